@@ -1,0 +1,1 @@
+"""Who uses the pipeline: command line, dashboard, experiments."""

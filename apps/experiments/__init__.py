@@ -1,0 +1,1 @@
+"""Accuracy, sweeps and reports."""

@@ -1,0 +1,1 @@
+"""Avatar bundles on disk, and how they are made."""

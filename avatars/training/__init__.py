@@ -1,0 +1,1 @@
+"""Training of an avatar (optional extra: PyTorch)."""

@@ -1,0 +1,1 @@
+"""Hardware profiles, the cost model and the thermal model."""

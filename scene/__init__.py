@@ -1,0 +1,1 @@
+"""What is shown and what it needs: scene files, motion, camera, planner."""

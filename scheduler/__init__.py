@@ -1,0 +1,1 @@
+"""Which job goes next: a pure core and its two drivers."""

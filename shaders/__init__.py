@@ -1,0 +1,1 @@
+"""GLSL programs (data)."""

@@ -1,0 +1,1 @@
+"""What the three units do, one folder per unit."""

@@ -1,0 +1,1 @@
+"""The CPU unit: pose, crop and present."""

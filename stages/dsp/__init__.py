@@ -1,0 +1,1 @@
+"""The DSP unit: inference of the INT8 network."""

@@ -1,0 +1,1 @@
+"""The GPU unit: raster and composite."""

@@ -1,0 +1,1 @@
+"""How packets move between units: slots, shared memory and the message bus."""
