@@ -47,19 +47,14 @@ def shape_buckets(size: str) -> list[Shape]:
 
 
 def _shapes_of_area(side: int) -> list[Shape]:
-    widest = [
-        (h, side * side // h // BUCKET_STEP * BUCKET_STEP)
-        for h in range(BUCKET_STEP, 2 * side + 1, BUCKET_STEP)
-    ]
+    widest = [(h, side * side // h // BUCKET_STEP * BUCKET_STEP) for h in range(BUCKET_STEP, 2 * side + 1, BUCKET_STEP)]
     shapes = [(h, w) for h, w in widest if w and max(h, w) <= min(4 * min(h, w), MAX_SIDE)]
     return [(h, w) for h, w in shapes if not any(b > h and v >= w for b, v in shapes)]
 
 
 def _check_side(side: int) -> int:
     if side % BUCKET_STEP or not BUCKET_STEP <= side <= MAX_SIDE:
-        raise ValueError(
-            f"found side {side}, expected a multiple of {BUCKET_STEP} from {BUCKET_STEP} to {MAX_SIDE}"
-        )
+        raise ValueError(f"found side {side}, expected a multiple of {BUCKET_STEP} from {BUCKET_STEP} to {MAX_SIDE}")
     return side
 
 
