@@ -66,8 +66,8 @@ def _checked_size(size: str) -> str:
 class OutputSpec(Model):
     """The picture that is presented."""
 
-    width: int = Field(640, ge=64, le=MAX_SIDE, multiple_of=2)
-    height: int = Field(480, ge=64, le=MAX_SIDE, multiple_of=2)
+    width: int = Field(default=640, ge=64, le=MAX_SIDE, multiple_of=2)
+    height: int = Field(default=480, ge=64, le=MAX_SIDE, multiple_of=2)
 
 
 class AvatarSpec(Model):
@@ -87,9 +87,9 @@ class CameraSpec(Model):
 
     source: str = "builtin:orbit"
     format: Literal["auto", "arkit", "tum", "nerf"] = "auto"
-    fov_y_deg: float = Field(40.0, gt=1, lt=170)
-    near_m: float = Field(0.05, gt=0, allow_inf_nan=False)
-    far_m: float = Field(100.0, gt=0, allow_inf_nan=False)
+    fov_y_deg: float = Field(default=40.0, gt=1, lt=170)
+    near_m: float = Field(default=0.05, gt=0, allow_inf_nan=False)
+    far_m: float = Field(default=100.0, gt=0, allow_inf_nan=False)
     place: Literal["auto", "none"] = "auto"
 
     @model_validator(mode="after")
@@ -103,14 +103,14 @@ class Scene(Model):
     """A scene. `background`: `room`, or a video, image folder or picture."""
 
     name: str = "scene"
-    fps: float = Field(30.0, gt=0, le=1000, allow_inf_nan=False)
-    frames: int = Field(300, ge=1, le=10_000_000)
+    fps: float = Field(default=30.0, gt=0, le=1000, allow_inf_nan=False)
+    frames: int = Field(default=300, ge=1, le=10_000_000)
     size: Annotated[str, AfterValidator(_checked_size)] = "256"
     background: str = "room"
-    error_budget_px: float = Field(0.5, ge=0, allow_inf_nan=False)
+    error_budget_px: float = Field(default=0.5, ge=0, allow_inf_nan=False)
     output: OutputSpec = OutputSpec()
     camera: CameraSpec = CameraSpec()
-    avatars: tuple[AvatarSpec, ...] = Field((AvatarSpec(),), min_length=1, max_length=8)
+    avatars: tuple[AvatarSpec, ...] = Field(default=(AvatarSpec(),), min_length=1, max_length=8)
 
 
 class UnitSettings(Model):
