@@ -1,0 +1,51 @@
+"""The OpenGL context of the GPU unit.
+
+Rule: one off-screen EGL context per process, hardware or software; nobody else in the project creates one.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import Any
+
+import moderngl
+
+from trilane.errors import MissingPartError
+
+INSTALL = "apt-get install libegl1 libgl1-mesa-dri"
+REQUIRED_VERSION = 330
+SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swr", "swiftshader", "swrast")
+
+
+@dataclass(frozen=True)
+class Driver:
+    """What drives the context. `hardware` is False for a renderer that runs on the CPU."""
+
+    vendor: str
+    renderer: str
+    version: str
+    hardware: bool
+
+
+def open_context(threads: int | None = None) -> Any:
+    """A new off-screen `moderngl.Context` of OpenGL 3.3 or later, current on the calling thread.
+
+    `threads`: CPU threads a software driver may use; Mesa reads it once, when the process makes its first context.
+    One thread means none beside the caller's. Raises MissingPartError when no context can be made.
+    """
+    if threads is not None:
+        os.environ["LP_NUM_THREADS"] = str(threads if threads > 1 else 0)
+    try:
+        create: Any = moderngl.create_context
+        return create(require=REQUIRED_VERSION, standalone=True, backend="egl")
+    except Exception as error:  # moderngl and glcontext raise bare Exception
+        raise MissingPartError(f"no OpenGL 3.3 context through EGL ({error})", INSTALL) from error
+
+
+def describe(ctx: Any) -> Driver:
+    """The driver behind `ctx`, as it names itself."""
+    info = ctx.info
+    renderer = str(info["GL_RENDERER"])
+    software = any(name in renderer.lower() for name in SOFTWARE_RENDERERS)
+    return Driver(str(info["GL_VENDOR"]), renderer, str(info["GL_VERSION"]), not software)

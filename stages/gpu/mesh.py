@@ -1,0 +1,201 @@
+"""A skinned mesh: arrays of a body turned into the vertex and index buffers that the shaders read.
+
+Rule: one interleaved buffer, one vertex per distinct (position, UV) corner, in an order that keeps neighbours together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.errors import BadInputError
+from trilane.stages.contracts import JOINTS, POSE_FEATURES
+
+WEIGHT_COUNTS = (4, 8, 12)
+PATCH_TRIANGLES = 320
+POSEDIRS_ROW = 8192  # texels in a row of the pose blend shape texture
+GROUPS = "abc"
+
+F32 = NDArray[np.float32]
+Ints = NDArray[np.integer[Any]]
+
+
+@dataclass(frozen=True)
+class MeshArrays:
+    """Per-vertex arrays after the split at UV seams, float32 unless told.
+
+    `position` (N,3) metres, rest pose. `uv` (N,2). `joint` (N,K) uint8, `weight` (N,K), rows sum to 1.
+    `triangles` (F,3) uint32. `source` (N,) int64: which vertex of the body a row came from. `normal` (N,3) and
+    `colour` (N,4): only for meshes that are shaded.
+    """
+
+    position: F32
+    uv: F32
+    joint: NDArray[np.uint8]
+    weight: F32
+    triangles: NDArray[np.uint32]
+    source: NDArray[np.int64]
+    surface: dict[str, F32] = field(default_factory=dict)
+
+    @property
+    def weights_per_vertex(self) -> int:
+        return int(self.joint.shape[1])
+
+
+def mesh_arrays(
+    vertices: NDArray[np.floating[Any]],
+    faces: Ints,
+    uv: NDArray[np.floating[Any]],
+    uv_faces: Ints,
+    joint: Ints,
+    weight: NDArray[np.floating[Any]],
+    normal: NDArray[np.floating[Any]] | None = None,
+    colour: NDArray[np.floating[Any]] | None = None,
+) -> MeshArrays:
+    """Split vertices at UV seams and order them for the vertex cache.
+
+    `vertices` (V,3) metres, `faces` (F,3), `uv` (T,2), `uv_faces` (F,3) per corner, `joint` and `weight` (V,K) with K
+    4, 8 or 12, optionally `normal` (V,3) and `colour` (V,4), both given together. Vertices that no face uses are
+    left out. Raises BadInputError when shapes, indices or values cannot be drawn.
+    """
+    _check(vertices, faces, uv, uv_faces, joint, weight)
+    triangle_order = patch_order(np.asarray(vertices, np.float64)[faces].mean(axis=1))
+    source, uv_source, triangles = split_corners(faces[triangle_order], uv_faces[triangle_order])
+    surface = {"normal": normal, "colour": colour}
+    return MeshArrays(
+        position=np.ascontiguousarray(vertices[source], np.float32),
+        uv=np.ascontiguousarray(uv[uv_source], np.float32),
+        joint=np.ascontiguousarray(joint[source], np.uint8),
+        weight=np.ascontiguousarray(weight[source], np.float32),
+        triangles=triangles,
+        source=source,
+        surface={
+            name: np.ascontiguousarray(values[source], np.float32)
+            for name, values in surface.items()
+            if values is not None
+        },
+    )
+
+
+def split_corners(faces: Ints, uv_faces: Ints) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.uint32]]:
+    """Distinct (vertex, uv) corners numbered by first use.
+
+    Returns the vertex (N,) and the uv (N,) of each, and the triangles (F,3) that index them.
+    """
+    corner = faces.astype(np.int64).ravel() << 32 | uv_faces.astype(np.int64).ravel()
+    distinct, first, inverse = np.unique(corner, return_index=True, return_inverse=True)
+    by_first_use = np.argsort(first)
+    number = np.empty_like(by_first_use)
+    number[by_first_use] = np.arange(len(by_first_use))
+    kept = distinct[by_first_use]
+    return kept >> 32, kept & 0xFFFFFFFF, number[inverse].reshape(faces.shape).astype(np.uint32)
+
+
+def patch_order(centres: NDArray[np.float64], patch: int = PATCH_TRIANGLES) -> NDArray[np.int64]:
+    """Order of triangles (F,) that keeps compact patches together: the longest side is halved until `patch` are left.
+
+    Software drivers shade vertices again for each batch of about a thousand indices; compact patches share few.
+    """
+    pending, done = [np.arange(len(centres))], []
+    while pending:
+        part = pending.pop()
+        if len(part) <= patch:
+            done.append(part)
+            continue
+        points = centres[part]
+        axis = int(np.argmax(np.ptp(points, axis=0)))
+        part = part[np.argsort(points[:, axis], kind="stable")]
+        half = -(-len(part) // 2 // patch) * patch if len(part) >= 2 * patch else len(part) // 2
+        pending += [part[half:], part[:half]]
+    return np.concatenate(done) if done else np.empty(0, np.int64)
+
+
+class SkinnedMesh:
+    """A `MeshArrays` on the GPU. `posedirs` (V,3,486): pose blend shapes, indexed by `MeshArrays.source`."""
+
+    def __init__(self, ctx: Any, arrays: MeshArrays, posedirs: NDArray[np.floating[Any]] | None = None) -> None:
+        self.arrays = arrays
+        self.posedirs = None if posedirs is None else _posedirs_texture(ctx, posedirs)
+        names, formats, columns = _layout(arrays, self.posedirs is not None)
+        packed = np.hstack([np.ascontiguousarray(column).view(np.uint8) for column in columns])
+        self._content = (ctx.buffer(packed.tobytes()), " ".join(formats), *names)
+        self._indices = ctx.buffer(arrays.triangles.tobytes())
+        self._joints = ctx.buffer(reserve=JOINTS * 48)
+        self._feature = ctx.buffer(reserve=-(-POSE_FEATURES // 4) * 16)
+        self._ctx = ctx
+
+    @property
+    def defines(self) -> dict[str, int]:
+        """Definitions that the vertex shader needs for this mesh."""
+        values = {"K": self.arrays.weights_per_vertex, "JOINTS": JOINTS}
+        if self.posedirs is not None:
+            values |= {"POSE_FEATURES": POSE_FEATURES, "ROW": POSEDIRS_ROW}
+        if self.arrays.surface:
+            values["SURFACE"] = 1
+        return values
+
+    def vertex_array(self, program: Any) -> Any:
+        """A vertex array of this mesh for `program`; attributes that the compiler dropped are skipped."""
+        return self._ctx.vertex_array(program, [self._content], self._indices, skip_errors=True)
+
+    def pose(self, program: Any, joints: F32, feature: F32 | None = None) -> None:
+        """Upload the skinning matrices (55,3,4) and the pose feature (486,), and bind them to `program`."""
+        self._joints.write(np.ascontiguousarray(joints, np.float32))
+        self._joints.bind_to_uniform_block(0)
+        program["Joints"].binding = 0
+        if self.posedirs is None:
+            return
+        if feature is None:
+            raise ValueError("a mesh with pose blend shapes needs the pose feature")
+        self._feature.write(np.ascontiguousarray(feature, np.float32))
+        self._feature.bind_to_uniform_block(1)
+        program["PoseFeature"].binding = 1
+        self.posedirs.use(location=8)
+        program["posedirs"].value = 8
+
+
+def _layout(arrays: MeshArrays, with_source: bool) -> tuple[list[str], list[str], list[NDArray[Any]]]:
+    columns: dict[str, tuple[str, NDArray[Any]]] = {"position": ("3f", arrays.position), "uv": ("2f", arrays.uv)}
+    columns |= {name: (f"{values.shape[1]}f", values) for name, values in arrays.surface.items()}
+    for group in range(arrays.weights_per_vertex // 4):
+        part = slice(4 * group, 4 * group + 4)
+        columns[f"joint_{GROUPS[group]}"] = ("4u1", arrays.joint[:, part])
+        columns[f"weight_{GROUPS[group]}"] = ("4f", arrays.weight[:, part])
+    if with_source:
+        columns["source"] = ("1u4", arrays.source.astype(np.uint32)[:, None])
+    return list(columns), [fmt for fmt, _ in columns.values()], [values for _, values in columns.values()]
+
+
+def _posedirs_texture(ctx: Any, posedirs: NDArray[np.floating[Any]]) -> Any:
+    if posedirs.shape[1:] != (3, POSE_FEATURES):
+        raise BadInputError("posedirs", f"shape {posedirs.shape}", f"(vertices, 3, {POSE_FEATURES})")
+    texels = posedirs.shape[0] * POSE_FEATURES
+    rows = -(-texels // POSEDIRS_ROW)
+    image = np.zeros((rows * POSEDIRS_ROW, 3), np.float16)
+    image[:texels] = posedirs.transpose(0, 2, 1).reshape(-1, 3)
+    return ctx.texture((POSEDIRS_ROW, rows), 3, image.tobytes(), dtype="f2", alignment=1)
+
+
+def _check(vertices: Any, faces: Any, uv: Any, uv_faces: Any, joint: Any, weight: Any) -> None:
+    tests = (
+        (faces.ndim == 2 and faces.shape[1] == 3 and len(faces) > 0, "faces", faces.shape, "(F, 3) with F > 0"),
+        (uv_faces.shape == faces.shape, "uv_faces", uv_faces.shape, f"{faces.shape} as faces has"),
+        (_indexes(faces, len(vertices)), "faces", "an index out of range", f"0 to {len(vertices) - 1}"),
+        (_indexes(uv_faces, len(uv)), "uv_faces", "an index out of range", f"0 to {len(uv) - 1}"),
+        (joint.shape == weight.shape == (len(vertices), joint.shape[-1]), "joint", joint.shape, "(V, K) as weight"),
+        (joint.shape[-1] in WEIGHT_COUNTS, "joint", f"{joint.shape[-1]} weights a vertex", "4, 8 or 12"),
+        (_indexes(joint, JOINTS), "joint", "an index out of range", f"0 to {JOINTS - 1}"),
+        (bool(np.isfinite(vertices).all()), "vertices", "NaN or infinity", "finite metres"),
+        (bool(np.isfinite(uv).all()), "uv", "NaN or infinity", "finite values"),
+        (bool(np.isfinite(weight).all()), "weight", "NaN or infinity", "finite values"),
+    )
+    for passed, where, found, expected in tests:
+        if not passed:
+            raise BadInputError(f"mesh {where}", str(found), expected)
+
+
+def _indexes(values: Any, count: int) -> bool:
+    return bool(values.size) and int(values.min()) >= 0 and int(values.max()) < count

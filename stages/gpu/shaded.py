@@ -1,0 +1,111 @@
+"""Skinned meshes drawn with a caller's fragment shader: pictures of ground truth.
+
+Rule: shaders write linear light; samples are averaged in linear light, then written as sRGB with straight alpha.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.stages.gpu.camera import Matrix, eye_of, target_clip
+from trilane.stages.gpu.mesh import SkinnedMesh
+from trilane.stages.gpu.program import build_program, set_uniforms
+
+F32 = NDArray[np.float32]
+RGBA8 = NDArray[np.uint8]
+GL_SRGB8_ALPHA8 = 0x8C43
+
+
+class ShadedMesh:
+    """One mesh with its fragment shader and textures.
+
+    The mesh needs `normal` and `colour`. The shader gets `v_position`, `v_normal` (world, not normalised), `v_rest`,
+    `v_uv`, `v_colour`, `gl_FrontFacing`, uniforms `view` (mat4), `eye` (vec3), a sampler2D per texture, and writes one
+    vec4: linear light and alpha (normally 1; `discard` makes holes). `textures`: name to (h,w,4) uint8 sRGB image
+    with row 0 at v = 0, read back in linear light, mipmapped, repeated.
+    """
+
+    def __init__(
+        self,
+        ctx: Any,
+        mesh: SkinnedMesh,
+        fragment: str | Path,
+        textures: Mapping[str, RGBA8] | None = None,
+        uniforms: Mapping[str, Any] | None = None,
+    ) -> None:
+        self._mesh = mesh
+        self._program = build_program(ctx, "skin.vert", fragment, **mesh.defines)
+        self._vertices = mesh.vertex_array(self._program)
+        self._textures = {name: _srgb_texture(ctx, image) for name, image in (textures or {}).items()}
+        set_uniforms(self._program, dict(uniforms or {}))
+
+    def draw(self, joints: F32, view: Matrix, projection: Matrix, uniforms: Mapping[str, Any]) -> None:
+        """Draw into the target in use. `joints` (55,3,4)."""
+        for location, (name, texture) in enumerate(self._textures.items()):
+            texture.use(location)
+            set_uniforms(self._program, {name: location})
+        camera = {"view": tuple(np.asarray(view, np.float64).T.ravel()), "eye": tuple(eye_of(view))}
+        set_uniforms(self._program, camera | dict(uniforms))
+        self._program["clip_from_world"].write(target_clip(view, projection))
+        self._mesh.pose(self._program, joints)
+        self._vertices.render()
+
+
+class ShadedRaster:
+    """Supersampled pictures of shaded meshes. `samples`: samples along each side of a pixel (2 is 2x2)."""
+
+    def __init__(self, ctx: Any, samples: int = 4) -> None:
+        self._ctx, self._samples = ctx, samples
+        self._resolve = build_program(ctx, "screen.vert", "resolve.frag", SAMPLES=samples)
+        self._screen = ctx.vertex_array(self._resolve, [])
+        self._targets: dict[tuple[int, int], tuple[Any, Any, Any]] = {}
+
+    def render(
+        self,
+        meshes: list[ShadedMesh],
+        joints: F32,
+        view: Matrix,
+        projection: Matrix,
+        shape: tuple[int, int],
+        uniforms: Mapping[str, Any] | None = None,
+    ) -> RGBA8:
+        """Picture (h,w,4) uint8, sRGB, straight alpha, row 0 on top, of `meshes` that share `joints`, depth tested.
+
+        Pixels no mesh covers are 0, 0, 0, 0. `uniforms`: set on every mesh's shader.
+        """
+        large, samples, small = self._target(shape)
+        large.use()
+        self._ctx.enable_only(moderngl.DEPTH_TEST)
+        large.clear(0.0, 0.0, 0.0, 0.0, depth=1.0)
+        for mesh in meshes:
+            mesh.draw(joints, view, projection, uniforms or {})
+        small.use()
+        self._ctx.enable_only(moderngl.NOTHING)
+        samples.use(0)
+        set_uniforms(self._resolve, {"samples": 0})
+        self._screen.render(vertices=3)
+        pixels = np.empty((*shape, 4), np.uint8)
+        small.read_into(pixels, components=4, alignment=1)
+        return pixels
+
+    def _target(self, shape: tuple[int, int]) -> tuple[Any, Any, Any]:
+        if shape not in self._targets:
+            size = (shape[1] * self._samples, shape[0] * self._samples)
+            samples = self._ctx.texture(size, 4, dtype="f2")
+            large = self._ctx.framebuffer([samples], self._ctx.depth_renderbuffer(size))
+            small = self._ctx.framebuffer([self._ctx.texture(shape[::-1], 4)])
+            self._targets[shape] = (large, samples, small)
+        return self._targets[shape]
+
+
+def _srgb_texture(ctx: Any, image: RGBA8) -> Any:
+    texture = ctx.texture((image.shape[1], image.shape[0]), 4, image.tobytes(), internal_format=GL_SRGB8_ALPHA8)
+    texture.build_mipmaps()
+    texture.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
+    return texture

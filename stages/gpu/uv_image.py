@@ -1,0 +1,54 @@
+"""The UV image of a skinned mesh: what the packed pass samples the texture with, as float32.
+
+Rule: same vertices, same rasterisation, same pixel centres as the packed pass; no antialiasing.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.stages.gpu.camera import Matrix, target_clip
+from trilane.stages.gpu.mesh import SkinnedMesh
+from trilane.stages.gpu.program import build_program
+
+F32 = NDArray[np.float32]
+
+
+class UvRaster:
+    """Draws `mesh` into UV images. Targets are kept by shape."""
+
+    def __init__(self, ctx: Any, mesh: SkinnedMesh) -> None:
+        self._ctx, self._mesh = ctx, mesh
+        self._program = build_program(ctx, "skin.vert", "uv.frag", **mesh.defines)
+        self._vertices = mesh.vertex_array(self._program)
+        self._targets: dict[tuple[int, int], Any] = {}
+
+    def render(
+        self, joints: F32, view: Matrix, projection: Matrix, shape: tuple[int, int], feature: F32 | None = None
+    ) -> F32:
+        """UV image (h,w,3) float32 of u, v, coverage (1 on the mesh, 0 elsewhere with u = v = 0), row 0 on top.
+
+        `joints` (55,3,4): skinning matrices. `projection`: of the crop, when there is one. `feature` (486,): only for
+        a mesh with pose blend shapes.
+        """
+        target = self._target(shape)
+        target.use()
+        self._ctx.enable_only(moderngl.DEPTH_TEST)
+        target.clear(0.0, 0.0, 0.0, 0.0, depth=1.0)
+        self._mesh.pose(self._program, joints, feature)
+        self._program["clip_from_world"].write(target_clip(view, projection))
+        self._vertices.render()
+        pixels = np.empty((*shape, 4), np.float32)
+        target.read_into(pixels, components=4, dtype="f4", alignment=1)
+        return pixels[..., :3]
+
+    def _target(self, shape: tuple[int, int]) -> Any:
+        if shape not in self._targets:
+            size = (shape[1], shape[0])
+            colour = self._ctx.texture(size, 4, dtype="f4")
+            self._targets[shape] = self._ctx.framebuffer([colour], self._ctx.depth_renderbuffer(size))
+        return self._targets[shape]
