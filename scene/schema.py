@@ -83,11 +83,14 @@ class AvatarSpec(Model):
 
 
 class CameraSpec(Model):
-    """`source`: `builtin:NAME` or a file. `place`: how the scene's anchor is put in front of a recorded camera."""
+    """`source`: `builtin:NAME` or a file. `place`: how the scene's anchor is put in front of a recorded camera.
+
+    `fov_y_deg`: of the picture's height; None takes what the file says, else what is usual for its format.
+    """
 
     source: str = "builtin:orbit"
     format: Literal["auto", "arkit", "tum", "nerf"] = "auto"
-    fov_y_deg: float = Field(default=40.0, gt=1, lt=170)
+    fov_y_deg: float | None = Field(default=None, gt=1, lt=170)
     near_m: float = Field(default=0.05, gt=0, allow_inf_nan=False)
     far_m: float = Field(default=100.0, gt=0, allow_inf_nan=False)
     place: Literal["auto", "none"] = "auto"
