@@ -1,5 +1,122 @@
-"""Entry point of the trilane command."""
+"""Entry point of the `trilane` command: the table of commands, the global options and the exit codes.
+
+Rule: a command is one module with a Typer `app`, named by one line of `COMMANDS` and imported when it is called;
+an error that a person can cause ends here as one sentence on stderr and an exit code, never as a traceback.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from typing import Annotated, Any, NoReturn
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+from trilane import __version__
+from trilane.errors import TrilaneError
+
+#: Command: its module, and the line that `trilane --help` shows for it.
+COMMANDS = {
+    "doctor": ("trilane.apps.cli.doctor", "Say what this machine has, what is missing and how to install it."),
+}
+
+FAILED, MISSING_PART, INTERRUPTED = 1, 3, 130
+
+EPILOG = """\b
+Examples:
+  trilane run
+  trilane run --motion walk.bvh --camera arkit.txt --frames 200 --json
+  trilane doctor
+
+\b
+Exit codes:
+  0 done, 1 the run failed, 2 wrong usage or bad input,
+  3 something is not installed, 130 interrupted
+"""
+
+
+class LazyGroup(TyperGroup):
+    """Lists the commands from the table and imports a command's module when it is called."""
+
+    def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002
+        return list(COMMANDS)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002
+        """A stand-in with the help line: enough for `--help` and completion of the name."""
+        if cmd_name not in COMMANDS:
+            return None
+        return TyperCommand(cmd_name, help=COMMANDS[cmd_name][1])
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        name, stand_in, rest = super().resolve_command(ctx, args)
+        if name is None or stand_in is None:
+            return name, stand_in, rest
+        command = typer.main.get_command(importlib.import_module(COMMANDS[name][0]).app)
+        command.name = name
+        return name, command, rest
+
+
+app = typer.Typer(
+    name="trilane",
+    cls=LazyGroup,
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    epilog=EPILOG,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"trilane {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error; may stand anywhere.")] = False,
+) -> None:
+    """Run, measure and predict a real-time neural-avatar pipeline on CPU, GPU and DSP units."""
+
+
+def _fail(message: str, code: int) -> NoReturn:
+    from rich.text import Text
+
+    from trilane.apps.cli.console import stderr_console
+
+    stderr_console().print(Text.assemble(("error: ", "bold red"), message), soft_wrap=True)
+    raise SystemExit(code)
+
+
+def _describe(error: Exception) -> tuple[str, int]:
+    """The sentence and the exit code of an error that reached the top."""
+    if isinstance(error, TrilaneError):
+        return str(error), error.exit_code
+    if isinstance(error, ModuleNotFoundError):
+        return f"the Python package {error.name} is missing; install it with: pip install trilane", MISSING_PART
+    if isinstance(error, OSError):
+        return f"{error.filename or 'the system'}: {error.strerror or error}", FAILED
+    return f"{type(error).__name__}: {error}; this is a defect of Trilane, --debug shows where", FAILED
 
 
 def main() -> None:
-    raise SystemExit(0)
+    """Run the command line of `sys.argv`; leaves by SystemExit with one of the exit codes."""
+    arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
+    debug = len(arguments) < len(sys.argv) - 1
+    try:
+        app(args=arguments, prog_name="trilane")
+    except KeyboardInterrupt:
+        _fail("interrupted", INTERRUPTED)
+    except Exception as error:
+        if debug:
+            raise
+        _fail(*_describe(error))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,38 @@
+"""What every command writes with: data on stdout, messages on stderr, JSON as one document.
+
+Rule: nothing but a command's result goes to stdout, so that `trilane ... --json | jq` always works.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else there.")]
+
+
+def stderr_console() -> Console:
+    """Console for messages and progress. Rich obeys NO_COLOR and plain pipes by itself."""
+    from rich.console import Console
+
+    return Console(stderr=True, highlight=False)
+
+
+def stdout_console() -> Console:
+    """Console for results that a person reads. A pipe gets 120 columns, so that tables are not cut."""
+    from rich.console import Console
+
+    return Console(highlight=False, width=None if sys.stdout.isatty() else 120)
+
+
+def print_json(document: Mapping[str, Any]) -> None:
+    """Print `document` as JSON on stdout. Raises ValueError for NaN and infinities, which JSON has not."""
+    sys.stdout.write(json.dumps(document, indent=1, allow_nan=False) + "\n")
+    sys.stdout.flush()

@@ -1,0 +1,149 @@
+"""`trilane doctor`: what this machine has, what is missing, and the line that installs it.
+
+Rule: a part is said to work only after it was tried here.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+import sys
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from trilane.apps.cli.console import JsonOption, print_json, stdout_console
+
+app = typer.Typer(rich_markup_mode=None, add_completion=False)
+
+MISSING = 3
+SHM = Path("/dev/shm")  # noqa: S108 - looked at, never written
+EPILOG = "\b\nExamples:\n  trilane doctor\n  trilane doctor --json"
+
+
+@dataclass(frozen=True)
+class Check:
+    """One part: what was found, whether it works, whether a run needs it, and the line that mends it."""
+
+    name: str
+    found: str
+    works: bool
+    needed: bool = True
+    install: str = ""
+
+
+def _python() -> Check:
+    works = sys.version_info >= (3, 11)
+    return Check("Python", platform.python_version(), works, install="apt-get install python3.11 python3.11-venv")
+
+
+def _packages() -> list[Check]:
+    from trilane.apps.machine import OPTIONAL_PACKAGES, PACKAGES, package_version
+
+    checks = []
+    for name in PACKAGES:
+        version = package_version(name)
+        checks.append(Check(name, version or "missing", version is not None, install=f"pip install {name}"))
+    for name, extra in OPTIONAL_PACKAGES.items():
+        version = package_version(name)
+        install = f'pip install "trilane[{extra}]"'
+        checks.append(Check(name, version or "missing", version is not None, needed=False, install=install))
+    return checks
+
+
+def _gl(facts: dict[str, Any] | None) -> Check:
+    install = "apt-get install libegl1 libgl1-mesa-dri"
+    if facts is None:
+        return Check("EGL and OpenGL", "no OpenGL 3.3 context can be made", works=False, install=install)
+    kind = "hardware" if facts["hardware"] else "software, on the CPU"
+    return Check("EGL and OpenGL", f"{facts['renderer']}, {facts['version']} ({kind})", works=True)
+
+
+def _runtimes() -> Check:
+    from trilane.apps.machine import runtime_facts
+
+    try:
+        facts = runtime_facts()
+    except Exception as error:  # a broken wheel raises whatever its loader raises
+        return Check(
+            "inference runtimes", f"{type(error).__name__}: {error}", works=False, install="pip install onnxruntime"
+        )
+    found = "; ".join(f"{runtime}: {', '.join(places)}" for runtime, places in facts.items())
+    return Check("inference runtimes", found, works=bool(facts["onnxruntime"]))
+
+
+def _cpu() -> Check:
+    from trilane.apps.machine import cpu_facts
+
+    cpu = cpu_facts()
+    flags = " ".join(cpu["flags"]) or "none of those that matter"
+    found = f"{cpu['model']}, {len(cpu['cores_allowed'])} of {cpu['cores']} cores allowed, {flags}"
+    return Check("CPU", found, works=True)
+
+
+def _int8() -> Check:
+    from trilane.apps.machine import cpu_facts
+
+    present = {"avx512_vnni", "avx_vnni", "amx_int8", "asimddp", "i8mm"} & set(cpu_facts()["flags"])
+    found = " ".join(sorted(present)) or "no; INT8 networks run on AVX2 or NEON alone"
+    return Check("INT8 dot product", found, works=bool(present), needed=False, install="needs another CPU")
+
+
+def _memfd() -> Check:
+    try:
+        handle = os.memfd_create("trilane-doctor", os.MFD_CLOEXEC)
+        os.ftruncate(handle, 4096)
+        os.close(handle)
+    except (AttributeError, OSError) as error:
+        return Check("memfd", str(error), works=False, install="needs Linux 3.17 or newer with memfd_create allowed")
+    return Check("memfd", "anonymous shared memory works", works=True)
+
+
+def _dev_shm() -> Check:
+    """Not needed: slots are memfds. What other programs left there is none of ours."""
+    if not SHM.is_dir():
+        return Check(str(SHM), "absent", works=False, needed=False, install="mount -t tmpfs tmpfs /dev/shm")
+    free = shutil.disk_usage(SHM).free
+    return Check(str(SHM), f"{free / 2**20:.0f} MiB free; Trilane leaves nothing there", works=True, needed=False)
+
+
+def checks(gl: dict[str, Any] | None) -> list[Check]:
+    """Every check, in the order they are shown; `gl` is what `machine.gl_facts` said."""
+    return [_python(), _cpu(), _int8(), _memfd(), _dev_shm(), _gl(gl), _runtimes(), *_packages()]
+
+
+def _state(check: Check) -> str:
+    if check.works:
+        return "[green]works[/green]"
+    return "[red]missing[/red]" if check.needed else "[yellow]absent[/yellow]"
+
+
+def _print_table(rows: list[Check]) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(title="What this machine has", title_justify="left")
+    for column in ("part", "state", "found", "mend with"):
+        table.add_column(column, overflow="fold")
+    for row in rows:
+        table.add_row(row.name, _state(row), escape(row.found), "" if row.works else escape(row.install))
+    stdout_console().print(table)
+
+
+@app.command(epilog=EPILOG)
+def doctor(as_json: JsonOption = False) -> None:
+    """Say what this machine has, what is missing and how to install it. Exit code 3 when a needed part is missing."""
+    from trilane.apps.machine import gl_facts, machine_facts
+
+    gl = gl_facts()
+    rows = checks(gl)
+    complete = all(row.works for row in rows if row.needed)
+    if as_json:
+        print_json({"complete": complete, "checks": [asdict(row) for row in rows], "machine": machine_facts(gl)})
+    else:
+        _print_table(rows)
+    if not complete:
+        raise typer.Exit(MISSING)

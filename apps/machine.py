@@ -1,0 +1,120 @@
+"""Facts of the machine that a measurement was made on: they stand beside every number that is reported.
+
+Rule: only what was read or tried on this machine is stated; what could not be read is absent, never guessed.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+#: Instructions that decide how fast INT8 and FP32 networks run; a network's speed means nothing without them.
+CPU_FLAGS = ("avx2", "fma", "f16c", "avx512f", "avx512_vnni", "avx_vnni", "avx512_bf16", "amx_int8", "sha_ni")
+ARM_FLAGS = ("asimd", "asimddp", "i8mm", "bf16", "sve", "sve2")
+
+PACKAGES = (
+    "numpy", "moderngl", "onnxruntime", "onnx", "pyzmq", "msgpack", "psutil", "rich", "typer", "pydantic", "av",
+    "Pillow", "perfetto",
+)  # fmt: skip
+OPTIONAL_PACKAGES = {"openvino": "openvino", "onnxruntime-qnn": "qnn", "torch": "train", "anny": "anny"}
+
+GL_TIMEOUT_S = 30.0
+GL_PROGRAM = "import json, trilane.apps.machine as m; print(json.dumps(m.open_gl()))"
+GL_LIMITS = (
+    "GL_MAX_TEXTURE_SIZE", "GL_MAX_DRAW_BUFFERS", "GL_MAX_COLOR_ATTACHMENTS", "GL_MAX_UNIFORM_BLOCK_SIZE",
+    "GL_MAX_TEXTURE_BUFFER_SIZE", "GL_MAX_VIEWPORT_DIMS",
+)  # fmt: skip
+
+
+def package_version(name: str) -> str | None:
+    """Version of an installed distribution, or None."""
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def cpu_facts() -> dict[str, Any]:
+    """Model, instruction flags and cores; `cores_allowed` are those that this process may run on."""
+    fields = _cpuinfo()
+    flags = set((fields.get("flags") or fields.get("Features") or "").split())
+    return {
+        "model": fields.get("model name") or platform.processor() or platform.machine(),
+        "architecture": platform.machine(),
+        "flags": [flag for flag in CPU_FLAGS + ARM_FLAGS if flag in flags],
+        "cores": os.cpu_count() or 1,
+        "cores_allowed": sorted(os.sched_getaffinity(0)),
+    }
+
+
+def _cpuinfo() -> dict[str, str]:
+    """Fields of the first core in /proc/cpuinfo."""
+    try:
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return {}
+    pairs = (line.partition(":") for line in text.split("\n\n")[0].splitlines())
+    return {key.strip(): value.strip() for key, _, value in pairs}
+
+
+def memory_bytes() -> int:
+    """Physical memory in bytes."""
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+
+
+def open_gl() -> dict[str, Any]:
+    """Make a context in this process and describe it. Raises MissingPartError when none can be made."""
+    from trilane.stages.gpu.context import describe, open_context
+
+    context = open_context()
+    driver, info = describe(context), context.info
+    limits = {name: info[name] for name in GL_LIMITS if name in info}
+    return {
+        "vendor": driver.vendor,
+        "renderer": driver.renderer,
+        "version": driver.version,
+        "hardware": driver.hardware,
+        "limits": limits,
+    }
+
+
+def gl_facts() -> dict[str, Any] | None:
+    """The OpenGL driver that EGL gives, tried in a process of its own: a driver may crash. None when none works."""
+    try:
+        done = subprocess.run([sys.executable, "-c", GL_PROGRAM], capture_output=True, timeout=GL_TIMEOUT_S, check=True)
+        facts = json.loads(done.stdout)
+    except (OSError, subprocess.SubprocessError, ValueError):
+        return None
+    return facts if isinstance(facts, dict) else None
+
+
+def runtime_facts() -> dict[str, Any]:
+    """Inference runtimes and what they can run on."""
+    import onnxruntime
+
+    facts: dict[str, Any] = {"onnxruntime": list(onnxruntime.get_available_providers())}
+    if package_version("openvino"):
+        import openvino
+
+        facts["openvino"] = list(openvino.Core().available_devices)
+    return facts
+
+
+def machine_facts(gl: dict[str, Any] | None = None) -> dict[str, Any]:
+    """All facts that stand beside a measurement; `gl` is what `gl_facts` said, when it was asked."""
+    packages = {name: package_version(name) for name in (*PACKAGES, *OPTIONAL_PACKAGES)}
+    return {
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        "trilane": package_version("trilane"),
+        "cpu": cpu_facts(),
+        "memory_bytes": memory_bytes(),
+        "gl": gl,
+        "packages": {name: version for name, version in packages.items() if version is not None},
+    }
