@@ -1,0 +1,121 @@
+"""The pictures of a run folder: the segments of video joined, their digests, and the contact sheet.
+
+Rule: nothing is encoded again and nothing is made up: video.mp4 holds the packets of the segments, and the contact
+sheet is decoded from video.mp4.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import av
+from PIL import Image, ImageDraw
+
+COLUMNS, ROWS = 4, 5
+THUMB_WIDTH = 320
+
+
+@dataclass(frozen=True)
+class Joined:
+    """What `join_segments` wrote. `frames`: pictures in the file; `seconds`: until the end of the last one."""
+
+    frames: int
+    seconds: float
+
+
+def join_segments(segments: list[Path], target: Path) -> Joined | None:
+    """Copy the packets of `segments`, in that order, into the MP4 file `target`; None when they hold no frame.
+
+    A segment that starts before the end of the one before it (a restarted stage, a repeated frame) is moved to
+    that end. A segment that was cut off counts up to its cut.
+    """
+    readable = [path for path in segments if _has_packets(path)]
+    if not readable:
+        return None
+    frames, end, base = 0, 0, 0.0
+    with av.open(str(target), "w", format="mp4", options={"movflags": "faststart"}) as output:
+        stream: Any = None
+        for path in readable:
+            with av.open(str(path)) as segment:
+                source = segment.streams.video[0]
+                stream = stream or output.add_stream_from_template(source)
+                shift: int | None = None
+                for packet in _packets(segment):
+                    shift = max(0, end - packet.pts) if shift is None else shift
+                    packet.pts, packet.dts, packet.stream = packet.pts + shift, packet.dts + shift, stream
+                    end, base = packet.pts + packet.duration, float(packet.time_base)
+                    output.mux(packet)
+                    frames += 1
+    return Joined(frames, end * base)
+
+
+def _packets(container: Any) -> Iterator[Any]:
+    """Whole packets of the video stream; a file that was cut off ends at its cut."""
+    try:
+        for packet in container.demux(video=0):
+            if packet.pts is not None and packet.size:
+                yield packet
+    except av.error.FFmpegError:
+        return
+
+
+def _has_packets(path: Path) -> bool:
+    try:
+        with av.open(str(path)) as segment:
+            return next(_packets(segment), None) is not None
+    except (av.error.FFmpegError, IndexError):
+        return False
+
+
+def run_checksum(digests: list[Path]) -> str | None:
+    """SHA-256 over the lines `frame digest` of all segments in order of frame; None when there is no line.
+
+    Two runs that presented the same bytes as the same frames have the same checksum.
+    """
+    lines = [line for path in digests for line in path.read_text(encoding="ascii").splitlines() if " " in line]
+    if not lines:
+        return None
+    ordered = sorted(lines, key=lambda line: int(line.split(" ")[0]))
+    return hashlib.sha256("\n".join(ordered).encode("ascii")).hexdigest()
+
+
+def contact_sheet(video: Path, target: Path) -> int:
+    """Write a PNG sheet of up to COLUMNS x ROWS frames of `video`, evenly spaced, first and last among them.
+
+    Each is labelled with its number. Returns how many there are. Raises av.error.FFmpegError when the video cannot be
+    decoded.
+    """
+    with av.open(str(video)) as container:
+        stream = container.streams.video[0]
+        times = sorted(packet.pts for packet in container.demux(stream) if packet.pts is not None)
+        count = min(COLUMNS * ROWS, len(times))
+        chosen = [times[round(k * (len(times) - 1) / max(1, count - 1))] for k in range(count)]
+        rate = float(stream.average_rate or stream.guessed_rate)
+        pictures = [(round(pts * float(stream.time_base) * rate), _decode_at(container, pts)) for pts in chosen]
+    _paste(pictures).save(target)
+    return count
+
+
+def _decode_at(container: Any, pts: int) -> Image.Image:
+    stream = container.streams.video[0]
+    container.seek(pts, stream=stream)
+    picture = next(frame for frame in container.decode(stream) if frame.pts >= pts)
+    image: Image.Image = picture.to_image()
+    return image.resize((THUMB_WIDTH, image.height * THUMB_WIDTH // image.width), Image.Resampling.LANCZOS)
+
+
+def _paste(pictures: list[tuple[int, Image.Image]]) -> Image.Image:
+    height = pictures[0][1].height
+    columns = min(COLUMNS, len(pictures))
+    sheet = Image.new("RGB", (columns * THUMB_WIDTH, -(-len(pictures) // columns) * height))
+    draw = ImageDraw.Draw(sheet)
+    for place, (frame, picture) in enumerate(pictures):
+        corner = (place % columns * THUMB_WIDTH, place // columns * height)
+        sheet.paste(picture, corner)
+        text = (corner[0] + 6, corner[1] + 4)
+        draw.text(text, f"frame {frame}", fill="white", stroke_width=2, stroke_fill="black", font_size=14)
+    return sheet

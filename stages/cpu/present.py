@@ -1,0 +1,115 @@
+"""The present stage: frames become a segment of video, and a digest of every frame a line beside it.
+
+Rule: what is presented is what the slot held, digested before anything else is done to it. Each process writes one
+segment, named so that none replaces another; the parent joins them (`trilane.apps.video`). A segment is fragmented
+MP4: when its writer is killed it is readable, short of the last frame at most.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import time
+from collections.abc import Mapping, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
+from numpy.typing import NDArray
+
+from trilane.scene.schema import RunConfig
+from trilane.stages.contracts import Packet
+
+SEGMENTS = "segments"
+KEYFRAME_EVERY = 30
+#: One thread, no look-ahead, no reordering: every frame leaves the encoder before the next one comes.
+ENCODER_OPTIONS = {"preset": "superfast", "crf": "20", "tune": "zerolatency"}
+#: Every frame is a fragment of its own and goes to the file at once.
+FRAGMENTS = {"movflags": "empty_moov+default_base_moof+frag_every_frame", "flush_packets": "1"}
+MS = 1e-6  # of a nanosecond
+
+
+class Segment:
+    """One file of H.264 video, written frame by frame, and beside it a text file of digests.
+
+    A digest line is the frame's number and the SHA-256 of its bytes (row 0 first, RGB).
+    """
+
+    def __init__(self, path: Path, fps: float, height: int, width: int) -> None:
+        rate = Fraction(fps).limit_denominator(1001)
+        self._container: Any = av.open(str(path), "w", format="mp4", options=dict(FRAGMENTS))
+        self._stream: Any = self._container.add_stream("libx264", rate=rate, options=dict(ENCODER_OPTIONS))
+        self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, "yuv420p"
+        context = self._stream.codec_context
+        context.thread_count, context.gop_size, context.time_base = 1, KEYFRAME_EVERY, 1 / rate
+        context.colorspace, context.color_range = Colorspace.ITU709, ColorRange.MPEG
+        self._reformatter: Any = VideoReformatter()
+        self._last = -1
+        self._digests = path.with_suffix(".sha256").open("w", encoding="ascii", buffering=1)
+
+    def digest(self, frame: int, pixels: NDArray[np.uint8]) -> None:
+        """Note the digest of `pixels`, (height, width, 3) and C-contiguous."""
+        self._digests.write(f"{frame} {hashlib.sha256(pixels.data).hexdigest()}\n")
+
+    def add(self, frame: int, pixels: NDArray[np.uint8]) -> None:
+        """Show `pixels`, (height, width, 3) RGB, from the instant of frame number `frame` on."""
+        rgb = av.VideoFrame.from_numpy_buffer(pixels, format="rgb24")
+        picture = self._reformatter.reformat(
+            rgb, format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG
+        )
+        self._last = max(self._last + 1, frame)
+        picture.pts, picture.time_base = self._last, self._stream.codec_context.time_base
+        self._container.mux(self._stream.encode(picture))
+
+    def close(self) -> None:
+        """Flush the encoder and complete the file."""
+        self._container.mux(self._stream.encode(None))
+        self._container.close()
+        self._digests.close()
+
+
+class PresentStage:
+    """Stage `present` of the CPU unit: one input edge of frames, no output.
+
+    Figures of a job that is recorded: `digest_ms` and `encode_ms`.
+    """
+
+    def __init__(self, config: RunConfig) -> None:
+        self._height, self._width = config.scene.output.height, config.scene.output.width
+        self._fps = config.scene.fps
+        self._folder = config.out_dir / SEGMENTS if config.record else None
+        self._frames: list[NDArray[np.uint8]] = []
+        self._segment: Segment | None = None
+
+    def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
+        """Views of the slots as frames, and the encoder, made ready. Raises ValueError when the stage has outputs."""
+        if outputs:
+            raise ValueError("the present stage has no output edge")
+        size = self._height * self._width * 3
+        self._frames = [packet.payload[:size].reshape(self._height, self._width, 3) for packet in inputs]
+        if self._folder is not None:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            path = self._folder / f"{time.monotonic_ns():020d}-{os.getpid()}.mp4"
+            self._segment = Segment(path, self._fps, self._height, self._width)
+
+    def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:  # noqa: ARG002
+        """Present `inputs[slot_in]` as frame `frame`. Raises ValueError when `slot_in` is None."""
+        if slot_in is None:
+            raise ValueError("the present stage needs an input slot")
+        if self._segment is None:
+            return {}
+        pixels = self._frames[slot_in]
+        start = time.perf_counter_ns()
+        self._segment.digest(frame, pixels)
+        digested = time.perf_counter_ns()
+        self._segment.add(frame, pixels)
+        return {"digest_ms": (digested - start) * MS, "encode_ms": (time.perf_counter_ns() - digested) * MS}
+
+    def close(self) -> None:
+        """Complete the segment."""
+        if self._segment is not None:
+            self._segment.close()
+            self._segment = None
