@@ -1,0 +1,85 @@
+"""The folder that a run writes: made under a temporary name beside its place and renamed when it is whole.
+
+Rule: a folder with the run's name is complete; one that ends in `.partial` is not, and is never taken for a run.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from datetime import UTC, datetime
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from trilane.errors import BadInputError
+
+
+def default_place(scene: str) -> Path:
+    """`runs/<UTC time>-<scene>` in the working directory, free at this moment."""
+    stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
+    safe = "".join(letter if letter.isalnum() or letter in "-_" else "-" for letter in scene)
+    place, tries = Path("runs") / f"{stamp}-{safe}", 1
+    while place.exists():
+        tries += 1
+        place = Path("runs") / f"{stamp}-{safe}-{tries}"
+    return place
+
+
+class RunFolder:
+    """Context manager: `work` is the temporary folder; leaving without `complete()` removes it and what it was put in.
+
+    Raises BadInputError on entry when `target` exists already or nothing can be written there.
+    """
+
+    def __init__(self, target: Path) -> None:
+        self.target = target.absolute()
+        self.work = self.target.with_name(f"{self.target.name}.{os.getpid()}.partial")
+        self._made: list[Path] = []
+        self._keep = False
+
+    def __enter__(self) -> Self:
+        if self.target.exists():
+            raise BadInputError(self.target, "a file or folder", "a name that is free", "choose another --out")
+        try:
+            self._make_parents()
+            self.work.mkdir()
+        except OSError as error:
+            self._remove()
+            reason = error.strerror or str(error)
+            raise BadInputError(
+                self.target, reason.lower(), "a place that can be written", "choose another --out"
+            ) from None
+        return self
+
+    def _make_parents(self) -> None:
+        missing = [folder for folder in self.target.parents if not folder.exists()]
+        for folder in reversed(missing):
+            folder.mkdir()
+            self._made.append(folder)
+
+    def complete(self) -> Path:
+        """Give the folder its name. Raises BadInputError when that was taken in the meantime; nothing is lost then."""
+        self._keep = True
+        try:
+            self.work.rename(self.target)
+        except OSError as error:
+            found = error.strerror or str(error)
+            raise BadInputError(
+                self.target, found.lower(), "a name that is free", f"the run is in {self.work}"
+            ) from None
+        return self.target
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if not self._keep:
+            self._remove()
+
+    def _remove(self) -> None:
+        shutil.rmtree(self.work, ignore_errors=True)
+        for folder in reversed(self._made):
+            try:
+                folder.rmdir()
+            except OSError:
+                return
