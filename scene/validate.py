@@ -1,0 +1,94 @@
+"""Scene files (TOML) to `Scene`, and a schema's complaint to one sentence for a person.
+
+Rule: the first thing that is wrong is named with its file and key; the values of a file are never changed.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from trilane.errors import BadInputError
+from trilane.scene.files import read_text
+from trilane.scene.schema import Scene
+
+OWN = "Value error, "
+INPUT_SHOULD = "Input should be "
+ENDING = ".toml"
+LONGEST_FOUND = 80
+BUILT_IN_PREFIX = "builtin:"
+BUILT_IN = ("room", "default")  # a background, an avatar
+
+
+def bad_input(where: str | Path, error: ValidationError) -> BadInputError:
+    """The first complaint of `error` as a BadInputError about `where`, with the key."""
+    first = error.errors()[0]
+    key = ".".join(str(part) for part in first["loc"])
+    place = f"{where}: {key}" if key else str(where)
+    if first["type"] == "extra_forbidden":
+        return BadInputError(place, "an unknown key", "a key of the scene schema", "correct its spelling or remove it")
+    if first["type"] == "missing":
+        return BadInputError(place, "nothing", "a value", "add the key")
+    message = str(first["msg"])
+    found = repr(first["input"])
+    if message.startswith(OWN):
+        own_found, _, expected = message.removeprefix(OWN).removeprefix("found ").partition(", expected ")
+        return BadInputError(place, own_found if expected else found, expected or own_found)
+    short = found if len(found) <= LONGEST_FOUND else found[:LONGEST_FOUND] + "..."
+    return BadInputError(place, short, message.removeprefix(INPUT_SHOULD))
+
+
+def scene_from(where: str | Path, values: Mapping[str, Any]) -> Scene:
+    """`values` as a Scene. Raises BadInputError that names `where` and the key."""
+    try:
+        return Scene.model_validate(values)
+    except ValidationError as error:
+        raise bad_input(where, error) from None
+
+
+def scene_names() -> list[str]:
+    """Names of the scenes that come with the package."""
+    folder = files("trilane.scene.scenes")
+    return sorted(item.name.removesuffix(ENDING) for item in folder.iterdir() if item.name.endswith(ENDING))
+
+
+def find_scene(name: str) -> Path:
+    """The file of a scene: a path, or the name of one that comes with the package. Raises BadInputError."""
+    if name in scene_names():
+        return Path(str(files("trilane.scene.scenes") / f"{name}{ENDING}"))
+    path = Path(name)
+    if path.suffix != ENDING:
+        raise BadInputError("scene", repr(name), f"a {ENDING} file or one of {', '.join(scene_names())}")
+    return path
+
+
+def load_scene(path: Path) -> dict[str, Any]:
+    """The values of a scene file, checked against the schema; paths in it are made absolute from its folder.
+
+    Raises BadInputError naming the line or the key.
+    """
+    try:
+        values = tomllib.loads(read_text(path, "a scene file (TOML)"))
+    except tomllib.TOMLDecodeError as error:
+        raise BadInputError(path, f"no valid TOML ({error})", "a scene file (TOML)") from None
+    values.setdefault("name", path.stem)
+    scene = scene_from(path, values)
+    base = path.absolute().parent
+    values["background"] = located(scene.background, base)
+    values["camera"] = {**values.get("camera", {}), "source": located(scene.camera.source, base)}
+    given = values.get("avatars", [{}])
+    values["avatars"] = [
+        {**raw, "motion": located(spec.motion, base), "bundle": located(spec.bundle, base)}
+        for raw, spec in zip(given, scene.avatars, strict=True)
+    ]
+    return values
+
+
+def located(source: str, base: Path) -> str:
+    """`source` as it is when it names something built in, else as a path that starts at `base`."""
+    return source if source in BUILT_IN or source.startswith(BUILT_IN_PREFIX) else str(base / source)
