@@ -1,0 +1,316 @@
+"""The scheduler: which job runs where, and when. Rule: pure; it knows the time only from `step`, and does no I/O.
+
+Each step takes events in, moves slots and frames, hands jobs to units that can hold one more, and answers with
+actions and with the time at which it wants to be asked again. The same events give the same actions.
+"""
+
+from __future__ import annotations
+
+from trilane.scheduler import faults
+from trilane.scheduler.events import (
+    Action,
+    Beat,
+    Decision,
+    Dispatch,
+    Event,
+    Finish,
+    Graph,
+    Job,
+    JobDone,
+    JobFailed,
+    SetDuty,
+    Settings,
+    Stop,
+    UnitDied,
+    UnitReady,
+)
+from trilane.scheduler.ledger import ASSIGNED, BLOCKED, STARVED, THROTTLED, Ledger
+from trilane.scheduler.policy import Candidate, policy_named
+from trilane.scheduler.source import Source
+from trilane.scheduler.state import FULL_DUTY, FrameState, StageState, UnitState, build
+from trilane.transport.slots import EdgeSlots
+
+HELD_JOBS = 2  # the one that runs and the one dispatched ahead
+
+
+class Core:
+    """The state machine of one run. Raises ValueError for an unknown policy or edge."""
+
+    def __init__(self, graph: Graph, settings: Settings) -> None:
+        self.graph, self.settings = graph, settings
+        self.policy = policy_named(settings.policy)
+        if self.policy.paced and not (settings.period_ns or settings.arrivals_ns):
+            raise ValueError(f"policy {settings.policy!r} needs a period or arrivals")
+        self.stages, self.units, self.edges = build(graph)
+        self.stage_named = {stage.name: stage for stage in self.stages}
+        self.ledger = Ledger(graph)
+        self.source = Source(settings, self._drop_at_source)
+        self.frames: dict[int, FrameState] = {}
+        self.actions: list[Action] = []
+        self.now_ns = 0
+        self.started = self.finished = self.stopping = False
+        limits = [limit for limit in (settings.in_flight, self.policy.in_flight) if limit]
+        self._in_flight = min(limits, default=0)
+        self._latency_position = self.stage_named[graph.latency_to].position
+        self._jobs = 0
+        self._dirty: list[UnitState] = []
+        self._handlers = {
+            UnitReady: self._on_ready,
+            JobDone: self._on_done,
+            JobFailed: self._on_failed,
+            UnitDied: self._on_died,
+            Beat: self._on_beat,
+            SetDuty: self._on_duty,
+            Stop: self._on_stop,
+        }
+
+    def step(self, now_ns: int, events: tuple[Event, ...] = ()) -> Decision:
+        """Tell the core what happened and what time it is; times never go back."""
+        self.now_ns = now_ns
+        self.actions = []
+        for event in events:
+            self._handlers[type(event)](event)  # type: ignore[operator]
+        if self.started and not self.finished:
+            if self.source.advance(now_ns):
+                self.touch(self.stages[0].unit)
+            faults.check_clocks(self)
+            self._assign()
+            if self.source.exhausted and not self.frames:
+                self.finish("stopped" if self.stopping else "done")
+        return Decision(tuple(self.actions), None if self.finished else self._next_deadline())
+
+    def touch(self, unit: UnitState) -> None:
+        """Something changed for the unit: look at it in this step."""
+        if not unit.dirty:
+            unit.dirty = True
+            self._dirty.append(unit)
+
+    def finish(self, cause: str) -> None:
+        self.finished = True
+        self.ledger.close(self.now_ns)
+        self.actions.append(Finish(cause))
+
+    def lose(self, frame: int, cause: str) -> None:
+        del self.frames[frame]
+        self.ledger.lost[cause] += 1
+        self.touch(self.stages[0].unit)
+
+    # events
+
+    def _on_ready(self, event: UnitReady) -> None:
+        unit = self.units[event.unit]
+        unit.alive, unit.starting_ns, unit.heard_ns = True, None, self.now_ns
+        self.touch(unit)
+        if not self.started and all(other.alive for other in self.units.values()):
+            self.started = True
+            self.ledger.start(self.now_ns)
+            self.source.start(self.now_ns)
+
+    def _on_done(self, event: JobDone) -> None:
+        unit = self.units[event.unit]
+        if not unit.queue or unit.queue[0].id != event.job:
+            return
+        job = unit.queue.popleft()
+        unit.head_since_ns = unit.heard_ns = self.now_ns
+        unit.failures = 0
+        stage, frame = self.stage_named[job.stage], self.frames[job.frame]
+        service_ns = event.t_end_ns - event.t_begin_ns
+        self.ledger.job(job, frame.ready_ns, event.t_begin_ns, event.t_end_ns)
+        stage.learn(service_ns)
+        if unit.duty < FULL_DUTY:
+            unit.hold_until_ns = event.t_end_ns + service_ns * (FULL_DUTY - unit.duty) // unit.duty
+        frame.ready_ns = event.t_end_ns
+        if stage.position == 0:
+            frame.pose_ns = event.t_pose_ns
+        if stage.position == self._latency_position:
+            frame.latency_ns = event.t_end_ns - frame.pose_ns
+        self.touch(unit)
+        self._pass_on(stage, job, event.t_end_ns)
+
+    def _pass_on(self, stage: StageState, job: Job, end_ns: int) -> None:
+        if stage.input:
+            stage.input.release(job.slot_in)
+            self.touch(self.stages[stage.position - 1].unit)
+        if stage.output:
+            self._drop_all(stage.output.commit(job.slot_out), stage.position)
+            self.touch(self.stages[stage.position + 1].unit)
+        else:
+            frame = self.frames.pop(job.frame)
+            self.ledger.presented(end_ns, frame.latency_ns, 0 < frame.deadline_ns < end_ns)
+            self.touch(self.stages[0].unit)
+
+    def _on_failed(self, event: JobFailed) -> None:
+        unit = self.units[event.unit]
+        if not unit.queue or unit.queue[0].id != event.job:
+            return
+        job = unit.queue.popleft()
+        unit.head_since_ns = unit.heard_ns = self.now_ns
+        faults.free_slots(self, job)
+        self.lose(job.frame, f"failed:{job.stage}")
+        self.touch(unit)
+        self._on_stop(Stop())
+
+    def _on_died(self, event: UnitDied) -> None:
+        faults.on_died(self, self.units[event.unit])
+
+    def _on_beat(self, event: Beat) -> None:
+        self.units[event.unit].heard_ns = self.now_ns
+
+    def _on_duty(self, event: SetDuty) -> None:
+        unit = self.units[event.unit]
+        unit.duty = max(1, min(FULL_DUTY, event.permille))
+        self.touch(unit)
+
+    def _on_stop(self, _event: Stop) -> None:
+        self.stopping = True
+        self.source.stop()
+
+    # choice
+
+    def _assign(self) -> None:
+        touched = []
+        while self._dirty:
+            unit = self._dirty.pop(0)
+            unit.dirty = False
+            touched.append(unit)
+            while self._has_room(unit):
+                stage = self._choose(unit)
+                if stage is None:
+                    break
+                self._dispatch(unit, stage)
+        for unit in touched:
+            self.ledger.enter(unit.name, self.now_ns, self._idle_state(unit))
+
+    def _has_room(self, unit: UnitState) -> bool:
+        if not unit.alive or unit.killing or unit.hold_until_ns > self.now_ns:
+            return False
+        if not unit.queue:
+            return True
+        return len(unit.queue) < HELD_JOBS and unit.duty == FULL_DUTY and self.now_ns >= self._ahead_ns(unit)
+
+    def _ahead_ns(self, unit: UnitState) -> int:
+        """When a unit that runs a job may be handed its next one."""
+        if self.policy.lead_ns is None:
+            return 0
+        return unit.head_since_ns + self.stage_named[unit.queue[0].stage].estimate_ns - self.policy.lead_ns
+
+    def _choose(self, unit: UnitState) -> StageState | None:
+        found = []
+        for stage in unit.stages:
+            frame = self._waiting(stage)
+            if frame is not None and (stage.output is None or stage.output.can_claim()):
+                found.append(Candidate(frame, stage.position, self._deadline_of(frame)))
+        if not found:
+            return None
+        chosen = found[0] if len(found) == 1 else self.policy.choose(found)
+        return self.stages[chosen.position]
+
+    def _waiting(self, stage: StageState) -> int | None:
+        """The frame that the stage would do next; what the policy gives up on is dropped on the way."""
+        edge = stage.input
+        if edge is None:
+            return self._waiting_at_source()
+        if self.policy.newest:
+            while len(edge.ready) > 1:
+                self._drop_all([edge.drop(edge.ready[0])], stage.position - 1)
+        if self.policy.drop_late:
+            while edge.ready and self._is_late(self._deadline_of(edge.frame[edge.ready[0]]), stage):
+                self._drop_all([edge.drop(edge.ready[0])], stage.position - 1, "late")
+        return edge.frame[edge.ready[0]] if edge.ready else None
+
+    def _waiting_at_source(self) -> int | None:
+        if self._in_flight and len(self.frames) >= self._in_flight:
+            return None
+        if self.policy.newest:
+            self.source.keep_newest()
+        if self.policy.drop_late and self.settings.deadline_ns:
+            while self.source.queue and self._is_late(
+                self.source.release_of_head(self.now_ns) + self.settings.deadline_ns, self.stages[0]
+            ):
+                self.source.drop_head("late")
+        return self.source.head()
+
+    def _is_late(self, deadline_ns: int, stage: StageState) -> bool:
+        """Whether the frame would miss its deadline even if nothing made it wait from here on.
+
+        Each frame that is given up lowers the estimates it was judged by, so that one slow measurement cannot
+        drop every frame for ever.
+        """
+        rest = self.stages[stage.position :]
+        if not deadline_ns or self.now_ns + sum(later.estimate_ns for later in rest) <= deadline_ns:
+            return False
+        for later in rest:
+            later.estimate_ns -= later.estimate_ns >> 4
+        return True
+
+    def _deadline_of(self, frame: int) -> int:
+        state = self.frames.get(frame)
+        if state is not None:
+            return state.deadline_ns
+        return self._deadline_from(self.source.release_of_head(self.now_ns))
+
+    def _deadline_from(self, release_ns: int) -> int:
+        return release_ns + self.settings.deadline_ns if self.settings.deadline_ns else 0
+
+    def _dispatch(self, unit: UnitState, stage: StageState) -> None:
+        slot_in = slot_out = -1
+        if stage.input is None:
+            frame, release_ns = self.source.take(self.now_ns)
+            self.frames[frame] = FrameState(release_ns, self._deadline_from(release_ns))
+        else:
+            slot_in = stage.input.ready[0]
+            frame = stage.input.frame[slot_in]
+            stage.input.take(slot_in)
+        if stage.output:
+            slot_out, gave_way = stage.output.claim(frame)
+            if gave_way is not None:
+                self._drop_all([gave_way], stage.position, "stale" if stage.output.rule.mailbox else "pool")
+        pool: EdgeSlots | None = stage.output or stage.input
+        job = Job(self._jobs, unit.name, stage.name, frame, slot_in, slot_out, pool.epoch if pool else 0)
+        self._jobs += 1
+        if not unit.queue:
+            unit.head_since_ns = self.now_ns
+        unit.queue.append(job)
+        self.actions.append(Dispatch(job))
+
+    # counts
+
+    def _drop_all(self, frames: list[int], edge: int, cause: str = "stale") -> None:
+        for frame in frames:
+            del self.frames[frame]
+            self.ledger.dropped[f"{self.graph.edge_name(edge)}:{cause}"] += 1
+            self.touch(self.stages[edge].unit)
+            self.touch(self.stages[0].unit)
+
+    def _drop_at_source(self, _frame: int, cause: str) -> None:
+        self.ledger.dropped[f"source->{self.stages[0].name}:{cause}"] += 1
+
+    def _idle_state(self, unit: UnitState) -> int:
+        if unit.queue or not unit.alive:
+            return ASSIGNED
+        states = [self._stage_state(stage) for stage in unit.stages]
+        if BLOCKED in states:
+            return BLOCKED
+        return THROTTLED if THROTTLED in states else STARVED
+
+    def _stage_state(self, stage: StageState) -> int:
+        if stage.input is None:
+            if self.source.head() is None:
+                return STARVED
+            if self._in_flight and len(self.frames) >= self._in_flight:
+                return BLOCKED
+        elif not stage.input.ready:
+            return STARVED
+        return BLOCKED if stage.output and not stage.output.can_claim() else THROTTLED
+
+    def _next_deadline(self) -> int | None:
+        times = faults.deadlines(self)
+        release = self.source.next_change_ns() if self.started else None
+        if release is not None:
+            times.append(release)
+        for unit in self.units.values():
+            if unit.hold_until_ns > self.now_ns:
+                times.append(unit.hold_until_ns)
+            if len(unit.queue) == 1 and self._ahead_ns(unit) > self.now_ns:
+                times.append(self._ahead_ns(unit))
+        return min(times, default=None)

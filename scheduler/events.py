@@ -1,0 +1,166 @@
+"""What the core is told (events) and what it answers (actions). Rule: plain tuples of numbers and short strings.
+
+All times are integer nanoseconds of the driver's clock. Slots are -1 where a stage has no such edge.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+
+class Job(NamedTuple):
+    """One stage of one frame on one unit, from a slot to a slot."""
+
+    id: int
+    unit: str
+    stage: str
+    frame: int
+    slot_in: int
+    slot_out: int
+    epoch: int
+
+
+class UnitReady(NamedTuple):
+    """A unit's process is up and its slots are bound."""
+
+    unit: str
+
+
+class JobDone(NamedTuple):
+    """`t_pose_ns`: when the frame's pose was sampled, as its header says."""
+
+    unit: str
+    job: int
+    t_begin_ns: int
+    t_end_ns: int
+    t_pose_ns: int
+
+
+class JobFailed(NamedTuple):
+    """A stage raised; the unit lives."""
+
+    unit: str
+    job: int
+
+
+class UnitDied(NamedTuple):
+    """A unit's process is gone."""
+
+    unit: str
+
+
+class Beat(NamedTuple):
+    """A unit without work says that it lives."""
+
+    unit: str
+
+
+class SetDuty(NamedTuple):
+    """From now on the unit may work `permille` thousandths of the time."""
+
+    unit: str
+    permille: int
+
+
+class Stop(NamedTuple):
+    """Admit no more frames; end when those in flight are done."""
+
+
+class Dispatch(NamedTuple):
+    """Hand the job to its unit."""
+
+    job: Job
+
+
+class Kill(NamedTuple):
+    """The unit missed its deadline: end its process; `UnitDied` is expected."""
+
+    unit: str
+
+
+class Start(NamedTuple):
+    """Start the unit's process again; `UnitReady` or `UnitDied` is expected."""
+
+    unit: str
+
+
+class Finish(NamedTuple):
+    """Every frame is accounted for. `cause`: `done`, `stopped`, or the unit that could not be kept alive."""
+
+    cause: str
+
+
+Event = UnitReady | JobDone | JobFailed | UnitDied | Beat | SetDuty | Stop
+Action = Dispatch | Kill | Start | Finish
+
+EVENTS = (UnitReady, JobDone, JobFailed, UnitDied, Beat, SetDuty, Stop)
+ACTIONS = (Dispatch, Kill, Start, Finish)
+
+
+class Decision(NamedTuple):
+    """The core's answer: what to do now, and when to ask again at the latest (None: at the next event)."""
+
+    actions: tuple[Action, ...]
+    next_deadline_ns: int | None
+
+
+@dataclass(frozen=True)
+class StageSpec:
+    """A stage and the unit that it runs on."""
+
+    name: str
+    unit: str
+
+
+@dataclass(frozen=True)
+class Graph:
+    """A chain of stages. `edges[i]`: the rule between stages i and i + 1. Latency ends with stage `latency_to`."""
+
+    stages: tuple[StageSpec, ...]
+    edges: tuple[str, ...]
+    latency_to: str
+
+    def __post_init__(self) -> None:
+        names = [stage.name for stage in self.stages]
+        if len(set(names)) != len(names) or not names:
+            raise ValueError(f"found stages {names}, expected different names")
+        if len(self.edges) != len(names) - 1 or self.latency_to not in names:
+            raise ValueError(f"found {len(self.edges)} edges and latency to {self.latency_to!r} for stages {names}")
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(stage.unit for stage in self.stages))
+
+    def edge_name(self, index: int) -> str:
+        return f"{self.stages[index].name}->{self.stages[index + 1].name}"
+
+
+def avatar_graph(edge: str = "double") -> Graph:
+    """The pipeline of DESIGN's data flow, every edge with the same rule."""
+    names = (("pose", "cpu"), ("raster", "gpu"), ("infer", "dsp"), ("composite", "gpu"), ("present", "cpu"))
+    return Graph(tuple(StageSpec(*name) for name in names), (edge,) * (len(names) - 1), "composite")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a run asks of the core. A time or limit of 0 means none.
+
+    `period_ns`: a frame is released every so often; 0: as soon as it can be taken. `arrivals_ns`: release times
+    from the start, instead of a period. `deadline_ns`: a frame's time from release to presented. `in_flight`: frames
+    between pose and presented. `in_queue`: released frames that may wait; more are turned away. `queue_timeout_ns`:
+    longest wait there. `hang_ns`: longest that a job may take, or an idle unit be silent when `beats` are expected.
+    """
+
+    frames: int
+    policy: str = "pipelined"
+    period_ns: int = 0
+    arrivals_ns: tuple[int, ...] = ()
+    deadline_ns: int = 0
+    in_flight: int = 0
+    in_queue: int = 0
+    queue_timeout_ns: int = 0
+    hang_ns: int = 10_000_000_000
+    start_ns: int = 120_000_000_000
+    beats: bool = False
+    max_failures: int = 5

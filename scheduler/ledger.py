@@ -1,0 +1,157 @@
+"""Where the time went. Rule: every nanosecond of a unit is busy or idle for one stated cause; the five sum to the run.
+
+busy: a job runs. starved: no input. blocked: input, but no free output slot, or the limit of frames in flight.
+throttled: held by the cap. overhead: a job is assigned but does not run (messages, scheduling), or the unit is down.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any
+
+from trilane.scheduler.events import Graph, Job
+from trilane.scheduler.stats import NS_PER_MS, ema_range_ms, jitter_ms, summary_ms
+
+ASSIGNED, STARVED, BLOCKED, THROTTLED = range(4)
+
+
+class _UnitBook:
+    def __init__(self) -> None:
+        self.state = STARVED
+        self.since_ns = 0
+        self.totals = [0, 0, 0, 0]
+        self.busy_ns = 0
+        self.busy_until_ns = 0
+        self.jobs = 0
+        self.restarts = 0
+
+    def enter(self, now_ns: int, state: int) -> None:
+        self.totals[self.state] += now_ns - self.since_ns
+        self.state, self.since_ns = state, now_ns
+
+    def work(self, begin_ns: int, end_ns: int) -> None:
+        begin_ns = max(begin_ns, self.busy_until_ns)
+        if end_ns > begin_ns:
+            self.busy_ns += end_ns - begin_ns
+            self.busy_until_ns = end_ns
+        self.jobs += 1
+
+    def shares(self) -> dict[str, Any]:
+        total = sum(self.totals) or 1
+        assigned, starved, blocked, throttled = self.totals
+        idle = {"starved": starved, "blocked": blocked, "throttled": throttled, "overhead": assigned - self.busy_ns}
+        return {
+            "busy": self.busy_ns / total,
+            "idle": {cause: ns / total for cause, ns in idle.items()},
+            "jobs": self.jobs,
+            "restarts": self.restarts,
+        }
+
+
+class _StageBook:
+    def __init__(self) -> None:
+        self.service_ns: list[int] = []
+        self.wait_ns: list[int] = []
+
+
+class Ledger:
+    """Fed by the core alone. Times in ns of the run's clock."""
+
+    def __init__(self, graph: Graph) -> None:
+        self._graph = graph
+        self._units = {unit: _UnitBook() for unit in graph.units}
+        self._stages = {stage.name: _StageBook() for stage in graph.stages}
+        self.start_ns = self.end_ns = 0
+        self.lost: Counter[str] = Counter()
+        self.dropped: Counter[str] = Counter()
+        self.presented_ns: list[int] = []
+        self.latency_ns: list[int] = []
+        self.late = 0
+
+    def start(self, now_ns: int) -> None:
+        self.start_ns = now_ns
+        for book in self._units.values():
+            book.since_ns = now_ns
+
+    def close(self, now_ns: int) -> None:
+        self.end_ns = now_ns
+        for book in self._units.values():
+            book.enter(now_ns, book.state)
+
+    def enter(self, unit: str, now_ns: int, state: int) -> None:
+        book = self._units[unit]
+        if book.state != state:
+            book.enter(now_ns, state)
+
+    def job(self, job: Job, ready_ns: int, begin_ns: int, end_ns: int) -> None:
+        book = self._stages[job.stage]
+        book.service_ns.append(end_ns - begin_ns)
+        book.wait_ns.append(begin_ns - ready_ns)
+        self._units[job.unit].work(begin_ns, end_ns)
+
+    def restart(self, unit: str) -> None:
+        self._units[unit].restarts += 1
+
+    def presented(self, end_ns: int, latency_ns: int, late: bool) -> None:
+        self.presented_ns.append(end_ns)
+        self.latency_ns.append(latency_ns)
+        self.late += late
+
+    @property
+    def frame_times_ns(self) -> list[int]:
+        return [after - before for before, after in zip(self.presented_ns, self.presented_ns[1:], strict=False)]
+
+    def report(
+        self,
+        *,
+        clock: str,
+        requested: int,
+        target_period_ns: int = 0,
+        isolated_ns: Mapping[str, float] | None = None,
+    ) -> dict[str, Any]:
+        """The keys of report.json. `isolated_ns`: mean service time of each stage measured alone; efficiency is null
+        without it. `target_period_ns`: frame times above it count as deadline misses when frames have no deadline."""
+        intervals = self.frame_times_ns
+        span = self.presented_ns[-1] - self.presented_ns[0] if intervals else 0
+        missed = sum(interval > target_period_ns for interval in intervals) if target_period_ns else self.late
+        return {
+            "clock": clock,
+            "frames": {
+                "requested": requested,
+                "presented": len(self.presented_ns),
+                "lost": sum(self.lost.values()),
+                "lost_by_cause": dict(sorted(self.lost.items())),
+                "dropped": dict(sorted(self.dropped.items())),
+            },
+            "duration_s": (self.end_ns - self.start_ns) / 1e9,
+            "frame_time_ms": {**summary_ms(intervals), **ema_range_ms(intervals), "jitter": jitter_ms(intervals)},
+            "latency_ms": summary_ms(self.latency_ns),
+            "fps": len(intervals) * 1e9 / span if span else 0.0,
+            "deadline_misses": missed,
+            "stages": {stage.name: self._stage_row(stage.name, stage.unit) for stage in self._graph.stages},
+            "units": {unit: book.shares() for unit, book in self._units.items()},
+            **self._efficiency(isolated_ns, span / len(intervals) if intervals else 0.0),
+        }
+
+    def _stage_row(self, name: str, unit: str) -> dict[str, Any]:
+        book = self._stages[name]
+        return {"unit": unit, "service_ms": summary_ms(book.service_ns), "wait_ms": summary_ms(book.wait_ns)}
+
+    def _efficiency(self, isolated_ns: Mapping[str, float] | None, interval_ns: float) -> dict[str, Any]:
+        """Service time of the slowest unit, alone, over the mean interval between presented frames.
+
+        A stage that was not measured alone (it writes files) counts with its mean in the run.
+        """
+        if not isolated_ns or not interval_ns:
+            return {"efficiency": None, "isolated_ms": {}}
+        per_unit: Counter[str] = Counter()
+        for stage in self._graph.stages:
+            in_run = self._stages[stage.name].service_ns
+            alone = isolated_ns.get(stage.name)
+            per_unit[stage.unit] += alone if alone is not None else sum(in_run) / max(len(in_run), 1)
+        return {
+            "efficiency": max(per_unit.values()) / interval_ns,
+            "bottleneck": max(per_unit, key=per_unit.__getitem__),
+            "isolated_ms": {name: ns / NS_PER_MS for name, ns in isolated_ns.items()},
+        }

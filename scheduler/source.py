@@ -1,0 +1,92 @@
+"""Where frames come from: release, the waiting queue and its two limits. Rule: a frame leaves here once, or is counted."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+
+from trilane.scheduler.events import Settings
+
+
+class Source:
+    """Frames 0..n-1. A released frame waits in `queue` until it is taken, turned away, or out of time.
+
+    Without a rate (no period, no arrivals) a frame counts as released in the moment in which it can be taken.
+    """
+
+    def __init__(self, settings: Settings, drop: Callable[[int, str], None]) -> None:
+        self._settings = settings
+        self._drop = drop
+        self._next = 0
+        self._end = settings.frames
+        self._start_ns = 0
+        self._paced = bool(settings.period_ns or settings.arrivals_ns)
+        self.queue: deque[tuple[int, int]] = deque()
+
+    def start(self, now_ns: int) -> None:
+        self._start_ns = now_ns
+
+    def stop(self) -> None:
+        """Nothing more is released, and what waits is forgotten."""
+        self._end = self._next
+        self.queue.clear()
+
+    @property
+    def exhausted(self) -> bool:
+        return self._next >= self._end and not self.queue
+
+    def next_change_ns(self) -> int | None:
+        """When the next frame is released or the oldest waiting one runs out of time."""
+        times = []
+        if self._paced and self._next < self._end:
+            times.append(self._release_ns(self._next))
+        if self._settings.queue_timeout_ns and self.queue:
+            times.append(self.queue[0][1] + self._settings.queue_timeout_ns)
+        return min(times, default=None)
+
+    def advance(self, now_ns: int) -> bool:
+        """Release what is due, drop what waited too long; True when something changed."""
+        changed = False
+        while self._paced and self._next < self._end and self._release_ns(self._next) <= now_ns:
+            self._admit(self._next, self._release_ns(self._next))
+            self._next += 1
+            changed = True
+        timeout = self._settings.queue_timeout_ns
+        while timeout and self.queue and self.queue[0][1] + timeout <= now_ns:
+            self._drop(self.queue.popleft()[0], "timeout")
+            changed = True
+        return changed
+
+    def head(self) -> int | None:
+        """The frame that is next, when one is there."""
+        if self.queue:
+            return self.queue[0][0]
+        return self._next if not self._paced and self._next < self._end else None
+
+    def keep_newest(self) -> None:
+        while len(self.queue) > 1:
+            self._drop(self.queue.popleft()[0], "stale")
+
+    def drop_head(self, cause: str) -> None:
+        self._drop(self.queue.popleft()[0], cause)
+
+    def take(self, now_ns: int) -> tuple[int, int]:
+        """The head and its release time."""
+        if self.queue:
+            return self.queue.popleft()
+        self._next += 1
+        return self._next - 1, now_ns
+
+    def release_of_head(self, now_ns: int) -> int:
+        return self.queue[0][1] if self.queue else now_ns
+
+    def _admit(self, frame: int, release_ns: int) -> None:
+        limit = self._settings.in_queue
+        if limit and len(self.queue) >= limit:
+            self._drop(frame, "queue_full")
+        else:
+            self.queue.append((frame, release_ns))
+
+    def _release_ns(self, frame: int) -> int:
+        arrivals = self._settings.arrivals_ns
+        return self._start_ns + (arrivals[frame] if arrivals else frame * self._settings.period_ns)

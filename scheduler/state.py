@@ -1,0 +1,81 @@
+"""What the core remembers of stages, units and frames. Rule: fields only; the decisions are in core.py and faults.py."""
+
+from __future__ import annotations
+
+from collections import deque
+
+from trilane.scheduler.events import Graph, Job
+from trilane.transport.slots import EdgeSlots, edge_rule
+
+FULL_DUTY = 1000
+
+
+class UnitState:
+    """`queue`: the running job, then the held one. `head_since_ns`: since when the first of them could run."""
+
+    __slots__ = (
+        "alive",
+        "dirty",
+        "duty",
+        "failures",
+        "head_since_ns",
+        "heard_ns",
+        "hold_until_ns",
+        "killing",
+        "name",
+        "queue",
+        "restart_at_ns",
+        "stages",
+        "starting_ns",
+    )
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.stages: list[StageState] = []
+        self.queue: deque[Job] = deque()
+        self.alive = self.killing = self.dirty = False
+        self.head_since_ns = self.heard_ns = self.hold_until_ns = 0
+        self.restart_at_ns: int | None = None
+        self.starting_ns: int | None = None
+        self.failures = 0
+        self.duty = FULL_DUTY
+
+
+class StageState:
+    """`estimate_ns`: running mean of its service time (weight 1/8), 0 before the first."""
+
+    __slots__ = ("estimate_ns", "input", "name", "output", "position", "unit")
+
+    def __init__(self, name: str, unit: UnitState, position: int) -> None:
+        self.name, self.unit, self.position = name, unit, position
+        self.input: EdgeSlots | None = None
+        self.output: EdgeSlots | None = None
+        self.estimate_ns = 0
+
+    def learn(self, service_ns: int) -> None:
+        self.estimate_ns += (service_ns - self.estimate_ns) >> 3 if self.estimate_ns else service_ns
+
+
+class FrameState:
+    """`ready_ns`: when its last stage ended. `latency_ns`: from the pose to the composited frame, once known."""
+
+    __slots__ = ("deadline_ns", "latency_ns", "pose_ns", "ready_ns")
+
+    def __init__(self, release_ns: int, deadline_ns: int) -> None:
+        self.ready_ns = release_ns
+        self.deadline_ns = deadline_ns
+        self.pose_ns = self.latency_ns = 0
+
+
+def build(graph: Graph) -> tuple[list[StageState], dict[str, UnitState], list[EdgeSlots]]:
+    """States of a graph, joined up."""
+    units = {name: UnitState(name) for name in graph.units}
+    edges = [EdgeSlots(edge_rule(text)) for text in graph.edges]
+    stages = []
+    for position, spec in enumerate(graph.stages):
+        stage = StageState(spec.name, units[spec.unit], position)
+        stage.input = edges[position - 1] if position else None
+        stage.output = edges[position] if position < len(edges) else None
+        units[spec.unit].stages.append(stage)
+        stages.append(stage)
+    return stages, units, edges

@@ -1,0 +1,46 @@
+"""Summaries of times. Rule: exact percentiles of what was measured (linear between ranks), no bins, standard library."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+NS_PER_MS = 1e6
+
+
+def percentile(ordered: Sequence[int], share: float) -> float:
+    """Linear interpolation between the two nearest ranks of the sorted `ordered`; 0 when it is empty."""
+    if not ordered:
+        return 0.0
+    place = share * (len(ordered) - 1)
+    low = int(place)
+    high = min(low + 1, len(ordered) - 1)
+    return ordered[low] + (ordered[high] - ordered[low]) * (place - low)
+
+
+def summary_ms(values_ns: Iterable[int]) -> dict[str, float]:
+    """mean, p50, p90, p95, p99, max in milliseconds; all 0 when there are no values."""
+    ordered = sorted(values_ns)
+    if not ordered:
+        return dict.fromkeys(("mean", "p50", "p90", "p95", "p99", "max"), 0.0)
+    ranks = {f"p{rank}": percentile(ordered, rank / 100) for rank in (50, 90, 95, 99)}
+    row = {"mean": sum(ordered) / len(ordered), **ranks, "max": ordered[-1]}
+    return {key: round(value / NS_PER_MS, 6) for key, value in row.items()}
+
+
+def ema_range_ms(values_ns: Sequence[int], span: int = 20) -> dict[str, float]:
+    """Smallest and largest exponential average (weight 2 / (span + 1)), from value `span` on when there are as many."""
+    if not values_ns:
+        return {f"ema{span}_min": 0.0, f"ema{span}_max": 0.0}
+    weight = 2 / (span + 1)
+    average, averages = float(values_ns[0]), []
+    for value in values_ns:
+        average += weight * (value - average)
+        averages.append(average)
+    settled = averages[span - 1 :] or averages[-1:]
+    return {f"ema{span}_min": round(min(settled) / NS_PER_MS, 6), f"ema{span}_max": round(max(settled) / NS_PER_MS, 6)}
+
+
+def jitter_ms(values_ns: Sequence[int]) -> float:
+    """Mean absolute difference of successive frame times."""
+    steps = [abs(after - before) for before, after in zip(values_ns, values_ns[1:], strict=False)]
+    return round(sum(steps) / len(steps) / NS_PER_MS, 6) if steps else 0.0

@@ -1,0 +1,165 @@
+"""The driver of simulated time. Rule: a heap keyed (t_ns, priority, seq) decides ties, so equal inputs give equal runs.
+
+The units are queues of jobs whose service times a callable gives; everything else is the real core.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from trilane.scheduler.core import Core
+from trilane.scheduler.events import (
+    Dispatch,
+    Event,
+    Finish,
+    Graph,
+    Job,
+    JobDone,
+    Kill,
+    Settings,
+    Start,
+    UnitDied,
+    UnitReady,
+)
+from trilane.scheduler.record import Recording
+from trilane.scheduler.result import JobRecord
+
+#: (stage, unit, frame, begin_ns) -> service time in ns.
+Service = Callable[[str, str, int, int], int]
+
+FAULT, EVENT = 0, 1  # priority at equal times; being asked again comes after both
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """What a simulated run hands back. `report` has the keys of report.json; `cause` is that of Finish."""
+
+    report: dict[str, Any]
+    recording: Recording | None
+    jobs: tuple[JobRecord, ...]
+    cause: str
+
+
+@dataclass
+class _VirtualUnit:
+    """`up`: a process exists, starting or ready. `epoch` grows when it dies: what it would have said is void."""
+
+    up: bool = True
+    free_ns: int = 0
+    epoch: int = 0
+
+
+class VirtualDriver:
+    """Runs a core in simulated time. `hop_ns`: delay of a message each way; `restart_ns`: a unit's start-up time."""
+
+    def __init__(
+        self,
+        graph: Graph,
+        settings: Settings,
+        service: Service,
+        *,
+        hop_ns: int = 0,
+        restart_ns: int = 1_000_000_000,
+        faults: Iterable[tuple[int, str]] = (),
+        inputs: Iterable[tuple[int, Event]] = (),
+        keep: bool = False,
+    ) -> None:
+        """`faults`: (t_ns, unit) deaths. `inputs`: (t_ns, event) from outside, such as SetDuty or Stop.
+        `keep`: record steps and jobs. Raises ValueError for an unknown policy or edge."""
+        self.core = Core(graph, settings)
+        self.recording = Recording(graph, settings) if keep else None
+        self.jobs: list[JobRecord] = []
+        self._service, self._hop_ns, self._restart_ns = service, hop_ns, restart_ns
+        self._heap: list[tuple[int, int, int, Event, int]] = []
+        self._sequence = 0
+        self._units = {unit: _VirtualUnit() for unit in graph.units}
+        self._actions: dict[type, Callable[[int, Any], None]] = {Kill: self._kill, Start: self._start}
+        for unit in graph.units:
+            self._push(0, EVENT, UnitReady(unit))
+        for at_ns, unit in faults:
+            self._push(at_ns, FAULT, UnitDied(unit))
+        for at_ns, event in inputs:
+            self._push(at_ns, FAULT, event)
+
+    def run(self) -> str:
+        """Until the core finishes; returns the cause. Raises RuntimeError when nothing can ever happen again."""
+        deadline: int | None = None
+        while True:
+            now_ns, events = self._next(deadline)
+            decision = self.core.step(now_ns, events)
+            if self.recording is not None:
+                self.recording.steps.append((now_ns, events, decision.actions))
+            for action in decision.actions:
+                if type(action) is Dispatch:
+                    self._dispatch(now_ns, action.job)
+                elif type(action) is Finish:
+                    return action.cause
+                else:
+                    self._actions[type(action)](now_ns, action)
+            deadline = decision.next_deadline_ns
+
+    def _next(self, deadline_ns: int | None) -> tuple[int, tuple[Event, ...]]:
+        """The next valid event, or none at the core's deadline when that comes first."""
+        while self._heap:
+            at_ns, _, _, event, epoch = self._heap[0]
+            if deadline_ns is not None and deadline_ns < at_ns:
+                return deadline_ns, ()
+            heapq.heappop(self._heap)
+            if self._accept(event, epoch):
+                return at_ns, (event,)
+        if deadline_ns is None:
+            raise RuntimeError("the simulation stands still: no event and no deadline is left")
+        return deadline_ns, ()
+
+    def _accept(self, event: Event, epoch: int) -> bool:
+        if type(event) is JobDone or type(event) is UnitReady:
+            return epoch == self._units[event.unit].epoch
+        if type(event) is UnitDied:
+            unit = self._units[event.unit]
+            was_up, unit.up = unit.up, False
+            unit.epoch += was_up
+            return was_up
+        return True
+
+    def _push(self, at_ns: int, priority: int, event: Event, epoch: int = 0) -> None:
+        self._sequence += 1
+        heapq.heappush(self._heap, (at_ns, priority, self._sequence, event, epoch))
+
+    def _dispatch(self, now_ns: int, job: Job) -> None:
+        unit = self._units[job.unit]
+        begin_ns = max(now_ns + self._hop_ns, unit.free_ns)
+        end_ns = unit.free_ns = begin_ns + self._service(job.stage, job.unit, job.frame, begin_ns)
+        self._push(end_ns + self._hop_ns, EVENT, JobDone(job.unit, job.id, begin_ns, end_ns, begin_ns), unit.epoch)
+        if self.recording is not None:
+            ready_ns = self.core.frames[job.frame].ready_ns
+            self.jobs.append(JobRecord(job.stage, job.unit, job.frame, ready_ns, now_ns, begin_ns, end_ns))
+
+    def _kill(self, now_ns: int, action: Kill) -> None:
+        self._push(now_ns, FAULT, UnitDied(action.unit))
+
+    def _start(self, now_ns: int, action: Start) -> None:
+        unit = self._units[action.unit]
+        unit.up, unit.free_ns = True, 0
+        self._push(now_ns + self._restart_ns, EVENT, UnitReady(action.unit), unit.epoch)
+
+
+def simulate(
+    graph: Graph,
+    settings: Settings,
+    service: Service,
+    *,
+    target_period_ns: int = 0,
+    isolated_ns: Mapping[str, float] | None = None,
+    keep: bool = False,
+    **driver: Any,
+) -> Simulation:
+    """Run to the end. `driver`: what VirtualDriver takes; `target_period_ns`, `isolated_ns`: see Ledger.report."""
+    virtual = VirtualDriver(graph, settings, service, keep=keep, **driver)
+    cause = virtual.run()
+    report = virtual.core.ledger.report(
+        clock="virtual", requested=settings.frames, target_period_ns=target_period_ns, isolated_ns=isolated_ns
+    )
+    return Simulation(report, virtual.recording, tuple(virtual.jobs), cause)

@@ -1,0 +1,137 @@
+"""Who may touch a slot, and when. Rule: a slot changes hands only by a transition of the table; nothing else moves it.
+
+    FREE --claim--> WRITING --commit--> READY --take--> READING --release--> FREE
+
+WRITING belongs to the producer's unit, READING to the consumer's, FREE and READY to nobody. Pure: no memory, no clock.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import deque
+from dataclasses import dataclass
+
+FREE, WRITING, READY, READING = "free", "writing", "ready", "reading"
+
+TRANSITIONS = {
+    ("claim", FREE): WRITING,
+    ("commit", WRITING): READY,
+    ("abandon", WRITING): FREE,  # the producer died or failed
+    ("take", READY): READING,
+    ("drop", READY): FREE,  # replaced by a newer frame, or too late
+    ("release", READING): FREE,
+    ("give_back", READING): READY,  # the consumer died before it began
+}
+
+MAX_SLOTS = 64
+
+
+class SlotError(RuntimeError):
+    """A transition that the table does not have: a defect of the caller, never of the user's input."""
+
+
+@dataclass(frozen=True)
+class EdgeRule:
+    """An edge's policy. `mailbox`: a commit replaces what waits. `yields`: a claim may replace the oldest waiting."""
+
+    name: str
+    slots: int
+    mailbox: bool = False
+    yields: bool = False
+
+
+#: Name -> rule; the count of those in COUNTED may be given as NAME:N.
+RULES = {
+    "single": EdgeRule("single", 1),
+    "double": EdgeRule("double", 2),
+    "triple": EdgeRule("triple", 3, mailbox=True, yields=True),
+    "fifo": EdgeRule("fifo", 4),
+    "orphan": EdgeRule("orphan", 6, yields=True),
+}
+COUNTED = {"fifo": 1, "orphan": 4}  # least count: an orphan edge has two slots read, one written and one waiting
+
+
+def edge_rule(text: str) -> EdgeRule:
+    """`single`, `double`, `triple`, `fifo[:N]`, `orphan[:N]`. Raises ValueError naming what was found."""
+    match = re.fullmatch(r"([a-z]+)(?::(\d{1,4}))?", text)
+    name, count = (match[1], match[2]) if match else (text, None)
+    if name not in RULES or (count and name not in COUNTED):
+        raise ValueError(f"found edge {text!r}, expected single, double, triple, fifo:N or orphan:N")
+    rule = RULES[name]
+    if count is None:
+        return rule
+    if not COUNTED[name] <= int(count) <= MAX_SLOTS:
+        raise ValueError(f"found edge {text!r}, expected {name}:N with N from {COUNTED[name]} to {MAX_SLOTS}")
+    return EdgeRule(name, int(count), rule.mailbox, rule.yields)
+
+
+class EdgeSlots:
+    """The slots of one edge. `state[i]`, `frame[i]` (-1 when none), `ready` oldest first, `epoch` grows at each fault."""
+
+    def __init__(self, rule: EdgeRule) -> None:
+        self.rule = rule
+        self.state = [FREE] * rule.slots
+        self.frame = [-1] * rule.slots
+        self.free = list(range(rule.slots - 1, -1, -1))
+        self.ready: deque[int] = deque()
+        self.epoch = 0
+
+    def can_claim(self) -> bool:
+        return bool(self.free) or (self.rule.yields and bool(self.ready))
+
+    def claim(self, frame: int) -> tuple[int, int | None]:
+        """A slot to write `frame` into, and the frame that gave way for it, if one did."""
+        dropped = None
+        if not self.free and self.rule.yields and self.ready:
+            dropped = self.drop(self.ready[0])
+        if not self.free:
+            raise SlotError("no slot to claim")
+        slot = self.free.pop()
+        self._move("claim", slot)
+        self.frame[slot] = frame
+        return slot, dropped
+
+    def commit(self, slot: int) -> list[int]:
+        """The slot's frame is complete; returns the frames that it replaces."""
+        self._move("commit", slot)
+        replaced = [self.drop(old) for old in list(self.ready)] if self.rule.mailbox else []
+        self.ready.append(slot)
+        return replaced
+
+    def take(self, slot: int) -> None:
+        self._move("take", slot)
+        self.ready.remove(slot)
+
+    def release(self, slot: int) -> None:
+        self._move("release", slot)
+        self._empty(slot)
+
+    def abandon(self, slot: int) -> None:
+        self._move("abandon", slot)
+        self._empty(slot)
+
+    def drop(self, slot: int) -> int:
+        """Take a waiting frame out; returns its number."""
+        self._move("drop", slot)
+        self.ready.remove(slot)
+        frame = self.frame[slot]
+        self._empty(slot)
+        return frame
+
+    def give_back(self, slot: int) -> list[int]:
+        """A taken frame waits again, in its old place; returns it when a newer one waits in a mailbox."""
+        self._move("give_back", slot)
+        self.ready = deque(sorted([*self.ready, slot], key=self.frame.__getitem__))
+        if not self.rule.mailbox:
+            return []
+        return [self.drop(old) for old in list(self.ready)[:-1]]
+
+    def _move(self, verb: str, slot: int) -> None:
+        state = TRANSITIONS.get((verb, self.state[slot]))
+        if state is None:
+            raise SlotError(f"cannot {verb} slot {slot}, which is {self.state[slot]}")
+        self.state[slot] = state
+
+    def _empty(self, slot: int) -> None:
+        self.frame[slot] = -1
+        self.free.append(slot)
