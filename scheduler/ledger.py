@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import Any
 
 from trilane.scheduler.events import Graph, Job
@@ -100,7 +101,7 @@ class Ledger:
 
     @property
     def frame_times_ns(self) -> list[int]:
-        return [after - before for before, after in zip(self.presented_ns, self.presented_ns[1:], strict=False)]
+        return [after - before for before, after in pairwise(self.presented_ns)]
 
     def report(
         self,
@@ -145,7 +146,7 @@ class Ledger:
         """
         if not isolated_ns or not interval_ns:
             return {"efficiency": None, "isolated_ms": {}}
-        per_unit: Counter[str] = Counter()
+        per_unit: dict[str, float] = dict.fromkeys(self._units, 0.0)
         for stage in self._graph.stages:
             in_run = self._stages[stage.name].service_ns
             alone = isolated_ns.get(stage.name)

@@ -1,4 +1,4 @@
-"""Where frames come from: release, the waiting queue and its two limits. Rule: a frame leaves here once, or is counted."""
+"""Where frames come from: release, the waiting queue, its limits. Rule: a frame leaves here once, or is counted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the core remembers of stages, units and frames. Rule: fields only; the decisions are in core.py and faults.py."""
+"""What the core remembers of stages, units and frames. Rule: fields only; core.py and faults.py decide."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
-"""Summaries of times. Rule: exact percentiles of what was measured (linear between ranks), no bins, standard library."""
+"""Summaries of times. Rule: exact percentiles of what was measured (linear between ranks), no bins."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from itertools import pairwise
 
 NS_PER_MS = 1e6
 
@@ -42,5 +43,5 @@ def ema_range_ms(values_ns: Sequence[int], span: int = 20) -> dict[str, float]:
 
 def jitter_ms(values_ns: Sequence[int]) -> float:
     """Mean absolute difference of successive frame times."""
-    steps = [abs(after - before) for before, after in zip(values_ns, values_ns[1:], strict=False)]
+    steps = [abs(after - before) for before, after in pairwise(values_ns)]
     return round(sum(steps) / len(steps) / NS_PER_MS, 6) if steps else 0.0

@@ -66,7 +66,7 @@ def edge_rule(text: str) -> EdgeRule:
 
 
 class EdgeSlots:
-    """The slots of one edge. `state[i]`, `frame[i]` (-1 when none), `ready` oldest first, `epoch` grows at each fault."""
+    """The slots of one edge. `frame[i]` is -1 when none, `ready` is oldest first, `epoch` grows at each fault."""
 
     def __init__(self, rule: EdgeRule) -> None:
         self.rule = rule
