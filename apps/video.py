@@ -27,30 +27,39 @@ class Joined:
     seconds: float
 
 
-def join_segments(segments: list[Path], target: Path) -> Joined | None:
+def join_segments(segments: list[Path], target: Path, fps: float) -> Joined | None:
     """Copy the packets of `segments`, in that order, into the MP4 file `target`; None when they hold no frame.
 
-    A segment that starts before the end of the one before it (a restarted stage, a repeated frame) is moved to
-    that end. A segment that was cut off counts up to its cut.
+    A packet is shown at the time of its frame's number, which its line of digest tells, or right after the one before
+    it when that is later. A segment that was cut off counts up to its cut.
     """
     readable = [path for path in segments if _has_packets(path)]
     if not readable:
         return None
-    frames, end, base = 0, 0, 0.0
+    frames, end = 0, 0
     with av.open(str(target), "w", format="mp4", options={"movflags": "faststart"}) as output:
         stream: Any = None
         for path in readable:
             with av.open(str(path)) as segment:
                 source = segment.streams.video[0]
                 stream = stream or output.add_stream_from_template(source)
-                shift: int | None = None
-                for packet in _packets(segment):
-                    shift = max(0, end - packet.pts) if shift is None else shift
-                    packet.pts, packet.dts, packet.stream = packet.pts + shift, packet.dts + shift, stream
-                    end, base = packet.pts + packet.duration, float(packet.time_base)
+                length = round(1 / (fps * source.time_base))
+                for packet, number in zip(_packets(segment), _frame_numbers(path), strict=False):
+                    packet.pts = packet.dts = max(end, number * length)
+                    packet.duration, packet.stream = length, stream
+                    end = packet.pts + length
                     output.mux(packet)
                     frames += 1
-    return Joined(frames, end * base)
+    return Joined(frames, end / (length * fps))
+
+
+def _frame_numbers(segment: Path) -> list[int]:
+    return [int(line.split(" ")[0]) for line in _digest_lines(segment.with_suffix(".sha256"))]
+
+
+def _digest_lines(path: Path) -> list[str]:
+    """Whole lines of a digest file; the last line of a file that was cut off may not be one."""
+    return [line for line in path.read_text(encoding="ascii").splitlines(keepends=True) if line.endswith("\n")]
 
 
 def _packets(container: Any) -> Iterator[Any]:
@@ -76,14 +85,14 @@ def run_checksum(digests: list[Path]) -> str | None:
 
     Two runs that presented the same bytes as the same frames have the same checksum.
     """
-    lines = [line for path in digests for line in path.read_text(encoding="ascii").splitlines() if " " in line]
+    lines = [line for path in digests for line in _digest_lines(path)]
     if not lines:
         return None
     ordered = sorted(lines, key=lambda line: int(line.split(" ")[0]))
-    return hashlib.sha256("\n".join(ordered).encode("ascii")).hexdigest()
+    return hashlib.sha256("".join(ordered).encode("ascii")).hexdigest()
 
 
-def contact_sheet(video: Path, target: Path) -> int:
+def contact_sheet(video: Path, target: Path, fps: float) -> int:
     """Write a PNG sheet of up to COLUMNS x ROWS frames of `video`, evenly spaced, first and last among them.
 
     Each is labelled with its number. Returns how many there are. Raises av.error.FFmpegError when the video cannot be
@@ -94,8 +103,7 @@ def contact_sheet(video: Path, target: Path) -> int:
         times = sorted(packet.pts for packet in container.demux(stream) if packet.pts is not None)
         count = min(COLUMNS * ROWS, len(times))
         chosen = [times[round(k * (len(times) - 1) / max(1, count - 1))] for k in range(count)]
-        rate = float(stream.average_rate or stream.guessed_rate)
-        pictures = [(round(pts * float(stream.time_base) * rate), _decode_at(container, pts)) for pts in chosen]
+        pictures = [(round(pts * stream.time_base * fps), _decode_at(container, pts)) for pts in chosen]
     _paste(pictures).save(target)
     return count
 
