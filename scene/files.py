@@ -1,0 +1,111 @@
+"""Input files opened with suspicion: sizes are read from headers before memory is taken, nothing is unpickled.
+
+Rule: whatever is wrong with a file becomes one BadInputError that names it.
+"""
+
+from __future__ import annotations
+
+import math
+import zipfile
+import zlib
+from collections.abc import Collection
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.errors import BadInputError
+
+MAX_ARRAY_BYTES = 1 << 30
+MAX_TEXT_BYTES = 256 << 20
+
+_DAMAGED = (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError)
+_HEADERS = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
+
+
+def require_file(path: Path, expected: str) -> int:
+    """Size of a regular, non-empty file in bytes. Raises BadInputError."""
+    try:
+        if not path.is_file():
+            found = "a folder" if path.is_dir() else "no such file"
+            raise BadInputError(path, found, expected)
+        size = path.stat().st_size
+    except (OSError, ValueError) as error:
+        raise BadInputError(path, f"a file that cannot be read ({error})", expected) from error
+    if size == 0:
+        raise BadInputError(path, "an empty file", expected)
+    return size
+
+
+def read_text(path: Path, expected: str) -> str:
+    """The file as text. Raises BadInputError when it is missing, empty, over 256 MiB or not UTF-8."""
+    size = require_file(path, expected)
+    if size > MAX_TEXT_BYTES:
+        raise BadInputError(path, f"{size} bytes", f"at most {MAX_TEXT_BYTES}")
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise BadInputError(path, f"a file that cannot be read as text ({error})", expected) from error
+
+
+def read_npy(path: Path, expected: str) -> NDArray[Any]:
+    """The array of a `.npy` file. Raises BadInputError; pickled, truncated and huge files are refused unread."""
+    size = require_file(path, expected)
+    try:
+        with path.open("rb") as file:
+            wanted = _checked_bytes(path, file, expected)
+            if size - file.tell() < wanted:
+                raise BadInputError(path, f"{size} bytes, truncated", f"{file.tell() + wanted} by its own header")
+            file.seek(0)
+            return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
+    except (OSError, ValueError, EOFError) as error:
+        raise BadInputError(path, f"no readable NumPy array ({error})", expected) from error
+
+
+def read_npz(path: Path, keys: Collection[str], expected: str) -> dict[str, NDArray[Any]]:
+    """Those of `keys` that the `.npz` file has; other members are not opened. Raises BadInputError."""
+    require_file(path, expected)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = {info.filename: info for info in archive.infolist()}
+            return {key: _member(path, archive, names[f"{key}.npy"]) for key in keys if f"{key}.npy" in names}
+    except _DAMAGED as error:
+        raise BadInputError(path, f"no readable .npz archive ({error})", expected) from error
+
+
+def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
+    where = f"{path}[{info.filename.removesuffix('.npy')}]"
+    with archive.open(info) as file:
+        wanted = _checked_bytes(where, file, "numbers")
+        if info.file_size < wanted:
+            raise BadInputError(where, f"{info.file_size} bytes, truncated", f"{wanted} by its own header")
+    with archive.open(info) as file:
+        return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
+
+
+def _checked_bytes(where: Path | str, file: IO[bytes], expected: str) -> int:
+    """Bytes of data that the header announces; leaves `file` at their start."""
+    version = np.lib.format.read_magic(file)
+    if version not in _HEADERS:
+        raise BadInputError(where, f".npy version {version}", "1.0 or 2.0")
+    shape, _, dtype = _HEADERS[version](file)
+    if dtype.hasobject:
+        raise BadInputError(where, "pickled objects", expected, "save it as a plain number array")
+    if any(side < 0 for side in shape):
+        raise BadInputError(where, f"shape {shape}", expected)
+    wanted = math.prod(shape) * dtype.itemsize
+    if wanted > MAX_ARRAY_BYTES:
+        raise BadInputError(where, f"shape {shape}, {wanted} bytes", f"at most {MAX_ARRAY_BYTES} bytes")
+    return wanted
+
+
+def as_numbers(where: Path | str, array: NDArray[Any], expected: str) -> NDArray[np.float64]:
+    """`array` as float64. Raises BadInputError when it holds no real numbers."""
+    if array.dtype.kind not in "fiu":
+        raise BadInputError(where, f"dtype {array.dtype}", expected)
+    with np.errstate(invalid="ignore"):
+        return array.astype(np.float64)

@@ -1,0 +1,1 @@
+"""Motions: files and built-in ones, read into SMPL-X poses over time."""

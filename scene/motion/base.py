@@ -1,0 +1,101 @@
+"""What every motion becomes: SMPL-X poses at increasing times, and the rule for the times between and beyond.
+
+Rule: a motion answers any time, from one frame or from a thousand; nothing here knows a file format.
+"""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.scene.rotations import quat_from_rotvec, rotvec_from_quat, slerp
+
+Array = NDArray[np.float64]
+
+JOINTS = 55
+#: Where the pelvis of the published neutral SMPL-X body is at rest, metres: AMASS files give the shift from there.
+REST_PELVIS: Array = np.array([0.003, -0.351, 0.012])
+
+
+class Wrap(enum.Enum):
+    """What follows the last frame."""
+
+    LOOP = "loops"
+    BOUNCE = "plays back and forth"
+
+
+def wrapped_time(t_s: float, length_s: float, wrap: Wrap) -> float:
+    """The time inside [0, length_s] that stands for `t_s`; a length of 0 always gives 0."""
+    if length_s <= 0:
+        return 0.0
+    if wrap is Wrap.LOOP:
+        return t_s % length_s
+    phase = t_s % (2 * length_s)
+    return min(phase, 2 * length_s - phase)
+
+
+def bracket(times_s: Array, t_s: float) -> tuple[int, int, float]:
+    """Neighbours `i <= j` of `t_s` in increasing `times_s` (T,) and the fraction of the way from i to j."""
+    last = len(times_s) - 1
+    j = min(max(int(np.searchsorted(times_s, t_s, side="right")), 1), last) if last else 0
+    i = max(j - 1, 0)
+    span = times_s[j] - times_s[i]
+    fraction = (t_s - times_s[i]) / span if span > 0 else 0.0
+    return i, j, float(min(max(fraction, 0.0), 1.0))
+
+
+@dataclass(frozen=True)
+class RawMotion:
+    """What a file said, before repair and turning upright.
+
+    `times_s` (T,), `poses` (T, 55, 3) axis-angle radians, `translation` (T, 3): of the pelvis, metres, or None when the format
+    has none; NaNs and repeated times still in. `up`: the axis usual for the format. `leg_m`: hip to ankle of the
+    recorded person, when known.
+    """
+
+    times_s: Array
+    poses: Array
+    translation: Array | None
+    betas: Array | None
+    up: str
+    notes: tuple[str, ...]
+    leg_m: float | None = None
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Poses over time, upright, facing +Z at first, in the middle of the ground it covers.
+
+    `times_s` (T,) from 0, strictly increasing. `poses` (T, 55, 3) axis-angle, radians, SMPL-X joint order.
+    `translation` (T, 3): where the pelvis is, metres, Y up. `betas` (n,) or None. `notes`: what the
+    source was taken for and what was mended. `leg_m`: hip to ankle of the recorded person, by which the translation
+    is scaled to another body, or None. `travels`: whether the translation was recorded.
+    """
+
+    times_s: Array
+    poses: Array
+    translation: Array
+    betas: Array | None
+    notes: tuple[str, ...]
+    wrap: Wrap
+    leg_m: float | None = None
+    travels: bool = True
+
+    @property
+    def duration_s(self) -> float:
+        return float(self.times_s[-1])
+
+    @cached_property
+    def _quats(self) -> Array:
+        return quat_from_rotvec(self.poses)
+
+    def sample(self, t_s: float) -> tuple[Array, Array]:
+        """Pose (55, 3) and translation (3,) at `t_s`: quaternions by slerp, translation linearly."""
+        i, j, fraction = bracket(self.times_s, wrapped_time(t_s, self.duration_s, self.wrap))
+        pose = rotvec_from_quat(slerp(self._quats[i], self._quats[j], fraction))
+        start, end = self.translation[i], self.translation[j]
+        return pose, start + (end - start) * fraction

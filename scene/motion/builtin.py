@@ -1,0 +1,232 @@
+"""The motions that the project wrote itself: a person who walks, waves and turns; one who stands; the T pose.
+
+Rule: the choreography is the tables below; the curves between them are computed, and a cycle ends where it began.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.scene.motion.arms import hanging_arm, relaxed_hands, waving_arm
+from trilane.scene.motion.base import JOINTS, Motion, Wrap
+from trilane.scene.motion.steps import Build, FootTrack, Swing, Walker, blurred, smooth_step, solve_leg
+from trilane.scene.rotations import about, matrix_from_quat, quat_from_matrix, rotvec_from_matrix, slerp
+from trilane.stages.cpu.joints import JOINT_INDEX
+
+Array = NDArray[np.float64]
+
+RATE_HZ = 60
+#: An adult of 1.76 m; other bodies scale the translation by their legs.
+BUILD = Build(
+    hip=(0.117, -0.008, -0.010),
+    knee=(0.014, -0.408, 0.034),
+    ankle=(0.0, -0.443, -0.025),
+    ankle_height=0.077,
+    ball=(0.0, -0.062, 0.146),
+    heel_behind=0.057,
+    feet_apart=0.19,
+)
+#: Of the leg's length: as far as a foot may be from its hip.
+REACH = 0.993
+
+#: from s, to s, what moves: z of the route in metres or heading in radians, how far.
+WALKS = ((0.25, 2.65, 1.5), (6.45, 8.85, -1.5))
+TURNS = ((5.25, 6.55, np.pi), (8.75, 9.95, np.pi))
+START_Z_M = -0.75
+#: side (+1 left), lift s, landing s.
+SWINGS = (
+    Swing(-1, 0.30, 0.76),
+    Swing(1, 0.88, 1.34),
+    Swing(-1, 1.46, 1.92),
+    Swing(1, 2.04, 2.50),
+    Swing(1, 5.32, 5.66),
+    Swing(-1, 5.74, 6.10),
+    Swing(1, 6.18, 6.50),
+    Swing(-1, 6.60, 7.04),
+    Swing(1, 7.14, 7.60),
+    Swing(-1, 7.72, 8.18),
+    Swing(1, 8.30, 8.76),
+    Swing(-1, 8.84, 9.16),
+    Swing(1, 9.22, 9.52),
+    Swing(-1, 9.58, 9.88),
+)
+PERIOD_S = 10.0
+#: raise from, up at, lower from, down at.
+WAVE_S = (2.45, 3.05, 4.75, 5.45)
+WAVES_PER_S = 1.7
+
+
+def walk_wave_turn() -> Motion:
+    """Ten seconds: walks to the viewer, waves, turns, walks back, turns."""
+    times = np.arange(int(PERIOD_S * RATE_HZ)) / RATE_HZ
+    walker = Walker(BUILD, _route, SWINGS, PERIOD_S)
+    left, right = walker.foot(1, times), walker.foot(-1, times)
+    return _closed(times, *_body(times, left, right), "walks, waves and turns")
+
+
+def idle() -> Motion:
+    """Eight seconds of standing: breath, weight from foot to foot, a look about."""
+    times = np.arange(8 * RATE_HZ) / RATE_HZ
+    tracks = [_standing(side, len(times)) for side in (1, -1)]
+    poses, places = _body(times, tracks[0], tracks[1], wave=False, shift_m=0.018 * np.sin(np.pi * times / 4))
+    poses[:, JOINT_INDEX["head"], 1] += 0.12 * np.sin(np.pi * times / 4 + 0.6)
+    return _closed(times, poses, places, "stands")
+
+
+def t_pose() -> Motion:
+    """The rest pose, held."""
+    poses, places = np.zeros((1, JOINTS, 3)), np.array([[0.0, 0.94, 0.0]])
+    return Motion(np.zeros(1), poses, places, None, ("built in: the T pose, one frame: held",), Wrap.LOOP, None, False)
+
+
+BUILTIN: dict[str, Callable[[], Motion]] = {"walk-wave-turn": walk_wave_turn, "idle": idle, "t-pose": t_pose}
+
+
+def _closed(times: Array, poses: Array, places: Array, what: str) -> Motion:
+    """A loop whose last frame is its first."""
+    times = np.append(times, len(times) / RATE_HZ)
+    poses, places = np.concatenate([poses, poses[:1]]), np.concatenate([places, places[:1]])
+    notes = (f"built in: {what}, {times[-1]:g} s at {RATE_HZ}/s, {Wrap.LOOP.value}",)
+    return Motion(times, poses, places, None, notes, Wrap.LOOP, BUILD.leg_m, False)
+
+
+def _route(times: Array) -> tuple[Array, Array, Array]:
+    z = START_Z_M + sum(far * _eased((times - start) / (end - start)) for start, end, far in WALKS)
+    heading = sum(angle * smooth_step((times - start) / (end - start)) for start, end, angle in TURNS)
+    return np.zeros_like(times), z, np.asarray(heading)
+
+
+def _eased(x: Array) -> Array:
+    """0 to 1, at constant speed but for a soft fifth at either end."""
+    ramp = 0.22
+    s = np.clip(x, 0.0, 1.0)
+    speed = 1 / (1 - ramp)
+    start, end = speed * s**2 / (2 * ramp), 1 - speed * (1 - s) ** 2 / (2 * ramp)
+    middle = speed * (s - ramp / 2)
+    return np.where(s < ramp, start, np.where(s > 1 - ramp, end, middle))
+
+
+def _standing(side: int, count: int) -> FootTrack:
+    ankle = np.tile([side * BUILD.feet_apart / 2, BUILD.ankle_height, 0.0], (count, 1))
+    return FootTrack(ankle, np.full(count, 0.1 * side), np.zeros(count), np.ones(count))
+
+
+def _body(
+    times: Array, left: FootTrack, right: FootTrack, wave: bool = True, shift_m: Array | float = 0.0
+) -> tuple[Array, Array]:
+    """Poses (T, 55, 3) and pelvis places (T, 3) over two feet."""
+    heading = blurred_heading(left, right)
+    ahead = _along(heading, left.ankle - right.ankle)
+    stride = blurred(ahead, 3)
+    weight = blurred(left.load - right.load, 7)
+    pace = blurred(np.abs(_along(heading, _velocity(left) + _velocity(right))) / 2, 8)
+    pelvis_yaw = -0.22 * stride
+    pelvis = about(1, heading + pelvis_yaw) @ about(2, 0.05 * weight)
+    place = _pelvis_place(left, right, heading, pelvis, weight, shift_m)
+    poses = np.zeros((len(times), JOINTS, 3))
+    _set(poses, "pelvis", pelvis)
+    for side, name, foot in ((1, "left", left), (-1, "right", right)):
+        hip = place + (pelvis @ BUILD.side(BUILD.hip, side))
+        for joint, turn in zip(("hip", "knee", "ankle"), solve_leg(BUILD, side, hip, pelvis, foot), strict=True):
+            _set(poses, f"{name}_{joint}", turn)
+        poses[:, JOINT_INDEX[f"{name}_foot"], 0] = -np.clip(foot.pitch, 0, 0.6) * foot.load
+    _trunk(poses, times, pelvis_yaw, weight, pace)
+    _arms(poses, times, stride, wave)
+    return poses, place
+
+
+def blurred_heading(left: FootTrack, right: FootTrack) -> Array:
+    """The pelvis's heading (T,), between the feet's; the cycle may end whole turns on."""
+    mean = np.unwrap((left.heading + right.heading) / 2)
+    drift = np.linspace(0, round((mean[-1] - mean[0]) / (2 * np.pi)) * 2 * np.pi, len(mean), endpoint=False)
+    return blurred(mean - drift, 6) + drift
+
+
+def _velocity(foot: FootTrack) -> Array:
+    return (np.roll(foot.ankle, -1, axis=0) - np.roll(foot.ankle, 1, axis=0)) * RATE_HZ / 2
+
+
+def _along(heading: Array, vectors: Array) -> Array:
+    return np.sin(heading) * vectors[:, 0] + np.cos(heading) * vectors[:, 2]
+
+
+def _pelvis_place(
+    left: FootTrack, right: FootTrack, heading: Array, pelvis: Array, weight: Array, shift_m: Array | float
+) -> Array:
+    """Between the feet, over the one that carries, and low enough for both legs to reach."""
+    between = blurred((left.ankle + right.ankle) / 2, 7)
+    aside = 0.028 * weight + shift_m
+    place = between + np.column_stack([np.cos(heading) * aside, 0 * aside, -np.sin(heading) * aside])
+    place[:, 0] += 0.02 * np.sin(heading)
+    place[:, 2] += 0.02 * np.cos(heading)
+    heights = [_height_within_reach(side, foot, place, pelvis) for side, foot in ((1, left), (-1, right))]
+    low = np.minimum(*heights)
+    place[:, 1] = blurred(_eroded(low, 6), 4)
+    return place
+
+
+def _eroded(values: Array, reach: int) -> Array:
+    """Cyclic running minimum (T,) over `reach` samples either side."""
+    return np.asarray(np.min([np.roll(values, k) for k in range(-reach, reach + 1)], axis=0))
+
+
+def _height_within_reach(side: int, foot: FootTrack, place: Array, pelvis: Array) -> Array:
+    """Greatest pelvis height (T,) at which a leg of REACH times its length touches its ankle."""
+    hip = pelvis @ BUILD.side(BUILD.hip, side)
+    flat = foot.ankle - place - hip
+    level = np.hypot(flat[:, 0], flat[:, 2])
+    return np.asarray(foot.ankle[:, 1] + np.sqrt((BUILD.leg_m * REACH) ** 2 - level**2) - hip[:, 1])
+
+
+def _trunk(poses: Array, times: Array, pelvis_yaw: Array, weight: Array, pace: Array) -> None:
+    """Shoulders against the hips, a lean with the pace, breath; the head stays level and ahead."""
+    breath = np.sin(2 * np.pi * times / (times[-1] + times[1]) * round(times[-1] / 3.6))
+    for name, share in (("spine1", 0.25), ("spine2", 0.35), ("spine3", 0.4)):
+        joint = poses[:, JOINT_INDEX[name]]
+        joint[:, 1] = -1.9 * share * pelvis_yaw
+        joint[:, 2] = -0.055 * share * weight
+        joint[:, 0] = 0.05 * share * pace
+    poses[:, JOINT_INDEX["spine3"], 0] -= 0.012 * breath
+    poses[:, JOINT_INDEX["neck"], 0] = 0.02
+    poses[:, JOINT_INDEX["head"], 1] = 0.9 * pelvis_yaw
+    poses[:, JOINT_INDEX["head"], 0] = 0.01 * breath - 0.03 * pace
+
+
+def _arms(poses: Array, times: Array, stride: Array, wave: bool) -> None:
+    """Arms against the legs; the right one waves."""
+    lag = np.roll(stride, 3)
+    up = _wave_weight(times) if wave else np.zeros_like(times)
+    for side, name in ((1, "left"), (-1, "right")):
+        shoulder, elbow, wrist = hanging_arm(side, 0.75 * side * lag)
+        if side < 0 and wave:
+            raised = waving_arm(np.sin(2 * np.pi * WAVES_PER_S * (times - WAVE_S[1])))
+            shoulder, elbow, wrist = (
+                _between(low, high, up) for low, high in zip((shoulder, elbow, wrist), raised, strict=True)
+            )
+        _set(poses, f"{name}_shoulder", shoulder)
+        _set(poses, f"{name}_elbow", elbow)
+        _set(poses, f"{name}_wrist", wrist)
+        poses[:, JOINT_INDEX[f"{name}_collar"], 2] = -0.06 * side
+        first = JOINT_INDEX[f"{name}_index1"]
+        open_hand = up if side < 0 else np.zeros_like(up)
+        curl = relaxed_hands(side) * (1 - 0.75 * open_hand)[:, None, None]
+        poses[:, first : first + 15] = curl
+    collar = poses[:, JOINT_INDEX["right_collar"]]
+    collar[:, 2] -= 0.18 * up
+
+
+def _wave_weight(times: Array) -> Array:
+    start, up, lower, down = WAVE_S
+    return np.asarray(smooth_step((times - start) / (up - start)) - smooth_step((times - lower) / (down - lower)))
+
+
+def _between(low: Array, high: Array, weight: Array) -> Array:
+    start, end = quat_from_matrix(low), quat_from_matrix(high)
+    return matrix_from_quat(slerp(start, end, weight))
+
+
+def _set(poses: Array, joint: str, turn: Array) -> None:
+    poses[:, JOINT_INDEX[joint]] = rotvec_from_matrix(turn)

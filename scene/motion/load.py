@@ -1,0 +1,45 @@
+"""A scene's `motion` entry to a Motion: a built-in name or a file, by its ending.
+
+Rule: the ending chooses the reader; the reader's errors name the file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from trilane.errors import BadInputError
+from trilane.scene.files import require_file
+from trilane.scene.motion.amass import load_amass
+from trilane.scene.motion.base import Motion, RawMotion
+from trilane.scene.motion.builtin import BUILTIN
+from trilane.scene.motion.retarget import load_retargeted
+from trilane.scene.motion.smplx_npy import load_smplx_npy
+from trilane.scene.motion.upright import finish
+from trilane.scene.schema import AvatarSpec
+
+PREFIX = "builtin:"
+
+_READERS: dict[str, Callable[[Path, str], RawMotion]] = {
+    ".npy": lambda path, _units: load_smplx_npy(path),
+    ".npz": lambda path, _units: load_amass(path),
+    ".bvh": load_retargeted,
+}
+
+
+def load_motion(spec: AvatarSpec, base: Path) -> Motion:
+    """The motion that `spec.motion` names; a relative path starts at `base`.
+
+    Raises BadInputError when there is no such motion or the file is unusable.
+    """
+    if spec.motion.startswith(PREFIX):
+        make = BUILTIN.get(spec.motion.removeprefix(PREFIX))
+        if make is None:
+            raise BadInputError("motion", repr(spec.motion), f"{PREFIX}{{{', '.join(BUILTIN)}}} or a file")
+        return make()
+    path = base / spec.motion
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise BadInputError(path, f"the ending {path.suffix!r}", f"a motion file: {', '.join(_READERS)}")
+    require_file(path, "a motion file")
+    return finish(reader(path, spec.units), str(path), spec.up_axis)

@@ -1,0 +1,138 @@
+"""Rotations as arrays: quaternions `w, x, y, z`, axis-angle vectors in radians, 3x3 matrices for column vectors.
+
+Rule: every function takes any leading axes, computes in float64 and is exact at 0 and at pi.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+#: Columns are the images of x, y, z: turns a Z-up world into a Y-up one, x kept.
+Y_UP_FROM_Z_UP: Array = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+
+
+def quat_from_rotvec(rotvec: ArrayLike) -> Array:
+    """Axis-angle (..., 3) to unit quaternions (..., 4), w >= 0 only for angles up to pi."""
+    vectors = np.asarray(rotvec, dtype=np.float64)
+    half = np.sqrt((vectors * vectors).sum(axis=-1, keepdims=True)) / 2
+    return np.concatenate([np.cos(half), np.sinc(half / np.pi) * vectors / 2], axis=-1)
+
+
+def rotvec_from_quat(quat: ArrayLike) -> Array:
+    """Unit quaternions (..., 4) to the shortest axis-angle (..., 3), angles in [0, pi]."""
+    q = np.asarray(quat, dtype=np.float64)
+    sine = np.sqrt((q[..., 1:] * q[..., 1:]).sum(axis=-1))
+    flip = np.where(q[..., 0] < 0, -1.0, 1.0)
+    angle = 2 * np.arctan2(sine, q[..., 0] * flip)
+    small = sine < 1e-12
+    factor = np.where(small, 2.0, angle / np.where(small, 1.0, sine)) * flip
+    return np.asarray(q[..., 1:] * factor[..., None])
+
+
+def matrix_from_quat(quat: ArrayLike) -> Array:
+    """Unit quaternions (..., 4) to rotation matrices (..., 3, 3)."""
+    w, x, y, z = np.moveaxis(np.asarray(quat, dtype=np.float64), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def quat_from_matrix(matrix: ArrayLike) -> Array:
+    """Rotation matrices (..., 3, 3) to unit quaternions (..., 4), by the largest of the four squared components.
+
+    Shepperd, "Quaternion from rotation matrix", J. Guidance and Control 1(3), 1978.
+    """
+    m = np.asarray(matrix, dtype=np.float64)
+    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    a, b, c = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
+    d, e, f = m[..., 1, 0] + m[..., 0, 1], m[..., 0, 2] + m[..., 2, 0], m[..., 2, 1] + m[..., 1, 2]
+    outer = np.stack(
+        [
+            np.stack([1 + xx + yy + zz, a, b, c], axis=-1),
+            np.stack([a, 1 + xx - yy - zz, d, e], axis=-1),
+            np.stack([b, d, 1 - xx + yy - zz, f], axis=-1),
+            np.stack([c, e, f, 1 - xx - yy + zz], axis=-1),
+        ],
+        axis=-2,
+    )
+    best = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
+    row = np.take_along_axis(outer, best[..., None, None], axis=-2)[..., 0, :]
+    return normalised(row)
+
+
+def matrix_from_rotvec(rotvec: ArrayLike) -> Array:
+    """Axis-angle (..., 3) to rotation matrices (..., 3, 3)."""
+    return matrix_from_quat(quat_from_rotvec(rotvec))
+
+
+def rotvec_from_matrix(matrix: ArrayLike) -> Array:
+    """Rotation matrices (..., 3, 3) to axis-angle (..., 3)."""
+    return rotvec_from_quat(quat_from_matrix(matrix))
+
+
+def about(axis: int, angle_rad: ArrayLike) -> Array:
+    """Rotation matrices (..., 3, 3) about coordinate axis 0, 1 or 2 by angles (...)."""
+    angle = np.asarray(angle_rad, dtype=np.float64)
+    unit = np.zeros(3)
+    unit[axis] = 1.0
+    return matrix_from_rotvec(angle[..., None] * unit)
+
+
+def quat_multiply(left: ArrayLike, right: ArrayLike) -> Array:
+    """Hamilton product (..., 4): turn by `right`, then by `left`."""
+    aw, ax, ay, az = np.moveaxis(np.asarray(left, dtype=np.float64), -1, 0)
+    bw, bx, by, bz = np.moveaxis(np.asarray(right, dtype=np.float64), -1, 0)
+    return np.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        axis=-1,
+    )
+
+
+def slerp(start: ArrayLike, end: ArrayLike, fraction: ArrayLike) -> Array:
+    """Great-circle interpolation (..., 4) of unit quaternions along the shorter arc; `fraction` (...) in [0, 1].
+
+    Shoemake, "Animating rotation with quaternion curves", SIGGRAPH 1985; nearly equal ends fall back on the chord.
+    """
+    a, b = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
+    s = np.asarray(fraction, dtype=np.float64)
+    dot = (a * b).sum(axis=-1)
+    sign = np.where(dot < 0, -1.0, 1.0)
+    angle = np.arccos(np.minimum(dot * sign, 1.0))
+    near = angle < 1e-6
+    sine = np.where(near, 1.0, np.sin(angle))
+    left = np.where(near, 1 - s, np.sin((1 - s) * angle) / sine)
+    right = np.where(near, s, np.sin(s * angle) / sine) * sign
+    return normalised(left[..., None] * a + right[..., None] * b)
+
+
+def normalised(vectors: ArrayLike) -> Array:
+    """Vectors (..., n) at unit length; a zero vector gives NaN."""
+    v = np.asarray(vectors, dtype=np.float64)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(v / np.sqrt((v * v).sum(axis=-1, keepdims=True)))
+
+
+def shortest_turn(source: ArrayLike, target: ArrayLike, fallback: ArrayLike = (1.0, 0.0, 0.0)) -> Array:
+    """Rotation matrices (..., 3, 3) of the least angle that turn directions `source` to `target`, both (..., 3).
+
+    Opposite directions are turned about the part of `fallback` that is square to them.
+    """
+    a, b = normalised(source), normalised(target)
+    axis = np.cross(a, b)
+    sine = np.sqrt((axis * axis).sum(axis=-1, keepdims=True))
+    side = np.asarray(fallback, dtype=np.float64)
+    side = side - (side * a).sum(axis=-1, keepdims=True) * a
+    unit = np.where(sine > 1e-9, axis / np.maximum(sine, 1e-300), normalised(side))
+    angle = np.arctan2(sine, (a * b).sum(axis=-1, keepdims=True))
+    return matrix_from_rotvec(unit * angle)
