@@ -59,11 +59,16 @@ class UNet(nn.Module):
         self.mask = nn.Sequential(*_convolution(c_in, c_in, make_norm), nn.Conv2d(c_in, 1, 3, 1, 1))
 
     def forward(self, x: Tensor) -> Tensor:
+        x = self.features(x)
+        return torch.sigmoid(torch.cat((self.colour(x), self.mask(x)), dim=1))
+
+    def features(self, x: Tensor) -> Tensor:
+        """What both heads read: (N, width, H, W)."""
         *skips, x = self.encoder(x)
         for level, skip in zip(self.levels, (*reversed(skips), None), strict=True):
             x = functional.interpolate(x, scale_factor=2.0, mode="nearest")
             x = level(x if skip is None else torch.cat((x, skip), dim=1))
-        return torch.sigmoid(torch.cat((self.colour(x), self.mask(x)), dim=1))
+        return x
 
 
 def _convolution(c_in: int, c_out: int, norm: Callable[[int], nn.Module]) -> tuple[nn.Module, ...]:

@@ -1,0 +1,192 @@
+"""From a float network to an integer one: calibrate on real frames, quantise, make bytes of both ends.
+
+Rule: unsigned 8-bit activations, signed symmetric per-channel weights, real 0 exact, output bytes are the picture.
+Weights have 7 bits under `reduce_range`: on a CPU without VNNI two products of 8-bit weights overflow 16 bits.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+from numpy.typing import NDArray
+from onnx import TensorProto, helper, numpy_helper
+from onnxruntime.quantization import (
+    CalibrationDataReader,
+    CalibrationMethod,
+    QDQQuantizer,
+    QuantType,
+    create_calibrator,
+)
+from onnxruntime.quantization.shape_inference import quant_pre_process
+
+from trilane.avatars.network_file import NetworkFile, check_network
+from trilane.errors import BadInputError
+
+MIN_FRAMES, MAX_FRAMES = 1, 1000
+#: Where the sigmoid rounds to byte 0 and 255: a logit beyond says nothing, and a wider range would cost steps.
+LOGIT_LIMIT = 6.5
+OUTPUT_SCALE = 1 / 255
+
+METHODS = {
+    "minmax": (CalibrationMethod.MinMax, {}),
+    "percentile": (CalibrationMethod.Percentile, {"percentile": 99.99}),
+    "entropy": (CalibrationMethod.Entropy, {}),
+}
+QUANTISED = [
+    *("Conv", "ConvTranspose", "Gemm", "Add", "Mul", "Concat", "MaxPool", "AveragePool", "GlobalAveragePool", "Resize"),
+    *("Relu", "Clip", "Sigmoid", "Reshape", "Transpose", "Slice", "Split", "Pad"),
+]
+
+
+@dataclass(frozen=True)
+class Quantised:
+    """An integer network, and the `facts` of how it was made: method, frames, weight bits, exceptions, version."""
+
+    network: NetworkFile
+    facts: dict[str, Any]
+
+
+class _OneFrame(CalibrationDataReader):  # type: ignore[misc]
+    def __init__(self, name: str, frame: NDArray[np.float32]) -> None:
+        self.feeds: Iterator[dict[str, Any]] = iter([{name: frame}])
+
+    def get_next(self) -> dict[str, Any] | None:
+        return next(self.feeds, None)
+
+
+def quantise(
+    model: onnx.ModelProto,
+    frames: Sequence[NDArray[np.float32]],
+    method: str = "minmax",
+    reduce_range: bool = True,
+    keep_float: Sequence[str] = (),
+) -> Quantised:
+    """Quantise a float NCHW network, one image at a time.
+
+    `model`: one float32 input (1, C, H, W), one output (1, 4, H, W) in 0..1. `frames`: real inputs (H, W, C).
+    `keep_float`: names of nodes that stay in float. Raises BadInputError for wrong frames or an unknown method.
+    """
+    if method not in METHODS:
+        raise BadInputError("quantise", f"method {method!r}", f"one of {', '.join(METHODS)}")
+    _check_frames(model, frames)
+    with tempfile.TemporaryDirectory(prefix="trilane-quantise-") as folder:
+        prepared = Path(folder) / "prepared.onnx"
+        source = Path(folder) / "float.onnx"
+        onnx.save(model, source)
+        quant_pre_process(source, prepared, skip_symbolic_shape=True)
+        ranges = _calibrate(prepared, frames, method, Path(folder) / "augmented.onnx")
+        quantised = _insert(onnx.load(prepared), ranges, reduce_range, keep_float)
+    _integer_ends(quantised)
+    facts = {
+        "method": method,
+        "calibration_frames": len(frames),
+        "weight_bits": 7 if reduce_range else 8,
+        "per_channel": True,
+        "float_layers": list(keep_float),
+        "onnxruntime": onnxruntime.__version__,
+    }
+    return Quantised(check_network(quantised, "quantised network"), facts)
+
+
+def _check_frames(model: onnx.ModelProto, frames: Sequence[NDArray[np.float32]]) -> None:
+    _, c, h, w = (dim.dim_value for dim in model.graph.input[0].type.tensor_type.shape.dim)
+    if not MIN_FRAMES <= len(frames) <= MAX_FRAMES:
+        raise BadInputError("calibration", f"{len(frames)} frames", f"{MIN_FRAMES} to {MAX_FRAMES}")
+    for i, frame in enumerate(frames):
+        if frame.shape != (h, w, c) or not np.isfinite(frame).all():
+            raise BadInputError("calibration", f"frame {i} of shape {frame.shape}", f"finite values, ({h}, {w}, {c})")
+
+
+def _calibrate(prepared: Path, frames: Sequence[NDArray[np.float32]], method: str, augmented: Path) -> Any:
+    kind, options = METHODS[method]
+    name = onnx.load(prepared, load_external_data=False).graph.input[0].name
+    calibrator = create_calibrator(
+        prepared, QUANTISED, augmented_model_path=str(augmented), calibrate_method=kind, extra_options=options
+    )
+    with contextlib.redirect_stdout(io.StringIO()):
+        for frame in frames:
+            nchw = np.ascontiguousarray(frame.transpose(2, 0, 1)[None], np.float32)
+            calibrator.collect_data(_OneFrame(name, nchw))
+        return calibrator.compute_data()
+
+
+def _insert(model: onnx.ModelProto, ranges: Any, reduce_range: bool, keep_float: Sequence[str]) -> onnx.ModelProto:
+    sigmoid = next((node for node in model.graph.node if node.output[0] == model.graph.output[0].name), None)
+    if sigmoid is None or sigmoid.op_type != "Sigmoid":
+        raise BadInputError("quantise", f"output made by {sigmoid and sigmoid.op_type}", "a Sigmoid")
+    logits = ranges[sigmoid.input[0]]
+    logits.lowest = np.maximum(logits.lowest, np.float32(-LOGIT_LIMIT))
+    logits.highest = np.minimum(logits.highest, np.float32(LOGIT_LIMIT))
+    quantiser = QDQQuantizer(
+        model,
+        per_channel=True,
+        reduce_range=reduce_range,
+        weight_qType=QuantType.QInt8,
+        activation_qType=QuantType.QUInt8,
+        tensors_range=ranges,
+        nodes_to_quantize=[],
+        nodes_to_exclude=list(keep_float),
+        op_types_to_quantize=QUANTISED,
+        extra_options={"WeightSymmetric": True},
+    )
+    quantiser.quantize_model()
+    quantiser.model.topological_sort()
+    result: onnx.ModelProto = quantiser.model.model
+    return result
+
+
+def _integer_ends(model: onnx.ModelProto) -> None:
+    """Drop the first Quantize and the last Dequantize; transpose instead, which the runtimes fold away."""
+    graph = model.graph
+    source, target = graph.input[0], graph.output[0]
+    first = next(node for node in graph.node if source.name in node.input and node.op_type == "QuantizeLinear")
+    last = next(node for node in graph.node if target.name in node.output and node.op_type == "DequantizeLinear")
+    maker = next(node for node in graph.node if last.input[0] in node.output)
+    _make_picture(graph, maker)
+    n, c, h, w = (dim.dim_value for dim in source.type.tensor_type.shape.dim)
+    inner = [node for node in graph.node if node not in (first, last)]
+    real = _nhwc_to_real(inner, source.name, first.output[0])
+    leave = helper.make_node("Transpose", [maker.output[0]], [target.name], name="bytes_out", perm=[0, 2, 3, 1])
+    del graph.node[:], graph.input[:], graph.output[:], graph.value_info[:]
+    graph.node.extend([*real, *inner, leave])
+    graph.input.append(helper.make_tensor_value_info(source.name, TensorProto.UINT8, [n, h, w, c]))
+    graph.output.append(helper.make_tensor_value_info(target.name, TensorProto.UINT8, [n, h, w, 4]))
+    used = {name for node in graph.node for name in node.input}
+    kept = [tensor for tensor in graph.initializer if tensor.name in used]
+    del graph.initializer[:]
+    graph.initializer.extend(kept)
+
+
+def _nhwc_to_real(inner: list[onnx.NodeProto], source: str, quantised: str) -> list[onnx.NodeProto]:
+    """Dequantise bytes, then transpose: OpenVINO keeps the first layer in integers only in this order."""
+    readers = [node for node in inner if quantised in node.input]
+    scale, zero_point = readers[0].input[1:3]
+    nchw = readers[0].output[0]
+    for reader in readers:
+        inner.remove(reader)
+    outputs = {source, *(reader.output[0] for reader in readers)}
+    for node in inner:
+        for slot, name in enumerate(node.input):
+            if name in outputs:
+                node.input[slot] = nchw
+    return [
+        helper.make_node("DequantizeLinear", [source, scale, zero_point], [f"{nchw}_nhwc"], name="bytes_in"),
+        helper.make_node("Transpose", [f"{nchw}_nhwc"], [nchw], name="to_nchw", perm=[0, 3, 1, 2]),
+    ]
+
+
+def _make_picture(graph: onnx.GraphProto, node: onnx.NodeProto) -> None:
+    """Give the last Quantize the scale 1/255 and zero point 0."""
+    values = {"picture_scale": np.float32(OUTPUT_SCALE), "picture_zero_point": np.uint8(0)}
+    for slot, (name, value) in enumerate(values.items(), start=1):
+        node.input[slot] = name
+        graph.initializer.append(numpy_helper.from_array(np.asarray(value), name))

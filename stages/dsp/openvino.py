@@ -1,0 +1,80 @@
+"""OpenVINO on the CPU, reading and writing the slots' own memory.
+
+Rule: after the first run of a session nothing is allocated and nothing is copied; no convolution runs in float.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import openvino
+from numpy.typing import NDArray
+
+from trilane.avatars.network_file import NetworkFile
+from trilane.errors import BadInputError
+from trilane.stages.dsp.runtime import RuntimeOptions
+
+DEVICE = "CPU"
+LAYERS = {"Convolution", "Deconvolution", "FullyConnected", "MatMul"}
+INTEGERS = ("i8", "u8")
+
+
+class OpenvinoBinding:
+    """One infer request with both tensors set."""
+
+    def __init__(self, compiled: Any, tensor: NDArray[np.uint8], image: NDArray[np.uint8]) -> None:
+        self._tensors = [openvino.Tensor(array, shared_memory=True) for array in (tensor, image)]
+        self._request = compiled.create_infer_request()
+        self._request.set_input_tensor(self._tensors[0])
+        self._request.set_output_tensor(self._tensors[1])
+
+    def run(self) -> None:
+        self._request.start_async()
+        self._request.wait()
+
+
+class OpenvinoSession:
+    """One compiled model."""
+
+    def __init__(self, compiled: Any) -> None:
+        self._compiled = compiled
+
+    def bind(self, tensor: NDArray[np.uint8], image: NDArray[np.uint8]) -> OpenvinoBinding:
+        return OpenvinoBinding(self._compiled, tensor, image)
+
+
+def load(network: NetworkFile, options: RuntimeOptions) -> OpenvinoSession:
+    """Compile `network`. Raises BadInputError when OpenVINO cannot, or leaves a layer in float."""
+    core = openvino.Core()
+    settings = {
+        "PERFORMANCE_HINT": "LATENCY",
+        "INFERENCE_NUM_THREADS": options.threads,
+        "NUM_STREAMS": 1,
+        "ENABLE_CPU_PINNING": False,
+    }
+    try:
+        model = core.read_model(network.model.SerializeToString())
+        compiled = core.compile_model(model, DEVICE, settings)
+    except RuntimeError as error:
+        raise BadInputError(network.where, str(error), "a network that OpenVINO loads") from error
+    _check_integer(compiled, network.where)
+    return OpenvinoSession(compiled)
+
+
+def version() -> str:
+    return f"openvino {openvino.__version__}"
+
+
+def _check_integer(compiled: Any, where: str) -> None:
+    left = []
+    for op in compiled.get_runtime_model().get_ops():
+        info = op.get_rt_info()
+        if _text(info, "layerType") in LAYERS and _text(info, "runtimePrecision").lower() not in INTEGERS:
+            left.append(op.get_friendly_name())
+    if left:
+        raise BadInputError(where, f"layers left in float: {', '.join(left)}", "integer layers", "quantise them")
+
+
+def _text(info: Any, key: str) -> str:
+    return str(info[key].astype(str)) if key in info else ""

@@ -1,0 +1,84 @@
+"""ONNX Runtime on the CPU, reading and writing the slots' own memory.
+
+Rule: after the first run of a session nothing is allocated and nothing is copied; no convolution runs in float.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+from numpy.typing import NDArray
+
+from trilane.avatars.network_file import NetworkFile, node_name
+from trilane.errors import BadInputError
+from trilane.stages.dsp.runtime import RuntimeOptions
+
+PROVIDER = "CPUExecutionProvider"
+FLOAT_LAYERS = {"Conv", "FusedConv", "NhwcFusedConv", "ConvTranspose", "Gemm", "FusedGemm", "MatMul", "FusedMatMul"}
+ERRORS_ONLY = 3
+
+
+class OrtBinding:
+    """One IOBinding on two addresses."""
+
+    def __init__(
+        self, session: onnxruntime.InferenceSession, tensor: NDArray[np.uint8], image: NDArray[np.uint8]
+    ) -> None:
+        self._buffers = (tensor, image)
+        self._session = session
+        self._io = session.io_binding()
+        source, target = session.get_inputs()[0], session.get_outputs()[0]
+        self._io.bind_input(source.name, "cpu", 0, np.uint8, tensor.shape, tensor.ctypes.data)
+        self._io.bind_output(target.name, "cpu", 0, np.uint8, image.shape, image.ctypes.data)
+
+    def run(self) -> None:
+        self._session.run_with_iobinding(self._io)
+
+
+class OrtSession:
+    """One inference session with threads of its own."""
+
+    def __init__(self, session: onnxruntime.InferenceSession) -> None:
+        self._session = session
+
+    def bind(self, tensor: NDArray[np.uint8], image: NDArray[np.uint8]) -> OrtBinding:
+        return OrtBinding(self._session, tensor, image)
+
+
+def load(network: NetworkFile, options: RuntimeOptions) -> OrtSession:
+    """Compile `network`. Raises BadInputError when ONNX Runtime cannot, or leaves a layer in float."""
+    with tempfile.TemporaryDirectory(prefix="trilane-ort-") as folder:
+        optimised = Path(folder) / "optimised.onnx"
+        settings = _settings(options)
+        settings.optimized_model_filepath = str(optimised)
+        try:
+            session = onnxruntime.InferenceSession(network.model.SerializeToString(), settings, providers=[PROVIDER])
+        except onnxruntime.capi.onnxruntime_pybind11_state.OrtException as error:
+            raise BadInputError(network.where, str(error), "a network that ONNX Runtime loads") from error
+        check_integer(onnx.load(optimised), network.where)
+    return OrtSession(session)
+
+
+def version() -> str:
+    return f"onnxruntime {onnxruntime.__version__}"
+
+
+def check_integer(optimised: onnx.ModelProto, where: str) -> None:
+    """Raises BadInputError naming the layers of an optimised graph that still compute in float."""
+    left = [node_name(node) for node in optimised.graph.node if node.op_type in FLOAT_LAYERS]
+    if left:
+        raise BadInputError(where, f"layers left in float: {', '.join(left)}", "integer layers", "quantise them")
+
+
+def _settings(options: RuntimeOptions) -> onnxruntime.SessionOptions:
+    settings = onnxruntime.SessionOptions()
+    settings.intra_op_num_threads = options.threads
+    settings.inter_op_num_threads = 1
+    settings.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
+    settings.log_severity_level = ERRORS_ONLY
+    settings.add_session_config_entry("session.intra_op.allow_spinning", str(int(options.spin)))
+    return settings
