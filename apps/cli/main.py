@@ -18,6 +18,7 @@ from trilane.errors import TrilaneError
 
 #: Command: its module, and the line that `trilane --help` shows for it.
 COMMANDS = {
+    "run": ("trilane.apps.cli.run", "Run a scene on the three units and write a run folder."),
     "doctor": ("trilane.apps.cli.doctor", "Say what this machine has, what is missing and how to install it."),
 }
 

@@ -1,0 +1,113 @@
+"""`trilane run`: a scene through the three units, to a run folder and a table.
+
+Rule: this file talks to the person; what is done is in `trilane.apps.configure` and `trilane.apps.run_job`.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from trilane.apps.cli.console import JsonOption, print_json, stderr_console, stdout_console
+
+if TYPE_CHECKING:
+    from trilane.apps.run_job import Hooks, Outcome
+
+app = typer.Typer(rich_markup_mode=None, add_completion=False)
+
+EPILOG = """\b
+Examples:
+  trilane run
+  trilane run --frames 60 --size 192 --out /tmp/run
+  trilane run --motion walk.bvh --camera arkit.txt --frames 200 --json
+  trilane run myscene.toml --background street.mp4 --policy sequential
+"""
+
+
+class PolicyName(StrEnum):
+    """Policies of a run."""
+
+    PIPELINED = "pipelined"
+    SEQUENTIAL = "sequential"
+
+
+@contextmanager
+def _hooks() -> Iterator[Hooks]:
+    """Messages, and a progress bar when stderr is a terminal."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.text import Text
+
+    from trilane.apps.run_job import Hooks
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    bar = Progress(*columns, console=stderr_console(), disable=not sys.stderr.isatty())
+    tasks: dict[str, int] = {}
+
+    def progress(what: str, presented: int, requested: int) -> None:
+        if what not in tasks:
+            tasks[what] = bar.add_task(what, total=requested)
+        bar.update(tasks[what], completed=presented)  # type: ignore[arg-type]
+
+    with bar:
+        yield Hooks(progress, lambda text: bar.console.print(Text(text), soft_wrap=True))
+
+
+def _print_outcome(outcome: Outcome, as_json: bool) -> None:
+    from trilane.apps.cli.run_table import run_table
+
+    if as_json:
+        print_json(outcome.report)
+    else:
+        stdout_console().print(run_table(outcome.report))
+    stderr_console().print(f"run folder: {outcome.folder}", soft_wrap=True, markup=False)
+
+
+@app.command(epilog=EPILOG)
+def run(
+    scene: Annotated[str, typer.Argument(help="A scene file (TOML), or the name of one that comes along.")] = "default",
+    motion: Annotated[str | None, typer.Option(help="SMPL-X .npy, AMASS .npz, .bvh, or builtin:NAME.")] = None,
+    camera: Annotated[str | None, typer.Option(help="ARKit log, TUM, transforms.json, or builtin:NAME.")] = None,
+    background: Annotated[str | None, typer.Option(help="room, or a video, image folder or picture.")] = None,
+    avatar: Annotated[str | None, typer.Option(help="default, or the folder of an avatar.")] = None,
+    frames: Annotated[int | None, typer.Option(help="How many frames to present.")] = None,
+    size: Annotated[str | None, typer.Option(help="Tensor size: HxW, or a side S for areas up to SxS.")] = None,
+    policy: Annotated[PolicyName, typer.Option(help="How frames are scheduled.")] = PolicyName.PIPELINED,
+    runtime: Annotated[
+        str, typer.Option(help="What runs the network: openvino, ort; auto: the fastest there is.")
+    ] = "auto",
+    baseline: Annotated[int, typer.Option(min=0, help="Frames of the sequential run beside it; 0: none.")] = 60,
+    out: Annotated[Path | None, typer.Option(help="Run folder to write; runs/TIME-SCENE when not given.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Run a scene on the three units and write a run folder.
+
+    The folder holds report.json, video.mp4, contact.png, trace.pftrace (open it at ui.perfetto.dev) and events.jsonl.
+    """
+    from trilane.apps.configure import Request, configure, required_machine
+    from trilane.apps.run_folder import default_place
+    from trilane.apps.run_job import Plan, run_to_folder
+
+    request = Request(scene, motion, camera, background, avatar, frames, size, runtime)
+    checked = configure(request, Path.cwd())
+    target = out or default_place(checked.config.scene.name)
+    with _hooks() as hooks:
+        for note in checked.notes:
+            hooks.message(note)
+        outcome = run_to_folder(
+            checked.config,
+            target,
+            Plan(str(policy), baseline),
+            hooks,
+            machine=required_machine(),
+            facts={"accuracy": dict(checked.accuracy), "notes": list(checked.notes)},
+        )
+    _print_outcome(outcome, as_json)
+    if outcome.report["failure"]:
+        stderr_console().print(f"the run failed: {outcome.report['failure']}", soft_wrap=True, markup=False)
+    raise typer.Exit(outcome.exit_code)

@@ -1,0 +1,114 @@
+"""What was asked for on the command line, as a RunConfig whose every part was looked at.
+
+Rule: motion, camera, background, avatar and runtime are opened and checked here, in the parent, so that a bad
+input ends the command before a process is started or a file is made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from trilane.apps.host import allowed_cores, unit_settings
+from trilane.apps.machine import gl_facts, machine_facts
+from trilane.avatars.bundle import Bundle, load_bundle
+from trilane.errors import MissingPartError
+from trilane.scene.camera.load import load_camera
+from trilane.scene.motion.load import load_motion
+from trilane.scene.schema import RunConfig, Scene
+from trilane.scene.validate import find_scene, load_scene, located, scene_from
+from trilane.stages.dsp.runtime import resolve
+from trilane.stages.gpu.background import open_background
+
+GL_INSTALL = "apt-get install libegl1 libgl1-mesa-dri"
+ROOM = "room"
+COMMAND_LINE = "command line"
+
+
+@dataclass(frozen=True)
+class Request:
+    """The options of `trilane run`; None leaves what the scene says."""
+
+    scene: str = "default"
+    motion: str | None = None
+    camera: str | None = None
+    background: str | None = None
+    avatar: str | None = None
+    frames: int | None = None
+    size: str | None = None
+    runtime: str = "auto"
+
+
+@dataclass(frozen=True)
+class Checked:
+    """A configuration that can be run, what the loads said of their sources, and the avatars' own figures."""
+
+    config: RunConfig
+    notes: tuple[str, ...]
+    accuracy: Mapping[str, Any]
+
+
+def requested_scene(request: Request) -> Scene:
+    """The scene file with the options laid over it. Raises BadInputError.
+
+    A motion or camera from the command line drops what the scene says of its own file's format.
+    """
+    values = load_scene(find_scene(request.scene))
+    here = Path.cwd()
+    values.update({key: getattr(request, key) for key in ("frames", "size") if getattr(request, key) is not None})
+    if request.background is not None:
+        values["background"] = located(request.background, here)
+    if request.camera is not None:
+        values["camera"] |= {"source": located(request.camera, here), "format": "auto"}
+    first = dict(values["avatars"][0])
+    if request.motion is not None:
+        first |= {"motion": located(request.motion, here), "up_axis": "auto", "units": "auto"}
+    if request.avatar is not None:
+        first["bundle"] = located(request.avatar, here)
+    values["avatars"] = [first, *values["avatars"][1:]]
+    return scene_from(COMMAND_LINE, values)
+
+
+def configure(request: Request, out_dir: Path) -> Checked:
+    """Look at every part of what was asked for. Raises BadInputError or MissingPartError."""
+    scene = requested_scene(request)
+    bundles = [_checked_bundle(spec.bundle) for spec in scene.avatars]
+    notes = [note for spec in scene.avatars for note in load_motion(spec, Path.cwd()).notes]
+    notes += load_camera(scene.camera, Path.cwd()).notes
+    _check_background(scene)
+    config = RunConfig(
+        scene=scene,
+        out_dir=out_dir,
+        avatar_dirs=tuple(bundle.folder.absolute() for bundle in bundles),
+        units=unit_settings(allowed_cores()),
+        runtime=resolve(request.runtime),
+    )
+    return Checked(config, tuple(notes), {bundle.manifest.name: _accuracy(bundle) for bundle in bundles})
+
+
+def _checked_bundle(name: str) -> Bundle:
+    bundle = load_bundle(name)
+    bundle.read_texture()
+    bundle.read_network()
+    return bundle
+
+
+def _check_background(scene: Scene) -> None:
+    if scene.background != ROOM:
+        open_background(Path(scene.background), (scene.output.height, scene.output.width), scene.fps).close()
+
+
+def _accuracy(bundle: Bundle) -> dict[str, Any]:
+    """The error of the avatar's pictures as its manifest has it; empty when it was never validated."""
+    validation = bundle.manifest.validation
+    return {} if validation is None else validation.model_dump(mode="json")
+
+
+def required_machine() -> dict[str, Any]:
+    """Facts of this machine. Raises MissingPartError when no OpenGL context can be made."""
+    gl = gl_facts()
+    if gl is None:
+        raise MissingPartError("no OpenGL 3.3 context through EGL", GL_INSTALL)
+    return machine_facts(gl)

@@ -1,0 +1,133 @@
+"""One run from a checked configuration to a complete run folder.
+
+Rule: whatever the units did, what is in the folder is whole: a run that was interrupted or failed says so in its
+report and keeps the frames that were presented; a run that presented none leaves no folder.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from trilane.apps.report import build_report, write_report
+from trilane.apps.run_folder import RunFolder
+from trilane.apps.trace import write_trace
+from trilane.apps.video import contact_sheet, join_segments, run_checksum
+from trilane.errors import TrilaneError
+from trilane.scene.schema import RunConfig
+from trilane.scheduler.result import RunResult
+from trilane.scheduler.run import run_pipeline
+from trilane.stages.cpu.present import SEGMENTS
+
+BASELINE_POLICY = "sequential"
+INTERRUPTED = 130
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How to run: the policy, and frames of the sequential run beside it (0: none)."""
+
+    policy: str = "pipelined"
+    baseline_frames: int = 60
+
+
+@dataclass(frozen=True)
+class Hooks:
+    """Who is told. `progress(what, presented, requested)`; `message(text)`."""
+
+    progress: Callable[[str, int, int], None]
+    message: Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """`report` as written, `folder` that holds it, and the exit code that the run asks for."""
+
+    report: dict[str, Any]
+    folder: Path
+    exit_code: int
+
+
+def run_to_folder(
+    config: RunConfig, target: Path, plan: Plan, hooks: Hooks, *, machine: dict[str, Any], facts: Mapping[str, Any]
+) -> Outcome:
+    """Run `config` and leave the run folder at `target`. `facts` are added to the report.
+
+    Raises BadInputError when `target` cannot be written, and TrilaneError when no frame was presented.
+    """
+    with RunFolder(target) as folder:
+        config = config.model_copy(update={"out_dir": folder.work})
+        result = _run(config, plan.policy, None, hooks)
+        baseline = _baseline(config, plan, hooks) if _went_well(result) else None
+        report = build_report(result, config, policy=plan.policy, machine=machine, baseline=baseline)
+        report |= {**facts, **_write_files(result, folder.work, config.scene.fps)}
+        write_report(report, folder.work / "report.json")
+        code = _exit_code(result)
+        return Outcome(report, folder.complete(), code)
+
+
+def _went_well(result: RunResult) -> bool:
+    return not result.interrupted and result.failure is None
+
+
+def _run(config: RunConfig, policy: str, frames: int | None, hooks: Hooks) -> RunResult:
+    """The run under `policy`. Raises TrilaneError when it ended before any frame was presented."""
+    result = run_pipeline(
+        config,
+        policy=policy,
+        frames=frames,
+        on_progress=lambda presented, requested: hooks.progress(policy, presented, requested),
+        on_message=hooks.message,
+    )
+    if result.presented:
+        return result
+    if result.interrupted:
+        raise KeyboardInterrupt
+    raise _error_of(result)
+
+
+def _error_of(result: RunResult) -> TrilaneError:
+    failure = result.failure
+    error = TrilaneError(failure.message if failure else "no frame was presented: " + "; ".join(result.messages))
+    error.exit_code = failure.exit_code if failure else error.exit_code
+    return error
+
+
+def _baseline(config: RunConfig, plan: Plan, hooks: Hooks) -> RunResult | None:
+    """The first frames of the same scene again, one frame at a time, with the same work; its pictures are not kept."""
+    if not plan.baseline_frames or plan.policy == BASELINE_POLICY:
+        return None
+    place = config.out_dir / BASELINE_POLICY
+    place.mkdir()
+    config = config.model_copy(update={"out_dir": place})
+    result = _run(config, BASELINE_POLICY, min(plan.baseline_frames, config.scene.frames), hooks)
+    shutil.rmtree(place)
+    if not _went_well(result):
+        hooks.message(f"the {BASELINE_POLICY} run beside it did not complete and is left out")
+        return None
+    return result
+
+
+def _exit_code(result: RunResult) -> int:
+    if result.interrupted:
+        return INTERRUPTED
+    return 0 if result.failure is None else result.failure.exit_code
+
+
+def _write_files(result: RunResult, work: Path, fps: float) -> dict[str, Any]:
+    """Everything but the report; what the report says of it."""
+    segments = work / SEGMENTS
+    files: dict[str, Any] = {"video": None, "checksum": None}
+    if segments.is_dir():
+        joined = join_segments(sorted(segments.glob("*.mp4")), work / "video.mp4", fps)
+        files["checksum"] = run_checksum(sorted(segments.glob("*.sha256")))
+        if joined is not None:
+            files["video"] = {"frames": joined.frames, "seconds": joined.seconds}
+            contact_sheet(work / "video.mp4", work / "contact.png", fps)
+        shutil.rmtree(segments)
+    result.recording.write(work / "events.jsonl")
+    write_trace(result.jobs, work / "trace.pftrace")
+    return files

@@ -1,0 +1,190 @@
+"""The run folder, the trace, the report and the table of a run, made from a run written by hand."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace, TrackEvent
+
+from trilane.apps.cli.run_table import run_table
+from trilane.apps.host import unit_settings
+from trilane.apps.report import read_report, write_report
+from trilane.apps.run_folder import RunFolder, default_place
+from trilane.apps.trace import write_trace
+from trilane.errors import BadInputError
+from trilane.scheduler.result import JobRecord
+
+TIMES = {"mean": 20.0, "p50": 20.0, "p90": 21.0, "p95": 22.0, "p99": 23.0, "max": 24.0}
+SHARE = {"busy": 0.5, "idle": {"starved": 0.25, "blocked": 0.15, "throttled": 0.0, "overhead": 0.1}}
+JOBS = (
+    JobRecord("pose", "cpu", 0, 1_000, 1_500, 2_000, 3_000),
+    JobRecord("raster", "gpu", 0, 3_000, 3_500, 4_000, 9_000),
+    JobRecord("pose", "cpu", 1, 3_000, 3_000, 4_000, 5_000),
+)
+
+
+def make_report(**changes: Any) -> dict[str, Any]:
+    run = {
+        "frames": {"requested": 3, "presented": 3, "lost": 0, "dropped": {"raster->infer:stale": 1}},
+        "frame_time_ms": {**TIMES, "ema20_min": 19.0, "ema20_max": 21.0},
+        "latency_ms": TIMES,
+        "fps": 50.0,
+        "deadline_misses": 0,
+        "stages": {"infer": {"unit": "dsp", "service_ms": TIMES, "wait_ms": TIMES}},
+        "units": {"dsp": SHARE},
+        "efficiency": 0.91,
+    }
+    config = {
+        "policy": "pipelined",
+        "runtime": "ort",
+        "units": {"dsp": {"cores": [2, 3], "threads": 2, "spin": True}},
+        "scene": {"name": "test", "size": "256", "output": {"width": 640, "height": 480}},
+    }
+    return {
+        "schema": 1,
+        "clock": "host",
+        "machine": {"cpu": {"model": "a processor", "flags": ["avx2"]}, "gl": None},
+        "config": config,
+        "plan": {},
+        "temperature_c": {},
+        "caps": {},
+        **run,
+        "baseline": {**run, "policy": "sequential", "efficiency": None},
+        "accuracy": {"someone": {"psnr_db_by_band": {"face": 31.25}, "iou": 0.9812}},
+        **changes,
+    }
+
+
+def test_a_folder_has_its_name_once_it_is_complete(tmp_path: Path) -> None:
+    target = tmp_path / "a" / "run"
+    with RunFolder(target) as folder:
+        (folder.work / "report.json").write_text("{}")
+        assert not target.exists()
+        assert folder.work.name.endswith(f"{os.getpid()}.partial")
+        assert folder.complete() == target
+    assert [path.name for path in target.iterdir()] == ["report.json"]
+    assert [path.name for path in target.parent.iterdir()] == ["run"]
+
+
+def test_a_folder_that_was_not_completed_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt), RunFolder(tmp_path / "a" / "b" / "run") as folder:
+        (folder.work / "half").write_text("half")
+        raise KeyboardInterrupt
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_exists_is_refused_and_kept(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "mine").write_text("mine")
+    with pytest.raises(BadInputError, match="a name that is free"), RunFolder(tmp_path / "run"):
+        pass
+    assert (tmp_path / "run" / "mine").read_text() == "mine"
+
+
+def test_a_place_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("a file")
+    with pytest.raises(BadInputError, match="choose another --out"), RunFolder(tmp_path / "file" / "run"):
+        pass
+
+
+def test_a_name_taken_in_the_meantime_loses_nothing(tmp_path: Path) -> None:
+    target = tmp_path / "run"
+    with pytest.raises(BadInputError, match="the run is in"), RunFolder(target) as folder:
+        (folder.work / "report.json").write_text("{}")
+        target.mkdir()
+        (target / "other").write_text("other")
+        folder.complete()
+    assert (folder.work / "report.json").exists()
+    assert (target / "other").exists()
+
+
+def test_the_default_place_is_free_and_named_after_the_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    first = default_place("../my scene")
+    assert first.parent == Path("runs")
+    assert first.name.endswith("Z----my-scene")
+
+
+def test_the_trace_has_a_track_per_unit_and_a_flow_per_frame(tmp_path: Path) -> None:
+    write_trace(JOBS, tmp_path / "trace.pftrace")
+    trace = Trace()
+    trace.ParseFromString((tmp_path / "trace.pftrace").read_bytes())
+    tracks = {p.track_descriptor.uuid: p.track_descriptor.name for p in trace.packet if p.HasField("track_descriptor")}
+    assert sorted(tracks.values()) == ["cpu", "gpu", "trilane"]
+    begins = [p for p in trace.packet if p.track_event.type == TrackEvent.TYPE_SLICE_BEGIN]
+    ends = [p for p in trace.packet if p.track_event.type == TrackEvent.TYPE_SLICE_END]
+    found = {
+        (p.track_event.name, tracks[p.track_event.track_uuid], p.timestamp, tuple(p.track_event.flow_ids))
+        for p in begins
+    }
+    assert found == {("pose", "cpu", 2_000, (1,)), ("raster", "gpu", 4_000, (1,)), ("pose", "cpu", 4_000, (2,))}
+    assert sorted(p.timestamp for p in ends) == [3_000, 5_000, 9_000]
+
+
+def test_a_report_is_read_back_from_its_folder(tmp_path: Path) -> None:
+    write_report(make_report(), tmp_path / "report.json")
+    report = read_report(tmp_path)
+    assert report.frames.presented == 3
+    assert report.stages["infer"].unit == "dsp"
+    assert report.units["dsp"].idle.blocked == 0.15
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [({"fps": "fast"}, "fps"), ({"clock": "sun"}, "clock"), ({"units": {"dsp": {"busy": 1}}}, "units.dsp.idle")],
+)
+def test_a_damaged_report_is_named_with_its_key(tmp_path: Path, change: dict[str, Any], named: str) -> None:
+    (tmp_path / "report.json").write_text(json.dumps(make_report(**change)))
+    with pytest.raises(BadInputError, match=f"report.json: {named}"):
+        read_report(tmp_path)
+
+
+def test_a_missing_report_is_a_bad_input(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="no such file"):
+        read_report(tmp_path / "nothing")
+
+
+def test_a_report_never_holds_nan(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="JSON"):
+        write_report(make_report(fps=float("nan")), tmp_path / "report.json")
+
+
+def test_the_table_shows_both_policies_and_dashes_what_was_not_measured() -> None:
+    from rich.console import Console
+
+    console = Console(width=140, record=True, file=io.StringIO())
+    console.print(run_table(make_report()))
+    text = console.export_text()
+    for expected in (
+        "pipelined, 3 frames",
+        "sequential, 3 frames",
+        "20.0 + 20.0",
+        "50 / 25 15 0 10",
+        "0.91",
+        "face 31.2 dB",
+    ):
+        assert expected in text
+    efficiency = next(line for line in text.splitlines() if "efficiency" in line)
+    assert "–" in efficiency
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 8, 16])
+def test_units_get_disjoint_cores_when_there_are_three(count: int) -> None:
+    units = unit_settings(range(count))
+    cores = [core for settings in units.values() for core in settings.cores]
+    assert set(cores) == set(range(count))
+    assert (len(cores) == len(set(cores))) == (count >= 3)
+    assert all(settings.threads == len(settings.cores) for settings in units.values())
+    if count == 2:
+        assert units["dsp"].cores == (1,)
+        assert units["dsp"].spin and not units["cpu"].spin
+
+
+def test_no_core_is_refused() -> None:
+    with pytest.raises(ValueError, match="no core"):
+        unit_settings([])

@@ -1,0 +1,74 @@
+"""Scene files: what is wrong is named by file and key, paths start at the file's folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from trilane.errors import BadInputError
+from trilane.scene.schema import Scene
+from trilane.scene.validate import find_scene, load_scene, scene_from, scene_names
+
+WRONG = {
+    "size = '100'": ("size", "found side 100", "a multiple of 32"),
+    "size = 'wide'": ("size", "found 'wide'", "HEIGHTxWIDTH"),
+    "frames = 0": ("frames", "found 0", "greater than or equal to 1"),
+    "fps = nan": ("fps", "found nan", "a finite number"),
+    "colour = 1": ("colour", "an unknown key", "a key of the scene schema"),
+    "avatars = []": ("avatars", "found []", "at least 1"),
+    "[output]\nwidth = 641": ("output.width", "found 641", "a multiple of 2"),
+    "[[avatars]]\nup_axis = 'x'": ("avatars.0.up_axis", "found 'x'", "'auto', 'y' or 'z'"),
+    "[camera]\nnear_m = 5\nfar_m = 1": ("camera", "near_m 5.0", "far_m 1.0"),
+    "frames 3": ("", "no valid TOML", "line 1"),
+}
+
+
+def write(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "scene.toml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("text", WRONG)
+def test_what_is_wrong_is_named_by_file_and_key(tmp_path: Path, text: str) -> None:
+    path = write(tmp_path, text)
+    with pytest.raises(BadInputError) as raised:
+        load_scene(path)
+    key, *parts = WRONG[text]
+    assert str(raised.value).startswith(f"{path}: {key}")
+    assert "\n" not in str(raised.value)
+    for part in parts:
+        assert part in str(raised.value)
+
+
+@pytest.mark.parametrize(("content", "part"), [(b"", "an empty file"), (b"\xff\xfe\x00", "cannot be read as text")])
+def test_a_file_that_is_no_text_is_refused(tmp_path: Path, content: bytes, part: str) -> None:
+    (tmp_path / "scene.toml").write_bytes(content)
+    with pytest.raises(BadInputError, match=part):
+        load_scene(tmp_path / "scene.toml")
+
+
+def test_paths_start_at_the_scene_file(tmp_path: Path) -> None:
+    text = "background='b.png'\n[camera]\nsource='c.txt'\n[[avatars]]\nmotion='m.bvh'\n[[avatars]]\nbundle='/x/y'\n"
+    scene = scene_from("scene", load_scene(write(tmp_path, text)))
+    assert scene.name == "scene"
+    assert scene.background == str(tmp_path / "b.png")
+    assert scene.camera.source == str(tmp_path / "c.txt")
+    assert [avatar.motion for avatar in scene.avatars] == [str(tmp_path / "m.bvh"), "builtin:walk-wave-turn"]
+    assert [avatar.bundle for avatar in scene.avatars] == ["default", "/x/y"]
+
+
+def test_every_scene_that_comes_along_is_valid() -> None:
+    assert "default" in scene_names()
+    for name in scene_names():
+        assert scene_from(name, load_scene(find_scene(name))).name == name
+
+
+def test_the_default_scene_says_what_the_schema_says() -> None:
+    assert scene_from("default", load_scene(find_scene("default"))) == Scene(name="default")
+
+
+def test_a_scene_that_is_neither_file_nor_name_is_refused() -> None:
+    with pytest.raises(BadInputError, match="one of .*default"):
+        find_scene("beach")
