@@ -70,5 +70,5 @@ def test_the_default_scene_says_what_the_schema_says() -> None:
 
 
 def test_a_scene_that_is_neither_file_nor_name_is_refused() -> None:
-    with pytest.raises(BadInputError, match="one of .*default"):
+    with pytest.raises(BadInputError, match=r"one of .*default"):
         find_scene("beach")
