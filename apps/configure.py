@@ -11,14 +11,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from trilane.apps.host import allowed_cores, unit_settings
 from trilane.apps.machine import gl_facts, machine_facts
 from trilane.avatars.bundle import Bundle, load_bundle
 from trilane.errors import MissingPartError
+from trilane.hw_profiles.host import host_units
 from trilane.scene.camera.load import load_camera
 from trilane.scene.motion.load import load_motion
 from trilane.scene.schema import RunConfig, Scene
 from trilane.scene.validate import find_scene, load_scene, located, scene_from
+from trilane.stages.cpu.body import load_body
 from trilane.stages.dsp.runtime import resolve
 from trilane.stages.gpu.background import open_background
 
@@ -82,7 +83,7 @@ def configure(request: Request, out_dir: Path) -> Checked:
         scene=scene,
         out_dir=out_dir,
         avatar_dirs=tuple(bundle.folder.absolute() for bundle in bundles),
-        units=unit_settings(allowed_cores()),
+        units=host_units(),
         runtime=resolve(request.runtime),
     )
     return Checked(config, tuple(notes), {bundle.manifest.name: _accuracy(bundle) for bundle in bundles})
@@ -90,6 +91,7 @@ def configure(request: Request, out_dir: Path) -> Checked:
 
 def _checked_bundle(name: str) -> Bundle:
     bundle = load_bundle(name)
+    load_body(bundle.body_path)
     bundle.read_texture()
     bundle.read_network()
     return bundle

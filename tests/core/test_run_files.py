@@ -12,7 +12,6 @@ import pytest
 from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace, TrackEvent
 
 from trilane.apps.cli.run_table import run_table
-from trilane.apps.host import unit_settings
 from trilane.apps.report import read_report, write_report
 from trilane.apps.run_folder import RunFolder, default_place
 from trilane.apps.trace import write_trace
@@ -171,20 +170,3 @@ def test_the_table_shows_both_policies_and_dashes_what_was_not_measured() -> Non
         assert expected in text
     efficiency = next(line for line in text.splitlines() if "efficiency" in line)
     assert "–" in efficiency
-
-
-@pytest.mark.parametrize("count", [1, 2, 3, 4, 8, 16])
-def test_units_get_disjoint_cores_when_there_are_three(count: int) -> None:
-    units = unit_settings(range(count))
-    cores = [core for settings in units.values() for core in settings.cores]
-    assert set(cores) == set(range(count))
-    assert (len(cores) == len(set(cores))) == (count >= 3)
-    assert all(settings.threads == len(settings.cores) for settings in units.values())
-    if count == 2:
-        assert units["dsp"].cores == (1,)
-        assert units["dsp"].spin and not units["cpu"].spin
-
-
-def test_no_core_is_refused() -> None:
-    with pytest.raises(ValueError, match="no core"):
-        unit_settings([])
