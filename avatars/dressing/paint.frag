@@ -213,10 +213,10 @@ void main() {
     vec3 linear_colour = pow(clamp(paint(v_rest), 0.0, 1.0), vec3(2.2));
     vec3 to_eye = normalize(eye - v_position);
     vec3 normal = normalize(v_normal);
-    bool inside = !gl_FrontFacing;
+    bool inside = gl_FrontFacing;  // rows of the target run from the top, which turns triangles round
     if (dot(normal, to_eye) < 0.0) normal = -normal;
     vec3 lamp = normalize(transpose(mat3(view)) * vec3(0.25, 0.45, 1.0));
-    float lit = 0.52 + 0.80 * pow(0.5 + 0.5 * dot(normal, lamp), 1.5);
+    float lit = 0.40 + 0.62 * pow(0.5 + 0.5 * dot(normal, lamp), 1.5);
     float shade = lit * mix(0.45, 1.0, clamp(v_colour.r, 0.0, 1.0));
-    pixel = vec4(linear_colour * shade * (inside ? 0.35 : 1.0), 1.0);
+    pixel = vec4(linear_colour * shade * (inside ? 0.45 : 1.0), 1.0);
 }
