@@ -2,10 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+import os
+from collections.abc import Callable, Iterator
 
+from trilane.errors import BadInputError
 from trilane.scene.schema import RunConfig
+from trilane.scheduler.events import Graph, Settings, avatar_graph
+from trilane.scheduler.policy import policy_named
+from trilane.scheduler.processes import UnitProcesses
+from trilane.scheduler.realtime import RealtimeDriver
 from trilane.scheduler.result import RunResult
+from trilane.scheduler.signals import Interrupts
+from trilane.stages.contracts import SlotLayout
+from trilane.stages.unit_loop import EdgeSpec
+from trilane.transport.memory import RegionLayout, create_region
+from trilane.transport.slots import edge_rule
+
+MAX_CHANNELS = 16  # of a tensor: what the GPU packs in one pass
+DEADLINE_PERIODS = 3  # from a frame's release until it must be presented: one period for each unit
+HANG_NS = 10_000_000_000
 
 
 def run_pipeline(
@@ -16,6 +32,7 @@ def run_pipeline(
     frames: int | None = None,
     pace_fps: float | None = None,
     isolate_frames: int = 8,
+    hang_ns: int = HANG_NS,
     on_progress: Callable[[int, int], None] | None = None,
     on_message: Callable[[str], None] | None = None,
 ) -> RunResult:
@@ -24,11 +41,140 @@ def run_pipeline(
     `policy`: sequential, pipelined, latest, deadline. `edge`: single, double, triple, fifo:N, orphan[:N].
     `pace_fps`: frames are released at that rate; None releases them as fast as they are taken (`latest` and
     `deadline` are always paced, by the scene's fps when None). `isolate_frames`: frames measured with the other
-    units quiet before the run, which efficiency needs; 0 leaves both out. `on_progress(presented, requested)` and
-    `on_message(text)` are called from this thread. SIGINT or SIGTERM ends the run cleanly with its result marked
-    `interrupted`; a second one ends the units at once.
+    units quiet before the run, which efficiency needs; 0 warms up and leaves both out. `hang_ns`: a unit whose job
+    takes longer is restarted. `on_progress(presented, requested)` and `on_message(text)` are called from this
+    thread. SIGINT or SIGTERM ends the run cleanly with its result marked `interrupted`; a second one ends the units
+    at once; before the first frame KeyboardInterrupt is raised instead.
 
-    Raises BadInputError, MissingPartError or another TrilaneError when a unit cannot start; a failure after that
-    is `RunResult.failure`.
+    Raises BadInputError for an unknown policy or edge, TrilaneError (with the exit code of the unit's error) when a
+    unit cannot start; a failure after that is `RunResult.failure`.
     """
-    raise NotImplementedError("being written")
+    graph, settings = _plan(config, policy, edge, frames or config.scene.frames, pace_fps, hang_ns)
+    with (
+        Interrupts() as interrupts,
+        _on_cores(config.units[graph.stages[0].unit].cores),
+        _regions(config, graph) as edges,
+        _processes(config, edges, graph) as processes,
+    ):
+        driver = RealtimeDriver(graph, settings, processes, interrupts, on_progress, on_message)
+        driver.start()
+        pids = processes.pids
+        alone = driver.measure_alone(_spread(settings.frames, max(isolate_frames, 1)))
+        cause = driver.run()
+        pids = {**pids, **processes.pids}
+        driver.close()
+    target_ns = 0 if settings.deadline_ns else round(1e9 / config.scene.fps)
+    report = driver.core.ledger.report(
+        clock="host",
+        requested=settings.frames,
+        target_period_ns=target_ns,
+        isolated_ns=alone if isolate_frames else None,
+    )
+    report.update(policy=policy, edge=edge)
+    for unit, row in report["units"].items():
+        row.update(pid=pids[unit], **config.units[unit].model_dump(mode="json"))
+    return RunResult(
+        report=report,
+        requested=settings.frames,
+        presented=len(driver.core.ledger.presented_ns),
+        lost=dict(driver.core.ledger.lost),
+        dropped=dict(driver.core.ledger.dropped),
+        pids=pids,
+        startup_ms=driver.startup_ms,
+        jobs=tuple(driver.jobs),
+        recording=driver.recording,
+        figures={stage: _means(driver, stage) for stage in driver.figures},
+        messages=tuple(driver.messages),
+        interrupted=cause in ("stopped", "aborted") and interrupts.count > 0,
+        failure=driver.failure,
+    )
+
+
+def edge_payload_bytes(config: RunConfig) -> dict[str, int]:
+    """Bytes of payload of each edge, for the largest tensor that the scene's size allows."""
+    avatars = len(config.scene.avatars)
+    output = config.scene.output
+    return {
+        "pose->raster": 0,
+        "raster->infer": avatars * config.max_tensor_pixels * MAX_CHANNELS,
+        "infer->composite": avatars * config.max_tensor_pixels * 4,
+        "composite->present": output.width * output.height * 3,
+    }
+
+
+def _plan(
+    config: RunConfig, policy: str, edge: str, frames: int, pace_fps: float | None, hang_ns: int
+) -> tuple[Graph, Settings]:
+    try:
+        paced = policy_named(policy).paced
+        edge_rule(edge)
+    except ValueError as error:
+        raise BadInputError("the run's settings", *_split_message(error)) from None
+    fps = pace_fps or (config.scene.fps if paced else None)
+    period_ns = round(1e9 / fps) if fps else 0
+    settings = Settings(
+        frames=frames,
+        policy=policy,
+        period_ns=period_ns,
+        deadline_ns=DEADLINE_PERIODS * period_ns,
+        hang_ns=hang_ns,
+        beats=True,
+    )
+    return avatar_graph(edge), settings
+
+
+def _split_message(error: ValueError) -> tuple[str, str]:
+    found, _, expected = str(error).removeprefix("found ").partition(", expected ")
+    return found, expected
+
+
+def _spread(frames: int, count: int) -> list[int]:
+    count = min(count, frames)
+    return [index * frames // count for index in range(count)]
+
+
+def _means(driver: RealtimeDriver, stage: str) -> dict[str, float]:
+    jobs = sum(record.stage == stage for record in driver.jobs)
+    return {name: total / max(jobs, 1) for name, total in driver.figures[stage].items()}
+
+
+@contextlib.contextmanager
+def _on_cores(cores: tuple[int, ...]) -> Iterator[None]:
+    """The scheduler runs with the CPU unit, off the cores of the others."""
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, cores)
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
+
+
+@contextlib.contextmanager
+def _regions(config: RunConfig, graph: Graph) -> Iterator[dict[str, EdgeSpec]]:
+    edges: dict[str, EdgeSpec] = {}
+    avatars = len(config.scene.avatars)
+    try:
+        for index, text in enumerate(graph.edges):
+            name = graph.edge_name(index)
+            payload = edge_payload_bytes(config)[name]
+            slots = edge_rule(text).slots
+            fd = create_region(name, RegionLayout(slots, SlotLayout(avatars, payload)))
+            edges[name] = EdgeSpec(fd=fd, slots=slots, avatars=avatars, payload_bytes=payload)
+        yield edges
+    finally:
+        for edge in edges.values():
+            os.close(edge.fd)
+
+
+@contextlib.contextmanager
+def _processes(config: RunConfig, edges: dict[str, EdgeSpec], graph: Graph) -> Iterator[UnitProcesses]:
+    stages: dict[str, dict[str, tuple[str | None, str | None]]] = {unit: {} for unit in graph.units}
+    last = len(graph.stages) - 1
+    for position, stage in enumerate(graph.stages):
+        source = graph.edge_name(position - 1) if position else None
+        stages[stage.unit][stage.name] = (source, graph.edge_name(position) if position < last else None)
+    processes = UnitProcesses(config, edges, stages)
+    try:
+        yield processes
+    finally:
+        processes.end_all()

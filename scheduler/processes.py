@@ -1,0 +1,201 @@
+"""The units' processes, seen from the parent. Rule: what was started here is ended here, and its end is always noticed.
+
+A unit speaks over its link, its stderr over a pipe, and its death over a pidfd; all are waited for at once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import zmq
+
+from trilane.errors import TrilaneError
+from trilane.scene.schema import RunConfig
+from trilane.stages.unit_loop import EdgeSpec, UnitSpec
+from trilane.transport.bus import BusFolder, Link
+from trilane.transport.messages import Message, MessageError
+
+TAIL_BYTES = 8192
+END_S = 2.0
+#: Libraries that make threads of their own read these; set before they are imported.
+THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+
+
+class Heard(NamedTuple):
+    """Something from a unit: a message, or None when its process has ended."""
+
+    unit: str
+    message: Message | None
+
+
+class _Process:
+    def __init__(self, unit: str, popen: subprocess.Popen[bytes], link: Link, folder: BusFolder) -> None:
+        assert popen.stderr is not None
+        self.unit, self.popen, self.link, self.folder = unit, popen, link, folder
+        self.stderr = popen.stderr
+        self.pidfd = os.pidfd_open(popen.pid)
+        self.tail = b""
+        self.folder_open = True
+        os.set_blocking(self.stderr.fileno(), False)
+
+    def read_stderr(self) -> bool:
+        """Keep the end of what was written; False when the pipe is closed."""
+        with contextlib.suppress(BlockingIOError):
+            while chunk := os.read(self.stderr.fileno(), TAIL_BYTES):
+                self.tail = (self.tail + chunk)[-TAIL_BYTES:]
+            return False
+        return True
+
+    def release_folder(self) -> None:
+        if self.folder_open:
+            self.folder_open = False
+            self.folder.remove()
+
+
+class UnitProcesses:
+    """Starts, hears and ends the processes of the units in `stages` (unit -> stage -> input and output edge)."""
+
+    def __init__(
+        self,
+        config: RunConfig,
+        edges: Mapping[str, EdgeSpec],
+        stages: Mapping[str, Mapping[str, tuple[str | None, str | None]]],
+    ) -> None:
+        self._config, self._edges, self._stages = config, edges, stages
+        self._context = zmq.Context()
+        self._poller = zmq.Poller()
+        self._sources: dict[object, tuple[str, _Process | None]] = {}
+        self._live: dict[str, _Process] = {}
+        self.last_words: dict[str, str] = {}
+
+    @property
+    def pids(self) -> dict[str, int]:
+        return {unit: process.popen.pid for unit, process in self._live.items()}
+
+    def watch(self, fd: int) -> None:
+        """Let `listen` return early when `fd` becomes readable."""
+        self._register(fd, "wake", None)
+
+    def start(self, unit: str) -> None:
+        """A fresh process for the unit; `Ready` or `Failed` follows, or its end."""
+        folder = BusFolder()
+        link = Link(self._context)
+        link.socket.bind(folder.endpoint(unit))
+        stages = dict(self._stages[unit])
+        used = {edge for pair in stages.values() for edge in pair if edge is not None}
+        edges = {name: self._edges[name] for name in used}
+        spec = UnitSpec(
+            parent_pid=os.getpid(),
+            endpoint=folder.endpoint(unit),
+            config=self._config,
+            edges=edges,
+            stages=stages,
+        )
+        process = _Process(unit, self._spawn(unit, spec), link, folder)
+        self._live[unit] = process
+        self._register(link.socket, "link", process)
+        self._register(process.pidfd, "end", process)
+        self._register(process.stderr.fileno(), "stderr", process)
+
+    def connected(self, unit: str) -> None:
+        """The unit has spoken: its socket needs no name any more."""
+        self._live[unit].release_folder()
+
+    def send(self, unit: str, message: Message) -> None:
+        """To a unit that is gone or does not read: nothing, its end or its deadline tells."""
+        process = self._live.get(unit)
+        if process is not None:
+            with contextlib.suppress(zmq.Again):
+                process.link.send(message)
+
+    def kill(self, unit: str) -> None:
+        if unit in self._live:
+            self._live[unit].popen.kill()
+
+    def listen(self, timeout_ms: int | None) -> list[Heard]:
+        """What came within the time; at once when something waits. Messages of a unit come before its end."""
+        heard: list[Heard] = []
+        ended = []
+        for source, _ in self._poller.poll(timeout_ms):
+            kind, process = self._sources[source]
+            if kind == "wake":
+                os.read(source, 64)
+            elif process is None:
+                continue
+            elif kind == "link":
+                heard += self._messages(process)
+            elif kind == "end":
+                ended.append(process)
+            elif not process.read_stderr():
+                self._unregister(source)
+        for process in ended:
+            heard += self._messages(process)
+            self._forget(process)
+            heard.append(Heard(process.unit, None))
+        return heard
+
+    def end_all(self) -> None:
+        """No process is left when this returns, however it was before."""
+        for process in list(self._live.values()):
+            process.popen.kill()
+        for process in list(self._live.values()):
+            self._forget(process)
+        self._context.destroy(linger=0)
+
+    def wait_for_end(self, units: list[str], timeout_s: float = END_S) -> None:
+        """Give units that were told to close the time to leave by themselves."""
+        end = time.monotonic() + timeout_s
+        while any(unit in self._live for unit in units) and time.monotonic() < end:
+            self.listen(50)
+
+    def _messages(self, process: _Process) -> list[Heard]:
+        heard = []
+        try:
+            while (message := process.link.receive()) is not None:
+                heard.append(Heard(process.unit, message))
+        except MessageError as error:
+            raise TrilaneError(f"unit {process.unit} sent what is no message: {error}") from None
+        return heard
+
+    def _spawn(self, unit: str, spec: UnitSpec) -> subprocess.Popen[bytes]:
+        fd = os.memfd_create(f"trilane:spec:{unit}", os.MFD_CLOEXEC)
+        try:
+            os.write(fd, spec.model_dump_json().encode())
+            threads = str(self._config.units[unit].threads)
+            return subprocess.Popen(
+                [sys.executable, "-P", "-m", "trilane.stages.worker", "--unit", unit, "--spec", str(fd)],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                pass_fds=[fd, *(edge.fd for edge in spec.edges.values())],
+                env={**os.environ, **dict.fromkeys(THREAD_LIMITS, threads), "TRILANE_UNIT": unit},
+                process_group=0,
+            )
+        finally:
+            os.close(fd)
+
+    def _forget(self, process: _Process) -> None:
+        process.popen.wait()
+        process.read_stderr()
+        self.last_words[process.unit] = process.tail.decode(errors="replace").strip()
+        for source in (process.link.socket, process.pidfd, process.stderr.fileno()):
+            self._unregister(source)
+        process.link.close()
+        process.release_folder()
+        os.close(process.pidfd)
+        process.stderr.close()
+        del self._live[process.unit]
+
+    def _register(self, source: object, kind: str, process: _Process | None) -> None:
+        self._poller.register(source, zmq.POLLIN)
+        self._sources[source] = (kind, process)
+
+    def _unregister(self, source: object) -> None:
+        if self._sources.pop(source, None) is not None:
+            self._poller.unregister(source)

@@ -1,0 +1,271 @@
+"""The driver on the host's clock. Rule: it waits, tells the core, and does what the core says; it decides nothing.
+
+Before the run it brings the units up, warms them, and measures each stage while the others are quiet.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable
+from statistics import fmean
+
+from trilane.errors import TrilaneError
+from trilane.scheduler.core import Core
+from trilane.scheduler.events import (
+    Action,
+    Beat,
+    Dispatch,
+    Event,
+    Finish,
+    Graph,
+    Job,
+    JobDone,
+    JobFailed,
+    Kill,
+    Settings,
+    Start,
+    Stop,
+    UnitDied,
+    UnitReady,
+)
+from trilane.scheduler.processes import Heard, UnitProcesses
+from trilane.scheduler.record import Recording
+from trilane.scheduler.result import Failure, JobRecord
+from trilane.scheduler.signals import Interrupts
+from trilane.transport.messages import (
+    Alive,
+    Close,
+    Closed,
+    Done,
+    Durations,
+    Failed,
+    Isolate,
+    Ready,
+    RunJob,
+)
+
+START_S = 120.0
+CLOSE_S = 30.0
+ISOLATE_LIMIT_S = 10.0  # frames measured alone: no more are begun after this
+REPEATS = 3
+PROGRESS_S = 0.1
+
+
+class UnitError(TrilaneError):
+    """A unit could not start or be measured; `exit_code` is the one of the error in the unit."""
+
+    def __init__(self, message: str, exit_code: int = 1) -> None:
+        super().__init__(message)
+        self.exit_code = exit_code
+
+
+class RealtimeDriver:
+    """One run over `processes`. Use in order: start, measure_alone, run, close."""
+
+    def __init__(
+        self,
+        graph: Graph,
+        settings: Settings,
+        processes: UnitProcesses,
+        interrupts: Interrupts,
+        on_progress: Callable[[int, int], None] | None = None,
+        on_message: Callable[[str], None] | None = None,
+    ) -> None:
+        self.core = Core(graph, settings)
+        self.recording = Recording(graph, settings)
+        self.jobs: list[JobRecord] = []
+        self.figures: dict[str, Counter[str]] = defaultdict(Counter)
+        self.messages: list[str] = []
+        self.failure: Failure | None = None
+        self.startup_ms: dict[str, float] = {}
+        self._graph, self._processes, self._interrupts = graph, processes, interrupts
+        self._on_progress, self._on_message = on_progress, on_message
+        self._open: dict[int, tuple[Job, int]] = {}
+        self._started_s: dict[str, float] = {}
+        self._progress_s = 0.0
+        self._stop_told = False
+        processes.watch(interrupts.fd)
+
+    # before the run
+
+    def start(self) -> None:
+        """Every unit up and bound. Raises UnitError when one cannot, KeyboardInterrupt when interrupted."""
+        waiting = set(self._graph.units)
+        for unit in self._graph.units:
+            self._start(unit)
+        end = time.monotonic() + START_S
+        while waiting:
+            if time.monotonic() > end:
+                raise UnitError(f"unit {', '.join(sorted(waiting))} was not ready after {START_S:.0f} s")
+            for unit, message in self._listen_before_run(waiting):
+                if isinstance(message, Ready):
+                    self._ready(unit)
+                    waiting.discard(unit)
+
+    def measure_alone(self, frames: list[int]) -> dict[str, float]:
+        """Mean service time in ns of each stage but the last (it writes files), the other units quiet.
+
+        Each of `frames` goes down the chain through the first slot of every edge; each stage repeats its job and
+        the first time is left out. Raises UnitError when a stage fails.
+        """
+        alone: dict[str, list[float]] = defaultdict(list)
+        end = time.monotonic() + ISOLATE_LIMIT_S
+        for frame in frames:
+            if alone and time.monotonic() > end:
+                break
+            for position, stage in enumerate(self._graph.stages[:-1]):
+                slot_in = 0 if position else -1
+                self._processes.send(stage.unit, Isolate(stage.name, frame, slot_in, 0, REPEATS))
+                alone[stage.name].append(fmean(self._durations(stage.unit)[1:]))
+        return {name: fmean(values) for name, values in alone.items()}
+
+    def _durations(self, unit: str) -> list[int]:
+        end = time.monotonic() + START_S
+        while time.monotonic() < end:
+            for speaker, message in self._listen_before_run({unit}):
+                if speaker == unit and isinstance(message, Durations):
+                    return message.values
+        raise UnitError(f"unit {unit} did not end a job within {START_S:.0f} s")
+
+    def _listen_before_run(self, _waiting: set[str]) -> list[Heard]:
+        heard = self._processes.listen(200)
+        if self._interrupts.count:
+            raise KeyboardInterrupt
+        for unit, message in heard:
+            if isinstance(message, Failed):
+                raise UnitError(message.message, message.exit_code)
+            if message is None:
+                raise UnitError(f"unit {unit} ended before the run began{self._last_words(unit)}")
+        return heard
+
+    # the run
+
+    def run(self) -> str:
+        """Until the core finishes; returns its cause, or `aborted` after a second interrupt."""
+        events: list[Event] = [UnitReady(unit) for unit in self._graph.units]
+        while True:
+            now_ns = time.monotonic_ns()
+            decision = self.core.step(now_ns, tuple(events))
+            self.recording.steps.append((now_ns, tuple(events), decision.actions))
+            for action in decision.actions:
+                self._perform(now_ns, action)
+            if self.core.finished:
+                self._progress(final=True)
+                return self._cause(decision.actions)
+            if self._interrupts.count > 1:
+                return self._abort()
+            self._progress()
+            events = self._wait(decision.next_deadline_ns)
+
+    def _wait(self, deadline_ns: int | None) -> list[Event]:
+        timeout_ms = None
+        if deadline_ns is not None:
+            timeout_ms = max(0, -((time.monotonic_ns() - deadline_ns) // 1_000_000))
+        events = [event for heard in self._processes.listen(timeout_ms) if (event := self._event(heard)) is not None]
+        if self._interrupts.count and not self._stop_told:
+            self._stop_told = True
+            self._say("interrupted: the frames in flight are finished; interrupt again to end at once")
+            events.append(Stop())
+        return events
+
+    def _event(self, heard: Heard) -> Event | None:
+        unit, message = heard
+        if isinstance(message, Done):
+            return self._done(unit, message)
+        if isinstance(message, Failed):
+            return self._failed(unit, message)
+        if isinstance(message, Ready):
+            self._ready(unit)
+            return UnitReady(unit)
+        if isinstance(message, Alive):
+            return Beat(unit)
+        if message is None:
+            self._say(f"unit {unit} ended unexpectedly{self._last_words(unit)}")
+            return UnitDied(unit)
+        return None
+
+    def _done(self, unit: str, message: Done) -> Event:
+        job, dispatch_ns = self._open.pop(message.id)
+        state = self.core.frames.get(job.frame)
+        if state is not None:
+            times = (state.ready_ns, dispatch_ns, message.t_begin_ns, message.t_end_ns)
+            self.jobs.append(JobRecord(job.stage, unit, job.frame, *times))
+        self.figures[job.stage].update(message.figures)
+        return JobDone(unit, message.id, message.t_begin_ns, message.t_end_ns, message.t_pose_ns)
+
+    def _failed(self, unit: str, message: Failed) -> Event | None:
+        if self.failure is None:
+            self.failure = Failure(message.message, message.exit_code)
+        self._say(message.message)
+        if message.id < 0:
+            return None  # it could not be built again; the end of its process follows
+        self._open.pop(message.id)
+        return JobFailed(unit, message.id)
+
+    def _perform(self, now_ns: int, action: Action) -> None:
+        if isinstance(action, Dispatch):
+            job = action.job
+            self._open[job.id] = (job, now_ns)
+            self._processes.send(job.unit, RunJob(job.id, job.stage, job.frame, job.slot_in, job.slot_out, job.epoch))
+        elif isinstance(action, Kill):
+            self._say(f"unit {action.unit} did not answer in time and is restarted")
+            self._processes.kill(action.unit)
+        elif isinstance(action, Start):
+            self._start(action.unit)
+
+    def _cause(self, actions: tuple[Action, ...]) -> str:
+        cause = next(action.cause for action in actions if isinstance(action, Finish))
+        if cause in self._graph.units and self.failure is None:
+            self.failure = Failure(f"unit {cause} could not be kept alive{self._last_words(cause)}")
+        return cause
+
+    def _abort(self) -> str:
+        for frame in list(self.core.frames):
+            self.core.lose(frame, "aborted")
+        self.core.finish("aborted")
+        return "aborted"
+
+    # after the run
+
+    def close(self) -> None:
+        """Stages complete their files, then the processes leave. A unit that does not is killed by end_all."""
+        waiting = set(self._processes.pids)
+        for unit in waiting:
+            self._processes.send(unit, Close())
+        end = time.monotonic() + CLOSE_S
+        while waiting and time.monotonic() < end and self._interrupts.count < 2:
+            for unit, message in self._processes.listen(200):
+                if isinstance(message, Failed):
+                    self.failure = self.failure or Failure(message.message, message.exit_code)
+                    self._say(message.message)
+                if message is None or isinstance(message, Closed):
+                    waiting.discard(unit)
+        if waiting:
+            self.failure = self.failure or Failure(f"unit {', '.join(sorted(waiting))} did not close its files")
+        self._processes.wait_for_end(list(self._processes.pids))
+
+    # helpers
+
+    def _start(self, unit: str) -> None:
+        self._started_s[unit] = time.monotonic()
+        self._processes.start(unit)
+
+    def _ready(self, unit: str) -> None:
+        self._processes.connected(unit)
+        self.startup_ms.setdefault(unit, (time.monotonic() - self._started_s[unit]) * 1000)
+
+    def _last_words(self, unit: str) -> str:
+        words = self._processes.last_words.get(unit, "")
+        return f"; its last words: {words.splitlines()[-1]}" if words else ""
+
+    def _say(self, text: str) -> None:
+        self.messages.append(text)
+        if self._on_message is not None:
+            self._on_message(text)
+
+    def _progress(self, *, final: bool = False) -> None:
+        now_s = time.monotonic()
+        if self._on_progress is not None and (final or now_s - self._progress_s >= PROGRESS_S):
+            self._progress_s = now_s
+            self._on_progress(len(self.core.ledger.presented_ns), self.core.settings.frames)

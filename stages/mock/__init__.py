@@ -1,0 +1,1 @@
+"""Units that do nothing but take time. For tests, by name; no run uses them unless its configuration says so."""

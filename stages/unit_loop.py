@@ -1,0 +1,194 @@
+"""The loop inside a unit's process. Rule: one message, one answer; an error is an answer, never silence.
+
+Slots are bound once, before the first job. A job copies the pose header from its input to its output slot and runs
+its stage; the first stage of the chain has no input, so the loop itself stamps frame, epoch and the pose's instant.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import time
+import traceback
+from collections.abc import Mapping
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+import zmq
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict
+
+from trilane.errors import TrilaneError
+from trilane.scene.schema import RunConfig
+from trilane.stages.contracts import Packet, SlotLayout, Stage
+from trilane.transport.bus import LAST_WORDS_MS, Link
+from trilane.transport.memory import RegionLayout, map_region
+from trilane.transport.messages import (
+    BUILDING,
+    CLOSING,
+    MEASURING,
+    Alive,
+    Close,
+    Closed,
+    Done,
+    Durations,
+    Failed,
+    Isolate,
+    Ready,
+    RunJob,
+)
+
+BEAT_MS = 500
+
+
+class EdgeSpec(BaseModel):
+    """A region that the unit maps. `fd` is inherited."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    fd: int
+    slots: int
+    avatars: int
+    payload_bytes: int
+
+    @property
+    def layout(self) -> RegionLayout:
+        return RegionLayout(self.slots, SlotLayout(self.avatars, self.payload_bytes))
+
+
+class UnitSpec(BaseModel):
+    """What a unit's process is told. `stages`: name to (input edge, output edge), each a key of `edges` or None."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    parent_pid: int
+    endpoint: str
+    config: RunConfig
+    edges: dict[str, EdgeSpec]
+    stages: dict[str, tuple[str | None, str | None]]
+
+
+class _BoundStage:
+    """A stage with its slots and byte views of their headers."""
+
+    def __init__(self, stage: Stage, inputs: list[Packet], outputs: list[Packet]) -> None:
+        self._stage, self._inputs, self._outputs = stage, inputs, outputs
+        self._header_in = [_header_bytes(packet) for packet in inputs]
+        self._header_out = [_header_bytes(packet) for packet in outputs]
+        stage.bind(inputs, outputs)
+
+    def run(self, frame: int, slot_in: int, slot_out: int, epoch: int) -> Mapping[str, float]:
+        if slot_out >= 0:
+            if slot_in >= 0:
+                self._header_out[slot_out][:] = self._header_in[slot_in]
+            else:
+                pose = self._outputs[slot_out].pose
+                pose["frame"], pose["t_pose_ns"] = frame, time.monotonic_ns()
+            self._outputs[slot_out].pose["epoch"] = epoch
+        return self._stage.run(frame, slot_in if slot_in >= 0 else None, slot_out if slot_out >= 0 else None)
+
+    def pose_ns(self, slot_in: int, slot_out: int) -> int:
+        """When the pose of the frame in the slots was sampled; 0 for a stage without slots."""
+        if slot_out >= 0:
+            return int(self._outputs[slot_out].pose["t_pose_ns"])
+        return int(self._inputs[slot_in].pose["t_pose_ns"]) if slot_in >= 0 else 0
+
+    def close(self) -> None:
+        self._stage.close()
+
+
+def _header_bytes(packet: Packet) -> NDArray[np.uint8]:
+    return packet.pose.reshape(1).view(np.uint8)
+
+
+def serve(unit: str, raw_spec: dict[str, Any]) -> int:
+    """Build, then answer messages until Close; the process's exit code."""
+    spec = UnitSpec.model_validate(raw_spec)
+    context = zmq.Context()
+    link = Link(context, LAST_WORDS_MS)
+    link.socket.connect(spec.endpoint)
+    try:
+        return _serve(unit, spec, link)
+    finally:
+        link.close()
+        context.term()
+
+
+def _serve(unit: str, spec: UnitSpec, link: Link) -> int:
+    try:
+        stages = _build(unit, spec)
+    except Exception as error:
+        return _fail(link, BUILDING, f"unit {unit}", error)
+    gc.collect()
+    gc.freeze()
+    link.send(Ready(os.getpid()))
+    while True:
+        if not link.wait(BEAT_MS):
+            if os.getppid() != spec.parent_pid:
+                return 1
+            link.send(Alive())
+            continue
+        message = link.receive()
+        if isinstance(message, RunJob):
+            _run_job(link, stages[message.stage], message)
+        elif isinstance(message, Isolate):
+            _isolate(link, stages[message.stage], message)
+        elif isinstance(message, Close):
+            return _close(unit, link, stages)
+
+
+def _build(unit: str, spec: UnitSpec) -> dict[str, _BoundStage]:
+    module = import_module(spec.config.fake.get(unit, f"trilane.stages.{unit}.unit"))
+    stages: dict[str, Stage] = module.build(spec.config)
+    if set(stages) != set(spec.stages):
+        raise TypeError(f"built stages {sorted(stages)}, expected {sorted(spec.stages)}")
+    packets = {name: map_region(edge.fd, edge.layout) for name, edge in spec.edges.items()}
+    return {
+        name: _BoundStage(stages[name], packets[source] if source else [], packets[sink] if sink else [])
+        for name, (source, sink) in spec.stages.items()
+    }
+
+
+def _run_job(link: Link, stage: _BoundStage, job: RunJob) -> None:
+    begin_ns = time.monotonic_ns()
+    try:
+        figures = stage.run(job.frame, job.slot_in, job.slot_out, job.epoch)
+    except Exception as error:
+        _fail(link, job.id, f"stage {job.stage}, frame {job.frame}", error)
+        return
+    end_ns = time.monotonic_ns()
+    values = {name: float(value) for name, value in figures.items()}
+    link.send(Done(job.id, begin_ns, end_ns, stage.pose_ns(job.slot_in, job.slot_out), values))
+
+
+def _isolate(link: Link, stage: _BoundStage, job: Isolate) -> None:
+    durations = []
+    try:
+        for _ in range(job.repeat):
+            begin_ns = time.monotonic_ns()
+            stage.run(job.frame, job.slot_in, job.slot_out, 0)
+            durations.append(time.monotonic_ns() - begin_ns)
+    except Exception as error:
+        _fail(link, MEASURING, f"stage {job.stage}, frame {job.frame}", error)
+        return
+    link.send(Durations(durations))
+
+
+def _close(unit: str, link: Link, stages: dict[str, _BoundStage]) -> int:
+    code = 0
+    for name, stage in stages.items():
+        try:
+            stage.close()
+        except Exception as error:
+            code = _fail(link, CLOSING, f"unit {unit}, closing {name}", error)
+    link.send(Closed())
+    return code
+
+
+def _fail(link: Link, job_id: int, where: str, error: Exception) -> int:
+    """Say it in one sentence; the traceback goes to stderr, which the parent keeps the end of."""
+    traceback.print_exception(error)
+    known = isinstance(error, TrilaneError)
+    text = str(error) if known else f"{where}: {type(error).__name__}: {error}"
+    code = error.exit_code if isinstance(error, TrilaneError) else 1
+    link.send(Failed(job_id, " ".join(text.split())[:2000], code))
+    return code

@@ -1,0 +1,127 @@
+"""What goes over the bus. Rule: a fixed list of messages with typed fields; anything else is refused, and never pickle.
+
+On the wire: msgpack of [name, field, ...].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, get_type_hints
+
+import msgpack
+
+MAX_BYTES = 1 << 16
+MAX_TEXT = 4000
+
+
+class MessageError(ValueError):
+    """Bytes that are not one of the messages."""
+
+
+class RunJob(NamedTuple):
+    """To a unit: do one stage of one frame."""
+
+    id: int
+    stage: str
+    frame: int
+    slot_in: int
+    slot_out: int
+    epoch: int
+
+
+class Isolate(NamedTuple):
+    """To a unit: do the same job `repeat` times back to back and answer with the durations."""
+
+    stage: str
+    frame: int
+    slot_in: int
+    slot_out: int
+    repeat: int
+
+
+class Close(NamedTuple):
+    """To a unit: complete the files, release everything and end."""
+
+
+class Ready(NamedTuple):
+    """From a unit: its stages are built and its slots are bound."""
+
+    pid: int
+
+
+class Done(NamedTuple):
+    """From a unit: a job ended. Times in ns of CLOCK_MONOTONIC; `figures` are the stage's own."""
+
+    id: int
+    t_begin_ns: int
+    t_end_ns: int
+    t_pose_ns: int
+    figures: dict[str, float]
+
+
+class Durations(NamedTuple):
+    """From a unit: the answer to Isolate, in ns."""
+
+    values: list[int]
+
+
+class Failed(NamedTuple):
+    """From a unit: a stage raised. `id`: of the job; -1 while building, -2 while measuring, -3 while closing."""
+
+    id: int
+    message: str
+    exit_code: int
+
+
+class Alive(NamedTuple):
+    """From a unit that has nothing to do."""
+
+
+class Closed(NamedTuple):
+    """From a unit: the answer to Close."""
+
+
+Message = RunJob | Isolate | Close | Ready | Done | Durations | Failed | Alive | Closed
+BUILDING, MEASURING, CLOSING = -1, -2, -3
+
+_KINDS: dict[str, Any] = {
+    kind.__name__: kind for kind in (RunJob, Isolate, Close, Ready, Done, Durations, Failed, Alive, Closed)
+}
+
+
+def _is_figures(value: Any) -> bool:
+    return isinstance(value, dict) and all(type(k) is str and type(v) in (int, float) for k, v in value.items())
+
+
+def _is_durations(value: Any) -> bool:
+    return isinstance(value, list) and all(type(item) is int for item in value)
+
+
+_CHECKS: dict[Any, Callable[[Any], bool]] = {
+    int: lambda value: type(value) is int,
+    str: lambda value: type(value) is str,
+    dict[str, float]: _is_figures,
+    list[int]: _is_durations,
+}
+_FIELDS = {name: [_CHECKS[kind_of] for kind_of in get_type_hints(kind).values()] for name, kind in _KINDS.items()}
+
+
+def pack(message: Message) -> bytes:
+    packed: bytes = msgpack.packb((type(message).__name__, *message))
+    return packed
+
+
+def unpack(data: bytes) -> Message:
+    """Raises MessageError for anything that is not one of the messages, field by field."""
+    try:
+        content = msgpack.unpackb(data)
+    except (ValueError, msgpack.UnpackException) as error:
+        raise MessageError(f"not msgpack: {error}") from None
+    if not isinstance(content, list) or not content or not isinstance(content[0], str) or content[0] not in _KINDS:
+        raise MessageError(f"unknown message {str(content)[:80]!r}")
+    name, *fields = content
+    checks = _FIELDS[name]
+    if len(fields) != len(checks) or not all(check(field) for check, field in zip(checks, fields, strict=True)):
+        raise MessageError(f"wrong fields for {name}: {str(fields)[:80]}")
+    message: Message = _KINDS[name](*fields)
+    return message
