@@ -6,6 +6,7 @@ Rule: what passes here is a static integer network from NHWC bytes to RGBA bytes
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -19,6 +20,8 @@ from onnx import TensorProto, external_data_helper, numpy_helper
 
 from trilane.errors import BadInputError
 
+#: Metadata of a file: a JSON list of the names of layers that were left in float on purpose.
+FLOAT_LAYERS_KEY = "trilane.float_layers"
 MAX_BYTES = 512 << 20
 MAX_SIDE = 4096
 MAX_BATCH = 64
@@ -65,6 +68,15 @@ class NetworkFile:
     @property
     def channels(self) -> int:
         return self.shape[3]
+
+    @property
+    def float_layers(self) -> frozenset[str]:
+        """Names of the layers that may run in float, because whoever quantised the network said so."""
+        texts = [prop.value for prop in self.model.metadata_props if prop.key == FLOAT_LAYERS_KEY]
+        try:
+            return frozenset(str(name) for text in texts for name in json.loads(text))
+        except (ValueError, TypeError, RecursionError) as error:
+            raise BadInputError(self.where, f"{FLOAT_LAYERS_KEY} {texts}", "a JSON list of names") from error
 
     @property
     def digest(self) -> str:
@@ -118,8 +130,10 @@ def _parse(path: Path) -> onnx.ModelProto:
         raise BadInputError(
             path, "bytes that do not parse", "an ONNX file", "copy it again: it may be cut short"
         ) from error
-    if not model.graph.node:
-        raise BadInputError(path, "no nodes", "an ONNX network")
+    if not model.graph.node or not any(entry.domain in ("", "ai.onnx") for entry in model.opset_import):
+        raise BadInputError(
+            path, "no nodes or no operator set", "an ONNX network", "copy it again: it may be cut short"
+        )
     _load_external(model, path)
     return model
 

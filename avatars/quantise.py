@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -28,7 +29,7 @@ from onnxruntime.quantization import (
 )
 from onnxruntime.quantization.shape_inference import quant_pre_process
 
-from trilane.avatars.network_file import NetworkFile, check_network
+from trilane.avatars.network_file import FLOAT_LAYERS_KEY, NetworkFile, check_network
 from trilane.errors import BadInputError
 
 MIN_FRAMES, MAX_FRAMES = 1, 1000
@@ -86,6 +87,7 @@ def quantise(
         ranges = _calibrate(prepared, frames, method, Path(folder) / "augmented.onnx")
         quantised = _insert(onnx.load(prepared), ranges, reduce_range, keep_float)
     _integer_ends(quantised)
+    _describe(quantised, keep_float)
     facts = {
         "method": method,
         "calibration_frames": len(frames),
@@ -138,6 +140,8 @@ def _insert(model: onnx.ModelProto, ranges: Any, reduce_range: bool, keep_float:
         op_types_to_quantize=QUANTISED,
         extra_options={"WeightSymmetric": True},
     )
+    for end in (model.graph.input[0], model.graph.output[0]):
+        quantiser.quantize_activation_tensor(end.name)
     quantiser.quantize_model()
     quantiser.model.topological_sort()
     result: onnx.ModelProto = quantiser.model.model
@@ -190,3 +194,11 @@ def _make_picture(graph: onnx.GraphProto, node: onnx.NodeProto) -> None:
     for slot, (name, value) in enumerate(values.items(), start=1):
         node.input[slot] = name
         graph.initializer.append(numpy_helper.from_array(np.asarray(value), name))
+
+
+def _describe(model: onnx.ModelProto, keep_float: Sequence[str]) -> None:
+    """Leave what runtimes read: one operator set, and the layers that are meant to stay in float."""
+    for entry in [entry for entry in model.opset_import if entry.domain not in ("", "ai.onnx")]:
+        model.opset_import.remove(entry)
+    del model.metadata_props[:]
+    helper.set_model_props(model, {FLOAT_LAYERS_KEY: json.dumps(list(keep_float))} if keep_float else {})

@@ -65,7 +65,9 @@ class InferStage:
         assert slot_in is not None and slot_out is not None
         pose, output = self._inputs[slot_in].pose, self._outputs[slot_out]
         height, width = pose["tensor_shape"].tolist()
-        visible = [i for i in range(min(len(self._networks), pose["avatar_count"])) if pose["avatars"]["visible"][i]]
+        visible = [
+            i for i in range(min(len(self._networks), int(pose["avatar_count"]))) if pose["avatars"]["visible"][i]
+        ]
         if len(visible) < len(self._networks):
             output.payload[:] = 0
         for avatar in visible:

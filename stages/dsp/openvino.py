@@ -18,6 +18,8 @@ from trilane.stages.dsp.runtime import RuntimeOptions
 DEVICE = "CPU"
 LAYERS = {"Convolution", "Deconvolution", "FullyConnected", "MatMul"}
 INTEGERS = ("i8", "u8")
+WITHOUT_BIAS = "/WithoutBiases"
+REMEDY = ("integer layers", "quantise them")
 
 
 class OpenvinoBinding:
@@ -58,7 +60,7 @@ def load(network: NetworkFile, options: RuntimeOptions) -> OpenvinoSession:
         compiled = core.compile_model(model, DEVICE, settings)
     except RuntimeError as error:
         raise BadInputError(network.where, str(error), "a network that OpenVINO loads") from error
-    _check_integer(compiled, network.where)
+    _check_integer(compiled, network)
     return OpenvinoSession(compiled)
 
 
@@ -66,14 +68,15 @@ def version() -> str:
     return f"openvino {openvino.__version__}"
 
 
-def _check_integer(compiled: Any, where: str) -> None:
-    left = []
+def _check_integer(compiled: Any, network: NetworkFile) -> None:
+    left = set()
     for op in compiled.get_runtime_model().get_ops():
         info = op.get_rt_info()
         if _text(info, "layerType") in LAYERS and _text(info, "runtimePrecision").lower() not in INTEGERS:
-            left.append(op.get_friendly_name())
+            left.add(op.get_friendly_name().removesuffix(WITHOUT_BIAS))
+    left -= network.float_layers
     if left:
-        raise BadInputError(where, f"layers left in float: {', '.join(left)}", "integer layers", "quantise them")
+        raise BadInputError(network.where, f"layers left in float: {', '.join(sorted(left))}", *REMEDY)
 
 
 def _text(info: Any, key: str) -> str:

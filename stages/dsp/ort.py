@@ -59,7 +59,7 @@ def load(network: NetworkFile, options: RuntimeOptions) -> OrtSession:
             session = onnxruntime.InferenceSession(network.model.SerializeToString(), settings, providers=[PROVIDER])
         except onnxruntime.capi.onnxruntime_pybind11_state.OrtException as error:
             raise BadInputError(network.where, str(error), "a network that ONNX Runtime loads") from error
-        check_integer(onnx.load(optimised), network.where)
+        check_integer(onnx.load(optimised), network)
     return OrtSession(session)
 
 
@@ -67,11 +67,14 @@ def version() -> str:
     return f"onnxruntime {onnxruntime.__version__}"
 
 
-def check_integer(optimised: onnx.ModelProto, where: str) -> None:
-    """Raises BadInputError naming the layers of an optimised graph that still compute in float."""
-    left = [node_name(node) for node in optimised.graph.node if node.op_type in FLOAT_LAYERS]
+def check_integer(optimised: onnx.ModelProto, network: NetworkFile) -> None:
+    """Raises BadInputError naming the layers of the optimised graph of `network` that still compute in float."""
+    layers = {node_name(node) for node in optimised.graph.node if node.op_type in FLOAT_LAYERS}
+    left = sorted(layers - network.float_layers)
     if left:
-        raise BadInputError(where, f"layers left in float: {', '.join(left)}", "integer layers", "quantise them")
+        raise BadInputError(
+            network.where, f"layers left in float: {', '.join(left)}", "integer layers", "quantise them"
+        )
 
 
 def _settings(options: RuntimeOptions) -> onnxruntime.SessionOptions:

@@ -1,0 +1,90 @@
+"""Quantisation: bytes at both ends, real zero exact, small error, 7-bit weights, named errors."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+from onnx import numpy_helper
+
+from trilane.avatars.quantise import METHODS, quantise
+from trilane.avatars.reshape import reshaped
+from trilane.errors import BadInputError
+
+
+def run(model, feed):
+    onnxruntime.set_default_logger_severity(3)
+    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    return session.run(None, {session.get_inputs()[0].name: feed})[0]
+
+
+def test_bytes_are_the_picture(tiny_float, tiny_frames, tiny_quantised):
+    network = tiny_quantised.network
+    frame = tiny_frames[0]
+    tensor = np.clip(np.round(frame / network.input.scale) + network.input.zero_point, 0, 255).astype(np.uint8)
+    wanted = run(tiny_float, frame.transpose(2, 0, 1)[None])[0].transpose(1, 2, 0)
+    found = run(network.model, tensor[None])[0]
+    assert found.dtype == np.uint8 and found.shape == (64, 64, 4)
+    assert np.abs(found / 255 - wanted).mean() < 2 / 255
+    assert network.output.scale == pytest.approx(1 / 255) and network.output.zero_point == 0
+
+
+def test_zero_is_exact(tiny_quantised):
+    assert 0 <= tiny_quantised.network.input.zero_point <= 255
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_calibrates(tiny_float, tiny_frames, method):
+    result = quantise(tiny_float, tiny_frames, method)
+    assert result.facts["method"] == method and result.facts["calibration_frames"] == len(tiny_frames)
+
+
+@pytest.mark.parametrize(("reduce_range", "limit"), [(True, 64), (False, 127)])
+def test_weights_have_seven_bits_when_reduced(tiny_float, tiny_frames, reduce_range, limit):
+    model = quantise(tiny_float, tiny_frames, reduce_range=reduce_range).network.model
+    weights = [numpy_helper.to_array(t) for t in model.graph.initializer if t.name.endswith(".w_quantized")]
+    assert len(weights) == 4
+    assert limit // 2 < max(np.abs(w.astype(int)).max() for w in weights) <= limit
+
+
+def test_a_layer_can_stay_in_float(tiny_float, tiny_frames):
+    result = quantise(tiny_float, tiny_frames, keep_float=["stem"])
+    assert result.facts["float_layers"] == ["stem"]
+    assert run(result.network.model, np.zeros((1, 64, 64, 5), np.uint8)).shape == (1, 64, 64, 4)
+
+
+def test_another_shape_computes_the_same(tiny_quantised):
+    """A constant picture has the same middle at every size."""
+    network = tiny_quantised.network
+    wide = reshaped(network, 32, 96, batch=2)
+    assert wide.shape == (2, 32, 96, 5) and wide.input == network.input
+    tensor = np.full((64, 64, 5), 99, np.uint8)
+    found = run(wide.model, np.broadcast_to(tensor[:1, :1], (2, 32, 96, 5)).copy())
+    assert found.shape == (2, 32, 96, 4)
+    assert np.abs(found[1, 16, 48].astype(int) - run(network.model, tensor[None])[0, 32, 32]).max() <= 1
+
+
+@pytest.mark.parametrize("shape", [(33, 64), (0, 64)])
+def test_wrong_shapes_are_refused(tiny_quantised, shape):
+    with pytest.raises(BadInputError, match="multiples of 32"):
+        reshaped(tiny_quantised.network, *shape)
+
+
+@pytest.mark.parametrize(
+    ("frames", "message"),
+    [([], "0 frames"), ([np.zeros((64, 32, 5), np.float32)], "frame 0"), ([np.full((64, 64, 5), np.nan)], "finite")],
+)
+def test_wrong_frames_are_named(tiny_float, frames, message):
+    with pytest.raises(BadInputError, match=message):
+        quantise(tiny_float, frames)
+
+
+def test_a_network_without_sigmoid_is_refused(tiny_float, tiny_frames):
+    model = copy.deepcopy(tiny_float)
+    model.graph.node[-1].op_type = "Tanh"
+    with pytest.raises(BadInputError, match="Sigmoid"):
+        quantise(model, tiny_frames)
+    assert isinstance(tiny_float, onnx.ModelProto)
