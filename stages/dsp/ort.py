@@ -12,6 +12,7 @@ import numpy as np
 import onnx
 import onnxruntime
 from numpy.typing import NDArray
+from onnxruntime.capi import onnxruntime_pybind11_state as state
 
 from trilane.avatars.network_file import NetworkFile, node_name
 from trilane.errors import BadInputError
@@ -19,6 +20,7 @@ from trilane.stages.dsp.runtime import RuntimeOptions
 
 PROVIDER = "CPUExecutionProvider"
 FLOAT_LAYERS = {"Conv", "FusedConv", "NhwcFusedConv", "ConvTranspose", "Gemm", "FusedGemm", "MatMul", "FusedMatMul"}
+LOAD_ERRORS = (state.Fail, state.InvalidArgument, state.InvalidGraph, state.NotImplemented, state.RuntimeException)
 ERRORS_ONLY = 3
 
 
@@ -57,7 +59,7 @@ def load(network: NetworkFile, options: RuntimeOptions) -> OrtSession:
         settings.optimized_model_filepath = str(optimised)
         try:
             session = onnxruntime.InferenceSession(network.model.SerializeToString(), settings, providers=[PROVIDER])
-        except onnxruntime.capi.onnxruntime_pybind11_state.OrtException as error:
+        except LOAD_ERRORS as error:
             raise BadInputError(network.where, str(error), "a network that ONNX Runtime loads") from error
         check_integer(onnx.load(optimised), network)
     return OrtSession(session)

@@ -1,0 +1,159 @@
+"""What every runtime keeps: same picture, the slots' own memory, no allocation, integer layers, named errors."""
+
+from __future__ import annotations
+
+import copy
+import gc
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import onnx
+import psutil
+import pytest
+from onnx import helper, numpy_helper
+from onnx.reference import ReferenceEvaluator
+
+from trilane.avatars.network_file import check_network
+from trilane.avatars.quantise import quantise
+from trilane.avatars.reshape import reshaped
+from trilane.errors import BadInputError, MissingPartError
+from trilane.stages.dsp import runtime
+from trilane.stages.dsp.runtime import RUNTIMES, RuntimeOptions, load_runtime
+
+#: The first whose DequantizeLinear the evaluator has; the operators used mean the same as in the files' own.
+EVALUATOR_OPSET = 19
+
+
+@pytest.fixture(params=RUNTIMES)
+def module(request):
+    pytest.importorskip(RUNTIMES[request.param].package)
+    return load_runtime(request.param)
+
+
+def tensor_of(network, frames):
+    real = np.stack(frames)[:1] / network.input.scale + network.input.zero_point
+    return np.clip(np.round(real), 0, 255).astype(np.uint8)
+
+
+def reference(network, tensor):
+    """The picture by the ONNX reference evaluator: operator definitions in NumPy, nothing fused."""
+    model = copy.deepcopy(network.model)
+    model.opset_import[0].version = EVALUATOR_OPSET
+    return ReferenceEvaluator(model).run(None, {network.model.graph.input[0].name: tensor})[0]
+
+
+def picture(module, network, tensor, threads=1):
+    image = np.full((*network.shape[:3], 4), 77, np.uint8)
+    module.load(network, RuntimeOptions(threads)).bind(tensor, image).run()
+    return image
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_the_picture_is_the_definitions(module, tiny_quantised, tiny_frames, threads):
+    network = tiny_quantised.network
+    tensor = tensor_of(network, tiny_frames)
+    difference = np.abs(picture(module, network, tensor, threads).astype(int) - reference(network, tensor))
+    assert difference.max() <= 4
+    assert difference.mean() <= 0.5
+
+
+def test_every_bucket_shape_runs(module, tiny_quantised):
+    for height, width in ((32, 96), (96, 32)):
+        network = reshaped(tiny_quantised.network, height, width)
+        tensor = np.random.default_rng(0).integers(0, 256, network.shape, dtype=np.uint8)
+        difference = np.abs(picture(module, network, tensor).astype(int) - reference(network, tensor))
+        assert difference.max() <= 4
+
+
+def test_a_binding_reads_and_writes_the_slots_themselves(module, tiny_quantised, tiny_frames):
+    """Bytes written into the slot after it was bound are what is read; the bound address is what is written."""
+    network = tiny_quantised.network
+    slot_in, slot_out = np.zeros(network.shape, np.uint8), np.zeros((*network.shape[:3], 4), np.uint8)
+    addresses = slot_in.ctypes.data, slot_out.ctypes.data
+    binding = module.load(network, RuntimeOptions()).bind(slot_in, slot_out)
+    binding.run()
+    empty = slot_out.copy()
+    slot_in[:] = tensor_of(network, tiny_frames)
+    binding.run()
+    assert (slot_out == picture(module, network, slot_in)).all()
+    assert (slot_out != empty).any()
+    assert addresses == (slot_in.ctypes.data, slot_out.ctypes.data)
+
+
+def test_bindings_of_one_session_do_not_mix(module, tiny_quantised):
+    network = tiny_quantised.network
+    session = module.load(network, RuntimeOptions())
+    rng = np.random.default_rng(3)
+    inputs = [rng.integers(0, 256, network.shape, dtype=np.uint8) for _ in range(2)]
+    images = [np.zeros((*network.shape[:3], 4), np.uint8) for _ in range(2)]
+    bindings = [session.bind(tensor, image) for tensor, image in zip(inputs, images, strict=True)]
+    for binding in bindings:
+        binding.run()
+    for tensor, image in zip(inputs, images, strict=True):
+        assert (image == picture(module, network, tensor)).all()
+
+
+def test_a_thousand_frames_allocate_nothing(module, tiny_quantised):
+    network = tiny_quantised.network
+    tensor, image = np.zeros(network.shape, np.uint8), np.zeros((*network.shape[:3], 4), np.uint8)
+    binding = module.load(network, RuntimeOptions()).bind(tensor, image)
+    for _ in range(50):
+        binding.run()
+    gc.collect()
+    tracemalloc.start()
+    resident, traced = psutil.Process().memory_info().rss, tracemalloc.get_traced_memory()[0]
+    for _ in range(1000):
+        binding.run()
+    grown = psutil.Process().memory_info().rss - resident
+    traced = tracemalloc.get_traced_memory()[0] - traced
+    tracemalloc.stop()
+    assert traced < 4096
+    assert grown < 1 << 19
+
+
+def test_a_layer_left_in_float_is_named(module, tiny_quantised):
+    """Weights that are no quantised tensor leave their convolution in float."""
+    model = copy.deepcopy(tiny_quantised.network.model)
+    conv = next(node for node in model.graph.node if node.name == "level")
+    model.graph.initializer.append(numpy_helper.from_array(np.ones((8, 16, 3, 3), np.float32) / 99, "plain"))
+    conv.input[1] = "plain"
+    with pytest.raises(BadInputError, match="level"):
+        module.load(check_network(model, "network.onnx"), RuntimeOptions())
+
+
+def test_a_layer_left_in_float_on_purpose_runs(module, tiny_float, tiny_frames):
+    network = quantise(tiny_float, tiny_frames, keep_float=["deep"]).network
+    tensor = tensor_of(network, tiny_frames)
+    difference = np.abs(picture(module, network, tensor).astype(int) - reference(network, tensor))
+    assert difference.mean() <= 0.5
+
+
+def test_a_graph_that_does_not_run_is_named(module, tiny_quantised):
+    model = copy.deepcopy(tiny_quantised.network.model)
+    next(node for node in model.graph.node if node.op_type == "Concat").attribute[0].CopyFrom(
+        helper.make_attribute("axis", 7)
+    )
+    with pytest.raises(BadInputError, match="joined"):
+        module.load(check_network(model, "network.onnx"), RuntimeOptions())
+
+
+def test_auto_is_the_fastest_installed():
+    assert runtime.resolve("auto") == runtime.installed()[0]
+
+
+def test_unknown_runtimes_are_refused():
+    with pytest.raises(BadInputError, match="tpu"):
+        runtime.resolve("tpu")
+
+
+def test_an_absent_runtime_says_how_to_get_it(monkeypatch):
+    entry = runtime.RuntimeEntry("trilane.stages.dsp.none", "no_such_package", "pip install it")
+    monkeypatch.setitem(RUNTIMES, "none", entry)
+    with pytest.raises(MissingPartError, match="pip install it"):
+        load_runtime("none")
+
+
+def test_the_wrong_file_is_named(tmp_path: Path, tiny_float: onnx.ModelProto):
+    with pytest.raises(BadInputError, match="FLOAT"):
+        check_network(tiny_float, str(tmp_path))

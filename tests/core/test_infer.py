@@ -1,0 +1,108 @@
+"""The infer stage: which avatar, which shape, which slot; transparent where nothing is visible."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from trilane.avatars.bundle import load_bundle
+from trilane.errors import BadInputError
+from trilane.scene.schema import RunConfig, Scene, UnitSettings
+from trilane.stages.contracts import SlotLayout, view_packet
+from trilane.stages.dsp.infer import InferStage
+from trilane.stages.dsp.unit import build
+
+CHANNELS = 5
+
+
+def slots(count, avatars, payload):
+    layout = SlotLayout(avatars, payload)
+    return [view_packet(memoryview(bytearray(layout.slot_bytes)), layout) for _ in range(count)]
+
+
+def make(folder, avatars=1, size="64", runtime="ort"):
+    scene = Scene.model_validate({"size": size, "avatars": [{}] * avatars})
+    units = {"dsp": UnitSettings(cores=(0,), threads=1)}
+    config = RunConfig(scene=scene, out_dir=folder, avatar_dirs=(folder,) * avatars, units=units, runtime=runtime)
+    stage = InferStage(config)
+    pixels = config.max_tensor_pixels * avatars
+    inputs, outputs = slots(2, avatars, pixels * CHANNELS), slots(2, avatars, pixels * 4)
+    stage.bind(inputs, outputs)
+    return stage, inputs, outputs
+
+
+def show(packet, shape, visible):
+    packet.pose["tensor_shape"] = shape
+    packet.pose["avatar_count"] = len(visible)
+    packet.pose["avatars"]["visible"][:] = visible
+
+
+def run_alone(folder, shape, tensor):
+    """The picture of one tensor in a stage of its own."""
+    stage, inputs, outputs = make(folder, size=f"{shape[0]}x{shape[1]}")
+    inputs[0].payload[: tensor.size] = tensor.ravel()
+    show(inputs[0], shape, [1])
+    stage.run(0, 0, 0)
+    return outputs[0].payload[: shape[0] * shape[1] * 4].copy()
+
+
+def random_tensor(shape, seed):
+    return np.random.default_rng(seed).integers(0, 256, (*shape, CHANNELS), dtype=np.uint8)
+
+
+def test_each_shape_and_slot_has_its_own_session(tiny_bundle):
+    stage, inputs, outputs = make(tiny_bundle)
+    assert stage.startup["sessions"] == 3
+    for shape, i, o in (((64, 64), 0, 1), ((32, 128), 1, 0), ((128, 32), 1, 1)):
+        tensor = random_tensor(shape, i + o)
+        inputs[i].payload[: tensor.size] = tensor.ravel()
+        show(inputs[i], shape, [1])
+        assert stage.run(0, i, o) == {"inferred": 1}
+        assert (outputs[o].payload[: shape[0] * shape[1] * 4] == run_alone(tiny_bundle, shape, tensor)).all()
+
+
+def test_nothing_visible_is_transparent_and_not_inferred(tiny_bundle):
+    stage, inputs, outputs = make(tiny_bundle)
+    outputs[0].payload[:] = 9
+    show(inputs[0], (0, 0), [0])
+    assert stage.run(0, 0, 0) == {"inferred": 0}
+    assert not outputs[0].payload.any()
+
+
+def test_avatars_lie_one_after_another(tiny_bundle):
+    shape = (64, 64)
+    stage, inputs, outputs = make(tiny_bundle, avatars=3)
+    tensors = [random_tensor(shape, seed) for seed in range(3)]
+    inputs[0].payload[:] = np.concatenate([tensor.ravel() for tensor in tensors])
+    show(inputs[0], shape, [1, 0, 1])
+    assert stage.run(0, 0, 0) == {"inferred": 2}
+    found = outputs[0].payload.reshape(3, -1)
+    assert (found[0] == run_alone(tiny_bundle, shape, tensors[0])).all()
+    assert not found[1].any()
+    assert (found[2] == run_alone(tiny_bundle, shape, tensors[2])).all()
+
+
+def test_one_network_is_loaded_once(tiny_bundle):
+    assert make(tiny_bundle, avatars=3)[0].startup["sessions"] == 3
+
+
+def test_a_shape_that_is_no_bucket_is_named(tiny_bundle):
+    stage, inputs, _ = make(tiny_bundle, size="64x64")
+    show(inputs[0], (96, 96), [1])
+    with pytest.raises(BadInputError, match="96x96"):
+        stage.run(7, 0, 0)
+
+
+def test_a_slot_that_is_too_small_is_refused(tiny_bundle):
+    units = {"dsp": UnitSettings(cores=(0,), threads=1)}
+    config = RunConfig(scene=Scene(size="64"), out_dir=tiny_bundle, avatar_dirs=(tiny_bundle,), units=units)
+    with pytest.raises(ValueError, match="slot of 100 bytes"):
+        InferStage(config).bind(slots(1, 1, 100), slots(1, 1, 64 * 64 * 4))
+
+
+def test_the_unit_owns_the_infer_stage(tiny_bundle):
+    units = {"dsp": UnitSettings(cores=(0,), threads=1)}
+    config = RunConfig(scene=Scene(size="64"), out_dir=tiny_bundle, avatar_dirs=(tiny_bundle,), units=units)
+    stages = build(config)
+    assert list(stages) == ["infer"]
+    assert load_bundle(tiny_bundle).manifest.network.channels == CHANNELS
