@@ -15,6 +15,7 @@ from trilane.errors import MissingPartError
 
 INSTALL = "apt-get install libegl1 libgl1-mesa-dri"
 REQUIRED_VERSION = 330
+LIBRARY = "libEGL.so.1"  # eglGetProcAddress gives every OpenGL function, so libGL need not be there
 SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swr", "swiftshader", "swrast")
 
 
@@ -38,7 +39,7 @@ def open_context(threads: int | None = None) -> Any:
         os.environ["LP_NUM_THREADS"] = str(threads if threads > 1 else 0)
     try:
         create: Any = moderngl.create_context
-        return create(require=REQUIRED_VERSION, standalone=True, backend="egl")
+        return create(require=REQUIRED_VERSION, standalone=True, backend="egl", libegl=LIBRARY, libgl=LIBRARY)
     except Exception as error:  # moderngl and glcontext raise bare Exception
         raise MissingPartError(f"no OpenGL 3.3 context through EGL ({error})", INSTALL) from error
 

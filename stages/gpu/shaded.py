@@ -13,13 +13,13 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
+from trilane.stages.gpu import gl
 from trilane.stages.gpu.camera import Matrix, eye_of, target_clip
 from trilane.stages.gpu.mesh import SkinnedMesh
 from trilane.stages.gpu.program import build_program, set_uniforms
 
 F32 = NDArray[np.float32]
 RGBA8 = NDArray[np.uint8]
-GL_SRGB8_ALPHA8 = 0x8C43
 
 
 class ShadedMesh:
@@ -105,7 +105,7 @@ class ShadedRaster:
 
 
 def _srgb_texture(ctx: Any, image: RGBA8) -> Any:
-    texture = ctx.texture((image.shape[1], image.shape[0]), 4, image.tobytes(), internal_format=GL_SRGB8_ALPHA8)
+    texture = ctx.texture((image.shape[1], image.shape[0]), 4, image.tobytes(), internal_format=gl.SRGB8_ALPHA8)
     texture.build_mipmaps()
     texture.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
     return texture

@@ -1,0 +1,14 @@
+#version 330
+// The avatar's picture at its crop rectangle.
+
+uniform vec4 rect;   // x0, y0, x1, y1 in normalised device coordinates, y up
+uniform vec4 source; // left, top, right, bottom of the picture, 0..1 of the texture
+
+out vec2 v_uv;
+
+void main() {
+    vec2 place = vec2(gl_VertexID & 1, gl_VertexID >> 1);
+    vec2 ndc = mix(rect.xw, rect.zy, place);
+    gl_Position = vec4(ndc.x, -ndc.y, 0.0, 1.0);
+    v_uv = mix(source.xy, source.zw, place);
+}

@@ -1,0 +1,94 @@
+"""The composite stage: background, contact shadow, avatars, in that order, to the presented frame.
+
+Rule: avatars are drawn far to near; one that is not visible leaves no trace.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.stages.contracts import Packet
+from trilane.stages.gpu import gl
+from trilane.stages.gpu.background import Background
+from trilane.stages.gpu.painters import AvatarPainter, PicturePainter, RoomPainter, ShadowPainter
+from trilane.stages.gpu.shadow import DISCS, floor_discs
+
+Shape = tuple[int, int]
+F64 = NDArray[np.float64]
+
+
+class CompositeStage:
+    """Draws frames of `shape` (height, width).
+
+    `shapes`: tensor shapes that may come. `rest`: rest joints (55,3) of each avatar of the scene, metres.
+    `background`: None for the built-in room.
+    """
+
+    def __init__(
+        self, ctx: Any, shape: Shape, shapes: Sequence[Shape], rest: Sequence[F64], background: Background | None
+    ) -> None:
+        self._shape, self._rest, self._background = shape, rest, background
+        colour = ctx.texture(shape[::-1], 4, internal_format=gl.SRGB8_ALPHA8)
+        self._target = ctx.framebuffer([colour])
+        self._room = RoomPainter(ctx) if background is None else None
+        self._picture = None if background is None else PicturePainter(ctx, shape)
+        self._shadow = ShadowPainter(ctx, len(DISCS) * len(rest))
+        self._painter = AvatarPainter(ctx, list(shapes))
+        self._inputs: Sequence[Packet] = ()
+        self._outputs: Sequence[Packet] = ()
+
+    def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
+        """Keep the slots."""
+        self._inputs, self._outputs = inputs, outputs
+
+    def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:  # noqa: ARG002
+        """Write the frame, (h,w,3) uint8 sRGB, row 0 on top."""
+        if slot_in is None or slot_out is None:
+            raise ValueError("composite needs an input and an output slot")
+        packet = self._inputs[slot_in]
+        self.draw(packet.pose, packet.payload)
+        frame_bytes = self._outputs[slot_out].payload[: math.prod(self._shape) * 3]
+        self._target.read_into(frame_bytes, components=3, alignment=1)
+        return {}
+
+    def draw(self, pose: NDArray[np.void], image: NDArray[np.uint8]) -> None:
+        """Draw the frame that `pose` and the network's `image` (h * w * 4 bytes or more) describe."""
+        avatars = list(pose["avatars"][: int(pose["avatar_count"])])
+        visible = [avatar for avatar in avatars if avatar["visible"]]
+        shape = (int(pose["tensor_shape"][0]), int(pose["tensor_shape"][1]))
+        if visible:
+            self._painter.upload(shape, image[: math.prod(shape) * 4])
+        self._target.use()
+        self._draw_background(pose)
+        if visible:
+            discs = [floor_discs(avatar["joints"], self._rest[int(avatar["avatar"])]) for avatar in visible]
+            self._shadow.draw(pose["view"], pose["projection"], np.concatenate(discs))
+        for avatar in sorted(visible, key=lambda a: self._depth(pose, a)):
+            rect = tuple(float(side) for side in avatar["rect"])
+            top, left, height, width = (int(side) for side in avatar["tensor_rect"])
+            self._painter.draw(self._target, shape, rect, (top, left, height, width))
+
+    def close(self) -> None:
+        """Close the background's file."""
+        if self._background is not None:
+            self._background.close()
+
+    def _draw_background(self, pose: NDArray[np.void]) -> None:
+        if self._room is not None:
+            self._room.draw(self._target, pose["view"], pose["projection"])
+        if self._background is None or self._picture is None:
+            return
+        picture = self._background.at(float(pose["media_time_s"]))
+        if picture is not None:
+            self._picture.upload(picture)
+        self._picture.draw()
+
+    def _depth(self, pose: NDArray[np.void], avatar: Any) -> float:
+        """Camera z of the pelvis: the most negative is the farthest."""
+        pelvis = avatar["joints"][0] @ np.append(self._rest[int(avatar["avatar"])][0], 1.0)
+        return float(pose["view"][2, :3] @ pelvis + pose["view"][2, 3])

@@ -1,0 +1,54 @@
+"""Raw OpenGL calls that moderngl has no method for.
+
+Rule: thin; one table of signatures, no state. Every call needs the context current on its thread.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
+from typing import Any
+
+from trilane.errors import MissingPartError
+from trilane.stages.gpu.context import INSTALL, LIBRARY
+
+COLOR = 0x1800
+FRAMEBUFFER_SRGB = 0x8DB9
+SRGB8_ALPHA8 = 0x8C43
+
+_INT, _UINT, _PTR = ctypes.c_int, ctypes.c_uint, ctypes.c_void_p
+_SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
+    "glClearBufferuiv": (None, (_UINT, _INT, _PTR)),
+    "glEnable": (None, (_UINT,)),
+    "glDisable": (None, (_UINT,)),
+}
+
+
+@cache
+def function(name: str) -> Callable[..., Any]:
+    """OpenGL function `name`. Raises MissingPartError when the driver lacks it."""
+    library = ctypes.CDLL(LIBRARY)
+    library.eglGetProcAddress.restype = ctypes.c_void_p
+    address = library.eglGetProcAddress(name.encode())
+    if not address:
+        raise MissingPartError(f"the OpenGL driver lacks {name}", INSTALL)
+    result, arguments = _SIGNATURES[name]
+    call: Callable[..., Any] = ctypes.CFUNCTYPE(result, *arguments)(address)
+    return call
+
+
+def clear_unsigned(value: tuple[int, int, int, int]) -> None:
+    """Fill colour attachment 0 of the bound framebuffer, an unsigned integer format, with `value`."""
+    function("glClearBufferuiv")(COLOR, 0, (ctypes.c_uint * 4)(*value))
+
+
+@contextmanager
+def srgb_target() -> Iterator[None]:
+    """Within it, draws into an sRGB target blend in linear light; outside, bytes are written as they are."""
+    function("glEnable")(FRAMEBUFFER_SRGB)
+    try:
+        yield
+    finally:
+        function("glDisable")(FRAMEBUFFER_SRGB)

@@ -1,0 +1,72 @@
+"""The raster stage: from a pose packet to the network's input tensor.
+
+Rule: the tensor is written straight into the output slot; a frame with nothing to show costs one fill.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.errors import TrilaneError
+from trilane.stages.contracts import Packet
+from trilane.stages.cpu.crop import crop_projection
+from trilane.stages.gpu.packed import PackedAvatar, PackedPass, Placement
+
+Shape = tuple[int, int]
+
+
+class RasterStage:
+    """`avatars[i]` draws the scene's avatar i. `shapes`: tensor shapes (height, width) that may come."""
+
+    def __init__(self, packed: PackedPass, avatars: Sequence[PackedAvatar], shapes: Sequence[Shape]) -> None:
+        self._packed, self._avatars, self._shapes = packed, avatars, shapes
+        self._inputs: Sequence[Packet] = ()
+        self._outputs: Sequence[Packet] = ()
+
+    def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
+        """Keep the slots and make a target for every tensor shape."""
+        self._inputs, self._outputs = inputs, outputs
+        for shape in self._shapes:
+            self._packed.target(shape)
+
+    def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
+        """Write frame `frame`'s tensor, (h,w,C) uint8. Raises TrilaneError when a joint is not a finite number."""
+        if slot_in is None or slot_out is None:
+            raise ValueError("raster needs an input and an output slot")
+        pose = self._inputs[slot_in].pose
+        shape = (int(pose["tensor_shape"][0]), int(pose["tensor_shape"][1]))
+        tensor = self._outputs[slot_out].payload[: math.prod(shape) * self._packed.channels]
+        visible = [a for a in pose["avatars"][: int(pose["avatar_count"])] if a["visible"]]
+        if not visible:
+            self._packed.background(tensor)
+            return {}
+        _refuse_nan(frame, visible)
+        target = self._packed.begin(shape)
+        for avatar in visible:
+            self._avatars[int(avatar["avatar"])].draw(target, pose["view"], _placement(pose, avatar))
+        self._packed.read_into(shape, tensor)
+        return {}
+
+    def close(self) -> None:
+        """The context goes with the process."""
+
+
+def _placement(pose: NDArray[np.void], avatar: Any) -> Placement:
+    top, left, height, width = (int(side) for side in avatar["tensor_rect"])
+    return Placement(
+        joints=avatar["joints"],
+        clip_projection=crop_projection(pose["projection"], avatar["rect"]),
+        rect=(top, left, height, width),
+        feature=avatar["pose_feature"],
+    )
+
+
+def _refuse_nan(frame: int, avatars: Sequence[Any]) -> None:
+    for avatar in avatars:
+        if not np.isfinite(avatar["joints"]).all():
+            raise TrilaneError(f"frame {frame}: avatar {int(avatar['avatar'])} has a joint that is not a finite number")
