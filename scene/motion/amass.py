@@ -40,9 +40,8 @@ def load_amass(path: Path) -> RawMotion:
         f"AMASS .npz ({NAMES[width]}, {width} columns), {len(poses)} frames at {rate:g}/s ({key})",
         f"hands: {hands_note(poses)}",
         f"betas: {'none' if betas is None else len(betas)}",
+        *(("no `trans`: stays in place",) if translation is None else ()),
     )
-    if translation is None:
-        notes += ("no `trans`: stays in place",)
     return RawMotion(np.arange(len(poses)) / rate, poses, translation, betas, "z", notes)
 
 

@@ -31,7 +31,7 @@ CURL = {
 def hanging_arm(side: int, swing: Array) -> tuple[Array, Array, Array]:
     """Shoulder, elbow and wrist (T, 3, 3) of an arm at the side, swung back by `swing` (T,) radians."""
     shoulder = about(0, swing + 0.03) @ about(2, np.array(-side * HANG))
-    bend = ELBOW_EASE + np.clip(-swing, 0, None) * 0.9 + 0.1 * np.abs(swing)
+    bend = ELBOW_EASE + np.clip(-swing, 0, None) * 0.7 + 0.1 * np.abs(swing)
     elbow = about(1, -side * bend)
     wrist = np.broadcast_to(about(2, np.array(-side * 0.08)), elbow.shape)
     return shoulder, elbow, wrist

@@ -52,9 +52,9 @@ def bracket(times_s: Array, t_s: float) -> tuple[int, int, float]:
 class RawMotion:
     """What a file said, before repair and turning upright.
 
-    `times_s` (T,), `poses` (T, 55, 3) axis-angle radians, `translation` (T, 3): of the pelvis, metres, or None when the format
-    has none; NaNs and repeated times still in. `up`: the axis usual for the format. `leg_m`: hip to ankle of the
-    recorded person, when known.
+    `times_s` (T,), `poses` (T, 55, 3) axis-angle radians, `translation` (T, 3): of the pelvis, metres, or None when
+    the format has none; NaNs and repeated times still in. `up`: the axis usual for the format. `leg_m`: hip to
+    ankle of the recorded person, when known.
     """
 
     times_s: Array

@@ -35,7 +35,7 @@ REACH = 0.993
 #: from s, to s, what moves: z of the route in metres or heading in radians, how far.
 WALKS = ((0.25, 2.65, 1.5), (6.45, 8.85, -1.5))
 TURNS = ((5.25, 6.55, np.pi), (8.75, 9.95, np.pi))
-START_Z_M = -0.75
+START_Z_M = -1.1
 #: side (+1 left), lift s, landing s.
 SWINGS = (
     Swing(-1, 0.30, 0.76),
@@ -96,7 +96,7 @@ def _closed(times: Array, poses: Array, places: Array, what: str) -> Motion:
 def _route(times: Array) -> tuple[Array, Array, Array]:
     z = START_Z_M + sum(far * _eased((times - start) / (end - start)) for start, end, far in WALKS)
     heading = sum(angle * smooth_step((times - start) / (end - start)) for start, end, angle in TURNS)
-    return np.zeros_like(times), z, np.asarray(heading)
+    return np.zeros_like(times), np.asarray(z), np.asarray(heading)
 
 
 def _eased(x: Array) -> Array:
@@ -200,7 +200,7 @@ def _arms(poses: Array, times: Array, stride: Array, wave: bool) -> None:
     lag = np.roll(stride, 3)
     up = _wave_weight(times) if wave else np.zeros_like(times)
     for side, name in ((1, "left"), (-1, "right")):
-        shoulder, elbow, wrist = hanging_arm(side, 0.75 * side * lag)
+        shoulder, elbow, wrist = hanging_arm(side, 0.6 * side * lag)
         if side < 0 and wave:
             raised = waving_arm(np.sin(2 * np.pi * WAVES_PER_S * (times - WAVE_S[1])))
             shoulder, elbow, wrist = (

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
 from trilane.scene.motion.base import JOINTS, RawMotion
-from trilane.scene.motion.bvh import Bvh, BvhJoint, load_bvh
+from trilane.scene.motion.bvh import BvhJoint, load_bvh
 from trilane.scene.motion.names import DIALECTS, plain
 from trilane.scene.rotations import rotvec_from_matrix, shortest_turn
 from trilane.stages.cpu.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS
@@ -66,7 +66,7 @@ def load_retargeted(path: Path, units: str) -> RawMotion:
         f"{len(where)} joints have a partner, {hands} of them in the hands",
         "betas: none in the format",
     )
-    times = np.arange(len(bvh.frames)) * bvh.frame_time_s
+    times = np.arange(len(bvh.frames), dtype=np.float64) * bvh.frame_time_s
     return RawMotion(times, poses, translation, None, "y", notes, leg * unit_m)
 
 
@@ -133,10 +133,7 @@ def _file_bone(name: str, joints: list[BvhJoint], offsets: Array, where: dict[st
         return None
     end = LIMBS[name][0]
     index = where[name]
-    if end in where:
-        bone = offsets[where[end]] - offsets[index]
-    else:
-        bone = _furthest_below(index, joints, offsets)
+    bone = offsets[where[end]] - offsets[index] if end in where else _furthest_below(index, joints, offsets)
     return bone if np.linalg.norm(bone) > 1e-6 else None
 
 
@@ -164,7 +161,7 @@ def _body_frame(offsets: Array, where: dict[str, int]) -> Array:
     frame = columns / np.linalg.norm(columns, axis=0)
     snapped = np.round(frame)
     close = np.abs(np.linalg.det(snapped) - 1) < 1e-9 and np.trace(snapped.T @ frame) > 1 + 2 * np.cos(np.radians(20))
-    return snapped if close else frame
+    return np.asarray(snapped if close else frame)
 
 
 def _local_turns(turns: Array, rest: dict[str, Array], where: dict[str, int]) -> Array:

@@ -82,7 +82,7 @@ def centred(translation: Array) -> Array:
     """`translation` (T, 3) with the middle of its ground rectangle over the origin."""
     low, high = translation.min(axis=0), translation.max(axis=0)
     middle = (low + high) / 2
-    return translation - np.array([middle[0], 0.0, middle[2]])
+    return np.asarray(translation - np.array([middle[0], 0.0, middle[2]]))
 
 
 def _end_note(times_s: Array, wrap: Wrap) -> str:

@@ -1,0 +1,1 @@
+"""Cameras: recorded paths and built-in ones, as a view and a projection over time."""

@@ -1,0 +1,39 @@
+"""ARKit log: `time r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz` a line, camera to world, metres, Y up.
+
+Rule: axes are those of the sensor in landscape (x right, y up, looks along -Z); the time unit is told by its size.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from trilane.scene.camera.recorded import RawCamera
+from trilane.scene.camera.table import read_table
+
+COLUMNS = 13
+EXPECTED = "an ARKit log: time and the 12 numbers of a 3x4 matrix a line"
+#: iPhone main camera, 26 mm equivalent on a 16:9 picture: long side, short side.
+LONG_SIDE_DEG, SHORT_SIDE_DEG = 60.0, 36.0
+
+
+def load_arkit(path: Path) -> RawCamera:
+    """Read `path`. Raises BadInputError with the line."""
+    table = read_table(path, COLUMNS, EXPECTED)
+    times = table[:, 0] - table[0, 0]
+    step = float(np.nanmedian(np.diff(times))) if len(times) > 2 else 0.0
+    unit, scale = ("ns", 1e-9) if step > 1e3 or table[0, 0] > 1e12 else ("s", 1.0)
+    matrices = table[:, 1:].reshape(-1, 3, 4)
+    rate = f", {1 / (step * scale):.4g}/s" if step > 0 else ""
+    notes = (f"ARKit log, {len(table)} poses{rate}, time in {unit}, camera to world",)
+    return RawCamera(
+        times * scale,
+        matrices[:, :, :3],
+        matrices[:, :, 3],
+        "y",
+        SHORT_SIDE_DEG,
+        LONG_SIDE_DEG,
+        "usual for a phone",
+        notes,
+    )

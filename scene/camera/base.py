@@ -1,0 +1,92 @@
+"""What every camera becomes: poses at increasing times, a field of view, and a view matrix for any instant.
+
+Rule: inside, a pose is camera to world, OpenGL axes (x right, y up, looks along -Z), world Y up; between samples
+the place is linear and the turn a slerp; after the last sample the path is run backwards.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.scene.motion.base import Wrap, bracket, wrapped_time
+from trilane.scene.rotations import matrix_from_quat, slerp
+
+Array = NDArray[np.float64]
+
+
+def view_from_pose(turn: Array, place: Array) -> Array:
+    """World to camera (4, 4) of a camera whose axes are the columns of `turn` (3, 3), standing at `place` (3,)."""
+    view = np.eye(4)
+    view[:3, :3] = turn.T
+    view[:3, 3] = -turn.T @ place
+    return view
+
+
+def look_at(place: Array, target: Array) -> Array:
+    """World to camera (4, 4) of a level camera at `place` (3,) that looks at `target` (3,), not straight up or down."""
+    back = place - target
+    back = back / np.linalg.norm(back)
+    right = np.cross([0.0, 1.0, 0.0], back)
+    right = right / np.linalg.norm(right)
+    return view_from_pose(np.stack([right, np.cross(back, right), back], axis=1), place)
+
+
+def projection_matrix(fov_y_deg: float, aspect: float, near_m: float, far_m: float) -> Array:
+    """OpenGL perspective matrix (4, 4); `aspect` is width over height."""
+    f = 1 / np.tan(np.radians(fov_y_deg) / 2)
+    depth = near_m - far_m
+    return np.array(
+        [
+            [f / aspect, 0.0, 0.0, 0.0],
+            [0.0, f, 0.0, 0.0],
+            [0.0, 0.0, (far_m + near_m) / depth, 2 * far_m * near_m / depth],
+            [0.0, 0.0, -1.0, 0.0],
+        ]
+    )
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Field of view of the picture's height, and the clip planes."""
+
+    fov_y_deg: float
+    near_m: float
+    far_m: float
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """A camera over time.
+
+    `times_s` (N,) from 0, strictly increasing. `quats` (N, 4) and `places` (N, 3): camera to world. `notes`: what
+    the source was taken for and what was mended. `recorded`: the path knows nothing of the scene and is to be placed.
+    """
+
+    times_s: Array
+    quats: Array
+    places: Array
+    lens: Lens
+    notes: tuple[str, ...]
+    wrap: Wrap = Wrap.BOUNCE
+    recorded: bool = True
+
+    @property
+    def duration_s(self) -> float:
+        return float(self.times_s[-1])
+
+    def pose(self, t_s: float) -> tuple[Array, Array]:
+        """Turn (3, 3) and place (3,) of the camera at `t_s`."""
+        i, j, fraction = bracket(self.times_s, wrapped_time(t_s, self.duration_s, self.wrap))
+        turn = matrix_from_quat(slerp(self.quats[i], self.quats[j], fraction))
+        return turn, self.places[i] + (self.places[j] - self.places[i]) * fraction
+
+    def sample(self, t_s: float) -> Array:
+        """World to camera (4, 4) at `t_s`."""
+        return view_from_pose(*self.pose(t_s))
+
+    def projection(self, aspect: float) -> Array:
+        """OpenGL clip matrix (4, 4) for a picture of `aspect` width over height."""
+        return projection_matrix(self.lens.fov_y_deg, aspect, self.lens.near_m, self.lens.far_m)

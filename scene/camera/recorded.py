@@ -1,0 +1,96 @@
+"""Poses of any recorder to a CameraPath: mended, world turned Y up, picture turned the right way up.
+
+Rule: relative motion is never changed. Only two constant turns are applied: one of the world, so that up is +Y, and
+one of the picture by a multiple of 90 degrees, as a phone turns its display.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.scene.camera.base import CameraPath, Lens
+from trilane.scene.motion.repair import kept_samples
+from trilane.scene.rotations import about, quat_from_matrix, shortest_turn
+from trilane.scene.schema import CameraSpec
+
+Array = NDArray[np.float64]
+
+UP = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+#: Below this cosine between the picture's mean up and the format's usual up, the usual up is not believed.
+BELIEVED = 0.3
+#: Largest |R^T R - 1| of a rotation matrix that a log may have.
+SKEW = 0.05
+#: Optical axes (x right, y down, z ahead) to OpenGL axes.
+OPENGL_FROM_OPTICAL: Array = np.diag([1.0, -1.0, -1.0])
+
+
+@dataclass(frozen=True)
+class RawCamera:
+    """What a log said: camera to world, OpenGL axes. `turns` (N, 3, 3), `places` (N, 3) metres, `times_s` (N,).
+
+    `usual_up`: axis of the world that is up for the format. `fov_y_deg`: by the file or usual for the device held
+    level, `portrait_fov_y_deg`: held upright; `lens`: where these come from.
+    """
+
+    times_s: Array
+    turns: Array
+    places: Array
+    usual_up: str
+    fov_y_deg: float
+    portrait_fov_y_deg: float
+    lens: str
+    notes: tuple[str, ...]
+
+
+def finish(raw: RawCamera, where: str, spec: CameraSpec) -> CameraPath:
+    """Make a CameraPath. Raises BadInputError when most of the poses are unusable."""
+    kept, repairs = kept_samples(where, raw.times_s, _sound(raw.turns, raw.places))
+    times, turns, places = raw.times_s[kept], raw.turns[kept], raw.places[kept]
+    up, quarter, note = _upright(turns, raw.usual_up)
+    world = shortest_turn(np.array(up), np.array(UP["y"]))
+    quats = quat_from_matrix(world @ turns @ about(2, np.array(quarter * np.pi / 2)))
+    usual = raw.portrait_fov_y_deg if quarter % 2 else raw.fov_y_deg
+    fov = usual if spec.fov_y_deg is None else spec.fov_y_deg
+    source = raw.lens if spec.fov_y_deg is None else "as given"
+    notes = (
+        *raw.notes,
+        note,
+        f"field of view {fov:.4g} degrees high, {source}",
+        *repairs,
+        f"{times[-1] - times[0]:.2f} s, then plays back and forth" if len(times) > 1 else "one pose: held",
+    )
+    lens = Lens(fov, spec.near_m, spec.far_m)
+    return CameraPath(times - times[0], quats, places @ world.T, lens, notes)
+
+
+def _sound(turns: Array, places: Array) -> NDArray[np.bool_]:
+    """Poses (N,) that are finite and whose matrix is a rotation."""
+    finite = np.asarray(np.isfinite(turns).all(axis=(1, 2)) & np.isfinite(places).all(axis=1))
+    safe = np.where(finite[:, None, None], turns, 0.0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        skew = np.abs(np.swapaxes(safe, -1, -2) @ safe - np.eye(3)).max(axis=(1, 2))
+        rotation = (skew < SKEW) & (np.linalg.det(safe) > 0)
+        return np.asarray(finite & rotation & (np.abs(np.where(finite[:, None], places, 0.0)) < 1e5).all(axis=1))
+
+
+def _upright(turns: Array, usual: str) -> tuple[tuple[float, float, float], int, str]:
+    """Up axis of the world, quarter turns of the picture, and a note.
+
+    The picture is turned so that its up is nearest to the world's; when even then they disagree, the world's up is
+    the axis nearest to the picture's own up.
+    """
+    x, y = turns[:, :, 0].mean(axis=0), turns[:, :, 1].mean(axis=0)
+    ups = np.array([y, -x, -y, x])
+    cosines = ups @ np.array(UP[usual])
+    quarter = int(np.argmax(cosines))
+    if cosines[quarter] > BELIEVED:
+        turned = f", device held so that the picture is turned by {quarter * 90} degrees" if quarter else ""
+        return UP[usual], quarter, f"{usual.upper()} up{turned}"
+    axis = int(np.argmax(np.abs(y)))
+    sign = 1.0 if y[axis] >= 0 else -1.0
+    vector = (sign * (axis == 0), sign * (axis == 1), sign * (axis == 2))
+    name = f"{'-' if sign < 0 else ''}{'XYZ'[axis]}"
+    return vector, 0, f"{name} up, as the camera is held (not {usual.upper()}, usual for the format)"

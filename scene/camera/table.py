@@ -1,0 +1,42 @@
+"""Text tables of camera poses: comment lines and one pose a line, numbers apart by blanks or commas.
+
+Rule: every line has the same count of numbers; the first that has not is named.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.errors import BadInputError
+from trilane.scene.files import read_text
+
+MAX_ROWS = 1_000_000
+
+
+def read_table(path: Path, columns: int, expected: str) -> NDArray[np.float64]:
+    """The numbers (N, columns) of `path`, N >= 1; `nan` and `inf` stay. Raises BadInputError with the line."""
+    rows = []
+    for number, words in _lines(path, expected):
+        if len(words) != columns:
+            raise BadInputError(f"{path}, line {number}", f"{len(words)} columns", expected)
+        try:
+            rows.append([float(word) for word in words])
+        except ValueError as error:
+            raise BadInputError(f"{path}, line {number}", str(error), expected) from None
+    if not rows or len(rows) > MAX_ROWS:
+        raise BadInputError(path, f"{len(rows)} poses", f"1 to {MAX_ROWS}; {expected}")
+    return np.array(rows)
+
+
+def column_count(path: Path, expected: str) -> int:
+    """Numbers on the first line that is no comment; 0 when there is none. Raises BadInputError."""
+    return next((len(words) for _, words in _lines(path, expected)), 0)
+
+
+def _lines(path: Path, expected: str) -> list[tuple[int, list[str]]]:
+    lines = enumerate(read_text(path, expected).splitlines(), 1)
+    cut = ((number, line.split("#", 1)[0].replace(",", " ").split()) for number, line in lines)
+    return [(number, words) for number, words in cut if words]

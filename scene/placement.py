@@ -1,0 +1,176 @@
+"""How a recorded camera and the avatars meet: the recording is set down in the scene so that it films them.
+
+Rule: the recording is moved as one rigid piece and stays upright: it is turned about the vertical, shifted, and
+lifted over the floor; what it does from frame to frame is never changed. Of all such places the one is taken from
+which the whole bodies are in the picture in the most frames, then the one where they are largest. The avatars face
+the camera at the first frame, as far as their own headings say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.scene.camera.base import CameraPath, view_from_pose
+from trilane.scene.grounding import outline
+from trilane.scene.mover import Mover
+from trilane.scene.rotations import about
+from trilane.scene.schema import Scene
+from trilane.stages.cpu.body import ShapedBody
+from trilane.stages.cpu.kinematics import Skeleton
+
+Array = NDArray[np.float64]
+F32 = NDArray[np.float32]
+
+#: Frames that a placement is judged by.
+LOOKS = 48
+#: Metres: how far aside of the camera, and how high over the floor, places are tried; first coarse, then finer.
+REACH_M, COARSE_M = 7.0, 0.5
+EYE_HEIGHTS_M: Array = np.arange(0.8, 3.61, 0.2)
+FINER_M = (0.25, 0.12, 0.06)
+#: The camera is never nearer to the floor than this.
+LOWEST_EYE_M = 0.3
+#: Part of the picture's half height and width that a whole body keeps within.
+MARGIN = 0.97
+#: Worth of a large picture against a whole one, per share of the picture's height.
+SIZE_WORTH, ENOUGH_SIZE = 0.12, 0.75
+NEAREST_M = 0.3
+
+
+@dataclass(frozen=True)
+class PlacedCamera:
+    """A camera in the scene. `turn` (3, 3) and `shift` (3,) take the path's world to the scene's."""
+
+    path: CameraPath
+    turn: Array
+    shift: Array
+    notes: tuple[str, ...]
+
+    def sample(self, t_s: float) -> Array:
+        """World to camera (4, 4) at `t_s`, scene world."""
+        turn, place = self.path.pose(t_s)
+        return view_from_pose(self.turn @ turn, self.turn @ place + self.shift)
+
+    def projection(self, aspect: float) -> Array:
+        """OpenGL clip matrix (4, 4)."""
+        return self.path.projection(aspect)
+
+
+@dataclass(frozen=True)
+class _Film:
+    """What a placement is judged by. `views` (F, 3, 4): path world to camera. `eyes` (F, 3): path world.
+
+    `boxes` (F, 8, 3): corners round the bodies, scene world. `scale` (2,): of x and y to NDC.
+    """
+
+    views: F32
+    eyes: Array
+    boxes: Array
+    scale: Array
+
+
+def place_camera(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]) -> PlacedCamera:
+    """Set `path` down among the avatars for the frames that `scene` asks for.
+
+    A built-in camera, and one whose spec says `place = "none"`, is left where it is.
+    """
+    if not path.recorded or scene.camera.place == "none":
+        return PlacedCamera(path, np.eye(3), np.zeros(3), ())
+    film = _film(path, scene, movers, bodies)
+    spots = _coarse_spots(film)
+    best = _best(film, spots)
+    for step in FINER_M:
+        best = _best(film, _around(best, step))
+    whole, size = _judged(film, best[None])
+    turn, shift = _transform(film, best)
+    eye = best[1] * -1 + film.eyes[:, 1].mean()
+    notes = (
+        f"camera set down {_distance(film, best):.1f} m from the avatar, {eye:.1f} m over the floor on average",
+        f"whole body in the picture in {whole[0]:.0%} of the frames, {size[0]:.0%} of its height on average",
+    )
+    return PlacedCamera(path, turn, shift, notes)
+
+
+def _film(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]) -> _Film:
+    count = min(scene.frames, LOOKS)
+    times = np.linspace(0.0, (scene.frames - 1) / scene.fps, count)
+    poses = [path.pose(float(t)) for t in times]
+    views = np.stack([view_from_pose(turn, place)[:3] for turn, place in poses]).astype(np.float32)
+    lows, highs = _bounds(times, movers, bodies)
+    pick = np.array([[(k >> axis) & 1 for axis in range(3)] for k in range(8)], dtype=bool)
+    boxes = np.where(pick[None], highs[:, None], lows[:, None])
+    projection = path.projection(scene.output.width / scene.output.height)
+    return _Film(views, np.stack([place for _, place in poses]), boxes, np.array([projection[0, 0], projection[1, 1]]))
+
+
+def _bounds(times: Array, movers: Sequence[Mover], bodies: Sequence[ShapedBody]) -> tuple[Array, Array]:
+    """Lowest and highest corners (F, 3) round all bodies."""
+    lows, highs = np.full((len(times), 3), np.inf), np.full((len(times), 3), -np.inf)
+    for mover, body in zip(movers, bodies, strict=True):
+        skeleton, shape = Skeleton(body.joints, body.body.parents), outline(body)
+        for k, t_s in enumerate(times):
+            pose, translation = mover.sample(float(t_s))
+            points = shape.posed(skeleton.pose(pose, translation, mover.world).matrices)
+            lows[k], highs[k] = np.minimum(lows[k], points.min(axis=0)), np.maximum(highs[k], points.max(axis=0))
+    return lows, highs
+
+
+def _coarse_spots(film: _Film) -> Array:
+    """Places (S, 3) of the scene's origin in the path's world."""
+    middle = film.eyes.mean(axis=0)
+    level = np.arange(-REACH_M, REACH_M + COARSE_M / 2, COARSE_M)
+    x, height, z = np.meshgrid(level, EYE_HEIGHTS_M, level, indexing="ij")
+    return np.asarray(middle + np.stack([x.ravel(), -height.ravel(), z.ravel()], axis=1))
+
+
+def _around(spot: Array, step: float) -> Array:
+    offsets = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)], dtype=np.float64)
+    return np.asarray(np.concatenate([spot[None], spot + step * offsets]))
+
+
+def _best(film: _Film, spots: Array) -> Array:
+    whole, size = _judged(film, spots)
+    worth = whole + SIZE_WORTH * np.minimum(size, ENOUGH_SIZE)
+    worth = np.where(film.eyes[:, 1].min() - spots[:, 1] >= LOWEST_EYE_M, worth, -1.0)
+    return np.asarray(spots[int(worth.argmax())])
+
+
+def _judged(film: _Film, spots: Array) -> tuple[Array, Array]:
+    """Per spot: share of the frames with whole bodies, mean share of the picture's height that they take. Each (S,)."""
+    angle = _facing(film, spots)
+    cos, sin = (f(angle).astype(np.float32)[:, None, None] for f in (np.cos, np.sin))
+    boxes, spots32 = film.boxes.astype(np.float32), spots.astype(np.float32)[:, :, None, None]
+    x = cos * boxes[..., 0] + sin * boxes[..., 2] + spots32[:, 0]
+    y = boxes[..., 1] + spots32[:, 1]
+    z = cos * boxes[..., 2] - sin * boxes[..., 0] + spots32[:, 2]
+    right, up, back = (_row(film.views[:, k], x, y, z) for k in range(3))
+    depth = np.maximum(-back, NEAREST_M)
+    ahead = (-back > NEAREST_M).all(axis=-1)
+    across, high = right * np.float32(film.scale[0]) / depth, up * np.float32(film.scale[1]) / depth
+    inside = (np.abs(across) < MARGIN).all(axis=-1) & (np.abs(high) < MARGIN).all(axis=-1)
+    tall = (np.clip(high.max(axis=-1), -1, 1) - np.clip(high.min(axis=-1), -1, 1)) / 2
+    return (ahead & inside).mean(axis=1), np.where(ahead, tall, 0.0).mean(axis=1)
+
+
+def _row(row: F32, x: F32, y: F32, z: F32) -> F32:
+    """One row (F, 4) of the views on points (S, F, 8)."""
+    a, b, c, d = (row[None, :, None, k] for k in range(4))
+    return np.asarray(a * x + b * y + c * z + d)
+
+
+def _facing(film: _Film, spots: Array) -> Array:
+    """Angle (S,) about +Y from the scene to the path's world, for which +Z at each spot points to the first eye."""
+    towards = film.eyes[0] - spots
+    return np.asarray(np.arctan2(towards[:, 0], towards[:, 2]))
+
+
+def _transform(film: _Film, spot: Array) -> tuple[Array, Array]:
+    turn = about(1, -_facing(film, spot[None])[0])
+    return turn, -turn @ spot
+
+
+def _distance(film: _Film, spot: Array) -> float:
+    return float(np.hypot(film.eyes[:, 0] - spot[0], film.eyes[:, 2] - spot[2]).mean())

@@ -1,0 +1,42 @@
+"""A scene with everything in its place: movers on the floor and a camera that films them.
+
+Rule: the one way from a scene and its bodies to what is sampled per frame; the command line and the pose stage both
+take it, so that what is said is what is done.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from trilane.scene.camera.load import load_camera
+from trilane.scene.motion.load import load_motion
+from trilane.scene.mover import Mover, make_mover
+from trilane.scene.placement import PlacedCamera, place_camera
+from trilane.scene.schema import Scene
+from trilane.stages.cpu.body import ShapedBody
+
+
+@dataclass(frozen=True)
+class Staged:
+    """`movers`: one for each avatar of the scene. `notes`: of the motions, of the floor, of the camera."""
+
+    movers: tuple[Mover, ...]
+    camera: PlacedCamera
+    notes: tuple[str, ...]
+
+
+def stage_scene(scene: Scene, bodies: Sequence[ShapedBody], base: Path) -> Staged:
+    """Load the motions and the camera of `scene`, whose avatars have `bodies`; relative paths start at `base`.
+
+    Raises BadInputError when a file is unusable.
+    """
+    motions = [load_motion(spec, base) for spec in scene.avatars]
+    movers = tuple(
+        make_mover(spec, motion, body) for spec, motion, body in zip(scene.avatars, motions, bodies, strict=True)
+    )
+    path = load_camera(scene.camera, base)
+    camera = place_camera(path, scene, movers, bodies)
+    notes = [note for mover in movers for note in (*mover.motion.notes, *mover.notes)]
+    return Staged(movers, camera, (*notes, *path.notes, *camera.notes))
