@@ -75,16 +75,17 @@ def requested_scene(request: Request) -> Scene:
 def configure(request: Request, out_dir: Path) -> Checked:
     """Look at every part of what was asked for. Raises BadInputError or MissingPartError."""
     scene = requested_scene(request)
-    bundles = [_checked_bundle(spec.bundle) for spec in scene.avatars]
+    runtime = resolve(request.runtime)
     notes = [note for spec in scene.avatars for note in load_motion(spec, Path.cwd()).notes]
     notes += load_camera(scene.camera, Path.cwd()).notes
     _check_background(scene)
+    bundles = [_checked_bundle(spec.bundle) for spec in scene.avatars]
     config = RunConfig(
         scene=scene,
         out_dir=out_dir,
         avatar_dirs=tuple(bundle.folder.absolute() for bundle in bundles),
         units=host_units(),
-        runtime=resolve(request.runtime),
+        runtime=runtime,
     )
     return Checked(config, tuple(notes), {bundle.manifest.name: _accuracy(bundle) for bundle in bundles})
 

@@ -20,6 +20,7 @@ from trilane.errors import TrilaneError
 from trilane.scene.schema import RunConfig
 from trilane.scheduler.result import RunResult
 from trilane.scheduler.run import run_pipeline
+from trilane.scheduler.signals import Interrupts
 from trilane.stages.cpu.present import SEGMENTS
 
 BASELINE_POLICY = "sequential"
@@ -61,12 +62,13 @@ def run_to_folder(
     with RunFolder(target) as folder:
         config = config.model_copy(update={"out_dir": folder.work})
         result = _run(config, plan.policy, None, hooks)
-        baseline = _baseline(config, plan, hooks) if _went_well(result) else None
-        report = build_report(result, config, policy=plan.policy, machine=machine, baseline=baseline)
-        report |= {**facts, **_write_files(result, folder.work, config.scene.fps)}
-        write_report(report, folder.work / "report.json")
-        code = _exit_code(result)
-        return Outcome(report, folder.complete(), code)
+        with Interrupts() as late:  # from here on a signal waits until the folder is whole
+            baseline, stopped = _baseline(config, plan, hooks) if _went_well(result) else (None, False)
+            report = build_report(result, config, policy=plan.policy, machine=machine, baseline=baseline)
+            report |= {**facts, **_write_files(result, folder.work, config.scene.fps)}
+            write_report(report, folder.work / "report.json")
+            place = folder.complete()
+        return Outcome(report, place, INTERRUPTED if stopped or late.count else _exit_code(result))
 
 
 def _went_well(result: RunResult) -> bool:
@@ -96,19 +98,26 @@ def _error_of(result: RunResult) -> TrilaneError:
     return error
 
 
-def _baseline(config: RunConfig, plan: Plan, hooks: Hooks) -> RunResult | None:
-    """The first frames of the same scene again, one frame at a time, with the same work; its pictures are not kept."""
+def _baseline(config: RunConfig, plan: Plan, hooks: Hooks) -> tuple[RunResult | None, bool]:
+    """The first frames of the same scene again, one frame at a time, with the same work; its pictures are not kept.
+
+    None when it was not asked for or did not complete; and whether it was interrupted.
+    """
     if not plan.baseline_frames or plan.policy == BASELINE_POLICY:
-        return None
+        return None, False
     place = config.out_dir / BASELINE_POLICY
     place.mkdir()
-    config = config.model_copy(update={"out_dir": place})
-    result = _run(config, BASELINE_POLICY, min(plan.baseline_frames, config.scene.frames), hooks)
-    shutil.rmtree(place)
-    if not _went_well(result):
-        hooks.message(f"the {BASELINE_POLICY} run beside it did not complete and is left out")
-        return None
-    return result
+    frames = min(plan.baseline_frames, config.scene.frames)
+    try:
+        result = _run(config.model_copy(update={"out_dir": place}), BASELINE_POLICY, frames, hooks)
+    except KeyboardInterrupt:
+        return None, True
+    except TrilaneError as error:
+        hooks.message(f"the {BASELINE_POLICY} run beside it failed and is left out: {error}")
+        return None, False
+    finally:
+        shutil.rmtree(place)
+    return (result if _went_well(result) else None), result.interrupted
 
 
 def _exit_code(result: RunResult) -> int:

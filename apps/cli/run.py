@@ -31,10 +31,12 @@ Examples:
 
 
 class PolicyName(StrEnum):
-    """Policies of a run."""
+    """Policies of the scheduler; the last two release frames at the scene's rate and may drop some."""
 
     PIPELINED = "pipelined"
     SEQUENTIAL = "sequential"
+    LATEST = "latest"
+    DEADLINE = "deadline"
 
 
 @contextmanager

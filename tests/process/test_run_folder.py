@@ -1,0 +1,125 @@
+"""A run of mock units to its folder: whole when it went well, honest when it did not, gone when nothing came of it."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from trilane.apps.machine import machine_facts
+from trilane.apps.report import read_report
+from trilane.apps.run_job import Hooks, Outcome, Plan, run_to_folder
+from trilane.errors import TrilaneError
+from trilane.hw_profiles.host import host_units
+from trilane.scene.schema import OutputSpec, RunConfig, Scene
+from trilane.scheduler.record import read, replay
+
+FRAMES = 24
+MOCK = "trilane.stages.mock.unit"
+
+
+class Listener:
+    """Keeps the messages, and interrupts this process once when `interrupt_at` is presented of run `during`."""
+
+    def __init__(self, during: str = "", interrupt_at: int = 0) -> None:
+        self.messages: list[str] = []
+        self._during, self._interrupt_at = during, interrupt_at
+
+    def progress(self, what: str, presented: int, requested: int) -> None:
+        assert presented <= requested
+        if what == self._during and presented >= self._interrupt_at:
+            self._during = ""
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+def run_mocks(target: Path, listener: Listener, plan: Plan | None = None, frames: int = FRAMES) -> Outcome:
+    config = RunConfig(
+        scene=Scene(frames=frames, output=OutputSpec(width=64, height=64)),
+        out_dir=target,
+        avatar_dirs=(),
+        units=host_units(),
+        fake=dict.fromkeys(("cpu", "gpu", "dsp"), MOCK),
+    )
+    hooks = Hooks(listener.progress, listener.messages.append)
+    return run_to_folder(
+        config, target, plan or Plan(baseline_frames=8), hooks, machine=machine_facts(), facts={"x": 1}
+    )
+
+
+def test_a_run_leaves_one_whole_folder_and_no_process(tmp_path: Path) -> None:
+    outcome = run_mocks(tmp_path / "run", Listener())
+    assert outcome.exit_code == 0
+    assert outcome.folder == tmp_path / "run"
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+    assert {"report.json", "trace.pftrace", "events.jsonl"} <= {path.name for path in outcome.folder.iterdir()}
+    assert psutil.Process().children() == []
+
+
+def test_the_report_has_the_keys_of_the_schema_and_the_baseline(tmp_path: Path) -> None:
+    report = read_report(run_mocks(tmp_path / "run", Listener()).folder)
+    added: dict[str, Any] = report.model_extra or {}
+    assert report.clock == "host"
+    assert (report.frames.requested, report.frames.presented, report.frames.lost) == (FRAMES, FRAMES, 0)
+    assert len(set(added["pids"].values())) == 3
+    assert added["baseline"]["policy"] == "sequential"
+    assert added["baseline"]["frames"]["presented"] == 8
+    assert added["baseline"]["fps"] < report.fps
+    assert added["x"] == 1
+    assert set(report.stages) == {"pose", "raster", "infer", "composite", "present"}
+    for unit in report.units.values():
+        idle = unit.idle
+        assert unit.busy + idle.starved + idle.blocked + idle.throttled + idle.overhead == pytest.approx(1)
+
+
+def test_the_events_of_a_run_replay_to_the_same_answers(tmp_path: Path) -> None:
+    outcome = run_mocks(tmp_path / "run", Listener(), Plan(baseline_frames=0))
+    assert list(replay(read(outcome.folder / "events.jsonl"))) == []
+
+
+def test_no_baseline_beside_a_sequential_run(tmp_path: Path) -> None:
+    assert run_mocks(tmp_path / "run", Listener(), Plan("sequential", 8)).report["baseline"] is None
+
+
+def test_an_interrupted_run_keeps_what_was_presented(tmp_path: Path) -> None:
+    outcome = run_mocks(tmp_path / "run", Listener("pipelined", 1), frames=2000)
+    assert outcome.exit_code == 130
+    assert outcome.report["interrupted"]
+    assert outcome.report["baseline"] is None
+    assert 1 <= read_report(outcome.folder).frames.presented < 2000
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+    assert psutil.Process().children() == []
+
+
+def test_an_interrupted_baseline_loses_nothing_of_the_run(tmp_path: Path) -> None:
+    outcome = run_mocks(tmp_path / "run", Listener("sequential", 1), Plan(baseline_frames=2000), frames=500)
+    assert outcome.exit_code == 130
+    assert not outcome.report["interrupted"]
+    assert outcome.report["baseline"] is None
+    assert read_report(outcome.folder).frames.presented == 500
+    assert not (outcome.folder / "sequential").exists()
+
+
+def test_a_stage_that_fails_is_named_and_the_frames_before_it_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TRILANE_MOCK", "infer=raise")
+    listener = Listener()
+    outcome = run_mocks(tmp_path / "run", listener, frames=100)  # frame 3 is none of those measured before the run
+    assert outcome.exit_code == 2
+    assert "mock.npz" in outcome.report["failure"]
+    assert 1 <= outcome.report["frames"]["presented"] < 100
+    assert any("mock.npz" in message for message in listener.messages)
+    assert psutil.Process().children() == []
+
+
+def test_a_unit_that_cannot_be_built_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TRILANE_MOCK", "infer=badbuild")
+    with pytest.raises(TrilaneError, match=r"mock\.onnx: found nothing") as raised:
+        run_mocks(tmp_path / "made" / "run", Listener())
+    assert raised.value.exit_code == 2
+    assert list(tmp_path.iterdir()) == []
+    assert psutil.Process().children() == []
