@@ -22,7 +22,7 @@ COMMANDS = {
     "doctor": ("trilane.apps.cli.doctor", "Say what this machine has, what is missing and how to install it."),
 }
 
-FAILED, MISSING_PART, INTERRUPTED = 1, 3, 130
+FAILED, MISSING_PART = 1, 3  # 2 is wrong usage and 130 an interrupt, as Typer has them
 
 EPILOG = """\b
 Examples:
@@ -111,8 +111,6 @@ def main() -> None:
     debug = len(arguments) < len(sys.argv) - 1
     try:
         app(args=arguments, prog_name="trilane")
-    except KeyboardInterrupt:
-        _fail("interrupted", INTERRUPTED)
     except Exception as error:
         if debug:
             raise
