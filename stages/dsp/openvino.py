@@ -5,6 +5,7 @@ Rule: after the first run of a session nothing is allocated and nothing is copie
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from trilane.avatars.network_file import NetworkFile
 from trilane.errors import BadInputError
-from trilane.stages.dsp.runtime import RuntimeOptions
+from trilane.stages.dsp.runtime import RuntimeOptions, cache_dir
 
 DEVICE = "CPU"
 LAYERS = {"Convolution", "Deconvolution", "FullyConnected", "MatMul"}
@@ -48,7 +49,6 @@ class OpenvinoSession:
 
 def load(network: NetworkFile, options: RuntimeOptions) -> OpenvinoSession:
     """Compile `network`. Raises BadInputError when OpenVINO cannot, or leaves a layer in float."""
-    core = openvino.Core()
     settings = {
         "PERFORMANCE_HINT": "LATENCY",
         "INFERENCE_NUM_THREADS": options.threads,
@@ -56,12 +56,22 @@ def load(network: NetworkFile, options: RuntimeOptions) -> OpenvinoSession:
         "ENABLE_CPU_PINNING": False,
     }
     try:
-        model = core.read_model(network.model.SerializeToString())
-        compiled = core.compile_model(model, DEVICE, settings)
+        model = _core().read_model(network.model.SerializeToString())
+        compiled = _core().compile_model(model, DEVICE, settings)
     except RuntimeError as error:
         raise BadInputError(network.where, str(error), "a network that OpenVINO loads") from error
     _check_integer(compiled, network)
     return OpenvinoSession(compiled)
+
+
+@cache
+def _core() -> Any:
+    """One core for all shapes. Its cache is keyed by network, settings, OpenVINO version and CPU."""
+    core = openvino.Core()
+    folder = cache_dir("openvino")
+    if folder is not None:
+        core.set_property({"CACHE_DIR": str(folder)})
+    return core
 
 
 def version() -> str:

@@ -6,9 +6,11 @@ Rule: a runtime is chosen by name and is what runs, or the run stops and says so
 from __future__ import annotations
 
 import importlib.util
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -89,3 +91,14 @@ def load_runtime(name: str) -> Runtime:
     """The module of runtime `name`. Raises BadInputError, MissingPartError."""
     module: Runtime = import_module(RUNTIMES[resolve(name)].module)
     return module
+
+
+def cache_dir(name: str) -> Path | None:
+    """Where compiled networks of runtime `name` are kept: under XDG_CACHE_HOME. None when it cannot be written."""
+    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    folder = Path(home) / "trilane" / name
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return None
+    return folder if os.access(folder, os.W_OK) else None
