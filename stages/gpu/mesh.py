@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +17,7 @@ from trilane.stages.contracts import JOINTS, POSE_FEATURES
 
 WEIGHT_COUNTS = (4, 8, 12)
 PATCH_TRIANGLES = 320
+MAX_OPEN = 0.005
 POSEDIRS_ROW = 8192  # texels in a row of the pose blend shape texture
 GROUPS = "abc"
 
@@ -29,7 +31,7 @@ class MeshArrays:
 
     `position` (N,3) metres, rest pose. `uv` (N,2). `joint` (N,K) uint8, `weight` (N,K), rows sum to 1.
     `triangles` (F,3) uint32. `source` (N,) int64: which vertex of the body a row came from. `normal` (N,3) and
-    `colour` (N,4): only for meshes that are shaded.
+    `colour` (N,4): only for meshes that are shaded. `closed`: triangles that face away are never seen from outside.
     """
 
     position: F32
@@ -39,6 +41,7 @@ class MeshArrays:
     triangles: NDArray[np.uint32]
     source: NDArray[np.int64]
     surface: dict[str, F32] = field(default_factory=dict)
+    closed: bool = False
 
     @property
     def weights_per_vertex(self) -> int:
@@ -77,7 +80,21 @@ def mesh_arrays(
             for name, values in surface.items()
             if values is not None
         },
+        closed=is_closed(vertices, faces),
     )
+
+
+def is_closed(vertices: NDArray[np.floating[Any]], faces: Ints) -> bool:
+    """Do the faces (F,3) wind outward around a volume, with at most MAX_OPEN of their edges open?
+
+    Bodies have small openings where no camera looks, such as the backs of the eyes.
+    """
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+    there, back = edges @ [1 << 32, 1], edges @ [1, 1 << 32]
+    corners = np.asarray(vertices, np.float64)[faces]
+    volume = np.einsum("fi,fi->", np.cross(corners[:, 0], corners[:, 1]), corners[:, 2])
+    open_edges = np.count_nonzero(~np.isin(there, back))
+    return bool(volume > 0 and open_edges <= MAX_OPEN * len(edges) and len(np.unique(there)) == len(there))
 
 
 def split_corners(faces: Ints, uv_faces: Ints) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.uint32]]:
@@ -128,14 +145,20 @@ class SkinnedMesh:
         self._ctx = ctx
 
     @property
-    def defines(self) -> dict[str, int]:
+    def defines(self) -> dict[str, int | str]:
         """Definitions that the vertex shader needs for this mesh."""
-        values = {"K": self.arrays.weights_per_vertex, "JOINTS": JOINTS}
+        values: dict[str, int | str] = {"K": self.arrays.weights_per_vertex, "JOINTS": JOINTS}
         if self.posedirs is not None:
             values |= {"POSE_FEATURES": POSE_FEATURES, "ROW": POSEDIRS_ROW}
         if self.arrays.surface:
             values["SURFACE"] = 1
         return values
+
+    def prepare(self, ctx: Any) -> None:
+        """Depth test, and leave out the triangles that face away when the mesh is closed."""
+        ctx.enable_only(moderngl.DEPTH_TEST | (moderngl.CULL_FACE if self.arrays.closed else moderngl.NOTHING))
+        ctx.depth_func = "<"
+        ctx.front_face = "cw"  # rows run downward: what winds counter-clockwise in the picture is stored clockwise
 
     def vertex_array(self, program: Any) -> Any:
         """A vertex array of this mesh for `program`; attributes that the compiler dropped are skipped."""

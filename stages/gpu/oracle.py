@@ -37,11 +37,19 @@ def skin(arrays: MeshArrays, joints: NDArray[np.floating[Any]]) -> F64:
 
 
 def rasterise(
-    world: F64, triangles: NDArray[np.integer[Any]], uv: NDArray[np.floating[Any]], clip: F64, shape: tuple[int, int]
+    world: F64,
+    triangles: NDArray[np.integer[Any]],
+    uv: NDArray[np.floating[Any]],
+    clip: F64,
+    shape: tuple[int, int],
+    cull: bool = False,
 ) -> OracleImage:
-    """Draw `triangles` (F,3) of `world` (N,3) with `uv` (N,2) through `clip` = projection @ view (4,4); row 0 on top."""
+    """Draw `triangles` (F,3) of `world` (N,3) with `uv` (N,2) through `clip` = projection @ view (4,4); row 0 on top.
+
+    `cull`: leave out triangles that wind clockwise in the picture.
+    """
     corners = _target_corners(world, clip, shape)[triangles]
-    pixel, depth, owner, share = _fragments(corners, shape)
+    pixel, depth, owner, share = _fragments(corners, shape, cull)
     nearest = np.lexsort((owner, depth, pixel))
     pixel, first = np.unique(pixel[nearest], return_index=True)
     chosen = nearest[first]
@@ -89,9 +97,13 @@ def _target_corners(world: F64, clip: F64, shape: tuple[int, int]) -> F64:
     return np.stack([(x + w) * shape[1] / 2, (y + w) * shape[0] / 2, z, w], axis=-1)
 
 
-def _fragments(corners: F64, shape: tuple[int, int]) -> tuple[NDArray[np.int64], F64, NDArray[np.int64], F64]:
+def _fragments(
+    corners: F64, shape: tuple[int, int], cull: bool
+) -> tuple[NDArray[np.int64], F64, NDArray[np.int64], F64]:
     """Every covered sample of every triangle: pixel index, depth z/w, triangle, shares (P,3) of the corners."""
     low, size = _boxes(corners, shape)
+    if cull:
+        size[_determinant(corners) >= 0] = 0
     parts = []
     for side in 2 ** np.arange(int(np.ceil(np.log2(max(size.max(initial=1), 1)))) + 1):
         members = np.flatnonzero((size <= side) & (size > side // 2))
@@ -123,7 +135,7 @@ def _boxes(corners: F64, shape: tuple[int, int]) -> tuple[NDArray[np.int64], NDA
 def _covered(corners: F64, members: Any, low: Any, side: int, shape: tuple[int, int]) -> tuple[Any, Any, Any, Any]:
     points = corners[members]
     edges = np.stack([_cross(points, 1, 2), _cross(points, 2, 0), _cross(points, 0, 1)], axis=1)
-    determinant = (edges[:, 0] * points[:, 0][:, [0, 1, 3]]).sum(axis=-1)
+    determinant = _determinant(points)
     turned = np.where(determinant < 0, -1.0, 1.0)[:, None, None]
     edges *= turned
     column = low[members, 0][:, None, None] + np.arange(side)[None, None, :]
@@ -143,6 +155,11 @@ def _covered(corners: F64, members: Any, low: Any, side: int, shape: tuple[int, 
 
 def _cross(points: F64, first: int, second: int) -> F64:
     return np.asarray(np.cross(points[:, first][:, [0, 1, 3]], points[:, second][:, [0, 1, 3]]))
+
+
+def _determinant(points: F64) -> F64:
+    """(F,): positive for triangles that wind clockwise in the picture (rows run downward)."""
+    return np.asarray((_cross(points, 1, 2) * points[:, 0][:, [0, 1, 3]]).sum(axis=-1))
 
 
 def _top_left(edges: F64) -> NDArray[np.bool_]:

@@ -20,6 +20,7 @@ from trilane.stages.gpu.program import build_program, set_uniforms
 
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
+Shape = tuple[int, int]
 
 CHANNELS = (4, 8, 12, 16)
 FP16_MAX = float(np.finfo(np.float16).max)
@@ -51,48 +52,66 @@ class Placement:
     feature: F32 | None = None
 
 
-class PackedPass:
-    """Draws meshes with one neural texture each into tensors of `channels` channels."""
+@dataclass(frozen=True)
+class Target:
+    """`words`: framebuffer of the tensor. A deferred pass adds `uv_image` and its framebuffer `uv`; they share a depth."""
 
-    def __init__(self, ctx: Any, channels: int, quantisation: Quantisation) -> None:
+    words: Any
+    uv_image: Any = None
+    uv: Any = None
+
+
+class PackedPass:
+    """Draws meshes with one neural texture each into tensors of `channels` channels.
+
+    `deferred`: first u and v of every pixel, then the texture once for each pixel that is seen; the bytes are the same.
+    Software drivers shade whole blocks of pixels for each small triangle, so there this is the faster way.
+    """
+
+    def __init__(self, ctx: Any, channels: int, quantisation: Quantisation, deferred: bool) -> None:
         if channels not in CHANNELS:
             raise BadInputError("network input", f"{channels} channels", "4, 8, 12 or 16", "pad with zero channels")
-        self.ctx, self.channels, self.quantisation = ctx, channels, quantisation
-        self._targets: dict[tuple[int, int], Any] = {}
+        self.ctx, self.channels, self.quantisation, self.deferred = ctx, channels, quantisation, deferred
+        self._targets: dict[Shape, Target] = {}
         self._background = (0x01010101 * quantisation.zero_point,) * 4
 
     @property
     def layers(self) -> int:
         return self.channels // 4
 
-    def target(self, shape: tuple[int, int]) -> Any:
-        """The framebuffer for tensors of `shape` (height, width); made on first use."""
+    def target(self, shape: Shape) -> Target:
+        """What tensors of `shape` (height, width) are drawn into; made on first use."""
         if shape not in self._targets:
-            size = (shape[1], shape[0])
-            words = self.ctx.texture(size, TARGET_WORDS[self.layers], dtype="u4")
-            self._targets[shape] = self.ctx.framebuffer([words], self.ctx.depth_renderbuffer(size))
+            self._targets[shape] = self._make_target(shape[::-1])
         return self._targets[shape]
 
-    def begin(self, shape: tuple[int, int]) -> Any:
-        """Clear the target of `shape` to the zero point and make it the one in use."""
+    def begin(self, shape: Shape) -> Target:
+        """Clear the target of `shape`: the zero point everywhere, nothing covered."""
         target = self.target(shape)
-        target.use()
-        target.depth_mask = True
-        target.viewport = (0, 0, shape[1], shape[0])
-        self.ctx.enable_only(moderngl.DEPTH_TEST)
-        target.clear(depth=1.0)
+        target.words.use()
+        target.words.viewport = (0, 0, shape[1], shape[0])
+        target.words.depth_mask = True
+        target.words.clear(depth=1.0)
         gl.clear_unsigned(self._background)
         return target
 
-    def read_into(self, shape: tuple[int, int], tensor: U8) -> None:
+    def read_into(self, shape: Shape, tensor: U8) -> None:
         """Copy the target of `shape` to `tensor`, (h * w * channels,) uint8."""
-        self.target(shape).read_into(
-            tensor, (0, 0, shape[1], shape[0]), components=self.layers, dtype="u4", alignment=1
-        )
+        box = (0, 0, shape[1], shape[0])
+        self.target(shape).words.read_into(tensor, box, components=self.layers, dtype="u4", alignment=1)
 
     def background(self, tensor: U8) -> None:
         """Fill `tensor` with what a frame without avatars holds."""
         tensor[:] = self.quantisation.zero_point
+
+    def _make_target(self, size: tuple[int, int]) -> Target:
+        depth = self.ctx.depth_renderbuffer(size)
+        words = self.ctx.framebuffer([self.ctx.texture(size, TARGET_WORDS[self.layers], dtype="u4")], depth)
+        if not self.deferred:
+            return Target(words)
+        image = self.ctx.texture(size, 2, dtype="f4")
+        image.filter = (moderngl.NEAREST, moderngl.NEAREST)
+        return Target(words, image, self.ctx.framebuffer([image], depth))
 
 
 class PackedAvatar:
@@ -101,24 +120,42 @@ class PackedAvatar:
     def __init__(self, packed: PackedPass, mesh: SkinnedMesh, texture: NDArray[np.floating[Any]]) -> None:
         check_texture(texture, packed.channels)
         self._mesh, self._ctx = mesh, packed.ctx
-        defines: dict[str, Any] = mesh.defines | {"LAYERS": packed.layers, "WORDS": WORD_TYPES[packed.layers]}
-        self._program = build_program(packed.ctx, "skin.vert", "pack.frag", **defines)
-        self._vertices = mesh.vertex_array(self._program)
         self._texture = texture_array(packed.ctx, texture)
-        quantisation = packed.quantisation
-        set_uniforms(
-            self._program,
-            {"neural": 0, "scale": quantisation.scale, "zero_point": float(quantisation.zero_point)},
-        )
+        defines: dict[str, int | str] = {"LAYERS": packed.layers, "WORDS": WORD_TYPES[packed.layers]}
+        if packed.deferred:
+            self._geometry = build_program(packed.ctx, "skin.vert", "uv_only.frag", **mesh.defines)
+            self._pack = build_program(packed.ctx, "behind.vert", "pack.frag", **defines, DEFERRED=1)
+            self._screen = packed.ctx.vertex_array(self._pack, [])
+        else:
+            self._geometry = self._pack = build_program(packed.ctx, "skin.vert", "pack.frag", **mesh.defines, **defines)
+        self._vertices = mesh.vertex_array(self._geometry)
+        scale, zero_point = packed.quantisation.scale, float(packed.quantisation.zero_point)
+        set_uniforms(self._pack, {"neural": 0, "uv_image": 1, "scale": scale, "zero_point": zero_point})
 
-    def draw(self, target: Any, view: Matrix, placement: Placement) -> None:
+    def draw(self, target: Target, view: Matrix, placement: Placement) -> None:
         """Draw into `target`, which a `PackedPass` began."""
         top, left, height, width = placement.rect
-        target.viewport = (left, top, width, height)
+        box = (left, top, width, height)
         self._texture.use(0)
-        self._mesh.pose(self._program, placement.joints, placement.feature)
-        self._program["clip_from_world"].write(target_clip(view, placement.clip_projection))
+        self._mesh.prepare(self._ctx)
+        self._mesh.pose(self._geometry, placement.joints, placement.feature)
+        self._geometry["clip_from_world"].write(target_clip(view, placement.clip_projection))
+        first = target.words if target.uv is None else target.uv
+        first.use()
+        first.viewport = box
         self._vertices.render()
+        if target.uv is not None:
+            self._write_words(target, box)
+
+    def _write_words(self, target: Target, box: tuple[int, int, int, int]) -> None:
+        target.words.use()
+        target.words.viewport = box
+        target.words.depth_mask = False
+        self._ctx.enable_only(moderngl.DEPTH_TEST)
+        self._ctx.depth_func = ">"
+        target.uv_image.use(1)
+        self._screen.render(vertices=3)
+        self._ctx.depth_func = "<"
 
 
 def texture_array(ctx: Any, texture: NDArray[np.floating[Any]]) -> Any:

@@ -44,7 +44,9 @@ class RoomPainter:
             self._extent = grown
             self._build()
         self._ctx.enable_only(moderngl.CULL_FACE)
-        self._ctx.front_face = "cw"  # rows run downward, so what winds counter-clockwise seems to wind clockwise
+        self._ctx.front_face = (
+            "cw"  # rows run downward: what winds counter-clockwise in the picture is stored clockwise
+        )
         target.clear(*(value / 255 for value in UNDER_THE_FLOOR))
         self._program["clip_from_world"].write(target_clip(view, projection))
         for texture, batch in zip(self._textures, self._batches, strict=True):

@@ -14,7 +14,7 @@ import moderngl
 from trilane.errors import TrilaneError
 
 
-def shader_source(name: str | Path, **defines: int) -> str:
+def shader_source(name: str | Path, **defines: int | str) -> str:
     """Text of shader `name` (a file of `trilane.shaders`, or a path) with the definitions inserted."""
     text = name.read_text() if isinstance(name, Path) else (files("trilane.shaders") / name).read_text()
     version, _, body = text.partition("\n")
@@ -22,7 +22,7 @@ def shader_source(name: str | Path, **defines: int) -> str:
     return "\n".join(lines)
 
 
-def build_program(ctx: Any, vertex: str | Path, fragment: str | Path, **defines: int) -> Any:
+def build_program(ctx: Any, vertex: str | Path, fragment: str | Path, **defines: int | str) -> Any:
     """A linked program of two shader files that share `defines`. Raises TrilaneError with the compiler's log."""
     try:
         return ctx.program(shader_source(vertex, **defines), shader_source(fragment, **defines))

@@ -110,9 +110,9 @@ def _uv(points: F64, axis: int, end: int) -> F64:
     if axis == 1 and end == 0:
         return np.asarray(points[:, [0, 2]] / FLOOR_PERIOD_M)
     if axis == 1:
-        return np.tile([0.3, 0.7], (len(points), 1))
+        return np.full((len(points), 2), (0.3, 0.7))
     along = points[:, 2 - axis] / WALL_PERIOD_M
-    return np.c_[along, points[:, 1] / WALL_TEXTURE_M]
+    return np.stack([along, points[:, 1] / WALL_TEXTURE_M], axis=1)
 
 
 def _light(points: F64, low: F64, high: F64, axis: int) -> F64:

@@ -82,6 +82,7 @@ class ShadedRaster:
         large, samples, small = self._target(shape)
         large.use()
         self._ctx.enable_only(moderngl.DEPTH_TEST)
+        self._ctx.depth_func = "<"
         large.clear(0.0, 0.0, 0.0, 0.0, depth=1.0)
         for mesh in meshes:
             mesh.draw(joints, view, projection, uniforms or {})

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
@@ -37,7 +36,7 @@ class UvRaster:
         """
         target = self._target(shape)
         target.use()
-        self._ctx.enable_only(moderngl.DEPTH_TEST)
+        self._mesh.prepare(self._ctx)
         target.clear(0.0, 0.0, 0.0, 0.0, depth=1.0)
         self._mesh.pose(self._program, joints, feature)
         self._program["clip_from_world"].write(target_clip(view, projection))

@@ -1,0 +1,53 @@
+"""The GPU unit's stages: raster and composite on one context.
+
+Rule: everything slow or fallible happens in `build`; the driver's kind decides how the packed pass is drawn, no more.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from trilane.errors import BadInputError
+from trilane.scene.schema import RunConfig
+from trilane.stages.contracts import Stage
+from trilane.stages.gpu.assets import AvatarAssets, load_assets
+from trilane.stages.gpu.background import Background, open_background
+from trilane.stages.gpu.composite import CompositeStage
+from trilane.stages.gpu.context import describe, open_context
+from trilane.stages.gpu.mesh import SkinnedMesh
+from trilane.stages.gpu.packed import PackedAvatar, PackedPass
+from trilane.stages.gpu.raster import RasterStage
+
+ROOM = "room"
+
+
+def build(config: RunConfig) -> dict[str, Stage]:
+    """`raster` and `composite`, sharing a context of the unit's threads. Raises BadInputError, MissingPartError."""
+    folders = list(dict.fromkeys(config.avatar_dirs))
+    assets = {folder: load_assets(folder) for folder in folders}
+    _check_one_encoding(assets)
+    ctx = open_context(config.units["gpu"].threads)
+    first = assets[folders[0]]
+    packed = PackedPass(ctx, first.texture.shape[2], first.quantisation, deferred=not describe(ctx).hardware)
+    drawn = {
+        folder: PackedAvatar(packed, SkinnedMesh(ctx, found.arrays, found.posedirs), found.texture)
+        for folder, found in assets.items()
+    }
+    shape = (config.scene.output.height, config.scene.output.width)
+    rest = [assets[folder].rest for folder in config.avatar_dirs]
+    return {
+        "raster": RasterStage(packed, [drawn[folder] for folder in config.avatar_dirs], config.buckets),
+        "composite": CompositeStage(ctx, shape, config.buckets, rest, _background(config, shape)),
+    }
+
+
+def _background(config: RunConfig, shape: tuple[int, int]) -> Background | None:
+    source = config.scene.background
+    return None if source == ROOM else open_background(Path(source), shape, config.scene.fps)
+
+
+def _check_one_encoding(assets: dict[Path, AvatarAssets]) -> None:
+    encodings = {(found.quantisation, found.texture.shape[2]): folder for folder, found in assets.items()}
+    if len(encodings) > 1:
+        names = " and ".join(str(folder) for folder in encodings.values())
+        raise BadInputError(names, "networks with different inputs", "avatars that one network can draw together")
