@@ -26,7 +26,7 @@ from trilane.stages.contracts import Packet
 SEGMENTS = "segments"
 KEYFRAME_EVERY = 30
 #: One thread, no look-ahead, no reordering: every frame leaves the encoder before the next one comes.
-ENCODER_OPTIONS = {"preset": "superfast", "crf": "20", "tune": "zerolatency"}
+ENCODER_OPTIONS = {"preset": "ultrafast", "crf": "20", "tune": "zerolatency"}
 #: Every frame is a fragment of its own and goes to the file at once.
 FRAGMENTS = {"movflags": "empty_moov+default_base_moof+frag_every_frame", "flush_packets": "1"}
 MS = 1e-6  # of a nanosecond
