@@ -1,0 +1,170 @@
+"""`trilane run` as a person runs it: real units in real processes around a tiny network.
+
+The tiny network's pictures mean nothing; what is tested is what the command leaves and says.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import av
+import numpy as np
+import psutil
+import pytest
+from PIL import Image
+
+from trilane.apps.report import read_report
+
+FRAMES = 20
+PATIENCE_S = 60.0
+WHOLE = {"report.json", "video.mp4", "contact.png", "trace.pftrace", "events.jsonl"}
+
+
+def command(bundle: Path, *arguments: str) -> list[str]:
+    base = [sys.executable, "-m", "trilane.apps.cli.main", "run", "--avatar", str(bundle), "--size", "64x64"]
+    return [*base, "--json", *arguments]
+
+
+def run(bundle: Path, folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command(bundle, *arguments), cwd=folder, capture_output=True, text=True, check=False)
+
+
+def wait_until(condition: object, what: str) -> None:
+    end = time.monotonic() + PATIENCE_S
+    while not condition():  # type: ignore[operator]
+        assert time.monotonic() < end, f"waited {PATIENCE_S} s for {what}"
+        time.sleep(0.05)
+
+
+def presented_something(folder: Path) -> bool:
+    return any(path.stat().st_size > 5000 for path in folder.glob("*.partial/segments/*.mp4"))
+
+
+@contextmanager
+def running(bundle: Path, folder: Path) -> Iterator[tuple[subprocess.Popen[str], list[psutil.Process]]]:
+    """A long run that has presented frames, and the processes of its units."""
+    arguments = command(bundle, "--frames", "100000", "--out", "run")
+    with subprocess.Popen(arguments, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as parent:
+        try:
+            wait_until(lambda: presented_something(folder) or parent.poll() is not None, "frames")
+            assert parent.poll() is None, parent.communicate()
+            yield parent, psutil.Process(parent.pid).children(recursive=True)
+        finally:
+            parent.kill()
+
+
+@pytest.fixture(scope="module")
+def finished(
+    tiny_bundle: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, subprocess.CompletedProcess[str]]:
+    """The folder in which a run was made, and what the command said."""
+    folder = tmp_path_factory.mktemp("run")
+    done = run(tiny_bundle, folder, "--frames", str(FRAMES), "--baseline", "10")
+    assert done.returncode == 0, done.stderr
+    return folder, done
+
+
+Finished = tuple[Path, subprocess.CompletedProcess[str]]
+
+
+def run_folder(finished: Finished) -> Path:
+    (folder,) = (finished[0] / "runs").iterdir()
+    return folder
+
+
+def test_the_run_folder_is_whole_and_alone(finished: Finished) -> None:
+    assert {path.name for path in run_folder(finished).iterdir()} == WHOLE
+    assert [path.name for path in finished[0].iterdir()] == ["runs"]
+
+
+def test_stdout_is_the_report_and_stderr_says_where_it_is(finished: Finished) -> None:
+    folder, done = run_folder(finished), finished[1]
+    assert json.loads(done.stdout) == json.loads((folder / "report.json").read_text())
+    assert str(folder) in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_the_report_says_what_was_asked_for(finished: Finished) -> None:
+    report = read_report(run_folder(finished))
+    facts = report.model_extra or {}
+    assert report.clock == "host"
+    assert (report.frames.requested, report.frames.presented, report.frames.lost) == (FRAMES, FRAMES, 0)
+    assert set(facts["pids"]) == {"cpu", "gpu", "dsp"}
+    assert len(set(facts["pids"].values())) == 3
+    assert facts["baseline"]["frames"]["presented"] == 10
+    assert report.machine["gl"]["renderer"]
+    assert report.machine["cpu"]["cores_allowed"]
+    assert facts["accuracy"] == {"tiny": {}}, "the tiny avatar was never validated, and nothing is made up"
+    assert all(facts["figures"]["present"][key] > 0 for key in ("digest_ms", "encode_ms"))
+
+
+def test_the_video_has_every_frame_and_the_sheet_shows_it(finished: Finished) -> None:
+    folder = run_folder(finished)
+    with av.open(str(folder / "video.mp4")) as container:
+        pictures = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    assert len(pictures) == FRAMES
+    assert all(picture.shape == (480, 640, 3) for picture in pictures)
+    assert min(float(picture.std()) for picture in pictures) > 5, "a room is no plain colour"
+    assert not np.array_equal(pictures[0], pictures[-1]), "the camera moves"
+    sheet = Image.open(folder / "contact.png")
+    assert sheet.size == (4 * 320, 5 * 240)
+
+
+def test_two_runs_present_the_same_bytes(finished: Finished, tiny_bundle: Path, tmp_path: Path) -> None:
+    done = run(tiny_bundle, tmp_path, "--frames", str(FRAMES), "--policy", "sequential")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["checksum"] == json.loads(finished[1].stdout)["checksum"]
+
+
+def test_recorded_motion_and_camera(tiny_bundle: Path, shared_data: Path, tmp_path: Path) -> None:
+    motion, camera = shared_data / "motion" / "cmu_jumping_jacks.bvh", shared_data / "camera" / "arkit_camera_pose.txt"
+    arguments = ["--motion", str(motion), "--camera", str(camera), "--frames", "12", "--baseline", "0"]
+    done = run(tiny_bundle, tmp_path, *arguments)
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert (report["frames"]["presented"], report["frames"]["lost"], report["baseline"]) == (12, 0, None)
+    for word in ("BVH", "ARKit"):
+        assert word in done.stderr, "each load says what it took the file for"
+
+
+def test_an_interrupted_run_keeps_its_frames_and_ends_its_units(tiny_bundle: Path, tmp_path: Path) -> None:
+    with running(tiny_bundle, tmp_path) as (parent, units):
+        parent.send_signal(signal.SIGINT)
+        out, err = parent.communicate(timeout=PATIENCE_S)
+        assert parent.returncode == 130, err
+    assert json.loads(out)["interrupted"]
+    assert {path.name for path in (tmp_path / "run").iterdir()} == WHOLE
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+    assert psutil.wait_procs(units, timeout=5)[1] == []
+
+
+def test_a_killed_run_leaves_nothing_that_looks_whole(tiny_bundle: Path, tmp_path: Path) -> None:
+    with running(tiny_bundle, tmp_path) as (parent, units):
+        assert len(units) >= 3
+        parent.kill()
+    assert psutil.wait_procs(units, timeout=10)[1] == [], "the units end with their parent"
+    assert [path.suffix for path in tmp_path.iterdir()] == [".partial"]
+
+
+def test_a_killed_unit_is_restarted_and_its_video_goes_on(tiny_bundle: Path, tmp_path: Path) -> None:
+    with running(tiny_bundle, tmp_path) as (parent, units):
+        victim = next(unit for unit in units if "cpu" in unit.cmdline())
+        victim.kill()
+        wait_until(lambda: len(list(tmp_path.glob("*.partial/segments/*.mp4"))) == 2, "a second segment")
+        second = max(tmp_path.glob("*.partial/segments/*.mp4"))
+        wait_until(lambda: second.stat().st_size > 5000, "frames after the restart")
+        parent.send_signal(signal.SIGINT)
+        out, err = parent.communicate(timeout=PATIENCE_S)
+    report = json.loads(out)
+    assert report["frames"]["lost"] > 0
+    assert "restart" in err or "unexpectedly" in err
+    assert report["video"]["frames"] >= report["frames"]["presented"] - 1, (
+        "short of the last frame before the kill at most"
+    )
