@@ -85,7 +85,7 @@ def build_report(
         "clock": "host",
         "machine": machine,
         "config": {**config.model_dump(mode="json", exclude={"out_dir"}), "policy": policy},
-        "plan": {},
+        "plan": {"tensor_shapes": [list(shape) for shape in config.buckets]},
         "temperature_c": {},
         "caps": {},
         **result.report,
