@@ -54,7 +54,7 @@ class Placement:
 
 @dataclass(frozen=True)
 class Target:
-    """`words`: framebuffer of the tensor. A deferred pass adds `uv_image` and its framebuffer `uv`; they share a depth."""
+    """`words`: framebuffer of the tensor. A deferred pass has `uv_image` and its framebuffer `uv` on the same depth."""
 
     words: Any
     uv_image: Any = None

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from trilane.errors import TrilaneError
 from trilane.stages.contracts import Packet
-from trilane.stages.cpu.crop import crop_projection
+from trilane.stages.cpu.crop import Rect, crop_projection
 from trilane.stages.gpu.packed import PackedAvatar, PackedPass, Placement
 
 Shape = tuple[int, int]
@@ -60,7 +60,7 @@ def _placement(pose: NDArray[np.void], avatar: Any) -> Placement:
     top, left, height, width = (int(side) for side in avatar["tensor_rect"])
     return Placement(
         joints=avatar["joints"],
-        clip_projection=crop_projection(pose["projection"], avatar["rect"]),
+        clip_projection=crop_projection(pose["projection"], Rect(*map(float, avatar["rect"]))),
         rect=(top, left, height, width),
         feature=avatar["pose_feature"],
     )

@@ -1,0 +1,98 @@
+"""Backgrounds from files: the covering rule, the order of frames, repetition, and bad files."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from PIL import Image
+
+from trilane.errors import BadInputError
+from trilane.stages.gpu.background import open_background
+
+
+def write_video(path: Path, levels: list[int], fps: int = 10) -> None:
+    """A video of flat grey frames, 64 x 48."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=fps)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for level in levels:
+            frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), level, np.uint8), format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+
+
+def test_picture_covers_the_output(tmp_path: Path) -> None:
+    """A wide picture loses its sides, equally; it is given once."""
+    pixels = np.zeros((20, 80, 3), np.uint8)
+    pixels[:, 30:50] = 200
+    Image.fromarray(pixels).save(tmp_path / "wide.png")
+    background = open_background(tmp_path / "wide.png", (40, 40), 30)
+    picture = background.at(0.0)
+    assert picture is not None
+    assert picture.shape == (40, 40, 3)
+    assert (np.abs(picture[:, 4:-4].astype(int) - 200) <= 1).all()
+    assert background.at(1.0) is None
+
+
+def test_folder_is_shown_in_order_and_again(tmp_path: Path) -> None:
+    """Sorted by name, one picture a frame, from the start after the last."""
+    for name, level in (("b.png", 20), ("a.jpg", 10), ("c.png", 30)):
+        Image.fromarray(np.full((8, 8, 3), level, np.uint8)).save(tmp_path / name)
+    background = open_background(tmp_path, (8, 8), 10)
+    shown = [background.at(step / 10) for step in range(5)]
+    assert [int(picture[0, 0, 0]) for picture in shown if picture is not None] == [10, 20, 30, 10, 20]
+    assert background.at(0.4) is None
+
+
+def test_video_follows_media_time_and_repeats(tmp_path: Path) -> None:
+    """Each time shows the newest frame that is due; after the end it starts again; the thread ends with it."""
+    levels = [20, 80, 140, 200]
+    write_video(tmp_path / "grey.mp4", levels)
+    background = open_background(tmp_path / "grey.mp4", (24, 32), 30)
+    seen = []
+    for time_s in (0.0, 0.05, 0.1, 0.3, 0.4, 0.5, 1.7):
+        picture = background.at(time_s)
+        seen.append(None if picture is None else round(float(picture.mean()) / 10) * 10)
+    background.close()
+    assert seen == [20, None, 80, 200, 20, 80, 80]
+    assert not [thread for thread in threading.enumerate() if thread.name == "background video"]
+
+
+BAD_FILES = {
+    "missing.mp4": None,
+    "empty.mp4": b"",
+    "text.mp4": b"hello",
+    "text.png": b"hello",
+    "cut.png": b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR",
+}
+
+
+@pytest.mark.parametrize("name", BAD_FILES)
+def test_bad_files_are_named(tmp_path: Path, name: str) -> None:
+    """One BadInputError with the file's name."""
+    content = BAD_FILES[name]
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(BadInputError, match=name.replace(".", r"\.")):
+        open_background(tmp_path / name, (8, 8), 30).close()
+
+
+def test_folder_without_pictures_is_refused(tmp_path: Path) -> None:
+    """The message lists the endings that count."""
+    with pytest.raises(BadInputError, match=r"\.png"):
+        open_background(tmp_path, (8, 8), 30)
+
+
+def test_sound_without_video_is_refused(tmp_path: Path) -> None:
+    """A file with no video stream."""
+    with av.open(str(tmp_path / "sound.wav"), "w") as container:
+        stream = container.add_stream("pcm_s16le", rate=8000)
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), format="s16", layout="mono")
+        frame.sample_rate = 8000
+        container.mux(stream.encode(frame))
+    with pytest.raises(BadInputError, match="no video stream"):
+        open_background(tmp_path / "sound.wav", (8, 8), 30)

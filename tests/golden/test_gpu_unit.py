@@ -1,0 +1,192 @@
+"""The GPU unit's two stages on real slots: what they write, and what the presented frame looks like."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from trilane.errors import BadInputError, TrilaneError
+from trilane.scene.schema import RunConfig, Scene, UnitSettings
+from trilane.stages.contracts import Packet, SlotLayout, view_packet
+from trilane.stages.gpu import unit
+from trilane.stages.gpu.assets import AvatarAssets
+from trilane.stages.gpu.composite import CompositeStage
+from trilane.stages.gpu.packed import PackedAvatar, PackedPass, Quantisation
+from trilane.stages.gpu.raster import RasterStage
+
+TENSOR = (96, 64)
+OUTPUT = (240, 320)
+ENCODING = Quantisation(6 / 255, 117)
+Camera = Callable[..., Any]
+
+
+def packet(payload_bytes: int, avatars: int = 1) -> Packet:
+    """A slot of zeros."""
+    layout = SlotLayout(avatars, payload_bytes)
+    return view_packet(memoryview(bytearray(layout.slot_bytes)), layout)
+
+
+def fill_pose(slot: Packet, joints: Any, view: Any, projection: Any, rect: Any, tensor: Any = TENSOR) -> None:
+    """One visible avatar that fills the tensor."""
+    slot.pose["avatar_count"], slot.pose["tensor_shape"] = 1, tensor
+    slot.pose["view"], slot.pose["projection"] = view, projection
+    avatar = slot.pose["avatars"][0]
+    avatar["visible"], avatar["rect"], avatar["tensor_rect"] = 1, rect, (0, 0, *tensor)
+    avatar["joints"] = joints
+
+
+@pytest.fixture
+def raster(gl: Any, person: Any, neural_texture: Any) -> tuple[RasterStage, Packet, Packet]:
+    """A raster stage with one input and one output slot."""
+    packed = PackedPass(gl, 16, ENCODING, deferred=True)
+    stage = RasterStage(packed, [PackedAvatar(packed, person.mesh, neural_texture)], [TENSOR])
+    source, target = packet(0), packet(TENSOR[0] * TENSOR[1] * 16 + 64)
+    stage.bind([source], [target])
+    return stage, source, target
+
+
+def test_crop_is_the_same_picture_enlarged(raster: Any, person: Any, camera: Camera) -> None:
+    """The lower left quarter of the screen, drawn as the whole tensor, shows the lower left of the body."""
+    stage, source, target = raster
+    view, projection = camera((0, 0.9, 3), (0, 0.9, 0), 40, 64 / 96)
+    whole, quarter = (np.empty((*TENSOR, 16), np.uint8) for _ in range(2))
+    for tensor, rect in ((whole, (-1, -1, 1, 1)), (quarter, (-1, -1, 0, 0))):
+        fill_pose(source, person.pose(np.zeros(165)), view, projection, rect)
+        stage.run(0, 0, 0)
+        tensor[:] = target.payload[: tensor.size].reshape(tensor.shape)
+    seen, enlarged = ((t != ENCODING.zero_point).any(axis=-1) for t in (whole, quarter))
+    assert seen[48:, :32].sum() > 100
+    assert abs(enlarged[::2, ::2].sum() - seen[48:, :32].sum()) < 0.15 * seen[48:, :32].sum()
+    assert not target.payload[whole.size :].any()
+
+
+def test_an_unseen_avatar_is_background(raster: Any) -> None:
+    """Every byte is the zero point, and bytes behind the tensor are left alone."""
+    stage, source, target = raster
+    source.pose["avatar_count"], source.pose["tensor_shape"] = 1, TENSOR
+    stage.run(0, 0, 0)
+    size = TENSOR[0] * TENSOR[1] * 16
+    assert (target.payload[:size] == ENCODING.zero_point).all()
+    assert not target.payload[size:].any()
+
+
+def test_a_frame_with_nan_joints_is_refused(raster: Any, person: Any, camera: Camera) -> None:
+    """The frame ends with an error that names it, before anything is drawn."""
+    stage, source, _ = raster
+    joints = person.pose(np.zeros(165))
+    joints[7, 1, 2] = np.nan
+    fill_pose(source, joints, *camera((0, 1, 3), (0, 1, 0)), (-1, -1, 1, 1))
+    with pytest.raises(TrilaneError, match="frame 12: avatar 0"):
+        stage.run(12, 0, 0)
+
+
+def composed(gl: Any, person: Any, image: NDArray[np.uint8], camera: Any, rect: Any, joints: Any) -> NDArray[np.uint8]:
+    """The frame of a composite stage with the built-in room."""
+    stage = CompositeStage(gl, OUTPUT, [TENSOR], [person.rest], None)
+    source, target = packet(image.size), packet(OUTPUT[0] * OUTPUT[1] * 3)
+    stage.bind([source], [target])
+    fill_pose(source, joints, *camera, rect)
+    source.payload[:] = image.ravel()
+    stage.run(0, 0, 0)
+    stage.close()
+    return target.payload.reshape(*OUTPUT, 3)
+
+
+def disc() -> NDArray[np.uint8]:
+    """A green disc with a soft rim; where it is transparent, the colour is red, which must not show."""
+    y, x = np.indices(TENSOR) - np.array([47.5, 31.5])[:, None, None]
+    alpha = np.clip(28 - np.hypot(x, y), 0, 1)
+    image = np.zeros((*TENSOR, 4), np.uint8)
+    image[..., 0], image[..., 1], image[..., 3] = np.where(alpha == 0, 255, 0), 160, np.rint(255 * alpha)
+    return image
+
+
+def test_frame_looks_as_it_did(gl: Any, person: Any, camera: Camera, golden: Any) -> None:
+    """Room, contact shadow and disc. Tolerance: mean 1, 1 % of the bytes more than 8 off (drivers filter freely)."""
+    view = camera((1.2, 1.5, 3.6), (0, 0.8, 0), 45, 4 / 3)
+    frame = composed(gl, person, disc(), view, (-0.2, -0.3, 0.2, 0.5), person.pose(np.zeros(165)))
+    golden("composite", frame, 1.0, 0.01)
+
+
+@pytest.mark.parametrize("scale", [0.2, 0.7, 1.0, 3.0])
+def test_edges_have_no_halo(gl: Any, person: Any, camera: Camera, scale: float) -> None:
+    """At every size each pixel lies between background and avatar: red from transparent pixels never leaks."""
+    view = camera((0, 1.5, 3.0), (0, 1.4, -4.0), 30, 4 / 3)
+    far = person.pose(np.zeros(165))
+    far[:, :, 3] += (0, 0, 3.5)  # the shadow falls behind the camera
+    half = np.array([TENSOR[1] / OUTPUT[1], TENSOR[0] / OUTPUT[0]]) * scale
+    empty = np.zeros((*TENSOR, 4), np.uint8)
+    behind = composed(gl, person, empty, view, (*-half, *half), far).astype(int)
+    frame = composed(gl, person, disc(), view, (*-half, *half), far).astype(int)
+    colour = np.array([0, 160, 0])
+    low, high = np.minimum(behind, colour) - 2, np.maximum(behind, colour) + 2
+    assert ((frame >= low) & (frame <= high)).all()
+    assert (np.abs(frame - colour).max(axis=-1) <= 2).sum() > 0.7 * np.pi * (28 * scale - 2) ** 2 * 0.9
+
+
+def test_alpha_is_blended_in_linear_light(gl: Any, person: Any, camera: Camera) -> None:
+    """White at half alpha over the room: the sRGB code of the mean of the two lights, within 2."""
+    view = camera((0, 1.5, 3.0), (0, 1.4, -4.0), 30, 4 / 3)
+    half = np.zeros((*TENSOR, 4), np.uint8)
+    far = person.pose(np.zeros(165))
+    far[:, :, 3] += (0, 0, 3.5)
+    behind = composed(gl, person, half, view, (-1, -1, 1, 1), far) / 255
+    half[:] = (255, 255, 255, 128)
+    frame = composed(gl, person, half, view, (-1, -1, 1, 1), far)
+    linear = np.where(behind <= 0.04045, behind / 12.92, ((behind + 0.055) / 1.055) ** 2.4)
+    mixed = linear * (127 / 255) + 128 / 255
+    expected = 255 * (1.055 * mixed ** (1 / 2.4) - 0.055)
+    assert np.abs(frame - expected).max() <= 2
+
+
+def config(tmp_path: Path, background: str) -> RunConfig:
+    """A run of one avatar."""
+    return RunConfig(
+        scene=Scene(background=background, size="96x64"),
+        out_dir=tmp_path,
+        avatar_dirs=(tmp_path,),
+        units={"gpu": UnitSettings(cores=(0,), threads=1)},
+    )
+
+
+@pytest.fixture
+def assets(person: Any, neural_texture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The default body with a random texture in place of a bundle."""
+    found = AvatarAssets(person.arrays, None, person.rest, neural_texture.astype(np.float32), ENCODING)
+    monkeypatch.setattr(unit, "load_assets", lambda _: found)
+
+
+@pytest.mark.usefixtures("assets")
+def test_unit_builds_both_stages(tmp_path: Path, person: Any, camera: Camera) -> None:
+    """A picture as the background shows where the avatar's picture is empty."""
+    path = tmp_path / "grey.png"
+    Image.fromarray(np.full((30, 40, 3), 90, np.uint8)).save(path)
+    stages = unit.build(config(tmp_path, str(path)))
+    assert list(stages) == ["raster", "composite"]
+    source, image = packet(0), packet(TENSOR[0] * TENSOR[1] * 16)
+    frame = packet(640 * 480 * 3)
+    stages["raster"].bind([source], [image])
+    fill_pose(source, person.pose(np.zeros(165)), *camera((0, 1, 3), (0, 1, 0)), (-1, -1, 1, 1))
+    stages["raster"].run(0, 0, 0)
+    assert (image.payload != ENCODING.zero_point).any()
+    image.payload[:] = 0
+    fill_pose(image, person.pose(np.zeros(165)), *camera((0, 1, 3), (0, 3, 0)), (-1, -1, 1, 1))
+    stages["composite"].bind([image], [frame])
+    stages["composite"].run(0, 0, 0)
+    stages["composite"].close()
+    assert (frame.payload == 90).all()
+
+
+@pytest.mark.usefixtures("assets")
+def test_bad_background_is_named(tmp_path: Path) -> None:
+    """A text file is no video."""
+    path = tmp_path / "notes.mp4"
+    path.write_text("not a video")
+    with pytest.raises(BadInputError, match=r"notes\.mp4"):
+        unit.build(config(tmp_path, str(path)))

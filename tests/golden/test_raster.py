@@ -1,0 +1,201 @@
+"""The packed pass against the float64 reference, and the cases that drivers find hard."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from trilane.errors import BadInputError
+from trilane.stages.gpu import oracle
+from trilane.stages.gpu.mesh import SkinnedMesh, mesh_arrays
+from trilane.stages.gpu.packed import PackedAvatar, PackedPass, Placement, Quantisation
+from trilane.stages.gpu.uv_image import UvRaster
+
+ENCODING = Quantisation(6 / 255, 117)
+REST = np.zeros(165)
+Camera = Callable[..., Any]
+
+
+def draw(gl: Any, mesh: Any, texture: Any, joints: Any, camera: Any, shape: Any, deferred: bool = True) -> Any:
+    """The tensor (h,w,C) of one avatar that fills it."""
+    packed = PackedPass(gl, texture.shape[2], ENCODING, deferred)
+    avatar = PackedAvatar(packed, mesh, texture)
+    avatar.draw(packed.begin(shape), camera[0], Placement(joints, camera[1], (0, 0, *shape)))
+    tensor = np.zeros(shape[0] * shape[1] * texture.shape[2], np.uint8)
+    packed.read_into(shape, tensor)
+    return tensor.reshape(*shape, texture.shape[2])
+
+
+def compare(gl: Any, arrays: Any, texture: Any, joints: Any, camera: Any, shape: Any) -> dict[str, float]:
+    """Figures of a drawn tensor against the reference's."""
+    mesh = SkinnedMesh(gl, arrays)
+    tensor = draw(gl, mesh, texture, joints, camera, shape)
+    covered = UvRaster(gl, mesh).render(joints, *camera, shape)[..., 2] > 0
+    clip = camera[1] @ camera[0]
+    image = oracle.rasterise(oracle.skin(arrays, joints), arrays.triangles, arrays.uv, clip, shape, arrays.closed)
+    expected = oracle.tensor(image, texture, ENCODING.scale, ENCODING.zero_point)
+    steps = np.abs(tensor.astype(int) - expected)[covered & image.coverage]
+    return {
+        "pixels": float(image.coverage.sum()),
+        "coverage": float((covered != image.coverage).sum()),
+        "within_one": float((steps <= 1).mean()) if steps.size else 1.0,
+        "background": float((tensor[~covered] != ENCODING.zero_point).sum()),
+    }
+
+
+def random_numbers(seed: int) -> NDArray[np.float64]:
+    """Axis-angle numbers of a bent body, (165,)."""
+    return np.random.default_rng(seed).normal(0, 0.2, 165)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_tensor_equals_the_reference(gl: Any, person: Any, neural_texture: Any, camera: Camera, seed: int) -> None:
+    """Coverage within 0.1 % of the mesh's pixels, 99.9 % of the values within one step, background exact."""
+    rng = np.random.default_rng(seed)
+    angle, distance = rng.uniform(0, 2 * np.pi), rng.uniform(0.9, 4.0)
+    target = np.array([0, rng.uniform(0.5, 1.5), 0])
+    eye = target + distance * np.array([np.sin(angle), rng.uniform(-0.2, 0.4), np.cos(angle)])
+    found = compare(
+        gl, person.arrays, neural_texture, person.pose(random_numbers(seed)), camera(eye, target), (384, 256)
+    )
+    assert found["pixels"] > 2000
+    assert found["coverage"] <= 0.001 * found["pixels"]
+    assert found["within_one"] >= 0.999
+    assert found["background"] == 0
+
+
+@pytest.mark.parametrize("channels", [4, 8, 12, 16])
+def test_channels(gl: Any, person: Any, neural_texture: Any, camera: Camera, channels: int) -> None:
+    """Every width gives the first channels of the widest, in one pass or two."""
+    view, joints, shape = camera((0.4, 1.2, 3), (0, 0.9, 0)), person.pose(REST), (96, 64)
+    widest = draw(gl, person.mesh, neural_texture, joints, view, shape)
+    for deferred in (False, True):
+        narrow = draw(gl, person.mesh, neural_texture[..., :channels], joints, view, shape, deferred)
+        assert np.array_equal(narrow, widest[..., :channels])
+
+
+def test_row_zero_is_on_top(gl: Any, person: Any, camera: Camera) -> None:
+    """The head is in the upper rows, the body's left hand on the picture's right."""
+    image = UvRaster(gl, person.mesh).render(person.pose(REST), *camera((0, 0.9, 3), (0, 0.9, 0)), (64, 64))
+    rows, columns = np.nonzero(image[..., 2])
+    assert np.ptp(columns[rows < rows.min() + 4]) < 12 < np.ptp(columns)
+    arms = person.pose(np.eye(165)[3 * 16 + 2] * 1.3)  # the left shoulder turns about z: the left arm goes up
+    raised = UvRaster(gl, person.mesh).render(arms, *camera((0, 0.9, 3), (0, 0.9, 0)), (64, 64))
+    assert np.nonzero(raised[:12, :, 2])[1].mean() > 34
+
+
+def test_avatars_share_a_tensor(gl: Any, person: Any, neural_texture: Any, camera: Camera) -> None:
+    """Two avatars in disjoint rectangles hold what each holds alone, to one step at a few pixels, and nothing else."""
+    view, joints = camera((0.4, 1.2, 3), (0, 0.9, 0)), person.pose(REST)
+    alone = draw(gl, person.mesh, neural_texture, joints, view, (96, 64))
+    for deferred in (False, True):
+        packed = PackedPass(gl, 16, ENCODING, deferred)
+        avatar = PackedAvatar(packed, person.mesh, neural_texture)
+        target = packed.begin((128, 160))
+        for top, left in ((0, 96), (32, 16)):
+            avatar.draw(target, view[0], Placement(joints, view[1], (top, left, 96, 64)))
+        tensor = np.zeros(128 * 160 * 16, np.uint8)
+        packed.read_into((128, 160), tensor)
+        both = tensor.reshape(128, 160, 16)
+        for part in (both[:96, 96:], both[32:, 16:80]):
+            steps = np.abs(part.astype(int) - alone)
+            assert steps.max() <= 1
+            assert (steps > 0).mean() < 0.001
+        both[:96, 96:] = both[32:, 16:80] = ENCODING.zero_point
+        assert (both == ENCODING.zero_point).all()
+
+
+HARD_VIEWS = {
+    "near plane through the body": ((0.0, 0.95, 0.35), (0.0, 0.95, 0.0), {"near": 0.3}),
+    "camera inside the body": ((0.0, 1.0, 0.03), (0.0, 1.1, 1.0), {"near": 0.01}),
+    "body behind the camera": ((0.0, 1.0, 1.0), (0.0, 1.0, 3.0), {}),
+    "a body of a few pixels": ((0.0, 1.0, 90.0), (0.0, 1.0, 0.0), {}),
+    "an eyelash away": ((0.03, 1.66, 0.24), (0.03, 1.64, 0.0), {"near": 0.001}),
+}
+NOTHING_SEEN = ("body behind the camera", "camera inside the body")
+
+
+@pytest.mark.parametrize("name", HARD_VIEWS)
+def test_hard_views(gl: Any, person: Any, neural_texture: Any, camera: Camera, name: str) -> None:
+    """Bounds: 0.2 % of the pixels plus 2 differ in coverage, 99.5 % of the values are within one step.
+
+    From inside, a closed body shows nothing: all its triangles face away.
+    """
+    eye, target, planes = HARD_VIEWS[name]
+    views = camera(eye, target, **planes)
+    found = compare(gl, person.arrays, neural_texture, person.pose(REST), views, (192, 192))
+    assert found["coverage"] <= 0.002 * found["pixels"] + 2
+    assert found["within_one"] >= 0.995
+    assert found["background"] == 0
+    assert (found["pixels"] == 0) == (name in NOTHING_SEEN)
+
+
+def quad(corners: list[tuple[float, float, float]], faces: list[tuple[int, int, int]]) -> Any:
+    """A mesh of joint 0 alone, u and v from x and y."""
+    vertices = np.array(corners, float)
+    indices = np.array(faces)
+    joint, weight = np.zeros((len(vertices), 4), int), np.eye(4)[np.zeros(len(vertices), int)]
+    return mesh_arrays(vertices, indices, vertices[:, :2] * 0.5 + 0.5, indices, joint, weight)
+
+
+def test_degenerate_and_inverted_triangles(gl: Any, neural_texture: Any, camera: Camera) -> None:
+    """Triangles without area draw nothing; those of open meshes are drawn whichever way they wind."""
+    corners = [(-1.0, -1.0, 0.0), (1.0, -1.0, 0.0), (1.0, 1.0, 0.0), (-1.0, 1.0, 0.0)]
+    joints = np.tile(np.eye(4)[:3], (55, 1, 1)).astype(np.float32)
+    views = camera((0.1, 0.2, 3.0), (0, 0, 0))
+    nothing = quad(corners, [(0, 1, 1), (2, 2, 2)])
+    assert compare(gl, nothing, neural_texture, joints, views, (64, 64))["pixels"] == 0
+    mixed = quad(corners, [(0, 1, 2), (0, 3, 2)])
+    found = compare(gl, mixed, neural_texture, joints, views, (64, 64))
+    assert found["pixels"] > 1000
+    assert found["coverage"] <= 2
+    assert found["background"] == 0
+
+
+def test_a_shared_edge_is_drawn_once() -> None:
+    """The reference's top-left rule: two triangles through pixel centres leave no gap, and each pixel has one owner."""
+    world = np.array([(-1.0, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)])
+    whole = oracle.rasterise(world, np.array([(0, 1, 2), (0, 2, 3)]), world[:, :2], np.eye(4), (8, 8))
+    parts = [oracle.rasterise(world, np.array([t]), world[:, :2], np.eye(4), (8, 8)) for t in ((0, 1, 2), (0, 2, 3))]
+    assert whole.coverage.all()
+    assert parts[0].coverage.sum() + parts[1].coverage.sum() == 64
+
+
+BAD_TEXTURES = {
+    "five channels": np.zeros((8, 8, 5)),
+    "beyond FP16": np.full((8, 8, 4), 1e5),
+    "NaN": np.full((8, 8, 4), np.nan),
+    "flat": np.zeros((8, 8)),
+}
+
+
+@pytest.mark.parametrize("name", BAD_TEXTURES)
+def test_bad_textures_are_refused(gl: Any, person: Any, name: str) -> None:
+    """One clear error each, before anything is uploaded."""
+    with pytest.raises(BadInputError, match="neural texture"):
+        PackedAvatar(PackedPass(gl, 4, ENCODING, True), person.mesh, BAD_TEXTURES[name])
+
+
+def test_bad_channel_count_is_refused(gl: Any) -> None:
+    """Channels come in fours."""
+    with pytest.raises(BadInputError, match="5 channels"):
+        PackedPass(gl, 5, ENCODING, True)
+
+
+def test_pose_blend_shapes_move_vertices(gl: Any, person: Any, camera: Camera) -> None:
+    """An offset of 0.2 m along x for feature 7 shifts the whole picture."""
+    posedirs = np.zeros((len(person.body.v_template), 3, 486), np.float32)
+    posedirs[:, 0, 7] = 0.1
+    mesh = SkinnedMesh(gl, person.arrays, posedirs)
+    feature = np.zeros(486, np.float32)
+    feature[7] = 2.0
+    joints, views = person.pose(REST), camera((0, 0.9, 3), (0, 0.9, 0))
+    blended = UvRaster(gl, mesh).render(joints, *views, (64, 64), feature)
+    moved = joints.copy()
+    moved[:, 0, 3] += 0.2 * joints[:, 0, 0]
+    plain = UvRaster(gl, person.mesh).render(moved, *views, (64, 64))
+    assert (blended[..., 2] != plain[..., 2]).sum() <= 8
