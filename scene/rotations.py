@@ -32,15 +32,25 @@ def rotvec_from_quat(quat: ArrayLike) -> Array:
     return np.asarray(q[..., 1:] * factor[..., None])
 
 
+def _products_to_matrix() -> Array:
+    """(16, 9): takes the products of (w, x, y, z) by themselves, row-major, to the rotation matrix, row-major."""
+    table = np.zeros((4, 4, 3, 3))
+    table[0, 0] = np.eye(3)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        table[1 + i, 1 + i, [i, j, k], [i, j, k]] = 1.0, -1.0, -1.0
+        table[1 + i, 1 + j, [i, j], [j, i]] = 2.0
+        table[0, 1 + i, [k, j], [j, k]] = 2.0, -2.0
+    return table.reshape(16, 9)
+
+
+_MATRIX = _products_to_matrix()
+
+
 def matrix_from_quat(quat: ArrayLike) -> Array:
     """Unit quaternions (..., 4) to rotation matrices (..., 3, 3)."""
-    w, x, y, z = np.moveaxis(np.asarray(quat, dtype=np.float64), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    q = np.asarray(quat, dtype=np.float64)
+    products = q[..., :, None] * q[..., None, :]
+    return np.asarray((products.reshape(*q.shape[:-1], 16) @ _MATRIX).reshape(*q.shape[:-1], 3, 3))
 
 
 def quat_from_matrix(matrix: ArrayLike) -> Array:

@@ -132,7 +132,7 @@ def _body(
         hip = place + (pelvis @ BUILD.side(BUILD.hip, side))
         for joint, turn in zip(("hip", "knee", "ankle"), solve_leg(BUILD, side, hip, pelvis, foot), strict=True):
             _set(poses, f"{name}_{joint}", turn)
-        poses[:, JOINT_INDEX[f"{name}_foot"], 0] = -np.clip(foot.pitch, 0, 0.6) * foot.load
+        poses[:, JOINT_INDEX[f"{name}_foot"], 0] = -np.clip(foot.pitch, 0, 0.6)
     _trunk(poses, times, pelvis_yaw, weight, pace)
     _arms(poses, times, stride, wave)
     return poses, place
@@ -140,7 +140,8 @@ def _body(
 
 def blurred_heading(left: FootTrack, right: FootTrack) -> Array:
     """The pelvis's heading (T,), between the feet's; the cycle may end whole turns on."""
-    mean = np.unwrap((left.heading + right.heading) / 2)
+    sines, cosines = (f(left.heading) + f(right.heading) for f in (np.sin, np.cos))
+    mean = np.unwrap(np.arctan2(sines, cosines))
     drift = np.linspace(0, round((mean[-1] - mean[0]) / (2 * np.pi)) * 2 * np.pi, len(mean), endpoint=False)
     return blurred(mean - drift, 6) + drift
 

@@ -114,10 +114,11 @@ class Walker:
             strike * (1 - smooth_step((local - air) / self.plant_s))
             + next_off * smooth_step(1 - (until_next - local) / self.roll_s) ** 1.5,
         )
-        heading = old[2] + (new[2] - old[2]) * smooth_step(phase)
+        turned = np.remainder(new[2] - old[2] + np.pi, 2 * np.pi) - np.pi
+        heading = old[2] + turned * smooth_step(phase)
         lifted = self._ankle(np.array(old), np.array([toe_off]))
         landed = self._ankle(np.array(new), np.array([strike]))
-        rise = (0.04 + 0.07 * abs(toe_off)) * np.sin(np.pi * np.clip(phase, 0, 1)) ** 1.5
+        rise = (0.04 + 0.07 * abs(toe_off)) * np.sin(np.pi * np.clip(phase, 0, 1) ** 0.7)
         flying = lifted + (landed - lifted) * smooth_step(phase)[:, None] + rise[:, None] * np.array([0.0, 1.0, 0.0])
         planted = self._ankle(np.array(new), pitch)
         in_air = local < air

@@ -1,0 +1,128 @@
+"""The pose stage: from a frame's number to everything that the other stages have to know about it.
+
+Rule: motion and camera are asked for the frame's media time, frame / fps; nothing that is not finite leaves here.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.avatars.bundle import load_bundle
+from trilane.errors import TrilaneError
+from trilane.scene.mover import Mover
+from trilane.scene.schema import RunConfig
+from trilane.scene.staging import stage_scene
+from trilane.stages.contracts import Packet
+from trilane.stages.cpu.body import ShapedBody, load_body
+from trilane.stages.cpu.crop import Rect
+from trilane.stages.cpu.kinematics import Posed, Skeleton
+from trilane.stages.cpu.mesh_bounds import MeshBounds
+from trilane.stages.cpu.tensor_layout import lay_out
+
+#: Clothes and hair reach this far from the body, metres; training crops with the same.
+STANDOFF_M = 0.045
+
+
+@dataclass(frozen=True)
+class _Actor:
+    mover: Mover
+    skeleton: Skeleton
+    bounds: MeshBounds
+
+
+class PoseStage:
+    """Stage `pose` of the CPU unit: no input edge, an output edge of headers."""
+
+    def __init__(self, config: RunConfig) -> None:
+        """Load bodies, motions and camera of `config`. Raises BadInputError."""
+        scene = config.scene
+        self._fps = scene.fps
+        self._output = (scene.output.height, scene.output.width)
+        self._buckets = config.buckets
+        folders = dict.fromkeys(config.avatar_dirs)
+        bodies = {folder: _shaped(folder) for folder in folders}
+        bounds = {folder: MeshBounds(body, standoff_m=STANDOFF_M) for folder, body in bodies.items()}
+        staged = stage_scene(scene, [bodies[folder] for folder in config.avatar_dirs], Path.cwd())
+        self._actors = [
+            _Actor(mover, Skeleton(bodies[folder].joints, bodies[folder].body.parents), bounds[folder])
+            for folder, mover in zip(config.avatar_dirs, staged.movers, strict=True)
+        ]
+        self._camera = staged.camera
+        self._projection = staged.camera.projection(scene.output.width / scene.output.height)
+        self._slots: list[NDArray[np.void]] = []
+
+    def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
+        """Take the output slots. Raises ValueError when the stage has inputs."""
+        if inputs:
+            raise ValueError("the pose stage has no input edge")
+        self._slots = [packet.pose for packet in outputs]
+
+    def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:  # noqa: ARG002
+        """Fill `outputs[slot_out]` for `frame`; the figure is how many avatars are visible.
+
+        Raises ValueError without `slot_out`, TrilaneError when a number of the frame is not finite.
+        """
+        if slot_out is None:
+            raise ValueError("the pose stage needs an output slot")
+        packet = self._slots[slot_out]
+        t_s = frame / self._fps
+        packet["frame"] = frame
+        packet["t_pose_ns"] = time.monotonic_ns()
+        packet["media_time_s"] = t_s
+        packet["avatar_count"] = len(self._actors)
+        view = self._camera.sample(t_s)
+        packet["view"], packet["projection"] = view, self._projection
+        _require_finite(view, frame, "camera")
+        clip = self._projection @ view
+        seen = [
+            (avatar, rect)
+            for index, actor in enumerate(self._actors)
+            if (rect := _pose(actor, avatar := packet["avatars"][index], index, t_s, frame, clip)) is not None
+        ]
+        self._lay_out(packet, seen)
+        return {"visible": float(len(seen))}
+
+    def _lay_out(self, packet: NDArray[np.void], seen: list[tuple[NDArray[np.void], Rect]]) -> None:
+        """Crop rectangles, cells and the tensor's shape; the smallest shape when nothing is to be drawn."""
+        if not seen:
+            packet["tensor_shape"] = min(self._buckets, key=lambda shape: shape[0] * shape[1])
+            return
+        layout = lay_out([rect for _, rect in seen], self._output, self._buckets)
+        packet["tensor_shape"] = layout.shape
+        for (avatar, _), (crop, cell) in zip(seen, layout.crops, strict=True):
+            avatar["rect"], avatar["tensor_rect"] = crop, cell
+
+    def close(self) -> None:
+        """Let go of the slots."""
+        self._slots = []
+
+
+def _shaped(folder: Path) -> ShapedBody:
+    bundle = load_bundle(folder)
+    return load_body(bundle.body_path).shape(bundle.manifest.betas, bundle.manifest.expression)
+
+
+def _pose(
+    actor: _Actor, avatar: NDArray[np.void], index: int, t_s: float, frame: int, clip: NDArray[np.float64]
+) -> Rect | None:
+    """Fill one avatar's joints; its rectangle on the screen, or None when nothing of it is visible."""
+    pose, translation = actor.mover.sample(t_s)
+    _require_finite(pose, frame, f"pose of avatar {index}")
+    _require_finite(translation, frame, f"place of avatar {index}")
+    posed: Posed = actor.skeleton.pose(pose, translation, actor.mover.world)
+    _require_finite(posed.matrices, frame, f"joints of avatar {index}")
+    rect = actor.bounds.rect(posed, clip)
+    avatar["avatar"], avatar["visible"] = index, rect is not None
+    avatar["joints"], avatar["pose_feature"] = posed.matrices, posed.feature
+    return rect
+
+
+def _require_finite(values: NDArray[np.floating], frame: int, what: str) -> None:
+    if not np.isfinite(values).all():
+        raise TrilaneError(f"frame {frame}: the {what} is not finite")
