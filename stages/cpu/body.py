@@ -115,7 +115,7 @@ class ShapedBody:
 
 
 def load_body(path: Path) -> Body:
-    """Read a body file. Raises BadInputError: missing, truncated, pickled, huge, misshapen, not finite, inconsistent."""
+    """Read a body file. Raises BadInputError: missing, truncated, pickled, huge, misshapen, NaN or inconsistent."""
     arrays = read_npz(path, _LAYOUT, EXPECTED)
     _check_layout(path, arrays)
     vertices = len(arrays["v_template"])

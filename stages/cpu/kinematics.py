@@ -89,7 +89,7 @@ class Skeleton:
         self._posed = Posed(self._matrices, self._world[:-1, :3, 3], self._feature.reshape(-1))
 
     def pose(self, pose: ArrayLike, translation: ArrayLike | None = None, world: F64 | None = None) -> Posed:
-        """Pose the chain: `pose` (J * 3,) axis-angle; `translation` (3,) metres, body space; `world` (4,4) body to world.
+        """Pose the chain: `pose` (J * 3,) axis-angle; `translation` (3,) metres; `world` (4,4): body to world.
 
         Raises BadInputError when the pose or the place is not finite or an angle is beyond a million radians.
         """

@@ -44,67 +44,36 @@ def largest_weights(weights: F32, k: int) -> TopWeights:
     return TopWeights(order.astype(np.int32), (kept / kept.sum(axis=1, keepdims=True)).astype(np.float32))
 
 
-def weight_error_bound(shaped: ShapedBody, k: int) -> F64:
-    """(V,) metres: no pose moves a vertex further than this by keeping only its `k` largest weights.
+def weight_error_bound(shaped: ShapedBody, weight_count: int) -> F64:
+    """(V,) metres: no pose moves a vertex further than this by keeping only its `weight_count` largest weights.
 
-    Let y_j be where joint j alone takes the rest vertex p, S the kept joints of total weight m, D the others. The
-    exact vertex is x = sum w_j y_j, the approximate one x' = sum_S (w_i / m) y_i. As x = m x' + sum_D w_j y_j and
-    m + sum_D w_j = 1,
+    Let y_j be where joint j alone takes the rest vertex p, and e_j the change of its weights; the e_j add up to zero.
+    Joint b and its parent carry p rigidly and agree on where the centre c_b of b goes, so their images of p lie on one
+    sphere about it: |y_b - y_parent| <= 2 |p - c_b|. Writing each y_j as the root's image plus the steps down to j,
 
-        x - x' = sum_D w_j (y_j - x') = sum_D sum_S w_j (w_i / m) (y_j - y_i).
+        sum_j e_j y_j = sum_b E_b (y_b - y_parent),   E_b the sum of e_j over b and the joints below it,
 
-    A joint b and its parent both carry p rigidly and agree on where the centre c_b of joint b goes, so their images of
-    p lie on one sphere about it: |y_b - y_parent| <= 2 |p - c_b|. Summed over the path from i to j in the joint
-    tree this bounds |y_j - y_i| by d(i, j), and |x - x'| <= sum_D sum_S w_j (w_i / m) d(i, j). Pose blend shapes that
-    move p by e add at most 2 e per joint on the path.
+    so the vertex moves by at most sum_b |E_b| 2 |p - c_b|. With pose blend shapes p is where they take it.
     """
-    body = shaped.body
-    reach = path_reach(shaped)
-    common = _common_ancestors(body.parents)
-    order = np.argsort(-body.weights, axis=1, kind="stable")
-    sorted_weights = np.take_along_axis(body.weights, order, axis=1).astype(np.float64)
-    bound = np.zeros(len(order))
-    rows = np.flatnonzero(sorted_weights[:, k] > 0.0)
-    if not len(rows):
-        return bound
-    kept, share = order[rows, :k], sorted_weights[rows, :k]
-    share = share / share.sum(axis=1, keepdims=True)
-    here = np.arange(len(rows))[:, None]
-    near = reach[rows]
-    for column in range(k, JOINTS):
-        weight = sorted_weights[rows, column]
-        if not weight.any():
-            break
-        left_out = order[rows, column][:, None]
-        distance = near[here, kept] + near[here, left_out] - 2.0 * near[here, common[kept, left_out]]
-        bound[rows] += weight * (share * distance).sum(axis=1)
-    return bound
+    kept = largest_weights(shaped.body.weights, weight_count).dense()
+    change = branch_sums(shaped.body.parents, kept.astype(np.float64) - shaped.body.weights)
+    return np.asarray((np.abs(change[:, 1:]) * 2.0 * joint_distance(shaped)[:, 1:]).sum(axis=1))
 
 
-def path_reach(shaped: ShapedBody) -> F64:
-    """(V,55): sum of 2 |p - c_b| over the joints b from below the root down to each joint, metres."""
-    steps = 2.0 * np.linalg.norm(shaped.vertices[:, None, :] - shaped.joints[None], axis=2)
-    steps[:, 0] = 0.0
-    return np.asarray(steps @ _on_path(shaped.body.parents).T.astype(np.float64))
+def joint_distance(shaped: ShapedBody) -> F64:
+    """(V,55) metres from each rest vertex to each joint."""
+    return np.asarray(np.linalg.norm(shaped.vertices[:, None, :] - shaped.joints[None], axis=2))
 
 
-def _on_path(parents: NDArray[np.int32]) -> NDArray[np.bool_]:
-    """(55,55) [joint, ancestor]: is it the joint itself or above it."""
-    above = np.eye(len(parents), dtype=bool)
+def branch_sums(parents: NDArray[np.int32], values: F64) -> F64:
+    """`values` (..., 55) summed over each joint and all joints below it."""
+    above = np.eye(len(parents))
     for joint in range(len(parents)):
         at = int(parents[joint])
         while at >= 0:
-            above[joint, at] = True
+            above[joint, at] = 1.0
             at = int(parents[at])
-    return above
-
-
-def _common_ancestors(parents: NDArray[np.int32]) -> NDArray[np.int64]:
-    """(55,55): the deepest joint that is above or equal to both."""
-    above = _on_path(parents)
-    depth = above.sum(axis=1)
-    shared = above[:, None, :] & above[None, :, :]
-    return np.where(shared, depth, -1).argmax(axis=2)
+    return np.asarray(values @ above)
 
 
 class CpuSkinner:

@@ -1,4 +1,4 @@
-"""The body against the official `smplx` package: same file, same poses, same vertices to a hundredth of a millimetre."""
+"""The body against the official `smplx` package: same file, same poses, same vertices to 0.01 mm."""
 
 from __future__ import annotations
 

@@ -1,0 +1,83 @@
+"""The crop: a rectangle of the screen, the tensor shape that fits it, and the projection that draws just that part.
+
+Rule: rectangles are x0, y0, x1, y1 in normalised device coordinates, y up; a tensor's pixels are square on the screen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from trilane.errors import BadInputError
+
+F64 = NDArray[np.float64]
+Shape = tuple[int, int]
+
+#: A body smaller than this on the screen is given a rectangle of this size, in output pixels.
+LEAST_PIXELS = 1.0
+
+
+class Rect(NamedTuple):
+    """x0 < x1, y0 < y1 in normalised device coordinates, y up."""
+
+    x0: float
+    y0: float
+    x1: float
+    y1: float
+
+    @property
+    def width(self) -> float:
+        return self.x1 - self.x0
+
+    @property
+    def height(self) -> float:
+        return self.y1 - self.y0
+
+
+SCREEN = Rect(-1.0, -1.0, 1.0, 1.0)
+
+
+def choose_bucket(rect: Rect, output: Shape, buckets: Sequence[Shape]) -> tuple[Shape, Rect]:
+    """The bucket that wastes the least area on `rect`, and `rect` grown to the bucket's aspect.
+
+    `output`: (height, width) of the picture in pixels. `buckets`: tensor shapes (height, width). Of equal fits the
+    larger bucket wins. The grown rectangle holds `rect`, keeps its centre if it can and lies on the screen if it fits
+    there; a side longer than the screen's hangs over it on both ends alike. Raises BadInputError without buckets.
+    """
+    if not buckets:
+        raise BadInputError("tensor shapes", "none", "at least one")
+    height = max(rect.height * output[0] / 2.0, LEAST_PIXELS)
+    width = max(rect.width * output[1] / 2.0, LEAST_PIXELS)
+
+    def grown_area(shape: Shape) -> tuple[float, int]:
+        scale = max(height / shape[0], width / shape[1])
+        return round(shape[0] * shape[1] * scale * scale / (height * width), 9), -shape[0] * shape[1]
+
+    shape = min(buckets, key=grown_area)
+    scale = max(height / shape[0], width / shape[1])
+    x0, x1 = _grow(rect.x0, rect.x1, 2.0 * scale * shape[1] / output[1])
+    y0, y1 = _grow(rect.y0, rect.y1, 2.0 * scale * shape[0] / output[0])
+    return shape, Rect(x0, y0, x1, y1)
+
+
+def _grow(low: float, high: float, length: float) -> tuple[float, float]:
+    """An interval of `length` about the middle of [low, high], moved onto [-1, 1] when it fits, else centred on it."""
+    if length >= 2.0:
+        return -length / 2.0, length / 2.0
+    start = min(max((low + high - length) / 2.0, -1.0), 1.0 - length)
+    return min(start, low), max(start + length, high)
+
+
+def crop_projection(projection: ArrayLike, rect: Rect) -> F64:
+    """(4,4): `projection` (4,4) followed by the map of `rect` onto the whole screen; depth is as it was.
+
+    With x' = (2 x - (x0 + x1)) / (x1 - x0) in normalised device coordinates the clip coordinate is
+    X' = (2 X - (x0 + x1) W) / (x1 - x0), which is linear, so the crop is exact for any projection.
+    """
+    after = np.eye(4)
+    after[0, 0], after[0, 3] = 2.0 / rect.width, -(rect.x0 + rect.x1) / rect.width
+    after[1, 1], after[1, 3] = 2.0 / rect.height, -(rect.y0 + rect.y1) / rect.height
+    return np.asarray(after @ np.asarray(projection, np.float64))

@@ -1,0 +1,115 @@
+"""Patches of a mesh: neighbouring triangles of like skinning, each with a sphere that holds it in every pose.
+
+Rule: a patch's radius is proved, not sampled.
+
+Let c be the rest position of the patch's centre, a vertex with weights u, and p another of its vertices with weights w;
+G_j is the rigid motion of joint j. Then
+
+    x_p - x_c = sum_j w_j (G_j p - G_j c) + sum_j (w_j - u_j) G_j c.
+
+The first sum is at most |p - c|. The second is a change of weights at c as in `skinning.weight_error_bound`, so it is
+at most sum_b |E_b| |G_b c - G_parent c|, E_b the sum of w_j - u_j over b and the joints below it; and as b turns about
+its centre c_b by its own angle t_b, |G_b c - G_parent c| <= 2 sin(t_b / 2) |c - c_b|.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.stages.cpu.body import ShapedBody
+from trilane.stages.cpu.skinning import branch_sums, joint_distance
+
+F64 = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+#: Coarse patches are cut until their triangles' middles differ by no more than this, metres, and these again.
+EXTENTS_M = (0.08, 0.02)
+LEAST_FACES = 4
+#: The angle, in radians, by which joints are taken to be turned when patches are cut.
+TYPICAL_TURN = 0.5
+
+
+@dataclass(frozen=True)
+class Level:
+    """P patches of one fineness. `centres` (P,) vertex indices.
+
+    `parts`: of each patch, the indices of its patches in the next level, or of its vertices in the last one.
+    `faces`: of each patch, the indices of its triangles.
+
+    The sphere about the posed centre has the radius `size` (P,) + sum_b `give` (P,54)_b 2 sin(t_b / 2), metres, t_b the
+    angle by which joint b = 1..54 is turned. `blend` (P,54): the most that the pose blend shapes of a joint move a
+    vertex, metres per unit of |R - I|.
+    """
+
+    centres: Ints
+    size: F64
+    give: F64
+    blend: F64
+    parts: list[Ints]
+    faces: list[Ints]
+
+
+def join(groups: list[Ints], chosen: Ints) -> Ints:
+    """The indices of the chosen groups, one after another."""
+    return np.concatenate([groups[patch] for patch in chosen]) if len(chosen) else np.zeros(0, np.int64)
+
+
+def build_levels(shaped: ShapedBody, weights: F64) -> list[Level]:
+    """Coarse and fine patches of all triangles of the body, skinned with `weights` (V,55)."""
+    branches = branch_sums(shaped.body.parents, weights)
+    swing = branches * joint_distance(shaped)
+    features = np.concatenate([shaped.vertices.astype(np.float64), TYPICAL_TURN * swing[:, 1:]], axis=1)
+    faces = shaped.body.faces
+    middles = features[faces].mean(axis=1)
+    coarse = _bisect(middles, np.arange(len(faces)), EXTENTS_M[0])
+    nested = [_bisect(middles, group, EXTENTS_M[1]) for group in coarse]
+    ends = np.cumsum([len(groups) for groups in nested])
+    children = [np.arange(end - len(groups), end) for groups, end in zip(nested, ends, strict=True)]
+    fine = [group for groups in nested for group in groups]
+    blend = _blend_reach(shaped.body.posedirs, len(weights))
+    return [
+        _level(shaped, features, branches, blend, coarse, children),
+        _level(shaped, features, branches, blend, fine, None),
+    ]
+
+
+def _level(
+    shaped: ShapedBody, features: F64, branches: F64, blend: F64, groups: list[Ints], parts: list[Ints] | None
+) -> Level:
+    members = [np.unique(shaped.body.faces[group]).astype(np.int64) for group in groups]
+    centres = np.array([rows[_nearest_to_middle(features[rows])] for rows in members])
+    rest = shaped.vertices.astype(np.float64)
+    flat, starts = np.concatenate(members), np.cumsum([0, *map(len, members)])[:-1]
+    own = np.repeat(centres, [len(rows) for rows in members])
+    size = np.maximum.reduceat(np.linalg.norm(rest[flat] - rest[own], axis=1), starts)
+    change = np.maximum.reduceat(np.abs(branches[flat] - branches[own]), starts, axis=0)
+    give = change * np.linalg.norm(rest[centres][:, None] - shaped.joints, axis=2)
+    reach = np.maximum.reduceat(blend[flat], starts, axis=0)
+    return Level(centres, size, give[:, 1:], reach, members if parts is None else parts, groups)
+
+
+def _blend_reach(posedirs: NDArray[np.float32] | None, count: int) -> F64:
+    """(V,54) metres: how far each joint's rotation, of unit |R - I|, can move each vertex by its blend shapes."""
+    if posedirs is None:
+        return np.zeros((count, 54))
+    blocks = posedirs.reshape(count, 3, 54, 9)
+    return np.asarray(np.sqrt(np.einsum("vajk,vajk->vj", blocks, blocks).astype(np.float64)))
+
+
+def _bisect(features: F64, rows: Ints, extent: float) -> list[Ints]:
+    """Groups of rows, halved again and again at the middle of the direction in which they reach furthest."""
+    here = features[rows]
+    low, high = here.min(axis=0), here.max(axis=0)
+    axis = int((high - low).argmax())
+    if len(rows) <= LEAST_FACES or high[axis] - low[axis] <= extent:
+        return [rows]
+    left = here[:, axis] < (low[axis] + high[axis]) / 2.0
+    return _bisect(features, rows[left], extent) + _bisect(features, rows[~left], extent)
+
+
+def _nearest_to_middle(points: F64) -> int:
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
+    return int(np.linalg.norm(points - middle, axis=1).argmin())

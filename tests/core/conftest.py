@@ -1,0 +1,45 @@
+"""A body small enough to write, break and skin many times."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from trilane.stages.cpu.joints import JOINT_PARENTS
+
+VERTICES, FACES, CORNERS = 90, 120, 130
+
+
+@pytest.fixture
+def body_arrays() -> dict[str, NDArray[Any]]:
+    """The arrays of a body file: 90 vertices around 55 joints, up to 6 weights each, pose blend shapes not zero."""
+    random = np.random.default_rng(11)
+    vertices = random.normal(0, 0.3, (VERTICES, 3))
+    weights = np.zeros((VERTICES, 55))
+    for row in weights:
+        row[random.choice(55, random.integers(1, 7), replace=False)] = 1.0
+    weights *= random.uniform(0.1, 1.0, weights.shape)
+    weights /= weights.sum(axis=1, keepdims=True)
+    regressor = random.uniform(0, 1, (55, VERTICES)) ** 8
+    floats = {
+        "v_template": vertices,
+        "shapedirs": random.normal(0, 0.01, (VERTICES, 3, 20)),
+        "posedirs": random.normal(0, 0.002, (VERTICES, 3, 486)),
+        "J_regressor": regressor / regressor.sum(axis=1, keepdims=True),
+        "weights": weights,
+        "vt": random.uniform(0, 1, (CORNERS, 2)),
+        "hands_componentsl": np.eye(45),
+        "hands_componentsr": np.eye(45),
+        "hands_meanl": random.normal(0, 0.2, 45),
+        "hands_meanr": random.normal(0, 0.2, 45),
+    }
+    integers = {
+        "f": random.integers(0, VERTICES, (FACES, 3)),
+        "ft": random.integers(0, CORNERS, (FACES, 3)),
+        "kintree_table": np.array([np.array(JOINT_PARENTS) % 2**32, range(55)]),
+    }
+    arrays: dict[str, NDArray[Any]] = {key: value.astype(np.float32) for key, value in floats.items()}
+    return arrays | {key: value.astype(np.uint32) for key, value in integers.items()}
