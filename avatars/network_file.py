@@ -38,6 +38,8 @@ OPERATORS = {
     *("AveragePool", "GlobalAveragePool", "MaxPool", "Resize", "DepthToSpace", "SpaceToDepth"),
     *("Concat", "Pad", "Reshape", "Slice", "Split", "Transpose", "QuantizeLinear", "DequantizeLinear"),
 }
+#: Where the time goes, and what must run in integers.
+LAYERS = ("Conv", "ConvTranspose", "Gemm")
 ZERO_POINT_TYPES = {
     TensorProto.UINT8: (0, 255),
     TensorProto.INT8: (-128, 127),
@@ -116,6 +118,28 @@ def constants_of(model: onnx.ModelProto) -> Mapping[str, TensorProto]:
         if node.op_type == "Constant":
             found.update((node.output[0], a.t) for a in node.attribute if a.name == "value")
     return found
+
+
+def check_integer_layers(network: NetworkFile) -> None:
+    """Raises BadInputError naming the layers whose inputs are not dequantised integers, but for `float_layers`."""
+    makers = {out: node for node in network.model.graph.node for out in node.output}
+    left = []
+    for node in network.model.graph.node:
+        if node.op_type in LAYERS and node_name(node) not in network.float_layers:
+            sources = [_beyond_transposes(makers, name) for name in node.input[:2]]
+            if any(source is None or source.op_type != "DequantizeLinear" for source in sources):
+                left.append(node_name(node))
+    if left:
+        raise BadInputError(
+            network.where, f"layers left in float: {', '.join(left)}", "integer layers", "quantise them"
+        )
+
+
+def _beyond_transposes(makers: Mapping[str, onnx.NodeProto], name: str) -> onnx.NodeProto | None:
+    node = makers.get(name)
+    while node is not None and node.op_type == "Transpose":
+        node = makers.get(node.input[0])
+    return node
 
 
 def _parse(path: Path) -> onnx.ModelProto:

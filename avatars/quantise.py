@@ -6,11 +6,9 @@ Weights have 7 bits under `reduce_range`: on a CPU without VNNI two products of 
 
 from __future__ import annotations
 
-import contextlib
-import io
 import json
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,27 +19,18 @@ import onnxruntime
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 from onnxruntime.quantization import (
-    CalibrationDataReader,
-    CalibrationMethod,
     QDQQuantizer,
     QuantType,
-    create_calibrator,
 )
 from onnxruntime.quantization.shape_inference import quant_pre_process
 
+from trilane.avatars.calibration import limit_logits, measure, share_ranges
 from trilane.avatars.network_file import FLOAT_LAYERS_KEY, NetworkFile, check_network
 from trilane.errors import BadInputError
 
 MIN_FRAMES, MAX_FRAMES = 1, 1000
-#: Where the sigmoid rounds to byte 0 and 255: a logit beyond says nothing, and a wider range would cost steps.
-LOGIT_LIMIT = 6.5
 OUTPUT_SCALE = 1 / 255
 
-METHODS = {
-    "minmax": (CalibrationMethod.MinMax, {}),
-    "percentile": (CalibrationMethod.Percentile, {"percentile": 99.99}),
-    "entropy": (CalibrationMethod.Entropy, {}),
-}
 QUANTISED = [
     *("Conv", "ConvTranspose", "Gemm", "Add", "Mul", "Concat", "MaxPool", "AveragePool", "GlobalAveragePool", "Resize"),
     *("Relu", "Clip", "Sigmoid", "Reshape", "Transpose", "Slice", "Split", "Pad"),
@@ -56,14 +45,6 @@ class Quantised:
     facts: dict[str, Any]
 
 
-class _OneFrame(CalibrationDataReader):  # type: ignore[misc]
-    def __init__(self, name: str, frame: NDArray[np.float32]) -> None:
-        self.feeds: Iterator[dict[str, Any]] = iter([{name: frame}])
-
-    def get_next(self) -> dict[str, Any] | None:
-        return next(self.feeds, None)
-
-
 def quantise(
     model: onnx.ModelProto,
     frames: Sequence[NDArray[np.float32]],
@@ -76,15 +57,13 @@ def quantise(
     `model`: one float32 input (1, C, H, W), one output (1, 4, H, W) in 0..1. `frames`: real inputs (H, W, C).
     `keep_float`: names of nodes that stay in float. Raises BadInputError for wrong frames or an unknown method.
     """
-    if method not in METHODS:
-        raise BadInputError("quantise", f"method {method!r}", f"one of {', '.join(METHODS)}")
     _check_frames(model, frames)
     with tempfile.TemporaryDirectory(prefix="trilane-quantise-") as folder:
         prepared = Path(folder) / "prepared.onnx"
         source = Path(folder) / "float.onnx"
         onnx.save(model, source)
         quant_pre_process(source, prepared, skip_symbolic_shape=True)
-        ranges = _calibrate(prepared, frames, method, Path(folder) / "augmented.onnx")
+        ranges = measure(prepared, frames, method, QUANTISED)
         quantised = _insert(onnx.load(prepared), ranges, reduce_range, keep_float)
     _integer_ends(quantised)
     _describe(quantised, keep_float)
@@ -108,26 +87,9 @@ def _check_frames(model: onnx.ModelProto, frames: Sequence[NDArray[np.float32]])
             raise BadInputError("calibration", f"frame {i} of shape {frame.shape}", f"finite values, ({h}, {w}, {c})")
 
 
-def _calibrate(prepared: Path, frames: Sequence[NDArray[np.float32]], method: str, augmented: Path) -> Any:
-    kind, options = METHODS[method]
-    name = onnx.load(prepared, load_external_data=False).graph.input[0].name
-    calibrator = create_calibrator(
-        prepared, QUANTISED, augmented_model_path=str(augmented), calibrate_method=kind, extra_options=options
-    )
-    with contextlib.redirect_stdout(io.StringIO()):
-        for frame in frames:
-            nchw = np.ascontiguousarray(frame.transpose(2, 0, 1)[None], np.float32)
-            calibrator.collect_data(_OneFrame(name, nchw))
-        return calibrator.compute_data()
-
-
 def _insert(model: onnx.ModelProto, ranges: Any, reduce_range: bool, keep_float: Sequence[str]) -> onnx.ModelProto:
-    sigmoid = next((node for node in model.graph.node if node.output[0] == model.graph.output[0].name), None)
-    if sigmoid is None or sigmoid.op_type != "Sigmoid":
-        raise BadInputError("quantise", f"output made by {sigmoid and sigmoid.op_type}", "a Sigmoid")
-    logits = ranges[sigmoid.input[0]]
-    logits.lowest = np.maximum(logits.lowest, np.float32(-LOGIT_LIMIT))
-    logits.highest = np.minimum(logits.highest, np.float32(LOGIT_LIMIT))
+    limit_logits(model, ranges)
+    share_ranges(model, ranges)
     quantiser = QDQQuantizer(
         model,
         per_channel=True,

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import importlib.util
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import Protocol
@@ -24,10 +24,14 @@ AUTO = "auto"
 
 @dataclass(frozen=True)
 class RuntimeOptions:
-    """`threads`: that compute, this process's own included. `spin`: may they spin between jobs."""
+    """`threads`: that compute, this process's own included. `spin`: may they spin between jobs.
+
+    `device`: settings of a runtime's own, by its own names, such as `htp_arch` of `qnn`.
+    """
 
     threads: int = 1
     spin: bool = False
+    device: Mapping[str, str] = field(default_factory=dict)
 
 
 class Binding(Protocol):
@@ -63,10 +67,11 @@ class RuntimeEntry:
     install: str
 
 
-#: Fastest first, by measurement: `auto` takes the first that is installed.
+#: Fastest first, by measurement: `auto` takes the first that is installed. An emulator is never the fastest.
 RUNTIMES = {
     "openvino": RuntimeEntry("trilane.stages.dsp.openvino", "openvino", "pip install 'trilane[openvino]'"),
     "ort": RuntimeEntry("trilane.stages.dsp.ort", "onnxruntime", "pip install onnxruntime"),
+    "qnn": RuntimeEntry("trilane.stages.dsp.qnn", "onnxruntime_qnn", "pip install 'trilane[qnn]'"),
 }
 
 

