@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from trilane.stages.contracts import Packet
 from trilane.stages.gpu import gl
 from trilane.stages.gpu.background import Background
+from trilane.stages.gpu.context import check
 from trilane.stages.gpu.painters import AvatarPainter, PicturePainter, RoomPainter, ShadowPainter
 from trilane.stages.gpu.shadow import DISCS, floor_discs
 
@@ -32,7 +33,7 @@ class CompositeStage:
     def __init__(
         self, ctx: Any, shape: Shape, shapes: Sequence[Shape], rest: Sequence[F64], background: Background | None
     ) -> None:
-        self._shape, self._rest, self._background = shape, rest, background
+        self._ctx, self._shape, self._rest, self._background = ctx, shape, rest, background
         colour = ctx.texture(shape[::-1], 4, internal_format=gl.SRGB8_ALPHA8)
         self._target = ctx.framebuffer([colour])
         self._room = RoomPainter(ctx) if background is None else None
@@ -54,6 +55,7 @@ class CompositeStage:
         self.draw(packet.pose, packet.payload)
         frame_bytes = self._outputs[slot_out].payload[: math.prod(self._shape) * 3]
         self._target.read_into(frame_bytes, components=3, alignment=1)
+        check(self._ctx)
         return {}
 
     def draw(self, pose: NDArray[np.void], image: NDArray[np.uint8]) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 
 import moderngl
 
-from trilane.errors import MissingPartError
+from trilane.errors import MissingPartError, TrilaneError
 
 INSTALL = "apt-get install libegl1 libgl1-mesa-dri"
 REQUIRED_VERSION = 330
@@ -42,6 +42,13 @@ def open_context(threads: int | None = None) -> Any:
         return create(require=REQUIRED_VERSION, standalone=True, backend="egl", libegl=LIBRARY, libgl=LIBRARY)
     except Exception as error:  # moderngl and glcontext raise bare Exception
         raise MissingPartError(f"no OpenGL 3.3 context through EGL ({error})", INSTALL) from error
+
+
+def check(ctx: Any) -> None:
+    """Raises TrilaneError when a call since the last check failed: the context was lost, or memory ran out."""
+    error = ctx.error
+    if error != "GL_NO_ERROR":
+        raise TrilaneError(f"OpenGL reports {error}: the context was lost or its memory ran out")
 
 
 def describe(ctx: Any) -> Driver:

@@ -14,13 +14,14 @@ from typing import Any
 from trilane.errors import MissingPartError
 from trilane.stages.gpu.context import INSTALL, LIBRARY
 
-COLOR = 0x1800
+COLOR, DEPTH = 0x1800, 0x1801
 FRAMEBUFFER_SRGB = 0x8DB9
 SRGB8_ALPHA8 = 0x8C43
 
 _INT, _UINT, _PTR = ctypes.c_int, ctypes.c_uint, ctypes.c_void_p
 _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "glClearBufferuiv": (None, (_UINT, _INT, _PTR)),
+    "glClearBufferfv": (None, (_UINT, _INT, _PTR)),
     "glEnable": (None, (_UINT,)),
     "glDisable": (None, (_UINT,)),
 }
@@ -40,8 +41,9 @@ def function(name: str) -> Callable[..., Any]:
 
 
 def clear_unsigned(value: tuple[int, int, int, int]) -> None:
-    """Fill colour attachment 0 of the bound framebuffer, an unsigned integer format, with `value`."""
+    """Fill the bound framebuffer: colour attachment 0, an unsigned integer format, with `value`, depth with 1."""
     function("glClearBufferuiv")(COLOR, 0, (ctypes.c_uint * 4)(*value))
+    function("glClearBufferfv")(DEPTH, 0, (ctypes.c_float * 1)(1.0))
 
 
 @contextmanager

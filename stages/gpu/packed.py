@@ -91,7 +91,6 @@ class PackedPass:
         target.words.use()
         target.words.viewport = (0, 0, shape[1], shape[0])
         target.words.depth_mask = True
-        target.words.clear(depth=1.0)
         gl.clear_unsigned(self._background)
         return target
 

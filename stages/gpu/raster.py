@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from trilane.errors import TrilaneError
 from trilane.stages.contracts import Packet
 from trilane.stages.cpu.crop import Rect, crop_projection
+from trilane.stages.gpu.context import check
 from trilane.stages.gpu.packed import PackedAvatar, PackedPass, Placement
 
 Shape = tuple[int, int]
@@ -50,6 +51,7 @@ class RasterStage:
         for avatar in visible:
             self._avatars[int(avatar["avatar"])].draw(target, pose["view"], _placement(pose, avatar))
         self._packed.read_into(shape, tensor)
+        check(self._packed.ctx)
         return {}
 
     def close(self) -> None:

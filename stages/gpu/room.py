@@ -23,7 +23,7 @@ WALL_TEXTURE_M = 4.0  # height that the wall texture spans; above it the paint g
 WALL_SHAPE = (1024, 256)
 SKIRTING_M = 0.11
 MARGIN_M = 0.6
-GRID = np.array([0, 0.03, 0.09, 0.2, 0.5, 0.8, 0.91, 0.97, 1])
+GRID = np.array([0, 0.04, 0.12, 0.5, 0.88, 0.96, 1])
 SEED = 7
 
 

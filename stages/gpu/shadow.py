@@ -16,13 +16,13 @@ F64 = NDArray[np.float64]
 
 # joint, radius on the floor in metres, strength there, height in metres over which it fades to 1/e
 DISCS = (
-    ("left_ankle", 0.15, 0.55, 0.18),
-    ("right_ankle", 0.15, 0.55, 0.18),
-    ("left_foot", 0.16, 0.60, 0.15),
-    ("right_foot", 0.16, 0.60, 0.15),
+    ("left_ankle", 0.15, 0.65, 0.18),
+    ("right_ankle", 0.15, 0.65, 0.18),
+    ("left_foot", 0.16, 0.70, 0.15),
+    ("right_foot", 0.16, 0.70, 0.15),
     ("left_knee", 0.22, 0.45, 0.30),
     ("right_knee", 0.22, 0.45, 0.30),
-    ("pelvis", 0.50, 0.50, 0.90),
+    ("pelvis", 0.50, 0.60, 1.20),
     ("spine3", 0.45, 0.45, 0.60),
     ("head", 0.30, 0.45, 0.30),
     ("left_wrist", 0.16, 0.45, 0.15),

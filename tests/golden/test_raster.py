@@ -116,6 +116,8 @@ HARD_VIEWS = {
     "a body of a few pixels": ((0.0, 1.0, 90.0), (0.0, 1.0, 0.0), {}),
     "an eyelash away": ((0.03, 1.66, 0.24), (0.03, 1.64, 0.0), {"near": 0.001}),
 }
+#: Looking straight down the body, which then is 10,000 pixels tall in a window of 192.
+HARD_VIEWS["a body of 10,000 pixels"] = ((0.0, 1.62, 3.0), (0.0, 1.62, 0.0), {"fov_y_deg": 0.645})
 NOTHING_SEEN = ("body behind the camera", "camera inside the body")
 
 
@@ -132,6 +134,30 @@ def test_hard_views(gl: Any, person: Any, neural_texture: Any, camera: Camera, n
     assert found["within_one"] >= 0.995
     assert found["background"] == 0
     assert (found["pixels"] == 0) == (name in NOTHING_SEEN)
+
+
+@pytest.mark.parametrize("shape", [(97, 61), (1, 1), (33, 200)])
+def test_sizes_that_are_no_multiple_of_32(gl: Any, person: Any, camera: Camera, shape: Any) -> None:
+    """Odd tensors and an odd texture agree with the reference as others do."""
+    texture = np.random.default_rng(0).normal(0, 0.5, (37, 21, 16)).astype(np.float16).astype(np.float64)
+    views = camera((0.2, 1.0, 2.0), (0, 1.0, 0), 40, shape[1] / shape[0])
+    found = compare(gl, person.arrays, texture, person.pose(REST), views, shape)
+    assert found["pixels"] > 0
+    assert found["coverage"] <= 0.002 * found["pixels"] + 1
+    assert found["within_one"] >= 0.995
+    assert found["background"] == 0
+
+
+def test_a_vertex_on_the_near_plane(gl: Any, neural_texture: Any, camera: Camera) -> None:
+    """A triangle that touches the near plane at a corner, and one that lies in it, agree to two pixels a row."""
+    joints = np.tile(np.eye(4)[:3], (55, 1, 1)).astype(np.float32)
+    views = camera((0.0, 0.0, 1.0), (0, 0, 0), 90, near=0.5)
+    touching = quad([(-0.4, -0.4, -1.0), (0.4, -0.4, -1.0), (0.0, 0.3, 0.5)], [(0, 1, 2)])
+    found = compare(gl, touching, neural_texture, joints, views, (64, 64))
+    assert found["pixels"] > 100
+    assert found["coverage"] <= 2
+    within = quad([(-0.4, -0.4, 0.5), (0.4, -0.4, 0.5), (0.0, 0.3, 0.5)], [(0, 1, 2)])
+    assert compare(gl, within, neural_texture, joints, views, (64, 64))["background"] == 0
 
 
 def quad(corners: list[tuple[float, float, float]], faces: list[tuple[int, int, int]]) -> Any:
