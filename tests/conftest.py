@@ -115,3 +115,16 @@ def tiny_bundle(tiny_quantised: Quantised, tmp_path_factory: pytest.TempPathFact
     manifest = Manifest(name="tiny", network=entry, quantisation=tiny_quantised.facts)
     write_bundle(folder, manifest, bundle_folder("default") / "body.npz", texture, tiny_quantised.network)
     return folder
+
+
+@pytest.fixture(scope="session")
+def drawable_bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bundle like `tiny_bundle` with 4 channels, which the GPU unit can pack: whole runs are made with it."""
+    folder = tmp_path_factory.mktemp("bundle") / "drawable"
+    frames = np.random.default_rng(1).normal(0, 1, (4, 64, 64, 4)).astype(np.float32)
+    network = quantise(tiny_float_network(channels=4), list(frames))
+    texture = np.random.default_rng(2).normal(0, 1, (32, 32, 4)).astype(np.float16)
+    entry = network_entry(network.network, "resnet18", "batch", 8)
+    manifest = Manifest(name="tiny", network=entry, quantisation=network.facts)
+    write_bundle(folder, manifest, bundle_folder("default") / "body.npz", texture, network.network)
+    return folder

@@ -110,7 +110,8 @@ def test_the_contact_sheet_shows_first_and_last_frame(tmp_path: Path) -> None:
     present(tmp_path, range(40))
     join_segments(segments(tmp_path), tmp_path / "video.mp4", FPS)
     assert contact_sheet(tmp_path / "video.mp4", tmp_path / "contact.png", FPS) == 20
-    sheet = np.asarray(Image.open(tmp_path / "contact.png"))
+    with Image.open(tmp_path / "contact.png") as picture:
+        sheet = np.asarray(picture)
     cell_height = 320 * HEIGHT // WIDTH
     assert sheet.shape == (5 * cell_height, 4 * 320, 3)
     assert sheet[cell_height - 3, 300].mean() == pytest.approx(grey_of(0), abs=3)

@@ -62,11 +62,11 @@ def running(bundle: Path, folder: Path) -> Iterator[tuple[subprocess.Popen[str],
 
 @pytest.fixture(scope="module")
 def finished(
-    tiny_bundle: Path, tmp_path_factory: pytest.TempPathFactory
+    drawable_bundle: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, subprocess.CompletedProcess[str]]:
     """The folder in which a run was made, and what the command said."""
     folder = tmp_path_factory.mktemp("run")
-    done = run(tiny_bundle, folder, "--frames", str(FRAMES), "--baseline", "10")
+    done = run(drawable_bundle, folder, "--frames", str(FRAMES), "--baseline", "10")
     assert done.returncode == 0, done.stderr
     return folder, done
 
@@ -113,20 +113,20 @@ def test_the_video_has_every_frame_and_the_sheet_shows_it(finished: Finished) ->
     assert all(picture.shape == (480, 640, 3) for picture in pictures)
     assert min(float(picture.std()) for picture in pictures) > 5, "a room is no plain colour"
     assert not np.array_equal(pictures[0], pictures[-1]), "the camera moves"
-    sheet = Image.open(folder / "contact.png")
-    assert sheet.size == (4 * 320, 5 * 240)
+    with Image.open(folder / "contact.png") as sheet:
+        assert sheet.size == (4 * 320, 5 * 240)
 
 
-def test_two_runs_present_the_same_bytes(finished: Finished, tiny_bundle: Path, tmp_path: Path) -> None:
-    done = run(tiny_bundle, tmp_path, "--frames", str(FRAMES), "--policy", "sequential")
+def test_two_runs_present_the_same_bytes(finished: Finished, drawable_bundle: Path, tmp_path: Path) -> None:
+    done = run(drawable_bundle, tmp_path, "--frames", str(FRAMES), "--policy", "sequential")
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["checksum"] == json.loads(finished[1].stdout)["checksum"]
 
 
-def test_recorded_motion_and_camera(tiny_bundle: Path, shared_data: Path, tmp_path: Path) -> None:
+def test_recorded_motion_and_camera(drawable_bundle: Path, shared_data: Path, tmp_path: Path) -> None:
     motion, camera = shared_data / "motion" / "cmu_jumping_jacks.bvh", shared_data / "camera" / "arkit_camera_pose.txt"
     arguments = ["--motion", str(motion), "--camera", str(camera), "--frames", "12", "--baseline", "0"]
-    done = run(tiny_bundle, tmp_path, *arguments)
+    done = run(drawable_bundle, tmp_path, *arguments)
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
     assert (report["frames"]["presented"], report["frames"]["lost"], report["baseline"]) == (12, 0, None)
@@ -134,8 +134,8 @@ def test_recorded_motion_and_camera(tiny_bundle: Path, shared_data: Path, tmp_pa
         assert word in done.stderr, "each load says what it took the file for"
 
 
-def test_an_interrupted_run_keeps_its_frames_and_ends_its_units(tiny_bundle: Path, tmp_path: Path) -> None:
-    with running(tiny_bundle, tmp_path) as (parent, units):
+def test_an_interrupted_run_keeps_its_frames_and_ends_its_units(drawable_bundle: Path, tmp_path: Path) -> None:
+    with running(drawable_bundle, tmp_path) as (parent, units):
         parent.send_signal(signal.SIGINT)
         out, err = parent.communicate(timeout=PATIENCE_S)
         assert parent.returncode == 130, err
@@ -145,16 +145,16 @@ def test_an_interrupted_run_keeps_its_frames_and_ends_its_units(tiny_bundle: Pat
     assert psutil.wait_procs(units, timeout=5)[1] == []
 
 
-def test_a_killed_run_leaves_nothing_that_looks_whole(tiny_bundle: Path, tmp_path: Path) -> None:
-    with running(tiny_bundle, tmp_path) as (parent, units):
+def test_a_killed_run_leaves_nothing_that_looks_whole(drawable_bundle: Path, tmp_path: Path) -> None:
+    with running(drawable_bundle, tmp_path) as (parent, units):
         assert len(units) >= 3
         parent.kill()
     assert psutil.wait_procs(units, timeout=10)[1] == [], "the units end with their parent"
     assert [path.suffix for path in tmp_path.iterdir()] == [".partial"]
 
 
-def test_a_killed_unit_is_restarted_and_its_video_goes_on(tiny_bundle: Path, tmp_path: Path) -> None:
-    with running(tiny_bundle, tmp_path) as (parent, units):
+def test_a_killed_unit_is_restarted_and_its_video_goes_on(drawable_bundle: Path, tmp_path: Path) -> None:
+    with running(drawable_bundle, tmp_path) as (parent, units):
         victim = next(unit for unit in units if "cpu" in unit.cmdline())
         victim.kill()
         wait_until(lambda: len(list(tmp_path.glob("*.partial/segments/*.mp4"))) == 2, "a second segment")
