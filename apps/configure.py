@@ -76,8 +76,8 @@ def configure(request: Request, out_dir: Path) -> Checked:
     """Look at every part of what was asked for. Raises BadInputError or MissingPartError."""
     scene = requested_scene(request)
     runtime = resolve(request.runtime)
-    notes = [note for spec in scene.avatars for note in load_motion(spec, Path.cwd()).notes]
-    notes += load_camera(scene.camera, Path.cwd()).notes
+    notes = [f"motion: {note}" for spec in scene.avatars for note in load_motion(spec, Path.cwd()).notes]
+    notes += [f"camera: {note}" for note in load_camera(scene.camera, Path.cwd()).notes]
     _check_background(scene)
     bundles = [_checked_bundle(spec.bundle) for spec in scene.avatars]
     config = RunConfig(

@@ -17,6 +17,8 @@ import typer
 from trilane.apps.cli.console import JsonOption, print_json, stderr_console, stdout_console
 
 if TYPE_CHECKING:
+    from rich.progress import TaskID
+
     from trilane.apps.run_job import Hooks, Outcome
 
 app = typer.Typer(rich_markup_mode=None, add_completion=False)
@@ -49,12 +51,14 @@ def _hooks() -> Iterator[Hooks]:
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     bar = Progress(*columns, console=stderr_console(), disable=not sys.stderr.isatty())
-    tasks: dict[str, int] = {}
+    tasks: dict[str, TaskID] = {}
+    starting = bar.add_task("starting the units", total=None)
 
     def progress(what: str, presented: int, requested: int) -> None:
         if what not in tasks:
+            bar.update(starting, visible=False)
             tasks[what] = bar.add_task(what, total=requested)
-        bar.update(tasks[what], completed=presented)  # type: ignore[arg-type]
+        bar.update(tasks[what], completed=presented)
 
     with bar:
         yield Hooks(progress, lambda text: bar.console.print(Text(text), soft_wrap=True))

@@ -33,7 +33,7 @@ def listing(folder: Path) -> list[Path]:
 
 def shared_memory() -> list[Path]:
     """What a Python program would leave in /dev/shm; other programs come and go there."""
-    return sorted(path for pattern in ("*trilane*", "psm_*", "sem.*") for path in SHM.glob(pattern))
+    return sorted(path for pattern in ("*trilane*", "psm_*") for path in SHM.glob(pattern))
 
 
 def huge_npy(path: Path) -> None:
