@@ -1,0 +1,184 @@
+"""`trilane profiles`: the hardware profiles that there are, what they say, whether they hold, and how they are fitted.
+
+Rule: this module reads options and shows results; every figure comes from `trilane.hw_profiles`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from trilane.apps.cli.console import JsonOption, print_json, stderr_console, stdout_console
+from trilane.errors import BadInputError
+
+if TYPE_CHECKING:
+    from trilane.hw_profiles.fit import Fit
+
+app = typer.Typer(rich_markup_mode=None, add_completion=False, no_args_is_help=True, help="Hardware profiles.")
+
+NOT_KNOWN = (
+    "A roofline knows how much work there is and how fast the chip can do it. It does not know which kernel the "
+    "runtime picks, how tensors fall into caches and tiles, or how warm the device was: on the GPU, rows of one "
+    "network stray by a fifth from any smooth law, and a number that one row alone determines is as good as that row."
+)
+
+
+@app.command("list", epilog="\b\nExamples:\n  trilane profiles list\n  trilane profiles list --json")
+def list_profiles(json: JsonOption = False) -> None:
+    """List the profiles that come with Trilane."""
+    from rich.table import Table
+
+    from trilane.hw_profiles.load import load_profile, profile_names
+
+    known = [(name, load_profile(name)) for name in profile_names()]
+    rows = [
+        {"name": n, "title": p.title, "units": {u: x.title for u, x in p.units.items()}}
+        for n, p in known
+        if not p.template
+    ]
+    if json:
+        print_json({"profiles": rows})
+        return
+    table = Table("profile", "chip", "gpu", "dsp")
+    for row in rows:
+        units: Any = row["units"]
+        table.add_row(str(row["name"]), str(row["title"]), units["gpu"], units["dsp"])
+    stdout_console().print(table)
+
+
+@app.command(epilog="\b\nExamples:\n  trilane profiles show snapdragon-888\n  trilane profiles show mine.toml --json")
+def show(
+    name: Annotated[str, typer.Argument(help="A profile's name or a TOML file.")],
+    json: JsonOption = False,
+) -> None:
+    """Show every number of a profile with its kind and source."""
+    from rich.table import Table
+
+    from trilane.hw_profiles.load import load_profile
+
+    profile = load_profile(name)
+    if json:
+        print_json(profile.model_dump(mode="json"))
+        return
+    table = Table("key", "value", "± %", "kind", "source", title=profile.title)
+    for key, number in _quantities(profile.model_dump(), ""):
+        value = "unknown" if number["value"] is None else f"{number['value']:g}"
+        spread = "" if number["spread"] is None else f"{100 * number['spread']:.0f}"
+        table.add_row(key, value, spread, number["kind"], number["source"])
+    stdout_console().print(table)
+
+
+def _quantities(data: Any, key: str) -> list[tuple[str, dict[str, Any]]]:
+    if not isinstance(data, dict):
+        return []
+    if "kind" in data and "source" in data:
+        return [(key, data)]
+    return [found for name, value in data.items() for found in _quantities(value, f"{key}.{name}".lstrip("."))]
+
+
+@app.command(epilog="\b\nExamples:\n  trilane profiles check\n  trilane profiles check mine.toml")
+def check(
+    names: Annotated[
+        list[str] | None, typer.Argument(help="Profiles or TOML files; all that are here if none.")
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Check profiles: their keys and ranges, and published latencies that they should reproduce."""
+    from rich.table import Table
+
+    from trilane.hw_profiles.load import load_profile, profile_names
+    from trilane.hw_profiles.published import check_published
+
+    profiles = {name: load_profile(name) for name in names or profile_names()}
+    found = [one for profile in profiles.values() for one in check_published(profile.name, profile)]
+    if json:
+        print_json({"valid": list(profiles), "published": [{**one._asdict(), "error": one.error} for one in found]})
+        return
+    console = stdout_console()
+    console.print(f"{len(profiles)} profiles are valid")
+    if not found:
+        return
+    table = Table("profile", "network", "published, ms", "predicted, ms", "error", "")
+    for one in found:
+        note = "" if one.independent else "sets the profile's peak rate"
+        figures = (f"{one.published_ms:g}", f"{one.predicted_ms:.2f}", f"{100 * one.error:+.0f} %")
+        table.add_row(one.profile, one.network, *figures, note)
+    console.print(table)
+
+
+@app.command(
+    epilog="\b\nExamples:\n  trilane profiles fit --from ../shared/data/snapdragon888_measured.csv\n"
+    "  trilane profiles fit --from rows.csv --profile mine.toml --name mine-fitted --write mine-fitted.toml"
+)
+def fit(
+    source: Annotated[Path, typer.Option("--from", help="CSV of measured rows.")],
+    profile: Annotated[str, typer.Option(help="Profile whose numbers are the priors.")] = "snapdragon-888-facts",
+    name: Annotated[str, typer.Option(help="Name of the fitted profile.")] = "snapdragon-888",
+    write: Annotated[Path | None, typer.Option(help="Write the fitted profile here.")] = None,
+    json: JsonOption = False,
+) -> None:
+    """Fit a profile to measured rows; print residuals and the error on rows left out."""
+    from trilane.hw_profiles.fit import as_toml, fit_profile
+
+    with stderr_console().status("fitting, each row left out in turn"):
+        result = fit_profile(profile, source)
+    if json:
+        print_json(_fit_document(result))
+    else:
+        _show_fit(result)
+    if write is not None:
+        title = result.data["title"].removesuffix(", before the fit")
+        command = f"trilane profiles fit --from {source}"
+        try:
+            write.write_text(as_toml(result, name, title, profile, command), encoding="utf-8")
+        except OSError as error:
+            raise BadInputError(write, error.strerror or str(error), "a place that can be written") from None
+
+
+def _fit_document(result: Fit) -> dict[str, Any]:
+    return {
+        "free_numbers": result.free_count,
+        "measurements": len(result.residuals),
+        "medians": {
+            c: {"error": result.median_error(c), "left_out_error": result.median_error(c, left_out=True)}
+            for c in result.columns
+        },
+        "numbers": {key: {"value": v, "spread": s} for key, (v, s) in result.numbers.items()},
+        "residuals": [
+            {
+                "row": r.row.place,
+                "column": r.column,
+                "measured_ms": r.measured_ms,
+                "fitted_ms": r.fitted_ms,
+                "error": r.error,
+                "left_out_error": r.left_out_error,
+            }
+            for r in result.residuals
+        ],
+        "note": NOT_KNOWN,
+    }
+
+
+def _show_fit(result: Fit) -> None:
+    from rich.table import Table
+
+    console = stdout_console()
+    table = Table("network", "measured", "ms", "fitted, ms", "error", "left out")
+    for r in result.residuals:
+        s = r.row.spec
+        network = f"{s.encoder} {s.norm} {s.height} {s.channels} {s.layout}"
+        errors = (f"{100 * r.error:+.1f} %", f"{100 * r.left_out_error:+.1f} %")
+        table.add_row(network, r.column, f"{r.measured_ms:.1f}", f"{r.fitted_ms:.1f}", *errors)
+    console.print(table)
+    medians = Table("median of absolute errors", "fitted", "left out")
+    for column in result.columns:
+        both = (result.median_error(column), result.median_error(column, left_out=True))
+        medians.add_row(column, *(f"{100 * value:.1f} %" for value in both))
+    console.print(medians)
+    numbers = Table("number", "value", "± %")
+    for key, (value, spread) in result.numbers.items():
+        numbers.add_row(key, f"{value:.4g}", f"{100 * spread:.0f}")
+    console.print(numbers)
+    console.print(f"{result.free_count} free numbers, {len(result.residuals)} measurements. {NOT_KNOWN}")

@@ -1,0 +1,54 @@
+"""The `host` profile: this machine, as far as the operating system tells.
+
+Rule: nothing is measured here, so every number is `assumed` and says what it was worked out from; the units share
+the machine's cores as they do in a run.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+CPU_INFO = Path("/proc/cpuinfo")
+#: CPU flag: INT8 and FP32 multiply-accumulates per cycle and core; the first that the machine has counts.
+RATES = {
+    "avx512_vnni": (128, 32),
+    "avx_vnni": (64, 16),
+    "avx2": (32, 16),
+    "asimddp": (32, 8),
+    "": (8, 4),
+}
+FALLBACK_GHZ = 2.5
+
+
+def host_tables() -> dict[str, Any]:
+    """What is laid over the file `host.toml`: peak rates of each unit."""
+    cores = psutil.cpu_count(logical=False) or psutil.cpu_count() or 1
+    frequency = psutil.cpu_freq()
+    ghz = (frequency.max or frequency.current) / 1e3 if frequency else 0.0
+    known_ghz = ghz if ghz > 0 else FALLBACK_GHZ
+    flags = set(CPU_INFO.read_text(encoding="utf-8", errors="replace").split()) if CPU_INFO.is_file() else set()
+    flag = next(name for name in RATES if name in flags or not name)
+    clock = f"{known_ghz:.1f} GHz" + ("" if ghz > 0 else " (not told, assumed)")
+    dsp_cores = max(1, cores - 2)
+    return {
+        "title": f"this machine: {cores} cores, {clock}, {flag or 'no vector products'}",
+        "units": {
+            "cpu": _unit(1, known_ghz, flag, clock),
+            "gpu": _unit(1, known_ghz, flag, clock),
+            "dsp": _unit(dsp_cores, known_ghz, flag, clock),
+        },
+    }
+
+
+def _unit(cores: int, ghz: float, flag: str, clock: str) -> dict[str, Any]:
+    int8, fp32 = RATES[flag]
+    source = f"{cores} cores x {clock} x {{}} products a cycle ({flag or 'scalar'})"
+
+    def peak(per_cycle: int) -> dict[str, Any]:
+        value = cores * ghz * per_cycle / 1e3
+        return {"value": value, "kind": "assumed", "spread": 0.3, "source": source.format(per_cycle)}
+
+    return {"peak_int8_tmac_s": peak(int8), "peak_fp16_tmac_s": peak(fp32), "peak_fp32_tmac_s": peak(fp32)}

@@ -1,0 +1,175 @@
+"""Reads hardware profiles: TOML, `extends`, checks.
+
+Rule: whatever is wrong with a file is a `BadInputError` that names the file, the key, what was found and expected.
+"""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from trilane.errors import BadInputError
+from trilane.hw_profiles.detect import host_tables
+from trilane.hw_profiles.schema import Profile
+
+HOST = "host"
+MAX_BYTES = 1_000_000
+MAX_DEPTH = 8
+#: Quantities are replaced whole by an extending profile: half of one number and half of another mean nothing.
+WHOLE = frozenset(["value", "kind", "source"])
+
+
+def profile_folder() -> Path:
+    """The folder of the profiles that come with Trilane."""
+    return Path(str(resources.files("trilane.hw_profiles")))
+
+
+def profile_names() -> list[str]:
+    """Names that `load_profile` knows, templates included."""
+    return sorted(path.stem for path in profile_folder().glob("*.toml"))
+
+
+def load_profile(name: str | Path) -> Profile:
+    """The profile `name`: one that comes with Trilane, or a path to a TOML file.
+
+    Raises BadInputError when it is not there or says something wrong.
+    """
+    path = _find(str(name), Path())
+    data = merged_tables(path)
+    if path.stem == HOST:
+        data = _overlay(data, host_tables())
+    return parse_profile(data, path)
+
+
+def load_runnable(name: str | Path) -> Profile:
+    """The profile `name`, which is to be a chip and no template. Raises BadInputError."""
+    profile = load_profile(name)
+    if profile.template:
+        chips = [other for other in profile_names() if not load_profile(other).template]
+        raise BadInputError("profile", f"the template {profile.name}", "one of " + ", ".join(chips))
+    return profile
+
+
+def load_tables(name: str | Path) -> tuple[dict[str, Any], Path]:
+    """The merged tables of the profile `name`, unchecked, and its path. Raises BadInputError."""
+    path = _find(str(name), Path())
+    return merged_tables(path), path
+
+
+def parse_profile(data: Mapping[str, Any], path: Path) -> Profile:
+    """Check `data`, the tables of a profile; `path` is named in errors. Raises BadInputError."""
+    try:
+        return Profile.model_validate(data)
+    except ValidationError as error:
+        raise _bad_input(error, path) from None
+
+
+def merged_tables(path: Path, seen: tuple[Path, ...] = ()) -> dict[str, Any]:
+    """The tables of `path` laid over those it extends. Raises BadInputError for a cycle or an unreadable file."""
+    path = path.resolve()
+    if path in seen:
+        chain = " -> ".join(p.name for p in (*seen[seen.index(path) :], path))
+        raise BadInputError(f"{path}: extends", f"the cycle {chain}", "a profile that does not extend itself")
+    if len(seen) >= MAX_DEPTH:
+        raise BadInputError(f"{path}: extends", f"more than {MAX_DEPTH} profiles in a row", "fewer")
+    data = _read(path)
+    parent = data.pop("extends", None)
+    if parent is None:
+        return data
+    if not isinstance(parent, str):
+        raise BadInputError(f"{path}: extends", repr(parent), "the name of a profile")
+    try:
+        base = merged_tables(_find(parent, path.parent), (*seen, path))
+    except BadInputError as error:
+        if error.where != "profile":
+            raise
+        raise BadInputError(f"{path}: extends", error.found, error.expected) from None
+    base.pop("template", None)
+    merged: dict[str, Any] = _overlay(base, data)
+    return merged
+
+
+def _find(name: str, beside: Path) -> Path:
+    if name.endswith(".toml"):
+        path = beside / name
+        if path.is_file():
+            return path
+        raise BadInputError("profile", f"no file {path}", "a TOML file that can be read")
+    for folder in (beside, profile_folder()):
+        path = folder / f"{name}.toml"
+        if name.replace("-", "").replace("_", "").isalnum() and path.is_file():
+            return path
+    names = profile_names()
+    close = difflib.get_close_matches(name, names, 1)
+    hint = f"did you mean {close[0]}?" if close else ""
+    raise BadInputError("profile", f"no profile {name!r}", "a .toml file or one of " + ", ".join(names), hint)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise BadInputError(path, f"{path.stat().st_size} bytes", f"at most {MAX_BYTES}")
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise BadInputError(path, str(error), "TOML in UTF-8") from None
+    except OSError as error:
+        raise BadInputError(path, error.strerror or str(error), "a file that can be read") from None
+
+
+def _overlay(base: Any, over: Any) -> Any:
+    if not (isinstance(base, dict) and isinstance(over, dict)) or WHOLE & over.keys():
+        return over
+    return {key: _overlay(base.get(key), over[key]) if key in over else base[key] for key in base | over}
+
+
+def _bad_input(error: ValidationError, path: Path) -> BadInputError:
+    first, count = error.errors(include_url=False)[0], error.error_count()
+    keys = [str(part) for part in first["loc"] if part != "[key]"]
+    more = f"; and {count - 1} more" if count > 1 else ""
+    where, message = f"{path}: {'.'.join(keys) or 'the profile'}", first["msg"].removeprefix("Value error, ")
+    if first["type"] == "extra_forbidden":
+        known = list(_siblings(keys))
+        close = difflib.get_close_matches(keys[-1], known, 1, 0.5)
+        expected = f"`{close[0]}`" if close else "one of " + ", ".join(known)
+        return BadInputError(where, f"the unknown key `{keys[-1]}`", expected, "units of measure end the name" + more)
+    if message.startswith("found ") and ", expected " in message:
+        found, expected = message.removeprefix("found ").split(", expected ", 1)
+        return BadInputError(where, found, expected + more)
+    if first["type"] == "missing":
+        return BadInputError(where, "nothing", "this key" + more)
+    found = _short(first["input"])
+    expected = "a table { value = ..., kind = ..., source = ... }" if "Quantity" in message else _expectation(message)
+    return BadInputError(where, found, expected + more)
+
+
+def _expectation(message: str) -> str:
+    text = message.removeprefix("Input should be ").removeprefix("Field ")
+    return text[:1].lower() + text[1:]
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, dict | list):
+        return f"a {'table' if isinstance(value, dict) else 'list'}"
+    text = repr(value)
+    return text if len(text) < 60 else text[:57] + "..."
+
+
+def _siblings(keys: Sequence[str]) -> Iterator[str]:
+    """The keys that the schema knows where the last of `keys` stands."""
+    model: Any = Profile
+    for key in keys[:-1]:
+        fields = getattr(model, "model_fields", {})
+        model = _model_of(fields[key].annotation if key in fields else model)
+    yield from getattr(model, "model_fields", {})
+
+
+def _model_of(annotation: Any) -> Any:
+    """The model that `dict[str, Model]` holds, or the annotation itself."""
+    arguments = getattr(annotation, "__args__", ())
+    return arguments[-1] if arguments else annotation

@@ -1,0 +1,43 @@
+"""Frame rate and temperature over minutes as one picture, for several performance profiles.
+
+Rule: draws what it is given; Matplotlib is an extra and is asked for by name where it is missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from trilane.errors import BadInputError, MissingPartError
+from trilane.hw_profiles.predict import Moment
+
+SUFFIXES = (".png", ".svg", ".pdf")
+
+
+def plot_over_time(runs: Mapping[str, Sequence[Moment]], limit_c: float, title: str, path: Path) -> None:
+    """Draw `runs` (label to moments) into `path`; `limit_c` is marked. Raises MissingPartError, BadInputError."""
+    if path.suffix not in SUFFIXES:
+        raise BadInputError(path, f"the ending {path.suffix!r}", "one of " + ", ".join(SUFFIXES))
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise MissingPartError("drawing needs Matplotlib", "pip install 'trilane[plot]'") from None
+    figure = Figure(figsize=(8, 6), layout="constrained")
+    rate, heat = figure.subplots(2, 1, sharex=True)
+    for label, moments in runs.items():
+        minutes = [m.t_s / 60 for m in moments]
+        (line,) = rate.plot(minutes, [1e3 / m.frame_ms for m in moments], label=label)
+        colour = line.get_color()
+        heat.plot(minutes, [m.device_c for m in moments], color=colour, label=f"{label}: device")
+        heat.plot(minutes, [m.junction_c for m in moments], color=colour, linestyle=":", label=f"{label}: junction")
+    heat.axhline(limit_c, color="black", linewidth=0.8, linestyle="--", label=f"device limit {limit_c:g} °C")
+    rate.set(ylabel="frames per second", title=title)
+    rate.set_ylim(bottom=0)
+    heat.set(xlabel="minutes (virtual clock)", ylabel="temperature, °C")
+    for axes in (rate, heat):
+        axes.grid(alpha=0.3)
+        axes.legend(loc="lower right", fontsize="small")
+    try:
+        figure.savefig(path, dpi=120)
+    except OSError as error:
+        raise BadInputError(path, error.strerror or str(error), "a place that can be written") from None

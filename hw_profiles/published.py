@@ -1,0 +1,100 @@
+"""Latencies that others published for known networks: an outside check of the profiles nobody here measured.
+
+Rule: these numbers are never fitted by `fit.py`; a profile that takes a peak rate from one of them says so in its
+`source`, and the check then only shows that it was carried over.
+
+Source: Qualcomm AI Hub Models, `unet_segmentation` and `resnet18`, w8a8, TFLite and QNN runtimes, QAIRT 2.41
+(BSD-3-Clause, github.com/quic/ai-hub-models, perf.yaml). The first is milesial's U-Net of
+31.0 M parameters on 640x1280x3.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+from trilane.hw_profiles.application import corners_of
+from trilane.hw_profiles.cost import Work, walk
+from trilane.hw_profiles.networks import GraphBuilder, TensorRef, resnet18
+from trilane.hw_profiles.roofline import job_time, machine_of
+from trilane.hw_profiles.schema import UNITS, Profile
+
+UNET_SIZE = (640, 1280)
+UNET_WIDTHS = (64, 128, 256, 512, 1024)
+
+#: (network, profile): published milliseconds. ResNet18 is the middle of both runtimes; the QCS8450 stands for the
+#: 8 Gen 1 and, as Qualcomm's own proxy, for the XR2 Gen 2; the QCS8550 for the 8 Gen 2.
+PUBLISHED_MS = {
+    ("unet", "snapdragon-8-gen-1"): 54.1,
+    ("unet", "snapdragon-xr2-gen-2"): 55.6,
+    ("unet", "snapdragon-8-gen-2"): 34.5,
+    ("unet", "snapdragon-8-gen-3"): 26.4,
+    ("unet", "snapdragon-8-elite"): 21.6,
+    ("resnet18", "snapdragon-8-gen-1"): 0.68,
+    ("resnet18", "snapdragon-xr2-gen-2"): 0.68,
+    ("resnet18", "snapdragon-8-gen-2"): 0.47,
+    ("resnet18", "snapdragon-8-gen-3"): 0.35,
+    ("resnet18", "snapdragon-8-elite"): 0.27,
+}
+#: The network whose time set the profile's peak rate.
+CARRIED_OVER = "unet"
+
+
+class Check(NamedTuple):
+    """`independent`: no number of the profile comes from this time."""
+
+    profile: str
+    network: str
+    independent: bool
+    published_ms: float
+    predicted_ms: float
+
+    @property
+    def error(self) -> float:
+        return self.predicted_ms / self.published_ms - 1
+
+
+@lru_cache(maxsize=1)
+def unet_work() -> Work:
+    """The work of the published U-Net."""
+    b = GraphBuilder("batch")
+    x = _double(b, b.input("image", 3, *UNET_SIZE), UNET_WIDTHS[0])
+    skips = []
+    for width in UNET_WIDTHS[1:]:
+        skips.append(x)
+        x = b.op("MaxPool", [x.name], (x.channels, x.height // 2, x.width // 2), kernel_shape=[2, 2], strides=[2, 2])
+        x = _double(b, x, width)
+    for width, skip in zip(reversed(UNET_WIDTHS[:-1]), reversed(skips), strict=True):
+        weight = b.weight((x.channels, width, 2, 2))
+        x = b.op("ConvTranspose", [x.name, weight], (width, *skip[2:]), kernel_shape=[2, 2], strides=[2, 2])
+        x = _double(b, b.op("Concat", [skip.name, x.name], (2 * width, *skip[2:]), axis=1), width)
+    out = b.conv(x, 2, 1, bias=True)
+    return walk(b.model("unet", [out]))
+
+
+def _double(b: GraphBuilder, x: TensorRef, width: int) -> TensorRef:
+    return b.unit(b.unit(x, width, 3), width, 3)
+
+
+@lru_cache(maxsize=1)
+def resnet18_work() -> Work:
+    """ResNet18 as a classifier of 224x224 pictures into 1000 classes."""
+    b = GraphBuilder("batch")
+    x = resnet18(b, b.input("image", 3, 224, 224))[-1]
+    out = b.conv(b.op("GlobalAveragePool", [x.name], (x.channels, 1, 1)), 1000, 1, bias=True)
+    return walk(b.model("resnet18", [out]))
+
+
+WORK = {"unet": unet_work, "resnet18": resnet18_work}
+
+
+def check_published(name: str, profile: Profile) -> list[Check]:
+    """`profile` against what was published for it under `burst`; empty where nothing was."""
+    unit = profile.units["dsp"]
+    clock = unit.clock(corners_of(profile, "burst")[UNITS.index("dsp")])
+    machine = machine_of(unit, profile.memory, clock)
+    return [
+        Check(name, network, network != CARRIED_OVER, ms, job_time(WORK[network](), machine).total_ms)
+        for (network, of), ms in PUBLISHED_MS.items()
+        if of == name
+    ]

@@ -1,0 +1,113 @@
+"""How long a network's job takes on a unit: a roofline per operator and the fixed costs around it.
+
+Rule: a pure function of counts and of the numbers of a `Unit`; no table of measured times is looked up anywhere.
+
+time = job + operators * dispatch + input elements * conversion + weights / bandwidth
+       + sum over operators of max(arithmetic, traffic) + what falls back to the CPU
+
+Sources: the roofline is that of Williams, Waterman and Patterson (2009). Units share the memory, and the bandwidth
+left to one falls by what the others use, as in Gables (Hill and Reddi, 2019). Matrix engines work on whole blocks of
+channels, so channel counts are rounded up to the unit's block before they are multiplied.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.hw_profiles.cost import ARITHMETIC, CLASSES, TRAFFIC, Work
+from trilane.hw_profiles.schema import Memory, Unit
+
+TRAFFIC_KEYS = tuple(f"{kind}_traffic" for kind in ARITHMETIC) + TRAFFIC
+
+
+@dataclass(frozen=True)
+class Machine:
+    """A unit as plain numbers. Rates per second, times in seconds; `reached` follows `CLASSES`.
+
+    `arithmetic`: multiply-accumulates per second by class, infinite where a class has none.
+    `traffic`: bytes per second by class.
+    """
+
+    arithmetic: NDArray[np.float64]
+    traffic: NDArray[np.float64]
+    stream: float
+    element_bytes: int
+    block: float
+    job: float
+    operator: float
+    input: float
+    permute: float
+    fallback: frozenset[str]
+    fallback_job: float
+    fallback_element: float
+
+
+@dataclass(frozen=True)
+class JobTime:
+    """Milliseconds of one job by part: `fixed`, `input`, `weights`, `fallback` and the operator classes."""
+
+    parts: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def total_ms(self) -> float:
+        return sum(self.parts.values())
+
+
+def machine_of(unit: Unit, memory: Memory, clock_fraction: float = 1.0, contended: bool = False) -> Machine:
+    """`unit` at `clock_fraction` of its highest clock; `contended`: while the application uses the memory too."""
+    use = memory.application_use_fraction.or_else(0.0) if contended else 0.0
+    bandwidth = memory.bandwidth_gb_s.or_else(10.0) * 1e9 * (1 - use)
+    share = unit.efficiency
+    arithmetic = [getattr(share, kind).or_else(0.1) * unit.peak_mac_s * clock_fraction for kind in ARITHMETIC]
+    traffic = np.array([getattr(share, key).or_else(0.1) for key in TRAFFIC_KEYS]) * bandwidth
+    return Machine(
+        arithmetic=np.array(arithmetic + [np.inf] * len(TRAFFIC)),
+        traffic=traffic,
+        stream=float(traffic[CLASSES.index("convolution")]),
+        element_bytes=unit.element_bytes,
+        block=unit.channel_block.or_else(1.0),
+        job=unit.job_fixed_ms.or_else(0.0) / 1e3,
+        operator=unit.operator_fixed_us.or_else(0.0) / 1e6,
+        input=unit.input_ns_per_element.or_else(0.0) / 1e9,
+        permute=unit.permute_fixed_ms.or_else(0.0) / 1e3,
+        fallback=frozenset(unit.fallback),
+        fallback_job=unit.fallback_fixed_ms.or_else(0.0) / 1e3,
+        fallback_element=unit.fallback_ns_per_element.or_else(0.0) / 1e9,
+    )
+
+
+def job_time(work: Work, machine: Machine, batch: int = 1) -> JobTime:
+    """Time of one job of `batch` frames. Fixed costs and weights are paid once a job."""
+    classes, counts = work.classes, work.table
+    away = np.array([o.op_type in machine.fallback for o in work.operators], dtype=bool)
+    seconds = np.where(away, 0.0, _roofline(counts, classes, machine))
+    parts = {
+        "fixed": machine.job + machine.operator * len(classes) + machine.permute * (work.input_tensors > 1),
+        "input": batch * work.input_elements * machine.input,
+        "weights": work.weights * machine.element_bytes / machine.stream,
+        "fallback": float(away.sum()) * machine.fallback_job
+        + batch * float(counts[away, 4].sum()) * machine.fallback_element,
+    }
+    by_class = batch * np.bincount(classes, weights=seconds, minlength=len(CLASSES))
+    parts |= dict(zip(CLASSES, by_class.tolist(), strict=True))
+    return JobTime({name: 1e3 * value for name, value in parts.items()})
+
+
+def _roofline(counts: NDArray[np.float64], classes: NDArray[np.int64], machine: Machine) -> NDArray[np.float64]:
+    """Seconds per operator, (operators,)."""
+    macs, moved, c_in, c_out = counts[:, 0], counts[:, 1], counts[:, 2], counts[:, 3]
+    padded = macs * _rounding(c_in, machine.block) * _rounding(c_out, machine.block)
+    arithmetic = np.where(classes == CLASSES.index("depthwise"), macs, padded) / machine.arithmetic[classes]
+    traffic = moved * machine.element_bytes / machine.traffic[classes]
+    larger: NDArray[np.float64] = np.maximum(arithmetic, traffic)
+    return larger
+
+
+def _rounding(channels: NDArray[np.float64], block: float) -> NDArray[np.float64]:
+    """How much rounding `channels` up to whole blocks multiplies them; 1 where there are none."""
+    known = np.maximum(channels, 1.0)
+    return np.ceil(known / block) * block / known

@@ -1,0 +1,253 @@
+"""What a hardware profile may say: units, speeds, powers and limits, each number with its source.
+
+Rule: every number is a `Quantity`, so that nothing is believed without saying where it is from; the unit of
+measure is the end of the key's name. Only shapes and ranges are checked here.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+
+UnitName = Literal["cpu", "gpu", "dsp"]
+UNITS: tuple[UnitName, ...] = ("cpu", "gpu", "dsp")
+Corner = Literal["max", "turbo", "nominal_plus", "nominal", "svs_plus", "svs", "svs2"]
+CORNERS: tuple[Corner, ...] = ("max", "turbo", "nominal_plus", "nominal", "svs_plus", "svs", "svs2")
+PERFORMANCE_PROFILES = (
+    "burst",
+    "sustained_high_performance",
+    "high_performance",
+    "balanced",
+    "low_balanced",
+    "power_saver",
+    "low_power_saver",
+)
+PerformanceProfileName = Literal[
+    "burst",
+    "sustained_high_performance",
+    "high_performance",
+    "balanced",
+    "low_balanced",
+    "power_saver",
+    "low_power_saver",
+]
+Kind = Literal["measured", "published", "fitted", "assumed", "unknown"]
+#: Relative error (standard deviation of the logarithm) of a kind of number, where its profile states none.
+SPREAD_OF_KIND: dict[str, float] = {"measured": 0.05, "published": 0.1, "fitted": 0.15, "assumed": 0.5, "unknown": 1.0}
+BYTES = {"int8": 1, "fp16": 2, "fp32": 4}
+
+
+class Model(BaseModel):
+    """Strict base: unknown keys are errors, values never change."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Quantity(Model):
+    """A number and where it is from. `kind = "unknown"` has no value.
+
+    `spread`: relative error, as the standard deviation of the number's logarithm.
+    """
+
+    value: float | None = Field(default=None, allow_inf_nan=False, strict=True)
+    kind: Kind
+    source: str = Field(min_length=1)
+    spread: float | None = Field(default=None, ge=0, le=5)
+
+    @model_validator(mode="after")
+    def _value_or_unknown(self) -> Self:
+        if (self.value is None) != (self.kind == "unknown"):
+            found = "no value" if self.value is None else "a value"
+            raise ValueError(f'found {found} under kind = "{self.kind}", expected one unless kind = "unknown"')
+        return self
+
+    @property
+    def relative_error(self) -> float:
+        return SPREAD_OF_KIND[self.kind] if self.spread is None else self.spread
+
+    def or_else(self, default: float) -> float:
+        return default if self.value is None else self.value
+
+
+class _Range:
+    """Validator of a quantity's value. Raises ValueError that says what was found and what was expected."""
+
+    def __init__(self, low: float, high: float) -> None:
+        self.low, self.high = low, high
+
+    def __call__(self, quantity: Quantity) -> Quantity:
+        if quantity.value is not None and not self.low <= quantity.value <= self.high:
+            raise ValueError(f"found {quantity.value:g}, expected {self.low:g} to {self.high:g}")
+        return quantity
+
+
+Rate = Annotated[Quantity, AfterValidator(_Range(1e-6, 1e5))]
+Fraction = Annotated[Quantity, AfterValidator(_Range(1e-6, 1))]
+Efficiency = Annotated[Quantity, AfterValidator(_Range(1e-6, 4))]
+Cost = Annotated[Quantity, AfterValidator(_Range(0, 1e6))]
+Power = Annotated[Quantity, AfterValidator(_Range(0, 1000))]
+Celsius = Annotated[Quantity, AfterValidator(_Range(-50, 200))]
+Resistance = Annotated[Quantity, AfterValidator(_Range(1e-3, 1000))]
+Seconds = Annotated[Quantity, AfterValidator(_Range(1e-3, 1e6))]
+Count = Annotated[Quantity, AfterValidator(_Range(1, 1e6))]
+
+
+class Memory(Model):
+    """`bandwidth_gb_s` of the whole chip. `application_use_fraction`: what camera, display and composition take."""
+
+    bandwidth_gb_s: Rate
+    application_use_fraction: Annotated[Quantity, AfterValidator(_Range(0, 0.95))]
+
+
+class Efficiencies(Model):
+    """Reached share of a peak: of arithmetic for the first three, of memory bandwidth for the others.
+
+    `*_traffic` are the shares of bandwidth that the products reach when traffic bounds them. Winograd and similar
+    shortcuts may take an arithmetic share above 1.
+    """
+
+    convolution: Efficiency
+    depthwise: Efficiency
+    pointwise: Efficiency
+    convolution_traffic: Efficiency
+    depthwise_traffic: Efficiency
+    pointwise_traffic: Efficiency
+    normalisation: Efficiency
+    resize: Efficiency
+    elementwise: Efficiency
+    permute: Efficiency
+
+
+class Unit(Model):
+    """One unit. `fallback`: ONNX operators that it cannot run and hands to the CPU.
+
+    `channel_block`: channel counts are rounded up to it. `job_fixed_ms` is paid once a job, `operator_fixed_us` once
+    an operator, `input_ns_per_element` for each element of the network's input, `permute_fixed_ms` where the input
+    comes in several tensors. `corners`: clock at each voltage corner as a fraction of the highest. While a job runs
+    the unit takes `power_max_w` times the clock fraction to the power of `power_exponent`, and `idle_w` otherwise.
+    `model_error_fraction`: what the roofline itself is off by, beside what its numbers are.
+    """
+
+    title: str
+    precision: Literal["int8", "fp16", "fp32"]
+    peak_int8_tmac_s: Rate
+    peak_fp16_tmac_s: Rate
+    peak_fp32_tmac_s: Rate
+    channel_block: Count
+    job_fixed_ms: Cost
+    operator_fixed_us: Cost
+    input_ns_per_element: Cost
+    permute_fixed_ms: Cost
+    fallback: tuple[str, ...] = ()
+    fallback_fixed_ms: Cost
+    fallback_ns_per_element: Cost
+    model_error_fraction: Annotated[Quantity, AfterValidator(_Range(0, 5))]
+    efficiency: Efficiencies
+    corners: dict[Corner, Fraction]
+    power_max_w: Power
+    power_exponent: Annotated[Quantity, AfterValidator(_Range(0, 6))]
+    idle_w: Power
+    junction_k_per_w: Resistance
+    junction_time_s: Seconds
+
+    @model_validator(mode="after")
+    def _all_corners(self) -> Self:
+        missing = [corner for corner in CORNERS if corner not in self.corners]
+        if missing:
+            raise ValueError(f"found no corner {', '.join(missing)}, expected all of {', '.join(CORNERS)}")
+        return self
+
+    def clock(self, corner: Corner) -> float:
+        return self.corners[corner].or_else(1.0)
+
+    def power_w(self, corner: Corner, busy: float) -> float:
+        """Mean power in watts while a share `busy` of the time is work."""
+        active: float = self.power_max_w.or_else(1.0) * self.clock(corner) ** self.power_exponent.or_else(3.0)
+        return busy * active + (1 - busy) * self.idle_w.or_else(0.0)
+
+    @property
+    def peak_mac_s(self) -> float:
+        peak: Quantity = getattr(self, f"peak_{self.precision}_tmac_s")
+        return peak.or_else(0.1) * 1e12
+
+    @property
+    def element_bytes(self) -> int:
+        return BYTES[self.precision]
+
+
+class Application(Model):
+    """The stages beside the network. Times at the `max` corner.
+
+    `raster_ns_per_pixel` and `raster_ns_per_vertex` on the GPU; `readback_ns_per_byte` from GPU memory to the network's
+    input, done with the GPU held; `handover_ms` from the end of the read-back to the network's start, with its unit
+    held; `composite_ms` on the GPU; `pose_ms` on the CPU; `display_ms` the shortest interval between shown frames.
+    `ema20_half_range_fraction`: how far the exponential average over 20 frames strays from the mean.
+    """
+
+    vertices: Annotated[Quantity, AfterValidator(_Range(0, 1e7))]
+    pose_ms: Cost
+    raster_ns_per_vertex: Cost
+    raster_ns_per_pixel: Cost
+    readback_ns_per_byte: Cost
+    handover_ms: Cost
+    composite_ms: Cost
+    present_ms: Cost
+    display_ms: Cost
+    ema20_half_range_fraction: Annotated[Quantity, AfterValidator(_Range(0, 1))]
+
+
+class PerformanceProfile(Model):
+    """The corner of each unit and how soon a quiet unit may sleep."""
+
+    cpu: Corner
+    gpu: Corner
+    dsp: Corner
+    sleep_latency_us: Cost
+
+    def corner(self, unit: UnitName) -> Corner:
+        corner: Corner = getattr(self, unit)
+        return corner
+
+
+class Thermal(Model):
+    """The device as a slow thermal mass over which each unit's junction sits, and what it does at its limits.
+
+    `step_wise` and `power_allocator` name the governors of the Linux thermal framework.
+    """
+
+    ambient_c: Celsius
+    base_power_w: Power
+    device_k_per_w: Resistance
+    device_time_s: Seconds
+    skin_limit_c: Celsius
+    junction_limit_c: Celsius
+    hysteresis_k: Cost
+    governor: Literal["step_wise", "power_allocator"]
+    poll_s: Seconds
+
+
+class Profile(Model):
+    """A chip in a device. `template`: only there to be extended."""
+
+    name: str = Field(min_length=1)
+    title: str
+    template: bool = False
+    memory: Memory
+    units: dict[UnitName, Unit]
+    application: Application
+    performance_profiles: dict[PerformanceProfileName, PerformanceProfile]
+    thermal: Thermal
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        for what, names, found in (
+            ("unit", UNITS, self.units),
+            ("performance profile", PERFORMANCE_PROFILES, self.performance_profiles),
+        ):
+            missing = [name for name in names if name not in found]
+            if missing:
+                raise ValueError(f"found no {what} {', '.join(missing)}, expected all of {', '.join(names)}")
+        if (self.thermal.skin_limit_c.value or 0) <= (self.thermal.ambient_c.value or 0):
+            raise ValueError("found thermal.skin_limit_c at or below thermal.ambient_c, expected it above")
+        return self

@@ -1,0 +1,180 @@
+"""The walk over a graph and the roofline on top of it: counts against known values, times against their physics."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper
+
+from trilane.errors import BadInputError
+from trilane.hw_profiles.application import corners_of, network_alone, split_work
+from trilane.hw_profiles.cost import CLASSES, network_work, walk
+from trilane.hw_profiles.load import load_profile
+from trilane.hw_profiles.networks import ENCODERS, NetworkSpec, build_network, parameters
+from trilane.hw_profiles.published import PUBLISHED_MS, check_published, resnet18_work, unet_work
+from trilane.hw_profiles.roofline import job_time, machine_of
+
+SUSTAINED = "sustained_high_performance"
+
+
+def spec(encoder: str = "resnet18", norm: str = "batch", side: int = 512, channels: int = 16) -> NetworkSpec:
+    return NetworkSpec(encoder, norm, side, side, channels)
+
+
+@pytest.mark.parametrize(
+    ("encoder", "millions"),
+    [("resnet18", 14.5), ("mobilenetv2", 6.6), ("mobilenetv3", 6.7), ("efficientnet-lite0", 6.1)],
+)
+def test_parameters_are_those_published(encoder: str, millions: float) -> None:
+    assert parameters(build_network(spec(encoder))) / 1e6 == pytest.approx(millions, rel=0.05)
+
+
+def test_resnet18_at_512_does_the_published_products() -> None:
+    assert network_work(spec()).macs / 1e9 == pytest.approx(65.9, abs=0.05)
+
+
+def test_published_networks_have_their_known_sizes() -> None:
+    """U-Net: 31.0 M parameters; ResNet18: 11.7 M and 1.82 GMAC at 224x224."""
+    assert unet_work().weights / 1e6 == pytest.approx(31.0, rel=0.01)
+    assert resnet18_work().weights / 1e6 == pytest.approx(11.7, rel=0.01)
+    assert resnet18_work().macs / 1e9 == pytest.approx(1.82, rel=0.01)
+
+
+@pytest.mark.parametrize("encoder", ENCODERS)
+@pytest.mark.parametrize("norm", ["batch", "instance"])
+def test_shapes_of_the_generated_graphs_are_those_that_onnx_infers(encoder: str, norm: str) -> None:
+    model = build_network(spec(encoder, norm, 64, 8))
+    onnx.checker.check_model(model)
+    stated = {v.name: [d.dim_value for d in v.type.tensor_type.shape.dim] for v in model.graph.value_info}
+    bare = onnx.ModelProto()
+    bare.CopyFrom(model)
+    del bare.graph.value_info[:]
+    inferred = onnx.shape_inference.infer_shapes(bare, strict_mode=True)
+    for value in inferred.graph.value_info:
+        found = [d.dim_value for d in value.type.tensor_type.shape.dim]
+        assert found == stated[value.name], value.name
+
+
+@pytest.mark.parametrize("encoder", ENCODERS)
+def test_group_and_instance_normalisation_have_the_same_shapes(encoder: str) -> None:
+    """ONNX infers no shape through the group norm; the graph differs from the checked one in that operator alone."""
+    rows = [
+        [(o.op_type.removeprefix("Group").removeprefix("Instance"), o.moved, o.live) for o in work.operators]
+        for work in (network_work(spec(encoder, norm, 64, 8)) for norm in ("group", "instance"))
+    ]
+    assert rows[0] == rows[1]
+
+
+def test_graphs_equal_the_trained_networks() -> None:
+    """Parameter counts against the PyTorch definition, for every encoder that it has."""
+    pytest.importorskip("torch")
+    from trilane.avatars.training.encoders import ENCODERS as TRAINED
+    from trilane.avatars.training.network import UNet
+
+    for encoder in sorted(set(TRAINED) & set(ENCODERS)):
+        trained = sum(p.numel() for p in UNet(encoder, "instance", channels=16).parameters())
+        assert parameters(build_network(spec(encoder, "instance"))) == pytest.approx(trained, rel=0.001), encoder
+
+
+def test_products_grow_with_the_area() -> None:
+    small, large = network_work(spec(side=256)), network_work(spec(side=512))
+    assert large.macs == pytest.approx(4 * small.macs, rel=1e-3)
+    assert large.weights == small.weights
+
+
+def test_quantised_graphs_count_as_their_float_ones() -> None:
+    """Quantize and dequantize nodes around a convolution leave its products and weights as they are."""
+    weight = helper.make_tensor("w8", TensorProto.INT8, (8, 4, 3, 3), np.zeros(288, np.int8).tobytes(), raw=True)
+    scale = helper.make_tensor("s", TensorProto.FLOAT, (), [0.1])
+    nodes = [
+        helper.make_node("DequantizeLinear", ["x", "s"], ["xf"]),
+        helper.make_node("DequantizeLinear", ["w8", "s"], ["wf"]),
+        helper.make_node("Conv", ["xf", "wf"], ["y"], pads=[1, 1, 1, 1], name="conv"),
+    ]
+    source = helper.make_tensor_value_info("x", TensorProto.INT8, (1, 4, 16, 16))
+    result = helper.make_tensor_value_info("y", TensorProto.FLOAT, (1, 8, 16, 16))
+    graph = helper.make_graph(nodes, "g", [source], [result], [weight, scale])
+    work = walk(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 21)]))
+    assert [o.kind for o in work.operators] == ["convolution"]
+    assert work.macs == 16 * 16 * 9 * 4 * 8
+    assert work.weights == 288
+    assert (work.input_elements, work.output_elements) == (4 * 256, 8 * 256)
+
+
+def test_an_operator_that_is_not_known_is_named() -> None:
+    x = helper.make_tensor_value_info("x", TensorProto.FLOAT, (1, 4, 16, 16))
+    y = helper.make_tensor_value_info("y", TensorProto.FLOAT, (1, 4, 16, 16))
+    graph = helper.make_graph([helper.make_node("Erf", ["x"], ["y"], name="odd")], "g", [x], [y])
+    with pytest.raises(BadInputError, match="odd"):
+        walk(helper.make_model(graph))
+
+
+def test_a_dynamic_shape_is_refused() -> None:
+    x = helper.make_tensor_value_info("x", TensorProto.FLOAT, (1, 4, "h", 16))
+    y = helper.make_tensor_value_info("y", TensorProto.FLOAT, (1, 4, "h", 16))
+    graph = helper.make_graph([helper.make_node("Tanh", ["x"], ["y"])], "g", [x], [y])
+    with pytest.raises(BadInputError, match="no static shape"):
+        walk(helper.make_model(graph))
+
+
+@pytest.mark.parametrize(("key", "value"), [("encoder", "vgg"), ("norm", "layer"), ("layout", "loose")])
+def test_unknown_words_are_named(key: str, value: str) -> None:
+    with pytest.raises(BadInputError, match=value):
+        replace(spec(), **{key: value})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("key", "value"), [("height", 100), ("width", 0), ("channels", 0), ("channels", 17)])
+def test_numbers_out_of_range_are_named(key: str, value: int) -> None:
+    with pytest.raises(BadInputError, match=str(value)):
+        replace(spec(), **{key: value})  # type: ignore[arg-type]
+
+
+def test_time_is_the_sum_of_its_parts_and_falls_with_the_clock() -> None:
+    profile = load_profile("snapdragon-888")
+    work, unit = network_work(spec()), profile.units["dsp"]
+    fast, slow = (job_time(work, machine_of(unit, profile.memory, clock)) for clock in (1.0, 0.5))
+    assert fast.total_ms == pytest.approx(sum(fast.parts.values()))
+    assert set(fast.parts) == {"fixed", "input", "weights", "fallback", *CLASSES}
+    assert fast.total_ms < slow.total_ms < 2 * fast.total_ms + 1e-9
+
+
+def test_contention_slows_what_memory_bounds() -> None:
+    profile = load_profile("snapdragon-888")
+    work = network_work(spec("mobilenetv2", "instance"))
+    alone, beside = (job_time(work, machine_of(profile.units["gpu"], profile.memory, 1.0, c)) for c in (False, True))
+    assert beside.parts["normalisation"] > alone.parts["normalisation"]
+    assert beside.parts["input"] == alone.parts["input"]
+
+
+def test_a_batch_pays_fixed_costs_and_weights_once() -> None:
+    profile = load_profile("snapdragon-888")
+    machine = machine_of(profile.units["dsp"], profile.memory)
+    one, four = (job_time(network_work(spec()), machine, batch) for batch in (1, 4))
+    once = one.parts["fixed"] + one.parts["weights"]
+    assert four.total_ms == pytest.approx(4 * one.total_ms - 3 * once)
+
+
+def test_group_normalisation_falls_back_on_the_dsp_and_not_on_the_gpu() -> None:
+    profile = load_profile("snapdragon-888")
+    corners = corners_of(profile, SUSTAINED)
+    assert network_alone(profile, spec(norm="group"), "dsp", corners).parts["fallback"] > 1000
+    assert network_alone(profile, spec(norm="group"), "gpu", corners).parts["fallback"] == 0
+
+
+@pytest.mark.parametrize("share", [0.01, 0.3, 0.9])
+def test_both_parts_of_a_split_do_all_the_work(share: float) -> None:
+    work = network_work(spec())
+    head, tail = split_work(work, share)
+    assert head.macs + tail.macs == work.macs
+    assert head.macs >= share * work.macs
+    assert head.output_elements == tail.input_elements > 0
+
+
+def test_profiles_nobody_fitted_are_within_half_of_published_times() -> None:
+    checks = [one for name in {p for _, p in PUBLISHED_MS} for one in check_published(name, load_profile(name))]
+    assert len(checks) == len(PUBLISHED_MS)
+    for one in checks:
+        assert abs(one.error) < (0.5 if one.independent else 0.02), one

@@ -1,0 +1,140 @@
+"""Hardware profiles as files: what comes with Trilane is valid, and what is wrong is named with file and key."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from trilane.errors import BadInputError
+from trilane.hw_profiles.load import (
+    load_profile,
+    load_runnable,
+    merged_tables,
+    parse_profile,
+    profile_folder,
+    profile_names,
+)
+from trilane.hw_profiles.schema import UNITS
+
+CHIPS = (
+    "agx-orin",
+    "host",
+    "snapdragon-8-elite",
+    "snapdragon-8-gen-1",
+    "snapdragon-8-gen-2",
+    "snapdragon-8-gen-3",
+    "snapdragon-865",
+    "snapdragon-888",
+    "snapdragon-xr2-gen-2",
+)
+
+
+@pytest.mark.parametrize("name", CHIPS)
+def test_every_chip_of_the_issue_can_be_run(name: str) -> None:
+    assert load_runnable(name).name == name
+
+
+def test_every_number_says_where_it_is_from() -> None:
+    """The schema enforces it; this holds the schema to it for every file that ships."""
+
+    def check(data: object, key: str) -> None:
+        if isinstance(data, dict):
+            if "kind" in data:
+                assert data["source"], key
+                assert (data.get("value") is None) == (data["kind"] == "unknown"), key
+            for name, value in data.items():
+                check(value, f"{key}.{name}")
+
+    for name in profile_names():
+        check(load_profile(name).model_dump(), name)
+
+
+def test_lower_corners_are_slower_and_take_less_power() -> None:
+    for name in CHIPS:
+        profile = load_profile(name)
+        for unit in (profile.units[u] for u in UNITS):
+            clocks = [unit.clock(corner) for corner in ("max", "turbo", "nominal_plus", "nominal", "svs_plus", "svs")]
+            powers = [unit.power_w(corner, 1.0) for corner in ("max", "turbo", "nominal", "svs")]
+            assert clocks == sorted(clocks, reverse=True)
+            assert powers == sorted(powers, reverse=True)
+
+
+BAD = {
+    "wrong unit of measure": ("[memory]\nbandwidth_mb_s = {Q}", "memory.bandwidth_mb_s", "bandwidth_gb_s"),
+    "negative power": ("[units.dsp]\npower_max_w = {N}", "units.dsp.power_max_w", "found -3, expected 0 to 1000"),
+    "unknown unit": ('[units.npu]\ntitle = "x"', "units.npu", "'cpu', 'gpu' or 'dsp'"),
+    "number without source": ("[units.dsp]\npower_max_w = 3", "units.dsp.power_max_w", "source"),
+    "unknown corner": ("[units.dsp.corners]\nwarp = {Q}", "units.dsp.corners.warp", "turbo"),
+    "unknown governor": ('[thermal]\ngovernor = "magic"', "thermal.governor", "step_wise"),
+    "share above one": ("[memory]\napplication_use_fraction = {Q}", "application_use_fraction", "0.95"),
+    "text for a number": ("[units.dsp]\npower_max_w = {T}", "units.dsp.power_max_w.value", "number"),
+    "infinite": ("[units.dsp]\npower_max_w = {I}", "units.dsp.power_max_w.value", "finite"),
+    "no value": ("[units.dsp]\npower_max_w = {V}", "units.dsp.power_max_w", "no value"),
+    "limit below the room": ("[thermal]\nskin_limit_c = {Q}", "skin_limit_c", "above"),
+}
+QUANTITIES = {
+    "{Q}": '{ value = 3, kind = "assumed", source = "x" }',
+    "{N}": '{ value = -3, kind = "assumed", source = "x" }',
+    "{T}": '{ value = "3", kind = "assumed", source = "x" }',
+    "{I}": '{ value = inf, kind = "assumed", source = "x" }',
+    "{V}": '{ kind = "assumed", source = "x" }',
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_bad_file_is_named_with_its_key(case: str, tmp_path: Path) -> None:
+    text, key, word = BAD[case]
+    for mark, quantity in QUANTITIES.items():
+        text = text.replace(mark, quantity)
+    path = tmp_path / "mine.toml"
+    path.write_text(f'extends = "snapdragon-888"\n{text}\n')
+    with pytest.raises(BadInputError) as raised:
+        load_profile(str(path))
+    message = str(raised.value)
+    assert str(path) in message
+    assert key in message
+    assert word in message
+
+
+def test_a_missing_corner_is_named() -> None:
+    path = profile_folder() / "snapdragon-888.toml"
+    data = merged_tables(path)
+    del data["units"]["dsp"]["corners"]["svs"]
+    with pytest.raises(BadInputError, match=r"units\.dsp: found no corner svs"):
+        parse_profile(data, path)
+
+
+def test_a_missing_performance_profile_is_named() -> None:
+    path = profile_folder() / "snapdragon-888.toml"
+    data = merged_tables(path)
+    del data["performance_profiles"]["burst"]
+    with pytest.raises(BadInputError, match="found no performance profile burst"):
+        parse_profile(data, path)
+
+
+def test_a_cycle_of_extends_is_named(tmp_path: Path) -> None:
+    (tmp_path / "a.toml").write_text('extends = "b"\n')
+    (tmp_path / "b.toml").write_text('extends = "a"\n')
+    with pytest.raises(BadInputError, match=r"a\.toml -> b\.toml -> a\.toml"):
+        load_profile(str(tmp_path / "a.toml"))
+
+
+@pytest.mark.parametrize(
+    ("text", "word"), [("a =", "TOML"), ("\xff\xfe", "UTF-8"), ('extends = "nope"', "nope"), ("extends = 3", "name")]
+)
+def test_an_unreadable_file_is_named(text: str, word: str, tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_bytes(text.encode("latin-1"))
+    with pytest.raises(BadInputError, match=word):
+        load_profile(str(path))
+
+
+def test_a_near_miss_is_suggested() -> None:
+    with pytest.raises(BadInputError, match="did you mean snapdragon-888"):
+        load_profile("snapdragon888")
+
+
+def test_a_template_cannot_be_run() -> None:
+    with pytest.raises(BadInputError, match="template"):
+        load_runnable("phone-template")

@@ -1,0 +1,195 @@
+"""Predictions: the application in virtual time, heat over minutes, tables, and what limits them."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from trilane.errors import BadInputError
+from trilane.hw_profiles.application import (
+    Plan,
+    Way,
+    corners_of,
+    reference_frame_ms,
+    stage_times_ms,
+    steady,
+)
+from trilane.hw_profiles.load import load_profile
+from trilane.hw_profiles.networks import NetworkSpec
+from trilane.hw_profiles.predict import over_time, predict, predict_table, what_if
+from trilane.hw_profiles.schema import UNITS, UnitName
+from trilane.hw_profiles.table import read_table
+from trilane.hw_profiles.thermal import GOVERNORS, Heat
+
+SPEC = NetworkSpec("resnet18", "batch", 512, 512, 16)
+SUSTAINED, BURST = "sustained_high_performance", "burst"
+RUNTIMES: tuple[UnitName, ...] = ("gpu", "dsp")
+
+
+@pytest.mark.parametrize("runtime", RUNTIMES)
+@pytest.mark.parametrize("side", [128, 256, 512, 1024])
+@pytest.mark.parametrize("layout", ["packed", "split"])
+def test_the_closed_form_of_the_fit_is_what_the_scheduler_does(runtime: UnitName, side: int, layout: str) -> None:
+    profile = load_profile("snapdragon-888")
+    plan, corners = (
+        Plan(NetworkSpec("resnet18", "batch", side, side, 8, layout), runtime),
+        corners_of(profile, SUSTAINED),
+    )
+    expected = reference_frame_ms(profile, plan, corners)
+    assert steady(profile, plan, corners).frame_ms == pytest.approx(expected, rel=0.002)
+    assert steady(profile, plan, corners, quick=True).frame_ms == pytest.approx(expected, rel=0.002)
+
+
+@pytest.mark.parametrize("policy", ["sequential", "pipelined", "latest", "deadline"])
+@pytest.mark.parametrize("edge", ["single", "double", "triple", "fifo:3", "orphan"])
+def test_every_way_of_working_runs_and_accounts_for_its_time(policy: str, edge: str) -> None:
+    profile = load_profile("snapdragon-888")
+    now = steady(profile, Plan(SPEC, "dsp", Way(policy, edge)), corners_of(profile, SUSTAINED))
+    assert now.frame_ms >= max(now.stages_ms.values()) - 1e-6
+    for unit in UNITS:
+        assert now.busy[unit] + sum(now.idle[unit].values()) == pytest.approx(1.0)
+
+
+def test_two_buffers_make_the_network_the_limit() -> None:
+    profile = load_profile("snapdragon-888")
+    corners = corners_of(profile, SUSTAINED)
+    now = steady(profile, Plan(SPEC, "dsp", Way("pipelined", "double")), corners)
+    assert now.frame_ms == pytest.approx(now.stages_ms["infer"], rel=0.01)
+    assert now.busy["dsp"] > 0.97
+
+
+def test_the_display_caps_what_is_fast() -> None:
+    profile = load_profile("snapdragon-888")
+    now = steady(profile, Plan(NetworkSpec("resnet18", "batch", 256, 256, 8), "dsp"), corners_of(profile, SUSTAINED))
+    assert now.capped
+    assert now.frame_ms == pytest.approx(16.6)
+
+
+def test_the_network_on_the_gpu_shares_it_with_drawing() -> None:
+    profile = load_profile("snapdragon-888")
+    corners = corners_of(profile, SUSTAINED)
+    times = stage_times_ms(profile, Plan(SPEC, "gpu"), corners)
+    together = sum(ms for (_, unit), ms in times.items() if unit == "gpu")
+    assert steady(profile, Plan(SPEC, "gpu", Way("pipelined", "double")), corners).frame_ms == pytest.approx(
+        together, rel=0.01
+    )
+
+
+@pytest.mark.parametrize("runtime", RUNTIMES)
+@pytest.mark.parametrize("governor", GOVERNORS)
+@pytest.mark.parametrize("side", [256, 512, 1024])
+def test_sustained_holds_its_rate_for_half_an_hour(runtime: UnitName, governor: str, side: int) -> None:
+    profile = load_profile("snapdragon-888")
+    moments = over_time(
+        profile, Plan(NetworkSpec("resnet18", "batch", side, side, 16), runtime), SUSTAINED, 30, governor
+    )
+    frames = [m.frame_ms for m in moments if m.t_s >= 60]
+    assert max(frames) <= 1.02 * min(frames)
+    assert max(max(m.device_c, m.junction_c) for m in moments) <= 55
+
+
+@pytest.mark.parametrize("runtime", RUNTIMES)
+@pytest.mark.parametrize("governor", GOVERNORS)
+def test_burst_is_faster_first_and_throttled_later(runtime: UnitName, governor: str) -> None:
+    profile, plan = load_profile("snapdragon-888"), Plan(SPEC, runtime)
+    burst, sustained = (over_time(profile, plan, name, 30, governor) for name in (BURST, SUSTAINED))
+    assert burst[0].frame_ms < 0.95 * sustained[0].frame_ms
+    assert burst[-1].frame_ms > 1.05 * burst[0].frame_ms
+    assert burst[-1].throttled
+    assert max(m.device_c for m in burst) <= profile.thermal.skin_limit_c.or_else(0) + 1
+
+
+def test_throttling_has_hysteresis() -> None:
+    """Corners change a handful of times in half an hour, not at every poll."""
+    moments = over_time(load_profile("snapdragon-888"), Plan(SPEC, "gpu"), BURST, 30)
+    changes = sum(a.corners != b.corners for a, b in pairwise(moments))
+    assert 1 <= changes <= 20
+
+
+def test_heat_approaches_resistance_times_power() -> None:
+    profile = load_profile("snapdragon-888")
+    heat, power = Heat.at_rest(profile), {"cpu": 0.5, "gpu": 1.0, "dsp": 1.5}
+    heat.advance(profile, power, 1e6)  # type: ignore[arg-type]
+    thermal = profile.thermal
+    total = sum(power.values()) + thermal.base_power_w.or_else(0)
+    assert heat.device_c == pytest.approx(thermal.ambient_c.or_else(0) + thermal.device_k_per_w.or_else(0) * total)
+    assert heat.junction_c["dsp"] > heat.junction_c["gpu"] > heat.device_c
+
+
+def test_one_long_step_is_many_short_ones() -> None:
+    """Exact for the device, whose power does not change in between."""
+    profile = load_profile("snapdragon-888")
+    power: dict[UnitName, float] = {"cpu": 0.5, "gpu": 1.0, "dsp": 1.5}
+    one, many = Heat.at_rest(profile), Heat.at_rest(profile)
+    one.advance(profile, power, 600)
+    for _ in range(600):
+        many.advance(profile, power, 1)
+    assert one.device_c == pytest.approx(many.device_c)
+
+
+def test_an_answer_has_the_keys_of_a_report() -> None:
+    answer = predict(load_profile("snapdragon-888"), Plan(SPEC, "dsp"), minutes=2)
+    assert {"schema", "clock", "machine", "config", "frame_time_ms", "latency_ms", "fps", "stages", "units"} <= set(
+        answer
+    )
+    assert {"efficiency", "temperature_c", "caps", "confidence", "energy_mj_per_frame"} <= set(answer)
+    assert answer["clock"] == "virtual"
+    assert answer["fps"] == pytest.approx(1e3 / answer["frame_time_ms"]["mean"])
+    assert 0.6 < answer["efficiency"] < 0.8  # the reference application reached 0.67
+    assert len(answer["timeline"]) == 120
+
+
+def test_an_unknown_chip_is_less_certain_than_a_measured_one() -> None:
+    plan = Plan(SPEC, "dsp")
+    known, guessed = (predict(load_profile(name), plan)["confidence"] for name in ("snapdragon-888", "snapdragon-865"))
+    assert guessed < known < 1
+
+
+def test_every_alternative_is_answered() -> None:
+    rows = {row["name"]: row["frame_ms"] for row in what_if(load_profile("snapdragon-888"), SPEC, "dsp", SUSTAINED)}
+    assert rows["pipelined, two buffers"] < rows["reference application"] < rows["one frame at a time"]
+
+
+def test_a_table_keeps_its_columns_and_answers_every_row(tmp_path: Path) -> None:
+    path = tmp_path / "rows.csv"
+    lines = ["# a comment", "encoder,norm,params_m,size,channels,layout,mine"]
+    for encoder in ("resnet18", "mobilenetv2", "mobilenetv3", "efficientnet-lite0"):
+        lines += [f"{encoder},{norm},6.6,{size},16,packed,x" for norm in ("batch", "instance") for size in (256, "640")]
+    path.write_text("\n".join([*lines, "resnet18,group,,384x192,8,split,"]) + "\n")
+    rows = list(predict_table(load_profile("snapdragon-888"), read_table(path)))
+    assert len(rows) == 17
+    assert rows[0] | {"encoder": "resnet18", "size": 256, "channels": 16, "mine": "x", "params_m": "6.6"} == rows[0]
+    for row in rows:
+        for runtime in RUNTIMES:
+            assert row[f"app_{runtime}_ms"] >= row[f"bench_{runtime}_ms"] > 0
+            assert row[f"app_{runtime}_ms_min"] <= row[f"app_{runtime}_ms"] <= row[f"app_{runtime}_ms_max"]
+        assert 0 < row["confidence"] < 1
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"way": Way(policy="best")}, "best"),
+        ({"way": Way(batch=0)}, "batch"),
+        ({"gpu_share": 1.0}, "gpu-share"),
+        ({"gpu_share": 0.5, "runtime": "gpu"}, "gpu-share"),
+        ({"runtime": "cpu"}, "cpu"),
+    ],
+)
+def test_a_plan_out_of_range_is_refused(change: dict[str, object], word: str) -> None:
+    with pytest.raises(BadInputError, match=word):
+        Plan(**{"spec": SPEC, "runtime": "dsp", **change})  # type: ignore[arg-type]
+
+
+def test_unknown_names_are_refused() -> None:
+    profile, plan = load_profile("snapdragon-888"), Plan(SPEC, "dsp")
+    with pytest.raises(BadInputError, match="warp"):
+        predict(profile, plan, "warp")
+    with pytest.raises(BadInputError, match="magic"):
+        predict(profile, plan, minutes=1, governor="magic")
+    with pytest.raises(BadInputError, match="minutes"):
+        predict(profile, plan, minutes=-1)
+    with pytest.raises(BadInputError, match="edge"):
+        predict(profile, Plan(SPEC, "dsp", Way(edge="quadruple")))
