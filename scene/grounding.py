@@ -23,22 +23,25 @@ Ground = Literal["auto", "sequence", "frame", "none"]
 LOOKS_PER_S, MAX_LOOKS = 30, 600
 #: One frame in twenty may dip below the floor, so that one bad frame does not lift all others.
 LOWEST_PERCENTILE = 5.0
-#: Looked along for the outermost vertices of each joint: the axes and the diagonals between them.
-_SIGNS = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) != (0, 0, 0)]
+#: Largest skin weights of a vertex that count here.
+WEIGHTS = 4
+#: Looked along for the outermost vertices of each joint: the axes and the diagonals of a cube.
+_SIGNS = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if abs(x) + abs(y) + abs(z) in (1, 3)]
 DIRECTIONS: Array = np.array(_SIGNS, dtype=np.float64) / np.linalg.norm(_SIGNS, axis=1, keepdims=True)
 
 
 @dataclass(frozen=True)
 class Outline:
-    """The outermost vertices of a body: `points` (K, 4) at rest with a 1 appended, `weights` (K, 55)."""
+    """The outermost vertices of a body: `points` (K, 4) at rest with a 1 appended; `joints` and `weights` (K, W)."""
 
     points: Array
+    joints: NDArray[np.intp]
     weights: Array
 
     def posed(self, matrices: NDArray[np.float32]) -> Array:
         """World positions (K, 3) under skinning matrices (55, 3, 4); pose blend shapes left out."""
-        blend = (self.weights @ matrices.reshape(len(matrices), 12)).reshape(-1, 3, 4)
-        return np.asarray((blend @ self.points[:, :, None])[:, :, 0])
+        blend = np.einsum("kw,kwc->kc", self.weights, matrices.reshape(-1, 12)[self.joints])
+        return np.asarray(np.einsum("kab,kb->ka", blend.reshape(-1, 3, 4), self.points))
 
 
 def outline(body: ShapedBody) -> Outline:
@@ -51,7 +54,9 @@ def outline(body: ShapedBody) -> Outline:
         picked.update(own[(rest[own] @ DIRECTIONS.T).argmax(axis=0)].tolist())
     index = np.array(sorted(picked))
     points = np.concatenate([rest[index], np.ones((len(index), 1))], axis=1)
-    return Outline(points, weights[index].astype(np.float64))
+    top = np.argsort(-weights[index], axis=1)[:, :WEIGHTS]
+    largest = np.take_along_axis(weights[index], top, axis=1).astype(np.float64)
+    return Outline(points, top, largest / largest.sum(axis=1, keepdims=True))
 
 
 def leg_length(joints: Array) -> float:

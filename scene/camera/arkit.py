@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from trilane.scene.camera.recorded import RawCamera
-from trilane.scene.camera.table import read_table
+from trilane.scene.camera.table import elapsed, read_table
 
 COLUMNS = 13
 EXPECTED = "an ARKit log: time and the 12 numbers of a 3x4 matrix a line"
+#: A median step above this is in nanoseconds, below it in seconds.
+LEAST_STEP_NS = 1e3
 #: iPhone main camera, 26 mm equivalent on a 16:9 picture: long side, short side.
 LONG_SIDE_DEG, SHORT_SIDE_DEG = 60.0, 36.0
 
@@ -21,9 +21,8 @@ LONG_SIDE_DEG, SHORT_SIDE_DEG = 60.0, 36.0
 def load_arkit(path: Path) -> RawCamera:
     """Read `path`. Raises BadInputError with the line."""
     table = read_table(path, COLUMNS, EXPECTED)
-    times = table[:, 0] - table[0, 0]
-    step = float(np.nanmedian(np.diff(times))) if len(times) > 2 else 0.0
-    unit, scale = ("ns", 1e-9) if step > 1e3 or table[0, 0] > 1e12 else ("s", 1.0)
+    times, step = elapsed(table[:, 0])
+    unit, scale = ("ns", 1e-9) if step > LEAST_STEP_NS else ("s", 1.0)
     matrices = table[:, 1:].reshape(-1, 3, 4)
     rate = f", {1 / (step * scale):.4g}/s" if step > 0 else ""
     notes = (f"ARKit log, {len(table)} poses{rate}, time in {unit}, camera to world",)

@@ -36,6 +36,14 @@ def column_count(path: Path, expected: str) -> int:
     return next((len(words) for _, words in _lines(path, expected)), 0)
 
 
+def elapsed(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Times (N,) since the first finite one, and their median step, 0 when there is none. NaNs stay NaN."""
+    finite = times[np.isfinite(times)]
+    if len(finite) < 2:
+        return times - times[0], 0.0
+    return times - finite[0], float(np.median(np.diff(finite)))
+
+
 def _lines(path: Path, expected: str) -> list[tuple[int, list[str]]]:
     lines = enumerate(read_text(path, expected).splitlines(), 1)
     cut = ((number, line.split("#", 1)[0].replace(",", " ").split()) for number, line in lines)

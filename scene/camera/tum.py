@@ -8,10 +8,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from trilane.scene.camera.recorded import OPENGL_FROM_OPTICAL, RawCamera
-from trilane.scene.camera.table import read_table
+from trilane.scene.camera.table import elapsed, read_table
 from trilane.scene.rotations import matrix_from_quat, normalised
 
 COLUMNS = 8
@@ -23,9 +21,8 @@ KINECT_DEG, KINECT_UPRIGHT_DEG = 49.8, 63.5
 def load_tum(path: Path) -> RawCamera:
     """Read `path`. Raises BadInputError with the line."""
     table = read_table(path, COLUMNS, EXPECTED)
-    times = table[:, 0] - table[0, 0]
+    times, step = elapsed(table[:, 0])
     turns = matrix_from_quat(normalised(table[:, [7, 4, 5, 6]])) @ OPENGL_FROM_OPTICAL
-    step = float(np.nanmedian(np.diff(times))) if len(times) > 2 else 0.0
     rate = f", {1 / step:.4g}/s" if step > 0 else ""
     notes = (f"TUM trajectory, {len(table)} poses{rate}, optical axes, camera to world",)
     return RawCamera(times, turns, table[:, 1:4], "z", KINECT_DEG, KINECT_UPRIGHT_DEG, "usual for a Kinect", notes)

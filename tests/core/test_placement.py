@@ -1,0 +1,153 @@
+"""Motion and camera meet: bodies on the floor, a recording moved as one piece to where it films them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from trilane.avatars.bundle import bundle_folder
+from trilane.scene.grounding import outline
+from trilane.scene.motion.base import Motion
+from trilane.scene.motion.builtin import BUILTIN
+from trilane.scene.mover import make_mover
+from trilane.scene.rotations import about, normalised
+from trilane.scene.schema import AvatarSpec, CameraSpec, Scene
+from trilane.scene.staging import Staged, stage_scene
+from trilane.stages.cpu.body import ShapedBody, load_body
+from trilane.stages.cpu.kinematics import Skeleton
+
+ASPECT = 640 / 480
+
+
+@pytest.fixture(scope="module")
+def body() -> ShapedBody:
+    return load_body(bundle_folder("default") / "body.npz").shape()
+
+
+def jump() -> Motion:
+    """Stands in the T pose, is half a metre up in the middle; recorded two metres too high."""
+    motion = BUILTIN["t-pose"]()
+    times = np.linspace(0, 1, 11)
+    heights = 2.0 + 0.5 * np.sin(np.pi * np.clip((times - 0.4) / 0.2, 0, 1))
+    places = np.column_stack([np.zeros(11), heights, np.zeros(11)])
+    return Motion(times, np.repeat(motion.poses, 11, axis=0), places, None, (), motion.wrap, None, travels=True)
+
+
+def staged(body: ShapedBody, camera: Path | str, motion: Path | str = "builtin:walk-wave-turn", **scene: Any) -> Staged:
+    values = {"avatars": (AvatarSpec(motion=str(motion)),), "camera": CameraSpec(source=str(camera)), **scene}
+    return stage_scene(Scene(**values), [body], Path("/"))
+
+
+def whole_share(scene: Staged, body: ShapedBody, frames: int) -> float:
+    """Share of frames with every outline vertex of the first avatar in the picture."""
+    skeleton, shape = Skeleton(body.joints, body.body.parents), outline(body)
+    projection, mover = scene.camera.projection(ASPECT), scene.movers[0]
+    whole = 0
+    for frame in range(0, frames, 4):
+        pose, place = mover.sample(frame / 30)
+        points = shape.posed(skeleton.pose(pose, place, mover.world).matrices)
+        clip = np.column_stack([points, np.ones(len(points))]) @ (projection @ scene.camera.sample(frame / 30)).T
+        whole += bool((clip[:, 3] > 0).all() and (np.abs(clip[:, :2]) < clip[:, 3:]).all())
+    return whole / len(range(0, frames, 4))
+
+
+def lowest(body: ShapedBody, mover: Any, t_s: float) -> float:
+    pose, place = mover.sample(t_s)
+    posed = Skeleton(body.joints, body.body.parents).pose(pose, place, mover.world)
+    return float(outline(body).posed(posed.matrices)[:, 1].min())
+
+
+def test_a_sequence_keeps_its_jumps(body: ShapedBody) -> None:
+    mover = make_mover(AvatarSpec(ground="auto"), jump(), body)
+    assert lowest(body, mover, 0.0) == pytest.approx(0.0, abs=1e-3)
+    assert lowest(body, mover, 0.5) == pytest.approx(0.5, abs=1e-3)
+
+
+def test_every_frame_may_be_grounded_or_none(body: ShapedBody) -> None:
+    by_frame = make_mover(AvatarSpec(ground="frame"), jump(), body)
+    as_recorded = make_mover(AvatarSpec(ground="none"), jump(), body)
+    for t_s in (0.0, 0.5):
+        assert lowest(body, by_frame, t_s) == pytest.approx(0.0, abs=2e-3)
+    assert lowest(body, as_recorded, 0.0) > 1.0
+
+
+def test_the_walker_is_on_the_floor_in_every_frame(body: ShapedBody) -> None:
+    mover = make_mover(AvatarSpec(), BUILTIN["walk-wave-turn"](), body)
+    assert max(abs(lowest(body, mover, k / 7)) for k in range(70)) < 0.01
+
+
+def test_position_and_heading_are_the_specs(body: ShapedBody) -> None:
+    spec = AvatarSpec(motion="builtin:t-pose", position=(1.0, 0.0, -2.0), heading_deg=90.0)
+    mover = make_mover(spec, BUILTIN["t-pose"](), body)
+    pose, place = mover.sample(0.0)
+    joints = Skeleton(body.joints, body.body.parents).pose(pose, place, mover.world).joints
+    assert joints[0, [0, 2]] == pytest.approx([1.0, -2.0], abs=1e-6)
+    left = joints[16] - joints[17]
+    assert normalised(left) == pytest.approx([0, 0, -1], abs=1e-6)
+
+
+def write_path(path: Path, looks: list[tuple[np.ndarray, np.ndarray]]) -> Path:
+    rows = [
+        " ".join(str(value) for value in (k / 30, *np.column_stack([turn, place]).ravel()))
+        for k, (turn, place) in enumerate(looks)
+    ]
+    path.write_text("\n".join(rows))
+    return path
+
+
+def wandering(count: int = 60) -> list[tuple[np.ndarray, np.ndarray]]:
+    angles = 0.15 * np.sin(np.arange(count) / 9)
+    return [
+        (about(1, np.array(2.0 + a)) @ about(0, np.array(-0.25 + a / 3)), np.array([30 + a, -7, 12 - a]))
+        for a in angles
+    ]
+
+
+def test_a_recording_is_moved_as_one_upright_piece(body: ShapedBody, tmp_path: Path) -> None:
+    looks = wandering()
+    scene = staged(body, write_path(tmp_path / "log.txt", looks), frames=60)
+    views = [scene.camera.sample(k / 30) for k in range(60)]
+    recorded = []
+    for turn, place in looks:
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = turn, place
+        recorded.append(np.linalg.inv(pose))
+    moved = np.linalg.inv(views[0]) @ recorded[0]
+    for view, original in zip(views, recorded, strict=True):
+        assert view @ moved == pytest.approx(original, abs=1e-6)
+    assert moved[1, :3] == pytest.approx([0, 1, 0], abs=1e-9)
+    assert moved[:3, :3] @ moved[:3, :3].T == pytest.approx(np.eye(3), abs=1e-9)
+
+
+def test_the_avatar_is_whole_in_the_picture_and_faces_the_camera(body: ShapedBody, tmp_path: Path) -> None:
+    scene = staged(body, write_path(tmp_path / "log.txt", wandering()), "builtin:idle", frames=60)
+    assert whole_share(scene, body, 60) == 1.0
+    eye = np.linalg.inv(scene.camera.sample(0.0))[:3, 3]
+    assert np.degrees(abs(np.arctan2(eye[0], eye[2]))) < 3.0
+    assert eye[1] > 0.3
+    assert any("whole body in the picture in 100%" in note for note in scene.notes)
+
+
+def test_a_camera_may_be_left_where_it_is(body: ShapedBody, tmp_path: Path) -> None:
+    log = write_path(tmp_path / "log.txt", wandering())
+    spec = CameraSpec(source=str(log), place="none")
+    scene = stage_scene(Scene(camera=spec), [body], Path("/"))
+    assert np.linalg.inv(scene.camera.sample(0.0))[:3, 3] == pytest.approx([30, -7, 12], abs=1e-6)
+
+
+@pytest.mark.parametrize("motion", ["builtin:walk-wave-turn", "builtin:idle"])
+def test_the_orbit_sees_the_whole_person(body: ShapedBody, motion: str) -> None:
+    assert whole_share(staged(body, "builtin:orbit", motion), body, 300) == 1.0
+
+
+@pytest.mark.parametrize("camera", ["arkit_camera_pose.txt", "tum_freiburg1_xyz.txt"])
+@pytest.mark.parametrize("motion", ["cmu_jumping_jacks.bvh", "smplx_poses_8.npy", None])
+def test_real_cameras_see_whole_people_in_nearly_every_frame(
+    body: ShapedBody, shared_data: Path, camera: str, motion: str | None
+) -> None:
+    source = "builtin:walk-wave-turn" if motion is None else shared_data / "motion" / motion
+    scene = staged(body, shared_data / "camera" / camera, source, frames=200)
+    assert whole_share(scene, body, 200) >= 0.95

@@ -1,0 +1,133 @@
+"""The pose stage: a frame's number to a packet that says everything, the same every time."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from trilane.errors import TrilaneError
+from trilane.scene.schema import AvatarSpec, CameraSpec, RunConfig, Scene, UnitSettings, shape_buckets
+from trilane.stages.contracts import Packet, SlotLayout, view_packet
+from trilane.stages.cpu.crop import Rect
+from trilane.stages.cpu.pose import PoseStage
+from trilane.stages.cpu.tensor_layout import lay_out
+from trilane.stages.cpu.unit import build
+
+OUTPUT = (480, 640)
+
+
+def config(bundle: Path, out_dir: Path, **scene: Any) -> RunConfig:
+    made = Scene(**scene)
+    settings = {unit: UnitSettings(cores=(0,), threads=1) for unit in ("cpu", "gpu", "dsp")}
+    return RunConfig(scene=made, out_dir=out_dir, avatar_dirs=(bundle,) * len(made.avatars), units=settings)
+
+
+def bound(stage: PoseStage, avatars: int = 1) -> Packet:
+    layout = SlotLayout(avatars, 0)
+    packet = view_packet(memoryview(bytearray(layout.slot_bytes)), layout)
+    stage.bind([], [packet])
+    return packet
+
+
+def test_a_packet_says_everything_of_its_frame(tiny_bundle: Path, tmp_path: Path) -> None:
+    stage = PoseStage(config(tiny_bundle, tmp_path, fps=25.0))
+    packet = bound(stage)
+    before = time.monotonic_ns()
+    assert stage.run(50, None, 0) == {"visible": 1.0}
+    pose, avatar = packet.pose, packet.pose["avatars"][0]
+    assert (int(pose["frame"]), float(pose["media_time_s"]), int(pose["avatar_count"])) == (50, 2.0, 1)
+    assert before <= int(pose["t_pose_ns"]) <= time.monotonic_ns()
+    assert tuple(pose["tensor_shape"]) in shape_buckets("256")
+    assert avatar["visible"] == 1
+    assert tuple(avatar["tensor_rect"]) == (0, 0, *pose["tensor_shape"])
+    rect = avatar["rect"]
+    aspect = (rect[2] - rect[0]) * OUTPUT[1] / ((rect[3] - rect[1]) * OUTPUT[0])
+    assert aspect == pytest.approx(pose["tensor_shape"][1] / pose["tensor_shape"][0], rel=1e-4)
+
+
+def test_the_skinned_feet_stand_on_the_floor(tiny_bundle: Path, tmp_path: Path) -> None:
+    stage = PoseStage(config(tiny_bundle, tmp_path))
+    packet = bound(stage)
+    for frame in (0, 31, 150):
+        stage.run(frame, None, 0)
+        joints = packet.pose["avatars"][0]["joints"].astype(np.float64)
+        ankles = [joints[k] @ [0.131 * side, -0.859, -0.001, 1.0] for k, side in ((7, 1), (8, -1))]
+        assert 0.05 < min(place[1] for place in ankles) < 0.11
+
+
+def test_a_frame_is_the_same_whatever_came_before(tiny_bundle: Path, tmp_path: Path) -> None:
+    first, second = (PoseStage(config(tiny_bundle, tmp_path)) for _ in range(2))
+    packets = bound(first), bound(second)
+    for frame in (7, 250, 90):
+        first.run(frame, None, 0)
+    second.run(90, None, 0)
+    for key in ("view", "projection", "tensor_shape", "avatars"):
+        assert packets[0].pose[key].tobytes() == packets[1].pose[key].tobytes()
+
+
+def test_an_avatar_out_of_the_picture_is_not_visible(tiny_bundle: Path, tmp_path: Path) -> None:
+    spec = AvatarSpec(position=(0.0, 0.0, 40.0))
+    stage = PoseStage(config(tiny_bundle, tmp_path, avatars=(AvatarSpec(), spec)))
+    packet = bound(stage, 2)
+    assert stage.run(0, None, 0) == {"visible": 1.0}
+    assert packet.pose["avatars"]["visible"].tolist() == [1, 0]
+    only_hidden = PoseStage(config(tiny_bundle, tmp_path, avatars=(spec,)))
+    packet = bound(only_hidden)
+    assert only_hidden.run(0, None, 0) == {"visible": 0.0}
+    assert tuple(packet.pose["tensor_shape"]) in shape_buckets("256")
+
+
+def test_two_avatars_share_the_tensor(tiny_bundle: Path, tmp_path: Path) -> None:
+    pair = (AvatarSpec(position=(-0.6, 0, 0)), AvatarSpec(position=(0.6, 0, 0), motion="builtin:idle"))
+    stage = PoseStage(config(tiny_bundle, tmp_path, avatars=pair))
+    packet = bound(stage, 2)
+    stage.run(0, None, 0)
+    (top, left, height, width), second = packet.pose["avatars"]["tensor_rect"].tolist()
+    assert (second[0] >= top + height) or (second[1] >= left + width)
+    assert max(second[0] + second[2], height) <= packet.pose["tensor_shape"][0]
+    assert max(second[1] + second[3], width) <= packet.pose["tensor_shape"][1]
+
+
+def test_nan_never_leaves_the_stage(tiny_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stage = PoseStage(config(tiny_bundle, tmp_path, camera=CameraSpec(source="builtin:static")))
+    bound(stage)
+    mover = type(stage._actors[0].mover)
+    monkeypatch.setattr(mover, "sample", lambda *_: (np.full((55, 3), np.nan), np.zeros(3)))
+    with pytest.raises(TrilaneError, match="frame 3: the pose of avatar 0 is not finite"):
+        stage.run(3, None, 0)
+
+
+def test_edges_are_checked(tiny_bundle: Path, tmp_path: Path) -> None:
+    stages = build(config(tiny_bundle, tmp_path))
+    assert sorted(stages) == ["pose", "present"]
+    packet = bound(stages["pose"])  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="no input edge"):
+        stages["pose"].bind([packet], [])
+    with pytest.raises(ValueError, match="needs an output slot"):
+        stages["pose"].run(0, None, None)
+    stages["pose"].close()
+
+
+sides = st.tuples(st.floats(-1, 0.9), st.floats(0.02, 2)).map(lambda p: (p[0], min(p[0] + p[1], 1.0)))
+rects = st.tuples(sides, sides).map(lambda p: Rect(p[0][0], p[1][0], p[0][1], p[1][1]))
+
+
+@given(st.lists(rects, min_size=1, max_size=8), st.sampled_from(["256", "320x192", "512"]))
+def test_crops_hold_their_bodies_and_cells_do_not_overlap(found: list[Rect], size: str) -> None:
+    layout = lay_out(found, OUTPUT, shape_buckets(size))
+    used = np.zeros(layout.shape, dtype=int)
+    for rect, (crop, (top, left, height, width)) in zip(found, layout.crops, strict=True):
+        assert crop.x0 <= rect.x0 + 1e-9
+        assert crop.y0 <= rect.y0 + 1e-9
+        assert crop.x1 >= rect.x1 - 1e-9
+        assert crop.y1 >= rect.y1 - 1e-9
+        used[top : top + height, left : left + width] += 1
+        shown = crop.width * OUTPUT[1] / (crop.height * OUTPUT[0])
+        assert shown == pytest.approx(width / height, rel=1e-6)
+    assert used.max() == 1
