@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 from trilane.errors import BadInputError
 from trilane.scene.camera import arkit, tum
 from trilane.scene.camera.arkit import load_arkit
@@ -40,7 +42,8 @@ def load_camera(spec: CameraSpec, base: Path) -> CameraPath:
     path = base / spec.source
     require_file(path, EXPECTED)
     kind = _kind(path) if spec.format == "auto" else spec.format
-    return finish(_READERS[kind](path), str(path), spec)
+    with np.errstate(over="ignore", invalid="ignore"):  # numbers that are not finite are `repair`'s concern
+        return finish(_READERS[kind](path), str(path), spec)
 
 
 def _kind(path: Path) -> str:

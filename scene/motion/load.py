@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 from trilane.errors import BadInputError
 from trilane.scene.files import require_file
 from trilane.scene.motion.amass import load_amass
@@ -42,4 +44,5 @@ def load_motion(spec: AvatarSpec, base: Path) -> Motion:
     if reader is None:
         raise BadInputError(path, f"the ending {path.suffix!r}", f"a motion file: {', '.join(_READERS)}")
     require_file(path, "a motion file")
-    return finish(reader(path, spec.units), str(path), spec.up_axis)
+    with np.errstate(over="ignore", invalid="ignore"):  # numbers that are not finite are `repair`'s concern
+        return finish(reader(path, spec.units), str(path), spec.up_axis)

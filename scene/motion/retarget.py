@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 #: Metres in one unit; `cmu` is the unit of the CMU recordings, 1/0.45 inches.
 UNITS_M = {"m": 1.0, "cm": 0.01, "in": 0.0254, "cmu": 0.0254 / 0.45}
 USUAL_LEG_M = 0.85
+LEAST_LENGTH = 1e-6
 REQUIRED = ("pelvis", "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle")
 #: Joint whose bone is laid on the file's -> the joint where that bone ends, and its direction in the T pose.
 LIMBS: dict[str, tuple[str, tuple[float, float, float]]] = {
@@ -51,8 +52,9 @@ def load_retargeted(path: Path, units: str) -> RawMotion:
     dialect, where = match_names(path, [joint.name for joint in bvh.joints])
     offsets = _rest_positions(bvh.joints)
     leg = float(np.mean([_leg(offsets, where, side) for side in ("left", "right")]))
-    if leg <= 0:
-        raise BadInputError(path, "legs of no length", "a skeleton with OFFSETs")
+    hips = offsets[where["left_hip"]] - offsets[where["right_hip"]]
+    if leg < LEAST_LENGTH or np.linalg.norm(hips) < LEAST_LENGTH:
+        raise BadInputError(path, "legs of no length or hips in one place", "a skeleton with OFFSETs")
     unit, unit_m = _unit(leg, units)
     turns, places = bvh.forward()
     poses = _local_turns(turns, _rest_turns(bvh.joints, offsets, where), where)

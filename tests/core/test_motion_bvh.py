@@ -163,6 +163,7 @@ BROKEN = {
     "CHANNELS 3 Zrotation": ("CHANNELS 3 Wrotation", "'Wrotation'"),
     "LeftUpLeg": ("Tail", "none is left_hip"),
     "95 0 0": ("95 0 zero", "could not convert"),
+    "OFFSET 9.000000 -3.000000": ("OFFSET -9.000000 -3.000000", "hips in one place"),
     "0 95 0 0": ("0 95 0", "one for each channel"),
 }
 
@@ -176,6 +177,15 @@ def test_broken_files_are_named_by_line(tmp_path: Path, part: str) -> None:
         load(tmp_path / "a.bvh", text.replace(part, replacement, 1))
     assert found in str(raised.value)
     assert "a.bvh" in str(raised.value)
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "1e300"])
+def test_a_frame_of_wild_numbers_is_left_out(tmp_path: Path, value: str) -> None:
+    lines = bvh_text([{}, {}, {}, {}]).splitlines()
+    lines[-2] = " ".join([value] * len(lines[-2].split()))
+    motion = load(tmp_path / "a.bvh", "\n".join(lines))
+    assert len(motion.times_s) == 3
+    assert any("1 samples not finite" in note for note in motion.notes)
 
 
 @given(st.integers(0, 2600))
