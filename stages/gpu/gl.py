@@ -11,10 +11,12 @@ from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
-from trilane.errors import MissingPartError
+from trilane.errors import MissingPartError, TrilaneError
 from trilane.stages.gpu.context import INSTALL, LIBRARY
 
 COLOR, DEPTH = 0x1800, 0x1801
+SYNC_GPU_COMMANDS_COMPLETE, SYNC_FLUSH_COMMANDS = 0x9117, 1
+TIMEOUT_EXPIRED, WAIT_FAILED = 0x911B, 0x911D
 FRAMEBUFFER_SRGB = 0x8DB9
 SRGB8_ALPHA8 = 0x8C43
 
@@ -22,6 +24,9 @@ _INT, _UINT, _PTR = ctypes.c_int, ctypes.c_uint, ctypes.c_void_p
 _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "glClearBufferuiv": (None, (_UINT, _INT, _PTR)),
     "glClearBufferfv": (None, (_UINT, _INT, _PTR)),
+    "glFenceSync": (_PTR, (_UINT, _UINT)),
+    "glClientWaitSync": (_UINT, (_PTR, _UINT, ctypes.c_uint64)),
+    "glDeleteSync": (None, (_PTR,)),
     "glEnable": (None, (_UINT,)),
     "glDisable": (None, (_UINT,)),
 }
@@ -44,6 +49,19 @@ def clear_unsigned(value: tuple[int, int, int, int]) -> None:
     """Fill the bound framebuffer: colour attachment 0, an unsigned integer format, with `value`, depth with 1."""
     function("glClearBufferuiv")(COLOR, 0, (ctypes.c_uint * 4)(*value))
     function("glClearBufferfv")(DEPTH, 0, (ctypes.c_float * 1)(1.0))
+
+
+def fence() -> int:
+    """A fence behind every command given so far; to be waited for once."""
+    return int(function("glFenceSync")(SYNC_GPU_COMMANDS_COMPLETE, 0))
+
+
+def wait_fence(sync: int, timeout_ns: int = 1_000_000_000) -> None:
+    """Wait for a fence and delete it. Raises TrilaneError when it does not come in time."""
+    result = function("glClientWaitSync")(sync, SYNC_FLUSH_COMMANDS, timeout_ns)
+    function("glDeleteSync")(sync)
+    if result in (TIMEOUT_EXPIRED, WAIT_FAILED):
+        raise TrilaneError(f"the GPU did not finish within {timeout_ns / 1e9:g} s")
 
 
 @contextmanager

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,13 @@ def gl() -> Any:
         return open_context(2)
     except MissingPartError as error:
         pytest.skip(str(error))
+
+
+@pytest.fixture(autouse=True)
+def current(gl: Any) -> Iterator[None]:
+    """Make the shared context the current one: some tests open their own."""
+    with gl:
+        yield
 
 
 @dataclass(frozen=True)
