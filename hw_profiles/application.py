@@ -162,7 +162,8 @@ def _run(graph: Graph, settings: Settings, service: Mapping[str, int]) -> Any:
     try:
         return simulate(graph, settings, lambda stage, _unit, _frame, _begin: service[stage]).report
     except ValueError as error:
-        raise BadInputError("edge", graph.edges[0], str(error)) from None
+        expected = str(error).partition("expected ")[2] or str(error)
+        raise BadInputError("edge", repr(graph.edges[0]), expected) from None
 
 
 def steady(profile: Profile, plan: Plan, corners: Corners, *, quick: bool = False) -> Steady:

@@ -6,7 +6,7 @@ Rule: nothing here knows any hardware; `roofline.py` turns the counts into time.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from math import prod
 from typing import Any, NamedTuple
@@ -49,6 +49,7 @@ KIND_OF = {
     "Tanh": "elementwise",
     "LeakyRelu": "elementwise",
 }
+REFERENCE_SIDES = (64, 128)
 #: A normalisation by statistics reads its input once for them and once to apply them.
 STATISTICS = frozenset(["InstanceNormalization", "GroupNormalization"])
 
@@ -129,7 +130,27 @@ def walk(model: Any) -> Work:
 
 @lru_cache(maxsize=4096)
 def network_work(spec: NetworkSpec) -> Work:
-    """The work of one of the reference networks; walked once per shape."""
+    """The work of one of the reference networks.
+
+    Their strides divide every side that `NetworkSpec` allows, so every count is a constant and a multiple of the
+    number of pixels: graphs of two sizes are walked, and all sizes follow exactly.
+    """
+    small, large = (_walked(replace(spec, height=side, width=side)) for side in REFERENCE_SIDES)
+    first, second = (side * side for side in REFERENCE_SIDES)
+
+    def at(a: int, b: int) -> int:
+        return a + (b - a) * (spec.pixels - first) // (second - first)
+
+    operators = tuple(
+        s._replace(macs=at(s.macs, b.macs), moved=at(s.moved, b.moved), out=at(s.out, b.out), live=at(s.live, b.live))
+        for s, b in zip(small.operators, large.operators, strict=True)
+    )
+    ends = (at(small.input_elements, large.input_elements), at(small.output_elements, large.output_elements))
+    return Work(operators, ends[0], small.input_tensors, ends[1])
+
+
+@lru_cache(maxsize=512)
+def _walked(spec: NetworkSpec) -> Work:
     return walk(build_network(spec))
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import lru_cache
 from math import gcd
 from typing import Any, NamedTuple
 
@@ -310,7 +309,6 @@ def _decoder(b: GraphBuilder, features: list[TensorRef]) -> TensorRef:
     return x
 
 
-@lru_cache(maxsize=256)
 def build_network(spec: NetworkSpec) -> Any:
     """The network as an `onnx.ModelProto` (opset 21, NCHW, batch 1) whose weights are inputs named `w<n>`."""
     b = GraphBuilder(spec.norm)

@@ -85,6 +85,13 @@ def test_products_grow_with_the_area() -> None:
     assert large.weights == small.weights
 
 
+@pytest.mark.parametrize("encoder", ENCODERS)
+@pytest.mark.parametrize("shape", [(32, 32), (384, 192), (640, 640)])
+def test_counts_of_any_size_are_those_of_a_walk(encoder: str, shape: tuple[int, int]) -> None:
+    one = NetworkSpec(encoder, "instance", *shape, 12, "split")
+    assert network_work(one) == walk(build_network(one))
+
+
 def test_quantised_graphs_count_as_their_float_ones() -> None:
     """Quantize and dequantize nodes around a convolution leave its products and weights as they are."""
     weight = helper.make_tensor("w8", TensorProto.INT8, (8, 4, 3, 3), np.zeros(288, np.int8).tobytes(), raw=True)

@@ -11,6 +11,7 @@ from trilane.errors import BadInputError
 from trilane.hw_profiles.fit import (
     STEPS,
     UNIT_OF_COLUMN,
+    Fit,
     as_toml,
     fit_profile,
     measurements,
@@ -31,6 +32,12 @@ def measured(shared_data: Path) -> Path:
     return shared_data / "snapdragon888_measured.csv"
 
 
+@pytest.fixture(scope="module")
+def fitted(shared_data: Path) -> Fit:
+    pytest.importorskip("scipy")
+    return fit_profile("snapdragon-888-facts", shared_data / "snapdragon888_measured.csv")
+
+
 def test_there_are_fewer_free_numbers_than_measurements(measured: Path) -> None:
     rows = read_table(measured)
     for step in STEPS:
@@ -47,17 +54,15 @@ def test_the_committed_profile_is_as_near_as_promised(measured: Path, columns: t
     assert median(abs(predicted_ms(profile, one) / one.ms - 1) for one in found) <= most
 
 
-def test_fitting_again_gives_the_committed_numbers(measured: Path) -> None:
-    pytest.importorskip("scipy")
-    result = fit_profile("snapdragon-888-facts", measured)
+def test_fitting_again_gives_the_committed_numbers(fitted: Fit) -> None:
     committed, _ = load_tables("snapdragon-888")
-    for key, (value, _) in result.numbers.items():
+    for key, (value, _) in fitted.numbers.items():
         table = committed
         for part in key.split("."):
             table = table[part]
         assert table["value"] == pytest.approx(value, rel=0.02), key
     for column in UNIT_OF_COLUMN:
-        assert result.median_error(column) <= result.median_error(column, left_out=True) + 1e-9
+        assert fitted.median_error(column) <= fitted.median_error(column, left_out=True) + 1e-9
 
 
 def test_numbers_that_made_the_rows_are_found_again(tmp_path: Path) -> None:
@@ -84,19 +89,17 @@ def test_numbers_that_made_the_rows_are_found_again(tmp_path: Path) -> None:
         lines.append(f"{text}," + ",".join(f"{value:.4f}" for value in figures))
     table.write_text("\n".join(lines) + "\n")
     result = fit_profile("snapdragon-888-facts", table)
-    fitted = parse_profile(result.data, path)
+    found = parse_profile(result.data, path)
     unseen = tmp_path / "unseen.csv"
     unseen.write_text("\n".join([HEADER, "efficientnet-lite0,instance,640,8,packed,1,1,1,1,1,1"]) + "\n")
     for step in STEPS:
         for one in measurements(read_table(unseen), step):
-            assert predicted_ms(fitted, one) == pytest.approx(predicted_ms(profile, one), rel=0.05), one.column
+            assert predicted_ms(found, one) == pytest.approx(predicted_ms(profile, one), rel=0.05), one.column
 
 
-def test_the_written_profile_can_be_read(measured: Path, tmp_path: Path) -> None:
-    pytest.importorskip("scipy")
-    result = fit_profile("snapdragon-888-facts", measured)
+def test_the_written_profile_can_be_read(fitted: Fit, tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
-    path.write_text(as_toml(result, "mine", "Mine", "snapdragon-888-facts", "trilane profiles fit --from x.csv"))
+    path.write_text(as_toml(fitted, "mine", "Mine", "snapdragon-888-facts", "trilane profiles fit --from x.csv"))
     profile = load_profile(str(path))
     assert profile.name == "mine"
     assert not profile.template

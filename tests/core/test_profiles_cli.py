@@ -1,0 +1,131 @@
+"""`trilane predict` and `trilane profiles` as a person calls them: JSON alone on stdout, exit codes, named errors."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from trilane.apps.cli.main import main
+
+
+def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    """Exit code of `trilane ARGUMENTS`."""
+    monkeypatch.setattr("sys.argv", ["trilane", *arguments])
+    with pytest.raises(SystemExit) as left:
+        main()
+    return int(left.value.code or 0)
+
+
+def answer(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: str) -> Any:
+    """The JSON document that `trilane ARGUMENTS --json` prints, which must be all that it prints."""
+    assert call(monkeypatch, *arguments, "--json") == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_predict_answers_one_configuration(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ("--norm", "instance", "--size", "384x192", "--runtime", "gpu", "--minutes", "3", "--what-if")
+    document = answer(monkeypatch, capsys, "predict", *options)
+    assert document["config"]["size"] == "384x192"
+    assert document["config"]["edge"] == "single"
+    assert document["stages"]["infer"]["unit"] == "gpu"
+    assert len(document["alternatives"]) >= 5
+
+
+def test_predict_answers_a_table(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    path = tmp_path / "rows.csv"
+    path.write_text("encoder,norm,params_m,size,channels,layout\nmobilenetv3,batch,6.7,640,8,packed\n")
+    document = answer(monkeypatch, capsys, "predict", "--table", str(path))
+    assert set(document["rows"][0]) >= {
+        "encoder",
+        "bench_gpu_ms",
+        "bench_dsp_ms",
+        "app_gpu_ms",
+        "app_dsp_ms",
+        "confidence",
+    }
+    assert call(monkeypatch, "predict", "--table", str(path)) == 0
+    assert "mobilenetv3" in capsys.readouterr().out
+
+
+def test_predict_draws_heat(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    path = tmp_path / "heat.svg"
+    assert call(monkeypatch, "predict", "--minutes", "5", "--plot", str(path)) == 0
+    assert "<svg" in path.read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("predict", "--profile", "nope"), ("nope", "snapdragon-888")),
+        (("predict", "--profile", "phone-template"), ("template",)),
+        (("predict", "--encoder", "vgg"), ("vgg", "resnet18")),
+        (("predict", "--size", "500"), ("500", "32")),
+        (("predict", "--channels", "0"), ("0", "1 to 16")),
+        (("predict", "--runtime", "npu"), ("npu", "dsp")),
+        (("predict", "--minutes", "nan"), ("nan",)),
+        (("predict", "--policy", "warp"), ("warp", "pipelined")),
+        (("predict", "--policy", "pipelined", "--edge", "octuple"), ("octuple", "double")),
+        (("predict", "--performance-profile", "warp"), ("warp", "burst")),
+        (("predict", "--table", "/nope.csv"), ("/nope.csv",)),
+        (("predict", "--plot", "heat.bmp"), (".bmp", ".svg")),
+        (("profiles", "show", "nope"), ("nope",)),
+        (("profiles", "fit", "--from", "/nope.csv"), ("/nope.csv",)),
+    ],
+)
+def test_wrong_usage_is_one_sentence_and_exit_code_2(
+    arguments: tuple[str, ...],
+    words: tuple[str, ...],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert call(monkeypatch, *arguments) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert "Traceback" not in printed.err
+    for word in words:
+        assert word in printed.err
+
+
+def test_a_bad_profile_is_exit_code_2_with_file_and_key(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(
+        'extends = "snapdragon-888"\n[units.gpu]\nidle_w = { value = -1, kind = "assumed", source = "x" }\n'
+    )
+    for command in (("profiles", "check", str(path)), ("predict", "--profile", str(path))):
+        assert call(monkeypatch, *command) == 2
+        assert f"{path}: units.gpu.idle_w: found -1, expected 0 to 1000" in capsys.readouterr().err.replace("\n", "")
+
+
+def test_profiles_are_listed_shown_and_checked(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    listed = answer(monkeypatch, capsys, "profiles", "list")["profiles"]
+    assert {"snapdragon-888", "host", "agx-orin"} <= {row["name"] for row in listed}
+    shown = answer(monkeypatch, capsys, "profiles", "show", "snapdragon-888")
+    assert shown["units"]["dsp"]["efficiency"]["convolution"]["kind"] == "fitted"
+    checked = answer(monkeypatch, capsys, "profiles", "check")
+    assert any(row["independent"] for row in checked["published"])
+    for command in ("list", "check"):
+        assert call(monkeypatch, "profiles", command) == 0
+    assert call(monkeypatch, "profiles", "show", "snapdragon-888") == 0
+    assert "units.dsp.efficiency.convolution" in capsys.readouterr().out
+
+
+def test_a_fit_prints_its_errors_and_writes_a_profile(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, shared_data: Path
+) -> None:
+    pytest.importorskip("scipy")
+    path = tmp_path / "mine.toml"
+    source = str(shared_data / "snapdragon888_measured.csv")
+    document = answer(monkeypatch, capsys, "profiles", "fit", "--from", source, "--name", "mine", "--write", str(path))
+    assert document["free_numbers"] < document["measurements"]
+    assert document["medians"]["bench_dsp_ms"]["error"] <= 0.06
+    assert answer(monkeypatch, capsys, "predict", "--profile", str(path))["machine"]["profile"] == "mine"
