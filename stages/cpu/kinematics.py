@@ -122,7 +122,9 @@ class Skeleton:
 
 def _require_finite(values: F64, where: str, expected: str) -> None:
     flat = values.ravel()
-    if not flat @ flat <= MAX_VALUE**2:  # also when it is NaN
+    with np.errstate(over="ignore", invalid="ignore"):
+        square = flat @ flat
+    if not square <= MAX_VALUE**2:  # also when it is NaN
         raise BadInputError(where, "NaN, infinity or a huge number", expected)
 
 

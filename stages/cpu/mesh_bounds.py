@@ -20,7 +20,7 @@ from trilane.stages.cpu.body import ShapedBody
 from trilane.stages.cpu.crop import Rect
 from trilane.stages.cpu.kinematics import Posed
 from trilane.stages.cpu.patches import Level, build_levels, join
-from trilane.stages.cpu.skinning import largest_weights
+from trilane.stages.cpu.skinning import blend_matrices, largest_weights
 
 F64 = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -123,9 +123,10 @@ class MeshBounds:
 
     def _sort_out(self, level: Level, rows: Ints, view: _View, seen: _Extent) -> tuple[Ints, Ints]:
         """Of these patches, those that may widen what was seen, and those that the near plane may cut."""
-        radius = level.size[rows] + level.give[rows] @ (view.turned / np.sqrt(2.0)) + (self._standoff + ROUNDING_M)
+        radius = level.size[rows] + (self._standoff + ROUNDING_M)
+        radius += np.einsum("pj,j->p", level.give[rows], view.turned / np.sqrt(2.0))
         if self._blend is not None:
-            radius += level.blend[rows] @ view.turned
+            radius += np.einsum("pj,j->p", level.blend[rows], view.turned)
         centres = self._project(level.centres[rows], view, blend=False)
         front, cut = _against_near(centres, radius, view)
         low, high = _quotients(centres, radius, view)
@@ -139,8 +140,8 @@ class MeshBounds:
         """(N,4) clip coordinates of `vertices` (N,), with or without the pose blend shapes."""
         rest = self._rest[vertices]
         if blend and self._blend is not None:
-            rest[:, :3] += self._blend[vertices] @ view.posed.feature
-        blended = (self._weights[vertices] @ view.per_joint).reshape(-1, 4, 4)
+            rest[:, :3] += np.einsum("naf,f->na", self._blend[vertices], view.posed.feature)
+        blended = blend_matrices(self._weights[vertices], view.per_joint).reshape(-1, 4, 4)
         return np.asarray(np.einsum("nab,nb->na", blended, rest))
 
     def _add_vertices(self, vertices: Ints, view: _View, seen: _Extent) -> None:

@@ -5,6 +5,7 @@ Rule: a saving comes with its proved bound. Weights that are left out are never 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,8 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 WEIGHT_COUNTS = (4, 8, 12)
+#: OpenBLAS wakes its other threads for products of more than 2**18 multiplications, which stalls on shared cores.
+_BLOCK_ROWS = 256
 
 
 @dataclass(frozen=True)
@@ -76,6 +79,16 @@ def branch_sums(parents: NDArray[np.int32], values: F64) -> F64:
     return np.asarray(values @ above)
 
 
+def blend_matrices(weights: F64, per_joint: F64) -> F64:
+    """(N,M): `weights` (N,55) @ `per_joint` (55,M), in blocks so small that the BLAS keeps them on this thread."""
+    blended = np.empty((len(weights), per_joint.shape[1]))
+    whole = len(weights) // _BLOCK_ROWS * _BLOCK_ROWS
+    blocks = weights[:whole].reshape(-1, _BLOCK_ROWS, weights.shape[1])
+    np.matmul(blocks, per_joint, out=blended[:whole].reshape(-1, _BLOCK_ROWS, per_joint.shape[1]))
+    np.matmul(weights[whole:], per_joint, out=blended[whole:])
+    return blended
+
+
 class CpuSkinner:
     """Vertices of one shaped body, frame by frame, in float64 inside.
 
@@ -94,16 +107,13 @@ class CpuSkinner:
         rest = self._rest
         if self._blend is not None:
             rest = rest + (self._blend @ posed.feature).reshape(-1, 3)
-        moved = (self._weights @ posed.matrices.reshape(JOINTS, 12).astype(np.float64)).reshape(-1, 3, 4)
+        moved = blend_matrices(self._weights, posed.matrices.reshape(JOINTS, 12).astype(np.float64)).reshape(-1, 3, 4)
         return np.asarray(np.einsum("vab,vb->va", moved[:, :, :3], rest) + moved[:, :, 3])
 
 
-def posed_vertices(shaped: ShapedBody, poses: ArrayLike, translation: ArrayLike | None = None) -> F32:
-    """(T,V,3) float32 vertices of poses (T,165) as `Body.full_pose` gives them. Raises BadInputError."""
-    frames = np.atleast_2d(np.asarray(poses, np.float64))
+def posed_vertices(shaped: ShapedBody, poses: ArrayLike, translation: ArrayLike | None = None) -> Iterator[F64]:
+    """Vertices (V,3), metres, of each of the poses (T,165) that `Body.full_pose` gave. Raises BadInputError."""
     skeleton = Skeleton(shaped.joints, shaped.body.parents)
     skinner = CpuSkinner(shaped)
-    out = np.empty((len(frames), len(shaped.vertices), 3), np.float32)
-    for frame, pose in enumerate(frames):
-        out[frame] = skinner.vertices(skeleton.pose(pose, translation))
-    return out
+    for pose in np.atleast_2d(np.asarray(poses, np.float64)):
+        yield skinner.vertices(skeleton.pose(pose, translation))
