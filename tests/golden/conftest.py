@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,10 +37,9 @@ def gl() -> Any:
 
 
 @pytest.fixture(autouse=True)
-def current(gl: Any) -> Iterator[None]:
+def current(gl: Any) -> None:
     """Make the shared context the current one: some tests open their own."""
-    with gl:
-        yield
+    gl.__enter__()
 
 
 @dataclass(frozen=True)
@@ -60,6 +59,7 @@ class Person:
 @pytest.fixture(scope="session")
 def person(gl: Any) -> Person:
     """The default body with eight weights a vertex, standing on the floor."""
+    gl.__enter__()
     body = load_body(bundle_folder("default") / "body.npz")
     shaped = body.shape()
     top = largest_weights(body.weights, 8)
