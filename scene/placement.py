@@ -3,7 +3,8 @@
 Rule: the recording is moved as one rigid piece and stays upright: it is turned about the vertical, shifted, and
 lifted over the floor; what it does from frame to frame is never changed. Of all such places the one is taken from
 which the whole bodies are in the picture in the most frames, then the one where they are largest. The avatars face
-the camera at the first frame, as far as their own headings say.
+the camera at the first frame, as far as their own headings say. Where the background was not filmed by the same
+camera, the camera is also tilted on its mount by one constant angle, so that it does not look at people from above.
 """
 
 from __future__ import annotations
@@ -35,6 +36,10 @@ FINER_M = (0.25, 0.12, 0.06)
 LOWEST_EYE_M = 0.3
 #: Part of the picture's half height and width that a whole body keeps within.
 MARGIN = 0.97
+#: Where the camera looks in the median frame, degrees over the horizon: tilted to here when it is outside.
+SIGHT_DEG = (-24.0, 0.0)
+LARGEST_TILT_DEG = 40.0
+SYNTHETIC_BACKGROUNDS = ("room",)
 #: Worth of a large picture against a whole one, per share of the picture's height.
 SIZE_WORTH, ENOUGH_SIZE = 0.12, 0.75
 NEAREST_M = 0.3
@@ -42,17 +47,21 @@ NEAREST_M = 0.3
 
 @dataclass(frozen=True)
 class PlacedCamera:
-    """A camera in the scene. `turn` (3, 3) and `shift` (3,) take the path's world to the scene's."""
+    """A camera in the scene. `turn` (3, 3) and `shift` (3,) take the path's world to the scene's.
+
+    `mount` (3, 3): from the camera's axes to the recorder's.
+    """
 
     path: CameraPath
     turn: Array
     shift: Array
+    mount: Array
     notes: tuple[str, ...]
 
     def sample(self, t_s: float) -> Array:
         """World to camera (4, 4) at `t_s`, scene world."""
         turn, place = self.path.pose(t_s)
-        return view_from_pose(self.turn @ turn, self.turn @ place + self.shift)
+        return view_from_pose(self.turn @ turn @ self.mount, self.turn @ place + self.shift)
 
     def projection(self, aspect: float) -> Array:
         """OpenGL clip matrix (4, 4)."""
@@ -78,8 +87,11 @@ def place_camera(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies
     A built-in camera, and one whose spec says `place = "none"`, is left where it is.
     """
     if not path.recorded or scene.camera.place == "none":
-        return PlacedCamera(path, np.eye(3), np.zeros(3), ())
-    film = _film(path, scene, movers, bodies)
+        return PlacedCamera(path, np.eye(3), np.zeros(3), np.eye(3), ())
+    times = np.linspace(0.0, (scene.frames - 1) / scene.fps, min(scene.frames, LOOKS))
+    tilt = _tilt_deg(path, times) if scene.background in SYNTHETIC_BACKGROUNDS else 0.0
+    mount = about(0, np.radians(tilt))
+    film = _film(path, mount, times, scene, movers, bodies)
     spots = _coarse_spots(film)
     best = _best(film, spots)
     for step in FINER_M:
@@ -87,18 +99,26 @@ def place_camera(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies
     whole, size = _judged(film, best[None])
     turn, shift = _transform(film, best)
     eye = best[1] * -1 + film.eyes[:, 1].mean()
+    tilted = (f"camera tilted by {tilt:+.0f} degrees on its mount",) if tilt else ()
     notes = (
+        *tilted,
         f"camera set down {_distance(film, best):.1f} m from the avatar, {eye:.1f} m over the floor on average",
         f"whole body in the picture in {whole[0]:.0%} of the frames, {size[0]:.0%} of its height on average",
     )
-    return PlacedCamera(path, turn, shift, notes)
+    return PlacedCamera(path, turn, shift, mount, notes)
 
 
-def _film(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]) -> _Film:
-    count = min(scene.frames, LOOKS)
-    times = np.linspace(0.0, (scene.frames - 1) / scene.fps, count)
+def _tilt_deg(path: CameraPath, times: Array) -> float:
+    """Degrees to turn the camera up on its mount, so that the median line of sight is within SIGHT_DEG."""
+    sight = float(np.median([np.degrees(np.arcsin(np.clip(-path.pose(float(t))[0][1, 2], -1, 1))) for t in times]))
+    return float(np.clip(np.clip(sight, *SIGHT_DEG) - sight, -LARGEST_TILT_DEG, LARGEST_TILT_DEG))
+
+
+def _film(
+    path: CameraPath, mount: Array, times: Array, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]
+) -> _Film:
     poses = [path.pose(float(t)) for t in times]
-    views = np.stack([view_from_pose(turn, place)[:3] for turn, place in poses]).astype(np.float32)
+    views = np.stack([view_from_pose(turn @ mount, place)[:3] for turn, place in poses]).astype(np.float32)
     lows, highs = _bounds(times, movers, bodies)
     pick = np.array([[(k >> axis) & 1 for axis in range(3)] for k in range(8)], dtype=bool)
     boxes = np.where(pick[None], highs[:, None], lows[:, None])

@@ -98,17 +98,17 @@ def write_path(path: Path, looks: list[tuple[np.ndarray, np.ndarray]]) -> Path:
     return path
 
 
-def wandering(count: int = 60) -> list[tuple[np.ndarray, np.ndarray]]:
+def wandering(count: int = 60, pitch: float = -0.25) -> list[tuple[np.ndarray, np.ndarray]]:
     angles = 0.15 * np.sin(np.arange(count) / 9)
     return [
-        (about(1, np.array(2.0 + a)) @ about(0, np.array(-0.25 + a / 3)), np.array([30 + a, -7, 12 - a]))
+        (about(1, np.array(2.0 + a)) @ about(0, np.array(pitch + a / 3)), np.array([30 + a, -7, 12 - a]))
         for a in angles
     ]
 
 
 def test_a_recording_is_moved_as_one_upright_piece(body: ShapedBody, tmp_path: Path) -> None:
-    looks = wandering()
-    scene = staged(body, write_path(tmp_path / "log.txt", looks), frames=60)
+    looks = wandering(pitch=-0.6)
+    scene = staged(body, write_path(tmp_path / "log.txt", looks), frames=60, background="film.mp4")
     views = [scene.camera.sample(k / 30) for k in range(60)]
     recorded = []
     for turn, place in looks:
@@ -120,6 +120,20 @@ def test_a_recording_is_moved_as_one_upright_piece(body: ShapedBody, tmp_path: P
         assert view @ moved == pytest.approx(original, abs=1e-6)
     assert moved[1, :3] == pytest.approx([0, 1, 0], abs=1e-9)
     assert moved[:3, :3] @ moved[:3, :3].T == pytest.approx(np.eye(3), abs=1e-9)
+
+
+def test_in_a_drawn_room_the_camera_is_tilted_by_one_angle(body: ShapedBody, tmp_path: Path) -> None:
+    log = write_path(tmp_path / "log.txt", wandering(pitch=-0.7))
+    filmed, drawn = (staged(body, log, frames=60, background=name) for name in ("film.mp4", "room"))
+    tilt = np.radians(np.degrees(0.7) - 24)
+    for t_s in (0.0, 0.4, 1.1):
+        turns = [scene.camera.sample(t_s)[:3, :3].T for scene in (filmed, drawn)]
+        level = np.degrees(np.arcsin(-turns[1][1, 2]))
+        assert -33 < level < -15
+        assert turns[1][1, 0] == pytest.approx(0, abs=1e-6)
+        assert turns[0][1] @ about(0, np.array(tilt)) == pytest.approx(turns[1][1], abs=0.02)
+    assert any("camera tilted by +16 degrees" in note for note in drawn.notes)
+    assert not any("tilted" in note for note in filmed.notes)
 
 
 def test_the_avatar_is_whole_in_the_picture_and_faces_the_camera(body: ShapedBody, tmp_path: Path) -> None:
