@@ -29,7 +29,7 @@ Ints = NDArray[np.integer[Any]]
 class MeshArrays:
     """Per-vertex arrays after the split at UV seams, float32 unless told.
 
-    `position` (N,3) metres, rest pose. `uv` (N,2). `joint` (N,K) uint8, `weight` (N,K), rows sum to 1.
+    `position` (N,3) metres, rest pose. `uv` (N,2). `joint` (N,K) uint8, `weight` (N,K) largest first, rows sum to 1.
     `triangles` (F,3) uint32. `source` (N,) int64: which vertex of the body a row came from. `normal` (N,3) and
     `colour` (N,4): only for meshes that are shaded. `closed`: triangles that face away are never seen from outside.
     """
@@ -68,6 +68,8 @@ def mesh_arrays(
     triangle_order = patch_order(np.asarray(vertices, np.float64)[faces].mean(axis=1))
     source, uv_source, triangles = split_corners(faces[triangle_order], uv_faces[triangle_order])
     surface = {"normal": normal, "colour": colour}
+    order = np.argsort(-weight, axis=1, kind="stable")
+    joint, weight = np.take_along_axis(joint, order, axis=1), np.take_along_axis(weight, order, axis=1)
     return MeshArrays(
         position=np.ascontiguousarray(vertices[source], np.float32),
         uv=np.ascontiguousarray(uv[uv_source], np.float32),
@@ -130,8 +132,18 @@ def patch_order(centres: NDArray[np.float64], patch: int = PATCH_TRIANGLES) -> N
     return np.concatenate(done) if done else np.empty(0, np.int64)
 
 
+def weight_batches(arrays: MeshArrays) -> dict[int, NDArray[np.uint32]]:
+    """Triangles (F_k,3) by the number of weights, 4, 8 or 12, that the neediest of their corners has above 0."""
+    used = np.count_nonzero(arrays.weight, axis=1)
+    needed = np.maximum(-(-used // 4) * 4, 4)[arrays.triangles].max(axis=1)
+    return {k: arrays.triangles[needed == k] for k in WEIGHT_COUNTS if (needed == k).any()}
+
+
 class SkinnedMesh:
-    """A `MeshArrays` on the GPU. `posedirs` (V,3,486): pose blend shapes, indexed by `MeshArrays.source`."""
+    """A `MeshArrays` on the GPU. `posedirs` (V,3,486): pose blend shapes, indexed by `MeshArrays.source`.
+
+    `batches`: number of weights and index buffer of the triangles that need as many.
+    """
 
     def __init__(self, ctx: Any, arrays: MeshArrays, posedirs: NDArray[np.floating[Any]] | None = None) -> None:
         self.arrays = arrays
@@ -139,15 +151,15 @@ class SkinnedMesh:
         names, formats, columns = _layout(arrays, self.posedirs is not None)
         packed = np.hstack([np.ascontiguousarray(column).view(np.uint8) for column in columns])
         self._content = (ctx.buffer(packed.tobytes()), " ".join(formats), *names)
-        self._indices = ctx.buffer(arrays.triangles.tobytes())
+        self.batches = [(k, ctx.buffer(part.tobytes())) for k, part in weight_batches(arrays).items()]
         self._joints = ctx.buffer(reserve=JOINTS * 48)
         self._feature = ctx.buffer(reserve=-(-POSE_FEATURES // 4) * 16)
         self._ctx = ctx
 
     @property
     def defines(self) -> dict[str, int | str]:
-        """Definitions that the vertex shader needs for this mesh."""
-        values: dict[str, int | str] = {"K": self.arrays.weights_per_vertex, "JOINTS": JOINTS}
+        """Definitions that the vertex shader needs for this mesh, beside K."""
+        values: dict[str, int | str] = {"JOINTS": JOINTS}
         if self.posedirs is not None:
             values |= {"POSE_FEATURES": POSE_FEATURES, "ROW": POSEDIRS_ROW}
         if self.arrays.surface:
@@ -160,20 +172,25 @@ class SkinnedMesh:
         ctx.depth_func = "<"
         ctx.front_face = "cw"  # rows run downward: what winds counter-clockwise in the picture is stored clockwise
 
-    def vertex_array(self, program: Any) -> Any:
+    def vertex_array(self, program: Any, indices: Any) -> Any:
         """A vertex array of this mesh for `program`; attributes that the compiler dropped are skipped."""
-        return self._ctx.vertex_array(program, [self._content], self._indices, skip_errors=True)
+        return self._ctx.vertex_array(program, [self._content], indices, skip_errors=True)
 
-    def pose(self, program: Any, joints: F32, feature: F32 | None = None) -> None:
-        """Upload the skinning matrices (55,3,4) and the pose feature (486,), and bind them to `program`."""
+    def upload_pose(self, joints: F32, feature: F32 | None = None) -> None:
+        """Take the skinning matrices (55,3,4), and the pose feature (486,) for a mesh with pose blend shapes."""
         self._joints.write(np.ascontiguousarray(joints, np.float32))
-        self._joints.bind_to_uniform_block(0)
-        program["Joints"].binding = 0
         if self.posedirs is None:
             return
         if feature is None:
             raise ValueError("a mesh with pose blend shapes needs the pose feature")
         self._feature.write(np.ascontiguousarray(feature, np.float32))
+
+    def bind_pose(self, program: Any) -> None:
+        """Let `program` read what was uploaded."""
+        self._joints.bind_to_uniform_block(0)
+        program["Joints"].binding = 0
+        if self.posedirs is None:
+            return
         self._feature.bind_to_uniform_block(1)
         program["PoseFeature"].binding = 1
         self.posedirs.use(location=8)

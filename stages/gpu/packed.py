@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
 from trilane.stages.gpu import gl
-from trilane.stages.gpu.camera import Matrix, target_clip
+from trilane.stages.gpu.camera import Matrix
 from trilane.stages.gpu.mesh import SkinnedMesh
+from trilane.stages.gpu.mesh_draw import MeshDraw
 from trilane.stages.gpu.program import build_program, set_uniforms
 
 F32 = NDArray[np.float32]
@@ -79,6 +80,12 @@ class PackedPass:
     def layers(self) -> int:
         return self.channels // 4
 
+    @property
+    def uniforms(self) -> dict[str, float]:
+        """What the packing shader is told."""
+        encoding = self.quantisation
+        return {"neural": 0, "uv_image": 1, "scale": encoding.scale, "zero_point": float(encoding.zero_point)}
+
     def target(self, shape: Shape) -> Target:
         """What tensors of `shape` (height, width) are drawn into; made on first use."""
         if shape not in self._targets:
@@ -122,14 +129,13 @@ class PackedAvatar:
         self._texture = texture_array(packed.ctx, texture)
         defines: dict[str, int | str] = {"LAYERS": packed.layers, "WORDS": WORD_TYPES[packed.layers]}
         if packed.deferred:
-            self._geometry = build_program(packed.ctx, "skin.vert", "uv_only.frag", **mesh.defines)
-            self._pack = build_program(packed.ctx, "behind.vert", "pack.frag", **defines, DEFERRED=1)
-            self._screen = packed.ctx.vertex_array(self._pack, [])
+            self._geometry = MeshDraw(packed.ctx, mesh, "uv_only.frag")
+            pack = build_program(packed.ctx, "behind.vert", "pack.frag", **defines, DEFERRED=1)
+            set_uniforms(pack, packed.uniforms)
+            self._screen = packed.ctx.vertex_array(pack, [])
         else:
-            self._geometry = self._pack = build_program(packed.ctx, "skin.vert", "pack.frag", **mesh.defines, **defines)
-        self._vertices = mesh.vertex_array(self._geometry)
-        scale, zero_point = packed.quantisation.scale, float(packed.quantisation.zero_point)
-        set_uniforms(self._pack, {"neural": 0, "uv_image": 1, "scale": scale, "zero_point": zero_point})
+            self._geometry = MeshDraw(packed.ctx, mesh, "pack.frag", **defines)
+            self._geometry.set(packed.uniforms)
 
     def draw(self, target: Target, view: Matrix, placement: Placement) -> None:
         """Draw into `target`, which a `PackedPass` began."""
@@ -137,12 +143,10 @@ class PackedAvatar:
         box = (left, top, width, height)
         self._texture.use(0)
         self._mesh.prepare(self._ctx)
-        self._mesh.pose(self._geometry, placement.joints, placement.feature)
-        self._geometry["clip_from_world"].write(target_clip(view, placement.clip_projection))
         first = target.words if target.uv is None else target.uv
         first.use()
         first.viewport = box
-        self._vertices.render()
+        self._geometry.draw(placement.joints, view, placement.clip_projection, placement.feature)
         if target.uv is not None:
             self._write_words(target, box)
 

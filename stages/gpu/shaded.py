@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.stages.gpu import gl
-from trilane.stages.gpu.camera import Matrix, eye_of, target_clip
+from trilane.stages.gpu.camera import Matrix, eye_of
 from trilane.stages.gpu.mesh import SkinnedMesh
+from trilane.stages.gpu.mesh_draw import MeshDraw
 from trilane.stages.gpu.program import build_program, set_uniforms
 
 F32 = NDArray[np.float32]
@@ -39,22 +40,18 @@ class ShadedMesh:
         textures: Mapping[str, RGBA8] | None = None,
         uniforms: Mapping[str, Any] | None = None,
     ) -> None:
-        self._mesh = mesh
-        self._program = build_program(ctx, "skin.vert", fragment, **mesh.defines)
-        self._vertices = mesh.vertex_array(self._program)
+        self._draw = MeshDraw(ctx, mesh, fragment)
         self._textures = {name: _srgb_texture(ctx, image) for name, image in (textures or {}).items()}
-        set_uniforms(self._program, dict(uniforms or {}))
+        self._draw.set(dict(uniforms or {}))
 
     def draw(self, joints: F32, view: Matrix, projection: Matrix, uniforms: Mapping[str, Any]) -> None:
         """Draw into the target in use. `joints` (55,3,4)."""
         for location, (name, texture) in enumerate(self._textures.items()):
             texture.use(location)
-            set_uniforms(self._program, {name: location})
+            self._draw.set({name: location})
         camera = {"view": tuple(np.asarray(view, np.float64).T.ravel()), "eye": tuple(eye_of(view))}
-        set_uniforms(self._program, camera | dict(uniforms))
-        self._program["clip_from_world"].write(target_clip(view, projection))
-        self._mesh.pose(self._program, joints)
-        self._vertices.render()
+        self._draw.set(camera | dict(uniforms))
+        self._draw.draw(joints, view, projection)
 
 
 class ShadedRaster:

@@ -7,14 +7,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.stages.gpu.camera import Matrix, target_clip
+from trilane.stages.gpu.camera import Matrix
 from trilane.stages.gpu.mesh import SkinnedMesh
+from trilane.stages.gpu.mesh_draw import MeshDraw
 from trilane.stages.gpu.packed import Placement, Quantisation, check_texture, texture_array
-from trilane.stages.gpu.program import build_program, set_uniforms
 
 U8 = NDArray[np.uint8]
 
@@ -32,11 +31,10 @@ class SplitPass:
     ) -> None:
         check_texture(texture, texture.shape[2])
         self._ctx, self._mesh, self._shape = ctx, mesh, shape
-        self._program = build_program(ctx, "skin.vert", "split.frag", **mesh.defines)
-        self._vertices = mesh.vertex_array(self._program)
+        self._draw = MeshDraw(ctx, mesh, "split.frag")
         self._texture = texture_array(ctx, texture)
         zero_point = float(quantisation.zero_point)
-        set_uniforms(self._program, {"neural": 0, "scale": quantisation.scale, "zero_point": zero_point})
+        self._draw.set({"neural": 0, "scale": quantisation.scale, "zero_point": zero_point})
         self._background = (zero_point / 255,) * 4
         size = shape[::-1]
         depth = ctx.depth_renderbuffer(size)
@@ -47,13 +45,11 @@ class SplitPass:
         """Draw every pass. The avatar fills the tensor; `placement.rect` is not read."""
         self._texture.use(0)
         self._mesh.prepare(self._ctx)
-        self._mesh.pose(self._program, placement.joints, placement.feature)
-        self._program["clip_from_world"].write(target_clip(view, placement.clip_projection))
         for layer, target in enumerate(self._targets):
             target.use()
             target.clear(*self._background, depth=1.0)
-            self._program["layer"].value = layer
-            self._vertices.render(moderngl.TRIANGLES)
+            self._draw.set({"layer": layer})
+            self._draw.draw(placement.joints, view, placement.clip_projection, placement.feature)
 
     def read_into(self, tensor: U8) -> None:
         """Read every pass and interleave them into `tensor`, (h * w * C,) uint8."""

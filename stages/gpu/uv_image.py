@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.stages.gpu.camera import Matrix, target_clip
+from trilane.stages.gpu.camera import Matrix
 from trilane.stages.gpu.mesh import SkinnedMesh
-from trilane.stages.gpu.program import build_program
+from trilane.stages.gpu.mesh_draw import MeshDraw
 
 F32 = NDArray[np.float32]
 
@@ -22,8 +22,7 @@ class UvRaster:
 
     def __init__(self, ctx: Any, mesh: SkinnedMesh) -> None:
         self._ctx, self._mesh = ctx, mesh
-        self._program = build_program(ctx, "skin.vert", "uv.frag", **mesh.defines)
-        self._vertices = mesh.vertex_array(self._program)
+        self._draw = MeshDraw(ctx, mesh, "uv.frag")
         self._targets: dict[tuple[int, int], Any] = {}
 
     def render(
@@ -38,9 +37,7 @@ class UvRaster:
         target.use()
         self._mesh.prepare(self._ctx)
         target.clear(0.0, 0.0, 0.0, 0.0, depth=1.0)
-        self._mesh.pose(self._program, joints, feature)
-        self._program["clip_from_world"].write(target_clip(view, projection))
-        self._vertices.render()
+        self._draw.draw(joints, view, projection, feature)
         pixels = np.empty((*shape, 4), np.float32)
         target.read_into(pixels, components=4, dtype="f4", alignment=1)
         return pixels[..., :3]
