@@ -20,7 +20,8 @@ PAGE = 4096
 #: One avatar of a frame.
 #: `joints`: skinning matrices, metres, world space, row-major 3x4: x_world = sum_k w_k (joints_k @ [x_rest, 1]).
 #: `pose_feature`: (R - I) row-major of joints 1..54; multiplies the body's `posedirs`.
-#: `rect`: crop rectangle x0, y0, x1, y1 in normalised device coordinates, y up, clipped to [-1, 1].
+#: `rect`: crop rectangle x0, y0, x1, y1 in normalised device coordinates, y up: the mesh's rectangle clipped to
+#: [-1, 1], grown to the tensor's aspect so that tensor pixels are square; what is grown may hang over the screen.
 #: `tensor_rect`: top, left, height, width in tensor pixels that the crop rectangle fills.
 #: `visible`: 0 when nothing of the avatar is on screen; the other fields are then unspecified.
 AVATAR_DTYPE = np.dtype(
