@@ -24,6 +24,7 @@ from trilane.scheduler.events import (
     UnitDied,
     UnitReady,
 )
+from trilane.scheduler.lateness import earliest_finish_ns
 from trilane.scheduler.ledger import ASSIGNED, BLOCKED, STARVED, THROTTLED, Ledger
 from trilane.scheduler.policy import Candidate, policy_named
 from trilane.scheduler.source import Source
@@ -70,10 +71,11 @@ class Core:
         self.actions = []
         for event in events:
             self._handlers[type(event)](event)  # type: ignore[operator]
+        if not self.finished:
+            faults.check_clocks(self)
         if self.started and not self.finished:
             if self.source.advance(now_ns):
                 self.touch(self.stages[0].unit)
-            faults.check_clocks(self)
             self._assign()
             if self.source.exhausted and not self.frames:
                 self.finish("stopped" if self.stopping else "done")
@@ -119,7 +121,7 @@ class Core:
         stage.learn(service_ns)
         if unit.duty < FULL_DUTY:
             unit.hold_until_ns = event.t_end_ns + service_ns * (FULL_DUTY - unit.duty) // unit.duty
-        frame.ready_ns = event.t_end_ns
+        frame.ready_ns, frame.position = event.t_end_ns, stage.position + 1
         if stage.position == 0:
             frame.pose_ns = event.t_pose_ns
         if stage.position == self._latency_position:
@@ -136,7 +138,7 @@ class Core:
             self.touch(self.stages[stage.position + 1].unit)
         else:
             frame = self.frames.pop(job.frame)
-            self.ledger.presented(end_ns, frame.latency_ns, 0 < frame.deadline_ns < end_ns)
+            self.ledger.presented(job.frame, end_ns, frame.latency_ns, 0 < frame.deadline_ns < end_ns)
             self.touch(self.stages[0].unit)
 
     def _on_failed(self, event: JobFailed) -> None:
@@ -214,7 +216,7 @@ class Core:
             while len(edge.ready) > 1:
                 self._drop_all([edge.drop(edge.ready[0])], stage.position - 1)
         if self.policy.drop_late:
-            while edge.ready and self._is_late(self._deadline_of(edge.frame[edge.ready[0]]), stage):
+            while edge.ready and self._is_late(edge.frame[edge.ready[0]], stage):
                 self._drop_all([edge.drop(edge.ready[0])], stage.position - 1, "late")
         return edge.frame[edge.ready[0]] if edge.ready else None
 
@@ -223,24 +225,25 @@ class Core:
             return None
         if self.policy.newest:
             self.source.keep_newest()
-        if self.policy.drop_late and self.settings.deadline_ns:
-            while self.source.queue and self._is_late(
-                self.source.release_of_head(self.now_ns) + self.settings.deadline_ns, self.stages[0]
-            ):
+        if self.policy.drop_late:
+            while self.source.queue and self._is_late(self.source.queue[0][0], self.stages[0]):
                 self.source.drop_head("late")
         return self.source.head()
 
-    def _is_late(self, deadline_ns: int, stage: StageState) -> bool:
-        """Whether the frame would miss its deadline even if nothing made it wait from here on.
+    def _is_late(self, frame: int, stage: StageState) -> bool:
+        """Whether the frame, whose next stage this is, must miss its deadline.
 
-        Each frame that is given up lowers the estimates it was judged by, so that one slow measurement cannot
-        drop every frame for ever.
+        With nothing in flight the estimates alone are to blame; they are lowered, so that one slow measurement
+        cannot drop every frame for ever.
         """
-        rest = self.stages[stage.position :]
-        if not deadline_ns or self.now_ns + sum(later.estimate_ns for later in rest) <= deadline_ns:
+        deadline_ns = self._deadline_of(frame)
+        if not deadline_ns:
             return False
-        for later in rest:
-            later.estimate_ns -= later.estimate_ns >> 4
+        if earliest_finish_ns(self.now_ns, frame, stage.position, self.stages, self.frames) <= deadline_ns:
+            return False
+        if not self.frames:
+            for later in self.stages:
+                later.estimate_ns -= later.estimate_ns >> 4
         return True
 
     def _deadline_of(self, frame: int) -> int:

@@ -66,6 +66,7 @@ class Ledger:
         self.start_ns = self.end_ns = 0
         self.lost: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
+        self.presented_frames: list[int] = []
         self.presented_ns: list[int] = []
         self.latency_ns: list[int] = []
         self.late = 0
@@ -94,7 +95,8 @@ class Ledger:
     def restart(self, unit: str) -> None:
         self._units[unit].restarts += 1
 
-    def presented(self, end_ns: int, latency_ns: int, late: bool) -> None:
+    def presented(self, frame: int, end_ns: int, latency_ns: int, late: bool) -> None:
+        self.presented_frames.append(frame)
         self.presented_ns.append(end_ns)
         self.latency_ns.append(latency_ns)
         self.late += late

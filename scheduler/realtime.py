@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable
-from statistics import fmean
+from statistics import fmean, median
 
 from trilane.errors import TrilaneError
 from trilane.scheduler.core import Core
@@ -81,6 +81,7 @@ class RealtimeDriver:
         self.startup_ms: dict[str, float] = {}
         self._graph, self._processes, self._interrupts = graph, processes, interrupts
         self._on_progress, self._on_message = on_progress, on_message
+        self._alone: dict[str, list[float]] = defaultdict(list)
         self._open: dict[int, tuple[Job, int]] = {}
         self._started_s: dict[str, float] = {}
         self._progress_s = 0.0
@@ -103,22 +104,35 @@ class RealtimeDriver:
                     self._ready(unit)
                     waiting.discard(unit)
 
-    def measure_alone(self, frames: list[int]) -> dict[str, float]:
-        """Mean service time in ns of each stage but the last (it writes files), the other units quiet.
+    def measure_alone(self, frames: list[int]) -> None:
+        """Note the service time of each stage but the last (it writes files), the other units quiet.
 
         Each of `frames` goes down the chain through the first slot of every edge; each stage repeats its job and
         the first time is left out. Raises UnitError when a stage fails.
         """
-        alone: dict[str, list[float]] = defaultdict(list)
         end = time.monotonic() + ISOLATE_LIMIT_S
         for frame in frames:
-            if alone and time.monotonic() > end:
+            if frame != frames[0] and time.monotonic() > end:
                 break
             for position, stage in enumerate(self._graph.stages[:-1]):
                 slot_in = 0 if position else -1
                 self._processes.send(stage.unit, Isolate(stage.name, frame, slot_in, 0, REPEATS))
-                alone[stage.name].append(fmean(self._durations(stage.unit)[1:]))
-        return {name: fmean(values) for name, values in alone.items()}
+                self._alone[stage.name].append(median(self._durations(stage.unit)[1:]))
+
+    def measure_again(self, frames: list[int]) -> None:
+        """The same after the run, so that a machine that grew slower or faster weighs on both sides; what goes
+        wrong here leaves the run's result as it is."""
+        if self.failure or not all(unit.alive for unit in self.core.units.values()):
+            return
+        try:
+            self.measure_alone(frames)
+        except (UnitError, KeyboardInterrupt) as error:
+            self._say(f"the measurement after the run was left out: {error or 'interrupted'}")
+
+    @property
+    def alone_ns(self) -> dict[str, float]:
+        """Mean service time in ns of each stage measured alone."""
+        return {name: fmean(values) for name, values in self._alone.items()}
 
     def _durations(self, unit: str) -> list[int]:
         end = time.monotonic() + START_S

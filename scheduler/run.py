@@ -41,10 +41,10 @@ def run_pipeline(
     `policy`: sequential, pipelined, latest, deadline. `edge`: single, double, triple, fifo:N, orphan[:N].
     `pace_fps`: frames are released at that rate; None releases them as fast as they are taken (`latest` and
     `deadline` are always paced, by the scene's fps when None). `isolate_frames`: frames measured with the other
-    units quiet before the run, which efficiency needs; 0 warms up and leaves both out. `hang_ns`: a unit whose job
-    takes longer is restarted. `on_progress(presented, requested)` and `on_message(text)` are called from this
-    thread. SIGINT or SIGTERM ends the run cleanly with its result marked `interrupted`; a second one ends the units
-    at once; before the first frame KeyboardInterrupt is raised instead.
+    units quiet, half of them before and half after the run, which efficiency needs; 0 warms up and leaves both out.
+    `hang_ns`: a unit whose job takes longer is restarted. `on_progress(presented, requested)` and
+    `on_message(text)` are called from this thread. SIGINT or SIGTERM ends the run cleanly with its result marked
+    `interrupted`; a second one ends the units at once; before the first frame KeyboardInterrupt is raised instead.
 
     Raises BadInputError for an unknown policy or edge, TrilaneError (with the exit code of the unit's error) when a
     unit cannot start; a failure after that is `RunResult.failure`.
@@ -59,16 +59,20 @@ def run_pipeline(
         driver = RealtimeDriver(graph, settings, processes, interrupts, on_progress, on_message)
         driver.start()
         pids = processes.pids
-        alone = driver.measure_alone(_spread(settings.frames, max(isolate_frames, 1)))
+        sample = _spread(settings.frames, max(isolate_frames, 1))
+        driver.measure_alone(sample[::2])
         cause = driver.run()
+        if sample[1::2] and cause == "done":
+            driver.measure_again(sample[1::2])
         pids = {**pids, **processes.pids}
-        driver.close()
+        if cause != "aborted":
+            driver.close()
     target_ns = 0 if settings.deadline_ns else round(1e9 / config.scene.fps)
     report = driver.core.ledger.report(
         clock="host",
         requested=settings.frames,
         target_period_ns=target_ns,
-        isolated_ns=alone if isolate_frames else None,
+        isolated_ns=driver.alone_ns if isolate_frames else None,
     )
     report.update(policy=policy, edge=edge)
     for unit, row in report["units"].items():

@@ -57,12 +57,15 @@ class StageState:
 
 
 class FrameState:
-    """`ready_ns`: when its last stage ended. `latency_ns`: from the pose to the composited frame, once known."""
+    """`position`: of its next stage. `ready_ns`: when its last stage ended.
 
-    __slots__ = ("deadline_ns", "latency_ns", "pose_ns", "ready_ns")
+    `latency_ns`: from the pose to the composited frame, once known.
+    """
+
+    __slots__ = ("deadline_ns", "latency_ns", "pose_ns", "position", "ready_ns")
 
     def __init__(self, release_ns: int, deadline_ns: int) -> None:
-        self.ready_ns = release_ns
+        self.position, self.ready_ns = 0, release_ns
         self.deadline_ns = deadline_ns
         self.pose_ns = self.latency_ns = 0
 

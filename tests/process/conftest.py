@@ -1,0 +1,56 @@
+"""Runs of real processes with mock units."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from trilane.hw_profiles.host import host_units
+from trilane.scene.schema import RunConfig, Scene
+
+MOCK = "trilane.stages.mock.unit"
+UNITS = ("cpu", "gpu", "dsp")
+SHM = Path("/dev/shm")  # noqa: S108 - looked at, not written to
+OPEN_FILES = Path("/proc/self/fd")
+
+
+@pytest.fixture
+def mock_config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., RunConfig]:
+    """`mock_config(frames, stage=milliseconds, ...)`: a run of mock units only."""
+
+    def make(frames: int = 40, **behaviour: object) -> RunConfig:
+        monkeypatch.setenv("TRILANE_MOCK", ",".join(f"{stage}={value}" for stage, value in behaviour.items()))
+        return RunConfig(
+            scene=Scene(frames=frames, size="64"),
+            out_dir=tmp_path,
+            avatar_dirs=(),
+            units=host_units(),
+            fake=dict.fromkeys(UNITS, MOCK),
+        )
+
+    return make
+
+
+def bus_folders(base: Path) -> set[str]:
+    return {folder.name for folder in base.glob("trilane-*")}
+
+
+@pytest.fixture
+def nothing_left(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """After the test: no child, no name in /dev/shm, no bus folder; yields the folder that those would be in."""
+    base = tmp_path_factory.mktemp("t")
+    monkeypatch.setattr("tempfile.tempdir", str(base))
+    monkeypatch.setenv("TMPDIR", str(base))
+    names, descriptors = _names(SHM), len(_names(OPEN_FILES))
+    yield base
+    assert not psutil.Process().children(recursive=True)
+    assert not {name for name in _names(SHM) - names if "trilane" in name}
+    assert bus_folders(base) == set()
+    assert len(_names(OPEN_FILES)) <= descriptors
+
+
+def _names(folder: Path) -> set[str]:
+    return {entry.name for entry in folder.iterdir()}

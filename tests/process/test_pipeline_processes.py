@@ -1,0 +1,217 @@
+"""The pipeline as processes: what a run presents, survives and leaves behind (which is nothing)."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import psutil
+import pytest
+
+from trilane.errors import BadInputError, TrilaneError
+from trilane.scene.schema import RunConfig
+from trilane.scheduler.record import replay
+from trilane.scheduler.result import RunResult
+from trilane.scheduler.run import run_pipeline
+
+Configure = Callable[..., RunConfig]
+pytestmark = pytest.mark.usefixtures("nothing_left")
+
+
+def unit_process(unit: str) -> psutil.Process:
+    for process in psutil.Process().children():
+        if process.cmdline()[-4:-2] == ["--unit", unit]:
+            return process
+    raise LookupError(unit)
+
+
+class When:
+    """Does `action` once the run has presented `frames`."""
+
+    def __init__(self, frames: int, action: Callable[[], object]) -> None:
+        self._frames, self._action, self._done = frames, action, False
+
+    def __call__(self, presented: int, _requested: int) -> None:
+        if presented >= self._frames and not self._done:
+            self._done = True
+            self._action()
+
+
+def check_accounts(result: RunResult) -> None:
+    counted = result.presented + sum(result.lost.values()) + sum(result.dropped.values())
+    assert counted == result.requested
+    for row in result.report["units"].values():
+        assert row["busy"] + sum(row["idle"].values()) == pytest.approx(1)
+    assert not list(replay(result.recording))
+
+
+@pytest.mark.parametrize("policy", ["sequential", "pipelined"])
+@pytest.mark.parametrize("edge", ["single", "double"])
+def test_every_frame_is_presented_in_order(mock_config: Configure, policy: str, edge: str) -> None:
+    config = mock_config(40)
+    result = run_pipeline(config, policy=policy, edge=edge, isolate_frames=2)
+    assert result.failure is None
+    assert (result.presented, dict(result.lost), dict(result.dropped)) == (40, {}, {})
+    assert (config.out_dir / "presented.txt").read_text().split() == [str(frame) for frame in range(40)]
+    assert len(set(result.pids.values())) == 3
+    assert result.report["clock"] == "host"
+    assert 0 < result.report["efficiency"] < 3
+    check_accounts(result)
+
+
+@pytest.mark.parametrize(("policy", "edge"), [("latest", "triple"), ("deadline", "double"), ("latest", "orphan")])
+def test_a_paced_run_drops_what_it_cannot_do_and_counts_it(mock_config: Configure, policy: str, edge: str) -> None:
+    result = run_pipeline(mock_config(100, infer=16), policy=policy, edge=edge, pace_fps=100, isolate_frames=0)
+    assert sum(result.dropped.values()) > 20
+    assert result.presented > 20
+    assert result.report["efficiency"] is None
+    check_accounts(result)
+
+
+def test_pipelined_hides_all_but_the_slowest(mock_config: Configure) -> None:
+    config = mock_config(60, raster=4, infer=12, composite=3, present=4)
+    reports = [run_pipeline(config, policy=policy).report for policy in ("sequential", "pipelined")]
+    assert reports[1]["fps"] > 1.4 * reports[0]["fps"]
+    assert reports[1]["bottleneck"] == "dsp"
+    assert reports[1]["efficiency"] > 0.8
+
+
+@pytest.mark.parametrize("unit", ["cpu", "gpu", "dsp"])
+def test_a_killed_unit_is_restarted_and_the_run_goes_on(mock_config: Configure, unit: str) -> None:
+    victims = []
+
+    def kill() -> None:
+        victims.append(unit_process(unit).pid)
+        os.kill(victims[0], signal.SIGKILL)
+
+    result = run_pipeline(mock_config(60, infer=5), isolate_frames=0, on_progress=When(10, kill))
+    assert result.failure is None
+    assert set(result.lost) == {f"died:{unit}"}
+    assert result.lost[f"died:{unit}"] <= 2
+    assert result.report["units"][unit]["restarts"] == 1
+    assert result.pids[unit] != victims[0]
+    assert any(unit in message for message in result.messages)
+    check_accounts(result)
+
+
+def test_a_stopped_unit_is_found_by_its_deadline(mock_config: Configure) -> None:
+    stop = When(10, lambda: unit_process("dsp").suspend())
+    result = run_pipeline(mock_config(40), isolate_frames=0, hang_ns=700_000_000, on_progress=stop)
+    assert set(result.lost) == {"hung:dsp"}
+    assert any("did not answer in time" in message for message in result.messages)
+    check_accounts(result)
+
+
+def test_a_job_that_never_ends_ends_the_run_after_some_restarts(mock_config: Configure) -> None:
+    result = run_pipeline(mock_config(8, raster="hang"), isolate_frames=0, hang_ns=300_000_000)
+    assert dict(result.lost) == {"hung:gpu": 1}
+    assert result.presented == 7
+    check_accounts(result)
+
+
+@pytest.mark.parametrize("stage", ["raster", "infer", "present"])
+def test_a_stage_that_raises_ends_the_run_with_its_sentence(mock_config: Configure, stage: str) -> None:
+    result = run_pipeline(mock_config(200, **{stage: "raise"}), isolate_frames=0)
+    assert result.failure is not None
+    assert result.failure.exit_code == 2
+    assert result.failure.message == "mock.npz: found nothing, expected something"
+    assert result.presented < 50
+    assert result.lost == {f"failed:{stage}": 1}
+
+
+@pytest.mark.parametrize("stage", ["pose", "raster", "infer"])
+def test_a_stage_that_cannot_be_built_is_the_callers_error(mock_config: Configure, stage: str) -> None:
+    with pytest.raises(TrilaneError, match="expected a network; train one") as caught:
+        run_pipeline(mock_config(5, **{stage: "badbuild"}))
+    assert caught.value.exit_code == 2
+
+
+def test_a_unit_that_dies_while_it_starts_is_an_error_with_its_last_words(mock_config: Configure) -> None:
+    config = mock_config(5).model_copy(update={"fake": {**mock_config(5).fake, "dsp": "antigravity_none"}})
+    with pytest.raises(TrilaneError, match="antigravity_none"):
+        run_pipeline(config)
+
+
+@pytest.mark.parametrize("settings", [{"policy": "fast"}, {"edge": "quad"}, {"edge": "fifo:0"}])
+def test_unknown_settings_are_bad_input(mock_config: Configure, settings: dict[str, str]) -> None:
+    with pytest.raises(BadInputError, match="found"):
+        run_pipeline(mock_config(5), **settings)
+
+
+def test_an_interrupt_finishes_what_is_in_flight(mock_config: Configure) -> None:
+    interrupt = When(10, lambda: os.kill(os.getpid(), signal.SIGINT))
+    result = run_pipeline(mock_config(2000, infer=5), isolate_frames=0, on_progress=interrupt)
+    assert result.interrupted
+    assert result.failure is None
+    assert 10 <= result.presented < 100
+    assert not result.lost
+
+
+def test_a_second_interrupt_ends_at_once(mock_config: Configure) -> None:
+    def interrupt() -> None:
+        for _ in range(2):
+            time.sleep(0.5)
+            os.kill(os.getpid(), signal.SIGINT)
+
+    thread = threading.Thread(target=interrupt)
+    begin = time.monotonic()
+    result = run_pipeline(mock_config(20, raster="hang"), isolate_frames=0, on_progress=When(2, thread.start))
+    thread.join()
+    assert time.monotonic() - begin < 8
+    assert result.interrupted
+    assert result.lost["aborted"] >= 1
+
+
+SCRIPT = """
+import sys
+from pathlib import Path
+from trilane.hw_profiles.host import host_units
+from trilane.scene.schema import RunConfig, Scene
+from trilane.scheduler.run import run_pipeline
+
+config = RunConfig(scene=Scene(frames=100000, size="64"), out_dir=Path(sys.argv[1]), avatar_dirs=(),
+                   units=host_units(), fake=dict.fromkeys(("cpu", "gpu", "dsp"), "trilane.stages.mock.unit"))
+run_pipeline(config, isolate_frames=0, on_progress=lambda done, _: print(done, flush=True))
+print("over", flush=True)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
+def test_nothing_outlives_the_parent(nothing_left: Path, tmp_path: Path, number: signal.Signals) -> None:
+    parent = subprocess.Popen(
+        [sys.executable, "-c", SCRIPT, str(tmp_path)], stdout=subprocess.PIPE, text=True, process_group=0
+    )
+    assert parent.stdout is not None
+    while int(parent.stdout.readline()) < 20:
+        pass
+    children = psutil.Process(parent.pid).children(recursive=True)
+    assert len(children) == 3
+    assert not list(nothing_left.glob("trilane-*"))
+    os.kill(parent.pid, number)
+    parent.stdout.read()
+    parent.stdout.close()
+    parent.wait(10)
+    _, alive = psutil.wait_procs(children, timeout=3)
+    assert not [process for process in alive if process.status() != psutil.STATUS_ZOMBIE]
+
+
+def test_a_parent_killed_while_it_starts_leaves_what_the_next_run_removes(
+    nothing_left: Path, tmp_path: Path, mock_config: Configure
+) -> None:
+    mock_config()
+    parent = subprocess.Popen([sys.executable, "-c", SCRIPT, str(tmp_path)], stdout=subprocess.DEVNULL)
+    while not list(nothing_left.glob("trilane-*/*")):
+        time.sleep(0.001)
+    children = psutil.Process(parent.pid).children(recursive=True)
+    parent.kill()
+    parent.wait()
+    _, alive = psutil.wait_procs(children, timeout=3)
+    assert not [process for process in alive if process.status() != psutil.STATUS_ZOMBIE]
+    run_pipeline(mock_config(3), isolate_frames=0)
+    assert not list(nothing_left.glob("trilane-*"))
