@@ -15,8 +15,8 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 from trilane.errors import BadInputError
-from trilane.hw_profiles.cost import CLASSES, Work, network_work
-from trilane.hw_profiles.networks import CHANNELS_PER_PASS, NetworkSpec
+from trilane.hw_profiles.cost import CLASSES, Network, Work
+from trilane.hw_profiles.networks import CHANNELS_PER_PASS
 from trilane.hw_profiles.roofline import JobTime, job_time, machine_of
 from trilane.hw_profiles.schema import UNITS, Corner, Profile, Unit, UnitName
 from trilane.scheduler.events import Graph, Settings, StageSpec
@@ -45,7 +45,7 @@ REFERENCE = Way()
 class Plan:
     """One application on one chip. `gpu_share`: the part of the network's products that the GPU does for the DSP."""
 
-    spec: NetworkSpec
+    network: Network
     runtime: UnitName
     way: Way = REFERENCE
     gpu_share: float = 0.0
@@ -73,9 +73,9 @@ def corners_of(profile: Profile, performance_profile: str) -> Corners:
     raise BadInputError("performance profile", repr(performance_profile), f"one of {known}")
 
 
-def network_alone(profile: Profile, spec: NetworkSpec, runtime: UnitName, corners: Corners) -> JobTime:
+def network_alone(profile: Profile, network: Network, runtime: UnitName, corners: Corners) -> JobTime:
     """The network run continuously with nothing beside it, as a benchmark does."""
-    return _job(profile, network_work(spec), runtime, corners, contended=False)
+    return _job(profile, network.work, runtime, corners, contended=False)
 
 
 def _job(
@@ -87,12 +87,12 @@ def _job(
 
 def stage_times_ms(profile: Profile, plan: Plan, corners: Corners) -> dict[tuple[str, UnitName], float]:
     """(stage, unit) -> milliseconds for one job of each stage, in data-flow order. A job is `batch` frames."""
-    app, spec, batch = profile.application, plan.spec, plan.way.batch
+    app, drawn_on, batch = profile.application, plan.network, plan.way.batch
     cpu, gpu = (profile.units[u].clock(corners[UNITS.index(u)]) for u in ("cpu", "gpu"))
-    passes = 1 if spec.layout == "packed" else -(-spec.channels // CHANNELS_PER_PASS)
-    moved = spec.pixels * (PACKED_BYTES_PER_PIXEL if spec.layout == "packed" else CHANNELS_PER_PASS * passes)
+    passes = 1 if drawn_on.layout == "packed" else -(-drawn_on.channels // CHANNELS_PER_PASS)
+    moved = drawn_on.pixels * (PACKED_BYTES_PER_PIXEL if drawn_on.layout == "packed" else CHANNELS_PER_PASS * passes)
     drawn = app.vertices.or_else(0) * app.raster_ns_per_vertex.or_else(0) * passes
-    drawn += spec.pixels * app.raster_ns_per_pixel.or_else(0) * -(-spec.channels // CHANNELS_PER_PASS)
+    drawn += drawn_on.pixels * app.raster_ns_per_pixel.or_else(0) * -(-drawn_on.channels // CHANNELS_PER_PASS)
     raster = drawn / gpu + moved * app.readback_ns_per_byte.or_else(0)
     times: dict[tuple[str, UnitName], float] = {
         ("pose", "cpu"): batch * app.pose_ms.or_else(0) / cpu,
@@ -106,7 +106,7 @@ def stage_times_ms(profile: Profile, plan: Plan, corners: Corners) -> dict[tuple
 
 def _network_ms(profile: Profile, plan: Plan, corners: Corners) -> dict[tuple[str, UnitName], float]:
     handover = profile.application.handover_ms.or_else(0)
-    work, batch = network_work(plan.spec), plan.way.batch
+    work, batch = plan.network.work, plan.way.batch
     if not plan.gpu_share:
         job = _job(profile, work, plan.runtime, corners, batch=batch)
         return {("infer", plan.runtime): handover + job.total_ms}

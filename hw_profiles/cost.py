@@ -50,6 +50,9 @@ KIND_OF = {
     "LeakyRelu": "elementwise",
 }
 REFERENCE_SIDES = (64, 128)
+#: Permutations between channels first and channels last. The units work channels last, so these only tell a file's
+#: order from the unit's and cost nothing.
+LAYOUT_CHANGES = ((0, 3, 1, 2), (0, 2, 3, 1))
 #: A normalisation by statistics reads its input once for them and once to apply them.
 STATISTICS = frozenset(["InstanceNormalization", "GroupNormalization"])
 
@@ -101,6 +104,30 @@ class Work:
         return sum(o.weights for o in self.operators)
 
 
+class Network(NamedTuple):
+    """What is to be run: the drawn tensor, how it is drawn (`packed` or `split`), and the work that follows on it.
+
+    `facts` says which network it is, for reports.
+    """
+
+    facts: Mapping[str, str]
+    height: int
+    width: int
+    channels: int
+    layout: str
+    work: Work
+
+    @property
+    def pixels(self) -> int:
+        return self.height * self.width
+
+
+def reference_network(spec: NetworkSpec) -> Network:
+    """One of the reference networks."""
+    facts = {"encoder": spec.encoder, "norm": spec.norm}
+    return Network(facts, spec.height, spec.width, spec.channels, spec.layout, network_work(spec))
+
+
 Shapes = Mapping[str, tuple[int, ...]]
 
 
@@ -117,7 +144,7 @@ def walk(model: Any) -> Work:
     operators = tuple(
         _operator(n, shapes, weights)._replace(live=live)
         for n, live in zip(graph.node, alive, strict=True)
-        if n.op_type not in FOLDED
+        if n.op_type not in FOLDED and not _changes_layout(n)
     )
     feeds = [i.name for i in graph.input if i.name not in weights]
     return Work(
@@ -176,6 +203,10 @@ def _size(shapes: Shapes, name: str) -> int:
     if size <= 0:
         raise BadInputError(f"tensor {name}", "no static shape", "a network exported with fixed sizes")
     return size
+
+
+def _changes_layout(node: Any) -> bool:
+    return node.op_type == "Transpose" and any(tuple(a.ints) in LAYOUT_CHANGES for a in node.attribute)
 
 
 def _alive(graph: Any, shapes: Shapes, weights: set[str]) -> list[int]:

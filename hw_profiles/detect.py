@@ -11,6 +11,8 @@ from typing import Any
 
 import psutil
 
+from trilane.hw_profiles.host import usable_cores
+
 CPU_INFO = Path("/proc/cpuinfo")
 #: CPU flag: INT8 and FP32 multiply-accumulates per cycle and core; the first that the machine has counts.
 RATES = {
@@ -25,7 +27,7 @@ FALLBACK_GHZ = 2.5
 
 def host_tables() -> dict[str, Any]:
     """What is laid over the file `host.toml`: peak rates of each unit."""
-    cores = psutil.cpu_count(logical=False) or psutil.cpu_count() or 1
+    cores = len(usable_cores())
     frequency = psutil.cpu_freq()
     ghz = (frequency.max or frequency.current) / 1e3 if frequency else 0.0
     known_ghz = ghz if ghz > 0 else FALLBACK_GHZ

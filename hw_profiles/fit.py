@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from trilane.errors import BadInputError, MissingPartError
 from trilane.hw_profiles.application import Plan, corners_of, network_alone, reference_frame_ms
+from trilane.hw_profiles.cost import reference_network
 from trilane.hw_profiles.load import load_tables, parse_profile
 from trilane.hw_profiles.schema import Profile, UnitName
 from trilane.hw_profiles.table import Row, read_table
@@ -160,9 +161,10 @@ def measurements(rows: Sequence[Row], step: Step) -> list[Measurement]:
 def predicted_ms(profile: Profile, measured: Measurement) -> float:
     """What `profile` says for `measured`, under the performance profile of the measurements."""
     corners, unit = corners_of(profile, MEASURED_UNDER), UNIT_OF_COLUMN[measured.column]
+    network = reference_network(measured.row.spec)
     if measured.column.startswith("bench"):
-        return network_alone(profile, measured.row.spec, unit, corners).total_ms
-    return reference_frame_ms(profile, Plan(measured.row.spec, unit), corners)
+        return network_alone(profile, network, unit, corners).total_ms
+    return reference_frame_ms(profile, Plan(network, unit), corners)
 
 
 def fit_profile(name: str | Path, table: Path) -> Fit:

@@ -23,8 +23,7 @@ from trilane.hw_profiles.application import (
     relative_error,
     steady,
 )
-from trilane.hw_profiles.cost import network_work
-from trilane.hw_profiles.networks import NetworkSpec
+from trilane.hw_profiles.cost import Network, reference_network
 from trilane.hw_profiles.schema import CORNERS, UNITS, Profile, UnitName
 from trilane.hw_profiles.table import Row
 from trilane.hw_profiles.thermal import GOVERNORS, Heat, Throttle, power_allocator, step_wise
@@ -107,10 +106,10 @@ def predict(
     `minutes` 0: the settled application alone, without heat. Raises BadInputError.
     """
     corners = corners_of(profile, performance_profile)
-    spec, unit = plan.spec, profile.units[plan.runtime]
-    alone, now = network_alone(profile, spec, plan.runtime, corners), steady(profile, plan, corners)
+    network, unit = plan.network, profile.units[plan.runtime]
+    alone, now = network_alone(profile, network, plan.runtime, corners), steady(profile, plan, corners)
     moments = over_time(profile, plan, performance_profile, minutes, governor) if minutes else []
-    error, work = relative_error(alone, unit), network_work(spec)
+    error, work = relative_error(alone, unit), network.work
     per_unit = {u: sum(ms for s, ms in now.stages_ms.items() if now.unit_of[s] == u) for u in UNITS}
     frame = _mean([m.frame_ms for m in moments]) if moments else now.frame_ms
     power = _mean([m.power_w for m in moments]) if moments else _settled_power(profile, now, corners)
@@ -143,13 +142,12 @@ def predict(
 
 
 def _config(plan: Plan, performance_profile: str, minutes: float, governor: str) -> dict[str, Any]:
-    spec, way = plan.spec, plan.way
+    network, way = plan.network, plan.way
     return {
-        "encoder": spec.encoder,
-        "norm": spec.norm,
-        "size": f"{spec.height}x{spec.width}",
-        "channels": spec.channels,
-        "layout": spec.layout,
+        **network.facts,
+        "size": f"{network.height}x{network.width}",
+        "channels": network.channels,
+        "layout": network.layout,
         "runtime": plan.runtime,
         "policy": way.policy,
         "edge": way.edge,
@@ -215,13 +213,13 @@ def _mean(values: Sequence[float]) -> float:
     return sum(values) / len(values)
 
 
-def what_if(profile: Profile, spec: NetworkSpec, runtime: UnitName, performance_profile: str) -> list[dict[str, Any]]:
+def what_if(profile: Profile, network: Network, runtime: UnitName, performance_profile: str) -> list[dict[str, Any]]:
     """The same network under every row of `ALTERNATIVES` that the runtime allows."""
     corners = corners_of(profile, performance_profile)
     rows = []
     for name, way, share in ALTERNATIVES:
         if not share or runtime == "dsp":
-            now = steady(profile, Plan(spec, runtime, way, share), corners)
+            now = steady(profile, Plan(network, runtime, way, share), corners)
             rows.append(
                 {"name": name, "frame_ms": now.frame_ms, "fps": 1e3 / now.frame_ms, "latency_ms": now.latency_ms}
             )
@@ -238,16 +236,16 @@ def predict_table(
     """One answer per row: its cells, then `bench_*_ms`, `app_*_ms` with their ranges, and `confidence`."""
     corners = corners_of(profile, performance_profile)
     for done, row in enumerate(rows, 1):
-        yield {**_cells(row), **_row_figures(profile, row.spec, corners, way)}
+        yield {**_cells(row), **_row_figures(profile, reference_network(row.spec), corners, way)}
         on_row(done)
 
 
-def _row_figures(profile: Profile, spec: NetworkSpec, corners: Corners, way: Way) -> dict[str, Any]:
+def _row_figures(profile: Profile, network: Network, corners: Corners, way: Way) -> dict[str, Any]:
     figures: dict[str, Any] = {}
     errors = []
     for runtime in RUNTIMES:
-        alone = network_alone(profile, spec, runtime, corners)
-        frame = steady(profile, Plan(spec, runtime, way), corners, quick=True).frame_ms
+        alone = network_alone(profile, network, runtime, corners)
+        frame = steady(profile, Plan(network, runtime, way), corners, quick=True).frame_ms
         low, high = ema_range_ms(profile, frame)
         errors.append(relative_error(alone, profile.units[runtime]))
         figures |= {f"bench_{runtime}_ms": alone.total_ms, f"app_{runtime}_ms": frame}

@@ -14,7 +14,8 @@ from trilane.apps.cli.console import JsonOption, print_json, stderr_console, std
 from trilane.errors import BadInputError
 
 if TYPE_CHECKING:
-    from trilane.hw_profiles.application import Plan
+    from trilane.hw_profiles.application import Plan, Way
+    from trilane.hw_profiles.cost import Network
     from trilane.hw_profiles.schema import Profile
 
 app = typer.Typer(rich_markup_mode=None, add_completion=False)
@@ -25,6 +26,7 @@ Examples:
   trilane predict --runtime gpu --norm instance --minutes 30
   trilane predict --policy pipelined --edge double --what-if
   trilane predict --performance-profile burst --minutes 30 --plot heat.svg
+  trilane predict --avatar default --runtime gpu
   trilane predict --table rows.csv --json
 """
 SUSTAINED, BURST = "sustained_high_performance", "burst"
@@ -39,6 +41,10 @@ def predict(
     size: Annotated[str, typer.Option(help="Tensor: one side, or HEIGHTxWIDTH.")] = "512",
     channels: Annotated[int, typer.Option(help="Channels of the neural texture, 1 to 16.")] = 16,
     layout: Annotated[str, typer.Option(help="packed: one raster pass; split: one per 4 channels.")] = "packed",
+    avatar: Annotated[
+        str | None, typer.Option(help="An avatar's network instead: `default` or a bundle folder.")
+    ] = None,
+    network: Annotated[Path | None, typer.Option(help="A quantised network instead: an ONNX file.")] = None,
     runtime: Annotated[str, typer.Option(help="Unit of the network: gpu or dsp.")] = "dsp",
     minutes: Annotated[float, typer.Option(help="Virtual minutes with heat; 0: settled, without.")] = 0.0,
     policy: Annotated[
@@ -48,8 +54,8 @@ def predict(
         ),
     ] = "reference",
     edge: Annotated[
-        str, typer.Option(help="Buffers between stages: single, double, triple, fifo:N, orphan.")
-    ] = "double",
+        str | None, typer.Option(help="Buffers between stages: single, double (if not given), triple, fifo:N, orphan.")
+    ] = None,
     batch: Annotated[int, typer.Option(help="Frames per job of the network.")] = 1,
     gpu_share: Annotated[float, typer.Option(help="Share of the network that the GPU does for the DSP.")] = 0.0,
     performance_profile: Annotated[str, typer.Option(help="burst, sustained_high_performance, ...")] = SUSTAINED,
@@ -62,23 +68,24 @@ def predict(
     json: JsonOption = False,
 ) -> None:
     """Predict frame time, idleness, heat and energy on a chip, with the error to expect."""
-    from trilane.hw_profiles.application import REFERENCE, Plan, Way
+    from trilane.hw_profiles.application import Plan
     from trilane.hw_profiles.load import load_runnable
     from trilane.hw_profiles.predict import predict as predict_one
     from trilane.hw_profiles.predict import what_if as alternatives
-    from trilane.hw_profiles.table import spec_of
 
     chip = load_runnable(profile)
-    way = REFERENCE._replace(batch=batch) if policy == "reference" else Way(policy, edge, batch)
+    way = _way(policy, edge, batch)
     if table is not None:
         _predict_table(chip, table, performance_profile, way, json=json)
         return
-    cells = {"encoder": encoder, "norm": norm, "size": size, "channels": str(channels), "layout": layout}
-    spec = spec_of(cells, "options")
-    plan = Plan(spec, _unit(runtime), way, gpu_share)
+    if network is not None or avatar is not None:
+        subject = _network_of(network, avatar, layout)
+    else:
+        subject = _reference(encoder, norm, size, channels, layout)
+    plan = Plan(subject, _unit(runtime), way, gpu_share)
     answer = predict_one(chip, plan, performance_profile, minutes, governor)
     if what_if:
-        answer["alternatives"] = alternatives(chip, spec, plan.runtime, performance_profile)
+        answer["alternatives"] = alternatives(chip, subject, plan.runtime, performance_profile)
     if plot is not None:
         _draw(chip, plan, performance_profile, minutes or PLOT_MINUTES, governor, plot)
     if json:
@@ -87,13 +94,48 @@ def predict(
         _show(answer)
 
 
+def _way(policy: str, edge: str | None, batch: int) -> Way:
+    from trilane.hw_profiles.application import REFERENCE, Way
+
+    if policy != "reference":
+        return Way(policy, edge or "double", batch)
+    if edge not in (None, REFERENCE.edge):
+        fix = "choose a --policy of your own, such as pipelined"
+        raise BadInputError("--edge", repr(edge), f"{REFERENCE.edge}, which the reference application has", fix)
+    return REFERENCE._replace(batch=batch)
+
+
+def _reference(encoder: str, norm: str, size: str, channels: int, layout: str) -> Network:
+    from trilane.hw_profiles.cost import reference_network
+    from trilane.hw_profiles.table import spec_of
+
+    cells = {"encoder": encoder, "norm": norm, "size": size, "channels": str(channels), "layout": layout}
+    return reference_network(spec_of(cells, "options"))
+
+
+def _network_of(path: Path | None, avatar: str | None, layout: str) -> Network:
+    """The network of a file, or of an avatar."""
+    from trilane.avatars.bundle import load_bundle
+    from trilane.avatars.network_file import read_network
+    from trilane.hw_profiles.cost import Network, walk
+
+    if path is not None and avatar is not None:
+        raise BadInputError("options", "--network and --avatar", "one of them")
+    if layout not in ("packed", "split"):
+        raise BadInputError("--layout", repr(layout), "packed or split")
+    file = read_network(path) if path is not None else load_bundle(avatar or "default").read_network()
+    _, height, width, channels = file.shape
+    facts = {"network": str(path)} if path is not None else {"avatar": str(avatar)}
+    return Network(facts, height, width, channels, layout, walk(file.model))
+
+
 def _unit(runtime: str) -> Any:
     if runtime not in ("gpu", "dsp"):
         raise BadInputError("--runtime", repr(runtime), "gpu or dsp")
     return runtime
 
 
-def _predict_table(chip: Profile, path: Path, performance_profile: str, way: Any, *, json: bool) -> None:
+def _predict_table(chip: Profile, path: Path, performance_profile: str, way: Way, *, json: bool) -> None:
     from rich.progress import Progress
 
     from trilane.hw_profiles.predict import predict_table
@@ -135,11 +177,15 @@ def _draw(chip: Profile, plan: Plan, asked: str, minutes: float, governor: str |
 
     names = dict.fromkeys((SUSTAINED, BURST, asked))
     runs = {name: over_time(chip, plan, name, minutes, governor) for name in names}
-    spec = plan.spec
+    net = plan.network
     title = (
-        f"{chip.title}\n{spec.encoder}, {spec.norm}, {spec.height}x{spec.width}x{spec.channels} on the {plan.runtime}"
+        f"{chip.title}\n{', '.join(net.facts.values())}, {net.height}x{net.width}x{net.channels} on the {plan.runtime}"
     )
     plot_over_time(runs, chip.thermal.skin_limit_c.or_else(0.0), title, path)
+
+
+def _named(config: dict[str, Any]) -> str:
+    return ", ".join(str(config[key]) for key in ("avatar", "network", "encoder", "norm") if key in config)
 
 
 def _show(answer: dict[str, Any]) -> None:
@@ -149,7 +195,7 @@ def _show(answer: dict[str, Any]) -> None:
     config, frame, network = answer["config"], answer["frame_time_ms"], answer["network"]
     console.print(f"{answer['machine']['title']} (virtual clock)")
     console.print(
-        f"{config['encoder']}, {config['norm']}, {config['size']}x{config['channels']} {config['layout']} "
+        f"{_named(config)}, {config['size']}x{config['channels']} {config['layout']} "
         f"on the {config['runtime']}: {network['gmac']:.1f} GMAC, {network['parameters_m']:.1f} M parameters"
     )
     console.print(f"network alone   {network['alone_ms']:.1f} ms")

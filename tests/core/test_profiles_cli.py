@@ -52,6 +52,16 @@ def test_predict_answers_a_table(
     assert "mobilenetv3" in capsys.readouterr().out
 
 
+def test_predict_answers_for_an_avatar(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tiny_bundle: Path
+) -> None:
+    document = answer(monkeypatch, capsys, "predict", "--avatar", str(tiny_bundle))
+    assert document["config"]["avatar"] == str(tiny_bundle)
+    assert document["config"]["size"] == "64x64"
+    by_file = answer(monkeypatch, capsys, "predict", "--network", str(tiny_bundle / "network.onnx"))
+    assert by_file["network"] == document["network"]
+
+
 def test_predict_draws_heat(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     path = tmp_path / "heat.svg"
@@ -71,6 +81,7 @@ def test_predict_draws_heat(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> 
         (("predict", "--minutes", "nan"), ("nan",)),
         (("predict", "--policy", "warp"), ("warp", "pipelined")),
         (("predict", "--policy", "pipelined", "--edge", "octuple"), ("octuple", "double")),
+        (("predict", "--edge", "triple"), ("triple", "--policy")),
         (("predict", "--performance-profile", "warp"), ("warp", "burst")),
         (("predict", "--table", "/nope.csv"), ("/nope.csv",)),
         (("predict", "--plot", "heat.bmp"), (".bmp", ".svg")),

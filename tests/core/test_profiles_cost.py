@@ -7,15 +7,19 @@ from dataclasses import replace
 import numpy as np
 import onnx
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
+from trilane.avatars.quantise import Quantised
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import corners_of, network_alone, split_work
-from trilane.hw_profiles.cost import CLASSES, network_work, walk
+from trilane.hw_profiles.cost import CLASSES, network_work, reference_network, walk
 from trilane.hw_profiles.load import load_profile
-from trilane.hw_profiles.networks import ENCODERS, NetworkSpec, build_network, parameters
+from trilane.hw_profiles.networks import ENCODERS, LAYOUTS, NORMS, NetworkSpec, build_network, parameters
 from trilane.hw_profiles.published import PUBLISHED_MS, check_published, resnet18_work, unet_work
 from trilane.hw_profiles.roofline import job_time, machine_of
+from trilane.hw_profiles.schema import UnitName
 
 SUSTAINED = "sustained_high_performance"
 
@@ -111,6 +115,13 @@ def test_quantised_graphs_count_as_their_float_ones() -> None:
     assert (work.input_elements, work.output_elements) == (4 * 256, 8 * 256)
 
 
+def test_a_quantised_avatar_counts_as_its_float_network(tiny_quantised: Quantised, tiny_float: onnx.ModelProto) -> None:
+    """Bytes in and out, channels last: the transposes at the ends change the order of a file and cost nothing."""
+    whole, plain = walk(tiny_quantised.network.model), walk(tiny_float)
+    assert [o.kind for o in whole.operators] == [o.kind for o in plain.operators]
+    assert (whole.macs, whole.weights, whole.input_elements) == (plain.macs, plain.weights, plain.input_elements)
+
+
 def test_an_operator_that_is_not_known_is_named() -> None:
     x = helper.make_tensor_value_info("x", TensorProto.FLOAT, (1, 4, 16, 16))
     y = helper.make_tensor_value_info("y", TensorProto.FLOAT, (1, 4, 16, 16))
@@ -148,6 +159,28 @@ def test_time_is_the_sum_of_its_parts_and_falls_with_the_clock() -> None:
     assert fast.total_ms < slow.total_ms < 2 * fast.total_ms + 1e-9
 
 
+@given(
+    encoder=st.sampled_from(ENCODERS),
+    norm=st.sampled_from(NORMS),
+    layout=st.sampled_from(LAYOUTS),
+    side=st.integers(1, 31),
+    channels=st.integers(4, 15),
+    unit=st.sampled_from(["gpu", "dsp"]),
+)
+def test_more_to_do_never_takes_less_time(
+    encoder: str, norm: str, layout: str, side: int, channels: int, unit: UnitName
+) -> None:
+    profile = load_profile("snapdragon-888")
+
+    def ms(side: int, channels: int) -> float:
+        network = reference_network(NetworkSpec(encoder, norm, 32 * side, 32 * side, channels, layout))
+        return network_alone(profile, network, unit, corners_of(profile, SUSTAINED)).total_ms
+
+    least = ms(side, channels)
+    assert 0 < least <= ms(side + 1, channels)
+    assert least <= ms(side, channels + 1)
+
+
 def test_contention_slows_what_memory_bounds() -> None:
     profile = load_profile("snapdragon-888")
     work = network_work(spec("mobilenetv2", "instance"))
@@ -167,8 +200,8 @@ def test_a_batch_pays_fixed_costs_and_weights_once() -> None:
 def test_group_normalisation_falls_back_on_the_dsp_and_not_on_the_gpu() -> None:
     profile = load_profile("snapdragon-888")
     corners = corners_of(profile, SUSTAINED)
-    assert network_alone(profile, spec(norm="group"), "dsp", corners).parts["fallback"] > 1000
-    assert network_alone(profile, spec(norm="group"), "gpu", corners).parts["fallback"] == 0
+    assert network_alone(profile, reference_network(spec(norm="group")), "dsp", corners).parts["fallback"] > 1000
+    assert network_alone(profile, reference_network(spec(norm="group")), "gpu", corners).parts["fallback"] == 0
 
 
 @pytest.mark.parametrize("share", [0.01, 0.3, 0.9])

@@ -16,6 +16,7 @@ from trilane.hw_profiles.application import (
     stage_times_ms,
     steady,
 )
+from trilane.hw_profiles.cost import reference_network
 from trilane.hw_profiles.load import load_profile
 from trilane.hw_profiles.networks import NetworkSpec
 from trilane.hw_profiles.predict import over_time, predict, predict_table, what_if
@@ -23,7 +24,7 @@ from trilane.hw_profiles.schema import UNITS, UnitName
 from trilane.hw_profiles.table import read_table
 from trilane.hw_profiles.thermal import GOVERNORS, Heat
 
-SPEC = NetworkSpec("resnet18", "batch", 512, 512, 16)
+NETWORK = reference_network(NetworkSpec("resnet18", "batch", 512, 512, 16))
 SUSTAINED, BURST = "sustained_high_performance", "burst"
 RUNTIMES: tuple[UnitName, ...] = ("gpu", "dsp")
 
@@ -34,7 +35,7 @@ RUNTIMES: tuple[UnitName, ...] = ("gpu", "dsp")
 def test_the_closed_form_of_the_fit_is_what_the_scheduler_does(runtime: UnitName, side: int, layout: str) -> None:
     profile = load_profile("snapdragon-888")
     plan, corners = (
-        Plan(NetworkSpec("resnet18", "batch", side, side, 8, layout), runtime),
+        Plan(reference_network(NetworkSpec("resnet18", "batch", side, side, 8, layout)), runtime),
         corners_of(profile, SUSTAINED),
     )
     expected = reference_frame_ms(profile, plan, corners)
@@ -46,7 +47,7 @@ def test_the_closed_form_of_the_fit_is_what_the_scheduler_does(runtime: UnitName
 @pytest.mark.parametrize("edge", ["single", "double", "triple", "fifo:3", "orphan"])
 def test_every_way_of_working_runs_and_accounts_for_its_time(policy: str, edge: str) -> None:
     profile = load_profile("snapdragon-888")
-    now = steady(profile, Plan(SPEC, "dsp", Way(policy, edge)), corners_of(profile, SUSTAINED))
+    now = steady(profile, Plan(NETWORK, "dsp", Way(policy, edge)), corners_of(profile, SUSTAINED))
     assert now.frame_ms >= max(now.stages_ms.values()) - 1e-6
     for unit in UNITS:
         assert now.busy[unit] + sum(now.idle[unit].values()) == pytest.approx(1.0)
@@ -55,14 +56,18 @@ def test_every_way_of_working_runs_and_accounts_for_its_time(policy: str, edge: 
 def test_two_buffers_make_the_network_the_limit() -> None:
     profile = load_profile("snapdragon-888")
     corners = corners_of(profile, SUSTAINED)
-    now = steady(profile, Plan(SPEC, "dsp", Way("pipelined", "double")), corners)
+    now = steady(profile, Plan(NETWORK, "dsp", Way("pipelined", "double")), corners)
     assert now.frame_ms == pytest.approx(now.stages_ms["infer"], rel=0.01)
     assert now.busy["dsp"] > 0.97
 
 
 def test_the_display_caps_what_is_fast() -> None:
     profile = load_profile("snapdragon-888")
-    now = steady(profile, Plan(NetworkSpec("resnet18", "batch", 256, 256, 8), "dsp"), corners_of(profile, SUSTAINED))
+    now = steady(
+        profile,
+        Plan(reference_network(NetworkSpec("resnet18", "batch", 256, 256, 8)), "dsp"),
+        corners_of(profile, SUSTAINED),
+    )
     assert now.capped
     assert now.frame_ms == pytest.approx(16.6)
 
@@ -70,9 +75,9 @@ def test_the_display_caps_what_is_fast() -> None:
 def test_the_network_on_the_gpu_shares_it_with_drawing() -> None:
     profile = load_profile("snapdragon-888")
     corners = corners_of(profile, SUSTAINED)
-    times = stage_times_ms(profile, Plan(SPEC, "gpu"), corners)
+    times = stage_times_ms(profile, Plan(NETWORK, "gpu"), corners)
     together = sum(ms for (_, unit), ms in times.items() if unit == "gpu")
-    assert steady(profile, Plan(SPEC, "gpu", Way("pipelined", "double")), corners).frame_ms == pytest.approx(
+    assert steady(profile, Plan(NETWORK, "gpu", Way("pipelined", "double")), corners).frame_ms == pytest.approx(
         together, rel=0.01
     )
 
@@ -83,7 +88,11 @@ def test_the_network_on_the_gpu_shares_it_with_drawing() -> None:
 def test_sustained_holds_its_rate_for_half_an_hour(runtime: UnitName, governor: str, side: int) -> None:
     profile = load_profile("snapdragon-888")
     moments = over_time(
-        profile, Plan(NetworkSpec("resnet18", "batch", side, side, 16), runtime), SUSTAINED, 30, governor
+        profile,
+        Plan(reference_network(NetworkSpec("resnet18", "batch", side, side, 16)), runtime),
+        SUSTAINED,
+        30,
+        governor,
     )
     frames = [m.frame_ms for m in moments if m.t_s >= 60]
     assert max(frames) <= 1.02 * min(frames)
@@ -93,7 +102,7 @@ def test_sustained_holds_its_rate_for_half_an_hour(runtime: UnitName, governor: 
 @pytest.mark.parametrize("runtime", RUNTIMES)
 @pytest.mark.parametrize("governor", GOVERNORS)
 def test_burst_is_faster_first_and_throttled_later(runtime: UnitName, governor: str) -> None:
-    profile, plan = load_profile("snapdragon-888"), Plan(SPEC, runtime)
+    profile, plan = load_profile("snapdragon-888"), Plan(NETWORK, runtime)
     burst, sustained = (over_time(profile, plan, name, 30, governor) for name in (BURST, SUSTAINED))
     assert burst[0].frame_ms < 0.95 * sustained[0].frame_ms
     assert burst[-1].frame_ms > 1.05 * burst[0].frame_ms
@@ -103,7 +112,7 @@ def test_burst_is_faster_first_and_throttled_later(runtime: UnitName, governor: 
 
 def test_throttling_has_hysteresis() -> None:
     """Corners change a handful of times in half an hour, not at every poll."""
-    moments = over_time(load_profile("snapdragon-888"), Plan(SPEC, "gpu"), BURST, 30)
+    moments = over_time(load_profile("snapdragon-888"), Plan(NETWORK, "gpu"), BURST, 30)
     changes = sum(a.corners != b.corners for a, b in pairwise(moments))
     assert 1 <= changes <= 20
 
@@ -130,7 +139,7 @@ def test_one_long_step_is_many_short_ones() -> None:
 
 
 def test_an_answer_has_the_keys_of_a_report() -> None:
-    answer = predict(load_profile("snapdragon-888"), Plan(SPEC, "dsp"), minutes=2)
+    answer = predict(load_profile("snapdragon-888"), Plan(NETWORK, "dsp"), minutes=2)
     assert {"schema", "clock", "machine", "config", "frame_time_ms", "latency_ms", "fps", "stages", "units"} <= set(
         answer
     )
@@ -142,13 +151,13 @@ def test_an_answer_has_the_keys_of_a_report() -> None:
 
 
 def test_an_unknown_chip_is_less_certain_than_a_measured_one() -> None:
-    plan = Plan(SPEC, "dsp")
+    plan = Plan(NETWORK, "dsp")
     known, guessed = (predict(load_profile(name), plan)["confidence"] for name in ("snapdragon-888", "snapdragon-865"))
     assert guessed < known < 1
 
 
 def test_every_alternative_is_answered() -> None:
-    rows = {row["name"]: row["frame_ms"] for row in what_if(load_profile("snapdragon-888"), SPEC, "dsp", SUSTAINED)}
+    rows = {row["name"]: row["frame_ms"] for row in what_if(load_profile("snapdragon-888"), NETWORK, "dsp", SUSTAINED)}
     assert rows["pipelined, two buffers"] < rows["reference application"] < rows["one frame at a time"]
 
 
@@ -180,11 +189,11 @@ def test_a_table_keeps_its_columns_and_answers_every_row(tmp_path: Path) -> None
 )
 def test_a_plan_out_of_range_is_refused(change: dict[str, object], word: str) -> None:
     with pytest.raises(BadInputError, match=word):
-        Plan(**{"spec": SPEC, "runtime": "dsp", **change})  # type: ignore[arg-type]
+        Plan(**{"network": NETWORK, "runtime": "dsp", **change})  # type: ignore[arg-type]
 
 
 def test_unknown_names_are_refused() -> None:
-    profile, plan = load_profile("snapdragon-888"), Plan(SPEC, "dsp")
+    profile, plan = load_profile("snapdragon-888"), Plan(NETWORK, "dsp")
     with pytest.raises(BadInputError, match="warp"):
         predict(profile, plan, "warp")
     with pytest.raises(BadInputError, match="magic"):
@@ -192,4 +201,4 @@ def test_unknown_names_are_refused() -> None:
     with pytest.raises(BadInputError, match="minutes"):
         predict(profile, plan, minutes=-1)
     with pytest.raises(BadInputError, match="edge"):
-        predict(profile, Plan(SPEC, "dsp", Way(edge="quadruple")))
+        predict(profile, Plan(NETWORK, "dsp", Way(edge="quadruple")))
