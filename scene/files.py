@@ -6,6 +6,8 @@ Rule: whatever is wrong with a file becomes one BadInputError that names it.
 from __future__ import annotations
 
 import math
+import tokenize
+import warnings
 import zipfile
 import zlib
 from collections.abc import Collection
@@ -20,7 +22,17 @@ from trilane.errors import BadInputError
 MAX_ARRAY_BYTES = 1 << 30
 MAX_TEXT_BYTES = 256 << 20
 
-_DAMAGED = (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError)
+#: What NumPy and zipfile raise on damaged files.
+DAMAGED = (
+    OSError,
+    ValueError,
+    EOFError,
+    tokenize.TokenError,
+    zipfile.BadZipFile,
+    zlib.error,
+    NotImplementedError,
+    RuntimeError,
+)
 _HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
@@ -61,8 +73,8 @@ def read_npy(path: Path, expected: str) -> NDArray[Any]:
             if size - file.tell() < wanted:
                 raise BadInputError(path, f"{size} bytes, truncated", f"{file.tell() + wanted} by its own header")
             file.seek(0)
-            return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
-    except (OSError, ValueError, EOFError) as error:
+            return _read_array(file)
+    except DAMAGED as error:
         raise BadInputError(path, f"no readable NumPy array ({error})", expected) from error
 
 
@@ -73,7 +85,7 @@ def read_npz(path: Path, keys: Collection[str], expected: str) -> dict[str, NDAr
         with zipfile.ZipFile(path) as archive:
             names = {info.filename: info for info in archive.infolist()}
             return {key: _member(path, archive, names[f"{key}.npy"]) for key in keys if f"{key}.npy" in names}
-    except _DAMAGED as error:
+    except DAMAGED as error:
         raise BadInputError(path, f"no readable .npz archive ({error})", expected) from error
 
 
@@ -84,17 +96,34 @@ def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDAr
         if info.file_size < wanted:
             raise BadInputError(where, f"{info.file_size} bytes, truncated", f"{wanted} by its own header")
     with archive.open(info) as file:
+        return _read_array(file)
+
+
+def read_header(where: Path | str, file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Shape, Fortran order and type of the array whose `.npy` header comes next in `file`.
+
+    Raises BadInputError on pickled objects and unknown versions, one of DAMAGED on a broken header.
+    """
+    version = np.lib.format.read_magic(file)
+    if version not in _HEADERS:
+        raise BadInputError(where, f".npy version {version}", "1.0 or 2.0")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of headers written by Python 2
+        shape, fortran, dtype = _HEADERS[version](file)
+    if dtype.hasobject:
+        raise BadInputError(where, "pickled objects", "numbers", "save it as a plain number array")
+    return shape, fortran, dtype
+
+
+def _read_array(file: IO[bytes]) -> NDArray[Any]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
         return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
 
 
 def _checked_bytes(where: Path | str, file: IO[bytes], expected: str) -> int:
     """Bytes of data that the header announces; leaves `file` at their start."""
-    version = np.lib.format.read_magic(file)
-    if version not in _HEADERS:
-        raise BadInputError(where, f".npy version {version}", "1.0 or 2.0")
-    shape, _, dtype = _HEADERS[version](file)
-    if dtype.hasobject:
-        raise BadInputError(where, "pickled objects", expected, "save it as a plain number array")
+    shape, _, dtype = read_header(where, file)
     if any(side < 0 for side in shape):
         raise BadInputError(where, f"shape {shape}", expected)
     wanted = math.prod(shape) * dtype.itemsize

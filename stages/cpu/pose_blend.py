@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import zipfile
-import zlib
 from pathlib import Path
 from typing import IO, Any
 
@@ -15,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
+from trilane.scene.files import DAMAGED, read_header
 
 KEY = "posedirs"
 MAX_BYTES = 1 << 30
 _CHUNK_ITEMS = 1 << 18
-_DAMAGED = (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError)
-_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 def read_pose_blend(path: Path, shape: tuple[int, int, int]) -> NDArray[np.float32] | None:
@@ -34,7 +32,7 @@ def read_pose_blend(path: Path, shape: tuple[int, int, int]) -> NDArray[np.float
                 raise BadInputError(path, f"no array {KEY!r}", "a body file in the SMPL-X layout (.npz)")
             with archive.open(f"{KEY}.npy") as file:
                 return _read(f"{path}[{KEY}]", file, shape)
-    except _DAMAGED as error:
+    except DAMAGED as error:
         raise BadInputError(path, f"no readable .npz archive ({error})", "a body file (.npz)") from error
 
 
@@ -64,12 +62,7 @@ def _read(where: str, file: IO[bytes], shape: tuple[int, int, int]) -> NDArray[n
 
 
 def _check_header(where: str, file: IO[bytes], shape: tuple[int, int, int]) -> tuple[np.dtype[Any], Any]:
-    version = np.lib.format.read_magic(file)
-    if version not in _HEADERS:
-        raise BadInputError(where, f".npy version {version}", "1.0 or 2.0")
-    found, fortran, dtype = _HEADERS[version](file)
-    if dtype.hasobject:
-        raise BadInputError(where, "pickled objects", "numbers", "save it as a plain number array")
+    found, fortran, dtype = read_header(where, file)
     if dtype.kind not in "fiu":
         raise BadInputError(where, f"dtype {dtype}", "numbers")
     if found != shape:

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from trilane.errors import BadInputError
 from trilane.scene.motion.base import Motion, Wrap
@@ -204,6 +206,27 @@ def test_an_npz_without_its_keys_or_damaged_is_refused(tmp_path: Path) -> None:
         archive.writestr("poses.npy", pickle.dumps({}))
     with pytest.raises(BadInputError, match=r"no readable \.npz"):
         load(path)
+
+
+@pytest.mark.parametrize("name", ["a.npy", "a.npz"])
+@given(st.lists(st.tuples(st.integers(0, 300), st.integers(0, 255)), min_size=1, max_size=6))
+@settings(max_examples=60, deadline=None)
+def test_damaged_arrays_are_read_or_refused(
+    tmp_path_factory: pytest.TempPathFactory, name: str, changes: list[tuple[int, int]]
+) -> None:
+    path = tmp_path_factory.mktemp("damaged") / name
+    if name == "a.npy":
+        np.save(path, poses())
+    else:
+        amass(path)
+    content = bytearray(path.read_bytes())
+    for place, value in changes:
+        content[place] = value
+    path.write_bytes(content)
+    try:
+        load(path)
+    except BadInputError as error:
+        assert name in str(error)
 
 
 def test_real_smplx_poses_stand_up(shared_data: Path) -> None:
