@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +23,10 @@ EMITTERS = 6000
 
 @dataclass(frozen=True)
 class BodyArrays:
-    """`vertices` (V,3) metres at rest, `faces` (F,3), `uv` (T,2), `uv_faces` (F,3), `weights` (V,55), `joints` (55,3)."""
+    """`vertices` (V,3) metres at rest, `faces` (F,3), `uv` (T,2), `uv_faces` (F,3), `weights` (V,55).
+
+    `joints` (55,3) at rest.
+    """
 
     vertices: F64
     faces: NDArray[np.int64]
@@ -51,11 +53,11 @@ class Layer:
 
 
 def dress(body: BodyArrays, found: Landmarks) -> list[Layer]:
-    """All layers of a dressed body, in the order of `MATERIALS`; the two shoes share one layer each for upper and sole."""
+    """All layers of a dressed body, the outer ones first; the two shoes share one layer each for upper and sole."""
     plain = [
-        ("skin", body.vertices, body.faces, body.vertices, body.weights),
         *(_garment(body, found, name) for name in GARMENTS),
         *_shoes(body, found),
+        ("skin", body.vertices, body.faces, body.vertices, body.weights),
     ]
     normals = [vertex_normals(vertices, faces) for _, vertices, faces, _, _ in plain]
     lights = _lights(plain, normals)
@@ -81,7 +83,8 @@ def _garment(body: BodyArrays, found: Landmarks, name: str) -> Plain:
 def _shirt_covers(at: F64, found: Landmarks) -> NDArray[np.bool_]:
     joints = found.joints
     below_sleeve = np.abs(at[:, 0]) < joints[marks.ELBOW, 0]
-    return below_sleeve & (at[:, 1] > joints[marks.HIP, 1] - 0.16) & (at[:, 1] < joints[marks.HEAD, 1] - 0.03)
+    above, below = at[:, 1] > joints[marks.HIP, 1] - 0.16, at[:, 1] < joints[marks.HEAD, 1] - 0.03
+    return np.asarray(below_sleeve & above & below)
 
 
 def _shirt_thickness(at: F64, found: Landmarks) -> tuple[F64, F64, int]:
@@ -98,7 +101,8 @@ def _shirt_thickness(at: F64, found: Landmarks) -> tuple[F64, F64, int]:
 def _trousers_covers(at: F64, found: Landmarks) -> NDArray[np.bool_]:
     joints = found.joints
     hand = np.abs(at[:, 0]) > joints[marks.SHOULDER, 0] + 0.1
-    return (at[:, 1] < joints[marks.PELVIS, 1] + 0.2) & (at[:, 1] > joints[marks.ANKLE, 1] - 0.04) & ~hand
+    below, above = at[:, 1] < joints[marks.PELVIS, 1] + 0.2, at[:, 1] > joints[marks.ANKLE, 1] - 0.04
+    return np.asarray(below & above & ~hand)
 
 
 def _trousers_thickness(at: F64, found: Landmarks) -> tuple[F64, F64, int]:
@@ -111,14 +115,16 @@ def _trousers_thickness(at: F64, found: Landmarks) -> tuple[F64, F64, int]:
 
 
 def _hair_covers(at: F64, found: Landmarks) -> NDArray[np.bool_]:
-    return at[:, 1] > found.joints[marks.NECK, 1] + 0.01
+    return np.asarray(at[:, 1] > found.joints[marks.NECK, 1] + 0.01)
 
 
 def _hair_thickness(at: F64, found: Landmarks) -> tuple[F64, F64, int]:
     up = smoothstep(found.eye[1] + 0.01, found.crown - 0.02, at[:, 1])
     front = smoothstep(found.eye[2] - 0.09, found.eye[2] + 0.01, at[:, 2])
     nape = smoothstep(found.eye[1] - 0.02, found.eye[1] - 0.1, at[:, 1])
-    temple = smoothstep(found.eye[1] + 0.05, found.eye[1], at[:, 1]) * smoothstep(found.ear[2] - 0.03, found.ear[2], at[:, 2])
+    temple = smoothstep(found.eye[1] + 0.05, found.eye[1], at[:, 1]) * smoothstep(
+        found.ear[2] - 0.03, found.ear[2], at[:, 2]
+    )
     lock = np.sin(60.0 * at[:, 0] + 25.0 * at[:, 2]) + np.sin(33.0 * at[:, 0] - 41.0 * at[:, 2] + 2.0)
     offset = (0.018 + 0.015 * up + 0.004 * up * front + 0.0022 * lock * up) * (1 - 0.6 * nape) * (1 - 0.7 * temple)
     return offset, 0.75 * offset, 8
@@ -137,7 +143,9 @@ GARMENTS: dict[str, tuple[Covers, Thickness]] = {
 def _shoes(body: BodyArrays, found: Landmarks) -> list[Plain]:
     layers: list[Plain] = []
     for part in ("shoe", "sole"):
-        pieces = [shoe(body.vertices, found.joints[ankle], side, part == "sole") for side, (ankle, _) in marks.LEG.items()]
+        pieces = [
+            shoe(body.vertices, found.joints[ankle], side, part == "sole") for side, (ankle, _) in marks.LEG.items()
+        ]
         vertices = np.vstack([vertices for vertices, _ in pieces])
         count = len(pieces[0][0])
         faces = np.vstack([faces + count * number for number, (_, faces) in enumerate(pieces)])
@@ -164,7 +172,11 @@ def _lights(plain: list[Plain], normals: list[F64]) -> list[F64]:
     lights = []
     for (_, vertices, faces, _, _), normal in zip(plain, normals, strict=True):
         raw = obscurance(
-            vertices + 0.004 * normal, normal, everything[some], every_normal[some], every_area[some] * step,
+            vertices + 0.004 * normal,
+            normal,
+            everything[some],
+            every_normal[some],
+            every_area[some] * step,
             OBSCURANCE_REACH_M,
         )
         lights.append(Smoother(faces, len(vertices)).smooth(raw, 3))
@@ -172,12 +184,4 @@ def _lights(plain: list[Plain], normals: list[F64]) -> list[F64]:
 
 
 def _mark(name: str, found: Landmarks, count: int) -> F64:
-    return found.eyeball.astype(np.float64) if name == "skin" else np.zeros(count)
-
-
-def standoff(layer: Layer, of: BodyArrays) -> F64:
-    """Height (N,) of each vertex of a layer over the point of the body below it, along the body's normal, metres."""
-    normal: Any = vertex_normals(of.vertices, of.faces)
-    index = {tuple(point): number for number, point in enumerate(of.vertices)}
-    own = normal[[index[tuple(point)] for point in layer.below]]
-    return np.einsum("ij,ij->i", layer.vertices - layer.below, own)
+    return np.asarray(found.eyeball, np.float64) if name == "skin" else np.zeros(count)

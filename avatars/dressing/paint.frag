@@ -26,7 +26,7 @@ out vec4 pixel;
 
 const vec3 SKIN = vec3(0.88, 0.67, 0.54);
 const vec3 BLUSH = vec3(0.84, 0.47, 0.40);
-const vec3 LIP = vec3(0.74, 0.36, 0.34);
+const vec3 LIP = vec3(0.75, 0.42, 0.38);
 const vec3 BROW = vec3(0.24, 0.15, 0.10);
 const vec3 IRIS = vec3(0.24, 0.42, 0.46);
 const vec3 SHIRT = vec3(0.07, 0.47, 0.52);
@@ -83,8 +83,8 @@ vec3 paint_skin(vec3 p) {
     float s = abs(q.x);
     vec3 c = SKIN * (1.0 + 0.025 * rough(p * 40.0));
     float face = over(q.z + 0.045, 0.02) * over(p.y - neck.y - 0.02, 0.02);
-    c = mix(c, BLUSH, 0.45 * face * blob(vec2(s - 0.040, q.y + 0.036), vec2(0.026, 0.022), 0.8));
-    c = mix(c, BLUSH, 0.35 * face * blob(vec2(s, q.y + 0.036), vec2(0.015, 0.014), 0.7) * over(q.z - 0.018, 0.01));
+    c = mix(c, BLUSH, 0.28 * face * blob(vec2(s - 0.040, q.y + 0.036), vec2(0.026, 0.022), 0.8));
+    c = mix(c, BLUSH, 0.25 * face * blob(vec2(s, q.y + 0.036), vec2(0.015, 0.014), 0.7) * over(q.z - 0.018, 0.01));
     c = mix(c, BLUSH, 0.45 * blob((p - vec3(sign(p.x) * ear.x, ear.yz)).zy, vec2(0.03, 0.04), 0.5) * over(s - ear.x + 0.02, 0.006));
     c = mix(c, c * vec3(0.92, 0.84, 0.82), face * blob(vec2(s - eyeball.x, q.y - 0.001), vec2(0.020, 0.010), 0.7));
     // mouth: lips round a dark line
@@ -119,7 +119,7 @@ vec3 paint_shirt(vec3 p) {
     c = mix(c, c * 0.55, band(abs(p.x) - shoulder.x + 0.012, 0.0022, 0.0012) * over(p.y - shoulder.y + 0.10, 0.01));        // shoulder seam
     c = mix(c, c * 0.55, band(p.y - hip.y + 0.042, 0.0018, 0.0012));                    // hem stitch
     float tilt = p.y - neck.y + 0.45 * (p.z - neck.z);
-    c = mix(c, CREAM, over(tilt + 0.012, 0.0015) * over(0.115 - length(p.xz - neck.xz), 0.004));                                      // collar
+    c = mix(c, CREAM, over(tilt + 0.012, 0.0015) * over(0.115 - length(p.xz - neck.xz), 0.0015));                                      // collar
     float front = over(p.z - neck.z - 0.03, 0.005);
     float placket = front * over(p.y - chest - 0.053, 0.001) * over(-0.012 - tilt, 0.0015);
     c = mix(c, SHIRT * 0.72, placket * band(p.x, 0.017, 0.0012));
@@ -213,7 +213,9 @@ void main() {
     vec3 linear_colour = pow(clamp(paint(v_rest), 0.0, 1.0), vec3(2.2));
     vec3 to_eye = normalize(eye - v_position);
     vec3 normal = normalize(v_normal);
-    bool inside = gl_FrontFacing;  // rows of the target run from the top, which turns triangles round
+    vec3 flat_normal = cross(dFdx(v_position), dFdy(v_position));
+    if (dot(flat_normal, to_eye) < 0.0) flat_normal = -flat_normal;
+    bool inside = dot(flat_normal, normal) < 0.0;
     if (dot(normal, to_eye) < 0.0) normal = -normal;
     vec3 lamp = normalize(transpose(mat3(view)) * vec3(0.25, 0.45, 1.0));
     float lit = 0.40 + 0.62 * pow(0.5 + 0.5 * dot(normal, lamp), 1.5);

@@ -59,7 +59,10 @@ def _stitch(rings: int, capped: bool) -> NDArray[np.int64]:
     faces = []
     for ring in range(rings - 1):
         low, high = ring * ANGLES, (ring + 1) * ANGLES
-        faces += [np.stack([low + here, low + after, high + here], 1), np.stack([low + after, high + after, high + here], 1)]
+        faces += [
+            np.stack([low + here, low + after, high + here], 1),
+            np.stack([low + after, high + after, high + here], 1),
+        ]
     bottom = np.full(ANGLES, rings * ANGLES)
     faces.append(np.stack([bottom, after, here], 1))
     if capped:

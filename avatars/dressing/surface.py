@@ -98,4 +98,4 @@ def smoothstep(low: float, high: float, values: F64) -> F64:
 
 
 def _scatter(faces: Ints, values: F64, count: int) -> F64:
-    return np.bincount(faces.ravel(), weights=values, minlength=count)
+    return np.asarray(np.bincount(faces.ravel(), weights=values, minlength=count), np.float64)

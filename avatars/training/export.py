@@ -8,8 +8,10 @@ from __future__ import annotations
 import io
 import warnings
 
+import numpy as np
 import onnx
 import torch
+from onnx import numpy_helper
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
@@ -67,4 +69,16 @@ def export_onnx(network: UNet, height: int, width: int) -> onnx.ModelProto:
             input_names=[INPUT],
             output_names=[OUTPUT],
         )
-    return onnx.load_model_from_string(file.getvalue())
+    model = onnx.load_model_from_string(file.getvalue())
+    _free_reshapes(model)
+    return model
+
+
+def _free_reshapes(model: onnx.ModelProto) -> None:
+    """Let every Reshape take batch and width from its input and work out the height, so that no shape is fixed."""
+    makers = {out: node for node in model.graph.node for out in node.output}
+    for node in model.graph.node:
+        if node.op_type == "Reshape":
+            shape = makers[node.input[1]].attribute[0].t
+            channels = int(numpy_helper.to_array(shape)[1])
+            shape.CopyFrom(numpy_helper.from_array(np.array([0, channels, -1, 0], np.int64)))

@@ -21,10 +21,21 @@ DECODER = (256, 128, 64, 64, 64)
 GROUPS = 8
 STRIDE = 32
 
+
+class GroupNorm(nn.GroupNorm):
+    """`nn.GroupNorm` in operators that quantise: an instance norm over groups, then a depthwise 1x1 convolution."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        n, c, h, w = x.shape
+        grouped = x.reshape(n, self.num_groups, c // self.num_groups * h, w)
+        x = functional.instance_norm(grouped, eps=self.eps).reshape(n, c, h, w)
+        return functional.conv2d(x, self.weight.view(c, 1, 1, 1), self.bias, groups=c)
+
+
 NORMS: dict[str, Callable[[int], nn.Module]] = {
     "batch": nn.BatchNorm2d,
     "instance": lambda channels: nn.InstanceNorm2d(channels, affine=True),
-    "group": lambda channels: nn.GroupNorm(math.gcd(channels, GROUPS), channels),
+    "group": lambda channels: GroupNorm(math.gcd(channels, GROUPS), channels),
 }
 
 

@@ -1,0 +1,66 @@
+"""The neural texture: one image of C channels kept as the sum of several scales.
+
+Rule: coarse scales carry what neighbours share, fine ones start at zero and hold only what the pictures demand.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
+
+F32 = NDArray[np.float32]
+
+SIDES = (512, 256, 128, 64, 32)
+LIMIT = 1.0
+
+
+class NeuralTexture(nn.Module):
+    """`start` (S,S,C): what the texture begins as, S the greatest of `sides`; the finest scale begins at zero.
+
+    The scales are fitted to `start` from the coarsest on, each to what the coarser ones leave. The sum is clipped to
+    -1..1, because the network's input has one byte range for all channels.
+    """
+
+    def __init__(self, start: F32, sides: tuple[int, ...] = SIDES) -> None:
+        super().__init__()
+        target = torch.from_numpy(np.ascontiguousarray(start.transpose(2, 0, 1)))[None]
+        self.side = sides[0]
+        scales: list[Tensor] = []
+        left = target
+        for side in sorted(sides):
+            scale = functional.interpolate(left, size=(side, side), mode="area")
+            scale = scale if side != self.side else torch.zeros_like(scale)
+            left = left - _enlarged(scale, self.side)
+            scales.append(scale)
+        self.scales = nn.ParameterList([nn.Parameter(scale) for scale in reversed(scales)])
+
+    def image(self) -> Tensor:
+        """The texture (1, C, S, S)."""
+        total = self.scales[0]
+        for scale in list(self.scales)[1:]:
+            total = total + _enlarged(scale, self.side)
+        return total.clamp(-LIMIT, LIMIT)
+
+
+def _enlarged(scale: Tensor, side: int) -> Tensor:
+    if scale.shape[-1] == side:
+        return scale
+    return functional.interpolate(scale, size=(side, side), mode="bilinear", align_corners=False)
+
+
+def sample(image: Tensor, uv: Tensor, covered: Tensor) -> Tensor:
+    """The network's input (N, C, H, W), channels last: `image` (1, C, S, S) read bilinearly at `uv` where `covered`.
+
+    `uv` (N, H, W, 2) in 0..1, `covered` (N, H, W) bool. Pixels not covered are exactly 0.
+    """
+    n, h, w = covered.shape
+    points = uv[covered] * 2 - 1
+    values = functional.grid_sample(
+        image, points[None, None], mode="bilinear", align_corners=False, padding_mode="border"
+    )
+    filled = image.new_zeros((n, h, w, image.shape[1]))
+    filled[covered] = values[0, :, 0].T
+    return filled.permute(0, 3, 1, 2)

@@ -1,0 +1,152 @@
+"""`python -m trilane.avatars.training.train`: render, train, quantise, validate and write an avatar in one go.
+
+Rule: everything a run depends on is in `TrainConfig`, and the command that was run is written into the bundle.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shlex
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from trilane.avatars.bundle import bundle_folder
+from trilane.avatars.training.data import open_groups
+from trilane.avatars.training.dataset import Sample, Studio, body_arrays, plan_training, plan_validation, write_dataset
+from trilane.avatars.training.finish import finish, write_avatar
+from trilane.avatars.training.fit import Avatar, FitConfig, fit, load_avatar, save_avatar
+from trilane.avatars.training.network import UNet
+from trilane.avatars.training.start import first_texture
+from trilane.avatars.training.texture import SIDES, NeuralTexture
+from trilane.errors import BadInputError, TrilaneError
+from trilane.scene.motion.load import load_motion
+from trilane.scene.schema import AvatarSpec
+from trilane.stages.cpu.body import ShapedBody, load_body
+
+CHANNELS = 16
+CHECKPOINT, FINAL, FACTS, TRAINING = "checkpoint.npz", "final.npz", "dataset.json", "training"
+BUILTIN_HELD_OUT = "builtin:walk-wave-turn"
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """One training run. `held_out`: motions that validation poses come from. `weights`: skip training, use these."""
+
+    body: Path = bundle_folder("default") / "body.npz"
+    out: Path = Path("avatar")
+    work: Path = Path("avatar-work")
+    sheet: Path | None = None
+    minutes: float = 60.0
+    samples: int = 4000
+    per_band: int = 24
+    held_out: tuple[str, ...] = (BUILTIN_HELD_OUT,)
+    width: int = 16
+    workers: int = 3
+    batch: int = 4
+    seed: int = 1
+    weights: Path | None = None
+
+
+def train(config: TrainConfig, report: Callable[[str], None], command: str = "") -> Path:
+    """Run `config` and return the bundle's folder. Raises BadInputError for inputs that do not fit."""
+    torch.manual_seed(config.seed)
+    shaped = load_body(config.body).shape()
+    studio = Studio(shaped, threads=config.workers)
+    held_out = held_out_samples(studio, config)
+    _render(studio, config, report)
+    avatar, steps = _fitted(shaped, config, report)
+    report("quantising and judging")
+    torch.set_num_threads(config.workers)
+    groups = open_groups(config.work / TRAINING)
+    done, made, texture, scale = finish(avatar, studio, shaped, groups, held_out, config.seed, config.workers)
+    facts = {
+        "body": "the default body, dressed by trilane.avatars.dressing",
+        "samples": config.samples,
+        "steps": steps,
+        "batch": config.batch,
+        "seed": config.seed,
+        "held_out_motions": [Path(name).name for name in config.held_out],
+        "texture_sides": list(SIDES),
+    }
+    write_avatar(config.out, config.body, done, made, texture, scale, config.width, facts, command)
+    if config.sheet is not None:
+        Image.fromarray(done.sheet).save(config.sheet, optimize=True)
+    report(json.dumps({"float": done.float_figures, "integer": done.integer_figures}))
+    return config.out
+
+
+def held_out_samples(studio: Studio, config: TrainConfig) -> list[Sample]:
+    """The validation samples of `config`, the same every time."""
+    motions = [load_motion(AvatarSpec(motion=name), Path.cwd()) for name in config.held_out]
+    return plan_validation(studio, config.per_band, config.seed, motions)
+
+
+def _render(studio: Studio, config: TrainConfig, report: Callable[[str], None]) -> None:
+    facts, folder = config.work / FACTS, config.work / TRAINING
+    wanted = {"samples": config.samples, "seed": config.seed}
+    if facts.exists():
+        found = json.loads(facts.read_text())
+        if found != wanted:
+            raise BadInputError(facts, str(found), str(wanted), "use another --work folder")
+        return
+    report(f"rendering {config.samples} samples into {folder}")
+    samples = plan_training(studio, config.samples, config.seed)
+    write_dataset(config.body, samples, folder, config.workers)
+    facts.write_text(json.dumps(wanted))
+
+
+def _fitted(shaped: ShapedBody, config: TrainConfig, report: Callable[[str], None]) -> tuple[Avatar, int]:
+    network = UNet(width=config.width, channels=CHANNELS)
+    if config.weights is not None:
+        blank = np.zeros((SIDES[0], SIDES[0], CHANNELS), np.float32)
+        return load_avatar(Avatar(NeuralTexture(blank), network), config.weights)
+    groups = open_groups(config.work / TRAINING)
+    start = first_texture(body_arrays(shaped), groups, SIDES[0], CHANNELS)
+    settings = FitConfig(minutes=config.minutes, workers=config.workers, batch=config.batch, seed=config.seed)
+
+    def checkpoint(avatar: Avatar, steps: int) -> None:
+        save_avatar(avatar, steps, config.work / CHECKPOINT)
+
+    avatar, steps = fit(Avatar(NeuralTexture(start), network), config.work / TRAINING, settings, report, checkpoint)
+    save_avatar(avatar, steps, config.work / FINAL)
+    return avatar, steps
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Parse the command line, run, and return the exit code."""
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    parser = argparse.ArgumentParser(prog="python -m trilane.avatars.training.train", description=__doc__)
+    for field in fields(TrainConfig):
+        default = field.default
+        if isinstance(default, tuple):
+            parser.add_argument("--held-out", action="append", help=f"motion for validation (default {default[0]})")
+        else:
+            kind = Path if default is None or isinstance(default, Path) else type(default)
+            parser.add_argument(f"--{field.name.replace('_', '-')}", type=kind, default=default, help=f"({default})")
+    values = vars(parser.parse_args(given))
+    values["held_out"] = tuple(values["held_out"] or (BUILTIN_HELD_OUT,))
+    started = time.monotonic()
+
+    def report(line: str) -> None:
+        print(f"{time.monotonic() - started:7.0f} s  {line}", file=sys.stderr, flush=True)
+
+    try:
+        folder = train(TrainConfig(**values), report, shlex.join([parser.prog, *given]))
+    except TrilaneError as error:
+        print(error, file=sys.stderr)
+        return error.exit_code
+    print(os.fspath(folder))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
