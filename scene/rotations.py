@@ -134,15 +134,21 @@ def normalised(vectors: ArrayLike) -> Array:
 
 
 def shortest_turn(source: ArrayLike, target: ArrayLike, fallback: ArrayLike = (1.0, 0.0, 0.0)) -> Array:
-    """Rotation matrices (..., 3, 3) of the least angle that turn directions `source` to `target`, both (..., 3).
+    """Rotation matrix (3, 3) of the least angle that turns direction `source` (3,) to `target` (3,).
 
-    Opposite directions are turned about the part of `fallback` that is square to them.
+    Opposite directions are turned about the part of `fallback` that is square to them, if it has one.
     """
     a, b = normalised(source), normalised(target)
     axis = np.cross(a, b)
-    sine = np.sqrt((axis * axis).sum(axis=-1, keepdims=True))
-    side = np.asarray(fallback, dtype=np.float64)
-    side = side - (side * a).sum(axis=-1, keepdims=True) * a
-    unit = np.where(sine > 1e-9, axis / np.maximum(sine, 1e-300), normalised(side))
-    angle = np.arctan2(sine, (a * b).sum(axis=-1, keepdims=True))
-    return matrix_from_rotvec(unit * angle)
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-9:
+        axis = _square_to(a, np.asarray(fallback, dtype=np.float64))
+    return matrix_from_rotvec(normalised(axis) * np.arctan2(sine, a @ b))
+
+
+def _square_to(unit: Array, wish: Array) -> Array:
+    """The part of `wish` (3,) square to `unit` (3,), or else any direction that is."""
+    side = wish - (wish @ unit) * unit
+    if np.linalg.norm(side) > 1e-6:
+        return np.asarray(side)
+    return np.cross(unit, np.eye(3)[np.abs(unit).argmin()])

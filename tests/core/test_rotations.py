@@ -63,3 +63,4 @@ def test_the_shortest_turn_lays_one_direction_on_the_other(source: np.ndarray, t
 
 def test_opposite_directions_turn_about_the_fallback() -> None:
     assert rot.shortest_turn([0, 0, 1], [0, 0, -1]) == pytest.approx(np.diag([1.0, -1.0, -1.0]), abs=1e-12)
+    assert rot.shortest_turn([1, 0, 0], [-1, 0, 0]) @ [1, 0, 0] == pytest.approx([-1, 0, 0], abs=1e-12)
