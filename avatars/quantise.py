@@ -33,7 +33,19 @@ OUTPUT_SCALE = 1 / 255
 
 QUANTISED = [
     *("Conv", "ConvTranspose", "Gemm", "Add", "Mul", "Concat", "MaxPool", "AveragePool", "GlobalAveragePool", "Resize"),
-    *("Relu", "Clip", "Sigmoid", "Reshape", "Transpose", "Slice", "Split", "Pad"),
+    *(
+        "InstanceNormalization",
+        "Relu",
+        "Clip",
+        "Sigmoid",
+        "HardSigmoid",
+        "HardSwish",
+        "Reshape",
+        "Transpose",
+        "Slice",
+        "Split",
+        "Pad",
+    ),
 ]
 
 

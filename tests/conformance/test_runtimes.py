@@ -24,8 +24,8 @@ from trilane.stages.dsp.runtime import RUNTIMES, RuntimeOptions, load_runtime
 #: The first whose DequantizeLinear the evaluator has; the operators used mean the same as in the files' own.
 EVALUATOR_OPSET = 19
 
-#: Largest and mean difference in bytes. One step of a logit is 3.3 bytes where the sigmoid is steepest, and the tiny network's
-#: random weights leave most logits there; HTP rounds differently by a step or two.
+#: Largest and mean difference in bytes. One step of a logit is 3.3 bytes where the sigmoid is steepest, and the tiny
+#: network's random weights leave most logits there; HTP rounds differently by a step or two.
 LIMITS = {"openvino": (4, 0.5), "ort": (4, 0.5), "qnn": (8, 1.0)}
 #: The emulator needs about 30 ms for a frame of the tiny network.
 FRAMES = {"openvino": 1000, "ort": 1000, "qnn": 20}

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import numpy as np
+import onnxruntime
 import pytest
 
 torch = pytest.importorskip("torch")
 
-from trilane.avatars.training.network import UNet  # noqa: E402
+from trilane.avatars.quantise import quantise  # noqa: E402
+from trilane.avatars.reshape import reshaped  # noqa: E402
+from trilane.avatars.training.encoders import ENCODERS  # noqa: E402
+from trilane.avatars.training.export import export_onnx  # noqa: E402
+from trilane.avatars.training.network import NORMS, UNet  # noqa: E402
 from trilane.errors import BadInputError  # noqa: E402
 
 
@@ -30,6 +36,41 @@ def test_full_width_has_the_published_size():
     network = UNet()
     assert sum(p.numel() for p in network.parameters()) == pytest.approx(14.58e6, rel=1e-3)
     assert count_macs(network, 128, 128, 16) * 16 == pytest.approx(65.9e9, rel=1e-3)
+
+
+torch.set_num_threads(1)
+
+PAIRS = [*((encoder, "batch") for encoder in ENCODERS), ("resnet18", "instance"), ("mobilenetv3", "group")]
+#: Published, in millions. Ours within 5 %.
+PARAMETERS = {"resnet18": 14.5, "mobilenetv2": 6.6, "mobilenetv3": 6.7, "efficientnet-lite0": 6.1}
+
+
+@pytest.mark.parametrize("encoder", ENCODERS)
+def test_every_encoder_has_its_published_size(encoder):
+    count = sum(p.numel() for p in UNet(encoder).parameters())
+    assert count / 1e6 == pytest.approx(PARAMETERS[encoder], rel=0.05)
+
+
+@pytest.mark.parametrize(("encoder", "norm"), PAIRS)
+def test_the_exported_network_computes_the_same(encoder, norm):
+    """At the exported shape and, where the runtime is given another, at that one."""
+    torch.manual_seed(0)
+    network = UNet(encoder, norm, width=8, channels=5)
+    model = export_onnx(network, 64, 96)
+    image = torch.randn(1, 5, 64, 96)
+    onnxruntime.set_default_logger_severity(3)
+    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    with torch.no_grad():
+        wanted = network(image).numpy()
+    assert session.run(None, {"tensor": image.numpy()})[0] == pytest.approx(wanted, abs=1e-3)
+
+
+@pytest.mark.parametrize("norm", NORMS)
+def test_a_quantised_network_runs_at_other_shapes(norm):
+    torch.manual_seed(0)
+    frames = [np.random.default_rng(i).normal(size=(64, 64, 5)).astype(np.float32) for i in range(2)]
+    quantised = quantise(export_onnx(UNet(norm=norm, width=4, channels=5), 64, 64), frames)
+    assert reshaped(quantised.network, 32, 96).shape == (1, 32, 96, 5)
 
 
 def test_output_is_rgba_of_the_input_size():
