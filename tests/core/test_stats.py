@@ -1,0 +1,38 @@
+"""Summaries of times against NumPy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from trilane.scheduler.stats import ema_range_ms, jitter_ms, percentile, summary_ms
+
+TIMES = st.lists(st.integers(0, 10**12), min_size=1, max_size=60)
+
+
+@given(TIMES)
+def test_a_summary_is_numpys(values: list[int]) -> None:
+    row = summary_ms(values)
+    assert row["mean"] == pytest.approx(np.mean(values) / 1e6, abs=1e-5)
+    assert row["max"] == pytest.approx(max(values) / 1e6, abs=1e-5)
+    for rank in (50, 90, 95, 99):
+        assert row[f"p{rank}"] == pytest.approx(np.percentile(values, rank) / 1e6, rel=1e-9, abs=1e-5)
+
+
+@given(TIMES)
+def test_an_exponential_average_stays_among_the_values(values: list[int]) -> None:
+    row = ema_range_ms(values)
+    assert min(values) / 1e6 - 1e-5 <= row["ema20_min"] <= row["ema20_max"] <= max(values) / 1e6 + 1e-5
+
+
+def test_nothing_gives_zeros() -> None:
+    assert percentile([], 0.5) == 0
+    assert set(summary_ms([]).values()) == {0.0}
+    assert ema_range_ms([]) == {"ema20_min": 0.0, "ema20_max": 0.0}
+    assert jitter_ms([]) == jitter_ms([5]) == 0
+
+
+def test_jitter_is_the_mean_step() -> None:
+    assert jitter_ms([10_000_000, 12_000_000, 9_000_000]) == 2.5
