@@ -29,10 +29,10 @@ PHENOTYPE = {"gender": 0.25, "age": 0.7, "muscle": 0.5, "weight": 0.5, "height":
 ADULTS = {
     "gender": (0.0, 1.0),
     "age": (0.6, 1.0),
-    "muscle": (0.15, 0.85),
-    "weight": (0.1, 0.9),
-    "height": (0.1, 0.75),
-    "proportions": (0.2, 0.9),
+    "muscle": (0.2, 0.8),
+    "weight": (0.2, 0.8),
+    "height": (0.25, 0.58),
+    "proportions": (0.3, 0.9),
 }
 SAMPLES = 400
 BETAS = 10
@@ -78,7 +78,9 @@ _TOES = tuple(f"toe{toe}-1" for toe in range(1, 6))
 #: Mesh steps: vertices and joints are kept to 2**-17 m (7.6 um) and weights to 2**-12, so that the file is small.
 LENGTH_STEP = 2.0**-17
 WEIGHT_STEP = 2.0**-12
-REGRESSOR_VERTICES = 160
+#: Vertices that a joint's centre is read from, and how far its weights may grow to fit every shape (square metres).
+REGRESSOR_VERTICES = 400
+REGRESSOR_RIDGE = 1e-8
 
 
 @dataclass(frozen=True)
@@ -177,18 +179,19 @@ def round_weights(weights: Array) -> Array:
 def regressor(vertices: Array, joints: Array) -> Array:
     """Sparse affine J_regressor (55, V) that gives `joints` (1 + K, 55, 3) from `vertices` (1 + K, V, 3).
 
-    Each row uses the 160 vertices nearest to the joint: of all solutions of the 1 + 3 (1 + K) equations (rows sum to
-    one, template and every shape component reproduced) the one nearest to an even mean.
+    Each row starts as the even mean of the 400 vertices nearest to the joint. Ridge regression then finds the smallest
+    change, zero in sum, that reproduces the joint for the template and every shape component.
     """
     shapes, count = vertices.shape[:2]
     rows = np.zeros((joints.shape[1], count))
     for j, centre in enumerate(joints[0]):
         near = np.argsort(np.linalg.norm(vertices[0] - centre, axis=1), kind="stable")[:REGRESSOR_VERTICES]
-        offsets = vertices[:, near] - np.eye(shapes)[:, :1, None] * centre
-        system = np.vstack([offsets.transpose(0, 2, 1).reshape(3 * shapes, -1), np.ones(len(near))])
-        wanted = np.concatenate([(joints[:, j] - np.eye(shapes)[:, :1] * centre).ravel(), [1.0]])
-        even = np.full(len(near), 1.0 / len(near))
-        rows[j, near] = even + np.linalg.lstsq(system, wanted - system @ even, rcond=1e-6)[0]
+        system = vertices[:, near].transpose(0, 2, 1).reshape(3 * shapes, -1)
+        mean = system.mean(axis=1)
+        system = system - mean[:, None]
+        ridge = REGRESSOR_RIDGE * np.eye(len(system))
+        change = system.T @ np.linalg.solve(system @ system.T + ridge, joints[:, j].ravel() - mean)
+        rows[j, near] = 1.0 / len(near) + change
     return rows
 
 
@@ -275,8 +278,8 @@ def _principal_components(model: Any, used: NDArray[np.int64]) -> Array:
     drawn = {name: random.uniform(low, high, SAMPLES) for name, (low, high) in ADULTS.items()}
     population = _rest(model, used, drawn, {})[0].reshape(SAMPLES, -1)
     population -= population.mean(axis=0)
-    _, spread, directions = np.linalg.svd(population, full_matrices=False)
-    components = directions[:BETAS] * (spread[:BETAS, None] / np.sqrt(SAMPLES - 1))
+    _, shares = np.linalg.eigh(population @ population.T)
+    components = shares[:, : -BETAS - 1 : -1].T @ population / np.sqrt(SAMPLES - 1)
     signs = np.sign(components[np.arange(BETAS), np.abs(components).argmax(axis=1)])
     return np.asarray((components * signs[:, None]).reshape(BETAS, -1, 3))
 
