@@ -30,13 +30,13 @@ const vec3 LIP = vec3(0.75, 0.42, 0.38);
 const vec3 BROW = vec3(0.24, 0.15, 0.10);
 const vec3 IRIS = vec3(0.24, 0.42, 0.46);
 const vec3 SHIRT = vec3(0.07, 0.47, 0.52);
-const vec3 CREAM = vec3(0.95, 0.88, 0.73);
+const vec3 CREAM = vec3(0.66, 0.80, 0.75);
 const vec3 DENIM = vec3(0.20, 0.23, 0.36);
-const vec3 STITCH = vec3(0.62, 0.50, 0.34);
+const vec3 STITCH = vec3(0.36, 0.34, 0.38);
 const vec3 HAIR = vec3(0.29, 0.17, 0.10);
 const vec3 HAIR_LIGHT = vec3(0.50, 0.32, 0.19);
 const vec3 SHOE = vec3(0.78, 0.24, 0.17);
-const vec3 RUBBER = vec3(0.93, 0.92, 0.88);
+const vec3 RUBBER = vec3(0.88, 0.85, 0.80);
 
 float band(float x, float half_width, float soft) {  // 1 where |x| < half_width
     return 1.0 - smoothstep(half_width - soft, half_width + soft, abs(x));
@@ -113,11 +113,10 @@ vec3 paint_shirt(vec3 p) {
     vec3 c = SHIRT * (1.0 + 0.06 * rough(p * vec3(25.0, 18.0, 25.0)));
     float chest = shoulder.y - 0.135;
     c = mix(c, CREAM, band(p.y - chest, 0.040, 0.0015) * over(shoulder.x - 0.012 - abs(p.x), 0.003));
-    c = mix(c, SHIRT * 0.55, band(abs(p.y - chest) - 0.050, 0.003, 0.0012) * over(shoulder.x - 0.012 - abs(p.x), 0.003));
     float sleeve_end = mix(shoulder.x, elbow.x, 0.60);
     c = mix(c, CREAM, over(abs(p.x) - sleeve_end + 0.026, 0.0015));
-    c = mix(c, c * 0.55, band(abs(p.x) - shoulder.x + 0.012, 0.0022, 0.0012) * over(p.y - shoulder.y + 0.10, 0.01));        // shoulder seam
-    c = mix(c, c * 0.55, band(p.y - hip.y + 0.042, 0.0018, 0.0012));                    // hem stitch
+    c = mix(c, c * 0.80, band(abs(p.x) - shoulder.x + 0.012, 0.0030, 0.0020) * over(p.y - shoulder.y + 0.10, 0.01));        // shoulder seam
+    c = mix(c, c * 0.82, band(p.y - hip.y + 0.042, 0.0030, 0.0020));                    // hem stitch
     float tilt = p.y - neck.y + 0.45 * (p.z - neck.z);
     c = mix(c, CREAM, over(tilt + 0.012, 0.0015) * over(0.115 - length(p.xz - neck.xz), 0.0015));                                      // collar
     float front = over(p.z - neck.z - 0.03, 0.005);
@@ -154,7 +153,7 @@ vec3 paint_hair(vec3 p) {
     float along = atan(dot(d, cross(across, whorl)), dot(d, across)) * 10.0 + 3.0 * dot(d, whorl);
     float calm = smoothstep(0.98, 0.80, dot(d, whorl));
     float strands = 0.5 + 0.5 * calm * sin(along * 2.0 + 1.5 * sin(along));
-    vec3 c = mix(HAIR, HAIR_LIGHT, 0.42 * strands);
+    vec3 c = mix(HAIR, HAIR_LIGHT, 0.10 + 0.20 * strands);
     float shine = band(q.y - 0.062 - 0.012 * sin(along), 0.016, 0.016);
     c = mix(c, HAIR_LIGHT * 1.2, 0.35 * shine);
     return mix(c * 0.6, c, smoothstep(0.0, 0.012, hairline(p)));

@@ -90,19 +90,19 @@ def write_avatar(
     scale: NDArray[np.float32],
     width: int,
     facts: dict[str, Any],
-    command: str,
+    names: dict[str, str],
 ) -> None:
-    """Write the bundle. `facts`: provenance."""
+    """Write the bundle. `facts`: provenance. `names`: `name` and `training_command`."""
     shown = {key: done.integer_figures[key] for key in ("psnr_db_by_band", "iou", "ssim")}
     loss = {
         band: round(done.float_figures["psnr_db_by_band"][band] - done.integer_figures["psnr_db_by_band"][band], 2)
         for band in BAND_NAMES
     }
     manifest = Manifest(
-        name=folder.name,
+        name=names["name"],
         network=network_entry(made.network, "resnet18", "batch", width),
         provenance=facts,
-        training_command=command,
+        training_command=names["training_command"],
         quantisation=made.facts,
         validation=Validation.model_validate(
             shown | {"float": done.float_figures, "integer": done.integer_figures, "psnr_loss_db": loss}

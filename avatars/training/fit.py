@@ -34,7 +34,7 @@ INPUT_STEPS = 127
 WARM_UP = 0.02
 #: Tensors with fewer pixels than this are half-size ones; only they are used at first, because they are cheap.
 SMALL_PIXELS = 160 * 160
-EXCHANGE_STEPS = 8
+EXCHANGE_STEPS = 4
 #: Share of a worker's change that the shared weights take, times the number of workers.
 TOTAL_SHARE = 1.5
 WATCH_S = 4.0
@@ -50,14 +50,14 @@ class FitConfig:
     workers: int = 3
     batch: int = 4
     seed: int = 0
-    network_rate: float = 2e-3
-    texture_rate: float = 1e-2
+    network_rate: float = 1.5e-3
+    texture_rate: float = 1.5e-3
     weight_decay: float = 1e-3
-    small_until: float = 0.15
-    freeze_norms_at: float = 0.65
+    small_until: float = 0.12
+    freeze_norms_at: float = 0.6
     average_s: float = 60.0
     report_s: float = 30.0
-    checkpoint_s: float = 300.0
+    checkpoint_s: float = 180.0
     max_steps: int = 10_000_000
 
 

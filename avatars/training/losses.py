@@ -12,7 +12,7 @@ from torch.nn import functional
 GREY = 0.5
 #: Pixels round the person that count as its outline.
 MARGIN_PX = 5
-WEIGHTS = {"composite": 1.0, "square": 4.0, "colour": 0.3, "edges": 0.5, "coarse": 0.5, "mask": 0.15, "overlap": 0.15}
+WEIGHTS = {"composite": 1.0, "square": 10.0, "colour": 0.3, "edges": 0.5, "coarse": 0.5, "mask": 0.15, "overlap": 0.15}
 
 
 def loss_terms(output: Tensor, target: Tensor) -> dict[str, Tensor]:

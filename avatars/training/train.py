@@ -43,6 +43,7 @@ class TrainConfig:
 
     body: Path = bundle_folder("default") / "body.npz"
     out: Path = Path("avatar")
+    name: str = "default"
     work: Path = Path("avatar-work")
     sheet: Path | None = None
     minutes: float = 60.0
@@ -56,7 +57,7 @@ class TrainConfig:
     weights: Path | None = None
 
 
-def train(config: TrainConfig, report: Callable[[str], None], command: str = "") -> Path:
+def train(config: TrainConfig, report: Callable[[str], None]) -> Path:
     """Run `config` and return the bundle's folder. Raises BadInputError for inputs that do not fit."""
     torch.manual_seed(config.seed)
     shaped = load_body(config.body).shape()
@@ -77,11 +78,24 @@ def train(config: TrainConfig, report: Callable[[str], None], command: str = "")
         "held_out_motions": [Path(name).name for name in config.held_out],
         "texture_sides": list(SIDES),
     }
-    write_avatar(config.out, config.body, done, made, texture, scale, config.width, facts, command)
+    names = {"name": config.name, "training_command": command_of(config)}
+    write_avatar(config.out, config.body, done, made, texture, scale, config.width, facts, names)
     if config.sheet is not None:
         Image.fromarray(done.sheet).save(config.sheet, optimize=True)
     report(json.dumps({"float": done.float_figures, "integer": done.integer_figures}))
     return config.out
+
+
+def command_of(config: TrainConfig) -> str:
+    """The command line of `config`, places left out: of a motion's file only the name stays."""
+    options: list[str] = []
+    for field in fields(TrainConfig):
+        value = getattr(config, field.name)
+        if isinstance(value, tuple):
+            options += [part for motion in value for part in ("--held-out", Path(motion).name)]
+        elif isinstance(value, int | float | str):
+            options += [f"--{field.name.replace('_', '-')}", str(value)]
+    return shlex.join(["python", "-m", "trilane.avatars.training.train", *options])
 
 
 def held_out_samples(studio: Studio, config: TrainConfig) -> list[Sample]:
@@ -140,7 +154,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"{time.monotonic() - started:7.0f} s  {line}", file=sys.stderr, flush=True)
 
     try:
-        folder = train(TrainConfig(**values), report, shlex.join([parser.prog, *given]))
+        folder = train(TrainConfig(**values), report)
     except TrilaneError as error:
         print(error, file=sys.stderr)
         return error.exit_code

@@ -1,0 +1,156 @@
+"""Training: samples repeat, held-out poses stay unseen, losses and metrics mean what they say, two steps run."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("scipy")
+pytest.importorskip("skimage")
+
+from trilane.avatars.training.data import U16, batches, create_group, open_groups  # noqa: E402
+from trilane.avatars.training.fit import Avatar, FitConfig, fit, load_avatar, save_avatar  # noqa: E402
+from trilane.avatars.training.losses import loss_terms, total_loss  # noqa: E402
+from trilane.avatars.training.metrics import image_error  # noqa: E402
+from trilane.avatars.training.network import UNet  # noqa: E402
+from trilane.avatars.training.poses import random_pose  # noqa: E402
+from trilane.avatars.training.spectral import eigenfunctions, fill_gaps, lay_out  # noqa: E402
+from trilane.avatars.training.texture import NeuralTexture, sample  # noqa: E402
+from trilane.avatars.training.train import TrainConfig, command_of, main  # noqa: E402
+from trilane.avatars.training.views import BANDS, random_view  # noqa: E402
+from trilane.errors import BadInputError  # noqa: E402
+from trilane.scene.motion.builtin import BUILTIN  # noqa: E402
+from trilane.stages.cpu.joints import JOINT_INDEX  # noqa: E402
+
+CHANNELS = 4
+SHAPE = (32, 64)
+
+
+@pytest.fixture
+def groups(tmp_path):
+    rng = np.random.default_rng(0)
+    group = create_group(tmp_path / "data", SHAPE, np.zeros(6, np.int8))
+    group.uv[:] = rng.integers(0, U16, group.uv.shape)
+    group.covered[:, 8:24, 16:48] = 1
+    group.rgba[:, 6:26, 14:50] = (200, 100, 50, 255)
+    return tmp_path / "data"
+
+
+def avatar():
+    torch.manual_seed(0)
+    start = np.random.default_rng(1).uniform(-0.5, 0.5, (64, 64, CHANNELS)).astype(np.float32)
+    return Avatar(NeuralTexture(start, sides=(64, 32)), UNet(width=8, channels=CHANNELS))
+
+
+def test_poses_repeat_and_differ():
+    one, same, other = (random_pose(np.random.default_rng(seed)) for seed in (3, 3, 4))
+    assert np.array_equal(one, same) and not np.array_equal(one, other)
+    assert one.shape == (55, 3) and np.isfinite(one).all()
+
+
+def test_knees_and_elbows_bend_one_way():
+    for seed in range(200):
+        pose = random_pose(np.random.default_rng(seed))
+        assert pose[JOINT_INDEX["left_knee"], 0] >= 0 and pose[JOINT_INDEX["right_knee"], 0] >= 0
+        assert pose[JOINT_INDEX["left_elbow"], 1] <= 0 <= pose[JOINT_INDEX["right_elbow"], 1]
+
+
+def test_held_out_poses_are_not_trained_on():
+    motion = BUILTIN["walk-wave-turn"]()
+    held_out = np.array([motion.sample(t)[0] for t in np.linspace(0, motion.duration_s, 40)])
+    trained = np.array([random_pose(np.random.default_rng((1, 1, number))) for number in range(400)])
+    apart = np.abs(held_out[:, None, 1:22] - trained[None, :, 1:22]).max(axis=(2, 3))
+    assert apart.min() > 0.1
+
+
+def test_views_frame_what_the_band_says():
+    joints = np.zeros((55, 3)) + np.random.default_rng(0).normal(size=(55, 3)) * 0.1
+    for band, (_, least, most) in BANDS.items():
+        view = random_view(np.random.default_rng(5), band, joints)
+        distance = np.linalg.norm(np.linalg.inv(view.view)[:3, 3])
+        framed = 2 * distance / view.projection[1, 1]
+        assert 0.5 * least < framed < 2 * most
+
+
+def test_batches_show_every_sample_once_an_epoch(groups):
+    stream = batches(open_groups(groups), 2, np.random.default_rng(0))
+    seen = np.concatenate([next(stream)[1] for _ in range(3)])
+    assert sorted(seen) == list(range(6))
+
+
+def test_texture_starts_as_it_is_told_and_reads_bilinearly():
+    start = np.repeat(np.linspace(-0.5, 0.5, 32, dtype=np.float32)[:, None, None], 32, axis=1)
+    smooth = NeuralTexture(np.repeat(np.repeat(start, 2, axis=0), 2, axis=1).repeat(3, axis=2), sides=(64, 32))
+    assert (
+        float((smooth.image().detach()[0, 0] - torch.from_numpy(start[..., 0].repeat(2, 0).repeat(2, 1))).abs().max())
+        < 0.02
+    )
+    uv = torch.tensor([[[[0.5, 0.25], [0.5, 0.75]]]])
+    read = sample(smooth.image(), uv, torch.tensor([[[True, False]]])).detach()
+    assert read.shape == (1, 3, 1, 2)
+    assert float(read[0, 0, 0, 0]) == pytest.approx(-0.25, abs=0.03)
+    assert (read[0, :, 0, 1] == 0).all()
+
+
+def test_a_perfect_picture_costs_nothing():
+    target = torch.zeros(1, 4, 32, 32)
+    target[:, :, 8:24, 8:24] = 1.0
+    perfect = total_loss(loss_terms(target, target))
+    worse = total_loss(loss_terms(target * 0.8, target))
+    assert float(perfect) < 0.01 < float(worse)
+
+
+def test_metrics_of_known_pictures():
+    truth = np.zeros((32, 32, 4), np.uint8)
+    truth[8:24, 8:24] = (128, 128, 128, 255)
+    off = truth.copy()
+    off[8:24, 8:24, :3] += 26
+    error = image_error(off, truth)
+    assert error.psnr_db == pytest.approx(-20 * np.log10(26 / 255), abs=0.01)
+    assert error.iou == 1.0
+    assert image_error(truth, np.zeros_like(truth)) is None
+
+
+def test_fields_are_smooth_and_gaps_filled():
+    grid = np.array([[x, y, 0.0] for x in range(6) for y in range(6)], np.float64)
+    corner = [(6 * x + y, 6 * x + y + 6, 6 * x + y + 1) for x in range(5) for y in range(5)]
+    faces = np.array(corner + [(b, b + 1, c) for _, b, c in corner])
+    fields = eigenfunctions(grid, faces, 3)
+    assert fields.shape == (36, 3) and np.abs(fields).max() == pytest.approx(1.0)
+    image, known = lay_out(fields, faces, grid[:, :2] / 10 + 0.1, faces, 32)
+    filled = fill_gaps(image, known)
+    assert known.any() and not known.all()
+    assert np.allclose(filled[known], image[known]) and np.isfinite(filled).all()
+
+
+def test_two_steps_of_training_run_and_are_saved(groups, tmp_path):
+    made, steps = fit(
+        avatar(),
+        groups,
+        FitConfig(minutes=2, workers=1, batch=2, max_steps=2),
+        report=lambda _: None,
+        checkpoint=lambda *_: None,
+    )
+    assert steps == 2
+    save_avatar(made, steps, tmp_path / "weights.npz")
+    again, found = load_avatar(avatar(), tmp_path / "weights.npz")
+    assert found == 2
+    assert all(torch.equal(a, b) for a, b in zip(made.state_dict().values(), again.state_dict().values(), strict=True))
+
+
+def test_weights_of_another_network_are_refused(tmp_path):
+    np.savez(tmp_path / "other.npz", steps=1, weights=np.zeros(3))
+    with pytest.raises(BadInputError, match=r"other\.npz"):
+        load_avatar(avatar(), tmp_path / "other.npz")
+
+
+def test_the_command_names_no_folder(tmp_path):
+    config = TrainConfig(work=tmp_path, held_out=(str(tmp_path / "jump.bvh"),), minutes=3.0)
+    command = command_of(config)
+    assert str(tmp_path) not in command and "--held-out jump.bvh" in command and "--minutes 3.0" in command
+
+
+def test_a_missing_body_is_a_sentence(tmp_path, capsys):
+    assert main(["--body", str(tmp_path / "none.npz"), "--work", str(tmp_path)]) == 2
+    assert "none.npz" in capsys.readouterr().err
