@@ -12,8 +12,9 @@ import shlex
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -35,11 +36,15 @@ from trilane.stages.cpu.body import ShapedBody, load_body
 CHANNELS = 16
 CHECKPOINT, FINAL, FACTS, TRAINING = "checkpoint.npz", "final.npz", "dataset.json", "training"
 BUILTIN_HELD_OUT = "builtin:walk-wave-turn"
+#: Of `FitConfig`, for a training that goes on.
+RESUMED: dict[str, Any] = {"network_rate": 8e-4, "texture_rate": 8e-4, "small_until": 0.0, "freeze_norms_at": 0.3}
 
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """One training run. `held_out`: motions that validation poses come from. `weights`: skip training, use these."""
+    """One training run. `held_out`: motions that validation poses come from. `weights`: skip training, use
+    these. `resume`: go on from these at a lower rate instead of starting anew.
+    """
 
     body: Path = bundle_folder("default") / "body.npz"
     out: Path = Path("avatar")
@@ -55,6 +60,7 @@ class TrainConfig:
     batch: int = 4
     seed: int = 1
     weights: Path | None = None
+    resume: Path | None = None
 
 
 def train(config: TrainConfig, report: Callable[[str], None]) -> Path:
@@ -119,20 +125,25 @@ def _render(studio: Studio, config: TrainConfig, report: Callable[[str], None]) 
 
 
 def _fitted(shaped: ShapedBody, config: TrainConfig, report: Callable[[str], None]) -> tuple[Avatar, int]:
+    blank = np.zeros((SIDES[0], SIDES[0], CHANNELS), np.float32)
     network = UNet(width=config.width, channels=CHANNELS)
     if config.weights is not None:
-        blank = np.zeros((SIDES[0], SIDES[0], CHANNELS), np.float32)
         return load_avatar(Avatar(NeuralTexture(blank), network), config.weights)
-    groups = open_groups(config.work / TRAINING)
-    start = first_texture(body_arrays(shaped), groups, SIDES[0], CHANNELS)
     settings = FitConfig(minutes=config.minutes, workers=config.workers, batch=config.batch, seed=config.seed)
+    done = 0
+    if config.resume is not None:
+        settings = replace(settings, **RESUMED, seed=config.seed + config.workers)
+        avatar, done = load_avatar(Avatar(NeuralTexture(blank), network), config.resume)
+    else:
+        start = first_texture(body_arrays(shaped), open_groups(config.work / TRAINING), SIDES[0], CHANNELS)
+        avatar = Avatar(NeuralTexture(start), network)
 
     def checkpoint(avatar: Avatar, steps: int) -> None:
-        save_avatar(avatar, steps, config.work / CHECKPOINT)
+        save_avatar(avatar, done + steps, config.work / CHECKPOINT)
 
-    avatar, steps = fit(Avatar(NeuralTexture(start), network), config.work / TRAINING, settings, report, checkpoint)
-    save_avatar(avatar, steps, config.work / FINAL)
-    return avatar, steps
+    avatar, steps = fit(avatar, config.work / TRAINING, settings, report, checkpoint)
+    save_avatar(avatar, done + steps, config.work / FINAL)
+    return avatar, done + steps
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
