@@ -88,7 +88,7 @@ class NetworkFile:
 
 def read_network(path: Path) -> NetworkFile:
     """Read and check an ONNX file. Raises BadInputError that names the file, the node and how to mend it."""
-    return check_network(_parse(path), str(path))
+    return check_network(parse_network(path), str(path))
 
 
 def check_network(model: onnx.ModelProto, where: str) -> NetworkFile:
@@ -142,7 +142,8 @@ def _beyond_transposes(makers: Mapping[str, onnx.NodeProto], name: str) -> onnx.
     return node
 
 
-def _parse(path: Path) -> onnx.ModelProto:
+def parse_network(path: Path) -> onnx.ModelProto:
+    """The ONNX file whatever it computes, external data read in. Raises BadInputError when it cannot be read."""
     try:
         size = path.stat().st_size
         if not 0 < size <= MAX_BYTES:

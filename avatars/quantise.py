@@ -17,7 +17,7 @@ import numpy as np
 import onnx
 import onnxruntime
 from numpy.typing import NDArray
-from onnx import TensorProto, helper, numpy_helper
+from onnx import TensorProto, TypeProto, helper, numpy_helper
 from onnxruntime.quantization import (
     QDQQuantizer,
     QuantType,
@@ -91,7 +91,11 @@ def quantise(
 
 
 def _check_frames(model: onnx.ModelProto, frames: Sequence[NDArray[np.float32]]) -> None:
-    _, c, h, w = (dim.dim_value for dim in model.graph.input[0].type.tensor_type.shape.dim)
+    kind = model.graph.input[0].type.tensor_type if len(model.graph.input) == 1 else TypeProto.Tensor()
+    sides = [dim.dim_value for dim in kind.shape.dim]
+    if kind.elem_type != TensorProto.FLOAT or len(sides) != 4 or sides[0] != 1 or min(sides) < 1:
+        raise BadInputError("quantise", f"an input of shape {sides}", "one float32 input 1 x C x H x W of fixed size")
+    _, c, h, w = sides
     if not MIN_FRAMES <= len(frames) <= MAX_FRAMES:
         raise BadInputError("calibration", f"{len(frames)} frames", f"{MIN_FRAMES} to {MAX_FRAMES}")
     for i, frame in enumerate(frames):

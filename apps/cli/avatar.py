@@ -1,0 +1,235 @@
+"""`trilane avatar`: look into bundles, export networks, quantise them, compile them for a Snapdragon.
+
+Rule: this file talks to the person; the work is done in `trilane.avatars` and `trilane.stages.dsp`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from trilane.apps.cli.console import JsonOption, print_json, stderr_console, stdout_console
+from trilane.errors import BadInputError, MissingPartError
+
+if TYPE_CHECKING:
+    import onnx
+
+app = typer.Typer(
+    rich_markup_mode=None,
+    add_completion=False,
+    no_args_is_help=True,
+    help="Look into avatars, export and quantise their networks.",
+)
+
+EPILOG_INSPECT = "\b\nExamples:\n  trilane avatar inspect default\n  trilane avatar inspect my-avatar --json"
+EPILOG_NETWORK = """\b
+Examples:
+  trilane avatar network --encoder mobilenetv2 --norm batch --width 64 --size 512x512 --out network.onnx
+"""
+EPILOG_QUANTIZE = """\b
+Examples:
+  trilane avatar quantize float.onnx --frames frames.npy --out network.onnx
+  trilane avatar quantize float.onnx --frames frames.npy --method entropy --count 20 --report report.json --out q.onnx
+"""
+EPILOG_EXPORT = "\b\nExamples:\n  trilane avatar export default --qnn --soc sm8350 --out avatar_ctx.onnx"
+MAX_FRAMES = 1000
+
+OutOption = Annotated[Path, typer.Option("--out", help="File to write.")]
+
+
+@app.command(epilog=EPILOG_INSPECT)
+def inspect(
+    name: Annotated[str, typer.Argument(help="`default` or a bundle's folder.")], json: JsonOption = False
+) -> None:
+    """Say what a bundle holds and how good it is, after every check that a run makes."""
+    from trilane.avatars.bundle import load_bundle
+    from trilane.avatars.inspect import bundle_facts
+
+    _show(bundle_facts(load_bundle(name)), json)
+
+
+@app.command(epilog=EPILOG_NETWORK)
+def network(
+    out: OutOption,
+    encoder: Annotated[
+        str, typer.Option(help="resnet18, mobilenetv2, mobilenetv3 or efficientnet-lite0.")
+    ] = "resnet18",
+    norm: Annotated[str, typer.Option(help="batch, instance or group.")] = "batch",
+    width: Annotated[int, typer.Option(help="64 is full width.")] = 64,
+    size: Annotated[str, typer.Option(help="HEIGHTxWIDTH, multiples of 32.")] = "512x512",
+    channels: Annotated[int, typer.Option(help="Channels of the neural texture.")] = 16,
+    seed: Annotated[int, typer.Option(help="Of the random weights.")] = 0,
+    json: JsonOption = False,
+) -> None:
+    """Export an untrained float network: ONNX, static shape, input `tensor`, output `rgba`."""
+    from trilane.avatars.inspect import graph_facts
+    from trilane.scene.schema import shape_buckets
+
+    try:
+        height, width_px = shape_buckets(size if "x" in size else f"{size}x{size}")[0]
+    except ValueError as error:
+        raise BadInputError("--size", size, str(error)) from error
+    model, parameters = _untrained(encoder, norm, width, channels, (height, width_px), seed)
+    _write(model, out)
+    settings = {"encoder": encoder, "norm": norm, "width": width, "channels": channels, "size": [height, width_px]}
+    facts = {"file": str(out), **settings, "parameters": parameters, "gmac": graph_facts(model)["gmac"]}
+    _show(facts, json)
+
+
+@app.command(epilog=EPILOG_QUANTIZE)
+def quantize(
+    source: Annotated[Path, typer.Argument(help="Float network (.onnx) with the input N x C x H x W.")],
+    frames: Annotated[Path, typer.Option(help="Real inputs: .npy (N, H, W, C) float.")],
+    out: OutOption,
+    method: Annotated[str, typer.Option(help="minmax, percentile or entropy.")] = "minmax",
+    count: Annotated[int, typer.Option(min=1, max=MAX_FRAMES, help="Frames to calibrate on.")] = 20,
+    full_range: Annotated[
+        bool, typer.Option("--full-range", help="8-bit weights: only for CPUs with VNNI, and for DSPs.")
+    ] = False,
+    equalise: Annotated[bool, typer.Option("--equalise", help="Equalise channel ranges across layers first.")] = False,
+    keep_float: Annotated[
+        list[str] | None, typer.Option(help="Name of a layer that stays in float; repeat it.")
+    ] = None,
+    report: Annotated[Path | None, typer.Option(help="Write the error of every layer, worst first, as JSON.")] = None,
+    json: JsonOption = False,
+) -> None:
+    """Quantise a float network to bytes in, bytes out, calibrated on real frames."""
+    from trilane.avatars.equalise import equalised
+    from trilane.avatars.inspect import network_facts
+    from trilane.avatars.network_file import parse_network
+    from trilane.avatars.quantise import quantise
+    from trilane.avatars.sqnr import layer_report
+
+    model = parse_network(source)
+    data = _frames(frames)
+    calibration = data[:count]
+    with _spinner(f"quantising on {len(calibration)} frames"):
+        result = quantise(
+            equalised(model) if equalise else model, calibration, method, not full_range, keep_float or []
+        )
+    facts = {"file": str(out), **network_facts(result.network), "quantisation": {**result.facts, "equalised": equalise}}
+    if report is not None:
+        with _spinner("measuring every layer"):
+            facts["layers"] = layer_report(model, result, data[-1])
+        _write_text(report, facts["layers"])
+    _write(result.network.model, out)
+    _show(facts, json)
+
+
+@app.command(epilog=EPILOG_EXPORT)
+def export(
+    name: Annotated[str, typer.Argument(help="`default` or a bundle's folder.")],
+    out: OutOption,
+    qnn: Annotated[bool, typer.Option("--qnn", help="As an HTP context binary, the only format there is.")] = False,
+    soc: Annotated[str, typer.Option(help="Qualcomm's name of the chip.")] = "sm8350",
+    size: Annotated[
+        str | None, typer.Option(help="HEIGHTxWIDTH of the tensor; the bundle's own when not given.")
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Compile an avatar's network for a Snapdragon, without one."""
+    from trilane.avatars.bundle import load_bundle
+    from trilane.avatars.reshape import reshaped
+    from trilane.scene.schema import parse_shape
+    from trilane.stages.dsp.runtime import resolve
+
+    if not qnn:
+        raise BadInputError("avatar export", "no format", "--qnn")
+    resolve("qnn")
+    from trilane.stages.dsp.qnn import version, write_context
+
+    whole = load_bundle(name).read_network()
+    try:
+        chosen = reshaped(whole, *parse_shape(size)) if size else whole
+    except ValueError as error:
+        raise BadInputError("--size", size or "", str(error)) from error
+    with _spinner(f"compiling for {soc}"):
+        write_context(chosen, soc, out)
+    _show({"file": str(out), "bytes": out.stat().st_size, "soc": soc, "compiler": version()}, json)
+
+
+def _untrained(
+    encoder: str, norm: str, width: int, channels: int, shape: tuple[int, int], seed: int
+) -> tuple[onnx.ModelProto, int]:
+    try:
+        import torch
+    except ModuleNotFoundError as error:
+        raise MissingPartError("exporting a network needs PyTorch", "pip install 'trilane[train]'") from error
+
+    from trilane.avatars.training.export import export_onnx
+    from trilane.avatars.training.network import UNet
+
+    torch.manual_seed(seed)
+    unet = UNet(encoder, norm, width, channels)
+    with _spinner("exporting"):
+        return export_onnx(unet, *shape), sum(p.numel() for p in unet.parameters())
+
+
+def _frames(path: Path) -> list[Any]:
+    import numpy as np
+
+    from trilane.scene.files import read_npy
+
+    array = read_npy(path, "frames (N, H, W, C)")
+    if array.ndim != 4 or array.dtype.kind != "f" or not len(array):
+        raise BadInputError(path, f"{array.dtype} of shape {array.shape}", "floats (N, H, W, C), N at least 1")
+    return [np.asarray(frame, np.float32) for frame in array[:MAX_FRAMES]]
+
+
+def _write(model: onnx.ModelProto, path: Path) -> None:
+    _replace(path, model.SerializeToString())
+
+
+def _write_text(path: Path, layers: Any) -> None:
+    import json
+
+    _replace(path, (json.dumps({"layers": layers}, indent=1) + "\n").encode())
+
+
+def _replace(path: Path, content: bytes) -> None:
+    """Write under a temporary name beside `path`, then rename: a killed command leaves no half file."""
+    draft = path.with_name(f".{path.name}-{os.getpid()}")
+    try:
+        draft.write_bytes(content)
+        draft.replace(path)
+    except OSError as error:
+        draft.unlink(missing_ok=True)
+        raise BadInputError(path, error.strerror or str(error), "a file that can be written") from error
+
+
+@contextmanager
+def _spinner(text: str) -> Iterator[None]:
+    console = stderr_console()
+    if not console.is_terminal:
+        yield
+        return
+    with console.status(text):
+        yield
+
+
+def _show(facts: Mapping[str, Any], json: bool) -> None:
+    if json:
+        print_json(facts)
+        return
+    from rich.table import Table
+
+    table = Table(show_header=False, box=None)
+    for key, value in _flat(facts):
+        table.add_row(key, f"{value:.4g}" if isinstance(value, float) else str(value))
+    stdout_console().print(table)
+
+
+def _flat(facts: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in facts.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{key}.")
+        elif isinstance(value, list) and value and isinstance(value[0], dict):
+            for entry in value:
+                yield str(entry.get("name")), {k: v for k, v in entry.items() if k != "name"}
+        else:
+            yield prefix + key, value
