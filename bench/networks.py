@@ -1,0 +1,94 @@
+"""The networks that the inference benches run: untrained, with the shapes and operators of the trained ones.
+
+Rule: weights and inputs are random and the same every time; how long a network takes does not depend on them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+
+from trilane.avatars.inspect import graph_facts
+from trilane.avatars.network_file import NetworkFile
+from trilane.avatars.quantise import quantise
+from trilane.avatars.reshape import reshaped
+from trilane.errors import MissingPartError
+
+CALIBRATION_SIDE = 64
+CALIBRATION_FRAMES = 5
+
+
+@dataclass(frozen=True)
+class Subject:
+    """`label`; `integer`: u8 in and out; `parameters` and `gmac` of the network as defined, not as laid out."""
+
+    label: dict[str, Any]
+    integer: NetworkFile
+    parameters: int
+    gmac: float
+
+
+def untrained(encoder: str, norm: str, width: int, size: tuple[int, int], channels: int = 16) -> Subject:
+    """An untrained network, quantised. Raises MissingPartError without PyTorch, BadInputError for wrong settings."""
+    network, torch = _unet(encoder, norm, width, channels)
+    from trilane.avatars.training.export import export_onnx
+
+    small = export_onnx(network, CALIBRATION_SIDE, CALIBRATION_SIDE)
+    rng = np.random.default_rng(0)
+    shape = (CALIBRATION_SIDE, CALIBRATION_SIDE, channels)
+    frames = [rng.normal(size=shape).astype(np.float32) for _ in range(CALIBRATION_FRAMES)]
+    label = {"encoder": encoder, "norm": norm, "width": width, "size": list(size), "channels": channels}
+    macs = _defined_macs(network, torch, channels) * size[0] * size[1]
+    parameters = sum(p.numel() for p in network.parameters())
+    return Subject(label, reshaped(quantise(small, frames).network, *size), parameters, macs / 1e9)
+
+
+def untrained_float(encoder: str, norm: str, width: int, size: tuple[int, int], channels: int = 16) -> onnx.ModelProto:
+    """The same network in float, (1, C, H, W) float32. Raises as `untrained`."""
+    from trilane.avatars.training.export import export_onnx
+
+    return export_onnx(_unet(encoder, norm, width, channels)[0], *size)
+
+
+def of_file(network: NetworkFile) -> Subject:
+    """A network file as a subject; its work is that of the layers in the file."""
+    facts = graph_facts(network.model)
+    return Subject(
+        {"network": network.where, "size": list(network.shape[1:3])}, network, facts["parameters"], facts["gmac"]
+    )
+
+
+def random_tensor(network: NetworkFile) -> NDArray[np.uint8]:
+    """(N, H, W, C) random bytes."""
+    return np.random.default_rng(1).integers(0, 256, network.shape, dtype=np.uint8)
+
+
+def _unet(encoder: str, norm: str, width: int, channels: int) -> tuple[Any, Any]:
+    try:
+        import torch
+    except ModuleNotFoundError as error:
+        raise MissingPartError("untrained networks need PyTorch", "pip install 'trilane[train]'") from error
+    from trilane.avatars.training.network import UNet
+
+    torch.manual_seed(0)
+    return UNet(encoder, norm, width, channels).eval(), torch
+
+
+def _defined_macs(network: Any, torch: Any, channels: int) -> float:
+    """Multiply-accumulates of the convolutions for one pixel of the tensor."""
+    total = 0
+
+    def add(module: Any, _inputs: Any, output: Any) -> None:
+        nonlocal total
+        total += output.shape[2] * output.shape[3] * module.weight.numel()
+
+    hooks = [m.register_forward_hook(add) for m in network.modules() if isinstance(m, torch.nn.Conv2d)]
+    with torch.no_grad():
+        network(torch.zeros(1, channels, CALIBRATION_SIDE, CALIBRATION_SIDE))
+    for hook in hooks:
+        hook.remove()
+    return total / CALIBRATION_SIDE**2

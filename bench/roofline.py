@@ -1,0 +1,119 @@
+"""What is the most this machine's cores can do, in INT8, in FP32, and from memory?
+
+Rule: a peak is the best that any kernel tried here reached, on layers with nothing in their way; no data sheet is read.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+
+from trilane.bench.turns import Way, runners
+from trilane.stages.dsp.runtime import installed
+
+#: (side, channels, kernel): layers whose weights stay in cache and whose channels fill the registers.
+INT8_LAYERS = ((32, 256, 3), (64, 128, 3), (64, 512, 1))
+LAYERS = 4
+RUNS, TURNS = 4, 6
+MATRIX = 1536
+COPY_BYTES = 128 << 20
+
+
+def measure(threads: int) -> dict[str, Any]:
+    """Best rates with `threads` threads: `int8_gmac_s`, `fp32_gmac_s`, `memory_gb_s`, and `rows` of what was tried."""
+    rows = _int8_rows(threads)
+    fp32 = _best_fp32(threads)
+    return {
+        "threads": threads,
+        "int8_gmac_s": max(row["gmac_s"] for row in rows),
+        "fp32_gmac_s": fp32,
+        "memory_gb_s": _memory_gb_s(),
+        "rows": rows,
+    }
+
+
+def _int8_rows(threads: int) -> list[dict[str, Any]]:
+    names = [name for name in installed() if name != "qnn"]
+    with tempfile.TemporaryDirectory(prefix="trilane-roofline-") as folder:
+        ways, work = {}, {}
+        for side, channels, kernel in INT8_LAYERS:
+            path = Path(folder) / f"{side}-{channels}-{kernel}.onnx"
+            onnx.save(_layers(side, channels, kernel), path)
+            for name in names:
+                key = f"{name} {side}x{side}x{channels} {kernel}x{kernel}"
+                ways[key] = Way(name, path, threads=threads)
+                work[key] = LAYERS * (side * channels * kernel) ** 2
+        return [{"kernel": key, "gmac_s": work[key] / 1e6 / ms} for key, ms in _best_ms(ways).items()]
+
+
+def _best_fp32(threads: int) -> float:
+    with tempfile.TemporaryDirectory(prefix="trilane-roofline-") as folder:
+        path = Path(folder) / "product.onnx"
+        onnx.save(_product(), path)
+        return MATRIX**3 / 1e6 / _best_ms({"fp32": Way("ort", path, threads=threads)})["fp32"]
+
+
+def _best_ms(ways: dict[str, Way]) -> dict[str, float]:
+    with runners(ways) as found:
+        best = dict.fromkeys(ways, float("inf"))
+        for _ in range(TURNS):
+            for key, runner in found.items():
+                best[key] = min(best[key], *runner.run(RUNS))
+    return best
+
+
+def _memory_gb_s() -> float:
+    """Bytes read and written a second by a copy far larger than the caches, one thread."""
+    source, target = np.ones(COPY_BYTES // 8), np.empty(COPY_BYTES // 8)
+    best = float("inf")
+    for _ in range(TURNS):
+        begin = time.perf_counter()
+        np.copyto(target, source)
+        best = min(best, time.perf_counter() - begin)
+    return 2 * COPY_BYTES / 1e9 / best
+
+
+def _product() -> onnx.ModelProto:
+    weights = np.random.default_rng(0).normal(size=(MATRIX, MATRIX)).astype(np.float32)
+    ends = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [MATRIX, MATRIX]) for name in ("x", "y")]
+    node = helper.make_node("MatMul", ["x", "w"], ["y"])
+    return _model([node], ends, [numpy_helper.from_array(weights, "w")])
+
+
+def _layers(side: int, channels: int, kernel: int) -> onnx.ModelProto:
+    """`LAYERS` quantised convolutions in a row, NHWC bytes in and out."""
+    rng = np.random.default_rng(0)
+    shape = (channels, channels, kernel, kernel)
+    constants = {
+        "scale": np.float32(0.05),
+        "zero": np.uint8(0),
+        "w": rng.integers(-63, 64, shape).astype(np.int8),
+        "w_scale": np.full(channels, 0.05 / (channels * kernel**2) ** 0.5, np.float32),
+        "w_zero": np.zeros(channels, np.int8),
+    }
+    tensors = [numpy_helper.from_array(np.asarray(value), name) for name, value in constants.items()]
+    nodes = [
+        helper.make_node("DequantizeLinear", ["x", "scale", "zero"], ["nhwc"]),
+        helper.make_node("Transpose", ["nhwc"], ["real0"], perm=[0, 3, 1, 2]),
+        helper.make_node("DequantizeLinear", ["w", "w_scale", "w_zero"], ["w_real"], axis=0),
+    ]
+    for i in range(LAYERS):
+        nodes += [
+            helper.make_node("Conv", [f"real{i}", "w_real"], [f"conv{i}"], pads=[kernel // 2] * 4),
+            helper.make_node("QuantizeLinear", [f"conv{i}", "scale", "zero"], [f"bytes{i}"]),
+            helper.make_node("DequantizeLinear", [f"bytes{i}", "scale", "zero"], [f"real{i + 1}"]),
+        ]
+    nodes[-1] = helper.make_node("Transpose", [f"bytes{LAYERS - 1}"], ["y"], perm=[0, 2, 3, 1])
+    ends = [helper.make_tensor_value_info(n, TensorProto.UINT8, [1, side, side, channels]) for n in ("x", "y")]
+    return _model(nodes, ends, tensors)
+
+
+def _model(nodes: list[Any], ends: list[Any], tensors: list[Any]) -> onnx.ModelProto:
+    graph = helper.make_graph(nodes, "roofline", ends[:1], ends[1:], tensors)
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)

@@ -1,0 +1,154 @@
+"""Runs several ways to infer turn about, each in a process of its own, so that no way's threads disturb another's.
+
+Rule: only one process computes at a time; the others wait on a pipe.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from trilane.errors import TrilaneError
+
+START_S = 300.0
+WARM_UP = 3
+
+
+@dataclass(frozen=True)
+class Way:
+    """`kind`: a row of `KINDS`. `threads` None: the library's default."""
+
+    kind: str
+    network: Path
+    runtime: str = ""
+    threads: int | None = None
+    spin: bool = False
+
+
+class Runner:
+    """The parent's end of one way."""
+
+    def __init__(self, pipe: Connection, name: str) -> None:
+        self._pipe, self._name = pipe, name
+        self.startup_ms = float(self._receive())
+
+    def run(self, count: int) -> list[float]:
+        """Milliseconds of `count` runs in a row."""
+        self._pipe.send(count)
+        times: list[float] = self._receive()
+        return times
+
+    def _receive(self) -> Any:
+        if not self._pipe.poll(START_S):
+            raise TrilaneError(f"{self._name}: no answer in {START_S:g} s")
+        try:
+            answer = self._pipe.recv()
+        except EOFError as error:
+            raise TrilaneError(f"{self._name}: its process ended") from error
+        if isinstance(answer, str):
+            raise TrilaneError(f"{self._name}: {answer}")
+        return answer
+
+
+@contextmanager
+def runners(ways: Mapping[str, Way]) -> Iterator[dict[str, Runner]]:
+    """One waiting process for each way; they end with the block. Raises TrilaneError when one does not start."""
+    context = multiprocessing.get_context("spawn")
+    processes, pipes = [], []
+    try:
+        found = {}
+        for name, way in ways.items():
+            ours, theirs = context.Pipe()
+            process = context.Process(target=serve, args=(theirs, way), daemon=True)
+            process.start()
+            theirs.close()
+            processes.append(process)
+            pipes.append(ours)
+            found[name] = Runner(ours, name)
+        yield found
+    finally:
+        for pipe in pipes:
+            pipe.close()
+        for process in processes:
+            process.join(5)
+            process.kill()
+
+
+def serve(pipe: Connection, way: Way) -> None:
+    """The child: load, report the start-up time, then run as often as each message says, until the pipe closes."""
+    try:
+        begin = time.perf_counter()
+        run = KINDS[way.kind](way)
+        pipe.send((time.perf_counter() - begin) * 1e3)
+        for _ in range(WARM_UP):
+            run()
+        while True:
+            pipe.send(_timed(run, pipe.recv()))
+    except (EOFError, BrokenPipeError):
+        return
+    except Exception as error:
+        pipe.send(f"{type(error).__name__}: {error}")
+
+
+def _timed(run: Callable[[], object], count: int) -> list[float]:
+    times = []
+    for _ in range(count):
+        begin = time.perf_counter_ns()
+        run()
+        times.append((time.perf_counter_ns() - begin) / 1e6)
+    return times
+
+
+def _runtime(way: Way) -> Callable[[], object]:
+    """Trilane's own way: slots bound once."""
+    from trilane.avatars.network_file import read_network
+    from trilane.bench.networks import random_tensor
+    from trilane.stages.dsp.runtime import RuntimeOptions, load_runtime
+
+    network = read_network(way.network)
+    image = np.zeros((*network.shape[:3], 4), np.uint8)
+    session = load_runtime(way.runtime).load(network, RuntimeOptions(way.threads or 1, way.spin))
+    return session.bind(random_tensor(network), image).run
+
+
+def _ort_default(way: Way) -> Callable[[], object]:
+    """As ONNX Runtime's first example does it: a session with defaults, `run` with an array."""
+    import onnxruntime
+
+    settings = onnxruntime.SessionOptions()
+    if way.threads is not None:
+        settings.intra_op_num_threads = way.threads
+    session = onnxruntime.InferenceSession(str(way.network), settings, providers=["CPUExecutionProvider"])
+    source = session.get_inputs()[0]
+    rng = np.random.default_rng(1)
+    if source.type == "tensor(uint8)":
+        feed: Any = rng.integers(0, 256, source.shape, dtype=np.uint8)
+    else:
+        feed = rng.normal(size=source.shape).astype(np.float32)
+    return lambda: session.run(None, {source.name: feed})
+
+
+def _openvino_default(way: Way) -> Callable[[], object]:
+    """As OpenVINO's first example does it: compile a file, call the model with an array."""
+    import openvino
+
+    settings = {} if way.threads is None else {"INFERENCE_NUM_THREADS": way.threads}
+    compiled = openvino.Core().compile_model(str(way.network), "CPU", settings)
+    feed = np.random.default_rng(1).integers(0, 256, tuple(compiled.input(0).shape), dtype=np.uint8)
+    request = compiled.create_infer_request()
+    return lambda: request.infer({0: feed})
+
+
+KINDS: dict[str, Callable[[Way], Callable[[], object]]] = {
+    "runtime": _runtime,
+    "ort": _ort_default,
+    "openvino": _openvino_default,
+}
