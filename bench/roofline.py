@@ -5,6 +5,7 @@ Rule: a peak is the best that any kernel tried here reached, on layers with noth
 
 from __future__ import annotations
 
+import os
 import tempfile
 import time
 from pathlib import Path
@@ -25,8 +26,12 @@ MATRIX = 1536
 COPY_BYTES = 128 << 20
 
 
-def measure(threads: int) -> dict[str, Any]:
-    """Best rates with `threads` threads: `int8_gmac_s`, `fp32_gmac_s`, `memory_gb_s`, and `rows` of what was tried."""
+def measure(threads: int = 0) -> dict[str, Any]:
+    """Best rates with `threads` threads; 0: one for each core that this process may use.
+
+    Keys: `int8_gmac_s`, `fp32_gmac_s`, `memory_gb_s`, and `rows` of what was tried.
+    """
+    threads = threads or len(os.sched_getaffinity(0))
     rows = _int8_rows(threads)
     fp32 = _best_fp32(threads)
     return {

@@ -46,6 +46,14 @@ class Runner:
         times: list[float] = self._receive()
         return times
 
+    def run_for(self, seconds: float) -> list[float]:
+        """Milliseconds of runs in a row for about `seconds`, at least one."""
+        times: list[float] = []
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            times += self.run(max(1, int(left * 1e3 / (2 * times[-1]))) if times else 1)
+        return times
+
     def _receive(self) -> Any:
         if not self._pipe.poll(START_S):
             raise TrilaneError(f"{self._name}: no answer in {START_S:g} s")

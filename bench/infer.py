@@ -1,0 +1,154 @@
+"""How long does a network take on each runtime, run continuously on constant random input?
+
+Rule: the runtimes and ONNX Runtime in FP32 take turns of one period each, on the same cores, in processes of their own.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import psutil
+
+from trilane.avatars.bundle import load_bundle
+from trilane.avatars.network_file import read_network
+from trilane.bench import roofline
+from trilane.bench.networks import Subject, of_file, untrained, untrained_float
+from trilane.bench.turns import Way, runners
+from trilane.errors import BadInputError
+from trilane.scene.schema import parse_shape
+from trilane.stages.dsp.runtime import resolve
+
+FP32 = "ort fp32"
+CACHE = "XDG_CACHE_HOME"
+
+
+def measure(
+    network: str = "",
+    encoder: tuple[str, ...] = ("resnet18",),
+    norm: tuple[str, ...] = ("batch",),
+    width: int = 64,
+    size: tuple[str, ...] = ("256x256",),
+    runtime: tuple[str, ...] = ("ort", "openvino"),
+    threads: int = 0,
+    spin: bool = False,
+    seconds: float = 5.0,
+    period: float = 1.0,
+) -> dict[str, Any]:
+    """One row per network and runtime. `network`: an .onnx file or a bundle; otherwise untrained ones are made.
+
+    Rows: the network's settings, `parameters`, `gmac`, `runtime`, `startup_cold_ms`, `startup_warm_ms` (libraries
+    imported, network loaded, with an empty and with a filled cache), `frames`, `min_ms` `mean_ms` `p50_ms` `p90_ms`
+    `p99_ms` `max_ms`, `periods` of min, mean, max, `int8_over_fp32` (how many times faster than ONNX Runtime in FP32),
+    `share_of_roofline` (of the INT8 peak measured beside), `temperature_c` where it can be read. `threads` 0: one for
+    each core that this process may use. Raises BadInputError, MissingPartError.
+    """
+    threads = threads or len(os.sched_getaffinity(0))
+    if not 0 < period <= seconds:
+        raise BadInputError("--period", f"{period:g}", f"more than 0, at most --seconds {seconds:g}")
+    names = [resolve(name) for name in runtime]
+    peak = roofline.measure(threads)
+    rows: list[dict[str, Any]] = []
+    for subject, twin in _subjects(network, encoder, norm, width, size):
+        with tempfile.TemporaryDirectory(prefix="trilane-bench-") as folder:
+            ways = _ways(Path(folder), subject, twin, names, threads, spin)
+            with _cache(Path(folder) / "cache"):
+                taken = _take(ways, seconds, period)
+        rows += _rows(subject, taken, peak["int8_gmac_s"])
+    return {"rows": rows, "roofline": peak, "config": {"threads": threads, "spin": spin, "seconds": seconds}}
+
+
+def _subjects(
+    network: str, encoder: tuple[str, ...], norm: tuple[str, ...], width: int, size: tuple[str, ...]
+) -> Iterator[tuple[Subject, onnx.ModelProto | None]]:
+    """Integer networks, and their twins in float where there is one."""
+    if network:
+        file = read_network(Path(network)) if network.endswith(".onnx") else load_bundle(network).read_network()
+        yield of_file(file), None
+        return
+    for one_encoder, one_norm, text in product(encoder, norm, size):
+        try:
+            shape = parse_shape(text)
+        except ValueError as error:
+            raise BadInputError("--size", text, str(error)) from error
+        settings = (one_encoder, one_norm, width, shape)
+        yield untrained(*settings), untrained_float(*settings)
+
+
+def _ways(
+    folder: Path, subject: Subject, twin: onnx.ModelProto | None, names: list[str], threads: int, spin: bool
+) -> dict[str, Way]:
+    integer = folder / "integer.onnx"
+    onnx.save(subject.integer.model, integer)
+    ways = {name: Way("runtime", integer, name, threads, spin) for name in names}
+    if twin is not None:
+        onnx.save(twin, folder / "float.onnx")
+        ways[FP32] = Way("ort", folder / "float.onnx", threads=threads)
+    return ways
+
+
+@contextmanager
+def _cache(folder: Path) -> Iterator[None]:
+    """Compiled networks are kept in `folder` by the processes started inside the block."""
+    before = os.environ.get(CACHE)
+    os.environ[CACHE] = str(folder)
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[CACHE]
+        else:
+            os.environ[CACHE] = before
+
+
+def _take(ways: dict[str, Way], seconds: float, period: float) -> dict[str, dict[str, Any]]:
+    with runners(ways) as found:
+        cold = {name: runner.startup_ms for name, runner in found.items()}
+    with runners(ways) as found:
+        taken: dict[str, dict[str, Any]] = {
+            name: {"startup_cold_ms": cold[name], "startup_warm_ms": runner.startup_ms, "periods": []}
+            for name, runner in found.items()
+        }
+        for _ in range(round(seconds / period)):
+            for name, runner in found.items():
+                taken[name]["periods"].append(runner.run_for(period))
+    return taken
+
+
+def _rows(subject: Subject, taken: dict[str, dict[str, Any]], peak_gmac_s: float) -> list[dict[str, Any]]:
+    medians = {name: float(np.median(np.concatenate(way["periods"]))) for name, way in taken.items()}
+    rows = []
+    for name, way in taken.items():
+        times = np.concatenate(way["periods"])
+        row = {
+            **subject.label,
+            "parameters": subject.parameters,
+            "gmac": subject.gmac,
+            "runtime": name,
+            "startup_cold_ms": way["startup_cold_ms"],
+            "startup_warm_ms": way["startup_warm_ms"],
+            "frames": len(times),
+            **{f"p{q}_ms": float(np.percentile(times, q)) for q in (50, 90, 99)},
+            **{f"{key}_ms": float(pick(times)) for key, pick in (("min", np.min), ("mean", np.mean), ("max", np.max))},
+            "periods": [{"min_ms": min(p), "mean_ms": float(np.mean(p)), "max_ms": max(p)} for p in way["periods"]],
+            "temperature_c": temperature_c(),
+        }
+        if name != FP32:
+            row["share_of_roofline"] = subject.gmac / (medians[name] / 1e3) / peak_gmac_s
+            row["int8_over_fp32"] = medians[FP32] / medians[name] if FP32 in medians else None
+        rows.append(row)
+    return rows
+
+
+def temperature_c() -> float | None:
+    """The hottest sensor, where the system shows any."""
+    read: dict[str, list[Any]] = getattr(psutil, "sensors_temperatures", dict)()
+    values = [sensor.current for sensors in read.values() for sensor in sensors]
+    return max(values) if values else None

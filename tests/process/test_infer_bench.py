@@ -1,0 +1,52 @@
+"""The inference benches on the tiny network: turns in processes of their own, rows that add up, errors by name."""
+
+from __future__ import annotations
+
+import multiprocessing
+
+import onnx
+import pytest
+
+from trilane.bench import infer, roofline
+from trilane.bench.turns import Way, runners
+from trilane.errors import BadInputError, TrilaneError
+
+
+@pytest.fixture
+def file(tiny_quantised, tmp_path):
+    path = tmp_path / "network.onnx"
+    onnx.save(tiny_quantised.network.model, path)
+    return path
+
+
+def test_ways_run_in_turns_and_leave_no_process(file):
+    with runners({"ours": Way("runtime", file, "ort", 1), "plain": Way("ort", file, threads=1)}) as found:
+        assert {name: len(runner.run(3)) for name, runner in found.items()} == {"ours": 3, "plain": 3}
+        assert all(runner.startup_ms > 0 for runner in found.values())
+    assert not multiprocessing.active_children()
+
+
+def test_a_way_that_fails_says_why(tmp_path):
+    with (
+        pytest.raises(TrilaneError, match=r"ours.*nothing\.onnx"),
+        runners({"ours": Way("runtime", tmp_path / "nothing.onnx", "ort")}),
+    ):
+        pass
+
+
+def test_a_file_is_measured(file, monkeypatch):
+    monkeypatch.setattr(roofline, "measure", lambda _threads: {"int8_gmac_s": 100.0})
+    result = infer.measure(str(file), runtime=("ort",), threads=1, seconds=0.2, period=0.1)
+    (row,) = result["rows"]
+    assert row["runtime"] == "ort" and len(row["periods"]) == 2
+    assert row["min_ms"] <= row["p50_ms"] <= row["p99_ms"] <= row["max_ms"]
+    assert 0 < row["share_of_roofline"] < 10 and row["int8_over_fp32"] is None
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [({"runtime": ("tpu",)}, "tpu"), ({"period": 0.0}, "--period"), ({"period": 9.0}, "--period")],
+)
+def test_wrong_options_are_named(asked, message):
+    with pytest.raises(BadInputError, match=message):
+        infer.measure(**asked)
