@@ -113,13 +113,14 @@ def test_frames_allocate_nothing(name, module, tiny_quantised):
     network = tiny_quantised.network
     tensor, image = np.zeros(network.shape, np.uint8), np.zeros((*network.shape[:3], 4), np.uint8)
     binding = module.load(network, RuntimeOptions()).bind(tensor, image)
+    tracemalloc.start()
     for _ in range(FRAMES[name] // 20):
         binding.run()
     gc.collect()
-    tracemalloc.start()
     resident, traced = psutil.Process().memory_info().rss, tracemalloc.get_traced_memory()[0]
     for _ in range(FRAMES[name]):
         binding.run()
+    gc.collect()
     grown = psutil.Process().memory_info().rss - resident
     traced = tracemalloc.get_traced_memory()[0] - traced
     tracemalloc.stop()
