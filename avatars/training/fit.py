@@ -42,12 +42,15 @@ WATCH_S = 4.0
 
 @dataclass(frozen=True)
 class FitConfig:
-    """`minutes`: budget. `small_until`: share of it on half-size tensors. `freeze_norms_at`: share after which batch
-    statistics stay as they are. `average_s`: time constant of the averaged weights.
+    """`minutes`: budget. `threads`: of each worker. `small_until`: share of the budget on half-size tensors.
+
+    `freeze_norms_at`: share after which batch statistics stay as they are. `average_s`: time constant of the averaged
+    weights.
     """
 
     minutes: float
     workers: int = 3
+    threads: int = 1
     batch: int = 4
     seed: int = 0
     network_rate: float = 1.5e-3
@@ -124,7 +127,7 @@ def spent(config: FitConfig, start: float) -> float:
 def _worker(
     number: int, shared: Avatar, data: Path, config: FitConfig, start: float, steps: Any, terms: Tensor, lock: Any
 ) -> None:
-    torch.set_num_threads(1)
+    torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed + number)
     avatar = copy.deepcopy(shared)
     avatar.network.to(memory_format=torch.channels_last)

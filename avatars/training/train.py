@@ -57,6 +57,7 @@ class TrainConfig:
     held_out: tuple[str, ...] = (BUILTIN_HELD_OUT,)
     width: int = 16
     workers: int = 3
+    threads: int = 1
     batch: int = 4
     seed: int = 1
     weights: Path | None = None
@@ -129,7 +130,8 @@ def _fitted(shaped: ShapedBody, config: TrainConfig, report: Callable[[str], Non
     network = UNet(width=config.width, channels=CHANNELS)
     if config.weights is not None:
         return load_avatar(Avatar(NeuralTexture(blank), network), config.weights)
-    settings = FitConfig(minutes=config.minutes, workers=config.workers, batch=config.batch, seed=config.seed)
+    shared = {name: getattr(config, name) for name in ("minutes", "workers", "threads", "batch", "seed")}
+    settings = FitConfig(**shared)
     done = 0
     if config.resume is not None:
         settings = replace(settings, **RESUMED, seed=config.seed + config.workers)
