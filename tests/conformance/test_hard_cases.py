@@ -20,7 +20,7 @@ torch.set_num_threads(1)
 SHAPE = (64, 64, 4)
 STEPS = {
     "folded": {"constant map": 1, "all background": 1, "saturating": 5, "usual": 1},
-    "statistics": {"constant map": 12, "all background": 1, "saturating": 22, "usual": 6},
+    "statistics": {"constant map": 12, "all background": 1, "saturating": 22, "usual": 9},
 }
 
 
