@@ -1,8 +1,11 @@
-"""The infer stage: which avatar, which shape, which slot; transparent where nothing is visible."""
+"""The infer stage: one network, which shape, which slot; transparent where nothing is visible."""
 
 from __future__ import annotations
 
+import shutil
+
 import numpy as np
+import onnx
 import pytest
 
 from trilane.avatars.bundle import load_bundle
@@ -69,17 +72,28 @@ def test_nothing_visible_is_transparent_and_not_inferred(tiny_bundle):
     assert not outputs[0].payload.any()
 
 
-def test_avatars_lie_one_after_another(tiny_bundle):
+def test_avatars_share_one_inference(tiny_bundle):
     shape = (64, 64)
     stage, inputs, outputs = make(tiny_bundle, avatars=3)
-    tensors = [random_tensor(shape, seed) for seed in range(3)]
-    inputs[0].payload[:] = np.concatenate([tensor.ravel() for tensor in tensors])
+    tensor = random_tensor(shape, 0)
+    inputs[0].payload[: tensor.size] = tensor.ravel()
     show(inputs[0], shape, [1, 0, 1])
-    assert stage.run(0, 0, 0) == {"inferred": 2}
-    found = outputs[0].payload.reshape(3, -1)
-    assert (found[0] == run_alone(tiny_bundle, shape, tensors[0])).all()
-    assert not found[1].any()
-    assert (found[2] == run_alone(tiny_bundle, shape, tensors[2])).all()
+    assert stage.run(0, 0, 0) == {"inferred": 1}
+    found = outputs[0].payload[: shape[0] * shape[1] * 4]
+    assert (found == run_alone(tiny_bundle, shape, tensor)).all()
+
+
+def test_avatars_of_different_networks_are_refused(tiny_bundle, tmp_path):
+    other = tmp_path / "other"
+    shutil.copytree(tiny_bundle, other)
+    model = onnx.load(other / "network.onnx")
+    model.doc_string = "another"
+    onnx.save(model, other / "network.onnx")
+    units = {"dsp": UnitSettings(cores=(0,), threads=1)}
+    scene = Scene.model_validate({"size": "64", "avatars": [{}] * 2})
+    config = RunConfig(scene=scene, out_dir=tmp_path, avatar_dirs=(tiny_bundle, other), units=units)
+    with pytest.raises(BadInputError, match="one network for all avatars"):
+        InferStage(config)
 
 
 def test_one_network_is_loaded_once(tiny_bundle):
