@@ -95,7 +95,7 @@ def _views(count: int, output: Shape, buckets: list[Shape]) -> list[_View]:
     skeleton, bounds = Skeleton(shaped.joints, body.parents), MeshBounds(shaped)
     seen: list[_View] = []
     while len(seen) < count:
-        posed, clip = skeleton.pose(everyday_pose(random)), _camera(random, output)
+        posed, clip = skeleton.pose(everyday_pose(random)), random_camera(random, output)
         start = time.perf_counter()
         rect = bounds.rect(posed, clip)
         taken = (time.perf_counter() - start) * 1e6
@@ -128,7 +128,7 @@ def everyday_pose(random: np.random.Generator) -> F64:
     return pose.ravel()
 
 
-def _camera(random: np.random.Generator, output: Shape) -> F64:
+def random_camera(random: np.random.Generator, output: Shape) -> F64:
     """(4,4) clip matrix of a camera 2.2 to 6 m away, a little above or below, with 30 to 60 degrees of view."""
     focal = 1.0 / np.tan(np.radians(random.uniform(30, 60)) / 2.0)
     projection = np.zeros((4, 4))

@@ -1,0 +1,136 @@
+"""`trilane bench`: the questions about speed and exactness that this machine can answer, by name.
+
+Rule: a bench is one module of `trilane.bench` whose `measure` answers, and one line of `BENCHES`. The parameters of
+`measure` are the command's options; their defaults say what they are.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+from trilane.apps.cli.console import JsonOption, print_json, stderr_console, stdout_console
+
+#: Bench: its module, and the line that `trilane bench --help` shows for it.
+BENCHES = {
+    "raster": ("trilane.bench.raster", "One packed pass against a pass for every four channels and a permute."),
+    "readback": ("trilane.bench.readback", "Every way of moving pixels between GPU and slot."),
+    "raster-oracle": ("trilane.bench.oracle", "The packed pass against the float64 reference."),
+    "crop": ("trilane.bench.crop", "What the crop wastes, beside squares around the joints."),
+    "infer": ("trilane.bench.infer", "A network, continuously, on each runtime and in FP32."),
+    "peers": (
+        "trilane.bench.peers",
+        "Trilane's runtimes beside ONNX Runtime, OpenVINO and benchmark_app as they come.",
+    ),
+    "roofline": ("trilane.bench.roofline", "The machine's INT8 and FP32 peaks and its memory bandwidth."),
+    "joints": ("trilane.bench.joints", "What the joint transforms of a frame cost."),
+}
+
+EPILOG = "\b\nExamples:\n  trilane bench raster --size 512 --channels 16 --json\n  trilane bench crop --views 2000"
+
+
+class BenchGroup(TyperGroup):
+    """Lists the benches from the table and imports a bench's module when it is called."""
+
+    def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002
+        return list(BENCHES)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002
+        """A stand-in with the help line: enough for `--help` and completion of the name."""
+        return TyperCommand(cmd_name, help=BENCHES[cmd_name][1]) if cmd_name in BENCHES else None
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        name, stand_in, rest = super().resolve_command(ctx, args)
+        if name is None or stand_in is None:
+            return name, stand_in, rest
+        return name, bench_command(name), rest
+
+
+app = typer.Typer(
+    cls=BenchGroup,
+    rich_markup_mode=None,
+    add_completion=False,
+    no_args_is_help=True,
+    epilog=EPILOG,
+    help="Measure this machine; results carry its facts.",
+)
+
+
+@app.callback()
+def bench() -> None:
+    """Measure this machine; results carry its facts."""
+
+
+def bench_command(name: str) -> Any:
+    """The command of bench `name`, with an option for every parameter of its `measure`."""
+    module, line = BENCHES[name]
+    measure = importlib.import_module(module).measure
+
+    def run(json: bool, **asked: Any) -> None:
+        show(name, measure, asked, json)
+
+    asked = {p.name: (_type(p.default), p.default) for p in inspect.signature(measure).parameters.values()}
+    options = {"json": (JsonOption, False), **asked}
+    described: Any = run
+    described.__annotations__ = {option: kind for option, (kind, _) in options.items()}
+    described.__signature__ = inspect.Signature(
+        [
+            inspect.Parameter(option, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
+            for option, (kind, default) in options.items()
+        ]
+    )
+    single = typer.Typer(rich_markup_mode=None, add_completion=False)
+    single.command(name, help=line)(described)
+    return typer.main.get_command(single)
+
+
+def _type(default: Any) -> Any:
+    """An option's type from its default; a sequence is asked for by giving the option once for each value."""
+    return list[type(default[0])] if isinstance(default, tuple) else type(default)  # type: ignore[misc]
+
+
+def show(name: str, measure: Callable[..., Mapping[str, Any]], asked: Mapping[str, Any], as_json: bool) -> None:
+    """Run `measure` with the options `asked`; print its result and the machine's facts."""
+    from trilane.apps.machine import machine_facts
+
+    with stderr_console().status(f"measuring {name}"):
+        result = dict(measure(**asked))
+    document = {"bench": name, **result, "machine": machine_facts(result.get("driver"))}
+    if as_json:
+        print_json(document)
+        return
+    rows = result.pop("rows", [])
+    console = stdout_console()
+    if rows:
+        console.print(_table([flat(row) for row in rows]))
+    for key, value in flat(result).items():
+        console.print(f"{key}: {_text(value)}", soft_wrap=True)
+    console.print(f"cpu: {document['machine']['cpu']['model']}, {document['machine']['cpu']['cores']} cores")
+
+
+def flat(data: Mapping[str, Any]) -> dict[str, Any]:
+    """`data` with the keys of mappings in it joined by dots."""
+    found: dict[str, Any] = {}
+    for key, value in data.items():
+        inner = flat(value) if isinstance(value, Mapping) else None
+        found.update({key: value} if inner is None else {f"{key}.{name}": each for name, each in inner.items()})
+    return found
+
+
+def _table(rows: list[dict[str, Any]]) -> Any:
+    from rich.table import Table
+
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    table = Table(*columns)
+    for row in rows:
+        table.add_row(*(_text(row.get(column, "")) for column in columns))
+    return table
+
+
+def _text(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
