@@ -54,7 +54,7 @@ class FitConfig:
     batch: int = 4
     seed: int = 0
     network_rate: float = 1.5e-3
-    texture_rate: float = 1.5e-3
+    texture_rate: float = 4e-4
     weight_decay: float = 1e-3
     small_until: float = 0.12
     freeze_norms_at: float = 0.6

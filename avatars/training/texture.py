@@ -1,6 +1,6 @@
 """The neural texture: one image of C channels kept as the sum of several scales.
 
-Rule: coarse scales carry what neighbours share, fine ones start at zero and hold only what the pictures demand.
+Rule: coarse scales carry what neighbours share, fine ones only what is left.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ LIMIT = 1.0
 
 
 class NeuralTexture(nn.Module):
-    """`start` (S,S,C): what the texture begins as, S the greatest of `sides`; the finest scale begins at zero.
+    """`start` (S,S,C): what the texture begins as, S the greatest of `sides`.
 
     The scales are fitted to `start` from the coarsest on, each to what the coarser ones leave. The sum is clipped to
     -1..1, because the network's input has one byte range for all channels.
@@ -32,7 +32,6 @@ class NeuralTexture(nn.Module):
         left = target
         for side in sorted(sides):
             scale = functional.interpolate(left, size=(side, side), mode="area")
-            scale = scale if side != self.side else torch.zeros_like(scale)
             left = left - _enlarged(scale, self.side)
             scales.append(scale)
         self.scales = nn.ParameterList([nn.Parameter(scale) for scale in reversed(scales)])

@@ -36,14 +36,15 @@ from trilane.stages.cpu.body import ShapedBody, load_body
 CHANNELS = 16
 CHECKPOINT, FINAL, FACTS, TRAINING = "checkpoint.npz", "final.npz", "dataset.json", "training"
 BUILTIN_HELD_OUT = "builtin:walk-wave-turn"
-#: Of `FitConfig`, for a training that goes on.
+#: Of `FitConfig`, for a training that does not begin with nothing.
+KNOWN_NETWORK: dict[str, Any] = {"small_until": 0.0, "freeze_norms_at": 0.3}
 RESUMED: dict[str, Any] = {"network_rate": 8e-4, "texture_rate": 8e-4, "small_until": 0.0, "freeze_norms_at": 0.3}
 
 
 @dataclass(frozen=True)
 class TrainConfig:
     """One training run. `held_out`: motions that validation poses come from. `weights`: skip training, use
-    these. `resume`: go on from these at a lower rate instead of starting anew.
+    these. `resume`: go on from these at a lower rate. `network`: take the network from these, the texture anew.
     """
 
     body: Path = bundle_folder("default") / "body.npz"
@@ -62,6 +63,7 @@ class TrainConfig:
     seed: int = 1
     weights: Path | None = None
     resume: Path | None = None
+    network: Path | None = None
 
 
 def train(config: TrainConfig, report: Callable[[str], None]) -> Path:
@@ -138,6 +140,9 @@ def _fitted(shaped: ShapedBody, config: TrainConfig, report: Callable[[str], Non
         avatar, done = load_avatar(Avatar(NeuralTexture(blank), network), config.resume)
     else:
         start = first_texture(body_arrays(shaped), open_groups(config.work / TRAINING), SIDES[0], CHANNELS)
+        if config.network is not None:
+            settings = replace(settings, **KNOWN_NETWORK)
+            network = load_avatar(Avatar(NeuralTexture(blank), network), config.network)[0].network
         avatar = Avatar(NeuralTexture(start), network)
 
     def checkpoint(avatar: Avatar, steps: int) -> None:
