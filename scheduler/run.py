@@ -31,7 +31,7 @@ def run_pipeline(
     edge: str = "double",
     frames: int | None = None,
     pace_fps: float | None = None,
-    isolate_frames: int = 8,
+    isolate_frames: int = 16,
     hang_ns: int = HANG_NS,
     on_progress: Callable[[int, int], None] | None = None,
     on_message: Callable[[str], None] | None = None,
