@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import copy
 import math
+import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -139,10 +140,10 @@ def _worker(
         batches(some or groups, config.batch, np.random.default_rng((config.seed, number, k)))
         for k, some in enumerate((small, groups))
     ]
-    before = _copy(avatar)
+    before, parent = _copy(avatar), os.getppid()
     for step in range(config.max_steps):
         share = spent(config, start)
-        if share >= 1:
+        if share >= 1 or os.getppid() != parent:
             break
         _set_mode(avatar, frozen=share > config.freeze_norms_at)
         for parameters, peak in zip(optimiser.param_groups, peaks, strict=True):

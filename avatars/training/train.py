@@ -38,7 +38,7 @@ CHECKPOINT, FINAL, FACTS, TRAINING = "checkpoint.npz", "final.npz", "dataset.jso
 BUILTIN_HELD_OUT = "builtin:walk-wave-turn"
 #: Of `FitConfig`, for a training that does not begin with nothing.
 KNOWN_NETWORK: dict[str, Any] = {"small_until": 0.0, "freeze_norms_at": 0.3}
-RESUMED: dict[str, Any] = {"network_rate": 8e-4, "texture_rate": 8e-4, "small_until": 0.0, "freeze_norms_at": 0.3}
+RESUMED: dict[str, Any] = {"network_rate": 1e-3, "texture_rate": 3e-4, "small_until": 0.0, "freeze_norms_at": 0.2}
 
 
 @dataclass(frozen=True)
