@@ -39,6 +39,7 @@ EXCHANGE_STEPS = 4
 #: Share of a worker's change that the shared weights take, times the number of workers.
 TOTAL_SHARE = 1.5
 WATCH_S = 4.0
+SAVED_WEIGHTS = "weights that this network's training saved"
 
 
 @dataclass(frozen=True)
@@ -179,14 +180,47 @@ def save_avatar(avatar: Avatar, steps: int, path: Path) -> None:
 
 def load_avatar(avatar: Avatar, path: Path) -> tuple[Avatar, int]:
     """Read what `save_avatar` wrote into `avatar`; the number of steps. Raises BadInputError."""
+    weights = _read_weights(path)
+    steps = int(weights.pop("steps", torch.tensor(0)))
+    _fill(avatar, weights, path)
+    return avatar.eval(), steps
+
+
+def load_network(network: UNet, path: Path) -> UNet:
+    """Read the network of what `save_avatar` or `save_network` wrote into `network`. Raises BadInputError."""
+    weights = _read_weights(path)
+    prefix = "network."
+    _fill(network, {k.removeprefix(prefix): v.float() for k, v in weights.items() if k.startswith(prefix)}, path)
+    return network
+
+
+def save_network(avatar: Avatar, path: Path) -> None:
+    """Write the network alone in half precision: small enough to be kept, and enough to go on training from."""
+    weights = {f"network.{name}": value.detach().numpy() for name, value in avatar.network.state_dict().items()}
+    halves = {name: value.astype(np.float16) for name, value in weights.items() if value.dtype.kind == "f"}
+    draft = path.with_name(f".{path.name}")
+    with draft.open("wb") as file:
+        np.savez_compressed(file, **halves)
+    draft.replace(path)
+
+
+def _read_weights(path: Path) -> dict[str, Tensor]:
     try:
         with np.load(path, allow_pickle=False) as arrays:
-            weights = {name: torch.from_numpy(arrays[name]) for name in arrays.files if name != "steps"}
-            steps = int(arrays["steps"])
-        avatar.load_state_dict(weights)
-    except (OSError, ValueError, KeyError, RuntimeError) as error:
-        raise BadInputError(path, str(error).splitlines()[0], "weights that this network's training saved") from error
-    return avatar.eval(), steps
+            return {name: torch.from_numpy(arrays[name]) for name in arrays.files}
+    except (OSError, ValueError, KeyError) as error:
+        raise BadInputError(path, str(error).splitlines()[0], SAVED_WEIGHTS) from error
+
+
+def _fill(module: nn.Module, weights: dict[str, Tensor], path: Path) -> None:
+    """Every floating-point weight of `module` has to be there; counters of batches may be left out."""
+    try:
+        missing, unexpected = module.load_state_dict(weights, strict=False)
+    except RuntimeError as error:
+        raise BadInputError(path, str(error).splitlines()[-1].strip(), SAVED_WEIGHTS) from error
+    missing = [name for name in missing if not name.endswith("num_batches_tracked")]
+    if missing or unexpected:
+        raise BadInputError(path, f"no {missing[0]}" if missing else f"also {unexpected[0]}", SAVED_WEIGHTS)
 
 
 def _optimiser(avatar: Avatar, config: FitConfig) -> torch.optim.Optimizer:

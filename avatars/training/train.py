@@ -24,7 +24,7 @@ from trilane.avatars.bundle import bundle_folder
 from trilane.avatars.training.data import open_groups
 from trilane.avatars.training.dataset import Sample, Studio, body_arrays, plan_training, plan_validation, write_dataset
 from trilane.avatars.training.finish import finish, write_avatar
-from trilane.avatars.training.fit import Avatar, FitConfig, fit, load_avatar, save_avatar
+from trilane.avatars.training.fit import Avatar, FitConfig, fit, load_avatar, load_network, save_avatar, save_network
 from trilane.avatars.training.network import UNet
 from trilane.avatars.training.start import first_texture
 from trilane.avatars.training.texture import SIDES, NeuralTexture
@@ -34,7 +34,8 @@ from trilane.scene.schema import AvatarSpec
 from trilane.stages.cpu.body import ShapedBody, load_body
 
 CHANNELS = 16
-CHECKPOINT, FINAL, FACTS, TRAINING = "checkpoint.npz", "final.npz", "dataset.json", "training"
+CHECKPOINT, FINAL, NETWORK = "checkpoint.npz", "final.npz", "network.npz"
+FACTS, TRAINING = "dataset.json", "training"
 BUILTIN_HELD_OUT = "builtin:walk-wave-turn"
 #: Of `FitConfig`, for a training that does not begin with nothing.
 KNOWN_NETWORK: dict[str, Any] = {"small_until": 0.0, "freeze_norms_at": 0.3}
@@ -142,7 +143,7 @@ def _fitted(shaped: ShapedBody, config: TrainConfig, report: Callable[[str], Non
         start = first_texture(body_arrays(shaped), open_groups(config.work / TRAINING), SIDES[0], CHANNELS)
         if config.network is not None:
             settings = replace(settings, **KNOWN_NETWORK)
-            network = load_avatar(Avatar(NeuralTexture(blank), network), config.network)[0].network
+            network = load_network(network, config.network)
         avatar = Avatar(NeuralTexture(start), network)
 
     def checkpoint(avatar: Avatar, steps: int) -> None:
@@ -150,6 +151,7 @@ def _fitted(shaped: ShapedBody, config: TrainConfig, report: Callable[[str], Non
 
     avatar, steps = fit(avatar, config.work / TRAINING, settings, report, checkpoint)
     save_avatar(avatar, done + steps, config.work / FINAL)
+    save_network(avatar, config.work / NETWORK)
     return avatar, done + steps
 
 

@@ -9,8 +9,17 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("scipy")
 pytest.importorskip("skimage")
 
+from trilane.avatars.bundle import bundle_folder  # noqa: E402
 from trilane.avatars.training.data import U16, batches, create_group, open_groups  # noqa: E402
-from trilane.avatars.training.fit import Avatar, FitConfig, fit, load_avatar, save_avatar  # noqa: E402
+from trilane.avatars.training.fit import (  # noqa: E402
+    Avatar,
+    FitConfig,
+    fit,
+    load_avatar,
+    load_network,
+    save_avatar,
+    save_network,
+)
 from trilane.avatars.training.losses import loss_terms, total_loss  # noqa: E402
 from trilane.avatars.training.metrics import image_error  # noqa: E402
 from trilane.avatars.training.network import UNet  # noqa: E402
@@ -154,3 +163,23 @@ def test_the_command_names_no_folder(tmp_path):
 def test_a_missing_body_is_a_sentence(tmp_path, capsys):
     assert main(["--body", str(tmp_path / "none.npz"), "--work", str(tmp_path)]) == 2
     assert "none.npz" in capsys.readouterr().err
+
+
+def test_the_network_alone_comes_back_in_half_precision(tmp_path):
+    made, path = avatar(), tmp_path / "network.npz"
+    save_network(made, path)
+    again = load_network(avatar().network, path)
+    for name, value in made.network.state_dict().items():
+        if value.is_floating_point():
+            assert torch.allclose(again.state_dict()[name], value, atol=1e-3, rtol=1e-3), name
+
+
+def test_the_kept_network_of_the_default_avatar_loads():
+    load_network(UNet(width=16, channels=16), bundle_folder("default").parent / "training" / "default-network.npz")
+
+
+def test_a_network_of_another_width_is_refused(tmp_path):
+    path = tmp_path / "network.npz"
+    save_network(avatar(), path)
+    with pytest.raises(BadInputError, match="size mismatch"):
+        load_network(UNet(width=16, channels=CHANNELS), path)
