@@ -38,7 +38,7 @@ from trilane.transport.messages import (
     Close,
     Closed,
     Done,
-    Durations,
+    Duration,
     Failed,
     Isolate,
     Ready,
@@ -107,17 +107,27 @@ class RealtimeDriver:
     def measure_alone(self, frames: list[int]) -> None:
         """Note the service time of each stage but the last (it writes files), the other units quiet.
 
-        Each of `frames` goes down the chain through the first slot of every edge; each stage repeats its job and
-        the first time is left out. Raises UnitError when a stage fails.
+        Each of `frames` goes down the chain through the first slot of every edge; then each unit repeats its stages
+        in turn, as it meets them in a run. Raises UnitError when a stage fails.
         """
         end = time.monotonic() + ISOLATE_LIMIT_S
+        chain = self._graph.stages[:-1]
         for frame in frames:
             if frame != frames[0] and time.monotonic() > end:
                 break
-            for position, stage in enumerate(self._graph.stages[:-1]):
-                slot_in = 0 if position else -1
-                self._processes.send(stage.unit, Isolate(stage.name, frame, slot_in, 0, REPEATS))
-                self._alone[stage.name].append(median(self._durations(stage.unit)[1:]))
+            for position in range(len(chain)):
+                self._isolated(position, frame)
+            for unit in self._graph.units:
+                own = [position for position, stage in enumerate(chain) if stage.unit == unit]
+                rounds = [[self._isolated(position, frame) for position in own] for _ in range(REPEATS)]
+                for position, times in zip(own, zip(*rounds, strict=True), strict=True):
+                    self._alone[chain[position].name].append(median(times))
+
+    def _isolated(self, position: int, frame: int) -> int:
+        """The duration in ns of one job of the stage at `position`."""
+        stage = self._graph.stages[position]
+        self._processes.send(stage.unit, Isolate(stage.name, frame, 0 if position else -1, 0))
+        return self._duration(stage.unit)
 
     def measure_again(self, frames: list[int]) -> None:
         """The same after the run, so that a machine that grew slower or faster weighs on both sides; what goes
@@ -134,12 +144,12 @@ class RealtimeDriver:
         """Mean service time in ns of each stage measured alone."""
         return {name: fmean(values) for name, values in self._alone.items()}
 
-    def _durations(self, unit: str) -> list[int]:
+    def _duration(self, unit: str) -> int:
         end = time.monotonic() + START_S
         while time.monotonic() < end:
             for speaker, message in self._listen_before_run({unit}):
-                if speaker == unit and isinstance(message, Durations):
-                    return message.values
+                if speaker == unit and isinstance(message, Duration):
+                    return message.value
         raise UnitError(f"unit {unit} did not end a job within {START_S:.0f} s")
 
     def _listen_before_run(self, _waiting: set[str]) -> list[Heard]:

@@ -32,7 +32,7 @@ from trilane.transport.messages import (
     Close,
     Closed,
     Done,
-    Durations,
+    Duration,
     Failed,
     Isolate,
     Ready,
@@ -161,16 +161,13 @@ def _run_job(link: Link, stage: _BoundStage, job: RunJob) -> None:
 
 
 def _isolate(link: Link, stage: _BoundStage, job: Isolate) -> None:
-    durations = []
+    begin_ns = time.monotonic_ns()
     try:
-        for _ in range(job.repeat):
-            begin_ns = time.monotonic_ns()
-            stage.run(job.frame, job.slot_in, job.slot_out, 0)
-            durations.append(time.monotonic_ns() - begin_ns)
+        stage.run(job.frame, job.slot_in, job.slot_out, 0)
     except Exception as error:
         _fail(link, MEASURING, f"stage {job.stage}, frame {job.frame}", error)
         return
-    link.send(Durations(durations))
+    link.send(Duration(time.monotonic_ns() - begin_ns))
 
 
 def _close(unit: str, link: Link, stages: dict[str, _BoundStage]) -> int:

@@ -30,13 +30,12 @@ class RunJob(NamedTuple):
 
 
 class Isolate(NamedTuple):
-    """To a unit: do the same job `repeat` times back to back and answer with the durations."""
+    """To a unit: do this job and answer with its duration; nothing is noted of the frame."""
 
     stage: str
     frame: int
     slot_in: int
     slot_out: int
-    repeat: int
 
 
 class Close(NamedTuple):
@@ -59,10 +58,10 @@ class Done(NamedTuple):
     figures: dict[str, float]
 
 
-class Durations(NamedTuple):
+class Duration(NamedTuple):
     """From a unit: the answer to Isolate, in ns."""
 
-    values: list[int]
+    value: int
 
 
 class Failed(NamedTuple):
@@ -81,11 +80,11 @@ class Closed(NamedTuple):
     """From a unit: the answer to Close."""
 
 
-Message = RunJob | Isolate | Close | Ready | Done | Durations | Failed | Alive | Closed
+Message = RunJob | Isolate | Close | Ready | Done | Duration | Failed | Alive | Closed
 BUILDING, MEASURING, CLOSING = -1, -2, -3
 
 _KINDS: dict[str, Any] = {
-    kind.__name__: kind for kind in (RunJob, Isolate, Close, Ready, Done, Durations, Failed, Alive, Closed)
+    kind.__name__: kind for kind in (RunJob, Isolate, Close, Ready, Done, Duration, Failed, Alive, Closed)
 }
 
 
@@ -93,15 +92,10 @@ def _is_figures(value: Any) -> bool:
     return isinstance(value, dict) and all(type(k) is str and type(v) in (int, float) for k, v in value.items())
 
 
-def _is_durations(value: Any) -> bool:
-    return isinstance(value, list) and all(type(item) is int for item in value)
-
-
 _CHECKS: dict[Any, Callable[[Any], bool]] = {
     int: lambda value: type(value) is int,
     str: lambda value: type(value) is str,
     dict[str, float]: _is_figures,
-    list[int]: _is_durations,
 }
 _FIELDS = {name: [_CHECKS[kind_of] for kind_of in get_type_hints(kind).values()] for name, kind in _KINDS.items()}
 
