@@ -40,16 +40,25 @@ def bus_folders(base: Path) -> set[str]:
 
 @pytest.fixture
 def nothing_left(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """After the test: no child, no name in /dev/shm, no bus folder; yields the folder that those would be in."""
+    """After the test: no new child, no name in /dev/shm, no bus folder; yields the folder that those would be in."""
     base = tmp_path_factory.mktemp("t")
     monkeypatch.setattr("tempfile.tempdir", str(base))
     monkeypatch.setenv("TMPDIR", str(base))
     names, descriptors = _names(SHM), len(_names(OPEN_FILES))
+    before = set(psutil.Process().children(recursive=True))
     yield base
-    assert not psutil.Process().children(recursive=True)
+    assert not set(psutil.Process().children(recursive=True)) - before
     assert not {name for name in _names(SHM) - names if "trilane" in name}
     assert bus_folders(base) == set()
     assert len(_names(OPEN_FILES)) <= descriptors
+
+
+@pytest.fixture
+def no_new_process() -> Iterator[None]:
+    """After the test this process has the children that it had before."""
+    before = set(psutil.Process().children(recursive=True))
+    yield
+    assert not set(psutil.Process().children(recursive=True)) - before
 
 
 def _names(folder: Path) -> set[str]:
