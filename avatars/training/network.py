@@ -43,11 +43,17 @@ class UNet(nn.Module):
     """(N, channels, H, W) float32 -> (N, 4, H, W): straight colour and mask, each in 0..1. H, W: multiples of 32.
 
     `width`: 64 is full; every channel count is scaled by `width` / 64 and rounded to a multiple of 4.
+    `input_skip`: the last level reads the input too, which is the only thing at full resolution; the paper's does not.
     Raises BadInputError for an unknown encoder or norm, or a width or channel count out of range.
     """
 
     def __init__(
-        self, encoder: str = "resnet18", norm: str = "batch", width: int = FULL_WIDTH, channels: int = 16
+        self,
+        encoder: str = "resnet18",
+        norm: str = "batch",
+        width: int = FULL_WIDTH,
+        channels: int = 16,
+        input_skip: bool = False,
     ) -> None:
         super().__init__()
         _check(encoder, norm, width, channels)
@@ -56,11 +62,12 @@ class UNet(nn.Module):
             return max(CHANNEL_STEP, round(count * width / FULL_WIDTH / CHANNEL_STEP) * CHANNEL_STEP)
 
         make_norm = NORMS[norm]
+        self.input_skip = input_skip
         self.encoder = ENCODERS[encoder](channels, scale, make_norm)
         *skips, deepest = self.encoder.channels
         self.levels = nn.ModuleList()
         c_in = deepest
-        for count, skip in zip(DECODER, (*reversed(skips), 0), strict=True):
+        for count, skip in zip(DECODER, (*reversed(skips), channels if input_skip else 0), strict=True):
             c_out = scale(count)
             self.levels.append(
                 nn.Sequential(*_convolution(c_in + skip, c_out, make_norm), *_convolution(c_out, c_out, make_norm))
@@ -75,8 +82,9 @@ class UNet(nn.Module):
 
     def features(self, x: Tensor) -> Tensor:
         """What both heads read: (N, width, H, W)."""
+        whole = x if self.input_skip else None
         *skips, x = self.encoder(x)
-        for level, skip in zip(self.levels, (*reversed(skips), None), strict=True):
+        for level, skip in zip(self.levels, (*reversed(skips), whole), strict=True):
             x = functional.interpolate(x, scale_factor=2.0, mode="nearest")
             x = level(x if skip is None else torch.cat((x, skip), dim=1))
         return x

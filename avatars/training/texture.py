@@ -20,33 +20,30 @@ LIMIT = 1.0
 class NeuralTexture(nn.Module):
     """`start` (S,S,C): what the texture begins as, S the greatest of `sides`.
 
-    The scales are fitted to `start` from the coarsest on, each to what the coarser ones leave. The sum is clipped to
-    -1..1, because the network's input has one byte range for all channels.
+    A Laplacian pyramid: each scale holds what `start`, shrunk to its side, adds to the next coarser one, enlarged.
+    The sum is clipped to -1..1, because the network's input has one byte range for all channels.
     """
 
     def __init__(self, start: F32, sides: tuple[int, ...] = SIDES) -> None:
         super().__init__()
         target = torch.from_numpy(np.ascontiguousarray(start.transpose(2, 0, 1)))[None]
-        self.side = sides[0]
         scales: list[Tensor] = []
-        left = target
+        coarser = torch.zeros(1, target.shape[1], 1, 1)
         for side in sorted(sides):
-            scale = functional.interpolate(left, size=(side, side), mode="area")
-            left = left - _enlarged(scale, self.side)
-            scales.append(scale)
+            shrunk = functional.interpolate(target, size=(side, side), mode="area")
+            scales.append(shrunk - _enlarged(coarser, side))
+            coarser = shrunk
         self.scales = nn.ParameterList([nn.Parameter(scale) for scale in reversed(scales)])
 
     def image(self) -> Tensor:
         """The texture (1, C, S, S)."""
-        total = self.scales[0]
-        for scale in list(self.scales)[1:]:
-            total = total + _enlarged(scale, self.side)
+        *finer, total = list(self.scales)
+        for scale in reversed(finer):
+            total = scale + _enlarged(total, scale.shape[-1])
         return total.clamp(-LIMIT, LIMIT)
 
 
 def _enlarged(scale: Tensor, side: int) -> Tensor:
-    if scale.shape[-1] == side:
-        return scale
     return functional.interpolate(scale, size=(side, side), mode="bilinear", align_corners=False)
 
 

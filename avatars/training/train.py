@@ -130,7 +130,7 @@ def _render(studio: Studio, config: TrainConfig, report: Callable[[str], None]) 
 
 def _fitted(shaped: ShapedBody, config: TrainConfig, report: Callable[[str], None]) -> tuple[Avatar, int]:
     blank = np.zeros((SIDES[0], SIDES[0], CHANNELS), np.float32)
-    network = UNet(width=config.width, channels=CHANNELS)
+    network = UNet(width=config.width, channels=CHANNELS, input_skip=True)
     if config.weights is not None:
         return load_avatar(Avatar(NeuralTexture(blank), network), config.weights)
     shared = {name: getattr(config, name) for name in ("minutes", "workers", "threads", "batch", "seed")}

@@ -55,7 +55,7 @@ class ShadedMesh:
 
 
 class ShadedRaster:
-    """Supersampled pictures of shaded meshes. `samples`: samples along each side of a pixel (2 is 2x2)."""
+    """Supersampled pictures of shaded meshes. `samples`: samples along each side of a pixel (2 is 2x2), even."""
 
     def __init__(self, ctx: Any, samples: int = 4) -> None:
         self._ctx, self._samples = ctx, samples
