@@ -22,6 +22,7 @@ BENCHES = {
     "readback": ("trilane.bench.readback", "Every way of moving pixels between GPU and slot."),
     "raster-oracle": ("trilane.bench.oracle", "The packed pass against the float64 reference."),
     "crop": ("trilane.bench.crop", "What the crop wastes, beside squares around the joints."),
+    "several": ("trilane.bench.several", "What an avatar loses to others in the same tensor."),
     "infer": ("trilane.bench.infer", "A network, continuously, on each runtime and in FP32."),
     "peers": (
         "trilane.bench.peers",

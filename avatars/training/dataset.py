@@ -69,7 +69,7 @@ class Studio:
         self.ctx = open_context(threads)
         self.mesh = SkinnedMesh(self.ctx, mesh)
         self._uv = UvRaster(self.ctx, self.mesh)
-        self._wardrobe = Wardrobe(self.ctx, dress(arrays, found), found, samples)
+        self.wardrobe = Wardrobe(self.ctx, dress(arrays, found), found, samples)
 
     def plan(self, seed: Sequence[int], source: PoseSource, band: str, size: str) -> Sample:
         """The sample of `seed`: tries views until enough of the body is on screen."""
@@ -87,7 +87,7 @@ class Studio:
         joints = self.skeleton.pose(sample.pose).matrices
         crop = sample.crop
         uv = self._uv.render(joints, sample.view.view, crop.projection, crop.shape)
-        rgba = self._wardrobe.render(joints, sample.view.view, crop.projection, crop.shape)
+        rgba = self.wardrobe.render(joints, sample.view.view, crop.projection, crop.shape)
         return uv, rgba
 
 

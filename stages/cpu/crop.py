@@ -58,12 +58,12 @@ def choose_bucket(rect: Rect, output: Shape, buckets: Sequence[Shape]) -> tuple[
 
     shape = min(buckets, key=grown_area)
     scale = max(height / shape[0], width / shape[1])
-    x0, x1 = _grow(rect.x0, rect.x1, 2.0 * scale * shape[1] / output[1])
-    y0, y1 = _grow(rect.y0, rect.y1, 2.0 * scale * shape[0] / output[0])
+    x0, x1 = grow(rect.x0, rect.x1, 2.0 * scale * shape[1] / output[1])
+    y0, y1 = grow(rect.y0, rect.y1, 2.0 * scale * shape[0] / output[0])
     return shape, Rect(x0, y0, x1, y1)
 
 
-def _grow(low: float, high: float, length: float) -> tuple[float, float]:
+def grow(low: float, high: float, length: float) -> tuple[float, float]:
     """An interval of `length` about the middle of [low, high], moved onto [-1, 1] when it fits, else centred on it."""
     if length >= 2.0:
         return -length / 2.0, length / 2.0

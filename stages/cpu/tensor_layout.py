@@ -1,18 +1,25 @@
 """Where each avatar's crop lies in the tensor that all avatars of a frame share.
 
-Rule: one visible avatar has the whole tensor; several have equal cells of it, side by side or one above another,
-whichever wastes the least. A crop has its cell's aspect, so that tensor pixels are square on the screen.
+Rule: one visible avatar has the whole tensor. Several are drawn at one scale, so each has a share of the tensor in
+proportion to its area on the screen, on shelves, at least `MARGIN_PX` of background apart. Tensor pixels are square on
+the screen.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from trilane.stages.cpu.crop import Rect, Shape, choose_bucket
+from trilane.errors import BadInputError
+from trilane.stages.cpu.crop import LEAST_PIXELS, Rect, Shape, choose_bucket, grow
 
 #: top, left, height, width in tensor pixels.
 Cell = tuple[int, int, int, int]
+
+#: Background between two avatars, tensor pixels: at this distance the default network paints one as if the other were
+#: not there. Measured by `trilane bench several`; docs/decisions/several-avatars.md has the figures.
+MARGIN_PX = 16
 
 
 @dataclass(frozen=True)
@@ -23,30 +30,69 @@ class TensorLayout:
     crops: tuple[tuple[Rect, Cell], ...]
 
 
-def lay_out(rects: Sequence[Rect], output: Shape, buckets: Sequence[Shape]) -> TensorLayout:
+@dataclass(frozen=True)
+class _Shelves:
+    """Avatars by number, row by row, in a tensor of `shape`; `scale`: tensor pixels for one output pixel."""
+
+    shape: Shape
+    rows: tuple[tuple[int, ...], ...]
+    scale: float
+
+
+def lay_out(rects: Sequence[Rect], output: Shape, buckets: Sequence[Shape], margin_px: int = MARGIN_PX) -> TensorLayout:
     """Place the visible avatars' mesh rectangles; `output` (height, width) of the picture in pixels.
 
-    At least one rectangle and one bucket; raises BadInputError without buckets.
+    Of several avatars in a tensor too small for them and their margins, the margins shrink. At least one rectangle and
+    one bucket; raises BadInputError without buckets, or when no bucket has a pixel for every avatar.
     """
     if len(rects) == 1:
         shape, grown = choose_bucket(rects[0], output, buckets)
         return TensorLayout(shape, ((grown, (0, 0, *shape)),))
-    options = [_divided(rects, output, shape, across) for shape in buckets for across in (True, False)]
-    return min(options, key=lambda layout: _pixels_drawn(layout, output))
+    sizes = [(max(r.height * output[0] / 2, LEAST_PIXELS), max(r.width * output[1] / 2, LEAST_PIXELS)) for r in rects]
+    best = max(_arrangements(sizes, buckets, margin_px), key=lambda shelves: shelves.scale, default=None)
+    if best is not None and best.scale > 0:
+        return TensorLayout(best.shape, _crops(rects, sizes, output, best, margin_px))
+    if margin_px == 0:
+        raise BadInputError(
+            "tensor shapes", f"{list(buckets)}", f"room for {len(rects)} avatars", "use a larger --size"
+        )
+    return lay_out(rects, output, buckets, margin_px // 2)
 
 
-def _divided(rects: Sequence[Rect], output: Shape, shape: Shape, across: bool) -> TensorLayout:
-    """Cells in a row when `across`, else in a column."""
-    count = len(rects)
-    height, width = (shape[0], shape[1] // count) if across else (shape[0] // count, shape[1])
-    crops = []
-    for k, rect in enumerate(rects):
-        _, grown = choose_bucket(rect, output, [(height, width)])
-        top, left = (0, k * width) if across else (k * height, 0)
-        crops.append((grown, (top, left, height, width)))
-    return TensorLayout(shape, tuple(crops))
+def _arrangements(sizes: Sequence[tuple[float, float]], buckets: Sequence[Shape], margin: int) -> Iterator[_Shelves]:
+    """Every bucket with the avatars, the tallest first, on one to as many shelves as there are avatars."""
+    order = sorted(range(len(sizes)), key=lambda k: -sizes[k][0])
+    for count in range(1, len(order) + 1):
+        each = math.ceil(len(order) / count)
+        rows = tuple(tuple(order[start : start + each]) for start in range(0, len(order), each))
+        for shape in buckets:
+            yield _Shelves(shape, rows, _scale(sizes, shape, rows, margin))
 
 
-def _pixels_drawn(layout: TensorLayout, output: Shape) -> float:
-    """Output pixels that one tensor pixel stands for, at the avatar that is drawn coarsest."""
-    return max(rect.height * output[0] / 2 / cell[2] for rect, cell in layout.crops)
+def _scale(sizes: Sequence[tuple[float, float]], shape: Shape, rows: Sequence[Sequence[int]], margin: int) -> float:
+    """The largest scale at which everything fits; a pixel is kept for rounding every side up."""
+    high = (shape[0] - margin * (len(rows) - 1) - len(rows)) / sum(max(sizes[k][0] for k in row) for row in rows)
+    wide = ((shape[1] - margin * (len(row) - 1) - len(row)) / sum(sizes[k][1] for k in row) for row in rows)
+    return min(high, *wide)
+
+
+def _crops(
+    rects: Sequence[Rect], sizes: Sequence[tuple[float, float]], output: Shape, shelves: _Shelves, margin: int
+) -> tuple[tuple[Rect, Cell], ...]:
+    """Crop rectangle and cell of each avatar, in the order of `rects`."""
+    placed: dict[int, tuple[Rect, Cell]] = {}
+    top = 0
+    for row in shelves.rows:
+        left = 0
+        for k in row:
+            height, width = (math.ceil(side * shelves.scale) for side in sizes[k])
+            placed[k] = _grown(rects[k], output, (height, width), shelves.scale), (top, left, height, width)
+            left += width + margin
+        top += max(cell[2] for _, cell in (placed[k] for k in row)) + margin
+    return tuple(placed[k] for k in range(len(rects)))
+
+
+def _grown(rect: Rect, output: Shape, cell: Shape, scale: float) -> Rect:
+    x0, x1 = grow(rect.x0, rect.x1, 2 * cell[1] / (scale * output[1]))
+    y0, y1 = grow(rect.y0, rect.y1, 2 * cell[0] / (scale * output[0]))
+    return Rect(x0, y0, x1, y1)

@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilane.errors import TrilaneError
+from trilane.errors import BadInputError, TrilaneError
 from trilane.scene.schema import AvatarSpec, CameraSpec, RunConfig, Scene, UnitSettings, shape_buckets
 from trilane.stages.contracts import Packet, SlotLayout, view_packet
 from trilane.stages.cpu.crop import Rect
 from trilane.stages.cpu.pose import PoseStage
-from trilane.stages.cpu.tensor_layout import lay_out
+from trilane.stages.cpu.tensor_layout import MARGIN_PX, lay_out
 from trilane.stages.cpu.unit import build
 
 OUTPUT = (480, 640)
@@ -88,10 +88,8 @@ def test_two_avatars_share_the_tensor(tiny_bundle: Path, tmp_path: Path) -> None
     stage = PoseStage(config(tiny_bundle, tmp_path, avatars=pair))
     packet = bound(stage, 2)
     stage.run(0, None, 0)
-    (top, left, height, width), second = packet.pose["avatars"]["tensor_rect"].tolist()
-    assert (second[0] >= top + height) or (second[1] >= left + width)
-    assert max(second[0] + second[2], height) <= packet.pose["tensor_shape"][0]
-    assert max(second[1] + second[3], width) <= packet.pose["tensor_shape"][1]
+    (_, left, _, width), second = sorted(packet.pose["avatars"]["tensor_rect"].tolist(), key=lambda cell: cell[1])
+    assert second[1] >= left + width + MARGIN_PX
 
 
 def test_nan_never_leaves_the_stage(tiny_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -119,15 +117,34 @@ rects = st.tuples(sides, sides).map(lambda p: Rect(p[0][0], p[1][0], p[0][1], p[
 
 
 @given(st.lists(rects, min_size=1, max_size=8), st.sampled_from(["256", "320x192", "512"]))
-def test_crops_hold_their_bodies_and_cells_do_not_overlap(found: list[Rect], size: str) -> None:
+def test_crops_hold_their_bodies_and_cells_keep_their_distance(found: list[Rect], size: str) -> None:
     layout = lay_out(found, OUTPUT, shape_buckets(size))
-    used = np.zeros(layout.shape, dtype=int)
+    taken = np.zeros((layout.shape[0] + MARGIN_PX, layout.shape[1] + MARGIN_PX), dtype=int)
     for rect, (crop, (top, left, height, width)) in zip(found, layout.crops, strict=True):
         assert crop.x0 <= rect.x0 + 1e-9
         assert crop.y0 <= rect.y0 + 1e-9
         assert crop.x1 >= rect.x1 - 1e-9
         assert crop.y1 >= rect.y1 - 1e-9
-        used[top : top + height, left : left + width] += 1
+        assert top + height <= layout.shape[0]
+        assert left + width <= layout.shape[1]
+        assert top >= 0
+        assert left >= 0
+        taken[top : top + height + MARGIN_PX, left : left + width + MARGIN_PX] += 1
         shown = crop.width * OUTPUT[1] / (crop.height * OUTPUT[0])
         assert shown == pytest.approx(width / height, rel=1e-6)
-    assert used.max() == 1
+    assert taken.max() == 1
+
+
+@given(st.lists(rects, min_size=2, max_size=8), st.sampled_from(["256", "512"]))
+def test_avatars_share_the_tensor_in_proportion_to_their_area(found: list[Rect], size: str) -> None:
+    """One scale for all, to the pixel that rounding up may add to each side."""
+    layout = lay_out(found, OUTPUT, shape_buckets(size))
+    pixels = [cell[3] / (crop.width * OUTPUT[1] / 2) for crop, cell in layout.crops]
+    assert max(pixels) == pytest.approx(min(pixels), rel=1e-6)
+
+
+def test_margins_shrink_before_avatars_are_left_out() -> None:
+    small = [Rect(-0.5, -0.5, 0.5, 0.5)] * 8
+    assert len(lay_out(small, OUTPUT, [(32, 32)]).crops) == 8
+    with pytest.raises(BadInputError, match="8 avatars"):
+        lay_out(small, OUTPUT, [(2, 2)])

@@ -1,0 +1,177 @@
+"""How much does an avatar change when others share its tensor, by the background between them?
+
+Rule: the same avatars in the same cells, together and each alone; only the neighbours differ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.avatars.bundle import bundle_folder, load_bundle
+from trilane.avatars.reshape import reshaped
+from trilane.errors import BadInputError, MissingPartError
+from trilane.scene.schema import AvatarSpec, Scene, Shape, shape_buckets
+from trilane.scene.staging import stage_scene
+from trilane.stages.cpu.body import ShapedBody, load_body
+from trilane.stages.cpu.crop import crop_projection
+from trilane.stages.cpu.kinematics import Skeleton
+from trilane.stages.cpu.mesh_bounds import MeshBounds
+from trilane.stages.cpu.pose import STANDOFF_M
+from trilane.stages.cpu.tensor_layout import MARGIN_PX, TensorLayout, lay_out
+from trilane.stages.dsp.runtime import Binding, RuntimeOptions, load_runtime
+from trilane.stages.gpu.assets import load_assets
+from trilane.stages.gpu.mesh import SkinnedMesh
+from trilane.stages.gpu.packed import PackedAvatar, PackedPass, Placement
+
+U8 = NDArray[np.uint8]
+BOUND_DB = 0.5
+OUTPUT = (480, 640)
+MOST_AVATARS = 8
+MOST_MARGIN = 128
+#: Metres between neighbours, and how far every second one stands back.
+STEP_M, BACK_M = 0.8, 0.7
+SECONDS = 10.0
+
+
+@dataclass(frozen=True)
+class _View:
+    """`joints`: of each avatar, (55,3,4). `layout`: of the tensor."""
+
+    joints: tuple[NDArray[np.float32], ...]
+    view: NDArray[np.float64]
+    projection: NDArray[np.float64]
+    layout: TensorLayout
+
+
+def measure(
+    avatars: int = 3, views: int = 12, size: str = "512", margins: tuple[int, ...] = (0, 4, 8, MARGIN_PX, 24, 32)
+) -> dict[str, Any]:
+    """The default avatar, `avatars` times in one tensor, in `views` moments of a scene, judged against ground truth.
+
+    Keys: `rows`, one per margin in tensor pixels: `loss_db_median`, `loss_db_worst` (PSNR of an avatar alone in its
+    cell minus PSNR with its neighbours), `psnr_db_alone` (median), `bytes_mean`, `bytes_max` (difference of the two
+    pictures inside the cell), `cell_height` (median, tensor pixels); `bound_db`; `margin_px` (of the pipeline);
+    `config`. Raises BadInputError, MissingPartError.
+    """
+    _check(avatars, views, size, margins)
+    stand = _Stand()
+    rows = []
+    for margin in margins:
+        found = np.array([row for view in _views(stand, avatars, views, size, margin) for row in stand.compare(view)])
+        together, alone, mean, most, height = found.T
+        loss = alone - together
+        rows.append(
+            {
+                "margin": margin,
+                "loss_db_median": float(np.median(loss)),
+                "loss_db_worst": float(loss.max()),
+                "psnr_db_alone": float(np.median(alone)),
+                "bytes_mean": float(mean.mean()),
+                "bytes_max": int(most.max()),
+                "cell_height": float(np.median(height)),
+            }
+        )
+    config = {"avatars": avatars, "views": views, "size": size, "output": list(OUTPUT)}
+    return {"rows": rows, "bound_db": BOUND_DB, "margin_px": MARGIN_PX, "config": config}
+
+
+class _Stand:
+    """The default avatar on the GPU, its network, and its ground truth."""
+
+    def __init__(self) -> None:
+        bundle = load_bundle("default")
+        self.shaped = load_body(bundle.body_path).shape(bundle.manifest.betas, bundle.manifest.expression)
+        self.network = bundle.read_network()
+        self._studio, self._image_error = _truth(self.shaped)
+        assets, ctx = load_assets(bundle_folder("default")), self._studio.ctx
+        self.packed = PackedPass(ctx, assets.texture.shape[2], assets.quantisation, deferred=True)
+        self.avatar = PackedAvatar(self.packed, SkinnedMesh(ctx, assets.arrays), assets.texture)
+        self._bound: dict[Shape, tuple[U8, U8, Binding]] = {}
+
+    def compare(self, view: _View) -> list[tuple[float, float, float, float, float]]:
+        """For each avatar: PSNR together, PSNR alone, mean and greatest difference in bytes, its cell's height."""
+        everyone = self._picture(view, range(len(view.joints)))
+        rows = []
+        for k, (crop, (top, left, height, width)) in enumerate(view.layout.crops):
+            cell = np.s_[top : top + height, left : left + width]
+            together, alone = everyone[cell], self._picture(view, [k])[cell]
+            projection = crop_projection(view.projection, crop)
+            truth = self._studio.wardrobe.render(view.joints[k], view.view, projection, (height, width))
+            errors = [self._image_error(picture, truth) for picture in (together, alone)]
+            if None not in errors:
+                steps = np.abs(together.astype(np.int16) - alone)
+                psnr_db = [error.psnr_db for error in errors]
+                rows.append((*psnr_db, float(steps.mean()), float(steps.max()), float(height)))
+        return rows
+
+    def _picture(self, view: _View, shown: Sequence[int]) -> U8:
+        """The network's picture (h,w,4) with only the avatars `shown`."""
+        shape = view.layout.shape
+        tensor, image, binding = self._binding(shape)
+        target = self.packed.begin(shape)
+        for k in shown:
+            crop, cell = view.layout.crops[k]
+            projection = crop_projection(view.projection, crop)
+            self.avatar.draw(target, view.view, Placement(view.joints[k], projection, cell))
+        self.packed.read_into(shape, tensor.reshape(-1))
+        binding.run()
+        picture: U8 = image[0].copy()
+        return picture
+
+    def _binding(self, shape: Shape) -> tuple[U8, U8, Binding]:
+        if shape not in self._bound:
+            tensor = np.empty((1, *shape, self.packed.channels), np.uint8)
+            image = np.empty((1, *shape, 4), np.uint8)
+            session = load_runtime("ort").load(reshaped(self.network, *shape), RuntimeOptions(threads=1))
+            self._bound[shape] = tensor, image, session.bind(tensor, image)
+        return self._bound[shape]
+
+
+def _views(stand: _Stand, avatars: int, views: int, size: str, margin: int) -> Iterator[_View]:
+    """Moments in which every avatar is seen, spread over the default motion."""
+    specs = tuple(
+        AvatarSpec(position=((k - (avatars - 1) / 2) * STEP_M, 0.0, -BACK_M * (k % 2))) for k in range(avatars)
+    )
+    scene = Scene(avatars=specs)
+    staged = stage_scene(scene, [stand.shaped] * avatars, Path.cwd())
+    skeleton = Skeleton(stand.shaped.joints, stand.shaped.body.parents)
+    bounds = MeshBounds(stand.shaped, standoff_m=STANDOFF_M)
+    projection = staged.camera.projection(OUTPUT[1] / OUTPUT[0])
+    for t_s in np.linspace(0.0, SECONDS, views, endpoint=False):
+        view, rects, joints = staged.camera.sample(t_s), [], []
+        for k, mover in enumerate(staged.movers):
+            pose, translation = mover.sample(t_s + k * SECONDS / avatars)
+            posed = skeleton.pose(pose, translation, mover.world)
+            rects.append(bounds.rect(posed, projection @ view))
+            joints.append(posed.matrices.copy())
+        if None not in rects:
+            seen = [rect for rect in rects if rect is not None]
+            yield _View(tuple(joints), view, projection, lay_out(seen, OUTPUT, shape_buckets(size), margin))
+
+
+def _truth(shaped: ShapedBody) -> tuple[Any, Any]:
+    """The dressed body on the GPU, and the `image_error` of two pictures."""
+    try:
+        from trilane.avatars.training.dataset import Studio
+        from trilane.avatars.training.metrics import image_error
+    except ImportError as error:
+        raise MissingPartError(f"ground truth needs {error.name}", "pip install 'trilane[train]'") from None
+    return Studio(shaped), image_error
+
+
+def _check(avatars: int, views: int, size: str, margins: Sequence[int]) -> None:
+    for option, value, most in (("--avatars", avatars, MOST_AVATARS), ("--views", views, 10_000)):
+        if not 1 <= value <= most:
+            raise BadInputError(option, str(value), f"1 to {most}")
+    if bad := [margin for margin in margins if not 0 <= margin <= MOST_MARGIN]:
+        raise BadInputError("--margins", str(bad[0]), f"0 to {MOST_MARGIN}")
+    try:
+        shape_buckets(size)
+    except ValueError as error:
+        raise BadInputError("--size", size, str(error)) from error
