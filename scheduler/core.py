@@ -28,7 +28,7 @@ from trilane.scheduler.lateness import earliest_finish_ns
 from trilane.scheduler.ledger import ASSIGNED, BLOCKED, STARVED, THROTTLED, Ledger
 from trilane.scheduler.policy import Candidate, policy_named
 from trilane.scheduler.source import Source
-from trilane.scheduler.state import FULL_DUTY, FrameState, StageState, UnitState, build
+from trilane.scheduler.state import FULL_DUTY, NEVER, FrameState, StageState, UnitState, build
 from trilane.transport.slots import EdgeSlots
 
 HELD_JOBS = 2  # the one that runs and the one dispatched ahead
@@ -53,7 +53,10 @@ class Core:
         limits = [limit for limit in (settings.in_flight, self.policy.in_flight) if limit]
         self._in_flight = min(limits, default=0)
         self._latency_position = self.stage_named[graph.latency_to].position
+        self._leads = self.policy.lead_ns is not None
+        self._drops = self.policy.newest or self.policy.drop_late
         self._jobs = 0
+        self.alarm_ns = 0
         self._dirty: list[UnitState] = []
         self._handlers = {
             UnitReady: self._on_ready,
@@ -71,15 +74,19 @@ class Core:
         self.actions = []
         for event in events:
             self._handlers[type(event)](event)  # type: ignore[operator]
-        if not self.finished:
+        if not self.finished and (now_ns >= self.alarm_ns or self._leads):
             faults.check_clocks(self)
         if self.started and not self.finished:
-            if self.source.advance(now_ns):
+            if now_ns >= self.source.due_ns and self.source.advance(now_ns):
                 self.touch(self.stages[0].unit)
             self._assign()
-            if self.source.exhausted and not self.frames:
+            if not self.frames and self.source.exhausted:
                 self.finish("stopped" if self.stopping else "done")
         return Decision(tuple(self.actions), None if self.finished else self._next_deadline())
+
+    def reset_alarm(self) -> None:
+        """A unit's clock was set: this step's answer looks at all of them again."""
+        self.alarm_ns = 0
 
     def touch(self, unit: UnitState) -> None:
         """Something changed for the unit: look at it in this step."""
@@ -102,6 +109,7 @@ class Core:
     def _on_ready(self, event: UnitReady) -> None:
         unit = self.units[event.unit]
         unit.alive, unit.starting_ns, unit.heard_ns = True, None, self.now_ns
+        self.reset_alarm()
         self.touch(unit)
         if not self.started and all(other.alive for other in self.units.values()):
             self.started = True
@@ -121,6 +129,7 @@ class Core:
         stage.learn(service_ns)
         if unit.duty < FULL_DUTY:
             unit.hold_until_ns = event.t_end_ns + service_ns * (FULL_DUTY - unit.duty) // unit.duty
+            self.reset_alarm()
         frame.ready_ns, frame.position = event.t_end_ns, stage.position + 1
         if stage.position == 0:
             frame.pose_ns = event.t_pose_ns
@@ -130,12 +139,17 @@ class Core:
         self._pass_on(stage, job, event.t_end_ns)
 
     def _pass_on(self, stage: StageState, job: Job, end_ns: int) -> None:
-        if stage.input:
-            stage.input.release(job.slot_in)
-            self.touch(self.stages[stage.position - 1].unit)
-        if stage.output:
-            self._drop_all(stage.output.commit(job.slot_out), stage.position)
-            self.touch(self.stages[stage.position + 1].unit)
+        source, sink = stage.input, stage.output
+        if source is not None:
+            if not source.free:
+                self.touch(self.stages[stage.position - 1].unit)
+            source.release(job.slot_in)
+        if sink is not None:
+            replaced = sink.commit(job.slot_out)
+            if replaced:
+                self._drop_all(replaced, stage.position)
+            if len(sink.ready) == 1 or self._drops:
+                self.touch(self.stages[stage.position + 1].unit)
         else:
             frame = self.frames.pop(job.frame)
             self.ledger.presented(job.frame, end_ns, frame.latency_ns, 0 < frame.deadline_ns < end_ns)
@@ -170,65 +184,76 @@ class Core:
     # choice
 
     def _assign(self) -> None:
-        touched = []
-        while self._dirty:
-            unit = self._dirty.pop(0)
+        dirty = self._dirty
+        for unit in dirty:  # a dispatch may append to the list, also a unit that was looked at before
             unit.dirty = False
-            touched.append(unit)
             while self._has_room(unit):
                 stage = self._choose(unit)
                 if stage is None:
                     break
                 self._dispatch(unit, stage)
-        for unit in touched:
-            self.ledger.enter(unit.name, self.now_ns, self._idle_state(unit))
+        for unit in dirty:
+            state = ASSIGNED if unit.queue else self._idle_state(unit)
+            self.ledger.enter(unit.name, self.now_ns, state)
+        dirty.clear()
 
     def _has_room(self, unit: UnitState) -> bool:
-        if not unit.alive or unit.killing or unit.hold_until_ns > self.now_ns:
+        held = len(unit.queue)
+        if held >= HELD_JOBS or not unit.alive or unit.killing or unit.hold_until_ns > self.now_ns:
             return False
-        if not unit.queue:
-            return True
-        return len(unit.queue) < HELD_JOBS and unit.duty == FULL_DUTY and self.now_ns >= self._ahead_ns(unit)
+        return not held or (unit.duty == FULL_DUTY and self.now_ns >= self.ahead_ns(unit))
 
-    def _ahead_ns(self, unit: UnitState) -> int:
+    def ahead_ns(self, unit: UnitState) -> int:
         """When a unit that runs a job may be handed its next one."""
         if self.policy.lead_ns is None:
             return 0
         return unit.head_since_ns + self.stage_named[unit.queue[0].stage].estimate_ns - self.policy.lead_ns
 
     def _choose(self, unit: UnitState) -> StageState | None:
-        found = []
+        found = None
+        rivals: list[Candidate] = []
         for stage in unit.stages:
             frame = self._waiting(stage)
-            if frame is not None and (stage.output is None or stage.output.can_claim()):
-                found.append(Candidate(frame, stage.position, self._deadline_of(frame)))
-        if not found:
-            return None
-        chosen = found[0] if len(found) == 1 else self.policy.choose(found)
-        return self.stages[chosen.position]
+            if frame is None or not (stage.output is None or stage.output.can_claim()):
+                continue
+            if len(unit.stages) > 1:
+                rivals.append(Candidate(frame, stage.position, self._deadline_of(frame)))
+            found = stage
+        return self.stages[self.policy.choose(rivals).position] if len(rivals) > 1 else found
 
     def _waiting(self, stage: StageState) -> int | None:
         """The frame that the stage would do next; what the policy gives up on is dropped on the way."""
+        if self._drops:
+            self._give_up(stage)
         edge = stage.input
+        if edge is not None:
+            return edge.frame[edge.ready[0]] if edge.ready else None
+        return None if self._is_full() else self.source.head()
+
+    def _is_full(self) -> bool:
+        """Whether as many frames are in flight as may be."""
+        return 0 < self._in_flight <= len(self.frames)
+
+    def _give_up(self, stage: StageState) -> None:
+        """Drop what waits for the stage and is stale or must be late."""
+        edge, policy = stage.input, self.policy
         if edge is None:
-            return self._waiting_at_source()
-        if self.policy.newest:
+            if not self._is_full():
+                self._give_up_at_source()
+            return
+        if policy.newest:
             while len(edge.ready) > 1:
                 self._drop_all([edge.drop(edge.ready[0])], stage.position - 1)
-        if self.policy.drop_late:
+        if policy.drop_late:
             while edge.ready and self._is_late(edge.frame[edge.ready[0]], stage):
                 self._drop_all([edge.drop(edge.ready[0])], stage.position - 1, "late")
-        return edge.frame[edge.ready[0]] if edge.ready else None
 
-    def _waiting_at_source(self) -> int | None:
-        if self._in_flight and len(self.frames) >= self._in_flight:
-            return None
+    def _give_up_at_source(self) -> None:
         if self.policy.newest:
             self.source.keep_newest()
         if self.policy.drop_late:
             while self.source.queue and self._is_late(self.source.queue[0][0], self.stages[0]):
                 self.source.drop_head("late")
-        return self.source.head()
 
     def _is_late(self, frame: int, stage: StageState) -> bool:
         """Whether the frame, whose next stage this is, must miss its deadline.
@@ -244,6 +269,7 @@ class Core:
         if not self.frames:
             for later in self.stages:
                 later.estimate_ns -= later.estimate_ns >> 4
+            self.reset_alarm()
         return True
 
     def _deadline_of(self, frame: int) -> int:
@@ -273,6 +299,7 @@ class Core:
         self._jobs += 1
         if not unit.queue:
             unit.head_since_ns = self.now_ns
+            self.alarm_ns = min(self.alarm_ns, self.now_ns + self.settings.hang_ns)
         unit.queue.append(job)
         self.actions.append(Dispatch(job))
 
@@ -292,28 +319,20 @@ class Core:
         if unit.queue or not unit.alive:
             return ASSIGNED
         states = [self._stage_state(stage) for stage in unit.stages]
-        if BLOCKED in states:
-            return BLOCKED
-        return THROTTLED if THROTTLED in states else STARVED
+        return next((state for state in (BLOCKED, THROTTLED) if state in states), STARVED)
 
     def _stage_state(self, stage: StageState) -> int:
         if stage.input is None:
             if self.source.head() is None:
                 return STARVED
-            if self._in_flight and len(self.frames) >= self._in_flight:
+            if self._is_full():
                 return BLOCKED
         elif not stage.input.ready:
             return STARVED
         return BLOCKED if stage.output and not stage.output.can_claim() else THROTTLED
 
     def _next_deadline(self) -> int | None:
-        times = faults.deadlines(self)
-        release = self.source.next_change_ns() if self.started else None
-        if release is not None:
-            times.append(release)
-        for unit in self.units.values():
-            if unit.hold_until_ns > self.now_ns:
-                times.append(unit.hold_until_ns)
-            if len(unit.queue) == 1 and self._ahead_ns(unit) > self.now_ns:
-                times.append(self._ahead_ns(unit))
-        return min(times, default=None)
+        if self._leads or self.alarm_ns <= self.now_ns:
+            self.alarm_ns = faults.next_alarm_ns(self)
+        next_ns = min(self.alarm_ns, self.source.due_ns)
+        return None if next_ns == NEVER else next_ns

@@ -6,7 +6,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from trilane.scheduler.events import Job, Kill, Start
-from trilane.scheduler.state import UnitState
+from trilane.scheduler.state import NEVER, UnitState
 
 if TYPE_CHECKING:
     from trilane.scheduler.core import Core
@@ -20,6 +20,7 @@ def on_died(core: Core, unit: UnitState) -> None:
     cause = f"{'hung' if unit.killing else 'died'}:{unit.name}"
     unit.alive = unit.killing = False
     unit.starting_ns = None
+    core.reset_alarm()
     jobs = list(unit.queue)
     unit.queue.clear()
     for job in jobs[:1]:
@@ -84,8 +85,11 @@ def check_clocks(core: Core) -> None:
             core.touch(unit)
 
 
-def deadlines(core: Core) -> list[int]:
-    """When a restart is due or a unit counts as hung."""
+def next_alarm_ns(core: Core) -> int:
+    """When the first clock of a unit runs out: a restart, a hold, a lead, a job or a silence too long; else NEVER.
+
+    No unit's clock can run out before, until one is set: ending a job and hearing from a unit only postpone it.
+    """
     times = []
     for unit in core.units.values():
         if unit.restart_at_ns is not None:
@@ -93,7 +97,11 @@ def deadlines(core: Core) -> list[int]:
         deadline = _hang_deadline(core, unit)
         if deadline is not None:
             times.append(deadline)
-    return times
+        if unit.hold_until_ns > core.now_ns:
+            times.append(unit.hold_until_ns)
+        if len(unit.queue) == 1 and core.ahead_ns(unit) > core.now_ns:
+            times.append(core.ahead_ns(unit))
+    return min(times, default=NEVER)
 
 
 def _hang_deadline(core: Core, unit: UnitState) -> int | None:

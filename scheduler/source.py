@@ -6,12 +6,14 @@ from collections import deque
 from collections.abc import Callable
 
 from trilane.scheduler.events import Settings
+from trilane.scheduler.state import NEVER
 
 
 class Source:
     """Frames 0..n-1. A released frame waits in `queue` until it is taken, turned away, or out of time.
 
     Without a rate (no period, no arrivals) a frame counts as released in the moment in which it can be taken.
+    `due_ns`: when the next frame is released or the oldest waiting one runs out of time.
     """
 
     def __init__(self, settings: Settings, drop: Callable[[int, str], None]) -> None:
@@ -22,27 +24,21 @@ class Source:
         self._start_ns = 0
         self._paced = bool(settings.period_ns or settings.arrivals_ns)
         self.queue: deque[tuple[int, int]] = deque()
+        self.due_ns = NEVER
 
     def start(self, now_ns: int) -> None:
         self._start_ns = now_ns
+        self._set_due()
 
     def stop(self) -> None:
         """Nothing more is released, and what waits is forgotten."""
         self._end = self._next
         self.queue.clear()
+        self._set_due()
 
     @property
     def exhausted(self) -> bool:
         return self._next >= self._end and not self.queue
-
-    def next_change_ns(self) -> int | None:
-        """When the next frame is released or the oldest waiting one runs out of time."""
-        times = []
-        if self._paced and self._next < self._end:
-            times.append(self._release_ns(self._next))
-        if self._settings.queue_timeout_ns and self.queue:
-            times.append(self.queue[0][1] + self._settings.queue_timeout_ns)
-        return min(times, default=None)
 
     def advance(self, now_ns: int) -> bool:
         """Release what is due, drop what waited too long; True when something changed."""
@@ -55,6 +51,7 @@ class Source:
         while timeout and self.queue and self.queue[0][1] + timeout <= now_ns:
             self._drop(self.queue.popleft()[0], "timeout")
             changed = True
+        self._set_due()
         return changed
 
     def head(self) -> int | None:
@@ -66,14 +63,18 @@ class Source:
     def keep_newest(self) -> None:
         while len(self.queue) > 1:
             self._drop(self.queue.popleft()[0], "stale")
+        self._set_due()
 
     def drop_head(self, cause: str) -> None:
         self._drop(self.queue.popleft()[0], cause)
+        self._set_due()
 
     def take(self, now_ns: int) -> tuple[int, int]:
         """The head and its release time."""
         if self.queue:
-            return self.queue.popleft()
+            head = self.queue.popleft()
+            self._set_due()
+            return head
         self._next += 1
         return self._next - 1, now_ns
 
@@ -86,6 +87,11 @@ class Source:
             self._drop(frame, "queue_full")
         else:
             self.queue.append((frame, release_ns))
+
+    def _set_due(self) -> None:
+        self.due_ns = self._release_ns(self._next) if self._paced and self._next < self._end else NEVER
+        if self._settings.queue_timeout_ns and self.queue:
+            self.due_ns = min(self.due_ns, self.queue[0][1] + self._settings.queue_timeout_ns)
 
     def _release_ns(self, frame: int) -> int:
         arrivals = self._settings.arrivals_ns

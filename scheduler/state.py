@@ -8,6 +8,7 @@ from trilane.scheduler.events import Graph, Job
 from trilane.transport.slots import EdgeSlots, edge_rule
 
 FULL_DUTY = 1000
+NEVER = 1 << 62  # ns
 
 
 class UnitState:

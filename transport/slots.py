@@ -14,13 +14,13 @@ from dataclasses import dataclass
 FREE, WRITING, READY, READING = "free", "writing", "ready", "reading"
 
 TRANSITIONS = {
-    ("claim", FREE): WRITING,
-    ("commit", WRITING): READY,
-    ("abandon", WRITING): FREE,  # the producer died or failed
-    ("take", READY): READING,
-    ("drop", READY): FREE,  # replaced by a newer frame, or too late
-    ("release", READING): FREE,
-    ("give_back", READING): READY,  # the consumer died before it began
+    "claim": (FREE, WRITING),
+    "commit": (WRITING, READY),
+    "abandon": (WRITING, FREE),  # the producer died or failed
+    "take": (READY, READING),
+    "drop": (READY, FREE),  # replaced by a newer frame, or too late
+    "release": (READING, FREE),
+    "give_back": (READING, READY),  # the consumer died before it began
 }
 
 MAX_SLOTS = 64
@@ -127,10 +127,10 @@ class EdgeSlots:
         return [self.drop(old) for old in list(self.ready)[:-1]]
 
     def _move(self, verb: str, slot: int) -> None:
-        state = TRANSITIONS.get((verb, self.state[slot]))
-        if state is None:
+        before, after = TRANSITIONS[verb]
+        if self.state[slot] != before:
             raise SlotError(f"cannot {verb} slot {slot}, which is {self.state[slot]}")
-        self.state[slot] = state
+        self.state[slot] = after
 
     def _empty(self, slot: int) -> None:
         self.frame[slot] = -1

@@ -31,14 +31,15 @@ def test_an_unknown_edge_is_named(text: str) -> None:
         edge_rule(text)
 
 
-@pytest.mark.parametrize("verb", sorted({verb for verb, _ in TRANSITIONS}))
+@pytest.mark.parametrize("verb", sorted(TRANSITIONS))
 @pytest.mark.parametrize("state", [FREE, WRITING, READY, READING])
 def test_what_the_table_does_not_have_is_refused(verb: str, state: str) -> None:
     edge = EdgeSlots(edge_rule("single"))
     edge.state[0] = state
-    if (verb, state) in TRANSITIONS:
+    before, after = TRANSITIONS[verb]
+    if state == before:
         edge._move(verb, 0)
-        assert edge.state[0] == TRANSITIONS[verb, state]
+        assert edge.state[0] == after
     else:
         with pytest.raises(SlotError):
             edge._move(verb, 0)
