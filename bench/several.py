@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.avatars.bundle import bundle_folder, load_bundle
+from trilane.avatars.bundle import Bundle, bundle_folder, load_bundle
 from trilane.avatars.reshape import reshaped
 from trilane.errors import BadInputError, MissingPartError
 from trilane.scene.schema import AvatarSpec, Scene, Shape, shape_buckets
@@ -86,9 +86,9 @@ class _Stand:
 
     def __init__(self) -> None:
         bundle = load_bundle("default")
-        self.shaped = load_body(bundle.body_path).shape(bundle.manifest.betas, bundle.manifest.expression)
+        self.shaped = shaped_body(bundle)
         self.network = bundle.read_network()
-        self._studio, self._image_error = _truth(self.shaped)
+        self._studio, self._image_error = ground_truth(bundle)
         assets, ctx = load_assets(bundle_folder("default")), self._studio.ctx
         self.packed = PackedPass(ctx, assets.texture.shape[2], assets.quantisation, deferred=True)
         self.avatar = PackedAvatar(self.packed, SkinnedMesh(ctx, assets.arrays), assets.texture)
@@ -155,14 +155,19 @@ def _views(stand: _Stand, avatars: int, views: int, size: str, margin: int) -> I
             yield _View(tuple(joints), view, projection, lay_out(seen, OUTPUT, shape_buckets(size), margin))
 
 
-def _truth(shaped: ShapedBody) -> tuple[Any, Any]:
-    """The dressed body on the GPU, and the `image_error` of two pictures."""
+def ground_truth(bundle: Bundle) -> tuple[Any, Any]:
+    """The bundle's body, dressed, on the GPU, and the `image_error` of two pictures. Raises MissingPartError."""
     try:
         from trilane.avatars.training.dataset import Studio
         from trilane.avatars.training.metrics import image_error
     except ImportError as error:
         raise MissingPartError(f"ground truth needs {error.name}", "pip install 'trilane[train]'") from None
-    return Studio(shaped), image_error
+    return Studio(shaped_body(bundle)), image_error
+
+
+def shaped_body(bundle: Bundle) -> ShapedBody:
+    """The body of `bundle` in the shape that its manifest says."""
+    return load_body(bundle.body_path).shape(bundle.manifest.betas, bundle.manifest.expression)
 
 
 def _check(avatars: int, views: int, size: str, margins: Sequence[int]) -> None:

@@ -103,13 +103,14 @@ class CameraSpec(Model):
 
 
 class Scene(Model):
-    """A scene. `background`: `room`, or a video, image folder or picture."""
+    """A scene. `background`: `room`, or a video, image folder or picture. `texture_filter`: of the neural texture."""
 
     name: str = "scene"
     fps: float = Field(default=30.0, gt=0, le=1000, allow_inf_nan=False)
     frames: int = Field(default=300, ge=1, le=10_000_000)
     size: Annotated[str, AfterValidator(_checked_size)] = "256"
     background: str = "room"
+    texture_filter: Literal["linear", "mipmap", "anisotropic"] = "linear"
     error_budget_px: float = Field(default=0.5, ge=0, allow_inf_nan=False)
     output: OutputSpec = OutputSpec()
     camera: CameraSpec = CameraSpec()

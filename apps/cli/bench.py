@@ -23,6 +23,7 @@ BENCHES = {
     "raster-oracle": ("trilane.bench.oracle", "The packed pass against the float64 reference."),
     "crop": ("trilane.bench.crop", "What the crop wastes, beside squares around the joints."),
     "several": ("trilane.bench.several", "What an avatar loses to others in the same tensor."),
+    "filters": ("trilane.bench.filters", "MIP maps and anisotropy of the neural texture: cost and difference."),
     "infer": ("trilane.bench.infer", "A network, continuously, on each runtime and in FP32."),
     "peers": (
         "trilane.bench.peers",

@@ -24,6 +24,12 @@ U8 = NDArray[np.uint8]
 Shape = tuple[int, int]
 
 CHANNELS = (4, 8, 12, 16)
+#: How the neural texture is read: the filter when it is shrunk, and the greatest anisotropy (the driver's may be less).
+FILTERS = {
+    "linear": (moderngl.LINEAR, 1.0),
+    "mipmap": (moderngl.LINEAR_MIPMAP_LINEAR, 1.0),
+    "anisotropic": (moderngl.LINEAR_MIPMAP_LINEAR, 16.0),
+}
 FP16_MAX = float(np.finfo(np.float16).max)
 WORD_TYPES = {1: "uint", 2: "uvec2", 3: "uvec4", 4: "uvec4"}
 TARGET_WORDS = {1: 1, 2: 2, 3: 4, 4: 4}  # three-word targets need not be drawable; the fourth word is not read back
@@ -67,12 +73,20 @@ class PackedPass:
 
     `deferred`: first u and v of every pixel, then the texture once for each pixel that is seen; the bytes are the same.
     Software drivers shade whole blocks of pixels for each small triangle, so there this is the faster way.
+    `filtering`: of `FILTERS`; a deferred pass has no derivatives and takes `linear` alone. Raises BadInputError.
     """
 
-    def __init__(self, ctx: Any, channels: int, quantisation: Quantisation, deferred: bool) -> None:
+    def __init__(
+        self, ctx: Any, channels: int, quantisation: Quantisation, deferred: bool, filtering: str = "linear"
+    ) -> None:
+        if filtering not in FILTERS:
+            raise BadInputError("texture filter", repr(filtering), f"one of {', '.join(FILTERS)}")
+        if deferred and filtering != "linear":
+            raise BadInputError("texture filter", filtering, "linear", "draw mesh and texture in one pass")
         if channels not in CHANNELS:
             raise BadInputError("network input", f"{channels} channels", "4, 8, 12 or 16", "pad with zero channels")
         self.ctx, self.channels, self.quantisation, self.deferred = ctx, channels, quantisation, deferred
+        self.filtering = filtering
         self._targets: dict[Shape, Target] = {}
         self._background = (0x01010101 * quantisation.zero_point,) * 4
 
@@ -126,7 +140,7 @@ class PackedAvatar:
     def __init__(self, packed: PackedPass, mesh: SkinnedMesh, texture: NDArray[np.floating[Any]]) -> None:
         check_texture(texture, packed.channels)
         self._mesh, self._ctx = mesh, packed.ctx
-        self._texture = texture_array(packed.ctx, texture)
+        self._texture = texture_array(packed.ctx, texture, packed.filtering)
         defines: dict[str, int | str] = {"LAYERS": packed.layers, "WORDS": WORD_TYPES[packed.layers]}
         if packed.deferred:
             self._geometry = MeshDraw(packed.ctx, mesh, "uv_only.frag")
@@ -161,13 +175,17 @@ class PackedAvatar:
         self._ctx.depth_func = "<"
 
 
-def texture_array(ctx: Any, texture: NDArray[np.floating[Any]]) -> Any:
-    """An FP16 array texture of C/4 RGBA layers from `texture` (H,W,C): bilinear, clamped to its edge."""
+def texture_array(ctx: Any, texture: NDArray[np.floating[Any]], filtering: str = "linear") -> Any:
+    """An FP16 array texture of C/4 RGBA layers from `texture` (H,W,C), clamped to its edge, read as `FILTERS` says."""
     height, width, channels = texture.shape
     layers = texture.reshape(height, width, channels // 4, 4).transpose(2, 0, 1, 3)
     pixels = np.ascontiguousarray(layers, np.float16).tobytes()
     array = ctx.texture_array((width, height, channels // 4), 4, pixels, dtype="f2")
-    array.filter = (moderngl.LINEAR, moderngl.LINEAR)
+    shrunk, anisotropy = FILTERS[filtering]
+    if shrunk != moderngl.LINEAR:
+        array.build_mipmaps()
+    array.filter = (shrunk, moderngl.LINEAR)
+    array.anisotropy = anisotropy
     array.repeat_x = array.repeat_y = False
     return array
 

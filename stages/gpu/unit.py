@@ -28,7 +28,9 @@ def build(config: RunConfig) -> dict[str, Stage]:
     _check_one_encoding(assets)
     ctx = open_context(config.units["gpu"].threads)
     first = assets[folders[0]]
-    packed = PackedPass(ctx, first.texture.shape[2], first.quantisation, deferred=not describe(ctx).hardware)
+    filtering = config.scene.texture_filter
+    deferred = filtering == "linear" and not describe(ctx).hardware
+    packed = PackedPass(ctx, first.texture.shape[2], first.quantisation, deferred, filtering)
     drawn = {
         folder: PackedAvatar(packed, SkinnedMesh(ctx, found.arrays, found.posedirs), found.texture)
         for folder, found in assets.items()

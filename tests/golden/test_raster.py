@@ -225,3 +225,26 @@ def test_pose_blend_shapes_move_vertices(gl: Any, person: Any, camera: Camera) -
     moved[:, 0, 3] += 0.2 * joints[:, 0, 0]
     plain = UvRaster(gl, person.mesh).render(moved, *views, (64, 64))
     assert (blended[..., 2] != plain[..., 2]).sum() <= 8
+
+
+@pytest.mark.parametrize("filtering", ["mipmap", "anisotropic"])
+def test_mip_maps_smooth_a_texture_that_is_shrunk(gl: Any, person: Any, camera: Camera, filtering: str) -> None:
+    """Noise read far away: linear keeps its contrast, MIP maps average it; enlarged, all filters read the same."""
+    noise = np.random.default_rng(0).choice([-2.0, 2.0], (512, 512, 4))
+    view, joints = camera((0, 0.9, 3), (0, 0.9, 0)), person.pose(REST)
+    contrast = {}
+    for name in ("linear", filtering):
+        packed = PackedPass(gl, 4, ENCODING, deferred=False, filtering=name)
+        avatar = PackedAvatar(packed, person.mesh, noise)
+        avatar.draw(packed.begin((64, 64)), view[0], Placement(joints, view[1], (0, 0, 64, 64)))
+        tensor = np.zeros(64 * 64 * 4, np.uint8)
+        packed.read_into((64, 64), tensor)
+        covered = (tensor.reshape(-1, 4) != ENCODING.zero_point).any(axis=1)
+        contrast[name] = tensor.reshape(-1, 4)[covered].std()
+    assert contrast[filtering] < 0.5 * contrast["linear"]
+
+
+def test_filters_that_cannot_be_are_refused(gl: Any) -> None:
+    for deferred, filtering in ((True, "mipmap"), (False, "bicubic")):
+        with pytest.raises(BadInputError, match="texture filter"):
+            PackedPass(gl, 4, ENCODING, deferred, filtering)
