@@ -19,6 +19,7 @@ from trilane.stages.gpu.context import describe, open_context
 from trilane.stages.gpu.mesh import SkinnedMesh
 from trilane.stages.gpu.packed import CHANNELS, PackedAvatar, PackedPass, Placement
 from trilane.stages.gpu.split import SplitPass
+from trilane.stages.gpu.uv_image import UvBytes
 
 MAX_SIDE = 4096
 WARM_UP = 5
@@ -44,7 +45,9 @@ def measure(size: int = 512, channels: int = 16, repeats: int = 40, threads: int
         "split": split_way(ctx, subject, (size, size)),
     }
     tensors = {name: np.zeros(size * size * channels, np.uint8) for name in ways}
-    times = interleaved({name: partial(way, tensors[name]) for name, way in ways.items()}, repeats)
+    turns = {name: partial(way, tensors[name]) for name, way in ways.items()}
+    turns["UV bytes alone"] = partial(uv_way(ctx, subject, (size, size)), np.zeros(size * size * 2, np.uint8))
+    times = interleaved(turns, repeats)
     _check_equal(tensors)
     rows = {name: summary(taken) for name, taken in times.items()}
     packed_ms, split_ms = rows["packed"]["median_ms"], rows["split"]["median_ms"]
@@ -80,6 +83,16 @@ def split_way(ctx: Any, subject: Subject, shape: tuple[int, int]) -> Callable[[A
     def turn(tensor: Any) -> None:
         split.draw(subject.view, placement)
         split.read_into(tensor)
+
+    return turn
+
+
+def uv_way(ctx: Any, subject: Subject, shape: tuple[int, int]) -> Callable[[Any], None]:
+    """A function that draws the UV coordinates of `subject` as two bytes a pixel."""
+    image = UvBytes(ctx, SkinnedMesh(ctx, subject.arrays))
+
+    def turn(tensor: Any) -> None:
+        image.render_into(tensor, subject.joints, subject.view, subject.projection, shape)
 
     return turn
 

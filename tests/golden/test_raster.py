@@ -13,7 +13,7 @@ from trilane.errors import BadInputError
 from trilane.stages.gpu import oracle
 from trilane.stages.gpu.mesh import SkinnedMesh, mesh_arrays
 from trilane.stages.gpu.packed import PackedAvatar, PackedPass, Placement, Quantisation
-from trilane.stages.gpu.uv_image import UvRaster
+from trilane.stages.gpu.uv_image import UvBytes, UvRaster
 
 ENCODING = Quantisation(6 / 255, 117)
 REST = np.zeros(165)
@@ -248,3 +248,13 @@ def test_filters_that_cannot_be_are_refused(gl: Any) -> None:
     for deferred, filtering in ((True, "mipmap"), (False, "bicubic")):
         with pytest.raises(BadInputError, match="texture filter"):
             PackedPass(gl, 4, ENCODING, deferred, filtering)
+
+
+def test_uv_bytes_are_the_uv_image_rounded(gl: Any, person: Any, camera: Camera) -> None:
+    """At sides that are no multiple of four too; half a step, and what FP32 leaves of a tie."""
+    view, joints, shape = camera((0.4, 1.2, 3), (0, 0.9, 0)), person.pose(random_numbers(1)), (97, 65)
+    image = UvRaster(gl, person.mesh).render(joints, *view, shape)
+    tensor = np.full(97 * 65 * 2, 77, np.uint8)
+    UvBytes(gl, person.mesh).render_into(tensor, joints, *view, shape)
+    assert np.abs(tensor.reshape(*shape, 2) - image[..., :2] * 255.0).max() <= 0.5 + 1e-3
+    assert not tensor.reshape(*shape, 2)[image[..., 2] == 0].any()
