@@ -187,21 +187,23 @@ class Core:
         dirty = self._dirty
         for unit in dirty:  # a dispatch may append to the list, also a unit that was looked at before
             unit.dirty = False
-            while self._has_room(unit):
+            while len(unit.queue) < HELD_JOBS and self._may_take(unit):
                 stage = self._choose(unit)
                 if stage is None:
                     break
                 self._dispatch(unit, stage)
         for unit in dirty:
             state = ASSIGNED if unit.queue else self._idle_state(unit)
-            self.ledger.enter(unit.name, self.now_ns, state)
+            if state != unit.state:
+                unit.state = state
+                self.ledger.enter(unit.name, self.now_ns, state)
         dirty.clear()
 
-    def _has_room(self, unit: UnitState) -> bool:
-        held = len(unit.queue)
-        if held >= HELD_JOBS or not unit.alive or unit.killing or unit.hold_until_ns > self.now_ns:
+    def _may_take(self, unit: UnitState) -> bool:
+        """Whether the unit may be handed one more job now."""
+        if not unit.alive or unit.killing or unit.hold_until_ns > self.now_ns:
             return False
-        return not held or (unit.duty == FULL_DUTY and self.now_ns >= self.ahead_ns(unit))
+        return not unit.queue or (unit.duty == FULL_DUTY and (not self._leads or self.now_ns >= self.ahead_ns(unit)))
 
     def ahead_ns(self, unit: UnitState) -> int:
         """When a unit that runs a job may be handed its next one."""
@@ -210,25 +212,33 @@ class Core:
         return unit.head_since_ns + self.stage_named[unit.queue[0].stage].estimate_ns - self.policy.lead_ns
 
     def _choose(self, unit: UnitState) -> StageState | None:
-        found = None
-        rivals: list[Candidate] = []
+        found: list[StageState] = []
         for stage in unit.stages:
-            frame = self._waiting(stage)
-            if frame is None or not (stage.output is None or stage.output.can_claim()):
-                continue
-            if len(unit.stages) > 1:
-                rivals.append(Candidate(frame, stage.position, self._deadline_of(frame)))
-            found = stage
-        return self.stages[self.policy.choose(rivals).position] if len(rivals) > 1 else found
+            if self._drops:
+                self._give_up(stage)
+            if self._can_run(stage):
+                found.append(stage)
+        if len(found) > 1:
+            return self.stages[self.policy.choose([self._candidate(stage) for stage in found]).position]
+        return found[0] if found else None
 
-    def _waiting(self, stage: StageState) -> int | None:
-        """The frame that the stage would do next; what the policy gives up on is dropped on the way."""
-        if self._drops:
-            self._give_up(stage)
+    def _can_run(self, stage: StageState) -> bool:
+        source, sink = stage.input, stage.output
+        if source is None:
+            if self.source.is_empty or self._is_full():
+                return False
+        elif not source.ready:
+            return False
+        return sink is None or bool(sink.free) or sink.can_claim()
+
+    def _candidate(self, stage: StageState) -> Candidate:
+        """The frame that the stage would do next."""
         edge = stage.input
-        if edge is not None:
-            return edge.frame[edge.ready[0]] if edge.ready else None
-        return None if self._is_full() else self.source.head()
+        if edge is None:
+            frame, release_ns = self.source.head(self.now_ns)
+            return Candidate(frame, stage.position, self._deadline_from(release_ns))
+        frame = edge.frame[edge.ready[0]]
+        return Candidate(frame, stage.position, self.frames[frame].deadline_ns)
 
     def _is_full(self) -> bool:
         """Whether as many frames are in flight as may be."""
@@ -245,38 +255,32 @@ class Core:
             while len(edge.ready) > 1:
                 self._drop_all([edge.drop(edge.ready[0])], stage.position - 1)
         if policy.drop_late:
-            while edge.ready and self._is_late(edge.frame[edge.ready[0]], stage):
+            while edge.ready and self._is_late(self._candidate(stage)):
                 self._drop_all([edge.drop(edge.ready[0])], stage.position - 1, "late")
 
     def _give_up_at_source(self) -> None:
         if self.policy.newest:
             self.source.keep_newest()
         if self.policy.drop_late:
-            while self.source.queue and self._is_late(self.source.queue[0][0], self.stages[0]):
+            while self.source.queue and self._is_late(self._candidate(self.stages[0])):
                 self.source.drop_head("late")
 
-    def _is_late(self, frame: int, stage: StageState) -> bool:
-        """Whether the frame, whose next stage this is, must miss its deadline.
+    def _is_late(self, waiting: Candidate) -> bool:
+        """Whether the frame must miss its deadline.
 
         With nothing in flight the estimates alone are to blame; they are lowered, so that one slow measurement
         cannot drop every frame for ever.
         """
-        deadline_ns = self._deadline_of(frame)
-        if not deadline_ns:
+        if not waiting.deadline_ns:
             return False
-        if earliest_finish_ns(self.now_ns, frame, stage.position, self.stages, self.frames) <= deadline_ns:
+        end_ns = earliest_finish_ns(self.now_ns, waiting.frame, waiting.position, self.stages, self.frames)
+        if end_ns <= waiting.deadline_ns:
             return False
         if not self.frames:
             for later in self.stages:
                 later.estimate_ns -= later.estimate_ns >> 4
             self.reset_alarm()
         return True
-
-    def _deadline_of(self, frame: int) -> int:
-        state = self.frames.get(frame)
-        if state is not None:
-            return state.deadline_ns
-        return self._deadline_from(self.source.release_of_head(self.now_ns))
 
     def _deadline_from(self, release_ns: int) -> int:
         return release_ns + self.settings.deadline_ns if self.settings.deadline_ns else 0
@@ -299,7 +303,9 @@ class Core:
         self._jobs += 1
         if not unit.queue:
             unit.head_since_ns = self.now_ns
-            self.alarm_ns = min(self.alarm_ns, self.now_ns + self.settings.hang_ns)
+            hangs_ns = self.now_ns + self.settings.hang_ns
+            if hangs_ns < self.alarm_ns:
+                self.alarm_ns = hangs_ns
         unit.queue.append(job)
         self.actions.append(Dispatch(job))
 
@@ -318,12 +324,18 @@ class Core:
     def _idle_state(self, unit: UnitState) -> int:
         if unit.queue or not unit.alive:
             return ASSIGNED
-        states = [self._stage_state(stage) for stage in unit.stages]
-        return next((state for state in (BLOCKED, THROTTLED) if state in states), STARVED)
+        found = STARVED
+        for stage in unit.stages:
+            state = self._stage_state(stage)
+            if state == BLOCKED:
+                return BLOCKED
+            if state == THROTTLED:
+                found = THROTTLED
+        return found
 
     def _stage_state(self, stage: StageState) -> int:
         if stage.input is None:
-            if self.source.head() is None:
+            if self.source.is_empty:
                 return STARVED
             if self._is_full():
                 return BLOCKED
@@ -334,5 +346,7 @@ class Core:
     def _next_deadline(self) -> int | None:
         if self._leads or self.alarm_ns <= self.now_ns:
             self.alarm_ns = faults.next_alarm_ns(self)
-        next_ns = min(self.alarm_ns, self.source.due_ns)
+        next_ns = self.source.due_ns
+        if self.alarm_ns < next_ns:
+            next_ns = self.alarm_ns
         return None if next_ns == NEVER else next_ns

@@ -32,7 +32,8 @@ class _UnitBook:
         self.state, self.since_ns = state, now_ns
 
     def work(self, begin_ns: int, end_ns: int) -> None:
-        begin_ns = max(begin_ns, self.busy_until_ns)
+        if begin_ns < self.busy_until_ns:
+            begin_ns = self.busy_until_ns
         if end_ns > begin_ns:
             self.busy_ns += end_ns - begin_ns
             self.busy_until_ns = end_ns
@@ -82,9 +83,7 @@ class Ledger:
             book.enter(now_ns, book.state)
 
     def enter(self, unit: str, now_ns: int, state: int) -> None:
-        book = self._units[unit]
-        if book.state != state:
-            book.enter(now_ns, state)
+        self._units[unit].enter(now_ns, state)
 
     def job(self, job: Job, ready_ns: int, begin_ns: int, end_ns: int) -> None:
         book = self._stages[job.stage]

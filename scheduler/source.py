@@ -54,11 +54,14 @@ class Source:
         self._set_due()
         return changed
 
-    def head(self) -> int | None:
-        """The frame that is next, when one is there."""
-        if self.queue:
-            return self.queue[0][0]
-        return self._next if not self._paced and self._next < self._end else None
+    @property
+    def is_empty(self) -> bool:
+        """Whether no frame can be taken now."""
+        return not self.queue and (self._paced or self._next >= self._end)
+
+    def head(self, now_ns: int) -> tuple[int, int]:
+        """The frame that is next and its release time; `is_empty` says whether there is one."""
+        return self.queue[0] if self.queue else (self._next, now_ns)
 
     def keep_newest(self) -> None:
         while len(self.queue) > 1:
@@ -71,15 +74,13 @@ class Source:
 
     def take(self, now_ns: int) -> tuple[int, int]:
         """The head and its release time."""
+        head = self.head(now_ns)
         if self.queue:
-            head = self.queue.popleft()
+            self.queue.popleft()
             self._set_due()
-            return head
-        self._next += 1
-        return self._next - 1, now_ns
-
-    def release_of_head(self, now_ns: int) -> int:
-        return self.queue[0][1] if self.queue else now_ns
+        else:
+            self._next += 1
+        return head
 
     def _admit(self, frame: int, release_ns: int) -> None:
         limit = self._settings.in_queue

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 
 from trilane.scheduler.events import Graph, Job
+from trilane.scheduler.ledger import STARVED
 from trilane.transport.slots import EdgeSlots, edge_rule
 
 FULL_DUTY = 1000
@@ -12,7 +13,10 @@ NEVER = 1 << 62  # ns
 
 
 class UnitState:
-    """`queue`: the running job, then the held one. `head_since_ns`: since when the first of them could run."""
+    """`queue`: the running job, then the held one. `head_since_ns`: since when the first of them could run.
+
+    `state`: the one that the ledger has it in.
+    """
 
     __slots__ = (
         "alive",
@@ -28,6 +32,7 @@ class UnitState:
         "restart_at_ns",
         "stages",
         "starting_ns",
+        "state",
     )
 
     def __init__(self, name: str) -> None:
@@ -40,6 +45,7 @@ class UnitState:
         self.starting_ns: int | None = None
         self.failures = 0
         self.duty = FULL_DUTY
+        self.state = STARVED
 
 
 class StageState:

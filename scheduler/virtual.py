@@ -89,17 +89,16 @@ class VirtualDriver:
         deadline: int | None = None
         while True:
             now_ns, events = self._next(deadline)
-            decision = self.core.step(now_ns, events)
+            actions, deadline = self.core.step(now_ns, events)
             if self.recording is not None:
-                self.recording.steps.append((now_ns, events, decision.actions))
-            for action in decision.actions:
+                self.recording.steps.append((now_ns, events, actions))
+            for action in actions:
                 if type(action) is Dispatch:
                     self._dispatch(now_ns, action.job)
                 elif type(action) is Finish:
                     return action.cause
                 else:
                     self._actions[type(action)](now_ns, action)
-            deadline = decision.next_deadline_ns
 
     def _next(self, deadline_ns: int | None) -> tuple[int, tuple[Event, ...]]:
         """The next valid event, or none at the core's deadline when that comes first."""
@@ -130,7 +129,9 @@ class VirtualDriver:
 
     def _dispatch(self, now_ns: int, job: Job) -> None:
         unit = self._units[job.unit]
-        begin_ns = max(now_ns + self._hop_ns, unit.free_ns)
+        begin_ns = now_ns + self._hop_ns
+        if begin_ns < unit.free_ns:
+            begin_ns = unit.free_ns
         end_ns = unit.free_ns = begin_ns + self._service(job.stage, job.unit, job.frame, begin_ns)
         self._push(end_ns + self._hop_ns, EVENT, JobDone(job.unit, job.id, begin_ns, end_ns, begin_ns), unit.epoch)
         if self.recording is not None:
