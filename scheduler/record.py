@@ -55,7 +55,9 @@ def read(path: Path) -> Recording:
                 row = json.loads(line)
                 events = tuple(_parse(item) for item in row["events"])
                 recording.steps.append((row["t"], events, tuple(_parse(item) for item in row["actions"])))
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except OSError as error:
+        raise BadInputError(path, (error.strerror or str(error)).lower(), "a recorded run") from None
+    except (ValueError, KeyError, TypeError) as error:
         raise BadInputError(
             f"{path}, line {number + 1}", str(error) or type(error).__name__, "a recorded run"
         ) from None

@@ -1,0 +1,133 @@
+"""How fast is the scheduler in virtual time, beside SimPy on the same model, and is it the same every time?
+
+Rule: both present every frame at the same nanosecond or the bench fails; they take turns, with the same service times.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from trilane.errors import BadInputError, TrilaneError
+from trilane.scheduler.events import Graph, Settings, avatar_graph
+from trilane.scheduler.record import read, replay
+from trilane.scheduler.virtual import Service, VirtualDriver, simulate
+
+MS = 1_000_000
+#: Mean service time in ms; each job takes from half of it to one and a half.
+SERVICE_MS = {"pose": 0.3, "raster": 4.0, "infer": 14.0, "composite": 2.0, "present": 3.0}
+FPS = 60
+PERIOD_NS = round(1e9 / FPS)
+REPEATS, SEED_FRAMES = 10, 300
+INSTALL = "pip install 'trilane[peers]'"
+
+
+def measure(minutes: float = 30.0, turns: int = 3, seeds: int = 10, events: str = "") -> dict[str, Any]:
+    """`minutes` of the avatar's pipeline at 60 frames a second, policy `pipelined`, edges `double`.
+
+    Rows: `way`, `frames`, median CPU `seconds`, `events_per_s` (an event: a frame's release or a job's end, the same
+    number in both), `processed` (by the way's own count; SimPy takes several to a job). `agree`: frames that both
+    present at the same nanosecond. `same_traces`: of `seeds` seeds, with a unit that dies, how many give one trace in
+    10 repeats; `different_traces`: traces between the seeds. `replay`: of the events of a run (`events`: its folder or
+    events.jsonl), `steps` and how many are answered differently.
+    Raises BadInputError for what is no recording, TrilaneError when SimPy disagrees.
+    """
+    if minutes <= 0 or turns < 1 or seeds < 1:
+        raise BadInputError("bench scheduler", f"minutes {minutes:g}, turns {turns}, seeds {seeds}", "positive numbers")
+    replayed = _replayed(events) if events else {}
+    frames = max(2, round(minutes * 60 * FPS))
+    graph, service = avatar_graph(), _service(0, frames)
+    ways: dict[str, Callable[[], list[int]]] = {"trilane": lambda: _trilane(graph, service, frames)}
+    absent = _add_simpy(ways, graph, service, frames)
+    seconds: dict[str, list[float]] = {way: [] for way in ways}
+    ends: dict[str, list[int]] = {}
+    for _ in range(turns):
+        for way, run in ways.items():
+            begin = time.process_time()
+            ends[way] = run()
+            seconds[way].append(time.process_time() - begin)
+    if any(other != ends["trilane"] for other in ends.values()):
+        raise TrilaneError("SimPy's model presents frames at other times than Trilane's scheduler")
+    counts = _processed(graph, service, frames, with_simpy=not absent)
+    events_each = frames * (len(graph.stages) + 1)
+    rows = [_row(way, frames, events_each, median(taken), counts[way]) for way, taken in seconds.items()]
+    speeds = {row["way"]: row["events_per_s"] for row in rows}
+    traces = [_traces(seed) for seed in range(seeds)]
+    return {
+        "rows": rows,
+        "over_simpy": speeds["trilane"] / speeds["simpy"] if "simpy" in speeds else None,
+        "agree": None if absent else frames,
+        "same_traces": sum(len(set(found)) == 1 for found in traces),
+        "different_traces": len({found[0] for found in traces}),
+        "config": {"minutes": minutes, "fps": FPS, "turns": turns, "seeds": seeds, "repeats": REPEATS},
+        **absent,
+        **replayed,
+    }
+
+
+def _service(seed: int, frames: int) -> Service:
+    """Service times from a table made beforehand, so that both ways pay a look-up and no more."""
+    rng = np.random.default_rng(seed)
+    table = {name: (ms * MS * rng.uniform(0.5, 1.5, frames)).astype(int).tolist() for name, ms in SERVICE_MS.items()}
+    return lambda stage, _unit, frame, _begin_ns: table[stage][frame]
+
+
+def _trilane(graph: Graph, service: Service, frames: int) -> list[int]:
+    driver = VirtualDriver(graph, Settings(frames, "pipelined", period_ns=PERIOD_NS), service)
+    driver.run()
+    driver.core.ledger.report(clock="virtual", requested=frames)
+    return driver.core.ledger.presented_ns
+
+
+def _add_simpy(
+    ways: dict[str, Callable[[], list[int]]], graph: Graph, service: Service, frames: int
+) -> dict[str, dict[str, str]]:
+    """The peer as a way, or why it is absent."""
+    try:
+        from trilane.bench.simpy_model import SimpyPipeline
+    except ModuleNotFoundError:
+        return {"absent": {"simpy": f"not installed: {INSTALL}"}}
+    ways["simpy"] = lambda: SimpyPipeline(graph, service, frames, PERIOD_NS).run()
+    return {}
+
+
+def _processed(graph: Graph, service: Service, frames: int, *, with_simpy: bool) -> dict[str, int]:
+    """Events that each way goes through by its own count."""
+    counts = {"trilane": frames * (len(graph.stages) + 1)}
+    if with_simpy:
+        from trilane.bench.simpy_model import SimpyPipeline
+
+        counts["simpy"] = SimpyPipeline(graph, service, frames, PERIOD_NS).run_counting()
+    return counts
+
+
+def _row(way: str, frames: int, events: int, seconds: float, processed: int) -> dict[str, Any]:
+    rates = {"seconds": seconds, "events_per_s": events / seconds}
+    return {"way": way, "frames": frames, "events": events, **rates, "processed": processed}
+
+
+def _traces(seed: int) -> list[str]:
+    """Digests of every step of equal runs under the `deadline` policy, in which the DSP dies once."""
+    settings = Settings(SEED_FRAMES, "deadline", period_ns=PERIOD_NS, deadline_ns=3 * PERIOD_NS)
+    found = []
+    for _ in range(REPEATS):
+        faults = [(1_000 * MS + seed * 7 * MS, "dsp")]
+        done = simulate(
+            avatar_graph(), settings, _service(seed, SEED_FRAMES), restart_ns=50 * MS, faults=faults, keep=True
+        )
+        assert done.recording is not None
+        found.append(hashlib.sha256(repr((done.recording.steps, done.report)).encode()).hexdigest())
+    return found
+
+
+def _replayed(events: str) -> dict[str, Any]:
+    path = Path(events)
+    recording = read(path / "events.jsonl" if path.is_dir() else path)
+    differences = list(replay(recording))
+    return {"replay": {"steps": len(recording.steps), "different": len(differences), "first": (differences or [""])[0]}}
