@@ -40,6 +40,7 @@ class Request:
     frames: int | None = None
     size: str | None = None
     runtime: str = "auto"
+    hud: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,9 @@ def requested_scene(request: Request) -> Scene:
     """
     values = load_scene(find_scene(request.scene))
     here = Path.cwd()
-    values.update({key: getattr(request, key) for key in ("frames", "size") if getattr(request, key) is not None})
+    values.update(
+        {key: getattr(request, key) for key in ("frames", "size", "hud") if getattr(request, key) is not None}
+    )
     if request.background is not None:
         values["background"] = located(request.background, here)
     if request.camera is not None:

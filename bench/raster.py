@@ -6,7 +6,7 @@ Rule: both ways draw the same subject in the same process, turn about, and must 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import partial
 from typing import Any
@@ -97,7 +97,7 @@ def uv_way(ctx: Any, subject: Subject, shape: tuple[int, int]) -> Callable[[Any]
     return turn
 
 
-def interleaved(ways: dict[str, Callable[[], object]], repeats: int) -> dict[str, list[float]]:
+def interleaved(ways: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, list[float]]:
     """Milliseconds of each way, `repeats` times turn about after a warm-up, so that a busy machine hits all alike."""
     times: dict[str, list[float]] = {name: [] for name in ways}
     for turn in range(-WARM_UP, repeats):

@@ -102,14 +102,39 @@ class CameraSpec(Model):
         return self
 
 
+class PlaneSpec(Model):
+    """A detected plane to show: a rectangle about `centre` (world, metres) with `normal` (any length but 0).
+
+    `turn_deg`: about the normal; at 0 the first side lies along the world's x on a level plane, else it points up.
+    """
+
+    centre: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
+    normal: tuple[Finite, Finite, Finite] = (0.0, 1.0, 0.0)
+    width_m: float = Field(default=2.0, gt=0, le=1000, allow_inf_nan=False)
+    depth_m: float = Field(default=2.0, gt=0, le=1000, allow_inf_nan=False)
+    turn_deg: Finite = 0.0
+
+    @field_validator("normal")
+    @classmethod
+    def _normal_has_length(cls, normal: tuple[float, float, float]) -> tuple[float, float, float]:
+        if not 1e-6 < math.hypot(*normal) < 1e6:
+            raise ValueError(f"found {normal}, expected a direction")
+        return normal
+
+
 class Scene(Model):
-    """A scene. `background`: `room`, or a video, image folder or picture. `texture_filter`: of the neural texture."""
+    """A scene. `background`: `room`, or a video, image folder or picture. `texture_filter`: of the neural texture.
+
+    `planes`: detected ones, shown over the background. `hud`: frame, rate and age are written on the picture.
+    """
 
     name: str = "scene"
     fps: float = Field(default=30.0, gt=0, le=1000, allow_inf_nan=False)
     frames: int = Field(default=300, ge=1, le=10_000_000)
     size: Annotated[str, AfterValidator(_checked_size)] = "256"
     background: str = "room"
+    hud: bool = False
+    planes: tuple[PlaneSpec, ...] = Field(default=(), max_length=32)
     texture_filter: Literal["linear", "mipmap", "anisotropic"] = "linear"
     error_budget_px: float = Field(default=0.5, ge=0, allow_inf_nan=False)
     output: OutputSpec = OutputSpec()

@@ -83,6 +83,7 @@ def run(
     avatar: Annotated[str | None, typer.Option(help="default, or the folder of an avatar.")] = None,
     frames: Annotated[int | None, typer.Option(help="How many frames to present.")] = None,
     size: Annotated[str | None, typer.Option(help="Tensor size: HxW, or a side S for areas up to SxS.")] = None,
+    hud: Annotated[bool | None, typer.Option(help="Write frame, rate and age on the picture.")] = None,
     policy: Annotated[PolicyName, typer.Option(help="How frames are scheduled.")] = PolicyName.PIPELINED,
     runtime: Annotated[
         str, typer.Option(help="What runs the network: openvino, ort; auto: the fastest there is.")
@@ -99,7 +100,7 @@ def run(
     from trilane.apps.run_folder import default_place
     from trilane.apps.run_job import Plan, run_to_folder
 
-    request = Request(scene, motion, camera, background, avatar, frames, size, runtime)
+    request = Request(scene, motion, camera, background, avatar, frames, size, runtime, hud)
     checked = configure(request, Path.cwd())
     target = out or default_place(checked.config.scene.name)
     with _hooks() as hooks:

@@ -1,4 +1,4 @@
-"""The composite stage: background, contact shadow, avatars, in that order, to the presented frame.
+"""The composite stage: background, planes, contact shadow, avatars, display, in that order, to the presented frame.
 
 Rule: avatars are drawn far to near; one that is not visible leaves no trace.
 """
@@ -12,11 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from trilane.scene.schema import PlaneSpec
 from trilane.stages.contracts import Packet
 from trilane.stages.gpu import gl
 from trilane.stages.gpu.background import Background
 from trilane.stages.gpu.context import check
+from trilane.stages.gpu.hud import Hud
 from trilane.stages.gpu.painters import AvatarPainter, PicturePainter, RoomPainter, ShadowPainter
+from trilane.stages.gpu.planes import PlanePainter
 from trilane.stages.gpu.shadow import DISCS, floor_discs
 
 Shape = tuple[int, int]
@@ -27,17 +30,26 @@ class CompositeStage:
     """Draws frames of `shape` (height, width).
 
     `shapes`: tensor shapes that may come. `rest`: rest joints (55,3) of each avatar of the scene, metres.
-    `background`: None for the built-in room.
+    `background`: None for the built-in room. `planes`: detected ones to show. `hud`: show frame, rate and age.
     """
 
     def __init__(
-        self, ctx: Any, shape: Shape, shapes: Sequence[Shape], rest: Sequence[F64], background: Background | None
+        self,
+        ctx: Any,
+        shape: Shape,
+        shapes: Sequence[Shape],
+        rest: Sequence[F64],
+        background: Background | None,
+        planes: Sequence[PlaneSpec] = (),
+        hud: bool = False,
     ) -> None:
         self._ctx, self._shape, self._rest, self._background = ctx, shape, rest, background
         colour = ctx.texture(shape[::-1], 4, internal_format=gl.SRGB8_ALPHA8)
         self._target = ctx.framebuffer([colour])
         self._room = RoomPainter(ctx) if background is None else None
         self._picture = None if background is None else PicturePainter(ctx, shape)
+        self._planes = PlanePainter(ctx, planes) if planes else None
+        self._hud = Hud(ctx) if hud else None
         self._shadow = ShadowPainter(ctx, len(DISCS) * len(rest))
         self._painter = AvatarPainter(ctx, list(shapes))
         self._inputs: Sequence[Packet] = ()
@@ -67,6 +79,8 @@ class CompositeStage:
             self._painter.upload(shape, image[: math.prod(shape) * 4])
         self._target.use()
         self._draw_background(pose)
+        if self._planes is not None:
+            self._planes.draw(pose["view"], pose["projection"])
         if visible:
             discs = [floor_discs(avatar["joints"], self._rest[int(avatar["avatar"])]) for avatar in visible]
             self._shadow.draw(pose["view"], pose["projection"], np.concatenate(discs))
@@ -74,6 +88,8 @@ class CompositeStage:
             rect = tuple(float(side) for side in avatar["rect"])
             top, left, height, width = (int(side) for side in avatar["tensor_rect"])
             self._painter.draw(self._target, shape, rect, (top, left, height, width))
+        if self._hud is not None:
+            self._hud.draw(self._target, pose)
 
     def close(self) -> None:
         """Close the background's file."""

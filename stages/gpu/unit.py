@@ -39,7 +39,15 @@ def build(config: RunConfig) -> dict[str, Stage]:
     rest = [assets[folder].rest for folder in config.avatar_dirs]
     return {
         "raster": RasterStage(packed, [drawn[folder] for folder in config.avatar_dirs], config.buckets),
-        "composite": CompositeStage(ctx, shape, config.buckets, rest, _background(config, shape)),
+        "composite": CompositeStage(
+            ctx,
+            shape,
+            config.buckets,
+            rest,
+            _background(config, shape),
+            planes=config.scene.planes,
+            hud=config.scene.hud,
+        ),
     }
 
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from trilane.errors import BadInputError, TrilaneError
-from trilane.scene.schema import RunConfig, Scene, UnitSettings
+from trilane.scene.schema import PlaneSpec, RunConfig, Scene, UnitSettings
 from trilane.stages.contracts import Packet, SlotLayout, view_packet
-from trilane.stages.gpu import unit
+from trilane.stages.gpu import hud, planes, unit
 from trilane.stages.gpu.assets import AvatarAssets
 from trilane.stages.gpu.composite import CompositeStage
 from trilane.stages.gpu.packed import PackedAvatar, PackedPass, Quantisation
@@ -86,9 +86,11 @@ def test_a_frame_with_nan_joints_is_refused(raster: Any, person: Any, camera: Ca
         stage.run(12, 0, 0)
 
 
-def composed(gl: Any, person: Any, image: NDArray[np.uint8], camera: Any, rect: Any, joints: Any) -> NDArray[np.uint8]:
+def composed(
+    gl: Any, person: Any, image: NDArray[np.uint8], camera: Any, rect: Any, joints: Any, **options: Any
+) -> NDArray[np.uint8]:
     """The frame of a composite stage with the built-in room."""
-    stage = CompositeStage(gl, OUTPUT, [TENSOR], [person.rest], None)
+    stage = CompositeStage(gl, OUTPUT, [TENSOR], [person.rest], None, **options)
     source, target = packet(image.size), packet(OUTPUT[0] * OUTPUT[1] * 3)
     stage.bind([source], [target])
     fill_pose(source, joints, *camera, rect)
@@ -112,6 +114,58 @@ def test_frame_looks_as_it_did(gl: Any, person: Any, camera: Camera, golden: Any
     view = camera((1.2, 1.5, 3.6), (0, 0.8, 0), 45, 4 / 3)
     frame = composed(gl, person, disc(), view, (-0.2, -0.3, 0.2, 0.5), person.pose(np.zeros(165)))
     golden("composite", frame, 1.0, 0.01)
+
+
+def test_the_display_stays_in_its_corner(gl: Any, person: Any, camera: Camera) -> None:
+    """Text on a dark sheet, lower left; every other pixel is as it was."""
+    scene = (
+        disc(),
+        camera((1.2, 1.5, 3.6), (0, 0.8, 0), 45, 4 / 3),
+        (-0.2, -0.3, 0.2, 0.5),
+        person.pose(np.zeros(165)),
+    )
+    plain, shown = composed(gl, person, *scene), composed(gl, person, *scene, hud=True)
+    changed = np.argwhere((plain != shown).any(axis=2))
+    (top, left), (bottom, right) = changed.min(axis=0), changed.max(axis=0)
+    assert top >= OUTPUT[0] - hud.SIZE[1] - hud.MARGIN_PX
+    assert bottom < OUTPUT[0] - hud.MARGIN_PX
+    assert left >= hud.MARGIN_PX
+    assert right < hud.MARGIN_PX + hud.SIZE[0]
+
+
+def test_the_display_says_frame_rate_and_age() -> None:
+    pose = packet(0).pose
+    pose["frame"], pose["media_time_s"], pose["t_pose_ns"] = 12, 0.4, 1_900_000_000
+    pose["tensor_shape"], pose["avatar_count"] = (320, 192), 1
+    pose["avatars"][0]["visible"] = 1
+    lines = hud.hud_lines(pose, [1_000_000_000, 1_500_000_000, 2_000_000_000])
+    assert lines == ["frame 12   0.40 s", "2.0 fps   100 ms from pose", "tensor 320x192   1 in view"]
+    assert "- fps" in hud.hud_lines(pose, [1])[1]
+
+
+def test_planes_lie_over_the_room_and_under_the_avatar(gl: Any, person: Any, camera: Camera) -> None:
+    """A level plane lights the floor where it lies; the avatar's opaque pixels do not change."""
+    scene = (
+        disc(),
+        camera((1.2, 1.5, 3.6), (0, 0.8, 0), 45, 4 / 3),
+        (-0.2, -0.3, 0.2, 0.5),
+        person.pose(np.zeros(165)),
+    )
+    plain, shown = composed(gl, person, *scene), composed(gl, person, *scene, planes=[PlaneSpec()])
+    changed = (plain != shown).any(axis=2)
+    assert 0.05 < changed.mean() < 0.6
+    assert shown[changed].mean() > plain[changed].mean() + 5
+    green = (plain == (0, 160, 0)).all(axis=2)
+    assert green.sum() > 500
+    assert not changed[green].any()
+
+
+@pytest.mark.parametrize("normal", [(0, 1, 0), (0, -3, 0), (0, 0, 1), (1, 2, 3), (1e-3, 0, 0)])
+def test_a_planes_sides_are_at_right_angles(normal: tuple[float, float, float]) -> None:
+    plane = PlaneSpec(normal=normal, width_m=3, depth_m=1, turn_deg=30)
+    across, along = planes.half_sides(plane)
+    assert [np.linalg.norm(across), np.linalg.norm(along)] == pytest.approx([1.5, 0.5], rel=1e-6)
+    assert [across @ along, across @ normal, along @ normal] == pytest.approx([0, 0, 0], abs=1e-6)
 
 
 @pytest.mark.parametrize("scale", [0.2, 0.7, 1.0, 3.0])
