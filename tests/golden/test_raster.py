@@ -258,3 +258,18 @@ def test_uv_bytes_are_the_uv_image_rounded(gl: Any, person: Any, camera: Camera)
     UvBytes(gl, person.mesh).render_into(tensor, joints, *view, shape)
     assert np.abs(tensor.reshape(*shape, 2) - image[..., :2] * 255.0).max() <= 0.5 + 1e-3
     assert not tensor.reshape(*shape, 2)[image[..., 2] == 0].any()
+
+
+def test_uv_seams_are_never_bridged(gl: Any, camera: Camera) -> None:
+    """Two triangles with one edge in space and islands far apart in UV: no pixel reads from between the islands."""
+    corners = np.array([[-1, 0, 0], [1, 0, 0], [1, 2, 0], [-1, 2, 0]], float)
+    uv = np.array([[0.05, 0.05], [0.2, 0.05], [0.2, 0.2], [0.8, 0.8], [0.95, 0.95], [0.8, 0.95]])
+    joint, weight = np.zeros((4, 4), int), np.eye(1, 4).repeat(4, axis=0)
+    arrays = mesh_arrays(corners, np.array([[0, 1, 2], [0, 2, 3]]), uv, np.array([[0, 1, 2], [3, 4, 5]]), joint, weight)
+    joints = np.tile(np.eye(3, 4, dtype=np.float32), (55, 1, 1))
+    image = UvRaster(gl, SkinnedMesh(gl, arrays)).render(joints, *camera((0, 1, 3), (0, 1, 0)), (128, 128))
+    seen = image[image[..., 2] > 0]
+    assert len(seen) > 1000
+    first = (seen[:, :2] <= 0.2 + 1e-6).all(axis=1)
+    assert (first | (seen[:, :2] >= 0.8 - 1e-6).all(axis=1)).all()
+    assert 0.4 < first.mean() < 0.6
