@@ -131,8 +131,8 @@ class MeshBounds:
         front, cut = _against_near(centres, radius, view)
         low, high = _quotients(centres, radius, view)
         front &= ((high >= -1.0) & (low <= 1.0)).all(axis=1)
-        # Bounds of one point of each patch: the centre itself, or what its sphere says when blend shapes move it.
-        point = _quotients(centres[front], np.zeros(int(front.sum())), view)
+        # Bounds of one vertex of each patch: the centre's own, or what its sphere says when blend shapes move it.
+        point = _quotients(centres[front], np.full(int(front.sum()), self._standoff), view)
         seen.add(*(point if self._blend is None else (high[front], low[front])))
         return rows[front][seen.widened_by(low[front], high[front])], rows[cut]
 
