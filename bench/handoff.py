@@ -1,0 +1,230 @@
+"""How long from the producer's last byte written until the consumer, another process, can read them all?
+
+Rule: one definition for every way, and all take turns; the producer writes every byte anew, then looks at the clock.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnContext
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from trilane.bench.handoff_unit import PAUSE_S, check_bytes
+from trilane.bench.handoff_ways import CHANNELS, Channel
+from trilane.errors import BadInputError, TrilaneError
+from trilane.hw_profiles.host import host_units
+from trilane.scene.schema import RunConfig, Scene
+from trilane.scheduler.run import run_pipeline
+
+#: KiB of a tensor of 16 channels -> its side; the sizes that can be asked for.
+SIDES = {256: 128, 1024: 256, 4096: 512, 16384: 1024}
+PIPELINE = "slot through the scheduler"
+MIN_FRAMES = 10
+ANSWER_S = 120
+LIMITS_US = {"p50": 150, "p99": 500}
+ENDS = ("producer", "consumer")
+
+Times = tuple[list[float], list[float]]
+
+
+def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 200, turns: int = 5) -> dict[str, Any]:
+    """Rows: `way`, `kib`, `frames`, `p50_us` `p99_us` `max_us` until all bytes can be read, `read_p50_us` until all
+    were read (every byte is, and checked).
+
+    `slot`: a slot of the pipeline's shared memory and the message that announces it, one process to another. `slot
+    through the scheduler`: the same between the raster and infer stages of a real run, where the message goes to the
+    scheduler's process, through its core, and on. Peers: `iceoryx2` with an event, `zeromq copied` frames, `pickled
+    queue` (multiprocessing.Queue). Each turn hands over `frames` times in each way and size; before each the consumer
+    waits at least 1 ms, as an idle unit does. `absent`: peers that are not installed. `met`: our two ways against
+    p50 <= 150 us and p99 <= 500 us at the largest size. `ahead`: of each peer, by p50, at every size.
+    Raises BadInputError for other sizes than 256, 1024, 4096, 16384 KiB.
+    """
+    unknown = set(kib) - set(SIDES)
+    if unknown or frames < MIN_FRAMES or turns < 1:
+        raise BadInputError(
+            "bench handoff",
+            f"--kib {sorted(unknown or kib)}, --frames {frames}, --turns {turns}",
+            f"sizes of {sorted(SIDES)} KiB, at least {MIN_FRAMES} frames and 1 turn",
+        )
+    times: dict[tuple[str, int], Times] = {}
+    with ExitStack() as stack:
+        pairs, absent = _pairs(stack, kib)
+        for _ in range(turns):
+            for size in kib:
+                for way in [way for way, of in pairs if of == size]:
+                    _add(times, (way, size), pairs[way, size].run(frames))
+                _add(times, (PIPELINE, size), _through_pipeline(size, frames))
+    rows = [_row(way, size, taken) for (way, size), taken in sorted(times.items(), key=lambda item: item[0][1])]
+    return {"rows": rows, **_verdicts(rows, max(kib)), "absent": absent, "config": {"frames": frames, "turns": turns}}
+
+
+class Pair:
+    """A producer and a consumer process that wait until they are asked."""
+
+    def __init__(self, context: SpawnContext, channel: Channel) -> None:
+        self._channel = channel
+        ours, theirs = zip(*(context.Pipe() for _ in ENDS), strict=True)
+        between = context.Pipe()
+        self._pipes: Sequence[Connection] = ours
+        units = host_units()
+        cores = (units["gpu"].cores, units["dsp"].cores)
+        self._processes = [
+            context.Process(target=end, args=(pipe, ack, channel, own), daemon=True)
+            for end, pipe, ack, own in zip((produce, consume), theirs, between, cores, strict=True)
+        ]
+        for process in self._processes:
+            process.start()
+        for pipe in (*theirs, *between):
+            pipe.close()
+        for pipe in self._pipes:
+            _answer(pipe)
+
+    def run(self, frames: int) -> Times:
+        """Microseconds from written to readable, and to all read, of `frames` hand-overs."""
+        for pipe in reversed(self._pipes):
+            pipe.send(frames)
+        written, (readable, read) = (_answer(pipe) for pipe in self._pipes)
+        return _microseconds(readable, written), _microseconds(read, written)
+
+    def close(self) -> None:
+        """End both processes."""
+        for pipe in self._pipes:
+            pipe.close()
+        for process in self._processes:
+            process.join(2)
+            process.kill()
+            process.join()
+        self._channel.close()
+
+
+def produce(pipe: Connection, ack: Connection, channel: Channel, cores: tuple[int, ...]) -> None:
+    """The process that writes; answers each number of frames with the instants, in ns, at which they were written."""
+    with _child(pipe, cores):
+        end = channel.producer()
+        pipe.send("ready")
+        while True:
+            written = []
+            for frame in range(pipe.recv()):
+                time.sleep(PAUSE_S)
+                end.buffer()[:] = frame % 251
+                written.append(time.monotonic_ns())
+                end.hand_over()
+                ack.recv_bytes()
+            pipe.send(written)
+
+
+def consume(pipe: Connection, ack: Connection, channel: Channel, cores: tuple[int, ...]) -> None:
+    """The process that reads; answers with the instants at which the bytes could be and had been read."""
+    with _child(pipe, cores):
+        end = channel.consumer()
+        pipe.send("ready")
+        while True:
+            readable, read = [], []
+            for frame in range(pipe.recv()):
+                payload = end.receive()
+                readable.append(time.monotonic_ns())
+                check_bytes(payload, frame % 251)
+                read.append(time.monotonic_ns())
+                del payload
+                end.release()
+                ack.send_bytes(b"\0")
+            pipe.send((readable, read))
+
+
+@contextmanager
+def _child(pipe: Connection, cores: tuple[int, ...]) -> Iterator[None]:
+    os.sched_setaffinity(0, cores)
+    try:
+        yield
+    except (EOFError, BrokenPipeError, ConnectionResetError):
+        return
+    except Exception as error:
+        pipe.send(TrilaneError(f"{type(error).__name__}: {error}"))
+
+
+def _answer(pipe: Connection) -> Any:
+    if not pipe.poll(ANSWER_S):
+        raise TrilaneError(f"bench handoff: no answer in {ANSWER_S} s")
+    answer = pipe.recv()
+    if isinstance(answer, TrilaneError):
+        raise answer
+    return answer
+
+
+def _pairs(stack: ExitStack, sizes: tuple[int, ...]) -> tuple[dict[tuple[str, int], Pair], dict[str, str]]:
+    """Waiting processes for each way and size that there is, and why a way is not there."""
+    context = multiprocessing.get_context("spawn")
+    pairs, absent = {}, {}
+    for way, make in CHANNELS.items():
+        for size in sizes:
+            try:
+                channel = make(size * 1024, context)
+            except ModuleNotFoundError as error:
+                absent[way] = f"{error.name} is not installed: pip install 'trilane[peers]'"
+                break
+            pairs[way, size] = Pair(context, channel)
+            stack.callback(pairs[way, size].close)
+    return pairs, absent
+
+
+def _through_pipeline(size: int, frames: int) -> Times:
+    """A sequential run of units that only write and read: from raster's end to infer's begin, and to its end."""
+    side = SIDES[size]
+    with tempfile.TemporaryDirectory(prefix="trilane-handoff-") as folder:
+        config = RunConfig(
+            scene=Scene(frames=frames, size=f"{side}x{side}"),
+            out_dir=Path(folder),
+            avatar_dirs=(),
+            units=host_units(),
+            record=False,
+            fake=dict.fromkeys(("cpu", "gpu", "dsp"), "trilane.bench.handoff_unit"),
+        )
+        result = run_pipeline(config, policy="sequential", isolate_frames=0)
+    if result.failure is not None or result.presented < frames:
+        raise TrilaneError(f"the run of {side}x{side} failed: {result.failure or 'frames were lost'}")
+    jobs = [job for job in result.jobs if job.stage == "infer"]
+    readable = _microseconds([job.begin_ns for job in jobs], [job.ready_ns for job in jobs])
+    return readable, _microseconds([job.end_ns for job in jobs], [job.ready_ns for job in jobs])
+
+
+def _microseconds(ends_ns: Sequence[int], begins_ns: Sequence[int]) -> list[float]:
+    return [(end - begin) / 1e3 for end, begin in zip(ends_ns, begins_ns, strict=True)]
+
+
+def _add(times: dict[tuple[str, int], Times], key: tuple[str, int], taken: Times) -> None:
+    for kept, new in zip(times.setdefault(key, ([], [])), taken, strict=True):
+        kept += new
+
+
+def _row(way: str, size: int, taken: Times) -> dict[str, Any]:
+    readable, read = taken
+    return {
+        "way": way,
+        "kib": size,
+        "frames": len(readable),
+        "p50_us": float(np.percentile(readable, 50)),
+        "p99_us": float(np.percentile(readable, 99)),
+        "max_us": max(readable),
+        "read_p50_us": float(np.percentile(read, 50)),
+    }
+
+
+def _verdicts(rows: list[dict[str, Any]], largest: int) -> dict[str, Any]:
+    p50 = {(row["way"], row["kib"]): row["p50_us"] for row in rows}
+    ours = [row for row in rows if row["way"] in ("slot", PIPELINE) and row["kib"] == largest]
+    peers = sorted({way for way, _ in p50} - {"slot", PIPELINE})
+    sizes = sorted({size for _, size in p50})
+    return {
+        "met": {row["way"]: all(row[f"{key}_us"] <= limit for key, limit in LIMITS_US.items()) for row in ours},
+        "ahead": {peer: all(p50["slot", size] < p50[peer, size] for size in sizes) for peer in peers},
+        "p50_largest_over_smallest": {way: p50[way, sizes[-1]] / p50[way, sizes[0]] for way in ("slot", PIPELINE)},
+    }
