@@ -103,7 +103,7 @@ def test_a_killed_unit_is_restarted_and_the_run_goes_on(mock_config: Configure, 
 
 def test_a_stopped_unit_is_found_by_its_deadline(mock_config: Configure) -> None:
     stop = When(10, lambda: unit_process("dsp").suspend())
-    result = run_pipeline(mock_config(40), isolate_frames=0, hang_ns=700_000_000, on_progress=stop)
+    result = run_pipeline(mock_config(60, infer=10), isolate_frames=0, hang_ns=700_000_000, on_progress=stop)
     assert set(result.lost) == {"hung:dsp"}
     assert any("did not answer in time" in message for message in result.messages)
     check_accounts(result)
