@@ -97,12 +97,14 @@ def train(config: TrainConfig, report: Callable[[str], None]) -> Path:
 
 
 def command_of(config: TrainConfig) -> str:
-    """The command line of `config`, places left out: of a motion's file only the name stays."""
+    """The command line of `config`, places left out: of motions and of weights to start from only the name stays."""
     options: list[str] = []
     for field in fields(TrainConfig):
         value = getattr(config, field.name)
         if isinstance(value, tuple):
             options += [part for motion in value for part in ("--held-out", Path(motion).name)]
+        elif field.name in ("weights", "resume", "network") and value is not None:
+            options += [f"--{field.name}", value.name]
         elif isinstance(value, int | float | str):
             options += [f"--{field.name.replace('_', '-')}", str(value)]
     return shlex.join(["python", "-m", "trilane.avatars.training.train", *options])
