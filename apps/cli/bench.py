@@ -30,6 +30,7 @@ BENCHES = {
         "Trilane's runtimes beside ONNX Runtime, OpenVINO and benchmark_app as they come.",
     ),
     "roofline": ("trilane.bench.roofline", "The machine's INT8 and FP32 peaks and its memory bandwidth."),
+    "pipeline": ("trilane.bench.pipeline", "Efficiency, idleness and gain of policies, edges and cores."),
     "handoff": ("trilane.bench.handoff", "A slot from process to process, beside pickling, copying and iceoryx2."),
     "scheduler": ("trilane.bench.scheduler", "The scheduler in virtual time beside SimPy, and its determinism."),
     "joints": ("trilane.bench.joints", "What the joint transforms of a frame cost."),

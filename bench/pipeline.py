@@ -1,0 +1,184 @@
+"""Does the pipeline keep its slowest unit busy, and what does that gain over one frame at a time?
+
+Rule: every run is paired with its stages alone, measured just before and after on the same cores, and with a
+`sequential` run beside it; configurations take turns, and a row is the median of its turns.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise, product
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from trilane.apps.configure import Request, configure
+from trilane.bench import full_width
+from trilane.errors import BadInputError, TrilaneError
+from trilane.hw_profiles.host import host_units, usable_cores
+from trilane.scene.schema import RunConfig
+from trilane.scheduler.policy import policy_named
+from trilane.scheduler.result import JobRecord, RunResult
+from trilane.scheduler.run import run_pipeline
+
+SEQUENTIAL = "sequential"
+MIN_FRAMES = 20
+ALONE = 32  # frames measured alone in each run
+PACE = 1.25  # of what the slowest unit can do: paced policies are always offered more than they can take
+NO_ACCURACY = "untrained: its pictures mean nothing, it is here for its work"
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One configuration of the grid."""
+
+    avatar: str
+    size: str
+    cores: int
+    policy: str
+    edge: str
+
+
+def measure(
+    avatar: tuple[str, ...] = ("default",),
+    size: tuple[str, ...] = ("512x512",),
+    policy: tuple[str, ...] = ("pipelined",),
+    edge: tuple[str, ...] = ("double",),
+    cores: tuple[int, ...] = (4,),
+    frames: int = 150,
+    turns: int = 5,
+    runtime: str = "auto",
+    no_video: bool = False,
+) -> dict[str, Any]:
+    """Policies x edges x cores; give an option once for each value. `avatar`: `default`, a bundle's folder, or
+    `resnet18`, the full-width network untrained (made once, with PyTorch). `cores`: how many the three units have.
+
+    Rows, medians over the turns: `frame_ms`, `fps`, `efficiency` (slowest unit alone / frame time), `slowest` and
+    `alone_ms` (that unit's stages alone), `busiest` unit, its `idle` from its first job's begin to its last one's end
+    and the causes: `starved` (no input), `undispatched` (input, but no free slot, or not told yet), `overhead` (told,
+    but not begun); `gain` over `sequential` in the same turn, `bound` sum(t) / max(t) of the units alone, and
+    `gain_of_bound`. `dropped`, `lost`: frames of all turns. `accuracy`: what the avatar's pictures are worth.
+    `no_video`: present nothing. Raises BadInputError, MissingPartError, TrilaneError when a run fails.
+    """
+    if frames < MIN_FRAMES or turns < 1:
+        raise BadInputError("bench pipeline", f"--frames {frames}, --turns {turns}", f"at least {MIN_FRAMES} and 1")
+    _check_cores(cores)
+    rows: list[dict[str, Any]] = []
+    accuracy: dict[str, Any] = {}
+    for one_avatar, one_size, count in product(avatar, size, cores):
+        config, accuracy[one_avatar] = _config(one_avatar, one_size, count, frames, runtime, video=not no_video)
+        plans = [Setting(one_avatar, one_size, count, *pair) for pair in _plans(policy, edge)]
+        taken: dict[Setting, list[dict[str, Any]]] = {plan: [] for plan in plans}
+        for _ in range(turns):
+            for plan, row in _turn(config, plans):
+                taken[plan].append(row)
+        rows += [_summary(plan, turned) for plan, turned in taken.items()]
+    return {
+        "rows": rows,
+        "accuracy": accuracy,
+        "config": {"frames": frames, "turns": turns, "runtime": config.runtime, "video": not no_video},
+    }
+
+
+def _check_cores(cores: tuple[int, ...]) -> None:
+    have = len(usable_cores())
+    if not all(1 <= count <= have for count in cores):
+        raise BadInputError("--cores", str(list(cores)), f"numbers from 1 to the {have} that this process may use")
+
+
+def _plans(policies: Sequence[str], edges: Sequence[str]) -> list[tuple[str, str]]:
+    """`sequential` first: the others are set against it."""
+    return [(SEQUENTIAL, "double"), *(pair for pair in product(policies, edges) if pair != (SEQUENTIAL, "double"))]
+
+
+def _config(avatar: str, size: str, cores: int, frames: int, runtime: str, *, video: bool) -> tuple[RunConfig, Any]:
+    folder = str(full_width.full_width_bundle()) if avatar == full_width.NAME else avatar
+    checked = configure(Request(size=size, avatar=folder, frames=frames, runtime=runtime), Path.cwd())
+    units = host_units(usable_cores()[:cores])
+    accuracy = next(iter(checked.accuracy.values())) or NO_ACCURACY
+    return checked.config.model_copy(update={"units": units, "record": video}), accuracy
+
+
+def _turn(config: RunConfig, plans: list[Setting]) -> Iterator[tuple[Setting, dict[str, Any]]]:
+    """One run of each; the `sequential` one says how much time the paced ones may take."""
+    base: dict[str, Any] = {}
+    for plan in plans:
+        row = _run(config, plan, base)
+        base = base or row
+        row["gain"] = base["frame_ms"] / row["frame_ms"]
+        row["bound"] = base["bound"]
+        row["gain_of_bound"] = row["gain"] / row["bound"]
+        yield plan, row
+
+
+def _run(config: RunConfig, plan: Setting, base: dict[str, Any]) -> dict[str, Any]:
+    pace = PACE * 1e3 / base["alone_ms"] if policy_named(plan.policy).paced else None
+    with tempfile.TemporaryDirectory(prefix="trilane-bench-") as folder:
+        placed = config.model_copy(update={"out_dir": Path(folder)})
+        result = run_pipeline(placed, policy=plan.policy, edge=plan.edge, pace_fps=pace, isolate_frames=ALONE)
+    if result.interrupted:
+        raise KeyboardInterrupt
+    if result.failure is not None or result.presented < 2:
+        raise TrilaneError(f"{plan}: {result.failure.message if result.failure else 'no frames were presented'}")
+    return _figures(result)
+
+
+def _figures(result: RunResult) -> dict[str, Any]:
+    report = result.report
+    alone = alone_by_unit(report)
+    slowest = max(alone, key=alone.__getitem__)
+    busiest = max(report["units"], key=lambda unit: float(report["units"][unit]["busy"]))
+    return {
+        "fps": report["fps"],
+        "frame_ms": report["frame_time_ms"]["mean"],
+        "efficiency": report["efficiency"],
+        "slowest": slowest,
+        "alone_ms": alone[slowest],
+        "bound": sum(alone.values()) / alone[slowest],
+        "busiest": busiest,
+        **idle_between_jobs([job for job in result.jobs if job.unit == busiest]),
+        "in_run_over_alone": _in_run(report, slowest) / alone[slowest],
+        "dropped": sum(result.dropped.values()),
+        "lost": sum(result.lost.values()),
+    }
+
+
+def alone_by_unit(report: dict[str, Any]) -> dict[str, float]:
+    """Milliseconds of each unit for a frame, its stages alone; the last stage, never run alone, as it was in the run."""
+    times = dict.fromkeys(report["units"], 0.0)
+    for name, stage in report["stages"].items():
+        times[stage["unit"]] += report["isolated_ms"].get(name, stage["service_ms"]["mean"])
+    return times
+
+
+def _in_run(report: dict[str, Any], unit: str) -> float:
+    return sum(float(row["service_ms"]["mean"]) for row in report["stages"].values() if row["unit"] == unit)
+
+
+def idle_between_jobs(jobs: Sequence[JobRecord]) -> dict[str, float]:
+    """Shares of the time between the first job's begin and the last one's end; `idle` is the sum of its causes."""
+    ordered = sorted(jobs, key=lambda job: job.begin_ns)
+    span = ordered[-1].end_ns - ordered[0].begin_ns
+    parts = {"starved": 0, "undispatched": 0, "overhead": 0}
+    for before, job in pairwise(ordered):
+        ready = min(max(job.ready_ns, before.end_ns), job.begin_ns)
+        told = min(max(job.dispatch_ns, ready), job.begin_ns)
+        parts["starved"] += ready - before.end_ns
+        parts["undispatched"] += told - ready
+        parts["overhead"] += job.begin_ns - told
+    shares = {cause: ns / span for cause, ns in parts.items()}
+    return {"idle": sum(shares.values()), **shares}
+
+
+def _summary(plan: Setting, turned: list[dict[str, Any]]) -> dict[str, Any]:
+    """Medians of numbers, the commonest of names, sums of frames."""
+    names = ("slowest", "busiest")
+    sums = ("dropped", "lost")
+    row: dict[str, Any] = {**vars(plan)}
+    for key in turned[0]:
+        values = [each[key] for each in turned]
+        pick: Callable[[list[Any]], Any] = sum if key in sums else median
+        row[key] = max(set(values), key=values.count) if key in names else pick(values)
+    return row
