@@ -146,7 +146,7 @@ def _figures(result: RunResult) -> dict[str, Any]:
 
 
 def alone_by_unit(report: dict[str, Any]) -> dict[str, float]:
-    """Milliseconds of each unit for a frame, its stages alone; the last stage, never run alone, as it was in the run."""
+    """Milliseconds of each unit for a frame, its stages alone; the last stage is never run alone: as in the run."""
     times = dict.fromkeys(report["units"], 0.0)
     for name, stage in report["stages"].items():
         times[stage["unit"]] += report["isolated_ms"].get(name, stage["service_ms"]["mean"])
