@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
+import sys
 from collections.abc import Callable, Iterator
 
 from trilane.errors import BadInputError
@@ -18,10 +20,12 @@ from trilane.stages.contracts import SlotLayout
 from trilane.stages.unit_loop import EdgeSpec
 from trilane.transport.memory import RegionLayout, create_region
 from trilane.transport.slots import edge_rule
+from trilane.transport.wakeup import DEFAULT, SHORTEST_NS, use_slice
 
 MAX_CHANNELS = 16  # of a tensor: what the GPU packs in one pass
 DEADLINE_PERIODS = 3  # from a frame's release until it must be presented: one period for each unit
 HANG_NS = 10_000_000_000
+SWITCH_S = 0.0002  # longest that another thread of this process keeps the interpreter
 
 
 def run_pipeline(
@@ -53,6 +57,7 @@ def run_pipeline(
     with (
         Interrupts() as interrupts,
         _on_cores(config.units[graph.stages[0].unit].cores),
+        _prompt(),
         _regions(config, graph) as edges,
         _processes(config, edges, graph) as processes,
     ):
@@ -151,6 +156,23 @@ def _on_cores(cores: tuple[int, ...]) -> Iterator[None]:
         yield
     finally:
         os.sched_setaffinity(0, before)
+
+
+@contextlib.contextmanager
+def _prompt() -> Iterator[None]:
+    """The scheduler answers at once: it is not kept waiting by the CPU unit on its core, by a thread that draws a
+    progress bar, or by collecting garbage, of which a run makes none."""
+    switch_s, collects = sys.getswitchinterval(), gc.isenabled()
+    sys.setswitchinterval(SWITCH_S)
+    gc.disable()
+    use_slice(SHORTEST_NS)
+    try:
+        yield
+    finally:
+        use_slice(DEFAULT)
+        sys.setswitchinterval(switch_s)
+        if collects:
+            gc.enable()
 
 
 @contextlib.contextmanager

@@ -30,6 +30,7 @@ from trilane.transport.messages import (
     pack,
     unpack,
 )
+from trilane.transport.wakeup import DEFAULT, SHORTEST_NS, use_slice
 
 MESSAGES = [
     RunJob(1, "raster", 2, -1, 0, 3),
@@ -156,3 +157,10 @@ def test_the_parent_does_not_wait_for_a_unit_that_does_not_read() -> None:
             parent.send(Close())
     parent.close()
     child.close()
+
+
+def test_a_slice_is_asked_for_and_given_back() -> None:
+    """Whether the kernel takes the wish or not, what this thread may do and its niceness stay as they were."""
+    before = os.sched_getscheduler(0), os.getpriority(os.PRIO_PROCESS, 0)
+    assert use_slice(SHORTEST_NS) == use_slice(DEFAULT)
+    assert (os.sched_getscheduler(0), os.getpriority(os.PRIO_PROCESS, 0)) == before
