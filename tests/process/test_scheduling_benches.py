@@ -1,0 +1,85 @@
+"""The benches of the scheduler, with few repeats: they answer, agree with their peers, and say who is absent."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from trilane.bench import handoff, pipeline, scheduler
+from trilane.errors import BadInputError
+from trilane.scheduler.result import JobRecord
+
+
+def job(ready: int, dispatch: int, begin: int, end: int) -> JobRecord:
+    return JobRecord("infer", "dsp", 0, ready, dispatch, begin, end)
+
+
+def test_idle_time_between_jobs_has_one_cause_for_every_nanosecond() -> None:
+    jobs = [
+        job(0, 0, 0, 10),
+        job(5, 6, 12, 20),  # held: 2 until it began
+        job(30, 33, 37, 60),  # 10 without input, 3 until the scheduler told, 4 until it began
+        job(50, 65, 65, 100),  # 5 with input, not told
+    ]
+    shares = pipeline.idle_between_jobs(jobs)
+    assert shares == pytest.approx({"idle": 0.24, "starved": 0.10, "undispatched": 0.08, "overhead": 0.06})
+
+
+def test_the_pipeline_is_set_against_its_stages_alone(drawable_bundle: Path) -> None:
+    result = pipeline.measure(
+        avatar=(str(drawable_bundle),), size=("64x64",), edge=("double", "orphan"), frames=20, turns=1, runtime="ort"
+    )
+    rows = {(row["policy"], row["edge"]): row for row in result["rows"]}
+    assert set(rows) == {("sequential", "double"), ("pipelined", "double"), ("pipelined", "orphan")}
+    for row in rows.values():
+        assert 0 < row["idle"] < 1
+        assert row["idle"] == pytest.approx(row["starved"] + row["undispatched"] + row["overhead"])
+        assert 1 <= row["bound"] <= 3
+        assert row["gain_of_bound"] == pytest.approx(row["gain"] / row["bound"])
+    assert rows["sequential", "double"]["gain"] == 1
+    assert list(result["accuracy"].values()) == [pipeline.NO_ACCURACY]
+
+
+@pytest.mark.parametrize("asked", [{"frames": 3}, {"turns": 0}, {"cores": (99,)}, {"size": ("63x64",)}])
+def test_a_pipeline_that_cannot_be_measured_is_refused(asked: dict[str, object]) -> None:
+    with pytest.raises(BadInputError):
+        pipeline.measure(**asked)  # type: ignore[arg-type]
+
+
+def test_every_way_hands_over_the_same_bytes() -> None:
+    result = handoff.measure(kib=(256,), frames=10, turns=1)
+    ways = {row["way"] for row in result["rows"]}
+    assert {"slot", handoff.PIPELINE, "pickled queue"} <= ways
+    assert ways | set(result["absent"]) == {*handoff.CHANNELS, handoff.PIPELINE}
+    for row in result["rows"]:
+        assert row["frames"] == 10
+        assert 0 < row["p50_us"] <= row["p99_us"] <= row["max_us"]
+        assert row["read_p50_us"] > row["p50_us"]
+
+
+def test_a_size_without_a_tensor_is_refused() -> None:
+    with pytest.raises(BadInputError, match="256"):
+        handoff.measure(kib=(100,))
+
+
+def test_virtual_time_agrees_with_simpy_and_repeats_itself() -> None:
+    pytest.importorskip("simpy")
+    result = scheduler.measure(minutes=0.1, turns=1, seeds=3)
+    assert [row["way"] for row in result["rows"]] == ["trilane", "simpy"]
+    assert result["agree"] == 360
+    assert result["same_traces"] == result["different_traces"] == 3
+
+
+def test_without_simpy_the_bench_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "simpy", None)
+    monkeypatch.delitem(sys.modules, "trilane.bench.simpy_model", raising=False)
+    result = scheduler.measure(minutes=0.05, turns=1, seeds=1)
+    assert [row["way"] for row in result["rows"]] == ["trilane"]
+    assert "pip install" in result["absent"]["simpy"]
+
+
+def test_a_recording_that_is_none_is_named(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match=r"events\.jsonl"):
+        scheduler.measure(minutes=0.05, events=str(tmp_path / "events.jsonl"))
