@@ -117,26 +117,28 @@ class Core:
             self.source.start(self.now_ns)
 
     def _on_done(self, event: JobDone) -> None:
-        unit = self.units[event.unit]
-        if not unit.queue or unit.queue[0].id != event.job:
+        name, job_id, begin_ns, end_ns, pose_ns = event
+        unit = self.units[name]
+        if not unit.queue or unit.queue[0].id != job_id:
             return
         job = unit.queue.popleft()
         unit.head_since_ns = unit.heard_ns = self.now_ns
         unit.failures = 0
         stage, frame = self.stage_named[job.stage], self.frames[job.frame]
-        service_ns = event.t_end_ns - event.t_begin_ns
-        self.ledger.job(job, frame.ready_ns, event.t_begin_ns, event.t_end_ns)
+        service_ns = end_ns - begin_ns
+        self.ledger.job(job, frame.ready_ns, begin_ns, end_ns)
         stage.learn(service_ns)
         if unit.duty < FULL_DUTY:
-            unit.hold_until_ns = event.t_end_ns + service_ns * (FULL_DUTY - unit.duty) // unit.duty
+            unit.hold_until_ns = end_ns + service_ns * (FULL_DUTY - unit.duty) // unit.duty
             self.reset_alarm()
-        frame.ready_ns, frame.position = event.t_end_ns, stage.position + 1
-        if stage.position == 0:
-            frame.pose_ns = event.t_pose_ns
-        if stage.position == self._latency_position:
-            frame.latency_ns = event.t_end_ns - frame.pose_ns
+        position = stage.position
+        frame.ready_ns, frame.position = end_ns, position + 1
+        if position == 0:
+            frame.pose_ns = pose_ns
+        if position == self._latency_position:
+            frame.latency_ns = end_ns - frame.pose_ns
         self.touch(unit)
-        self._pass_on(stage, job, event.t_end_ns)
+        self._pass_on(stage, job, end_ns)
 
     def _pass_on(self, stage: StageState, job: Job, end_ns: int) -> None:
         source, sink = stage.input, stage.output
@@ -216,20 +218,17 @@ class Core:
         for stage in unit.stages:
             if self._drops:
                 self._give_up(stage)
-            if self._can_run(stage):
+            source, sink = stage.input, stage.output
+            if source is None:
+                if self.source.is_empty or self._is_full():
+                    continue
+            elif not source.ready:
+                continue
+            if sink is None or sink.free or sink.can_claim():
                 found.append(stage)
         if len(found) > 1:
             return self.stages[self.policy.choose([self._candidate(stage) for stage in found]).position]
         return found[0] if found else None
-
-    def _can_run(self, stage: StageState) -> bool:
-        source, sink = stage.input, stage.output
-        if source is None:
-            if self.source.is_empty or self._is_full():
-                return False
-        elif not source.ready:
-            return False
-        return sink is None or bool(sink.free) or sink.can_claim()
 
     def _candidate(self, stage: StageState) -> Candidate:
         """The frame that the stage would do next."""

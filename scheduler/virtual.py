@@ -128,15 +128,16 @@ class VirtualDriver:
         heapq.heappush(self._heap, (at_ns, priority, self._sequence, event, epoch))
 
     def _dispatch(self, now_ns: int, job: Job) -> None:
-        unit = self._units[job.unit]
+        job_id, name, stage, frame, *_ = job
+        unit = self._units[name]
         begin_ns = now_ns + self._hop_ns
         if begin_ns < unit.free_ns:
             begin_ns = unit.free_ns
-        end_ns = unit.free_ns = begin_ns + self._service(job.stage, job.unit, job.frame, begin_ns)
-        self._push(end_ns + self._hop_ns, EVENT, JobDone(job.unit, job.id, begin_ns, end_ns, begin_ns), unit.epoch)
+        end_ns = unit.free_ns = begin_ns + self._service(stage, name, frame, begin_ns)
+        self._push(end_ns + self._hop_ns, EVENT, JobDone(name, job_id, begin_ns, end_ns, begin_ns), unit.epoch)
         if self.recording is not None:
-            ready_ns = self.core.frames[job.frame].ready_ns
-            self.jobs.append(JobRecord(job.stage, job.unit, job.frame, ready_ns, now_ns, begin_ns, end_ns))
+            ready_ns = self.core.frames[frame].ready_ns
+            self.jobs.append(JobRecord(stage, name, frame, ready_ns, now_ns, begin_ns, end_ns))
 
     def _kill(self, now_ns: int, action: Kill) -> None:
         self._push(now_ns, FAULT, UnitDied(action.unit))
