@@ -55,6 +55,7 @@ class Core:
         self._latency_position = self.stage_named[graph.latency_to].position
         self._leads = self.policy.lead_ns is not None
         self._drops = self.policy.newest or self.policy.drop_late
+        self._estimates = self._leads or self.policy.drop_late
         self._jobs = 0
         self.alarm_ns = 0
         self._dirty: list[UnitState] = []
@@ -127,7 +128,8 @@ class Core:
         stage, frame = self.stage_named[job.stage], self.frames[job.frame]
         service_ns = end_ns - begin_ns
         self.ledger.job(job, frame.ready_ns, begin_ns, end_ns)
-        stage.learn(service_ns)
+        if self._estimates:
+            stage.learn(service_ns)
         if unit.duty < FULL_DUTY:
             unit.hold_until_ns = end_ns + service_ns * (FULL_DUTY - unit.duty) // unit.duty
             self.reset_alarm()

@@ -31,14 +31,6 @@ class _UnitBook:
         self.totals[self.state] += now_ns - self.since_ns
         self.state, self.since_ns = state, now_ns
 
-    def work(self, begin_ns: int, end_ns: int) -> None:
-        if begin_ns < self.busy_until_ns:
-            begin_ns = self.busy_until_ns
-        if end_ns > begin_ns:
-            self.busy_ns += end_ns - begin_ns
-            self.busy_until_ns = end_ns
-        self.jobs += 1
-
     def shares(self) -> dict[str, Any]:
         total = sum(self.totals) or 1
         assigned, starved, blocked, throttled = self.totals
@@ -86,10 +78,13 @@ class Ledger:
         self._units[unit].enter(now_ns, state)
 
     def job(self, job: Job, ready_ns: int, begin_ns: int, end_ns: int) -> None:
-        book = self._stages[job.stage]
-        book.service_ns.append(end_ns - begin_ns)
-        book.wait_ns.append(begin_ns - ready_ns)
-        self._units[job.unit].work(begin_ns, end_ns)
+        stage, unit = self._stages[job.stage], self._units[job.unit]
+        stage.service_ns.append(end_ns - begin_ns)
+        stage.wait_ns.append(begin_ns - ready_ns)
+        unit.jobs += 1
+        if end_ns > unit.busy_until_ns:
+            unit.busy_ns += end_ns - max(begin_ns, unit.busy_until_ns)
+            unit.busy_until_ns = end_ns
 
     def restart(self, unit: str) -> None:
         self._units[unit].restarts += 1

@@ -5,6 +5,7 @@ The units are queues of jobs whose service times a callable gives; everything el
 
 from __future__ import annotations
 
+import gc
 import heapq
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -86,6 +87,15 @@ class VirtualDriver:
 
     def run(self) -> str:
         """Until the core finishes; returns the cause. Raises RuntimeError when nothing can ever happen again."""
+        collects = gc.isenabled()
+        gc.disable()  # a run makes no cycles, and looking for them takes a tenth of its time
+        try:
+            return self._run()
+        finally:
+            if collects:
+                gc.enable()
+
+    def _run(self) -> str:
         deadline: int | None = None
         while True:
             now_ns, events = self._next(deadline)
@@ -102,11 +112,9 @@ class VirtualDriver:
 
     def _next(self, deadline_ns: int | None) -> tuple[int, tuple[Event, ...]]:
         """The next valid event, or none at the core's deadline when that comes first."""
-        while self._heap:
-            at_ns, _, _, event, epoch = self._heap[0]
-            if deadline_ns is not None and deadline_ns < at_ns:
-                return deadline_ns, ()
-            heapq.heappop(self._heap)
+        heap = self._heap
+        while heap and (deadline_ns is None or heap[0][0] <= deadline_ns):
+            at_ns, _, _, event, epoch = heapq.heappop(heap)
             if self._accept(event, epoch):
                 return at_ns, (event,)
         if deadline_ns is None:
