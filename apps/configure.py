@@ -13,7 +13,7 @@ from typing import Any
 
 from trilane.apps.machine import gl_facts, machine_facts
 from trilane.avatars.bundle import Bundle, load_bundle
-from trilane.errors import MissingPartError
+from trilane.errors import BadInputError, MissingPartError
 from trilane.hw_profiles.host import host_units
 from trilane.scene.camera.load import load_camera
 from trilane.scene.motion.load import load_motion
@@ -41,6 +41,7 @@ class Request:
     size: str | None = None
     runtime: str = "auto"
     hud: bool | None = None
+    skinning: str = "auto"
 
 
 @dataclass(frozen=True)
@@ -83,12 +84,15 @@ def configure(request: Request, out_dir: Path) -> Checked:
     notes += [f"camera: {note}" for note in load_camera(scene.camera, Path.cwd()).notes]
     _check_background(scene)
     bundles = [_checked_bundle(spec.bundle) for spec in scene.avatars]
+    unit, why = skinning_unit(request.skinning)
+    notes.append(f"skinning: {unit} unit ({why})")
     config = RunConfig(
         scene=scene,
         out_dir=out_dir,
         avatar_dirs=tuple(bundle.folder.absolute() for bundle in bundles),
         units=host_units(),
         runtime=runtime,
+        posed_vertices=tuple(len(load_body(b.body_path).v_template) for b in bundles) if unit == "cpu" else (),
     )
     return Checked(config, tuple(notes), {bundle.manifest.name: _accuracy(bundle) for bundle in bundles})
 
@@ -110,6 +114,17 @@ def _accuracy(bundle: Bundle) -> dict[str, Any]:
     """The error of the avatar's pictures as its manifest has it; empty when it was never validated."""
     validation = bundle.manifest.validation
     return {} if validation is None else validation.model_dump(mode="json")
+
+
+def skinning_unit(asked: str) -> tuple[str, str]:
+    """`cpu` or `gpu`, and why: what was asked for, else the GPU where the driver is hardware. Raises BadInputError."""
+    if asked in ("cpu", "gpu"):
+        return asked, "as asked"
+    if asked != "auto":
+        raise BadInputError("--skinning", repr(asked), "auto, cpu or gpu")
+    gl = gl_facts()
+    hardware = gl is not None and bool(gl.get("hardware"))
+    return ("gpu", "the driver is hardware") if hardware else ("cpu", "the OpenGL driver is software")
 
 
 def required_machine() -> dict[str, Any]:

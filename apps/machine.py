@@ -11,6 +11,7 @@ import os
 import platform
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +87,7 @@ def open_gl() -> dict[str, Any]:
     }
 
 
+@cache
 def gl_facts() -> dict[str, Any] | None:
     """The OpenGL driver that EGL gives, tried in a process of its own: a driver may crash. None when none works."""
     try:

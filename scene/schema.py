@@ -153,8 +153,9 @@ class UnitSettings(Model):
 class RunConfig(Model):
     """Everything a unit's process is told, as plain data. Paths are absolute and were checked by the parent.
 
-    `out_dir` is the temporary run folder. `runtime` names the DSP runtime. `fake` maps a unit to the dotted module
-    of a mock unit and is set by tests alone.
+    `out_dir` is the temporary run folder. `runtime` names the DSP runtime. `posed_vertices`: of each avatar, when the
+    CPU unit skins; empty when the GPU does. `fake` maps a unit to the dotted module of a mock unit and is set by tests
+    alone.
     """
 
     scene: Scene
@@ -163,6 +164,7 @@ class RunConfig(Model):
     units: dict[str, UnitSettings]
     runtime: str = "ort"
     record: bool = True
+    posed_vertices: tuple[int, ...] = ()
     fake: dict[str, str] = {}
 
     @field_validator("units")

@@ -16,7 +16,7 @@ from trilane.scheduler.processes import UnitProcesses
 from trilane.scheduler.realtime import RealtimeDriver
 from trilane.scheduler.result import RunResult
 from trilane.scheduler.signals import Interrupts
-from trilane.stages.contracts import SlotLayout
+from trilane.stages.contracts import SlotLayout, posed_vertices_bytes
 from trilane.stages.unit_loop import EdgeSpec
 from trilane.transport.memory import RegionLayout, create_region
 from trilane.transport.slots import edge_rule
@@ -101,12 +101,11 @@ def run_pipeline(
 
 def edge_payload_bytes(config: RunConfig) -> dict[str, int]:
     """Bytes of payload of each edge, for the largest tensor that the scene's size allows."""
-    avatars = len(config.scene.avatars)
     output = config.scene.output
     return {
-        "pose->raster": 0,
-        "raster->infer": avatars * config.max_tensor_pixels * MAX_CHANNELS,
-        "infer->composite": avatars * config.max_tensor_pixels * 4,
+        "pose->raster": posed_vertices_bytes(config.posed_vertices),
+        "raster->infer": config.max_tensor_pixels * MAX_CHANNELS,
+        "infer->composite": config.max_tensor_pixels * 4,
         "composite->present": output.width * output.height * 3,
     }
 

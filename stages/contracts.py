@@ -94,6 +94,24 @@ def view_packet(buffer: memoryview, layout: SlotLayout) -> Packet:
     return Packet(pose, payload)
 
 
+def posed_vertices(payload: NDArray[np.uint8], counts: Sequence[int]) -> list[NDArray[np.float32]]:
+    """Views (V,3) float32 into the payload of the pose edge, one for each avatar of `counts` vertices; none if empty.
+
+    They hold skinned vertices in the body's order, metres, world space, when the CPU unit skins.
+    """
+    views, start = [], 0
+    for count in counts:
+        size = posed_vertices_bytes([count])
+        views.append(payload[start : start + size].view(np.float32).reshape(count, 3))
+        start += size
+    return views
+
+
+def posed_vertices_bytes(counts: Sequence[int]) -> int:
+    """Bytes that `posed_vertices` needs."""
+    return sum(counts) * 3 * np.dtype(np.float32).itemsize
+
+
 class Stage(Protocol):
     """One stage inside a unit's process. Made by `build` of `trilane.stages.<unit>.unit`."""
 

@@ -88,6 +88,9 @@ def run(
     runtime: Annotated[
         str, typer.Option(help="What runs the network: openvino, ort; auto: the fastest there is.")
     ] = "auto",
+    skinning: Annotated[
+        str, typer.Option(help="Which unit poses the vertices: cpu, gpu; auto: cpu when OpenGL is software.")
+    ] = "auto",
     baseline: Annotated[int, typer.Option(min=0, help="Frames of the sequential run beside it; 0: none.")] = 60,
     out: Annotated[Path | None, typer.Option(help="Run folder to write; runs/TIME-SCENE when not given.")] = None,
     as_json: JsonOption = False,
@@ -100,7 +103,7 @@ def run(
     from trilane.apps.run_folder import default_place
     from trilane.apps.run_job import Plan, run_to_folder
 
-    request = Request(scene, motion, camera, background, avatar, frames, size, runtime, hud)
+    request = Request(scene, motion, camera, background, avatar, frames, size, runtime, hud, skinning)
     checked = configure(request, Path.cwd())
     target = out or default_place(checked.config.scene.name)
     with _hooks() as hooks:

@@ -106,12 +106,15 @@ class MeshBounds:
         self._blend = body.posedirs if pose_blend else None
         self._levels = build_levels(shaped, self._weights)
 
-    def rect(self, posed: Posed, clip: ArrayLike) -> Rect | None:
+    def rect(self, posed: Posed, clip: ArrayLike, vertices: NDArray[np.float32] | None = None) -> Rect | None:
         """The mesh's rectangle on the screen, clipped to it; None when nothing is visible.
 
-        `posed`: rigid transforms of `Skeleton.pose`. `clip` (4,4): projection @ view, of any kind.
+        `posed`: rigid transforms of `Skeleton.pose`. `clip` (4,4): projection @ view, of any kind. `vertices` (V,3):
+        the frame's skinned vertices, if there are any: then a body that is wholly on the screen needs no patches.
         """
         view = _View.of(posed, clip)
+        if vertices is not None and (whole := self._rect_of_whole(vertices, view)) is not None:
+            return whole
         seen = _Extent()
         rows = np.arange(len(self._levels[0].centres))
         for level in self._levels:
@@ -120,6 +123,21 @@ class MeshBounds:
         self._add_vertices(rows, view, seen)
         self._add_triangles(join(self._levels[-1].faces, cut), view, seen)
         return seen.rect()
+
+    def _rect_of_whole(self, vertices: NDArray[np.float32], view: _View) -> Rect | None:
+        """The rectangle of a body all of which is on the screen; None when any of it may not be."""
+        flat = vertices @ view.camera[:, :3].T.astype(np.float32) + view.camera[:, 3].astype(np.float32)
+        points = flat.astype(np.float64)
+        radius = self._standoff + ROUNDING_M
+        near, far = points[:, 3] + points[:, 2], points[:, 3] - points[:, 2]
+        if near.min() <= radius * view.near_norm or far.min() < radius * view.far_norm:
+            return None
+        if points[:, 3].min() <= radius * view.norms[3] + _W_LEAST:
+            return None
+        low, high = _quotients(points, np.full(len(points), radius), view)
+        seen = _Extent()
+        seen.add(low, high)
+        return seen.rect() if (seen.low > -1.0).all() and (seen.high < 1.0).all() else None
 
     def _sort_out(self, level: Level, rows: Ints, view: _View, seen: _Extent) -> tuple[Ints, Ints]:
         """Of these patches, those that may widen what was seen, and those that the near plane may cut."""

@@ -18,11 +18,12 @@ from trilane.errors import TrilaneError
 from trilane.scene.mover import Mover
 from trilane.scene.schema import RunConfig
 from trilane.scene.staging import stage_scene
-from trilane.stages.contracts import Packet
+from trilane.stages.contracts import Packet, posed_vertices
 from trilane.stages.cpu.body import ShapedBody, load_body
 from trilane.stages.cpu.crop import Rect
 from trilane.stages.cpu.kinematics import Posed, Skeleton
 from trilane.stages.cpu.mesh_bounds import MeshBounds
+from trilane.stages.cpu.skinning import FrameSkinner
 from trilane.stages.cpu.tensor_layout import lay_out
 
 #: Clothes and hair reach this far from the body, metres; training crops with the same.
@@ -34,6 +35,7 @@ class _Actor:
     mover: Mover
     skeleton: Skeleton
     bounds: MeshBounds
+    skinner: FrameSkinner | None
 
 
 class PoseStage:
@@ -50,18 +52,26 @@ class PoseStage:
         bounds = {folder: MeshBounds(body, standoff_m=STANDOFF_M) for folder, body in bodies.items()}
         staged = stage_scene(scene, [bodies[folder] for folder in config.avatar_dirs], Path.cwd())
         self._actors = [
-            _Actor(mover, Skeleton(bodies[folder].joints, bodies[folder].body.parents), bounds[folder])
+            _Actor(
+                mover,
+                Skeleton(bodies[folder].joints, bodies[folder].body.parents),
+                bounds[folder],
+                FrameSkinner(bodies[folder]) if config.posed_vertices else None,
+            )
             for folder, mover in zip(config.avatar_dirs, staged.movers, strict=True)
         ]
         self._camera = staged.camera
         self._projection = staged.camera.projection(scene.output.width / scene.output.height)
+        self._counts = config.posed_vertices
         self._slots: list[NDArray[np.void]] = []
+        self._vertices: list[list[NDArray[np.float32]]] = []
 
     def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
         """Take the output slots. Raises ValueError when the stage has inputs."""
         if inputs:
             raise ValueError("the pose stage has no input edge")
         self._slots = [packet.pose for packet in outputs]
+        self._vertices = [posed_vertices(packet.payload, self._counts) for packet in outputs]
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:  # noqa: ARG002
         """Fill `outputs[slot_out]` for `frame`; the figure is how many avatars are visible.
@@ -80,10 +90,12 @@ class PoseStage:
         packet["view"], packet["projection"] = view, self._projection
         _require_finite(view, frame, "camera")
         clip = self._projection @ view
+        vertices: Sequence[NDArray[np.float32] | None] = self._vertices[slot_out] or [None] * len(self._actors)
         seen = [
             (avatar, rect)
             for index, actor in enumerate(self._actors)
-            if (rect := _pose(actor, avatar := packet["avatars"][index], index, t_s, frame, clip)) is not None
+            if (rect := _pose(actor, avatar := packet["avatars"][index], vertices[index], index, t_s, frame, clip))
+            is not None
         ]
         self._lay_out(packet, seen)
         return {"visible": float(len(seen))}
@@ -100,7 +112,7 @@ class PoseStage:
 
     def close(self) -> None:
         """Let go of the slots."""
-        self._slots = []
+        self._slots, self._vertices = [], []
 
 
 def _shaped(folder: Path) -> ShapedBody:
@@ -109,15 +121,23 @@ def _shaped(folder: Path) -> ShapedBody:
 
 
 def _pose(
-    actor: _Actor, avatar: NDArray[np.void], index: int, t_s: float, frame: int, clip: NDArray[np.float64]
+    actor: _Actor,
+    avatar: NDArray[np.void],
+    vertices: NDArray[np.float32] | None,
+    index: int,
+    t_s: float,
+    frame: int,
+    clip: NDArray[np.float64],
 ) -> Rect | None:
-    """Fill one avatar's joints; its rectangle on the screen, or None when nothing of it is visible."""
+    """Fill one avatar's joints, and `vertices` if given; its rectangle on the screen, None when nothing is visible."""
     pose, translation = actor.mover.sample(t_s)
     _require_finite(pose, frame, f"pose of avatar {index}")
     _require_finite(translation, frame, f"place of avatar {index}")
     posed: Posed = actor.skeleton.pose(pose, translation, actor.mover.world)
     _require_finite(posed.matrices, frame, f"joints of avatar {index}")
-    rect = actor.bounds.rect(posed, clip)
+    if actor.skinner is not None and vertices is not None:
+        actor.skinner.skin_into(posed, vertices)
+    rect = actor.bounds.rect(posed, clip, vertices)
     avatar["avatar"], avatar["visible"] = index, rect is not None
     avatar["joints"], avatar["pose_feature"] = posed.matrices, posed.feature
     return rect

@@ -111,6 +111,34 @@ class CpuSkinner:
         return np.asarray(np.einsum("vab,vb->va", moved[:, :, :3], rest) + moved[:, :, 3])
 
 
+class FrameSkinner:
+    """Vertices of one shaped body in float32, into memory that the caller owns: what the CPU unit does each frame."""
+
+    def __init__(self, shaped: ShapedBody) -> None:
+        body = shaped.body
+        rows = -(-len(body.weights) // _BLOCK_ROWS) * _BLOCK_ROWS
+        weights = np.zeros((rows, JOINTS), np.float32)
+        weights[: len(body.weights)] = body.weights
+        self._weights = weights.reshape(-1, _BLOCK_ROWS, JOINTS)
+        self._moved = np.empty((len(self._weights), _BLOCK_ROWS, 12), np.float32)
+        self._rest = np.ascontiguousarray(shaped.vertices.T, np.float32)
+        self._blend = body.posedirs.reshape(-1, POSE_FEATURES) if body.posedirs is not None else None
+        self._term = np.empty(len(body.weights), np.float32)
+
+    def skin_into(self, posed: Posed, vertices: F32) -> None:
+        """Write `vertices` (V,3), world metres, of a frame of `Skeleton.pose`."""
+        rest = self._rest
+        if self._blend is not None:
+            rest = rest + (self._blend @ posed.feature).reshape(-1, 3).T.astype(np.float32)
+        np.matmul(self._weights, posed.matrices.reshape(JOINTS, 12), out=self._moved)
+        moved = self._moved.reshape(-1, 3, 4)[: len(vertices)]
+        for axis in range(3):
+            vertices[:, axis] = moved[:, axis, 3]
+            for column in range(3):
+                np.multiply(moved[:, axis, column], rest[column], out=self._term)
+                vertices[:, axis] += self._term
+
+
 def posed_vertices(shaped: ShapedBody, poses: ArrayLike, translation: ArrayLike | None = None) -> Iterator[F64]:
     """Vertices (V,3), metres, of each of the poses (T,165) that `Body.full_pose` gave. Raises BadInputError."""
     skeleton = Skeleton(shaped.joints, shaped.body.parents)

@@ -6,7 +6,7 @@ Rule: one interleaved buffer, one vertex per distinct (position, UV) corner, in 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import moderngl
 import numpy as np
@@ -139,11 +139,83 @@ def weight_batches(arrays: MeshArrays) -> dict[int, NDArray[np.uint32]]:
     return {k: arrays.triangles[needed == k] for k in WEIGHT_COUNTS if (needed == k).any()}
 
 
+@dataclass(frozen=True)
+class BodyPose:
+    """One body in one frame. `joints` (55,3,4): skinning matrices. `feature` (486,): for pose blend shapes.
+
+    `vertices` (V,3): where the body's vertices are, when the CPU unit has skinned them.
+    """
+
+    joints: F32
+    feature: F32 | None = None
+    vertices: F32 | None = None
+
+
+class Mesh(Protocol):
+    """What `MeshDraw` draws: buffers, a vertex shader, and a way to take a frame's pose."""
+
+    arrays: MeshArrays
+    vertex_shader: str
+    batches: list[tuple[int, Any]]
+
+    @property
+    def defines(self) -> dict[str, int | str]:
+        """Definitions that the vertex shader needs, beside K."""
+
+    def prepare(self, ctx: Any) -> None:
+        """Set the tests that the mesh is drawn with."""
+
+    def vertex_array(self, program: Any, indices: Any) -> Any:
+        """A vertex array of this mesh for `program`."""
+
+    def upload_pose(self, pose: BodyPose) -> None:
+        """Take a frame's pose."""
+
+    def bind_pose(self, program: Any) -> None:
+        """Let `program` read it."""
+
+
+class PosedMesh:
+    """A `MeshArrays` on the GPU whose vertices come skinned, frame by frame."""
+
+    vertex_shader = "posed.vert"
+
+    def __init__(self, ctx: Any, arrays: MeshArrays) -> None:
+        self.arrays, self._ctx = arrays, ctx
+        self.defines: dict[str, int | str] = {}
+        self._corners = np.empty((len(arrays.source), 3), np.float32)
+        self._positions = ctx.buffer(reserve=self._corners.nbytes, dynamic=True)
+        self._uv = ctx.buffer(arrays.uv.tobytes())
+        self.batches = [(WEIGHT_COUNTS[0], ctx.buffer(arrays.triangles.tobytes()))]
+
+    def prepare(self, ctx: Any) -> None:
+        """As `SkinnedMesh.prepare`."""
+        _prepare(ctx, self.arrays.closed)
+
+    def vertex_array(self, program: Any, indices: Any) -> Any:
+        """A vertex array of this mesh for `program`."""
+        content = [(self._positions, "3f", "position"), (self._uv, "2f", "uv")]
+        return self._ctx.vertex_array(program, content, indices, skip_errors=True)
+
+    def upload_pose(self, pose: BodyPose) -> None:
+        """Take the body's vertices; ValueError without them."""
+        if pose.vertices is None:
+            raise ValueError("a posed mesh needs the frame's vertices")
+        np.take(pose.vertices, self.arrays.source, axis=0, out=self._corners)
+        self._positions.orphan()
+        self._positions.write(self._corners)
+
+    def bind_pose(self, program: Any) -> None:
+        """Nothing: positions are attributes."""
+
+
 class SkinnedMesh:
     """A `MeshArrays` on the GPU. `posedirs` (V,3,486): pose blend shapes, indexed by `MeshArrays.source`.
 
     `batches`: number of weights and index buffer of the triangles that need as many.
     """
+
+    vertex_shader = "skin.vert"
 
     def __init__(self, ctx: Any, arrays: MeshArrays, posedirs: NDArray[np.floating[Any]] | None = None) -> None:
         self.arrays = arrays
@@ -168,22 +240,20 @@ class SkinnedMesh:
 
     def prepare(self, ctx: Any) -> None:
         """Depth test, and leave out the triangles that face away when the mesh is closed."""
-        ctx.enable_only(moderngl.DEPTH_TEST | (moderngl.CULL_FACE if self.arrays.closed else moderngl.NOTHING))
-        ctx.depth_func = "<"
-        ctx.front_face = "cw"  # rows run downward: what winds counter-clockwise in the picture is stored clockwise
+        _prepare(ctx, self.arrays.closed)
 
     def vertex_array(self, program: Any, indices: Any) -> Any:
         """A vertex array of this mesh for `program`; attributes that the compiler dropped are skipped."""
         return self._ctx.vertex_array(program, [self._content], indices, skip_errors=True)
 
-    def upload_pose(self, joints: F32, feature: F32 | None = None) -> None:
-        """Take the skinning matrices (55,3,4), and the pose feature (486,) for a mesh with pose blend shapes."""
-        self._joints.write(np.ascontiguousarray(joints, np.float32))
+    def upload_pose(self, pose: BodyPose) -> None:
+        """Take the skinning matrices, and the pose feature for a mesh with pose blend shapes."""
+        self._joints.write(np.ascontiguousarray(pose.joints, np.float32))
         if self.posedirs is None:
             return
-        if feature is None:
+        if pose.feature is None:
             raise ValueError("a mesh with pose blend shapes needs the pose feature")
-        self._feature.write(np.ascontiguousarray(feature, np.float32))
+        self._feature.write(np.ascontiguousarray(pose.feature, np.float32))
 
     def bind_pose(self, program: Any) -> None:
         """Let `program` read what was uploaded."""
@@ -195,6 +265,12 @@ class SkinnedMesh:
         program["PoseFeature"].binding = 1
         self.posedirs.use(location=8)
         program["posedirs"].value = 8
+
+
+def _prepare(ctx: Any, closed: bool) -> None:
+    ctx.enable_only(moderngl.DEPTH_TEST | (moderngl.CULL_FACE if closed else moderngl.NOTHING))
+    ctx.depth_func = "<"
+    ctx.front_face = "cw"  # rows run downward: what winds counter-clockwise in the picture is stored clockwise
 
 
 def _layout(arrays: MeshArrays, with_source: bool) -> tuple[list[str], list[str], list[NDArray[Any]]]:

@@ -9,24 +9,19 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from trilane.stages.gpu.camera import Matrix, target_clip
-from trilane.stages.gpu.mesh import SkinnedMesh
+from trilane.stages.gpu.mesh import BodyPose, Mesh
 from trilane.stages.gpu.program import build_program, set_uniforms
-
-F32 = NDArray[np.float32]
 
 
 class MeshDraw:
     """`mesh` drawn with `fragment`, a file of `trilane.shaders` or a path; `defines` go to both shaders."""
 
-    def __init__(self, ctx: Any, mesh: SkinnedMesh, fragment: str | Path, **defines: int | str) -> None:
+    def __init__(self, ctx: Any, mesh: Mesh, fragment: str | Path, **defines: int | str) -> None:
         self._mesh, self._ctx = mesh, ctx
         self._parts = []
         for weights, indices in mesh.batches:
-            program = build_program(ctx, "skin.vert", fragment, **mesh.defines, **defines, K=weights)
+            program = build_program(ctx, mesh.vertex_shader, fragment, **mesh.defines, **defines, K=weights)
             self._parts.append((program, mesh.vertex_array(program, indices)))
 
     def set(self, values: dict[str, Any]) -> None:
@@ -34,10 +29,10 @@ class MeshDraw:
         for program, _ in self._parts:
             set_uniforms(program, values)
 
-    def draw(self, joints: F32, view: Matrix, projection: Matrix, feature: F32 | None = None) -> None:
-        """Draw into the target in use, with the tests that are enabled. `joints` (55,3,4), `feature` (486,) or None."""
+    def draw(self, pose: BodyPose, view: Matrix, projection: Matrix) -> None:
+        """Draw into the target in use, with the tests that are enabled."""
         clip = target_clip(view, projection)
-        self._mesh.upload_pose(joints, feature)
+        self._mesh.upload_pose(pose)
         for program, vertices in self._parts:
             self._mesh.bind_pose(program)
             program["clip_from_world"].write(clip)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from trilane.errors import BadInputError
 from trilane.stages.gpu import gl
 from trilane.stages.gpu.camera import Matrix
-from trilane.stages.gpu.mesh import SkinnedMesh
+from trilane.stages.gpu.mesh import BodyPose, Mesh
 from trilane.stages.gpu.mesh_draw import MeshDraw
 from trilane.stages.gpu.program import build_program, set_uniforms
 
@@ -51,12 +51,21 @@ class Quantisation:
 
 @dataclass(frozen=True)
 class Placement:
-    """One avatar in a tensor. `clip_projection`: of its crop. `rect`: top, left, height, width in tensor pixels."""
+    """One avatar in a tensor. `clip_projection`: of its crop. `rect`: top, left, height, width in tensor pixels.
+
+    `joints`, `feature`, `vertices`: as of `BodyPose`.
+    """
 
     joints: F32
     clip_projection: Matrix
     rect: tuple[int, int, int, int]
     feature: F32 | None = None
+    vertices: F32 | None = None
+
+    @property
+    def pose(self) -> BodyPose:
+        """What the mesh needs of it."""
+        return BodyPose(self.joints, self.feature, self.vertices)
 
 
 @dataclass(frozen=True)
@@ -137,7 +146,7 @@ class PackedPass:
 class PackedAvatar:
     """One avatar's mesh and texture, ready for a `PackedPass`. `texture` (H,W,C): finite, within FP16's range."""
 
-    def __init__(self, packed: PackedPass, mesh: SkinnedMesh, texture: NDArray[np.floating[Any]]) -> None:
+    def __init__(self, packed: PackedPass, mesh: Mesh, texture: NDArray[np.floating[Any]]) -> None:
         check_texture(texture, packed.channels)
         self._mesh, self._ctx = mesh, packed.ctx
         self._texture = texture_array(packed.ctx, texture, packed.filtering)
@@ -160,7 +169,7 @@ class PackedAvatar:
         first = target.words if target.uv is None else target.uv
         first.use()
         first.viewport = box
-        self._geometry.draw(placement.joints, view, placement.clip_projection, placement.feature)
+        self._geometry.draw(placement.pose, view, placement.clip_projection)
         if target.uv is not None:
             self._write_words(target, box)
 

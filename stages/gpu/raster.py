@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.errors import TrilaneError
-from trilane.stages.contracts import Packet
+from trilane.stages.contracts import Packet, posed_vertices
 from trilane.stages.cpu.crop import Rect, crop_projection
 from trilane.stages.gpu.context import check
 from trilane.stages.gpu.packed import PackedAvatar, PackedPass, Placement
@@ -22,16 +22,27 @@ Shape = tuple[int, int]
 
 
 class RasterStage:
-    """`avatars[i]` draws the scene's avatar i. `shapes`: tensor shapes (height, width) that may come."""
+    """`avatars[i]` draws the scene's avatar i. `shapes`: tensor shapes (height, width) that may come.
 
-    def __init__(self, packed: PackedPass, avatars: Sequence[PackedAvatar], shapes: Sequence[Shape]) -> None:
-        self._packed, self._avatars, self._shapes = packed, avatars, shapes
+    `posed_vertices`: how many vertices of each avatar come skinned in the input slot; empty when the GPU skins.
+    """
+
+    def __init__(
+        self,
+        packed: PackedPass,
+        avatars: Sequence[PackedAvatar],
+        shapes: Sequence[Shape],
+        posed_vertices: Sequence[int] = (),
+    ) -> None:
+        self._packed, self._avatars, self._shapes, self._counts = packed, avatars, shapes, posed_vertices
+        self._vertices: list[list[NDArray[np.float32]]] = []
         self._inputs: Sequence[Packet] = ()
         self._outputs: Sequence[Packet] = ()
 
     def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
         """Keep the slots and make a target for every tensor shape."""
         self._inputs, self._outputs = inputs, outputs
+        self._vertices = [posed_vertices(packet.payload, self._counts) for packet in inputs]
         for shape in self._shapes:
             self._packed.target(shape)
 
@@ -48,23 +59,28 @@ class RasterStage:
             return {}
         _refuse_nan(frame, visible)
         target = self._packed.begin(shape)
+        skinned = self._vertices[slot_in]
         for avatar in visible:
-            self._avatars[int(avatar["avatar"])].draw(target, pose["view"], _placement(pose, avatar))
+            number = int(avatar["avatar"])
+            placement = _placement(pose, avatar, skinned[number] if skinned else None)
+            self._avatars[number].draw(target, pose["view"], placement)
         self._packed.read_into(shape, tensor)
         check(self._packed.ctx)
         return {}
 
     def close(self) -> None:
-        """The context goes with the process."""
+        """Let go of the slots; the context goes with the process."""
+        self._vertices = []
 
 
-def _placement(pose: NDArray[np.void], avatar: Any) -> Placement:
+def _placement(pose: NDArray[np.void], avatar: Any, vertices: NDArray[np.float32] | None) -> Placement:
     top, left, height, width = (int(side) for side in avatar["tensor_rect"])
     return Placement(
         joints=avatar["joints"],
         clip_projection=crop_projection(pose["projection"], Rect(*map(float, avatar["rect"]))),
         rect=(top, left, height, width),
         feature=avatar["pose_feature"],
+        vertices=vertices,
     )
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from trilane.stages.gpu import gl
 from trilane.stages.gpu.camera import Matrix, eye_of
-from trilane.stages.gpu.mesh import SkinnedMesh
+from trilane.stages.gpu.mesh import BodyPose, SkinnedMesh
 from trilane.stages.gpu.mesh_draw import MeshDraw
 from trilane.stages.gpu.program import build_program, set_uniforms
 
@@ -51,7 +51,7 @@ class ShadedMesh:
             self._draw.set({name: location})
         camera = {"view": tuple(np.asarray(view, np.float64).T.ravel()), "eye": tuple(eye_of(view))}
         self._draw.set(camera | dict(uniforms))
-        self._draw.draw(joints, view, projection)
+        self._draw.draw(BodyPose(joints), view, projection)
 
 
 class ShadedRaster:

@@ -49,7 +49,7 @@ class SplitPass:
             target.use()
             target.clear(*self._background, depth=1.0)
             self._draw.set({"layer": layer})
-            self._draw.draw(placement.joints, view, placement.clip_projection, placement.feature)
+            self._draw.draw(placement.pose, view, placement.clip_projection)
 
     def read_into(self, tensor: U8) -> None:
         """Read every pass and interleave them into `tensor`, (h * w * C,) uint8."""

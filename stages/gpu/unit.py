@@ -6,6 +6,7 @@ Rule: everything slow or fallible happens in `build`; the driver's kind decides 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from trilane.errors import BadInputError
 from trilane.scene.schema import RunConfig
@@ -14,7 +15,7 @@ from trilane.stages.gpu.assets import AvatarAssets, load_assets
 from trilane.stages.gpu.background import Background, open_background
 from trilane.stages.gpu.composite import CompositeStage
 from trilane.stages.gpu.context import describe, open_context
-from trilane.stages.gpu.mesh import SkinnedMesh
+from trilane.stages.gpu.mesh import Mesh, PosedMesh, SkinnedMesh
 from trilane.stages.gpu.packed import PackedAvatar, PackedPass
 from trilane.stages.gpu.raster import RasterStage
 
@@ -32,13 +33,15 @@ def build(config: RunConfig) -> dict[str, Stage]:
     deferred = filtering == "linear" and not describe(ctx).hardware
     packed = PackedPass(ctx, first.texture.shape[2], first.quantisation, deferred, filtering)
     drawn = {
-        folder: PackedAvatar(packed, SkinnedMesh(ctx, found.arrays, found.posedirs), found.texture)
+        folder: PackedAvatar(packed, _mesh(ctx, found, bool(config.posed_vertices)), found.texture)
         for folder, found in assets.items()
     }
     shape = (config.scene.output.height, config.scene.output.width)
     rest = [assets[folder].rest for folder in config.avatar_dirs]
     return {
-        "raster": RasterStage(packed, [drawn[folder] for folder in config.avatar_dirs], config.buckets),
+        "raster": RasterStage(
+            packed, [drawn[folder] for folder in config.avatar_dirs], config.buckets, config.posed_vertices
+        ),
         "composite": CompositeStage(
             ctx,
             shape,
@@ -49,6 +52,10 @@ def build(config: RunConfig) -> dict[str, Stage]:
             hud=config.scene.hud,
         ),
     }
+
+
+def _mesh(ctx: Any, found: AvatarAssets, posed: bool) -> Mesh:
+    return PosedMesh(ctx, found.arrays) if posed else SkinnedMesh(ctx, found.arrays, found.posedirs)
 
 
 def _background(config: RunConfig, shape: tuple[int, int]) -> Background | None:

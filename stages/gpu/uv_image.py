@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.stages.gpu.camera import Matrix
-from trilane.stages.gpu.mesh import SkinnedMesh
+from trilane.stages.gpu.mesh import BodyPose, SkinnedMesh
 from trilane.stages.gpu.mesh_draw import MeshDraw
 
 F32 = NDArray[np.float32]
@@ -37,7 +37,7 @@ class UvRaster:
         target.use()
         self._mesh.prepare(self._ctx)
         target.clear(0.0, 0.0, 0.0, 0.0, depth=1.0)
-        self._draw.draw(joints, view, projection, feature)
+        self._draw.draw(BodyPose(joints, feature), view, projection)
         pixels = np.empty((*shape, 4), np.float32)
         target.read_into(pixels, components=4, dtype="f4", alignment=1)
         return pixels[..., :3]
@@ -79,5 +79,5 @@ class UvBytes:
         target.use()
         self._mesh.prepare(self._ctx)
         target.clear(0.0, 0.0, 0.0, 0.0, depth=1.0)
-        self._draw.draw(joints, view, projection, feature)
+        self._draw.draw(BodyPose(joints, feature), view, projection)
         target.read_into(tensor, components=2, alignment=1)

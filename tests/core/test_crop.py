@@ -188,9 +188,10 @@ def test_nothing_on_screen_falls_outside() -> None:
     visible = 0
     for _ in range(2000):
         posed, clip = skeleton.pose(random_pose(random)), random_clip(random)
-        points = surface_points(skinner.vertices(posed), shaped.body.faces, random)
-        seen = visible_points(points, clip)
+        vertices = skinner.vertices(posed)
+        seen = visible_points(surface_points(vertices, shaped.body.faces, random), clip)
         assert_holds(bounds.rect(posed, clip), seen)
+        assert_holds(bounds.rect(posed, clip, vertices.astype(np.float32)), seen)
         visible += bool(len(seen))
     assert visible > 1000
 
@@ -205,10 +206,13 @@ def test_rectangle_is_tight_on_whole_bodies() -> None:
     clip = perspective(np.radians(40), 4 / 3, 0.05, 100.0) @ view
     for _ in range(50):
         posed = skeleton.pose(random.normal(0, 0.4, 165))
-        h = np.c_[skinner.vertices(posed), np.ones(len(shaped.vertices))] @ clip.T
+        vertices = skinner.vertices(posed)
+        h = np.c_[vertices, np.ones(len(vertices))] @ clip.T
         seen = h[:, :2] / h[:, 3:]
-        rect = bounds.rect(posed, clip)
-        np.testing.assert_allclose(rect, [*seen.min(axis=0), *seen.max(axis=0)], atol=3e-6)
+        expected = [*seen.min(axis=0), *seen.max(axis=0)]
+        np.testing.assert_allclose(bounds.rect(posed, clip), expected, atol=3e-6)
+        quick = bounds.rect(posed, clip, vertices.astype(np.float32))
+        np.testing.assert_allclose(quick, expected, atol=1e-4)
 
 
 def test_wasted_area_of_whole_bodies() -> None:
