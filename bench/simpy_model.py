@@ -10,8 +10,8 @@ from typing import Any
 
 import simpy
 
-from trilane.scheduler.core import HELD_JOBS
 from trilane.scheduler.events import Graph
+from trilane.scheduler.state import HELD_JOBS
 from trilane.scheduler.virtual import Service
 from trilane.transport.slots import edge_rule
 

@@ -31,8 +31,6 @@ from trilane.scheduler.source import Source
 from trilane.scheduler.state import FULL_DUTY, NEVER, FrameState, StageState, UnitState, build
 from trilane.transport.slots import EdgeSlots
 
-HELD_JOBS = 2  # the one that runs and the one dispatched ahead
-
 
 class Core:
     """The state machine of one run. Raises ValueError for an unknown policy or edge."""
@@ -58,7 +56,8 @@ class Core:
         self._estimates = self._leads or self.policy.drop_late
         self._jobs = 0
         self.alarm_ns = 0
-        self._dirty: list[UnitState] = []
+        self._touched: list[UnitState] = []
+        self.touch = self._touched.append  # something changed for the unit: look at it in this step
         self._handlers = {
             UnitReady: self._on_ready,
             JobDone: self._on_done,
@@ -89,12 +88,6 @@ class Core:
         """A unit's clock was set: this step's answer looks at all of them again."""
         self.alarm_ns = 0
 
-    def touch(self, unit: UnitState) -> None:
-        """Something changed for the unit: look at it in this step."""
-        if not unit.dirty:
-            unit.dirty = True
-            self._dirty.append(unit)
-
     def finish(self, cause: str) -> None:
         self.finished = True
         self.ledger.close(self.now_ns)
@@ -110,6 +103,7 @@ class Core:
     def _on_ready(self, event: UnitReady) -> None:
         unit = self.units[event.unit]
         unit.alive, unit.starting_ns, unit.heard_ns = True, None, self.now_ns
+        unit.set_room(self.now_ns)
         self.reset_alarm()
         self.touch(unit)
         if not self.started and all(other.alive for other in self.units.values()):
@@ -132,6 +126,7 @@ class Core:
             stage.learn(service_ns)
         if unit.duty < FULL_DUTY:
             unit.hold_until_ns = end_ns + service_ns * (FULL_DUTY - unit.duty) // unit.duty
+            unit.set_room(self.now_ns)
             self.reset_alarm()
         position = stage.position
         frame.ready_ns, frame.position = end_ns, position + 1
@@ -179,6 +174,7 @@ class Core:
     def _on_duty(self, event: SetDuty) -> None:
         unit = self.units[event.unit]
         unit.duty = max(1, min(FULL_DUTY, event.permille))
+        unit.set_room(self.now_ns)
         self.touch(unit)
 
     def _on_stop(self, _event: Stop) -> None:
@@ -188,26 +184,19 @@ class Core:
     # choice
 
     def _assign(self) -> None:
-        dirty = self._dirty
-        for unit in dirty:  # a dispatch may append to the list, also a unit that was looked at before
-            unit.dirty = False
-            while len(unit.queue) < HELD_JOBS and self._may_take(unit):
+        touched = self._touched
+        for unit in touched:  # a dispatch may append to the list, also a unit that was looked at before
+            while len(unit.queue) < unit.room:
                 stage = self._choose(unit)
                 if stage is None:
                     break
                 self._dispatch(unit, stage)
-        for unit in dirty:
+        for unit in touched:
             state = ASSIGNED if unit.queue else self._idle_state(unit)
             if state != unit.state:
                 unit.state = state
                 self.ledger.enter(unit.name, self.now_ns, state)
-        dirty.clear()
-
-    def _may_take(self, unit: UnitState) -> bool:
-        """Whether the unit may be handed one more job now."""
-        if not unit.alive or unit.killing or unit.hold_until_ns > self.now_ns:
-            return False
-        return not unit.queue or (unit.duty == FULL_DUTY and (not self._leads or self.now_ns >= self.ahead_ns(unit)))
+        touched.clear()
 
     def ahead_ns(self, unit: UnitState) -> int:
         """When a unit that runs a job may be handed its next one."""
@@ -216,6 +205,8 @@ class Core:
         return unit.head_since_ns + self.stage_named[unit.queue[0].stage].estimate_ns - self.policy.lead_ns
 
     def _choose(self, unit: UnitState) -> StageState | None:
+        if self._leads and unit.queue and self.now_ns < self.ahead_ns(unit):
+            return None
         found: list[StageState] = []
         for stage in unit.stages:
             if self._drops:

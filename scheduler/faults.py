@@ -19,6 +19,7 @@ def on_died(core: Core, unit: UnitState) -> None:
     """Reclaim the unit's slots under a new epoch and plan its restart, or end the run when it fails too often."""
     cause = f"{'hung' if unit.killing else 'died'}:{unit.name}"
     unit.alive = unit.killing = False
+    unit.room = 0
     unit.starting_ns = None
     core.reset_alarm()
     jobs = list(unit.queue)
@@ -77,9 +78,11 @@ def check_clocks(core: Core) -> None:
         deadline = _hang_deadline(core, unit)
         if deadline is not None and deadline <= core.now_ns:
             unit.killing = True
+            unit.room = 0
             core.actions.append(Kill(unit.name))
         if 0 < unit.hold_until_ns <= core.now_ns:
             unit.hold_until_ns = 0
+            unit.set_room(core.now_ns)
             core.touch(unit)
         if len(unit.queue) == 1 and core.policy.lead_ns is not None:
             core.touch(unit)

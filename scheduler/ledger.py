@@ -27,10 +27,6 @@ class _UnitBook:
         self.jobs = 0
         self.restarts = 0
 
-    def enter(self, now_ns: int, state: int) -> None:
-        self.totals[self.state] += now_ns - self.since_ns
-        self.state, self.since_ns = state, now_ns
-
     def shares(self) -> dict[str, Any]:
         total = sum(self.totals) or 1
         assigned, starved, blocked, throttled = self.totals
@@ -71,11 +67,13 @@ class Ledger:
 
     def close(self, now_ns: int) -> None:
         self.end_ns = now_ns
-        for book in self._units.values():
-            book.enter(now_ns, book.state)
+        for unit, book in self._units.items():
+            self.enter(unit, now_ns, book.state)
 
     def enter(self, unit: str, now_ns: int, state: int) -> None:
-        self._units[unit].enter(now_ns, state)
+        book = self._units[unit]
+        book.totals[book.state] += now_ns - book.since_ns
+        book.state, book.since_ns = state, now_ns
 
     def job(self, job: Job, ready_ns: int, begin_ns: int, end_ns: int) -> None:
         stage, unit = self._stages[job.stage], self._units[job.unit]

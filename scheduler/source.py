@@ -13,7 +13,8 @@ class Source:
     """Frames 0..n-1. A released frame waits in `queue` until it is taken, turned away, or out of time.
 
     Without a rate (no period, no arrivals) a frame counts as released in the moment in which it can be taken.
-    `due_ns`: when the next frame is released or the oldest waiting one runs out of time.
+    `due_ns`: when the next frame is released or the oldest waiting one runs out of time. `is_empty`: whether no frame
+    can be taken now.
     """
 
     def __init__(self, settings: Settings, drop: Callable[[int, str], None]) -> None:
@@ -25,6 +26,7 @@ class Source:
         self._paced = bool(settings.period_ns or settings.arrivals_ns)
         self.queue: deque[tuple[int, int]] = deque()
         self.due_ns = NEVER
+        self.is_empty = self._paced or not self._end
 
     def start(self, now_ns: int) -> None:
         self._start_ns = now_ns
@@ -54,11 +56,6 @@ class Source:
         self._set_due()
         return changed
 
-    @property
-    def is_empty(self) -> bool:
-        """Whether no frame can be taken now."""
-        return not self.queue and (self._paced or self._next >= self._end)
-
     def head(self, now_ns: int) -> tuple[int, int]:
         """The frame that is next and its release time; `is_empty` says whether there is one."""
         return self.queue[0] if self.queue else (self._next, now_ns)
@@ -77,9 +74,9 @@ class Source:
         head = self.head(now_ns)
         if self.queue:
             self.queue.popleft()
-            self._set_due()
         else:
             self._next += 1
+        self._set_due()
         return head
 
     def _admit(self, frame: int, release_ns: int) -> None:
@@ -90,6 +87,7 @@ class Source:
             self.queue.append((frame, release_ns))
 
     def _set_due(self) -> None:
+        self.is_empty = not self.queue and (self._paced or self._next >= self._end)
         self.due_ns = self._release_ns(self._next) if self._paced and self._next < self._end else NEVER
         if self._settings.queue_timeout_ns and self.queue:
             self.due_ns = min(self.due_ns, self.queue[0][1] + self._settings.queue_timeout_ns)

@@ -8,6 +8,7 @@ from trilane.scheduler.events import Graph, Job
 from trilane.scheduler.ledger import STARVED
 from trilane.transport.slots import EdgeSlots, edge_rule
 
+HELD_JOBS = 2  # the one that runs and the one dispatched ahead
 FULL_DUTY = 1000
 NEVER = 1 << 62  # ns
 
@@ -15,12 +16,11 @@ NEVER = 1 << 62  # ns
 class UnitState:
     """`queue`: the running job, then the held one. `head_since_ns`: since when the first of them could run.
 
-    `state`: the one that the ledger has it in.
+    `state`: the one that the ledger has it in. `room`: how many jobs it may have, see `set_room`.
     """
 
     __slots__ = (
         "alive",
-        "dirty",
         "duty",
         "failures",
         "head_since_ns",
@@ -30,6 +30,7 @@ class UnitState:
         "name",
         "queue",
         "restart_at_ns",
+        "room",
         "stages",
         "starting_ns",
         "state",
@@ -39,13 +40,21 @@ class UnitState:
         self.name = name
         self.stages: list[StageState] = []
         self.queue: deque[Job] = deque()
-        self.alive = self.killing = self.dirty = False
+        self.alive = self.killing = False
+        self.room = 0
         self.head_since_ns = self.heard_ns = self.hold_until_ns = 0
         self.restart_at_ns: int | None = None
         self.starting_ns: int | None = None
         self.failures = 0
         self.duty = FULL_DUTY
         self.state = STARVED
+
+    def set_room(self, now_ns: int) -> None:
+        """To be called when one of the fields was set that it depends on, and when a hold ends."""
+        if not self.alive or self.killing or self.hold_until_ns > now_ns:
+            self.room = 0
+        else:
+            self.room = HELD_JOBS if self.duty == FULL_DUTY else 1
 
 
 class StageState:

@@ -142,7 +142,9 @@ class VirtualDriver:
         if begin_ns < unit.free_ns:
             begin_ns = unit.free_ns
         end_ns = unit.free_ns = begin_ns + self._service(stage, name, frame, begin_ns)
-        self._push(end_ns + self._hop_ns, EVENT, JobDone(name, job_id, begin_ns, end_ns, begin_ns), unit.epoch)
+        done = JobDone(name, job_id, begin_ns, end_ns, begin_ns)
+        self._sequence += 1
+        heapq.heappush(self._heap, (end_ns + self._hop_ns, EVENT, self._sequence, done, unit.epoch))
         if self.recording is not None:
             ready_ns = self.core.frames[frame].ready_ns
             self.jobs.append(JobRecord(stage, name, frame, ready_ns, now_ns, begin_ns, end_ns))
