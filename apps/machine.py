@@ -20,12 +20,10 @@ CPU_FLAGS = ("avx2", "fma", "f16c", "avx512f", "avx512_vnni", "avx_vnni", "avx51
 ARM_FLAGS = ("asimd", "asimddp", "i8mm", "bf16", "sve", "sve2")
 
 PACKAGES = (
-    "numpy", "moderngl", "onnxruntime", "onnx", "msgpack", "psutil", "rich", "typer", "pydantic", "av",
+    "numpy", "moderngl", "onnxruntime", "onnx", "pyzmq", "msgpack", "psutil", "rich", "typer", "pydantic", "av",
     "Pillow", "perfetto",
 )  # fmt: skip
-OPTIONAL_PACKAGES = {
-    "openvino": "openvino", "onnxruntime-qnn": "qnn", "torch": "train", "anny": "anny", "pyzmq": "peers",
-}  # fmt: skip
+OPTIONAL_PACKAGES = {"openvino": "openvino", "onnxruntime-qnn": "qnn", "torch": "train", "anny": "anny"}
 
 GL_TIMEOUT_S = 30.0
 GL_PROGRAM = "import json, trilane.apps.machine as m; print(json.dumps(m.open_gl()))"

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import socket
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -43,11 +42,10 @@ def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 200, turns:
 
     `slot`: a slot of the pipeline's shared memory and the message that announces it, one process to another. `slot
     through the scheduler`: the same between the raster and infer stages of a real run, where the message goes to the
-    scheduler's process, through its core, and on. `slot by zeromq`: the message over ZeroMQ instead of a Unix socket.
-    Peers: `iceoryx2` with an event, `zeromq copied` frames, `pickled queue` (multiprocessing.Queue). Each turn hands
-    over `frames` times in each way and size; before each the consumer waits at least 1 ms, as an idle unit does.
-    `absent`: peers that are not installed. `met`: our two ways against p50 <= 150 us and p99 <= 500 us at the largest
-    size. `ahead`: of each peer, by p50, at every size.
+    scheduler's process, through its core, and on. Peers: `iceoryx2` with an event, `zeromq copied` frames, `pickled
+    queue` (multiprocessing.Queue). Each turn hands over `frames` times in each way and size; before each the consumer
+    waits at least 1 ms, as an idle unit does. `absent`: peers that are not installed. `met`: our two ways against
+    p50 <= 150 us and p99 <= 500 us at the largest size. `ahead`: of each peer, by p50, at every size.
     Raises BadInputError for other sizes than 256, 1024, 4096, 16384 KiB.
     """
     unknown = set(kib) - set(SIDES)
@@ -75,18 +73,18 @@ class Pair:
     def __init__(self, context: SpawnContext, channel: Channel) -> None:
         self._channel = channel
         ours, theirs = zip(*(context.Pipe() for _ in ENDS), strict=True)
-        between, ends = context.Pipe(), socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        between = context.Pipe()
         self._pipes: Sequence[Connection] = ours
         units = host_units()
         cores = (units["gpu"].cores, units["dsp"].cores)
         self._processes = [
-            context.Process(target=work, args=(pipe, ack, end, channel, own), daemon=True)
-            for work, pipe, ack, end, own in zip((produce, consume), theirs, between, ends, cores, strict=True)
+            context.Process(target=end, args=(pipe, ack, channel, own), daemon=True)
+            for end, pipe, ack, own in zip((produce, consume), theirs, between, cores, strict=True)
         ]
         for process in self._processes:
             process.start()
-        for handle in (*theirs, *between, *ends):
-            handle.close()
+        for pipe in (*theirs, *between):
+            pipe.close()
         for pipe in self._pipes:
             _answer(pipe)
 
@@ -108,12 +106,10 @@ class Pair:
         self._channel.close()
 
 
-def produce(
-    pipe: Connection, ack: Connection, socket_end: socket.socket, channel: Channel, cores: tuple[int, ...]
-) -> None:
+def produce(pipe: Connection, ack: Connection, channel: Channel, cores: tuple[int, ...]) -> None:
     """The process that writes; answers each number of frames with the instants, in ns, at which they were written."""
     with _child(pipe, cores):
-        end = channel.producer(socket_end)
+        end = channel.producer()
         pipe.send("ready")
         while True:
             written = []
@@ -126,12 +122,10 @@ def produce(
             pipe.send(written)
 
 
-def consume(
-    pipe: Connection, ack: Connection, socket_end: socket.socket, channel: Channel, cores: tuple[int, ...]
-) -> None:
+def consume(pipe: Connection, ack: Connection, channel: Channel, cores: tuple[int, ...]) -> None:
     """The process that reads; answers with the instants at which the bytes could be and had been read."""
     with _child(pipe, cores):
-        end = channel.consumer(socket_end)
+        end = channel.consumer()
         pipe.send("ready")
         while True:
             readable, read = [], []

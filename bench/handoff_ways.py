@@ -6,21 +6,19 @@ Rule: `Producer.buffer` is filled before the clock starts; `Consumer.receive` re
 from __future__ import annotations
 
 import os
-import shutil
-import socket
-import tempfile
 from collections.abc import Callable
 from multiprocessing.context import SpawnContext
 from multiprocessing.queues import Queue
 from typing import Any, Protocol
 
 import numpy as np
+import zmq
 from numpy.typing import NDArray
 
 from trilane.stages.contracts import SlotLayout
-from trilane.transport.bus import Link
+from trilane.transport.bus import BusFolder, Link
 from trilane.transport.memory import RegionLayout, create_region, map_region
-from trilane.transport.messages import Message, RunJob, pack, unpack
+from trilane.transport.messages import RunJob
 
 U8 = NDArray[np.uint8]
 SLOTS = 2
@@ -50,10 +48,10 @@ class Consumer(Protocol):
 class Channel(Protocol):
     """Made in the parent, sent to both children, opened there."""
 
-    def producer(self, end: socket.socket) -> Producer:
-        """In the child that writes. `end`: of a SOCK_SEQPACKET pair with the other child."""
+    def producer(self) -> Producer:
+        """In the child that writes."""
 
-    def consumer(self, end: socket.socket) -> Consumer:
+    def consumer(self) -> Consumer:
         """In the child that reads."""
 
     def close(self) -> None:
@@ -65,90 +63,52 @@ class SlotChannel:
 
     def __init__(self, size: int, _context: SpawnContext) -> None:
         self._layout = RegionLayout(SLOTS, SlotLayout(1, size))
-        self._region = create_region("handoff", self._layout)
-        self._parent = os.getpid()
+        self._fd = create_region("handoff", self._layout)
+        self._folder = BusFolder()
+        self._place = f"/proc/{os.getpid()}/fd/{self._fd}"
+        self._endpoint = self._folder.endpoint("handoff")
 
-    def slots(self) -> list[U8]:
-        """In a child: views of the slots' payloads."""
-        fd = os.open(f"/proc/{self._parent}/fd/{self._region}", os.O_RDWR)
-        views = [packet.payload for packet in map_region(fd, self._layout)]
-        os.close(fd)
-        return views
+    def __getstate__(self) -> dict[str, Any]:
+        return {"_layout": self._layout, "_place": self._place, "_endpoint": self._endpoint}
 
-    def producer(self, end: socket.socket) -> Producer:
-        return _SlotProducer(self.slots(), Link(end, WAIT_MS).send)
+    def producer(self) -> Producer:
+        return _SlotEnd(*self._open(), bind=True, endpoint=self._endpoint)
 
-    def consumer(self, end: socket.socket) -> Consumer:
-        return _SlotConsumer(self.slots(), Link(end, WAIT_MS).receive)
+    def consumer(self) -> Consumer:
+        return _SlotEnd(*self._open(), bind=False, endpoint=self._endpoint)
 
-    def close(self) -> None:
-        os.close(self._region)
-
-
-class ZmqSlotChannel(SlotChannel):
-    """The same slots and message, announced over a ZeroMQ PAIR: what the choice of the bus is worth."""
-
-    def __init__(self, size: int, context: SpawnContext) -> None:
-        super().__init__(size, context)
-        self._endpoint = _Endpoint()
-
-    def producer(self, end: socket.socket) -> Producer:  # noqa: ARG002 - it has a socket of its own
-        pair = self._endpoint.open(bind=True)
-        return _SlotProducer(self.slots(), lambda message: pair.send(pack(message)))
-
-    def consumer(self, end: socket.socket) -> Consumer:  # noqa: ARG002
-        pair = self._endpoint.open(bind=False)
-        return _SlotConsumer(self.slots(), lambda: unpack(pair.recv()))
+    def _open(self) -> tuple[int, RegionLayout]:
+        return os.open(self._place, os.O_RDWR), self._layout
 
     def close(self) -> None:
-        super().close()
-        self._endpoint.remove()
+        os.close(self._fd)
+        self._folder.remove()
 
 
-class _SlotProducer:
-    def __init__(self, payloads: list[U8], send: Callable[[Message], Any]) -> None:
-        self._payloads, self._send, self._count = payloads, send, 0
+class _SlotEnd:
+    def __init__(self, fd: int, layout: RegionLayout, *, bind: bool, endpoint: str) -> None:
+        self._payloads = [packet.payload for packet in map_region(fd, layout)]
+        self._link = Link(zmq.Context(), WAIT_MS)
+        (self._link.socket.bind if bind else self._link.socket.connect)(endpoint)
+        self._count = 0
 
     def buffer(self) -> U8:
         return self._payloads[self._count % SLOTS]
 
     def hand_over(self) -> None:
         slot = self._count % SLOTS
-        self._send(RunJob(self._count, "infer", self._count, slot, slot, 0))
+        self._link.send(RunJob(self._count, "infer", self._count, slot, slot, 0))
         self._count += 1
 
-
-class _SlotConsumer:
-    def __init__(self, payloads: list[U8], wait: Callable[[], Message | None]) -> None:
-        self._payloads, self._wait = payloads, wait
-
     def receive(self) -> U8:
-        while not isinstance(message := self._wait(), RunJob):
-            pass
-        return self._payloads[message.slot_in]
+        while True:
+            self._link.wait(WAIT_MS)
+            message = self._link.receive()
+            if isinstance(message, RunJob):
+                return self._payloads[message.slot_in]
 
     def release(self) -> None:
         """The acknowledgement gives the slot back."""
-
-
-class _Endpoint:
-    """A ZeroMQ PAIR between two processes, with a name in a folder of its own."""
-
-    def __init__(self) -> None:
-        import zmq  # noqa: F401 - says here, in the parent, that it is not installed
-
-        self._folder = tempfile.mkdtemp(prefix="trilane-", dir="/tmp")
-
-    def open(self, *, bind: bool) -> Any:
-        import zmq
-
-        pair = zmq.Context().socket(zmq.PAIR)
-        pair.setsockopt(zmq.RCVTIMEO, WAIT_MS)
-        (pair.bind if bind else pair.connect)(f"ipc://{self._folder}/pair")
-        return pair
-
-    def remove(self) -> None:
-        shutil.rmtree(self._folder, ignore_errors=True)
 
 
 class QueueChannel:
@@ -157,10 +117,10 @@ class QueueChannel:
     def __init__(self, size: int, context: SpawnContext) -> None:
         self._size, self._queue = size, context.Queue()
 
-    def producer(self, end: socket.socket) -> Producer:  # noqa: ARG002 - it has a channel of its own
+    def producer(self) -> Producer:
         return _QueueEnd(self._queue, self._size)
 
-    def consumer(self, end: socket.socket) -> Consumer:  # noqa: ARG002
+    def consumer(self) -> Consumer:
         return _QueueEnd(self._queue, 0)
 
     def close(self) -> None:
@@ -189,30 +149,37 @@ class ZmqChannel:
     """The bytes themselves as a ZeroMQ frame, copied as pyzmq does it by default."""
 
     def __init__(self, size: int, _context: SpawnContext) -> None:
-        self._size, self._endpoint = size, _Endpoint()
+        self._folder = BusFolder()
+        self._size, self._endpoint = size, self._folder.endpoint("handoff")
 
-    def producer(self, end: socket.socket) -> Producer:  # noqa: ARG002 - it has a socket of its own
-        return _ZmqEnd(self._endpoint.open(bind=True), self._size)
+    def __getstate__(self) -> dict[str, Any]:
+        return {"_size": self._size, "_endpoint": self._endpoint}
 
-    def consumer(self, end: socket.socket) -> Consumer:  # noqa: ARG002
-        return _ZmqEnd(self._endpoint.open(bind=False), 0)
+    def producer(self) -> Producer:
+        return _ZmqEnd(self._endpoint, self._size, bind=True)
+
+    def consumer(self) -> Consumer:
+        return _ZmqEnd(self._endpoint, 0, bind=False)
 
     def close(self) -> None:
-        self._endpoint.remove()
+        self._folder.remove()
 
 
 class _ZmqEnd:
-    def __init__(self, pair: Any, size: int) -> None:
-        self._pair, self._own = pair, np.zeros(size, np.uint8)
+    def __init__(self, endpoint: str, size: int, *, bind: bool) -> None:
+        self._own = np.zeros(size, np.uint8)
+        self._socket = zmq.Context().socket(zmq.PAIR)
+        self._socket.setsockopt(zmq.RCVTIMEO, WAIT_MS)
+        (self._socket.bind if bind else self._socket.connect)(endpoint)
 
     def buffer(self) -> U8:
         return self._own
 
     def hand_over(self) -> None:
-        self._pair.send(self._own)
+        self._socket.send(self._own.data)
 
     def receive(self) -> U8:
-        return np.frombuffer(self._pair.recv(), np.uint8)
+        return np.frombuffer(self._socket.recv(), np.uint8)
 
     def release(self) -> None:
         """The bytes are this process's own."""
@@ -226,10 +193,10 @@ class IceoryxChannel:
 
         self._size, self._name = size, f"trilane/handoff/{os.getpid()}/{size}"
 
-    def producer(self, end: socket.socket) -> Producer:  # noqa: ARG002 - it has a channel of its own
+    def producer(self) -> Producer:
         return _IceoryxProducer(self._name, self._size)
 
-    def consumer(self, end: socket.socket) -> Consumer:  # noqa: ARG002
+    def consumer(self) -> Consumer:
         return _IceoryxConsumer(self._name)
 
     def close(self) -> None:
@@ -285,7 +252,6 @@ class _IceoryxConsumer:
 #: Way -> its channel. `slot` is Trilane's, one message from end to end.
 CHANNELS: dict[str, Callable[[int, SpawnContext], Channel]] = {
     "slot": SlotChannel,
-    "slot by zeromq": ZmqSlotChannel,
     "iceoryx2": IceoryxChannel,
     "zeromq copied": ZmqChannel,
     "pickled queue": QueueChannel,

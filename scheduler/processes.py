@@ -7,17 +7,18 @@ from __future__ import annotations
 
 import contextlib
 import os
-import select
 import subprocess
 import sys
 import time
 from collections.abc import Mapping
 from typing import NamedTuple
 
+import zmq
+
 from trilane.errors import TrilaneError
 from trilane.scene.schema import RunConfig
 from trilane.stages.unit_loop import EdgeSpec, UnitSpec
-from trilane.transport.bus import Link, pair
+from trilane.transport.bus import BusFolder, Link
 from trilane.transport.messages import Message, MessageError
 
 TAIL_BYTES = 8192
@@ -34,12 +35,13 @@ class Heard(NamedTuple):
 
 
 class _Process:
-    def __init__(self, unit: str, popen: subprocess.Popen[bytes], link: Link) -> None:
+    def __init__(self, unit: str, popen: subprocess.Popen[bytes], link: Link, folder: BusFolder) -> None:
         assert popen.stderr is not None
-        self.unit, self.popen, self.link = unit, popen, link
+        self.unit, self.popen, self.link, self.folder = unit, popen, link, folder
         self.stderr = popen.stderr
         self.pidfd = os.pidfd_open(popen.pid)
         self.tail = b""
+        self.folder_open = True
         os.set_blocking(self.stderr.fileno(), False)
 
     def read_stderr(self) -> bool:
@@ -49,6 +51,11 @@ class _Process:
                 self.tail = (self.tail + chunk)[-TAIL_BYTES:]
             return False
         return True
+
+    def release_folder(self) -> None:
+        if self.folder_open:
+            self.folder_open = False
+            self.folder.remove()
 
 
 class UnitProcesses:
@@ -61,8 +68,9 @@ class UnitProcesses:
         stages: Mapping[str, Mapping[str, tuple[str | None, str | None]]],
     ) -> None:
         self._config, self._edges, self._stages = config, edges, stages
-        self._poller = select.poll()
-        self._sources: dict[int, tuple[str, _Process | None]] = {}
+        self._context = zmq.Context()
+        self._poller = zmq.Poller()
+        self._sources: dict[object, tuple[str, _Process | None]] = {}
         self._live: dict[str, _Process] = {}
         self.last_words: dict[str, str] = {}
 
@@ -76,29 +84,34 @@ class UnitProcesses:
 
     def start(self, unit: str) -> None:
         """A fresh process for the unit; `Ready` or `Failed` follows, or its end."""
-        link, theirs = pair()
+        folder = BusFolder()
+        link = Link(self._context)
+        link.socket.bind(folder.endpoint(unit))
         stages = dict(self._stages[unit])
         used = {edge for pair in stages.values() for edge in pair if edge is not None}
         edges = {name: self._edges[name] for name in used}
         spec = UnitSpec(
             parent_pid=os.getpid(),
-            link_fd=theirs.fileno(),
+            endpoint=folder.endpoint(unit),
             config=self._config,
             edges=edges,
             stages=stages,
         )
-        with contextlib.closing(theirs):
-            process = _Process(unit, self._spawn(unit, spec), link)
+        process = _Process(unit, self._spawn(unit, spec), link, folder)
         self._live[unit] = process
-        self._register(link.fileno(), "link", process)
+        self._register(link.socket, "link", process)
         self._register(process.pidfd, "end", process)
         self._register(process.stderr.fileno(), "stderr", process)
+
+    def connected(self, unit: str) -> None:
+        """The unit has spoken: its socket needs no name any more."""
+        self._live[unit].release_folder()
 
     def send(self, unit: str, message: Message) -> None:
         """To a unit that is gone or does not read: nothing, its end or its deadline tells."""
         process = self._live.get(unit)
         if process is not None:
-            with contextlib.suppress(BlockingIOError, ConnectionError):
+            with contextlib.suppress(zmq.Again):
                 process.link.send(message)
 
     def kill(self, unit: str) -> None:
@@ -133,6 +146,7 @@ class UnitProcesses:
             process.popen.kill()
         for process in list(self._live.values()):
             self._forget(process)
+        self._context.destroy(linger=0)
 
     def wait_for_end(self, units: list[str], timeout_s: float = END_S) -> None:
         """Give units that were told to close the time to leave by themselves."""
@@ -145,8 +159,6 @@ class UnitProcesses:
         try:
             while (message := process.link.receive()) is not None:
                 heard.append(Heard(process.unit, message))
-        except EOFError:
-            self._unregister(process.link.fileno())  # its process ends, or has ended: the pidfd tells
         except MessageError as error:
             raise TrilaneError(f"unit {process.unit} sent what is no message: {error}") from None
         return heard
@@ -161,7 +173,7 @@ class UnitProcesses:
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.PIPE,
-                pass_fds=[fd, spec.link_fd, *(edge.fd for edge in spec.edges.values())],
+                pass_fds=[fd, *(edge.fd for edge in spec.edges.values())],
                 env={**os.environ, **dict.fromkeys(THREAD_LIMITS, threads), "TRILANE_UNIT": unit},
                 process_group=0,
             )
@@ -172,17 +184,18 @@ class UnitProcesses:
         process.popen.wait()
         process.read_stderr()
         self.last_words[process.unit] = process.tail.decode(errors="replace").strip()
-        for source in (process.link.fileno(), process.pidfd, process.stderr.fileno()):
+        for source in (process.link.socket, process.pidfd, process.stderr.fileno()):
             self._unregister(source)
         process.link.close()
+        process.release_folder()
         os.close(process.pidfd)
         process.stderr.close()
         del self._live[process.unit]
 
-    def _register(self, source: int, kind: str, process: _Process | None) -> None:
-        self._poller.register(source, select.POLLIN)
+    def _register(self, source: object, kind: str, process: _Process | None) -> None:
+        self._poller.register(source, zmq.POLLIN)
         self._sources[source] = (kind, process)
 
-    def _unregister(self, source: int) -> None:
+    def _unregister(self, source: object) -> None:
         if self._sources.pop(source, None) is not None:
             self._poller.unregister(source)

@@ -171,9 +171,9 @@ class RealtimeDriver:
         while True:
             now_ns = time.monotonic_ns()
             decision = self.core.step(now_ns, tuple(events))
+            self.recording.steps.append((now_ns, tuple(events), decision.actions))
             for action in decision.actions:
                 self._perform(now_ns, action)
-            self.recording.steps.append((now_ns, tuple(events), decision.actions))
             if self.core.finished:
                 self._progress(final=True)
                 return self._cause(decision.actions)
@@ -276,6 +276,7 @@ class RealtimeDriver:
         self._processes.start(unit)
 
     def _ready(self, unit: str) -> None:
+        self._processes.connected(unit)
         self.startup_ms.setdefault(unit, (time.monotonic() - self._started_s[unit]) * 1000)
 
     def _last_words(self, unit: str) -> str:

@@ -6,7 +6,6 @@ its stage; the first stage of the chain has no input, so the loop itself stamps 
 
 from __future__ import annotations
 
-import contextlib
 import gc
 import os
 import time
@@ -16,13 +15,14 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
+import zmq
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 from trilane.errors import TrilaneError
 from trilane.scene.schema import RunConfig
 from trilane.stages.contracts import Packet, SlotLayout, Stage
-from trilane.transport.bus import Link
+from trilane.transport.bus import LAST_WORDS_MS, Link
 from trilane.transport.memory import RegionLayout, map_region
 from trilane.transport.messages import (
     BUILDING,
@@ -57,14 +57,11 @@ class EdgeSpec(BaseModel):
 
 
 class UnitSpec(BaseModel):
-    """What a unit's process is told. `stages`: name to (input edge, output edge), each a key of `edges` or None.
-
-    `link_fd`: its end of the bus, inherited.
-    """
+    """What a unit's process is told. `stages`: name to (input edge, output edge), each a key of `edges` or None."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     parent_pid: int
-    link_fd: int
+    endpoint: str
     config: RunConfig
     edges: dict[str, EdgeSpec]
     stages: dict[str, tuple[str | None, str | None]]
@@ -106,11 +103,14 @@ def _header_bytes(packet: Packet) -> NDArray[np.uint8]:
 def serve(unit: str, raw_spec: dict[str, Any]) -> int:
     """Build, then answer messages until Close; the process's exit code."""
     spec = UnitSpec.model_validate(raw_spec)
-    with contextlib.closing(Link.inherited(spec.link_fd, BEAT_MS)) as link:
-        try:
-            return _serve(unit, spec, link)
-        except (EOFError, ConnectionError):
-            return 1  # the parent is gone
+    context = zmq.Context()
+    link = Link(context, LAST_WORDS_MS)
+    link.socket.connect(spec.endpoint)
+    try:
+        return _serve(unit, spec, link)
+    finally:
+        link.close()
+        context.term()
 
 
 def _serve(unit: str, spec: UnitSpec, link: Link) -> int:
@@ -122,12 +122,13 @@ def _serve(unit: str, spec: UnitSpec, link: Link) -> int:
     gc.freeze()
     link.send(Ready(os.getpid()))
     while True:
-        message = link.receive()
-        if message is None:
+        if not link.wait(BEAT_MS):
             if os.getppid() != spec.parent_pid:
                 return 1
             link.send(Alive())
-        elif isinstance(message, RunJob):
+            continue
+        message = link.receive()
+        if isinstance(message, RunJob):
             _run_job(link, stages[message.stage], message)
         elif isinstance(message, Isolate):
             _isolate(link, stages[message.stage], message)

@@ -1,64 +1,93 @@
-"""The bus: one pair of Unix sockets (SOCK_SEQPACKET) per unit. Rule: no name anywhere; messages stay whole, in order.
+"""The bus: one ZeroMQ PAIR socket per unit over ipc. Rule: its folder is private, and there only while a unit connects.
 
-The parent makes the pair and the unit inherits its end, so nothing is left on disk whoever is killed, and an end that
-closes is noticed by the other at once.
+Once every unit is connected the folder is removed: the connections live on without a name. What a killed parent may
+leave in the moment before that is removed by the next run, which knows by the lock that nobody holds it.
 """
 
 from __future__ import annotations
 
-import socket
-import struct
+import contextlib
+import fcntl
+import os
+import shutil
+import tempfile
+from pathlib import Path
 from typing import Self
+
+import zmq
 
 from trilane.transport.messages import MAX_BYTES, Message, pack, unpack
 
-#: What the kernel keeps of messages that were not read yet, in each direction; a message takes about 1 KiB of it.
-BUFFER_BYTES = 1 << 20
+PREFIX = "trilane-"
+LOCK = "lock"
+HIGH_WATER = 64  # messages; a unit has at most a few outstanding
+LAST_WORDS_MS = 1000  # how long a unit that ends tries to deliver what it said last
+MAX_PATH = 80  # of the folder; a unix socket's path holds 108 bytes
+
+
+class BusFolder:
+    """A 0700 folder for the sockets' names, held by a lock on a file inside."""
+
+    def __init__(self) -> None:
+        base = tempfile.gettempdir()
+        base = base if len(base) < MAX_PATH else "/tmp"  # noqa: S108 - mkdtemp below makes a private folder in it
+        sweep(Path(base))
+        self.path = Path(tempfile.mkdtemp(prefix=PREFIX, dir=base))
+        self._lock = os.open(self.path / LOCK, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
+        fcntl.flock(self._lock, fcntl.LOCK_EX)
+
+    def endpoint(self, name: str) -> str:
+        return f"ipc://{self.path / name}"
+
+    def remove(self) -> None:
+        shutil.rmtree(self.path, ignore_errors=True)
+        os.close(self._lock)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_exc: object) -> None:
+        self.remove()
+
+
+def sweep(base: Path) -> None:
+    """Remove this user's bus folders whose owner is gone: those whose lock can be taken."""
+    for folder in base.glob(f"{PREFIX}*"):
+        with contextlib.suppress(OSError):
+            if folder.is_symlink() or folder.stat().st_uid != os.getuid():
+                continue
+            lock = os.open(folder / LOCK, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(folder, ignore_errors=True)
+            finally:
+                os.close(lock)
 
 
 class Link:
-    """One end of a connection. With a patience it waits: for a message so long, and for room to send without end."""
+    """One end of a connection. Messages arrive in order or not at all."""
 
-    def __init__(self, end: socket.socket, patience_ms: int = 0) -> None:
-        self.socket = end
-        self._flags = 0 if patience_ms else socket.MSG_DONTWAIT
-        self._buffer = bytearray(MAX_BYTES)
-        end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
-        end.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, _timeval(patience_ms))
-
-    @classmethod
-    def inherited(cls, fd: int, patience_ms: int) -> Self:
-        """The unit's end, which its process was started with."""
-        return cls(socket.socket(fileno=fd), patience_ms)
-
-    def fileno(self) -> int:
-        return self.socket.fileno()
+    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], linger_ms: int = 0) -> None:
+        self.socket: zmq.Socket[bytes] = context.socket(zmq.PAIR)
+        self.socket.setsockopt(zmq.LINGER, linger_ms)
+        self.socket.setsockopt(zmq.MAXMSGSIZE, MAX_BYTES)
+        self.socket.setsockopt(zmq.SNDHWM, HIGH_WATER)
+        self.socket.setsockopt(zmq.RCVHWM, HIGH_WATER)
 
     def send(self, message: Message) -> None:
-        """Raises BlockingIOError when the other end has stopped reading, ConnectionError when it is gone."""
-        self.socket.send(pack(message), self._flags)
+        """Raises zmq.Again when the other end has stopped reading."""
+        self.socket.send(pack(message), zmq.DONTWAIT)
 
     def receive(self) -> Message | None:
-        """The next message, None when there is none. Raises MessageError for anything else, EOFError at the end."""
+        """The next message, None when there is none. Raises MessageError for anything else."""
         try:
-            count = self.socket.recv_into(self._buffer, 0, self._flags)
-        except BlockingIOError:
+            return unpack(self.socket.recv(zmq.DONTWAIT))
+        except zmq.Again:
             return None
-        except ConnectionResetError:  # said once when the other end left with messages unread; its own come after it
-            return self.receive()
-        if not count:
-            raise EOFError
-        return unpack(memoryview(self._buffer)[:count])
+
+    def wait(self, timeout_ms: int) -> bool:
+        """Whether a message came within the time."""
+        return bool(self.socket.poll(timeout_ms))
 
     def close(self) -> None:
         self.socket.close()
-
-
-def _timeval(milliseconds: int) -> bytes:
-    return struct.pack("@ll", *divmod(milliseconds * 1000, 1_000_000))
-
-
-def pair() -> tuple[Link, socket.socket]:
-    """The parent's end, and the one that a unit inherits."""
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    return Link(ours), theirs

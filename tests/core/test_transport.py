@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import contextlib
 import os
+from pathlib import Path
 
 import msgpack
 import numpy as np
 import pytest
+import zmq
 from hypothesis import given
 from hypothesis import strategies as st
 
 from trilane.errors import TrilaneError
 from trilane.stages.contracts import SlotLayout
-from trilane.transport.bus import Link, pair
+from trilane.transport.bus import LOCK, BusFolder, Link, sweep
 from trilane.transport.memory import RegionLayout, create_region, map_region
 from trilane.transport.messages import (
-    MAX_BYTES,
     Alive,
     Close,
     Closed,
@@ -110,53 +111,50 @@ def test_a_region_that_is_too_small_is_refused() -> None:
     os.close(fd)
 
 
-def linked() -> tuple[Link, Link]:
-    ours, theirs = pair()
-    return ours, Link.inherited(theirs.detach(), 200)
-
-
-def test_messages_arrive_whole_and_in_order() -> None:
-    parent, child = linked()
+def test_the_folder_is_private_and_goes_while_the_link_lives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    context = zmq.Context()
+    parent, child = Link(context), Link(context)
+    folder = BusFolder()
+    assert folder.path.stat().st_mode & 0o777 == 0o700
+    parent.socket.bind(folder.endpoint("cpu"))
+    child.socket.connect(folder.endpoint("cpu"))
     child.send(Ready(1))
-    child.send(Alive())
-    assert (parent.receive(), parent.receive(), parent.receive()) == (Ready(1), Alive(), None)
+    assert parent.wait(2000)
+    assert parent.receive() == Ready(1)
+    folder.remove()
+    assert not list(tmp_path.iterdir())
     parent.send(Close())
+    assert child.wait(2000)
     assert (child.receive(), child.receive()) == (Close(), None)
     parent.close()
     child.close()
+    context.term()
 
 
-def test_a_message_too_large_is_refused() -> None:
-    parent, child = linked()
-    child.socket.send(bytes(MAX_BYTES + 1))
-    with pytest.raises(MessageError):
-        parent.receive()
+def test_a_message_too_large_is_not_received() -> None:
+    context = zmq.Context()
+    parent, child = Link(context), Link(context)
+    with BusFolder() as folder:
+        parent.socket.bind(folder.endpoint("cpu"))
+        child.socket.connect(folder.endpoint("cpu"))
+        child.socket.send(bytes(1 << 17), zmq.DONTWAIT)
+        assert not parent.wait(300)
     parent.close()
     child.close()
+    context.term()
 
 
-def test_last_words_are_heard_before_the_end() -> None:
-    """Also when the end that left had not read everything, of which the kernel tells with a reset."""
-    parent, child = linked()
-    parent.send(Close())
-    child.send(Closed())
-    child.close()
-    assert parent.receive() == Closed()
-    for _ in range(2):
-        with pytest.raises(EOFError):
-            parent.receive()
-    with pytest.raises(ConnectionError):
-        parent.send(Close())
-    parent.close()
-
-
-def test_the_parent_does_not_wait_for_a_unit_that_does_not_read() -> None:
-    parent, child = linked()
-    with pytest.raises(BlockingIOError):
-        for _ in range(1 << 16):
-            parent.send(Close())
-    parent.close()
-    child.close()
+def test_only_a_folder_that_nobody_holds_is_swept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    held = BusFolder()
+    (tmp_path / "trilane-stale").mkdir()
+    (tmp_path / "trilane-stale" / LOCK).touch()
+    (tmp_path / "trilane-other").mkdir()
+    (tmp_path / "trilane-link").symlink_to(held.path)
+    sweep(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([held.path.name, "trilane-other", "trilane-link"])
+    held.remove()
 
 
 def test_a_slice_is_asked_for_and_given_back() -> None:
