@@ -171,9 +171,9 @@ class RealtimeDriver:
         while True:
             now_ns = time.monotonic_ns()
             decision = self.core.step(now_ns, tuple(events))
-            self.recording.steps.append((now_ns, tuple(events), decision.actions))
             for action in decision.actions:
                 self._perform(now_ns, action)
+            self.recording.steps.append((now_ns, tuple(events), decision.actions))
             if self.core.finished:
                 self._progress(final=True)
                 return self._cause(decision.actions)

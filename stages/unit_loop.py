@@ -15,14 +15,13 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
-import zmq
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 from trilane.errors import TrilaneError
 from trilane.scene.schema import RunConfig
 from trilane.stages.contracts import Packet, SlotLayout, Stage
-from trilane.transport.bus import LAST_WORDS_MS, Link
+from trilane.transport.bus import LAST_WORDS_MS, Link, prompt_context
 from trilane.transport.memory import RegionLayout, map_region
 from trilane.transport.messages import (
     BUILDING,
@@ -38,8 +37,10 @@ from trilane.transport.messages import (
     Ready,
     RunJob,
 )
+from trilane.transport.wakeup import UNIT_NS, use_slice
 
 BEAT_MS = 500
+SCHEDULER = "cpu"  # the unit whose cores the scheduler shares
 
 
 class EdgeSpec(BaseModel):
@@ -103,8 +104,9 @@ def _header_bytes(packet: Packet) -> NDArray[np.uint8]:
 def serve(unit: str, raw_spec: dict[str, Any]) -> int:
     """Build, then answer messages until Close; the process's exit code."""
     spec = UnitSpec.model_validate(raw_spec)
-    context = zmq.Context()
+    context = prompt_context(spec.config.units[SCHEDULER].cores)
     link = Link(context, LAST_WORDS_MS)
+    use_slice(UNIT_NS)
     link.socket.connect(spec.endpoint)
     try:
         return _serve(unit, spec, link)
@@ -122,13 +124,13 @@ def _serve(unit: str, spec: UnitSpec, link: Link) -> int:
     gc.freeze()
     link.send(Ready(os.getpid()))
     while True:
-        if not link.wait(BEAT_MS):
-            if os.getppid() != spec.parent_pid:
-                return 1
-            link.send(Alive())
-            continue
-        message = link.receive()
-        if isinstance(message, RunJob):
+        message = link.receive()  # before any waiting: the next job is often there
+        if message is None:
+            if not link.wait(BEAT_MS):
+                if os.getppid() != spec.parent_pid:
+                    return 1
+                link.send(Alive())
+        elif isinstance(message, RunJob):
             _run_job(link, stages[message.stage], message)
         elif isinstance(message, Isolate):
             _isolate(link, stages[message.stage], message)

@@ -1,7 +1,6 @@
 """The process of a unit: `python -P -m trilane.stages.worker --unit UNIT --spec FD`.
 
-Rule: first the ties (die with the parent, stay on the given cores, run in slices of the usual length), then, and
-only then, the heavy imports.
+Rule: first the ties (die with the parent, stay on the given cores), then, and only then, the heavy imports.
 """
 
 from __future__ import annotations
@@ -13,8 +12,6 @@ import os
 import signal
 import sys
 from typing import Any
-
-from trilane.transport.wakeup import DEFAULT, use_slice
 
 PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
 
@@ -45,7 +42,6 @@ def main() -> int:
     die_with_parent(spec["parent_pid"])
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.sched_setaffinity(0, spec["config"]["units"][args.unit]["cores"])
-    use_slice(DEFAULT)
 
     from trilane.stages.unit_loop import serve
 

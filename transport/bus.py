@@ -11,12 +11,14 @@ import fcntl
 import os
 import shutil
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Self
 
 import zmq
 
 from trilane.transport.messages import MAX_BYTES, Message, pack, unpack
+from trilane.transport.wakeup import SHORTEST_NS, use_slice
 
 PREFIX = "trilane-"
 LOCK = "lock"
@@ -62,6 +64,19 @@ def sweep(base: Path) -> None:
                 shutil.rmtree(folder, ignore_errors=True)
             finally:
                 os.close(lock)
+
+
+def prompt_context(cores: Sequence[int]) -> zmq.Context[zmq.Socket[bytes]]:
+    """A context for a unit, to be used from this thread: its I/O thread runs on `cores` and at once when it is woken.
+
+    Left where the unit works it would wait for the job that the unit begins the moment after it said `Done`.
+    Leaves this thread with a short slice.
+    """
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    for core in cores:
+        context.set(zmq.THREAD_AFFINITY_CPU_ADD, core)
+    use_slice(SHORTEST_NS)  # the thread inherits it when the first socket is made
+    return context
 
 
 class Link:

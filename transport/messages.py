@@ -5,8 +5,7 @@ On the wire: msgpack of [name, field, ...].
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple, get_type_hints
+from typing import Any, NamedTuple, get_origin, get_type_hints
 
 import msgpack
 
@@ -88,20 +87,18 @@ _KINDS: dict[str, Any] = {
 }
 
 
-def _is_figures(value: Any) -> bool:
-    return isinstance(value, dict) and all(type(k) is str and type(v) in (int, float) for k, v in value.items())
+#: Name -> types of the fields as they come off the wire.
+_TYPES = {name: [get_origin(of) or of for of in get_type_hints(kind).values()] for name, kind in _KINDS.items()}
+_PACKER = msgpack.Packer()  # one for the process: making one costs more than packing
 
 
-_CHECKS: dict[Any, Callable[[Any], bool]] = {
-    int: lambda value: type(value) is int,
-    str: lambda value: type(value) is str,
-    dict[str, float]: _is_figures,
-}
-_FIELDS = {name: [_CHECKS[kind_of] for kind_of in get_type_hints(kind).values()] for name, kind in _KINDS.items()}
+def _are_figures(fields: list[Any]) -> bool:
+    figures = (value for value in fields if type(value) is dict)
+    return all(type(key) is str and type(value) in (int, float) for each in figures for key, value in each.items())
 
 
 def pack(message: Message) -> bytes:
-    packed: bytes = msgpack.packb((type(message).__name__, *message))
+    packed: bytes = _PACKER.pack((type(message).__name__, *message))
     return packed
 
 
@@ -114,8 +111,8 @@ def unpack(data: bytes) -> Message:
     if not isinstance(content, list) or not content or not isinstance(content[0], str) or content[0] not in _KINDS:
         raise MessageError(f"unknown message {str(content)[:80]!r}")
     name, *fields = content
-    checks = _FIELDS[name]
-    if len(fields) != len(checks) or not all(check(field) for check, field in zip(checks, fields, strict=True)):
+    types = _TYPES[name]
+    if [type(field) for field in fields] != types or (dict in types and not _are_figures(fields)):
         raise MessageError(f"wrong fields for {name}: {str(fields)[:80]}")
     message: Message = _KINDS[name](*fields)
     return message

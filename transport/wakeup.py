@@ -3,6 +3,9 @@
 Linux lets a woken task wait until the running one's time slice ends, about 3 ms, unless its own slice is shorter
 (EEVDF since Linux 6.12; older kernels ignore the wish). Here, with another process busy on the same core, the 99th
 percentile of the wake-up went from 3.4 ms to 0.2 ms.
+
+It matters most for ZeroMQ's I/O threads. A unit that says `Done` begins its next job the moment after, and the thread
+that should carry the message waited on the same core until that job's slice was over: 1.6 ms from raster to infer.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ import platform
 import struct
 
 SHORTEST_NS = 100_000
+UNIT_NS = 1_000_000  # a unit that a job wakes goes before other programs, and lets the scheduler go before itself
 DEFAULT = 0
 #: <asm/unistd.h>
 SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
