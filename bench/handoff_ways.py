@@ -15,10 +15,13 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
+from trilane.hw_profiles.host import host_units
 from trilane.stages.contracts import SlotLayout
-from trilane.transport.bus import BusFolder, Link
+from trilane.stages.unit_loop import SCHEDULER
+from trilane.transport.bus import BusFolder, Link, prompt_context
 from trilane.transport.memory import RegionLayout, create_region, map_region
 from trilane.transport.messages import RunJob
+from trilane.transport.wakeup import UNIT_NS, use_slice
 
 U8 = NDArray[np.uint8]
 SLOTS = 2
@@ -67,18 +70,25 @@ class SlotChannel:
         self._folder = BusFolder()
         self._place = f"/proc/{os.getpid()}/fd/{self._fd}"
         self._endpoint = self._folder.endpoint("handoff")
+        self._bus_cores = host_units()[SCHEDULER].cores
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"_layout": self._layout, "_place": self._place, "_endpoint": self._endpoint}
+        return {name: value for name, value in vars(self).items() if name != "_folder"}
 
     def producer(self) -> Producer:
-        return _SlotEnd(*self._open(), bind=True, endpoint=self._endpoint)
+        return _SlotEnd(self._slots(), self._link("bind"))
 
     def consumer(self) -> Consumer:
-        return _SlotEnd(*self._open(), bind=False, endpoint=self._endpoint)
+        return _SlotEnd(self._slots(), self._link("connect"))
 
-    def _open(self) -> tuple[int, RegionLayout]:
-        return os.open(self._place, os.O_RDWR), self._layout
+    def _slots(self) -> list[U8]:
+        return [packet.payload for packet in map_region(os.open(self._place, os.O_RDWR), self._layout)]
+
+    def _link(self, verb: str) -> Link:
+        link = Link(prompt_context(self._bus_cores), WAIT_MS)
+        use_slice(UNIT_NS)
+        getattr(link.socket, verb)(self._endpoint)
+        return link
 
     def close(self) -> None:
         os.close(self._fd)
@@ -86,11 +96,8 @@ class SlotChannel:
 
 
 class _SlotEnd:
-    def __init__(self, fd: int, layout: RegionLayout, *, bind: bool, endpoint: str) -> None:
-        self._payloads = [packet.payload for packet in map_region(fd, layout)]
-        self._link = Link(zmq.Context(), WAIT_MS)
-        (self._link.socket.bind if bind else self._link.socket.connect)(endpoint)
-        self._count = 0
+    def __init__(self, payloads: list[U8], link: Link) -> None:
+        self._payloads, self._link, self._count = payloads, link, 0
 
     def buffer(self) -> U8:
         return self._payloads[self._count % SLOTS]
