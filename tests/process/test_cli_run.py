@@ -21,6 +21,7 @@ import pytest
 from PIL import Image
 
 from trilane.apps.report import read_report
+from trilane.scheduler.record import read, replay
 
 FRAMES = 20
 PATIENCE_S = 60.0
@@ -115,6 +116,12 @@ def test_the_video_has_every_frame_and_the_sheet_shows_it(finished: Finished) ->
     assert not np.array_equal(pictures[0], pictures[-1]), "the camera moves"
     with Image.open(folder / "contact.png") as sheet:
         assert sheet.size == (4 * 320, 5 * 240)
+
+
+def test_the_events_of_real_units_replay_to_the_same_answers(finished: Finished) -> None:
+    recording = read(run_folder(finished) / "events.jsonl")
+    assert len(recording.steps) > FRAMES
+    assert not list(replay(recording))
 
 
 def test_two_runs_present_the_same_bytes(finished: Finished, drawable_bundle: Path, tmp_path: Path) -> None:
