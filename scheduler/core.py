@@ -314,26 +314,22 @@ class Core:
         self.ledger.dropped[f"source->{self.stages[0].name}:{cause}"] += 1
 
     def _idle_state(self, unit: UnitState) -> int:
-        if unit.queue or not unit.alive:
+        """Why a unit without a job has none."""
+        if not unit.alive:
             return ASSIGNED
         found = STARVED
         for stage in unit.stages:
-            state = self._stage_state(stage)
-            if state == BLOCKED:
+            if stage.input is None:
+                if self.source.is_empty:
+                    continue
+                if self._is_full():
+                    return BLOCKED
+            elif not stage.input.ready:
+                continue
+            if stage.output and not stage.output.can_claim():
                 return BLOCKED
-            if state == THROTTLED:
-                found = THROTTLED
+            found = THROTTLED
         return found
-
-    def _stage_state(self, stage: StageState) -> int:
-        if stage.input is None:
-            if self.source.is_empty:
-                return STARVED
-            if self._is_full():
-                return BLOCKED
-        elif not stage.input.ready:
-            return STARVED
-        return BLOCKED if stage.output and not stage.output.can_claim() else THROTTLED
 
     def _next_deadline(self) -> int | None:
         if self._leads or self.alarm_ns <= self.now_ns:

@@ -115,14 +115,17 @@ class VirtualDriver:
         heap = self._heap
         while heap and (deadline_ns is None or heap[0][0] <= deadline_ns):
             at_ns, _, _, event, epoch = heapq.heappop(heap)
-            if self._accept(event, epoch):
+            if type(event) is JobDone:
+                if epoch == self._units[event.unit].epoch:
+                    return at_ns, (event,)
+            elif self._accept(event, epoch):
                 return at_ns, (event,)
         if deadline_ns is None:
             raise RuntimeError("the simulation stands still: no event and no deadline is left")
         return deadline_ns, ()
 
     def _accept(self, event: Event, epoch: int) -> bool:
-        if type(event) is JobDone or type(event) is UnitReady:
+        if type(event) is UnitReady:
             return epoch == self._units[event.unit].epoch
         if type(event) is UnitDied:
             unit = self._units[event.unit]
