@@ -36,7 +36,13 @@ BENCHES = {
     "joints": ("trilane.bench.joints", "What the joint transforms of a frame cost."),
 }
 
-EPILOG = "\b\nExamples:\n  trilane bench raster --size 512 --channels 16 --json\n  trilane bench crop --views 2000"
+EPILOG = """\b
+Examples:
+  trilane bench raster --size 512 --channels 16 --json
+  trilane bench crop --views 2000
+  trilane bench pipeline --avatar default --avatar resnet18 --size 512x512
+  trilane bench handoff
+"""
 
 
 class BenchGroup(TyperGroup):
