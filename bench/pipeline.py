@@ -22,6 +22,7 @@ from trilane.scene.schema import RunConfig
 from trilane.scheduler.policy import policy_named
 from trilane.scheduler.result import JobRecord, RunResult
 from trilane.scheduler.run import run_pipeline
+from trilane.transport.slots import edge_rule
 
 SEQUENTIAL = "sequential"
 MIN_FRAMES = 20
@@ -64,7 +65,7 @@ def measure(
     """
     if frames < MIN_FRAMES or turns < 1:
         raise BadInputError("bench pipeline", f"--frames {frames}, --turns {turns}", f"at least {MIN_FRAMES} and 1")
-    _check_cores(cores)
+    _check(policy, edge, cores)
     rows: list[dict[str, Any]] = []
     accuracy: dict[str, Any] = {}
     for one_avatar, one_size, count in product(avatar, size, cores):
@@ -82,7 +83,13 @@ def measure(
     }
 
 
-def _check_cores(cores: tuple[int, ...]) -> None:
+def _check(policies: Sequence[str], edges: Sequence[str], cores: Sequence[int]) -> None:
+    for option, check, values in (("--policy", policy_named, policies), ("--edge", edge_rule, edges)):
+        for value in values:
+            try:
+                check(value)
+            except ValueError as error:
+                raise BadInputError(option, value, str(error).partition("expected ")[2]) from None
     have = len(usable_cores())
     if not all(1 <= count <= have for count in cores):
         raise BadInputError("--cores", str(list(cores)), f"numbers from 1 to the {have} that this process may use")

@@ -42,7 +42,9 @@ def test_the_pipeline_is_set_against_its_stages_alone(drawable_bundle: Path) -> 
     assert list(result["accuracy"].values()) == [pipeline.NO_ACCURACY]
 
 
-@pytest.mark.parametrize("asked", [{"frames": 3}, {"turns": 0}, {"cores": (99,)}, {"size": ("63x64",)}])
+@pytest.mark.parametrize(
+    "asked", [{"frames": 3}, {"turns": 0}, {"cores": (99,)}, {"size": ("63x64",)}, {"policy": ("x",)}, {"edge": ("x",)}]
+)
 def test_a_pipeline_that_cannot_be_measured_is_refused(asked: dict[str, object]) -> None:
     with pytest.raises(BadInputError):
         pipeline.measure(**asked)  # type: ignore[arg-type]
