@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from trilane.apps.pace import Pace, compare
 from trilane.apps.report import build_report, write_report
 from trilane.apps.run_folder import RunFolder
 from trilane.apps.trace import write_trace
@@ -29,10 +30,11 @@ INTERRUPTED = 130
 
 @dataclass(frozen=True)
 class Plan:
-    """How to run: the policy, and frames of the sequential run beside it (0: none)."""
+    """How to run: the policy, frames of the sequential run beside it (0: none), and a chip's pace to keep."""
 
     policy: str = "pipelined"
     baseline_frames: int = 60
+    pace: Pace | None = None
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,8 @@ def run_to_folder(
         with Interrupts() as late:  # from here on a signal waits until the folder is whole
             baseline, stopped = _baseline(config, plan, hooks) if _went_well(result) else (None, False)
             report = build_report(result, config, policy=plan.policy, machine=machine, baseline=baseline)
+            if plan.pace is not None:
+                report["pace"] = compare(plan.pace, plan.policy, config.scene.frames, result.jobs)
             report |= {**facts, **_write_files(result, folder.work, config.scene.fps)}
             write_report(report, folder.work / "report.json")
             place = folder.complete()

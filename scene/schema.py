@@ -154,8 +154,8 @@ class RunConfig(Model):
     """Everything a unit's process is told, as plain data. Paths are absolute and were checked by the parent.
 
     `out_dir` is the temporary run folder. `runtime` names the DSP runtime. `posed_vertices`: of each avatar, when the
-    CPU unit skins; empty when the GPU does. `fake` maps a unit to the dotted module of a mock unit and is set by tests
-    alone.
+    CPU unit skins; empty when the GPU does. `pace_ns`: how long a job of a stage is held, at least. `fake` maps a unit
+    to the dotted module of a mock unit and is set by tests alone.
     """
 
     scene: Scene
@@ -165,6 +165,7 @@ class RunConfig(Model):
     runtime: str = "ort"
     record: bool = True
     posed_vertices: tuple[int, ...] = ()
+    pace_ns: dict[str, int] = {}
     fake: dict[str, str] = {}
 
     @field_validator("units")

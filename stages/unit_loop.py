@@ -40,6 +40,7 @@ from trilane.transport.messages import (
 from trilane.transport.wakeup import UNIT_NS, use_slice
 
 BEAT_MS = 500
+WATCH_NS = 150_000  # of a hold: a sleep ends about this much late
 SCHEDULER = "cpu"  # the unit whose cores the scheduler shares
 
 
@@ -69,15 +70,24 @@ class UnitSpec(BaseModel):
 
 
 class _BoundStage:
-    """A stage with its slots and byte views of their headers."""
+    """A stage with its slots and byte views of their headers. `pace_ns`: how long a job is held, at least."""
 
-    def __init__(self, stage: Stage, inputs: list[Packet], outputs: list[Packet]) -> None:
+    def __init__(self, stage: Stage, inputs: list[Packet], outputs: list[Packet], pace_ns: int) -> None:
+        self._pace_ns = pace_ns
         self._stage, self._inputs, self._outputs = stage, inputs, outputs
         self._header_in = [_header_bytes(packet) for packet in inputs]
         self._header_out = [_header_bytes(packet) for packet in outputs]
         stage.bind(inputs, outputs)
 
     def run(self, frame: int, slot_in: int, slot_out: int, epoch: int) -> Mapping[str, float]:
+        """Do the job, and hold it until its pace has passed."""
+        end_ns = time.monotonic_ns() + self._pace_ns
+        figures = self._do(frame, slot_in, slot_out, epoch)
+        if self._pace_ns:
+            hold_until(end_ns)
+        return figures
+
+    def _do(self, frame: int, slot_in: int, slot_out: int, epoch: int) -> Mapping[str, float]:
         if slot_out >= 0:
             if slot_in >= 0:
                 self._header_out[slot_out][:] = self._header_in[slot_in]
@@ -95,6 +105,13 @@ class _BoundStage:
 
     def close(self) -> None:
         self._stage.close()
+
+
+def hold_until(end_ns: int) -> None:
+    """Return at `end_ns` of CLOCK_MONOTONIC, or at once when that has passed: sleep, and watch the last moments."""
+    while (left_ns := end_ns - time.monotonic_ns()) > 0:
+        if left_ns > WATCH_NS:
+            time.sleep((left_ns - WATCH_NS) / 1e9)
 
 
 def _header_bytes(packet: Packet) -> NDArray[np.uint8]:
@@ -145,7 +162,12 @@ def _build(unit: str, spec: UnitSpec) -> dict[str, _BoundStage]:
         raise TypeError(f"built stages {sorted(stages)}, expected {sorted(spec.stages)}")
     packets = {name: map_region(edge.fd, edge.layout) for name, edge in spec.edges.items()}
     return {
-        name: _BoundStage(stages[name], packets[source] if source else [], packets[sink] if sink else [])
+        name: _BoundStage(
+            stages[name],
+            packets[source] if source else [],
+            packets[sink] if sink else [],
+            spec.config.pace_ns.get(name, 0),
+        )
         for name, (source, sink) in spec.stages.items()
     }
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,11 +16,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from trilane.apps.cli.console import JsonOption, print_json, stderr_console, stdout_console
+from trilane.errors import BadInputError
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
+    from trilane.apps.pace import Pace
     from trilane.apps.run_job import Hooks, Outcome
+    from trilane.scene.schema import RunConfig
 
 app = typer.Typer(rich_markup_mode=None, add_completion=False)
 
@@ -28,6 +32,7 @@ Examples:
   trilane run
   trilane run --frames 60 --size 192 --out /tmp/run
   trilane run --motion walk.bvh --camera arkit.txt --frames 200 --json
+  trilane run --profile snapdragon-888 --pace --slow-motion 24 --frames 60
   trilane run myscene.toml --background street.mp4 --policy sequential
 """
 
@@ -74,6 +79,18 @@ def _print_outcome(outcome: Outcome, as_json: bool) -> None:
     stderr_console().print(f"run folder: {outcome.folder}", soft_wrap=True, markup=False)
 
 
+def _pace(config: RunConfig, profile: str | None, asked: bool, slow_motion: float) -> Pace | None:
+    if (profile is not None) != asked:
+        found = "--profile without --pace" if profile is not None else "--pace without --profile"
+        fix = "give both; `trilane predict --profile` answers without running"
+        raise BadInputError("options", found, "both or neither", fix)
+    if profile is None:
+        return None
+    from trilane.apps.pace import pace_of
+
+    return pace_of(config, profile, slow_motion)
+
+
 @app.command(epilog=EPILOG)
 def run(
     scene: Annotated[str, typer.Argument(help="A scene file (TOML), or the name of one that comes along.")] = "default",
@@ -91,6 +108,9 @@ def run(
     skinning: Annotated[
         str, typer.Option(help="Which unit poses the vertices: cpu, gpu; auto: cpu when OpenGL is software.")
     ] = "auto",
+    profile: Annotated[str | None, typer.Option(help="Hardware profile whose pace to keep; with --pace.")] = None,
+    pace: Annotated[bool, typer.Option("--pace", help="Hold each job until its modelled time has passed.")] = False,
+    slow_motion: Annotated[float, typer.Option(help="With --pace: times slower than the chip.")] = 1.0,
     baseline: Annotated[int, typer.Option(min=0, help="Frames of the sequential run beside it; 0: none.")] = 60,
     out: Annotated[Path | None, typer.Option(help="Run folder to write; runs/TIME-SCENE when not given.")] = None,
     as_json: JsonOption = False,
@@ -105,6 +125,9 @@ def run(
 
     request = Request(scene, motion, camera, background, avatar, frames, size, runtime, hud, skinning)
     checked = configure(request, Path.cwd())
+    held = _pace(checked.config, profile, pace, slow_motion)
+    if held is not None:
+        checked = replace(checked, config=checked.config.model_copy(update={"pace_ns": dict(held.stage_ns)}))
     target = out or default_place(checked.config.scene.name)
     with _hooks() as hooks:
         for note in checked.notes:
@@ -112,7 +135,7 @@ def run(
         outcome = run_to_folder(
             checked.config,
             target,
-            Plan(str(policy), baseline),
+            Plan(str(policy), baseline, held),
             hooks,
             machine=required_machine(),
             facts={"accuracy": dict(checked.accuracy), "notes": list(checked.notes)},

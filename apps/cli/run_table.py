@@ -50,8 +50,19 @@ def _caption(report: Run) -> str:
         f"{cpu['model']} ({' '.join(cpu['flags'])}); cores: {cores}",
         f"network on {report['config']['runtime']}; OpenGL on {gl['renderer'] if gl else DASH}",
     ]
+    if "pace" in report:
+        lines.append(_pace(report["pace"]))
     lines += [_accuracy(name, facts) for name, facts in report.get("accuracy", {}).items()]
     return "\n".join(lines)
+
+
+def _pace(pace: Mapping[str, Any]) -> str:
+    slower = ", ".join(f"{stage} {count}" for stage, count in pace["host_slower"].items()) or "none"
+    held = f"held to {pace['profile']}, {pace['slow_motion']:g} times slower" if pace["slow_motion"] != 1 else ""
+    return (
+        f"{held or 'held to ' + pace['profile']}: {_number(pace['measured_ms'], 2)} ms a frame, in virtual time "
+        f"{_number(pace['virtual_ms'], 2)} ms (ratio {_number(pace['ratio'], 3)}); jobs too slow here: {slower}"
+    )
 
 
 def _accuracy(name: str, facts: Mapping[str, Any]) -> str:

@@ -14,6 +14,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from trilane.apps.pace import Pace, compare
 from trilane.errors import BadInputError, TrilaneError
 from trilane.scene.schema import RunConfig
 from trilane.scheduler.record import replay
@@ -72,6 +73,19 @@ def test_a_paced_run_drops_what_it_cannot_do_and_counts_it(mock_config: Configur
     assert result.presented > 20
     assert result.report["efficiency"] is None
     check_accounts(result)
+
+
+def test_a_run_at_a_pace_has_the_frame_time_of_virtual_time(mock_config: Configure) -> None:
+    """Jobs of a millisecond, held for 20 to 40; the median interval, for another program may hold one frame up."""
+    stage_ns = {"pose": 2, "raster": 10, "infer": 40, "composite": 20, "present": 2}
+    stage_ns = {stage: ms * 1_000_000 for stage, ms in stage_ns.items()}
+    config = mock_config(20, raster=1, infer=1).model_copy(update={"pace_ns": stage_ns})
+    result = run_pipeline(config)
+    found = compare(Pace("chip", "any", 1.0, stage_ns), "pipelined", 20, result.jobs)
+    assert result.presented == 20
+    assert found["virtual_ms"] == 40
+    assert result.report["frame_time_ms"]["p50"] == pytest.approx(40, rel=0.05)
+    assert min(job.end_ns - job.begin_ns for job in result.jobs if job.stage == "infer") >= stage_ns["infer"]
 
 
 def test_pipelined_hides_all_but_the_slowest(mock_config: Configure) -> None:

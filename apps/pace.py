@@ -1,0 +1,113 @@
+"""A run at the pace of a chip: how long each job is held, and how the run compares with the same run in virtual time.
+
+Rule: the chip's times come from its hardware profile, the order of jobs from the scheduler; a job that the host could
+not do in time is counted, never hidden.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from trilane.avatars.bundle import load_bundle
+from trilane.avatars.reshape import reshaped
+from trilane.errors import BadInputError
+from trilane.hw_profiles.application import Plan, corners_of, stage_times_ms
+from trilane.hw_profiles.cost import Network, walk
+from trilane.hw_profiles.load import load_runnable
+from trilane.scene.schema import RunConfig
+from trilane.scheduler.events import Settings, avatar_graph
+from trilane.scheduler.result import JobRecord
+from trilane.scheduler.virtual import simulate
+
+SUSTAINED = "sustained_high_performance"
+MAX_SLOW_MOTION = 1000.0
+#: A job that ends this much after its pace was done in time: waking up takes this long on a quiet machine.
+SLACK_NS = 200_000
+#: Frames round one that came late whose times it may have changed: as many as are in flight, and one.
+WAKE_FRAMES = 8
+
+
+@dataclass(frozen=True)
+class Pace:
+    """`stage_ns`: how long a job of each stage is held. `slow_motion`: how many times slower than the chip."""
+
+    profile: str
+    performance_profile: str
+    slow_motion: float
+    stage_ns: Mapping[str, int]
+
+
+def pace_of(config: RunConfig, profile: str, slow_motion: float = 1.0, performance_profile: str = SUSTAINED) -> Pace:
+    """The pace of `config` on the chip `profile`: a name or a TOML file. Raises BadInputError.
+
+    The network's time is that of the largest tensor that the scene's size allows.
+    """
+    if not 0 < slow_motion <= MAX_SLOW_MOTION:
+        raise BadInputError("--slow-motion", f"{slow_motion:g}", f"above 0, at most {MAX_SLOW_MOTION:g}")
+    chip = load_runnable(profile)
+    height, width = max(config.buckets, key=lambda shape: shape[0] * shape[1])
+    file = load_bundle(config.avatar_dirs[0]).read_network()
+    facts = {"avatar": config.avatar_dirs[0].name}
+    network = Network(facts, height, width, file.shape[3], "packed", walk(reshaped(file, height, width).model))
+    times = stage_times_ms(chip, Plan(network, "dsp"), corners_of(chip, performance_profile))
+    held = {stage: round(ms * slow_motion * 1e6) for (stage, _), ms in times.items()}
+    return Pace(chip.name, performance_profile, slow_motion, held)
+
+
+def compare(pace: Pace, policy: str, frames: int, jobs: Sequence[JobRecord]) -> dict[str, Any]:
+    """What report.json says of a paced run: the block `pace`.
+
+    `host_slower`: of each stage, jobs that the host did not do in time; `late_frames`: numbers of their frames.
+    `virtual_ms`, `measured_ms`: median time between presented frames in virtual time and here, here only of frames with
+    no late one among the `WAKE_FRAMES` before them; `ratio`: measured over virtual, None when no frame is left.
+    """
+    late = [job for job in jobs if job.end_ns - job.begin_ns > pace.stage_ns[job.stage] + SLACK_NS]
+    late_frames = sorted({job.frame for job in late})
+    virtual = _virtual_ms(pace, policy, frames)
+    measured = _measured_ms(jobs, late_frames)
+    return {
+        "profile": pace.profile,
+        "performance_profile": pace.performance_profile,
+        "slow_motion": pace.slow_motion,
+        "stage_ms": {stage: ns / 1e6 for stage, ns in pace.stage_ns.items()},
+        "host_slower": dict(Counter(job.stage for job in late)),
+        "late_frames": late_frames,
+        "virtual_ms": virtual,
+        "measured_ms": measured,
+        "compared_share": _share(jobs, late_frames),
+        "ratio": None if measured is None else measured / virtual,
+    }
+
+
+def _virtual_ms(pace: Pace, policy: str, frames: int) -> float:
+    """Median time between presented frames of the same run in virtual time."""
+    result = simulate(avatar_graph(), Settings(frames, policy), lambda stage, *_: pace.stage_ns[stage], keep=True)
+    return float(np.median(np.diff(_presented(result.jobs)[1]))) / 1e6
+
+
+def _presented(jobs: Sequence[JobRecord]) -> tuple[list[int], list[int]]:
+    """Numbers of the presented frames and when each was presented, ns."""
+    ends = sorted((job.end_ns, job.frame) for job in jobs if job.stage == "present")
+    return [frame for _, frame in ends], [end for end, _ in ends]
+
+
+def _in_time(jobs: Sequence[JobRecord], late_frames: Sequence[int]) -> list[tuple[int, int]]:
+    """(number of the frame, ns since the one before it) where no frame near was late."""
+    frames, ends = _presented(jobs)
+    disturbed = {near for frame in late_frames for near in range(frame - 1, frame + WAKE_FRAMES)}
+    pairs = zip(frames[1:], np.diff(ends).tolist(), strict=True)
+    return [(frame, interval) for frame, interval in pairs if frame not in disturbed]
+
+
+def _measured_ms(jobs: Sequence[JobRecord], late_frames: Sequence[int]) -> float | None:
+    kept = _in_time(jobs, late_frames)
+    return float(np.median([interval for _, interval in kept])) / 1e6 if kept else None
+
+
+def _share(jobs: Sequence[JobRecord], late_frames: Sequence[int]) -> float:
+    return len(_in_time(jobs, late_frames)) / max(1, len(_presented(jobs)[0]) - 1)

@@ -1,0 +1,82 @@
+"""A run at a chip's pace: what is held, what is late, and what is compared."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+
+from trilane.apps.pace import SLACK_NS, Pace, compare, pace_of
+from trilane.avatars.bundle import bundle_folder
+from trilane.errors import BadInputError
+from trilane.scene.schema import RunConfig, Scene, UnitSettings
+from trilane.scheduler.events import Settings, avatar_graph
+from trilane.scheduler.result import JobRecord
+from trilane.scheduler.virtual import simulate
+from trilane.stages.unit_loop import hold_until
+
+MS = 1_000_000
+STAGE_NS = {"pose": MS, "raster": 4 * MS, "infer": 9 * MS, "composite": 3 * MS, "present": MS}
+PACE = Pace("chip", "sustained_high_performance", 1.0, STAGE_NS)
+
+
+def config(size: str = "256") -> RunConfig:
+    units = {unit: UnitSettings(cores=(0,), threads=1) for unit in ("cpu", "gpu", "dsp")}
+    return RunConfig(scene=Scene(size=size), out_dir=Path(), avatar_dirs=(bundle_folder("default"),), units=units)
+
+
+def jobs(late: int | None = None, frames: int = 40) -> list[JobRecord]:
+    """Jobs of a simulated run; the inference of frame `late` takes twice its time."""
+
+    def service(stage: str, _unit: str, frame: int, _begin: int) -> int:
+        return STAGE_NS[stage] * (2 if (stage, frame) == ("infer", late) else 1)
+
+    return list(simulate(avatar_graph(), Settings(frames, "pipelined"), service, keep=True).jobs)
+
+
+def test_a_run_in_time_has_the_virtual_frame_time() -> None:
+    found = compare(PACE, "pipelined", 40, jobs())
+    assert found["ratio"] == pytest.approx(1.0)
+    assert found["virtual_ms"] == 9.0
+    assert (found["host_slower"], found["late_frames"], found["compared_share"]) == ({}, [], 1.0)
+
+
+def test_a_late_job_is_counted_and_its_neighbours_are_not_compared() -> None:
+    found = compare(PACE, "pipelined", 40, jobs(late=20))
+    assert found["host_slower"] == {"infer": 1}
+    assert found["late_frames"] == [20]
+    assert found["ratio"] == pytest.approx(1.0)
+    assert 0.7 < found["compared_share"] < 1
+
+
+def test_nothing_is_compared_when_every_frame_is_late() -> None:
+    slow = [job._replace(end_ns=job.end_ns + 2 * SLACK_NS) for job in jobs()]
+    found = compare(PACE, "pipelined", 40, slow)
+    assert (found["measured_ms"], found["ratio"], found["compared_share"]) == (None, None, 0.0)
+    assert len(found["late_frames"]) == 40
+
+
+def test_a_chips_times_grow_with_the_tensor_and_the_slow_motion() -> None:
+    small, large = pace_of(config(), "snapdragon-888"), pace_of(config("512"), "snapdragon-888")
+    assert set(small.stage_ns) == {"pose", "raster", "infer", "composite", "present"}
+    assert large.stage_ns["infer"] > small.stage_ns["infer"] > 0
+    assert pace_of(config(), "snapdragon-888", 8).stage_ns["infer"] == pytest.approx(
+        8 * small.stage_ns["infer"], rel=1e-6
+    )
+
+
+@pytest.mark.parametrize("slow_motion", [0, -1, float("nan"), float("inf"), 1e9])
+def test_slow_motion_out_of_range_is_refused(slow_motion: float) -> None:
+    with pytest.raises(BadInputError, match="--slow-motion"):
+        pace_of(config(), "snapdragon-888", slow_motion)
+
+
+def test_a_hold_ends_when_it_should_and_never_before() -> None:
+    for hold_ns in (0, 50_000, 3 * MS):
+        end_ns = time.monotonic_ns() + hold_ns
+        hold_until(end_ns)
+        assert time.monotonic_ns() >= end_ns
+    before = time.monotonic_ns()
+    hold_until(before - MS)
+    assert time.monotonic_ns() - before < 100 * MS
