@@ -48,11 +48,13 @@ def read_table(path: Path) -> list[Row]:
     except OSError as error:
         raise BadInputError(path, error.strerror or str(error), "a file that can be read") from None
     lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
-    if not lines:
+    if len(lines) < 2:
         raise BadInputError(path, "no rows", "a header and at least one row")
     if len(lines) > MAX_ROWS:
         raise BadInputError(path, f"{len(lines)} rows", f"at most {MAX_ROWS}")
     header = [cell.strip() for cell in next(csv.reader([lines[0][1]]))]
+    if twice := [key for key in dict.fromkeys(header) if header.count(key) > 1]:
+        raise BadInputError(f"{path}: line {lines[0][0]}", f"column {twice[0]!r} twice", "every column once")
     missing = [key for key in KEYS if key not in header]
     if missing:
         raise BadInputError(f"{path}: line {lines[0][0]}", f"no column {', '.join(missing)}", ", ".join(KEYS))

@@ -70,6 +70,23 @@ def test_predict_draws_heat(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("encoder,norm,size,channels,layout\n", "no rows"),
+        ("encoder,norm,size,channels,layout,size\nresnet18,batch,512,16,packed,256\n", "column 'size' twice"),
+        ("encoder,norm,size\nresnet18,batch,512\n", "no column channels, layout"),
+        ("encoder,norm,size,channels,layout\nresnet18,batch,512\n", "line 2: found 3 cells"),
+    ],
+)
+def test_a_bad_table_is_named_with_its_line(
+    text: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "rows.csv").write_text(text)
+    assert call(monkeypatch, "predict", "--table", str(tmp_path / "rows.csv")) == 2
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (("predict", "--profile", "nope"), ("nope", "snapdragon-888")),
