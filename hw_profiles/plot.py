@@ -32,7 +32,7 @@ def plot_over_time(runs: Mapping[str, Sequence[Moment]], limit_c: float, title: 
         heat.plot(minutes, [m.junction_c for m in moments], color=colour, linestyle=":", label=f"{label}: junction")
     heat.axhline(limit_c, color="black", linewidth=0.8, linestyle="--", label=f"device limit {limit_c:g} °C")
     rate.set(ylabel="frames per second", title=title)
-    rate.set_ylim(bottom=0)
+    rate.set_ylim(0, 1.15 * rate.get_ylim()[1])
     heat.set(xlabel="minutes (virtual clock)", ylabel="temperature, °C")
     for axes in (rate, heat):
         axes.grid(alpha=0.3)
