@@ -5,7 +5,7 @@ Rule: what is stored is what the pipeline's raster gave; nothing is resampled.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -62,13 +62,13 @@ def open_groups(folder: Path, writable: bool = False) -> list[ShapeGroup]:
 
 
 def batches(
-    groups: list[ShapeGroup], size: int, rng: np.random.Generator
+    groups: list[ShapeGroup], size: int, rng: np.random.Generator, repeats: Sequence[int] = (1,) * 5
 ) -> Iterator[tuple[ShapeGroup, NDArray[np.int64]]]:
-    """Endless batches of one shape each; every sample of the set comes once before any comes again."""
+    """Endless batches of one shape each; an epoch has every sample as often as `repeats` says of its band."""
     while True:
         epoch: list[tuple[ShapeGroup, NDArray[np.int64]]] = []
         for group in groups:
-            order = rng.permutation(len(group))
+            order = rng.permutation(np.repeat(np.arange(len(group)), np.asarray(repeats)[group.band]))
             parts = np.array_split(order, max(1, len(order) // size))
             epoch += [(group, np.sort(part)) for part in parts if len(part)]
         for index in rng.permutation(len(epoch)):

@@ -47,7 +47,7 @@ class FitConfig:
     """`minutes`: budget. `threads`: of each worker. `small_until`: share of the budget on half-size tensors.
 
     `freeze_norms_at`: share after which batch statistics stay as they are. `average_s`: time constant of the averaged
-    weights.
+    weights. `repeats`: of a sample in an epoch, by its band: far, full body, upper body, face, anywhere.
     """
 
     minutes: float
@@ -61,6 +61,7 @@ class FitConfig:
     small_until: float = 0.12
     freeze_norms_at: float = 0.6
     average_s: float = 60.0
+    repeats: tuple[int, ...] = (1, 1, 1, 1, 1)
     report_s: float = 30.0
     checkpoint_s: float = 180.0
     max_steps: int = 10_000_000
@@ -138,7 +139,7 @@ def _worker(
     groups = open_groups(data)
     small = [group for group in groups if math.prod(group.shape) < SMALL_PIXELS]
     streams = [
-        batches(some or groups, config.batch, np.random.default_rng((config.seed, number, k)))
+        batches(some or groups, config.batch, np.random.default_rng((config.seed, number, k)), config.repeats)
         for k, some in enumerate((small, groups))
     ]
     before, parent = _copy(avatar), os.getppid()

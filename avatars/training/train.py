@@ -39,7 +39,13 @@ FACTS, TRAINING = "dataset.json", "training"
 BUILTIN_HELD_OUT = "builtin:walk-wave-turn"
 #: Of `FitConfig`, for a training that does not begin with nothing.
 KNOWN_NETWORK: dict[str, Any] = {"small_until": 0.0, "freeze_norms_at": 0.3}
-RESUMED: dict[str, Any] = {"network_rate": 1e-3, "texture_rate": 3e-4, "small_until": 0.0, "freeze_norms_at": 0.2}
+RESUMED: dict[str, Any] = {
+    "network_rate": 6e-4,
+    "texture_rate": 2e-4,
+    "small_until": 0.0,
+    "freeze_norms_at": 0.1,
+    "repeats": (2, 1, 2, 3, 1),
+}
 
 
 @dataclass(frozen=True)

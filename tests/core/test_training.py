@@ -175,7 +175,10 @@ def test_the_network_alone_comes_back_in_half_precision(tmp_path):
 
 
 def test_the_kept_network_of_the_default_avatar_loads():
-    load_network(UNet(width=16, channels=16), bundle_folder("default").parent / "training" / "default-network.npz")
+    load_network(
+        UNet(width=16, channels=16, input_skip=True),
+        bundle_folder("default").parent / "training" / "default-network.npz",
+    )
 
 
 def test_a_network_of_another_width_is_refused(tmp_path):
