@@ -7,8 +7,10 @@ Weights have 7 bits under `reduce_range`: on a CPU without VNNI two products of 
 from __future__ import annotations
 
 import json
+import logging
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -90,6 +92,21 @@ def quantise(
     return Quantised(check_network(quantised, "quantised network"), facts)
 
 
+@contextmanager
+def _no_axis_warnings() -> Iterator[None]:
+    """The quantiser says through the root logger that vectors (of norms) have no second axis; they need none."""
+
+    def other(record: logging.LogRecord) -> bool:
+        return "is out-of-range for weight" not in record.getMessage()
+
+    logger = logging.getLogger()
+    logger.addFilter(other)
+    try:
+        yield
+    finally:
+        logger.removeFilter(other)
+
+
 def _check_frames(model: onnx.ModelProto, frames: Sequence[NDArray[np.float32]]) -> None:
     kind = model.graph.input[0].type.tensor_type if len(model.graph.input) == 1 else TypeProto.Tensor()
     sides = [dim.dim_value for dim in kind.shape.dim]
@@ -120,7 +137,8 @@ def _insert(model: onnx.ModelProto, ranges: Any, reduce_range: bool, keep_float:
     )
     for end in (model.graph.input[0], model.graph.output[0]):
         quantiser.quantize_activation_tensor(end.name)
-    quantiser.quantize_model()
+    with _no_axis_warnings():
+        quantiser.quantize_model()
     quantiser.model.topological_sort()
     result: onnx.ModelProto = quantiser.model.model
     return result

@@ -22,6 +22,7 @@ COMMANDS = {
     "body": ("trilane.apps.cli.body", "Look into body files, pose them, build one."),
     "avatar": ("trilane.apps.cli.avatar", "Look into avatars, export and quantise their networks."),
     "bench": ("trilane.apps.cli.bench", "Measure this machine: raster, readback, crop and more."),
+    "accuracy": ("trilane.apps.cli.accuracy", "Compare runtimes on a scene, and with float on hard cases."),
     "predict": ("trilane.apps.cli.predict", "Predict frame time, idleness, heat and energy on a chip."),
     "profiles": ("trilane.apps.cli.profiles", "List, show, check and fit the hardware profiles."),
     "doctor": ("trilane.apps.cli.doctor", "Say what this machine has, what is missing and how to install it."),

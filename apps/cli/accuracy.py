@@ -1,0 +1,94 @@
+"""`trilane accuracy`: how far runtimes are from each other on a scene, and from float on hard cases.
+
+Rule: this module reads options and shows results; every figure comes from `trilane.apps.experiments`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from trilane.apps.cli.console import JsonOption, print_json, stderr_console, stdout_console
+
+app = typer.Typer(rich_markup_mode=None, add_completion=False)
+
+EPILOG = """\b
+Examples:
+  trilane accuracy
+  trilane accuracy closeup --frames 20 --runtime ort --runtime openvino
+  trilane accuracy --hard-cases --json
+"""
+OUT_OF_BOUNDS = 1
+
+
+@app.command(epilog=EPILOG)
+def accuracy(
+    scene: Annotated[str, typer.Argument(help="A scene file (TOML), or the name of one that comes along.")] = "default",
+    avatar: Annotated[str | None, typer.Option(help="default, or the folder of an avatar.")] = None,
+    size: Annotated[str | None, typer.Option(help="Tensor size: HxW, or a side S for areas up to SxS.")] = None,
+    frames: Annotated[int, typer.Option(help="Frames, spread over the scene.")] = 8,
+    runtime: Annotated[list[str] | None, typer.Option(help="Once for each; all that are installed if none.")] = None,
+    hard_cases: Annotated[bool, typer.Option("--hard-cases", help="Hard inputs and networks instead.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare the runtimes with each other on a scene's frames, or with float on hard cases.
+
+    Exit code 1 when a figure is out of its bound.
+    """
+    from trilane.apps.experiments.accuracy import installed_runtimes
+
+    names = list(runtime or installed_runtimes())
+    if hard_cases:
+        passed = _hard_cases([name for name in names if runtime or name != "qnn"], as_json)
+    else:
+        passed = _scene(scene, avatar, size, frames, names, as_json)
+    if not passed:
+        raise typer.Exit(OUT_OF_BOUNDS)
+
+
+def _hard_cases(names: list[str], as_json: bool) -> bool:
+    from rich.progress import track
+
+    from trilane.apps.experiments.hard_cases import INPUTS, NETWORKS, hard_cases
+
+    console = stderr_console()
+    count = len(NETWORKS) * len(INPUTS) * len(names)
+    rows = list(track(hard_cases(names), "hard cases", count, console=console, disable=not console.is_terminal))
+    if as_json:
+        print_json({"schema": 1, "hard_cases": rows})
+    else:
+        _print(rows, ("name", "error", "bound", "unit", "passed"))
+    return all(row["passed"] for row in rows)
+
+
+def _scene(scene: str, avatar: str | None, size: str | None, frames: int, names: list[str], as_json: bool) -> bool:
+    from trilane.apps.configure import Request, configure, required_machine
+    from trilane.apps.experiments.accuracy import runtime_differences
+
+    config = configure(Request(scene, avatar=avatar, size=size, runtime="ort"), Path.cwd()).config
+    machine = required_machine()
+    with stderr_console().status(f"{frames} frames on {', '.join(names)}"):
+        result = runtime_differences(config, names, frames)
+    if as_json:
+        print_json({"schema": 1, **result, "machine": machine})
+    else:
+        _print(result["rows"], ("first", "second", "mean", "largest", "worst_frame"))
+        bounds = result["bounds"]
+        stdout_console().print(
+            f"of 255, over {len(result['frames'])} frames; bounds: mean {bounds['mean']}, largest {bounds['largest']}"
+        )
+    return all(
+        row["mean"] <= result["bounds"]["mean"] and row["largest"] <= result["bounds"]["largest"]
+        for row in result["rows"]
+    )
+
+
+def _print(rows: list[dict[str, Any]], columns: tuple[str, ...]) -> None:
+    from rich.table import Table
+
+    table = Table(*columns)
+    for row in rows:
+        table.add_row(*(f"{row[key]:.3g}" if isinstance(row[key], float) else str(row[key]) for key in columns))
+    stdout_console().print(table)
