@@ -47,14 +47,14 @@ def measure(
     size: tuple[str, ...] = ("512x512",),
     policy: tuple[str, ...] = ("pipelined",),
     edge: tuple[str, ...] = ("double",),
-    cores: tuple[int, ...] = (4,),
+    cores: tuple[int, ...] = (0,),
     frames: int = 150,
     turns: int = 5,
     runtime: str = "auto",
     no_video: bool = False,
 ) -> dict[str, Any]:
     """Policies x edges x cores; give an option once for each value. `avatar`: `default`, a bundle's folder, or
-    `resnet18`, the full-width network untrained (made once, with PyTorch). `cores`: how many the three units have.
+    `resnet18`, the full-width network untrained (made once, with PyTorch). `cores`: how many the three units have; 0: all.
 
     Rows, medians over the turns: `frame_ms`, `fps`, `efficiency` (slowest unit alone / frame time), `slowest` and
     `alone_ms` (that unit's stages alone), `busiest` unit, its `idle` from its first job's begin to its last one's end
@@ -65,6 +65,7 @@ def measure(
     """
     if frames < MIN_FRAMES or turns < 1:
         raise BadInputError("bench pipeline", f"--frames {frames}, --turns {turns}", f"at least {MIN_FRAMES} and 1")
+    cores = tuple(count or len(usable_cores()) for count in cores)
     _check(policy, edge, cores)
     rows: list[dict[str, Any]] = []
     accuracy: dict[str, Any] = {}
