@@ -54,7 +54,8 @@ def measure(
     no_video: bool = False,
 ) -> dict[str, Any]:
     """Policies x edges x cores; give an option once for each value. `avatar`: `default`, a bundle's folder, or
-    `resnet18`, the full-width network untrained (made once, with PyTorch). `cores`: how many the three units have; 0: all.
+    `resnet18`, the full-width network untrained (made once, with PyTorch). `cores`: how many the three units have, 0
+    for all of them.
 
     Rows, medians over the turns: `frame_ms`, `fps`, `efficiency` (slowest unit alone / frame time), `slowest` and
     `alone_ms` (that unit's stages alone), `busiest` unit, its `idle` from its first job's begin to its last one's end
