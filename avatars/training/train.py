@@ -18,9 +18,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from PIL import Image
 
-from trilane.avatars.bundle import bundle_folder
+from trilane.avatars.bundle import bundle_folder, load_bundle
 from trilane.avatars.training.data import open_groups
 from trilane.avatars.training.dataset import Sample, Studio, body_arrays, plan_training, plan_validation, write_dataset
 from trilane.avatars.training.finish import finish, write_avatar
@@ -51,7 +52,8 @@ RESUMED: dict[str, Any] = {
 @dataclass(frozen=True)
 class TrainConfig:
     """One training run. `held_out`: motions that validation poses come from. `weights`: skip training, use
-    these. `resume`: go on from these at a lower rate. `network`: take the network from these, the texture anew.
+    these. `resume`: go on from these at a lower rate. `network`: take the network from these, the texture anew, or
+    with `texture` from that avatar (a name or a folder), and go on at the lower rate too.
     """
 
     body: Path = bundle_folder("default") / "body.npz"
@@ -71,6 +73,7 @@ class TrainConfig:
     weights: Path | None = None
     resume: Path | None = None
     network: Path | None = None
+    texture: str | None = None
 
 
 def train(config: TrainConfig, report: Callable[[str], None]) -> Path:
@@ -148,9 +151,9 @@ def _fitted(shaped: ShapedBody, config: TrainConfig, report: Callable[[str], Non
         settings = replace(settings, **RESUMED, seed=config.seed + config.workers)
         avatar, done = load_avatar(Avatar(NeuralTexture(blank), network), config.resume)
     else:
-        start = first_texture(body_arrays(shaped), open_groups(config.work / TRAINING), SIDES[0], CHANNELS)
+        start = _start(shaped, config)
         if config.network is not None:
-            settings = replace(settings, **KNOWN_NETWORK)
+            settings = replace(settings, **(RESUMED if config.texture else KNOWN_NETWORK))
             network = load_network(network, config.network)
         avatar = Avatar(NeuralTexture(start), network)
 
@@ -163,6 +166,15 @@ def _fitted(shaped: ShapedBody, config: TrainConfig, report: Callable[[str], Non
     return avatar, done + steps
 
 
+def _start(shaped: ShapedBody, config: TrainConfig) -> NDArray[np.float32]:
+    if config.texture is None:
+        return first_texture(body_arrays(shaped), open_groups(config.work / TRAINING), SIDES[0], CHANNELS)
+    texture = load_bundle(config.texture).read_texture()
+    if texture.shape != (SIDES[0], SIDES[0], CHANNELS):
+        raise BadInputError("--texture", f"shape {texture.shape}", f"({SIDES[0]}, {SIDES[0]}, {CHANNELS})")
+    return texture
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parse the command line, run, and return the exit code."""
     given = sys.argv[1:] if arguments is None else list(arguments)
@@ -172,7 +184,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if isinstance(default, tuple):
             parser.add_argument("--held-out", action="append", help=f"motion for validation (default {default[0]})")
         else:
-            kind = Path if default is None or isinstance(default, Path) else type(default)
+            named = "Path" in str(field.type)
+            kind = Path if named else str if default is None else type(default)
             parser.add_argument(f"--{field.name.replace('_', '-')}", type=kind, default=default, help=f"({default})")
     values = vars(parser.parse_args(given))
     values["held_out"] = tuple(values["held_out"] or (BUILTIN_HELD_OUT,))
