@@ -15,8 +15,9 @@ import numpy as np
 
 from trilane.bench.subject import ENCODING, Subject, standing
 from trilane.errors import BadInputError, TrilaneError
+from trilane.stages.cpu.skinning import FrameSkinner
 from trilane.stages.gpu.context import describe, open_context
-from trilane.stages.gpu.mesh import SkinnedMesh
+from trilane.stages.gpu.mesh import PosedMesh, SkinnedMesh
 from trilane.stages.gpu.packed import CHANNELS, PackedAvatar, PackedPass, Placement
 from trilane.stages.gpu.split import SplitPass
 from trilane.stages.gpu.uv_image import UvBytes
@@ -46,6 +47,8 @@ def measure(size: int = 512, channels: int = 16, repeats: int = 40, threads: int
     }
     tensors = {name: np.zeros(size * size * channels, np.uint8) for name in ways}
     turns = {name: partial(way, tensors[name]) for name, way in ways.items()}
+    skinned = np.zeros_like(tensors["packed"])
+    turns["skinned by the CPU unit, packed"] = partial(posed_way(ctx, subject, (size, size), deferred), skinned)
     turns["UV bytes alone"] = partial(uv_way(ctx, subject, (size, size)), np.zeros(size * size * 2, np.uint8))
     times = interleaved(turns, repeats)
     _check_equal(tensors)
@@ -69,6 +72,22 @@ def packed_way(ctx: Any, subject: Subject, shape: tuple[int, int], deferred: boo
     placement = Placement(subject.joints, subject.projection, (0, 0, *shape))
 
     def turn(tensor: Any) -> None:
+        avatar.draw(packed.begin(shape), subject.view, placement)
+        packed.read_into(shape, tensor)
+
+    return turn
+
+
+def posed_way(ctx: Any, subject: Subject, shape: tuple[int, int], deferred: bool) -> Callable[[Any], None]:
+    """A function that skins `subject` as the CPU unit does, then draws it packed: the time of both."""
+    packed = PackedPass(ctx, subject.texture.shape[2], ENCODING, deferred)
+    avatar = PackedAvatar(packed, PosedMesh(ctx, subject.arrays), subject.texture)
+    skinner = FrameSkinner(subject.shaped)
+    vertices = np.empty((len(subject.shaped.vertices), 3), np.float32)
+    placement = Placement(subject.joints, subject.projection, (0, 0, *shape), vertices=vertices)
+
+    def turn(tensor: Any) -> None:
+        skinner.skin_into(subject.posed, vertices)
         avatar.draw(packed.begin(shape), subject.view, placement)
         packed.read_into(shape, tensor)
 

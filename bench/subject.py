@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.avatars.bundle import bundle_folder
-from trilane.stages.cpu.body import load_body
+from trilane.stages.cpu.body import ShapedBody, load_body
 from trilane.stages.cpu.joints import JOINT_INDEX
-from trilane.stages.cpu.kinematics import Skeleton
+from trilane.stages.cpu.kinematics import Posed, Skeleton
 from trilane.stages.cpu.skinning import largest_weights
 from trilane.stages.gpu.mesh import MeshArrays, mesh_arrays
 from trilane.stages.gpu.packed import Quantisation
@@ -29,6 +29,8 @@ ARMS_DOWN_RAD = 1.1
 class Subject:
     """`joints` (55,3,4) float32, `view` and `projection` (4,4) float64, `texture` (512,512,C) float64."""
 
+    shaped: ShapedBody
+    posed: Posed
     arrays: MeshArrays
     joints: NDArray[np.float32]
     view: NDArray[np.float64]
@@ -48,6 +50,8 @@ def standing(channels: int, weights: int = 8) -> Subject:
     view = np.eye(4)
     view[:3, 3] = (0.0, -HEIGHT_M, -DISTANCE_M)
     return Subject(
+        shaped=shaped,
+        posed=posed,
         arrays=mesh_arrays(shaped.vertices, body.faces, body.uv, body.uv_faces, top.joints, top.weights),
         joints=posed.matrices.copy(),
         view=view,
