@@ -112,31 +112,46 @@ class CpuSkinner:
 
 
 class FrameSkinner:
-    """Vertices of one shaped body in float32, into memory that the caller owns: what the CPU unit does each frame."""
+    """Vertices of one shaped body in float32, into memory that the caller owns: what the CPU unit does each frame.
+
+    Vertices come in blocks. Neighbours hang on few joints, so a block is multiplied with its own joints alone, as many
+    as the neediest block has. x of all vertices lie in a row, then y, then z.
+    """
 
     def __init__(self, shaped: ShapedBody) -> None:
         body = shaped.body
-        rows = -(-len(body.weights) // _BLOCK_ROWS) * _BLOCK_ROWS
-        weights = np.zeros((rows, JOINTS), np.float32)
-        weights[: len(body.weights)] = body.weights
-        self._weights = weights.reshape(-1, _BLOCK_ROWS, JOINTS)
-        self._moved = np.empty((len(self._weights), _BLOCK_ROWS, 12), np.float32)
-        self._rest = np.ascontiguousarray(shaped.vertices.T, np.float32)
+        count = len(body.weights)
+        blocks = -(-count // _BLOCK_ROWS)
+        weights = np.zeros((blocks * _BLOCK_ROWS, JOINTS), np.float32)
+        weights[:count] = body.weights
+        per_block = weights.reshape(blocks, _BLOCK_ROWS, JOINTS).transpose(0, 2, 1)
+        used = (per_block != 0).any(axis=2)
+        self._joints = np.argsort(~used, axis=1, kind="stable")[:, : int(used.sum(axis=1).max())]
+        self._weights = np.ascontiguousarray(np.take_along_axis(per_block, self._joints[:, :, None], axis=1))
+        self._moved = np.empty((blocks, 12, _BLOCK_ROWS), np.float32)
+        self._rest = np.zeros((3, blocks * _BLOCK_ROWS), np.float32)
+        self._rest[:, :count] = shaped.vertices.T
+        self._blended = self._rest.copy()
         self._blend = body.posedirs.reshape(-1, POSE_FEATURES) if body.posedirs is not None else None
-        self._term = np.empty(len(body.weights), np.float32)
+        self._sum = np.empty((blocks, _BLOCK_ROWS), np.float32)
+        self._term = np.empty_like(self._sum)
 
     def skin_into(self, posed: Posed, vertices: F32) -> None:
         """Write `vertices` (V,3), world metres, of a frame of `Skeleton.pose`."""
-        rest = self._rest
+        count = len(vertices)
         if self._blend is not None:
-            rest = rest + (self._blend @ posed.feature).reshape(-1, 3).T.astype(np.float32)
-        np.matmul(self._weights, posed.matrices.reshape(JOINTS, 12), out=self._moved)
-        moved = self._moved.reshape(-1, 3, 4)[: len(vertices)]
+            np.add(self._rest[:, :count], (self._blend @ posed.feature).reshape(-1, 3).T, out=self._blended[:, :count])
+        rest = self._blended.reshape(3, -1, _BLOCK_ROWS)
+        matrices = posed.matrices.reshape(JOINTS, 12)[self._joints]
+        np.matmul(np.ascontiguousarray(matrices.transpose(0, 2, 1)), self._weights, out=self._moved)
         for axis in range(3):
-            vertices[:, axis] = moved[:, axis, 3]
-            for column in range(3):
-                np.multiply(moved[:, axis, column], rest[column], out=self._term)
-                vertices[:, axis] += self._term
+            row = self._moved[:, 4 * axis : 4 * axis + 4]
+            np.multiply(row[:, 0], rest[0], out=self._sum)
+            for column in (1, 2):
+                np.multiply(row[:, column], rest[column], out=self._term)
+                np.add(self._sum, self._term, out=self._sum)
+            np.add(self._sum, row[:, 3], out=self._sum)
+            vertices[:, axis] = self._sum.reshape(-1)[:count]
 
 
 def posed_vertices(shaped: ShapedBody, poses: ArrayLike, translation: ArrayLike | None = None) -> Iterator[F64]:

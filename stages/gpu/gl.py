@@ -46,8 +46,12 @@ def function(name: str) -> Callable[..., Any]:
 
 
 def clear_unsigned(value: tuple[int, int, int, int]) -> None:
-    """Fill the bound framebuffer: colour attachment 0, an unsigned integer format, with `value`, depth with 1."""
+    """Fill colour attachment 0 of the bound framebuffer, an unsigned integer format, with `value`."""
     function("glClearBufferuiv")(COLOR, 0, (ctypes.c_uint * 4)(*value))
+
+
+def clear_depth() -> None:
+    """Fill the depth of the bound framebuffer with 1."""
     function("glClearBufferfv")(DEPTH, 0, (ctypes.c_float * 1)(1.0))
 
 

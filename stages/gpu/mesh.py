@@ -186,7 +186,7 @@ class PosedMesh:
         self._corners = np.empty((len(arrays.source), 3), np.float32)
         self._positions = ctx.buffer(reserve=self._corners.nbytes, dynamic=True)
         self._uv = ctx.buffer(arrays.uv.tobytes())
-        self.batches = [(WEIGHT_COUNTS[0], ctx.buffer(arrays.triangles.tobytes()))]
+        self.batches = [(WEIGHT_COUNTS[0], ctx.buffer(_index_bytes(arrays, arrays.triangles)))]
 
     def prepare(self, ctx: Any) -> None:
         """As `SkinnedMesh.prepare`."""
@@ -195,13 +195,13 @@ class PosedMesh:
     def vertex_array(self, program: Any, indices: Any) -> Any:
         """A vertex array of this mesh for `program`."""
         content = [(self._positions, "3f", "position"), (self._uv, "2f", "uv")]
-        return self._ctx.vertex_array(program, content, indices, skip_errors=True)
+        return _vertex_array(self._ctx, program, content, indices, self.arrays)
 
     def upload_pose(self, pose: BodyPose) -> None:
         """Take the body's vertices; ValueError without them."""
         if pose.vertices is None:
             raise ValueError("a posed mesh needs the frame's vertices")
-        np.take(pose.vertices, self.arrays.source, axis=0, out=self._corners)
+        np.take(pose.vertices, self.arrays.source, axis=0, out=self._corners, mode="clip")  # "raise" copies twice
         self._positions.orphan()
         self._positions.write(self._corners)
 
@@ -223,7 +223,7 @@ class SkinnedMesh:
         names, formats, columns = _layout(arrays, self.posedirs is not None)
         packed = np.hstack([np.ascontiguousarray(column).view(np.uint8) for column in columns])
         self._content = (ctx.buffer(packed.tobytes()), " ".join(formats), *names)
-        self.batches = [(k, ctx.buffer(part.tobytes())) for k, part in weight_batches(arrays).items()]
+        self.batches = [(k, ctx.buffer(_index_bytes(arrays, part))) for k, part in weight_batches(arrays).items()]
         self._joints = ctx.buffer(reserve=JOINTS * 48)
         self._feature = ctx.buffer(reserve=-(-POSE_FEATURES // 4) * 16)
         self._ctx = ctx
@@ -244,7 +244,7 @@ class SkinnedMesh:
 
     def vertex_array(self, program: Any, indices: Any) -> Any:
         """A vertex array of this mesh for `program`; attributes that the compiler dropped are skipped."""
-        return self._ctx.vertex_array(program, [self._content], indices, skip_errors=True)
+        return _vertex_array(self._ctx, program, [self._content], indices, self.arrays)
 
     def upload_pose(self, pose: BodyPose) -> None:
         """Take the skinning matrices, and the pose feature for a mesh with pose blend shapes."""
@@ -265,6 +265,21 @@ class SkinnedMesh:
         program["PoseFeature"].binding = 1
         self.posedirs.use(location=8)
         program["posedirs"].value = 8
+
+
+def _index_size(arrays: MeshArrays) -> int:
+    """Bytes of an index: two where they suffice, which software drivers read faster."""
+    return 2 if len(arrays.position) <= 1 << 16 else 4
+
+
+def _index_bytes(arrays: MeshArrays, triangles: NDArray[np.uint32]) -> bytes:
+    return triangles.astype(f"u{_index_size(arrays)}").tobytes()
+
+
+def _vertex_array(ctx: Any, program: Any, content: Any, indices: Any, arrays: MeshArrays) -> Any:
+    return ctx.vertex_array(
+        program, content, index_buffer=indices, index_element_size=_index_size(arrays), skip_errors=True
+    )
 
 
 def _prepare(ctx: Any, closed: bool) -> None:
