@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
-from trilane.errors import TrilaneError
+from trilane.errors import TrilaneError, UnitLostError
 from trilane.scene.schema import RunConfig
 from trilane.stages.contracts import Packet, SlotLayout, Stage
 from trilane.transport.bus import LAST_WORDS_MS, Link, prompt_context
@@ -176,6 +176,8 @@ def _run_job(link: Link, stage: _BoundStage, job: RunJob) -> None:
     begin_ns = time.monotonic_ns()
     try:
         figures = stage.run(job.frame, job.slot_in, job.slot_out, job.epoch)
+    except UnitLostError:
+        raise
     except Exception as error:
         _fail(link, job.id, f"stage {job.stage}, frame {job.frame}", error)
         return

@@ -27,6 +27,10 @@ class BadInputError(TrilaneError):
         super().__init__(f"{where}: found {found}, expected {expected}" + (f"; {fix}" if fix else ""))
 
 
+class UnitLostError(TrilaneError):
+    """A unit cannot go on, but a new process in its place can: it ends, and the scheduler restarts it."""
+
+
 class MissingPartError(TrilaneError):
     """The environment lacks something. Exit code 3. `install` is the line to type."""
 

@@ -16,7 +16,7 @@ from trilane.scene.schema import PlaneSpec
 from trilane.stages.contracts import Packet
 from trilane.stages.gpu import gl
 from trilane.stages.gpu.background import Background
-from trilane.stages.gpu.context import check
+from trilane.stages.gpu.context import checked
 from trilane.stages.gpu.hud import Hud
 from trilane.stages.gpu.painters import AvatarPainter, PicturePainter, RoomPainter, ShadowPainter
 from trilane.stages.gpu.planes import PlanePainter
@@ -64,10 +64,10 @@ class CompositeStage:
         if slot_in is None or slot_out is None:
             raise ValueError("composite needs an input and an output slot")
         packet = self._inputs[slot_in]
-        self.draw(packet.pose, packet.payload)
         frame_bytes = self._outputs[slot_out].payload[: math.prod(self._shape) * 3]
-        self._target.read_into(frame_bytes, components=3, alignment=1)
-        check(self._ctx)
+        with checked(self._ctx):
+            self.draw(packet.pose, packet.payload)
+            self._target.read_into(frame_bytes, components=3, alignment=1)
         return {}
 
     def draw(self, pose: NDArray[np.void], image: NDArray[np.uint8]) -> None:

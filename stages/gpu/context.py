@@ -5,13 +5,17 @@ Rule: one off-screen EGL context per process, hardware or software; nobody else 
 
 from __future__ import annotations
 
+import ctypes
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import moderngl
 
-from trilane.errors import MissingPartError, TrilaneError
+from trilane.errors import MissingPartError, TrilaneError, UnitLostError
 
 INSTALL = "apt-get install libegl1 libgl1-mesa-dri"
 REQUIRED_VERSION = 330
@@ -45,10 +49,39 @@ def open_context(threads: int | None = None) -> Any:
 
 
 def check(ctx: Any) -> None:
-    """Raises TrilaneError when a call since the last check failed: the context was lost, or memory ran out."""
-    error = ctx.error
+    """Raises UnitLostError when the context was lost, TrilaneError when a call since the last check failed.
+
+    Without a current context OpenGL calls do nothing and report nothing, so a stale tensor would pass for a new one.
+    """
+    error = ctx.error if current() else "GL_CONTEXT_LOST"
+    if error == "GL_CONTEXT_LOST":
+        raise UnitLostError("the OpenGL context was lost")
     if error != "GL_NO_ERROR":
-        raise TrilaneError(f"OpenGL reports {error}: the context was lost or its memory ran out")
+        raise TrilaneError(f"OpenGL reports {error}: its memory ran out, or a call was wrong")
+
+
+@contextmanager
+def checked(ctx: Any) -> Iterator[None]:
+    """`check` behind what is done within it; whatever else goes wrong without a context is the loss of it."""
+    try:
+        yield
+    except Exception as error:
+        if current():
+            raise
+        raise UnitLostError("the OpenGL context was lost") from error
+    check(ctx)
+
+
+def current() -> bool:
+    """Has the calling thread a context of EGL?"""
+    return bool(_current_context()())
+
+
+@cache
+def _current_context() -> Any:
+    call = ctypes.CDLL(LIBRARY).eglGetCurrentContext
+    call.restype, call.argtypes = ctypes.c_void_p, ()
+    return call
 
 
 def describe(ctx: Any) -> Driver:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from trilane.errors import TrilaneError
 from trilane.stages.contracts import Packet, posed_vertices
 from trilane.stages.cpu.crop import Rect, crop_projection
-from trilane.stages.gpu.context import check
+from trilane.stages.gpu.context import checked
 from trilane.stages.gpu.packed import PackedAvatar, PackedPass, Placement
 
 Shape = tuple[int, int]
@@ -47,7 +47,10 @@ class RasterStage:
             self._packed.target(shape)
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
-        """Write frame `frame`'s tensor, (h,w,C) uint8. Raises TrilaneError when a joint is not a finite number."""
+        """Write frame `frame`'s tensor, (h,w,C) uint8.
+
+        Raises TrilaneError when a joint is not a finite number, UnitLostError with the context.
+        """
         if slot_in is None or slot_out is None:
             raise ValueError("raster needs an input and an output slot")
         pose = self._inputs[slot_in].pose
@@ -58,14 +61,14 @@ class RasterStage:
             self._packed.background(tensor)
             return {}
         _refuse_nan(frame, visible)
-        target = self._packed.begin(shape)
         skinned = self._vertices[slot_in]
-        for avatar in visible:
-            number = int(avatar["avatar"])
-            placement = _placement(pose, avatar, skinned[number] if skinned else None)
-            self._avatars[number].draw(target, pose["view"], placement)
-        self._packed.read_into(shape, tensor)
-        check(self._packed.ctx)
+        with checked(self._packed.ctx):
+            target = self._packed.begin(shape)
+            for avatar in visible:
+                number = int(avatar["avatar"])
+                placement = _placement(pose, avatar, skinned[number] if skinned else None)
+                self._avatars[number].draw(target, pose["view"], placement)
+            self._packed.read_into(shape, tensor)
         return {}
 
     def close(self) -> None:

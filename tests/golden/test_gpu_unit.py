@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from trilane.errors import BadInputError, TrilaneError
+from trilane.errors import BadInputError, TrilaneError, UnitLostError
 from trilane.scene.schema import PlaneSpec, RunConfig, Scene, UnitSettings
 from trilane.stages.contracts import Packet, SlotLayout, view_packet
 from trilane.stages.gpu import hud, planes, unit
@@ -19,6 +19,7 @@ from trilane.stages.gpu.assets import AvatarAssets
 from trilane.stages.gpu.composite import CompositeStage
 from trilane.stages.gpu.packed import PackedAvatar, PackedPass, Quantisation
 from trilane.stages.gpu.raster import RasterStage
+from trilane.stages.mock.lost_context import lose_context
 
 TENSOR = (96, 64)
 OUTPUT = (240, 320)
@@ -84,6 +85,16 @@ def test_a_frame_with_nan_joints_is_refused(raster: Any, person: Any, camera: Ca
     fill_pose(source, joints, *camera((0, 1, 3), (0, 1, 0)), (-1, -1, 1, 1))
     with pytest.raises(TrilaneError, match="frame 12: avatar 0"):
         stage.run(12, 0, 0)
+
+
+def test_a_lost_context_is_an_error_not_a_stale_tensor(raster: Any, person: Any, camera: Camera) -> None:
+    """Without a context OpenGL's calls do nothing, in silence."""
+    stage, source, _ = raster
+    fill_pose(source, person.pose(np.zeros(165)), *camera((0, 1, 3), (0, 1, 0)), (-1, -1, 1, 1))
+    stage.run(0, 0, 0)
+    lose_context()
+    with pytest.raises(UnitLostError, match="context was lost"):
+        stage.run(1, 0, 0)
 
 
 def composed(

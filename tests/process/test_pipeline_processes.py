@@ -14,6 +14,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from trilane.apps.configure import Request, configure
 from trilane.apps.pace import Pace, compare
 from trilane.errors import BadInputError, TrilaneError
 from trilane.scene.schema import RunConfig
@@ -127,6 +128,18 @@ def test_a_job_that_never_ends_ends_the_run_after_some_restarts(mock_config: Con
     result = run_pipeline(mock_config(8, raster="hang"), isolate_frames=0, hang_ns=300_000_000)
     assert dict(result.lost) == {"hung:gpu": 1}
     assert result.presented == 7
+    check_accounts(result)
+
+
+def test_a_lost_context_costs_a_restart_and_a_frame(tmp_path: Path) -> None:
+    config = configure(Request(frames=40, size="128"), tmp_path).config
+    losing = config.model_copy(update={"fake": {"gpu": "trilane.stages.mock.lost_context"}})
+    result = run_pipeline(losing, isolate_frames=0)
+    assert result.failure is None
+    assert set(result.lost) == {"died:gpu"}
+    assert result.lost["died:gpu"] == 1
+    assert result.report["units"]["gpu"]["restarts"] == 1
+    assert any("context was lost" in message for message in result.messages)
     check_accounts(result)
 
 
