@@ -9,6 +9,7 @@ from __future__ import annotations
 from trilane.scheduler import faults
 from trilane.scheduler.events import (
     Action,
+    Ask,
     Beat,
     Decision,
     Dispatch,
@@ -38,8 +39,8 @@ class Core:
     def __init__(self, graph: Graph, settings: Settings) -> None:
         self.graph, self.settings = graph, settings
         self.policy = policy_named(settings.policy)
-        if self.policy.paced and not (settings.period_ns or settings.arrivals_ns):
-            raise ValueError(f"policy {settings.policy!r} needs a period or arrivals")
+        if self.policy.paced and not (settings.period_ns or settings.arrivals_ns or settings.asked):
+            raise ValueError(f"policy {settings.policy!r} needs a period, arrivals or somebody who asks")
         self.stages, self.units, self.edges = build(graph)
         self.stage_named = {stage.name: stage for stage in self.stages}
         self.ledger = Ledger(graph)
@@ -66,6 +67,7 @@ class Core:
             Beat: self._on_beat,
             SetDuty: self._on_duty,
             Stop: self._on_stop,
+            Ask: self._on_ask,
         }
 
     def step(self, now_ns: int, events: tuple[Event, ...] = ()) -> Decision:
@@ -180,6 +182,10 @@ class Core:
     def _on_stop(self, _event: Stop) -> None:
         self.stopping = True
         self.source.stop()
+
+    def _on_ask(self, event: Ask) -> None:
+        self.source.ask(event.frames, self.now_ns)
+        self.touch(self.stages[0].unit)
 
     # choice
 

@@ -67,6 +67,12 @@ class Stop(NamedTuple):
     """Admit no more frames; end when those in flight are done."""
 
 
+class Ask(NamedTuple):
+    """Somebody outside wants so many more frames, now."""
+
+    frames: int
+
+
 class Dispatch(NamedTuple):
     """Hand the job to its unit."""
 
@@ -91,10 +97,10 @@ class Finish(NamedTuple):
     cause: str
 
 
-Event = UnitReady | JobDone | JobFailed | UnitDied | Beat | SetDuty | Stop
+Event = UnitReady | JobDone | JobFailed | UnitDied | Beat | SetDuty | Stop | Ask
 Action = Dispatch | Kill | Start | Finish
 
-EVENTS = (UnitReady, JobDone, JobFailed, UnitDied, Beat, SetDuty, Stop)
+EVENTS = (UnitReady, JobDone, JobFailed, UnitDied, Beat, SetDuty, Stop, Ask)
 ACTIONS = (Dispatch, Kill, Start, Finish)
 
 
@@ -147,15 +153,17 @@ class Settings:
     """What a run asks of the core. A time or limit of 0 means none.
 
     `period_ns`: a frame is released every so often; 0: as soon as it can be taken. `arrivals_ns`: release times
-    from the start, instead of a period. `deadline_ns`: a frame's time from release to presented. `in_flight`: frames
-    between pose and presented. `in_queue`: released frames that may wait; more are turned away. `queue_timeout_ns`:
-    longest wait there. `hang_ns`: longest that a job may take, or an idle unit be silent when `beats` are expected.
+    from the start, instead of a period. `asked`: frames are released by `Ask` alone. `deadline_ns`: a frame's time from
+    release to presented. `in_flight`: frames between pose and presented. `in_queue`: released frames that may wait;
+    more are turned away. `queue_timeout_ns`: longest wait there. `hang_ns`: longest that a job may take, or that an
+    idle unit may be silent when `beats` are expected.
     """
 
     frames: int
     policy: str = "pipelined"
     period_ns: int = 0
     arrivals_ns: tuple[int, ...] = ()
+    asked: bool = False
     deadline_ns: int = 0
     in_flight: int = 0
     in_queue: int = 0

@@ -29,6 +29,7 @@ from trilane.scheduler.events import (
     UnitDied,
     UnitReady,
 )
+from trilane.scheduler.inlet import Inlet
 from trilane.scheduler.processes import Heard, UnitProcesses
 from trilane.scheduler.record import Recording
 from trilane.scheduler.result import Failure, JobRecord
@@ -71,6 +72,7 @@ class RealtimeDriver:
         interrupts: Interrupts,
         on_progress: Callable[[int, int], None] | None = None,
         on_message: Callable[[str], None] | None = None,
+        inlet: Inlet | None = None,
     ) -> None:
         self.core = Core(graph, settings)
         self.recording = Recording(graph, settings)
@@ -86,7 +88,10 @@ class RealtimeDriver:
         self._started_s: dict[str, float] = {}
         self._progress_s = 0.0
         self._stop_told = False
+        self._inlet, self._last = inlet, graph.stages[-1].name
         processes.watch(interrupts.fd)
+        if inlet is not None:
+            processes.watch(inlet.fd)
 
     # before the run
 
@@ -168,6 +173,8 @@ class RealtimeDriver:
     def run(self) -> str:
         """Until the core finishes; returns its cause, or `aborted` after a second interrupt."""
         events: list[Event] = [UnitReady(unit) for unit in self._graph.units]
+        if self._inlet is not None:
+            self._inlet.is_open.set()
         while True:
             now_ns = time.monotonic_ns()
             decision = self.core.step(now_ns, tuple(events))
@@ -191,6 +198,8 @@ class RealtimeDriver:
             self._stop_told = True
             self._say("interrupted: the frames in flight are finished; interrupt again to end at once")
             events.append(Stop())
+        if self._inlet is not None:
+            events += self._inlet.events()
         return events
 
     def _event(self, heard: Heard) -> Event | None:
@@ -215,6 +224,8 @@ class RealtimeDriver:
         if state is not None:
             times = (state.ready_ns, dispatch_ns, message.t_begin_ns, message.t_end_ns)
             self.jobs.append(JobRecord(job.stage, unit, job.frame, *times))
+            if self._inlet is not None and job.stage == self._last:
+                self._inlet.answered(job.frame)
         self.figures[job.stage].update(message.figures)
         return JobDone(unit, message.id, message.t_begin_ns, message.t_end_ns, message.t_pose_ns)
 

@@ -7,10 +7,12 @@ import gc
 import os
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 from trilane.errors import BadInputError
 from trilane.scene.schema import RunConfig
 from trilane.scheduler.events import Graph, Settings, avatar_graph
+from trilane.scheduler.inlet import Inlet
 from trilane.scheduler.policy import policy_named
 from trilane.scheduler.processes import UnitProcesses
 from trilane.scheduler.realtime import RealtimeDriver
@@ -39,6 +41,7 @@ def run_pipeline(
     hang_ns: int = HANG_NS,
     on_progress: Callable[[int, int], None] | None = None,
     on_message: Callable[[str], None] | None = None,
+    inlet: Inlet | None = None,
 ) -> RunResult:
     """Run `frames` frames (the scene's count when None) through the three units and report.
 
@@ -49,19 +52,22 @@ def run_pipeline(
     `hang_ns`: a unit whose job takes longer is restarted. `on_progress(presented, requested)` and
     `on_message(text)` are called from this thread. SIGINT or SIGTERM ends the run cleanly with its result marked
     `interrupted`; a second one ends the units at once; before the first frame KeyboardInterrupt is raised instead.
+    `inlet`: frames are released as somebody asks for them, `frames` at most; it is closed when this returns.
 
     Raises BadInputError for an unknown policy or edge, TrilaneError (with the exit code of the unit's error) when a
     unit cannot start; a failure after that is `RunResult.failure`.
     """
     graph, settings = _plan(config, policy, edge, frames or config.scene.frames, pace_fps, hang_ns)
+    settings = replace(settings, asked=inlet is not None)
     with (
+        contextlib.closing(inlet) if inlet is not None else contextlib.nullcontext(),
         Interrupts() as interrupts,
         _on_cores(config.units[graph.stages[0].unit].cores),
         _prompt(),
         _regions(config, graph) as edges,
         _processes(config, edges, graph) as processes,
     ):
-        driver = RealtimeDriver(graph, settings, processes, interrupts, on_progress, on_message)
+        driver = RealtimeDriver(graph, settings, processes, interrupts, on_progress, on_message, inlet)
         driver.start()
         pids = processes.pids
         sample = _spread(settings.frames, max(isolate_frames, 1))
@@ -72,10 +78,11 @@ def run_pipeline(
         pids = {**pids, **processes.pids}
         if cause != "aborted":
             driver.close()
+    requested = settings.frames if inlet is None else driver.core.source.released
     target_ns = 0 if settings.deadline_ns else round(1e9 / config.scene.fps)
     report = driver.core.ledger.report(
         clock="host",
-        requested=settings.frames,
+        requested=requested,
         target_period_ns=target_ns,
         isolated_ns=driver.alone_ns if isolate_frames else None,
     )
@@ -84,7 +91,7 @@ def run_pipeline(
         row.update(pid=pids[unit], **config.units[unit].model_dump(mode="json"))
     return RunResult(
         report=report,
-        requested=settings.frames,
+        requested=requested,
         presented=len(driver.core.ledger.presented_ns),
         lost=dict(driver.core.ledger.lost),
         dropped=dict(driver.core.ledger.dropped),

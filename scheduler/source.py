@@ -12,9 +12,9 @@ from trilane.scheduler.state import NEVER
 class Source:
     """Frames 0..n-1. A released frame waits in `queue` until it is taken, turned away, or out of time.
 
-    Without a rate (no period, no arrivals) a frame counts as released in the moment in which it can be taken.
-    `due_ns`: when the next frame is released or the oldest waiting one runs out of time. `is_empty`: whether no frame
-    can be taken now.
+    Without a rate (no period, no arrivals, nobody who asks) a frame counts as released in the moment in which it can
+    be taken. `due_ns`: when the next frame is released or the oldest waiting one runs out of time. `is_empty`:
+    whether no frame can be taken now.
     """
 
     def __init__(self, settings: Settings, drop: Callable[[int, str], None]) -> None:
@@ -23,7 +23,7 @@ class Source:
         self._next = 0
         self._end = settings.frames
         self._start_ns = 0
-        self._paced = bool(settings.period_ns or settings.arrivals_ns)
+        self._paced = bool(settings.period_ns or settings.arrivals_ns or settings.asked)
         self.queue: deque[tuple[int, int]] = deque()
         self.due_ns = NEVER
         self.is_empty = self._paced or not self._end
@@ -37,6 +37,11 @@ class Source:
         self._end = self._next
         self.queue.clear()
         self._set_due()
+
+    @property
+    def released(self) -> int:
+        """How many frames have left or wait."""
+        return self._next
 
     @property
     def exhausted(self) -> bool:
@@ -55,6 +60,13 @@ class Source:
             changed = True
         self._set_due()
         return changed
+
+    def ask(self, count: int, now_ns: int) -> None:
+        """Release `count` frames, or those that are left."""
+        for frame in range(self._next, min(self._next + count, self._end)):
+            self._admit(frame, now_ns)
+            self._next += 1
+        self._set_due()
 
     def head(self, now_ns: int) -> tuple[int, int]:
         """The frame that is next and its release time; `is_empty` says whether there is one."""
@@ -93,5 +105,7 @@ class Source:
             self.due_ns = min(self.due_ns, self.queue[0][1] + self._settings.queue_timeout_ns)
 
     def _release_ns(self, frame: int) -> int:
+        if self._settings.asked:
+            return NEVER
         arrivals = self._settings.arrivals_ns
         return self._start_ns + (arrivals[frame] if arrivals else frame * self._settings.period_ns)

@@ -12,7 +12,7 @@ import pytest
 import trilane.scheduler
 from trilane.errors import BadInputError
 from trilane.scheduler.core import Core
-from trilane.scheduler.events import Graph, SetDuty, Settings, StageSpec, Stop, avatar_graph
+from trilane.scheduler.events import Ask, Graph, SetDuty, Settings, StageSpec, Stop, avatar_graph
 from trilane.scheduler.record import read, replay
 from trilane.scheduler.virtual import Service, Simulation, simulate
 
@@ -119,6 +119,21 @@ def test_arrivals_are_kept() -> None:
     poses = {record.frame: record.begin_ns for record in jobs if record.stage == "pose"}
     assert all(poses[frame] >= arrivals[frame] for frame in poses)
     assert poses[FRAMES - 1] == arrivals[-1]
+
+
+def test_frames_are_released_when_they_are_asked_for_and_no_more_than_there_are() -> None:
+    inputs = [(1 * MS, Ask(1)), (500 * MS, Ask(3)), (2000 * MS, Ask(FRAMES))]
+    result = run(asked=True, inputs=inputs, keep=True)
+    begins = [record.begin_ns // MS for record in result.jobs if record.stage == "pose"]
+    assert begins[:2] == [1, 500]
+    assert begins[4] == 2000
+    assert result.report["frames"]["presented"] == FRAMES
+    assert result.cause == "done"
+
+
+def test_a_run_that_nobody_asks_of_ends_when_it_is_told() -> None:
+    result = run(asked=True, inputs=[(1 * MS, Ask(2)), (900 * MS, Stop())])
+    assert (result.report["frames"]["presented"], result.cause) == (2, "stopped")
 
 
 def test_a_duty_cycle_throttles_a_unit() -> None:

@@ -1,0 +1,121 @@
+"""MLCommons LoadGen as the judge of a run: it asks, it measures, and its own summary says valid or not.
+
+Rule: LoadGen decides when a query comes and what counts; here its queries become frames and the answers go back.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+import re
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from trilane.bench.load import WARM_UP, Load, Queries, queries_needed
+from trilane.errors import MissingPartError, TrilaneError
+from trilane.scheduler.inlet import Inlet
+
+INSTALL = 'pip install "trilane[loadgen]"'
+NAMES = {"single-stream": "SingleStream", "multi-stream": "MultiStream", "server": "Server", "offline": "Offline"}
+VERDICT = re.compile(r"^Result is : (\w+)", re.MULTILINE)
+SAMPLES = 64  # LoadGen draws from as many; every one is the motion's next frame
+SUMMARY = "mlperf_log_summary.txt"
+
+
+def load_generator() -> Any:
+    """The module. Raises MissingPartError."""
+    try:
+        return importlib.import_module("mlperf_loadgen")
+    except ImportError:
+        raise MissingPartError("LoadGen, the judge, is not installed", INSTALL) from None
+
+
+@dataclass
+class Judged:
+    """LoadGen's word: `valid`, and its `summary` as it wrote it."""
+
+    valid: bool = False
+    summary: str = ""
+
+
+@dataclass
+class Judge:
+    """Plays `load` by LoadGen into an inlet. `queries` sees the frames too, and says when the run is over early."""
+
+    load: Load
+    queries: Queries
+    judged: Judged = field(default_factory=Judged)
+    _ids: list[int] = field(default_factory=list)
+    _begun: bool = False
+
+    def answered(self, frame: int) -> None:
+        """For `Inlet`: a frame is a sample of LoadGen's, once the warm-up is over."""
+        self.queries.answered(frame)
+        if self._begun:
+            self._complete(frame - WARM_UP)
+
+    def ended(self) -> None:
+        """For `Inlet`: LoadGen waits for every answer, so those that will not come are given now."""
+        self.queries.ended()
+        if self._begun:
+            for number in range(len(self.queries.answered_s), len(self._ids)):
+                self._complete(number)
+
+    def play(self, inlet: Inlet) -> None:
+        """Warm up, then let LoadGen ask until it has enough. Raises TrilaneError when the run ends first."""
+        lg = load_generator()
+        self.queries.warm_up(inlet)
+        self._begun = True
+
+        def issue(samples: list[Any]) -> None:
+            self._ids += [sample.id for sample in samples]
+            self.queries.ask(inlet, len(samples))
+            if self.queries.over:
+                self.ended()
+
+        system = lg.ConstructSUT(issue, lambda: None)
+        library = lg.ConstructQSL(SAMPLES, SAMPLES, lambda _: None, lambda _: None)
+        try:
+            with tempfile.TemporaryDirectory(prefix="trilane-loadgen-") as folder:
+                lg.StartTestWithLogSettings(system, library, self._settings(lg), _logs(lg, folder))
+                self.judged.summary = (Path(folder) / SUMMARY).read_text(encoding="utf-8")
+        finally:
+            lg.DestroyQSL(library)
+            lg.DestroySUT(system)
+        if self.queries.over:
+            raise TrilaneError("the run ended before LoadGen had its answers")
+        word = VERDICT.search(self.judged.summary)
+        self.judged.valid = word is not None and word[1] == "VALID"
+
+    def _complete(self, number: int) -> None:
+        lg = load_generator()
+        lg.QuerySamplesComplete([lg.QuerySampleResponse(self._ids[number], 0, 0)])
+
+    def _settings(self, lg: Any) -> Any:
+        load = self.load
+        settings = lg.TestSettings()
+        settings.scenario = getattr(lg.TestScenario, NAMES[load.scenario])
+        settings.mode = lg.TestMode.PerformanceOnly
+        settings.min_duration_ms = math.ceil(load.seconds * 1e3)
+        settings.min_query_count = queries_needed(load.percentile)
+        settings.server_target_qps = load.rate
+        settings.server_target_latency_ns = round(load.limit_ms * 1e6)
+        settings.server_target_latency_percentile = load.percentile
+        settings.single_stream_target_latency_percentile = load.percentile
+        settings.multi_stream_target_latency_percentile = load.percentile
+        settings.multi_stream_samples_per_query = load.samples
+        settings.offline_expected_qps = load.rate
+        settings.schedule_rng_seed = load.seed
+        return settings
+
+
+def _logs(lg: Any, folder: str) -> Any:
+    output = lg.LogOutputSettings()
+    output.outdir = folder
+    output.copy_summary_to_stdout = False
+    settings = lg.LogSettings()
+    settings.log_output = output
+    settings.enable_trace = False
+    return settings

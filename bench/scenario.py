@@ -1,0 +1,144 @@
+"""Does the pipeline answer as a service should: one query at a time, several, at random moments, all at once?
+
+Rule: the whole pipeline is asked, pose to presented frame; the verdict says valid or why not, and an outside judge can
+be asked for the same load.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from trilane.apps.configure import Request, configure
+from trilane.bench.load import PATTERNS, Load, Queries, bound_ms, play, verdict
+from trilane.bench.loadgen import Judge, load_generator
+from trilane.errors import BadInputError, TrilaneError
+from trilane.scene.schema import RunConfig
+from trilane.scheduler.inlet import Inlet
+from trilane.scheduler.run import run_pipeline
+
+JUDGES = ("trilane", "loadgen")
+MAX_FRAMES = 1_000_000
+LIMITS = {"--seconds": (0.1, 3600.0), "--rate": (0.1, 1000.0), "--limit-ms": (1.0, 60_000.0), "--samples": (1, 64)}
+
+
+def measure(
+    scenario: tuple[str, ...] = ("single-stream", "server"),
+    judge: tuple[str, ...] = ("trilane",),
+    avatar: str = "default",
+    size: str = "256x256",
+    seconds: float = 20.0,
+    rate: float = 15.0,
+    limit_ms: float = 250.0,
+    samples: int = 4,
+    policy: str = "pipelined",
+    edge: str = "double",
+    runtime: str = "auto",
+    seed: int = 1,
+) -> dict[str, Any]:
+    """Scenarios x judges; give an option once for each value. `scenario`: single-stream, multi-stream (`samples` frames
+    a query), server (`rate` queries a second at random moments, each within `limit_ms`), offline. `judge`: `trilane`
+    or `loadgen`, MLCommons' own. A row is valid when it lasted `seconds` and has as many queries as its percentile
+    needs, and for a server when few enough were late.
+
+    Raises BadInputError, MissingPartError, TrilaneError when a run fails.
+    """
+    _check(scenario, judge, {"--seconds": seconds, "--rate": rate, "--limit-ms": limit_ms, "--samples": samples})
+    if "loadgen" in judge:
+        load_generator()
+    checked = configure(Request(size=size, avatar=avatar, frames=MAX_FRAMES, runtime=runtime), Path.cwd())
+    rows, summaries = [], {}
+    for name in scenario:
+        load = Load(name, seconds, rate, limit_ms, samples, seed)
+        for one in judge:
+            row, summary = ask(checked.config, load, one, policy, edge)
+            rows.append(row)
+            summaries[f"{name}, {one}"] = summary
+    return {
+        "rows": rows,
+        "summaries": {name: text for name, text in summaries.items() if text},
+        "accuracy": dict(checked.accuracy),
+        "config": {"size": size, "policy": policy, "edge": edge, "runtime": checked.config.runtime, "seed": seed},
+    }
+
+
+def ask(config: RunConfig, load: Load, judge: str, policy: str, edge: str) -> tuple[dict[str, Any], str]:
+    """One run under `load`; its row and LoadGen's summary. Raises TrilaneError when the run fails."""
+    queries = Queries(size=load.samples if load.scenario == "multi-stream" and judge == "trilane" else 1)
+    loadgen = Judge(load, queries) if judge == "loadgen" else None
+    inlet = Inlet(*((queries.answered, queries.ended) if loadgen is None else (loadgen.answered, loadgen.ended)))
+    player = _Player(inlet, (lambda: play(load, inlet, queries)) if loadgen is None else lambda: loadgen.play(inlet))
+    with tempfile.TemporaryDirectory(prefix="trilane-bench-") as folder:
+        placed = config.model_copy(update={"out_dir": Path(folder), "record": False})
+        player.start()
+        try:
+            result = run_pipeline(placed, policy=policy, edge=edge, frames=MAX_FRAMES, isolate_frames=0, inlet=inlet)
+        finally:
+            inlet.close()
+            player.join()
+    if result.failure is not None:
+        raise TrilaneError(result.failure.message)
+    if result.interrupted:
+        raise KeyboardInterrupt
+    if player.errors:
+        raise player.errors[0]
+    return _row(load, queries, loadgen), loadgen.judged.summary if loadgen is not None else ""
+
+
+@dataclass
+class _Player(threading.Thread):
+    """Asks, on a thread of its own, once the inlet is open; what it raises is kept."""
+
+    inlet: Inlet
+    work: Callable[[], None]
+    errors: list[TrilaneError] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        super().__init__(name="player", daemon=True)
+
+    def run(self) -> None:
+        self.inlet.is_open.wait()
+        try:
+            self.work()
+        except TrilaneError as error:
+            self.errors.append(error)
+        finally:
+            self.inlet.end()
+
+    def __hash__(self) -> int:
+        return id(self)
+
+
+def _row(load: Load, queries: Queries, loadgen: Judge | None) -> dict[str, Any]:
+    latencies = queries.latencies_ms
+    lasted_s = queries.answered_s[-1] - queries.asked_s[0]
+    reasons = verdict(load, latencies, lasted_s)
+    return {
+        "scenario": load.scenario,
+        "judge": "trilane" if loadgen is None else "loadgen",
+        "verdict": "VALID" if (loadgen.judged.valid if loadgen is not None else not reasons) else "INVALID",
+        "queries": len(latencies),
+        "seconds": lasted_s,
+        "rate": len(latencies) / lasted_s,
+        "p50_ms": median(latencies),
+        "percentile": load.percentile,
+        "percentile_ms": bound_ms(latencies, load.percentile),
+        "max_ms": max(latencies),
+        "because": "; ".join(reasons) if loadgen is None else "",
+    }
+
+
+def _check(scenarios: tuple[str, ...], judges: tuple[str, ...], numbers: dict[str, float]) -> None:
+    for option, values, known in (("--scenario", scenarios, tuple(PATTERNS)), ("--judge", judges, JUDGES)):
+        for value in values:
+            if value not in known:
+                raise BadInputError(option, repr(value), f"one of {', '.join(known)}")
+    for option, number in numbers.items():
+        low, high = LIMITS[option]
+        if not low <= number <= high:
+            raise BadInputError(option, f"{number:g}", f"{low:g} to {high:g}")
