@@ -232,7 +232,7 @@ class RealtimeDriver:
     def _failed(self, unit: str, message: Failed) -> Event | None:
         if self.failure is None:
             self.failure = Failure(message.message, message.exit_code)
-        self._say(message.message)
+            self._say(message.message)
         if message.id < 0:
             return None  # it could not be built again; the end of its process follows
         self._open.pop(message.id)

@@ -32,6 +32,10 @@ BENCHES = {
     "roofline": ("trilane.bench.roofline", "The machine's INT8 and FP32 peaks and its memory bandwidth."),
     "pipeline": ("trilane.bench.pipeline", "Efficiency, idleness and gain of policies, edges and cores."),
     "scenario": ("trilane.bench.scenario", "Single-stream, multi-stream, server, offline; LoadGen as outside judge."),
+    "faults": (
+        "trilane.bench.faults",
+        "Units killed and stopped at random moments: what is lost, how soon all is well.",
+    ),
     "handoff": ("trilane.bench.handoff", "A slot from process to process, beside pickling, copying and iceoryx2."),
     "scheduler": ("trilane.bench.scheduler", "The scheduler in virtual time beside SimPy, and its determinism."),
     "joints": ("trilane.bench.joints", "What the joint transforms of a frame cost."),

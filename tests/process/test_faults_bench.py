@@ -1,0 +1,49 @@
+"""Units that are killed and stopped in real processes of mock units: everything is counted, the pace comes back."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable
+
+import pytest
+
+from trilane.bench import faults
+from trilane.bench.faults import Signals
+from trilane.errors import BadInputError
+from trilane.scene.schema import RunConfig
+
+Configure = Callable[..., RunConfig]
+MS = 1_000_000
+pytestmark = pytest.mark.usefixtures("nothing_left")
+
+
+@pytest.mark.parametrize("unit", faults.UNITS)
+def test_a_unit_that_is_killed_again_and_again_costs_a_frame_each_time(mock_config: Configure, unit: str) -> None:
+    kills = [(0.3, signal.SIGKILL), (2.0, signal.SIGKILL)]
+    row = faults.endure(mock_config(200, infer=5), Signals(unit, kills), 200, 50, 5)
+    assert (row["signals"], row["restarts"], row["ended"]) == (2, 2, "all frames")
+    assert row["lost_per_death"] <= 1
+    assert (row["uncounted"], row["dropped"], row["left"], row["not_back"]) == (0, 0, 0, 0)
+    assert row["back_max_ms"] < 3000
+
+
+def test_a_unit_that_is_stopped_goes_on_and_nothing_is_lost(mock_config: Configure) -> None:
+    moments = [(0.2, signal.SIGSTOP), (1.0, signal.SIGCONT)]
+    row = faults.endure(mock_config(80), Signals("gpu", moments), 80, 50, 5)
+    assert (row["signals"], row["restarts"], row["presented"], row["ended"]) == (1, 0, 80, "all frames")
+
+
+def test_pace_is_back_with_the_first_of_frames_that_keep_it() -> None:
+    presented = [n * 10 * MS for n in range(10)] + [1000 * MS, 1100 * MS] + [(1200 + 10 * n) * MS for n in range(10)]
+    assert faults.back_to_pace_ms([95 * MS], presented, 10 * MS) == [1105.0]
+    assert faults.back_to_pace_ms([95 * MS, 1205 * MS], presented, 10 * MS) == [5.0]
+    assert faults.back_to_pace_ms([], presented, 10 * MS) == []
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [{"unit": ("npu",)}, {"fault": ("x",)}, {"times": 0}, {"seconds": 0.0}, {"fps": float("nan")}, {"stop_s": 99.0}],
+)
+def test_faults_that_cannot_be_are_refused(asked: dict[str, object]) -> None:
+    with pytest.raises(BadInputError, match="expected"):
+        faults.measure(**asked)  # type: ignore[arg-type]
