@@ -16,7 +16,8 @@ import numpy as np
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.reshape import reshaped
 from trilane.errors import BadInputError
-from trilane.hw_profiles.application import Plan, corners_of, stage_times_ms
+from trilane.hw_profiles.application import Plan, stage_times_ms
+from trilane.hw_profiles.corners import corners_of
 from trilane.hw_profiles.cost import Network, walk
 from trilane.hw_profiles.load import load_runnable
 from trilane.scene.schema import RunConfig

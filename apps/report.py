@@ -13,10 +13,12 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from trilane.errors import BadInputError
+from trilane.hw_profiles.host import sensor_c
 from trilane.scene.schema import RunConfig
 from trilane.scheduler.result import RunResult
 
 MAX_REPORT_BYTES = 64 << 20
+NO_CAP = "none: every unit works as much as its cores and threads allow"
 #: What a comparison under another policy keeps of that run's report.
 BASELINE_KEYS = ("frames", "frame_time_ms", "latency_ms", "fps", "deadline_misses", "stages", "units", "efficiency")
 
@@ -86,9 +88,9 @@ def build_report(
         "machine": machine,
         "config": {**config.model_dump(mode="json", exclude={"out_dir"}), "policy": policy},
         "plan": {"tensor_shapes": [list(shape) for shape in config.buckets]},
-        "temperature_c": {},
-        "caps": {},
+        "caps": {"how": NO_CAP},
         **result.report,
+        "temperature_c": {**result.report.get("temperature_c", {}), "sensor": sensor_c()},
         "pids": dict(result.pids),
         "startup_ms": dict(result.startup_ms),
         "figures": {stage: dict(figures) for stage, figures in result.figures.items()},

@@ -18,23 +18,28 @@ from trilane.apps.run_folder import RunFolder
 from trilane.apps.trace import write_trace
 from trilane.apps.video import contact_sheet, join_segments, run_checksum
 from trilane.errors import TrilaneError
+from trilane.hw_profiles.load import load_runnable
 from trilane.scene.schema import RunConfig
+from trilane.scheduler.governor import Governor
 from trilane.scheduler.result import RunResult
 from trilane.scheduler.run import run_pipeline
 from trilane.scheduler.signals import Interrupts
 from trilane.stages.cpu.present import SEGMENTS
 
 BASELINE_POLICY = "sequential"
+HOST = "host"
 INTERRUPTED = 130
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How to run: the policy, frames of the sequential run beside it (0: none), and a chip's pace to keep."""
+    """How to run: the policy, frames of the sequential run beside it (0: none), a chip's pace to keep, and the
+    performance profile whose caps hold (None: no cap)."""
 
     policy: str = "pipelined"
     baseline_frames: int = 60
     pace: Pace | None = None
+    performance_profile: str | None = None
 
 
 @dataclass(frozen=True)
@@ -63,7 +68,7 @@ def run_to_folder(
     """
     with RunFolder(target) as folder:
         config = config.model_copy(update={"out_dir": folder.work})
-        result = _run(config, plan.policy, None, hooks)
+        result = _run(config, plan, plan.policy, None, hooks)
         with Interrupts() as late:  # from here on a signal waits until the folder is whole
             baseline, stopped = _baseline(config, plan, hooks) if _went_well(result) else (None, False)
             report = build_report(result, config, policy=plan.policy, machine=machine, baseline=baseline)
@@ -79,14 +84,16 @@ def _went_well(result: RunResult) -> bool:
     return not result.interrupted and result.failure is None
 
 
-def _run(config: RunConfig, policy: str, frames: int | None, hooks: Hooks) -> RunResult:
+def _run(config: RunConfig, plan: Plan, policy: str, frames: int | None, hooks: Hooks) -> RunResult:
     """The run under `policy`. Raises TrilaneError when it ended before any frame was presented."""
+    capped = plan.performance_profile is not None
     result = run_pipeline(
         config,
         policy=policy,
         frames=frames,
         on_progress=lambda presented, requested: hooks.progress(policy, presented, requested),
         on_message=hooks.message,
+        governor=Governor(load_runnable(HOST), str(plan.performance_profile)) if capped else None,
     )
     if result.presented:
         return result
@@ -113,7 +120,7 @@ def _baseline(config: RunConfig, plan: Plan, hooks: Hooks) -> tuple[RunResult | 
     place.mkdir()
     frames = min(plan.baseline_frames, config.scene.frames)
     try:
-        result = _run(config.model_copy(update={"out_dir": place}), BASELINE_POLICY, frames, hooks)
+        result = _run(config.model_copy(update={"out_dir": place}), plan, BASELINE_POLICY, frames, hooks)
     except KeyboardInterrupt:
         return None, True
     except TrilaneError as error:

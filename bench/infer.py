@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import onnx
-import psutil
 
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import read_network
@@ -23,6 +22,7 @@ from trilane.bench import roofline
 from trilane.bench.networks import Subject, of_file, untrained, untrained_float
 from trilane.bench.turns import Way, runners
 from trilane.errors import BadInputError
+from trilane.hw_profiles.host import sensor_c
 from trilane.scene.schema import parse_shape
 from trilane.stages.dsp.runtime import resolve
 
@@ -138,17 +138,10 @@ def _rows(subject: Subject, taken: dict[str, dict[str, Any]], peak_gmac_s: float
             **{f"p{q}_ms": float(np.percentile(times, q)) for q in (50, 90, 99)},
             **{f"{key}_ms": float(pick(times)) for key, pick in (("min", np.min), ("mean", np.mean), ("max", np.max))},
             "periods": [{"min_ms": min(p), "mean_ms": float(np.mean(p)), "max_ms": max(p)} for p in way["periods"]],
-            "temperature_c": temperature_c(),
+            "temperature_c": sensor_c(),
         }
         if name != FP32:
             row["share_of_roofline"] = subject.gmac / (medians[name] / 1e3) / peak_gmac_s
             row["int8_over_fp32"] = medians[FP32] / medians[name] if FP32 in medians else None
         rows.append(row)
     return rows
-
-
-def temperature_c() -> float | None:
-    """The hottest sensor, where the system shows any."""
-    read: dict[str, list[Any]] = getattr(psutil, "sensors_temperatures", dict)()
-    values = [sensor.current for sensors in read.values() for sensor in sensors]
-    return max(values) if values else None

@@ -15,10 +15,11 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 from trilane.errors import BadInputError
+from trilane.hw_profiles.corners import Corners
 from trilane.hw_profiles.cost import CLASSES, Network, Work
 from trilane.hw_profiles.networks import CHANNELS_PER_PASS
 from trilane.hw_profiles.roofline import JobTime, job_time, machine_of
-from trilane.hw_profiles.schema import UNITS, Corner, Profile, Unit, UnitName
+from trilane.hw_profiles.schema import UNITS, Profile, Unit, UnitName
 from trilane.scheduler.events import Graph, Settings, StageSpec
 from trilane.scheduler.policy import POLICIES
 from trilane.scheduler.virtual import simulate
@@ -59,18 +60,6 @@ class Plan:
             raise BadInputError("batch", str(self.way.batch), "1 to 64")
         if not 0 <= self.gpu_share < 1 or (self.gpu_share and self.runtime == "gpu"):
             raise BadInputError("gpu-share", f"{self.gpu_share:g} on {self.runtime}", "0 to below 1, on the dsp")
-
-
-Corners = tuple[Corner, Corner, Corner]
-
-
-def corners_of(profile: Profile, performance_profile: str) -> Corners:
-    """Corners of cpu, gpu and dsp. Raises BadInputError for a name that is no performance profile."""
-    for name, found in profile.performance_profiles.items():
-        if name == performance_profile:
-            return found.cpu, found.gpu, found.dsp
-    known = ", ".join(profile.performance_profiles)
-    raise BadInputError("performance profile", repr(performance_profile), f"one of {known}")
 
 
 def network_alone(profile: Profile, network: Network, runtime: UnitName, corners: Corners) -> JobTime:

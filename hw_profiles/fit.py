@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.errors import BadInputError, MissingPartError
-from trilane.hw_profiles.application import Plan, corners_of, network_alone, reference_frame_ms
+from trilane.hw_profiles.application import Plan, network_alone, reference_frame_ms
+from trilane.hw_profiles.corners import corners_of
 from trilane.hw_profiles.cost import reference_network
 from trilane.hw_profiles.load import load_tables, parse_profile
 from trilane.hw_profiles.schema import Profile, UnitName

@@ -8,6 +8,9 @@ from __future__ import annotations
 import math
 import os
 from pathlib import Path
+from typing import Any
+
+import psutil
 
 from trilane.scene.schema import UnitSettings
 
@@ -59,3 +62,10 @@ def host_units(cores: tuple[int, ...] | None = None) -> dict[str, UnitSettings]:
 
 def _alone(unit: str, split: dict[str, tuple[int, ...]]) -> bool:
     return all(not set(split[unit]) & set(cores) for other, cores in split.items() if other != unit)
+
+
+def sensor_c() -> float | None:
+    """Degrees Celsius of the hottest sensor, where the system shows any."""
+    read: dict[str, list[Any]] = getattr(psutil, "sensors_temperatures", dict)()
+    values = [sensor.current for sensors in read.values() for sensor in sensors]
+    return max(values) if values else None

@@ -14,23 +14,21 @@ from trilane.errors import BadInputError
 from trilane.hw_profiles.application import (
     REFERENCE,
     RUNTIMES,
-    Corners,
     Plan,
     Steady,
     Way,
-    corners_of,
     network_alone,
     relative_error,
     steady,
 )
+from trilane.hw_profiles.corners import Corners, corners_of
 from trilane.hw_profiles.cost import Network, reference_network
 from trilane.hw_profiles.schema import CORNERS, UNITS, Profile, UnitName
 from trilane.hw_profiles.table import Row
-from trilane.hw_profiles.thermal import GOVERNORS, Heat, Throttle, power_allocator, step_wise
+from trilane.hw_profiles.thermal import GOVERNORS, Heat, Throttle
 
 SUSTAINED = "sustained_high_performance"
 MAX_MINUTES = 24 * 60
-GOVERN = {"step_wise": step_wise, "power_allocator": power_allocator}
 
 #: What-if: name, way of working, share of the network on the GPU.
 ALTERNATIVES: tuple[tuple[str, Way, float], ...] = (
@@ -84,7 +82,7 @@ def over_time(
         held = any(throttle.steps.values())
         hottest = max(heat.junction_c.values())
         moments.append(Moment((tick + 1) * poll, now.frame_ms, heat.device_c, hottest, total, held, corners))
-        GOVERN[name](profile, heat, throttle, asked, power)
+        GOVERNORS[name](profile, heat, throttle, asked, power)
     return moments
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import NamedTuple
 
-from trilane.hw_profiles.application import corners_of
+from trilane.hw_profiles.corners import corners_of
 from trilane.hw_profiles.cost import Work, walk
 from trilane.hw_profiles.networks import GraphBuilder, TensorRef, resnet18
 from trilane.hw_profiles.roofline import job_time, machine_of

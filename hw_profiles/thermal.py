@@ -9,13 +9,11 @@ Sources: lumped RC models of phones (for one, Bhat, Gumussoy and Ogras, 2019); g
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from math import exp
 
 from trilane.hw_profiles.schema import CORNERS, UNITS, Profile, UnitName
-
-GOVERNORS = ("step_wise", "power_allocator")
 
 
 @dataclass
@@ -112,3 +110,7 @@ def _next_step_w(profile: Profile, throttle: Throttle, name: UnitName, asked: in
     unit, index = profile.units[name], throttle.corner_index(name, asked)
     now, then = (unit.power_w(CORNERS[i], 1.0) for i in (index, index - 1))
     return power_w * (then / now - 1) if now else 0.0
+
+
+Govern = Callable[[Profile, Heat, Throttle, Mapping[UnitName, int], Mapping[UnitName, float]], None]
+GOVERNORS: dict[str, Govern] = {"step_wise": step_wise, "power_allocator": power_allocator}

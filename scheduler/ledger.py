@@ -84,6 +84,11 @@ class Ledger:
             unit.busy_ns += end_ns - max(begin_ns, unit.busy_until_ns)
             unit.busy_until_ns = end_ns
 
+    @property
+    def busy_ns(self) -> dict[str, int]:
+        """How long each unit has worked so far: jobs that have ended."""
+        return {unit: book.busy_ns for unit, book in self._units.items()}
+
     def restart(self, unit: str) -> None:
         self._units[unit].restarts += 1
 

@@ -29,11 +29,13 @@ from trilane.scheduler.events import (
     UnitDied,
     UnitReady,
 )
+from trilane.scheduler.governor import Governor
 from trilane.scheduler.inlet import Inlet
 from trilane.scheduler.processes import Heard, UnitProcesses
 from trilane.scheduler.record import Recording
 from trilane.scheduler.result import Failure, JobRecord
 from trilane.scheduler.signals import Interrupts
+from trilane.scheduler.state import NEVER
 from trilane.transport.messages import (
     Alive,
     Close,
@@ -73,6 +75,7 @@ class RealtimeDriver:
         on_progress: Callable[[int, int], None] | None = None,
         on_message: Callable[[str], None] | None = None,
         inlet: Inlet | None = None,
+        governor: Governor | None = None,
     ) -> None:
         self.core = Core(graph, settings)
         self.recording = Recording(graph, settings)
@@ -89,6 +92,7 @@ class RealtimeDriver:
         self._progress_s = 0.0
         self._stop_told = False
         self._inlet, self._last = inlet, graph.stages[-1].name
+        self._governor = governor
         processes.watch(interrupts.fd)
         if inlet is not None:
             processes.watch(inlet.fd)
@@ -175,6 +179,8 @@ class RealtimeDriver:
         events: list[Event] = [UnitReady(unit) for unit in self._graph.units]
         if self._inlet is not None:
             self._inlet.is_open.set()
+        if self._governor is not None:
+            events += self._governor.begin(time.monotonic_ns())
         while True:
             now_ns = time.monotonic_ns()
             decision = self.core.step(now_ns, tuple(events))
@@ -191,6 +197,8 @@ class RealtimeDriver:
 
     def _wait(self, deadline_ns: int | None) -> list[Event]:
         timeout_ms = None
+        if self._governor is not None:
+            deadline_ns = min(deadline_ns or NEVER, self._governor.due_ns)
         if deadline_ns is not None:
             timeout_ms = max(0, -((time.monotonic_ns() - deadline_ns) // 1_000_000))
         events = [event for heard in self._processes.listen(timeout_ms) if (event := self._event(heard)) is not None]
@@ -200,6 +208,8 @@ class RealtimeDriver:
             events.append(Stop())
         if self._inlet is not None:
             events += self._inlet.events()
+        if self._governor is not None and (now_ns := time.monotonic_ns()) >= self._governor.due_ns:
+            events += self._governor.tick(now_ns, self.core.ledger.busy_ns)
         return events
 
     def _event(self, heard: Heard) -> Event | None:

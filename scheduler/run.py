@@ -12,6 +12,7 @@ from dataclasses import replace
 from trilane.errors import BadInputError
 from trilane.scene.schema import RunConfig
 from trilane.scheduler.events import Graph, Settings, avatar_graph
+from trilane.scheduler.governor import Governor
 from trilane.scheduler.inlet import Inlet
 from trilane.scheduler.policy import policy_named
 from trilane.scheduler.processes import UnitProcesses
@@ -42,6 +43,7 @@ def run_pipeline(
     on_progress: Callable[[int, int], None] | None = None,
     on_message: Callable[[str], None] | None = None,
     inlet: Inlet | None = None,
+    governor: Governor | None = None,
 ) -> RunResult:
     """Run `frames` frames (the scene's count when None) through the three units and report.
 
@@ -53,6 +55,7 @@ def run_pipeline(
     `on_message(text)` are called from this thread. SIGINT or SIGTERM ends the run cleanly with its result marked
     `interrupted`; a second one ends the units at once; before the first frame KeyboardInterrupt is raised instead.
     `inlet`: frames are released as somebody asks for them, `frames` at most; it is closed when this returns.
+    `governor`: holds the units to shares of the time, and says in the report what it did.
 
     Raises BadInputError for an unknown policy or edge, TrilaneError (with the exit code of the unit's error) when a
     unit cannot start; a failure after that is `RunResult.failure`.
@@ -67,7 +70,7 @@ def run_pipeline(
         _regions(config, graph) as edges,
         _processes(config, edges, graph) as processes,
     ):
-        driver = RealtimeDriver(graph, settings, processes, interrupts, on_progress, on_message, inlet)
+        driver = RealtimeDriver(graph, settings, processes, interrupts, on_progress, on_message, inlet, governor)
         driver.start()
         pids = processes.pids
         sample = _spread(settings.frames, max(isolate_frames, 1))
@@ -86,7 +89,7 @@ def run_pipeline(
         target_period_ns=target_ns,
         isolated_ns=driver.alone_ns if isolate_frames else None,
     )
-    report.update(policy=policy, edge=edge)
+    report.update(policy=policy, edge=edge, **(governor.report() if governor is not None else {}))
     for unit, row in report["units"].items():
         row.update(pid=pids[unit], **config.units[unit].model_dump(mode="json"))
     return RunResult(

@@ -32,6 +32,7 @@ Examples:
   trilane run
   trilane run --frames 60 --size 192 --out /tmp/run
   trilane run --motion walk.bvh --camera arkit.txt --frames 200 --json
+  trilane run --performance-profile sustained_high_performance
   trilane run --profile snapdragon-888 --pace --slow-motion 24 --frames 60
   trilane run myscene.toml --background street.mp4 --policy sequential
 """
@@ -44,6 +45,18 @@ class PolicyName(StrEnum):
     SEQUENTIAL = "sequential"
     LATEST = "latest"
     DEADLINE = "deadline"
+
+
+class PerformanceName(StrEnum):
+    """SNPE's names of the caps."""
+
+    BURST = "burst"
+    SUSTAINED_HIGH_PERFORMANCE = "sustained_high_performance"
+    HIGH_PERFORMANCE = "high_performance"
+    BALANCED = "balanced"
+    LOW_BALANCED = "low_balanced"
+    POWER_SAVER = "power_saver"
+    LOW_POWER_SAVER = "low_power_saver"
 
 
 @contextmanager
@@ -111,6 +124,9 @@ def run(
     profile: Annotated[str | None, typer.Option(help="Hardware profile whose pace to keep; with --pace.")] = None,
     pace: Annotated[bool, typer.Option("--pace", help="Hold each job until its modelled time has passed.")] = False,
     slow_motion: Annotated[float, typer.Option(help="With --pace: times slower than the chip.")] = 1.0,
+    performance_profile: Annotated[
+        PerformanceName | None, typer.Option(help="Cap of the units: duty cycles of the host profile's corners.")
+    ] = None,
     baseline: Annotated[int, typer.Option(min=0, help="Frames of the sequential run beside it; 0: none.")] = 60,
     out: Annotated[Path | None, typer.Option(help="Run folder to write; runs/TIME-SCENE when not given.")] = None,
     as_json: JsonOption = False,
@@ -126,6 +142,8 @@ def run(
     request = Request(scene, motion, camera, background, avatar, frames, size, runtime, hud, skinning)
     checked = configure(request, Path.cwd())
     held = _pace(checked.config, profile, pace, slow_motion)
+    if held is not None and performance_profile is not None:
+        raise BadInputError("options", "--performance-profile with --pace", "one of them", "a pace is capped already")
     if held is not None:
         checked = replace(checked, config=checked.config.model_copy(update={"pace_ns": dict(held.stage_ns)}))
     target = out or default_place(checked.config.scene.name)
@@ -135,7 +153,7 @@ def run(
         outcome = run_to_folder(
             checked.config,
             target,
-            Plan(str(policy), baseline, held),
+            Plan(str(policy), baseline, held, performance_profile and str(performance_profile)),
             hooks,
             machine=required_machine(),
             facts={"accuracy": dict(checked.accuracy), "notes": list(checked.notes)},

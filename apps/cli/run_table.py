@@ -52,6 +52,8 @@ def _caption(report: Run) -> str:
     ]
     if "pace" in report:
         lines.append(_pace(report["pace"]))
+    if "performance_profile" in report["caps"]:
+        lines.append(_caps(report["caps"], report["temperature_c"]))
     lines += [_accuracy(name, facts) for name, facts in report.get("accuracy", {}).items()]
     return "\n".join(lines)
 
@@ -62,6 +64,15 @@ def _pace(pace: Mapping[str, Any]) -> str:
     return (
         f"{held or 'held to ' + pace['profile']}: {_number(pace['measured_ms'], 2)} ms a frame, in virtual time "
         f"{_number(pace['virtual_ms'], 2)} ms (ratio {_number(pace['ratio'], 3)}); jobs too slow here: {slower}"
+    )
+
+
+def _caps(caps: Mapping[str, Any], temperature: Mapping[str, Any]) -> str:
+    duties = ", ".join(f"{unit} {row['duty_mean']:.0%}" for unit, row in caps["units"].items())
+    return (
+        f"capped as {caps['performance_profile']}: duty cycles {duties}; throttled "
+        f"{caps['throttled_share']:.0%} of the time; {temperature['kind']}: at most "
+        f"{_number(temperature['junction_max'])} C"
     )
 
 

@@ -13,7 +13,8 @@ from onnx import TensorProto, helper
 
 from trilane.avatars.quantise import Quantised
 from trilane.errors import BadInputError
-from trilane.hw_profiles.application import corners_of, network_alone, split_work
+from trilane.hw_profiles.application import network_alone, split_work
+from trilane.hw_profiles.corners import corners_of
 from trilane.hw_profiles.cost import CLASSES, network_work, reference_network, walk
 from trilane.hw_profiles.load import load_profile
 from trilane.hw_profiles.networks import ENCODERS, LAYOUTS, NORMS, NetworkSpec, build_network, parameters

@@ -11,11 +11,11 @@ from trilane.errors import BadInputError
 from trilane.hw_profiles.application import (
     Plan,
     Way,
-    corners_of,
     reference_frame_ms,
     stage_times_ms,
     steady,
 )
+from trilane.hw_profiles.corners import corners_of
 from trilane.hw_profiles.cost import reference_network
 from trilane.hw_profiles.load import load_profile
 from trilane.hw_profiles.networks import NetworkSpec

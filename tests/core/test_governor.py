@@ -1,0 +1,80 @@
+"""The host's cap: what a performance profile asks for, heat from busy time, throttling with hysteresis, one account."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+
+from trilane.errors import BadInputError
+from trilane.hw_profiles.load import load_runnable
+from trilane.hw_profiles.schema import UNITS, Profile
+from trilane.scheduler.events import SetDuty, Settings, avatar_graph
+from trilane.scheduler.governor import Governor
+from trilane.scheduler.virtual import simulate
+
+S = 1_000_000_000
+
+
+@pytest.fixture
+def phone() -> Profile:
+    return load_runnable("snapdragon-888")
+
+
+def worked(governor: Governor, seconds: int, share: float = 1.0) -> list[tuple[int, SetDuty]]:
+    """Ticks each second, every unit busy for `share` of what its duty allows."""
+    events = [(0, event) for event in governor.begin(0)]
+    busy = dict.fromkeys(UNITS, 0)
+    duty = dict.fromkeys(UNITS, 1000)
+    for second in range(1, seconds + 1):
+        for _, event in events:
+            duty[event.unit] = event.permille  # type: ignore[index]
+        busy = {unit: busy[unit] + round(share * duty[unit] * S / 1000) for unit in UNITS}
+        events += [(second, event) for event in governor.tick(second * S, busy)]
+    return events
+
+
+def test_a_performance_profile_is_its_corners_duty(phone: Profile) -> None:
+    asked = {event.unit: event.permille for event in Governor(phone, "power_saver").begin(0)}
+    corners = phone.performance_profiles["power_saver"]
+    assert asked == {unit: round(1000 * phone.units[unit].clock(corners.corner(unit))) for unit in UNITS}
+    assert Governor(phone, "burst").begin(0) == []
+
+
+def test_burst_is_throttled_at_the_limit_and_let_go_below_it(phone: Profile) -> None:
+    governor = Governor(phone, "burst")
+    events = worked(governor, 3600)
+    caps, heat = governor.report()["caps"], governor.report()["temperature_c"]
+    assert 0 < caps["first_throttled_s"] < 3600
+    assert heat["device_max"] < phone.thermal.skin_limit_c.or_else(0) + 1
+    steps = [event.permille for _, event in events if event.unit == "dsp"]
+    assert any(after < before for before, after in pairwise([1000, *steps]))
+    assert all(0 < row["duty"] <= row["duty_mean"] <= 1 for row in caps["units"].values())
+
+
+def test_idle_units_stay_cool_and_unthrottled(phone: Profile) -> None:
+    governor = Governor(phone, "sustained_high_performance")
+    worked(governor, 1800, share=0.05)
+    assert governor.report()["caps"]["throttled_share"] == 0
+    assert governor.report()["temperature_c"]["device_max"] < phone.thermal.skin_limit_c.or_else(0)
+
+
+def test_equal_ticks_give_equal_events(phone: Profile) -> None:
+    assert worked(Governor(phone, "burst"), 2000) == worked(Governor(phone, "burst"), 2000)
+
+
+def test_a_capped_pipeline_is_as_slow_as_its_duty(phone: Profile) -> None:
+    events = [(0, event) for event in Governor(phone, "power_saver").begin(0)]
+    times = {"pose": 1, "raster": 4, "infer": 10, "composite": 3, "present": 1}
+    result = simulate(
+        avatar_graph(), Settings(200), lambda stage, *_: times[stage] * 1_000_000, inputs=events, keep=True
+    )
+    duty = next(event.permille for _, event in events if event.unit == "dsp") / 1000
+    assert result.report["frame_time_ms"]["mean"] == pytest.approx(10 / duty, rel=0.02)
+    assert result.report["units"]["dsp"]["idle"]["throttled"] == pytest.approx(1 - duty, abs=0.03)
+
+
+@pytest.mark.parametrize(("profile", "governor"), [("turbo", None), ("burst", "ondemand")])
+def test_names_that_are_not_known_are_refused(phone: Profile, profile: str, governor: str | None) -> None:
+    with pytest.raises(BadInputError, match="expected"):
+        Governor(phone, profile, governor)
