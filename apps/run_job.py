@@ -34,12 +34,14 @@ INTERRUPTED = 130
 @dataclass(frozen=True)
 class Plan:
     """How to run: the policy, frames of the sequential run beside it (0: none), a chip's pace to keep, and the
-    performance profile whose caps hold (None: no cap)."""
+    performance profile whose caps hold (None: no cap). `latch_ms`: of the poses, but not of the run beside it.
+    """
 
     policy: str = "pipelined"
     baseline_frames: int = 60
     pace: Pace | None = None
     performance_profile: str | None = None
+    latch_ms: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -93,6 +95,7 @@ def _run(config: RunConfig, plan: Plan, policy: str, frames: int | None, hooks: 
         frames=frames,
         on_progress=lambda presented, requested: hooks.progress(policy, presented, requested),
         on_message=hooks.message,
+        latch_ms=plan.latch_ms if policy == plan.policy else 0.0,
         governor=Governor(load_runnable(HOST), str(plan.performance_profile)) if capped else None,
     )
     if result.presented:

@@ -30,7 +30,7 @@ from trilane.scheduler.ledger import ASSIGNED, BLOCKED, STARVED, THROTTLED, Ledg
 from trilane.scheduler.policy import Candidate, policy_named
 from trilane.scheduler.source import Source
 from trilane.scheduler.state import FULL_DUTY, NEVER, FrameState, StageState, UnitState, build
-from trilane.transport.slots import EdgeSlots
+from trilane.transport.slots import READING, EdgeSlots
 
 
 class Core:
@@ -54,7 +54,8 @@ class Core:
         self._latency_position = self.stage_named[graph.latency_to].position
         self._leads = self.policy.lead_ns is not None
         self._drops = self.policy.newest or self.policy.drop_late
-        self._estimates = self._leads or self.policy.drop_late
+        self._latches = settings.latch_ns > 0 and len(self.stages) > 1
+        self._estimates = self._leads or self.policy.drop_late or self._latches
         self._jobs = 0
         self.alarm_ns = 0
         self._touched: list[UnitState] = []
@@ -79,6 +80,8 @@ class Core:
         if not self.finished and (now_ns >= self.alarm_ns or self._leads):
             faults.check_clocks(self)
         if self.started and not self.finished:
+            if self._latches:
+                self.touch(self.stages[0].unit)
             if now_ns >= self.source.due_ns and self.source.advance(now_ns):
                 self.touch(self.stages[0].unit)
             self._assign()
@@ -153,7 +156,7 @@ class Core:
                 self.touch(self.stages[stage.position + 1].unit)
         else:
             frame = self.frames.pop(job.frame)
-            self.ledger.presented(job.frame, end_ns, frame.latency_ns, 0 < frame.deadline_ns < end_ns)
+            self.ledger.presented(job.frame, end_ns, frame.latency_ns, frame.deadline_ns)
             self.touch(self.stages[0].unit)
 
     def _on_failed(self, event: JobFailed) -> None:
@@ -219,7 +222,7 @@ class Core:
                 self._give_up(stage)
             source, sink = stage.input, stage.output
             if source is None:
-                if self.source.is_empty or self._is_full():
+                if self.source.is_empty or self._is_full() or self.now_ns < self._latch_from_ns():
                     continue
             elif not source.ready:
                 continue
@@ -228,6 +231,20 @@ class Core:
         if len(found) > 1:
             return self.stages[self.policy.choose([self._candidate(stage) for stage in found]).position]
         return found[0] if found else None
+
+    def _latch_from_ns(self) -> int:
+        """When the first stage may begin its next frame: not while one waits behind it, and just in time."""
+        if not self._latches:
+            return 0
+        first, second = self.stages[0], self.stages[1]
+        edge = first.output
+        if edge is not None and len(edge.free) + edge.state.count(READING) < edge.rule.slots:
+            return NEVER
+        queue = second.unit.queue
+        free_ns = second.unit.head_since_ns if queue else self.now_ns
+        for job in queue:
+            free_ns += self.stage_named[job.stage].estimate_ns
+        return free_ns - first.estimate_ns - self.settings.latch_ns
 
     def _candidate(self, stage: StageState) -> Candidate:
         """The frame that the stage would do next."""
@@ -328,7 +345,7 @@ class Core:
             if stage.input is None:
                 if self.source.is_empty:
                     continue
-                if self._is_full():
+                if self._is_full() or self.now_ns < self._latch_from_ns():
                     return BLOCKED
             elif not stage.input.ready:
                 continue
@@ -343,4 +360,6 @@ class Core:
         next_ns = self.source.due_ns
         if self.alarm_ns < next_ns:
             next_ns = self.alarm_ns
+        if self._latches and not self.source.is_empty and self.now_ns < (latch_ns := self._latch_from_ns()) < next_ns:
+            next_ns = latch_ns
         return None if next_ns == NEVER else next_ns

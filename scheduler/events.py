@@ -156,7 +156,8 @@ class Settings:
     from the start, instead of a period. `asked`: frames are released by `Ask` alone. `deadline_ns`: a frame's time from
     release to presented. `in_flight`: frames between pose and presented. `in_queue`: released frames that may wait;
     more are turned away. `queue_timeout_ns`: longest wait there. `hang_ns`: longest that a job may take, or that an
-    idle unit may be silent when `beats` are expected.
+    idle unit may be silent when `beats` are expected. `latch_ns`: the first stage of a frame begins so late that it is
+    expected to end this long before the second can take it: the pose is newer, and waits less.
     """
 
     frames: int
@@ -164,6 +165,7 @@ class Settings:
     period_ns: int = 0
     arrivals_ns: tuple[int, ...] = ()
     asked: bool = False
+    latch_ns: int = 0
     deadline_ns: int = 0
     in_flight: int = 0
     in_queue: int = 0

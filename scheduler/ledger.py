@@ -12,7 +12,7 @@ from itertools import pairwise
 from typing import Any
 
 from trilane.scheduler.events import Graph, Job
-from trilane.scheduler.stats import NS_PER_MS, ema_range_ms, jitter_ms, summary_ms
+from trilane.scheduler.stats import NS_PER_MS, ema_range_ms, jitter_ms, real_time_score, summary_ms
 
 ASSIGNED, STARVED, BLOCKED, THROTTLED = range(4)
 
@@ -58,7 +58,7 @@ class Ledger:
         self.presented_frames: list[int] = []
         self.presented_ns: list[int] = []
         self.latency_ns: list[int] = []
-        self.late = 0
+        self.lateness_ns: list[int] = []
 
     def start(self, now_ns: int) -> None:
         self.start_ns = now_ns
@@ -92,11 +92,13 @@ class Ledger:
     def restart(self, unit: str) -> None:
         self._units[unit].restarts += 1
 
-    def presented(self, frame: int, end_ns: int, latency_ns: int, late: bool) -> None:
+    def presented(self, frame: int, end_ns: int, latency_ns: int, deadline_ns: int) -> None:
+        """`deadline_ns`: 0 when the frame has none."""
         self.presented_frames.append(frame)
         self.presented_ns.append(end_ns)
         self.latency_ns.append(latency_ns)
-        self.late += late
+        if deadline_ns:
+            self.lateness_ns.append(end_ns - deadline_ns)
 
     @property
     def frame_times_ns(self) -> list[int]:
@@ -114,7 +116,7 @@ class Ledger:
         without it. `target_period_ns`: frame times above it count as deadline misses when frames have no deadline."""
         intervals = self.frame_times_ns
         span = self.presented_ns[-1] - self.presented_ns[0] if intervals else 0
-        missed = sum(interval > target_period_ns for interval in intervals) if target_period_ns else self.late
+        late_ns = [interval - target_period_ns for interval in intervals] if target_period_ns else self.lateness_ns
         return {
             "clock": clock,
             "frames": {
@@ -128,7 +130,12 @@ class Ledger:
             "frame_time_ms": {**summary_ms(intervals), **ema_range_ms(intervals), "jitter": jitter_ms(intervals)},
             "latency_ms": summary_ms(self.latency_ns),
             "fps": len(intervals) * 1e9 / span if span else 0.0,
-            "deadline_misses": missed,
+            "deadline_misses": sum(late > 0 for late in late_ns),
+            "xrbench": {
+                "real_time": real_time_score(late_ns),
+                "qoe": len(self.presented_ns) / requested if requested else 0.0,
+                "energy": None,  # no power was measured
+            },
             "stages": {stage.name: self._stage_row(stage.name, stage.unit) for stage in self._graph.stages},
             "units": {unit: book.shares() for unit, book in self._units.items()},
             **self._efficiency(isolated_ns, span / len(intervals) if intervals else 0.0),

@@ -44,6 +44,7 @@ def run_pipeline(
     on_message: Callable[[str], None] | None = None,
     inlet: Inlet | None = None,
     governor: Governor | None = None,
+    latch_ms: float = 0.0,
 ) -> RunResult:
     """Run `frames` frames (the scene's count when None) through the three units and report.
 
@@ -55,13 +56,14 @@ def run_pipeline(
     `on_message(text)` are called from this thread. SIGINT or SIGTERM ends the run cleanly with its result marked
     `interrupted`; a second one ends the units at once; before the first frame KeyboardInterrupt is raised instead.
     `inlet`: frames are released as somebody asks for them, `frames` at most; it is closed when this returns.
+    `latch_ms`: a pose is sampled so late that it is expected to end so long before the raster can take it; 0: at once.
     `governor`: holds the units to shares of the time, and says in the report what it did.
 
     Raises BadInputError for an unknown policy or edge, TrilaneError (with the exit code of the unit's error) when a
     unit cannot start; a failure after that is `RunResult.failure`.
     """
     graph, settings = _plan(config, policy, edge, frames or config.scene.frames, pace_fps, hang_ns)
-    settings = replace(settings, asked=inlet is not None)
+    settings = replace(settings, asked=inlet is not None, latch_ns=round(latch_ms * 1e6))
     with (
         contextlib.closing(inlet) if inlet is not None else contextlib.nullcontext(),
         Interrupts() as interrupts,

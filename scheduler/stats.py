@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
+from math import exp
 
 NS_PER_MS = 1e6
+SCORE_PER_MS = 15.0
+LARGEST_EXPONENT = 700.0  # e to it is still a number
 
 
 def percentile(ordered: Sequence[int], share: float) -> float:
@@ -45,3 +48,14 @@ def jitter_ms(values_ns: Sequence[int]) -> float:
     """Mean absolute difference of successive frame times."""
     steps = [abs(after - before) for before, after in pairwise(values_ns)]
     return round(sum(steps) / len(steps) / NS_PER_MS, 6) if steps else 0.0
+
+
+def real_time_score(lateness_ns: Sequence[int]) -> float | None:
+    """Mean of 1 / (1 + e^(15 l)), l the lateness of a frame in ms: 1 in time, 0 late, None for no frame.
+
+    Kwon et al., XRBench, MLSys 2023, section 3.
+    """
+    if not lateness_ns:
+        return None
+    steep = [min(SCORE_PER_MS * late / NS_PER_MS, LARGEST_EXPONENT) for late in lateness_ns]
+    return sum(1 / (1 + exp(value)) for value in steep) / len(steep)

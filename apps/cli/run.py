@@ -32,6 +32,7 @@ Examples:
   trilane run
   trilane run --frames 60 --size 192 --out /tmp/run
   trilane run --motion walk.bvh --camera arkit.txt --frames 200 --json
+  trilane run --latch 3
   trilane run --performance-profile sustained_high_performance
   trilane run --profile snapdragon-888 --pace --slow-motion 24 --frames 60
   trilane run myscene.toml --background street.mp4 --policy sequential
@@ -124,6 +125,9 @@ def run(
     profile: Annotated[str | None, typer.Option(help="Hardware profile whose pace to keep; with --pace.")] = None,
     pace: Annotated[bool, typer.Option("--pace", help="Hold each job until its modelled time has passed.")] = False,
     slow_motion: Annotated[float, typer.Option(help="With --pace: times slower than the chip.")] = 1.0,
+    latch: Annotated[
+        float, typer.Option(min=0, max=1000, help="Sample poses late: ready so many ms before the raster; 0: at once.")
+    ] = 0.0,
     performance_profile: Annotated[
         PerformanceName | None, typer.Option(help="Cap of the units: duty cycles of the host profile's corners.")
     ] = None,
@@ -153,7 +157,7 @@ def run(
         outcome = run_to_folder(
             checked.config,
             target,
-            Plan(str(policy), baseline, held, performance_profile and str(performance_profile)),
+            Plan(str(policy), baseline, held, performance_profile and str(performance_profile), latch),
             hooks,
             machine=required_machine(),
             facts={"accuracy": dict(checked.accuracy), "notes": list(checked.notes)},

@@ -32,7 +32,7 @@ def uneven(stage: str, unit: str, frame: int, begin_ns: int) -> int:
 
 def run(policy: str = "pipelined", edge: str = "double", times: Service = service, **more: object) -> Simulation:
     settings = {"period_ns": 10 * MS, "deadline_ns": 60 * MS} if policy in ("latest", "deadline") else {}
-    driver = {key: more.pop(key) for key in ("faults", "inputs", "hop_ns", "keep") if key in more}
+    driver = {key: more.pop(key) for key in ("faults", "inputs", "hop_ns", "restart_ns", "keep") if key in more}
     alone = {name: ms * MS for name, ms in SERVICE_MS.items()}
     return simulate(
         avatar_graph(edge), Settings(FRAMES, policy, **{**settings, **more}), times, isolated_ns=alone, **driver
@@ -134,6 +134,27 @@ def test_frames_are_released_when_they_are_asked_for_and_no_more_than_there_are(
 def test_a_run_that_nobody_asks_of_ends_when_it_is_told() -> None:
     result = run(asked=True, inputs=[(1 * MS, Ask(2)), (900 * MS, Stop())])
     assert (result.report["frames"]["presented"], result.cause) == (2, "stopped")
+
+
+def test_a_late_pose_is_newer_and_costs_no_frame() -> None:
+    early, late = run(times=uneven), run(times=uneven, latch_ns=3 * MS)
+    assert late.report["latency_ms"]["p50"] < early.report["latency_ms"]["p50"] * 0.85
+    assert late.report["fps"] > early.report["fps"] * 0.99
+    assert late.report["units"]["cpu"]["idle"]["blocked"] > 0
+
+
+def test_a_late_pose_waits_for_nobody_who_is_gone() -> None:
+    result = run(latch_ns=2 * MS, faults=[(300 * MS, "gpu"), (900 * MS, "cpu")], restart_ns=50 * MS)
+    assert result.cause == "done"
+    assert result.report["frames"]["presented"] + result.report["frames"]["lost"] == FRAMES
+
+
+def test_the_score_of_a_run_falls_with_lateness_and_with_drops() -> None:
+    slow, fast = (run(period_ns=period * MS, deadline_ns=3 * period * MS).report["xrbench"] for period in (1, 1000))
+    assert fast == {"real_time": pytest.approx(1), "qoe": 1, "energy": None}
+    assert slow["real_time"] < 0.1
+    dropped = run(period_ns=5 * MS, deadline_ns=10_000 * MS, in_queue=4, in_flight=3).report
+    assert dropped["xrbench"]["qoe"] == pytest.approx(dropped["frames"]["presented"] / FRAMES)
 
 
 def test_a_duty_cycle_throttles_a_unit() -> None:

@@ -69,6 +69,7 @@ def check(core: Core) -> None:
     hop_ns=st.integers(0, 50),
     period_ns=st.integers(1, 2000),
     limits=st.tuples(st.integers(0, 5), st.integers(0, 3), st.integers(0, 3000)),
+    latch_ns=st.integers(0, 1500),
     faults=st.lists(st.tuples(st.integers(0, 60_000), st.sampled_from(UNITS)), max_size=4),
 )
 def test_no_slot_is_owned_twice_no_frame_is_lost_or_out_of_order(
@@ -78,6 +79,7 @@ def test_no_slot_is_owned_twice_no_frame_is_lost_or_out_of_order(
     hop_ns: int,
     period_ns: int,
     limits: tuple[int, int, int],
+    latch_ns: int,
     faults: list[tuple[int, str]],
 ) -> None:
     in_flight, in_queue, timeout_ns = limits
@@ -89,6 +91,7 @@ def test_no_slot_is_owned_twice_no_frame_is_lost_or_out_of_order(
         in_flight=in_flight,
         in_queue=in_queue,
         queue_timeout_ns=timeout_ns,
+        latch_ns=latch_ns,
         hang_ns=10**7,
         max_failures=20,
     )
