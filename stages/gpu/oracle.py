@@ -105,7 +105,7 @@ def _fragments(
     if cull:
         size[_determinant(corners) >= 0] = 0
     parts = []
-    for side in 2 ** np.arange(int(np.ceil(np.log2(max(size.max(initial=1), 1)))) + 1):
+    for side in 2 ** np.arange(int(np.ceil(np.log2(float(size.max(initial=1))))) + 1):
         members = np.flatnonzero((size <= side) & (size > side // 2))
         step = max(1, BATCH_SAMPLES // int(side * side))
         parts += [

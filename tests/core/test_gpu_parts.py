@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilane.errors import BadInputError, MissingPartError, TrilaneError
+from trilane.errors import BadInputError, MissingPartError, TrilaneError, UnitLostError
 from trilane.stages.contracts import JOINTS
 from trilane.stages.gpu import context
 from trilane.stages.gpu.mesh import is_closed, mesh_arrays, patch_order, split_corners
@@ -125,8 +125,24 @@ def test_missing_driver_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
         context.open_context()
 
 
-def test_a_lost_context_is_reported() -> None:
-    """A driver's error after a frame ends the run in one sentence."""
+@pytest.mark.parametrize(
+    ("current", "error", "kind"),
+    [
+        (True, "GL_CONTEXT_LOST", UnitLostError),
+        (False, "GL_NO_ERROR", UnitLostError),
+        (True, "GL_OUT_OF_MEMORY", TrilaneError),
+    ],
+)
+def test_what_a_driver_reports_is_an_error(
+    monkeypatch: pytest.MonkeyPatch, current: bool, error: str, kind: type[TrilaneError]
+) -> None:
+    """A lost context is one that a new process mends; without a current one the driver reports nothing."""
+    monkeypatch.setattr(context, "current", lambda: current)
+    with pytest.raises(kind, match="OpenGL") as caught:
+        context.check(SimpleNamespace(error=error))
+    assert type(caught.value) is kind
+
+
+def test_a_frame_that_went_well_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(context, "current", lambda: True)
     context.check(SimpleNamespace(error="GL_NO_ERROR"))
-    with pytest.raises(TrilaneError, match="context was lost"):
-        context.check(SimpleNamespace(error="GL_CONTEXT_LOST"))
