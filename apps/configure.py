@@ -15,9 +15,8 @@ from trilane.apps.machine import gl_facts, machine_facts
 from trilane.avatars.bundle import Bundle, load_bundle
 from trilane.errors import BadInputError, MissingPartError
 from trilane.hw_profiles.host import host_units
-from trilane.scene.camera.load import load_camera
-from trilane.scene.motion.load import load_motion
 from trilane.scene.schema import RunConfig, Scene
+from trilane.scene.staging import stage_scene
 from trilane.scene.validate import find_scene, load_scene, located, scene_from
 from trilane.stages.cpu.body import load_body
 from trilane.stages.dsp.runtime import resolve
@@ -80,10 +79,10 @@ def configure(request: Request, out_dir: Path) -> Checked:
     """Look at every part of what was asked for. Raises BadInputError or MissingPartError."""
     scene = requested_scene(request)
     runtime = resolve(request.runtime)
-    notes = [f"motion: {note}" for spec in scene.avatars for note in load_motion(spec, Path.cwd()).notes]
-    notes += [f"camera: {note}" for note in load_camera(scene.camera, Path.cwd()).notes]
     _check_background(scene)
     bundles = [_checked_bundle(spec.bundle) for spec in scene.avatars]
+    bodies = {bundle.folder: load_body(bundle.body_path).shape() for bundle in bundles}
+    notes = list(stage_scene(scene, [bodies[bundle.folder] for bundle in bundles], Path.cwd()).notes)
     unit, why = skinning_unit(request.skinning)
     notes.append(f"skinning: {unit} unit ({why})")
     config = RunConfig(
@@ -92,14 +91,13 @@ def configure(request: Request, out_dir: Path) -> Checked:
         avatar_dirs=tuple(bundle.folder.absolute() for bundle in bundles),
         units=host_units(),
         runtime=runtime,
-        posed_vertices=tuple(len(load_body(b.body_path).v_template) for b in bundles) if unit == "cpu" else (),
+        posed_vertices=tuple(len(bodies[b.folder].vertices) for b in bundles) if unit == "cpu" else (),
     )
     return Checked(config, tuple(notes), {bundle.manifest.name: _accuracy(bundle) for bundle in bundles})
 
 
 def _checked_bundle(name: str) -> Bundle:
     bundle = load_bundle(name)
-    load_body(bundle.body_path)
     bundle.read_texture()
     bundle.read_network()
     return bundle

@@ -39,9 +39,9 @@ class RunFolder:
         self._keep = False
 
     def __enter__(self) -> Self:
-        if self.target.exists():
-            raise BadInputError(self.target, "a file or folder", "a name that is free", "choose another --out")
         try:
+            if self.target.exists():
+                raise BadInputError(self.target, "a file or folder", "a name that is free", "choose another --out")
             self._make_parents()
             self.work.mkdir()
         except OSError as error:

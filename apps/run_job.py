@@ -77,9 +77,19 @@ def run_to_folder(
             if plan.pace is not None:
                 report["pace"] = compare(plan.pace, plan.policy, config.scene.frames, result.jobs)
             report |= {**facts, **_write_files(result, folder.work, config.scene.fps)}
+            _tell(report, hooks)
             write_report(report, folder.work / "report.json")
             place = folder.complete()
         return Outcome(report, place, INTERRUPTED if stopped or late.count else _exit_code(result))
+
+
+def _tell(report: dict[str, Any], hooks: Hooks) -> None:
+    """What a person should not have to find in the report."""
+    shown, presented = (report["video"] or {}).get("frames", 0), report["frames"]["presented"]
+    if report["video"] and shown < presented:
+        hooks.message(f"video.mp4 holds {shown} of {presented} frames: a writer was killed before its last")
+    if report["figures"].get("pose", {}).get("visible") == 0:
+        hooks.message("no avatar was in the picture in any frame")
 
 
 def _went_well(result: RunResult) -> bool:

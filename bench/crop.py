@@ -47,7 +47,7 @@ def measure(views: int = 1000, size: str = "256", height: int = 480, width: int 
     try:
         buckets = shape_buckets(size)
     except ValueError as error:
-        raise BadInputError("--size", size, str(error)) from error
+        raise BadInputError.about("--size", error) from error
     seen = _views(views, (height, width), buckets)
     mesh_area = np.array([_area(view.mesh) for view in seen])
     side = np.array([(view.joints[2:] - view.joints[:2]).max() for view in seen])

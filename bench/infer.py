@@ -77,7 +77,7 @@ def _subjects(
         try:
             shape = parse_shape(text)
         except ValueError as error:
-            raise BadInputError("--size", text, str(error)) from error
+            raise BadInputError.about("--size", error) from error
         settings = (one_encoder, one_norm, width, shape)
         yield untrained(*settings), untrained_float(*settings)
 

@@ -45,7 +45,7 @@ def measure(
     try:
         shape = parse_shape(size)
     except ValueError as error:
-        raise BadInputError("--size", size, str(error)) from error
+        raise BadInputError.about("--size", error) from error
     subject = untrained("resnet18", "batch", width, shape)
     with tempfile.TemporaryDirectory(prefix="trilane-peers-") as name:
         folder = Path(name)

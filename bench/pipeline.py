@@ -91,7 +91,7 @@ def _check(policies: Sequence[str], edges: Sequence[str], cores: Sequence[int]) 
             try:
                 check(value)
             except ValueError as error:
-                raise BadInputError(option, value, str(error).partition("expected ")[2]) from None
+                raise BadInputError.about(option, error) from None
     have = len(usable_cores())
     if not all(1 <= count <= have for count in cores):
         raise BadInputError("--cores", str(list(cores)), f"numbers from 1 to the {have} that this process may use")

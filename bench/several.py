@@ -179,4 +179,4 @@ def _check(avatars: int, views: int, size: str, margins: Sequence[int]) -> None:
     try:
         shape_buckets(size)
     except ValueError as error:
-        raise BadInputError("--size", size, str(error)) from error
+        raise BadInputError.about("--size", error) from error

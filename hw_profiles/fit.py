@@ -9,6 +9,7 @@ The networks are fitted first, each unit alone, then the application on top of t
 from __future__ import annotations
 
 import copy
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -271,7 +272,7 @@ def as_toml(result: Fit, name: str, title: str, extends: str, command: str) -> s
         "# `spread` is what the fit leaves open, as the standard deviation of the logarithm.",
         f'extends = "{extends}"',
         f'name = "{name}"',
-        f'title = "{title}"',
+        f"title = {json.dumps(title)}",
     ]
     section, source = "", command.removeprefix("trilane ")
     for key in sorted(result.numbers, key=lambda k: k.rsplit(".", 1)):
@@ -280,5 +281,7 @@ def as_toml(result: Fit, name: str, title: str, extends: str, command: str) -> s
             lines += ["", f"[{table}]"]
             section = table
         value, spread = result.numbers[key]
-        lines.append(f'{last} = {{ value = {value:.4g}, kind = "fitted", spread = {spread:.2g}, source = "{source}" }}')
+        lines.append(
+            f'{last} = {{ value = {value:.4g}, kind = "fitted", spread = {spread:.2g}, source = {json.dumps(source)} }}'
+        )
     return "\n".join(lines) + "\n"

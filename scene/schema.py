@@ -14,8 +14,11 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validat
 
 MAX_SIDE = 4096
 BUCKET_STEP = 32
+MAX_DEPTH_RATIO = 1e6  # a depth buffer of 24 bits cannot tell apart what is nearer together
+FARTHEST_M = 1e4  # of an avatar from the scene's origin: float32 then still tells millimetres apart
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+Metres = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan=False)]
 Shape = tuple[int, int]
 
 
@@ -75,8 +78,8 @@ class AvatarSpec(Model):
 
     bundle: str = "default"
     motion: str = "builtin:walk-wave-turn"
-    position: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
-    heading_deg: Finite = 0.0
+    position: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
+    heading_deg: float = Field(default=0.0, ge=-3600, le=3600, allow_inf_nan=False)
     up_axis: Literal["auto", "y", "z"] = "auto"
     units: Literal["auto", "m", "cm", "in", "cmu"] = "auto"
     ground: Literal["auto", "sequence", "frame", "none"] = "auto"
@@ -97,8 +100,11 @@ class CameraSpec(Model):
 
     @model_validator(mode="after")
     def _near_before_far(self) -> Self:
-        if self.near_m >= self.far_m:
-            raise ValueError(f"near_m {self.near_m} is not below far_m {self.far_m}")
+        if not self.near_m < self.far_m <= MAX_DEPTH_RATIO * self.near_m:
+            raise ValueError(
+                f"found near_m {self.near_m:g} and far_m {self.far_m:g}, expected near_m below far_m and "
+                f"far_m at most {MAX_DEPTH_RATIO:g} times near_m"
+            )
         return self
 
 
@@ -128,7 +134,7 @@ class Scene(Model):
     `planes`: detected ones, shown over the background. `hud`: frame, rate and age are written on the picture.
     """
 
-    name: str = "scene"
+    name: str = Field(default="scene", min_length=1, max_length=80, pattern=r"^[\w .-]+$")
     fps: float = Field(default=30.0, gt=0, le=1000, allow_inf_nan=False)
     frames: int = Field(default=300, ge=1, le=10_000_000)
     size: Annotated[str, AfterValidator(_checked_size)] = "256"

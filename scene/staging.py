@@ -38,5 +38,6 @@ def stage_scene(scene: Scene, bodies: Sequence[ShapedBody], base: Path) -> Stage
     )
     path = load_camera(scene.camera, base)
     camera = place_camera(path, scene, movers, bodies)
-    notes = [note for mover in movers for note in (*mover.motion.notes, *mover.notes)]
-    return Staged(movers, camera, (*notes, *path.notes, *camera.notes))
+    notes = [f"motion: {note}" for mover in movers for note in (*mover.motion.notes, *mover.notes)]
+    notes += [f"camera: {note}" for note in (*path.notes, *camera.notes)]
+    return Staged(movers, camera, tuple(notes))

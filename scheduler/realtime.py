@@ -224,7 +224,7 @@ class RealtimeDriver:
         if isinstance(message, Alive):
             return Beat(unit)
         if message is None:
-            self._say(f"unit {unit} ended unexpectedly{self._last_words(unit)}")
+            self._say(f"unit {unit} ended unexpectedly and is started again{self._last_words(unit)}")
             return UnitDied(unit)
         return None
 

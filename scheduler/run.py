@@ -129,7 +129,7 @@ def _plan(
         paced = policy_named(policy).paced
         edge_rule(edge)
     except ValueError as error:
-        raise BadInputError("the run's settings", *_split_message(error)) from None
+        raise BadInputError.about("the run's settings", error) from None
     fps = pace_fps or (config.scene.fps if paced else None)
     period_ns = round(1e9 / fps) if fps else 0
     settings = Settings(
@@ -141,11 +141,6 @@ def _plan(
         beats=True,
     )
     return avatar_graph(edge), settings
-
-
-def _split_message(error: ValueError) -> tuple[str, str]:
-    found, _, expected = str(error).removeprefix("found ").partition(", expected ")
-    return found, expected
 
 
 def _spread(frames: int, count: int) -> list[int]:

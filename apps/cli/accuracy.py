@@ -5,12 +5,13 @@ Rule: this module reads options and shows results; every figure comes from `tril
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from trilane.apps.cli.console import JsonOption, print_json, stderr_console, stdout_console
+from trilane.apps.cli.console import JsonOption, print_json, stderr_console, stdout_console, stdout_kept
 
 app = typer.Typer(rich_markup_mode=None, add_completion=False)
 
@@ -55,7 +56,8 @@ def _hard_cases(names: list[str], as_json: bool) -> bool:
 
     console = stderr_console()
     count = len(NETWORKS) * len(INPUTS) * len(names)
-    rows = list(track(hard_cases(names), "hard cases", count, console=console, disable=not console.is_terminal))
+    with stdout_kept():
+        rows = list(track(hard_cases(names), "hard cases", count, console=console, disable=not console.is_terminal))
     if as_json:
         print_json({"schema": 1, "hard_cases": rows})
     else:
@@ -69,7 +71,7 @@ def _scene(scene: str, avatar: str | None, size: str | None, frames: int, names:
 
     config = configure(Request(scene, avatar=avatar, size=size, runtime="ort"), Path.cwd()).config
     machine = required_machine()
-    with stderr_console().status(f"{frames} frames on {', '.join(names)}"):
+    with stderr_console().status(f"{frames} frames on {', '.join(names)}"), stdout_kept():
         result = runtime_differences(config, names, frames)
     if as_json:
         print_json({"schema": 1, **result, "machine": machine})
@@ -79,10 +81,16 @@ def _scene(scene: str, avatar: str | None, size: str | None, frames: int, names:
         stdout_console().print(
             f"of 255, over {len(result['frames'])} frames; bounds: mean {bounds['mean']}, largest {bounds['largest']}"
         )
-    return all(
-        row["mean"] <= result["bounds"]["mean"] and row["largest"] <= result["bounds"]["largest"]
-        for row in result["rows"]
-    )
+    out = [sentence for row in result["rows"] for sentence in _out_of_bounds(row, result["bounds"])]
+    for sentence in out:
+        stderr_console().print(sentence, soft_wrap=True, markup=False)
+    return not out
+
+
+def _out_of_bounds(row: dict[str, Any], bounds: dict[str, float]) -> Iterator[str]:
+    for figure, bound in bounds.items():
+        if row[figure] > bound:
+            yield f"out of bounds: {row['first']} and {row['second']}, {figure} {row[figure]:.3g}, expected {bound:g}"
 
 
 def _print(rows: list[dict[str, Any]], columns: tuple[str, ...]) -> None:

@@ -73,7 +73,7 @@ def network(
     try:
         height, width_px = shape_buckets(size if "x" in size else f"{size}x{size}")[0]
     except ValueError as error:
-        raise BadInputError("--size", size, str(error)) from error
+        raise BadInputError.about("--size", error) from error
     model, parameters = _untrained(encoder, norm, width, channels, (height, width_px), seed)
     _write(model, out)
     settings = {"encoder": encoder, "norm": norm, "width": width, "channels": channels, "size": [height, width_px]}
@@ -147,7 +147,7 @@ def export(
     try:
         chosen = reshaped(whole, *parse_shape(size)) if size else whole
     except ValueError as error:
-        raise BadInputError("--size", size or "", str(error)) from error
+        raise BadInputError.about("--size", error) from error
     with _spinner(f"compiling for {soc}"):
         write_context(chosen, soc, out)
     _show({"file": str(out), "bytes": out.stat().st_size, "soc": soc, "compiler": version()}, json)

@@ -14,7 +14,7 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from trilane.apps.cli.console import JsonOption, print_json, stderr_console, stdout_console
+from trilane.apps.cli.console import JsonOption, print_json, stderr_console, stdout_console, stdout_kept
 
 #: Bench: its module, and the line that `trilane bench --help` shows for it.
 BENCHES = {
@@ -113,8 +113,10 @@ def _type(default: Any) -> Any:
 def show(name: str, measure: Callable[..., Mapping[str, Any]], asked: Mapping[str, Any], as_json: bool) -> None:
     """Run `measure` with the options `asked`; print its result and the machine's facts."""
     from trilane.apps.machine import machine_facts
+    from trilane.bench.limits import check_limits
 
-    with stderr_console().status(f"measuring {name}"):
+    check_limits(asked)
+    with stderr_console().status(f"measuring {name}"), stdout_kept():
         result = dict(measure(**asked))
     document = {"bench": name, **result, "machine": machine_facts(result.get("driver"))}
     if as_json:

@@ -31,10 +31,24 @@ Examples:
 """
 SUSTAINED, BURST = "sustained_high_performance", "burst"
 PLOT_MINUTES = 30.0
+OF_A_FILE = {"encoder", "norm", "size", "channels"}
+#: Option: those that have no effect beside it.
+IGNORED = {
+    "avatar": OF_A_FILE,
+    "network": OF_A_FILE,
+    "table": OF_A_FILE
+    | {"layout", "avatar", "network", "runtime", "minutes", "gpu_share", "governor", "what_if", "plot"},
+}
+WHY_IGNORED = {
+    "avatar": "the avatar's network says so itself",
+    "network": "the file says so itself",
+    "table": "each row says so itself",
+}
 
 
 @app.command(epilog=EPILOG)
 def predict(
+    ctx: typer.Context,
     profile: Annotated[str, typer.Option(help="Hardware profile: a name or a TOML file.")] = "snapdragon-888",
     encoder: Annotated[str, typer.Option(help="resnet18, mobilenetv2, mobilenetv3, efficientnet-lite0")] = "resnet18",
     norm: Annotated[str, typer.Option(help="batch, instance, group")] = "batch",
@@ -72,7 +86,11 @@ def predict(
     from trilane.hw_profiles.load import load_runnable
     from trilane.hw_profiles.predict import predict as predict_one
     from trilane.hw_profiles.predict import what_if as alternatives
+    from trilane.hw_profiles.thermal import GOVERNORS
 
+    _refuse_ignored(ctx)
+    if governor is not None and governor not in GOVERNORS:
+        raise BadInputError("--governor", repr(governor), " or ".join(GOVERNORS))
     chip = load_runnable(profile)
     way = _way(policy, edge, batch)
     if table is not None:
@@ -92,6 +110,16 @@ def predict(
         print_json(answer)
     else:
         _show(answer)
+
+
+def _refuse_ignored(ctx: typer.Context) -> None:
+    """Options that another one leaves without effect."""
+    sources = {name: ctx.get_parameter_source(name) for name in ctx.params}
+    given = {name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"}
+    for option, others in IGNORED.items():
+        if option in given and (useless := given & others):
+            names = ", ".join(sorted(f"--{name.replace('_', '-')}" for name in useless))
+            raise BadInputError("options", f"{names} beside --{option}", "one or the other", WHY_IGNORED[option])
 
 
 def _way(policy: str, edge: str | None, batch: int) -> Way:
@@ -201,8 +229,8 @@ def _show(answer: dict[str, Any]) -> None:
     console.print(f"network alone   {network['alone_ms']:.1f} ms")
     capped = ", held by the display" if answer["display_capped"] else ""
     console.print(
-        f"application     {frame['mean']:.1f} ms ({frame['ema20_min']:.1f} to {frame['ema20_max']:.1f}), "
-        f"{answer['fps']:.1f} fps{capped}"
+        f"application     {frame['mean']:.1f} ms, {answer['fps']:.1f} fps{capped}; averages over 20 frames stray from "
+        f"{frame['ema20_min']:.1f} to {frame['ema20_max']:.1f} ms"
     )
     console.print(f"latency         {answer['latency_ms']['mean']:.1f} ms")
     console.print(f"efficiency      {answer['efficiency']:.2f}")

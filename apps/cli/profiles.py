@@ -5,6 +5,7 @@ Rule: this module reads options and shows results; every figure comes from `tril
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -97,7 +98,7 @@ def check(
         print_json({"valid": list(profiles), "published": [{**one._asdict(), "error": one.error} for one in found]})
         return
     console = stdout_console()
-    console.print(f"{len(profiles)} profiles are valid")
+    console.print(f"{len(profiles)} valid: {', '.join(profiles)}")
     if not found:
         return
     table = Table("profile", "network", "published, ms", "predicted, ms", "error", "")
@@ -122,6 +123,10 @@ def fit(
     """Fit a profile to measured rows; print residuals and the error on rows left out."""
     from trilane.hw_profiles.fit import as_toml, fit_profile
 
+    if not re.fullmatch(r"[\w.-]{1,64}", name):
+        raise BadInputError("--name", repr(name), "letters, digits, dots, hyphens and underscores")
+    if write is not None and not write.absolute().parent.is_dir():
+        raise BadInputError(write, "no such folder", "a place that can be written")
     with stderr_console().status("fitting, each row left out in turn"):
         result = fit_profile(profile, source)
     if json:

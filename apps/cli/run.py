@@ -99,6 +99,8 @@ def _pace(config: RunConfig, profile: str | None, asked: bool, slow_motion: floa
         fix = "give both; `trilane predict --profile` answers without running"
         raise BadInputError("options", found, "both or neither", fix)
     if profile is None:
+        if slow_motion != 1.0:
+            raise BadInputError("options", "--slow-motion without --pace", "--pace and --profile with it")
         return None
     from trilane.apps.pace import pace_of
 

@@ -26,6 +26,12 @@ class BadInputError(TrilaneError):
         self.where, self.found, self.expected, self.fix = str(where), found, expected, fix
         super().__init__(f"{where}: found {found}, expected {expected}" + (f"; {fix}" if fix else ""))
 
+    @classmethod
+    def about(cls, where: str | Path, error: ValueError) -> BadInputError:
+        """Of an `error` whose text is `found A, expected B`."""
+        found, _, expected = str(error).removeprefix("found ").partition(", expected ")
+        return cls(where, found, expected)
+
 
 class UnitLostError(TrilaneError):
     """A unit cannot go on, but a new process in its place can: it ends, and the scheduler restarts it."""

@@ -1,6 +1,7 @@
 """The head-up display: what frame this is, how fast frames come and how old they are, written on the picture.
 
-Rule: figures are this stage's own clock; they are renewed a few times a second, so that they can be read.
+Rule: frame and time are those of the picture; figures of this stage's own clock are renewed a few times a second, so
+that they can be read, and begin anew with the frames.
 """
 
 from __future__ import annotations
@@ -34,15 +35,13 @@ class Hud:
         self._texture = ctx.texture(SIZE, 4)
         self._font = ImageFont.load_default(TEXT_PX)
         self._presented: deque[int] = deque(maxlen=REMEMBERED)
-        self._renewed_ns = 0
+        self._renewed_ns = self._frame = 0
+        self._measured = ""
 
     def draw(self, target: Any, pose: NDArray[np.void]) -> None:
         """Blend the display for the frame that `pose` describes over `target`."""
-        now = time.monotonic_ns()
-        self._presented.append(now)
-        if now - self._renewed_ns >= RENEW_NS:
-            self._renewed_ns = now
-            self._texture.write(hud_picture(hud_lines(pose, list(self._presented)), self._font).tobytes())
+        lines = self._lines(pose, time.monotonic_ns())
+        self._texture.write(hud_picture(lines, self._font).tobytes())
         corner = MARGIN_PX, target.height - MARGIN_PX - SIZE[1]
         self._program["corner"].value = corner
         target.viewport = (*corner, *SIZE)
@@ -52,17 +51,33 @@ class Hud:
         self._screen.render(vertices=3)
         target.viewport = (0, 0, target.width, target.height)
 
+    def _lines(self, pose: NDArray[np.void], now_ns: int) -> list[str]:
+        if int(pose["frame"]) <= self._frame:
+            self._presented.clear()
+            self._renewed_ns = 0
+        self._frame = int(pose["frame"])
+        self._presented.append(now_ns)
+        if now_ns - self._renewed_ns >= RENEW_NS:
+            self._renewed_ns = now_ns
+            self._measured = measured_line(pose, list(self._presented))
+        return hud_lines(pose, self._measured)
 
-def hud_lines(pose: NDArray[np.void], presented_ns: list[int]) -> list[str]:
-    """Three lines; `presented_ns`: when the last frames were composed, the present one last."""
+
+def measured_line(pose: NDArray[np.void], presented_ns: list[int]) -> str:
+    """Rate and age; `presented_ns`: when the last frames were composed, the present one last."""
     span = presented_ns[-1] - presented_ns[0]
     rate = f"{(len(presented_ns) - 1) * 1e9 / span:.1f} fps" if span > 0 else "- fps"
     age_ms = (presented_ns[-1] - int(pose["t_pose_ns"])) / 1e6
+    return f"{rate}   {age_ms:.0f} ms from pose"
+
+
+def hud_lines(pose: NDArray[np.void], measured: str) -> list[str]:
+    """Three lines, `measured` in their middle."""
     height, width = pose["tensor_shape"].tolist()
     visible = int(sum(avatar["visible"] for avatar in pose["avatars"][: int(pose["avatar_count"])]))
     return [
         f"frame {int(pose['frame'])}   {float(pose['media_time_s']):.2f} s",
-        f"{rate}   {age_ms:.0f} ms from pose",
+        measured,
         f"tensor {height}x{width}   {visible} in view",
     ]
 

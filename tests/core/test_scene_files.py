@@ -19,7 +19,10 @@ WRONG = {
     "avatars = []": ("avatars", "found []", "at least 1"),
     "[output]\nwidth = 641": ("output.width", "found 641", "a multiple of 2"),
     "[[avatars]]\nup_axis = 'x'": ("avatars.0.up_axis", "found 'x'", "'auto', 'y' or 'z'"),
-    "[camera]\nnear_m = 5\nfar_m = 1": ("camera", "near_m 5.0", "far_m 1.0"),
+    "[camera]\nnear_m = 5\nfar_m = 1": ("camera", "near_m 5 and far_m 1", "expected near_m below far_m"),
+    "[camera]\nnear_m = 1e-9": ("camera", "far_m 100", "at most 1e+06 times near_m"),
+    "name = '../x'": ("name", "found '../x'"),
+    "[[avatars]]\nposition = [1e5, 0, 0]": ("avatars.0.position.0", "found 100000.0", "less than or equal to 10000"),
     "frames 3": ("", "no valid TOML", "line 1"),
 }
 

@@ -149,9 +149,31 @@ def test_the_display_says_frame_rate_and_age() -> None:
     pose["frame"], pose["media_time_s"], pose["t_pose_ns"] = 12, 0.4, 1_900_000_000
     pose["tensor_shape"], pose["avatar_count"] = (320, 192), 1
     pose["avatars"][0]["visible"] = 1
-    lines = hud.hud_lines(pose, [1_000_000_000, 1_500_000_000, 2_000_000_000])
-    assert lines == ["frame 12   0.40 s", "2.0 fps   100 ms from pose", "tensor 320x192   1 in view"]
-    assert "- fps" in hud.hud_lines(pose, [1])[1]
+    measured = hud.measured_line(pose, [1_000_000_000, 1_500_000_000, 2_000_000_000])
+    assert hud.hud_lines(pose, measured) == [
+        "frame 12   0.40 s",
+        "2.0 fps   100 ms from pose",
+        "tensor 320x192   1 in view",
+    ]
+    assert "- fps" in hud.measured_line(pose, [1])
+
+
+def test_the_displays_frame_is_the_pictures(gl: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames that were measured before a run leave nothing behind."""
+    shown: list[list[str]] = []
+
+    def noted(lines: list[str], _font: Any) -> NDArray[np.uint8]:
+        shown.append(lines)
+        return np.zeros((*hud.SIZE[::-1], 4), np.uint8)
+
+    monkeypatch.setattr(hud, "hud_picture", noted)
+    display, target = hud.Hud(gl), gl.simple_framebuffer((640, 480))
+    pose = packet(0).pose
+    for frame in (7, 8, 0, 1, 2):
+        pose["frame"] = frame
+        display.draw(target, pose)
+    assert [lines[0].split()[1] for lines in shown] == ["7", "8", "0", "1", "2"]
+    assert shown[2][1].startswith("- fps")
 
 
 def test_planes_lie_over_the_room_and_under_the_avatar(gl: Any, person: Any, camera: Camera) -> None:

@@ -107,6 +107,12 @@ OPTIONS = {
     "chip without pace": (["--profile", "snapdragon-888"], "options", "--profile without --pace"),
     "unknown chip": (["--profile", "abacus", "--pace"], "abacus", "expected"),
     "no slow motion": (["--profile", "snapdragon-888", "--pace", "--slow-motion", "0"], "--slow-motion", "found 0"),
+    "slow motion alone": (["--slow-motion", "3"], "options", "--slow-motion without --pace"),
+    "two caps": (
+        ["--profile", "snapdragon-888", "--pace", "--performance-profile", "burst"],
+        "options",
+        "--performance-profile with --pace",
+    ),
     "unknown motion": (["--motion", "builtin:fly"], "motion", "builtin:fly"),
     "unknown camera": (["--camera", "builtin:fly"], "camera", "builtin:fly"),
     "missing background": (["--background", "b.mp4"], "b.mp4", "no such file"),
@@ -178,7 +184,7 @@ def test_a_bad_avatar(
     refused(tmp_path, monkeypatch, capsys, ["--avatar", "avatar"], spoil(tmp_path / "avatar"), said)
 
 
-@pytest.mark.parametrize("place", ["taken", "file/run", "/proc/run"])
+@pytest.mark.parametrize("place", ["taken", "file/run", "/proc/run", "a" * 300])
 def test_a_place_that_cannot_be_written(
     place: str,
     tiny_bundle: Path,

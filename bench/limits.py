@@ -1,0 +1,41 @@
+"""What the options of benches may be. Rule: an option means the same in every bench, so its range stands here once; a
+bench that needs a narrower one says so itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from trilane.errors import BadInputError
+
+#: Option: least and greatest value.
+LIMITS: dict[str, tuple[float, float]] = {
+    "repeats": (1, 100_000),
+    "threads": (0, 1024),
+    "turns": (1, 10_000),
+    "views": (1, 1_000_000),
+    "frames": (1, 10_000_000),
+    "seeds": (1, 1000),
+    "times": (1, 1000),
+    "width": (1, 8192),
+    "height": (1, 8192),
+    "channels": (1, 16),
+    "sizes": (1, 4096),
+    "avatars": (1, 8),
+    "kib": (1, 1 << 20),
+    "minutes": (0.01, 1440),
+    "seconds": (0.05, 86_400),
+    "period": (0.01, 86_400),
+}
+
+
+def check_limits(asked: Mapping[str, Any]) -> None:
+    """Raises BadInputError for a number of `asked` (option: value or values) that is out of its range."""
+    for option, given in asked.items():
+        low, high = LIMITS.get(option, (None, None))
+        if low is None or high is None:
+            continue
+        for value in given if isinstance(given, list | tuple) else (given,):
+            if not isinstance(value, str) and not low <= value <= high:
+                raise BadInputError(f"--{option}", f"{value:g}", f"{low:g} to {high:g}")
