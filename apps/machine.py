@@ -23,7 +23,13 @@ PACKAGES = (
     "numpy", "moderngl", "onnxruntime", "onnx", "pyzmq", "msgpack", "psutil", "rich", "typer", "pydantic", "av",
     "Pillow", "perfetto",
 )  # fmt: skip
-OPTIONAL_PACKAGES = {"openvino": "openvino", "onnxruntime-qnn": "qnn", "torch": "train", "anny": "anny"}
+OPTIONAL_PACKAGES = {
+    "openvino": "openvino",
+    "onnxruntime-qnn": "qnn",
+    "torch": "train",
+    "anny": "anny",
+    "mlcommons-loadgen": "loadgen",
+}
 
 GL_TIMEOUT_S = 30.0
 GL_PROGRAM = "import json, trilane.apps.machine as m; print(json.dumps(m.open_gl()))"

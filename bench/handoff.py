@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -142,6 +143,7 @@ def consume(pipe: Connection, ack: Connection, channel: Channel, cores: tuple[in
 
 @contextmanager
 def _child(pipe: Connection, cores: tuple[int, ...]) -> Iterator[None]:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends it
     os.sched_setaffinity(0, cores)
     try:
         yield

@@ -47,11 +47,29 @@ make_venv() {
   "$python" -m venv --clear .venv || lacks "Python $version could not make .venv" "sudo apt-get install -y python$version-venv"
 }
 
-has_egl() { .venv/bin/python -c 'from trilane.stages.gpu.context import open_context; open_context()' >/dev/null 2>&1; }
+# Exit code 0: a context can be made; 3: it cannot; else the packages themselves do not work.
+try_egl() { .venv/bin/python -c 'import sys
+from trilane.errors import MissingPartError
+from trilane.stages.gpu.context import open_context
+try:
+    open_context()
+except MissingPartError:
+    sys.exit(3)'; }
+has_egl() {
+  local code=0
+  try_egl || code=$?
+  if [ "$code" -ne 0 ] && [ "$code" -ne 3 ]; then
+    lacks "the installed packages do not work (see above)" "make clean, then make again"
+  fi
+  [ "$code" -eq 0 ]
+}
+has_pip() { .venv/bin/python -m pip --version >/dev/null 2>&1; }
 
-is_new_enough .venv/bin/python || make_venv
-say "installing packages (${extras:-no extras})"
-.venv/bin/python -m pip install --quiet --disable-pip-version-check --editable ".${extras:+[$extras]}"
+{ is_new_enough .venv/bin/python && has_pip; } || make_venv
+say "installing packages (${extras:-no extras}); the first time takes a minute or more, and up to 1 GB"
+.venv/bin/python -m pip install --quiet --disable-pip-version-check --editable ".${extras:+[$extras]}" ||
+  lacks "pip could not install the packages (see above): no network, or no wheel for this Python and machine" \
+    ".venv/bin/python -m pip install --editable '.[$extras]'"
 if ! has_egl; then
   apt_or_lacks "no OpenGL 3.3 context can be made through EGL" libegl1 libgl1-mesa-dri
   has_egl || lacks "EGL and Mesa are installed, yet no OpenGL 3.3 context can be made; see: .venv/bin/trilane doctor" \

@@ -117,11 +117,20 @@ def _shares(share: Mapping[str, Any] | None) -> str:
 def _time_rows(runs: list[Run]) -> Rows:
     for key, name in (("frame_time_ms", "frame time"), ("latency_ms", "latency")):
         for measure in PERCENTILES:
-            yield name if measure == "mean" else "", f"{measure}, ms", [_number(run[key].get(measure)) for run in runs]
+            yield (
+                name if measure == "mean" else "",
+                f"{measure}, ms",
+                [_number(_of_several(run, run[key].get(measure))) for run in runs],
+            )
+
+
+def _of_several(run: Run, value: float | None) -> float | None:
+    """A time between frames, or a latency, needs two frames to be a statistic."""
+    return value if run["frames"]["presented"] > 1 else None
 
 
 def _rate_rows(runs: list[Run]) -> Rows:
-    yield "rate", "frames per second", [_number(run["fps"]) for run in runs]
+    yield "rate", "frames per second", [_number(_of_several(run, run["fps"])) for run in runs]
     yield "efficiency", "slowest unit alone / frame time", [_number(run["efficiency"], 2) for run in runs]
     yield (
         "frames",
