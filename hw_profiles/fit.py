@@ -153,8 +153,8 @@ def measurements(rows: Sequence[Row], step: Step) -> list[Measurement]:
             if column.startswith("bench"):
                 value = row.number(column)
             else:
-                ends = row.number(f"{column}_min"), row.number(f"{column}_max")
-                value = (ends[0] + ends[1]) / 2 if ends[0] and ends[1] else None
+                ends = row.range(column)
+                value = sum(ends) / 2 if ends else None
             if value is not None:
                 found.append(Measurement(row, column, value))
     return found
@@ -214,9 +214,8 @@ def _from_residuals(residuals: Sequence[Residual], rows: Sequence[Row]) -> dict[
     ranges = []
     for row in rows:
         for column in ("app_dsp_ms", "app_gpu_ms"):
-            low, high = row.number(f"{column}_min"), row.number(f"{column}_max")
-            if low and high:
-                ranges.append((high - low) / (high + low))
+            if ends := row.range(column):
+                ranges.append((ends[1] - ends[0]) / sum(ends))
     numbers["application.ema20_half_range_fraction"] = (median(ranges), 1.0)
     return numbers
 

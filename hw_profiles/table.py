@@ -36,6 +36,15 @@ class Row:
             raise BadInputError(f"{self.place}: {column}", repr(text), "a number above 0, or nothing")
         return value
 
+    def range(self, column: str) -> tuple[float, float] | None:
+        """What `column`_min and `column`_max say; None when one of them is blank. Raises BadInputError."""
+        low, high = self.number(f"{column}_min"), self.number(f"{column}_max")
+        if low is None or high is None:
+            return None
+        if low > high:
+            raise BadInputError(f"{self.place}: {column}_min", f"{low:g}", f"at most {column}_max, which is {high:g}")
+        return low, high
+
 
 def read_table(path: Path) -> list[Row]:
     """The rows of `path`. Raises BadInputError."""

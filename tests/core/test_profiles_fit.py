@@ -135,3 +135,13 @@ def test_a_bad_table_is_named_with_its_line(text: str, word: str, tmp_path: Path
     with pytest.raises(BadInputError, match=word):
         for row in read_table(path):
             row.number("bench_dsp_ms")
+
+
+def test_a_range_that_ends_before_it_begins_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "rows.csv"
+    path.write_text(
+        "encoder,norm,size,channels,layout,app_dsp_ms_min,app_dsp_ms_max\nresnet18,batch,256,8,packed,57,55\n"
+    )
+    (row,) = read_table(path)
+    with pytest.raises(BadInputError, match=r"line 2: app_dsp_ms_min: found 57, expected at most app_dsp_ms_max"):
+        row.range("app_dsp_ms")
