@@ -211,11 +211,8 @@ def _from_residuals(residuals: Sequence[Residual], rows: Sequence[Row]) -> dict[
     for unit in ("dsp", "gpu"):
         errors = [abs(r.left_out_error) for r in residuals if r.column == f"bench_{unit}_ms"]
         numbers[f"units.{unit}.model_error_fraction"] = (NORMAL_OVER_MEDIAN * median(errors), 0.5)
-    ranges = []
-    for row in rows:
-        for column in ("app_dsp_ms", "app_gpu_ms"):
-            if ends := row.range(column):
-                ranges.append((ends[1] - ends[0]) / sum(ends))
+    found = [row.range(column) for row in rows for column in ("app_dsp_ms", "app_gpu_ms")]
+    ranges = [(ends[1] - ends[0]) / sum(ends) for ends in found if ends]
     numbers["application.ema20_half_range_fraction"] = (median(ranges), 1.0)
     return numbers
 
