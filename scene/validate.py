@@ -21,6 +21,15 @@ OWN = "Value error, "
 INPUT_SHOULD = "Input should be "
 ENDING = ".toml"
 LONGEST_FOUND = 80
+#: Kind of complaint: what was expected, where the schema's own words are not for people.
+EXPECTED = {
+    "too_short": "at least {min_length} of them",
+    "too_long": "at most {max_length} of them",
+    "model_type": "a table",
+    "model_attributes_type": "a table",
+    "tuple_type": "a list",
+    "string_pattern_mismatch": "letters, digits, spaces, dots, hyphens and underscores",
+}
 BUILT_IN_PREFIX = "builtin:"
 BUILT_IN = ("room", "default")  # a background, an avatar
 
@@ -40,7 +49,8 @@ def bad_input(where: str | Path, error: ValidationError) -> BadInputError:
         own_found, _, expected = message.removeprefix(OWN).removeprefix("found ").partition(", expected ")
         return BadInputError(place, own_found if expected else found, expected or own_found)
     short = found if len(found) <= LONGEST_FOUND else found[:LONGEST_FOUND] + "..."
-    return BadInputError(place, short, message.removeprefix(INPUT_SHOULD))
+    expected = EXPECTED.get(first["type"], "").format(**first.get("ctx", {}))
+    return BadInputError(place, short, expected or message.removeprefix(INPUT_SHOULD))
 
 
 def scene_from(where: str | Path, values: Mapping[str, Any]) -> Scene:
@@ -90,5 +100,10 @@ def load_scene(path: Path) -> dict[str, Any]:
 
 
 def located(source: str, base: Path) -> str:
-    """`source` as it is when it names something built in, else as a path that starts at `base`."""
+    """`source` as it is when it names something built in, else as a path that starts at `base`.
+
+    Raises BadInputError for no name at all.
+    """
+    if not source:
+        raise BadInputError("name of a file", "nothing", "a path, or the name of something built in")
     return source if source in BUILT_IN or source.startswith(BUILT_IN_PREFIX) else str(base / source)

@@ -113,6 +113,7 @@ OPTIONS = {
         "options",
         "--performance-profile with --pace",
     ),
+    "no motion": (["--motion", ""], "name of a file", "found nothing"),
     "unknown motion": (["--motion", "builtin:fly"], "motion", "builtin:fly"),
     "unknown camera": (["--camera", "builtin:fly"], "camera", "builtin:fly"),
     "missing background": (["--background", "b.mp4"], "b.mp4", "no such file"),
