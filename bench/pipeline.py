@@ -60,8 +60,9 @@ def measure(
     Rows, medians over the turns: `frame_ms`, `fps`, `efficiency` (slowest unit alone / frame time), `slowest` and
     `alone_ms` (that unit's stages alone), `busiest` unit, its `idle` from its first job's begin to its last one's end
     and the causes: `starved` (no input), `undispatched` (input, but no free slot, or not told yet), `overhead` (told,
-    but not begun); `gain` over `sequential` in the same turn, `bound` sum(t) / max(t) of the units alone, and
-    `gain_of_bound`. `dropped`, `lost`: frames of all turns. `accuracy`: what the avatar's pictures are worth.
+    but not begun); `gain` over `sequential` in the same turn, `bound` sum(t) / max(t): stages in turn, as a sequential
+    run does them, over the slowest unit's stages repeated, as a pipelined run does them, and `gain_of_bound`.
+    `dropped`, `lost`: frames of all turns. `accuracy`: what the avatar's pictures are worth.
     `no_video`: present nothing. Raises BadInputError, MissingPartError, TrilaneError when a run fails.
     """
     if frames < MIN_FRAMES or turns < 1:
@@ -136,7 +137,7 @@ def _run(config: RunConfig, plan: Setting, base: dict[str, Any]) -> dict[str, An
 
 def _figures(result: RunResult) -> dict[str, Any]:
     report = result.report
-    alone = alone_by_unit(report)
+    alone = by_unit(report, "isolated_ms")
     slowest = max(alone, key=alone.__getitem__)
     busiest = max(report["units"], key=lambda unit: float(report["units"][unit]["busy"]))
     return {
@@ -145,7 +146,7 @@ def _figures(result: RunResult) -> dict[str, Any]:
         "efficiency": report["efficiency"],
         "slowest": slowest,
         "alone_ms": alone[slowest],
-        "bound": sum(alone.values()) / alone[slowest],
+        "bound": sum(by_unit(report, "in_turn_ms").values()) / alone[slowest],
         "busiest": busiest,
         **idle_between_jobs([job for job in result.jobs if job.unit == busiest]),
         "in_run_over_alone": _in_run(report, slowest) / alone[slowest],
@@ -154,11 +155,11 @@ def _figures(result: RunResult) -> dict[str, Any]:
     }
 
 
-def alone_by_unit(report: dict[str, Any]) -> dict[str, float]:
-    """Milliseconds of each unit for a frame, its stages alone; the last stage is never run alone: as in the run."""
+def by_unit(report: dict[str, Any], times_of: str) -> dict[str, float]:
+    """Milliseconds of each unit for a frame: its stages' `times_of`; the last one is never run alone: as in the run."""
     times = dict.fromkeys(report["units"], 0.0)
     for name, stage in report["stages"].items():
-        times[stage["unit"]] += report["isolated_ms"].get(name, stage["service_ms"]["mean"])
+        times[stage["unit"]] += report[times_of].get(name, stage["service_ms"]["mean"])
     return times
 
 

@@ -87,6 +87,7 @@ class RealtimeDriver:
         self._graph, self._processes, self._interrupts = graph, processes, interrupts
         self._on_progress, self._on_message = on_progress, on_message
         self._alone: dict[str, list[float]] = defaultdict(list)
+        self._in_turn: dict[str, list[float]] = defaultdict(list)
         self._open: dict[int, tuple[Job, int]] = {}
         self._started_s: dict[str, float] = {}
         self._progress_s = 0.0
@@ -116,16 +117,17 @@ class RealtimeDriver:
     def measure_alone(self, frames: list[int]) -> None:
         """Note the service time of each stage but the last (it writes files), the other units quiet.
 
-        Each of `frames` goes down the chain through the first slot of every edge; then each unit repeats its stages
-        in turn, as it meets them in a run. Raises UnitError when a stage fails.
+        Each of `frames` goes down the chain through the first slot of every edge, so that each stage comes after those
+        of other units, as in a sequential run; then each unit repeats its stages in turn, as it meets them in a
+        pipelined one. Raises UnitError when a stage fails.
         """
         end = time.monotonic() + ISOLATE_LIMIT_S
         chain = self._graph.stages[:-1]
         for frame in frames:
             if frame != frames[0] and time.monotonic() > end:
                 break
-            for position in range(len(chain)):
-                self._isolated(position, frame)
+            for position, stage in enumerate(chain):
+                self._in_turn[stage.name].append(self._isolated(position, frame))
             for unit in self._graph.units:
                 own = [position for position, stage in enumerate(chain) if stage.unit == unit]
                 rounds = [[self._isolated(position, frame) for position in own] for _ in range(REPEATS)]
@@ -152,6 +154,11 @@ class RealtimeDriver:
     def alone_ns(self) -> dict[str, float]:
         """Mean service time in ns of each stage measured alone."""
         return {name: fmean(values) for name, values in self._alone.items()}
+
+    @property
+    def in_turn_ns(self) -> dict[str, float]:
+        """Mean service time in ns of each stage when a frame goes down the chain alone; the first one warmed up."""
+        return {name: fmean(values[1:] or values) for name, values in self._in_turn.items()}
 
     def _duration(self, unit: str) -> int:
         end = time.monotonic() + START_S

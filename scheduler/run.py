@@ -92,6 +92,7 @@ def run_pipeline(
         isolated_ns=driver.alone_ns if isolate_frames else None,
     )
     report.update(policy=policy, edge=edge, **(governor.report() if governor is not None else {}))
+    report["in_turn_ms"] = {stage: ns / 1e6 for stage, ns in driver.in_turn_ns.items()} if isolate_frames else {}
     for unit, row in report["units"].items():
         row.update(pid=pids[unit], **config.units[unit].model_dump(mode="json"))
     return RunResult(
