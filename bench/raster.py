@@ -46,9 +46,11 @@ def measure(size: int = 512, channels: int = 16, repeats: int = 40, threads: int
         "split": split_way(ctx, subject, (size, size)),
     }
     tensors = {name: np.zeros(size * size * channels, np.uint8) for name in ways}
-    turns = {name: partial(way, tensors[name]) for name, way in ways.items()}
+    turns: dict[str, Callable[[], object]] = {name: partial(way, tensors[name]) for name, way in ways.items()}
     skinned = np.zeros_like(tensors["packed"])
-    turns["skinned by the CPU unit, packed"] = partial(posed_way(ctx, subject, (size, size), deferred), skinned)
+    skin, draw = posed_ways(ctx, subject, (size, size), deferred)
+    turns["CPU unit skins: packed"] = partial(draw, skinned)
+    turns["CPU unit skins: skinning"] = skin
     turns["UV bytes alone"] = partial(uv_way(ctx, subject, (size, size)), np.zeros(size * size * 2, np.uint8))
     times = interleaved(turns, repeats)
     _check_equal(tensors)
@@ -78,20 +80,25 @@ def packed_way(ctx: Any, subject: Subject, shape: tuple[int, int], deferred: boo
     return turn
 
 
-def posed_way(ctx: Any, subject: Subject, shape: tuple[int, int], deferred: bool) -> Callable[[Any], None]:
-    """A function that skins `subject` as the CPU unit does, then draws it packed: the time of both."""
+def posed_ways(
+    ctx: Any, subject: Subject, shape: tuple[int, int], deferred: bool
+) -> tuple[Callable[[], None], Callable[[Any], None]]:
+    """A function that skins `subject` as the CPU unit does, and one that draws what was skinned, packed."""
     packed = PackedPass(ctx, subject.texture.shape[2], ENCODING, deferred)
     avatar = PackedAvatar(packed, PosedMesh(ctx, subject.arrays), subject.texture)
     skinner = FrameSkinner(subject.shaped)
     vertices = np.empty((len(subject.shaped.vertices), 3), np.float32)
     placement = Placement(subject.joints, subject.projection, (0, 0, *shape), vertices=vertices)
 
-    def turn(tensor: Any) -> None:
+    def skin() -> None:
         skinner.skin_into(subject.posed, vertices)
+
+    def draw(tensor: Any) -> None:
         avatar.draw(packed.begin(shape), subject.view, placement)
         packed.read_into(shape, tensor)
 
-    return turn
+    skin()
+    return skin, draw
 
 
 def split_way(ctx: Any, subject: Subject, shape: tuple[int, int]) -> Callable[[Any], None]:

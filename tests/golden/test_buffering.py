@@ -60,7 +60,8 @@ def test_raster_bench_compares_equal_bytes() -> None:
         "packed, other way",
         "split",
         "UV bytes alone",
-        "skinned by the CPU unit, packed",
+        "CPU unit skins: packed",
+        "CPU unit skins: skinning",
     }
 
 
