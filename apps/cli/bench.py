@@ -41,6 +41,9 @@ BENCHES = {
     "joints": ("trilane.bench.joints", "What the joint transforms of a frame cost."),
 }
 
+#: A table with more of them lies on its side.
+MOST_COLUMNS = 9
+
 EPILOG = """\b
 Examples:
   trilane bench raster --size 512 --channels 16 --json
@@ -144,6 +147,11 @@ def _table(rows: list[dict[str, Any]]) -> Any:
     from rich.table import Table
 
     columns = list(dict.fromkeys(key for row in rows for key in row))
+    if len(columns) > MOST_COLUMNS:
+        lying = Table(*([""] * (len(rows) + 1)), show_header=False)
+        for column in columns:
+            lying.add_row(column, *(_text(row.get(column, "")) for row in rows))
+        return lying
     table = Table(*columns)
     for row in rows:
         table.add_row(*(_text(row.get(column, "")) for column in columns))
