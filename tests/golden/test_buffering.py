@@ -55,6 +55,7 @@ def test_raster_bench_compares_equal_bytes() -> None:
     found = raster.measure(size=96, channels=8, repeats=2)
     assert found["ratios"]["split_over_packed"] == found["split_ms"] / found["packed_ms"]
     assert 0.05 < found["covered"] < 0.5
+    assert found["raster_ms"] in [row["median_ms"] for row in found["rows"]]
     assert {row["way"] for row in found["rows"]} == {
         "packed",
         "packed, other way",
