@@ -36,6 +36,7 @@ Examples:
   trilane avatar quantize float.onnx --frames frames.npy --out network.onnx
   trilane avatar quantize float.onnx --frames frames.npy --method entropy --count 20 --report report.json --out q.onnx
 """
+EPILOG_CALIBRATIONS = "\b\nExamples:\n  trilane avatar calibrations float.onnx --frames frames.npy --method minmax"
 EPILOG_EXPORT = "\b\nExamples:\n  trilane avatar export default --qnn --soc sm8350 --out avatar_ctx.onnx"
 MAX_FRAMES = 1000
 
@@ -119,6 +120,38 @@ def quantize(
         _write_text(report, facts["layers"])
     _write(result.network.model, out)
     _show(facts, json)
+
+
+@app.command(epilog=EPILOG_CALIBRATIONS)
+def calibrations(
+    source: Annotated[Path, typer.Argument(help="Float network (.onnx) with the input N x C x H x W.")],
+    frames: Annotated[Path, typer.Option(help="Real inputs: .npy (N, H, W, C) float; the last 5 are judged.")],
+    method: Annotated[
+        list[str] | None, typer.Option(help="minmax, percentile or entropy; repeat it. All if none.")
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Compare numbers of calibration frames and methods by the error of the picture."""
+    from rich.progress import track
+    from rich.table import Table
+
+    from trilane.avatars.calibration import METHODS
+    from trilane.avatars.calibration_table import COUNTS, calibration_table
+    from trilane.avatars.network_file import parse_network
+
+    methods = method or list(METHODS)
+    console = stderr_console()
+    found = calibration_table(parse_network(source), _frames(frames), methods)
+    steps = len(methods) * len(COUNTS)
+    rows = list(track(found, "quantising", steps, console=console, disable=not console.is_terminal))
+    if json:
+        print_json({"rows": rows})
+        return
+    table = Table("method", "frames", "PSNR to float, dB", "mean, of 255", "largest")
+    for row in rows:
+        figures = (f"{row['psnr_db']:.2f}", f"{row['mean']:.2f}", f"{row['largest']:.0f}")
+        table.add_row(row["method"], str(row["count"]), *figures)
+    stdout_console().print(table)
 
 
 @app.command(epilog=EPILOG_EXPORT)

@@ -54,6 +54,21 @@ def test_quantize_writes_a_network_and_a_report(files):
     assert 10 < layers[0]["sqnr_db"] <= layers[-1]["sqnr_db"] < 80
 
 
+def test_calibrations_are_compared_on_frames_that_none_was_calibrated_on(files, tiny_frames):
+    np.save(files / "many.npy", np.stack([*tiny_frames] * 6)[:16])
+    rows = call("calibrations", files / "float.onnx", "--frames", files / "many.npy", "--method", "minmax")["rows"]
+    assert [(row["method"], row["count"]) for row in rows] == [("minmax", 5), ("minmax", 10)]
+    for row in rows:
+        assert 30 < row["psnr_db"] < 80
+        assert 0 < row["mean"] < 8 <= row["largest"] <= 255
+
+
+def test_too_few_frames_to_compare_are_refused(files):
+    np.save(files / "few.npy", np.zeros((9, 64, 64, 5), np.float32))
+    with pytest.raises(BadInputError, match="found 9 of them, expected at least 10"):
+        call("calibrations", files / "float.onnx", "--frames", files / "few.npy")
+
+
 def test_equalised_networks_compute_the_same(tiny_float, tiny_frames):
     import onnxruntime
 
