@@ -17,7 +17,9 @@ import pytest
 from trilane.apps.configure import Request, configure
 from trilane.apps.pace import Pace, compare
 from trilane.errors import BadInputError, TrilaneError
+from trilane.hw_profiles.load import load_runnable
 from trilane.scene.schema import RunConfig
+from trilane.scheduler.governor import Governor
 from trilane.scheduler.record import replay
 from trilane.scheduler.result import RunResult
 from trilane.scheduler.run import run_pipeline
@@ -129,6 +131,29 @@ def test_a_job_that_never_ends_ends_the_run_after_some_restarts(mock_config: Con
     assert dict(result.lost) == {"hung:gpu": 1}
     assert result.presented == 7
     check_accounts(result)
+
+
+def test_a_cap_holds_every_unit_and_says_so(mock_config: Configure) -> None:
+    """Half of the time at most, whatever the jobs ask for; the recording with the cap's events replays."""
+    free = run_pipeline(mock_config(60, infer=10), isolate_frames=0)
+    capped = run_pipeline(
+        mock_config(60, infer=10), isolate_frames=0, governor=Governor(load_runnable("host"), "power_saver")
+    )
+    check_accounts(capped)
+    assert capped.report["fps"] < 0.7 * free.report["fps"]
+    assert capped.report["units"]["dsp"]["idle"]["throttled"] > 0.2
+    assert capped.report["caps"]["performance_profile"] == "power_saver"
+    assert capped.report["caps"]["units"]["dsp"]["duty"] < 0.5
+
+
+def test_late_poses_arrive_and_are_newer(mock_config: Configure) -> None:
+    early, late = (
+        run_pipeline(mock_config(80, pose=2, raster=5, infer=10), isolate_frames=0, latch_ms=latch_ms)
+        for latch_ms in (0, 4)
+    )
+    check_accounts(late)
+    assert late.presented == 80
+    assert late.report["latency_ms"]["p50"] < early.report["latency_ms"]["p50"]
 
 
 def test_a_lost_context_costs_a_restart_and_a_frame(tmp_path: Path) -> None:
