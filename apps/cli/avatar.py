@@ -37,6 +37,11 @@ Examples:
   trilane avatar quantize float.onnx --frames frames.npy --method entropy --count 20 --report report.json --out q.onnx
 """
 EPILOG_CALIBRATIONS = "\b\nExamples:\n  trilane avatar calibrations float.onnx --frames frames.npy --method minmax"
+EPILOG_SPLIT = """\b
+Examples:
+  trilane avatar split default
+  trilane avatar split default --at /Concat_4_output_0_QuantizeLinear_Output --out parts
+"""
 EPILOG_EXPORT = "\b\nExamples:\n  trilane avatar export default --qnn --soc sm8350 --out avatar_ctx.onnx"
 MAX_FRAMES = 1000
 
@@ -151,6 +156,50 @@ def calibrations(
     for row in rows:
         figures = (f"{row['psnr_db']:.2f}", f"{row['mean']:.2f}", f"{row['largest']:.0f}")
         table.add_row(row["method"], str(row["count"]), *figures)
+    stdout_console().print(table)
+
+
+@app.command(epilog=EPILOG_SPLIT)
+def split(
+    name: Annotated[str, typer.Argument(help="`default` or a bundle's folder.")],
+    at: Annotated[str | None, typer.Option(help="Quantised tensor to cut at; all are listed if not given.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder to write head.onnx and tail.onnx to.")] = None,
+    size: Annotated[str, typer.Option(help="Tensor: one side, or HEIGHTxWIDTH.")] = "256",
+    json: JsonOption = False,
+) -> None:
+    """Cut an avatar's network in two; the parts one after the other give the same bytes."""
+    from rich.table import Table
+
+    from trilane.avatars.bundle import load_bundle
+    from trilane.avatars.reshape import reshaped
+    from trilane.avatars.split import cuts
+    from trilane.avatars.split import split as cut_at
+    from trilane.scene.schema import parse_shape
+
+    if (at is None) != (out is None):
+        raise BadInputError("options", "--at without --out" if at else "--out without --at", "both, or neither")
+    try:
+        height, width = parse_shape(size if "x" in size else f"{size}x{size}")
+    except ValueError as error:
+        raise BadInputError.about("--size", error) from error
+    whole = reshaped(load_bundle(name).read_network(), height, width)
+    if at is not None and out is not None:
+        head, tail = cut_at(whole, at)
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise BadInputError(out, (error.strerror or str(error)).lower(), "a folder that can be written") from None
+        for part, model in (("head.onnx", head), ("tail.onnx", tail)):
+            _write(model, out / part)
+        _show({"head": str(out / "head.onnx"), "tail": str(out / "tail.onnx"), "at": at}, json)
+        return
+    rows = [{"at": cut.at, "tensors": len(cut.crossing), "bytes": cut.bytes} for cut in cuts(whole)]
+    if json:
+        print_json({"cuts": rows})
+        return
+    table = Table("cut at", "tensors that cross", "bytes")
+    for row in rows:
+        table.add_row(*map(str, row.values()))
     stdout_console().print(table)
 
 

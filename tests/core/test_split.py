@@ -1,0 +1,76 @@
+"""A network in two parts: at every place where it can be cut, the parts give the bytes of the whole."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+from typer.testing import CliRunner
+
+from trilane.apps.cli.avatar import app
+from trilane.avatars.bundle import load_bundle
+from trilane.avatars.network_file import NetworkFile
+from trilane.avatars.split import cuts, split
+from trilane.errors import BadInputError
+
+QUIET = 3
+
+
+def run(model: onnx.ModelProto, known: dict[str, Any]) -> dict[str, Any]:
+    """`known` and what `model` makes of it."""
+    settings = onnxruntime.SessionOptions()
+    settings.log_severity_level = QUIET
+    session = onnxruntime.InferenceSession(model.SerializeToString(), settings, providers=["CPUExecutionProvider"])
+    values = session.run(None, {value.name: known[value.name] for value in session.get_inputs()})
+    return known | dict(zip([value.name for value in session.get_outputs()], values, strict=True))
+
+
+@pytest.fixture(scope="module")
+def network(tiny_quantised: Any) -> NetworkFile:
+    return tiny_quantised.network
+
+
+def test_parts_give_the_bytes_of_the_whole_wherever_it_is_cut(network: NetworkFile) -> None:
+    tensor = np.random.default_rng(0).integers(0, 256, network.shape, dtype=np.uint8)
+    given = {network.model.graph.input[0].name: tensor}
+    output = network.model.graph.output[0].name
+    whole = run(network.model, given)[output]
+    found = list(cuts(network))
+    assert len(found) >= 3
+    for cut in found:
+        head, tail = split(network, cut.at)
+        kinds = {value.type.tensor_type.elem_type for value in (*head.graph.output, *tail.graph.input)}
+        assert kinds == {onnx.TensorProto.UINT8}
+        assert (run(tail, run(head, given))[output] == whole).all()
+        assert cut.bytes == sum(np.prod(shape) for shape in cut.crossing.values())
+
+
+def test_the_default_avatar_can_be_cut_at_its_skips() -> None:
+    found = list(cuts(load_bundle("default").read_network()))
+    assert len(found) > 40
+    assert max(len(cut.crossing) for cut in found) >= 6
+
+
+def test_a_place_that_is_none_is_refused(network: NetworkFile) -> None:
+    with pytest.raises(BadInputError, match="'nowhere', expected a quantised tensor"):
+        split(network, "nowhere")
+
+
+def test_the_command_lists_places_and_writes_parts(tmp_path: Path, tiny_bundle: Path) -> None:
+    listed = CliRunner().invoke(app, ["split", str(tiny_bundle), "--size", "64", "--json"])
+    places = [row["at"] for row in json.loads(listed.stdout)["cuts"]]
+    written = CliRunner().invoke(
+        app, ["split", str(tiny_bundle), "--size", "64", "--at", places[0], "--out", str(tmp_path / "parts"), "--json"]
+    )
+    assert written.exit_code == 0
+    assert {path.name for path in (tmp_path / "parts").iterdir()} == {"head.onnx", "tail.onnx"}
+
+
+def test_half_of_the_options_is_refused(tiny_bundle: Path) -> None:
+    with pytest.raises(BadInputError, match="--at without --out"):
+        raise CliRunner().invoke(app, ["split", str(tiny_bundle), "--at", "x"]).exception or AssertionError
