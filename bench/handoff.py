@@ -86,8 +86,12 @@ class Pair:
             process.start()
         for pipe in (*theirs, *between):
             pipe.close()
-        for pipe in self._pipes:
-            _answer(pipe)
+        try:
+            for pipe in self._pipes:
+                _answer(pipe)
+        except BaseException:
+            self.close()
+            raise
 
     def run(self, frames: int) -> Times:
         """Microseconds from written to readable, and to all read, of `frames` hand-overs."""

@@ -6,9 +6,12 @@ Rule: `Producer.buffer` is filled before the clock starts; `Consumer.receive` re
 from __future__ import annotations
 
 import os
+import shutil
+import tempfile
 from collections.abc import Callable
 from multiprocessing.context import SpawnContext
 from multiprocessing.queues import Queue
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -26,6 +29,7 @@ from trilane.transport.wakeup import UNIT_NS, use_slice
 U8 = NDArray[np.uint8]
 SLOTS = 2
 WAIT_MS = 60_000
+SHM = Path("/dev/shm")  # noqa: S108 - what iceoryx2 leaves there under our prefix is removed
 
 
 class Producer(Protocol):
@@ -193,38 +197,50 @@ class _ZmqEnd:
 
 
 class IceoryxChannel:
-    """iceoryx2: a loaned sample is written in place and sent, an event wakes the other end. Nothing is copied."""
+    """iceoryx2: a loaned sample is written in place and sent, an event wakes the other end. Nothing is copied.
+
+    It keeps some files for the next program of the user; here they have a folder and a prefix of their own, and go.
+    Both are short, because the path of a Unix socket is.
+    """
 
     def __init__(self, size: int, _context: SpawnContext) -> None:
         import iceoryx2  # noqa: F401 - says here, in the parent, that it is not installed
 
-        self._size, self._name = size, f"trilane/handoff/{os.getpid()}/{size}"
+        self._size = size
+        self._folder = tempfile.mkdtemp(prefix="iox-", dir="/tmp")
+        self._prefix = f"{Path(self._folder).name}_"
 
     def producer(self) -> Producer:
-        return _IceoryxProducer(self._name, self._size)
+        return _IceoryxProducer(self._folder, self._prefix, self._size)
 
     def consumer(self) -> Consumer:
-        return _IceoryxConsumer(self._name)
+        return _IceoryxConsumer(self._folder, self._prefix)
 
     def close(self) -> None:
-        """Its services go with the children."""
+        """After the children have ended: nothing of theirs is left."""
+        shutil.rmtree(self._folder, ignore_errors=True)
+        for left in SHM.glob(f"{self._prefix}*"):
+            left.unlink(missing_ok=True)
 
 
-def _iceoryx_services(name: str) -> tuple[Any, Any, Any]:
+def _iceoryx_services(folder: str, prefix: str) -> tuple[Any, Any, Any]:
     import ctypes
 
     import iceoryx2 as iox
 
     iox.set_log_level(iox.LogLevel.Error)
-    node = iox.NodeBuilder.new().create(iox.ServiceType.Ipc)
-    service = iox.ServiceName.new(name)
+    config = iox.config.default()
+    config.global_cfg.root_path = iox.Path.new(folder)
+    config.global_cfg.prefix = iox.FileName.new(prefix)
+    node = iox.NodeBuilder.new().config(config).create(iox.ServiceType.Ipc)
+    service = iox.ServiceName.new("trilane/handoff")
     samples = node.service_builder(service).publish_subscribe(iox.Slice[ctypes.c_uint8]).open_or_create()
     return node, samples, node.service_builder(service).event().open_or_create()
 
 
 class _IceoryxProducer:
-    def __init__(self, name: str, size: int) -> None:
-        self._node, samples, event = _iceoryx_services(name)
+    def __init__(self, folder: str, prefix: str, size: int) -> None:
+        self._node, samples, event = _iceoryx_services(folder, prefix)
         self._publisher = samples.publisher_builder().initial_max_slice_len(size).create()
         self._notifier = event.notifier_builder().create()
         self._size = size
@@ -240,8 +256,8 @@ class _IceoryxProducer:
 
 
 class _IceoryxConsumer:
-    def __init__(self, name: str) -> None:
-        self._node, samples, event = _iceoryx_services(name)
+    def __init__(self, folder: str, prefix: str) -> None:
+        self._node, samples, event = _iceoryx_services(folder, prefix)
         self._subscriber = samples.subscriber_builder().create()
         self._listener = event.listener_builder().create()
         self._sample: Any = None

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from trilane.bench import handoff, pipeline, scheduler
+from trilane.bench import handoff, handoff_ways, pipeline, scheduler
 from trilane.errors import BadInputError
 from trilane.scheduler.result import JobRecord
 
@@ -50,7 +50,13 @@ def test_a_pipeline_that_cannot_be_measured_is_refused(asked: dict[str, object])
         pipeline.measure(**asked)  # type: ignore[arg-type]
 
 
+def peers_files() -> set[Path]:
+    """What iceoryx2 keeps in memory and on disk."""
+    return {*handoff_ways.SHM.glob("io*"), *Path("/tmp").glob("io*")}  # noqa: S108 - looked at
+
+
 def test_every_way_hands_over_the_same_bytes() -> None:
+    before = peers_files()
     result = handoff.measure(kib=(256,), frames=10, turns=1)
     ways = {row["way"] for row in result["rows"]}
     assert {"slot", handoff.PIPELINE, "pickled queue"} <= ways
@@ -59,6 +65,7 @@ def test_every_way_hands_over_the_same_bytes() -> None:
         assert row["frames"] == 10
         assert 0 < row["p50_us"] <= row["p99_us"] <= row["max_us"]
         assert row["read_p50_us"] > row["p50_us"]
+    assert peers_files() == before
 
 
 def test_a_size_without_a_tensor_is_refused() -> None:
