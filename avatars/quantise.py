@@ -1,7 +1,8 @@
 """From a float network to an integer one: calibrate on real frames, quantise, make bytes of both ends.
 
-Rule: unsigned 8-bit activations, signed symmetric per-channel weights, real 0 exact, output bytes are the picture.
-Weights have 7 bits under `reduce_range`: on a CPU without VNNI two products of 8-bit weights overflow 16 bits.
+Rule: unsigned 8-bit activations, signed symmetric per-channel weights, real 0 exact, output bytes are the picture; and
+all runtimes round alike where they can be made to, see `dyadic`.
+Weights stay within 64 under `reduce_range`: on a CPU without VNNI two products of larger ones overflow 16 bits.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from onnxruntime.quantization import (
 from onnxruntime.quantization.shape_inference import quant_pre_process
 
 from trilane.avatars.calibration import limit_logits, measure, share_ranges
+from trilane.avatars.dyadic import dyadic_ranges, dyadic_weights, rounds_alike
 from trilane.avatars.network_file import FLOAT_LAYERS_KEY, NetworkFile, check_network
 from trilane.errors import BadInputError
 
@@ -78,13 +80,16 @@ def quantise(
         onnx.save(model, source)
         quant_pre_process(source, prepared, skip_symbolic_shape=True)
         ranges = measure(prepared, frames, method, QUANTISED)
-        quantised = _insert(onnx.load(prepared), ranges, reduce_range, keep_float)
+        plain = onnx.load(prepared)
+        alike = rounds_alike(plain)
+        quantised = _insert(plain, ranges, reduce_range, keep_float)
     _integer_ends(quantised)
     _describe(quantised, keep_float)
     facts = {
         "method": method,
         "calibration_frames": len(frames),
-        "weight_bits": 7 if reduce_range else 8,
+        "weight_bits": (7 if reduce_range else 8) - alike,
+        "rounds_alike": alike,
         "per_channel": True,
         "float_layers": list(keep_float),
         "onnxruntime": onnxruntime.__version__,
@@ -122,7 +127,12 @@ def _check_frames(model: onnx.ModelProto, frames: Sequence[NDArray[np.float32]])
 
 def _insert(model: onnx.ModelProto, ranges: Any, reduce_range: bool, keep_float: Sequence[str]) -> onnx.ModelProto:
     limit_logits(model, ranges)
-    share_ranges(model, ranges)
+    overrides = {}
+    if rounds_alike(model):
+        dyadic_ranges(model, ranges)
+        overrides = dyadic_weights(model, ranges, reduce_range, keep_float)
+    else:
+        share_ranges(model, ranges)
     quantiser = QDQQuantizer(
         model,
         per_channel=True,
@@ -133,7 +143,7 @@ def _insert(model: onnx.ModelProto, ranges: Any, reduce_range: bool, keep_float:
         nodes_to_quantize=[],
         nodes_to_exclude=list(keep_float),
         op_types_to_quantize=QUANTISED,
-        extra_options={"WeightSymmetric": True},
+        extra_options={"WeightSymmetric": True, "TensorQuantOverrides": overrides},
     )
     for end in (model.graph.input[0], model.graph.output[0]):
         quantiser.quantize_activation_tensor(end.name)

@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from torch import multiprocessing as tmp
 
 from trilane.avatars.training.data import U16, ShapeGroup, batches, open_groups
+from trilane.avatars.training.jitter import add_jitter
 from trilane.avatars.training.losses import loss_terms, total_loss
 from trilane.avatars.training.network import UNet
 from trilane.avatars.training.texture import NeuralTexture, sample
@@ -48,6 +49,7 @@ class FitConfig:
 
     `freeze_norms_at`: share after which batch statistics stay as they are. `average_s`: time constant of the averaged
     weights. `repeats`: of a sample in an epoch, by its band: far, full body, upper body, face, anywhere.
+    `jitter_steps`: of bytes, noise on activations.
     """
 
     minutes: float
@@ -62,6 +64,7 @@ class FitConfig:
     freeze_norms_at: float = 0.6
     average_s: float = 60.0
     repeats: tuple[int, ...] = (1, 1, 1, 1, 1)
+    jitter_steps: float = 1.0
     report_s: float = 30.0
     checkpoint_s: float = 180.0
     max_steps: int = 10_000_000
@@ -133,6 +136,7 @@ def _worker(
     torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed + number)
     avatar = copy.deepcopy(shared)
+    add_jitter(avatar.network, config.jitter_steps)
     avatar.network.to(memory_format=torch.channels_last)
     optimiser = _optimiser(avatar, config)
     peaks = [group["lr"] for group in optimiser.param_groups]

@@ -24,9 +24,8 @@ from trilane.stages.dsp.runtime import RUNTIMES, RuntimeOptions, load_runtime
 #: The first whose DequantizeLinear the evaluator has; the operators used mean the same as in the files' own.
 EVALUATOR_OPSET = 19
 
-#: Largest and mean difference in bytes. One step of a logit is 3.3 bytes where the sigmoid is steepest, and the tiny
-#: network's random weights leave most logits there; HTP rounds differently by a step or two.
-LIMITS = {"openvino": (4, 0.5), "ort": (4, 0.5), "qnn": (8, 1.0)}
+#: Largest and mean difference in bytes: the network rounds alike, but there is more than one way to a sigmoid.
+LIMITS = {"openvino": (1, 0.05), "ort": (0, 0.0), "qnn": (0, 0.0)}
 #: The emulator needs about 30 ms for a frame of the tiny network.
 FRAMES = {"openvino": 1000, "ort": 1000, "qnn": 20}
 #: Bytes of the smallest Python object, and what the interpreter itself may come to hold meanwhile.
@@ -116,7 +115,7 @@ def test_frames_allocate_nothing(name, module, tiny_quantised):
     network = tiny_quantised.network
     tensor, image = np.zeros(network.shape, np.uint8), np.zeros((*network.shape[:3], 4), np.uint8)
     binding = module.load(network, RuntimeOptions()).bind(tensor, image)
-    rounds = [_growth(binding, FRAMES[name]) for _ in range(3)]
+    rounds = [_growth(binding, FRAMES[name]) for _ in range(5)]
     assert min(resident for resident, _ in rounds) <= 0
     assert min(traced for _, traced in rounds) < max(SMALLEST_OBJECT * FRAMES[name], INTERPRETERS_OWN)
 

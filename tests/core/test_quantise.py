@@ -1,4 +1,4 @@
-"""Quantisation: bytes at both ends, real zero exact, small error, 7-bit weights, named errors."""
+"""Quantisation: bytes at both ends, real zero exact, small error, weights that cannot overflow, named errors."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_bytes_are_the_picture(tiny_float, tiny_frames, tiny_quantised):
     wanted = run(tiny_float, frame.transpose(2, 0, 1)[None])[0].transpose(1, 2, 0)
     found = run(network.model, tensor[None])[0]
     assert found.dtype == np.uint8 and found.shape == (64, 64, 4)
-    assert np.abs(found / 255 - wanted).mean() < 2 / 255
+    assert np.abs(found / 255 - wanted).mean() < 2.5 / 255  # weights of 6 bits
     assert network.output.scale == pytest.approx(1 / 255) and network.output.zero_point == 0
 
 
