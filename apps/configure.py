@@ -6,20 +6,25 @@ input ends the command before a process is started or a file is made.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
+
 from trilane.apps.machine import gl_facts, machine_facts
 from trilane.avatars.bundle import Bundle, load_bundle
+from trilane.avatars.split import split
 from trilane.errors import BadInputError, MissingPartError
 from trilane.hw_profiles.host import host_units
-from trilane.scene.schema import RunConfig, Scene
+from trilane.hw_profiles.load import HOST, load_profile
+from trilane.hw_profiles.runtimes import fastest_runtime
+from trilane.scene.schema import NetworkCut, RunConfig, Scene
 from trilane.scene.staging import stage_scene
 from trilane.scene.validate import find_scene, load_scene, located, scene_from
 from trilane.stages.cpu.body import load_body
-from trilane.stages.dsp.runtime import resolve
+from trilane.stages.dsp.runtime import RUNTIMES, installed, resolve
 from trilane.stages.gpu.background import open_background
 
 GL_INSTALL = "apt-get install libegl1 libgl1-mesa-dri"
@@ -41,6 +46,7 @@ class Request:
     runtime: str = "auto"
     hud: bool | None = None
     skinning: str = "auto"
+    split: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -78,13 +84,14 @@ def requested_scene(request: Request) -> Scene:
 def configure(request: Request, out_dir: Path) -> Checked:
     """Look at every part of what was asked for. Raises BadInputError or MissingPartError."""
     scene = requested_scene(request)
-    runtime = resolve(request.runtime)
+    runtime, reason = requested_runtime(request.runtime)
     _check_background(scene)
     bundles = [_checked_bundle(spec.bundle) for spec in scene.avatars]
     bodies = {bundle.folder: load_body(bundle.body_path).shape() for bundle in bundles}
     notes = list(stage_scene(scene, [bodies[bundle.folder] for bundle in bundles], Path.cwd()).notes)
+    cuts = requested_cuts(request.split, bundles[0])
     unit, why = skinning_unit(request.skinning)
-    notes.append(f"skinning: {unit} unit ({why})")
+    notes += [f"runtime: {runtime} ({reason})", f"skinning: {unit} unit ({why})"]
     config = RunConfig(
         scene=scene,
         out_dir=out_dir,
@@ -92,8 +99,31 @@ def configure(request: Request, out_dir: Path) -> Checked:
         units=host_units(),
         runtime=runtime,
         posed_vertices=tuple(len(bodies[b.folder].vertices) for b in bundles) if unit == "cpu" else (),
+        cuts=cuts,
     )
     return Checked(config, tuple(notes), {bundle.manifest.name: _accuracy(bundle) for bundle in bundles})
+
+
+def requested_runtime(asked: str) -> tuple[str, str]:
+    """The runtime and why: as asked, else the fastest installed one. Raises BadInputError, MissingPartError."""
+    if asked == "auto":
+        return fastest_runtime(load_profile(HOST), installed())
+    if asked not in RUNTIMES:
+        raise BadInputError("runtime", repr(asked), f"auto or one of {', '.join(RUNTIMES)}")
+    return resolve(asked), "as asked"
+
+
+def requested_cuts(texts: Sequence[str], bundle: Bundle) -> tuple[NetworkCut, ...]:
+    """`TENSOR=UNIT` texts as cuts of the bundle's network. Raises BadInputError."""
+    cuts = []
+    for text in texts:
+        at, _, unit = text.rpartition("=")
+        try:
+            cuts.append(NetworkCut.model_validate({"at": at, "unit": unit}))
+        except ValidationError:
+            raise BadInputError("--split", repr(text), "TENSOR=UNIT, with UNIT one of cpu, gpu, dsp") from None
+    split(bundle.read_network(), [cut.at for cut in cuts])
+    return tuple(cuts)
 
 
 def _checked_bundle(name: str) -> Bundle:

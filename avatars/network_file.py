@@ -58,18 +58,11 @@ class Affine:
 
 
 @dataclass(frozen=True)
-class NetworkFile:
-    """A checked network. `shape`: N, H, W, C of its input. Output: N, H, W, 4 uint8."""
+class IntegerNetwork:
+    """What a runtime loads: a static integer graph with bytes at its ends, `where` it comes from."""
 
     where: str
     model: onnx.ModelProto = field(repr=False)
-    shape: tuple[int, int, int, int]
-    input: Affine
-    output: Affine
-
-    @property
-    def channels(self) -> int:
-        return self.shape[3]
 
     @property
     def float_layers(self) -> frozenset[str]:
@@ -84,6 +77,19 @@ class NetworkFile:
     def digest(self) -> str:
         """SHA-256 of the network, hexadecimal."""
         return hashlib.sha256(self.model.SerializeToString(deterministic=True)).hexdigest()
+
+
+@dataclass(frozen=True)
+class NetworkFile(IntegerNetwork):
+    """A checked network. `shape`: N, H, W, C of its input. Output: N, H, W, 4 uint8."""
+
+    shape: tuple[int, int, int, int]
+    input: Affine
+    output: Affine
+
+    @property
+    def channels(self) -> int:
+        return self.shape[3]
 
 
 def read_network(path: Path) -> NetworkFile:
@@ -120,7 +126,7 @@ def constants_of(model: onnx.ModelProto) -> Mapping[str, TensorProto]:
     return found
 
 
-def check_integer_layers(network: NetworkFile) -> None:
+def check_integer_layers(network: IntegerNetwork) -> None:
     """Raises BadInputError naming the layers whose inputs are not dequantised integers, but for `float_layers`."""
     makers = {out: node for node in network.model.graph.node for out in node.output}
     left = []

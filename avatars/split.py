@@ -1,26 +1,28 @@
-"""Cuts a quantised network in two at a quantised tensor. Rule: only bytes cross a cut, so that the parts one after the
-other give the bytes of the whole.
+"""Cuts a quantised network at quantised tensors. Rule: only bytes cross a cut, so that the parts one after the other
+give the bytes of the whole.
 
 What crosses beside the tensor itself (the skips of a U-Net, its input) crosses too; a Dequantize whose bytes cross,
-and a Transpose behind it, go to the second part.
+and a Transpose behind it, go to the part that reads them.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
-import numpy as np
 import onnx
 from onnx import TensorProto, helper
 
-from trilane.avatars.network_file import NetworkFile
+from trilane.avatars.network_file import IntegerNetwork, NetworkFile
 from trilane.errors import BadInputError
 
 QUANTIZE = "QuantizeLinear"
-#: Nodes of one input that the second part can do again from the bytes that cross.
+#: Nodes of one input that a later part can do again from the bytes that cross.
 MOVABLE = ("DequantizeLinear", "Transpose")
+Shapes = dict[str, tuple[int, ...]]
 
 
 @dataclass(frozen=True)
@@ -28,12 +30,25 @@ class Cut:
     """A place to cut. `crossing`: tensor (all uint8) to shape; `at` is one of them. `nodes`: how many come before."""
 
     at: str
-    crossing: dict[str, tuple[int, ...]]
+    crossing: Shapes
     nodes: int
 
     @property
     def bytes(self) -> int:
-        return sum(int(np.prod(shape)) for shape in self.crossing.values())
+        return sum(math.prod(shape) for shape in self.crossing.values())
+
+
+@dataclass(frozen=True)
+class NetworkPart(IntegerNetwork):
+    """A part that runs by itself. `inputs` and `outputs`: those of `model`, in its order, tensor (uint8) to shape.
+
+    `given`, `handed_on`: what crosses before and after it; what is handed on and no output was given, and is passed.
+    """
+
+    inputs: Shapes
+    outputs: Shapes
+    given: Shapes
+    handed_on: Shapes
 
 
 def cuts(network: NetworkFile) -> Iterator[Cut]:
@@ -46,18 +61,28 @@ def cuts(network: NetworkFile) -> Iterator[Cut]:
                 yield Cut(node.output[0], crossing, number)
 
 
-def split(network: NetworkFile, at: str) -> tuple[onnx.ModelProto, onnx.ModelProto]:
-    """The part up to the quantised tensor `at`, and the rest. Raises BadInputError when it cannot be cut there."""
-    for cut in cuts(network):
-        if cut.at == at:
-            return _part(network, cut, head=True), _part(network, cut, head=False)
-    raise BadInputError(f"{network.where}, --at", repr(at), "a quantised tensor; without --at they are listed")
+def split(network: NetworkFile, at: Sequence[str]) -> list[NetworkPart]:
+    """The parts of `network` between the quantised tensors `at`, which come in the order of its work.
+
+    Raises BadInputError when it cannot be cut there.
+    """
+    known = {cut.at: cut for cut in cuts(network)} if at else {}
+    for name in at:
+        if name not in known:
+            fix = "`trilane avatar split` without --at lists them"
+            raise BadInputError(f"{network.where}, cut", repr(name), "a quantised tensor", fix)
+    chosen = [known[name] for name in at]
+    if any(first.nodes >= second.nodes for first, second in pairwise(chosen)):
+        raise BadInputError(f"{network.where}, cuts", ", ".join(at), "different tensors in the order of the work")
+    graph = network.model.graph
+    begin = Cut("", _declared(graph.input), 0)
+    end = Cut("", _declared(graph.output), len(graph.node))
+    return [_part(network, *ends) for ends in pairwise([begin, *chosen, end])]
 
 
-def _crossing(graph: onnx.GraphProto, nodes: int) -> dict[str, tuple[int, ...]] | None:
+def _crossing(graph: onnx.GraphProto, nodes: int) -> Shapes | None:
     """What the nodes from number `nodes` on read of those before; None when it is not bytes alone."""
     makers = {name: node for node in graph.node[:nodes] for name in node.output}
-    shapes = _shapes(graph)
     names = []
     for node in graph.node[nodes:]:
         for name in node.input:
@@ -70,36 +95,30 @@ def _crossing(graph: onnx.GraphProto, nodes: int) -> dict[str, tuple[int, ...]] 
     kinds = {value.name: value.type.tensor_type.elem_type for value in (*graph.value_info, *graph.input)}
     if any(kinds.get(name) != TensorProto.UINT8 for name in distinct):
         return None
+    shapes = _declared((*graph.value_info, *graph.input))
     return {name: shapes[name] for name in distinct}
 
 
-def _part(network: NetworkFile, cut: Cut, *, head: bool) -> onnx.ModelProto:
+def _part(network: NetworkFile, before: Cut, after: Cut) -> NetworkPart:
     graph = network.model.graph
-    values = [helper.make_tensor_value_info(name, TensorProto.UINT8, shape) for name, shape in cut.crossing.items()]
-    if head:
-        nodes = list(graph.node[: cut.nodes])
-        inputs, outputs = list(graph.input), [value for value in values if value.name != graph.input[0].name]
-        nodes = _needed(nodes, [value.name for value in outputs])
-    else:
-        nodes, inputs, outputs = _tail_nodes(graph, cut), values, list(graph.output)
-    used = {name for node in nodes for name in node.input}
+    own = graph.node[before.nodes : after.nodes]
+    made = {name for node in own for name in node.output}
+    outputs = {name: shape for name, shape in after.crossing.items() if name in made}
+    again = [node for node in graph.node[: before.nodes] if node.op_type in MOVABLE]
+    nodes = _needed([*again, *own], list(outputs))
+    read = {name for node in nodes for name in node.input}
+    inputs = {name: shape for name, shape in before.crossing.items() if name in read}
     part = helper.make_graph(
         nodes,
-        f"{graph.name} {'head' if head else 'tail'}",
-        inputs,
-        outputs,
-        [t for t in graph.initializer if t.name in used],
+        f"{graph.name} from {before.at or 'the beginning'} to {after.at or 'the end'}",
+        _values(inputs),
+        _values(outputs),
+        [tensor for tensor in graph.initializer if tensor.name in read],
     )
     model = helper.make_model(part, opset_imports=network.model.opset_import, ir_version=network.model.ir_version)
+    model.metadata_props.extend(network.model.metadata_props)
     onnx.checker.check_model(model)
-    return model
-
-
-def _tail_nodes(graph: onnx.GraphProto, cut: Cut) -> list[onnx.NodeProto]:
-    """The nodes behind the cut, after those that lead from what crosses to what they read."""
-    movable = [node for node in graph.node[: cut.nodes] if node.op_type in MOVABLE]
-    read = [name for node in graph.node[cut.nodes :] for name in node.input]
-    return [*_needed(movable, read), *graph.node[cut.nodes :]]
+    return NetworkPart(network.where, model, inputs, outputs, before.crossing, after.crossing)
 
 
 def _needed(nodes: Sequence[onnx.NodeProto], outputs: Sequence[str]) -> list[onnx.NodeProto]:
@@ -111,6 +130,9 @@ def _needed(nodes: Sequence[onnx.NodeProto], outputs: Sequence[str]) -> list[onn
     return kept[::-1]
 
 
-def _shapes(graph: Any) -> dict[str, tuple[int, ...]]:
-    values = (*graph.value_info, *graph.input, *graph.output)
+def _declared(values: Any) -> Shapes:
     return {value.name: tuple(dim.dim_value for dim in value.type.tensor_type.shape.dim) for value in values}
+
+
+def _values(shapes: Shapes) -> list[onnx.ValueInfoProto]:
+    return [helper.make_tensor_value_info(name, TensorProto.UINT8, shape) for name, shape in shapes.items()]

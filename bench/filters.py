@@ -74,7 +74,7 @@ class _Subject:
         picture = np.empty((1, *shape, 4), np.uint8)
         rows = []
         for name, tensor in tensors.items():
-            session.bind(tensor, picture).run()
+            session.bind([tensor], [picture]).run()
             rows.append(
                 {
                     "side": shape[0],

@@ -36,6 +36,7 @@ def measure(
     norm: tuple[str, ...] = ("batch",),
     width: int = 64,
     size: tuple[str, ...] = ("256x256",),
+    batch: tuple[int, ...] = (1,),
     runtime: tuple[str, ...] = ("ort", "openvino"),
     threads: int = 0,
     spin: bool = False,
@@ -43,6 +44,8 @@ def measure(
     period: float = 1.0,
 ) -> dict[str, Any]:
     """One row per network and runtime. `network`: an .onnx file or a bundle; otherwise untrained ones are made.
+
+    `batch`: frames that are inferred at once; FP32 takes them one at a time, and all times are those of one frame.
 
     Rows: the network's settings, `parameters`, `gmac`, `runtime`, `startup_cold_ms`, `startup_warm_ms` (libraries
     imported, network loaded, with an empty and with a filled cache), `frames`, `min_ms` `mean_ms` `p50_ms` `p90_ms`
@@ -56,7 +59,7 @@ def measure(
     names = [resolve(name) for name in runtime]
     peak = roofline.measure(threads)
     rows: list[dict[str, Any]] = []
-    for subject, twin in _subjects(network, encoder, norm, width, size):
+    for subject, twin in _subjects(network, encoder, norm, width, size, batch):
         with tempfile.TemporaryDirectory(prefix="trilane-bench-") as folder:
             ways = _ways(Path(folder), subject, twin, names, threads, spin)
             with _cache(Path(folder) / "cache"):
@@ -66,20 +69,26 @@ def measure(
 
 
 def _subjects(
-    network: str, encoder: tuple[str, ...], norm: tuple[str, ...], width: int, size: tuple[str, ...]
+    network: str,
+    encoder: tuple[str, ...],
+    norm: tuple[str, ...],
+    width: int,
+    size: tuple[str, ...],
+    batch: tuple[int, ...],
 ) -> Iterator[tuple[Subject, onnx.ModelProto | None]]:
     """Integer networks, and their twins in float where there is one."""
     if network:
         file = read_network(Path(network)) if network.endswith(".onnx") else load_bundle(network).read_network()
-        yield of_file(file), None
+        for frames in batch:
+            yield of_file(file, frames), None
         return
-    for one_encoder, one_norm, text in product(encoder, norm, size):
+    for one_encoder, one_norm, text, frames in product(encoder, norm, size, batch):
         try:
             shape = parse_shape(text)
         except ValueError as error:
             raise BadInputError.about("--size", error) from error
         settings = (one_encoder, one_norm, width, shape)
-        yield untrained(*settings), untrained_float(*settings)
+        yield untrained(*settings, batch=frames), untrained_float(*settings)
 
 
 def _ways(
@@ -123,21 +132,26 @@ def _take(ways: dict[str, Way], seconds: float, period: float) -> dict[str, dict
 
 
 def _rows(subject: Subject, taken: dict[str, dict[str, Any]], peak_gmac_s: float) -> list[dict[str, Any]]:
-    medians = {name: float(np.median(np.concatenate(way["periods"]))) for name, way in taken.items()}
+    batches = {name: 1 if name == FP32 else subject.integer.shape[0] for name in taken}
+    periods = {name: [np.divide(times, batches[name]) for times in way["periods"]] for name, way in taken.items()}
+    medians = {name: float(np.median(np.concatenate(found))) for name, found in periods.items()}
     rows = []
     for name, way in taken.items():
-        times = np.concatenate(way["periods"])
+        times = np.concatenate(periods[name])
         row = {
             **subject.label,
             "parameters": subject.parameters,
             "gmac": subject.gmac,
             "runtime": name,
+            "batch": batches[name],
             "startup_cold_ms": way["startup_cold_ms"],
             "startup_warm_ms": way["startup_warm_ms"],
-            "frames": len(times),
+            "frames": len(times) * batches[name],
             **{f"p{q}_ms": float(np.percentile(times, q)) for q in (50, 90, 99)},
             **{f"{key}_ms": float(pick(times)) for key, pick in (("min", np.min), ("mean", np.mean), ("max", np.max))},
-            "periods": [{"min_ms": min(p), "mean_ms": float(np.mean(p)), "max_ms": max(p)} for p in way["periods"]],
+            "periods": [
+                {"min_ms": float(p.min()), "mean_ms": float(p.mean()), "max_ms": float(p.max())} for p in periods[name]
+            ],
             "temperature_c": sensor_c(),
         }
         if name != FP32:

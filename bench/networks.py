@@ -32,7 +32,9 @@ class Subject:
     gmac: float
 
 
-def untrained(encoder: str, norm: str, width: int, size: tuple[int, int], channels: int = 16) -> Subject:
+def untrained(
+    encoder: str, norm: str, width: int, size: tuple[int, int], channels: int = 16, batch: int = 1
+) -> Subject:
     """An untrained network, quantised. Raises MissingPartError without PyTorch, BadInputError for wrong settings."""
     network, torch = _unet(encoder, norm, width, channels)
     from trilane.avatars.training.export import export_onnx
@@ -44,7 +46,7 @@ def untrained(encoder: str, norm: str, width: int, size: tuple[int, int], channe
     label = {"encoder": encoder, "norm": norm, "width": width, "size": list(size), "channels": channels}
     macs = _defined_macs(network, torch, channels) * size[0] * size[1]
     parameters = sum(p.numel() for p in network.parameters())
-    return Subject(label, reshaped(quantise(small, frames).network, *size), parameters, macs / 1e9)
+    return Subject(label, reshaped(quantise(small, frames).network, *size, batch), parameters, macs / 1e9)
 
 
 def untrained_float(encoder: str, norm: str, width: int, size: tuple[int, int], channels: int = 16) -> onnx.ModelProto:
@@ -54,12 +56,12 @@ def untrained_float(encoder: str, norm: str, width: int, size: tuple[int, int], 
     return export_onnx(_unet(encoder, norm, width, channels)[0], *size)
 
 
-def of_file(network: NetworkFile) -> Subject:
+def of_file(network: NetworkFile, batch: int = 1) -> Subject:
     """A network file as a subject; its work is that of the layers in the file."""
     facts = graph_facts(network.model)
-    return Subject(
-        {"network": network.where, "size": list(network.shape[1:3])}, network, facts["parameters"], facts["gmac"]
-    )
+    size = network.shape[1:3]
+    label = {"network": network.where, "size": list(size)}
+    return Subject(label, reshaped(network, *size, batch), facts["parameters"], facts["gmac"])
 
 
 def random_tensor(network: NetworkFile) -> NDArray[np.uint8]:

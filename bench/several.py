@@ -129,7 +129,7 @@ class _Stand:
             tensor = np.empty((1, *shape, self.packed.channels), np.uint8)
             image = np.empty((1, *shape, 4), np.uint8)
             session = load_runtime("ort").load(reshaped(self.network, *shape), RuntimeOptions(threads=1))
-            self._bound[shape] = tensor, image, session.bind(tensor, image)
+            self._bound[shape] = tensor, image, session.bind([tensor], [image])
         return self._bound[shape]
 
 

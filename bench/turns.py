@@ -124,7 +124,7 @@ def _runtime(way: Way) -> Callable[[], object]:
     network = read_network(way.network)
     image = np.zeros((*network.shape[:3], 4), np.uint8)
     session = load_runtime(way.runtime).load(network, RuntimeOptions(way.threads or 1, way.spin))
-    return session.bind(random_tensor(network), image).run
+    return session.bind([random_tensor(network)], [image]).run
 
 
 def _ort_default(way: Way) -> Callable[[], object]:

@@ -156,12 +156,19 @@ class UnitSettings(Model):
     spin: bool = False
 
 
+class NetworkCut(Model):
+    """The network is cut at quantised tensor `at`; what follows runs on `unit`."""
+
+    at: str
+    unit: Literal["cpu", "gpu", "dsp"]
+
+
 class RunConfig(Model):
     """Everything a unit's process is told, as plain data. Paths are absolute and were checked by the parent.
 
     `out_dir` is the temporary run folder. `runtime` names the DSP runtime. `posed_vertices`: of each avatar, when the
     CPU unit skins; empty when the GPU does. `pace_ns`: how long a job of a stage is held, at least. `fake` maps a unit
-    to the dotted module of a mock unit and is set by tests alone.
+    to the dotted module of a mock unit and is set by tests alone. `cuts`: of the network; its first part is the DSP's.
     """
 
     scene: Scene
@@ -173,6 +180,7 @@ class RunConfig(Model):
     posed_vertices: tuple[int, ...] = ()
     pace_ns: dict[str, int] = {}
     fake: dict[str, str] = {}
+    cuts: tuple[NetworkCut, ...] = ()
 
     @field_validator("units")
     @classmethod
@@ -185,6 +193,16 @@ class RunConfig(Model):
     @property
     def buckets(self) -> list[Shape]:
         return shape_buckets(self.scene.size)
+
+    @property
+    def infer_units(self) -> tuple[str, ...]:
+        """The unit of each part of the network, in the order of the work."""
+        return ("dsp", *(cut.unit for cut in self.cuts))
+
+    @property
+    def infer_names(self) -> tuple[str, ...]:
+        """The stages that run the parts: `infer`, `infer-2`, ..."""
+        return ("infer", *(f"infer-{number}" for number in range(2, len(self.cuts) + 2)))
 
     @property
     def max_tensor_pixels(self) -> int:

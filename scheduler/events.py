@@ -5,6 +5,7 @@ All times are integer nanoseconds of the driver's clock. Slots are -1 where a st
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -142,9 +143,9 @@ class Graph:
         return f"{self.stages[index].name}->{self.stages[index + 1].name}"
 
 
-def avatar_graph(edge: str = "double") -> Graph:
-    """The pipeline of DESIGN's data flow, every edge with the same rule."""
-    names = (("pose", "cpu"), ("raster", "gpu"), ("infer", "dsp"), ("composite", "gpu"), ("present", "cpu"))
+def avatar_graph(edge: str = "double", infer: Iterable[tuple[str, str]] = (("infer", "dsp"),)) -> Graph:
+    """The pipeline of DESIGN's data flow, every edge with the same rule. `infer`: stages and units of the network."""
+    names = (("pose", "cpu"), ("raster", "gpu"), *infer, ("composite", "gpu"), ("present", "cpu"))
     return Graph(tuple(StageSpec(*name) for name in names), (edge,) * (len(names) - 1), "composite")
 
 

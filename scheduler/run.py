@@ -8,6 +8,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import pairwise
 
 from trilane.errors import BadInputError
 from trilane.scene.schema import RunConfig
@@ -20,6 +21,7 @@ from trilane.scheduler.realtime import RealtimeDriver
 from trilane.scheduler.result import RunResult
 from trilane.scheduler.signals import Interrupts
 from trilane.stages.contracts import SlotLayout, posed_vertices_bytes
+from trilane.stages.dsp.parts import crossing_bytes
 from trilane.stages.unit_loop import EdgeSpec
 from trilane.transport.memory import RegionLayout, create_region
 from trilane.transport.slots import edge_rule
@@ -114,11 +116,12 @@ def run_pipeline(
 
 def edge_payload_bytes(config: RunConfig) -> dict[str, int]:
     """Bytes of payload of each edge, for the largest tensor that the scene's size allows."""
-    output = config.scene.output
+    output, names = config.scene.output, config.infer_names
     return {
         "pose->raster": posed_vertices_bytes(config.posed_vertices),
         "raster->infer": config.max_tensor_pixels * MAX_CHANNELS,
-        "infer->composite": config.max_tensor_pixels * 4,
+        **{f"{a}->{b}": size for (a, b), size in zip(pairwise(names), crossing_bytes(config), strict=True)},
+        f"{names[-1]}->composite": config.max_tensor_pixels * 4,
         "composite->present": output.width * output.height * 3,
     }
 
@@ -141,7 +144,7 @@ def _plan(
         hang_ns=hang_ns,
         beats=True,
     )
-    return avatar_graph(edge), settings
+    return avatar_graph(edge, zip(config.infer_names, config.infer_units, strict=True)), settings
 
 
 def _spread(frames: int, count: int) -> list[int]:
@@ -185,11 +188,11 @@ def _prompt() -> Iterator[None]:
 @contextlib.contextmanager
 def _regions(config: RunConfig, graph: Graph) -> Iterator[dict[str, EdgeSpec]]:
     edges: dict[str, EdgeSpec] = {}
-    avatars = len(config.scene.avatars)
+    avatars, payloads = len(config.scene.avatars), edge_payload_bytes(config)
     try:
         for index, text in enumerate(graph.edges):
             name = graph.edge_name(index)
-            payload = edge_payload_bytes(config)[name]
+            payload = payloads[name]
             slots = edge_rule(text).slots
             fd = create_region(name, RegionLayout(slots, SlotLayout(avatars, payload)))
             edges[name] = EdgeSpec(fd=fd, slots=slots, avatars=avatars, payload_bytes=payload)

@@ -42,6 +42,7 @@ from trilane.transport.wakeup import UNIT_NS, use_slice
 BEAT_MS = 500
 WATCH_NS = 150_000  # of a hold: a sleep ends about this much late
 SCHEDULER = "cpu"  # the unit whose cores the scheduler shares
+INFERRING = "dsp"  # the unit whose own stages are those of the network
 
 
 class EdgeSpec(BaseModel):
@@ -158,6 +159,10 @@ def _serve(unit: str, spec: UnitSpec, link: Link) -> int:
 def _build(unit: str, spec: UnitSpec) -> dict[str, _BoundStage]:
     module = import_module(spec.config.fake.get(unit, f"trilane.stages.{unit}.unit"))
     stages: dict[str, Stage] = module.build(spec.config)
+    if unit != INFERRING and unit in spec.config.infer_units:
+        from trilane.stages.dsp.infer import infer_stages  # slow to import, and seldom needed by the other units
+
+        stages = {**stages, **infer_stages(spec.config, unit)}
     if set(stages) != set(spec.stages):
         raise TypeError(f"built stages {sorted(stages)}, expected {sorted(spec.stages)}")
     packets = {name: map_region(edge.fd, edge.layout) for name, edge in spec.edges.items()}

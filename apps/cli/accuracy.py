@@ -38,9 +38,9 @@ def accuracy(
 
     Exit code 1 when a figure is out of its bound.
     """
-    from trilane.apps.experiments.accuracy import installed_runtimes
+    from trilane.stages.dsp.runtime import installed
 
-    names = list(runtime or installed_runtimes())
+    names = list(runtime or installed())
     if hard_cases:
         passed = _hard_cases([name for name in names if runtime or name != "qnn"], as_json)
     else:

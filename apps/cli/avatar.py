@@ -162,12 +162,17 @@ def calibrations(
 @app.command(epilog=EPILOG_SPLIT)
 def split(
     name: Annotated[str, typer.Argument(help="`default` or a bundle's folder.")],
-    at: Annotated[str | None, typer.Option(help="Quantised tensor to cut at; all are listed if not given.")] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Folder to write head.onnx and tail.onnx to.")] = None,
+    at: Annotated[
+        list[str] | None, typer.Option(help="Quantised tensor to cut at, once for each cut; all are listed if none.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder to write part-1.onnx, part-2.onnx, ... to.")] = None,
     size: Annotated[str, typer.Option(help="Tensor: one side, or HEIGHTxWIDTH.")] = "256",
     json: JsonOption = False,
 ) -> None:
-    """Cut an avatar's network in two; the parts one after the other give the same bytes."""
+    """Cut an avatar's network; the parts one after the other give the same bytes.
+
+    `trilane run --split TENSOR=UNIT` runs the parts as stages of their own.
+    """
     from rich.table import Table
 
     from trilane.avatars.bundle import load_bundle
@@ -176,22 +181,23 @@ def split(
     from trilane.avatars.split import split as cut_at
     from trilane.scene.schema import parse_shape
 
-    if (at is None) != (out is None):
+    if bool(at) != (out is not None):
         raise BadInputError("options", "--at without --out" if at else "--out without --at", "both, or neither")
     try:
         height, width = parse_shape(size if "x" in size else f"{size}x{size}")
     except ValueError as error:
         raise BadInputError.about("--size", error) from error
     whole = reshaped(load_bundle(name).read_network(), height, width)
-    if at is not None and out is not None:
-        head, tail = cut_at(whole, at)
+    if at and out is not None:
+        parts = cut_at(whole, at)
         try:
             out.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise BadInputError(out, (error.strerror or str(error)).lower(), "a folder that can be written") from None
-        for part, model in (("head.onnx", head), ("tail.onnx", tail)):
-            _write(model, out / part)
-        _show({"head": str(out / "head.onnx"), "tail": str(out / "tail.onnx"), "at": at}, json)
+        files = [out / f"part-{number}.onnx" for number in range(1, len(parts) + 1)]
+        for part, file in zip(parts, files, strict=True):
+            _write(part.model, file)
+        _show({"parts": [str(file) for file in files], "at": list(at)}, json)
         return
     rows = [{"at": cut.at, "tensors": len(cut.crossing), "bytes": cut.bytes} for cut in cuts(whole)]
     if json:

@@ -33,6 +33,7 @@ Examples:
   trilane run --frames 60 --size 192 --out /tmp/run
   trilane run --motion walk.bvh --camera arkit.txt --frames 200 --json
   trilane run --latch 3
+  trilane run --split /Concat_4_output_0_QuantizeLinear_Output=cpu
   trilane run --performance-profile sustained_high_performance
   trilane run --profile snapdragon-888 --pace --slow-motion 24 --frames 60
   trilane run myscene.toml --background street.mp4 --policy sequential
@@ -124,6 +125,10 @@ def run(
     skinning: Annotated[
         str, typer.Option(help="Which unit poses the vertices: cpu, gpu; auto: cpu when OpenGL is software.")
     ] = "auto",
+    split: Annotated[
+        list[str] | None,
+        typer.Option(help="TENSOR=UNIT: cut the network there, the rest runs on UNIT. `trilane avatar split` lists."),
+    ] = None,
     profile: Annotated[str | None, typer.Option(help="Hardware profile whose pace to keep; with --pace.")] = None,
     pace: Annotated[bool, typer.Option("--pace", help="Hold each job until its modelled time has passed.")] = False,
     slow_motion: Annotated[float, typer.Option(help="With --pace: times slower than the chip.")] = 1.0,
@@ -145,7 +150,9 @@ def run(
     from trilane.apps.run_folder import default_place
     from trilane.apps.run_job import Plan, run_to_folder
 
-    request = Request(scene, motion, camera, background, avatar, frames, size, runtime, hud, skinning)
+    request = Request(
+        scene, motion, camera, background, avatar, frames, size, runtime, hud, skinning, tuple(split or ())
+    )
     checked = configure(request, Path.cwd())
     held = _pace(checked.config, profile, pace, slow_motion)
     if held is not None and performance_profile is not None:

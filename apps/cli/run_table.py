@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 DASH = "–"
 IDLE = ("starved", "blocked", "throttled", "overhead")
 PERCENTILES = ("mean", "p50", "p90", "p95", "p99", "max")
-STAGES = ("pose", "raster", "infer", "composite", "present")
 UNITS = ("cpu", "gpu", "dsp")
 
 Run = Mapping[str, Any]
@@ -91,7 +90,7 @@ Rows = Iterator[tuple[str, str, list[str]]]
 
 
 def _stage_rows(runs: list[Run]) -> Rows:
-    for stage in (name for name in STAGES if name in runs[0]["stages"]):
+    for stage in runs[0]["stages"]:
         unit = runs[0]["stages"][stage]["unit"]
         cells = [_service_and_wait(run["stages"].get(stage)) for run in runs]
         yield f"{stage} ({unit})", "service + wait, ms", cells

@@ -20,7 +20,7 @@ from trilane.scene.schema import RunConfig, Shape
 from trilane.scheduler.run import MAX_CHANNELS
 from trilane.stages.contracts import Packet, SlotLayout, posed_vertices_bytes, view_packet
 from trilane.stages.cpu.pose import PoseStage
-from trilane.stages.dsp.runtime import RUNTIMES, Binding, RuntimeOptions, load_runtime
+from trilane.stages.dsp.runtime import Binding, RuntimeOptions, load_runtime
 from trilane.stages.gpu import unit as gpu
 
 U8 = NDArray[np.uint8]
@@ -68,13 +68,6 @@ def _row(pair: tuple[str, str], found: list[tuple[float, int, int]]) -> dict[str
     }
 
 
-def installed_runtimes() -> list[str]:
-    """Names of the runtimes whose packages are there, in the order of the table."""
-    from importlib.util import find_spec
-
-    return [name for name, entry in RUNTIMES.items() if find_spec(entry.package) is not None]
-
-
 class _Sessions:
     """The network of the scene's first avatar on each runtime, by tensor shape."""
 
@@ -89,7 +82,7 @@ class _Sessions:
         if (runtime, shape) not in self._bound:
             slots = np.empty((1, *tensor.shape), np.uint8), np.empty((1, *shape, 4), np.uint8)
             session = self._runtimes[runtime].load(reshaped(self._network, *shape), RuntimeOptions(threads=1))
-            self._bound[runtime, shape] = (*slots, session.bind(*slots))
+            self._bound[runtime, shape] = (*slots, session.bind(slots[:1], slots[1:]))
         slot_in, slot_out, binding = self._bound[runtime, shape]
         slot_in[0] = tensor
         binding.run()

@@ -80,7 +80,7 @@ def error_of(pair: Pair, case: str, runtime: str) -> float:
     frame = INPUTS[case](np.random.default_rng(7))
     tensor = np.clip(np.round(frame / encoding.scale) + encoding.zero_point, 0, 255).astype(np.uint8)
     image = np.zeros((1, *SHAPE[:2], 4), np.uint8)
-    load_runtime(runtime).load(pair.integer, RuntimeOptions()).bind(np.ascontiguousarray(tensor[None]), image).run()
+    load_runtime(runtime).load(pair.integer, RuntimeOptions()).bind([np.ascontiguousarray(tensor[None])], [image]).run()
     real = (tensor.astype(np.float32) - encoding.zero_point) * np.float32(encoding.scale)
     with torch.no_grad():
         wanted = pair.network(torch.from_numpy(real).permute(2, 0, 1)[None]).permute(0, 2, 3, 1).numpy()

@@ -81,7 +81,7 @@ def integer_painter(studio: Studio, network: NetworkFile, texture: NDArray[np.fl
         if shape not in sessions:
             sessions[shape] = load(reshaped(network, *shape), RuntimeOptions(threads=threads))
         picture = np.empty((1, *shape, 4), np.uint8)
-        sessions[shape].bind(tensor, picture).run()
+        sessions[shape].bind([tensor], [picture]).run()
         found: RGBA8 = picture[0]
         return found
 

@@ -1,45 +1,59 @@
-"""The infer stage: tensor bytes of a slot in, picture bytes of a slot out, by the avatar's integer network.
+"""The infer stage: bytes of a slot in, bytes of a slot out, by the avatar's integer network or a part of it.
 
 Rule: sessions and bindings are all made in `bind`, a frame allocates nothing, and with nobody in view nothing is run.
 """
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.avatars.bundle import load_bundle
-from trilane.avatars.network_file import RGBA, NetworkFile
-from trilane.avatars.reshape import reshaped
+from trilane.avatars.split import NetworkPart
 from trilane.errors import BadInputError
 from trilane.scene.schema import RunConfig, Shape
 from trilane.stages.contracts import Packet
-from trilane.stages.dsp.runtime import Binding, RuntimeOptions, load_runtime, resolve
+from trilane.stages.dsp.parts import parts_for, shared_network, views
+from trilane.stages.dsp.runtime import Binding, RuntimeOptions, Session, load_runtime, resolve
 
+U8 = NDArray[np.uint8]
 Key = tuple[Shape, int, int]
 
 
-class InferStage:
-    """`trilane.stages.contracts.Stage`. One inference a frame: H·W·C bytes in, H·W·4 bytes out.
+@dataclass(frozen=True)
+class BoundPart:
+    """A part on a pair of slots. `passed`: (from, to) tensors that a later part reads as this one was given them."""
 
-    Several avatars share the tensor, each in its `tensor_rect`, so they must share one network.
-    `runtime`: the name of the runtime that runs. Raises BadInputError, MissingPartError when made or bound.
+    binding: Binding
+    passed: Sequence[tuple[U8, U8]]
+
+    def run(self) -> None:
+        for source, target in self.passed:
+            np.copyto(target, source)
+        self.binding.run()
+
+
+class InferStage:
+    """`trilane.stages.contracts.Stage`. One inference a frame; a whole network turns H·W·C bytes into H·W·4.
+
+    `part`: which one of those that the configuration's cuts make. Several avatars share the tensor, each in its
+    `tensor_rect`, so they must share one network. `runtime`: the name of the runtime that runs. Raises BadInputError,
+    MissingPartError when made or bound.
     """
 
-    def __init__(self, config: RunConfig) -> None:
+    def __init__(self, config: RunConfig, part: int = 0) -> None:
         self.runtime = resolve(config.runtime)
         self._module = load_runtime(self.runtime)
-        settings = config.units["dsp"]
+        self._config, self._part = config, part
+        settings = config.units[config.infer_units[part]]
         self._options = RuntimeOptions(settings.threads, settings.spin)
         self._shapes = config.buckets
-        self._network = _shared_network(config.avatar_dirs)
-        self._bindings: dict[Key, Binding] = {}
+        self._network = shared_network(config.avatar_dirs)
+        self._bindings: dict[Key, BoundPart] = {}
         self._inputs: Sequence[Packet] = ()
         self._outputs: Sequence[Packet] = ()
         self.startup: dict[str, float] = {}
@@ -49,10 +63,10 @@ class InferStage:
         begin = time.monotonic_ns()
         self._inputs, self._outputs = inputs, outputs
         for shape in self._shapes:
-            session = self._module.load(reshaped(self._network, *shape), self._options)
+            part = parts_for(self._config, self._network, shape)[self._part]
+            session = self._module.load(part, self._options)
             for (i, source), (o, target) in product(enumerate(inputs), enumerate(outputs)):
-                tensor = _view(source.payload, (1, *shape, self._network.channels))
-                self._bindings[shape, i, o] = session.bind(tensor, _view(target.payload, (1, *shape, RGBA)))
+                self._bindings[shape, i, o] = _bound(session, part, source.payload, target.payload)
         compiled = time.monotonic_ns()
         for shape in self._shapes:
             self._bindings[shape, 0, 0].run()
@@ -75,7 +89,7 @@ class InferStage:
         self._bindings.clear()
         self._inputs = self._outputs = ()
 
-    def _binding(self, shape: Shape, slot_in: int, slot_out: int, frame: int) -> Binding:
+    def _binding(self, shape: Shape, slot_in: int, slot_out: int, frame: int) -> BoundPart:
         try:
             return self._bindings[shape, slot_in, slot_out]
         except KeyError:
@@ -83,19 +97,13 @@ class InferStage:
             raise BadInputError(f"frame {frame}", f"tensor shape {shape[0]}x{shape[1]}", f"one of {known}") from None
 
 
-def _shared_network(folders: Sequence[Path]) -> NetworkFile:
-    bundles = [load_bundle(folder) for folder in folders]
-    first, *others = [bundle.read_network() for bundle in bundles]
-    for bundle, network in zip(bundles[1:], others, strict=True):
-        if network.digest != first.digest:
-            found = "another network than the scene's first avatar has"
-            raise BadInputError(bundle.network_path, found, "one network for all avatars, as they share a tensor")
-    return first
+def infer_stages(config: RunConfig, unit: str) -> dict[str, InferStage]:
+    """The infer stages of `unit` by name: one for each part of the network that runs there. Raises as InferStage."""
+    named = enumerate(zip(config.infer_names, config.infer_units, strict=True))
+    return {name: InferStage(config, part) for part, (name, own) in named if own == unit}
 
 
-def _view(payload: NDArray[np.uint8], shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """The first bytes of a slot as an array. Raises ValueError when the slot is too small."""
-    size = math.prod(shape)
-    if size > payload.size:
-        raise ValueError(f"a slot of {payload.size} bytes, {size} needed")
-    return payload[:size].reshape(shape)
+def _bound(session: Session, part: NetworkPart, source: U8, target: U8) -> BoundPart:
+    given, handed_on = views(source, part.given), views(target, part.handed_on)
+    binding = session.bind([given[name] for name in part.inputs], [handed_on[name] for name in part.outputs])
+    return BoundPart(binding, [(given[name], handed_on[name]) for name in handed_on if name not in part.outputs])

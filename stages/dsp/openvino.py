@@ -5,16 +5,15 @@ Rule: after the first run of a session nothing is allocated and nothing is copie
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
-import numpy as np
 import openvino
-from numpy.typing import NDArray
 
-from trilane.avatars.network_file import NetworkFile
+from trilane.avatars.network_file import IntegerNetwork
 from trilane.errors import BadInputError
-from trilane.stages.dsp.runtime import RuntimeOptions, cache_dir
+from trilane.stages.dsp.runtime import U8, RuntimeOptions, cache_dir
 
 DEVICE = "CPU"
 LAYERS = {"Convolution", "Deconvolution", "FullyConnected", "MatMul"}
@@ -24,13 +23,13 @@ REMEDY = ("integer layers", "quantise them")
 
 
 class OpenvinoBinding:
-    """One infer request with both tensors set."""
+    """One infer request with all its tensors set."""
 
-    def __init__(self, compiled: Any, tensor: NDArray[np.uint8], image: NDArray[np.uint8]) -> None:
-        self._tensors = [openvino.Tensor(array, shared_memory=True) for array in (tensor, image)]
+    def __init__(self, compiled: Any, inputs: Sequence[U8], outputs: Sequence[U8]) -> None:
+        self._tensors = [openvino.Tensor(array, shared_memory=True) for array in (*inputs, *outputs)]
         self._request = compiled.create_infer_request()
-        self._request.set_input_tensor(self._tensors[0])
-        self._request.set_output_tensor(self._tensors[1])
+        for port, tensor in zip((*compiled.inputs, *compiled.outputs), self._tensors, strict=True):
+            self._request.set_tensor(port, tensor)
 
     def run(self) -> None:
         self._request.start_async()
@@ -43,11 +42,11 @@ class OpenvinoSession:
     def __init__(self, compiled: Any) -> None:
         self._compiled = compiled
 
-    def bind(self, tensor: NDArray[np.uint8], image: NDArray[np.uint8]) -> OpenvinoBinding:
-        return OpenvinoBinding(self._compiled, tensor, image)
+    def bind(self, inputs: Sequence[U8], outputs: Sequence[U8]) -> OpenvinoBinding:
+        return OpenvinoBinding(self._compiled, inputs, outputs)
 
 
-def load(network: NetworkFile, options: RuntimeOptions) -> OpenvinoSession:
+def load(network: IntegerNetwork, options: RuntimeOptions) -> OpenvinoSession:
     """Compile `network`. Raises BadInputError when OpenVINO cannot, or leaves a layer in float."""
     settings = {
         "PERFORMANCE_HINT": "LATENCY",
@@ -78,7 +77,7 @@ def version() -> str:
     return f"openvino {openvino.__version__}"
 
 
-def _check_integer(compiled: Any, network: NetworkFile) -> None:
+def _check_integer(compiled: Any, network: IntegerNetwork) -> None:
     left = set()
     for op in compiled.get_runtime_model().get_ops():
         info = op.get_rt_info()

@@ -6,36 +6,43 @@ Rule: after the first run of a session nothing is allocated and nothing is copie
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import onnx
 import onnxruntime
-from numpy.typing import NDArray
 from onnxruntime.capi import onnxruntime_pybind11_state as state
 
-from trilane.avatars.network_file import NetworkFile, node_name
+from trilane.avatars.network_file import IntegerNetwork, node_name
 from trilane.errors import BadInputError
-from trilane.stages.dsp.runtime import RuntimeOptions
+from trilane.stages.dsp.runtime import U8, RuntimeOptions
 
 PROVIDER = "CPUExecutionProvider"
 FLOAT_LAYERS = {"Conv", "FusedConv", "NhwcFusedConv", "ConvTranspose", "Gemm", "FusedGemm", "MatMul", "FusedMatMul"}
-LOAD_ERRORS = (state.Fail, state.InvalidArgument, state.InvalidGraph, state.NotImplemented, state.RuntimeException)
+LOAD_ERRORS = (
+    state.Fail,
+    state.InvalidProtobuf,
+    state.EPFail,
+    state.InvalidArgument,
+    state.InvalidGraph,
+    state.NotImplemented,
+    state.RuntimeException,
+)
 ERRORS_ONLY = 3
 
 
 class OrtBinding:
-    """One IOBinding on two addresses."""
+    """One IOBinding on the buffers' addresses."""
 
-    def __init__(
-        self, session: onnxruntime.InferenceSession, tensor: NDArray[np.uint8], image: NDArray[np.uint8]
-    ) -> None:
-        self._buffers = (tensor, image)
+    def __init__(self, session: onnxruntime.InferenceSession, inputs: Sequence[U8], outputs: Sequence[U8]) -> None:
+        self._buffers = (*inputs, *outputs)
         self._session = session
         self._io = session.io_binding()
-        source, target = session.get_inputs()[0], session.get_outputs()[0]
-        self._io.bind_input(source.name, "cpu", 0, np.uint8, tensor.shape, tensor.ctypes.data)
-        self._io.bind_output(target.name, "cpu", 0, np.uint8, image.shape, image.ctypes.data)
+        for source, array in zip(session.get_inputs(), inputs, strict=True):
+            self._io.bind_input(source.name, "cpu", 0, np.uint8, array.shape, array.ctypes.data)
+        for target, array in zip(session.get_outputs(), outputs, strict=True):
+            self._io.bind_output(target.name, "cpu", 0, np.uint8, array.shape, array.ctypes.data)
 
     def run(self) -> None:
         self._session.run_with_iobinding(self._io)
@@ -47,11 +54,11 @@ class OrtSession:
     def __init__(self, session: onnxruntime.InferenceSession) -> None:
         self._session = session
 
-    def bind(self, tensor: NDArray[np.uint8], image: NDArray[np.uint8]) -> OrtBinding:
-        return OrtBinding(self._session, tensor, image)
+    def bind(self, inputs: Sequence[U8], outputs: Sequence[U8]) -> OrtBinding:
+        return OrtBinding(self._session, inputs, outputs)
 
 
-def load(network: NetworkFile, options: RuntimeOptions) -> OrtSession:
+def load(network: IntegerNetwork, options: RuntimeOptions) -> OrtSession:
     """Compile `network`. Raises BadInputError when ONNX Runtime cannot, or leaves a layer in float."""
     with tempfile.TemporaryDirectory(prefix="trilane-ort-") as folder:
         optimised = Path(folder) / "optimised.onnx"
@@ -69,7 +76,7 @@ def version() -> str:
     return f"onnxruntime {onnxruntime.__version__}"
 
 
-def check_integer(optimised: onnx.ModelProto, network: NetworkFile) -> None:
+def check_integer(optimised: onnx.ModelProto, network: IntegerNetwork) -> None:
     """Raises BadInputError naming the layers of the optimised graph of `network` that still compute in float."""
     layers = {node_name(node) for node in optimised.graph.node if node.op_type in FLOAT_LAYERS}
     left = sorted(layers - network.float_layers)

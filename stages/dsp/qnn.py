@@ -5,6 +5,10 @@ Rule: the whole graph runs on the HTP or nothing does; no node falls back to the
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
+import os
+import platform
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
@@ -13,10 +17,10 @@ from typing import Any
 import onnxruntime
 import onnxruntime_qnn
 
-from trilane.avatars.network_file import NetworkFile, check_integer_layers
+from trilane.avatars.network_file import IntegerNetwork, NetworkFile, check_integer_layers
 from trilane.errors import BadInputError, MissingPartError
 from trilane.stages.dsp.ort import ERRORS_ONLY, LOAD_ERRORS, OrtSession
-from trilane.stages.dsp.runtime import RuntimeOptions
+from trilane.stages.dsp.runtime import RuntimeOptions, cache_dir
 
 NAME = onnxruntime_qnn.get_ep_name()
 #: Snapdragon 888: SoC number of Qualcomm's SDK, Hexagon v68.
@@ -24,10 +28,26 @@ SOCS = {"sm8350": {"soc_model": "30", "htp_arch": "68"}}
 DEFAULTS = {**SOCS["sm8350"], "htp_performance_mode": "burst"}
 
 
-def load(network: NetworkFile, options: RuntimeOptions) -> OrtSession:
-    """Compile `network` for the HTP. Raises BadInputError when a node of it does not run there in integers."""
+def load(network: IntegerNetwork, options: RuntimeOptions) -> OrtSession:
+    """Compile `network` for the HTP, or take what was compiled before.
+
+    Raises BadInputError when a node of it does not run there in integers.
+    """
     check_integer_layers(network)
-    return OrtSession(_session(network, {**DEFAULTS, **options.device}, {}))
+    device = {**DEFAULTS, **options.device}
+    source, folder = network.model.SerializeToString(), cache_dir("qnn")
+    if folder is None:
+        return OrtSession(_session(network.where, source, device, {}))
+    compiled = folder / f"{_key(network, device)}.onnx"
+    with contextlib.suppress(OSError, BadInputError):  # not there, or spoilt: it is compiled again
+        return OrtSession(_session(network.where, compiled.read_bytes(), device, {}))
+    draft = compiled.with_name(f".{compiled.stem}-{os.getpid()}.onnx")
+    try:
+        session = _session(network.where, source, device, _context(draft))
+        draft.replace(compiled)
+    finally:
+        draft.unlink(missing_ok=True)
+    return OrtSession(session)
 
 
 def write_context(network: NetworkFile, soc: str, path: Path) -> None:
@@ -35,24 +55,34 @@ def write_context(network: NetworkFile, soc: str, path: Path) -> None:
     if soc not in SOCS:
         raise BadInputError("soc", repr(soc), f"one of {', '.join(SOCS)}")
     check_integer_layers(network)
-    context = {"ep.context_enable": "1", "ep.context_embed_mode": "1", "ep.context_file_path": str(path)}
-    _session(network, SOCS[soc], context)
+    _session(network.where, network.model.SerializeToString(), SOCS[soc], _context(path))
 
 
 def version() -> str:
     return f"onnxruntime-qnn {onnxruntime_qnn.__version__}"
 
 
-def _session(network: NetworkFile, device: Mapping[str, str], entries: Mapping[str, str]) -> Any:
+def _key(network: IntegerNetwork, device: Mapping[str, str]) -> str:
+    """What a compiled network depends on, as a file name."""
+    parts = (network.digest, version(), platform.machine(), *(f"{key}={device[key]}" for key in sorted(device)))
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+
+
+def _context(path: Path) -> dict[str, str]:
+    """Entries that make a session write what it compiled."""
+    return {"ep.context_enable": "1", "ep.context_embed_mode": "1", "ep.context_file_path": str(path)}
+
+
+def _session(where: str, model: bytes, device: Mapping[str, str], entries: Mapping[str, str]) -> Any:
     settings = onnxruntime.SessionOptions()
     settings.log_severity_level = ERRORS_ONLY
     settings.add_provider_for_devices(_devices(), {"backend_path": onnxruntime_qnn.get_qnn_htp_path(), **device})
     for key, value in {"session.disable_cpu_ep_fallback": "1", **entries}.items():
         settings.add_session_config_entry(key, value)
     try:
-        return onnxruntime.InferenceSession(network.model.SerializeToString(), settings)
+        return onnxruntime.InferenceSession(model, settings)
     except LOAD_ERRORS as error:
-        raise BadInputError(network.where, str(error), "a network that runs on the HTP as a whole") from error
+        raise BadInputError(where, str(error), "a network that runs on the HTP as a whole") from error
 
 
 @cache

@@ -16,10 +16,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.avatars.network_file import NetworkFile
+from trilane.avatars.network_file import IntegerNetwork
 from trilane.errors import BadInputError, MissingPartError
 
-AUTO = "auto"
+U8 = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -35,23 +35,26 @@ class RuntimeOptions:
 
 
 class Binding(Protocol):
-    """A network bound to one input and one output buffer."""
+    """A network bound to its buffers."""
 
     def run(self) -> None:
-        """Compute the output buffer from the input buffer; nothing is copied or allocated."""
+        """Compute the output buffers from the input buffers; nothing is copied or allocated."""
 
 
 class Session(Protocol):
     """A loaded network of one shape."""
 
-    def bind(self, tensor: NDArray[np.uint8], image: NDArray[np.uint8]) -> Binding:
-        """Bind buffers: `tensor` (N, H, W, C), `image` (N, H, W, 4), C-contiguous; both must outlive the binding."""
+    def bind(self, inputs: Sequence[U8], outputs: Sequence[U8]) -> Binding:
+        """Bind buffers, C-contiguous, in the network's order; all must outlive the binding.
+
+        A whole network has one input (N, H, W, C) and one output (N, H, W, 4); a part has those of its cuts.
+        """
 
 
 class Runtime(Protocol):
     """A module of this folder."""
 
-    def load(self, network: NetworkFile, options: RuntimeOptions) -> Session:
+    def load(self, network: IntegerNetwork, options: RuntimeOptions) -> Session:
         """Compile for the network's own shape. Raises BadInputError naming a node that it cannot run in integers."""
 
     def version(self) -> str:
@@ -60,35 +63,45 @@ class Runtime(Protocol):
 
 @dataclass(frozen=True)
 class RuntimeEntry:
-    """Where a runtime lives, what it needs, and how to get that."""
+    """Where a runtime lives, the package that it needs, a file that this package must hold, and how to get that."""
 
     module: str
     package: str
     install: str
+    file: str = ""
+
+    @property
+    def is_installed(self) -> bool:
+        spec = importlib.util.find_spec(self.package)
+        return spec is not None and (not self.file or (Path(spec.origin or "").parent / self.file).is_file())
 
 
-#: Fastest first, by measurement: `auto` takes the first that is installed. An emulator is never the fastest.
 RUNTIMES = {
     "openvino": RuntimeEntry("trilane.stages.dsp.openvino", "openvino", "pip install 'trilane[openvino]'"),
     "ort": RuntimeEntry("trilane.stages.dsp.ort", "onnxruntime", "pip install onnxruntime"),
     "qnn": RuntimeEntry("trilane.stages.dsp.qnn", "onnxruntime_qnn", "pip install 'trilane[qnn]'"),
+    "cuda": RuntimeEntry(
+        "trilane.stages.dsp.cuda",
+        "onnxruntime",
+        "pip uninstall onnxruntime; pip install onnxruntime-gpu, on a machine with an NVIDIA GPU",
+        "capi/libonnxruntime_providers_cuda.so",
+    ),
 }
 
 
 def installed() -> Sequence[str]:
-    """Names of the runtimes whose package is present, fastest first."""
-    return [name for name, entry in RUNTIMES.items() if importlib.util.find_spec(entry.package)]
+    """Names of the runtimes whose package is present."""
+    return [name for name, entry in RUNTIMES.items() if entry.is_installed]
 
 
 def resolve(name: str) -> str:
-    """The runtime that `name` means: `auto` is the fastest installed one. Raises BadInputError, MissingPartError."""
-    if name == AUTO:
-        return installed()[0]
+    """`name`, which is an installed runtime. Raises BadInputError, MissingPartError."""
     if name not in RUNTIMES:
-        raise BadInputError("runtime", f"{name!r}", f"{AUTO} or one of {', '.join(RUNTIMES)}")
+        raise BadInputError("runtime", f"{name!r}", f"one of {', '.join(RUNTIMES)}")
     entry = RUNTIMES[name]
-    if importlib.util.find_spec(entry.package) is None:
-        raise MissingPartError(f"runtime {name} needs the package {entry.package}", entry.install)
+    if not entry.is_installed:
+        what = f"a build of {entry.package} with {entry.file}" if entry.file else f"the package {entry.package}"
+        raise MissingPartError(f"runtime {name} needs {what}", entry.install)
     return name
 
 

@@ -1,12 +1,12 @@
-"""The DSP unit: it owns the infer stage."""
+"""The DSP unit: it owns the infer stage, or the parts of it that were not given to another unit."""
 
 from __future__ import annotations
 
 from trilane.scene.schema import RunConfig
 from trilane.stages.contracts import Stage
-from trilane.stages.dsp.infer import InferStage
+from trilane.stages.dsp.infer import infer_stages
 
 
 def build(config: RunConfig) -> dict[str, Stage]:
     """The unit's stages by name. Raises BadInputError, MissingPartError."""
-    return {"infer": InferStage(config)}
+    return {**infer_stages(config, "dsp")}

@@ -17,6 +17,7 @@ from onnx.reference import ReferenceEvaluator
 from trilane.avatars.network_file import check_network
 from trilane.avatars.quantise import quantise
 from trilane.avatars.reshape import reshaped
+from trilane.avatars.split import cuts, split
 from trilane.errors import BadInputError, MissingPartError
 from trilane.stages.dsp import runtime
 from trilane.stages.dsp.runtime import RUNTIMES, RuntimeOptions, load_runtime
@@ -25,16 +26,21 @@ from trilane.stages.dsp.runtime import RUNTIMES, RuntimeOptions, load_runtime
 EVALUATOR_OPSET = 19
 
 #: Largest and mean difference in bytes: the network rounds alike, but there is more than one way to a sigmoid.
-LIMITS = {"openvino": (1, 0.05), "ort": (0, 0.0), "qnn": (0, 0.0)}
+LIMITS = {"openvino": (1, 0.05), "ort": (0, 0.0), "qnn": (0, 0.0), "cuda": (1, 0.05)}
 #: The emulator needs about 30 ms for a frame of the tiny network.
-FRAMES = {"openvino": 1000, "ort": 1000, "qnn": 20}
+FRAMES = {"openvino": 1000, "ort": 1000, "qnn": 20, "cuda": 1000}
 #: Bytes of the smallest Python object, and what the interpreter itself may come to hold meanwhile.
 SMALLEST_OBJECT, INTERPRETERS_OWN = 16, 4096
 
 
+def skip_without(name):
+    if not RUNTIMES[name].is_installed:
+        pytest.skip(f"runtime {name} is not installed: {RUNTIMES[name].install}")
+
+
 @pytest.fixture(params=RUNTIMES)
 def name(request):
-    pytest.importorskip(RUNTIMES[request.param].package)
+    skip_without(request.param)
     return request.param
 
 
@@ -64,7 +70,7 @@ def reference(network, tensor):
 
 def picture(module, network, tensor, threads=1):
     image = np.full((*network.shape[:3], 4), 77, np.uint8)
-    module.load(network, RuntimeOptions(threads)).bind(tensor, image).run()
+    module.load(network, RuntimeOptions(threads)).bind([tensor], [image]).run()
     return image
 
 
@@ -82,12 +88,46 @@ def test_every_bucket_shape_runs(name, module, tiny_quantised):
         assert_same(picture(module, network, tensor), reference(network, tensor), name)
 
 
+def test_a_batch_gives_the_bytes_of_its_frames(module, tiny_quantised):
+    one, three = (reshaped(tiny_quantised.network, 64, 64, batch=count) for count in (1, 3))
+    tensor = np.random.default_rng(0).integers(0, 256, three.shape, dtype=np.uint8)
+    found = picture(module, three, tensor)
+    assert (found == np.concatenate([picture(module, one, frame[None]) for frame in tensor])).all()
+
+
+def test_parts_give_the_bytes_of_the_whole(module, tiny_quantised):
+    network = tiny_quantised.network
+    tensor = np.random.default_rng(0).integers(0, 256, network.shape, dtype=np.uint8)
+    places = [cut.at for cut in cuts(network)]
+    first, second = split(network, [places[len(places) // 2]])
+    known = dict.fromkeys(first.given, tensor) | {
+        name: np.empty(shape, np.uint8) for name, shape in first.outputs.items()
+    }
+    image = np.empty((*network.shape[:3], 4), np.uint8)
+    for part, made in ((first, [known[name] for name in first.outputs]), (second, [image])):
+        module.load(part, RuntimeOptions()).bind([known[name] for name in part.inputs], made).run()
+    assert (image == picture(module, network, tensor)).all()
+
+
+def test_what_qnn_compiled_is_kept_and_made_anew_when_spoilt(tiny_quantised, monkeypatch, tmp_path):
+    skip_without("qnn")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    module, network = load_runtime("qnn"), tiny_quantised.network
+    tensor = np.random.default_rng(0).integers(0, 256, network.shape, dtype=np.uint8)
+    first = picture(module, network, tensor)
+    (kept,) = (tmp_path / "trilane" / "qnn").iterdir()
+    assert (picture(module, network, tensor) == first).all()
+    kept.write_bytes(b"spoilt")
+    assert (picture(module, network, tensor) == first).all()
+    assert len(kept.read_bytes()) > 1000
+
+
 def test_a_binding_reads_and_writes_the_slots_themselves(module, tiny_quantised, tiny_frames):
     """Bytes written into the slot after it was bound are what is read; the bound address is what is written."""
     network = tiny_quantised.network
     slot_in, slot_out = np.zeros(network.shape, np.uint8), np.zeros((*network.shape[:3], 4), np.uint8)
     addresses = slot_in.ctypes.data, slot_out.ctypes.data
-    binding = module.load(network, RuntimeOptions()).bind(slot_in, slot_out)
+    binding = module.load(network, RuntimeOptions()).bind([slot_in], [slot_out])
     binding.run()
     empty = slot_out.copy()
     slot_in[:] = tensor_of(network, tiny_frames)
@@ -103,7 +143,7 @@ def test_bindings_of_one_session_do_not_mix(module, tiny_quantised):
     rng = np.random.default_rng(3)
     inputs = [rng.integers(0, 256, network.shape, dtype=np.uint8) for _ in range(2)]
     images = [np.zeros((*network.shape[:3], 4), np.uint8) for _ in range(2)]
-    bindings = [session.bind(tensor, image) for tensor, image in zip(inputs, images, strict=True)]
+    bindings = [session.bind([tensor], [image]) for tensor, image in zip(inputs, images, strict=True)]
     for binding in bindings:
         binding.run()
     for tensor, image in zip(inputs, images, strict=True):
@@ -114,7 +154,7 @@ def test_frames_allocate_nothing(name, module, tiny_quantised):
     """What leaks grows in every round; what other threads of this process do, only in some."""
     network = tiny_quantised.network
     tensor, image = np.zeros(network.shape, np.uint8), np.zeros((*network.shape[:3], 4), np.uint8)
-    binding = module.load(network, RuntimeOptions()).bind(tensor, image)
+    binding = module.load(network, RuntimeOptions()).bind([tensor], [image])
     rounds = [_growth(binding, FRAMES[name]) for _ in range(5)]
     assert min(resident for resident, _ in rounds) <= 0
     assert min(traced for _, traced in rounds) < max(SMALLEST_OBJECT * FRAMES[name], INTERPRETERS_OWN)
@@ -158,10 +198,6 @@ def test_a_graph_that_does_not_run_is_named(module, tiny_quantised):
         module.load(check_network(model, "network.onnx"), RuntimeOptions())
 
 
-def test_auto_is_the_fastest_installed():
-    assert runtime.resolve("auto") == runtime.installed()[0]
-
-
 def test_unknown_runtimes_are_refused():
     with pytest.raises(BadInputError, match="tpu"):
         runtime.resolve("tpu")
@@ -172,6 +208,14 @@ def test_an_absent_runtime_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(RUNTIMES, "none", entry)
     with pytest.raises(MissingPartError, match="pip install it"):
         load_runtime("none")
+
+
+def test_a_package_without_the_part_that_a_runtime_needs_is_absent(monkeypatch):
+    entry = runtime.RuntimeEntry("trilane.stages.dsp.none", "onnxruntime", "pip install more", "capi/none.so")
+    monkeypatch.setitem(RUNTIMES, "none", entry)
+    with pytest.raises(MissingPartError, match=r"onnxruntime with capi/none\.so.*pip install more"):
+        load_runtime("none")
+    assert "none" not in runtime.installed() and "ort" in runtime.installed()
 
 
 def test_the_wrong_file_is_named(tmp_path: Path, tiny_float: onnx.ModelProto):

@@ -43,7 +43,7 @@ def test_parts_give_the_bytes_of_the_whole_wherever_it_is_cut(network: NetworkFi
     found = list(cuts(network))
     assert len(found) >= 3
     for cut in found:
-        head, tail = split(network, cut.at)
+        head, tail = (part.model for part in split(network, [cut.at]))
         kinds = {value.type.tensor_type.elem_type for value in (*head.graph.output, *tail.graph.input)}
         assert kinds == {onnx.TensorProto.UINT8}
         assert (run(tail, run(head, given))[output] == whole).all()
@@ -58,7 +58,7 @@ def test_the_default_avatar_can_be_cut_at_its_skips() -> None:
 
 def test_a_place_that_is_none_is_refused(network: NetworkFile) -> None:
     with pytest.raises(BadInputError, match="'nowhere', expected a quantised tensor"):
-        split(network, "nowhere")
+        split(network, ["nowhere"])
 
 
 def test_the_command_lists_places_and_writes_parts(tmp_path: Path, tiny_bundle: Path) -> None:
@@ -68,9 +68,35 @@ def test_the_command_lists_places_and_writes_parts(tmp_path: Path, tiny_bundle: 
         app, ["split", str(tiny_bundle), "--size", "64", "--at", places[0], "--out", str(tmp_path / "parts"), "--json"]
     )
     assert written.exit_code == 0
-    assert {path.name for path in (tmp_path / "parts").iterdir()} == {"head.onnx", "tail.onnx"}
+    assert {path.name for path in (tmp_path / "parts").iterdir()} == {"part-1.onnx", "part-2.onnx"}
 
 
 def test_half_of_the_options_is_refused(tiny_bundle: Path) -> None:
     with pytest.raises(BadInputError, match="--at without --out"):
         raise CliRunner().invoke(app, ["split", str(tiny_bundle), "--at", "x"]).exception or AssertionError
+
+
+def test_many_parts_give_the_bytes_of_the_whole(network: NetworkFile) -> None:
+    tensor = np.random.default_rng(1).integers(0, 256, network.shape, dtype=np.uint8)
+    known = {network.model.graph.input[0].name: tensor}
+    output = network.model.graph.output[0].name
+    whole = run(network.model, known)[output]
+    parts = split(network, [cut.at for cut in cuts(network)][::2])
+    assert len(parts) > 3
+    for part in parts:
+        assert set(part.inputs) <= set(part.given) and set(part.outputs) <= set(part.handed_on)
+        assert set(part.handed_on) - set(part.outputs) <= set(part.given)
+        known = run(part.model, known)
+    assert (known[output] == whole).all()
+
+
+def test_an_uncut_network_is_one_part(network: NetworkFile) -> None:
+    (part,) = split(network, [])
+    assert part.given == {network.model.graph.input[0].name: network.shape}
+    assert part.handed_on == {network.model.graph.output[0].name: (*network.shape[:3], 4)}
+
+
+def test_cuts_in_another_order_are_refused(network: NetworkFile) -> None:
+    first, second, *_ = (cut.at for cut in cuts(network))
+    with pytest.raises(BadInputError, match="in the order of the work"):
+        split(network, [second, first])

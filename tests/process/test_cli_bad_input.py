@@ -103,6 +103,8 @@ OPTIONS = {
     "unknown scene": (["beach"], "scene", "default"),
     "unknown runtime": (["--runtime", "abacus"], "runtime", "'abacus'"),
     "unknown skinning": (["--skinning", "npu"], "--skinning", "'npu'"),
+    "a split without a unit": (["--split", "rgba"], "--split", "UNIT one of cpu, gpu, dsp"),
+    "a split nowhere": (["--split", "nowhere=cpu"], "network.onnx, cut", "'nowhere'"),
     "pace of no chip": (["--pace"], "options", "--pace without --profile"),
     "chip without pace": (["--profile", "snapdragon-888"], "options", "--profile without --pace"),
     "unknown chip": (["--profile", "abacus", "--pace"], "abacus", "expected"),

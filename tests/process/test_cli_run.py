@@ -21,6 +21,8 @@ import pytest
 from PIL import Image
 
 from trilane.apps.report import read_report
+from trilane.avatars.bundle import load_bundle
+from trilane.avatars.split import cuts
 from trilane.scheduler.record import read, replay
 
 FRAMES = 20
@@ -73,6 +75,21 @@ def finished(
 
 
 Finished = tuple[Path, subprocess.CompletedProcess[str]]
+
+
+def test_parts_of_the_network_are_stages_of_their_own_with_the_same_pictures(
+    finished: Finished, drawable_bundle: Path, tmp_path: Path
+) -> None:
+    whole = json.loads(finished[1].stdout)
+    places = [cut.at for cut in cuts(load_bundle(str(drawable_bundle)).read_network())]
+    split = ("--split", f"{places[1]}=cpu", "--split", f"{places[-2]}=dsp")
+    done = run(drawable_bundle, tmp_path, "--frames", str(FRAMES), "--baseline", "0", *split)
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert list(report["stages"]) == ["pose", "raster", "infer", "infer-2", "infer-3", "composite", "present"]
+    assert [report["stages"][name]["unit"] for name in ("infer", "infer-2", "infer-3")] == ["dsp", "cpu", "dsp"]
+    assert report["frames"]["presented"] == FRAMES
+    assert report["checksum"] == whole["checksum"]
 
 
 def run_folder(finished: Finished) -> Path:

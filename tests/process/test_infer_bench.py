@@ -43,6 +43,14 @@ def test_a_file_is_measured(file, monkeypatch):
     assert 0 < row["share_of_roofline"] < 10 and row["int8_over_fp32"] is None
 
 
+def test_times_of_a_batch_are_those_of_a_frame(file, monkeypatch):
+    monkeypatch.setattr(roofline, "measure", lambda _threads: {"int8_gmac_s": 100.0})
+    result = infer.measure(str(file), batch=(1, 8), runtime=("ort",), threads=1, seconds=0.2, period=0.1)
+    one, eight = result["rows"]
+    assert (one["batch"], eight["batch"]) == (1, 8) and eight["frames"] % 8 == 0
+    assert one["p50_ms"] / 4 < eight["p50_ms"] < one["p50_ms"] * 4
+
+
 @pytest.mark.parametrize(
     ("asked", "message"),
     [({"runtime": ("tpu",)}, "tpu"), ({"period": 0.0}, "--period"), ({"period": 9.0}, "--period")],

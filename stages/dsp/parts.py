@@ -1,0 +1,66 @@
+"""Which part of the network a stage runs, and how the tensors of a cut lie in a slot.
+
+Rule: what crosses a cut lies in the order of the cut, each tensor on its own cache lines; every process that looks at
+the same configuration finds the same places.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.avatars.bundle import load_bundle
+from trilane.avatars.network_file import NetworkFile
+from trilane.avatars.reshape import reshaped
+from trilane.avatars.split import NetworkPart, Shapes, split
+from trilane.errors import BadInputError
+from trilane.scene.schema import RunConfig, Shape
+
+LINE = 64  # bytes of a cache line, and of the widest vector register
+U8 = NDArray[np.uint8]
+
+
+def shared_network(folders: Sequence[Path]) -> NetworkFile:
+    """The network of the avatars in `folders`. Raises BadInputError when they do not share one."""
+    bundles = [load_bundle(folder) for folder in folders]
+    first, *others = [bundle.read_network() for bundle in bundles]
+    for bundle, network in zip(bundles[1:], others, strict=True):
+        if network.digest != first.digest:
+            found = "another network than the scene's first avatar has"
+            raise BadInputError(bundle.network_path, found, "one network for all avatars, as they share a tensor")
+    return first
+
+
+def parts_for(config: RunConfig, network: NetworkFile, shape: Shape) -> list[NetworkPart]:
+    """The parts of `network` for tensors of `shape`, cut as `config` says; one part when it is not cut."""
+    return split(reshaped(network, *shape), [cut.at for cut in config.cuts])
+
+
+def crossing_bytes(config: RunConfig) -> list[int]:
+    """Bytes that cross each cut, for the scene's shape that needs most. Raises BadInputError."""
+    if not config.cuts:
+        return []
+    network = shared_network(config.avatar_dirs)
+    shapes = [[part.handed_on for part in parts_for(config, network, shape)[:-1]] for shape in config.buckets]
+    return [max(extent(crossing) for crossing in crossings) for crossings in zip(*shapes, strict=True)]
+
+
+def extent(shapes: Shapes) -> int:
+    """Bytes that tensors of `shapes` take up in a slot."""
+    return sum(-(-math.prod(shape) // LINE) * LINE for shape in shapes.values())
+
+
+def views(payload: U8, shapes: Shapes) -> dict[str, U8]:
+    """Tensors of `shapes` in a slot, in their order. Raises ValueError when the slot is too small."""
+    found, start = {}, 0
+    for name, shape in shapes.items():
+        size = math.prod(shape)
+        if start + size > payload.size:
+            raise ValueError(f"a slot of {payload.size} bytes, {start + size} needed")
+        found[name] = payload[start : start + size].reshape(shape)
+        start += -(-size // LINE) * LINE
+    return found

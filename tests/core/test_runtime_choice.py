@@ -1,0 +1,33 @@
+"""`auto`: the fastest runtime that is installed, by the host profile."""
+
+from __future__ import annotations
+
+import pytest
+
+from trilane.errors import MissingPartError
+from trilane.hw_profiles import detect
+from trilane.hw_profiles.load import load_profile
+from trilane.hw_profiles.runtimes import fastest_runtime
+from trilane.stages.dsp.runtime import RUNTIMES
+
+
+@pytest.mark.parametrize(("flag", "fastest"), [("avx2", "openvino"), ("avx512_vnni", "openvino"), ("asimddp", "ort")])
+def test_the_instructions_of_the_machine_decide(monkeypatch, tmp_path, flag, fastest):
+    (tmp_path / "cpuinfo").write_text(f"flags : fpu {flag}")
+    monkeypatch.setattr(detect, "CPU_INFO", tmp_path / "cpuinfo")
+    name, why = fastest_runtime(load_profile("host"), ["ort", "openvino", "qnn"])
+    assert name == fastest and "host profile" in why and "qnn" not in why
+
+
+def test_only_what_is_installed_is_taken():
+    assert fastest_runtime(load_profile("host"), ["ort"])[0] == "ort"
+
+
+def test_nothing_to_take_says_what_to_install():
+    with pytest.raises(MissingPartError, match="pip install onnxruntime"):
+        fastest_runtime(load_profile("host"), ["qnn"])
+
+
+def test_the_table_knows_only_runtimes_that_there_are():
+    assert {name for speeds, *_ in detect.RUNTIMES.values() for name in speeds} <= set(RUNTIMES)
+    assert set(detect.RUNTIMES) == set(detect.RATES)
