@@ -109,10 +109,14 @@ def _step_of(data: Any) -> float:
 
 
 def _cut(name: str, data: Any, model: onnx.ModelProto) -> tuple[float, float]:
-    """What of the measured range is to be held: from at most 0 to at least 0; all of the network's own ends."""
+    """What of the measured range is to be held: from at most 0 to at least 0.
+
+    All of the network's own ends, and of the logits, or nothing would be quite transparent.
+    """
     makers = {out: node for node in model.graph.node for out in node.output}
-    ends = {model.graph.input[0].name, model.graph.output[0].name}
-    share = 1.0 if name in ends else COVER
+    ends = {value.name for value in (model.graph.input[0], model.graph.output[0])}
+    logits = {source for node in model.graph.node if node.op_type == "Sigmoid" for source in node.input}
+    share = 1.0 if name in ends | logits else COVER
     low, high = (share * float(np.asarray(bound).item()) for bound in (data.lowest, data.highest))
     rectified = name in makers and makers[name].op_type == "Relu"
     return 0.0 if rectified else min(low, 0.0), max(high, 0.0)

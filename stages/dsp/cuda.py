@@ -6,7 +6,10 @@ A slot is copied to the GPU and back, which `bind` cannot spare: its memory is n
 
 from __future__ import annotations
 
+from functools import cache
+
 import onnxruntime
+from onnx import TensorProto, helper
 
 from trilane.avatars.network_file import IntegerNetwork, check_integer_layers
 from trilane.errors import BadInputError, MissingPartError
@@ -14,6 +17,8 @@ from trilane.stages.dsp.ort import ERRORS_ONLY, LOAD_ERRORS, OrtSession
 from trilane.stages.dsp.runtime import RUNTIMES, RuntimeOptions
 
 PROVIDER = "CUDAExecutionProvider"
+PROBE_OPSET, PROBE_IR = 17, 8
+SILENT = 4
 
 
 def load(network: IntegerNetwork, options: RuntimeOptions) -> OrtSession:
@@ -21,6 +26,7 @@ def load(network: IntegerNetwork, options: RuntimeOptions) -> OrtSession:
 
     Raises BadInputError when a node of it does not run there, MissingPartError when there is no GPU that works.
     """
+    _check_gpu()
     check_integer_layers(network)
     settings = onnxruntime.SessionOptions()
     settings.log_severity_level = ERRORS_ONLY
@@ -30,9 +36,20 @@ def load(network: IntegerNetwork, options: RuntimeOptions) -> OrtSession:
         session = onnxruntime.InferenceSession(network.model.SerializeToString(), settings, providers=[provider])
     except LOAD_ERRORS as error:
         raise BadInputError(network.where, str(error), "a network that runs on the GPU as a whole") from error
-    if PROVIDER not in session.get_providers():
-        raise MissingPartError("CUDA found no GPU that works", RUNTIMES["cuda"].install)
     return OrtSession(session)
+
+
+@cache
+def _check_gpu() -> None:
+    """Raises MissingPartError when the provider cannot be made: without it ONNX Runtime goes on without a word."""
+    values = [helper.make_tensor_value_info(name, TensorProto.UINT8, [1]) for name in ("x", "y")]
+    graph = helper.make_graph([helper.make_node("Identity", ["x"], ["y"])], "probe", values[:1], values[1:])
+    probe = helper.make_model(graph, opset_imports=[helper.make_opsetid("", PROBE_OPSET)], ir_version=PROBE_IR)
+    settings = onnxruntime.SessionOptions()
+    settings.log_severity_level = SILENT
+    session = onnxruntime.InferenceSession(probe.SerializeToString(), settings, providers=[PROVIDER])
+    if PROVIDER not in session.get_providers():
+        raise MissingPartError("ONNX Runtime found no NVIDIA GPU with CUDA and cuDNN", RUNTIMES["cuda"].install)
 
 
 def version() -> str:
