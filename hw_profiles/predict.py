@@ -26,6 +26,7 @@ from trilane.hw_profiles.cost import Network, reference_network
 from trilane.hw_profiles.schema import CORNERS, UNITS, Profile, UnitName
 from trilane.hw_profiles.table import Row
 from trilane.hw_profiles.thermal import GOVERNORS, Heat, Throttle
+from trilane.scheduler.stats import energy_score
 
 SUSTAINED = "sustained_high_performance"
 MAX_MINUTES = 24 * 60
@@ -131,6 +132,7 @@ def predict(
         "efficiency": max(per_unit.values()) / plan.way.batch / now.frame_ms,
         "power_w": power,
         "energy_mj_per_frame": power * frame,
+        "xrbench": {"energy": energy_score(power * frame)},
         "temperature_c": _temperatures(moments),
         "caps": _caps(moments),
         "timeline": [_shown(m) for m in _thinned(moments)],

@@ -39,6 +39,7 @@ class Governor:
         self._sum: dict[UnitName, float] = dict.fromkeys(UNITS, 0.0)
         self._ticks = self._held = 0
         self._first_held_s: float | None = None
+        self._joules = 0.0
         self._hottest = {"device": self._heat.device_c, "junction": max(self._heat.junction_c.values())}
         self._duty: dict[UnitName, int] = {}
         self.due_ns = 0
@@ -53,12 +54,19 @@ class Governor:
         """What changes at `now_ns`; `busy_ns`: how long each unit has worked since the run began."""
         seconds = (now_ns - self._last_ns) / NS
         power = {unit: self._power_w(unit, busy_ns[unit] - self._busy_ns[unit], now_ns) for unit in UNITS}
+        self._joules += seconds * (sum(power.values()) + self._profile.thermal.base_power_w.or_else(0.0))
         self._heat.advance(self._profile, power, seconds)
         self._note((now_ns - self._start_ns) / NS)
         GOVERNORS[self.name](self._profile, self._heat, self._throttle, self._asked, power)
         self._busy_ns = {unit: busy_ns[unit] for unit in UNITS}
         self._last_ns, self.due_ns = now_ns, now_ns + self._poll_ns
         return self._changed()
+
+    @property
+    def power_w(self) -> float | None:
+        """Mean power of the whole device, modelled from busy time; None before the first tick."""
+        seconds = (self._last_ns - self._start_ns) / NS
+        return self._joules / seconds if seconds > 0 else None
 
     def report(self) -> dict[str, Any]:
         """`caps` and `temperature_c` of report.json."""
@@ -73,6 +81,7 @@ class Governor:
                 for unit, total in self._sum.items()
                 if unit in self._duty
             },
+            "power_w": self.power_w,
             "throttled_share": self._held / ticks,
             "first_throttled_s": self._first_held_s,
         }

@@ -134,7 +134,7 @@ class Ledger:
             "xrbench": {
                 "real_time": real_time_score(late_ns),
                 "qoe": len(self.presented_ns) / requested if requested else 0.0,
-                "energy": None,  # no power was measured
+                "energy": None,  # who knows the power fills it in
             },
             "stages": {stage.name: self._stage_row(stage.name, stage.unit) for stage in self._graph.stages},
             "units": {unit: book.shares() for unit, book in self._units.items()},

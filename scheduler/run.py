@@ -20,6 +20,7 @@ from trilane.scheduler.processes import UnitProcesses
 from trilane.scheduler.realtime import RealtimeDriver
 from trilane.scheduler.result import RunResult
 from trilane.scheduler.signals import Interrupts
+from trilane.scheduler.stats import energy_score
 from trilane.stages.contracts import SlotLayout, posed_vertices_bytes
 from trilane.stages.dsp.parts import crossing_bytes
 from trilane.stages.unit_loop import EdgeSpec
@@ -94,6 +95,8 @@ def run_pipeline(
         isolated_ns=driver.alone_ns if isolate_frames else None,
     )
     report.update(policy=policy, edge=edge, **(governor.report() if governor is not None else {}))
+    if governor is not None and governor.power_w is not None and report["fps"]:
+        report["xrbench"]["energy"] = energy_score(1e3 * governor.power_w / report["fps"])
     report["in_turn_ms"] = {stage: ns / 1e6 for stage, ns in driver.in_turn_ns.items()} if isolate_frames else {}
     for unit, row in report["units"].items():
         row.update(pid=pids[unit], **config.units[unit].model_dump(mode="json"))

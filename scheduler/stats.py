@@ -8,6 +8,7 @@ from math import exp
 
 NS_PER_MS = 1e6
 SCORE_PER_MS = 15.0
+LARGEST_ENERGY_MJ = 1500.0
 LARGEST_EXPONENT = 700.0  # e to it is still a number
 
 
@@ -48,6 +49,14 @@ def jitter_ms(values_ns: Sequence[int]) -> float:
     """Mean absolute difference of successive frame times."""
     steps = [abs(after - before) for before, after in pairwise(values_ns)]
     return round(sum(steps) / len(steps) / NS_PER_MS, 6) if steps else 0.0
+
+
+def energy_score(frame_mj: float) -> float:
+    """(E - e) / E, e the millijoules of a frame, E = `LARGEST_ENERGY_MJ`: 1 for nothing, 0 for E and more.
+
+    Kwon et al., XRBench, MLSys 2023, section 3, with their E.
+    """
+    return max(0.0, 1 - frame_mj / LARGEST_ENERGY_MJ)
 
 
 def real_time_score(lateness_ns: Sequence[int]) -> float | None:

@@ -59,6 +59,18 @@ def test_idle_units_stay_cool_and_unthrottled(phone: Profile) -> None:
     assert governor.report()["temperature_c"]["device_max"] < phone.thermal.skin_limit_c.or_else(0)
 
 
+def test_power_is_that_of_the_units_and_of_the_rest(phone: Profile) -> None:
+    governor = Governor(phone, "burst")
+    governor.begin(0)
+    assert governor.power_w is None
+    governor.tick(S, dict.fromkeys(UNITS, 0))
+    rest = phone.thermal.base_power_w.or_else(0)
+    assert governor.power_w == pytest.approx(rest + sum(phone.units[unit].idle_w.or_else(0) for unit in UNITS))
+    governor.tick(2 * S, dict.fromkeys(UNITS, S))
+    full = rest + sum(phone.units[unit].power_max_w.or_else(0) for unit in UNITS)
+    assert governor.power_w == pytest.approx((full + rest + sum(phone.units[u].idle_w.or_else(0) for u in UNITS)) / 2)
+
+
 def test_equal_ticks_give_equal_events(phone: Profile) -> None:
     assert worked(Governor(phone, "burst"), 2000) == worked(Governor(phone, "burst"), 2000)
 

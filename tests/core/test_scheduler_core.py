@@ -14,6 +14,7 @@ from trilane.errors import BadInputError
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import Ask, Graph, SetDuty, Settings, StageSpec, Stop, avatar_graph
 from trilane.scheduler.record import read, replay
+from trilane.scheduler.stats import energy_score
 from trilane.scheduler.virtual import Service, Simulation, simulate
 
 MS = 1_000_000
@@ -155,6 +156,10 @@ def test_the_score_of_a_run_falls_with_lateness_and_with_drops() -> None:
     assert slow["real_time"] < 0.1
     dropped = run(period_ns=5 * MS, deadline_ns=10_000 * MS, in_queue=4, in_flight=3).report
     assert dropped["xrbench"]["qoe"] == pytest.approx(dropped["frames"]["presented"] / FRAMES)
+
+
+def test_the_energy_score_falls_to_0_at_xrbenchs_limit() -> None:
+    assert [energy_score(mj) for mj in (0, 750, 1500, 9000)] == [1, 0.5, 0, 0]
 
 
 def test_a_duty_cycle_throttles_a_unit() -> None:
