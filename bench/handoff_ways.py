@@ -18,10 +18,9 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from trilane.hw_profiles.host import host_units
 from trilane.stages.contracts import SlotLayout
-from trilane.stages.unit_loop import SCHEDULER
-from trilane.transport.bus import BusFolder, Link, prompt_context
+from trilane.transport.bus import BusFolder
+from trilane.transport.line import Line, line_pair
 from trilane.transport.memory import RegionLayout, create_region, map_region
 from trilane.transport.messages import RunJob
 from trilane.transport.wakeup import UNIT_NS, use_slice
@@ -66,55 +65,45 @@ class Channel(Protocol):
 
 
 class SlotChannel:
-    """As the pipeline: slots of a sealed memfd region, announced by a message over a `Link`."""
+    """As the pipeline: slots of a sealed memfd region, announced by a message over a `Line`."""
 
     def __init__(self, size: int, _context: SpawnContext) -> None:
         self._layout = RegionLayout(SLOTS, SlotLayout(1, size))
         self._fd = create_region("handoff", self._layout)
-        self._folder = BusFolder()
         self._place = f"/proc/{os.getpid()}/fd/{self._fd}"
-        self._endpoint = self._folder.endpoint("handoff")
-        self._bus_cores = host_units()[SCHEDULER].cores
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name != "_folder"}
+        self._ends = line_pair()
 
     def producer(self) -> Producer:
-        return _SlotEnd(self._slots(), self._link("bind"))
+        return _SlotEnd(self._slots(), Line(self._ends[0], WAIT_MS))
 
     def consumer(self) -> Consumer:
-        return _SlotEnd(self._slots(), self._link("connect"))
+        return _SlotEnd(self._slots(), Line(self._ends[1], WAIT_MS))
 
     def _slots(self) -> list[U8]:
         return [packet.payload for packet in map_region(os.open(self._place, os.O_RDWR), self._layout)]
 
-    def _link(self, verb: str) -> Link:
-        link = Link(prompt_context(self._bus_cores), WAIT_MS)
-        use_slice(UNIT_NS)
-        getattr(link.socket, verb)(self._endpoint)
-        return link
-
     def close(self) -> None:
         os.close(self._fd)
-        self._folder.remove()
+        for end in self._ends:
+            end.close()
 
 
 class _SlotEnd:
-    def __init__(self, payloads: list[U8], link: Link) -> None:
-        self._payloads, self._link, self._count = payloads, link, 0
+    def __init__(self, payloads: list[U8], line: Line) -> None:
+        self._payloads, self._line, self._count = payloads, line, 0
+        use_slice(UNIT_NS)
 
     def buffer(self) -> U8:
         return self._payloads[self._count % SLOTS]
 
     def hand_over(self) -> None:
         slot = self._count % SLOTS
-        self._link.send(RunJob(self._count, "infer", self._count, slot, slot, 0))
+        self._line.send(RunJob(self._count, "infer", self._count, slot, slot, 0))
         self._count += 1
 
     def receive(self) -> U8:
         while True:
-            self._link.wait(WAIT_MS)
-            message = self._link.receive()
+            message = self._line.receive()
             if isinstance(message, RunJob):
                 return self._payloads[message.slot_in]
 

@@ -60,8 +60,9 @@ def measure(
     Rows, medians over the turns: `frame_ms`, `fps`, `efficiency` (slowest unit alone / frame time), `slowest` and
     `alone_ms` (that unit's stages alone), `busiest` unit, its `idle` from its first job's begin to its last one's end
     and the causes: `starved` (no input), `undispatched` (input, but no free slot, or not told yet), `overhead` (told,
-    but not begun); `gain` over `sequential` in the same turn, `bound` sum(t) / max(t): stages in turn, as a sequential
-    run does them, over the slowest unit's stages repeated, as a pipelined run does them, and `gain_of_bound`.
+    but not begun); `gain` over `sequential` in the same turn, `bound` sum(t) / max(t): all stages as that sequential
+    run took them, over the slowest unit's stages alone beside this run, and `gain_of_bound`. `hops_ms`: what the run
+    takes for a frame beyond its stages; a pipelined run hides them, which the bound does not count.
     `dropped`, `lost`: frames of all turns. `accuracy`: what the avatar's pictures are worth.
     `no_video`: present nothing. Raises BadInputError, MissingPartError, TrilaneError when a run fails.
     """
@@ -118,7 +119,7 @@ def _turn(config: RunConfig, plans: list[Setting]) -> Iterator[tuple[Setting, di
         row = _run(config, plan, base)
         base = base or row
         row["gain"] = base["frame_ms"] / row["frame_ms"]
-        row["bound"] = base["bound"]
+        row["bound"] = base["stages_ms"] / row["alone_ms"]
         row["gain_of_bound"] = row["gain"] / row["bound"]
         yield plan, row
 
@@ -139,6 +140,7 @@ def _figures(result: RunResult) -> dict[str, Any]:
     report = result.report
     alone = by_unit(report, "isolated_ms")
     slowest = max(alone, key=alone.__getitem__)
+    stages_ms = sum(float(row["service_ms"]["mean"]) for row in report["stages"].values())
     busiest = max(report["units"], key=lambda unit: float(report["units"][unit]["busy"]))
     return {
         "fps": report["fps"],
@@ -146,7 +148,8 @@ def _figures(result: RunResult) -> dict[str, Any]:
         "efficiency": report["efficiency"],
         "slowest": slowest,
         "alone_ms": alone[slowest],
-        "bound": sum(by_unit(report, "in_turn_ms").values()) / alone[slowest],
+        "stages_ms": stages_ms,
+        "hops_ms": report["frame_time_ms"]["mean"] - stages_ms,
         "busiest": busiest,
         **idle_between_jobs([job for job in result.jobs if job.unit == busiest]),
         "in_run_over_alone": _in_run(report, slowest) / alone[slowest],

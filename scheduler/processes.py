@@ -19,6 +19,7 @@ from trilane.errors import TrilaneError
 from trilane.scene.schema import RunConfig
 from trilane.stages.unit_loop import EdgeSpec, UnitSpec
 from trilane.transport.bus import BusFolder, Link
+from trilane.transport.line import Line, line_pair
 from trilane.transport.messages import Message, MessageError
 
 TAIL_BYTES = 8192
@@ -85,7 +86,8 @@ class UnitProcesses:
     def start(self, unit: str) -> None:
         """A fresh process for the unit; `Ready` or `Failed` follows, or its end."""
         folder = BusFolder()
-        link = Link(self._context)
+        ours, theirs = line_pair()
+        link = Link(self._context, Line(ours))
         link.socket.bind(folder.endpoint(unit))
         stages = dict(self._stages[unit])
         used = {edge for pair in stages.values() for edge in pair if edge is not None}
@@ -93,13 +95,16 @@ class UnitProcesses:
         spec = UnitSpec(
             parent_pid=os.getpid(),
             endpoint=folder.endpoint(unit),
+            line_fd=theirs.fileno(),
             config=self._config,
             edges=edges,
             stages=stages,
         )
-        process = _Process(unit, self._spawn(unit, spec), link, folder)
+        with theirs:
+            process = _Process(unit, self._spawn(unit, spec), link, folder)
         self._live[unit] = process
-        self._register(link.socket, "link", process)
+        for source in link.sources:
+            self._register(source, "link", process)
         self._register(process.pidfd, "end", process)
         self._register(process.stderr.fileno(), "stderr", process)
 
@@ -173,7 +178,7 @@ class UnitProcesses:
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.PIPE,
-                pass_fds=[fd, *(edge.fd for edge in spec.edges.values())],
+                pass_fds=[fd, spec.line_fd, *(edge.fd for edge in spec.edges.values())],
                 env={**os.environ, **dict.fromkeys(THREAD_LIMITS, threads), "TRILANE_UNIT": unit},
                 process_group=0,
             )
@@ -184,7 +189,7 @@ class UnitProcesses:
         process.popen.wait()
         process.read_stderr()
         self.last_words[process.unit] = process.tail.decode(errors="replace").strip()
-        for source in (process.link.socket, process.pidfd, process.stderr.fileno()):
+        for source in (*process.link.sources, process.pidfd, process.stderr.fileno()):
             self._unregister(source)
         process.link.close()
         process.release_folder()

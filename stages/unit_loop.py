@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gc
 import os
+import socket
 import time
 import traceback
 from collections.abc import Mapping
@@ -22,6 +23,7 @@ from trilane.errors import TrilaneError, UnitLostError
 from trilane.scene.schema import RunConfig
 from trilane.stages.contracts import Packet, SlotLayout, Stage
 from trilane.transport.bus import LAST_WORDS_MS, Link, prompt_context
+from trilane.transport.line import Line
 from trilane.transport.memory import RegionLayout, map_region
 from trilane.transport.messages import (
     BUILDING,
@@ -60,11 +62,15 @@ class EdgeSpec(BaseModel):
 
 
 class UnitSpec(BaseModel):
-    """What a unit's process is told. `stages`: name to (input edge, output edge), each a key of `edges` or None."""
+    """What a unit's process is told. `line_fd` is inherited.
+
+    `stages`: name to (input edge, output edge), each a key of `edges` or None.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     parent_pid: int
     endpoint: str
+    line_fd: int
     config: RunConfig
     edges: dict[str, EdgeSpec]
     stages: dict[str, tuple[str | None, str | None]]
@@ -123,7 +129,7 @@ def serve(unit: str, raw_spec: dict[str, Any]) -> int:
     """Build, then answer messages until Close; the process's exit code."""
     spec = UnitSpec.model_validate(raw_spec)
     context = prompt_context(spec.config.units[SCHEDULER].cores)
-    link = Link(context, LAST_WORDS_MS)
+    link = Link(context, Line(socket.socket(fileno=spec.line_fd), BEAT_MS), LAST_WORDS_MS)
     use_slice(UNIT_NS)
     link.socket.connect(spec.endpoint)
     try:
@@ -142,12 +148,11 @@ def _serve(unit: str, spec: UnitSpec, link: Link) -> int:
     gc.freeze()
     link.send(Ready(os.getpid()))
     while True:
-        message = link.receive()  # before any waiting: the next job is often there
+        message = link.line.receive()
         if message is None:
-            if not link.wait(BEAT_MS):
-                if os.getppid() != spec.parent_pid:
-                    return 1
-                link.send(Alive())
+            if os.getppid() != spec.parent_pid:
+                return 1
+            link.send(Alive())
         elif isinstance(message, RunJob):
             _run_job(link, stages[message.stage], message)
         elif isinstance(message, Isolate):

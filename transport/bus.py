@@ -17,7 +17,8 @@ from typing import Self
 
 import zmq
 
-from trilane.transport.messages import MAX_BYTES, Message, pack, unpack
+from trilane.transport.line import Line
+from trilane.transport.messages import LIFE_SIGNS, MAX_BYTES, Message, pack, unpack
 from trilane.transport.wakeup import SHORTEST_NS, use_slice
 
 PREFIX = "trilane-"
@@ -80,29 +81,38 @@ def prompt_context(cores: Sequence[int]) -> zmq.Context[zmq.Socket[bytes]]:
 
 
 class Link:
-    """One end of a connection. Messages arrive in order or not at all."""
+    """One end of a connection: the bus, and the line. Messages of each arrive in order or not at all."""
 
-    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], linger_ms: int = 0) -> None:
+    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], line: Line, linger_ms: int = 0) -> None:
+        self.line = line
         self.socket: zmq.Socket[bytes] = context.socket(zmq.PAIR)
         self.socket.setsockopt(zmq.LINGER, linger_ms)
         self.socket.setsockopt(zmq.MAXMSGSIZE, MAX_BYTES)
         self.socket.setsockopt(zmq.SNDHWM, HIGH_WATER)
         self.socket.setsockopt(zmq.RCVHWM, HIGH_WATER)
 
+    @property
+    def sources(self) -> tuple[object, ...]:
+        """What becomes readable when a message comes, as a poller takes it."""
+        return self.line.fileno(), self.socket
+
     def send(self, message: Message) -> None:
-        """Raises zmq.Again when the other end has stopped reading."""
-        self.socket.send(pack(message), zmq.DONTWAIT)
+        """Raises zmq.Again when the other end has stopped reading the bus."""
+        if isinstance(message, LIFE_SIGNS):
+            self.socket.send(pack(message), zmq.DONTWAIT)
+        else:
+            self.line.send(message)
 
     def receive(self) -> Message | None:
-        """The next message, None when there is none. Raises MessageError for anything else."""
+        """The next message, those of the line first; None when there is none. Raises MessageError for anything else."""
+        message = self.line.receive()
+        if message is not None:
+            return message
         try:
             return unpack(self.socket.recv(zmq.DONTWAIT))
         except zmq.Again:
             return None
 
-    def wait(self, timeout_ms: int) -> bool:
-        """Whether a message came within the time."""
-        return bool(self.socket.poll(timeout_ms))
-
     def close(self) -> None:
         self.socket.close()
+        self.line.close()

@@ -81,6 +81,8 @@ class Closed(NamedTuple):
 
 Message = RunJob | Isolate | Close | Ready | Done | Duration | Failed | Alive | Closed
 BUILDING, MEASURING, CLOSING = -1, -2, -3
+#: What goes over the bus; the rest goes over the line.
+LIFE_SIGNS = (Ready, Alive)
 
 _KINDS: dict[str, Any] = {
     kind.__name__: kind for kind in (RunJob, Isolate, Close, Ready, Done, Duration, Failed, Alive, Closed)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import time
 from pathlib import Path
 
 import msgpack
@@ -16,6 +17,7 @@ from hypothesis import strategies as st
 from trilane.errors import TrilaneError
 from trilane.stages.contracts import SlotLayout
 from trilane.transport.bus import LOCK, BusFolder, Link, sweep
+from trilane.transport.line import Line, line_pair
 from trilane.transport.memory import RegionLayout, create_region, map_region
 from trilane.transport.messages import (
     Alive,
@@ -111,35 +113,91 @@ def test_a_region_that_is_too_small_is_refused() -> None:
     os.close(fd)
 
 
+def come(link: Link) -> bool:
+    """Whether a message comes to `link` within two seconds."""
+    poller = zmq.Poller()
+    for source in link.sources:
+        poller.register(source, zmq.POLLIN)
+    return bool(poller.poll(2000))
+
+
 def test_the_folder_is_private_and_goes_while_the_link_lives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     context = zmq.Context()
-    parent, child = Link(context), Link(context)
+    parent, child = (Link(context, Line(end)) for end in line_pair())
     folder = BusFolder()
     assert folder.path.stat().st_mode & 0o777 == 0o700
     parent.socket.bind(folder.endpoint("cpu"))
     child.socket.connect(folder.endpoint("cpu"))
     child.send(Ready(1))
-    assert parent.wait(2000)
-    assert parent.receive() == Ready(1)
+    assert come(parent) and parent.receive() == Ready(1)
     folder.remove()
     assert not list(tmp_path.iterdir())
-    parent.send(Close())
-    assert child.wait(2000)
-    assert (child.receive(), child.receive()) == (Close(), None)
+    child.send(Alive())
+    assert come(parent) and (parent.receive(), parent.receive()) == (Alive(), None)
     parent.close()
     child.close()
     context.term()
 
 
+def test_work_goes_over_the_line(tmp_path: Path) -> None:
+    """It needs no address, comes before what the bus holds, and keeps its order."""
+    context = zmq.Context()
+    ends = line_pair()
+    parent, child = Link(context, Line(ends[0])), Link(context, Line(ends[1], 2000))
+    parent.socket.bind(f"ipc://{tmp_path}/bus")
+    child.socket.connect(f"ipc://{tmp_path}/bus")
+    job, done = RunJob(1, "infer", 7, 0, 1, 0), Done(1, 2, 3, 4, {"inferred": 1.0})
+    parent.send(job)
+    assert child.line.receive() == job
+    child.send(Alive())
+    assert come(parent)
+    child.send(done)
+    child.send(Failed(2, "no such thing", 2))
+    assert [parent.receive() for _ in range(4)] == [done, Failed(2, "no such thing", 2), Alive(), None]
+    parent.close()
+    child.close()
+    context.term()
+
+
+def test_a_line_waits_as_long_as_it_has_patience() -> None:
+    ours, theirs = line_pair()
+    line, begin = Line(ours, 50), time.monotonic()
+    assert line.receive() is None and time.monotonic() - begin > 0.03
+    assert Line(theirs).receive() is None
+    line.close()
+    theirs.close()
+
+
+def test_a_line_whose_end_is_gone_or_stopped_says_nothing() -> None:
+    ours, theirs = (Line(end) for end in line_pair())
+    for number in range(10_000):
+        ours.send(RunJob(number, "infer", 0, 0, 0, 0))
+    assert theirs.receive() == RunJob(0, "infer", 0, 0, 0, 0)
+    theirs.close()
+    ours.send(Done(1, 2, 3, 4, {}))
+    assert ours.receive() is None
+    ours.close()
+
+
+def test_a_line_refuses_what_is_no_message() -> None:
+    end, other = line_pair()
+    end.send(b"no message")
+    line = Line(other)
+    with pytest.raises(MessageError):
+        line.receive()
+    end.close()
+    line.close()
+
+
 def test_a_message_too_large_is_not_received() -> None:
     context = zmq.Context()
-    parent, child = Link(context), Link(context)
+    parent, child = (Link(context, Line(end)) for end in line_pair())
     with BusFolder() as folder:
         parent.socket.bind(folder.endpoint("cpu"))
         child.socket.connect(folder.endpoint("cpu"))
         child.socket.send(bytes(1 << 17), zmq.DONTWAIT)
-        assert not parent.wait(300)
+        assert not parent.socket.poll(300)
     parent.close()
     child.close()
     context.term()

@@ -1,0 +1,47 @@
+"""The line of a unit: work to it, and answers. Rule: one message is one wake-up, and no thread is between the ends.
+
+A pair of Unix sockets that keep messages apart. That a unit lives is said over the bus.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import struct
+
+from trilane.transport.messages import MAX_BYTES, Message, pack, unpack
+
+
+def line_pair() -> tuple[socket.socket, socket.socket]:
+    """Both ends, not inherited unless they are passed on."""
+    return socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+
+
+class Line:
+    """One end. Messages arrive in order or not at all. `patience_ms`: how long `receive` waits; 0: not at all."""
+
+    def __init__(self, end: socket.socket, patience_ms: int = 0) -> None:
+        self._socket = end
+        self._flags = 0 if patience_ms else socket.MSG_DONTWAIT
+        end.setblocking(True)
+        seconds, rest = divmod(patience_ms, 1000)
+        end.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("@ll", seconds, rest * 1000))
+
+    def fileno(self) -> int:
+        return self._socket.fileno()
+
+    def send(self, message: Message) -> None:
+        """To an end that is gone or has stopped reading: nothing, its end or its deadline tells."""
+        with contextlib.suppress(BlockingIOError, BrokenPipeError, ConnectionResetError):
+            self._socket.send(pack(message), socket.MSG_DONTWAIT)
+
+    def receive(self) -> Message | None:
+        """The next message, None when there is none or the other end is gone. Raises MessageError for anything else."""
+        try:
+            data = self._socket.recv(MAX_BYTES, self._flags)
+        except (BlockingIOError, ConnectionResetError):
+            return None
+        return unpack(data) if data else None
+
+    def close(self) -> None:
+        self._socket.close()
