@@ -138,7 +138,7 @@ def _run(config: RunConfig, plan: Setting, base: dict[str, Any]) -> dict[str, An
 
 def _figures(result: RunResult) -> dict[str, Any]:
     report = result.report
-    alone = by_unit(report, "isolated_ms")
+    alone = _alone_ms(report)
     slowest = max(alone, key=alone.__getitem__)
     stages_ms = sum(float(row["service_ms"]["mean"]) for row in report["stages"].values())
     busiest = max(report["units"], key=lambda unit: float(report["units"][unit]["busy"]))
@@ -158,11 +158,11 @@ def _figures(result: RunResult) -> dict[str, Any]:
     }
 
 
-def by_unit(report: dict[str, Any], times_of: str) -> dict[str, float]:
-    """Milliseconds of each unit for a frame: its stages' `times_of`; the last one is never run alone: as in the run."""
+def _alone_ms(report: dict[str, Any]) -> dict[str, float]:
+    """Milliseconds of each unit for a frame: its stages alone; the last one is never run alone: as in the run."""
     times = dict.fromkeys(report["units"], 0.0)
     for name, stage in report["stages"].items():
-        times[stage["unit"]] += report[times_of].get(name, stage["service_ms"]["mean"])
+        times[stage["unit"]] += report["isolated_ms"].get(name, stage["service_ms"]["mean"])
     return times
 
 

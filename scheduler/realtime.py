@@ -87,7 +87,6 @@ class RealtimeDriver:
         self._graph, self._processes, self._interrupts = graph, processes, interrupts
         self._on_progress, self._on_message = on_progress, on_message
         self._alone: dict[str, list[float]] = defaultdict(list)
-        self._in_turn: dict[str, list[float]] = defaultdict(list)
         self._open: dict[int, tuple[Job, int]] = {}
         self._started_s: dict[str, float] = {}
         self._progress_s = 0.0
@@ -117,9 +116,8 @@ class RealtimeDriver:
     def measure_alone(self, frames: list[int]) -> None:
         """Note the service time of each stage but the last (it writes files), the other units quiet.
 
-        Each of `frames` goes down the chain through the first slot of every edge, so that each stage comes after those
-        of other units, as in a sequential run; then each unit repeats its stages in turn, as it meets them in a
-        pipelined one. Raises UnitError when a stage fails.
+        Each of `frames` goes down the chain through the first slot of every edge; then each unit repeats its stages
+        in turn and without a pause, as it meets them in a pipelined run. Raises UnitError when a stage fails.
         """
         end = time.monotonic() + ISOLATE_LIMIT_S
         chain = self._graph.stages[:-1]
@@ -127,18 +125,18 @@ class RealtimeDriver:
             if frame != frames[0] and time.monotonic() > end:
                 break
             for position, stage in enumerate(chain):
-                self._in_turn[stage.name].append(self._isolated(position, frame))
+                self._isolated(stage.unit, [position], frame)
             for unit in self._graph.units:
                 own = [position for position, stage in enumerate(chain) if stage.unit == unit]
-                rounds = [[self._isolated(position, frame) for position in own] for _ in range(REPEATS)]
-                for position, times in zip(own, zip(*rounds, strict=True), strict=True):
-                    self._alone[chain[position].name].append(median(times))
+                times = self._isolated(unit, own * REPEATS, frame)
+                for index, position in enumerate(own):
+                    self._alone[chain[position].name].append(median(times[index :: len(own)]))
 
-    def _isolated(self, position: int, frame: int) -> int:
-        """The duration in ns of one job of the stage at `position`."""
-        stage = self._graph.stages[position]
-        self._processes.send(stage.unit, Isolate(stage.name, frame, 0 if position else -1, 0))
-        return self._duration(stage.unit)
+    def _isolated(self, unit: str, positions: list[int], frame: int) -> list[int]:
+        """The durations in ns of jobs of the unit's stages at `positions`, all handed to it at once."""
+        for position in positions:
+            self._processes.send(unit, Isolate(self._graph.stages[position].name, frame, 0 if position else -1, 0))
+        return self._durations(unit, len(positions))
 
     def measure_again(self, frames: list[int]) -> None:
         """The same after the run, so that a machine that grew slower or faster weighs on both sides; what goes
@@ -155,18 +153,15 @@ class RealtimeDriver:
         """Mean service time in ns of each stage measured alone."""
         return {name: fmean(values) for name, values in self._alone.items()}
 
-    @property
-    def in_turn_ns(self) -> dict[str, float]:
-        """Mean service time in ns of each stage when a frame goes down the chain alone; the first one warmed up."""
-        return {name: fmean(values[1:] or values) for name, values in self._in_turn.items()}
-
-    def _duration(self, unit: str) -> int:
+    def _durations(self, unit: str, count: int) -> list[int]:
+        found: list[int] = []
         end = time.monotonic() + START_S
-        while time.monotonic() < end:
-            for speaker, message in self._listen_before_run({unit}):
-                if speaker == unit and isinstance(message, Duration):
-                    return message.value
-        raise UnitError(f"unit {unit} did not end a job within {START_S:.0f} s")
+        while len(found) < count:
+            if time.monotonic() > end:
+                raise UnitError(f"unit {unit} did not end its jobs within {START_S:.0f} s")
+            heard = self._listen_before_run({unit})
+            found += [message.value for name, message in heard if name == unit and isinstance(message, Duration)]
+        return found
 
     def _listen_before_run(self, _waiting: set[str]) -> list[Heard]:
         heard = self._processes.listen(200)

@@ -97,7 +97,6 @@ def run_pipeline(
     report.update(policy=policy, edge=edge, **(governor.report() if governor is not None else {}))
     if governor is not None and governor.power_w is not None and report["fps"]:
         report["xrbench"]["energy"] = energy_score(1e3 * governor.power_w / report["fps"])
-    report["in_turn_ms"] = {stage: ns / 1e6 for stage, ns in driver.in_turn_ns.items()} if isolate_frames else {}
     for unit, row in report["units"].items():
         row.update(pid=pids[unit], **config.units[unit].model_dump(mode="json"))
     return RunResult(
