@@ -18,6 +18,7 @@ from onnxruntime.quantization import CalibrationDataReader, CalibrationMethod, c
 
 from trilane.errors import BadInputError
 
+FINITE = "a network whose tensors are finite on the frames"
 METHODS = {
     "minmax": (CalibrationMethod.MinMax, {}),
     "percentile": (CalibrationMethod.Percentile, {"percentile": 99.99}),
@@ -55,7 +56,14 @@ def measure(path: Path, frames: Sequence[NDArray[np.float32]], method: str, oper
         for frame in frames:
             nchw = np.ascontiguousarray(frame.transpose(2, 0, 1)[None], np.float32)
             calibrator.collect_data(_OneFrame(name, nchw))
-        return calibrator.compute_data()
+        try:
+            ranges = calibrator.compute_data()
+        except ValueError as error:  # a histogram of numbers that are none
+            raise BadInputError("calibration", str(error), FINITE) from error
+    for tensor in ranges.keys():  # noqa: SIM118 - no dict
+        if not all(np.isfinite(bound).all() for bound in (ranges[tensor].lowest, ranges[tensor].highest)):
+            raise BadInputError("calibration", f"tensor {tensor!r} without end", FINITE)
+    return ranges
 
 
 def limit_logits(model: onnx.ModelProto, ranges: Any) -> None:

@@ -9,7 +9,7 @@ A scale holds `COVER` of the measured range: the rest is cut off where that halv
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,8 @@ ALIKE = {*SHARING, "Conv", "Relu", "Sigmoid", "Constant", "Identity"}
 WEIGHT_TOP = {True: 64, False: 126}
 #: An accumulator's unit is at least this part of its output's step: float32 then holds every sum that counts.
 FINEST = 2.0**-16
+#: Units of an accumulator that a bias may be, for the same reason.
+LARGEST_BIAS = 2.0**22
 
 
 def rounds_alike(model: onnx.ModelProto) -> bool:
@@ -52,30 +54,30 @@ def dyadic_ranges(model: onnx.ModelProto, ranges: Any) -> None:
             ranges[name].highest = np.float32((BYTE - zero) * step)
 
 
-def dyadic_weights(
-    model: onnx.ModelProto, ranges: Any, reduce_range: bool, keep_float: Sequence[str]
-) -> dict[str, list[dict[str, Any]]]:
+def dyadic_weights(model: onnx.ModelProto, ranges: Any, reduce_range: bool) -> dict[str, list[dict[str, Any]]]:
     """Round the weights and biases of every Conv, and say at what scales: a power of two for each output channel.
 
     Weights become even numbers of steps and biases odd ones, so that no sum is half way between two bytes. Scales are
-    in the form of ONNX Runtime's `TensorQuantOverrides`, by the weights' name. `keep_float`: nodes to leave alone.
+    in the form of ONNX Runtime's `TensorQuantOverrides`, by the weights' name.
     """
     constants = {tensor.name: tensor for tensor in model.graph.initializer}
     known = set(ranges.keys())
     found = {}
     for node in model.graph.node:
         ends = {node.input[0], node.output[0]} if node.op_type == "Conv" else set()
-        if not ends or node.name in keep_float or not ends <= known or node.input[1] not in constants:
+        if not ends or not ends <= known or node.input[1] not in constants:
             continue
         source, target = (_step_of(ranges[name]) for name in (node.input[0], node.output[0]))
         kernel = constants[node.input[1]]
-        scales = _round_weights(kernel, FINEST * target / source, WEIGHT_TOP[reduce_range])
         if len(node.input) == 2:
-            bias = numpy_helper.from_array(np.zeros(len(scales), np.float32), f"{node.output[0]}_bias")
-            constants[bias.name] = model.graph.initializer.add()
-            constants[bias.name].CopyFrom(bias)
-            node.input.append(bias.name)
-        _round_bias(constants[node.input[2]], source * scales)
+            none = numpy_helper.from_array(np.zeros(kernel.dims[0], np.float32), f"{node.output[0]}_bias")
+            constants[none.name] = model.graph.initializer.add()
+            constants[none.name].CopyFrom(none)
+            node.input.append(none.name)
+        bias = constants[node.input[2]]
+        finest = np.maximum(FINEST * target, np.abs(numpy_helper.to_array(bias)) / LARGEST_BIAS) / source
+        scales = _round_weights(kernel, finest, WEIGHT_TOP[reduce_range])
+        _round_bias(bias, source * scales)
         found[kernel.name] = [
             {"quant_type": QuantType.QInt8, "axis": 0, "scale": np.float32(scale), "zero_point": np.int8(0)}
             for scale in scales
@@ -83,8 +85,8 @@ def dyadic_weights(
     return found
 
 
-def _round_weights(kernel: onnx.TensorProto, finest: float, top: int) -> NDArray[np.float64]:
-    """Make `kernel` (O, I, h, w) even multiples of the scales (O,) that are returned, up to `top` of them."""
+def _round_weights(kernel: onnx.TensorProto, finest: NDArray[np.float64], top: int) -> NDArray[np.float64]:
+    """Make `kernel` (O, I, h, w) even multiples, up to `top`, of the scales (O,) returned: `finest` (O,) at least."""
     values = numpy_helper.to_array(kernel).astype(np.float64)
     rows = values.reshape(len(values), -1)
     largest = np.abs(rows).max(axis=1) / (top + 0.99)

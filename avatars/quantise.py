@@ -71,9 +71,11 @@ def quantise(
     """Quantise a float NCHW network, one image at a time.
 
     `model`: one float32 input (1, C, H, W), one output (1, 4, H, W) in 0..1. `frames`: real inputs (H, W, C).
-    `keep_float`: names of nodes that stay in float. Raises BadInputError for wrong frames or an unknown method.
+    `keep_float`: names of nodes that stay in float. Raises BadInputError for wrong frames, an unknown method, or a
+    network whose weights or tensors are not finite.
     """
     _check_frames(model, frames)
+    _check_weights(model)
     with tempfile.TemporaryDirectory(prefix="trilane-quantise-") as folder:
         prepared = Path(folder) / "prepared.onnx"
         source = Path(folder) / "float.onnx"
@@ -81,8 +83,8 @@ def quantise(
         quant_pre_process(source, prepared, skip_symbolic_shape=True)
         ranges = measure(prepared, frames, method, QUANTISED)
         plain = onnx.load(prepared)
-        alike = rounds_alike(plain)
-        quantised = _insert(plain, ranges, reduce_range, keep_float)
+        alike = rounds_alike(plain) and not keep_float
+        quantised = _insert(plain, ranges, reduce_range, keep_float, alike)
     _integer_ends(quantised)
     _describe(quantised, keep_float)
     facts = {
@@ -125,12 +127,20 @@ def _check_frames(model: onnx.ModelProto, frames: Sequence[NDArray[np.float32]])
             raise BadInputError("calibration", f"frame {i} of shape {frame.shape}", f"finite values, ({h}, {w}, {c})")
 
 
-def _insert(model: onnx.ModelProto, ranges: Any, reduce_range: bool, keep_float: Sequence[str]) -> onnx.ModelProto:
+def _check_weights(model: onnx.ModelProto) -> None:
+    for tensor in model.graph.initializer:
+        if tensor.data_type == TensorProto.FLOAT and not np.isfinite(numpy_helper.to_array(tensor)).all():
+            raise BadInputError("quantise", f"weights {tensor.name!r} that are not finite", "a trained network")
+
+
+def _insert(
+    model: onnx.ModelProto, ranges: Any, reduce_range: bool, keep_float: Sequence[str], alike: bool
+) -> onnx.ModelProto:
     limit_logits(model, ranges)
     overrides = {}
-    if rounds_alike(model):
+    if alike:
         dyadic_ranges(model, ranges)
-        overrides = dyadic_weights(model, ranges, reduce_range, keep_float)
+        overrides = dyadic_weights(model, ranges, reduce_range)
     else:
         share_ranges(model, ranges)
     quantiser = QDQQuantizer(

@@ -13,6 +13,7 @@ from onnx import helper, numpy_helper
 
 from trilane.avatars.dyadic import dyadic_weights, rounds_alike
 from trilane.avatars.quantise import quantise
+from trilane.errors import BadInputError
 
 FIRST, SECOND = "tensor", "made"
 
@@ -92,7 +93,7 @@ def test_no_sum_is_half_way_between_two_bytes(reduce_range, seed, size):
     model = helper.make_model(helper.make_graph([node], "g", [], [], weights))
     step, reach = 2.0**-5, 2.0 ** np.ceil(np.log2(10 * size))
     known = {FIRST: Range(0, 255 * step), SECOND: Range(-127 * reach / 128, 128 * reach / 128)}
-    scales = np.array([row["scale"] for row in dyadic_weights(model, known, reduce_range, [])["w"]], np.float64)
+    scales = np.array([row["scale"] for row in dyadic_weights(model, known, reduce_range)["w"]], np.float64)
     kernel, bias = (numpy_helper.to_array(tensor).astype(np.float64) for tensor in model.graph.initializer)
     integers, offset = np.rint(kernel[..., 0, 0] / scales[:, None]), np.rint(bias / (scales * step))
     assert not (integers % 2).any() and (offset % 2 == 1).all()
@@ -100,6 +101,29 @@ def test_no_sum_is_half_way_between_two_bytes(reduce_range, seed, size):
     value = sums * (scales * step / (reach / 128))
     assert (np.rint(value) == np.floor(value + 0.5)).all()
     assert (np.rint(value.astype(np.float32)) == np.rint(value)).all()
+
+
+@pytest.mark.parametrize("size", [1e4, 1e6])
+def test_a_huge_bias_stays_exact_in_float32(tiny_float, tiny_frames, size):
+    model = copy.deepcopy(tiny_float)
+    bias = next(tensor for tensor in model.graph.initializer if tensor.name == "deep.b")
+    bias.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(bias) * np.float32(size), "deep.b"))
+    values, makers = parts(quantise(model, tiny_frames).network.model)
+    biases = [values[makers[node.input[2]].input[0]] for node in makers.values() if node.op_type == "Conv"]
+    assert all(np.abs(bias.astype(np.int64)).max() < 2**23 and (bias % 2).all() for bias in biases)
+
+
+@pytest.mark.parametrize(("factor", "named"), [("nan", "deep.w"), ("1e38", "calibration")])
+def test_a_network_that_is_not_finite_is_refused(tiny_float, tiny_frames, factor, named):
+    model = copy.deepcopy(tiny_float)
+    kernel = next(tensor for tensor in model.graph.initializer if tensor.name == "deep.w")
+    kernel.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(kernel) * np.float32(factor), "deep.w"))
+    with pytest.raises(BadInputError, match=named):
+        quantise(model, tiny_frames)
+
+
+def test_a_network_with_a_float_layer_keeps_its_measured_scales(tiny_float, tiny_frames):
+    assert not quantise(tiny_float, tiny_frames, keep_float=["stem"]).facts["rounds_alike"]
 
 
 def test_what_rounds_alike(tiny_float):
