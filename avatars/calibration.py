@@ -53,12 +53,12 @@ def measure(path: Path, frames: Sequence[NDArray[np.float32]], method: str, oper
         path, list(operators), str(path.with_suffix(".augmented.onnx")), calibrate_method=kind, extra_options=options
     )
     with contextlib.redirect_stdout(io.StringIO()):
-        for frame in frames:
-            nchw = np.ascontiguousarray(frame.transpose(2, 0, 1)[None], np.float32)
-            calibrator.collect_data(_OneFrame(name, nchw))
         try:
+            for frame in frames:
+                nchw = np.ascontiguousarray(frame.transpose(2, 0, 1)[None], np.float32)
+                calibrator.collect_data(_OneFrame(name, nchw))
             ranges = calibrator.compute_data()
-        except ValueError as error:  # a histogram of numbers that are none
+        except ValueError as error:  # a histogram of numbers that are none, or of too many sizes
             raise BadInputError("calibration", str(error), FINITE) from error
     for tensor in ranges.keys():  # noqa: SIM118 - no dict
         if not all(np.isfinite(bound).all() for bound in (ranges[tensor].lowest, ranges[tensor].highest)):

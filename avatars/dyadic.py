@@ -30,12 +30,18 @@ ALIKE = {*SHARING, "Conv", "Relu", "Sigmoid", "Constant", "Identity"}
 WEIGHT_TOP = {True: 64, False: 126}
 #: An accumulator's unit is at least this part of its output's step: float32 then holds every sum that counts.
 FINEST = 2.0**-16
+#: And at most this part: of a half, odd sums would all be half way; of more, HTP gives another picture.
+COARSEST = 0.25
 #: Units of an accumulator that a bias may be, for the same reason.
 LARGEST_BIAS = 2.0**22
 
 
-def rounds_alike(model: onnx.ModelProto) -> bool:
-    """Whether the other functions of this module make every runtime give the same bytes for float network `model`."""
+class NotAlikeError(ValueError):
+    """The network's weights are so large that a unit of a sum is too much of its output's step."""
+
+
+def may_round_alike(model: onnx.ModelProto) -> bool:
+    """Whether float network `model` is made of operators that every runtime can be made to compute alike."""
     return all(node.op_type in ALIKE for node in model.graph.node)
 
 
@@ -58,8 +64,9 @@ def dyadic_weights(model: onnx.ModelProto, ranges: Any, reduce_range: bool) -> d
     """Round the weights and biases of every Conv, and say at what scales: a power of two for each output channel.
 
     Weights become even numbers of steps and biases odd ones, so that no sum is half way between two bytes. Scales are
-    in the form of ONNX Runtime's `TensorQuantOverrides`, by the weights' name.
+    in the form of ONNX Runtime's `TensorQuantOverrides`, by the weights' name. Raises NotAlikeError.
     """
+    written = _written(model)
     constants = {tensor.name: tensor for tensor in model.graph.initializer}
     known = set(ranges.keys())
     found = {}
@@ -67,7 +74,7 @@ def dyadic_weights(model: onnx.ModelProto, ranges: Any, reduce_range: bool) -> d
         ends = {node.input[0], node.output[0]} if node.op_type == "Conv" else set()
         if not ends or not ends <= known or node.input[1] not in constants:
             continue
-        source, target = (_step_of(ranges[name]) for name in (node.input[0], node.output[0]))
+        source, target = (_step_of(ranges[name]) for name in (node.input[0], written[node.output[0]]))
         kernel = constants[node.input[1]]
         if len(node.input) == 2:
             none = numpy_helper.from_array(np.zeros(kernel.dims[0], np.float32), f"{node.output[0]}_bias")
@@ -77,12 +84,27 @@ def dyadic_weights(model: onnx.ModelProto, ranges: Any, reduce_range: bool) -> d
         bias = constants[node.input[2]]
         finest = np.maximum(FINEST * target, np.abs(numpy_helper.to_array(bias)) / LARGEST_BIAS) / source
         scales = _round_weights(kernel, finest, WEIGHT_TOP[reduce_range])
+        if (source * scales > COARSEST * target).any():
+            raise NotAlikeError(node.name)
         _round_bias(bias, source * scales)
         found[kernel.name] = [
             {"quant_type": QuantType.QInt8, "axis": 0, "scale": np.float32(scale), "zero_point": np.int8(0)}
             for scale in scales
         ]
     return found
+
+
+def _written(model: onnx.ModelProto) -> dict[str, str]:
+    """Each tensor, to what is written of it: what a Relu makes of it when nothing else reads it, else itself."""
+    readers: dict[str, list[onnx.NodeProto]] = {}
+    for node in model.graph.node:
+        for name in node.input:
+            readers.setdefault(name, []).append(node)
+    written = {}
+    for name in (name for node in model.graph.node for name in node.output):
+        found = readers.get(name, [])
+        written[name] = found[0].output[0] if len(found) == 1 and found[0].op_type == "Relu" else name
+    return written
 
 
 def _round_weights(kernel: onnx.TensorProto, finest: NDArray[np.float64], top: int) -> NDArray[np.float64]:

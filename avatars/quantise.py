@@ -7,6 +7,7 @@ Weights stay within 64 under `reduce_range`: on a CPU without VNNI two products 
 
 from __future__ import annotations
 
+import copy
 import json
 import logging
 import tempfile
@@ -28,7 +29,7 @@ from onnxruntime.quantization import (
 from onnxruntime.quantization.shape_inference import quant_pre_process
 
 from trilane.avatars.calibration import limit_logits, measure, share_ranges
-from trilane.avatars.dyadic import dyadic_ranges, dyadic_weights, rounds_alike
+from trilane.avatars.dyadic import NotAlikeError, dyadic_ranges, dyadic_weights, may_round_alike
 from trilane.avatars.network_file import FLOAT_LAYERS_KEY, NetworkFile, check_network
 from trilane.errors import BadInputError
 
@@ -83,15 +84,24 @@ def quantise(
         quant_pre_process(source, prepared, skip_symbolic_shape=True)
         ranges = measure(prepared, frames, method, QUANTISED)
         plain = onnx.load(prepared)
-        alike = rounds_alike(plain) and not keep_float
-        quantised = _insert(plain, ranges, reduce_range, keep_float, alike)
+        unknown = set(keep_float) - {node.name for node in plain.graph.node}
+        if unknown:
+            raise BadInputError(
+                "quantise", f"no layer {', '.join(sorted(unknown))}", "names of layers to keep in float"
+            )
+        limit_logits(plain, ranges)
+        overrides = None if keep_float else _made_alike(plain, ranges, reduce_range)
+        alike = overrides is not None
+        if overrides is None:
+            share_ranges(plain, ranges)
+        quantised = _insert(plain, ranges, reduce_range, keep_float, overrides or {})
     _integer_ends(quantised)
     _describe(quantised, keep_float)
     facts = {
         "method": method,
         "calibration_frames": len(frames),
         "weight_bits": (7 if reduce_range else 8) - alike,
-        "rounds_alike": alike,
+        "rounds_alike": alike and reduce_range,
         "per_channel": True,
         "float_layers": list(keep_float),
         "onnxruntime": onnxruntime.__version__,
@@ -133,16 +143,27 @@ def _check_weights(model: onnx.ModelProto) -> None:
             raise BadInputError("quantise", f"weights {tensor.name!r} that are not finite", "a trained network")
 
 
+def _made_alike(model: onnx.ModelProto, ranges: Any, reduce_range: bool) -> dict[str, Any] | None:
+    """Make `model` and `ranges` such that every runtime rounds alike; the scales of its weights.
+
+    None where that cannot be; both are then as they were.
+    """
+    if not may_round_alike(model):
+        return None
+    rounded, widened = copy.deepcopy(model), copy.deepcopy(ranges)
+    dyadic_ranges(rounded, widened)
+    try:
+        overrides = dyadic_weights(rounded, widened, reduce_range)
+    except NotAlikeError:
+        return None
+    dyadic_ranges(model, ranges)
+    model.CopyFrom(rounded)
+    return overrides
+
+
 def _insert(
-    model: onnx.ModelProto, ranges: Any, reduce_range: bool, keep_float: Sequence[str], alike: bool
+    model: onnx.ModelProto, ranges: Any, reduce_range: bool, keep_float: Sequence[str], overrides: dict[str, Any]
 ) -> onnx.ModelProto:
-    limit_logits(model, ranges)
-    overrides = {}
-    if alike:
-        dyadic_ranges(model, ranges)
-        overrides = dyadic_weights(model, ranges, reduce_range)
-    else:
-        share_ranges(model, ranges)
     quantiser = QDQQuantizer(
         model,
         per_channel=True,
