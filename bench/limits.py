@@ -4,6 +4,7 @@ bench that needs a narrower one says so itself.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,7 +13,7 @@ from trilane.errors import BadInputError
 #: Option: least and greatest value.
 LIMITS: dict[str, tuple[float, float]] = {
     "repeats": (1, 100_000),
-    "threads": (0, 1024),
+    "threads": (0, 4 * (os.cpu_count() or 1)),
     "turns": (1, 10_000),
     "views": (1, 1_000_000),
     "frames": (1, 10_000_000),

@@ -164,6 +164,8 @@ class UnitProcesses:
         try:
             while (message := process.link.receive()) is not None:
                 heard.append(Heard(process.unit, message))
+            if process.link.line.ended:
+                self._unregister(process.link.line.fileno())  # it would be readable for ever
         except MessageError as error:
             raise TrilaneError(f"unit {process.unit} sent what is no message: {error}") from None
         return heard

@@ -6,6 +6,7 @@ its stage; the first stage of the chain has no input, so the loop itself stamps 
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import socket
@@ -16,6 +17,7 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
+import zmq
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
@@ -152,7 +154,8 @@ def _serve(unit: str, spec: UnitSpec, link: Link) -> int:
         if message is None:
             if os.getppid() != spec.parent_pid:
                 return 1
-            link.send(Alive())
+            with contextlib.suppress(zmq.Again):  # the scheduler is stopped: it will hear of us when it goes on
+                link.send(Alive())
         elif isinstance(message, RunJob):
             _run_job(link, stages[message.stage], message)
         elif isinstance(message, Isolate):
@@ -223,5 +226,6 @@ def _fail(link: Link, job_id: int, where: str, error: Exception) -> int:
     known = isinstance(error, TrilaneError)
     text = str(error) if known else f"{where}: {type(error).__name__}: {error}"
     code = error.exit_code if isinstance(error, TrilaneError) else 1
-    link.send(Failed(job_id, " ".join(text.split())[:2000], code))
+    plain = text.encode(errors="replace").decode()  # a name of a file may hold what no text may
+    link.send(Failed(job_id, " ".join(plain.split())[:2000], code))
     return code

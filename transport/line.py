@@ -18,9 +18,13 @@ def line_pair() -> tuple[socket.socket, socket.socket]:
 
 
 class Line:
-    """One end. Messages arrive in order or not at all. `patience_ms`: how long `receive` waits; 0: not at all."""
+    """One end. Messages arrive in order or not at all. `patience_ms`: how long `receive` waits; 0: not at all.
+
+    `ended`: the other end is gone, and all that it said was received.
+    """
 
     def __init__(self, end: socket.socket, patience_ms: int = 0) -> None:
+        self.ended = False
         self._socket = end
         self._flags = 0 if patience_ms else socket.MSG_DONTWAIT
         end.setblocking(True)
@@ -39,8 +43,11 @@ class Line:
         """The next message, None when there is none or the other end is gone. Raises MessageError for anything else."""
         try:
             data = self._socket.recv(MAX_BYTES, self._flags)
-        except (BlockingIOError, ConnectionResetError):
+        except BlockingIOError:
             return None
+        except ConnectionResetError:
+            data = b""
+        self.ended = not data
         return unpack(data) if data else None
 
     def close(self) -> None:

@@ -111,6 +111,8 @@ def quantize(
     from trilane.avatars.quantise import quantise
     from trilane.avatars.sqnr import layer_report
 
+    if out.resolve() == source.resolve():
+        raise BadInputError("--out", str(out), "another file than the float network")
     model = parse_network(source)
     data = _frames(frames)
     calibration = data[:count]

@@ -120,7 +120,7 @@ def run(
     hud: Annotated[bool | None, typer.Option(help="Write frame, rate and age on the picture.")] = None,
     policy: Annotated[PolicyName, typer.Option(help="How frames are scheduled.")] = PolicyName.PIPELINED,
     runtime: Annotated[
-        str, typer.Option(help="What runs the network: openvino, ort; auto: the fastest there is.")
+        str, typer.Option(help="What runs the network: openvino, ort, qnn, cuda; auto: the fastest there is.")
     ] = "auto",
     skinning: Annotated[
         str, typer.Option(help="Which unit poses the vertices: cpu, gpu; auto: cpu when OpenGL is software.")
@@ -155,6 +155,8 @@ def run(
     )
     checked = configure(request, Path.cwd())
     held = _pace(checked.config, profile, pace, slow_motion)
+    if held is not None and split:
+        raise BadInputError("options", "--split with --pace", "one of them", "a chip's pace is that of a whole network")
     if held is not None and performance_profile is not None:
         raise BadInputError("options", "--performance-profile with --pace", "one of them", "a pace is capped already")
     if held is not None:

@@ -54,6 +54,13 @@ def test_quantize_writes_a_network_and_a_report(files):
     assert 10 < layers[0]["sqnr_db"] <= layers[-1]["sqnr_db"] < 80
 
 
+def test_quantize_does_not_write_over_the_float_network(files):
+    before = (files / "float.onnx").read_bytes()
+    with pytest.raises(BadInputError, match="another file than the float network"):
+        call("quantize", files / "float.onnx", "--frames", files / "frames.npy", "--out", files / "float.onnx")
+    assert (files / "float.onnx").read_bytes() == before
+
+
 def test_calibrations_are_compared_on_frames_that_none_was_calibrated_on(files, tiny_frames):
     np.save(files / "many.npy", np.stack([*tiny_frames] * 6)[:16])
     rows = call("calibrations", files / "float.onnx", "--frames", files / "many.npy", "--method", "minmax")["rows"]

@@ -176,7 +176,7 @@ def test_a_line_whose_end_is_gone_or_stopped_says_nothing() -> None:
     assert theirs.receive() == RunJob(0, "infer", 0, 0, 0, 0)
     theirs.close()
     ours.send(Done(1, 2, 3, 4, {}))
-    assert ours.receive() is None
+    assert ours.receive() is None and ours.ended
     ours.close()
 
 

@@ -105,6 +105,11 @@ OPTIONS = {
     "unknown skinning": (["--skinning", "npu"], "--skinning", "'npu'"),
     "a split without a unit": (["--split", "rgba"], "--split", "UNIT one of cpu, gpu, dsp"),
     "a split nowhere": (["--split", "nowhere=cpu"], "network.onnx, cut", "'nowhere'"),
+    "a split at a chip's pace": (
+        ["--pace", "--profile", "snapdragon-888", "--split", "rgba_QuantizeLinear_Output=cpu"],
+        "options",
+        "--split with --pace",
+    ),
     "pace of no chip": (["--pace"], "options", "--pace without --profile"),
     "chip without pace": (["--profile", "snapdragon-888"], "options", "--profile without --pace"),
     "unknown chip": (["--profile", "abacus", "--pace"], "abacus", "expected"),
