@@ -28,6 +28,8 @@ BANDS = ("far", "full_body", "upper_body", "face")
 TEXTURE_KEYS = ("texture", "scale")
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+#: Of a shape or expression, in standard deviations: what lies outside is no body.
+Coefficient = Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)]
 FileName = Annotated[str, Field(min_length=1, max_length=200)]
 
 
@@ -72,8 +74,8 @@ class Manifest(_Model):
     body: FileName = "body.npz"
     texture: FileName = "texture.npz"
     network: NetworkEntry
-    betas: tuple[Finite, ...] = Field(default=(), max_length=400)
-    expression: tuple[Finite, ...] = Field(default=(), max_length=100)
+    betas: tuple[Coefficient, ...] = Field(default=(), max_length=400)
+    expression: tuple[Coefficient, ...] = Field(default=(), max_length=100)
     provenance: dict[str, Any] = {}
     training_command: str = ""
     quantisation: dict[str, Any] = {}

@@ -12,20 +12,23 @@ import onnx
 from trilane.avatars.bundle import Bundle
 from trilane.avatars.network_file import NetworkFile
 from trilane.hw_profiles.cost import walk
+from trilane.stages.cpu.body import load_body
 
 
 def bundle_facts(bundle: Bundle) -> dict[str, Any]:
     """The manifest's entries, sizes in bytes, and what the network's file holds. Raises BadInputError.
 
-    Keys: `name`, `folder`, `files`, `texture`, `network`, `quantisation`, `provenance`, `training_command`,
+    Keys: `name`, `folder`, `files`, `body`, `texture`, `network`, `quantisation`, `provenance`, `training_command`,
     `validation`.
     """
     manifest = bundle.manifest
+    shaped = load_body(bundle.body_path).shape(manifest.betas, manifest.expression)
     files = {"body": bundle.body_path, "texture": bundle.texture_path, "network": bundle.network_path}
     return {
         "name": manifest.name,
         "folder": str(bundle.folder),
         "files": {key: {"name": path.name, "bytes": path.stat().st_size} for key, path in files.items()},
+        "body": {"vertices": len(shaped.vertices)},
         "texture": {"shape": list(bundle.read_texture().shape)},
         "network": {**manifest.network.model_dump(), **network_facts(bundle.read_network())},
         "quantisation": manifest.quantisation,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import numpy as np
 import onnx
@@ -37,6 +38,16 @@ def test_inspect_says_what_the_manifest_says(tiny_bundle):
     assert facts["network"]["channels"] == 5 and facts["network"]["shape"] == [1, 64, 64, 5]
     assert facts["network"]["parameters"] > 0 and facts["quantisation"]["method"] == "minmax"
     assert facts["validation"] is None
+
+
+@pytest.mark.parametrize(("key", "value", "named"), [("body", "texture.npz", "v_template"), ("betas", [1e9], "betas")])
+def test_inspect_refuses_what_a_run_would(tiny_bundle, tmp_path, key, value, named):
+    broken = tmp_path / "broken"
+    shutil.copytree(tiny_bundle, broken)
+    manifest = json.loads((broken / "manifest.json").read_text())
+    (broken / "manifest.json").write_text(json.dumps(manifest | {key: value}))
+    with pytest.raises(BadInputError, match=named):
+        call("inspect", broken)
 
 
 def test_inspect_prints_a_table(tiny_bundle):
