@@ -90,11 +90,11 @@ def quantise(
                 "quantise", f"no layer {', '.join(sorted(unknown))}", "names of layers to keep in float"
             )
         limit_logits(plain, ranges)
-        overrides = None if keep_float else _made_alike(plain, ranges, reduce_range)
-        alike = overrides is not None
-        if overrides is None:
+        made = None if keep_float else _made_alike(plain, ranges, reduce_range)
+        alike = made is not None
+        if made is None:
             share_ranges(plain, ranges)
-        quantised = _insert(plain, ranges, reduce_range, keep_float, overrides or {})
+        quantised = _insert(*(made or (plain, ranges, {})), reduce_range, keep_float)
     _integer_ends(quantised)
     _describe(quantised, keep_float)
     facts = {
@@ -143,26 +143,25 @@ def _check_weights(model: onnx.ModelProto) -> None:
             raise BadInputError("quantise", f"weights {tensor.name!r} that are not finite", "a trained network")
 
 
-def _made_alike(model: onnx.ModelProto, ranges: Any, reduce_range: bool) -> dict[str, Any] | None:
-    """Make `model` and `ranges` such that every runtime rounds alike; the scales of its weights.
+def _made_alike(
+    model: onnx.ModelProto, ranges: Any, reduce_range: bool
+) -> tuple[onnx.ModelProto, Any, dict[str, Any]] | None:
+    """Copies of `model` and `ranges` with which every runtime rounds alike, and the scales of the weights.
 
-    None where that cannot be; both are then as they were.
+    None where that cannot be.
     """
     if not may_round_alike(model):
         return None
     rounded, widened = copy.deepcopy(model), copy.deepcopy(ranges)
     dyadic_ranges(rounded, widened)
     try:
-        overrides = dyadic_weights(rounded, widened, reduce_range)
+        return rounded, widened, dyadic_weights(rounded, widened, reduce_range)
     except NotAlikeError:
         return None
-    dyadic_ranges(model, ranges)
-    model.CopyFrom(rounded)
-    return overrides
 
 
 def _insert(
-    model: onnx.ModelProto, ranges: Any, reduce_range: bool, keep_float: Sequence[str], overrides: dict[str, Any]
+    model: onnx.ModelProto, ranges: Any, overrides: dict[str, Any], reduce_range: bool, keep_float: Sequence[str]
 ) -> onnx.ModelProto:
     quantiser = QDQQuantizer(
         model,

@@ -11,16 +11,14 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from trilane.avatars.split import NetworkPart
 from trilane.errors import BadInputError
 from trilane.scene.schema import RunConfig, Shape
 from trilane.stages.contracts import Packet
 from trilane.stages.dsp.parts import parts_for, shared_network, views
-from trilane.stages.dsp.runtime import Binding, RuntimeOptions, Session, load_runtime, resolve
+from trilane.stages.dsp.runtime import U8, Binding, RuntimeOptions, Session, load_runtime, resolve
 
-U8 = NDArray[np.uint8]
 Key = tuple[Shape, int, int]
 
 

@@ -10,18 +10,15 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import NetworkFile
 from trilane.avatars.reshape import reshaped
 from trilane.avatars.split import NetworkPart, Shapes, split
 from trilane.errors import BadInputError
 from trilane.scene.schema import RunConfig, Shape
+from trilane.stages.dsp.runtime import U8
 
 LINE = 64  # bytes of a cache line, and of the widest vector register
-U8 = NDArray[np.uint8]
 
 
 def shared_network(folders: Sequence[Path]) -> NetworkFile:

@@ -19,7 +19,6 @@ def pair(request):
 
 @pytest.mark.parametrize("case", INPUTS)
 @pytest.mark.parametrize("runtime", [name for name in RUNTIMES if name != "qnn"])
-def test_the_picture_is_near_the_float_networks(pair, runtime, case):
-    if not RUNTIMES[runtime].is_installed:
-        pytest.skip(f"runtime {runtime} is not installed")
+def test_the_picture_is_near_the_float_networks(skip_without, pair, runtime, case):
+    skip_without(runtime)
     assert error_of(pair, case, runtime) <= pair.bounds[case]

@@ -33,13 +33,8 @@ FRAMES = {"openvino": 1000, "ort": 1000, "qnn": 20, "cuda": 1000}
 SMALLEST_OBJECT, INTERPRETERS_OWN = 16, 4096
 
 
-def skip_without(name):
-    if not RUNTIMES[name].is_installed:
-        pytest.skip(f"runtime {name} is not installed: {RUNTIMES[name].install}")
-
-
 @pytest.fixture(params=RUNTIMES)
-def name(request):
+def name(request, skip_without):
     skip_without(request.param)
     return request.param
 
@@ -109,7 +104,7 @@ def test_parts_give_the_bytes_of_the_whole(module, tiny_quantised):
     assert (image == picture(module, network, tensor)).all()
 
 
-def test_what_qnn_compiled_is_kept_and_made_anew_when_spoilt(tiny_quantised, monkeypatch, tmp_path):
+def test_what_qnn_compiled_is_kept_and_made_anew_when_spoilt(skip_without, tiny_quantised, monkeypatch, tmp_path):
     skip_without("qnn")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     module, network = load_runtime("qnn"), tiny_quantised.network
