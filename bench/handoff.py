@@ -25,6 +25,7 @@ from trilane.errors import BadInputError, TrilaneError
 from trilane.hw_profiles.host import host_units
 from trilane.scene.schema import RunConfig, Scene
 from trilane.scheduler.run import run_pipeline
+from trilane.transport.wakeup import awake
 
 #: KiB of a tensor of 16 channels -> its side; the sizes that can be asked for.
 SIDES = {256: 128, 1024: 256, 4096: 512, 16384: 1024}
@@ -57,15 +58,16 @@ def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 200, turns:
             f"sizes of {sorted(SIDES)} KiB, at least {MIN_FRAMES} frames and 1 turn",
         )
     times: dict[tuple[str, int], Times] = {}
-    with ExitStack() as stack:
+    with awake() as idle_cores, ExitStack() as stack:
         pairs, absent = _pairs(stack, kib)
         for _ in range(turns):
             for size in kib:
                 for way in [way for way, of in pairs if of == size]:
                     _add(times, (way, size), pairs[way, size].run(frames))
                 _add(times, (PIPELINE, size), _through_pipeline(size, frames))
+    config = {"frames": frames, "turns": turns, "idle_cores": idle_cores}
     rows = [_row(way, size, taken) for (way, size), taken in sorted(times.items(), key=lambda item: item[0][1])]
-    return {"rows": rows, **_verdicts(rows, max(kib)), "absent": absent, "config": {"frames": frames, "turns": turns}}
+    return {"rows": rows, **_verdicts(rows, max(kib)), "absent": absent, "config": config}
 
 
 class Pair:

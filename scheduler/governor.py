@@ -18,6 +18,8 @@ from trilane.hw_profiles.thermal import GOVERNORS, Heat, Throttle
 from trilane.scheduler.events import SetDuty
 from trilane.scheduler.state import FULL_DUTY
 
+#: Performance profiles that vote for a short wake-up of a sleeping unit: idle cores stay awake.
+PROMPT = ("burst", "sustained_high_performance", "high_performance")
 HOW = "duty cycles; cores and threads of each unit stand with it"
 NS = 1_000_000_000
 
@@ -61,6 +63,11 @@ class Governor:
         self._busy_ns = {unit: busy_ns[unit] for unit in UNITS}
         self._last_ns, self.due_ns = now_ns, now_ns + self._poll_ns
         return self._changed()
+
+    @property
+    def is_prompt(self) -> bool:
+        """Whether a message's wake-up matters more than the power of cores that wait for it."""
+        return self._performance_profile in PROMPT
 
     @property
     def power_w(self) -> float | None:

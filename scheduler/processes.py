@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import contextlib
 import os
+import select
 import subprocess
 import sys
 import time
 from collections.abc import Mapping
+from enum import Enum
 from typing import NamedTuple
 
 import zmq
@@ -35,6 +37,12 @@ class Heard(NamedTuple):
     message: Message | None
 
 
+class _Kind(Enum):
+    """Of what becomes readable."""
+
+    LINE, BUS, STDERR, END, WAKE = range(5)
+
+
 class _Process:
     def __init__(self, unit: str, popen: subprocess.Popen[bytes], link: Link, folder: BusFolder) -> None:
         assert popen.stderr is not None
@@ -44,6 +52,15 @@ class _Process:
         self.tail = b""
         self.folder_open = True
         os.set_blocking(self.stderr.fileno(), False)
+
+    @property
+    def sources(self) -> dict[_Kind, int]:
+        return {
+            _Kind.LINE: self.link.line.fileno(),
+            _Kind.BUS: self.link.bus_fd,
+            _Kind.STDERR: self.stderr.fileno(),
+            _Kind.END: self.pidfd,
+        }
 
     def read_stderr(self) -> bool:
         """Keep the end of what was written; False when the pipe is closed."""
@@ -70,8 +87,8 @@ class UnitProcesses:
     ) -> None:
         self._config, self._edges, self._stages = config, edges, stages
         self._context = zmq.Context()
-        self._poller = zmq.Poller()
-        self._sources: dict[object, tuple[str, _Process | None]] = {}
+        self._poller = select.epoll()
+        self._sources: dict[int, tuple[_Kind, _Process | None]] = {}
         self._live: dict[str, _Process] = {}
         self.last_words: dict[str, str] = {}
 
@@ -81,7 +98,7 @@ class UnitProcesses:
 
     def watch(self, fd: int) -> None:
         """Let `listen` return early when `fd` becomes readable."""
-        self._register(fd, "wake", None)
+        self._register(fd, _Kind.WAKE, None)
 
     def start(self, unit: str) -> None:
         """A fresh process for the unit; `Ready` or `Failed` follows, or its end."""
@@ -103,10 +120,8 @@ class UnitProcesses:
         with theirs:
             process = _Process(unit, self._spawn(unit, spec), link, folder)
         self._live[unit] = process
-        for source in link.sources:
-            self._register(source, "link", process)
-        self._register(process.pidfd, "end", process)
-        self._register(process.stderr.fileno(), "stderr", process)
+        for kind, fd in process.sources.items():
+            self._register(fd, kind, process)
 
     def connected(self, unit: str) -> None:
         """The unit has spoken: its socket needs no name any more."""
@@ -127,20 +142,22 @@ class UnitProcesses:
         """What came within the time; at once when something waits. Messages of a unit come before its end."""
         heard: list[Heard] = []
         ended = []
-        for source, _ in self._poller.poll(timeout_ms):
+        for source, _ in self._poller.poll(None if timeout_ms is None else timeout_ms / 1000):
             kind, process = self._sources[source]
-            if kind == "wake":
+            if process is None:
                 os.read(source, 64)
-            elif process is None:
-                continue
-            elif kind == "link":
-                heard += self._messages(process)
-            elif kind == "end":
+            elif kind is _Kind.LINE:
+                heard += self._work(process)
+            elif kind is _Kind.BUS:
+                heard += self._life_signs(process)
+            elif kind is _Kind.END:
                 ended.append(process)
             elif not process.read_stderr():
                 self._unregister(source)
         for process in ended:
-            heard += self._messages(process)
+            while work := self._work(process):
+                heard += work
+            heard += self._life_signs(process)
             self._forget(process)
             heard.append(Heard(process.unit, None))
         return heard
@@ -152,6 +169,7 @@ class UnitProcesses:
         for process in list(self._live.values()):
             self._forget(process)
         self._context.destroy(linger=0)
+        self._poller.close()
 
     def wait_for_end(self, units: list[str], timeout_s: float = END_S) -> None:
         """Give units that were told to close the time to leave by themselves."""
@@ -159,16 +177,23 @@ class UnitProcesses:
         while any(unit in self._live for unit in units) and time.monotonic() < end:
             self.listen(50)
 
-    def _messages(self, process: _Process) -> list[Heard]:
-        heard = []
+    def _work(self, process: _Process) -> list[Heard]:
+        """The next message of the line, if there is one; the others make it readable again."""
         try:
-            while (message := process.link.receive()) is not None:
-                heard.append(Heard(process.unit, message))
-            if process.link.line.ended:
-                self._unregister(process.link.line.fileno())  # it would be readable for ever
+            message = process.link.line.receive()
         except MessageError as error:
-            raise TrilaneError(f"unit {process.unit} sent what is no message: {error}") from None
-        return heard
+            raise _no_message(process, error) from None
+        if message is not None:
+            return [Heard(process.unit, message)]
+        if process.link.line.ended:
+            self._unregister(process.link.line.fileno())  # it would be readable for ever
+        return []
+
+    def _life_signs(self, process: _Process) -> list[Heard]:
+        try:
+            return [Heard(process.unit, message) for message in process.link.bus_messages()]
+        except MessageError as error:
+            raise _no_message(process, error) from None
 
     def _spawn(self, unit: str, spec: UnitSpec) -> subprocess.Popen[bytes]:
         fd = os.memfd_create(f"trilane:spec:{unit}", os.MFD_CLOEXEC)
@@ -191,7 +216,7 @@ class UnitProcesses:
         process.popen.wait()
         process.read_stderr()
         self.last_words[process.unit] = process.tail.decode(errors="replace").strip()
-        for source in (*process.link.sources, process.pidfd, process.stderr.fileno()):
+        for source in process.sources.values():
             self._unregister(source)
         process.link.close()
         process.release_folder()
@@ -199,10 +224,14 @@ class UnitProcesses:
         process.stderr.close()
         del self._live[process.unit]
 
-    def _register(self, source: object, kind: str, process: _Process | None) -> None:
-        self._poller.register(source, zmq.POLLIN)
+    def _register(self, source: int, kind: _Kind, process: _Process | None) -> None:
+        self._poller.register(source, select.EPOLLIN)
         self._sources[source] = (kind, process)
 
-    def _unregister(self, source: object) -> None:
+    def _unregister(self, source: int) -> None:
         if self._sources.pop(source, None) is not None:
             self._poller.unregister(source)
+
+
+def _no_message(process: _Process, error: MessageError) -> TrilaneError:
+    return TrilaneError(f"unit {process.unit} sent what is no message: {error}")

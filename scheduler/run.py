@@ -26,7 +26,7 @@ from trilane.stages.dsp.parts import crossing_bytes
 from trilane.stages.unit_loop import EdgeSpec
 from trilane.transport.memory import RegionLayout, create_region
 from trilane.transport.slots import edge_rule
-from trilane.transport.wakeup import DEFAULT, SHORTEST_NS, use_slice
+from trilane.transport.wakeup import DEFAULT, SHORTEST_NS, awake, use_slice
 
 MAX_CHANNELS = 16  # of a tensor: what the GPU packs in one pass
 DEADLINE_PERIODS = 3  # from a frame's release until it must be presented: one period for each unit
@@ -72,6 +72,7 @@ def run_pipeline(
         Interrupts() as interrupts,
         _on_cores(config.units[graph.stages[0].unit].cores),
         _prompt(),
+        awake(governor is None or governor.is_prompt) as idle_cores,
         _regions(config, graph) as edges,
         _processes(config, edges, graph) as processes,
     ):
@@ -94,7 +95,9 @@ def run_pipeline(
         target_period_ns=target_ns,
         isolated_ns=driver.alone_ns if isolate_frames else None,
     )
-    report.update(policy=policy, edge=edge, **(governor.report() if governor is not None else {}))
+    report.update(
+        policy=policy, edge=edge, idle_cores=idle_cores, **(governor.report() if governor is not None else {})
+    )
     if governor is not None and governor.power_w is not None and report["fps"]:
         report["xrbench"]["energy"] = energy_score(1e3 * governor.power_w / report["fps"])
     for unit, row in report["units"].items():

@@ -92,9 +92,9 @@ class Link:
         self.socket.setsockopt(zmq.RCVHWM, HIGH_WATER)
 
     @property
-    def sources(self) -> tuple[object, ...]:
-        """What becomes readable when a message comes, as a poller takes it."""
-        return self.line.fileno(), self.socket
+    def bus_fd(self) -> int:
+        """Readable when `bus_messages` is to be called: the bus may have something."""
+        return self.socket.fileno()
 
     def send(self, message: Message) -> None:
         """Raises zmq.Again when the other end has stopped reading the bus."""
@@ -103,15 +103,12 @@ class Link:
         else:
             self.line.send(message)
 
-    def receive(self) -> Message | None:
-        """The next message, those of the line first; None when there is none. Raises MessageError for anything else."""
-        message = self.line.receive()
-        if message is not None:
-            return message
-        try:
-            return unpack(self.socket.recv(zmq.DONTWAIT))
-        except zmq.Again:
-            return None
+    def bus_messages(self) -> list[Message]:
+        """All that came over the bus since the last call. Raises MessageError for what is no message."""
+        messages = []
+        while self.socket.poll(0):  # until there is none: only then `bus_fd` rests
+            messages.append(unpack(self.socket.recv(zmq.DONTWAIT)))
+        return messages
 
     def close(self) -> None:
         self.socket.close()

@@ -5,7 +5,6 @@ A pair of Unix sockets that keep messages apart. That a unit lives is said over 
 
 from __future__ import annotations
 
-import contextlib
 import socket
 import struct
 
@@ -25,6 +24,7 @@ class Line:
 
     def __init__(self, end: socket.socket, patience_ms: int = 0) -> None:
         self.ended = False
+        self._buffer = memoryview(bytearray(MAX_BYTES))
         self._socket = end
         self._flags = 0 if patience_ms else socket.MSG_DONTWAIT
         end.setblocking(True)
@@ -36,19 +36,21 @@ class Line:
 
     def send(self, message: Message) -> None:
         """To an end that is gone or has stopped reading: nothing, its end or its deadline tells."""
-        with contextlib.suppress(BlockingIOError, BrokenPipeError, ConnectionResetError):
+        try:
             self._socket.send(pack(message), socket.MSG_DONTWAIT)
+        except (BlockingIOError, BrokenPipeError, ConnectionResetError):
+            return
 
     def receive(self) -> Message | None:
         """The next message, None when there is none or the other end is gone. Raises MessageError for anything else."""
         try:
-            data = self._socket.recv(MAX_BYTES, self._flags)
+            size = self._socket.recv_into(self._buffer, 0, self._flags)
         except BlockingIOError:
             return None
         except ConnectionResetError:
-            data = b""
-        self.ended = not data
-        return unpack(data) if data else None
+            size = 0
+        self.ended = not size
+        return unpack(self._buffer[:size]) if size else None
 
     def close(self) -> None:
         self._socket.close()

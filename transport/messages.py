@@ -87,16 +87,11 @@ LIFE_SIGNS = (Ready, Alive)
 _KINDS: dict[str, Any] = {
     kind.__name__: kind for kind in (RunJob, Isolate, Close, Ready, Done, Duration, Failed, Alive, Closed)
 }
-
-
-#: Name -> types of the fields as they come off the wire.
-_TYPES = {name: [get_origin(of) or of for of in get_type_hints(kind).values()] for name, kind in _KINDS.items()}
+#: Name -> the message, and the types of its fields as they come off the wire.
+_FORMS = {
+    name: (kind, tuple(get_origin(of) or of for of in get_type_hints(kind).values())) for name, kind in _KINDS.items()
+}
 _PACKER = msgpack.Packer()  # one for the process: making one costs more than packing
-
-
-def _are_figures(fields: list[Any]) -> bool:
-    figures = (value for value in fields if type(value) is dict)
-    return all(type(key) is str and type(value) in (int, float) for each in figures for key, value in each.items())
 
 
 def pack(message: Message) -> bytes:
@@ -104,17 +99,22 @@ def pack(message: Message) -> bytes:
     return packed
 
 
-def unpack(data: bytes) -> Message:
+def unpack(data: bytes | memoryview) -> Message:
     """Raises MessageError for anything that is not one of the messages, field by field."""
     try:
-        content = msgpack.unpackb(data)
+        content = msgpack.unpackb(data, use_list=False)
     except (ValueError, msgpack.UnpackException) as error:
         raise MessageError(f"not msgpack: {error}") from None
-    if not isinstance(content, list) or not content or not isinstance(content[0], str) or content[0] not in _KINDS:
+    form = _FORMS.get(content[0]) if type(content) is tuple and content and type(content[0]) is str else None
+    if form is None:
         raise MessageError(f"unknown message {str(content)[:80]!r}")
-    name, *fields = content
-    types = _TYPES[name]
-    if [type(field) for field in fields] != types or (dict in types and not _are_figures(fields)):
-        raise MessageError(f"wrong fields for {name}: {str(fields)[:80]}")
-    message: Message = _KINDS[name](*fields)
+    kind, types = form
+    fields = content[1:]
+    if tuple(map(type, fields)) != types or (dict in types and not _are_figures(fields[types.index(dict)])):
+        raise MessageError(f"wrong fields for {content[0]}: {str(fields)[:80]}")
+    message: Message = tuple.__new__(kind, fields)
     return message
+
+
+def _are_figures(figures: dict[Any, Any]) -> bool:
+    return all(type(key) is str and type(value) in (int, float) for key, value in figures.items())

@@ -10,10 +10,13 @@ that should carry the message waited on the same core until that job's slice was
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import platform
 import struct
+from collections.abc import Iterator
+from pathlib import Path
 
 SHORTEST_NS = 100_000
 UNIT_NS = 1_000_000  # a unit that a job wakes goes before other programs, and lets the scheduler go before itself
@@ -23,6 +26,9 @@ SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
 #: struct sched_attr of <linux/sched/types.h>: size, policy, flags, nice, priority, runtime, deadline, period.
 SCHED_ATTR = "=IIQiIQQQ"
 SCHED_OTHER = 0
+#: Linux's "PM QoS": while it is open, no core sleeps so deeply that waking takes longer than the written int, in us.
+LATENCY_FILE = Path("/dev/cpu_dma_latency")
+AWAKE = "wait awake"
 
 
 def use_slice(slice_ns: int) -> bool:
@@ -33,3 +39,25 @@ def use_slice(slice_ns: int) -> bool:
     nice = os.getpriority(os.PRIO_PROCESS, 0)
     wish = struct.pack(SCHED_ATTR, struct.calcsize(SCHED_ATTR), SCHED_OTHER, 0, nice, 0, slice_ns, 0, 0)
     return bool(ctypes.CDLL(None).syscall(number, 0, wish, 0) == 0)
+
+
+@contextlib.contextmanager
+def awake(wanted: bool = True) -> Iterator[str]:
+    """While entered, cores without work stay awake, on the whole machine. Yields AWAKE, or that they sleep, and why.
+
+    A core that sleeps takes 50 us and more to hear of a message; one that waits awake takes power. For root alone,
+    unless the machine's owner says otherwise; the kernel forgets it with the process.
+    """
+    if not wanted:
+        yield "sleep: the performance profile asks for no haste"
+        return
+    try:
+        file = os.open(LATENCY_FILE, os.O_WRONLY | os.O_CLOEXEC)
+    except OSError as error:
+        yield f"sleep: {LATENCY_FILE}: {os.strerror(error.errno or 0).lower()}"
+        return
+    try:
+        os.write(file, struct.pack("=i", 0))
+        yield AWAKE
+    finally:
+        os.close(file)

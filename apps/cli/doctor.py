@@ -110,9 +110,18 @@ def _dev_shm() -> Check:
     return Check(str(SHM), f"{free / 2**20:.0f} MiB free; Trilane leaves nothing there", works=True, needed=False)
 
 
+def _wakeup() -> Check:
+    """Not needed: a message reaches a core that sleeps some 50 us later."""
+    from trilane.transport.wakeup import AWAKE, LATENCY_FILE, awake
+
+    install = f'setfacl -m "u:$USER:w" {LATENCY_FILE}'
+    with awake() as idle_cores:
+        return Check("idle cores", idle_cores, works=idle_cores == AWAKE, needed=False, install=install)
+
+
 def checks(gl: dict[str, Any] | None) -> list[Check]:
     """Every check, in the order they are shown; `gl` is what `machine.gl_facts` said."""
-    return [_python(), _cpu(), _int8(), _memfd(), _dev_shm(), _gl(gl), _runtimes(), *_packages()]
+    return [_python(), _cpu(), _int8(), _memfd(), _dev_shm(), _wakeup(), _gl(gl), _runtimes(), *_packages()]
 
 
 def _state(check: Check) -> str:

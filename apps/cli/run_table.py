@@ -46,7 +46,7 @@ def _caption(report: Run) -> str:
     cpu, gl = report["machine"]["cpu"], report["machine"].get("gl")
     cores = ", ".join(f"{unit} {_cores(report, unit)}" for unit in UNITS if unit in report["config"]["units"])
     lines = [
-        f"{cpu['model']} ({' '.join(cpu['flags'])}); cores: {cores}",
+        f"{cpu['model']} ({' '.join(cpu['flags'])}); cores: {cores}; idle cores {report['idle_cores']}",
         f"network on {report['config']['runtime']}; OpenGL on {gl['renderer'] if gl else DASH}",
     ]
     if "pace" in report:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import os
+import select
+import struct
 import time
 from pathlib import Path
 
@@ -27,13 +29,14 @@ from trilane.transport.messages import (
     Duration,
     Failed,
     Isolate,
+    Message,
     MessageError,
     Ready,
     RunJob,
     pack,
     unpack,
 )
-from trilane.transport.wakeup import DEFAULT, SHORTEST_NS, use_slice
+from trilane.transport.wakeup import AWAKE, DEFAULT, SHORTEST_NS, awake, use_slice
 
 MESSAGES = [
     RunJob(1, "raster", 2, -1, 0, 3),
@@ -113,12 +116,12 @@ def test_a_region_that_is_too_small_is_refused() -> None:
     os.close(fd)
 
 
-def come(link: Link) -> bool:
-    """Whether a message comes to `link` within two seconds."""
-    poller = zmq.Poller()
-    for source in link.sources:
-        poller.register(source, zmq.POLLIN)
-    return bool(poller.poll(2000))
+def heard(link: Link) -> list[Message]:
+    """What comes over the bus within two seconds."""
+    messages: list[Message] = []
+    while not messages and select.select([link.bus_fd], [], [], 2)[0]:
+        messages = link.bus_messages()
+    return messages
 
 
 def test_the_folder_is_private_and_goes_while_the_link_lives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -130,18 +133,18 @@ def test_the_folder_is_private_and_goes_while_the_link_lives(tmp_path: Path, mon
     parent.socket.bind(folder.endpoint("cpu"))
     child.socket.connect(folder.endpoint("cpu"))
     child.send(Ready(1))
-    assert come(parent) and parent.receive() == Ready(1)
+    assert heard(parent) == [Ready(1)]
     folder.remove()
     assert not list(tmp_path.iterdir())
     child.send(Alive())
-    assert come(parent) and (parent.receive(), parent.receive()) == (Alive(), None)
+    assert heard(parent) == [Alive()] and parent.bus_messages() == []
     parent.close()
     child.close()
     context.term()
 
 
-def test_work_goes_over_the_line(tmp_path: Path) -> None:
-    """It needs no address, comes before what the bus holds, and keeps its order."""
+def test_work_goes_over_the_line_and_life_signs_over_the_bus(tmp_path: Path) -> None:
+    """Work needs no address, and keeps its order."""
     context = zmq.Context()
     ends = line_pair()
     parent, child = Link(context, Line(ends[0])), Link(context, Line(ends[1], 2000))
@@ -151,10 +154,11 @@ def test_work_goes_over_the_line(tmp_path: Path) -> None:
     parent.send(job)
     assert child.line.receive() == job
     child.send(Alive())
-    assert come(parent)
     child.send(done)
     child.send(Failed(2, "no such thing", 2))
-    assert [parent.receive() for _ in range(4)] == [done, Failed(2, "no such thing", 2), Alive(), None]
+    assert [parent.line.receive() for _ in range(3)] == [done, Failed(2, "no such thing", 2), None]
+    assert heard(parent) == [Alive()]
+    assert not select.select([parent.bus_fd], [], [], 0)[0]
     parent.close()
     child.close()
     context.term()
@@ -220,3 +224,16 @@ def test_a_slice_is_asked_for_and_given_back() -> None:
     before = os.sched_getscheduler(0), os.getpriority(os.PRIO_PROCESS, 0)
     assert use_slice(SHORTEST_NS) == use_slice(DEFAULT)
     assert (os.sched_getscheduler(0), os.getpriority(os.PRIO_PROCESS, 0)) == before
+
+
+def test_cores_stay_awake_for_a_while(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "latency"
+    monkeypatch.setattr("trilane.transport.wakeup.LATENCY_FILE", file)
+    with awake() as idle_cores:
+        assert idle_cores == f"sleep: {file}: no such file or directory"
+    file.touch()
+    with awake(wanted=False) as idle_cores:
+        assert idle_cores.startswith("sleep: ") and not file.read_bytes()
+    with awake() as idle_cores:
+        assert idle_cores == AWAKE
+        assert file.read_bytes() == struct.pack("=i", 0)
