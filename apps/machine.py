@@ -15,6 +15,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from trilane.scheduler.compiled import form
+
 #: Instructions that decide how fast INT8 and FP32 networks run; a network's speed means nothing without them.
 CPU_FLAGS = ("avx2", "fma", "f16c", "avx512f", "avx512_vnni", "avx_vnni", "avx512_bf16", "amx_int8", "sha_ni")
 ARM_FLAGS = ("asimd", "asimddp", "i8mm", "bf16", "sve", "sve2")
@@ -121,6 +123,7 @@ def machine_facts(gl: dict[str, Any] | None = None) -> dict[str, Any]:
         "system": platform.platform(),
         "python": platform.python_version(),
         "trilane": package_version("trilane"),
+        "scheduler_core": form(),
         "cpu": cpu_facts(),
         "memory_bytes": memory_bytes(),
         "gl": gl,

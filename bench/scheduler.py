@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from trilane.errors import BadInputError, TrilaneError
+from trilane.scheduler.compiled import form
 from trilane.scheduler.events import Graph, Settings, avatar_graph
 from trilane.scheduler.record import read, replay
 from trilane.scheduler.virtual import Service, VirtualDriver, simulate
@@ -65,7 +66,14 @@ def measure(minutes: float = 30.0, turns: int = 3, seeds: int = 10, events: str 
         "agree": None if absent else frames,
         "same_traces": sum(len(set(found)) == 1 for found in traces),
         "different_traces": len({found[0] for found in traces}),
-        "config": {"minutes": minutes, "fps": FPS, "turns": turns, "seeds": seeds, "repeats": REPEATS},
+        "config": {
+            "core": form(),
+            "minutes": minutes,
+            "fps": FPS,
+            "turns": turns,
+            "seeds": seeds,
+            "repeats": REPEATS,
+        },
         **absent,
         **replayed,
     }

@@ -137,7 +137,7 @@ class Graph:
 
     @property
     def units(self) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(stage.unit for stage in self.stages))
+        return tuple(dict.fromkeys([stage.unit for stage in self.stages]))
 
     def edge_name(self, index: int) -> str:
         return f"{self.stages[index].name}->{self.stages[index + 1].name}"

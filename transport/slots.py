@@ -26,7 +26,7 @@ TRANSITIONS = {
 MAX_SLOTS = 64
 
 
-class SlotError(RuntimeError):
+class SlotError(Exception):
     """A transition that the table does not have: a defect of the caller, never of the user's input."""
 
 

@@ -119,9 +119,18 @@ def _wakeup() -> Check:
         return Check("idle cores", idle_cores, works=idle_cores == AWAKE, needed=False, install=install)
 
 
+def _core() -> Check:
+    """Not needed: interpreted, the same core is some three times slower in virtual time."""
+    from trilane.scheduler.compiled import form
+
+    found = form()
+    install = "apt-get install gcc python3-dev, then install Trilane again"
+    return Check("scheduler core", found, works=found == "compiled", needed=False, install=install)
+
+
 def checks(gl: dict[str, Any] | None) -> list[Check]:
     """Every check, in the order they are shown; `gl` is what `machine.gl_facts` said."""
-    return [_python(), _cpu(), _int8(), _memfd(), _dev_shm(), _wakeup(), _gl(gl), _runtimes(), *_packages()]
+    return [_python(), _cpu(), _int8(), _memfd(), _dev_shm(), _wakeup(), _core(), _gl(gl), _runtimes(), *_packages()]
 
 
 def _state(check: Check) -> str:

@@ -1,0 +1,50 @@
+"""Which modules are compiled, and whether they are here. Rule: what runs is what the sources say, or nothing runs.
+
+mypyc turns the pure core into C while the package is installed (setup.py); without a C compiler the same files run as
+Python, some three times slower. The name of the compiled library holds a digest of the sources it was made from.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+from pathlib import Path
+
+#: Relative to the package's folder. Pure: they import nothing but each other and the standard library.
+MODULES = (
+    "scheduler/core.py",
+    "scheduler/events.py",
+    "scheduler/faults.py",
+    "scheduler/lateness.py",
+    "scheduler/ledger.py",
+    "scheduler/policy.py",
+    "scheduler/record.py",
+    "scheduler/result.py",
+    "scheduler/source.py",
+    "scheduler/state.py",
+    "scheduler/stats.py",
+    "scheduler/virtual.py",
+    "transport/slots.py",
+)
+PREFIX = "trilane_core_"
+PACKAGE = Path(__file__).resolve().parents[1]
+
+
+def library(package: Path) -> str:
+    """Name of the library that is made from the sources in the package's folder, without mypyc's ending."""
+    sources = hashlib.sha256(b"\0".join((package / name).read_bytes() for name in MODULES))
+    return PREFIX + sources.hexdigest()[:16]
+
+
+def form(package: Path = PACKAGE) -> str:
+    """`compiled` or `interpreted`. Raises MissingPartError when what is compiled was made from other sources."""
+    if not list((package / MODULES[0]).parent.glob(f"{Path(MODULES[0]).stem}.*.so")):
+        return "interpreted"
+    if importlib.util.find_spec(f"{library(package)}__mypyc") is None:
+        from trilane.errors import MissingPartError  # setup.py reads this file before there is a package
+
+        raise MissingPartError(
+            "the scheduler's sources were changed after they were compiled",
+            "make compile, or to run them as Python while you edit: make interpreted",
+        )
+    return "compiled"
