@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
-from math import exp
+from math import comb, exp
 
 NS_PER_MS = 1e6
 SCORE_PER_MS = 15.0
@@ -43,6 +43,21 @@ def ema_range_ms(values_ns: Sequence[int], span: int = 20) -> dict[str, float]:
         averages.append(average)
     settled = averages[span - 1 :] or averages[-1:]
     return {f"ema{span}_min": round(min(settled) / NS_PER_MS, 6), f"ema{span}_max": round(max(settled) / NS_PER_MS, 6)}
+
+
+def median_interval(values: Sequence[float], confidence: float = 0.95) -> tuple[float, float]:
+    """Between which of the values the median of what they were drawn from lies, with at least that confidence.
+
+    By the sign test: the k-th least and the k-th largest, k the largest with P(B(n, 1/2) < k) <= (1 - confidence) / 2.
+    With too few values for that (below six for 0.95) the least and the largest. Raises ValueError for no values.
+    """
+    if not values:
+        raise ValueError("no values")
+    ordered, outside, rank = sorted(values), 0.0, 0
+    while (outside := outside + comb(len(ordered), rank) / 2 ** len(ordered)) <= (1 - confidence) / 2:
+        rank += 1
+    rank = max(rank, 1)
+    return ordered[rank - 1], ordered[-rank]
 
 
 def jitter_ms(values_ns: Sequence[int]) -> float:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilane.scheduler.stats import ema_range_ms, jitter_ms, percentile, summary_ms
+from trilane.scheduler.stats import ema_range_ms, jitter_ms, median_interval, percentile, summary_ms
 
 TIMES = st.lists(st.integers(0, 10**12), min_size=1, max_size=60)
 
@@ -36,3 +36,14 @@ def test_nothing_gives_zeros() -> None:
 
 def test_jitter_is_the_mean_step() -> None:
     assert jitter_ms([10_000_000, 12_000_000, 9_000_000]) == 2.5
+
+
+@pytest.mark.parametrize(("count", "rank"), [(1, 1), (5, 1), (6, 1), (8, 1), (9, 2), (20, 6), (100, 40)])
+def test_the_interval_of_a_median_is_that_of_the_sign_test(count: int, rank: int) -> None:
+    """Ranks as in the tables of the sign test for 95 %."""
+    assert median_interval(range(count, 0, -1)) == (rank, count + 1 - rank)
+
+
+def test_of_no_values_there_is_no_median() -> None:
+    with pytest.raises(ValueError, match="no values"):
+        median_interval([])
