@@ -52,6 +52,7 @@ def make_report(**changes: Any) -> dict[str, Any]:
         "plan": {},
         "temperature_c": {},
         "caps": {},
+        "idle_cores": "wait awake",
         **run,
         "baseline": {**run, "policy": "sequential", "efficiency": None},
         "accuracy": {"someone": {"psnr_db_by_band": {"face": 31.25}, "iou": 0.9812}},
