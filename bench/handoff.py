@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from trilane.bench.handoff_unit import PAUSE_S, check_bytes
-from trilane.bench.handoff_ways import CHANNELS, Channel
+from trilane.bench.handoff_ways import BARE, CHANNELS, SLOT, WRITTEN, Channel
 from trilane.errors import BadInputError, TrilaneError
 from trilane.hw_profiles.host import host_units
 from trilane.scene.schema import RunConfig, Scene
@@ -30,6 +30,7 @@ from trilane.transport.wakeup import awake
 #: KiB of a tensor of 16 channels -> its side; the sizes that can be asked for.
 SIDES = {256: 128, 1024: 256, 4096: 512, 16384: 1024}
 PIPELINE = "slot through the scheduler"
+OURS = (SLOT, BARE, PIPELINE)
 MIN_FRAMES = 10
 ANSWER_S = 120
 LIMITS_US = {"p50": 150, "p99": 500}
@@ -42,7 +43,8 @@ def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 200, turns:
     """Rows: `way`, `kib`, `frames`, `p50_us` `p99_us` `max_us` until all bytes can be read, `read_p50_us` until all
     were read (every byte is, and checked).
 
-    `slot`: a slot of the pipeline's shared memory and the message that announces it, one process to another. `slot
+    `slot`: a slot of the pipeline's shared memory and the message that announces it, one process to another; `slot, 256
+    KiB of it written`: the same, so that its size weighs on nothing but the announcement. `slot
     through the scheduler`: the same between the raster and infer stages of a real run, where the message goes to the
     scheduler's process, through its core, and on. Peers: `iceoryx2` with an event, `zeromq copied` frames, `pickled
     queue` (multiprocessing.Queue). Each turn hands over `frames` times in each way and size; before each the consumer
@@ -73,7 +75,7 @@ def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 200, turns:
 class Pair:
     """A producer and a consumer process that wait until they are asked."""
 
-    def __init__(self, context: SpawnContext, channel: Channel) -> None:
+    def __init__(self, context: SpawnContext, channel: Channel, written: int) -> None:
         self._channel = channel
         ours, theirs = zip(*(context.Pipe() for _ in ENDS), strict=True)
         between = context.Pipe()
@@ -81,7 +83,7 @@ class Pair:
         units = host_units()
         cores = (units["gpu"].cores, units["dsp"].cores)
         self._processes = [
-            context.Process(target=end, args=(pipe, ack, channel, own), daemon=True)
+            context.Process(target=end, args=(pipe, ack, channel, own, written), daemon=True)
             for end, pipe, ack, own in zip((produce, consume), theirs, between, cores, strict=True)
         ]
         for process in self._processes:
@@ -113,23 +115,23 @@ class Pair:
         self._channel.close()
 
 
-def produce(pipe: Connection, ack: Connection, channel: Channel, cores: tuple[int, ...]) -> None:
+def produce(pipe: Connection, ack: Connection, channel: Channel, cores: tuple[int, ...], written: int) -> None:
     """The process that writes; answers each number of frames with the instants, in ns, at which they were written."""
     with _child(pipe, cores):
         end = channel.producer()
         pipe.send("ready")
         while True:
-            written = []
+            instants = []
             for frame in range(pipe.recv()):
                 time.sleep(PAUSE_S)
-                end.buffer()[:] = frame % 251
-                written.append(time.monotonic_ns())
+                end.buffer()[:written] = frame % 251
+                instants.append(time.monotonic_ns())
                 end.hand_over()
                 ack.recv_bytes()
-            pipe.send(written)
+            pipe.send(instants)
 
 
-def consume(pipe: Connection, ack: Connection, channel: Channel, cores: tuple[int, ...]) -> None:
+def consume(pipe: Connection, ack: Connection, channel: Channel, cores: tuple[int, ...], written: int) -> None:
     """The process that reads; answers with the instants at which the bytes could be and had been read."""
     with _child(pipe, cores):
         end = channel.consumer()
@@ -139,7 +141,7 @@ def consume(pipe: Connection, ack: Connection, channel: Channel, cores: tuple[in
             for frame in range(pipe.recv()):
                 payload = end.receive()
                 readable.append(time.monotonic_ns())
-                check_bytes(payload, frame % 251)
+                check_bytes(payload[:written], frame % 251)
                 read.append(time.monotonic_ns())
                 del payload
                 end.release()
@@ -179,7 +181,7 @@ def _pairs(stack: ExitStack, sizes: tuple[int, ...]) -> tuple[dict[tuple[str, in
             except ModuleNotFoundError as error:
                 absent[way] = f"{error.name} is not installed: pip install 'trilane[peers]'"
                 break
-            pairs[way, size] = Pair(context, channel)
+            pairs[way, size] = Pair(context, channel, WRITTEN.get(way, size * 1024))
             stack.callback(pairs[way, size].close)
     return pairs, absent
 
@@ -228,11 +230,11 @@ def _row(way: str, size: int, taken: Times) -> dict[str, Any]:
 
 def _verdicts(rows: list[dict[str, Any]], largest: int) -> dict[str, Any]:
     p50 = {(row["way"], row["kib"]): row["p50_us"] for row in rows}
-    ours = [row for row in rows if row["way"] in ("slot", PIPELINE) and row["kib"] == largest]
-    peers = sorted({way for way, _ in p50} - {"slot", PIPELINE})
+    ours = [row for row in rows if row["way"] in (SLOT, PIPELINE) and row["kib"] == largest]
+    peers = sorted({way for way, _ in p50} - {*OURS})
     sizes = sorted({size for _, size in p50})
     return {
         "met": {row["way"]: all(row[f"{key}_us"] <= limit for key, limit in LIMITS_US.items()) for row in ours},
-        "ahead": {peer: all(p50["slot", size] < p50[peer, size] for size in sizes) for peer in peers},
-        "p50_largest_over_smallest": {way: p50[way, sizes[-1]] / p50[way, sizes[0]] for way in ("slot", PIPELINE)},
+        "ahead": {peer: all(p50[SLOT, size] < p50[peer, size] for size in sizes) for peer in peers},
+        "p50_largest_over_smallest": {way: p50[way, sizes[-1]] / p50[way, sizes[0]] for way in OURS},
     }

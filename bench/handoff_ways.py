@@ -261,10 +261,15 @@ class _IceoryxConsumer:
         self._sample.delete()
 
 
-#: Way -> its channel. `slot` is Trilane's, one message from end to end.
+SLOT, BARE = "slot", "slot, 256 KiB of it written"
+#: Way -> its channel. `SLOT` is Trilane's, one message from end to end; `BARE` shows it without what writing does to
+#: the caches.
 CHANNELS: dict[str, Callable[[int, SpawnContext], Channel]] = {
-    "slot": SlotChannel,
+    SLOT: SlotChannel,
+    BARE: SlotChannel,
     "iceoryx2": IceoryxChannel,
     "zeromq copied": ZmqChannel,
     "pickled queue": QueueChannel,
 }
+#: Bytes that are written and read of each slot; the other ways: all of them.
+WRITTEN = {BARE: 256 * 1024}
