@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 
 #: Relative to the package's folder. Pure: they import nothing but each other and the standard library.
@@ -38,7 +39,8 @@ def library(package: Path) -> str:
 
 def form(package: Path = PACKAGE) -> str:
     """`compiled` or `interpreted`. Raises MissingPartError when what is compiled was made from other sources."""
-    if not list((package / MODULES[0]).parent.glob(f"{Path(MODULES[0]).stem}.*.so")):
+    stem = package / MODULES[0].removesuffix(".py")
+    if not any(stem.with_name(stem.name + suffix).exists() for suffix in EXTENSION_SUFFIXES):
         return "interpreted"
     if importlib.util.find_spec(f"{library(package)}__mypyc") is None:
         from trilane.errors import MissingPartError  # setup.py reads this file before there is a package

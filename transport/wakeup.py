@@ -51,13 +51,12 @@ def awake(wanted: bool = True) -> Iterator[str]:
     if not wanted:
         yield "sleep: the performance profile asks for no haste"
         return
-    try:
-        file = os.open(LATENCY_FILE, os.O_WRONLY | os.O_CLOEXEC)
-    except OSError as error:
-        yield f"sleep: {LATENCY_FILE}: {os.strerror(error.errno or 0).lower()}"
-        return
-    try:
-        os.write(file, struct.pack("=i", 0))
-        yield AWAKE
-    finally:
-        os.close(file)
+    with contextlib.ExitStack() as stack:
+        try:
+            file = os.open(LATENCY_FILE, os.O_WRONLY | os.O_CLOEXEC)
+            stack.callback(os.close, file)
+            os.write(file, struct.pack("=i", 0))
+            idle_cores = AWAKE
+        except OSError as error:
+            idle_cores = f"sleep: {LATENCY_FILE}: {os.strerror(error.errno or 0).lower()}"
+        yield idle_cores

@@ -90,3 +90,10 @@ def test_a_capped_pipeline_is_as_slow_as_its_duty(phone: Profile) -> None:
 def test_names_that_are_not_known_are_refused(phone: Profile, profile: str, governor: str | None) -> None:
     with pytest.raises(BadInputError, match="expected"):
         Governor(phone, profile, governor)
+
+
+@pytest.mark.parametrize(
+    ("name", "prompt"), [("sustained_high_performance", True), ("burst", True), ("balanced", False)]
+)
+def test_idle_cores_may_sleep_under_the_profiles_that_save_power(phone: Profile, name: str, prompt: bool) -> None:
+    assert Governor(phone, name).is_prompt is prompt
