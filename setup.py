@@ -1,4 +1,4 @@
-"""Compiles the modules that scheduler/compiled.py lists. Rule: without a C compiler the package is installed as Python.
+"""Compiles the modules that scheduler/compiled.py lists. Rule: where that fails the package is installed as Python.
 
 mypyc is asked only by the commands that build something; the others would wait for it in vain.
 """
@@ -21,7 +21,11 @@ def compiled_modules() -> list[Extension]:
         old.unlink()
     flags = ["--ignore-missing-imports", "--follow-imports=silent"]
     modules = [str(PACKAGE / name) for name in names["MODULES"]]
-    found = mypycify([*flags, *modules], opt_level="2", debug_level="0", group_name=names["library"](PACKAGE))
+    try:
+        found = mypycify([*flags, *modules], opt_level="2", debug_level="0", group_name=names["library"](PACKAGE))
+    except SystemExit:  # so it ends when this mypy finds something to say about the sources
+        print("mypyc cannot compile the scheduler (see above): it is installed as Python", file=sys.stderr)
+        return []
     for extension in found:
         extension.optional = True
     return found

@@ -76,6 +76,6 @@ if ! has_egl; then
     "sudo apt-get install --reinstall -y libegl1 libgl1-mesa-dri"
 fi
 if [ "$(.venv/bin/python -c 'from trilane.scheduler.compiled import form; print(form())')" = interpreted ]; then
-  say "no C compiler: the scheduler runs as Python, some three times slower in virtual time; to have it compiled:"
-  say "sudo apt-get install -y gcc python3-dev && make clean, then make again"
+  say "not compiled, for want of a C compiler: the scheduler runs as Python, some three times slower in virtual time"
+  say "to have it compiled: sudo apt-get install -y gcc python3-dev && make clean, then make again"
 fi
