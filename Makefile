@@ -5,7 +5,7 @@ SHELL := /bin/bash
 .PHONY: run test setup format compile interpreted clean
 
 BIN := .venv/bin
-COMPILED := $(shell sed -n 's/^    "\(.*\.py\)",$$/\1/p' scheduler/compiled.py)
+COMPILED := $(shell sed -n 's/^    "\(.*\.py\)",$$/\1/p' src/trilane/compiled.py)
 
 run: .venv/ready-run
 	$(BIN)/trilane run $(ARGS)
@@ -22,13 +22,17 @@ format: .venv/ready-test
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# The scheduler's core in C, where there is a C compiler; and back, to edit it without compiling each time.
+# The scheduler's core in C; or as Python until the next `make compile`, to edit it without compiling each time.
 compile: .venv/ready-test
+	rm -f .venv/interpreted
 	$(BIN)/python setup.py --quiet build_ext --inplace
+	@$(BIN)/python -c 'import sys; from trilane.compiled import form; sys.exit(form() != "compiled")' || \
+	  { echo "make compile: not compiled (see above); it takes a C compiler: sudo apt-get install -y gcc python3-dev"; exit 3; }
 	touch .venv/ready-core .venv/ready-run
 
-interpreted:
+interpreted: .venv/ready-run
 	rm -f src/*.so src/trilane/*/*.so
+	touch .venv/interpreted
 
 # The stamps are newer than what they depend on once the set-up is complete, so a second `make` starts at once.
 .venv/ready-run: scripts/setup.sh pyproject.toml setup.py $(COMPILED)
@@ -40,7 +44,8 @@ interpreted:
 	touch $@ .venv/ready-core .venv/ready-run
 
 .venv/ready-core: $(COMPILED) | .venv/ready-test
-	$(MAKE) compile
+	$(BIN)/python setup.py --quiet build_ext --inplace
+	touch $@ .venv/ready-run
 
 clean:
 	rm -rf .venv build dist src/*.so src/trilane/*/*.so

@@ -15,7 +15,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from trilane.scheduler.compiled import form
+from trilane.compiled import form
 
 #: Instructions that decide how fast INT8 and FP32 networks run; a network's speed means nothing without them.
 CPU_FLAGS = ("avx2", "fma", "f16c", "avx512f", "avx512_vnni", "avx_vnni", "avx512_bf16", "amx_int8", "sha_ni")

@@ -23,7 +23,6 @@ from trilane.transport.bus import BusFolder
 from trilane.transport.line import Line, line_pair
 from trilane.transport.memory import RegionLayout, create_region, map_region
 from trilane.transport.messages import RunJob
-from trilane.transport.wakeup import UNIT_NS, use_slice
 
 U8 = NDArray[np.uint8]
 SLOTS = 2
@@ -91,7 +90,6 @@ class SlotChannel:
 class _SlotEnd:
     def __init__(self, payloads: list[U8], line: Line) -> None:
         self._payloads, self._line, self._count = payloads, line, 0
-        use_slice(UNIT_NS)
 
     def buffer(self) -> U8:
         return self._payloads[self._count % SLOTS]

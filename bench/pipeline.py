@@ -53,7 +53,7 @@ def measure(
     frames: int = 60,
     turns: int = 9,
     runtime: str = "auto",
-    no_video: bool = False,
+    video: bool = True,
 ) -> dict[str, Any]:
     """Policies x edges x cores; give an option once for each value. `avatar`: `default`, a bundle's folder, or
     `resnet18`, the full-width network untrained (made once, with PyTorch). `cores`: how many the three units have, 0
@@ -62,12 +62,12 @@ def measure(
     Rows, medians over the turns: `frame_ms`, `fps`, `efficiency` (slowest unit alone / frame time), `slowest` and
     `alone_ms` (that unit's stages alone), `busiest` unit, its `idle` from its first job's begin to its last one's end
     and the causes: `starved` (no input), `undispatched` (input, but no free slot, or not told yet), `overhead` (told,
-    but not begun); `gain` over `sequential` in the same turn, `bound` sum(t) / max(t): what a frame of that sequential
-    run takes, each stage and the hand-over to it, over the slowest unit's stages alone beside this run; `gain_of_bound`
-    and the ends of its 95 % interval, `of_bound_low`, `of_bound_high` (of the median over the turns; with fewer than
-    six of them their least and largest). `hops_ms`: what the run takes for a frame beyond its stages.
+    but not begun); `gain` over `sequential` in the same turn, `bound` sum(t) / max(t): all stages alone beside this
+    run (`all_alone_ms`) and that sequential run's hand-overs, over the slowest unit's stages alone; `gain_of_bound` and
+    the ends of its 95 % interval, `of_bound_low`, `of_bound_high` (of the median over the turns; with fewer than
+    six of them their least and largest). `hops_ms`: what a sequential run takes for a frame beyond its stages.
     `dropped`, `lost`: frames of all turns. `accuracy`: what the avatar's pictures are worth.
-    `no_video`: present nothing. Raises BadInputError, MissingPartError, TrilaneError when a run fails.
+    `video`: or present nothing. Raises BadInputError, MissingPartError, TrilaneError when a run fails.
     """
     if frames < MIN_FRAMES or turns < 1:
         raise BadInputError("bench pipeline", f"--frames {frames}, --turns {turns}", f"at least {MIN_FRAMES} and 1")
@@ -76,7 +76,7 @@ def measure(
     rows: list[dict[str, Any]] = []
     accuracy: dict[str, Any] = {}
     for one_avatar, one_size, count in product(avatar, size, cores):
-        config, accuracy[one_avatar] = _config(one_avatar, one_size, count, frames, runtime, video=not no_video)
+        config, accuracy[one_avatar] = _config(one_avatar, one_size, count, frames, runtime, video=video)
         plans = [Setting(one_avatar, one_size, count, *pair) for pair in _plans(policy, edge)]
         taken: dict[Setting, list[dict[str, Any]]] = {plan: [] for plan in plans}
         for _ in range(turns):
@@ -86,7 +86,7 @@ def measure(
     return {
         "rows": rows,
         "accuracy": accuracy,
-        "config": {"frames": frames, "turns": turns, "runtime": config.runtime, "video": not no_video},
+        "config": {"frames": frames, "turns": turns, "runtime": config.runtime, "video": video},
     }
 
 
@@ -122,7 +122,7 @@ def _turn(config: RunConfig, plans: list[Setting]) -> Iterator[tuple[Setting, di
         row = _run(config, plan, base)
         base = base or row
         row["gain"] = base["frame_ms"] / row["frame_ms"]
-        row["bound"] = base["frame_ms"] / row["alone_ms"]
+        row["bound"] = (row["all_alone_ms"] + base["hops_ms"]) / row["alone_ms"]
         row["gain_of_bound"] = row["gain"] / row["bound"]
         yield plan, row
 
@@ -151,7 +151,8 @@ def _figures(result: RunResult) -> dict[str, Any]:
         "efficiency": report["efficiency"],
         "slowest": slowest,
         "alone_ms": alone[slowest],
-        "hops_ms": report["frame_time_ms"]["mean"] - stages_ms,
+        "all_alone_ms": sum(alone.values()),
+        "hops_ms": report["frame_time_ms"]["mean"] - stages_ms if report["policy"] == SEQUENTIAL else None,
         "busiest": busiest,
         **idle_between_jobs([job for job in result.jobs if job.unit == busiest]),
         "in_run_over_alone": _in_run(report, slowest) / alone[slowest],
@@ -195,6 +196,6 @@ def _summary(plan: Setting, turned: list[dict[str, Any]]) -> dict[str, Any]:
     for key in turned[0]:
         values = [each[key] for each in turned]
         pick: Callable[[list[Any]], Any] = sum if key in sums else median
-        row[key] = max(set(values), key=values.count) if key in names else pick(values)
+        row[key] = None if None in values else max(set(values), key=values.count) if key in names else pick(values)
     row["of_bound_low"], row["of_bound_high"] = median_interval([each["gain_of_bound"] for each in turned])
     return row

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from trilane.compiled import form
 from trilane.errors import BadInputError, TrilaneError
-from trilane.scheduler.compiled import form
 from trilane.scheduler.events import Graph, Settings, avatar_graph
 from trilane.scheduler.record import read, replay
 from trilane.scheduler.virtual import Service, VirtualDriver, simulate

@@ -1,5 +1,5 @@
 """Which job goes next: a pure core and its two drivers."""
 
-from trilane.scheduler.compiled import form
+from trilane.compiled import check
 
-form()
+check()

@@ -75,7 +75,7 @@ if ! has_egl; then
   has_egl || lacks "EGL and Mesa are installed, yet no OpenGL 3.3 context can be made; see: .venv/bin/trilane doctor" \
     "sudo apt-get install --reinstall -y libegl1 libgl1-mesa-dri"
 fi
-if [ "$(.venv/bin/python -c 'from trilane.scheduler.compiled import form; print(form())')" = interpreted ]; then
-  say "not compiled, for want of a C compiler: the scheduler runs as Python, some three times slower in virtual time"
-  say "to have it compiled: sudo apt-get install -y gcc python3-dev && make clean, then make again"
+if [ ! -e .venv/interpreted ] && [ "$(.venv/bin/python -c 'from trilane.compiled import form; print(form())')" = interpreted ]; then
+  say "not compiled, for want of a C compiler: the scheduler runs as Python, less than half as fast in virtual time"
+  say "to have it compiled: sudo apt-get install -y gcc python3-dev && make compile"
 fi

@@ -152,7 +152,7 @@ def _serve(unit: str, spec: UnitSpec, link: Link) -> int:
     while True:
         message = link.line.receive()
         if message is None:
-            if os.getppid() != spec.parent_pid:
+            if link.line.ended or os.getppid() != spec.parent_pid:
                 return 1
             with contextlib.suppress(zmq.Again):  # the scheduler is stopped: it will hear of us when it goes on
                 link.send(Alive())

@@ -48,7 +48,7 @@ class Line:
         except BlockingIOError:
             return None
         except ConnectionResetError:
-            size = 0
+            return self.receive()  # said once; what came before it can still be read
         self.ended = not size
         return unpack(self._buffer[:size]) if size else None
 

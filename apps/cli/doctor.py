@@ -114,17 +114,19 @@ def _wakeup() -> Check:
     """Not needed: a message reaches a core that sleeps some 50 us later."""
     from trilane.transport.wakeup import AWAKE, LATENCY_FILE, awake
 
-    install = f'setfacl -m "u:$USER:w" {LATENCY_FILE}'
+    install = f'apt-get install acl; setfacl -m "u:$USER:w" {LATENCY_FILE}'
     with awake() as idle_cores:
         return Check("idle cores", idle_cores, works=idle_cores == AWAKE, needed=False, install=install)
 
 
 def _core() -> Check:
-    """Not needed: interpreted, the same core is some three times slower in virtual time."""
-    from trilane.scheduler.compiled import form
+    """Not needed as long as it is not stale: interpreted, the same core is less than half as fast in virtual time."""
+    from trilane.compiled import MEND, STALE, form
 
     found = form()
-    install = "apt-get install gcc python3-dev, then install Trilane again"
+    if found == "stale":
+        return Check("scheduler core", STALE, works=False, install=MEND)
+    install = "make compile; it takes gcc and python3-dev. Without a checkout: install Trilane again"
     return Check("scheduler core", found, works=found == "compiled", needed=False, install=install)
 
 

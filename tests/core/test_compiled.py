@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from trilane.compiled import MODULES, check, form, library
 from trilane.errors import MissingPartError
-from trilane.scheduler.compiled import MODULES, form, library
 
 PACKAGE = Path(__file__).resolve().parents[2] / "src" / "trilane"
 #: Prints a digest of every step of runs under all policies and edges, with units that die.
@@ -56,7 +56,7 @@ def test_the_compiled_core_answers_as_its_sources_do(tmp_path: Path) -> None:
         pytest.skip("no compiled core here: it takes a C compiler when Trilane is installed")
     for folder in ("scheduler", "transport"):
         shutil.copytree(PACKAGE / folder, tmp_path / "trilane" / folder, ignore=shutil.ignore_patterns("*.so"))
-    for name in ("__init__.py", "errors.py"):
+    for name in ("__init__.py", "compiled.py", "errors.py"):
         shutil.copy(PACKAGE / name, tmp_path / "trilane")
     as_python, as_compiled = traces(tmp_path), traces(PACKAGE.parent)
     assert (as_python[0], as_compiled[0]) == ("False", "True")
@@ -78,5 +78,6 @@ def test_sources_that_changed_after_they_were_compiled_do_not_run(tmp_path: Path
     with (package / "transport" / "slots.py").open("a") as file:
         file.write("\n")
     assert library(package) != before
+    assert form(package) == "stale"
     with pytest.raises(MissingPartError, match="make compile"):
-        form(package)
+        check(package)

@@ -1,7 +1,7 @@
 """Which modules are compiled, and whether they are here. Rule: what runs is what the sources say, or nothing runs.
 
 mypyc turns the pure core into C while the package is installed (setup.py); without a C compiler the same files run as
-Python, some three times slower. The name of the compiled library holds a digest of the sources it was made from.
+Python, less than half as fast. The name of the compiled library holds a digest of the sources it was made from.
 """
 
 from __future__ import annotations
@@ -28,7 +28,9 @@ MODULES = (
     "transport/slots.py",
 )
 PREFIX = "trilane_core_"
-PACKAGE = Path(__file__).resolve().parents[1]
+STALE = "the scheduler's sources were changed after they were compiled"
+MEND = "make compile, or to run them as Python while you edit: make interpreted"
+PACKAGE = Path(__file__).resolve().parent
 
 
 def library(package: Path) -> str:
@@ -38,15 +40,16 @@ def library(package: Path) -> str:
 
 
 def form(package: Path = PACKAGE) -> str:
-    """`compiled` or `interpreted`. Raises MissingPartError when what is compiled was made from other sources."""
+    """`compiled`, `interpreted`, or `stale`: compiled, but from other sources than these."""
     stem = package / MODULES[0].removesuffix(".py")
     if not any(stem.with_name(stem.name + suffix).exists() for suffix in EXTENSION_SUFFIXES):
         return "interpreted"
-    if importlib.util.find_spec(f"{library(package)}__mypyc") is None:
+    return "stale" if importlib.util.find_spec(f"{library(package)}__mypyc") is None else "compiled"
+
+
+def check(package: Path = PACKAGE) -> None:
+    """Raises MissingPartError when what is compiled was made from other sources."""
+    if form(package) == "stale":
         from trilane.errors import MissingPartError  # setup.py reads this file before there is a package
 
-        raise MissingPartError(
-            "the scheduler's sources were changed after they were compiled",
-            "make compile, or to run them as Python while you edit: make interpreted",
-        )
-    return "compiled"
+        raise MissingPartError(STALE, MEND)
