@@ -68,8 +68,9 @@ class VirtualDriver:
         inputs: Iterable[tuple[int, Event]] = (),
         keep: bool = False,
     ) -> None:
-        """`faults`: (t_ns, unit) deaths. `inputs`: (t_ns, event) from outside, such as SetDuty or Stop.
-        `keep`: record steps and jobs. Raises ValueError for an unknown policy or edge."""
+        """All times are `int`, those of `service` too (no NumPy integers). `faults`: (t_ns, unit) deaths.
+        `inputs`: (t_ns, event) from outside, such as SetDuty or Stop. `keep`: record steps and jobs.
+        Raises ValueError for an unknown policy or edge."""
         self.core = Core(graph, settings)
         self.recording = Recording(graph, settings) if keep else None
         self.jobs: list[JobRecord] = []
