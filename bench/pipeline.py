@@ -67,7 +67,7 @@ def measure(
     the ends of its 95 % interval, `of_bound_low`, `of_bound_high` (of the median over the turns; with fewer than
     six of them their least and largest). `hops_ms`: what a sequential run takes for a frame beyond its stages.
     `dropped`, `lost`: frames of all turns. `accuracy`: what the avatar's pictures are worth.
-    `video`: or present nothing. Raises BadInputError, MissingPartError, TrilaneError when a run fails.
+    `video`: write one, or present nothing. Raises BadInputError, MissingPartError, TrilaneError when a run fails.
     """
     if frames < MIN_FRAMES or turns < 1:
         raise BadInputError("bench pipeline", f"--frames {frames}, --turns {turns}", f"at least {MIN_FRAMES} and 1")
