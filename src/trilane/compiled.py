@@ -11,7 +11,7 @@ import importlib.util
 from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 
-#: Relative to the package's folder. Pure: they import nothing but each other and the standard library.
+#: Relative to the package's folder. Pure: they import each other, trilane.errors and the standard library alone.
 MODULES = (
     "scheduler/core.py",
     "scheduler/events.py",

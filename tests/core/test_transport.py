@@ -184,6 +184,17 @@ def test_a_line_whose_end_is_gone_or_stopped_says_nothing() -> None:
     ours.close()
 
 
+def test_what_was_said_before_an_end_that_left_work_unread_is_heard() -> None:
+    """The kernel says first that the connection was reset."""
+    ours, theirs = (Line(end) for end in line_pair())
+    theirs.send(Done(1, 2, 3, 4, {}))
+    ours.send(RunJob(2, "infer", 0, 0, 0, 0))
+    theirs.close()
+    assert ours.receive() == Done(1, 2, 3, 4, {}) and not ours.ended
+    assert ours.receive() is None and ours.ended
+    ours.close()
+
+
 def test_a_line_refuses_what_is_no_message() -> None:
     end, other = line_pair()
     end.send(b"no message")
