@@ -44,14 +44,15 @@ def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 200, turns:
     """Rows: `way`, `kib`, `frames`, `p50_us` `p99_us` `max_us` until all bytes can be read, `read_p50_us` until all
     were read (every byte is, and checked).
 
-    `slot`: a slot of the pipeline's shared memory and the message that announces it, one process to another. `slot, 256
-    KiB of it written`: the same, without what filling all of it does to the caches. `slot through the scheduler`:
-    `slot` between the raster and infer stages of a real run, where the message goes to the scheduler's process, through its core, and on. Peers: `iceoryx2` with an event, `zeromq copied` frames, `pickled
-    queue` (multiprocessing.Queue). Each turn hands over `frames` times in each way and size; before each the consumer
-    waits at least 1 ms, as an idle unit does. `absent`: peers that are not installed. `met`: our two ways against
-    p50 <= 150 us and p99 <= 500 us at the largest size. `slower_us`: of each peer and size, what its p50 of a turn is
-    over that of `slot` in the same turn: the ends of the 95 % interval of the median over the turns (with fewer than
-    six of them the least and largest). `ahead`: of each peer, when that interval is above 0 at every size.
+    `slot`: a slot of the pipeline's shared memory and the message that announces it, one process to another. `slot,
+    256 KiB of it written`: the same, without what filling all of it does to the caches. `slot through the scheduler`:
+    `slot` between the raster and infer stages of a real run, where the message goes to the scheduler's process,
+    through its core, and on. Peers: `iceoryx2` with an event, `zeromq copied` frames, `pickled queue`
+    (multiprocessing.Queue). Each turn hands over `frames` times in each way and size; before each the consumer waits
+    at least 1 ms, as an idle unit does. `absent`: peers that are not installed. `met`: our two ways against p50 <= 150
+    us and p99 <= 500 us at the largest size. `slower_us`: of each peer and size, what its p50 of a turn is over that
+    of `slot` in the same turn: the ends of the 95 % interval of the median over the turns (with fewer than six of them
+    the least and largest). `ahead`: of each peer, when that interval is above 0 at every size.
     Raises BadInputError for other sizes than 256, 1024, 4096, 16384 KiB.
     """
     unknown = set(kib) - set(SIDES)
