@@ -11,6 +11,7 @@ import tempfile
 from collections.abc import Callable
 from multiprocessing.context import SpawnContext
 from multiprocessing.queues import Queue
+from multiprocessing.reduction import DupFd
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 
 from trilane.stages.contracts import SlotLayout
 from trilane.transport.bus import BusFolder
-from trilane.transport.line import Line, line_pair
+from trilane.transport.line import Line, LineEnd, line_pair
 from trilane.transport.memory import RegionLayout, create_region, map_region
 from trilane.transport.messages import RunJob
 
@@ -72,11 +73,18 @@ class SlotChannel:
         self._place = f"/proc/{os.getpid()}/fd/{self._fd}"
         self._ends = line_pair()
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_ends": [[DupFd(fd) for fd in end] for end in self._ends]}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        there, back = (LineEnd(*(fd.detach() for fd in end)) for end in state["_ends"])
+        self.__dict__.update(state, _ends=(there, back))
+
     def producer(self) -> Producer:
-        return _SlotEnd(self._slots(), Line(self._ends[0], WAIT_MS))
+        return _SlotEnd(self._slots(), Line(self._ends[0], waits=True))
 
     def consumer(self) -> Consumer:
-        return _SlotEnd(self._slots(), Line(self._ends[1], WAIT_MS))
+        return _SlotEnd(self._slots(), Line(self._ends[1], waits=True))
 
     def _slots(self) -> list[U8]:
         return [packet.payload for packet in map_region(os.open(self._place, os.O_RDWR), self._layout)]
@@ -96,7 +104,7 @@ class _SlotEnd:
 
     def hand_over(self) -> None:
         slot = self._count % SLOTS
-        self._line.send(RunJob(self._count, "infer", self._count, slot, slot, 0))
+        self._line.send(RunJob(self._count, 0, self._count, slot, slot, 0))
         self._count += 1
 
     def receive(self) -> U8:

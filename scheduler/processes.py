@@ -112,13 +112,15 @@ class UnitProcesses:
         spec = UnitSpec(
             parent_pid=os.getpid(),
             endpoint=folder.endpoint(unit),
-            line_fd=theirs.fileno(),
+            line=theirs,
             config=self._config,
             edges=edges,
             stages=stages,
         )
-        with theirs:
+        try:
             process = _Process(unit, self._spawn(unit, spec), link, folder)
+        finally:
+            theirs.close()
         self._live[unit] = process
         for kind, fd in process.sources.items():
             self._register(fd, kind, process)
@@ -205,7 +207,7 @@ class UnitProcesses:
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.PIPE,
-                pass_fds=[fd, spec.line_fd, *(edge.fd for edge in spec.edges.values())],
+                pass_fds=[fd, *spec.line, *(edge.fd for edge in spec.edges.values())],
                 env={**os.environ, **dict.fromkeys(THREAD_LIMITS, threads), "TRILANE_UNIT": unit},
                 process_group=0,
             )

@@ -44,6 +44,7 @@ from trilane.transport.messages import (
     Duration,
     Failed,
     Isolate,
+    Ping,
     Ready,
     RunJob,
 )
@@ -53,6 +54,7 @@ CLOSE_S = 30.0
 ISOLATE_LIMIT_S = 10.0  # frames measured alone: no more are begun after this
 REPEATS = 3
 PROGRESS_S = 0.1
+PING_NS = 500_000_000
 
 
 class UnitError(TrilaneError):
@@ -88,8 +90,14 @@ class RealtimeDriver:
         self._on_progress, self._on_message = on_progress, on_message
         self._alone: dict[str, list[float]] = defaultdict(list)
         self._open: dict[int, tuple[Job, int]] = {}
+        self._places = {
+            name: place
+            for unit in graph.units
+            for place, name in enumerate(stage.name for stage in graph.stages if stage.unit == unit)
+        }
         self._started_s: dict[str, float] = {}
         self._progress_s = 0.0
+        self._ping_ns = 0
         self._stop_told = False
         self._inlet, self._last = inlet, graph.stages[-1].name
         self._governor = governor
@@ -135,7 +143,8 @@ class RealtimeDriver:
     def _isolated(self, unit: str, positions: list[int], frame: int) -> list[int]:
         """The durations in ns of jobs of the unit's stages at `positions`, all handed to it at once."""
         for position in positions:
-            self._processes.send(unit, Isolate(self._graph.stages[position].name, frame, 0 if position else -1, 0))
+            place = self._places[self._graph.stages[position].name]
+            self._processes.send(unit, Isolate(place, frame, 0 if position else -1, 0))
         return self._durations(unit, len(positions))
 
     def measure_again(self, frames: list[int]) -> None:
@@ -198,11 +207,10 @@ class RealtimeDriver:
             events = self._wait(decision.next_deadline_ns)
 
     def _wait(self, deadline_ns: int | None) -> list[Event]:
-        timeout_ms = None
+        until_ns = min(self._ping_ns, NEVER if deadline_ns is None else deadline_ns)
         if self._governor is not None:
-            deadline_ns = min(deadline_ns or NEVER, self._governor.due_ns)
-        if deadline_ns is not None:
-            timeout_ms = max(0, -((time.monotonic_ns() - deadline_ns) // 1_000_000))
+            until_ns = min(until_ns, self._governor.due_ns)
+        timeout_ms = max(0, -((time.monotonic_ns() - until_ns) // 1_000_000))
         events = [event for heard in self._processes.listen(timeout_ms) if (event := self._event(heard)) is not None]
         if self._interrupts.count and not self._stop_told:
             self._stop_told = True
@@ -210,9 +218,19 @@ class RealtimeDriver:
             events.append(Stop())
         if self._inlet is not None:
             events += self._inlet.events()
-        if self._governor is not None and (now_ns := time.monotonic_ns()) >= self._governor.due_ns:
+        now_ns = time.monotonic_ns()
+        if self._governor is not None and now_ns >= self._governor.due_ns:
             events += self._governor.tick(now_ns, self.core.ledger.busy_ns)
+        if now_ns >= self._ping_ns:
+            self._ping(now_ns)
         return events
+
+    def _ping(self, now_ns: int) -> None:
+        """Units that work are heard of when their job ends; the others are asked."""
+        self._ping_ns = now_ns + PING_NS
+        for unit in self.core.units.values():
+            if unit.alive and not unit.queue:
+                self._processes.send(unit.name, Ping())
 
     def _event(self, heard: Heard) -> Event | None:
         unit, message = heard
@@ -254,7 +272,8 @@ class RealtimeDriver:
         if isinstance(action, Dispatch):
             job = action.job
             self._open[job.id] = (job, now_ns)
-            self._processes.send(job.unit, RunJob(job.id, job.stage, job.frame, job.slot_in, job.slot_out, job.epoch))
+            message = RunJob(job.id, self._places[job.stage], job.frame, job.slot_in, job.slot_out, job.epoch)
+            self._processes.send(job.unit, message)
         elif isinstance(action, Kill):
             self._say(f"unit {action.unit} did not answer in time and is restarted")
             self._processes.kill(action.unit)

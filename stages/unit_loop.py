@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import gc
 import os
-import socket
 import time
 import traceback
 from collections.abc import Mapping
@@ -25,11 +24,12 @@ from trilane.errors import TrilaneError, UnitLostError
 from trilane.scene.schema import RunConfig
 from trilane.stages.contracts import Packet, SlotLayout, Stage
 from trilane.transport.bus import LAST_WORDS_MS, Link, prompt_context
-from trilane.transport.line import Line
+from trilane.transport.line import Line, LineEnd
 from trilane.transport.memory import RegionLayout, map_region
 from trilane.transport.messages import (
     BUILDING,
     CLOSING,
+    MAX_TEXT,
     MEASURING,
     Alive,
     Close,
@@ -38,12 +38,12 @@ from trilane.transport.messages import (
     Duration,
     Failed,
     Isolate,
+    Ping,
     Ready,
     RunJob,
 )
 from trilane.transport.wakeup import UNIT_NS, use_slice
 
-BEAT_MS = 500
 WATCH_NS = 150_000  # of a hold: a sleep ends about this much late
 SCHEDULER = "cpu"  # the unit whose cores the scheduler shares
 INFERRING = "dsp"  # the unit whose own stages are those of the network
@@ -64,15 +64,15 @@ class EdgeSpec(BaseModel):
 
 
 class UnitSpec(BaseModel):
-    """What a unit's process is told. `line_fd` is inherited.
+    """What a unit's process is told. `line` is inherited.
 
-    `stages`: name to (input edge, output edge), each a key of `edges` or None.
+    `stages`: name to (input edge, output edge), each a key of `edges` or None; messages count them in this order.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     parent_pid: int
     endpoint: str
-    line_fd: int
+    line: LineEnd
     config: RunConfig
     edges: dict[str, EdgeSpec]
     stages: dict[str, tuple[str | None, str | None]]
@@ -81,8 +81,8 @@ class UnitSpec(BaseModel):
 class _BoundStage:
     """A stage with its slots and byte views of their headers. `pace_ns`: how long a job is held, at least."""
 
-    def __init__(self, stage: Stage, inputs: list[Packet], outputs: list[Packet], pace_ns: int) -> None:
-        self._pace_ns = pace_ns
+    def __init__(self, name: str, stage: Stage, inputs: list[Packet], outputs: list[Packet], pace_ns: int) -> None:
+        self.name, self._pace_ns = name, pace_ns
         self._stage, self._inputs, self._outputs = stage, inputs, outputs
         self._header_in = [_header_bytes(packet) for packet in inputs]
         self._header_out = [_header_bytes(packet) for packet in outputs]
@@ -131,7 +131,7 @@ def serve(unit: str, raw_spec: dict[str, Any]) -> int:
     """Build, then answer messages until Close; the process's exit code."""
     spec = UnitSpec.model_validate(raw_spec)
     context = prompt_context(spec.config.units[SCHEDULER].cores)
-    link = Link(context, Line(socket.socket(fileno=spec.line_fd), BEAT_MS), LAST_WORDS_MS)
+    link = Link(context, Line(spec.line, waits=True), LAST_WORDS_MS)
     use_slice(UNIT_NS)
     link.socket.connect(spec.endpoint)
     try:
@@ -151,20 +151,20 @@ def _serve(unit: str, spec: UnitSpec, link: Link) -> int:
     link.send(Ready(os.getpid()))
     while True:
         message = link.line.receive()
-        if message is None:
-            if link.line.ended or os.getppid() != spec.parent_pid:
-                return 1
+        if isinstance(message, RunJob):
+            _run_job(link, stages[message.stage], message)
+        elif isinstance(message, Ping):
             with contextlib.suppress(zmq.Again):  # the scheduler is stopped: it will hear of us when it goes on
                 link.send(Alive())
-        elif isinstance(message, RunJob):
-            _run_job(link, stages[message.stage], message)
         elif isinstance(message, Isolate):
             _isolate(link, stages[message.stage], message)
         elif isinstance(message, Close):
             return _close(unit, link, stages)
+        elif link.line.ended:
+            return 1
 
 
-def _build(unit: str, spec: UnitSpec) -> dict[str, _BoundStage]:
+def _build(unit: str, spec: UnitSpec) -> list[_BoundStage]:
     module = import_module(spec.config.fake.get(unit, f"trilane.stages.{unit}.unit"))
     stages: dict[str, Stage] = module.build(spec.config)
     if unit != INFERRING and unit in spec.config.infer_units:
@@ -174,15 +174,16 @@ def _build(unit: str, spec: UnitSpec) -> dict[str, _BoundStage]:
     if set(stages) != set(spec.stages):
         raise TypeError(f"built stages {sorted(stages)}, expected {sorted(spec.stages)}")
     packets = {name: map_region(edge.fd, edge.layout) for name, edge in spec.edges.items()}
-    return {
-        name: _BoundStage(
+    return [
+        _BoundStage(
+            name,
             stages[name],
             packets[source] if source else [],
             packets[sink] if sink else [],
             spec.config.pace_ns.get(name, 0),
         )
         for name, (source, sink) in spec.stages.items()
-    }
+    ]
 
 
 def _run_job(link: Link, stage: _BoundStage, job: RunJob) -> None:
@@ -192,7 +193,7 @@ def _run_job(link: Link, stage: _BoundStage, job: RunJob) -> None:
     except UnitLostError:
         raise
     except Exception as error:
-        _fail(link, job.id, f"stage {job.stage}, frame {job.frame}", error)
+        _fail(link, job.id, f"stage {stage.name}, frame {job.frame}", error)
         return
     end_ns = time.monotonic_ns()
     values = {name: float(value) for name, value in figures.items()}
@@ -204,18 +205,18 @@ def _isolate(link: Link, stage: _BoundStage, job: Isolate) -> None:
     try:
         stage.run(job.frame, job.slot_in, job.slot_out, 0)
     except Exception as error:
-        _fail(link, MEASURING, f"stage {job.stage}, frame {job.frame}", error)
+        _fail(link, MEASURING, f"stage {stage.name}, frame {job.frame}", error)
         return
     link.send(Duration(time.monotonic_ns() - begin_ns))
 
 
-def _close(unit: str, link: Link, stages: dict[str, _BoundStage]) -> int:
+def _close(unit: str, link: Link, stages: list[_BoundStage]) -> int:
     code = 0
-    for name, stage in stages.items():
+    for stage in stages:
         try:
             stage.close()
         except Exception as error:
-            code = _fail(link, CLOSING, f"unit {unit}, closing {name}", error)
+            code = _fail(link, CLOSING, f"unit {unit}, closing {stage.name}", error)
     link.send(Closed())
     return code
 
@@ -226,6 +227,6 @@ def _fail(link: Link, job_id: int, where: str, error: Exception) -> int:
     known = isinstance(error, TrilaneError)
     text = str(error) if known else f"{where}: {type(error).__name__}: {error}"
     code = error.exit_code if isinstance(error, TrilaneError) else 1
-    plain = text.encode(errors="replace").decode()  # a name of a file may hold what no text may
-    link.send(Failed(job_id, " ".join(plain.split())[:2000], code))
+    plain = " ".join(text.split()).encode(errors="replace")  # a name of a file may hold what no text may
+    link.send(Failed(job_id, code, plain[:MAX_TEXT].decode(errors="ignore")))
     return code

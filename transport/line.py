@@ -1,56 +1,77 @@
 """The line of a unit: work to it, and answers. Rule: one message is one wake-up, and no thread is between the ends.
 
-A pair of Unix sockets that keep messages apart. That a unit lives is said over the bus.
+Two pipes in packet mode (O_DIRECT of pipe(2)), which keep messages apart. That a unit lives is said over the bus.
 """
 
 from __future__ import annotations
 
-import socket
-import struct
+import fcntl
+import os
+from typing import NamedTuple
 
+from trilane.errors import TrilaneError
 from trilane.transport.messages import MAX_BYTES, Message, pack, unpack
 
+PACKETS = 64  # that a pipe holds, a page each; a unit has at most a few outstanding
 
-def line_pair() -> tuple[socket.socket, socket.socket]:
-    """Both ends, not inherited unless they are passed on."""
-    return socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+
+class LineEnd(NamedTuple):
+    """File descriptors, not inherited unless they are passed on."""
+
+    reads: int
+    writes: int
+
+    def close(self) -> None:
+        for fd in self:
+            os.close(fd)
+
+
+def line_pair() -> tuple[LineEnd, LineEnd]:
+    """Both ends. Raises TrilaneError when the user has no more memory for pipes."""
+    there, back = (os.pipe2(os.O_CLOEXEC | os.O_DIRECT) for _ in range(2))
+    ends = LineEnd(back[0], there[1]), LineEnd(there[0], back[1])
+    try:
+        for end in ends:
+            fcntl.fcntl(end.writes, fcntl.F_SETPIPE_SZ, PACKETS * os.sysconf("SC_PAGESIZE"))
+    except OSError as error:
+        for end in ends:
+            end.close()
+        limit = "/proc/sys/fs/pipe-user-pages-soft"
+        raise TrilaneError(f"no pipe of {PACKETS} messages: {error.strerror}; {limit} is the user's limit") from None
+    return ends
 
 
 class Line:
-    """One end. Messages arrive in order or not at all. `patience_ms`: how long `receive` waits; 0: not at all.
+    """One end. Messages arrive in order or not at all. `waits`: `receive` waits for a message.
 
     `ended`: the other end is gone, and all that it said was received.
     """
 
-    def __init__(self, end: socket.socket, patience_ms: int = 0) -> None:
+    def __init__(self, end: LineEnd, *, waits: bool = False) -> None:
         self.ended = False
-        self._buffer = memoryview(bytearray(MAX_BYTES))
-        self._socket = end
-        self._flags = 0 if patience_ms else socket.MSG_DONTWAIT
-        end.setblocking(True)
-        seconds, rest = divmod(patience_ms, 1000)
-        end.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("@ll", seconds, rest * 1000))
+        self._end = end
+        self._reads, self._writes = end
+        os.set_blocking(end.reads, waits)
+        os.set_blocking(end.writes, False)
 
     def fileno(self) -> int:
-        return self._socket.fileno()
+        return self._reads
 
     def send(self, message: Message) -> None:
         """To an end that is gone or has stopped reading: nothing, its end or its deadline tells."""
         try:
-            self._socket.send(pack(message), socket.MSG_DONTWAIT)
-        except (BlockingIOError, BrokenPipeError, ConnectionResetError):
+            os.write(self._writes, pack(message))
+        except (BlockingIOError, BrokenPipeError):
             return
 
     def receive(self) -> Message | None:
         """The next message, None when there is none or the other end is gone. Raises MessageError for anything else."""
         try:
-            size = self._socket.recv_into(self._buffer, 0, self._flags)
+            data = os.read(self._reads, MAX_BYTES)
         except BlockingIOError:
             return None
-        except ConnectionResetError:
-            return self.receive()  # said once; what came before it can still be read
-        self.ended = not size
-        return unpack(self._buffer[:size]) if size else None
+        self.ended = not data
+        return unpack(data) if data else None
 
     def close(self) -> None:
-        self._socket.close()
+        self._end.close()
