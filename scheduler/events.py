@@ -29,7 +29,7 @@ class UnitReady(NamedTuple):
 
 
 class JobDone(NamedTuple):
-    """`t_pose_ns`: when the frame's pose was sampled, as its header says."""
+    """`t_pose_ns`: when the frame's pose was sampled, as its header says; 0 but from the first stage."""
 
     unit: str
     job: int

@@ -11,8 +11,8 @@ import select
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
-from enum import Enum
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import NamedTuple
 
 import zmq
@@ -37,12 +37,6 @@ class Heard(NamedTuple):
     message: Message | None
 
 
-class _Kind(Enum):
-    """Of what becomes readable."""
-
-    LINE, BUS, STDERR, END, WAKE = range(5)
-
-
 class _Process:
     def __init__(self, unit: str, popen: subprocess.Popen[bytes], link: Link, folder: BusFolder) -> None:
         assert popen.stderr is not None
@@ -52,15 +46,6 @@ class _Process:
         self.tail = b""
         self.folder_open = True
         os.set_blocking(self.stderr.fileno(), False)
-
-    @property
-    def sources(self) -> dict[_Kind, int]:
-        return {
-            _Kind.LINE: self.link.line.fileno(),
-            _Kind.BUS: self.link.bus_fd,
-            _Kind.STDERR: self.stderr.fileno(),
-            _Kind.END: self.pidfd,
-        }
 
     def read_stderr(self) -> bool:
         """Keep the end of what was written; False when the pipe is closed."""
@@ -88,8 +73,9 @@ class UnitProcesses:
         self._config, self._edges, self._stages = config, edges, stages
         self._context = zmq.Context()
         self._poller = select.epoll()
-        self._sources: dict[int, tuple[_Kind, _Process | None]] = {}
+        self._reactions: dict[int, Callable[[], list[Heard]]] = {}
         self._live: dict[str, _Process] = {}
+        self._ended: list[_Process] = []
         self.last_words: dict[str, str] = {}
 
     @property
@@ -98,7 +84,7 @@ class UnitProcesses:
 
     def watch(self, fd: int) -> None:
         """Let `listen` return early when `fd` becomes readable."""
-        self._register(fd, _Kind.WAKE, None)
+        self._register(fd, partial(_swallow, fd))
 
     def start(self, unit: str) -> None:
         """A fresh process for the unit; `Ready` or `Failed` follows, or its end."""
@@ -122,8 +108,10 @@ class UnitProcesses:
         finally:
             theirs.close()
         self._live[unit] = process
-        for kind, fd in process.sources.items():
-            self._register(fd, kind, process)
+        self._register(link.line.fileno(), partial(self._work, process))
+        self._register(link.bus_fd, partial(self._life_signs, process))
+        self._register(process.stderr.fileno(), partial(self._stderr, process))
+        self._register(process.pidfd, partial(self._end, process))
 
     def connected(self, unit: str) -> None:
         """The unit has spoken: its socket needs no name any more."""
@@ -133,8 +121,7 @@ class UnitProcesses:
         """To a unit that is gone or does not read: nothing, its end or its deadline tells."""
         process = self._live.get(unit)
         if process is not None:
-            with contextlib.suppress(zmq.Again):
-                process.link.send(message)
+            process.link.line.send(message)
 
     def kill(self, unit: str) -> None:
         if unit in self._live:
@@ -143,20 +130,10 @@ class UnitProcesses:
     def listen(self, timeout_ms: int | None) -> list[Heard]:
         """What came within the time; at once when something waits. Messages of a unit come before its end."""
         heard: list[Heard] = []
-        ended = []
-        for source, _ in self._poller.poll(None if timeout_ms is None else timeout_ms / 1000):
-            kind, process = self._sources[source]
-            if process is None:
-                os.read(source, 64)
-            elif kind is _Kind.LINE:
-                heard += self._work(process)
-            elif kind is _Kind.BUS:
-                heard += self._life_signs(process)
-            elif kind is _Kind.END:
-                ended.append(process)
-            elif not process.read_stderr():
-                self._unregister(source)
-        for process in ended:
+        for fd, _ in self._poller.poll(None if timeout_ms is None else timeout_ms / 1000):
+            heard += self._reactions[fd]()
+        while self._ended:
+            process = self._ended.pop()
             while work := self._work(process):
                 heard += work
             heard += self._life_signs(process)
@@ -197,6 +174,15 @@ class UnitProcesses:
         except MessageError as error:
             raise _no_message(process, error) from None
 
+    def _stderr(self, process: _Process) -> list[Heard]:
+        if not process.read_stderr():
+            self._unregister(process.stderr.fileno())
+        return []
+
+    def _end(self, process: _Process) -> list[Heard]:
+        self._ended.append(process)
+        return []
+
     def _spawn(self, unit: str, spec: UnitSpec) -> subprocess.Popen[bytes]:
         fd = os.memfd_create(f"trilane:spec:{unit}", os.MFD_CLOEXEC)
         try:
@@ -218,21 +204,26 @@ class UnitProcesses:
         process.popen.wait()
         process.read_stderr()
         self.last_words[process.unit] = process.tail.decode(errors="replace").strip()
-        for source in process.sources.values():
-            self._unregister(source)
+        for fd in (process.link.line.fileno(), process.link.bus_fd, process.stderr.fileno(), process.pidfd):
+            self._unregister(fd)
         process.link.close()
         process.release_folder()
         os.close(process.pidfd)
         process.stderr.close()
         del self._live[process.unit]
 
-    def _register(self, source: int, kind: _Kind, process: _Process | None) -> None:
-        self._poller.register(source, select.EPOLLIN)
-        self._sources[source] = (kind, process)
+    def _register(self, fd: int, reaction: Callable[[], list[Heard]]) -> None:
+        self._poller.register(fd, select.EPOLLIN)
+        self._reactions[fd] = reaction
 
-    def _unregister(self, source: int) -> None:
-        if self._sources.pop(source, None) is not None:
-            self._poller.unregister(source)
+    def _unregister(self, fd: int) -> None:
+        if self._reactions.pop(fd, None) is not None:
+            self._poller.unregister(fd)
+
+
+def _swallow(fd: int) -> list[Heard]:
+    os.read(fd, 64)
+    return []
 
 
 def _no_message(process: _Process, error: MessageError) -> TrilaneError:

@@ -96,6 +96,7 @@ class RealtimeDriver:
             for place, name in enumerate(stage.name for stage in graph.stages if stage.unit == unit)
         }
         self._started_s: dict[str, float] = {}
+        self._unbooked: list[tuple[Job, int, int | None, Done]] = []
         self._progress_s = 0.0
         self._ping_ns = 0
         self._stop_told = False
@@ -197,6 +198,7 @@ class RealtimeDriver:
             decision = self.core.step(now_ns, tuple(events))
             for action in decision.actions:
                 self._perform(now_ns, action)
+            self._book()
             self.recording.steps.append((now_ns, tuple(events), decision.actions))
             if self.core.finished:
                 self._progress(final=True)
@@ -251,13 +253,20 @@ class RealtimeDriver:
     def _done(self, unit: str, message: Done) -> Event:
         job, dispatch_ns = self._open.pop(message.id)
         state = self.core.frames.get(job.frame)
-        if state is not None:
-            times = (state.ready_ns, dispatch_ns, message.t_begin_ns, message.t_end_ns)
-            self.jobs.append(JobRecord(job.stage, unit, job.frame, *times))
-            if self._inlet is not None and job.stage == self._last:
-                self._inlet.answered(job.frame)
-        self.figures[job.stage].update(message.figures)
+        self._unbooked.append((job, dispatch_ns, None if state is None else state.ready_ns, message))
         return JobDone(unit, message.id, message.t_begin_ns, message.t_end_ns, message.t_pose_ns)
+
+    def _book(self) -> None:
+        """Note what the ended jobs took, while the units are at the next."""
+        for job, dispatch_ns, ready_ns, done in self._unbooked:
+            if ready_ns is not None:
+                times = (ready_ns, dispatch_ns, done.t_begin_ns, done.t_end_ns)
+                self.jobs.append(JobRecord(job.stage, job.unit, job.frame, *times))
+                if self._inlet is not None and job.stage == self._last:
+                    self._inlet.answered(job.frame)
+            if done.figures:
+                self.figures[job.stage].update(done.figures)
+        self._unbooked.clear()
 
     def _failed(self, unit: str, message: Failed) -> Event | None:
         if self.failure is None:

@@ -6,7 +6,6 @@ its stage; the first stage of the chain has no input, so the loop itself stamps 
 
 from __future__ import annotations
 
-import contextlib
 import gc
 import os
 import time
@@ -16,7 +15,6 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
-import zmq
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
@@ -107,10 +105,8 @@ class _BoundStage:
         return self._stage.run(frame, slot_in if slot_in >= 0 else None, slot_out if slot_out >= 0 else None)
 
     def pose_ns(self, slot_in: int, slot_out: int) -> int:
-        """When the pose of the frame in the slots was sampled; 0 for a stage without slots."""
-        if slot_out >= 0:
-            return int(self._outputs[slot_out].pose["t_pose_ns"])
-        return int(self._inputs[slot_in].pose["t_pose_ns"]) if slot_in >= 0 else 0
+        """Of the chain's first stage: when the pose in its output slot was sampled; else 0."""
+        return int(self._outputs[slot_out].pose["t_pose_ns"]) if slot_in < 0 <= slot_out else 0
 
     def close(self) -> None:
         self._stage.close()
@@ -148,14 +144,13 @@ def _serve(unit: str, spec: UnitSpec, link: Link) -> int:
         return _fail(link, BUILDING, f"unit {unit}", error)
     gc.collect()
     gc.freeze()
-    link.send(Ready(os.getpid()))
+    link.sign(Ready(os.getpid()))
     while True:
         message = link.line.receive()
         if isinstance(message, RunJob):
             _run_job(link, stages[message.stage], message)
         elif isinstance(message, Ping):
-            with contextlib.suppress(zmq.Again):  # the scheduler is stopped: it will hear of us when it goes on
-                link.send(Alive())
+            link.sign(Alive())
         elif isinstance(message, Isolate):
             _isolate(link, stages[message.stage], message)
         elif isinstance(message, Close):
@@ -197,7 +192,7 @@ def _run_job(link: Link, stage: _BoundStage, job: RunJob) -> None:
         return
     end_ns = time.monotonic_ns()
     values = {name: float(value) for name, value in figures.items()}
-    link.send(Done(job.id, begin_ns, end_ns, stage.pose_ns(job.slot_in, job.slot_out), values))
+    link.line.send(Done(job.id, begin_ns, end_ns, stage.pose_ns(job.slot_in, job.slot_out), values))
 
 
 def _isolate(link: Link, stage: _BoundStage, job: Isolate) -> None:
@@ -207,7 +202,7 @@ def _isolate(link: Link, stage: _BoundStage, job: Isolate) -> None:
     except Exception as error:
         _fail(link, MEASURING, f"stage {stage.name}, frame {job.frame}", error)
         return
-    link.send(Duration(time.monotonic_ns() - begin_ns))
+    link.line.send(Duration(time.monotonic_ns() - begin_ns))
 
 
 def _close(unit: str, link: Link, stages: list[_BoundStage]) -> int:
@@ -217,7 +212,7 @@ def _close(unit: str, link: Link, stages: list[_BoundStage]) -> int:
             stage.close()
         except Exception as error:
             code = _fail(link, CLOSING, f"unit {unit}, closing {stage.name}", error)
-    link.send(Closed())
+    link.line.send(Closed())
     return code
 
 
@@ -228,5 +223,5 @@ def _fail(link: Link, job_id: int, where: str, error: Exception) -> int:
     text = str(error) if known else f"{where}: {type(error).__name__}: {error}"
     code = error.exit_code if isinstance(error, TrilaneError) else 1
     plain = " ".join(text.split()).encode(errors="replace")  # a name of a file may hold what no text may
-    link.send(Failed(job_id, code, plain[:MAX_TEXT].decode(errors="ignore")))
+    link.line.send(Failed(job_id, code, plain[:MAX_TEXT].decode(errors="ignore")))
     return code

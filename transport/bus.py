@@ -18,7 +18,7 @@ from typing import Self
 import zmq
 
 from trilane.transport.line import Line
-from trilane.transport.messages import LIFE_SIGNS, MAX_BYTES, Message, pack, unpack
+from trilane.transport.messages import MAX_BYTES, LifeSign, Message, pack, unpack
 from trilane.transport.wakeup import SHORTEST_NS, use_slice
 
 PREFIX = "trilane-"
@@ -96,12 +96,10 @@ class Link:
         """Readable when `bus_messages` is to be called: the bus may have something."""
         return self.socket.fileno()
 
-    def send(self, message: Message) -> None:
-        """Raises zmq.Again when the other end has stopped reading the bus."""
-        if isinstance(message, LIFE_SIGNS):
+    def sign(self, message: LifeSign) -> None:
+        """Over the bus; what has an order goes over the line. Nothing to an end that has stopped reading."""
+        with contextlib.suppress(zmq.Again):
             self.socket.send(pack(message), zmq.DONTWAIT)
-        else:
-            self.line.send(message)
 
     def bus_messages(self) -> list[Message]:
         """All that came over the bus since the last call. Raises MessageError for what is no message."""

@@ -1,7 +1,8 @@
 """What units and scheduler say to each other. Rule: a fixed list of messages with typed fields; anything else is
 refused, and never pickle.
 
-On the wire: a byte that names the message, its integers of 64 bits, and then, as msgpack, the one field that is none.
+On the wire: a byte that names the message, its integers of 64 bits, and then, as msgpack, the one field that is none
+and not empty.
 Whoever waits for a message has cold caches; what is all integers is read there in half the time that msgpack takes.
 """
 
@@ -86,10 +87,9 @@ class Closed(NamedTuple):
     """From a unit: the answer to Close."""
 
 
+LifeSign = Ready | Alive
 Message = RunJob | Isolate | Ping | Close | Ready | Done | Duration | Failed | Alive | Closed
 BUILDING, MEASURING, CLOSING = -1, -2, -3
-#: What goes over the bus; the rest goes over the line.
-LIFE_SIGNS = (Ready, Alive)
 
 _KINDS: tuple[Any, ...] = (RunJob, Isolate, Ping, Close, Ready, Done, Duration, Failed, Alive, Closed)
 _PACKER = msgpack.Packer()  # one for the process: making one costs more than packing
@@ -121,6 +121,8 @@ def pack(message: Message) -> bytes:
     fields: tuple[Any, ...] = message
     if rest is None:
         return code + integers.pack(*fields)
+    if not fields[-1]:
+        return code + integers.pack(*fields[:-1])
     packed: bytes = _PACKER.pack(fields[-1])
     if integers.size + len(packed) >= MAX_BYTES:
         raise MessageError(f"{type(message).__name__} of {len(packed)} bytes, expected less than {MAX_BYTES}")
@@ -137,7 +139,7 @@ def unpack(data: bytes | memoryview) -> Message:
         raise MessageError(f"{len(data)} bytes for {kind.__name__}, which takes {end}")
     fields = integers.unpack_from(data, 1)
     if rest is not None:
-        fields += (_unpack_rest(data[end:], rest),)
+        fields += (_unpack_rest(data[end:], rest) if len(data) > end else rest(),)
     message: Message = tuple.__new__(kind, fields)
     return message
 
