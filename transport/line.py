@@ -28,7 +28,7 @@ class LineEnd(NamedTuple):
 
 def line_pair() -> tuple[LineEnd, LineEnd]:
     """Both ends. Raises TrilaneError when the user has no more memory for pipes."""
-    there, back = (os.pipe2(os.O_CLOEXEC | os.O_DIRECT) for _ in range(2))
+    there, back = os.pipe2(os.O_CLOEXEC | os.O_DIRECT), os.pipe2(os.O_CLOEXEC | os.O_DIRECT)
     ends = LineEnd(back[0], there[1]), LineEnd(there[0], back[1])
     try:
         for end in ends:

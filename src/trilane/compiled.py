@@ -1,6 +1,6 @@
 """Which modules are compiled, and whether they are here. Rule: what runs is what the sources say, or nothing runs.
 
-mypyc turns the pure core into C while the package is installed (setup.py); without a C compiler the same files run as
+mypyc turns the core, and the line over which it is told and answers, into C while the package is installed (setup.py); without a C compiler the same files run as
 Python, less than half as fast. The name of the compiled library holds a digest of the sources it was made from.
 """
 
@@ -11,7 +11,7 @@ import importlib.util
 from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 
-#: Relative to the package's folder. Pure: they import each other, trilane.errors and the standard library alone.
+#: Relative to the package's folder. They import each other, trilane.errors, msgpack and the standard library alone.
 MODULES = (
     "scheduler/core.py",
     "scheduler/events.py",
@@ -25,6 +25,8 @@ MODULES = (
     "scheduler/state.py",
     "scheduler/stats.py",
     "scheduler/virtual.py",
+    "transport/line.py",
+    "transport/messages.py",
     "transport/slots.py",
 )
 PREFIX = "trilane_core_"
