@@ -9,11 +9,12 @@ from __future__ import annotations
 import importlib
 import inspect
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from trilane.apps.cli.bench_options import meaning
 from trilane.apps.cli.console import JsonOption, print_json, stderr_console, stdout_console, stdout_kept
 
 #: Bench: its module, and the line that `trilane bench --help` shows for it.
@@ -41,6 +42,7 @@ BENCHES = {
     "joints": ("trilane.bench.joints", "What the joint transforms of a frame cost."),
 }
 
+METAVARS: dict[type, str] = {int: "N", float: "X", str: "TEXT"}
 #: A table with more of them lies on its side.
 MOST_COLUMNS = 9
 
@@ -93,7 +95,7 @@ def bench_command(name: str) -> Any:
     def run(json: bool, **asked: Any) -> None:
         show(name, measure, asked, json)
 
-    asked = {p.name: (_type(p.default), p.default) for p in inspect.signature(measure).parameters.values()}
+    asked = {p.name: (_option(name, p), p.default) for p in inspect.signature(measure).parameters.values()}
     options = {"json": (JsonOption, False), **asked}
     described: Any = run
     described.__annotations__ = {option: kind for option, (kind, _) in options.items()}
@@ -108,9 +110,14 @@ def bench_command(name: str) -> Any:
     return typer.main.get_command(single)
 
 
-def _type(default: Any) -> Any:
+def _option(bench: str, parameter: inspect.Parameter) -> Any:
     """An option's type from its default; a sequence is asked for by giving the option once for each value."""
-    return list[type(default[0])] if isinstance(default, tuple) else type(default)  # type: ignore[misc]
+    default = parameter.default
+    several = isinstance(default, tuple)
+    kind = type(default[0] if several else default)
+    text = meaning(bench, parameter.name) + (" Once for each." if several else "")
+    about = typer.Option(help=text, metavar=None if kind is bool else METAVARS[kind])
+    return Annotated[list[kind] if several else kind, about]  # type: ignore[valid-type]
 
 
 def show(name: str, measure: Callable[..., Mapping[str, Any]], asked: Mapping[str, Any], as_json: bool) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import json
 import sys
 
@@ -9,6 +11,7 @@ import pytest
 
 from trilane.apps.cli import main as cli
 from trilane.apps.cli.bench import BENCHES, bench_command, flat
+from trilane.apps.cli.bench_options import MEANINGS, meaning
 
 
 def run_here(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
@@ -24,9 +27,20 @@ def test_help_lists_every_bench(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     assert all(name in text for name in BENCHES)
 
 
-@pytest.mark.parametrize("name", ["raster", "readback", "raster-oracle", "crop", "joints"])
-def test_options_are_the_parameters_of_measure(name: str) -> None:
-    assert "json" in {parameter.name for parameter in bench_command(name).params}
+def parameters(name: str) -> set[str]:
+    return set(inspect.signature(importlib.import_module(BENCHES[name][0]).measure).parameters)
+
+
+@pytest.mark.parametrize("name", BENCHES)
+def test_options_are_the_parameters_of_measure_and_each_has_a_line(name: str) -> None:
+    options = {option.name: option for option in bench_command(name).params}
+    assert set(options) == parameters(name) | {"json"}
+    assert all(options[parameter].help.startswith(meaning(name, parameter)) for parameter in parameters(name))
+
+
+def test_no_line_is_without_its_option() -> None:
+    spoken = {option for name in BENCHES for own in parameters(name) for option in (own, f"{name} {own}")}
+    assert set(MEANINGS) <= spoken
 
 
 def test_json_is_one_document_with_the_machine(
