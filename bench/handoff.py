@@ -55,13 +55,12 @@ def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 200, turns:
     the least and largest). `ahead`: of each peer, when that interval is above 0 at every size.
     Raises BadInputError for other sizes than 256, 1024, 4096, 16384 KiB.
     """
-    unknown = set(kib) - set(SIDES)
-    if unknown or frames < MIN_FRAMES or turns < 1:
-        raise BadInputError(
-            "bench handoff",
-            f"--kib {sorted(unknown or kib)}, --frames {frames}, --turns {turns}",
-            f"sizes of {sorted(SIDES)} KiB, at least {MIN_FRAMES} frames and 1 turn",
-        )
+    if unknown := set(kib) - set(SIDES):
+        raise BadInputError("--kib", str(min(unknown)), ", ".join(map(str, SIDES)))
+    if frames < MIN_FRAMES:
+        raise BadInputError("--frames", str(frames), f"at least {MIN_FRAMES}")
+    if turns < 1:
+        raise BadInputError("--turns", str(turns), "at least 1")
     times: dict[tuple[str, int], list[Times]] = {}
     with awake() as idle_cores, ExitStack() as stack:
         pairs, absent = _pairs(stack, kib)

@@ -24,7 +24,6 @@ LIMITS: dict[str, tuple[float, float]] = {
     "channels": (1, 16),
     "sizes": (1, 4096),
     "avatars": (1, 8),
-    "kib": (1, 1 << 20),
     "batch": (1, 64),
     "minutes": (0.01, 1440),
     "seconds": (0.05, 86_400),

@@ -26,7 +26,7 @@ MEANINGS = {
     "limit_ms": "Longest latency that counts as in time.",
     "margins": "Pixels of the tensor between two avatars.",
     "minutes": "Virtual minutes.",
-    "network": "An .onnx file or an avatar's bundle; without it one is made of --encoder, --norm and --width.",
+    "network": "An .onnx file or a bundle, at its own size; else one is made of --encoder, --norm, --width and --size.",
     "norm": "batch, instance or group.",
     "period": "Seconds between two of the rates that are written down.",
     "policy": "sequential, pipelined, latest or deadline.",
