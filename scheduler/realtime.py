@@ -98,7 +98,7 @@ class RealtimeDriver:
         self._started_s: dict[str, float] = {}
         self._unbooked: list[tuple[Job, int, int | None, Done]] = []
         self._progress_s = 0.0
-        self._ping_ns = 0
+        self._ping_ns, self._ping_every_ns = 0, min(PING_NS, settings.hang_ns // 3)
         self._stop_told = False
         self._inlet, self._last = inlet, graph.stages[-1].name
         self._governor = governor
@@ -224,15 +224,20 @@ class RealtimeDriver:
         if self._governor is not None and now_ns >= self._governor.due_ns:
             events += self._governor.tick(now_ns, self.core.ledger.busy_ns)
         if now_ns >= self._ping_ns:
-            self._ping(now_ns)
+            events += self._ping(now_ns)
         return events
 
-    def _ping(self, now_ns: int) -> None:
-        """Units that work are heard of when their job ends; the others are asked."""
-        self._ping_ns = now_ns + PING_NS
-        for unit in self.core.units.values():
-            if unit.alive and not unit.queue:
-                self._processes.send(unit.name, Ping())
+    def _ping(self, now_ns: int) -> list[Event]:
+        """Ask the units that do not work whether they live; the others are heard of when their job ends.
+
+        When this process itself was stopped, nobody was asked, and nobody's silence counts.
+        """
+        idle = [unit.name for unit in self.core.units.values() if unit.alive and not unit.queue]
+        for unit in idle:
+            self._processes.send(unit, Ping())
+        missed = now_ns - self._ping_ns > self._ping_every_ns
+        self._ping_ns = now_ns + self._ping_every_ns
+        return [Beat(unit) for unit in idle] if missed else []
 
     def _event(self, heard: Heard) -> Event | None:
         unit, message = heard

@@ -19,6 +19,7 @@ from trilane.apps.pace import Pace, compare
 from trilane.errors import BadInputError, TrilaneError
 from trilane.hw_profiles.load import load_runnable
 from trilane.scene.schema import RunConfig
+from trilane.scheduler.events import Beat
 from trilane.scheduler.governor import Governor
 from trilane.scheduler.record import replay
 from trilane.scheduler.result import RunResult
@@ -124,6 +125,25 @@ def test_a_stopped_unit_is_found_by_its_deadline(mock_config: Configure) -> None
     assert set(result.lost) == {"hung:dsp"}
     assert any("did not answer in time" in message for message in result.messages)
     check_accounts(result)
+
+
+def test_a_scheduler_that_was_stopped_blames_nobody(mock_config: Configure) -> None:
+    """Not the units that waited for it longer than they may be silent; some of them have nothing to do."""
+    stopped = When(10, lambda: time.sleep(1.0))
+    result = run_pipeline(mock_config(40, infer=10), isolate_frames=0, hang_ns=500_000_000, on_progress=stopped)
+    assert result.presented == 40
+    assert not any(row["restarts"] for row in result.report["units"].values())
+    check_accounts(result)
+
+
+def test_idle_units_are_asked_whether_they_live(mock_config: Configure) -> None:
+    """The CPU waits longer for its next job than a unit may be silent."""
+    config = mock_config(2, raster=300, infer=300, composite=300)
+    result = run_pipeline(config, policy="sequential", isolate_frames=0, hang_ns=500_000_000)
+    beats = [event for _, events, _ in result.recording.steps for event in events if isinstance(event, Beat)]
+    assert result.presented == 2
+    assert not any(row["restarts"] for row in result.report["units"].values())
+    assert any(beat.unit == "cpu" for beat in beats)
 
 
 def test_a_job_that_never_ends_ends_the_run_after_some_restarts(mock_config: Configure) -> None:
