@@ -81,9 +81,11 @@ class SlotChannel:
         self.__dict__.update(state, _ends=(there, back))
 
     def producer(self) -> Producer:
+        self._ends[1].close()
         return _SlotEnd(self._slots(), Line(self._ends[0], waits=True))
 
     def consumer(self) -> Consumer:
+        self._ends[0].close()
         return _SlotEnd(self._slots(), Line(self._ends[1], waits=True))
 
     def _slots(self) -> list[U8]:
@@ -112,6 +114,8 @@ class _SlotEnd:
             message = self._line.receive()
             if isinstance(message, RunJob):
                 return self._payloads[message.slot_in]
+            if self._line.ended:
+                raise EOFError
 
     def release(self) -> None:
         """The acknowledgement gives the slot back."""

@@ -19,6 +19,7 @@ from trilane.scheduler.events import (
     Job,
     JobDone,
     JobFailed,
+    Pinged,
     SetDuty,
     Settings,
     Stop,
@@ -65,6 +66,7 @@ class Core:
             JobDone: self._on_done,
             JobFailed: self._on_failed,
             UnitDied: self._on_died,
+            Pinged: self._on_pinged,
             Beat: self._on_beat,
             SetDuty: self._on_duty,
             Stop: self._on_stop,
@@ -93,6 +95,10 @@ class Core:
         """A unit's clock was set: this step's answer looks at all of them again."""
         self.alarm_ns = 0
 
+    def _set_alarm(self, at_ns: int) -> None:
+        if at_ns < self.alarm_ns:
+            self.alarm_ns = at_ns
+
     def finish(self, cause: str) -> None:
         self.finished = True
         self.ledger.close(self.now_ns)
@@ -107,7 +113,7 @@ class Core:
 
     def _on_ready(self, event: UnitReady) -> None:
         unit = self.units[event.unit]
-        unit.alive, unit.starting_ns, unit.heard_ns = True, None, self.now_ns
+        unit.alive, unit.starting_ns, unit.pinged_ns = True, None, 0
         unit.set_room(self.now_ns)
         self.reset_alarm()
         self.touch(unit)
@@ -122,7 +128,7 @@ class Core:
         if not unit.queue or unit.queue[0].id != job_id:
             return
         job = unit.queue.popleft()
-        unit.head_since_ns = unit.heard_ns = self.now_ns
+        unit.head_since_ns, unit.pinged_ns = self.now_ns, 0
         unit.failures = 0
         stage, frame = self.stage_named[job.stage], self.frames[job.frame]
         service_ns = end_ns - begin_ns
@@ -164,7 +170,7 @@ class Core:
         if not unit.queue or unit.queue[0].id != event.job:
             return
         job = unit.queue.popleft()
-        unit.head_since_ns = unit.heard_ns = self.now_ns
+        unit.head_since_ns, unit.pinged_ns = self.now_ns, 0
         faults.free_slots(self, job)
         self.lose(job.frame, f"failed:{job.stage}")
         self.touch(unit)
@@ -173,8 +179,12 @@ class Core:
     def _on_died(self, event: UnitDied) -> None:
         faults.on_died(self, self.units[event.unit])
 
+    def _on_pinged(self, event: Pinged) -> None:
+        self.units[event.unit].pinged_ns = self.now_ns
+        self._set_alarm(self.now_ns + self.settings.hang_ns)
+
     def _on_beat(self, event: Beat) -> None:
-        self.units[event.unit].heard_ns = self.now_ns
+        self.units[event.unit].pinged_ns = 0
 
     def _on_duty(self, event: SetDuty) -> None:
         unit = self.units[event.unit]
@@ -318,9 +328,7 @@ class Core:
         self._jobs += 1
         if not unit.queue:
             unit.head_since_ns = self.now_ns
-            hangs_ns = self.now_ns + self.settings.hang_ns
-            if hangs_ns < self.alarm_ns:
-                self.alarm_ns = hangs_ns
+            self._set_alarm(self.now_ns + self.settings.hang_ns)
         unit.queue.append(job)
         self.actions.append(Dispatch(job))
 

@@ -51,8 +51,14 @@ class UnitDied(NamedTuple):
     unit: str
 
 
+class Pinged(NamedTuple):
+    """A unit without work was asked whether it lives."""
+
+    unit: str
+
+
 class Beat(NamedTuple):
-    """A unit without work says that it lives."""
+    """The unit's answer."""
 
     unit: str
 
@@ -98,10 +104,10 @@ class Finish(NamedTuple):
     cause: str
 
 
-Event = UnitReady | JobDone | JobFailed | UnitDied | Beat | SetDuty | Stop | Ask
+Event = UnitReady | JobDone | JobFailed | UnitDied | Pinged | Beat | SetDuty | Stop | Ask
 Action = Dispatch | Kill | Start | Finish
 
-EVENTS = (UnitReady, JobDone, JobFailed, UnitDied, Beat, SetDuty, Stop, Ask)
+EVENTS = (UnitReady, JobDone, JobFailed, UnitDied, Pinged, Beat, SetDuty, Stop, Ask)
 ACTIONS = (Dispatch, Kill, Start, Finish)
 
 
@@ -157,8 +163,8 @@ class Settings:
     from the start, instead of a period. `asked`: frames are released by `Ask` alone. `deadline_ns`: a frame's time from
     release to presented. `in_flight`: frames between pose and presented. `in_queue`: released frames that may wait;
     more are turned away. `queue_timeout_ns`: longest wait there. `hang_ns`: longest that a job may take, or that an
-    idle unit may be silent when `beats` are expected. `latch_ns`: the first stage of a frame begins so late that it is
-    expected to end this long before the second can take it: the pose is newer, and waits less.
+    idle unit may leave a question unanswered. `latch_ns`: the first stage of a frame begins so late that it is expected
+    to end this long before the second can take it: the pose is newer, and waits less.
     """
 
     frames: int
@@ -173,5 +179,4 @@ class Settings:
     queue_timeout_ns: int = 0
     hang_ns: int = 10_000_000_000
     start_ns: int = 120_000_000_000
-    beats: bool = False
     max_failures: int = 5

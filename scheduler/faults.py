@@ -19,6 +19,7 @@ def on_died(core: Core, unit: UnitState) -> None:
     """Reclaim the unit's slots under a new epoch and plan its restart, or end the run when it fails too often."""
     cause = f"{'hung' if unit.killing else 'died'}:{unit.name}"
     unit.alive = unit.killing = False
+    unit.pinged_ns = 0
     unit.room = 0
     unit.starting_ns = None
     core.reset_alarm()
@@ -89,7 +90,7 @@ def check_clocks(core: Core) -> None:
 
 
 def next_alarm_ns(core: Core) -> int:
-    """When the first clock of a unit runs out: a restart, a hold, a lead, a job or a silence too long; else NEVER.
+    """When the first clock of a unit runs out: a restart, a hold, a lead, a job or an answer too late; else NEVER.
 
     No unit's clock can run out before, until one is set: ending a job and hearing from a unit only postpone it.
     """
@@ -116,4 +117,4 @@ def _hang_deadline(core: Core, unit: UnitState) -> int | None:
         return None
     if unit.queue:
         return unit.head_since_ns + core.settings.hang_ns
-    return unit.heard_ns + core.settings.hang_ns if core.settings.beats else None
+    return unit.pinged_ns + core.settings.hang_ns if unit.pinged_ns else None

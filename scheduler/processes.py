@@ -21,7 +21,7 @@ from trilane.errors import TrilaneError
 from trilane.scene.schema import RunConfig
 from trilane.stages.unit_loop import EdgeSpec, UnitSpec
 from trilane.transport.bus import BusFolder, Link
-from trilane.transport.line import Line, line_pair
+from trilane.transport.line import Line, LineEnd, line_pair
 from trilane.transport.messages import Message, MessageError
 
 TAIL_BYTES = 8192
@@ -76,6 +76,8 @@ class UnitProcesses:
         self._reactions: dict[int, Callable[[], list[Heard]]] = {}
         self._live: dict[str, _Process] = {}
         self._ended: list[_Process] = []
+        #: Stage -> its number among those of its unit, as messages have it.
+        self.places = {stage: place for own in stages.values() for place, stage in enumerate(own)}
         self.last_words: dict[str, str] = {}
 
     @property
@@ -87,26 +89,19 @@ class UnitProcesses:
         self._register(fd, partial(_swallow, fd))
 
     def start(self, unit: str) -> None:
-        """A fresh process for the unit; `Ready` or `Failed` follows, or its end."""
-        folder = BusFolder()
-        ours, theirs = line_pair()
-        link = Link(self._context, Line(ours))
-        link.socket.bind(folder.endpoint(unit))
-        stages = dict(self._stages[unit])
-        used = {edge for pair in stages.values() for edge in pair if edge is not None}
-        edges = {name: self._edges[name] for name in used}
-        spec = UnitSpec(
-            parent_pid=os.getpid(),
-            endpoint=folder.endpoint(unit),
-            line=theirs,
-            config=self._config,
-            edges=edges,
-            stages=stages,
-        )
-        try:
-            process = _Process(unit, self._spawn(unit, spec), link, folder)
-        finally:
-            theirs.close()
+        """A fresh process for the unit; `Ready` or `Failed` follows, or its end. Raises TrilaneError, OSError."""
+        with contextlib.ExitStack() as undo:
+            folder = BusFolder()
+            undo.callback(folder.remove)
+            ours, theirs = line_pair()
+            link = Link(self._context, Line(ours))
+            undo.callback(link.close)
+            with contextlib.closing(theirs):
+                link.socket.bind(folder.endpoint(unit))
+                popen = self._spawn(unit, self._spec(unit, folder, theirs))
+            undo.callback(_end, popen)
+            process = _Process(unit, popen, link, folder)
+            undo.pop_all()
         self._live[unit] = process
         self._register(link.line.fileno(), partial(self._work, process))
         self._register(link.bus_fd, partial(self._life_signs, process))
@@ -115,7 +110,8 @@ class UnitProcesses:
 
     def connected(self, unit: str) -> None:
         """The unit has spoken: its socket needs no name any more."""
-        self._live[unit].release_folder()
+        if unit in self._live:
+            self._live[unit].release_folder()
 
     def send(self, unit: str, message: Message) -> None:
         """To a unit that is gone or does not read: nothing, its end or its deadline tells."""
@@ -130,7 +126,8 @@ class UnitProcesses:
     def listen(self, timeout_ms: int | None) -> list[Heard]:
         """What came within the time; at once when something waits. Messages of a unit come before its end."""
         heard: list[Heard] = []
-        for fd, _ in self._poller.poll(None if timeout_ms is None else timeout_ms / 1000):
+        readable = self._poller.poll(None if timeout_ms is None else timeout_ms / 1000)
+        for fd, _ in readable or self._poller.poll(0):  # after a SIGSTOP the first one does not look again
             heard += self._reactions[fd]()
         while self._ended:
             process = self._ended.pop()
@@ -183,6 +180,18 @@ class UnitProcesses:
         self._ended.append(process)
         return []
 
+    def _spec(self, unit: str, folder: BusFolder, line: LineEnd) -> UnitSpec:
+        stages = dict(self._stages[unit])
+        used = {edge for pair in stages.values() for edge in pair if edge is not None}
+        return UnitSpec(
+            parent_pid=os.getpid(),
+            endpoint=folder.endpoint(unit),
+            line=line,
+            config=self._config,
+            edges={name: self._edges[name] for name in used},
+            stages=stages,
+        )
+
     def _spawn(self, unit: str, spec: UnitSpec) -> subprocess.Popen[bytes]:
         fd = os.memfd_create(f"trilane:spec:{unit}", os.MFD_CLOEXEC)
         try:
@@ -219,6 +228,11 @@ class UnitProcesses:
     def _unregister(self, fd: int) -> None:
         if self._reactions.pop(fd, None) is not None:
             self._poller.unregister(fd)
+
+
+def _end(popen: subprocess.Popen[bytes]) -> None:
+    popen.kill()
+    popen.communicate()
 
 
 def _swallow(fd: int) -> list[Heard]:

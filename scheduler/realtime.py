@@ -23,6 +23,7 @@ from trilane.scheduler.events import (
     JobDone,
     JobFailed,
     Kill,
+    Pinged,
     Settings,
     Start,
     Stop,
@@ -36,6 +37,7 @@ from trilane.scheduler.record import Recording
 from trilane.scheduler.result import Failure, JobRecord
 from trilane.scheduler.signals import Interrupts
 from trilane.scheduler.state import NEVER
+from trilane.transport.line import PACKETS
 from trilane.transport.messages import (
     Alive,
     Close,
@@ -55,6 +57,7 @@ ISOLATE_LIMIT_S = 10.0  # frames measured alone: no more are begun after this
 REPEATS = 3
 PROGRESS_S = 0.1
 PING_NS = 500_000_000
+AT_ONCE = PACKETS - 4  # the others are for what else may be under way
 
 
 class UnitError(TrilaneError):
@@ -90,15 +93,10 @@ class RealtimeDriver:
         self._on_progress, self._on_message = on_progress, on_message
         self._alone: dict[str, list[float]] = defaultdict(list)
         self._open: dict[int, tuple[Job, int]] = {}
-        self._places = {
-            name: place
-            for unit in graph.units
-            for place, name in enumerate(stage.name for stage in graph.stages if stage.unit == unit)
-        }
         self._started_s: dict[str, float] = {}
         self._unbooked: list[tuple[Job, int, int | None, Done]] = []
         self._progress_s = 0.0
-        self._ping_ns, self._ping_every_ns = 0, min(PING_NS, settings.hang_ns // 3)
+        self._ping_ns = 0
         self._stop_told = False
         self._inlet, self._last = inlet, graph.stages[-1].name
         self._governor = governor
@@ -126,7 +124,8 @@ class RealtimeDriver:
         """Note the service time of each stage but the last (it writes files), the other units quiet.
 
         Each of `frames` goes down the chain through the first slot of every edge; then each unit repeats its stages
-        in turn and without a pause, as it meets them in a pipelined run. Raises UnitError when a stage fails.
+        in turn and without a pause, as it meets them in a pipelined run; the first turn follows a pause and does not
+        count. Raises UnitError when a stage fails.
         """
         end = time.monotonic() + ISOLATE_LIMIT_S
         chain = self._graph.stages[:-1]
@@ -137,16 +136,20 @@ class RealtimeDriver:
                 self._isolated(stage.unit, [position], frame)
             for unit in self._graph.units:
                 own = [position for position, stage in enumerate(chain) if stage.unit == unit]
-                times = self._isolated(unit, own * REPEATS, frame)
+                times = self._isolated(unit, own * (1 + REPEATS), frame)[len(own) :]
                 for index, position in enumerate(own):
                     self._alone[chain[position].name].append(median(times[index :: len(own)]))
 
     def _isolated(self, unit: str, positions: list[int], frame: int) -> list[int]:
-        """The durations in ns of jobs of the unit's stages at `positions`, all handed to it at once."""
-        for position in positions:
-            place = self._places[self._graph.stages[position].name]
-            self._processes.send(unit, Isolate(place, frame, 0 if position else -1, 0))
-        return self._durations(unit, len(positions))
+        """The durations in ns of jobs of the unit's stages at `positions`, as many handed to it at once as it takes."""
+        found: list[int] = []
+        for first in range(0, len(positions), AT_ONCE):
+            several = positions[first : first + AT_ONCE]
+            for position in several:
+                place = self._processes.places[self._graph.stages[position].name]
+                self._processes.send(unit, Isolate(place, frame, 0 if position else -1, 0))
+            found += self._durations(unit, len(several))
+        return found
 
     def measure_again(self, frames: list[int]) -> None:
         """The same after the run, so that a machine that grew slower or faster weighs on both sides; what goes
@@ -228,16 +231,12 @@ class RealtimeDriver:
         return events
 
     def _ping(self, now_ns: int) -> list[Event]:
-        """Ask the units that do not work whether they live; the others are heard of when their job ends.
-
-        When this process itself was stopped, nobody was asked, and nobody's silence counts.
-        """
-        idle = [unit.name for unit in self.core.units.values() if unit.alive and not unit.queue]
-        for unit in idle:
+        """Ask the units that do not work whether they live; the others are heard of when their job ends."""
+        self._ping_ns = now_ns + PING_NS
+        asked = [unit.name for unit in self.core.units.values() if unit.alive and not unit.queue and not unit.pinged_ns]
+        for unit in asked:
             self._processes.send(unit, Ping())
-        missed = now_ns - self._ping_ns > self._ping_every_ns
-        self._ping_ns = now_ns + self._ping_every_ns
-        return [Beat(unit) for unit in idle] if missed else []
+        return [Pinged(unit) for unit in asked]
 
     def _event(self, heard: Heard) -> Event | None:
         unit, message = heard
@@ -259,6 +258,8 @@ class RealtimeDriver:
         job, dispatch_ns = self._open.pop(message.id)
         state = self.core.frames.get(job.frame)
         self._unbooked.append((job, dispatch_ns, None if state is None else state.ready_ns, message))
+        if state is not None and self._inlet is not None and job.stage == self._last:
+            self._inlet.answered(job.frame)
         return JobDone(unit, message.id, message.t_begin_ns, message.t_end_ns, message.t_pose_ns)
 
     def _book(self) -> None:
@@ -267,10 +268,7 @@ class RealtimeDriver:
             if ready_ns is not None:
                 times = (ready_ns, dispatch_ns, done.t_begin_ns, done.t_end_ns)
                 self.jobs.append(JobRecord(job.stage, job.unit, job.frame, *times))
-                if self._inlet is not None and job.stage == self._last:
-                    self._inlet.answered(job.frame)
-            if done.figures:
-                self.figures[job.stage].update(done.figures)
+            self.figures[job.stage].update(done.figures)
         self._unbooked.clear()
 
     def _failed(self, unit: str, message: Failed) -> Event | None:
@@ -286,7 +284,7 @@ class RealtimeDriver:
         if isinstance(action, Dispatch):
             job = action.job
             self._open[job.id] = (job, now_ns)
-            message = RunJob(job.id, self._places[job.stage], job.frame, job.slot_in, job.slot_out, job.epoch)
+            message = RunJob(job.id, self._processes.places[job.stage], job.frame, job.slot_in, job.slot_out, job.epoch)
             self._processes.send(job.unit, message)
         elif isinstance(action, Kill):
             self._say(f"unit {action.unit} did not answer in time and is restarted")

@@ -147,7 +147,6 @@ def _plan(
         period_ns=period_ns,
         deadline_ns=DEADLINE_PERIODS * period_ns,
         hang_ns=hang_ns,
-        beats=True,
     )
     return avatar_graph(edge, zip(config.infer_names, config.infer_units, strict=True)), settings
 

@@ -10,7 +10,10 @@ from typing import Any, Self
 
 
 class Interrupts:
-    """While entered from the main thread, counts the signals and makes `fd` readable; elsewhere does nothing."""
+    """While entered from the main thread, counts the signals and makes `fd` readable; elsewhere does nothing.
+
+    SIGPIPE is ignored meanwhile, as Python does: what is said to a unit that is gone must not end the program.
+    """
 
     def __init__(self) -> None:
         self.count = 0
@@ -23,6 +26,7 @@ class Interrupts:
             self._wakeup_before = signal.set_wakeup_fd(self._write_fd, warn_on_full_buffer=False)
             for number in (signal.SIGINT, signal.SIGTERM):
                 self._before[number] = signal.signal(number, self._count)
+            self._before[signal.SIGPIPE] = signal.signal(signal.SIGPIPE, signal.SIG_IGN)
         return self
 
     def __exit__(self, *_exc: object) -> None:

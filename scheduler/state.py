@@ -16,7 +16,8 @@ NEVER = 1 << 62  # ns
 class UnitState:
     """`queue`: the running job, then the held one. `head_since_ns`: since when the first of them could run.
 
-    `state`: the one that the ledger has it in. `room`: how many jobs it may have, see `set_room`.
+    `pinged_ns`: since when it was asked whether it lives, 0 when it has answered. `state`: the one that the ledger has
+    it in. `room`: how many jobs it may have, see `set_room`.
     """
 
     __slots__ = (
@@ -24,10 +25,10 @@ class UnitState:
         "duty",
         "failures",
         "head_since_ns",
-        "heard_ns",
         "hold_until_ns",
         "killing",
         "name",
+        "pinged_ns",
         "queue",
         "restart_at_ns",
         "room",
@@ -42,7 +43,7 @@ class UnitState:
         self.queue: deque[Job] = deque()
         self.alive = self.killing = False
         self.room = 0
-        self.head_since_ns = self.heard_ns = self.hold_until_ns = 0
+        self.head_since_ns = self.pinged_ns = self.hold_until_ns = 0
         self.restart_at_ns: int | None = None
         self.starting_ns: int | None = None
         self.failures = 0

@@ -36,6 +36,7 @@ from trilane.transport.messages import (
     Duration,
     Failed,
     Isolate,
+    MessageError,
     Ping,
     Ready,
     RunJob,
@@ -139,7 +140,7 @@ def serve(unit: str, raw_spec: dict[str, Any]) -> int:
 
 def _serve(unit: str, spec: UnitSpec, link: Link) -> int:
     try:
-        stages = _build(unit, spec)
+        stages = dict(enumerate(_build(unit, spec)))
     except Exception as error:
         return _fail(link, BUILDING, f"unit {unit}", error)
     gc.collect()
@@ -154,9 +155,11 @@ def _serve(unit: str, spec: UnitSpec, link: Link) -> int:
         elif isinstance(message, Isolate):
             _isolate(link, stages[message.stage], message)
         elif isinstance(message, Close):
-            return _close(unit, link, stages)
+            return _close(unit, link, list(stages.values()))
         elif link.line.ended:
             return 1
+        else:
+            raise MessageError(f"{message} is not for a unit")
 
 
 def _build(unit: str, spec: UnitSpec) -> list[_BoundStage]:
@@ -185,14 +188,13 @@ def _run_job(link: Link, stage: _BoundStage, job: RunJob) -> None:
     begin_ns = time.monotonic_ns()
     try:
         figures = stage.run(job.frame, job.slot_in, job.slot_out, job.epoch)
+        end_ns = time.monotonic_ns()
+        values = {name: float(value) for name, value in figures.items()}
+        link.line.send(Done(job.id, begin_ns, end_ns, stage.pose_ns(job.slot_in, job.slot_out), values))
     except UnitLostError:
         raise
     except Exception as error:
         _fail(link, job.id, f"stage {stage.name}, frame {job.frame}", error)
-        return
-    end_ns = time.monotonic_ns()
-    values = {name: float(value) for name, value in figures.items()}
-    link.line.send(Done(job.id, begin_ns, end_ns, stage.pose_ns(job.slot_in, job.slot_out), values))
 
 
 def _isolate(link: Link, stage: _BoundStage, job: Isolate) -> None:

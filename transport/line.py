@@ -5,6 +5,7 @@ Two pipes in packet mode (O_DIRECT of pipe(2)), which keep messages apart. That 
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 from typing import NamedTuple
@@ -12,7 +13,7 @@ from typing import NamedTuple
 from trilane.errors import TrilaneError
 from trilane.transport.messages import MAX_BYTES, Message, pack, unpack
 
-PACKETS = 64  # that a pipe holds, a page each; a unit has at most a few outstanding
+PACKETS = 16  # that a pipe holds: a page each, of the 64 KiB that Linux gives it; a unit has a few outstanding
 
 
 class LineEnd(NamedTuple):
@@ -27,18 +28,19 @@ class LineEnd(NamedTuple):
 
 
 def line_pair() -> tuple[LineEnd, LineEnd]:
-    """Both ends. Raises TrilaneError when the user has no more memory for pipes."""
-    there, back = os.pipe2(os.O_CLOEXEC | os.O_DIRECT), os.pipe2(os.O_CLOEXEC | os.O_DIRECT)
-    ends = LineEnd(back[0], there[1]), LineEnd(there[0], back[1])
+    """Both ends. Raises TrilaneError when this user or process has no more pipes."""
+    fds: list[int] = []
     try:
-        for end in ends:
-            fcntl.fcntl(end.writes, fcntl.F_SETPIPE_SZ, PACKETS * os.sysconf("SC_PAGESIZE"))
+        for _ in range(2):
+            fds += os.pipe2(os.O_CLOEXEC | os.O_DIRECT)
+            size = fcntl.fcntl(fds[-1], fcntl.F_GETPIPE_SZ)
+            if size < PACKETS * os.sysconf("SC_PAGESIZE"):
+                raise OSError(errno.EDQUOT, f"{size} bytes for a pipe, by /proc/sys/fs/pipe-user-pages-soft")
     except OSError as error:
-        for end in ends:
-            end.close()
-        limit = "/proc/sys/fs/pipe-user-pages-soft"
-        raise TrilaneError(f"no pipe of {PACKETS} messages: {error.strerror}; {limit} is the user's limit") from None
-    return ends
+        for fd in fds:
+            os.close(fd)
+        raise TrilaneError(f"no pipe for {PACKETS} messages: {error.strerror}") from None
+    return LineEnd(fds[2], fds[1]), LineEnd(fds[0], fds[3])
 
 
 class Line:

@@ -75,8 +75,20 @@ def test_what_are_no_figures_is_refused(figures: object) -> None:
         unpack(pack(Done(1, 2, 3, 4, {})) + msgpack.packb(figures))
 
 
-def test_a_message_too_large_is_not_packed() -> None:
-    assert len(pack(Failed(1, 1, "e" * MAX_TEXT))) <= MAX_BYTES
+def test_text_that_is_none_is_refused() -> None:
+    with pytest.raises(MessageError, match="expected str"):
+        unpack(pack(Failed(1, 2, "")) + msgpack.packb(1))
+
+
+def test_the_largest_message_passes_whole_and_a_larger_one_is_not_packed() -> None:
+    largest = Failed(1, 1, "e" * (MAX_BYTES - len(pack(Failed(1, 1, ""))) - 3))
+    ours, theirs = (Line(end) for end in line_pair())
+    ours.send(largest)
+    ours.send(Ping())
+    assert len(pack(largest)) == MAX_BYTES > MAX_TEXT
+    assert theirs.receive() == largest and theirs.receive() == Ping()
+    ours.close()
+    theirs.close()
     with pytest.raises(MessageError, match="less than 4096"):
         pack(Failed(1, 1, "e" * MAX_BYTES))
 
@@ -196,15 +208,30 @@ def test_what_was_said_before_an_end_that_left_work_unread_is_heard() -> None:
     ours.close()
 
 
-def test_a_user_without_memory_for_pipes_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object) -> None:
-        raise PermissionError(errno.EPERM, "Operation not permitted")
+def open_files() -> set[Path]:
+    return set(Path("/proc/self/fd").iterdir())
 
-    before = set(Path("/proc/self/fd").iterdir())
-    monkeypatch.setattr("fcntl.fcntl", refuse)
-    with pytest.raises(TrilaneError, match="pipe-user-pages-soft"):
+
+def test_a_user_without_memory_for_pipes_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = open_files()
+    monkeypatch.setattr("fcntl.fcntl", lambda *_: 4096)
+    with pytest.raises(TrilaneError, match=r"4096 bytes for a pipe, by .*pipe-user-pages-soft"):
         line_pair()
-    assert set(Path("/proc/self/fd").iterdir()) == before
+    assert open_files() == before
+
+
+def test_a_process_without_files_for_pipes_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    before, pipes = open_files(), iter([os.pipe2])
+
+    def pipe2(flags: int) -> tuple[int, int]:
+        for make in pipes:
+            return make(flags)
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr("os.pipe2", pipe2)
+    with pytest.raises(TrilaneError, match="Too many open files"):
+        line_pair()
+    assert open_files() == before
 
 
 def test_a_line_refuses_what_is_no_message() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
@@ -127,15 +128,6 @@ def test_a_stopped_unit_is_found_by_its_deadline(mock_config: Configure) -> None
     check_accounts(result)
 
 
-def test_a_scheduler_that_was_stopped_blames_nobody(mock_config: Configure) -> None:
-    """Not the units that waited for it longer than they may be silent; some of them have nothing to do."""
-    stopped = When(10, lambda: time.sleep(1.0))
-    result = run_pipeline(mock_config(40, infer=10), isolate_frames=0, hang_ns=500_000_000, on_progress=stopped)
-    assert result.presented == 40
-    assert not any(row["restarts"] for row in result.report["units"].values())
-    check_accounts(result)
-
-
 def test_idle_units_are_asked_whether_they_live(mock_config: Configure) -> None:
     """The CPU waits longer for its next job than a unit may be silent."""
     config = mock_config(2, raster=300, infer=300, composite=300)
@@ -248,18 +240,21 @@ from trilane.hw_profiles.host import host_units
 from trilane.scene.schema import RunConfig, Scene
 from trilane.scheduler.run import run_pipeline
 
-config = RunConfig(scene=Scene(frames=100000, size="64"), out_dir=Path(sys.argv[1]), avatar_dirs=(),
+config = RunConfig(scene=Scene(frames=int(sys.argv[2]), size="64"), out_dir=Path(sys.argv[1]), avatar_dirs=(),
                    units=host_units(), fake=dict.fromkeys(("cpu", "gpu", "dsp"), "trilane.stages.mock.unit"))
-run_pipeline(config, isolate_frames=0, on_progress=lambda done, _: print(done, flush=True))
-print("over", flush=True)
+result = run_pipeline(config, isolate_frames=0, hang_ns=int(float(sys.argv[3]) * 1e9),
+                      on_progress=lambda done, _: print(done, flush=True))
+print(f"over: {result.presented} presented, lost {result.lost}, {result.messages}", flush=True)
 """
+
+
+def script(folder: Path, frames: int, hang_s: float) -> list[str]:
+    return [sys.executable, "-c", SCRIPT, str(folder), str(frames), str(hang_s)]
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
 def test_nothing_outlives_the_parent(nothing_left: Path, tmp_path: Path, number: signal.Signals) -> None:
-    parent = subprocess.Popen(
-        [sys.executable, "-c", SCRIPT, str(tmp_path)], stdout=subprocess.PIPE, text=True, process_group=0
-    )
+    parent = subprocess.Popen(script(tmp_path, 100_000, 10), stdout=subprocess.PIPE, text=True, process_group=0)
     assert parent.stdout is not None
     while int(parent.stdout.readline()) < 20:
         pass
@@ -274,11 +269,56 @@ def test_nothing_outlives_the_parent(nothing_left: Path, tmp_path: Path, number:
     assert not [process for process in alive if process.status() != psutil.STATUS_ZOMBIE]
 
 
+def test_a_scheduler_that_was_stopped_blames_nobody(tmp_path: Path, mock_config: Configure) -> None:
+    """Not the units that waited for it longer than they may be silent, with a job done or with nothing to do."""
+    mock_config(infer=10)
+    parent = subprocess.Popen(script(tmp_path, 60, 0.5), stdout=subprocess.PIPE, text=True, process_group=0)
+    assert parent.stdout is not None
+    while int(parent.stdout.readline()) < 10:
+        pass
+    os.kill(parent.pid, signal.SIGSTOP)
+    time.sleep(1.2)
+    os.kill(parent.pid, signal.SIGCONT)
+    said = parent.stdout.read().splitlines()
+    parent.stdout.close()
+    assert parent.wait(10) == 0
+    assert said[-1] == "over: 60 presented, lost {}, ()"
+
+
+def test_units_that_cannot_be_started_leave_nothing(
+    nothing_left: Path, mock_config: Configure, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`nothing_left` looks for open files and folders."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOMEM, "Cannot allocate memory")
+
+    for part in ("subprocess.Popen", "os.pidfd_open", "trilane.scheduler.processes.line_pair"):
+        with monkeypatch.context() as patched, pytest.raises(OSError, match="Cannot allocate"):
+            patched.setattr(part, refuse)
+            run_pipeline(mock_config(3), isolate_frames=0)
+        assert not list(nothing_left.glob("trilane-*"))
+        assert not psutil.Process().children()
+
+
+def test_an_idle_unit_that_does_not_answer_is_restarted(
+    mock_config: Configure, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The DSP has no job while pose and raster work, and so loses none."""
+    monkeypatch.setattr("trilane.scheduler.realtime.PING_NS", 50_000_000)
+    stop = When(1, lambda: unit_process("dsp").suspend())
+    config = mock_config(3, pose=400, raster=400)
+    result = run_pipeline(config, policy="sequential", isolate_frames=0, hang_ns=600_000_000, on_progress=stop)
+    assert result.report["units"]["dsp"]["restarts"] == 1
+    assert any("dsp did not answer in time" in message for message in result.messages)
+    assert result.presented == 3 and not result.lost
+
+
 def test_a_parent_killed_while_it_starts_leaves_what_the_next_run_removes(
     nothing_left: Path, tmp_path: Path, mock_config: Configure
 ) -> None:
     mock_config()
-    parent = subprocess.Popen([sys.executable, "-c", SCRIPT, str(tmp_path)], stdout=subprocess.DEVNULL)
+    parent = subprocess.Popen(script(tmp_path, 100_000, 10), stdout=subprocess.DEVNULL)
     while not list(nothing_left.glob("trilane-*/*")):
         time.sleep(0.001)
     children = psutil.Process(parent.pid).children(recursive=True)
