@@ -130,8 +130,8 @@ def test_a_stopped_unit_is_found_by_its_deadline(mock_config: Configure) -> None
 
 def test_idle_units_are_asked_whether_they_live(mock_config: Configure) -> None:
     """The CPU waits longer for its next job than a unit may be silent."""
-    config = mock_config(2, raster=300, infer=300, composite=300)
-    result = run_pipeline(config, policy="sequential", isolate_frames=0, hang_ns=500_000_000)
+    config = mock_config(2, raster=400, infer=400, composite=400)
+    result = run_pipeline(config, policy="sequential", isolate_frames=0, hang_ns=700_000_000)
     beats = [event for _, events, _ in result.recording.steps for event in events if isinstance(event, Beat)]
     assert result.presented == 2
     assert not any(row["restarts"] for row in result.report["units"].values())
@@ -272,12 +272,12 @@ def test_nothing_outlives_the_parent(nothing_left: Path, tmp_path: Path, number:
 def test_a_scheduler_that_was_stopped_blames_nobody(tmp_path: Path, mock_config: Configure) -> None:
     """Not the units that waited for it longer than they may be silent, with a job done or with nothing to do."""
     mock_config(infer=10)
-    parent = subprocess.Popen(script(tmp_path, 60, 0.5), stdout=subprocess.PIPE, text=True, process_group=0)
+    parent = subprocess.Popen(script(tmp_path, 60, 1.0), stdout=subprocess.PIPE, text=True, process_group=0)
     assert parent.stdout is not None
     while int(parent.stdout.readline()) < 10:
         pass
     os.kill(parent.pid, signal.SIGSTOP)
-    time.sleep(1.2)
+    time.sleep(2.0)
     os.kill(parent.pid, signal.SIGCONT)
     said = parent.stdout.read().splitlines()
     parent.stdout.close()
@@ -307,8 +307,8 @@ def test_an_idle_unit_that_does_not_answer_is_restarted(
     """The DSP has no job while pose and raster work, and so loses none."""
     monkeypatch.setattr("trilane.scheduler.realtime.PING_NS", 50_000_000)
     stop = When(1, lambda: unit_process("dsp").suspend())
-    config = mock_config(3, pose=400, raster=400)
-    result = run_pipeline(config, policy="sequential", isolate_frames=0, hang_ns=600_000_000, on_progress=stop)
+    config = mock_config(3, pose=500, raster=500)
+    result = run_pipeline(config, policy="sequential", isolate_frames=0, hang_ns=850_000_000, on_progress=stop)
     assert result.report["units"]["dsp"]["restarts"] == 1
     assert any("dsp did not answer in time" in message for message in result.messages)
     assert result.presented == 3 and not result.lost
