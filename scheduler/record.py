@@ -22,7 +22,7 @@ from trilane.scheduler.events import (
     StageSpec,
 )
 
-SCHEMA = 1
+SCHEMA = 2
 _NAMED: dict[str, Any] = {kind.__name__: kind for kind in (*EVENTS, *ACTIONS)}
 
 
@@ -50,6 +50,8 @@ def read(path: Path) -> Recording:
     try:
         with path.open(encoding="utf-8") as file:
             header = json.loads(next(file, ""))
+            if header["schema"] != SCHEMA:
+                raise ValueError(f"schema {header['schema']!r}; this Trilane reads {SCHEMA}")
             recording = Recording(_graph(header["graph"]), Settings(**_tuples(header["settings"])))
             for number, line in enumerate(file, start=1):  # noqa: B007 - named in the message below
                 row = json.loads(line)

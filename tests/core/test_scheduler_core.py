@@ -12,7 +12,20 @@ import pytest
 import trilane.scheduler
 from trilane.errors import BadInputError
 from trilane.scheduler.core import Core
-from trilane.scheduler.events import Ask, Graph, SetDuty, Settings, StageSpec, Stop, avatar_graph
+from trilane.scheduler.events import (
+    Ask,
+    Beat,
+    Graph,
+    JobDone,
+    Kill,
+    Pinged,
+    SetDuty,
+    Settings,
+    StageSpec,
+    Stop,
+    UnitReady,
+    avatar_graph,
+)
 from trilane.scheduler.record import read, replay
 from trilane.scheduler.stats import energy_score
 from trilane.scheduler.virtual import Service, Simulation, simulate
@@ -224,6 +237,28 @@ def test_a_file_that_is_no_recording_is_named(tmp_path: Path, text: str) -> None
     path.write_text(text)
     with pytest.raises(BadInputError, match=r"events\.jsonl, line 1"):
         read(path)
+
+
+def test_a_recording_of_another_schema_is_not_replayed(tmp_path: Path) -> None:
+    path = tmp_path / "events.jsonl"
+    run("pipelined", keep=True).recording.write(path)
+    path.write_text(path.read_text().replace('"schema": 2', '"schema": 1', 1))
+    with pytest.raises(BadInputError, match=r"line 1: found schema 1; this Trilane reads 2"):
+        read(path)
+
+
+def test_only_a_question_that_nobody_answers_costs_an_idle_unit_its_life() -> None:
+    """The DSP and the CPU have nothing to do while the GPU's job runs; both are asked, one answers."""
+    core = Core(avatar_graph(), Settings(10, "sequential", hang_ns=100))
+    (pose,) = core.step(0, tuple(UnitReady(unit) for unit in ("cpu", "gpu", "dsp"))).actions
+    core.step(10, (JobDone("cpu", pose.job.id, 0, 10, 0),))
+    core.step(20, (Pinged("cpu"), Pinged("dsp")))
+    core.step(30, (Beat("cpu"), Beat("gpu")))
+    decision = core.step(109)
+    assert (decision.actions, decision.next_deadline_ns) == ((), 110)
+    assert core.step(110).actions == (Kill("gpu"),)
+    assert core.step(120).actions == (Kill("dsp"),)
+    assert core.step(100_000).actions == ()
 
 
 def test_settings_that_cannot_be_are_refused() -> None:
