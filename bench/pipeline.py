@@ -1,18 +1,18 @@
 """Does the pipeline keep its slowest unit busy, and what does that gain over one frame at a time?
 
-Rule: every run is paired with its stages alone, measured just before and after on the same cores, and with a
-`sequential` run beside it; configurations take turns, many and short, because a machine that is shared grows slower
-and faster within seconds, and a row is the median of its turns.
+Rule: every run is paired with its stages alone, measured just before and after on the same cores, and with the
+`sequential` runs before and after it; configurations take turns, many and short, because a machine that is shared
+grows slower and faster within seconds, and a row is the median of its turns.
 """
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
 from pathlib import Path
-from statistics import median
+from statistics import fmean, median
 from typing import Any
 
 from trilane.apps.configure import Request, configure
@@ -62,8 +62,8 @@ def measure(
     Rows, medians over the turns: `frame_ms`, `fps`, `efficiency` (slowest unit alone / frame time), `slowest` and
     `alone_ms` (that unit's stages alone), `busiest` unit, its `idle` from its first job's begin to its last one's end
     and the causes: `starved` (no input), `undispatched` (input, but no free slot, or not told yet), `overhead` (told,
-    but not begun); `gain` over `sequential` in the same turn, `bound` sum(t) / max(t): all stages alone beside this
-    run (`all_alone_ms`) and that sequential run's hand-overs, over the slowest unit's stages alone; `gain_of_bound` and
+    but not begun); `gain` over the mean of the `sequential` runs before and after, `bound` sum(t) / max(t): all stages
+    alone beside this run (`all_alone_ms`) and those runs' hand-overs, over the slowest unit's; `gain_of_bound` and
     the ends of its 95 % interval, `of_bound_low`, `of_bound_high` (of the median over the turns; with fewer than
     six of them their least and largest). `hops_ms`: what a sequential run takes for a frame beyond its stages.
     `dropped`, `lost`: frames of all turns. `accuracy`: what the avatar's pictures are worth.
@@ -78,11 +78,11 @@ def measure(
     for one_avatar, one_size, count in product(avatar, size, cores):
         config, accuracy[one_avatar] = _config(one_avatar, one_size, count, frames, runtime, video=video)
         plans = [Setting(one_avatar, one_size, count, *pair) for pair in _plans(policy, edge)]
-        taken: dict[Setting, list[dict[str, Any]]] = {plan: [] for plan in plans}
-        for _ in range(turns):
-            for plan, row in _turn(config, plans):
-                taken[plan].append(row)
-        rows += [_summary(plan, turned) for plan, turned in taken.items()]
+        taken = [_turn(config, plans) for _ in range(turns)]
+        closing = _run(config, plans[0])
+        for turn, after in zip(taken, [*(turn[0] for turn in taken[1:]), closing], strict=True):
+            _compare(turn, after)
+        rows += [_summary(plan, list(turned)) for plan, turned in zip(plans, zip(*taken, strict=True), strict=True)]
     return {
         "rows": rows,
         "accuracy": accuracy,
@@ -115,20 +115,23 @@ def _config(avatar: str, size: str, cores: int, frames: int, runtime: str, *, vi
     return checked.config.model_copy(update={"units": units, "record": video}), accuracy
 
 
-def _turn(config: RunConfig, plans: list[Setting]) -> Iterator[tuple[Setting, dict[str, Any]]]:
+def _turn(config: RunConfig, plans: list[Setting]) -> list[dict[str, Any]]:
     """One run of each; the `sequential` one says how much time the paced ones may take."""
-    base: dict[str, Any] = {}
-    for plan in plans:
-        row = _run(config, plan, base)
-        base = base or row
-        row["gain"] = base["frame_ms"] / row["frame_ms"]
-        row["bound"] = (row["all_alone_ms"] + base["hops_ms"]) / row["alone_ms"]
+    base = _run(config, plans[0])
+    return [base, *(_run(config, plan, base["alone_ms"]) for plan in plans[1:])]
+
+
+def _compare(turn: list[dict[str, Any]], after: dict[str, Any]) -> None:
+    """Set the runs of a turn, `sequential` first, against that one and the one `after` them; itself against itself."""
+    for place, row in enumerate(turn):
+        beside = (turn[0], after if place else turn[0])
+        row["gain"] = fmean(base["frame_ms"] for base in beside) / row["frame_ms"]
+        row["bound"] = (row["all_alone_ms"] + fmean(base["hops_ms"] for base in beside)) / row["alone_ms"]
         row["gain_of_bound"] = row["gain"] / row["bound"]
-        yield plan, row
 
 
-def _run(config: RunConfig, plan: Setting, base: dict[str, Any]) -> dict[str, Any]:
-    pace = PACE * 1e3 / base["alone_ms"] if policy_named(plan.policy).paced else None
+def _run(config: RunConfig, plan: Setting, alone_ms: float = 0.0) -> dict[str, Any]:
+    pace = PACE * 1e3 / alone_ms if policy_named(plan.policy).paced else None
     with tempfile.TemporaryDirectory(prefix="trilane-bench-") as folder:
         placed = config.model_copy(update={"out_dir": Path(folder)})
         result = run_pipeline(placed, policy=plan.policy, edge=plan.edge, pace_fps=pace, isolate_frames=ALONE)
