@@ -10,6 +10,7 @@ from trilane.scheduler import faults
 from trilane.scheduler.events import (
     Action,
     Ask,
+    Away,
     Beat,
     Decision,
     Dispatch,
@@ -68,6 +69,7 @@ class Core:
             UnitDied: self._on_died,
             Pinged: self._on_pinged,
             Beat: self._on_beat,
+            Away: self._on_away,
             SetDuty: self._on_duty,
             Stop: self._on_stop,
             Ask: self._on_ask,
@@ -185,6 +187,11 @@ class Core:
 
     def _on_beat(self, event: Beat) -> None:
         self.units[event.unit].pinged_ns = 0
+
+    def _on_away(self, event: Away) -> None:
+        for unit in self.units.values():
+            faults.forgive(unit, event.ns)
+        self.reset_alarm()
 
     def _on_duty(self, event: SetDuty) -> None:
         unit = self.units[event.unit]

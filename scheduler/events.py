@@ -63,6 +63,12 @@ class Beat(NamedTuple):
     unit: str
 
 
+class Away(NamedTuple):
+    """Whoever runs the core did nothing for `ns` since the last step: units have as much longer to answer."""
+
+    ns: int
+
+
 class SetDuty(NamedTuple):
     """From now on the unit may work `permille` thousandths of the time."""
 
@@ -104,10 +110,10 @@ class Finish(NamedTuple):
     cause: str
 
 
-Event = UnitReady | JobDone | JobFailed | UnitDied | Pinged | Beat | SetDuty | Stop | Ask
+Event = UnitReady | JobDone | JobFailed | UnitDied | Pinged | Beat | Away | SetDuty | Stop | Ask
 Action = Dispatch | Kill | Start | Finish
 
-EVENTS = (UnitReady, JobDone, JobFailed, UnitDied, Pinged, Beat, SetDuty, Stop, Ask)
+EVENTS = (UnitReady, JobDone, JobFailed, UnitDied, Pinged, Beat, Away, SetDuty, Stop, Ask)
 ACTIONS = (Dispatch, Kill, Start, Finish)
 
 

@@ -1,5 +1,5 @@
 """Units that die or hang. Rule: slots go back to their edge only after the unit's process is gone; what it was doing
-is lost and counted, what it only held is done again."""
+is lost and counted, what it only held is done again (a frame whose first stage it held is lost, too)."""
 
 from __future__ import annotations
 
@@ -87,6 +87,15 @@ def check_clocks(core: Core) -> None:
             core.touch(unit)
         if len(unit.queue) == 1 and core.policy.lead_ns is not None:
             core.touch(unit)
+
+
+def forgive(unit: UnitState, ns: int) -> None:
+    """Every clock that tells whether the unit hangs runs out so much later."""
+    unit.head_since_ns += ns
+    if unit.pinged_ns:
+        unit.pinged_ns += ns
+    if unit.starting_ns is not None:
+        unit.starting_ns += ns
 
 
 def next_alarm_ns(core: Core) -> int:

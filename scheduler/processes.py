@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import resource
 import select
 import subprocess
 import sys
@@ -28,6 +29,10 @@ TAIL_BYTES = 8192
 END_S = 2.0
 #: Libraries that make threads of their own read these; set before they are imported.
 THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+
+
+#: Files and sockets that a run holds open, with room for a unit that is restarted.
+LEAST_FILES = 96
 
 
 class Heard(NamedTuple):
@@ -126,8 +131,7 @@ class UnitProcesses:
     def listen(self, timeout_ms: int | None) -> list[Heard]:
         """What came within the time; at once when something waits. Messages of a unit come before its end."""
         heard: list[Heard] = []
-        readable = self._poller.poll(None if timeout_ms is None else timeout_ms / 1000)
-        for fd, _ in readable or self._poller.poll(0):  # after a SIGSTOP the first one does not look again
+        for fd, _ in self._poller.poll(None if timeout_ms is None else timeout_ms / 1000):
             heard += self._reactions[fd]()
         while self._ended:
             process = self._ended.pop()
@@ -228,6 +232,13 @@ class UnitProcesses:
     def _unregister(self, fd: int) -> None:
         if self._reactions.pop(fd, None) is not None:
             self._poller.unregister(fd)
+
+
+def check_open_files() -> None:
+    """Raises TrilaneError when this process may open too few files for a run."""
+    limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+    if limit != resource.RLIM_INFINITY and limit < LEAST_FILES:
+        raise TrilaneError(f"open files: found a limit of {limit}, expected at least {LEAST_FILES}: ulimit -n 1024")
 
 
 def _end(popen: subprocess.Popen[bytes]) -> None:

@@ -14,6 +14,7 @@ from trilane.errors import TrilaneError
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import (
     Action,
+    Away,
     Beat,
     Dispatch,
     Event,
@@ -57,6 +58,7 @@ ISOLATE_LIMIT_S = 10.0  # frames measured alone: no more are begun after this
 REPEATS = 3
 PROGRESS_S = 0.1
 PING_NS = 500_000_000
+LONGEST_TURN_NS = PING_NS + 250_000_000  # between two steps, unless this process was stopped
 AT_ONCE = PACKETS - 4  # the others are for what else may be under way
 
 
@@ -196,8 +198,12 @@ class RealtimeDriver:
             self._inlet.is_open.set()
         if self._governor is not None:
             events += self._governor.begin(time.monotonic_ns())
+        last_ns = time.monotonic_ns()
         while True:
             now_ns = time.monotonic_ns()
+            if now_ns - last_ns > LONGEST_TURN_NS:
+                events.insert(0, Away(now_ns - last_ns))
+            last_ns = now_ns
             decision = self.core.step(now_ns, tuple(events))
             for action in decision.actions:
                 self._perform(now_ns, action)

@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 from trilane.errors import BadInputError
 from trilane.scheduler.core import Core
@@ -23,7 +23,15 @@ from trilane.scheduler.events import (
 )
 
 SCHEMA = 2
-_NAMED: dict[str, Any] = {kind.__name__: kind for kind in (*EVENTS, *ACTIONS)}
+
+
+def _forms(kinds: tuple[Any, ...]) -> dict[str, tuple[Any, list[Any]]]:
+    """Name -> what is made of a row, and the types of its fields; those of a dispatch are its job's."""
+    shaped = {kind: Job if kind is Dispatch else kind for kind in kinds}
+    return {kind.__name__: (kind, list(get_type_hints(shape).values())) for kind, shape in shaped.items()}
+
+
+_EVENTS, _ACTIONS = _forms(EVENTS), _forms(ACTIONS)
 
 
 @dataclass
@@ -53,13 +61,17 @@ def read(path: Path) -> Recording:
             if header["schema"] != SCHEMA:
                 raise ValueError(f"schema {header['schema']!r}; this Trilane reads {SCHEMA}")
             recording = Recording(_graph(header["graph"]), Settings(**_tuples(header["settings"])))
+            Core(recording.graph, recording.settings)  # says what is wrong with them
             for number, line in enumerate(file, start=1):  # noqa: B007 - named in the message below
                 row = json.loads(line)
-                events = tuple(_parse(item) for item in row["events"])
-                recording.steps.append((row["t"], events, tuple(_parse(item) for item in row["actions"])))
+                now_ns = row["t"]
+                if type(now_ns) is not int or (recording.steps and now_ns < recording.steps[-1][0]):
+                    raise ValueError(f"time {now_ns!r}, expected ns that do not go back")
+                events = tuple(_parse(item, _EVENTS) for item in row["events"])
+                recording.steps.append((now_ns, events, tuple(_parse(item, _ACTIONS) for item in row["actions"])))
     except OSError as error:
         raise BadInputError(path, (error.strerror or str(error)).lower(), "a recorded run") from None
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise BadInputError(
             f"{path}, line {number + 1}", str(error) or type(error).__name__, "a recorded run"
         ) from None
@@ -67,10 +79,16 @@ def read(path: Path) -> Recording:
 
 
 def replay(recording: Recording) -> Iterator[str]:
-    """Feed the events to a fresh core; one sentence for every step that is answered differently."""
+    """Feed the events to a fresh core; one sentence for every step that is answered differently.
+
+    Raises BadInputError for events of units or frames that there are not.
+    """
     core = Core(recording.graph, recording.settings)
     for now_ns, events, actions in recording.steps:
-        answer = core.step(now_ns, events).actions
+        try:
+            answer = core.step(now_ns, events).actions
+        except KeyError as error:
+            raise BadInputError(f"the recording at {now_ns} ns", str(error), "a unit and a frame of the run") from None
         if answer != actions:
             yield f"at {now_ns} ns: recorded {actions}, replayed {answer}"
 
@@ -80,9 +98,15 @@ def _row(item: Any) -> list[Any]:
     return [type(item).__name__, *fields]
 
 
-def _parse(row: list[Any]) -> Any:
+def _parse(row: list[Any], forms: dict[str, tuple[Any, list[Any]]]) -> Any:
+    """Raises ValueError for a name or for types of fields that none of `forms` has."""
     name, *fields = row
-    return Dispatch(Job(*fields)) if name == "Dispatch" else _NAMED[name](*fields)
+    if name not in forms:
+        raise ValueError(f"{str(name)[:80]!r}, expected one of {', '.join(forms)}")
+    kind, types = forms[name]
+    if [type(field) for field in fields] != types:
+        raise ValueError(f"{str(row)[:80]}, expected fields of {', '.join(each.__name__ for each in types)}")
+    return Dispatch(Job(*fields)) if kind is Dispatch else kind(*fields)
 
 
 def _graph(data: dict[str, Any]) -> Graph:

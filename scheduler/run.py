@@ -16,7 +16,7 @@ from trilane.scheduler.events import Graph, Settings, avatar_graph
 from trilane.scheduler.governor import Governor
 from trilane.scheduler.inlet import Inlet
 from trilane.scheduler.policy import policy_named
-from trilane.scheduler.processes import UnitProcesses
+from trilane.scheduler.processes import UnitProcesses, check_open_files
 from trilane.scheduler.realtime import RealtimeDriver
 from trilane.scheduler.result import RunResult
 from trilane.scheduler.signals import Interrupts
@@ -65,6 +65,7 @@ def run_pipeline(
     Raises BadInputError for an unknown policy or edge, TrilaneError (with the exit code of the unit's error) when a
     unit cannot start; a failure after that is `RunResult.failure`.
     """
+    check_open_files()
     graph, settings = _plan(config, policy, edge, frames or config.scene.frames, pace_fps, hang_ns)
     settings = replace(settings, asked=inlet is not None, latch_ns=round(latch_ms * 1e6))
     with (

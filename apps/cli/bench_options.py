@@ -12,7 +12,7 @@ MEANINGS = {
     "batch": "Pictures inferred at once.",
     "channels": "Of the neural texture: 4, 8, 12 or 16.",
     "cores": "How many the three units have; 0: all.",
-    "edge": "Rule of the edges: single, double, triple, fifo:N or orphan.",
+    "edge": "Rule of the edges: single, double, triple, fifo:N, orphan or orphan:N.",
     "encoder": "resnet18, mobilenetv2, mobilenetv3 or efficientnet-lite0.",
     "events": "A run's folder or its events.jsonl, to be replayed.",
     "fault": "kill (SIGKILL at random moments) or stop (SIGSTOP once).",

@@ -14,6 +14,7 @@ from trilane.errors import BadInputError
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import (
     Ask,
+    Away,
     Beat,
     Graph,
     JobDone,
@@ -23,6 +24,7 @@ from trilane.scheduler.events import (
     Settings,
     StageSpec,
     Stop,
+    UnitDied,
     UnitReady,
     avatar_graph,
 )
@@ -245,6 +247,45 @@ def test_a_recording_of_another_schema_is_not_replayed(tmp_path: Path) -> None:
     path.write_text(path.read_text().replace('"schema": 2', '"schema": 1', 1))
     with pytest.raises(BadInputError, match=r"line 1: found schema 1; this Trilane reads 2"):
         read(path)
+
+
+@pytest.mark.parametrize(
+    ("row", "said"),
+    [
+        ('{"t": "abc", "events": [], "actions": []}', "time 'abc'"),
+        ('{"t": -1, "events": [], "actions": []}', "time -1"),
+        ('{"t": 9e9, "events": [["Kill", "dsp"]], "actions": []}', "time"),
+        ('{"t": 9000000000000, "events": [["Kill", "dsp"]], "actions": []}', "'Kill', expected one of UnitReady"),
+        ('{"t": 9000000000000, "events": [["UnitDied", 1]], "actions": []}', "expected fields of str"),
+        ('{"t": 9000000000000, "events": [], "actions": [["Kill"]]}', "expected fields of str"),
+        ("[" * 100_000, "line 4"),
+        ('{"t": 9', "line 4"),
+    ],
+)
+def test_a_line_that_is_no_step_is_named(tmp_path: Path, row: str, said: str) -> None:
+    path = tmp_path / "events.jsonl"
+    run("pipelined", keep=True).recording.write(path)
+    path.write_text("\n".join([*path.read_text().splitlines()[:3], row]))
+    with pytest.raises(BadInputError, match=r"events\.jsonl, line 4") as refused:
+        read(path)
+    assert said in str(refused.value)
+
+
+def test_events_of_a_unit_that_there_is_not_are_not_replayed() -> None:
+    recording = run("pipelined", keep=True).recording
+    now_ns, _, actions = recording.steps[5]
+    recording.steps[5] = (now_ns, (UnitDied("npu"),), actions)
+    with pytest.raises(BadInputError, match="npu"):
+        list(replay(recording))
+
+
+def test_a_core_that_was_left_alone_gives_its_units_as_much_longer() -> None:
+    core = Core(avatar_graph(), Settings(10, "sequential", hang_ns=100))
+    core.step(0, tuple(UnitReady(unit) for unit in ("cpu", "gpu", "dsp")))
+    core.step(10, (Pinged("dsp"),))
+    assert core.step(1050, (Away(1000),)).actions == ()
+    assert core.step(1100).actions == (Kill("cpu"),)
+    assert core.step(1110).actions == (Kill("dsp"),)
 
 
 def test_only_a_question_that_nobody_answers_costs_an_idle_unit_its_life() -> None:

@@ -300,6 +300,12 @@ def test_units_that_cannot_be_started_leave_nothing(
         assert not list(nothing_left.glob("trilane-*"))
 
 
+def test_a_run_that_may_open_too_few_files_says_so(mock_config: Configure, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("resource.getrlimit", lambda _: (40, 4096))
+    with pytest.raises(TrilaneError, match="found a limit of 40, expected at least 96"):
+        run_pipeline(mock_config(3), isolate_frames=0)
+
+
 def test_an_idle_unit_that_does_not_answer_is_restarted(
     mock_config: Configure, monkeypatch: pytest.MonkeyPatch
 ) -> None:
