@@ -29,8 +29,6 @@ TAIL_BYTES = 8192
 END_S = 2.0
 #: Libraries that make threads of their own read these; set before they are imported.
 THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
-
-
 #: Files and sockets that a run holds open, with room for a unit that is restarted.
 LEAST_FILES = 96
 
@@ -104,7 +102,7 @@ class UnitProcesses:
             with contextlib.closing(theirs):
                 link.socket.bind(folder.endpoint(unit))
                 popen = self._spawn(unit, self._spec(unit, folder, theirs))
-            undo.callback(_end, popen)
+            undo.callback(_end_now, popen)
             process = _Process(unit, popen, link, folder)
             undo.pop_all()
         self._live[unit] = process
@@ -128,10 +126,10 @@ class UnitProcesses:
         if unit in self._live:
             self._live[unit].popen.kill()
 
-    def listen(self, timeout_ms: int | None) -> list[Heard]:
+    def listen(self, timeout_ms: int) -> list[Heard]:
         """What came within the time; at once when something waits. Messages of a unit come before its end."""
         heard: list[Heard] = []
-        for fd, _ in self._poller.poll(None if timeout_ms is None else timeout_ms / 1000):
+        for fd, _ in self._poller.poll(timeout_ms / 1000):
             heard += self._reactions[fd]()
         while self._ended:
             process = self._ended.pop()
@@ -241,7 +239,7 @@ def check_open_files() -> None:
         raise TrilaneError(f"open files: found a limit of {limit}, expected at least {LEAST_FILES}: ulimit -n 1024")
 
 
-def _end(popen: subprocess.Popen[bytes]) -> None:
+def _end_now(popen: subprocess.Popen[bytes]) -> None:
     popen.kill()
     popen.communicate()
 

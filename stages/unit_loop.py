@@ -10,7 +10,7 @@ import gc
 import os
 import time
 import traceback
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from importlib import import_module
 from typing import Any
 
@@ -155,7 +155,7 @@ def _serve(unit: str, spec: UnitSpec, link: Link) -> int:
         elif isinstance(message, Isolate):
             _isolate(link, stages[message.stage], message)
         elif isinstance(message, Close):
-            return _close(unit, link, list(stages.values()))
+            return _close(unit, link, stages.values())
         elif link.line.ended:
             return 1
         else:
@@ -207,7 +207,7 @@ def _isolate(link: Link, stage: _BoundStage, job: Isolate) -> None:
     link.line.send(Duration(time.monotonic_ns() - begin_ns))
 
 
-def _close(unit: str, link: Link, stages: list[_BoundStage]) -> int:
+def _close(unit: str, link: Link, stages: Iterable[_BoundStage]) -> int:
     code = 0
     for stage in stages:
         try:
