@@ -20,12 +20,12 @@ from trilane.hw_profiles.application import Plan, stage_times_ms
 from trilane.hw_profiles.corners import corners_of
 from trilane.hw_profiles.cost import Network, walk
 from trilane.hw_profiles.load import load_runnable
-from trilane.scene.schema import RunConfig
 from trilane.scheduler.events import Settings, avatar_graph
-from trilane.scheduler.result import JobRecord
+from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.virtual import simulate
+from trilane.stages.config import RunConfig
+from trilane.units import SUSTAINED
 
-SUSTAINED = "sustained_high_performance"
 MAX_SLOW_MOTION = 1000.0
 #: A job that ends this much after its pace was done in time: waking up takes this long on a quiet machine.
 SLACK_NS = 200_000

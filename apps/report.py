@@ -14,8 +14,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles.host import sensor_c
-from trilane.scene.schema import RunConfig
-from trilane.scheduler.result import RunResult
+from trilane.pipeline.result import RunResult
+from trilane.stages.config import RunConfig
 
 MAX_REPORT_BYTES = 64 << 20
 NO_CAP = "none: every unit works as much as its cores and threads allow"

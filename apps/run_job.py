@@ -18,12 +18,12 @@ from trilane.apps.run_folder import RunFolder
 from trilane.apps.trace import write_trace
 from trilane.apps.video import contact_sheet, join_segments, run_checksum
 from trilane.errors import TrilaneError
+from trilane.hw_profiles.governor import Governor
 from trilane.hw_profiles.load import load_runnable
-from trilane.scene.schema import RunConfig
-from trilane.scheduler.governor import Governor
-from trilane.scheduler.result import RunResult
-from trilane.scheduler.run import run_pipeline
-from trilane.scheduler.signals import Interrupts
+from trilane.pipeline.result import RunResult
+from trilane.pipeline.run import run_pipeline
+from trilane.pipeline.signals import Interrupts
+from trilane.stages.config import RunConfig
 from trilane.stages.cpu.present import SEGMENTS
 
 BASELINE_POLICY = "sequential"

@@ -11,11 +11,11 @@ from pathlib import Path
 from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import TrackDescriptor, TrackEvent
 from perfetto.trace_builder.proto_builder import StreamingTraceProtoBuilder
 
-from trilane.scheduler.result import JobRecord
+from trilane.scheduler.ledger import JobRecord
+from trilane.units import UNITS
 
 SEQUENCE = 1
 PROCESS_TRACK = 1
-UNITS = ("cpu", "gpu", "dsp")
 
 
 def write_trace(jobs: Sequence[JobRecord], target: Path) -> None:

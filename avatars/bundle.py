@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from trilane.avatars.network_file import MAX_CHANNELS, MAX_SIDE, Affine, NetworkFile, read_network
 from trilane.errors import BadInputError
-from trilane.scene.files import read_npz, read_text, require_file
+from trilane.files import read_npz, read_text, require_file
 
 MANIFEST = "manifest.json"
 DEFAULT = "default"

@@ -13,15 +13,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from trilane.arrays import F64
+from trilane.body.body import load_body
+from trilane.body.joints import JOINT_INDEX
+from trilane.body.kinematics import Skeleton, rodrigues
 from trilane.errors import BadInputError
-from trilane.scene.schema import Shape, shape_buckets
-from trilane.stages.cpu.body import load_body
+from trilane.shapes import Shape, shape_buckets
 from trilane.stages.cpu.crop import Rect, choose_bucket
-from trilane.stages.cpu.joints import JOINT_INDEX
-from trilane.stages.cpu.kinematics import Skeleton, rodrigues
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 
-F64 = NDArray[np.float64]
 BODY = Path(__file__).resolve().parents[1] / "avatars" / "default" / "body.npz"
 NEAR, FAR = 0.05, 100.0
 

@@ -19,14 +19,14 @@ from typing import Any
 
 import psutil
 
-from trilane.apps.configure import Request, configure
 from trilane.errors import BadInputError
-from trilane.scene.schema import RunConfig
+from trilane.pipeline.result import RunResult
+from trilane.pipeline.run import run_pipeline
 from trilane.scheduler.events import UnitDied, UnitReady
-from trilane.scheduler.result import RunResult
-from trilane.scheduler.run import run_pipeline
+from trilane.stages.config import RunConfig
+from trilane.stages.configure import Request, configure
+from trilane.units import UNITS
 
-UNITS = ("cpu", "gpu", "dsp")
 FAULTS = ("kill", "stop")
 SHM = Path("/dev/shm")  # noqa: S108 - looked at, not written to
 #: A run is back to its pace with the first of so many frames whose mean distance is at most so many periods.

@@ -10,22 +10,21 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from trilane.arrays import U8
 from trilane.avatars.bundle import bundle_folder, load_bundle
 from trilane.avatars.reshape import reshaped
+from trilane.bench.fixture import standing
 from trilane.bench.raster import interleaved, summary
 from trilane.bench.several import ground_truth
-from trilane.bench.subject import standing
 from trilane.errors import BadInputError
-from trilane.scene.schema import BUCKET_STEP
+from trilane.shapes import BUCKET_STEP
 from trilane.stages.dsp.runtime import RuntimeOptions, load_runtime
 from trilane.stages.gpu.assets import load_assets
 from trilane.stages.gpu.context import describe
 from trilane.stages.gpu.mesh import SkinnedMesh
 from trilane.stages.gpu.packed import FILTERS, PackedAvatar, PackedPass, Placement
 
-U8 = NDArray[np.uint8]
 MAX_SIDE = 2048
 
 

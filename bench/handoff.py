@@ -20,12 +20,13 @@ from typing import Any
 import numpy as np
 
 from trilane.bench.handoff_unit import PAUSE_S, check_bytes
-from trilane.bench.handoff_ways import BARE, CHANNELS, SLOT, WRITTEN, Channel
+from trilane.bench.handoff_variants import BARE, CHANNELS, SLOT, WRITTEN, Channel
 from trilane.errors import BadInputError, TrilaneError
 from trilane.hw_profiles.host import host_units
-from trilane.scene.schema import RunConfig, Scene
-from trilane.scheduler.run import run_pipeline
+from trilane.pipeline.run import run_pipeline
+from trilane.scene.schema import Scene
 from trilane.scheduler.stats import median_interval
+from trilane.stages.config import RunConfig
 from trilane.transport.wakeup import UNIT_NS, awake, use_slice
 
 #: KiB of a tensor of 16 channels -> its side; the sizes that can be asked for.

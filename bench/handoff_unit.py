@@ -12,15 +12,15 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from trilane.errors import TrilaneError
-from trilane.scene.schema import RunConfig
-from trilane.stages.contracts import Packet
+from trilane.stages.config import RunConfig
+from trilane.transport.packets import Packet
 
 STAGES = {"cpu": ("pose", "present"), "gpu": ("raster", "composite"), "dsp": ("infer",)}
 PAUSE_S = 0.001
 
 
 class HandoffStage:
-    """`trilane.stages.contracts.Stage`."""
+    """`trilane.pipeline.stage.Stage`."""
 
     def __init__(self, name: str) -> None:
         self._name = name

@@ -19,11 +19,11 @@ import onnx
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import read_network
 from trilane.bench import roofline
+from trilane.bench.interleaved import Way, runners
 from trilane.bench.networks import Subject, of_file, untrained, untrained_float
-from trilane.bench.turns import Way, runners
 from trilane.errors import BadInputError
 from trilane.hw_profiles.host import sensor_c
-from trilane.scene.schema import parse_shape
+from trilane.shapes import parse_shape
 from trilane.stages.dsp.runtime import resolve
 
 FP32 = "ort fp32"

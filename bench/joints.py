@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from trilane.body.body import load_body
+from trilane.body.kinematics import Skeleton
 from trilane.errors import BadInputError
-from trilane.stages.cpu.body import load_body
-from trilane.stages.cpu.kinematics import Skeleton
 
 BODY = Path(__file__).resolve().parents[1] / "avatars" / "default" / "body.npz"
 LIMIT_US = 200.0

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from trilane.errors import TrilaneError
-from trilane.scheduler.inlet import Inlet
+from trilane.pipeline.requests import FrameRequestQueue
 
 CONFIDENCE = 0.99
 WARM_UP = 8
@@ -42,7 +42,9 @@ class Load:
 
 @dataclass
 class Queries:
-    """What is asked of an `Inlet`, and when it was answered; shared by the thread that asks and the one that runs.
+    """What is asked of a `FrameRequestQueue`, and when it was answered.
+
+    Shared by the thread that asks and the one that runs.
 
     A query is `size` frames and is answered with the last of them.
     """
@@ -54,13 +56,13 @@ class Queries:
     changed: threading.Condition = field(default_factory=threading.Condition)
     _frames: int = 0
 
-    def ask(self, inlet: Inlet, count: int = 1) -> None:
+    def ask(self, inlet: FrameRequestQueue, count: int = 1) -> None:
         """`count` queries, now."""
         self.asked_s += [time.monotonic()] * count
         inlet.ask(count * self.size)
 
     def answered(self, _frame: int) -> None:
-        """For `Inlet`."""
+        """For `FrameRequestQueue`."""
         with self.changed:
             self._frames += 1
             if self._frames % self.size == 0:
@@ -68,7 +70,7 @@ class Queries:
                 self.changed.notify_all()
 
     def ended(self) -> None:
-        """For `Inlet`."""
+        """For `FrameRequestQueue`."""
         with self.changed:
             self.over = True
             self.changed.notify_all()
@@ -82,7 +84,7 @@ class Queries:
             if len(self.answered_s) < len(self.asked_s):
                 raise TrilaneError("the run ended before every query was answered")
 
-    def warm_up(self, inlet: Inlet) -> None:
+    def warm_up(self, inlet: FrameRequestQueue) -> None:
         """A few queries that are not counted."""
         self.ask(inlet, WARM_UP)
         self.wait()
@@ -99,14 +101,14 @@ class Queries:
         return [(end - begin) * 1e3 for begin, end in zip(self.asked_s, self.answered_s, strict=False)]
 
 
-def play(load: Load, inlet: Inlet, queries: Queries) -> None:
+def play(load: Load, inlet: FrameRequestQueue, queries: Queries) -> None:
     """Ask as `load` says until it has lasted long enough and has queries enough, and wait for the answers."""
     queries.warm_up(inlet)
     PATTERNS[load.scenario](load, inlet, queries)
     queries.wait()
 
 
-def _one_at_a_time(load: Load, inlet: Inlet, queries: Queries) -> None:
+def _one_at_a_time(load: Load, inlet: FrameRequestQueue, queries: Queries) -> None:
     end = time.monotonic() + load.seconds
     needed = queries_needed(load.percentile)
     while time.monotonic() < end or len(queries.asked_s) < needed:
@@ -114,7 +116,7 @@ def _one_at_a_time(load: Load, inlet: Inlet, queries: Queries) -> None:
         queries.wait()
 
 
-def _poisson(load: Load, inlet: Inlet, queries: Queries) -> None:
+def _poisson(load: Load, inlet: FrameRequestQueue, queries: Queries) -> None:
     gaps = random.Random(load.seed)
     at = time.monotonic()
     end, needed = at + load.seconds, queries_needed(load.percentile)
@@ -125,7 +127,7 @@ def _poisson(load: Load, inlet: Inlet, queries: Queries) -> None:
         queries.ask(inlet)
 
 
-def _all_at_once(load: Load, inlet: Inlet, queries: Queries) -> None:
+def _all_at_once(load: Load, inlet: FrameRequestQueue, queries: Queries) -> None:
     """As many as last for the time, by the rate that a first few show."""
     few = queries_needed(load.percentile)
     queries.ask(inlet, few)
@@ -135,7 +137,7 @@ def _all_at_once(load: Load, inlet: Inlet, queries: Queries) -> None:
     queries.ask(inlet, max(few, math.ceil(1.1 * rate * load.seconds)))
 
 
-PATTERNS: dict[str, Callable[[Load, Inlet, Queries], None]] = {
+PATTERNS: dict[str, Callable[[Load, FrameRequestQueue, Queries], None]] = {
     "single-stream": _one_at_a_time,
     "multi-stream": _one_at_a_time,
     "server": _poisson,

@@ -15,7 +15,7 @@ from typing import Any
 
 from trilane.bench.load import WARM_UP, Load, Queries, queries_needed
 from trilane.errors import MissingPartError, TrilaneError
-from trilane.scheduler.inlet import Inlet
+from trilane.pipeline.requests import FrameRequestQueue
 
 INSTALL = 'pip install "trilane[loadgen]"'
 NAMES = {"single-stream": "SingleStream", "multi-stream": "MultiStream", "server": "Server", "offline": "Offline"}
@@ -51,19 +51,19 @@ class Judge:
     _begun: bool = False
 
     def answered(self, frame: int) -> None:
-        """For `Inlet`: a frame is a sample of LoadGen's, once the warm-up is over."""
+        """For `FrameRequestQueue`: a frame is a sample of LoadGen's, once the warm-up is over."""
         self.queries.answered(frame)
         if self._begun:
             self._complete(frame - WARM_UP)
 
     def ended(self) -> None:
-        """For `Inlet`: LoadGen waits for every answer, so those that will not come are given now."""
+        """For `FrameRequestQueue`: LoadGen waits for every answer, so those that will not come are given now."""
         self.queries.ended()
         if self._begun:
             for number in range(len(self.queries.answered_s), len(self._ids)):
                 self._complete(number)
 
-    def play(self, inlet: Inlet) -> None:
+    def play(self, inlet: FrameRequestQueue) -> None:
         """Warm up, then let LoadGen ask until it has enough. Raises TrilaneError when the run ends first."""
         lg = load_generator()
         self.queries.warm_up(inlet)

@@ -12,11 +12,11 @@ import numpy as np
 import onnx
 from numpy.typing import NDArray
 
-from trilane.avatars.inspect import graph_facts
+from trilane.apps.avatar_facts import graph_facts
 from trilane.avatars.network_file import NetworkFile
-from trilane.avatars.quantise import quantise
 from trilane.avatars.reshape import reshaped
 from trilane.errors import MissingPartError
+from trilane.training.quantising.quantise import quantise
 
 CALIBRATION_SIDE = 64
 CALIBRATION_FRAMES = 5
@@ -37,7 +37,7 @@ def untrained(
 ) -> Subject:
     """An untrained network, quantised. Raises MissingPartError without PyTorch, BadInputError for wrong settings."""
     network, torch = _unet(encoder, norm, width, channels)
-    from trilane.avatars.training.export import export_onnx
+    from trilane.training.export import export_onnx
 
     small = export_onnx(network, CALIBRATION_SIDE, CALIBRATION_SIDE)
     rng = np.random.default_rng(0)
@@ -51,7 +51,7 @@ def untrained(
 
 def untrained_float(encoder: str, norm: str, width: int, size: tuple[int, int], channels: int = 16) -> onnx.ModelProto:
     """The same network in float, (1, C, H, W) float32. Raises as `untrained`."""
-    from trilane.avatars.training.export import export_onnx
+    from trilane.training.export import export_onnx
 
     return export_onnx(_unet(encoder, norm, width, channels)[0], *size)
 
@@ -74,7 +74,7 @@ def _unet(encoder: str, norm: str, width: int, channels: int) -> tuple[Any, Any]
         import torch
     except ModuleNotFoundError as error:
         raise MissingPartError("untrained networks need PyTorch", "pip install 'trilane[train]'") from error
-    from trilane.avatars.training.network import UNet
+    from trilane.training.network import UNet
 
     torch.manual_seed(0)
     return UNet(encoder, norm, width, channels).eval(), torch

@@ -12,16 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.avatars.bundle import bundle_folder
+from trilane.bench import float_raster as oracle
 from trilane.bench.crop import everyday_pose, random_camera
-from trilane.bench.subject import ENCODING, standing
+from trilane.bench.fixture import ENCODING, standing
+from trilane.body.body import load_body
+from trilane.body.kinematics import Skeleton
 from trilane.errors import BadInputError
-from trilane.stages.cpu.body import load_body
-from trilane.stages.cpu.kinematics import Skeleton
-from trilane.stages.gpu import oracle
 from trilane.stages.gpu.context import describe, open_context
 from trilane.stages.gpu.mesh import SkinnedMesh
 from trilane.stages.gpu.packed import PackedAvatar, PackedPass, Placement
-from trilane.stages.gpu.uv_image import UvRaster
+from trilane.training.uv_image import UvRaster
 
 CHANNELS = 16
 MAX_SIDE = 2048

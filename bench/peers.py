@@ -18,10 +18,10 @@ import numpy as np
 import onnx
 
 from trilane.bench import roofline
+from trilane.bench.interleaved import Way, runners
 from trilane.bench.networks import untrained, untrained_float
-from trilane.bench.turns import Way, runners
 from trilane.errors import BadInputError, MissingPartError, TrilaneError
-from trilane.scene.schema import parse_shape
+from trilane.shapes import parse_shape
 from trilane.stages.dsp.runtime import resolve
 
 APP = "benchmark_app"

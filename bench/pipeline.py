@@ -15,15 +15,16 @@ from pathlib import Path
 from statistics import fmean, median
 from typing import Any
 
-from trilane.apps.configure import Request, configure
 from trilane.bench import full_width
 from trilane.errors import BadInputError, TrilaneError
 from trilane.hw_profiles.host import host_units, usable_cores
-from trilane.scene.schema import RunConfig
+from trilane.pipeline.result import RunResult
+from trilane.pipeline.run import run_pipeline
+from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.policy import policy_named
-from trilane.scheduler.result import JobRecord, RunResult
-from trilane.scheduler.run import run_pipeline
 from trilane.scheduler.stats import median_interval
+from trilane.stages.config import RunConfig
+from trilane.stages.configure import Request, configure
 from trilane.transport.slots import edge_rule
 
 SEQUENTIAL = "sequential"

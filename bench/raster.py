@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from trilane.bench.subject import ENCODING, Subject, standing
+from trilane.bench.fixture import ENCODING, Subject, standing
+from trilane.bench.split_pass import SplitPass
+from trilane.body.skinning import FrameSkinner
 from trilane.errors import BadInputError, TrilaneError
-from trilane.stages.cpu.skinning import FrameSkinner
 from trilane.stages.gpu.context import describe, open_context
 from trilane.stages.gpu.mesh import PosedMesh, SkinnedMesh
 from trilane.stages.gpu.packed import CHANNELS, PackedAvatar, PackedPass, Placement
-from trilane.stages.gpu.split import SplitPass
-from trilane.stages.gpu.uv_image import UvBytes
+from trilane.training.uv_image import UvBytes
 
 MAX_SIDE = 4096
 WARM_UP = 5

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from trilane.bench.fixture import ENCODING, standing
+from trilane.bench.gpu_buffering import READBACKS, UPLOADS, Readback, Upload
 from trilane.bench.raster import interleaved, summary
-from trilane.bench.subject import ENCODING, standing
 from trilane.errors import TrilaneError
-from trilane.stages.gpu.buffering import READBACKS, UPLOADS, Readback, Upload
 from trilane.stages.gpu.context import describe, open_context
 from trilane.stages.gpu.mesh import SkinnedMesh
 from trilane.stages.gpu.packed import CHANNELS, PackedAvatar, PackedPass, Placement

@@ -14,13 +14,13 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from trilane.apps.configure import Request, configure
 from trilane.bench.load import PATTERNS, Load, Queries, bound_ms, play, verdict
 from trilane.bench.loadgen import Judge, load_generator
 from trilane.errors import BadInputError, TrilaneError
-from trilane.scene.schema import RunConfig
-from trilane.scheduler.inlet import Inlet
-from trilane.scheduler.run import run_pipeline
+from trilane.pipeline.requests import FrameRequestQueue
+from trilane.pipeline.run import run_pipeline
+from trilane.stages.config import RunConfig
+from trilane.stages.configure import Request, configure
 
 JUDGES = ("trilane", "loadgen")
 MAX_FRAMES = 1_000_000
@@ -71,7 +71,9 @@ def ask(config: RunConfig, load: Load, judge: str, policy: str, edge: str) -> tu
     """One run under `load`; its row and LoadGen's summary. Raises TrilaneError when the run fails."""
     queries = Queries(size=load.samples if load.scenario == "multi-stream" and judge == "trilane" else 1)
     loadgen = Judge(load, queries) if judge == "loadgen" else None
-    inlet = Inlet(*((queries.answered, queries.ended) if loadgen is None else (loadgen.answered, loadgen.ended)))
+    inlet = FrameRequestQueue(
+        *((queries.answered, queries.ended) if loadgen is None else (loadgen.answered, loadgen.ended))
+    )
     player = _Player(inlet, (lambda: play(load, inlet, queries)) if loadgen is None else lambda: loadgen.play(inlet))
     with tempfile.TemporaryDirectory(prefix="trilane-bench-") as folder:
         placed = config.model_copy(update={"out_dir": Path(folder), "record": False})
@@ -94,7 +96,7 @@ def ask(config: RunConfig, load: Load, judge: str, policy: str, edge: str) -> tu
 class _Player(threading.Thread):
     """Asks, on a thread of its own, once the inlet is open; what it raises is kept."""
 
-    inlet: Inlet
+    inlet: FrameRequestQueue
     work: Callable[[], None]
     errors: list[TrilaneError] = field(default_factory=list)
 

@@ -17,7 +17,7 @@ import numpy as np
 from trilane.compiled import form
 from trilane.errors import BadInputError, TrilaneError
 from trilane.scheduler.events import Graph, Settings, avatar_graph
-from trilane.scheduler.record import read, replay
+from trilane.scheduler.recording import read, replay
 from trilane.scheduler.virtual import Service, VirtualDriver, simulate
 
 MS = 1_000_000

@@ -13,14 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from trilane.arrays import U8
 from trilane.avatars.bundle import Bundle, bundle_folder, load_bundle
 from trilane.avatars.reshape import reshaped
+from trilane.body.body import ShapedBody, load_body
+from trilane.body.kinematics import Skeleton
 from trilane.errors import BadInputError, MissingPartError
-from trilane.scene.schema import AvatarSpec, Scene, Shape, shape_buckets
+from trilane.scene.schema import AvatarSpec, Scene
 from trilane.scene.staging import stage_scene
-from trilane.stages.cpu.body import ShapedBody, load_body
+from trilane.shapes import Shape, shape_buckets
 from trilane.stages.cpu.crop import crop_projection
-from trilane.stages.cpu.kinematics import Skeleton
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 from trilane.stages.cpu.pose import STANDOFF_M
 from trilane.stages.cpu.tensor_layout import MARGIN_PX, TensorLayout, lay_out
@@ -29,7 +31,6 @@ from trilane.stages.gpu.assets import load_assets
 from trilane.stages.gpu.mesh import SkinnedMesh
 from trilane.stages.gpu.packed import PackedAvatar, PackedPass, Placement
 
-U8 = NDArray[np.uint8]
 BOUND_DB = 0.5
 OUTPUT = (480, 640)
 MOST_AVATARS = 8
@@ -158,8 +159,8 @@ def _views(stand: _Stand, avatars: int, views: int, size: str, margin: int) -> I
 def ground_truth(bundle: Bundle) -> tuple[Any, Any]:
     """The bundle's body, dressed, on the GPU, and the `image_error` of two pictures. Raises MissingPartError."""
     try:
-        from trilane.avatars.training.dataset import Studio
-        from trilane.avatars.training.metrics import image_error
+        from trilane.training.dataset import Studio
+        from trilane.training.metrics import image_error
     except ImportError as error:
         raise MissingPartError(f"ground truth needs {error.name}", "pip install 'trilane[train]'") from None
     return Studio(shaped_body(bundle)), image_error

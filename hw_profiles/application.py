@@ -19,10 +19,11 @@ from trilane.hw_profiles.corners import Corners
 from trilane.hw_profiles.cost import CLASSES, Network, Work
 from trilane.hw_profiles.networks import CHANNELS_PER_PASS
 from trilane.hw_profiles.roofline import JobTime, job_time, machine_of
-from trilane.hw_profiles.schema import UNITS, Profile, Unit, UnitName
+from trilane.hw_profiles.schema import Profile, Unit
 from trilane.scheduler.events import Graph, Settings, StageSpec
 from trilane.scheduler.policy import POLICIES
 from trilane.scheduler.virtual import simulate
+from trilane.units import UNITS, UnitName
 
 RUNTIMES: tuple[UnitName, ...] = ("gpu", "dsp")
 PACKED_BYTES_PER_PIXEL = 16

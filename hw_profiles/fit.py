@@ -17,17 +17,18 @@ from statistics import median
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from trilane.arrays import F64
 from trilane.errors import BadInputError, MissingPartError
 from trilane.hw_profiles.application import Plan, network_alone, reference_frame_ms
 from trilane.hw_profiles.corners import corners_of
 from trilane.hw_profiles.cost import reference_network
 from trilane.hw_profiles.load import load_tables, parse_profile
-from trilane.hw_profiles.schema import Profile, UnitName
+from trilane.hw_profiles.schema import Profile
 from trilane.hw_profiles.table import Row, read_table
+from trilane.units import SUSTAINED, UnitName
 
-MEASURED_UNDER = "sustained_high_performance"
+MEASURED_UNDER = SUSTAINED
 NORMAL_OVER_MEDIAN = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 
 Keys = tuple[str, ...]
@@ -217,14 +218,11 @@ def _from_residuals(residuals: Sequence[Residual], rows: Sequence[Row]) -> dict[
     return numbers
 
 
-Floats = NDArray[np.float64]
-
-
-def _solve(data: Mapping[str, Any], path: Path, step: Step, found: Sequence[Measurement]) -> tuple[Floats, Floats]:
+def _solve(data: Mapping[str, Any], path: Path, step: Step, found: Sequence[Measurement]) -> tuple[F64, F64]:
     """Factors on the priors of `step.free`, and the spread of each that is left after the fit."""
     priors = np.array([_at(data, keys[0]).get("spread", 0.5) for keys in step.free])
 
-    def residuals(x: Floats) -> Floats:
+    def residuals(x: F64) -> F64:
         profile = parse_profile(with_factors(data, step.free, np.exp(x * priors)), path)
         errors = [np.log(predicted_ms(profile, one) / one.ms) / step.noise for one in found]
         return np.concatenate([errors, x])
@@ -243,7 +241,7 @@ def _least_squares() -> Callable[..., Any]:
     return solver
 
 
-def with_factors(data: Mapping[str, Any], free: Sequence[Keys], factors: Sequence[float] | Floats) -> dict[str, Any]:
+def with_factors(data: Mapping[str, Any], free: Sequence[Keys], factors: Sequence[float] | F64) -> dict[str, Any]:
     """A copy of the tables `data` with the values of each group of keys multiplied by its factor."""
     copied = copy.deepcopy(dict(data))
     for keys, factor in zip(free, factors, strict=True):

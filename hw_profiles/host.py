@@ -12,7 +12,7 @@ from typing import Any
 
 import psutil
 
-from trilane.scene.schema import UnitSettings
+from trilane.pipeline.description import UnitSettings
 
 CGROUP = Path("/sys/fs/cgroup")
 

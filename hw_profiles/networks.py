@@ -76,7 +76,7 @@ MOBILENET_V2 = Inverted(
     ),
     1280,
 )
-#: The last layer is that of the trained network (`trilane.avatars.training.encoders`): 512 instead of its own 1280.
+#: The last layer is that of the trained network (`trilane.training.encoders`): 512 instead of its own 1280.
 EFFICIENTNET_LITE0 = Inverted(
     32,
     "Clip",

@@ -23,12 +23,12 @@ from trilane.hw_profiles.application import (
 )
 from trilane.hw_profiles.corners import Corners, corners_of
 from trilane.hw_profiles.cost import Network, reference_network
-from trilane.hw_profiles.schema import CORNERS, UNITS, Profile, UnitName
+from trilane.hw_profiles.schema import CORNERS, Profile
 from trilane.hw_profiles.table import Row
 from trilane.hw_profiles.thermal import GOVERNORS, Heat, Throttle
 from trilane.scheduler.stats import energy_score
+from trilane.units import SUSTAINED, UNITS, UnitName
 
-SUSTAINED = "sustained_high_performance"
 MAX_MINUTES = 24 * 60
 
 #: What-if: name, way of working, share of the network on the GPU.

@@ -17,7 +17,8 @@ from trilane.hw_profiles.corners import corners_of
 from trilane.hw_profiles.cost import Work, walk
 from trilane.hw_profiles.networks import GraphBuilder, TensorRef, resnet18
 from trilane.hw_profiles.roofline import job_time, machine_of
-from trilane.hw_profiles.schema import UNITS, Profile
+from trilane.hw_profiles.schema import Profile
+from trilane.units import UNITS
 
 UNET_SIZE = (640, 1280)
 UNET_WIDTHS = (64, 128, 256, 512, 1024)

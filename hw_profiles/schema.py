@@ -10,28 +10,10 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
-UnitName = Literal["cpu", "gpu", "dsp"]
-UNITS: tuple[UnitName, ...] = ("cpu", "gpu", "dsp")
+from trilane.units import PERFORMANCE_PROFILES, UNITS, PerformanceProfile, UnitName
+
 Corner = Literal["max", "turbo", "nominal_plus", "nominal", "svs_plus", "svs", "svs2"]
 CORNERS: tuple[Corner, ...] = ("max", "turbo", "nominal_plus", "nominal", "svs_plus", "svs", "svs2")
-PERFORMANCE_PROFILES = (
-    "burst",
-    "sustained_high_performance",
-    "high_performance",
-    "balanced",
-    "low_balanced",
-    "power_saver",
-    "low_power_saver",
-)
-PerformanceProfileName = Literal[
-    "burst",
-    "sustained_high_performance",
-    "high_performance",
-    "balanced",
-    "low_balanced",
-    "power_saver",
-    "low_power_saver",
-]
 Kind = Literal["measured", "published", "fitted", "assumed", "unknown"]
 #: Relative error (standard deviation of the logarithm) of a kind of number, where its profile states none.
 SPREAD_OF_KIND: dict[str, float] = {"measured": 0.05, "published": 0.1, "fitted": 0.15, "assumed": 0.5, "unknown": 1.0}
@@ -199,7 +181,7 @@ class Application(Model):
     ema20_half_range_fraction: Annotated[Quantity, AfterValidator(_Range(0, 1))]
 
 
-class PerformanceProfile(Model):
+class PerformanceSettings(Model):
     """The corner of each unit and how soon a quiet unit may sleep."""
 
     cpu: Corner
@@ -238,7 +220,7 @@ class Profile(Model):
     memory: Memory
     units: dict[UnitName, Unit]
     application: Application
-    performance_profiles: dict[PerformanceProfileName, PerformanceProfile]
+    performance_profiles: dict[PerformanceProfile, PerformanceSettings]
     thermal: Thermal
 
     @model_validator(mode="after")

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles.networks import NetworkSpec
-from trilane.scene.schema import parse_shape
+from trilane.shapes import parse_shape
 
 KEYS = ("encoder", "norm", "size", "channels", "layout")
 MAX_BYTES, MAX_ROWS = 32_000_000, 100_000

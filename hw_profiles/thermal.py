@@ -13,7 +13,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from math import exp
 
-from trilane.hw_profiles.schema import CORNERS, UNITS, Profile, UnitName
+from trilane.hw_profiles.schema import CORNERS, Profile
+from trilane.units import UNITS, UnitName
 
 
 @dataclass

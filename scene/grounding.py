@@ -12,12 +12,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from trilane.arrays import F64
+from trilane.body.body import ShapedBody
+from trilane.body.joints import JOINT_INDEX
+from trilane.body.kinematics import Skeleton
 from trilane.scene.motion.base import Motion
-from trilane.stages.cpu.body import ShapedBody
-from trilane.stages.cpu.joints import JOINT_INDEX
-from trilane.stages.cpu.kinematics import Skeleton
 
-Array = NDArray[np.float64]
 Ground = Literal["auto", "sequence", "frame", "none"]
 
 LOOKS_PER_S, MAX_LOOKS = 30, 600
@@ -27,18 +27,18 @@ LOWEST_PERCENTILE = 5.0
 WEIGHTS = 4
 #: Looked along for the outermost vertices of each joint: the axes and the diagonals of a cube.
 _SIGNS = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if abs(x) + abs(y) + abs(z) in (1, 3)]
-DIRECTIONS: Array = np.array(_SIGNS, dtype=np.float64) / np.linalg.norm(_SIGNS, axis=1, keepdims=True)
+DIRECTIONS: F64 = np.array(_SIGNS, dtype=np.float64) / np.linalg.norm(_SIGNS, axis=1, keepdims=True)
 
 
 @dataclass(frozen=True)
 class Outline:
     """The outermost vertices of a body: `points` (K, 4) at rest with a 1 appended; `joints` and `weights` (K, W)."""
 
-    points: Array
+    points: F64
     joints: NDArray[np.intp]
-    weights: Array
+    weights: F64
 
-    def posed(self, matrices: NDArray[np.float32]) -> Array:
+    def posed(self, matrices: NDArray[np.float32]) -> F64:
         """World positions (K, 3) under skinning matrices (55, 3, 4); pose blend shapes left out."""
         blend = np.einsum("kw,kwc->kc", self.weights, matrices.reshape(-1, 12)[self.joints])
         return np.asarray(np.einsum("kab,kb->ka", blend.reshape(-1, 3, 4), self.points))
@@ -59,7 +59,7 @@ def outline(body: ShapedBody) -> Outline:
     return Outline(points, top, largest / largest.sum(axis=1, keepdims=True))
 
 
-def leg_length(joints: Array) -> float:
+def leg_length(joints: F64) -> float:
     """Hip to knee to ankle of rest joints (55, 3), metres, left side."""
     hip, knee, ankle = (joints[JOINT_INDEX[f"left_{name}"]] for name in ("hip", "knee", "ankle"))
     return float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
@@ -77,9 +77,7 @@ def _look_count(motion: Motion) -> int:
     return min(max(len(motion.times_s), dense), MAX_LOOKS)
 
 
-def lift(
-    motion: Motion, skeleton: Skeleton, shape: Outline, shift: Array, scale: float, rule: Ground
-) -> tuple[Array, Array]:
+def lift(motion: Motion, skeleton: Skeleton, shape: Outline, shift: F64, scale: float, rule: Ground) -> tuple[F64, F64]:
     """Times (L,) and metres to add at them (L,), linear between; `shift` and `scale` as in `Mover`."""
     if rule == "none":
         return np.zeros(1), np.zeros(1)

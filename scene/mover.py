@@ -8,16 +8,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from trilane.arrays import F64
+from trilane.body.body import ShapedBody
+from trilane.body.kinematics import Skeleton
 from trilane.scene.grounding import ground_rule, leg_length, lift, outline
 from trilane.scene.motion.base import Motion, bracket, wrapped_time
 from trilane.scene.rotations import about
 from trilane.scene.schema import AvatarSpec
-from trilane.stages.cpu.body import ShapedBody
-from trilane.stages.cpu.kinematics import Skeleton
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -28,14 +26,14 @@ class Mover:
     """
 
     motion: Motion
-    world: Array
+    world: F64
     scale: float
-    shift: Array
-    lift_times_s: Array
-    lift_m: Array
+    shift: F64
+    lift_times_s: F64
+    lift_m: F64
     notes: tuple[str, ...]
 
-    def sample(self, t_s: float) -> tuple[Array, Array]:
+    def sample(self, t_s: float) -> tuple[F64, F64]:
         """Pose (55, 3) and translation (3,), in body space before `world`."""
         pose, pelvis = self.motion.sample(t_s)
         translation = pelvis * self.scale + self.shift

@@ -13,24 +13,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from trilane.arrays import F32, F64
+from trilane.body.body import ShapedBody
+from trilane.body.kinematics import Skeleton
 from trilane.scene.camera.base import CameraPath, view_from_pose
 from trilane.scene.grounding import outline
 from trilane.scene.mover import Mover
 from trilane.scene.rotations import about
 from trilane.scene.schema import Scene
-from trilane.stages.cpu.body import ShapedBody
-from trilane.stages.cpu.kinematics import Skeleton
-
-Array = NDArray[np.float64]
-F32 = NDArray[np.float32]
 
 #: Frames that a placement is judged by.
 LOOKS = 48
 #: Metres: how far aside of the camera, and how high over the floor, places are tried; first coarse, then finer.
 REACH_M, COARSE_M = 7.0, 0.5
-EYE_HEIGHTS_M: Array = np.arange(0.8, 3.61, 0.2)
+EYE_HEIGHTS_M: F64 = np.arange(0.8, 3.61, 0.2)
 FINER_M = (0.25, 0.12, 0.06)
 #: The camera is never nearer to the floor than this.
 LOWEST_EYE_M = 0.3
@@ -53,17 +50,17 @@ class PlacedCamera:
     """
 
     path: CameraPath
-    turn: Array
-    shift: Array
-    mount: Array
+    turn: F64
+    shift: F64
+    mount: F64
     notes: tuple[str, ...]
 
-    def sample(self, t_s: float) -> Array:
+    def sample(self, t_s: float) -> F64:
         """World to camera (4, 4) at `t_s`, scene world."""
         turn, place = self.path.pose(t_s)
         return view_from_pose(self.turn @ turn @ self.mount, self.turn @ place + self.shift)
 
-    def projection(self, aspect: float) -> Array:
+    def projection(self, aspect: float) -> F64:
         """OpenGL clip matrix (4, 4)."""
         return self.path.projection(aspect)
 
@@ -76,9 +73,9 @@ class _Film:
     """
 
     views: F32
-    eyes: Array
-    boxes: Array
-    scale: Array
+    eyes: F64
+    boxes: F64
+    scale: F64
 
 
 def place_camera(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]) -> PlacedCamera:
@@ -108,14 +105,14 @@ def place_camera(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies
     return PlacedCamera(path, turn, shift, mount, notes)
 
 
-def _tilt_deg(path: CameraPath, times: Array) -> float:
+def _tilt_deg(path: CameraPath, times: F64) -> float:
     """Degrees to turn the camera up on its mount, so that the median line of sight is within SIGHT_DEG."""
     sight = float(np.median([np.degrees(np.arcsin(np.clip(-path.pose(float(t))[0][1, 2], -1, 1))) for t in times]))
     return float(np.clip(np.clip(sight, *SIGHT_DEG) - sight, -LARGEST_TILT_DEG, LARGEST_TILT_DEG))
 
 
 def _film(
-    path: CameraPath, mount: Array, times: Array, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]
+    path: CameraPath, mount: F64, times: F64, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]
 ) -> _Film:
     poses = [path.pose(float(t)) for t in times]
     views = np.stack([view_from_pose(turn @ mount, place)[:3] for turn, place in poses]).astype(np.float32)
@@ -126,7 +123,7 @@ def _film(
     return _Film(views, np.stack([place for _, place in poses]), boxes, np.array([projection[0, 0], projection[1, 1]]))
 
 
-def _bounds(times: Array, movers: Sequence[Mover], bodies: Sequence[ShapedBody]) -> tuple[Array, Array]:
+def _bounds(times: F64, movers: Sequence[Mover], bodies: Sequence[ShapedBody]) -> tuple[F64, F64]:
     """Lowest and highest corners (F, 3) round all bodies."""
     lows, highs = np.full((len(times), 3), np.inf), np.full((len(times), 3), -np.inf)
     for mover, body in zip(movers, bodies, strict=True):
@@ -138,7 +135,7 @@ def _bounds(times: Array, movers: Sequence[Mover], bodies: Sequence[ShapedBody])
     return lows, highs
 
 
-def _coarse_spots(film: _Film) -> Array:
+def _coarse_spots(film: _Film) -> F64:
     """Places (S, 3) of the scene's origin in the path's world."""
     middle = film.eyes.mean(axis=0)
     level = np.arange(-REACH_M, REACH_M + COARSE_M / 2, COARSE_M)
@@ -146,19 +143,19 @@ def _coarse_spots(film: _Film) -> Array:
     return np.asarray(middle + np.stack([x.ravel(), -height.ravel(), z.ravel()], axis=1))
 
 
-def _around(spot: Array, step: float) -> Array:
+def _around(spot: F64, step: float) -> F64:
     offsets = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)], dtype=np.float64)
     return np.asarray(np.concatenate([spot[None], spot + step * offsets]))
 
 
-def _best(film: _Film, spots: Array) -> Array:
+def _best(film: _Film, spots: F64) -> F64:
     whole, size = _judged(film, spots)
     worth = whole + SIZE_WORTH * np.minimum(size, ENOUGH_SIZE)
     worth = np.where(film.eyes[:, 1].min() - spots[:, 1] >= LOWEST_EYE_M, worth, -1.0)
     return np.asarray(spots[int(worth.argmax())])
 
 
-def _judged(film: _Film, spots: Array) -> tuple[Array, Array]:
+def _judged(film: _Film, spots: F64) -> tuple[F64, F64]:
     """Per spot: share of the frames with whole bodies, mean share of the picture's height that they take. Each (S,)."""
     angle = _facing(film, spots)
     cos, sin = (f(angle).astype(np.float32)[:, None, None] for f in (np.cos, np.sin))
@@ -181,16 +178,16 @@ def _row(row: F32, x: F32, y: F32, z: F32) -> F32:
     return np.asarray(a * x + b * y + c * z + d)
 
 
-def _facing(film: _Film, spots: Array) -> Array:
+def _facing(film: _Film, spots: F64) -> F64:
     """Angle (S,) about +Y from the scene to the path's world, for which +Z at each spot points to the first eye."""
     towards = film.eyes[0] - spots
     return np.asarray(np.arctan2(towards[:, 0], towards[:, 2]))
 
 
-def _transform(film: _Film, spot: Array) -> tuple[Array, Array]:
+def _transform(film: _Film, spot: F64) -> tuple[F64, F64]:
     turn = about(1, -_facing(film, spot[None])[0])
     return turn, -turn @ spot
 
 
-def _distance(film: _Film, spot: Array) -> float:
+def _distance(film: _Film, spot: F64) -> float:
     return float(np.hypot(film.eyes[:, 0] - spot[0], film.eyes[:, 2] - spot[2]).mean())

@@ -6,22 +6,22 @@ Rule: every function takes any leading axes, computes in float64 and is exact at
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from trilane.arrays import F64
 
 #: Columns are the images of x, y, z: turns a Z-up world into a Y-up one, x kept.
-Y_UP_FROM_Z_UP: Array = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+Y_UP_FROM_Z_UP: F64 = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
-def quat_from_rotvec(rotvec: ArrayLike) -> Array:
+def quat_from_rotvec(rotvec: ArrayLike) -> F64:
     """Axis-angle (..., 3) to unit quaternions (..., 4), w >= 0 only for angles up to pi."""
     vectors = np.asarray(rotvec, dtype=np.float64)
     half = np.sqrt((vectors * vectors).sum(axis=-1, keepdims=True)) / 2
     return np.concatenate([np.cos(half), np.sinc(half / np.pi) * vectors / 2], axis=-1)
 
 
-def rotvec_from_quat(quat: ArrayLike) -> Array:
+def rotvec_from_quat(quat: ArrayLike) -> F64:
     """Unit quaternions (..., 4) to the shortest axis-angle (..., 3), angles in [0, pi]."""
     q = np.asarray(quat, dtype=np.float64)
     sine = np.sqrt((q[..., 1:] * q[..., 1:]).sum(axis=-1))
@@ -32,7 +32,7 @@ def rotvec_from_quat(quat: ArrayLike) -> Array:
     return np.asarray(q[..., 1:] * factor[..., None])
 
 
-def _products_to_matrix() -> Array:
+def _products_to_matrix() -> F64:
     """(16, 9): takes the products of (w, x, y, z) by themselves, row-major, to the rotation matrix, row-major."""
     table = np.zeros((4, 4, 3, 3))
     table[0, 0] = np.eye(3)
@@ -46,14 +46,14 @@ def _products_to_matrix() -> Array:
 _MATRIX = _products_to_matrix()
 
 
-def matrix_from_quat(quat: ArrayLike) -> Array:
+def matrix_from_quat(quat: ArrayLike) -> F64:
     """Unit quaternions (..., 4) to rotation matrices (..., 3, 3)."""
     q = np.asarray(quat, dtype=np.float64)
     products = q[..., :, None] * q[..., None, :]
     return np.asarray((products.reshape(*q.shape[:-1], 16) @ _MATRIX).reshape(*q.shape[:-1], 3, 3))
 
 
-def quat_from_matrix(matrix: ArrayLike) -> Array:
+def quat_from_matrix(matrix: ArrayLike) -> F64:
     """Rotation matrices (..., 3, 3) to unit quaternions (..., 4), by the largest of the four squared components.
 
     Shepperd, "Quaternion from rotation matrix", J. Guidance and Control 1(3), 1978.
@@ -76,17 +76,17 @@ def quat_from_matrix(matrix: ArrayLike) -> Array:
     return normalised(row)
 
 
-def matrix_from_rotvec(rotvec: ArrayLike) -> Array:
+def matrix_from_rotvec(rotvec: ArrayLike) -> F64:
     """Axis-angle (..., 3) to rotation matrices (..., 3, 3)."""
     return matrix_from_quat(quat_from_rotvec(rotvec))
 
 
-def rotvec_from_matrix(matrix: ArrayLike) -> Array:
+def rotvec_from_matrix(matrix: ArrayLike) -> F64:
     """Rotation matrices (..., 3, 3) to axis-angle (..., 3)."""
     return rotvec_from_quat(quat_from_matrix(matrix))
 
 
-def about(axis: int, angle_rad: ArrayLike) -> Array:
+def about(axis: int, angle_rad: ArrayLike) -> F64:
     """Rotation matrices (..., 3, 3) about coordinate axis 0, 1 or 2 by angles (...)."""
     angle = np.asarray(angle_rad, dtype=np.float64)
     unit = np.zeros(3)
@@ -94,7 +94,7 @@ def about(axis: int, angle_rad: ArrayLike) -> Array:
     return matrix_from_rotvec(angle[..., None] * unit)
 
 
-def quat_multiply(left: ArrayLike, right: ArrayLike) -> Array:
+def quat_multiply(left: ArrayLike, right: ArrayLike) -> F64:
     """Hamilton product (..., 4): turn by `right`, then by `left`."""
     aw, ax, ay, az = np.moveaxis(np.asarray(left, dtype=np.float64), -1, 0)
     bw, bx, by, bz = np.moveaxis(np.asarray(right, dtype=np.float64), -1, 0)
@@ -109,7 +109,7 @@ def quat_multiply(left: ArrayLike, right: ArrayLike) -> Array:
     )
 
 
-def slerp(start: ArrayLike, end: ArrayLike, fraction: ArrayLike) -> Array:
+def slerp(start: ArrayLike, end: ArrayLike, fraction: ArrayLike) -> F64:
     """Great-circle interpolation (..., 4) of unit quaternions along the shorter arc; `fraction` (...) in [0, 1].
 
     Shoemake, "Animating rotation with quaternion curves", SIGGRAPH 1985; nearly equal ends fall back on the chord.
@@ -126,14 +126,14 @@ def slerp(start: ArrayLike, end: ArrayLike, fraction: ArrayLike) -> Array:
     return normalised(left[..., None] * a + right[..., None] * b)
 
 
-def normalised(vectors: ArrayLike) -> Array:
+def normalised(vectors: ArrayLike) -> F64:
     """Vectors (..., n) at unit length; a zero vector gives NaN."""
     v = np.asarray(vectors, dtype=np.float64)
     with np.errstate(invalid="ignore"):
         return np.asarray(v / np.sqrt((v * v).sum(axis=-1, keepdims=True)))
 
 
-def shortest_turn(source: ArrayLike, target: ArrayLike, fallback: ArrayLike = (1.0, 0.0, 0.0)) -> Array:
+def shortest_turn(source: ArrayLike, target: ArrayLike, fallback: ArrayLike = (1.0, 0.0, 0.0)) -> F64:
     """Rotation matrix (3, 3) of the least angle that turns direction `source` (3,) to `target` (3,).
 
     Opposite directions are turned about the part of `fallback` that is square to them, if it has one.
@@ -146,7 +146,7 @@ def shortest_turn(source: ArrayLike, target: ArrayLike, fallback: ArrayLike = (1
     return matrix_from_rotvec(normalised(axis) * np.arctan2(sine, a @ b))
 
 
-def _square_to(unit: Array, wish: Array) -> Array:
+def _square_to(unit: F64, wish: F64) -> F64:
     """The part of `wish` (3,) square to `unit` (3,), or else any direction that is."""
     side = wish - (wish @ unit) * unit
     if np.linalg.norm(side) > 1e-6:

@@ -1,4 +1,4 @@
-"""What a scene file may say: the TOML schema of a scene, and the resolved configuration every unit receives.
+"""What a scene file may say: the TOML schema of a scene.
 
 Rule: only shapes and ranges are checked here; whether a file exists and what it holds is its loader's concern.
 """
@@ -6,64 +6,23 @@ Rule: only shapes and ranges are checked here; whether a file exists and what it
 from __future__ import annotations
 
 import math
-import re
-from pathlib import Path
 from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
-MAX_SIDE = 4096
-BUCKET_STEP = 32
+from trilane.shapes import MAX_SIDE, checked_size
+
 MAX_DEPTH_RATIO = 1e6  # a depth buffer of 24 bits cannot tell apart what is nearer together
 FARTHEST_M = 1e4  # of an avatar from the scene's origin: float32 then still tells millimetres apart
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Metres = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan=False)]
-Shape = tuple[int, int]
 
 
 class Model(BaseModel):
     """Strict base: unknown keys are errors, values never change."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-def parse_shape(text: str) -> Shape:
-    """`HxW` to (height, width). Raises ValueError naming what was found."""
-    match = re.fullmatch(r"(\d+)x(\d+)", text)
-    if match is None:
-        raise ValueError(f"found {text!r}, expected HEIGHTxWIDTH such as 256x256")
-    return int(match[1]), int(match[2])
-
-
-def shape_buckets(size: str) -> list[Shape]:
-    """Tensor shapes (height, width) that `size` allows.
-
-    `HxW` gives that one shape. A single number S gives the shapes of sides in multiples of 32, aspect within
-    1:4 and area at most S², of which none holds another: tall for a standing body, wide for a lying one, S x S
-    between. Raises ValueError when a side is no multiple of 32 or out of range.
-    """
-    if re.fullmatch(r"\d+", size):
-        return _shapes_of_area(_check_side(int(size)))
-    height, width = parse_shape(size)
-    return [(_check_side(height), _check_side(width))]
-
-
-def _shapes_of_area(side: int) -> list[Shape]:
-    widest = [(h, side * side // h // BUCKET_STEP * BUCKET_STEP) for h in range(BUCKET_STEP, 2 * side + 1, BUCKET_STEP)]
-    shapes = [(h, w) for h, w in widest if w and max(h, w) <= min(4 * min(h, w), MAX_SIDE)]
-    return [(h, w) for h, w in shapes if not any(b > h and v >= w for b, v in shapes)]
-
-
-def _check_side(side: int) -> int:
-    if side % BUCKET_STEP or not BUCKET_STEP <= side <= MAX_SIDE:
-        raise ValueError(f"found side {side}, expected a multiple of {BUCKET_STEP} from {BUCKET_STEP} to {MAX_SIDE}")
-    return side
-
-
-def _checked_size(size: str) -> str:
-    shape_buckets(size)
-    return size
 
 
 class OutputSpec(Model):
@@ -137,7 +96,7 @@ class Scene(Model):
     name: str = Field(default="scene", min_length=1, max_length=80, pattern=r"^[\w .-]+$")
     fps: float = Field(default=30.0, gt=0, le=1000, allow_inf_nan=False)
     frames: int = Field(default=300, ge=1, le=10_000_000)
-    size: Annotated[str, AfterValidator(_checked_size)] = "256"
+    size: Annotated[str, AfterValidator(checked_size)] = "256"
     background: str = "room"
     hud: bool = False
     planes: tuple[PlaneSpec, ...] = Field(default=(), max_length=32)
@@ -146,64 +105,3 @@ class Scene(Model):
     output: OutputSpec = OutputSpec()
     camera: CameraSpec = CameraSpec()
     avatars: tuple[AvatarSpec, ...] = Field(default=(AvatarSpec(),), min_length=1, max_length=8)
-
-
-class UnitSettings(Model):
-    """What a unit may use of the host. `cores`: of this machine; `spin`: may threads spin between jobs."""
-
-    cores: tuple[int, ...] = Field(min_length=1)
-    threads: int = Field(ge=1)
-    spin: bool = False
-
-
-class NetworkCut(Model):
-    """The network is cut at quantised tensor `at`; what follows runs on `unit`."""
-
-    at: str
-    unit: Literal["cpu", "gpu", "dsp"]
-
-
-class RunConfig(Model):
-    """Everything a unit's process is told, as plain data. Paths are absolute and were checked by the parent.
-
-    `out_dir` is the temporary run folder. `runtime` names the DSP runtime. `posed_vertices`: of each avatar, when the
-    CPU unit skins; empty when the GPU does. `pace_ns`: how long a job of a stage is held, at least. `fake` maps a unit
-    to the dotted module of a mock unit and is set by tests alone. `cuts`: of the network; its first part is the DSP's.
-    """
-
-    scene: Scene
-    out_dir: Path
-    avatar_dirs: tuple[Path, ...]
-    units: dict[str, UnitSettings]
-    runtime: str = "ort"
-    record: bool = True
-    posed_vertices: tuple[int, ...] = ()
-    pace_ns: dict[str, int] = {}
-    fake: dict[str, str] = {}
-    cuts: tuple[NetworkCut, ...] = ()
-
-    @field_validator("units")
-    @classmethod
-    def _units_known(cls, units: dict[str, UnitSettings]) -> dict[str, UnitSettings]:
-        unknown = set(units) - {"cpu", "gpu", "dsp"}
-        if unknown:
-            raise ValueError(f"unknown unit {sorted(unknown)}, expected cpu, gpu, dsp")
-        return units
-
-    @property
-    def buckets(self) -> list[Shape]:
-        return shape_buckets(self.scene.size)
-
-    @property
-    def infer_units(self) -> tuple[str, ...]:
-        """The unit of each part of the network, in the order of the work."""
-        return ("dsp", *(cut.unit for cut in self.cuts))
-
-    @property
-    def infer_names(self) -> tuple[str, ...]:
-        """The stages that run the parts: `infer`, `infer-2`, ..."""
-        return ("infer", *(f"infer-{number}" for number in range(2, len(self.cuts) + 2)))
-
-    @property
-    def max_tensor_pixels(self) -> int:
-        return max(math.prod(shape) for shape in self.buckets)

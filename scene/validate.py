@@ -14,7 +14,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from trilane.errors import BadInputError
-from trilane.scene.files import read_text
+from trilane.files import read_text
 from trilane.scene.schema import Scene
 
 OWN = "Value error, "

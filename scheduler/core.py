@@ -6,31 +6,31 @@ actions and with the time at which it wants to be asked again. The same events g
 
 from __future__ import annotations
 
-from trilane.scheduler import faults
+from trilane.scheduler import watchdog
+from trilane.scheduler.completion import earliest_completion_ns
 from trilane.scheduler.events import (
     Action,
-    Ask,
-    Away,
-    Beat,
     Decision,
     Dispatch,
     Event,
     Finish,
+    FrameRequest,
     Graph,
     Job,
     JobDone,
     JobFailed,
     Pinged,
+    Pong,
+    SchedulerStalled,
     SetDuty,
     Settings,
     Stop,
     UnitDied,
     UnitReady,
 )
-from trilane.scheduler.lateness import earliest_finish_ns
+from trilane.scheduler.frame_source import Source
 from trilane.scheduler.ledger import ASSIGNED, BLOCKED, STARVED, THROTTLED, Ledger
 from trilane.scheduler.policy import Candidate, policy_named
-from trilane.scheduler.source import Source
 from trilane.scheduler.state import FULL_DUTY, NEVER, FrameState, StageState, UnitState, build
 from trilane.transport.slots import READING, EdgeSlots
 
@@ -68,11 +68,11 @@ class Core:
             JobFailed: self._on_failed,
             UnitDied: self._on_died,
             Pinged: self._on_pinged,
-            Beat: self._on_beat,
-            Away: self._on_away,
+            Pong: self._on_beat,
+            SchedulerStalled: self._on_away,
             SetDuty: self._on_duty,
             Stop: self._on_stop,
-            Ask: self._on_ask,
+            FrameRequest: self._on_ask,
         }
 
     def step(self, now_ns: int, events: tuple[Event, ...] = ()) -> Decision:
@@ -82,7 +82,7 @@ class Core:
         for event in events:
             self._handlers[type(event)](event)  # type: ignore[operator]
         if not self.finished and (now_ns >= self.alarm_ns or self._leads):
-            faults.check_clocks(self)
+            watchdog.check_clocks(self)
         if self.started and not self.finished:
             if self._latches:
                 self.touch(self.stages[0].unit)
@@ -173,24 +173,24 @@ class Core:
             return
         job = unit.queue.popleft()
         unit.head_since_ns, unit.pinged_ns = self.now_ns, 0
-        faults.free_slots(self, job)
+        watchdog.free_slots(self, job)
         self.lose(job.frame, f"failed:{job.stage}")
         self.touch(unit)
         self._on_stop(Stop())
 
     def _on_died(self, event: UnitDied) -> None:
-        faults.on_died(self, self.units[event.unit])
+        watchdog.on_died(self, self.units[event.unit])
 
     def _on_pinged(self, event: Pinged) -> None:
         self.units[event.unit].pinged_ns = self.now_ns
         self._set_alarm(self.now_ns + self.settings.hang_ns)
 
-    def _on_beat(self, event: Beat) -> None:
+    def _on_beat(self, event: Pong) -> None:
         self.units[event.unit].pinged_ns = 0
 
-    def _on_away(self, event: Away) -> None:
+    def _on_away(self, event: SchedulerStalled) -> None:
         for unit in self.units.values():
-            faults.forgive(unit, event.ns)
+            watchdog.extend_deadlines(unit, event.ns)
         self.reset_alarm()
 
     def _on_duty(self, event: SetDuty) -> None:
@@ -203,7 +203,7 @@ class Core:
         self.stopping = True
         self.source.stop()
 
-    def _on_ask(self, event: Ask) -> None:
+    def _on_ask(self, event: FrameRequest) -> None:
         self.source.ask(event.frames, self.now_ns)
         self.touch(self.stages[0].unit)
 
@@ -305,7 +305,7 @@ class Core:
         """
         if not waiting.deadline_ns:
             return False
-        end_ns = earliest_finish_ns(self.now_ns, waiting.frame, waiting.position, self.stages, self.frames)
+        end_ns = earliest_completion_ns(self.now_ns, waiting.frame, waiting.position, self.stages, self.frames)
         if end_ns <= waiting.deadline_ns:
             return False
         if not self.frames:
@@ -327,9 +327,9 @@ class Core:
             frame = stage.input.frame[slot_in]
             stage.input.take(slot_in)
         if stage.output:
-            slot_out, gave_way = stage.output.claim(frame)
-            if gave_way is not None:
-                self._drop_all([gave_way], stage.position, "stale" if stage.output.rule.mailbox else "pool")
+            slot_out, evicted = stage.output.claim(frame)
+            if evicted is not None:
+                self._drop_all([evicted], stage.position, "stale" if stage.output.rule.mailbox else "pool")
         pool: EdgeSlots | None = stage.output or stage.input
         job = Job(self._jobs, unit.name, stage.name, frame, slot_in, slot_out, pool.epoch if pool else 0)
         self._jobs += 1
@@ -371,7 +371,7 @@ class Core:
 
     def _next_deadline(self) -> int | None:
         if self._leads or self.alarm_ns <= self.now_ns:
-            self.alarm_ns = faults.next_alarm_ns(self)
+            self.alarm_ns = watchdog.next_alarm_ns(self)
         next_ns = self.source.due_ns
         if self.alarm_ns < next_ns:
             next_ns = self.alarm_ns

@@ -29,13 +29,13 @@ class UnitReady(NamedTuple):
 
 
 class JobDone(NamedTuple):
-    """`t_pose_ns`: when the frame's pose was sampled, as its header says; 0 but from the first stage."""
+    """`t_sampled_ns`: when the frame's pose was sampled, as its header says; 0 but from the first stage."""
 
     unit: str
     job: int
     t_begin_ns: int
     t_end_ns: int
-    t_pose_ns: int
+    t_sampled_ns: int
 
 
 class JobFailed(NamedTuple):
@@ -57,13 +57,13 @@ class Pinged(NamedTuple):
     unit: str
 
 
-class Beat(NamedTuple):
+class Pong(NamedTuple):
     """The unit's answer."""
 
     unit: str
 
 
-class Away(NamedTuple):
+class SchedulerStalled(NamedTuple):
     """Whoever runs the core did nothing for `ns` since the last step: units have as much longer to answer."""
 
     ns: int
@@ -80,7 +80,7 @@ class Stop(NamedTuple):
     """Admit no more frames; end when those in flight are done."""
 
 
-class Ask(NamedTuple):
+class FrameRequest(NamedTuple):
     """Somebody outside wants so many more frames, now."""
 
     frames: int
@@ -110,10 +110,10 @@ class Finish(NamedTuple):
     cause: str
 
 
-Event = UnitReady | JobDone | JobFailed | UnitDied | Pinged | Beat | Away | SetDuty | Stop | Ask
+Event = UnitReady | JobDone | JobFailed | UnitDied | Pinged | Pong | SchedulerStalled | SetDuty | Stop | FrameRequest
 Action = Dispatch | Kill | Start | Finish
 
-EVENTS = (UnitReady, JobDone, JobFailed, UnitDied, Pinged, Beat, Away, SetDuty, Stop, Ask)
+EVENTS = (UnitReady, JobDone, JobFailed, UnitDied, Pinged, Pong, SchedulerStalled, SetDuty, Stop, FrameRequest)
 ACTIONS = (Dispatch, Kill, Start, Finish)
 
 
@@ -163,14 +163,20 @@ def avatar_graph(edge: str = "double", infer: Iterable[tuple[str, str]] = (("inf
 
 @dataclass(frozen=True)
 class Settings:
-    """What a run asks of the core. A time or limit of 0 means none.
+    """What a run asks of the core. A time or a limit of 0 means none.
 
-    `period_ns`: a frame is released every so often; 0: as soon as it can be taken. `arrivals_ns`: release times
-    from the start, instead of a period. `asked`: frames are released by `Ask` alone. `deadline_ns`: a frame's time from
-    release to presented. `in_flight`: frames between pose and presented. `in_queue`: released frames that may wait;
-    more are turned away. `queue_timeout_ns`: longest wait there. `hang_ns`: longest that a job may take, or that an
-    idle unit may leave a question unanswered. `latch_ns`: the first stage of a frame begins so late that it is expected
-    to end this long before the second can take it: the pose is newer, and waits less.
+    `period_ns`: a frame is released every so often; 0: as soon as it can be taken.
+    `arrivals_ns`: release times from the start, instead of a period.
+    `asked`: frames are released by `FrameRequest` alone.
+    `latch_ns`: the first stage of a frame begins so late that it is expected to end this long before the second can
+    take it: the pose is newer, and waits less.
+    `deadline_ns`: a frame's time from release to presented.
+    `in_flight`: frames between pose and presented.
+    `in_queue`: released frames that may wait; more are turned away.
+    `queue_timeout_ns`: the longest wait there.
+    `hang_ns`: the longest that a job may take, or that an idle unit may leave a question unanswered.
+    `start_ns`: the longest that a unit may take to start.
+    `max_failures`: in a row, without a finished job between them, after which a unit is given up.
     """
 
     frames: int

@@ -9,12 +9,24 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 from trilane.scheduler.events import Graph, Job
 from trilane.scheduler.stats import NS_PER_MS, ema_range_ms, jitter_ms, real_time_score, summary_ms
 
 ASSIGNED, STARVED, BLOCKED, THROTTLED = range(4)
+
+
+class JobRecord(NamedTuple):
+    """One finished job. Times in ns of the run's clock; `ready` is when its input was there."""
+
+    stage: str
+    unit: str
+    frame: int
+    ready_ns: int
+    dispatch_ns: int
+    begin_ns: int
+    end_ns: int
 
 
 class _UnitBook:

@@ -25,8 +25,8 @@ from trilane.scheduler.events import (
     UnitDied,
     UnitReady,
 )
-from trilane.scheduler.record import Recording
-from trilane.scheduler.result import JobRecord
+from trilane.scheduler.ledger import JobRecord
+from trilane.scheduler.recording import Recording
 
 #: (stage, unit, frame, begin_ns) -> service time in ns.
 Service = Callable[[str, str, int, int], int]
@@ -54,7 +54,10 @@ class _VirtualUnit:
 
 
 class VirtualDriver:
-    """Runs a core in simulated time. `hop_ns`: delay of a message each way; `restart_ns`: a unit's start-up time."""
+    """Runs a core in simulated time.
+
+    `message_delay_ns`: of a message each way. `restart_ns`: a unit's start-up time.
+    """
 
     def __init__(
         self,
@@ -62,7 +65,7 @@ class VirtualDriver:
         settings: Settings,
         service: Service,
         *,
-        hop_ns: int = 0,
+        message_delay_ns: int = 0,
         restart_ns: int = 1_000_000_000,
         faults: Iterable[tuple[int, str]] = (),
         inputs: Iterable[tuple[int, Event]] = (),
@@ -74,7 +77,7 @@ class VirtualDriver:
         self.core = Core(graph, settings)
         self.recording = Recording(graph, settings) if keep else None
         self.jobs: list[JobRecord] = []
-        self._service, self._hop_ns, self._restart_ns = service, hop_ns, restart_ns
+        self._service, self._hop_ns, self._restart_ns = service, message_delay_ns, restart_ns
         self._heap: list[tuple[int, int, int, Event, int]] = []
         self._sequence = 0
         self._units = {unit: _VirtualUnit() for unit in graph.units}

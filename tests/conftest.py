@@ -11,7 +11,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from trilane.avatars.bundle import Manifest, bundle_folder, network_entry, write_bundle
-from trilane.avatars.quantise import Quantised, quantise
+from trilane.training.quantising.quantise import Quantised, quantise
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 

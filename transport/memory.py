@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import psutil
 
 from trilane.errors import TrilaneError
-from trilane.stages.contracts import Packet, SlotLayout, view_packet
+from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 MIB = 1 << 20
 F_ADD_SEALS, F_SEAL_SHRINK, F_SEAL_GROW = 1033, 0x2, 0x4  # <linux/fcntl.h>; the fcntl module of Python 3.11 lacks some

@@ -61,7 +61,7 @@ class Done(NamedTuple):
     id: int
     t_begin_ns: int
     t_end_ns: int
-    t_pose_ns: int
+    t_sampled_ns: int
     figures: dict[str, float]
 
 
@@ -87,7 +87,7 @@ class Closed(NamedTuple):
     """From a unit: the answer to Close."""
 
 
-LifeSign = Ready | Alive
+Heartbeat = Ready | Alive
 Message = RunJob | Isolate | Ping | Close | Ready | Done | Duration | Failed | Alive | Closed
 BUILDING, MEASURING, CLOSING = -1, -2, -3
 

@@ -66,8 +66,8 @@ def _hard_cases(names: list[str], as_json: bool) -> bool:
 
 
 def _scene(scene: str, avatar: str | None, size: str | None, frames: int, names: list[str], as_json: bool) -> bool:
-    from trilane.apps.configure import Request, configure, required_machine
     from trilane.apps.experiments.accuracy import runtime_differences
+    from trilane.stages.configure import Request, configure, required_machine
 
     config = configure(Request(scene, avatar=avatar, size=size, runtime="ort"), Path.cwd()).config
     machine = required_machine()

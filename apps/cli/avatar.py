@@ -53,8 +53,8 @@ def inspect(
     name: Annotated[str, typer.Argument(help="`default` or a bundle's folder.")], json: JsonOption = False
 ) -> None:
     """Say what a bundle holds and how good it is, after every check that a run makes."""
+    from trilane.apps.avatar_facts import bundle_facts
     from trilane.avatars.bundle import load_bundle
-    from trilane.avatars.inspect import bundle_facts
 
     _show(bundle_facts(load_bundle(name)), json)
 
@@ -73,8 +73,8 @@ def network(
     json: JsonOption = False,
 ) -> None:
     """Export an untrained float network: ONNX, static shape, input `tensor`, output `rgba`."""
-    from trilane.avatars.inspect import graph_facts
-    from trilane.scene.schema import shape_buckets
+    from trilane.apps.avatar_facts import graph_facts
+    from trilane.shapes import shape_buckets
 
     try:
         height, width_px = shape_buckets(size if "x" in size else f"{size}x{size}")[0]
@@ -105,11 +105,11 @@ def quantize(
     json: JsonOption = False,
 ) -> None:
     """Quantise a float network to bytes in, bytes out, calibrated on real frames."""
-    from trilane.avatars.equalise import equalised
-    from trilane.avatars.inspect import network_facts
+    from trilane.apps.avatar_facts import network_facts
     from trilane.avatars.network_file import parse_network
-    from trilane.avatars.quantise import quantise
-    from trilane.avatars.sqnr import layer_report
+    from trilane.training.quantising.equalise import equalised
+    from trilane.training.quantising.quantise import quantise
+    from trilane.training.quantising.sqnr import layer_report
 
     if out.resolve() == source.resolve():
         raise BadInputError("--out", str(out), "another file than the float network")
@@ -142,9 +142,9 @@ def calibrations(
     from rich.progress import track
     from rich.table import Table
 
-    from trilane.avatars.calibration import METHODS
-    from trilane.avatars.calibration_table import COUNTS, calibration_table
     from trilane.avatars.network_file import parse_network
+    from trilane.training.quantising.calibration import METHODS
+    from trilane.training.quantising.calibration_table import COUNTS, calibration_table
 
     methods = method or list(METHODS)
     console = stderr_console()
@@ -181,7 +181,7 @@ def split(
     from trilane.avatars.reshape import reshaped
     from trilane.avatars.split import cuts
     from trilane.avatars.split import split as cut_at
-    from trilane.scene.schema import parse_shape
+    from trilane.shapes import parse_shape
 
     if bool(at) != (out is not None):
         raise BadInputError("options", "--at without --out" if at else "--out without --at", "both, or neither")
@@ -225,7 +225,7 @@ def export(
     """Compile an avatar's network for a Snapdragon, without one."""
     from trilane.avatars.bundle import load_bundle
     from trilane.avatars.reshape import reshaped
-    from trilane.scene.schema import parse_shape
+    from trilane.shapes import parse_shape
     from trilane.stages.dsp.runtime import resolve
 
     if not qnn:
@@ -251,8 +251,8 @@ def _untrained(
     except ModuleNotFoundError as error:
         raise MissingPartError("exporting a network needs PyTorch", "pip install 'trilane[train]'") from error
 
-    from trilane.avatars.training.export import export_onnx
-    from trilane.avatars.training.network import UNet
+    from trilane.training.export import export_onnx
+    from trilane.training.network import UNet
 
     torch.manual_seed(seed)
     unet = UNet(encoder, norm, width, channels)
@@ -263,7 +263,7 @@ def _untrained(
 def _frames(path: Path) -> list[Any]:
     import numpy as np
 
-    from trilane.scene.files import read_npy
+    from trilane.files import read_npy
 
     array = read_npy(path, "frames (N, H, W, C)")
     if array.ndim != 4 or array.dtype.kind != "f" or not len(array):

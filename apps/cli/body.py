@@ -1,6 +1,6 @@
 """`trilane body`: look into body files, pose them, build one.
 
-Rule: this file talks to the person; the work is done in `trilane.stages.cpu` and `trilane.avatars.from_anny`.
+Rule: this file talks to the person; the work is done in `trilane.stages.cpu` and `trilane.training.from_anny`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from trilane.stages.cpu.body import ShapedBody
+    from trilane.body.body import ShapedBody
 
 app = typer.Typer(
     rich_markup_mode=None,
@@ -57,8 +57,8 @@ def inspect(
 
 def body_facts(path: Path) -> dict[str, Any]:
     """Counts, size and skinning of a body file. Raises BadInputError."""
-    from trilane.stages.cpu.body import load_body
-    from trilane.stages.cpu.skinning import WEIGHT_COUNTS, weight_error_bound
+    from trilane.body.body import load_body
+    from trilane.body.skinning import WEIGHT_COUNTS, weight_error_bound
 
     body = load_body(path)
     shaped = body.shape()
@@ -93,8 +93,8 @@ def vertices(
     json: JsonOption = False,
 ) -> None:
     """Write the vertices of every pose, with pose blend shapes."""
-    from trilane.scene.files import as_numbers, read_npy
-    from trilane.stages.cpu.body import load_body
+    from trilane.body.body import load_body
+    from trilane.files import as_numbers, read_npy
 
     shaped = load_body(body).shape()
     expected = "poses of shape (T, 165)"
@@ -123,7 +123,7 @@ def _write_vertices(out: Path, shaped: ShapedBody, frames: NDArray[np.float64]) 
     """Write under a temporary name beside `out`, then rename."""
     import numpy as np
 
-    from trilane.stages.cpu.skinning import posed_vertices
+    from trilane.body.skinning import posed_vertices
 
     shape = (len(frames), len(shaped.vertices), 3)
     with _new_file(out, 4 * shape[0] * shape[1] * 3) as part:
@@ -170,7 +170,7 @@ def from_anny(
     json: JsonOption = False,
 ) -> None:
     """Build a body in the SMPL-X layout from the open body model `anny`; takes minutes the first time."""
-    from trilane.avatars.from_anny import write_body
+    from trilane.training.from_anny import write_body
 
     with stderr_console().status("building the body from anny"):
         write_body(out)

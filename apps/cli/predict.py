@@ -12,6 +12,7 @@ import typer
 
 from trilane.apps.cli.console import JsonOption, print_json, stderr_console, stdout_console
 from trilane.errors import BadInputError
+from trilane.units import BURST, SUSTAINED
 
 if TYPE_CHECKING:
     from trilane.hw_profiles.application import Plan, Way
@@ -29,7 +30,6 @@ Examples:
   trilane predict --avatar default --runtime gpu
   trilane predict --table rows.csv --json
 """
-SUSTAINED, BURST = "sustained_high_performance", "burst"
 PLOT_MINUTES = 30.0
 OF_A_FILE = {"encoder", "norm", "size", "channels"}
 #: Option: those that have no effect beside it.

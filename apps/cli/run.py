@@ -1,6 +1,6 @@
 """`trilane run`: a scene through the three units, to a run folder and a table.
 
-Rule: this file talks to the person; what is done is in `trilane.apps.configure` and `trilane.apps.run_job`.
+Rule: this file talks to the person; what is done is in `trilane.stages.configure` and `trilane.apps.run_job`.
 """
 
 from __future__ import annotations
@@ -17,13 +17,14 @@ import typer
 
 from trilane.apps.cli.console import JsonOption, print_json, stderr_console, stdout_console
 from trilane.errors import BadInputError
+from trilane.units import PerformanceProfile
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
     from trilane.apps.pace import Pace
     from trilane.apps.run_job import Hooks, Outcome
-    from trilane.scene.schema import RunConfig
+    from trilane.stages.config import RunConfig
 
 app = typer.Typer(rich_markup_mode=None, add_completion=False)
 
@@ -47,18 +48,6 @@ class PolicyName(StrEnum):
     SEQUENTIAL = "sequential"
     LATEST = "latest"
     DEADLINE = "deadline"
-
-
-class PerformanceName(StrEnum):
-    """SNPE's names of the caps."""
-
-    BURST = "burst"
-    SUSTAINED_HIGH_PERFORMANCE = "sustained_high_performance"
-    HIGH_PERFORMANCE = "high_performance"
-    BALANCED = "balanced"
-    LOW_BALANCED = "low_balanced"
-    POWER_SAVER = "power_saver"
-    LOW_POWER_SAVER = "low_power_saver"
 
 
 @contextmanager
@@ -136,7 +125,7 @@ def run(
         float, typer.Option(min=0, max=1000, help="Sample poses late: ready so many ms before the raster; 0: at once.")
     ] = 0.0,
     performance_profile: Annotated[
-        PerformanceName | None, typer.Option(help="Cap of the units: duty cycles of the host profile's corners.")
+        PerformanceProfile | None, typer.Option(help="Cap of the units: duty cycles of the host profile's corners.")
     ] = None,
     baseline: Annotated[int, typer.Option(min=0, help="Frames of the sequential run beside it; 0: none.")] = 60,
     out: Annotated[Path | None, typer.Option(help="Run folder to write; runs/TIME-SCENE when not given.")] = None,
@@ -146,9 +135,9 @@ def run(
 
     The folder holds report.json, video.mp4, contact.png, trace.pftrace (open it at ui.perfetto.dev) and events.jsonl.
     """
-    from trilane.apps.configure import Request, configure, required_machine
     from trilane.apps.run_folder import default_place
     from trilane.apps.run_job import Plan, run_to_folder
+    from trilane.stages.configure import Request, configure, required_machine
 
     request = Request(
         scene, motion, camera, background, avatar, frames, size, runtime, hud, skinning, tuple(split or ())

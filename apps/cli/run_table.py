@@ -8,13 +8,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
+from trilane.units import UNITS
+
 if TYPE_CHECKING:
     from rich.table import Table
 
 DASH = "–"
 IDLE = ("starved", "blocked", "throttled", "overhead")
 PERCENTILES = ("mean", "p50", "p90", "p95", "p99", "max")
-UNITS = ("cpu", "gpu", "dsp")
 
 Run = Mapping[str, Any]
 

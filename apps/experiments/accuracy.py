@@ -11,19 +11,20 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from trilane.arrays import U8
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.reshape import reshaped
 from trilane.errors import BadInputError
-from trilane.scene.schema import RunConfig, Shape
-from trilane.scheduler.run import MAX_CHANNELS
-from trilane.stages.contracts import Packet, SlotLayout, posed_vertices_bytes, view_packet
+from trilane.pipeline.run import MAX_CHANNELS
+from trilane.shapes import Shape
+from trilane.stages.config import RunConfig
 from trilane.stages.cpu.pose import PoseStage
 from trilane.stages.dsp.runtime import Binding, RuntimeOptions, load_runtime
 from trilane.stages.gpu import unit as gpu
+from trilane.stages.packets import pose_dtype, posed_vertices_bytes
+from trilane.transport.packets import Packet, SlotLayout, view_packet
 
-U8 = NDArray[np.uint8]
 #: Of 255: bounds on the difference of any two runtimes.
 MEAN_BOUND, LARGEST_BOUND = 0.5, 4
 MAX_FRAMES = 10_000
@@ -104,10 +105,10 @@ def _tensors(config: RunConfig, frames: int) -> Iterator[tuple[int, U8]]:
     for frame in (index * total // count for index in range(count)):
         pose.run(frame, None, 0)
         raster.run(frame, 0, 0)
-        height, width = posed.pose["tensor_shape"].tolist()
+        height, width = posed.header["tensor_shape"].tolist()
         yield frame, drawn.payload[: height * width * channels].reshape(height, width, channels)
 
 
 def _packet(avatars: int, payload: int) -> Packet:
-    layout = SlotLayout(avatars, payload)
+    layout = SlotLayout(pose_dtype(avatars), payload)
     return view_packet(memoryview(bytearray(layout.slot_bytes)), layout)

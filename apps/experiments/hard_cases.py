@@ -12,14 +12,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from trilane.arrays import F32
 from trilane.avatars.network_file import NetworkFile
-from trilane.avatars.quantise import quantise
 from trilane.errors import MissingPartError
 from trilane.stages.dsp.runtime import RuntimeOptions, load_runtime
+from trilane.training.quantising.quantise import quantise
 
-F32 = NDArray[np.float32]
 SHAPE = (64, 64, 4)
 WIDTH = 8
 OUTLIER = 100.0
@@ -58,8 +57,8 @@ def make_pair(name: str) -> Pair:
         import torch
     except ImportError:
         raise MissingPartError("hard cases need PyTorch", "pip install 'trilane[train]'") from None
-    from trilane.avatars.training.export import export_onnx
-    from trilane.avatars.training.network import UNet
+    from trilane.training.export import export_onnx
+    from trilane.training.network import UNet
 
     norm, outlier, bounds = NETWORKS[name]
     torch.manual_seed(0)

@@ -9,15 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from trilane.arrays import F64
 from trilane.scene.motion.base import Wrap, bracket, wrapped_time
 from trilane.scene.rotations import matrix_from_quat, slerp
 
-Array = NDArray[np.float64]
 
-
-def view_from_pose(turn: Array, place: Array) -> Array:
+def view_from_pose(turn: F64, place: F64) -> F64:
     """World to camera (4, 4) of a camera whose axes are the columns of `turn` (3, 3), standing at `place` (3,)."""
     view = np.eye(4)
     view[:3, :3] = turn.T
@@ -25,7 +23,7 @@ def view_from_pose(turn: Array, place: Array) -> Array:
     return view
 
 
-def look_at(place: Array, target: Array) -> Array:
+def look_at(place: F64, target: F64) -> F64:
     """World to camera (4, 4) of a level camera at `place` (3,) that looks at `target` (3,), not straight up or down."""
     back = place - target
     back = back / np.linalg.norm(back)
@@ -34,7 +32,7 @@ def look_at(place: Array, target: Array) -> Array:
     return view_from_pose(np.stack([right, np.cross(back, right), back], axis=1), place)
 
 
-def projection_matrix(fov_y_deg: float, aspect: float, near_m: float, far_m: float) -> Array:
+def projection_matrix(fov_y_deg: float, aspect: float, near_m: float, far_m: float) -> F64:
     """OpenGL perspective matrix (4, 4); `aspect` is width over height."""
     f = 1 / np.tan(np.radians(fov_y_deg) / 2)
     depth = near_m - far_m
@@ -65,9 +63,9 @@ class CameraPath:
     the source was taken for and what was mended. `recorded`: the path knows nothing of the scene and is to be placed.
     """
 
-    times_s: Array
-    quats: Array
-    places: Array
+    times_s: F64
+    quats: F64
+    places: F64
     lens: Lens
     notes: tuple[str, ...]
     wrap: Wrap = Wrap.BOUNCE
@@ -77,16 +75,16 @@ class CameraPath:
     def duration_s(self) -> float:
         return float(self.times_s[-1])
 
-    def pose(self, t_s: float) -> tuple[Array, Array]:
+    def pose(self, t_s: float) -> tuple[F64, F64]:
         """Turn (3, 3) and place (3,) of the camera at `t_s`."""
         i, j, fraction = bracket(self.times_s, wrapped_time(t_s, self.duration_s, self.wrap))
         turn = matrix_from_quat(slerp(self.quats[i], self.quats[j], fraction))
         return turn, self.places[i] + (self.places[j] - self.places[i]) * fraction
 
-    def sample(self, t_s: float) -> Array:
+    def sample(self, t_s: float) -> F64:
         """World to camera (4, 4) at `t_s`."""
         return view_from_pose(*self.pose(t_s))
 
-    def projection(self, aspect: float) -> Array:
+    def projection(self, aspect: float) -> F64:
         """OpenGL clip matrix (4, 4) for a picture of `aspect` width over height."""
         return projection_matrix(self.lens.fov_y_deg, aspect, self.lens.near_m, self.lens.far_m)

@@ -8,14 +8,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from trilane.scene.camera.base import CameraPath, Lens, look_at
 from trilane.scene.motion.base import Wrap
 from trilane.scene.rotations import quat_from_matrix
 from trilane.scene.schema import CameraSpec
-
-Array = NDArray[np.float64]
 
 FOV_Y_DEG = 40.0
 RATE_HZ = 30

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from trilane.errors import BadInputError
+from trilane.files import require_file
 from trilane.scene.camera import arkit, tum
 from trilane.scene.camera.arkit import load_arkit
 from trilane.scene.camera.base import CameraPath
@@ -19,7 +20,6 @@ from trilane.scene.camera.nerf import load_nerf
 from trilane.scene.camera.recorded import RawCamera, finish
 from trilane.scene.camera.table import column_count
 from trilane.scene.camera.tum import load_tum
-from trilane.scene.files import require_file
 from trilane.scene.schema import CameraSpec
 
 PREFIX = "builtin:"

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
+from trilane.files import read_text
 from trilane.scene.camera.recorded import RawCamera
-from trilane.scene.files import read_text
 
 EXPECTED = "a NeRF transforms.json: `frames`, each with a 4x4 `transform_matrix`"
 FILM_RATE_HZ = 30.0

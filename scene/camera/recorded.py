@@ -11,12 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from trilane.arrays import F64
 from trilane.scene.camera.base import CameraPath, Lens
 from trilane.scene.motion.repair import kept_samples
 from trilane.scene.rotations import about, quat_from_matrix, shortest_turn
 from trilane.scene.schema import CameraSpec
-
-Array = NDArray[np.float64]
 
 UP = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 #: Below this cosine between the picture's mean up and the format's usual up, the usual up is not believed.
@@ -24,7 +23,7 @@ BELIEVED = 0.3
 #: Largest |R^T R - 1| of a rotation matrix that a log may have.
 SKEW = 0.05
 #: Optical axes (x right, y down, z ahead) to OpenGL axes.
-OPENGL_FROM_OPTICAL: Array = np.diag([1.0, -1.0, -1.0])
+OPENGL_FROM_OPTICAL: F64 = np.diag([1.0, -1.0, -1.0])
 
 
 @dataclass(frozen=True)
@@ -35,9 +34,9 @@ class RawCamera:
     level, `portrait_fov_y_deg`: held upright; `lens`: where these come from.
     """
 
-    times_s: Array
-    turns: Array
-    places: Array
+    times_s: F64
+    turns: F64
+    places: F64
     usual_up: str
     fov_y_deg: float
     portrait_fov_y_deg: float
@@ -66,7 +65,7 @@ def finish(raw: RawCamera, where: str, spec: CameraSpec) -> CameraPath:
     return CameraPath(times - times[0], quats, places @ world.T, lens, notes)
 
 
-def _sound(turns: Array, places: Array) -> NDArray[np.bool_]:
+def _sound(turns: F64, places: F64) -> NDArray[np.bool_]:
     """Poses (N,) that are finite and whose matrix is a rotation."""
     finite = np.asarray(np.isfinite(turns).all(axis=(1, 2)) & np.isfinite(places).all(axis=1))
     safe = np.where(finite[:, None, None], turns, 0.0)
@@ -76,7 +75,7 @@ def _sound(turns: Array, places: Array) -> NDArray[np.bool_]:
         return np.asarray(finite & rotation & (np.abs(np.where(finite[:, None], places, 0.0)) < 1e5).all(axis=1))
 
 
-def _upright(turns: Array, usual: str) -> tuple[tuple[float, float, float], int, str]:
+def _upright(turns: F64, usual: str) -> tuple[tuple[float, float, float], int, str]:
     """Up axis of the world, quarter turns of the picture, and a note.
 
     The picture is turned so that its up is nearest to the world's; when even then they disagree, the world's up is

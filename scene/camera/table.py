@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
-from trilane.scene.files import read_text
+from trilane.files import read_text
 
 MAX_ROWS = 1_000_000
 

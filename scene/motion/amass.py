@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
-from trilane.scene.files import as_numbers, read_npz
+from trilane.files import as_numbers, read_npz
 from trilane.scene.motion.base import JOINTS, REST_PELVIS, RawMotion
 from trilane.scene.motion.smplx_npy import hands_note
 

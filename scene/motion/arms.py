@@ -6,11 +6,9 @@ Rule: side is +1 for left and -1 for right; turns are local to the parent, +X le
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from trilane.arrays import F64
 from trilane.scene.rotations import about, normalised
-
-Array = NDArray[np.float64]
 
 #: How far an arm hangs down from the T pose, radians, collar not counted.
 HANG = 1.27
@@ -28,7 +26,7 @@ CURL = {
 }
 
 
-def hanging_arm(side: int, swing: Array) -> tuple[Array, Array, Array]:
+def hanging_arm(side: int, swing: F64) -> tuple[F64, F64, F64]:
     """Shoulder, elbow and wrist (T, 3, 3) of an arm at the side, swung back by `swing` (T,) radians."""
     shoulder = about(0, swing + 0.03) @ about(2, np.array(-side * HANG))
     bend = ELBOW_EASE + np.clip(-swing, 0, None) * 0.7 + 0.1 * np.abs(swing)
@@ -37,7 +35,7 @@ def hanging_arm(side: int, swing: Array) -> tuple[Array, Array, Array]:
     return shoulder, elbow, wrist
 
 
-def waving_arm(wave: Array) -> tuple[Array, Array, Array]:
+def waving_arm(wave: F64) -> tuple[F64, F64, F64]:
     """Shoulder, elbow and wrist (T, 3, 3) of the right arm, palm to the viewer; `wave` (T,) in [-1, 1] is outward."""
     upper = normalised(np.array(UPPER_ARM) + 0.05 * wave[:, None] * np.array([-1.0, 0.5, 0.0]))
     fore = normalised(np.array(FOREARM) + WAVE_REACH * wave[:, None] * np.array([-1.0, 0.0, 0.0]))
@@ -48,7 +46,7 @@ def waving_arm(wave: Array) -> tuple[Array, Array, Array]:
     return shoulder, about(1, bend), about(1, np.full(len(wave), -0.1)) @ wrist
 
 
-def relaxed_hands(side: int) -> Array:
+def relaxed_hands(side: int) -> F64:
     """Axis-angle (15, 3) of one hand's fingers, SMPL-X order: index, middle, pinky, ring, thumb."""
     fingers = [[(0.0, 0.0, -side * angle) for angle in CURL[name]] for name in ("index", "middle", "pinky", "ring")]
     thumb = [(0.1, -side * 0.15, 0.0), (0.0, side * 0.1, 0.0), (0.0, side * 0.12, 0.0)]

@@ -10,15 +10,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from trilane.arrays import F64
 from trilane.scene.rotations import quat_from_rotvec, rotvec_from_quat, slerp
-
-Array = NDArray[np.float64]
 
 JOINTS = 55
 #: Where the pelvis of the published neutral SMPL-X body is at rest, metres: AMASS files give the shift from there.
-REST_PELVIS: Array = np.array([0.003, -0.351, 0.012])
+REST_PELVIS: F64 = np.array([0.003, -0.351, 0.012])
 
 
 class Wrap(enum.Enum):
@@ -38,7 +36,7 @@ def wrapped_time(t_s: float, length_s: float, wrap: Wrap) -> float:
     return min(phase, 2 * length_s - phase)
 
 
-def bracket(times_s: Array, t_s: float) -> tuple[int, int, float]:
+def bracket(times_s: F64, t_s: float) -> tuple[int, int, float]:
     """Neighbours `i <= j` of `t_s` in increasing `times_s` (T,) and the fraction of the way from i to j."""
     last = len(times_s) - 1
     j = min(max(int(np.searchsorted(times_s, t_s, side="right")), 1), last) if last else 0
@@ -57,10 +55,10 @@ class RawMotion:
     ankle of the recorded person, when known.
     """
 
-    times_s: Array
-    poses: Array
-    translation: Array | None
-    betas: Array | None
+    times_s: F64
+    poses: F64
+    translation: F64 | None
+    betas: F64 | None
     up: str
     notes: tuple[str, ...]
     leg_m: float | None = None
@@ -76,10 +74,10 @@ class Motion:
     is scaled to another body, or None. `travels`: whether the translation was recorded.
     """
 
-    times_s: Array
-    poses: Array
-    translation: Array
-    betas: Array | None
+    times_s: F64
+    poses: F64
+    translation: F64
+    betas: F64 | None
     notes: tuple[str, ...]
     wrap: Wrap
     leg_m: float | None = None
@@ -90,10 +88,10 @@ class Motion:
         return float(self.times_s[-1])
 
     @cached_property
-    def _quats(self) -> Array:
+    def _quats(self) -> F64:
         return quat_from_rotvec(self.poses)
 
-    def sample(self, t_s: float) -> tuple[Array, Array]:
+    def sample(self, t_s: float) -> tuple[F64, F64]:
         """Pose (55, 3) and translation (3,) at `t_s`: quaternions by slerp, translation linearly."""
         i, j, fraction = bracket(self.times_s, wrapped_time(t_s, self.duration_s, self.wrap))
         pose = rotvec_from_quat(slerp(self._quats[i], self._quats[j], fraction))

@@ -8,15 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from trilane.arrays import F64
+from trilane.body.joints import JOINT_INDEX
 from trilane.scene.motion.arms import hanging_arm, relaxed_hands, waving_arm
 from trilane.scene.motion.base import JOINTS, Motion, Wrap
 from trilane.scene.motion.steps import Build, FootTrack, Swing, Walker, blurred, smooth_step, solve_leg
 from trilane.scene.rotations import about, matrix_from_quat, quat_from_matrix, rotvec_from_matrix, slerp
-from trilane.stages.cpu.joints import JOINT_INDEX
-
-Array = NDArray[np.float64]
 
 RATE_HZ = 60
 #: An adult of 1.76 m; other bodies scale the translation by their legs.
@@ -85,7 +83,7 @@ def t_pose() -> Motion:
 BUILTIN: dict[str, Callable[[], Motion]] = {"walk-wave-turn": walk_wave_turn, "idle": idle, "t-pose": t_pose}
 
 
-def _closed(times: Array, poses: Array, places: Array, what: str) -> Motion:
+def _closed(times: F64, poses: F64, places: F64, what: str) -> Motion:
     """A loop whose last frame is its first."""
     times = np.append(times, len(times) / RATE_HZ)
     poses, places = np.concatenate([poses, poses[:1]]), np.concatenate([places, places[:1]])
@@ -93,13 +91,13 @@ def _closed(times: Array, poses: Array, places: Array, what: str) -> Motion:
     return Motion(times, poses, places, None, notes, Wrap.LOOP, BUILD.leg_m, False)
 
 
-def _route(times: Array) -> tuple[Array, Array, Array]:
+def _route(times: F64) -> tuple[F64, F64, F64]:
     z = START_Z_M + sum(far * _eased((times - start) / (end - start)) for start, end, far in WALKS)
     heading = sum(angle * smooth_step((times - start) / (end - start)) for start, end, angle in TURNS)
     return np.zeros_like(times), np.asarray(z), np.asarray(heading)
 
 
-def _eased(x: Array) -> Array:
+def _eased(x: F64) -> F64:
     """0 to 1, at constant speed but for a soft fifth at either end."""
     ramp = 0.22
     s = np.clip(x, 0.0, 1.0)
@@ -115,8 +113,8 @@ def _standing(side: int, count: int) -> FootTrack:
 
 
 def _body(
-    times: Array, left: FootTrack, right: FootTrack, wave: bool = True, shift_m: Array | float = 0.0
-) -> tuple[Array, Array]:
+    times: F64, left: FootTrack, right: FootTrack, wave: bool = True, shift_m: F64 | float = 0.0
+) -> tuple[F64, F64]:
     """Poses (T, 55, 3) and pelvis places (T, 3) over two feet."""
     heading = blurred_heading(left, right)
     ahead = _along(heading, left.ankle - right.ankle)
@@ -138,7 +136,7 @@ def _body(
     return poses, place
 
 
-def blurred_heading(left: FootTrack, right: FootTrack) -> Array:
+def blurred_heading(left: FootTrack, right: FootTrack) -> F64:
     """The pelvis's heading (T,), between the feet's; the cycle may end whole turns on."""
     sines, cosines = (f(left.heading) + f(right.heading) for f in (np.sin, np.cos))
     mean = np.unwrap(np.arctan2(sines, cosines))
@@ -146,17 +144,17 @@ def blurred_heading(left: FootTrack, right: FootTrack) -> Array:
     return blurred(mean - drift, 6) + drift
 
 
-def _velocity(foot: FootTrack) -> Array:
+def _velocity(foot: FootTrack) -> F64:
     return (np.roll(foot.ankle, -1, axis=0) - np.roll(foot.ankle, 1, axis=0)) * RATE_HZ / 2
 
 
-def _along(heading: Array, vectors: Array) -> Array:
+def _along(heading: F64, vectors: F64) -> F64:
     return np.sin(heading) * vectors[:, 0] + np.cos(heading) * vectors[:, 2]
 
 
 def _pelvis_place(
-    left: FootTrack, right: FootTrack, heading: Array, pelvis: Array, weight: Array, shift_m: Array | float
-) -> Array:
+    left: FootTrack, right: FootTrack, heading: F64, pelvis: F64, weight: F64, shift_m: F64 | float
+) -> F64:
     """Between the feet, over the one that carries, and low enough for both legs to reach."""
     between = blurred((left.ankle + right.ankle) / 2, 7)
     aside = 0.028 * weight + shift_m
@@ -169,12 +167,12 @@ def _pelvis_place(
     return place
 
 
-def _eroded(values: Array, reach: int) -> Array:
+def _eroded(values: F64, reach: int) -> F64:
     """Cyclic running minimum (T,) over `reach` samples either side."""
     return np.asarray(np.min([np.roll(values, k) for k in range(-reach, reach + 1)], axis=0))
 
 
-def _height_within_reach(side: int, foot: FootTrack, place: Array, pelvis: Array) -> Array:
+def _height_within_reach(side: int, foot: FootTrack, place: F64, pelvis: F64) -> F64:
     """Greatest pelvis height (T,) at which a leg of REACH times its length touches its ankle."""
     hip = pelvis @ BUILD.side(BUILD.hip, side)
     flat = foot.ankle - place - hip
@@ -182,7 +180,7 @@ def _height_within_reach(side: int, foot: FootTrack, place: Array, pelvis: Array
     return np.asarray(foot.ankle[:, 1] + np.sqrt((BUILD.leg_m * REACH) ** 2 - level**2) - hip[:, 1])
 
 
-def _trunk(poses: Array, times: Array, pelvis_yaw: Array, weight: Array, pace: Array) -> None:
+def _trunk(poses: F64, times: F64, pelvis_yaw: F64, weight: F64, pace: F64) -> None:
     """Shoulders against the hips, a lean with the pace, breath; the head stays level and ahead."""
     breath = np.sin(2 * np.pi * times / (times[-1] + times[1]) * round(times[-1] / 3.6))
     for name, share in (("spine1", 0.25), ("spine2", 0.35), ("spine3", 0.4)):
@@ -196,7 +194,7 @@ def _trunk(poses: Array, times: Array, pelvis_yaw: Array, weight: Array, pace: A
     poses[:, JOINT_INDEX["head"], 0] = 0.01 * breath - 0.03 * pace
 
 
-def _arms(poses: Array, times: Array, stride: Array, wave: bool) -> None:
+def _arms(poses: F64, times: F64, stride: F64, wave: bool) -> None:
     """Arms against the legs; the right one waves."""
     lag = np.roll(stride, 3)
     up = _wave_weight(times) if wave else np.zeros_like(times)
@@ -219,15 +217,15 @@ def _arms(poses: Array, times: Array, stride: Array, wave: bool) -> None:
     collar[:, 2] -= 0.18 * up
 
 
-def _wave_weight(times: Array) -> Array:
+def _wave_weight(times: F64) -> F64:
     start, up, lower, down = WAVE_S
     return np.asarray(smooth_step((times - start) / (up - start)) - smooth_step((times - lower) / (down - lower)))
 
 
-def _between(low: Array, high: Array, weight: Array) -> Array:
+def _between(low: F64, high: F64, weight: F64) -> F64:
     start, end = quat_from_matrix(low), quat_from_matrix(high)
     return matrix_from_quat(slerp(start, end, weight))
 
 
-def _set(poses: Array, joint: str, turn: Array) -> None:
+def _set(poses: F64, joint: str, turn: F64) -> None:
     poses[:, JOINT_INDEX[joint]] = rotvec_from_matrix(turn)

@@ -11,13 +11,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from trilane.arrays import F64
 from trilane.errors import BadInputError
-from trilane.scene.files import read_text
+from trilane.files import read_text
 from trilane.scene.rotations import about
-
-Array = NDArray[np.float64]
 
 EXPECTED = "a BVH file: HIERARCHY, MOTION, Frames, Frame Time, one line of channels a frame"
 MAX_JOINTS = 1000
@@ -32,10 +30,10 @@ class BvhJoint:
 
     name: str
     parent: int
-    offset: Array
+    offset: F64
     channels: tuple[str, ...] = ()
     first: int = 0
-    tip: Array | None = None
+    tip: F64 | None = None
 
 
 @dataclass(frozen=True)
@@ -43,10 +41,10 @@ class Bvh:
     """`frames`: (T, channels) in file units and degrees. `frame_time_s`: of one frame."""
 
     joints: list[BvhJoint]
-    frames: Array
+    frames: F64
     frame_time_s: float
 
-    def forward(self) -> tuple[Array, Array]:
+    def forward(self) -> tuple[F64, F64]:
         """Global rotations (T, J, 3, 3) and positions (T, J, 3) in file units of every joint."""
         count = len(self.frames)
         turns, places = np.empty((count, len(self.joints), 3, 3)), np.empty((count, len(self.joints), 3))
@@ -60,7 +58,7 @@ class Bvh:
                 places[:, index] = places[:, joint.parent] + (above @ shift[..., None])[..., 0]
         return turns, places
 
-    def _local(self, joint: BvhJoint) -> tuple[Array, Array]:
+    def _local(self, joint: BvhJoint) -> tuple[F64, F64]:
         turn = np.broadcast_to(np.eye(3), (len(self.frames), 3, 3))
         shift = np.tile(joint.offset, (len(self.frames), 1))
         for column, channel in enumerate(joint.channels, joint.first):
@@ -104,7 +102,7 @@ class _Words:
             raise self.error(repr(word), "a finite number")
         return value
 
-    def offset(self) -> Array:
+    def offset(self) -> F64:
         self.want("OFFSET")
         return np.array([self.number() for _ in range(3)])
 
@@ -190,7 +188,7 @@ def _header(path: Path, lines: list[str], index: int, key: str) -> float:
         raise BadInputError(where, repr(text), f"`{key} NUMBER`") from None
 
 
-def _rows(path: Path, lines: list[str], start: int, count: int, columns: int) -> Array:
+def _rows(path: Path, lines: list[str], start: int, count: int, columns: int) -> F64:
     numbered = [(k + 1, line) for k, line in enumerate(lines[start:], start) if line.strip()]
     if len(numbered) < count:
         raise BadInputError(f"{path}, line {len(lines)}", f"{len(numbered)} frames, then the end", f"{count} frames")

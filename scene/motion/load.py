@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from trilane.errors import BadInputError
-from trilane.scene.files import require_file
+from trilane.files import require_file
 from trilane.scene.motion.amass import load_amass
 from trilane.scene.motion.base import Motion, RawMotion
 from trilane.scene.motion.builtin import BUILTIN

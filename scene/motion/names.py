@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 
-from trilane.stages.cpu.joints import JOINT_NAMES
+from trilane.body.joints import JOINT_NAMES
 
 
 def plain(name: str) -> str:

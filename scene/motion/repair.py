@@ -9,15 +9,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from trilane.arrays import F64
 from trilane.errors import BadInputError
-
-Array = NDArray[np.float64]
 
 #: An interval this many times the median is reported as a gap.
 GAP = 1.5
 
 
-def kept_samples(where: str, times_s: Array, sound: NDArray[np.bool_]) -> tuple[NDArray[np.intp], tuple[str, ...]]:
+def kept_samples(where: str, times_s: F64, sound: NDArray[np.bool_]) -> tuple[NDArray[np.intp], tuple[str, ...]]:
     """Indices to keep of samples at `times_s` (T,) of which `sound` (T,) are readable, and notes on the rest.
 
     Raises BadInputError when less than half of the samples remain.
@@ -43,7 +42,7 @@ def kept_samples(where: str, times_s: Array, sound: NDArray[np.bool_]) -> tuple[
     return increasing, (*notes, *_gap_notes(times_s[increasing]))
 
 
-def _strictly_increasing(times_s: Array) -> NDArray[np.bool_]:
+def _strictly_increasing(times_s: F64) -> NDArray[np.bool_]:
     """Marks the times that are later than every kept one before them."""
     highest = np.maximum.accumulate(times_s)
     keep = np.ones(len(times_s), dtype=bool)
@@ -51,7 +50,7 @@ def _strictly_increasing(times_s: Array) -> NDArray[np.bool_]:
     return keep
 
 
-def _gap_notes(times_s: Array) -> tuple[str, ...]:
+def _gap_notes(times_s: F64) -> tuple[str, ...]:
     steps = np.diff(times_s)
     if len(steps) < 2:
         return ()

@@ -10,16 +10,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from trilane.arrays import F64
+from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS
 from trilane.errors import BadInputError
 from trilane.scene.motion.base import JOINTS, RawMotion
 from trilane.scene.motion.bvh import BvhJoint, load_bvh
 from trilane.scene.motion.names import DIALECTS, plain
 from trilane.scene.rotations import rotvec_from_matrix, shortest_turn
-from trilane.stages.cpu.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS
-
-Array = NDArray[np.float64]
 
 #: Metres in one unit; `cmu` is the unit of the CMU recordings, 1/0.45 inches.
 UNITS_M = {"m": 1.0, "cm": 0.01, "in": 0.0254, "cmu": 0.0254 / 0.45}
@@ -93,7 +91,7 @@ def match_names(path: Path, names: list[str]) -> tuple[str, dict[str, int]]:
     return best, found[best]
 
 
-def _rest_positions(joints: list[BvhJoint]) -> Array:
+def _rest_positions(joints: list[BvhJoint]) -> F64:
     """Positions (J, 3) in the file's zero pose."""
     places = np.zeros((len(joints), 3))
     for index, joint in enumerate(joints):
@@ -101,7 +99,7 @@ def _rest_positions(joints: list[BvhJoint]) -> Array:
     return places
 
 
-def _leg(offsets: Array, where: dict[str, int], side: str) -> float:
+def _leg(offsets: F64, where: dict[str, int], side: str) -> float:
     hip, knee, ankle = (offsets[where[f"{side}_{part}"]] for part in ("hip", "knee", "ankle"))
     return float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
 
@@ -115,10 +113,10 @@ def _unit(leg: float, units: str) -> tuple[str, float]:
     return f"unknown, scaled to a leg of {USUAL_LEG_M} m", USUAL_LEG_M / leg
 
 
-def _rest_turns(joints: list[BvhJoint], offsets: Array, where: dict[str, int]) -> dict[str, Array]:
+def _rest_turns(joints: list[BvhJoint], offsets: F64, where: dict[str, int]) -> dict[str, F64]:
     """{SMPL-X name: matrix (3, 3) from the SMPL-X rest frame to the file's zero-pose frame}."""
     frame = _body_frame(offsets, where)
-    turns: dict[str, Array] = {}
+    turns: dict[str, F64] = {}
     for index, name in enumerate(JOINT_NAMES):
         above = turns.get(JOINT_NAMES[JOINT_PARENTS[index]], frame) if index else frame
         turns[name] = above if name in LIMBS or index >= 25 else frame
@@ -129,7 +127,7 @@ def _rest_turns(joints: list[BvhJoint], offsets: Array, where: dict[str, int]) -
     return turns
 
 
-def _file_bone(name: str, joints: list[BvhJoint], offsets: Array, where: dict[str, int]) -> Array | None:
+def _file_bone(name: str, joints: list[BvhJoint], offsets: F64, where: dict[str, int]) -> F64 | None:
     """Direction (3,) of the bone in the file's zero pose, or None when the file does not tell."""
     if name not in where:
         return None
@@ -139,7 +137,7 @@ def _file_bone(name: str, joints: list[BvhJoint], offsets: Array, where: dict[st
     return bone if np.linalg.norm(bone) > 1e-6 else None
 
 
-def _furthest_below(index: int, joints: list[BvhJoint], offsets: Array) -> Array:
+def _furthest_below(index: int, joints: list[BvhJoint], offsets: F64) -> F64:
     """From a joint to the furthest end site below it, (3,)."""
     below = {index}
     best = np.zeros(3)
@@ -152,7 +150,7 @@ def _furthest_below(index: int, joints: list[BvhJoint], offsets: Array) -> Array
     return best
 
 
-def _body_frame(offsets: Array, where: dict[str, int]) -> Array:
+def _body_frame(offsets: F64, where: dict[str, int]) -> F64:
     """Columns: the body's left, up and forward in the file's zero pose; snapped to the axes when within 20 degrees."""
     hips = (offsets[where["left_hip"]] + offsets[where["right_hip"]]) / 2
     left = offsets[where["left_hip"]] - offsets[where["right_hip"]]
@@ -166,9 +164,9 @@ def _body_frame(offsets: Array, where: dict[str, int]) -> Array:
     return np.asarray(snapped if close else frame)
 
 
-def _local_turns(turns: Array, rest: dict[str, Array], where: dict[str, int]) -> Array:
+def _local_turns(turns: F64, rest: dict[str, F64], where: dict[str, int]) -> F64:
     """Axis-angle (T, 55, 3) of the SMPL-X joints from the file's global turns (T, J, 3, 3)."""
-    globals_: list[Array] = []
+    globals_: list[F64] = []
     poses = np.zeros((len(turns), JOINTS, 3))
     for index, name in enumerate(JOINT_NAMES):
         above = globals_[JOINT_PARENTS[index]] if index else np.broadcast_to(np.eye(3), (len(turns), 3, 3))

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
-from trilane.scene.files import as_numbers, read_npy
+from trilane.files import as_numbers, read_npy
 from trilane.scene.motion.base import JOINTS, RawMotion
 from trilane.scene.rotations import matrix_from_rotvec, rotvec_from_matrix
 

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from trilane.arrays import F64
 from trilane.scene.rotations import about, normalised
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -34,7 +33,7 @@ class Build:
         """Hip to knee to ankle."""
         return float(np.linalg.norm(self.knee) + np.linalg.norm(self.ankle))
 
-    def side(self, offset: tuple[float, float, float], side: int) -> Array:
+    def side(self, offset: tuple[float, float, float], side: int) -> F64:
         """`offset` for side +1 (left) or -1 (right)."""
         return np.array([offset[0] * side, offset[1], offset[2]])
 
@@ -49,26 +48,26 @@ class Swing:
 
 
 #: t (T,) -> x, z, heading, each (T,): where the walker would stand.
-Route = Callable[[Array], tuple[Array, Array, Array]]
+Route = Callable[[F64], tuple[F64, F64, F64]]
 
 
 @dataclass(frozen=True)
 class FootTrack:
     """`ankle` (T, 3), `heading` (T,), `pitch` (T,) heel-up positive, `load` (T,) 1 on the ground and 0 in the air."""
 
-    ankle: Array
-    heading: Array
-    pitch: Array
-    load: Array
+    ankle: F64
+    heading: F64
+    pitch: F64
+    load: F64
 
 
-def smooth_step(x: Array) -> Array:
+def smooth_step(x: F64) -> F64:
     """0 to 1 with flat ends and flat slopes: 6x^5 - 15x^4 + 10x^3."""
     s = np.clip(x, 0.0, 1.0)
     return np.asarray(s * s * s * (s * (6 * s - 15) + 10))
 
 
-def blurred(values: Array, sigma: float) -> Array:
+def blurred(values: F64, sigma: float) -> F64:
     """Cyclic Gaussian blur of (T, ...) along time, `sigma` in samples."""
     frequency = np.fft.rfftfreq(len(values)).reshape(-1, *[1] * (values.ndim - 1))
     gain = np.exp(-2 * (np.pi * sigma * frequency) ** 2)
@@ -86,7 +85,7 @@ class Walker:
     roll_s: float = 0.2
     plant_s: float = 0.1
 
-    def foot(self, side: int, times_s: Array) -> FootTrack:
+    def foot(self, side: int, times_s: F64) -> FootTrack:
         """The track of one foot at `times_s` (T,)."""
         swings = sorted((s for s in self.swings if s.side == side), key=lambda s: s.start_s)
         tracks = [self._step(swings, k, times_s) for k in range(len(swings))]
@@ -97,7 +96,7 @@ class Walker:
         columns = np.stack([table for _, table in tracks])[pick, np.arange(len(times_s))]
         return FootTrack(columns[:, :3], columns[:, 3], columns[:, 4], columns[:, 5])
 
-    def _step(self, swings: list[Swing], k: int, times_s: Array) -> tuple[NDArray[np.bool_], Array]:
+    def _step(self, swings: list[Swing], k: int, times_s: F64) -> tuple[NDArray[np.bool_], F64]:
         """The part of the cycle from swing k's start to the next swing's start: who owns it, and the table (T, 6)."""
         swing, after = swings[k], swings[(k + 1) % len(swings)]
         before = swings[k - 1]
@@ -141,7 +140,7 @@ class Walker:
         size = float(np.clip(ahead / 0.9, 0.0, 1.0))
         return 0.12 + 0.55 * size, -0.28 * size
 
-    def _ankle(self, place: Array, pitch: Array) -> Array:
+    def _ankle(self, place: F64, pitch: F64) -> F64:
         """Ankle (T, 3) of a foot on the ground at `place` x, z, heading: rolls over the ball, plants on the heel."""
         turn = about(1, np.full(len(pitch), place[2])) @ about(0, pitch)
         flat = about(1, np.array(place[2]))
@@ -152,7 +151,7 @@ class Walker:
         return ground + pivot @ flat.T - (turn @ pivot[..., None])[..., 0]
 
 
-def solve_leg(build: Build, side: int, hip: Array, pelvis: Array, foot: FootTrack) -> tuple[Array, Array, Array]:
+def solve_leg(build: Build, side: int, hip: F64, pelvis: F64, foot: FootTrack) -> tuple[F64, F64, F64]:
     """Local turns (T, 3, 3) of hip, knee and ankle that put the ankle on its track.
 
     `hip` (T, 3): hip joint in the world. `pelvis` (T, 3, 3): its turn. Out of reach stretches the leg towards it.
@@ -168,14 +167,14 @@ def solve_leg(build: Build, side: int, hip: Array, pelvis: Array, foot: FootTrac
     return hip_local, knee, np.swapaxes(turn @ knee, -1, -2) @ sole
 
 
-def _knee_angle(thigh: Array, shin: Array, distance: Array) -> Array:
+def _knee_angle(thigh: F64, shin: F64, distance: F64) -> F64:
     """Flexion (T,) about +X at which |thigh + R shin| = distance: a cos + b sin = c."""
     a, b = thigh[1] * shin[1] + thigh[2] * shin[2], thigh[2] * shin[1] - thigh[1] * shin[2]
     c = (distance**2 - thigh @ thigh - shin @ shin) / 2 - thigh[0] * shin[0]
     return np.asarray(np.arctan2(b, a) + np.arccos(np.clip(c / np.hypot(a, b), -1.0, 1.0)))
 
 
-def _frame(along: Array, lateral: Array) -> Array:
+def _frame(along: F64, lateral: F64) -> F64:
     """Matrices (T, 3, 3) whose second column is `along` and whose first is nearest to `lateral`."""
     second = normalised(along)
     third = normalised(np.cross(np.broadcast_to(lateral, second.shape), second))

@@ -8,12 +8,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from trilane.arrays import F64
 from trilane.errors import BadInputError
 from trilane.scene.motion.base import Motion, RawMotion, Wrap
 from trilane.scene.motion.repair import kept_samples
 from trilane.scene.rotations import Y_UP_FROM_Z_UP, about, matrix_from_rotvec, rotvec_from_matrix
-
-Array = NDArray[np.float64]
 
 MAX_FRAMES = 200_000
 MAX_ANGLE_RAD = 64.0
@@ -47,20 +46,20 @@ def finish(raw: RawMotion, where: str, up_axis: str) -> Motion:
     )
 
 
-def _sound(poses: Array, shift: Array) -> NDArray[np.bool_]:
+def _sound(poses: F64, shift: F64) -> NDArray[np.bool_]:
     """Frames (T,) whose numbers are finite and whose place is on this planet."""
     finite = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(shift).all(axis=1)
     with np.errstate(invalid="ignore"):
         return np.asarray(finite & (np.abs(shift) < MAX_PLACE_M).all(axis=1))
 
 
-def _check_angles(poses: Array, where: str) -> None:
+def _check_angles(poses: F64, where: str) -> None:
     largest = float(np.abs(poses).max())
     if largest > MAX_ANGLE_RAD:
         raise BadInputError(where, f"an angle of {largest:.3g}", "axis-angle in radians", "convert degrees to radians")
 
 
-def _up_axis(roots: Array, usual: str, given: str) -> tuple[str, str]:
+def _up_axis(roots: F64, usual: str, given: str) -> tuple[str, str]:
     if given != "auto":
         return given, "as given"
     mean = roots[:, :, 1].mean(axis=0)
@@ -70,7 +69,7 @@ def _up_axis(roots: Array, usual: str, given: str) -> tuple[str, str]:
     return usual, "as usual for the format"
 
 
-def _facing(root: Array) -> Array:
+def _facing(root: F64) -> F64:
     """Turn about Y (3, 3) after which a body with root turn `root` (3, 3) faces +Z; none for one that lies."""
     x, _, z = root[:, 2]
     if np.hypot(x, z) < 0.3:
@@ -78,14 +77,14 @@ def _facing(root: Array) -> Array:
     return about(1, -np.arctan2(x, z))
 
 
-def centred(translation: Array) -> Array:
+def centred(translation: F64) -> F64:
     """`translation` (T, 3) with the middle of its ground rectangle over the origin."""
     low, high = translation.min(axis=0), translation.max(axis=0)
     middle = (low + high) / 2
     return np.asarray(translation - np.array([middle[0], 0.0, middle[2]]))
 
 
-def _end_note(times_s: Array, wrap: Wrap) -> str:
+def _end_note(times_s: F64, wrap: Wrap) -> str:
     if len(times_s) == 1:
         return "one frame: held"
     return f"{times_s[-1] - times_s[0]:.2f} s, then {wrap.value}"

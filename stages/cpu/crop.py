@@ -9,11 +9,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from trilane.arrays import F64
 from trilane.errors import BadInputError
 
-F64 = NDArray[np.float64]
 Shape = tuple[int, int]
 
 #: A body smaller than this on the screen is given a rectangle of this size, in output pixels.

@@ -15,16 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from trilane.stages.contracts import JOINTS
-from trilane.stages.cpu.body import ShapedBody
+from trilane.arrays import F64, I64, Mask
+from trilane.body.body import ShapedBody
+from trilane.body.joints import JOINTS
+from trilane.body.kinematics import Posed
+from trilane.body.skinning import blend_matrices, largest_weights
 from trilane.stages.cpu.crop import Rect
-from trilane.stages.cpu.kinematics import Posed
 from trilane.stages.cpu.patches import Level, build_levels, join
-from trilane.stages.cpu.skinning import blend_matrices, largest_weights
-
-F64 = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 #: Added to every radius, metres, and to every side of the rectangle, NDC, against rounding.
 ROUNDING_M = 1e-4
@@ -139,7 +136,7 @@ class MeshBounds:
         seen.add(low, high)
         return seen.rect() if (seen.low > -1.0).all() and (seen.high < 1.0).all() else None
 
-    def _sort_out(self, level: Level, rows: Ints, view: _View, seen: _Extent) -> tuple[Ints, Ints]:
+    def _sort_out(self, level: Level, rows: I64, view: _View, seen: _Extent) -> tuple[I64, I64]:
         """Of these patches, those that may widen what was seen, and those that the near plane may cut."""
         radius = level.size[rows] + (self._standoff + ROUNDING_M)
         radius += np.einsum("pj,j->p", level.give[rows], view.turned / np.sqrt(2.0))
@@ -162,11 +159,11 @@ class MeshBounds:
         blended = blend_matrices(self._weights[vertices], view.per_joint).reshape(-1, 4, 4)
         return np.asarray(np.einsum("nab,nb->na", blended, rest))
 
-    def _add_vertices(self, vertices: Ints, view: _View, seen: _Extent) -> None:
+    def _add_vertices(self, vertices: I64, view: _View, seen: _Extent) -> None:
         points = self._project(vertices, view)
         seen.add(*_quotients(points, np.full(len(points), self._standoff), view))
 
-    def _add_triangles(self, faces: Ints, view: _View, seen: _Extent) -> None:
+    def _add_triangles(self, faces: I64, view: _View, seen: _Extent) -> None:
         """Add triangles that the near plane may cut, clipped to it."""
         corners = self._project(self._faces[faces].ravel(), view).reshape(-1, 3, 4)
         kept = _clip_near(corners, self._standoff * view.near_norm)

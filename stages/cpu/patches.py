@@ -19,11 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.stages.cpu.body import ShapedBody
-from trilane.stages.cpu.skinning import branch_sums, joint_distance
-
-F64 = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from trilane.arrays import F64, I64
+from trilane.body.body import ShapedBody
+from trilane.body.skinning import branch_sums, joint_distance
 
 #: Coarse patches are cut until their triangles' middles differ by no more than this, metres, and these again.
 EXTENTS_M = (0.08, 0.02)
@@ -44,15 +42,15 @@ class Level:
     vertex, metres per unit of |R - I|.
     """
 
-    centres: Ints
+    centres: I64
     size: F64
     give: F64
     blend: F64
-    parts: list[Ints]
-    faces: list[Ints]
+    parts: list[I64]
+    faces: list[I64]
 
 
-def join(groups: list[Ints], chosen: Ints) -> Ints:
+def join(groups: list[I64], chosen: I64) -> I64:
     """The indices of the chosen groups, one after another."""
     return np.concatenate([groups[patch] for patch in chosen]) if len(chosen) else np.zeros(0, np.int64)
 
@@ -77,7 +75,7 @@ def build_levels(shaped: ShapedBody, weights: F64) -> list[Level]:
 
 
 def _level(
-    shaped: ShapedBody, features: F64, branches: F64, blend: F64, groups: list[Ints], parts: list[Ints] | None
+    shaped: ShapedBody, features: F64, branches: F64, blend: F64, groups: list[I64], parts: list[I64] | None
 ) -> Level:
     members = [np.unique(shaped.body.faces[group]).astype(np.int64) for group in groups]
     centres = np.array([rows[_nearest_to_middle(features[rows])] for rows in members])
@@ -99,7 +97,7 @@ def _blend_reach(posedirs: NDArray[np.float32] | None, count: int) -> F64:
     return np.asarray(np.sqrt(np.einsum("vajk,vajk->vj", blocks, blocks).astype(np.float64)))
 
 
-def _bisect(features: F64, rows: Ints, extent: float) -> list[Ints]:
+def _bisect(features: F64, rows: I64, extent: float) -> list[I64]:
     """Groups of rows, halved again and again at the middle of the direction in which they reach furthest."""
     here = features[rows]
     low, high = here.min(axis=0), here.max(axis=0)

@@ -14,17 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.avatars.bundle import load_bundle
+from trilane.body.body import ShapedBody, load_body
+from trilane.body.kinematics import Posed, Skeleton
+from trilane.body.skinning import FrameSkinner
 from trilane.errors import TrilaneError
 from trilane.scene.mover import Mover
-from trilane.scene.schema import RunConfig
 from trilane.scene.staging import stage_scene
-from trilane.stages.contracts import Packet, posed_vertices
-from trilane.stages.cpu.body import ShapedBody, load_body
+from trilane.stages.config import RunConfig
 from trilane.stages.cpu.crop import Rect
-from trilane.stages.cpu.kinematics import Posed, Skeleton
 from trilane.stages.cpu.mesh_bounds import MeshBounds
-from trilane.stages.cpu.skinning import FrameSkinner
 from trilane.stages.cpu.tensor_layout import lay_out
+from trilane.stages.packets import posed_vertices
+from trilane.transport.packets import Packet
 
 #: Clothes and hair reach this far from the body, metres; training crops with the same.
 STANDOFF_M = 0.045
@@ -70,7 +71,7 @@ class PoseStage:
         """Take the output slots. Raises ValueError when the stage has inputs."""
         if inputs:
             raise ValueError("the pose stage has no input edge")
-        self._slots = [packet.pose for packet in outputs]
+        self._slots = [packet.header for packet in outputs]
         self._vertices = [posed_vertices(packet.payload, self._counts) for packet in outputs]
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:  # noqa: ARG002
@@ -83,7 +84,7 @@ class PoseStage:
         packet = self._slots[slot_out]
         t_s = frame / self._fps
         packet["frame"] = frame
-        packet["t_pose_ns"] = time.monotonic_ns()
+        packet["t_sampled_ns"] = time.monotonic_ns()
         packet["media_time_s"] = t_s
         packet["avatar_count"] = len(self._actors)
         view = self._camera.sample(t_s)

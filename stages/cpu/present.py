@@ -20,8 +20,8 @@ import numpy as np
 from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 from numpy.typing import NDArray
 
-from trilane.scene.schema import RunConfig
-from trilane.stages.contracts import Packet
+from trilane.stages.config import RunConfig
+from trilane.transport.packets import Packet
 
 SEGMENTS = "segments"
 KEYFRAME_EVERY = 30

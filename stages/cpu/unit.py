@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from trilane.scene.schema import RunConfig
-from trilane.stages.contracts import Stage
+from trilane.pipeline.stage import Stage
+from trilane.stages.config import RunConfig
 from trilane.stages.cpu.pose import PoseStage
 from trilane.stages.cpu.present import PresentStage
 

@@ -12,12 +12,14 @@ from itertools import product
 
 import numpy as np
 
+from trilane.arrays import U8
 from trilane.avatars.split import NetworkPart
 from trilane.errors import BadInputError
-from trilane.scene.schema import RunConfig, Shape
-from trilane.stages.contracts import Packet
+from trilane.shapes import Shape
+from trilane.stages.config import RunConfig
 from trilane.stages.dsp.parts import parts_for, shared_network, views
-from trilane.stages.dsp.runtime import U8, Binding, RuntimeOptions, Session, load_runtime, resolve
+from trilane.stages.dsp.runtime import Binding, RuntimeOptions, Session, load_runtime, resolve
+from trilane.transport.packets import Packet
 
 Key = tuple[Shape, int, int]
 
@@ -36,7 +38,7 @@ class BoundPart:
 
 
 class InferStage:
-    """`trilane.stages.contracts.Stage`. One inference a frame; a whole network turns H·W·C bytes into H·W·4.
+    """`trilane.pipeline.stage.Stage`. One inference a frame; a whole network turns H·W·C bytes into H·W·4.
 
     `part`: which one of those that the configuration's cuts make. Several avatars share the tensor, each in its
     `tensor_rect`, so they must share one network. `runtime`: the name of the runtime that runs. Raises BadInputError,
@@ -74,7 +76,7 @@ class InferStage:
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
         """Infer the tensor unless nobody is in view; then the picture is transparent. Figures: `inferred`, 0 or 1."""
         assert slot_in is not None and slot_out is not None
-        pose = self._inputs[slot_in].pose
+        pose = self._inputs[slot_in].header
         if not pose["avatars"]["visible"].any():
             self._outputs[slot_out].payload[:] = 0
             return {"inferred": 0}

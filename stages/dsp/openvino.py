@@ -11,9 +11,10 @@ from typing import Any
 
 import openvino
 
+from trilane.arrays import U8
 from trilane.avatars.network_file import IntegerNetwork
 from trilane.errors import BadInputError
-from trilane.stages.dsp.runtime import U8, RuntimeOptions, cache_dir
+from trilane.stages.dsp.runtime import RuntimeOptions, cache_dir
 
 DEVICE = "CPU"
 LAYERS = {"Convolution", "Deconvolution", "FullyConnected", "MatMul"}

@@ -14,9 +14,10 @@ import onnx
 import onnxruntime
 from onnxruntime.capi import onnxruntime_pybind11_state as state
 
+from trilane.arrays import U8
 from trilane.avatars.network_file import IntegerNetwork, node_name
 from trilane.errors import BadInputError
-from trilane.stages.dsp.runtime import U8, RuntimeOptions
+from trilane.stages.dsp.runtime import RuntimeOptions
 
 PROVIDER = "CPUExecutionProvider"
 FLOAT_LAYERS = {"Conv", "FusedConv", "NhwcFusedConv", "ConvTranspose", "Gemm", "FusedGemm", "MatMul", "FusedMatMul"}

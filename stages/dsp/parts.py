@@ -10,13 +10,14 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
+from trilane.arrays import U8
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import NetworkFile
 from trilane.avatars.reshape import reshaped
 from trilane.avatars.split import NetworkPart, Shapes, split
 from trilane.errors import BadInputError
-from trilane.scene.schema import RunConfig, Shape
-from trilane.stages.dsp.runtime import U8
+from trilane.shapes import Shape
+from trilane.stages.config import RunConfig
 
 LINE = 64  # bytes of a cache line, and of the widest vector register
 

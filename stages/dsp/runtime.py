@@ -13,13 +13,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from trilane.arrays import U8
 from trilane.avatars.network_file import IntegerNetwork
 from trilane.errors import BadInputError, MissingPartError
-
-U8 = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)

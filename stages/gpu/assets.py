@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.avatars.bundle import load_bundle
-from trilane.stages.cpu.body import Body, load_body
-from trilane.stages.cpu.skinning import WEIGHT_COUNTS, largest_weights
+from trilane.body.body import Body, load_body
+from trilane.body.skinning import WEIGHT_COUNTS, largest_weights
 from trilane.stages.gpu.mesh import MeshArrays, mesh_arrays
 from trilane.stages.gpu.packed import Quantisation
 

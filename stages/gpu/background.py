@@ -11,14 +11,13 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, ImageOps, UnidentifiedImageError
 
+from trilane.arrays import U8
 from trilane.errors import BadInputError
-from trilane.scene.files import require_file
+from trilane.files import require_file
 from trilane.stages.gpu.video import VideoReader
 
-U8 = NDArray[np.uint8]
 Shape = tuple[int, int]
 
 PICTURES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff"})

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from trilane.arrays import F64
 from trilane.scene.schema import PlaneSpec
-from trilane.stages.contracts import Packet
 from trilane.stages.gpu import gl
 from trilane.stages.gpu.background import Background
 from trilane.stages.gpu.context import checked
@@ -21,9 +21,9 @@ from trilane.stages.gpu.hud import Hud
 from trilane.stages.gpu.painters import AvatarPainter, PicturePainter, RoomPainter, ShadowPainter
 from trilane.stages.gpu.planes import PlanePainter
 from trilane.stages.gpu.shadow import DISCS, floor_discs
+from trilane.transport.packets import Packet
 
 Shape = tuple[int, int]
-F64 = NDArray[np.float64]
 
 
 class CompositeStage:
@@ -66,7 +66,7 @@ class CompositeStage:
         packet = self._inputs[slot_in]
         frame_bytes = self._outputs[slot_out].payload[: math.prod(self._shape) * 3]
         with checked(self._ctx):
-            self.draw(packet.pose, packet.payload)
+            self.draw(packet.header, packet.payload)
             self._target.read_into(frame_bytes, components=3, alignment=1)
         return {}
 

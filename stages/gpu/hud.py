@@ -67,7 +67,7 @@ def measured_line(pose: NDArray[np.void], presented_ns: list[int]) -> str:
     """Rate and age; `presented_ns`: when the last frames were composed, the present one last."""
     span = presented_ns[-1] - presented_ns[0]
     rate = f"{(len(presented_ns) - 1) * 1e9 / span:.1f} fps" if span > 0 else "- fps"
-    age_ms = (presented_ns[-1] - int(pose["t_pose_ns"])) / 1e6
+    age_ms = (presented_ns[-1] - int(pose["t_sampled_ns"])) / 1e6
     return f"{rate}   {age_ms:.0f} ms from pose"
 
 

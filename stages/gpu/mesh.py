@@ -12,17 +12,15 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
+from trilane.arrays import F32, Ints
+from trilane.body.joints import JOINTS, POSE_FEATURES
 from trilane.errors import BadInputError
-from trilane.stages.contracts import JOINTS, POSE_FEATURES
 
 WEIGHT_COUNTS = (4, 8, 12)
 PATCH_TRIANGLES = 320
 MAX_OPEN = 0.005
 POSEDIRS_ROW = 8192  # texels in a row of the pose blend shape texture
 GROUPS = "abc"
-
-F32 = NDArray[np.float32]
-Ints = NDArray[np.integer[Any]]
 
 
 @dataclass(frozen=True)

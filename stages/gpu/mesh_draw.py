@@ -9,7 +9,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from trilane.stages.gpu.camera import Matrix, target_clip
+from trilane.arrays import Floats
+from trilane.stages.gpu.camera import target_clip
 from trilane.stages.gpu.mesh import BodyPose, Mesh
 from trilane.stages.gpu.program import build_program, set_uniforms
 
@@ -29,7 +30,7 @@ class MeshDraw:
         for program, _ in self._parts:
             set_uniforms(program, values)
 
-    def draw(self, pose: BodyPose, view: Matrix, projection: Matrix) -> None:
+    def draw(self, pose: BodyPose, view: Floats, projection: Floats) -> None:
         """Draw into the target in use, with the tests that are enabled."""
         clip = target_clip(view, projection)
         self._mesh.upload_pose(pose)

@@ -12,15 +12,13 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
+from trilane.arrays import F32, U8, Floats
 from trilane.errors import BadInputError
 from trilane.stages.gpu import gl
-from trilane.stages.gpu.camera import Matrix
 from trilane.stages.gpu.mesh import BodyPose, Mesh
 from trilane.stages.gpu.mesh_draw import MeshDraw
 from trilane.stages.gpu.program import build_program, set_uniforms
 
-F32 = NDArray[np.float32]
-U8 = NDArray[np.uint8]
 Shape = tuple[int, int]
 
 CHANNELS = (4, 8, 12, 16)
@@ -57,7 +55,7 @@ class Placement:
     """
 
     joints: F32
-    clip_projection: Matrix
+    clip_projection: Floats
     rect: tuple[int, int, int, int]
     feature: F32 | None = None
     vertices: F32 | None = None
@@ -169,7 +167,7 @@ class PackedAvatar:
             self._geometry = MeshDraw(packed.ctx, mesh, "pack.frag", **defines)
             self._geometry.set(packed.uniforms)
 
-    def draw(self, target: Target, view: Matrix, placement: Placement) -> None:
+    def draw(self, target: Target, view: Floats, placement: Placement) -> None:
         """Draw into `target`, which a `PackedPass` began."""
         top, left, height, width = placement.rect
         box = (left, top, width, height)

@@ -9,15 +9,13 @@ from typing import Any
 
 import moderngl
 import numpy as np
-from numpy.typing import NDArray
 
+from trilane.arrays import F32, U8, Floats
 from trilane.stages.gpu import gl
-from trilane.stages.gpu.camera import Matrix, eye_of, target_clip
+from trilane.stages.gpu.camera import eye_of, target_clip
 from trilane.stages.gpu.program import build_program
 from trilane.stages.gpu.room import Extent, floor_texture, room_mesh, wall_texture
 
-U8 = NDArray[np.uint8]
-F32 = NDArray[np.float32]
 MAX_TAPS = 8
 HALF_TEXEL_INWARD = np.array([0.5, 0.5, -0.5, -0.5])
 UNDER_THE_FLOOR = (70, 66, 60)
@@ -37,7 +35,7 @@ class RoomPainter:
         self._batches: list[Any] = []
         self._build()
 
-    def draw(self, target: Any, view: Matrix, projection: Matrix) -> None:
+    def draw(self, target: Any, view: Floats, projection: Floats) -> None:
         """Fill `target` with the room as seen by `view` and `projection`; a camera under the floor sees no floor."""
         grown = self._extent.holding(eye_of(view))
         if grown is not self._extent:
@@ -91,7 +89,7 @@ class ShadowPainter:
         self._program = build_program(ctx, "shadow.vert", "shadow.frag", BLOBS=blobs)
         self._discs = ctx.vertex_array(self._program, [])
 
-    def draw(self, view: Matrix, projection: Matrix, blobs: F32) -> None:
+    def draw(self, view: Floats, projection: Floats, blobs: F32) -> None:
         """Darken the target in use. `blobs` (N,4) float32: x, z, radius in metres, strength 0..1."""
         if not len(blobs) or eye_of(view)[1] <= 0:
             return

@@ -10,14 +10,13 @@ from typing import Any
 
 import moderngl
 import numpy as np
-from numpy.typing import NDArray
 
+from trilane.arrays import F32, Floats
 from trilane.scene.schema import PlaneSpec
 from trilane.stages.gpu import gl
-from trilane.stages.gpu.camera import Matrix, target_clip
+from trilane.stages.gpu.camera import target_clip
 from trilane.stages.gpu.program import build_program
 
-F32 = NDArray[np.float32]
 UPRIGHT = 0.9  # a normal with more of y than this takes the world's x as its first side's direction
 
 
@@ -33,7 +32,7 @@ class PlanePainter:
         self._program["across"].write(np.array([across for across, _ in sides], np.float32))
         self._program["along"].write(np.array([along for _, along in sides], np.float32))
 
-    def draw(self, view: Matrix, projection: Matrix) -> None:
+    def draw(self, view: Floats, projection: Floats) -> None:
         """Blend the planes over what is there, as seen by `view` and `projection`."""
         self._ctx.enable_only(moderngl.BLEND)
         self._ctx.blend_func = moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA

@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.errors import TrilaneError
-from trilane.stages.contracts import Packet, posed_vertices
 from trilane.stages.cpu.crop import Rect, crop_projection
 from trilane.stages.gpu.context import checked
 from trilane.stages.gpu.packed import PackedAvatar, PackedPass, Placement
+from trilane.stages.packets import posed_vertices
+from trilane.transport.packets import Packet
 
 Shape = tuple[int, int]
 
@@ -53,7 +54,7 @@ class RasterStage:
         """
         if slot_in is None or slot_out is None:
             raise ValueError("raster needs an input and an output slot")
-        pose = self._inputs[slot_in].pose
+        pose = self._inputs[slot_in].header
         shape = (int(pose["tensor_shape"][0]), int(pose["tensor_shape"][1]))
         tensor = self._outputs[slot_out].payload[: math.prod(shape) * self._packed.channels]
         visible = [a for a in pose["avatars"][: int(pose["avatar_count"])] if a["visible"]]

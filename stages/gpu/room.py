@@ -10,9 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
+from trilane.arrays import F32, F64, U8
 
 FLOOR_PERIOD_M = 2.4
 FLOOR_SIDE = 1024

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.stages.cpu.joints import JOINT_INDEX
-
-F64 = NDArray[np.float64]
+from trilane.arrays import F64
+from trilane.body.joints import JOINT_INDEX
 
 # joint, radius on the floor in metres, strength there, height in metres over which it fades to 1/e
 DISCS = (

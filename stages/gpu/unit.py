@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from trilane.errors import BadInputError
-from trilane.scene.schema import RunConfig
-from trilane.stages.contracts import Stage
+from trilane.pipeline.stage import Stage
+from trilane.stages.config import RunConfig
 from trilane.stages.gpu.assets import AvatarAssets, load_assets
 from trilane.stages.gpu.background import Background, open_background
 from trilane.stages.gpu.composite import CompositeStage

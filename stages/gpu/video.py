@@ -14,11 +14,10 @@ from typing import Any
 
 import av
 import numpy as np
-from numpy.typing import NDArray
 
+from trilane.arrays import U8
 from trilane.errors import BadInputError, TrilaneError
 
-U8 = NDArray[np.uint8]
 AHEAD = 4
 MAX_PIXELS = 64_000_000
 DEFAULT_STEP_S = 1 / 30

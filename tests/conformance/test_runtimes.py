@@ -15,12 +15,12 @@ from onnx import helper, numpy_helper
 from onnx.reference import ReferenceEvaluator
 
 from trilane.avatars.network_file import check_network
-from trilane.avatars.quantise import quantise
 from trilane.avatars.reshape import reshaped
 from trilane.avatars.split import cuts, split
 from trilane.errors import BadInputError, MissingPartError
 from trilane.stages.dsp import runtime
 from trilane.stages.dsp.runtime import RUNTIMES, RuntimeOptions, load_runtime
+from trilane.training.quantising.quantise import quantise
 
 #: The first whose DequantizeLinear the evaluator has; the operators used mean the same as in the files' own.
 EVALUATOR_OPSET = 19

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from trilane.stages.cpu.body import load_body
-from trilane.stages.cpu.skinning import posed_vertices
+from trilane.body.body import load_body
+from trilane.body.skinning import posed_vertices
 
 torch = pytest.importorskip("torch")
 smplx = pytest.importorskip("smplx")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from trilane.stages.cpu.joints import JOINT_PARENTS
+from trilane.body.joints import JOINT_PARENTS
 
 VERTICES, FACES, CORNERS = 90, 120, 130
 

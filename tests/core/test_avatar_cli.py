@@ -11,9 +11,9 @@ import pytest
 from typer.testing import CliRunner
 
 from trilane.apps.cli.avatar import app
-from trilane.avatars.equalise import equalised
 from trilane.avatars.network_file import read_network
 from trilane.errors import BadInputError
+from trilane.training.quantising.equalise import equalised
 
 runner = CliRunner()
 

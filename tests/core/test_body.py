@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from trilane.body.body import Body, load_body
 from trilane.errors import BadInputError
-from trilane.stages.cpu.body import Body, load_body
 
 Arrays = dict[str, NDArray[Any]]
 

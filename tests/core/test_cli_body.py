@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from trilane.apps.cli.body import app
+from trilane.body.body import load_body
+from trilane.body.skinning import posed_vertices
 from trilane.errors import BadInputError
-from trilane.stages.cpu.body import load_body
-from trilane.stages.cpu.skinning import posed_vertices
 
 RUNNER = CliRunner()
 

@@ -12,15 +12,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from trilane.arrays import F64
+from trilane.body.body import ShapedBody, load_body
+from trilane.body.kinematics import Skeleton, rodrigues
+from trilane.body.skinning import CpuSkinner
 from trilane.errors import BadInputError
-from trilane.scene.schema import shape_buckets
-from trilane.stages.cpu.body import ShapedBody, load_body
+from trilane.shapes import shape_buckets
 from trilane.stages.cpu.crop import SCREEN, Rect, choose_bucket, crop_projection
-from trilane.stages.cpu.kinematics import Skeleton, rodrigues
 from trilane.stages.cpu.mesh_bounds import MeshBounds
-from trilane.stages.cpu.skinning import CpuSkinner
 
-F64 = NDArray[np.float64]
 DEFAULT = Path(__file__).resolve().parents[2] / "avatars" / "default" / "body.npz"
 SLACK = 1e-9
 

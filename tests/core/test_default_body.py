@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trilane.avatars.from_anny import joint_bones, joint_of_bone, regressor, round_weights
-from trilane.avatars.tpose import about, align, bake, power
+from trilane.body.body import Body, load_body
+from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS
 from trilane.errors import BadInputError
-from trilane.stages.cpu.body import Body, load_body
-from trilane.stages.cpu.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS
+from trilane.training.from_anny import joint_bones, joint_of_bone, regressor, round_weights
+from trilane.training.tpose import about, align, bake, power
 
 PATH = Path(__file__).resolve().parents[2] / "avatars" / "default" / "body.npz"
 
@@ -154,7 +154,7 @@ def test_body_is_built_anew_as_committed(tmp_path: Path) -> None:
     pytest.importorskip("anny")
     if not (Path.home() / ".cache" / "anny").is_dir():
         pytest.skip("anny has not been built on this machine; its first build takes minutes")
-    from trilane.avatars.from_anny import write_body
+    from trilane.training.from_anny import write_body
 
     write_body(tmp_path / "again.npz")
     again, committed = np.load(tmp_path / "again.npz"), np.load(PATH)

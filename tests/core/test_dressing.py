@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from trilane.avatars.bundle import bundle_folder
-from trilane.avatars.dressing.landmarks import find_landmarks
-from trilane.avatars.dressing.layers import MATERIALS, BodyArrays, dress
-from trilane.avatars.dressing.surface import obscurance, shell, vertex_normals
-from trilane.stages.cpu.body import load_body
+from trilane.body.body import load_body
+from trilane.training.clothing.landmarks import find_landmarks
+from trilane.training.clothing.layers import MATERIALS, BodyArrays, dress
+from trilane.training.clothing.surface import obscurance, shell, vertex_normals
 
 #: Percentile of a layer's vertices, metres that it stands off the body at least, and the farthest at most. Hair is cut
 #: out of a cap that lies close on the face.

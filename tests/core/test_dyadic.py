@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from onnx import helper, numpy_helper
 
-from trilane.avatars.dyadic import NotAlikeError, dyadic_weights, may_round_alike
-from trilane.avatars.quantise import quantise
 from trilane.errors import BadInputError
+from trilane.training.quantising.dyadic import NotAlikeError, dyadic_weights, may_round_alike
+from trilane.training.quantising.quantise import quantise
 
 FIRST, SECOND = "tensor", "made"
 

@@ -7,11 +7,12 @@ from itertools import pairwise
 import pytest
 
 from trilane.errors import BadInputError
+from trilane.hw_profiles.governor import Governor
 from trilane.hw_profiles.load import load_runnable
-from trilane.hw_profiles.schema import UNITS, Profile
+from trilane.hw_profiles.schema import Profile
 from trilane.scheduler.events import SetDuty, Settings, avatar_graph
-from trilane.scheduler.governor import Governor
 from trilane.scheduler.virtual import simulate
+from trilane.units import UNITS
 
 S = 1_000_000_000
 

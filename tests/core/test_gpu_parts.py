@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from trilane.body.joints import JOINTS
 from trilane.errors import BadInputError, MissingPartError, TrilaneError, UnitLostError
-from trilane.stages.contracts import JOINTS
 from trilane.stages.gpu import context
 from trilane.stages.gpu.mesh import is_closed, mesh_arrays, patch_order, split_corners
 from trilane.stages.gpu.room import Extent, floor_texture, room_mesh, wall_texture

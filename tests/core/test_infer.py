@@ -10,16 +10,19 @@ import pytest
 
 from trilane.avatars.bundle import load_bundle
 from trilane.errors import BadInputError
-from trilane.scene.schema import RunConfig, Scene, UnitSettings
-from trilane.stages.contracts import SlotLayout, view_packet
+from trilane.pipeline.description import UnitSettings
+from trilane.scene.schema import Scene
+from trilane.stages.config import RunConfig
 from trilane.stages.dsp.infer import InferStage
 from trilane.stages.dsp.unit import build
+from trilane.stages.packets import pose_dtype
+from trilane.transport.packets import SlotLayout, view_packet
 
 CHANNELS = 5
 
 
 def slots(count, avatars, payload):
-    layout = SlotLayout(avatars, payload)
+    layout = SlotLayout(pose_dtype(avatars), payload)
     return [view_packet(memoryview(bytearray(layout.slot_bytes)), layout) for _ in range(count)]
 
 
@@ -35,9 +38,9 @@ def make(folder, avatars=1, size="64", runtime="ort"):
 
 
 def show(packet, shape, visible):
-    packet.pose["tensor_shape"] = shape
-    packet.pose["avatar_count"] = len(visible)
-    packet.pose["avatars"]["visible"][:] = visible
+    packet.header["tensor_shape"] = shape
+    packet.header["avatar_count"] = len(visible)
+    packet.header["avatars"]["visible"][:] = visible
 
 
 def run_alone(folder, shape, tensor):

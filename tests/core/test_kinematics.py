@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from trilane.arrays import F64
+from trilane.body.joints import JOINT_PARENTS
+from trilane.body.kinematics import Skeleton, rodrigues, turn
 from trilane.errors import BadInputError
-from trilane.stages.cpu.joints import JOINT_PARENTS
-from trilane.stages.cpu.kinematics import Skeleton, rodrigues, turn
 
 PARENTS = np.array(JOINT_PARENTS, np.int32)
-F64 = NDArray[np.float64]
 
 directions = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 0.1)
 angles = st.one_of(

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS
 from trilane.errors import BadInputError
 from trilane.scene.motion.base import Motion
 from trilane.scene.motion.bvh import load_bvh
@@ -17,7 +18,6 @@ from trilane.scene.motion.names import DIALECTS, plain
 from trilane.scene.motion.retarget import LIMBS
 from trilane.scene.rotations import about, matrix_from_rotvec
 from trilane.scene.schema import AvatarSpec
-from trilane.stages.cpu.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS
 
 #: name, parent, offset in centimetres: arms hang, legs spread.
 SKELETON = (

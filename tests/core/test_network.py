@@ -8,12 +8,12 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from trilane.avatars.quantise import quantise  # noqa: E402
 from trilane.avatars.reshape import reshaped  # noqa: E402
-from trilane.avatars.training.encoders import ENCODERS  # noqa: E402
-from trilane.avatars.training.export import export_onnx  # noqa: E402
-from trilane.avatars.training.network import NORMS, UNet  # noqa: E402
 from trilane.errors import BadInputError  # noqa: E402
+from trilane.training.encoders import ENCODERS  # noqa: E402
+from trilane.training.export import export_onnx  # noqa: E402
+from trilane.training.network import NORMS, UNet  # noqa: E402
+from trilane.training.quantising.quantise import quantise  # noqa: E402
 
 
 def count_macs(network, height, width, channels):

@@ -10,11 +10,13 @@ import pytest
 from trilane.apps.pace import SLACK_NS, Pace, compare, pace_of
 from trilane.avatars.bundle import bundle_folder
 from trilane.errors import BadInputError
-from trilane.scene.schema import RunConfig, Scene, UnitSettings
+from trilane.pipeline.description import UnitSettings
+from trilane.pipeline.unit_loop import hold_until
+from trilane.scene.schema import Scene
 from trilane.scheduler.events import Settings, avatar_graph
-from trilane.scheduler.result import JobRecord
+from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.virtual import simulate
-from trilane.stages.unit_loop import hold_until
+from trilane.stages.config import RunConfig
 
 MS = 1_000_000
 STAGE_NS = {"pose": MS, "raster": 4 * MS, "infer": 9 * MS, "composite": 3 * MS, "present": MS}

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from trilane.avatars.bundle import bundle_folder
+from trilane.body.body import ShapedBody, load_body
+from trilane.body.kinematics import Skeleton
 from trilane.scene.grounding import outline
 from trilane.scene.motion.base import Motion
 from trilane.scene.motion.builtin import BUILTIN
@@ -16,8 +18,6 @@ from trilane.scene.mover import make_mover
 from trilane.scene.rotations import about, normalised
 from trilane.scene.schema import AvatarSpec, CameraSpec, Scene
 from trilane.scene.staging import Staged, stage_scene
-from trilane.stages.cpu.body import ShapedBody, load_body
-from trilane.stages.cpu.kinematics import Skeleton
 
 ASPECT = 640 / 480
 

@@ -12,12 +12,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trilane.errors import BadInputError, TrilaneError
-from trilane.scene.schema import AvatarSpec, CameraSpec, RunConfig, Scene, UnitSettings, shape_buckets
-from trilane.stages.contracts import Packet, SlotLayout, view_packet
+from trilane.pipeline.description import UnitSettings
+from trilane.scene.schema import AvatarSpec, CameraSpec, Scene
+from trilane.shapes import shape_buckets
+from trilane.stages.config import RunConfig
 from trilane.stages.cpu.crop import Rect
 from trilane.stages.cpu.pose import PoseStage
 from trilane.stages.cpu.tensor_layout import MARGIN_PX, lay_out
 from trilane.stages.cpu.unit import build
+from trilane.stages.packets import pose_dtype
+from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 OUTPUT = (480, 640)
 
@@ -29,7 +33,7 @@ def config(bundle: Path, out_dir: Path, **scene: Any) -> RunConfig:
 
 
 def bound(stage: PoseStage, avatars: int = 1) -> Packet:
-    layout = SlotLayout(avatars, 0)
+    layout = SlotLayout(pose_dtype(avatars), 0)
     packet = view_packet(memoryview(bytearray(layout.slot_bytes)), layout)
     stage.bind([], [packet])
     return packet
@@ -40,9 +44,9 @@ def test_a_packet_says_everything_of_its_frame(tiny_bundle: Path, tmp_path: Path
     packet = bound(stage)
     before = time.monotonic_ns()
     assert stage.run(50, None, 0) == {"visible": 1.0}
-    pose, avatar = packet.pose, packet.pose["avatars"][0]
+    pose, avatar = packet.header, packet.header["avatars"][0]
     assert (int(pose["frame"]), float(pose["media_time_s"]), int(pose["avatar_count"])) == (50, 2.0, 1)
-    assert before <= int(pose["t_pose_ns"]) <= time.monotonic_ns()
+    assert before <= int(pose["t_sampled_ns"]) <= time.monotonic_ns()
     assert tuple(pose["tensor_shape"]) in shape_buckets("256")
     assert avatar["visible"] == 1
     assert tuple(avatar["tensor_rect"]) == (0, 0, *pose["tensor_shape"])
@@ -56,7 +60,7 @@ def test_the_skinned_feet_stand_on_the_floor(tiny_bundle: Path, tmp_path: Path) 
     packet = bound(stage)
     for frame in (0, 31, 150):
         stage.run(frame, None, 0)
-        joints = packet.pose["avatars"][0]["joints"].astype(np.float64)
+        joints = packet.header["avatars"][0]["joints"].astype(np.float64)
         ankles = [joints[k] @ [0.131 * side, -0.859, -0.001, 1.0] for k, side in ((7, 1), (8, -1))]
         assert 0.05 < min(place[1] for place in ankles) < 0.11
 
@@ -68,7 +72,7 @@ def test_a_frame_is_the_same_whatever_came_before(tiny_bundle: Path, tmp_path: P
         first.run(frame, None, 0)
     second.run(90, None, 0)
     for key in ("view", "projection", "tensor_shape", "avatars"):
-        assert packets[0].pose[key].tobytes() == packets[1].pose[key].tobytes()
+        assert packets[0].header[key].tobytes() == packets[1].header[key].tobytes()
 
 
 def test_an_avatar_out_of_the_picture_is_not_visible(tiny_bundle: Path, tmp_path: Path) -> None:
@@ -76,11 +80,11 @@ def test_an_avatar_out_of_the_picture_is_not_visible(tiny_bundle: Path, tmp_path
     stage = PoseStage(config(tiny_bundle, tmp_path, avatars=(AvatarSpec(), spec)))
     packet = bound(stage, 2)
     assert stage.run(0, None, 0) == {"visible": 1.0}
-    assert packet.pose["avatars"]["visible"].tolist() == [1, 0]
+    assert packet.header["avatars"]["visible"].tolist() == [1, 0]
     only_hidden = PoseStage(config(tiny_bundle, tmp_path, avatars=(spec,)))
     packet = bound(only_hidden)
     assert only_hidden.run(0, None, 0) == {"visible": 0.0}
-    assert tuple(packet.pose["tensor_shape"]) in shape_buckets("256")
+    assert tuple(packet.header["tensor_shape"]) in shape_buckets("256")
 
 
 def test_two_avatars_share_the_tensor(tiny_bundle: Path, tmp_path: Path) -> None:
@@ -88,7 +92,7 @@ def test_two_avatars_share_the_tensor(tiny_bundle: Path, tmp_path: Path) -> None
     stage = PoseStage(config(tiny_bundle, tmp_path, avatars=pair))
     packet = bound(stage, 2)
     stage.run(0, None, 0)
-    (_, left, _, width), second = sorted(packet.pose["avatars"]["tensor_rect"].tolist(), key=lambda cell: cell[1])
+    (_, left, _, width), second = sorted(packet.header["avatars"]["tensor_rect"].tolist(), key=lambda cell: cell[1])
     assert second[1] >= left + width + MARGIN_PX
 
 

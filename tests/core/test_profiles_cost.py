@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
-from trilane.avatars.quantise import Quantised
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import network_alone, split_work
 from trilane.hw_profiles.corners import corners_of
@@ -20,7 +19,8 @@ from trilane.hw_profiles.load import load_profile
 from trilane.hw_profiles.networks import ENCODERS, LAYOUTS, NORMS, NetworkSpec, build_network, parameters
 from trilane.hw_profiles.published import PUBLISHED_MS, check_published, resnet18_work, unet_work
 from trilane.hw_profiles.roofline import job_time, machine_of
-from trilane.hw_profiles.schema import UnitName
+from trilane.training.quantising.quantise import Quantised
+from trilane.units import UnitName
 
 SUSTAINED = "sustained_high_performance"
 
@@ -76,8 +76,8 @@ def test_group_and_instance_normalisation_have_the_same_shapes(encoder: str) -> 
 def test_graphs_equal_the_trained_networks() -> None:
     """Parameter counts against the PyTorch definition, for every encoder that it has."""
     pytest.importorskip("torch")
-    from trilane.avatars.training.encoders import ENCODERS as TRAINED
-    from trilane.avatars.training.network import UNet
+    from trilane.training.encoders import ENCODERS as TRAINED
+    from trilane.training.network import UNet
 
     for encoder in sorted(set(TRAINED) & set(ENCODERS)):
         trained = sum(p.numel() for p in UNet(encoder, "instance", channels=16).parameters())

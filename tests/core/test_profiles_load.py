@@ -15,7 +15,7 @@ from trilane.hw_profiles.load import (
     profile_folder,
     profile_names,
 )
-from trilane.hw_profiles.schema import UNITS
+from trilane.units import UNITS
 
 CHIPS = (
     "agx-orin",

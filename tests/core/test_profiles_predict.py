@@ -20,9 +20,9 @@ from trilane.hw_profiles.cost import reference_network
 from trilane.hw_profiles.load import load_profile
 from trilane.hw_profiles.networks import NetworkSpec
 from trilane.hw_profiles.predict import over_time, predict, predict_table, what_if
-from trilane.hw_profiles.schema import UNITS, UnitName
 from trilane.hw_profiles.table import read_table
 from trilane.hw_profiles.thermal import GOVERNORS, Heat
+from trilane.units import UNITS, UnitName
 
 NETWORK = reference_network(NetworkSpec("resnet18", "batch", 512, 512, 16))
 SUSTAINED, BURST = "sustained_high_performance", "burst"

@@ -10,10 +10,10 @@ import onnxruntime
 import pytest
 from onnx import numpy_helper
 
-from trilane.avatars.calibration import METHODS
-from trilane.avatars.quantise import quantise
 from trilane.avatars.reshape import reshaped
 from trilane.errors import BadInputError
+from trilane.training.quantising.calibration import METHODS
+from trilane.training.quantising.quantise import quantise
 
 
 def run(model, feed):

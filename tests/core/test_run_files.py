@@ -16,7 +16,7 @@ from trilane.apps.report import read_report, write_report
 from trilane.apps.run_folder import RunFolder, default_place
 from trilane.apps.trace import write_trace
 from trilane.errors import BadInputError
-from trilane.scheduler.result import JobRecord
+from trilane.scheduler.ledger import JobRecord
 
 TIMES = {"mean": 20.0, "p50": 20.0, "p90": 21.0, "p95": 22.0, "p99": 23.0, "max": 24.0}
 SHARE = {"busy": 0.5, "idle": {"starved": 0.25, "blocked": 0.15, "throttled": 0.0, "overhead": 0.1}}

@@ -13,13 +13,13 @@ import trilane.scheduler
 from trilane.errors import BadInputError
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import (
-    Ask,
-    Away,
-    Beat,
+    FrameRequest,
     Graph,
     JobDone,
     Kill,
     Pinged,
+    Pong,
+    SchedulerStalled,
     SetDuty,
     Settings,
     StageSpec,
@@ -28,14 +28,14 @@ from trilane.scheduler.events import (
     UnitReady,
     avatar_graph,
 )
-from trilane.scheduler.record import read, replay
+from trilane.scheduler.recording import read, replay
 from trilane.scheduler.stats import energy_score
 from trilane.scheduler.virtual import Service, Simulation, simulate
 
 MS = 1_000_000
 SERVICE_MS = {"pose": 0.3, "raster": 4.0, "infer": 16.0, "composite": 2.0, "present": 3.0}
 FRAMES = 200
-PURE = ("core", "events", "policy", "state", "faults", "source", "ledger", "lateness", "stats")
+PURE = ("core", "events", "policy", "state", "watchdog", "frame_source", "ledger", "completion", "stats")
 
 
 def service(stage: str, _unit: str, _frame: int, _begin_ns: int) -> int:
@@ -48,7 +48,9 @@ def uneven(stage: str, unit: str, frame: int, begin_ns: int) -> int:
 
 def run(policy: str = "pipelined", edge: str = "double", times: Service = service, **more: object) -> Simulation:
     settings = {"period_ns": 10 * MS, "deadline_ns": 60 * MS} if policy in ("latest", "deadline") else {}
-    driver = {key: more.pop(key) for key in ("faults", "inputs", "hop_ns", "restart_ns", "keep") if key in more}
+    driver = {
+        key: more.pop(key) for key in ("faults", "inputs", "message_delay_ns", "restart_ns", "keep") if key in more
+    }
     alone = {name: ms * MS for name, ms in SERVICE_MS.items()}
     return simulate(
         avatar_graph(edge), Settings(FRAMES, policy, **{**settings, **more}), times, isolated_ns=alone, **driver
@@ -63,7 +65,7 @@ def test_sequential_takes_the_sum_of_all_stages() -> None:
 
 @pytest.mark.parametrize("edge", ["double", "fifo:4"])
 def test_pipelined_keeps_the_slowest_unit_busy(edge: str) -> None:
-    report = run(edge=edge, hop_ns=MS // 10).report
+    report = run(edge=edge, message_delay_ns=MS // 10).report
     assert report["efficiency"] == pytest.approx(1)
     assert report["units"]["dsp"]["busy"] > 0.99
     assert report["frames"]["presented"] == FRAMES
@@ -107,7 +109,7 @@ def test_one_slow_job_does_not_drop_frames_for_ever() -> None:
 @pytest.mark.parametrize("policy", ["sequential", "pipelined", "latest", "deadline"])
 @pytest.mark.parametrize("edge", ["single", "double", "triple", "fifo:3", "orphan"])
 def test_every_account_adds_up(policy: str, edge: str) -> None:
-    report = run(policy, edge, uneven, hop_ns=MS // 20, faults=[(300 * MS, "dsp"), (700 * MS, "cpu")]).report
+    report = run(policy, edge, uneven, message_delay_ns=MS // 20, faults=[(300 * MS, "dsp"), (700 * MS, "cpu")]).report
     frames = report["frames"]
     assert frames["presented"] + frames["lost"] + sum(frames["dropped"].values()) == FRAMES
     for row in report["units"].values():
@@ -138,7 +140,7 @@ def test_arrivals_are_kept() -> None:
 
 
 def test_frames_are_released_when_they_are_asked_for_and_no_more_than_there_are() -> None:
-    inputs = [(1 * MS, Ask(1)), (500 * MS, Ask(3)), (2000 * MS, Ask(FRAMES))]
+    inputs = [(1 * MS, FrameRequest(1)), (500 * MS, FrameRequest(3)), (2000 * MS, FrameRequest(FRAMES))]
     result = run(asked=True, inputs=inputs, keep=True)
     begins = [record.begin_ns // MS for record in result.jobs if record.stage == "pose"]
     assert begins[:2] == [1, 500]
@@ -148,7 +150,7 @@ def test_frames_are_released_when_they_are_asked_for_and_no_more_than_there_are(
 
 
 def test_a_run_that_nobody_asks_of_ends_when_it_is_told() -> None:
-    result = run(asked=True, inputs=[(1 * MS, Ask(2)), (900 * MS, Stop())])
+    result = run(asked=True, inputs=[(1 * MS, FrameRequest(2)), (900 * MS, Stop())])
     assert (result.report["frames"]["presented"], result.cause) == (2, "stopped")
 
 
@@ -283,7 +285,7 @@ def test_a_core_that_was_left_alone_gives_its_units_as_much_longer() -> None:
     core = Core(avatar_graph(), Settings(10, "sequential", hang_ns=100))
     core.step(0, tuple(UnitReady(unit) for unit in ("cpu", "gpu", "dsp")))
     core.step(10, (Pinged("dsp"),))
-    assert core.step(1050, (Away(1000),)).actions == ()
+    assert core.step(1050, (SchedulerStalled(1000),)).actions == ()
     assert core.step(1100).actions == (Kill("cpu"),)
     assert core.step(1110).actions == (Kill("dsp"),)
 
@@ -294,7 +296,7 @@ def test_only_a_question_that_nobody_answers_costs_an_idle_unit_its_life() -> No
     (pose,) = core.step(0, tuple(UnitReady(unit) for unit in ("cpu", "gpu", "dsp"))).actions
     core.step(10, (JobDone("cpu", pose.job.id, 0, 10, 0),))
     core.step(20, (Pinged("cpu"), Pinged("dsp")))
-    core.step(30, (Beat("cpu"), Beat("gpu")))
+    core.step(30, (Pong("cpu"), Pong("gpu")))
     decision = core.step(109)
     assert (decision.actions, decision.next_deadline_ns) == ((), 110)
     assert core.step(110).actions == (Kill("gpu"),)

@@ -65,7 +65,7 @@ def check(core: Core) -> None:
     graph=graphs(),
     policy=st.sampled_from(POLICIES),
     seed=st.integers(0, 2**32),
-    hop_ns=st.integers(0, 50),
+    message_delay_ns=st.integers(0, 50),
     period_ns=st.integers(1, 2000),
     limits=st.tuples(st.integers(0, 5), st.integers(0, 3), st.integers(0, 3000)),
     latch_ns=st.integers(0, 1500),
@@ -75,7 +75,7 @@ def test_no_slot_is_owned_twice_no_frame_is_lost_or_out_of_order(
     graph: Graph,
     policy: str,
     seed: int,
-    hop_ns: int,
+    message_delay_ns: int,
     period_ns: int,
     limits: tuple[int, int, int],
     latch_ns: int,
@@ -95,7 +95,9 @@ def test_no_slot_is_owned_twice_no_frame_is_lost_or_out_of_order(
         max_failures=20,
     )
     faults = [fault for fault in faults if fault[1] in graph.units]
-    driver = VirtualDriver(graph, run, service_of(seed), hop_ns=hop_ns, restart_ns=5000, faults=faults, keep=True)
+    driver = VirtualDriver(
+        graph, run, service_of(seed), message_delay_ns=message_delay_ns, restart_ns=5000, faults=faults, keep=True
+    )
     assert driver.run() == "done"
     frames = driver.core.ledger.report(clock="virtual", requested=60)["frames"]
     assert frames["presented"] + frames["lost"] + sum(frames["dropped"].values()) == 60
@@ -113,11 +115,11 @@ def test_no_slot_is_owned_twice_no_frame_is_lost_or_out_of_order(
 
 
 @settings(max_examples=150, deadline=None)
-@given(graph=graphs(KEEPING), seed=st.integers(0, 2**32), hop_ns=st.integers(0, 100))
-def test_pipelined_is_never_slower_than_sequential(graph: Graph, seed: int, hop_ns: int) -> None:
+@given(graph=graphs(KEEPING), seed=st.integers(0, 2**32), message_delay_ns=st.integers(0, 100))
+def test_pipelined_is_never_slower_than_sequential(graph: Graph, seed: int, message_delay_ns: int) -> None:
     took = {}
     for policy in ("sequential", "pipelined"):
-        driver = VirtualDriver(graph, Settings(40, policy), service_of(seed), hop_ns=hop_ns)
+        driver = VirtualDriver(graph, Settings(40, policy), service_of(seed), message_delay_ns=message_delay_ns)
         driver.run()
         ledger = driver.core.ledger
         assert len(ledger.presented_ns) == 40

@@ -11,10 +11,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from trilane.body.body import ShapedBody, load_body
+from trilane.body.kinematics import Skeleton, rodrigues
+from trilane.body.skinning import CpuSkinner, FrameSkinner, largest_weights, posed_vertices, weight_error_bound
 from trilane.errors import BadInputError
-from trilane.stages.cpu.body import ShapedBody, load_body
-from trilane.stages.cpu.kinematics import Skeleton, rodrigues
-from trilane.stages.cpu.skinning import CpuSkinner, FrameSkinner, largest_weights, posed_vertices, weight_error_bound
 
 Arrays = dict[str, NDArray[Any]]
 

@@ -58,8 +58,8 @@ def test_an_orphan_edge_never_waits_and_gives_up_its_oldest() -> None:
     edge = EdgeSlots(edge_rule("orphan:4"))
     dropped = []
     for frame in range(10):
-        slot, gave_way = edge.claim(frame)
-        dropped.append(gave_way)
+        slot, evicted = edge.claim(frame)
+        dropped.append(evicted)
         edge.commit(slot)
     assert dropped == [None] * 4 + list(range(6))
 

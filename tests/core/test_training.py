@@ -10,8 +10,11 @@ pytest.importorskip("scipy")
 pytest.importorskip("skimage")
 
 from trilane.avatars.bundle import bundle_folder  # noqa: E402
-from trilane.avatars.training.data import U16, batches, create_group, open_groups  # noqa: E402
-from trilane.avatars.training.fit import (  # noqa: E402
+from trilane.body.joints import JOINT_INDEX  # noqa: E402
+from trilane.errors import BadInputError  # noqa: E402
+from trilane.scene.motion.builtin import BUILTIN  # noqa: E402
+from trilane.training.data import U16, batches, create_group, open_groups  # noqa: E402
+from trilane.training.fit import (  # noqa: E402
     Avatar,
     FitConfig,
     fit,
@@ -20,17 +23,14 @@ from trilane.avatars.training.fit import (  # noqa: E402
     save_avatar,
     save_network,
 )
-from trilane.avatars.training.losses import loss_terms, total_loss  # noqa: E402
-from trilane.avatars.training.metrics import image_error  # noqa: E402
-from trilane.avatars.training.network import UNet  # noqa: E402
-from trilane.avatars.training.poses import random_pose  # noqa: E402
-from trilane.avatars.training.spectral import eigenfunctions, fill_gaps, lay_out  # noqa: E402
-from trilane.avatars.training.texture import NeuralTexture, sample  # noqa: E402
-from trilane.avatars.training.train import TrainConfig, command_of, main  # noqa: E402
-from trilane.avatars.training.views import BANDS, random_view  # noqa: E402
-from trilane.errors import BadInputError  # noqa: E402
-from trilane.scene.motion.builtin import BUILTIN  # noqa: E402
-from trilane.stages.cpu.joints import JOINT_INDEX  # noqa: E402
+from trilane.training.losses import loss_terms, total_loss  # noqa: E402
+from trilane.training.metrics import image_error  # noqa: E402
+from trilane.training.network import UNet  # noqa: E402
+from trilane.training.poses import random_pose  # noqa: E402
+from trilane.training.spectral import eigenfunctions, fill_gaps, lay_out  # noqa: E402
+from trilane.training.texture import NeuralTexture, sample  # noqa: E402
+from trilane.training.train import TrainConfig, command_of, main  # noqa: E402
+from trilane.training.views import BANDS, random_view  # noqa: E402
 
 CHANNELS = 4
 SHAPE = (32, 64)

@@ -18,9 +18,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trilane.errors import TrilaneError
-from trilane.stages.contracts import SlotLayout
-from trilane.transport.bus import LOCK, BusFolder, Link, sweep
-from trilane.transport.line import PACKETS, Line, line_pair
+from trilane.transport.heartbeats import LOCK, BusFolder, Link, sweep
+from trilane.transport.job_pipe import PACKETS, JobPipe, job_pipe_pair
 from trilane.transport.memory import RegionLayout, create_region, map_region
 from trilane.transport.messages import (
     MAX_BYTES,
@@ -40,6 +39,7 @@ from trilane.transport.messages import (
     pack,
     unpack,
 )
+from trilane.transport.packets import SlotLayout, header_dtype
 from trilane.transport.wakeup import AWAKE, DEFAULT, SHORTEST_NS, awake, use_slice
 
 MESSAGES = [
@@ -82,7 +82,7 @@ def test_text_that_is_none_is_refused() -> None:
 
 def test_the_largest_message_passes_whole_and_a_larger_one_is_not_packed() -> None:
     largest = Failed(1, 1, "e" * (MAX_BYTES - len(pack(Failed(1, 1, ""))) - 3))
-    ours, theirs = (Line(end) for end in line_pair())
+    ours, theirs = (JobPipe(end) for end in job_pipe_pair())
     ours.send(largest)
     ours.send(Ping())
     assert len(pack(largest)) == MAX_BYTES > MAX_TEXT
@@ -101,15 +101,15 @@ def test_any_bytes_are_a_message_or_refused(data: bytes) -> None:
 
 @pytest.mark.parametrize("payload", [0, 1, 4096, 100_000])
 def test_slots_of_a_region_are_apart_and_start_empty(payload: int) -> None:
-    layout = RegionLayout(3, SlotLayout(2, payload))
+    layout = RegionLayout(3, SlotLayout(header_dtype(), payload))
     fd = create_region("test", layout)
     packets, others = map_region(fd, layout), map_region(fd, layout)
     for index, packet in enumerate(packets):
         assert not packet.payload.any()
-        packet.pose["frame"] = index
+        packet.header["frame"] = index
         packet.payload[:] = index + 1
     for index, packet in enumerate(others):
-        assert packet.pose["frame"] == index
+        assert packet.header["frame"] == index
         assert np.all(packet.payload == index + 1)
     with pytest.raises(OSError, match="not permitted"):
         os.ftruncate(fd, 0)
@@ -118,13 +118,13 @@ def test_slots_of_a_region_are_apart_and_start_empty(payload: int) -> None:
 
 def test_a_region_that_the_machine_cannot_hold_is_refused_before_it_is_made() -> None:
     with pytest.raises(TrilaneError, match="lower the tensor or output size"):
-        create_region("test", RegionLayout(64, SlotLayout(1, 1 << 40)))
+        create_region("test", RegionLayout(64, SlotLayout(header_dtype(), 1 << 40)))
 
 
 def test_a_region_that_is_too_small_is_refused() -> None:
-    fd = create_region("test", RegionLayout(1, SlotLayout(1, 10)))
+    fd = create_region("test", RegionLayout(1, SlotLayout(header_dtype(), 10)))
     with pytest.raises(ValueError, match="the layout needs"):
-        map_region(fd, RegionLayout(2, SlotLayout(1, 10)))
+        map_region(fd, RegionLayout(2, SlotLayout(header_dtype(), 10)))
     os.close(fd)
 
 
@@ -139,7 +139,7 @@ def heard(link: Link) -> list[Message]:
 def test_the_folder_is_private_and_goes_while_the_link_lives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     context = zmq.Context()
-    parent, child = (Link(context, Line(end)) for end in line_pair())
+    parent, child = (Link(context, JobPipe(end)) for end in job_pipe_pair())
     folder = BusFolder()
     assert folder.path.stat().st_mode & 0o777 == 0o700
     parent.socket.bind(folder.endpoint("cpu"))
@@ -158,8 +158,8 @@ def test_the_folder_is_private_and_goes_while_the_link_lives(tmp_path: Path, mon
 def test_work_goes_over_the_line_and_life_signs_over_the_bus(tmp_path: Path) -> None:
     """Work needs no address, and keeps its order."""
     context = zmq.Context()
-    ends = line_pair()
-    parent, child = Link(context, Line(ends[0])), Link(context, Line(ends[1], waits=True))
+    ends = job_pipe_pair()
+    parent, child = Link(context, JobPipe(ends[0])), Link(context, JobPipe(ends[1], waits=True))
     parent.socket.bind(f"ipc://{tmp_path}/bus")
     child.socket.connect(f"ipc://{tmp_path}/bus")
     job, done = RunJob(1, 0, 7, 0, 1, 0), Done(1, 2, 3, 4, {"inferred": 1.0})
@@ -177,8 +177,8 @@ def test_work_goes_over_the_line_and_life_signs_over_the_bus(tmp_path: Path) -> 
 
 
 def test_a_line_waits_for_a_message_or_not_at_all() -> None:
-    ours, theirs = line_pair()
-    patient, hasty = Line(ours, waits=True), Line(theirs)
+    ours, theirs = job_pipe_pair()
+    patient, hasty = JobPipe(ours, waits=True), JobPipe(theirs)
     assert hasty.receive() is None and not hasty.ended
     threading.Timer(0.05, hasty.send, [Ping()]).start()
     assert patient.receive() == Ping()
@@ -188,7 +188,7 @@ def test_a_line_waits_for_a_message_or_not_at_all() -> None:
 
 
 def test_a_line_whose_end_is_gone_or_stopped_says_nothing() -> None:
-    ours, theirs = (Line(end) for end in line_pair())
+    ours, theirs = (JobPipe(end) for end in job_pipe_pair())
     for number in range(10_000):
         ours.send(RunJob(number, 0, 0, 0, 0, 0))
     assert [theirs.receive() for _ in range(PACKETS + 1)] == [*(RunJob(n, 0, 0, 0, 0, 0) for n in range(PACKETS)), None]
@@ -199,7 +199,7 @@ def test_a_line_whose_end_is_gone_or_stopped_says_nothing() -> None:
 
 
 def test_what_was_said_before_an_end_that_left_work_unread_is_heard() -> None:
-    ours, theirs = (Line(end) for end in line_pair())
+    ours, theirs = (JobPipe(end) for end in job_pipe_pair())
     theirs.send(Done(1, 2, 3, 4, {}))
     ours.send(RunJob(2, 0, 0, 0, 0, 0))
     theirs.close()
@@ -216,7 +216,7 @@ def test_a_user_without_memory_for_pipes_is_told_so(monkeypatch: pytest.MonkeyPa
     before = open_files()
     monkeypatch.setattr("fcntl.fcntl", lambda *_: 4096)
     with pytest.raises(TrilaneError, match=r"4096 bytes for a pipe, by .*pipe-user-pages-soft"):
-        line_pair()
+        job_pipe_pair()
     assert open_files() == before
 
 
@@ -230,14 +230,14 @@ def test_a_process_without_files_for_pipes_is_told_so(monkeypatch: pytest.Monkey
 
     monkeypatch.setattr("os.pipe2", pipe2)
     with pytest.raises(TrilaneError, match="Too many open files"):
-        line_pair()
+        job_pipe_pair()
     assert open_files() == before
 
 
 def test_a_line_refuses_what_is_no_message() -> None:
-    end, other = line_pair()
+    end, other = job_pipe_pair()
     os.write(end.writes, b"no message")
-    line = Line(other)
+    line = JobPipe(other)
     with pytest.raises(MessageError):
         line.receive()
     end.close()
@@ -246,7 +246,7 @@ def test_a_line_refuses_what_is_no_message() -> None:
 
 def test_a_message_too_large_is_not_received() -> None:
     context = zmq.Context()
-    parent, child = (Link(context, Line(end)) for end in line_pair())
+    parent, child = (Link(context, JobPipe(end)) for end in job_pipe_pair())
     with BusFolder() as folder:
         parent.socket.bind(folder.endpoint("cpu"))
         child.socket.connect(folder.endpoint("cpu"))

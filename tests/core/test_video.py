@@ -11,9 +11,12 @@ import pytest
 from PIL import Image
 
 from trilane.apps.video import contact_sheet, join_segments, run_checksum
-from trilane.scene.schema import OutputSpec, RunConfig, Scene, UnitSettings
-from trilane.stages.contracts import Packet, SlotLayout, view_packet
+from trilane.pipeline.description import UnitSettings
+from trilane.scene.schema import OutputSpec, Scene
+from trilane.stages.config import RunConfig
 from trilane.stages.cpu.present import SEGMENTS, PresentStage
+from trilane.stages.packets import pose_dtype
+from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 WIDTH, HEIGHT, FPS = 96, 64, 30.0
 
@@ -29,7 +32,7 @@ def make_config(out_dir: Path, *, record: bool = True) -> RunConfig:
 
 
 def make_slot() -> Packet:
-    layout = SlotLayout(avatars=1, payload_bytes=WIDTH * HEIGHT * 3)
+    layout = SlotLayout(pose_dtype(1), payload_bytes=WIDTH * HEIGHT * 3)
     return view_packet(memoryview(bytearray(layout.slot_bytes)), layout)
 
 

@@ -12,19 +12,17 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from trilane.arrays import F32, F64
 from trilane.avatars.bundle import bundle_folder
+from trilane.body.body import Body, load_body
+from trilane.body.kinematics import Skeleton
+from trilane.body.skinning import largest_weights
 from trilane.errors import MissingPartError
-from trilane.stages.cpu.body import Body, load_body
-from trilane.stages.cpu.kinematics import Skeleton
-from trilane.stages.cpu.skinning import largest_weights
 from trilane.stages.gpu.context import open_context
 from trilane.stages.gpu.mesh import MeshArrays, SkinnedMesh, mesh_arrays
 
 HERE = Path(__file__).parent
 FAILED = HERE / "failed"
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 
 @pytest.fixture(scope="session")

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from trilane.bench import raster, readback
+from trilane.bench.gpu_buffering import READBACKS, UPLOADS
 from trilane.errors import BadInputError, TrilaneError
 from trilane.stages.gpu import gl as raw
-from trilane.stages.gpu.buffering import READBACKS, UPLOADS
 
 
 @pytest.mark.parametrize("name", READBACKS)

@@ -8,12 +8,12 @@ import pytest
 pytest.importorskip("torch")
 
 from trilane.avatars.bundle import bundle_folder
-from trilane.avatars.training.data import U16, open_groups
-from trilane.avatars.training.dataset import Studio, plan_training, write_dataset
-from trilane.avatars.training.poses import random_pose
-from trilane.avatars.training.views import BANDS
+from trilane.body.body import load_body
 from trilane.errors import MissingPartError
-from trilane.stages.cpu.body import load_body
+from trilane.training.data import U16, open_groups
+from trilane.training.dataset import Studio, plan_training, write_dataset
+from trilane.training.poses import random_pose
+from trilane.training.views import BANDS
 
 BODY = bundle_folder("default") / "body.npz"
 

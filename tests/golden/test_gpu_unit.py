@@ -12,14 +12,17 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from trilane.errors import BadInputError, TrilaneError, UnitLostError
-from trilane.scene.schema import PlaneSpec, RunConfig, Scene, UnitSettings
-from trilane.stages.contracts import Packet, SlotLayout, view_packet
+from trilane.pipeline.description import UnitSettings
+from trilane.scene.schema import PlaneSpec, Scene
+from trilane.stages.config import RunConfig
 from trilane.stages.gpu import hud, planes, unit
 from trilane.stages.gpu.assets import AvatarAssets
 from trilane.stages.gpu.composite import CompositeStage
 from trilane.stages.gpu.packed import PackedAvatar, PackedPass, Quantisation
 from trilane.stages.gpu.raster import RasterStage
-from trilane.stages.mock.lost_context import lose_context
+from trilane.stages.packets import pose_dtype
+from trilane.testing.lost_context import lose_context
+from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 TENSOR = (96, 64)
 OUTPUT = (240, 320)
@@ -29,15 +32,15 @@ Camera = Callable[..., Any]
 
 def packet(payload_bytes: int, avatars: int = 1) -> Packet:
     """A slot of zeros."""
-    layout = SlotLayout(avatars, payload_bytes)
+    layout = SlotLayout(pose_dtype(avatars), payload_bytes)
     return view_packet(memoryview(bytearray(layout.slot_bytes)), layout)
 
 
 def fill_pose(slot: Packet, joints: Any, view: Any, projection: Any, rect: Any, tensor: Any = TENSOR) -> None:
     """One visible avatar that fills the tensor."""
-    slot.pose["avatar_count"], slot.pose["tensor_shape"] = 1, tensor
-    slot.pose["view"], slot.pose["projection"] = view, projection
-    avatar = slot.pose["avatars"][0]
+    slot.header["avatar_count"], slot.header["tensor_shape"] = 1, tensor
+    slot.header["view"], slot.header["projection"] = view, projection
+    avatar = slot.header["avatars"][0]
     avatar["visible"], avatar["rect"], avatar["tensor_rect"] = 1, rect, (0, 0, *tensor)
     avatar["joints"] = joints
 
@@ -70,7 +73,7 @@ def test_crop_is_the_same_picture_enlarged(raster: Any, person: Any, camera: Cam
 def test_an_unseen_avatar_is_background(raster: Any) -> None:
     """Every byte is the zero point, and bytes behind the tensor are left alone."""
     stage, source, target = raster
-    source.pose["avatar_count"], source.pose["tensor_shape"] = 1, TENSOR
+    source.header["avatar_count"], source.header["tensor_shape"] = 1, TENSOR
     stage.run(0, 0, 0)
     size = TENSOR[0] * TENSOR[1] * 16
     assert (target.payload[:size] == ENCODING.zero_point).all()
@@ -145,8 +148,8 @@ def test_the_display_stays_in_its_corner(gl: Any, person: Any, camera: Camera) -
 
 
 def test_the_display_says_frame_rate_and_age() -> None:
-    pose = packet(0).pose
-    pose["frame"], pose["media_time_s"], pose["t_pose_ns"] = 12, 0.4, 1_900_000_000
+    pose = packet(0).header
+    pose["frame"], pose["media_time_s"], pose["t_sampled_ns"] = 12, 0.4, 1_900_000_000
     pose["tensor_shape"], pose["avatar_count"] = (320, 192), 1
     pose["avatars"][0]["visible"] = 1
     measured = hud.measured_line(pose, [1_000_000_000, 1_500_000_000, 2_000_000_000])
@@ -168,7 +171,7 @@ def test_the_displays_frame_is_the_pictures(gl: Any, monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(hud, "hud_picture", noted)
     display, target = hud.Hud(gl), gl.simple_framebuffer((640, 480))
-    pose = packet(0).pose
+    pose = packet(0).header
     for frame in (7, 8, 0, 1, 2):
         pose["frame"] = frame
         display.draw(target, pose)

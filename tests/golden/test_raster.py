@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from trilane.bench import float_raster as oracle
+from trilane.body.skinning import FrameSkinner
 from trilane.errors import BadInputError
-from trilane.stages.cpu.skinning import FrameSkinner
-from trilane.stages.gpu import oracle
 from trilane.stages.gpu.mesh import PosedMesh, SkinnedMesh, mesh_arrays
 from trilane.stages.gpu.packed import PackedAvatar, PackedPass, Placement, Quantisation
-from trilane.stages.gpu.uv_image import UvBytes, UvRaster
+from trilane.training.uv_image import UvBytes, UvRaster
 
 ENCODING = Quantisation(6 / 255, 117)
 REST = np.zeros(165)

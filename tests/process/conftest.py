@@ -10,10 +10,11 @@ import psutil
 import pytest
 
 from trilane.hw_profiles.host import host_units
-from trilane.scene.schema import RunConfig, Scene
+from trilane.scene.schema import Scene
+from trilane.stages.config import RunConfig
+from trilane.units import UNITS
 
-MOCK = "trilane.stages.mock.unit"
-UNITS = ("cpu", "gpu", "dsp")
+MOCK = "trilane.testing.doubles"
 SHM = Path("/dev/shm")  # noqa: S108 - looked at, not written to
 OPEN_FILES = Path("/proc/self/fd")
 

@@ -23,7 +23,7 @@ from PIL import Image
 from trilane.apps.report import read_report
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.split import cuts
-from trilane.scheduler.record import read, replay
+from trilane.scheduler.recording import read, replay
 
 FRAMES = 20
 PATIENCE_S = 60.0

@@ -10,7 +10,7 @@ import pytest
 from trilane.bench import faults
 from trilane.bench.faults import Signals
 from trilane.errors import BadInputError
-from trilane.scene.schema import RunConfig
+from trilane.stages.config import RunConfig
 
 Configure = Callable[..., RunConfig]
 MS = 1_000_000

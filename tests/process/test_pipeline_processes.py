@@ -15,16 +15,16 @@ from pathlib import Path
 import psutil
 import pytest
 
-from trilane.apps.configure import Request, configure
 from trilane.apps.pace import Pace, compare
 from trilane.errors import BadInputError, TrilaneError
+from trilane.hw_profiles.governor import Governor
 from trilane.hw_profiles.load import load_runnable
-from trilane.scene.schema import RunConfig
-from trilane.scheduler.events import Beat
-from trilane.scheduler.governor import Governor
-from trilane.scheduler.record import replay
-from trilane.scheduler.result import RunResult
-from trilane.scheduler.run import run_pipeline
+from trilane.pipeline.result import RunResult
+from trilane.pipeline.run import run_pipeline
+from trilane.scheduler.events import Pong
+from trilane.scheduler.recording import replay
+from trilane.stages.config import RunConfig
+from trilane.stages.configure import Request, configure
 
 Configure = Callable[..., RunConfig]
 pytestmark = pytest.mark.usefixtures("nothing_left")
@@ -132,7 +132,7 @@ def test_idle_units_are_asked_whether_they_live(mock_config: Configure) -> None:
     """The CPU waits longer for its next job than a unit may be silent."""
     config = mock_config(2, raster=400, infer=400, composite=400)
     result = run_pipeline(config, policy="sequential", isolate_frames=0, hang_ns=700_000_000)
-    beats = [event for _, events, _ in result.recording.steps for event in events if isinstance(event, Beat)]
+    beats = [event for _, events, _ in result.recording.steps for event in events if isinstance(event, Pong)]
     assert result.presented == 2
     assert not any(row["restarts"] for row in result.report["units"].values())
     assert any(beat.unit == "cpu" for beat in beats)
@@ -170,7 +170,7 @@ def test_late_poses_arrive_and_are_newer(mock_config: Configure) -> None:
 
 def test_a_lost_context_costs_a_restart_and_a_frame(tmp_path: Path) -> None:
     config = configure(Request(frames=40, size="128"), tmp_path).config
-    losing = config.model_copy(update={"fake": {"gpu": "trilane.stages.mock.lost_context"}})
+    losing = config.model_copy(update={"fake": {"gpu": "trilane.testing.lost_context"}})
     result = run_pipeline(losing, isolate_frames=0)
     assert result.failure is None
     assert set(result.lost) == {"died:gpu"}
@@ -237,11 +237,12 @@ SCRIPT = """
 import sys
 from pathlib import Path
 from trilane.hw_profiles.host import host_units
-from trilane.scene.schema import RunConfig, Scene
-from trilane.scheduler.run import run_pipeline
+from trilane.stages.config import RunConfig
+from trilane.scene.schema import Scene
+from trilane.pipeline.run import run_pipeline
 
 config = RunConfig(scene=Scene(frames=int(sys.argv[2]), size="64"), out_dir=Path(sys.argv[1]), avatar_dirs=(),
-                   units=host_units(), fake=dict.fromkeys(("cpu", "gpu", "dsp"), "trilane.stages.mock.unit"))
+                   units=host_units(), fake=dict.fromkeys(("cpu", "gpu", "dsp"), "trilane.testing.doubles"))
 result = run_pipeline(config, isolate_frames=0, hang_ns=int(float(sys.argv[3]) * 1e9),
                       on_progress=lambda done, _: print(done, flush=True))
 print(f"over: {result.presented} presented, lost {result.lost}, {result.messages}", flush=True)
@@ -293,7 +294,7 @@ def test_units_that_cannot_be_started_leave_nothing(
     def refuse(*_: object, **__: object) -> None:
         raise OSError(errno.ENOMEM, "Cannot allocate memory")
 
-    for part in ("subprocess.Popen", "os.pidfd_open", "trilane.scheduler.processes.line_pair"):
+    for part in ("subprocess.Popen", "os.pidfd_open", "trilane.pipeline.processes.job_pipe_pair"):
         with monkeypatch.context() as patched, pytest.raises(OSError, match="Cannot allocate"):
             patched.setattr(part, refuse)
             run_pipeline(mock_config(3), isolate_frames=0)
@@ -310,7 +311,7 @@ def test_an_idle_unit_that_does_not_answer_is_restarted(
     mock_config: Configure, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The DSP has no job while pose and raster work, and so loses none."""
-    monkeypatch.setattr("trilane.scheduler.realtime.PING_NS", 50_000_000)
+    monkeypatch.setattr("trilane.pipeline.realtime.PING_NS", 50_000_000)
     stop = When(1, lambda: unit_process("dsp").suspend())
     config = mock_config(3, pose=500, raster=500)
     result = run_pipeline(config, policy="sequential", isolate_frames=0, hang_ns=850_000_000, on_progress=stop)

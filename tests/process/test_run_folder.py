@@ -14,11 +14,12 @@ from trilane.apps.report import read_report
 from trilane.apps.run_job import Hooks, Outcome, Plan, run_to_folder
 from trilane.errors import TrilaneError
 from trilane.hw_profiles.host import host_units
-from trilane.scene.schema import OutputSpec, RunConfig, Scene
-from trilane.scheduler.record import read, replay
+from trilane.scene.schema import OutputSpec, Scene
+from trilane.scheduler.recording import read, replay
+from trilane.stages.config import RunConfig
 
 FRAMES = 24
-MOCK = "trilane.stages.mock.unit"
+MOCK = "trilane.testing.doubles"
 pytestmark = pytest.mark.usefixtures("no_new_process")
 
 

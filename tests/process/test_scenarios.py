@@ -11,7 +11,7 @@ import pytest
 from trilane.bench import load, scenario
 from trilane.bench.load import Load
 from trilane.errors import BadInputError, TrilaneError
-from trilane.scene.schema import RunConfig
+from trilane.stages.config import RunConfig
 
 Configure = Callable[..., RunConfig]
 pytestmark = pytest.mark.usefixtures("nothing_left")

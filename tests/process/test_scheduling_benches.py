@@ -9,7 +9,7 @@ import pytest
 
 from trilane.bench import handoff, handoff_ways, pipeline, scheduler
 from trilane.errors import BadInputError
-from trilane.scheduler.result import JobRecord
+from trilane.scheduler.ledger import JobRecord
 
 
 def job(ready: int, dispatch: int, begin: int, end: int) -> JobRecord:

@@ -1,0 +1,49 @@
+"""What a bundle and a network are, as plain data for people and for JSON.
+
+Rule: every figure is read from the files or from the manifest, which says how it was measured.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import onnx
+
+from trilane.avatars.bundle import Bundle
+from trilane.avatars.network_file import NetworkFile
+from trilane.body.body import load_body
+from trilane.hw_profiles.cost import walk
+
+
+def bundle_facts(bundle: Bundle) -> dict[str, Any]:
+    """The manifest's entries, sizes in bytes, and what the network's file holds. Raises BadInputError.
+
+    Keys: `name`, `folder`, `files`, `body`, `texture`, `network`, `quantisation`, `provenance`, `training_command`,
+    `validation`.
+    """
+    manifest = bundle.manifest
+    shaped = load_body(bundle.body_path).shape(manifest.betas, manifest.expression)
+    files = {"body": bundle.body_path, "texture": bundle.texture_path, "network": bundle.network_path}
+    return {
+        "name": manifest.name,
+        "folder": str(bundle.folder),
+        "files": {key: {"name": path.name, "bytes": path.stat().st_size} for key, path in files.items()},
+        "body": {"vertices": len(shaped.vertices)},
+        "texture": {"shape": list(bundle.read_texture().shape)},
+        "network": {**manifest.network.model_dump(), **network_facts(bundle.read_network())},
+        "quantisation": manifest.quantisation,
+        "provenance": manifest.provenance,
+        "training_command": manifest.training_command,
+        "validation": manifest.validation.model_dump() if manifest.validation else None,
+    }
+
+
+def network_facts(network: NetworkFile) -> dict[str, Any]:
+    """`shape` (N, H, W, C), `sha256`, and the work of one pass, see `graph_facts`."""
+    return {"shape": list(network.shape), "sha256": network.digest, **graph_facts(network.model)}
+
+
+def graph_facts(model: onnx.ModelProto) -> dict[str, Any]:
+    """`parameters` of the layers as they are in the file, `gmac` of one pass."""
+    work = walk(model)
+    return {"parameters": work.weights, "gmac": work.macs / 1e9}

@@ -1,0 +1,74 @@
+"""What the GPU benches draw: the default body, standing, in a square picture that it fills from top to bottom.
+
+Rule: the same numbers every time; only size and channels vary.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.avatars.bundle import bundle_folder
+from trilane.body.body import ShapedBody, load_body
+from trilane.body.joints import JOINT_INDEX
+from trilane.body.kinematics import Posed, Skeleton
+from trilane.body.skinning import largest_weights
+from trilane.stages.gpu.mesh import MeshArrays, mesh_arrays
+from trilane.stages.gpu.packed import Quantisation
+
+TEXTURE_SIDE = 512
+ENCODING = Quantisation(6 / 255, 128)
+DISTANCE_M, HEIGHT_M, FRAME_M = 3.0, 0.9, 1.9
+ARMS_DOWN_RAD = 1.1
+
+
+@dataclass(frozen=True)
+class Subject:
+    """`joints` (55,3,4) float32, `view` and `projection` (4,4) float64, `texture` (512,512,C) float64."""
+
+    shaped: ShapedBody
+    posed: Posed
+    arrays: MeshArrays
+    joints: NDArray[np.float32]
+    view: NDArray[np.float64]
+    projection: NDArray[np.float64]
+    texture: NDArray[np.float64]
+
+
+def standing(channels: int, weights: int = 8) -> Subject:
+    """The subject with `weights` (4, 8 or 12) skin weights a vertex."""
+    body = load_body(bundle_folder("default") / "body.npz")
+    shaped = body.shape()
+    top = largest_weights(body.weights, weights)
+    pose = np.zeros((55, 3))
+    pose[JOINT_INDEX["left_shoulder"], 2], pose[JOINT_INDEX["right_shoulder"], 2] = -ARMS_DOWN_RAD, ARMS_DOWN_RAD
+    low = float(shaped.vertices[:, 1].min())
+    posed = Skeleton(shaped.joints, body.parents).pose(pose.ravel(), translation=(0.0, -low, 0.0))
+    view = np.eye(4)
+    view[:3, 3] = (0.0, -HEIGHT_M, -DISTANCE_M)
+    return Subject(
+        shaped=shaped,
+        posed=posed,
+        arrays=mesh_arrays(shaped.vertices, body.faces, body.uv, body.uv_faces, top.joints, top.weights),
+        joints=posed.matrices.copy(),
+        view=view,
+        projection=_projection(),
+        texture=_texture(channels),
+    )
+
+
+def _projection() -> NDArray[np.float64]:
+    near, far, zoom = 0.05, 100.0, 2 * DISTANCE_M / FRAME_M
+    projection: NDArray[np.float64] = np.diag([zoom, zoom, -(far + near) / (far - near), 0.0])
+    projection[2, 3], projection[3, 2] = -2 * far * near / (far - near), -1.0
+    return projection
+
+
+def _texture(channels: int) -> NDArray[Any]:
+    rng = np.random.default_rng(0)
+    row, column = np.indices((TEXTURE_SIDE, TEXTURE_SIDE)) * (2 * np.pi / TEXTURE_SIDE)
+    waves = rng.integers(1, 40, (channels, 2))
+    return np.stack([np.sin(waves[c, 0] * row + c) + np.cos(waves[c, 1] * column) for c in range(channels)], axis=-1)

@@ -1,0 +1,167 @@
+"""A reference rasteriser in float64 NumPy: what the GPU stage's pictures are judged by.
+
+Rule: exact where a driver rounds. Pixel centres at half-integers, top-left rule, less-than depth test, no snapping of
+vertices, no clipping: triangles are evaluated in homogeneous coordinates (Olano and Greer, "Triangle scan conversion
+using 2D homogeneous coordinates", 1997) and cut by the near and far planes pixel by pixel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.arrays import F64
+from trilane.stages.gpu.camera import FLIP_Y
+from trilane.stages.gpu.mesh import MeshArrays
+
+BATCH_SAMPLES = 4_000_000
+
+
+@dataclass(frozen=True)
+class OracleImage:
+    """`coverage` (h,w) bool. `triangle` (h,w) int64, -1 outside. `uv` (h,w,2) and `depth` (h,w) float64, 0 outside."""
+
+    coverage: NDArray[np.bool_]
+    triangle: NDArray[np.int64]
+    uv: F64
+    depth: F64
+
+
+def skin(arrays: MeshArrays, joints: NDArray[np.floating[Any]]) -> F64:
+    """World positions (N,3) of `arrays` under skinning matrices `joints` (55,3,4)."""
+    matrices = np.einsum("nk,nkij->nij", arrays.weight.astype(np.float64), joints.astype(np.float64)[arrays.joint])
+    return np.asarray(np.einsum("nij,nj->ni", matrices[..., :3], arrays.position.astype(np.float64)) + matrices[..., 3])
+
+
+def rasterise(
+    world: F64,
+    triangles: NDArray[np.integer[Any]],
+    uv: NDArray[np.floating[Any]],
+    clip: F64,
+    shape: tuple[int, int],
+    cull: bool = False,
+) -> OracleImage:
+    """Draw `triangles` (F,3) of `world` (N,3) with `uv` (N,2) through `clip` = projection @ view (4,4); row 0 on top.
+
+    `cull`: leave out triangles that wind clockwise in the picture.
+    """
+    corners = _target_corners(world, clip, shape)[triangles]
+    pixel, depth, owner, share = _fragments(corners, shape, cull)
+    nearest = np.lexsort((owner, depth, pixel))
+    pixel, first = np.unique(pixel[nearest], return_index=True)
+    chosen = nearest[first]
+    height, width = shape
+    coverage = np.zeros(height * width, bool)
+    triangle = np.full(height * width, -1, np.int64)
+    image_uv, image_depth = np.zeros((height * width, 2)), np.zeros(height * width)
+    coverage[pixel], triangle[pixel], image_depth[pixel] = True, owner[chosen], depth[chosen]
+    image_uv[pixel] = np.einsum("pk,pkc->pc", share[chosen], uv.astype(np.float64)[triangles[owner[chosen]]])
+    return OracleImage(
+        coverage.reshape(shape), triangle.reshape(shape), image_uv.reshape(*shape, 2), image_depth.reshape(shape)
+    )
+
+
+def sample(texture: F64, uv: F64) -> F64:
+    """Bilinear samples (..., C) of `texture` (H,W,C) at `uv` (..., 2), clamped to its edge."""
+    height, width = texture.shape[:2]
+    column, row = uv[..., 0] * width - 0.5, uv[..., 1] * height - 0.5
+    left, top = np.floor(column).astype(np.int64), np.floor(row).astype(np.int64)
+    right_share, bottom_share = (column - left)[..., None], (row - top)[..., None]
+
+    def at(dy: int, dx: int) -> F64:
+        return np.asarray(texture[np.clip(top + dy, 0, height - 1), np.clip(left + dx, 0, width - 1)])
+
+    upper = at(0, 0) * (1 - right_share) + at(0, 1) * right_share
+    lower = at(1, 0) * (1 - right_share) + at(1, 1) * right_share
+    return np.asarray(upper * (1 - bottom_share) + lower * bottom_share)
+
+
+def quantise(real: F64, scale: float, zero_point: int) -> NDArray[np.uint8]:
+    """q = clamp(round(real / scale) + zero_point, 0, 255), halves to even."""
+    return np.asarray(np.clip(np.rint(real / scale) + zero_point, 0, 255), np.uint8)
+
+
+def tensor(image: OracleImage, texture: F64, scale: float, zero_point: int) -> NDArray[np.uint8]:
+    """The network's input (h,w,C) uint8 for `image` and `texture` (H,W,C), zero point outside the mesh."""
+    q = np.full((*image.coverage.shape, texture.shape[2]), zero_point, np.uint8)
+    q[image.coverage] = quantise(sample(texture, image.uv[image.coverage]), scale, zero_point)
+    return q
+
+
+def _target_corners(world: F64, clip: F64, shape: tuple[int, int]) -> F64:
+    """Vertices (N,4): homogeneous column, row, clip z, clip w, so that column / w is a position in pixels."""
+    x, y, z, w = np.moveaxis(np.c_[world, np.ones(len(world))] @ (FLIP_Y @ clip).T, -1, 0)
+    return np.stack([(x + w) * shape[1] / 2, (y + w) * shape[0] / 2, z, w], axis=-1)
+
+
+def _fragments(
+    corners: F64, shape: tuple[int, int], cull: bool
+) -> tuple[NDArray[np.int64], F64, NDArray[np.int64], F64]:
+    """Every covered sample of every triangle: pixel index, depth z/w, triangle, shares (P,3) of the corners."""
+    low, size = _boxes(corners, shape)
+    if cull:
+        size[_determinant(corners) >= 0] = 0
+    parts = []
+    for side in 2 ** np.arange(int(np.ceil(np.log2(float(size.max(initial=1))))) + 1):
+        members = np.flatnonzero((size <= side) & (size > side // 2))
+        step = max(1, BATCH_SAMPLES // int(side * side))
+        parts += [
+            _covered(corners, members[at : at + step], low, int(side), shape) for at in range(0, len(members), step)
+        ]
+    if not parts:
+        return np.empty(0, np.int64), np.empty(0), np.empty(0, np.int64), np.empty((0, 3))
+    pixel, depth, owner, share = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return pixel, depth, owner, share
+
+
+def _boxes(corners: F64, shape: tuple[int, int]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First pixel (F,2) column, row and side (F,) of a square that holds each triangle; side 0 when it is outside."""
+    limit = np.array([shape[1], shape[0]])
+    w = corners[..., 3]
+    in_front = (w > 0).all(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        place = corners[..., :2] / w[..., None]
+    place[~in_front] = np.array([[0, 0], limit, limit])
+    low = np.clip(np.floor(np.clip(place.min(axis=1), -1, limit)), 0, limit).astype(np.int64)
+    high = np.clip(np.ceil(np.clip(place.max(axis=1), -1, limit)), 0, limit).astype(np.int64)
+    side = (high - low).max(axis=1)
+    side[((high - low).min(axis=1) <= 0) | (w <= 0).all(axis=1)] = 0
+    return low, side
+
+
+def _covered(corners: F64, members: Any, low: Any, side: int, shape: tuple[int, int]) -> tuple[Any, Any, Any, Any]:
+    points = corners[members]
+    edges = np.stack([_cross(points, 1, 2), _cross(points, 2, 0), _cross(points, 0, 1)], axis=1)
+    determinant = _determinant(points)
+    turned = np.where(determinant < 0, -1.0, 1.0)[:, None, None]
+    edges *= turned
+    column = low[members, 0][:, None, None] + np.arange(side)[None, None, :]
+    row = low[members, 1][:, None, None] + np.arange(side)[None, :, None]
+    value = edges[:, :, 0, None, None] * (column + 0.5)[:, None]
+    value = value + edges[:, :, 1, None, None] * (row + 0.5)[:, None] + edges[:, :, 2, None, None]
+    owned = (value > 0) | ((value == 0) & _top_left(edges)[:, :, None, None])
+    inside = owned.all(axis=1) & (column < shape[1]) & (row < shape[0]) & (determinant != 0)[:, None, None]
+    which, y, x = np.nonzero(inside)
+    share = value[which, :, y, x]
+    share /= share.sum(axis=1, keepdims=True)
+    z, w = (np.einsum("pk,pk->p", share, points[which, :, axis]) for axis in (2, 3))
+    kept = (z >= -w) & (z <= w) & (w > 0)
+    pixel = row[which, y, 0] * shape[1] + column[which, 0, x]
+    return pixel[kept], (z[kept] / w[kept]), members[which][kept], share[kept]
+
+
+def _cross(points: F64, first: int, second: int) -> F64:
+    return np.asarray(np.cross(points[:, first][:, [0, 1, 3]], points[:, second][:, [0, 1, 3]]))
+
+
+def _determinant(points: F64) -> F64:
+    """(F,): positive for triangles that wind clockwise in the picture (rows run downward)."""
+    return np.asarray((_cross(points, 1, 2) * points[:, 0][:, [0, 1, 3]]).sum(axis=-1))
+
+
+def _top_left(edges: F64) -> NDArray[np.bool_]:
+    """Which edges (F,3,3) own the samples on them, rows downward: left edges, and level ones with the inside below."""
+    return np.asarray((edges[..., 0] > 0) | ((edges[..., 0] == 0) & (edges[..., 1] > 0)))

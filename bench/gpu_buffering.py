@@ -1,0 +1,157 @@
+"""Ways to move pixels between the GPU and a slot, by name.
+
+Rule: every way gives the same bytes; they differ in when the caller waits. `lag`: how many submits later they arrive.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from trilane.arrays import U8
+from trilane.stages.gpu import gl
+
+Box = tuple[int, int, int, int]
+RING = 3
+
+
+class Readback(Protocol):
+    """Reads `box` of a framebuffer of 32-bit unsigned words."""
+
+    lag: int
+
+    def submit(self, target: Any, box: Box, words: int, tensor: U8) -> None:
+        """Start to read `words` components a pixel into `tensor`, which is filled `lag` submits later."""
+
+    def drain(self) -> None:
+        """Fill every tensor that was submitted."""
+
+
+class DirectReadback:
+    """The driver copies to the slot, and the caller waits."""
+
+    lag = 0
+
+    def __init__(self, ctx: Any, most_bytes: int) -> None:
+        """Nothing is allocated."""
+
+    def submit(self, target: Any, box: Box, words: int, tensor: U8) -> None:
+        """Read at once."""
+        target.read_into(tensor, box, components=words, dtype="u4", alignment=1)
+
+    def drain(self) -> None:
+        """Nothing waits."""
+
+
+class PboReadback:
+    """The driver copies to one pixel buffer, the caller from there to the slot."""
+
+    lag = 0
+    orphan = False
+
+    def __init__(self, ctx: Any, most_bytes: int) -> None:
+        self._buffer = ctx.buffer(reserve=most_bytes)
+
+    def submit(self, target: Any, box: Box, words: int, tensor: U8) -> None:
+        """Read to the buffer, then copy."""
+        if self.orphan:
+            self._buffer.orphan()
+        target.read_into(self._buffer, box, components=words, dtype="u4", alignment=1)
+        self._buffer.read_into(tensor, size=tensor.nbytes)
+
+    def drain(self) -> None:
+        """Nothing waits."""
+
+
+class OrphanPboReadback(PboReadback):
+    """As `PboReadback`, with fresh memory for each frame, so that the driver need not wait for the old."""
+
+    orphan = True
+
+
+class RingReadback:
+    """Pixel buffers in turn, each with a fence; the slot is filled when its buffer's turn comes again."""
+
+    lag = RING - 1
+
+    def __init__(self, ctx: Any, most_bytes: int) -> None:
+        self._free = deque(ctx.buffer(reserve=most_bytes) for _ in range(RING))
+        self._waiting: deque[tuple[Any, int, U8]] = deque()
+
+    def submit(self, target: Any, box: Box, words: int, tensor: U8) -> None:
+        """Start this read; finish the oldest when all buffers are taken."""
+        buffer = self._free.popleft()
+        target.read_into(buffer, box, components=words, dtype="u4", alignment=1)
+        self._waiting.append((buffer, gl.fence(), tensor))
+        if not self._free:
+            self._finish()
+
+    def drain(self) -> None:
+        """Wait for all of them."""
+        while self._waiting:
+            self._finish()
+
+    def _finish(self) -> None:
+        buffer, sync, tensor = self._waiting.popleft()
+        gl.wait_fence(sync)
+        buffer.read_into(tensor, size=tensor.nbytes)
+        self._free.append(buffer)
+
+
+READBACKS: dict[str, Callable[[Any, int], Readback]] = {
+    "direct": DirectReadback,
+    "pbo": PboReadback,
+    "pbo-orphan": OrphanPboReadback,
+    "pbo-ring": RingReadback,
+}
+
+
+class Upload(Protocol):
+    """Writes a slot's bytes to a texture."""
+
+    def write(self, texture: Any, image: U8) -> None:
+        """After this the caller may change `image`."""
+
+
+class SubUpload:
+    """The driver copies from the slot."""
+
+    def __init__(self, ctx: Any, most_bytes: int) -> None:
+        """Nothing is allocated."""
+
+    def write(self, texture: Any, image: U8) -> None:
+        """Copy at once."""
+        texture.write(image, alignment=1)
+
+
+class OrphanUpload:
+    """Through one pixel buffer whose memory is renewed for each frame."""
+
+    def __init__(self, ctx: Any, most_bytes: int) -> None:
+        self._buffer = ctx.buffer(reserve=most_bytes)
+
+    def write(self, texture: Any, image: U8) -> None:
+        """Copy to fresh memory, from there the driver copies on."""
+        self._buffer.orphan()
+        self._buffer.write(image)
+        texture.write(self._buffer, alignment=1)
+
+
+class RingUpload:
+    """Through pixel buffers in turn; one is written again only after its fence."""
+
+    def __init__(self, ctx: Any, most_bytes: int) -> None:
+        self._ring: deque[tuple[Any, int | None]] = deque((ctx.buffer(reserve=most_bytes), None) for _ in range(RING))
+
+    def write(self, texture: Any, image: U8) -> None:
+        """Copy to the oldest buffer, from there the driver copies on."""
+        buffer, sync = self._ring.popleft()
+        if sync is not None:
+            gl.wait_fence(sync)
+        buffer.write(image)
+        texture.write(buffer, alignment=1)
+        self._ring.append((buffer, gl.fence()))
+
+
+UPLOADS: dict[str, Callable[[Any, int], Upload]] = {"sub": SubUpload, "orphan": OrphanUpload, "ring": RingUpload}

@@ -1,0 +1,284 @@
+"""The two ends of every hand-over that `bench handoff` compares: where to write, how to announce, how to receive.
+
+Rule: `Producer.buffer` is filled before the clock starts; `Consumer.receive` returns when every byte can be read.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from multiprocessing.context import SpawnContext
+from multiprocessing.queues import Queue
+from multiprocessing.reduction import DupFd
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import zmq
+
+from trilane.arrays import U8
+from trilane.transport.heartbeats import BusFolder
+from trilane.transport.job_pipe import JobPipe, JobPipeEnd, job_pipe_pair
+from trilane.transport.memory import RegionLayout, create_region, map_region
+from trilane.transport.messages import RunJob
+from trilane.transport.packets import SlotLayout, header_dtype
+
+SLOTS = 2
+WAIT_MS = 60_000
+SHM = Path("/dev/shm")  # noqa: S108 - what iceoryx2 leaves there under our prefix is removed
+
+
+class Producer(Protocol):
+    """The end that has the bytes first."""
+
+    def buffer(self) -> U8:
+        """Where the next bytes are written."""
+
+    def hand_over(self) -> None:
+        """They are written: tell the other end, or send them."""
+
+
+class Consumer(Protocol):
+    """The end that waits for them."""
+
+    def receive(self) -> U8:
+        """Wait for the next bytes; they may be read until `release`."""
+
+    def release(self) -> None:
+        """They were read."""
+
+
+class Channel(Protocol):
+    """Made in the parent, sent to both children, opened there."""
+
+    def producer(self) -> Producer:
+        """In the child that writes."""
+
+    def consumer(self) -> Consumer:
+        """In the child that reads."""
+
+    def close(self) -> None:
+        """In the parent, when both are gone."""
+
+
+class SlotChannel:
+    """As the pipeline: slots of a sealed memfd region, announced by a message over a `JobPipe`."""
+
+    def __init__(self, size: int, _context: SpawnContext) -> None:
+        self._layout = RegionLayout(SLOTS, SlotLayout(header_dtype(), size))
+        self._fd = create_region("handoff", self._layout)
+        self._place = f"/proc/{os.getpid()}/fd/{self._fd}"
+        self._ends = job_pipe_pair()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_ends": [[DupFd(fd) for fd in end] for end in self._ends]}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        there, back = (JobPipeEnd(*(fd.detach() for fd in end)) for end in state["_ends"])
+        self.__dict__.update(state, _ends=(there, back))
+
+    def producer(self) -> Producer:
+        self._ends[1].close()
+        return _SlotEnd(self._slots(), JobPipe(self._ends[0], waits=True))
+
+    def consumer(self) -> Consumer:
+        self._ends[0].close()
+        return _SlotEnd(self._slots(), JobPipe(self._ends[1], waits=True))
+
+    def _slots(self) -> list[U8]:
+        return [packet.payload for packet in map_region(os.open(self._place, os.O_RDWR), self._layout)]
+
+    def close(self) -> None:
+        os.close(self._fd)
+        for end in self._ends:
+            end.close()
+
+
+class _SlotEnd:
+    def __init__(self, payloads: list[U8], line: JobPipe) -> None:
+        self._payloads, self._line, self._count = payloads, line, 0
+
+    def buffer(self) -> U8:
+        return self._payloads[self._count % SLOTS]
+
+    def hand_over(self) -> None:
+        slot = self._count % SLOTS
+        self._line.send(RunJob(self._count, 0, self._count, slot, slot, 0))
+        self._count += 1
+
+    def receive(self) -> U8:
+        while True:
+            message = self._line.receive()
+            if isinstance(message, RunJob):
+                return self._payloads[message.slot_in]
+            if self._line.ended:
+                raise EOFError
+
+    def release(self) -> None:
+        """The acknowledgement gives the slot back."""
+
+
+class QueueChannel:
+    """A `multiprocessing.Queue`: the array is pickled, copied through a pipe, and made again."""
+
+    def __init__(self, size: int, context: SpawnContext) -> None:
+        self._size, self._queue = size, context.Queue()
+
+    def producer(self) -> Producer:
+        return _QueueEnd(self._queue, self._size)
+
+    def consumer(self) -> Consumer:
+        return _QueueEnd(self._queue, 0)
+
+    def close(self) -> None:
+        self._queue.close()
+
+
+class _QueueEnd:
+    def __init__(self, channel: Queue[Any], size: int) -> None:
+        self._queue, self._own = channel, np.zeros(size, np.uint8)
+
+    def buffer(self) -> U8:
+        return self._own
+
+    def hand_over(self) -> None:
+        self._queue.put(self._own)
+
+    def receive(self) -> U8:
+        array: U8 = self._queue.get(timeout=WAIT_MS / 1000)
+        return array
+
+    def release(self) -> None:
+        """The array is this process's own."""
+
+
+class ZmqChannel:
+    """The bytes themselves as a ZeroMQ frame, copied as pyzmq does it by default."""
+
+    def __init__(self, size: int, _context: SpawnContext) -> None:
+        self._folder = BusFolder()
+        self._size, self._endpoint = size, self._folder.endpoint("handoff")
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"_size": self._size, "_endpoint": self._endpoint}
+
+    def producer(self) -> Producer:
+        return _ZmqEnd(self._endpoint, self._size, bind=True)
+
+    def consumer(self) -> Consumer:
+        return _ZmqEnd(self._endpoint, 0, bind=False)
+
+    def close(self) -> None:
+        self._folder.remove()
+
+
+class _ZmqEnd:
+    def __init__(self, endpoint: str, size: int, *, bind: bool) -> None:
+        self._own = np.zeros(size, np.uint8)
+        self._socket = zmq.Context().socket(zmq.PAIR)
+        self._socket.setsockopt(zmq.RCVTIMEO, WAIT_MS)
+        (self._socket.bind if bind else self._socket.connect)(endpoint)
+
+    def buffer(self) -> U8:
+        return self._own
+
+    def hand_over(self) -> None:
+        self._socket.send(self._own.data)
+
+    def receive(self) -> U8:
+        return np.frombuffer(self._socket.recv(), np.uint8)
+
+    def release(self) -> None:
+        """The bytes are this process's own."""
+
+
+class IceoryxChannel:
+    """iceoryx2: a loaned sample is written in place and sent, an event wakes the other end. Nothing is copied.
+
+    It keeps some files for the next program of the user; here they have a folder and a prefix of their own, and go.
+    Both are short, because the path of a Unix socket is.
+    """
+
+    def __init__(self, size: int, _context: SpawnContext) -> None:
+        import iceoryx2  # noqa: F401 - says here, in the parent, that it is not installed
+
+        self._size = size
+        self._folder = tempfile.mkdtemp(prefix="iox-", dir="/tmp")
+        self._prefix = f"{Path(self._folder).name}_"
+
+    def producer(self) -> Producer:
+        return _IceoryxProducer(self._folder, self._prefix, self._size)
+
+    def consumer(self) -> Consumer:
+        return _IceoryxConsumer(self._folder, self._prefix)
+
+    def close(self) -> None:
+        """After the children have ended: nothing of theirs is left."""
+        shutil.rmtree(self._folder, ignore_errors=True)
+        for left in SHM.glob(f"{self._prefix}*"):
+            left.unlink(missing_ok=True)
+
+
+def _iceoryx_services(folder: str, prefix: str) -> tuple[Any, Any, Any]:
+    import ctypes
+
+    import iceoryx2 as iox
+
+    iox.set_log_level(iox.LogLevel.Error)
+    config = iox.config.default()
+    config.global_cfg.root_path = iox.Path.new(folder)
+    config.global_cfg.prefix = iox.FileName.new(prefix)
+    node = iox.NodeBuilder.new().config(config).create(iox.ServiceType.Ipc)
+    service = iox.ServiceName.new("trilane/handoff")
+    samples = node.service_builder(service).publish_subscribe(iox.Slice[ctypes.c_uint8]).open_or_create()
+    return node, samples, node.service_builder(service).event().open_or_create()
+
+
+class _IceoryxProducer:
+    def __init__(self, folder: str, prefix: str, size: int) -> None:
+        self._node, samples, event = _iceoryx_services(folder, prefix)
+        self._publisher = samples.publisher_builder().initial_max_slice_len(size).create()
+        self._notifier = event.notifier_builder().create()
+        self._size = size
+        self._sample: Any = None
+
+    def buffer(self) -> U8:
+        self._sample = self._publisher.loan_slice_uninit(self._size)
+        return np.frombuffer(self._sample.payload().as_memory_view(), np.uint8)
+
+    def hand_over(self) -> None:
+        self._sample.assume_init().send()
+        self._notifier.notify()
+
+
+class _IceoryxConsumer:
+    def __init__(self, folder: str, prefix: str) -> None:
+        self._node, samples, event = _iceoryx_services(folder, prefix)
+        self._subscriber = samples.subscriber_builder().create()
+        self._listener = event.listener_builder().create()
+        self._sample: Any = None
+
+    def receive(self) -> U8:
+        while (sample := self._subscriber.receive()) is None:
+            self._listener.blocking_wait()
+        self._sample = sample
+        return np.frombuffer(sample.payload().as_memory_view(), np.uint8)
+
+    def release(self) -> None:
+        self._sample.delete()
+
+
+SLOT, BARE = "slot", "slot, 256 KiB of it written"
+#: Way -> its channel. `SLOT` is Trilane's, one message from end to end; `BARE` shows it without what writing does to
+#: the caches.
+CHANNELS: dict[str, Callable[[int, SpawnContext], Channel]] = {
+    SLOT: SlotChannel,
+    BARE: SlotChannel,
+    "iceoryx2": IceoryxChannel,
+    "zeromq copied": ZmqChannel,
+    "pickled queue": QueueChannel,
+}
+#: Bytes that are written and read of each slot; the other ways: all of them.
+WRITTEN = {BARE: 256 * 1024}

@@ -1,0 +1,4 @@
+"""SMPL-X mathematics: the body file, joints, kinematics, blend shapes and skinning.
+
+It may use `transport/` and what lies below, and needs only NumPy.
+"""

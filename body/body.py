@@ -1,0 +1,217 @@
+"""Body files in the SMPL-X layout: read without pickle, checked before memory is taken, immutable afterwards.
+
+Rule: a `Body` is finite, consistent and ready for use; whatever is wrong with a file becomes one BadInputError.
+
+The layout is that of https://smpl-x.is.tue.mpg.de, read as the `smplx` package reads it: the rest shape is
+`v_template + shapedirs @ [betas, expression]`, the joints are `J_regressor @ rest shape`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from trilane.arrays import F32, F64, I32
+from trilane.body.joints import JOINTS, LEFT_HAND, POSE_FEATURES, POSE_SIZE, RIGHT_HAND
+from trilane.body.pose_blend import read_pose_blend
+from trilane.errors import BadInputError
+from trilane.files import read_npz
+
+EXPECTED = "a body file in the SMPL-X layout (.npz)"
+MAX_VERTICES = 1 << 18
+MAX_FACES = 1 << 19
+SUM_TOLERANCE = 1e-3
+
+#: Key: its shape ("V" vertices, "F" faces, "T" texture coordinates, "*" anything), and whether it holds indices.
+_LAYOUT: dict[str, tuple[tuple[int | str, ...], bool]] = {
+    "v_template": (("V", 3), False),
+    "shapedirs": (("V", 3, "*"), False),
+    "J_regressor": ((JOINTS, "V"), False),
+    "weights": (("V", JOINTS), False),
+    "kintree_table": ((2, JOINTS), True),
+    "f": (("F", 3), True),
+    "vt": (("T", 2), False),
+    "ft": (("F", 3), True),
+    "hands_componentsl": (("*", 45), False),
+    "hands_componentsr": (("*", 45), False),
+    "hands_meanl": ((45,), False),
+    "hands_meanr": ((45,), False),
+}
+_LIMITS = {"V": MAX_VERTICES, "F": MAX_FACES, "T": 3 * MAX_FACES}
+
+#: First expression column and number of them, by the columns that the file has at least.
+_FULL, _SHORT = (400, 300, 100), (20, 10, 10)
+
+
+@dataclass(frozen=True)
+class Body:
+    """A body of V vertices, F triangles and T texture coordinates. Metres, Y up. Arrays are read-only.
+
+    `v_template` (V,3); `shape_dirs` (V,3,S) and `expression_dirs` (V,3,E): metres per unit of each coefficient;
+    `posedirs` (V,3,486), or None when the file's are all zero; `j_regressor` (55,V); `weights` (V,55);
+    `parents` (55,), -1 at the root; `faces` (F,3); `uv` (T,2), u right, v up; `uv_faces` (F,3), per corner;
+    `hand_components` (left (C,45), right (C,45)); `hand_mean` (90,), axis-angle, left then right.
+    """
+
+    source: str
+    v_template: F32
+    shape_dirs: F32
+    expression_dirs: F32
+    posedirs: F32 | None
+    j_regressor: F32
+    weights: F32
+    parents: I32
+    faces: I32
+    uv: F32
+    uv_faces: I32
+    hand_components: tuple[F32, F32]
+    hand_mean: F32
+
+    @property
+    def has_pose_blend_shapes(self) -> bool:
+        return self.posedirs is not None
+
+    def shape(self, betas: ArrayLike = (), expression: ArrayLike = ()) -> ShapedBody:
+        """The body with these coefficients (up to S and E of them; missing ones are 0). Raises BadInputError."""
+        rest = self.v_template.astype(np.float64)
+        for name, dirs, given in (
+            ("betas", self.shape_dirs, betas),
+            ("expression", self.expression_dirs, expression),
+        ):
+            values = np.atleast_1d(np.asarray(given, np.float64))
+            if values.ndim != 1 or len(values) > dirs.shape[2] or not np.isfinite(values).all():
+                found = f"an array of shape {values.shape}" if np.isfinite(values).all() else "NaN or infinity"
+                raise BadInputError(name, found, f"at most {dirs.shape[2]} finite numbers")
+            if len(values):
+                rest += dirs[:, :, : len(values)] @ values
+        joints = self.j_regressor.astype(np.float64) @ rest
+        return ShapedBody(_frozen(rest.astype(np.float32)), _frozen(joints), self)
+
+    def full_pose(self, poses: ArrayLike, flat_hand_mean: bool) -> F64:
+        """Poses (..., 165) as the joints take them: the mean hand is added unless `flat_hand_mean`."""
+        full = np.array(poses, np.float64)
+        if full.ndim == 0 or full.shape[-1] != POSE_SIZE:
+            raise BadInputError("poses", f"shape {full.shape}", f"(..., {POSE_SIZE})")
+        if not flat_hand_mean:
+            full[..., LEFT_HAND.start : RIGHT_HAND.stop] += self.hand_mean
+        return full
+
+
+@dataclass(frozen=True)
+class ShapedBody:
+    """One person at rest: `vertices` (V,3) float32 and `joints` (55,3) float64, metres, body space."""
+
+    vertices: F32
+    joints: F64
+    body: Body
+
+
+def load_body(path: Path) -> Body:
+    """Read a body file. Raises BadInputError: missing, truncated, pickled, huge, misshapen, NaN or inconsistent."""
+    arrays = read_npz(path, _LAYOUT, EXPECTED)
+    _check_layout(path, arrays)
+    vertices = len(arrays["v_template"])
+    parents = _parents(path, arrays["kintree_table"])
+    _check_indices(path, arrays["f"], vertices, "f", "vertices")
+    _check_indices(path, arrays["ft"], len(arrays["vt"]), "ft", "texture coordinates")
+    weights = _floats(path, arrays, "weights")
+    _check_weights(path, weights)
+    shape_dirs, expression_dirs = _split_shape(path, _floats(path, arrays, "shapedirs"))
+    return Body(
+        source=str(path),
+        v_template=_floats(path, arrays, "v_template"),
+        shape_dirs=shape_dirs,
+        expression_dirs=expression_dirs,
+        posedirs=read_pose_blend(path, (vertices, 3, POSE_FEATURES)),
+        j_regressor=_floats(path, arrays, "J_regressor"),
+        weights=weights,
+        parents=parents,
+        faces=_frozen(arrays["f"].astype(np.int32)),
+        uv=_floats(path, arrays, "vt"),
+        uv_faces=_frozen(arrays["ft"].astype(np.int32)),
+        hand_components=(_floats(path, arrays, "hands_componentsl"), _floats(path, arrays, "hands_componentsr")),
+        hand_mean=_frozen(np.concatenate([_floats(path, arrays, "hands_meanl"), _floats(path, arrays, "hands_meanr")])),
+    )
+
+
+def _frozen(array: NDArray[Any]) -> NDArray[Any]:
+    array.flags.writeable = False
+    return array
+
+
+def _check_layout(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
+    sizes: dict[str, int] = {}
+    for key, (sides, is_index) in _LAYOUT.items():
+        if key not in arrays:
+            raise BadInputError(path, f"no array {key!r}", EXPECTED, f"arrays that were found: {sorted(arrays)}")
+        array = arrays[key]
+        if array.dtype.kind not in ("iu" if is_index else "fiu"):
+            raise BadInputError(f"{path}[{key}]", f"dtype {array.dtype}", "integers" if is_index else "numbers")
+        if len(array.shape) == len(sides):
+            for side, size in zip(sides, array.shape, strict=True):
+                if isinstance(side, str):
+                    sizes.setdefault(side, size)
+        wanted = tuple(sizes.get(str(side), side) if side != "*" else "*" for side in sides)
+        if not _matches(array.shape, wanted):
+            raise BadInputError(f"{path}[{key}]", f"shape {array.shape}", f"({', '.join(map(str, wanted))})")
+    for side, limit in _LIMITS.items():
+        if not 0 < sizes[side] <= limit:
+            raise BadInputError(path, f"{sizes[side]} {side}", f"1 to {limit} (V vertices, F faces, T vt)")
+
+
+def _matches(shape: tuple[int, ...], wanted: tuple[int | str, ...]) -> bool:
+    return len(shape) == len(wanted) and all(b in ("*", a) for a, b in zip(shape, wanted, strict=True))
+
+
+def _floats(path: Path, arrays: dict[str, NDArray[Any]], key: str) -> F32:
+    with np.errstate(over="ignore"):
+        array = arrays[key].astype(np.float32)
+    if not np.isfinite(array).all():
+        raise BadInputError(f"{path}[{key}]", "NaN or infinity", "finite numbers")
+    return _frozen(array)
+
+
+def _check_indices(path: Path, indices: NDArray[Any], count: int, key: str, of: str) -> None:
+    low, high = int(indices.min()), int(indices.max())
+    if low < 0 or high >= count:
+        raise BadInputError(f"{path}[{key}]", f"indices from {low} to {high}", f"0 to {count - 1}, the {of}")
+
+
+def _check_weights(path: Path, weights: F32) -> None:
+    sums = weights.sum(axis=1, dtype=np.float64)
+    worst = int(np.abs(sums - 1.0).argmax())
+    where = f"{path}[weights]"
+    if weights.min() < -SUM_TOLERANCE:
+        raise BadInputError(where, f"a weight of {weights.min():.3g}", "weights of at least 0")
+    if abs(sums[worst] - 1.0) > SUM_TOLERANCE:
+        raise BadInputError(where, f"a sum of {sums[worst]:.4g} at vertex {worst}", "rows that sum to 1")
+
+
+def _split_shape(path: Path, dirs: F32) -> tuple[F32, F32]:
+    columns = dirs.shape[2]
+    for least, first, count in (_FULL, _SHORT):
+        if columns >= least:
+            split = dirs[:, :, :first], dirs[:, :, first : first + count]
+            return _frozen(np.ascontiguousarray(split[0])), _frozen(np.ascontiguousarray(split[1]))
+    raise BadInputError(f"{path}[shapedirs]", f"{columns} columns", "400 (betas, expression from 300) or 20 (from 10)")
+
+
+def _parents(path: Path, table: NDArray[Any]) -> I32:
+    """Parents from the first row; the root's entry, whatever it is, is -1."""
+    stored = [int(parent) for parent in table[0]]
+    where = f"{path}[kintree_table]"
+    for joint, parent in enumerate(stored[1:], start=1):
+        if not 0 <= parent < JOINTS:
+            raise BadInputError(where, f"parent {parent} at joint {joint}", f"0 to {JOINTS - 1}")
+    parents = [-1, *stored[1:]]
+    for joint in range(JOINTS):
+        at, steps = joint, 0
+        while at >= 0 and steps <= JOINTS:
+            at, steps = parents[at], steps + 1
+        if at >= 0:
+            raise BadInputError(where, f"a cycle through joint {joint}", "a tree whose root is joint 0")
+    return _frozen(np.array(parents, np.int32))

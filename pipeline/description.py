@@ -1,0 +1,120 @@
+"""A pipeline as data: stages, the edges between them, and the units that they run on. Rule: it knows no stage's work.
+
+A `Pipeline` is plain data, which JSON can carry to a unit's process; a stage's work is behind the name of its factory.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Mapping
+from itertools import pairwise
+from typing import Annotated, Any, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, PlainSerializer, PlainValidator, model_validator
+
+from trilane.errors import BadInputError
+from trilane.scheduler.events import Graph, StageSpec
+from trilane.transport.packets import FRAME_FIELDS, header_dtype
+from trilane.transport.slots import edge_rule
+
+FACTORY = r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$"
+
+
+class Model(BaseModel):
+    """Strict base: unknown keys are errors, values never change."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
+
+
+def _header(value: Any) -> np.dtype[Any]:
+    dtype = np.lib.format.descr_to_dtype(ast.literal_eval(value)) if isinstance(value, str) else value
+    if not isinstance(dtype, np.dtype) or (dtype.names or ())[: len(FRAME_FIELDS)] != tuple(n for n, _ in FRAME_FIELDS):
+        raise ValueError(f"found header {value!r}, expected one of trilane.transport.packets.header_dtype")
+    return dtype
+
+
+def _header_text(dtype: np.dtype[Any]) -> str:
+    return repr(np.lib.format.dtype_to_descr(dtype))
+
+
+HeaderDtype = Annotated[
+    np.dtype[Any], PlainValidator(_header), PlainSerializer(_header_text, return_type=str, when_used="json")
+]
+
+
+class UnitSettings(Model):
+    """What a unit may use of the host. `cores`: of this machine; `spin`: may threads spin between jobs."""
+
+    cores: tuple[int, ...] = Field(min_length=1)
+    threads: int = Field(ge=1)
+    spin: bool = False
+
+
+class PipelineStage(Model):
+    """One stage. `factory`: `module:name` of a `trilane.pipeline.stage.StageFactory`, importable in the unit's process.
+
+    `settings`: handed to the factory, as JSON takes them. `pace_ns`: how long a job is held, at least.
+    """
+
+    name: str = Field(pattern=r"^[\w-]+$")
+    unit: str = Field(pattern=r"^[\w-]+$")
+    factory: str = Field(pattern=FACTORY)
+    settings: dict[str, Any] = {}
+    pace_ns: int = Field(default=0, ge=0)
+
+
+class PipelineEdge(Model):
+    """The slots between a stage and the next. `rule`: single, double, triple, fifo:N or orphan[:N].
+
+    `header`: of every packet, made by `trilane.transport.packets.header_dtype`. `payload_bytes`: of every packet.
+    """
+
+    payload_bytes: int = Field(ge=0)
+    header: HeaderDtype = header_dtype()
+    rule: str = "double"
+
+
+class Pipeline(Model):
+    """A chain of `stages`, joined by `edges` (one fewer).
+
+    `units`: cores and threads of each unit that a stage names; the scheduler runs on the cores of the first stage's.
+    `latency_to`: the stage with whose end a frame's latency ends; the last one when it is not given.
+    """
+
+    stages: tuple[PipelineStage, ...] = Field(min_length=1)
+    edges: tuple[PipelineEdge, ...]
+    units: dict[str, UnitSettings]
+    latency_to: str = ""
+
+    @model_validator(mode="after")
+    def _joined(self) -> Self:
+        missing = {stage.unit for stage in self.stages} - set(self.units)
+        if missing:
+            raise ValueError(f"found no settings of unit {', '.join(sorted(missing))}, expected them in `units`")
+        self.graph()
+        for edge in self.edges:
+            edge_rule(edge.rule)
+        return self
+
+    def graph(self) -> Graph:
+        """What the scheduler knows of it."""
+        stages = tuple(StageSpec(stage.name, stage.unit) for stage in self.stages)
+        rules = tuple(edge.rule for edge in self.edges)
+        return Graph(stages, rules, self.latency_to or self.stages[-1].name)
+
+    @property
+    def edge_names(self) -> list[str]:
+        return [f"{before.name}->{after.name}" for before, after in pairwise(self.stages)]
+
+    def with_rule(self, rule: str) -> Pipeline:
+        """The same with `rule` for every edge. Raises BadInputError for an unknown one."""
+        try:
+            edge_rule(rule)
+        except ValueError as error:
+            raise BadInputError.about("the run's settings", error) from None
+        return self.model_copy(update={"edges": tuple(e.model_copy(update={"rule": rule}) for e in self.edges)})
+
+    def with_units(self, units: Mapping[str, UnitSettings]) -> Pipeline:
+        """The same on other cores."""
+        return self.model_copy(update={"units": dict(units)})

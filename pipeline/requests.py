@@ -1,0 +1,60 @@
+"""Frames that somebody else asks for while a run goes on. Rule: `ask` and `end` may be called by any thread; answers
+come on the thread of the run, in the order of the frames that were presented.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+from collections import deque
+from collections.abc import Callable
+
+from trilane.scheduler.events import Event, FrameRequest, Stop
+
+
+class FrameRequestQueue:
+    """The way into one run. Frames are numbered from 0 as they are asked for.
+
+    `answered(frame)`: it was presented. `ended()`: the run is over, and nothing more is answered.
+    """
+
+    def __init__(self, answered: Callable[[int], None], ended: Callable[[], None]) -> None:
+        self.fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self.is_open = threading.Event()
+        self.answered, self._ended = answered, ended
+        self._events: deque[Event] = deque()
+        self._lock = threading.Lock()
+        self._closed = False
+
+    def ask(self, count: int = 1) -> None:
+        """FrameRequest for `count` frames; of a run that is over: nothing."""
+        self._say(FrameRequest(count))
+
+    def end(self) -> None:
+        """What was asked for is finished, more does not come."""
+        self._say(Stop())
+
+    def events(self) -> list[Event]:
+        """What was said since the last call."""
+        taken: list[Event] = []
+        with contextlib.suppress(IndexError):
+            while True:
+                taken.append(self._events.popleft())
+        return taken
+
+    def close(self) -> None:
+        """The run is over: `ended` is called, whoever waits for `is_open` goes on."""
+        with self._lock:
+            if self._closed:
+                return
+            self._closed = True
+            os.close(self.fd)
+        self._ended()
+        self.is_open.set()
+
+    def _say(self, event: Event) -> None:
+        with self._lock:
+            if not self._closed:
+                self._events.append(event)
+                os.eventfd_write(self.fd, 1)

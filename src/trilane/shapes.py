@@ -1,0 +1,49 @@
+"""Sizes of tensors as text and as shape buckets. Rule: (height, width), sides in multiples of `BUCKET_STEP`."""
+
+from __future__ import annotations
+
+import re
+
+MAX_SIDE = 4096
+BUCKET_STEP = 32
+
+Shape = tuple[int, int]
+
+
+def parse_shape(text: str) -> Shape:
+    """`HxW` to (height, width). Raises ValueError naming what was found."""
+    match = re.fullmatch(r"(\d+)x(\d+)", text)
+    if match is None:
+        raise ValueError(f"found {text!r}, expected HEIGHTxWIDTH such as 256x256")
+    return int(match[1]), int(match[2])
+
+
+def shape_buckets(size: str) -> list[Shape]:
+    """Tensor shapes (height, width) that `size` allows.
+
+    `HxW` gives that one shape. A single number S gives the shapes of sides in multiples of 32, aspect within
+    1:4 and area at most S², of which none holds another: tall for a standing body, wide for a lying one, S x S
+    between. Raises ValueError when a side is no multiple of 32 or out of range.
+    """
+    if re.fullmatch(r"\d+", size):
+        return _shapes_of_area(_check_side(int(size)))
+    height, width = parse_shape(size)
+    return [(_check_side(height), _check_side(width))]
+
+
+def _shapes_of_area(side: int) -> list[Shape]:
+    widest = [(h, side * side // h // BUCKET_STEP * BUCKET_STEP) for h in range(BUCKET_STEP, 2 * side + 1, BUCKET_STEP)]
+    shapes = [(h, w) for h, w in widest if w and max(h, w) <= min(4 * min(h, w), MAX_SIDE)]
+    return [(h, w) for h, w in shapes if not any(b > h and v >= w for b, v in shapes)]
+
+
+def _check_side(side: int) -> int:
+    if side % BUCKET_STEP or not BUCKET_STEP <= side <= MAX_SIDE:
+        raise ValueError(f"found side {side}, expected a multiple of {BUCKET_STEP} from {BUCKET_STEP} to {MAX_SIDE}")
+    return side
+
+
+def checked_size(size: str) -> str:
+    """`size` itself. Raises ValueError as `shape_buckets`."""
+    shape_buckets(size)
+    return size

@@ -1,0 +1,32 @@
+"""Names that everything shares: the units, the performance profiles, the avatar's stages. Rule: each list stands once."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Literal, get_args
+
+UnitName = Literal["cpu", "gpu", "dsp"]
+UNITS: tuple[UnitName, ...] = get_args(UnitName)
+
+
+class PerformanceProfile(StrEnum):
+    """Caps by SNPE's and QNN's names, from the highest power to the lowest."""
+
+    BURST = "burst"
+    SUSTAINED_HIGH_PERFORMANCE = "sustained_high_performance"
+    HIGH_PERFORMANCE = "high_performance"
+    BALANCED = "balanced"
+    LOW_BALANCED = "low_balanced"
+    POWER_SAVER = "power_saver"
+    LOW_POWER_SAVER = "low_power_saver"
+
+
+PERFORMANCE_PROFILES = tuple(profile.value for profile in PerformanceProfile)
+BURST = PerformanceProfile.BURST.value
+SUSTAINED = PerformanceProfile.SUSTAINED_HIGH_PERFORMANCE.value
+
+#: The stages of the avatar's pipeline before and after those of the network, and the unit of each.
+BEFORE_INFER: tuple[tuple[str, UnitName], ...] = (("pose", "cpu"), ("raster", "gpu"))
+INFER: tuple[str, UnitName] = ("infer", "dsp")
+AFTER_INFER: tuple[tuple[str, UnitName], ...] = (("composite", "gpu"), ("present", "cpu"))
+LATENCY_TO = "composite"

@@ -1,0 +1,66 @@
+"""The checked configuration of a run of the avatar. Rule: plain data; the parent has looked at every path in it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from pydantic import Field, field_validator
+
+from trilane.pipeline.description import UnitSettings
+from trilane.scene.schema import Model, Scene
+from trilane.shapes import Shape, shape_buckets
+from trilane.units import UnitName
+
+
+class NetworkCut(Model):
+    """The network is cut at quantised tensor `at`; what follows runs on `unit`."""
+
+    at: str
+    unit: UnitName
+
+
+class RunConfig(Model):
+    """Everything a unit's process is told, as plain data. Paths are absolute and were checked by the parent.
+
+    `out_dir` is the temporary run folder. `runtime` names the DSP runtime. `posed_vertices`: of each avatar, when the
+    CPU unit skins; empty when the GPU does. `pace_ns`: how long a job of a stage is held, at least. `fake` maps a unit
+    to the dotted module of a mock unit and is set by tests alone. `cuts`: of the network; its first part is the DSP's.
+    """
+
+    scene: Scene
+    out_dir: Path
+    avatar_dirs: tuple[Path, ...]
+    units: dict[str, UnitSettings]
+    runtime: str = "ort"
+    record: bool = True
+    posed_vertices: tuple[int, ...] = ()
+    pace_ns: dict[str, int] = Field(default={})
+    fake: dict[str, str] = Field(default={})
+    cuts: tuple[NetworkCut, ...] = ()
+
+    @field_validator("units")
+    @classmethod
+    def _units_known(cls, units: dict[str, UnitSettings]) -> dict[str, UnitSettings]:
+        unknown = set(units) - {"cpu", "gpu", "dsp"}
+        if unknown:
+            raise ValueError(f"unknown unit {sorted(unknown)}, expected cpu, gpu, dsp")
+        return units
+
+    @property
+    def buckets(self) -> list[Shape]:
+        return shape_buckets(self.scene.size)
+
+    @property
+    def infer_units(self) -> tuple[str, ...]:
+        """The unit of each part of the network, in the order of the work."""
+        return ("dsp", *(cut.unit for cut in self.cuts))
+
+    @property
+    def infer_names(self) -> tuple[str, ...]:
+        """The stages that run the parts: `infer`, `infer-2`, ..."""
+        return ("infer", *(f"infer-{number}" for number in range(2, len(self.cuts) + 2)))
+
+    @property
+    def max_tensor_pixels(self) -> int:
+        return max(math.prod(shape) for shape in self.buckets)

