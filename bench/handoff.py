@@ -8,29 +8,25 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
-import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnContext
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from trilane.bench.handoff_unit import PAUSE_S, check_bytes
+from trilane.bench.handoff_stages import PAUSE_S, READER, check_bytes, handoff_pipeline
 from trilane.bench.handoff_variants import BARE, CHANNELS, SLOT, WRITTEN, Channel
 from trilane.errors import BadInputError, TrilaneError
 from trilane.hw_profiles.host import host_units
 from trilane.pipeline.run import run_pipeline
-from trilane.scene.schema import Scene
 from trilane.scheduler.stats import median_interval
-from trilane.stages.config import RunConfig
 from trilane.transport.wakeup import UNIT_NS, awake, use_slice
 
-#: KiB of a tensor of 16 channels -> its side; the sizes that can be asked for.
-SIDES = {256: 128, 1024: 256, 4096: 512, 16384: 1024}
+#: KiB of a tensor of 16 channels at 128, 256, 512 and 1024 squared; other sizes are not asked for.
+SIZES_KIB = (256, 1024, 4096, 16384)
 PIPELINE = "slot through the scheduler"
 OURS = (SLOT, BARE, PIPELINE)
 MIN_FRAMES = 10
@@ -56,8 +52,8 @@ def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 200, turns:
     the least and largest). `ahead`: of each peer, when that interval is above 0 at every size.
     Raises BadInputError for other sizes than 256, 1024, 4096, 16384 KiB.
     """
-    if unknown := set(kib) - set(SIDES):
-        raise BadInputError("--kib", str(min(unknown)), ", ".join(map(str, SIDES)))
+    if unknown := set(kib) - set(SIZES_KIB):
+        raise BadInputError("--kib", str(min(unknown)), ", ".join(map(str, SIZES_KIB)))
     if frames < MIN_FRAMES:
         raise BadInputError("--frames", str(frames), f"at least {MIN_FRAMES}")
     if turns < 1:
@@ -194,22 +190,12 @@ def _pairs(stack: ExitStack, sizes: tuple[int, ...]) -> tuple[dict[tuple[str, in
 
 def _through_pipeline(size: int, frames: int) -> Times:
     """A sequential run of units that only write and read: from raster's end to infer's begin, and to its end."""
-    side = SIDES[size]
-    with tempfile.TemporaryDirectory(prefix="trilane-handoff-") as folder:
-        config = RunConfig(
-            scene=Scene(frames=frames, size=f"{side}x{side}"),
-            out_dir=Path(folder),
-            avatar_dirs=(),
-            units=host_units(),
-            record=False,
-            fake=dict.fromkeys(("cpu", "gpu", "dsp"), "trilane.bench.handoff_unit"),
-        )
-        result = run_pipeline(config, policy="sequential", isolate_frames=0)
+    result = run_pipeline(handoff_pipeline(size * 1024), frames, policy="sequential", isolated_frames=0)
     if result.interrupted:
         raise KeyboardInterrupt
     if result.failure is not None or result.presented < frames:
-        raise TrilaneError(f"the run of {side}x{side} failed: {result.failure or 'frames were lost'}")
-    jobs = [job for job in result.jobs if job.stage == "infer"]
+        raise TrilaneError(f"the run with {size} KiB failed: {result.failure or 'frames were lost'}")
+    jobs = [job for job in result.jobs if job.stage == READER]
     readable = _microseconds([job.begin_ns for job in jobs], [job.ready_ns for job in jobs])
     return readable, _microseconds([job.end_ns for job in jobs], [job.ready_ns for job in jobs])
 

@@ -6,8 +6,8 @@ A `Pipeline` is plain data, which JSON can carry to a unit's process; a stage's 
 from __future__ import annotations
 
 import ast
-from collections.abc import Mapping
 from itertools import pairwise
+from pathlib import Path
 from typing import Annotated, Any, Self
 
 import numpy as np
@@ -80,12 +80,16 @@ class Pipeline(Model):
 
     `units`: cores and threads of each unit that a stage names; the scheduler runs on the cores of the first stage's.
     `latency_to`: the stage with whose end a frame's latency ends; the last one when it is not given.
+    `module_folders`: where a unit's process looks for the modules of factories before anywhere else.
+    `preload`: modules that are imported once, before the units' processes are forked; those of `module_folders` cannot be.
     """
 
     stages: tuple[PipelineStage, ...] = Field(min_length=1)
     edges: tuple[PipelineEdge, ...]
     units: dict[str, UnitSettings]
     latency_to: str = ""
+    module_folders: tuple[Path, ...] = ()
+    preload: tuple[str, ...] = ()
 
     @model_validator(mode="after")
     def _joined(self) -> Self:
@@ -104,8 +108,28 @@ class Pipeline(Model):
         return Graph(stages, rules, self.latency_to or self.stages[-1].name)
 
     @property
+    def joints(self) -> dict[str, tuple[PipelineStage, PipelineStage]]:
+        """The stages that each edge joins, by the edge's name `FROM->TO`, in the order of the chain."""
+        return {f"{before.name}->{after.name}": (before, after) for before, after in pairwise(self.stages)}
+
+    @property
     def edge_names(self) -> list[str]:
-        return [f"{before.name}->{after.name}" for before, after in pairwise(self.stages)]
+        return list(self.joints)
+
+    @property
+    def rule(self) -> str:
+        """The rule of every edge, or all of them in order when they differ."""
+        rules = [edge.rule for edge in self.edges]
+        return ",".join(dict.fromkeys(rules) if len(set(rules)) == 1 else rules)
+
+    @property
+    def scheduler_cores(self) -> tuple[int, ...]:
+        """Where the scheduler runs: with the unit of the first stage."""
+        return self.units[self.stages[0].unit].cores
+
+    def stages_of(self, unit: str) -> tuple[PipelineStage, ...]:
+        """The unit's stages, in the order of the chain."""
+        return tuple(stage for stage in self.stages if stage.unit == unit)
 
     def with_rule(self, rule: str) -> Pipeline:
         """The same with `rule` for every edge. Raises BadInputError for an unknown one."""
@@ -114,7 +138,3 @@ class Pipeline(Model):
         except ValueError as error:
             raise BadInputError.about("the run's settings", error) from None
         return self.model_copy(update={"edges": tuple(e.model_copy(update={"rule": rule}) for e in self.edges)})
-
-    def with_units(self, units: Mapping[str, UnitSettings]) -> Pipeline:
-        """The same on other cores."""
-        return self.model_copy(update={"units": dict(units)})

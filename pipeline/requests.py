@@ -1,5 +1,5 @@
-"""Frames that somebody else asks for while a run goes on. Rule: `ask` and `end` may be called by any thread; answers
-come on the thread of the run, in the order of the frames that were presented.
+"""Frames that somebody else asks for while a run goes on. Rule: `request` and `end` may be called by any
+thread; answers come on the thread of the run, in the order of the frames that were presented.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ class FrameRequestQueue:
         self._lock = threading.Lock()
         self._closed = False
 
-    def ask(self, count: int = 1) -> None:
-        """FrameRequest for `count` frames; of a run that is over: nothing."""
-        self._say(FrameRequest(count))
+    def request(self, count: int = 1) -> None:
+        """Ask for `count` frames; once the run is over this does nothing."""
+        self._put(FrameRequest(count))
 
     def end(self) -> None:
-        """What was asked for is finished, more does not come."""
-        self._say(Stop())
+        """No more is asked for; what was asked for is finished."""
+        self._put(Stop())
 
     def events(self) -> list[Event]:
-        """What was said since the last call."""
-        taken: list[Event] = []
+        """What was requested since the last call."""
+        events: list[Event] = []
         with contextlib.suppress(IndexError):
             while True:
-                taken.append(self._events.popleft())
-        return taken
+                events.append(self._events.popleft())
+        return events
 
     def close(self) -> None:
         """The run is over: `ended` is called, whoever waits for `is_open` goes on."""
@@ -53,7 +53,7 @@ class FrameRequestQueue:
         self._ended()
         self.is_open.set()
 
-    def _say(self, event: Event) -> None:
+    def _put(self, event: Event) -> None:
         with self._lock:
             if not self._closed:
                 self._events.append(event)

@@ -1,4 +1,4 @@
-"""What a run hands back. Rule: plain data; nothing here acts, and no file is written but the events on request."""
+"""What a run hands back. Rule: plain data; nothing here acts, and a recording is written where the caller asks for it."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from trilane.scheduler.causes import Drop, Loss
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.recording import Recording
 
@@ -22,22 +23,22 @@ class Failure:
 class RunResult:
     """A finished run.
 
-    `report` holds the keys of report.json that a run knows (DESIGN: clock, frames, frame_time_ms, latency_ms, fps,
-    deadline_misses, stages, units with pid and cores, efficiency); the caller adds machine, config and plan.
-    `failure` is set when a stage failed or a unit could not be kept alive; what was done until then is still here.
-    `messages` tells a person what went wrong on the way (a unit that died and was restarted, ...).
+    `report`: the keys of report.json that a run knows; who calls it adds the machine and the configuration.
+    `lost`, `dropped`: frames by cause. `startup_ms`: of each unit. `metrics`: of each stage, the mean of a job's.
+    `messages`: what went wrong on the way, such as a unit that died and was restarted.
+    `failure`: set when a stage failed or a unit could not be kept alive; what was done until then is still here.
     """
 
     report: dict[str, Any]
     requested: int
     presented: int
-    lost: Mapping[str, int]
-    dropped: Mapping[str, int]
+    lost: Mapping[Loss, int]
+    dropped: Mapping[Drop, int]
     pids: Mapping[str, int]
     startup_ms: Mapping[str, float]
     jobs: tuple[JobRecord, ...]
     recording: Recording
-    figures: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    metrics: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     messages: tuple[str, ...] = ()
     interrupted: bool = False
     failure: Failure | None = None

@@ -1,4 +1,4 @@
-"""Run the pipeline on this machine. Rule: whatever happens, the units' processes are gone when this returns."""
+"""Run a pipeline on this machine. Rule: whatever happens, the units' processes are gone when this returns."""
 
 from __future__ import annotations
 
@@ -6,166 +6,231 @@ import contextlib
 import gc
 import os
 import sys
-from collections.abc import Callable, Iterator
-from dataclasses import replace
-from itertools import pairwise
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Protocol
 
-from trilane.errors import BadInputError
-from trilane.hw_profiles.governor import Governor
-from trilane.pipeline.processes import UnitProcesses, check_open_files
-from trilane.pipeline.realtime import RealtimeDriver
+from trilane.errors import BadInputError, UnexpectedValue
+from trilane.pipeline.assets import Assets, share_assets
+from trilane.pipeline.description import Pipeline
+from trilane.pipeline.isolated import IsolatedTimes
+from trilane.pipeline.lifecycle import close_units, start_units
+from trilane.pipeline.realtime_clock import Governor, RealtimeClock
+from trilane.pipeline.regions import edge_regions
 from trilane.pipeline.requests import FrameRequestQueue
 from trilane.pipeline.result import RunResult
+from trilane.pipeline.run_log import RunLog, UnitError, after_stderr
 from trilane.pipeline.signals import Interrupts
-from trilane.pipeline.unit_loop import EdgeSpec
-from trilane.scheduler.events import Graph, Settings, avatar_graph
+from trilane.pipeline.unit_processes import UnitProcesses, check_open_files
+from trilane.pipeline.unit_starter import UnitStarter
+from trilane.scheduler.causes import Outcome, OutcomeKind
+from trilane.scheduler.core import Core
+from trilane.scheduler.events import Settings
+from trilane.scheduler.loop import run_loop
 from trilane.scheduler.policy import policy_named
+from trilane.scheduler.recording import Recording
 from trilane.scheduler.stats import energy_score
-from trilane.stages.config import RunConfig
-from trilane.stages.dsp.parts import crossing_bytes
-from trilane.stages.packets import pose_dtype, posed_vertices_bytes
-from trilane.transport.memory import RegionLayout, create_region
-from trilane.transport.packets import SlotLayout
-from trilane.transport.slots import edge_rule
 from trilane.transport.wakeup import DEFAULT, SHORTEST_NS, awake, use_slice
 
-MAX_CHANNELS = 16  # of a tensor: what the GPU packs in one pass
-DEADLINE_PERIODS = 3  # from a frame's release until it must be presented: one period for each unit
+DEADLINE_PERIODS = 3  # from a frame's release until it must be presented
 HANG_NS = 10_000_000_000
-SWITCH_S = 0.0002  # longest that another thread of this process keeps the interpreter
+SWITCH_S = 0.0002  # the longest that another thread of this process keeps the interpreter
+
+
+class ReportingGovernor(Governor, Protocol):
+    """A governor of a whole run."""
+
+    @property
+    def is_prompt(self) -> bool:
+        """Whether idle cores should stay awake for the next message."""
+
+    @property
+    def power_w(self) -> float | None:
+        """Mean power of the run so far, None when it is not known."""
+
+    def report(self) -> dict[str, Any]:
+        """`caps` and `temperature_c` of the report."""
 
 
 def run_pipeline(
-    config: RunConfig,
+    pipeline: Pipeline,
+    frames: int,
     *,
     policy: str = "pipelined",
-    edge: str = "double",
-    frames: int | None = None,
+    fps: float = 30.0,
     pace_fps: float | None = None,
-    isolate_frames: int = 16,
+    assets: Assets | None = None,
+    isolated_frames: int = 16,
     hang_ns: int = HANG_NS,
+    latch_ms: float = 0.0,
+    requests: FrameRequestQueue | None = None,
+    governor: ReportingGovernor | None = None,
+    starter: UnitStarter | None = None,
     on_progress: Callable[[int, int], None] | None = None,
     on_message: Callable[[str], None] | None = None,
-    inlet: FrameRequestQueue | None = None,
-    governor: Governor | None = None,
-    latch_ms: float = 0.0,
 ) -> RunResult:
-    """Run `frames` frames (the scene's count when None) through the three units and report.
+    """Run `frames` frames through the units of `pipeline` and report.
 
-    `policy`: sequential, pipelined, latest, deadline. `edge`: single, double, triple, fifo:N, orphan[:N].
-    `pace_fps`: frames are released at that rate; None releases them as fast as they are taken (`latest` and
-    `deadline` are always paced, by the scene's fps when None). `isolate_frames`: frames measured with the other
-    units quiet, half of them before and half after the run, which efficiency needs; 0 warms up and leaves both out.
-    `hang_ns`: a unit whose job takes longer is restarted. `on_progress(presented, requested)` and
-    `on_message(text)` are called from this thread. SIGINT or SIGTERM ends the run cleanly with its result marked
-    `interrupted`; a second one ends the units at once; before the first frame KeyboardInterrupt is raised instead.
-    `inlet`: frames are released as somebody asks for them, `frames` at most; it is closed when this returns.
-    `latch_ms`: a pose is sampled so late that it is expected to end so long before the raster can take it; 0: at once.
+    `policy`: sequential, pipelined, latest or deadline.
+    `fps`: the rate that the frames are meant for; a longer frame time counts as a missed deadline.
+    `pace_fps`: frames are released at this rate; None releases them as fast as they are taken, and under `latest` and
+    `deadline`, which need a rate, at `fps`.
+    `assets`: arrays that every stage may read.
+    `isolated_frames`: frames measured with the other units quiet, half of them before the run and half after it, which
+    efficiency needs; 0 does a single one, to warm up, and measures nothing.
+    `hang_ns`: a unit whose job takes longer is restarted.
+    `latch_ms`: the first stage begins so late that it is expected to end this long before the second can take it; 0: at
+    once.
+    `requests`: frames are released as somebody asks for them, `frames` at most; it is closed when this returns.
     `governor`: holds the units to shares of the time, and says in the report what it did.
+    `starter`: a fork server that was started earlier; None makes one for this run.
+    `on_progress(presented, requested)`, `on_message(text)`: called from this thread.
 
-    Raises BadInputError for an unknown policy or edge, TrilaneError (with the exit code of the unit's error) when a
-    unit cannot start; a failure after that is `RunResult.failure`.
+    SIGINT or SIGTERM ends the run cleanly with its result marked `interrupted`; a second one ends the units at once;
+    before the first frame KeyboardInterrupt is raised instead.
+
+    Raises BadInputError for an unknown policy, TrilaneError (with the exit code of the unit's error) when a unit cannot
+    start; a failure after that is `RunResult.failure`.
     """
     check_open_files()
-    graph, settings = _plan(config, policy, edge, frames or config.scene.frames, pace_fps, hang_ns)
-    settings = replace(settings, asked=inlet is not None, latch_ns=round(latch_ms * 1e6))
+    settings = _settings(policy, frames, fps, pace_fps, hang_ns, latch_ms, requests)
+    log = RunLog(on_message)
     with (
-        contextlib.closing(inlet) if inlet is not None else contextlib.nullcontext(),
+        contextlib.closing(requests) if requests is not None else contextlib.nullcontext(),
         Interrupts() as interrupts,
-        _on_cores(config.units[graph.stages[0].unit].cores),
-        _prompt(),
+        _on_cores(pipeline.scheduler_cores),
+        _prompt_answers(),
         awake(governor is None or governor.is_prompt) as idle_cores,
-        _regions(config, graph) as edges,
-        _processes(config, edges, graph) as processes,
+        _processes(pipeline, assets or {}, starter) as processes,
     ):
-        driver = RealtimeDriver(graph, settings, processes, interrupts, on_progress, on_message, inlet, governor)
-        driver.start()
-        pids = processes.pids
-        sample = _spread(settings.frames, max(isolate_frames, 1))
-        driver.measure_alone(sample[::2])
-        cause = driver.run()
-        if sample[1::2] and cause == "done":
-            driver.measure_again(sample[1::2])
-        pids = {**pids, **processes.pids}
-        if cause != "aborted":
-            driver.close()
-    requested = settings.frames if inlet is None else driver.core.source.released
-    target_ns = 0 if settings.deadline_ns else round(1e9 / config.scene.fps)
-    report = driver.core.ledger.report(
+        core = Core(pipeline.graph(), settings)
+        clock = RealtimeClock(core, processes, interrupts, log, requests, governor, on_progress)
+        run = _Run(core, clock, processes, interrupts, log, Recording(core.graph, settings))
+        run.execute(isolated_frames)
+    report = core.ledger.report(
         clock="host",
-        requested=requested,
-        target_period_ns=target_ns,
-        isolated_ns=driver.alone_ns if isolate_frames else None,
+        requested=settings.frames if requests is None else core.source.released,
+        target_period_ns=0 if settings.deadline_ns else round(1e9 / fps),
+        isolated_ns=run.isolated.mean_ns if isolated_frames else None,
     )
-    report.update(
-        policy=policy, edge=edge, idle_cores=idle_cores, **(governor.report() if governor is not None else {})
-    )
+    report.update(policy=policy, edge=pipeline.rule, idle_cores=idle_cores, **(governor.report() if governor else {}))
     if governor is not None and governor.power_w is not None and report["fps"]:
         report["xrbench"]["energy"] = energy_score(1e3 * governor.power_w / report["fps"])
     for unit, row in report["units"].items():
-        row.update(pid=pids[unit], **config.units[unit].model_dump(mode="json"))
-    return RunResult(
-        report=report,
-        requested=requested,
-        presented=len(driver.core.ledger.presented_ns),
-        lost=dict(driver.core.ledger.lost),
-        dropped=dict(driver.core.ledger.dropped),
-        pids=pids,
-        startup_ms=driver.startup_ms,
-        jobs=tuple(driver.jobs),
-        recording=driver.recording,
-        figures={stage: _means(driver, stage) for stage in driver.figures},
-        messages=tuple(driver.messages),
-        interrupted=cause in ("stopped", "aborted") and interrupts.count > 0,
-        failure=driver.failure,
-    )
+        row.update(pid=run.pids[unit], **pipeline.units[unit].model_dump(mode="json"))
+    return run.result(report)
 
 
-def edge_payload_bytes(config: RunConfig) -> dict[str, int]:
-    """Bytes of payload of each edge, for the largest tensor that the scene's size allows."""
-    output, names = config.scene.output, config.infer_names
-    return {
-        "pose->raster": posed_vertices_bytes(config.posed_vertices),
-        "raster->infer": config.max_tensor_pixels * MAX_CHANNELS,
-        **{f"{a}->{b}": size for (a, b), size in zip(pairwise(names), crossing_bytes(config), strict=True)},
-        f"{names[-1]}->composite": config.max_tensor_pixels * 4,
-        "composite->present": output.width * output.height * 3,
-    }
+class _Run:
+    """The steps of one run: start, isolated times, the scheduler's loop, isolated times again, close."""
+
+    def __init__(
+        self,
+        core: Core,
+        clock: RealtimeClock,
+        processes: UnitProcesses,
+        interrupts: Interrupts,
+        log: RunLog,
+        recording: Recording,
+    ) -> None:
+        self._core, self._clock, self._processes = core, clock, processes
+        self._interrupts, self._log, self._recording = interrupts, log, recording
+        self.isolated = IsolatedTimes(core.graph, processes, interrupts)
+        self.pids: dict[str, int] = {}
+        self._startup_ms: dict[str, float] = {}
+        self._outcome = Outcome(OutcomeKind.ABORTED)
+
+    def execute(self, isolated_frames: int) -> None:
+        """All of it. Raises as `run_pipeline`."""
+        self._startup_ms = start_units(self._processes, self._core.graph.units, self._interrupts)
+        self.pids = self._processes.pids
+        sample = _spread(self._core.settings.frames, max(isolated_frames, 1))
+        self.isolated.measure(sample[::2])
+        self._outcome = run_loop(self._core, self._clock, self._recording)
+        self._clock.finish()
+        if self._outcome.kind is OutcomeKind.GAVE_UP:
+            tail = after_stderr(self._processes.stderr_tails.get(self._outcome.unit, ""))
+            self._log.fail(f"unit {self._outcome.unit} could not be kept alive{tail}")
+        if sample[1::2] and self._outcome.kind is OutcomeKind.DONE:
+            self._measure_again(sample[1::2])
+        self.pids = {**self.pids, **self._processes.pids}
+        if self._outcome.kind is not OutcomeKind.ABORTED:
+            close_units(self._processes, self._log, self._interrupts)
+
+    def result(self, report: dict[str, Any]) -> RunResult:
+        ledger = self._core.ledger
+        stopped = self._outcome.kind in (OutcomeKind.STOPPED, OutcomeKind.ABORTED)
+        return RunResult(
+            report=report,
+            requested=report["frames"]["requested"],
+            presented=len(ledger.presented_ns),
+            lost=dict(ledger.lost),
+            dropped=dict(ledger.dropped),
+            pids=self.pids,
+            startup_ms=self._startup_ms,
+            jobs=tuple(self._clock.jobs),
+            recording=self._recording,
+            metrics=self._mean_metrics(),
+            messages=tuple(self._log.messages),
+            interrupted=stopped and self._interrupts.count > 0,
+            failure=self._log.failure,
+        )
+
+    def _measure_again(self, frames: list[int]) -> None:
+        """After the run, so that a machine which grew slower or faster weighs on both sides.
+
+        What goes wrong here leaves the run's result as it is.
+        """
+        if self._log.failure or not self._core.all_ready():
+            return
+        try:
+            self.isolated.measure(frames)
+        except (UnitError, KeyboardInterrupt) as error:
+            self._log.say(f"the measurement after the run was left out: {error or 'interrupted'}")
+
+    def _mean_metrics(self) -> Mapping[str, Mapping[str, float]]:
+        """Of each stage that reported any, the mean of a job."""
+        jobs = {stage: sum(job.stage == stage for job in self._clock.jobs) for stage in self._clock.metrics}
+        return {
+            stage: {name: total / max(jobs[stage], 1) for name, total in sums.items()}
+            for stage, sums in self._clock.metrics.items()
+        }
 
 
-def _plan(
-    config: RunConfig, policy: str, edge: str, frames: int, pace_fps: float | None, hang_ns: int
-) -> tuple[Graph, Settings]:
+def _settings(
+    policy: str,
+    frames: int,
+    fps: float,
+    pace_fps: float | None,
+    hang_ns: int,
+    latch_ms: float,
+    requests: FrameRequestQueue | None,
+) -> Settings:
     try:
         paced = policy_named(policy).paced
-        edge_rule(edge)
-    except ValueError as error:
-        raise BadInputError.about("the run's settings", error) from None
-    fps = pace_fps or (config.scene.fps if paced else None)
-    period_ns = round(1e9 / fps) if fps else 0
-    settings = Settings(
+    except UnexpectedValue as error:
+        raise BadInputError.at("the run's settings", error) from None
+    release_fps = pace_fps or (fps if paced else None)
+    period_ns = round(1e9 / release_fps) if release_fps else 0
+    return Settings(
         frames=frames,
         policy=policy,
         period_ns=period_ns,
         deadline_ns=DEADLINE_PERIODS * period_ns,
         hang_ns=hang_ns,
+        asked=requests is not None,
+        latch_ns=round(latch_ms * 1e6),
     )
-    return avatar_graph(edge, zip(config.infer_names, config.infer_units, strict=True)), settings
 
 
 def _spread(frames: int, count: int) -> list[int]:
+    """`count` frame numbers, evenly over the run."""
     count = min(count, frames)
     return [index * frames // count for index in range(count)]
 
 
-def _means(driver: RealtimeDriver, stage: str) -> dict[str, float]:
-    jobs = sum(record.stage == stage for record in driver.jobs)
-    return {name: total / max(jobs, 1) for name, total in driver.figures[stage].items()}
-
-
 @contextlib.contextmanager
 def _on_cores(cores: tuple[int, ...]) -> Iterator[None]:
-    """The scheduler runs with the CPU unit, off the cores of the others."""
+    """The scheduler runs on `cores`, off those of the other units."""
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, cores)
     try:
@@ -175,9 +240,12 @@ def _on_cores(cores: tuple[int, ...]) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _prompt() -> Iterator[None]:
-    """The scheduler answers at once: it is not kept waiting by the CPU unit on its core, by a thread that draws a
-    progress bar, or by collecting garbage, of which a run makes none."""
+def _prompt_answers() -> Iterator[None]:
+    """The scheduler answers at once.
+
+    It does not wait for another unit's time slice on its core, for a thread that draws a progress bar, or for garbage
+    collection: a run makes no garbage in cycles.
+    """
     switch_s, collects = sys.getswitchinterval(), gc.isenabled()
     sys.setswitchinterval(SWITCH_S)
     gc.disable()
@@ -192,31 +260,11 @@ def _prompt() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _regions(config: RunConfig, graph: Graph) -> Iterator[dict[str, EdgeSpec]]:
-    edges: dict[str, EdgeSpec] = {}
-    header, payloads = pose_dtype(len(config.scene.avatars)), edge_payload_bytes(config)
-    try:
-        for index, text in enumerate(graph.edges):
-            name = graph.edge_name(index)
-            payload = payloads[name]
-            slots = edge_rule(text).slots
-            fd = create_region(name, RegionLayout(slots, SlotLayout(header, payload)))
-            edges[name] = EdgeSpec(fd=fd, slots=slots, header=header, payload_bytes=payload)
-        yield edges
-    finally:
-        for edge in edges.values():
-            os.close(edge.fd)
-
-
-@contextlib.contextmanager
-def _processes(config: RunConfig, edges: dict[str, EdgeSpec], graph: Graph) -> Iterator[UnitProcesses]:
-    stages: dict[str, dict[str, tuple[str | None, str | None]]] = {unit: {} for unit in graph.units}
-    last = len(graph.stages) - 1
-    for position, stage in enumerate(graph.stages):
-        source = graph.edge_name(position - 1) if position else None
-        stages[stage.unit][stage.name] = (source, graph.edge_name(position) if position < last else None)
-    processes = UnitProcesses(config, edges, stages)
-    try:
-        yield processes
-    finally:
-        processes.end_all()
+def _processes(pipeline: Pipeline, assets: Assets, starter: UnitStarter | None) -> Iterator[UnitProcesses]:
+    """The fork server, unless the caller has one; the memory; then the processes that map it."""
+    with contextlib.ExitStack() as stack:
+        used = starter or stack.enter_context(UnitStarter(pipeline.preload))
+        assets_fd = share_assets(assets)
+        stack.callback(os.close, assets_fd)
+        regions = stack.enter_context(edge_regions(pipeline))
+        yield stack.enter_context(contextlib.closing(UnitProcesses(pipeline, regions, assets_fd, used)))

@@ -1,4 +1,4 @@
-"""What a stage is to the process that runs it. Rule: it sees its slots and its settings, nothing else."""
+"""What a stage is to the process that runs it. Rule: it sees its slots, its settings and its unit, nothing else."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeVar
 
+from trilane.pipeline.assets import Assets
 from trilane.pipeline.description import UnitSettings
 from trilane.transport.packets import Packet
 
@@ -21,8 +22,8 @@ class Stage(Protocol):
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
         """Do frame `frame` from `inputs[slot_in]` to `outputs[slot_out]`; metrics for the log, often empty.
 
-        The first stage of a pipeline has no input, the last no output. Between stages whose edges have the same
-        header, the header of the input slot has already been copied to the output slot.
+        The first stage of a pipeline has no input, the last no output. The header of the output slot already holds the
+        frame's number and sampling time; where both edges have the same header, all of the input's.
         """
 
     def close(self) -> None:
@@ -31,18 +32,22 @@ class Stage(Protocol):
 
 @dataclass(frozen=True)
 class UnitContext:
-    """What the stages of one unit share in its process. `name`: of the unit."""
+    """What the stages of one unit share in its process.
+
+    `name`: of the unit. `settings`: its cores and threads. `assets`: the arrays that the run was given, read-only.
+    """
 
     name: str
     settings: UnitSettings
-    _shared: dict[Any, Any] = field(default_factory=dict)
+    assets: Assets
+    _shared: dict[str, Any] = field(default_factory=dict)
 
-    def shared(self, make: Callable[[], T]) -> T:
-        """What `make` returns, made once in this process: such as a context that two stages draw with."""
-        if make not in self._shared:
-            self._shared[make] = make()
-        found: T = self._shared[make]
-        return found
+    def shared(self, key: str, make: Callable[[], T]) -> T:
+        """What `make` returns, made once in this process: such as the context with which two stages draw."""
+        if key not in self._shared:
+            self._shared[key] = make()
+        made: T = self._shared[key]
+        return made
 
 
 class StageFactory(Protocol):

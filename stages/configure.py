@@ -15,15 +15,17 @@ from pydantic import ValidationError
 
 from trilane.apps.machine import gl_facts, machine_facts
 from trilane.avatars.bundle import Bundle, load_bundle
+from trilane.avatars.network_file import NetworkFile
 from trilane.avatars.split import split
-from trilane.body.body import load_body
 from trilane.errors import BadInputError, MissingPartError
 from trilane.hw_profiles.host import host_units
 from trilane.hw_profiles.load import HOST, load_profile
 from trilane.hw_profiles.runtimes import fastest_runtime
+from trilane.pipeline.assets import Assets
 from trilane.scene.schema import Scene
 from trilane.scene.staging import stage_scene
 from trilane.scene.validate import find_scene, load_scene, located, scene_from
+from trilane.stages.avatar_assets import load_avatar, pack_assets, require_one_tensor
 from trilane.stages.config import NetworkCut, RunConfig
 from trilane.stages.dsp.runtime import RUNTIMES, installed, resolve
 from trilane.stages.gpu.background import open_background
@@ -52,9 +54,14 @@ class Request:
 
 @dataclass(frozen=True)
 class Checked:
-    """A configuration that can be run, what the loads said of their sources, and the avatars' own figures."""
+    """A configuration that can be run.
+
+    `assets`: what was loaded to check it, as the units take it. `notes`: what the loads said of their sources.
+    `accuracy`: of each avatar, by its name, the figures of its validation.
+    """
 
     config: RunConfig
+    assets: Assets
     notes: tuple[str, ...]
     accuracy: Mapping[str, Any]
 
@@ -87,22 +94,25 @@ def configure(request: Request, out_dir: Path) -> Checked:
     scene = requested_scene(request)
     runtime, reason = requested_runtime(request.runtime)
     _check_background(scene)
-    bundles = [_checked_bundle(spec.bundle) for spec in scene.avatars]
-    bodies = {bundle.folder: load_body(bundle.body_path).shape() for bundle in bundles}
-    notes = list(stage_scene(scene, [bodies[bundle.folder] for bundle in bundles], Path.cwd()).notes)
-    cuts = requested_cuts(request.split, bundles[0])
+    bundles = {spec.bundle: load_bundle(spec.bundle) for spec in scene.avatars}
+    avatars = {bundle.folder.absolute(): load_avatar(bundle) for bundle in bundles.values()}
+    folders = tuple(bundles[spec.bundle].folder.absolute() for spec in scene.avatars)
+    require_one_tensor(list(avatars.values()))
+    staged = stage_scene(scene, [avatars[folder].shaped for folder in folders], Path.cwd())
+    cuts = requested_cuts(request.split, avatars[folders[0]].network)
     unit, why = skinning_unit(request.skinning)
-    notes += [f"runtime: {runtime} ({reason})", f"skinning: {unit} unit ({why})"]
     config = RunConfig(
         scene=scene,
         out_dir=out_dir,
-        avatar_dirs=tuple(bundle.folder.absolute() for bundle in bundles),
+        avatar_dirs=folders,
         units=host_units(),
         runtime=runtime,
-        posed_vertices=tuple(len(bodies[b.folder].vertices) for b in bundles) if unit == "cpu" else (),
+        posed_vertices=tuple(len(avatars[folder].shaped.vertices) for folder in folders) if unit == "cpu" else (),
         cuts=cuts,
     )
-    return Checked(config, tuple(notes), {bundle.manifest.name: _accuracy(bundle) for bundle in bundles})
+    notes = (*staged.notes, f"runtime: {runtime} ({reason})", f"skinning: {unit} unit ({why})")
+    accuracy = {avatar.bundle.manifest.name: _accuracy(avatar.bundle) for avatar in avatars.values()}
+    return Checked(config, pack_assets(list(avatars.values()), staged), notes, accuracy)
 
 
 def requested_runtime(asked: str) -> tuple[str, str]:
@@ -114,8 +124,8 @@ def requested_runtime(asked: str) -> tuple[str, str]:
     return resolve(asked), "as asked"
 
 
-def requested_cuts(texts: Sequence[str], bundle: Bundle) -> tuple[NetworkCut, ...]:
-    """`TENSOR=UNIT` texts as cuts of the bundle's network. Raises BadInputError."""
+def requested_cuts(texts: Sequence[str], network: NetworkFile) -> tuple[NetworkCut, ...]:
+    """`TENSOR=UNIT` texts as cuts of `network`. Raises BadInputError."""
     cuts = []
     for text in texts:
         at, _, unit = text.rpartition("=")
@@ -123,15 +133,8 @@ def requested_cuts(texts: Sequence[str], bundle: Bundle) -> tuple[NetworkCut, ..
             cuts.append(NetworkCut.model_validate({"at": at, "unit": unit}))
         except ValidationError:
             raise BadInputError("--split", repr(text), "TENSOR=UNIT, with UNIT one of cpu, gpu, dsp") from None
-    split(bundle.read_network(), [cut.at for cut in cuts])
+    split(network, [cut.at for cut in cuts])
     return tuple(cuts)
-
-
-def _checked_bundle(name: str) -> Bundle:
-    bundle = load_bundle(name)
-    bundle.read_texture()
-    bundle.read_network()
-    return bundle
 
 
 def _check_background(scene: Scene) -> None:

@@ -15,6 +15,7 @@ its centre c_b by its own angle t_b, |G_b c - G_parent c| <= 2 sin(t_b / 2) |c -
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,12 +23,14 @@ from numpy.typing import NDArray
 from trilane.arrays import F64, I64
 from trilane.body.body import ShapedBody
 from trilane.body.skinning import branch_sums, joint_distance
+from trilane.cache import Arrays, cached_arrays
 
 #: Coarse patches are cut until their triangles' middles differ by no more than this, metres, and these again.
 EXTENTS_M = (0.08, 0.02)
 LEAST_FACES = 4
 #: The angle, in radians, by which joints are taken to be turned when patches are cut.
 TYPICAL_TURN = 0.5
+VERSION = "patches 1"  # to be raised when the same body gives other patches
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,37 @@ def join(groups: list[I64], chosen: I64) -> I64:
 
 
 def build_levels(shaped: ShapedBody, weights: F64) -> list[Level]:
-    """Coarse and fine patches of all triangles of the body, skinned with `weights` (V,55)."""
+    """Coarse and fine patches of all triangles of the body, skinned with `weights` (V,55); from the cache if they can be."""
+    body = shaped.body
+    sources = [shaped.vertices, shaped.joints, body.parents, body.faces, weights]
+    sources += [body.posedirs] if body.posedirs is not None else []
+    stored = cached_arrays(VERSION, sources, lambda: _levels_to_arrays(_build_levels(shaped, weights)))
+    return _levels_from_arrays(stored)
+
+
+def _levels_to_arrays(levels: list[Level]) -> dict[str, NDArray[Any]]:
+    arrays: dict[str, NDArray[Any]] = {}
+    for number, level in enumerate(levels):
+        arrays |= {f"{name}{number}": getattr(level, name) for name in ("centres", "size", "give", "blend")}
+        for name in ("parts", "faces"):
+            groups: list[I64] = getattr(level, name)
+            arrays[f"{name}{number}"] = np.concatenate(groups)
+            arrays[f"{name}{number}_ends"] = np.cumsum([len(group) for group in groups])
+    return arrays
+
+
+def _levels_from_arrays(arrays: Arrays) -> list[Level]:
+    levels = []
+    for number in range(len(EXTENTS_M)):
+        parts, faces = (
+            np.split(arrays[f"{name}{number}"], arrays[f"{name}{number}_ends"][:-1]) for name in ("parts", "faces")
+        )
+        own = {name: arrays[f"{name}{number}"] for name in ("centres", "size", "give", "blend")}
+        levels.append(Level(**own, parts=parts, faces=faces))
+    return levels
+
+
+def _build_levels(shaped: ShapedBody, weights: F64) -> list[Level]:
     branches = branch_sums(shaped.body.parents, weights)
     swing = branches * joint_distance(shaped)
     features = np.concatenate([shaped.vertices.astype(np.float64), TYPICAL_TURN * swing[:, 1:]], axis=1)

@@ -8,18 +8,18 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.avatars.bundle import load_bundle
-from trilane.body.body import ShapedBody, load_body
 from trilane.body.kinematics import Posed, Skeleton
 from trilane.body.skinning import FrameSkinner
 from trilane.errors import TrilaneError
+from trilane.pipeline.assets import Assets
+from trilane.pipeline.stage import UnitContext
 from trilane.scene.mover import Mover
-from trilane.scene.staging import stage_scene
+from trilane.stages.avatar_assets import distinct, shaped_body, staged_of
 from trilane.stages.config import RunConfig
 from trilane.stages.cpu.crop import Rect
 from trilane.stages.cpu.mesh_bounds import MeshBounds
@@ -42,16 +42,16 @@ class _Actor:
 class PoseStage:
     """Stage `pose` of the CPU unit: no input edge, an output edge of headers."""
 
-    def __init__(self, config: RunConfig) -> None:
-        """Load bodies, motions and camera of `config`. Raises BadInputError."""
+    def __init__(self, config: RunConfig, assets: Assets) -> None:
+        """The scene of `config`, whose avatars, motions and camera lie in `assets`."""
         scene = config.scene
         self._fps = scene.fps
         self._output = (scene.output.height, scene.output.width)
         self._buckets = config.buckets
-        folders = dict.fromkeys(config.avatar_dirs)
-        bodies = {folder: _shaped(folder) for folder in folders}
+        folders = distinct(config)
+        bodies = {folder: shaped_body(assets, number) for number, folder in enumerate(folders)}
         bounds = {folder: MeshBounds(body, standoff_m=STANDOFF_M) for folder, body in bodies.items()}
-        staged = stage_scene(scene, [bodies[folder] for folder in config.avatar_dirs], Path.cwd())
+        staged = staged_of(assets)
         self._actors = [
             _Actor(
                 mover,
@@ -116,9 +116,9 @@ class PoseStage:
         self._slots, self._vertices = [], []
 
 
-def _shaped(folder: Path) -> ShapedBody:
-    bundle = load_bundle(folder)
-    return load_body(bundle.body_path).shape(bundle.manifest.betas, bundle.manifest.expression)
+def build(settings: Mapping[str, Any], unit: UnitContext) -> PoseStage:
+    """The pose stage of the configuration in `settings`."""
+    return PoseStage(RunConfig.model_validate(settings["config"]), unit.assets)
 
 
 def _pose(

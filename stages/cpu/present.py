@@ -20,6 +20,7 @@ import numpy as np
 from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 from numpy.typing import NDArray
 
+from trilane.pipeline.stage import UnitContext
 from trilane.stages.config import RunConfig
 from trilane.transport.packets import Packet
 
@@ -113,3 +114,8 @@ class PresentStage:
         if self._segment is not None:
             self._segment.close()
             self._segment = None
+
+
+def build(settings: Mapping[str, Any], unit: UnitContext) -> PresentStage:  # noqa: ARG001 - a factory's signature
+    """The present stage of the configuration in `settings`."""
+    return PresentStage(RunConfig.model_validate(settings["config"]))

@@ -9,15 +9,19 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
 
 from trilane.arrays import U8
+from trilane.avatars.network_file import NetworkFile
 from trilane.avatars.split import NetworkPart
 from trilane.errors import BadInputError
+from trilane.pipeline.stage import UnitContext
 from trilane.shapes import Shape
+from trilane.stages.avatar_assets import network_of
 from trilane.stages.config import RunConfig
-from trilane.stages.dsp.parts import parts_for, shared_network, views
+from trilane.stages.dsp.parts import parts_for, views
 from trilane.stages.dsp.runtime import Binding, RuntimeOptions, Session, load_runtime, resolve
 from trilane.transport.packets import Packet
 
@@ -40,19 +44,19 @@ class BoundPart:
 class InferStage:
     """`trilane.pipeline.stage.Stage`. One inference a frame; a whole network turns H·W·C bytes into H·W·4.
 
-    `part`: which one of those that the configuration's cuts make. Several avatars share the tensor, each in its
-    `tensor_rect`, so they must share one network. `runtime`: the name of the runtime that runs. Raises BadInputError,
-    MissingPartError when made or bound.
+    `network`: of all avatars, which share the tensor, each in its `tensor_rect`.
+    `part`: which one of the parts that the configuration's cuts make.
+    Raises BadInputError, MissingPartError when made or bound.
     """
 
-    def __init__(self, config: RunConfig, part: int = 0) -> None:
+    def __init__(self, config: RunConfig, network: NetworkFile, part: int = 0) -> None:
         self.runtime = resolve(config.runtime)
         self._module = load_runtime(self.runtime)
         self._config, self._part = config, part
         settings = config.units[config.infer_units[part]]
         self._options = RuntimeOptions(settings.threads, settings.spin)
         self._shapes = config.buckets
-        self._network = shared_network(config.avatar_dirs)
+        self._network = network
         self._bindings: dict[Key, BoundPart] = {}
         self._inputs: Sequence[Packet] = ()
         self._outputs: Sequence[Packet] = ()
@@ -97,10 +101,10 @@ class InferStage:
             raise BadInputError(f"frame {frame}", f"tensor shape {shape[0]}x{shape[1]}", f"one of {known}") from None
 
 
-def infer_stages(config: RunConfig, unit: str) -> dict[str, InferStage]:
-    """The infer stages of `unit` by name: one for each part of the network that runs there. Raises as InferStage."""
-    named = enumerate(zip(config.infer_names, config.infer_units, strict=True))
-    return {name: InferStage(config, part) for part, (name, own) in named if own == unit}
+def build(settings: Mapping[str, Any], unit: UnitContext) -> InferStage:
+    """The stage that runs part `settings["part"]` of the network. Raises BadInputError, MissingPartError."""
+    config = RunConfig.model_validate(settings["config"])
+    return InferStage(config, network_of(unit.assets), settings["part"])
 
 
 def _bound(session: Session, part: NetworkPart, source: U8, target: U8) -> BoundPart:

@@ -7,30 +7,15 @@ the same configuration finds the same places.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from pathlib import Path
 
 from trilane.arrays import U8
-from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import NetworkFile
 from trilane.avatars.reshape import reshaped
 from trilane.avatars.split import NetworkPart, Shapes, split
-from trilane.errors import BadInputError
 from trilane.shapes import Shape
 from trilane.stages.config import RunConfig
 
 LINE = 64  # bytes of a cache line, and of the widest vector register
-
-
-def shared_network(folders: Sequence[Path]) -> NetworkFile:
-    """The network of the avatars in `folders`. Raises BadInputError when they do not share one."""
-    bundles = [load_bundle(folder) for folder in folders]
-    first, *others = [bundle.read_network() for bundle in bundles]
-    for bundle, network in zip(bundles[1:], others, strict=True):
-        if network.digest != first.digest:
-            found = "another network than the scene's first avatar has"
-            raise BadInputError(bundle.network_path, found, "one network for all avatars, as they share a tensor")
-    return first
 
 
 def parts_for(config: RunConfig, network: NetworkFile, shape: Shape) -> list[NetworkPart]:
@@ -38,11 +23,10 @@ def parts_for(config: RunConfig, network: NetworkFile, shape: Shape) -> list[Net
     return split(reshaped(network, *shape), [cut.at for cut in config.cuts])
 
 
-def crossing_bytes(config: RunConfig) -> list[int]:
-    """Bytes that cross each cut, for the scene's shape that needs most. Raises BadInputError."""
+def crossing_bytes(config: RunConfig, network: NetworkFile) -> list[int]:
+    """Bytes that cross each cut of `network`, for the scene's shape that needs most. Raises BadInputError."""
     if not config.cuts:
         return []
-    network = shared_network(config.avatar_dirs)
     shapes = [[part.handed_on for part in parts_for(config, network, shape)[:-1]] for shape in config.buckets]
     return [max(extent(crossing) for crossing in crossings) for crossings in zip(*shapes, strict=True)]
 

@@ -7,30 +7,42 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.arrays import F64
-from trilane.scene.schema import PlaneSpec
+from trilane.arrays import F64, Floats
+from trilane.pipeline.stage import UnitContext
+from trilane.scene.placement import PlacedCamera
+from trilane.scene.schema import PlaneSpec, Scene
+from trilane.shapes import Shape
+from trilane.stages.avatar_assets import distinct, shaped_body, staged_of
+from trilane.stages.config import RunConfig
 from trilane.stages.gpu import gl
-from trilane.stages.gpu.background import Background
-from trilane.stages.gpu.context import checked
+from trilane.stages.gpu.background import Background, open_background
+from trilane.stages.gpu.camera import eye_of
+from trilane.stages.gpu.context import CONTEXT, checked, open_context
 from trilane.stages.gpu.hud import Hud
 from trilane.stages.gpu.painters import AvatarPainter, PicturePainter, RoomPainter, ShadowPainter
 from trilane.stages.gpu.planes import PlanePainter
 from trilane.stages.gpu.shadow import DISCS, floor_discs
 from trilane.transport.packets import Packet
 
-Shape = tuple[int, int]
+ROOM = "room"
+ROOM_FRAMES = 8
 
 
 class CompositeStage:
     """Draws frames of `shape` (height, width).
 
-    `shapes`: tensor shapes that may come. `rest`: rest joints (55,3) of each avatar of the scene, metres.
-    `background`: None for the built-in room. `planes`: detected ones to show. `hud`: show frame, rate and age.
+    `shapes`: tensor shapes that may come.
+    `rest`: rest joints (55,3) of each avatar of the scene, metres.
+    `background`: None for the built-in room.
+    `eyes`: places (3,) of the camera that the room is made to hold.
+    `planes`: detected ones to show.
+    `hud`: show frame, rate and age.
     """
 
     def __init__(
@@ -40,13 +52,14 @@ class CompositeStage:
         shapes: Sequence[Shape],
         rest: Sequence[F64],
         background: Background | None,
+        eyes: Sequence[Floats] = (),
         planes: Sequence[PlaneSpec] = (),
         hud: bool = False,
     ) -> None:
         self._ctx, self._shape, self._rest, self._background = ctx, shape, rest, background
         colour = ctx.texture(shape[::-1], 4, internal_format=gl.SRGB8_ALPHA8)
         self._target = ctx.framebuffer([colour])
-        self._room = RoomPainter(ctx) if background is None else None
+        self._room = RoomPainter(ctx, eyes) if background is None else None
         self._picture = None if background is None else PicturePainter(ctx, shape)
         self._planes = PlanePainter(ctx, planes) if planes else None
         self._hud = Hud(ctx) if hud else None
@@ -110,3 +123,27 @@ class CompositeStage:
         """Camera z of the pelvis: the most negative is the farthest."""
         pelvis = avatar["joints"][0] @ np.append(self._rest[int(avatar["avatar"])][0], 1.0)
         return float(pose["view"][2, :3] @ pelvis + pose["view"][2, 3])
+
+
+def build(settings: Mapping[str, Any], unit: UnitContext) -> CompositeStage:
+    """The composite stage of the configuration in `settings`. Raises BadInputError, MissingPartError."""
+    config = RunConfig.model_validate(settings["config"])
+    scene = config.scene
+    shape, folders = (scene.output.height, scene.output.width), distinct(config)
+    joints = [shaped_body(unit.assets, folders.index(folder)).joints for folder in config.avatar_dirs]
+    if scene.background == ROOM:
+        background, eyes = None, room_eyes(staged_of(unit.assets).camera, scene)
+    else:
+        background, eyes = open_background(Path(scene.background), shape, scene.fps), []
+    ctx = unit.shared(CONTEXT, lambda: open_context(unit.settings.threads))
+    return CompositeStage(ctx, shape, config.buckets, joints, background, eyes, scene.planes, scene.hud)
+
+
+def room_eyes(camera: PlacedCamera, scene: Scene) -> list[Floats]:
+    """Where the camera stands at ROOM_FRAMES instants spread over the scene, float32 as in a packet.
+
+    The room holds them from the first frame on: it seldom grows, and it is the same in a unit that was restarted.
+    """
+    count = min(ROOM_FRAMES, scene.frames)
+    frames = [index * scene.frames // count for index in range(count)]
+    return [eye_of(camera.sample(frame / scene.fps).astype(np.float32)) for frame in frames]

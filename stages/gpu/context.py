@@ -19,6 +19,7 @@ from trilane.errors import MissingPartError, TrilaneError, UnitLostError
 
 INSTALL = "apt-get install libegl1 libgl1-mesa-dri"
 REQUIRED_VERSION = 330
+CONTEXT = "OpenGL context"  # its key among what the stages of the unit share
 LIBRARY = "libEGL.so.1"  # eglGetProcAddress gives every OpenGL function, so libGL need not be there
 SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swr", "swiftshader", "swrast")
 

@@ -5,6 +5,8 @@ Rule: backgrounds are copied as the sRGB bytes they are; everything blended over
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import reduce
 from typing import Any
 
 import moderngl
@@ -14,7 +16,7 @@ from trilane.arrays import F32, U8, Floats
 from trilane.stages.gpu import gl
 from trilane.stages.gpu.camera import eye_of, target_clip
 from trilane.stages.gpu.program import build_program
-from trilane.stages.gpu.room import Extent, floor_texture, room_mesh, wall_texture
+from trilane.stages.gpu.room import Extent, room_mesh, room_textures
 
 MAX_TAPS = 8
 HALF_TEXEL_INWARD = np.array([0.5, 0.5, -0.5, -0.5])
@@ -24,14 +26,16 @@ UNDER_THE_FLOOR = (70, 66, 60)
 class RoomPainter:
     """The built-in room, which grows when a camera leaves it."""
 
-    def __init__(self, ctx: Any) -> None:
+    def __init__(self, ctx: Any, eyes: Sequence[Floats] = ()) -> None:
+        """`eyes`: places (3,) of cameras that the room holds from the beginning."""
         self._ctx = ctx
         self._program = build_program(ctx, "room.vert", "room.frag")
+        floor, wall = room_textures()
         self._textures = [
-            _detail(ctx, floor_texture(), moderngl.LINEAR_MIPMAP_LINEAR),
-            _detail(ctx, wall_texture(), moderngl.LINEAR_MIPMAP_NEAREST),  # too smooth to show where levels change
+            _detail(ctx, floor, moderngl.LINEAR_MIPMAP_LINEAR),
+            _detail(ctx, wall, moderngl.LINEAR_MIPMAP_NEAREST),  # too smooth to show where levels change
         ]
-        self._extent = Extent()
+        self._extent = reduce(Extent.holding, eyes, Extent())
         self._batches: list[Any] = []
         self._build()
 

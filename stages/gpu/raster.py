@@ -12,14 +12,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from trilane.body.body import ShapedBody
 from trilane.errors import TrilaneError
+from trilane.pipeline.stage import UnitContext
+from trilane.shapes import Shape
+from trilane.stages.avatar_assets import distinct, quantisation_of, shaped_body, texture_of
+from trilane.stages.config import RunConfig
 from trilane.stages.cpu.crop import Rect, crop_projection
-from trilane.stages.gpu.context import checked
+from trilane.stages.gpu.avatar_mesh import avatar_mesh
+from trilane.stages.gpu.context import CONTEXT, checked, describe, open_context
+from trilane.stages.gpu.mesh import Mesh, PosedMesh, SkinnedMesh
 from trilane.stages.gpu.packed import PackedAvatar, PackedPass, Placement
 from trilane.stages.packets import posed_vertices
 from trilane.transport.packets import Packet
-
-Shape = tuple[int, int]
 
 
 class RasterStage:
@@ -92,3 +97,27 @@ def _refuse_nan(frame: int, avatars: Sequence[Any]) -> None:
     for avatar in avatars:
         if not np.isfinite(avatar["joints"]).all():
             raise TrilaneError(f"frame {frame}: avatar {int(avatar['avatar'])} has a joint that is not a finite number")
+
+
+def build(settings: Mapping[str, Any], unit: UnitContext) -> RasterStage:
+    """The raster stage of the configuration in `settings`. Raises BadInputError, MissingPartError.
+
+    The driver's kind decides how the packed pass is drawn, no more.
+    """
+    config = RunConfig.model_validate(settings["config"])
+    ctx = unit.shared(CONTEXT, lambda: open_context(unit.settings.threads))
+    folders, filtering = distinct(config), config.scene.texture_filter
+    textures = [texture_of(unit.assets, number) for number in range(len(folders))]
+    deferred = filtering == "linear" and not describe(ctx).hardware
+    packed = PackedPass(ctx, textures[0].shape[2], quantisation_of(unit.assets, 0), deferred, filtering)
+    drawn = {
+        folder: PackedAvatar(packed, _mesh(ctx, shaped_body(unit.assets, number), config), texture)
+        for number, (folder, texture) in enumerate(zip(folders, textures, strict=True))
+    }
+    avatars = [drawn[folder] for folder in config.avatar_dirs]
+    return RasterStage(packed, avatars, config.buckets, config.posed_vertices)
+
+
+def _mesh(ctx: Any, shaped: ShapedBody, config: RunConfig) -> Mesh:
+    arrays = avatar_mesh(shaped)
+    return PosedMesh(ctx, arrays) if config.posed_vertices else SkinnedMesh(ctx, arrays, shaped.body.posedirs)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import F32, F64, U8
+from trilane.cache import cached_arrays
 
 FLOOR_PERIOD_M = 2.4
 FLOOR_SIDE = 1024
@@ -23,6 +24,7 @@ SKIRTING_M = 0.11
 MARGIN_M = 0.6
 GRID = np.array([0, 0.04, 0.12, 0.5, 0.88, 0.96, 1])
 SEED = 7
+VERSION = "room textures 1"  # to be raised when the textures change
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,12 @@ def room_mesh(extent: Extent) -> RoomMesh:
         triangles[0].astype(np.uint32),
         np.concatenate(triangles[1:]).astype(np.uint32),
     )
+
+
+def room_textures() -> tuple[U8, U8]:
+    """The floor's and the wall's texture; the cache keeps them, as their noise takes a good part of a second."""
+    stored = cached_arrays(VERSION, (), lambda: {"floor": floor_texture(), "wall": wall_texture()})
+    return stored["floor"], stored["wall"]
 
 
 def floor_texture() -> U8:

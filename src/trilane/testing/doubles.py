@@ -1,31 +1,39 @@
-"""Mock stages of every unit. Rule: they spend the time that the environment says, and check what they are handed.
+"""Doubles of the avatar's five stages. Rule: they spend the time that they are told, and check what they are handed.
 
-`TRILANE_MOCK` holds `stage=milliseconds` pairs separated by commas (default 1 ms each); `stage=raise` fails at frame
-3, `stage=hang` never ends frame 3, `stage=badbuild` cannot be built. The payload of a frame is its number, repeated,
-and each stage checks it, so that a slot used twice is seen.
+The payload of a frame is its number, repeated, and each stage checks it, so that a slot used twice is seen.
 """
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from trilane.errors import BadInputError
-from trilane.stages.config import RunConfig
+from trilane.hw_profiles.host import host_units
+from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage
+from trilane.pipeline.stage import UnitContext
 from trilane.transport.packets import Packet
+from trilane.units import AFTER_INFER, BEFORE_INFER, INFER, LATENCY_TO
 
-STAGES = {"cpu": ("pose", "present"), "gpu": ("raster", "composite"), "dsp": ("infer",)}
+STAGES = (*BEFORE_INFER, INFER, *AFTER_INFER)
+FACTORY = "trilane.testing.doubles:build"
 BAD_FRAME = 3
+PAYLOAD_BYTES = 4096
+CHECKED_BYTES = 64
 
 
-class MockStage:
-    """Spends `spend_ms` per frame by sleeping; passes the frame's number on in the payload."""
+class StageDouble:
+    """Sleeps through each job, passes the frame's number on in the payload, and writes it to the file `log`, if any.
 
-    def __init__(self, name: str, behaviour: str, log: str | None) -> None:
-        self._name, self._behaviour = name, behaviour
+    `behaviour`: milliseconds of a job as text, or `raise`: fails at frame 3, or `hang`: never ends frame 3.
+    """
+
+    def __init__(self, behaviour: str, log: str | None) -> None:
+        self._behaviour = behaviour
         self._spend_s = 0.001 if behaviour in ("raise", "hang") else float(behaviour) / 1000
         self._log = open(log, "a", encoding="ascii") if log else None  # noqa: SIM115, PTH123 - closed in close()
 
@@ -37,10 +45,9 @@ class MockStage:
             raise BadInputError("mock.npz", "nothing", "something")
         time.sleep(3600 if self._behaviour == "hang" and frame == BAD_FRAME else self._spend_s)
         if slot_in is not None:
-            self._check(self._inputs[slot_in], frame)
+            _check(self._inputs[slot_in], frame)
         if slot_out is not None:
-            packet = self._outputs[slot_out]
-            packet.payload[:64] = frame % 251
+            self._outputs[slot_out].payload[:CHECKED_BYTES] = frame % 251
         if self._log is not None:
             self._log.write(f"{frame}\n")
         return {"frame": float(frame)}
@@ -49,18 +56,41 @@ class MockStage:
         if self._log is not None:
             self._log.close()
 
-    def _check(self, packet: Packet, frame: int) -> None:
-        if int(packet.header["frame"]) != frame:
-            raise RuntimeError(f"header of frame {packet.header['frame']} for frame {frame}")
-        if packet.payload.size and not np.all(packet.payload[:64] == frame % 251):
-            raise RuntimeError(f"payload {packet.payload[:4]} for frame {frame}")
+
+def _check(packet: Packet, frame: int) -> None:
+    if int(packet.header["frame"]) != frame:
+        raise RuntimeError(f"header of frame {packet.header['frame']} for frame {frame}")
+    if not np.all(packet.payload[:CHECKED_BYTES] == frame % 251):
+        raise RuntimeError(f"payload {packet.payload[:4]} for frame {frame}")
 
 
-def build(config: RunConfig) -> dict[str, MockStage]:
-    """The stages of the unit whose fake this is; the unit is known from the one that runs here."""
-    unit = os.environ["TRILANE_UNIT"]
-    spend = dict(part.split("=") for part in os.environ.get("TRILANE_MOCK", "").split(",") if part)
-    if "badbuild" in (spend.get(name) for name in STAGES[unit]):
+def build(settings: Mapping[str, Any], unit: UnitContext) -> StageDouble:  # noqa: ARG001 - a factory's signature
+    """The stage that `settings` describe: `behaviour` (also `badbuild`: cannot be built) and `log`."""
+    if settings["behaviour"] == "badbuild":
         raise BadInputError("mock.onnx", "nothing", "a network", "train one")
-    log = str(config.out_dir / "presented.txt") if config.record else None
-    return {name: MockStage(name, spend.get(name, "1"), log if name == "present" else None) for name in STAGES[unit]}
+    return StageDouble(settings["behaviour"], settings["log"])
+
+
+def pipeline_of_doubles(
+    log: Path | None = None, pace_ns: Mapping[str, int] | None = None, **behaviour: object
+) -> Pipeline:
+    """The avatar's stages as doubles. `behaviour`: of a stage, by its name; 1 ms when it is not given.
+
+    `log`: the file in which the last stage writes the frames that it presents.
+    """
+    last = STAGES[-1][0]
+    return Pipeline(
+        stages=tuple(
+            PipelineStage(
+                name=name,
+                unit=unit,
+                factory=FACTORY,
+                settings={"behaviour": str(behaviour.get(name, 1)), "log": str(log) if log and name == last else None},
+                pace_ns=(pace_ns or {}).get(name, 0),
+            )
+            for name, unit in STAGES
+        ),
+        edges=(PipelineEdge(payload_bytes=PAYLOAD_BYTES),) * (len(STAGES) - 1),
+        units=host_units(),
+        latency_to=LATENCY_TO,
+    )

@@ -1,6 +1,6 @@
-"""The real GPU unit, whose OpenGL context is taken away once in a run, in the middle of a raster.
+"""The real raster stage, whose OpenGL context is taken away once in a run, before a frame.
 
-Rule: only the first process of a run loses its context; a file in the run's folder remembers.
+Rule: only the first process of a run loses its context; a file in the run's folder remembers it.
 """
 
 from __future__ import annotations
@@ -8,13 +8,14 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-from trilane.stages.config import RunConfig
-from trilane.transport.packets import Packet
-from trilane.pipeline.stage import Stage
-from trilane.stages.gpu import unit
+from trilane.pipeline.stage import Stage, UnitContext
+from trilane.stages.gpu import raster
 from trilane.stages.gpu.context import LIBRARY
+from trilane.transport.packets import Packet
 
+FACTORY = "trilane.testing.lost_context:build"
 BAD_FRAME = 3
 MARK = "lost-context"
 
@@ -47,7 +48,6 @@ class LosingStage:
         self._stage.close()
 
 
-def build(config: RunConfig) -> dict[str, Stage]:
-    """The stages of the GPU unit."""
-    stages = unit.build(config)
-    return stages | {"raster": LosingStage(stages["raster"], config.out_dir / MARK)}
+def build(settings: Mapping[str, Any], unit: UnitContext) -> LosingStage:
+    """The raster stage of `settings`; the mark is put into the folder `settings["config"]["out_dir"]`."""
+    return LosingStage(raster.build(settings, unit), Path(settings["config"]["out_dir"]) / MARK)

@@ -1,6 +1,7 @@
 """The units' processes, seen from the parent. Rule: what was started here is ended here, and its end is always noticed.
 
-A unit speaks over its link, its stderr over a pipe, and its death over a pidfd; all are waited for at once.
+A unit's messages come over its link, what it writes to stderr over a pipe, and its end over a pidfd; one poller waits
+for them all.
 """
 
 from __future__ import annotations
@@ -9,8 +10,7 @@ import contextlib
 import os
 import resource
 import select
-import subprocess
-import sys
+import signal
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -19,44 +19,50 @@ from typing import NamedTuple
 import zmq
 
 from trilane.errors import TrilaneError
-from trilane.pipeline.unit_loop import EdgeSpec, UnitSpec
-from trilane.stages.config import RunConfig
+from trilane.pipeline.description import Pipeline
+from trilane.pipeline.regions import EdgeRegion
+from trilane.pipeline.unit_spec import UnitSpec
+from trilane.pipeline.unit_starter import StartedUnit, UnitStarter
 from trilane.transport.heartbeats import BusFolder, Link
 from trilane.transport.job_pipe import JobPipe, JobPipeEnd, job_pipe_pair
 from trilane.transport.messages import Message, MessageError
 
 TAIL_BYTES = 8192
 END_S = 2.0
-#: Libraries that make threads of their own read these; set before they are imported.
-THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 #: Files and sockets that a run holds open, with room for a unit that is restarted.
 LEAST_FILES = 96
 
 
 class UnitMessage(NamedTuple):
-    """Something from a unit: a message, or None when its process has ended."""
+    """A message of a unit, or None when its process has ended."""
 
     unit: str
     message: Message | None
 
 
 class _Process:
-    def __init__(self, unit: str, popen: subprocess.Popen[bytes], link: Link, folder: BusFolder) -> None:
-        assert popen.stderr is not None
-        self.unit, self.popen, self.link, self.folder = unit, popen, link, folder
-        self.stderr = popen.stderr
-        self.pidfd = os.pidfd_open(popen.pid)
+    def __init__(self, unit: str, started: StartedUnit, stderr_fd: int, link: Link, folder: BusFolder) -> None:
+        self.unit, self.pid, self.pidfd = unit, started.pid, started.pidfd
+        self.stderr_fd, self.link, self.folder = stderr_fd, link, folder
         self.tail = b""
         self.folder_open = True
-        os.set_blocking(self.stderr.fileno(), False)
+        os.set_blocking(stderr_fd, False)
 
     def read_stderr(self) -> bool:
         """Keep the end of what was written; False when the pipe is closed."""
         with contextlib.suppress(BlockingIOError):
-            while chunk := os.read(self.stderr.fileno(), TAIL_BYTES):
+            while chunk := os.read(self.stderr_fd, TAIL_BYTES):
                 self.tail = (self.tail + chunk)[-TAIL_BYTES:]
             return False
         return True
+
+    def kill(self) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            signal.pidfd_send_signal(self.pidfd, signal.SIGKILL)
+
+    def wait(self) -> None:
+        """Until the process has ended."""
+        select.select([self.pidfd], [], [])
 
     def release_folder(self) -> None:
         if self.folder_open:
@@ -65,27 +71,29 @@ class _Process:
 
 
 class UnitProcesses:
-    """Starts, hears and ends the processes of the units in `stages` (unit -> stage -> input and output edge)."""
+    """Starts, hears and ends the processes of the units of `pipeline`, whose edges have `regions`.
+
+    `assets_fd`: of the arrays that every unit may read. `stderr_tails`: of units that have ended, the end of what they
+    wrote. `places`: stage to its place among those of its unit, as messages have it.
+    """
 
     def __init__(
-        self,
-        config: RunConfig,
-        edges: Mapping[str, EdgeSpec],
-        stages: Mapping[str, Mapping[str, tuple[str | None, str | None]]],
+        self, pipeline: Pipeline, regions: Mapping[str, EdgeRegion], assets_fd: int, starter: UnitStarter
     ) -> None:
-        self._config, self._edges, self._stages = config, edges, stages
+        self._pipeline, self._regions, self._assets_fd, self._starter = pipeline, regions, assets_fd, starter
         self._context = zmq.Context()
         self._poller = select.epoll()
         self._reactions: dict[int, Callable[[], list[UnitMessage]]] = {}
         self._live: dict[str, _Process] = {}
         self._ended: list[_Process] = []
-        #: Stage -> its number among those of its unit, as messages have it.
-        self.places = {stage: place for own in stages.values() for place, stage in enumerate(own)}
-        self.last_words: dict[str, str] = {}
+        self.places = {
+            stage.name: place for unit in pipeline.units for place, stage in enumerate(pipeline.stages_of(unit))
+        }
+        self.stderr_tails: dict[str, str] = {}
 
     @property
     def pids(self) -> dict[str, int]:
-        return {unit: process.popen.pid for unit, process in self._live.items()}
+        return {unit: process.pid for unit, process in self._live.items()}
 
     def watch(self, fd: int) -> None:
         """Let `listen` return early when `fd` becomes readable."""
@@ -101,18 +109,22 @@ class UnitProcesses:
             undo.callback(link.close)
             with contextlib.closing(theirs):
                 link.socket.bind(folder.endpoint(unit))
-                popen = self._spawn(unit, self._spec(unit, folder, theirs))
-            undo.callback(_end_now, popen)
-            process = _Process(unit, popen, link, folder)
+                stderr_fd, theirs_stderr = os.pipe2(os.O_CLOEXEC)
+                undo.callback(os.close, stderr_fd)
+                try:
+                    started = self._starter.start(self._spec(unit, folder, theirs), theirs_stderr)
+                finally:
+                    os.close(theirs_stderr)
+            process = _Process(unit, started, stderr_fd, link, folder)
             undo.pop_all()
         self._live[unit] = process
-        self._register(link.line.fileno(), partial(self._work, process))
-        self._register(link.bus_fd, partial(self._life_signs, process))
-        self._register(process.stderr.fileno(), partial(self._stderr, process))
+        self._register(link.job_pipe.fileno(), partial(self._job_messages, process))
+        self._register(link.heartbeat_fd, partial(self._heartbeats, process))
+        self._register(process.stderr_fd, partial(self._stderr, process))
         self._register(process.pidfd, partial(self._end, process))
 
     def connected(self, unit: str) -> None:
-        """The unit has spoken: its socket needs no name any more."""
+        """The unit is connected: its socket needs no name any more."""
         if unit in self._live:
             self._live[unit].release_folder()
 
@@ -120,30 +132,30 @@ class UnitProcesses:
         """To a unit that is gone or does not read: nothing, its end or its deadline tells."""
         process = self._live.get(unit)
         if process is not None:
-            process.link.line.send(message)
+            process.link.job_pipe.send(message)
 
     def kill(self, unit: str) -> None:
         if unit in self._live:
-            self._live[unit].popen.kill()
+            self._live[unit].kill()
 
     def listen(self, timeout_ms: int) -> list[UnitMessage]:
-        """What came within the time; at once when something waits. Messages of a unit come before its end."""
-        heard: list[UnitMessage] = []
+        """What came within the time; at once when something waits. A unit's messages come before its end."""
+        messages: list[UnitMessage] = []
         for fd, _ in self._poller.poll(timeout_ms / 1000):
-            heard += self._reactions[fd]()
+            messages += self._reactions[fd]()
         while self._ended:
             process = self._ended.pop()
-            while work := self._work(process):
-                heard += work
-            heard += self._life_signs(process)
+            while unread := self._job_messages(process):
+                messages += unread
+            messages += self._heartbeats(process)
             self._forget(process)
-            heard.append(UnitMessage(process.unit, None))
-        return heard
+            messages.append(UnitMessage(process.unit, None))
+        return messages
 
-    def end_all(self) -> None:
+    def close(self) -> None:
         """No process is left when this returns, however it was before."""
         for process in list(self._live.values()):
-            process.popen.kill()
+            process.kill()
         for process in list(self._live.values()):
             self._forget(process)
         self._context.destroy(linger=0)
@@ -155,72 +167,61 @@ class UnitProcesses:
         while any(unit in self._live for unit in units) and time.monotonic() < end:
             self.listen(50)
 
-    def _work(self, process: _Process) -> list[UnitMessage]:
-        """The next message of the line, if there is one; the others make it readable again."""
+    def _job_messages(self, process: _Process) -> list[UnitMessage]:
+        """The next message of the job pipe, if there is one; while more wait, the pipe stays readable."""
         try:
-            message = process.link.line.receive()
+            message = process.link.job_pipe.receive()
         except MessageError as error:
-            raise _no_message(process, error) from None
+            raise _bad_message(process, error) from None
         if message is not None:
             return [UnitMessage(process.unit, message)]
-        if process.link.line.ended:
-            self._unregister(process.link.line.fileno())  # it would be readable for ever
+        if process.link.job_pipe.ended:
+            self._unregister(process.link.job_pipe.fileno())  # else the poller would report it for ever
         return []
 
-    def _life_signs(self, process: _Process) -> list[UnitMessage]:
+    def _heartbeats(self, process: _Process) -> list[UnitMessage]:
         try:
-            return [UnitMessage(process.unit, message) for message in process.link.bus_messages()]
+            return [UnitMessage(process.unit, message) for message in process.link.heartbeats()]
         except MessageError as error:
-            raise _no_message(process, error) from None
+            raise _bad_message(process, error) from None
 
     def _stderr(self, process: _Process) -> list[UnitMessage]:
         if not process.read_stderr():
-            self._unregister(process.stderr.fileno())
+            self._unregister(process.stderr_fd)
         return []
 
     def _end(self, process: _Process) -> list[UnitMessage]:
         self._ended.append(process)
         return []
 
-    def _spec(self, unit: str, folder: BusFolder, line: JobPipeEnd) -> UnitSpec:
-        stages = dict(self._stages[unit])
-        used = {edge for pair in stages.values() for edge in pair if edge is not None}
+    def _spec(self, unit: str, folder: BusFolder, job_pipe: JobPipeEnd) -> UnitSpec:
+        pipeline, stages = self._pipeline, self._pipeline.stages_of(unit)
+        inputs = {after.name: name for name, (_, after) in pipeline.joints.items() if after.unit == unit}
+        outputs = {before.name: name for name, (before, _) in pipeline.joints.items() if before.unit == unit}
         return UnitSpec(
-            parent_pid=os.getpid(),
+            unit=unit,
             endpoint=folder.endpoint(unit),
-            line=line,
-            config=self._config,
-            edges={name: self._edges[name] for name in used},
+            job_pipe=job_pipe,
+            assets_fd=self._assets_fd,
+            settings=pipeline.units[unit],
+            scheduler_cores=pipeline.scheduler_cores,
             stages=stages,
+            module_folders=tuple(folder.absolute() for folder in pipeline.module_folders),
+            edges={name: self._regions[name] for name in {*inputs.values(), *outputs.values()}},
+            inputs=inputs,
+            outputs=outputs,
         )
 
-    def _spawn(self, unit: str, spec: UnitSpec) -> subprocess.Popen[bytes]:
-        fd = os.memfd_create(f"trilane:spec:{unit}", os.MFD_CLOEXEC)
-        try:
-            os.write(fd, spec.model_dump_json().encode())
-            threads = str(self._config.units[unit].threads)
-            return subprocess.Popen(
-                [sys.executable, "-P", "-m", "trilane.pipeline.worker", "--unit", unit, "--spec", str(fd)],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
-                pass_fds=[fd, *spec.line, *(edge.fd for edge in spec.edges.values())],
-                env={**os.environ, **dict.fromkeys(THREAD_LIMITS, threads), "TRILANE_UNIT": unit},
-                process_group=0,
-            )
-        finally:
-            os.close(fd)
-
     def _forget(self, process: _Process) -> None:
-        process.popen.wait()
+        process.wait()
         process.read_stderr()
-        self.last_words[process.unit] = process.tail.decode(errors="replace").strip()
-        for fd in (process.link.line.fileno(), process.link.bus_fd, process.stderr.fileno(), process.pidfd):
+        self.stderr_tails[process.unit] = process.tail.decode(errors="replace").strip()
+        for fd in (process.link.job_pipe.fileno(), process.link.heartbeat_fd, process.stderr_fd, process.pidfd):
             self._unregister(fd)
         process.link.close()
         process.release_folder()
         os.close(process.pidfd)
-        process.stderr.close()
+        os.close(process.stderr_fd)
         del self._live[process.unit]
 
     def _register(self, fd: int, reaction: Callable[[], list[UnitMessage]]) -> None:
@@ -239,15 +240,10 @@ def check_open_files() -> None:
         raise TrilaneError(f"open files: found a limit of {limit}, expected at least {LEAST_FILES}: ulimit -n 1024")
 
 
-def _end_now(popen: subprocess.Popen[bytes]) -> None:
-    popen.kill()
-    popen.communicate()
-
-
 def _swallow(fd: int) -> list[UnitMessage]:
     os.read(fd, 64)
     return []
 
 
-def _no_message(process: _Process, error: MessageError) -> TrilaneError:
-    return TrilaneError(f"unit {process.unit} sent what is no message: {error}")
+def _bad_message(process: _Process, error: MessageError) -> TrilaneError:
+    return TrilaneError(f"unit {process.unit} sent bytes that are not a message: {error}")

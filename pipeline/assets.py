@@ -1,0 +1,78 @@
+"""Arrays that the parent has loaded and every unit of a run may read. Rule: written once, sealed, mapped, never copied.
+
+One region of anonymous memory holds them all: 8 bytes with the length of the index, the index as JSON, then the
+arrays, each on its own page. A unit maps it read-only; it goes with the last process that has it.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import mmap
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.errors import TrilaneError
+from trilane.transport.memory import F_ADD_SEALS, F_SEAL_GROW, F_SEAL_SHRINK
+from trilane.transport.packets import PAGE
+
+Assets = Mapping[str, NDArray[Any]]
+
+F_SEAL_WRITE = 0x8  # <linux/fcntl.h>
+LENGTH_BYTES = 8
+
+
+def share_assets(assets: Assets) -> int:
+    """A descriptor of sealed memory that holds `assets`. Raises TrilaneError when there is too little memory."""
+    index, end = _index(assets)
+    head = json.dumps(index).encode()
+    start = _page_up(LENGTH_BYTES + len(head))
+    fd = os.memfd_create("trilane:assets", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+    try:
+        os.posix_fallocate(fd, 0, start + end)
+        os.pwrite(fd, len(head).to_bytes(LENGTH_BYTES, "little") + head, 0)
+        for name, array in assets.items():
+            _write_all(fd, np.ascontiguousarray(array), start + index[name]["offset"])
+        fcntl.fcntl(fd, F_ADD_SEALS, F_SEAL_SHRINK | F_SEAL_GROW | F_SEAL_WRITE)
+    except OSError as error:
+        os.close(fd)
+        raise TrilaneError(f"{(start + end) >> 20} MiB for the avatar's data: {error.strerror}") from None
+    return fd
+
+
+def map_assets(fd: int) -> dict[str, NDArray[Any]]:
+    """Read-only views of the arrays in `fd`, in the order in which they were given."""
+    view = memoryview(mmap.mmap(fd, os.fstat(fd).st_size, prot=mmap.PROT_READ))
+    length = int.from_bytes(view[:LENGTH_BYTES], "little")
+    index: dict[str, Any] = json.loads(bytes(view[LENGTH_BYTES : LENGTH_BYTES + length]))
+    start = _page_up(LENGTH_BYTES + length)
+    return {
+        name: np.frombuffer(
+            view, dtype=np.dtype(entry["dtype"]), count=int(np.prod(entry["shape"])), offset=start + entry["offset"]
+        ).reshape(entry["shape"])
+        for name, entry in index.items()
+    }
+
+
+def _index(assets: Assets) -> tuple[dict[str, dict[str, Any]], int]:
+    """Type, shape and place of every array, from the first page after the index; and where the last one ends."""
+    index, offset = {}, 0
+    for name, array in assets.items():
+        index[name] = {"dtype": array.dtype.str, "shape": list(array.shape), "offset": offset}
+        offset += _page_up(array.nbytes)
+    return index, max(offset, PAGE)
+
+
+def _page_up(size: int) -> int:
+    return -(-size // PAGE) * PAGE
+
+
+def _write_all(fd: int, array: NDArray[Any], offset: int) -> None:
+    data = memoryview(array.reshape(-1).view(np.uint8)) if array.nbytes else memoryview(b"")
+    while data:
+        written = os.pwrite(fd, data, offset)
+        data, offset = data[written:], offset + written

@@ -1,0 +1,73 @@
+"""A stage on its slots, as a unit's loop runs it. Rule: headers are passed on here, so that no stage has to think of it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from trilane.arrays import U8
+from trilane.pipeline.stage import Stage
+from trilane.transport.packets import FRAME_FIELDS, Packet
+
+WAKE_UP_NS = 150_000  # a sleep ends about this much late
+
+
+class BoundStage:
+    """`stage` with its slots. `pace_ns`: how long a job is held, at least."""
+
+    def __init__(self, name: str, stage: Stage, inputs: list[Packet], outputs: list[Packet], pace_ns: int) -> None:
+        self.name, self._pace_ns = name, pace_ns
+        self._stage, self._outputs = stage, outputs
+        self._pass_on = _header_copier(inputs, outputs)
+        stage.bind(inputs, outputs)
+
+    def run(self, frame: int, slot_in: int, slot_out: int, epoch: int) -> Mapping[str, float]:
+        """Do the job, and hold it until its pace has passed. A slot is -1 where the stage has no such edge."""
+        end_ns = time.monotonic_ns() + self._pace_ns
+        if slot_out >= 0:
+            if slot_in >= 0:
+                self._pass_on(slot_in, slot_out)
+            else:
+                header = self._outputs[slot_out].header
+                header["frame"], header["t_sampled_ns"] = frame, time.monotonic_ns()
+            self._outputs[slot_out].header["epoch"] = epoch
+        metrics = self._stage.run(frame, slot_in if slot_in >= 0 else None, slot_out if slot_out >= 0 else None)
+        if self._pace_ns:
+            hold_until(end_ns)
+        return metrics
+
+    def sampled_ns(self, slot_in: int, slot_out: int) -> int:
+        """Of a pipeline's first stage: when the frame in its output slot was sampled; else 0."""
+        return int(self._outputs[slot_out].header["t_sampled_ns"]) if slot_in < 0 <= slot_out else 0
+
+    def close(self) -> None:
+        self._stage.close()
+
+
+def hold_until(end_ns: int) -> None:
+    """Return at `end_ns` of CLOCK_MONOTONIC, or at once when that has passed: sleep, then watch the clock."""
+    while (left_ns := end_ns - time.monotonic_ns()) > 0:
+        if left_ns > WAKE_UP_NS:
+            time.sleep((left_ns - WAKE_UP_NS) / 1e9)
+
+
+def _header_copier(inputs: list[Packet], outputs: list[Packet]) -> Callable[[int, int], None]:
+    """Copies the header from an input slot to an output slot; of different headers the frame's fields alone."""
+    if inputs and outputs and inputs[0].header.dtype != outputs[0].header.dtype:
+        return lambda slot_in, slot_out: _copy_fields(inputs[slot_in].header, outputs[slot_out].header)
+    sources, targets = [_bytes_of(packet) for packet in inputs], [_bytes_of(packet) for packet in outputs]
+
+    def copy(slot_in: int, slot_out: int) -> None:
+        targets[slot_out][:] = sources[slot_in]
+
+    return copy
+
+
+def _copy_fields(source: Any, target: Any) -> None:
+    for name, _ in FRAME_FIELDS:
+        target[name] = source[name]
+
+
+def _bytes_of(packet: Packet) -> U8:
+    return packet.header.reshape(1).view("u1")

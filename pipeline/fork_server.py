@@ -1,0 +1,114 @@
+"""The process that units are forked from. Rule: one thread, no part in any run; it ends with its parent, its units with it.
+
+`python -P -m trilane.pipeline.fork_server --socket FD --parent PID --preload MODULE,...` imports once what every unit
+needs, then forks a unit for each request, so that a unit starts in milliseconds instead of importing everything again.
+
+A request is one packet on a SOCK_SEQPACKET socket: JSON, and with it the descriptors of the unit's spec (in a memory
+file), of its stderr, and of what the spec names. The answer is the unit's process number, and with it its pidfd.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import ctypes
+import gc
+import importlib
+import json
+import os
+import signal
+import socket
+import sys
+import traceback
+from collections.abc import Sequence
+from typing import Any
+
+PR_SET_PDEATHSIG, PR_SET_NAME = 1, 15  # <linux/prctl.h>
+MAX_FDS = 250  # that one packet carries: SCM_MAX_FD of Linux is 253
+PACKET_BYTES = 1 << 16
+ALWAYS = "trilane.pipeline.unit_loop"
+#: Libraries that make threads of their own read these when they are loaded.
+THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+
+
+def process_name(unit: str) -> str:
+    """What the kernel calls the process of `unit` (`ps -o comm`): 15 bytes at most."""
+    return f"trilane-{unit}"[:15]
+
+
+def serve(requests: socket.socket) -> None:
+    """Fork a unit for each request, until the other end is closed and every unit has ended."""
+    server_pid = os.getpid()
+    signal.signal(signal.SIGCHLD, lambda _number, _frame: _reap(os.WNOHANG))
+    while True:
+        packet, fds, _flags, _address = socket.recv_fds(requests, PACKET_BYTES, MAX_FDS)
+        if not packet:
+            break
+        pid = os.fork()
+        if pid == 0:
+            requests.close()
+            os._exit(_run_unit(json.loads(packet), fds, server_pid))
+        pidfd = os.pidfd_open(pid)
+        socket.send_fds(requests, [str(pid).encode()], [pidfd])
+        for fd in (pidfd, *fds):
+            os.close(fd)
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    _reap(0)
+
+
+def _reap(options: int) -> None:
+    """Take leave of the units that have ended; with options 0, of all of them when they end."""
+    with contextlib.suppress(ChildProcessError):
+        while os.waitpid(-1, options)[0]:
+            pass
+
+
+def _run_unit(request: dict[str, Any], fds: Sequence[int], server_pid: int) -> int:
+    """In the forked process: the unit's whole life, and its exit code."""
+    try:
+        spec_fd, stderr_fd, *passed = fds
+        os.dup2(stderr_fd, sys.stderr.fileno())
+        os.close(stderr_fd)
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        die_with_parent(server_pid)
+        os.setpgid(0, 0)
+        ctypes.CDLL(None).prctl(PR_SET_NAME, process_name(request["unit"]).encode(), 0, 0, 0)
+        os.sched_setaffinity(0, request["cores"])
+        os.environ |= dict.fromkeys(THREAD_LIMITS, str(request["threads"]))
+        spec = json.loads(os.pread(spec_fd, os.fstat(spec_fd).st_size, 0))
+        os.close(spec_fd)
+        loop = importlib.import_module(ALWAYS)
+        code: int = loop.serve(spec, dict(zip(request["fds"], passed, strict=True)))
+    except BaseException:
+        traceback.print_exc()
+        code = 1
+    sys.stderr.flush()
+    return code
+
+
+def die_with_parent(parent_pid: int) -> None:
+    """SIGKILL this process when the one that made it ends, also when it has ended already."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0) != 0:
+        raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG)")
+    if os.getppid() != parent_pid:
+        os._exit(1)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Forks the units of a run; started by Trilane, not by hand.")
+    parser.add_argument("--socket", type=int, required=True)
+    parser.add_argument("--parent", type=int, required=True)
+    parser.add_argument("--preload", default="")
+    arguments = parser.parse_args()
+    die_with_parent(arguments.parent)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for module in (ALWAYS, *filter(None, arguments.preload.split(","))):
+        importlib.import_module(module)
+    gc.collect()
+    gc.freeze()  # a unit's collector then leaves alone, and does not copy, the pages that all units share
+    serve(socket.socket(fileno=arguments.socket))
+
+
+if __name__ == "__main__":
+    main()

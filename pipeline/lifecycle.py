@@ -1,0 +1,70 @@
+"""The units' lives outside the run itself: all up before it, all closed after it. Rule: the deadlines are here."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+
+from trilane.pipeline.run_log import RunLog, UnitError, after_stderr
+from trilane.pipeline.signals import Interrupts
+from trilane.pipeline.unit_processes import UnitMessage, UnitProcesses
+from trilane.transport.messages import Close, Closed, Failed, Ready
+
+START_S = 120.0
+CLOSE_S = 30.0
+POLL_MS = 200
+
+
+def start_units(processes: UnitProcesses, units: Iterable[str], interrupts: Interrupts) -> dict[str, float]:
+    """Every unit up and bound to its slots; how many milliseconds each took.
+
+    Raises UnitError when one cannot start, KeyboardInterrupt when interrupted.
+    """
+    started_s = {}
+    for unit in units:
+        started_s[unit] = time.monotonic()
+        processes.start(unit)
+    waiting = set(started_s)
+    end = time.monotonic() + START_S
+    took_ms: dict[str, float] = {}
+    while waiting:
+        if time.monotonic() > end:
+            raise UnitError(f"unit {', '.join(sorted(waiting))} was not ready after {START_S:.0f} s")
+        for unit, message in listen_before_run(processes, interrupts):
+            if isinstance(message, Ready):
+                processes.connected(unit)
+                took_ms[unit] = (time.monotonic() - started_s[unit]) * 1000
+                waiting.discard(unit)
+    return took_ms
+
+
+def listen_before_run(processes: UnitProcesses, interrupts: Interrupts) -> list[UnitMessage]:
+    """The next messages. Raises UnitError when a unit failed or ended, KeyboardInterrupt when interrupted."""
+    messages = processes.listen(POLL_MS)
+    if interrupts.count:
+        raise KeyboardInterrupt
+    for unit, message in messages:
+        if isinstance(message, Failed):
+            raise UnitError(message.message, message.exit_code)
+        if message is None:
+            tail = after_stderr(processes.stderr_tails.get(unit, ""))
+            raise UnitError(f"unit {unit} ended before the run began{tail}")
+    return messages
+
+
+def close_units(processes: UnitProcesses, log: RunLog, interrupts: Interrupts) -> None:
+    """The stages complete their files, then the processes leave; one that does not is killed by `UnitProcesses.close`."""
+    waiting = set(processes.pids)
+    for unit in waiting:
+        processes.send(unit, Close())
+    end = time.monotonic() + CLOSE_S
+    while waiting and time.monotonic() < end and interrupts.count < 2:
+        for unit, message in processes.listen(POLL_MS):
+            if isinstance(message, Failed):
+                log.fail(message.message, message.exit_code)
+                log.say(message.message)
+            if message is None or isinstance(message, Closed):
+                waiting.discard(unit)
+    if waiting and interrupts.count < 2:
+        log.fail(f"unit {', '.join(sorted(waiting))} did not close its files")
+    processes.wait_for_end(list(processes.pids))

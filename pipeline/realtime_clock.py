@@ -1,0 +1,210 @@
+"""The clock of this machine, for the scheduler's loop. Rule: it waits and does what the core says; it decides nothing.
+
+`wait` turns what the units, the signals and the governor say into events; `perform` turns actions into messages.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable
+from typing import Protocol
+
+from trilane.pipeline.requests import FrameRequestQueue
+from trilane.pipeline.run_log import RunLog, after_stderr
+from trilane.pipeline.signals import Interrupts
+from trilane.pipeline.unit_processes import UnitMessage, UnitProcesses
+from trilane.scheduler.core import Core
+from trilane.scheduler.events import (
+    Abort,
+    Action,
+    Dispatch,
+    Event,
+    Job,
+    JobDone,
+    JobFailed,
+    Kill,
+    Pinged,
+    Pong,
+    SchedulerStalled,
+    SetDuty,
+    Start,
+    Stop,
+    UnitDied,
+    UnitReady,
+)
+from trilane.scheduler.ledger import JobRecord
+from trilane.scheduler.state import NEVER
+from trilane.transport import messages
+from trilane.transport.messages import Done, Failed, Ping, Ready, RunJob
+
+PROGRESS_S = 0.1
+PING_NS = 500_000_000
+LONGEST_STEP_NS = PING_NS + 250_000_000  # between two steps, unless this process was stopped
+
+
+class Governor(Protocol):
+    """Holds the units to shares of the time. `due_ns`: when it wants to be asked next."""
+
+    due_ns: int
+
+    def begin(self, now_ns: int) -> list[SetDuty]:
+        """The duties at the start of the run."""
+
+    def tick(self, now_ns: int, busy_ns: dict[str, int]) -> list[SetDuty]:
+        """What changes now; `busy_ns`: how long each unit has worked since the run began."""
+
+
+class RealtimeClock:
+    """`trilane.scheduler.loop.Clock` of one run over `processes`; it lets `core` run until that finishes.
+
+    `jobs`: of every job that ended, when. `metrics`: of every stage, the sums of what its jobs reported.
+    """
+
+    def __init__(
+        self,
+        core: Core,
+        processes: UnitProcesses,
+        interrupts: Interrupts,
+        log: RunLog,
+        requests: FrameRequestQueue | None,
+        governor: Governor | None,
+        on_progress: Callable[[int, int], None] | None,
+    ) -> None:
+        self.jobs: list[JobRecord] = []
+        self.metrics: dict[str, Counter[str]] = defaultdict(Counter)
+        self._core, self._processes, self._interrupts, self._log = core, processes, interrupts, log
+        self._requests, self._governor, self._on_progress = requests, governor, on_progress
+        self._last_stage = core.graph.stages[-1].name
+        self._open: dict[int, tuple[Job, int]] = {}
+        self._unbooked: list[tuple[Job, int, int | None, Done]] = []
+        self._begun = self._stopping = False
+        self._step_ns = self._ping_ns = 0
+        self._progress_s = 0.0
+        processes.watch(interrupts.fd)
+        if requests is not None:
+            processes.watch(requests.fd)
+
+    def wait(self, deadline_ns: int) -> tuple[int, tuple[Event, ...]]:
+        """What happened until `deadline_ns` at the latest, and what time it is then."""
+        self._book()
+        self._show_progress()
+        events = self._listen(deadline_ns) if self._begun else self._begin()
+        now_ns = time.monotonic_ns()
+        if now_ns - self._step_ns > LONGEST_STEP_NS:
+            events.insert(0, SchedulerStalled(now_ns - self._step_ns))
+        self._step_ns = now_ns
+        return now_ns, tuple(events)
+
+    def perform(self, now_ns: int, actions: tuple[Action, ...]) -> None:
+        """Tell the units."""
+        for action in actions:
+            if isinstance(action, Dispatch):
+                self._dispatch(now_ns, action.job)
+            elif isinstance(action, Kill):
+                self._log.say(f"unit {action.unit} did not answer in time and is restarted")
+                self._processes.kill(action.unit)
+            elif isinstance(action, Start):
+                self._processes.start(action.unit)
+
+    def finish(self) -> None:
+        """Book what the last step ended, and show the final progress."""
+        self._book()
+        self._show_progress(final=True)
+
+    def _begin(self) -> list[Event]:
+        self._begun = True
+        self._step_ns = time.monotonic_ns()
+        events: list[Event] = [UnitReady(unit) for unit in self._core.graph.units]
+        if self._requests is not None:
+            self._requests.is_open.set()
+        if self._governor is not None:
+            events += self._governor.begin(self._step_ns)
+        return events
+
+    def _listen(self, deadline_ns: int) -> list[Event]:
+        until_ns = min(self._ping_ns, deadline_ns, NEVER if self._governor is None else self._governor.due_ns)
+        timeout_ms = max(0, -((time.monotonic_ns() - until_ns) // 1_000_000))
+        messages = self._processes.listen(timeout_ms)
+        events = [event for message in messages if (event := self._event(message)) is not None]
+        events += self._interrupted()
+        if self._requests is not None:
+            events += self._requests.events()
+        now_ns = time.monotonic_ns()
+        if self._governor is not None and now_ns >= self._governor.due_ns:
+            events += self._governor.tick(now_ns, self._core.ledger.busy_ns)
+        if now_ns >= self._ping_ns:
+            events += self._ping(now_ns)
+        return events
+
+    def _interrupted(self) -> list[Event]:
+        """The first interrupt stops the run, a second one aborts it."""
+        if self._interrupts.count > 1:
+            return [Abort()]
+        if self._interrupts.count and not self._stopping:
+            self._stopping = True
+            self._log.say("interrupted: the frames in flight are finished; interrupt again to end at once")
+            return [Stop()]
+        return []
+
+    def _ping(self, now_ns: int) -> list[Event]:
+        """Ask idle units whether they live; a busy one is heard of when its job ends."""
+        self._ping_ns = now_ns + PING_NS
+        units = self._core.units_to_ping()
+        for unit in units:
+            self._processes.send(unit, Ping())
+        return [Pinged(unit) for unit in units]
+
+    def _event(self, unit_message: UnitMessage) -> Event | None:
+        unit, message = unit_message
+        if isinstance(message, Done):
+            return self._done(unit, message)
+        if isinstance(message, Failed):
+            return self._failed(unit, message)
+        if isinstance(message, Ready):
+            self._processes.connected(unit)
+            return UnitReady(unit)
+        if isinstance(message, messages.Pong):
+            return Pong(unit)
+        if message is None:
+            self._log.say(f"unit {unit} ended unexpectedly and is started again{self._stderr_tail(unit)}")
+            return UnitDied(unit)
+        return None
+
+    def _done(self, unit: str, message: Done) -> Event:
+        job, dispatch_ns = self._open.pop(message.id)
+        frame = self._core.frames.get(job.frame)
+        self._unbooked.append((job, dispatch_ns, None if frame is None else frame.ready_ns, message))
+        if frame is not None and self._requests is not None and job.stage == self._last_stage:
+            self._requests.answered(job.frame)
+        return JobDone(unit, message.id, message.t_begin_ns, message.t_end_ns, message.t_sampled_ns)
+
+    def _failed(self, unit: str, message: Failed) -> Event | None:
+        self._log.fail_with(message)
+        if message.id < 0:
+            return None  # the unit could not be built again; the end of its process follows
+        self._open.pop(message.id)
+        return JobFailed(unit, message.id)
+
+    def _dispatch(self, now_ns: int, job: Job) -> None:
+        self._open[job.id] = (job, now_ns)
+        place = self._processes.places[job.stage]
+        self._processes.send(job.unit, RunJob(job.id, place, job.frame, job.slot_in, job.slot_out, job.epoch))
+
+    def _book(self) -> None:
+        """Note what the ended jobs took; done after the next jobs were dispatched, while the units work."""
+        for job, dispatch_ns, ready_ns, done in self._unbooked:
+            if ready_ns is not None:
+                times = (ready_ns, dispatch_ns, done.t_begin_ns, done.t_end_ns)
+                self.jobs.append(JobRecord(job.stage, job.unit, job.frame, *times))
+            self.metrics[job.stage].update(done.metrics)
+        self._unbooked.clear()
+
+    def _stderr_tail(self, unit: str) -> str:
+        return after_stderr(self._processes.stderr_tails.get(unit, ""))
+
+    def _show_progress(self, *, final: bool = False) -> None:
+        now_s = time.monotonic()
+        if self._on_progress is not None and (final or now_s - self._progress_s >= PROGRESS_S):
+            self._progress_s = now_s
+            self._on_progress(len(self._core.ledger.presented_ns), self._core.settings.frames)

@@ -1,0 +1,47 @@
+"""What a person is told of a run while it goes on. Rule: the first failure stands; everything said is kept for the report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from trilane.errors import TrilaneError
+from trilane.pipeline.result import Failure
+from trilane.transport.messages import Failed
+
+
+class UnitError(TrilaneError):
+    """A unit could not start or be measured; `exit_code` is the one of the error in the unit."""
+
+    def __init__(self, message: str, exit_code: int = 1) -> None:
+        super().__init__(message)
+        self.exit_code = exit_code
+
+
+class RunLog:
+    """`messages` in order, and the run's first `failure`. `on_message` is called with each message."""
+
+    def __init__(self, on_message: Callable[[str], None] | None = None) -> None:
+        self.messages: list[str] = []
+        self.failure: Failure | None = None
+        self._on_message = on_message
+
+    def say(self, text: str) -> None:
+        self.messages.append(text)
+        if self._on_message is not None:
+            self._on_message(text)
+
+    def fail(self, text: str, exit_code: int = 1) -> None:
+        """Note the failure, unless there was one before; the result shows it."""
+        self.failure = self.failure or Failure(text, exit_code)
+
+    def fail_with(self, message: Failed) -> None:
+        """A stage's error: said, and noted as the failure."""
+        if self.failure is None:
+            self.fail(message.message, message.exit_code)
+            self.say(message.message)
+
+
+def after_stderr(tail: str) -> str:
+    """The last line of what a unit wrote to stderr, to be put behind a sentence; empty when it wrote nothing."""
+    lines = tail.splitlines()
+    return f"; it wrote last: {lines[-1]}" if lines else ""

@@ -1,0 +1,97 @@
+"""The parent's end of the fork server. Rule: it starts units, and leaves no process when it is closed."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Sequence
+from typing import NamedTuple, Self
+
+from trilane.errors import TrilaneError
+from trilane.pipeline.fork_server import THREAD_LIMITS
+from trilane.pipeline.unit_spec import UnitSpec
+
+ANSWER_S = 60.0  # the modules to preload may come from a slow disk
+CLOSE_S = 5.0
+TAIL_BYTES = 8192
+
+
+class StartedUnit(NamedTuple):
+    """A unit's process. `pidfd`: readable when it has ended; to be closed by who has it."""
+
+    pid: int
+    pidfd: int
+
+
+class UnitStarter:
+    """A fork server with the modules `preload` imported; it imports them while the caller goes on.
+
+    Close it when its units have ended. Raises OSError when no process can be made.
+    """
+
+    def __init__(self, preload: Sequence[str] = ()) -> None:
+        self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._stderr = os.memfd_create("trilane:stderr", os.MFD_CLOEXEC)
+        arguments = [f"--socket={theirs.fileno()}", f"--parent={os.getpid()}", f"--preload={','.join(preload)}"]
+        try:
+            self._server = subprocess.Popen(
+                [sys.executable, "-P", "-m", "trilane.pipeline.fork_server", *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=self._stderr,
+                pass_fds=[theirs.fileno()],
+                env={**os.environ, **dict.fromkeys(THREAD_LIMITS, "1")},
+                process_group=0,
+            )
+        except BaseException:
+            self._socket.close()
+            os.close(self._stderr)
+            raise
+        finally:
+            theirs.close()
+        self._socket.settimeout(ANSWER_S)
+
+    def start(self, spec: UnitSpec, stderr_fd: int) -> StartedUnit:
+        """A process for the unit, which writes to `stderr_fd`. Raises TrilaneError when the fork server failed."""
+        spec_fd = os.memfd_create(f"trilane:spec:{spec.unit}", os.MFD_CLOEXEC)
+        try:
+            os.write(spec_fd, spec.model_dump_json().encode())
+            settings = spec.settings
+            request = {"unit": spec.unit, "cores": settings.cores, "threads": settings.threads, "fds": spec.fds}
+            socket.send_fds(self._socket, [json.dumps(request).encode()], [spec_fd, stderr_fd, *spec.fds])
+            answer, fds, _flags, _address = socket.recv_fds(self._socket, 32, 1)
+        except OSError as error:
+            raise TrilaneError(f"unit {spec.unit} could not be started: {self._reason(error)}") from None
+        finally:
+            os.close(spec_fd)
+        if not answer:
+            raise TrilaneError(f"unit {spec.unit} could not be started: {self._reason(None)}")
+        return StartedUnit(int(answer), fds[0])
+
+    def close(self) -> None:
+        """End the fork server; units that still live end with it."""
+        self._socket.close()
+        try:
+            self._server.wait(CLOSE_S)
+        except subprocess.TimeoutExpired:
+            self._server.send_signal(signal.SIGKILL)
+            self._server.wait()
+        os.close(self._stderr)
+
+    def _reason(self, error: OSError | None) -> str:
+        """The end of what the fork server wrote, else the error's own words."""
+        size = os.fstat(self._stderr).st_size
+        tail = os.pread(self._stderr, TAIL_BYTES, max(0, size - TAIL_BYTES)).decode(errors="replace").strip()
+        if tail:
+            return tail.splitlines()[-1]
+        return "the process that forks it has ended" if error is None else error.strerror or str(error)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_exc: object) -> None:
+        self.close()

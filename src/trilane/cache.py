@@ -1,0 +1,71 @@
+"""What was worked out before and would be worked out again. Rule: a cache saves time and never decides anything.
+
+It lies under XDG_CACHE_HOME. An entry's name is a digest of all that it was made from; one that cannot be read is made
+again, and where nothing can be written nothing is kept.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.files import write_atomically
+
+ARRAYS = "arrays"
+MAX_ENTRIES = 64  # of arrays, some MB each; the oldest go first
+
+Arrays = Mapping[str, NDArray[Any]]
+
+
+def cache_dir(name: str) -> Path | None:
+    """The folder of the cache `name`; None when it cannot be written."""
+    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    folder = Path(home) / "trilane" / name
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return None
+    return folder if os.access(folder, os.W_OK) else None
+
+
+def cached_arrays(name: str, sources: Iterable[NDArray[Any] | str], make: Callable[[], Arrays]) -> Arrays:
+    """What `make` returns, from the cache when it was made from the same `sources` before.
+
+    `name`: of what is made, with a number that grows when the code that makes it changes.
+    """
+    folder = cache_dir(ARRAYS)
+    if folder is None:
+        return make()
+    entry = folder / f"{_digest(name, sources)}.npz"
+    with contextlib.suppress(OSError, ValueError, EOFError, KeyError), np.load(entry, allow_pickle=False) as stored:
+        return {key: stored[key] for key in stored.files}
+    made = make()
+    with contextlib.suppress(OSError):
+        with write_atomically(entry) as draft, draft.open("wb") as file:
+            np.savez(file, allow_pickle=False, **made)
+        _forget_oldest(folder)
+    return made
+
+
+def _digest(name: str, sources: Iterable[NDArray[Any] | str]) -> str:
+    digest = hashlib.blake2b(name.encode(), digest_size=20)
+    for source in sources:
+        if isinstance(source, str):
+            digest.update(source.encode() + b"\0")
+        else:
+            digest.update(f"{source.dtype.str}{source.shape}".encode())
+            digest.update(np.ascontiguousarray(source).data)
+    return digest.hexdigest()
+
+
+def _forget_oldest(folder: Path) -> None:
+    entries = sorted(folder.glob("*.npz"), key=lambda path: path.stat().st_mtime)
+    for entry in entries[:-MAX_ENTRIES]:
+        entry.unlink(missing_ok=True)

@@ -1,0 +1,122 @@
+"""What the parent has loaded of a scene's avatars, as the arrays that every unit maps. Rule: opened once, in the parent.
+
+Names begin with what they belong to: `body0/` and `avatar0/` of the first distinct bundle, `network`, `scene/`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+
+from trilane.arrays import F32
+from trilane.avatars.bundle import Bundle
+from trilane.avatars.network_file import NetworkFile, check_network
+from trilane.body.body import Body, ShapedBody, load_body
+from trilane.errors import BadInputError
+from trilane.pipeline.assets import Assets
+from trilane.scene.staged_arrays import staged_from_arrays, staged_to_arrays
+from trilane.scene.staging import Staged
+from trilane.stages.config import RunConfig
+from trilane.stages.gpu.packed import Quantisation
+
+NETWORK, NETWORK_PATH, SCENE = "network", "network_path", "scene/"
+HANDS = ("hand_components_left", "hand_components_right")
+BODY_ARRAYS = tuple(field.name for field in fields(Body) if field.name not in ("source", "hand_components"))
+
+
+@dataclass(frozen=True)
+class AvatarData:
+    """One distinct bundle, loaded. `texture` (H,W,C) float32."""
+
+    bundle: Bundle
+    shaped: ShapedBody
+    texture: F32
+    network: NetworkFile
+
+
+def load_avatar(bundle: Bundle) -> AvatarData:
+    """Everything that a run needs of `bundle`. Raises BadInputError."""
+    manifest = bundle.manifest
+    shaped = load_body(bundle.body_path).shape(manifest.betas, manifest.expression)
+    return AvatarData(bundle, shaped, bundle.read_texture(), bundle.read_network())
+
+
+def require_one_tensor(avatars: Sequence[AvatarData]) -> None:
+    """Raises BadInputError unless `avatars` can share a tensor: one network, and one encoding of its input."""
+    first, *others = avatars
+    for other in others:
+        if other.network.digest != first.network.digest:
+            found = "another network than the scene's first avatar has"
+            expected = "one network for all avatars, as they share a tensor"
+            raise BadInputError(other.bundle.network_path, found, expected)
+        if _encoding(other) != _encoding(first):
+            names = f"{first.bundle.folder} and {other.bundle.folder}"
+            raise BadInputError(names, "networks with different inputs", "avatars that one network can draw together")
+
+
+def _encoding(avatar: AvatarData) -> tuple[Any, ...]:
+    return (avatar.bundle.manifest.network.input, avatar.texture.shape[2])
+
+
+def pack_assets(avatars: Sequence[AvatarData], staged: Staged) -> dict[str, NDArray[Any]]:
+    """The arrays of a run: of every distinct avatar in order, of the network, and of the scene."""
+    arrays: dict[str, NDArray[Any]] = {}
+    for number, avatar in enumerate(avatars):
+        body, scale = avatar.shaped.body, avatar.bundle.manifest.network.input
+        arrays |= {f"body{number}/vertices": avatar.shaped.vertices, f"body{number}/joints": avatar.shaped.joints}
+        arrays |= {f"body{number}/{name}": array for name in BODY_ARRAYS if (array := getattr(body, name)) is not None}
+        arrays |= {f"body{number}/{name}": array for name, array in zip(HANDS, body.hand_components, strict=True)}
+        arrays[f"avatar{number}/texture"] = avatar.texture
+        arrays[f"avatar{number}/input"] = np.array([scale.scale, scale.zero_point])
+    network = avatars[0].network
+    arrays[NETWORK] = np.frombuffer(network.model.SerializeToString(), np.uint8)
+    arrays[NETWORK_PATH] = np.frombuffer(network.where.encode(), np.uint8)
+    return arrays | {SCENE + name: array for name, array in staged_to_arrays(staged).items()}
+
+
+def distinct(config: RunConfig) -> list[Path]:
+    """The folders of the distinct bundles of `config`, in the order in which assets number them."""
+    return list(dict.fromkeys(config.avatar_dirs))
+
+
+def shaped_body(assets: Assets, number: int) -> ShapedBody:
+    """The body of distinct avatar `number`."""
+    own = _with_prefix(assets, f"body{number}/")
+    body = Body(
+        source=f"avatar {number} of the run",
+        hand_components=(own[HANDS[0]], own[HANDS[1]]),
+        **{name: own.get(name) for name in BODY_ARRAYS},  # type: ignore[arg-type] - `posedirs` alone may be None
+    )
+    return ShapedBody(own["vertices"], own["joints"], body)
+
+
+def texture_of(assets: Assets, number: int) -> F32:
+    """The neural texture (H,W,C) of distinct avatar `number`."""
+    return assets[f"avatar{number}/texture"]
+
+
+def quantisation_of(assets: Assets, number: int) -> Quantisation:
+    """How distinct avatar `number` is packed for the network."""
+    scale, zero_point = assets[f"avatar{number}/input"].tolist()
+    return Quantisation(scale, int(zero_point))
+
+
+def network_of(assets: Assets) -> NetworkFile:
+    """The network that all avatars share."""
+    model = onnx.load_from_string(assets[NETWORK].tobytes())
+    return check_network(model, assets[NETWORK_PATH].tobytes().decode())
+
+
+def staged_of(assets: Assets) -> Staged:
+    """The scene's movers and camera."""
+    return staged_from_arrays(_with_prefix(assets, SCENE))
+
+
+def _with_prefix(assets: Assets, prefix: str) -> Mapping[str, NDArray[Any]]:
+    return {name.removeprefix(prefix): array for name, array in assets.items() if name.startswith(prefix)}
