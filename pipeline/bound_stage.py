@@ -1,4 +1,4 @@
-"""A stage on its slots, as a unit's loop runs it. Rule: headers are passed on here, so that no stage has to think of it."""
+"""A stage on its slots, as a unit's loop runs it. Rule: headers are passed on here; no stage has to think of them."""
 
 from __future__ import annotations
 

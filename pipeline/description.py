@@ -81,7 +81,7 @@ class Pipeline(Model):
     `units`: cores and threads of each unit that a stage names; the scheduler runs on the cores of the first stage's.
     `latency_to`: the stage with whose end a frame's latency ends; the last one when it is not given.
     `module_folders`: where a unit's process looks for the modules of factories before anywhere else.
-    `preload`: modules that are imported once, before the units' processes are forked; those of `module_folders` cannot be.
+    `preload`: modules that are imported once, before the units' processes are forked; none from `module_folders`.
     """
 
     stages: tuple[PipelineStage, ...] = Field(min_length=1)

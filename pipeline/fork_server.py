@@ -1,4 +1,4 @@
-"""The process that units are forked from. Rule: one thread, no part in any run; it ends with its parent, its units with it.
+"""The process that units are forked from. Rule: one thread; it ends with its parent, and its units end with it.
 
 `python -P -m trilane.pipeline.fork_server --socket FD --parent PID --preload MODULE,...` imports once what every unit
 needs, then forks a unit for each request, so that a unit starts in milliseconds instead of importing everything again.

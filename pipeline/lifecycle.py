@@ -53,7 +53,7 @@ def listen_before_run(processes: UnitProcesses, interrupts: Interrupts) -> list[
 
 
 def close_units(processes: UnitProcesses, log: RunLog, interrupts: Interrupts) -> None:
-    """The stages complete their files, then the processes leave; one that does not is killed by `UnitProcesses.close`."""
+    """The stages complete their files, then the processes leave; `UnitProcesses.close` kills one that does not."""
     waiting = set(processes.pids)
     for unit in waiting:
         processes.send(unit, Close())

@@ -1,4 +1,4 @@
-"""What a run hands back. Rule: plain data; nothing here acts, and a recording is written where the caller asks for it."""
+"""What a run hands back. Rule: plain data; a recording is written only where the caller asks for it."""
 
 from __future__ import annotations
 

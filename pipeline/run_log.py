@@ -1,4 +1,4 @@
-"""What a person is told of a run while it goes on. Rule: the first failure stands; everything said is kept for the report."""
+"""What a person is told while a run goes on. Rule: the first failure stands; every message is in the report too."""
 
 from __future__ import annotations
 

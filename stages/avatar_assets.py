@@ -1,4 +1,4 @@
-"""What the parent has loaded of a scene's avatars, as the arrays that every unit maps. Rule: opened once, in the parent.
+"""What the parent has loaded of a scene and its avatars, as arrays that every unit maps. Rule: files are opened once.
 
 Names begin with what they belong to: `body0/` and `avatar0/` of the first distinct bundle, `network`, `scene/`.
 """

@@ -1,4 +1,4 @@
-"""The avatar's pipeline as `trilane.pipeline` runs it: its stages, what passes between them, and the data they are given.
+"""The avatar's pipeline as `trilane.pipeline` runs it: its stages, what passes between them, and their data.
 
 Rule: everything that the run must know of the avatar is said here, as data; no other module of the run knows an avatar.
 """

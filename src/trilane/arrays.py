@@ -1,4 +1,4 @@
-"""Names for the array types of annotations. Rule: a name says the element type; the docstring that uses it, the shape."""
+"""Names for the array types of annotations. Rule: a name says the element type; docstrings say the shape."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Names that everything shares: the units, the performance profiles, the avatar's stages. Rule: each list stands once."""
+"""Names that all folders share: units, performance profiles, the avatar's stages. Rule: each list stands once."""
 
 from __future__ import annotations
 

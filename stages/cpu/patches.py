@@ -59,7 +59,7 @@ def join(groups: list[I64], chosen: I64) -> I64:
 
 
 def build_levels(shaped: ShapedBody, weights: F64) -> list[Level]:
-    """Coarse and fine patches of all triangles of the body, skinned with `weights` (V,55); from the cache if they can be."""
+    """Coarse and fine patches of all triangles of the body, skinned with `weights` (V,55); cached."""
     body = shaped.body
     sources = [shaped.vertices, shaped.joints, body.parents, body.faces, weights]
     sources += [body.posedirs] if body.posedirs is not None else []
