@@ -129,6 +129,6 @@ def test_every_extra_that_is_named_is_one() -> None:
 def test_the_gpus_runtime_replaces_the_other(from_clone: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(from_clone)
     assert RUNTIMES["cuda"].install() == (
-        ".venv/bin/pip uninstall -y onnxruntime && .venv/bin/pip install onnxruntime-gpu, "
-        "on a machine with an NVIDIA GPU"
+        ".venv/bin/pip uninstall -y onnxruntime && .venv/bin/pip install onnxruntime-gpu  "
+        "# on a machine with an NVIDIA GPU"
     )
