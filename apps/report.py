@@ -118,7 +118,7 @@ def read_report(path: Path) -> Report:
             raise BadInputError(file, f"{file.stat().st_size} bytes", f"a report of at most {MAX_REPORT_BYTES}")
         return Report.model_validate_json(file.read_bytes())
     except OSError as error:
-        raise BadInputError(file, (error.strerror or str(error)).lower(), expected) from None
+        raise BadInputError.of_os_error(file, error, expected) from None
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"]) or "the document"
