@@ -13,18 +13,17 @@ from pathlib import Path
 from typing import Any
 
 from trilane.apps.pace import Pace, compare
-from trilane.apps.report import build_report, write_report
+from trilane.apps.report import Report, build_report, write_report
 from trilane.apps.run_folder import RunFolder
-from trilane.apps.trace import write_trace
-from trilane.apps.video import contact_sheet, join_segments, run_checksum
 from trilane.errors import TrilaneError
 from trilane.hw_profiles.governor import Governor
 from trilane.hw_profiles.load import load_runnable
 from trilane.pipeline.result import RunResult
-from trilane.pipeline.run import run_pipeline
 from trilane.pipeline.signals import Interrupts
+from trilane.pipeline.unit_starter import UnitStarter
+from trilane.stages.avatar_pipeline import run_avatar
 from trilane.stages.config import RunConfig
-from trilane.stages.cpu.present import SEGMENTS
+from trilane.stages.configure import Checked
 
 BASELINE_POLICY = "sequential"
 HOST = "host"
@@ -33,8 +32,13 @@ INTERRUPTED = 130
 
 @dataclass(frozen=True)
 class Plan:
-    """How to run: the policy, frames of the sequential run beside it (0: none), a chip's pace to keep, and the
-    performance profile whose caps hold (None: no cap). `latch_ms`: of the poses, but not of the run beside it.
+    """How to run.
+
+    `policy`: of the scheduler.
+    `baseline_frames`: of a sequential run after it, to compare with; 0: none.
+    `pace`: of a chip, to keep; None: as fast as it goes.
+    `performance_profile`: whose caps hold; None: no cap.
+    `latch_ms`: how long before it is needed a pose is sampled; not in the run that is compared with.
     """
 
     policy: str = "pipelined"
@@ -56,63 +60,99 @@ class Hooks:
 class Outcome:
     """`report` as written, `folder` that holds it, and the exit code that the run asks for."""
 
-    report: dict[str, Any]
+    report: Report
     folder: Path
     exit_code: int
 
 
 def run_to_folder(
-    config: RunConfig, target: Path, plan: Plan, hooks: Hooks, *, machine: dict[str, Any], facts: Mapping[str, Any]
+    checked: Checked,
+    target: Path,
+    plan: Plan,
+    hooks: Hooks,
+    *,
+    machine: Mapping[str, Any],
+    starter: UnitStarter | None = None,
 ) -> Outcome:
-    """Run `config` and leave the run folder at `target`. `facts` are added to the report.
+    """Run what was checked and leave the run folder at `target`.
 
+    `checked`: configuration, data, notes and the avatars' figures.
+    `target`: must not exist yet.
+    `plan`: how to run.
+    `hooks`: who is told.
+    `machine`: what `machine_facts` said.
+    `starter`: a fork server that was started earlier.
     Raises BadInputError when `target` cannot be written, and TrilaneError when no frame was presented.
     """
     with RunFolder(target) as folder:
-        config = config.model_copy(update={"out_dir": folder.work})
-        result = _run(config, plan, plan.policy, None, hooks)
+        job = _Job(checked, plan, hooks, starter)
+        result = job.run(folder.work)
         with Interrupts() as late:  # from here on a signal waits until the folder is whole
-            baseline, stopped = _baseline(config, plan, hooks) if _went_well(result) else (None, False)
-            report = build_report(result, config, policy=plan.policy, machine=machine, baseline=baseline)
+            baseline, stopped = job.run_baseline(folder.work) if _is_complete(result) else (None, False)
+            facts = {"accuracy": dict(checked.accuracy), "notes": list(checked.notes)}
             if plan.pace is not None:
-                report["pace"] = compare(plan.pace, plan.policy, config.scene.frames, result.jobs)
-            report |= {**facts, **_write_files(result, folder.work, config.scene.fps)}
+                facts["pace"] = compare(plan.pace, plan.policy, checked.config.scene.frames, result.jobs)
+            facts |= _write_files(result, folder.work, checked.config.scene.fps)
+            report = build_report(result, checked.config, machine=machine, baseline=baseline, facts=facts)
             _tell(report, hooks)
             write_report(report, folder.work / "report.json")
             place = folder.complete()
         return Outcome(report, place, INTERRUPTED if stopped or late.count else _exit_code(result))
 
 
-def _tell(report: dict[str, Any], hooks: Hooks) -> None:
-    """What a person should not have to find in the report."""
-    shown, presented = (report["video"] or {}).get("frames", 0), report["frames"]["presented"]
-    if report["video"] and shown < presented:
-        hooks.message(f"video.mp4 holds {shown} of {presented} frames: a writer was killed before its last")
-    if report["figures"].get("pose", {}).get("visible") == 0:
-        hooks.message("no avatar was in the picture in any frame")
+class _Job:
+    """The runs of one job: the one that was asked for, and the sequential one to compare with."""
+
+    def __init__(self, checked: Checked, plan: Plan, hooks: Hooks, starter: UnitStarter | None) -> None:
+        self._checked, self._plan, self._hooks, self._starter = checked, plan, hooks, starter
+
+    def run(self, folder: Path) -> RunResult:
+        """The run that was asked for. Raises TrilaneError when it ended before any frame was presented."""
+        return self._run(folder, self._plan.policy, None, self._plan.latch_ms)
+
+    def run_baseline(self, folder: Path) -> tuple[RunResult | None, bool]:
+        """The first frames of the same scene again, one frame at a time; its pictures are not kept.
+
+        None when it was not asked for or did not complete; and whether it was interrupted.
+        """
+        if not self._plan.baseline_frames or self._plan.policy == BASELINE_POLICY:
+            return None, False
+        place = folder / BASELINE_POLICY
+        place.mkdir()
+        frames = min(self._plan.baseline_frames, self._checked.config.scene.frames)
+        try:
+            result = self._run(place, BASELINE_POLICY, frames, 0.0)
+        except KeyboardInterrupt:
+            return None, True
+        except TrilaneError as error:
+            self._hooks.message(f"the {BASELINE_POLICY} run to compare with failed and is left out: {error}")
+            return None, False
+        finally:
+            shutil.rmtree(place)
+        return (result if _is_complete(result) else None), result.interrupted
+
+    def _run(self, folder: Path, policy: str, frames: int | None, latch_ms: float) -> RunResult:
+        profile = self._plan.performance_profile
+        result = run_avatar(
+            self._checked.config.model_copy(update={"out_dir": folder}),
+            self._checked.assets,
+            policy=policy,
+            frames=frames,
+            latch_ms=latch_ms,
+            governor=None if profile is None else Governor(load_runnable(HOST), profile),
+            starter=self._starter,
+            on_progress=lambda presented, requested: self._hooks.progress(policy, presented, requested),
+            on_message=self._hooks.message,
+        )
+        if result.presented:
+            return result
+        if result.interrupted:
+            raise KeyboardInterrupt
+        raise _error_of(result)
 
 
-def _went_well(result: RunResult) -> bool:
+def _is_complete(result: RunResult) -> bool:
     return not result.interrupted and result.failure is None
-
-
-def _run(config: RunConfig, plan: Plan, policy: str, frames: int | None, hooks: Hooks) -> RunResult:
-    """The run under `policy`. Raises TrilaneError when it ended before any frame was presented."""
-    capped = plan.performance_profile is not None
-    result = run_pipeline(
-        config,
-        policy=policy,
-        frames=frames,
-        on_progress=lambda presented, requested: hooks.progress(policy, presented, requested),
-        on_message=hooks.message,
-        latch_ms=plan.latch_ms if policy == plan.policy else 0.0,
-        governor=Governor(load_runnable(HOST), str(plan.performance_profile)) if capped else None,
-    )
-    if result.presented:
-        return result
-    if result.interrupted:
-        raise KeyboardInterrupt
-    raise _error_of(result)
 
 
 def _error_of(result: RunResult) -> TrilaneError:
@@ -122,45 +162,36 @@ def _error_of(result: RunResult) -> TrilaneError:
     return error
 
 
-def _baseline(config: RunConfig, plan: Plan, hooks: Hooks) -> tuple[RunResult | None, bool]:
-    """The first frames of the same scene again, one frame at a time, with the same work; its pictures are not kept.
-
-    None when it was not asked for or did not complete; and whether it was interrupted.
-    """
-    if not plan.baseline_frames or plan.policy == BASELINE_POLICY:
-        return None, False
-    place = config.out_dir / BASELINE_POLICY
-    place.mkdir()
-    frames = min(plan.baseline_frames, config.scene.frames)
-    try:
-        result = _run(config.model_copy(update={"out_dir": place}), plan, BASELINE_POLICY, frames, hooks)
-    except KeyboardInterrupt:
-        return None, True
-    except TrilaneError as error:
-        hooks.message(f"the {BASELINE_POLICY} run beside it failed and is left out: {error}")
-        return None, False
-    finally:
-        shutil.rmtree(place)
-    return (result if _went_well(result) else None), result.interrupted
-
-
 def _exit_code(result: RunResult) -> int:
     if result.interrupted:
         return INTERRUPTED
     return 0 if result.failure is None else result.failure.exit_code
 
 
+def _tell(report: Report, hooks: Hooks) -> None:
+    """What a person should not have to find in the report."""
+    if report.video is not None and report.video.frames < report.frames.presented:
+        shown = f"{report.video.frames} of {report.frames.presented} frames"
+        hooks.message(f"video.mp4 holds {shown}: a writer was killed before its last")
+    if report.stage_metrics.get("pose", {}).get("visible") == 0:
+        hooks.message("no avatar was in the picture in any frame")
+
+
 def _write_files(result: RunResult, work: Path, fps: float) -> dict[str, Any]:
     """Everything but the report; what the report says of it."""
+    from trilane.apps.trace import write_trace
+    from trilane.apps.video import contact_sheet, join_segments, run_checksum
+    from trilane.stages.cpu.present import SEGMENTS
+
     segments = work / SEGMENTS
-    files: dict[str, Any] = {"video": None, "checksum": None}
+    facts: dict[str, Any] = {"video": None, "checksum": None}
     if segments.is_dir():
         joined = join_segments(sorted(segments.glob("*.mp4")), work / "video.mp4", fps)
-        files["checksum"] = run_checksum(sorted(segments.glob("*.sha256")))
+        facts["checksum"] = run_checksum(sorted(segments.glob("*.sha256")))
         if joined is not None:
-            files["video"] = {"frames": joined.frames, "seconds": joined.seconds}
+            facts["video"] = {"frames": joined.frames, "seconds": joined.seconds}
             contact_sheet(work / "video.mp4", work / "contact.png", fps)
         shutil.rmtree(segments)
     result.recording.write(work / "events.jsonl")
     write_trace(result.jobs, work / "trace.pftrace")
-    return files
+    return facts

@@ -21,6 +21,7 @@ from trilane.bench.handoff_stages import PAUSE_S, READER, check_bytes, handoff_p
 from trilane.bench.handoff_variants import BARE, CHANNELS, SLOT, WRITTEN, Channel
 from trilane.errors import BadInputError, TrilaneError
 from trilane.hw_profiles.host import host_units
+from trilane.install import install_line
 from trilane.pipeline.run import run_pipeline
 from trilane.scheduler.stats import median_interval
 from trilane.transport.wakeup import UNIT_NS, awake, use_slice
@@ -181,7 +182,7 @@ def _pairs(stack: ExitStack, sizes: tuple[int, ...]) -> tuple[dict[tuple[str, in
             try:
                 channel = make(size * 1024, context)
             except ModuleNotFoundError as error:
-                absent[way] = f"{error.name} is not installed: pip install 'trilane[peers]'"
+                absent[way] = f"{error.name} is not installed: {install_line('peers')}"
                 break
             pairs[way, size] = Pair(context, channel, WRITTEN.get(way, size * 1024))
             stack.callback(pairs[way, size].close)

@@ -17,6 +17,7 @@ from trilane.errors import BadInputError
 from trilane.scheduler.events import Graph, StageSpec
 from trilane.transport.packets import FRAME_FIELDS, header_dtype
 from trilane.transport.slots import edge_rule
+from trilane.unexpected import UnexpectedValue
 
 FACTORY = r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$"
 
@@ -30,7 +31,7 @@ class Model(BaseModel):
 def _header(value: Any) -> np.dtype[Any]:
     dtype = np.lib.format.descr_to_dtype(ast.literal_eval(value)) if isinstance(value, str) else value
     if not isinstance(dtype, np.dtype) or (dtype.names or ())[: len(FRAME_FIELDS)] != tuple(n for n, _ in FRAME_FIELDS):
-        raise ValueError(f"found header {value!r}, expected one of trilane.transport.packets.header_dtype")
+        raise UnexpectedValue(f"header {value!r}", "one made by trilane.transport.packets.header_dtype")
     return dtype
 
 
@@ -95,7 +96,7 @@ class Pipeline(Model):
     def _joined(self) -> Self:
         missing = {stage.unit for stage in self.stages} - set(self.units)
         if missing:
-            raise ValueError(f"found no settings of unit {', '.join(sorted(missing))}, expected them in `units`")
+            raise UnexpectedValue(f"no settings of unit {', '.join(sorted(missing))}", "them in `units`")
         self.graph()
         for edge in self.edges:
             edge_rule(edge.rule)
@@ -135,6 +136,6 @@ class Pipeline(Model):
         """The same with `rule` for every edge. Raises BadInputError for an unknown one."""
         try:
             edge_rule(rule)
-        except ValueError as error:
-            raise BadInputError.about("the run's settings", error) from None
+        except UnexpectedValue as error:
+            raise BadInputError.at("the run's settings", error) from None
         return self.model_copy(update={"edges": tuple(e.model_copy(update={"rule": rule}) for e in self.edges)})

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Protocol
 
-from trilane.errors import BadInputError, UnexpectedValue
+from trilane.errors import BadInputError
 from trilane.pipeline.assets import Assets, share_assets
 from trilane.pipeline.description import Pipeline
 from trilane.pipeline.isolated import IsolatedTimes
@@ -29,6 +29,7 @@ from trilane.scheduler.loop import run_loop
 from trilane.scheduler.policy import policy_named
 from trilane.scheduler.recording import Recording
 from trilane.scheduler.stats import energy_score
+from trilane.unexpected import UnexpectedValue
 from trilane.transport.wakeup import DEFAULT, SHORTEST_NS, awake, use_slice
 
 DEADLINE_PERIODS = 3  # from a frame's release until it must be presented

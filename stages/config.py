@@ -10,6 +10,7 @@ from pydantic import Field, field_validator
 from trilane.pipeline.description import UnitSettings
 from trilane.scene.schema import Model, Scene
 from trilane.shapes import Shape, shape_buckets
+from trilane.unexpected import UnexpectedValue
 from trilane.units import UnitName
 
 
@@ -44,7 +45,7 @@ class RunConfig(Model):
     def _units_known(cls, units: dict[str, UnitSettings]) -> dict[str, UnitSettings]:
         unknown = set(units) - {"cpu", "gpu", "dsp"}
         if unknown:
-            raise ValueError(f"unknown unit {sorted(unknown)}, expected cpu, gpu, dsp")
+            raise UnexpectedValue(f"unknown unit {sorted(unknown)}", "cpu, gpu, dsp")
         return units
 
     @property

@@ -17,6 +17,7 @@ from trilane.apps.machine import gl_facts, machine_facts
 from trilane.avatars.bundle import Bundle, load_bundle
 from trilane.avatars.network_file import NetworkFile
 from trilane.avatars.split import split
+from trilane.install import EGL_LINE
 from trilane.errors import BadInputError, MissingPartError
 from trilane.hw_profiles.host import host_units
 from trilane.hw_profiles.load import HOST, load_profile
@@ -30,7 +31,6 @@ from trilane.stages.config import NetworkCut, RunConfig
 from trilane.stages.dsp.runtime import RUNTIMES, installed, resolve
 from trilane.stages.gpu.background import open_background
 
-GL_INSTALL = "apt-get install libegl1 libgl1-mesa-dri"
 ROOM = "room"
 COMMAND_LINE = "command line"
 
@@ -163,5 +163,5 @@ def required_machine() -> dict[str, Any]:
     """Facts of this machine. Raises MissingPartError when no OpenGL context can be made."""
     gl = gl_facts()
     if gl is None:
-        raise MissingPartError("no OpenGL 3.3 context through EGL", GL_INSTALL)
+        raise MissingPartError("no OpenGL 3.3 context through EGL", EGL_LINE)
     return machine_facts(gl)

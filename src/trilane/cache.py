@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.files import write_atomically
+from trilane.writing import write_atomically
 
 ARRAYS = "arrays"
 MAX_ENTRIES = 64  # of arrays, some MB each; the oldest go first

@@ -47,12 +47,6 @@ class BadInputError(TrilaneError):
         return cls(where, unexpected.found, unexpected.expected, unexpected.remedy)
 
     @classmethod
-    def about(cls, where: str | Path, error: ValueError) -> BadInputError:
-        """`at`, under the name that pipeline/ still calls it by."""
-        assert isinstance(error, UnexpectedValue)
-        return cls.at(where, error)
-
-    @classmethod
     def of_os_error(cls, where: str | Path, error: OSError, expected: str, remedy: str = "") -> BadInputError:
         """What the system said when `where` was opened, read or written.
 
