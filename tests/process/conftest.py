@@ -1,39 +1,18 @@
-"""Runs of real processes with mock units."""
+"""What runs of real processes leave behind, which is nothing, and how a test finds a unit's process."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
 import pytest
 
-from trilane.hw_profiles.host import host_units
-from trilane.scene.schema import Scene
-from trilane.stages.config import RunConfig
-from trilane.units import UNITS
 
 MOCK = "trilane.testing.doubles"
 SHM = Path("/dev/shm")  # noqa: S108 - looked at, not written to
 OPEN_FILES = Path("/proc/self/fd")
-
-
-@pytest.fixture
-def mock_config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., RunConfig]:
-    """`mock_config(frames, stage=milliseconds, ...)`: a run of mock units only."""
-
-    def make(frames: int = 40, **behaviour: object) -> RunConfig:
-        monkeypatch.setenv("TRILANE_MOCK", ",".join(f"{stage}={value}" for stage, value in behaviour.items()))
-        return RunConfig(
-            scene=Scene(frames=frames, size="64"),
-            out_dir=tmp_path,
-            avatar_dirs=(),
-            units=host_units(),
-            fake=dict.fromkeys(UNITS, MOCK),
-        )
-
-    return make
 
 
 def bus_folders(base: Path) -> set[str]:

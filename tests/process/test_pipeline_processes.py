@@ -9,32 +9,29 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
 
 from trilane.apps.pace import Pace, compare
+from trilane.bench.faults import unit_process
 from trilane.errors import BadInputError, TrilaneError
 from trilane.hw_profiles.governor import Governor
 from trilane.hw_profiles.load import load_runnable
+from trilane.pipeline.description import Pipeline
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run import run_pipeline
 from trilane.scheduler.events import Pong
 from trilane.scheduler.recording import replay
-from trilane.stages.config import RunConfig
+from trilane.stages.avatar_pipeline import avatar_pipeline
 from trilane.stages.configure import Request, configure
+from trilane.testing import lost_context
+from trilane.testing.doubles import pipeline_of_doubles as doubles
 
-Configure = Callable[..., RunConfig]
 pytestmark = pytest.mark.usefixtures("nothing_left")
-
-
-def unit_process(unit: str) -> psutil.Process:
-    for process in psutil.Process().children():
-        if process.cmdline()[-4:-2] == ["--unit", unit]:
-            return process
-    raise LookupError(unit)
 
 
 class When:
@@ -49,6 +46,16 @@ class When:
             self._action()
 
 
+def by_cause(counts: Mapping[Any, int]) -> dict[str, int]:
+    return {str(cause): count for cause, count in counts.items()}
+
+
+def with_factory(pipeline: Pipeline, name: str, factory: str) -> Pipeline:
+    """`pipeline` with another factory of stage `name`."""
+    stages = [s.model_copy(update={"factory": factory}) if s.name == name else s for s in pipeline.stages]
+    return pipeline.model_copy(update={"stages": tuple(stages)})
+
+
 def check_accounts(result: RunResult) -> None:
     counted = result.presented + sum(result.lost.values()) + sum(result.dropped.values())
     assert counted == result.requested
@@ -59,12 +66,12 @@ def check_accounts(result: RunResult) -> None:
 
 @pytest.mark.parametrize("policy", ["sequential", "pipelined"])
 @pytest.mark.parametrize("edge", ["single", "double"])
-def test_every_frame_is_presented_in_order(mock_config: Configure, policy: str, edge: str) -> None:
-    config = mock_config(40)
-    result = run_pipeline(config, policy=policy, edge=edge, isolate_frames=2)
+def test_every_frame_is_presented_in_order(tmp_path: Path, policy: str, edge: str) -> None:
+    log = tmp_path / "presented.txt"
+    result = run_pipeline(doubles(log).with_rule(edge), 40, policy=policy, isolated_frames=2)
     assert result.failure is None
     assert (result.presented, dict(result.lost), dict(result.dropped)) == (40, {}, {})
-    assert (config.out_dir / "presented.txt").read_text().split() == [str(frame) for frame in range(40)]
+    assert log.read_text().split() == [str(frame) for frame in range(40)]
     assert len(set(result.pids.values())) == 3
     assert result.report["clock"] == "host"
     assert 0 < result.report["efficiency"] < 3
@@ -72,20 +79,19 @@ def test_every_frame_is_presented_in_order(mock_config: Configure, policy: str, 
 
 
 @pytest.mark.parametrize(("policy", "edge"), [("latest", "triple"), ("deadline", "double"), ("latest", "orphan")])
-def test_a_paced_run_drops_what_it_cannot_do_and_counts_it(mock_config: Configure, policy: str, edge: str) -> None:
-    result = run_pipeline(mock_config(100, infer=16), policy=policy, edge=edge, pace_fps=100, isolate_frames=0)
+def test_a_paced_run_drops_what_it_cannot_do_and_counts_it(policy: str, edge: str) -> None:
+    result = run_pipeline(doubles(infer=16).with_rule(edge), 100, policy=policy, pace_fps=100, isolated_frames=0)
     assert sum(result.dropped.values()) > 20
     assert result.presented > 20
     assert result.report["efficiency"] is None
     check_accounts(result)
 
 
-def test_a_run_at_a_pace_has_the_frame_time_of_virtual_time(mock_config: Configure) -> None:
+def test_a_run_at_a_pace_has_the_frame_time_of_virtual_time() -> None:
     """Jobs of a millisecond, held for 20 to 40; the median interval, for another program may hold one frame up."""
     stage_ns = {"pose": 2, "raster": 10, "infer": 40, "composite": 20, "present": 2}
     stage_ns = {stage: ms * 1_000_000 for stage, ms in stage_ns.items()}
-    config = mock_config(20, raster=1, infer=1).model_copy(update={"pace_ns": stage_ns})
-    result = run_pipeline(config)
+    result = run_pipeline(doubles(pace_ns=stage_ns), 20)
     found = compare(Pace("chip", "any", 1.0, stage_ns), "pipelined", 20, result.jobs)
     assert result.presented == 20
     assert found["virtual_ms"] == 40
@@ -93,16 +99,16 @@ def test_a_run_at_a_pace_has_the_frame_time_of_virtual_time(mock_config: Configu
     assert min(job.end_ns - job.begin_ns for job in result.jobs if job.stage == "infer") >= stage_ns["infer"]
 
 
-def test_pipelined_hides_all_but_the_slowest(mock_config: Configure) -> None:
-    config = mock_config(60, raster=4, infer=12, composite=3, present=4)
-    reports = [run_pipeline(config, policy=policy).report for policy in ("sequential", "pipelined")]
+def test_pipelined_hides_all_but_the_slowest() -> None:
+    pipeline = doubles(raster=4, infer=12, composite=3, present=4)
+    reports = [run_pipeline(pipeline, 60, policy=policy).report for policy in ("sequential", "pipelined")]
     assert reports[1]["fps"] > 1.4 * reports[0]["fps"]
     assert reports[1]["bottleneck"] == "dsp"
     assert reports[1]["efficiency"] > 0.8
 
 
 @pytest.mark.parametrize(("unit", "slowest"), [("cpu", "pose"), ("gpu", "raster"), ("dsp", "infer")])
-def test_a_killed_unit_is_restarted_and_the_run_goes_on(mock_config: Configure, unit: str, slowest: str) -> None:
+def test_a_killed_unit_is_restarted_and_the_run_goes_on(unit: str, slowest: str) -> None:
     """The unit that is killed is the one that always has a job in hand; an idle one would lose nothing."""
     victims = []
 
@@ -110,46 +116,46 @@ def test_a_killed_unit_is_restarted_and_the_run_goes_on(mock_config: Configure, 
         victims.append(unit_process(unit).pid)
         os.kill(victims[0], signal.SIGKILL)
 
-    result = run_pipeline(mock_config(60, **{slowest: 10}), isolate_frames=0, on_progress=When(10, kill))
+    result = run_pipeline(doubles(**{slowest: 10}), 60, isolated_frames=0, on_progress=When(10, kill))
     assert result.failure is None
-    assert set(result.lost) == {f"died:{unit}"}
-    assert result.lost[f"died:{unit}"] <= 2
+    assert set(map(str, result.lost)) == {f"died:{unit}"}
+    assert sum(result.lost.values()) <= 2
     assert result.report["units"][unit]["restarts"] == 1
     assert result.pids[unit] != victims[0]
     assert any(unit in message for message in result.messages)
     check_accounts(result)
 
 
-def test_a_stopped_unit_is_found_by_its_deadline(mock_config: Configure) -> None:
+def test_a_stopped_unit_is_found_by_its_deadline() -> None:
     stop = When(10, lambda: unit_process("dsp").suspend())
-    result = run_pipeline(mock_config(60, infer=10), isolate_frames=0, hang_ns=700_000_000, on_progress=stop)
-    assert set(result.lost) == {"hung:dsp"}
+    result = run_pipeline(doubles(infer=10), 60, isolated_frames=0, hang_ns=700_000_000, on_progress=stop)
+    assert set(map(str, result.lost)) == {"hung:dsp"}
     assert any("did not answer in time" in message for message in result.messages)
     check_accounts(result)
 
 
-def test_idle_units_are_asked_whether_they_live(mock_config: Configure) -> None:
+def test_idle_units_are_asked_whether_they_live() -> None:
     """The CPU waits longer for its next job than a unit may be silent."""
-    config = mock_config(2, raster=400, infer=400, composite=400)
-    result = run_pipeline(config, policy="sequential", isolate_frames=0, hang_ns=700_000_000)
+    pipeline = doubles(raster=400, infer=400, composite=400)
+    result = run_pipeline(pipeline, 2, policy="sequential", isolated_frames=0, hang_ns=700_000_000)
     beats = [event for _, events, _ in result.recording.steps for event in events if isinstance(event, Pong)]
     assert result.presented == 2
     assert not any(row["restarts"] for row in result.report["units"].values())
     assert any(beat.unit == "cpu" for beat in beats)
 
 
-def test_a_job_that_never_ends_ends_the_run_after_some_restarts(mock_config: Configure) -> None:
-    result = run_pipeline(mock_config(8, raster="hang"), isolate_frames=0, hang_ns=300_000_000)
-    assert dict(result.lost) == {"hung:gpu": 1}
+def test_a_job_that_never_ends_ends_the_run_after_some_restarts() -> None:
+    result = run_pipeline(doubles(raster="hang"), 8, isolated_frames=0, hang_ns=300_000_000)
+    assert by_cause(result.lost) == {"hung:gpu": 1}
     assert result.presented == 7
     check_accounts(result)
 
 
-def test_a_cap_holds_every_unit_and_says_so(mock_config: Configure) -> None:
+def test_a_cap_holds_every_unit_and_says_so() -> None:
     """Half of the time at most, whatever the jobs ask for; the recording with the cap's events replays."""
-    free = run_pipeline(mock_config(60, infer=10), isolate_frames=0)
+    free = run_pipeline(doubles(infer=10), 60, isolated_frames=0)
     capped = run_pipeline(
-        mock_config(60, infer=10), isolate_frames=0, governor=Governor(load_runnable("host"), "power_saver")
+        doubles(infer=10), 60, isolated_frames=0, governor=Governor(load_runnable("host"), "power_saver")
     )
     check_accounts(capped)
     assert capped.report["fps"] < 0.7 * free.report["fps"]
@@ -158,9 +164,9 @@ def test_a_cap_holds_every_unit_and_says_so(mock_config: Configure) -> None:
     assert capped.report["caps"]["units"]["dsp"]["duty"] < 0.5
 
 
-def test_late_poses_arrive_and_are_newer(mock_config: Configure) -> None:
+def test_late_poses_arrive_and_are_newer() -> None:
     early, late = (
-        run_pipeline(mock_config(80, pose=2, raster=5, infer=10), isolate_frames=0, latch_ms=latch_ms)
+        run_pipeline(doubles(pose=2, raster=5, infer=10), 80, isolated_frames=0, latch_ms=latch_ms)
         for latch_ms in (0, 4)
     )
     check_accounts(late)
@@ -169,56 +175,55 @@ def test_late_poses_arrive_and_are_newer(mock_config: Configure) -> None:
 
 
 def test_a_lost_context_costs_a_restart_and_a_frame(tmp_path: Path) -> None:
-    config = configure(Request(frames=40, size="128"), tmp_path).config
-    losing = config.model_copy(update={"fake": {"gpu": "trilane.testing.lost_context"}})
-    result = run_pipeline(losing, isolate_frames=0)
+    checked = configure(Request(frames=40, size="128"), tmp_path)
+    losing = with_factory(avatar_pipeline(checked.config, checked.assets), "raster", lost_context.FACTORY)
+    result = run_pipeline(losing, 40, assets=checked.assets, isolated_frames=0)
     assert result.failure is None
-    assert set(result.lost) == {"died:gpu"}
-    assert result.lost["died:gpu"] == 1
+    assert by_cause(result.lost) == {"died:gpu": 1}
     assert result.report["units"]["gpu"]["restarts"] == 1
     assert any("context was lost" in message for message in result.messages)
     check_accounts(result)
 
 
 @pytest.mark.parametrize("stage", ["raster", "infer", "present"])
-def test_a_stage_that_raises_ends_the_run_with_its_sentence(mock_config: Configure, stage: str) -> None:
-    result = run_pipeline(mock_config(200, **{stage: "raise"}), isolate_frames=0)
+def test_a_stage_that_raises_ends_the_run_with_its_sentence(stage: str) -> None:
+    result = run_pipeline(doubles(**{stage: "raise"}), 200, isolated_frames=0)
     assert result.failure is not None
     assert result.failure.exit_code == 2
     assert result.failure.message == "mock.npz: found nothing, expected something"
     assert result.presented < 50
-    assert result.lost == {f"failed:{stage}": 1}
+    assert by_cause(result.lost) == {f"failed:{stage}": 1}
 
 
 @pytest.mark.parametrize("stage", ["pose", "raster", "infer"])
-def test_a_stage_that_cannot_be_built_is_the_callers_error(mock_config: Configure, stage: str) -> None:
+def test_a_stage_that_cannot_be_built_is_the_callers_error(stage: str) -> None:
     with pytest.raises(TrilaneError, match="expected a network; train one") as caught:
-        run_pipeline(mock_config(5, **{stage: "badbuild"}))
+        run_pipeline(doubles(**{stage: "badbuild"}), 5)
     assert caught.value.exit_code == 2
 
 
-def test_a_unit_that_dies_while_it_starts_is_an_error_with_its_last_words(mock_config: Configure) -> None:
-    config = mock_config(5).model_copy(update={"fake": {**mock_config(5).fake, "dsp": "antigravity_none"}})
+def test_a_unit_that_dies_while_it_starts_is_an_error_with_its_last_words() -> None:
+    pipeline = with_factory(doubles(), "infer", "antigravity_none:build")
     with pytest.raises(TrilaneError, match="antigravity_none"):
-        run_pipeline(config)
+        run_pipeline(pipeline, 5)
 
 
-@pytest.mark.parametrize("settings", [{"policy": "fast"}, {"edge": "quad"}, {"edge": "fifo:0"}])
-def test_unknown_settings_are_bad_input(mock_config: Configure, settings: dict[str, str]) -> None:
+@pytest.mark.parametrize(("policy", "edge"), [("fast", "double"), ("pipelined", "quad"), ("pipelined", "fifo:0")])
+def test_unknown_settings_are_bad_input(policy: str, edge: str) -> None:
     with pytest.raises(BadInputError, match="found"):
-        run_pipeline(mock_config(5), **settings)
+        run_pipeline(doubles().with_rule(edge), 5, policy=policy)
 
 
-def test_an_interrupt_finishes_what_is_in_flight(mock_config: Configure) -> None:
+def test_an_interrupt_finishes_what_is_in_flight() -> None:
     interrupt = When(10, lambda: os.kill(os.getpid(), signal.SIGINT))
-    result = run_pipeline(mock_config(2000, infer=5), isolate_frames=0, on_progress=interrupt)
+    result = run_pipeline(doubles(infer=5), 2000, isolated_frames=0, on_progress=interrupt)
     assert result.interrupted
     assert result.failure is None
     assert 10 <= result.presented < 100
     assert not result.lost
 
 
-def test_a_second_interrupt_ends_at_once(mock_config: Configure) -> None:
+def test_a_second_interrupt_ends_at_once() -> None:
     def interrupt() -> None:
         for _ in range(2):
             time.sleep(0.5)
@@ -226,41 +231,37 @@ def test_a_second_interrupt_ends_at_once(mock_config: Configure) -> None:
 
     thread = threading.Thread(target=interrupt)
     begin = time.monotonic()
-    result = run_pipeline(mock_config(20, raster="hang"), isolate_frames=0, on_progress=When(2, thread.start))
+    result = run_pipeline(doubles(raster="hang"), 20, isolated_frames=0, on_progress=When(2, thread.start))
     thread.join()
     assert time.monotonic() - begin < 8
     assert result.interrupted
-    assert result.lost["aborted"] >= 1
+    assert by_cause(result.lost)["aborted"] >= 1
+    check_accounts(result)
 
 
 SCRIPT = """
 import sys
-from pathlib import Path
-from trilane.hw_profiles.host import host_units
-from trilane.stages.config import RunConfig
-from trilane.scene.schema import Scene
 from trilane.pipeline.run import run_pipeline
+from trilane.testing.doubles import pipeline_of_doubles
 
-config = RunConfig(scene=Scene(frames=int(sys.argv[2]), size="64"), out_dir=Path(sys.argv[1]), avatar_dirs=(),
-                   units=host_units(), fake=dict.fromkeys(("cpu", "gpu", "dsp"), "trilane.testing.doubles"))
-result = run_pipeline(config, isolate_frames=0, hang_ns=int(float(sys.argv[3]) * 1e9),
-                      on_progress=lambda done, _: print(done, flush=True))
-print(f"over: {result.presented} presented, lost {result.lost}, {result.messages}", flush=True)
+result = run_pipeline(pipeline_of_doubles(infer=int(sys.argv[3])), int(sys.argv[1]), isolated_frames=0,
+                      hang_ns=int(float(sys.argv[2]) * 1e9), on_progress=lambda done, _: print(done, flush=True))
+print(f"over: {result.presented} presented, lost {dict(result.lost)}, {result.messages}", flush=True)
 """
 
 
-def script(folder: Path, frames: int, hang_s: float) -> list[str]:
-    return [sys.executable, "-c", SCRIPT, str(folder), str(frames), str(hang_s)]
+def script(frames: int, hang_s: float, infer_ms: int = 1) -> list[str]:
+    return [sys.executable, "-c", SCRIPT, str(frames), str(hang_s), str(infer_ms)]
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
-def test_nothing_outlives_the_parent(nothing_left: Path, tmp_path: Path, number: signal.Signals) -> None:
-    parent = subprocess.Popen(script(tmp_path, 100_000, 10), stdout=subprocess.PIPE, text=True, process_group=0)
+def test_nothing_outlives_the_parent(nothing_left: Path, number: signal.Signals) -> None:
+    parent = subprocess.Popen(script(100_000, 10), stdout=subprocess.PIPE, text=True, process_group=0)
     assert parent.stdout is not None
     while int(parent.stdout.readline()) < 20:
         pass
     children = psutil.Process(parent.pid).children(recursive=True)
-    assert len(children) == 3
+    assert len(children) == 4  # the fork server and three units
     assert not list(nothing_left.glob("trilane-*"))
     os.kill(parent.pid, number)
     parent.stdout.read()
@@ -270,10 +271,9 @@ def test_nothing_outlives_the_parent(nothing_left: Path, tmp_path: Path, number:
     assert not [process for process in alive if process.status() != psutil.STATUS_ZOMBIE]
 
 
-def test_a_scheduler_that_was_stopped_blames_nobody(tmp_path: Path, mock_config: Configure) -> None:
+def test_a_scheduler_that_was_stopped_blames_nobody() -> None:
     """Not the units that waited for it longer than they may be silent, with a job done or with nothing to do."""
-    mock_config(infer=10)
-    parent = subprocess.Popen(script(tmp_path, 60, 1.0), stdout=subprocess.PIPE, text=True, process_group=0)
+    parent = subprocess.Popen(script(60, 1.0, infer_ms=10), stdout=subprocess.PIPE, text=True, process_group=0)
     assert parent.stdout is not None
     while int(parent.stdout.readline()) < 10:
         pass
@@ -286,45 +286,38 @@ def test_a_scheduler_that_was_stopped_blames_nobody(tmp_path: Path, mock_config:
     assert said[-1] == "over: 60 presented, lost {}, ()"
 
 
-def test_units_that_cannot_be_started_leave_nothing(
-    nothing_left: Path, mock_config: Configure, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_units_that_cannot_be_started_leave_nothing(nothing_left: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """`nothing_left` looks for open files and processes."""
 
     def refuse(*_: object, **__: object) -> None:
         raise OSError(errno.ENOMEM, "Cannot allocate memory")
 
-    for part in ("subprocess.Popen", "os.pidfd_open", "trilane.pipeline.processes.job_pipe_pair"):
+    for part in ("subprocess.Popen", "os.memfd_create", "trilane.pipeline.unit_processes.job_pipe_pair"):
         with monkeypatch.context() as patched, pytest.raises(OSError, match="Cannot allocate"):
             patched.setattr(part, refuse)
-            run_pipeline(mock_config(3), isolate_frames=0)
+            run_pipeline(doubles(), 3, isolated_frames=0)
         assert not list(nothing_left.glob("trilane-*"))
 
 
-def test_a_run_that_may_open_too_few_files_says_so(mock_config: Configure, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_that_may_open_too_few_files_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("resource.getrlimit", lambda _: (40, 4096))
     with pytest.raises(TrilaneError, match="found a limit of 40, expected at least 96"):
-        run_pipeline(mock_config(3), isolate_frames=0)
+        run_pipeline(doubles(), 3, isolated_frames=0)
 
 
-def test_an_idle_unit_that_does_not_answer_is_restarted(
-    mock_config: Configure, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_idle_unit_that_does_not_answer_is_restarted(monkeypatch: pytest.MonkeyPatch) -> None:
     """The DSP has no job while pose and raster work, and so loses none."""
-    monkeypatch.setattr("trilane.pipeline.realtime.PING_NS", 50_000_000)
+    monkeypatch.setattr("trilane.pipeline.realtime_clock.PING_NS", 50_000_000)
     stop = When(1, lambda: unit_process("dsp").suspend())
-    config = mock_config(3, pose=500, raster=500)
-    result = run_pipeline(config, policy="sequential", isolate_frames=0, hang_ns=850_000_000, on_progress=stop)
+    pipeline = doubles(pose=500, raster=500)
+    result = run_pipeline(pipeline, 3, policy="sequential", isolated_frames=0, hang_ns=850_000_000, on_progress=stop)
     assert result.report["units"]["dsp"]["restarts"] == 1
     assert any("dsp did not answer in time" in message for message in result.messages)
     assert result.presented == 3 and not result.lost
 
 
-def test_a_parent_killed_while_it_starts_leaves_what_the_next_run_removes(
-    nothing_left: Path, tmp_path: Path, mock_config: Configure
-) -> None:
-    mock_config()
-    parent = subprocess.Popen(script(tmp_path, 100_000, 10), stdout=subprocess.DEVNULL)
+def test_a_parent_killed_while_it_starts_leaves_what_the_next_run_removes(nothing_left: Path, tmp_path: Path) -> None:
+    parent = subprocess.Popen(script(100_000, 10), stdout=subprocess.DEVNULL)
     while not list(nothing_left.glob("trilane-*/*")):
         time.sleep(0.001)
     children = psutil.Process(parent.pid).children(recursive=True)
@@ -332,5 +325,5 @@ def test_a_parent_killed_while_it_starts_leaves_what_the_next_run_removes(
     parent.wait()
     _, alive = psutil.wait_procs(children, timeout=3)
     assert not [process for process in alive if process.status() != psutil.STATUS_ZOMBIE]
-    run_pipeline(mock_config(3), isolate_frames=0)
+    run_pipeline(doubles(), 3, isolated_frames=0)
     assert not list(nothing_left.glob("trilane-*"))
