@@ -16,12 +16,13 @@ from trilane.pipeline.processes import UnitMessage, UnitProcesses
 from trilane.pipeline.requests import FrameRequestQueue
 from trilane.pipeline.result import Failure
 from trilane.pipeline.signals import Interrupts
+from trilane.scheduler.causes import Outcome, OutcomeKind
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import (
+    Abort,
     Action,
     Dispatch,
     Event,
-    Finish,
     Graph,
     Job,
     JobDone,
@@ -38,7 +39,6 @@ from trilane.scheduler.events import (
 )
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.recording import Recording
-from trilane.scheduler.state import NEVER
 from trilane.transport.job_pipe import PACKETS
 from trilane.transport.messages import (
     Alive,
@@ -157,7 +157,7 @@ class RealtimeDriver:
     def measure_again(self, frames: list[int]) -> None:
         """The same after the run, so that a machine that grew slower or faster weighs on both sides; what goes
         wrong here leaves the run's result as it is."""
-        if self.failure or not all(unit.alive for unit in self.core.units.values()):
+        if self.failure or not all(unit.is_ready for unit in self.core.units.values()):
             return
         try:
             self.measure_alone(frames)
@@ -192,8 +192,8 @@ class RealtimeDriver:
 
     # the run
 
-    def run(self) -> str:
-        """Until the core finishes; returns its cause, or `aborted` after a second interrupt."""
+    def run(self) -> Outcome:
+        """Until the core finishes, which a second interrupt makes it do at once."""
         events: list[Event] = [UnitReady(unit) for unit in self._graph.units]
         if self._inlet is not None:
             self._inlet.is_open.set()
@@ -210,16 +210,14 @@ class RealtimeDriver:
                 self._perform(now_ns, action)
             self._book()
             self.recording.steps.append((now_ns, tuple(events), decision.actions))
-            if self.core.finished:
+            if self.core.outcome is not None:
                 self._progress(final=True)
-                return self._cause(decision.actions)
-            if self._interrupts.count > 1:
-                return self._abort()
+                return self._explained(self.core.outcome)
             self._progress()
             events = self._wait(decision.next_deadline_ns)
 
-    def _wait(self, deadline_ns: int | None) -> list[Event]:
-        until_ns = min(self._ping_ns, NEVER if deadline_ns is None else deadline_ns)
+    def _wait(self, deadline_ns: int) -> list[Event]:
+        until_ns = min(self._ping_ns, deadline_ns)
         if self._governor is not None:
             until_ns = min(until_ns, self._governor.due_ns)
         timeout_ms = max(0, -((time.monotonic_ns() - until_ns) // 1_000_000))
@@ -228,6 +226,8 @@ class RealtimeDriver:
             self._stop_told = True
             self._say("interrupted: the frames in flight are finished; interrupt again to end at once")
             events.append(Stop())
+        if self._interrupts.count > 1:
+            events.append(Abort())
         if self._inlet is not None:
             events += self._inlet.events()
         now_ns = time.monotonic_ns()
@@ -240,7 +240,7 @@ class RealtimeDriver:
     def _ping(self, now_ns: int) -> list[Event]:
         """FrameRequest the units that do not work whether they live; the others are heard of when their job ends."""
         self._ping_ns = now_ns + PING_NS
-        asked = [unit.name for unit in self.core.units.values() if unit.alive and not unit.queue and not unit.pinged_ns]
+        asked = [unit.name for unit in self.core.units.values() if unit.awaits_nothing]
         for unit in asked:
             self._processes.send(unit, Ping())
         return [Pinged(unit) for unit in asked]
@@ -299,17 +299,10 @@ class RealtimeDriver:
         elif isinstance(action, Start):
             self._start(action.unit)
 
-    def _cause(self, actions: tuple[Action, ...]) -> str:
-        cause = next(action.cause for action in actions if isinstance(action, Finish))
-        if cause in self._graph.units and self.failure is None:
-            self.failure = Failure(f"unit {cause} could not be kept alive{self._last_words(cause)}")
-        return cause
-
-    def _abort(self) -> str:
-        for frame in list(self.core.frames):
-            self.core.lose(frame, "aborted")
-        self.core.finish("aborted")
-        return "aborted"
+    def _explained(self, outcome: Outcome) -> Outcome:
+        if outcome.kind == OutcomeKind.GAVE_UP and self.failure is None:
+            self.failure = Failure(f"unit {outcome.unit} could not be kept alive{self._last_words(outcome.unit)}")
+        return outcome
 
     # after the run
 

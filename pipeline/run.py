@@ -11,6 +11,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 from trilane.errors import BadInputError
+from trilane.hw_profiles.application import application_graph
 from trilane.hw_profiles.governor import Governor
 from trilane.pipeline.processes import UnitProcesses, check_open_files
 from trilane.pipeline.realtime import RealtimeDriver
@@ -18,7 +19,8 @@ from trilane.pipeline.requests import FrameRequestQueue
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.signals import Interrupts
 from trilane.pipeline.unit_loop import EdgeSpec
-from trilane.scheduler.events import Graph, Settings, avatar_graph
+from trilane.scheduler.causes import OutcomeKind
+from trilane.scheduler.events import Graph, Settings
 from trilane.scheduler.policy import policy_named
 from trilane.scheduler.stats import energy_score
 from trilane.stages.config import RunConfig
@@ -83,11 +85,11 @@ def run_pipeline(
         pids = processes.pids
         sample = _spread(settings.frames, max(isolate_frames, 1))
         driver.measure_alone(sample[::2])
-        cause = driver.run()
-        if sample[1::2] and cause == "done":
+        outcome = driver.run()
+        if sample[1::2] and outcome.kind == OutcomeKind.DONE:
             driver.measure_again(sample[1::2])
         pids = {**pids, **processes.pids}
-        if cause != "aborted":
+        if outcome.kind != OutcomeKind.ABORTED:
             driver.close()
     requested = settings.frames if inlet is None else driver.core.source.released
     target_ns = 0 if settings.deadline_ns else round(1e9 / config.scene.fps)
@@ -108,15 +110,15 @@ def run_pipeline(
         report=report,
         requested=requested,
         presented=len(driver.core.ledger.presented_ns),
-        lost=dict(driver.core.ledger.lost),
-        dropped=dict(driver.core.ledger.dropped),
+        lost=driver.core.ledger.lost_by_cause,
+        dropped=driver.core.ledger.dropped_by_cause,
         pids=pids,
         startup_ms=driver.startup_ms,
         jobs=tuple(driver.jobs),
         recording=driver.recording,
         figures={stage: _means(driver, stage) for stage in driver.figures},
         messages=tuple(driver.messages),
-        interrupted=cause in ("stopped", "aborted") and interrupts.count > 0,
+        interrupted=outcome.kind in (OutcomeKind.STOPPED, OutcomeKind.ABORTED) and interrupts.count > 0,
         failure=driver.failure,
     )
 
@@ -150,7 +152,7 @@ def _plan(
         deadline_ns=DEADLINE_PERIODS * period_ns,
         hang_ns=hang_ns,
     )
-    return avatar_graph(edge, zip(config.infer_names, config.infer_units, strict=True)), settings
+    return application_graph(edge, zip(config.infer_names, config.infer_units, strict=True)), settings
 
 
 def _spread(frames: int, count: int) -> list[int]:
