@@ -16,11 +16,11 @@ import numpy as np
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.reshape import reshaped
 from trilane.errors import BadInputError
-from trilane.hw_profiles.application import Plan, stage_times_ms
+from trilane.hw_profiles.application import Plan, application_graph, stage_times_ms
 from trilane.hw_profiles.corners import corners_of
 from trilane.hw_profiles.cost import Network, walk
 from trilane.hw_profiles.load import load_runnable
-from trilane.scheduler.events import Settings, avatar_graph
+from trilane.scheduler.events import Settings
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.virtual import simulate
 from trilane.stages.config import RunConfig
@@ -87,7 +87,7 @@ def compare(pace: Pace, policy: str, frames: int, jobs: Sequence[JobRecord]) -> 
 
 def _virtual_ms(pace: Pace, policy: str, frames: int) -> float:
     """Median time between presented frames of the same run in virtual time."""
-    result = simulate(avatar_graph(), Settings(frames, policy), lambda stage, *_: pace.stage_ns[stage], keep=True)
+    result = simulate(application_graph(), Settings(frames, policy), lambda stage, *_: pace.stage_ns[stage], keep=True)
     return float(np.median(np.diff(_presented(result.jobs)[1]))) / 1e6
 
 

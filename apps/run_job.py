@@ -22,7 +22,6 @@ from trilane.pipeline.result import RunResult
 from trilane.pipeline.signals import Interrupts
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.stages.avatar_pipeline import run_avatar
-from trilane.stages.config import RunConfig
 from trilane.stages.configure import Checked
 
 BASELINE_POLICY = "sequential"

@@ -16,8 +16,9 @@ import numpy as np
 
 from trilane.compiled import form
 from trilane.errors import BadInputError, TrilaneError
+from trilane.hw_profiles.application import application_graph
 from trilane.install import install_line
-from trilane.scheduler.events import Graph, Settings, avatar_graph
+from trilane.scheduler.events import Graph, Settings
 from trilane.scheduler.recording import read, replay
 from trilane.scheduler.virtual import Service, VirtualDriver, simulate
 
@@ -43,7 +44,7 @@ def measure(minutes: float = 30.0, turns: int = 3, seeds: int = 10, events: str 
         raise BadInputError("bench scheduler", f"minutes {minutes:g}, turns {turns}, seeds {seeds}", "positive numbers")
     replayed = _replayed(events) if events else {}
     frames = max(2, round(minutes * 60 * FPS))
-    graph, service = avatar_graph(), _service(0, frames)
+    graph, service = application_graph(), _service(0, frames)
     ways: dict[str, Callable[[], list[int]]] = {"trilane": lambda: _trilane(graph, service, frames)}
     absent = _add_simpy(ways, graph, service, frames)
     seconds: dict[str, list[float]] = {way: [] for way in ways}
@@ -127,7 +128,7 @@ def _traces(seed: int) -> list[str]:
     for _ in range(REPEATS):
         faults = [(1_000 * MS + seed * 7 * MS, "dsp")]
         done = simulate(
-            avatar_graph(), settings, _service(seed, SEED_FRAMES), restart_ns=50 * MS, faults=faults, keep=True
+            application_graph(), settings, _service(seed, SEED_FRAMES), restart_ns=50 * MS, faults=faults, keep=True
         )
         assert done.recording is not None
         found.append(hashlib.sha256(repr((done.recording.steps, done.report)).encode()).hexdigest())

@@ -9,7 +9,7 @@ unit.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -20,11 +20,11 @@ from trilane.hw_profiles.cost import CLASSES, Network, Work
 from trilane.hw_profiles.networks import CHANNELS_PER_PASS
 from trilane.hw_profiles.roofline import JobTime, job_time, machine_of
 from trilane.hw_profiles.schema import Profile, Unit
-from trilane.scheduler.events import Graph, Settings, StageSpec
+from trilane.scheduler.events import Graph, Settings, chain
 from trilane.scheduler.policy import POLICIES
 from trilane.scheduler.virtual import simulate
 from trilane.unexpected import UnexpectedValue
-from trilane.units import UNITS, UnitName
+from trilane.units import AFTER_INFER, BEFORE_INFER, INFER, LATENCY_TO, UNITS, UnitName
 
 RUNTIMES: tuple[UnitName, ...] = ("gpu", "dsp")
 PACKED_BYTES_PER_PIXEL = 16
@@ -133,11 +133,16 @@ class Steady:
     idle: Mapping[str, Mapping[str, float]]
 
 
+def application_graph(edge: str = "double", infer: Iterable[tuple[str, str]] = (INFER,)) -> Graph:
+    """The avatar's pipeline, every edge with the same rule. `infer`: the network's stages and their units."""
+    return chain((*BEFORE_INFER, *infer, *AFTER_INFER), edge, LATENCY_TO)
+
+
 @lru_cache(maxsize=4096)
 def _settled(times: tuple[tuple[str, UnitName, int], ...], way: Way, display_ns: int, quick: bool) -> tuple[Any, bool]:
     """Report of a run of `times`, and whether the display held it back."""
-    stages = tuple(StageSpec(name, unit) for name, unit, _ in times)
-    graph = Graph(stages, (way.edge,) * (len(stages) - 1), "composite")
+    infer = [(name, unit) for name, unit, _ in times[len(BEFORE_INFER) : -len(AFTER_INFER)]]
+    graph = application_graph(way.edge, infer)
     service = {name: ns for name, _, ns in times}
     paced = POLICIES[way.policy].paced
     regular = way.edge in ("single", "double") and not paced

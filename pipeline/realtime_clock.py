@@ -16,6 +16,7 @@ from trilane.pipeline.signals import Interrupts
 from trilane.pipeline.unit_processes import UnitMessage, UnitProcesses
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import (
+    NEVER,
     Abort,
     Action,
     Dispatch,
@@ -34,7 +35,6 @@ from trilane.scheduler.events import (
     UnitReady,
 )
 from trilane.scheduler.ledger import JobRecord
-from trilane.scheduler.state import NEVER
 from trilane.transport import messages
 from trilane.transport.messages import Done, Failed, Ping, Ready, RunJob
 
@@ -150,7 +150,7 @@ class RealtimeClock:
     def _ping(self, now_ns: int) -> list[Event]:
         """Ask idle units whether they live; a busy one is heard of when its job ends."""
         self._ping_ns = now_ns + PING_NS
-        units = self._core.units_to_ping()
+        units = [unit.name for unit in self._core.units.values() if unit.awaits_nothing]
         for unit in units:
             self._processes.send(unit, Ping())
         return [Pinged(unit) for unit in units]

@@ -29,8 +29,8 @@ from trilane.scheduler.loop import run_loop
 from trilane.scheduler.policy import policy_named
 from trilane.scheduler.recording import Recording
 from trilane.scheduler.stats import energy_score
-from trilane.unexpected import UnexpectedValue
 from trilane.transport.wakeup import DEFAULT, SHORTEST_NS, awake, use_slice
+from trilane.unexpected import UnexpectedValue
 
 DEADLINE_PERIODS = 3  # from a frame's release until it must be presented
 HANG_NS = 10_000_000_000
@@ -181,7 +181,7 @@ class _Run:
 
         What goes wrong here leaves the run's result as it is.
         """
-        if self._log.failure or not self._core.all_ready():
+        if self._log.failure or not all(unit.is_ready for unit in self._core.units.values()):
             return
         try:
             self.isolated.measure(frames)

@@ -1,7 +1,8 @@
-"""When a frame can be presented at the earliest. Rule: a bound: no frame is given up that could be in time.
+"""The earliest time at which a frame can be presented: the bound on its completion. Rule: never later than it can be,
+so that no frame is given up that could be in time.
 
-The bound holds as far as service times are what they were lately: older frames go first at every stage, so a frame
-waits at each for their work there, or arrives after its own work before it, whichever is later.
+It is a lower bound as far as service times are what they were lately. At every stage older frames go first: a frame
+begins there after their work at that stage, or after its own work at the stages before, whichever ends later.
 """
 
 from __future__ import annotations
@@ -14,9 +15,15 @@ from trilane.scheduler.state import FrameState, StageState
 def earliest_completion_ns(
     now_ns: int, frame: int, position: int, stages: Sequence[StageState], frames: Mapping[int, FrameState]
 ) -> int:
-    """End of the last stage for `frame`, whose next stage is at `position`.
+    """The bound for the end of the last stage of `frame`.
 
-    max over s >= position of [ max(own work before s, work of older frames at s) + own work from s on ].
+    `now_ns`: the time.
+    `frame`: its number; frames with smaller numbers are older.
+    `position`: of its next stage in the chain.
+    `stages`: the chain, with the estimates of service times.
+    `frames`: those in flight, by number.
+
+    It is now + max over s >= position of [ max(own work before s, work of older frames at s) + own work from s on ].
     """
     older = [0] * len(stages)
     for number, state in frames.items():

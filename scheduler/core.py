@@ -1,38 +1,62 @@
 """The scheduler: which job runs where, and when. Rule: pure; it knows the time only from `step`, and does no I/O.
 
-Each step takes events in, moves slots and frames, hands jobs to units that can hold one more, and answers with
-actions and with the time at which it wants to be asked again. The same events give the same actions.
+Theory of operation. A driver calls `step` with the time and what has happened since (events); it answers with what to
+do now (actions) and with the time at which it wants to be asked again. The same steps give the same answers, so a run
+is replayed from its events alone. One step: (1) each event moves slots, frames and units; (2) when the alarm has gone
+off, units whose deadline or hold is over are killed, started again or let work; (3) the source releases what is due;
+(4) every dirty unit is handed jobs until its queue is full or nothing can run; (5) with no frame in flight and none to
+come, the run is finished.
+
+Slots. Between two stages lies an edge with a fixed number of slots (transport/slots.py). A job holds its input slot
+and its output slot from dispatch until it is done, so a stage can begin only when a frame waits before it and a slot is
+free behind it. That is all that holds back the stages before a slow one.
+
+Dirty units. A step looks only at units for which something has changed: the unit's own job ended, a frame came to one
+of its stages, a slot got free behind one, its life or duty changed. Whoever changes such a thing calls `mark_dirty`;
+a dispatch may make a unit dirty that this step has already looked at, and it is looked at again.
+
+The alarm is a time before which no unit's deadline or hold can be over (watchdog.py). It is found by asking all units
+only when it has gone off or was reset: events that put a deadline off leave it as it is, to be found too early.
+
+Dispatch ahead and leading. A unit holds its next job while one runs, so that no message delay lies between them. A
+policy that wants the newest frame hands the next job over only `lead_ns` before the running one should end. Latching
+is the same for the first stage: it begins so late that its pose is new when the second stage can take it.
 """
 
 from __future__ import annotations
 
 from trilane.scheduler import watchdog
-from trilane.scheduler.completion import earliest_completion_ns
+from trilane.scheduler.assignment import Assignment
+from trilane.scheduler.causes import Drop, DropCause, Loss, LossKind, Outcome, OutcomeKind
+from trilane.scheduler.choice import Choice
 from trilane.scheduler.events import (
+    NEVER,
+    Abort,
     Action,
     Decision,
-    Dispatch,
     Event,
     Finish,
     FrameRequest,
     Graph,
-    Job,
     JobDone,
     JobFailed,
+    Kill,
     Pinged,
     Pong,
     SchedulerStalled,
     SetDuty,
     Settings,
+    Start,
     Stop,
     UnitDied,
     UnitReady,
 )
+from trilane.scheduler.flow import Flow
 from trilane.scheduler.frame_source import Source
-from trilane.scheduler.ledger import ASSIGNED, BLOCKED, STARVED, THROTTLED, Ledger
-from trilane.scheduler.policy import Candidate, policy_named
-from trilane.scheduler.state import FULL_DUTY, NEVER, FrameState, StageState, UnitState, build
-from trilane.transport.slots import READING, EdgeSlots
+from trilane.scheduler.ledger import Ledger
+from trilane.scheduler.policy import policy_named
+from trilane.scheduler.state import FULL_DUTY, UnitState
+from trilane.scheduler.unit_life import READY, STOPPING, DeadlinePassed
 
 
 class Core:
@@ -40,341 +64,219 @@ class Core:
 
     def __init__(self, graph: Graph, settings: Settings) -> None:
         self.graph, self.settings = graph, settings
-        self.policy = policy_named(settings.policy)
-        if self.policy.paced and not (settings.period_ns or settings.arrivals_ns or settings.asked):
-            raise ValueError(f"policy {settings.policy!r} needs a period, arrivals or somebody who asks")
-        self.stages, self.units, self.edges = build(graph)
-        self.stage_named = {stage.name: stage for stage in self.stages}
+        self.policy = policy = policy_named(settings.policy)
+        if policy.paced and not (settings.period_ns or settings.arrivals_ns or settings.asked):
+            raise ValueError(f"policy {settings.policy!r} needs a period, arrivals or frame requests")
         self.ledger = Ledger(graph)
-        self.source = Source(settings, self._drop_at_source)
-        self.frames: dict[int, FrameState] = {}
+        self.source = Source(settings, self._count_drop_at_source)
+        self.flow = Flow(graph, self.ledger, policy.newest or policy.drop_late)
+        self.stages, self.units, self.frames = self.flow.stages, self.flow.units, self.flow.frames
+        self.choice = Choice(settings, policy, self.stages, self.source, self.frames)
+        self.assignment = Assignment(policy, settings.hang_ns, self.flow, self.source, self.choice, self.ledger)
+        self.mark_dirty = self.flow.mark_dirty
         self.actions: list[Action] = []
-        self.now_ns = 0
+        self.now_ns = self.alarm_ns = 0
         self.started = self.finished = self.stopping = False
-        limits = [limit for limit in (settings.in_flight, self.policy.in_flight) if limit]
-        self._in_flight = min(limits, default=0)
-        self._latency_position = self.stage_named[graph.latency_to].position
-        self._leads = self.policy.lead_ns is not None
-        self._drops = self.policy.newest or self.policy.drop_late
-        self._latches = settings.latch_ns > 0 and len(self.stages) > 1
-        self._estimates = self._leads or self.policy.drop_late or self._latches
-        self._jobs = 0
-        self.alarm_ns = 0
-        self._touched: list[UnitState] = []
-        self.touch = self._touched.append  # something changed for the unit: look at it in this step
+        self.outcome: Outcome | None = None
+        self._stage_named = self.flow.stage_named
+        self._latency_position = self._stage_named[graph.latency_to].position
+        self._hang_ns, self._lead_ns, self._latches = settings.hang_ns, policy.lead_ns, self.choice.latches
+        self._estimates = self._lead_ns > 0 or policy.drop_late or self._latches
         self._handlers = {
             UnitReady: self._on_ready,
             JobDone: self._on_done,
             JobFailed: self._on_failed,
             UnitDied: self._on_died,
             Pinged: self._on_pinged,
-            Pong: self._on_beat,
-            SchedulerStalled: self._on_away,
+            Pong: self._on_pong,
+            SchedulerStalled: self._on_stalled,
             SetDuty: self._on_duty,
             Stop: self._on_stop,
-            FrameRequest: self._on_ask,
+            FrameRequest: self._on_request,
+            Abort: self._on_abort,
         }
 
     def step(self, now_ns: int, events: tuple[Event, ...] = ()) -> Decision:
-        """Tell the core what happened and what time it is; times never go back."""
+        """Tell the core what happened and what time it is; times never go back. Nothing is heard after the finish.
+
+        Raises KeyError for a unit that there is not, UnitLifeError for an event that cannot happen to a unit now.
+        """
         self.now_ns = now_ns
         self.actions = []
         for event in events:
+            if self.finished:
+                break
             self._handlers[type(event)](event)  # type: ignore[operator]
-        if not self.finished and (now_ns >= self.alarm_ns or self._leads):
-            watchdog.check_clocks(self)
+        if not self.finished and (now_ns >= self.alarm_ns or self._lead_ns):
+            self._check_units()
         if self.started and not self.finished:
             if self._latches:
-                self.touch(self.stages[0].unit)
+                self.mark_dirty(self.stages[0].unit)
             if now_ns >= self.source.due_ns and self.source.advance(now_ns):
-                self.touch(self.stages[0].unit)
-            self._assign()
+                self.mark_dirty(self.stages[0].unit)
+            before = len(self.actions)
+            self.assignment.assign(now_ns, self.actions)
+            if len(self.actions) > before:
+                self._set_alarm(now_ns + self._hang_ns)  # a job that was handed out now may be late then
             if not self.frames and self.source.exhausted:
-                self.finish("stopped" if self.stopping else "done")
-        return Decision(tuple(self.actions), None if self.finished else self._next_deadline())
+                self._finish(Outcome(OutcomeKind.STOPPED if self.stopping else OutcomeKind.DONE))
+        return Decision(tuple(self.actions), NEVER if self.finished else self._next_deadline())
 
-    def reset_alarm(self) -> None:
-        """A unit's clock was set: this step's answer looks at all of them again."""
+    def _next_deadline(self) -> int:
+        if self._lead_ns or self.alarm_ns <= self.now_ns:
+            self.alarm_ns = watchdog.next_alarm_ns(self.units.values(), self.now_ns, self._lead_ns)
+        next_ns = self.source.due_ns
+        if self.alarm_ns < next_ns:
+            next_ns = self.alarm_ns
+        if self._latches and not self.source.is_empty:
+            latch_ns = self.choice.latch_from_ns(self.now_ns)
+            if self.now_ns < latch_ns < next_ns:
+                return latch_ns
+        return next_ns
+
+    def _reset_alarm(self) -> None:
+        """A deadline or a hold was set: this step asks all units again."""
         self.alarm_ns = 0
 
     def _set_alarm(self, at_ns: int) -> None:
         if at_ns < self.alarm_ns:
             self.alarm_ns = at_ns
 
-    def finish(self, cause: str) -> None:
-        self.finished = True
+    def _finish(self, outcome: Outcome) -> None:
+        self.finished, self.outcome = True, outcome
         self.ledger.close(self.now_ns)
-        self.actions.append(Finish(cause))
+        self.actions.append(Finish(outcome))
 
-    def lose(self, frame: int, cause: str) -> None:
-        del self.frames[frame]
-        self.ledger.lost[cause] += 1
-        self.touch(self.stages[0].unit)
+    def _finish_at_once(self, loss: Loss, outcome: Outcome) -> None:
+        for frame in list(self.frames):
+            self.flow.mark_lost(frame, loss)
+        self._finish(outcome)
 
-    # events
+    def _count_drop_at_source(self, cause: DropCause) -> None:
+        self.ledger.dropped[Drop(f"source->{self.graph.stages[0].name}", cause)] += 1
 
-    def _on_ready(self, event: UnitReady) -> None:
-        unit = self.units[event.unit]
-        unit.alive, unit.starting_ns, unit.pinged_ns = True, None, 0
-        unit.set_room(self.now_ns)
-        self.reset_alarm()
-        self.touch(unit)
-        if not self.started and all(other.alive for other in self.units.values()):
-            self.started = True
-            self.ledger.start(self.now_ns)
-            self.source.start(self.now_ns)
+    # events of jobs
 
     def _on_done(self, event: JobDone) -> None:
         name, job_id, begin_ns, end_ns, pose_ns = event
         unit = self.units[name]
         if not unit.queue or unit.queue[0].id != job_id:
-            return
+            return  # it was lost with the process that did it
         job = unit.queue.popleft()
-        unit.head_since_ns, unit.pinged_ns = self.now_ns, 0
+        self._begin_next(unit)
         unit.failures = 0
-        stage, frame = self.stage_named[job.stage], self.frames[job.frame]
+        stage, frame = self._stage_named[job.stage], self.frames[job.frame]
         service_ns = end_ns - begin_ns
         self.ledger.job(job, frame.ready_ns, begin_ns, end_ns)
         if self._estimates:
             stage.learn(service_ns)
         if unit.duty < FULL_DUTY:
             unit.hold_until_ns = end_ns + service_ns * (FULL_DUTY - unit.duty) // unit.duty
-            unit.set_room(self.now_ns)
-            self.reset_alarm()
+            unit.update_queue_capacity()
+            self._reset_alarm()
         position = stage.position
         frame.ready_ns, frame.position = end_ns, position + 1
         if position == 0:
             frame.pose_ns = pose_ns
         if position == self._latency_position:
             frame.latency_ns = end_ns - frame.pose_ns
-        self.touch(unit)
-        self._pass_on(stage, job, end_ns)
+        self.mark_dirty(unit)
+        self.flow.pass_on(stage, job, end_ns)
 
-    def _pass_on(self, stage: StageState, job: Job, end_ns: int) -> None:
-        source, sink = stage.input, stage.output
-        if source is not None:
-            if not source.free:
-                self.touch(self.stages[stage.position - 1].unit)
-            source.release(job.slot_in)
-        if sink is not None:
-            replaced = sink.commit(job.slot_out)
-            if replaced:
-                self._drop_all(replaced, stage.position)
-            if len(sink.ready) == 1 or self._drops:
-                self.touch(self.stages[stage.position + 1].unit)
-        else:
-            frame = self.frames.pop(job.frame)
-            self.ledger.presented(job.frame, end_ns, frame.latency_ns, frame.deadline_ns)
-            self.touch(self.stages[0].unit)
+    def _begin_next(self, unit: UnitState) -> None:
+        """The unit's job is over, and the one that it holds, if any, begins."""
+        unit.head_since_ns = self.now_ns
+        unit.deadline_ns = self.now_ns + self._hang_ns if unit.queue and unit.life == READY else NEVER
 
     def _on_failed(self, event: JobFailed) -> None:
         unit = self.units[event.unit]
         if not unit.queue or unit.queue[0].id != event.job:
-            return
+            return  # it was lost with the process that did it
         job = unit.queue.popleft()
-        unit.head_since_ns, unit.pinged_ns = self.now_ns, 0
-        watchdog.free_slots(self, job)
-        self.lose(job.frame, f"failed:{job.stage}")
-        self.touch(unit)
+        self._begin_next(unit)
+        self.flow.free_slots(job)
+        self.flow.mark_lost(job.frame, Loss(LossKind.FAILED, job.stage))
+        self.mark_dirty(unit)
         self._on_stop(Stop())
 
+    # events of units, each by unit_life.py's table
+
+    def _on_ready(self, event: UnitReady) -> None:
+        unit = self.units[event.unit]
+        if not unit.move(UnitReady, NEVER):
+            return
+        unit.update_queue_capacity()
+        self._reset_alarm()
+        self.mark_dirty(unit)
+        if not self.started and all(other.life == READY for other in self.units.values()):
+            self.started = True
+            self.ledger.start(self.now_ns)
+            self.source.start(self.now_ns)
+
     def _on_died(self, event: UnitDied) -> None:
-        watchdog.on_died(self, self.units[event.unit])
+        """Plan the restart and reclaim the slots, or end the run when the unit fails too often."""
+        unit = self.units[event.unit]
+        loss = Loss(LossKind.HUNG if unit.life == STOPPING else LossKind.DIED, unit.name)
+        unit.move(UnitDied, self.now_ns + watchdog.back_off_ns(unit.failures + 1))
+        unit.failures += 1
+        unit.update_queue_capacity()
+        self._reset_alarm()
+        self.flow.reclaim(unit, loss)
+        self.mark_dirty(unit)
+        if unit.failures > self.settings.max_failures:
+            self._finish_at_once(Loss(LossKind.GAVE_UP, unit.name), Outcome(OutcomeKind.GAVE_UP, unit.name))
 
     def _on_pinged(self, event: Pinged) -> None:
-        self.units[event.unit].pinged_ns = self.now_ns
-        self._set_alarm(self.now_ns + self.settings.hang_ns)
+        unit = self.units[event.unit]
+        answer_by_ns = self.now_ns + self._hang_ns
+        if unit.move(Pinged, unit.deadline_ns if unit.queue else answer_by_ns):
+            self._set_alarm(answer_by_ns)
 
-    def _on_beat(self, event: Pong) -> None:
-        self.units[event.unit].pinged_ns = 0
-
-    def _on_away(self, event: SchedulerStalled) -> None:
-        for unit in self.units.values():
-            watchdog.extend_deadlines(unit, event.ns)
-        self.reset_alarm()
+    def _on_pong(self, event: Pong) -> None:
+        unit = self.units[event.unit]
+        unit.move(Pong, unit.deadline_ns if unit.queue else NEVER)
 
     def _on_duty(self, event: SetDuty) -> None:
         unit = self.units[event.unit]
         unit.duty = max(1, min(FULL_DUTY, event.permille))
-        unit.set_room(self.now_ns)
-        self.touch(unit)
+        unit.update_queue_capacity()
+        self.mark_dirty(unit)
+
+    def _check_units(self) -> None:
+        """Carry out what the watchdog says of each unit."""
+        for unit in self.units.values():
+            verdict = watchdog.verdict(unit, self.now_ns, self._lead_ns)
+            if verdict == watchdog.KILL:
+                unit.move(DeadlinePassed, NEVER)
+                unit.update_queue_capacity()
+                self.actions.append(Kill(unit.name))
+            elif verdict == watchdog.START:
+                unit.move(DeadlinePassed, self.now_ns + self.settings.start_ns)
+                unit.hold_until_ns = NEVER
+                self.ledger.restart(unit.name)
+                self.actions.append(Start(unit.name))
+            elif verdict == watchdog.RESUME:
+                unit.hold_until_ns = NEVER
+                unit.update_queue_capacity()
+                self.mark_dirty(unit)
+            elif verdict == watchdog.LOOK:
+                self.mark_dirty(unit)
+
+    # events of the run
+
+    def _on_stalled(self, event: SchedulerStalled) -> None:
+        for unit in self.units.values():
+            unit.deadline_ns = watchdog.extended_deadline_ns(unit, event.ns)
+            unit.head_since_ns += event.ns
+        self._reset_alarm()
 
     def _on_stop(self, _event: Stop) -> None:
         self.stopping = True
         self.source.stop()
 
-    def _on_ask(self, event: FrameRequest) -> None:
-        self.source.ask(event.frames, self.now_ns)
-        self.touch(self.stages[0].unit)
+    def _on_request(self, event: FrameRequest) -> None:
+        self.source.request(event.frames, self.now_ns)
+        self.mark_dirty(self.stages[0].unit)
 
-    # choice
-
-    def _assign(self) -> None:
-        touched = self._touched
-        for unit in touched:  # a dispatch may append to the list, also a unit that was looked at before
-            while len(unit.queue) < unit.room:
-                stage = self._choose(unit)
-                if stage is None:
-                    break
-                self._dispatch(unit, stage)
-        for unit in touched:
-            state = ASSIGNED if unit.queue else self._idle_state(unit)
-            if state != unit.state:
-                unit.state = state
-                self.ledger.enter(unit.name, self.now_ns, state)
-        touched.clear()
-
-    def ahead_ns(self, unit: UnitState) -> int:
-        """When a unit that runs a job may be handed its next one."""
-        if self.policy.lead_ns is None:
-            return 0
-        return unit.head_since_ns + self.stage_named[unit.queue[0].stage].estimate_ns - self.policy.lead_ns
-
-    def _choose(self, unit: UnitState) -> StageState | None:
-        if self._leads and unit.queue and self.now_ns < self.ahead_ns(unit):
-            return None
-        found: list[StageState] = []
-        for stage in unit.stages:
-            if self._drops:
-                self._give_up(stage)
-            source, sink = stage.input, stage.output
-            if source is None:
-                if self.source.is_empty or self._is_full() or self.now_ns < self._latch_from_ns():
-                    continue
-            elif not source.ready:
-                continue
-            if sink is None or sink.free or sink.can_claim():
-                found.append(stage)
-        if len(found) > 1:
-            return self.stages[self.policy.choose([self._candidate(stage) for stage in found]).position]
-        return found[0] if found else None
-
-    def _latch_from_ns(self) -> int:
-        """When the first stage may begin its next frame: not while one waits behind it, and just in time."""
-        if not self._latches:
-            return 0
-        first, second = self.stages[0], self.stages[1]
-        edge = first.output
-        if edge is not None and len(edge.free) + edge.state.count(READING) < edge.rule.slots:
-            return NEVER
-        queue = second.unit.queue
-        free_ns = second.unit.head_since_ns if queue else self.now_ns
-        for job in queue:
-            free_ns += self.stage_named[job.stage].estimate_ns
-        return free_ns - first.estimate_ns - self.settings.latch_ns
-
-    def _candidate(self, stage: StageState) -> Candidate:
-        """The frame that the stage would do next."""
-        edge = stage.input
-        if edge is None:
-            frame, release_ns = self.source.head(self.now_ns)
-            return Candidate(frame, stage.position, self._deadline_from(release_ns))
-        frame = edge.frame[edge.ready[0]]
-        return Candidate(frame, stage.position, self.frames[frame].deadline_ns)
-
-    def _is_full(self) -> bool:
-        """Whether as many frames are in flight as may be."""
-        return 0 < self._in_flight <= len(self.frames)
-
-    def _give_up(self, stage: StageState) -> None:
-        """Drop what waits for the stage and is stale or must be late."""
-        edge, policy = stage.input, self.policy
-        if edge is None:
-            if not self._is_full():
-                self._give_up_at_source()
-            return
-        if policy.newest:
-            while len(edge.ready) > 1:
-                self._drop_all([edge.drop(edge.ready[0])], stage.position - 1)
-        if policy.drop_late:
-            while edge.ready and self._is_late(self._candidate(stage)):
-                self._drop_all([edge.drop(edge.ready[0])], stage.position - 1, "late")
-
-    def _give_up_at_source(self) -> None:
-        if self.policy.newest:
-            self.source.keep_newest()
-        if self.policy.drop_late:
-            while self.source.queue and self._is_late(self._candidate(self.stages[0])):
-                self.source.drop_head("late")
-
-    def _is_late(self, waiting: Candidate) -> bool:
-        """Whether the frame must miss its deadline.
-
-        With nothing in flight the estimates alone are to blame; they are lowered, so that one slow measurement
-        cannot drop every frame for ever.
-        """
-        if not waiting.deadline_ns:
-            return False
-        end_ns = earliest_completion_ns(self.now_ns, waiting.frame, waiting.position, self.stages, self.frames)
-        if end_ns <= waiting.deadline_ns:
-            return False
-        if not self.frames:
-            for later in self.stages:
-                later.estimate_ns -= later.estimate_ns >> 4
-            self.reset_alarm()
-        return True
-
-    def _deadline_from(self, release_ns: int) -> int:
-        return release_ns + self.settings.deadline_ns if self.settings.deadline_ns else 0
-
-    def _dispatch(self, unit: UnitState, stage: StageState) -> None:
-        slot_in = slot_out = -1
-        if stage.input is None:
-            frame, release_ns = self.source.take(self.now_ns)
-            self.frames[frame] = FrameState(release_ns, self._deadline_from(release_ns))
-        else:
-            slot_in = stage.input.ready[0]
-            frame = stage.input.frame[slot_in]
-            stage.input.take(slot_in)
-        if stage.output:
-            slot_out, evicted = stage.output.claim(frame)
-            if evicted is not None:
-                self._drop_all([evicted], stage.position, "stale" if stage.output.rule.mailbox else "pool")
-        pool: EdgeSlots | None = stage.output or stage.input
-        job = Job(self._jobs, unit.name, stage.name, frame, slot_in, slot_out, pool.epoch if pool else 0)
-        self._jobs += 1
-        if not unit.queue:
-            unit.head_since_ns = self.now_ns
-            self._set_alarm(self.now_ns + self.settings.hang_ns)
-        unit.queue.append(job)
-        self.actions.append(Dispatch(job))
-
-    # counts
-
-    def _drop_all(self, frames: list[int], edge: int, cause: str = "stale") -> None:
-        for frame in frames:
-            del self.frames[frame]
-            self.ledger.dropped[f"{self.graph.edge_name(edge)}:{cause}"] += 1
-            self.touch(self.stages[edge].unit)
-            self.touch(self.stages[0].unit)
-
-    def _drop_at_source(self, _frame: int, cause: str) -> None:
-        self.ledger.dropped[f"source->{self.stages[0].name}:{cause}"] += 1
-
-    def _idle_state(self, unit: UnitState) -> int:
-        """Why a unit without a job has none."""
-        if not unit.alive:
-            return ASSIGNED
-        found = STARVED
-        for stage in unit.stages:
-            if stage.input is None:
-                if self.source.is_empty:
-                    continue
-                if self._is_full() or self.now_ns < self._latch_from_ns():
-                    return BLOCKED
-            elif not stage.input.ready:
-                continue
-            if stage.output and not stage.output.can_claim():
-                return BLOCKED
-            found = THROTTLED
-        return found
-
-    def _next_deadline(self) -> int | None:
-        if self._leads or self.alarm_ns <= self.now_ns:
-            self.alarm_ns = watchdog.next_alarm_ns(self)
-        next_ns = self.source.due_ns
-        if self.alarm_ns < next_ns:
-            next_ns = self.alarm_ns
-        if self._latches and not self.source.is_empty and self.now_ns < (latch_ns := self._latch_from_ns()) < next_ns:
-            next_ns = latch_ns
-        return None if next_ns == NEVER else next_ns
+    def _on_abort(self, _event: Abort) -> None:
+        self._finish_at_once(Loss(LossKind.ABORTED), Outcome(OutcomeKind.ABORTED))

@@ -1,13 +1,18 @@
-"""What the core is told (events) and what it answers (actions). Rule: plain tuples of numbers and short strings.
+"""Events, which the core takes in, and actions, which it answers with. Rule: plain tuples of numbers and short strings.
 
-All times are integer nanoseconds of the driver's clock. Slots are -1 where a stage has no such edge.
+All times are integer nanoseconds of the driver's clock, from 0 on. There is one notation for a time that will not come
+or is not set, here and in every file of the scheduler: NEVER. Slots are -1 where a stage has no such edge.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Final, NamedTuple
+
+from trilane.scheduler.causes import Outcome
+
+NEVER: Final = (1 << 62) - 1  # ns; the largest integer that mypyc keeps unboxed
 
 from trilane.unexpected import UnexpectedValue
 
@@ -41,7 +46,7 @@ class JobDone(NamedTuple):
 
 
 class JobFailed(NamedTuple):
-    """A stage raised; the unit lives."""
+    """A stage raised an error; the unit lives."""
 
     unit: str
     job: int
@@ -54,19 +59,19 @@ class UnitDied(NamedTuple):
 
 
 class Pinged(NamedTuple):
-    """A unit without work was asked whether it lives."""
+    """A unit without a job was sent a ping, and must answer with `Pong`."""
 
     unit: str
 
 
 class Pong(NamedTuple):
-    """The unit's answer."""
+    """The unit answered the ping: it lives."""
 
     unit: str
 
 
 class SchedulerStalled(NamedTuple):
-    """Whoever runs the core did nothing for `ns` since the last step: units have as much longer to answer."""
+    """The driver did nothing for `ns` since the last step: units have as much longer to answer."""
 
     ns: int
 
@@ -83,9 +88,13 @@ class Stop(NamedTuple):
 
 
 class FrameRequest(NamedTuple):
-    """Somebody outside wants so many more frames, now."""
+    """So many more frames are wanted from outside, now."""
 
     frames: int
+
+
+class Abort(NamedTuple):
+    """End at once: every frame in flight is lost."""
 
 
 class Dispatch(NamedTuple):
@@ -107,23 +116,24 @@ class Start(NamedTuple):
 
 
 class Finish(NamedTuple):
-    """Every frame is accounted for. `cause`: `done`, `stopped`, or the unit that could not be kept alive."""
+    """The run is over, and every frame is accounted for."""
 
-    cause: str
+    outcome: Outcome
 
 
-Event = UnitReady | JobDone | JobFailed | UnitDied | Pinged | Pong | SchedulerStalled | SetDuty | Stop | FrameRequest
+UnitEvent = UnitReady | UnitDied | Pinged | Pong | SetDuty
+Event = JobDone | JobFailed | UnitEvent | SchedulerStalled | Stop | FrameRequest | Abort
 Action = Dispatch | Kill | Start | Finish
 
-EVENTS = (UnitReady, JobDone, JobFailed, UnitDied, Pinged, Pong, SchedulerStalled, SetDuty, Stop, FrameRequest)
+EVENTS = (UnitReady, JobDone, JobFailed, UnitDied, Pinged, Pong, SchedulerStalled, SetDuty, Stop, FrameRequest, Abort)
 ACTIONS = (Dispatch, Kill, Start, Finish)
 
 
 class Decision(NamedTuple):
-    """The core's answer: what to do now, and when to ask again at the latest (None: at the next event)."""
+    """The core's answer: what to do now, and when to ask again at the latest (NEVER: at the next event)."""
 
     actions: tuple[Action, ...]
-    next_deadline_ns: int | None
+    next_deadline_ns: int
 
 
 @dataclass(frozen=True)
@@ -158,15 +168,18 @@ class Graph:
         return f"{self.stages[index].name}->{self.stages[index + 1].name}"
 
 
-def avatar_graph(edge: str = "double", infer: Iterable[tuple[str, str]] = (("infer", "dsp"),)) -> Graph:
-    """The pipeline of DESIGN's data flow, every edge with the same rule. `infer`: stages and units of the network."""
-    names = (("pose", "cpu"), ("raster", "gpu"), *infer, ("composite", "gpu"), ("present", "cpu"))
-    return Graph(tuple(StageSpec(*name) for name in names), (edge,) * (len(names) - 1), "composite")
+def chain(stages: Iterable[tuple[str, str]], edge: str, latency_to: str) -> Graph:
+    """A graph of `stages`, each a name and its unit, all of whose edges have the same rule.
+
+    Raises ValueError for stages of one name, and when `latency_to` is none of them.
+    """
+    specs = tuple(StageSpec(name, unit) for name, unit in stages)
+    return Graph(specs, (edge,) * (len(specs) - 1), latency_to)
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What a run asks of the core. A time or a limit of 0 means none.
+    """What a run asks of the core. All `_ns` are lengths of time; a length or a limit of 0 means that there is none.
 
     `period_ns`: a frame is released every so often; 0: as soon as it can be taken.
     `arrivals_ns`: release times from the start, instead of a period.
@@ -177,7 +190,7 @@ class Settings:
     `in_flight`: frames between pose and presented.
     `in_queue`: released frames that may wait; more are turned away.
     `queue_timeout_ns`: the longest wait there.
-    `hang_ns`: the longest that a job may take, or that an idle unit may leave a question unanswered.
+    `hang_ns`: the longest that a job may take, or that an idle unit may leave a ping unanswered.
     `start_ns`: the longest that a unit may take to start.
     `max_failures`: in a row, without a finished job between them, after which a unit is given up.
     """

@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 
-from trilane.scheduler.events import Settings
-from trilane.scheduler.state import NEVER
+from trilane.scheduler.causes import DropCause
+from trilane.scheduler.events import NEVER, Settings
 
 
 class Source:
     """Frames 0..n-1. A released frame waits in `queue` until it is taken, turned away, or out of time.
 
-    Without a rate (no period, no arrivals, nobody who asks) a frame counts as released in the moment in which it can
-    be taken. `due_ns`: when the next frame is released or the oldest waiting one runs out of time. `is_empty`:
-    whether no frame can be taken now.
+    Without a rate (no period, no arrivals, no requests) a frame counts as released in the moment in which it can be
+    taken. `drop` is called with the cause of each frame that is dropped here. `due_ns`: when the next frame is
+    released or the oldest waiting one runs out of time. `is_empty`: whether no frame can be taken now.
     """
 
-    def __init__(self, settings: Settings, drop: Callable[[int, str], None]) -> None:
+    def __init__(self, settings: Settings, drop: Callable[[DropCause], None]) -> None:
         self._settings = settings
         self._drop = drop
         self._next = 0
@@ -29,6 +29,7 @@ class Source:
         self.is_empty = self._paced or not self._end
 
     def start(self, now_ns: int) -> None:
+        """The run begins: periods and arrivals count from here."""
         self._start_ns = now_ns
         self._set_due()
 
@@ -56,12 +57,13 @@ class Source:
             changed = True
         timeout = self._settings.queue_timeout_ns
         while timeout and self.queue and self.queue[0][1] + timeout <= now_ns:
-            self._drop(self.queue.popleft()[0], "timeout")
+            self.queue.popleft()
+            self._drop(DropCause.TIMEOUT)
             changed = True
         self._set_due()
         return changed
 
-    def ask(self, count: int, now_ns: int) -> None:
+    def request(self, count: int, now_ns: int) -> None:
         """Release `count` frames, or those that are left."""
         for frame in range(self._next, min(self._next + count, self._end)):
             self._admit(frame, now_ns)
@@ -73,12 +75,16 @@ class Source:
         return self.queue[0] if self.queue else (self._next, now_ns)
 
     def keep_newest(self) -> None:
+        """The others that wait are stale."""
         while len(self.queue) > 1:
-            self._drop(self.queue.popleft()[0], "stale")
+            self.queue.popleft()
+            self._drop(DropCause.STALE)
         self._set_due()
 
-    def drop_head(self, cause: str) -> None:
-        self._drop(self.queue.popleft()[0], cause)
+    def drop_late_head(self) -> None:
+        """The frame that has waited longest cannot be in time."""
+        self.queue.popleft()
+        self._drop(DropCause.LATE)
         self._set_due()
 
     def take(self, now_ns: int) -> tuple[int, int]:
@@ -94,7 +100,7 @@ class Source:
     def _admit(self, frame: int, release_ns: int) -> None:
         limit = self._settings.in_queue
         if limit and len(self.queue) >= limit:
-            self._drop(frame, "queue_full")
+            self._drop(DropCause.QUEUE_FULL)
         else:
             self.queue.append((frame, release_ns))
 

@@ -11,7 +11,8 @@ from collections.abc import Mapping
 from itertools import pairwise
 from typing import Any, NamedTuple
 
-from trilane.scheduler.events import Graph, Job
+from trilane.scheduler.causes import Drop, Loss
+from trilane.scheduler.events import NEVER, Graph, Job
 from trilane.scheduler.stats import NS_PER_MS, ema_range_ms, jitter_ms, real_time_score, summary_ms
 
 ASSIGNED, STARVED, BLOCKED, THROTTLED = range(4)
@@ -65,8 +66,8 @@ class Ledger:
         self._units = {unit: _UnitBook() for unit in graph.units}
         self._stages = {stage.name: _StageBook() for stage in graph.stages}
         self.start_ns = self.end_ns = 0
-        self.lost: Counter[str] = Counter()
-        self.dropped: Counter[str] = Counter()
+        self.lost: Counter[Loss] = Counter()
+        self.dropped: Counter[Drop] = Counter()
         self.presented_frames: list[int] = []
         self.presented_ns: list[int] = []
         self.latency_ns: list[int] = []
@@ -105,12 +106,22 @@ class Ledger:
         self._units[unit].restarts += 1
 
     def presented(self, frame: int, end_ns: int, latency_ns: int, deadline_ns: int) -> None:
-        """`deadline_ns`: 0 when the frame has none."""
+        """`deadline_ns`: NEVER when the frame has none."""
         self.presented_frames.append(frame)
         self.presented_ns.append(end_ns)
         self.latency_ns.append(latency_ns)
-        if deadline_ns:
+        if deadline_ns != NEVER:
             self.lateness_ns.append(end_ns - deadline_ns)
+
+    @property
+    def lost_by_cause(self) -> dict[str, int]:
+        """Frames lost, by the cause's key in the report."""
+        return dict(sorted((str(loss), count) for loss, count in self.lost.items()))
+
+    @property
+    def dropped_by_cause(self) -> dict[str, int]:
+        """Frames dropped, by the cause's key in the report."""
+        return dict(sorted((str(drop), count) for drop, count in self.dropped.items()))
 
     @property
     def frame_times_ns(self) -> list[int]:
@@ -124,7 +135,7 @@ class Ledger:
         target_period_ns: int = 0,
         isolated_ns: Mapping[str, float] | None = None,
     ) -> dict[str, Any]:
-        """The keys of report.json. `isolated_ns`: mean service time of each stage measured alone; efficiency is null
+        """The keys of report.json. `isolated_ns`: mean service time of each stage measured isolated; efficiency is null
         without it. `target_period_ns`: frame times above it count as deadline misses when frames have no deadline."""
         intervals = self.frame_times_ns
         span = self.presented_ns[-1] - self.presented_ns[0] if intervals else 0
@@ -135,8 +146,8 @@ class Ledger:
                 "requested": requested,
                 "presented": len(self.presented_ns),
                 "lost": sum(self.lost.values()),
-                "lost_by_cause": dict(sorted(self.lost.items())),
-                "dropped": dict(sorted(self.dropped.items())),
+                "lost_by_cause": self.lost_by_cause,
+                "dropped": self.dropped_by_cause,
             },
             "duration_s": (self.end_ns - self.start_ns) / 1e9,
             "frame_time_ms": {**summary_ms(intervals), **ema_range_ms(intervals), "jitter": jitter_ms(intervals)},
@@ -146,7 +157,7 @@ class Ledger:
             "xrbench": {
                 "real_time": real_time_score(late_ns),
                 "qoe": len(self.presented_ns) / requested if requested else 0.0,
-                "energy": None,  # who knows the power fills it in
+                "energy": None,  # filled in by a caller that knows the power
             },
             "stages": {stage.name: self._stage_row(stage.name, stage.unit) for stage in self._graph.stages},
             "units": {unit: book.shares() for unit, book in self._units.items()},
@@ -158,17 +169,17 @@ class Ledger:
         return {"unit": unit, "service_ms": summary_ms(book.service_ns), "wait_ms": summary_ms(book.wait_ns)}
 
     def _efficiency(self, isolated_ns: Mapping[str, float] | None, interval_ns: float) -> dict[str, Any]:
-        """Service time of the slowest unit, alone, over the mean interval between presented frames.
+        """Isolated service time of the slowest unit over the mean interval between presented frames.
 
-        A stage that was not measured alone (it writes files) counts with its mean in the run.
+        A stage that was not measured isolated (it writes files) counts with its mean in the run.
         """
         if not isolated_ns or not interval_ns:
             return {"efficiency": None, "isolated_ms": {}}
         per_unit: dict[str, float] = dict.fromkeys(self._units, 0.0)
         for stage in self._graph.stages:
             in_run = self._stages[stage.name].service_ns
-            alone = isolated_ns.get(stage.name)
-            per_unit[stage.unit] += alone if alone is not None else sum(in_run) / max(len(in_run), 1)
+            isolated = isolated_ns.get(stage.name)
+            per_unit[stage.unit] += isolated if isolated is not None else sum(in_run) / max(len(in_run), 1)
         return {
             "efficiency": max(per_unit.values()) / interval_ns,
             "bottleneck": max(per_unit, key=per_unit.__getitem__),

@@ -10,7 +10,7 @@ from trilane.unexpected import UnexpectedValue
 
 
 class Candidate(NamedTuple):
-    """A job that could start now. `position`: of its stage in the chain. `deadline_ns`: 0 when the frame has none."""
+    """A job that could start now. `position`: of its stage in the chain. `deadline_ns`: of its frame, or NEVER."""
 
     frame: int
     position: int
@@ -39,14 +39,14 @@ class Policy:
     `choose`: which of its runnable jobs a shared unit takes. `in_flight`: frames between admission and presented, 0
     for no limit of its own. `newest`: of the frames that wait for a stage the newest is taken, the others are stale.
     `drop_late`: a frame that cannot make its deadline is dropped before its next stage. `lead_ns`: how long before
-    the expected end of its job a unit is handed the next; None: at once. `paced`: frames need a release rate.
+    the expected end of its job a unit is handed the next; 0: as soon as there is one. `paced`: frames need a rate.
     """
 
     choose: Callable[[Sequence[Candidate]], Candidate]
     in_flight: int = 0
     newest: bool = False
     drop_late: bool = False
-    lead_ns: int | None = None
+    lead_ns: int = 0
     paced: bool = False
 
 

@@ -1,14 +1,16 @@
-"""What the core was told and what it answered. Rule: a replay gives the same actions, or says where not."""
+"""The steps of a run: events in, actions out. Rule: a replay gives the same actions, or says where it does not."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
+from enum import StrEnum
 from pathlib import Path
 from typing import Any, get_type_hints
 
 from trilane.errors import BadInputError
+from trilane.scheduler.causes import Outcome
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import (
     ACTIONS,
@@ -16,20 +18,23 @@ from trilane.scheduler.events import (
     Action,
     Dispatch,
     Event,
+    Finish,
     Graph,
     Job,
     Settings,
     StageSpec,
 )
+from trilane.scheduler.unit_life import UnitLifeError
 from trilane.unexpected import UnexpectedValue
 
-SCHEMA = 2
+SCHEMA = 3
+#: Actions that carry one tuple, which is written in their place.
+CARRIED: dict[Any, Any] = {Dispatch: Job, Finish: Outcome}
 
 
 def _forms(kinds: tuple[Any, ...]) -> dict[str, tuple[Any, list[Any]]]:
-    """Name -> what is made of a row, and the types of its fields; those of a dispatch are its job's."""
-    shaped = {kind: Job if kind is Dispatch else kind for kind in kinds}
-    return {kind.__name__: (kind, list(get_type_hints(shape).values())) for kind, shape in shaped.items()}
+    """Name -> the event or action, and the types of the fields of its row."""
+    return {kind.__name__: (kind, list(get_type_hints(CARRIED.get(kind, kind)).values())) for kind in kinds}
 
 
 _EVENTS, _ACTIONS = _forms(EVENTS), _forms(ACTIONS)
@@ -84,7 +89,7 @@ def read(path: Path) -> Recording:
 def replay(recording: Recording) -> Iterator[str]:
     """Feed the events to a fresh core; one sentence for every step that is answered differently.
 
-    Raises BadInputError for events of units or frames that there are not.
+    Raises BadInputError for events of units or frames that there are not, or that cannot happen to a unit then.
     """
     core = Core(recording.graph, recording.settings)
     for now_ns, events, actions in recording.steps:
@@ -92,24 +97,28 @@ def replay(recording: Recording) -> Iterator[str]:
             answer = core.step(now_ns, events).actions
         except KeyError as error:
             raise BadInputError(f"the recording at {now_ns} ns", str(error), "a unit and a frame of the run") from None
+        except UnitLifeError as error:
+            raise BadInputError(f"the recording at {now_ns} ns", str(error), "events that can follow") from None
         if answer != actions:
             yield f"at {now_ns} ns: recorded {actions}, replayed {answer}"
 
 
 def _row(item: Any) -> list[Any]:
-    fields = item.job if isinstance(item, Dispatch) else item
+    fields = item[0] if type(item) in CARRIED else item
     return [type(item).__name__, *fields]
 
 
 def _parse(row: list[Any], forms: dict[str, tuple[Any, list[Any]]]) -> Any:
-    """Raises UnexpectedValue for a name or for types of fields that none of `forms` has."""
+    """Raises UnexpectedValue for a name, for types of fields or for a kind of outcome that none of `forms` has."""
     name, *fields = row
     if name not in forms:
         raise UnexpectedValue(repr(str(name)[:80]), f"one of {', '.join(forms)}")
     kind, types = forms[name]
-    if [type(field) for field in fields] != types:
-        raise UnexpectedValue(str(row)[:80], f"fields of {', '.join(each.__name__ for each in types)}")
-    return Dispatch(Job(*fields)) if kind is Dispatch else kind(*fields)
+    written = [str if issubclass(each, StrEnum) else each for each in types]
+    if [type(field) for field in fields] != written:
+        raise UnexpectedValue(str(row)[:80], f"fields of {', '.join(each.__name__ for each in written)}")
+    values = [each(field) for each, field in zip(types, fields, strict=True)]
+    return kind(CARRIED[kind](*values)) if kind in CARRIED else kind(*values)
 
 
 def _graph(data: dict[str, Any]) -> Graph:

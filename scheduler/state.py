@@ -1,61 +1,92 @@
-"""What the core remembers of stages, units and frames. Rule: fields only; core.py and faults.py decide."""
+"""What the core remembers of stages, units and frames. Rule: fields and what follows from them; core.py decides.
+
+A time that is not set is NEVER.
+"""
 
 from __future__ import annotations
 
 from collections import deque
 
-from trilane.scheduler.events import Graph, Job
+from trilane.scheduler.events import NEVER, Graph, Job
 from trilane.scheduler.ledger import STARVED
+from trilane.scheduler.unit_life import IGNORED, READY, STARTING, state_after
 from trilane.transport.slots import EdgeSlots, edge_rule
 
 HELD_JOBS = 2  # the one that runs and the one dispatched ahead
 FULL_DUTY = 1000
-NEVER = 1 << 62  # ns
 
 
 class UnitState:
-    """`queue`: the running job, then the held one. `head_since_ns`: since when the first of them could run.
+    """`life`: its state by unit_life.py. `deadline_ns`: when what that state waits for is late.
 
-    `pinged_ns`: since when it was asked whether it lives, 0 when it has answered. `state`: the one that the ledger has
-    it in. `room`: how many jobs it may have, see `set_room`.
+    `queue`: the running job, then the one dispatched ahead. `queue_capacity`: how many jobs it may hold now, see
+    `update_queue_capacity`. `head_since_ns`: since when the running job could run. `hold_until_ns`: the end of the
+    pause that its duty asks for. `failures`: how often it died since it last ended a job. `account`: where the ledger
+    books its time now.
     """
 
     __slots__ = (
-        "alive",
+        "account",
+        "deadline_ns",
         "duty",
         "failures",
         "head_since_ns",
         "hold_until_ns",
-        "killing",
+        "life",
         "name",
-        "pinged_ns",
         "queue",
-        "restart_at_ns",
-        "room",
+        "queue_capacity",
         "stages",
-        "starting_ns",
-        "state",
     )
 
     def __init__(self, name: str) -> None:
         self.name = name
         self.stages: list[StageState] = []
         self.queue: deque[Job] = deque()
-        self.alive = self.killing = False
-        self.room = 0
-        self.head_since_ns = self.pinged_ns = self.hold_until_ns = 0
-        self.restart_at_ns: int | None = None
-        self.starting_ns: int | None = None
+        self.queue_capacity = 0
+        self.life: int = STARTING
+        self.deadline_ns: int = NEVER
+        self.hold_until_ns: int = NEVER
+        self.head_since_ns = 0
         self.failures = 0
         self.duty = FULL_DUTY
-        self.state = STARVED
+        self.account = STARVED
 
-    def set_room(self, now_ns: int) -> None:
-        """To be called when one of the fields was set that it depends on, and when a hold ends."""
-        if not self.alive or self.killing or self.hold_until_ns > now_ns:
-            self.room = 0
+    @property
+    def is_ready(self) -> bool:
+        """Whether its process is up and not being stopped."""
+        return self.life == READY
+
+    @property
+    def awaits_nothing(self) -> bool:
+        """Whether it is ready, has no job, and was not pinged: only a ping can tell whether it lives."""
+        return self.life == READY and not self.queue and self.deadline_ns == NEVER
+
+    def move(self, event: type, deadline_ns: int) -> bool:
+        """Take the table's row for `event`, from then on with `deadline_ns`; False: the event is ignored.
+
+        Raises UnitLifeError for an event that cannot happen now.
+        """
+        after = state_after(self.name, self.life, event)
+        if after == IGNORED:
+            return False
+        self.life, self.deadline_ns = after, deadline_ns
+        return True
+
+    def update_queue_capacity(self) -> None:
+        """To be called when `life`, `hold_until_ns` or `duty` was set, on which it depends."""
+        if self.life != READY or self.hold_until_ns != NEVER:
+            self.queue_capacity = 0
         else:
-            self.room = HELD_JOBS if self.duty == FULL_DUTY else 1
+            self.queue_capacity = HELD_JOBS if self.duty == FULL_DUTY else 1
+
+    def expected_end_ns(self) -> int:
+        """When the running job should end, by its stage's estimate. Raises IndexError when no job runs."""
+        name = self.queue[0].stage
+        for stage in self.stages:
+            if stage.name == name:
+                return self.head_since_ns + stage.estimate_ns
+        raise KeyError(name)
 
 
 class StageState:
@@ -70,7 +101,12 @@ class StageState:
         self.estimate_ns = 0
 
     def learn(self, service_ns: int) -> None:
+        """Take one more measured service time into the estimate."""
         self.estimate_ns += (service_ns - self.estimate_ns) >> 3 if self.estimate_ns else service_ns
+
+    def lower_estimate(self) -> None:
+        """By a sixteenth: it may rest on one slow job, and no job corrects it while every frame is given up."""
+        self.estimate_ns -= self.estimate_ns >> 4
 
 
 class FrameState:
@@ -88,7 +124,7 @@ class FrameState:
 
 
 def build(graph: Graph) -> tuple[list[StageState], dict[str, UnitState], list[EdgeSlots]]:
-    """States of a graph, joined up."""
+    """States of a graph, joined up. Raises ValueError for an unknown edge."""
     units = {name: UnitState(name) for name in graph.units}
     edges = [EdgeSlots(edge_rule(text)) for text in graph.edges]
     stages = []

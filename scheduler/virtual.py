@@ -11,11 +11,13 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from trilane.scheduler.causes import Outcome
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import (
+    NEVER,
+    Action,
     Dispatch,
     Event,
-    Finish,
     Graph,
     Job,
     JobDone,
@@ -26,27 +28,28 @@ from trilane.scheduler.events import (
     UnitReady,
 )
 from trilane.scheduler.ledger import JobRecord
+from trilane.scheduler.loop import run_loop
 from trilane.scheduler.recording import Recording
 
 #: (stage, unit, frame, begin_ns) -> service time in ns.
 Service = Callable[[str, str, int, int], int]
 
-FAULT, EVENT = 0, 1  # priority at equal times; being asked again comes after both
+FAULT, EVENT = 0, 1  # priority at equal times; the core's deadline comes after both
 
 
 @dataclass(frozen=True)
 class Simulation:
-    """What a simulated run hands back. `report` has the keys of report.json; `cause` is that of Finish."""
+    """What a simulated run hands back. `report` has the keys of report.json."""
 
     report: dict[str, Any]
     recording: Recording | None
     jobs: tuple[JobRecord, ...]
-    cause: str
+    outcome: Outcome
 
 
 @dataclass
 class _VirtualUnit:
-    """`up`: a process exists, starting or ready. `epoch` grows when it dies: what it would have said is void."""
+    """`up`: a process exists, starting or ready. `epoch` grows when it dies: events of an older epoch are void."""
 
     up: bool = True
     free_ns: int = 0
@@ -54,10 +57,7 @@ class _VirtualUnit:
 
 
 class VirtualDriver:
-    """Runs a core in simulated time.
-
-    `message_delay_ns`: of a message each way. `restart_ns`: a unit's start-up time.
-    """
+    """The clock of simulated time (loop.py), and the core that it runs."""
 
     def __init__(
         self,
@@ -71,17 +71,24 @@ class VirtualDriver:
         inputs: Iterable[tuple[int, Event]] = (),
         keep: bool = False,
     ) -> None:
-        """All times are `int`, those of `service` too (no NumPy integers). `faults`: (t_ns, unit) deaths.
-        `inputs`: (t_ns, event) from outside, such as SetDuty or Stop. `keep`: record steps and jobs.
-        Raises ValueError for an unknown policy or edge."""
+        """All times are `int`, those of `service` too (no NumPy integers).
+
+        `graph`, `settings`: of the core.
+        `service`: gives the service time of each job.
+        `message_delay_ns`: of a message, each way.
+        `restart_ns`: a unit's start-up time.
+        `faults`: (t_ns, unit), deaths of units.
+        `inputs`: (t_ns, event), events from outside, such as SetDuty or Stop.
+        `keep`: record steps and jobs.
+        Raises ValueError for an unknown policy or edge.
+        """
         self.core = Core(graph, settings)
         self.recording = Recording(graph, settings) if keep else None
         self.jobs: list[JobRecord] = []
-        self._service, self._hop_ns, self._restart_ns = service, message_delay_ns, restart_ns
+        self._service, self._message_delay_ns, self._restart_ns = service, message_delay_ns, restart_ns
         self._heap: list[tuple[int, int, int, Event, int]] = []
         self._sequence = 0
         self._units = {unit: _VirtualUnit() for unit in graph.units}
-        self._actions: dict[type, Callable[[int, Any], None]] = {Kill: self._kill, Start: self._start}
         for unit in graph.units:
             self._push(0, EVENT, UnitReady(unit))
         for at_ns, unit in faults:
@@ -89,44 +96,39 @@ class VirtualDriver:
         for at_ns, event in inputs:
             self._push(at_ns, FAULT, event)
 
-    def run(self) -> str:
-        """Until the core finishes; returns the cause. Raises RuntimeError when nothing can ever happen again."""
+    def run(self) -> Outcome:
+        """Until the core finishes. Raises RuntimeError when nothing can ever happen again."""
         collects = gc.isenabled()
         gc.disable()  # a run makes no cycles, and looking for them takes a tenth of its time
         try:
-            return self._run()
+            return run_loop(self.core, self, self.recording)
         finally:
             if collects:
                 gc.enable()
 
-    def _run(self) -> str:
-        deadline: int | None = None
-        while True:
-            now_ns, events = self._next(deadline)
-            actions, deadline = self.core.step(now_ns, events)
-            if self.recording is not None:
-                self.recording.steps.append((now_ns, events, actions))
-            for action in actions:
-                if type(action) is Dispatch:
-                    self._dispatch(now_ns, action.job)
-                elif type(action) is Finish:
-                    return action.cause
-                else:
-                    self._actions[type(action)](now_ns, action)
-
-    def _next(self, deadline_ns: int | None) -> tuple[int, tuple[Event, ...]]:
+    def wait(self, deadline_ns: int) -> tuple[int, tuple[Event, ...]]:
         """The next valid event, or none at the core's deadline when that comes first."""
         heap = self._heap
-        while heap and (deadline_ns is None or heap[0][0] <= deadline_ns):
+        while heap and heap[0][0] <= deadline_ns:
             at_ns, _, _, event, epoch = heapq.heappop(heap)
             if type(event) is JobDone:
                 if epoch == self._units[event.unit].epoch:
                     return at_ns, (event,)
             elif self._accept(event, epoch):
                 return at_ns, (event,)
-        if deadline_ns is None:
+        if deadline_ns == NEVER:
             raise RuntimeError("the simulation stands still: no event and no deadline is left")
         return deadline_ns, ()
+
+    def perform(self, now_ns: int, actions: tuple[Action, ...]) -> None:
+        """Put what follows from the actions on the heap."""
+        for action in actions:
+            if type(action) is Dispatch:
+                self._dispatch(now_ns, action.job)
+            elif type(action) is Kill:
+                self._push(now_ns, FAULT, UnitDied(action.unit))
+            elif type(action) is Start:
+                self._start(now_ns, action)
 
     def _accept(self, event: Event, epoch: int) -> bool:
         if type(event) is UnitReady:
@@ -145,19 +147,16 @@ class VirtualDriver:
     def _dispatch(self, now_ns: int, job: Job) -> None:
         job_id, name, stage, frame, *_ = job
         unit = self._units[name]
-        begin_ns = now_ns + self._hop_ns
+        begin_ns = now_ns + self._message_delay_ns
         if begin_ns < unit.free_ns:
             begin_ns = unit.free_ns
         end_ns = unit.free_ns = begin_ns + self._service(stage, name, frame, begin_ns)
         done = JobDone(name, job_id, begin_ns, end_ns, begin_ns)
         self._sequence += 1
-        heapq.heappush(self._heap, (end_ns + self._hop_ns, EVENT, self._sequence, done, unit.epoch))
+        heapq.heappush(self._heap, (end_ns + self._message_delay_ns, EVENT, self._sequence, done, unit.epoch))
         if self.recording is not None:
             ready_ns = self.core.frames[frame].ready_ns
             self.jobs.append(JobRecord(stage, name, frame, ready_ns, now_ns, begin_ns, end_ns))
-
-    def _kill(self, now_ns: int, action: Kill) -> None:
-        self._push(now_ns, FAULT, UnitDied(action.unit))
 
     def _start(self, now_ns: int, action: Start) -> None:
         unit = self._units[action.unit]
@@ -175,10 +174,15 @@ def simulate(
     keep: bool = False,
     **driver: Any,
 ) -> Simulation:
-    """Run to the end. `driver`: what VirtualDriver takes; `target_period_ns`, `isolated_ns`: see Ledger.report."""
+    """Run to the end.
+
+    `graph`, `settings`, `service`, `keep`, `driver`: see VirtualDriver.
+    `target_period_ns`, `isolated_ns`: see Ledger.report.
+    Raises ValueError for an unknown policy or edge, RuntimeError when nothing can ever happen again.
+    """
     virtual = VirtualDriver(graph, settings, service, keep=keep, **driver)
-    cause = virtual.run()
+    outcome = virtual.run()
     report = virtual.core.ledger.report(
         clock="virtual", requested=settings.frames, target_period_ns=target_period_ns, isolated_ns=isolated_ns
     )
-    return Simulation(report, virtual.recording, tuple(virtual.jobs), cause)
+    return Simulation(report, virtual.recording, tuple(virtual.jobs), outcome)

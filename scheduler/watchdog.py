@@ -1,129 +1,56 @@
-"""Units that die or hang. Rule: slots go back to their edge only after the unit's process is gone; what it was doing
-is lost and counted, what it only held is done again (a frame whose first stage it held is lost, too)."""
+"""Which units' time is up, and when the next one's will be. Rule: it looks and answers; the core carries it out."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterable
+from typing import Final
 
-from trilane.scheduler.events import Job, Kill, Start
-from trilane.scheduler.state import NEVER, UnitState
+from trilane.scheduler.events import NEVER
+from trilane.scheduler.state import UnitState
+from trilane.scheduler.unit_life import DOWN, READY, STARTING
 
-if TYPE_CHECKING:
-    from trilane.scheduler.core import Core
+#: Verdicts: leave the unit alone, kill its process, start it again, let it work after a hold, see if it takes a job.
+NOTHING: Final = 0
+KILL: Final = 1
+START: Final = 2
+RESUME: Final = 3
+LOOK: Final = 4
 
 #: Wait before a restart, by failures in a row without a finished job between; the last repeats.
 BACK_OFF_NS = (0, 100_000_000, 400_000_000, 1_600_000_000)
 
 
-def on_died(core: Core, unit: UnitState) -> None:
-    """Reclaim the unit's slots under a new epoch and plan its restart, or end the run when it fails too often."""
-    cause = f"{'hung' if unit.killing else 'died'}:{unit.name}"
-    unit.alive = unit.killing = False
-    unit.pinged_ns = 0
-    unit.room = 0
-    unit.starting_ns = None
-    core.reset_alarm()
-    jobs = list(unit.queue)
-    unit.queue.clear()
-    for job in jobs[:1]:
-        free_slots(core, job)
-        core.lose(job.frame, cause)
-    for job in reversed(jobs[1:]):
-        _put_back(core, job, cause)
-    for stage in unit.stages:
-        for edge in (stage.input, stage.output):
-            if edge is not None:
-                edge.epoch += 1
-    core.touch(unit)
-    unit.failures += 1
-    if unit.failures > core.settings.max_failures:
-        for frame in list(core.frames):
-            core.lose(frame, f"gave_up:{unit.name}")
-        core.finish(unit.name)
-    else:
-        unit.restart_at_ns = core.now_ns + BACK_OFF_NS[min(unit.failures, len(BACK_OFF_NS)) - 1]
+def verdict(unit: UnitState, now_ns: int, lead_ns: int) -> int:
+    """What is to be done with the unit now. `lead_ns`: of the policy; with one, the unit's next job may be due."""
+    if unit.deadline_ns <= now_ns:
+        return START if unit.life == DOWN else KILL
+    if unit.hold_until_ns <= now_ns:
+        return RESUME
+    return LOOK if lead_ns and len(unit.queue) == 1 else NOTHING
 
 
-def free_slots(core: Core, job: Job) -> None:
-    """Both slots of a job that will not end are free again."""
-    stage = core.stage_named[job.stage]
-    if stage.input:
-        stage.input.release(job.slot_in)
-        core.touch(core.stages[stage.position - 1].unit)
-    if stage.output:
-        stage.output.abandon(job.slot_out)
-        core.touch(stage.unit)
+def next_alarm_ns(units: Iterable[UnitState], now_ns: int, lead_ns: int) -> int:
+    """When the first verdict that is not NOTHING is due, or NEVER.
 
-
-def _put_back(core: Core, job: Job, cause: str) -> None:
-    stage = core.stage_named[job.stage]
-    if stage.output:
-        stage.output.abandon(job.slot_out)
-    if stage.input is None:
-        core.lose(job.frame, cause)
-        return
-    for frame in stage.input.give_back(job.slot_in):
-        del core.frames[frame]
-        core.ledger.dropped[f"{core.graph.edge_name(stage.position - 1)}:stale"] += 1
-    core.touch(core.stages[stage.position - 1].unit)
-
-
-def check_clocks(core: Core) -> None:
-    """Kill what missed its deadline, restart what has waited, and look at units whose time has come."""
-    for unit in core.units.values():
-        if unit.restart_at_ns is not None and unit.restart_at_ns <= core.now_ns:
-            unit.restart_at_ns, unit.starting_ns = None, core.now_ns
-            unit.hold_until_ns = 0
-            core.ledger.restart(unit.name)
-            core.actions.append(Start(unit.name))
-        deadline = _hang_deadline(core, unit)
-        if deadline is not None and deadline <= core.now_ns:
-            unit.killing = True
-            unit.room = 0
-            core.actions.append(Kill(unit.name))
-        if 0 < unit.hold_until_ns <= core.now_ns:
-            unit.hold_until_ns = 0
-            unit.set_room(core.now_ns)
-            core.touch(unit)
-        if len(unit.queue) == 1 and core.policy.lead_ns is not None:
-            core.touch(unit)
-
-
-def extend_deadlines(unit: UnitState, ns: int) -> None:
-    """Every clock that tells whether the unit hangs runs out so much later."""
-    unit.head_since_ns += ns
-    if unit.pinged_ns:
-        unit.pinged_ns += ns
-    if unit.starting_ns is not None:
-        unit.starting_ns += ns
-
-
-def next_alarm_ns(core: Core) -> int:
-    """When the first clock of a unit runs out: a restart, a hold, a lead, a job or an answer too late; else NEVER.
-
-    No unit's clock can run out before, until one is set: ending a job and hearing from a unit only postpone it.
+    No verdict can be due earlier until a deadline or a hold is set: a job's end and a Pong only put deadlines off.
     """
-    times = []
-    for unit in core.units.values():
-        if unit.restart_at_ns is not None:
-            times.append(unit.restart_at_ns)
-        deadline = _hang_deadline(core, unit)
-        if deadline is not None:
-            times.append(deadline)
-        if unit.hold_until_ns > core.now_ns:
-            times.append(unit.hold_until_ns)
-        if len(unit.queue) == 1 and core.ahead_ns(unit) > core.now_ns:
-            times.append(core.ahead_ns(unit))
-    return min(times, default=NEVER)
+    alarm_ns = NEVER
+    for unit in units:
+        alarm_ns = min(alarm_ns, unit.deadline_ns, unit.hold_until_ns)
+        if lead_ns and len(unit.queue) == 1:
+            lead_from_ns = unit.expected_end_ns() - lead_ns
+            if now_ns < lead_from_ns < alarm_ns:
+                alarm_ns = lead_from_ns
+    return alarm_ns
 
 
-def _hang_deadline(core: Core, unit: UnitState) -> int | None:
-    if unit.killing:
-        return None
-    if unit.starting_ns is not None:
-        return unit.starting_ns + core.settings.start_ns
-    if not unit.alive:
-        return None
-    if unit.queue:
-        return unit.head_since_ns + core.settings.hang_ns
-    return unit.pinged_ns + core.settings.hang_ns if unit.pinged_ns else None
+def back_off_ns(failures: int) -> int:
+    """How long a unit stays down after so many failures in a row, 1 or more."""
+    return BACK_OFF_NS[min(failures, len(BACK_OFF_NS)) - 1]
+
+
+def extended_deadline_ns(unit: UnitState, ns: int) -> int:
+    """The unit's deadline after the scheduler did nothing for `ns`: it has as much longer. A restart is not put off."""
+    if unit.deadline_ns == NEVER or unit.life not in (STARTING, READY):
+        return unit.deadline_ns
+    return unit.deadline_ns + ns

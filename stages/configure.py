@@ -17,11 +17,11 @@ from trilane.apps.machine import gl_facts, machine_facts
 from trilane.avatars.bundle import Bundle, load_bundle
 from trilane.avatars.network_file import NetworkFile
 from trilane.avatars.split import split
-from trilane.install import EGL_LINE
 from trilane.errors import BadInputError, MissingPartError
 from trilane.hw_profiles.host import host_units
 from trilane.hw_profiles.load import HOST, load_profile
 from trilane.hw_profiles.runtimes import fastest_runtime
+from trilane.install import EGL_LINE
 from trilane.pipeline.assets import Assets
 from trilane.scene.schema import Scene
 from trilane.scene.staging import stage_scene

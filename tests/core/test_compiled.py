@@ -19,15 +19,16 @@ PACKAGE = Path(__file__).resolve().parents[2] / "src" / "trilane"
 TRACES = """
 import hashlib, random
 from trilane.scheduler.core import __file__ as core
-from trilane.scheduler.events import Settings, avatar_graph
+from trilane.scheduler.events import Settings, chain
 from trilane.scheduler.virtual import simulate
+stages = (("pose", "cpu"), ("raster", "gpu"), ("infer", "dsp"), ("composite", "gpu"), ("present", "cpu"))
 service = lambda stage, unit, frame, begin: random.Random(f"{stage} {frame}").randint(1, 9000)
 found = []
 for policy in ("sequential", "pipelined", "latest", "deadline"):
     for edge in ("single", "double", "triple", "fifo:3", "orphan"):
         settings = Settings(80, policy, period_ns=7000, deadline_ns=40000, latch_ns=500)
         faults = [(150_000, "dsp"), (310_000, "gpu")]
-        done = simulate(avatar_graph(edge), settings, service, restart_ns=9000, faults=faults, keep=True)
+        done = simulate(chain(stages, edge, "composite"), settings, service, restart_ns=9000, faults=faults, keep=True)
         found.append(repr((done.recording.steps, done.report, done.jobs)))
 print(core.endswith(".so"), hashlib.sha256("".join(found).encode()).hexdigest())
 """

@@ -7,10 +7,11 @@ from itertools import pairwise
 import pytest
 
 from trilane.errors import BadInputError
+from trilane.hw_profiles.application import application_graph
 from trilane.hw_profiles.governor import Governor
 from trilane.hw_profiles.load import load_runnable
 from trilane.hw_profiles.schema import Profile
-from trilane.scheduler.events import SetDuty, Settings, avatar_graph
+from trilane.scheduler.events import SetDuty, Settings
 from trilane.scheduler.virtual import simulate
 from trilane.units import UNITS
 
@@ -80,7 +81,7 @@ def test_a_capped_pipeline_is_as_slow_as_its_duty(phone: Profile) -> None:
     events = [(0, event) for event in Governor(phone, "power_saver").begin(0)]
     times = {"pose": 1, "raster": 4, "infer": 10, "composite": 3, "present": 1}
     result = simulate(
-        avatar_graph(), Settings(200), lambda stage, *_: times[stage] * 1_000_000, inputs=events, keep=True
+        application_graph(), Settings(200), lambda stage, *_: times[stage] * 1_000_000, inputs=events, keep=True
     )
     duty = next(event.permille for _, event in events if event.unit == "dsp") / 1000
     assert result.report["frame_time_ms"]["mean"] == pytest.approx(10 / duty, rel=0.02)

@@ -10,10 +10,11 @@ import pytest
 from trilane.apps.pace import SLACK_NS, Pace, compare, pace_of
 from trilane.avatars.bundle import bundle_folder
 from trilane.errors import BadInputError
+from trilane.hw_profiles.application import application_graph
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.unit_loop import hold_until
 from trilane.scene.schema import Scene
-from trilane.scheduler.events import Settings, avatar_graph
+from trilane.scheduler.events import Settings
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.virtual import simulate
 from trilane.stages.config import RunConfig
@@ -34,7 +35,7 @@ def jobs(late: int | None = None, frames: int = 40) -> list[JobRecord]:
     def service(stage: str, _unit: str, frame: int, _begin: int) -> int:
         return STAGE_NS[stage] * (2 if (stage, frame) == ("infer", late) else 1)
 
-    return list(simulate(avatar_graph(), Settings(frames, "pipelined"), service, keep=True).jobs)
+    return list(simulate(application_graph(), Settings(frames, "pipelined"), service, keep=True).jobs)
 
 
 def test_a_run_in_time_has_the_virtual_frame_time() -> None:

@@ -11,6 +11,8 @@ import pytest
 
 import trilane.scheduler
 from trilane.errors import BadInputError
+from trilane.hw_profiles.application import application_graph
+from trilane.scheduler.causes import Outcome, OutcomeKind
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import (
     FrameRequest,
@@ -26,7 +28,6 @@ from trilane.scheduler.events import (
     Stop,
     UnitDied,
     UnitReady,
-    avatar_graph,
 )
 from trilane.scheduler.recording import read, replay
 from trilane.scheduler.stats import energy_score
@@ -35,7 +36,22 @@ from trilane.scheduler.virtual import Service, Simulation, simulate
 MS = 1_000_000
 SERVICE_MS = {"pose": 0.3, "raster": 4.0, "infer": 16.0, "composite": 2.0, "present": 3.0}
 FRAMES = 200
-PURE = ("core", "events", "policy", "state", "watchdog", "frame_source", "ledger", "completion", "stats")
+PURE = (
+    "assignment",
+    "causes",
+    "choice",
+    "completion",
+    "core",
+    "events",
+    "flow",
+    "frame_source",
+    "ledger",
+    "policy",
+    "state",
+    "stats",
+    "unit_life",
+    "watchdog",
+)
 PURE_BELOW = ("trilane.transport.slots", "trilane.unexpected")  # what of the lower layers the core may import
 
 
@@ -54,7 +70,7 @@ def run(policy: str = "pipelined", edge: str = "double", times: Service = servic
     }
     alone = {name: ms * MS for name, ms in SERVICE_MS.items()}
     return simulate(
-        avatar_graph(edge), Settings(FRAMES, policy, **{**settings, **more}), times, isolated_ns=alone, **driver
+        application_graph(edge), Settings(FRAMES, policy, **{**settings, **more}), times, isolated_ns=alone, **driver
     )
 
 
@@ -147,12 +163,12 @@ def test_frames_are_released_when_they_are_asked_for_and_no_more_than_there_are(
     assert begins[:2] == [1, 500]
     assert begins[4] == 2000
     assert result.report["frames"]["presented"] == FRAMES
-    assert result.cause == "done"
+    assert result.outcome == Outcome(OutcomeKind.DONE)
 
 
 def test_a_run_that_nobody_asks_of_ends_when_it_is_told() -> None:
     result = run(asked=True, inputs=[(1 * MS, FrameRequest(2)), (900 * MS, Stop())])
-    assert (result.report["frames"]["presented"], result.cause) == (2, "stopped")
+    assert (result.report["frames"]["presented"], result.outcome) == (2, Outcome(OutcomeKind.STOPPED))
 
 
 def test_a_late_pose_is_newer_and_costs_no_frame() -> None:
@@ -164,7 +180,7 @@ def test_a_late_pose_is_newer_and_costs_no_frame() -> None:
 
 def test_a_late_pose_waits_for_nobody_who_is_gone() -> None:
     result = run(latch_ns=2 * MS, faults=[(300 * MS, "gpu"), (900 * MS, "cpu")], restart_ns=50 * MS)
-    assert result.cause == "done"
+    assert result.outcome == Outcome(OutcomeKind.DONE)
     assert result.report["frames"]["presented"] + result.report["frames"]["lost"] == FRAMES
 
 
@@ -188,7 +204,7 @@ def test_a_duty_cycle_throttles_a_unit() -> None:
 
 def test_stop_finishes_what_is_in_flight() -> None:
     result = run(inputs=[(500 * MS, Stop())])
-    assert result.cause == "stopped"
+    assert result.outcome == Outcome(OutcomeKind.STOPPED)
     assert 0 < result.report["frames"]["presented"] < FRAMES
     assert result.report["frames"]["lost"] == 0
 
@@ -215,7 +231,7 @@ def test_a_unit_that_keeps_dying_ends_the_run() -> None:
         return 10**15 if stage == "infer" else service(stage, unit, frame, begin_ns)
 
     result = run(times=never, hang_ns=100 * MS, max_failures=3)
-    assert result.cause == "dsp"
+    assert result.outcome == Outcome(OutcomeKind.GAVE_UP, "dsp")
     frames = result.report["frames"]
     assert frames["presented"] == 0
     assert frames["lost_by_cause"]["hung:dsp"] == 4
@@ -247,8 +263,8 @@ def test_a_file_that_is_no_recording_is_named(tmp_path: Path, text: str) -> None
 def test_a_recording_of_another_schema_is_not_replayed(tmp_path: Path) -> None:
     path = tmp_path / "events.jsonl"
     run("pipelined", keep=True).recording.write(path)
-    path.write_text(path.read_text().replace('"schema": 2', '"schema": 1', 1))
-    with pytest.raises(BadInputError, match=r"line 1: found schema 1; this Trilane reads 2"):
+    path.write_text(path.read_text().replace('"schema": 3', '"schema": 2', 1))
+    with pytest.raises(BadInputError, match=r"line 1: found schema 2; this Trilane reads 3"):
         read(path)
 
 
@@ -283,7 +299,7 @@ def test_events_of_a_unit_that_there_is_not_are_not_replayed() -> None:
 
 
 def test_a_core_that_was_left_alone_gives_its_units_as_much_longer() -> None:
-    core = Core(avatar_graph(), Settings(10, "sequential", hang_ns=100))
+    core = Core(application_graph(), Settings(10, "sequential", hang_ns=100))
     core.step(0, tuple(UnitReady(unit) for unit in ("cpu", "gpu", "dsp")))
     core.step(10, (Pinged("dsp"),))
     assert core.step(1050, (SchedulerStalled(1000),)).actions == ()
@@ -293,7 +309,7 @@ def test_a_core_that_was_left_alone_gives_its_units_as_much_longer() -> None:
 
 def test_only_a_question_that_nobody_answers_costs_an_idle_unit_its_life() -> None:
     """The DSP and the CPU have nothing to do while the GPU's job runs; both are asked, one answers."""
-    core = Core(avatar_graph(), Settings(10, "sequential", hang_ns=100))
+    core = Core(application_graph(), Settings(10, "sequential", hang_ns=100))
     (pose,) = core.step(0, tuple(UnitReady(unit) for unit in ("cpu", "gpu", "dsp"))).actions
     core.step(10, (JobDone("cpu", pose.job.id, 0, 10, 0),))
     core.step(20, (Pinged("cpu"), Pinged("dsp")))
@@ -307,11 +323,11 @@ def test_only_a_question_that_nobody_answers_costs_an_idle_unit_its_life() -> No
 
 def test_settings_that_cannot_be_are_refused() -> None:
     with pytest.raises(ValueError, match="found policy"):
-        Core(avatar_graph(), Settings(1, "fastest"))
+        Core(application_graph(), Settings(1, "fastest"))
     with pytest.raises(ValueError, match="needs a period"):
-        Core(avatar_graph(), Settings(1, "latest"))
+        Core(application_graph(), Settings(1, "latest"))
     with pytest.raises(ValueError, match="found edge"):
-        Core(avatar_graph("quad"), Settings(1))
+        Core(application_graph("quad"), Settings(1))
     with pytest.raises(ValueError, match="different names"):
         Graph((StageSpec("a", "cpu"), StageSpec("a", "cpu")), ("double",), "a")
     with pytest.raises(ValueError, match="latency to"):

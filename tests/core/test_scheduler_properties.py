@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from trilane.scheduler.causes import Outcome, OutcomeKind
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import Graph, Settings, StageSpec
 from trilane.scheduler.virtual import VirtualDriver
@@ -35,18 +36,18 @@ def service_of(seed: int) -> Any:
 
 def check(core: Core) -> None:
     """No slot in two hands, none lost, every frame in flight in one place."""
-    written: dict[int, list[int]] = {index: [] for index in range(len(core.edges))}
-    read: dict[int, list[int]] = {index: [] for index in range(len(core.edges))}
+    written: dict[int, list[int]] = {index: [] for index in range(len(core.flow.edges))}
+    read: dict[int, list[int]] = {index: [] for index in range(len(core.flow.edges))}
     held = []
     for unit in core.units.values():
         for job in unit.queue:
-            position = core.stage_named[job.stage].position
+            position = core.flow.stage_named[job.stage].position
             held.append(job.frame)
             if job.slot_in >= 0:
                 read[position - 1].append(job.slot_in)
             if job.slot_out >= 0:
                 written[position].append(job.slot_out)
-    for index, edge in enumerate(core.edges):
+    for index, edge in enumerate(core.flow.edges):
         by_state: dict[str, list[int]] = {FREE: [], WRITING: [], READY: [], READING: []}
         for slot, state in enumerate(edge.state):
             by_state[state].append(slot)
@@ -98,7 +99,7 @@ def test_no_slot_is_owned_twice_no_frame_is_lost_or_out_of_order(
     driver = VirtualDriver(
         graph, run, service_of(seed), message_delay_ns=message_delay_ns, restart_ns=5000, faults=faults, keep=True
     )
-    assert driver.run() == "done"
+    assert driver.run() == Outcome(OutcomeKind.DONE)
     frames = driver.core.ledger.report(clock="virtual", requested=60)["frames"]
     assert frames["presented"] + frames["lost"] + sum(frames["dropped"].values()) == 60
     presented = driver.core.ledger.presented_frames

@@ -1,0 +1,103 @@
+"""Handing jobs to units. Rule: only dirty units are looked at, in the order in which they were marked.
+
+What waits in vain before a stage (it is stale, or must be late) is given up in the moment in which the stage is
+considered, and not before.
+"""
+
+from __future__ import annotations
+
+from trilane.scheduler.causes import DropCause
+from trilane.scheduler.choice import Choice
+from trilane.scheduler.events import Action, Dispatch
+from trilane.scheduler.flow import Flow
+from trilane.scheduler.frame_source import Source
+from trilane.scheduler.ledger import ASSIGNED, Ledger
+from trilane.scheduler.policy import Policy
+from trilane.scheduler.state import StageState, UnitState
+
+
+class Assignment:
+    """Fills the queues of units."""
+
+    def __init__(
+        self, policy: Policy, hang_ns: int, flow: Flow, source: Source, choice: Choice, ledger: Ledger
+    ) -> None:
+        """The one of a run.
+
+        `policy`: which frames it gives up, and how far ahead it hands out jobs.
+        `hang_ns`: the longest that a job may take.
+        `flow`, `source`: what it moves.
+        `choice`: what it asks.
+        `ledger`: where it notes why units have no job.
+        """
+        self._policy, self._hang_ns = policy, hang_ns
+        self._flow, self._source, self._choice, self._ledger = flow, source, choice, ledger
+        self._lead_ns = policy.lead_ns
+        self._drops = policy.newest or policy.drop_late
+
+    def assign(self, now_ns: int, actions: list[Action]) -> None:
+        """Hand jobs to the dirty units, as `Dispatch` in `actions`, until each is full or has nothing to run."""
+        dirty = self._flow.dirty
+        for unit in dirty:  # a dispatch may append to the list, also a unit that was looked at before
+            while len(unit.queue) < unit.queue_capacity:
+                stage = self._next_stage(unit, now_ns)
+                if stage is None:
+                    break
+                self._dispatch(unit, stage, now_ns, actions)
+        for unit in dirty:
+            account = ASSIGNED if unit.queue else self._choice.account_without_job(unit, now_ns)
+            if account != unit.account:
+                unit.account = account
+                self._ledger.enter(unit.name, now_ns, account)
+        dirty.clear()
+
+    def _next_stage(self, unit: UnitState, now_ns: int) -> StageState | None:
+        if self._lead_ns and unit.queue and now_ns < unit.expected_end_ns() - self._lead_ns:
+            return None
+        runnable: list[StageState] = []
+        for stage in unit.stages:
+            if self._drops:
+                self._give_up(stage, now_ns)
+            if self._choice.can_begin(stage, now_ns):
+                runnable.append(stage)
+        if len(runnable) > 1:
+            return self._choice.preferred(runnable, now_ns)
+        return runnable[0] if runnable else None
+
+    def _dispatch(self, unit: UnitState, stage: StageState, now_ns: int, actions: list[Action]) -> None:
+        edge = stage.input
+        if edge is None:
+            frame, release_ns = self._source.take(now_ns)
+            self._flow.admit(frame, release_ns, self._choice.deadline_from_ns(release_ns))
+        else:
+            frame = edge.frame[edge.ready[0]]
+        job = self._flow.begin(stage, frame)
+        if not unit.queue:
+            unit.head_since_ns = now_ns
+            unit.deadline_ns = now_ns + self._hang_ns
+        unit.queue.append(job)
+        actions.append(Dispatch(job))
+
+    def _give_up(self, stage: StageState, now_ns: int) -> None:
+        """Drop what waits for the stage and is stale or must be late."""
+        edge = stage.input
+        if edge is None:
+            if not self._choice.is_full():
+                self._give_up_at_source(stage, now_ns)
+            return
+        if self._policy.newest:
+            while len(edge.ready) > 1:
+                self._flow.drop_oldest(stage, DropCause.STALE)
+        if self._policy.drop_late:
+            while edge.ready and self._choice.is_late(stage, now_ns):
+                self._flow.drop_oldest(stage, DropCause.LATE)
+
+    def _give_up_at_source(self, first: StageState, now_ns: int) -> None:
+        if self._policy.newest:
+            self._source.keep_newest()
+        if self._policy.drop_late:
+            while self._source.queue and self._choice.is_late(first, now_ns):
+                if not self._flow.frames:  # nothing is in its way: the estimates alone say that it is late
+                    for stage in self._flow.stages:
+                        stage.lower_estimate()
+                self._source.drop_late_head()

@@ -1,0 +1,76 @@
+"""Why a run ended, a frame was lost or one was dropped. Rule: a kind and where it happened; nobody parses a string.
+
+`str()` of each is its key in the report and in messages.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import NamedTuple
+
+
+class OutcomeKind(StrEnum):
+    """How a run ended: every frame went through; `Stop`; `Abort`; a unit failed too often."""
+
+    DONE = "done"
+    STOPPED = "stopped"
+    ABORTED = "aborted"
+    GAVE_UP = "gave_up"
+
+
+class Outcome(NamedTuple):
+    """How a run ended. `unit`: the one that could not be kept alive, for GAVE_UP alone."""
+
+    kind: OutcomeKind
+    unit: str = ""
+
+    def __str__(self) -> str:
+        return _joined(self.kind.value, self.unit)
+
+
+class LossKind(StrEnum):
+    """What ended a frame in flight: its unit died, hung or was given up; its stage failed; the run was aborted."""
+
+    DIED = "died"
+    HUNG = "hung"
+    GAVE_UP = "gave_up"
+    FAILED = "failed"
+    ABORTED = "aborted"
+
+
+class Loss(NamedTuple):
+    """Why a frame in flight was lost. `where`: the unit, for FAILED the stage, for ABORTED nothing."""
+
+    kind: LossKind
+    where: str = ""
+
+    def __str__(self) -> str:
+        return _joined(self.kind.value, self.where)
+
+
+class DropCause(StrEnum):
+    """Why a waiting frame was taken out.
+
+    STALE: a newer one took its place. LATE: it could not be in time. POOL: an edge had no other slot. QUEUE_FULL and
+    TIMEOUT: it was turned away, or waited too long, before the first stage.
+    """
+
+    STALE = "stale"
+    LATE = "late"
+    POOL = "pool"
+    QUEUE_FULL = "queue_full"
+    TIMEOUT = "timeout"
+
+
+class Drop(NamedTuple):
+    """Where a frame was dropped, as `producer->consumer`, and why."""
+
+    edge: str
+    cause: DropCause
+
+    def __str__(self) -> str:
+        return _joined(self.edge, self.cause.value)
+
+
+def _joined(first: str, second: str) -> str:
+    return f"{first}:{second}" if second else first

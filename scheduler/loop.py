@@ -1,0 +1,43 @@
+"""The loop that every driver runs. Rule: one loop for all clocks; drivers differ in their `Clock` alone."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from trilane.scheduler.causes import Outcome
+from trilane.scheduler.core import Core
+from trilane.scheduler.events import NEVER, Action, Event
+from trilane.scheduler.recording import Recording
+
+
+class Clock(Protocol):
+    """The world around the core: it knows the time, hears what happens and does what the core says."""
+
+    def wait(self, deadline_ns: int) -> tuple[int, tuple[Event, ...]]:
+        """Until something happens or the deadline comes; what time it is and what has happened.
+
+        `deadline_ns`: NEVER when only an event can bring the core on. So it is in the first call of a run, which must
+        return the first events: a `UnitReady` for each unit that is up.
+        Times never go back. It may return without an event at any time.
+        """
+        ...
+
+    def perform(self, now_ns: int, actions: tuple[Action, ...]) -> None:
+        """Do what the core answered at `now_ns`; called after every step, also with no action."""
+        ...
+
+
+def run_loop(core: Core, clock: Clock, recording: Recording | None = None) -> Outcome:
+    """Run `core` until it finishes; every step is added to `recording`.
+
+    Raises what `clock` raises, KeyError and UnitLifeError (see Core.step).
+    """
+    deadline_ns: int = NEVER
+    while True:
+        now_ns, events = clock.wait(deadline_ns)
+        actions, deadline_ns = core.step(now_ns, events)
+        clock.perform(now_ns, actions)
+        if recording is not None:
+            recording.steps.append((now_ns, events, actions))
+        if core.outcome is not None:
+            return core.outcome
