@@ -12,7 +12,7 @@ import onnx
 from trilane.avatars.bundle import Bundle
 from trilane.avatars.network_file import NetworkFile
 from trilane.body.body import load_body
-from trilane.hw_profiles.cost import walk
+from trilane.hw_profiles.network_work import walk
 
 
 def bundle_facts(bundle: Bundle) -> dict[str, Any]:

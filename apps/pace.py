@@ -17,9 +17,9 @@ from trilane.avatars.bundle import load_bundle
 from trilane.avatars.reshape import reshaped
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import Plan, stage_times_ms
-from trilane.hw_profiles.corners import corners_of
-from trilane.hw_profiles.cost import Network, walk
 from trilane.hw_profiles.load import load_runnable
+from trilane.hw_profiles.network_work import Network, walk
+from trilane.hw_profiles.performance_profiles import corners_of
 from trilane.scheduler.events import Settings, avatar_graph
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.virtual import simulate

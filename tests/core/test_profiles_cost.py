@@ -13,12 +13,12 @@ from onnx import TensorProto, helper
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import network_alone, split_work
-from trilane.hw_profiles.corners import corners_of
-from trilane.hw_profiles.cost import CLASSES, network_work, reference_network, walk
 from trilane.hw_profiles.load import load_profile
-from trilane.hw_profiles.networks import ENCODERS, LAYOUTS, NORMS, NetworkSpec, build_network, parameters
-from trilane.hw_profiles.published import PUBLISHED_MS, check_published, resnet18_work, unet_work
-from trilane.hw_profiles.roofline import job_time, machine_of
+from trilane.hw_profiles.network_work import CLASSES, network_work, reference_network, walk
+from trilane.hw_profiles.operator_times import job_time, machine_of
+from trilane.hw_profiles.performance_profiles import corners_of
+from trilane.hw_profiles.published_times import PUBLISHED_MS, check_published, resnet18_work, unet_work
+from trilane.hw_profiles.reference_networks import ENCODERS, LAYOUTS, NORMS, NetworkSpec, build_network, parameters
 from trilane.training.quantising.quantise import Quantised
 from trilane.units import UnitName
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.hw_profiles.cost import ARITHMETIC, CLASSES, TRAFFIC, Work
+from trilane.hw_profiles.network_work import ARITHMETIC, CLASSES, TRAFFIC, Work
 from trilane.hw_profiles.schema import Memory, Unit
 
 TRAFFIC_KEYS = tuple(f"{kind}_traffic" for kind in ARITHMETIC) + TRAFFIC

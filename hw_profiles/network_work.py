@@ -16,7 +16,7 @@ import onnx
 from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
-from trilane.hw_profiles.networks import NetworkSpec, build_network
+from trilane.hw_profiles.reference_networks import NetworkSpec, build_network
 
 ARITHMETIC = ("convolution", "pointwise", "depthwise")
 TRAFFIC = ("normalisation", "resize", "elementwise", "permute")

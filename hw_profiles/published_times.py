@@ -13,10 +13,10 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import NamedTuple
 
-from trilane.hw_profiles.corners import corners_of
-from trilane.hw_profiles.cost import Work, walk
-from trilane.hw_profiles.networks import GraphBuilder, TensorRef, resnet18
-from trilane.hw_profiles.roofline import job_time, machine_of
+from trilane.hw_profiles.network_work import Work, walk
+from trilane.hw_profiles.operator_times import job_time, machine_of
+from trilane.hw_profiles.performance_profiles import corners_of
+from trilane.hw_profiles.reference_networks import GraphBuilder, TensorRef, resnet18
 from trilane.hw_profiles.schema import Profile
 from trilane.units import UNITS
 
