@@ -1,130 +1,39 @@
-"""The U-Nets of the reference application as ONNX graphs without weights: shapes and operators only.
+"""The U-Nets of the reference application: their ONNX graphs and the work that they ask of a unit.
 
-Rule: no tensor data is ever made here, so any size is cheap to describe; weights are graph inputs with a shape.
-The decoder, heads and channel counts are those of DESIGN section 5. Encoders follow their papers: ResNet
-(He 2015), MobileNetV2 (Sandler 2018), MobileNetV3 large (Howard 2019), EfficientNet-Lite0 (Tan 2019, the
-mobile variant without squeeze-and-excitation). Batch normalisation is folded and leaves no operator.
+Rule: the decoder, the heads and the channel counts are the same for all; only the encoder (`reference_encoders.py`),
+the normalisation, the size and the input's layout differ. Batch normalisation is folded and leaves no operator.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
-from math import gcd
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from math import prod
+from typing import Any
 
 import onnx
-from onnx import TensorProto, helper
 
 from trilane.errors import BadInputError
+from trilane.hw_profiles.graph_builder import GraphBuilder, TensorRef
+from trilane.hw_profiles.network_work import Network, Work, count_work
+from trilane.hw_profiles.reference_encoders import ENCODERS, encode
 
 DECODER = (256, 128, 64, 64, 64)
 HEADS = (3, 1)
 NORMS = ("batch", "instance", "group")
 LAYOUTS = ("packed", "split")
-GROUPS = 8
 CHANNELS_PER_PASS = 4
 MAX_SIDE = 4096
-
-
-class Block(NamedTuple):
-    """Inverted residual block: expansion width, output width, kernel, stride, activation, squeeze-and-excitation."""
-
-    expand: int
-    out: int
-    kernel: int
-    stride: int
-    act: str
-    squeeze: bool = False
-
-
-def _inverted(stem: int, rows: Iterable[tuple[int, int, int, int, int]]) -> tuple[Block, ...]:
-    """Rows (expansion factor, width, repeats, stride, kernel) to blocks; `stem` is the width before the first."""
-    blocks: list[Block] = []
-    width = stem
-    for factor, out, repeats, stride, kernel in rows:
-        for index in range(repeats):
-            blocks.append(Block(width * factor, out, kernel, stride if index == 0 else 1, "Clip"))
-            width = out
-    return tuple(blocks)
-
-
-@dataclass(frozen=True)
-class Inverted:
-    """An encoder of inverted residual blocks. `tail`: width of a last 1x1 convolution, 0 for none."""
-
-    stem: int
-    stem_act: str
-    blocks: tuple[Block, ...]
-    tail: int
-
-
-MOBILENET_V2 = Inverted(
-    32,
-    "Clip",
-    _inverted(
-        32,
-        [
-            (1, 16, 1, 1, 3),
-            (6, 24, 2, 2, 3),
-            (6, 32, 3, 2, 3),
-            (6, 64, 4, 2, 3),
-            (6, 96, 3, 1, 3),
-            (6, 160, 3, 2, 3),
-            (6, 320, 1, 1, 3),
-        ],
-    ),
-    1280,
-)
-#: The last layer is that of the trained network (`trilane.training.encoders`): 512 instead of its own 1280.
-EFFICIENTNET_LITE0 = Inverted(
-    32,
-    "Clip",
-    _inverted(
-        32,
-        [
-            (1, 16, 1, 1, 3),
-            (6, 24, 2, 2, 3),
-            (6, 40, 2, 2, 5),
-            (6, 80, 3, 2, 3),
-            (6, 112, 3, 1, 5),
-            (6, 192, 4, 2, 5),
-            (6, 320, 1, 1, 3),
-        ],
-    ),
-    512,
-)
-MOBILENET_V3 = Inverted(
-    16,
-    "HardSwish",
-    (
-        Block(16, 16, 3, 1, "Relu"),
-        Block(64, 24, 3, 2, "Relu"),
-        Block(72, 24, 3, 1, "Relu"),
-        Block(72, 40, 5, 2, "Relu", True),
-        Block(120, 40, 5, 1, "Relu", True),
-        Block(120, 40, 5, 1, "Relu", True),
-        Block(240, 80, 3, 2, "HardSwish"),
-        Block(200, 80, 3, 1, "HardSwish"),
-        Block(184, 80, 3, 1, "HardSwish"),
-        Block(184, 80, 3, 1, "HardSwish"),
-        Block(480, 112, 3, 1, "HardSwish", True),
-        Block(672, 112, 3, 1, "HardSwish", True),
-        Block(672, 160, 5, 2, "HardSwish", True),
-        Block(960, 160, 5, 1, "HardSwish", True),
-        Block(960, 160, 5, 1, "HardSwish", True),
-    ),
-    960,
-)
-INVERTED = {"mobilenetv2": MOBILENET_V2, "mobilenetv3": MOBILENET_V3, "efficientnet-lite0": EFFICIENTNET_LITE0}
-ENCODERS = ("resnet18", *INVERTED)
+#: Sides of the two graphs from which the work at every other size follows.
+REFERENCE_SIDES = (64, 128)
 
 
 @dataclass(frozen=True)
 class NetworkSpec:
-    """One network. `height`, `width` in pixels, multiples of 32; `channels` of the rasterised texture, 4 to 16.
+    """One reference network.
 
-    Raises BadInputError when made with a value outside its range.
+    `encoder`: of ENCODERS; `norm`: of NORMS; `layout`: of LAYOUTS. `height`, `width`: in pixels, multiples of 32 up to
+    MAX_SIDE. `channels`: of the rasterised texture, 1 to 16. Raises BadInputError for any other value.
     """
 
     encoder: str
@@ -135,9 +44,9 @@ class NetworkSpec:
     layout: str = "packed"
 
     def __post_init__(self) -> None:
-        _one_of("encoder", self.encoder, ENCODERS)
-        _one_of("norm", self.norm, NORMS)
-        _one_of("layout", self.layout, LAYOUTS)
+        _require_one_of("encoder", self.encoder, ENCODERS)
+        _require_one_of("norm", self.norm, NORMS)
+        _require_one_of("layout", self.layout, LAYOUTS)
         for name, side in (("height", self.height), ("width", self.width)):
             if side % 32 or not 32 <= side <= MAX_SIDE:
                 raise BadInputError("size", f"{name} {side}", f"a multiple of 32 from 32 to {MAX_SIDE}")
@@ -149,98 +58,16 @@ class NetworkSpec:
         return self.height * self.width
 
 
-def _one_of(key: str, found: str, known: tuple[str, ...]) -> None:
-    if found not in known:
-        raise BadInputError(key, repr(found), "one of " + ", ".join(known))
-
-
-class TensorRef(NamedTuple):
-    name: str
-    channels: int
-    height: int
-    width: int
-
-
-class GraphBuilder:
-    """Collects nodes and shapes. All tensors are NCHW of batch 1, FLOAT by name only: the cost model sets bytes."""
-
-    def __init__(self, norm: str) -> None:
-        self.norm = norm
-        self.nodes: list[Any] = []
-        self.inputs: list[Any] = []
-        self.infos: list[Any] = []
-        self.twice = helper.make_tensor("twice", TensorProto.FLOAT, (4,), (1, 1, 2, 2))
-
-    def input(self, name: str, channels: int, height: int, width: int) -> TensorRef:
-        self.inputs.append(value_info(name, (1, channels, height, width)))
-        return TensorRef(name, channels, height, width)
-
-    def weight(self, shape: tuple[int, ...]) -> str:
-        name = f"w{len(self.inputs)}"
-        self.inputs.append(value_info(name, shape))
-        return name
-
-    def op(self, kind: str, sources: list[str], shape: tuple[int, int, int], **attributes: Any) -> TensorRef:
-        out = TensorRef(f"{kind}_{len(self.nodes)}", *shape)
-        self.nodes.append(helper.make_node(kind, sources, [out.name], name=out.name, **attributes))
-        self.infos.append(value_info(out.name, (1, *shape)))
-        return out
-
-    def conv(
-        self, x: TensorRef, out: int, kernel: int, stride: int = 1, groups: int = 1, bias: bool = False
-    ) -> TensorRef:
-        weight = self.weight((out, x.channels // groups, kernel, kernel))
-        sources = [x.name, weight] + ([self.weight((out,))] if bias else [])
-        shape = (out, -(-x.height // stride), -(-x.width // stride))
-        return self.op(
-            "Conv",
-            sources,
-            shape,
-            kernel_shape=[kernel] * 2,
-            strides=[stride] * 2,
-            pads=[kernel // 2] * 4,
-            group=groups,
-        )
-
-    def same(self, kind: str, x: TensorRef, *more: str, **attributes: Any) -> TensorRef:
-        return self.op(kind, [x.name, *more], x[1:], **attributes)
-
-    def normed(self, x: TensorRef) -> TensorRef:
-        if self.norm == "batch":
-            return x
-        scales = [self.weight((x.channels,)), self.weight((x.channels,))]
-        if self.norm == "instance":
-            return self.same("InstanceNormalization", x, *scales)
-        return self.same("GroupNormalization", x, *scales, num_groups=gcd(GROUPS, x.channels))
-
-    def unit(
-        self, x: TensorRef, out: int, kernel: int, act: str | None = "Relu", stride: int = 1, groups: int = 1
-    ) -> TensorRef:
-        """Convolution, normalisation, activation."""
-        y = self.normed(self.conv(x, out, kernel, stride, groups, bias=self.norm == "batch"))
-        return y if act is None else self.same(act, y)
-
-    def upsampled(self, x: TensorRef) -> TensorRef:
-        """Nearest neighbour, twice the size."""
-        shape = (x.channels, 2 * x.height, 2 * x.width)
-        return self.op("Resize", [x.name, "", self.twice.name], shape, mode="nearest")
-
-    def model(self, name: str, outputs: list[TensorRef]) -> Any:
-        """Everything so far as an `onnx.ModelProto`, opset 21."""
-        results = [value_info(out.name, (1, *out[1:])) for out in outputs]
-        graph = helper.make_graph(self.nodes, name, self.inputs, results, [self.twice], value_info=self.infos)
-        return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 21)])
-
-    def add(self, x: TensorRef, y: TensorRef) -> TensorRef:
-        return self.op("Add", [x.name, y.name], x[1:])
-
-
-def value_info(name: str, shape: tuple[int, ...]) -> Any:
-    return helper.make_tensor_value_info(name, TensorProto.FLOAT, shape)
+def _require_one_of(key: str, value: str, known: tuple[str, ...]) -> None:
+    if value not in known:
+        raise BadInputError(key, repr(value), "one of " + ", ".join(known))
 
 
 def _network_input(b: GraphBuilder, spec: NetworkSpec) -> TensorRef:
-    """Packed: one tensor. Split: one tensor per raster pass, joined and permuted before the first convolution."""
+    """The input as the raster stage makes it.
+
+    `packed`: one tensor. `split`: one tensor per raster pass, joined and permuted before the first convolution.
+    """
     shape = (spec.height, spec.width)
     if spec.layout == "packed":
         return b.input("input", spec.channels, *shape)
@@ -250,56 +77,8 @@ def _network_input(b: GraphBuilder, spec: NetworkSpec) -> TensorRef:
     return b.same("Transpose", joined, perm=[0, 1, 2, 3])
 
 
-def resnet18(b: GraphBuilder, x: TensorRef) -> list[TensorRef]:
-    """Features at strides 2, 4, 8, 16, 32."""
-    x = b.unit(x, 64, 7, stride=2)
-    features = [x]
-    x = b.op("MaxPool", [x.name], (64, x.height // 2, x.width // 2), kernel_shape=[3, 3], strides=[2, 2], pads=[1] * 4)
-    for width, stride in ((64, 1), (128, 2), (256, 2), (512, 2)):
-        for index in range(2):
-            x = _basic_block(b, x, width, stride if index == 0 else 1)
-        features.append(x)
-    return features
-
-
-def _basic_block(b: GraphBuilder, x: TensorRef, width: int, stride: int) -> TensorRef:
-    y = b.unit(b.unit(x, width, 3, stride=stride), width, 3, act=None)
-    shortcut = x if (stride, x.channels) == (1, width) else b.unit(x, width, 1, act=None, stride=stride)
-    return b.same("Relu", b.add(y, shortcut))
-
-
-def _squeeze(b: GraphBuilder, x: TensorRef) -> TensorRef:
-    """Squeeze-and-excitation: mean over the picture, two 1x1 convolutions, gate. Width a quarter, rounded to 8s."""
-    inner = max(8, (x.channels // 4 + 4) // 8 * 8)
-    pooled = b.op("GlobalAveragePool", [x.name], (x.channels, 1, 1))
-    hidden = b.same("Relu", b.conv(pooled, inner, 1, bias=True))
-    gate = b.same("HardSigmoid", b.conv(hidden, x.channels, 1, bias=True))
-    return b.op("Mul", [x.name, gate.name], x[1:])
-
-
-def _inverted_block(b: GraphBuilder, x: TensorRef, block: Block) -> TensorRef:
-    y = x if block.expand == x.channels else b.unit(x, block.expand, 1, block.act)
-    y = b.unit(y, block.expand, block.kernel, block.act, block.stride, groups=block.expand)
-    if block.squeeze:
-        y = _squeeze(b, y)
-    y = b.unit(y, block.out, 1, act=None)
-    return b.add(x, y) if block.stride == 1 and x.channels == block.out else y
-
-
-def _inverted_encoder(b: GraphBuilder, x: TensorRef, encoder: Inverted) -> list[TensorRef]:
-    """Features before each halving and at the end: strides 2, 4, 8, 16, 32."""
-    x = b.unit(x, encoder.stem, 3, encoder.stem_act, stride=2)
-    features: list[TensorRef] = []
-    for block in encoder.blocks:
-        if block.stride == 2:
-            features.append(x)
-        x = _inverted_block(b, x, block)
-    if encoder.tail:
-        x = b.unit(x, encoder.tail, 1, encoder.blocks[-1].act)
-    return [*features, x]
-
-
 def _decoder(b: GraphBuilder, features: list[TensorRef]) -> TensorRef:
+    """Full-size features from those of the encoder, each joined on the way up where its size comes."""
     x, skips = features[-1], [*reversed(features[:-1]), None]
     for width, skip in zip(DECODER, skips, strict=True):
         x = b.upsampled(x)
@@ -313,8 +92,7 @@ def build_network(spec: NetworkSpec) -> Any:
     """The network as an `onnx.ModelProto` (opset 21, NCHW, batch 1) whose weights are inputs named `w<n>`."""
     b = GraphBuilder(spec.norm)
     x = _network_input(b, spec)
-    features = resnet18(b, x) if spec.encoder == "resnet18" else _inverted_encoder(b, x, INVERTED[spec.encoder])
-    body = _decoder(b, features)
+    body = _decoder(b, encode(b, x, spec.encoder))
     heads = [b.conv(b.unit(body, DECODER[-1], 3), width, 3, bias=True) for width in HEADS]
     joined = b.op("Concat", [head.name for head in heads], (sum(HEADS), *body[2:]), axis=1)
     return b.model(f"unet-{spec.encoder}-{spec.norm}", [b.same("Sigmoid", joined)])
@@ -323,15 +101,40 @@ def build_network(spec: NetworkSpec) -> Any:
 def parameters(model: Any) -> int:
     """Number of weights and biases of a model made by `build_network`."""
     shapes = [_shape(info) for info in model.graph.input if info.name.startswith("w")]
-    return sum(_product(shape) for shape in shapes)
+    return sum(prod(shape) for shape in shapes)
 
 
 def _shape(info: onnx.ValueInfoProto) -> list[int]:
     return [d.dim_value for d in info.type.tensor_type.shape.dim]
 
 
-def _product(values: Iterable[int]) -> int:
-    result = 1
-    for value in values:
-        result *= value
-    return result
+def reference_network(spec: NetworkSpec) -> Network:
+    """The network of `spec` with its work and the facts that reports name it by."""
+    facts = {"encoder": spec.encoder, "norm": spec.norm}
+    return Network(facts, spec.height, spec.width, spec.channels, spec.layout, network_work(spec))
+
+
+@lru_cache(maxsize=4096)
+def network_work(spec: NetworkSpec) -> Work:
+    """The work of the network of `spec`.
+
+    The strides divide every side that `NetworkSpec` allows, so every count is a constant plus a multiple of the number
+    of pixels. It is counted on graphs of two sizes; the counts at every other size follow from these exactly.
+    """
+    small, large = (_counted(replace(spec, height=side, width=side)) for side in REFERENCE_SIDES)
+    first, second = (side * side for side in REFERENCE_SIDES)
+
+    def at(a: int, b: int) -> int:
+        return a + (b - a) * (spec.pixels - first) // (second - first)
+
+    operators = tuple(
+        s._replace(macs=at(s.macs, b.macs), moved=at(s.moved, b.moved), out=at(s.out, b.out), live=at(s.live, b.live))
+        for s, b in zip(small.operators, large.operators, strict=True)
+    )
+    ends = (at(small.input_elements, large.input_elements), at(small.output_elements, large.output_elements))
+    return Work(operators, ends[0], small.input_tensors, ends[1])
+
+
+@lru_cache(maxsize=512)
+def _counted(spec: NetworkSpec) -> Work:
+    return count_work(build_network(spec))

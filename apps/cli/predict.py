@@ -135,7 +135,7 @@ def _way(policy: str, edge: str | None, batch: int) -> Way:
 
 def _reference(encoder: str, norm: str, size: str, channels: int, layout: str) -> Network:
     from trilane.hw_profiles.configuration_table import spec_of
-    from trilane.hw_profiles.network_work import reference_network
+    from trilane.hw_profiles.reference_networks import reference_network
 
     cells = {"encoder": encoder, "norm": norm, "size": size, "channels": str(channels), "layout": layout}
     return reference_network(spec_of(cells, "options"))
@@ -145,7 +145,7 @@ def _network_of(path: Path | None, avatar: str | None, layout: str) -> Network:
     """The network of a file, or of an avatar."""
     from trilane.avatars.bundle import load_bundle
     from trilane.avatars.network_file import read_network
-    from trilane.hw_profiles.network_work import Network, walk
+    from trilane.hw_profiles.network_work import Network, count_work
 
     if path is not None and avatar is not None:
         raise BadInputError("options", "--network and --avatar", "one of them")
@@ -154,7 +154,7 @@ def _network_of(path: Path | None, avatar: str | None, layout: str) -> Network:
     file = read_network(path) if path is not None else load_bundle(avatar or "default").read_network()
     _, height, width, channels = file.shape
     facts = {"network": str(path)} if path is not None else {"avatar": str(avatar)}
-    return Network(facts, height, width, channels, layout, walk(file.model))
+    return Network(facts, height, width, channels, layout, count_work(file.model))
 
 
 def _unit(runtime: str) -> Any:

@@ -17,10 +17,9 @@ from trilane.hw_profiles.application import (
 )
 from trilane.hw_profiles.configuration_table import read_table
 from trilane.hw_profiles.load import load_profile
-from trilane.hw_profiles.network_work import reference_network
 from trilane.hw_profiles.performance_profiles import corners_of
 from trilane.hw_profiles.predict import over_time, predict, predict_table, what_if
-from trilane.hw_profiles.reference_networks import NetworkSpec
+from trilane.hw_profiles.reference_networks import NetworkSpec, reference_network
 from trilane.hw_profiles.throttling import GOVERNORS, Heat
 from trilane.units import UNITS, UnitName
 

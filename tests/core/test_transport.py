@@ -267,9 +267,7 @@ def test_only_a_folder_whose_lock_is_free_is_removed(tmp_path: Path, monkeypatch
     (tmp_path / "trilane-link").symlink_to(locked.path)
     expected = [locked.path.name, "trilane-other", "trilane-link"]
     remove_abandoned(tmp_path)
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
-        [locked.path.name, "trilane-other", "trilane-link"]
-    )
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(expected)
     locked.remove()
 
 
