@@ -22,87 +22,15 @@ from trilane.arrays import F64
 from trilane.errors import BadInputError, MissingPartError
 from trilane.hw_profiles.application import Plan, isolated_job_time, reference_frame_ms
 from trilane.hw_profiles.configuration_table import Row, read_table
+from trilane.hw_profiles.fit_steps import STEPS, UNIT_OF_COLUMN, Keys, Step
 from trilane.hw_profiles.load import load_tables, parse_profile
 from trilane.hw_profiles.performance_profiles import corners_of
 from trilane.hw_profiles.reference_networks import reference_network
 from trilane.hw_profiles.schema import Profile
-from trilane.units import SUSTAINED, UnitName
+from trilane.units import SUSTAINED
 
 MEASURED_UNDER = SUSTAINED
 NORMAL_OVER_MEDIAN = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
-
-Keys = tuple[str, ...]
-
-
-class Step(NamedTuple):
-    """One step of the fit.
-
-    `columns`: measured ones that it fits. `free`: groups of keys that are multiplied by one factor each. `noise`:
-    relative error of a measurement.
-    """
-
-    name: str
-    columns: tuple[str, ...]
-    free: tuple[Keys, ...]
-    noise: float
-
-
-def _efficiency(unit: str, *names: str) -> Keys:
-    return tuple(f"units.{unit}.efficiency.{name}" for name in names)
-
-
-STEPS = (
-    Step(
-        "network on the DSP",
-        ("bench_dsp_ms",),
-        (
-            _efficiency("dsp", "convolution", "pointwise"),
-            _efficiency(
-                "dsp",
-                "convolution_traffic",
-                "depthwise_traffic",
-                "pointwise_traffic",
-                "normalisation",
-                "resize",
-                "elementwise",
-            ),
-            _efficiency("dsp", "permute"),
-            ("units.dsp.input_ns_per_element",),
-            ("units.dsp.permute_fixed_ms",),
-            ("units.dsp.fallback_ns_per_element",),
-        ),
-        0.04,
-    ),
-    Step(
-        "network on the GPU",
-        ("bench_gpu_ms",),
-        (
-            _efficiency("gpu", "convolution", "pointwise"),
-            _efficiency("gpu", "depthwise_traffic", "pointwise_traffic"),
-            _efficiency("gpu", "normalisation"),
-            _efficiency("gpu", "permute"),
-            ("units.gpu.input_ns_per_element",),
-            ("units.gpu.permute_fixed_ms",),
-        ),
-        0.12,
-    ),
-    Step(
-        "application",
-        ("app_dsp_ms", "app_gpu_ms"),
-        (
-            ("application.readback_ns_per_byte",),
-            ("application.handover_ms",),
-            ("memory.application_use_fraction",),
-        ),
-        0.1,
-    ),
-)
-UNIT_OF_COLUMN: dict[str, UnitName] = {
-    "bench_dsp_ms": "dsp",
-    "bench_gpu_ms": "gpu",
-    "app_dsp_ms": "dsp",
-    "app_gpu_ms": "gpu",
-}
 
 
 class Measurement(NamedTuple):
@@ -126,10 +54,12 @@ class Residual:
 
     @property
     def error(self) -> float:
+        """Relative error of the fit."""
         return self.fitted_ms / self.measured_ms - 1
 
     @property
     def left_out_error(self) -> float:
+        """Relative error of the fit to all other measurements."""
         return self.left_out_ms / self.measured_ms - 1
 
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from trilane.errors import BadInputError, MissingPartError
-from trilane.hw_profiles.predict import Moment
+from trilane.hw_profiles.over_time import Moment
 
 SUFFIXES = (".png", ".svg", ".pdf")
 

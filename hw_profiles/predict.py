@@ -7,10 +7,8 @@ is one minus that error, and zero when the error is as large as the number.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any
 
-from trilane.errors import BadInputError
 from trilane.hw_profiles.application import (
     REFERENCE,
     RUNTIMES,
@@ -23,15 +21,13 @@ from trilane.hw_profiles.application import (
 )
 from trilane.hw_profiles.configuration_table import Row
 from trilane.hw_profiles.network_work import Network
+from trilane.hw_profiles.operator_times import JobTime
+from trilane.hw_profiles.over_time import Moment, over_time, unit_power_w
 from trilane.hw_profiles.performance_profiles import Corners, corners_of
 from trilane.hw_profiles.reference_networks import reference_network
-from trilane.hw_profiles.schema import CORNERS, Profile
-from trilane.hw_profiles.thermal_state import ThermalState
-from trilane.hw_profiles.throttling import GOVERNORS, Throttle
+from trilane.hw_profiles.schema import Profile
 from trilane.scheduler.stats import energy_score
 from trilane.units import SUSTAINED, UNITS, UnitName
-
-MAX_MINUTES = 24 * 60
 
 #: Rows of `what_if`: name, how the stages are joined, share of the network on the GPU.
 ALTERNATIVES: tuple[tuple[str, Variant, float], ...] = (
@@ -43,66 +39,6 @@ ALTERNATIVES: tuple[tuple[str, Variant, float], ...] = (
     ("pipelined, batches of 2", Variant("pipelined", "double", 2), 0.0),
     ("pipelined, 5 % of the network on the GPU", Variant("pipelined", "double"), 0.05),
 )
-
-
-@dataclass(frozen=True)
-class Moment:
-    """The application at one poll of the governor.
-
-    `device_c`, `junction_c`: temperatures of the device and of the hottest junction, degrees Celsius. `throttled`:
-    whether a unit is below the corner that the performance profile requests; `corners`: where the units are.
-    """
-
-    t_s: float
-    frame_ms: float
-    device_c: float
-    junction_c: float
-    power_w: float
-    throttled: bool
-    corners: Corners
-
-
-def over_time(
-    profile: Profile, plan: Plan, performance_profile: str, minutes: float, governor: str | None = None
-) -> list[Moment]:
-    """The application from a cold start, one moment per poll of the governor.
-
-    `profile`: of the chip.
-    `plan`: what runs on it.
-    `performance_profile`: by name.
-    `minutes`: of virtual time.
-    `governor`: of GOVERNORS; None for the profile's own.
-    Raises BadInputError for an unknown name or a time out of range.
-    """
-    name = governor or profile.thermal.governor
-    if name not in GOVERNORS:
-        raise BadInputError("governor", repr(name), " or ".join(GOVERNORS))
-    if not 0 < minutes <= MAX_MINUTES:
-        raise BadInputError("minutes", f"{minutes:g}", f"above 0, at most {MAX_MINUTES}")
-    requested = dict(zip(UNITS, map(CORNERS.index, corners_of(profile, performance_profile)), strict=True))
-    thermal_state, throttle, moments = ThermalState.at_rest(profile), Throttle(), []
-    poll_s, steady_at = profile.thermal.poll_s.or_else(1.0), dict[Corners, Steady]()
-    for tick in range(max(1, round(60 * minutes / poll_s))):
-        cpu, gpu, dsp = (CORNERS[throttle.corner_index(unit, requested[unit])] for unit in UNITS)
-        corners = (cpu, gpu, dsp)
-        if corners not in steady_at:
-            steady_at[corners] = steady(profile, plan, corners)
-        now = steady_at[corners]
-        power = _power_w(profile, now, corners)
-        thermal_state.advance(profile, power, poll_s)
-        total = sum(power.values()) + profile.thermal.base_power_w.or_else(0)
-        throttled = any(throttle.steps.values())
-        hottest = max(thermal_state.junction_c.values())
-        t_s = (tick + 1) * poll_s
-        moments.append(Moment(t_s, now.frame_ms, thermal_state.device_c, hottest, total, throttled, corners))
-        GOVERNORS[name](profile, thermal_state, throttle, requested, power)
-    return moments
-
-
-def _power_w(profile: Profile, now: Steady, corners: Corners) -> dict[UnitName, float]:
-    return {
-        name: profile.units[name].power_w(corner, now.busy[name]) for name, corner in zip(UNITS, corners, strict=True)
-    }
 
 
 def predict(
@@ -122,39 +58,53 @@ def predict(
     Raises BadInputError for an unknown name or a time out of range.
     """
     corners = corners_of(profile, performance_profile)
-    network, unit = plan.network, profile.units[plan.runtime]
-    alone, now = isolated_job_time(profile, network, plan.runtime, corners), steady(profile, plan, corners)
+    now = steady(profile, plan, corners)
     moments = over_time(profile, plan, performance_profile, minutes, governor) if minutes else []
-    error, work = relative_error(alone, unit), network.work
-    per_unit = {u: sum(ms for s, ms in now.stages_ms.items() if now.unit_of[s] == u) for u in UNITS}
     frame = _mean([m.frame_ms for m in moments]) if moments else now.frame_ms
     power = _mean([m.power_w for m in moments]) if moments else _settled_power(profile, now, corners)
+    job = isolated_job_time(profile, plan.network, plan.runtime, corners)
     return {
         "schema": 1,
         "clock": "virtual",
         "machine": {"profile": profile.name, "title": profile.title},
         "config": _config(plan, performance_profile, minutes, governor or profile.thermal.governor),
-        "network": {
-            "parameters_m": work.weights / 1e6,
-            "gmac": work.macs / 1e9,
-            "alone_ms": alone.total_ms,
-            "parts_ms": dict(alone.parts),
-        },
+        "network": _network(plan, job),
         "frame_time_ms": _frame_times(profile, frame, [m.frame_ms for m in moments] or [frame]),
         "latency_ms": {"mean": now.latency_ms},
         "fps": 1e3 / frame,
-        "display_capped": now.capped,
-        "stages": {s: {"unit": now.unit_of[s], "service_ms": {"mean": ms}} for s, ms in now.stages_ms.items()},
-        "units": {u: {"busy": now.busy[u], "idle": dict(now.idle[u])} for u in UNITS},
-        "efficiency": max(per_unit.values()) / plan.variant.batch / now.frame_ms,
+        **_settled(plan, now),
         "power_w": power,
         "energy_mj_per_frame": power * frame,
         "xrbench": {"energy": energy_score(power * frame)},
         "temperature_c": _temperatures(moments),
         "caps": _caps(moments),
         "timeline": [_shown(m) for m in _thinned(moments)],
-        "expected_error": error,
-        "confidence": max(0.0, 1 - error),
+        **_expected_error(profile, plan, job),
+    }
+
+
+def _expected_error(profile: Profile, plan: Plan, job: JobTime) -> dict[str, float]:
+    error = relative_error(job, profile.units[plan.runtime])
+    return {"expected_error": error, "confidence": max(0.0, 1 - error)}
+
+
+def _network(plan: Plan, job: JobTime) -> dict[str, Any]:
+    work = plan.network.work
+    return {
+        "parameters_m": work.weights / 1e6,
+        "gmac": work.macs / 1e9,
+        "alone_ms": job.total_ms,
+        "parts_ms": dict(job.parts),
+    }
+
+
+def _settled(plan: Plan, now: Steady) -> dict[str, Any]:
+    per_unit = {u: sum(ms for s, ms in now.stages_ms.items() if now.unit_of[s] == u) for u in UNITS}
+    return {
+        "display_capped": now.capped,
+        "stages": {s: {"unit": now.unit_of[s], "service_ms": {"mean": ms}} for s, ms in now.stages_ms.items()},
+        "units": {u: {"busy": now.busy[u], "idle": dict(now.idle[u])} for u in UNITS},
+        "efficiency": max(per_unit.values()) / plan.variant.batch / now.frame_ms,
     }
 
 
@@ -177,7 +127,7 @@ def _config(plan: Plan, performance_profile: str, minutes: float, governor: str)
 
 
 def _settled_power(profile: Profile, now: Steady, corners: Corners) -> float:
-    return sum(_power_w(profile, now, corners).values()) + profile.thermal.base_power_w.or_else(0)
+    return sum(unit_power_w(profile, now, corners).values()) + profile.thermal.base_power_w.or_else(0)
 
 
 def _frame_times(profile: Profile, mean_ms: float, frames: Sequence[float]) -> dict[str, float]:

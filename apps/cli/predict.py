@@ -200,8 +200,8 @@ def _show_table(answers: list[dict[str, Any]]) -> None:
 
 
 def _draw(chip: Profile, plan: Plan, asked: str, minutes: float, governor: str | None, path: Path) -> None:
+    from trilane.hw_profiles.over_time import over_time
     from trilane.hw_profiles.plot import plot_over_time
-    from trilane.hw_profiles.predict import over_time
 
     names = dict.fromkeys((SUSTAINED, BURST, asked))
     runs = {name: over_time(chip, plan, name, minutes, governor) for name in names}

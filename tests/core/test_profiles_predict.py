@@ -17,8 +17,9 @@ from trilane.hw_profiles.application import (
 )
 from trilane.hw_profiles.configuration_table import read_table
 from trilane.hw_profiles.load import load_profile
+from trilane.hw_profiles.over_time import over_time
 from trilane.hw_profiles.performance_profiles import corners_of
-from trilane.hw_profiles.predict import over_time, predict, predict_table, what_if
+from trilane.hw_profiles.predict import predict, predict_table, what_if
 from trilane.hw_profiles.reference_networks import NetworkSpec, reference_network
 from trilane.hw_profiles.thermal_state import ThermalState
 from trilane.hw_profiles.throttling import GOVERNORS
