@@ -12,7 +12,7 @@ import onnx
 from trilane.avatars.bundle import Bundle
 from trilane.avatars.network_file import NetworkFile
 from trilane.body.body import load_body
-from trilane.hw_profiles.cost import walk
+from trilane.hw_profiles.network_work import count_work
 
 
 def bundle_facts(bundle: Bundle) -> dict[str, Any]:
@@ -45,5 +45,5 @@ def network_facts(network: NetworkFile) -> dict[str, Any]:
 
 def graph_facts(model: onnx.ModelProto) -> dict[str, Any]:
     """`parameters` of the layers as they are in the file, `gmac` of one pass."""
-    work = walk(model)
+    work = count_work(model)
     return {"parameters": work.weights, "gmac": work.macs / 1e9}

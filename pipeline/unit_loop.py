@@ -19,8 +19,9 @@ from trilane.pipeline.assets import map_assets
 from trilane.pipeline.bound_stage import BoundStage
 from trilane.pipeline.stage import StageFactory, UnitContext
 from trilane.pipeline.unit_spec import UnitSpec
-from trilane.transport.bus import LAST_WORDS_MS, Link, prompt_context
+from trilane.transport.heartbeats import LINGER_MS, context_on_cores
 from trilane.transport.job_pipe import JobPipe
+from trilane.transport.link import Link
 from trilane.transport.memory import map_region
 from trilane.transport.messages import (
     BUILDING,
@@ -48,10 +49,10 @@ def serve(raw_spec: dict[str, Any], number_of: Mapping[int, int]) -> int:
     `number_of`: what each descriptor that the spec names is called in this process.
     """
     spec = UnitSpec.model_validate(raw_spec).renumbered(number_of)
-    context = prompt_context(spec.scheduler_cores)
-    link = Link(context, JobPipe(spec.job_pipe, waits=True), LAST_WORDS_MS)
+    context = context_on_cores(spec.scheduler_cores)
+    link = Link(context, JobPipe(spec.job_pipe, waits=True), LINGER_MS)
     use_slice(UNIT_NS)
-    link.socket.connect(spec.endpoint)
+    link.connect(spec.endpoint)
     try:
         return _serve(spec, link)
     finally:

@@ -23,9 +23,10 @@ from trilane.pipeline.description import Pipeline
 from trilane.pipeline.regions import EdgeRegion
 from trilane.pipeline.unit_spec import UnitSpec
 from trilane.pipeline.unit_starter import StartedUnit, UnitStarter
-from trilane.transport.heartbeats import BusFolder, Link
 from trilane.transport.job_pipe import JobPipe, JobPipeEnd, job_pipe_pair
+from trilane.transport.link import Link
 from trilane.transport.messages import Message, MessageError
+from trilane.transport.socket_folder import SocketFolder
 
 TAIL_BYTES = 8192
 END_S = 2.0
@@ -41,7 +42,7 @@ class UnitMessage(NamedTuple):
 
 
 class _Process:
-    def __init__(self, unit: str, started: StartedUnit, stderr_fd: int, link: Link, folder: BusFolder) -> None:
+    def __init__(self, unit: str, started: StartedUnit, stderr_fd: int, link: Link, folder: SocketFolder) -> None:
         self.unit, self.pid, self.pidfd = unit, started.pid, started.pidfd
         self.stderr_fd, self.link, self.folder = stderr_fd, link, folder
         self.tail = b""
@@ -102,13 +103,13 @@ class UnitProcesses:
     def start(self, unit: str) -> None:
         """A fresh process for the unit; `Ready` or `Failed` follows, or its end. Raises TrilaneError, OSError."""
         with contextlib.ExitStack() as undo:
-            folder = BusFolder()
+            folder = SocketFolder()
             undo.callback(folder.remove)
             ours, theirs = job_pipe_pair()
             link = Link(self._context, JobPipe(ours))
             undo.callback(link.close)
             with contextlib.closing(theirs):
-                link.socket.bind(folder.endpoint(unit))
+                link.bind(folder.endpoint(unit))
                 stderr_fd, theirs_stderr = os.pipe2(os.O_CLOEXEC)
                 undo.callback(os.close, stderr_fd)
                 try:
@@ -194,7 +195,7 @@ class UnitProcesses:
         self._ended.append(process)
         return []
 
-    def _spec(self, unit: str, folder: BusFolder, job_pipe: JobPipeEnd) -> UnitSpec:
+    def _spec(self, unit: str, folder: SocketFolder, job_pipe: JobPipeEnd) -> UnitSpec:
         pipeline, stages = self._pipeline, self._pipeline.stages_of(unit)
         inputs = {after.name: name for name, (_, after) in pipeline.joints.items() if after.unit == unit}
         outputs = {before.name: name for name, (before, _) in pipeline.joints.items() if before.unit == unit}

@@ -11,10 +11,9 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from trilane.scheduler.causes import Outcome
+from trilane.unexpected import UnexpectedValue
 
 NEVER: Final = (1 << 62) - 1  # ns; the largest integer that mypyc keeps unboxed
-
-from trilane.unexpected import UnexpectedValue
 
 
 class Job(NamedTuple):

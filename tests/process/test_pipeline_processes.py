@@ -316,7 +316,7 @@ def test_an_idle_unit_that_does_not_answer_is_restarted(monkeypatch: pytest.Monk
     assert result.presented == 3 and not result.lost
 
 
-def test_a_parent_killed_while_it_starts_leaves_what_the_next_run_removes(nothing_left: Path, tmp_path: Path) -> None:
+def test_a_parent_killed_while_it_starts_leaves_what_the_next_run_removes(nothing_left: Path) -> None:
     parent = subprocess.Popen(script(100_000, 10), stdout=subprocess.DEVNULL)
     while not list(nothing_left.glob("trilane-*/*")):
         time.sleep(0.001)
