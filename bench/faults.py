@@ -21,6 +21,7 @@ import psutil
 
 from trilane.errors import BadInputError
 from trilane.pipeline.result import RunResult
+from trilane.pipeline.fork_server import process_name
 from trilane.pipeline.run import run_pipeline
 from trilane.scheduler.events import UnitDied, UnitReady
 from trilane.stages.config import RunConfig
@@ -74,6 +75,14 @@ def measure(
     }
 
 
+def unit_process(unit: str) -> psutil.Process:
+    """The process of `unit` in the run that this process has under way. Raises LookupError when there is none."""
+    for process in psutil.Process().children(recursive=True):
+        if process.name() == process_name(unit):
+            return process
+    raise LookupError(unit)
+
+
 @dataclass
 class Signals(threading.Thread):
     """Sends each pair of `moments` (seconds from the start, signal) to the process of `unit`. `sent_ns`: when, of those
@@ -104,10 +113,8 @@ class Signals(threading.Thread):
     def _process(self) -> psutil.Process | None:
         """The unit's process, once there is one."""
         while not self.over.is_set():
-            for process in psutil.Process().children():
-                with contextlib.suppress(psutil.Error):
-                    if process.cmdline()[-4:-2] == ["--unit", self.unit]:
-                        return process
+            with contextlib.suppress(psutil.Error, LookupError):
+                return unit_process(self.unit)
             self.over.wait(WAIT_S)
         return None
 

@@ -72,7 +72,7 @@ def _page_up(size: int) -> int:
 
 
 def _write_all(fd: int, array: NDArray[Any], offset: int) -> None:
-    data = memoryview(array.reshape(-1).view(np.uint8)) if array.nbytes else memoryview(b"")
+    data = memoryview(array.reshape(-1).view(np.uint8).data) if array.nbytes else memoryview(b"")
     while data:
         written = os.pwrite(fd, data, offset)
         data, offset = data[written:], offset + written

@@ -88,11 +88,9 @@ def distinct(config: RunConfig) -> list[Path]:
 def shaped_body(assets: Assets, number: int) -> ShapedBody:
     """The body of distinct avatar `number`."""
     own = _with_prefix(assets, f"body{number}/")
-    body = Body(
-        source=f"avatar {number} of the run",
-        hand_components=(own[HANDS[0]], own[HANDS[1]]),
-        **{name: own.get(name) for name in BODY_ARRAYS},  # type: ignore[arg-type] - `posedirs` alone may be None
-    )
+    arrays: dict[str, Any] = {name: own.get(name) for name in BODY_ARRAYS}  # `posedirs` alone may be None
+    hands = (own[HANDS[0]], own[HANDS[1]])
+    body = Body(source=f"avatar {number} of the run", hand_components=hands, **arrays)
     return ShapedBody(own["vertices"], own["joints"], body)
 
 

@@ -61,7 +61,7 @@ def join(groups: list[I64], chosen: I64) -> I64:
 def build_levels(shaped: ShapedBody, weights: F64) -> list[Level]:
     """Coarse and fine patches of all triangles of the body, skinned with `weights` (V,55); cached."""
     body = shaped.body
-    sources = [shaped.vertices, shaped.joints, body.parents, body.faces, weights]
+    sources: list[NDArray[Any]] = [shaped.vertices, shaped.joints, body.parents, body.faces, weights]
     sources += [body.posedirs] if body.posedirs is not None else []
     stored = cached_arrays(VERSION, sources, lambda: _levels_to_arrays(_build_levels(shaped, weights)))
     return _levels_from_arrays(stored)

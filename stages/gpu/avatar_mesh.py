@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +20,7 @@ def avatar_mesh(shaped: ShapedBody) -> MeshArrays:
     """Vertices, triangles and weights of `shaped`, in the order in which they are drawn."""
     body = shaped.body
     sources = (shaped.vertices, body.faces, body.uv, body.uv_faces, body.weights)
-    arrays = dict(cached_arrays(VERSION, sources, lambda: _arrays(shaped)))
+    arrays: dict[str, Any] = dict(cached_arrays(VERSION, sources, lambda: _arrays(shaped)))
     closed = bool(arrays.pop("closed"))
     return MeshArrays(**arrays, closed=closed)
 

@@ -35,7 +35,7 @@ class RoomPainter:
             _detail(ctx, floor, moderngl.LINEAR_MIPMAP_LINEAR),
             _detail(ctx, wall, moderngl.LINEAR_MIPMAP_NEAREST),  # too smooth to show where levels change
         ]
-        self._extent = reduce(Extent.holding, eyes, Extent())
+        self._extent = reduce(Extent.holding, (np.asarray(eye, np.float64) for eye in eyes), Extent())
         self._batches: list[Any] = []
         self._build()
 

@@ -26,7 +26,7 @@ log = Path(sys.argv[1])
 killed = []
 def kill_once(presented, _requested):
     if presented >= 30 and not killed:
-        killed.append(next(p for p in psutil.Process().children() if "right" in p.cmdline()))
+        killed.append(next(p for p in psutil.Process().children(recursive=True) if p.name() == "trilane-right"))
         killed[0].send_signal(signal.SIGKILL)
 
 result = run_pipeline(brightness.pipeline(log), frames=120, pace_fps=100, on_progress=kill_once)
