@@ -85,16 +85,18 @@ class Motion:
 
     @property
     def duration_s(self) -> float:
+        """Time of the last frame."""
         return float(self.times_s[-1])
 
     @cached_property
-    def _quats(self) -> F64:
+    def quats(self) -> F64:
+        """`poses` as unit quaternions (T, 55, 4)."""
         return quat_from_rotvec(self.poses)
 
     def sample(self, t_s: float) -> tuple[F64, F64]:
         """Pose (55, 3) and translation (3,) at `t_s`: quaternions by slerp, translation linearly."""
         i, j, fraction = bracket(self.times_s, wrapped_time(t_s, self.duration_s, self.wrap))
-        pose = rotvec_from_quat(slerp(self._quats[i], self._quats[j], fraction))
+        pose = rotvec_from_quat(slerp(self.quats[i], self.quats[j], fraction))
         start, end = self.translation[i], self.translation[j]
         return pose, start + (end - start) * fraction
 
@@ -103,6 +105,6 @@ class Motion:
         brackets = [bracket(self.times_s, wrapped_time(float(t_s), self.duration_s, self.wrap)) for t_s in times_s]
         i, j = (np.array([neighbours[k] for neighbours in brackets]) for k in (0, 1))
         fraction = np.array([fraction for _, _, fraction in brackets])
-        poses = rotvec_from_quat(slerp(self._quats[i], self._quats[j], fraction[:, None]))
+        poses = rotvec_from_quat(slerp(self.quats[i], self.quats[j], fraction[:, None]))
         start, end = self.translation[i], self.translation[j]
         return poses, start + (end - start) * fraction[:, None]

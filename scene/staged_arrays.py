@@ -1,0 +1,110 @@
+"""A staged scene as plain arrays, to hand it from the process that staged it to others.
+
+Rule: the round trip is exact: every mover and the camera sample to the same bits afterwards. Notes do not travel. A key
+is `mover.N.FIELD` or `camera.FIELD`; a field that is None has no key.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.scene.camera.path import CameraPath, Lens
+from trilane.scene.motion.motion import Motion, Wrap
+from trilane.scene.mover import Mover
+from trilane.scene.placed_camera import PlacedCamera
+from trilane.scene.staging import Staged
+
+Arrays = dict[str, NDArray[Any]]
+
+WRAPS = tuple(Wrap)
+
+
+def staged_to_arrays(staged: Staged) -> Arrays:
+    """The arrays of `staged`, without copies where it has arrays already. They hold no Python objects."""
+    arrays: Arrays = {"movers": np.array(len(staged.movers))}
+    for index, mover in enumerate(staged.movers):
+        arrays |= {f"mover.{index}.{key}": value for key, value in _mover_arrays(mover).items()}
+    arrays |= {f"camera.{key}": value for key, value in _camera_arrays(staged.camera).items()}
+    return arrays
+
+
+def staged_from_arrays(arrays: Mapping[str, NDArray[Any]]) -> Staged:
+    """The scene that `staged_to_arrays` was called with, without its notes; keeps `arrays`, which may be read-only.
+
+    Raises KeyError when one is missing.
+    """
+    movers = tuple(_mover(_below(arrays, f"mover.{index}.")) for index in range(int(arrays["movers"])))
+    return Staged(movers, _camera(_below(arrays, "camera.")), ())
+
+
+def _below(arrays: Mapping[str, NDArray[Any]], prefix: str) -> Arrays:
+    return {key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)}
+
+
+def _mover_arrays(mover: Mover) -> Arrays:
+    motion = mover.motion
+    optional = {"betas": motion.betas, "leg_m": motion.leg_m}
+    return {
+        "times_s": motion.times_s,
+        "poses": motion.poses,
+        "quats": motion.quats,
+        "translation": motion.translation,
+        "wrap": np.array(WRAPS.index(motion.wrap)),
+        "travels": np.array(motion.travels),
+        "world": mover.world,
+        "scale": np.array(mover.scale),
+        "shift": mover.shift,
+        "lift_times_s": mover.lift_times_s,
+        "lift_m": mover.lift_m,
+        **{key: np.asarray(value) for key, value in optional.items() if value is not None},
+    }
+
+
+def _mover(arrays: Arrays) -> Mover:
+    leg_m = arrays.get("leg_m")
+    motion = Motion(
+        arrays["times_s"],
+        arrays["poses"],
+        arrays["translation"],
+        arrays.get("betas"),
+        (),
+        WRAPS[int(arrays["wrap"])],
+        None if leg_m is None else float(leg_m),
+        bool(arrays["travels"]),
+    )
+    vars(motion)["quats"] = arrays["quats"]  # the cached property, which otherwise is computed at the first sample
+    return Mover(
+        motion, arrays["world"], float(arrays["scale"]), arrays["shift"], arrays["lift_times_s"], arrays["lift_m"], ()
+    )
+
+
+def _camera_arrays(camera: PlacedCamera) -> Arrays:
+    path = camera.path
+    return {
+        "times_s": path.times_s,
+        "quats": path.quats,
+        "places": path.places,
+        "lens": np.array([path.lens.fov_y_deg, path.lens.near_m, path.lens.far_m]),
+        "wrap": np.array(WRAPS.index(path.wrap)),
+        "recorded": np.array(path.recorded),
+        "turn": camera.turn,
+        "shift": camera.shift,
+        "mount": camera.mount,
+    }
+
+
+def _camera(arrays: Arrays) -> PlacedCamera:
+    path = CameraPath(
+        arrays["times_s"],
+        arrays["quats"],
+        arrays["places"],
+        Lens(*(float(value) for value in arrays["lens"])),
+        (),
+        WRAPS[int(arrays["wrap"])],
+        bool(arrays["recorded"]),
+    )
+    return PlacedCamera(path, arrays["turn"], arrays["shift"], arrays["mount"], ())
