@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from trilane.apps.pace import Pace, compare
-from trilane.apps.report import build_report, write_report
+from trilane.apps.report import Report, build_report, write_report
 from trilane.apps.run_folder import RunFolder
 from trilane.apps.trace import write_trace
 from trilane.apps.video import contact_sheet, join_segments, run_checksum
@@ -56,7 +56,7 @@ class Hooks:
 class Outcome:
     """`report` as written, `folder` that holds it, and the exit code that the run asks for."""
 
-    report: dict[str, Any]
+    report: Report
     folder: Path
     exit_code: int
 
@@ -73,22 +73,24 @@ def run_to_folder(
         result = _run(config, plan, plan.policy, None, hooks)
         with Interrupts() as late:  # from here on a signal waits until the folder is whole
             baseline, stopped = _baseline(config, plan, hooks) if _went_well(result) else (None, False)
-            report = build_report(result, config, policy=plan.policy, machine=machine, baseline=baseline)
+            known = {**facts, **_write_files(result, folder.work, config.scene.fps)}
             if plan.pace is not None:
-                report["pace"] = compare(plan.pace, plan.policy, config.scene.frames, result.jobs)
-            report |= {**facts, **_write_files(result, folder.work, config.scene.fps)}
+                known["pace"] = compare(plan.pace, plan.policy, config.scene.frames, result.jobs)
+            report = build_report(result, config, machine=machine, baseline=baseline, facts=known)
             _tell(report, hooks)
             write_report(report, folder.work / "report.json")
             place = folder.complete()
         return Outcome(report, place, INTERRUPTED if stopped or late.count else _exit_code(result))
 
 
-def _tell(report: dict[str, Any], hooks: Hooks) -> None:
+def _tell(report: Report, hooks: Hooks) -> None:
     """What a person should not have to find in the report."""
-    shown, presented = (report["video"] or {}).get("frames", 0), report["frames"]["presented"]
-    if report["video"] and shown < presented:
-        hooks.message(f"video.mp4 holds {shown} of {presented} frames: a writer was killed before its last")
-    if report["figures"].get("pose", {}).get("visible") == 0:
+    presented = report.frames.presented
+    if report.video and report.video.frames < presented:
+        hooks.message(
+            f"video.mp4 holds {report.video.frames} of {presented} frames: a writer was killed before its last"
+        )
+    if report.stage_metrics.get("pose", {}).get("visible") == 0:
         hooks.message("no avatar was in the picture in any frame")
 
 
@@ -162,5 +164,5 @@ def _write_files(result: RunResult, work: Path, fps: float) -> dict[str, Any]:
             contact_sheet(work / "video.mp4", work / "contact.png", fps)
         shutil.rmtree(segments)
     result.recording.write(work / "events.jsonl")
-    write_trace(result.jobs, work / "trace.pftrace")
+    write_trace(result.jobs, result.recording.graph.units, work / "trace.pftrace")
     return files

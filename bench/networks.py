@@ -12,10 +12,10 @@ import numpy as np
 import onnx
 from numpy.typing import NDArray
 
-from trilane.apps.avatar_facts import graph_facts
 from trilane.avatars.network_file import NetworkFile
 from trilane.avatars.reshape import reshaped
 from trilane.errors import MissingPartError
+from trilane.hw_profiles.cost import graph_facts
 from trilane.training.quantising.quantise import quantise
 
 CALIBRATION_SIDE = 64

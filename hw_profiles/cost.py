@@ -155,6 +155,12 @@ def walk(model: Any) -> Work:
     )
 
 
+def graph_facts(model: Any) -> dict[str, Any]:
+    """`parameters` of the layers as they are in the file, `gmac` of one pass. Raises as `walk`."""
+    work = walk(model)
+    return {"parameters": work.weights, "gmac": work.macs / 1e9}
+
+
 @lru_cache(maxsize=4096)
 def network_work(spec: NetworkSpec) -> Work:
     """The work of one of the reference networks.
