@@ -255,7 +255,7 @@ def read_report(path: Path) -> Report:
         _refuse_newer(file, document)
         return Report.model_validate(document)
     except OSError as error:
-        raise BadInputError(file, (error.strerror or str(error)).lower(), EXPECTED) from None
+        raise BadInputError.of_os_error(file, error, EXPECTED) from None
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"]) or "the document"

@@ -13,6 +13,7 @@ from types import TracebackType
 from typing import Self
 
 from trilane.errors import BadInputError
+from trilane.writing import WRITABLE
 
 
 def default_place(scene: str) -> Path:
@@ -46,10 +47,7 @@ class RunFolder:
             self.work.mkdir()
         except OSError as error:
             self._remove()
-            reason = error.strerror or str(error)
-            raise BadInputError(
-                self.target, reason.lower(), "a place that can be written", "choose another --out"
-            ) from None
+            raise BadInputError.of_os_error(self.target, error, WRITABLE, "choose another --out") from None
         return self
 
     def _make_parents(self) -> None:
@@ -64,10 +62,8 @@ class RunFolder:
         try:
             self.work.rename(self.target)
         except OSError as error:
-            found = error.strerror or str(error)
-            raise BadInputError(
-                self.target, found.lower(), "a name that is free", f"the run is in {self.work}"
-            ) from None
+            remedy = f"the run is in {self.work}"
+            raise BadInputError.of_os_error(self.target, error, "a name that is free", remedy) from None
         return self.target
 
     def __exit__(

@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import math
 import shutil
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -21,6 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from trilane.avatars.network_file import MAX_CHANNELS, MAX_SIDE, Affine, NetworkFile, read_network
 from trilane.errors import BadInputError
 from trilane.files import read_npz, read_text, require_file
+from trilane.writing import write_folder
 
 MANIFEST = "manifest.json"
 DEFAULT = "default"
@@ -153,14 +153,12 @@ def network_entry(network: NetworkFile, encoder: str, norm: str, width: int) -> 
 def write_bundle(
     folder: Path, manifest: Manifest, body: Path, texture: NDArray[Any], network: NetworkFile, scale: Any = None
 ) -> None:
-    """Write a bundle under a temporary name, read it back, then put it in place of `folder`'s files.
+    """Write a bundle beside `folder`, read it back, then put its files in `folder`.
 
     `body`: an .npz file to copy. `texture`: (H, W, C) float16, or int8 with `scale` (C,) float32.
     Raises BadInputError when the parts do not fit; then nothing is written.
     """
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".bundle-", dir=folder.parent) as name:
-        draft = Path(name)
+    with write_folder(folder) as draft:
         shutil.copyfile(body, draft / manifest.body)
         arrays: dict[str, Any] = (
             {"texture": texture} if scale is None else {"texture": texture, "scale": np.asarray(scale, np.float32)}
@@ -171,9 +169,6 @@ def write_bundle(
         bundle = load_bundle(draft)
         bundle.read_texture()
         bundle.read_network()
-        folder.mkdir(exist_ok=True)
-        for file in draft.iterdir():
-            file.replace(folder / file.name)
 
 
 def _parse(text: str, path: Path) -> Manifest:

@@ -18,7 +18,7 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 from onnx import TensorProto, external_data_helper, numpy_helper
 
-from trilane.errors import BadInputError
+from trilane.errors import BadInputError, reason
 
 #: Metadata of a file: a JSON list of the names of layers that were left in float on purpose.
 FLOAT_LAYERS_KEY = "trilane.float_layers"
@@ -156,7 +156,7 @@ def parse_network(path: Path) -> onnx.ModelProto:
             raise BadInputError(path, f"a file of {size} bytes", f"an ONNX network of 1 to {MAX_BYTES} bytes")
         model = onnx.load_model_from_string(path.read_bytes())
     except OSError as error:
-        raise BadInputError(path, error.strerror or str(error), "a readable ONNX file") from error
+        raise BadInputError.of_os_error(path, error, "a readable ONNX file") from error
     except DecodeError as error:
         raise BadInputError(
             path, "bytes that do not parse", "an ONNX file", "copy it again: it may be cut short"
@@ -185,7 +185,7 @@ def _load_external(model: onnx.ModelProto, path: Path) -> None:
         try:
             external_data_helper.load_external_data_for_tensor(tensor, str(folder))
         except (OSError, ValueError, onnx.checker.ValidationError) as error:
-            raise BadInputError(path, f"tensor {tensor.name!r} in {file}: {error}", "readable data") from error
+            raise BadInputError(path, f"tensor {tensor.name!r} in {file}: {reason(error)}", "readable data") from error
         tensor.data_location = TensorProto.DEFAULT
         del tensor.external_data[:]
 

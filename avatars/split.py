@@ -69,8 +69,8 @@ def split(network: NetworkFile, at: Sequence[str]) -> list[NetworkPart]:
     known = {cut.at: cut for cut in cuts(network)} if at else {}
     for name in at:
         if name not in known:
-            fix = "`trilane avatar split` without --at lists them"
-            raise BadInputError(f"{network.where}, cut", repr(name), "a quantised tensor", fix)
+            remedy = "`trilane avatar split` without --at lists them"
+            raise BadInputError(f"{network.where}, cut", repr(name), "a quantised tensor", remedy)
     chosen = [known[name] for name in at]
     if any(first.nodes >= second.nodes for first, second in pairwise(chosen)):
         raise BadInputError(f"{network.where}, cuts", ", ".join(at), "different tensors in the order of the work")

@@ -21,6 +21,7 @@ from trilane.errors import BadInputError
 from trilane.shapes import Shape, shape_buckets
 from trilane.stages.cpu.crop import Rect, choose_bucket
 from trilane.stages.cpu.mesh_bounds import MeshBounds
+from trilane.unexpected import UnexpectedValue
 
 BODY = Path(__file__).resolve().parents[1] / "avatars" / "default" / "body.npz"
 NEAR, FAR = 0.05, 100.0
@@ -46,8 +47,8 @@ def measure(views: int = 1000, size: str = "256", height: int = 480, width: int 
         raise BadInputError("--views", str(views), "at least 1")
     try:
         buckets = shape_buckets(size)
-    except ValueError as error:
-        raise BadInputError.about("--size", error) from error
+    except UnexpectedValue as error:
+        raise BadInputError.at("--size", error) from error
     seen = _views(views, (height, width), buckets)
     mesh_area = np.array([_area(view.mesh) for view in seen])
     side = np.array([(view.joints[2:] - view.joints[:2]).max() for view in seen])

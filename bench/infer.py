@@ -25,6 +25,7 @@ from trilane.errors import BadInputError
 from trilane.hw_profiles.host import sensor_c
 from trilane.shapes import parse_shape
 from trilane.stages.dsp.runtime import resolve
+from trilane.unexpected import UnexpectedValue
 
 FP32 = "ort fp32"
 CACHE = "XDG_CACHE_HOME"
@@ -85,8 +86,8 @@ def _subjects(
     for one_encoder, one_norm, text, frames in product(encoder, norm, size, batch):
         try:
             shape = parse_shape(text)
-        except ValueError as error:
-            raise BadInputError.about("--size", error) from error
+        except UnexpectedValue as error:
+            raise BadInputError.at("--size", error) from error
         settings = (one_encoder, one_norm, width, shape)
         yield untrained(*settings, batch=frames), untrained_float(*settings)
 

@@ -17,7 +17,6 @@ from trilane.bench.load import WARM_UP, Load, Queries, queries_needed
 from trilane.errors import MissingPartError, TrilaneError
 from trilane.pipeline.requests import FrameRequestQueue
 
-INSTALL = 'pip install "trilane[loadgen]"'
 NAMES = {"single-stream": "SingleStream", "multi-stream": "MultiStream", "server": "Server", "offline": "Offline"}
 VERDICT = re.compile(r"^Result is : (\w+)", re.MULTILINE)
 SAMPLES = 64  # LoadGen draws from as many; every one is the motion's next frame
@@ -29,7 +28,7 @@ def load_generator() -> Any:
     try:
         return importlib.import_module("mlperf_loadgen")
     except ImportError:
-        raise MissingPartError("LoadGen, the judge, is not installed", INSTALL) from None
+        raise MissingPartError("LoadGen, the judge, is not installed", extra="loadgen") from None
 
 
 @dataclass

@@ -73,7 +73,7 @@ def _unet(encoder: str, norm: str, width: int, channels: int) -> tuple[Any, Any]
     try:
         import torch
     except ModuleNotFoundError as error:
-        raise MissingPartError("untrained networks need PyTorch", "pip install 'trilane[train]'") from error
+        raise MissingPartError("untrained networks need PyTorch", extra="train") from error
     from trilane.training.network import UNet
 
     torch.manual_seed(0)

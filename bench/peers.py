@@ -23,6 +23,7 @@ from trilane.bench.networks import untrained, untrained_float
 from trilane.errors import BadInputError, MissingPartError, TrilaneError
 from trilane.shapes import parse_shape
 from trilane.stages.dsp.runtime import resolve
+from trilane.unexpected import UnexpectedValue
 
 APP = "benchmark_app"
 APP_STATS = "benchmark_report.json"
@@ -44,8 +45,8 @@ def measure(
     threads = threads or len(os.sched_getaffinity(0))
     try:
         shape = parse_shape(size)
-    except ValueError as error:
-        raise BadInputError.about("--size", error) from error
+    except UnexpectedValue as error:
+        raise BadInputError.at("--size", error) from error
     subject = untrained("resnet18", "batch", width, shape)
     with tempfile.TemporaryDirectory(prefix="trilane-peers-") as name:
         folder = Path(name)
@@ -95,7 +96,7 @@ def _benchmark_app(network: Path, folder: Path, threads: int, seconds: int) -> f
     """Median latency in milliseconds by OpenVINO's tool: one request at a time."""
     tool = shutil.which(APP, path=f"{Path(sys.executable).parent}:{os.environ.get('PATH', '')}")
     if tool is None:
-        raise MissingPartError(f"{APP} is not there", "pip install openvino")
+        raise MissingPartError(f"{APP} is not there", extra="openvino")
     options = ["-hint", "none", "-api", "sync", "-nthreads", str(threads), "-nstreams", "1", "-t", str(seconds)]
     report = ["-report_type", "no_counters", "-report_folder", str(folder), "-json_stats"]
     command = [tool, "-m", str(network), "-d", "CPU", *options, *report]

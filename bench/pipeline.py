@@ -26,6 +26,7 @@ from trilane.scheduler.stats import median_interval
 from trilane.stages.config import RunConfig
 from trilane.stages.configure import Request, configure
 from trilane.transport.slots import edge_rule
+from trilane.unexpected import UnexpectedValue
 
 SEQUENTIAL = "sequential"
 MIN_FRAMES = 20
@@ -96,8 +97,8 @@ def _check(policies: Sequence[str], edges: Sequence[str], cores: Sequence[int]) 
         for value in values:
             try:
                 check(value)
-            except ValueError as error:
-                raise BadInputError.about(option, error) from None
+            except UnexpectedValue as error:
+                raise BadInputError.at(option, error) from None
     have = len(usable_cores())
     if not all(1 <= count <= have for count in cores):
         raise BadInputError("--cores", str(list(cores)), f"numbers from 1 to the {have} that this process may use")

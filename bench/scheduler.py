@@ -16,6 +16,7 @@ import numpy as np
 
 from trilane.compiled import form
 from trilane.errors import BadInputError, TrilaneError
+from trilane.install import install_line
 from trilane.scheduler.events import Graph, Settings, avatar_graph
 from trilane.scheduler.recording import read, replay
 from trilane.scheduler.virtual import Service, VirtualDriver, simulate
@@ -26,7 +27,6 @@ SERVICE_MS = {"pose": 0.3, "raster": 4.0, "infer": 14.0, "composite": 2.0, "pres
 FPS = 60
 PERIOD_NS = round(1e9 / FPS)
 REPEATS, SEED_FRAMES = 10, 300
-INSTALL = "pip install 'trilane[peers]'"
 
 
 def measure(minutes: float = 30.0, turns: int = 3, seeds: int = 10, events: str = "") -> dict[str, Any]:
@@ -100,7 +100,7 @@ def _add_simpy(
     try:
         from trilane.bench.simpy_model import SimpyPipeline
     except ModuleNotFoundError:
-        return {"absent": {"simpy": f"not installed: {INSTALL}"}}
+        return {"absent": {"simpy": f"not installed: {install_line('peers')}"}}
     ways["simpy"] = lambda: SimpyPipeline(graph, service, frames, PERIOD_NS).run()
     return {}
 

@@ -30,6 +30,7 @@ from trilane.stages.dsp.runtime import Binding, RuntimeOptions, load_runtime
 from trilane.stages.gpu.assets import load_assets
 from trilane.stages.gpu.mesh import SkinnedMesh
 from trilane.stages.gpu.packed import PackedAvatar, PackedPass, Placement
+from trilane.unexpected import UnexpectedValue
 
 BOUND_DB = 0.5
 OUTPUT = (480, 640)
@@ -162,7 +163,7 @@ def ground_truth(bundle: Bundle) -> tuple[Any, Any]:
         from trilane.training.dataset import Studio
         from trilane.training.metrics import image_error
     except ImportError as error:
-        raise MissingPartError(f"ground truth needs {error.name}", "pip install 'trilane[train]'") from None
+        raise MissingPartError(f"ground truth needs {error.name}", extra="train") from None
     return Studio(shaped_body(bundle)), image_error
 
 
@@ -179,5 +180,5 @@ def _check(avatars: int, views: int, size: str, margins: Sequence[int]) -> None:
         raise BadInputError("--margins", str(bad[0]), f"0 to {MOST_MARGIN}")
     try:
         shape_buckets(size)
-    except ValueError as error:
-        raise BadInputError.about("--size", error) from error
+    except UnexpectedValue as error:
+        raise BadInputError.at("--size", error) from error

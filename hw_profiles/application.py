@@ -23,6 +23,7 @@ from trilane.hw_profiles.schema import Profile, Unit
 from trilane.scheduler.events import Graph, Settings, StageSpec
 from trilane.scheduler.policy import POLICIES
 from trilane.scheduler.virtual import simulate
+from trilane.unexpected import UnexpectedValue
 from trilane.units import UNITS, UnitName
 
 RUNTIMES: tuple[UnitName, ...] = ("gpu", "dsp")
@@ -152,7 +153,7 @@ def _run(graph: Graph, settings: Settings, service: Mapping[str, int]) -> Any:
     try:
         return simulate(graph, settings, lambda stage, _unit, _frame, _begin: service[stage]).report
     except ValueError as error:
-        expected = str(error).partition("expected ")[2] or str(error)
+        expected = error.expected if isinstance(error, UnexpectedValue) else str(error)
         raise BadInputError("edge", repr(graph.edges[0]), expected) from None
 
 

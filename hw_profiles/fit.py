@@ -236,7 +236,7 @@ def _least_squares() -> Callable[..., Any]:
     try:
         from scipy.optimize import least_squares
     except ImportError:
-        raise MissingPartError("fitting needs SciPy", "pip install 'trilane[fit]'") from None
+        raise MissingPartError("fitting needs SciPy", extra="fit") from None
     solver: Callable[..., Any] = least_squares
     return solver
 

@@ -17,12 +17,14 @@ from pydantic import ValidationError
 from trilane.errors import BadInputError
 from trilane.hw_profiles.detect import host_tables
 from trilane.hw_profiles.schema import Profile
+from trilane.unexpected import unexpected_in
 
 HOST = "host"
 MAX_BYTES = 1_000_000
 MAX_DEPTH = 8
 #: Quantities are replaced whole by an extending profile: half of one number and half of another mean nothing.
 WHOLE = frozenset(["value", "kind", "source"])
+UNIT_HINT = "units of measure end the name"
 
 
 def profile_folder() -> Path:
@@ -119,7 +121,7 @@ def _read(path: Path) -> dict[str, Any]:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise BadInputError(path, str(error), "TOML in UTF-8") from None
     except OSError as error:
-        raise BadInputError(path, error.strerror or str(error), "a file that can be read") from None
+        raise BadInputError.of_os_error(path, error, "a file that can be read") from None
 
 
 def _overlay(base: Any, over: Any) -> Any:
@@ -131,21 +133,21 @@ def _overlay(base: Any, over: Any) -> Any:
 def _bad_input(error: ValidationError, path: Path) -> BadInputError:
     first, count = error.errors(include_url=False)[0], error.error_count()
     keys = [str(part) for part in first["loc"] if part != "[key]"]
-    more = f"; and {count - 1} more" if count > 1 else ""
-    where, message = f"{path}: {'.'.join(keys) or 'the profile'}", first["msg"].removeprefix("Value error, ")
+    more = f"and {count - 1} more" if count > 1 else ""
+    where, message = f"{path}: {'.'.join(keys) or 'the profile'}", first["msg"]
     if first["type"] == "extra_forbidden":
         known = list(_siblings(keys))
         close = difflib.get_close_matches(keys[-1], known, 1, 0.5)
         expected = f"`{close[0]}`" if close else "one of " + ", ".join(known)
-        return BadInputError(where, f"the unknown key `{keys[-1]}`", expected, "units of measure end the name" + more)
-    if message.startswith("found ") and ", expected " in message:
-        found, expected = message.removeprefix("found ").split(", expected ", 1)
-        return BadInputError(where, found, expected + more)
+        remedy = f"{UNIT_HINT}; {more}" if more else UNIT_HINT
+        return BadInputError(where, f"the unknown key `{keys[-1]}`", expected, remedy)
+    unexpected = unexpected_in(first)
+    if unexpected is not None:
+        return BadInputError(where, unexpected.found, unexpected.expected, more)
     if first["type"] == "missing":
-        return BadInputError(where, "nothing", "this key" + more)
-    found = _short(first["input"])
+        return BadInputError(where, "nothing", "this key", more)
     expected = "a table { value = ..., kind = ..., source = ... }" if "Quantity" in message else _expectation(message)
-    return BadInputError(where, found, expected + more)
+    return BadInputError(where, _short(first["input"]), expected, more)
 
 
 def _expectation(message: str) -> str:

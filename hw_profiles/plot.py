@@ -10,6 +10,7 @@ from pathlib import Path
 
 from trilane.errors import BadInputError, MissingPartError
 from trilane.hw_profiles.predict import Moment
+from trilane.writing import write_atomically
 
 SUFFIXES = (".png", ".svg", ".pdf")
 
@@ -21,7 +22,7 @@ def plot_over_time(runs: Mapping[str, Sequence[Moment]], limit_c: float, title: 
     try:
         from matplotlib.figure import Figure
     except ImportError:
-        raise MissingPartError("drawing needs Matplotlib", "pip install 'trilane[plot]'") from None
+        raise MissingPartError("drawing needs Matplotlib", extra="plot") from None
     figure = Figure(figsize=(8, 6), layout="constrained")
     rate, heat = figure.subplots(2, 1, sharex=True)
     for label, moments in runs.items():
@@ -37,7 +38,5 @@ def plot_over_time(runs: Mapping[str, Sequence[Moment]], limit_c: float, title: 
     for axes in (rate, heat):
         axes.grid(alpha=0.3)
         axes.legend(loc="lower right", fontsize="small")
-    try:
-        figure.savefig(path, dpi=120)
-    except OSError as error:
-        raise BadInputError(path, error.strerror or str(error), "a place that can be written") from None
+    with write_atomically(path) as draft:
+        figure.savefig(draft, dpi=120)

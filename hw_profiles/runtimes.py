@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 from trilane.errors import MissingPartError
 from trilane.hw_profiles.schema import Profile
-
-INSTALL = "pip install onnxruntime"
+from trilane.install import package_line
 
 
 def fastest_runtime(profile: Profile, installed: Sequence[str]) -> tuple[str, str]:
@@ -17,7 +16,7 @@ def fastest_runtime(profile: Profile, installed: Sequence[str]) -> tuple[str, st
     """
     speeds = {name: profile.units["dsp"].runtimes[name] for name in installed if name in profile.units["dsp"].runtimes}
     if not speeds:
-        raise MissingPartError("no runtime that the host profile knows is installed", INSTALL)
+        raise MissingPartError("no runtime that the host profile knows is installed", package_line("onnxruntime"))
     name = max(speeds, key=lambda one: speeds[one].or_else(0.0))
     times = ", ".join(f"{one} {speed.or_else(0.0):g}" for one, speed in speeds.items())
     return name, f"times the speed of FP32, by the host profile: {times}; {speeds[name].source}"

@@ -10,6 +10,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
+from trilane.unexpected import UnexpectedValue
 from trilane.units import PERFORMANCE_PROFILES, UNITS, PerformanceProfile, UnitName
 
 Corner = Literal["max", "turbo", "nominal_plus", "nominal", "svs_plus", "svs", "svs2"]
@@ -40,8 +41,8 @@ class Quantity(Model):
     @model_validator(mode="after")
     def _value_or_unknown(self) -> Self:
         if (self.value is None) != (self.kind == "unknown"):
-            found = "no value" if self.value is None else "a value"
-            raise ValueError(f'found {found} under kind = "{self.kind}", expected one unless kind = "unknown"')
+            amount = "no value" if self.value is None else "a value"
+            raise UnexpectedValue(f'{amount} under kind = "{self.kind}"', 'one unless kind = "unknown"')
         return self
 
     @property
@@ -53,14 +54,14 @@ class Quantity(Model):
 
 
 class _Range:
-    """Validator of a quantity's value. Raises ValueError that says what was found and what was expected."""
+    """Validator of a quantity's value. Raises UnexpectedValue."""
 
     def __init__(self, low: float, high: float) -> None:
         self.low, self.high = low, high
 
     def __call__(self, quantity: Quantity) -> Quantity:
         if quantity.value is not None and not self.low <= quantity.value <= self.high:
-            raise ValueError(f"found {quantity.value:g}, expected {self.low:g} to {self.high:g}")
+            raise UnexpectedValue(f"{quantity.value:g}", f"{self.low:g} to {self.high:g}")
         return quantity
 
 
@@ -139,7 +140,7 @@ class Unit(Model):
     def _all_corners(self) -> Self:
         missing = [corner for corner in CORNERS if corner not in self.corners]
         if missing:
-            raise ValueError(f"found no corner {', '.join(missing)}, expected all of {', '.join(CORNERS)}")
+            raise UnexpectedValue(f"no corner {', '.join(missing)}", f"all of {', '.join(CORNERS)}")
         return self
 
     def clock(self, corner: Corner) -> float:
@@ -231,7 +232,7 @@ class Profile(Model):
         ):
             missing = [name for name in names if name not in found]
             if missing:
-                raise ValueError(f"found no {what} {', '.join(missing)}, expected all of {', '.join(names)}")
+                raise UnexpectedValue(f"no {what} {', '.join(missing)}", f"all of {', '.join(names)}")
         if (self.thermal.skin_limit_c.value or 0) <= (self.thermal.ambient_c.value or 0):
-            raise ValueError("found thermal.skin_limit_c at or below thermal.ambient_c, expected it above")
+            raise UnexpectedValue("thermal.skin_limit_c at or below thermal.ambient_c", "it above")
         return self

@@ -13,6 +13,7 @@ from pathlib import Path
 from trilane.errors import BadInputError
 from trilane.hw_profiles.networks import NetworkSpec
 from trilane.shapes import parse_shape
+from trilane.unexpected import UnexpectedValue
 
 KEYS = ("encoder", "norm", "size", "channels", "layout")
 MAX_BYTES, MAX_ROWS = 32_000_000, 100_000
@@ -55,7 +56,7 @@ def read_table(path: Path) -> list[Row]:
     except UnicodeDecodeError as error:
         raise BadInputError(path, str(error), "text in UTF-8") from None
     except OSError as error:
-        raise BadInputError(path, error.strerror or str(error), "a file that can be read") from None
+        raise BadInputError.of_os_error(path, error, "a file that can be read") from None
     lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
     if len(lines) < 2:
         raise BadInputError(path, "no rows", "a header and at least one row")
@@ -82,7 +83,7 @@ def spec_of(cells: dict[str, str], place: str) -> NetworkSpec:
     size = cells["size"]
     try:
         height, width = parse_shape(size if "x" in size else f"{size}x{size}")
-    except ValueError:
+    except UnexpectedValue:
         raise BadInputError(f"{place}: size", repr(size), "a side such as 512, or HEIGHTxWIDTH") from None
     channels = cells["channels"]
     if not channels.isdecimal() or len(channels) > 4:

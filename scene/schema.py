@@ -11,6 +11,7 @@ from typing import Annotated, Literal, Self
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from trilane.shapes import MAX_SIDE, checked_size
+from trilane.unexpected import UnexpectedValue
 
 MAX_DEPTH_RATIO = 1e6  # a depth buffer of 24 bits cannot tell apart what is nearer together
 FARTHEST_M = 1e4  # of an avatar from the scene's origin: float32 then still tells millimetres apart
@@ -60,9 +61,9 @@ class CameraSpec(Model):
     @model_validator(mode="after")
     def _near_before_far(self) -> Self:
         if not self.near_m < self.far_m <= MAX_DEPTH_RATIO * self.near_m:
-            raise ValueError(
-                f"found near_m {self.near_m:g} and far_m {self.far_m:g}, expected near_m below far_m and "
-                f"far_m at most {MAX_DEPTH_RATIO:g} times near_m"
+            raise UnexpectedValue(
+                f"near_m {self.near_m:g} and far_m {self.far_m:g}",
+                f"near_m below far_m and far_m at most {MAX_DEPTH_RATIO:g} times near_m",
             )
         return self
 
@@ -83,7 +84,7 @@ class PlaneSpec(Model):
     @classmethod
     def _normal_has_length(cls, normal: tuple[float, float, float]) -> tuple[float, float, float]:
         if not 1e-6 < math.hypot(*normal) < 1e6:
-            raise ValueError(f"found {normal}, expected a direction")
+            raise UnexpectedValue(str(normal), "a direction")
         return normal
 
 

@@ -16,8 +16,8 @@ from pydantic import ValidationError
 from trilane.errors import BadInputError
 from trilane.files import read_text
 from trilane.scene.schema import Scene
+from trilane.unexpected import unexpected_in
 
-OWN = "Value error, "
 INPUT_SHOULD = "Input should be "
 ENDING = ".toml"
 LONGEST_FOUND = 80
@@ -43,14 +43,13 @@ def bad_input(where: str | Path, error: ValidationError) -> BadInputError:
         return BadInputError(place, "an unknown key", "a key of the scene schema", "correct its spelling or remove it")
     if first["type"] == "missing":
         return BadInputError(place, "nothing", "a value", "add the key")
-    message = str(first["msg"])
-    found = repr(first["input"])
-    if message.startswith(OWN):
-        own_found, _, expected = message.removeprefix(OWN).removeprefix("found ").partition(", expected ")
-        return BadInputError(place, own_found if expected else found, expected or own_found)
-    short = found if len(found) <= LONGEST_FOUND else found[:LONGEST_FOUND] + "..."
+    unexpected = unexpected_in(first)
+    if unexpected is not None:
+        return BadInputError.at(place, unexpected)
+    value = repr(first["input"])
+    short = value if len(value) <= LONGEST_FOUND else value[:LONGEST_FOUND] + "..."
     expected = EXPECTED.get(first["type"], "").format(**first.get("ctx", {}))
-    return BadInputError(place, short, expected or message.removeprefix(INPUT_SHOULD))
+    return BadInputError(place, short, expected or str(first["msg"]).removeprefix(INPUT_SHOULD))
 
 
 def scene_from(where: str | Path, values: Mapping[str, Any]) -> Scene:

@@ -9,6 +9,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from trilane.unexpected import UnexpectedValue
+
 
 class Job(NamedTuple):
     """One stage of one frame on one unit, from a slot to a slot."""
@@ -143,9 +145,10 @@ class Graph:
     def __post_init__(self) -> None:
         names = [stage.name for stage in self.stages]
         if len(set(names)) != len(names) or not names:
-            raise ValueError(f"found stages {names}, expected different names")
+            raise UnexpectedValue(f"stages {names}", "different names")
         if len(self.edges) != len(names) - 1 or self.latency_to not in names:
-            raise ValueError(f"found {len(self.edges)} edges and latency to {self.latency_to!r} for stages {names}")
+            found = f"{len(self.edges)} edges and latency to {self.latency_to!r} for stages {names}"
+            raise UnexpectedValue(found, "one edge fewer than stages, and latency to one of them")
 
     @property
     def units(self) -> tuple[str, ...]:

@@ -6,6 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from trilane.unexpected import UnexpectedValue
+
 
 class Candidate(NamedTuple):
     """A job that could start now. `position`: of its stage in the chain. `deadline_ns`: 0 when the frame has none."""
@@ -57,7 +59,7 @@ POLICIES = {
 
 
 def policy_named(name: str) -> Policy:
-    """Raises ValueError naming what was found."""
+    """The row of `POLICIES`. Raises UnexpectedValue."""
     if name not in POLICIES:
-        raise ValueError(f"found policy {name!r}, expected one of {', '.join(POLICIES)}")
+        raise UnexpectedValue(f"policy {name!r}", f"one of {', '.join(POLICIES)}")
     return POLICIES[name]

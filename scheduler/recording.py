@@ -21,6 +21,7 @@ from trilane.scheduler.events import (
     Settings,
     StageSpec,
 )
+from trilane.unexpected import UnexpectedValue
 
 SCHEMA = 2
 
@@ -66,11 +67,13 @@ def read(path: Path) -> Recording:
                 row = json.loads(line)
                 now_ns = row["t"]
                 if type(now_ns) is not int or (recording.steps and now_ns < recording.steps[-1][0]):
-                    raise ValueError(f"time {now_ns!r}, expected ns that do not go back")
+                    raise UnexpectedValue(f"time {now_ns!r}", "ns that do not go back")
                 events = tuple(_parse(item, _EVENTS) for item in row["events"])
                 recording.steps.append((now_ns, events, tuple(_parse(item, _ACTIONS) for item in row["actions"])))
     except OSError as error:
-        raise BadInputError(path, (error.strerror or str(error)).lower(), "a recorded run") from None
+        raise BadInputError.of_os_error(path, error, "a recorded run") from None
+    except UnexpectedValue as error:
+        raise BadInputError.at(f"{path}, line {number + 1}", error) from None
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise BadInputError(
             f"{path}, line {number + 1}", str(error) or type(error).__name__, "a recorded run"
@@ -99,13 +102,13 @@ def _row(item: Any) -> list[Any]:
 
 
 def _parse(row: list[Any], forms: dict[str, tuple[Any, list[Any]]]) -> Any:
-    """Raises ValueError for a name or for types of fields that none of `forms` has."""
+    """Raises UnexpectedValue for a name or for types of fields that none of `forms` has."""
     name, *fields = row
     if name not in forms:
-        raise ValueError(f"{str(name)[:80]!r}, expected one of {', '.join(forms)}")
+        raise UnexpectedValue(repr(str(name)[:80]), f"one of {', '.join(forms)}")
     kind, types = forms[name]
     if [type(field) for field in fields] != types:
-        raise ValueError(f"{str(row)[:80]}, expected fields of {', '.join(each.__name__ for each in types)}")
+        raise UnexpectedValue(str(row)[:80], f"fields of {', '.join(each.__name__ for each in types)}")
     return Dispatch(Job(*fields)) if kind is Dispatch else kind(*fields)
 
 

@@ -24,12 +24,13 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch import multiprocessing as tmp
 
-from trilane.errors import BadInputError
+from trilane.errors import BadInputError, reason
 from trilane.training.data import U16, ShapeGroup, batches, open_groups
 from trilane.training.jitter import add_jitter
 from trilane.training.losses import loss_terms, total_loss
 from trilane.training.network import UNet
 from trilane.training.texture import NeuralTexture, sample
+from trilane.writing import write_atomically
 
 #: Steps of the network's input bytes on either side of zero.
 INPUT_STEPS = 127
@@ -177,10 +178,8 @@ def train_step(
 
 def save_avatar(avatar: Avatar, steps: int, path: Path) -> None:
     """Write all weights and the number of steps as one .npz, under a temporary name first."""
-    draft = path.with_name(f".{path.name}")
-    with draft.open("wb") as file:
+    with write_atomically(path) as draft, draft.open("wb") as file:
         np.savez(file, steps=steps, **{name: value.detach().numpy() for name, value in avatar.state_dict().items()})
-    draft.replace(path)
 
 
 def load_avatar(avatar: Avatar, path: Path) -> tuple[Avatar, int]:
@@ -203,10 +202,8 @@ def save_network(avatar: Avatar, path: Path) -> None:
     """Write the network alone in half precision: small enough to be kept, and enough to go on training from."""
     weights = {f"network.{name}": value.detach().numpy() for name, value in avatar.network.state_dict().items()}
     halves = {name: value.astype(np.float16) for name, value in weights.items() if value.dtype.kind == "f"}
-    draft = path.with_name(f".{path.name}")
-    with draft.open("wb") as file:
+    with write_atomically(path) as draft, draft.open("wb") as file:
         np.savez_compressed(file, **halves)
-    draft.replace(path)
 
 
 def _read_weights(path: Path) -> dict[str, Tensor]:
@@ -214,7 +211,7 @@ def _read_weights(path: Path) -> dict[str, Tensor]:
         with np.load(path, allow_pickle=False) as arrays:
             return {name: torch.from_numpy(arrays[name]) for name in arrays.files}
     except (OSError, ValueError, KeyError) as error:
-        raise BadInputError(path, str(error).splitlines()[0], SAVED_WEIGHTS) from error
+        raise BadInputError(path, reason(error).splitlines()[0], SAVED_WEIGHTS) from error
 
 
 def _fill(module: nn.Module, weights: dict[str, Tensor], path: Path) -> None:

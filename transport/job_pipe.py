@@ -10,7 +10,7 @@ import fcntl
 import os
 from typing import NamedTuple
 
-from trilane.errors import TrilaneError
+from trilane.errors import TrilaneError, reason
 from trilane.transport.messages import MAX_BYTES, Message, pack, unpack
 
 PACKETS = 16  # that a pipe holds: a page each, of the 64 KiB that Linux gives it; a unit has a few outstanding
@@ -39,7 +39,7 @@ def job_pipe_pair() -> tuple[JobPipeEnd, JobPipeEnd]:
     except OSError as error:
         for fd in fds:
             os.close(fd)
-        raise TrilaneError(f"no pipe for {PACKETS} messages: {error.strerror}") from None
+        raise TrilaneError(f"no pipe for {PACKETS} messages: {reason(error)}") from None
     return JobPipeEnd(fds[2], fds[1]), JobPipeEnd(fds[0], fds[3])
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import psutil
 
-from trilane.errors import TrilaneError
+from trilane.errors import TrilaneError, reason
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 MIB = 1 << 20
@@ -47,7 +47,7 @@ def create_region(name: str, layout: RegionLayout) -> int:
         fcntl.fcntl(fd, F_ADD_SEALS, F_SEAL_SHRINK | F_SEAL_GROW)
     except OSError as error:
         os.close(fd)
-        raise TrilaneError(_too_little(name, layout, error.strerror or str(error))) from None
+        raise TrilaneError(_too_little(name, layout, reason(error))) from None
     return fd
 
 

@@ -11,6 +11,8 @@ import re
 from collections import deque
 from dataclasses import dataclass
 
+from trilane.unexpected import UnexpectedValue
+
 FREE, WRITING, READY, READING = "free", "writing", "ready", "reading"
 
 TRANSITIONS = {
@@ -52,16 +54,16 @@ COUNTED = {"fifo": 1, "orphan": 4}  # least count: an orphan edge has two slots 
 
 
 def edge_rule(text: str) -> EdgeRule:
-    """`single`, `double`, `triple`, `fifo[:N]`, `orphan[:N]`. Raises ValueError naming what was found."""
+    """`single`, `double`, `triple`, `fifo[:N]`, `orphan[:N]`. Raises UnexpectedValue."""
     match = re.fullmatch(r"([a-z]+)(?::(\d{1,4}))?", text)
     name, count = (match[1], match[2]) if match else (text, None)
     if name not in RULES or (count and name not in COUNTED):
-        raise ValueError(f"found edge {text!r}, expected single, double, triple, fifo:N or orphan:N")
+        raise UnexpectedValue(f"edge {text!r}", "single, double, triple, fifo:N or orphan:N")
     rule = RULES[name]
     if count is None:
         return rule
     if not COUNTED[name] <= int(count) <= MAX_SLOTS:
-        raise ValueError(f"found edge {text!r}, expected {name}:N with N from {COUNTED[name]} to {MAX_SLOTS}")
+        raise UnexpectedValue(f"edge {text!r}", f"{name}:N with N from {COUNTED[name]} to {MAX_SLOTS}")
     return EdgeRule(name, int(count), rule.mailbox, rule.yields)
 
 

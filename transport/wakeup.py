@@ -18,6 +18,8 @@ import struct
 from collections.abc import Iterator
 from pathlib import Path
 
+from trilane.errors import reason
+
 SHORTEST_NS = 100_000
 UNIT_NS = 1_000_000  # a unit that a job wakes goes before other programs, and lets the scheduler go before itself
 DEFAULT = 0
@@ -58,5 +60,5 @@ def awake(wanted: bool = True) -> Iterator[str]:
             os.write(file, struct.pack("=i", 0))
             idle_cores = AWAKE
         except OSError as error:
-            idle_cores = f"sleep: {LATENCY_FILE}: {os.strerror(error.errno or 0).lower()}"
+            idle_cores = f"sleep: {LATENCY_FILE}: {reason(error)}"
         yield idle_cores

@@ -5,7 +5,6 @@ Rule: this file talks to the person; the work is done in `trilane.avatars` and `
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +14,7 @@ import typer
 
 from trilane.apps.cli.console import JsonOption, print_json, stderr_console, stdout_console
 from trilane.errors import BadInputError, MissingPartError
+from trilane.unexpected import UnexpectedValue
 
 if TYPE_CHECKING:
     import onnx
@@ -78,8 +78,8 @@ def network(
 
     try:
         height, width_px = shape_buckets(size if "x" in size else f"{size}x{size}")[0]
-    except ValueError as error:
-        raise BadInputError.about("--size", error) from error
+    except UnexpectedValue as error:
+        raise BadInputError.at("--size", error) from error
     model, parameters = _untrained(encoder, norm, width, channels, (height, width_px), seed)
     _write(model, out)
     settings = {"encoder": encoder, "norm": norm, "width": width, "channels": channels, "size": [height, width_px]}
@@ -187,15 +187,15 @@ def split(
         raise BadInputError("options", "--at without --out" if at else "--out without --at", "both, or neither")
     try:
         height, width = parse_shape(size if "x" in size else f"{size}x{size}")
-    except ValueError as error:
-        raise BadInputError.about("--size", error) from error
+    except UnexpectedValue as error:
+        raise BadInputError.at("--size", error) from error
     whole = reshaped(load_bundle(name).read_network(), height, width)
     if at and out is not None:
         parts = cut_at(whole, at)
         try:
             out.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise BadInputError(out, (error.strerror or str(error)).lower(), "a folder that can be written") from None
+            raise BadInputError.of_os_error(out, error, "a folder that can be written") from None
         files = [out / f"part-{number}.onnx" for number in range(1, len(parts) + 1)]
         for part, file in zip(parts, files, strict=True):
             _write(part.model, file)
@@ -236,8 +236,8 @@ def export(
     whole = load_bundle(name).read_network()
     try:
         chosen = reshaped(whole, *parse_shape(size)) if size else whole
-    except ValueError as error:
-        raise BadInputError.about("--size", error) from error
+    except UnexpectedValue as error:
+        raise BadInputError.at("--size", error) from error
     with _spinner(f"compiling for {soc}"):
         write_context(chosen, soc, out)
     _show({"file": str(out), "bytes": out.stat().st_size, "soc": soc, "compiler": version()}, json)
@@ -249,7 +249,7 @@ def _untrained(
     try:
         import torch
     except ModuleNotFoundError as error:
-        raise MissingPartError("exporting a network needs PyTorch", "pip install 'trilane[train]'") from error
+        raise MissingPartError("exporting a network needs PyTorch", extra="train") from error
 
     from trilane.training.export import export_onnx
     from trilane.training.network import UNet
@@ -272,24 +272,17 @@ def _frames(path: Path) -> list[Any]:
 
 
 def _write(model: onnx.ModelProto, path: Path) -> None:
-    _replace(path, model.SerializeToString())
+    from trilane.writing import write_bytes
+
+    write_bytes(path, model.SerializeToString())
 
 
 def _write_text(path: Path, layers: Any) -> None:
     import json
 
-    _replace(path, (json.dumps({"layers": layers}, indent=1) + "\n").encode())
+    from trilane.writing import write_bytes
 
-
-def _replace(path: Path, content: bytes) -> None:
-    """Write under a temporary name beside `path`, then rename: a killed command leaves no half file."""
-    draft = path.with_name(f".{path.name}-{os.getpid()}")
-    try:
-        draft.write_bytes(content)
-        draft.replace(path)
-    except OSError as error:
-        draft.unlink(missing_ok=True)
-        raise BadInputError(path, error.strerror or str(error), "a file that can be written") from error
+    write_bytes(path, (json.dumps({"layers": layers}, indent=1) + "\n").encode())
 
 
 @contextmanager

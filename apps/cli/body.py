@@ -30,6 +30,7 @@ app = typer.Typer(
     help="Look into body files, pose them, build one.",
 )
 
+OTHER_OUT = "give another --out"
 EPILOG_INSPECT = "\b\nExamples:\n  trilane body inspect SMPLX_NEUTRAL.npz\n  trilane body inspect body.npz --json"
 EPILOG_VERTICES = """\b
 Examples:
@@ -120,14 +121,16 @@ def _check_poses(path: Path, frames: NDArray[np.float64], expected: str) -> NDAr
 
 
 def _write_vertices(out: Path, shaped: ShapedBody, frames: NDArray[np.float64]) -> tuple[int, int, int]:
-    """Write under a temporary name beside `out`, then rename."""
+    """The vertices of every pose as the file `out`; the shape of their array. Raises BadInputError."""
     import numpy as np
 
     from trilane.body.skinning import posed_vertices
+    from trilane.writing import write_atomically
 
     shape = (len(frames), len(shaped.vertices), 3)
-    with _new_file(out, 4 * shape[0] * shape[1] * 3) as part:
-        array = np.lib.format.open_memmap(part, mode="w+", dtype=np.float32, shape=shape)
+    _check_place(out, 4 * shape[0] * shape[1] * 3)
+    with write_atomically(out, OTHER_OUT) as draft:
+        array = np.lib.format.open_memmap(draft, mode="w+", dtype=np.float32, shape=shape)
         with _progress(len(frames)) as advance:
             for frame, mesh in enumerate(posed_vertices(shaped, frames)):
                 array[frame] = mesh
@@ -136,23 +139,15 @@ def _write_vertices(out: Path, shaped: ShapedBody, frames: NDArray[np.float64]) 
     return shape
 
 
-@contextmanager
-def _new_file(path: Path, size: int) -> Iterator[Path]:
-    """A temporary name in the folder of `path`, renamed to it at the end. Raises BadInputError."""
-    fix = "give another --out"
-    if not path.parent.is_dir() or path.is_dir():
-        raise BadInputError(path, "no such folder" if not path.is_dir() else "a folder", "a file in a folder", fix)
+def _check_place(path: Path, size: int) -> None:
+    """Raises BadInputError when no file of `size` bytes can be at `path`."""
+    if path.is_dir():
+        raise BadInputError(path, "a folder", "a file in a folder", OTHER_OUT)
+    if not path.parent.is_dir():
+        raise BadInputError(path, "no such folder", "a file in a folder", OTHER_OUT)
     free = shutil.disk_usage(path.parent).free
     if free < size + (1 << 20):
-        raise BadInputError(path.parent, f"{free} bytes free", f"room for {size}", fix)
-    part = path.with_name(f".{path.name}.part")
-    try:
-        yield part
-        part.replace(path)
-    except OSError as error:
-        raise BadInputError(path, error.strerror or str(error), "a place that can be written", fix) from error
-    finally:
-        part.unlink(missing_ok=True)
+        raise BadInputError(path.parent, f"{free} bytes free", f"room for {size}", OTHER_OUT)
 
 
 @contextmanager

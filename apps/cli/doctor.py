@@ -16,6 +16,8 @@ from typing import Any
 import typer
 
 from trilane.apps.cli.console import JsonOption, print_json, stdout_console
+from trilane.errors import reason
+from trilane.install import EGL_LINE, clone, install_line, package_line
 
 app = typer.Typer(rich_markup_mode=None, add_completion=False)
 
@@ -46,18 +48,17 @@ def _packages() -> list[Check]:
     checks = []
     for name in PACKAGES:
         version = package_version(name)
-        checks.append(Check(name, version or "missing", version is not None, install=f"pip install {name}"))
+        checks.append(Check(name, version or "missing", version is not None, install=package_line(name)))
     for name, extra in OPTIONAL_PACKAGES.items():
         version = package_version(name)
-        install = f'pip install "trilane[{extra}]"'
-        checks.append(Check(name, version or "missing", version is not None, needed=False, install=install))
+        line = install_line(extra)
+        checks.append(Check(name, version or "missing", version is not None, needed=False, install=line))
     return checks
 
 
 def _gl(facts: dict[str, Any] | None) -> Check:
-    install = "apt-get install libegl1 libgl1-mesa-dri"
     if facts is None:
-        return Check("EGL and OpenGL", "no OpenGL 3.3 context can be made", works=False, install=install)
+        return Check("EGL and OpenGL", "no OpenGL 3.3 context can be made", works=False, install=EGL_LINE)
     kind = "hardware" if facts["hardware"] else "software, on the CPU"
     return Check("EGL and OpenGL", f"{facts['renderer']}, {facts['version']} ({kind})", works=True)
 
@@ -68,9 +69,8 @@ def _runtimes() -> Check:
     try:
         facts = runtime_facts()
     except Exception as error:  # a broken wheel raises whatever its loader raises
-        return Check(
-            "inference runtimes", f"{type(error).__name__}: {error}", works=False, install="pip install onnxruntime"
-        )
+        found = f"{type(error).__name__}: {error}"
+        return Check("inference runtimes", found, works=False, install=package_line("onnxruntime"))
     found = "; ".join(f"{runtime}: {', '.join(places)}" for runtime, places in facts.items())
     return Check("inference runtimes", found, works=bool(facts["onnxruntime"]))
 
@@ -98,7 +98,7 @@ def _memfd() -> Check:
         os.ftruncate(handle, 4096)
         os.close(handle)
     except (AttributeError, OSError) as error:
-        return Check("memfd", str(error), works=False, install="needs Linux 3.17 or newer with memfd_create allowed")
+        return Check("memfd", reason(error), works=False, install="needs Linux 3.17 or newer with memfd_create allowed")
     return Check("memfd", "anonymous shared memory works", works=True)
 
 
@@ -126,7 +126,8 @@ def _core() -> Check:
     found = form()
     if found == "stale":
         return Check("scheduler core", STALE, works=False, install=MEND)
-    install = "make compile; it takes gcc and python3-dev. Without a checkout: install Trilane again"
+    install = "make compile" if clone() else "install Trilane again from its sources"
+    install += ", where there are gcc and python3-dev"
     return Check("scheduler core", found, works=found == "compiled", needed=False, install=install)
 
 

@@ -14,7 +14,8 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from trilane import __version__
-from trilane.errors import TrilaneError
+from trilane.errors import TrilaneError, reason
+from trilane.install import install_line
 
 #: Command: its module, and the line that `trilane --help` shows for it.
 COMMANDS = {
@@ -105,9 +106,9 @@ def _describe(error: Exception) -> tuple[str, int]:
     if isinstance(error, TrilaneError):
         return str(error), error.exit_code
     if isinstance(error, ModuleNotFoundError):
-        return f"the Python package {error.name} is missing; install it with: pip install trilane", MISSING_PART
+        return f"the Python package {error.name} is missing; install it with: {install_line()}", MISSING_PART
     if isinstance(error, OSError):
-        return f"{error.filename or 'the system'}: {error.strerror or error}", FAILED
+        return f"{error.filename or 'the system'}: {reason(error)}", FAILED
     return f"{type(error).__name__}: {error}; this is a defect of Trilane, --debug shows where", FAILED
 
 

@@ -128,8 +128,8 @@ def _way(policy: str, edge: str | None, batch: int) -> Way:
     if policy != "reference":
         return Way(policy, edge or "double", batch)
     if edge not in (None, REFERENCE.edge):
-        fix = "choose a --policy of your own, such as pipelined"
-        raise BadInputError("--edge", repr(edge), f"{REFERENCE.edge}, which the reference application has", fix)
+        remedy = "choose a --policy of your own, such as pipelined"
+        raise BadInputError("--edge", repr(edge), f"{REFERENCE.edge}, which the reference application has", remedy)
     return REFERENCE._replace(batch=batch)
 
 

@@ -13,6 +13,7 @@ import typer
 
 from trilane.apps.cli.console import JsonOption, print_json, stderr_console, stdout_console
 from trilane.errors import BadInputError
+from trilane.writing import WRITABLE, write_bytes
 
 if TYPE_CHECKING:
     from trilane.hw_profiles.fit import Fit
@@ -126,7 +127,7 @@ def fit(
     if not re.fullmatch(r"[\w.-]{1,64}", name):
         raise BadInputError("--name", repr(name), "letters, digits, dots, hyphens and underscores")
     if write is not None and not write.absolute().parent.is_dir():
-        raise BadInputError(write, "no such folder", "a place that can be written")
+        raise BadInputError(write, "no such folder", WRITABLE)
     with stderr_console().status("fitting, each row left out in turn"):
         result = fit_profile(profile, source)
     if json:
@@ -136,10 +137,7 @@ def fit(
     if write is not None:
         title = result.data["title"].removesuffix(", before the fit")
         command = f"trilane profiles fit --from {source}"
-        try:
-            write.write_text(as_toml(result, name, title, profile, command), encoding="utf-8")
-        except OSError as error:
-            raise BadInputError(write, error.strerror or str(error), "a place that can be written") from None
+        write_bytes(write, as_toml(result, name, title, profile, command).encode())
 
 
 def _fit_document(result: Fit) -> dict[str, Any]:

@@ -86,8 +86,8 @@ def _print_outcome(outcome: Outcome, as_json: bool) -> None:
 def _pace(config: RunConfig, profile: str | None, asked: bool, slow_motion: float) -> Pace | None:
     if (profile is not None) != asked:
         found = "--profile without --pace" if profile is not None else "--pace without --profile"
-        fix = "give both; `trilane predict --profile` answers without running"
-        raise BadInputError("options", found, "both or neither", fix)
+        remedy = "give both; `trilane predict --profile` answers without running"
+        raise BadInputError("options", found, "both or neither", remedy)
     if profile is None:
         if slow_motion != 1.0:
             raise BadInputError("options", "--slow-motion without --pace", "--pace and --profile with it")

@@ -56,7 +56,7 @@ def make_pair(name: str) -> Pair:
     try:
         import torch
     except ImportError:
-        raise MissingPartError("hard cases need PyTorch", "pip install 'trilane[train]'") from None
+        raise MissingPartError("hard cases need PyTorch", extra="train") from None
     from trilane.training.export import export_onnx
     from trilane.training.network import UNet
 

@@ -1,11 +1,23 @@
 """The errors that reach a person: each says what was found, what was expected and how to mend it.
 
 Rule: code raises these for anything a user can cause; the command line turns them into one sentence and an exit code.
+The parts of a sentence are fields: nothing reads them out of a text.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
+
+from trilane.install import install_line
+from trilane.unexpected import UnexpectedValue
+
+
+def reason(error: Exception) -> str:
+    """Why it failed, as part of a sentence: an OSError without its number and path, any other error's own text."""
+    if not isinstance(error, OSError):
+        return str(error)
+    text = error.strerror or str(error)
+    return text[:1].lower() + text[1:]
 
 
 class TrilaneError(Exception):
@@ -17,20 +29,38 @@ class TrilaneError(Exception):
 class BadInputError(TrilaneError):
     """Wrong usage or bad input. Exit code 2.
 
-    `where` is the file, with key or line when known; `found`, `expected` and `fix` are sentence parts.
+    `where` is the file, with key or line when known; `found`, `expected` and `remedy` are sentence parts.
     """
 
     exit_code = 2
 
-    def __init__(self, where: str | Path, found: str, expected: str, fix: str = "") -> None:
-        self.where, self.found, self.expected, self.fix = str(where), found, expected, fix
-        super().__init__(f"{where}: found {found}, expected {expected}" + (f"; {fix}" if fix else ""))
+    def __init__(self, where: str | Path, found: str, expected: str, remedy: str = "") -> None:
+        super().__init__(str(where), found, expected, remedy)
+        self.where, self.found, self.expected, self.remedy = str(where), found, expected, remedy
+
+    def __str__(self) -> str:
+        return f"{self.where}: {UnexpectedValue(self.found, self.expected, self.remedy)}"
+
+    @classmethod
+    def at(cls, where: str | Path, unexpected: UnexpectedValue) -> BadInputError:
+        """`unexpected`, whose place is `where`."""
+        return cls(where, unexpected.found, unexpected.expected, unexpected.remedy)
 
     @classmethod
     def about(cls, where: str | Path, error: ValueError) -> BadInputError:
-        """Of an `error` whose text is `found A, expected B`."""
-        found, _, expected = str(error).removeprefix("found ").partition(", expected ")
-        return cls(where, found, expected)
+        """`at`, under the name that pipeline/ still calls it by."""
+        assert isinstance(error, UnexpectedValue)
+        return cls.at(where, error)
+
+    @classmethod
+    def of_os_error(cls, where: str | Path, error: OSError, expected: str, remedy: str = "") -> BadInputError:
+        """What the system said when `where` was opened, read or written.
+
+        `where`: the file or folder.
+        `error`: its reason is what was found.
+        `expected`, `remedy`: sentence parts.
+        """
+        return cls(where, reason(error), expected, remedy)
 
 
 class UnitLostError(TrilaneError):
@@ -38,10 +68,16 @@ class UnitLostError(TrilaneError):
 
 
 class MissingPartError(TrilaneError):
-    """The environment lacks something. Exit code 3. `install` is the line to type."""
+    """The environment lacks something. Exit code 3.
+
+    `what` is missing. `install` is the line to type; `extra` in its place names one of Trilane's extras.
+    """
 
     exit_code = 3
 
-    def __init__(self, what: str, install: str) -> None:
-        self.what, self.install = what, install
-        super().__init__(f"{what}; install it with: {install}")
+    def __init__(self, what: str, install: str = "", *, extra: str = "") -> None:
+        self.what, self.install = what, install or install_line(extra)
+        super().__init__(self.what, self.install)
+
+    def __str__(self) -> str:
+        return f"{self.what}; install it with: {self.install}"

@@ -17,7 +17,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.errors import BadInputError
+from trilane.errors import BadInputError, reason
 
 MAX_ARRAY_BYTES = 1 << 30
 MAX_TEXT_BYTES = 256 << 20
@@ -47,7 +47,7 @@ def require_file(path: Path, expected: str) -> int:
             raise BadInputError(path, found, expected)
         size = path.stat().st_size
     except (OSError, ValueError) as error:
-        raise BadInputError(path, f"a file that cannot be read ({error})", expected) from error
+        raise BadInputError(path, f"a file that cannot be read ({reason(error)})", expected) from error
     if size == 0:
         raise BadInputError(path, "an empty file", expected)
     return size
@@ -61,7 +61,7 @@ def read_text(path: Path, expected: str) -> str:
     try:
         return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise BadInputError(path, f"a file that cannot be read as text ({error})", expected) from error
+        raise BadInputError(path, f"a file that cannot be read as text ({reason(error)})", expected) from error
 
 
 def read_npy(path: Path, expected: str) -> NDArray[Any]:
@@ -75,7 +75,7 @@ def read_npy(path: Path, expected: str) -> NDArray[Any]:
             file.seek(0)
             return _read_array(file)
     except DAMAGED as error:
-        raise BadInputError(path, f"no readable NumPy array ({error})", expected) from error
+        raise BadInputError(path, f"no readable NumPy array ({reason(error)})", expected) from error
 
 
 def read_npz(path: Path, keys: Collection[str], expected: str) -> dict[str, NDArray[Any]]:
@@ -86,7 +86,7 @@ def read_npz(path: Path, keys: Collection[str], expected: str) -> dict[str, NDAr
             names = {info.filename: info for info in archive.infolist()}
             return {key: _member(path, archive, names[f"{key}.npy"]) for key in keys if f"{key}.npy" in names}
     except DAMAGED as error:
-        raise BadInputError(path, f"no readable .npz archive ({error})", expected) from error
+        raise BadInputError(path, f"no readable .npz archive ({reason(error)})", expected) from error
 
 
 def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 
+from trilane.unexpected import UnexpectedValue
+
 MAX_SIDE = 4096
 BUCKET_STEP = 32
 
@@ -11,10 +13,10 @@ Shape = tuple[int, int]
 
 
 def parse_shape(text: str) -> Shape:
-    """`HxW` to (height, width). Raises ValueError naming what was found."""
+    """`HxW` to (height, width). Raises UnexpectedValue."""
     match = re.fullmatch(r"(\d+)x(\d+)", text)
     if match is None:
-        raise ValueError(f"found {text!r}, expected HEIGHTxWIDTH such as 256x256")
+        raise UnexpectedValue(repr(text), "HEIGHTxWIDTH such as 256x256")
     return int(match[1]), int(match[2])
 
 
@@ -23,7 +25,7 @@ def shape_buckets(size: str) -> list[Shape]:
 
     `HxW` gives that one shape. A single number S gives the shapes of sides in multiples of 32, aspect within
     1:4 and area at most S², of which none holds another: tall for a standing body, wide for a lying one, S x S
-    between. Raises ValueError when a side is no multiple of 32 or out of range.
+    between. Raises UnexpectedValue when a side is no multiple of 32 or out of range.
     """
     if re.fullmatch(r"\d+", size):
         return _shapes_of_area(_check_side(int(size)))
@@ -39,11 +41,11 @@ def _shapes_of_area(side: int) -> list[Shape]:
 
 def _check_side(side: int) -> int:
     if side % BUCKET_STEP or not BUCKET_STEP <= side <= MAX_SIDE:
-        raise ValueError(f"found side {side}, expected a multiple of {BUCKET_STEP} from {BUCKET_STEP} to {MAX_SIDE}")
+        raise UnexpectedValue(f"side {side}", f"a multiple of {BUCKET_STEP} from {BUCKET_STEP} to {MAX_SIDE}")
     return side
 
 
 def checked_size(size: str) -> str:
-    """`size` itself. Raises ValueError as `shape_buckets`."""
+    """`size` itself. Raises UnexpectedValue as `shape_buckets`."""
     shape_buckets(size)
     return size

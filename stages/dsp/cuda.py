@@ -14,7 +14,7 @@ from onnx import TensorProto, helper
 from trilane.avatars.network_file import IntegerNetwork, check_integer_layers
 from trilane.errors import BadInputError, MissingPartError
 from trilane.stages.dsp.ort import ERRORS_ONLY, LOAD_ERRORS, OrtSession
-from trilane.stages.dsp.runtime import RUNTIMES, RuntimeOptions
+from trilane.stages.dsp.runtime import RuntimeOptions, cuda_line
 
 PROVIDER = "CUDAExecutionProvider"
 PROBE_OPSET, PROBE_IR = 17, 8
@@ -49,7 +49,7 @@ def _check_gpu() -> None:
     settings.log_severity_level = SILENT
     session = onnxruntime.InferenceSession(probe.SerializeToString(), settings, providers=[PROVIDER])
     if PROVIDER not in session.get_providers():
-        raise MissingPartError("ONNX Runtime found no NVIDIA GPU with CUDA and cuDNN", RUNTIMES["cuda"].install)
+        raise MissingPartError("ONNX Runtime found no NVIDIA GPU with CUDA and cuDNN", cuda_line())
 
 
 def version() -> str:

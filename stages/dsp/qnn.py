@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import os
 import platform
 from collections.abc import Mapping
 from functools import cache
@@ -21,6 +20,7 @@ from trilane.avatars.network_file import IntegerNetwork, NetworkFile, check_inte
 from trilane.errors import BadInputError, MissingPartError
 from trilane.stages.dsp.ort import ERRORS_ONLY, LOAD_ERRORS, OrtSession
 from trilane.stages.dsp.runtime import RuntimeOptions, cache_dir
+from trilane.writing import write_atomically
 
 NAME = onnxruntime_qnn.get_ep_name()
 #: Snapdragon 888: SoC number of Qualcomm's SDK, Hexagon v68.
@@ -41,12 +41,8 @@ def load(network: IntegerNetwork, options: RuntimeOptions) -> OrtSession:
     compiled = folder / f"{_key(network, device)}.onnx"
     with contextlib.suppress(OSError, BadInputError):  # not there, or spoilt: it is compiled again
         return OrtSession(_session(network.where, compiled.read_bytes(), device, {}))
-    draft = compiled.with_name(f".{compiled.stem}-{os.getpid()}.onnx")
-    try:
+    with write_atomically(compiled) as draft:
         session = _session(network.where, source, device, _context(draft))
-        draft.replace(compiled)
-    finally:
-        draft.unlink(missing_ok=True)
     return OrtSession(session)
 
 
@@ -55,7 +51,8 @@ def write_context(network: NetworkFile, soc: str, path: Path) -> None:
     if soc not in SOCS:
         raise BadInputError("soc", repr(soc), f"one of {', '.join(SOCS)}")
     check_integer_layers(network)
-    _session(network.where, network.model.SerializeToString(), SOCS[soc], _context(path))
+    with write_atomically(path) as draft:
+        _session(network.where, network.model.SerializeToString(), SOCS[soc], _context(draft))
 
 
 def version() -> str:
@@ -90,5 +87,5 @@ def _devices() -> list[Any]:
     onnxruntime.register_execution_provider_library(NAME, onnxruntime_qnn.get_library_path())
     found = [device for device in onnxruntime.get_ep_devices() if device.ep_name == NAME]
     if not found:
-        raise MissingPartError("no HTP device, real or emulated", "pip install 'trilane[qnn]'")
+        raise MissingPartError("no HTP device, real or emulated", extra="qnn")
     return found[:1]

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import importlib.util
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Protocol
@@ -16,6 +17,7 @@ from typing import Protocol
 from trilane.arrays import U8
 from trilane.avatars.network_file import IntegerNetwork
 from trilane.errors import BadInputError, MissingPartError
+from trilane.install import install_line, package_line, pip
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ class RuntimeEntry:
 
     module: str
     package: str
-    install: str
+    install: Callable[[], str]
     file: str = ""
 
     @property
@@ -72,14 +74,20 @@ class RuntimeEntry:
         return spec is not None and (not self.file or (Path(spec.origin or "").parent / self.file).is_file())
 
 
+def cuda_line() -> str:
+    """The command for the runtime `cuda`: the build for GPUs replaces the other, whose modules it has."""
+    here = pip()
+    return f"{here} uninstall -y onnxruntime && {here} install onnxruntime-gpu, on a machine with an NVIDIA GPU"
+
+
 RUNTIMES = {
-    "openvino": RuntimeEntry("trilane.stages.dsp.openvino", "openvino", "pip install 'trilane[openvino]'"),
-    "ort": RuntimeEntry("trilane.stages.dsp.ort", "onnxruntime", "pip install onnxruntime"),
-    "qnn": RuntimeEntry("trilane.stages.dsp.qnn", "onnxruntime_qnn", "pip install 'trilane[qnn]'"),
+    "openvino": RuntimeEntry("trilane.stages.dsp.openvino", "openvino", partial(install_line, "openvino")),
+    "ort": RuntimeEntry("trilane.stages.dsp.ort", "onnxruntime", partial(package_line, "onnxruntime")),
+    "qnn": RuntimeEntry("trilane.stages.dsp.qnn", "onnxruntime_qnn", partial(install_line, "qnn")),
     "cuda": RuntimeEntry(
         "trilane.stages.dsp.cuda",
         "onnxruntime",
-        "pip uninstall onnxruntime; pip install onnxruntime-gpu, on a machine with an NVIDIA GPU",
+        cuda_line,
         "capi/libonnxruntime_providers_cuda.so",
     ),
 }
@@ -97,7 +105,7 @@ def resolve(name: str) -> str:
     entry = RUNTIMES[name]
     if not entry.is_installed:
         what = f"a build of {entry.package} with {entry.file}" if entry.file else f"the package {entry.package}"
-        raise MissingPartError(f"runtime {name} needs {what}", entry.install)
+        raise MissingPartError(f"runtime {name} needs {what}", entry.install())
     return name
 
 

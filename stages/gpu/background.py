@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image, ImageOps, UnidentifiedImageError
 
 from trilane.arrays import U8
-from trilane.errors import BadInputError
+from trilane.errors import BadInputError, reason
 from trilane.files import require_file
 from trilane.stages.gpu.video import VideoReader
 
@@ -88,4 +88,6 @@ def read_picture(path: Path, shape: Shape) -> U8:
             upright = ImageOps.exif_transpose(image).convert("RGB")
         return np.asarray(ImageOps.fit(upright, (shape[1], shape[0]), Image.Resampling.LANCZOS))
     except (OSError, ValueError, SyntaxError, UnidentifiedImageError, Image.DecompressionBombError) as error:
-        raise BadInputError(path, f"no readable picture ({error})", "a PNG, JPEG, BMP, WebP or TIFF file") from error
+        raise BadInputError(
+            path, f"no readable picture ({reason(error)})", "a PNG, JPEG, BMP, WebP or TIFF file"
+        ) from error

@@ -16,8 +16,8 @@ from typing import Any
 import moderngl
 
 from trilane.errors import MissingPartError, TrilaneError, UnitLostError
+from trilane.install import EGL_LINE
 
-INSTALL = "apt-get install libegl1 libgl1-mesa-dri"
 REQUIRED_VERSION = 330
 LIBRARY = "libEGL.so.1"  # eglGetProcAddress gives every OpenGL function, so libGL need not be there
 SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swr", "swiftshader", "swrast")
@@ -45,7 +45,7 @@ def open_context(threads: int | None = None) -> Any:
         create: Any = moderngl.create_context
         return create(require=REQUIRED_VERSION, standalone=True, backend="egl", libegl=LIBRARY, libgl=LIBRARY)
     except Exception as error:  # moderngl and glcontext raise bare Exception
-        raise MissingPartError(f"no OpenGL 3.3 context through EGL ({error})", INSTALL) from error
+        raise MissingPartError(f"no OpenGL 3.3 context through EGL ({error})", EGL_LINE) from error
 
 
 def check(ctx: Any) -> None:

@@ -12,7 +12,8 @@ from functools import cache
 from typing import Any
 
 from trilane.errors import MissingPartError, TrilaneError
-from trilane.stages.gpu.context import INSTALL, LIBRARY
+from trilane.install import EGL_LINE
+from trilane.stages.gpu.context import LIBRARY
 
 COLOR, DEPTH = 0x1800, 0x1801
 SYNC_GPU_COMMANDS_COMPLETE, SYNC_FLUSH_COMMANDS = 0x9117, 1
@@ -39,7 +40,7 @@ def function(name: str) -> Callable[..., Any]:
     library.eglGetProcAddress.restype = ctypes.c_void_p
     address = library.eglGetProcAddress(name.encode())
     if not address:
-        raise MissingPartError(f"the OpenGL driver lacks {name}", INSTALL)
+        raise MissingPartError(f"the OpenGL driver lacks {name}", EGL_LINE)
     result, arguments = _SIGNATURES[name]
     call: Callable[..., Any] = ctypes.CFUNCTYPE(result, *arguments)(address)
     return call

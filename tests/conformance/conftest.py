@@ -13,6 +13,6 @@ def skip_without():
 
     def skip(name):
         if not RUNTIMES[name].is_installed:
-            pytest.skip(f"runtime {name} is not installed: {RUNTIMES[name].install}")
+            pytest.skip(f"runtime {name} is not installed: {RUNTIMES[name].install()}")
 
     return skip

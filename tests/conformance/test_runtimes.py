@@ -199,14 +199,14 @@ def test_unknown_runtimes_are_refused():
 
 
 def test_an_absent_runtime_says_how_to_get_it(monkeypatch):
-    entry = runtime.RuntimeEntry("trilane.stages.dsp.none", "no_such_package", "pip install it")
+    entry = runtime.RuntimeEntry("trilane.stages.dsp.none", "no_such_package", lambda: "pip install it")
     monkeypatch.setitem(RUNTIMES, "none", entry)
     with pytest.raises(MissingPartError, match="pip install it"):
         load_runtime("none")
 
 
 def test_a_package_without_the_part_that_a_runtime_needs_is_absent(monkeypatch):
-    entry = runtime.RuntimeEntry("trilane.stages.dsp.none", "onnxruntime", "pip install more", "capi/none.so")
+    entry = runtime.RuntimeEntry("trilane.stages.dsp.none", "onnxruntime", lambda: "pip install more", "capi/none.so")
     monkeypatch.setitem(RUNTIMES, "none", entry)
     with pytest.raises(MissingPartError, match=r"onnxruntime with capi/none\.so.*pip install more"):
         load_runtime("none")

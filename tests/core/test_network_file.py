@@ -127,7 +127,7 @@ def test_wrong_files_are_named(tmp_path, content):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(BadInputError, match="No such file"):
+    with pytest.raises(BadInputError, match="no such file"):
         read_network(tmp_path / "network.onnx")
 
 

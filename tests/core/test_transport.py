@@ -229,7 +229,7 @@ def test_a_process_without_files_for_pipes_is_told_so(monkeypatch: pytest.Monkey
         raise OSError(errno.EMFILE, "Too many open files")
 
     monkeypatch.setattr("os.pipe2", pipe2)
-    with pytest.raises(TrilaneError, match="Too many open files"):
+    with pytest.raises(TrilaneError, match="too many open files"):
         job_pipe_pair()
     assert open_files() == before
 

@@ -101,7 +101,7 @@ def raise_from_doctor(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> 
     [
         (MissingPartError("no engine", "apt-get install engine"), 3, "install it with: apt-get install engine"),
         (ModuleNotFoundError("no", name="engine"), 3, "the Python package engine is missing"),
-        (OSError(28, "No space left on device", "/a/file"), 1, "/a/file: No space left on device"),
+        (OSError(28, "No space left on device", "/a/file"), 1, "/a/file: no space left on device"),
         (ZeroDivisionError("by zero"), 1, "ZeroDivisionError: by zero; this is a defect"),
     ],
 )

@@ -1,0 +1,27 @@
+"""A value that is not what it should be, said in parts.
+
+Rule: raised where the value's place (a file, key or option) is not known; whoever knows it makes a `BadInputError`
+with `BadInputError.at`. It imports nothing, so the scheduler's core may raise it too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+
+class UnexpectedValue(ValueError):  # noqa: N818 - the value is at fault, as in ValueError
+    """`found` and `expected` are sentence parts; `remedy` says how to mend it and may be empty."""
+
+    def __init__(self, found: str, expected: str, remedy: str = "") -> None:
+        super().__init__(found, expected, remedy)
+        self.found, self.expected, self.remedy = found, expected, remedy
+
+    def __str__(self) -> str:
+        return f"found {self.found}, expected {self.expected}" + (f"; {self.remedy}" if self.remedy else "")
+
+
+def unexpected_in(details: Mapping[str, Any]) -> UnexpectedValue | None:
+    """The error that a validator raised, out of one of the `errors()` of a pydantic ValidationError; else None."""
+    cause = details.get("ctx", {}).get("error")
+    return cause if isinstance(cause, UnexpectedValue) else None

@@ -1,0 +1,82 @@
+"""Output files that are whole or not there: written under a temporary name beside their place, then renamed.
+
+Rule: whatever ends the writing, the file that stood there before stays as it was, and no other file is left. Only a
+process that is killed outright may leave its temporary file, `.trilane-*`.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from trilane.errors import BadInputError
+
+WRITABLE = "a place that can be written"
+PREFIX = ".trilane-"
+
+
+@contextmanager
+def write_atomically(path: Path, remedy: str = "") -> Iterator[Path]:
+    """A name to write to, with the suffix of `path`; it becomes `path` when the block ends without an error.
+
+    No file has the name yet, and no two calls get the same one. A device or a pipe (/dev/stdout) is itself the name.
+    Raises BadInputError with `remedy` for every OSError of the block and of the renaming.
+    """
+    draft = path.parent / f"{PREFIX}{secrets.token_hex(8)}{path.suffix}"
+    try:
+        if _is_stream(path):
+            yield path
+            return
+        yield draft
+        _flush(draft)
+        draft.replace(path)
+    except OSError as error:
+        raise BadInputError.of_os_error(path, error, WRITABLE, remedy) from error
+    finally:
+        with suppress(OSError):
+            draft.unlink(missing_ok=True)
+
+
+def write_bytes(path: Path, content: bytes, remedy: str = "") -> None:
+    """`content` as the file `path`, by `write_atomically`. Raises BadInputError."""
+    with write_atomically(path, remedy) as draft:
+        draft.write_bytes(content)
+
+
+@contextmanager
+def write_folder(folder: Path) -> Iterator[Path]:
+    """An empty folder to write files to; they take their places in `folder` when the block ends without an error.
+
+    Each file of `folder` is whole at any moment, but they change one after the other; other files in it stay.
+    Raises BadInputError for every OSError of the block and of the renaming.
+    """
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=PREFIX, dir=folder.parent) as name:
+            yield Path(name)
+            files = sorted(Path(name).iterdir())
+            for file in files:
+                _flush(file)
+            folder.mkdir(exist_ok=True)
+            for file in files:
+                file.replace(folder / file.name)
+    except OSError as error:
+        raise BadInputError.of_os_error(folder, error, WRITABLE) from error
+
+
+def _is_stream(path: Path) -> bool:
+    """Is it a device, a pipe or a socket, which a file must not replace."""
+    return path.exists() and not path.is_file() and not path.is_dir()
+
+
+def _flush(file: Path) -> None:
+    """Bring the content of `file` to the disk, so that a name never stands for less than the whole."""
+    fd = os.open(file, os.O_RDONLY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
