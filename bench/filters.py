@@ -14,7 +14,7 @@ import numpy as np
 from trilane.arrays import U8
 from trilane.avatars.bundle import bundle_folder, load_bundle
 from trilane.avatars.reshape import reshaped
-from trilane.bench.fixture import standing
+from trilane.bench.lib.fixture import standing
 from trilane.bench.raster import interleaved, summary
 from trilane.bench.several import ground_truth
 from trilane.errors import BadInputError

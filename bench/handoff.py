@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from trilane.bench.handoff_unit import PAUSE_S, check_bytes
-from trilane.bench.handoff_variants import BARE, CHANNELS, SLOT, WRITTEN, Channel
+from trilane.bench.lib.handoff_variants import BARE, CHANNELS, SLOT, WRITTEN, Channel
 from trilane.errors import BadInputError, TrilaneError
 from trilane.hw_profiles.host import host_units
 from trilane.pipeline.run import run_pipeline

@@ -19,8 +19,8 @@ import onnx
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import read_network
 from trilane.bench import roofline
-from trilane.bench.interleaved import Way, runners
-from trilane.bench.networks import Subject, of_file, untrained, untrained_float
+from trilane.bench.lib.interleaved import Way, runners
+from trilane.bench.lib.networks import Subject, of_file, untrained, untrained_float
 from trilane.errors import BadInputError
 from trilane.hw_profiles.host import sensor_c
 from trilane.shapes import parse_shape

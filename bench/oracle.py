@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.avatars.bundle import bundle_folder
-from trilane.bench import float_raster as oracle
+from trilane.bench.lib import float_raster
 from trilane.bench.crop import everyday_pose, random_camera
-from trilane.bench.fixture import ENCODING, standing
+from trilane.bench.lib.fixture import ENCODING, standing
 from trilane.body.body import load_body
 from trilane.body.kinematics import Skeleton
 from trilane.errors import BadInputError

@@ -18,8 +18,8 @@ import numpy as np
 import onnx
 
 from trilane.bench import roofline
-from trilane.bench.interleaved import Way, runners
-from trilane.bench.networks import untrained, untrained_float
+from trilane.bench.lib.interleaved import Way, runners
+from trilane.bench.lib.networks import untrained, untrained_float
 from trilane.errors import BadInputError, MissingPartError, TrilaneError
 from trilane.shapes import parse_shape
 from trilane.stages.dsp.runtime import resolve

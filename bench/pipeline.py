@@ -15,7 +15,7 @@ from pathlib import Path
 from statistics import fmean, median
 from typing import Any
 
-from trilane.bench import full_width
+from trilane.bench.lib import full_width
 from trilane.errors import BadInputError, TrilaneError
 from trilane.hw_profiles.host import host_units, usable_cores
 from trilane.pipeline.result import RunResult

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from trilane.bench.fixture import ENCODING, Subject, standing
-from trilane.bench.split_pass import SplitPass
+from trilane.bench.lib.fixture import ENCODING, Subject, standing
+from trilane.bench.lib.split_pass import SplitPass
 from trilane.body.skinning import FrameSkinner
 from trilane.errors import BadInputError, TrilaneError
 from trilane.stages.gpu.context import describe, open_context

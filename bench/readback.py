@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from trilane.bench.fixture import ENCODING, standing
-from trilane.bench.gpu_buffering import READBACKS, UPLOADS, Readback, Upload
+from trilane.bench.lib.fixture import ENCODING, standing
+from trilane.bench.lib.gpu_buffering import READBACKS, UPLOADS, Readback, Upload
 from trilane.bench.raster import interleaved, summary
 from trilane.errors import TrilaneError
 from trilane.stages.gpu.context import describe, open_context

@@ -14,8 +14,8 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from trilane.bench.load import PATTERNS, Load, Queries, bound_ms, play, verdict
-from trilane.bench.loadgen import Judge, load_generator
+from trilane.bench.lib.load import PATTERNS, Load, Queries, bound_ms, play, verdict
+from trilane.bench.lib.loadgen import Judge, load_generator
 from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline.requests import FrameRequestQueue
 from trilane.pipeline.run import run_pipeline

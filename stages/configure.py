@@ -13,7 +13,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from trilane.apps.machine import gl_facts, machine_facts
+from trilane.stages.machine import gl_facts, machine_facts
 from trilane.avatars.bundle import Bundle, load_bundle
 from trilane.avatars.split import split
 from trilane.body.body import load_body

@@ -8,7 +8,7 @@ import onnx
 import pytest
 
 from trilane.bench import infer, roofline
-from trilane.bench.interleaved import Way, runners
+from trilane.bench.lib.interleaved import Way, runners
 from trilane.errors import BadInputError, TrilaneError
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from trilane.apps.machine import machine_facts
+from trilane.stages.machine import machine_facts
 from trilane.apps.report import read_report
 from trilane.apps.run_job import Hooks, Outcome, Plan, run_to_folder
 from trilane.errors import TrilaneError

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import pytest
 
 from trilane.bench import load, scenario
-from trilane.bench.load import Load
+from trilane.bench.lib.load import Load
 from trilane.errors import BadInputError, TrilaneError
 from trilane.stages.config import RunConfig
 

@@ -118,7 +118,7 @@ def _timed(run: Callable[[], object], count: int) -> list[float]:
 def _runtime(way: Way) -> Callable[[], object]:
     """Trilane's own way: slots bound once."""
     from trilane.avatars.network_file import read_network
-    from trilane.bench.networks import random_tensor
+    from trilane.bench.lib.networks import random_tensor
     from trilane.stages.dsp.runtime import RuntimeOptions, load_runtime
 
     network = read_network(way.network)

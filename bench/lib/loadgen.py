@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from trilane.bench.load import WARM_UP, Load, Queries, queries_needed
+from trilane.bench.lib.load import WARM_UP, Load, Queries, queries_needed
 from trilane.errors import MissingPartError, TrilaneError
 from trilane.pipeline.requests import FrameRequestQueue
 

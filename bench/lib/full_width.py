@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from trilane.avatars.bundle import MANIFEST, Manifest, bundle_folder, load_bundle, network_entry, write_bundle
-from trilane.bench.networks import untrained
+from trilane.bench.lib.networks import untrained
 from trilane.errors import TrilaneError
 from trilane.stages.dsp.runtime import cache_dir
 
