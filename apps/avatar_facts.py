@@ -10,7 +10,7 @@ from typing import Any
 from trilane.avatars.bundle import Bundle
 from trilane.avatars.network_file import NetworkFile
 from trilane.body.body import load_body
-from trilane.hw_profiles.cost import graph_facts
+from trilane.hw_profiles.network_work import graph_facts
 
 
 def bundle_facts(bundle: Bundle) -> dict[str, Any]:

@@ -17,9 +17,9 @@ from trilane.avatars.bundle import load_bundle
 from trilane.avatars.reshape import reshaped
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import Plan, stage_times_ms
-from trilane.hw_profiles.corners import corners_of
-from trilane.hw_profiles.cost import Network, walk
 from trilane.hw_profiles.load import load_runnable
+from trilane.hw_profiles.network_work import Network, count_work
+from trilane.hw_profiles.performance_profiles import corners_of
 from trilane.scheduler.events import Settings, avatar_graph
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.virtual import simulate
@@ -54,7 +54,7 @@ def pace_of(config: RunConfig, profile: str, slow_motion: float = 1.0, performan
     height, width = max(config.buckets, key=lambda shape: shape[0] * shape[1])
     file = load_bundle(config.avatar_dirs[0]).read_network()
     facts = {"avatar": config.avatar_dirs[0].name}
-    network = Network(facts, height, width, file.shape[3], "packed", walk(reshaped(file, height, width).model))
+    network = Network(facts, height, width, file.shape[3], "packed", count_work(reshaped(file, height, width).model))
     times = stage_times_ms(chip, Plan(network, "dsp"), corners_of(chip, performance_profile))
     held = {stage: round(ms * slow_motion * 1e6) for (stage, _), ms in times.items()}
     return Pace(chip.name, performance_profile, slow_motion, held)

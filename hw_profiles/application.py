@@ -15,10 +15,10 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 from trilane.errors import BadInputError
-from trilane.hw_profiles.corners import Corners
-from trilane.hw_profiles.cost import CLASSES, Network, Work
-from trilane.hw_profiles.networks import CHANNELS_PER_PASS
-from trilane.hw_profiles.roofline import JobTime, job_time, machine_of
+from trilane.hw_profiles.network_work import CLASSES, Network, Work
+from trilane.hw_profiles.operator_times import JobTime, job_time, machine_of
+from trilane.hw_profiles.performance_profiles import Corners
+from trilane.hw_profiles.reference_networks import CHANNELS_PER_PASS
 from trilane.hw_profiles.schema import Profile, Unit
 from trilane.scheduler.events import Graph, Settings, StageSpec
 from trilane.scheduler.policy import POLICIES

@@ -21,11 +21,11 @@ import numpy as np
 from trilane.arrays import F64
 from trilane.errors import BadInputError, MissingPartError
 from trilane.hw_profiles.application import Plan, network_alone, reference_frame_ms
-from trilane.hw_profiles.corners import corners_of
-from trilane.hw_profiles.cost import reference_network
+from trilane.hw_profiles.configuration_table import Row, read_table
 from trilane.hw_profiles.load import load_tables, parse_profile
+from trilane.hw_profiles.performance_profiles import corners_of
+from trilane.hw_profiles.reference_networks import reference_network
 from trilane.hw_profiles.schema import Profile
-from trilane.hw_profiles.table import Row, read_table
 from trilane.units import SUSTAINED, UnitName
 
 MEASURED_UNDER = SUSTAINED

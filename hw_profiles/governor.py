@@ -12,9 +12,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from trilane.errors import BadInputError
-from trilane.hw_profiles.corners import corners_of
+from trilane.hw_profiles.performance_profiles import corners_of
 from trilane.hw_profiles.schema import CORNERS, Profile
-from trilane.hw_profiles.thermal import GOVERNORS, Heat, Throttle
+from trilane.hw_profiles.throttling import GOVERNORS, Heat, Throttle
 from trilane.scheduler.events import SetDuty
 from trilane.scheduler.state import FULL_DUTY
 from trilane.units import PERFORMANCE_PROFILES, UNITS, UnitName

@@ -15,7 +15,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from trilane.errors import BadInputError
-from trilane.hw_profiles.detect import host_tables
+from trilane.hw_profiles.host_profile import host_tables
 from trilane.hw_profiles.schema import Profile
 from trilane.unexpected import unexpected_in
 

@@ -21,11 +21,12 @@ from trilane.hw_profiles.application import (
     relative_error,
     steady,
 )
-from trilane.hw_profiles.corners import Corners, corners_of
-from trilane.hw_profiles.cost import Network, reference_network
+from trilane.hw_profiles.configuration_table import Row
+from trilane.hw_profiles.network_work import Network
+from trilane.hw_profiles.performance_profiles import Corners, corners_of
+from trilane.hw_profiles.reference_networks import reference_network
 from trilane.hw_profiles.schema import CORNERS, Profile
-from trilane.hw_profiles.table import Row
-from trilane.hw_profiles.thermal import GOVERNORS, Heat, Throttle
+from trilane.hw_profiles.throttling import GOVERNORS, Heat, Throttle
 from trilane.scheduler.stats import energy_score
 from trilane.units import SUSTAINED, UNITS, UnitName
 

@@ -21,9 +21,10 @@ import zmq
 from trilane.errors import TrilaneError
 from trilane.pipeline.unit_loop import EdgeSpec, UnitSpec
 from trilane.stages.config import RunConfig
-from trilane.transport.heartbeats import BusFolder, Link
 from trilane.transport.job_pipe import JobPipe, JobPipeEnd, job_pipe_pair
+from trilane.transport.link import Link
 from trilane.transport.messages import Message, MessageError
+from trilane.transport.socket_folder import SocketFolder
 
 TAIL_BYTES = 8192
 END_S = 2.0
@@ -41,7 +42,7 @@ class UnitMessage(NamedTuple):
 
 
 class _Process:
-    def __init__(self, unit: str, popen: subprocess.Popen[bytes], link: Link, folder: BusFolder) -> None:
+    def __init__(self, unit: str, popen: subprocess.Popen[bytes], link: Link, folder: SocketFolder) -> None:
         assert popen.stderr is not None
         self.unit, self.popen, self.link, self.folder = unit, popen, link, folder
         self.stderr = popen.stderr
@@ -94,20 +95,20 @@ class UnitProcesses:
     def start(self, unit: str) -> None:
         """A fresh process for the unit; `Ready` or `Failed` follows, or its end. Raises TrilaneError, OSError."""
         with contextlib.ExitStack() as undo:
-            folder = BusFolder()
+            folder = SocketFolder()
             undo.callback(folder.remove)
             ours, theirs = job_pipe_pair()
             link = Link(self._context, JobPipe(ours))
             undo.callback(link.close)
             with contextlib.closing(theirs):
-                link.socket.bind(folder.endpoint(unit))
+                link.bind(folder.endpoint(unit))
                 popen = self._spawn(unit, self._spec(unit, folder, theirs))
             undo.callback(_end_now, popen)
             process = _Process(unit, popen, link, folder)
             undo.pop_all()
         self._live[unit] = process
-        self._register(link.line.fileno(), partial(self._work, process))
-        self._register(link.bus_fd, partial(self._life_signs, process))
+        self._register(link.job_pipe.fileno(), partial(self._work, process))
+        self._register(link.heartbeat_fd, partial(self._life_signs, process))
         self._register(process.stderr.fileno(), partial(self._stderr, process))
         self._register(process.pidfd, partial(self._end, process))
 
@@ -120,7 +121,7 @@ class UnitProcesses:
         """To a unit that is gone or does not read: nothing, its end or its deadline tells."""
         process = self._live.get(unit)
         if process is not None:
-            process.link.line.send(message)
+            process.link.job_pipe.send(message)
 
     def kill(self, unit: str) -> None:
         if unit in self._live:
@@ -158,18 +159,18 @@ class UnitProcesses:
     def _work(self, process: _Process) -> list[UnitMessage]:
         """The next message of the line, if there is one; the others make it readable again."""
         try:
-            message = process.link.line.receive()
+            message = process.link.job_pipe.receive()
         except MessageError as error:
             raise _no_message(process, error) from None
         if message is not None:
             return [UnitMessage(process.unit, message)]
-        if process.link.line.ended:
-            self._unregister(process.link.line.fileno())  # it would be readable for ever
+        if process.link.job_pipe.ended:
+            self._unregister(process.link.job_pipe.fileno())  # it would be readable for ever
         return []
 
     def _life_signs(self, process: _Process) -> list[UnitMessage]:
         try:
-            return [UnitMessage(process.unit, message) for message in process.link.bus_messages()]
+            return [UnitMessage(process.unit, message) for message in process.link.heartbeats()]
         except MessageError as error:
             raise _no_message(process, error) from None
 
@@ -182,7 +183,7 @@ class UnitProcesses:
         self._ended.append(process)
         return []
 
-    def _spec(self, unit: str, folder: BusFolder, line: JobPipeEnd) -> UnitSpec:
+    def _spec(self, unit: str, folder: SocketFolder, line: JobPipeEnd) -> UnitSpec:
         stages = dict(self._stages[unit])
         used = {edge for pair in stages.values() for edge in pair if edge is not None}
         return UnitSpec(
@@ -215,7 +216,7 @@ class UnitProcesses:
         process.popen.wait()
         process.read_stderr()
         self.last_words[process.unit] = process.tail.decode(errors="replace").strip()
-        for fd in (process.link.line.fileno(), process.link.bus_fd, process.stderr.fileno(), process.pidfd):
+        for fd in (process.link.job_pipe.fileno(), process.link.heartbeat_fd, process.stderr.fileno(), process.pidfd):
             self._unregister(fd)
         process.link.close()
         process.release_folder()

@@ -39,17 +39,17 @@ from trilane.scheduler.events import (
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.recording import Recording
 from trilane.scheduler.state import NEVER
+from trilane.transport import messages
 from trilane.transport.job_pipe import PACKETS
 from trilane.transport.messages import (
-    Alive,
     Close,
     Closed,
     Done,
     Duration,
     Failed,
-    Isolate,
     Ping,
     Ready,
+    RunIsolated,
     RunJob,
 )
 
@@ -150,7 +150,7 @@ class RealtimeDriver:
             several = positions[first : first + AT_ONCE]
             for position in several:
                 place = self._processes.places[self._graph.stages[position].name]
-                self._processes.send(unit, Isolate(place, frame, 0 if position else -1, 0))
+                self._processes.send(unit, RunIsolated(place, frame, 0 if position else -1, 0))
             found += self._durations(unit, len(several))
         return found
 
@@ -254,7 +254,7 @@ class RealtimeDriver:
         if isinstance(message, Ready):
             self._ready(unit)
             return UnitReady(unit)
-        if isinstance(message, Alive):
+        if isinstance(message, messages.Pong):
             return Pong(unit)
         if message is None:
             self._say(f"unit {unit} ended unexpectedly and is started again{self._last_words(unit)}")
@@ -275,7 +275,7 @@ class RealtimeDriver:
             if ready_ns is not None:
                 times = (ready_ns, dispatch_ns, done.t_begin_ns, done.t_end_ns)
                 self.jobs.append(JobRecord(job.stage, job.unit, job.frame, *times))
-            self.figures[job.stage].update(done.figures)
+            self.figures[job.stage].update(done.metrics)
         self._unbooked.clear()
 
     def _failed(self, unit: str, message: Failed) -> Event | None:

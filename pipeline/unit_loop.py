@@ -22,24 +22,25 @@ from trilane.errors import TrilaneError, UnitLostError
 from trilane.pipeline.description import HeaderDtype
 from trilane.pipeline.stage import Stage
 from trilane.stages.config import RunConfig
-from trilane.transport.heartbeats import LAST_WORDS_MS, Link, prompt_context
+from trilane.transport.heartbeats import LINGER_MS, context_on_cores
 from trilane.transport.job_pipe import JobPipe, JobPipeEnd
+from trilane.transport.link import Link
 from trilane.transport.memory import RegionLayout, map_region
 from trilane.transport.messages import (
     BUILDING,
     CLOSING,
     MAX_TEXT,
     MEASURING,
-    Alive,
     Close,
     Closed,
     Done,
     Duration,
     Failed,
-    Isolate,
     MessageError,
     Ping,
+    Pong,
     Ready,
+    RunIsolated,
     RunJob,
 )
 from trilane.transport.packets import Packet, SlotLayout
@@ -129,10 +130,10 @@ def _header_bytes(packet: Packet) -> NDArray[np.uint8]:
 def serve(unit: str, raw_spec: dict[str, Any]) -> int:
     """Build, then answer messages until Close; the process's exit code."""
     spec = UnitSpec.model_validate(raw_spec)
-    context = prompt_context(spec.config.units[SCHEDULER].cores)
-    link = Link(context, JobPipe(spec.line, waits=True), LAST_WORDS_MS)
+    context = context_on_cores(spec.config.units[SCHEDULER].cores)
+    link = Link(context, JobPipe(spec.line, waits=True), LINGER_MS)
     use_slice(UNIT_NS)
-    link.socket.connect(spec.endpoint)
+    link.connect(spec.endpoint)
     try:
         return _serve(unit, spec, link)
     finally:
@@ -147,18 +148,18 @@ def _serve(unit: str, spec: UnitSpec, link: Link) -> int:
         return _fail(link, BUILDING, f"unit {unit}", error)
     gc.collect()
     gc.freeze()
-    link.sign(Ready(os.getpid()))
+    link.send_heartbeat(Ready(os.getpid()))
     while True:
-        message = link.line.receive()
+        message = link.job_pipe.receive()
         if isinstance(message, RunJob):
             _run_job(link, stages[message.stage], message)
         elif isinstance(message, Ping):
-            link.sign(Alive())
-        elif isinstance(message, Isolate):
+            link.send_heartbeat(Pong())
+        elif isinstance(message, RunIsolated):
             _isolate(link, stages[message.stage], message)
         elif isinstance(message, Close):
             return _close(unit, link, stages.values())
-        elif link.line.ended:
+        elif link.job_pipe.ended:
             return 1
         else:
             raise MessageError(f"{message} is not for a unit")
@@ -192,21 +193,21 @@ def _run_job(link: Link, stage: _BoundStage, job: RunJob) -> None:
         figures = stage.run(job.frame, job.slot_in, job.slot_out, job.epoch)
         end_ns = time.monotonic_ns()
         values = {name: float(value) for name, value in figures.items()}
-        link.line.send(Done(job.id, begin_ns, end_ns, stage.pose_ns(job.slot_in, job.slot_out), values))
+        link.job_pipe.send(Done(job.id, begin_ns, end_ns, stage.pose_ns(job.slot_in, job.slot_out), values))
     except UnitLostError:
         raise
     except Exception as error:
         _fail(link, job.id, f"stage {stage.name}, frame {job.frame}", error)
 
 
-def _isolate(link: Link, stage: _BoundStage, job: Isolate) -> None:
+def _isolate(link: Link, stage: _BoundStage, job: RunIsolated) -> None:
     begin_ns = time.monotonic_ns()
     try:
         stage.run(job.frame, job.slot_in, job.slot_out, 0)
     except Exception as error:
         _fail(link, MEASURING, f"stage {stage.name}, frame {job.frame}", error)
         return
-    link.line.send(Duration(time.monotonic_ns() - begin_ns))
+    link.job_pipe.send(Duration(time.monotonic_ns() - begin_ns))
 
 
 def _close(unit: str, link: Link, stages: Iterable[_BoundStage]) -> int:
@@ -216,7 +217,7 @@ def _close(unit: str, link: Link, stages: Iterable[_BoundStage]) -> int:
             stage.close()
         except Exception as error:
             code = _fail(link, CLOSING, f"unit {unit}, closing {stage.name}", error)
-    link.line.send(Closed())
+    link.job_pipe.send(Closed())
     return code
 
 
@@ -227,5 +228,5 @@ def _fail(link: Link, job_id: int, where: str, error: Exception) -> int:
     text = str(error) if known else f"{where}: {type(error).__name__}: {error}"
     code = error.exit_code if isinstance(error, TrilaneError) else 1
     plain = " ".join(text.split()).encode(errors="replace")  # a name of a file may hold what no text may
-    link.line.send(Failed(job_id, code, plain[:MAX_TEXT].decode(errors="ignore")))
+    link.job_pipe.send(Failed(job_id, code, plain[:MAX_TEXT].decode(errors="ignore")))
     return code

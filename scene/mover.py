@@ -12,8 +12,8 @@ import numpy as np
 from trilane.arrays import F64
 from trilane.body.body import ShapedBody
 from trilane.body.kinematics import Skeleton
-from trilane.scene.grounding import ground_rule, leg_length, lift, outline
-from trilane.scene.motion.base import Motion, bracket, wrapped_time
+from trilane.scene.floor import ground_rule, leg_length, lift, outline
+from trilane.scene.motion.motion import Motion, bracket, wrapped_time
 from trilane.scene.rotations import about
 from trilane.scene.schema import AvatarSpec
 

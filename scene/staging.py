@@ -12,9 +12,9 @@ from pathlib import Path
 
 from trilane.body.body import ShapedBody
 from trilane.scene.camera.load import load_camera
+from trilane.scene.camera_placement import PlacedCamera, place_camera
 from trilane.scene.motion.load import load_motion
 from trilane.scene.mover import Mover, make_mover
-from trilane.scene.placement import PlacedCamera, place_camera
 from trilane.scene.schema import Scene
 
 

@@ -20,10 +20,10 @@ from trilane.body.body import load_body
 from trilane.errors import BadInputError, MissingPartError
 from trilane.hw_profiles.host import host_units
 from trilane.hw_profiles.load import HOST, load_profile
-from trilane.hw_profiles.runtimes import fastest_runtime
+from trilane.hw_profiles.runtime_choice import fastest_runtime
+from trilane.scene.load import find_scene, load_scene, located, scene_from
 from trilane.scene.schema import Scene
 from trilane.scene.staging import stage_scene
-from trilane.scene.validate import find_scene, load_scene, located, scene_from
 from trilane.stages.config import NetworkCut, RunConfig
 from trilane.stages.dsp.runtime import RUNTIMES, installed, resolve
 from trilane.stages.gpu.background import open_background

@@ -19,7 +19,7 @@ from trilane.arrays import F64
 from trilane.body.body import ShapedBody, load_body
 from trilane.body.kinematics import Skeleton
 from trilane.body.skinning import largest_weights
-from trilane.scene.motion.base import Motion
+from trilane.scene.motion.motion import Motion
 from trilane.shapes import Shape, shape_buckets
 from trilane.stages.gpu.assets import enough_weights
 from trilane.stages.gpu.context import open_context

@@ -1,6 +1,7 @@
-"""The line of a unit: work to it, and answers. Rule: one message is one wake-up, and no thread is between the ends.
+"""The job pipe of a unit: jobs to it, and its answers. Rule: one message wakes one process, with no thread between.
 
-Two pipes in packet mode (O_DIRECT of pipe(2)), which keep messages apart. That a unit lives is said over the bus.
+It is two pipes, one each way, in packet mode (O_DIRECT of pipe(2)), in which every read returns one whole message.
+Heartbeats do not go over it (see `trilane.transport.heartbeats`).
 """
 
 from __future__ import annotations
@@ -13,11 +14,11 @@ from typing import NamedTuple
 from trilane.errors import TrilaneError, reason
 from trilane.transport.messages import MAX_BYTES, Message, pack, unpack
 
-PACKETS = 16  # that a pipe holds: a page each, of the 64 KiB that Linux gives it; a unit has a few outstanding
+PACKETS = 16  # messages that a pipe holds: a page each, of the 64 KiB that Linux gives a pipe
 
 
 class JobPipeEnd(NamedTuple):
-    """File descriptors, not inherited unless they are passed on."""
+    """The file descriptors of one end. Child processes inherit them only when they are passed on explicitly."""
 
     reads: int
     writes: int
@@ -28,7 +29,7 @@ class JobPipeEnd(NamedTuple):
 
 
 def job_pipe_pair() -> tuple[JobPipeEnd, JobPipeEnd]:
-    """Both ends. Raises TrilaneError when this user or process has no more pipes."""
+    """The two ends of a new job pipe. Raises TrilaneError when this user or this process may open no more pipes."""
     fds: list[int] = []
     try:
         for _ in range(2):
@@ -44,9 +45,10 @@ def job_pipe_pair() -> tuple[JobPipeEnd, JobPipeEnd]:
 
 
 class JobPipe:
-    """One end. Messages arrive in order or not at all. `waits`: `receive` waits for a message.
+    """One end of a job pipe. Messages arrive in order or not at all.
 
-    `ended`: the other end is gone, and all that it said was received.
+    `waits`: `receive` waits until there is a message. `ended`: the other end is closed, and every message that it sent
+    has been received.
     """
 
     def __init__(self, end: JobPipeEnd, *, waits: bool = False) -> None:
@@ -57,17 +59,24 @@ class JobPipe:
         os.set_blocking(end.writes, False)
 
     def fileno(self) -> int:
+        """Readable when `receive` has something to return, or when the other end is closed."""
         return self._reads
 
     def send(self, message: Message) -> None:
-        """To an end that is gone or has stopped reading: nothing, its end or its deadline tells."""
+        """Send without waiting. Does nothing when the other end is closed or its pipe is full.
+
+        The scheduler learns of such a unit by the end of its process or by a missed deadline.
+        """
         try:
             os.write(self._writes, pack(message))
         except (BlockingIOError, BrokenPipeError):
             return
 
     def receive(self) -> Message | None:
-        """The next message, None when there is none or the other end is gone. Raises MessageError for anything else."""
+        """The next message; None when none has come (if this end does not wait) or the other end is closed.
+
+        Raises MessageError for bytes that are no message.
+        """
         try:
             data = os.read(self._reads, MAX_BYTES)
         except BlockingIOError:

@@ -1,7 +1,7 @@
-"""The memory that packets live in. Rule: no name anywhere (memfd), one region per edge, its size sealed.
+"""The shared memory that packets live in. Rule: one region per edge, without a name (memfd) and of a fixed size.
 
-The parent makes the regions and keeps their descriptors; children inherit and map them. A region is gone with the
-last process that has it, whatever ends that process.
+The parent makes the regions and keeps their descriptors; its children inherit and map them. The kernel frees a region
+when the last process that has it ends, however it ends.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from trilane.errors import TrilaneError, reason
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 MIB = 1 << 20
-F_ADD_SEALS, F_SEAL_SHRINK, F_SEAL_GROW = 1033, 0x2, 0x4  # <linux/fcntl.h>; the fcntl module of Python 3.11 lacks some
+#: Of <linux/fcntl.h>; the fcntl module of Python 3.11 does not have all of them.
+F_ADD_SEALS, F_SEAL_SHRINK, F_SEAL_GROW = 1033, 0x2, 0x4
 
 
 @dataclass(frozen=True)
@@ -33,10 +34,10 @@ class RegionLayout:
 
 
 def create_region(name: str, layout: RegionLayout) -> int:
-    """A descriptor of fresh, zeroed shared memory (`name` is for humans: it shows in /proc/PID/maps only).
+    """A descriptor of new, zeroed shared memory for `layout`. `name` is shown in /proc/PID/maps and nowhere else.
 
-    Every page is reserved here, so that a machine without memory says so now and not by a signal in a later write.
-    Raises TrilaneError when there is too little.
+    Every page is reserved here: on a machine with too little memory this function fails, and not a later write, which
+    would end the process by a signal. Raises TrilaneError when there is too little memory.
     """
     free = psutil.virtual_memory().available
     if layout.total_bytes > free:
@@ -56,9 +57,9 @@ def map_region(fd: int, layout: RegionLayout) -> list[Packet]:
 
     Raises ValueError when the region is smaller than the layout.
     """
-    found = os.fstat(fd).st_size
-    if found < layout.total_bytes:
-        raise ValueError(f"region of {found} bytes, the layout needs {layout.total_bytes}")
+    region_bytes = os.fstat(fd).st_size
+    if region_bytes < layout.total_bytes:
+        raise ValueError(f"region of {region_bytes} bytes, the layout needs {layout.total_bytes}")
     view = memoryview(mmap.mmap(fd, layout.total_bytes))
     step = layout.slot.slot_bytes
     return [view_packet(view[index * step : (index + 1) * step], layout.slot) for index in range(layout.slots)]

@@ -1,9 +1,9 @@
-"""What units and scheduler say to each other. Rule: a fixed list of messages with typed fields; anything else is
-refused, and never pickle.
+"""The messages between the scheduler and its units. Rule: a fixed list with typed fields; anything else is refused.
 
-On the wire: a byte that names the message, its integers of 64 bits, and then, as msgpack, the one field that is none
-and not empty.
-Whoever waits for a message has cold caches; what is all integers is read there in half the time that msgpack takes.
+The bytes of a message: one byte that says which message it is, its integer fields with 64 bits each, and at the end,
+packed with msgpack, the field of another type. That last part is left out when the field is empty. Integers are not
+packed with msgpack because reading them would then take twice the time in a process that has just been woken. Nothing
+is ever pickled.
 """
 
 from __future__ import annotations
@@ -13,16 +13,20 @@ from typing import Any, NamedTuple, get_origin, get_type_hints
 
 import msgpack
 
-MAX_BYTES = 4096  # a pipe takes no more at once (PIPE_BUF of pipe(7))
-MAX_TEXT = 2000  # bytes of UTF-8
+MAX_BYTES = 4096  # of a message: a pipe takes no more in one piece (PIPE_BUF of pipe(7))
+MAX_TEXT = 2000  # bytes of UTF-8 in `Failed.message`
 
 
 class MessageError(ValueError):
-    """Bytes that are not one of the messages."""
+    """Bytes that are none of the messages."""
 
 
 class RunJob(NamedTuple):
-    """To a unit: do one of its stages, counted as UnitSpec has them, for one frame."""
+    """To a unit: run one of its stages for one frame.
+
+    `id`: of the job; its answer, `Done` or `Failed`, carries the same. `stage`: place in the unit's list of stages,
+    from 0. `slot_in`, `slot_out`: slots of the stage's edges, -1 where it has no such edge. `epoch`: of `slot_out`.
+    """
 
     id: int
     stage: int
@@ -32,8 +36,8 @@ class RunJob(NamedTuple):
     epoch: int
 
 
-class Isolate(NamedTuple):
-    """To a unit: do this job and answer with its duration; nothing is noted of the frame."""
+class RunIsolated(NamedTuple):
+    """To a unit: run one of its stages by itself and answer with `Duration`. Fields as in `RunJob`."""
 
     stage: int
     frame: int
@@ -42,61 +46,74 @@ class Isolate(NamedTuple):
 
 
 class Ping(NamedTuple):
-    """To a unit that has nothing to do: say that you are alive."""
+    """To a unit that has no job: answer with `Pong`."""
 
 
 class Close(NamedTuple):
-    """To a unit: complete the files, release everything and end."""
+    """To a unit: complete your files, release everything, answer with `Closed` and end."""
 
 
 class Ready(NamedTuple):
-    """From a unit: its stages are built and its slots are bound."""
+    """From a unit, as a heartbeat: its stages are built and their slots are bound. `pid`: of its process."""
 
     pid: int
 
 
 class Done(NamedTuple):
-    """From a unit: a job ended. Times in ns of CLOCK_MONOTONIC; `figures` are the stage's own."""
+    """From a unit: the job `id` has ended. Times in ns of CLOCK_MONOTONIC.
+
+    `t_sampled_ns`: of the chain's first stage, when it sampled the frame's input; of the others 0. `metrics`: numbers
+    that the stage itself reports of the job, by name.
+    """
 
     id: int
     t_begin_ns: int
     t_end_ns: int
     t_sampled_ns: int
-    figures: dict[str, float]
+    metrics: dict[str, float]
 
 
 class Duration(NamedTuple):
-    """From a unit: the answer to Isolate, in ns."""
+    """From a unit: the answer to `RunIsolated`: how long the stage took, in ns."""
 
     value: int
 
 
 class Failed(NamedTuple):
-    """From a unit: a stage raised. `id`: of the job, or one of the marks below. `message`: at most MAX_TEXT."""
+    """From a unit: something raised an error.
+
+    `id`: of the job, or BUILDING, MEASURING or CLOSING when it was none. `exit_code`: that the error asks the program
+    to end with. `message`: for people, at most MAX_TEXT bytes.
+    """
 
     id: int
     exit_code: int
     message: str
 
 
-class Alive(NamedTuple):
-    """From a unit: the answer to Ping."""
+class Pong(NamedTuple):
+    """From a unit, as a heartbeat: the answer to `Ping`."""
 
 
 class Closed(NamedTuple):
-    """From a unit: the answer to Close."""
+    """From a unit: the answer to `Close`."""
 
 
-Heartbeat = Ready | Alive
-Message = RunJob | Isolate | Ping | Close | Ready | Done | Duration | Failed | Alive | Closed
+Heartbeat = Ready | Pong
+Message = RunJob | RunIsolated | Ping | Close | Ready | Done | Duration | Failed | Pong | Closed
+#: `Failed.id` of an error outside a job: while stages were built, in `RunIsolated`, while stages were closed.
 BUILDING, MEASURING, CLOSING = -1, -2, -3
 
-_KINDS: tuple[Any, ...] = (RunJob, Isolate, Ping, Close, Ready, Done, Duration, Failed, Alive, Closed)
+#: A message's place here is its first byte.
+_KINDS: tuple[Any, ...] = (RunJob, RunIsolated, Ping, Close, Ready, Done, Duration, Failed, Pong, Closed)
 _PACKER = msgpack.Packer()  # one for the process: making one costs more than packing
 
 
 class _Form(NamedTuple):
-    """Of a message on the wire. `rest`: the type of its last field when that is no integer."""
+    """How a kind of message is written as bytes.
+
+    `code`: its first byte. `integers`: its integer fields. `rest`: the type of its last field if that is no integer.
+    """
 
     kind: Any
     code: bytes
@@ -116,7 +133,10 @@ _FORM_OF = {form.kind: form for form in _FORMS}
 
 
 def pack(message: Message) -> bytes:
-    """Raises struct.error for an integer of more than 64 bits, MessageError for more than MAX_BYTES."""
+    """The bytes of `message`.
+
+    Raises struct.error for an integer of more than 64 bits, MessageError when it has more than MAX_BYTES.
+    """
     _, code, integers, rest = _FORM_OF[type(message)]
     fields: tuple[Any, ...] = message
     if rest is None:
@@ -130,7 +150,7 @@ def pack(message: Message) -> bytes:
 
 
 def unpack(data: bytes | memoryview) -> Message:
-    """Raises MessageError for anything that is not one of the messages, field by field."""
+    """The message whose bytes are `data`. Raises MessageError when they are no message or a field has a wrong type."""
     if not data or data[0] >= len(_FORMS):
         raise MessageError(f"unknown message {bytes(data[:80])!r}")
     kind, _, integers, rest = _FORMS[data[0]]
@@ -144,15 +164,15 @@ def unpack(data: bytes | memoryview) -> Message:
     return message
 
 
-def _unpack_rest(data: bytes | memoryview, wanted: type) -> Any:
+def _unpack_rest(data: bytes | memoryview, expected: type) -> Any:
     try:
         rest: Any = msgpack.unpackb(data)
     except (ValueError, msgpack.UnpackException) as error:
         raise MessageError(f"not msgpack: {error}") from None
-    if not (_are_figures(rest) if wanted is dict else type(rest) is wanted):
-        raise MessageError(f"found {str(rest)[:80]!r}, expected {wanted.__name__}")
+    if not (_are_metrics(rest) if expected is dict else type(rest) is expected):
+        raise MessageError(f"found {str(rest)[:80]!r}, expected {expected.__name__}")
     return rest
 
 
-def _are_figures(rest: Any) -> bool:
+def _are_metrics(rest: Any) -> bool:
     return type(rest) is dict and all(type(key) is str and type(value) in (int, float) for key, value in rest.items())

@@ -1,11 +1,11 @@
-"""How soon a process that a message wakes gets its core. Rule: it asks the kernel, and is none the worse when refused.
+"""How soon a process runs after a message has woken it. Rule: the kernel is asked; a refusal changes only the speed.
 
-Linux lets a woken task wait until the running one's time slice ends, about 3 ms, unless its own slice is shorter
-(EEVDF since Linux 6.12; older kernels ignore the wish). Here, with another process busy on the same core, the 99th
-percentile of the wake-up went from 3.4 ms to 0.2 ms.
+Linux makes a woken thread wait until the time slice of the running one ends, about 3 ms, unless the woken one asks for
+a shorter slice (EEVDF since Linux 6.12; older kernels ignore the request). Measured with another process busy on the
+same core, the 99th percentile of the wake-up went from 3.4 ms to 0.2 ms.
 
-It matters most for ZeroMQ's I/O threads. A unit that says `Done` begins its next job the moment after, and the thread
-that should carry the message waited on the same core until that job's slice was over: 1.6 ms from raster to infer.
+This matters most for ZeroMQ's I/O threads. A unit that has sent a message begins its next job at once; the thread that
+is to carry the message then waited on the same core for the end of that job's slice: 1.6 ms from raster to infer.
 """
 
 from __future__ import annotations
@@ -21,34 +21,38 @@ from pathlib import Path
 from trilane.errors import reason
 
 SHORTEST_NS = 100_000
-UNIT_NS = 1_000_000  # a unit that a job wakes goes before other programs, and lets the scheduler go before itself
+UNIT_NS = 1_000_000  # of a unit: shorter than that of other programs, longer than the scheduler's
 DEFAULT = 0
 #: <asm/unistd.h>
 SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
 #: struct sched_attr of <linux/sched/types.h>: size, policy, flags, nice, priority, runtime, deadline, period.
 SCHED_ATTR = "=IIQiIQQQ"
 SCHED_OTHER = 0
-#: Linux's "PM QoS": while it is open, no core sleeps so deeply that waking takes longer than the written int, in us.
+#: Linux's "PM QoS" file: while it is open, no core sleeps so deeply that waking it takes longer than the integer
+#: written to it, in microseconds.
 LATENCY_FILE = Path("/dev/cpu_dma_latency")
 AWAKE = "wait awake"
 
 
 def use_slice(slice_ns: int) -> bool:
-    """Ask for a slice of `slice_ns` for this thread and the processes it starts; whether the kernel took the wish."""
+    """Ask for a time slice of `slice_ns` for this thread and the processes it starts.
+
+    Returns whether the kernel accepted it.
+    """
     number = SCHED_SETATTR.get(platform.machine())
     if number is None or os.sched_getscheduler(0) != os.SCHED_OTHER:
         return False
     nice = os.getpriority(os.PRIO_PROCESS, 0)
-    wish = struct.pack(SCHED_ATTR, struct.calcsize(SCHED_ATTR), SCHED_OTHER, 0, nice, 0, slice_ns, 0, 0)
-    return bool(ctypes.CDLL(None).syscall(number, 0, wish, 0) == 0)
+    attributes = struct.pack(SCHED_ATTR, struct.calcsize(SCHED_ATTR), SCHED_OTHER, 0, nice, 0, slice_ns, 0, 0)
+    return bool(ctypes.CDLL(None).syscall(number, 0, attributes, 0) == 0)
 
 
 @contextlib.contextmanager
 def awake(wanted: bool = True) -> Iterator[str]:
-    """While entered, cores without work stay awake, on the whole machine. Yields AWAKE, or that they sleep, and why.
+    """Keep idle cores of the whole machine awake inside the `with` block. Yields AWAKE, or `sleep: ` and the reason.
 
-    A core that sleeps takes 50 us and more to hear of a message; one that waits awake takes power. For root alone,
-    unless the machine's owner says otherwise; the kernel forgets it with the process.
+    A sleeping core takes 50 us and more to react to a message; one that is kept awake takes power. Usually only root
+    may do this. The kernel undoes it when the process ends.
     """
     if not wanted:
         yield "sleep: the performance profile asks for no haste"

@@ -73,7 +73,7 @@ def network(
     json: JsonOption = False,
 ) -> None:
     """Export an untrained float network: ONNX, static shape, input `tensor`, output `rgba`."""
-    from trilane.hw_profiles.cost import graph_facts
+    from trilane.hw_profiles.network_work import graph_facts
     from trilane.shapes import shape_buckets
 
     try:

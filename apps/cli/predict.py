@@ -16,7 +16,7 @@ from trilane.units import BURST, SUSTAINED
 
 if TYPE_CHECKING:
     from trilane.hw_profiles.application import Plan, Way
-    from trilane.hw_profiles.cost import Network
+    from trilane.hw_profiles.network_work import Network
     from trilane.hw_profiles.schema import Profile
 
 app = typer.Typer(rich_markup_mode=None, add_completion=False)
@@ -86,7 +86,7 @@ def predict(
     from trilane.hw_profiles.load import load_runnable
     from trilane.hw_profiles.predict import predict as predict_one
     from trilane.hw_profiles.predict import what_if as alternatives
-    from trilane.hw_profiles.thermal import GOVERNORS
+    from trilane.hw_profiles.throttling import GOVERNORS
 
     _refuse_ignored(ctx)
     if governor is not None and governor not in GOVERNORS:
@@ -134,8 +134,8 @@ def _way(policy: str, edge: str | None, batch: int) -> Way:
 
 
 def _reference(encoder: str, norm: str, size: str, channels: int, layout: str) -> Network:
-    from trilane.hw_profiles.cost import reference_network
-    from trilane.hw_profiles.table import spec_of
+    from trilane.hw_profiles.configuration_table import spec_of
+    from trilane.hw_profiles.reference_networks import reference_network
 
     cells = {"encoder": encoder, "norm": norm, "size": size, "channels": str(channels), "layout": layout}
     return reference_network(spec_of(cells, "options"))
@@ -145,7 +145,7 @@ def _network_of(path: Path | None, avatar: str | None, layout: str) -> Network:
     """The network of a file, or of an avatar."""
     from trilane.avatars.bundle import load_bundle
     from trilane.avatars.network_file import read_network
-    from trilane.hw_profiles.cost import Network, walk
+    from trilane.hw_profiles.network_work import Network, count_work
 
     if path is not None and avatar is not None:
         raise BadInputError("options", "--network and --avatar", "one of them")
@@ -154,7 +154,7 @@ def _network_of(path: Path | None, avatar: str | None, layout: str) -> Network:
     file = read_network(path) if path is not None else load_bundle(avatar or "default").read_network()
     _, height, width, channels = file.shape
     facts = {"network": str(path)} if path is not None else {"avatar": str(avatar)}
-    return Network(facts, height, width, channels, layout, walk(file.model))
+    return Network(facts, height, width, channels, layout, count_work(file.model))
 
 
 def _unit(runtime: str) -> Any:
@@ -166,8 +166,8 @@ def _unit(runtime: str) -> Any:
 def _predict_table(chip: Profile, path: Path, performance_profile: str, way: Way, *, json: bool) -> None:
     from rich.progress import Progress
 
+    from trilane.hw_profiles.configuration_table import read_table
     from trilane.hw_profiles.predict import predict_table
-    from trilane.hw_profiles.table import read_table
 
     rows = read_table(path)
     console = stderr_console()
@@ -189,7 +189,7 @@ SHOWN = ("bench_gpu_ms", "bench_dsp_ms", "app_gpu_ms", "app_dsp_ms", "confidence
 def _show_table(answers: list[dict[str, Any]]) -> None:
     from rich.table import Table
 
-    from trilane.hw_profiles.table import KEYS
+    from trilane.hw_profiles.configuration_table import KEYS
 
     table = Table("encoder", "norm", "size", "ch", "layout", *SHOWN)
     for row in answers:

@@ -91,7 +91,7 @@ def check(
     from rich.table import Table
 
     from trilane.hw_profiles.load import load_profile, profile_names
-    from trilane.hw_profiles.published import check_published
+    from trilane.hw_profiles.published_times import check_published
 
     profiles = {name: load_profile(name) for name in names or profile_names()}
     found = [one for profile in profiles.values() for one in check_published(profile.name, profile)]

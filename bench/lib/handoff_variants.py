@@ -19,11 +19,11 @@ import numpy as np
 import zmq
 
 from trilane.arrays import U8
-from trilane.transport.heartbeats import BusFolder
 from trilane.transport.job_pipe import JobPipe, JobPipeEnd, job_pipe_pair
 from trilane.transport.memory import RegionLayout, create_region, map_region
 from trilane.transport.messages import RunJob
 from trilane.transport.packets import SlotLayout, header_dtype
+from trilane.transport.socket_folder import SocketFolder
 
 SLOTS = 2
 WAIT_MS = 60_000
@@ -158,7 +158,7 @@ class ZmqChannel:
     """The bytes themselves as a ZeroMQ frame, copied as pyzmq does it by default."""
 
     def __init__(self, size: int, _context: SpawnContext) -> None:
-        self._folder = BusFolder()
+        self._folder = SocketFolder()
         self._size, self._endpoint = size, self._folder.endpoint("handoff")
 
     def __getstate__(self) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from trilane.avatars.network_file import NetworkFile
 from trilane.avatars.reshape import reshaped
 from trilane.errors import MissingPartError
-from trilane.hw_profiles.cost import graph_facts
+from trilane.hw_profiles.network_work import graph_facts
 from trilane.training.quantising.quantise import quantise
 
 CALIBRATION_SIDE = 64

@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from trilane.scene.camera.recorded import RawCamera
-from trilane.scene.camera.table import elapsed, read_table
+from trilane.scene.camera.text_table import elapsed, read_table
 
 COLUMNS = 13
 EXPECTED = "an ARKit log: time and the 12 numbers of a 3x4 matrix a line"

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trilane.scene.camera.base import CameraPath, Lens, look_at
-from trilane.scene.motion.base import Wrap
+from trilane.scene.camera.path import CameraPath, Lens, look_at
+from trilane.scene.motion.motion import Wrap
 from trilane.scene.rotations import quat_from_matrix
 from trilane.scene.schema import CameraSpec
 

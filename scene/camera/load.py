@@ -14,11 +14,11 @@ from trilane.errors import BadInputError
 from trilane.files import require_file
 from trilane.scene.camera import arkit, tum
 from trilane.scene.camera.arkit import load_arkit
-from trilane.scene.camera.base import CameraPath
 from trilane.scene.camera.builtin import ORBITS, load_builtin
 from trilane.scene.camera.nerf import load_nerf
+from trilane.scene.camera.path import CameraPath
 from trilane.scene.camera.recorded import RawCamera, finish
-from trilane.scene.camera.table import column_count
+from trilane.scene.camera.text_table import column_count
 from trilane.scene.camera.tum import load_tum
 from trilane.scene.schema import CameraSpec
 

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import F64
-from trilane.scene.camera.base import CameraPath, Lens
-from trilane.scene.motion.repair import kept_samples
+from trilane.scene.camera.path import CameraPath, Lens
+from trilane.scene.motion.usable_samples import kept_samples
 from trilane.scene.rotations import about, quat_from_matrix, shortest_turn
 from trilane.scene.schema import CameraSpec
 

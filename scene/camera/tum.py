@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from trilane.scene.camera.recorded import OPENGL_FROM_OPTICAL, RawCamera
-from trilane.scene.camera.table import elapsed, read_table
+from trilane.scene.camera.text_table import elapsed, read_table
 from trilane.scene.rotations import matrix_from_quat, normalised
 
 COLUMNS = 8

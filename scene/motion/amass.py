@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
 from trilane.files import as_numbers, read_npz
-from trilane.scene.motion.base import JOINTS, REST_PELVIS, RawMotion
+from trilane.scene.motion.motion import JOINTS, REST_PELVIS, RawMotion
 from trilane.scene.motion.smplx_npy import hands_note
 
 EXPECTED = "AMASS motion: `poses` (T, 156) or (T, 165), `trans` (T, 3), a frame rate"

@@ -11,9 +11,9 @@ import numpy as np
 
 from trilane.arrays import F64
 from trilane.body.joints import JOINT_INDEX
-from trilane.scene.motion.arms import hanging_arm, relaxed_hands, waving_arm
-from trilane.scene.motion.base import JOINTS, Motion, Wrap
-from trilane.scene.motion.steps import Build, FootTrack, Swing, Walker, blurred, smooth_step, solve_leg
+from trilane.scene.motion.arm_poses import hanging_arm, relaxed_hands, waving_arm
+from trilane.scene.motion.footsteps import Build, FootTrack, Swing, Walker, blurred, smooth_step, solve_leg
+from trilane.scene.motion.motion import JOINTS, Motion, Wrap
 from trilane.scene.rotations import about, matrix_from_quat, quat_from_matrix, rotvec_from_matrix, slerp
 
 RATE_HZ = 60

@@ -13,11 +13,11 @@ import numpy as np
 from trilane.errors import BadInputError
 from trilane.files import require_file
 from trilane.scene.motion.amass import load_amass
-from trilane.scene.motion.base import Motion, RawMotion
 from trilane.scene.motion.builtin import BUILTIN
-from trilane.scene.motion.retarget import load_retargeted
+from trilane.scene.motion.bvh_retarget import load_retargeted
+from trilane.scene.motion.motion import Motion, RawMotion
+from trilane.scene.motion.recorded import finish
 from trilane.scene.motion.smplx_npy import load_smplx_npy
-from trilane.scene.motion.upright import finish
 from trilane.scene.schema import AvatarSpec
 
 PREFIX = "builtin:"

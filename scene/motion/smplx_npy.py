@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
 from trilane.files import as_numbers, read_npy
-from trilane.scene.motion.base import JOINTS, RawMotion
+from trilane.scene.motion.motion import JOINTS, RawMotion
 from trilane.scene.rotations import matrix_from_rotvec, rotvec_from_matrix
 
 EXPECTED = "SMPL-X poses, an array of shape (T, 165) in radians"

@@ -9,8 +9,8 @@ from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import ShapedBody, load_body
 from trilane.body.joints import JOINT_INDEX
 from trilane.body.kinematics import Skeleton
-from trilane.scene.motion.base import Wrap, bracket, wrapped_time
 from trilane.scene.motion.builtin import BUILTIN, SWINGS
+from trilane.scene.motion.motion import Wrap, bracket, wrapped_time
 from trilane.scene.mover import Mover, make_mover
 from trilane.scene.rotations import matrix_from_rotvec, rotvec_from_matrix
 from trilane.scene.schema import AvatarSpec

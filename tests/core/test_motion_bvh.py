@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 
 from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS
 from trilane.errors import BadInputError
-from trilane.scene.motion.base import Motion
 from trilane.scene.motion.bvh import load_bvh
+from trilane.scene.motion.bvh_joint_names import DIALECTS, plain
+from trilane.scene.motion.bvh_retarget import LIMBS
 from trilane.scene.motion.load import load_motion
-from trilane.scene.motion.names import DIALECTS, plain
-from trilane.scene.motion.retarget import LIMBS
+from trilane.scene.motion.motion import Motion
 from trilane.scene.rotations import about, matrix_from_rotvec
 from trilane.scene.schema import AvatarSpec
 

@@ -11,9 +11,9 @@ import pytest
 from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import ShapedBody, load_body
 from trilane.body.kinematics import Skeleton
-from trilane.scene.grounding import outline
-from trilane.scene.motion.base import Motion
+from trilane.scene.floor import outline
 from trilane.scene.motion.builtin import BUILTIN
+from trilane.scene.motion.motion import Motion
 from trilane.scene.mover import make_mover
 from trilane.scene.rotations import about, normalised
 from trilane.scene.schema import AvatarSpec, CameraSpec, Scene

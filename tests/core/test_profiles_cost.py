@@ -13,12 +13,21 @@ from onnx import TensorProto, helper
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import network_alone, split_work
-from trilane.hw_profiles.corners import corners_of
-from trilane.hw_profiles.cost import CLASSES, network_work, reference_network, walk
 from trilane.hw_profiles.load import load_profile
-from trilane.hw_profiles.networks import ENCODERS, LAYOUTS, NORMS, NetworkSpec, build_network, parameters
-from trilane.hw_profiles.published import PUBLISHED_MS, check_published, resnet18_work, unet_work
-from trilane.hw_profiles.roofline import job_time, machine_of
+from trilane.hw_profiles.network_work import CLASSES, count_work
+from trilane.hw_profiles.operator_times import job_time, machine_of
+from trilane.hw_profiles.performance_profiles import corners_of
+from trilane.hw_profiles.published_times import PUBLISHED_MS, check_published, resnet18_work, unet_work
+from trilane.hw_profiles.reference_encoders import ENCODERS
+from trilane.hw_profiles.reference_networks import (
+    LAYOUTS,
+    NORMS,
+    NetworkSpec,
+    build_network,
+    network_work,
+    parameters,
+    reference_network,
+)
 from trilane.training.quantising.quantise import Quantised
 from trilane.units import UnitName
 
@@ -94,7 +103,7 @@ def test_products_grow_with_the_area() -> None:
 @pytest.mark.parametrize("shape", [(32, 32), (384, 192), (640, 640)])
 def test_counts_of_any_size_are_those_of_a_walk(encoder: str, shape: tuple[int, int]) -> None:
     one = NetworkSpec(encoder, "instance", *shape, 12, "split")
-    assert network_work(one) == walk(build_network(one))
+    assert network_work(one) == count_work(build_network(one))
 
 
 def test_quantised_graphs_count_as_their_float_ones() -> None:
@@ -109,7 +118,7 @@ def test_quantised_graphs_count_as_their_float_ones() -> None:
     source = helper.make_tensor_value_info("x", TensorProto.INT8, (1, 4, 16, 16))
     result = helper.make_tensor_value_info("y", TensorProto.FLOAT, (1, 8, 16, 16))
     graph = helper.make_graph(nodes, "g", [source], [result], [weight, scale])
-    work = walk(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 21)]))
+    work = count_work(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 21)]))
     assert [o.kind for o in work.operators] == ["convolution"]
     assert work.macs == 16 * 16 * 9 * 4 * 8
     assert work.weights == 288
@@ -118,7 +127,7 @@ def test_quantised_graphs_count_as_their_float_ones() -> None:
 
 def test_a_quantised_avatar_counts_as_its_float_network(tiny_quantised: Quantised, tiny_float: onnx.ModelProto) -> None:
     """Bytes in and out, channels last: the transposes at the ends change the order of a file and cost nothing."""
-    whole, plain = walk(tiny_quantised.network.model), walk(tiny_float)
+    whole, plain = count_work(tiny_quantised.network.model), count_work(tiny_float)
     assert [o.kind for o in whole.operators] == [o.kind for o in plain.operators]
     assert (whole.macs, whole.weights, whole.input_elements) == (plain.macs, plain.weights, plain.input_elements)
 
@@ -128,7 +137,7 @@ def test_an_operator_that_is_not_known_is_named() -> None:
     y = helper.make_tensor_value_info("y", TensorProto.FLOAT, (1, 4, 16, 16))
     graph = helper.make_graph([helper.make_node("Erf", ["x"], ["y"], name="odd")], "g", [x], [y])
     with pytest.raises(BadInputError, match="odd"):
-        walk(helper.make_model(graph))
+        count_work(helper.make_model(graph))
 
 
 def test_a_dynamic_shape_is_refused() -> None:
@@ -136,7 +145,7 @@ def test_a_dynamic_shape_is_refused() -> None:
     y = helper.make_tensor_value_info("y", TensorProto.FLOAT, (1, 4, "h", 16))
     graph = helper.make_graph([helper.make_node("Tanh", ["x"], ["y"])], "g", [x], [y])
     with pytest.raises(BadInputError, match="no static shape"):
-        walk(helper.make_model(graph))
+        count_work(helper.make_model(graph))
 
 
 @pytest.mark.parametrize(("key", "value"), [("encoder", "vgg"), ("norm", "layer"), ("layout", "loose")])

@@ -8,6 +8,7 @@ from statistics import median
 import pytest
 
 from trilane.errors import BadInputError
+from trilane.hw_profiles.configuration_table import read_table
 from trilane.hw_profiles.fit import (
     STEPS,
     UNIT_OF_COLUMN,
@@ -19,7 +20,6 @@ from trilane.hw_profiles.fit import (
     with_factors,
 )
 from trilane.hw_profiles.load import load_profile, load_tables, parse_profile
-from trilane.hw_profiles.table import read_table
 
 HEADER = (
     "encoder,norm,size,channels,layout,bench_dsp_ms,bench_gpu_ms,"

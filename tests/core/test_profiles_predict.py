@@ -15,13 +15,12 @@ from trilane.hw_profiles.application import (
     stage_times_ms,
     steady,
 )
-from trilane.hw_profiles.corners import corners_of
-from trilane.hw_profiles.cost import reference_network
+from trilane.hw_profiles.configuration_table import read_table
 from trilane.hw_profiles.load import load_profile
-from trilane.hw_profiles.networks import NetworkSpec
+from trilane.hw_profiles.performance_profiles import corners_of
 from trilane.hw_profiles.predict import over_time, predict, predict_table, what_if
-from trilane.hw_profiles.table import read_table
-from trilane.hw_profiles.thermal import GOVERNORS, Heat
+from trilane.hw_profiles.reference_networks import NetworkSpec, reference_network
+from trilane.hw_profiles.throttling import GOVERNORS, Heat
 from trilane.units import UNITS, UnitName
 
 NETWORK = reference_network(NetworkSpec("resnet18", "batch", 512, 512, 16))

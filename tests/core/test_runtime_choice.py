@@ -5,16 +5,16 @@ from __future__ import annotations
 import pytest
 
 from trilane.errors import MissingPartError
-from trilane.hw_profiles import detect
+from trilane.hw_profiles import host_profile
 from trilane.hw_profiles.load import load_profile
-from trilane.hw_profiles.runtimes import fastest_runtime
+from trilane.hw_profiles.runtime_choice import fastest_runtime
 from trilane.stages.dsp.runtime import RUNTIMES
 
 
 @pytest.mark.parametrize(("flag", "fastest"), [("avx2", "openvino"), ("avx512_vnni", "openvino"), ("asimddp", "ort")])
 def test_the_instructions_of_the_machine_decide(monkeypatch, tmp_path, flag, fastest):
     (tmp_path / "cpuinfo").write_text(f"flags : fpu {flag}")
-    monkeypatch.setattr(detect, "CPU_INFO", tmp_path / "cpuinfo")
+    monkeypatch.setattr(host_profile, "CPU_INFO", tmp_path / "cpuinfo")
     name, why = fastest_runtime(load_profile("host"), ["ort", "openvino", "qnn"])
     assert name == fastest and "host profile" in why and "qnn" not in why
 
@@ -29,5 +29,5 @@ def test_nothing_to_take_says_what_to_install():
 
 
 def test_the_table_knows_only_runtimes_that_there_are():
-    assert {name for speeds, *_ in detect.RUNTIMES.values() for name in speeds} <= set(RUNTIMES)
-    assert set(detect.RUNTIMES) == set(detect.RATES)
+    assert {name for speeds, *_ in host_profile.RUNTIMES.values() for name in speeds} <= set(RUNTIMES)
+    assert set(host_profile.RUNTIMES) == set(host_profile.RATES)

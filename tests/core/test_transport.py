@@ -18,40 +18,41 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trilane.errors import TrilaneError
-from trilane.transport.heartbeats import LOCK, BusFolder, Link, sweep
 from trilane.transport.job_pipe import PACKETS, JobPipe, job_pipe_pair
+from trilane.transport.link import Link
 from trilane.transport.memory import RegionLayout, create_region, map_region
 from trilane.transport.messages import (
     MAX_BYTES,
     MAX_TEXT,
-    Alive,
     Close,
     Closed,
     Done,
     Duration,
     Failed,
-    Isolate,
     Message,
     MessageError,
     Ping,
+    Pong,
     Ready,
+    RunIsolated,
     RunJob,
     pack,
     unpack,
 )
 from trilane.transport.packets import SlotLayout, header_dtype
+from trilane.transport.socket_folder import LOCK, SocketFolder, remove_abandoned
 from trilane.transport.wakeup import AWAKE, DEFAULT, SHORTEST_NS, awake, use_slice
 
 MESSAGES = [
     RunJob(1, 0, 2, -1, 0, 3),
-    Isolate(1, 4, 0, 1),
+    RunIsolated(1, 4, 0, 1),
     Ping(),
     Close(),
     Ready(1234),
     Done(1, 2**62, 2**62 + 1, 0, {"encode_ms": 1.5}),
     Duration(2**40),
-    Failed(-1, 2, "what was found"),
-    Alive(),
+    Failed(-1, 2, "a failure"),
+    Pong(),
     Closed(),
 ]
 
@@ -64,18 +65,18 @@ def test_a_message_arrives_as_it_was_sent(message: object) -> None:
 
 
 @pytest.mark.parametrize("data", [b"", b"\xff", b"no message", pack(Close()) + b"\0", pack(Ready(1))[:-1]])
-def test_what_is_not_a_message_is_refused(data: bytes) -> None:
+def test_bytes_that_are_no_message_are_refused(data: bytes) -> None:
     with pytest.raises(MessageError):
         unpack(data)
 
 
-@pytest.mark.parametrize("figures", [None, [], 1, "text", {"a": "b"}, {1: 2.0}, {"a": True}])
-def test_what_are_no_figures_is_refused(figures: object) -> None:
+@pytest.mark.parametrize("metrics", [None, [], 1, "text", {"a": "b"}, {1: 2.0}, {"a": True}])
+def test_values_that_are_no_metrics_are_refused(metrics: object) -> None:
     with pytest.raises(MessageError, match=r"expected dict|not msgpack"):
-        unpack(pack(Done(1, 2, 3, 4, {})) + msgpack.packb(figures))
+        unpack(pack(Done(1, 2, 3, 4, {})) + msgpack.packb(metrics))
 
 
-def test_text_that_is_none_is_refused() -> None:
+def test_a_text_field_of_another_type_is_refused() -> None:
     with pytest.raises(MessageError, match="expected str"):
         unpack(pack(Failed(1, 2, "")) + msgpack.packb(1))
 
@@ -128,11 +129,11 @@ def test_a_region_that_is_too_small_is_refused() -> None:
     os.close(fd)
 
 
-def heard(link: Link) -> list[Message]:
-    """What comes over the bus within two seconds."""
+def received(link: Link) -> list[Message]:
+    """The first heartbeats that come within two seconds."""
     messages: list[Message] = []
-    while not messages and select.select([link.bus_fd], [], [], 2)[0]:
-        messages = link.bus_messages()
+    while not messages and select.select([link.heartbeat_fd], [], [], 2)[0]:
+        messages = link.heartbeats()
     return messages
 
 
@@ -140,43 +141,43 @@ def test_the_folder_is_private_and_goes_while_the_link_lives(tmp_path: Path, mon
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     context = zmq.Context()
     parent, child = (Link(context, JobPipe(end)) for end in job_pipe_pair())
-    folder = BusFolder()
+    folder = SocketFolder()
     assert folder.path.stat().st_mode & 0o777 == 0o700
-    parent.socket.bind(folder.endpoint("cpu"))
-    child.socket.connect(folder.endpoint("cpu"))
-    child.sign(Ready(1))
-    assert heard(parent) == [Ready(1)]
+    parent.bind(folder.endpoint("cpu"))
+    child.connect(folder.endpoint("cpu"))
+    child.send_heartbeat(Ready(1))
+    assert received(parent) == [Ready(1)]
     folder.remove()
     assert not list(tmp_path.iterdir())
-    child.sign(Alive())
-    assert heard(parent) == [Alive()] and parent.bus_messages() == []
+    child.send_heartbeat(Pong())
+    assert received(parent) == [Pong()] and parent.heartbeats() == []
     parent.close()
     child.close()
     context.term()
 
 
-def test_work_goes_over_the_line_and_life_signs_over_the_bus(tmp_path: Path) -> None:
-    """Work needs no address, and keeps its order."""
+def test_jobs_go_over_the_job_pipe_and_heartbeats_over_zeromq(tmp_path: Path) -> None:
+    """Jobs need no address, and keep their order."""
     context = zmq.Context()
     ends = job_pipe_pair()
     parent, child = Link(context, JobPipe(ends[0])), Link(context, JobPipe(ends[1], waits=True))
-    parent.socket.bind(f"ipc://{tmp_path}/bus")
-    child.socket.connect(f"ipc://{tmp_path}/bus")
+    parent.bind(f"ipc://{tmp_path}/bus")
+    child.connect(f"ipc://{tmp_path}/bus")
     job, done = RunJob(1, 0, 7, 0, 1, 0), Done(1, 2, 3, 4, {"inferred": 1.0})
-    parent.line.send(job)
-    assert child.line.receive() == job
-    child.sign(Alive())
-    child.line.send(done)
-    child.line.send(Failed(2, 2, "no such thing"))
-    assert [parent.line.receive() for _ in range(3)] == [done, Failed(2, 2, "no such thing"), None]
-    assert heard(parent) == [Alive()]
-    assert not select.select([parent.bus_fd], [], [], 0)[0]
+    parent.job_pipe.send(job)
+    assert child.job_pipe.receive() == job
+    child.send_heartbeat(Pong())
+    child.job_pipe.send(done)
+    child.job_pipe.send(Failed(2, 2, "no such thing"))
+    assert [parent.job_pipe.receive() for _ in range(3)] == [done, Failed(2, 2, "no such thing"), None]
+    assert received(parent) == [Pong()]
+    assert not select.select([parent.heartbeat_fd], [], [], 0)[0]
     parent.close()
     child.close()
     context.term()
 
 
-def test_a_line_waits_for_a_message_or_not_at_all() -> None:
+def test_a_job_pipe_waits_for_a_message_or_not_at_all() -> None:
     ours, theirs = job_pipe_pair()
     patient, hasty = JobPipe(ours, waits=True), JobPipe(theirs)
     assert hasty.receive() is None and not hasty.ended
@@ -187,7 +188,7 @@ def test_a_line_waits_for_a_message_or_not_at_all() -> None:
     patient.close()
 
 
-def test_a_line_whose_end_is_gone_or_stopped_says_nothing() -> None:
+def test_sending_to_an_end_that_is_closed_or_full_does_nothing() -> None:
     ours, theirs = (JobPipe(end) for end in job_pipe_pair())
     for number in range(10_000):
         ours.send(RunJob(number, 0, 0, 0, 0, 0))
@@ -198,7 +199,7 @@ def test_a_line_whose_end_is_gone_or_stopped_says_nothing() -> None:
     ours.close()
 
 
-def test_what_was_said_before_an_end_that_left_work_unread_is_heard() -> None:
+def test_messages_sent_before_an_end_closed_with_work_unread_are_received() -> None:
     ours, theirs = (JobPipe(end) for end in job_pipe_pair())
     theirs.send(Done(1, 2, 3, 4, {}))
     ours.send(RunJob(2, 0, 0, 0, 0, 0))
@@ -234,39 +235,40 @@ def test_a_process_without_files_for_pipes_is_told_so(monkeypatch: pytest.Monkey
     assert open_files() == before
 
 
-def test_a_line_refuses_what_is_no_message() -> None:
+def test_a_job_pipe_refuses_bytes_that_are_no_message() -> None:
     end, other = job_pipe_pair()
     os.write(end.writes, b"no message")
-    line = JobPipe(other)
+    job_pipe = JobPipe(other)
     with pytest.raises(MessageError):
-        line.receive()
+        job_pipe.receive()
     end.close()
-    line.close()
+    job_pipe.close()
 
 
 def test_a_message_too_large_is_not_received() -> None:
     context = zmq.Context()
     parent, child = (Link(context, JobPipe(end)) for end in job_pipe_pair())
-    with BusFolder() as folder:
-        parent.socket.bind(folder.endpoint("cpu"))
-        child.socket.connect(folder.endpoint("cpu"))
-        child.socket.send(bytes(1 << 17), zmq.DONTWAIT)
-        assert not parent.socket.poll(300)
+    with SocketFolder() as folder:
+        parent.bind(folder.endpoint("cpu"))
+        child.connect(folder.endpoint("cpu"))
+        child.heartbeat_socket.socket.send(bytes(1 << 17), zmq.DONTWAIT)
+        assert not parent.heartbeat_socket.socket.poll(300)
     parent.close()
     child.close()
     context.term()
 
 
-def test_only_a_folder_that_nobody_holds_is_swept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_a_folder_whose_lock_is_free_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    held = BusFolder()
+    locked = SocketFolder()
     (tmp_path / "trilane-stale").mkdir()
     (tmp_path / "trilane-stale" / LOCK).touch()
     (tmp_path / "trilane-other").mkdir()
-    (tmp_path / "trilane-link").symlink_to(held.path)
-    sweep(tmp_path)
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([held.path.name, "trilane-other", "trilane-link"])
-    held.remove()
+    (tmp_path / "trilane-link").symlink_to(locked.path)
+    expected = [locked.path.name, "trilane-other", "trilane-link"]
+    remove_abandoned(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(expected)
+    locked.remove()
 
 
 def test_a_slice_is_asked_for_and_given_back() -> None:

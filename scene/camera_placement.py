@@ -17,8 +17,8 @@ import numpy as np
 from trilane.arrays import F32, F64
 from trilane.body.body import ShapedBody
 from trilane.body.kinematics import Skeleton
-from trilane.scene.camera.base import CameraPath, view_from_pose
-from trilane.scene.grounding import outline
+from trilane.scene.camera.path import CameraPath, view_from_pose
+from trilane.scene.floor import outline
 from trilane.scene.mover import Mover
 from trilane.scene.rotations import about
 from trilane.scene.schema import Scene

@@ -1,7 +1,7 @@
-"""Latencies that others published for known networks: an outside check of the profiles nobody here measured.
+"""Latencies that others have published for known networks, to check profiles of chips that were never measured here.
 
-Rule: these numbers are never fitted by `fit.py`; a profile that takes a peak rate from one of them says so in its
-`source`, and the check then only shows that it was carried over.
+Rule: `fit.py` never uses these numbers. A profile that takes a peak rate from one of them says so in its `source`; for
+that network the check only shows that the number was carried over.
 
 Source: Qualcomm AI Hub Models, `unet_segmentation` and `resnet18`, w8a8, TFLite and QNN runtimes, QAIRT 2.41
 (BSD-3-Clause, github.com/quic/ai-hub-models, perf.yaml). The first is milesial's U-Net of
@@ -13,18 +13,19 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import NamedTuple
 
-from trilane.hw_profiles.corners import corners_of
-from trilane.hw_profiles.cost import Work, walk
-from trilane.hw_profiles.networks import GraphBuilder, TensorRef, resnet18
-from trilane.hw_profiles.roofline import job_time, machine_of
+from trilane.hw_profiles.graph_builder import GraphBuilder, TensorRef
+from trilane.hw_profiles.network_work import Work, count_work
+from trilane.hw_profiles.operator_times import job_time, machine_of
+from trilane.hw_profiles.performance_profiles import corners_of
+from trilane.hw_profiles.reference_encoders import resnet18
 from trilane.hw_profiles.schema import Profile
 from trilane.units import UNITS
 
 UNET_SIZE = (640, 1280)
 UNET_WIDTHS = (64, 128, 256, 512, 1024)
 
-#: (network, profile): published milliseconds. ResNet18 is the middle of both runtimes; the QCS8450 stands for the
-#: 8 Gen 1 and, as Qualcomm's own proxy, for the XR2 Gen 2; the QCS8550 for the 8 Gen 2.
+#: (network, profile): published milliseconds. Those of ResNet18 are the mean of both runtimes. The times of the 8 Gen 1
+#: were published for the QCS8450, which Qualcomm also takes for the XR2 Gen 2; those of the 8 Gen 2 for the QCS8550.
 PUBLISHED_MS = {
     ("unet", "snapdragon-8-gen-1"): 54.1,
     ("unet", "snapdragon-xr2-gen-2"): 55.6,
@@ -37,12 +38,12 @@ PUBLISHED_MS = {
     ("resnet18", "snapdragon-8-gen-3"): 0.35,
     ("resnet18", "snapdragon-8-elite"): 0.27,
 }
-#: The network whose time set the profile's peak rate.
+#: The network whose published time gave the profiles their peak rate.
 CARRIED_OVER = "unet"
 
 
 class Check(NamedTuple):
-    """`independent`: no number of the profile comes from this time."""
+    """A published time beside the predicted one. `independent`: no number of the profile comes from this time."""
 
     profile: str
     network: str
@@ -70,7 +71,7 @@ def unet_work() -> Work:
         x = b.op("ConvTranspose", [x.name, weight], (width, *skip[2:]), kernel_shape=[2, 2], strides=[2, 2])
         x = _double(b, b.op("Concat", [skip.name, x.name], (2 * width, *skip[2:]), axis=1), width)
     out = b.conv(x, 2, 1, bias=True)
-    return walk(b.model("unet", [out]))
+    return count_work(b.model("unet", [out]))
 
 
 def _double(b: GraphBuilder, x: TensorRef, width: int) -> TensorRef:
@@ -83,19 +84,19 @@ def resnet18_work() -> Work:
     b = GraphBuilder("batch")
     x = resnet18(b, b.input("image", 3, 224, 224))[-1]
     out = b.conv(b.op("GlobalAveragePool", [x.name], (x.channels, 1, 1)), 1000, 1, bias=True)
-    return walk(b.model("resnet18", [out]))
+    return count_work(b.model("resnet18", [out]))
 
 
 WORK = {"unet": unet_work, "resnet18": resnet18_work}
 
 
 def check_published(name: str, profile: Profile) -> list[Check]:
-    """`profile` against what was published for it under `burst`; empty where nothing was."""
+    """Published times of the chip `name` beside those that `profile` predicts under `burst`; none if none is known."""
     unit = profile.units["dsp"]
     clock = unit.clock(corners_of(profile, "burst")[UNITS.index("dsp")])
     machine = machine_of(unit, profile.memory, clock)
     return [
         Check(name, network, network != CARRIED_OVER, ms, job_time(WORK[network](), machine).total_ms)
-        for (network, of), ms in PUBLISHED_MS.items()
-        if of == name
+        for (network, chip), ms in PUBLISHED_MS.items()
+        if chip == name
     ]

@@ -11,7 +11,7 @@ from math import isfinite
 from pathlib import Path
 
 from trilane.errors import BadInputError
-from trilane.hw_profiles.networks import NetworkSpec
+from trilane.hw_profiles.reference_networks import NetworkSpec
 from trilane.shapes import parse_shape
 from trilane.unexpected import UnexpectedValue
 

@@ -14,9 +14,9 @@ import numpy as np
 from trilane.arrays import F64
 from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS
 from trilane.errors import BadInputError
-from trilane.scene.motion.base import JOINTS, RawMotion
 from trilane.scene.motion.bvh import BvhJoint, load_bvh
-from trilane.scene.motion.names import DIALECTS, plain
+from trilane.scene.motion.bvh_joint_names import DIALECTS, plain
+from trilane.scene.motion.motion import JOINTS, RawMotion
 from trilane.scene.rotations import rotvec_from_matrix, shortest_turn
 
 #: Metres in one unit; `cmu` is the unit of the CMU recordings, 1/0.45 inches.

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F64
 from trilane.errors import BadInputError
-from trilane.scene.motion.base import Motion, RawMotion, Wrap
-from trilane.scene.motion.repair import kept_samples
+from trilane.scene.motion.motion import Motion, RawMotion, Wrap
+from trilane.scene.motion.usable_samples import kept_samples
 from trilane.scene.rotations import Y_UP_FROM_Z_UP, about, matrix_from_rotvec, rotvec_from_matrix
 
 MAX_FRAMES = 200_000

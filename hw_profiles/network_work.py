@@ -1,13 +1,13 @@
-"""What a network asks of a unit: an ONNX graph walked once, as a list of operators with counts.
+"""The work of a network: its ONNX operators, each with its multiply-accumulates and the elements that it moves.
 
-Rule: nothing here knows any hardware; `roofline.py` turns the counts into time.
+Rule: nothing here knows any hardware; `operator_times.py` turns the counts into time.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from dataclasses import dataclass
+from functools import cached_property
 from math import prod
 from typing import Any, NamedTuple
 
@@ -16,16 +16,16 @@ import onnx
 from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
-from trilane.hw_profiles.networks import NetworkSpec, build_network
 
 ARITHMETIC = ("convolution", "pointwise", "depthwise")
 TRAFFIC = ("normalisation", "resize", "elementwise", "permute")
 CLASSES = ARITHMETIC + TRAFFIC
 
-#: Operators that a runtime folds into the convolution before them, or that only name a tensor anew.
+#: Operators that cost nothing: a runtime folds them into the convolution before them, or they only rename a tensor.
 FOLDED = frozenset(
     ("Relu", "Clip", "Sigmoid", "BatchNormalization", "QuantizeLinear", "DequantizeLinear", "Identity")
 ) | frozenset(("Reshape", "Flatten", "Squeeze", "Unsqueeze", "Constant", "Dropout"))
+#: ONNX operator -> its class, for all but convolutions.
 KIND_OF = {
     "InstanceNormalization": "normalisation",
     "GroupNormalization": "normalisation",
@@ -49,18 +49,19 @@ KIND_OF = {
     "Tanh": "elementwise",
     "LeakyRelu": "elementwise",
 }
-REFERENCE_SIDES = (64, 128)
-#: Permutations between channels first and channels last. The units work channels last, so these only tell a file's
-#: order from the unit's and cost nothing.
+#: Permutations between channels first and channels last. They cost nothing: the units work with channels last, and
+#: these operators are in the file only because its order is the other one.
 LAYOUT_CHANGES = ((0, 3, 1, 2), (0, 2, 3, 1))
-#: A normalisation by statistics reads its input once for them and once to apply them.
+#: Normalisations that read their input twice: once for its mean and variance and once to apply them.
 STATISTICS = frozenset(["InstanceNormalization", "GroupNormalization"])
 
 
 class Operator(NamedTuple):
-    """One operator. `macs` multiply-accumulates; `moved` activation elements read and written; `weights` elements.
-    `c_in`, `c_out`: channels that one product joins and makes (per group), 0 where there is no product.
-    `out`: elements of the result. `live`: elements that must be kept after it for later operators.
+    """One operator of a network and its counts.
+
+    `op_type`: of ONNX. `kind`: of CLASSES. `macs`: multiply-accumulates. `moved`: activation elements read and written.
+    `weights`: elements of its weights. `c_in`, `c_out`: input and output channels per group, 0 for an operator without
+    products. `out`: elements of the result. `live`: elements that later operators still need after it.
     """
 
     name: str
@@ -77,7 +78,7 @@ class Operator(NamedTuple):
 
 @dataclass(frozen=True)
 class Work:
-    """A network as work: its operators, and the elements and tensors that enter and leave."""
+    """The operators of a network, in order, and the sizes of its inputs and outputs in elements."""
 
     operators: tuple[Operator, ...]
     input_elements: int
@@ -86,28 +87,31 @@ class Work:
 
     @cached_property
     def table(self) -> NDArray[np.float64]:
-        """(operators, 5): macs, moved, c_in, c_out, out."""
+        """Counts (operators, 5): macs, moved, c_in, c_out, out."""
         rows = [(o.macs, o.moved, o.c_in, o.c_out, o.out) for o in self.operators]
         return np.array(rows, dtype=np.float64).reshape(-1, 5)
 
     @cached_property
     def classes(self) -> NDArray[np.int64]:
-        """(operators,): index into `CLASSES`."""
+        """Index into `CLASSES` of each operator (operators,)."""
         return np.array([CLASSES.index(o.kind) for o in self.operators], dtype=np.int64)
 
     @cached_property
     def macs(self) -> int:
+        """Multiply-accumulates of the whole network."""
         return sum(o.macs for o in self.operators)
 
     @cached_property
     def weights(self) -> int:
+        """Weight elements of the whole network."""
         return sum(o.weights for o in self.operators)
 
 
 class Network(NamedTuple):
-    """What is to be run: the drawn tensor, how it is drawn (`packed` or `split`), and the work that follows on it.
+    """A network with the input that the raster stage draws for it.
 
-    `facts` says which network it is, for reports.
+    `facts`: what reports call it. `height`, `width`, `channels`: of its input. `layout`: `packed` (one tensor) or
+    `split` (one tensor per raster pass).
     """
 
     facts: Mapping[str, str]
@@ -122,69 +126,37 @@ class Network(NamedTuple):
         return self.height * self.width
 
 
-def reference_network(spec: NetworkSpec) -> Network:
-    """One of the reference networks."""
-    facts = {"encoder": spec.encoder, "norm": spec.norm}
-    return Network(facts, spec.height, spec.width, spec.channels, spec.layout, network_work(spec))
-
-
 Shapes = Mapping[str, tuple[int, ...]]
 
 
-def walk(model: Any) -> Work:
-    """The work of `model` (an `onnx.ModelProto` of static shapes, NCHW or quantised with QDQ).
+def count_work(model: Any) -> Work:
+    """The work of `model`, an `onnx.ModelProto` with static shapes, NCHW, in floats or quantised with QDQ.
 
-    Raises BadInputError for a tensor without a static shape and for an operator that the model does not know.
+    Raises BadInputError for a tensor without a static shape and for an operator that is in none of the tables above.
     """
     shapes = _shapes(model)
     graph = model.graph
     weights = {i.name for i in graph.initializer} | _weight_inputs(graph)
     weights |= {n.output[0] for n in graph.node if n.op_type == "DequantizeLinear" and n.input[0] in weights}
-    alive = _alive(graph, shapes, weights)
+    live_counts = _live_counts(graph, shapes, weights)
     operators = tuple(
         _operator(n, shapes, weights)._replace(live=live)
-        for n, live in zip(graph.node, alive, strict=True)
+        for n, live in zip(graph.node, live_counts, strict=True)
         if n.op_type not in FOLDED and not _changes_layout(n)
     )
-    feeds = [i.name for i in graph.input if i.name not in weights]
+    inputs = [i.name for i in graph.input if i.name not in weights]
     return Work(
         operators,
-        sum(_size(shapes, name) for name in feeds),
-        len(feeds),
+        sum(_size(shapes, name) for name in inputs),
+        len(inputs),
         sum(_size(shapes, o.name) for o in graph.output),
     )
 
 
 def graph_facts(model: Any) -> dict[str, Any]:
-    """`parameters` of the layers as they are in the file, `gmac` of one pass. Raises as `walk`."""
-    work = walk(model)
+    """`parameters` of the layers as they are in the file, `gmac` of one pass. Raises as `count_work`."""
+    work = count_work(model)
     return {"parameters": work.weights, "gmac": work.macs / 1e9}
-
-
-@lru_cache(maxsize=4096)
-def network_work(spec: NetworkSpec) -> Work:
-    """The work of one of the reference networks.
-
-    Their strides divide every side that `NetworkSpec` allows, so every count is a constant and a multiple of the
-    number of pixels: graphs of two sizes are walked, and all sizes follow exactly.
-    """
-    small, large = (_walked(replace(spec, height=side, width=side)) for side in REFERENCE_SIDES)
-    first, second = (side * side for side in REFERENCE_SIDES)
-
-    def at(a: int, b: int) -> int:
-        return a + (b - a) * (spec.pixels - first) // (second - first)
-
-    operators = tuple(
-        s._replace(macs=at(s.macs, b.macs), moved=at(s.moved, b.moved), out=at(s.out, b.out), live=at(s.live, b.live))
-        for s, b in zip(small.operators, large.operators, strict=True)
-    )
-    ends = (at(small.input_elements, large.input_elements), at(small.output_elements, large.output_elements))
-    return Work(operators, ends[0], small.input_tensors, ends[1])
-
-
-@lru_cache(maxsize=512)
-def _walked(spec: NetworkSpec) -> Work:
-    return walk(build_network(spec))
 
 
 def _shapes(model: Any) -> dict[str, tuple[int, ...]]:
@@ -198,7 +170,7 @@ def _shapes(model: Any) -> dict[str, tuple[int, ...]]:
 
 
 def _weight_inputs(graph: Any) -> set[str]:
-    """Inputs that stand for weights in a graph without data: every second and later input of a product or norm."""
+    """Graph inputs that are weights: those that a convolution or normalisation has as its second or a later input."""
     names = {i.name for i in graph.input}
     kinds = ("Conv", "ConvTranspose", "InstanceNormalization", "GroupNormalization")
     return {name for node in graph.node if node.op_type in kinds for name in node.input[1:] if name in names}
@@ -215,20 +187,20 @@ def _changes_layout(node: Any) -> bool:
     return node.op_type == "Transpose" and any(tuple(a.ints) in LAYOUT_CHANGES for a in node.attribute)
 
 
-def _alive(graph: Any, shapes: Shapes, weights: set[str]) -> list[int]:
-    """Elements that later nodes, or the caller, still need after each node."""
-    last = {name: index for index, node in enumerate(graph.node) for name in node.input if name not in weights}
-    last |= {output.name: len(graph.node) for output in graph.output}
-    ends: dict[int, int] = {}
-    alive, counts = 0, []
+def _live_counts(graph: Any, shapes: Shapes, weights: set[str]) -> list[int]:
+    """After each node: elements of all results so far that later nodes, or the caller, still need."""
+    last_use = {name: index for index, node in enumerate(graph.node) for name in node.input if name not in weights}
+    last_use |= {output.name: len(graph.node) for output in graph.output}
+    freed: dict[int, int] = {}
+    live, counts = 0, []
     for index, node in enumerate(graph.node):
         for name in node.output[:1]:
             size = prod(shapes.get(name, (0,)))
-            if last.get(name, index) > index:
-                alive += size
-                ends[last[name]] = ends.get(last[name], 0) + size
-        alive -= ends.pop(index, 0)
-        counts.append(alive)
+            if last_use.get(name, index) > index:
+                live += size
+                freed[last_use[name]] = freed.get(last_use[name], 0) + size
+        live -= freed.pop(index, 0)
+        counts.append(live)
     return counts
 
 

@@ -16,7 +16,7 @@ from trilane.arrays import F64
 from trilane.body.body import ShapedBody
 from trilane.body.joints import JOINT_INDEX
 from trilane.body.kinematics import Skeleton
-from trilane.scene.motion.base import Motion
+from trilane.scene.motion.motion import Motion
 
 Ground = Literal["auto", "sequence", "frame", "none"]
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from trilane.arrays import F64
-from trilane.scene.motion.base import Wrap, bracket, wrapped_time
+from trilane.scene.motion.motion import Wrap, bracket, wrapped_time
 from trilane.scene.rotations import matrix_from_quat, slerp
 
 
