@@ -1,4 +1,4 @@
-"""Measurements of this machine: one module per question, each answered by its `measure`, and `lib/` for what they share.
+"""Measurements of this machine: a module for each question, whose `measure` answers it, and `lib/` for what they share.
 
-It may use every folder but apps/.
+It may use every folder but apps/. The parameters of `measure` are options of `trilane bench`, explained in its help.
 """

@@ -13,7 +13,6 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from trilane.stages.machine import gl_facts, machine_facts
 from trilane.avatars.bundle import Bundle, load_bundle
 from trilane.avatars.split import split
 from trilane.body.body import load_body
@@ -27,6 +26,7 @@ from trilane.scene.staging import stage_scene
 from trilane.stages.config import NetworkCut, RunConfig
 from trilane.stages.dsp.runtime import RUNTIMES, installed, resolve
 from trilane.stages.gpu.background import open_background
+from trilane.stages.machine import gl_facts, machine_facts
 
 GL_INSTALL = "apt-get install libegl1 libgl1-mesa-dri"
 ROOM = "room"

@@ -197,7 +197,7 @@ class _ZmqEnd:
 class IceoryxChannel:
     """iceoryx2: a loaned sample is written in place and sent, an event wakes the other end. Nothing is copied.
 
-    iceoryx2 leaves files for the user's next program. Here they have a folder and a prefix of their own and are removed.
+    iceoryx2 leaves files for the user's next program. Here they get a folder and a prefix of their own and are removed.
     Both are short, because the path of a Unix socket must be.
     """
 

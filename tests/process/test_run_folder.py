@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from trilane.stages.machine import machine_facts
 from trilane.apps.report import read_report
 from trilane.apps.run_job import Hooks, Outcome, Plan, run_to_folder
 from trilane.errors import TrilaneError
@@ -16,6 +15,7 @@ from trilane.hw_profiles.host import host_units
 from trilane.scene.schema import OutputSpec, Scene
 from trilane.scheduler.recording import read, replay
 from trilane.stages.config import RunConfig
+from trilane.stages.machine import machine_facts
 
 FRAMES = 24
 MOCK = "trilane.testing.doubles"
