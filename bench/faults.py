@@ -30,7 +30,7 @@ from trilane.units import UNITS
 
 FAULTS = ("kill", "stop")
 SHM = Path("/dev/shm")  # noqa: S108 - looked at, not written to
-#: A run is back to its pace with the first of `PACE_FRAMES` frames whose mean distance is at most `PACE_PERIODS` periods.
+#: A run is back to its pace with the first of so many frames whose mean distance is at most so many periods.
 PACE_FRAMES, PACE_PERIODS = 5, 1.2
 SPACE = 0.7  # share of the mean time between two signals in which no other is sent
 WAIT_S = 0.02
@@ -49,7 +49,7 @@ def measure(
     runtime: str = "auto",
     seed: int = 1,
 ) -> dict[str, Any]:
-    """A run for each unit and fault: `kill` (SIGKILL, `times` in a run) or `stop` (SIGSTOP, once, for `stop_s` seconds).
+    """A run for each unit and fault: `kill` (SIGKILL, `times` in a run) or `stop` (SIGSTOP once, for `stop_s` seconds).
 
     Rows: `signals` sent; `ended`: all frames, or why it failed; frames `requested`, `presented`, `lost`, `dropped` and
     `uncounted` (none of these three); `lost_per_death`; `restarts`; `ready_ms`: from a unit's death until it is ready

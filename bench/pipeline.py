@@ -31,7 +31,7 @@ from trilane.unexpected import UnexpectedValue
 
 SEQUENTIAL = "sequential"
 MIN_FRAMES = 20
-ISOLATED_FRAMES = 16  # of each run
+ALONE = 16  # frames of each run that are measured isolated
 PACE = 1.25  # of the slowest unit's rate: paced policies always get more frames than they can present
 NO_ACCURACY = "untrained: its pictures mean nothing, it is here for its work"
 
@@ -81,14 +81,10 @@ def measure(
     accuracy: dict[str, Any] = {}
     for name, tensor_size, count in product(avatar, size, cores):
         config, accuracy[name] = _config(name, tensor_size, count, frames, runtime, video=video)
-        rows += _measure_rounds(
-            config, [Setting(name, tensor_size, count, *pair) for pair in _pairs(policy, edge)], turns
-        )
-    return {
-        "rows": rows,
-        "accuracy": accuracy,
-        "config": {"frames": frames, "turns": turns, "runtime": config.runtime, "video": video},
-    }
+        settings = [Setting(name, tensor_size, count, *pair) for pair in _pairs(policy, edge)]
+        rows += _measure_rounds(config, settings, turns)
+    facts = {"frames": frames, "turns": turns, "runtime": config.runtime, "video": video}
+    return {"rows": rows, "accuracy": accuracy, "config": facts}
 
 
 def _measure_rounds(config: RunConfig, settings: list[Setting], rounds: int) -> list[dict[str, Any]]:
@@ -148,7 +144,7 @@ def _run(config: RunConfig, plan: Setting, alone_ms: float = 0.0) -> dict[str, A
     pace = PACE * 1e3 / alone_ms if policy_named(plan.policy).paced else None
     with tempfile.TemporaryDirectory(prefix="trilane-bench-") as folder:
         placed = config.model_copy(update={"out_dir": Path(folder)})
-        result = run_pipeline(placed, policy=plan.policy, edge=plan.edge, pace_fps=pace, isolate_frames=ISOLATED_FRAMES)
+        result = run_pipeline(placed, policy=plan.policy, edge=plan.edge, pace_fps=pace, isolate_frames=ALONE)
     if result.interrupted:
         raise KeyboardInterrupt
     if result.failure is not None or result.presented < 2:

@@ -1,7 +1,7 @@
 """Does the pipeline answer as a service should: one query at a time, several, at random moments, all at once?
 
-Rule: the whole pipeline is asked, from pose to presented frame. A result is valid or says why not; MLCommons LoadGen can
-ask and evaluate the same load.
+Rule: the whole pipeline is asked, from pose to presented frame. A result is valid or says why not, and MLCommons
+LoadGen can ask for and evaluate the same load.
 """
 
 from __future__ import annotations

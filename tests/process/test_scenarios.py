@@ -12,6 +12,7 @@ from trilane.bench import scenario
 from trilane.bench.lib import load
 from trilane.bench.lib.load import Load
 from trilane.errors import BadInputError, TrilaneError
+from trilane.pipeline.requests import FrameRequestQueue
 from trilane.stages.config import RunConfig
 
 Configure = Callable[..., RunConfig]
@@ -65,12 +66,11 @@ def test_a_stage_that_fails_ends_the_scenario_with_its_sentence(mock_config: Con
 
 
 def test_an_interrupt_ends_a_scenario(mock_config: Configure, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupt(*_: object) -> None:
+    def ask_and_interrupt(_load: Load, requests: FrameRequestQueue, queries: load.Queries) -> None:
+        queries.ask(requests, 5)
         os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setitem(
-        load.PATTERNS, "offline", lambda _load, requests, queries: (queries.ask(requests, 5), interrupt())
-    )
+    monkeypatch.setitem(load.PATTERNS, "offline", ask_and_interrupt)
     with pytest.raises(KeyboardInterrupt):
         scenario.run_scenario(mock_config(1), Load("offline", seconds=60), "trilane", "pipelined", "double")
 
