@@ -1,10 +1,10 @@
 """The whole application on a chip: a service time per stage, run through the real scheduler in virtual time.
 
-Rule: what a frame costs is computed here, who waits for whom is the scheduler's business alone.
+Rule: this file computes what a frame costs each stage; which stage waits for which is decided by the scheduler alone.
 
-`REFERENCE` is the reference application's way of working: one buffer between stages, so that a frame is not drawn
-before the network has let go of the buffer that it reads. Read-back holds the GPU; the hand-over holds the network's
-unit.
+`REFERENCE` is how the reference application works: with one buffer between stages, so that a frame is not drawn before
+the network has released the buffer that it reads. The GPU is busy during read-back, the network's unit during the
+hand-over.
 """
 
 from __future__ import annotations
@@ -28,66 +28,90 @@ from trilane.units import UNITS, UnitName
 
 RUNTIMES: tuple[UnitName, ...] = ("gpu", "dsp")
 PACKED_BYTES_PER_PIXEL = 16
-#: Frames of a simulated run: for shares of time, for a frame time alone, and where drops make intervals vary.
+#: Frames of a simulated run: for shares of time, for a frame time alone, and where dropped frames vary the intervals.
 FRAMES, QUICK_FRAMES, FRAMES_WITH_DROPS = 192, 12, 480
 NS_PER_MS = 1_000_000
 
 
-class Way(NamedTuple):
-    """How the stages are joined: scheduling policy, rule of every edge, frames per network job."""
+class Variant(NamedTuple):
+    """How the stages are joined.
+
+    `policy`: of the scheduler. `edge`: rule of the edges between stages, the same for all. `batch`: frames per job.
+    """
 
     policy: str = "pipelined"
     edge: str = "single"
     batch: int = 1
 
 
-REFERENCE = Way()
+REFERENCE = Variant()
 
 
 @dataclass(frozen=True)
 class Plan:
-    """One application on one chip. `gpu_share`: the part of the network's products that the GPU does for the DSP."""
+    """One application on one chip. `runtime`: the unit of the network.
+
+    `gpu_share`: the part of the network's products that the GPU does when the rest runs on the DSP. Raises
+    BadInputError for a value outside its range.
+    """
 
     network: Network
     runtime: UnitName
-    way: Way = REFERENCE
+    variant: Variant = REFERENCE
     gpu_share: float = 0.0
 
     def __post_init__(self) -> None:
         if self.runtime not in RUNTIMES:
             raise BadInputError("runtime", repr(self.runtime), "gpu or dsp")
-        if self.way.policy not in POLICIES:
-            raise BadInputError("policy", repr(self.way.policy), "one of " + ", ".join(POLICIES))
-        if not 1 <= self.way.batch <= 64:
-            raise BadInputError("batch", str(self.way.batch), "1 to 64")
+        if self.variant.policy not in POLICIES:
+            raise BadInputError("policy", repr(self.variant.policy), "one of " + ", ".join(POLICIES))
+        if not 1 <= self.variant.batch <= 64:
+            raise BadInputError("batch", str(self.variant.batch), "1 to 64")
         if not 0 <= self.gpu_share < 1 or (self.gpu_share and self.runtime == "gpu"):
             raise BadInputError("gpu-share", f"{self.gpu_share:g} on {self.runtime}", "0 to below 1, on the dsp")
 
 
-def network_alone(profile: Profile, network: Network, runtime: UnitName, corners: Corners) -> JobTime:
-    """The network run continuously with nothing beside it, as a benchmark does."""
+def isolated_job_time(profile: Profile, network: Network, runtime: UnitName, corners: Corners) -> JobTime:
+    """Time of one frame's job when the network runs continuously and nothing else does, as in a benchmark.
+
+    `profile`: of the chip.
+    `network`: that runs.
+    `runtime`: the unit that runs it.
+    `corners`: of all units.
+    """
     return _job(profile, network.work, runtime, corners, contended=False)
 
 
 def _job(
     profile: Profile, work: Work, unit: UnitName, corners: Corners, *, contended: bool = True, batch: int = 1
 ) -> JobTime:
+    """Time of a job with the operators of `work`.
+
+    `profile`: of the chip.
+    `work`: of one frame.
+    `unit`: that does it.
+    `corners`: of all units.
+    `contended`: whether the rest of the application uses the memory too.
+    `batch`: frames of the job.
+    """
     clock = profile.units[unit].clock(corners[UNITS.index(unit)])
     return job_time(work, machine_of(profile.units[unit], profile.memory, clock, contended), batch)
 
 
 def stage_times_ms(profile: Profile, plan: Plan, corners: Corners) -> dict[tuple[str, UnitName], float]:
-    """(stage, unit) -> milliseconds for one job of each stage, in data-flow order. A job is `batch` frames."""
-    app, drawn_on, batch = profile.application, plan.network, plan.way.batch
+    """Milliseconds of one job of each (stage, unit), in data-flow order. A job has `plan.variant.batch` frames."""
+    app, network, batch = profile.application, plan.network, plan.variant.batch
     cpu, gpu = (profile.units[u].clock(corners[UNITS.index(u)]) for u in ("cpu", "gpu"))
-    passes = 1 if drawn_on.layout == "packed" else -(-drawn_on.channels // CHANNELS_PER_PASS)
-    moved = drawn_on.pixels * (PACKED_BYTES_PER_PIXEL if drawn_on.layout == "packed" else CHANNELS_PER_PASS * passes)
-    drawn = app.vertices.or_else(0) * app.raster_ns_per_vertex.or_else(0) * passes
-    drawn += drawn_on.pixels * app.raster_ns_per_pixel.or_else(0) * -(-drawn_on.channels // CHANNELS_PER_PASS)
-    raster = drawn / gpu + moved * app.readback_ns_per_byte.or_else(0)
+    passes = 1 if network.layout == "packed" else -(-network.channels // CHANNELS_PER_PASS)
+    moved_bytes = network.pixels * (
+        PACKED_BYTES_PER_PIXEL if network.layout == "packed" else CHANNELS_PER_PASS * passes
+    )
+    draw_ns = app.vertices.or_else(0) * app.raster_ns_per_vertex.or_else(0) * passes
+    draw_ns += network.pixels * app.raster_ns_per_pixel.or_else(0) * -(-network.channels // CHANNELS_PER_PASS)
+    raster_ns = draw_ns / gpu + moved_bytes * app.readback_ns_per_byte.or_else(0)
     times: dict[tuple[str, UnitName], float] = {
         ("pose", "cpu"): batch * app.pose_ms.or_else(0) / cpu,
-        ("raster", "gpu"): batch * raster / 1e6,
+        ("raster", "gpu"): batch * raster_ns / 1e6,
     }
     times |= _network_ms(profile, plan, corners)
     times["composite", "gpu"] = batch * app.composite_ms.or_else(0) / gpu
@@ -97,7 +121,7 @@ def stage_times_ms(profile: Profile, plan: Plan, corners: Corners) -> dict[tuple
 
 def _network_ms(profile: Profile, plan: Plan, corners: Corners) -> dict[tuple[str, UnitName], float]:
     handover = profile.application.handover_ms.or_else(0)
-    work, batch = plan.network.work, plan.way.batch
+    work, batch = plan.network.work, plan.variant.batch
     if not plan.gpu_share:
         job = _job(profile, work, plan.runtime, corners, batch=batch)
         return {("infer", plan.runtime): handover + job.total_ms}
@@ -109,11 +133,14 @@ def _network_ms(profile: Profile, plan: Plan, corners: Corners) -> dict[tuple[st
 
 
 def split_work(work: Work, share: float) -> tuple[Work, Work]:
-    """Cut after the first operators that do `share` of the products; what is alive there goes from one to the other."""
-    done, cut = 0, 0
+    """`work` in two parts, cut after the first operators that together have `share` of the products.
+
+    The elements that are live at the cut are the output of the first part and the input of the second.
+    """
+    macs, cut = 0, 0
     for cut, operator in enumerate(work.operators, 1):  # noqa: B007
-        done += operator.macs
-        if done >= share * work.macs:
+        macs += operator.macs
+        if macs >= share * work.macs:
             break
     crossing = work.operators[cut - 1].live
     head = Work(work.operators[:cut], work.input_elements, work.input_tensors, crossing)
@@ -122,7 +149,11 @@ def split_work(work: Work, share: float) -> tuple[Work, Work]:
 
 @dataclass(frozen=True)
 class Steady:
-    """The application once it has settled. Shares of time sum to 1 per unit."""
+    """The application once it has settled.
+
+    `capped`: whether it waits for the display. `unit_of`: unit of each stage. `stages_ms`: time of a job of each stage.
+    `busy`: share of the time in which each unit works; `idle`: shares of the rest by cause. They sum to 1 per unit.
+    """
 
     frame_ms: float
     latency_ms: float
@@ -134,19 +165,27 @@ class Steady:
 
 
 @lru_cache(maxsize=4096)
-def _settled(times: tuple[tuple[str, UnitName, int], ...], way: Way, display_ns: int, quick: bool) -> tuple[Any, bool]:
-    """Report of a run of `times`, and whether the display held it back."""
+def _settled(
+    times: tuple[tuple[str, UnitName, int], ...], variant: Variant, display_ns: int, quick: bool
+) -> tuple[Any, bool]:
+    """The report of a run, and whether the display limits its rate.
+
+    `times`: stage, unit and nanoseconds of a job.
+    `variant`: how the stages are joined.
+    `display_ns`: the shortest time between two shown jobs.
+    `quick`: whether to run only QUICK_FRAMES where that is enough.
+    """
     stages = tuple(StageSpec(name, unit) for name, unit, _ in times)
-    graph = Graph(stages, (way.edge,) * (len(stages) - 1), "composite")
+    graph = Graph(stages, (variant.edge,) * (len(stages) - 1), "composite")
     service = {name: ns for name, _, ns in times}
-    paced = POLICIES[way.policy].paced
-    regular = way.edge in ("single", "double") and not paced
+    paced = POLICIES[variant.policy].paced
+    regular = variant.edge in ("single", "double") and not paced
     frames = (QUICK_FRAMES if quick else FRAMES) if regular else FRAMES_WITH_DROPS
-    settings = Settings(frames, way.policy, period_ns=display_ns if paced else 0)
+    settings = Settings(frames, variant.policy, period_ns=display_ns if paced else 0)
     report = _run(graph, settings, service)
     if paced or report["frame_time_ms"]["mean"] * NS_PER_MS >= display_ns:
         return report, False
-    return _run(graph, Settings(frames, way.policy, period_ns=display_ns), service), True
+    return _run(graph, Settings(frames, variant.policy, period_ns=display_ns), service), True
 
 
 def _run(graph: Graph, settings: Settings, service: Mapping[str, int]) -> Any:
@@ -158,14 +197,17 @@ def _run(graph: Graph, settings: Settings, service: Mapping[str, int]) -> Any:
 
 
 def steady(profile: Profile, plan: Plan, corners: Corners, *, quick: bool = False) -> Steady:
-    """Frame time, latency and idleness with the units held at `corners`, by the scheduler in virtual time.
+    """Frame time, latency and shares of time, by the scheduler in virtual time.
 
-    `quick`: a short run, good for the frame time alone; the shares of time then count filling and draining.
+    `profile`: of the chip.
+    `plan`: what runs on it.
+    `corners`: at which the units stay.
+    `quick`: whether a short run will do. Its frame time is right; its shares of time include filling and draining.
     """
     times = stage_times_ms(profile, plan, corners)
     rounded = tuple((name, unit, round(ms * NS_PER_MS)) for (name, unit), ms in times.items())
-    batch, display = plan.way.batch, profile.application.display_ms.or_else(0)
-    report, capped = _settled(rounded, plan.way, round(batch * display * NS_PER_MS), quick)
+    batch, display = plan.variant.batch, profile.application.display_ms.or_else(0)
+    report, capped = _settled(rounded, plan.variant, round(batch * display * NS_PER_MS), quick)
     units = report["units"]
     frame = max(report["frame_time_ms"]["mean"], *times.values()) / batch
     return Steady(
@@ -180,9 +222,10 @@ def steady(profile: Profile, plan: Plan, corners: Corners, *, quick: bool = Fals
 
 
 def reference_frame_ms(profile: Profile, plan: Plan, corners: Corners) -> float:
-    """Mean frame time of `REFERENCE` in closed form, for fitting: one buffer makes its three stages follow each other.
+    """Mean frame time of the variant `REFERENCE` without a run of the scheduler, for fitting.
 
-    A test holds it against the scheduler in virtual time.
+    With one buffer between stages, raster, network and composite follow each other, so that their times add up. A test
+    compares the result with the scheduler in virtual time.
     """
     times = stage_times_ms(profile, plan, corners)
     chain = sum(ms for (name, _), ms in times.items() if name not in ("pose", "present"))
@@ -190,8 +233,11 @@ def reference_frame_ms(profile: Profile, plan: Plan, corners: Corners) -> float:
 
 
 def relative_error(job: JobTime, unit: Unit) -> float:
-    """Expected relative error of `job`: each part by the number that it rests on, and the model's own beside them."""
-    rests_on = {
+    """Expected relative error of the time of `job` on `unit`.
+
+    It joins the error of the number that each part of the time is computed from, and that of the model itself.
+    """
+    computed_from = {
         "fixed": unit.job_fixed_ms,
         "input": unit.input_ns_per_element,
         "weights": unit.efficiency.convolution_traffic,
@@ -199,7 +245,7 @@ def relative_error(job: JobTime, unit: Unit) -> float:
         "depthwise": unit.efficiency.depthwise_traffic,
         "pointwise": unit.efficiency.pointwise_traffic,
     }
-    rests_on |= {kind: getattr(unit.efficiency, kind) for kind in CLASSES if kind not in rests_on}
+    computed_from |= {kind: getattr(unit.efficiency, kind) for kind in CLASSES if kind not in computed_from}
     shares = {part: ms / job.total_ms for part, ms in job.parts.items()}
-    variance = sum((shares[part] * quantity.relative_error) ** 2 for part, quantity in rests_on.items())
+    variance = sum((shares[part] * quantity.relative_error) ** 2 for part, quantity in computed_from.items())
     return float((variance + unit.model_error_fraction.or_else(0.5) ** 2) ** 0.5)

@@ -1,4 +1,4 @@
-"""Tables of configurations as CSV: the columns of the measured file, `#` opens a comment line.
+"""Tables of network configurations as CSV, with or without measured times; lines that begin with `#` are comments.
 
 Rule: a bad cell is a `BadInputError` that names file, line and column.
 """
@@ -21,14 +21,14 @@ MAX_BYTES, MAX_ROWS = 32_000_000, 100_000
 
 @dataclass(frozen=True)
 class Row:
-    """`cells`: the row as text by column. `place`: file and line, for messages."""
+    """One configuration. `place`: its file and line, for messages. `cells`: its text by column."""
 
     place: str
     cells: dict[str, str]
     spec: NetworkSpec
 
     def number(self, column: str) -> float | None:
-        """A measured value above zero; None where the cell is blank or the column absent."""
+        """The measured value, above 0; None where the cell is blank or the column absent. Raises BadInputError."""
         text = self.cells.get(column, "")
         if not text:
             return None
@@ -38,7 +38,7 @@ class Row:
         return value
 
     def range(self, column: str) -> tuple[float, float] | None:
-        """What `column`_min and `column`_max say; None when one of them is blank. Raises BadInputError."""
+        """The values of `column`_min and `column`_max; None when one of them is blank. Raises BadInputError."""
         low, high = self.number(f"{column}_min"), self.number(f"{column}_max")
         if low is None or high is None:
             return None
@@ -48,7 +48,7 @@ class Row:
 
 
 def read_table(path: Path) -> list[Row]:
-    """The rows of `path`. Raises BadInputError."""
+    """The rows of `path`. Raises BadInputError when it is unreadable or too large, or lacks a column of KEYS."""
     try:
         if path.stat().st_size > MAX_BYTES:
             raise BadInputError(path, f"{path.stat().st_size} bytes", f"at most {MAX_BYTES}")
@@ -63,8 +63,8 @@ def read_table(path: Path) -> list[Row]:
     if len(lines) > MAX_ROWS:
         raise BadInputError(path, f"{len(lines)} rows", f"at most {MAX_ROWS}")
     header = [cell.strip() for cell in next(csv.reader([lines[0][1]]))]
-    if twice := [key for key in dict.fromkeys(header) if header.count(key) > 1]:
-        raise BadInputError(f"{path}: line {lines[0][0]}", f"column {twice[0]!r} twice", "every column once")
+    if repeated := [key for key in dict.fromkeys(header) if header.count(key) > 1]:
+        raise BadInputError(f"{path}: line {lines[0][0]}", f"column {repeated[0]!r} twice", "every column once")
     missing = [key for key in KEYS if key not in header]
     if missing:
         raise BadInputError(f"{path}: line {lines[0][0]}", f"no column {', '.join(missing)}", ", ".join(KEYS))

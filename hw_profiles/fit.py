@@ -1,9 +1,9 @@
 """Fits a profile's efficiencies to measured rows.
 
-Rule: fewer free numbers than measurements, each with a physical meaning and a prior; the prior of a number is the
-value and the `spread` that the profile to be fitted states for it. Minimised is the sum of squares of
-log(predicted / measured) / noise and of log(number / prior) / spread: the most probable numbers if both are normal.
-The networks are fitted first, each unit alone, then the application on top of them.
+Rule: there are fewer free numbers than measurements, and each has a physical meaning and a prior: the value and the
+`spread` that the profile states before the fit. The fit minimises the sum of squares of log(predicted / measured) /
+noise and of log(number / prior) / spread, which gives the most probable numbers if both are normally distributed. The
+network's numbers are fitted first, for each unit by itself, then those of the application.
 """
 
 from __future__ import annotations
@@ -20,88 +20,22 @@ import numpy as np
 
 from trilane.arrays import F64
 from trilane.errors import BadInputError, MissingPartError
-from trilane.hw_profiles.application import Plan, network_alone, reference_frame_ms
+from trilane.hw_profiles.application import Plan, isolated_job_time, reference_frame_ms
 from trilane.hw_profiles.configuration_table import Row, read_table
+from trilane.hw_profiles.fit_steps import STEPS, UNIT_OF_COLUMN, Keys, Step
 from trilane.hw_profiles.load import load_tables, parse_profile
 from trilane.hw_profiles.performance_profiles import corners_of
 from trilane.hw_profiles.reference_networks import reference_network
 from trilane.hw_profiles.schema import Profile
-from trilane.units import SUSTAINED, UnitName
+from trilane.units import SUSTAINED
 
 MEASURED_UNDER = SUSTAINED
 NORMAL_OVER_MEDIAN = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 
-Keys = tuple[str, ...]
-
-
-class Step(NamedTuple):
-    """One stage of the fit. `free`: groups of keys that move together. `noise`: relative error of a measurement."""
-
-    name: str
-    columns: tuple[str, ...]
-    free: tuple[Keys, ...]
-    noise: float
-
-
-def _efficiency(unit: str, *names: str) -> Keys:
-    return tuple(f"units.{unit}.efficiency.{name}" for name in names)
-
-
-STEPS = (
-    Step(
-        "network on the DSP",
-        ("bench_dsp_ms",),
-        (
-            _efficiency("dsp", "convolution", "pointwise"),
-            _efficiency(
-                "dsp",
-                "convolution_traffic",
-                "depthwise_traffic",
-                "pointwise_traffic",
-                "normalisation",
-                "resize",
-                "elementwise",
-            ),
-            _efficiency("dsp", "permute"),
-            ("units.dsp.input_ns_per_element",),
-            ("units.dsp.permute_fixed_ms",),
-            ("units.dsp.fallback_ns_per_element",),
-        ),
-        0.04,
-    ),
-    Step(
-        "network on the GPU",
-        ("bench_gpu_ms",),
-        (
-            _efficiency("gpu", "convolution", "pointwise"),
-            _efficiency("gpu", "depthwise_traffic", "pointwise_traffic"),
-            _efficiency("gpu", "normalisation"),
-            _efficiency("gpu", "permute"),
-            ("units.gpu.input_ns_per_element",),
-            ("units.gpu.permute_fixed_ms",),
-        ),
-        0.12,
-    ),
-    Step(
-        "application",
-        ("app_dsp_ms", "app_gpu_ms"),
-        (
-            ("application.readback_ns_per_byte",),
-            ("application.handover_ms",),
-            ("memory.application_use_fraction",),
-        ),
-        0.1,
-    ),
-)
-UNIT_OF_COLUMN: dict[str, UnitName] = {
-    "bench_dsp_ms": "dsp",
-    "bench_gpu_ms": "gpu",
-    "app_dsp_ms": "dsp",
-    "app_gpu_ms": "gpu",
-}
-
 
 class Measurement(NamedTuple):
+    """One cell of the table: its row, its column, and its value in milliseconds."""
+
     row: Row
     column: str
     ms: float
@@ -109,7 +43,7 @@ class Measurement(NamedTuple):
 
 @dataclass(frozen=True)
 class Residual:
-    """One measurement beside the fit; `left_out_ms` is predicted by a fit that did not see it."""
+    """One measurement beside the fit. `left_out_ms`: predicted by a fit to all other measurements of the step."""
 
     step: str
     row: Row
@@ -120,16 +54,22 @@ class Residual:
 
     @property
     def error(self) -> float:
+        """Relative error of the fit."""
         return self.fitted_ms / self.measured_ms - 1
 
     @property
     def left_out_error(self) -> float:
+        """Relative error of the fit to all other measurements."""
         return self.left_out_ms / self.measured_ms - 1
 
 
 @dataclass(frozen=True)
 class Fit:
-    """`numbers`: value and relative spread by key. `data`: the tables of the fitted profile."""
+    """The result of a fit.
+
+    `data`: the tables of the fitted profile. `numbers`: value and relative spread of each fitted key. `free_count`: how
+    many numbers were free.
+    """
 
     data: Mapping[str, Any]
     numbers: Mapping[str, tuple[float, float]]
@@ -142,13 +82,14 @@ class Fit:
         return tuple(dict.fromkeys(r.column for r in self.residuals))
 
     def median_error(self, column: str, *, left_out: bool = False) -> float:
+        """Median absolute relative error of `column`; `left_out`: of the fits that did not see the measurement."""
         errors = [abs(r.left_out_error if left_out else r.error) for r in self.residuals if r.column == column]
         return median(errors) if errors else 0.0
 
 
 def measurements(rows: Sequence[Row], step: Step) -> list[Measurement]:
-    """What `rows` measured of `step`. An application's figure is the middle of its range."""
-    found = []
+    """The measurements of `step` in `rows`. That of an application is the middle of its range."""
+    result = []
     for row in rows:
         for column in step.columns:
             if column.startswith("bench"):
@@ -157,16 +98,16 @@ def measurements(rows: Sequence[Row], step: Step) -> list[Measurement]:
                 ends = row.range(column)
                 value = sum(ends) / 2 if ends else None
             if value is not None:
-                found.append(Measurement(row, column, value))
-    return found
+                result.append(Measurement(row, column, value))
+    return result
 
 
 def predicted_ms(profile: Profile, measured: Measurement) -> float:
-    """What `profile` says for `measured`, under the performance profile of the measurements."""
+    """Milliseconds that `profile` predicts for `measured`, under the performance profile MEASURED_UNDER."""
     corners, unit = corners_of(profile, MEASURED_UNDER), UNIT_OF_COLUMN[measured.column]
     network = reference_network(measured.row.spec)
     if measured.column.startswith("bench"):
-        return network_alone(profile, network, unit, corners).total_ms
+        return isolated_job_time(profile, network, unit, corners).total_ms
     return reference_frame_ms(profile, Plan(network, unit), corners)
 
 
@@ -178,7 +119,7 @@ def fit_profile(name: str | Path, table: Path) -> Fit:
 
 
 def fit(data: Mapping[str, Any], path: Path, rows: Sequence[Row]) -> Fit:
-    """Fit the profile of the tables `data` (of `path`) to `rows`.
+    """Fit the profile of the tables `data`, which are those of the file `path`, to `rows`.
 
     Raises BadInputError when there are no more measurements than free numbers, MissingPartError without SciPy.
     """
@@ -186,20 +127,20 @@ def fit(data: Mapping[str, Any], path: Path, rows: Sequence[Row]) -> Fit:
     numbers: dict[str, tuple[float, float]] = {}
     residuals: list[Residual] = []
     for step in STEPS:
-        found = measurements(rows, step)
-        if len(found) <= len(step.free):
+        measured = measurements(rows, step)
+        if len(measured) <= len(step.free):
             expected = f"more than the {len(step.free)} free numbers of the {step.name}"
-            raise BadInputError(path, f"{len(found)} measurements", expected)
+            raise BadInputError(path, f"{len(measured)} measurements", expected)
         start = fitted
-        values, spreads = _solve(start, path, step, found)
+        values, spreads = _solve(start, path, step, measured)
         fitted = with_factors(start, step.free, values)
         profile = parse_profile(fitted, path)
-        for index, one in enumerate(found):
-            others = found[:index] + found[index + 1 :]
+        for index, measurement in enumerate(measured):
+            others = measured[:index] + measured[index + 1 :]
             without = parse_profile(with_factors(start, step.free, _solve(start, path, step, others)[0]), path)
-            residuals.append(
-                Residual(step.name, one.row, one.column, one.ms, predicted_ms(profile, one), predicted_ms(without, one))
-            )
+            row, column, ms = measurement
+            fitted_ms, left_out_ms = predicted_ms(profile, measurement), predicted_ms(without, measurement)
+            residuals.append(Residual(step.name, row, column, ms, fitted_ms, left_out_ms))
         for keys, spread in zip(step.free, spreads, strict=True):
             numbers |= {key: (_at(fitted, key)["value"], float(spread)) for key in keys}
     numbers |= _from_residuals(residuals, rows)
@@ -207,24 +148,30 @@ def fit(data: Mapping[str, Any], path: Path, rows: Sequence[Row]) -> Fit:
 
 
 def _from_residuals(residuals: Sequence[Residual], rows: Sequence[Row]) -> dict[str, tuple[float, float]]:
-    """The model's own error from what it says of rows left out, and the spread of frame times from their ranges."""
+    """The model's own error, from its errors on measurements left out; the spread of frame times, from their ranges."""
     numbers = {}
     for unit in ("dsp", "gpu"):
         errors = [abs(r.left_out_error) for r in residuals if r.column == f"bench_{unit}_ms"]
         numbers[f"units.{unit}.model_error_fraction"] = (NORMAL_OVER_MEDIAN * median(errors), 0.5)
-    found = [row.range(column) for row in rows for column in ("app_dsp_ms", "app_gpu_ms")]
-    ranges = [(ends[1] - ends[0]) / sum(ends) for ends in found if ends]
+    measured_ranges = [row.range(column) for row in rows for column in ("app_dsp_ms", "app_gpu_ms")]
+    ranges = [(ends[1] - ends[0]) / sum(ends) for ends in measured_ranges if ends]
     numbers["application.ema20_half_range_fraction"] = (median(ranges), 1.0)
     return numbers
 
 
-def _solve(data: Mapping[str, Any], path: Path, step: Step, found: Sequence[Measurement]) -> tuple[F64, F64]:
-    """Factors on the priors of `step.free`, and the spread of each that is left after the fit."""
+def _solve(data: Mapping[str, Any], path: Path, step: Step, measured: Sequence[Measurement]) -> tuple[F64, F64]:
+    """Factors on the priors of `step.free`, and the spread of each after the fit.
+
+    `data`: tables of the profile with the priors.
+    `path`: of its file, for messages.
+    `step`: of the fit.
+    `measured`: what it is fitted to.
+    """
     priors = np.array([_at(data, keys[0]).get("spread", 0.5) for keys in step.free])
 
     def residuals(x: F64) -> F64:
         profile = parse_profile(with_factors(data, step.free, np.exp(x * priors)), path)
-        errors = [np.log(predicted_ms(profile, one) / one.ms) / step.noise for one in found]
+        errors = [np.log(predicted_ms(profile, each) / each.ms) / step.noise for each in measured]
         return np.concatenate([errors, x])
 
     solution = _least_squares()(residuals, np.zeros(len(priors)))
@@ -255,12 +202,19 @@ def _at(data: Mapping[str, Any], key: str) -> dict[str, Any]:
     table: Any = data
     for part in key.split("."):
         table = table[part]
-    found: dict[str, Any] = table
-    return found
+    quantity: dict[str, Any] = table
+    return quantity
 
 
 def as_toml(result: Fit, name: str, title: str, extends: str, command: str) -> str:
-    """The fitted profile as a TOML file that lays the fitted numbers over `extends`."""
+    """The text of a TOML file with the fitted numbers.
+
+    `result`: of the fit.
+    `name`: of the new profile.
+    `title`: of the new profile.
+    `extends`: name of the profile that has all other numbers.
+    `command`: that made the file; it becomes the source of every number.
+    """
     lines = [
         f"# Written by `{command}`: {result.free_count} numbers from {len(result.residuals)} measurements.",
         "# `spread` is what the fit leaves open, as the standard deviation of the logarithm.",

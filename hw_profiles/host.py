@@ -1,6 +1,7 @@
-"""This machine as three units. Rule: cores are shared only when there are too few, and then `spin` is off.
+"""This machine as three units: which cores each has. Rule: units share cores only when there are too few.
 
-Cores are those that this process may use; a quota of the control group lowers their number.
+The cores are those that this process may use; a quota of the control group lowers their number. The threads of a unit
+spin between jobs only when no other unit shares its cores.
 """
 
 from __future__ import annotations
@@ -18,14 +19,14 @@ CGROUP = Path("/sys/fs/cgroup")
 
 
 def usable_cores() -> tuple[int, ...]:
-    """Core numbers, ascending: the affinity mask, cut to what the control group's quota pays for (at least one)."""
+    """Numbers of the cores in the affinity mask, ascending, at most as many as the control group's quota allows."""
     cores = sorted(os.sched_getaffinity(0))
     quota = cgroup_quota()
     return tuple(cores if quota is None else cores[: max(1, math.ceil(quota))])
 
 
 def cgroup_quota(root: Path = CGROUP) -> float | None:
-    """CPUs' worth of time that the control group allows; None when it does not limit them."""
+    """How many CPUs' time the control group allows; None when it sets no limit. `root`: where its files are."""
     try:
         limit, period = (root / "cpu.max").read_text().split()
     except (OSError, ValueError):
@@ -44,7 +45,7 @@ def cgroup_quota(root: Path = CGROUP) -> float | None:
 def split_cores(cores: tuple[int, ...]) -> dict[str, tuple[int, ...]]:
     """Cores of each unit: one for the CPU (and the scheduler), one for the GPU, the rest for the DSP.
 
-    From eight cores on the GPU has a quarter. With two cores CPU and GPU share one; with one all share it.
+    With eight cores or more, the GPU has a quarter of them. With two, CPU and GPU share one; with one, all share it.
     """
     if len(cores) == 1:
         return {"cpu": cores, "gpu": cores, "dsp": cores}
@@ -55,17 +56,19 @@ def split_cores(cores: tuple[int, ...]) -> dict[str, tuple[int, ...]]:
 
 
 def host_units(cores: tuple[int, ...] | None = None) -> dict[str, UnitSettings]:
-    """Settings of the three units on this machine, or on the given cores of it."""
+    """Settings of the three units on `cores` of this machine, None for all usable ones."""
     split = split_cores(cores or usable_cores())
-    return {unit: UnitSettings(cores=own, threads=len(own), spin=_alone(unit, split)) for unit, own in split.items()}
+    return {
+        unit: UnitSettings(cores=own, threads=len(own), spin=_has_own_cores(unit, split)) for unit, own in split.items()
+    }
 
 
-def _alone(unit: str, split: dict[str, tuple[int, ...]]) -> bool:
+def _has_own_cores(unit: str, split: dict[str, tuple[int, ...]]) -> bool:
     return all(not set(split[unit]) & set(cores) for other, cores in split.items() if other != unit)
 
 
 def sensor_c() -> float | None:
-    """Degrees Celsius of the hottest sensor, where the system shows any."""
-    read: dict[str, list[Any]] = getattr(psutil, "sensors_temperatures", dict)()
-    values = [sensor.current for sensors in read.values() for sensor in sensors]
+    """Temperature of the hottest sensor in degrees Celsius; None on a system that shows none."""
+    by_chip: dict[str, list[Any]] = getattr(psutil, "sensors_temperatures", dict)()
+    values = [sensor.current for sensors in by_chip.values() for sensor in sensors]
     return max(values) if values else None

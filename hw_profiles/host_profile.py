@@ -1,7 +1,7 @@
-"""The `host` profile: this machine, as far as the operating system tells.
+"""The numbers of the profile `host` that depend on this machine: peak rates of each unit and speeds of the runtimes.
 
-Rule: nothing is measured here, so every number says what it was worked out from, or on which other machine it was seen;
-the units share the machine's cores as they do in a run.
+Rule: nothing is measured here. Every number says in its `source` what it was computed from, or on which other machine
+it was measured. The units have as many cores as in a run.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import psutil
 from trilane.hw_profiles.host import usable_cores
 
 CPU_INFO = Path("/proc/cpuinfo")
-#: CPU flag: INT8 and FP32 multiply-accumulates per cycle and core; the first that the machine has counts.
+#: CPU flag -> INT8 and FP32 multiply-accumulates per cycle and core. The first flag that the machine has is used.
 RATES = {
     "avx512_vnni": (128, 32),
     "avx_vnni": (64, 16),
@@ -25,7 +25,7 @@ RATES = {
 FALLBACK_GHZ = 2.5
 ZEN_5 = "ResNet18 of width 64 at 512x512 on four Zen 5 cores"
 ZEN_3 = "ResNet18 of width 64 at 512x512 on four Zen 3 cores, docs/networks.md"
-#: CPU flag as above: how many times faster than ONNX Runtime in FP32 a runtime is, and where that was seen.
+#: CPU flag -> how many times faster each runtime is than ONNX Runtime in FP32, kind of these numbers, their source.
 RUNTIMES: dict[str, tuple[dict[str, float], str, str]] = {
     "avx512_vnni": ({"openvino": 3.7, "ort": 2.2}, "measured", ZEN_5),
     "avx_vnni": ({"openvino": 3.7, "ort": 2.2}, "assumed", f"like {ZEN_5}"),
@@ -36,7 +36,7 @@ RUNTIMES: dict[str, tuple[dict[str, float], str, str]] = {
 
 
 def host_tables() -> dict[str, Any]:
-    """What is laid over the file `host.toml`: peak rates of each unit."""
+    """Tables that are laid over those of `host.toml`: title, peak rates of the units, speeds of the runtimes."""
     cores = len(usable_cores())
     frequency = psutil.cpu_freq()
     ghz = (frequency.max or frequency.current) / 1e3 if frequency else 0.0

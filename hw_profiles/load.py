@@ -1,6 +1,7 @@
-"""Reads hardware profiles: TOML, `extends`, checks.
+"""Reads hardware profiles: TOML files that may extend each other, checked against the schema.
 
-Rule: whatever is wrong with a file is a `BadInputError` that names the file, the key, what was found and expected.
+Rule: every defect of a file becomes a `BadInputError` that names the file, the key, what was found and what was
+expected.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from trilane.unexpected import unexpected_in
 HOST = "host"
 MAX_BYTES = 1_000_000
 MAX_DEPTH = 8
-#: Quantities are replaced whole by an extending profile: half of one number and half of another mean nothing.
+#: Keys of a quantity. An extending profile replaces a quantity as a whole, never its value or its source alone.
 WHOLE = frozenset(["value", "kind", "source"])
 UNIT_HINT = "units of measure end the name"
 
@@ -33,14 +34,14 @@ def profile_folder() -> Path:
 
 
 def profile_names() -> list[str]:
-    """Names that `load_profile` knows, templates included."""
+    """The names of the profiles that come with Trilane, templates included."""
     return sorted(path.stem for path in profile_folder().glob("*.toml"))
 
 
 def load_profile(name: str | Path) -> Profile:
     """The profile `name`: one that comes with Trilane, or a path to a TOML file.
 
-    Raises BadInputError when it is not there or says something wrong.
+    Raises BadInputError when there is none or something in it is wrong.
     """
     path = _find(str(name), Path())
     data = merged_tables(path)
@@ -50,7 +51,7 @@ def load_profile(name: str | Path) -> Profile:
 
 
 def load_runnable(name: str | Path) -> Profile:
-    """The profile `name`, which is to be a chip and no template. Raises BadInputError."""
+    """The profile `name`. Raises BadInputError as `load_profile`, and for a template, which describes no chip."""
     profile = load_profile(name)
     if profile.template:
         chips = [other for other in profile_names() if not load_profile(other).template]
@@ -59,13 +60,13 @@ def load_runnable(name: str | Path) -> Profile:
 
 
 def load_tables(name: str | Path) -> tuple[dict[str, Any], Path]:
-    """The merged tables of the profile `name`, unchecked, and its path. Raises BadInputError."""
+    """The merged tables of the profile `name`, before the schema is checked, and its path. Raises BadInputError."""
     path = _find(str(name), Path())
     return merged_tables(path), path
 
 
 def parse_profile(data: Mapping[str, Any], path: Path) -> Profile:
-    """Check `data`, the tables of a profile; `path` is named in errors. Raises BadInputError."""
+    """The profile of the tables `data`; `path` is named in errors. Raises BadInputError for any defect."""
     try:
         return Profile.model_validate(data)
     except ValidationError as error:
@@ -73,7 +74,10 @@ def parse_profile(data: Mapping[str, Any], path: Path) -> Profile:
 
 
 def merged_tables(path: Path, seen: tuple[Path, ...] = ()) -> dict[str, Any]:
-    """The tables of `path` laid over those it extends. Raises BadInputError for a cycle or an unreadable file."""
+    """The tables of `path` laid over those of the profile that it extends; `seen`: files that extend this one.
+
+    Raises BadInputError for a cycle or an unreadable file.
+    """
     path = path.resolve()
     if path in seen:
         chain = " -> ".join(p.name for p in (*seen[seen.index(path) :], path))
@@ -163,7 +167,7 @@ def _short(value: Any) -> str:
 
 
 def _siblings(keys: Sequence[str]) -> Iterator[str]:
-    """The keys that the schema knows where the last of `keys` stands."""
+    """The keys that the schema allows in the table that the last of `keys` is in."""
     model: Any = Profile
     for key in keys[:-1]:
         fields = getattr(model, "model_fields", {})

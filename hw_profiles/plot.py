@@ -1,6 +1,6 @@
-"""Frame rate and temperature over minutes as one picture, for several performance profiles.
+"""A picture of frame rate and temperature over minutes, for several performance profiles.
 
-Rule: draws what it is given; Matplotlib is an extra and is asked for by name where it is missing.
+Rule: nothing is computed here. Matplotlib is an optional dependency; where it is missing, the error names it.
 """
 
 from __future__ import annotations
@@ -9,14 +9,21 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from trilane.errors import BadInputError, MissingPartError
-from trilane.hw_profiles.predict import Moment
+from trilane.hw_profiles.over_time import Moment
 from trilane.writing import write_atomically
 
 SUFFIXES = (".png", ".svg", ".pdf")
 
 
 def plot_over_time(runs: Mapping[str, Sequence[Moment]], limit_c: float, title: str, path: Path) -> None:
-    """Draw `runs` (label to moments) into `path`; `limit_c` is marked. Raises MissingPartError, BadInputError."""
+    """Draw frame rates and temperatures into a file.
+
+    `runs`: label of each curve -> its moments.
+    `limit_c`: temperature that is marked.
+    `title`: of the picture.
+    `path`: of the file; its ending is one of SUFFIXES.
+    Raises MissingPartError without Matplotlib, BadInputError for another ending or a file that cannot be written.
+    """
     if path.suffix not in SUFFIXES:
         raise BadInputError(path, f"the ending {path.suffix!r}", "one of " + ", ".join(SUFFIXES))
     try:
@@ -24,18 +31,20 @@ def plot_over_time(runs: Mapping[str, Sequence[Moment]], limit_c: float, title: 
     except ImportError:
         raise MissingPartError("drawing needs Matplotlib", extra="plot") from None
     figure = Figure(figsize=(8, 6), layout="constrained")
-    rate, heat = figure.subplots(2, 1, sharex=True)
+    rate, temperature = figure.subplots(2, 1, sharex=True)
     for label, moments in runs.items():
         minutes = [m.t_s / 60 for m in moments]
         (line,) = rate.plot(minutes, [1e3 / m.frame_ms for m in moments], label=label)
         colour = line.get_color()
-        heat.plot(minutes, [m.device_c for m in moments], color=colour, label=f"{label}: device")
-        heat.plot(minutes, [m.junction_c for m in moments], color=colour, linestyle=":", label=f"{label}: junction")
-    heat.axhline(limit_c, color="black", linewidth=0.8, linestyle="--", label=f"device limit {limit_c:g} °C")
+        temperature.plot(minutes, [m.device_c for m in moments], color=colour, label=f"{label}: device")
+        temperature.plot(
+            minutes, [m.junction_c for m in moments], color=colour, linestyle=":", label=f"{label}: junction"
+        )
+    temperature.axhline(limit_c, color="black", linewidth=0.8, linestyle="--", label=f"device limit {limit_c:g} °C")
     rate.set(ylabel="frames per second", title=title)
     rate.set_ylim(0, 1.15 * rate.get_ylim()[1])
-    heat.set(xlabel="minutes (virtual clock)", ylabel="temperature, °C")
-    for axes in (rate, heat):
+    temperature.set(xlabel="minutes (virtual clock)", ylabel="temperature, °C")
+    for axes in (rate, temperature):
         axes.grid(alpha=0.3)
         axes.legend(loc="lower right", fontsize="small")
     with write_atomically(path) as draft:

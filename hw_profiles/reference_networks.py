@@ -78,7 +78,7 @@ def _network_input(b: GraphBuilder, spec: NetworkSpec) -> TensorRef:
 
 
 def _decoder(b: GraphBuilder, features: list[TensorRef]) -> TensorRef:
-    """Full-size features from those of the encoder, each joined on the way up where its size comes."""
+    """Features at full size: those of the encoder from the smallest up, each joined with those of its own size."""
     x, skips = features[-1], [*reversed(features[:-1]), None]
     for width, skip in zip(DECODER, skips, strict=True):
         x = b.upsampled(x)

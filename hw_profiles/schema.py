@@ -1,7 +1,7 @@
-"""What a hardware profile may say: units, speeds, powers and limits, each number with its source.
+"""The schema of a hardware profile: units, speeds, powers and limits, each number with its source.
 
-Rule: every number is a `Quantity`, so that nothing is believed without saying where it is from; the unit of
-measure is the end of the key's name. Only shapes and ranges are checked here.
+Rule: every number is a `Quantity`, which states where the number is from; the unit of measure ends the key's name.
+Only shapes and ranges are checked here.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ BYTES = {"int8": 1, "fp16": 2, "fp32": 4}
 
 
 class Model(BaseModel):
-    """Strict base: unknown keys are errors, values never change."""
+    """Base of all tables: unknown keys are errors, and values never change after loading."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class Quantity(Model):
-    """A number and where it is from. `kind = "unknown"` has no value.
+    """A number, its kind and where it is from. One of kind `unknown` has no value.
 
-    `spread`: relative error, as the standard deviation of the number's logarithm.
+    `spread`: its relative error, as the standard deviation of its logarithm; None for the usual one of its kind.
     """
 
     value: float | None = Field(default=None, allow_inf_nan=False, strict=True)
@@ -47,14 +47,16 @@ class Quantity(Model):
 
     @property
     def relative_error(self) -> float:
+        """`spread`, or the usual one of the kind of number."""
         return SPREAD_OF_KIND[self.kind] if self.spread is None else self.spread
 
     def or_else(self, default: float) -> float:
+        """The value, or `default` when it is unknown."""
         return default if self.value is None else self.value
 
 
 class _Range:
-    """Validator of a quantity's value. Raises UnexpectedValue."""
+    """Validator of a quantity's value, from `low` to `high`. Raises UnexpectedValue for any other."""
 
     def __init__(self, low: float, high: float) -> None:
         self.low, self.high = low, high
@@ -77,7 +79,10 @@ Count = Annotated[Quantity, AfterValidator(_Range(1, 1e6))]
 
 
 class Memory(Model):
-    """`bandwidth_gb_s` of the whole chip. `application_use_fraction`: what camera, display and composition take."""
+    """The memory that the units share. `bandwidth_gb_s`: of the whole chip.
+
+    `application_use_fraction`: share of it that camera, display and composition take.
+    """
 
     bandwidth_gb_s: Rate
     application_use_fraction: Annotated[Quantity, AfterValidator(_Range(0, 0.95))]
@@ -109,8 +114,8 @@ class Unit(Model):
     an operator, `input_ns_per_element` for each element of the network's input, `permute_fixed_ms` where the input
     comes in several tensors. `corners`: clock at each voltage corner as a fraction of the highest. While a job runs
     the unit takes `power_max_w` times the clock fraction to the power of `power_exponent`, and `idle_w` otherwise.
-    `model_error_fraction`: what the roofline itself is off by, beside what its numbers are. `runtimes`: how many times
-    faster than ONNX Runtime in FP32 each of them runs an INT8 network; of the host's DSP unit alone.
+    `model_error_fraction`: relative error of the roofline itself, apart from that of its numbers. `runtimes`: how many
+    times faster than ONNX Runtime in FP32 each runtime runs an INT8 network; only the host's DSP unit has them.
     """
 
     title: str
@@ -144,20 +149,23 @@ class Unit(Model):
         return self
 
     def clock(self, corner: Corner) -> float:
+        """The clock at `corner` as a fraction of the highest."""
         return self.corners[corner].or_else(1.0)
 
     def power_w(self, corner: Corner, busy: float) -> float:
-        """Mean power in watts while a share `busy` of the time is work."""
+        """Mean power in watts at `corner` when the unit works for a share `busy` of the time."""
         active: float = self.power_max_w.or_else(1.0) * self.clock(corner) ** self.power_exponent.or_else(3.0)
         return busy * active + (1 - busy) * self.idle_w.or_else(0.0)
 
     @property
     def peak_mac_s(self) -> float:
+        """Highest multiply-accumulates per second at the unit's precision."""
         peak: Quantity = getattr(self, f"peak_{self.precision}_tmac_s")
         return peak.or_else(0.1) * 1e12
 
     @property
     def element_bytes(self) -> int:
+        """Bytes of one element at the unit's precision."""
         return BYTES[self.precision]
 
 
@@ -183,7 +191,7 @@ class Application(Model):
 
 
 class PerformanceSettings(Model):
-    """The corner of each unit and how soon a quiet unit may sleep."""
+    """A performance profile: the corner of each unit, and how soon an idle unit may sleep."""
 
     cpu: Corner
     gpu: Corner
@@ -191,14 +199,15 @@ class PerformanceSettings(Model):
     sleep_latency_us: Cost
 
     def corner(self, unit: UnitName) -> Corner:
+        """The corner of `unit`."""
         corner: Corner = getattr(self, unit)
         return corner
 
 
 class Thermal(Model):
-    """The device as a slow thermal mass over which each unit's junction sits, and what it does at its limits.
+    """The device as a slow thermal mass under the junction of each unit, its limits, and the governor that keeps them.
 
-    `step_wise` and `power_allocator` name the governors of the Linux thermal framework.
+    `governor`: of the Linux thermal framework. `poll_s`: how often it looks.
     """
 
     ambient_c: Celsius
@@ -213,7 +222,7 @@ class Thermal(Model):
 
 
 class Profile(Model):
-    """A chip in a device. `template`: only there to be extended."""
+    """A chip in a device. `template`: whether it describes no chip and is only there to be extended."""
 
     name: str = Field(min_length=1)
     title: str
@@ -226,11 +235,11 @@ class Profile(Model):
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
-        for what, names, found in (
+        for what, names, stated in (
             ("unit", UNITS, self.units),
             ("performance profile", PERFORMANCE_PROFILES, self.performance_profiles),
         ):
-            missing = [name for name in names if name not in found]
+            missing = [name for name in names if name not in stated]
             if missing:
                 raise UnexpectedValue(f"no {what} {', '.join(missing)}", f"all of {', '.join(names)}")
         if (self.thermal.skin_limit_c.value or 0) <= (self.thermal.ambient_c.value or 0):

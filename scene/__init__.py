@@ -1,1 +1,3 @@
-"""What is shown and what it needs: scene files, motion, camera, planner."""
+"""What is shown: scene files, motions and cameras, and how they are put together in one place.
+Uses `body` and the modules beside the package's folders (`trilane.errors`, `trilane.files` and their like).
+"""

@@ -1,7 +1,7 @@
-"""A scene with everything in its place: movers on the floor and a camera that films them.
+"""A scene with everything in its place: the motions on the floor, and a camera that films them.
 
-Rule: the one way from a scene and its bodies to what is sampled per frame; the command line and the pose stage both
-take it, so that what is said is what is done.
+Rule: this is the only way from a scene and its bodies to what is sampled per frame, so that what the command line
+reports of a scene is what the pose stage does.
 """
 
 from __future__ import annotations
@@ -12,15 +12,16 @@ from pathlib import Path
 
 from trilane.body.body import ShapedBody
 from trilane.scene.camera.load import load_camera
-from trilane.scene.camera_placement import PlacedCamera, place_camera
+from trilane.scene.camera_placement import place_camera
 from trilane.scene.motion.load import load_motion
 from trilane.scene.mover import Mover, make_mover
+from trilane.scene.placed_camera import PlacedCamera
 from trilane.scene.schema import Scene
 
 
 @dataclass(frozen=True)
 class Staged:
-    """`movers`: one for each avatar of the scene. `notes`: of the motions, of the floor, of the camera."""
+    """`movers`: one per avatar of the scene. `notes`: what was decided about motions, floor and camera, for people."""
 
     movers: tuple[Mover, ...]
     camera: PlacedCamera

@@ -15,7 +15,7 @@ from trilane.errors import BadInputError
 from trilane.units import BURST, SUSTAINED
 
 if TYPE_CHECKING:
-    from trilane.hw_profiles.application import Plan, Way
+    from trilane.hw_profiles.application import Plan, Variant
     from trilane.hw_profiles.network_work import Network
     from trilane.hw_profiles.schema import Profile
 
@@ -122,11 +122,11 @@ def _refuse_ignored(ctx: typer.Context) -> None:
             raise BadInputError("options", f"{names} beside --{option}", "one or the other", WHY_IGNORED[option])
 
 
-def _way(policy: str, edge: str | None, batch: int) -> Way:
-    from trilane.hw_profiles.application import REFERENCE, Way
+def _way(policy: str, edge: str | None, batch: int) -> Variant:
+    from trilane.hw_profiles.application import REFERENCE, Variant
 
     if policy != "reference":
-        return Way(policy, edge or "double", batch)
+        return Variant(policy, edge or "double", batch)
     if edge not in (None, REFERENCE.edge):
         remedy = "choose a --policy of your own, such as pipelined"
         raise BadInputError("--edge", repr(edge), f"{REFERENCE.edge}, which the reference application has", remedy)
@@ -163,7 +163,7 @@ def _unit(runtime: str) -> Any:
     return runtime
 
 
-def _predict_table(chip: Profile, path: Path, performance_profile: str, way: Way, *, json: bool) -> None:
+def _predict_table(chip: Profile, path: Path, performance_profile: str, way: Variant, *, json: bool) -> None:
     from rich.progress import Progress
 
     from trilane.hw_profiles.configuration_table import read_table
@@ -200,8 +200,8 @@ def _show_table(answers: list[dict[str, Any]]) -> None:
 
 
 def _draw(chip: Profile, plan: Plan, asked: str, minutes: float, governor: str | None, path: Path) -> None:
+    from trilane.hw_profiles.over_time import over_time
     from trilane.hw_profiles.plot import plot_over_time
-    from trilane.hw_profiles.predict import over_time
 
     names = dict.fromkeys((SUSTAINED, BURST, asked))
     runs = {name: over_time(chip, plan, name, minutes, governor) for name in names}

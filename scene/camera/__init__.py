@@ -1,1 +1,3 @@
-"""Cameras: recorded paths and built-in ones, as a view and a projection over time."""
+"""Reads camera files and makes the built-in cameras: a view and a projection over time.
+Uses, of `scene`, the motion's sampling in time, the rotations and the schema.
+"""

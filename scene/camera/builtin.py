@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trilane.scene.camera.path import CameraPath, Lens, look_at
+from trilane.scene.camera.path import CameraPath, Lens, axes_towards
 from trilane.scene.motion.motion import Wrap
 from trilane.scene.rotations import quat_from_matrix
 from trilane.scene.schema import CameraSpec
@@ -50,8 +50,7 @@ def load_builtin(name: str, spec: CameraSpec) -> CameraPath | None:
     angle = np.radians(orbit.swing_deg) * np.sin(phase - 0.6)
     distance = orbit.far_m + (orbit.near_m - orbit.far_m) * (1 - np.cos(phase)) / 2
     places = np.column_stack([distance * np.sin(angle), np.full(len(times), orbit.height_m), distance * np.cos(angle)])
-    views = np.stack([look_at(place, np.array(orbit.target)) for place in places])
     fov = FOV_Y_DEG if spec.fov_y_deg is None else spec.fov_y_deg
     notes = (f"built in: {orbit.what}, {orbit.period_s:g} s a cycle, field of view {fov:g} degrees high",)
-    quats = quat_from_matrix(np.swapaxes(views[:, :3, :3], -1, -2))
+    quats = quat_from_matrix(axes_towards(places, np.array(orbit.target)))
     return CameraPath(times, quats, places, Lens(fov, spec.near_m, spec.far_m), notes, Wrap.LOOP, recorded=False)

@@ -25,11 +25,19 @@ def view_from_pose(turn: F64, place: F64) -> F64:
 
 def look_at(place: F64, target: F64) -> F64:
     """World to camera (4, 4) of a level camera at `place` (3,) that looks at `target` (3,), not straight up or down."""
-    back = place - target
-    back = back / np.linalg.norm(back)
-    right = np.cross([0.0, 1.0, 0.0], back)
-    right = right / np.linalg.norm(right)
-    return view_from_pose(np.stack([right, np.cross(back, right), back], axis=1), place)
+    return view_from_pose(axes_towards(place[None], target)[0], place)
+
+
+def axes_towards(places: F64, target: F64) -> F64:
+    """Camera axes as columns (N, 3, 3) of level cameras at `places` (N, 3) that look at `target` (3,)."""
+    back = _unit_rows(places - target)
+    right = _unit_rows(np.cross([0.0, 1.0, 0.0], back))
+    return np.stack([right, np.cross(back, right), back], axis=-1)
+
+
+def _unit_rows(vectors: F64) -> F64:
+    lengths = [np.linalg.norm(vector) for vector in vectors]
+    return np.asarray(vectors / np.array(lengths)[:, None])
 
 
 def projection_matrix(fov_y_deg: float, aspect: float, near_m: float, far_m: float) -> F64:

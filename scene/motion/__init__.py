@@ -1,1 +1,3 @@
-"""Motions: files and built-in ones, read into SMPL-X poses over time."""
+"""Reads motion files and makes the built-in motions: SMPL-X poses over time.
+Uses `body` and, of `scene`, the rotations and the schema.
+"""

@@ -97,3 +97,12 @@ class Motion:
         pose = rotvec_from_quat(slerp(self._quats[i], self._quats[j], fraction))
         start, end = self.translation[i], self.translation[j]
         return pose, start + (end - start) * fraction
+
+    def sample_all(self, times_s: F64) -> tuple[F64, F64]:
+        """Poses (N, 55, 3) and translations (N, 3) at `times_s` (N,), each as `sample` gives it."""
+        brackets = [bracket(self.times_s, wrapped_time(float(t_s), self.duration_s, self.wrap)) for t_s in times_s]
+        i, j = (np.array([neighbours[k] for neighbours in brackets]) for k in (0, 1))
+        fraction = np.array([fraction for _, _, fraction in brackets])
+        poses = rotvec_from_quat(slerp(self._quats[i], self._quats[j], fraction[:, None]))
+        start, end = self.translation[i], self.translation[j]
+        return poses, start + (end - start) * fraction[:, None]

@@ -11,7 +11,7 @@ import pytest
 from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import ShapedBody, load_body
 from trilane.body.kinematics import Skeleton
-from trilane.scene.floor import outline
+from trilane.scene.body_outline import outline
 from trilane.scene.motion.builtin import BUILTIN
 from trilane.scene.motion.motion import Motion
 from trilane.scene.mover import make_mover

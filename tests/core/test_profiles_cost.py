@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
 from trilane.errors import BadInputError
-from trilane.hw_profiles.application import network_alone, split_work
+from trilane.hw_profiles.application import isolated_job_time, split_work
 from trilane.hw_profiles.load import load_profile
 from trilane.hw_profiles.network_work import CLASSES, count_work
 from trilane.hw_profiles.operator_times import job_time, machine_of
@@ -184,7 +184,7 @@ def test_more_to_do_never_takes_less_time(
 
     def ms(side: int, channels: int) -> float:
         network = reference_network(NetworkSpec(encoder, norm, 32 * side, 32 * side, channels, layout))
-        return network_alone(profile, network, unit, corners_of(profile, SUSTAINED)).total_ms
+        return isolated_job_time(profile, network, unit, corners_of(profile, SUSTAINED)).total_ms
 
     least = ms(side, channels)
     assert 0 < least <= ms(side + 1, channels)
@@ -210,8 +210,8 @@ def test_a_batch_pays_fixed_costs_and_weights_once() -> None:
 def test_group_normalisation_falls_back_on_the_dsp_and_not_on_the_gpu() -> None:
     profile = load_profile("snapdragon-888")
     corners = corners_of(profile, SUSTAINED)
-    assert network_alone(profile, reference_network(spec(norm="group")), "dsp", corners).parts["fallback"] > 1000
-    assert network_alone(profile, reference_network(spec(norm="group")), "gpu", corners).parts["fallback"] == 0
+    assert isolated_job_time(profile, reference_network(spec(norm="group")), "dsp", corners).parts["fallback"] > 1000
+    assert isolated_job_time(profile, reference_network(spec(norm="group")), "gpu", corners).parts["fallback"] == 0
 
 
 @pytest.mark.parametrize("share", [0.01, 0.3, 0.9])

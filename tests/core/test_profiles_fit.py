@@ -10,8 +10,6 @@ import pytest
 from trilane.errors import BadInputError
 from trilane.hw_profiles.configuration_table import read_table
 from trilane.hw_profiles.fit import (
-    STEPS,
-    UNIT_OF_COLUMN,
     Fit,
     as_toml,
     fit_profile,
@@ -19,6 +17,7 @@ from trilane.hw_profiles.fit import (
     predicted_ms,
     with_factors,
 )
+from trilane.hw_profiles.fit_steps import STEPS, UNIT_OF_COLUMN
 from trilane.hw_profiles.load import load_profile, load_tables, parse_profile
 
 HEADER = (

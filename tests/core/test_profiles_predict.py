@@ -10,17 +10,19 @@ import pytest
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import (
     Plan,
-    Way,
+    Variant,
     reference_frame_ms,
     stage_times_ms,
     steady,
 )
 from trilane.hw_profiles.configuration_table import read_table
 from trilane.hw_profiles.load import load_profile
+from trilane.hw_profiles.over_time import over_time
 from trilane.hw_profiles.performance_profiles import corners_of
-from trilane.hw_profiles.predict import over_time, predict, predict_table, what_if
+from trilane.hw_profiles.predict import predict, predict_table, what_if
 from trilane.hw_profiles.reference_networks import NetworkSpec, reference_network
-from trilane.hw_profiles.throttling import GOVERNORS, Heat
+from trilane.hw_profiles.thermal_state import ThermalState
+from trilane.hw_profiles.throttling import GOVERNORS
 from trilane.units import UNITS, UnitName
 
 NETWORK = reference_network(NetworkSpec("resnet18", "batch", 512, 512, 16))
@@ -46,7 +48,7 @@ def test_the_closed_form_of_the_fit_is_what_the_scheduler_does(runtime: UnitName
 @pytest.mark.parametrize("edge", ["single", "double", "triple", "fifo:3", "orphan"])
 def test_every_way_of_working_runs_and_accounts_for_its_time(policy: str, edge: str) -> None:
     profile = load_profile("snapdragon-888")
-    now = steady(profile, Plan(NETWORK, "dsp", Way(policy, edge)), corners_of(profile, SUSTAINED))
+    now = steady(profile, Plan(NETWORK, "dsp", Variant(policy, edge)), corners_of(profile, SUSTAINED))
     assert now.frame_ms >= max(now.stages_ms.values()) - 1e-6
     for unit in UNITS:
         assert now.busy[unit] + sum(now.idle[unit].values()) == pytest.approx(1.0)
@@ -55,7 +57,7 @@ def test_every_way_of_working_runs_and_accounts_for_its_time(policy: str, edge: 
 def test_two_buffers_make_the_network_the_limit() -> None:
     profile = load_profile("snapdragon-888")
     corners = corners_of(profile, SUSTAINED)
-    now = steady(profile, Plan(NETWORK, "dsp", Way("pipelined", "double")), corners)
+    now = steady(profile, Plan(NETWORK, "dsp", Variant("pipelined", "double")), corners)
     assert now.frame_ms == pytest.approx(now.stages_ms["infer"], rel=0.01)
     assert now.busy["dsp"] > 0.97
 
@@ -76,7 +78,7 @@ def test_the_network_on_the_gpu_shares_it_with_drawing() -> None:
     corners = corners_of(profile, SUSTAINED)
     times = stage_times_ms(profile, Plan(NETWORK, "gpu"), corners)
     together = sum(ms for (_, unit), ms in times.items() if unit == "gpu")
-    assert steady(profile, Plan(NETWORK, "gpu", Way("pipelined", "double")), corners).frame_ms == pytest.approx(
+    assert steady(profile, Plan(NETWORK, "gpu", Variant("pipelined", "double")), corners).frame_ms == pytest.approx(
         together, rel=0.01
     )
 
@@ -116,21 +118,23 @@ def test_throttling_has_hysteresis() -> None:
     assert 1 <= changes <= 20
 
 
-def test_heat_approaches_resistance_times_power() -> None:
+def test_the_temperature_approaches_resistance_times_power() -> None:
     profile = load_profile("snapdragon-888")
-    heat, power = Heat.at_rest(profile), {"cpu": 0.5, "gpu": 1.0, "dsp": 1.5}
-    heat.advance(profile, power, 1e6)  # type: ignore[arg-type]
+    thermal_state, power = ThermalState.at_rest(profile), {"cpu": 0.5, "gpu": 1.0, "dsp": 1.5}
+    thermal_state.advance(profile, power, 1e6)  # type: ignore[arg-type]
     thermal = profile.thermal
     total = sum(power.values()) + thermal.base_power_w.or_else(0)
-    assert heat.device_c == pytest.approx(thermal.ambient_c.or_else(0) + thermal.device_k_per_w.or_else(0) * total)
-    assert heat.junction_c["dsp"] > heat.junction_c["gpu"] > heat.device_c
+    assert thermal_state.device_c == pytest.approx(
+        thermal.ambient_c.or_else(0) + thermal.device_k_per_w.or_else(0) * total
+    )
+    assert thermal_state.junction_c["dsp"] > thermal_state.junction_c["gpu"] > thermal_state.device_c
 
 
 def test_one_long_step_is_many_short_ones() -> None:
     """Exact for the device, whose power does not change in between."""
     profile = load_profile("snapdragon-888")
     power: dict[UnitName, float] = {"cpu": 0.5, "gpu": 1.0, "dsp": 1.5}
-    one, many = Heat.at_rest(profile), Heat.at_rest(profile)
+    one, many = ThermalState.at_rest(profile), ThermalState.at_rest(profile)
     one.advance(profile, power, 600)
     for _ in range(600):
         many.advance(profile, power, 1)
@@ -179,8 +183,8 @@ def test_a_table_keeps_its_columns_and_answers_every_row(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("change", "word"),
     [
-        ({"way": Way(policy="best")}, "best"),
-        ({"way": Way(batch=0)}, "batch"),
+        ({"variant": Variant(policy="best")}, "best"),
+        ({"variant": Variant(batch=0)}, "batch"),
         ({"gpu_share": 1.0}, "gpu-share"),
         ({"gpu_share": 0.5, "runtime": "gpu"}, "gpu-share"),
         ({"runtime": "cpu"}, "cpu"),
@@ -200,4 +204,4 @@ def test_unknown_names_are_refused() -> None:
     with pytest.raises(BadInputError, match="minutes"):
         predict(profile, plan, minutes=-1)
     with pytest.raises(BadInputError, match="edge"):
-        predict(profile, Plan(NETWORK, "dsp", Way(edge="quadruple")))
+        predict(profile, Plan(NETWORK, "dsp", Variant(edge="quadruple")))
