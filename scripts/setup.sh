@@ -69,7 +69,7 @@ has_pip() { .venv/bin/python -m pip --version >/dev/null 2>&1; }
 say "installing packages (${extras:-no extras}); the first time takes a minute or more, and up to 1 GB"
 .venv/bin/python -m pip install --quiet --disable-pip-version-check --editable ".${extras:+[$extras]}" ||
   lacks "pip could not install the packages (see above): no network, or no wheel for this Python and machine" \
-    ".venv/bin/python -m pip install --editable '.[$extras]'"
+    ".venv/bin/python -m pip install --editable '.${extras:+[$extras]}'"
 if ! has_egl; then
   apt_or_lacks "no OpenGL 3.3 context can be made through EGL" libegl1 libgl1-mesa-dri
   has_egl || lacks "EGL and Mesa are installed, yet no OpenGL 3.3 context can be made; see: .venv/bin/trilane doctor" \

@@ -177,7 +177,7 @@ def train_step(
 
 
 def save_avatar(avatar: Avatar, steps: int, path: Path) -> None:
-    """Write all weights and the number of steps as one .npz, under a temporary name first."""
+    """Write all weights and the number of steps as the .npz file `path`, whole or not at all. Raises BadInputError."""
     with write_atomically(path) as draft, draft.open("wb") as file:
         np.savez(file, steps=steps, **{name: value.detach().numpy() for name, value in avatar.state_dict().items()})
 
@@ -199,7 +199,10 @@ def load_network(network: UNet, path: Path) -> UNet:
 
 
 def save_network(avatar: Avatar, path: Path) -> None:
-    """Write the network alone in half precision: small enough to be kept, and enough to go on training from."""
+    """Write the network alone in half precision: small enough to be kept, and enough to go on training from.
+
+    Raises BadInputError when `path` cannot be written.
+    """
     weights = {f"network.{name}": value.detach().numpy() for name, value in avatar.network.state_dict().items()}
     halves = {name: value.astype(np.float16) for name, value in weights.items() if value.dtype.kind == "f"}
     with write_atomically(path) as draft, draft.open("wb") as file:

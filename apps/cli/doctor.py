@@ -23,6 +23,7 @@ app = typer.Typer(rich_markup_mode=None, add_completion=False)
 
 MISSING = 3
 SHM = Path("/dev/shm")  # noqa: S108 - looked at, never written
+REINSTALL = "install Trilane again from its sources, where there are gcc and python3-dev"
 EPILOG = "\b\nExamples:\n  trilane doctor\n  trilane doctor --json"
 
 
@@ -126,8 +127,7 @@ def _core() -> Check:
     found = form()
     if found == "stale":
         return Check("scheduler core", STALE, works=False, install=MEND)
-    install = "make compile" if clone() else "install Trilane again from its sources"
-    install += ", where there are gcc and python3-dev"
+    install = "make compile  # it takes gcc and python3-dev" if clone() else REINSTALL
     return Check("scheduler core", found, works=found == "compiled", needed=False, install=install)
 
 

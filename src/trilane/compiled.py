@@ -12,7 +12,8 @@ import importlib.util
 from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 
-#: Relative to the package's folder. They import each other, trilane.errors, trilane.unexpected, msgpack and the standard library alone.
+#: Relative to the package's folder. They import each other, trilane.errors, trilane.unexpected, msgpack and the
+#: standard library alone.
 MODULES = (
     "scheduler/core.py",
     "scheduler/events.py",

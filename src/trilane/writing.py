@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import os
 import secrets
+import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -24,18 +25,17 @@ def write_atomically(path: Path, remedy: str = "") -> Iterator[Path]:
     """A name to write to, with the suffix of `path`; it becomes `path` when the block ends without an error.
 
     No file has the name yet, and no two calls get the same one. A device or a pipe (/dev/stdout) is itself the name.
-    Raises BadInputError with `remedy` for every OSError of the block and of the renaming.
+    Raises BadInputError with `remedy` when the file cannot be written; an OSError about another file passes.
     """
     draft = path.parent / f"{PREFIX}{secrets.token_hex(8)}{path.suffix}"
     try:
-        if _is_stream(path):
-            yield path
-            return
-        yield draft
-        _flush(draft)
-        draft.replace(path)
-    except OSError as error:
-        raise BadInputError.of_os_error(path, error, WRITABLE, remedy) from error
+        with _os_errors_about(path, remedy, (path, draft)):
+            if _is_stream(path):
+                yield path
+            else:
+                yield draft
+                _flush(draft)
+                draft.replace(path)
     finally:
         with suppress(OSError):
             draft.unlink(missing_ok=True)
@@ -52,20 +52,39 @@ def write_folder(folder: Path) -> Iterator[Path]:
     """An empty folder to write files to; they take their places in `folder` when the block ends without an error.
 
     Each file of `folder` is whole at any moment, but they change one after the other; other files in it stay.
-    Raises BadInputError for every OSError of the block and of the renaming.
+    Raises BadInputError when a file cannot be written; an OSError about a file elsewhere passes.
     """
-    try:
+    with _os_errors_about(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=PREFIX, dir=folder.parent) as name:
-            yield Path(name)
-            files = sorted(Path(name).iterdir())
-            for file in files:
-                _flush(file)
-            folder.mkdir(exist_ok=True)
-            for file in files:
-                file.replace(folder / file.name)
+        draft = Path(tempfile.mkdtemp(prefix=PREFIX, dir=folder.parent))
+    try:
+        with _os_errors_about(folder, own=(draft,)):
+            yield draft
+        with _os_errors_about(folder):
+            _move_files(draft, folder)
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+
+
+@contextmanager
+def _os_errors_about(path: Path, remedy: str = "", own: Sequence[Path] = ()) -> Iterator[None]:
+    """Raises BadInputError about `path` for an OSError; with `own`, not for one that names a file outside these."""
+    try:
+        yield
     except OSError as error:
-        raise BadInputError.of_os_error(folder, error, WRITABLE) from error
+        named = Path(os.fsdecode(error.filename)) if isinstance(error.filename, str | bytes | os.PathLike) else None
+        if own and named is not None and not any(named.is_relative_to(place) for place in own):
+            raise
+        raise BadInputError.of_os_error(path, error, WRITABLE, remedy) from error
+
+
+def _move_files(source: Path, target: Path) -> None:
+    files = sorted(source.iterdir())
+    for file in files:
+        _flush(file)
+    target.mkdir(exist_ok=True)
+    for file in files:
+        file.replace(target / file.name)
 
 
 def _is_stream(path: Path) -> bool:

@@ -77,7 +77,7 @@ class RuntimeEntry:
 def cuda_line() -> str:
     """The command for the runtime `cuda`: the build for GPUs replaces the other, whose modules it has."""
     here = pip()
-    return f"{here} uninstall -y onnxruntime && {here} install onnxruntime-gpu, on a machine with an NVIDIA GPU"
+    return f"{here} uninstall -y onnxruntime && {here} install onnxruntime-gpu  # on a machine with an NVIDIA GPU"
 
 
 RUNTIMES = {

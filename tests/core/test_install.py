@@ -1,0 +1,134 @@
+"""The command that installs what is missing fits the way Trilane was installed, and where the user stands."""
+
+from __future__ import annotations
+
+import ast
+import importlib.metadata
+import shlex
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from trilane import install
+from trilane.install import clone, install_line, package_line, pip
+from trilane.stages.dsp.runtime import RUNTIMES
+
+ROOT = Path(__file__).resolve().parents[2]
+PYTHON = "/opt/my python/bin/python3"
+REQUIRES = [
+    "numpy>=1.26",
+    "pyzmq>=26",
+    'anny>=0.6; extra == "anny"',
+    'torch>=2.6; extra == "anny"',
+    "torch>=2.6; extra == 'train'",
+    'iceoryx2>=0.7; python_version >= "3.11" and extra == "peers"',
+    'tomli; python_version < "3.11"',
+]
+
+
+@pytest.fixture
+def from_clone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A clone with its .venv, whose Python is the one that runs; the user stands elsewhere."""
+    root = tmp_path / "trilane"
+    (root / "src" / "trilane").mkdir(parents=True)
+    (root / "pyproject.toml").touch()
+    monkeypatch.setattr(install, "PACKAGE", root / "src" / "trilane")
+    monkeypatch.setattr(sys, "prefix", str(root / ".venv"))
+    monkeypatch.setattr(sys, "executable", str(root / ".venv/bin/python"))
+    monkeypatch.chdir(tmp_path)
+    return root
+
+
+@pytest.fixture
+def from_wheel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(install, "PACKAGE", tmp_path / "lib" / "python3.11" / "site-packages" / "trilane")
+    monkeypatch.setattr(sys, "executable", PYTHON)
+    monkeypatch.setattr(importlib.metadata, "requires", lambda name: REQUIRES if name == "trilane" else None)
+
+
+def test_in_the_clone(from_clone: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(from_clone)
+    assert install_line("anny") == ".venv/bin/pip install -e '.[anny]'"
+    assert install_line() == ".venv/bin/pip install -e ."
+    assert package_line("onnxruntime") == ".venv/bin/pip install onnxruntime"
+
+
+def test_beside_the_clone(from_clone: Path) -> None:
+    assert install_line("anny") == f"{from_clone}/.venv/bin/pip install -e '{from_clone}[anny]'"
+    assert install_line() == f"{from_clone}/.venv/bin/pip install -e {from_clone}"
+
+
+def test_a_clone_in_the_environment_of_another(from_clone: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "prefix", "/opt/other")
+    monkeypatch.setattr(sys, "executable", "/opt/other/bin/python")
+    assert install_line("fit") == f"/opt/other/bin/python -m pip install -e '{from_clone}[fit]'"
+    monkeypatch.chdir(from_clone)
+    assert install_line("fit") == "/opt/other/bin/python -m pip install -e '.[fit]'"
+
+
+def test_a_clone_whose_path_has_a_space(from_clone: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    spaced = from_clone.rename(from_clone.with_name("my trilane"))
+    monkeypatch.setattr(install, "PACKAGE", spaced / "src" / "trilane")
+    monkeypatch.setattr(sys, "prefix", str(spaced / ".venv"))
+    assert shlex.split(install_line("fit")) == [f"{spaced}/.venv/bin/pip", "install", "-e", f"{spaced}[fit]"]
+
+
+def test_from_a_folder_that_was_removed(from_clone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    assert install_line("fit") == f"{from_clone}/.venv/bin/pip install -e '{from_clone}[fit]'"
+
+
+@pytest.mark.usefixtures("from_wheel")
+def test_from_a_wheel_an_extra_is_its_packages() -> None:
+    assert clone() is None
+    assert pip() == f"'{PYTHON}' -m pip"
+    assert install_line("anny") == f"'{PYTHON}' -m pip install 'anny>=0.6' 'torch>=2.6'"
+    assert install_line("train") == f"'{PYTHON}' -m pip install 'torch>=2.6'"
+    assert install_line("peers") == f"'{PYTHON}' -m pip install 'iceoryx2>=0.7'"
+    assert install_line() == f"'{PYTHON}' -m pip install 'numpy>=1.26' 'pyzmq>=26' tomli"
+    assert package_line("onnxruntime") == f"'{PYTHON}' -m pip install onnxruntime"
+
+
+@pytest.mark.usefixtures("from_wheel")
+def test_a_package_without_a_distribution_still_says_something(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(name: str) -> list[str]:
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(importlib.metadata, "requires", missing)
+    assert install_line("anny") == f"'{PYTHON}' -m pip install (the packages that Trilane's pyproject.toml lists)"
+
+
+def test_these_tests_run_from_a_clone() -> None:
+    assert clone() == ROOT
+
+
+def extras_named(file: Path) -> Iterator[str]:
+    """What is given to `install_line(...)`, `partial(install_line, ...)` and `MissingPartError(extra=...)`."""
+    for node in ast.walk(ast.parse(file.read_text())):
+        if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Name):
+            continue
+        given = [arg.value for arg in node.args if isinstance(arg, ast.Constant)]
+        if node.func.id == "install_line" or "install_line" in [getattr(arg, "id", "") for arg in node.args]:
+            yield from given
+        if node.func.id == "MissingPartError":
+            yield from (ast.literal_eval(word.value) for word in node.keywords if word.arg == "extra")
+
+
+def test_every_extra_that_is_named_is_one() -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    folders = [folder for folder in (ROOT / "src" / "trilane").iterdir() if folder.is_dir()]
+    named = {extra for folder in folders for file in folder.rglob("*.py") for extra in extras_named(file)}
+    assert {"anny", "fit", "loadgen", "openvino", "peers", "plot", "qnn", "train"} <= named <= set(extras)
+
+
+def test_the_gpus_runtime_replaces_the_other(from_clone: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(from_clone)
+    assert RUNTIMES["cuda"].install() == (
+        ".venv/bin/pip uninstall -y onnxruntime && .venv/bin/pip install onnxruntime-gpu  "
+        "# on a machine with an NVIDIA GPU"
+    )
