@@ -7,12 +7,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import onnx
-
 from trilane.avatars.bundle import Bundle
 from trilane.avatars.network_file import NetworkFile
 from trilane.body.body import load_body
-from trilane.hw_profiles.network_work import count_work
+from trilane.hw_profiles.network_work import graph_facts
 
 
 def bundle_facts(bundle: Bundle) -> dict[str, Any]:
@@ -41,9 +39,3 @@ def bundle_facts(bundle: Bundle) -> dict[str, Any]:
 def network_facts(network: NetworkFile) -> dict[str, Any]:
     """`shape` (N, H, W, C), `sha256`, and the work of one pass, see `graph_facts`."""
     return {"shape": list(network.shape), "sha256": network.digest, **graph_facts(network.model)}
-
-
-def graph_facts(model: onnx.ModelProto) -> dict[str, Any]:
-    """`parameters` of the layers as they are in the file, `gmac` of one pass."""
-    work = count_work(model)
-    return {"parameters": work.weights, "gmac": work.macs / 1e9}

@@ -1,125 +1,270 @@
-"""report.json: what every run says of itself, on either clock.
+"""report.json: what every run says of itself.
 
-Rule: the keys are those of the project's report schema; more may be added, none is renamed, and no speed is
-reported without the machine it was measured on and the image error of the avatar it was measured with.
+Rule: one model writes the file and reads it, and its fields stand in the order of the file's keys. No speed is reported
+without the machine it was measured on and the image error of the avatar it was measured with.
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
+from pydantic_core import from_json
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles.host import sensor_c
+from trilane.pipeline.report import (
+    Caps,
+    FrameCounts,
+    FrameTimes,
+    Record,
+    RunMetrics,
+    StageTimes,
+    Temperature,
+    TimeSummary,
+    UnitShares,
+    metrics_of,
+)
 from trilane.pipeline.result import RunResult
+from trilane.shapes import Shape
 from trilane.stages.config import RunConfig
 
+SCHEMA = 1
 MAX_REPORT_BYTES = 64 << 20
 NO_CAP = "none: every unit works as much as its cores and threads allow"
-#: What a comparison under another policy keeps of that run's report.
-BASELINE_KEYS = ("frames", "frame_time_ms", "latency_ms", "fps", "deadline_misses", "stages", "units", "efficiency")
+EXPECTED = "a run folder or its report.json"
 
 
-class Part(BaseModel):
-    """A part of a report: the keys below, and whatever was added."""
+class Cpu(Record):
+    """The processor.
 
-    model_config = ConfigDict(extra="allow", frozen=True)
+    `model`: its name.
+    `architecture`: such as x86_64.
+    `flags`: of its instructions those that decide how fast networks run.
+    `cores`: that the machine has.
+    `cores_allowed`: numbers of those that the run might use.
+    """
 
-
-class Frames(Part):
-    requested: int
-    presented: int
-    lost: int
-    dropped: dict[str, int]
-
-
-class StageTimes(Part):
-    """Statistics of a stage: `service_ms` of its jobs, `wait_ms` between a job's input and its begin."""
-
-    unit: str
-    service_ms: dict[str, float]
-    wait_ms: dict[str, float]
+    model: str
+    architecture: str
+    flags: tuple[str, ...]
+    cores: int
+    cores_allowed: tuple[int, ...]
 
 
-class Idle(Part):
-    starved: float
-    blocked: float
-    throttled: float
-    overhead: float
+class GlDriver(Record):
+    """The OpenGL driver. `hardware`: false when the CPU draws; `limits`: OpenGL's constants of that name."""
+
+    vendor: str
+    renderer: str
+    version: str
+    hardware: bool
+    limits: dict[str, int | tuple[int, ...]]
 
 
-class UnitShare(Part):
-    """Shares of the run's time; `busy` and the four parts of `idle` sum to 1."""
+class Machine(Record):
+    """The machine that was measured.
 
-    busy: float
-    idle: Idle
+    `system`: operating system and kernel.
+    `python`, `trilane`: versions; null for a Trilane that was never installed.
+    `scheduler_core`: compiled, interpreted or stale.
+    `cpu`: the processor.
+    `memory_bytes`: physical memory.
+    `gl`: the OpenGL driver, null when there is none.
+    `packages`: version of each that is installed and that Trilane uses.
+    """
+
+    system: str
+    python: str
+    trilane: str | None
+    scheduler_core: str
+    cpu: Cpu
+    memory_bytes: int
+    gl: GlDriver | None
+    packages: dict[str, str]
 
 
-class Report(Part):
-    """The whole document. `clock`: measured on this machine, or computed from a hardware profile."""
+class WorkPlan(Record):
+    """What the scene's size allows. `tensor_shapes`: (height, width) in pixels of the tensors that may be drawn."""
 
-    schema_: int = Field(alias="schema")
-    clock: Literal["host", "virtual"]
-    machine: dict[str, Any]
-    config: dict[str, Any]
-    plan: dict[str, Any]
-    frames: Frames
-    frame_time_ms: dict[str, float]
-    latency_ms: dict[str, float]
+    tensor_shapes: tuple[Shape, ...]
+
+
+class Baseline(Record):
+    """The same scene under another policy; the keys mean what they mean in the report. `policy`: which one."""
+
+    policy: str
+    frames: FrameCounts
+    frame_time_ms: FrameTimes
+    latency_ms: TimeSummary
     fps: float
     deadline_misses: int
     stages: dict[str, StageTimes]
-    units: dict[str, UnitShare]
+    units: dict[str, UnitShares]
     efficiency: float | None
-    temperature_c: dict[str, Any]
-    caps: dict[str, Any]
+
+
+class PaceComparison(Record):
+    """A run at the pace of a chip, beside the same run in virtual time.
+
+    `profile`: hardware profile of the chip.
+    `performance_profile`: under which the chip runs.
+    `slow_motion`: how many times slower than the chip.
+    `stage_ms`: how long a job of each stage was held.
+    `host_slower`: of each stage, jobs that the host did not do in that time.
+    `late_frames`: numbers of the frames that such jobs belong to.
+    `virtual_ms`: median frame time in virtual time.
+    `measured_ms`: median frame time here, over frames with no late one near; null when there is none.
+    `compared_share`: share of the frames that were compared.
+    `ratio`: measured over virtual; null when no frame was compared.
+    """
+
+    profile: str
+    performance_profile: str
+    slow_motion: float
+    stage_ms: dict[str, float]
+    host_slower: dict[str, int]
+    late_frames: tuple[int, ...]
+    virtual_ms: float
+    measured_ms: float | None
+    compared_share: float
+    ratio: float | None
+
+
+class Video(Record):
+    """video.mp4. `frames`: in it; `seconds`: until the end of the last one."""
+
+    frames: int
+    seconds: float
+
+
+class Preamble(Record):
+    """The keys that a report begins with.
+
+    `schema_`: `schema` in the file, 1.
+    `clock`: of the times.
+    `machine`: that the run was measured on.
+    `config`: the RunConfig as JSON without its folder, and the `policy`.
+    `plan`: what followed from it.
+    `caps`: what held the units.
+    """
+
+    schema_: Literal[1] = Field(alias="schema")
+    clock: Literal["host", "virtual"]
+    machine: Machine
+    config: dict[str, Any]
+    plan: WorkPlan
+    caps: Caps
+
+
+class Report(RunMetrics, Preamble):
+    """The whole document: the keys of `Preamble`, those of `RunMetrics` that it has not, and these.
+
+    `pids`: process of each unit at the end.
+    `startup_ms`: until each unit was ready.
+    `stage_metrics`: `figures` in the file: mean of each metric that a stage gave with its jobs.
+    `messages`: to a person, of what went wrong on the way.
+    `interrupted`: whether a signal ended the run.
+    `failure`: why it ended early, null when it did not.
+    `baseline`: the `sequential` run of the same scene, null when there was none.
+    `pace`: of a run at a chip's pace.
+    `accuracy`: of each avatar, `validation` of its manifest; empty when it was never validated.
+    `notes`: what each file that was opened was taken for, and what was chosen for the run.
+    `video`: null when no frame was recorded.
+    `checksum`: SHA-256 over the presented pictures, null when none was recorded.
+    """
+
+    caps: Caps
+    temperature_c: Temperature
+    pids: dict[str, int]
+    startup_ms: dict[str, float]
+    stage_metrics: dict[str, dict[str, float]] = Field(alias="figures")
+    messages: tuple[str, ...]
+    interrupted: bool
+    failure: str | None
+    baseline: Baseline | None
+    pace: PaceComparison | None = None
+    accuracy: dict[str, dict[str, Any]] = Field(default={})
+    notes: tuple[str, ...] = ()
+    video: Video | None
+    checksum: str | None
 
 
 def build_report(
-    result: RunResult, config: RunConfig, *, policy: str, machine: dict[str, Any], baseline: RunResult | None
-) -> dict[str, Any]:
-    """The report of a run on the host clock; the caller adds what its own parts say (`accuracy`, `plan`, files)."""
-    report = {
-        "schema": 1,
-        "clock": "host",
+    result: RunResult,
+    config: RunConfig,
+    *,
+    machine: Mapping[str, Any],
+    baseline: RunResult | None,
+    facts: Mapping[str, Any],
+) -> Report:
+    """The report of a run on the host clock. Raises ValueError naming a wrong or unknown key.
+
+    `result`: of the run.
+    `config`: that it ran.
+    `machine`: what `machine_facts` said.
+    `baseline`: the run under another policy beside it, if there was one.
+    `facts`: what others know of the run: `video`, `checksum`, and any of `pace`, `accuracy`, `notes`.
+    """
+    metrics = metrics_of(result.report)
+    sensor = {"sensor": sensor_c()}
+    document = {
+        **metrics.as_json(),
+        "schema": SCHEMA,
         "machine": machine,
-        "config": {**config.model_dump(mode="json", exclude={"out_dir"}), "policy": policy},
-        "plan": {"tensor_shapes": [list(shape) for shape in config.buckets]},
-        "caps": {"how": NO_CAP},
-        **result.report,
-        "temperature_c": {**result.report.get("temperature_c", {}), "sensor": sensor_c()},
-        "pids": dict(result.pids),
-        "startup_ms": dict(result.startup_ms),
-        "figures": {stage: dict(figures) for stage, figures in result.figures.items()},
-        "messages": list(result.messages),
+        "config": {**config.model_dump(mode="json", exclude={"out_dir"}), "policy": metrics.policy},
+        "plan": {"tensor_shapes": config.buckets},
+        "caps": metrics.caps.as_json() if metrics.caps else {"how": NO_CAP},
+        "temperature_c": (metrics.temperature_c.as_json() if metrics.temperature_c else {}) | sensor,
+        "pids": result.pids,
+        "startup_ms": result.startup_ms,
+        "figures": result.figures,
+        "messages": result.messages,
         "interrupted": result.interrupted,
-        "failure": None if result.failure is None else result.failure.message,
-        "baseline": None,
+        "failure": result.failure and result.failure.message,
+        "baseline": baseline and _compared(metrics_of(baseline.report)),
+        **facts,
     }
-    if baseline is not None:
-        report["baseline"] = {"policy": "sequential", **{key: baseline.report.get(key) for key in BASELINE_KEYS}}
-    return report
+    return Report.model_validate(document)
 
 
-def write_report(report: dict[str, Any], target: Path) -> None:
-    """Write `report` as JSON. Raises ValueError for a NaN or an infinity."""
-    target.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+def _compared(metrics: RunMetrics) -> Baseline:
+    return Baseline.model_validate({key: getattr(metrics, key) for key in Baseline.model_fields})
+
+
+def write_report(report: Report, target: Path) -> None:
+    """Write `report` as JSON. Raises ValueError for a report that could not be read back, a NaN or an infinity."""
+    document = report.as_json()
+    Report.model_validate(document)
+    target.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def read_report(path: Path) -> Report:
-    """The report in `path`, a file or a run folder. Raises BadInputError naming the first key that is wrong."""
+    """The report in `path`, a file or a run folder. Raises BadInputError naming the first key that is wrong.
+
+    A report of a newer schema is refused as such.
+    """
     file = path / "report.json" if path.is_dir() else path
-    expected = "a run folder or its report.json"
     try:
         if file.stat().st_size > MAX_REPORT_BYTES:
             raise BadInputError(file, f"{file.stat().st_size} bytes", f"a report of at most {MAX_REPORT_BYTES}")
-        return Report.model_validate_json(file.read_bytes())
+        document = from_json(file.read_bytes())
+        _refuse_newer(file, document)
+        return Report.model_validate(document)
     except OSError as error:
-        raise BadInputError.of_os_error(file, error, expected) from None
+        raise BadInputError.of_os_error(file, error, EXPECTED) from None
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"]) or "the document"
-        raise BadInputError(f"{file}: {key}", first["msg"].lower(), expected) from None
+        raise BadInputError(f"{file}: {key}", first["msg"].lower(), EXPECTED) from None
+    except ValueError as error:
+        raise BadInputError(f"{file}: the document", str(error), EXPECTED) from None
+
+
+def _refuse_newer(file: Path, document: Any) -> None:
+    schema = document.get("schema") if isinstance(document, dict) else None
+    if isinstance(schema, int) and schema > SCHEMA:
+        raise BadInputError(f"{file}: schema", str(schema), f"{SCHEMA}", "a newer Trilane wrote it: update this one")

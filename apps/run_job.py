@@ -192,5 +192,5 @@ def _write_files(result: RunResult, work: Path, fps: float) -> dict[str, Any]:
             contact_sheet(work / "video.mp4", work / "contact.png", fps)
         shutil.rmtree(segments)
     result.recording.write(work / "events.jsonl")
-    write_trace(result.jobs, work / "trace.pftrace")
+    write_trace(result.jobs, result.recording.graph.units, work / "trace.pftrace")
     return facts

@@ -1,6 +1,6 @@
 """What does a run lose when its units are killed or stopped, and how soon is it back to its pace?
 
-Rule: real processes get real signals at random moments; what is left behind afterwards is looked for, not assumed.
+Rule: real processes get real signals at random moments; what is left afterwards is looked for, not assumed.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import tempfile
 import threading
 import time
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -20,6 +20,7 @@ from typing import Any
 import psutil
 
 from trilane.errors import BadInputError
+from trilane.pipeline.report import metrics_of
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.fork_server import process_name
 from trilane.pipeline.run import run_pipeline
@@ -32,7 +33,7 @@ FAULTS = ("kill", "stop")
 SHM = Path("/dev/shm")  # noqa: S108 - looked at, not written to
 #: A run is back to its pace with the first of so many frames whose mean distance is at most so many periods.
 PACE_FRAMES, PACE_PERIODS = 5, 1.2
-SPACE = 0.7  # of the mean time between two signals is kept free of others
+SPACE = 0.7  # share of the mean time between two signals in which no other is sent
 WAIT_S = 0.02
 
 
@@ -49,14 +50,13 @@ def measure(
     runtime: str = "auto",
     seed: int = 1,
 ) -> dict[str, Any]:
-    """A run for each unit and fault; give an option once for each value. `fault`: `kill` (SIGKILL, `times` in a run) or
-    `stop` (SIGSTOP for `stop_s` seconds, once). `fps`: frames are released at this rate, for `seconds`. `hang_s`: a
-    unit that says nothing for so long is restarted.
+    """A run for each unit and fault: `kill` (SIGKILL, `times` in a run) or `stop` (SIGSTOP once, for `stop_s` seconds).
 
-    Rows: `signals` sent, `ended` (what of), frames `requested`, `presented`, `lost`, `dropped` and `uncounted`,
-    `lost_per_death`, `restarts`, `ready_ms` (from a unit's death to its being ready again, model load and context
-    included, median), `back_ms` and `back_max_ms` (from the signal to the run's pace), `not_back` (signals after which
-    the next came first), `left`: processes and names in /dev/shm afterwards.
+    Rows: `signals` sent; `ended`: all frames, or why it failed; frames `requested`, `presented`, `lost`, `dropped` and
+    `uncounted` (none of these three); `lost_per_death`; `restarts`; `ready_ms`: from a unit's death until it is ready
+    again, model load and context included, median; `back_ms`, `back_max_ms`: from a signal until the run is back to its
+    pace, median and longest; `not_back`: signals after which the next signal came before the run was back to its pace;
+    `left`: processes and names in /dev/shm afterwards.
 
     Raises BadInputError, MissingPartError.
     """
@@ -64,10 +64,9 @@ def measure(
     frames = round(seconds * fps)
     checked = configure(Request(size=size, avatar=avatar, frames=frames, runtime=runtime), Path.cwd())
     rows = []
-    for one_unit in unit:
-        for one_fault in fault:
-            signals = Signals(one_unit, _moments(one_fault, times, seconds, stop_s, seed))
-            rows.append({"unit": one_unit, "fault": one_fault, **endure(checked.config, signals, frames, fps, hang_s)})
+    for name, kind in product(unit, fault):
+        signals = Signals(name, _moments(kind, times, seconds, stop_s, seed))
+        rows.append({"unit": name, "fault": kind, **run_under(signals, checked.config, frames, fps, hang_s)})
     return {
         "rows": rows,
         "accuracy": dict(checked.accuracy),
@@ -85,8 +84,13 @@ def unit_process(unit: str) -> psutil.Process:
 
 @dataclass
 class Signals(threading.Thread):
-    """Sends each pair of `moments` (seconds from the start, signal) to the process of `unit`. `sent_ns`: when, of those
-    that take something away."""
+    """Sends signals to the process of one unit while a run goes on.
+
+    `unit`: its name.
+    `moments`: (seconds from the first presented frame, signal).
+    `sent_ns`: when each was sent, without those that let a stopped process go on.
+    `begun`, `over`: set by the run with its first frame and at its end.
+    """
 
     unit: str
     moments: list[tuple[float, signal.Signals]]
@@ -122,8 +126,14 @@ class Signals(threading.Thread):
         return id(self)
 
 
-def endure(config: RunConfig, signals: Signals, frames: int, fps: float, hang_s: float) -> dict[str, Any]:
-    """One run under `signals`, as a row."""
+def run_under(signals: Signals, config: RunConfig, frames: int, fps: float, hang_s: float) -> dict[str, Any]:
+    """The row of one run under `signals`.
+
+    `config`: of the run.
+    `frames`: that are requested.
+    `fps`: at which they are released.
+    `hang_s`: after which a unit without a heartbeat is restarted.
+    """
     names = _names()
     children = set(psutil.Process().children(recursive=True))
     with tempfile.TemporaryDirectory(prefix="trilane-bench-") as folder:
@@ -158,7 +168,7 @@ def _row(result: RunResult, signals: Signals, period_ns: int) -> dict[str, Any]:
         "dropped": dropped,
         "uncounted": result.requested - result.presented - lost - dropped,
         "lost_per_death": lost / (deaths(result) or 1),
-        "restarts": result.report["units"][signals.unit]["restarts"],
+        "restarts": metrics_of(result.report).units[signals.unit].restarts,
         "ready_ms": median(ready) if ready else None,
         "back_ms": median(back) if back else None,
         "back_max_ms": max(back) if back else None,
@@ -172,7 +182,12 @@ def presented_ns(result: RunResult) -> list[int]:
 
 
 def back_to_pace_ms(sent_ns: list[int], presented: list[int], period_ns: int) -> list[float]:
-    """Of every signal that was followed by the run's pace before the next one: the time until then."""
+    """Milliseconds from each signal until the run was back to its pace; none where the next signal came before.
+
+    `sent_ns`: when the signals were sent.
+    `presented`: when each frame was presented, in order, ns.
+    `period_ns`: of the run's pace.
+    """
     times = []
     for at_ns, next_ns in pairwise([*sent_ns, presented[-1] + 1 if presented else 0]):
         after = [end_ns for end_ns in presented if at_ns < end_ns < next_ns]
@@ -185,7 +200,7 @@ def back_to_pace_ms(sent_ns: list[int], presented: list[int], period_ns: int) ->
 
 
 def ready_ms(result: RunResult, unit: str) -> list[float]:
-    """From each death of `unit` to its being ready again, back-off included."""
+    """Milliseconds from each death of `unit` until it was ready again, back-off included."""
     times, died_ns = [], None
     for now_ns, events, _ in result.recording.steps:
         for event in events:
@@ -198,12 +213,12 @@ def ready_ms(result: RunResult, unit: str) -> list[float]:
 
 
 def deaths(result: RunResult) -> int:
-    """How often a unit's process ended during the run."""
+    """How often the process of any unit ended during the run."""
     return sum(isinstance(event, UnitDied) for _, events, _ in result.recording.steps for event in events)
 
 
 def _moments(fault: str, times: int, seconds: float, stop_s: float, seed: int) -> list[tuple[float, signal.Signals]]:
-    """When what is sent."""
+    """(seconds, signal) of each."""
     draw = random.Random(seed)
     if fault == "stop":
         at_s = seconds * draw.uniform(0.1, 0.3)
@@ -235,6 +250,6 @@ def _check(
         ("--stop-s", str(stop_s), 0 < stop_s < 0.7 * seconds, f"more than 0, less than {0.7 * seconds:g}"),
         ("--hang-s", str(hang_s), 0.1 <= hang_s <= 600, "0.1 to 600"),
     )
-    for option, found, passed, expected in tests:
+    for option, value, passed, expected in tests:
         if not passed:
-            raise BadInputError(option, found, expected)
+            raise BadInputError(option, value, expected)

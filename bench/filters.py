@@ -1,6 +1,6 @@
 """What do MIP maps and anisotropic filtering of the neural texture cost, and what do they change?
 
-Rule: one avatar, one view, every filter in turn; a filter's picture is judged against the same ground truth.
+Rule: one avatar, one view, the filters interleaved; every filter's picture is compared with the same ground truth.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import numpy as np
 from trilane.arrays import U8
 from trilane.avatars.bundle import bundle_folder, load_bundle
 from trilane.avatars.reshape import reshaped
-from trilane.bench.fixture import standing
-from trilane.bench.raster import interleaved, summary
-from trilane.bench.several import ground_truth
+from trilane.bench.lib.fixture import standing
+from trilane.bench.lib.ground_truth import ground_truth
+from trilane.bench.lib.timing import interleaved_ms, summary_ms
 from trilane.errors import BadInputError
 from trilane.shapes import BUCKET_STEP
 from trilane.stages.dsp.runtime import RuntimeOptions, load_runtime
@@ -33,29 +33,30 @@ def measure(sizes: tuple[int, ...] = (64, 128, 256, 512), repeats: int = 20) -> 
 
     Keys: `rows`, one per size and filter: `raster_ms` (median), `steps_mean` (mean difference from `linear` over the
     body's bytes), `psnr_db` (of the painted picture; the network was trained with `linear`); `driver`; `config`.
+
     Raises BadInputError, MissingPartError.
     """
     if bad := [side for side in sizes if side % BUCKET_STEP or not BUCKET_STEP <= side <= MAX_SIDE]:
         raise BadInputError("--sizes", str(bad[0]), f"a multiple of {BUCKET_STEP} up to {MAX_SIDE}")
     if repeats < 1:
         raise BadInputError("--repeats", str(repeats), "at least 1")
-    scene = _Subject()
-    rows = [row for side in sizes for row in scene.rows((side, side), repeats)]
+    fixture = _FilterFixture()
+    rows = [row for side in sizes for row in fixture.rows((side, side), repeats)]
     return {
         "rows": rows,
-        "driver": asdict(describe(scene.ctx)),
+        "driver": asdict(describe(fixture.ctx)),
         "config": {"sizes": list(sizes), "repeats": repeats},
     }
 
 
-class _Subject:
+class _FilterFixture:
     """The default avatar drawn with every filter."""
 
     def __init__(self) -> None:
         bundle, assets = load_bundle("default"), load_assets(bundle_folder("default"))
         self._studio, self._image_error = ground_truth(bundle)
         self.ctx, self._network = self._studio.ctx, bundle.read_network()
-        self._subject = standing(assets.texture.shape[2])
+        self._fixture = standing(assets.texture.shape[2])
         self._drawn = {}
         for name in FILTERS:
             packed = PackedPass(self.ctx, assets.texture.shape[2], assets.quantisation, deferred=False, filtering=name)
@@ -64,11 +65,11 @@ class _Subject:
     def rows(self, shape: tuple[int, int], repeats: int) -> list[dict[str, Any]]:
         """One row per filter."""
         tensors = {name: np.empty((1, *shape, drawn[0].channels), np.uint8) for name, drawn in self._drawn.items()}
-        ways = {name: partial(self._draw, name, shape, tensor) for name, tensor in tensors.items()}
-        times = interleaved(ways, repeats)
-        plain, subject = tensors["linear"], self._subject
+        variants = {name: partial(self._draw, name, shape, tensor) for name, tensor in tensors.items()}
+        times = interleaved_ms(variants, repeats)
+        plain, fixture = tensors["linear"], self._fixture
         body = (plain != self._network.input.zero_point).any(axis=-1)
-        truth = self._studio.wardrobe.render(subject.joints, subject.view, subject.projection, shape)
+        truth = self._studio.wardrobe.render(fixture.joints, fixture.view, fixture.projection, shape)
         session = load_runtime("ort").load(reshaped(self._network, *shape), RuntimeOptions(threads=1))
         picture = np.empty((1, *shape, 4), np.uint8)
         rows = []
@@ -78,7 +79,7 @@ class _Subject:
                 {
                     "side": shape[0],
                     "filter": name,
-                    "raster_ms": summary(times[name])["median_ms"],
+                    "raster_ms": summary_ms(times[name])["median_ms"],
                     "steps_mean": float(np.abs(tensor[body].astype(np.int16) - plain[body]).mean()),
                     "psnr_db": float(self._image_error(picture[0], truth).psnr_db),
                 }
@@ -87,7 +88,7 @@ class _Subject:
 
     def _draw(self, name: str, shape: tuple[int, int], tensor: U8) -> None:
         packed, avatar = self._drawn[name]
-        subject = self._subject
-        placement = Placement(subject.joints, subject.projection, (0, 0, *shape))
-        avatar.draw(packed.begin(shape), subject.view, placement)
+        fixture = self._fixture
+        placement = Placement(fixture.joints, fixture.projection, (0, 0, *shape))
+        avatar.draw(packed.begin(shape), fixture.view, placement)
         packed.read_into(shape, tensor.reshape(-1))

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from trilane.bench.handoff_stages import PAUSE_S, READER, check_bytes, handoff_pipeline
-from trilane.bench.handoff_variants import BARE, CHANNELS, SLOT, WRITTEN, Channel
+from trilane.bench.lib.handoff_stages import PAUSE_S, READER, check_bytes, handoff_pipeline
+from trilane.bench.lib.handoff_variants import BARE, CHANNELS, SLOT, WRITTEN, Channel
 from trilane.errors import BadInputError, TrilaneError
 from trilane.hw_profiles.host import host_units
 from trilane.install import install_line

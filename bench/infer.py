@@ -1,6 +1,7 @@
 """How long does a network take on each runtime, run continuously on constant random input?
 
-Rule: the runtimes and ONNX Runtime in FP32 take turns of one period each, on the same cores, in processes of their own.
+Rule: the runtimes and ONNX Runtime in FP32 run interleaved, a period each, on the same cores, in processes of their
+own.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ import onnx
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import read_network
 from trilane.bench import roofline
-from trilane.bench.interleaved import Way, runners
-from trilane.bench.networks import Subject, of_file, untrained, untrained_float
+from trilane.bench.lib.interleaved import Variant, runners
+from trilane.bench.lib.networks import NetworkFixture, fixture_of_file, untrained, untrained_float
 from trilane.errors import BadInputError
 from trilane.hw_profiles.host import sensor_c
 from trilane.shapes import parse_shape
@@ -44,15 +45,15 @@ def measure(
     seconds: float = 5.0,
     period: float = 1.0,
 ) -> dict[str, Any]:
-    """One row per network and runtime. `network`: an .onnx file or a bundle; otherwise untrained ones are made.
+    """One row per network and runtime. Times are those of one frame; FP32 infers one frame at a time in any batch.
 
-    `batch`: frames that are inferred at once; FP32 takes them one at a time, and all times are those of one frame.
+    Rows: the network's settings, `parameters`, `gmac`, `runtime`, `startup_cold_ms` and `startup_warm_ms` (libraries
+    imported and network loaded, with an empty and with a filled cache), `frames`, `min_ms`, `mean_ms`, `p50_ms`,
+    `p90_ms`, `p99_ms`, `max_ms`, `periods` (min, mean, max of each), `int8_over_fp32` (how many times faster than ONNX
+    Runtime in FP32), `share_of_roofline` (of the INT8 peak of this machine, measured in the same bench),
+    `temperature_c` where it can be read.
 
-    Rows: the network's settings, `parameters`, `gmac`, `runtime`, `startup_cold_ms`, `startup_warm_ms` (libraries
-    imported, network loaded, with an empty and with a filled cache), `frames`, `min_ms` `mean_ms` `p50_ms` `p90_ms`
-    `p99_ms` `max_ms`, `periods` of min, mean, max, `int8_over_fp32` (how many times faster than ONNX Runtime in FP32),
-    `share_of_roofline` (of the INT8 peak measured beside), `temperature_c` where it can be read. `threads` 0: one for
-    each core that this process may use. Raises BadInputError, MissingPartError.
+    Raises BadInputError, MissingPartError.
     """
     threads = threads or len(os.sched_getaffinity(0))
     if not 0 < period <= seconds:
@@ -60,28 +61,28 @@ def measure(
     names = [resolve(name) for name in runtime]
     peak = roofline.measure(threads)
     rows: list[dict[str, Any]] = []
-    for subject, twin in _subjects(network, encoder, norm, width, size, batch):
+    for fixture, plain in _fixtures(network, encoder, norm, width, size, batch):
         with tempfile.TemporaryDirectory(prefix="trilane-bench-") as folder:
-            ways = _ways(Path(folder), subject, twin, names, threads, spin)
+            variants = _variants(Path(folder), fixture, plain, names, threads, spin)
             with _cache(Path(folder) / "cache"):
-                taken = _take(ways, seconds, period)
-        rows += _rows(subject, taken, peak["int8_gmac_s"])
+                measured = _measure_periods(variants, seconds, period)
+        rows += _rows(fixture, measured, peak["int8_gmac_s"])
     return {"rows": rows, "roofline": peak, "config": {"threads": threads, "spin": spin, "seconds": seconds}}
 
 
-def _subjects(
+def _fixtures(
     network: str,
     encoder: tuple[str, ...],
     norm: tuple[str, ...],
     width: int,
     size: tuple[str, ...],
     batch: tuple[int, ...],
-) -> Iterator[tuple[Subject, onnx.ModelProto | None]]:
-    """Integer networks, and their twins in float where there is one."""
+) -> Iterator[tuple[NetworkFixture, onnx.ModelProto | None]]:
+    """Integer networks, and each in float where there is one."""
     if network:
         file = read_network(Path(network)) if network.endswith(".onnx") else load_bundle(network).read_network()
         for frames in batch:
-            yield of_file(file, frames), None
+            yield fixture_of_file(file, frames), None
         return
     for one_encoder, one_norm, text, frames in product(encoder, norm, size, batch):
         try:
@@ -92,16 +93,16 @@ def _subjects(
         yield untrained(*settings, batch=frames), untrained_float(*settings)
 
 
-def _ways(
-    folder: Path, subject: Subject, twin: onnx.ModelProto | None, names: list[str], threads: int, spin: bool
-) -> dict[str, Way]:
+def _variants(
+    folder: Path, fixture: NetworkFixture, plain: onnx.ModelProto | None, names: list[str], threads: int, spin: bool
+) -> dict[str, Variant]:
     integer = folder / "integer.onnx"
-    onnx.save(subject.integer.model, integer)
-    ways = {name: Way("runtime", integer, name, threads, spin) for name in names}
-    if twin is not None:
-        onnx.save(twin, folder / "float.onnx")
-        ways[FP32] = Way("ort", folder / "float.onnx", threads=threads)
-    return ways
+    onnx.save(fixture.integer.model, integer)
+    variants = {name: Variant("runtime", integer, name, threads, spin) for name in names}
+    if plain is not None:
+        onnx.save(plain, folder / "float.onnx")
+        variants[FP32] = Variant("ort", folder / "float.onnx", threads=threads)
+    return variants
 
 
 @contextmanager
@@ -118,35 +119,38 @@ def _cache(folder: Path) -> Iterator[None]:
             os.environ[CACHE] = before
 
 
-def _take(ways: dict[str, Way], seconds: float, period: float) -> dict[str, dict[str, Any]]:
-    with runners(ways) as found:
-        cold = {name: runner.startup_ms for name, runner in found.items()}
-    with runners(ways) as found:
-        taken: dict[str, dict[str, Any]] = {
+def _measure_periods(variants: dict[str, Variant], seconds: float, period: float) -> dict[str, dict[str, Any]]:
+    """Start-up times of each variant, and the times of its runs in each period, ms."""
+    with runners(variants) as by_name:
+        cold = {name: runner.startup_ms for name, runner in by_name.items()}
+    with runners(variants) as by_name:
+        measured: dict[str, dict[str, Any]] = {
             name: {"startup_cold_ms": cold[name], "startup_warm_ms": runner.startup_ms, "periods": []}
-            for name, runner in found.items()
+            for name, runner in by_name.items()
         }
         for _ in range(round(seconds / period)):
-            for name, runner in found.items():
-                taken[name]["periods"].append(runner.run_for(period))
-    return taken
+            for name, runner in by_name.items():
+                measured[name]["periods"].append(runner.run_for(period))
+    return measured
 
 
-def _rows(subject: Subject, taken: dict[str, dict[str, Any]], peak_gmac_s: float) -> list[dict[str, Any]]:
-    batches = {name: 1 if name == FP32 else subject.integer.shape[0] for name in taken}
-    periods = {name: [np.divide(times, batches[name]) for times in way["periods"]] for name, way in taken.items()}
-    medians = {name: float(np.median(np.concatenate(found))) for name, found in periods.items()}
+def _rows(fixture: NetworkFixture, measured: dict[str, dict[str, Any]], peak_gmac_s: float) -> list[dict[str, Any]]:
+    batches = {name: 1 if name == FP32 else fixture.integer.shape[0] for name in measured}
+    periods = {
+        name: [np.divide(times, batches[name]) for times in facts["periods"]] for name, facts in measured.items()
+    }
+    medians = {name: float(np.median(np.concatenate(times))) for name, times in periods.items()}
     rows = []
-    for name, way in taken.items():
+    for name, facts in measured.items():
         times = np.concatenate(periods[name])
         row = {
-            **subject.label,
-            "parameters": subject.parameters,
-            "gmac": subject.gmac,
+            **fixture.label,
+            "parameters": fixture.parameters,
+            "gmac": fixture.gmac,
             "runtime": name,
             "batch": batches[name],
-            "startup_cold_ms": way["startup_cold_ms"],
-            "startup_warm_ms": way["startup_warm_ms"],
+            "startup_cold_ms": facts["startup_cold_ms"],
+            "startup_warm_ms": facts["startup_warm_ms"],
             "frames": len(times) * batches[name],
             **{f"p{q}_ms": float(np.percentile(times, q)) for q in (50, 90, 99)},
             **{f"{key}_ms": float(pick(times)) for key, pick in (("min", np.min), ("mean", np.mean), ("max", np.max))},
@@ -156,7 +160,7 @@ def _rows(subject: Subject, taken: dict[str, dict[str, Any]], peak_gmac_s: float
             "temperature_c": sensor_c(),
         }
         if name != FP32:
-            row["share_of_roofline"] = subject.gmac / (medians[name] / 1e3) / peak_gmac_s
+            row["share_of_roofline"] = fixture.gmac / (medians[name] / 1e3) / peak_gmac_s
             row["int8_over_fp32"] = medians[FP32] / medians[name] if FP32 in medians else None
         rows.append(row)
     return rows

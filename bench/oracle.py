@@ -1,6 +1,6 @@
 """How far is the packed pass from the float64 reference?
 
-Rule: poses and views are drawn from one seed, and every figure is over all of them, the worst beside the whole.
+Rule: poses and views come from one seed; every figure is over all of them, and the worst view stands beside it.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.avatars.bundle import bundle_folder
-from trilane.bench import float_raster as oracle
-from trilane.bench.crop import everyday_pose, random_camera
-from trilane.bench.fixture import ENCODING, standing
+from trilane.bench.lib import float_raster
+from trilane.bench.lib.fixture import ENCODING, standing
+from trilane.bench.lib.views import everyday_pose, random_camera
 from trilane.body.body import load_body
 from trilane.body.kinematics import Skeleton
 from trilane.errors import BadInputError
@@ -34,7 +34,9 @@ def measure(views: int = 100, size: int = 512) -> dict[str, Any]:
 
     Keys: `pixels` (of the reference's mesh), `coverage_differs` (share of them), `within_one_step` (share of the values
     where both cover), `background_bytes_wrong`, the worst view's `worst_coverage` and `worst_within_one`, `bounds`,
-    `driver`, `config`. Raises BadInputError, MissingPartError.
+    `driver`, `config`.
+
+    Raises BadInputError, MissingPartError.
     """
     if views < 1:
         raise BadInputError("--views", str(views), "at least 1")
@@ -57,11 +59,12 @@ def measure(views: int = 100, size: int = 512) -> dict[str, Any]:
 
 
 def _compare(ctx: Any, views: int, shape: tuple[int, int]) -> NDArray[np.int64]:
-    """A row for each view: mesh pixels, pixels covered by one only, values, those within one step, wrong bytes."""
+    """A row for each view: mesh pixels, pixels that only one covers, values, those within one step, wrong bytes."""
     random = np.random.default_rng(0)
-    subject = standing(CHANNELS)
-    texture = subject.texture.astype(np.float16).astype(np.float64)
-    mesh = SkinnedMesh(ctx, subject.arrays)
+    fixture = standing(CHANNELS)
+    arrays = fixture.arrays
+    texture = fixture.texture.astype(np.float16).astype(np.float64)
+    mesh = SkinnedMesh(ctx, arrays)
     packed = PackedPass(ctx, CHANNELS, ENCODING, deferred=not describe(ctx).hardware)
     avatar, coverage = PackedAvatar(packed, mesh, texture), UvRaster(ctx, mesh)
     body = load_body(bundle_folder("default") / "body.npz")
@@ -73,9 +76,9 @@ def _compare(ctx: Any, views: int, shape: tuple[int, int]) -> NDArray[np.int64]:
         avatar.draw(packed.begin(shape), EYE, Placement(joints, clip, (0, 0, *shape)))
         packed.read_into(shape, tensor.reshape(-1))
         covered = coverage.render(joints, EYE, clip, shape)[..., 2] > 0
-        world = oracle.skin(subject.arrays, joints)
-        image = oracle.rasterise(world, subject.arrays.triangles, subject.arrays.uv, clip, shape, subject.arrays.closed)
-        expected = oracle.tensor(image, texture, ENCODING.scale, ENCODING.zero_point)
+        world = float_raster.skin(arrays, joints)
+        image = float_raster.rasterise(world, arrays.triangles, arrays.uv, clip, shape, arrays.closed)
+        expected = float_raster.tensor(image, texture, ENCODING.scale, ENCODING.zero_point)
         steps = np.abs(tensor.astype(np.int16) - expected)[covered & image.coverage]
         wrong = (tensor[~covered] != ENCODING.zero_point).sum()
         differs = (covered != image.coverage).sum()

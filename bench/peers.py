@@ -1,6 +1,6 @@
 """Are Trilane's runtimes as fast as the libraries themselves, and how far from what the machine can do?
 
-Rule: the libraries are run as their first examples run them; ours on as many threads; all take turns.
+Rule: the libraries run as their first examples run them, ours on as many threads; all run interleaved.
 """
 
 from __future__ import annotations
@@ -18,13 +18,14 @@ import numpy as np
 import onnx
 
 from trilane.bench import roofline
-from trilane.bench.interleaved import Way, runners
-from trilane.bench.networks import untrained, untrained_float
+from trilane.bench.lib.interleaved import Variant, runners
+from trilane.bench.lib.networks import untrained, untrained_float
 from trilane.errors import BadInputError, MissingPartError, TrilaneError
 from trilane.shapes import parse_shape
 from trilane.stages.dsp.runtime import resolve
 from trilane.unexpected import UnexpectedValue
 
+ORT, OPENVINO, FP32 = "trilane ort", "trilane openvino", "onnxruntime fp32"
 APP = "benchmark_app"
 APP_STATS = "benchmark_report.json"
 APP_TIMEOUT_S = 600
@@ -33,11 +34,13 @@ APP_TIMEOUT_S = 600
 def measure(
     width: int = 64, size: str = "512x512", threads: int = 0, turns: int = 8, seconds: int = 2
 ) -> dict[str, Any]:
-    """Ratios of speed (1 is equal, more is faster than what stands after `over`), from medians; `rows` beside.
+    """Ratios of speed from medians: 1 is equal, more is faster than what stands after `over`.
 
     `ratios.ort_over_fp32`, `ratios.openvino_over_fp32`: ours in INT8 over ONNX Runtime in FP32 with its defaults.
     `ratios.openvino_of_roofline`: share of the INT8 peak measured here. `ratios.openvino_over_benchmark_app`: ours
-    over OpenVINO's own tool on the same file. Each way runs for `seconds` in each turn.
+    over OpenVINO's own tool on the same file. `rows`: median and number of runs of each variant. Each variant runs for
+    `seconds` in each round.
+
     Raises MissingPartError without OpenVINO or PyTorch.
     """
     for name in ("openvino", "ort"):
@@ -47,62 +50,63 @@ def measure(
         shape = parse_shape(size)
     except UnexpectedValue as error:
         raise BadInputError.at("--size", error) from error
-    subject = untrained("resnet18", "batch", width, shape)
-    with tempfile.TemporaryDirectory(prefix="trilane-peers-") as name:
-        folder = Path(name)
-        integer, plain = folder / "integer.onnx", folder / "float.onnx"
-        onnx.save(subject.integer.model, integer)
+    fixture = untrained("resnet18", "batch", width, shape)
+    with tempfile.TemporaryDirectory(prefix="trilane-peers-") as folder:
+        integer, plain = Path(folder) / "integer.onnx", Path(folder) / "float.onnx"
+        onnx.save(fixture.integer.model, integer)
         onnx.save(untrained_float("resnet18", "batch", width, shape), plain)
-        ways = {
-            "trilane ort": Way("runtime", integer, "ort", threads),
-            "trilane openvino": Way("runtime", integer, "openvino", threads),
-            "onnxruntime fp32": Way("ort", plain),
-            "onnxruntime int8": Way("ort", integer),
-            "openvino int8": Way("openvino", integer),
-        }
-        times, app = _take(ways, folder, threads, turns, seconds)
+        times = _measure_rounds(_variants(integer, plain, threads), integer, threads, turns, seconds)
     peak = roofline.measure(threads)
-    medians = {key: float(np.median(taken)) for key, taken in times.items()} | {APP: float(np.median(app))}
-    ours = medians["trilane openvino"]
+    medians = {name: float(np.median(times_ms)) for name, times_ms in times.items()}
+    ours = medians[OPENVINO]
     return {
         "ratios": {
-            "ort_over_fp32": medians["onnxruntime fp32"] / medians["trilane ort"],
-            "openvino_over_fp32": medians["onnxruntime fp32"] / ours,
-            "openvino_of_roofline": subject.gmac / (ours / 1e3) / peak["int8_gmac_s"],
+            "ort_over_fp32": medians[FP32] / medians[ORT],
+            "openvino_over_fp32": medians[FP32] / ours,
+            "openvino_of_roofline": fixture.gmac / (ours / 1e3) / peak["int8_gmac_s"],
             "openvino_over_benchmark_app": medians[APP] / ours,
         },
-        "rows": [{"way": key, "median_ms": value, "runs": len(times.get(key, app))} for key, value in medians.items()],
-        "gmac": subject.gmac,
+        "rows": [{"way": name, "median_ms": value, "runs": len(times[name])} for name, value in medians.items()],
+        "gmac": fixture.gmac,
         "roofline": peak,
         "config": {"width": width, "size": size, "threads": threads, "turns": turns, "seconds": seconds},
     }
 
 
-def _take(
-    ways: dict[str, Way], folder: Path, threads: int, turns: int, seconds: int
-) -> tuple[dict[str, list[float]], list[float]]:
-    """Milliseconds of each way, and the medians that `benchmark_app` printed, one in each turn."""
-    times: dict[str, list[float]] = {key: [] for key in ways}
-    app: list[float] = []
-    with runners(ways) as found:
-        for _ in range(turns):
-            for key, runner in found.items():
-                times[key] += runner.run_for(seconds)
-            app.append(_benchmark_app(ways["openvino int8"].network, folder, threads, seconds))
-    return times, app
+def _variants(integer: Path, plain: Path, threads: int) -> dict[str, Variant]:
+    return {
+        ORT: Variant("runtime", integer, "ort", threads),
+        OPENVINO: Variant("runtime", integer, "openvino", threads),
+        FP32: Variant("ort", plain),
+        "onnxruntime int8": Variant("ort", integer),
+        "openvino int8": Variant("openvino", integer),
+    }
 
 
-def _benchmark_app(network: Path, folder: Path, threads: int, seconds: int) -> float:
+def _measure_rounds(
+    variants: dict[str, Variant], integer: Path, threads: int, rounds: int, seconds: int
+) -> dict[str, list[float]]:
+    """Milliseconds of each variant's runs; of `benchmark_app`, the median that it printed in each round."""
+    times: dict[str, list[float]] = {name: [] for name in (*variants, APP)}
+    with runners(variants) as by_name:
+        for _ in range(rounds):
+            for name, runner in by_name.items():
+                times[name] += runner.run_for(seconds)
+            times[APP].append(_benchmark_app(integer, threads, seconds))
+    return times
+
+
+def _benchmark_app(network: Path, threads: int, seconds: int) -> float:
     """Median latency in milliseconds by OpenVINO's tool: one request at a time."""
     tool = shutil.which(APP, path=f"{Path(sys.executable).parent}:{os.environ.get('PATH', '')}")
     if tool is None:
         raise MissingPartError(f"{APP} is not there", extra="openvino")
     options = ["-hint", "none", "-api", "sync", "-nthreads", str(threads), "-nstreams", "1", "-t", str(seconds)]
-    report = ["-report_type", "no_counters", "-report_folder", str(folder), "-json_stats"]
+    report = ["-report_type", "no_counters", "-report_folder", str(network.parent), "-json_stats"]
     command = [tool, "-m", str(network), "-d", "CPU", *options, *report]
     try:
         subprocess.run(command, check=True, capture_output=True, timeout=APP_TIMEOUT_S)
-        stats = json.loads((folder / APP_STATS).read_text())
+        stats = json.loads((network.parent / APP_STATS).read_text())
         return float(stats["execution_results"]["latency (ms)"])
     except (OSError, subprocess.SubprocessError, ValueError, KeyError) as error:
         raise TrilaneError(f"{APP} failed: {error}") from error

@@ -1,8 +1,8 @@
 """Does the pipeline keep its slowest unit busy, and what does that gain over one frame at a time?
 
-Rule: every run is paired with its stages alone, measured just before and after on the same cores, and with the
-`sequential` runs before and after it; configurations take turns, many and short, because a machine that is shared
-grows slower and faster within seconds, and a row is the median of its turns.
+Rule: every run is compared with its stages isolated, measured just before and after on the same cores, and with the
+`sequential` runs before and after it. Settings run interleaved in many short rounds, because a shared machine grows
+slower and faster within seconds; a row is the median over the rounds.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ from pathlib import Path
 from statistics import fmean, median
 from typing import Any
 
-from trilane.bench import full_width
+from trilane.bench.lib import full_width
 from trilane.errors import BadInputError, TrilaneError
 from trilane.hw_profiles.host import host_units, usable_cores
+from trilane.pipeline.report import RunMetrics, metrics_of
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run import run_pipeline
 from trilane.scheduler.ledger import JobRecord
@@ -30,14 +31,14 @@ from trilane.unexpected import UnexpectedValue
 
 SEQUENTIAL = "sequential"
 MIN_FRAMES = 20
-ALONE = 16  # frames measured alone in each run
-PACE = 1.25  # of what the slowest unit can do: paced policies are always offered more than they can take
+ALONE = 16  # frames of each run that are measured isolated
+PACE = 1.25  # of the slowest unit's rate: paced policies always get more frames than they can present
 NO_ACCURACY = "untrained: its pictures mean nothing, it is here for its work"
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One configuration of the grid."""
+    """What one row measures."""
 
     avatar: str
     size: str
@@ -57,19 +58,20 @@ def measure(
     runtime: str = "auto",
     video: bool = True,
 ) -> dict[str, Any]:
-    """Policies x edges x cores; give an option once for each value. `avatar`: `default`, a bundle's folder, or
-    `resnet18`, the full-width network untrained (made once, with PyTorch). `cores`: how many the three units have, 0
-    for all of them.
+    """A row for each avatar, size, number of cores, policy and edge; figures are medians over the rounds (`turns`).
 
-    Rows, medians over the turns: `frame_ms`, `fps`, `efficiency` (slowest unit alone / frame time), `slowest` and
-    `alone_ms` (that unit's stages alone), `busiest` unit, its `idle` from its first job's begin to its last one's end
-    and the causes: `starved` (no input), `undispatched` (input, but no free slot, or not told yet), `overhead` (told,
-    but not begun); `gain` over the mean of the `sequential` runs before and after, `bound` sum(t) / max(t): all stages
-    alone beside this run (`all_alone_ms`) and those runs' hand-overs, over the slowest unit's; `gain_of_bound` and
-    the ends of its 95 % interval, `of_bound_low`, `of_bound_high` (of the median over the turns; with fewer than
-    six of them their least and largest). `hops_ms`: what a sequential run takes for a frame beyond its stages.
-    `dropped`, `lost`: frames of all turns. `accuracy`: what the avatar's pictures are worth.
-    `video`: write one, or present nothing. Raises BadInputError, MissingPartError, TrilaneError when a run fails.
+    Rows: `frame_ms`, `fps`; `efficiency`: the slowest unit's stages, isolated, over the frame time; `slowest`: that
+    unit, `alone_ms`: its stages isolated; `busiest`: the unit with the most work, `idle`: its share without a job from
+    its first job's begin to its last one's end, and the causes: `starved` (no input), `undispatched` (input, but no
+    free slot, or not dispatched yet), `overhead` (dispatched, but not begun).
+
+    `gain`: over the mean of the `sequential` runs before and after. `bound`: sum(t) / max(t), where sum(t) is all
+    stages isolated (`all_alone_ms`) and the hand-overs of those sequential runs, and max(t) the slowest unit's stages.
+    `gain_of_bound`: one over the other; `of_bound_low`, `of_bound_high`: the 95 % interval of its median (with fewer
+    than six rounds the least and largest). `hops_ms`: what a sequential run takes for a frame beyond its stages.
+    `dropped`, `lost`: frames of all rounds. `accuracy`: the error of the avatar's pictures.
+
+    Raises BadInputError, MissingPartError, TrilaneError when a run fails.
     """
     if frames < MIN_FRAMES or turns < 1:
         raise BadInputError("bench pipeline", f"--frames {frames}, --turns {turns}", f"at least {MIN_FRAMES} and 1")
@@ -77,19 +79,22 @@ def measure(
     _check(policy, edge, cores)
     rows: list[dict[str, Any]] = []
     accuracy: dict[str, Any] = {}
-    for one_avatar, one_size, count in product(avatar, size, cores):
-        config, accuracy[one_avatar] = _config(one_avatar, one_size, count, frames, runtime, video=video)
-        plans = [Setting(one_avatar, one_size, count, *pair) for pair in _plans(policy, edge)]
-        taken = [_turn(config, plans) for _ in range(turns)]
-        closing = _run(config, plans[0])
-        for turn, after in zip(taken, [*(turn[0] for turn in taken[1:]), closing], strict=True):
-            _compare(turn, after)
-        rows += [_summary(plan, list(turned)) for plan, turned in zip(plans, zip(*taken, strict=True), strict=True)]
-    return {
-        "rows": rows,
-        "accuracy": accuracy,
-        "config": {"frames": frames, "turns": turns, "runtime": config.runtime, "video": video},
-    }
+    for name, tensor_size, count in product(avatar, size, cores):
+        config, accuracy[name] = _config(name, tensor_size, count, frames, runtime, video=video)
+        settings = [Setting(name, tensor_size, count, *pair) for pair in _pairs(policy, edge)]
+        rows += _measure_rounds(config, settings, turns)
+    facts = {"frames": frames, "turns": turns, "runtime": config.runtime, "video": video}
+    return {"rows": rows, "accuracy": accuracy, "config": facts}
+
+
+def _measure_rounds(config: RunConfig, settings: list[Setting], rounds: int) -> list[dict[str, Any]]:
+    """A row for each setting. One more `sequential` run ends the last round."""
+    measured = [_run_round(config, settings) for _ in range(rounds)]
+    closing = _run(config, settings[0])
+    for runs, after in zip(measured, [*(runs[0] for runs in measured[1:]), closing], strict=True):
+        _compare(runs, after)
+    by_setting = zip(*measured, strict=True)
+    return [_summary(setting, list(runs)) for setting, runs in zip(settings, by_setting, strict=True)]
 
 
 def _check(policies: Sequence[str], edges: Sequence[str], cores: Sequence[int]) -> None:
@@ -104,8 +109,8 @@ def _check(policies: Sequence[str], edges: Sequence[str], cores: Sequence[int]) 
         raise BadInputError("--cores", str(list(cores)), f"numbers from 1 to the {have} that this process may use")
 
 
-def _plans(policies: Sequence[str], edges: Sequence[str]) -> list[tuple[str, str]]:
-    """`sequential` first: the others are set against it."""
+def _pairs(policies: Sequence[str], edges: Sequence[str]) -> list[tuple[str, str]]:
+    """Policies and edges; `sequential` first, because the others are compared with it."""
     return [(SEQUENTIAL, "double"), *(pair for pair in product(policies, edges) if pair != (SEQUENTIAL, "double"))]
 
 
@@ -117,16 +122,19 @@ def _config(avatar: str, size: str, cores: int, frames: int, runtime: str, *, vi
     return checked.config.model_copy(update={"units": units, "record": video}), accuracy
 
 
-def _turn(config: RunConfig, plans: list[Setting]) -> list[dict[str, Any]]:
-    """One run of each; the `sequential` one says how much time the paced ones may take."""
-    base = _run(config, plans[0])
-    return [base, *(_run(config, plan, base["alone_ms"]) for plan in plans[1:])]
+def _run_round(config: RunConfig, settings: list[Setting]) -> list[dict[str, Any]]:
+    """One run of each; the `sequential` one sets the pace of the paced ones."""
+    base = _run(config, settings[0])
+    return [base, *(_run(config, setting, base["alone_ms"]) for setting in settings[1:])]
 
 
-def _compare(turn: list[dict[str, Any]], after: dict[str, Any]) -> None:
-    """Set the runs of a turn, `sequential` first, against that one and the one `after` them; itself against itself."""
-    for place, row in enumerate(turn):
-        beside = (turn[0], after if place else turn[0])
+def _compare(runs: list[dict[str, Any]], after: dict[str, Any]) -> None:
+    """Compare the `runs` of a round, `sequential` first, with that one and the one `after` them.
+
+    The `sequential` run is compared with itself.
+    """
+    for place, row in enumerate(runs):
+        beside = (runs[0], after if place else runs[0])
         row["gain"] = fmean(base["frame_ms"] for base in beside) / row["frame_ms"]
         row["bound"] = (row["all_alone_ms"] + fmean(base["hops_ms"] for base in beside)) / row["alone_ms"]
         row["gain_of_bound"] = row["gain"] / row["bound"]
@@ -145,37 +153,38 @@ def _run(config: RunConfig, plan: Setting, alone_ms: float = 0.0) -> dict[str, A
 
 
 def _figures(result: RunResult) -> dict[str, Any]:
-    report = result.report
-    alone = _alone_ms(report)
-    slowest = max(alone, key=alone.__getitem__)
-    stages_ms = sum(float(row["service_ms"]["mean"]) for row in report["stages"].values())
-    busiest = max(report["units"], key=lambda unit: float(report["units"][unit]["busy"]))
+    """The row of one run, before it is compared with others."""
+    metrics = metrics_of(result.report)
+    isolated = _isolated_ms(metrics)
+    slowest = max(isolated, key=isolated.__getitem__)
+    stages_ms = sum(stage.service_ms.mean for stage in metrics.stages.values())
+    busiest = max(metrics.units, key=lambda unit: metrics.units[unit].busy)
     return {
-        "fps": report["fps"],
-        "frame_ms": report["frame_time_ms"]["mean"],
-        "efficiency": report["efficiency"],
+        "fps": metrics.fps,
+        "frame_ms": metrics.frame_time_ms.mean,
+        "efficiency": metrics.efficiency,
         "slowest": slowest,
-        "alone_ms": alone[slowest],
-        "all_alone_ms": sum(alone.values()),
-        "hops_ms": report["frame_time_ms"]["mean"] - stages_ms if report["policy"] == SEQUENTIAL else None,
+        "alone_ms": isolated[slowest],
+        "all_alone_ms": sum(isolated.values()),
+        "hops_ms": metrics.frame_time_ms.mean - stages_ms if metrics.policy == SEQUENTIAL else None,
         "busiest": busiest,
         **idle_between_jobs([job for job in result.jobs if job.unit == busiest]),
-        "in_run_over_alone": _in_run(report, slowest) / alone[slowest],
+        "in_run_over_alone": _in_run_ms(metrics, slowest) / isolated[slowest],
         "dropped": sum(result.dropped.values()),
         "lost": sum(result.lost.values()),
     }
 
 
-def _alone_ms(report: dict[str, Any]) -> dict[str, float]:
-    """Milliseconds of each unit for a frame: its stages alone; the last one is never run alone: as in the run."""
-    times = dict.fromkeys(report["units"], 0.0)
-    for name, stage in report["stages"].items():
-        times[stage["unit"]] += report["isolated_ms"].get(name, stage["service_ms"]["mean"])
+def _isolated_ms(metrics: RunMetrics) -> dict[str, float]:
+    """Milliseconds of each unit for a frame: its stages isolated; the last stage never is and counts as in the run."""
+    times = dict.fromkeys(metrics.units, 0.0)
+    for name, stage in metrics.stages.items():
+        times[stage.unit] += metrics.isolated_ms.get(name, stage.service_ms.mean)
     return times
 
 
-def _in_run(report: dict[str, Any], unit: str) -> float:
-    return sum(float(row["service_ms"]["mean"]) for row in report["stages"].values() if row["unit"] == unit)
+def _in_run_ms(metrics: RunMetrics, unit: str) -> float:
+    return sum(stage.service_ms.mean for stage in metrics.stages.values() if stage.unit == unit)
 
 
 def idle_between_jobs(jobs: Sequence[JobRecord]) -> dict[str, float]:
@@ -185,22 +194,22 @@ def idle_between_jobs(jobs: Sequence[JobRecord]) -> dict[str, float]:
     parts = {"starved": 0, "undispatched": 0, "overhead": 0}
     for before, job in pairwise(ordered):
         ready = min(max(job.ready_ns, before.end_ns), job.begin_ns)
-        told = min(max(job.dispatch_ns, ready), job.begin_ns)
+        dispatched = min(max(job.dispatch_ns, ready), job.begin_ns)
         parts["starved"] += ready - before.end_ns
-        parts["undispatched"] += told - ready
-        parts["overhead"] += job.begin_ns - told
+        parts["undispatched"] += dispatched - ready
+        parts["overhead"] += job.begin_ns - dispatched
     shares = {cause: ns / span for cause, ns in parts.items()}
     return {"idle": sum(shares.values()), **shares}
 
 
-def _summary(plan: Setting, turned: list[dict[str, Any]]) -> dict[str, Any]:
-    """Medians of numbers, the commonest of names, sums of frames."""
+def _summary(setting: Setting, runs: list[dict[str, Any]]) -> dict[str, Any]:
+    """Of the runs of one setting: medians of numbers, the commonest of names, sums of frames."""
     names = ("slowest", "busiest")
     sums = ("dropped", "lost")
-    row: dict[str, Any] = {**vars(plan)}
-    for key in turned[0]:
-        values = [each[key] for each in turned]
+    row: dict[str, Any] = {**vars(setting)}
+    for key in runs[0]:
+        values = [run[key] for run in runs]
         pick: Callable[[list[Any]], Any] = sum if key in sums else median
         row[key] = None if None in values else max(set(values), key=values.count) if key in names else pick(values)
-    row["of_bound_low"], row["of_bound_high"] = median_interval([each["gain_of_bound"] for each in turned])
+    row["of_bound_low"], row["of_bound_high"] = median_interval([run["gain_of_bound"] for run in runs])
     return row

@@ -1,20 +1,20 @@
 """How much faster is one packed pass than a pass for every four channels and a permute?
 
-Rule: both ways draw the same subject in the same process, turn about, and must give the same bytes.
+Rule: all variants draw the same body in the same process, interleaved, and must give the same bytes.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from trilane.bench.fixture import ENCODING, Subject, standing
-from trilane.bench.split_pass import SplitPass
+from trilane.bench.lib.fixture import ENCODING, Fixture, standing
+from trilane.bench.lib.split_pass import SplitPass
+from trilane.bench.lib.timing import interleaved_ms, summary_ms
 from trilane.body.skinning import FrameSkinner
 from trilane.errors import BadInputError, TrilaneError
 from trilane.stages.gpu.context import describe, open_context
@@ -23,39 +23,31 @@ from trilane.stages.gpu.packed import CHANNELS, PackedAvatar, PackedPass, Placem
 from trilane.training.uv_image import UvBytes
 
 MAX_SIDE = 4096
-WARM_UP = 5
-UNEQUAL = 1e-3  # share of bytes that may differ by one step: UVs are interpolated at other places of other targets
+#: The variants whose bytes are compared.
+COMPARED = ("packed", "packed, other way", "split")
+UNEQUAL = 1e-3  # share of bytes that may differ by one step: other targets interpolate UVs at other places
 
 
 def measure(size: int = 512, channels: int = 16, repeats: int = 40, threads: int = 1) -> dict[str, Any]:
-    """Milliseconds of one raster, readback to host memory included; medians of `repeats` turns.
+    """Milliseconds of one raster, readback to host memory included; medians over `repeats`.
 
     Keys: `raster_ms` (the raster stage as a run on this driver does it: where it is software, the CPU unit skins),
-    `packed_ms`, `split_ms`, `ratios.split_over_packed`, `rows` (one per way: median, minimum, p90), `covered`
-    (share of the pixels), `driver`, `config`. Raises BadInputError, MissingPartError; TrilaneError when bytes differ.
+    `packed_ms`, `split_ms`, `ratios.split_over_packed`, `rows` (one per variant: median, minimum, p90), `covered`
+    (share of the pixels), `driver`, `config`.
+
+    Raises BadInputError, MissingPartError; TrilaneError when bytes differ.
     """
     if not 1 <= size <= MAX_SIDE:
         raise BadInputError("--size", str(size), f"1 to {MAX_SIDE}")
     if channels not in CHANNELS:
         raise BadInputError("--channels", str(channels), "4, 8, 12 or 16")
     ctx = open_context(threads)
-    subject = standing(channels)
     deferred = not describe(ctx).hardware
-    ways = {
-        "packed": packed_way(ctx, subject, (size, size), deferred),
-        "packed, other way": packed_way(ctx, subject, (size, size), not deferred),
-        "split": split_way(ctx, subject, (size, size)),
-    }
-    tensors = {name: np.zeros(size * size * channels, np.uint8) for name in ways}
-    turns: dict[str, Callable[[], object]] = {name: partial(way, tensors[name]) for name, way in ways.items()}
-    skinned = np.zeros_like(tensors["packed"])
-    skin, draw = posed_ways(ctx, subject, (size, size), deferred)
-    turns["CPU unit skins: packed"] = partial(draw, skinned)
-    turns["CPU unit skins: skinning"] = skin
-    turns["UV bytes alone"] = partial(uv_way(ctx, subject, (size, size)), np.zeros(size * size * 2, np.uint8))
-    times = interleaved(turns, repeats)
+    tensors = {name: np.zeros(size * size * channels, np.uint8) for name in COMPARED}
+    variants = _variants(ctx, standing(channels), tensors, (size, size), deferred)
+    times = interleaved_ms(variants, repeats)
     _check_equal(tensors)
-    rows = {name: summary(taken) for name, taken in times.items()}
+    rows = {name: summary_ms(times_ms) for name, times_ms in times.items()}
     packed_ms, split_ms = rows["packed"]["median_ms"], rows["split"]["median_ms"]
     as_in_a_run = "CPU unit skins: packed" if deferred else "packed"
     return {
@@ -70,81 +62,89 @@ def measure(size: int = 512, channels: int = 16, repeats: int = 40, threads: int
     }
 
 
-def packed_way(ctx: Any, subject: Subject, shape: tuple[int, int], deferred: bool) -> Callable[[Any], None]:
-    """A function that draws `subject` by the packed pass and reads it into a tensor."""
-    packed = PackedPass(ctx, subject.texture.shape[2], ENCODING, deferred)
-    avatar = PackedAvatar(packed, SkinnedMesh(ctx, subject.arrays), subject.texture)
-    placement = Placement(subject.joints, subject.projection, (0, 0, *shape))
+def _variants(
+    ctx: Any, fixture: Fixture, tensors: dict[str, Any], shape: tuple[int, int], deferred: bool
+) -> dict[str, Callable[[], object]]:
+    """Every variant; those of `COMPARED` write to their own of `tensors`."""
+    draws = (
+        packed_variant(ctx, fixture, shape, deferred),
+        packed_variant(ctx, fixture, shape, not deferred),
+        split_variant(ctx, fixture, shape),
+    )
+    variants: dict[str, Callable[[], object]] = {
+        name: partial(draw, tensors[name]) for name, draw in zip(COMPARED, draws, strict=True)
+    }
+    skin, draw_skinned = skinned_variant(ctx, fixture, shape, deferred)
+    variants["CPU unit skins: packed"] = partial(draw_skinned, np.zeros_like(tensors["packed"]))
+    variants["CPU unit skins: skinning"] = skin
+    uv_bytes = np.zeros(shape[0] * shape[1] * 2, np.uint8)
+    variants["UV bytes alone"] = partial(uv_variant(ctx, fixture, shape), uv_bytes)
+    return variants
 
-    def turn(tensor: Any) -> None:
-        avatar.draw(packed.begin(shape), subject.view, placement)
+
+def packed_variant(ctx: Any, fixture: Fixture, shape: tuple[int, int], deferred: bool) -> Callable[[Any], None]:
+    """A function that draws the body by the packed pass and reads it into a tensor.
+
+    `ctx`: the OpenGL context.
+    `fixture`: the body.
+    `shape`: (height, width) of the tensor.
+    `deferred`: whether UVs are drawn first and the texture is read in a second pass.
+    """
+    packed = PackedPass(ctx, fixture.texture.shape[2], ENCODING, deferred)
+    avatar = PackedAvatar(packed, SkinnedMesh(ctx, fixture.arrays), fixture.texture)
+    placement = Placement(fixture.joints, fixture.projection, (0, 0, *shape))
+
+    def draw_and_read(tensor: Any) -> None:
+        avatar.draw(packed.begin(shape), fixture.view, placement)
         packed.read_into(shape, tensor)
 
-    return turn
+    return draw_and_read
 
 
-def posed_ways(
-    ctx: Any, subject: Subject, shape: tuple[int, int], deferred: bool
+def skinned_variant(
+    ctx: Any, fixture: Fixture, shape: tuple[int, int], deferred: bool
 ) -> tuple[Callable[[], None], Callable[[Any], None]]:
-    """A function that skins `subject` as the CPU unit does, and one that draws what was skinned, packed."""
-    packed = PackedPass(ctx, subject.texture.shape[2], ENCODING, deferred)
-    avatar = PackedAvatar(packed, PosedMesh(ctx, subject.arrays), subject.texture)
-    skinner = FrameSkinner(subject.shaped)
-    vertices = np.empty((len(subject.shaped.vertices), 3), np.float32)
-    placement = Placement(subject.joints, subject.projection, (0, 0, *shape), vertices=vertices)
+    """A function that skins the body as the CPU unit does, and one that draws the skinned body by the packed pass.
+
+    Parameters as in `packed_variant`.
+    """
+    packed = PackedPass(ctx, fixture.texture.shape[2], ENCODING, deferred)
+    avatar = PackedAvatar(packed, PosedMesh(ctx, fixture.arrays), fixture.texture)
+    skinner = FrameSkinner(fixture.shaped)
+    vertices = np.empty((len(fixture.shaped.vertices), 3), np.float32)
+    placement = Placement(fixture.joints, fixture.projection, (0, 0, *shape), vertices=vertices)
 
     def skin() -> None:
-        skinner.skin_into(subject.posed, vertices)
+        skinner.skin_into(fixture.posed, vertices)
 
     def draw(tensor: Any) -> None:
-        avatar.draw(packed.begin(shape), subject.view, placement)
+        avatar.draw(packed.begin(shape), fixture.view, placement)
         packed.read_into(shape, tensor)
 
     skin()
     return skin, draw
 
 
-def split_way(ctx: Any, subject: Subject, shape: tuple[int, int]) -> Callable[[Any], None]:
-    """A function that draws `subject` by the split passes, reads them and permutes."""
-    split = SplitPass(ctx, SkinnedMesh(ctx, subject.arrays), subject.texture, ENCODING, shape)
-    placement = Placement(subject.joints, subject.projection, (0, 0, *shape))
+def split_variant(ctx: Any, fixture: Fixture, shape: tuple[int, int]) -> Callable[[Any], None]:
+    """A function that draws the body by the split passes, reads them and permutes."""
+    split = SplitPass(ctx, SkinnedMesh(ctx, fixture.arrays), fixture.texture, ENCODING, shape)
+    placement = Placement(fixture.joints, fixture.projection, (0, 0, *shape))
 
-    def turn(tensor: Any) -> None:
-        split.draw(subject.view, placement)
+    def draw_and_read(tensor: Any) -> None:
+        split.draw(fixture.view, placement)
         split.read_into(tensor)
 
-    return turn
+    return draw_and_read
 
 
-def uv_way(ctx: Any, subject: Subject, shape: tuple[int, int]) -> Callable[[Any], None]:
-    """A function that draws the UV coordinates of `subject` as two bytes a pixel."""
-    image = UvBytes(ctx, SkinnedMesh(ctx, subject.arrays))
+def uv_variant(ctx: Any, fixture: Fixture, shape: tuple[int, int]) -> Callable[[Any], None]:
+    """A function that draws the UV coordinates of the body as two bytes a pixel."""
+    image = UvBytes(ctx, SkinnedMesh(ctx, fixture.arrays))
 
-    def turn(tensor: Any) -> None:
-        image.render_into(tensor, subject.joints, subject.view, subject.projection, shape)
+    def draw_and_read(tensor: Any) -> None:
+        image.render_into(tensor, fixture.joints, fixture.view, fixture.projection, shape)
 
-    return turn
-
-
-def interleaved(ways: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, list[float]]:
-    """Milliseconds of each way, `repeats` times turn about after a warm-up, so that a busy machine hits all alike."""
-    times: dict[str, list[float]] = {name: [] for name in ways}
-    for turn in range(-WARM_UP, repeats):
-        for name, way in ways.items():
-            start = time.perf_counter_ns()
-            way()
-            if turn >= 0:
-                times[name].append((time.perf_counter_ns() - start) / 1e6)
-    return times
-
-
-def summary(times_ms: list[float]) -> dict[str, float]:
-    """Median, minimum and 90th percentile in milliseconds."""
-    return {
-        "median_ms": float(np.median(times_ms)),
-        "min_ms": float(np.min(times_ms)),
-        "p90_ms": float(np.percentile(times_ms, 90)),
-    }
+    return draw_and_read
 
 
 def _check_equal(tensors: dict[str, Any]) -> None:

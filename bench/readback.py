@@ -1,6 +1,7 @@
-"""Which way of moving pixels between GPU and slot is the fastest on this driver?
+"""Which variant of moving pixels between GPU and slot is the fastest on this driver?
 
-Rule: every way moves the same bytes, turn about: alone, and after a draw that it may hide behind.
+Rule: all variants move the same bytes and run interleaved, once without a draw and once after one, during which a copy
+may go on.
 """
 
 from __future__ import annotations
@@ -12,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from trilane.bench.fixture import ENCODING, standing
-from trilane.bench.gpu_buffering import READBACKS, UPLOADS, Readback, Upload
-from trilane.bench.raster import interleaved, summary
+from trilane.bench.lib.fixture import ENCODING, standing
+from trilane.bench.lib.gpu_buffering import READBACKS, UPLOADS, Readback, Upload
+from trilane.bench.lib.timing import interleaved_ms, summary_ms
 from trilane.errors import TrilaneError
 from trilane.stages.gpu.context import describe, open_context
 from trilane.stages.gpu.mesh import SkinnedMesh
@@ -30,11 +31,14 @@ TIME_SOURCES = {
 def measure(
     sizes: Sequence[int] = SIZES, channels: Sequence[int] = CHANNELS, repeats: int = 20, threads: int = 1
 ) -> dict[str, Any]:
-    """One row for each size, number of channels and way: `kind` (readback, upload), `way`, `lag`, `move`, `turn`.
+    """One row for each size, number of channels and variant: `kind` (readback, upload), `way`, `lag`, `move`, `turn`.
 
-    `move`: the copy alone, when nothing else is left to do (uploads: with a copy to another framebuffer). `turn`: with
-    the draw of the tensor before it. `fastest`: for each kind the way with the smallest sum of medians, of `turn` on a
-    hardware driver and of `move` on a software one, where nothing runs beside the caller. Raises MissingPartError.
+    `lag`: how many frames later the bytes arrive. `move`: the copy isolated, when the GPU has nothing else to do
+    (uploads: with a copy to another framebuffer). `turn`: the copy with the draw of the tensor before it. `fastest`:
+    for each kind the variant with the smallest sum of medians, of `turn` on a hardware driver and of `move` on a
+    software one, where nothing runs beside the caller.
+
+    Raises MissingPartError.
     """
     ctx = open_context(threads)
     driver = describe(ctx)
@@ -54,31 +58,31 @@ def measure(
 
 def _readback_rows(ctx: Any, size: int, channels: int, repeats: int) -> list[dict[str, Any]]:
     shape = (size, size)
-    subject = standing(channels)
+    fixture = standing(channels)
     packed = PackedPass(ctx, channels, ENCODING, deferred=not describe(ctx).hardware)
-    avatar = PackedAvatar(packed, SkinnedMesh(ctx, subject.arrays), subject.texture)
-    placement = Placement(subject.joints, subject.projection, (0, 0, *shape))
-    ways = {name: make(ctx, size * size * channels) for name, make in READBACKS.items()}
+    avatar = PackedAvatar(packed, SkinnedMesh(ctx, fixture.arrays), fixture.texture)
+    placement = Placement(fixture.joints, fixture.projection, (0, 0, *shape))
+    variants = {name: make(ctx, size * size * channels) for name, make in READBACKS.items()}
     tensors = {name: np.zeros(size * size * channels, np.uint8) for name in READBACKS}
 
-    def move(way: Readback, tensor: Any) -> None:
-        way.submit(packed.target(shape).words, (0, 0, size, size), packed.layers, tensor)
+    def move(variant: Readback, tensor: Any) -> None:
+        variant.submit(packed.target(shape).words, (0, 0, size, size), packed.layers, tensor)
 
-    def turn(way: Readback, tensor: Any) -> None:
-        avatar.draw(packed.begin(shape), subject.view, placement)
-        move(way, tensor)
+    def turn(variant: Readback, tensor: Any) -> None:
+        avatar.draw(packed.begin(shape), fixture.view, placement)
+        move(variant, tensor)
 
-    turns = interleaved({name: partial(turn, way, tensors[name]) for name, way in ways.items()}, repeats)
+    turns = interleaved_ms({name: partial(turn, variant, tensors[name]) for name, variant in variants.items()}, repeats)
     ctx.finish()
-    moves = interleaved({name: partial(move, way, tensors[name]) for name, way in ways.items()}, repeats)
-    for name, way in ways.items():
-        way.drain()
+    moves = interleaved_ms({name: partial(move, variant, tensors[name]) for name, variant in variants.items()}, repeats)
+    for name, variant in variants.items():
+        variant.drain()
         if not np.array_equal(tensors[name], tensors["direct"]):
             raise TrilaneError(f"readback {name} gave other bytes than direct")
     facts = {"kind": "readback", "size": size, "channels": channels}
     return [
-        {**facts, "way": name, "lag": way.lag, "move": summary(moves[name]), "turn": summary(turns[name])}
-        for name, way in ways.items()
+        {**facts, "way": name, "lag": variant.lag, "move": summary_ms(moves[name]), "turn": summary_ms(turns[name])}
+        for name, variant in variants.items()
     ]
 
 
@@ -87,30 +91,30 @@ def _upload_rows(ctx: Any, size: int, repeats: int) -> list[dict[str, Any]]:
     target = ctx.framebuffer([ctx.texture((size, size), 4)])
     textures = {name: ctx.texture((size, size), 4) for name in UPLOADS}
 
-    def move(way: Upload, texture: Any, source: Any) -> None:
-        way.write(texture, image)
+    def move(variant: Upload, texture: Any, source: Any) -> None:
+        variant.write(texture, image)
         ctx.copy_framebuffer(target, source)
         ctx.finish()
 
-    times = interleaved(
+    times = interleaved_ms(
         {
             name: partial(move, make(ctx, image.nbytes), textures[name], ctx.framebuffer([textures[name]]))
             for name, make in UPLOADS.items()
         },
         repeats,
     )
-    found = np.empty_like(image)
+    read = np.empty_like(image)
     for name, texture in textures.items():
-        texture.read_into(found)
-        if not np.array_equal(found, image):
-            raise TrilaneError(f"upload {name} gave other bytes than it took")
+        texture.read_into(read)
+        if not np.array_equal(read, image):
+            raise TrilaneError(f"upload {name} gave other bytes than were written")
     facts = {"kind": "upload", "size": size, "channels": 4, "lag": 0}
-    return [{**facts, "way": name, "move": summary(taken)} for name, taken in times.items()]
+    return [{**facts, "way": name, "move": summary_ms(moves)} for name, moves in times.items()]
 
 
 def _fastest(rows: list[dict[str, Any]], kind: str, figure: str) -> str:
-    ways: dict[str, float] = {}
+    sums: dict[str, float] = {}
     for row in rows:
         if row["kind"] == kind:
-            ways[row["way"]] = ways.get(row["way"], 0.0) + row[figure]["median_ms"]
-    return min(ways, key=lambda way: ways[way])
+            sums[row["way"]] = sums.get(row["way"], 0.0) + row[figure]["median_ms"]
+    return min(sums, key=lambda variant: sums[variant])

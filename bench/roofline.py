@@ -1,6 +1,6 @@
 """What is the most this machine's cores can do, in INT8, in FP32, and from memory?
 
-Rule: a peak is the best that any kernel tried here reached, on layers with nothing in their way; no data sheet is read.
+Rule: a peak is the best rate that any kernel reached here, on layers that suit it; no data sheet is read.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from trilane.bench.interleaved import Way, runners
+from trilane.bench.lib.interleaved import Variant, runners
 from trilane.stages.dsp.runtime import installed
 
 #: (side, channels, kernel): layers whose weights stay in cache and whose channels fill the registers.
 INT8_LAYERS = ((32, 256, 3), (64, 128, 3), (64, 512, 1))
 LAYERS = 4
-RUNS, TURNS = 4, 6
+RUNS, ROUNDS = 4, 6
 MATRIX = 1536
 COPY_BYTES = 128 << 20
 
@@ -29,7 +29,8 @@ COPY_BYTES = 128 << 20
 def measure(threads: int = 0) -> dict[str, Any]:
     """Best rates with `threads` threads; 0: one for each core that this process may use.
 
-    Keys: `int8_gmac_s`, `fp32_gmac_s`, `memory_gb_s`, and `rows` of what was tried.
+    Keys: `int8_gmac_s`, `fp32_gmac_s` (1e9 multiply-accumulates a second), `memory_gb_s` (bytes read and written by one
+    thread), and `rows`: the rate of each INT8 kernel that was tried.
     """
     threads = threads or len(os.sched_getaffinity(0))
     rows = _int8_rows(threads)
@@ -46,29 +47,29 @@ def measure(threads: int = 0) -> dict[str, Any]:
 def _int8_rows(threads: int) -> list[dict[str, Any]]:
     names = [name for name in installed() if name != "qnn"]
     with tempfile.TemporaryDirectory(prefix="trilane-roofline-") as folder:
-        ways, work = {}, {}
+        variants, work = {}, {}
         for side, channels, kernel in INT8_LAYERS:
             path = Path(folder) / f"{side}-{channels}-{kernel}.onnx"
             onnx.save(_layers(side, channels, kernel), path)
             for name in names:
                 key = f"{name} {side}x{side}x{channels} {kernel}x{kernel}"
-                ways[key] = Way(name, path, threads=threads)
+                variants[key] = Variant(name, path, threads=threads)
                 work[key] = LAYERS * (side * channels * kernel) ** 2
-        return [{"kernel": key, "gmac_s": work[key] / 1e6 / ms} for key, ms in _best_ms(ways).items()]
+        return [{"kernel": key, "gmac_s": work[key] / 1e6 / ms} for key, ms in _best_ms(variants).items()]
 
 
 def _best_fp32(threads: int) -> float:
     with tempfile.TemporaryDirectory(prefix="trilane-roofline-") as folder:
         path = Path(folder) / "product.onnx"
         onnx.save(_product(), path)
-        return MATRIX**3 / 1e6 / _best_ms({"fp32": Way("ort", path, threads=threads)})["fp32"]
+        return MATRIX**3 / 1e6 / _best_ms({"fp32": Variant("ort", path, threads=threads)})["fp32"]
 
 
-def _best_ms(ways: dict[str, Way]) -> dict[str, float]:
-    with runners(ways) as found:
-        best = dict.fromkeys(ways, float("inf"))
-        for _ in range(TURNS):
-            for key, runner in found.items():
+def _best_ms(variants: dict[str, Variant]) -> dict[str, float]:
+    with runners(variants) as by_name:
+        best = dict.fromkeys(variants, float("inf"))
+        for _ in range(ROUNDS):
+            for key, runner in by_name.items():
                 best[key] = min(best[key], *runner.run(RUNS))
     return best
 
@@ -77,7 +78,7 @@ def _memory_gb_s() -> float:
     """Bytes read and written a second by a copy far larger than the caches, one thread."""
     source, target = np.ones(COPY_BYTES // 8), np.empty(COPY_BYTES // 8)
     best = float("inf")
-    for _ in range(TURNS):
+    for _ in range(ROUNDS):
         begin = time.perf_counter()
         np.copyto(target, source)
         best = min(best, time.perf_counter() - begin)

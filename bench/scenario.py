@@ -1,7 +1,7 @@
 """Does the pipeline answer as a service should: one query at a time, several, at random moments, all at once?
 
-Rule: the whole pipeline is asked, pose to presented frame; the verdict says valid or why not, and an outside judge can
-be asked for the same load.
+Rule: the whole pipeline is asked, from pose to presented frame. A result is valid or says why not, and MLCommons
+LoadGen can ask for and evaluate the same load.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from trilane.bench.load import PATTERNS, Load, Queries, bound_ms, play, verdict
-from trilane.bench.loadgen import Judge, load_generator
+from trilane.bench.lib.load import PATTERNS, Load, Queries, bound_ms, play, verdict
+from trilane.bench.lib.loadgen import LoadGenPlayer, load_generator
 from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline.requests import FrameRequestQueue
 from trilane.pipeline.run import run_pipeline
@@ -41,10 +41,12 @@ def measure(
     runtime: str = "auto",
     seed: int = 1,
 ) -> dict[str, Any]:
-    """Scenarios x judges; give an option once for each value. `scenario`: single-stream, multi-stream (`samples` frames
-    a query), server (`rate` queries a second at random moments, each within `limit_ms`), offline. `judge`: `trilane`
-    or `loadgen`, MLCommons' own. A row is valid when it lasted `seconds` and has as many queries as its percentile
-    needs, and for a server when few enough were late.
+    """One row for each scenario and each of `judge`: `trilane` or `loadgen`, MLCommons' own.
+
+    Scenarios: single-stream, multi-stream (`samples` frames a query), server (`rate` queries a second at random
+    moments, each to be answered within `limit_ms`), offline. A row's `verdict` is VALID when it lasted `seconds`, has
+    as many queries as its percentile needs, and for a server when few enough were late; `because` says why not.
+    `percentile_ms`: the latency that `percentile` of all queries are within.
 
     Raises BadInputError, MissingPartError, TrilaneError when a run fails.
     """
@@ -55,10 +57,10 @@ def measure(
     rows, summaries = [], {}
     for name in scenario:
         load = Load(name, seconds, rate, limit_ms, samples, seed)
-        for one in judge:
-            row, summary = ask(checked.config, load, one, policy, edge)
+        for evaluated_by in judge:
+            row, summary = run_scenario(checked.config, load, evaluated_by, policy, edge)
             rows.append(row)
-            summaries[f"{name}, {one}"] = summary
+            summaries[f"{name}, {evaluated_by}"] = summary
     return {
         "rows": rows,
         "summaries": {name: text for name, text in summaries.items() if text},
@@ -67,10 +69,19 @@ def measure(
     }
 
 
-def ask(config: RunConfig, load: Load, judge: str, policy: str, edge: str) -> tuple[dict[str, Any], str]:
-    """One run under `load`; its row and LoadGen's summary. Raises TrilaneError when the run fails."""
-    queries = Queries(size=load.samples if load.scenario == "multi-stream" and judge == "trilane" else 1)
-    loadgen = Judge(load, queries) if judge == "loadgen" else None
+def run_scenario(
+    config: RunConfig, load: Load, evaluated_by: str, policy: str, edge: str
+) -> tuple[dict[str, Any], str]:
+    """One run under `load`: its row, and LoadGen's summary where LoadGen evaluates it.
+
+    `config`: of the run.
+    `load`: the pattern and its limits.
+    `evaluated_by`: one of `JUDGES`.
+    `policy`, `edge`: of the scheduler.
+    Raises TrilaneError when the run fails.
+    """
+    queries = Queries(size=load.samples if load.scenario == "multi-stream" and evaluated_by == "trilane" else 1)
+    loadgen = LoadGenPlayer(load, queries) if evaluated_by == "loadgen" else None
     inlet = FrameRequestQueue(
         *((queries.answered, queries.ended) if loadgen is None else (loadgen.answered, loadgen.ended))
     )
@@ -89,14 +100,19 @@ def ask(config: RunConfig, load: Load, judge: str, policy: str, edge: str) -> tu
         raise KeyboardInterrupt
     if player.errors:
         raise player.errors[0]
-    return _row(load, queries, loadgen), loadgen.judged.summary if loadgen is not None else ""
+    return _row(load, queries, loadgen), loadgen.verdict.summary if loadgen is not None else ""
 
 
 @dataclass
 class _Player(threading.Thread):
-    """Asks, on a thread of its own, once the inlet is open; what it raises is kept."""
+    """Asks for frames on a thread of its own.
 
-    inlet: FrameRequestQueue
+    `requests`: of the run; asking begins when it is open.
+    `work`: asks, and waits for the answers.
+    `errors`: what `work` raised.
+    """
+
+    requests: FrameRequestQueue
     work: Callable[[], None]
     errors: list[TrilaneError] = field(default_factory=list)
 
@@ -104,26 +120,26 @@ class _Player(threading.Thread):
         super().__init__(name="player", daemon=True)
 
     def run(self) -> None:
-        self.inlet.is_open.wait()
+        self.requests.is_open.wait()
         try:
             self.work()
         except TrilaneError as error:
             self.errors.append(error)
         finally:
-            self.inlet.end()
+            self.requests.end()
 
     def __hash__(self) -> int:
         return id(self)
 
 
-def _row(load: Load, queries: Queries, loadgen: Judge | None) -> dict[str, Any]:
+def _row(load: Load, queries: Queries, loadgen: LoadGenPlayer | None) -> dict[str, Any]:
     latencies = queries.latencies_ms
     lasted_s = queries.answered_s[-1] - queries.asked_s[0]
     reasons = verdict(load, latencies, lasted_s)
     return {
         "scenario": load.scenario,
         "judge": "trilane" if loadgen is None else "loadgen",
-        "verdict": "VALID" if (loadgen.judged.valid if loadgen is not None else not reasons) else "INVALID",
+        "verdict": "VALID" if (loadgen.verdict.valid if loadgen is not None else not reasons) else "INVALID",
         "queries": len(latencies),
         "seconds": lasted_s,
         "rate": len(latencies) / lasted_s,

@@ -1,6 +1,6 @@
-"""How much does an avatar change when others share its tensor, by the background between them?
+"""How much does an avatar change when others share its tensor, by the width of the background between them?
 
-Rule: the same avatars in the same cells, together and each alone; only the neighbours differ.
+Rule: the same avatars in the same cells, together and each on its own; only the neighbours differ.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import U8
-from trilane.avatars.bundle import Bundle, bundle_folder, load_bundle
+from trilane.avatars.bundle import bundle_folder, load_bundle
 from trilane.avatars.reshape import reshaped
-from trilane.body.body import ShapedBody, load_body
+from trilane.bench.lib.ground_truth import ground_truth, shaped_body
 from trilane.body.kinematics import Skeleton
-from trilane.errors import BadInputError, MissingPartError
+from trilane.errors import BadInputError
 from trilane.scene.schema import AvatarSpec, Scene
 from trilane.scene.staging import stage_scene
 from trilane.shapes import Shape, shape_buckets
@@ -43,7 +43,12 @@ SECONDS = 10.0
 
 @dataclass(frozen=True)
 class _View:
-    """`joints`: of each avatar, (55,3,4). `layout`: of the tensor."""
+    """A moment of the scene.
+
+    `joints`: (55,3,4) of each avatar.
+    `view`, `projection`: (4,4) of the camera.
+    `layout`: of the tensor.
+    """
 
     joints: tuple[NDArray[np.float32], ...]
     view: NDArray[np.float64]
@@ -54,26 +59,29 @@ class _View:
 def measure(
     avatars: int = 3, views: int = 12, size: str = "512", margins: tuple[int, ...] = (0, 4, 8, MARGIN_PX, 24, 32)
 ) -> dict[str, Any]:
-    """The default avatar, `avatars` times in one tensor, in `views` moments of a scene, judged against ground truth.
+    """The default avatar, `avatars` times in one tensor, in `views` moments of a scene, compared with ground truth.
 
-    Keys: `rows`, one per margin in tensor pixels: `loss_db_median`, `loss_db_worst` (PSNR of an avatar alone in its
-    cell minus PSNR with its neighbours), `psnr_db_alone` (median), `bytes_mean`, `bytes_max` (difference of the two
-    pictures inside the cell), `cell_height` (median, tensor pixels); `bound_db`; `margin_px` (of the pipeline);
-    `config`. Raises BadInputError, MissingPartError.
+    Keys: `rows`, one per margin in tensor pixels: `loss_db_median`, `loss_db_worst` (PSNR of an avatar on its own in
+    its cell minus PSNR with its neighbours), `psnr_db_alone` (on its own, median), `bytes_mean`, `bytes_max`
+    (difference of the two pictures inside the cell), `cell_height` (median, tensor pixels); `bound_db`; `margin_px` (of
+    the pipeline); `config`.
+
+    Raises BadInputError, MissingPartError.
     """
     _check(avatars, views, size, margins)
-    stand = _Stand()
+    fixture = _CrowdFixture()
     rows = []
     for margin in margins:
-        found = np.array([row for view in _views(stand, avatars, views, size, margin) for row in stand.compare(view)])
-        together, alone, mean, most, height = found.T
-        loss = alone - together
+        seen = _views(fixture, avatars, views, size, margin)
+        figures = np.array([row for view in seen for row in fixture.compare(view)])
+        together, isolated, mean, most, height = figures.T
+        loss = isolated - together
         rows.append(
             {
                 "margin": margin,
                 "loss_db_median": float(np.median(loss)),
                 "loss_db_worst": float(loss.max()),
-                "psnr_db_alone": float(np.median(alone)),
+                "psnr_db_alone": float(np.median(isolated)),
                 "bytes_mean": float(mean.mean()),
                 "bytes_max": int(most.max()),
                 "cell_height": float(np.median(height)),
@@ -83,7 +91,7 @@ def measure(
     return {"rows": rows, "bound_db": BOUND_DB, "margin_px": MARGIN_PX, "config": config}
 
 
-class _Stand:
+class _CrowdFixture:
     """The default avatar on the GPU, its network, and its ground truth."""
 
     def __init__(self) -> None:
@@ -97,17 +105,17 @@ class _Stand:
         self._bound: dict[Shape, tuple[U8, U8, Binding]] = {}
 
     def compare(self, view: _View) -> list[tuple[float, float, float, float, float]]:
-        """For each avatar: PSNR together, PSNR alone, mean and greatest difference in bytes, its cell's height."""
+        """For each avatar: PSNR together, PSNR on its own, mean and greatest difference in bytes, its cell's height."""
         everyone = self._picture(view, range(len(view.joints)))
         rows = []
         for k, (crop, (top, left, height, width)) in enumerate(view.layout.crops):
             cell = np.s_[top : top + height, left : left + width]
-            together, alone = everyone[cell], self._picture(view, [k])[cell]
+            together, isolated = everyone[cell], self._picture(view, [k])[cell]
             projection = crop_projection(view.projection, crop)
             truth = self._studio.wardrobe.render(view.joints[k], view.view, projection, (height, width))
-            errors = [self._image_error(picture, truth) for picture in (together, alone)]
+            errors = [self._image_error(picture, truth) for picture in (together, isolated)]
             if None not in errors:
-                steps = np.abs(together.astype(np.int16) - alone)
+                steps = np.abs(together.astype(np.int16) - isolated)
                 psnr_db = [error.psnr_db for error in errors]
                 rows.append((*psnr_db, float(steps.mean()), float(steps.max()), float(height)))
         return rows
@@ -135,15 +143,15 @@ class _Stand:
         return self._bound[shape]
 
 
-def _views(stand: _Stand, avatars: int, views: int, size: str, margin: int) -> Iterator[_View]:
+def _views(fixture: _CrowdFixture, avatars: int, views: int, size: str, margin: int) -> Iterator[_View]:
     """Moments in which every avatar is seen, spread over the default motion."""
     specs = tuple(
         AvatarSpec(position=((k - (avatars - 1) / 2) * STEP_M, 0.0, -BACK_M * (k % 2))) for k in range(avatars)
     )
     scene = Scene(avatars=specs)
-    staged = stage_scene(scene, [stand.shaped] * avatars, Path.cwd())
-    skeleton = Skeleton(stand.shaped.joints, stand.shaped.body.parents)
-    bounds = MeshBounds(stand.shaped, standoff_m=STANDOFF_M)
+    staged = stage_scene(scene, [fixture.shaped] * avatars, Path.cwd())
+    skeleton = Skeleton(fixture.shaped.joints, fixture.shaped.body.parents)
+    bounds = MeshBounds(fixture.shaped, standoff_m=STANDOFF_M)
     projection = staged.camera.projection(OUTPUT[1] / OUTPUT[0])
     for t_s in np.linspace(0.0, SECONDS, views, endpoint=False):
         view, rects, joints = staged.camera.sample(t_s), [], []
@@ -155,21 +163,6 @@ def _views(stand: _Stand, avatars: int, views: int, size: str, margin: int) -> I
         if None not in rects:
             seen = [rect for rect in rects if rect is not None]
             yield _View(tuple(joints), view, projection, lay_out(seen, OUTPUT, shape_buckets(size), margin))
-
-
-def ground_truth(bundle: Bundle) -> tuple[Any, Any]:
-    """The bundle's body, dressed, on the GPU, and the `image_error` of two pictures. Raises MissingPartError."""
-    try:
-        from trilane.training.dataset import Studio
-        from trilane.training.metrics import image_error
-    except ImportError as error:
-        raise MissingPartError(f"ground truth needs {error.name}", extra="train") from None
-    return Studio(shaped_body(bundle)), image_error
-
-
-def shaped_body(bundle: Bundle) -> ShapedBody:
-    """The body of `bundle` in the shape that its manifest says."""
-    return load_body(bundle.body_path).shape(bundle.manifest.betas, bundle.manifest.expression)
 
 
 def _check(avatars: int, views: int, size: str, margins: Sequence[int]) -> None:

@@ -153,6 +153,12 @@ def count_work(model: Any) -> Work:
     )
 
 
+def graph_facts(model: Any) -> dict[str, Any]:
+    """`parameters` of the layers as they are in the file, `gmac` of one pass. Raises as `count_work`."""
+    work = count_work(model)
+    return {"parameters": work.weights, "gmac": work.macs / 1e9}
+
+
 def _shapes(model: Any) -> dict[str, tuple[int, ...]]:
     shapes = {i.name: tuple(i.dims) for i in model.graph.initializer}
     known = {v.name for v in model.graph.value_info}

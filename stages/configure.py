@@ -13,7 +13,6 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from trilane.apps.machine import gl_facts, machine_facts
 from trilane.avatars.bundle import Bundle, load_bundle
 from trilane.avatars.network_file import NetworkFile
 from trilane.avatars.split import split
@@ -30,6 +29,7 @@ from trilane.stages.avatar_assets import load_avatar, pack_assets, require_one_t
 from trilane.stages.config import NetworkCut, RunConfig
 from trilane.stages.dsp.runtime import RUNTIMES, installed, resolve
 from trilane.stages.gpu.background import open_background
+from trilane.stages.machine import gl_facts, machine_facts
 
 ROOM = "room"
 COMMAND_LINE = "command line"

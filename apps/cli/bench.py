@@ -122,8 +122,8 @@ def _option(bench: str, parameter: inspect.Parameter) -> Any:
 
 def show(name: str, measure: Callable[..., Mapping[str, Any]], asked: Mapping[str, Any], as_json: bool) -> None:
     """Run `measure` with the options `asked`; print its result and the machine's facts."""
-    from trilane.apps.machine import machine_facts
-    from trilane.bench.limits import check_limits
+    from trilane.bench.lib.limits import check_limits
+    from trilane.stages.machine import machine_facts
 
     check_limits(asked)
     with stderr_console().status(f"measuring {name}"), stdout_kept():

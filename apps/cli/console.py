@@ -10,15 +10,10 @@ import os
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rich.console import Console
-
-JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else there.")]
-
 
 def stderr_console() -> Console:
     """Console for messages and progress. Rich obeys NO_COLOR and plain pipes by itself."""
@@ -36,19 +31,55 @@ def stdout_console() -> Console:
 
 @contextmanager
 def stdout_kept() -> Iterator[None]:
-    """Within it, what libraries write to file descriptor 1 goes to stderr: it is no result."""
+    """Inside the block, what libraries write to file descriptor 1 goes to stderr: it is not a result."""
     sys.stdout.flush()
-    kept = os.dup(1)
+    stdout_copy = os.dup(1)
     os.dup2(2, 1)
     try:
         yield
     finally:
         sys.stdout.flush()
-        os.dup2(kept, 1)
-        os.close(kept)
+        os.dup2(stdout_copy, 1)
+        os.close(stdout_copy)
+
+
+@contextmanager
+def spinner(text: str) -> Iterator[None]:
+    """`text` beside a moving sign while the block runs, when stderr is a terminal."""
+    console = stderr_console()
+    if not console.is_terminal:
+        yield
+        return
+    with console.status(text):
+        yield
 
 
 def print_json(document: Mapping[str, Any]) -> None:
-    """Print `document` as JSON on stdout. Raises ValueError for NaN and infinities, which JSON has not."""
+    """Print `document` as JSON on stdout. Raises ValueError for NaN and infinities, which JSON cannot hold."""
     sys.stdout.write(json.dumps(document, indent=1, allow_nan=False) + "\n")
     sys.stdout.flush()
+
+
+def print_facts(facts: Mapping[str, Any], as_json: bool) -> None:
+    """Print `facts` on stdout: as JSON, or as a table with a row for every key."""
+    if as_json:
+        print_json(facts)
+        return
+    from rich.table import Table
+
+    table = Table(show_header=False, box=None)
+    for key, value in _flat(facts):
+        table.add_row(key, f"{value:.4g}" if isinstance(value, float) else str(value))
+    stdout_console().print(table)
+
+
+def _flat(facts: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Keys of mappings inside joined by dots; entries of a list of mappings under their names."""
+    for key, value in facts.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{key}.")
+        elif isinstance(value, list) and value and isinstance(value[0], dict):
+            for entry in value:
+                yield str(entry.get("name")), {k: v for k, v in entry.items() if k != "name"}
+        else:
+            yield prefix + key, value

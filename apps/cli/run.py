@@ -77,7 +77,7 @@ def _print_outcome(outcome: Outcome, as_json: bool) -> None:
     from trilane.apps.cli.run_table import run_table
 
     if as_json:
-        print_json(outcome.report)
+        print_json(outcome.report.as_json())
     else:
         stdout_console().print(run_table(outcome.report))
     stderr_console().print(f"run folder: {outcome.folder}", soft_wrap=True, markup=False)
@@ -163,6 +163,6 @@ def run(
             facts={"accuracy": dict(checked.accuracy), "notes": list(checked.notes)},
         )
     _print_outcome(outcome, as_json)
-    if outcome.report["failure"]:
-        stderr_console().print(f"the run failed: {outcome.report['failure']}", soft_wrap=True, markup=False)
+    if outcome.report.failure:
+        stderr_console().print(f"the run failed: {outcome.report.failure}", soft_wrap=True, markup=False)
     raise typer.Exit(outcome.exit_code)

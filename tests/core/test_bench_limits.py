@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from trilane.apps.cli.bench import BENCHES, show
-from trilane.bench.limits import LIMITS, check_limits
+from trilane.bench.lib.limits import LIMITS, check_limits
 from trilane.errors import BadInputError
 
 

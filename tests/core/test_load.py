@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilane.bench.load import Load, bound_ms, queries_needed, tail, verdict
+from trilane.bench.lib.load import Load, bound_ms, queries_needed, tail, verdict
 
 
 @pytest.mark.parametrize(("percentile", "late", "queries"), [(0.90, 1, 64), (0.95, 1, 130), (0.99, 1, 662)])

@@ -12,14 +12,39 @@ import pytest
 from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace, TrackEvent
 
 from trilane.apps.cli.run_table import run_table
-from trilane.apps.report import read_report, write_report
+from trilane.apps.report import Report, read_report, write_report
 from trilane.apps.run_folder import RunFolder, default_place
 from trilane.apps.trace import write_trace
 from trilane.errors import BadInputError
 from trilane.scheduler.ledger import JobRecord
 
 TIMES = {"mean": 20.0, "p50": 20.0, "p90": 21.0, "p95": 22.0, "p99": 23.0, "max": 24.0}
-SHARE = {"busy": 0.5, "idle": {"starved": 0.25, "blocked": 0.15, "throttled": 0.0, "overhead": 0.1}}
+SHARE = {
+    "busy": 0.5,
+    "idle": {"starved": 0.25, "blocked": 0.15, "throttled": 0.0, "overhead": 0.1},
+    "jobs": 3,
+    "restarts": 0,
+    "pid": 7,
+    "cores": [2, 3],
+    "threads": 2,
+    "spin": True,
+}
+MACHINE = {
+    "system": "Linux",
+    "python": "3.11",
+    "trilane": None,
+    "scheduler_core": "interpreted",
+    "cpu": {
+        "model": "a processor",
+        "architecture": "x86_64",
+        "flags": ["avx2"],
+        "cores": 4,
+        "cores_allowed": [0, 1, 2, 3],
+    },
+    "memory_bytes": 1 << 34,
+    "gl": None,
+    "packages": {"numpy": "2.0"},
+}
 JOBS = (
     JobRecord("pose", "cpu", 0, 1_000, 1_500, 2_000, 3_000),
     JobRecord("raster", "gpu", 0, 3_000, 3_500, 4_000, 9_000),
@@ -28,9 +53,11 @@ JOBS = (
 
 
 def make_report(**changes: Any) -> dict[str, Any]:
+    """What a run writes, with `changes`."""
+    counts = {"requested": 3, "presented": 3, "lost": 0, "lost_by_cause": {}, "dropped": {"raster->infer:stale": 1}}
     run = {
-        "frames": {"requested": 3, "presented": 3, "lost": 0, "dropped": {"raster->infer:stale": 1}},
-        "frame_time_ms": {**TIMES, "ema20_min": 19.0, "ema20_max": 21.0},
+        "frames": counts,
+        "frame_time_ms": {**TIMES, "ema20_min": 19.0, "ema20_max": 21.0, "jitter": 0.5},
         "latency_ms": TIMES,
         "fps": 50.0,
         "deadline_misses": 0,
@@ -47,15 +74,28 @@ def make_report(**changes: Any) -> dict[str, Any]:
     return {
         "schema": 1,
         "clock": "host",
-        "machine": {"cpu": {"model": "a processor", "flags": ["avx2"]}, "gl": None},
+        "machine": MACHINE,
         "config": config,
-        "plan": {},
-        "temperature_c": {},
-        "caps": {},
-        "idle_cores": "wait awake",
+        "plan": {"tensor_shapes": [[256, 256]]},
+        "caps": {"how": "none"},
         **run,
-        "baseline": {**run, "policy": "sequential", "efficiency": None},
+        "duration_s": 1.0,
+        "xrbench": {"real_time": None, "qoe": 1.0, "energy": None},
+        "isolated_ms": {},
+        "policy": "pipelined",
+        "edge": "double",
+        "idle_cores": "wait awake",
+        "temperature_c": {"sensor": None},
+        "pids": {"dsp": 7},
+        "startup_ms": {"dsp": 1.0},
+        "figures": {"infer": {"a_ms": 1.0}},
+        "messages": [],
+        "interrupted": False,
+        "failure": None,
+        "baseline": {"policy": "sequential", **run, "efficiency": None},
         "accuracy": {"someone": {"psnr_db_by_band": {"face": 31.25}, "iou": 0.9812}},
+        "video": None,
+        "checksum": None,
         **changes,
     }
 
@@ -111,7 +151,7 @@ def test_the_default_place_is_free_and_named_after_the_scene(tmp_path: Path, mon
 
 
 def test_the_trace_has_a_track_per_unit_and_a_flow_per_frame(tmp_path: Path) -> None:
-    write_trace(JOBS, tmp_path / "trace.pftrace")
+    write_trace(JOBS, ("cpu", "gpu", "dsp"), tmp_path / "trace.pftrace")
     trace = Trace()
     trace.ParseFromString((tmp_path / "trace.pftrace").read_bytes())
     tracks = {p.track_descriptor.uuid: p.track_descriptor.name for p in trace.packet if p.HasField("track_descriptor")}
@@ -126,12 +166,51 @@ def test_the_trace_has_a_track_per_unit_and_a_flow_per_frame(tmp_path: Path) -> 
     assert sorted(p.timestamp for p in ends) == [3_000, 5_000, 9_000]
 
 
+def test_tracks_are_in_the_order_of_the_units_of_the_graph(tmp_path: Path) -> None:
+    jobs = [JOBS[0]._replace(unit="npu"), JOBS[1]]
+    write_trace(jobs, ("npu", "isp", "gpu"), tmp_path / "trace.pftrace")
+    trace = Trace()
+    trace.ParseFromString((tmp_path / "trace.pftrace").read_bytes())
+    tracks = [p.track_descriptor for p in trace.packet if p.HasField("track_descriptor")]
+    assert [(track.name, track.sibling_order_rank) for track in tracks[1:]] == [("npu", 0), ("gpu", 2)]
+
+
 def test_a_report_is_read_back_from_its_folder(tmp_path: Path) -> None:
-    write_report(make_report(), tmp_path / "report.json")
+    write_report(Report.model_validate(make_report()), tmp_path / "report.json")
     report = read_report(tmp_path)
     assert report.frames.presented == 3
     assert report.stages["infer"].unit == "dsp"
     assert report.units["dsp"].idle.blocked == 0.15
+
+
+def test_the_file_has_the_keys_that_were_set_in_the_order_of_the_model(tmp_path: Path) -> None:
+    """A `pace`, a `bottleneck` that were never set are absent; whatever order they came in, the file's is one."""
+    document = make_report()
+    write_report(Report.model_validate(document), tmp_path / "report.json")
+    written = json.loads((tmp_path / "report.json").read_text())
+    assert written == document
+    keys = [field.alias or name for name, field in Report.model_fields.items()]
+    assert list(written) == [key for key in keys if key in document]
+    assert keys[:7] == ["schema", "clock", "machine", "config", "plan", "caps", "frames"]
+
+
+@pytest.mark.parametrize("change", [{"speed": 1.0}, {"caps": {"how": "none", "cap": 1}}])
+def test_an_unknown_key_is_never_written(change: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="Extra inputs are not permitted"):
+        Report.model_validate(make_report(**change))
+
+
+def test_a_report_of_a_newer_schema_is_refused_as_such(tmp_path: Path) -> None:
+    (tmp_path / "report.json").write_text(json.dumps({"schema": 2, "everything": "else"}))
+    with pytest.raises(BadInputError, match="schema: found 2, expected 1; a newer Trilane"):
+        read_report(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{", "null"])
+def test_a_file_that_is_no_report_is_a_bad_input(text: str, tmp_path: Path) -> None:
+    (tmp_path / "report.json").write_text(text)
+    with pytest.raises(BadInputError, match=r"report\.json: the document"):
+        read_report(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -151,14 +230,14 @@ def test_a_missing_report_is_a_bad_input(tmp_path: Path) -> None:
 
 def test_a_report_never_holds_nan(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="JSON"):
-        write_report(make_report(fps=float("nan")), tmp_path / "report.json")
+        write_report(Report.model_validate(make_report(fps=float("nan"))), tmp_path / "report.json")
 
 
 def test_the_table_shows_both_policies_and_dashes_what_was_not_measured() -> None:
     from rich.console import Console
 
     console = Console(width=140, record=True, file=io.StringIO())
-    console.print(run_table(make_report()))
+    console.print(run_table(Report.model_validate(make_report())))
     text = console.export_text()
     for expected in (
         "pipelined, 3 frames",

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from trilane.bench import raster, readback
-from trilane.bench.gpu_buffering import READBACKS, UPLOADS
+from trilane.bench.lib.gpu_buffering import READBACKS, UPLOADS
 from trilane.errors import BadInputError, TrilaneError
 from trilane.stages.gpu import gl as raw
 

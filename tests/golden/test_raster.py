@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from trilane.bench import float_raster as oracle
+from trilane.bench.lib import float_raster
 from trilane.body.skinning import FrameSkinner
 from trilane.errors import BadInputError
 from trilane.stages.gpu.mesh import PosedMesh, SkinnedMesh, mesh_arrays
@@ -37,8 +37,10 @@ def compare(gl: Any, arrays: Any, texture: Any, joints: Any, camera: Any, shape:
     tensor = draw(gl, mesh, texture, joints, camera, shape)
     covered = UvRaster(gl, mesh).render(joints, *camera, shape)[..., 2] > 0
     clip = camera[1] @ camera[0]
-    image = oracle.rasterise(oracle.skin(arrays, joints), arrays.triangles, arrays.uv, clip, shape, arrays.closed)
-    expected = oracle.tensor(image, texture, ENCODING.scale, ENCODING.zero_point)
+    image = float_raster.rasterise(
+        float_raster.skin(arrays, joints), arrays.triangles, arrays.uv, clip, shape, arrays.closed
+    )
+    expected = float_raster.tensor(image, texture, ENCODING.scale, ENCODING.zero_point)
     steps = np.abs(tensor.astype(int) - expected)[covered & image.coverage]
     return {
         "pixels": float(image.coverage.sum()),
@@ -186,8 +188,10 @@ def test_degenerate_and_inverted_triangles(gl: Any, neural_texture: Any, camera:
 def test_a_shared_edge_is_drawn_once() -> None:
     """The reference's top-left rule: two triangles through pixel centres leave no gap, and each pixel has one owner."""
     world = np.array([(-1.0, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)])
-    whole = oracle.rasterise(world, np.array([(0, 1, 2), (0, 2, 3)]), world[:, :2], np.eye(4), (8, 8))
-    parts = [oracle.rasterise(world, np.array([t]), world[:, :2], np.eye(4), (8, 8)) for t in ((0, 1, 2), (0, 2, 3))]
+    whole = float_raster.rasterise(world, np.array([(0, 1, 2), (0, 2, 3)]), world[:, :2], np.eye(4), (8, 8))
+    parts = [
+        float_raster.rasterise(world, np.array([t]), world[:, :2], np.eye(4), (8, 8)) for t in ((0, 1, 2), (0, 2, 3))
+    ]
     assert whole.coverage.all()
     assert parts[0].coverage.sum() + parts[1].coverage.sum() == 64
 

@@ -1,4 +1,4 @@
-"""The inference benches on the tiny network: turns in processes of their own, rows that add up, errors by name."""
+"""The inference benches on the tiny network: rounds in processes of their own, rows that add up, errors by name."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import onnx
 import pytest
 
 from trilane.bench import infer, roofline
-from trilane.bench.interleaved import Way, runners
+from trilane.bench.lib.interleaved import Variant, runners
 from trilane.errors import BadInputError, TrilaneError
 
 
@@ -19,17 +19,17 @@ def file(tiny_quantised, tmp_path):
     return path
 
 
-def test_ways_run_in_turns_and_leave_no_process(file):
-    with runners({"ours": Way("runtime", file, "ort", 1), "plain": Way("ort", file, threads=1)}) as found:
-        assert {name: len(runner.run(3)) for name, runner in found.items()} == {"ours": 3, "plain": 3}
-        assert all(runner.startup_ms > 0 for runner in found.values())
+def test_variants_run_interleaved_and_leave_no_process(file):
+    with runners({"ours": Variant("runtime", file, "ort", 1), "plain": Variant("ort", file, threads=1)}) as by_name:
+        assert {name: len(runner.run(3)) for name, runner in by_name.items()} == {"ours": 3, "plain": 3}
+        assert all(runner.startup_ms > 0 for runner in by_name.values())
     assert not multiprocessing.active_children()
 
 
-def test_a_way_that_fails_says_why(tmp_path):
+def test_a_variant_that_fails_says_why(tmp_path):
     with (
         pytest.raises(TrilaneError, match=r"ours.*nothing\.onnx"),
-        runners({"ours": Way("runtime", tmp_path / "nothing.onnx", "ort")}),
+        runners({"ours": Variant("runtime", tmp_path / "nothing.onnx", "ort")}),
     ):
         pass
 

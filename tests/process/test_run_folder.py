@@ -5,11 +5,9 @@ from __future__ import annotations
 import os
 import signal
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from trilane.apps.machine import machine_facts
 from trilane.apps.report import read_report
 from trilane.apps.run_job import Hooks, Outcome, Plan, run_to_folder
 from trilane.errors import TrilaneError
@@ -17,6 +15,7 @@ from trilane.hw_profiles.host import host_units
 from trilane.scene.schema import OutputSpec, Scene
 from trilane.scheduler.recording import read, replay
 from trilane.stages.config import RunConfig
+from trilane.stages.machine import machine_facts
 
 FRAMES = 24
 MOCK = "trilane.testing.doubles"
@@ -47,7 +46,7 @@ def run_mocks(target: Path, listener: Listener, plan: Plan | None = None, frames
     )
     hooks = Hooks(listener.progress, listener.messages.append)
     return run_to_folder(
-        config, target, plan or Plan(baseline_frames=8), hooks, machine=machine_facts(), facts={"x": 1}
+        config, target, plan or Plan(baseline_frames=8), hooks, machine=machine_facts(), facts={"notes": ["x"]}
     )
 
 
@@ -61,14 +60,14 @@ def test_a_run_leaves_one_whole_folder_and_no_process(tmp_path: Path) -> None:
 
 def test_the_report_has_the_keys_of_the_schema_and_the_baseline(tmp_path: Path) -> None:
     report = read_report(run_mocks(tmp_path / "run", Listener()).folder)
-    added: dict[str, Any] = report.model_extra or {}
     assert report.clock == "host"
     assert (report.frames.requested, report.frames.presented, report.frames.lost) == (FRAMES, FRAMES, 0)
-    assert len(set(added["pids"].values())) == 3
-    assert added["baseline"]["policy"] == "sequential"
-    assert added["baseline"]["frames"]["presented"] == 8
-    assert added["baseline"]["fps"] < report.fps
-    assert added["x"] == 1
+    assert len(set(report.pids.values())) == 3
+    assert report.baseline is not None
+    assert report.baseline.policy == "sequential"
+    assert report.baseline.frames.presented == 8
+    assert report.baseline.fps < report.fps
+    assert report.notes == ("x",)
     assert set(report.stages) == {"pose", "raster", "infer", "composite", "present"}
     for unit in report.units.values():
         idle = unit.idle
@@ -81,14 +80,14 @@ def test_the_events_of_a_run_replay_to_the_same_answers(tmp_path: Path) -> None:
 
 
 def test_no_baseline_beside_a_sequential_run(tmp_path: Path) -> None:
-    assert run_mocks(tmp_path / "run", Listener(), Plan("sequential", 8)).report["baseline"] is None
+    assert run_mocks(tmp_path / "run", Listener(), Plan("sequential", 8)).report.baseline is None
 
 
 def test_an_interrupted_run_keeps_what_was_presented(tmp_path: Path) -> None:
     outcome = run_mocks(tmp_path / "run", Listener("pipelined", 1), frames=2000)
     assert outcome.exit_code == 130
-    assert outcome.report["interrupted"]
-    assert outcome.report["baseline"] is None
+    assert outcome.report.interrupted
+    assert outcome.report.baseline is None
     assert 1 <= read_report(outcome.folder).frames.presented < 2000
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
@@ -96,8 +95,8 @@ def test_an_interrupted_run_keeps_what_was_presented(tmp_path: Path) -> None:
 def test_an_interrupted_baseline_loses_nothing_of_the_run(tmp_path: Path) -> None:
     outcome = run_mocks(tmp_path / "run", Listener("sequential", 1), Plan(baseline_frames=2000), frames=500)
     assert outcome.exit_code == 130
-    assert not outcome.report["interrupted"]
-    assert outcome.report["baseline"] is None
+    assert not outcome.report.interrupted
+    assert outcome.report.baseline is None
     assert read_report(outcome.folder).frames.presented == 500
     assert not (outcome.folder / "sequential").exists()
 
@@ -109,8 +108,8 @@ def test_a_stage_that_fails_is_named_and_the_frames_before_it_are_kept(
     listener = Listener()
     outcome = run_mocks(tmp_path / "run", listener, frames=100)  # frame 3 is none of those measured before the run
     assert outcome.exit_code == 2
-    assert "mock.npz" in outcome.report["failure"]
-    assert 1 <= outcome.report["frames"]["presented"] < 100
+    assert "mock.npz" in (outcome.report.failure or "")
+    assert 1 <= outcome.report.frames.presented < 100
     assert any("mock.npz" in message for message in listener.messages)
 
 

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from trilane.bench import handoff, handoff_ways, pipeline, scheduler
+from trilane.bench import handoff, pipeline, scheduler
+from trilane.bench.lib import handoff_variants
 from trilane.errors import BadInputError
 from trilane.scheduler.ledger import JobRecord
 
@@ -53,7 +54,7 @@ def test_a_pipeline_that_cannot_be_measured_is_refused(asked: dict[str, object])
 
 def peers_files() -> set[Path]:
     """What iceoryx2 keeps in memory and on disk."""
-    return {*handoff_ways.SHM.glob("io*"), *Path("/tmp").glob("io*")}  # noqa: S108 - looked at
+    return {*handoff_variants.SHM.glob("io*"), *Path("/tmp").glob("io*")}  # noqa: S108 - looked at
 
 
 def test_every_way_hands_over_the_same_bytes() -> None:

@@ -1,4 +1,4 @@
-"""A reference rasteriser in float64 NumPy: what the GPU stage's pictures are judged by.
+"""A reference rasteriser in float64 NumPy: what the GPU stage's pictures are compared with.
 
 Rule: exact where a driver rounds. Pixel centres at half-integers, top-left rule, less-than depth test, no snapping of
 vertices, no clipping: triangles are evaluated in homogeneous coordinates (Olano and Greer, "Triangle scan conversion
@@ -21,7 +21,7 @@ BATCH_SAMPLES = 4_000_000
 
 
 @dataclass(frozen=True)
-class OracleImage:
+class ReferenceImage:
     """`coverage` (h,w) bool. `triangle` (h,w) int64, -1 outside. `uv` (h,w,2) and `depth` (h,w) float64, 0 outside."""
 
     coverage: NDArray[np.bool_]
@@ -43,9 +43,14 @@ def rasterise(
     clip: F64,
     shape: tuple[int, int],
     cull: bool = False,
-) -> OracleImage:
-    """Draw `triangles` (F,3) of `world` (N,3) with `uv` (N,2) through `clip` = projection @ view (4,4); row 0 on top.
+) -> ReferenceImage:
+    """Draw triangles; row 0 is the top one.
 
+    `world`: (N,3) vertices, metres.
+    `triangles`: (F,3) vertices of each.
+    `uv`: (N,2) of each vertex.
+    `clip`: (4,4), projection @ view.
+    `shape`: (height, width) in pixels.
     `cull`: leave out triangles that wind clockwise in the picture.
     """
     corners = _target_corners(world, clip, shape)[triangles]
@@ -59,7 +64,7 @@ def rasterise(
     image_uv, image_depth = np.zeros((height * width, 2)), np.zeros(height * width)
     coverage[pixel], triangle[pixel], image_depth[pixel] = True, owner[chosen], depth[chosen]
     image_uv[pixel] = np.einsum("pk,pkc->pc", share[chosen], uv.astype(np.float64)[triangles[owner[chosen]]])
-    return OracleImage(
+    return ReferenceImage(
         coverage.reshape(shape), triangle.reshape(shape), image_uv.reshape(*shape, 2), image_depth.reshape(shape)
     )
 
@@ -84,8 +89,13 @@ def quantise(real: F64, scale: float, zero_point: int) -> NDArray[np.uint8]:
     return np.asarray(np.clip(np.rint(real / scale) + zero_point, 0, 255), np.uint8)
 
 
-def tensor(image: OracleImage, texture: F64, scale: float, zero_point: int) -> NDArray[np.uint8]:
-    """The network's input (h,w,C) uint8 for `image` and `texture` (H,W,C), zero point outside the mesh."""
+def tensor(image: ReferenceImage, texture: F64, scale: float, zero_point: int) -> NDArray[np.uint8]:
+    """The network's input (h,w,C) uint8.
+
+    `image`: the mesh as it is seen.
+    `texture`: (H,W,C).
+    `scale`, `zero_point`: of the quantisation; the zero point stands outside the mesh.
+    """
     q = np.full((*image.coverage.shape, texture.shape[2]), zero_point, np.uint8)
     q[image.coverage] = quantise(sample(texture, image.uv[image.coverage]), scale, zero_point)
     return q
@@ -148,9 +158,9 @@ def _covered(corners: F64, members: Any, low: Any, side: int, shape: tuple[int, 
     share = value[which, :, y, x]
     share /= share.sum(axis=1, keepdims=True)
     z, w = (np.einsum("pk,pk->p", share, points[which, :, axis]) for axis in (2, 3))
-    kept = (z >= -w) & (z <= w) & (w > 0)
+    in_depth = (z >= -w) & (z <= w) & (w > 0)
     pixel = row[which, y, 0] * shape[1] + column[which, 0, x]
-    return pixel[kept], (z[kept] / w[kept]), members[which][kept], share[kept]
+    return pixel[in_depth], (z[in_depth] / w[in_depth]), members[which][in_depth], share[in_depth]
 
 
 def _cross(points: F64, first: int, second: int) -> F64:

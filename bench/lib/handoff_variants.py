@@ -31,36 +31,36 @@ SHM = Path("/dev/shm")  # noqa: S108 - what iceoryx2 leaves there under our pref
 
 
 class Producer(Protocol):
-    """The end that has the bytes first."""
+    """The end that writes."""
 
     def buffer(self) -> U8:
-        """Where the next bytes are written."""
+        """Where to write the next bytes."""
 
     def hand_over(self) -> None:
-        """They are written: tell the other end, or send them."""
+        """Announce or send the bytes that were written to `buffer`."""
 
 
 class Consumer(Protocol):
-    """The end that waits for them."""
+    """The end that reads."""
 
     def receive(self) -> U8:
         """Wait for the next bytes; they may be read until `release`."""
 
     def release(self) -> None:
-        """They were read."""
+        """Give the bytes back after reading them."""
 
 
 class Channel(Protocol):
-    """Made in the parent, sent to both children, opened there."""
+    """A channel from one process to another: made in the parent, sent to both children, opened there."""
 
     def producer(self) -> Producer:
-        """In the child that writes."""
+        """The end of the child that writes, called there."""
 
     def consumer(self) -> Consumer:
-        """In the child that reads."""
+        """The end of the child that reads, called there."""
 
     def close(self) -> None:
-        """In the parent, when both are gone."""
+        """Called in the parent when both children have ended."""
 
 
 class SlotChannel:
@@ -97,27 +97,27 @@ class SlotChannel:
 
 
 class _SlotEnd:
-    def __init__(self, payloads: list[U8], line: JobPipe) -> None:
-        self._payloads, self._line, self._count = payloads, line, 0
+    def __init__(self, payloads: list[U8], job_pipe: JobPipe) -> None:
+        self._payloads, self._job_pipe, self._count = payloads, job_pipe, 0
 
     def buffer(self) -> U8:
         return self._payloads[self._count % SLOTS]
 
     def hand_over(self) -> None:
         slot = self._count % SLOTS
-        self._line.send(RunJob(self._count, 0, self._count, slot, slot, 0))
+        self._job_pipe.send(RunJob(self._count, 0, self._count, slot, slot, 0))
         self._count += 1
 
     def receive(self) -> U8:
         while True:
-            message = self._line.receive()
+            message = self._job_pipe.receive()
             if isinstance(message, RunJob):
                 return self._payloads[message.slot_in]
-            if self._line.ended:
+            if self._job_pipe.ended:
                 raise EOFError
 
     def release(self) -> None:
-        """The acknowledgement gives the slot back."""
+        """Nothing to do: the bench's acknowledgement gives the slot back."""
 
 
 class QueueChannel:
@@ -151,7 +151,7 @@ class _QueueEnd:
         return array
 
     def release(self) -> None:
-        """The array is this process's own."""
+        """Nothing to do: the array belongs to this process."""
 
 
 class ZmqChannel:
@@ -191,14 +191,14 @@ class _ZmqEnd:
         return np.frombuffer(self._socket.recv(), np.uint8)
 
     def release(self) -> None:
-        """The bytes are this process's own."""
+        """Nothing to do: the bytes belong to this process."""
 
 
 class IceoryxChannel:
     """iceoryx2: a loaned sample is written in place and sent, an event wakes the other end. Nothing is copied.
 
-    It keeps some files for the next program of the user; here they have a folder and a prefix of their own, and go.
-    Both are short, because the path of a Unix socket is.
+    iceoryx2 leaves files for the user's next program. Here they get a folder and a prefix of their own and are removed.
+    Both are short, because the path of a Unix socket must be.
     """
 
     def __init__(self, size: int, _context: SpawnContext) -> None:
@@ -215,7 +215,7 @@ class IceoryxChannel:
         return _IceoryxConsumer(self._folder, self._prefix)
 
     def close(self) -> None:
-        """After the children have ended: nothing of theirs is left."""
+        """Remove what iceoryx2 left, once the children have ended."""
         shutil.rmtree(self._folder, ignore_errors=True)
         for left in SHM.glob(f"{self._prefix}*"):
             left.unlink(missing_ok=True)
@@ -271,8 +271,8 @@ class _IceoryxConsumer:
 
 
 SLOT, BARE = "slot", "slot, 256 KiB of it written"
-#: Way -> its channel. `SLOT` is Trilane's, one message from end to end; `BARE` shows it without what writing does to
-#: the caches.
+#: Variant: its channel. `SLOT` is Trilane's, with one message from process to process. `BARE` writes only part of the
+#: slot, which leaves out what writing does to the caches.
 CHANNELS: dict[str, Callable[[int, SpawnContext], Channel]] = {
     SLOT: SlotChannel,
     BARE: SlotChannel,
@@ -280,5 +280,5 @@ CHANNELS: dict[str, Callable[[int, SpawnContext], Channel]] = {
     "zeromq copied": ZmqChannel,
     "pickled queue": QueueChannel,
 }
-#: Bytes that are written and read of each slot; the other ways: all of them.
+#: Variant: bytes of each slot that are written and read, where it is not all of them.
 WRITTEN = {BARE: 256 * 1024}

@@ -1,4 +1,4 @@
-"""The split baseline: a pass for every four channels, then a permute on the CPU. Kept to be measured against.
+"""The baseline that the packed pass is measured against: a pass for every four channels, then a permute on the CPU.
 
 Rule: it writes the same bytes as the packed pass and shares its mesh, its texture and its triangles.
 """
@@ -17,7 +17,14 @@ from trilane.stages.gpu.packed import Placement, Quantisation, check_texture, te
 
 
 class SplitPass:
-    """Draws one avatar into tensors of `shape` (height, width), RGBA8 by RGBA8. `texture` (H,W,C)."""
+    """Draws one avatar into tensors, RGBA8 by RGBA8.
+
+    `ctx`: the OpenGL context.
+    `mesh`: of the avatar.
+    `texture`: (H,W,C) floats, C a multiple of 4.
+    `quantisation`: of the tensor.
+    `shape`: (height, width) of the tensor in pixels.
+    """
 
     def __init__(
         self,

@@ -1,6 +1,6 @@
-"""MLCommons LoadGen as the judge of a run: it asks, it measures, and its own summary says valid or not.
+"""A run evaluated by MLCommons LoadGen: it asks, it measures, and its own summary says valid or not.
 
-Rule: LoadGen decides when a query comes and what counts; here its queries become frames and the answers go back.
+Rule: LoadGen decides when a query comes and what counts; here its queries become frames, and the answers go back.
 """
 
 from __future__ import annotations
@@ -13,64 +13,72 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from trilane.bench.load import WARM_UP, Load, Queries, queries_needed
+from trilane.bench.lib.load import WARM_UP, Load, Queries, queries_needed
 from trilane.errors import MissingPartError, TrilaneError
 from trilane.pipeline.requests import FrameRequestQueue
 
 NAMES = {"single-stream": "SingleStream", "multi-stream": "MultiStream", "server": "Server", "offline": "Offline"}
 VERDICT = re.compile(r"^Result is : (\w+)", re.MULTILINE)
-SAMPLES = 64  # LoadGen draws from as many; every one is the motion's next frame
+SAMPLES = 64  # of the library that LoadGen draws from; whichever it draws, the motion's next frame is presented
 SUMMARY = "mlperf_log_summary.txt"
 
 
 def load_generator() -> Any:
-    """The module. Raises MissingPartError."""
+    """The module `mlperf_loadgen`. Raises MissingPartError."""
     try:
         return importlib.import_module("mlperf_loadgen")
     except ImportError:
-        raise MissingPartError("LoadGen, the judge, is not installed", extra="loadgen") from None
+        raise MissingPartError("LoadGen is not installed", extra="loadgen") from None
 
 
 @dataclass
-class Judged:
-    """LoadGen's word: `valid`, and its `summary` as it wrote it."""
+class LoadGenVerdict:
+    """Whether LoadGen calls the run `valid`, and its `summary` as it wrote it."""
 
     valid: bool = False
     summary: str = ""
 
 
 @dataclass
-class Judge:
-    """Plays `load` by LoadGen into an inlet. `queries` sees the frames too, and says when the run is over early."""
+class LoadGenPlayer:
+    """Lets LoadGen ask a run for frames.
+
+    `load`: the pattern and its limits, handed to LoadGen.
+    `queries`: is told of the frames too, and says when the run is over early.
+    `verdict`: filled by `play`.
+    """
 
     load: Load
     queries: Queries
-    judged: Judged = field(default_factory=Judged)
+    verdict: LoadGenVerdict = field(default_factory=LoadGenVerdict)
     _ids: list[int] = field(default_factory=list)
     _begun: bool = False
 
     def answered(self, frame: int) -> None:
-        """For `FrameRequestQueue`: a frame is a sample of LoadGen's, once the warm-up is over."""
+        """Called by the `FrameRequestQueue`: after the warm-up each frame is a sample of LoadGen's."""
         self.queries.answered(frame)
         if self._begun:
             self._complete(frame - WARM_UP)
 
     def ended(self) -> None:
-        """For `FrameRequestQueue`: LoadGen waits for every answer, so those that will not come are given now."""
+        """Called by the `FrameRequestQueue` when the run is over.
+
+        LoadGen waits for every answer, so queries that will never be answered are completed here.
+        """
         self.queries.ended()
         if self._begun:
             for number in range(len(self.queries.answered_s), len(self._ids)):
                 self._complete(number)
 
-    def play(self, inlet: FrameRequestQueue) -> None:
-        """Warm up, then let LoadGen ask until it has enough. Raises TrilaneError when the run ends first."""
+    def play(self, requests: FrameRequestQueue) -> None:
+        """Warm up, then let LoadGen ask until it has enough answers. Raises TrilaneError when the run ends first."""
         lg = load_generator()
-        self.queries.warm_up(inlet)
+        self.queries.warm_up(requests)
         self._begun = True
 
         def issue(samples: list[Any]) -> None:
             self._ids += [sample.id for sample in samples]
-            self.queries.ask(inlet, len(samples))
+            self.queries.ask(requests, len(samples))
             if self.queries.over:
                 self.ended()
 
@@ -79,14 +87,14 @@ class Judge:
         try:
             with tempfile.TemporaryDirectory(prefix="trilane-loadgen-") as folder:
                 lg.StartTestWithLogSettings(system, library, self._settings(lg), _logs(lg, folder))
-                self.judged.summary = (Path(folder) / SUMMARY).read_text(encoding="utf-8")
+                self.verdict.summary = (Path(folder) / SUMMARY).read_text(encoding="utf-8")
         finally:
             lg.DestroyQSL(library)
             lg.DestroySUT(system)
         if self.queries.over:
             raise TrilaneError("the run ended before LoadGen had its answers")
-        word = VERDICT.search(self.judged.summary)
-        self.judged.valid = word is not None and word[1] == "VALID"
+        line = VERDICT.search(self.verdict.summary)
+        self.verdict.valid = line is not None and line[1] == "VALID"
 
     def _complete(self, number: int) -> None:
         lg = load_generator()

@@ -1,6 +1,6 @@
 """The full-width network of the paper as an avatar: the default avatar's body and texture around untrained weights.
 
-Rule: it is there for its work alone (its pictures mean nothing), is made once and kept with the compiled networks.
+Rule: only its work counts, its pictures mean nothing; it is made once and kept in the folder of compiled networks.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from trilane.avatars.bundle import MANIFEST, Manifest, bundle_folder, load_bundle, network_entry, write_bundle
-from trilane.bench.networks import untrained
+from trilane.bench.lib.networks import untrained
 from trilane.errors import TrilaneError
 from trilane.stages.dsp.runtime import cache_dir
 
@@ -21,7 +21,10 @@ SIDE = 64  # the network is convolutional; a run reshapes it
 
 
 def full_width_bundle() -> Path:
-    """The bundle's folder, made when it is not there yet. Raises MissingPartError without PyTorch, TrilaneError."""
+    """The bundle's folder, made when it is not there yet.
+
+    Raises MissingPartError without PyTorch, TrilaneError when no cache folder can be written.
+    """
     home = cache_dir("bench")
     if home is None:
         raise TrilaneError("the cache folder cannot be written: set XDG_CACHE_HOME to one that can")

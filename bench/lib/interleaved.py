@@ -1,4 +1,4 @@
-"""Runs several ways to infer turn about, each in a process of its own, so that no way's threads disturb another's.
+"""Variants of inference that run interleaved, each in a process of its own: no variant's threads disturb another's.
 
 Rule: only one process computes at a time; the others wait on a pipe.
 """
@@ -23,8 +23,15 @@ WARM_UP = 3
 
 
 @dataclass(frozen=True)
-class Way:
-    """`kind`: a row of `KINDS`. `threads` None: the library's default."""
+class Variant:
+    """One way to infer.
+
+    `kind`: key of `KINDS`.
+    `network`: an ONNX file.
+    `runtime`: of the kind `runtime`, which one.
+    `threads`: None for the library's default.
+    `spin`: whether the threads may spin between runs.
+    """
 
     kind: str
     network: Path
@@ -34,7 +41,7 @@ class Way:
 
 
 class Runner:
-    """The parent's end of one way."""
+    """One variant, as the parent sees it. `startup_ms`: until its network was loaded, imports included."""
 
     def __init__(self, pipe: Connection, name: str) -> None:
         self._pipe, self._name = pipe, name
@@ -67,21 +74,21 @@ class Runner:
 
 
 @contextmanager
-def runners(ways: Mapping[str, Way]) -> Iterator[dict[str, Runner]]:
-    """One waiting process for each way; they end with the block. Raises TrilaneError when one does not start."""
+def runners(variants: Mapping[str, Variant]) -> Iterator[dict[str, Runner]]:
+    """A waiting process for each variant; they end with the block. Raises TrilaneError when one does not start."""
     context = multiprocessing.get_context("spawn")
     processes, pipes = [], []
     try:
-        found = {}
-        for name, way in ways.items():
+        by_name = {}
+        for name, variant in variants.items():
             ours, theirs = context.Pipe()
-            process = context.Process(target=serve, args=(theirs, way), daemon=True)
+            process = context.Process(target=serve, args=(theirs, variant), daemon=True)
             process.start()
             theirs.close()
             processes.append(process)
             pipes.append(ours)
-            found[name] = Runner(ours, name)
-        yield found
+            by_name[name] = Runner(ours, name)
+        yield by_name
     finally:
         for pipe in pipes:
             pipe.close()
@@ -90,11 +97,11 @@ def runners(ways: Mapping[str, Way]) -> Iterator[dict[str, Runner]]:
             process.kill()
 
 
-def serve(pipe: Connection, way: Way) -> None:
-    """The child: load, report the start-up time, then run as often as each message says, until the pipe closes."""
+def serve(pipe: Connection, variant: Variant) -> None:
+    """The child: load, send the start-up time, then run as often as each message says, until `pipe` closes."""
     try:
         begin = time.perf_counter()
-        run = KINDS[way.kind](way)
+        run = KINDS[variant.kind](variant)
         pipe.send((time.perf_counter() - begin) * 1e3)
         for _ in range(WARM_UP):
             run()
@@ -115,26 +122,26 @@ def _timed(run: Callable[[], object], count: int) -> list[float]:
     return times
 
 
-def _runtime(way: Way) -> Callable[[], object]:
-    """Trilane's own way: slots bound once."""
+def _runtime(variant: Variant) -> Callable[[], object]:
+    """As Trilane runs a network: arrays bound once."""
     from trilane.avatars.network_file import read_network
-    from trilane.bench.networks import random_tensor
+    from trilane.bench.lib.networks import random_tensor
     from trilane.stages.dsp.runtime import RuntimeOptions, load_runtime
 
-    network = read_network(way.network)
+    network = read_network(variant.network)
     image = np.zeros((*network.shape[:3], 4), np.uint8)
-    session = load_runtime(way.runtime).load(network, RuntimeOptions(way.threads or 1, way.spin))
+    session = load_runtime(variant.runtime).load(network, RuntimeOptions(variant.threads or 1, variant.spin))
     return session.bind([random_tensor(network)], [image]).run
 
 
-def _ort_default(way: Way) -> Callable[[], object]:
+def _ort_default(variant: Variant) -> Callable[[], object]:
     """As ONNX Runtime's first example does it: a session with defaults, `run` with an array."""
     import onnxruntime
 
     settings = onnxruntime.SessionOptions()
-    if way.threads is not None:
-        settings.intra_op_num_threads = way.threads
-    session = onnxruntime.InferenceSession(str(way.network), settings, providers=["CPUExecutionProvider"])
+    if variant.threads is not None:
+        settings.intra_op_num_threads = variant.threads
+    session = onnxruntime.InferenceSession(str(variant.network), settings, providers=["CPUExecutionProvider"])
     source = session.get_inputs()[0]
     rng = np.random.default_rng(1)
     if source.type == "tensor(uint8)":
@@ -144,18 +151,18 @@ def _ort_default(way: Way) -> Callable[[], object]:
     return lambda: session.run(None, {source.name: feed})
 
 
-def _openvino_default(way: Way) -> Callable[[], object]:
+def _openvino_default(variant: Variant) -> Callable[[], object]:
     """As OpenVINO's first example does it: compile a file, call the model with an array."""
     import openvino
 
-    settings = {} if way.threads is None else {"INFERENCE_NUM_THREADS": way.threads}
-    compiled = openvino.Core().compile_model(str(way.network), "CPU", settings)
+    settings = {} if variant.threads is None else {"INFERENCE_NUM_THREADS": variant.threads}
+    compiled = openvino.Core().compile_model(str(variant.network), "CPU", settings)
     feed = np.random.default_rng(1).integers(0, 256, tuple(compiled.input(0).shape), dtype=np.uint8)
     request = compiled.create_infer_request()
     return lambda: request.infer({0: feed})
 
 
-KINDS: dict[str, Callable[[Way], Callable[[], object]]] = {
+KINDS: dict[str, Callable[[Variant], Callable[[], object]]] = {
     "runtime": _runtime,
     "ort": _ort_default,
     "openvino": _openvino_default,

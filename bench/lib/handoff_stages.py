@@ -18,7 +18,7 @@ from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage
 from trilane.pipeline.stage import UnitContext
 from trilane.transport.packets import Packet
 
-FACTORY = "trilane.bench.handoff_stages:build"
+FACTORY = "trilane.bench.lib.handoff_stages:build"
 PAUSE_S = 0.001
 WRITER, READER = "raster", "infer"
 STAGES = (("pose", "cpu"), (WRITER, "gpu"), (READER, "dsp"), ("present", "cpu"))

@@ -1,6 +1,6 @@
-"""Ways to move pixels between the GPU and a slot, by name.
+"""Variants of moving pixels between the GPU and a slot, by name.
 
-Rule: every way gives the same bytes; they differ in when the caller waits. `lag`: how many submits later they arrive.
+Rule: every variant gives the same bytes; they differ in when the caller waits.
 """
 
 from __future__ import annotations
@@ -17,12 +17,18 @@ RING = 3
 
 
 class Readback(Protocol):
-    """Reads `box` of a framebuffer of 32-bit unsigned words."""
+    """Reads part of a framebuffer of 32-bit unsigned words. `lag`: how many submits later the bytes arrive."""
 
     lag: int
 
     def submit(self, target: Any, box: Box, words: int, tensor: U8) -> None:
-        """Start to read `words` components a pixel into `tensor`, which is filled `lag` submits later."""
+        """Start to read.
+
+        `target`: the framebuffer.
+        `box`: (x, y, width, height) in pixels.
+        `words`: components of a pixel.
+        `tensor`: bytes to fill, `lag` submits later.
+        """
 
     def drain(self) -> None:
         """Fill every tensor that was submitted."""
@@ -71,7 +77,7 @@ class OrphanPboReadback(PboReadback):
 
 
 class RingReadback:
-    """Pixel buffers in turn, each with a fence; the slot is filled when its buffer's turn comes again."""
+    """A ring of pixel buffers, each with a fence; the slot is filled when its buffer is needed again."""
 
     lag = RING - 1
 
@@ -80,7 +86,7 @@ class RingReadback:
         self._waiting: deque[tuple[Any, int, U8]] = deque()
 
     def submit(self, target: Any, box: Box, words: int, tensor: U8) -> None:
-        """Start this read; finish the oldest when all buffers are taken."""
+        """Start this read; finish the oldest when no buffer is free."""
         buffer = self._free.popleft()
         target.read_into(buffer, box, components=words, dtype="u4", alignment=1)
         self._waiting.append((buffer, gl.fence(), tensor))
@@ -126,7 +132,7 @@ class SubUpload:
 
 
 class OrphanUpload:
-    """Through one pixel buffer whose memory is renewed for each frame."""
+    """Through one pixel buffer, with fresh memory for each frame."""
 
     def __init__(self, ctx: Any, most_bytes: int) -> None:
         self._buffer = ctx.buffer(reserve=most_bytes)
@@ -139,7 +145,7 @@ class OrphanUpload:
 
 
 class RingUpload:
-    """Through pixel buffers in turn; one is written again only after its fence."""
+    """Through a ring of pixel buffers; one is written again only after its fence."""
 
     def __init__(self, ctx: Any, most_bytes: int) -> None:
         self._ring: deque[tuple[Any, int | None]] = deque((ctx.buffer(reserve=most_bytes), None) for _ in range(RING))

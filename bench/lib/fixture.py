@@ -1,4 +1,4 @@
-"""What the GPU benches draw: the default body, standing, in a square picture that it fills from top to bottom.
+"""What the GPU benches draw: the default body, standing, as high as a square picture.
 
 Rule: the same numbers every time; only size and channels vary.
 """
@@ -26,8 +26,16 @@ ARMS_DOWN_RAD = 1.1
 
 
 @dataclass(frozen=True)
-class Subject:
-    """`joints` (55,3,4) float32, `view` and `projection` (4,4) float64, `texture` (512,512,C) float64."""
+class Fixture:
+    """The body and how it is seen.
+
+    `shaped`: the body's shape.
+    `posed`: its joints, posed.
+    `arrays`: its mesh for the GPU.
+    `joints`: (55,3,4) float32 skinning matrices.
+    `view`, `projection`: (4,4) float64.
+    `texture`: (512,512,C) float64, the same numbers every time.
+    """
 
     shaped: ShapedBody
     posed: Posed
@@ -38,8 +46,8 @@ class Subject:
     texture: NDArray[np.float64]
 
 
-def standing(channels: int, weights: int = 8) -> Subject:
-    """The subject with `weights` (4, 8 or 12) skin weights a vertex."""
+def standing(channels: int, weights: int = 8) -> Fixture:
+    """The body with arms half down. `channels`: of its texture; `weights`: 4, 8 or 12 skin weights a vertex."""
     body = load_body(bundle_folder("default") / "body.npz")
     shaped = body.shape()
     top = largest_weights(body.weights, weights)
@@ -49,7 +57,7 @@ def standing(channels: int, weights: int = 8) -> Subject:
     posed = Skeleton(shaped.joints, body.parents).pose(pose.ravel(), translation=(0.0, -low, 0.0))
     view = np.eye(4)
     view[:3, 3] = (0.0, -HEIGHT_M, -DISTANCE_M)
-    return Subject(
+    return Fixture(
         shaped=shaped,
         posed=posed,
         arrays=mesh_arrays(shaped.vertices, body.faces, body.uv, body.uv_faces, top.joints, top.weights),

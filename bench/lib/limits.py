@@ -1,5 +1,7 @@
-"""What the options of benches may be. Rule: an option means the same in every bench, so its range stands here once; a
-bench that needs a narrower one says so itself.
+"""Ranges of the benches' options.
+
+Rule: an option means the same in every bench, so its range stands here once; a bench that needs a narrower one checks
+it itself.
 """
 
 from __future__ import annotations
@@ -32,11 +34,11 @@ LIMITS: dict[str, tuple[float, float]] = {
 
 
 def check_limits(asked: Mapping[str, Any]) -> None:
-    """Raises BadInputError for a number of `asked` (option: value or values) that is out of its range."""
-    for option, given in asked.items():
+    """`asked`: value or values of each option. Raises BadInputError for a number that is out of its option's range."""
+    for option, values in asked.items():
         low, high = LIMITS.get(option, (None, None))
         if low is None or high is None:
             continue
-        for value in given if isinstance(given, list | tuple) else (given,):
+        for value in values if isinstance(values, list | tuple) else (values,):
             if not isinstance(value, str) and not low <= value <= high:
                 raise BadInputError(f"--{option}", f"{value:g}", f"{low:g} to {high:g}")

@@ -12,10 +12,10 @@ import numpy as np
 import onnx
 from numpy.typing import NDArray
 
-from trilane.apps.avatar_facts import graph_facts
 from trilane.avatars.network_file import NetworkFile
 from trilane.avatars.reshape import reshaped
 from trilane.errors import MissingPartError
+from trilane.hw_profiles.network_work import graph_facts
 from trilane.training.quantising.quantise import quantise
 
 CALIBRATION_SIDE = 64
@@ -23,8 +23,13 @@ CALIBRATION_FRAMES = 5
 
 
 @dataclass(frozen=True)
-class Subject:
-    """`label`; `integer`: u8 in and out; `parameters` and `gmac` of the network as defined, not as laid out."""
+class NetworkFixture:
+    """A network to be timed.
+
+    `label`: its settings, as they stand in a bench's rows.
+    `integer`: the network with bytes in and out.
+    `parameters`, `gmac`: of the network as it is defined, whatever its file adds for layout.
+    """
 
     label: dict[str, Any]
     integer: NetworkFile
@@ -34,8 +39,16 @@ class Subject:
 
 def untrained(
     encoder: str, norm: str, width: int, size: tuple[int, int], channels: int = 16, batch: int = 1
-) -> Subject:
-    """An untrained network, quantised. Raises MissingPartError without PyTorch, BadInputError for wrong settings."""
+) -> NetworkFixture:
+    """An untrained network, quantised.
+
+    `encoder`, `norm`: see `trilane.training.network.UNet`.
+    `width`: 64 is full; every channel count scales with it.
+    `size`: (height, width) of the tensor in pixels.
+    `channels`: of the tensor.
+    `batch`: frames that are inferred at once.
+    Raises MissingPartError without PyTorch, BadInputError for wrong settings.
+    """
     network, torch = _unet(encoder, norm, width, channels)
     from trilane.training.export import export_onnx
 
@@ -46,26 +59,26 @@ def untrained(
     label = {"encoder": encoder, "norm": norm, "width": width, "size": list(size), "channels": channels}
     macs = _defined_macs(network, torch, channels) * size[0] * size[1]
     parameters = sum(p.numel() for p in network.parameters())
-    return Subject(label, reshaped(quantise(small, frames).network, *size, batch), parameters, macs / 1e9)
+    return NetworkFixture(label, reshaped(quantise(small, frames).network, *size, batch), parameters, macs / 1e9)
 
 
 def untrained_float(encoder: str, norm: str, width: int, size: tuple[int, int], channels: int = 16) -> onnx.ModelProto:
-    """The same network in float, (1, C, H, W) float32. Raises as `untrained`."""
+    """The network that `untrained` quantises, in float: (1, C, H, W) float32. Parameters and errors as there."""
     from trilane.training.export import export_onnx
 
     return export_onnx(_unet(encoder, norm, width, channels)[0], *size)
 
 
-def of_file(network: NetworkFile, batch: int = 1) -> Subject:
-    """A network file as a subject; its work is that of the layers in the file."""
+def fixture_of_file(network: NetworkFile, batch: int = 1) -> NetworkFixture:
+    """`network`, with the work of the layers in its file. `batch`: frames that are inferred at once."""
     facts = graph_facts(network.model)
     size = network.shape[1:3]
     label = {"network": network.where, "size": list(size)}
-    return Subject(label, reshaped(network, *size, batch), facts["parameters"], facts["gmac"])
+    return NetworkFixture(label, reshaped(network, *size, batch), facts["parameters"], facts["gmac"])
 
 
 def random_tensor(network: NetworkFile) -> NDArray[np.uint8]:
-    """(N, H, W, C) random bytes."""
+    """(N, H, W, C) random bytes, the same every time."""
     return np.random.default_rng(1).integers(0, 256, network.shape, dtype=np.uint8)
 
 

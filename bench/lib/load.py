@@ -1,5 +1,7 @@
-"""The four load patterns of MLPerf inference and what makes a result valid. Rule: names, patterns and the number of
-queries that a percentile needs are LoadGen's, so that both can be laid side by side; the warm-up is not counted.
+"""The four load patterns of MLPerf inference and what makes a result valid.
+
+Rule: names, patterns and the number of queries that a percentile needs are LoadGen's, so that results can be compared
+with LoadGen's; the warm-up is not counted.
 
 Reddi et al., MLPerf Inference Benchmark, ISCA 2020, sections III and V.
 """
@@ -18,15 +20,22 @@ from trilane.pipeline.requests import FrameRequestQueue
 
 CONFIDENCE = 0.99
 WARM_UP = 8
-#: Scenario: the percentile of its queries' latency that is judged. Offline is judged by its rate.
+#: Scenario: the percentile of its queries' latency that decides. Offline is decided by its rate.
 PERCENTILES = {"single-stream": 0.90, "multi-stream": 0.99, "server": 0.99, "offline": 0.90}
 STALLED_S = 60.0
 
 
 @dataclass(frozen=True)
 class Load:
-    """`seconds`: least duration. `rate`: queries a second that a server is asked. `limit_ms`: on the percentile of a
-    server's latency. `samples`: frames in a query of multi-stream. `seed`: of the arrivals."""
+    """What is asked of the pipeline.
+
+    `scenario`: key of `PATTERNS`.
+    `seconds`: least duration.
+    `rate`: queries a second of the server scenario.
+    `limit_ms`: of the server scenario, on the percentile of its latency.
+    `samples`: frames in a query of multi-stream.
+    `seed`: of the moments at which a server's queries arrive.
+    """
 
     scenario: str
     seconds: float
@@ -42,11 +51,12 @@ class Load:
 
 @dataclass
 class Queries:
-    """What is asked of a `FrameRequestQueue`, and when it was answered.
+    """When each query was asked of a `FrameRequestQueue` and answered; the thread that asks and the run's share it.
 
-    Shared by the thread that asks and the one that runs.
-
-    A query is `size` frames and is answered with the last of them.
+    `size`: frames of a query, which is answered with the last of them.
+    `asked_s`, `answered_s`: monotonic seconds of the queries that count.
+    `over`: the run has ended.
+    `changed`: notified with every answer and at the end of the run.
     """
 
     size: int = 1
@@ -56,13 +66,13 @@ class Queries:
     changed: threading.Condition = field(default_factory=threading.Condition)
     _frames: int = 0
 
-    def ask(self, inlet: FrameRequestQueue, count: int = 1) -> None:
-        """`count` queries, now."""
+    def ask(self, requests: FrameRequestQueue, count: int = 1) -> None:
+        """Ask `count` queries now."""
         self.asked_s += [time.monotonic()] * count
-        inlet.ask(count * self.size)
+        requests.ask(count * self.size)
 
     def answered(self, _frame: int) -> None:
-        """For `FrameRequestQueue`."""
+        """Called by the `FrameRequestQueue` with each presented frame."""
         with self.changed:
             self._frames += 1
             if self._frames % self.size == 0:
@@ -70,13 +80,16 @@ class Queries:
                 self.changed.notify_all()
 
     def ended(self) -> None:
-        """For `FrameRequestQueue`."""
+        """Called by the `FrameRequestQueue` when the run is over."""
         with self.changed:
             self.over = True
             self.changed.notify_all()
 
     def wait(self) -> None:
-        """Until every query is answered. Raises TrilaneError when the run ends first or nothing moves."""
+        """Wait until every query is answered.
+
+        Raises TrilaneError when the run ends first, or when nothing is answered for `STALLED_S`.
+        """
         with self.changed:
             while len(self.answered_s) < len(self.asked_s) and not self.over:
                 if not self.changed.wait(STALLED_S):
@@ -84,39 +97,44 @@ class Queries:
             if len(self.answered_s) < len(self.asked_s):
                 raise TrilaneError("the run ended before every query was answered")
 
-    def warm_up(self, inlet: FrameRequestQueue) -> None:
-        """A few queries that are not counted."""
-        self.ask(inlet, WARM_UP)
+    def warm_up(self, requests: FrameRequestQueue) -> None:
+        """Ask a few queries that are not counted."""
+        self.ask(requests, WARM_UP)
         self.wait()
-        self.forget()
+        self.restart()
 
-    def forget(self) -> None:
-        """Count from now on."""
+    def restart(self) -> None:
+        """Count only the queries from now on."""
         self.asked_s.clear()
         self.answered_s.clear()
 
     @property
     def latencies_ms(self) -> list[float]:
-        """Of the answered ones, in the order in which they were asked."""
+        """Of the answered queries, in the order in which they were asked."""
         return [(end - begin) * 1e3 for begin, end in zip(self.asked_s, self.answered_s, strict=False)]
 
 
-def play(load: Load, inlet: FrameRequestQueue, queries: Queries) -> None:
-    """Ask as `load` says until it has lasted long enough and has queries enough, and wait for the answers."""
-    queries.warm_up(inlet)
-    PATTERNS[load.scenario](load, inlet, queries)
+def play(load: Load, requests: FrameRequestQueue, queries: Queries) -> None:
+    """Ask as `load` says until the time has passed and there are enough queries, then wait for the answers.
+
+    `load`: the pattern and its limits.
+    `requests`: of the run.
+    `queries`: are filled.
+    """
+    queries.warm_up(requests)
+    PATTERNS[load.scenario](load, requests, queries)
     queries.wait()
 
 
-def _one_at_a_time(load: Load, inlet: FrameRequestQueue, queries: Queries) -> None:
+def _one_at_a_time(load: Load, requests: FrameRequestQueue, queries: Queries) -> None:
     end = time.monotonic() + load.seconds
     needed = queries_needed(load.percentile)
     while time.monotonic() < end or len(queries.asked_s) < needed:
-        queries.ask(inlet)
+        queries.ask(requests)
         queries.wait()
 
 
-def _poisson(load: Load, inlet: FrameRequestQueue, queries: Queries) -> None:
+def _poisson(load: Load, requests: FrameRequestQueue, queries: Queries) -> None:
     gaps = random.Random(load.seed)
     at = time.monotonic()
     end, needed = at + load.seconds, queries_needed(load.percentile)
@@ -124,17 +142,17 @@ def _poisson(load: Load, inlet: FrameRequestQueue, queries: Queries) -> None:
         if queries.over:
             return
         time.sleep(max(0.0, at - time.monotonic()))
-        queries.ask(inlet)
+        queries.ask(requests)
 
 
-def _all_at_once(load: Load, inlet: FrameRequestQueue, queries: Queries) -> None:
-    """As many as last for the time, by the rate that a first few show."""
+def _all_at_once(load: Load, requests: FrameRequestQueue, queries: Queries) -> None:
+    """As many queries as will take the time, by the rate that a first few show."""
     few = queries_needed(load.percentile)
-    queries.ask(inlet, few)
+    queries.ask(requests, few)
     queries.wait()
     rate = few / (queries.answered_s[-1] - queries.asked_s[0])
-    queries.forget()
-    queries.ask(inlet, max(few, math.ceil(1.1 * rate * load.seconds)))
+    queries.restart()
+    queries.ask(requests, max(few, math.ceil(1.1 * rate * load.seconds)))
 
 
 PATTERNS: dict[str, Callable[[Load, FrameRequestQueue, Queries], None]] = {
@@ -146,7 +164,10 @@ PATTERNS: dict[str, Callable[[Load, FrameRequestQueue, Queries], None]] = {
 
 
 def tail(queries: int, late: int, share: float) -> float:
-    """Chance that at most `late` of `queries` are late when each is with probability `share`: the binomial's tail."""
+    """The tail of the binomial distribution: the chance of at most `late` late queries of `queries`.
+
+    `share`: chance of each to be late.
+    """
     logs = [
         math.lgamma(queries + 1)
         - math.lgamma(k + 1)
@@ -159,8 +180,10 @@ def tail(queries: int, late: int, share: float) -> float:
 
 
 def queries_needed(percentile: float, late: int = 1) -> int:
-    """The least number of queries of which `late` may be beyond a limit so that `percentile` of all that could be
-    asked are within it, at `CONFIDENCE`: 64 for 0.90 and 662 for 0.99 with one late query."""
+    """The least number of queries that show, at `CONFIDENCE`, that `percentile` of all queries are within a limit.
+
+    `late` of them may be beyond it: 64 are needed for 0.90, 662 for 0.99, with one late query.
+    """
     low, high = late, late + 1
     while tail(high, late, 1 - percentile) > 1 - CONFIDENCE:
         low, high = high, 2 * high
@@ -171,9 +194,9 @@ def queries_needed(percentile: float, late: int = 1) -> int:
 
 
 def bound_ms(latencies_ms: list[float], percentile: float) -> float | None:
-    """What `percentile` of all latencies are within, at `CONFIDENCE`; None when the queries are too few to say.
+    """The latency that `percentile` of all queries are within, at `CONFIDENCE`; None when there are too few queries.
 
-    Of `late` queries that may be beyond it one fewer is left out, as LoadGen does.
+    It is the k-th largest, k the number of queries that may be late, as in LoadGen.
     """
     if len(latencies_ms) < queries_needed(percentile):
         return None
@@ -184,7 +207,12 @@ def bound_ms(latencies_ms: list[float], percentile: float) -> float | None:
 
 
 def verdict(load: Load, latencies_ms: list[float], lasted_s: float) -> list[str]:
-    """What makes the result invalid, in sentences; none when it is valid."""
+    """What makes the result invalid, in sentences; empty when it is valid.
+
+    `load`: that was asked for.
+    `latencies_ms`: of all queries.
+    `lasted_s`: from the first query to the last answer.
+    """
     needed = queries_needed(load.percentile)
     reasons = []
     if lasted_s < load.seconds:

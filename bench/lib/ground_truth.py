@@ -1,0 +1,27 @@
+"""Ground truth for the benches that need the error of a picture: the default body, clothed, drawn on the GPU.
+
+Rule: it is drawn by what training draws its samples with.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from trilane.avatars.bundle import Bundle
+from trilane.body.body import ShapedBody, load_body
+from trilane.errors import MissingPartError
+
+
+def ground_truth(bundle: Bundle) -> tuple[Any, Any]:
+    """The renderer of the bundle's body, clothed, and the `image_error` of two pictures. Raises MissingPartError."""
+    try:
+        from trilane.training.dataset import Studio
+        from trilane.training.metrics import image_error
+    except ImportError as error:
+        raise MissingPartError(f"ground truth needs {error.name}", extra="train") from None
+    return Studio(shaped_body(bundle)), image_error
+
+
+def shaped_body(bundle: Bundle) -> ShapedBody:
+    """The body of `bundle` in the shape that its manifest says."""
+    return load_body(bundle.body_path).shape(bundle.manifest.betas, bundle.manifest.expression)

@@ -1,0 +1,214 @@
+"""What a run measured, as checked data: the keys of report.json that a run of any pipeline knows.
+
+Rule: the fields stand in the order of the file's keys; an unknown key is an error; an optional field that was not set
+is left out of the file. Times are in ms, shares between 0 and 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from pydantic import Field
+
+from trilane.pipeline.description import Model
+
+
+class Record(Model):
+    """Base of everything that is written to report.json."""
+
+    def as_json(self) -> dict[str, Any]:
+        """The keys that were set, as JSON takes them, in the order of the fields."""
+        return self.model_dump(mode="json", by_alias=True, exclude_unset=True)
+
+
+class FrameCounts(Record):
+    """Frames of a run, counted.
+
+    `requested`: asked for.
+    `presented`: that reached the last stage's end.
+    `lost`: begun and never presented, because a unit died or a stage failed.
+    `lost_by_cause`: the same by `cause:unit`.
+    `dropped`: left out by the policy, by `edge:cause`.
+    """
+
+    requested: int
+    presented: int
+    lost: int
+    lost_by_cause: dict[str, int]
+    dropped: dict[str, int]
+
+
+class TimeSummary(Record):
+    """Statistics of times in ms: `mean`, exact percentiles `p50` to `p99`, and `max`; all 0 when there were none."""
+
+    mean: float
+    p50: float
+    p90: float
+    p95: float
+    p99: float
+    max: float
+
+
+class FrameTimes(TimeSummary):
+    """Times between presented frames, ms.
+
+    `ema20_min`, `ema20_max`: smallest and largest exponential average over 20 frames.
+    `jitter`: mean absolute difference of successive frame times.
+    """
+
+    ema20_min: float
+    ema20_max: float
+    jitter: float
+
+
+class XrBench(Record):
+    """XRBench's scores (Kwon et al., MLSys 2023, section 3), 0 to 1.
+
+    `real_time`: how well frames kept their deadlines; null when none had one.
+    `qoe`: quality of experience, presented over requested frames.
+    `energy`: null where the power is not known.
+    """
+
+    real_time: float | None
+    qoe: float
+    energy: float | None
+
+
+class StageTimes(Record):
+    """One stage. `unit`: that ran it; `service_ms`: of its jobs; `wait_ms`: from a job's input to its begin."""
+
+    unit: str
+    service_ms: TimeSummary
+    wait_ms: TimeSummary
+
+
+class IdleShares(Record):
+    """Why a unit did not work, as shares of the run's time.
+
+    `starved`: it had no input.
+    `blocked`: it had input, but no free output slot, or the limit of frames in flight was reached.
+    `throttled`: its cap held it.
+    `overhead`: a job was on its way to it, or its process was down.
+    """
+
+    starved: float
+    blocked: float
+    throttled: float
+    overhead: float
+
+
+class UnitShares(Record):
+    """One unit; `busy` and the four parts of `idle` sum to 1.
+
+    `busy`: share of the time in which a job ran.
+    `idle`: the rest, by cause.
+    `jobs`: that it ended.
+    `restarts`: new processes after the first.
+    `pid`: of its last process; on the host clock, as the three below.
+    `cores`: that it may use.
+    `threads`: that its stages may use.
+    `spin`: whether those threads may spin between jobs.
+    """
+
+    busy: float
+    idle: IdleShares
+    jobs: int
+    restarts: int
+    pid: int | None = None
+    cores: tuple[int, ...] = ()
+    threads: int = 0
+    spin: bool = False
+
+
+class UnitCap(Record):
+    """The cap of one unit. `corner`: at the run's end; `duty`: share of the time then; `duty_mean`: over the run."""
+
+    corner: str
+    duty: float
+    duty_mean: float
+
+
+class Caps(Record):
+    """What held the units; all but `how` is there when a performance profile was asked for.
+
+    `how`: what a cap is on this clock, or that there was none.
+    `profile`: hardware profile whose corners and limits hold.
+    `performance_profile`: that was asked for.
+    `governor`: name of the rule that lowers and raises corners.
+    `units`: the cap of each.
+    `power_w`: mean modelled power, null when the run was too short for one.
+    `throttled_share`: share of the time in which a unit was below the corner that was asked for.
+    `first_throttled_s`: when that began, null when it never did.
+    """
+
+    how: str
+    profile: str = ""
+    performance_profile: str | None = None
+    governor: str = ""
+    units: dict[str, UnitCap] = Field(default={})
+    power_w: float | None = None
+    throttled_share: float = 0.0
+    first_throttled_s: float | None = None
+
+
+class Temperature(Record):
+    """Degrees Celsius; all but `sensor` is there when the temperature was modelled.
+
+    `kind`: how it was modelled.
+    `device_end`: of the device's body at the end of the run.
+    `device_max`: the highest of the device's body.
+    `junction_max`: the highest of any unit.
+    `sensor`: this machine's hottest sensor at the end of the run, null where the system shows none.
+    """
+
+    kind: str = ""
+    device_end: float | None = None
+    device_max: float | None = None
+    junction_max: float | None = None
+    sensor: float | None = None
+
+
+class RunMetrics(Record):
+    """What a run measured.
+
+    `clock`: `host`, measured on this machine, or `virtual`, computed from a hardware profile.
+    `frames`: counted by what became of them.
+    `duration_s`: from the first job to the end of the run.
+    `frame_time_ms`: between presented frames.
+    `latency_ms`: from the sampled pose to the end of the stage that the pipeline names (the composited frame).
+    `fps`: presented frames a second; 0 for fewer than two.
+    `deadline_misses`: frames presented after their deadline, or frame times above the target.
+    `xrbench`: XRBench's scores.
+    `stages`: times of each, in the order of the pipeline.
+    `units`: shares of each.
+    `efficiency`: the slowest unit's stages, measured isolated, over the mean frame time; null when not measured.
+    `bottleneck`: that slowest unit; absent when not measured.
+    `isolated_ms`: mean time of each stage that was measured while no other unit worked.
+    `policy`, `edge`: of the scheduler; `idle_cores`: whether cores without work stayed awake; on the host clock.
+    `caps`, `temperature_c`: of a capped run.
+    """
+
+    clock: Literal["host", "virtual"]
+    frames: FrameCounts
+    duration_s: float
+    frame_time_ms: FrameTimes
+    latency_ms: TimeSummary
+    fps: float
+    deadline_misses: int
+    xrbench: XrBench
+    stages: dict[str, StageTimes]
+    units: dict[str, UnitShares]
+    efficiency: float | None
+    bottleneck: str | None = None
+    isolated_ms: dict[str, float]
+    policy: str = ""
+    edge: str = ""
+    idle_cores: str = ""
+    caps: Caps | None = None
+    temperature_c: Temperature | None = None
+
+
+def metrics_of(ledger_report: Mapping[str, Any]) -> RunMetrics:
+    """`Ledger.report()`, and what the run added to it, checked. Raises ValueError naming a wrong or unknown key."""
+    return RunMetrics.model_validate(ledger_report)
