@@ -26,7 +26,6 @@ from trilane.pipeline.report import (
     Temperature,
     TimeSummary,
     UnitShares,
-    metrics_of,
 )
 from trilane.pipeline.result import RunResult
 from trilane.shapes import Shape
@@ -209,7 +208,7 @@ def build_report(
     `baseline`: the run under another policy beside it, if there was one.
     `facts`: what others know of the run: `video`, `checksum`, and any of `pace`, `accuracy`, `notes`.
     """
-    metrics = metrics_of(result.report)
+    metrics = result.report
     sensor = {"sensor": sensor_c()}
     document = {
         **metrics.as_json(),
@@ -221,11 +220,11 @@ def build_report(
         "temperature_c": (metrics.temperature_c.as_json() if metrics.temperature_c else {}) | sensor,
         "pids": result.pids,
         "startup_ms": result.startup_ms,
-        "figures": result.figures,
+        "figures": result.metrics,
         "messages": result.messages,
         "interrupted": result.interrupted,
         "failure": result.failure and result.failure.message,
-        "baseline": baseline and _compared(metrics_of(baseline.report)),
+        "baseline": baseline and _compared(baseline.report),
         **facts,
     }
     return Report.model_validate(document)

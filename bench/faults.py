@@ -20,12 +20,13 @@ from typing import Any
 import psutil
 
 from trilane.errors import BadInputError
-from trilane.pipeline.report import metrics_of
-from trilane.pipeline.result import RunResult
+from trilane.pipeline.assets import Assets
+from trilane.pipeline.description import Pipeline
 from trilane.pipeline.fork_server import process_name
+from trilane.pipeline.result import RunResult
 from trilane.pipeline.run import run_pipeline
 from trilane.scheduler.events import UnitDied, UnitReady
-from trilane.stages.config import RunConfig
+from trilane.stages.avatar_pipeline import avatar_pipeline
 from trilane.stages.configure import Request, configure
 from trilane.units import UNITS
 
@@ -66,7 +67,10 @@ def measure(
     rows = []
     for name, kind in product(unit, fault):
         signals = Signals(name, _moments(kind, times, seconds, stop_s, seed))
-        rows.append({"unit": name, "fault": kind, **run_under(signals, checked.config, frames, fps, hang_s)})
+        with tempfile.TemporaryDirectory(prefix="trilane-bench-") as folder:
+            pipeline = avatar_pipeline(checked.changed(out_dir=Path(folder)).config, checked.assets)
+            row = run_under(signals, pipeline, frames, fps, hang_s, checked.assets)
+        rows.append({"unit": name, "fault": kind, **row})
     return {
         "rows": rows,
         "accuracy": dict(checked.accuracy),
@@ -126,31 +130,33 @@ class Signals(threading.Thread):
         return id(self)
 
 
-def run_under(signals: Signals, config: RunConfig, frames: int, fps: float, hang_s: float) -> dict[str, Any]:
+def run_under(
+    signals: Signals, pipeline: Pipeline, frames: int, fps: float, hang_s: float, assets: Assets | None = None
+) -> dict[str, Any]:
     """The row of one run under `signals`.
 
-    `config`: of the run.
+    `pipeline`, `assets`: what is run, and the arrays that its stages may read.
     `frames`: that are requested.
     `fps`: at which they are released.
     `hang_s`: after which a unit without a heartbeat is restarted.
     """
     names = _names()
     children = set(psutil.Process().children(recursive=True))
-    with tempfile.TemporaryDirectory(prefix="trilane-bench-") as folder:
-        signals.start()
-        try:
-            result = run_pipeline(
-                config.model_copy(update={"out_dir": Path(folder)}),
-                frames=frames,
-                pace_fps=fps,
-                isolate_frames=0,
-                hang_ns=round(hang_s * 1e9),
-                on_progress=lambda *_: signals.begun.set(),
-            )
-        finally:
-            signals.begun.set()
-            signals.over.set()
-            signals.join()
+    signals.start()
+    try:
+        result = run_pipeline(
+            pipeline,
+            frames,
+            pace_fps=fps,
+            assets=assets,
+            isolated_frames=0,
+            hang_ns=round(hang_s * 1e9),
+            on_progress=lambda *_: signals.begun.set(),
+        )
+    finally:
+        signals.begun.set()
+        signals.over.set()
+        signals.join()
     left = len(set(psutil.Process().children(recursive=True)) - children) + len(_names() - names)
     return _row(result, signals, round(1e9 / fps)) | {"left": left}
 
@@ -168,7 +174,7 @@ def _row(result: RunResult, signals: Signals, period_ns: int) -> dict[str, Any]:
         "dropped": dropped,
         "uncounted": result.requested - result.presented - lost - dropped,
         "lost_per_death": lost / (deaths(result) or 1),
-        "restarts": metrics_of(result.report).units[signals.unit].restarts,
+        "restarts": result.report.units[signals.unit].restarts,
         "ready_ms": median(ready) if ready else None,
         "back_ms": median(back) if back else None,
         "back_max_ms": max(back) if back else None,

@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 
 from trilane.arrays import U8
-from trilane.avatars.bundle import bundle_folder, load_bundle
+from trilane.avatars.bundle import load_bundle
 from trilane.avatars.reshape import reshaped
+from trilane.bench.lib.drawable import load_drawable
 from trilane.bench.lib.fixture import standing
 from trilane.bench.lib.ground_truth import ground_truth
 from trilane.bench.lib.timing import interleaved_ms, summary_ms
 from trilane.errors import BadInputError
 from trilane.shapes import BUCKET_STEP
 from trilane.stages.dsp.runtime import RuntimeOptions, load_runtime
-from trilane.stages.gpu.assets import load_assets
 from trilane.stages.gpu.context import describe
 from trilane.stages.gpu.mesh import SkinnedMesh
 from trilane.stages.gpu.packed import FILTERS, PackedAvatar, PackedPass, Placement
@@ -53,7 +53,7 @@ class _FilterFixture:
     """The default avatar drawn with every filter."""
 
     def __init__(self) -> None:
-        bundle, assets = load_bundle("default"), load_assets(bundle_folder("default"))
+        bundle, assets = load_bundle("default"), load_drawable("default")
         self._studio, self._image_error = ground_truth(bundle)
         self.ctx, self._network = self._studio.ctx, bundle.read_network()
         self._fixture = standing(assets.texture.shape[2])

@@ -18,14 +18,13 @@ from typing import Any
 from trilane.bench.lib import full_width
 from trilane.errors import BadInputError, TrilaneError
 from trilane.hw_profiles.host import host_units, usable_cores
-from trilane.pipeline.report import RunMetrics, metrics_of
+from trilane.pipeline.report import RunMetrics
 from trilane.pipeline.result import RunResult
-from trilane.pipeline.run import run_pipeline
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.policy import policy_named
 from trilane.scheduler.stats import median_interval
-from trilane.stages.config import RunConfig
-from trilane.stages.configure import Request, configure
+from trilane.stages.avatar_pipeline import run_avatar
+from trilane.stages.configure import Checked, Request, configure
 from trilane.transport.slots import edge_rule
 from trilane.unexpected import UnexpectedValue
 
@@ -80,17 +79,17 @@ def measure(
     rows: list[dict[str, Any]] = []
     accuracy: dict[str, Any] = {}
     for name, tensor_size, count in product(avatar, size, cores):
-        config, accuracy[name] = _config(name, tensor_size, count, frames, runtime, video=video)
+        checked, accuracy[name] = _config(name, tensor_size, count, frames, runtime, video=video)
         settings = [Setting(name, tensor_size, count, *pair) for pair in _pairs(policy, edge)]
-        rows += _measure_rounds(config, settings, turns)
-    facts = {"frames": frames, "turns": turns, "runtime": config.runtime, "video": video}
+        rows += _measure_rounds(checked, settings, turns)
+    facts = {"frames": frames, "turns": turns, "runtime": checked.config.runtime, "video": video}
     return {"rows": rows, "accuracy": accuracy, "config": facts}
 
 
-def _measure_rounds(config: RunConfig, settings: list[Setting], rounds: int) -> list[dict[str, Any]]:
+def _measure_rounds(checked: Checked, settings: list[Setting], rounds: int) -> list[dict[str, Any]]:
     """A row for each setting. One more `sequential` run ends the last round."""
-    measured = [_run_round(config, settings) for _ in range(rounds)]
-    closing = _run(config, settings[0])
+    measured = [_run_round(checked, settings) for _ in range(rounds)]
+    closing = _run(checked, settings[0])
     for runs, after in zip(measured, [*(runs[0] for runs in measured[1:]), closing], strict=True):
         _compare(runs, after)
     by_setting = zip(*measured, strict=True)
@@ -114,18 +113,18 @@ def _pairs(policies: Sequence[str], edges: Sequence[str]) -> list[tuple[str, str
     return [(SEQUENTIAL, "double"), *(pair for pair in product(policies, edges) if pair != (SEQUENTIAL, "double"))]
 
 
-def _config(avatar: str, size: str, cores: int, frames: int, runtime: str, *, video: bool) -> tuple[RunConfig, Any]:
+def _config(avatar: str, size: str, cores: int, frames: int, runtime: str, *, video: bool) -> tuple[Checked, Any]:
     folder = str(full_width.full_width_bundle()) if avatar == full_width.NAME else avatar
     checked = configure(Request(size=size, avatar=folder, frames=frames, runtime=runtime), Path.cwd())
     units = host_units(usable_cores()[:cores])
     accuracy = next(iter(checked.accuracy.values())) or NO_ACCURACY
-    return checked.config.model_copy(update={"units": units, "record": video}), accuracy
+    return checked.changed(units=units, record=video), accuracy
 
 
-def _run_round(config: RunConfig, settings: list[Setting]) -> list[dict[str, Any]]:
+def _run_round(checked: Checked, settings: list[Setting]) -> list[dict[str, Any]]:
     """One run of each; the `sequential` one sets the pace of the paced ones."""
-    base = _run(config, settings[0])
-    return [base, *(_run(config, setting, base["alone_ms"]) for setting in settings[1:])]
+    base = _run(checked, settings[0])
+    return [base, *(_run(checked, setting, base["alone_ms"]) for setting in settings[1:])]
 
 
 def _compare(runs: list[dict[str, Any]], after: dict[str, Any]) -> None:
@@ -140,11 +139,13 @@ def _compare(runs: list[dict[str, Any]], after: dict[str, Any]) -> None:
         row["gain_of_bound"] = row["gain"] / row["bound"]
 
 
-def _run(config: RunConfig, plan: Setting, alone_ms: float = 0.0) -> dict[str, Any]:
+def _run(checked: Checked, plan: Setting, alone_ms: float = 0.0) -> dict[str, Any]:
     pace = PACE * 1e3 / alone_ms if policy_named(plan.policy).paced else None
     with tempfile.TemporaryDirectory(prefix="trilane-bench-") as folder:
-        placed = config.model_copy(update={"out_dir": Path(folder)})
-        result = run_pipeline(placed, policy=plan.policy, edge=plan.edge, pace_fps=pace, isolate_frames=ALONE)
+        placed = checked.changed(out_dir=Path(folder))
+        result = run_avatar(
+            placed.config, placed.assets, policy=plan.policy, edge=plan.edge, pace_fps=pace, isolated_frames=ALONE
+        )
     if result.interrupted:
         raise KeyboardInterrupt
     if result.failure is not None or result.presented < 2:
@@ -154,7 +155,7 @@ def _run(config: RunConfig, plan: Setting, alone_ms: float = 0.0) -> dict[str, A
 
 def _figures(result: RunResult) -> dict[str, Any]:
     """The row of one run, before it is compared with others."""
-    metrics = metrics_of(result.report)
+    metrics = result.report
     isolated = _isolated_ms(metrics)
     slowest = max(isolated, key=isolated.__getitem__)
     stages_ms = sum(stage.service_ms.mean for stage in metrics.stages.values())

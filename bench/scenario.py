@@ -6,7 +6,6 @@ LoadGen can ask for and evaluate the same load.
 
 from __future__ import annotations
 
-import tempfile
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -17,9 +16,11 @@ from typing import Any
 from trilane.bench.lib.load import PATTERNS, Load, Queries, bound_ms, play, verdict
 from trilane.bench.lib.loadgen import LoadGenPlayer, load_generator
 from trilane.errors import BadInputError, TrilaneError
+from trilane.pipeline.assets import Assets
+from trilane.pipeline.description import Pipeline
 from trilane.pipeline.requests import FrameRequestQueue
 from trilane.pipeline.run import run_pipeline
-from trilane.stages.config import RunConfig
+from trilane.stages.avatar_pipeline import avatar_pipeline
 from trilane.stages.configure import Request, configure
 
 JUDGES = ("trilane", "loadgen")
@@ -54,11 +55,12 @@ def measure(
     if "loadgen" in judge:
         load_generator()
     checked = configure(Request(size=size, avatar=avatar, frames=MAX_FRAMES, runtime=runtime), Path.cwd())
+    pipeline = avatar_pipeline(checked.changed(record=False).config, checked.assets, edge)
     rows, summaries = [], {}
     for name in scenario:
         load = Load(name, seconds, rate, limit_ms, samples, seed)
         for evaluated_by in judge:
-            row, summary = run_scenario(checked.config, load, evaluated_by, policy, edge)
+            row, summary = run_scenario(pipeline, checked.assets, load, evaluated_by, policy)
             rows.append(row)
             summaries[f"{name}, {evaluated_by}"] = summary
     return {
@@ -70,30 +72,28 @@ def measure(
 
 
 def run_scenario(
-    config: RunConfig, load: Load, evaluated_by: str, policy: str, edge: str
+    pipeline: Pipeline, assets: Assets, load: Load, evaluated_by: str, policy: str
 ) -> tuple[dict[str, Any], str]:
     """One run under `load`: its row, and LoadGen's summary where LoadGen evaluates it.
 
-    `config`: of the run.
+    `pipeline`, `assets`: what is run, and the arrays that its stages may read.
     `load`: the pattern and its limits.
     `evaluated_by`: one of `JUDGES`.
-    `policy`, `edge`: of the scheduler.
+    `policy`: of the scheduler.
     Raises TrilaneError when the run fails.
     """
     queries = Queries(size=load.samples if load.scenario == "multi-stream" and evaluated_by == "trilane" else 1)
     loadgen = LoadGenPlayer(load, queries) if evaluated_by == "loadgen" else None
-    inlet = FrameRequestQueue(
-        *((queries.answered, queries.ended) if loadgen is None else (loadgen.answered, loadgen.ended))
-    )
-    player = _Player(inlet, (lambda: play(load, inlet, queries)) if loadgen is None else lambda: loadgen.play(inlet))
-    with tempfile.TemporaryDirectory(prefix="trilane-bench-") as folder:
-        placed = config.model_copy(update={"out_dir": Path(folder), "record": False})
-        player.start()
-        try:
-            result = run_pipeline(placed, policy=policy, edge=edge, frames=MAX_FRAMES, isolate_frames=0, inlet=inlet)
-        finally:
-            inlet.close()
-            player.join()
+    answered, ended = (queries.answered, queries.ended) if loadgen is None else (loadgen.answered, loadgen.ended)
+    requests = FrameRequestQueue(answered, ended)
+    work = (lambda: play(load, requests, queries)) if loadgen is None else lambda: loadgen.play(requests)
+    player = _Player(requests, work)
+    player.start()
+    try:
+        result = run_pipeline(pipeline, MAX_FRAMES, policy=policy, assets=assets, isolated_frames=0, requests=requests)
+    finally:
+        requests.close()
+        player.join()
     if result.failure is not None:
         raise TrilaneError(result.failure.message)
     if result.interrupted:

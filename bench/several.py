@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import U8
-from trilane.avatars.bundle import bundle_folder, load_bundle
+from trilane.avatars.bundle import load_bundle
 from trilane.avatars.reshape import reshaped
+from trilane.bench.lib.drawable import load_drawable
 from trilane.bench.lib.ground_truth import ground_truth, shaped_body
 from trilane.body.kinematics import Skeleton
 from trilane.errors import BadInputError
@@ -27,7 +28,6 @@ from trilane.stages.cpu.mesh_bounds import MeshBounds
 from trilane.stages.cpu.pose import STANDOFF_M
 from trilane.stages.cpu.tensor_layout import MARGIN_PX, TensorLayout, lay_out
 from trilane.stages.dsp.runtime import Binding, RuntimeOptions, load_runtime
-from trilane.stages.gpu.assets import load_assets
 from trilane.stages.gpu.mesh import SkinnedMesh
 from trilane.stages.gpu.packed import PackedAvatar, PackedPass, Placement
 from trilane.unexpected import UnexpectedValue
@@ -99,7 +99,7 @@ class _CrowdFixture:
         self.shaped = shaped_body(bundle)
         self.network = bundle.read_network()
         self._studio, self._image_error = ground_truth(bundle)
-        assets, ctx = load_assets(bundle_folder("default")), self._studio.ctx
+        assets, ctx = load_drawable("default"), self._studio.ctx
         self.packed = PackedPass(ctx, assets.texture.shape[2], assets.quantisation, deferred=True)
         self.avatar = PackedAvatar(self.packed, SkinnedMesh(ctx, assets.arrays), assets.texture)
         self._bound: dict[Shape, tuple[U8, U8, Binding]] = {}

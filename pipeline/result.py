@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
+from trilane.pipeline.report import RunMetrics
 from trilane.scheduler.causes import Drop, Loss
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.recording import Recording
@@ -23,13 +23,13 @@ class Failure:
 class RunResult:
     """A finished run.
 
-    `report`: the keys of report.json that a run knows; who calls it adds the machine and the configuration.
+    `report`: what the run measured; who calls it adds the machine and the configuration.
     `lost`, `dropped`: frames by cause. `startup_ms`: of each unit. `metrics`: of each stage, the mean of a job's.
     `messages`: what went wrong on the way, such as a unit that died and was restarted.
     `failure`: set when a stage failed or a unit could not be kept alive; what was done until then is still here.
     """
 
-    report: dict[str, Any]
+    report: RunMetrics
     requested: int
     presented: int
     lost: Mapping[Loss, int]

@@ -16,6 +16,7 @@ from trilane.pipeline.isolated import IsolatedTimes
 from trilane.pipeline.lifecycle import close_units, start_units
 from trilane.pipeline.realtime_clock import Governor, RealtimeClock
 from trilane.pipeline.regions import edge_regions
+from trilane.pipeline.report import RunMetrics, metrics_of
 from trilane.pipeline.requests import FrameRequestQueue
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run_log import RunLog, UnitError, after_stderr
@@ -118,7 +119,7 @@ def run_pipeline(
         report["xrbench"]["energy"] = energy_score(1e3 * governor.power_w / report["fps"])
     for unit, row in report["units"].items():
         row.update(pid=run.pids[unit], **pipeline.units[unit].model_dump(mode="json"))
-    return run.result(report)
+    return run.result(metrics_of(report))
 
 
 class _Run:
@@ -157,12 +158,12 @@ class _Run:
         if self._outcome.kind is not OutcomeKind.ABORTED:
             close_units(self._processes, self._log, self._interrupts)
 
-    def result(self, report: dict[str, Any]) -> RunResult:
+    def result(self, report: RunMetrics) -> RunResult:
         ledger = self._core.ledger
         stopped = self._outcome.kind in (OutcomeKind.STOPPED, OutcomeKind.ABORTED)
         return RunResult(
             report=report,
-            requested=report["frames"]["requested"],
+            requested=report.frames.requested,
             presented=len(ledger.presented_ns),
             lost=dict(ledger.lost),
             dropped=dict(ledger.dropped),

@@ -7,7 +7,7 @@ input ends the command before a process is started or a file is made.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +64,10 @@ class Checked:
     assets: Assets
     notes: tuple[str, ...]
     accuracy: Mapping[str, Any]
+
+    def changed(self, **values: Any) -> Checked:
+        """The same with other `values` of the configuration, such as `out_dir`, `record` or `units`."""
+        return replace(self, config=self.config.model_copy(update=values))
 
 
 def requested_scene(request: Request) -> Scene:

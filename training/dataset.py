@@ -21,7 +21,7 @@ from trilane.body.kinematics import Skeleton
 from trilane.body.skinning import largest_weights
 from trilane.scene.motion.motion import Motion
 from trilane.shapes import Shape, shape_buckets
-from trilane.stages.gpu.assets import enough_weights
+from trilane.stages.gpu.avatar_mesh import enough_weights
 from trilane.stages.gpu.context import open_context
 from trilane.stages.gpu.mesh import SkinnedMesh, mesh_arrays
 from trilane.training.clothing.clothing import Wardrobe

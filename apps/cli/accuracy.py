@@ -69,10 +69,10 @@ def _scene(scene: str, avatar: str | None, size: str | None, frames: int, names:
     from trilane.apps.experiments.accuracy import runtime_differences
     from trilane.stages.configure import Request, configure, required_machine
 
-    config = configure(Request(scene, avatar=avatar, size=size, runtime="ort"), Path.cwd()).config
+    checked = configure(Request(scene, avatar=avatar, size=size, runtime="ort"), Path.cwd())
     machine = required_machine()
     with stderr_console().status(f"{frames} frames on {', '.join(names)}"), stdout_kept():
-        result = runtime_differences(config, names, frames)
+        result = runtime_differences(checked, names, frames)
     if as_json:
         print_json({"schema": 1, **result, "machine": machine})
     else:

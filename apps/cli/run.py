@@ -8,7 +8,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -149,18 +148,18 @@ def run(
     if held is not None and performance_profile is not None:
         raise BadInputError("options", "--performance-profile with --pace", "one of them", "a pace is capped already")
     if held is not None:
-        checked = replace(checked, config=checked.config.model_copy(update={"pace_ns": dict(held.stage_ns)}))
+        checked = checked.changed(pace_ns=dict(held.stage_ns))
     target = out or default_place(checked.config.scene.name)
     with _hooks() as hooks:
         for note in checked.notes:
             hooks.message(note)
         outcome = run_to_folder(
-            checked.config,
+            checked,
             target,
             Plan(str(policy), baseline, held, performance_profile and str(performance_profile), latch),
             hooks,
             machine=required_machine(),
-            facts={"accuracy": dict(checked.accuracy), "notes": list(checked.notes)},
+            starter=starter,
         )
     _print_outcome(outcome, as_json)
     if outcome.report.failure:

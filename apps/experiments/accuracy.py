@@ -13,16 +13,18 @@ from typing import Any
 import numpy as np
 
 from trilane.arrays import U8
-from trilane.avatars.bundle import load_bundle
+from trilane.avatars.network_file import NetworkFile
 from trilane.avatars.reshape import reshaped
 from trilane.errors import BadInputError
-from trilane.pipeline.run import MAX_CHANNELS
+from trilane.pipeline.stage import UnitContext
 from trilane.shapes import Shape
-from trilane.stages.config import RunConfig
-from trilane.stages.cpu.pose import PoseStage
+from trilane.stages.avatar_assets import network_of
+from trilane.stages.avatar_pipeline import edge_bytes
+from trilane.stages.configure import Checked
+from trilane.stages.cpu.pose import build as build_pose
 from trilane.stages.dsp.runtime import Binding, RuntimeOptions, load_runtime
-from trilane.stages.gpu import unit as gpu
-from trilane.stages.packets import pose_dtype, posed_vertices_bytes
+from trilane.stages.gpu.raster import build as build_raster
+from trilane.stages.packets import pose_dtype
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 #: Of 255: bounds on the difference of any two runtimes.
@@ -30,7 +32,7 @@ MEAN_BOUND, LARGEST_BOUND = 0.5, 4
 MAX_FRAMES = 10_000
 
 
-def runtime_differences(config: RunConfig, runtimes: Sequence[str], frames: int) -> dict[str, Any]:
+def runtime_differences(checked: Checked, runtimes: Sequence[str], frames: int) -> dict[str, Any]:
     """`frames` frames of the scene, evenly spread, through each of `runtimes`.
 
     Keys: `rows`, one per pair: `first`, `second`, `mean`, `largest` (of 255, over all channels and frames),
@@ -41,11 +43,11 @@ def runtime_differences(config: RunConfig, runtimes: Sequence[str], frames: int)
         raise BadInputError("--frames", str(frames), f"1 to {MAX_FRAMES}")
     if len(set(runtimes)) < 2 or len(set(runtimes)) < len(runtimes):
         raise BadInputError("--runtime", ", ".join(runtimes) or "none", "two or more different runtimes")
-    sessions = _Sessions(config, runtimes)
+    sessions = _Sessions(network_of(checked.assets), runtimes)
     pairs = list(combinations(runtimes, 2))
     seen: dict[tuple[str, str], list[tuple[float, int, int]]] = {pair: [] for pair in pairs}
     numbers = []
-    for frame, tensor in _tensors(config, frames):
+    for frame, tensor in _tensors(checked, frames):
         numbers.append(frame)
         pictures = {name: sessions.picture(name, tensor).astype(np.int16) for name in runtimes}
         for pair in pairs:
@@ -72,8 +74,8 @@ def _row(pair: tuple[str, str], found: list[tuple[float, int, int]]) -> dict[str
 class _Sessions:
     """The network of the scene's first avatar on each runtime, by tensor shape."""
 
-    def __init__(self, config: RunConfig, runtimes: Sequence[str]) -> None:
-        self._network = load_bundle(config.avatar_dirs[0]).read_network()
+    def __init__(self, network: NetworkFile, runtimes: Sequence[str]) -> None:
+        self._network = network
         self._runtimes = {name: load_runtime(name) for name in runtimes}
         self._bound: dict[tuple[str, Shape], tuple[U8, U8, Binding]] = {}
 
@@ -91,17 +93,19 @@ class _Sessions:
         return picture
 
 
-def _tensors(config: RunConfig, frames: int) -> Iterator[tuple[int, U8]]:
+def _tensors(checked: Checked, frames: int) -> Iterator[tuple[int, U8]]:
     """(number, tensor (h,w,C)) of frames that are evenly spread over the scene."""
-    total = config.scene.frames
+    config, assets = checked.config, checked.assets
+    total, avatars = config.scene.frames, len(config.avatar_dirs)
     count = min(frames, total)
-    avatars = len(config.avatar_dirs)
-    posed = _packet(avatars, posed_vertices_bytes(config.posed_vertices))
-    drawn = _packet(avatars, config.max_tensor_pixels * MAX_CHANNELS)
-    pose, raster = PoseStage(config), gpu.build(config)["raster"]
+    sizes = edge_bytes(config, assets)
+    posed, drawn = _packet(avatars, sizes["pose->raster"]), _packet(avatars, sizes["raster->infer"])
+    settings = {"config": config.model_dump(mode="json")}
+    pose = build_pose(settings, UnitContext("cpu", config.units["cpu"], assets))
+    raster = build_raster(settings, UnitContext("gpu", config.units["gpu"], assets))
     pose.bind([], [posed])
     raster.bind([posed], [drawn])
-    channels = load_bundle(config.avatar_dirs[0]).read_network().shape[3]
+    channels = network_of(assets).channels
     for frame in (index * total // count for index in range(count)):
         pose.run(frame, None, 0)
         raster.run(frame, 0, 0)

@@ -69,7 +69,7 @@ class Queries:
     def ask(self, requests: FrameRequestQueue, count: int = 1) -> None:
         """Ask `count` queries now."""
         self.asked_s += [time.monotonic()] * count
-        requests.ask(count * self.size)
+        requests.request(count * self.size)
 
     def answered(self, _frame: int) -> None:
         """Called by the `FrameRequestQueue` with each presented frame."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F64, Floats
 from trilane.pipeline.stage import UnitContext
-from trilane.scene.placement import PlacedCamera
+from trilane.scene.placed_camera import PlacedCamera
 from trilane.scene.schema import PlaneSpec, Scene
 from trilane.shapes import Shape
 from trilane.stages.avatar_assets import distinct, shaped_body, staged_of

@@ -3,32 +3,30 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable
 
 import pytest
 
 from trilane.bench import faults
 from trilane.bench.faults import Signals
 from trilane.errors import BadInputError
-from trilane.stages.config import RunConfig
+from trilane.testing.doubles import pipeline_of_doubles as doubles
 
-Configure = Callable[..., RunConfig]
 MS = 1_000_000
 pytestmark = pytest.mark.usefixtures("nothing_left")
 
 
 @pytest.mark.parametrize("unit", faults.UNITS)
-def test_a_unit_that_is_killed_again_and_again_costs_a_frame_each_time(mock_config: Configure, unit: str) -> None:
+def test_a_unit_that_is_killed_again_and_again_costs_a_frame_each_time(unit: str) -> None:
     kills = [(0.3, signal.SIGKILL), (2.0, signal.SIGKILL)]
-    row = faults.run_under(Signals(unit, kills), mock_config(200, infer=5), 200, 50, 5)
+    row = faults.run_under(Signals(unit, kills), doubles(infer=5), 200, 50, 5)
     assert (row["signals"], row["restarts"], row["ended"]) == (2, 2, "all frames")
     assert row["lost_per_death"] <= 1
     assert (row["uncounted"], row["dropped"], row["left"]) == (0, 0, 0)
 
 
-def test_a_unit_that_is_stopped_goes_on_and_nothing_is_lost(mock_config: Configure) -> None:
+def test_a_unit_that_is_stopped_goes_on_and_nothing_is_lost() -> None:
     moments = [(0.2, signal.SIGSTOP), (1.0, signal.SIGCONT)]
-    row = faults.run_under(Signals("gpu", moments), mock_config(80), 80, 50, 5)
+    row = faults.run_under(Signals("gpu", moments), doubles(), 80, 50, 5)
     assert (row["signals"], row["restarts"], row["presented"], row["ended"]) == (1, 0, 80, "all frames")
 
 

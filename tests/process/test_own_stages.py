@@ -34,9 +34,9 @@ loaded = [line for line in log.with_suffix(".modules").read_text().split()]
 print(json.dumps({
     "presented": result.presented, "requested": result.requested,
     "lost": {str(cause): count for cause, count in result.lost.items()},
-    "restarts": {unit: row["restarts"] for unit, row in result.report["units"].items()},
-    "shares": {unit: row["busy"] + sum(row["idle"].values()) for unit, row in result.report["units"].items()},
-    "efficiency": result.report["efficiency"], "brightness": result.metrics["sink"]["brightness"],
+    "restarts": {unit: row.restarts for unit, row in result.report.units.items()},
+    "shares": {unit: row.busy + sum(row.idle.as_json().values()) for unit, row in result.report.units.items()},
+    "efficiency": result.report.efficiency, "brightness": result.metrics["sink"]["brightness"],
     "failure": result.failure and result.failure.message, "replayed": list(replay(result.recording)),
     "here": sorted(sys.modules), "unit": loaded,
 }))

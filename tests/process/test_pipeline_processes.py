@@ -59,8 +59,8 @@ def with_factory(pipeline: Pipeline, name: str, factory: str) -> Pipeline:
 def check_accounts(result: RunResult) -> None:
     counted = result.presented + sum(result.lost.values()) + sum(result.dropped.values())
     assert counted == result.requested
-    for row in result.report["units"].values():
-        assert row["busy"] + sum(row["idle"].values()) == pytest.approx(1)
+    for unit in result.report.units.values():
+        assert unit.busy + sum(unit.idle.as_json().values()) == pytest.approx(1)
     assert not list(replay(result.recording))
 
 
@@ -73,8 +73,8 @@ def test_every_frame_is_presented_in_order(tmp_path: Path, policy: str, edge: st
     assert (result.presented, dict(result.lost), dict(result.dropped)) == (40, {}, {})
     assert log.read_text().split() == [str(frame) for frame in range(40)]
     assert len(set(result.pids.values())) == 3
-    assert result.report["clock"] == "host"
-    assert 0 < result.report["efficiency"] < 3
+    assert result.report.clock == "host"
+    assert 0 < (result.report.efficiency or 0) < 3
     check_accounts(result)
 
 
@@ -83,7 +83,7 @@ def test_a_paced_run_drops_what_it_cannot_do_and_counts_it(policy: str, edge: st
     result = run_pipeline(doubles(infer=16).with_rule(edge), 100, policy=policy, pace_fps=100, isolated_frames=0)
     assert sum(result.dropped.values()) > 20
     assert result.presented > 20
-    assert result.report["efficiency"] is None
+    assert result.report.efficiency is None
     check_accounts(result)
 
 
@@ -95,16 +95,16 @@ def test_a_run_at_a_pace_has_the_frame_time_of_virtual_time() -> None:
     found = compare(Pace("chip", "any", 1.0, stage_ns), "pipelined", 20, result.jobs)
     assert result.presented == 20
     assert found["virtual_ms"] == 40
-    assert result.report["frame_time_ms"]["p50"] == pytest.approx(40, rel=0.05)
+    assert result.report.frame_time_ms.p50 == pytest.approx(40, rel=0.05)
     assert min(job.end_ns - job.begin_ns for job in result.jobs if job.stage == "infer") >= stage_ns["infer"]
 
 
 def test_pipelined_hides_all_but_the_slowest() -> None:
     pipeline = doubles(raster=4, infer=12, composite=3, present=4)
     reports = [run_pipeline(pipeline, 60, policy=policy).report for policy in ("sequential", "pipelined")]
-    assert reports[1]["fps"] > 1.4 * reports[0]["fps"]
-    assert reports[1]["bottleneck"] == "dsp"
-    assert reports[1]["efficiency"] > 0.8
+    assert reports[1].fps > 1.4 * reports[0].fps
+    assert reports[1].bottleneck == "dsp"
+    assert (reports[1].efficiency or 0) > 0.8
 
 
 @pytest.mark.parametrize(("unit", "slowest"), [("cpu", "pose"), ("gpu", "raster"), ("dsp", "infer")])
@@ -120,7 +120,7 @@ def test_a_killed_unit_is_restarted_and_the_run_goes_on(unit: str, slowest: str)
     assert result.failure is None
     assert set(map(str, result.lost)) == {f"died:{unit}"}
     assert sum(result.lost.values()) <= 2
-    assert result.report["units"][unit]["restarts"] == 1
+    assert result.report.units[unit].restarts == 1
     assert result.pids[unit] != victims[0]
     assert any(unit in message for message in result.messages)
     check_accounts(result)
@@ -140,7 +140,7 @@ def test_idle_units_are_asked_whether_they_live() -> None:
     result = run_pipeline(pipeline, 2, policy="sequential", isolated_frames=0, hang_ns=700_000_000)
     beats = [event for _, events, _ in result.recording.steps for event in events if isinstance(event, Pong)]
     assert result.presented == 2
-    assert not any(row["restarts"] for row in result.report["units"].values())
+    assert not any(unit.restarts for unit in result.report.units.values())
     assert any(beat.unit == "cpu" for beat in beats)
 
 
@@ -158,10 +158,11 @@ def test_a_cap_holds_every_unit_and_says_so() -> None:
         doubles(infer=10), 60, isolated_frames=0, governor=Governor(load_runnable("host"), "power_saver")
     )
     check_accounts(capped)
-    assert capped.report["fps"] < 0.7 * free.report["fps"]
-    assert capped.report["units"]["dsp"]["idle"]["throttled"] > 0.2
-    assert capped.report["caps"]["performance_profile"] == "power_saver"
-    assert capped.report["caps"]["units"]["dsp"]["duty"] < 0.5
+    assert capped.report.fps < 0.7 * free.report.fps
+    assert capped.report.units["dsp"].idle.throttled > 0.2
+    assert capped.report.caps is not None
+    assert capped.report.caps.performance_profile == "power_saver"
+    assert capped.report.caps.units["dsp"].duty < 0.5
 
 
 def test_late_poses_arrive_and_are_newer() -> None:
@@ -171,7 +172,7 @@ def test_late_poses_arrive_and_are_newer() -> None:
     )
     check_accounts(late)
     assert late.presented == 80
-    assert late.report["latency_ms"]["p50"] < early.report["latency_ms"]["p50"]
+    assert late.report.latency_ms.p50 < early.report.latency_ms.p50
 
 
 def test_a_lost_context_costs_a_restart_and_a_frame(tmp_path: Path) -> None:
@@ -180,7 +181,7 @@ def test_a_lost_context_costs_a_restart_and_a_frame(tmp_path: Path) -> None:
     result = run_pipeline(losing, 40, assets=checked.assets, isolated_frames=0)
     assert result.failure is None
     assert by_cause(result.lost) == {"died:gpu": 1}
-    assert result.report["units"]["gpu"]["restarts"] == 1
+    assert result.report.units["gpu"].restarts == 1
     assert any("context was lost" in message for message in result.messages)
     check_accounts(result)
 
@@ -311,7 +312,7 @@ def test_an_idle_unit_that_does_not_answer_is_restarted(monkeypatch: pytest.Monk
     stop = When(1, lambda: unit_process("dsp").suspend())
     pipeline = doubles(pose=500, raster=500)
     result = run_pipeline(pipeline, 3, policy="sequential", isolated_frames=0, hang_ns=850_000_000, on_progress=stop)
-    assert result.report["units"]["dsp"]["restarts"] == 1
+    assert result.report.units["dsp"].restarts == 1
     assert any("dsp did not answer in time" in message for message in result.messages)
     assert result.presented == 3 and not result.lost
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable
 
 import pytest
 
@@ -13,66 +12,61 @@ from trilane.bench.lib import load
 from trilane.bench.lib.load import Load
 from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline.requests import FrameRequestQueue
-from trilane.stages.config import RunConfig
+from trilane.testing.doubles import pipeline_of_doubles as doubles
 
-Configure = Callable[..., RunConfig]
 pytestmark = pytest.mark.usefixtures("nothing_left")
 
 
 @pytest.mark.parametrize(("name", "queries"), [("single-stream", 64), ("server", 662), ("offline", 64)])
-def test_every_query_is_answered_and_judged(mock_config: Configure, name: str, queries: int) -> None:
+def test_every_query_is_answered_and_judged(name: str, queries: int) -> None:
     asked = Load(name, seconds=0.1, rate=300, limit_ms=5000)  # 64 frames take 0.128 s at least: two stages of 1 ms
-    row, summary = scenario.run_scenario(mock_config(1), asked, "trilane", "pipelined", "double")
+    row, summary = scenario.run_scenario(doubles(), {}, asked, "trilane", "pipelined")
     assert (row["verdict"], row["because"], summary) == ("VALID", "", "")
     assert row["queries"] >= queries
     assert 0 < row["p50_ms"] <= row["percentile_ms"] <= row["max_ms"]
 
 
-def test_a_query_of_several_frames_takes_longer_than_one(
-    mock_config: Configure, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_query_of_several_frames_takes_longer_than_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(load.PERCENTILES, "multi-stream", 0.9)
-    config = mock_config(1, infer=5)
-    one, _ = scenario.run_scenario(config, Load("single-stream", seconds=0.1), "trilane", "pipelined", "double")
-    four, _ = scenario.run_scenario(
-        config, Load("multi-stream", seconds=0.1, samples=4), "trilane", "pipelined", "double"
-    )
+    pipeline = doubles(infer=5)
+    one, _ = scenario.run_scenario(pipeline, {}, Load("single-stream", seconds=0.1), "trilane", "pipelined")
+    four, _ = scenario.run_scenario(pipeline, {}, Load("multi-stream", seconds=0.1, samples=4), "trilane", "pipelined")
     assert four["p50_ms"] > one["p50_ms"] + 10
 
 
-def test_a_server_that_is_too_slow_is_invalid_and_says_why(mock_config: Configure) -> None:
+def test_a_server_that_is_too_slow_is_invalid_and_says_why() -> None:
     asked = Load("server", seconds=0.1, rate=500, limit_ms=1)
-    row, _ = scenario.run_scenario(mock_config(1), asked, "trilane", "pipelined", "double")
+    row, _ = scenario.run_scenario(doubles(), {}, asked, "trilane", "pipelined")
     assert row["verdict"] == "INVALID"
     assert "took longer than 1 ms" in row["because"]
 
 
 @pytest.mark.parametrize("name", ["single-stream", "server"])
-def test_loadgen_finds_it_valid(mock_config: Configure, name: str) -> None:
+def test_loadgen_finds_it_valid(name: str) -> None:
     pytest.importorskip("mlperf_loadgen")
     asked = Load(name, seconds=0.2, rate=300, limit_ms=5000)
-    row, summary = scenario.run_scenario(mock_config(1), asked, "loadgen", "pipelined", "double")
+    row, summary = scenario.run_scenario(doubles(), {}, asked, "loadgen", "pipelined")
     assert row["verdict"] == "VALID"
     assert "Result is : VALID" in summary
 
 
 @pytest.mark.parametrize("judge", ["trilane", "loadgen"])
-def test_a_stage_that_fails_ends_the_scenario_with_its_sentence(mock_config: Configure, judge: str) -> None:
+def test_a_stage_that_fails_ends_the_scenario_with_its_sentence(judge: str) -> None:
     if judge == "loadgen":
         pytest.importorskip("mlperf_loadgen")
     asked = Load("single-stream", seconds=0.1)
     with pytest.raises(TrilaneError, match=r"mock\.npz: found nothing"):
-        scenario.run_scenario(mock_config(1, raster="raise"), asked, judge, "pipelined", "double")
+        scenario.run_scenario(doubles(raster="raise"), {}, asked, judge, "pipelined")
 
 
-def test_an_interrupt_ends_a_scenario(mock_config: Configure, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupt_ends_a_scenario(monkeypatch: pytest.MonkeyPatch) -> None:
     def ask_and_interrupt(_load: Load, requests: FrameRequestQueue, queries: load.Queries) -> None:
         queries.ask(requests, 5)
         os.kill(os.getpid(), signal.SIGINT)
 
     monkeypatch.setitem(load.PATTERNS, "offline", ask_and_interrupt)
     with pytest.raises(KeyboardInterrupt):
-        scenario.run_scenario(mock_config(1), Load("offline", seconds=60), "trilane", "pipelined", "double")
+        scenario.run_scenario(doubles(), {}, Load("offline", seconds=60), "trilane", "pipelined")
 
 
 @pytest.mark.parametrize(
