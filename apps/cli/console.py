@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rich.console import Console
 
+
 def stderr_console() -> Console:
     """Console for messages and progress. Rich obeys NO_COLOR and plain pipes by itself."""
     from rich.console import Console
