@@ -9,11 +9,13 @@ import socket
 import subprocess
 import sys
 from collections.abc import Sequence
-from typing import NamedTuple, Self
+from typing import TYPE_CHECKING, NamedTuple, Self
 
 from trilane.errors import TrilaneError
 from trilane.pipeline.fork_server import THREAD_LIMITS
-from trilane.pipeline.unit_spec import UnitSpec
+
+if TYPE_CHECKING:
+    from trilane.pipeline.unit_spec import UnitSpec
 
 ANSWER_S = 60.0  # the modules to preload may come from a slow disk
 CLOSE_S = 5.0

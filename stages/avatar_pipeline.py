@@ -16,18 +16,10 @@ from trilane.pipeline.run import run_pipeline
 from trilane.stages.avatar_assets import network_of
 from trilane.stages.config import RunConfig
 from trilane.stages.dsp.parts import crossing_bytes
+from trilane.stages.factories import FACTORIES, PRELOAD
 from trilane.stages.packets import pose_dtype, posed_vertices_bytes
 from trilane.units import AFTER_INFER, BEFORE_INFER, LATENCY_TO
 
-#: Stage to its factory; the parts of the network share one.
-FACTORIES = {
-    "pose": "trilane.stages.cpu.pose:build",
-    "raster": "trilane.stages.gpu.raster:build",
-    "infer": "trilane.stages.dsp.infer:build",
-    "composite": "trilane.stages.gpu.composite:build",
-    "present": "trilane.stages.cpu.present:build",
-}
-PRELOAD = tuple(factory.partition(":")[0] for factory in FACTORIES.values())
 MAX_CHANNELS = 16  # of a tensor: what the GPU packs in one pass
 
 

@@ -34,7 +34,7 @@ OPTIONAL_PACKAGES = {
 }
 
 GL_TIMEOUT_S = 30.0
-GL_PROGRAM = "import json, trilane.stages.machine as m; print(json.dumps(m.open_gl()))"
+GL_PROGRAM = "import json, trilane.stages.machine as m; print(json.dumps(m.open_gl()), flush=True); m.os._exit(0)"
 GL_LIMITS = (
     "GL_MAX_TEXTURE_SIZE", "GL_MAX_DRAW_BUFFERS", "GL_MAX_COLOR_ATTACHMENTS", "GL_MAX_UNIFORM_BLOCK_SIZE",
     "GL_MAX_TEXTURE_BUFFER_SIZE", "GL_MAX_VIEWPORT_DIMS",
@@ -94,14 +94,41 @@ def open_gl() -> dict[str, Any]:
 
 
 @cache
-def gl_facts() -> dict[str, Any] | None:
-    """The OpenGL driver that EGL gives, tried in a process of its own: a driver may crash. None when none works."""
+def gl_probe() -> subprocess.Popen[bytes] | None:
+    """The process that looks at OpenGL, because a driver may crash; None when it cannot be started.
+
+    Whoever needs `gl_facts` later calls this early: the process works while the caller goes on.
+    """
+    command = [sys.executable, "-c", GL_PROGRAM]
     try:
-        done = subprocess.run([sys.executable, "-c", GL_PROGRAM], capture_output=True, timeout=GL_TIMEOUT_S, check=True)
-        facts = json.loads(done.stdout)
-    except (OSError, subprocess.SubprocessError, ValueError):
+        return subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, process_group=0
+        )
+    except OSError:
         return None
+
+
+@cache
+def gl_facts() -> dict[str, Any] | None:
+    """The OpenGL driver that EGL gives; None when none works."""
+    probe = gl_probe()
+    if probe is None:
+        return None
+    try:
+        printed, _ = probe.communicate(timeout=GL_TIMEOUT_S)
+        facts = json.loads(printed)
+    except (subprocess.TimeoutExpired, ValueError):
+        return None
+    finally:
+        end_gl_probe()
     return facts if isinstance(facts, dict) else None
+
+
+def end_gl_probe() -> None:
+    """Leave no process behind, whether its answer was needed or not."""
+    if gl_probe.cache_info().currsize and (probe := gl_probe()) is not None:
+        probe.kill()
+        probe.communicate()
 
 
 def runtime_facts() -> dict[str, Any]:

@@ -11,7 +11,8 @@ from typing import Annotated, Any
 
 import typer
 
-from trilane.apps.cli.console import JsonOption, print_json, stderr_console, stdout_console, stdout_kept
+from trilane.apps.cli.console import print_json, stderr_console, stdout_console, stdout_kept
+from trilane.apps.cli.options import JsonOption, SceneArgument, SceneAvatarOption, SceneSizeOption
 
 app = typer.Typer(rich_markup_mode=None, add_completion=False)
 
@@ -26,12 +27,17 @@ OUT_OF_BOUNDS = 1
 
 @app.command(epilog=EPILOG)
 def accuracy(
-    scene: Annotated[str, typer.Argument(help="A scene file (TOML), or the name of one that comes along.")] = "default",
-    avatar: Annotated[str | None, typer.Option(help="default, or the folder of an avatar.")] = None,
-    size: Annotated[str | None, typer.Option(help="Tensor size: HxW, or a side S for areas up to SxS.")] = None,
-    frames: Annotated[int, typer.Option(help="Frames, spread over the scene.")] = 8,
-    runtime: Annotated[list[str] | None, typer.Option(help="Once for each; all that are installed if none.")] = None,
-    hard_cases: Annotated[bool, typer.Option("--hard-cases", help="Hard inputs and networks instead.")] = False,
+    scene: SceneArgument = "default",
+    avatar: SceneAvatarOption = None,
+    size: SceneSizeOption = None,
+    frames: Annotated[int, typer.Option(help="How many frames, evenly spread over the scene.")] = 8,
+    runtime: Annotated[
+        list[str] | None,
+        typer.Option(help="ort, openvino, qnn or cuda, once for each; all that are installed if none."),
+    ] = None,
+    hard_cases: Annotated[
+        bool, typer.Option("--hard-cases", help="Compare with float on hard inputs and networks instead.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Compare the runtimes with each other on a scene's frames, or with float on hard cases.

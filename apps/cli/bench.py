@@ -15,7 +15,8 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from trilane.apps.cli.bench_options import meaning
-from trilane.apps.cli.console import JsonOption, print_json, stderr_console, stdout_console, stdout_kept
+from trilane.apps.cli.console import print_json, stderr_console, stdout_console, stdout_kept
+from trilane.apps.cli.options import JsonOption
 
 #: Bench: its module, and the line that `trilane bench --help` shows for it.
 BENCHES = {

@@ -1,66 +1,77 @@
-"""What the options of the benches mean. Rule: a word means the same everywhere, or has a line for the bench where not.
+"""What the options of the benches mean, by name.
 
-The options themselves are the parameters of each bench's `measure`.
+Rule: an option means the same in every bench, or has a line of its own for the bench where it does not. The options
+themselves are the parameters of each bench's `measure`.
 """
 
 from __future__ import annotations
 
-#: Option, or bench and option -> its line in `--help`.
+from trilane.apps.cli.options import ENCODER_HELP, NORM_HELP, POLICY_HELP, RUNTIME_HELP, SIZE_HELP, WIDTH_HELP
+
+FIXED_SIZE = "Tensor size in pixels: HEIGHTxWIDTH."
+SQUARE_SIZE = "Side of the square tensor in pixels."
+NAMED_RUNTIME = "ort, openvino, qnn or cuda."
+DRIVER_THREADS = "Threads of the software OpenGL driver."
+
+#: Option, or bench and option: its line in `--help`.
 MEANINGS = {
-    "avatar": "`default`, a bundle's folder, or `resnet18`: the full-width network, untrained.",
-    "avatars": "How many persons share the tensor.",
-    "batch": "Pictures inferred at once.",
-    "channels": "Of the neural texture: 4, 8, 12 or 16.",
-    "cores": "How many the three units have; 0: all.",
-    "edge": "Rule of the edges: single, double, triple, fifo:N, orphan or orphan:N.",
-    "encoder": "resnet18, mobilenetv2, mobilenetv3 or efficientnet-lite0.",
-    "events": "A run's folder or its events.jsonl, to be replayed.",
+    "avatar": "`default`, the folder of an avatar, or `resnet18`: the full-width network, untrained.",
+    "avatars": "How many avatars share the tensor.",
+    "batch": "Frames inferred at once.",
+    "channels": "Channels of the neural texture: 4, 8, 12 or 16.",
+    "cores": "Cores of the three units together; 0: all that this process may use.",
+    "edge": "Buffers between stages: single, double, triple, fifo:N, orphan or orphan:N.",
+    "encoder": ENCODER_HELP,
+    "events": "Folder of a run, or its events.jsonl, to be replayed.",
     "fault": "kill (SIGKILL at random moments) or stop (SIGSTOP once).",
     "fps": "Frames released a second.",
-    "frames": "Frames of a run.",
-    "handoff frames": "Hand-overs in each turn, way and size.",
-    "hang_s": "Seconds without a sign of life after which a unit is restarted.",
-    "height": "Of the picture, in pixels.",
-    "judge": "trilane, loadgen or both.",
-    "kib": "Size of the slot: 256, 1024, 4096 or 16384.",
-    "limit_ms": "Longest latency that counts as in time.",
+    "frames": "Frames of each run.",
+    "handoff frames": "Hand-overs in each round, of each variant and size.",
+    "hang_s": "Seconds without a heartbeat after which a unit is restarted.",
+    "height": "Height of the picture in pixels.",
+    "judge": "Who evaluates the run: trilane or loadgen.",
+    "kib": "Size of the slot in KiB: 256, 1024, 4096 or 16384.",
+    "limit_ms": "Longest latency of the server scenario that counts as in time.",
     "margins": "Pixels of the tensor between two avatars.",
     "minutes": "Virtual minutes.",
-    "network": "An .onnx file or a bundle, at its own size; else one is made of --encoder, --norm, --width and --size.",
-    "norm": "batch, instance or group.",
-    "period": "Seconds between two of the rates that are written down.",
-    "policy": "sequential, pipelined, latest or deadline.",
+    "network": "An .onnx file or an avatar, at its own size; if none, one of --encoder, --norm, --width and --size.",
+    "norm": NORM_HELP,
+    "period": "Seconds that one runtime runs before the next one does.",
+    "policy": POLICY_HELP,
     "rate": "Queries a second of the server scenario.",
-    "repeats": "Repetitions; the median counts.",
-    "runtime": "auto, ort, openvino, qnn or cuda.",
+    "repeats": "How often each variant runs.",
+    "joints repeats": "How many loops are timed.",
+    "runtime": RUNTIME_HELP,
+    "infer runtime": NAMED_RUNTIME,
     "samples": "Frames of a multi-stream query.",
     "scenario": "single-stream, multi-stream, server or offline.",
     "seconds": "How long each run lasts.",
-    "infer seconds": "How long each network and runtime runs.",
-    "peers seconds": "How long each way runs in a turn.",
-    "seed": "Of the random moments and service times.",
+    "infer seconds": "How long each network runs on each runtime.",
+    "peers seconds": "How long each variant runs in a round.",
+    "seed": "Seed of the random moments.",
     "seeds": "How many seeds are compared.",
-    "size": "Of the tensor: HEIGHTxWIDTH in pixels; or N, all shapes of at most N x N pixels.",
-    "sizes": "Sides of square tensors, in pixels.",
-    "spin": "Let the runtime's threads wait awake.",
+    "size": SIZE_HELP,
+    "sizes": "Sides of square tensors in pixels.",
+    "spin": "Let the runtime's threads spin between jobs.",
     "stop_s": "Seconds that a stopped unit stands still.",
-    "threads": "Of the runtime; 0: one for each core.",
-    "raster threads": "Of the software driver.",
-    "readback threads": "Of the software driver.",
-    "times": "Kills in each run.",
-    "turns": "Each way once a turn, in pairs.",
+    "threads": "Threads of the runtime; 0: one for each core that this process may use.",
+    "raster threads": DRIVER_THREADS,
+    "readback threads": DRIVER_THREADS,
+    "times": "How often the unit is killed in a run.",
+    "turns": "Rounds: each runs every variant once.",
     "unit": "cpu, gpu or dsp.",
     "video": "Encode the video, as a run does.",
-    "views": "Random poses and views.",
-    "width": "Of the network: 64 is full, every channel count scales with it.",
-    "infer size": "Of the tensor: HEIGHTxWIDTH in pixels.",
-    "peers size": "Of the tensor: HEIGHTxWIDTH in pixels.",
-    "raster size": "Side of the square tensor, in pixels.",
-    "raster-oracle size": "Side of the square tensor, in pixels.",
-    "crop width": "Of the picture, in pixels.",
+    "views": "How many random poses and views.",
+    "several views": "How many moments of the motion.",
+    "width": WIDTH_HELP,
+    "infer size": FIXED_SIZE,
+    "peers size": FIXED_SIZE,
+    "raster size": SQUARE_SIZE,
+    "raster-oracle size": SQUARE_SIZE,
+    "crop width": "Width of the picture in pixels.",
 }
 
 
 def meaning(bench: str, option: str) -> str:
-    """The line for `option` of `bench`. Raises KeyError for an option that nobody has described."""
+    """The line for `option` of `bench`. Raises KeyError for an option without one."""
     return MEANINGS.get(f"{bench} {option}") or MEANINGS[option]

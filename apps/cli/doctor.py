@@ -15,7 +15,8 @@ from typing import Any
 
 import typer
 
-from trilane.apps.cli.console import JsonOption, print_json, stdout_console
+from trilane.apps.cli.console import print_json, stdout_console
+from trilane.apps.cli.options import JsonOption
 from trilane.errors import reason
 from trilane.install import EGL_LINE, clone, install_line, package_line
 

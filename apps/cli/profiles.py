@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from trilane.apps.cli.console import JsonOption, print_json, stderr_console, stdout_console
+from trilane.apps.cli.console import print_json, stderr_console, stdout_console
+from trilane.apps.cli.options import JsonOption
 from trilane.errors import BadInputError
 from trilane.writing import WRITABLE, write_bytes
 

@@ -14,7 +14,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from trilane.apps.cli.console import JsonOption, print_json, stderr_console, stdout_console
+from trilane.apps.cli.console import print_json, stderr_console, stdout_console
+from trilane.apps.cli.options import (
+    PROFILE_HELP,
+    RUNTIME_HELP,
+    JsonOption,
+    PerformanceProfileOption,
+    SceneArgument,
+    SceneAvatarOption,
+    SceneSizeOption,
+)
 from trilane.errors import BadInputError
 from trilane.units import PerformanceProfile
 
@@ -22,8 +31,10 @@ if TYPE_CHECKING:
     from rich.progress import TaskID
 
     from trilane.apps.pace import Pace
-    from trilane.apps.run_job import Hooks, Outcome
+    from trilane.apps.run_job import Hooks, Outcome, Plan
+    from trilane.pipeline.unit_starter import UnitStarter
     from trilane.stages.config import RunConfig
+    from trilane.stages.configure import Checked
 
 app = typer.Typer(rich_markup_mode=None, add_completion=False)
 
@@ -49,6 +60,33 @@ class PolicyName(StrEnum):
     DEADLINE = "deadline"
 
 
+MotionOption = Annotated[str | None, typer.Option(help="SMPL-X .npy, AMASS .npz, .bvh, or builtin:NAME.")]
+CameraOption = Annotated[str | None, typer.Option(help="ARKit log, TUM, transforms.json, or builtin:NAME.")]
+BackgroundOption = Annotated[str | None, typer.Option(help="room, or a video, image folder or picture.")]
+FramesOption = Annotated[int | None, typer.Option(help="How many frames to present.")]
+HudOption = Annotated[bool | None, typer.Option(help="Write frame, rate and age on the picture.")]
+PolicyOption = Annotated[PolicyName, typer.Option(help="How frames are scheduled.")]
+RuntimeOption = Annotated[str, typer.Option(help=f"What runs the network: {RUNTIME_HELP}")]
+SkinningOption = Annotated[
+    str, typer.Option(help="Which unit poses the vertices: cpu, gpu; auto: cpu when OpenGL is software.")
+]
+SplitOption = Annotated[
+    list[str] | None,
+    typer.Option(help="TENSOR=UNIT: cut the network there, the rest runs on UNIT. `trilane avatar split` lists."),
+]
+PacedProfileOption = Annotated[str | None, typer.Option("--profile", help=f"{PROFILE_HELP} With --pace.")]
+PaceOption = Annotated[bool, typer.Option("--pace", help="Hold each job until its modelled time has passed.")]
+SlowMotionOption = Annotated[float, typer.Option(help="With --pace: times slower than the chip.")]
+LatchOption = Annotated[
+    float, typer.Option(min=0, max=1000, help="Sample poses late: ready so many ms before the raster; 0: at once.")
+]
+CapOption = Annotated[PerformanceProfile | None, PerformanceProfileOption]
+BaselineOption = Annotated[
+    int, typer.Option(min=0, help="Frames of the `sequential` run of the same scene that follows; 0: none.")
+]
+FolderOption = Annotated[Path | None, typer.Option("--out", help="Run folder to write; runs/TIME-SCENE if none.")]
+
+
 @contextmanager
 def _hooks() -> Iterator[Hooks]:
     """Messages, and a progress bar when stderr is a terminal."""
@@ -72,17 +110,65 @@ def _hooks() -> Iterator[Hooks]:
         yield Hooks(progress, lambda text: bar.console.print(Text(text), soft_wrap=True))
 
 
-def _print_outcome(outcome: Outcome, as_json: bool) -> None:
-    from trilane.apps.cli.run_table import run_table
+@app.command(epilog=EPILOG)
+def run(
+    scene: SceneArgument = "default",
+    motion: MotionOption = None,
+    camera: CameraOption = None,
+    background: BackgroundOption = None,
+    avatar: SceneAvatarOption = None,
+    frames: FramesOption = None,
+    size: SceneSizeOption = None,
+    hud: HudOption = None,
+    policy: PolicyOption = PolicyName.PIPELINED,
+    runtime: RuntimeOption = "auto",
+    skinning: SkinningOption = "auto",
+    split: SplitOption = None,
+    profile: PacedProfileOption = None,
+    pace: PaceOption = False,
+    slow_motion: SlowMotionOption = 1.0,
+    latch: LatchOption = 0.0,
+    performance_profile: CapOption = None,
+    baseline: BaselineOption = 60,
+    out: FolderOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Run a scene on the three units and write a run folder.
 
-    if as_json:
-        print_json(outcome.report.as_json())
-    else:
-        stdout_console().print(run_table(outcome.report))
-    stderr_console().print(f"run folder: {outcome.folder}", soft_wrap=True, markup=False)
+    The folder holds report.json, video.mp4, contact.png, trace.pftrace (open it at ui.perfetto.dev) and events.jsonl.
+    """
+    with _prepared_processes() as starter:
+        from trilane.apps.run_job import Plan
+        from trilane.stages.configure import Request, configure
+
+        cuts = tuple(split or ())
+        request = Request(scene, motion, camera, background, avatar, frames, size, runtime, hud, skinning, cuts)
+        checked = configure(request, Path.cwd())
+        chip_pace = _pace(checked.config, profile, pace, slow_motion)
+        cap = performance_profile and str(performance_profile)
+        _refuse_beside_pace(chip_pace, cuts, cap)
+        outcome = _run(checked, out, Plan(str(policy), baseline, chip_pace, cap, latch), starter)
+    _print_outcome(outcome, as_json)
+    raise typer.Exit(outcome.exit_code)
+
+
+@contextmanager
+def _prepared_processes() -> Iterator[UnitStarter]:
+    """The fork server and the look at OpenGL: both import what they need while this process does the same."""
+    from trilane.pipeline.unit_starter import UnitStarter
+    from trilane.stages.factories import PRELOAD
+    from trilane.stages.machine import end_gl_probe, gl_probe
+
+    with UnitStarter(PRELOAD) as starter:
+        gl_probe()
+        try:
+            yield starter
+        finally:
+            end_gl_probe()
 
 
 def _pace(config: RunConfig, profile: str | None, asked: bool, slow_motion: float) -> Pace | None:
+    """The pace of the chip `profile`, when `--pace` was `asked` for. Raises BadInputError."""
     if (profile is not None) != asked:
         found = "--profile without --pace" if profile is not None else "--pace without --profile"
         remedy = "give both; `trilane predict --profile` answers without running"
@@ -96,72 +182,38 @@ def _pace(config: RunConfig, profile: str | None, asked: bool, slow_motion: floa
     return pace_of(config, profile, slow_motion)
 
 
-@app.command(epilog=EPILOG)
-def run(
-    scene: Annotated[str, typer.Argument(help="A scene file (TOML), or the name of one that comes along.")] = "default",
-    motion: Annotated[str | None, typer.Option(help="SMPL-X .npy, AMASS .npz, .bvh, or builtin:NAME.")] = None,
-    camera: Annotated[str | None, typer.Option(help="ARKit log, TUM, transforms.json, or builtin:NAME.")] = None,
-    background: Annotated[str | None, typer.Option(help="room, or a video, image folder or picture.")] = None,
-    avatar: Annotated[str | None, typer.Option(help="default, or the folder of an avatar.")] = None,
-    frames: Annotated[int | None, typer.Option(help="How many frames to present.")] = None,
-    size: Annotated[str | None, typer.Option(help="Tensor size: HxW, or a side S for areas up to SxS.")] = None,
-    hud: Annotated[bool | None, typer.Option(help="Write frame, rate and age on the picture.")] = None,
-    policy: Annotated[PolicyName, typer.Option(help="How frames are scheduled.")] = PolicyName.PIPELINED,
-    runtime: Annotated[
-        str, typer.Option(help="What runs the network: openvino, ort, qnn, cuda; auto: the fastest there is.")
-    ] = "auto",
-    skinning: Annotated[
-        str, typer.Option(help="Which unit poses the vertices: cpu, gpu; auto: cpu when OpenGL is software.")
-    ] = "auto",
-    split: Annotated[
-        list[str] | None,
-        typer.Option(help="TENSOR=UNIT: cut the network there, the rest runs on UNIT. `trilane avatar split` lists."),
-    ] = None,
-    profile: Annotated[str | None, typer.Option(help="Hardware profile whose pace to keep; with --pace.")] = None,
-    pace: Annotated[bool, typer.Option("--pace", help="Hold each job until its modelled time has passed.")] = False,
-    slow_motion: Annotated[float, typer.Option(help="With --pace: times slower than the chip.")] = 1.0,
-    latch: Annotated[
-        float, typer.Option(min=0, max=1000, help="Sample poses late: ready so many ms before the raster; 0: at once.")
-    ] = 0.0,
-    performance_profile: Annotated[
-        PerformanceProfile | None, typer.Option(help="Cap of the units: duty cycles of the host profile's corners.")
-    ] = None,
-    baseline: Annotated[int, typer.Option(min=0, help="Frames of the sequential run beside it; 0: none.")] = 60,
-    out: Annotated[Path | None, typer.Option(help="Run folder to write; runs/TIME-SCENE when not given.")] = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Run a scene on the three units and write a run folder.
-
-    The folder holds report.json, video.mp4, contact.png, trace.pftrace (open it at ui.perfetto.dev) and events.jsonl.
-    """
-    from trilane.apps.run_folder import default_place
-    from trilane.apps.run_job import Plan, run_to_folder
-    from trilane.stages.configure import Request, configure, required_machine
-
-    request = Request(
-        scene, motion, camera, background, avatar, frames, size, runtime, hud, skinning, tuple(split or ())
-    )
-    checked = configure(request, Path.cwd())
-    held = _pace(checked.config, profile, pace, slow_motion)
-    if held is not None and split:
+def _refuse_beside_pace(pace: Pace | None, cuts: tuple[str, ...], cap: str | None) -> None:
+    """Raises BadInputError for an option that a chip's pace leaves no room for."""
+    if pace is not None and cuts:
         raise BadInputError("options", "--split with --pace", "one of them", "a chip's pace is that of a whole network")
-    if held is not None and performance_profile is not None:
+    if pace is not None and cap is not None:
         raise BadInputError("options", "--performance-profile with --pace", "one of them", "a pace is capped already")
-    if held is not None:
-        checked = checked.changed(pace_ns=dict(held.stage_ns))
+
+
+def _run(checked: Checked, out: Path | None, plan: Plan, starter: UnitStarter) -> Outcome:
+    """Run `checked` as `plan` says, to the folder `out` or the default one."""
+    from trilane.apps.run_folder import default_place
+    from trilane.apps.run_job import run_to_folder
+    from trilane.stages.configure import required_machine
+
+    if plan.pace is not None:
+        checked = checked.changed(pace_ns=dict(plan.pace.stage_ns))
     target = out or default_place(checked.config.scene.name)
     with _hooks() as hooks:
         for note in checked.notes:
             hooks.message(note)
-        outcome = run_to_folder(
-            checked,
-            target,
-            Plan(str(policy), baseline, held, performance_profile and str(performance_profile), latch),
-            hooks,
-            machine=required_machine(),
-            starter=starter,
-        )
-    _print_outcome(outcome, as_json)
-    if outcome.report.failure:
-        stderr_console().print(f"the run failed: {outcome.report.failure}", soft_wrap=True, markup=False)
-    raise typer.Exit(outcome.exit_code)
+        return run_to_folder(checked, target, plan, hooks, machine=required_machine(), starter=starter)
+
+
+def _print_outcome(outcome: Outcome, as_json: bool) -> None:
+    """The report or its table on stdout; the folder, and why a run failed, on stderr."""
+    from trilane.apps.cli.run_table import run_table
+
+    report = outcome.report
+    if as_json:
+        print_json(report.as_json())
+    else:
+        stdout_console().print(run_table(report))
+    stderr_console().print(f"run folder: {outcome.folder}", soft_wrap=True, markup=False)
+    if report.failure:
+        stderr_console().print(f"the run failed: {report.failure}", soft_wrap=True, markup=False)
