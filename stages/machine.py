@@ -99,7 +99,7 @@ def gl_probe() -> subprocess.Popen[bytes] | None:
 
     Whoever needs `gl_facts` later calls this early: the process works while the caller goes on.
     """
-    command = [sys.executable, "-c", GL_PROGRAM]
+    command = [sys.executable, "-P", "-c", GL_PROGRAM]
     try:
         return subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, process_group=0

@@ -1,0 +1,237 @@
+"""The keys of `--json` and of report.json stay what programs read: as json_keys.toml has them, none lost, none new.
+
+Rule: every command that takes `--json` is in json_keys.toml, and is run as a person runs it, with its cheapest
+arguments; its stdout is one JSON document. What the lines of the file mean stands at its head.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+from numpy.typing import NDArray
+
+from trilane.apps.cli import main as cli
+
+FILE = Path(__file__).with_name("json_keys.toml")
+DATA = tomllib.loads(FILE.read_text(encoding="utf-8"))
+SLOW = "TRILANE_SLOW_KEYS"
+TIMEOUT_S = 110
+
+#: Names from the document's root to a key; those of lists end in `[]` where an entry of theirs is meant.
+Names = tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A command of the file; the fields are described at the file's head."""
+
+    name: str
+    table: str
+    arguments: list[str]
+    keys: list[str]
+    files: dict[str, list[str]] = field(default_factory=dict)
+    needs: list[str] = field(default_factory=list)
+    after: str = ""
+    exits: list[int] = field(default_factory=lambda: [0])
+    seconds: int = 0
+
+    @property
+    def line(self) -> str:
+        return " ".join(["trilane", *self.arguments, "--json"])
+
+
+CASES = {name: Case(name, table, **fields) for table in ("commands", "slow") for name, fields in DATA[table].items()}
+
+
+@dataclass
+class Place:
+    """A folder with everything that the commands read. Each command is run in it once."""
+
+    folder: Path
+    printed: dict[str, str] = field(default_factory=dict)
+
+    def run(self, case: Case) -> str:
+        """What the command prints on stdout."""
+        if case.after:
+            self.run(CASES[case.after])
+        if case.name not in self.printed:
+            done = subprocess.run(
+                [sys.executable, "-m", "trilane.apps.cli.main", *case.arguments, "--json"],
+                cwd=self.folder,
+                capture_output=True,
+                text=True,
+                check=False,
+                timeout=TIMEOUT_S,
+            )
+            assert done.returncode in case.exits, f"{case.line}\nended with {done.returncode}: {done.stderr}"
+            self.printed[case.name] = done.stdout
+        return self.printed[case.name]
+
+
+@pytest.fixture(scope="module")
+def place(
+    drawable_bundle: Path,
+    tiny_float: onnx.ModelProto,
+    tiny_frames: list[NDArray[Any]],
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Place:
+    folder = tmp_path_factory.mktemp("keys")
+    shutil.copytree(drawable_bundle, folder / "bundle")
+    manifest = folder / "bundle" / "manifest.json"
+    validation = {"psnr_db_by_band": {"full_body": 30.0}, "iou": 0.9, "ssim": 0.9}
+    manifest.write_text(json.dumps(json.loads(manifest.read_text()) | {"validation": validation}))
+    onnx.save(tiny_float, folder / "float.onnx")
+    np.save(folder / "frames.npy", np.stack(tiny_frames * 3)[:16])
+    np.save(folder / "poses.npy", np.zeros((1, 165)))
+    for name, text in DATA["inputs"].items():
+        (folder / name).write_text(text.lstrip(), encoding="utf-8")
+    return Place(folder)
+
+
+def one_document(text: str, where: str) -> Any:
+    """The JSON document that `text` is; fails when it is none, or more than one, or holds what JSON has not."""
+
+    def refuse(word: str) -> None:
+        raise ValueError(f"{word} is no JSON")
+
+    try:
+        return json.loads(text, parse_constant=refuse)
+    except ValueError as error:
+        wrong = str(error)
+    pytest.fail(f"{where}: expected one JSON document and nothing else: {wrong}; found:\n{text[:500]}", pytrace=False)
+
+
+def names_in(value: Any, above: Names = ()) -> Iterator[Names]:
+    """Every key in a document."""
+    if isinstance(value, dict):
+        for key, below in value.items():
+            yield (*above, key)
+            yield from names_in(below, (*above, key))
+    elif isinstance(value, list) and above:
+        for entry in value:
+            yield from names_in(entry, (*above[:-1], f"{above[-1]}[]"))
+
+
+def listed(lines: list[str]) -> Iterator[Names]:
+    """The keys that lines of the file stand for, parts put in, each after those above it."""
+    for line in lines:
+        pieces = re.split(r"\{(.*?)\}", line)
+        for chosen in product(*(piece.split(",") if place % 2 else [piece] for place, piece in enumerate(pieces))):
+            *above, last = "".join(chosen).split(".")
+            ends = listed(DATA["parts"][last[1:]]) if last.startswith("@") else [(last,)]
+            for names in ((*above, *end) for end in ends):
+                for count in range(1, len(names) + 1):
+                    yield (*names[: count - 1], names[count - 1].removesuffix("[]"))
+
+
+def same(found: Names, meant: Names) -> bool:
+    """Is the key `found` the one that the file has as `meant`?"""
+    pairs = zip(found, meant, strict=False)
+    return len(found) == len(meant) and all(
+        own in (name, f"{name}?") or own.removesuffix("?") == "*" for name, own in pairs
+    )
+
+
+def written(names: Names) -> str:
+    return ".".join(names)
+
+
+def differences(document: Any, lines: list[str]) -> list[str]:
+    """A line for every key that is missing in the document, or new."""
+    found = dict.fromkeys(names_in(document))
+    meant = dict.fromkeys(listed(lines))
+    missing = [
+        written(names)
+        for names in meant
+        if not any(name.endswith("?") for name in names) and not any(same(each, names) for each in found)
+    ]
+    new = [written(names) for names in found if not any(same(names, each) for each in meant)]
+    return [*(f"  missing: {key}" for key in missing), *(f"  new:     {key}" for key in new)]
+
+
+def check(document: Any, lines: list[str], what: str, where: str) -> None:
+    wrong = differences(document, lines)
+    if wrong:
+        pytest.fail(
+            "\n".join(
+                [
+                    f"{what}: other keys than {FILE.name} has",
+                    *wrong,
+                    "Programs read these keys: give a missing one its name back.",
+                    f"If a change is meant, write it in tests/process/{FILE.name} under {where}: a line for a new key",
+                    "(`*` for a name that is data, `?` after one that may be absent), none for one that is gone,",
+                    "and say so in CHANGELOG.md.",
+                ]
+            ),
+            pytrace=False,
+        )
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_keys_are_those_of_the_file(name: str, place: Place) -> None:
+    case = CASES[name]
+    for package in case.needs:
+        if find_spec(package) is None:
+            pytest.skip(f"{case.line}: needs the package {package}, which is absent")
+    if case.table == "slow" and SLOW not in os.environ:
+        pytest.skip(f"{case.line}: takes {case.seconds} s; {SLOW}=1 runs it")
+    document = one_document(place.run(case), case.line)
+    heading = f'[{case.table}."{name}"]'
+    check(document, case.keys, case.line, f"`keys` of {heading}")
+    for file, keys in case.files.items():
+        inside = one_document((place.folder / file).read_text(encoding="utf-8"), file)
+        check(inside, keys, f"{case.line}\n{file}, which it writes", f"`files` of {heading}")
+
+
+def commands_with_json(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *words: str
+) -> Iterator[Names]:
+    """The words of every command below `words` whose help names `--json`."""
+    monkeypatch.setattr(sys, "argv", ["trilane", *words, "--help"])
+    with pytest.raises(SystemExit):
+        cli.main()
+    text = capsys.readouterr().out
+    if "--json " in text.partition("Examples:")[0]:
+        yield words
+    _, _, below = text.partition("\nCommands:\n")
+    for name in re.findall(r"^  (\S+)", below.partition("\n\n")[0], re.MULTILINE):
+        yield from commands_with_json(monkeypatch, capsys, *words, name)
+
+
+def test_every_command_that_takes_json_is_in_the_file(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    there = set(commands_with_json(monkeypatch, capsys))
+    held = {tuple(case.arguments[: len(words)]) for case in CASES.values() for words in there}
+    absent = [" ".join(("trilane", *words)) for words in sorted(there - held)]
+    assert len(there) > 30
+    assert not absent, f"no entry in {FILE.name} for {', '.join(absent)}: add one under [commands], see the file's head"
+
+
+def test_a_key_that_is_lost_or_new_or_renamed_is_named() -> None:
+    lines = ["rows[].{way,ms}", "units.*.busy", "absent?.simpy"]
+    good = {"rows": [{"way": "a", "ms": 1}], "units": {"cpu": {"busy": 1}, "a.b": {"busy": 1}}}
+    assert differences(good, lines) == []
+    assert differences(good | {"absent": {"simpy": "why"}}, lines) == []
+    assert differences(good | {"rows": []}, lines) == ["  missing: rows[].way", "  missing: rows[].ms"]
+    assert differences(good | {"rows": [{"way": "a", "us": 1}]}, lines) == [
+        "  missing: rows[].ms",
+        "  new:     rows[].us",
+    ]
+    assert differences(good | {"units": {"cpu": {}}}, lines) == ["  missing: units.*.busy"]
+    assert differences(good | {"absent": {"other": 1}, "x": 1}, lines) == ["  new:     absent.other", "  new:     x"]
