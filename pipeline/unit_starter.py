@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -36,26 +37,27 @@ class UnitStarter:
     """
 
     def __init__(self, preload: Sequence[str] = ()) -> None:
-        self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self._stderr = os.memfd_create("trilane:stderr", os.MFD_CLOEXEC)
-        arguments = [f"--socket={theirs.fileno()}", f"--parent={os.getpid()}", f"--preload={','.join(preload)}"]
-        try:
-            self._server = subprocess.Popen(
-                [sys.executable, "-P", "-m", "trilane.pipeline.fork_server", *arguments],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=self._stderr,
-                pass_fds=[theirs.fileno()],
-                env={**os.environ, **dict.fromkeys(THREAD_LIMITS, "1")},
-                process_group=0,
-            )
-        except BaseException:
-            self._socket.close()
-            os.close(self._stderr)
-            raise
-        finally:
-            theirs.close()
+        with contextlib.ExitStack() as undo, contextlib.ExitStack() as ended:
+            self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+            undo.callback(self._socket.close)
+            ended.callback(theirs.close)
+            self._stderr = os.memfd_create("trilane:stderr", os.MFD_CLOEXEC)
+            undo.callback(os.close, self._stderr)
+            self._server = self._spawn(theirs, preload)
+            undo.pop_all()
         self._socket.settimeout(ANSWER_S)
+
+    def _spawn(self, theirs: socket.socket, preload: Sequence[str]) -> subprocess.Popen[bytes]:
+        arguments = [f"--socket={theirs.fileno()}", f"--parent={os.getpid()}", f"--preload={','.join(preload)}"]
+        return subprocess.Popen(
+            [sys.executable, "-P", "-m", "trilane.pipeline.fork_server", *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=self._stderr,
+            pass_fds=[theirs.fileno()],
+            env={**os.environ, **dict.fromkeys(THREAD_LIMITS, "1")},
+            process_group=0,
+        )
 
     def start(self, spec: UnitSpec, stderr_fd: int) -> StartedUnit:
         """A process for the unit, which writes to `stderr_fd`. Raises TrilaneError when the fork server failed."""

@@ -11,11 +11,12 @@ import pytest
 from trilane.avatars.bundle import load_bundle
 from trilane.errors import BadInputError
 from trilane.pipeline.description import UnitSettings
+from trilane.pipeline.stage import UnitContext
 from trilane.scene.schema import Scene
 from trilane.stages.config import RunConfig
-from trilane.stages.dsp.infer import InferStage
-from trilane.stages.dsp.unit import build
+from trilane.stages.dsp.infer import InferStage, build
 from trilane.stages.packets import pose_dtype
+from trilane.testing.assets import assets_of
 from trilane.transport.packets import SlotLayout, view_packet
 
 CHANNELS = 5
@@ -30,7 +31,7 @@ def make(folder, avatars=1, size="64", runtime="ort"):
     scene = Scene.model_validate({"size": size, "avatars": [{}] * avatars})
     units = {"dsp": UnitSettings(cores=(0,), threads=1)}
     config = RunConfig(scene=scene, out_dir=folder, avatar_dirs=(folder,) * avatars, units=units, runtime=runtime)
-    stage = InferStage(config)
+    stage = InferStage(config, load_bundle(folder).read_network())
     pixels = config.max_tensor_pixels * avatars
     inputs, outputs = slots(2, avatars, pixels * CHANNELS), slots(2, avatars, pixels * 4)
     stage.bind(inputs, outputs)
@@ -96,7 +97,7 @@ def test_avatars_of_different_networks_are_refused(tiny_bundle, tmp_path):
     scene = Scene.model_validate({"size": "64", "avatars": [{}] * 2})
     config = RunConfig(scene=scene, out_dir=tmp_path, avatar_dirs=(tiny_bundle, other), units=units)
     with pytest.raises(BadInputError, match="one network for all avatars"):
-        InferStage(config)
+        assets_of(config)
 
 
 def test_one_network_is_loaded_once(tiny_bundle):
@@ -114,12 +115,14 @@ def test_a_slot_that_is_too_small_is_refused(tiny_bundle):
     units = {"dsp": UnitSettings(cores=(0,), threads=1)}
     config = RunConfig(scene=Scene(size="64"), out_dir=tiny_bundle, avatar_dirs=(tiny_bundle,), units=units)
     with pytest.raises(ValueError, match="slot of 100 bytes"):
-        InferStage(config).bind(slots(1, 1, 100), slots(1, 1, 64 * 64 * 4))
+        InferStage(config, load_bundle(tiny_bundle).read_network()).bind(slots(1, 1, 100), slots(1, 1, 64 * 64 * 4))
 
 
-def test_the_unit_owns_the_infer_stage(tiny_bundle):
+def test_the_factory_builds_a_part_of_the_network(tiny_bundle):
     units = {"dsp": UnitSettings(cores=(0,), threads=1)}
     config = RunConfig(scene=Scene(size="64"), out_dir=tiny_bundle, avatar_dirs=(tiny_bundle,), units=units)
-    stages = build(config)
-    assert list(stages) == ["infer"]
+    unit = UnitContext("dsp", units["dsp"], assets_of(config))
+    stage = build({"config": config.model_dump(mode="json"), "part": 0}, unit)
+    stage.bind(slots(1, 1, 64 * 64 * CHANNELS), slots(1, 1, 64 * 64 * 4))
+    assert stage.startup["sessions"] == 3
     assert load_bundle(tiny_bundle).manifest.network.channels == CHANNELS

@@ -13,14 +13,15 @@ from hypothesis import strategies as st
 
 from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline.description import UnitSettings
+from trilane.pipeline.stage import UnitContext
 from trilane.scene.schema import AvatarSpec, CameraSpec, Scene
 from trilane.shapes import shape_buckets
 from trilane.stages.config import RunConfig
 from trilane.stages.cpu.crop import Rect
-from trilane.stages.cpu.pose import PoseStage
+from trilane.stages.cpu.pose import PoseStage, build
 from trilane.stages.cpu.tensor_layout import MARGIN_PX, lay_out
-from trilane.stages.cpu.unit import build
 from trilane.stages.packets import pose_dtype
+from trilane.testing.assets import assets_of
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 OUTPUT = (480, 640)
@@ -32,6 +33,10 @@ def config(bundle: Path, out_dir: Path, **scene: Any) -> RunConfig:
     return RunConfig(scene=made, out_dir=out_dir, avatar_dirs=(bundle,) * len(made.avatars), units=settings)
 
 
+def pose_stage(config: RunConfig) -> PoseStage:
+    return PoseStage(config, assets_of(config))
+
+
 def bound(stage: PoseStage, avatars: int = 1) -> Packet:
     layout = SlotLayout(pose_dtype(avatars), 0)
     packet = view_packet(memoryview(bytearray(layout.slot_bytes)), layout)
@@ -40,7 +45,7 @@ def bound(stage: PoseStage, avatars: int = 1) -> Packet:
 
 
 def test_a_packet_says_everything_of_its_frame(tiny_bundle: Path, tmp_path: Path) -> None:
-    stage = PoseStage(config(tiny_bundle, tmp_path, fps=25.0))
+    stage = pose_stage(config(tiny_bundle, tmp_path, fps=25.0))
     packet = bound(stage)
     before = time.monotonic_ns()
     assert stage.run(50, None, 0) == {"visible": 1.0}
@@ -56,7 +61,7 @@ def test_a_packet_says_everything_of_its_frame(tiny_bundle: Path, tmp_path: Path
 
 
 def test_the_skinned_feet_stand_on_the_floor(tiny_bundle: Path, tmp_path: Path) -> None:
-    stage = PoseStage(config(tiny_bundle, tmp_path))
+    stage = pose_stage(config(tiny_bundle, tmp_path))
     packet = bound(stage)
     for frame in (0, 31, 150):
         stage.run(frame, None, 0)
@@ -66,7 +71,7 @@ def test_the_skinned_feet_stand_on_the_floor(tiny_bundle: Path, tmp_path: Path) 
 
 
 def test_a_frame_is_the_same_whatever_came_before(tiny_bundle: Path, tmp_path: Path) -> None:
-    first, second = (PoseStage(config(tiny_bundle, tmp_path)) for _ in range(2))
+    first, second = (pose_stage(config(tiny_bundle, tmp_path)) for _ in range(2))
     packets = bound(first), bound(second)
     for frame in (7, 250, 90):
         first.run(frame, None, 0)
@@ -81,7 +86,7 @@ def test_an_avatar_out_of_the_picture_is_not_visible(tiny_bundle: Path, tmp_path
     packet = bound(stage, 2)
     assert stage.run(0, None, 0) == {"visible": 1.0}
     assert packet.header["avatars"]["visible"].tolist() == [1, 0]
-    only_hidden = PoseStage(config(tiny_bundle, tmp_path, avatars=(spec,)))
+    only_hidden = pose_stage(config(tiny_bundle, tmp_path, avatars=(spec,)))
     packet = bound(only_hidden)
     assert only_hidden.run(0, None, 0) == {"visible": 0.0}
     assert tuple(packet.header["tensor_shape"]) in shape_buckets("256")
@@ -89,7 +94,7 @@ def test_an_avatar_out_of_the_picture_is_not_visible(tiny_bundle: Path, tmp_path
 
 def test_two_avatars_share_the_tensor(tiny_bundle: Path, tmp_path: Path) -> None:
     pair = (AvatarSpec(position=(-0.6, 0, 0)), AvatarSpec(position=(0.6, 0, 0), motion="builtin:idle"))
-    stage = PoseStage(config(tiny_bundle, tmp_path, avatars=pair))
+    stage = pose_stage(config(tiny_bundle, tmp_path, avatars=pair))
     packet = bound(stage, 2)
     stage.run(0, None, 0)
     (_, left, _, width), second = sorted(packet.header["avatars"]["tensor_rect"].tolist(), key=lambda cell: cell[1])
@@ -97,7 +102,7 @@ def test_two_avatars_share_the_tensor(tiny_bundle: Path, tmp_path: Path) -> None
 
 
 def test_nan_never_leaves_the_stage(tiny_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    stage = PoseStage(config(tiny_bundle, tmp_path, camera=CameraSpec(source="builtin:static")))
+    stage = pose_stage(config(tiny_bundle, tmp_path, camera=CameraSpec(source="builtin:static")))
     bound(stage)
     mover = type(stage._actors[0].mover)
     monkeypatch.setattr(mover, "sample", lambda *_: (np.full((55, 3), np.nan), np.zeros(3)))
@@ -106,14 +111,15 @@ def test_nan_never_leaves_the_stage(tiny_bundle: Path, tmp_path: Path, monkeypat
 
 
 def test_edges_are_checked(tiny_bundle: Path, tmp_path: Path) -> None:
-    stages = build(config(tiny_bundle, tmp_path))
-    assert sorted(stages) == ["pose", "present"]
-    packet = bound(stages["pose"])  # type: ignore[arg-type]
+    asked = config(tiny_bundle, tmp_path)
+    unit = UnitContext("cpu", asked.units["cpu"], assets_of(asked))
+    stage = build({"config": asked.model_dump(mode="json")}, unit)
+    packet = bound(stage)
     with pytest.raises(ValueError, match="no input edge"):
-        stages["pose"].bind([packet], [])
+        stage.bind([packet], [])
     with pytest.raises(ValueError, match="needs an output slot"):
-        stages["pose"].run(0, None, None)
-    stages["pose"].close()
+        stage.run(0, None, None)
+    stage.close()
 
 
 sides = st.tuples(st.floats(-1, 0.9), st.floats(0.02, 2)).map(lambda p: (p[0], min(p[0] + p[1], 1.0)))

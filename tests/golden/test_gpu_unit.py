@@ -11,16 +11,19 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from trilane.avatars.bundle import load_bundle
 from trilane.errors import BadInputError, TrilaneError, UnitLostError
 from trilane.pipeline.description import UnitSettings
+from trilane.pipeline.stage import UnitContext
 from trilane.scene.schema import PlaneSpec, Scene
 from trilane.stages.config import RunConfig
-from trilane.stages.gpu import hud, planes, unit
-from trilane.stages.gpu.assets import AvatarAssets
+from trilane.stages.gpu import composite, hud, planes
+from trilane.stages.gpu import raster as raster_stage
 from trilane.stages.gpu.composite import CompositeStage
 from trilane.stages.gpu.packed import PackedAvatar, PackedPass, Quantisation
 from trilane.stages.gpu.raster import RasterStage
 from trilane.stages.packets import pose_dtype
+from trilane.testing.assets import assets_of
 from trilane.testing.lost_context import lose_context
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 
@@ -235,48 +238,42 @@ def test_alpha_is_blended_in_linear_light(gl: Any, person: Any, camera: Camera) 
     assert np.abs(frame - expected).max() <= 2
 
 
-def config(tmp_path: Path, background: str) -> RunConfig:
-    """A run of one avatar."""
-    return RunConfig(
-        scene=Scene(background=background, size="96x64"),
-        out_dir=tmp_path,
-        avatar_dirs=(tmp_path,),
+def built(bundle: Path, background: Path) -> tuple[RasterStage, CompositeStage]:
+    """Both stages of a run of one avatar, made as a unit makes them: on one context."""
+    config = RunConfig(
+        scene=Scene(background=str(background), size="96x64"),
+        out_dir=bundle,
+        avatar_dirs=(bundle,),
         units={"gpu": UnitSettings(cores=(0,), threads=1)},
     )
+    unit = UnitContext("gpu", config.units["gpu"], assets_of(config))
+    settings = {"config": config.model_dump(mode="json")}
+    return raster_stage.build(settings, unit), composite.build(settings, unit)
 
 
-@pytest.fixture
-def assets(person: Any, neural_texture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The default body with a random texture in place of a bundle."""
-    found = AvatarAssets(person.arrays, None, person.rest, neural_texture.astype(np.float32), ENCODING)
-    monkeypatch.setattr(unit, "load_assets", lambda _: found)
-
-
-@pytest.mark.usefixtures("assets")
-def test_unit_builds_both_stages(tmp_path: Path, person: Any, camera: Camera) -> None:
+def test_the_factories_build_both_stages(tmp_path: Path, drawable_bundle: Path, person: Any, camera: Camera) -> None:
     """A picture as the background shows where the avatar's picture is empty."""
     path = tmp_path / "grey.png"
     Image.fromarray(np.full((30, 40, 3), 90, np.uint8)).save(path)
-    stages = unit.build(config(tmp_path, str(path)))
-    assert list(stages) == ["raster", "composite"]
+    drawn, composed_stage = built(drawable_bundle, path)
+    zero_point = load_bundle(drawable_bundle).manifest.network.input.zero_point
     source, image = packet(0), packet(TENSOR[0] * TENSOR[1] * 16)
     frame = packet(640 * 480 * 3)
-    stages["raster"].bind([source], [image])
+    drawn.bind([source], [image])
     fill_pose(source, person.pose(np.zeros(165)), *camera((0, 1, 3), (0, 1, 0)), (-1, -1, 1, 1))
-    stages["raster"].run(0, 0, 0)
-    assert (image.payload != ENCODING.zero_point).any()
+    drawn.run(0, 0, 0)
+    assert (image.payload[: TENSOR[0] * TENSOR[1] * 4] != zero_point).any()
     image.payload[:] = 0
     fill_pose(image, person.pose(np.zeros(165)), *camera((0, 1, 3), (0, 3, 0)), (-1, -1, 1, 1))
-    stages["composite"].bind([image], [frame])
-    stages["composite"].run(0, 0, 0)
-    stages["composite"].close()
+    composed_stage.bind([image], [frame])
+    composed_stage.run(0, 0, 0)
+    composed_stage.close()
     assert (frame.payload == 90).all()
 
 
-@pytest.mark.usefixtures("assets")
-def test_bad_background_is_named(tmp_path: Path) -> None:
+def test_bad_background_is_named(tmp_path: Path, drawable_bundle: Path) -> None:
     """A text file is no video."""
     path = tmp_path / "notes.mp4"
     path.write_text("not a video")
     with pytest.raises(BadInputError, match=r"notes\.mp4"):
-        unit.build(config(tmp_path, str(path)))
+        built(drawable_bundle, path)

@@ -237,7 +237,7 @@ def test_a_second_interrupt_ends_at_once() -> None:
     assert time.monotonic() - begin < 8
     assert result.interrupted
     assert by_cause(result.lost)["aborted"] >= 1
-    check_accounts(result)
+    assert not list(replay(result.recording))
 
 
 SCRIPT = """
