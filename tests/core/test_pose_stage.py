@@ -82,7 +82,7 @@ def test_a_frame_is_the_same_whatever_came_before(tiny_bundle: Path, tmp_path: P
 
 def test_an_avatar_out_of_the_picture_is_not_visible(tiny_bundle: Path, tmp_path: Path) -> None:
     spec = AvatarSpec(position=(0.0, 0.0, 40.0))
-    stage = PoseStage(config(tiny_bundle, tmp_path, avatars=(AvatarSpec(), spec)))
+    stage = pose_stage(config(tiny_bundle, tmp_path, avatars=(AvatarSpec(), spec)))
     packet = bound(stage, 2)
     assert stage.run(0, None, 0) == {"visible": 1.0}
     assert packet.header["avatars"]["visible"].tolist() == [1, 0]
