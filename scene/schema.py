@@ -52,8 +52,8 @@ class CameraSpec(Model):
     """The camera.
 
     `source`: `builtin:NAME` or a file. `fov_y_deg`: of the picture's height; None for that of the file, or the usual
-    one of its format. `near_m`, `far_m`: clip planes. `place`: whether a recorded camera is placed in the scene (`auto`) or
-    stays where it was recorded (`none`).
+    one of its format. `near_m`, `far_m`: clip planes. `place`: whether a recorded camera is placed in the scene
+    (`auto`) or stays where it was recorded (`none`).
     """
 
     source: str = "builtin:orbit"
