@@ -1,6 +1,6 @@
-"""Scene files (TOML) to `Scene`, and a schema's complaint to one sentence for a person.
+"""Loads scene files (TOML), and turns an error of the schema into one sentence for people.
 
-Rule: the first thing that is wrong is named with its file and key; the values of a file are never changed.
+Rule: the first defect is named with its file and key; the values of a file are never changed.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from trilane.unexpected import unexpected_in
 INPUT_SHOULD = "Input should be "
 ENDING = ".toml"
 LONGEST_FOUND = 80
-#: Kind of complaint: what was expected, where the schema's own words are not for people.
+#: Type of a pydantic error -> what was expected, where pydantic's own text is not fit for people.
 EXPECTED = {
     "too_short": "at least {min_length} of them",
     "too_long": "at most {max_length} of them",
@@ -35,7 +35,7 @@ BUILT_IN = ("room", "default")  # a background, an avatar
 
 
 def bad_input(where: str | Path, error: ValidationError) -> BadInputError:
-    """The first complaint of `error` as a BadInputError about `where`, with the key."""
+    """The first defect that `error` lists, as a BadInputError about `where` with the key."""
     first = error.errors()[0]
     key = ".".join(str(part) for part in first["loc"])
     place = f"{where}: {key}" if key else str(where)
@@ -90,18 +90,18 @@ def load_scene(path: Path) -> dict[str, Any]:
     base = path.absolute().parent
     values["background"] = located(scene.background, base)
     values["camera"] = {**values.get("camera", {}), "source": located(scene.camera.source, base)}
-    given = values.get("avatars", [{}])
+    avatars = values.get("avatars", [{}])
     values["avatars"] = [
         {**raw, "motion": located(spec.motion, base), "bundle": located(spec.bundle, base)}
-        for raw, spec in zip(given, scene.avatars, strict=True)
+        for raw, spec in zip(avatars, scene.avatars, strict=True)
     ]
     return values
 
 
 def located(source: str, base: Path) -> str:
-    """`source` as it is when it names something built in, else as a path that starts at `base`.
+    """`source` unchanged if it names something built in, else as a path that starts at `base`.
 
-    Raises BadInputError for no name at all.
+    Raises BadInputError for an empty text.
     """
     if not source:
         raise BadInputError("name of a file", "nothing", "a path, or the name of something built in")

@@ -1,6 +1,6 @@
-"""Rotations as arrays: quaternions `w, x, y, z`, axis-angle vectors in radians, 3x3 matrices for column vectors.
+"""Conversions of rotations: quaternions `w, x, y, z`, axis-angle vectors in radians, 3x3 matrices for column vectors.
 
-Rule: every function takes any leading axes, computes in float64 and is exact at 0 and at pi.
+Rule: every function accepts any leading axes, computes in float64 and is exact at angles of 0 and pi.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ from numpy.typing import ArrayLike
 
 from trilane.arrays import F64
 
-#: Columns are the images of x, y, z: turns a Z-up world into a Y-up one, x kept.
+#: Turns a Z-up world into a Y-up one and keeps x.
 Y_UP_FROM_Z_UP: F64 = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
 def quat_from_rotvec(rotvec: ArrayLike) -> F64:
-    """Axis-angle (..., 3) to unit quaternions (..., 4), w >= 0 only for angles up to pi."""
+    """Axis-angle (..., 3) to unit quaternions (..., 4); w is negative for angles between pi and 3 pi."""
     vectors = np.asarray(rotvec, dtype=np.float64)
     half = np.sqrt((vectors * vectors).sum(axis=-1, keepdims=True)) / 2
     return np.concatenate([np.cos(half), np.sinc(half / np.pi) * vectors / 2], axis=-1)
@@ -33,7 +33,7 @@ def rotvec_from_quat(quat: ArrayLike) -> F64:
 
 
 def _products_to_matrix() -> F64:
-    """(16, 9): takes the products of (w, x, y, z) by themselves, row-major, to the rotation matrix, row-major."""
+    """Table (16, 9) from the outer product of (w, x, y, z) with itself to the rotation matrix, both row-major."""
     table = np.zeros((4, 4, 3, 3))
     table[0, 0] = np.eye(3)
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
@@ -54,7 +54,7 @@ def matrix_from_quat(quat: ArrayLike) -> F64:
 
 
 def quat_from_matrix(matrix: ArrayLike) -> F64:
-    """Rotation matrices (..., 3, 3) to unit quaternions (..., 4), by the largest of the four squared components.
+    """Rotation matrices (..., 3, 3) to unit quaternions (..., 4), computed from the component that is largest.
 
     Shepperd, "Quaternion from rotation matrix", J. Guidance and Control 1(3), 1978.
     """
@@ -95,7 +95,7 @@ def about(axis: int, angle_rad: ArrayLike) -> F64:
 
 
 def quat_multiply(left: ArrayLike, right: ArrayLike) -> F64:
-    """Hamilton product (..., 4): turn by `right`, then by `left`."""
+    """Hamilton product (..., 4): the turn by `right` and then by `left`."""
     aw, ax, ay, az = np.moveaxis(np.asarray(left, dtype=np.float64), -1, 0)
     bw, bx, by, bz = np.moveaxis(np.asarray(right, dtype=np.float64), -1, 0)
     return np.stack(
@@ -112,7 +112,7 @@ def quat_multiply(left: ArrayLike, right: ArrayLike) -> F64:
 def slerp(start: ArrayLike, end: ArrayLike, fraction: ArrayLike) -> F64:
     """Great-circle interpolation (..., 4) of unit quaternions along the shorter arc; `fraction` (...) in [0, 1].
 
-    Shoemake, "Animating rotation with quaternion curves", SIGGRAPH 1985; nearly equal ends fall back on the chord.
+    Shoemake, "Animating rotation with quaternion curves", SIGGRAPH 1985. Between nearly equal ends it is linear.
     """
     a, b = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
     s = np.asarray(fraction, dtype=np.float64)
@@ -136,19 +136,19 @@ def normalised(vectors: ArrayLike) -> F64:
 def shortest_turn(source: ArrayLike, target: ArrayLike, fallback: ArrayLike = (1.0, 0.0, 0.0)) -> F64:
     """Rotation matrix (3, 3) of the least angle that turns direction `source` (3,) to `target` (3,).
 
-    Opposite directions are turned about the part of `fallback` that is square to them, if it has one.
+    Between opposite directions the axis is the part of `fallback` (3,) that is perpendicular to them, if it has one.
     """
     a, b = normalised(source), normalised(target)
     axis = np.cross(a, b)
     sine = float(np.linalg.norm(axis))
     if sine < 1e-9:
-        axis = _square_to(a, np.asarray(fallback, dtype=np.float64))
+        axis = _perpendicular_to(a, np.asarray(fallback, dtype=np.float64))
     return matrix_from_rotvec(normalised(axis) * np.arctan2(sine, a @ b))
 
 
-def _square_to(unit: F64, wish: F64) -> F64:
-    """The part of `wish` (3,) square to `unit` (3,), or else any direction that is."""
-    side = wish - (wish @ unit) * unit
+def _perpendicular_to(unit: F64, preferred: F64) -> F64:
+    """The part of `preferred` (3,) perpendicular to `unit` (3,), or any such direction where it has none."""
+    side = preferred - (preferred @ unit) * unit
     if np.linalg.norm(side) > 1e-6:
         return np.asarray(side)
     return np.cross(unit, np.eye(3)[np.abs(unit).argmin()])

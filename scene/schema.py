@@ -1,6 +1,6 @@
-"""What a scene file may say: the TOML schema of a scene.
+"""The schema of a scene file.
 
-Rule: only shapes and ranges are checked here; whether a file exists and what it holds is its loader's concern.
+Rule: only types and ranges are checked here; the loaders check whether a named file exists and what is in it.
 """
 
 from __future__ import annotations
@@ -13,28 +13,32 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validat
 from trilane.shapes import MAX_SIDE, checked_size
 from trilane.unexpected import UnexpectedValue
 
-MAX_DEPTH_RATIO = 1e6  # a depth buffer of 24 bits cannot tell apart what is nearer together
-FARTHEST_M = 1e4  # of an avatar from the scene's origin: float32 then still tells millimetres apart
+MAX_DEPTH_RATIO = 1e6  # of far to near clip plane; beyond it a depth buffer of 24 bits is too coarse
+FARTHEST_M = 1e4  # of an avatar from the scene's origin; there float32 still resolves millimetres
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Metres = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan=False)]
 
 
 class Model(BaseModel):
-    """Strict base: unknown keys are errors, values never change."""
+    """Base of all tables: unknown keys are errors, and values never change after loading."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class OutputSpec(Model):
-    """The picture that is presented."""
+    """Size of the picture that is shown, in pixels."""
 
     width: int = Field(default=640, ge=64, le=MAX_SIDE, multiple_of=2)
     height: int = Field(default=480, ge=64, le=MAX_SIDE, multiple_of=2)
 
 
 class AvatarSpec(Model):
-    """One avatar. `bundle`: `default` or a folder. `motion`: `builtin:NAME` or a file. Position in metres."""
+    """One avatar.
+
+    `bundle`: `default` or a folder. `motion`: `builtin:NAME` or a file. `position`: metres. `up_axis`, `units`: of the
+    motion file. `ground`: how the motion is put on the floor (`floor.py`).
+    """
 
     bundle: str = "default"
     motion: str = "builtin:walk-wave-turn"
@@ -46,9 +50,11 @@ class AvatarSpec(Model):
 
 
 class CameraSpec(Model):
-    """`source`: `builtin:NAME` or a file. `place`: how the scene's anchor is put in front of a recorded camera.
+    """The camera.
 
-    `fov_y_deg`: of the picture's height; None takes what the file says, else what is usual for its format.
+    `source`: `builtin:NAME` or a file. `fov_y_deg`: of the picture's height; None for that of the file, or the usual
+    one of its format. `near_m`, `far_m`: clip planes. `place`: whether a recorded camera is placed in the scene
+    (`auto`) or stays where it was recorded (`none`).
     """
 
     source: str = "builtin:orbit"
@@ -69,9 +75,9 @@ class CameraSpec(Model):
 
 
 class PlaneSpec(Model):
-    """A detected plane to show: a rectangle about `centre` (world, metres) with `normal` (any length but 0).
+    """A detected plane to show: a rectangle round `centre` (world, metres) with `normal` (of any length but 0).
 
-    `turn_deg`: about the normal; at 0 the first side lies along the world's x on a level plane, else it points up.
+    `turn_deg`: about the normal. At 0 the first side lies along the world's x if the plane is level, else it points up.
     """
 
     centre: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
@@ -89,9 +95,11 @@ class PlaneSpec(Model):
 
 
 class Scene(Model):
-    """A scene. `background`: `room`, or a video, image folder or picture. `texture_filter`: of the neural texture.
+    """A scene.
 
-    `planes`: detected ones, shown over the background. `hud`: frame, rate and age are written on the picture.
+    `background`: `room`, or a video, a folder of images or a picture. `hud`: whether frame, rate and age are written on
+    the picture. `planes`: detected ones, shown over the background. `texture_filter`: of the neural texture.
+    `error_budget_px`: accepted, but nothing reads it.
     """
 
     name: str = Field(default="scene", min_length=1, max_length=80, pattern=r"^[\w .-]+$")

@@ -1,6 +1,7 @@
 """ARKit log: `time r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz` a line, camera to world, metres, Y up.
 
-Rule: axes are those of the sensor in landscape (x right, y up, looks along -Z); the time unit is told by its size.
+Rule: axes are those of the sensor in landscape (x right, y up, looks along -Z); whether times are in nanoseconds or
+seconds is recognised by the size of their steps.
 """
 
 from __future__ import annotations
@@ -12,9 +13,9 @@ from trilane.scene.camera.text_table import elapsed, read_table
 
 COLUMNS = 13
 EXPECTED = "an ARKit log: time and the 12 numbers of a 3x4 matrix a line"
-#: A median step above this is in nanoseconds, below it in seconds.
+#: With a median step above this, times are in nanoseconds, else in seconds.
 LEAST_STEP_NS = 1e3
-#: iPhone main camera, 26 mm equivalent on a 16:9 picture: long side, short side.
+#: Field of view of an iPhone's main camera, 26 mm equivalent, on a 16:9 picture: long side, short side.
 LONG_SIDE_DEG, SHORT_SIDE_DEG = 60.0, 36.0
 
 

@@ -1,4 +1,4 @@
-"""Cameras that need no file, for a person at the origin who faces +Z.
+"""The built-in cameras, for a person at the origin who faces +Z.
 
 Rule: each is a formula of time, sampled over one cycle that ends where it began.
 """

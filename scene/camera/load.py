@@ -1,6 +1,6 @@
-"""A scene's `camera` entry to a CameraPath: a built-in name or a file, by its format.
+"""Loads the camera of a scene: a built-in one by name, or a file.
 
-Rule: JSON is NeRF's; of the text tables, the count of columns tells which.
+Rule: a JSON file is NeRF's; the format of a text table is recognised by its number of columns.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from trilane.scene.camera.arkit import load_arkit
 from trilane.scene.camera.builtin import ORBITS, load_builtin
 from trilane.scene.camera.nerf import load_nerf
 from trilane.scene.camera.path import CameraPath
-from trilane.scene.camera.recorded import RawCamera, finish
+from trilane.scene.camera.recorded import RawCamera, path_from_recording
 from trilane.scene.camera.text_table import column_count
 from trilane.scene.camera.tum import load_tum
 from trilane.scene.schema import CameraSpec
@@ -35,15 +35,15 @@ def load_camera(spec: CameraSpec, base: Path) -> CameraPath:
     Raises BadInputError when there is no such camera or the file is unusable.
     """
     if spec.source.startswith(PREFIX):
-        path_of = load_builtin(spec.source.removeprefix(PREFIX), spec)
-        if path_of is None:
+        built_in = load_builtin(spec.source.removeprefix(PREFIX), spec)
+        if built_in is None:
             raise BadInputError("camera", repr(spec.source), f"{PREFIX}{{{', '.join(ORBITS)}}} or a file")
-        return path_of
+        return built_in
     path = base / spec.source
     require_file(path, EXPECTED)
     kind = _kind(path) if spec.format == "auto" else spec.format
-    with np.errstate(over="ignore", invalid="ignore"):  # numbers that are not finite are `repair`'s concern
-        return finish(_READERS[kind](path), str(path), spec)
+    with np.errstate(over="ignore", invalid="ignore"):  # `usable_samples` leaves out what is not finite
+        return path_from_recording(_READERS[kind](path), str(path), spec)
 
 
 def _kind(path: Path) -> str:

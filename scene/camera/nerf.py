@@ -1,7 +1,7 @@
 """NeRF `transforms.json`: `frames[].transform_matrix`, 4x4 camera to world, OpenGL axes, Z up.
 
-Rule: the lens is the file's (`fl_y` and `h`, `fl_x` and `w`, or `camera_angle_x`); the format has no times: views in
-small steps are a film at 30 a second, others are stills, one a second.
+Rule: the lens is that of the file (`fl_y` and `h`, `fl_x` and `w`, or `camera_angle_x`). The format has no times: views
+less than FILM_STEP_DEG apart are a film at 30 a second, others are stills, one a second.
 """
 
 from __future__ import annotations

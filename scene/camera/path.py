@@ -1,7 +1,7 @@
-"""What every camera becomes: poses at increasing times, a field of view, and a view matrix for any instant.
+"""A camera over time, whatever its source: poses at increasing times, sampled at any time, and a lens.
 
-Rule: inside, a pose is camera to world, OpenGL axes (x right, y up, looks along -Z), world Y up; between samples
-the place is linear and the turn a slerp; after the last sample the path is run backwards.
+Rule: a pose is camera to world, OpenGL axes (x right, y up, looks along -Z), world Y up. Between samples the place is
+interpolated linearly and the turn by slerp; after the last sample the path loops or is run backwards (`wrap`).
 """
 
 from __future__ import annotations
@@ -41,7 +41,12 @@ def _unit_rows(vectors: F64) -> F64:
 
 
 def projection_matrix(fov_y_deg: float, aspect: float, near_m: float, far_m: float) -> F64:
-    """OpenGL perspective matrix (4, 4); `aspect` is width over height."""
+    """OpenGL perspective matrix (4, 4).
+
+    `fov_y_deg`: field of view of the picture's height.
+    `aspect`: width over height.
+    `near_m`, `far_m`: distances of the clip planes.
+    """
     f = 1 / np.tan(np.radians(fov_y_deg) / 2)
     depth = near_m - far_m
     return np.array(
@@ -67,8 +72,9 @@ class Lens:
 class CameraPath:
     """A camera over time.
 
-    `times_s` (N,) from 0, strictly increasing. `quats` (N, 4) and `places` (N, 3): camera to world. `notes`: what
-    the source was taken for and what was mended. `recorded`: the path knows nothing of the scene and is to be placed.
+    `times_s` (N,): from 0, strictly increasing. `quats` (N, 4) and `places` (N, 3), metres: camera to world. `notes`:
+    how the source was read, for people. `wrap`: what follows the last sample. `recorded`: whether the path
+    comes from a recording, which has to be placed in the scene.
     """
 
     times_s: F64
@@ -81,6 +87,7 @@ class CameraPath:
 
     @property
     def duration_s(self) -> float:
+        """Time of the last sample."""
         return float(self.times_s[-1])
 
     def pose(self, t_s: float) -> tuple[F64, F64]:

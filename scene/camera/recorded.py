@@ -1,7 +1,7 @@
-"""Poses of any recorder to a CameraPath: mended, world turned Y up, picture turned the right way up.
+"""A recorded camera to a CameraPath: bad poses left out, world Y up, picture the right way up.
 
-Rule: relative motion is never changed. Only two constant turns are applied: one of the world, so that up is +Y, and
-one of the picture by a multiple of 90 degrees, as a phone turns its display.
+Rule: the movement from pose to pose never changes. Two constant turns are applied: one of the world, so that +Y is up,
+and one of the picture by a multiple of 90 degrees, as a phone turns its display.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F64
 from trilane.scene.camera.path import CameraPath, Lens
-from trilane.scene.motion.usable_samples import kept_samples
+from trilane.scene.motion.usable_samples import usable_samples
 from trilane.scene.rotations import about, quat_from_matrix, shortest_turn
 from trilane.scene.schema import CameraSpec
 
 UP = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-#: Below this cosine between the picture's mean up and the format's usual up, the usual up is not believed.
-BELIEVED = 0.3
-#: Largest |R^T R - 1| of a rotation matrix that a log may have.
+#: The usual up of the format holds when its cosine with the picture's mean up is above this.
+LEAST_UP_COSINE = 0.3
+#: A matrix is taken for a rotation when |R^T R - 1| is below this.
 SKEW = 0.05
 #: Optical axes (x right, y down, z ahead) to OpenGL axes.
 OPENGL_FROM_OPTICAL: F64 = np.diag([1.0, -1.0, -1.0])
@@ -28,10 +28,12 @@ OPENGL_FROM_OPTICAL: F64 = np.diag([1.0, -1.0, -1.0])
 
 @dataclass(frozen=True)
 class RawCamera:
-    """What a log said: camera to world, OpenGL axes. `turns` (N, 3, 3), `places` (N, 3) metres, `times_s` (N,).
+    """The content of a camera file, before anything is left out or turned.
 
-    `usual_up`: axis of the world that is up for the format. `fov_y_deg`: by the file or usual for the device held
-    level, `portrait_fov_y_deg`: held upright; `lens`: where these come from.
+    `times_s` (N,): seconds. `turns` (N, 3, 3) and `places` (N, 3), metres: camera to world, OpenGL axes. `usual_up`:
+    the axis of the world that is usually up in the format. `fov_y_deg`: field of view of the picture's height with the
+    device held level; `portrait_fov_y_deg`: held upright; `lens`: where these two come from. `notes`: on the file, for
+    people.
     """
 
     times_s: F64
@@ -44,10 +46,14 @@ class RawCamera:
     notes: tuple[str, ...]
 
 
-def finish(raw: RawCamera, where: str, spec: CameraSpec) -> CameraPath:
-    """Make a CameraPath. Raises BadInputError when most of the poses are unusable."""
-    kept, repairs = kept_samples(where, raw.times_s, _sound(raw.turns, raw.places))
-    times, turns, places = raw.times_s[kept], raw.turns[kept], raw.places[kept]
+def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraPath:
+    """The camera path of a file.
+
+    `raw`: its content. `where`: its path, for messages. `spec`: of the scene, with the lens. Raises BadInputError when
+    more than half of the poses are unusable.
+    """
+    usable, repairs = usable_samples(where, raw.times_s, _readable(raw.turns, raw.places))
+    times, turns, places = raw.times_s[usable], raw.turns[usable], raw.places[usable]
     up, quarter, note = _upright(turns, raw.usual_up)
     world = shortest_turn(np.array(up), np.array(UP["y"]))
     quats = quat_from_matrix(world @ turns @ about(2, np.array(quarter * np.pi / 2)))
@@ -65,8 +71,8 @@ def finish(raw: RawCamera, where: str, spec: CameraSpec) -> CameraPath:
     return CameraPath(times - times[0], quats, places @ world.T, lens, notes)
 
 
-def _sound(turns: F64, places: F64) -> NDArray[np.bool_]:
-    """Poses (N,) that are finite and whose matrix is a rotation."""
+def _readable(turns: F64, places: F64) -> NDArray[np.bool_]:
+    """Whether each pose (N,) is finite, its matrix a rotation and its place not absurdly far off."""
     finite = np.asarray(np.isfinite(turns).all(axis=(1, 2)) & np.isfinite(places).all(axis=1))
     safe = np.where(finite[:, None, None], turns, 0.0)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -78,14 +84,14 @@ def _sound(turns: F64, places: F64) -> NDArray[np.bool_]:
 def _upright(turns: F64, usual: str) -> tuple[tuple[float, float, float], int, str]:
     """Up axis of the world, quarter turns of the picture, and a note.
 
-    The picture is turned so that its up is nearest to the world's; when even then they disagree, the world's up is
-    the axis nearest to the picture's own up.
+    The picture is turned so that its up is nearest to the usual one. Where the two disagree even then, the picture is
+    not turned, and up is the axis nearest to the picture's own up.
     """
     x, y = turns[:, :, 0].mean(axis=0), turns[:, :, 1].mean(axis=0)
     ups = np.array([y, -x, -y, x])
     cosines = ups @ np.array(UP[usual])
     quarter = int(np.argmax(cosines))
-    if cosines[quarter] > BELIEVED:
+    if cosines[quarter] > LEAST_UP_COSINE:
         turned = f", device held so that the picture is turned by {quarter * 90} degrees" if quarter else ""
         return UP[usual], quarter, f"{usual.upper()} up{turned}"
     axis = int(np.argmax(np.abs(y)))

@@ -1,6 +1,6 @@
-"""Text tables of camera poses: comment lines and one pose a line, numbers apart by blanks or commas.
+"""Reads text tables of camera poses: one pose per line, numbers separated by blanks or commas, `#` for comments.
 
-Rule: every line has the same count of numbers; the first that has not is named.
+Rule: every line has the same count of numbers; the error names the first line that has not.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ def read_table(path: Path, columns: int, expected: str) -> NDArray[np.float64]:
 
 
 def column_count(path: Path, expected: str) -> int:
-    """Numbers on the first line that is no comment; 0 when there is none. Raises BadInputError."""
+    """How many numbers the first line that is no comment has; 0 when there is no such line. Raises BadInputError."""
     return next((len(words) for _, words in _lines(path, expected)), 0)
 
 
 def elapsed(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Times (N,) since the first finite one, and their median step, 0 when there is none. NaNs stay NaN."""
+    """Times (N,) since the first finite one, and the median of their steps, 0 with fewer than two. NaNs stay NaN."""
     finite = times[np.isfinite(times)]
     if len(finite) < 2:
         return times - times[0], 0.0

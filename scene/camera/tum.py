@@ -14,7 +14,7 @@ from trilane.scene.rotations import matrix_from_quat, normalised
 
 COLUMNS = 8
 EXPECTED = "a TUM trajectory: time, tx ty tz, qx qy qz qw a line"
-#: Kinect colour camera: 640x480 at a focal length of 517 pixels.
+#: Field of view of the Kinect's colour camera, 640x480 at a focal length of 517 pixels: height, width.
 KINECT_DEG, KINECT_UPRIGHT_DEG = 49.8, 63.5
 
 

@@ -1,6 +1,7 @@
-"""AMASS `.npz` files: `poses` 156 wide (SMPL-H) or 165 wide (SMPL-X), `trans`, `betas` and a rate in either spelling.
+"""Reads AMASS `.npz` files: `poses` of 156 columns (SMPL-H) or 165 (SMPL-X), `trans`, `betas` and a frame rate.
 
-Rule: the joints that SMPL-H lacks (jaw, eyes) are at rest; every other key is ignored. Layout: https://amass.is.tue.mpg.de.
+Rule: joints that SMPL-H does not have (jaw, eyes) are at rest; all other keys are ignored. Layout:
+https://amass.is.tue.mpg.de.
 """
 
 from __future__ import annotations
@@ -13,12 +14,13 @@ from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
 from trilane.files import as_numbers, read_npz
-from trilane.scene.motion.motion import JOINTS, REST_PELVIS, RawMotion
+from trilane.scene.motion.motion import JOINTS, REST_PELVIS
+from trilane.scene.motion.recorded import RawMotion
 from trilane.scene.motion.smplx_npy import hands_note
 
 EXPECTED = "AMASS motion: `poses` (T, 156) or (T, 165), `trans` (T, 3), a frame rate"
 RATE_KEYS = ("mocap_framerate", "mocap_frame_rate")
-#: Width of `poses` -> the SMPL-X joints that its columns are, in order.
+#: Number of columns of `poses` -> the SMPL-X joints that they are, in order.
 COLUMNS = {
     156: (*range(22), *range(25, JOINTS)),
     165: tuple(range(JOINTS)),
@@ -29,13 +31,13 @@ MAX_BETAS = 400
 
 def load_amass(path: Path) -> RawMotion:
     """Read `path`. Raises BadInputError naming the key that is missing or has the wrong shape."""
-    found = read_npz(path, ("poses", "trans", "betas", *RATE_KEYS), EXPECTED)
-    if "poses" not in found:
+    arrays = read_npz(path, ("poses", "trans", "betas", *RATE_KEYS), EXPECTED)
+    if "poses" not in arrays:
         raise BadInputError(path, "no key `poses`", EXPECTED)
-    poses, width = _poses(path, found["poses"])
-    rate, key = _rate(path, found)
-    translation = _translation(path, found.get("trans"), len(poses))
-    betas = _betas(path, found.get("betas"))
+    poses, width = _poses(path, arrays["poses"])
+    rate, key = _rate(path, arrays)
+    translation = _translation(path, arrays.get("trans"), len(poses))
+    betas = _betas(path, arrays.get("betas"))
     notes = (
         f"AMASS .npz ({NAMES[width]}, {width} columns), {len(poses)} frames at {rate:g}/s ({key})",
         f"hands: {hands_note(poses)}",
@@ -54,10 +56,10 @@ def _poses(path: Path, array: NDArray[Any]) -> tuple[NDArray[np.float64], int]:
     return poses, array.shape[1]
 
 
-def _rate(path: Path, found: dict[str, NDArray[Any]]) -> tuple[float, str]:
+def _rate(path: Path, arrays: dict[str, NDArray[Any]]) -> tuple[float, str]:
     for key in RATE_KEYS:
-        if key in found:
-            value = as_numbers(f"{path}[{key}]", found[key], "one number")
+        if key in arrays:
+            value = as_numbers(f"{path}[{key}]", arrays[key], "one number")
             if value.size != 1 or not 1 <= value.item() <= 1000:
                 raise BadInputError(f"{path}[{key}]", str(value.tolist()), "one rate from 1 to 1000 frames/s")
             return float(value.item()), key

@@ -1,6 +1,7 @@
-"""Arm and hand poses for the built-in motions, from the T pose: hanging, waving, fingers at ease.
+"""Poses of arms and hands for the built-in motions: hanging, waving, relaxed fingers.
 
-Rule: side is +1 for left and -1 for right; turns are local to the parent, +X left, +Y up, +Z ahead.
+Rule: `side` is +1 for left and -1 for right; turns are local to the parent joint, from the T pose: +X left, +Y up, +Z
+ahead.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import numpy as np
 from trilane.arrays import F64
 from trilane.scene.rotations import about, normalised
 
-#: How far an arm hangs down from the T pose, radians, collar not counted.
+#: Angle of a hanging arm below the T pose, radians, without the collar's part.
 HANG = 1.27
 ELBOW_EASE = 0.22
 #: Directions of the right arm raised to wave: upper arm and forearm at the middle of the wave.

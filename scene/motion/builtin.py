@@ -1,6 +1,6 @@
-"""The motions that the project wrote itself: a person who walks, waves and turns; one who stands; the T pose.
+"""The built-in motions: a person who walks, waves and turns; a person who stands; the T pose.
 
-Rule: the choreography is the tables below; the curves between them are computed, and a cycle ends where it began.
+Rule: the tables below say what happens when; the curves between are computed, and a cycle ends where it began.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ BUILD = Build(
     heel_behind=0.057,
     feet_apart=0.19,
 )
-#: Of the leg's length: as far as a foot may be from its hip.
+#: Largest distance of an ankle from its hip, as a part of the leg's length.
 REACH = 0.993
 
-#: from s, to s, what moves: z of the route in metres or heading in radians, how far.
+#: Start in seconds, end in seconds, and by how much the route changes in between: z in metres, heading in radians.
 WALKS = ((0.25, 2.65, 1.5), (6.45, 8.85, -1.5))
 TURNS = ((5.25, 6.55, np.pi), (8.75, 9.95, np.pi))
 START_Z_M = -1.1
-#: side (+1 left), lift s, landing s.
+#: Steps of the feet: side (+1 left), lift and landing in seconds.
 SWINGS = (
     Swing(-1, 0.30, 0.76),
     Swing(1, 0.88, 1.34),
@@ -52,13 +52,13 @@ SWINGS = (
     Swing(-1, 9.58, 9.88),
 )
 PERIOD_S = 10.0
-#: raise from, up at, lower from, down at.
+#: The waving arm, seconds: starts to rise, is up, starts to sink, is down.
 WAVE_S = (2.45, 3.05, 4.75, 5.45)
 WAVES_PER_S = 1.7
 
 
 def walk_wave_turn() -> Motion:
-    """Ten seconds: walks to the viewer, waves, turns, walks back, turns."""
+    """Ten seconds of a person who walks to the viewer, waves, turns, walks back and turns again."""
     times = np.arange(int(PERIOD_S * RATE_HZ)) / RATE_HZ
     walker = Walker(BUILD, _route, SWINGS, PERIOD_S)
     left, right = walker.foot(1, times), walker.foot(-1, times)
@@ -66,7 +66,7 @@ def walk_wave_turn() -> Motion:
 
 
 def idle() -> Motion:
-    """Eight seconds of standing: breath, weight from foot to foot, a look about."""
+    """Eight seconds of a person who stands, breathes, shifts the weight and looks about."""
     times = np.arange(8 * RATE_HZ) / RATE_HZ
     tracks = [_standing(side, len(times)) for side in (1, -1)]
     poses, places = _body(times, tracks[0], tracks[1], wave=False, shift_m=0.018 * np.sin(np.pi * times / 4))
@@ -75,7 +75,7 @@ def idle() -> Motion:
 
 
 def t_pose() -> Motion:
-    """The rest pose, held."""
+    """The rest pose, one frame."""
     poses, places = np.zeros((1, JOINTS, 3)), np.array([[0.0, 0.94, 0.0]])
     return Motion(np.zeros(1), poses, places, None, ("built in: the T pose, one frame: held",), Wrap.LOOP, None, False)
 
@@ -98,7 +98,7 @@ def _route(times: F64) -> tuple[F64, F64, F64]:
 
 
 def _eased(x: F64) -> F64:
-    """0 to 1, at constant speed but for a soft fifth at either end."""
+    """0 to 1 at constant speed, with a soft start and end of a fifth each."""
     ramp = 0.22
     s = np.clip(x, 0.0, 1.0)
     speed = 1 / (1 - ramp)
@@ -115,7 +115,13 @@ def _standing(side: int, count: int) -> FootTrack:
 def _body(
     times: F64, left: FootTrack, right: FootTrack, wave: bool = True, shift_m: F64 | float = 0.0
 ) -> tuple[F64, F64]:
-    """Poses (T, 55, 3) and pelvis places (T, 3) over two feet."""
+    """Poses (T, 55, 3) and pelvis places (T, 3) of a body on two feet.
+
+    `times`: of the cycle (T,).
+    `left`, `right`: tracks of the feet.
+    `wave`: whether the right arm waves.
+    `shift_m`: of the pelvis to its left, (T,) or one number.
+    """
     heading = blurred_heading(left, right)
     ahead = _along(heading, left.ankle - right.ankle)
     stride = blurred(ahead, 3)
@@ -137,7 +143,7 @@ def _body(
 
 
 def blurred_heading(left: FootTrack, right: FootTrack) -> F64:
-    """The pelvis's heading (T,), between the feet's; the cycle may end whole turns on."""
+    """The pelvis's heading (T,), smoothed and midway between those of the feet; a cycle may end whole turns further."""
     sines, cosines = (f(left.heading) + f(right.heading) for f in (np.sin, np.cos))
     mean = np.unwrap(np.arctan2(sines, cosines))
     drift = np.linspace(0, round((mean[-1] - mean[0]) / (2 * np.pi)) * 2 * np.pi, len(mean), endpoint=False)
@@ -155,7 +161,14 @@ def _along(heading: F64, vectors: F64) -> F64:
 def _pelvis_place(
     left: FootTrack, right: FootTrack, heading: F64, pelvis: F64, weight: F64, shift_m: F64 | float
 ) -> F64:
-    """Between the feet, over the one that carries, and low enough for both legs to reach."""
+    """Pelvis places (T, 3): between the feet, towards the loaded one, and low enough for both legs to reach.
+
+    `left`, `right`: tracks of the feet.
+    `heading` (T,): of the pelvis.
+    `pelvis` (T, 3, 3): its turn.
+    `weight` (T,): 1 with all weight on the left foot, -1 on the right.
+    `shift_m`: to the left, besides.
+    """
     between = blurred((left.ankle + right.ankle) / 2, 7)
     aside = 0.028 * weight + shift_m
     place = between + np.column_stack([np.cos(heading) * aside, 0 * aside, -np.sin(heading) * aside])
@@ -173,7 +186,13 @@ def _eroded(values: F64, reach: int) -> F64:
 
 
 def _height_within_reach(side: int, foot: FootTrack, place: F64, pelvis: F64) -> F64:
-    """Greatest pelvis height (T,) at which a leg of REACH times its length touches its ankle."""
+    """Greatest pelvis height (T,) at which the leg reaches its ankle.
+
+    `side`: +1 left, -1 right.
+    `foot`: its track.
+    `place` (T, 3): of the pelvis; only x and z count.
+    `pelvis` (T, 3, 3): its turn.
+    """
     hip = pelvis @ BUILD.side(BUILD.hip, side)
     flat = foot.ankle - place - hip
     level = np.hypot(flat[:, 0], flat[:, 2])
@@ -181,7 +200,14 @@ def _height_within_reach(side: int, foot: FootTrack, place: F64, pelvis: F64) ->
 
 
 def _trunk(poses: F64, times: F64, pelvis_yaw: F64, weight: F64, pace: F64) -> None:
-    """Shoulders against the hips, a lean with the pace, breath; the head stays level and ahead."""
+    """Set spine, neck and head: shoulders turn against the hips, the body leans with the pace and breathes.
+
+    `poses` (T, 55, 3): changed in place.
+    `times` (T,): of the cycle.
+    `pelvis_yaw` (T,): of the hips, radians.
+    `weight` (T,): 1 with all weight on the left foot, -1 on the right.
+    `pace` (T,): speed of the feet, m/s.
+    """
     breath = np.sin(2 * np.pi * times / (times[-1] + times[1]) * round(times[-1] / 3.6))
     for name, share in (("spine1", 0.25), ("spine2", 0.35), ("spine3", 0.4)):
         joint = poses[:, JOINT_INDEX[name]]
@@ -195,7 +221,7 @@ def _trunk(poses: F64, times: F64, pelvis_yaw: F64, weight: F64, pace: F64) -> N
 
 
 def _arms(poses: F64, times: F64, stride: F64, wave: bool) -> None:
-    """Arms against the legs; the right one waves."""
+    """Set arms and hands: they swing against the legs, and the right one waves when `wave` is set."""
     lag = np.roll(stride, 3)
     up = _wave_weight(times) if wave else np.zeros_like(times)
     for side, name in ((1, "left"), (-1, "right")):

@@ -1,6 +1,6 @@
-"""BVH: the hierarchy and the channels of every frame, as the file orders them.
+"""Reads BVH files: the skeleton, and the channels of every frame in the file's order.
 
-Rule: syntax only; what a joint's name means is `retarget`'s concern. Every error names the line.
+Rule: syntax only; `bvh_retarget.py` interprets the joints' names. Every error names the line.
 """
 
 from __future__ import annotations
@@ -25,8 +25,11 @@ CHANNELS = {f"{axis}{kind}": (kind, k) for kind in ("position", "rotation") for 
 
 @dataclass
 class BvhJoint:
-    """One joint. `offset` (3,) from its parent in file units; `channels`: as `Zrotation`, in file order;
-    `first`: column of the first of them; `tip`: offset of the end site, if any."""
+    """One joint of the file.
+
+    `parent`: index of its parent, -1 at the root. `offset` (3,): from its parent, file units. `channels`: such as
+    `Zrotation`, in file order. `first`: column of the first of them. `tip` (3,): offset of its end site, None without.
+    """
 
     name: str
     parent: int
@@ -38,7 +41,7 @@ class BvhJoint:
 
 @dataclass(frozen=True)
 class Bvh:
-    """`frames`: (T, channels) in file units and degrees. `frame_time_s`: of one frame."""
+    """The content of a file. `frames` (T, channels): file units and degrees. `frame_time_s`: seconds per frame."""
 
     joints: list[BvhJoint]
     frames: F64
@@ -73,7 +76,7 @@ class Bvh:
 
 @dataclass
 class _Words:
-    """The words of the hierarchy with the lines they stand on."""
+    """The words of the hierarchy, one after the other, each with its line."""
 
     path: Path
     words: Iterator[tuple[int, str]]

@@ -1,7 +1,6 @@
-"""What other skeletons call the joints of SMPL-X.
+"""Names that BVH skeletons of several programs have for the SMPL-X joints.
 
-Rule: a skeleton is known by the table that has most of its names; names are compared without prefix, case and
-separators.
+Rule: one table per family of skeletons; names are compared without prefix, case and separators.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from trilane.body.joints import JOINT_NAMES
 
 
 def plain(name: str) -> str:
-    """`mixamorig:Left_Hand` -> `lefthand`."""
+    """`name` without prefix, case and separators: `mixamorig:Left_Hand` -> `lefthand`."""
     return re.sub(r"[^a-z0-9]", "", name.rsplit(":", 1)[-1].lower().removeprefix("bip01"))
 
 

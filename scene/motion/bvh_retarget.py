@@ -1,8 +1,8 @@
-"""A BVH skeleton onto the SMPL-X joints, by name.
+"""Puts the motion of a BVH skeleton on the SMPL-X joints, which are matched by name.
 
-Rule: a joint's global turn is the file's, times the fixed turn that lays the SMPL-X rest bone on the file's rest
-bone; so limbs point where the recorded limbs point, whatever the file's zero pose is. Trunk and head keep the
-file's turns as they are. Joints without a partner follow their parent.
+Rule: a joint's global turn is that of the file times a fixed turn, which lays the SMPL-X rest bone on the file's rest
+bone. So every limb points in the direction of the recorded one, whatever the file's zero pose is. Trunk and head take
+the file's turns unchanged. A joint that the file does not have follows its parent.
 """
 
 from __future__ import annotations
@@ -16,15 +16,14 @@ from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS
 from trilane.errors import BadInputError
 from trilane.scene.motion.bvh import BvhJoint, load_bvh
 from trilane.scene.motion.bvh_joint_names import DIALECTS, plain
-from trilane.scene.motion.motion import JOINTS, RawMotion
+from trilane.scene.motion.bvh_units import leg_length, unit_of
+from trilane.scene.motion.motion import JOINTS
+from trilane.scene.motion.recorded import RawMotion
 from trilane.scene.rotations import rotvec_from_matrix, shortest_turn
 
-#: Metres in one unit; `cmu` is the unit of the CMU recordings, 1/0.45 inches.
-UNITS_M = {"m": 1.0, "cm": 0.01, "in": 0.0254, "cmu": 0.0254 / 0.45}
-USUAL_LEG_M = 0.85
 LEAST_LENGTH = 1e-6
 REQUIRED = ("pelvis", "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle")
-#: Joint whose bone is laid on the file's -> the joint where that bone ends, and its direction in the T pose.
+#: Joint whose bone is laid on that of the file -> the joint at the other end of the bone, its direction in the T pose.
 LIMBS: dict[str, tuple[str, tuple[float, float, float]]] = {
     "left_hip": ("left_knee", (0.0, -1.0, 0.0)),
     "right_hip": ("right_knee", (0.0, -1.0, 0.0)),
@@ -47,23 +46,23 @@ def load_retargeted(path: Path, units: str) -> RawMotion:
     Raises BadInputError when the file is no BVH or its names are of no known skeleton.
     """
     bvh = load_bvh(path)
-    dialect, where = match_names(path, [joint.name for joint in bvh.joints])
+    dialect, index_of = match_names(path, [joint.name for joint in bvh.joints])
     offsets = _rest_positions(bvh.joints)
-    leg = float(np.mean([_leg(offsets, where, side) for side in ("left", "right")]))
-    hips = offsets[where["left_hip"]] - offsets[where["right_hip"]]
+    leg = leg_length(offsets, index_of)
+    hips = offsets[index_of["left_hip"]] - offsets[index_of["right_hip"]]
     if leg < LEAST_LENGTH or np.linalg.norm(hips) < LEAST_LENGTH:
         raise BadInputError(path, "legs of no length or hips in one place", "a skeleton with OFFSETs")
-    unit, unit_m = _unit(leg, units)
+    unit, unit_m = unit_of(leg, units)
     turns, places = bvh.forward()
-    poses = _local_turns(turns, _rest_turns(bvh.joints, offsets, where), where)
-    translation = places[:, where["pelvis"]] * unit_m
-    partners = sorted(JOINT_INDEX[name] for name in where)
+    poses = _local_turns(turns, _rest_turns(bvh.joints, offsets, index_of), index_of)
+    translation = places[:, index_of["pelvis"]] * unit_m
+    partners = sorted(JOINT_INDEX[name] for name in index_of)
     hands = sum(index >= 25 for index in partners)
     rate = 1 / bvh.frame_time_s
     notes = (
         f"BVH, {len(bvh.joints)} joints named as in {dialect}, {len(bvh.frames)} frames at {rate:.4g}/s",
         f"units: {unit} (leg of {leg * unit_m:.2f} m)",
-        f"{len(where)} joints have a partner, {hands} of them in the hands",
+        f"{len(index_of)} joints have a partner, {hands} of them in the hands",
         "betas: none in the format",
     )
     times = np.arange(len(bvh.frames), dtype=np.float64) * bvh.frame_time_s
@@ -71,16 +70,19 @@ def load_retargeted(path: Path, units: str) -> RawMotion:
 
 
 def match_names(path: Path, names: list[str]) -> tuple[str, dict[str, int]]:
-    """The dialect with the most of `names`, and {SMPL-X name: index in `names`}. Raises BadInputError."""
-    seen: dict[str, int] = {}
+    """The dialect that has the most of `names`, and {SMPL-X name: index in `names`}.
+
+    Raises BadInputError when none has all of REQUIRED; `path` is named in it.
+    """
+    index_of: dict[str, int] = {}
     for index, name in enumerate(names):
-        seen.setdefault(plain(name), index)
-    found = {
-        dialect: {target: seen[source] for source, target in table.items() if source in seen}
+        index_of.setdefault(plain(name), index)
+    matches = {
+        dialect: {target: index_of[source] for source, target in table.items() if source in index_of}
         for dialect, table in DIALECTS.items()
     }
-    best = max(found, key=lambda dialect: len(found[dialect]))
-    missing = [name for name in REQUIRED if name not in found[best]]
+    best = max(matches, key=lambda dialect: len(matches[dialect]))
+    missing = [name for name in REQUIRED if name not in matches[best]]
     if missing:
         raise BadInputError(
             path,
@@ -88,7 +90,7 @@ def match_names(path: Path, names: list[str]) -> tuple[str, dict[str, int]]:
             f"the joint names of {', '.join(DIALECTS)}",
             "rename the joints",
         )
-    return best, found[best]
+    return best, matches[best]
 
 
 def _rest_positions(joints: list[BvhJoint]) -> F64:
@@ -99,46 +101,32 @@ def _rest_positions(joints: list[BvhJoint]) -> F64:
     return places
 
 
-def _leg(offsets: F64, where: dict[str, int], side: str) -> float:
-    hip, knee, ankle = (offsets[where[f"{side}_{part}"]] for part in ("hip", "knee", "ankle"))
-    return float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
-
-
-def _unit(leg: float, units: str) -> tuple[str, float]:
-    if units != "auto":
-        return f"{units}, as given", UNITS_M[units]
-    name = min(UNITS_M, key=lambda unit: abs(np.log(leg * UNITS_M[unit] / USUAL_LEG_M)))
-    if 0.6 < leg * UNITS_M[name] / USUAL_LEG_M < 1.6:
-        return f"{name}, by the length of the legs", UNITS_M[name]
-    return f"unknown, scaled to a leg of {USUAL_LEG_M} m", USUAL_LEG_M / leg
-
-
-def _rest_turns(joints: list[BvhJoint], offsets: F64, where: dict[str, int]) -> dict[str, F64]:
+def _rest_turns(joints: list[BvhJoint], offsets: F64, index_of: dict[str, int]) -> dict[str, F64]:
     """{SMPL-X name: matrix (3, 3) from the SMPL-X rest frame to the file's zero-pose frame}."""
-    frame = _body_frame(offsets, where)
+    frame = _body_frame(offsets, index_of)
     turns: dict[str, F64] = {}
     for index, name in enumerate(JOINT_NAMES):
         above = turns.get(JOINT_NAMES[JOINT_PARENTS[index]], frame) if index else frame
         turns[name] = above if name in LIMBS or index >= 25 else frame
-        bone = _file_bone(name, joints, offsets, where) if name in LIMBS else None
+        bone = _file_bone(name, joints, offsets, index_of) if name in LIMBS else None
         if bone is not None:
             ours = above @ np.array(LIMBS[name][1])
             turns[name] = shortest_turn(ours, bone, fallback=frame[:, 0]) @ above
     return turns
 
 
-def _file_bone(name: str, joints: list[BvhJoint], offsets: F64, where: dict[str, int]) -> F64 | None:
-    """Direction (3,) of the bone in the file's zero pose, or None when the file does not tell."""
-    if name not in where:
+def _file_bone(name: str, joints: list[BvhJoint], offsets: F64, index_of: dict[str, int]) -> F64 | None:
+    """Direction (3,) of the bone that begins at joint `name`, in the file's zero pose; None when it has none."""
+    if name not in index_of:
         return None
     end = LIMBS[name][0]
-    index = where[name]
-    bone = offsets[where[end]] - offsets[index] if end in where else _furthest_below(index, joints, offsets)
+    index = index_of[name]
+    bone = offsets[index_of[end]] - offsets[index] if end in index_of else _to_furthest_tip(index, joints, offsets)
     return bone if np.linalg.norm(bone) > 1e-6 else None
 
 
-def _furthest_below(index: int, joints: list[BvhJoint], offsets: F64) -> F64:
-    """From a joint to the furthest end site below it, (3,)."""
+def _to_furthest_tip(index: int, joints: list[BvhJoint], offsets: F64) -> F64:
+    """Vector (3,) from a joint to the furthest end site below it; zero when there is none."""
     below = {index}
     best = np.zeros(3)
     for k, joint in enumerate(joints):
@@ -150,12 +138,12 @@ def _furthest_below(index: int, joints: list[BvhJoint], offsets: F64) -> F64:
     return best
 
 
-def _body_frame(offsets: F64, where: dict[str, int]) -> F64:
-    """Columns: the body's left, up and forward in the file's zero pose; snapped to the axes when within 20 degrees."""
-    hips = (offsets[where["left_hip"]] + offsets[where["right_hip"]]) / 2
-    left = offsets[where["left_hip"]] - offsets[where["right_hip"]]
-    top = next((where[name] for name in ("head", "neck", "spine3", "spine2", "spine1") if name in where), None)
-    up = offsets[top] - hips if top is not None else hips - offsets[where["left_ankle"]]
+def _body_frame(offsets: F64, index_of: dict[str, int]) -> F64:
+    """The body's left, up and forward as columns (3, 3), in the file's zero pose; snapped to axes within 20 degrees."""
+    hips = (offsets[index_of["left_hip"]] + offsets[index_of["right_hip"]]) / 2
+    left = offsets[index_of["left_hip"]] - offsets[index_of["right_hip"]]
+    top = next((index_of[name] for name in ("head", "neck", "spine3", "spine2", "spine1") if name in index_of), None)
+    up = offsets[top] - hips if top is not None else hips - offsets[index_of["left_ankle"]]
     forward = np.cross(left, up)
     columns = np.stack([np.cross(up, forward), up, forward], axis=1)
     frame = columns / np.linalg.norm(columns, axis=0)
@@ -164,13 +152,13 @@ def _body_frame(offsets: F64, where: dict[str, int]) -> F64:
     return np.asarray(snapped if close else frame)
 
 
-def _local_turns(turns: F64, rest: dict[str, F64], where: dict[str, int]) -> F64:
+def _local_turns(turns: F64, rest: dict[str, F64], index_of: dict[str, int]) -> F64:
     """Axis-angle (T, 55, 3) of the SMPL-X joints from the file's global turns (T, J, 3, 3)."""
     globals_: list[F64] = []
     poses = np.zeros((len(turns), JOINTS, 3))
     for index, name in enumerate(JOINT_NAMES):
         above = globals_[JOINT_PARENTS[index]] if index else np.broadcast_to(np.eye(3), (len(turns), 3, 3))
-        turn = turns[:, where[name]] @ rest[name] if name in where else above
+        turn = turns[:, index_of[name]] @ rest[name] if name in index_of else above
         globals_.append(turn)
         poses[:, index] = rotvec_from_matrix(np.swapaxes(above, -1, -2) @ turn)
     return poses

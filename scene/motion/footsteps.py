@@ -1,7 +1,7 @@
-"""Walking on planned footprints: where the feet, the pelvis and the leg joints are at every instant of a cycle.
+"""Walking on planned footprints: the tracks of the feet over a cycle, and the leg joints that reach them.
 
-Rule: a foot that carries weight does not move; the legs are solved to reach it, so nothing slides. All times wrap
-round the cycle. Positions in metres, Y up; headings in radians about +Y, 0 faces +Z.
+Rule: a foot that carries weight does not move, and the legs are solved to reach it, so that feet do not slide. All
+times wrap round the cycle. Positions are in metres, Y up; headings in radians about +Y, 0 faces +Z.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from trilane.scene.rotations import about, normalised
 
 @dataclass(frozen=True)
 class Build:
-    """The legs that the steps are planned for: offsets at rest, left side, metres."""
+    """Measures of the legs that walk, metres. Offsets are of the left side at rest, each from the joint before."""
 
     hip: tuple[float, float, float]
     knee: tuple[float, float, float]
@@ -47,13 +47,17 @@ class Swing:
     end_s: float
 
 
-#: t (T,) -> x, z, heading, each (T,): where the walker would stand.
+#: Times (T,) -> x, z, heading, each (T,): where the walker would stand.
 Route = Callable[[F64], tuple[F64, F64, F64]]
 
 
 @dataclass(frozen=True)
 class FootTrack:
-    """`ankle` (T, 3), `heading` (T,), `pitch` (T,) heel-up positive, `load` (T,) 1 on the ground and 0 in the air."""
+    """One foot over time.
+
+    `ankle` (T, 3): its place. `heading` (T,). `pitch` (T,): radians, positive with the heel up. `load` (T,): 1 on the
+    ground, 0 in the air.
+    """
 
     ankle: F64
     heading: F64
@@ -89,15 +93,18 @@ class Walker:
         """The track of one foot at `times_s` (T,)."""
         swings = sorted((s for s in self.swings if s.side == side), key=lambda s: s.start_s)
         tracks = [self._step(swings, k, times_s) for k in range(len(swings))]
-        owner = np.stack([owned for owned, _ in tracks])
-        if not (owner.sum(axis=0) == 1).all():
+        in_part = np.stack([inside for inside, _ in tracks])
+        if not (in_part.sum(axis=0) == 1).all():
             raise ValueError("swings of one foot overlap")
-        pick = owner.argmax(axis=0)
-        columns = np.stack([table for _, table in tracks])[pick, np.arange(len(times_s))]
+        part = in_part.argmax(axis=0)
+        columns = np.stack([table for _, table in tracks])[part, np.arange(len(times_s))]
         return FootTrack(columns[:, :3], columns[:, 3], columns[:, 4], columns[:, 5])
 
     def _step(self, swings: list[Swing], k: int, times_s: F64) -> tuple[NDArray[np.bool_], F64]:
-        """The part of the cycle from swing k's start to the next swing's start: who owns it, and the table (T, 6)."""
+        """The part of the cycle from the start of swing `k` to that of the next one.
+
+        Returns which times are in it (T,), and a table (T, 6): ankle, heading, pitch, load.
+        """
         swing, after = swings[k], swings[(k + 1) % len(swings)]
         before = swings[k - 1]
         local = (times_s - swing.start_s) % self.period_s
@@ -126,7 +133,7 @@ class Walker:
         return local < until_next, table
 
     def _print(self, swing: Swing, after: Swing) -> tuple[float, float, float]:
-        """Where the foot stands between two swings: x, z, heading of the ankle's ground point."""
+        """The footprint between two swings: x and z of the point below the ankle, and heading."""
         stance = (after.start_s - swing.end_s) % self.period_s
         middle = np.array([(swing.end_s + stance / 2) % self.period_s])
         x, z, heading = (float(value[0]) for value in self.route(middle))
@@ -135,13 +142,13 @@ class Walker:
 
     @staticmethod
     def _pitches(old: tuple[float, float, float], new: tuple[float, float, float]) -> tuple[float, float]:
-        """Heel-up angle at toe-off and toe-up angle at heel strike, by the length of the stride."""
+        """Pitch at toe-off, heel up, and at heel strike, toes up; both grow with the length of the stride."""
         ahead = np.array([np.sin(new[2]), np.cos(new[2])]) @ (np.array(new[:2]) - np.array(old[:2]))
         size = float(np.clip(ahead / 0.9, 0.0, 1.0))
         return 0.12 + 0.55 * size, -0.28 * size
 
     def _ankle(self, place: F64, pitch: F64) -> F64:
-        """Ankle (T, 3) of a foot on the ground at `place` x, z, heading: rolls over the ball, plants on the heel."""
+        """Ankle (T, 3) of a foot that stands at `place` (x, z, heading) with `pitch` (T,), on its ball or heel."""
         turn = about(1, np.full(len(pitch), place[2])) @ about(0, pitch)
         flat = about(1, np.array(place[2]))
         ball = np.array(self.build.ball)
@@ -154,7 +161,11 @@ class Walker:
 def solve_leg(build: Build, side: int, hip: F64, pelvis: F64, foot: FootTrack) -> tuple[F64, F64, F64]:
     """Local turns (T, 3, 3) of hip, knee and ankle that put the ankle on its track.
 
-    `hip` (T, 3): hip joint in the world. `pelvis` (T, 3, 3): its turn. Out of reach stretches the leg towards it.
+    `build`: measures of the leg.
+    `side`: +1 left, -1 right.
+    `hip` (T, 3): place of the hip joint.
+    `pelvis` (T, 3, 3): turn of the pelvis.
+    `foot`: track of the foot. Towards an ankle out of reach the leg is stretched.
     """
     thigh, shin = build.side(build.knee, side), build.side(build.ankle, side)
     to_ankle = foot.ankle - hip

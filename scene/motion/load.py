@@ -1,6 +1,6 @@
-"""A scene's `motion` entry to a Motion: a built-in name or a file, by its ending.
+"""Loads the motion of a scene's avatar: a built-in one by name, or a file.
 
-Rule: the ending chooses the reader; the reader's errors name the file.
+Rule: the ending of the file decides which reader is used; the reader's errors name the file.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from trilane.files import require_file
 from trilane.scene.motion.amass import load_amass
 from trilane.scene.motion.builtin import BUILTIN
 from trilane.scene.motion.bvh_retarget import load_retargeted
-from trilane.scene.motion.motion import Motion, RawMotion
-from trilane.scene.motion.recorded import finish
+from trilane.scene.motion.motion import Motion
+from trilane.scene.motion.recorded import RawMotion, motion_from_recording
 from trilane.scene.motion.smplx_npy import load_smplx_npy
 from trilane.scene.schema import AvatarSpec
 
@@ -44,5 +44,5 @@ def load_motion(spec: AvatarSpec, base: Path) -> Motion:
     if reader is None:
         raise BadInputError(path, f"the ending {path.suffix!r}", f"a motion file: {', '.join(_READERS)}")
     require_file(path, "a motion file")
-    with np.errstate(over="ignore", invalid="ignore"):  # numbers that are not finite are `repair`'s concern
-        return finish(reader(path, spec.units), str(path), spec.up_axis)
+    with np.errstate(over="ignore", invalid="ignore"):  # `usable_samples` leaves out what is not finite
+        return motion_from_recording(reader(path, spec.units), str(path), spec.up_axis)

@@ -1,6 +1,6 @@
-"""What every motion becomes: SMPL-X poses at increasing times, and the rule for the times between and beyond.
+"""A motion, whatever its source: SMPL-X poses at increasing times, sampled at any time between and beyond them.
 
-Rule: a motion answers any time, from one frame or from a thousand; nothing here knows a file format.
+Rule: a motion of one frame can be sampled like one of a thousand; nothing here depends on a file format.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ from trilane.arrays import F64
 from trilane.scene.rotations import quat_from_rotvec, rotvec_from_quat, slerp
 
 JOINTS = 55
-#: Where the pelvis of the published neutral SMPL-X body is at rest, metres: AMASS files give the shift from there.
+#: Rest place of the pelvis of the published neutral SMPL-X body, metres; translations in AMASS files start from it.
 REST_PELVIS: F64 = np.array([0.003, -0.351, 0.012])
 
 
 class Wrap(enum.Enum):
-    """What follows the last frame."""
+    """What follows the last frame. The values are words for notes."""
 
     LOOP = "loops"
     BOUNCE = "plays back and forth"
 
 
 def wrapped_time(t_s: float, length_s: float, wrap: Wrap) -> float:
-    """The time inside [0, length_s] that stands for `t_s`; a length of 0 always gives 0."""
+    """The time in [0, length_s] whose frame is shown at `t_s`; 0 for a length of 0."""
     if length_s <= 0:
         return 0.0
     if wrap is Wrap.LOOP:
@@ -37,7 +37,7 @@ def wrapped_time(t_s: float, length_s: float, wrap: Wrap) -> float:
 
 
 def bracket(times_s: F64, t_s: float) -> tuple[int, int, float]:
-    """Neighbours `i <= j` of `t_s` in increasing `times_s` (T,) and the fraction of the way from i to j."""
+    """Indices `i <= j` of the neighbours of `t_s` in increasing `times_s` (T,); how far it is from i to j, 0 to 1."""
     last = len(times_s) - 1
     j = min(max(int(np.searchsorted(times_s, t_s, side="right")), 1), last) if last else 0
     i = max(j - 1, 0)
@@ -47,31 +47,13 @@ def bracket(times_s: F64, t_s: float) -> tuple[int, int, float]:
 
 
 @dataclass(frozen=True)
-class RawMotion:
-    """What a file said, before repair and turning upright.
-
-    `times_s` (T,), `poses` (T, 55, 3) axis-angle radians, `translation` (T, 3): of the pelvis, metres, or None when
-    the format has none; NaNs and repeated times still in. `up`: the axis usual for the format. `leg_m`: hip to
-    ankle of the recorded person, when known.
-    """
-
-    times_s: F64
-    poses: F64
-    translation: F64 | None
-    betas: F64 | None
-    up: str
-    notes: tuple[str, ...]
-    leg_m: float | None = None
-
-
-@dataclass(frozen=True)
 class Motion:
     """Poses over time, upright, facing +Z at first, in the middle of the ground it covers.
 
-    `times_s` (T,) from 0, strictly increasing. `poses` (T, 55, 3) axis-angle, radians, SMPL-X joint order.
-    `translation` (T, 3): where the pelvis is, metres, Y up. `betas` (n,) or None. `notes`: what the
-    source was taken for and what was mended. `leg_m`: hip to ankle of the recorded person, by which the translation
-    is scaled to another body, or None. `travels`: whether the translation was recorded.
+    `times_s` (T,): from 0, strictly increasing. `poses` (T, 55, 3): axis-angle, radians, SMPL-X joint order.
+    `translation` (T, 3): place of the pelvis, metres, Y up. `betas` (n,) or None. `notes`: how the source was read, for
+    people. `wrap`: what follows the last frame. `leg_m`: hip to ankle of the recorded person, by which the translation
+    is scaled to another body; None when unknown. `travels`: whether the translation was recorded.
     """
 
     times_s: F64
@@ -94,7 +76,7 @@ class Motion:
         return quat_from_rotvec(self.poses)
 
     def sample(self, t_s: float) -> tuple[F64, F64]:
-        """Pose (55, 3) and translation (3,) at `t_s`: quaternions by slerp, translation linearly."""
+        """Pose (55, 3) and translation (3,) at `t_s`: turns interpolated by slerp, the translation linearly."""
         i, j, fraction = bracket(self.times_s, wrapped_time(t_s, self.duration_s, self.wrap))
         pose = rotvec_from_quat(slerp(self.quats[i], self.quats[j], fraction))
         start, end = self.translation[i], self.translation[j]

@@ -1,36 +1,59 @@
-"""A raw recording to a Motion: mended, turned Y up, facing +Z at first, in the middle of the ground it covers.
+"""A recorded motion to a Motion: bad frames left out, Y up, facing +Z at first, centred on the ground it covers.
 
-Rule: up is what is given, else the axis that the body's own up points along on average, else the format's usual one.
+Rule: up is the axis that the scene states, else the one that the body's own up points along on average, else the usual
+one of the format.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import F64
 from trilane.errors import BadInputError
-from trilane.scene.motion.motion import Motion, RawMotion, Wrap
-from trilane.scene.motion.usable_samples import kept_samples
+from trilane.scene.motion.motion import Motion, Wrap
+from trilane.scene.motion.usable_samples import usable_samples
 from trilane.scene.rotations import Y_UP_FROM_Z_UP, about, matrix_from_rotvec, rotvec_from_matrix
 
 MAX_FRAMES = 200_000
 MAX_ANGLE_RAD = 64.0
 MAX_PLACE_M = 10_000.0
-#: Cosine above which the body's mean up axis decides.
-SURE = 0.7
+#: The body's own up decides when the cosine between it, on average, and an axis is above this.
+LEAST_UP_COSINE = 0.7
 
 
-def finish(raw: RawMotion, where: str, up_axis: str) -> Motion:
-    """Make a Motion of what a file said; `up_axis` is `y`, `z` or `auto`.
+@dataclass(frozen=True)
+class RawMotion:
+    """The content of a motion file, before anything is left out or turned.
 
-    Raises BadInputError when it is too long, in degrees, or for the most part unreadable.
+    `times_s` (T,): seconds; NaNs and repeated times are still in. `poses` (T, 55, 3): axis-angle, radians, SMPL-X joint
+    order. `translation` (T, 3): of the pelvis, metres; None when the format has none. `betas` (n,) or None. `up`: the
+    axis that is usually up in the format. `notes`: on the file, for people. `leg_m`: hip to ankle of the recorded
+    person; None when unknown.
+    """
+
+    times_s: F64
+    poses: F64
+    translation: F64 | None
+    betas: F64 | None
+    up: str
+    notes: tuple[str, ...]
+    leg_m: float | None = None
+
+
+def motion_from_recording(raw: RawMotion, where: str, up_axis: str) -> Motion:
+    """The motion of a file.
+
+    `raw`: its content. `where`: its path, for messages. `up_axis`: `y`, `z` or `auto`. Raises BadInputError when it has
+    more than MAX_FRAMES frames, is in degrees, or is unreadable in more than half of its frames.
     """
     if len(raw.times_s) > MAX_FRAMES:
         raise BadInputError(where, f"{len(raw.times_s)} frames", f"at most {MAX_FRAMES}")
     shift = np.zeros((len(raw.poses), 3)) if raw.translation is None else raw.translation
-    kept, repairs = kept_samples(where, raw.times_s, _sound(raw.poses, shift))
-    times, poses, shift = raw.times_s[kept], raw.poses[kept], shift[kept]
+    usable, repairs = usable_samples(where, raw.times_s, _readable(raw.poses, shift))
+    times, poses, shift = raw.times_s[usable], raw.poses[usable], shift[usable]
     _check_angles(poses, where)
     roots = matrix_from_rotvec(poses[:, 0])
     up, how = _up_axis(roots, raw.up, up_axis)
@@ -46,8 +69,8 @@ def finish(raw: RawMotion, where: str, up_axis: str) -> Motion:
     )
 
 
-def _sound(poses: F64, shift: F64) -> NDArray[np.bool_]:
-    """Frames (T,) whose numbers are finite and whose place is on this planet."""
+def _readable(poses: F64, shift: F64) -> NDArray[np.bool_]:
+    """Whether the numbers of each frame (T,) are finite and its place is within MAX_PLACE_M."""
     finite = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(shift).all(axis=1)
     with np.errstate(invalid="ignore"):
         return np.asarray(finite & (np.abs(shift) < MAX_PLACE_M).all(axis=1))
@@ -59,18 +82,19 @@ def _check_angles(poses: F64, where: str) -> None:
         raise BadInputError(where, f"an angle of {largest:.3g}", "axis-angle in radians", "convert degrees to radians")
 
 
-def _up_axis(roots: F64, usual: str, given: str) -> tuple[str, str]:
-    if given != "auto":
-        return given, "as given"
+def _up_axis(roots: F64, usual: str, stated: str) -> tuple[str, str]:
+    """The axis that is up, and a note on how it was decided."""
+    if stated != "auto":
+        return stated, "as given"
     mean = roots[:, :, 1].mean(axis=0)
     for index, name in ((1, "y"), (2, "z")):
-        if mean[index] > SURE:
+        if mean[index] > LEAST_UP_COSINE:
             return name, "as the body stands"
     return usual, "as usual for the format"
 
 
 def _facing(root: F64) -> F64:
-    """Turn about Y (3, 3) after which a body with root turn `root` (3, 3) faces +Z; none for one that lies."""
+    """Turn about Y (3, 3) after which a body with root turn `root` (3, 3) faces +Z; the identity for one that lies."""
     x, _, z = root[:, 2]
     if np.hypot(x, z) < 0.3:
         return np.eye(3)
@@ -78,7 +102,7 @@ def _facing(root: F64) -> F64:
 
 
 def centred(translation: F64) -> F64:
-    """`translation` (T, 3) with the middle of its ground rectangle over the origin."""
+    """`translation` (T, 3), shifted so that the rectangle of ground that it covers has its middle at the origin."""
     low, high = translation.min(axis=0), translation.max(axis=0)
     middle = (low + high) / 2
     return np.asarray(translation - np.array([middle[0], 0.0, middle[2]]))

@@ -1,7 +1,7 @@
-"""Holes in a recording: bad samples are left out and the neighbours are interpolated across, and it is said.
+"""Leaves bad samples out of a recorded motion or camera path; a note says how many.
 
-Rule: a sample is left out when it holds a number that is not finite or when its time is not after the last kept one;
-more than half left out is no recording but an error.
+Rule: a sample is left out when its caller finds it unreadable or its time is not after that of the last usable one.
+Sampling interpolates across the hole. A file in which more than half of the samples are bad is refused.
 """
 
 from __future__ import annotations
@@ -12,16 +12,17 @@ from numpy.typing import NDArray
 from trilane.arrays import F64
 from trilane.errors import BadInputError
 
-#: An interval this many times the median is reported as a gap.
+#: An interval longer than this many median intervals is reported as a gap.
 GAP = 1.5
 
 
-def kept_samples(where: str, times_s: F64, sound: NDArray[np.bool_]) -> tuple[NDArray[np.intp], tuple[str, ...]]:
-    """Indices to keep of samples at `times_s` (T,) of which `sound` (T,) are readable, and notes on the rest.
+def usable_samples(where: str, times_s: F64, readable: NDArray[np.bool_]) -> tuple[NDArray[np.intp], tuple[str, ...]]:
+    """Indices of the usable samples, and notes on the others and on gaps in time.
 
-    Raises BadInputError when less than half of the samples remain.
+    `where`: the file, for messages. `times_s` (T,): of the samples. `readable` (T,): whether their values are readable.
+    Raises BadInputError when less than half of the samples are usable.
     """
-    timed = sound & np.isfinite(times_s)
+    timed = readable & np.isfinite(times_s)
     broken = int(len(times_s) - timed.sum())
     indices = np.flatnonzero(timed)
     increasing = indices[_strictly_increasing(times_s[indices])]
@@ -43,11 +44,11 @@ def kept_samples(where: str, times_s: F64, sound: NDArray[np.bool_]) -> tuple[ND
 
 
 def _strictly_increasing(times_s: F64) -> NDArray[np.bool_]:
-    """Marks the times that are later than every kept one before them."""
+    """Whether each time (T,) is later than all before it."""
     highest = np.maximum.accumulate(times_s)
-    keep = np.ones(len(times_s), dtype=bool)
-    keep[1:] = times_s[1:] > highest[:-1]
-    return keep
+    later = np.ones(len(times_s), dtype=bool)
+    later[1:] = times_s[1:] > highest[:-1]
+    return later
 
 
 def _gap_notes(times_s: F64) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Cameras: conventions of each format, what is mended and said, what is refused by name."""
+"""Cameras: conventions of each format, what is repaired and noted, what is refused."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ def arkit(tmp_path: Path, roll: float = 0.0) -> Path:
 def check_path(camera: CameraPath, step_s: float) -> None:
     """The path is `path_of_poses`."""
     for k, (turn, place) in enumerate(path_of_poses()):
-        found_turn, found_place = camera.pose(k * step_s)
-        assert found_turn == pytest.approx(turn, abs=1e-6)
-        assert found_place == pytest.approx(place, abs=1e-6)
+        actual_turn, actual_place = camera.pose(k * step_s)
+        assert actual_turn == pytest.approx(turn, abs=1e-6)
+        assert actual_place == pytest.approx(place, abs=1e-6)
 
 
 def test_arkit_is_opengl_camera_to_world_in_nanoseconds(tmp_path: Path) -> None:

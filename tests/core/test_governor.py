@@ -1,4 +1,4 @@
-"""The host's cap: what a performance profile asks for, heat from busy time, throttling with hysteresis, one account."""
+"""The governor of a run: duties of a performance profile, temperatures from busy time, throttling with hysteresis."""
 
 from __future__ import annotations
 
@@ -37,18 +37,18 @@ def worked(governor: Governor, seconds: int, share: float = 1.0) -> list[tuple[i
 
 
 def test_a_performance_profile_is_its_corners_duty(phone: Profile) -> None:
-    asked = {event.unit: event.permille for event in Governor(phone, "power_saver").begin(0)}
+    requested = {event.unit: event.permille for event in Governor(phone, "power_saver").begin(0)}
     corners = phone.performance_profiles["power_saver"]
-    assert asked == {unit: round(1000 * phone.units[unit].clock(corners.corner(unit))) for unit in UNITS}
+    assert requested == {unit: round(1000 * phone.units[unit].clock(corners.corner(unit))) for unit in UNITS}
     assert Governor(phone, "burst").begin(0) == []
 
 
 def test_burst_is_throttled_at_the_limit_and_let_go_below_it(phone: Profile) -> None:
     governor = Governor(phone, "burst")
     events = worked(governor, 3600)
-    caps, heat = governor.report()["caps"], governor.report()["temperature_c"]
+    caps, temperatures = governor.report()["caps"], governor.report()["temperature_c"]
     assert 0 < caps["first_throttled_s"] < 3600
-    assert heat["device_max"] < phone.thermal.skin_limit_c.or_else(0) + 1
+    assert temperatures["device_max"] < phone.thermal.skin_limit_c.or_else(0) + 1
     steps = [event.permille for _, event in events if event.unit == "dsp"]
     assert any(after < before for before, after in pairwise([1000, *steps]))
     assert all(0 < row["duty"] <= row["duty_mean"] <= 1 for row in caps["units"].values())

@@ -1,4 +1,4 @@
-"""Motion files: what each format is taken for, what is mended and said, and what is refused by name."""
+"""Motion files: how each format is read and repaired, what the notes say, and what is refused."""
 
 from __future__ import annotations
 
@@ -64,16 +64,16 @@ def test_unlike_neighbours_are_separate_poses(tmp_path: Path) -> None:
     assert "separate poses" in " ".join(motion.notes)
 
 
-@pytest.mark.parametrize(("up", "given", "note"), [
+@pytest.mark.parametrize(("up", "stated", "note"), [
     ("y", "auto", "Y up, as the body stands"),
     ("z", "auto", "Z up, as the body stands"),
     ("y", "z", "Z up, as given"),
 ])  # fmt: skip
-def test_the_up_axis_is_the_bodys_own(tmp_path: Path, up: str, given: str, note: str) -> None:
+def test_the_up_axis_is_the_bodys_own(tmp_path: Path, up: str, stated: str, note: str) -> None:
     np.save(tmp_path / "a.npy", poses(up=up))
-    motion = load(tmp_path / "a.npy", up_axis=given)
+    motion = load(tmp_path / "a.npy", up_axis=stated)
     assert note in motion.notes
-    if given == "auto":
+    if stated == "auto":
         assert matrix_from_rotvec(motion.poses[0, 0]) == pytest.approx(np.eye(3), abs=1e-12)
 
 

@@ -1,4 +1,4 @@
-"""A run at a chip's pace: what is held, what is late, and what is compared."""
+"""A run at a chip's pace: jobs that are held to their time, late ones, and the comparison with the virtual run."""
 
 from __future__ import annotations
 
@@ -39,25 +39,25 @@ def jobs(late: int | None = None, frames: int = 40) -> list[JobRecord]:
 
 
 def test_a_run_in_time_has_the_virtual_frame_time() -> None:
-    found = compare(PACE, "pipelined", 40, jobs())
-    assert found["ratio"] == pytest.approx(1.0)
-    assert found["virtual_ms"] == 9.0
-    assert (found["host_slower"], found["late_frames"], found["compared_share"]) == ({}, [], 1.0)
+    comparison = compare(PACE, "pipelined", 40, jobs())
+    assert comparison["ratio"] == pytest.approx(1.0)
+    assert comparison["virtual_ms"] == 9.0
+    assert (comparison["host_slower"], comparison["late_frames"], comparison["compared_share"]) == ({}, [], 1.0)
 
 
 def test_a_late_job_is_counted_and_its_neighbours_are_not_compared() -> None:
-    found = compare(PACE, "pipelined", 40, jobs(late=20))
-    assert found["host_slower"] == {"infer": 1}
-    assert found["late_frames"] == [20]
-    assert found["ratio"] == pytest.approx(1.0)
-    assert 0.7 < found["compared_share"] < 1
+    comparison = compare(PACE, "pipelined", 40, jobs(late=20))
+    assert comparison["host_slower"] == {"infer": 1}
+    assert comparison["late_frames"] == [20]
+    assert comparison["ratio"] == pytest.approx(1.0)
+    assert 0.7 < comparison["compared_share"] < 1
 
 
 def test_nothing_is_compared_when_every_frame_is_late() -> None:
     slow = [job._replace(end_ns=job.end_ns + 2 * SLACK_NS) for job in jobs()]
-    found = compare(PACE, "pipelined", 40, slow)
-    assert (found["measured_ms"], found["ratio"], found["compared_share"]) == (None, None, 0.0)
-    assert len(found["late_frames"]) == 40
+    comparison = compare(PACE, "pipelined", 40, slow)
+    assert (comparison["measured_ms"], comparison["ratio"], comparison["compared_share"]) == (None, None, 0.0)
+    assert len(comparison["late_frames"]) == 40
 
 
 def test_a_chips_times_grow_with_the_tensor_and_the_slow_motion() -> None:

@@ -1,4 +1,4 @@
-"""The walk over a graph and the roofline on top of it: counts against known values, times against their physics."""
+"""Work of a graph and its time: counts against known values, times against their physics."""
 
 from __future__ import annotations
 
@@ -68,8 +68,8 @@ def test_shapes_of_the_generated_graphs_are_those_that_onnx_infers(encoder: str,
     del bare.graph.value_info[:]
     inferred = onnx.shape_inference.infer_shapes(bare, strict_mode=True)
     for value in inferred.graph.value_info:
-        found = [d.dim_value for d in value.type.tensor_type.shape.dim]
-        assert found == stated[value.name], value.name
+        inferred_shape = [d.dim_value for d in value.type.tensor_type.shape.dim]
+        assert inferred_shape == stated[value.name], value.name
 
 
 @pytest.mark.parametrize("encoder", ENCODERS)
@@ -101,9 +101,9 @@ def test_products_grow_with_the_area() -> None:
 
 @pytest.mark.parametrize("encoder", ENCODERS)
 @pytest.mark.parametrize("shape", [(32, 32), (384, 192), (640, 640)])
-def test_counts_of_any_size_are_those_of_a_walk(encoder: str, shape: tuple[int, int]) -> None:
-    one = NetworkSpec(encoder, "instance", *shape, 12, "split")
-    assert network_work(one) == count_work(build_network(one))
+def test_counts_of_any_size_are_those_of_its_graph(encoder: str, shape: tuple[int, int]) -> None:
+    network = NetworkSpec(encoder, "instance", *shape, 12, "split")
+    assert network_work(network) == count_work(build_network(network))
 
 
 def test_quantised_graphs_count_as_their_float_ones() -> None:
@@ -224,7 +224,7 @@ def test_both_parts_of_a_split_do_all_the_work(share: float) -> None:
 
 
 def test_profiles_nobody_fitted_are_within_half_of_published_times() -> None:
-    checks = [one for name in {p for _, p in PUBLISHED_MS} for one in check_published(name, load_profile(name))]
+    checks = [check for name in {p for _, p in PUBLISHED_MS} for check in check_published(name, load_profile(name))]
     assert len(checks) == len(PUBLISHED_MS)
-    for one in checks:
-        assert abs(one.error) < (0.5 if one.independent else 0.02), one
+    for check in checks:
+        assert abs(check.error) < (0.5 if check.independent else 0.02), check

@@ -49,8 +49,9 @@ def test_there_are_fewer_free_numbers_than_measurements(measured: Path) -> None:
 )
 def test_the_committed_profile_is_as_near_as_promised(measured: Path, columns: tuple[str, ...], most: float) -> None:
     profile, rows = load_profile("snapdragon-888"), read_table(measured)
-    found = [one for step in STEPS for one in measurements(rows, step) if one.column in columns]
-    assert median(abs(predicted_ms(profile, one) / one.ms - 1) for one in found) <= most
+    all_measured = [measurement for step in STEPS for measurement in measurements(rows, step)]
+    compared = [measurement for measurement in all_measured if measurement.column in columns]
+    assert median(abs(predicted_ms(profile, measurement) / measurement.ms - 1) for measurement in compared) <= most
 
 
 def test_fitting_again_gives_the_committed_numbers(fitted: Fit) -> None:
@@ -83,17 +84,24 @@ def test_numbers_that_made_the_rows_are_found_again(tmp_path: Path) -> None:
     table.write_text("\n".join([HEADER, *(f"{row},1,1,1,1,1,1" for row in seen)]) + "\n")
     lines = [HEADER]
     for text, row in zip(seen, read_table(table), strict=True):
-        one = {m.column: predicted_ms(profile, m) for step in STEPS for m in measurements([row], step)}
-        figures = [one["bench_dsp_ms"], one["bench_gpu_ms"], *[one["app_dsp_ms"]] * 2, *[one["app_gpu_ms"]] * 2]
-        lines.append(f"{text}," + ",".join(f"{value:.4f}" for value in figures))
+        predicted = {m.column: predicted_ms(profile, m) for step in STEPS for m in measurements([row], step)}
+        times_ms = [
+            predicted["bench_dsp_ms"],
+            predicted["bench_gpu_ms"],
+            *[predicted["app_dsp_ms"]] * 2,
+            *[predicted["app_gpu_ms"]] * 2,
+        ]
+        lines.append(f"{text}," + ",".join(f"{value:.4f}" for value in times_ms))
     table.write_text("\n".join(lines) + "\n")
     result = fit_profile("snapdragon-888-facts", table)
-    found = parse_profile(result.data, path)
+    refitted = parse_profile(result.data, path)
     unseen = tmp_path / "unseen.csv"
     unseen.write_text("\n".join([HEADER, "efficientnet-lite0,instance,640,8,packed,1,1,1,1,1,1"]) + "\n")
     for step in STEPS:
-        for one in measurements(read_table(unseen), step):
-            assert predicted_ms(found, one) == pytest.approx(predicted_ms(profile, one), rel=0.05), one.column
+        for measurement in measurements(read_table(unseen), step):
+            assert predicted_ms(refitted, measurement) == pytest.approx(predicted_ms(profile, measurement), rel=0.05), (
+                measurement.column
+            )
 
 
 def test_the_written_profile_can_be_read(fitted: Fit, tmp_path: Path) -> None:
