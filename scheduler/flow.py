@@ -5,8 +5,6 @@ It moves frames and slots as it is told, and notes for which units that changed 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from trilane.scheduler.causes import Drop, DropCause, Loss
 from trilane.scheduler.events import Graph, Job
 from trilane.scheduler.ledger import Ledger
@@ -25,9 +23,12 @@ class Flow:
         self.stage_named = {stage.name: stage for stage in self.stages}
         self.frames: dict[int, FrameState] = {}
         self.dirty: list[UnitState] = []
-        self.mark_dirty: Callable[[UnitState], None] = self.dirty.append
         self._graph, self._ledger, self._drops = graph, ledger, drops
         self._jobs = 0
+
+    def mark_dirty(self, unit: UnitState) -> None:
+        """Something has changed for the unit: this step looks at it."""
+        self.dirty.append(unit)
 
     def admit(self, frame: int, release_ns: int, deadline_ns: int) -> None:
         """The frame is in flight from now on."""

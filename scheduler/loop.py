@@ -23,7 +23,7 @@ class Clock(Protocol):
         ...
 
     def perform(self, now_ns: int, actions: tuple[Action, ...]) -> None:
-        """Do what the core answered at `now_ns`; called after every step, also with no action."""
+        """Do what the core answered at `now_ns`: one action or more."""
         ...
 
 
@@ -32,11 +32,13 @@ def run_loop(core: Core, clock: Clock, recording: Recording | None = None) -> Ou
 
     Raises what `clock` raises, KeyError and UnitLifeError (see Core.step).
     """
+    wait, perform = clock.wait, clock.perform  # looked up once: they are called for every step
     deadline_ns: int = NEVER
     while True:
-        now_ns, events = clock.wait(deadline_ns)
+        now_ns, events = wait(deadline_ns)
         actions, deadline_ns = core.step(now_ns, events)
-        clock.perform(now_ns, actions)
+        if actions:
+            perform(now_ns, actions)
         if recording is not None:
             recording.steps.append((now_ns, events, actions))
         if core.outcome is not None:

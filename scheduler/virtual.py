@@ -6,9 +6,9 @@ The units are queues of jobs whose service times a callable gives; everything el
 from __future__ import annotations
 
 import gc
-import heapq
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from heapq import heappop, heappush
 from typing import Any
 
 from trilane.scheduler.causes import Outcome
@@ -110,7 +110,7 @@ class VirtualDriver:
         """The next valid event, or none at the core's deadline when that comes first."""
         heap = self._heap
         while heap and heap[0][0] <= deadline_ns:
-            at_ns, _, _, event, epoch = heapq.heappop(heap)
+            at_ns, _, _, event, epoch = heappop(heap)
             if type(event) is JobDone:
                 if epoch == self._units[event.unit].epoch:
                     return at_ns, (event,)
@@ -142,7 +142,7 @@ class VirtualDriver:
 
     def _push(self, at_ns: int, priority: int, event: Event, epoch: int = 0) -> None:
         self._sequence += 1
-        heapq.heappush(self._heap, (at_ns, priority, self._sequence, event, epoch))
+        heappush(self._heap, (at_ns, priority, self._sequence, event, epoch))
 
     def _dispatch(self, now_ns: int, job: Job) -> None:
         job_id, name, stage, frame, *_ = job
@@ -153,7 +153,7 @@ class VirtualDriver:
         end_ns = unit.free_ns = begin_ns + self._service(stage, name, frame, begin_ns)
         done = JobDone(name, job_id, begin_ns, end_ns, begin_ns)
         self._sequence += 1
-        heapq.heappush(self._heap, (end_ns + self._message_delay_ns, EVENT, self._sequence, done, unit.epoch))
+        heappush(self._heap, (end_ns + self._message_delay_ns, EVENT, self._sequence, done, unit.epoch))
         if self.recording is not None:
             ready_ns = self.core.frames[frame].ready_ns
             self.jobs.append(JobRecord(stage, name, frame, ready_ns, now_ns, begin_ns, end_ns))
