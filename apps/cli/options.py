@@ -42,6 +42,8 @@ METHOD_HELP = "minmax, percentile or entropy."
 
 # A body.
 BODY_HELP = "Body file in the SMPL-X layout (.npz)."
+BodyFileArgument = Annotated[Path, typer.Argument(help=BODY_HELP)]
+BodyFileOption = Annotated[Path, typer.Option(help=BODY_HELP)]
 
 # A hardware profile.
 PROFILE_HELP = "Hardware profile: a name or a TOML file."

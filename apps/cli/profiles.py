@@ -1,4 +1,4 @@
-"""`trilane profiles`: the hardware profiles that there are, what they say, whether they hold, and how they are fitted.
+"""`trilane profiles`: list, show, check and fit hardware profiles.
 
 Rule: this module reads options and shows results; every figure comes from `trilane.hw_profiles`.
 """
@@ -78,7 +78,7 @@ def _quantities(data: Any, key: str) -> list[tuple[str, dict[str, Any]]]:
         return []
     if "kind" in data and "source" in data:
         return [(key, data)]
-    return [found for name, value in data.items() for found in _quantities(value, f"{key}.{name}".lstrip("."))]
+    return [number for name, value in data.items() for number in _quantities(value, f"{key}.{name}".lstrip("."))]
 
 
 @app.command(epilog="\b\nExamples:\n  trilane profiles check\n  trilane profiles check mine.toml")
@@ -95,19 +95,19 @@ def check(
     from trilane.hw_profiles.published_times import check_published
 
     profiles = {name: load_profile(name) for name in names or profile_names()}
-    found = [one for profile in profiles.values() for one in check_published(profile.name, profile)]
+    latencies = [row for profile in profiles.values() for row in check_published(profile.name, profile)]
     if json:
-        print_json({"valid": list(profiles), "published": [{**one._asdict(), "error": one.error} for one in found]})
+        print_json({"valid": list(profiles), "published": [{**row._asdict(), "error": row.error} for row in latencies]})
         return
     console = stdout_console()
     console.print(f"{len(profiles)} valid: {', '.join(profiles)}")
-    if not found:
+    if not latencies:
         return
     table = Table("profile", "network", "published, ms", "predicted, ms", "error", "")
-    for one in found:
-        note = "" if one.independent else "sets the profile's peak rate"
-        figures = (f"{one.published_ms:g}", f"{one.predicted_ms:.2f}", f"{100 * one.error:+.0f} %")
-        table.add_row(one.profile, one.network, *figures, note)
+    for row in latencies:
+        note = "" if row.independent else "sets the profile's peak rate"
+        figures = (f"{row.published_ms:g}", f"{row.predicted_ms:.2f}", f"{100 * row.error:+.0f} %")
+        table.add_row(row.profile, row.network, *figures, note)
     console.print(table)
 
 

@@ -1,1 +1,4 @@
-"""The profiling dashboard."""
+"""The dashboard: runs in a browser.
+
+It may use apps/ and every lower folder, but not apps/cli/.
+"""

@@ -1,1 +1,4 @@
-"""Accuracy, sweeps and reports."""
+"""Experiments over runs and networks: accuracy, hard cases.
+
+It may use every lower folder, but neither apps/cli/ nor apps/dashboard/.
+"""

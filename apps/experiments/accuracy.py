@@ -1,7 +1,7 @@
 """How far are the runtimes from each other on the frames of a scene?
 
-Rule: every runtime gets the same bytes, drawn by the pipeline's own pose and raster stages; nothing is averaged away:
-the largest difference of any byte stands beside the mean.
+Rule: every runtime gets the same bytes, drawn by the pipeline's own pose and raster stages; the largest difference of
+any byte stands beside the mean.
 """
 
 from __future__ import annotations
@@ -33,8 +33,11 @@ MAX_FRAMES = 10_000
 
 
 def runtime_differences(checked: Checked, runtimes: Sequence[str], frames: int) -> dict[str, Any]:
-    """`frames` frames of the scene, evenly spread, through each of `runtimes`.
+    """How far the pictures of each pair of runtimes are apart.
 
+    `checked`: the scene and its avatars.
+    `runtimes`: two or more, by name.
+    `frames`: how many, evenly spread over the scene.
     Keys: `rows`, one per pair: `first`, `second`, `mean`, `largest` (of 255, over all channels and frames),
     `worst_frame`; `bounds`; `frames` (their numbers); `runtimes` (name to version). Raises BadInputError and
     MissingPartError.
@@ -45,29 +48,30 @@ def runtime_differences(checked: Checked, runtimes: Sequence[str], frames: int) 
         raise BadInputError("--runtime", ", ".join(runtimes) or "none", "two or more different runtimes")
     sessions = _Sessions(network_of(checked.assets), runtimes)
     pairs = list(combinations(runtimes, 2))
-    seen: dict[tuple[str, str], list[tuple[float, int, int]]] = {pair: [] for pair in pairs}
+    steps_of: dict[tuple[str, str], list[tuple[float, int, int]]] = {pair: [] for pair in pairs}
     numbers = []
     for frame, tensor in _tensors(checked, frames):
         numbers.append(frame)
         pictures = {name: sessions.picture(name, tensor).astype(np.int16) for name in runtimes}
         for pair in pairs:
             steps = np.abs(pictures[pair[0]] - pictures[pair[1]])
-            seen[pair].append((float(steps.mean()), int(steps.max()), frame))
+            steps_of[pair].append((float(steps.mean()), int(steps.max()), frame))
     return {
-        "rows": [_row(pair, found) for pair, found in seen.items()],
+        "rows": [_row(pair, steps) for pair, steps in steps_of.items()],
         "bounds": {"mean": MEAN_BOUND, "largest": LARGEST_BOUND},
         "frames": numbers,
         "runtimes": {name: load_runtime(name).version() for name in runtimes},
     }
 
 
-def _row(pair: tuple[str, str], found: list[tuple[float, int, int]]) -> dict[str, Any]:
+def _row(pair: tuple[str, str], steps: list[tuple[float, int, int]]) -> dict[str, Any]:
+    """`steps`: (mean, largest, number) of each frame."""
     return {
         "first": pair[0],
         "second": pair[1],
-        "mean": float(np.mean([mean for mean, _, _ in found])),
-        "largest": max(largest for _, largest, _ in found),
-        "worst_frame": max(found)[2],
+        "mean": float(np.mean([mean for mean, _, _ in steps])),
+        "largest": max(largest for _, largest, _ in steps),
+        "worst_frame": max(steps)[2],
     }
 
 

@@ -1,8 +1,7 @@
 """Numerically hard inputs and networks: how near the picture stays to the float network's, on every runtime.
 
-Rule: networks are untrained and seeded, errors are mean steps of 1/255, and every case has a stated bound. Instance
-and group norm amplify what is nearly constant, and ranges that calibration never saw are clamped: there the bounds are
-wide.
+Rule: networks are untrained and seeded, errors are mean steps of 1/255, and every case has a stated bound. The bounds
+are wide where instance and group norm amplify nearly constant maps, and where inputs leave the calibrated range.
 """
 
 from __future__ import annotations
@@ -72,7 +71,12 @@ def make_pair(name: str) -> Pair:
 
 
 def error_of(pair: Pair, case: str, runtime: str) -> float:
-    """Mean difference in steps of 1/255 of input `case` on `runtime`; NaN when the float network gives no number."""
+    """Mean difference in steps of 1/255; NaN when the float network gives no number.
+
+    `pair`: the two networks.
+    `case`: key of `INPUTS`.
+    `runtime`: that runs the integer network.
+    """
     import torch
 
     encoding = pair.integer.input

@@ -55,9 +55,9 @@ def test_inspect_prints_a_table(tiny_bundle):
     assert result.exit_code == 0 and "network.width" in result.stdout
 
 
-def test_quantize_writes_a_network_and_a_report(files):
+def test_quantise_writes_a_network_and_a_report(files):
     options = ("--frames", files / "frames.npy", "--out", files / "q.onnx", "--report", files / "report.json")
-    facts = call("quantize", files / "float.onnx", *options, "--count", 3)
+    facts = call("quantise", files / "float.onnx", *options, "--count", 3)
     assert facts["quantisation"]["calibration_frames"] == 3
     assert read_network(files / "q.onnx").digest == facts["sha256"]
     layers = json.loads((files / "report.json").read_text())["layers"]
@@ -65,10 +65,17 @@ def test_quantize_writes_a_network_and_a_report(files):
     assert 10 < layers[0]["sqnr_db"] <= layers[-1]["sqnr_db"] < 80
 
 
-def test_quantize_does_not_write_over_the_float_network(files):
+def test_the_first_name_of_quantise_still_works_and_is_not_listed(files):
+    facts = call("quantize", files / "float.onnx", "--frames", files / "frames.npy", "--out", files / "q.onnx")
+    assert read_network(files / "q.onnx").digest == facts["sha256"]
+    listed = runner.invoke(app, ["--help"]).stdout
+    assert "quantise" in listed and "quantize" not in listed
+
+
+def test_quantise_does_not_write_over_the_float_network(files):
     before = (files / "float.onnx").read_bytes()
     with pytest.raises(BadInputError, match="another file than the float network"):
-        call("quantize", files / "float.onnx", "--frames", files / "frames.npy", "--out", files / "float.onnx")
+        call("quantise", files / "float.onnx", "--frames", files / "frames.npy", "--out", files / "float.onnx")
     assert (files / "float.onnx").read_bytes() == before
 
 
@@ -110,7 +117,7 @@ def test_network_exports_the_published_size(tmp_path):
 WRONG = {
     "no file": (["inspect", "nowhere"], "nowhere"),
     "size": (["network", "--size", "65x64", "--out", "x.onnx"], "--size"),
-    "float network": (["quantize", "missing.onnx", "--frames", "f.npy", "--out", "q.onnx"], r"missing\.onnx"),
+    "float network": (["quantise", "missing.onnx", "--frames", "f.npy", "--out", "q.onnx"], r"missing\.onnx"),
     "format": (["export", "default", "--out", "x.onnx"], "--qnn"),
 }
 
@@ -128,13 +135,13 @@ def test_wrong_usage_is_named(tmp_path, monkeypatch, case):
 def test_wrong_frames_are_refused(files, frames):
     np.save(files / "frames.npy", frames)
     with pytest.raises(BadInputError, match=r"frames\.npy"):
-        call("quantize", files / "float.onnx", "--frames", files / "frames.npy", "--out", files / "q.onnx")
+        call("quantise", files / "float.onnx", "--frames", files / "frames.npy", "--out", files / "q.onnx")
 
 
 def test_an_unwritable_output_is_named(files):
     with pytest.raises(BadInputError, match="no_folder"):
         call(
-            *("quantize", files / "float.onnx", "--frames", files / "frames.npy"),
+            *("quantise", files / "float.onnx", "--frames", files / "frames.npy"),
             *("--out", files / "no_folder" / "q.onnx"),
         )
 

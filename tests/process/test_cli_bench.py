@@ -65,3 +65,15 @@ def test_bad_questions(monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ..
 
 def test_flat_joins_keys() -> None:
     assert flat({"a": {"b": 1, "c": {"d": 2}}, "e": 3}) == {"a.b": 1, "a.c.d": 2, "e": 3}
+
+
+@pytest.mark.parametrize("name", BENCHES)
+def test_help_says_what_is_measured(name: str) -> None:
+    """The line of the list, the module's question, and what `measure` answers; no option is without its line."""
+    command = bench_command(name)
+    line, question, answer = (command.help or "").split("\n\n", 2)
+    assert line == BENCHES[name][1]
+    assert question.endswith("?")
+    assert answer
+    assert "Raises" not in answer
+    assert all(option.help for option in command.params)
