@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import U8
-from trilane.avatars.bundle import Bundle, bundle_folder, load_bundle
-from trilane.avatars.reshape import reshaped
+from trilane.avatars.bundle import CLOTHES_STANDOFF_M, Bundle, bundle_folder, load_bundle
+from trilane.avatars.network_reshape import reshaped
 from trilane.body.body import ShapedBody, load_body
 from trilane.body.kinematics import Skeleton
 from trilane.errors import BadInputError, MissingPartError
@@ -24,12 +24,11 @@ from trilane.scene.staging import stage_scene
 from trilane.shapes import Shape, shape_buckets
 from trilane.stages.cpu.crop import crop_projection
 from trilane.stages.cpu.mesh_bounds import MeshBounds
-from trilane.stages.cpu.pose import STANDOFF_M
 from trilane.stages.cpu.tensor_layout import MARGIN_PX, TensorLayout, lay_out
 from trilane.stages.dsp.runtime import Binding, RuntimeOptions, load_runtime
 from trilane.stages.gpu.assets import load_assets
-from trilane.stages.gpu.mesh import SkinnedMesh
-from trilane.stages.gpu.packed import PackedAvatar, PackedPass, Placement
+from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement
+from trilane.stages.gpu.skinned_mesh import SkinnedMesh
 
 BOUND_DB = 0.5
 OUTPUT = (480, 640)
@@ -103,7 +102,7 @@ class _Stand:
             cell = np.s_[top : top + height, left : left + width]
             together, alone = everyone[cell], self._picture(view, [k])[cell]
             projection = crop_projection(view.projection, crop)
-            truth = self._studio.wardrobe.render(view.joints[k], view.view, projection, (height, width))
+            truth = self._studio.clothed_body.render(view.joints[k], view.view, projection, (height, width))
             errors = [self._image_error(picture, truth) for picture in (together, alone)]
             if None not in errors:
                 steps = np.abs(together.astype(np.int16) - alone)
@@ -142,7 +141,7 @@ def _views(stand: _Stand, avatars: int, views: int, size: str, margin: int) -> I
     scene = Scene(avatars=specs)
     staged = stage_scene(scene, [stand.shaped] * avatars, Path.cwd())
     skeleton = Skeleton(stand.shaped.joints, stand.shaped.body.parents)
-    bounds = MeshBounds(stand.shaped, standoff_m=STANDOFF_M)
+    bounds = MeshBounds(stand.shaped, standoff_m=CLOTHES_STANDOFF_M)
     projection = staged.camera.projection(OUTPUT[1] / OUTPUT[0])
     for t_s in np.linspace(0.0, SECONDS, views, endpoint=False):
         view, rects, joints = staged.camera.sample(t_s), [], []
@@ -159,11 +158,11 @@ def _views(stand: _Stand, avatars: int, views: int, size: str, margin: int) -> I
 def ground_truth(bundle: Bundle) -> tuple[Any, Any]:
     """The bundle's body, dressed, on the GPU, and the `image_error` of two pictures. Raises MissingPartError."""
     try:
-        from trilane.training.dataset import Studio
-        from trilane.training.metrics import image_error
+        from trilane.training.image_error import image_error
+        from trilane.training.sample_renderer import SampleRenderer
     except ImportError as error:
         raise MissingPartError(f"ground truth needs {error.name}", "pip install 'trilane[train]'") from None
-    return Studio(shaped_body(bundle)), image_error
+    return SampleRenderer(shaped_body(bundle)), image_error
 
 
 def shaped_body(bundle: Bundle) -> ShapedBody:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.avatars.bundle import load_bundle
+from trilane.avatars.bundle import CLOTHES_STANDOFF_M, load_bundle
 from trilane.body.body import ShapedBody, load_body
 from trilane.body.kinematics import Posed, Skeleton
 from trilane.body.skinning import FrameSkinner
@@ -26,9 +26,6 @@ from trilane.stages.cpu.mesh_bounds import MeshBounds
 from trilane.stages.cpu.tensor_layout import lay_out
 from trilane.stages.packets import posed_vertices
 from trilane.transport.packets import Packet
-
-#: Clothes and hair reach this far from the body, metres; training crops with the same.
-STANDOFF_M = 0.045
 
 
 @dataclass(frozen=True)
@@ -50,7 +47,7 @@ class PoseStage:
         self._buckets = config.buckets
         folders = dict.fromkeys(config.avatar_dirs)
         bodies = {folder: _shaped(folder) for folder in folders}
-        bounds = {folder: MeshBounds(body, standoff_m=STANDOFF_M) for folder, body in bodies.items()}
+        bounds = {folder: MeshBounds(body, standoff_m=CLOTHES_STANDOFF_M) for folder, body in bodies.items()}
         staged = stage_scene(scene, [bodies[folder] for folder in config.avatar_dirs], Path.cwd())
         self._actors = [
             _Actor(

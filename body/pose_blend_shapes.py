@@ -1,6 +1,6 @@
-"""Pose blend shapes of a body file, read as a stream.
+"""Reads the pose blend shapes of a body file as a stream.
 
-Rule: 80 MB of zeros are never held: memory is taken when the first number that is not zero arrives.
+Rule: an array of zeros (80 MB in many files) takes no memory: it is allocated at the first number that is not zero.
 """
 
 from __future__ import annotations
@@ -62,11 +62,11 @@ def _read(where: str, file: IO[bytes], shape: tuple[int, int, int]) -> NDArray[n
 
 
 def _check_header(where: str, file: IO[bytes], shape: tuple[int, int, int]) -> tuple[np.dtype[Any], Any]:
-    found, fortran, dtype = read_header(where, file)
+    stored_shape, fortran, dtype = read_header(where, file)
     if dtype.kind not in "fiu":
         raise BadInputError(where, f"dtype {dtype}", "numbers")
-    if found != shape:
-        raise BadInputError(where, f"shape {found}", str(shape))
+    if stored_shape != shape:
+        raise BadInputError(where, f"shape {stored_shape}", str(shape))
     if math.prod(shape) * dtype.itemsize > MAX_BYTES:
-        raise BadInputError(where, f"shape {found} of {dtype}", f"at most {MAX_BYTES} bytes")
+        raise BadInputError(where, f"shape {stored_shape} of {dtype}", f"at most {MAX_BYTES} bytes")
     return dtype, "F" if fortran else "C"

@@ -1,6 +1,6 @@
-"""Makes the same network for another tensor shape: rewrites batch, height and width, and infers the rest again.
+"""Makes the same network for another tensor shape: rewrites batch, height and width and infers all other shapes again.
 
-Rule: the result is static again and proven so; weights are untouched.
+Rule: the result is static and passes the checks of every network; weights are not changed.
 """
 
 from __future__ import annotations
@@ -8,14 +8,21 @@ from __future__ import annotations
 import onnx
 from onnx import shape_inference
 
-from trilane.avatars.network_file import NetworkFile, check_network
+from trilane.avatars.integer_network import NetworkFile
+from trilane.avatars.network_checks import check_network
 from trilane.errors import BadInputError
 
 STRIDE = 32
 
 
 def reshaped(network: NetworkFile, height: int, width: int, batch: int = 1) -> NetworkFile:
-    """`network` for (batch, height, width, C). Raises BadInputError when its graph cannot run at that shape."""
+    """`network` for inputs of another shape; the same object when it has that shape already.
+
+    `network`: the checked network.
+    `height`, `width`: of the input in pixels, multiples of 32.
+    `batch`: frames that are inferred together.
+    Raises BadInputError when the graph cannot run at that shape.
+    """
     if height % STRIDE or width % STRIDE or min(height, width, batch) < 1:
         raise BadInputError(network.where, f"shape {batch}x{height}x{width}", f"sides in multiples of {STRIDE}")
     if network.shape[:3] == (batch, height, width):

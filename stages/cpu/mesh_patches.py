@@ -1,4 +1,4 @@
-"""Patches of a mesh: neighbouring triangles of like skinning, each with a sphere that holds it in every pose.
+"""Patches of a mesh: neighbouring triangles with similar skin weights, each with a sphere that holds it in every pose.
 
 Rule: a patch's radius is proved, not sampled.
 
@@ -7,9 +7,9 @@ G_j is the rigid motion of joint j. Then
 
     x_p - x_c = sum_j w_j (G_j p - G_j c) + sum_j (w_j - u_j) G_j c.
 
-The first sum is at most |p - c|. The second is a change of weights at c as in `skinning.weight_error_bound`, so it is
-at most sum_b |E_b| |G_b c - G_parent c|, E_b the sum of w_j - u_j over b and the joints below it; and as b turns about
-its centre c_b by its own angle t_b, |G_b c - G_parent c| <= 2 sin(t_b / 2) |c - c_b|.
+The first sum is at most |p - c|. The second is a change of weights at c as in `skin_weights.weight_error_bound`, so it
+is at most sum_b |E_b| |G_b c - G_parent c|, where E_b is the sum of w_j - u_j over b and the joints below it; and as b
+turns about its centre c_b by its own angle t_b, |G_b c - G_parent c| <= 2 sin(t_b / 2) |c - c_b|.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F64, I64
 from trilane.body.body import ShapedBody
-from trilane.body.skinning import branch_sums, joint_distance
+from trilane.body.skin_weights import branch_sums, joint_distance
 
-#: Coarse patches are cut until their triangles' middles differ by no more than this, metres, and these again.
+#: Largest distance between the middles of a patch's triangles, metres: of coarse patches, and of fine ones.
 EXTENTS_M = (0.08, 0.02)
 LEAST_FACES = 4
-#: The angle, in radians, by which joints are taken to be turned when patches are cut.
+#: Joint angle, radians, that patches are cut for: triangles that move apart at this angle are put into other patches.
 TYPICAL_TURN = 0.5
 
 
 @dataclass(frozen=True)
 class Level:
-    """P patches of one fineness. `centres` (P,) vertex indices.
+    """P patches of one level of detail.
 
-    `parts`: of each patch, the indices of its patches in the next level, or of its vertices in the last one.
-    `faces`: of each patch, the indices of its triangles.
-
-    The sphere about the posed centre has the radius `size` (P,) + sum_b `give` (P,54)_b 2 sin(t_b / 2), metres, t_b the
-    angle by which joint b = 1..54 is turned. `blend` (P,54): the most that the pose blend shapes of a joint move a
-    vertex, metres per unit of |R - I|.
+    `centres`: (P,) vertex indices.
+    `size`, `give`: (P,) and (P,54). The sphere about a patch's posed centre has the radius
+    size + sum_b give_b 2 sin(t_b / 2), metres, where t_b is the angle of joint b = 1..54.
+    `blend`: (P,54) the furthest that the pose blend shapes of a joint move a vertex, metres per unit of |R - I|.
+    `parts`: for each patch, the indices of its patches in the next level; in the last level, of its vertices.
+    `faces`: for each patch, the indices of its triangles.
     """
 
     centres: I64
@@ -51,12 +51,12 @@ class Level:
 
 
 def join(groups: list[I64], chosen: I64) -> I64:
-    """The indices of the chosen groups, one after another."""
+    """The indices of the groups that `chosen` lists, in one array."""
     return np.concatenate([groups[patch] for patch in chosen]) if len(chosen) else np.zeros(0, np.int64)
 
 
 def build_levels(shaped: ShapedBody, weights: F64) -> list[Level]:
-    """Coarse and fine patches of all triangles of the body, skinned with `weights` (V,55)."""
+    """Coarse and fine patches of all triangles of the body. `weights` (V,55): the skin weights it is drawn with."""
     branches = branch_sums(shaped.body.parents, weights)
     swing = branches * joint_distance(shaped)
     features = np.concatenate([shaped.vertices.astype(np.float64), TYPICAL_TURN * swing[:, 1:]], axis=1)
@@ -90,7 +90,7 @@ def _level(
 
 
 def _blend_reach(posedirs: NDArray[np.float32] | None, count: int) -> F64:
-    """(V,54) metres: how far each joint's rotation, of unit |R - I|, can move each vertex by its blend shapes."""
+    """(V,54) metres: how far each joint's pose blend shapes can move each vertex at |R - I| = 1."""
     if posedirs is None:
         return np.zeros((count, 54))
     blocks = posedirs.reshape(count, 3, 54, 9)
@@ -98,7 +98,7 @@ def _blend_reach(posedirs: NDArray[np.float32] | None, count: int) -> F64:
 
 
 def _bisect(features: F64, rows: I64, extent: float) -> list[I64]:
-    """Groups of rows, halved again and again at the middle of the direction in which they reach furthest."""
+    """`rows` in groups: halved along the longest axis of their `features` until no axis is longer than `extent`."""
     here = features[rows]
     low, high = here.min(axis=0), here.max(axis=0)
     axis = int((high - low).argmax())

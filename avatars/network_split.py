@@ -1,8 +1,9 @@
-"""Cuts a quantised network at quantised tensors. Rule: only bytes cross a cut, so that the parts one after the other
-give the bytes of the whole.
+"""Cuts a quantised network at quantised tensors.
 
-What crosses beside the tensor itself (the skips of a U-Net, its input) crosses too; a Dequantize whose bytes cross,
-and a Transpose behind it, go to the part that reads them.
+Rule: only bytes cross a cut, so the parts, run one after the other, give the same bytes as the whole network.
+
+Every tensor that a later part reads crosses the cut, not only the tensor it is named after: a U-Net's skips, or its
+input. A Dequantize whose bytes cross, and a Transpose behind it, are repeated in the part that reads them.
 """
 
 from __future__ import annotations
@@ -16,18 +17,21 @@ from typing import Any
 import onnx
 from onnx import TensorProto, helper
 
-from trilane.avatars.network_file import IntegerNetwork, NetworkFile
+from trilane.avatars.integer_network import IntegerNetwork, NetworkFile
 from trilane.errors import BadInputError
 
 QUANTIZE = "QuantizeLinear"
-#: Nodes of one input that a later part can do again from the bytes that cross.
+#: Operators of one input that a later part can repeat from the bytes that cross.
 MOVABLE = ("DequantizeLinear", "Transpose")
 Shapes = dict[str, tuple[int, ...]]
 
 
 @dataclass(frozen=True)
 class Cut:
-    """A place to cut. `crossing`: tensor (all uint8) to shape; `at` is one of them. `nodes`: how many come before."""
+    """A place to cut. `at`: the tensor it is named after. `nodes`: how many nodes of the graph come before it.
+
+    `crossing`: name and shape of every tensor that crosses, all uint8; `at` is one of them.
+    """
 
     at: str
     crossing: Shapes
@@ -35,14 +39,17 @@ class Cut:
 
     @property
     def bytes(self) -> int:
+        """Bytes that cross the cut for one frame."""
         return sum(math.prod(shape) for shape in self.crossing.values())
 
 
 @dataclass(frozen=True)
 class NetworkPart(IntegerNetwork):
-    """A part that runs by itself. `inputs` and `outputs`: those of `model`, in its order, tensor (uint8) to shape.
+    """A part of the network that runs by itself. All four tables take a uint8 tensor's name to its shape.
 
-    `given`, `handed_on`: what crosses before and after it; what is handed on and no output was given, and is passed.
+    `inputs`, `outputs`: the tensors of `model`, in its order.
+    `given`: the tensors that cross the cut before this part; `handed_on`: those that cross the cut behind it. A tensor
+    of `handed_on` that is not in `outputs` is in `given`, and is copied on unchanged.
     """
 
     inputs: Shapes
@@ -52,7 +59,7 @@ class NetworkPart(IntegerNetwork):
 
 
 def cuts(network: NetworkFile) -> Iterator[Cut]:
-    """Every place where `network` can be cut, in the order of its work."""
+    """Every place where `network` can be cut, in the order of its nodes."""
     graph = onnx.shape_inference.infer_shapes(network.model).graph
     for number, node in enumerate(graph.node, 1):
         if node.op_type == QUANTIZE and node.output[0] != graph.output[0].name:
@@ -62,7 +69,7 @@ def cuts(network: NetworkFile) -> Iterator[Cut]:
 
 
 def split(network: NetworkFile, at: Sequence[str]) -> list[NetworkPart]:
-    """The parts of `network` between the quantised tensors `at`, which come in the order of its work.
+    """The parts of `network`, cut at the quantised tensors `at`, which are in the order of the network's nodes.
 
     Raises BadInputError when it cannot be cut there.
     """
@@ -81,7 +88,7 @@ def split(network: NetworkFile, at: Sequence[str]) -> list[NetworkPart]:
 
 
 def _crossing(graph: onnx.GraphProto, nodes: int) -> Shapes | None:
-    """What the nodes from number `nodes` on read of those before; None when it is not bytes alone."""
+    """Tensors that the nodes from number `nodes` on read from the nodes before; None unless all of them are bytes."""
     makers = {name: node for node in graph.node[:nodes] for name in node.output}
     names = []
     for node in graph.node[nodes:]:
@@ -104,8 +111,8 @@ def _part(network: NetworkFile, before: Cut, after: Cut) -> NetworkPart:
     own = graph.node[before.nodes : after.nodes]
     made = {name for node in own for name in node.output}
     outputs = {name: shape for name, shape in after.crossing.items() if name in made}
-    again = [node for node in graph.node[: before.nodes] if node.op_type in MOVABLE]
-    nodes = _needed([*again, *own], list(outputs))
+    repeated = [node for node in graph.node[: before.nodes] if node.op_type in MOVABLE]
+    nodes = _needed([*repeated, *own], list(outputs))
     read = {name for node in nodes for name in node.input}
     inputs = {name: shape for name, shape in before.crossing.items() if name in read}
     part = helper.make_graph(
@@ -122,12 +129,13 @@ def _part(network: NetworkFile, before: Cut, after: Cut) -> NetworkPart:
 
 
 def _needed(nodes: Sequence[onnx.NodeProto], outputs: Sequence[str]) -> list[onnx.NodeProto]:
-    wanted, kept = set(outputs), []
+    """The nodes that `outputs` depend on, in their order."""
+    wanted, needed = set(outputs), []
     for node in reversed(nodes):
         if wanted.intersection(node.output):
             wanted.update(node.input)
-            kept.append(node)
-    return kept[::-1]
+            needed.append(node)
+    return needed[::-1]
 
 
 def _declared(values: Any) -> Shapes:
