@@ -15,7 +15,7 @@ from pydantic import ValidationError
 
 from trilane.apps.machine import gl_facts, machine_facts
 from trilane.avatars.bundle import Bundle, load_bundle
-from trilane.avatars.split import split
+from trilane.avatars.network_split import split
 from trilane.body.body import load_body
 from trilane.errors import BadInputError, MissingPartError
 from trilane.hw_profiles.host import host_units

@@ -13,7 +13,7 @@ from itertools import product
 import numpy as np
 
 from trilane.arrays import U8
-from trilane.avatars.split import NetworkPart
+from trilane.avatars.network_split import NetworkPart
 from trilane.errors import BadInputError
 from trilane.shapes import Shape
 from trilane.stages.config import RunConfig

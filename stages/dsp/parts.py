@@ -12,9 +12,9 @@ from pathlib import Path
 
 from trilane.arrays import U8
 from trilane.avatars.bundle import load_bundle
-from trilane.avatars.network_file import NetworkFile
-from trilane.avatars.reshape import reshaped
-from trilane.avatars.split import NetworkPart, Shapes, split
+from trilane.avatars.integer_network import NetworkFile
+from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.network_split import NetworkPart, Shapes, split
 from trilane.errors import BadInputError
 from trilane.shapes import Shape
 from trilane.stages.config import RunConfig

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from trilane.avatars.bundle import load_bundle
 from trilane.body.body import Body, load_body
-from trilane.body.skinning import WEIGHT_COUNTS, largest_weights
-from trilane.stages.gpu.mesh import MeshArrays, mesh_arrays
-from trilane.stages.gpu.packed import Quantisation
+from trilane.body.skin_weights import WEIGHT_COUNTS, largest_weights
+from trilane.stages.gpu.mesh_arrays import MeshArrays, mesh_arrays
+from trilane.stages.gpu.packed_pass import Quantisation
 
 LARGEST_LOSS = 1e-3  # of a vertex's weight
 

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F64
 from trilane.scene.schema import PlaneSpec
-from trilane.stages.gpu import gl
+from trilane.stages.gpu import opengl_calls
 from trilane.stages.gpu.background import Background
-from trilane.stages.gpu.context import checked
-from trilane.stages.gpu.hud import Hud
-from trilane.stages.gpu.painters import AvatarPainter, PicturePainter, RoomPainter, ShadowPainter
-from trilane.stages.gpu.planes import PlanePainter
-from trilane.stages.gpu.shadow import DISCS, floor_discs
+from trilane.stages.gpu.composite_painters import AvatarPainter, PicturePainter, RoomPainter, ShadowPainter
+from trilane.stages.gpu.contact_shadows import DISCS, floor_discs
+from trilane.stages.gpu.detected_planes import PlanePainter
+from trilane.stages.gpu.head_up_display import Hud
+from trilane.stages.gpu.opengl_context import checked
 from trilane.transport.packets import Packet
 
 Shape = tuple[int, int]
@@ -44,7 +44,7 @@ class CompositeStage:
         hud: bool = False,
     ) -> None:
         self._ctx, self._shape, self._rest, self._background = ctx, shape, rest, background
-        colour = ctx.texture(shape[::-1], 4, internal_format=gl.SRGB8_ALPHA8)
+        colour = ctx.texture(shape[::-1], 4, internal_format=opengl_calls.SRGB8_ALPHA8)
         self._target = ctx.framebuffer([colour])
         self._room = RoomPainter(ctx) if background is None else None
         self._picture = None if background is None else PicturePainter(ctx, shape)

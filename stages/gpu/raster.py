@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from trilane.errors import TrilaneError
 from trilane.stages.cpu.crop import Rect, crop_projection
-from trilane.stages.gpu.context import checked
-from trilane.stages.gpu.packed import PackedAvatar, PackedPass, Placement
+from trilane.stages.gpu.opengl_context import checked
+from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement
 from trilane.stages.packets import posed_vertices
 from trilane.transport.packets import Packet
 

@@ -14,10 +14,10 @@ from trilane.stages.config import RunConfig
 from trilane.stages.gpu.assets import AvatarAssets, load_assets
 from trilane.stages.gpu.background import Background, open_background
 from trilane.stages.gpu.composite import CompositeStage
-from trilane.stages.gpu.context import describe, open_context
-from trilane.stages.gpu.mesh import Mesh, PosedMesh, SkinnedMesh
-from trilane.stages.gpu.packed import PackedAvatar, PackedPass
+from trilane.stages.gpu.opengl_context import describe, open_context
+from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass
 from trilane.stages.gpu.raster import RasterStage
+from trilane.stages.gpu.skinned_mesh import Mesh, PosedMesh, SkinnedMesh
 
 ROOM = "room"
 

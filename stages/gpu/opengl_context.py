@@ -1,6 +1,6 @@
 """The OpenGL context of the GPU unit.
 
-Rule: one off-screen EGL context per process, hardware or software; nobody else in the project creates one.
+Rule: one off-screen EGL context per process, hardware or software; no other file creates one.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swr", "swiftshader", "swrast")
 
 @dataclass(frozen=True)
 class Driver:
-    """What drives the context. `hardware` is False for a renderer that runs on the CPU."""
+    """The OpenGL driver. `hardware` is False for a renderer that runs on the CPU."""
 
     vendor: str
     renderer: str
@@ -36,8 +36,8 @@ class Driver:
 def open_context(threads: int | None = None) -> Any:
     """A new off-screen `moderngl.Context` of OpenGL 3.3 or later, current on the calling thread.
 
-    `threads`: CPU threads a software driver may use; Mesa reads it once, when the process makes its first context.
-    One thread means none beside the caller's. Raises MissingPartError when no context can be made.
+    `threads`: CPU threads that a software driver may use, the calling thread included; Mesa reads the number once, when
+    the process makes its first context. Raises MissingPartError when no context can be made.
     """
     if threads is not None:
         os.environ["LP_NUM_THREADS"] = str(threads if threads > 1 else 0)
@@ -51,7 +51,7 @@ def open_context(threads: int | None = None) -> Any:
 def check(ctx: Any) -> None:
     """Raises UnitLostError when the context was lost, TrilaneError when a call since the last check failed.
 
-    Without a current context OpenGL calls do nothing and report nothing, so a stale tensor would pass for a new one.
+    Without a current context OpenGL calls do nothing and report no error, so an old tensor would look like a new one.
     """
     error = ctx.error if current() else "GL_CONTEXT_LOST"
     if error == "GL_CONTEXT_LOST":
@@ -62,7 +62,7 @@ def check(ctx: Any) -> None:
 
 @contextmanager
 def checked(ctx: Any) -> Iterator[None]:
-    """`check` behind what is done within it; whatever else goes wrong without a context is the loss of it."""
+    """Run the block, then `check`. An exception raised while there is no current context becomes UnitLostError."""
     try:
         yield
     except Exception as error:
@@ -73,7 +73,7 @@ def checked(ctx: Any) -> Iterator[None]:
 
 
 def current() -> bool:
-    """Has the calling thread a context of EGL?"""
+    """Whether the calling thread has a current EGL context."""
     return bool(_current_context()())
 
 
@@ -85,7 +85,7 @@ def _current_context() -> Any:
 
 
 def describe(ctx: Any) -> Driver:
-    """The driver behind `ctx`, as it names itself."""
+    """The driver of `ctx`, by the names it gives itself."""
     info = ctx.info
     renderer = str(info["GL_RENDERER"])
     software = any(name in renderer.lower() for name in SOFTWARE_RENDERERS)

@@ -1,6 +1,6 @@
-"""What the composite draws, one class per layer: room, picture, contact shadow, avatar.
+"""The painters of the composite, one class per layer of the frame: room, picture, contact shadows, avatars.
 
-Rule: backgrounds are copied as the sRGB bytes they are; everything blended over them is blended in linear light.
+Rule: background bytes are copied unchanged, as sRGB; whatever is blended over them is blended in linear light.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ import moderngl
 import numpy as np
 
 from trilane.arrays import F32, U8, Floats
-from trilane.stages.gpu import gl
-from trilane.stages.gpu.camera import eye_of, target_clip
-from trilane.stages.gpu.program import build_program
-from trilane.stages.gpu.room import Extent, floor_texture, room_mesh, wall_texture
+from trilane.stages.gpu import opengl_calls
+from trilane.stages.gpu.builtin_room import Extent, floor_texture, room_mesh, wall_texture
+from trilane.stages.gpu.camera_matrices import eye_of, target_clip
+from trilane.stages.gpu.shader_program import build_program
 
 MAX_TAPS = 8
 HALF_TEXEL_INWARD = np.array([0.5, 0.5, -0.5, -0.5])
@@ -22,29 +22,27 @@ UNDER_THE_FLOOR = (70, 66, 60)
 
 
 class RoomPainter:
-    """The built-in room, which grows when a camera leaves it."""
+    """The built-in room, which is made larger when a camera leaves it."""
 
     def __init__(self, ctx: Any) -> None:
         self._ctx = ctx
         self._program = build_program(ctx, "room.vert", "room.frag")
         self._textures = [
             _detail(ctx, floor_texture(), moderngl.LINEAR_MIPMAP_LINEAR),
-            _detail(ctx, wall_texture(), moderngl.LINEAR_MIPMAP_NEAREST),  # too smooth to show where levels change
+            _detail(ctx, wall_texture(), moderngl.LINEAR_MIPMAP_NEAREST),  # too smooth to show a change of MIP level
         ]
         self._extent = Extent()
         self._batches: list[Any] = []
         self._build()
 
     def draw(self, target: Any, view: Floats, projection: Floats) -> None:
-        """Fill `target` with the room as seen by `view` and `projection`; a camera under the floor sees no floor."""
+        """Fill `target` with the room as seen by `view` and `projection`; from below, the floor is not drawn."""
         grown = self._extent.holding(eye_of(view))
         if grown is not self._extent:
             self._extent = grown
             self._build()
         self._ctx.enable_only(moderngl.CULL_FACE)
-        self._ctx.front_face = (
-            "cw"  # rows run downward: what winds counter-clockwise in the picture is stored clockwise
-        )
+        self._ctx.front_face = "cw"  # row 0 is on top, see `skinned_mesh`
         target.clear(*(value / 255 for value in UNDER_THE_FLOOR))
         self._program["clip_from_world"].write(target_clip(view, projection))
         for texture, batch in zip(self._textures, self._batches, strict=True):
@@ -62,7 +60,7 @@ class RoomPainter:
 
 
 class PicturePainter:
-    """A picture of the output's size, (h,w,3) uint8."""
+    """A background picture of the output's size, (h,w,3) uint8."""
 
     def __init__(self, ctx: Any, shape: tuple[int, int]) -> None:
         self._ctx = ctx
@@ -71,7 +69,7 @@ class PicturePainter:
         self._texture = ctx.texture(shape[::-1], 3, alignment=1)
 
     def upload(self, picture: U8) -> None:
-        """Take `picture` as what `draw` shows."""
+        """Write `picture` (h,w,3) to the GPU; `draw` shows it from now on."""
         self._texture.write(picture, alignment=1)
 
     def draw(self) -> None:
@@ -99,12 +97,12 @@ class ShadowPainter:
         padded = np.zeros((self._count, 4), np.float32)
         padded[: len(blobs)] = blobs
         self._program["blob"].write(padded)
-        with gl.srgb_target():
+        with opengl_calls.srgb_target():
             self._discs.render(vertices=6 * len(blobs))
 
 
 class AvatarPainter:
-    """The network's pictures: uploaded once a frame, then drawn avatar by avatar at their crop rectangles."""
+    """The network's picture: uploaded once a frame, then drawn avatar by avatar at their crop rectangles."""
 
     def __init__(self, ctx: Any, shapes: list[tuple[int, int]]) -> None:
         self._ctx = ctx
@@ -115,7 +113,7 @@ class AvatarPainter:
         self._pictures = {shape: self._picture(shape) for shape in shapes}
 
     def upload(self, shape: tuple[int, int], image: U8) -> None:
-        """Take `image`, (h * w * 4,) uint8, sRGB with straight alpha, as the picture of `shape`."""
+        """Write `image` (h * w * 4,) uint8, sRGB with straight alpha, to the GPU as the picture of `shape`."""
         straight, target, _ = self._pictures[shape]
         straight.write(image)
         target.use()
@@ -126,7 +124,13 @@ class AvatarPainter:
     def draw(
         self, target: Any, shape: tuple[int, int], rect: tuple[float, ...], tensor_rect: tuple[int, int, int, int]
     ) -> None:
-        """Blend the part `tensor_rect` (top, left, height, width) of the picture of `shape` over `target` at `rect`."""
+        """Blend one avatar's part of the picture over `target`.
+
+        `target`: the framebuffer.
+        `shape`: (height, width) of the picture that was uploaded.
+        `rect`: where the avatar is on the screen, x0, y0, x1, y1 in normalised device coordinates.
+        `tensor_rect`: its part of the picture: top, left, height, width.
+        """
         top, left, height, width = tensor_rect
         rows, columns = (rect[3] - rect[1]) / 2 * target.height, (rect[2] - rect[0]) / 2 * target.width
         taps = int(np.clip(np.ceil(max(height / max(rows, 1e-6), width / max(columns, 1e-6)) - 0.25), 1, MAX_TAPS))
@@ -140,11 +144,11 @@ class AvatarPainter:
         program["source"].value = tuple(edge / size)
         program["inside"].value = tuple((edge + HALF_TEXEL_INWARD) / size)
         self._pictures[shape][2].use(0)
-        with gl.srgb_target():
+        with opengl_calls.srgb_target():
             quad.render(moderngl.TRIANGLE_STRIP, vertices=4)
 
     def _picture(self, shape: tuple[int, int]) -> tuple[Any, Any, Any]:
-        straight = self._ctx.texture(shape[::-1], 4, internal_format=gl.SRGB8_ALPHA8)
+        straight = self._ctx.texture(shape[::-1], 4, internal_format=opengl_calls.SRGB8_ALPHA8)
         premultiplied = self._ctx.texture(shape[::-1], 4, dtype="f2")
         premultiplied.filter = (moderngl.LINEAR, moderngl.LINEAR)
         premultiplied.repeat_x = premultiplied.repeat_y = False

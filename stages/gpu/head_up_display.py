@@ -1,7 +1,7 @@
-"""The head-up display: what frame this is, how fast frames come and how old they are, written on the picture.
+"""The head-up display: frame number, frame rate, age and tensor size, written on the picture.
 
-Rule: frame and time are those of the picture; figures of this stage's own clock are renewed a few times a second, so
-that they can be read, and begin anew with the frames.
+Rule: frame number and time are the picture's; rate and age, which this stage measures, are updated four times a second
+so that they can be read, and start anew when frame numbers do.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from trilane.stages.gpu.program import build_program
+from trilane.stages.gpu.shader_program import build_program
 
 SIZE = (232, 62)  # width, height
 MARGIN_PX = 8
@@ -26,7 +26,7 @@ SHEET, INK = (0, 0, 0, 150), (255, 255, 255, 255)
 
 
 class Hud:
-    """Draws into the lower left corner of a target; a smaller one shows what fits."""
+    """Draws into the lower left corner of a target; a target smaller than the display shows a part of it."""
 
     def __init__(self, ctx: Any) -> None:
         self._ctx = ctx
@@ -39,7 +39,7 @@ class Hud:
         self._measured = ""
 
     def draw(self, target: Any, pose: NDArray[np.void]) -> None:
-        """Blend the display for the frame that `pose` describes over `target`."""
+        """Blend the display for the frame of pose packet `pose` over `target`."""
         lines = self._lines(pose, time.monotonic_ns())
         self._texture.write(hud_picture(lines, self._font).tobytes())
         corner = MARGIN_PX, target.height - MARGIN_PX - SIZE[1]
@@ -64,7 +64,7 @@ class Hud:
 
 
 def measured_line(pose: NDArray[np.void], presented_ns: list[int]) -> str:
-    """Rate and age; `presented_ns`: when the last frames were composed, the present one last."""
+    """The line of rate and age. `presented_ns`: when the last frames were composed, this frame's time last."""
     span = presented_ns[-1] - presented_ns[0]
     rate = f"{(len(presented_ns) - 1) * 1e9 / span:.1f} fps" if span > 0 else "- fps"
     age_ms = (presented_ns[-1] - int(pose["t_sampled_ns"])) / 1e6
@@ -72,7 +72,7 @@ def measured_line(pose: NDArray[np.void], presented_ns: list[int]) -> str:
 
 
 def hud_lines(pose: NDArray[np.void], measured: str) -> list[str]:
-    """Three lines, `measured` in their middle."""
+    """The three lines of the display; `measured` is the middle one."""
     height, width = pose["tensor_shape"].tolist()
     visible = int(sum(avatar["visible"] for avatar in pose["avatars"][: int(pose["avatar_count"])]))
     return [
@@ -83,7 +83,7 @@ def hud_lines(pose: NDArray[np.void], measured: str) -> list[str]:
 
 
 def hud_picture(lines: list[str], font: Any) -> NDArray[np.uint8]:
-    """(62,232,4) uint8, straight alpha: `lines` on a dark sheet."""
+    """(62,232,4) uint8, straight alpha: `lines` on a dark background."""
     image = Image.new("RGBA", SIZE, SHEET)
     ImageDraw.Draw(image).multiline_text((8, 3), "\n".join(lines), INK, font, spacing=3)
     return np.asarray(image)

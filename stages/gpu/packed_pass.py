@@ -1,6 +1,6 @@
-"""The packed pass: a posed mesh and a neural texture become the network's INT8 input in one draw.
+"""The packed pass: draws a posed mesh with its neural texture as the network's input tensor, in bytes.
 
-Rule: bytes leave the GPU in tensor order (NHWC, row 0 on top), already in the network's encoding.
+Rule: bytes leave the GPU in tensor order (NHWC, row 0 on top) and already have the network's scale and zero point.
 """
 
 from __future__ import annotations
@@ -10,32 +10,29 @@ from typing import Any
 
 import moderngl
 import numpy as np
-from numpy.typing import NDArray
 
 from trilane.arrays import F32, U8, Floats
 from trilane.errors import BadInputError
-from trilane.stages.gpu import gl
-from trilane.stages.gpu.mesh import BodyPose, Mesh
+from trilane.shapes import Shape
+from trilane.stages.gpu import opengl_calls
 from trilane.stages.gpu.mesh_draw import MeshDraw
-from trilane.stages.gpu.program import build_program, set_uniforms
-
-Shape = tuple[int, int]
+from trilane.stages.gpu.shader_program import build_program, set_uniforms
+from trilane.stages.gpu.skinned_mesh import BodyPose, Mesh
+from trilane.stages.gpu.texture_array import FILTERS, check_texture, texture_array
 
 CHANNELS = (4, 8, 12, 16)
-#: How the neural texture is read: the filter when it is shrunk, and the greatest anisotropy (the driver's may be less).
-FILTERS = {
-    "linear": (moderngl.LINEAR, 1.0),
-    "mipmap": (moderngl.LINEAR_MIPMAP_LINEAR, 1.0),
-    "anisotropic": (moderngl.LINEAR_MIPMAP_LINEAR, 16.0),
-}
-FP16_MAX = float(np.finfo(np.float16).max)
 WORD_TYPES = {1: "uint", 2: "uvec2", 3: "uvec4", 4: "uvec4"}
-TARGET_WORDS = {1: 1, 2: 2, 3: 4, 4: 4}  # three-word targets need not be drawable; the fourth word is not read back
+#: 32-bit words of a target's pixel by the tensor's. OpenGL does not promise drawable targets of three words, so they
+#: have four, of which the fourth is not read back.
+TARGET_WORDS = {1: 1, 2: 2, 3: 4, 4: 4}
 
 
 @dataclass(frozen=True)
 class Quantisation:
-    """real = (q - zero_point) * scale, q in 0..255."""
+    """How the tensor's bytes stand for real numbers: real = (q - zero_point) * scale, q in 0..255.
+
+    Raises BadInputError when made with a scale that is not positive or a zero point that is not a byte.
+    """
 
     scale: float
     zero_point: int
@@ -49,9 +46,9 @@ class Quantisation:
 
 @dataclass(frozen=True)
 class Placement:
-    """One avatar in a tensor. `clip_projection`: of its crop. `rect`: top, left, height, width in tensor pixels.
+    """One avatar in a tensor. `rect`: top, left, height, width in tensor pixels. `clip_projection` (4,4): of its crop.
 
-    `joints`, `feature`, `vertices`: as of `BodyPose`.
+    `joints`, `feature`, `vertices`: its pose, as in `BodyPose`.
     """
 
     joints: F32
@@ -62,15 +59,15 @@ class Placement:
 
     @property
     def pose(self) -> BodyPose:
-        """What the mesh needs of it."""
+        """The pose, as the mesh takes it."""
         return BodyPose(self.joints, self.feature, self.vertices)
 
 
 @dataclass(frozen=True)
 class Target:
-    """`words`: framebuffer of the tensor. A deferred pass has `uv_image` and its framebuffer `uv` on the same depth.
+    """`words`: framebuffer of the tensor. Of a deferred pass also `uv_image` and its framebuffer `uv`, with one depth.
 
-    `blank`: bytes of a tensor with nothing in it, which software drivers copy in less time than they clear.
+    `blank`: bytes of an empty tensor; software drivers copy them faster than they clear a target.
     """
 
     words: Any
@@ -80,16 +77,21 @@ class Target:
 
 
 class PackedPass:
-    """Draws meshes with one neural texture each into tensors of `channels` channels.
-
-    `deferred`: first u and v of every pixel, then the texture once for each pixel that is seen; the bytes are the same.
-    Software drivers shade whole blocks of pixels for each small triangle, so there this is the faster way.
-    `filtering`: of `FILTERS`; a deferred pass has no derivatives and takes `linear` alone. Raises BadInputError.
-    """
+    """Draws meshes, each with its neural texture, into tensors."""
 
     def __init__(
         self, ctx: Any, channels: int, quantisation: Quantisation, deferred: bool, filtering: str = "linear"
     ) -> None:
+        """Check the settings; targets are made on first use.
+
+        `ctx`: the OpenGL context.
+        `channels`: of the tensors and textures, one of `CHANNELS`.
+        `quantisation`: scale and zero point of the bytes.
+        `deferred`: draw u and v of every pixel first, then read the texture once for each visible pixel. The bytes are
+        the same. It is faster on software drivers, which shade whole blocks of pixels for each small triangle.
+        `filtering`: a name of `FILTERS`. A deferred pass has no derivatives of u and v, so it takes only `linear`.
+        Raises BadInputError.
+        """
         if filtering not in FILTERS:
             raise BadInputError("texture filter", repr(filtering), f"one of {', '.join(FILTERS)}")
         if deferred and filtering != "linear":
@@ -107,27 +109,27 @@ class PackedPass:
 
     @property
     def uniforms(self) -> dict[str, float]:
-        """What the packing shader is told."""
+        """Uniforms of `pack.frag`."""
         encoding = self.quantisation
         return {"neural": 0, "uv_image": 1, "scale": encoding.scale, "zero_point": float(encoding.zero_point)}
 
     def target(self, shape: Shape) -> Target:
-        """What tensors of `shape` (height, width) are drawn into; made on first use."""
+        """The target for tensors of `shape` (height, width); made on first use."""
         if shape not in self._targets:
             self._targets[shape] = self._make_target(shape[::-1])
         return self._targets[shape]
 
     def begin(self, shape: Shape) -> Target:
-        """Clear the target of `shape`: the zero point everywhere, nothing covered."""
+        """Fill the target of `shape` with the zero point and the greatest depth, and return it."""
         target = self.target(shape)
         target.words.use()
         target.words.viewport = (0, 0, shape[1], shape[0])
         target.words.depth_mask = True
         if target.blank is None:
-            gl.clear_unsigned(self._background)
+            opengl_calls.clear_unsigned(self._background)
         else:
             target.words.color_attachments[0].write(target.blank)
-        gl.clear_depth()
+        opengl_calls.clear_depth()
         return target
 
     def read_into(self, shape: Shape, tensor: U8) -> None:
@@ -136,7 +138,7 @@ class PackedPass:
         self.target(shape).words.read_into(tensor, box, components=self.layers, dtype="u4", alignment=1)
 
     def background(self, tensor: U8) -> None:
-        """Fill `tensor` with what a frame without avatars holds."""
+        """Fill `tensor` with the zero point, the content of a frame without avatars."""
         tensor[:] = self.quantisation.zero_point
 
     def _make_target(self, size: tuple[int, int]) -> Target:
@@ -151,9 +153,10 @@ class PackedPass:
 
 
 class PackedAvatar:
-    """One avatar's mesh and texture, ready for a `PackedPass`. `texture` (H,W,C): finite, within FP16's range."""
+    """One avatar's mesh and texture, which a `PackedPass` draws."""
 
-    def __init__(self, packed: PackedPass, mesh: Mesh, texture: NDArray[np.floating[Any]]) -> None:
+    def __init__(self, packed: PackedPass, mesh: Mesh, texture: Floats) -> None:
+        """`texture` (H,W,C) is uploaded here. Raises BadInputError when FP16 cannot hold it or C is not the pass's."""
         check_texture(texture, packed.channels)
         self._mesh, self._ctx = mesh, packed.ctx
         self._texture = texture_array(packed.ctx, texture, packed.filtering)
@@ -168,7 +171,12 @@ class PackedAvatar:
             self._geometry.set(packed.uniforms)
 
     def draw(self, target: Target, view: Floats, placement: Placement) -> None:
-        """Draw into `target`, which a `PackedPass` began."""
+        """Draw into `target`, which `PackedPass.begin` has cleared.
+
+        `target`: of the pass.
+        `view`: (4,4) the camera.
+        `placement`: the avatar's pose, crop and rectangle of the tensor.
+        """
         top, left, height, width = placement.rect
         box = (left, top, width, height)
         self._texture.use(0)
@@ -189,27 +197,3 @@ class PackedAvatar:
         target.uv_image.use(1)
         self._screen.render(vertices=3)
         self._ctx.depth_func = "<"
-
-
-def texture_array(ctx: Any, texture: NDArray[np.floating[Any]], filtering: str = "linear") -> Any:
-    """An FP16 array texture of C/4 RGBA layers from `texture` (H,W,C), clamped to its edge, read as `FILTERS` says."""
-    height, width, channels = texture.shape
-    layers = texture.reshape(height, width, channels // 4, 4).transpose(2, 0, 1, 3)
-    pixels = np.ascontiguousarray(layers, np.float16).tobytes()
-    array = ctx.texture_array((width, height, channels // 4), 4, pixels, dtype="f2")
-    shrunk, anisotropy = FILTERS[filtering]
-    if shrunk != moderngl.LINEAR:
-        array.build_mipmaps()
-    array.filter = (shrunk, moderngl.LINEAR)
-    array.anisotropy = anisotropy
-    array.repeat_x = array.repeat_y = False
-    return array
-
-
-def check_texture(texture: NDArray[np.floating[Any]], channels: int) -> None:
-    """Raises BadInputError unless `texture` is (H,W,channels) of numbers that FP16 can hold."""
-    if texture.ndim != 3 or texture.shape[2] != channels:
-        raise BadInputError("neural texture", f"shape {texture.shape}", f"(height, width, {channels})")
-    largest = float(np.abs(texture).max()) if texture.size else 0.0
-    if not largest <= FP16_MAX:
-        raise BadInputError("neural texture", f"a value of {largest}", f"numbers within FP16's ±{FP16_MAX:.0f}")

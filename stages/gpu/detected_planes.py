@@ -1,6 +1,6 @@
-"""Detected planes as a phone's tracking shows them: faint rectangles with a grid, over the background.
+"""Draws detected planes as a phone's tracking shows them: faint rectangles with a grid, over the background.
 
-Rule: planes are the scene's; nothing is detected here.
+Rule: the planes are those of the scene file; nothing is detected here.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ import numpy as np
 
 from trilane.arrays import F32, Floats
 from trilane.scene.schema import PlaneSpec
-from trilane.stages.gpu import gl
-from trilane.stages.gpu.camera import target_clip
-from trilane.stages.gpu.program import build_program
+from trilane.stages.gpu import opengl_calls
+from trilane.stages.gpu.camera_matrices import target_clip
+from trilane.stages.gpu.shader_program import build_program
 
-UPRIGHT = 0.9  # a normal with more of y than this takes the world's x as its first side's direction
+UPRIGHT = 0.9  # sides of a plane whose unit normal has |y| above this are aligned with the world's x, others with its y
 
 
 class PlanePainter:
@@ -33,16 +33,16 @@ class PlanePainter:
         self._program["along"].write(np.array([along for _, along in sides], np.float32))
 
     def draw(self, view: Floats, projection: Floats) -> None:
-        """Blend the planes over what is there, as seen by `view` and `projection`."""
+        """Blend the planes over the target, as seen by `view` and `projection`."""
         self._ctx.enable_only(moderngl.BLEND)
         self._ctx.blend_func = moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA
         self._program["clip_from_world"].write(target_clip(view, projection))
-        with gl.srgb_target():
+        with opengl_calls.srgb_target():
             self._sheets.render(vertices=6 * self._count)
 
 
 def half_sides(plane: PlaneSpec) -> tuple[F32, F32]:
-    """Half of each side of `plane` as vectors (3,), metres: at right angles to each other and to the normal."""
+    """Half of each side of `plane` as a vector (3,), metres: at right angles to each other and to the normal."""
     normal = np.asarray(plane.normal, np.float64) / np.linalg.norm(plane.normal)
     towards = np.array([1.0, 0.0, 0.0]) if abs(normal[1]) > UPRIGHT else np.array([0.0, 1.0, 0.0])
     along = np.cross(normal, towards)

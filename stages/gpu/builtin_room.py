@@ -1,6 +1,6 @@
 """The built-in background: a room with a wooden floor at y = 0, as a mesh and two textures.
 
-Rule: everything is made from numbers and a fixed seed; the room holds every camera that looks at it.
+Rule: mesh and textures are computed from constants and a fixed seed, and the room always holds the camera.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Extent:
     high: tuple[float, float, float] = (4.0, 3.0, 4.0)
 
     def holding(self, eye: F64) -> Extent:
-        """This room, or a larger one with walls and ceiling at least MARGIN_M beyond `eye` (3,); never smaller."""
+        """This room, or a larger one with walls and ceiling at least MARGIN_M beyond camera position `eye` (3,)."""
         low = (min(self.low[0], eye[0] - MARGIN_M), self.low[1], min(self.low[2], eye[2] - MARGIN_M))
         high = tuple(max(side, float(at) + MARGIN_M) for side, at in zip(self.high, eye, strict=True))
         grown = Extent((float(low[0]), low[1], float(low[2])), (high[0], high[1], high[2]))
@@ -42,7 +42,7 @@ class Extent:
 
 @dataclass(frozen=True)
 class RoomMesh:
-    """`vertices` (N,8) float32: position, uv, light. `floor` and `rest` (M,3) uint32: triangles, inside facing."""
+    """`vertices` (N,8) float32: position, uv, light. `floor` and `rest` (M,3) uint32: triangles facing inwards."""
 
     vertices: F32
     floor: NDArray[np.uint32]
@@ -134,7 +134,7 @@ def _triangles(turned: bool) -> NDArray[np.int64]:
 
 
 def _noise(rng: np.random.Generator, shape: tuple[int, int], length: tuple[float, float]) -> F64:
-    """Periodic noise of mean 0 and deviation 1; `length`: Gaussian correlation across columns and along rows."""
+    """Periodic noise of mean 0 and deviation 1. `length`: Gaussian correlation lengths, across columns and rows."""
     frequency = [np.fft.fftfreq(n)[:, None] if k == 0 else np.fft.fftfreq(n)[None] for k, n in enumerate(shape)]
     spread = (frequency[0] * length[1]) ** 2 + (frequency[1] * length[0]) ** 2
     field = np.fft.ifft2(np.fft.fft2(rng.normal(size=shape)) * np.exp(-2 * np.pi**2 * spread / 4)).real

@@ -1,6 +1,6 @@
 """Raw OpenGL calls that moderngl has no method for.
 
-Rule: thin; one table of signatures, no state. Every call needs the context current on its thread.
+Rule: one table of signatures and no state; the calling thread must have the context current.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from functools import cache
 from typing import Any
 
 from trilane.errors import MissingPartError, TrilaneError
-from trilane.stages.gpu.context import INSTALL, LIBRARY
+from trilane.stages.gpu.opengl_context import INSTALL, LIBRARY
 
 COLOR, DEPTH = 0x1800, 0x1801
 SYNC_GPU_COMMANDS_COMPLETE, SYNC_FLUSH_COMMANDS = 0x9117, 1
@@ -34,7 +34,7 @@ _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
 
 @cache
 def function(name: str) -> Callable[..., Any]:
-    """OpenGL function `name`. Raises MissingPartError when the driver lacks it."""
+    """OpenGL function `name` of `_SIGNATURES`. Raises MissingPartError when the driver lacks it."""
     library = ctypes.CDLL(LIBRARY)
     library.eglGetProcAddress.restype = ctypes.c_void_p
     address = library.eglGetProcAddress(name.encode())
@@ -46,22 +46,22 @@ def function(name: str) -> Callable[..., Any]:
 
 
 def clear_unsigned(value: tuple[int, int, int, int]) -> None:
-    """Fill colour attachment 0 of the bound framebuffer, an unsigned integer format, with `value`."""
+    """Fill colour attachment 0 of the bound framebuffer, which has an unsigned integer format, with `value`."""
     function("glClearBufferuiv")(COLOR, 0, (ctypes.c_uint * 4)(*value))
 
 
 def clear_depth() -> None:
-    """Fill the depth of the bound framebuffer with 1."""
+    """Fill the bound framebuffer's depth with 1, the greatest depth."""
     function("glClearBufferfv")(DEPTH, 0, (ctypes.c_float * 1)(1.0))
 
 
 def fence() -> int:
-    """A fence behind every command given so far; to be waited for once."""
+    """A fence after every command issued so far. It must be passed to `wait_fence` exactly once."""
     return int(function("glFenceSync")(SYNC_GPU_COMMANDS_COMPLETE, 0))
 
 
 def wait_fence(sync: int, timeout_ns: int = 1_000_000_000) -> None:
-    """Wait for a fence and delete it. Raises TrilaneError when it does not come in time."""
+    """Wait for fence `sync` and delete it. Raises TrilaneError when the GPU does not reach it within `timeout_ns`."""
     result = function("glClientWaitSync")(sync, SYNC_FLUSH_COMMANDS, timeout_ns)
     function("glDeleteSync")(sync)
     if result in (TIMEOUT_EXPIRED, WAIT_FAILED):
@@ -70,7 +70,7 @@ def wait_fence(sync: int, timeout_ns: int = 1_000_000_000) -> None:
 
 @contextmanager
 def srgb_target() -> Iterator[None]:
-    """Within it, draws into an sRGB target blend in linear light; outside, bytes are written as they are."""
+    """Draws inside the block blend in linear light when the target is sRGB; outside it bytes are written unchanged."""
     function("glEnable")(FRAMEBUFFER_SRGB)
     try:
         yield

@@ -1,6 +1,6 @@
 """A video as a background: decoded ahead on a thread, in step with media time.
 
-Rule: at most AHEAD frames wait; the reader of frames never waits for more than the next one.
+Rule: the thread decodes at most AHEAD frames in advance, and `at` waits for at most one frame to be decoded.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ DEFAULT_STEP_S = 1 / 30
 
 
 class VideoReader:
-    """The first video stream of a file, covering `shape`, repeated for ever. Raises BadInputError."""
+    """The first video stream of a file, scaled and cropped to `shape`, played in a loop. Raises BadInputError."""
 
     def __init__(self, path: Path, shape: tuple[int, int]) -> None:
         self._path, self._shape = path, shape
@@ -36,7 +36,10 @@ class VideoReader:
         self._thread.start()
 
     def at(self, time_s: float) -> U8 | None:
-        """The newest frame (h,w,3) uint8 not after `time_s`, or None when that one was given before."""
+        """The newest frame (h,w,3) uint8 not after `time_s`; None when the last call returned that frame already.
+
+        Raises BadInputError when the file cannot be decoded.
+        """
         due = None
         while self._next[0] <= time_s + 1e-6:
             due = self._next[1]
@@ -69,12 +72,12 @@ class VideoReader:
                 return self._queue.put(item, timeout=0.1)
 
     def _frames(self) -> Iterator[tuple[float, U8]]:
-        """(time, picture) for ever; the first has time 0. A round with no frame is an error."""
+        """Pairs of time and picture without end, from time 0. Raises BadInputError for a video without frames."""
         begin = 0.0
         while True:
             last, step = -1.0, DEFAULT_STEP_S
             for time_s, picture in self._one_round():
-                at = max(time_s, last)  # some files have times that run back
+                at = max(time_s, last)  # in some files times decrease
                 step = at - last if at > last >= 0 else step
                 last = at
                 yield begin + at, picture

@@ -1,6 +1,6 @@
-"""Contact shadows: where a body's parts take light from the floor.
+"""Contact shadows: the soft dark discs that a body casts on the floor under its joints.
 
-Rule: a table of discs; each widens and fades with the height of its joint above the floor.
+Rule: one table of discs; each disc grows and fades with the height of its joint above the floor.
 """
 
 from __future__ import annotations
