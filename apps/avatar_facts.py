@@ -10,7 +10,7 @@ from typing import Any
 import onnx
 
 from trilane.avatars.bundle import Bundle
-from trilane.avatars.network_file import NetworkFile
+from trilane.avatars.integer_network import NetworkFile
 from trilane.body.body import load_body
 from trilane.hw_profiles.cost import walk
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from trilane.arrays import U8
 from trilane.avatars.bundle import bundle_folder, load_bundle
-from trilane.avatars.reshape import reshaped
+from trilane.avatars.network_reshape import reshaped
 from trilane.bench.fixture import standing
 from trilane.bench.raster import interleaved, summary
 from trilane.bench.several import ground_truth
@@ -21,9 +21,10 @@ from trilane.errors import BadInputError
 from trilane.shapes import BUCKET_STEP
 from trilane.stages.dsp.runtime import RuntimeOptions, load_runtime
 from trilane.stages.gpu.assets import load_assets
-from trilane.stages.gpu.context import describe
-from trilane.stages.gpu.mesh import SkinnedMesh
-from trilane.stages.gpu.packed import FILTERS, PackedAvatar, PackedPass, Placement
+from trilane.stages.gpu.opengl_context import describe
+from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement
+from trilane.stages.gpu.skinned_mesh import SkinnedMesh
+from trilane.stages.gpu.texture_array import FILTERS
 
 MAX_SIDE = 2048
 
@@ -68,7 +69,7 @@ class _Subject:
         times = interleaved(ways, repeats)
         plain, subject = tensors["linear"], self._subject
         body = (plain != self._network.input.zero_point).any(axis=-1)
-        truth = self._studio.wardrobe.render(subject.joints, subject.view, subject.projection, shape)
+        truth = self._studio.clothed_body.render(subject.joints, subject.view, subject.projection, shape)
         session = load_runtime("ort").load(reshaped(self._network, *shape), RuntimeOptions(threads=1))
         picture = np.empty((1, *shape, 4), np.uint8)
         rows = []

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from trilane.avatars.bundle import MANIFEST, Manifest, bundle_folder, load_bundle, network_entry, write_bundle
+from trilane.avatars.bundle import MANIFEST, bundle_folder, load_bundle, write_bundle
+from trilane.avatars.manifest import Manifest, network_entry
 from trilane.bench.networks import untrained
 from trilane.errors import TrilaneError
 from trilane.stages.dsp.runtime import cache_dir

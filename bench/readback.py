@@ -16,9 +16,9 @@ from trilane.bench.fixture import ENCODING, standing
 from trilane.bench.gpu_buffering import READBACKS, UPLOADS, Readback, Upload
 from trilane.bench.raster import interleaved, summary
 from trilane.errors import TrilaneError
-from trilane.stages.gpu.context import describe, open_context
-from trilane.stages.gpu.mesh import SkinnedMesh
-from trilane.stages.gpu.packed import CHANNELS, PackedAvatar, PackedPass, Placement
+from trilane.stages.gpu.opengl_context import describe, open_context
+from trilane.stages.gpu.packed_pass import CHANNELS, PackedAvatar, PackedPass, Placement
+from trilane.stages.gpu.skinned_mesh import SkinnedMesh
 
 SIZES = (256, 512, 1024)
 TIME_SOURCES = {

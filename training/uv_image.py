@@ -1,6 +1,6 @@
-"""The UV image of a skinned mesh: what the packed pass samples the texture with, as float32, or as two bytes a pixel.
+"""The UV image of a skinned mesh: u and v of every pixel, as float32 or as bytes, before any texture is read.
 
-Rule: same vertices, same rasterisation, same pixel centres as the packed pass; no antialiasing.
+Rule: same vertices, same rasterisation and same pixel centres as the packed pass; no antialiasing.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import F32, Floats
-from trilane.stages.gpu.mesh import BodyPose, SkinnedMesh
 from trilane.stages.gpu.mesh_draw import MeshDraw
+from trilane.stages.gpu.skinned_mesh import BodyPose, SkinnedMesh
 
 
 class UvRaster:

@@ -107,9 +107,9 @@ def quantize(
     """Quantise a float network to bytes in, bytes out, calibrated on real frames."""
     from trilane.apps.avatar_facts import network_facts
     from trilane.avatars.network_file import parse_network
-    from trilane.training.quantising.equalise import equalised
+    from trilane.training.quantising.cross_layer_equalisation import equalised
+    from trilane.training.quantising.layer_noise import layer_report
     from trilane.training.quantising.quantise import quantise
-    from trilane.training.quantising.sqnr import layer_report
 
     if out.resolve() == source.resolve():
         raise BadInputError("--out", str(out), "another file than the float network")
@@ -178,9 +178,9 @@ def split(
     from rich.table import Table
 
     from trilane.avatars.bundle import load_bundle
-    from trilane.avatars.reshape import reshaped
-    from trilane.avatars.split import cuts
-    from trilane.avatars.split import split as cut_at
+    from trilane.avatars.network_reshape import reshaped
+    from trilane.avatars.network_split import cuts
+    from trilane.avatars.network_split import split as cut_at
     from trilane.shapes import parse_shape
 
     if bool(at) != (out is not None):
@@ -224,7 +224,7 @@ def export(
 ) -> None:
     """Compile an avatar's network for a Snapdragon, without one."""
     from trilane.avatars.bundle import load_bundle
-    from trilane.avatars.reshape import reshaped
+    from trilane.avatars.network_reshape import reshaped
     from trilane.shapes import parse_shape
     from trilane.stages.dsp.runtime import resolve
 
@@ -251,8 +251,8 @@ def _untrained(
     except ModuleNotFoundError as error:
         raise MissingPartError("exporting a network needs PyTorch", "pip install 'trilane[train]'") from error
 
-    from trilane.training.export import export_onnx
     from trilane.training.network import UNet
+    from trilane.training.onnx_export import export_onnx
 
     torch.manual_seed(seed)
     unet = UNet(encoder, norm, width, channels)

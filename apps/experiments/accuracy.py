@@ -14,7 +14,7 @@ import numpy as np
 
 from trilane.arrays import U8
 from trilane.avatars.bundle import load_bundle
-from trilane.avatars.reshape import reshaped
+from trilane.avatars.network_reshape import reshaped
 from trilane.errors import BadInputError
 from trilane.pipeline.run import MAX_CHANNELS
 from trilane.shapes import Shape

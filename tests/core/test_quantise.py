@@ -10,7 +10,7 @@ import onnxruntime
 import pytest
 from onnx import numpy_helper
 
-from trilane.avatars.reshape import reshaped
+from trilane.avatars.network_reshape import reshaped
 from trilane.errors import BadInputError
 from trilane.training.quantising.calibration import METHODS
 from trilane.training.quantising.quantise import quantise

@@ -13,7 +13,7 @@ from trilane.stages.config import RunConfig
 from trilane.transport.packets import Packet
 from trilane.pipeline.stage import Stage
 from trilane.stages.gpu import unit
-from trilane.stages.gpu.context import LIBRARY
+from trilane.stages.gpu.opengl_context import LIBRARY
 
 BAD_FRAME = 3
 MARK = "lost-context"

@@ -1,6 +1,6 @@
-"""Random natural poses: what people do with their limbs, drawn from a table of attitudes with joint ranges.
+"""Random natural poses, drawn from a table of attitudes (stand, walk, reach, ...) with ranges of joint angles.
 
-Rule: every pose comes from a seed; no recorded or built-in motion is ever used here, so those stay unseen.
+Rule: a pose depends only on the random generator; no recorded or built-in motion is used, so those can be held out.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from trilane.scene.rotations import about, rotvec_from_matrix
 
 JOINTS = len(JOINT_NAMES)
 
-#: Standard deviation in degrees about x, y, z that every pose adds to a joint; fingers are curled apart from this.
+#: Standard deviation, degrees about x, y, z, of the angles added to the joints of every pose. Fingers: `_curl_hand`.
 JITTER_DEG = {
     "spine1": (5, 5, 3),
     "spine2": (4, 5, 3),
@@ -45,7 +45,7 @@ SIDES = {"left": 1.0, "right": -1.0}
 
 
 def random_pose(rng: np.random.Generator) -> F64:
-    """Axis-angle rotations (55,3), radians, SMPL-X joint order; the root only leans, the camera goes round it."""
+    """Axis-angle rotations (55,3), radians, in SMPL-X joint order. The root only leans: the cameras go round it."""
     pose = np.zeros((JOINTS, 3))
     ATTITUDES[_pick(rng, WEIGHTS)](pose, rng)
     for name, deviation in JITTER_DEG.items():
@@ -121,8 +121,10 @@ WEIGHTS = {"stand": 0.20, "walk": 0.26, "reach": 0.20, "overhead": 0.15, "sit": 
 
 
 def _arm(pose: F64, side: str, raised: float, swung: float, bent: float, twisted: float = 0.0) -> None:
-    """Degrees from the T pose: `raised` 90 is overhead, -90 hanging; `swung` > 0 is back; `bent` at the elbow;
-    `twisted` < 0 turns the forearm up.
+    """Set one arm of `pose`, in degrees from the T pose.
+
+    `raised` 90 is overhead, -90 hanging; `swung` > 0 is backwards; `bent` is the elbow's angle; `twisted` < 0 turns the
+    forearm upwards.
     """
     sign = SIDES[side]
     hanging, level = max(0.0, -np.sin(np.radians(raised))), np.cos(np.radians(raised))
@@ -133,7 +135,10 @@ def _arm(pose: F64, side: str, raised: float, swung: float, bent: float, twisted
 
 
 def _leg(pose: F64, side: str, flexed: float, bent: float, spread: float) -> None:
-    """Degrees from standing: `flexed` < 0 lifts the thigh forwards, `bent` folds the knee, `spread` to the side."""
+    """Set one leg of `pose`, in degrees from standing.
+
+    `flexed` < 0 lifts the thigh forwards, `bent` is the knee's angle, `spread` moves the leg to the side.
+    """
     sign = SIDES[side]
     turn = about(2, np.radians(sign * spread)) @ about(0, np.radians(flexed))
     pose[JOINT_INDEX[f"{side}_hip"]] = rotvec_from_matrix(turn)

@@ -10,10 +10,11 @@ pytest.importorskip("torch")
 from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import load_body
 from trilane.errors import MissingPartError
-from trilane.training.data import U16, open_groups
-from trilane.training.dataset import Studio, plan_training, write_dataset
-from trilane.training.poses import random_pose
-from trilane.training.views import BANDS
+from trilane.training.dataset import plan_training, write_dataset
+from trilane.training.random_poses import random_pose
+from trilane.training.random_views import BANDS
+from trilane.training.sample_files import U16, open_groups
+from trilane.training.sample_renderer import SampleRenderer
 
 BODY = bundle_folder("default") / "body.npz"
 
@@ -21,22 +22,22 @@ BODY = bundle_folder("default") / "body.npz"
 @pytest.fixture(scope="module")
 def opened():
     try:
-        return Studio(load_body(BODY).shape(), threads=2)
+        return SampleRenderer(load_body(BODY).shape(), threads=2)
     except MissingPartError as error:
         pytest.skip(str(error))
 
 
 @pytest.fixture
-def studio(opened):
-    """The studio, its context the current one."""
+def renderer(opened):
+    """The renderer, its context the current one."""
     opened.ctx.__enter__()
     return opened
 
 
 @pytest.mark.parametrize("band", BANDS)
-def test_a_person_covers_the_uv_image_and_more(studio, band):
-    sample = studio.plan((7, 1), random_pose, band, "128")
-    uv, rgba = studio.render(sample)
+def test_a_person_covers_the_uv_image_and_more(renderer, band):
+    sample = renderer.plan((7, 1), random_pose, band, "128")
+    uv, rgba = renderer.render(sample)
     body, person = uv[..., 2] > 0, rgba[..., 3] > 128
     assert uv.shape[:2] == rgba.shape[:2] == sample.crop.shape
     assert np.isfinite(uv).all() and uv[..., :2].min() >= 0 and uv[..., :2].max() <= 1
@@ -45,8 +46,8 @@ def test_a_person_covers_the_uv_image_and_more(studio, band):
     assert (rgba[~person & (rgba[..., 3] == 0)] == 0).all()
 
 
-def test_clothes_skin_and_hair_have_their_own_colours(studio):
-    _, rgba = studio.render(studio.plan((7, 2), lambda _: np.zeros((55, 3)), "full_body", "256"))
+def test_clothes_skin_and_hair_have_their_own_colours(renderer):
+    _, rgba = renderer.render(renderer.plan((7, 2), lambda _: np.zeros((55, 3)), "full_body", "256"))
     opaque = rgba[rgba[..., 3] == 255][:, :3].astype(int)
     red, green, blue = opaque.T
     assert (red > green + 20).mean() > 0.1  # skin, hair, shoes
@@ -54,15 +55,15 @@ def test_clothes_skin_and_hair_have_their_own_colours(studio):
     assert ((blue > red + 10) & (blue > green)).mean() > 0.1  # trousers
 
 
-def test_a_seed_gives_the_same_bytes_in_any_process(studio, tmp_path):
-    samples = plan_training(studio, 2, seed=9)
-    again = plan_training(studio, 2, seed=9)
+def test_a_seed_gives_the_same_bytes_in_any_process(renderer, tmp_path):
+    samples = plan_training(renderer, 2, seed=9)
+    again = plan_training(renderer, 2, seed=9)
     assert all(
         np.array_equal(a.pose, b.pose) and a.crop.shape == b.crop.shape for a, b in zip(samples, again, strict=True)
     )
     write_dataset(BODY, samples, tmp_path, processes=1)
     groups = {group.shape: group for group in open_groups(tmp_path)}
-    uv, rgba = studio.render(samples[0])
+    uv, rgba = renderer.render(samples[0])
     stored = groups[samples[0].crop.shape]
     assert np.array_equal(stored.rgba[0], rgba)
     assert np.array_equal(stored.uv[0], np.round(uv[..., :2] * U16).astype(np.uint16))

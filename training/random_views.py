@@ -1,6 +1,6 @@
-"""Random cameras round a posed body, by band: what of the body fills the screen, from far away to the face.
+"""Random cameras round a posed body, by band: how much of the body fills the screen, from far away to the face.
 
-Rule: a close-up comes from a camera that is near or has a long lens, never from enlarged pixels.
+Rule: a close-up is taken by a camera that is near or has a long lens; pixels are never enlarged.
 """
 
 from __future__ import annotations
@@ -14,14 +14,15 @@ from trilane.body.joints import JOINT_INDEX
 
 NEAR_M, FAR_M = 0.05, 100.0
 NEAREST_M = 0.45
-#: Band: the joints a camera may aim at, and metres of height at the aim that fill the screen, from and to.
+#: Band to the joints that a camera may aim at, and the least and greatest height, metres at the aim, that fills the
+#: screen.
 BANDS: dict[str, tuple[tuple[str, ...], float, float]] = {
     "far": (("pelvis", "spine1"), 4.5, 10.0),
     "full_body": (("pelvis", "spine1"), 1.9, 3.4),
     "upper_body": (("spine2", "spine3", "neck"), 0.75, 1.25),
     "face": (("head",), 0.34, 0.60),
 }
-#: Only in training: any part of the body at any distance.
+#: Joints that a camera may aim at in band `anywhere`, which only training has.
 ANYWHERE = (
     "left_wrist",
     "right_wrist",
@@ -48,7 +49,7 @@ class View:
 
 
 def random_view(rng: np.random.Generator, band: str, joints: F64) -> View:
-    """A camera for `band` (of `BANDS`, or `anywhere`) on a body whose `joints` (55,3) are in the world, metres."""
+    """A random camera of `band` (a name of `BANDS`, or `anywhere`) for a body with `joints` (55,3) in world metres."""
     names, least, most = BANDS.get(band, (ANYWHERE, 0.4, 2.5))
     aim = joints[JOINT_INDEX[names[rng.integers(len(names))]]]
     if band == "face":
@@ -66,7 +67,7 @@ def random_view(rng: np.random.Generator, band: str, joints: F64) -> View:
 
 
 def look_at(eye: F64, at: F64, roll: float = 0.0) -> F64:
-    """World to camera (4,4): at `eye`, looking at `at`, turned by `roll` radians about the line of sight."""
+    """The matrix (4,4) from world to camera of a camera at `eye` that looks at `at`, rolled by `roll` radians."""
     z = (eye - at) / np.linalg.norm(eye - at)
     x = np.cross([0.0, 1.0, 0.0], z)
     x /= np.linalg.norm(x)
@@ -79,7 +80,12 @@ def look_at(eye: F64, at: F64, roll: float = 0.0) -> F64:
 
 
 def perspective(fov_y: float, aspect: float, near: float = NEAR_M, far: float = FAR_M) -> F64:
-    """OpenGL projection (4,4) of a vertical field of view in radians."""
+    """OpenGL projection (4,4).
+
+    `fov_y`: vertical field of view, radians.
+    `aspect`: width over height.
+    `near`, `far`: distances of the clip planes, metres.
+    """
     f = 1 / np.tan(fov_y / 2)
     matrix = np.zeros((4, 4))
     matrix[0, 0], matrix[1, 1], matrix[3, 2] = f / aspect, f, -1.0

@@ -1,4 +1,4 @@
-"""The first texture: the mean colour that the training pictures show at each texel, and the body's smoothest fields.
+"""The texture that training starts from: the mean colour of each texel in the training pictures, and smooth fields.
 
 Rule: it is computed from the body and the training set alone.
 """
@@ -9,22 +9,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import F32
-from trilane.training.clothing.layers import BodyArrays
-from trilane.training.data import U16, ShapeGroup
-from trilane.training.spectral import eigenfunctions, fill_gaps, lay_out
+from trilane.training.body_arrays import BodyArrays
+from trilane.training.sample_files import U16, ShapeGroup
+from trilane.training.surface_fields import eigenfunctions
+from trilane.training.texture_layout import fill_gaps, lay_out
 
 COLOURS = 3
 OPAQUE = 250
-#: Most samples of one shape that are read. Half-size ones are not: their pixels hold too much.
+#: At most this many samples of one shape are read, and none with fewer pixels: those span too many texels.
 MOST_SAMPLES = 250
 LEAST_PIXELS = 200 * 200
-#: A pixel that spans more of the texture than this crosses a seam.
+#: A pixel that spans more than this share of the texture crosses a UV seam.
 LARGEST_SPAN = 0.03
 LEAST_WEIGHT = 1e-4
 
 
 def first_texture(body: BodyArrays, groups: list[ShapeGroup], side: int, channels: int) -> F32:
-    """(side, side, channels) in -1..1: three channels of colour as seen head-on, then eigenfunctions."""
+    """(side, side, channels) in -1..1: three channels of colour, then eigenfunctions of the body's Laplacian.
+
+    `body`: the body at rest.
+    `groups`: the training samples.
+    `side`: of the texture, texels.
+    `channels`: of the texture, more than three.
+    """
     fields = eigenfunctions(body.vertices, body.faces, channels - COLOURS)
     image, known = lay_out(fields, body.faces, body.uv, body.uv_faces, side)
     smooth = fill_gaps(image, known)
@@ -33,10 +40,10 @@ def first_texture(body: BodyArrays, groups: list[ShapeGroup], side: int, channel
 
 
 def mean_colours(groups: list[ShapeGroup], side: int) -> NDArray[np.float64]:
-    """(side, side, 3) in 0..1: what the pictures show where each texel is drawn; texels never seen are filled in.
+    """(side, side, 3) in 0..1: the mean colour of the pixels at which each texel is drawn; unseen texels are filled.
 
-    Clothes stand off the body, so a texel shows another point of them in every view; the mean is sharp because views
-    along the surface's normal, and near ones, count most.
+    Clothes stand off the body, so in every view a texel shows another point of them. The mean is still sharp, because
+    near views and views along the surface's normal have the largest weights.
     """
     total, count = np.zeros((side * side, COLOURS)), np.zeros(side * side)
     for group in groups:
@@ -78,7 +85,7 @@ def head_on(uv: NDArray[np.float64], covered: NDArray[np.bool_], side: int) -> N
 
 
 def used_texels(body: BodyArrays, side: int, margin: int) -> NDArray[np.bool_]:
-    """(side, side): texels that a bilinear read of the body can touch, and `margin` more round them."""
+    """(side, side): texels that a bilinear read of the body's texture can use, and `margin` more round them."""
     _, known = lay_out(np.zeros((len(body.vertices), 1)), body.faces, body.uv, body.uv_faces, side)
     for _ in range(margin):
         grown = known.copy()

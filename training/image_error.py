@@ -1,6 +1,6 @@
-"""Image error of an avatar's picture against the ground truth.
+"""Error of an avatar's picture against the ground truth: PSNR, SSIM and IoU.
 
-Rule: pictures are compared as they are shown, over mid-grey, inside the box of the true mask.
+Rule: pictures are compared over mid-grey, inside the box of the true mask.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class ImageError:
 
 
 def image_error(picture: U8, truth: U8) -> ImageError | None:
-    """Error of `picture` (h,w,4) against `truth` (h,w,4), straight alpha. None when the truth shows no one."""
+    """Error of `picture` against `truth`, both (h,w,4) with straight alpha; None when the truth shows no person."""
     mask, true_mask = picture[..., 3] >= HALF, truth[..., 3] >= HALF
     if not true_mask.any():
         return None
@@ -46,6 +46,6 @@ def image_error(picture: U8, truth: U8) -> ImageError | None:
 
 
 def over_grey(image: U8) -> NDArray[np.float64]:
-    """(h,w,4) uint8 over mid-grey, (h,w,3) in 0..1."""
+    """`image` (h,w,4) uint8 over mid-grey: (h,w,3) in 0..1."""
     alpha = image[..., 3:] / 255
     return np.asarray(image[..., :3] / 255 * alpha + GREY * (1 - alpha))

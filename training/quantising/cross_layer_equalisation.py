@@ -1,4 +1,4 @@
-"""Cross-layer equalisation: channels of neighbouring layers get like ranges, and the network computes the same.
+"""Cross-layer equalisation: channels of neighbouring layers get similar ranges, and the network computes the same.
 
 Rule: relu(s x) = s relu(x) for s > 0, so a channel may be scaled after one layer and back before the next.
 Source: Nagel et al. 2019, "Data-Free Quantization Through Weight Equalization and Bias Correction", section 4.1.
@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 from onnx import numpy_helper
 
 ROUNDS = 3
-#: Between neighbours of a pair; scales outside say that a channel is dead, and are left at the limit.
+#: Least and greatest factor between two layers; a channel that would need more is dead and gets the limit.
 SCALE_LIMITS = (1e-2, 1e2)
 
 
 def equalised(model: onnx.ModelProto) -> onnx.ModelProto:
-    """A copy of the float network with every Conv -> ReLU -> Conv chain equalised; grouped layers are left alone.
+    """A copy of the float network with every Conv -> ReLU -> Conv chain equalised; grouped layers are not changed.
 
-    For a channel with range r1 of the weights that make it and r2 of those that read it, s = sqrt(r1 r2) / r2: the
-    first layer's row is divided by s, the second layer's column multiplied by it.
+    With r1 the range of the weights that make a channel and r2 of those that read it, s = sqrt(r1 r2) / r2: the first
+    layer's row is divided by s, the second layer's column is multiplied by it.
     """
     result = copy.deepcopy(model)
     weights = {tensor.name: tensor for tensor in result.graph.initializer}
@@ -40,6 +40,7 @@ def equalised(model: onnx.ModelProto) -> onnx.ModelProto:
 def _pairs(
     graph: onnx.GraphProto, weights: dict[str, onnx.TensorProto]
 ) -> Iterator[tuple[onnx.NodeProto, onnx.NodeProto]]:
+    """Pairs of Convs with only a ReLU between them."""
     users: dict[str, list[onnx.NodeProto]] = {}
     for node in graph.node:
         for name in node.input:
@@ -52,12 +53,13 @@ def _pairs(
 
 
 def _only(users: dict[str, list[onnx.NodeProto]], node: onnx.NodeProto) -> onnx.NodeProto | None:
-    found = users.get(node.output[0], [])
-    return found[0] if len(found) == 1 else None
+    """The only node that reads the output of `node`; None when there are others or none."""
+    readers = users.get(node.output[0], [])
+    return readers[0] if len(readers) == 1 else None
 
 
 def _plain(node: onnx.NodeProto, weights: dict[str, onnx.TensorProto], users: dict[str, list[onnx.NodeProto]]) -> bool:
-    """A Conv of one group whose constants are its own."""
+    """Whether `node` is a Conv of one group that shares its weights with no other node."""
     if node.op_type != "Conv" or any(a.name == "group" and a.i != 1 for a in node.attribute):
         return False
     return all(name in weights and len(users[name]) == 1 for name in node.input[1:])

@@ -1,7 +1,7 @@
 """Turns a mesh whose arms hang at 45 degrees into the T pose, with its shape components and joints.
 
-Rule: the rotations are chosen once, for the template; with them fixed, linear blend skinning is linear in vertices and
-joints, so template and offsets are baked by the same map and stay exact for every shape.
+Rule: the rotations are computed once, from the template. With fixed rotations linear blend skinning is linear in the
+vertices and joints, so the same map is applied to template and offsets, and the result is exact for every shape.
 
 T pose: upper arm and forearm along +X (left) or -X (right), palms down with the thumb in front, fingers in the plane of
 the palm. Legs: thighs 2 degrees apart from the vertical seen from the front, shins upright, feet as they were.
@@ -17,7 +17,7 @@ from trilane.body.joints import JOINT_INDEX, JOINT_PARENTS
 _UP = np.array([0.0, 1.0, 0.0])
 _FRONT = np.array([0.0, 0.0, 1.0])
 _FINGER_TIPS = ("thumb", "index", "middle", "ring", "pinky")
-#: Share of the hand's turn about the forearm that the forearm takes, and of the arm's lift that the collar takes.
+#: Share of the hand's turn about the forearm that the forearm makes, and of the upper arm's lift that the collar makes.
 _FOREARM_TWIST = 0.5
 _COLLAR_LIFT = 0.15
 _THIGH_SPREAD = np.radians(2.0)
@@ -26,7 +26,7 @@ _THIGH_SPREAD = np.radians(2.0)
 def bake(points: F64, weights: F64, tips: F64) -> F64:
     """`points` (1 + K, V + 55, 3) in the T pose: row 0 is the template, the others are offsets. Metres.
 
-    `weights` (V, 55); `tips` (10, 3) finger ends of the template, thumb to pinky, left then right.
+    `weights` (V, 55). `tips` (10, 3): finger ends of the template, thumb to pinky, left then right.
     """
     vertex_count = len(weights)
     rotations = rest_rotations(points[0, vertex_count:], tips)
@@ -82,13 +82,13 @@ def _hand_rotation(at: object, out: F64) -> F64:
 
 
 def _flat(hand: F64, segment: F64, finger: str) -> F64:
-    """The hand's rotation, then the smallest one that lays a finger's segment into the horizontal plane."""
+    """The hand's rotation, then the smallest rotation that turns a finger's segment into the horizontal plane."""
     turned = hand @ segment
     return hand if finger == "thumb" else align(turned, turned - _UP * (turned @ _UP)) @ hand
 
 
 def frame(first: F64, second: F64) -> F64:
-    """Rotation whose columns are `first`, the part of `second` across it, and their cross product, all unit."""
+    """Rotation with unit columns: `first`, the part of `second` at right angles to it, and their cross product."""
     x = first / np.linalg.norm(first)
     y = second - x * (second @ x)
     y /= np.linalg.norm(y)
@@ -112,13 +112,13 @@ def about(axis: F64, angle: float) -> F64:
 
 
 def power(rotation: F64, share: float) -> F64:
-    """`share` of a rotation by less than half a turn, about its own axis."""
+    """The rotation about the axis of `rotation` by `share` of its angle, which is less than half a turn."""
     axis = np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]])
     return about(axis, share * float(np.arctan2(np.linalg.norm(axis), np.trace(rotation) - 1.0)))
 
 
 def _twist(rotation: F64, axis: F64) -> float:
-    """Angle of a rotation's turn about the unit `axis` (the twist of its swing-twist split)."""
+    """Angle, radians, by which `rotation` turns about the unit `axis`: the twist of its swing-twist decomposition."""
     vector = np.array(
         [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
     )

@@ -1,6 +1,6 @@
-"""The neural texture: one image of C channels kept as the sum of several scales.
+"""The neural texture: one image of C channels, stored as the sum of several scales.
 
-Rule: coarse scales carry what neighbours share, fine ones only what is left.
+Rule: a coarse scale holds what neighbouring texels have in common, a finer one only the difference to it.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ LIMIT = 1.0
 
 
 class NeuralTexture(nn.Module):
-    """`start` (S,S,C): what the texture begins as, S the greatest of `sides`.
+    """A Laplacian pyramid that sums to `start` (S,S,C) before training; S is the greatest of `sides`.
 
-    A Laplacian pyramid: each scale holds what `start`, shrunk to its side, adds to the next coarser one, enlarged.
-    The sum is clipped to -1..1, because the network's input has one byte range for all channels.
+    Each scale holds the difference of `start`, shrunk to its side, and the next coarser scale's image, enlarged. The
+    sum is clipped to -1..1, because the network's input has one byte range for all channels.
     """
 
     def __init__(self, start: F32, sides: tuple[int, ...] = SIDES) -> None:
@@ -46,10 +46,10 @@ def _enlarged(scale: Tensor, side: int) -> Tensor:
     return functional.interpolate(scale, size=(side, side), mode="bilinear", align_corners=False)
 
 
-def sample(image: Tensor, uv: Tensor, covered: Tensor) -> Tensor:
-    """The network's input (N, C, H, W), channels last: `image` (1, C, S, S) read bilinearly at `uv` where `covered`.
+def read_texture(image: Tensor, uv: Tensor, covered: Tensor) -> Tensor:
+    """The network's input (N, C, H, W), channels last in memory: the texture read bilinearly at `uv`.
 
-    `uv` (N, H, W, 2) in 0..1, `covered` (N, H, W) bool. Pixels not covered are exactly 0.
+    `image` (1, C, S, S), `uv` (N, H, W, 2) in 0..1, `covered` (N, H, W) bool. Pixels that are not covered are 0.
     """
     n, h, w = covered.shape
     points = uv[covered] * 2 - 1

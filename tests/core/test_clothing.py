@@ -7,9 +7,10 @@ import pytest
 
 from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import load_body
+from trilane.training.body_arrays import BodyArrays
 from trilane.training.clothing.landmarks import find_landmarks
-from trilane.training.clothing.layers import MATERIALS, BodyArrays, dress
-from trilane.training.clothing.surface import obscurance, shell, vertex_normals
+from trilane.training.clothing.layers import MATERIALS, clothing_layers
+from trilane.training.clothing.surface_geometry import obscurance, shell, vertex_normals
 
 #: Percentile of a layer's vertices, metres that it stands off the body at least, and the farthest at most. Hair is cut
 #: out of a cap that lies close on the face.
@@ -37,8 +38,8 @@ def body():
 
 @pytest.fixture(scope="module")
 def layers(body):
-    found = find_landmarks(body.vertices, body.joints, body.weights)
-    return {layer.material: layer for layer in dress(body, found)}
+    landmarks = find_landmarks(body.vertices, body.joints, body.weights)
+    return {layer.material: layer for layer in clothing_layers(body, landmarks)}
 
 
 def test_every_material_has_a_layer(layers):

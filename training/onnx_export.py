@@ -1,6 +1,6 @@
-"""Writes the network as a float ONNX file of one static shape, norms folded where they can be.
+"""Exports the network as a float ONNX model of one static shape, with batch norms folded into the convolutions.
 
-Rule: the file computes what the network computes; only how the two heads are laid out differs.
+Rule: the model computes the same as the network; only the layout of the two heads differs.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ INPUT, OUTPUT = "tensor", "rgba"
 
 
 class _OneHead(nn.Module):
-    """Both heads as one: the first layers side by side, the second block-diagonal, so the features are read once."""
+    """Both heads as one, so that the features are read once: first layers side by side, second ones block-diagonal."""
 
     def __init__(self, network: UNet) -> None:
         super().__init__()
@@ -49,9 +49,9 @@ def _fused(head: nn.Sequential) -> tuple[nn.Conv2d, nn.Conv2d]:
 
 
 def export_onnx(network: UNet, height: int, width: int) -> onnx.ModelProto:
-    """A float network for (1, C, height, width): input `tensor`, output `rgba` (1, 4, height, width) in 0..1.
+    """A float model for (1, C, height, width): input `tensor`, output `rgba` (1, 4, height, width) in 0..1.
 
-    `network` is put in evaluation mode. Height and width: multiples of 32.
+    `network` is put into evaluation mode. `height` and `width`: multiples of 32.
     """
     network.eval()
     batch_norm = isinstance(network.colour[1], nn.BatchNorm2d)
@@ -75,7 +75,7 @@ def export_onnx(network: UNet, height: int, width: int) -> onnx.ModelProto:
 
 
 def _free_reshapes(model: onnx.ModelProto) -> None:
-    """Let every Reshape take batch and width from its input and work out the height, so that no shape is fixed."""
+    """Make every Reshape take batch and width from its input and compute the height, so that no shape is fixed."""
     makers = {out: node for node in model.graph.node for out in node.output}
     for node in model.graph.node:
         if node.op_type == "Reshape":

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from onnx import helper, numpy_helper
 
 from trilane.errors import BadInputError
-from trilane.training.quantising.dyadic import NotAlikeError, dyadic_weights, may_round_alike
+from trilane.training.quantising.power_of_two_scales import CannotRoundAlikeError, may_round_alike, power_of_two_weights
 from trilane.training.quantising.quantise import quantise
 
 FIRST, SECOND = "tensor", "made"
@@ -94,8 +94,8 @@ def test_no_sum_is_half_way_between_two_bytes(reduce_range, seed, size):
     step, reach = 2.0**-5, 2.0 ** np.ceil(np.log2(10 * size))
     known = {FIRST: Range(0, 255 * step), SECOND: Range(-127 * reach / 128, 128 * reach / 128)}
     try:
-        overrides = dyadic_weights(model, known, reduce_range)
-    except NotAlikeError:
+        overrides = power_of_two_weights(model, known, reduce_range)
+    except CannotRoundAlikeError:
         return
     scales = np.array([row["scale"] for row in overrides["w"]], np.float64)
     kernel, bias = (numpy_helper.to_array(tensor).astype(np.float64) for tensor in model.graph.initializer)
@@ -144,7 +144,7 @@ def test_a_huge_bias_stays_exact_in_float32():
     node = helper.make_node("Conv", [FIRST, "w", "b"], [SECOND], "layer")
     model = helper.make_model(helper.make_graph([node], "g", [], [], weights))
     known = {FIRST: Range(0, 255 / 32), SECOND: Range(0, 255 / 8)}
-    (row,) = dyadic_weights(model, known, True)["w"]
+    (row,) = power_of_two_weights(model, known, True)["w"]
     offset = numpy_helper.to_array(model.graph.initializer[1])[0] * 32 / row["scale"]
     assert offset % 2 == 1 and 2**20 < offset < 2**23
 

@@ -1,6 +1,6 @@
-"""Noise on activations while training, so that the picture hardly changes when another runtime rounds otherwise.
+"""Noise on activations while training, so that the picture hardly changes when another runtime rounds differently.
 
-Rule: only what a rectifier lets through is touched, by about what a byte of it can tell apart; never outside training.
+Rule: noise is added only to positive outputs of ReLUs, is about as large as one step of a byte, and only in training.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from torch import Tensor, nn
 BYTE_STEPS = 255
 
 
-def add_jitter(network: nn.Module, steps: float) -> None:
-    """From now on every ReLU of `network` adds up to `steps` steps of 1/255 of its largest value, in training mode."""
+def add_activation_noise(network: nn.Module, steps: float) -> None:
+    """Make every ReLU of `network` add noise of up to `steps` times 1/255 of its largest output, in training mode."""
 
     def hook(module: nn.Module, _inputs: Any, output: Tensor) -> Tensor | None:
         if not module.training:

@@ -1,6 +1,6 @@
 """Rendered samples on disk: one folder of memory-mapped arrays per tensor shape.
 
-Rule: what is stored is what the pipeline's raster gave; nothing is resampled.
+Rule: arrays hold the pixels that were rendered, none resampled.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from trilane.shapes import Shape, parse_shape
 
 U16 = 65535
-#: Array to its trailing shape and type. `uv`: u, v in 1/65535. `covered`: 1 on the body. `rgba`: the ground truth.
+#: Array to its trailing shape and type. `uv`: u and v in 1/65535. `covered`: 1 on the body. `rgba`: the ground truth.
 FIELDS: dict[str, tuple[tuple[int, ...], type]] = {
     "uv": ((2,), np.uint16),
     "covered": ((), np.uint8),
@@ -27,7 +27,7 @@ FIELDS: dict[str, tuple[tuple[int, ...], type]] = {
 
 @dataclass(frozen=True)
 class ShapeGroup:
-    """Samples of one tensor shape. Arrays (N, H, W, ...) as in `FIELDS`; `band` (N,) index into the bands."""
+    """Samples of one tensor shape. Arrays (N, H, W, ...) as in `FIELDS`; `band` (N,): the index of each one's band."""
 
     shape: Shape
     uv: NDArray[np.uint16]
@@ -40,7 +40,7 @@ class ShapeGroup:
 
 
 def create_group(folder: Path, shape: Shape, bands: NDArray[np.int8]) -> ShapeGroup:
-    """Arrays on disk for `len(bands)` samples, to be written."""
+    """New arrays on disk under `folder`, for the caller to fill, one sample for each of `bands`."""
     place = folder / f"{shape[0]}x{shape[1]}"
     place.mkdir(parents=True, exist_ok=True)
     np.save(place / "band.npy", bands)
@@ -52,7 +52,7 @@ def create_group(folder: Path, shape: Shape, bands: NDArray[np.int8]) -> ShapeGr
 
 
 def open_groups(folder: Path, writable: bool = False) -> list[ShapeGroup]:
-    """All groups of a data set, by shape."""
+    """All groups of the data set in `folder`, in order of their shapes."""
     mode: Any = "r+" if writable else "r"
     groups = []
     for place in sorted(folder.iterdir(), key=lambda path: parse_shape(path.name)):
@@ -64,7 +64,13 @@ def open_groups(folder: Path, writable: bool = False) -> list[ShapeGroup]:
 def batches(
     groups: list[ShapeGroup], size: int, rng: np.random.Generator, repeats: Sequence[int] = (1,) * 5
 ) -> Iterator[tuple[ShapeGroup, NDArray[np.int64]]]:
-    """Endless batches of one shape each; an epoch has every sample as often as `repeats` says of its band."""
+    """Batches without end, each of one tensor shape: a group and the indices of the samples in it.
+
+    `groups`: the samples.
+    `size`: samples of a batch, roughly.
+    `rng`: shuffles the samples of each epoch.
+    `repeats`: how often an epoch has a sample, by its band.
+    """
     while True:
         epoch: list[tuple[ShapeGroup, NDArray[np.int64]]] = []
         for group in groups:

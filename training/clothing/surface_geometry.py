@@ -1,6 +1,6 @@
-"""Geometry of triangle surfaces: normals, smoothing, shells that stand off, obscurance.
+"""Geometry of triangle surfaces: normals, areas, smoothing, shells that stand off, obscurance.
 
-Rule: arrays in, arrays out; nothing here knows a body or a garment.
+Rule: functions take arrays and return arrays; none knows a body or a garment.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from trilane.arrays import F64, Ints
 
 
 def vertex_normals(vertices: F64, faces: Ints) -> F64:
-    """Unit normals (V,3): face normals weighted by area. Vertices of no face get +Y."""
+    """Unit normals (V,3) of the vertices: face normals weighted by area. A vertex without a face has +Y."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     face_normal = np.cross(b - a, c - a)
     total = np.stack([_scatter(faces, np.repeat(face_normal[:, k], 3), len(vertices)) for k in range(3)], axis=1)
@@ -27,7 +27,7 @@ def vertex_areas(vertices: F64, faces: Ints) -> F64:
 
 
 class Smoother:
-    """Mean over the neighbours of each vertex of a mesh; a vertex of no face keeps its value."""
+    """Means over the neighbours of each vertex of a mesh; a vertex without a face keeps its value."""
 
     def __init__(self, faces: Ints, count: int) -> None:
         edges = np.unique(np.sort(np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1), axis=0)
@@ -37,24 +37,29 @@ class Smoother:
         self._count = count
 
     def mean(self, values: F64) -> F64:
-        """(V,) or (V,C) -> the same shape."""
+        """The mean of the neighbours' `values`, (V,) or (V,C), in the same shape."""
         columns = values.reshape(self._count, -1)
         sums = [np.bincount(self._to, weights=column[self._from], minlength=self._count) for column in columns.T]
         around = np.stack(sums, axis=1) / np.maximum(self._degree, 1)[:, None]
         return np.where(self._degree[:, None] > 0, around, columns).reshape(values.shape)
 
     def smooth(self, values: F64, rounds: int) -> F64:
-        """`rounds` half steps towards the mean of the neighbours."""
+        """`values` moved half way to the mean of the neighbours, `rounds` times."""
         for _ in range(rounds):
             values = 0.5 * (values + self.mean(values))
         return values
 
 
 def shell(vertices: F64, faces: Ints, offset: F64, least: F64, rounds: int) -> F64:
-    """A smooth surface (V,3) over `vertices`: raised by `offset` (V,) metres along smoothed normals, then relaxed.
+    """A smooth surface (V,3) over a mesh, which bridges hollows as cloth does.
 
-    Each of `rounds` smooths the surface and lifts it back to at least `least` (V,) metres over the one below, along
-    the normals; hollows are bridged as cloth does.
+    The mesh is raised along smoothed normals. Each round then smooths the surface and lifts it back along the normals
+    to its least height.
+
+    `vertices`, `faces`: (V,3) and (F,3), the mesh.
+    `offset`: (V,) metres that it is raised by.
+    `least`: (V,) least height over the mesh, metres.
+    `rounds`: of smoothing.
     """
     smoother = Smoother(faces, len(vertices))
     normal = smoother.smooth(vertex_normals(vertices, faces), 6)
@@ -68,10 +73,14 @@ def shell(vertices: F64, faces: Ints, offset: F64, least: F64, rounds: int) -> F
 
 
 def obscurance(points: F64, normals: F64, emitters: F64, emitter_normals: F64, areas: F64, reach: float) -> F64:
-    """Share of light (N,) in 0..1 left at `points` when discs of `areas` (M,) at `emitters` stand in the way.
+    """Share of light (N,) in 0..1 that reaches points when discs stand in the way: disc-to-point form factors.
 
-    Disc-to-point form factors, faded out at `reach` metres (M. Bunnell, Dynamic Ambient Occlusion and Indirect
-    Lighting, GPU Gems 2, 2005).
+    M. Bunnell, Dynamic Ambient Occlusion and Indirect Lighting, GPU Gems 2, 2005.
+
+    `points`, `normals`: (N,3) where the light is computed.
+    `emitters`, `emitter_normals`: (M,3) centres and normals of the discs.
+    `areas`: (M,) of the discs, square metres.
+    `reach`: metres at which a disc's effect has faded out.
     """
     left = np.empty(len(points))
     for start in range(0, len(points), 512):
@@ -88,7 +97,7 @@ def obscurance(points: F64, normals: F64, emitters: F64, emitter_normals: F64, a
 
 
 def smoothstep(low: float, high: float, values: F64) -> F64:
-    """0 below `low`, 1 above `high`, the cubic between; `low` may be the larger."""
+    """0 at `low`, 1 at `high`, a cubic between them and constant beyond; `low` may be the larger of the two."""
     t = np.clip((values - low) / (high - low), 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 

@@ -1,4 +1,4 @@
-"""Skinned meshes drawn with a caller's fragment shader: pictures of ground truth.
+"""Draws skinned meshes with a fragment shader of the caller, supersampled: pictures of the ground truth.
 
 Rule: shaders write linear light; samples are averaged in linear light, then written as sRGB with straight alpha.
 """
@@ -13,20 +13,19 @@ import moderngl
 import numpy as np
 
 from trilane.arrays import F32, U8, Floats
-from trilane.stages.gpu import gl
-from trilane.stages.gpu.camera import eye_of
-from trilane.stages.gpu.mesh import BodyPose, SkinnedMesh
+from trilane.stages.gpu import opengl_calls
+from trilane.stages.gpu.camera_matrices import eye_of
 from trilane.stages.gpu.mesh_draw import MeshDraw
-from trilane.stages.gpu.program import build_program, set_uniforms
+from trilane.stages.gpu.shader_program import build_program, set_uniforms
+from trilane.stages.gpu.skinned_mesh import BodyPose, SkinnedMesh
 
 
 class ShadedMesh:
     """One mesh with its fragment shader and textures.
 
-    The mesh needs `normal` and `colour`. The shader gets `v_position`, `v_normal` (world, not normalised), `v_rest`,
-    `v_uv`, `v_colour`, `gl_FrontFacing`, uniforms `view` (mat4), `eye` (vec3), a sampler2D per texture, and writes one
-    vec4: linear light and alpha (normally 1; `discard` makes holes). `textures`: name to (h,w,4) uint8 sRGB image
-    with row 0 at v = 0, read back in linear light, mipmapped, repeated.
+    The mesh must have `normal` and `colour`. The shader reads `v_position`, `v_normal` (world, not normalised),
+    `v_rest`, `v_uv`, `v_colour`, `gl_FrontFacing`, the uniforms `view` (mat4) and `eye` (vec3) and a sampler2D for each
+    texture. It writes one vec4: linear light and alpha, which is 1; `discard` makes holes.
     """
 
     def __init__(
@@ -37,12 +36,26 @@ class ShadedMesh:
         textures: Mapping[str, U8] | None = None,
         uniforms: Mapping[str, Any] | None = None,
     ) -> None:
+        """Compile the shader and upload the textures.
+
+        `ctx`: the OpenGL context.
+        `mesh`: what to draw.
+        `fragment`: a file of `trilane.shaders`, or a path.
+        `textures`: name to (h,w,4) uint8 sRGB image with row 0 at v = 0; read in linear light, mipmapped, repeated.
+        `uniforms`: that never change.
+        Raises TrilaneError when the shader does not compile.
+        """
         self._draw = MeshDraw(ctx, mesh, fragment)
         self._textures = {name: _srgb_texture(ctx, image) for name, image in (textures or {}).items()}
         self._draw.set(dict(uniforms or {}))
 
     def draw(self, joints: F32, view: Floats, projection: Floats, uniforms: Mapping[str, Any]) -> None:
-        """Draw into the target in use. `joints` (55,3,4)."""
+        """Draw into the target in use.
+
+        `joints`: (55,3,4) skinning matrices.
+        `view`, `projection`: (4,4) the camera.
+        `uniforms`: of this draw.
+        """
         for location, (name, texture) in enumerate(self._textures.items()):
             texture.use(location)
             self._draw.set({name: location})
@@ -69,9 +82,13 @@ class ShadedRaster:
         shape: tuple[int, int],
         uniforms: Mapping[str, Any] | None = None,
     ) -> U8:
-        """Picture (h,w,4) uint8, sRGB, straight alpha, row 0 on top, of `meshes` that share `joints`, depth tested.
+        """The picture (h,w,4) uint8, sRGB, straight alpha, row 0 on top; pixels that no mesh covers are 0, 0, 0, 0.
 
-        Pixels no mesh covers are 0, 0, 0, 0. `uniforms`: set on every mesh's shader.
+        `meshes`: what to draw, depth tested.
+        `joints`: (55,3,4) skinning matrices of all meshes.
+        `view`, `projection`: (4,4) the camera.
+        `shape`: (height, width) of the picture.
+        `uniforms`: set on every mesh's shader.
         """
         large, samples, small = self._target(shape)
         large.use()
@@ -100,7 +117,9 @@ class ShadedRaster:
 
 
 def _srgb_texture(ctx: Any, image: U8) -> Any:
-    texture = ctx.texture((image.shape[1], image.shape[0]), 4, image.tobytes(), internal_format=gl.SRGB8_ALPHA8)
+    texture = ctx.texture(
+        (image.shape[1], image.shape[0]), 4, image.tobytes(), internal_format=opengl_calls.SRGB8_ALPHA8
+    )
     texture.build_mipmaps()
     texture.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
     return texture
