@@ -48,14 +48,14 @@ class NetworkPart(IntegerNetwork):
     """A part of the network that runs by itself. All four tables take a uint8 tensor's name to its shape.
 
     `inputs`, `outputs`: the tensors of `model`, in its order.
-    `given`: the tensors that cross the cut before this part; `handed_on`: those that cross the cut behind it. A tensor
-    of `handed_on` that is not in `outputs` is in `given`, and is copied on unchanged.
+    `crossing_in`: tensors that cross the cut before this part; `crossing_out`: those that cross the cut behind it. A
+    tensor of `crossing_out` that is not in `outputs` is in `crossing_in`, and has to be copied unchanged.
     """
 
     inputs: Shapes
     outputs: Shapes
-    given: Shapes
-    handed_on: Shapes
+    crossing_in: Shapes
+    crossing_out: Shapes
 
 
 def cuts(network: NetworkFile) -> Iterator[Cut]:

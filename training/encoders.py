@@ -28,9 +28,15 @@ class Encoder(Protocol):
 
 
 class ResidualBlock(nn.Module):
-    """Two 3x3 convolutions beside a shortcut, which is a strided 1x1 convolution where the shape changes."""
+    """Two 3x3 convolutions, added to a shortcut, which is a strided 1x1 convolution where the shape changes."""
 
     def __init__(self, c_in: int, c_out: int, stride: int, norm: Norm) -> None:
+        """A block from `c_in` to `c_out` channels.
+
+        `c_in`, `c_out`: channels of its input and output.
+        `stride`: of its first convolution.
+        `norm`: makes a normalisation for a number of channels.
+        """
         super().__init__()
         self.body = nn.Sequential(
             nn.Conv2d(c_in, c_out, 3, stride, 1, bias=False),
@@ -98,6 +104,13 @@ class InvertedResidual(nn.Module):
     """1x1 expansion, depthwise convolution, optional squeeze, linear 1x1 projection, added where shapes agree."""
 
     def __init__(self, c_in: int, row: Row, scale: Scale, norm: Norm) -> None:
+        """The block of one row of the table.
+
+        `c_in`: channels of its input.
+        `row`: its kernel, channels, stride and activation.
+        `scale`: scales a channel count by the network's width.
+        `norm`: makes a normalisation for a number of channels.
+        """
         super().__init__()
         inner, c_out = scale(row.expanded), scale(row.channels)
         activation = ACTIVATIONS[row.activation]
@@ -127,6 +140,13 @@ class MobileFeatures(nn.Module):
     """
 
     def __init__(self, spec: MobileEncoder, c_in: int, scale: Scale, norm: Norm) -> None:
+        """The encoder of one table.
+
+        `spec`: the table.
+        `c_in`: channels of its input.
+        `scale`: scales a channel count by the network's width.
+        `norm`: makes a normalisation for a number of channels.
+        """
         super().__init__()
         before = scale(spec.stem)
         activation = ACTIVATIONS[spec.activation]

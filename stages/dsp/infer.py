@@ -104,6 +104,6 @@ def infer_stages(config: RunConfig, unit: str) -> dict[str, InferStage]:
 
 
 def _bound(session: Session, part: NetworkPart, source: U8, target: U8) -> BoundPart:
-    given, handed_on = views(source, part.given), views(target, part.handed_on)
+    given, handed_on = views(source, part.crossing_in), views(target, part.crossing_out)
     binding = session.bind([given[name] for name in part.inputs], [handed_on[name] for name in part.outputs])
     return BoundPart(binding, [(given[name], handed_on[name]) for name in handed_on if name not in part.outputs])

@@ -43,7 +43,7 @@ def crossing_bytes(config: RunConfig) -> list[int]:
     if not config.cuts:
         return []
     network = shared_network(config.avatar_dirs)
-    shapes = [[part.handed_on for part in parts_for(config, network, shape)[:-1]] for shape in config.buckets]
+    shapes = [[part.crossing_out for part in parts_for(config, network, shape)[:-1]] for shape in config.buckets]
     return [max(extent(crossing) for crossing in crossings) for crossings in zip(*shapes, strict=True)]
 
 

@@ -64,7 +64,7 @@ class PicturePainter:
 
     def __init__(self, ctx: Any, shape: tuple[int, int]) -> None:
         self._ctx = ctx
-        self._program = build_program(ctx, "screen.vert", "picture.frag")
+        self._program = build_program(ctx, "whole_screen.vert", "picture.frag")
         self._screen = ctx.vertex_array(self._program, [])
         self._texture = ctx.texture(shape[::-1], 3, alignment=1)
 
@@ -106,7 +106,7 @@ class AvatarPainter:
 
     def __init__(self, ctx: Any, shapes: list[tuple[int, int]]) -> None:
         self._ctx = ctx
-        self._premultiply = build_program(ctx, "screen.vert", "premultiply.frag")
+        self._premultiply = build_program(ctx, "whole_screen.vert", "premultiply.frag")
         self._screen = ctx.vertex_array(self._premultiply, [])
         programs = [build_program(ctx, "avatar.vert", "avatar.frag", TAPS=taps) for taps in range(1, MAX_TAPS + 1)]
         self._quads = [(program, ctx.vertex_array(program, [])) for program in programs]

@@ -30,7 +30,7 @@ class Hud:
 
     def __init__(self, ctx: Any) -> None:
         self._ctx = ctx
-        self._program = build_program(ctx, "screen.vert", "hud.frag")
+        self._program = build_program(ctx, "whole_screen.vert", "head_up_display.frag")
         self._screen = ctx.vertex_array(self._program, [])
         self._texture = ctx.texture(SIZE, 4)
         self._font = ImageFont.load_default(TEXT_PX)

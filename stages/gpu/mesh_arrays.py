@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.arrays import F32, Ints
+from trilane.arrays import F32, Floats, Ints
 from trilane.body.joints import JOINTS
 from trilane.body.skin_weights import WEIGHT_COUNTS
 from trilane.errors import BadInputError
@@ -45,14 +45,14 @@ class MeshArrays:
 
 
 def mesh_arrays(
-    vertices: NDArray[np.floating[Any]],
+    vertices: Floats,
     faces: Ints,
-    uv: NDArray[np.floating[Any]],
+    uv: Floats,
     uv_faces: Ints,
     joint: Ints,
-    weight: NDArray[np.floating[Any]],
-    normal: NDArray[np.floating[Any]] | None = None,
-    colour: NDArray[np.floating[Any]] | None = None,
+    weight: Floats,
+    normal: Floats | None = None,
+    colour: Floats | None = None,
 ) -> MeshArrays:
     """Split vertices at UV seams and order them for the vertex cache. Vertices that no face uses are left out.
 
@@ -62,14 +62,12 @@ def mesh_arrays(
     `uv_faces`: (F,3) indices of `uv`, per corner.
     `joint`: (V,K) joint indices, K of 4, 8 or 12.
     `weight`: (V,K) their skin weights.
-    `normal`: (V,3) unit normals, of a mesh that is shaded.
-    `colour`: (V,4) colours, of a mesh that is shaded.
+    `normal`, `colour`: (V,3) unit normals and (V,4) colours of a mesh that is shaded.
     Raises BadInputError when shapes, indices or values cannot be drawn.
     """
     _check(vertices, faces, uv, uv_faces, joint, weight)
     triangle_order = patch_order(np.asarray(vertices, np.float64)[faces].mean(axis=1))
     source, uv_source, triangles = split_corners(faces[triangle_order], uv_faces[triangle_order])
-    surface = {"normal": normal, "colour": colour}
     order = np.argsort(-weight, axis=1, kind="stable")
     joint, weight = np.take_along_axis(joint, order, axis=1), np.take_along_axis(weight, order, axis=1)
     return MeshArrays(
@@ -79,16 +77,17 @@ def mesh_arrays(
         weight=np.ascontiguousarray(weight[source], np.float32),
         triangles=triangles,
         source=source,
-        surface={
-            name: np.ascontiguousarray(values[source], np.float32)
-            for name, values in surface.items()
-            if values is not None
-        },
+        surface=_surface(normal, colour, source),
         closed=is_closed(vertices, faces),
     )
 
 
-def is_closed(vertices: NDArray[np.floating[Any]], faces: Ints) -> bool:
+def _surface(normal: Floats | None, colour: Floats | None, source: NDArray[np.int64]) -> dict[str, F32]:
+    arrays = {"normal": normal, "colour": colour}
+    return {name: np.ascontiguousarray(rows[source], np.float32) for name, rows in arrays.items() if rows is not None}
+
+
+def is_closed(vertices: Floats, faces: Ints) -> bool:
     """Whether the faces (F,3) wind outward around a volume with at most a share `MAX_OPEN` of their edges open.
 
     Bodies have small openings that no camera sees, such as the backs of the eyes.

@@ -109,7 +109,7 @@ class PackedPass:
 
     @property
     def uniforms(self) -> dict[str, float]:
-        """Uniforms of `pack.frag`."""
+        """Uniforms of `packed_tensor.frag`."""
         encoding = self.quantisation
         return {"neural": 0, "uv_image": 1, "scale": encoding.scale, "zero_point": float(encoding.zero_point)}
 
@@ -163,11 +163,11 @@ class PackedAvatar:
         defines: dict[str, int | str] = {"LAYERS": packed.layers, "WORDS": WORD_TYPES[packed.layers]}
         if packed.deferred:
             self._geometry = MeshDraw(packed.ctx, mesh, "uv_only.frag")
-            pack = build_program(packed.ctx, "behind.vert", "pack.frag", **defines, DEFERRED=1)
+            pack = build_program(packed.ctx, "farthest.vert", "packed_tensor.frag", **defines, DEFERRED=1)
             set_uniforms(pack, packed.uniforms)
             self._screen = packed.ctx.vertex_array(pack, [])
         else:
-            self._geometry = MeshDraw(packed.ctx, mesh, "pack.frag", **defines)
+            self._geometry = MeshDraw(packed.ctx, mesh, "packed_tensor.frag", **defines)
             self._geometry.set(packed.uniforms)
 
     def draw(self, target: Target, view: Floats, placement: Placement) -> None:

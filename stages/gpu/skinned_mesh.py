@@ -64,7 +64,7 @@ class Mesh(Protocol):
 class PosedMesh:
     """A mesh whose vertices the CPU unit skins frame by frame."""
 
-    vertex_shader = "posed.vert"
+    vertex_shader = "posed_vertices.vert"
 
     def __init__(self, ctx: Any, arrays: MeshArrays) -> None:
         self.arrays, self._ctx = arrays, ctx

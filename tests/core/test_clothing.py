@@ -1,4 +1,4 @@
-"""The dressed body: garments stand off, layers are skinned by the body's weights, pictures are finite and complete."""
+"""The clothed body: garments stand off, layers are skinned by the body's weights, everything is finite."""
 
 from __future__ import annotations
 

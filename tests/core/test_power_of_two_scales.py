@@ -1,4 +1,4 @@
-"""Networks that round alike: scales are powers of two, no sum is half way, nothing is lost where tensors are joined."""
+"""Networks that round alike: scales are powers of two, no sum is half way, tensors that are joined have one scale."""
 
 from __future__ import annotations
 

@@ -48,9 +48,9 @@ def avatar():
 
 
 def test_poses_repeat_and_differ():
-    one, same, other = (random_pose(np.random.default_rng(seed)) for seed in (3, 3, 4))
-    assert np.array_equal(one, same) and not np.array_equal(one, other)
-    assert one.shape == (55, 3) and np.isfinite(one).all()
+    pose, same, other = (random_pose(np.random.default_rng(seed)) for seed in (3, 3, 4))
+    assert np.array_equal(pose, same) and not np.array_equal(pose, other)
+    assert pose.shape == (55, 3) and np.isfinite(pose).all()
 
 
 def test_knees_and_elbows_bend_one_way():
@@ -138,8 +138,8 @@ def test_two_steps_of_training_run_and_are_saved(groups, tmp_path):
     )
     assert steps == 2
     save_avatar(made, steps, tmp_path / "weights.npz")
-    again, found = load_avatar(avatar(), tmp_path / "weights.npz")
-    assert found == 2
+    again, steps_read = load_avatar(avatar(), tmp_path / "weights.npz")
+    assert steps_read == 2
     assert all(torch.equal(a, b) for a, b in zip(made.state_dict().values(), again.state_dict().values(), strict=True))
 
 

@@ -1,4 +1,4 @@
-"""Pictures of the dressed body through the GPU stage: people of several colours, repeated exactly by their seed."""
+"""Pictures of the clothed body through the GPU stage: clothes of several colours, the same bytes for the same seed."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def opened():
 
 @pytest.fixture
 def renderer(opened):
-    """The renderer, its context the current one."""
+    """The renderer, with its OpenGL context made current."""
     opened.ctx.__enter__()
     return opened
 

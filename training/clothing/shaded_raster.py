@@ -69,7 +69,7 @@ class ShadedRaster:
 
     def __init__(self, ctx: Any, samples: int = 4) -> None:
         self._ctx, self._samples = ctx, samples
-        self._resolve = build_program(ctx, "screen.vert", "resolve.frag", SAMPLES=samples)
+        self._resolve = build_program(ctx, "whole_screen.vert", "tent_filter.frag", SAMPLES=samples)
         self._screen = ctx.vertex_array(self._resolve, [])
         self._targets: dict[tuple[int, int], tuple[Any, Any, Any]] = {}
 

@@ -1,6 +1,6 @@
 #version 330
-// Tent filter, two pixels wide, of SAMPLES x SAMPLES linear-light samples a pixel, weighted by alpha, to sRGB with
-// straight alpha. SAMPLES is even. Past the border the outermost samples repeat.
+// Averages SAMPLES x SAMPLES linear-light samples a pixel with a tent filter two pixels wide, weighted by alpha, and
+// writes sRGB with straight alpha. SAMPLES is even. Beyond the border the outermost samples repeat.
 
 uniform sampler2D samples;
 out vec4 pixel;

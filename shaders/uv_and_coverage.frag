@@ -1,5 +1,5 @@
 #version 330
-// The UV image: u, v and coverage, before any texture is read.
+// Writes the UV image: u, v and coverage.
 
 in vec2 v_uv;
 out vec4 pixel;

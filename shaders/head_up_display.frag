@@ -1,5 +1,5 @@
 #version 330
-// A picture of text, straight alpha, copied to the viewport's corner pixel by pixel.
+// Copies the head-up display, a picture with straight alpha, to a corner of the viewport pixel by pixel.
 
 uniform sampler2D picture;
 uniform ivec2 corner;

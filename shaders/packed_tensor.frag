@@ -1,7 +1,7 @@
 #version 330
-// The packed write: C channels of the neural texture, quantised, four to a 32-bit word.
+// Writes the network's input: C channels of the neural texture, quantised to bytes, four to a 32-bit word.
 // q = clamp(roundEven(x / scale) + zero_point, 0, 255); byte b of word l is channel 4 l + b.
-// With DEFERRED, u and v come from an image that an earlier pass drew; else from the vertex shader.
+// With DEFERRED, u and v come from an image that an earlier pass drew, else from the vertex shader.
 
 uniform sampler2DArray neural;
 uniform float scale;

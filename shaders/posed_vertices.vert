@@ -1,5 +1,5 @@
 #version 330
-// Vertices that the CPU unit has posed already.
+// Draws vertices that the CPU unit has skinned.
 
 uniform mat4 clip_from_world;
 
