@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 from trilane.avatars.bundle import Bundle
-from trilane.avatars.network_file import NetworkFile
+from trilane.avatars.integer_network import NetworkFile
 from trilane.body.body import load_body
 from trilane.hw_profiles.network_work import graph_facts
 

@@ -1,85 +1,32 @@
 """An avatar on disk: a folder of manifest, body, neural texture and integer network.
 
-Rule: nothing outside the folder is opened, and every number is checked before it is used.
+Rule: no file outside the folder is opened, and every number is checked before it is used.
 """
 
 from __future__ import annotations
 
-import json
 import math
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 import onnx
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from trilane.avatars.network_file import MAX_CHANNELS, MAX_SIDE, Affine, NetworkFile, read_network
+from trilane.avatars.integer_network import MAX_SIDE, Affine, NetworkFile
+from trilane.avatars.manifest import ByteRange, Manifest, parse_manifest
+from trilane.avatars.network_file import read_network
 from trilane.errors import BadInputError
 from trilane.files import read_npz, read_text, require_file
 from trilane.writing import write_folder
 
 MANIFEST = "manifest.json"
 DEFAULT = "default"
-BANDS = ("far", "full_body", "upper_body", "face")
 TEXTURE_KEYS = ("texture", "scale")
-
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-#: Of a shape or expression, in standard deviations: what lies outside is no body.
-Coefficient = Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)]
-FileName = Annotated[str, Field(min_length=1, max_length=200)]
-
-
-class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class ByteRange(_Model):
-    """`real = (q - zero_point) * scale`, q in 0..255."""
-
-    scale: float = Field(ge=1e-12, le=1e12, allow_inf_nan=False)
-    zero_point: int = Field(ge=0, le=255)
-
-
-class NetworkEntry(_Model):
-    """The network file and what was exported into it. `width` 64 is full; `channels` of the neural texture."""
-
-    file: FileName
-    encoder: str
-    norm: str
-    width: int = Field(ge=1, le=256)
-    channels: int = Field(ge=1, le=MAX_CHANNELS)
-    input: ByteRange
-    output: ByteRange = ByteRange(scale=1 / 255, zero_point=0)
-
-
-class Validation(_Model):
-    """Image error on poses and views never trained on. PSNR in dB inside the mask's box; IoU, SSIM 0..1."""
-
-    model_config = ConfigDict(extra="allow", frozen=True)
-
-    psnr_db_by_band: dict[Literal["far", "full_body", "upper_body", "face"], Finite]
-    iou: float = Field(ge=0, le=1)
-    ssim: float = Field(ge=-1, le=1)
-
-
-class Manifest(_Model):
-    """`manifest.json`. File names are relative to the bundle's folder."""
-
-    schema_version: Literal[1] = 1
-    name: str = Field(min_length=1, max_length=100)
-    body: FileName = "body.npz"
-    texture: FileName = "texture.npz"
-    network: NetworkEntry
-    betas: tuple[Coefficient, ...] = Field(default=(), max_length=400)
-    expression: tuple[Coefficient, ...] = Field(default=(), max_length=100)
-    provenance: dict[str, Any] = {}
-    training_command: str = ""
-    quantisation: dict[str, Any] = {}
-    validation: Validation | None = None
+#: Clothes and hair of an avatar reach this far from its body, metres. The pose stage and the training crop by it.
+CLOTHES_STANDOFF_M = 0.045
 
 
 @dataclass(frozen=True)
@@ -111,7 +58,7 @@ class Bundle:
         )
 
     def read_network(self) -> NetworkFile:
-        """The checked network. Raises BadInputError, also when it is not what the manifest says."""
+        """The checked network. Raises BadInputError, also when it contradicts the manifest."""
         network = read_network(self.network_path)
         entry = self.manifest.network
         if network.channels != entry.channels:
@@ -130,24 +77,10 @@ def load_bundle(name: str | Path) -> Bundle:
     """Read a bundle's manifest. Raises BadInputError naming file and key."""
     folder = bundle_folder(name)
     path = folder / MANIFEST
-    manifest = _parse(read_text(path, "an avatar's manifest"), path)
+    manifest = parse_manifest(read_text(path, "an avatar's manifest"), path)
     for key, file in (("body", manifest.body), ("texture", manifest.texture), ("network.file", manifest.network.file)):
         _check_inside(folder, file, f"{path}: {key}")
     return Bundle(folder, manifest)
-
-
-def network_entry(network: NetworkFile, encoder: str, norm: str, width: int) -> NetworkEntry:
-    """The manifest's entry of a quantised network, stored as `network.onnx`."""
-    ends = [ByteRange(scale=end.scale, zero_point=end.zero_point) for end in (network.input, network.output)]
-    return NetworkEntry(
-        file="network.onnx",
-        encoder=encoder,
-        norm=norm,
-        width=width,
-        channels=network.channels,
-        input=ends[0],
-        output=ends[1],
-    )
 
 
 def write_bundle(
@@ -155,8 +88,13 @@ def write_bundle(
 ) -> None:
     """Write a bundle beside `folder`, read it back, then put its files in `folder`.
 
-    `body`: an .npz file to copy. `texture`: (H, W, C) float16, or int8 with `scale` (C,) float32.
-    Raises BadInputError when the parts do not fit; then nothing is written.
+    `folder`: of the bundle; made when it does not exist.
+    `manifest`: its content.
+    `body`: an .npz file to copy.
+    `texture`: (H, W, C) float16, or int8 with `scale`.
+    `network`: the network to write.
+    `scale`: (C,) float32, of an int8 texture.
+    Raises BadInputError when the parts do not fit together; then nothing is written.
     """
     with write_folder(folder) as draft:
         shutil.copyfile(body, draft / manifest.body)
@@ -171,24 +109,6 @@ def write_bundle(
         bundle.read_network()
 
 
-def _parse(text: str, path: Path) -> Manifest:
-    try:
-        return Manifest.model_validate_json(text)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        key = ".".join(map(str, first["loc"])) or "document"
-        raise BadInputError(
-            f"{path}: {key}", f"{_short(first['input'])} ({first['msg']})", "a valid manifest"
-        ) from error
-    except (RecursionError, ValueError) as error:
-        raise BadInputError(path, str(error), "a JSON manifest") from error
-
-
-def _short(value: object) -> str:
-    text = json.dumps(value, default=str)
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
 def _check_inside(folder: Path, file: str, where: str) -> None:
     resolved = (folder / file).resolve()
     if folder.resolve() not in resolved.parents:
@@ -196,12 +116,12 @@ def _check_inside(folder: Path, file: str, where: str) -> None:
     require_file(resolved, f"the file that {where} names")
 
 
-def _check_same(found: Affine, expected: ByteRange, where: str) -> None:
-    same_scale = math.isclose(found.scale, expected.scale, rel_tol=1e-5)
-    if not same_scale or found.zero_point != expected.zero_point:
+def _check_same(of_file: Affine, expected: ByteRange, where: str) -> None:
+    same_scale = math.isclose(of_file.scale, expected.scale, rel_tol=1e-5)
+    if not same_scale or of_file.zero_point != expected.zero_point:
         raise BadInputError(
             where,
-            f"scale {found.scale:g}, zero point {found.zero_point}",
+            f"scale {of_file.scale:g}, zero point {of_file.zero_point}",
             f"scale {expected.scale:g}, zero point {expected.zero_point} by the manifest",
         )
 

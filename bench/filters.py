@@ -13,7 +13,7 @@ import numpy as np
 
 from trilane.arrays import U8
 from trilane.avatars.bundle import load_bundle
-from trilane.avatars.reshape import reshaped
+from trilane.avatars.network_reshape import reshaped
 from trilane.bench.lib.drawable import load_drawable
 from trilane.bench.lib.fixture import standing
 from trilane.bench.lib.ground_truth import ground_truth
@@ -21,9 +21,10 @@ from trilane.bench.lib.timing import interleaved_ms, summary_ms
 from trilane.errors import BadInputError
 from trilane.shapes import BUCKET_STEP
 from trilane.stages.dsp.runtime import RuntimeOptions, load_runtime
-from trilane.stages.gpu.context import describe
-from trilane.stages.gpu.mesh import SkinnedMesh
-from trilane.stages.gpu.packed import FILTERS, PackedAvatar, PackedPass, Placement
+from trilane.stages.gpu.opengl_context import describe
+from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement
+from trilane.stages.gpu.skinned_mesh import SkinnedMesh
+from trilane.stages.gpu.texture_array import FILTERS
 
 MAX_SIDE = 2048
 
@@ -69,7 +70,7 @@ class _FilterFixture:
         times = interleaved_ms(variants, repeats)
         plain, fixture = tensors["linear"], self._fixture
         body = (plain != self._network.input.zero_point).any(axis=-1)
-        truth = self._studio.wardrobe.render(fixture.joints, fixture.view, fixture.projection, shape)
+        truth = self._studio.clothed_body.render(fixture.joints, fixture.view, fixture.projection, shape)
         session = load_runtime("ort").load(reshaped(self._network, *shape), RuntimeOptions(threads=1))
         picture = np.empty((1, *shape, 4), np.uint8)
         rows = []

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import U8
-from trilane.avatars.bundle import load_bundle
-from trilane.avatars.reshape import reshaped
+from trilane.avatars.bundle import CLOTHES_STANDOFF_M, load_bundle
+from trilane.avatars.network_reshape import reshaped
 from trilane.bench.lib.drawable import load_drawable
 from trilane.bench.lib.ground_truth import ground_truth, shaped_body
 from trilane.body.kinematics import Skeleton
@@ -25,11 +25,10 @@ from trilane.scene.staging import stage_scene
 from trilane.shapes import Shape, shape_buckets
 from trilane.stages.cpu.crop import crop_projection
 from trilane.stages.cpu.mesh_bounds import MeshBounds
-from trilane.stages.cpu.pose import STANDOFF_M
 from trilane.stages.cpu.tensor_layout import MARGIN_PX, TensorLayout, lay_out
 from trilane.stages.dsp.runtime import Binding, RuntimeOptions, load_runtime
-from trilane.stages.gpu.mesh import SkinnedMesh
-from trilane.stages.gpu.packed import PackedAvatar, PackedPass, Placement
+from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement
+from trilane.stages.gpu.skinned_mesh import SkinnedMesh
 from trilane.unexpected import UnexpectedValue
 
 BOUND_DB = 0.5
@@ -112,7 +111,7 @@ class _CrowdFixture:
             cell = np.s_[top : top + height, left : left + width]
             together, isolated = everyone[cell], self._picture(view, [k])[cell]
             projection = crop_projection(view.projection, crop)
-            truth = self._studio.wardrobe.render(view.joints[k], view.view, projection, (height, width))
+            truth = self._studio.clothed_body.render(view.joints[k], view.view, projection, (height, width))
             errors = [self._image_error(picture, truth) for picture in (together, isolated)]
             if None not in errors:
                 steps = np.abs(together.astype(np.int16) - isolated)
@@ -151,7 +150,7 @@ def _views(fixture: _CrowdFixture, avatars: int, views: int, size: str, margin: 
     scene = Scene(avatars=specs)
     staged = stage_scene(scene, [fixture.shaped] * avatars, Path.cwd())
     skeleton = Skeleton(fixture.shaped.joints, fixture.shaped.body.parents)
-    bounds = MeshBounds(fixture.shaped, standoff_m=STANDOFF_M)
+    bounds = MeshBounds(fixture.shaped, standoff_m=CLOTHES_STANDOFF_M)
     projection = staged.camera.projection(OUTPUT[1] / OUTPUT[0])
     for t_s in np.linspace(0.0, SECONDS, views, endpoint=False):
         view, rects, joints = staged.camera.sample(t_s), [], []

@@ -1,4 +1,4 @@
-"""SMPL-X mathematics: the body file, joints, kinematics, blend shapes and skinning.
+"""The body's mathematics in the SMPL-X layout: the body file, joints, kinematics, pose blend shapes and skinning.
 
-It may use `transport/` and what lies below, and needs only NumPy.
+It may use `transport/` and the modules in `src/trilane`, and needs no package but NumPy.
 """

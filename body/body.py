@@ -1,6 +1,6 @@
-"""Body files in the SMPL-X layout: read without pickle, checked before memory is taken, immutable afterwards.
+"""A body, read from a file in the SMPL-X layout: no pickle, sizes checked before memory is taken, read-only arrays.
 
-Rule: a `Body` is finite, consistent and ready for use; whatever is wrong with a file becomes one BadInputError.
+Rule: a `Body` is finite, consistent and ready for use; anything wrong with a file raises one BadInputError.
 
 The layout is that of https://smpl-x.is.tue.mpg.de, read as the `smplx` package reads it: the rest shape is
 `v_template + shapedirs @ [betas, expression]`, the joints are `J_regressor @ rest shape`.
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from trilane.arrays import F32, F64, I32
 from trilane.body.joints import JOINTS, LEFT_HAND, POSE_FEATURES, POSE_SIZE, RIGHT_HAND
-from trilane.body.pose_blend import read_pose_blend
+from trilane.body.pose_blend_shapes import read_pose_blend
 from trilane.errors import BadInputError
 from trilane.files import read_npz
 
@@ -26,7 +26,7 @@ MAX_VERTICES = 1 << 18
 MAX_FACES = 1 << 19
 SUM_TOLERANCE = 1e-3
 
-#: Key: its shape ("V" vertices, "F" faces, "T" texture coordinates, "*" anything), and whether it holds indices.
+#: Array of the file to its shape ("V" vertices, "F" faces, "T" texture coordinates, "*" any) and whether it is indices.
 _LAYOUT: dict[str, tuple[tuple[int | str, ...], bool]] = {
     "v_template": (("V", 3), False),
     "shapedirs": (("V", 3, "*"), False),
@@ -43,7 +43,7 @@ _LAYOUT: dict[str, tuple[tuple[int | str, ...], bool]] = {
 }
 _LIMITS = {"V": MAX_VERTICES, "F": MAX_FACES, "T": 3 * MAX_FACES}
 
-#: First expression column and number of them, by the columns that the file has at least.
+#: (least number of columns of `shapedirs`, first expression column, number of expression columns).
 _FULL, _SHORT = (400, 300, 100), (20, 10, 10)
 
 
@@ -76,23 +76,26 @@ class Body:
         return self.posedirs is not None
 
     def shape(self, betas: ArrayLike = (), expression: ArrayLike = ()) -> ShapedBody:
-        """The body with these coefficients (up to S and E of them; missing ones are 0). Raises BadInputError."""
+        """The body with up to S `betas` and up to E `expression` coefficients; missing ones are 0.
+
+        Raises BadInputError for too many coefficients or ones that are not finite.
+        """
         rest = self.v_template.astype(np.float64)
-        for name, dirs, given in (
+        for name, dirs, coefficients in (
             ("betas", self.shape_dirs, betas),
             ("expression", self.expression_dirs, expression),
         ):
-            values = np.atleast_1d(np.asarray(given, np.float64))
+            values = np.atleast_1d(np.asarray(coefficients, np.float64))
             if values.ndim != 1 or len(values) > dirs.shape[2] or not np.isfinite(values).all():
-                found = f"an array of shape {values.shape}" if np.isfinite(values).all() else "NaN or infinity"
-                raise BadInputError(name, found, f"at most {dirs.shape[2]} finite numbers")
+                fault = f"an array of shape {values.shape}" if np.isfinite(values).all() else "NaN or infinity"
+                raise BadInputError(name, fault, f"at most {dirs.shape[2]} finite numbers")
             if len(values):
                 rest += dirs[:, :, : len(values)] @ values
         joints = self.j_regressor.astype(np.float64) @ rest
         return ShapedBody(_frozen(rest.astype(np.float32)), _frozen(joints), self)
 
     def full_pose(self, poses: ArrayLike, flat_hand_mean: bool) -> F64:
-        """Poses (..., 165) as the joints take them: the mean hand is added unless `flat_hand_mean`."""
+        """Axis-angle `poses` (..., 165) with the mean hand pose added unless `flat_hand_mean`. Raises BadInputError."""
         full = np.array(poses, np.float64)
         if full.ndim == 0 or full.shape[-1] != POSE_SIZE:
             raise BadInputError("poses", f"shape {full.shape}", f"(..., {POSE_SIZE})")
@@ -111,7 +114,9 @@ class ShapedBody:
 
 
 def load_body(path: Path) -> Body:
-    """Read a body file. Raises BadInputError: missing, truncated, pickled, huge, misshapen, NaN or inconsistent."""
+    """Read a body file. Raises BadInputError when it is missing, truncated, pickled, too large, of another layout, not
+    finite or inconsistent.
+    """
     arrays = read_npz(path, _LAYOUT, EXPECTED)
     _check_layout(path, arrays)
     vertices = len(arrays["v_template"])
@@ -201,7 +206,7 @@ def _split_shape(path: Path, dirs: F32) -> tuple[F32, F32]:
 
 
 def _parents(path: Path, table: NDArray[Any]) -> I32:
-    """Parents from the first row; the root's entry, whatever it is, is -1."""
+    """(55,) parents from the table's first row; the root's is -1 whatever the file has there. Raises BadInputError."""
     stored = [int(parent) for parent in table[0]]
     where = f"{path}[kintree_table]"
     for joint, parent in enumerate(stored[1:], start=1):

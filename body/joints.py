@@ -1,6 +1,6 @@
 """The 55 joints of the SMPL-X layout: names and parents, in file order.
 
-Rule: the one place that knows what joint 20 is; everything else asks by name.
+Rule: only this file knows joint numbers; all other code looks joints up by name.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Forward kinematics: axis-angle poses to skinning matrices, in float64, without allocation per frame.
+"""Forward kinematics: from an axis-angle pose to skinning matrices, in float64, in memory that is allocated once.
 
 Rule: exact at every angle. A rotation by t = |v| about v has the quaternion w = cos(t/2), u = v sin(t/2) / t, and
-R - I = 2 (u u^T - (u.u) I + w [u]x) (O. Rodrigues, 1840): nothing cancels near 0 or pi, and the norm needs no bias.
+R - I = 2 (u u^T - (u.u) I + w [u]x) (O. Rodrigues, 1840), in which no digits cancel near 0 or pi.
 """
 
 from __future__ import annotations
@@ -14,14 +14,15 @@ from numpy.typing import ArrayLike, NDArray
 from trilane.arrays import F32, F64
 from trilane.errors import BadInputError
 
-#: sin(x) / x is exactly 1 in float64 here and below, so that 0 needs no case of its own.
+#: sin(x) / x is exactly 1 in float64 at this x and below; smaller halves of angles are replaced by it, so 0 needs no
+#: special case.
 _TINY = 1e-150
-#: Beyond this a joint angle (radians) keeps little of its phase and a place (metres) little of its millimetres.
+#: Largest joint angle (radians) and coordinate (metres): float64 and float32 lose too many digits beyond it.
 MAX_VALUE = 1e6
 
 
 def _products_to_turn() -> F64:
-    """(16, 9): takes the products of (w, ux, uy, uz) by themselves, row-major, to R - I, row-major."""
+    """(16, 9) matrix that turns the outer product of (w, ux, uy, uz) with itself, row-major, into R - I, row-major."""
     table = np.zeros((4, 4, 3, 3))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         table[1 + i, 1 + i, [j, k], [j, k]] = -2.0
@@ -53,7 +54,7 @@ def rodrigues(rotvec: ArrayLike) -> F64:
 
 @dataclass(frozen=True)
 class Posed:
-    """One frame of a skeleton; views of its buffers, valid until the next call.
+    """One frame of a skeleton. The arrays are the skeleton's own buffers, valid until its next `pose`.
 
     `matrices` (55,3,4) float32: x_world = sum_k w_k (matrices_k @ [x_rest, 1]). `joints` (55,3) float64, metres,
     world. `feature` (486,) float32: R - I of joints 1..54, row-major, R local.
@@ -87,9 +88,12 @@ class Skeleton:
         self._posed = Posed(self._matrices, self._world[:-1, :3, 3], self._feature.reshape(-1))
 
     def pose(self, pose: ArrayLike, translation: ArrayLike | None = None, world: F64 | None = None) -> Posed:
-        """Pose the chain: `pose` (J * 3,) axis-angle; `translation` (3,) metres; `world` (4,4): body to world.
+        """Pose the chain.
 
-        Raises BadInputError when the pose or the place is not finite or an angle is beyond a million radians.
+        `pose`: (J * 3,) axis-angle, radians.
+        `translation`: (3,) metres, of the root in body space; None for none.
+        `world`: (4,4) from body space to the world; None for the identity.
+        Raises BadInputError when a number is not finite or an angle or coordinate is beyond a million.
         """
         self._angles.reshape(-1)[:] = np.asarray(pose, np.float64).reshape(-1)
         _require_finite(self._angles, "pose", "joint angles below 1e6 rad")

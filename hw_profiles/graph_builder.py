@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from onnx import TensorProto, helper
 
-GROUPS = 8  # of a group normalisation, or fewer where they do not divide the channels
+from trilane.unet_tables import NORM_GROUPS
 
 
 class TensorRef(NamedTuple):
@@ -106,7 +106,7 @@ class GraphBuilder:
         scales = [self.weight((x.channels,)), self.weight((x.channels,))]
         if self.norm == "instance":
             return self.same("InstanceNormalization", x, *scales)
-        return self.same("GroupNormalization", x, *scales, num_groups=gcd(GROUPS, x.channels))
+        return self.same("GroupNormalization", x, *scales, num_groups=gcd(NORM_GROUPS, x.channels))
 
     def unit(
         self, x: TensorRef, out: int, kernel: int, act: str | None = "Relu", stride: int = 1, groups: int = 1

@@ -16,11 +16,9 @@ import onnx
 from trilane.errors import BadInputError
 from trilane.hw_profiles.graph_builder import GraphBuilder, TensorRef
 from trilane.hw_profiles.network_work import Network, Work, count_work
-from trilane.hw_profiles.reference_encoders import ENCODERS, encode
+from trilane.hw_profiles.reference_encoders import encode
+from trilane.unet_tables import DECODER, ENCODERS, HEADS, NORMS
 
-DECODER = (256, 128, 64, 64, 64)
-HEADS = (3, 1)
-NORMS = ("batch", "instance", "group")
 LAYOUTS = ("packed", "split")
 CHANNELS_PER_PASS = 4
 MAX_SIDE = 4096

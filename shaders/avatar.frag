@@ -1,5 +1,5 @@
 #version 330
-// The premultiplied picture, averaged over the pixel's footprint with TAPS x TAPS bilinear reads.
+// Reads the premultiplied picture, averaged over the pixel's footprint with TAPS x TAPS bilinear reads.
 
 uniform sampler2D picture;
 uniform vec4 inside; // left, top, right, bottom that may be read

@@ -1,5 +1,5 @@
 #version 330
-// The avatar's picture at its crop rectangle.
+// Places the avatar's picture at its crop rectangle on the screen.
 
 uniform vec4 rect;   // x0, y0, x1, y1 in normalised device coordinates, y up
 uniform vec4 source; // left, top, right, bottom of the picture, 0..1 of the texture

@@ -1,5 +1,5 @@
 #version 330
-// A picture of exactly the target's size, copied.
+// Copies a picture of exactly the target's size.
 
 uniform sampler2D picture;
 out vec4 pixel;

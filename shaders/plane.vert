@@ -1,5 +1,5 @@
 #version 330
-// A rectangle in the world for each detected plane.
+// Places a rectangle in the world for each detected plane.
 
 uniform mat4 clip_from_world;
 uniform vec3 centre[PLANES];

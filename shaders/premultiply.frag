@@ -1,5 +1,5 @@
 #version 330
-// Straight alpha to premultiplied, in linear light (the sampler decodes sRGB).
+// Premultiplies colours by alpha, in linear light (the sampler decodes sRGB).
 
 uniform sampler2D image;
 out vec4 pixel;

@@ -1,5 +1,5 @@
 #version 330
-// Bytes as they are shown: texture and light are multiplied in sRGB, because both were painted for that.
+// Draws the room: texture and light are multiplied as sRGB bytes, because both were painted for that.
 
 uniform sampler2D detail;
 

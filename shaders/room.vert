@@ -1,5 +1,5 @@
 #version 330
-// Walls, floor and ceiling: light is baked per vertex, detail comes from a repeating texture.
+// Places walls, floor and ceiling: light is baked per vertex, detail comes from a repeating texture.
 
 uniform mat4 clip_from_world;
 

@@ -1,5 +1,5 @@
 #version 330
-// How much light the blob takes away, as alpha; falls smoothly to nothing at the rim.
+// Writes how much light a contact shadow takes away, as alpha; it falls smoothly to 0 at the rim.
 
 in vec2 v_place;
 flat in float v_strength;

@@ -1,5 +1,5 @@
 #version 330
-// A soft disc on the floor for each blob: xyz the point on the floor and the radius, strength apart.
+// Places a disc on the floor for each contact shadow.
 
 uniform mat4 clip_from_world;
 uniform vec4 blob[BLOBS]; // x, z, radius, strength

@@ -1,5 +1,6 @@
 #version 330
-// The split baseline: one layer of four channels, quantised as the packed pass does, one byte to a colour channel.
+// Writes one layer of four channels, quantised as the packed pass does, one byte to a colour channel: the baseline of
+// `trilane bench raster` that draws the tensor in several passes.
 
 uniform sampler2DArray neural;
 uniform float scale;

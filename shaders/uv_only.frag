@@ -1,5 +1,5 @@
 #version 330
-// u and v alone; coverage is in the depth buffer.
+// Writes u and v; coverage is in the depth buffer.
 
 in vec2 v_uv;
 out vec2 pixel;

@@ -16,14 +16,15 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F32
 from trilane.avatars.bundle import Bundle
-from trilane.avatars.network_file import NetworkFile, check_network
+from trilane.avatars.integer_network import NetworkFile
+from trilane.avatars.network_checks import check_network
 from trilane.body.body import Body, ShapedBody, load_body
 from trilane.errors import BadInputError
 from trilane.pipeline.assets import Assets
 from trilane.scene.staged_arrays import staged_from_arrays, staged_to_arrays
 from trilane.scene.staging import Staged
 from trilane.stages.config import RunConfig
-from trilane.stages.gpu.packed import Quantisation
+from trilane.stages.gpu.packed_pass import Quantisation
 
 NETWORK, NETWORK_PATH, SCENE = "network", "network_path", "scene/"
 HANDS = ("hand_components_left", "hand_components_right")

@@ -14,8 +14,8 @@ from typing import Any
 from pydantic import ValidationError
 
 from trilane.avatars.bundle import Bundle, load_bundle
-from trilane.avatars.network_file import NetworkFile
-from trilane.avatars.split import split
+from trilane.avatars.integer_network import NetworkFile
+from trilane.avatars.network_split import split
 from trilane.errors import BadInputError, MissingPartError
 from trilane.hw_profiles.host import host_units
 from trilane.hw_profiles.load import HOST, load_profile

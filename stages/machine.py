@@ -79,7 +79,7 @@ def memory_bytes() -> int:
 
 def open_gl() -> dict[str, Any]:
     """Make a context in this process and describe it. Raises MissingPartError when none can be made."""
-    from trilane.stages.gpu.context import describe, open_context
+    from trilane.stages.gpu.opengl_context import describe, open_context
 
     context = open_context()
     driver, info = describe(context), context.info

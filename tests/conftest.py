@@ -10,7 +10,8 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from trilane.avatars.bundle import Manifest, bundle_folder, network_entry, write_bundle
+from trilane.avatars.bundle import bundle_folder, write_bundle
+from trilane.avatars.manifest import Manifest, network_entry
 from trilane.training.quantising.quantise import Quantised, quantise
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"

@@ -1,104 +1,21 @@
-"""The encoders: each is a table, and turns (N, C, H, W) into features at strides 2, 4, 8, 16 and 32.
+"""The encoders in PyTorch: each turns (N, C, H, W) into features at strides 2, 4, 8, 16 and 32.
 
-Rule: an encoder is rows of numbers; the only code is what one row means.
-Sources: He et al. 2015 (ResNet18); Sandler et al. 2018 (MobileNetV2); Howard et al. 2019 (MobileNetV3 large);
-Tan and Le 2019 with the changes of TensorFlow's EfficientNet-Lite (no squeeze, ReLU6, stem and head unscaled).
+Rule: channel counts, kernels and strides come from `trilane.unet_tables`; this file only says what a row means.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Protocol
 
 from torch import Tensor, nn
 
+from trilane.unet_tables import MOBILE_ENCODERS, RESNET18_STAGES, RESNET18_STEM, MobileEncoder, Row, squeeze_channels
+
 Norm = Callable[[int], nn.Module]
 Scale = Callable[[int], int]
 
-#: ResNet18: (channels, stride) of the four stages, two blocks each.
-RESNET18 = ((64, 1), (128, 2), (256, 2), (512, 2))
-
 ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {"relu": nn.ReLU, "relu6": nn.ReLU6, "hardswish": nn.Hardswish}
-SQUEEZE = 4
-
-
-@dataclass(frozen=True)
-class Row:
-    """One inverted residual block. `expanded`: channels inside the block."""
-
-    kernel: int
-    expanded: int
-    channels: int
-    stride: int
-    activation: str = "relu6"
-    squeeze: bool = False
-
-
-@dataclass(frozen=True)
-class Mobile:
-    """An encoder of inverted residuals: `stem` channels, its `activation`, rows, and a last 1x1 layer."""
-
-    stem: int
-    activation: str
-    rows: tuple[Row, ...]
-    last: int
-
-
-def _repeated(spec: Sequence[tuple[int, int, int, int, int]], before: int) -> tuple[Row, ...]:
-    """Rows from (kernel, expansion, channels, count, stride): every block expands what enters it."""
-    rows = []
-    for kernel, expansion, channels, count, stride in spec:
-        for i in range(count):
-            rows.append(Row(kernel, before * expansion, channels, stride if i == 0 else 1))
-            before = channels
-    return tuple(rows)
-
-
-MOBILENET_V2 = Mobile(
-    stem=32,
-    activation="relu6",
-    rows=_repeated(
-        (
-            *((3, 1, 16, 1, 1), (3, 6, 24, 2, 2), (3, 6, 32, 3, 2), (3, 6, 64, 4, 2)),
-            *((3, 6, 96, 3, 1), (3, 6, 160, 3, 2), (3, 6, 320, 1, 1)),
-        ),
-        before=32,
-    ),
-    last=1280,
-)
-#: Its own head of 1280 would make the network larger than the published 6.1 M; ResNet18's 512 makes it 6.0 M.
-EFFICIENTNET_LITE0 = Mobile(
-    stem=32,
-    activation="relu6",
-    rows=_repeated(
-        (
-            *((3, 1, 16, 1, 1), (3, 6, 24, 2, 2), (5, 6, 40, 2, 2), (3, 6, 80, 3, 2)),
-            *((5, 6, 112, 3, 1), (5, 6, 192, 4, 2), (3, 6, 320, 1, 1)),
-        ),
-        before=32,
-    ),
-    last=512,
-)
-MOBILENET_V3 = Mobile(
-    stem=16,
-    activation="hardswish",
-    rows=(
-        Row(3, 16, 16, 1, "relu"),
-        Row(3, 64, 24, 2, "relu"),
-        Row(3, 72, 24, 1, "relu"),
-        Row(5, 72, 40, 2, "relu", squeeze=True),
-        *[Row(5, 120, 40, 1, "relu", squeeze=True)] * 2,
-        Row(3, 240, 80, 2, "hardswish"),
-        Row(3, 200, 80, 1, "hardswish"),
-        *[Row(3, 184, 80, 1, "hardswish")] * 2,
-        Row(3, 480, 112, 1, "hardswish", squeeze=True),
-        Row(3, 672, 112, 1, "hardswish", squeeze=True),
-        Row(5, 672, 160, 2, "hardswish", squeeze=True),
-        *[Row(5, 960, 160, 1, "hardswish", squeeze=True)] * 2,
-    ),
-    last=960,
-)
 
 
 class Encoder(Protocol):
@@ -111,9 +28,15 @@ class Encoder(Protocol):
 
 
 class ResidualBlock(nn.Module):
-    """Two 3x3 convolutions beside a shortcut, which is a strided 1x1 convolution where the shape changes."""
+    """Two 3x3 convolutions, added to a shortcut, which is a strided 1x1 convolution where the shape changes."""
 
     def __init__(self, c_in: int, c_out: int, stride: int, norm: Norm) -> None:
+        """A block from `c_in` to `c_out` channels.
+
+        `c_in`, `c_out`: channels of its input and output.
+        `stride`: of its first convolution.
+        `norm`: makes a normalisation for a number of channels.
+        """
         super().__init__()
         self.body = nn.Sequential(
             nn.Conv2d(c_in, c_out, 3, stride, 1, bias=False),
@@ -138,16 +61,16 @@ class ResNet18(nn.Module):
 
     def __init__(self, c_in: int, scale: Scale, norm: Norm) -> None:
         super().__init__()
-        stem = scale(RESNET18[0][0])
+        stem = scale(RESNET18_STEM)
         self.stem = nn.Sequential(nn.Conv2d(c_in, stem, 7, 2, 3, bias=False), norm(stem), nn.ReLU(inplace=True))
         self.pool = nn.MaxPool2d(3, 2, 1)
         self.stages = nn.ModuleList()
         before = stem
-        for count, stride in RESNET18:
+        for count, stride in RESNET18_STAGES:
             c = scale(count)
             self.stages.append(nn.Sequential(ResidualBlock(before, c, stride, norm), ResidualBlock(c, c, 1, norm)))
             before = c
-        self.channels = (stem, *(scale(count) for count, _ in RESNET18))
+        self.channels = (stem, *(scale(count) for count, _ in RESNET18_STAGES))
 
     def forward(self, x: Tensor) -> list[Tensor]:
         features = [self.stem(x)]
@@ -159,11 +82,11 @@ class ResNet18(nn.Module):
 
 
 class SqueezeExcite(nn.Module):
-    """Scales each channel by what the whole picture says of it."""
+    """Squeeze-and-excitation: scales each channel by a factor computed from the channels' means over the picture."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        inner = max(8, (channels // SQUEEZE + 4) // 8 * 8)
+        inner = squeeze_channels(channels)
         self.body = nn.Sequential(
             nn.AdaptiveAvgPool2d(1),
             nn.Conv2d(channels, inner, 1),
@@ -181,6 +104,13 @@ class InvertedResidual(nn.Module):
     """1x1 expansion, depthwise convolution, optional squeeze, linear 1x1 projection, added where shapes agree."""
 
     def __init__(self, c_in: int, row: Row, scale: Scale, norm: Norm) -> None:
+        """The block of one row of the table.
+
+        `c_in`: channels of its input.
+        `row`: its kernel, channels, stride and activation.
+        `scale`: scales a channel count by the network's width.
+        `norm`: makes a normalisation for a number of channels.
+        """
         super().__init__()
         inner, c_out = scale(row.expanded), scale(row.channels)
         activation = ACTIVATIONS[row.activation]
@@ -203,10 +133,20 @@ class InvertedResidual(nn.Module):
         return x + out if self.add else out
 
 
-class MobileEncoder(nn.Module):
-    """A 3x3 stride-2 stem, inverted residuals, a last 1x1 layer. Features: what enters each later stride; the last."""
+class MobileFeatures(nn.Module):
+    """A 3x3 stride-2 stem, inverted residual blocks, a last 1x1 layer.
 
-    def __init__(self, spec: Mobile, c_in: int, scale: Scale, norm: Norm) -> None:
+    Features: the tensors that enter the strided blocks, and the last layer's output.
+    """
+
+    def __init__(self, spec: MobileEncoder, c_in: int, scale: Scale, norm: Norm) -> None:
+        """The encoder of one table.
+
+        `spec`: the table.
+        `c_in`: channels of its input.
+        `scale`: scales a channel count by the network's width.
+        `norm`: makes a normalisation for a number of channels.
+        """
         super().__init__()
         before = scale(spec.stem)
         activation = ACTIVATIONS[spec.activation]
@@ -231,13 +171,11 @@ class MobileEncoder(nn.Module):
         return features
 
 
-def _mobile(spec: Mobile) -> Callable[[int, Scale, Norm], nn.Module]:
-    return lambda c_in, scale, norm: MobileEncoder(spec, c_in, scale, norm)
+def _mobile(spec: MobileEncoder) -> Callable[[int, Scale, Norm], nn.Module]:
+    return lambda c_in, scale, norm: MobileFeatures(spec, c_in, scale, norm)
 
 
 ENCODERS: dict[str, Callable[[int, Scale, Norm], nn.Module]] = {
     "resnet18": ResNet18,
-    "mobilenetv2": _mobile(MOBILENET_V2),
-    "mobilenetv3": _mobile(MOBILENET_V3),
-    "efficientnet-lite0": _mobile(EFFICIENTNET_LITE0),
+    **{name: _mobile(spec) for name, spec in MOBILE_ENCODERS.items()},
 }

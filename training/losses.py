@@ -1,9 +1,9 @@
-"""What training minimises: the figure it is judged by, colour, the composite round the outline, edges, the mask.
+"""What training minimises: errors of the picture over grey, of its decibels, its colours, its edges and its mask.
 
-What nobody sees, the colour where there is no person, is drawn black: it costs nothing, and left alone it is noise that
-differs from runtime to runtime.
+Rule: every term is a mean over the pixels it is about, so that the weights in the table mean the same for every view.
 
-Rule: every term is a mean over what it is about, so that weights in the table below mean the same for every view.
+The colour where there is no person is not visible and is trained to be black: left alone it would be noise that differs
+from runtime to runtime.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from scipy.ndimage import maximum_filter
 from torch import Tensor
 from torch.nn import functional
 
-GREY = 0.5
+from trilane.training.image_error import GREY
+
 #: Pixels round the person that count as its outline.
 MARGIN_PX = 5
 WEIGHTS = {
@@ -30,7 +31,7 @@ LEAST_SQUARE = 1e-5
 
 
 def loss_terms(output: Tensor, target: Tensor) -> dict[str, Tensor]:
-    """Terms by name, before weighting. `output` and `target` (N, 4, H, W): straight colour and mask, 0..1."""
+    """The terms by name, before weighting. `output` and `target` (N, 4, H, W): straight colour and mask, 0..1."""
     mask, true_mask = output[:, 3:], target[:, 3:]
     near = _grown(true_mask)
     pixels = near.sum() * 3 + 1
@@ -63,18 +64,18 @@ def missing_db(difference: Tensor, near: Tensor) -> Tensor:
 
 
 def _grown(mask: Tensor) -> Tensor:
-    """1 on the person and `MARGIN_PX` round it, else 0; (N, 1, H, W)."""
+    """(N, 1, H, W): 1 on the person of `mask` and up to `MARGIN_PX` round it, else 0."""
     side = 2 * MARGIN_PX + 1
     grown = maximum_filter(mask.detach().numpy(), (1, 1, side, side), mode="constant")
     return torch.from_numpy(grown).gt(0).float()
 
 
 def total_loss(terms: dict[str, Tensor]) -> Tensor:
-    """The weighted sum."""
+    """The sum of the terms, weighted by `WEIGHTS`."""
     return torch.stack([WEIGHTS[name] * term for name, term in terms.items()]).sum()
 
 
 def composite(image: Tensor) -> Tensor:
-    """(N, 4, H, W) over mid-grey, (N, 3, H, W)."""
+    """`image` (N, 4, H, W) over mid-grey: (N, 3, H, W)."""
     mask = image[:, 3:]
     return image[:, :3] * mask + GREY * (1 - mask)

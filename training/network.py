@@ -1,6 +1,6 @@
 """The avatar's network: an encoder, a decoder of five levels with skips, a colour head and a mask head.
 
-Rule: this is the one definition of the network; everything that runs it runs a file exported from here.
+Rule: this is the only definition of the network that computes; every runtime runs a file exported from it.
 """
 
 from __future__ import annotations
@@ -14,12 +14,10 @@ from torch.nn import functional
 
 from trilane.errors import BadInputError
 from trilane.training.encoders import ENCODERS
+from trilane.unet_tables import DECODER, HEADS, NORM_GROUPS
 
 FULL_WIDTH = 64
 CHANNEL_STEP = 4
-DECODER = (256, 128, 64, 64, 64)
-GROUPS = 8
-STRIDE = 32
 
 
 class GroupNorm(nn.GroupNorm):
@@ -35,17 +33,12 @@ class GroupNorm(nn.GroupNorm):
 NORMS: dict[str, Callable[[int], nn.Module]] = {
     "batch": nn.BatchNorm2d,
     "instance": lambda channels: nn.InstanceNorm2d(channels, affine=True),
-    "group": lambda channels: GroupNorm(math.gcd(channels, GROUPS), channels),
+    "group": lambda channels: GroupNorm(math.gcd(channels, NORM_GROUPS), channels),
 }
 
 
 class UNet(nn.Module):
-    """(N, channels, H, W) float32 -> (N, 4, H, W): straight colour and mask, each in 0..1. H, W: multiples of 32.
-
-    `width`: 64 is full; every channel count is scaled by `width` / 64 and rounded to a multiple of 4.
-    `input_skip`: the last level reads the input too, which is the only thing at full resolution; the paper's does not.
-    Raises BadInputError for an unknown encoder or norm, or a width or channel count out of range.
-    """
+    """(N, channels, H, W) float32 to (N, 4, H, W): straight colour and mask, each in 0..1. H, W: multiples of 32."""
 
     def __init__(
         self,
@@ -55,6 +48,15 @@ class UNet(nn.Module):
         channels: int = 16,
         input_skip: bool = False,
     ) -> None:
+        """Build the network, untrained.
+
+        `encoder`: a name of `ENCODERS`.
+        `norm`: a name of `NORMS`.
+        `width`: 64 is the full network; every channel count is scaled by `width` / 64 and rounded to a multiple of 4.
+        `channels`: of the input.
+        `input_skip`: the last level also reads the input, the only tensor of full resolution; the paper's does not.
+        Raises BadInputError for an unknown encoder or norm, or a width or channel count out of range.
+        """
         super().__init__()
         _check(encoder, norm, width, channels)
 
@@ -73,15 +75,15 @@ class UNet(nn.Module):
                 nn.Sequential(*_convolution(c_in + skip, c_out, make_norm), *_convolution(c_out, c_out, make_norm))
             )
             c_in = c_out
-        self.colour = nn.Sequential(*_convolution(c_in, c_in, make_norm), nn.Conv2d(c_in, 3, 3, 1, 1))
-        self.mask = nn.Sequential(*_convolution(c_in, c_in, make_norm), nn.Conv2d(c_in, 1, 3, 1, 1))
+        self.colour = nn.Sequential(*_convolution(c_in, c_in, make_norm), nn.Conv2d(c_in, HEADS[0], 3, 1, 1))
+        self.mask = nn.Sequential(*_convolution(c_in, c_in, make_norm), nn.Conv2d(c_in, HEADS[1], 3, 1, 1))
 
     def forward(self, x: Tensor) -> Tensor:
         x = self.features(x)
         return torch.sigmoid(torch.cat((self.colour(x), self.mask(x)), dim=1))
 
     def features(self, x: Tensor) -> Tensor:
-        """What both heads read: (N, width, H, W)."""
+        """The features (N, width, H, W) that both heads read."""
         whole = x if self.input_skip else None
         *skips, x = self.encoder(x)
         for level, skip in zip(self.levels, (*reversed(skips), whole), strict=True):

@@ -26,19 +26,23 @@ from trilane.body.body import ShapedBody, load_body
 from trilane.errors import BadInputError, TrilaneError
 from trilane.scene.motion.load import load_motion
 from trilane.scene.schema import AvatarSpec
-from trilane.training.data import open_groups
-from trilane.training.dataset import Sample, Studio, body_arrays, plan_training, plan_validation, write_dataset
-from trilane.training.finish import finish, write_avatar
-from trilane.training.fit import Avatar, FitConfig, fit, load_avatar, load_network, save_avatar, save_network
+from trilane.training.body_arrays import body_arrays
+from trilane.training.dataset import plan_training, plan_validation, write_dataset
+from trilane.training.first_texture import first_texture
+from trilane.training.make_bundle import evaluate_avatar, quantise_avatar, write_avatar
 from trilane.training.network import UNet
-from trilane.training.start import first_texture
-from trilane.training.texture import SIDES, NeuralTexture
+from trilane.training.neural_texture import SIDES, NeuralTexture
+from trilane.training.sample_files import open_groups
+from trilane.training.sample_renderer import Sample, SampleRenderer
+from trilane.training.trainable_avatar import TrainableAvatar
+from trilane.training.training_loop import FitConfig, fit
+from trilane.training.weights_file import load_avatar, load_network, save_avatar, save_network
 
 CHANNELS = 16
 CHECKPOINT, FINAL, NETWORK = "checkpoint.npz", "final.npz", "network.npz"
 FACTS, TRAINING = "dataset.json", "training"
 BUILTIN_HELD_OUT = "builtin:walk-wave-turn"
-#: Of `FitConfig`, for a training that does not begin with nothing.
+#: Settings of `FitConfig` for a training that starts from a network, and for one that also has a trained texture.
 KNOWN_NETWORK: dict[str, Any] = {"small_until": 0.0, "freeze_norms_at": 0.3}
 RESUMED: dict[str, Any] = {
     "network_rate": 6e-4,
@@ -51,9 +55,14 @@ RESUMED: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """One training run. `held_out`: motions that validation poses come from. `weights`: skip training, use
-    these. `resume`: go on from these at a lower rate. `network`: take the network from these, the texture anew, or
-    with `texture` from that avatar (a name or a folder), and go on at the lower rate too.
+    """One training run.
+
+    `body`: the body file. `out`: folder of the bundle. `name`: of the avatar. `work`: folder of data set and weights.
+    `sheet`: picture file that compares held-out samples; None for none.
+    `minutes`: of training. `samples`: of the training set. `per_band`: validation samples of each band.
+    `held_out`: motions that validation poses come from. `width`: of the network; 64 is full.
+    `weights`: do not train, use these. `resume`: continue from these weights at a lower rate. `network`: start from the
+    network of these weights, with a new texture or with `texture`, that of a trained avatar (a name or a folder).
     """
 
     body: Path = bundle_folder("default") / "body.npz"
@@ -77,19 +86,31 @@ class TrainConfig:
 
 
 def train(config: TrainConfig, report: Callable[[str], None]) -> Path:
-    """Run `config` and return the bundle's folder. Raises BadInputError for inputs that do not fit."""
+    """Run `config` and return the bundle's folder; `report` takes lines of progress.
+
+    Raises BadInputError for inputs that do not fit together, MissingPartError without OpenGL.
+    """
     torch.manual_seed(config.seed)
     shaped = load_body(config.body).shape()
-    studio = Studio(shaped, threads=config.workers)
-    held_out = held_out_samples(studio, config)
-    _render(studio, config, report)
-    avatar, steps = _fitted(shaped, config, report)
-    report("quantising and judging")
+    renderer = SampleRenderer(shaped, threads=config.workers)
+    held_out = held_out_samples(renderer, config)
+    _render_training_set(renderer, config, report)
+    avatar, steps = _trained(shaped, config, report)
+    report("quantising and evaluating")
     torch.set_num_threads(config.workers)
-    groups = open_groups(config.work / TRAINING)
-    done, made, texture, scale = finish(avatar, studio, shaped, groups, held_out, config.seed, config.workers)
-    facts = {
-        "body": "the default body, dressed by trilane.training.clothing",
+    quantised = quantise_avatar(avatar, shaped, open_groups(config.work / TRAINING), config.seed)
+    evaluation = evaluate_avatar(avatar, quantised, renderer, held_out, config.workers)
+    names = {"name": config.name, "training_command": command_of(config)}
+    write_avatar(config.out, config.body, quantised, evaluation, config.width, _provenance(config, steps), names)
+    if config.sheet is not None:
+        Image.fromarray(evaluation.sheet).save(config.sheet, optimize=True)
+    report(json.dumps({"float": evaluation.float_errors, "integer": evaluation.integer_errors}))
+    return config.out
+
+
+def _provenance(config: TrainConfig, steps: int) -> dict[str, Any]:
+    return {
+        "body": "the default body, clothed by trilane.training.clothing",
         "samples": config.samples,
         "steps": steps,
         "batch": config.batch,
@@ -97,16 +118,10 @@ def train(config: TrainConfig, report: Callable[[str], None]) -> Path:
         "held_out_motions": [Path(name).name for name in config.held_out],
         "texture_sides": list(SIDES),
     }
-    names = {"name": config.name, "training_command": command_of(config)}
-    write_avatar(config.out, config.body, done, made, texture, scale, config.width, facts, names)
-    if config.sheet is not None:
-        Image.fromarray(done.sheet).save(config.sheet, optimize=True)
-    report(json.dumps({"float": done.float_figures, "integer": done.integer_figures}))
-    return config.out
 
 
 def command_of(config: TrainConfig) -> str:
-    """The command line of `config`, places left out: of motions and of weights to start from only the name stays."""
+    """The command line of `config` without folders: motions and weights are written by their file names alone."""
     options: list[str] = []
     for field in fields(TrainConfig):
         value = getattr(config, field.name)
@@ -119,54 +134,68 @@ def command_of(config: TrainConfig) -> str:
     return shlex.join(["python", "-m", "trilane.training.train", *options])
 
 
-def held_out_samples(studio: Studio, config: TrainConfig) -> list[Sample]:
+def held_out_samples(renderer: SampleRenderer, config: TrainConfig) -> list[Sample]:
     """The validation samples of `config`, the same every time."""
     motions = [load_motion(AvatarSpec(motion=name), Path.cwd()) for name in config.held_out]
-    return plan_validation(studio, config.per_band, config.seed, motions)
+    return plan_validation(renderer, config.per_band, config.seed, motions)
 
 
-def _render(studio: Studio, config: TrainConfig, report: Callable[[str], None]) -> None:
+def _render_training_set(renderer: SampleRenderer, config: TrainConfig, report: Callable[[str], None]) -> None:
+    """Render the training set into the work folder, unless it is there. Raises BadInputError for another set's."""
     facts, folder = config.work / FACTS, config.work / TRAINING
     wanted = {"samples": config.samples, "seed": config.seed}
     if facts.exists():
-        found = json.loads(facts.read_text())
-        if found != wanted:
-            raise BadInputError(facts, str(found), str(wanted), "use another --work folder")
+        present = json.loads(facts.read_text())
+        if present != wanted:
+            raise BadInputError(facts, str(present), str(wanted), "use another --work folder")
         return
     report(f"rendering {config.samples} samples into {folder}")
-    samples = plan_training(studio, config.samples, config.seed)
+    samples = plan_training(renderer, config.samples, config.seed)
     write_dataset(config.body, samples, folder, config.workers)
     facts.write_text(json.dumps(wanted))
 
 
-def _fitted(shaped: ShapedBody, config: TrainConfig, report: Callable[[str], None]) -> tuple[Avatar, int]:
-    blank = np.zeros((SIDES[0], SIDES[0], CHANNELS), np.float32)
-    network = UNet(width=config.width, channels=CHANNELS, input_skip=True)
+def _trained(shaped: ShapedBody, config: TrainConfig, report: Callable[[str], None]) -> tuple[TrainableAvatar, int]:
+    """The trained avatar and its number of steps; with `config.weights`, those weights as they are."""
     if config.weights is not None:
-        return load_avatar(Avatar(NeuralTexture(blank), network), config.weights)
-    shared = {name: getattr(config, name) for name in ("minutes", "workers", "threads", "batch", "seed")}
-    settings = FitConfig(**shared)
-    done = 0
-    if config.resume is not None:
-        settings = replace(settings, **RESUMED, seed=config.seed + config.workers)
-        avatar, done = load_avatar(Avatar(NeuralTexture(blank), network), config.resume)
-    else:
-        start = _start(shaped, config)
-        if config.network is not None:
-            settings = replace(settings, **(RESUMED if config.texture else KNOWN_NETWORK))
-            network = load_network(network, config.network)
-        avatar = Avatar(NeuralTexture(start), network)
+        return load_avatar(_blank_avatar(config), config.weights)
+    avatar, steps_before, settings = _starting_point(shaped, config)
 
-    def checkpoint(avatar: Avatar, steps: int) -> None:
-        save_avatar(avatar, done + steps, config.work / CHECKPOINT)
+    def checkpoint(avatar: TrainableAvatar, steps: int) -> None:
+        save_avatar(avatar, steps_before + steps, config.work / CHECKPOINT)
 
     avatar, steps = fit(avatar, config.work / TRAINING, settings, report, checkpoint)
-    save_avatar(avatar, done + steps, config.work / FINAL)
+    save_avatar(avatar, steps_before + steps, config.work / FINAL)
     save_network(avatar, config.work / NETWORK)
-    return avatar, done + steps
+    return avatar, steps_before + steps
 
 
-def _start(shaped: ShapedBody, config: TrainConfig) -> NDArray[np.float32]:
+def _starting_point(shaped: ShapedBody, config: TrainConfig) -> tuple[TrainableAvatar, int, FitConfig]:
+    """The avatar that training starts from, the steps it has been trained, and the settings of the training."""
+    shared = {name: getattr(config, name) for name in ("minutes", "workers", "threads", "batch", "seed")}
+    settings = FitConfig(**shared)
+    if config.resume is not None:
+        avatar, steps = load_avatar(_blank_avatar(config), config.resume)
+        return avatar, steps, replace(settings, **RESUMED, seed=config.seed + config.workers)
+    network = _new_network(config)
+    texture = _first_texture(shaped, config)
+    if config.network is not None:
+        settings = replace(settings, **(RESUMED if config.texture else KNOWN_NETWORK))
+        network = load_network(network, config.network)
+    return TrainableAvatar(NeuralTexture(texture), network), 0, settings
+
+
+def _new_network(config: TrainConfig) -> UNet:
+    return UNet(width=config.width, channels=CHANNELS, input_skip=True)
+
+
+def _blank_avatar(config: TrainConfig) -> TrainableAvatar:
+    """An avatar of the right shapes, for weights to be loaded into."""
+    network = _new_network(config)
+    return TrainableAvatar(NeuralTexture(np.zeros((SIDES[0], SIDES[0], CHANNELS), np.float32)), network)
+
+
+def _first_texture(shaped: ShapedBody, config: TrainConfig) -> NDArray[np.float32]:
     if config.texture is None:
         return first_texture(body_arrays(shaped), open_groups(config.work / TRAINING), SIDES[0], CHANNELS)
     texture = load_bundle(config.texture).read_texture()
@@ -175,19 +204,22 @@ def _start(shaped: ShapedBody, config: TrainConfig) -> NDArray[np.float32]:
     return texture
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Parse the command line, run, and return the exit code."""
-    given = sys.argv[1:] if arguments is None else list(arguments)
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m trilane.training.train", description=__doc__)
     for field in fields(TrainConfig):
         default = field.default
         if isinstance(default, tuple):
             parser.add_argument("--held-out", action="append", help=f"motion for validation (default {default[0]})")
         else:
-            named = "Path" in str(field.type)
-            kind = Path if named else str if default is None else type(default)
+            is_path = "Path" in str(field.type)
+            kind = Path if is_path else str if default is None else type(default)
             parser.add_argument(f"--{field.name.replace('_', '-')}", type=kind, default=default, help=f"({default})")
-    values = vars(parser.parse_args(given))
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line `arguments`, the process's own by default, and return the exit code."""
+    values = vars(_parser().parse_args(sys.argv[1:] if arguments is None else list(arguments)))
     values["held_out"] = tuple(values["held_out"] or (BUILTIN_HELD_OUT,))
     started = time.monotonic()
 

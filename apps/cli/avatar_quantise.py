@@ -43,7 +43,7 @@ def quantise(
     """Quantise a float network to bytes in, bytes out, calibrated on real frames."""
     from trilane.apps.avatar_facts import network_facts
     from trilane.avatars.network_file import parse_network
-    from trilane.training.quantising.equalise import equalised
+    from trilane.training.quantising.cross_layer_equalisation import equalised
     from trilane.training.quantising.quantise import quantise as quantise_on
     from trilane.writing import write_bytes
 
@@ -93,7 +93,7 @@ def calibrations(
 
 def _write_layers(path: Path, model: Any, result: Any, frame: Any) -> Any:
     """The error of every layer on `frame`, also written to `path`."""
-    from trilane.training.quantising.sqnr import layer_report
+    from trilane.training.quantising.layer_noise import layer_report
     from trilane.writing import write_bytes
 
     with spinner("measuring every layer"):

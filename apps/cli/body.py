@@ -1,6 +1,6 @@
 """`trilane body`: look into body files, pose them, build one.
 
-Rule: this file talks to the person; the work is done in `trilane.body` and `trilane.training.from_anny`.
+Rule: this file talks to the person; the work is done in `trilane.body` and `trilane.training.body_from_anny`.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def inspect(path: BodyFileArgument, json: JsonOption = False) -> None:
 def body_facts(path: Path) -> dict[str, Any]:
     """Counts, size and skinning of a body file. Raises BadInputError."""
     from trilane.body.body import load_body
-    from trilane.body.skinning import WEIGHT_COUNTS, weight_error_bound
+    from trilane.body.skin_weights import WEIGHT_COUNTS, weight_error_bound
 
     body = load_body(path)
     shaped = body.shape()
@@ -164,7 +164,7 @@ def from_anny(
     json: JsonOption = False,
 ) -> None:
     """Build a body in the SMPL-X layout from the open body model `anny`; takes minutes the first time."""
-    from trilane.training.from_anny import write_body
+    from trilane.training.body_from_anny import write_body
 
     with stderr_console().status("building the body from anny"):
         write_body(out)

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from trilane.arrays import U8
-from trilane.avatars.network_file import NetworkFile
-from trilane.avatars.reshape import reshaped
+from trilane.avatars.integer_network import NetworkFile
+from trilane.avatars.network_reshape import reshaped
 from trilane.errors import BadInputError
 from trilane.pipeline.stage import UnitContext
 from trilane.shapes import Shape

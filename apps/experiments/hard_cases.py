@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from trilane.arrays import F32
-from trilane.avatars.network_file import NetworkFile
+from trilane.avatars.integer_network import NetworkFile
 from trilane.errors import MissingPartError
 from trilane.stages.dsp.runtime import RuntimeOptions, load_runtime
 from trilane.training.quantising.quantise import quantise
@@ -56,8 +56,8 @@ def make_pair(name: str) -> Pair:
         import torch
     except ImportError:
         raise MissingPartError("hard cases need PyTorch", extra="train") from None
-    from trilane.training.export import export_onnx
     from trilane.training.network import UNet
+    from trilane.training.onnx_export import export_onnx
 
     norm, outlier, bounds = NETWORKS[name]
     torch.manual_seed(0)

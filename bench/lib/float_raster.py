@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import F64
-from trilane.stages.gpu.camera import FLIP_Y
-from trilane.stages.gpu.mesh import MeshArrays
+from trilane.stages.gpu.camera_matrices import FLIP_Y
+from trilane.stages.gpu.mesh_arrays import MeshArrays
 
 BATCH_SAMPLES = 4_000_000
 

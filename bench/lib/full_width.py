@@ -10,10 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from trilane.avatars.bundle import MANIFEST, Manifest, bundle_folder, load_bundle, network_entry, write_bundle
+from trilane.avatars.bundle import MANIFEST, bundle_folder, load_bundle, write_bundle
+from trilane.avatars.manifest import Manifest, network_entry
 from trilane.bench.lib.networks import untrained
+from trilane.cache import cache_dir
 from trilane.errors import TrilaneError
-from trilane.stages.dsp.runtime import cache_dir
 
 NAME = "resnet18"
 ENCODER, NORM, WIDTH = "resnet18", "batch", 64

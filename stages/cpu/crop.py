@@ -1,4 +1,4 @@
-"""The crop: a rectangle of the screen, the tensor shape that fits it, and the projection that draws just that part.
+"""The crop: a rectangle of the screen, the tensor shape that fits it, and the projection that draws only that part.
 
 Rule: rectangles are x0, y0, x1, y1 in normalised device coordinates, y up; a tensor's pixels are square on the screen.
 """
@@ -13,10 +13,9 @@ from numpy.typing import ArrayLike
 
 from trilane.arrays import F64
 from trilane.errors import BadInputError
+from trilane.shapes import Shape
 
-Shape = tuple[int, int]
-
-#: A body smaller than this on the screen is given a rectangle of this size, in output pixels.
+#: Least height and width of a crop, in output pixels, however small the body is on the screen.
 LEAST_PIXELS = 1.0
 
 
@@ -41,11 +40,15 @@ SCREEN = Rect(-1.0, -1.0, 1.0, 1.0)
 
 
 def choose_bucket(rect: Rect, output: Shape, buckets: Sequence[Shape]) -> tuple[Shape, Rect]:
-    """The bucket that wastes the least area on `rect`, and `rect` grown to the bucket's aspect.
+    """The tensor shape that wastes the least area on `rect`, and `rect` grown to the shape's aspect.
 
-    `output`: (height, width) of the picture in pixels. `buckets`: tensor shapes (height, width). Of equal fits the
-    larger bucket wins. The grown rectangle holds `rect`, keeps its centre if it can and lies on the screen if it fits
-    there; a side longer than the screen's hangs over it on both ends alike. Raises BadInputError without buckets.
+    The grown rectangle holds `rect`. It is moved onto the screen where it fits; a side longer than the screen reaches
+    over both of its edges by the same length. Of two shapes that waste the same area the larger is chosen.
+
+    `rect`: the mesh's rectangle.
+    `output`: (height, width) of the picture in pixels.
+    `buckets`: tensor shapes (height, width) to choose from.
+    Raises BadInputError without buckets.
     """
     if not buckets:
         raise BadInputError("tensor shapes", "none", "at least one")
@@ -72,7 +75,7 @@ def grow(low: float, high: float, length: float) -> tuple[float, float]:
 
 
 def crop_projection(projection: ArrayLike, rect: Rect) -> F64:
-    """(4,4): `projection` (4,4) followed by the map of `rect` onto the whole screen; depth is as it was.
+    """(4,4): `projection` (4,4) followed by the map of `rect` onto the whole screen; depth does not change.
 
     With x' = (2 x - (x0 + x1)) / (x1 - x0) in normalised device coordinates the clip coordinate is
     X' = (2 X - (x0 + x1) W) / (x1 - x0), which is linear, so the crop is exact for any projection.

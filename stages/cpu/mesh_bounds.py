@@ -1,10 +1,11 @@
 """The screen rectangle of a skinned mesh, exact, at a fraction of the cost of skinning it.
 
-Rule: nothing of the mesh that is on the screen lies outside the rectangle; what is behind the near plane or beside the
-screen does not widen it.
+Rule: no part of the mesh that is on the screen lies outside the rectangle; parts behind the near plane or beside the
+screen do not widen it.
 
-Spheres that hold patches of the mesh in any pose (`patches`) say which patches are off the screen, which are cut by the
-near plane, and which can touch the rectangle's sides; only those are looked at more closely, and at last skinned.
+Spheres that hold patches of the mesh in any pose (`mesh_patches`) tell which patches are off the screen, which ones the
+near plane cuts, and which ones can reach the rectangle's sides. Only the last two kinds are looked at in finer patches,
+and only their vertices are skinned.
 """
 
 from __future__ import annotations
@@ -19,11 +20,12 @@ from trilane.arrays import F64, I64, Mask
 from trilane.body.body import ShapedBody
 from trilane.body.joints import JOINTS
 from trilane.body.kinematics import Posed
-from trilane.body.skinning import blend_matrices, largest_weights
+from trilane.body.skin_weights import largest_weights
+from trilane.body.skinning import blend_matrices
 from trilane.stages.cpu.crop import Rect
-from trilane.stages.cpu.patches import Level, build_levels, join
+from trilane.stages.cpu.mesh_patches import Level, build_levels, join
 
-#: Added to every radius, metres, and to every side of the rectangle, NDC, against rounding.
+#: Margins for rounding, added to every radius (metres) and to every side of the rectangle (NDC).
 ROUNDING_M = 1e-4
 ROUNDING_NDC = 1e-6
 _W_LEAST = 1e-9
@@ -31,7 +33,7 @@ _W_LEAST = 1e-9
 
 @dataclass
 class _Extent:
-    """Least and greatest (x, y) seen so far, normalised device coordinates."""
+    """Least and greatest (x, y) of the points added so far, normalised device coordinates."""
 
     low: F64 = field(default_factory=lambda: np.full(2, np.inf))
     high: F64 = field(default_factory=lambda: np.full(2, -np.inf))
@@ -43,12 +45,13 @@ class _Extent:
             np.maximum(self.high, high.max(axis=0), out=self.high)
 
     def widened_by(self, low: F64, high: F64) -> Mask:
-        """(N,): which bounds (N,2) reach over a side that is not yet at the screen's edge."""
+        """(N,) which of the bounds `low`, `high` (N,2) would move a side that is not yet at the screen's edge."""
         return np.asarray(
             (((low < self.low) & (self.low > -1.0)) | ((high > self.high) & (self.high < 1.0))).any(axis=1)
         )
 
     def rect(self) -> Rect | None:
+        """The rectangle, clipped to the screen; None when it is empty."""
         low, high = np.maximum(self.low - ROUNDING_NDC, -1.0), np.minimum(self.high + ROUNDING_NDC, 1.0)
         if not (low < high).all():
             return None
@@ -57,7 +60,10 @@ class _Extent:
 
 @dataclass(frozen=True)
 class _View:
-    """One frame: the camera (4,4) and its rows' norms, each joint's map from rest to clip space (55,16), the pose."""
+    """One frame: the camera, (4,4) to clip space, with the norms of its rows, and the body's pose.
+
+    `per_joint` (55,16): each joint's matrix from rest to clip space. `turned` (54,): |R - I| of joints 1 to 54.
+    """
 
     camera: F64
     norms: F64
@@ -85,15 +91,18 @@ class _View:
 
 
 class MeshBounds:
-    """Bounds of one shaped body, for any pose and camera.
-
-    `weight_count`: the skin weights that are drawn, None for all. `standoff_m`: what is drawn reaches this far from the
-    mesh (clothes, hair). `pose_blend`: pose blend shapes are drawn, if the body has any.
-    """
+    """Bounds of one shaped body, for any pose and camera."""
 
     def __init__(
         self, shaped: ShapedBody, weight_count: int | None = None, standoff_m: float = 0.0, pose_blend: bool = True
     ) -> None:
+        """Cut the body into patches.
+
+        `shaped`: the body.
+        `weight_count`: how many skin weights of a vertex it is drawn with; None for all.
+        `standoff_m`: how far clothes and hair reach from the mesh, metres.
+        `pose_blend`: whether its pose blend shapes, if any, are drawn.
+        """
         body = shaped.body
         weights = body.weights if weight_count is None else largest_weights(body.weights, weight_count).dense()
         self._weights = weights.astype(np.float64)
@@ -106,8 +115,10 @@ class MeshBounds:
     def rect(self, posed: Posed, clip: ArrayLike, vertices: NDArray[np.float32] | None = None) -> Rect | None:
         """The mesh's rectangle on the screen, clipped to it; None when nothing is visible.
 
-        `posed`: rigid transforms of `Skeleton.pose`. `clip` (4,4): projection @ view, of any kind. `vertices` (V,3):
-        the frame's skinned vertices, if there are any: then a body that is wholly on the screen needs no patches.
+        `posed`: the frame, of `Skeleton.pose`.
+        `clip`: (4,4) projection @ view, of any lens.
+        `vertices`: (V,3) the frame's skinned vertices where the caller has them: a body wholly on the screen then needs
+        no patches.
         """
         view = _View.of(posed, clip)
         if vertices is not None and (whole := self._rect_of_whole(vertices, view)) is not None:
@@ -122,7 +133,7 @@ class MeshBounds:
         return seen.rect()
 
     def _rect_of_whole(self, vertices: NDArray[np.float32], view: _View) -> Rect | None:
-        """The rectangle of a body all of which is on the screen; None when any of it may not be."""
+        """The rectangle of a body that is wholly on the screen; None when a part of it may be off the screen."""
         flat = vertices @ view.camera[:, :3].T.astype(np.float32) + view.camera[:, 3].astype(np.float32)
         points = flat.astype(np.float64)
         radius = self._standoff + ROUNDING_M
@@ -137,7 +148,7 @@ class MeshBounds:
         return seen.rect() if (seen.low > -1.0).all() and (seen.high < 1.0).all() else None
 
     def _sort_out(self, level: Level, rows: I64, view: _View, seen: _Extent) -> tuple[I64, I64]:
-        """Of these patches, those that may widen what was seen, and those that the near plane may cut."""
+        """Of the patches `rows`: the indices of those that may widen `seen`, and of those the near plane may cut."""
         radius = level.size[rows] + (self._standoff + ROUNDING_M)
         radius += np.einsum("pj,j->p", level.give[rows], view.turned / np.sqrt(2.0))
         if self._blend is not None:
@@ -146,13 +157,14 @@ class MeshBounds:
         front, cut = _against_near(centres, radius, view)
         low, high = _quotients(centres, radius, view)
         front &= ((high >= -1.0) & (low <= 1.0)).all(axis=1)
-        # Bounds of one vertex of each patch: the centre's own, or what its sphere says when blend shapes move it.
+        # A point of each patch that is surely covered widens the rectangle now, so that fewer patches need refining:
+        # the centre, or where blend shapes may have moved the centre, the inner side of its sphere.
         point = _quotients(centres[front], np.full(int(front.sum()), self._standoff), view)
         seen.add(*(point if self._blend is None else (high[front], low[front])))
         return rows[front][seen.widened_by(low[front], high[front])], rows[cut]
 
     def _project(self, vertices: NDArray[np.integer[Any]], view: _View, blend: bool = True) -> F64:
-        """(N,4) clip coordinates of `vertices` (N,), with or without the pose blend shapes."""
+        """(N,4) clip coordinates of `vertices` (N,); `blend`: apply the pose blend shapes."""
         rest = self._rest[vertices]
         if blend and self._blend is not None:
             rest[:, :3] += np.einsum("naf,f->na", self._blend[vertices], view.posed.feature)
@@ -164,14 +176,17 @@ class MeshBounds:
         seen.add(*_quotients(points, np.full(len(points), self._standoff), view))
 
     def _add_triangles(self, faces: I64, view: _View, seen: _Extent) -> None:
-        """Add triangles that the near plane may cut, clipped to it."""
+        """Add the triangles that the near plane may cut, clipped to it."""
         corners = self._project(self._faces[faces].ravel(), view).reshape(-1, 3, 4)
-        kept = _clip_near(corners, self._standoff * view.near_norm)
-        seen.add(*_quotients(kept, np.full(len(kept), self._standoff), view))
+        clipped = _clip_near(corners, self._standoff * view.near_norm)
+        seen.add(*_quotients(clipped, np.full(len(clipped), self._standoff), view))
 
 
 def _against_near(centres: F64, radius: F64, view: _View) -> tuple[Mask, Mask]:
-    """Which spheres lie wholly in front of the near plane (and of W = 0), and which cross it; neither: out of sight."""
+    """(N,) which spheres lie wholly in front of the near plane (and W = 0), and (N,) which cross it.
+
+    A sphere that is neither is not visible.
+    """
     near, far = centres[:, 3] + centres[:, 2], centres[:, 3] - centres[:, 2]
     within = far + radius * view.far_norm >= 0.0
     front = (near - radius * view.near_norm > 0.0) & (centres[:, 3] - radius * view.norms[3] > _W_LEAST)
@@ -179,7 +194,10 @@ def _against_near(centres: F64, radius: F64, view: _View) -> tuple[Mask, Mask]:
 
 
 def _quotients(points: F64, radius: F64, view: _View) -> tuple[F64, F64]:
-    """Bounds of (X/W, Y/W) over spheres: X, Y and W are linear, so each moves by the radius times its row's norm."""
+    """Least and greatest (X/W, Y/W), each (N,2), over spheres of `radius` (N,) about clip coordinates `points` (N,4).
+
+    X, Y and W are linear in the point, so over a sphere each varies by the radius times the norm of its matrix row.
+    """
     reach = radius[:, None] * view.norms[:2]
     least = np.maximum(points[:, 3] - radius * view.norms[3], _W_LEAST)[:, None]
     most = np.maximum(points[:, 3] + radius * view.norms[3], _W_LEAST)[:, None]
@@ -188,12 +206,15 @@ def _quotients(points: F64, radius: F64, view: _View) -> tuple[F64, F64]:
 
 
 def _clip_near(triangles: F64, slack: float) -> F64:
-    """(N,4) clip coordinates: corners in front of the near plane, moved back by `slack`, and where edges cross it."""
+    """(N,4) clip coordinates of the corners in front of the near plane, and of the points where edges cross it.
+
+    `triangles` (F,3,4). `slack`: how far the plane is moved back, in clip coordinates.
+    """
     near = triangles[:, :, 2] + triangles[:, :, 3] + slack
-    kept = [triangles[near > 0.0]]
+    points = [triangles[near > 0.0]]
     for a, b in ((0, 1), (1, 2), (2, 0)):
         crosses = (near[:, a] > 0.0) != (near[:, b] > 0.0)
         start, end = triangles[crosses, a], triangles[crosses, b]
         share = near[crosses, a] / (near[crosses, a] - near[crosses, b])
-        kept.append(start + share[:, None] * (end - start))
-    return np.concatenate(kept)
+        points.append(start + share[:, None] * (end - start))
+    return np.concatenate(points)

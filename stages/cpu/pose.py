@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from trilane.avatars.bundle import CLOTHES_STANDOFF_M
 from trilane.body.kinematics import Posed, Skeleton
 from trilane.body.skinning import FrameSkinner
 from trilane.errors import TrilaneError
@@ -26,9 +27,6 @@ from trilane.stages.cpu.mesh_bounds import MeshBounds
 from trilane.stages.cpu.tensor_layout import lay_out
 from trilane.stages.packets import posed_vertices
 from trilane.transport.packets import Packet
-
-#: Clothes and hair reach this far from the body, metres; training crops with the same.
-STANDOFF_M = 0.045
 
 
 @dataclass(frozen=True)
@@ -50,7 +48,7 @@ class PoseStage:
         self._buckets = config.buckets
         folders = distinct(config)
         bodies = {folder: shaped_body(assets, number) for number, folder in enumerate(folders)}
-        bounds = {folder: MeshBounds(body, standoff_m=STANDOFF_M) for folder, body in bodies.items()}
+        bounds = {folder: MeshBounds(body, standoff_m=CLOTHES_STANDOFF_M) for folder, body in bodies.items()}
         staged = staged_of(assets)
         self._actors = [
             _Actor(

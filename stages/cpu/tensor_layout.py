@@ -1,8 +1,8 @@
 """Where each avatar's crop lies in the tensor that all avatars of a frame share.
 
-Rule: one visible avatar has the whole tensor. Several are drawn at one scale, so each has a share of the tensor in
-proportion to its area on the screen, on shelves, at least `MARGIN_PX` of background apart. Tensor pixels are square on
-the screen.
+Rule: one visible avatar has the whole tensor. Several are drawn at one scale in rows, so each has a share of the tensor
+in proportion to its area on the screen, with at least `MARGIN_PX` of background between them. Tensor pixels are square
+on the screen.
 """
 
 from __future__ import annotations
@@ -12,13 +12,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from trilane.errors import BadInputError
-from trilane.stages.cpu.crop import LEAST_PIXELS, Rect, Shape, choose_bucket, grow
+from trilane.shapes import Shape
+from trilane.stages.cpu.crop import LEAST_PIXELS, Rect, choose_bucket, grow
 
 #: top, left, height, width in tensor pixels.
 Cell = tuple[int, int, int, int]
 
-#: Background between two avatars, tensor pixels: at this distance the default network paints one as if the other were
-#: not there. Measured by `trilane bench several`; docs/decisions/several-avatars.md has the figures.
+#: Background between two avatars, tensor pixels: at this distance the default network paints each as if the other were
+#: not there. Measured by `trilane bench several`; the numbers are in docs/decisions/several-avatars.md.
 MARGIN_PX = 16
 
 
@@ -31,8 +32,8 @@ class TensorLayout:
 
 
 @dataclass(frozen=True)
-class _Shelves:
-    """Avatars by number, row by row, in a tensor of `shape`; `scale`: tensor pixels for one output pixel."""
+class _Arrangement:
+    """`rows`: the avatars' numbers, row by row, in a tensor of `shape`. `scale`: tensor pixels for one output pixel."""
 
     shape: Shape
     rows: tuple[tuple[int, ...], ...]
@@ -40,16 +41,19 @@ class _Shelves:
 
 
 def lay_out(rects: Sequence[Rect], output: Shape, buckets: Sequence[Shape], margin_px: int = MARGIN_PX) -> TensorLayout:
-    """Place the visible avatars' mesh rectangles; `output` (height, width) of the picture in pixels.
+    """Place the visible avatars in one tensor. Where the tensor is too small for them, their margins shrink.
 
-    Of several avatars in a tensor too small for them and their margins, the margins shrink. At least one rectangle and
-    one bucket; raises BadInputError without buckets, or when no bucket has a pixel for every avatar.
+    `rects`: the avatars' mesh rectangles on the screen, at least one.
+    `output`: (height, width) of the picture in pixels.
+    `buckets`: tensor shapes (height, width) to choose from.
+    `margin_px`: background between two avatars, tensor pixels.
+    Raises BadInputError without buckets, or when no bucket has a pixel for every avatar.
     """
     if len(rects) == 1:
         shape, grown = choose_bucket(rects[0], output, buckets)
         return TensorLayout(shape, ((grown, (0, 0, *shape)),))
     sizes = [(max(r.height * output[0] / 2, LEAST_PIXELS), max(r.width * output[1] / 2, LEAST_PIXELS)) for r in rects]
-    best = max(_arrangements(sizes, buckets, margin_px), key=lambda shelves: shelves.scale, default=None)
+    best = max(_arrangements(sizes, buckets, margin_px), key=lambda arrangement: arrangement.scale, default=None)
     if best is not None and best.scale > 0:
         return TensorLayout(best.shape, _crops(rects, sizes, output, best, margin_px))
     if margin_px == 0:
@@ -59,34 +63,36 @@ def lay_out(rects: Sequence[Rect], output: Shape, buckets: Sequence[Shape], marg
     return lay_out(rects, output, buckets, margin_px // 2)
 
 
-def _arrangements(sizes: Sequence[tuple[float, float]], buckets: Sequence[Shape], margin: int) -> Iterator[_Shelves]:
-    """Every bucket with the avatars, the tallest first, on one to as many shelves as there are avatars."""
+def _arrangements(
+    sizes: Sequence[tuple[float, float]], buckets: Sequence[Shape], margin: int
+) -> Iterator[_Arrangement]:
+    """In every bucket, the avatars, tallest first, in one row, in two rows, and so on up to a row for each."""
     order = sorted(range(len(sizes)), key=lambda k: -sizes[k][0])
     for count in range(1, len(order) + 1):
         each = math.ceil(len(order) / count)
         rows = tuple(tuple(order[start : start + each]) for start in range(0, len(order), each))
         for shape in buckets:
-            yield _Shelves(shape, rows, _scale(sizes, shape, rows, margin))
+            yield _Arrangement(shape, rows, _scale(sizes, shape, rows, margin))
 
 
 def _scale(sizes: Sequence[tuple[float, float]], shape: Shape, rows: Sequence[Sequence[int]], margin: int) -> float:
-    """The largest scale at which everything fits; a pixel is kept for rounding every side up."""
+    """The largest scale at which all rows fit; one pixel of each side is reserved for rounding up."""
     high = (shape[0] - margin * (len(rows) - 1) - len(rows)) / sum(max(sizes[k][0] for k in row) for row in rows)
     wide = ((shape[1] - margin * (len(row) - 1) - len(row)) / sum(sizes[k][1] for k in row) for row in rows)
     return min(high, *wide)
 
 
 def _crops(
-    rects: Sequence[Rect], sizes: Sequence[tuple[float, float]], output: Shape, shelves: _Shelves, margin: int
+    rects: Sequence[Rect], sizes: Sequence[tuple[float, float]], output: Shape, arrangement: _Arrangement, margin: int
 ) -> tuple[tuple[Rect, Cell], ...]:
     """Crop rectangle and cell of each avatar, in the order of `rects`."""
     placed: dict[int, tuple[Rect, Cell]] = {}
     top = 0
-    for row in shelves.rows:
+    for row in arrangement.rows:
         left = 0
         for k in row:
-            height, width = (math.ceil(side * shelves.scale) for side in sizes[k])
-            placed[k] = _grown(rects[k], output, (height, width), shelves.scale), (top, left, height, width)
+            height, width = (math.ceil(side * arrangement.scale) for side in sizes[k])
+            placed[k] = _grown(rects[k], output, (height, width), arrangement.scale), (top, left, height, width)
             left += width + margin
         top += max(cell[2] for _, cell in (placed[k] for k in row)) + margin
     return tuple(placed[k] for k in range(len(rects)))

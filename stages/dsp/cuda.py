@@ -1,7 +1,9 @@
-"""ONNX Runtime on an NVIDIA GPU. Rule: the whole graph runs on the GPU or nothing does; no node falls back to the CPU.
+"""The runtime `cuda`: ONNX Runtime on an NVIDIA GPU.
 
-ONNX Runtime has no integer layers for CUDA: a layer's sum is computed in float, from the same bytes to the same bytes.
-A slot is copied to the GPU and back, which `bind` cannot spare: its memory is not the GPU's.
+Rule: every node of the graph runs on the GPU; when one cannot, loading fails, and none falls back to the CPU.
+
+ONNX Runtime has no integer layers for CUDA: it computes a layer's sum in float, from the same bytes to the same bytes.
+Slots are copied to the GPU and back in every run, because the GPU cannot read their memory directly.
 """
 
 from __future__ import annotations
@@ -11,7 +13,7 @@ from functools import cache
 import onnxruntime
 from onnx import TensorProto, helper
 
-from trilane.avatars.network_file import IntegerNetwork, check_integer_layers
+from trilane.avatars.integer_network import IntegerNetwork, check_integer_layers
 from trilane.errors import BadInputError, MissingPartError
 from trilane.stages.dsp.ort import ERRORS_ONLY, LOAD_ERRORS, OrtSession
 from trilane.stages.dsp.runtime import RuntimeOptions, cuda_line
@@ -22,9 +24,9 @@ SILENT = 4
 
 
 def load(network: IntegerNetwork, options: RuntimeOptions) -> OrtSession:
-    """Compile `network` for the GPU; `options.device`: the provider's own settings.
+    """Compile `network` for the GPU; `options.device`: settings of the CUDA provider.
 
-    Raises BadInputError when a node of it does not run there, MissingPartError when there is no GPU that works.
+    Raises BadInputError when a node of it does not run there, MissingPartError when no GPU works.
     """
     _check_gpu()
     check_integer_layers(network)
@@ -41,7 +43,7 @@ def load(network: IntegerNetwork, options: RuntimeOptions) -> OrtSession:
 
 @cache
 def _check_gpu() -> None:
-    """Raises MissingPartError when the provider cannot be made: without it ONNX Runtime goes on without a word."""
+    """Raises MissingPartError when the CUDA provider cannot be loaded; ONNX Runtime itself reports no error then."""
     values = [helper.make_tensor_value_info(name, TensorProto.UINT8, [1]) for name in ("x", "y")]
     graph = helper.make_graph([helper.make_node("Identity", ["x"], ["y"])], "probe", values[:1], values[1:])
     probe = helper.make_model(graph, opset_imports=[helper.make_opsetid("", PROBE_OPSET)], ir_version=PROBE_IR)

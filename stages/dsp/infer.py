@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from trilane.arrays import U8
-from trilane.avatars.network_file import NetworkFile
-from trilane.avatars.split import NetworkPart
+from trilane.avatars.integer_network import NetworkFile
+from trilane.avatars.network_split import NetworkPart
 from trilane.errors import BadInputError
 from trilane.pipeline.stage import UnitContext
 from trilane.shapes import Shape
@@ -108,6 +108,6 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> InferStage:
 
 
 def _bound(session: Session, part: NetworkPart, source: U8, target: U8) -> BoundPart:
-    given, handed_on = views(source, part.given), views(target, part.handed_on)
+    given, handed_on = views(source, part.crossing_in), views(target, part.crossing_out)
     binding = session.bind([given[name] for name in part.inputs], [handed_on[name] for name in part.outputs])
     return BoundPart(binding, [(given[name], handed_on[name]) for name in handed_on if name not in part.outputs])

@@ -1,6 +1,6 @@
-"""OpenVINO on the CPU, reading and writing the slots' own memory.
+"""The runtime `openvino`: OpenVINO on the CPU, which reads and writes the slots' own memory.
 
-Rule: after the first run of a session nothing is allocated and nothing is copied; no convolution runs in float.
+Rule: after the first run of a session nothing is allocated and nothing is copied; no layer runs in float.
 """
 
 from __future__ import annotations
@@ -12,9 +12,10 @@ from typing import Any
 import openvino
 
 from trilane.arrays import U8
-from trilane.avatars.network_file import IntegerNetwork
+from trilane.avatars.integer_network import IntegerNetwork
+from trilane.cache import cache_dir
 from trilane.errors import BadInputError
-from trilane.stages.dsp.runtime import RuntimeOptions, cache_dir
+from trilane.stages.dsp.runtime import RuntimeOptions
 
 DEVICE = "CPU"
 LAYERS = {"Convolution", "Deconvolution", "FullyConnected", "MatMul"}
@@ -24,7 +25,7 @@ REMEDY = ("integer layers", "quantise them")
 
 
 class OpenvinoBinding:
-    """One infer request with all its tensors set."""
+    """One infer request whose tensors are the bound buffers."""
 
     def __init__(self, compiled: Any, inputs: Sequence[U8], outputs: Sequence[U8]) -> None:
         self._tensors = [openvino.Tensor(array, shared_memory=True) for array in (*inputs, *outputs)]
@@ -48,7 +49,7 @@ class OpenvinoSession:
 
 
 def load(network: IntegerNetwork, options: RuntimeOptions) -> OpenvinoSession:
-    """Compile `network`. Raises BadInputError when OpenVINO cannot, or leaves a layer in float."""
+    """Compile `network`. Raises BadInputError when OpenVINO cannot load it or would run a layer in float."""
     settings = {
         "PERFORMANCE_HINT": "LATENCY",
         "INFERENCE_NUM_THREADS": options.threads,
@@ -66,7 +67,7 @@ def load(network: IntegerNetwork, options: RuntimeOptions) -> OpenvinoSession:
 
 @cache
 def _core() -> Any:
-    """One core for all shapes. Its cache is keyed by network, settings, OpenVINO version and CPU."""
+    """OpenVINO's core, one for all shapes. It finds compiled networks by network, settings, version and CPU."""
     core = openvino.Core()
     folder = cache_dir("openvino")
     if folder is not None:
@@ -79,14 +80,14 @@ def version() -> str:
 
 
 def _check_integer(compiled: Any, network: IntegerNetwork) -> None:
-    left = set()
+    float_layers = set()
     for op in compiled.get_runtime_model().get_ops():
         info = op.get_rt_info()
         if _text(info, "layerType") in LAYERS and _text(info, "runtimePrecision").lower() not in INTEGERS:
-            left.add(op.get_friendly_name().removesuffix(WITHOUT_BIAS))
-    left -= network.float_layers
-    if left:
-        raise BadInputError(network.where, f"layers left in float: {', '.join(sorted(left))}", *REMEDY)
+            float_layers.add(op.get_friendly_name().removesuffix(WITHOUT_BIAS))
+    float_layers -= network.float_layers
+    if float_layers:
+        raise BadInputError(network.where, f"layers left in float: {', '.join(sorted(float_layers))}", *REMEDY)
 
 
 def _text(info: Any, key: str) -> str:

@@ -1,6 +1,6 @@
-"""ONNX Runtime on the CPU, reading and writing the slots' own memory.
+"""The runtime `ort`: ONNX Runtime on the CPU, which reads and writes the slots' own memory.
 
-Rule: after the first run of a session nothing is allocated and nothing is copied; no convolution runs in float.
+Rule: after the first run of a session nothing is allocated and nothing is copied; no layer runs in float.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import onnxruntime
 from onnxruntime.capi import onnxruntime_pybind11_state as state
 
 from trilane.arrays import U8
-from trilane.avatars.network_file import IntegerNetwork, node_name
+from trilane.avatars.integer_network import IntegerNetwork, node_name
 from trilane.errors import BadInputError
 from trilane.stages.dsp.runtime import RuntimeOptions
 
@@ -34,7 +34,7 @@ ERRORS_ONLY = 3
 
 
 class OrtBinding:
-    """One IOBinding on the buffers' addresses."""
+    """An ONNX Runtime IOBinding to the buffers' addresses."""
 
     def __init__(self, session: onnxruntime.InferenceSession, inputs: Sequence[U8], outputs: Sequence[U8]) -> None:
         self._buffers = (*inputs, *outputs)
@@ -50,7 +50,7 @@ class OrtBinding:
 
 
 class OrtSession:
-    """One inference session with threads of its own."""
+    """One inference session, which has its own threads."""
 
     def __init__(self, session: onnxruntime.InferenceSession) -> None:
         self._session = session
@@ -60,7 +60,7 @@ class OrtSession:
 
 
 def load(network: IntegerNetwork, options: RuntimeOptions) -> OrtSession:
-    """Compile `network`. Raises BadInputError when ONNX Runtime cannot, or leaves a layer in float."""
+    """Compile `network`. Raises BadInputError when ONNX Runtime cannot load it or would run a layer in float."""
     with tempfile.TemporaryDirectory(prefix="trilane-ort-") as folder:
         optimised = Path(folder) / "optimised.onnx"
         settings = _settings(options)
@@ -78,12 +78,12 @@ def version() -> str:
 
 
 def check_integer(optimised: onnx.ModelProto, network: IntegerNetwork) -> None:
-    """Raises BadInputError naming the layers of the optimised graph of `network` that still compute in float."""
+    """Raises BadInputError naming the layers that compute in float in `optimised`, the optimised graph of `network`."""
     layers = {node_name(node) for node in optimised.graph.node if node.op_type in FLOAT_LAYERS}
-    left = sorted(layers - network.float_layers)
-    if left:
+    float_layers = sorted(layers - network.float_layers)
+    if float_layers:
         raise BadInputError(
-            network.where, f"layers left in float: {', '.join(left)}", "integer layers", "quantise them"
+            network.where, f"layers left in float: {', '.join(float_layers)}", "integer layers", "quantise them"
         )
 
 

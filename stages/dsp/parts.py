@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 
 from trilane.arrays import U8
-from trilane.avatars.network_file import NetworkFile
-from trilane.avatars.reshape import reshaped
-from trilane.avatars.split import NetworkPart, Shapes, split
+from trilane.avatars.integer_network import NetworkFile
+from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.network_split import NetworkPart, Shapes, split
 from trilane.shapes import Shape
 from trilane.stages.config import RunConfig
 
@@ -27,7 +27,7 @@ def crossing_bytes(config: RunConfig, network: NetworkFile) -> list[int]:
     """Bytes that cross each cut of `network`, for the scene's shape that needs most. Raises BadInputError."""
     if not config.cuts:
         return []
-    shapes = [[part.handed_on for part in parts_for(config, network, shape)[:-1]] for shape in config.buckets]
+    shapes = [[part.crossing_out for part in parts_for(config, network, shape)[:-1]] for shape in config.buckets]
     return [max(extent(crossing) for crossing in crossings) for crossings in zip(*shapes, strict=True)]
 
 

@@ -1,6 +1,6 @@
-"""Qualcomm's HTP backend through ONNX Runtime: the Hexagon of a Snapdragon, or its emulator on x86 Linux.
+"""The runtime `qnn`: Qualcomm's HTP through ONNX Runtime, on the Hexagon of a Snapdragon or its emulator on x86 Linux.
 
-Rule: the whole graph runs on the HTP or nothing does; no node falls back to the CPU.
+Rule: every node of the graph runs on the HTP; when one cannot, loading fails, and none falls back to the CPU.
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ from typing import Any
 import onnxruntime
 import onnxruntime_qnn
 
-from trilane.avatars.network_file import IntegerNetwork, NetworkFile, check_integer_layers
+from trilane.avatars.integer_network import IntegerNetwork, NetworkFile, check_integer_layers
+from trilane.cache import cache_dir
 from trilane.errors import BadInputError, MissingPartError
 from trilane.stages.dsp.ort import ERRORS_ONLY, LOAD_ERRORS, OrtSession
-from trilane.stages.dsp.runtime import RuntimeOptions, cache_dir
+from trilane.stages.dsp.runtime import RuntimeOptions
 from trilane.writing import write_atomically
 
 NAME = onnxruntime_qnn.get_ep_name()
@@ -29,7 +30,7 @@ DEFAULTS = {**SOCS["sm8350"], "htp_performance_mode": "burst"}
 
 
 def load(network: IntegerNetwork, options: RuntimeOptions) -> OrtSession:
-    """Compile `network` for the HTP, or take what was compiled before.
+    """Compile `network` for the HTP, or load the compiled network from the cache.
 
     Raises BadInputError when a node of it does not run there in integers.
     """
@@ -39,7 +40,7 @@ def load(network: IntegerNetwork, options: RuntimeOptions) -> OrtSession:
     if folder is None:
         return OrtSession(_session(network.where, source, device, {}))
     compiled = folder / f"{_key(network, device)}.onnx"
-    with contextlib.suppress(OSError, BadInputError):  # not there, or spoilt: it is compiled again
+    with contextlib.suppress(OSError, BadInputError):  # missing or damaged: it is compiled again
         return OrtSession(_session(network.where, compiled.read_bytes(), device, {}))
     with write_atomically(compiled) as draft:
         session = _session(network.where, source, device, _context(draft))
@@ -47,7 +48,10 @@ def load(network: IntegerNetwork, options: RuntimeOptions) -> OrtSession:
 
 
 def write_context(network: NetworkFile, soc: str, path: Path) -> None:
-    """Write `network` compiled for `soc` as an ONNX file that embeds the HTP context binary. Raises BadInputError."""
+    """Write `network`, compiled for `soc`, as an ONNX file at `path` that embeds the HTP's context binary.
+
+    Raises BadInputError for an unknown `soc` or a network that does not run on the HTP in integers.
+    """
     if soc not in SOCS:
         raise BadInputError("soc", repr(soc), f"one of {', '.join(SOCS)}")
     check_integer_layers(network)
@@ -60,13 +64,13 @@ def version() -> str:
 
 
 def _key(network: IntegerNetwork, device: Mapping[str, str]) -> str:
-    """What a compiled network depends on, as a file name."""
+    """A file name from everything that a compiled network depends on."""
     parts = (network.digest, version(), platform.machine(), *(f"{key}={device[key]}" for key in sorted(device)))
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 
 def _context(path: Path) -> dict[str, str]:
-    """Entries that make a session write what it compiled."""
+    """Session entries that make ONNX Runtime write the compiled network to `path`."""
     return {"ep.context_enable": "1", "ep.context_embed_mode": "1", "ep.context_file_path": str(path)}
 
 

@@ -1,12 +1,11 @@
-"""What runs an integer network: the protocol every runtime keeps, and the table of those there are.
+"""Runtimes, which run an integer network: the protocol that each of them offers, and the table of all of them.
 
-Rule: a runtime is chosen by name and is what runs, or the run stops and says so; none falls back to another.
+Rule: a runtime is chosen by name; it runs the network or the run stops with an error. None falls back to another.
 """
 
 from __future__ import annotations
 
 import importlib.util
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -15,16 +14,16 @@ from pathlib import Path
 from typing import Protocol
 
 from trilane.arrays import U8
-from trilane.avatars.network_file import IntegerNetwork
+from trilane.avatars.integer_network import IntegerNetwork
 from trilane.errors import BadInputError, MissingPartError
 from trilane.install import install_line, package_line, pip
 
 
 @dataclass(frozen=True)
 class RuntimeOptions:
-    """`threads`: that compute, this process's own included. `spin`: may they spin between jobs.
+    """`threads`: that compute, the calling one included. `spin`: whether they may spin between jobs.
 
-    `device`: settings of a runtime's own, by its own names, such as `htp_arch` of `qnn`.
+    `device`: settings that only one runtime has, by its own names, such as `htp_arch` of `qnn`.
     """
 
     threads: int = 1
@@ -43,25 +42,28 @@ class Session(Protocol):
     """A loaded network of one shape."""
 
     def bind(self, inputs: Sequence[U8], outputs: Sequence[U8]) -> Binding:
-        """Bind buffers, C-contiguous, in the network's order; all must outlive the binding.
+        """Bind C-contiguous buffers, in the order of the network's inputs and outputs; they must outlive the binding.
 
-        A whole network has one input (N, H, W, C) and one output (N, H, W, 4); a part has those of its cuts.
+        A whole network has one input (N, H, W, C) and one output (N, H, W, 4); a part has the tensors of its cuts.
         """
 
 
 class Runtime(Protocol):
-    """A module of this folder."""
+    """What each runtime's module of this folder offers."""
 
     def load(self, network: IntegerNetwork, options: RuntimeOptions) -> Session:
-        """Compile for the network's own shape. Raises BadInputError naming a node that it cannot run in integers."""
+        """Compile `network` for its shape. Raises BadInputError naming a node that it cannot run in integers."""
 
     def version(self) -> str:
-        """Of the library, as it is installed."""
+        """Name and version of the installed library."""
 
 
 @dataclass(frozen=True)
 class RuntimeEntry:
-    """Where a runtime lives, the package that it needs, a file that this package must hold, and how to get that."""
+    """A runtime: its module, the package it needs, the command that installs it, and a file the package must contain.
+
+    `file`: relative to the package's folder; empty when the package alone suffices.
+    """
 
     module: str
     package: str
@@ -70,6 +72,7 @@ class RuntimeEntry:
 
     @property
     def is_installed(self) -> bool:
+        """Whether the package, and its `file`, are there."""
         spec = importlib.util.find_spec(self.package)
         return spec is not None and (not self.file or (Path(spec.origin or "").parent / self.file).is_file())
 
@@ -94,12 +97,12 @@ RUNTIMES = {
 
 
 def installed() -> Sequence[str]:
-    """Names of the runtimes whose package is present."""
+    """Names of the runtimes that are installed."""
     return [name for name, entry in RUNTIMES.items() if entry.is_installed]
 
 
 def resolve(name: str) -> str:
-    """`name`, which is an installed runtime. Raises BadInputError, MissingPartError."""
+    """`name` itself. Raises BadInputError when it is no runtime, MissingPartError when the runtime is not installed."""
     if name not in RUNTIMES:
         raise BadInputError("runtime", f"{name!r}", f"one of {', '.join(RUNTIMES)}")
     entry = RUNTIMES[name]
@@ -110,17 +113,6 @@ def resolve(name: str) -> str:
 
 
 def load_runtime(name: str) -> Runtime:
-    """The module of runtime `name`. Raises BadInputError, MissingPartError."""
+    """The module of runtime `name`. Raises as `resolve`."""
     module: Runtime = import_module(RUNTIMES[resolve(name)].module)
     return module
-
-
-def cache_dir(name: str) -> Path | None:
-    """Where compiled networks of runtime `name` are kept: under XDG_CACHE_HOME. None when it cannot be written."""
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    folder = Path(home) / "trilane" / name
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return None
-    return folder if os.access(folder, os.W_OK) else None

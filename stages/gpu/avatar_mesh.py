@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from trilane.body.body import Body, ShapedBody
-from trilane.body.skinning import WEIGHT_COUNTS, largest_weights
+from trilane.body.skin_weights import WEIGHT_COUNTS, largest_weights
 from trilane.cache import Arrays, cached_arrays
-from trilane.stages.gpu.mesh import MeshArrays, mesh_arrays
+from trilane.stages.gpu.mesh_arrays import MeshArrays, mesh_arrays
 
 LARGEST_LOSS = 1e-3  # of a vertex's weight
 VERSION = "avatar mesh 1"  # to be raised when the same body gives other arrays

@@ -16,7 +16,7 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from trilane.arrays import U8
 from trilane.errors import BadInputError, reason
 from trilane.files import require_file
-from trilane.stages.gpu.video import VideoReader
+from trilane.stages.gpu.video_reader import VideoReader
 
 Shape = tuple[int, int]
 

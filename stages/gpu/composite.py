@@ -20,14 +20,14 @@ from trilane.scene.schema import PlaneSpec, Scene
 from trilane.shapes import Shape
 from trilane.stages.avatar_assets import distinct, shaped_body, staged_of
 from trilane.stages.config import RunConfig
-from trilane.stages.gpu import gl
+from trilane.stages.gpu import opengl_calls
 from trilane.stages.gpu.background import Background, open_background
-from trilane.stages.gpu.camera import eye_of
-from trilane.stages.gpu.context import CONTEXT, checked, open_context
-from trilane.stages.gpu.hud import Hud
-from trilane.stages.gpu.painters import AvatarPainter, PicturePainter, RoomPainter, ShadowPainter
-from trilane.stages.gpu.planes import PlanePainter
-from trilane.stages.gpu.shadow import DISCS, floor_discs
+from trilane.stages.gpu.camera_matrices import eye_of
+from trilane.stages.gpu.composite_painters import AvatarPainter, PicturePainter, RoomPainter, ShadowPainter
+from trilane.stages.gpu.contact_shadows import DISCS, floor_discs
+from trilane.stages.gpu.detected_planes import PlanePainter
+from trilane.stages.gpu.head_up_display import Hud
+from trilane.stages.gpu.opengl_context import CONTEXT, checked, open_context
 from trilane.transport.packets import Packet
 
 ROOM = "room"
@@ -57,7 +57,7 @@ class CompositeStage:
         hud: bool = False,
     ) -> None:
         self._ctx, self._shape, self._rest, self._background = ctx, shape, rest, background
-        colour = ctx.texture(shape[::-1], 4, internal_format=gl.SRGB8_ALPHA8)
+        colour = ctx.texture(shape[::-1], 4, internal_format=opengl_calls.SRGB8_ALPHA8)
         self._target = ctx.framebuffer([colour])
         self._room = RoomPainter(ctx, eyes) if background is None else None
         self._picture = None if background is None else PicturePainter(ctx, shape)

@@ -20,9 +20,9 @@ from trilane.stages.avatar_assets import distinct, quantisation_of, shaped_body,
 from trilane.stages.config import RunConfig
 from trilane.stages.cpu.crop import Rect, crop_projection
 from trilane.stages.gpu.avatar_mesh import avatar_mesh
-from trilane.stages.gpu.context import CONTEXT, checked, describe, open_context
-from trilane.stages.gpu.mesh import Mesh, PosedMesh, SkinnedMesh
-from trilane.stages.gpu.packed import PackedAvatar, PackedPass, Placement
+from trilane.stages.gpu.opengl_context import CONTEXT, checked, describe, open_context
+from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement
+from trilane.stages.gpu.skinned_mesh import Mesh, PosedMesh, SkinnedMesh
 from trilane.stages.packets import posed_vertices
 from trilane.transport.packets import Packet
 

@@ -1,4 +1,4 @@
-"""What every runtime keeps: same picture, the slots' own memory, no allocation, integer layers, named errors."""
+"""Every runtime: same picture, the slots' own memory, no allocation, integer layers, errors that name the node."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ import pytest
 from onnx import helper, numpy_helper
 from onnx.reference import ReferenceEvaluator
 
-from trilane.avatars.network_file import check_network
-from trilane.avatars.reshape import reshaped
-from trilane.avatars.split import cuts, split
+from trilane.avatars.network_checks import check_network
+from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.network_split import cuts, split
 from trilane.errors import BadInputError, MissingPartError
 from trilane.stages.dsp import runtime
 from trilane.stages.dsp.runtime import RUNTIMES, RuntimeOptions, load_runtime
@@ -25,7 +25,7 @@ from trilane.training.quantising.quantise import quantise
 #: The first whose DequantizeLinear the evaluator has; the operators used mean the same as in the files' own.
 EVALUATOR_OPSET = 19
 
-#: Largest and mean difference in bytes: the network rounds alike, but there is more than one way to a sigmoid.
+#: Largest and mean difference in bytes: the network rounds alike, but runtimes compute the sigmoid in different ways.
 LIMITS = {"openvino": (1, 0.05), "ort": (0, 0.0), "qnn": (0, 0.0), "cuda": (1, 0.05)}
 #: The emulator needs about 30 ms for a frame of the tiny network.
 FRAMES = {"openvino": 1000, "ort": 1000, "qnn": 20, "cuda": 1000}
@@ -84,10 +84,10 @@ def test_every_bucket_shape_runs(name, module, tiny_quantised):
 
 
 def test_a_batch_gives_the_bytes_of_its_frames(module, tiny_quantised):
-    one, three = (reshaped(tiny_quantised.network, 64, 64, batch=count) for count in (1, 3))
+    single, three = (reshaped(tiny_quantised.network, 64, 64, batch=count) for count in (1, 3))
     tensor = np.random.default_rng(0).integers(0, 256, three.shape, dtype=np.uint8)
-    found = picture(module, three, tensor)
-    assert (found == np.concatenate([picture(module, one, frame[None]) for frame in tensor])).all()
+    pictures = picture(module, three, tensor)
+    assert (pictures == np.concatenate([picture(module, single, frame[None]) for frame in tensor])).all()
 
 
 def test_parts_give_the_bytes_of_the_whole(module, tiny_quantised):
@@ -95,7 +95,7 @@ def test_parts_give_the_bytes_of_the_whole(module, tiny_quantised):
     tensor = np.random.default_rng(0).integers(0, 256, network.shape, dtype=np.uint8)
     places = [cut.at for cut in cuts(network)]
     first, second = split(network, [places[len(places) // 2]])
-    known = dict.fromkeys(first.given, tensor) | {
+    known = dict.fromkeys(first.crossing_in, tensor) | {
         name: np.empty(shape, np.uint8) for name, shape in first.outputs.items()
     }
     image = np.empty((*network.shape[:3], 4), np.uint8)
@@ -104,17 +104,17 @@ def test_parts_give_the_bytes_of_the_whole(module, tiny_quantised):
     assert (image == picture(module, network, tensor)).all()
 
 
-def test_what_qnn_compiled_is_kept_and_made_anew_when_spoilt(skip_without, tiny_quantised, monkeypatch, tmp_path):
+def test_a_damaged_compiled_network_of_qnn_is_compiled_again(skip_without, tiny_quantised, monkeypatch, tmp_path):
     skip_without("qnn")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     module, network = load_runtime("qnn"), tiny_quantised.network
     tensor = np.random.default_rng(0).integers(0, 256, network.shape, dtype=np.uint8)
     first = picture(module, network, tensor)
-    (kept,) = (tmp_path / "trilane" / "qnn").iterdir()
+    (compiled,) = (tmp_path / "trilane" / "qnn").iterdir()
     assert (picture(module, network, tensor) == first).all()
-    kept.write_bytes(b"spoilt")
+    compiled.write_bytes(b"damaged")
     assert (picture(module, network, tensor) == first).all()
-    assert len(kept.read_bytes()) > 1000
+    assert len(compiled.read_bytes()) > 1000
 
 
 def test_a_binding_reads_and_writes_the_slots_themselves(module, tiny_quantised, tiny_frames):

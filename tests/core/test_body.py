@@ -58,7 +58,7 @@ def test_full_files_keep_expression_at_300(tmp_path: Path, body_arrays: Arrays) 
 
 
 def test_zero_pose_blend_shapes_cost_nothing(tmp_path: Path, body_arrays: Arrays) -> None:
-    """All-zero pose blend shapes are told apart and not held."""
+    """All-zero pose blend shapes are recognised and take no memory."""
     body = load(tmp_path, body_arrays | {"posedirs": np.zeros((90, 3, 486))})
     assert body.posedirs is None
     assert not body.has_pose_blend_shapes

@@ -8,7 +8,8 @@ import shutil
 import numpy as np
 import pytest
 
-from trilane.avatars.bundle import Manifest, load_bundle, network_entry, write_bundle
+from trilane.avatars.bundle import load_bundle, write_bundle
+from trilane.avatars.manifest import Manifest, network_entry
 from trilane.errors import BadInputError
 
 

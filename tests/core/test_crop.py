@@ -69,7 +69,7 @@ def test_standing_bodies_get_tall_tensors() -> None:
 
 
 def test_one_pixel_and_ten_thousand_pixel_bodies() -> None:
-    """A point gets a rectangle of at least one output pixel; a rectangle beyond the screen is held too."""
+    """A point gets a rectangle of at least one output pixel; a rectangle larger than the screen is enclosed too."""
     _, small = choose_bucket(Rect(0.3, 0.3, 0.3, 0.3), (480, 640), [(256, 256)])
     assert small.width * 640 / 2 == pytest.approx(1.0)
     _, large = choose_bucket(SCREEN, (10_000, 10_000), [(256, 512)])

@@ -11,8 +11,9 @@ import pytest
 from trilane.body.body import Body, load_body
 from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS
 from trilane.errors import BadInputError
-from trilane.training.from_anny import joint_bones, joint_of_bone, regressor, round_weights
-from trilane.training.tpose import about, align, bake, power
+from trilane.training.anny_mesh import joint_bones, joint_of_bone
+from trilane.training.body_from_anny import regressor, round_weights
+from trilane.training.t_pose import about, align, bake, power
 
 PATH = Path(__file__).resolve().parents[2] / "avatars" / "default" / "body.npz"
 
@@ -154,7 +155,7 @@ def test_body_is_built_anew_as_committed(tmp_path: Path) -> None:
     pytest.importorskip("anny")
     if not (Path.home() / ".cache" / "anny").is_dir():
         pytest.skip("anny has not been built on this machine; its first build takes minutes")
-    from trilane.training.from_anny import write_body
+    from trilane.training.body_from_anny import write_body
 
     write_body(tmp_path / "again.npz")
     again, committed = np.load(tmp_path / "again.npz"), np.load(PATH)

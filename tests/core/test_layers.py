@@ -21,6 +21,7 @@ ROWS = (
         "files",
         "install",
         "shapes",
+        "unet_tables",
         "unexpected",
         "units",
         "writing",

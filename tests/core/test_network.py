@@ -8,11 +8,11 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from trilane.avatars.reshape import reshaped  # noqa: E402
+from trilane.avatars.network_reshape import reshaped  # noqa: E402
 from trilane.errors import BadInputError  # noqa: E402
 from trilane.training.encoders import ENCODERS  # noqa: E402
-from trilane.training.export import export_onnx  # noqa: E402
 from trilane.training.network import NORMS, UNet  # noqa: E402
+from trilane.training.onnx_export import export_onnx  # noqa: E402
 from trilane.training.quantising.quantise import quantise  # noqa: E402
 
 

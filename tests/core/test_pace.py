@@ -11,8 +11,8 @@ from trilane.apps.pace import SLACK_NS, Pace, compare, pace_of
 from trilane.avatars.bundle import bundle_folder
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import application_graph
+from trilane.pipeline.bound_stage import hold_until
 from trilane.pipeline.description import UnitSettings
-from trilane.pipeline.unit_loop import hold_until
 from trilane.scene.schema import Scene
 from trilane.scheduler.events import Settings
 from trilane.scheduler.ledger import JobRecord

@@ -18,10 +18,8 @@ from trilane.hw_profiles.network_work import CLASSES, count_work
 from trilane.hw_profiles.operator_times import job_time, machine_of
 from trilane.hw_profiles.performance_profiles import corners_of
 from trilane.hw_profiles.published_times import PUBLISHED_MS, check_published, resnet18_work, unet_work
-from trilane.hw_profiles.reference_encoders import ENCODERS
 from trilane.hw_profiles.reference_networks import (
     LAYOUTS,
-    NORMS,
     NetworkSpec,
     build_network,
     network_work,
@@ -29,6 +27,7 @@ from trilane.hw_profiles.reference_networks import (
     reference_network,
 )
 from trilane.training.quantising.quantise import Quantised
+from trilane.unet_tables import ENCODERS, NORMS
 from trilane.units import UnitName
 
 SUSTAINED = "sustained_high_performance"

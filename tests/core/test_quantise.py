@@ -10,7 +10,7 @@ import onnxruntime
 import pytest
 from onnx import numpy_helper
 
-from trilane.avatars.reshape import reshaped
+from trilane.avatars.network_reshape import reshaped
 from trilane.errors import BadInputError
 from trilane.training.quantising.calibration import METHODS
 from trilane.training.quantising.quantise import quantise
@@ -27,9 +27,9 @@ def test_bytes_are_the_picture(tiny_float, tiny_frames, tiny_quantised):
     frame = tiny_frames[0]
     tensor = np.clip(np.round(frame / network.input.scale) + network.input.zero_point, 0, 255).astype(np.uint8)
     wanted = run(tiny_float, frame.transpose(2, 0, 1)[None])[0].transpose(1, 2, 0)
-    found = run(network.model, tensor[None])[0]
-    assert found.dtype == np.uint8 and found.shape == (64, 64, 4)
-    assert np.abs(found / 255 - wanted).mean() < 2.5 / 255  # weights of 6 bits
+    picture = run(network.model, tensor[None])[0]
+    assert picture.dtype == np.uint8 and picture.shape == (64, 64, 4)
+    assert np.abs(picture / 255 - wanted).mean() < 2.5 / 255  # weights of 6 bits
     assert network.output.scale == pytest.approx(1 / 255) and network.output.zero_point == 0
 
 
@@ -63,9 +63,9 @@ def test_another_shape_computes_the_same(tiny_quantised):
     wide = reshaped(network, 32, 96, batch=2)
     assert wide.shape == (2, 32, 96, 5) and wide.input == network.input
     tensor = np.full((64, 64, 5), 99, np.uint8)
-    found = run(wide.model, np.broadcast_to(tensor[:1, :1], (2, 32, 96, 5)).copy())
-    assert found.shape == (2, 32, 96, 4)
-    assert np.abs(found[1, 16, 48].astype(int) - run(network.model, tensor[None])[0, 32, 32]).max() <= 1
+    picture = run(wide.model, np.broadcast_to(tensor[:1, :1], (2, 32, 96, 5)).copy())
+    assert picture.shape == (2, 32, 96, 4)
+    assert np.abs(picture[1, 16, 48].astype(int) - run(network.model, tensor[None])[0, 32, 32]).max() <= 1
 
 
 @pytest.mark.parametrize("shape", [(33, 64), (0, 64)])
@@ -92,7 +92,7 @@ def test_a_network_without_sigmoid_is_refused(tiny_float, tiny_frames):
 
 
 def test_a_concat_moves_bytes(tiny_quantised):
-    """Inputs and output of a Concat have one scale: what comes in goes out, whoever fuses it."""
+    """Inputs and output of a Concat have one scale, so its bytes do not change, whichever runtime fuses it."""
     model = tiny_quantised.network.model
     values = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
     makers = {out: node for node in model.graph.node for out in node.output}

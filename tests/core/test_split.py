@@ -14,8 +14,8 @@ from typer.testing import CliRunner
 
 from trilane.apps.cli.avatar import app
 from trilane.avatars.bundle import load_bundle
-from trilane.avatars.network_file import NetworkFile
-from trilane.avatars.split import cuts, split
+from trilane.avatars.integer_network import NetworkFile
+from trilane.avatars.network_split import cuts, split
 from trilane.errors import BadInputError
 
 QUIET = 3
@@ -37,26 +37,26 @@ def network(tiny_quantised: Any) -> NetworkFile:
 
 def test_parts_give_the_bytes_of_the_whole_wherever_it_is_cut(network: NetworkFile) -> None:
     tensor = np.random.default_rng(0).integers(0, 256, network.shape, dtype=np.uint8)
-    given = {network.model.graph.input[0].name: tensor}
+    inputs = {network.model.graph.input[0].name: tensor}
     output = network.model.graph.output[0].name
-    whole = run(network.model, given)[output]
-    found = list(cuts(network))
-    assert len(found) >= 3
-    for cut in found:
+    whole = run(network.model, inputs)[output]
+    places = list(cuts(network))
+    assert len(places) >= 3
+    for cut in places:
         head, tail = (part.model for part in split(network, [cut.at]))
         kinds = {value.type.tensor_type.elem_type for value in (*head.graph.output, *tail.graph.input)}
         assert kinds == {onnx.TensorProto.UINT8}
-        assert (run(tail, run(head, given))[output] == whole).all()
+        assert (run(tail, run(head, inputs))[output] == whole).all()
         assert cut.bytes == sum(np.prod(shape) for shape in cut.crossing.values())
 
 
 def test_the_default_avatar_can_be_cut_at_its_skips() -> None:
-    found = list(cuts(load_bundle("default").read_network()))
-    assert len(found) > 40
-    assert max(len(cut.crossing) for cut in found) >= 6
+    places = list(cuts(load_bundle("default").read_network()))
+    assert len(places) > 40
+    assert max(len(cut.crossing) for cut in places) >= 6
 
 
-def test_a_place_that_is_none_is_refused(network: NetworkFile) -> None:
+def test_a_tensor_that_is_not_quantised_is_no_place_to_cut(network: NetworkFile) -> None:
     with pytest.raises(BadInputError, match="'nowhere', expected a quantised tensor"):
         split(network, ["nowhere"])
 
@@ -84,16 +84,16 @@ def test_many_parts_give_the_bytes_of_the_whole(network: NetworkFile) -> None:
     parts = split(network, [cut.at for cut in cuts(network)][::2])
     assert len(parts) > 3
     for part in parts:
-        assert set(part.inputs) <= set(part.given) and set(part.outputs) <= set(part.handed_on)
-        assert set(part.handed_on) - set(part.outputs) <= set(part.given)
+        assert set(part.inputs) <= set(part.crossing_in) and set(part.outputs) <= set(part.crossing_out)
+        assert set(part.crossing_out) - set(part.outputs) <= set(part.crossing_in)
         known = run(part.model, known)
     assert (known[output] == whole).all()
 
 
 def test_an_uncut_network_is_one_part(network: NetworkFile) -> None:
     (part,) = split(network, [])
-    assert part.given == {network.model.graph.input[0].name: network.shape}
-    assert part.handed_on == {network.model.graph.output[0].name: (*network.shape[:3], 4)}
+    assert part.crossing_in == {network.model.graph.input[0].name: network.shape}
+    assert part.crossing_out == {network.model.graph.output[0].name: (*network.shape[:3], 4)}
 
 
 def test_cuts_in_another_order_are_refused(network: NetworkFile) -> None:

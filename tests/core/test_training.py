@@ -13,24 +13,19 @@ from trilane.avatars.bundle import bundle_folder  # noqa: E402
 from trilane.body.joints import JOINT_INDEX  # noqa: E402
 from trilane.errors import BadInputError  # noqa: E402
 from trilane.scene.motion.builtin import BUILTIN  # noqa: E402
-from trilane.training.data import U16, batches, create_group, open_groups  # noqa: E402
-from trilane.training.fit import (  # noqa: E402
-    Avatar,
-    FitConfig,
-    fit,
-    load_avatar,
-    load_network,
-    save_avatar,
-    save_network,
-)
+from trilane.training.image_error import image_error  # noqa: E402
 from trilane.training.losses import loss_terms, total_loss  # noqa: E402
-from trilane.training.metrics import image_error  # noqa: E402
 from trilane.training.network import UNet  # noqa: E402
-from trilane.training.poses import random_pose  # noqa: E402
-from trilane.training.spectral import eigenfunctions, fill_gaps, lay_out  # noqa: E402
-from trilane.training.texture import NeuralTexture, sample  # noqa: E402
+from trilane.training.neural_texture import NeuralTexture, read_texture  # noqa: E402
+from trilane.training.random_poses import random_pose  # noqa: E402
+from trilane.training.random_views import BANDS, random_view  # noqa: E402
+from trilane.training.sample_files import U16, batches, create_group, open_groups  # noqa: E402
+from trilane.training.surface_fields import eigenfunctions  # noqa: E402
+from trilane.training.texture_layout import fill_gaps, lay_out  # noqa: E402
 from trilane.training.train import TrainConfig, command_of, main  # noqa: E402
-from trilane.training.views import BANDS, random_view  # noqa: E402
+from trilane.training.trainable_avatar import TrainableAvatar  # noqa: E402
+from trilane.training.training_loop import FitConfig, fit  # noqa: E402
+from trilane.training.weights_file import load_avatar, load_network, save_avatar, save_network  # noqa: E402
 
 CHANNELS = 4
 SHAPE = (32, 64)
@@ -49,13 +44,13 @@ def groups(tmp_path):
 def avatar():
     torch.manual_seed(0)
     start = np.random.default_rng(1).uniform(-0.5, 0.5, (64, 64, CHANNELS)).astype(np.float32)
-    return Avatar(NeuralTexture(start, sides=(64, 32)), UNet(width=8, channels=CHANNELS))
+    return TrainableAvatar(NeuralTexture(start, sides=(64, 32)), UNet(width=8, channels=CHANNELS))
 
 
 def test_poses_repeat_and_differ():
-    one, same, other = (random_pose(np.random.default_rng(seed)) for seed in (3, 3, 4))
-    assert np.array_equal(one, same) and not np.array_equal(one, other)
-    assert one.shape == (55, 3) and np.isfinite(one).all()
+    pose, same, other = (random_pose(np.random.default_rng(seed)) for seed in (3, 3, 4))
+    assert np.array_equal(pose, same) and not np.array_equal(pose, other)
+    assert pose.shape == (55, 3) and np.isfinite(pose).all()
 
 
 def test_knees_and_elbows_bend_one_way():
@@ -96,7 +91,7 @@ def test_texture_starts_as_it_is_told_and_reads_bilinearly():
         < 0.02
     )
     uv = torch.tensor([[[[0.5, 0.25], [0.5, 0.75]]]])
-    read = sample(smooth.image(), uv, torch.tensor([[[True, False]]])).detach()
+    read = read_texture(smooth.image(), uv, torch.tensor([[[True, False]]])).detach()
     assert read.shape == (1, 3, 1, 2)
     assert float(read[0, 0, 0, 0]) == pytest.approx(-0.25, abs=0.03)
     assert (read[0, :, 0, 1] == 0).all()
@@ -143,8 +138,8 @@ def test_two_steps_of_training_run_and_are_saved(groups, tmp_path):
     )
     assert steps == 2
     save_avatar(made, steps, tmp_path / "weights.npz")
-    again, found = load_avatar(avatar(), tmp_path / "weights.npz")
-    assert found == 2
+    again, steps_read = load_avatar(avatar(), tmp_path / "weights.npz")
+    assert steps_read == 2
     assert all(torch.equal(a, b) for a, b in zip(made.state_dict().values(), again.state_dict().values(), strict=True))
 
 
@@ -177,7 +172,7 @@ def test_the_network_alone_comes_back_in_half_precision(tmp_path):
 def test_the_kept_network_of_the_default_avatar_loads():
     load_network(
         UNet(width=16, channels=16, input_skip=True),
-        bundle_folder("default").parent / "training" / "default-network.npz",
+        bundle_folder("default").parents[1] / "training" / "default-network.npz",
     )
 
 

@@ -16,10 +16,11 @@ from trilane.arrays import F32, F64
 from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import Body, load_body
 from trilane.body.kinematics import Skeleton
-from trilane.body.skinning import largest_weights
+from trilane.body.skin_weights import largest_weights
 from trilane.errors import MissingPartError
-from trilane.stages.gpu.context import open_context
-from trilane.stages.gpu.mesh import MeshArrays, SkinnedMesh, mesh_arrays
+from trilane.stages.gpu.mesh_arrays import MeshArrays, mesh_arrays
+from trilane.stages.gpu.opengl_context import open_context
+from trilane.stages.gpu.skinned_mesh import SkinnedMesh
 
 HERE = Path(__file__).parent
 FAILED = HERE / "failed"

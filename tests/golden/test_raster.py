@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from trilane.bench.lib import float_raster
 from trilane.body.skinning import FrameSkinner
 from trilane.errors import BadInputError
-from trilane.stages.gpu.mesh import PosedMesh, SkinnedMesh, mesh_arrays
-from trilane.stages.gpu.packed import PackedAvatar, PackedPass, Placement, Quantisation
+from trilane.stages.gpu.mesh_arrays import mesh_arrays
+from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement, Quantisation
+from trilane.stages.gpu.skinned_mesh import PosedMesh, SkinnedMesh
 from trilane.training.uv_image import UvBytes, UvRaster
 
 ENCODING = Quantisation(6 / 255, 117)
@@ -32,7 +33,7 @@ def draw(gl: Any, mesh: Any, texture: Any, joints: Any, camera: Any, shape: Any,
 
 
 def compare(gl: Any, arrays: Any, texture: Any, joints: Any, camera: Any, shape: Any) -> dict[str, float]:
-    """Figures of a drawn tensor against the reference's."""
+    """How much a drawn tensor differs from the reference's: counts of pixels, and the share within one step."""
     mesh = SkinnedMesh(gl, arrays)
     tensor = draw(gl, mesh, texture, joints, camera, shape)
     covered = UvRaster(gl, mesh).render(joints, *camera, shape)[..., 2] > 0
@@ -62,13 +63,13 @@ def test_tensor_equals_the_reference(gl: Any, person: Any, neural_texture: Any, 
     angle, distance = rng.uniform(0, 2 * np.pi), rng.uniform(0.9, 4.0)
     target = np.array([0, rng.uniform(0.5, 1.5), 0])
     eye = target + distance * np.array([np.sin(angle), rng.uniform(-0.2, 0.4), np.cos(angle)])
-    found = compare(
+    difference = compare(
         gl, person.arrays, neural_texture, person.pose(random_numbers(seed)), camera(eye, target), (384, 256)
     )
-    assert found["pixels"] > 2000
-    assert found["coverage"] <= 0.001 * found["pixels"]
-    assert found["within_one"] >= 0.999
-    assert found["background"] == 0
+    assert difference["pixels"] > 2000
+    assert difference["coverage"] <= 0.001 * difference["pixels"]
+    assert difference["within_one"] >= 0.999
+    assert difference["background"] == 0
 
 
 @pytest.mark.parametrize("channels", [4, 8, 12, 16])
@@ -92,7 +93,7 @@ def test_row_zero_is_on_top(gl: Any, person: Any, camera: Camera) -> None:
 
 
 def test_avatars_share_a_tensor(gl: Any, person: Any, neural_texture: Any, camera: Camera) -> None:
-    """Two avatars in disjoint rectangles hold what each holds alone, to one step at a few pixels, and nothing else."""
+    """Two avatars in disjoint rectangles have the bytes of each drawn alone, to one step at a few pixels."""
     view, joints = camera((0.4, 1.2, 3), (0, 0.9, 0)), person.pose(REST)
     alone = draw(gl, person.mesh, neural_texture, joints, view, (96, 64))
     for deferred in (False, True):
@@ -132,11 +133,11 @@ def test_hard_views(gl: Any, person: Any, neural_texture: Any, camera: Camera, n
     """
     eye, target, planes = HARD_VIEWS[name]
     views = camera(eye, target, **planes)
-    found = compare(gl, person.arrays, neural_texture, person.pose(REST), views, (192, 192))
-    assert found["coverage"] <= 0.002 * found["pixels"] + 2
-    assert found["within_one"] >= 0.995
-    assert found["background"] == 0
-    assert (found["pixels"] == 0) == (name in NOTHING_SEEN)
+    difference = compare(gl, person.arrays, neural_texture, person.pose(REST), views, (192, 192))
+    assert difference["coverage"] <= 0.002 * difference["pixels"] + 2
+    assert difference["within_one"] >= 0.995
+    assert difference["background"] == 0
+    assert (difference["pixels"] == 0) == (name in NOTHING_SEEN)
 
 
 @pytest.mark.parametrize("shape", [(97, 61), (1, 1), (33, 200)])
@@ -144,11 +145,11 @@ def test_sizes_that_are_no_multiple_of_32(gl: Any, person: Any, camera: Camera, 
     """Odd tensors and an odd texture agree with the reference as others do."""
     texture = np.random.default_rng(0).normal(0, 0.5, (37, 21, 16)).astype(np.float16).astype(np.float64)
     views = camera((0.2, 1.0, 2.0), (0, 1.0, 0), 40, shape[1] / shape[0])
-    found = compare(gl, person.arrays, texture, person.pose(REST), views, shape)
-    assert found["pixels"] > 0
-    assert found["coverage"] <= 0.002 * found["pixels"] + 1
-    assert found["within_one"] >= 0.995
-    assert found["background"] == 0
+    difference = compare(gl, person.arrays, texture, person.pose(REST), views, shape)
+    assert difference["pixels"] > 0
+    assert difference["coverage"] <= 0.002 * difference["pixels"] + 1
+    assert difference["within_one"] >= 0.995
+    assert difference["background"] == 0
 
 
 def test_a_vertex_on_the_near_plane(gl: Any, neural_texture: Any, camera: Camera) -> None:
@@ -156,9 +157,9 @@ def test_a_vertex_on_the_near_plane(gl: Any, neural_texture: Any, camera: Camera
     joints = np.tile(np.eye(4)[:3], (55, 1, 1)).astype(np.float32)
     views = camera((0.0, 0.0, 1.0), (0, 0, 0), 90, near=0.5)
     touching = quad([(-0.4, -0.4, -1.0), (0.4, -0.4, -1.0), (0.0, 0.3, 0.5)], [(0, 1, 2)])
-    found = compare(gl, touching, neural_texture, joints, views, (64, 64))
-    assert found["pixels"] > 100
-    assert found["coverage"] <= 2
+    difference = compare(gl, touching, neural_texture, joints, views, (64, 64))
+    assert difference["pixels"] > 100
+    assert difference["coverage"] <= 2
     within = quad([(-0.4, -0.4, 0.5), (0.4, -0.4, 0.5), (0.0, 0.3, 0.5)], [(0, 1, 2)])
     assert compare(gl, within, neural_texture, joints, views, (64, 64))["background"] == 0
 
@@ -179,10 +180,10 @@ def test_degenerate_and_inverted_triangles(gl: Any, neural_texture: Any, camera:
     nothing = quad(corners, [(0, 1, 1), (2, 2, 2)])
     assert compare(gl, nothing, neural_texture, joints, views, (64, 64))["pixels"] == 0
     mixed = quad(corners, [(0, 1, 2), (0, 3, 2)])
-    found = compare(gl, mixed, neural_texture, joints, views, (64, 64))
-    assert found["pixels"] > 1000
-    assert found["coverage"] <= 2
-    assert found["background"] == 0
+    difference = compare(gl, mixed, neural_texture, joints, views, (64, 64))
+    assert difference["pixels"] > 1000
+    assert difference["coverage"] <= 2
+    assert difference["background"] == 0
 
 
 def test_a_shared_edge_is_drawn_once() -> None:
@@ -293,9 +294,9 @@ def test_vertices_from_the_cpu_unit_give_the_same_tensor(
     packed = PackedPass(gl, 16, ENCODING, deferred)
     avatar = PackedAvatar(packed, PosedMesh(gl, person.arrays), neural_texture)
     avatar.draw(packed.begin(shape), view[0], Placement(joints, view[1], (0, 0, *shape), vertices=vertices))
-    found = np.zeros(expected.size, np.uint8)
-    packed.read_into(shape, found)
+    tensor = np.zeros(expected.size, np.uint8)
+    packed.read_into(shape, tensor)
     assert (expected != ENCODING.zero_point).mean() > 0.1
-    assert (np.abs(found.reshape(expected.shape) - expected) <= 1).mean() >= 0.999
+    assert (np.abs(tensor.reshape(expected.shape) - expected) <= 1).mean() >= 0.999
     with pytest.raises(ValueError, match="vertices"):
         avatar.draw(packed.begin(shape), view[0], Placement(joints, view[1], (0, 0, *shape)))

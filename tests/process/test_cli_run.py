@@ -22,7 +22,7 @@ from PIL import Image
 
 from trilane.apps.report import read_report
 from trilane.avatars.bundle import load_bundle
-from trilane.avatars.split import cuts
+from trilane.avatars.network_split import cuts
 from trilane.scheduler.recording import read, replay
 
 FRAMES = 20

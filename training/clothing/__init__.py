@@ -1,1 +1,4 @@
-"""The ground truth of the default avatar: the default body with clothes, hair and paint."""
+"""The clothes, hair and paint of the default body, which make the ground truth that avatars are trained on.
+
+It may use `training/body_arrays.py`, `stages/` and the folders below it.
+"""

@@ -1,6 +1,6 @@
-"""Where things are on a body at rest: the measures that garments and paint are placed by.
+"""Landmarks of a body at rest, by which garments and paint are placed: joints, eyes, ears, top and bottom.
 
-Rule: everything is measured from the body's arrays (rest pose, metres); no coordinate is written down.
+Rule: everything is measured from the body's arrays (rest pose, metres); no coordinate is a constant.
 """
 
 from __future__ import annotations
@@ -12,16 +12,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import F64
+from trilane.body.joints import JOINT_INDEX
 
-PELVIS, HIP, KNEE, ANKLE, FOOT, NECK, HEAD, SHOULDER, ELBOW, WRIST = 0, 1, 4, 7, 10, 12, 15, 16, 18, 20
-LEFT_EYE, RIGHT_EYE = 23, 24
-LEG = {1: (7, 10), -1: (8, 11)}  # ankle and toe joint of the left (+X) and right foot
+PELVIS, NECK, HEAD = JOINT_INDEX["pelvis"], JOINT_INDEX["neck"], JOINT_INDEX["head"]
+#: Of joints that both sides have, the left one.
+HIP, KNEE, ANKLE, FOOT = (JOINT_INDEX[f"left_{name}"] for name in ("hip", "knee", "ankle", "foot"))
+SHOULDER, ELBOW = JOINT_INDEX["left_shoulder"], JOINT_INDEX["left_elbow"]
+LEFT_EYE, RIGHT_EYE = JOINT_INDEX["left_eye"], JOINT_INDEX["right_eye"]
+#: Ankle of each foot by its side: 1 is the left one (+X), -1 the right one.
+ANKLES = {1: JOINT_INDEX["left_ankle"], -1: JOINT_INDEX["right_ankle"]}
 
 
 @dataclass(frozen=True)
 class Landmarks:
-    """`joints` (55,3). `eye` (3,): centre of the left eyeball, `eye_radius` metres; `eyeball` (V,) bool: its vertices
-    and those of the right one. `ear` (3,): tip of the left ear. `crown`: greatest y. `sole`: least y.
+    """Positions in metres, rest pose.
+
+    `joints` (55,3). `eye` (3,): centre of the left eyeball; `eye_radius`: its radius. `eyeball` (V,) bool: whether a
+    vertex is of either eyeball. `ear` (3,): tip of the left ear. `crown`: greatest y. `sole`: least y.
     """
 
     joints: F64
@@ -31,10 +38,6 @@ class Landmarks:
     ear: F64
     crown: float
     sole: float
-
-    @property
-    def height(self) -> float:
-        return self.crown - self.sole
 
 
 def find_landmarks(vertices: F64, joints: F64, weights: NDArray[np.floating[Any]]) -> Landmarks:

@@ -1,7 +1,7 @@
 #version 330
-// What the dressed body looks like: where each layer ends, its colours, and a soft lamp on the camera.
+// Paints the clothed body: where each layer ends, its colours, and the light of a soft lamp on the camera.
 // Everything is placed by the point at rest, `v_rest` (metres), relative to landmarks of the body.
-// v_colour: r light left by the surroundings, g 1 on the eyeballs.
+// v_colour: r is the obscurance, 1 in the open; g is 1 on the eyeballs.
 
 in vec3 v_position;
 in vec3 v_normal;

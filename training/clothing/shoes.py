@@ -1,6 +1,7 @@
-"""A shoe: slices of the foot's shadow, one over the other, each convex and a little wider than the foot.
+"""A shoe: horizontal slices of the foot, one over the other, each convex and a little wider than the foot.
 
-Rule: the shape comes from the support function of the foot's vertices; it is closed below and open at the ankle.
+Rule: a slice is the support function of the foot's vertices seen from above; the shoe is closed below and open at the
+ankle.
 """
 
 from __future__ import annotations
@@ -19,9 +20,12 @@ UPPER_STEP_M, FLANGE_M = 0.004, 0.005
 
 
 def shoe(vertices: F64, ankle: F64, side: int, sole: bool) -> tuple[F64, NDArray[np.int64]]:
-    """Vertices (N,3) and faces (F,3) of the upper or the sole on the foot of `side` (+1 left, -1 right).
+    """Vertices (N,3), metres, and faces (F,3) of one shoe's upper or of its sole.
 
-    `vertices` (V,3): the body at rest. `ankle` (3,): its joint.
+    `vertices`: (V,3) the body at rest.
+    `ankle`: (3,) the joint of the foot.
+    `side`: 1 for the left foot, -1 for the right one.
+    `sole`: the sole instead of the upper.
     """
     foot = vertices[(vertices[:, 0] * side > 0) & (vertices[:, 1] < ankle[1] + TOP_M + 0.02)]
     ground = foot[:, 1].min()
@@ -40,6 +44,7 @@ def shoe(vertices: F64, ankle: F64, side: int, sole: bool) -> tuple[F64, NDArray
 
 
 def _ring(foot: F64, height: float, margin: float) -> F64:
+    """The slice (ANGLES,3) at `height`, `margin` wider than the vertices `foot` (N,3), metres."""
     flat = foot[:, [2, 0]]
     centre = 0.5 * (flat.min(axis=0) + flat.max(axis=0))
     angle = np.arange(ANGLES) * (2 * np.pi / ANGLES)
@@ -53,7 +58,7 @@ def _ring(foot: F64, height: float, margin: float) -> F64:
 
 
 def _stitch(rings: int, capped: bool) -> NDArray[np.int64]:
-    """Faces between consecutive rings, and fans over the first and, when `capped`, the last."""
+    """Faces between consecutive rings, and a fan over the first one; when `capped`, also over the last one."""
     here = np.arange(ANGLES)
     after = (here + 1) % ANGLES
     faces = []

@@ -1,1 +1,4 @@
-"""From a float network to the integer network that the DSP runs: calibration, scales, equalisation."""
+"""From a float network to the integer network that the DSP runs: calibration, scales and zero points, equalisation.
+
+It may use `avatars/` and the modules in `src/trilane`, but nothing else of `training/`.
+"""

@@ -1,6 +1,7 @@
-"""What range each tensor of a network has on real frames, and what is made of it.
+"""Calibration: the range of each tensor of a network on real frames.
 
-Rule: ranges are measured, then only narrowed where bytes cannot show the difference, or shared where bytes are moved.
+Rule: ranges are measured; after that they are only narrowed where bytes cannot show the difference, or made one range
+where an operator only moves bytes.
 """
 
 from __future__ import annotations
@@ -24,9 +25,9 @@ METHODS = {
     "percentile": (CalibrationMethod.Percentile, {"percentile": 99.99}),
     "entropy": (CalibrationMethod.Entropy, {}),
 }
-#: Where the sigmoid rounds to byte 0 and 255: a logit beyond says nothing, and a wider range would cost steps.
+#: At this logit and beyond, the sigmoid rounds to byte 0 or 255, so a wider range would only make steps coarser.
 LOGIT_LIMIT = 6.5
-#: Operators whose output has the range of their input.
+#: Operators that only move bytes, so that their output has the range of their input.
 MOVES = ("Resize", "MaxPool", "Reshape", "Transpose", "Slice", "Split", "DepthToSpace", "SpaceToDepth")
 RECTIFIERS = ("Relu", "Clip")
 
@@ -40,10 +41,13 @@ class _OneFrame(CalibrationDataReader):
 
 
 def measure(path: Path, frames: Sequence[NDArray[np.float32]], method: str, operators: Sequence[str]) -> Any:
-    """Ranges (ONNX Runtime's TensorsData) of the tensors at `operators` of the float network at `path`.
+    """Ranges of the tensors, ONNX Runtime's TensorsData.
 
-    `frames`: (H, W, C) float32, one by one, so that memory does not grow with their number. A second file is written
-    beside `path`. Raises BadInputError for an unknown method.
+    `path`: of the float network; a second file is written beside it.
+    `frames`: (H, W, C) float32, fed one by one, so that memory does not grow with their number.
+    `method`: a name of `METHODS`.
+    `operators`: types of the operators whose inputs and outputs are measured.
+    Raises BadInputError for an unknown method or tensors that are not finite.
     """
     if method not in METHODS:
         raise BadInputError("quantise", f"method {method!r}", f"one of {', '.join(METHODS)}")
@@ -77,10 +81,11 @@ def limit_logits(model: onnx.ModelProto, ranges: Any) -> None:
 
 
 def share_ranges(model: onnx.ModelProto, ranges: Any) -> None:
-    """Give the inputs and the output of each Concat one range, so that it moves bytes and rounds nothing.
+    """Give the inputs and the output of each Concat one range, so that it moves bytes and rounds nothing. In place.
 
-    Runtimes that fuse a Concat into the layers before it would otherwise clamp at other values than those that do not.
-    Left alone where the shared range is signed and a member is rectified: its clamp at 0 would be lost.
+    Otherwise runtimes that fuse a Concat into the layers before it would clamp at other values than those that do not.
+    A Concat is left as it is when the common range would be signed and one of its tensors is rectified: that tensor
+    would lose its clamp at 0.
     """
     makers = {out: node for node in model.graph.node for out in node.output}
     for node in model.graph.node:
@@ -97,7 +102,7 @@ def share_ranges(model: onnx.ModelProto, ranges: Any) -> None:
 
 
 def _sources(name: str, makers: dict[str, onnx.NodeProto]) -> Iterator[str]:
-    """`name`, and what it is a mere move of."""
+    """`name`, and the tensors that operators of `MOVES` made it from."""
     yield name
     while name in makers and makers[name].op_type in MOVES:
         name = makers[name].input[0]

@@ -1,6 +1,6 @@
-"""What the number of calibration frames and the method cost the picture.
+"""Compares calibration methods and numbers of frames by the error of the picture.
 
-Rule: pictures are judged on frames that no row was calibrated on, against the float network on the unrounded input.
+Rule: pictures are evaluated on frames that no row was calibrated on, against the float network on the float input.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from trilane.training.quantising.calibration import METHODS
 from trilane.training.quantising.quantise import quantise
 
 COUNTS = (5, 10, 20, 50, 100)
-JUDGED = 5
+#: Frames that pictures are evaluated on: the last ones.
+EVALUATED = 5
 PROVIDERS = ["CPUExecutionProvider"]
 ERRORS_ONLY = 3
 
@@ -31,31 +32,35 @@ def calibration_table(
     methods: Sequence[str] = tuple(METHODS),
     counts: Sequence[int] = COUNTS,
 ) -> Iterator[dict[str, Any]]:
-    """Rows `method`, `count`, `psnr_db` (mean over the last `JUDGED` frames), `mean` and `largest` (of 255).
+    """Rows `method`, `count`, `psnr_db` (mean over the last `EVALUATED` frames), `mean` and `largest` error (of 255).
 
-    `model`: the float network (1, C, H, W). `frames`: (H, W, C) each; counts that would reach into the judged ones are
-    left out. Raises BadInputError when there are too few frames for the smallest count, or for an unknown method.
+    `model`: the float network (1, C, H, W).
+    `frames`: (H, W, C) each.
+    `methods`: names of `METHODS`.
+    `counts`: of calibration frames; a count that would include evaluated frames is left out.
+    Raises BadInputError when there are too few frames for the smallest count, or for an unknown method.
     """
-    spare = len(frames) - JUDGED
+    spare = len(frames) - EVALUATED
     possible = [count for count in counts if count <= spare]
     if not possible:
-        raise BadInputError("frames", f"{len(frames)} of them", f"at least {min(counts) + JUDGED}")
+        raise BadInputError("frames", f"{len(frames)} of them", f"at least {min(counts) + EVALUATED}")
     for method in methods:
         if method not in METHODS:
             raise BadInputError("--method", repr(method), f"one of {', '.join(METHODS)}")
-    judged = frames[spare:]
+    evaluated = frames[spare:]
     run = _session(model)
-    wanted = [255 * run(np.ascontiguousarray(frame.transpose(2, 0, 1)[None])).transpose(0, 2, 3, 1) for frame in judged]
+    channels_first = [np.ascontiguousarray(frame.transpose(2, 0, 1)[None]) for frame in evaluated]
+    float_pictures = [255 * run(frame).transpose(0, 2, 3, 1) for frame in channels_first]
     for method in methods:
         for count in possible:
             network = quantise(model, frames[:count], method).network
             integer, scale, zero = _session(network.model), network.input.scale, network.input.zero_point
-            found = [integer(np.clip(np.round(f / scale) + zero, 0, 255).astype(np.uint8)[None]) for f in judged]
-            yield {"method": method, "count": count, **_errors(wanted, found)}
+            tensors = [np.clip(np.round(f / scale) + zero, 0, 255).astype(np.uint8)[None] for f in evaluated]
+            yield {"method": method, "count": count, **_errors(float_pictures, [integer(t) for t in tensors])}
 
 
 def _session(model: onnx.ModelProto) -> Any:
-    """A function of the network's one input."""
+    """A function from the network's one input to its one output."""
     settings = onnxruntime.SessionOptions()
     settings.log_severity_level = ERRORS_ONLY
     session = onnxruntime.InferenceSession(model.SerializeToString(), settings, providers=PROVIDERS)
@@ -63,8 +68,8 @@ def _session(model: onnx.ModelProto) -> Any:
     return lambda feed: session.run(None, {name: feed})[0]
 
 
-def _errors(wanted: Sequence[F32], found: Sequence[NDArray[np.uint8]]) -> dict[str, float]:
-    differences = [np.abs(true - picture) for true, picture in zip(wanted, found, strict=True)]
+def _errors(float_pictures: Sequence[F32], pictures: Sequence[NDArray[np.uint8]]) -> dict[str, float]:
+    differences = [np.abs(true - picture) for true, picture in zip(float_pictures, pictures, strict=True)]
     squares = [float(np.square(difference, dtype=np.float64).mean()) for difference in differences]
     return {
         "psnr_db": float(np.mean([20 * math.log10(255) - 10 * math.log10(max(square, 1e-12)) for square in squares])),

@@ -1,9 +1,0 @@
-#version 330
-// The UV image: u, v and coverage, before any texture is read.
-
-in vec2 v_uv;
-out vec4 pixel;
-
-void main() {
-    pixel = vec4(v_uv, 1.0, 1.0);
-}

@@ -1,0 +1,166 @@
+"""The painters of the composite, one class per layer of the frame: room, picture, contact shadows, avatars.
+
+Rule: background bytes are copied unchanged, as sRGB; whatever is blended over them is blended in linear light.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import reduce
+from typing import Any
+
+import moderngl
+import numpy as np
+
+from trilane.arrays import F32, U8, Floats
+from trilane.stages.gpu import opengl_calls
+from trilane.stages.gpu.builtin_room import Extent, room_mesh, room_textures
+from trilane.stages.gpu.camera_matrices import eye_of, target_clip
+from trilane.stages.gpu.shader_program import build_program
+
+MAX_TAPS = 8
+HALF_TEXEL_INWARD = np.array([0.5, 0.5, -0.5, -0.5])
+UNDER_THE_FLOOR = (70, 66, 60)
+
+
+class RoomPainter:
+    """The built-in room, which is made larger when a camera leaves it."""
+
+    def __init__(self, ctx: Any, eyes: Sequence[Floats] = ()) -> None:
+        """`eyes`: places (3,) of cameras that the room holds from the beginning."""
+        self._ctx = ctx
+        self._program = build_program(ctx, "room.vert", "room.frag")
+        floor, wall = room_textures()
+        self._textures = [
+            _detail(ctx, floor, moderngl.LINEAR_MIPMAP_LINEAR),
+            _detail(ctx, wall, moderngl.LINEAR_MIPMAP_NEAREST),  # too smooth to show where levels change
+        ]
+        self._extent = reduce(Extent.holding, (np.asarray(eye, np.float64) for eye in eyes), Extent())
+        self._batches: list[Any] = []
+        self._build()
+
+    def draw(self, target: Any, view: Floats, projection: Floats) -> None:
+        """Fill `target` with the room as seen by `view` and `projection`; from below, the floor is not drawn."""
+        grown = self._extent.holding(eye_of(view))
+        if grown is not self._extent:
+            self._extent = grown
+            self._build()
+        self._ctx.enable_only(moderngl.CULL_FACE)
+        self._ctx.front_face = "cw"  # row 0 is on top, see `skinned_mesh`
+        target.clear(*(value / 255 for value in UNDER_THE_FLOOR))
+        self._program["clip_from_world"].write(target_clip(view, projection))
+        for texture, batch in zip(self._textures, self._batches, strict=True):
+            texture.use(0)
+            batch.render()
+
+    def _build(self) -> None:
+        mesh = room_mesh(self._extent)
+        for batch in self._batches:
+            batch.release()
+        vertices = self._ctx.buffer(mesh.vertices.tobytes())
+        content = [(vertices, "3f 2f 3f", "position", "uv", "light")]
+        parts = (mesh.floor, mesh.rest)
+        self._batches = [self._ctx.vertex_array(self._program, content, self._ctx.buffer(p.tobytes())) for p in parts]
+
+
+class PicturePainter:
+    """A background picture of the output's size, (h,w,3) uint8."""
+
+    def __init__(self, ctx: Any, shape: tuple[int, int]) -> None:
+        self._ctx = ctx
+        self._program = build_program(ctx, "whole_screen.vert", "picture.frag")
+        self._screen = ctx.vertex_array(self._program, [])
+        self._texture = ctx.texture(shape[::-1], 3, alignment=1)
+
+    def upload(self, picture: U8) -> None:
+        """Write `picture` (h,w,3) to the GPU; `draw` shows it from now on."""
+        self._texture.write(picture, alignment=1)
+
+    def draw(self) -> None:
+        """Copy the picture to the target in use."""
+        self._ctx.enable_only(moderngl.NOTHING)
+        self._texture.use(0)
+        self._screen.render(vertices=3)
+
+
+class ShadowPainter:
+    """Contact shadows: up to `blobs` soft discs on the floor."""
+
+    def __init__(self, ctx: Any, blobs: int) -> None:
+        self._ctx, self._count = ctx, blobs
+        self._program = build_program(ctx, "shadow.vert", "shadow.frag", BLOBS=blobs)
+        self._discs = ctx.vertex_array(self._program, [])
+
+    def draw(self, view: Floats, projection: Floats, blobs: F32) -> None:
+        """Darken the target in use. `blobs` (N,4) float32: x, z, radius in metres, strength 0..1."""
+        if not len(blobs) or eye_of(view)[1] <= 0:
+            return
+        self._ctx.enable_only(moderngl.BLEND)
+        self._ctx.blend_func = moderngl.ZERO, moderngl.ONE_MINUS_SRC_ALPHA
+        self._program["clip_from_world"].write(target_clip(view, projection))
+        padded = np.zeros((self._count, 4), np.float32)
+        padded[: len(blobs)] = blobs
+        self._program["blob"].write(padded)
+        with opengl_calls.srgb_target():
+            self._discs.render(vertices=6 * len(blobs))
+
+
+class AvatarPainter:
+    """The network's picture: uploaded once a frame, then drawn avatar by avatar at their crop rectangles."""
+
+    def __init__(self, ctx: Any, shapes: list[tuple[int, int]]) -> None:
+        self._ctx = ctx
+        self._premultiply = build_program(ctx, "whole_screen.vert", "premultiply.frag")
+        self._screen = ctx.vertex_array(self._premultiply, [])
+        programs = [build_program(ctx, "avatar.vert", "avatar.frag", TAPS=taps) for taps in range(1, MAX_TAPS + 1)]
+        self._quads = [(program, ctx.vertex_array(program, [])) for program in programs]
+        self._pictures = {shape: self._picture(shape) for shape in shapes}
+
+    def upload(self, shape: tuple[int, int], image: U8) -> None:
+        """Write `image` (h * w * 4,) uint8, sRGB with straight alpha, to the GPU as the picture of `shape`."""
+        straight, target, _ = self._pictures[shape]
+        straight.write(image)
+        target.use()
+        self._ctx.enable_only(moderngl.NOTHING)
+        straight.use(0)
+        self._screen.render(vertices=3)
+
+    def draw(
+        self, target: Any, shape: tuple[int, int], rect: tuple[float, ...], tensor_rect: tuple[int, int, int, int]
+    ) -> None:
+        """Blend one avatar's part of the picture over `target`.
+
+        `target`: the framebuffer.
+        `shape`: (height, width) of the picture that was uploaded.
+        `rect`: where the avatar is on the screen, x0, y0, x1, y1 in normalised device coordinates.
+        `tensor_rect`: its part of the picture: top, left, height, width.
+        """
+        top, left, height, width = tensor_rect
+        rows, columns = (rect[3] - rect[1]) / 2 * target.height, (rect[2] - rect[0]) / 2 * target.width
+        taps = int(np.clip(np.ceil(max(height / max(rows, 1e-6), width / max(columns, 1e-6)) - 0.25), 1, MAX_TAPS))
+        program, quad = self._quads[taps - 1]
+        size = np.array([shape[1], shape[0]] * 2)
+        edge = np.array([left, top, left + width, top + height])
+        target.use()
+        self._ctx.enable_only(moderngl.BLEND)
+        self._ctx.blend_func = moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA
+        program["rect"].value = tuple(float(side) for side in rect)
+        program["source"].value = tuple(edge / size)
+        program["inside"].value = tuple((edge + HALF_TEXEL_INWARD) / size)
+        self._pictures[shape][2].use(0)
+        with opengl_calls.srgb_target():
+            quad.render(moderngl.TRIANGLE_STRIP, vertices=4)
+
+    def _picture(self, shape: tuple[int, int]) -> tuple[Any, Any, Any]:
+        straight = self._ctx.texture(shape[::-1], 4, internal_format=opengl_calls.SRGB8_ALPHA8)
+        premultiplied = self._ctx.texture(shape[::-1], 4, dtype="f2")
+        premultiplied.filter = (moderngl.LINEAR, moderngl.LINEAR)
+        premultiplied.repeat_x = premultiplied.repeat_y = False
+        return straight, self._ctx.framebuffer([premultiplied]), premultiplied
+
+
+def _detail(ctx: Any, image: U8, minify: int) -> Any:
+    texture = ctx.texture((image.shape[1], image.shape[0]), 4, image.tobytes())
+    texture.build_mipmaps()
+    texture.filter = (minify, moderngl.LINEAR)
+    return texture

@@ -1,0 +1,199 @@
+"""The packed pass: draws a posed mesh with its neural texture as the network's input tensor, in bytes.
+
+Rule: bytes leave the GPU in tensor order (NHWC, row 0 on top) and already have the network's scale and zero point.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import moderngl
+import numpy as np
+
+from trilane.arrays import F32, U8, Floats
+from trilane.errors import BadInputError
+from trilane.shapes import Shape
+from trilane.stages.gpu import opengl_calls
+from trilane.stages.gpu.mesh_draw import MeshDraw
+from trilane.stages.gpu.shader_program import build_program, set_uniforms
+from trilane.stages.gpu.skinned_mesh import BodyPose, Mesh
+from trilane.stages.gpu.texture_array import FILTERS, check_texture, texture_array
+
+CHANNELS = (4, 8, 12, 16)
+WORD_TYPES = {1: "uint", 2: "uvec2", 3: "uvec4", 4: "uvec4"}
+#: 32-bit words of a target's pixel by the tensor's. OpenGL does not promise drawable targets of three words, so they
+#: have four, of which the fourth is not read back.
+TARGET_WORDS = {1: 1, 2: 2, 3: 4, 4: 4}
+
+
+@dataclass(frozen=True)
+class Quantisation:
+    """How the tensor's bytes stand for real numbers: real = (q - zero_point) * scale, q in 0..255.
+
+    Raises BadInputError when made with a scale that is not positive or a zero point that is not a byte.
+    """
+
+    scale: float
+    zero_point: int
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.scale) and self.scale > 0):
+            raise BadInputError("quantisation scale", str(self.scale), "a positive number")
+        if not 0 <= self.zero_point <= 255:
+            raise BadInputError("quantisation zero point", str(self.zero_point), "0 to 255")
+
+
+@dataclass(frozen=True)
+class Placement:
+    """One avatar in a tensor. `rect`: top, left, height, width in tensor pixels. `clip_projection` (4,4): of its crop.
+
+    `joints`, `feature`, `vertices`: its pose, as in `BodyPose`.
+    """
+
+    joints: F32
+    clip_projection: Floats
+    rect: tuple[int, int, int, int]
+    feature: F32 | None = None
+    vertices: F32 | None = None
+
+    @property
+    def pose(self) -> BodyPose:
+        """The pose, as the mesh takes it."""
+        return BodyPose(self.joints, self.feature, self.vertices)
+
+
+@dataclass(frozen=True)
+class Target:
+    """`words`: framebuffer of the tensor. Of a deferred pass also `uv_image` and its framebuffer `uv`, with one depth.
+
+    `blank`: bytes of an empty tensor; software drivers copy them faster than they clear a target.
+    """
+
+    words: Any
+    uv_image: Any = None
+    uv: Any = None
+    blank: U8 | None = None
+
+
+class PackedPass:
+    """Draws meshes, each with its neural texture, into tensors."""
+
+    def __init__(
+        self, ctx: Any, channels: int, quantisation: Quantisation, deferred: bool, filtering: str = "linear"
+    ) -> None:
+        """Check the settings; targets are made on first use.
+
+        `ctx`: the OpenGL context.
+        `channels`: of the tensors and textures, one of `CHANNELS`.
+        `quantisation`: scale and zero point of the bytes.
+        `deferred`: draw u and v of every pixel first, then read the texture once for each visible pixel. The bytes are
+        the same. It is faster on software drivers, which shade whole blocks of pixels for each small triangle.
+        `filtering`: a name of `FILTERS`. A deferred pass has no derivatives of u and v, so it takes only `linear`.
+        Raises BadInputError.
+        """
+        if filtering not in FILTERS:
+            raise BadInputError("texture filter", repr(filtering), f"one of {', '.join(FILTERS)}")
+        if deferred and filtering != "linear":
+            raise BadInputError("texture filter", filtering, "linear", "draw mesh and texture in one pass")
+        if channels not in CHANNELS:
+            raise BadInputError("network input", f"{channels} channels", "4, 8, 12 or 16", "pad with zero channels")
+        self.ctx, self.channels, self.quantisation, self.deferred = ctx, channels, quantisation, deferred
+        self.filtering = filtering
+        self._targets: dict[Shape, Target] = {}
+        self._background = (0x01010101 * quantisation.zero_point,) * 4
+
+    @property
+    def layers(self) -> int:
+        return self.channels // 4
+
+    @property
+    def uniforms(self) -> dict[str, float]:
+        """Uniforms of `packed_tensor.frag`."""
+        encoding = self.quantisation
+        return {"neural": 0, "uv_image": 1, "scale": encoding.scale, "zero_point": float(encoding.zero_point)}
+
+    def target(self, shape: Shape) -> Target:
+        """The target for tensors of `shape` (height, width); made on first use."""
+        if shape not in self._targets:
+            self._targets[shape] = self._make_target(shape[::-1])
+        return self._targets[shape]
+
+    def begin(self, shape: Shape) -> Target:
+        """Fill the target of `shape` with the zero point and the greatest depth, and return it."""
+        target = self.target(shape)
+        target.words.use()
+        target.words.viewport = (0, 0, shape[1], shape[0])
+        target.words.depth_mask = True
+        if target.blank is None:
+            opengl_calls.clear_unsigned(self._background)
+        else:
+            target.words.color_attachments[0].write(target.blank)
+        opengl_calls.clear_depth()
+        return target
+
+    def read_into(self, shape: Shape, tensor: U8) -> None:
+        """Copy the target of `shape` to `tensor`, (h * w * channels,) uint8."""
+        box = (0, 0, shape[1], shape[0])
+        self.target(shape).words.read_into(tensor, box, components=self.layers, dtype="u4", alignment=1)
+
+    def background(self, tensor: U8) -> None:
+        """Fill `tensor` with the zero point, the content of a frame without avatars."""
+        tensor[:] = self.quantisation.zero_point
+
+    def _make_target(self, size: tuple[int, int]) -> Target:
+        depth = self.ctx.depth_renderbuffer(size)
+        words = self.ctx.framebuffer([self.ctx.texture(size, TARGET_WORDS[self.layers], dtype="u4")], depth)
+        if not self.deferred:
+            return Target(words)
+        image = self.ctx.texture(size, 2, dtype="f4")
+        image.filter = (moderngl.NEAREST, moderngl.NEAREST)
+        blank = np.full(size[0] * size[1] * 4 * TARGET_WORDS[self.layers], self.quantisation.zero_point, np.uint8)
+        return Target(words, image, self.ctx.framebuffer([image], depth), blank)
+
+
+class PackedAvatar:
+    """One avatar's mesh and texture, which a `PackedPass` draws."""
+
+    def __init__(self, packed: PackedPass, mesh: Mesh, texture: Floats) -> None:
+        """`texture` (H,W,C) is uploaded here. Raises BadInputError when FP16 cannot hold it or C is not the pass's."""
+        check_texture(texture, packed.channels)
+        self._mesh, self._ctx = mesh, packed.ctx
+        self._texture = texture_array(packed.ctx, texture, packed.filtering)
+        defines: dict[str, int | str] = {"LAYERS": packed.layers, "WORDS": WORD_TYPES[packed.layers]}
+        if packed.deferred:
+            self._geometry = MeshDraw(packed.ctx, mesh, "uv_only.frag")
+            pack = build_program(packed.ctx, "farthest.vert", "packed_tensor.frag", **defines, DEFERRED=1)
+            set_uniforms(pack, packed.uniforms)
+            self._screen = packed.ctx.vertex_array(pack, [])
+        else:
+            self._geometry = MeshDraw(packed.ctx, mesh, "packed_tensor.frag", **defines)
+            self._geometry.set(packed.uniforms)
+
+    def draw(self, target: Target, view: Floats, placement: Placement) -> None:
+        """Draw into `target`, which `PackedPass.begin` has cleared.
+
+        `target`: of the pass.
+        `view`: (4,4) the camera.
+        `placement`: the avatar's pose, crop and rectangle of the tensor.
+        """
+        top, left, height, width = placement.rect
+        box = (left, top, width, height)
+        self._texture.use(0)
+        self._mesh.prepare(self._ctx)
+        first = target.words if target.uv is None else target.uv
+        first.use()
+        first.viewport = box
+        self._geometry.draw(placement.pose, view, placement.clip_projection)
+        if target.uv is not None:
+            self._write_words(target, box)
+
+    def _write_words(self, target: Target, box: tuple[int, int, int, int]) -> None:
+        target.words.use()
+        target.words.viewport = box
+        target.words.depth_mask = False
+        self._ctx.enable_only(moderngl.DEPTH_TEST)
+        self._ctx.depth_func = ">"
+        target.uv_image.use(1)
+        self._screen.render(vertices=3)
+        self._ctx.depth_func = "<"

@@ -1,0 +1,147 @@
+"""From trained weights to an avatar's bundle: quantise network and texture, evaluate both networks, write the files.
+
+Rule: every error in the manifest is measured here, on the content of the files that are written.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from trilane.avatars.bundle import write_bundle
+from trilane.avatars.manifest import Manifest, Validation, network_entry
+from trilane.avatars.network_reshape import reshaped
+from trilane.body.body import ShapedBody
+from trilane.training.body_arrays import body_arrays
+from trilane.training.comparison_sheet import comparison_sheet
+from trilane.training.evaluate import evaluate, float_painter, integer_painter, summary
+from trilane.training.first_texture import used_texels
+from trilane.training.neural_texture import read_texture
+from trilane.training.onnx_export import export_onnx
+from trilane.training.quantising.quantise import Quantised, quantise
+from trilane.training.sample_files import U16, ShapeGroup
+from trilane.training.sample_renderer import BAND_NAMES, Sample, SampleRenderer
+from trilane.training.trainable_avatar import TrainableAvatar
+
+INT8_MAX = 127
+#: The network is calibrated at the tensor shape that standing bodies get most often, and stored for the square one.
+CALIBRATION_SHAPE = (320, 192)
+STORED_SHAPE = (256, 256)
+CALIBRATION_FRAMES = 96
+METHOD = "minmax"
+TEXEL_MARGIN = 3
+
+
+@dataclass(frozen=True)
+class QuantisedAvatar:
+    """`network`: in integers. `texture` (S,S,C) int8 with `scale` (C,) float32."""
+
+    network: Quantised
+    texture: NDArray[np.int8]
+    scale: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """`float_errors`, `integer_errors`: `summary` of each network. `sheet`: truth, float, integer side by side."""
+
+    float_errors: dict[str, Any]
+    integer_errors: dict[str, Any]
+    sheet: NDArray[np.uint8]
+
+
+def byte_texture(avatar: TrainableAvatar, shaped: ShapedBody) -> tuple[NDArray[np.int8], NDArray[np.float32]]:
+    """The texture as int8 (S,S,C) and the scale (C,) of each channel; texels that the body does not use are 0."""
+    image = avatar.texture.image().detach()[0].permute(1, 2, 0).numpy()
+    image = image * used_texels(body_arrays(shaped), image.shape[0], TEXEL_MARGIN)[..., None]
+    scale = np.maximum(np.abs(image).max(axis=(0, 1)), 1e-6) / INT8_MAX
+    return np.round(image / scale).astype(np.int8), scale.astype(np.float32)
+
+
+def integer_network(avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int) -> Quantised:
+    """The network in integers, calibrated on training samples of one shape."""
+    group = next(group for group in groups if group.shape == CALIBRATION_SHAPE)
+    chosen = np.random.default_rng(seed).permutation(len(group))[:CALIBRATION_FRAMES]
+    frames = _inputs(avatar, group, np.sort(chosen))
+    quantised = quantise(export_onnx(avatar.network, *CALIBRATION_SHAPE), frames, METHOD)
+    return Quantised(reshaped(quantised.network, *STORED_SHAPE), quantised.facts)
+
+
+def quantise_avatar(
+    avatar: TrainableAvatar, shaped: ShapedBody, groups: list[ShapeGroup], seed: int
+) -> QuantisedAvatar:
+    """Network and texture in integers.
+
+    `avatar`: the trained weights.
+    `shaped`: the body, whose texels are stored.
+    `groups`: training samples, from which calibration frames are chosen.
+    `seed`: of that choice.
+    """
+    texture, scale = byte_texture(avatar, shaped)
+    return QuantisedAvatar(integer_network(avatar, groups, seed), texture, scale)
+
+
+def evaluate_avatar(
+    avatar: TrainableAvatar, quantised: QuantisedAvatar, renderer: SampleRenderer, held_out: list[Sample], threads: int
+) -> Evaluation:
+    """Evaluate the avatar on samples it was not trained on, in float and in integers.
+
+    `avatar`: the trained weights.
+    `quantised`: the same avatar in integers.
+    `renderer`: renders the samples.
+    `held_out`: the samples.
+    `threads`: of the integer network's runtime.
+    """
+    texture = quantised.texture.astype(np.float32) * quantised.scale
+    floats = evaluate(renderer, held_out, float_painter(avatar))
+    integers = evaluate(renderer, held_out, integer_painter(renderer, quantised.network.network, texture, threads))
+    return Evaluation(summary(floats), summary(integers), comparison_sheet(floats, integers))
+
+
+def write_avatar(
+    folder: Path,
+    body: Path,
+    quantised: QuantisedAvatar,
+    evaluation: Evaluation,
+    width: int,
+    provenance: dict[str, Any],
+    names: dict[str, str],
+) -> None:
+    """Write the bundle.
+
+    `folder`: of the bundle.
+    `body`: the body file.
+    `quantised`: network and texture.
+    `evaluation`: the errors that go into the manifest.
+    `width`: of the network; 64 is full.
+    `provenance`: how the avatar was trained.
+    `names`: `name` and `training_command` of the manifest.
+    """
+    floats, integers = evaluation.float_errors, evaluation.integer_errors
+    errors = {key: integers[key] for key in ("psnr_db_by_band", "iou", "ssim")}
+    loss = {band: round(floats["psnr_db_by_band"][band] - integers["psnr_db_by_band"][band], 2) for band in BAND_NAMES}
+    manifest = Manifest(
+        name=names["name"],
+        network=network_entry(quantised.network.network, "resnet18", "batch", width),
+        provenance=provenance,
+        training_command=names["training_command"],
+        quantisation=quantised.network.facts,
+        validation=Validation.model_validate(errors | {"float": floats, "integer": integers, "psnr_loss_db": loss}),
+    )
+    write_bundle(folder, manifest, body, quantised.texture, quantised.network.network, quantised.scale)
+
+
+def _inputs(avatar: TrainableAvatar, group: ShapeGroup, index: NDArray[np.int64]) -> list[NDArray[np.float32]]:
+    """The network's inputs (H, W, C) for samples `index` of `group`."""
+    image = avatar.texture.image().detach()
+    frames = []
+    for number in index:
+        uv = torch.from_numpy(group.uv[number].astype(np.float32) / U16)[None]
+        covered = torch.from_numpy(group.covered[number] > 0)[None]
+        frames.append(read_texture(image, uv, covered)[0].permute(1, 2, 0).numpy())
+    return frames

@@ -1,0 +1,98 @@
+"""Random cameras round a posed body, by band: how much of the body fills the screen, from far away to the face.
+
+Rule: a close-up is taken by a camera that is near or has a long lens; pixels are never enlarged.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from trilane.arrays import F64
+from trilane.body.joints import JOINT_INDEX
+
+NEAR_M, FAR_M = 0.05, 100.0
+NEAREST_M = 0.45
+#: Band to the joints that a camera may aim at, and the least and greatest height, metres at the aim, that fills the
+#: screen.
+BANDS: dict[str, tuple[tuple[str, ...], float, float]] = {
+    "far": (("pelvis", "spine1"), 4.5, 10.0),
+    "full_body": (("pelvis", "spine1"), 1.9, 3.4),
+    "upper_body": (("spine2", "spine3", "neck"), 0.75, 1.25),
+    "face": (("head",), 0.34, 0.60),
+}
+#: Joints that a camera may aim at in band `anywhere`, which only training has.
+ANYWHERE = (
+    "left_wrist",
+    "right_wrist",
+    "left_elbow",
+    "left_knee",
+    "right_knee",
+    "left_foot",
+    "right_foot",
+    "spine1",
+    "head",
+)
+SCREENS = (4 / 3, 4 / 3, 16 / 9, 3 / 4)
+PITCH_DEG = (-20.0, 40.0)
+FOV_DEG = (24.0, 60.0)
+
+
+@dataclass(frozen=True)
+class View:
+    """`view` and `projection` (4,4), OpenGL; `aspect` of the screen, width over height."""
+
+    view: F64
+    projection: F64
+    aspect: float
+
+
+def random_view(rng: np.random.Generator, band: str, joints: F64) -> View:
+    """A random camera of `band` (a name of `BANDS`, or `anywhere`) for a body with `joints` (55,3) in world metres."""
+    names, least, most = BANDS.get(band, (ANYWHERE, 0.4, 2.5))
+    aim = joints[JOINT_INDEX[names[rng.integers(len(names))]]]
+    if band == "face":
+        aim = aim + 0.04 * (joints[JOINT_INDEX["left_eye"]] - joints[JOINT_INDEX["head"]]) / 0.1
+    framed = np.exp(rng.uniform(np.log(least), np.log(most)))
+    fov = np.radians(rng.uniform(*FOV_DEG))
+    distance = max(framed / (2 * np.tan(fov / 2)), NEAREST_M)
+    fov = 2 * np.arctan(framed / (2 * distance))
+    yaw, pitch = rng.uniform(-np.pi, np.pi), np.radians(_pitch(rng))
+    back = np.array([np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)])
+    aspect = SCREENS[rng.integers(len(SCREENS))]
+    off = 0.18 * framed * np.clip(rng.standard_normal(3), -1.5, 1.5)
+    roll = np.radians(4.0) * rng.standard_normal()
+    return View(look_at(aim + distance * back + off, aim + off, roll), perspective(fov, aspect), aspect)
+
+
+def look_at(eye: F64, at: F64, roll: float = 0.0) -> F64:
+    """The matrix (4,4) from world to camera of a camera at `eye` that looks at `at`, rolled by `roll` radians."""
+    z = (eye - at) / np.linalg.norm(eye - at)
+    x = np.cross([0.0, 1.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    y = np.cross(z, x)
+    c, s = np.cos(roll), np.sin(roll)
+    view = np.eye(4)
+    view[:3, :3] = [c * x + s * y, c * y - s * x, z]
+    view[:3, 3] = -view[:3, :3] @ eye
+    return view
+
+
+def perspective(fov_y: float, aspect: float, near: float = NEAR_M, far: float = FAR_M) -> F64:
+    """OpenGL projection (4,4).
+
+    `fov_y`: vertical field of view, radians.
+    `aspect`: width over height.
+    `near`, `far`: distances of the clip planes, metres.
+    """
+    f = 1 / np.tan(fov_y / 2)
+    matrix = np.zeros((4, 4))
+    matrix[0, 0], matrix[1, 1], matrix[3, 2] = f / aspect, f, -1.0
+    matrix[2, 2], matrix[2, 3] = (far + near) / (near - far), 2 * far * near / (near - far)
+    return matrix
+
+
+def _pitch(rng: np.random.Generator) -> float:
+    low, high = PITCH_DEG
+    return float(rng.triangular(low, 5.0, high))

@@ -1,0 +1,93 @@
+"""Renders one sample of the training: the UV image of the default body and the picture of it clothed.
+
+Rule: crop, tensor shape and both rasters are the pipeline's; a sample depends only on its seed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.arrays import F64
+from trilane.body.body import ShapedBody
+from trilane.body.kinematics import Skeleton
+from trilane.body.skin_weights import largest_weights
+from trilane.shapes import shape_buckets
+from trilane.stages.gpu.avatar_mesh import enough_weights
+from trilane.stages.gpu.mesh_arrays import mesh_arrays
+from trilane.stages.gpu.opengl_context import open_context
+from trilane.stages.gpu.skinned_mesh import SkinnedMesh
+from trilane.training.body_arrays import body_arrays
+from trilane.training.clothing.clothed_body import ClothedBody
+from trilane.training.clothing.landmarks import find_landmarks
+from trilane.training.clothing.layers import clothing_layers
+from trilane.training.random_views import BANDS, View, random_view
+from trilane.training.sample_crop import Crop, Cropper
+from trilane.training.uv_image import UvRaster
+
+BAND_NAMES = tuple(BANDS)
+ANYWHERE = len(BAND_NAMES)
+LEAST_PIXELS = 200
+PoseSource = Callable[[np.random.Generator], F64]
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What to render. `pose` (55,3) axis-angle, radians. `band`: an index into BAND_NAMES, or ANYWHERE."""
+
+    pose: F64
+    view: View
+    crop: Crop
+    band: int
+
+
+class SampleRenderer:
+    """Plans and renders samples of one body, with an OpenGL context of its own."""
+
+    def __init__(self, shaped: ShapedBody, threads: int | None = None, samples: int = 2) -> None:
+        """Put clothes on the body and open the context.
+
+        `shaped`: the body.
+        `threads`: of a software OpenGL driver; None for its default.
+        `samples`: of the ground truth along each side of a pixel, an even number.
+        Raises MissingPartError without OpenGL.
+        """
+        body = shaped.body
+        arrays = body_arrays(shaped)
+        top = largest_weights(body.weights, enough_weights(body))
+        mesh = mesh_arrays(shaped.vertices, body.faces, body.uv, body.uv_faces, top.joints, top.weights)
+        landmarks = find_landmarks(arrays.vertices, arrays.joints, arrays.weights)
+        self.skeleton = Skeleton(shaped.joints, body.parents)
+        self.cropper = Cropper(shaped)
+        self.ctx = open_context(threads)
+        self.mesh = SkinnedMesh(self.ctx, mesh)
+        self._uv = UvRaster(self.ctx, self.mesh)
+        self.clothed_body = ClothedBody(self.ctx, clothing_layers(arrays, landmarks), landmarks, samples)
+
+    def plan(self, seed: Sequence[int], source: PoseSource, band: str, size: str) -> Sample:
+        """The sample of `seed`: draws views until enough of the body is on the screen.
+
+        `seed`: numbers that alone decide the sample.
+        `source`: draws the pose.
+        `band`: a name of BANDS, or `anywhere`.
+        `size`: the tensor size, as `shape_buckets` takes it.
+        """
+        rng = np.random.default_rng(seed)
+        pose = source(rng)
+        posed = self.skeleton.pose(pose)
+        while True:
+            view = random_view(rng, band, posed.joints)
+            crop = self.cropper.crop(posed, view, shape_buckets(size))
+            if crop is not None and crop.pixels >= LEAST_PIXELS:
+                return Sample(pose, view, crop, BAND_NAMES.index(band) if band in BANDS else ANYWHERE)
+
+    def render(self, sample: Sample) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+        """The UV image (h,w,3) float32 of u, v, coverage, and the ground truth (h,w,4) uint8, straight alpha."""
+        joints = self.skeleton.pose(sample.pose).matrices
+        crop = sample.crop
+        uv = self._uv.render(joints, sample.view.view, crop.projection, crop.shape)
+        rgba = self.clothed_body.render(joints, sample.view.view, crop.projection, crop.shape)
+        return uv, rgba
