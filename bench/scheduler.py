@@ -99,7 +99,7 @@ def _add_simpy(
 ) -> dict[str, dict[str, str]]:
     """The peer as a way, or why it is absent."""
     try:
-        from trilane.bench.simpy_model import SimpyPipeline
+        from trilane.bench.lib.simpy_model import SimpyPipeline
     except ModuleNotFoundError:
         return {"absent": {"simpy": f"not installed: {install_line('peers')}"}}
     ways["simpy"] = lambda: SimpyPipeline(graph, service, frames, PERIOD_NS).run()
@@ -110,7 +110,7 @@ def _processed(graph: Graph, service: Service, frames: int, *, with_simpy: bool)
     """Events that each way goes through by its own count."""
     counts = {"trilane": frames * (len(graph.stages) + 1)}
     if with_simpy:
-        from trilane.bench.simpy_model import SimpyPipeline
+        from trilane.bench.lib.simpy_model import SimpyPipeline
 
         counts["simpy"] = SimpyPipeline(graph, service, frames, PERIOD_NS).run_counting()
     return counts

@@ -85,7 +85,7 @@ def test_virtual_time_agrees_with_simpy_and_repeats_itself() -> None:
 
 def test_without_simpy_the_bench_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "simpy", None)
-    monkeypatch.delitem(sys.modules, "trilane.bench.simpy_model", raising=False)
+    monkeypatch.delitem(sys.modules, "trilane.bench.lib.simpy_model", raising=False)
     result = scheduler.measure(minutes=0.05, turns=1, seeds=1)
     assert [row["way"] for row in result["rows"]] == ["trilane"]
     assert "pip install" in result["absent"]["simpy"]
