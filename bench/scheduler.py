@@ -1,6 +1,7 @@
 """How fast is the scheduler in virtual time, beside SimPy on the same model, and is it the same every time?
 
-Rule: both present every frame at the same nanosecond or the bench fails; they take turns, with the same service times.
+Rule: both present every frame at the same nanosecond or the bench fails; their runs are interleaved, with the same
+service times.
 """
 
 from __future__ import annotations
@@ -31,14 +32,19 @@ REPEATS, SEED_FRAMES = 10, 300
 
 
 def measure(minutes: float = 30.0, turns: int = 3, seeds: int = 10, events: str = "") -> dict[str, Any]:
-    """`minutes` of the avatar's pipeline at 60 frames a second, policy `pipelined`, edges `double`.
+    """The speed of both, and whether equal inputs give equal runs.
+
+    `minutes`: of the avatar's pipeline at 60 frames a second, policy `pipelined`, edges `double`.
+    `turns`: runs of each, interleaved; the median counts.
+    `seeds`: for how many seeds equal runs are compared.
+    `events`: a run's folder or events.jsonl, to be replayed.
 
     Rows: `way`, `frames`, median CPU `seconds`, `events_per_s` (an event: a frame's release or a job's end, the same
     number in both), `processed` (by the way's own count; SimPy takes several to a job). `agree`: frames that both
-    present at the same nanosecond. `same_traces`: of `seeds` seeds, with a unit that dies, how many give one trace in
-    10 repeats; `different_traces`: traces between the seeds. `replay`: of the events of a run (`events`: its folder or
-    events.jsonl), `steps` and how many are answered differently.
-    Raises BadInputError for what is no recording, TrilaneError when SimPy disagrees.
+    present at the same nanosecond. `same_traces`: for how many seeds 10 repeats of a run in which a unit dies give one
+    trace; `different_traces`: traces between the seeds. `replay`: of `events`, the `steps` and how many are answered
+    differently.
+    Raises BadInputError when `events` is not a recording, TrilaneError when SimPy disagrees.
     """
     if minutes <= 0 or turns < 1 or seeds < 1:
         raise BadInputError("bench scheduler", f"minutes {minutes:g}, turns {turns}, seeds {seeds}", "positive numbers")
@@ -58,15 +64,15 @@ def measure(minutes: float = 30.0, turns: int = 3, seeds: int = 10, events: str 
         raise TrilaneError("SimPy's model presents frames at other times than Trilane's scheduler")
     counts = _processed(graph, service, frames, with_simpy=not absent)
     events_each = frames * (len(graph.stages) + 1)
-    rows = [_row(way, frames, events_each, median(taken), counts[way]) for way, taken in seconds.items()]
+    rows = [_row(way, frames, events_each, median(runs), counts[way]) for way, runs in seconds.items()]
     speeds = {row["way"]: row["events_per_s"] for row in rows}
     traces = [_traces(seed) for seed in range(seeds)]
     return {
         "rows": rows,
         "over_simpy": speeds["trilane"] / speeds["simpy"] if "simpy" in speeds else None,
         "agree": None if absent else frames,
-        "same_traces": sum(len(set(found)) == 1 for found in traces),
-        "different_traces": len({found[0] for found in traces}),
+        "same_traces": sum(len(set(repeats)) == 1 for repeats in traces),
+        "different_traces": len({repeats[0] for repeats in traces}),
         "config": {
             "core": form(),
             "minutes": minutes,
@@ -81,7 +87,7 @@ def measure(minutes: float = 30.0, turns: int = 3, seeds: int = 10, events: str 
 
 
 def _service(seed: int, frames: int) -> Service:
-    """Service times from a table made beforehand, so that both ways pay a look-up and no more."""
+    """Service times from a table made beforehand, so that both runs pay for a look-up and no more."""
     rng = np.random.default_rng(seed)
     table = {name: (ms * MS * rng.uniform(0.5, 1.5, frames)).astype(int).tolist() for name, ms in SERVICE_MS.items()}
     return lambda stage, _unit, frame, _begin_ns: table[stage][frame]
@@ -97,7 +103,7 @@ def _trilane(graph: Graph, service: Service, frames: int) -> list[int]:
 def _add_simpy(
     ways: dict[str, Callable[[], list[int]]], graph: Graph, service: Service, frames: int
 ) -> dict[str, dict[str, str]]:
-    """The peer as a way, or why it is absent."""
+    """Add SimPy's run to `ways`, or answer why it is absent."""
     try:
         from trilane.bench.lib.simpy_model import SimpyPipeline
     except ModuleNotFoundError:
@@ -107,7 +113,7 @@ def _add_simpy(
 
 
 def _processed(graph: Graph, service: Service, frames: int, *, with_simpy: bool) -> dict[str, int]:
-    """Events that each way goes through by its own count."""
+    """How many events each of the two processes, by its own count."""
     counts = {"trilane": frames * (len(graph.stages) + 1)}
     if with_simpy:
         from trilane.bench.lib.simpy_model import SimpyPipeline
@@ -124,15 +130,15 @@ def _row(way: str, frames: int, events: int, seconds: float, processed: int) -> 
 def _traces(seed: int) -> list[str]:
     """Digests of every step of equal runs under the `deadline` policy, in which the DSP dies once."""
     settings = Settings(SEED_FRAMES, "deadline", period_ns=PERIOD_NS, deadline_ns=3 * PERIOD_NS)
-    found = []
+    digests = []
     for _ in range(REPEATS):
         faults = [(1_000 * MS + seed * 7 * MS, "dsp")]
         done = simulate(
             application_graph(), settings, _service(seed, SEED_FRAMES), restart_ns=50 * MS, faults=faults, keep=True
         )
         assert done.recording is not None
-        found.append(hashlib.sha256(repr((done.recording.steps, done.report)).encode()).hexdigest())
-    return found
+        digests.append(hashlib.sha256(repr((done.recording.steps, done.report)).encode()).hexdigest())
+    return digests
 
 
 def _replayed(events: str) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Who may touch a slot, and when. Rule: a slot changes hands only by a transition of the table; nothing else moves it.
+"""Which unit a slot belongs to, and when. Rule: a slot changes hands by a transition of the table, and by nothing else.
 
     FREE --claim--> WRITING --commit--> READY --take--> READING --release--> FREE
 
@@ -79,10 +79,14 @@ class EdgeSlots:
         self.epoch = 0
 
     def can_claim(self) -> bool:
+        """Whether a slot is free, or may be taken from the oldest waiting frame."""
         return bool(self.free) or (self.rule.yields and bool(self.ready))
 
     def claim(self, frame: int) -> tuple[int, int | None]:
-        """A slot to write `frame` into, and the frame that gave way for it, if one did."""
+        """A slot to write `frame` into, and the waiting frame that was evicted from it, if one was.
+
+        Raises SlotError when none is free and none may be evicted.
+        """
         dropped = None
         if not self.free and self.rule.yields and self.ready:
             dropped = self.drop(self.ready[0])
@@ -101,14 +105,17 @@ class EdgeSlots:
         return replaced
 
     def take(self, slot: int) -> None:
+        """The consumer's unit reads the slot from now on."""
         self._move("take", slot)
         self.ready.remove(slot)
 
     def release(self, slot: int) -> None:
+        """The consumer's unit has read the slot."""
         self._move("release", slot)
         self._empty(slot)
 
     def abandon(self, slot: int) -> None:
+        """The producer's unit will not complete the slot."""
         self._move("abandon", slot)
         self._empty(slot)
 

@@ -1,6 +1,6 @@
 """The avatar's pipeline in SimPy, for comparison: the same chain, slots, held jobs and order as the `pipelined` policy.
 
-Rule: nothing but what decides when a frame is presented; no accounts, no faults, no other policies.
+Rule: only what decides when a frame is presented; no ledger, no faults, no other policies.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class SimpyPipeline:
         return self.presented_ns
 
     def run_counting(self) -> int:
-        """The same, one event after the other; returns how many SimPy processed."""
+        """The same, and returns how many events SimPy processed."""
         count = 0
         while self.env.peek() != simpy.core.Infinity:
             self.env.step()

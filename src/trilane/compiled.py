@@ -1,8 +1,8 @@
 """Which modules are compiled, and whether they are here. Rule: what runs is what the sources say, or nothing runs.
 
-mypyc turns the core, and the line over which it is told and answers, into C while the package is installed (setup.py);
-without a C compiler the same files run as Python, less than half as fast. The name of the compiled library holds a
-digest of the sources it was made from.
+mypyc turns the core, and the job pipe over which units get jobs and answer, into C while the package is installed
+(setup.py); without a C compiler the same files run as Python, less than half as fast. The name of the compiled library
+holds a digest of the sources it was made from.
 """
 
 from __future__ import annotations

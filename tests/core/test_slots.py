@@ -75,7 +75,7 @@ def test_a_frame_given_back_waits_in_its_old_place() -> None:
     assert [edge.frame[slot] for slot in edge.ready] == [0, 1, 2]
 
 
-def test_a_frame_given_back_to_a_mailbox_gives_way_to_a_newer_one() -> None:
+def test_a_frame_given_back_to_a_mailbox_is_evicted_by_a_newer_one() -> None:
     edge = EdgeSlots(edge_rule("triple"))
     edge.commit(edge.claim(0)[0])
     held = edge.ready[0]
