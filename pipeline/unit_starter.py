@@ -46,6 +46,7 @@ class UnitStarter:
             self._server = self._spawn(theirs, preload)
             undo.pop_all()
         self._socket.settimeout(ANSWER_S)
+        self._is_used = False
 
     def _spawn(self, theirs: socket.socket, preload: Sequence[str]) -> subprocess.Popen[bytes]:
         arguments = [f"--socket={theirs.fileno()}", f"--parent={os.getpid()}", f"--preload={','.join(preload)}"]
@@ -61,6 +62,7 @@ class UnitStarter:
 
     def start(self, spec: UnitSpec, stderr_fd: int) -> StartedUnit:
         """A process for the unit, which writes to `stderr_fd`. Raises TrilaneError when the fork server failed."""
+        self._is_used = True
         spec_fd = os.memfd_create(f"trilane:spec:{spec.unit}", os.MFD_CLOEXEC)
         try:
             os.write(spec_fd, spec.model_dump_json().encode())
@@ -79,6 +81,8 @@ class UnitStarter:
     def close(self) -> None:
         """End the fork server; units that still live end with it."""
         self._socket.close()
+        if not self._is_used:
+            self._server.kill()  # it may still be importing
         try:
             self._server.wait(CLOSE_S)
         except subprocess.TimeoutExpired:

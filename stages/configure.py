@@ -6,7 +6,7 @@ input ends the command before a process is started or a file is made.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,8 @@ from trilane.stages.machine import gl_facts, machine_facts
 
 ROOM = "room"
 COMMAND_LINE = "command line"
+
+GlFacts = Callable[[], dict[str, Any] | None]
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,7 @@ def requested_scene(request: Request) -> Scene:
     return scene_from(COMMAND_LINE, values)
 
 
-def configure(request: Request, out_dir: Path) -> Checked:
+def configure(request: Request, out_dir: Path, gl: GlFacts = gl_facts) -> Checked:
     """Look at every part of what was asked for. Raises BadInputError or MissingPartError."""
     scene = requested_scene(request)
     runtime, reason = requested_runtime(request.runtime)
@@ -104,7 +106,7 @@ def configure(request: Request, out_dir: Path) -> Checked:
     require_one_tensor(list(avatars.values()))
     staged = stage_scene(scene, [avatars[folder].shaped for folder in folders], Path.cwd())
     cuts = requested_cuts(request.split, avatars[folders[0]].network)
-    unit, why = skinning_unit(request.skinning)
+    unit, why = skinning_unit(request.skinning, gl)
     config = RunConfig(
         scene=scene,
         out_dir=out_dir,
@@ -152,20 +154,20 @@ def _accuracy(bundle: Bundle) -> dict[str, Any]:
     return {} if validation is None else validation.model_dump(mode="json")
 
 
-def skinning_unit(asked: str) -> tuple[str, str]:
+def skinning_unit(asked: str, gl: GlFacts = gl_facts) -> tuple[str, str]:
     """`cpu` or `gpu`, and why: what was asked for, else the GPU where the driver is hardware. Raises BadInputError."""
     if asked in ("cpu", "gpu"):
         return asked, "as asked"
     if asked != "auto":
         raise BadInputError("--skinning", repr(asked), "auto, cpu or gpu")
-    gl = gl_facts()
-    hardware = gl is not None and bool(gl.get("hardware"))
+    driver = gl()
+    hardware = driver is not None and bool(driver.get("hardware"))
     return ("gpu", "the driver is hardware") if hardware else ("cpu", "the OpenGL driver is software")
 
 
-def required_machine() -> dict[str, Any]:
+def required_machine(gl: GlFacts = gl_facts) -> dict[str, Any]:
     """Facts of this machine. Raises MissingPartError when no OpenGL context can be made."""
-    gl = gl_facts()
-    if gl is None:
+    driver = gl()
+    if driver is None:
         raise MissingPartError("no OpenGL 3.3 context through EGL", EGL_LINE)
-    return machine_facts(gl)
+    return machine_facts(driver)

@@ -5,6 +5,7 @@ Rule: only what was read or tried on this machine is stated; what could not be r
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import json
 import os
@@ -93,42 +94,46 @@ def open_gl() -> dict[str, Any]:
     }
 
 
-@cache
-def gl_probe() -> subprocess.Popen[bytes] | None:
-    """The process that looks at OpenGL, because a driver may crash; None when it cannot be started.
+class GlProbe:
+    """Looks at the OpenGL driver in a process of its own, because a driver may crash; the caller goes on meanwhile."""
 
-    Whoever needs `gl_facts` later calls this early: the process works while the caller goes on.
-    """
-    command = [sys.executable, "-P", "-c", GL_PROGRAM]
-    try:
-        return subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, process_group=0
+    def __init__(self) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", "-c", GL_PROGRAM],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            process_group=0,
         )
-    except OSError:
-        return None
+        self._facts: dict[str, Any] | None = None
+        self._is_open = True
+
+    def facts(self) -> dict[str, Any] | None:
+        """The driver that EGL gives; None when none works."""
+        if self._is_open:
+            with contextlib.suppress(subprocess.TimeoutExpired, ValueError):
+                printed, _ = self._process.communicate(timeout=GL_TIMEOUT_S)
+                read = json.loads(printed)
+                self._facts = read if isinstance(read, dict) else None
+            self.close()
+        return self._facts
+
+    def close(self) -> None:
+        """No process is left, whether its answer was asked for or not."""
+        if self._is_open:
+            self._is_open = False
+            self._process.kill()
+            self._process.communicate()
 
 
 @cache
 def gl_facts() -> dict[str, Any] | None:
-    """The OpenGL driver that EGL gives; None when none works."""
-    probe = gl_probe()
-    if probe is None:
-        return None
+    """The OpenGL driver that EGL gives; None when none works, or no process can be started to look at it."""
     try:
-        printed, _ = probe.communicate(timeout=GL_TIMEOUT_S)
-        facts = json.loads(printed)
-    except (subprocess.TimeoutExpired, ValueError):
+        with contextlib.closing(GlProbe()) as probe:
+            return probe.facts()
+    except OSError:
         return None
-    finally:
-        end_gl_probe()
-    return facts if isinstance(facts, dict) else None
-
-
-def end_gl_probe() -> None:
-    """Leave no process behind, whether its answer was needed or not."""
-    if gl_probe.cache_info().currsize and (probe := gl_probe()) is not None:
-        probe.kill()
-        probe.communicate()
 
 
 def runtime_facts() -> dict[str, Any]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from trilane.pipeline.unit_starter import UnitStarter
     from trilane.stages.config import RunConfig
     from trilane.stages.configure import Checked
+    from trilane.stages.machine import GlProbe
 
 app = typer.Typer(rich_markup_mode=None, add_completion=False)
 
@@ -137,34 +138,30 @@ def run(
 
     The folder holds report.json, video.mp4, contact.png, trace.pftrace (open it at ui.perfetto.dev) and events.jsonl.
     """
-    with _prepared_processes() as starter:
+    with _early_processes() as (starter, gl):
         from trilane.apps.run_job import Plan
         from trilane.stages.configure import Request, configure
 
         cuts = tuple(split or ())
         request = Request(scene, motion, camera, background, avatar, frames, size, runtime, hud, skinning, cuts)
-        checked = configure(request, Path.cwd())
+        checked = configure(request, Path.cwd(), gl.facts)
         chip_pace = _pace(checked.config, profile, pace, slow_motion)
         cap = performance_profile and str(performance_profile)
         _refuse_beside_pace(chip_pace, cuts, cap)
-        outcome = _run(checked, out, Plan(str(policy), baseline, chip_pace, cap, latch), starter)
+        outcome = _run(checked, out, Plan(str(policy), baseline, chip_pace, cap, latch), starter, gl)
     _print_outcome(outcome, as_json)
     raise typer.Exit(outcome.exit_code)
 
 
 @contextmanager
-def _prepared_processes() -> Iterator[UnitStarter]:
+def _early_processes() -> Iterator[tuple[UnitStarter, GlProbe]]:
     """The fork server and the look at OpenGL: both import what they need while this process does the same."""
     from trilane.pipeline.unit_starter import UnitStarter
     from trilane.stages.factories import PRELOAD
-    from trilane.stages.machine import end_gl_probe, gl_probe
+    from trilane.stages.machine import GlProbe
 
-    with UnitStarter(PRELOAD) as starter:
-        gl_probe()
-        try:
-            yield starter
-        finally:
-            end_gl_probe()
+    with UnitStarter(PRELOAD) as starter, closing(GlProbe()) as gl:
+        yield starter, gl
 
 
 def _pace(config: RunConfig, profile: str | None, asked: bool, slow_motion: float) -> Pace | None:
@@ -190,7 +187,7 @@ def _refuse_beside_pace(pace: Pace | None, cuts: tuple[str, ...], cap: str | Non
         raise BadInputError("options", "--performance-profile with --pace", "one of them", "a pace is capped already")
 
 
-def _run(checked: Checked, out: Path | None, plan: Plan, starter: UnitStarter) -> Outcome:
+def _run(checked: Checked, out: Path | None, plan: Plan, starter: UnitStarter, gl: GlProbe) -> Outcome:
     """Run `checked` as `plan` says, to the folder `out` or the default one."""
     from trilane.apps.run_folder import default_place
     from trilane.apps.run_job import run_to_folder
@@ -202,7 +199,7 @@ def _run(checked: Checked, out: Path | None, plan: Plan, starter: UnitStarter) -
     with _hooks() as hooks:
         for note in checked.notes:
             hooks.message(note)
-        return run_to_folder(checked, target, plan, hooks, machine=required_machine(), starter=starter)
+        return run_to_folder(checked, target, plan, hooks, machine=required_machine(gl.facts), starter=starter)
 
 
 def _print_outcome(outcome: Outcome, as_json: bool) -> None:

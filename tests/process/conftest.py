@@ -9,7 +9,6 @@ from pathlib import Path
 import psutil
 import pytest
 
-MOCK = "trilane.testing.doubles"
 SHM = Path("/dev/shm")  # noqa: S108 - looked at, not written to
 OPEN_FILES = Path("/proc/self/fd")
 

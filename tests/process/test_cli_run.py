@@ -23,6 +23,7 @@ from PIL import Image
 from trilane.apps.report import read_report
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_split import cuts
+from trilane.pipeline.fork_server import process_name
 from trilane.scheduler.recording import read, replay
 
 FRAMES = 20
@@ -180,7 +181,7 @@ def test_a_killed_run_leaves_nothing_that_looks_whole(drawable_bundle: Path, tmp
 
 def test_a_killed_unit_is_restarted_and_its_video_goes_on(drawable_bundle: Path, tmp_path: Path) -> None:
     with running(drawable_bundle, tmp_path) as (parent, units):
-        victim = next(unit for unit in units if "cpu" in unit.cmdline())
+        victim = next(unit for unit in units if unit.name() == process_name("cpu"))
         victim.kill()
         wait_until(lambda: len(list(tmp_path.glob("*.partial/segments/*.mp4"))) == 2, "a second segment")
         second = max(tmp_path.glob("*.partial/segments/*.mp4"))

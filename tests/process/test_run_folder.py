@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -12,14 +13,18 @@ from trilane.apps.report import read_report
 from trilane.apps.run_job import Hooks, Outcome, Plan, run_to_folder
 from trilane.errors import TrilaneError
 from trilane.hw_profiles.host import host_units
+from trilane.pipeline.assets import Assets
+from trilane.pipeline.result import RunResult
+from trilane.pipeline.run import run_pipeline
 from trilane.scene.schema import OutputSpec, Scene
 from trilane.scheduler.recording import read, replay
 from trilane.stages.config import RunConfig
+from trilane.stages.configure import Checked
 from trilane.stages.machine import machine_facts
+from trilane.testing.doubles import pipeline_of_doubles
 
 FRAMES = 24
-MOCK = "trilane.testing.doubles"
-pytestmark = pytest.mark.usefixtures("no_new_process")
+pytestmark = pytest.mark.usefixtures("no_new_process", "behaviour")
 
 
 class Listener:
@@ -36,18 +41,29 @@ class Listener:
             os.kill(os.getpid(), signal.SIGINT)
 
 
+@pytest.fixture
+def behaviour(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
+    """Runs are of doubles; what is put in here is how they behave, by stage."""
+    asked: dict[str, object] = {}
+
+    def run_doubles(config: RunConfig, assets: Assets, frames: int | None, **options: Any) -> RunResult:
+        pipeline = pipeline_of_doubles(**asked)
+        return run_pipeline(pipeline, frames or config.scene.frames, fps=config.scene.fps, assets=assets, **options)
+
+    monkeypatch.setattr("trilane.apps.run_job.run_avatar", run_doubles)
+    return asked
+
+
 def run_mocks(target: Path, listener: Listener, plan: Plan | None = None, frames: int = FRAMES) -> Outcome:
     config = RunConfig(
         scene=Scene(frames=frames, output=OutputSpec(width=64, height=64)),
         out_dir=target,
         avatar_dirs=(),
         units=host_units(),
-        fake=dict.fromkeys(("cpu", "gpu", "dsp"), MOCK),
     )
     hooks = Hooks(listener.progress, listener.messages.append)
-    return run_to_folder(
-        config, target, plan or Plan(baseline_frames=8), hooks, machine=machine_facts(), facts={"notes": ["x"]}
-    )
+    checked = Checked(config, assets={}, notes=("x",), accuracy={})
+    return run_to_folder(checked, target, plan or Plan(baseline_frames=8), hooks, machine=machine_facts())
 
 
 def test_a_run_leaves_one_whole_folder_and_no_process(tmp_path: Path) -> None:
@@ -102,9 +118,9 @@ def test_an_interrupted_baseline_loses_nothing_of_the_run(tmp_path: Path) -> Non
 
 
 def test_a_stage_that_fails_is_named_and_the_frames_before_it_are_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, behaviour: dict[str, object]
 ) -> None:
-    monkeypatch.setenv("TRILANE_MOCK", "infer=raise")
+    behaviour["infer"] = "raise"
     listener = Listener()
     outcome = run_mocks(tmp_path / "run", listener, frames=100)  # frame 3 is none of those measured before the run
     assert outcome.exit_code == 2
@@ -113,8 +129,8 @@ def test_a_stage_that_fails_is_named_and_the_frames_before_it_are_kept(
     assert any("mock.npz" in message for message in listener.messages)
 
 
-def test_a_unit_that_cannot_be_built_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TRILANE_MOCK", "infer=badbuild")
+def test_a_unit_that_cannot_be_built_leaves_nothing(tmp_path: Path, behaviour: dict[str, object]) -> None:
+    behaviour["infer"] = "badbuild"
     with pytest.raises(TrilaneError, match=r"mock\.onnx: found nothing") as raised:
         run_mocks(tmp_path / "made" / "run", Listener())
     assert raised.value.exit_code == 2
