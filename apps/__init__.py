@@ -1,4 +1,4 @@
-"""Who uses the pipeline: the command line, the dashboard, experiments and the run folder.
+"""Who uses the pipeline: the command line, experiments, what a run writes into its folder.
 
 It may use every other folder; nothing imports it.
 """

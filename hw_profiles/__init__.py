@@ -1,3 +1,4 @@
 """Describes chips (profiles in TOML) and computes their times, power, temperatures and throttling; also this machine's.
-Uses `scheduler` for runs in virtual time, `pipeline` for a unit's settings, and the modules beside the folders.
+
+It may use `pipeline/` and the folders below it: `scheduler/` for virtual time, `pipeline/` for the settings of a unit.
 """

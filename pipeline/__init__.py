@@ -1,4 +1,4 @@
-"""A run of any pipeline on real processes: driver, unit processes, worker, requests.
+"""Runs any pipeline on real processes: its description, the unit processes, the loop inside them, and the host clock.
 
-It may use `scheduler/`, `transport/` and what lies below; it knows neither scene nor avatar, OpenGL or ONNX.
+It may use `scheduler/`, `transport/` and what lies below them; it knows neither scene nor avatar, OpenGL or ONNX.
 """

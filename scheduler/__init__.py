@@ -1,4 +1,8 @@
-"""Which job goes next: a pure core and its two drivers."""
+"""Decides which job runs next: a pure core, the loop that drives it, and the driver of virtual time.
+
+It may use `transport/` and the modules in `src/trilane`; it imports no clock and no NumPy, and its only
+files are recordings.
+"""
 
 from trilane.compiled import check
 

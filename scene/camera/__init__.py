@@ -1,3 +1,4 @@
 """Reads camera files and makes the built-in cameras: a view and a projection over time.
-Uses, of `scene`, the motion's sampling in time, the rotations and the schema.
+
+It may use, of `scene/`, the rotations, the schema, and from `scene/motion/` the sampling in time.
 """

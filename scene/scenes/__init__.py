@@ -1,1 +1,1 @@
-"""Scenes as files."""
+"""The scenes that come with Trilane, as TOML files (data)."""
