@@ -44,11 +44,13 @@ def serve(requests: socket.socket) -> None:
         packet, fds, _flags, _address = socket.recv_fds(requests, PACKET_BYTES, MAX_FDS)
         if not packet:
             break
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGCHLD})  # a unit that dies at once keeps its number
         pid = os.fork()
         if pid == 0:
             requests.close()
             os._exit(_run_unit(json.loads(packet), fds, server_pid))
         pidfd = os.pidfd_open(pid)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGCHLD})
         socket.send_fds(requests, [str(pid).encode()], [pidfd])
         for fd in (pidfd, *fds):
             os.close(fd)
@@ -70,6 +72,7 @@ def _run_unit(request: dict[str, Any], fds: Sequence[int], server_pid: int) -> i
         os.dup2(stderr_fd, sys.stderr.fileno())
         os.close(stderr_fd)
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGCHLD})
         die_with_parent(server_pid)
         os.setpgid(0, 0)
         ctypes.CDLL(None).prctl(PR_SET_NAME, process_name(request["unit"]).encode(), 0, 0, 0)

@@ -18,7 +18,7 @@ from trilane.transport.job_pipe import PACKETS
 from trilane.transport.messages import Duration, RunIsolated
 
 LIMIT_S = 10.0  # no further frame is begun after this
-REPEATS = 3
+REPEATS = 2
 AT_ONCE = PACKETS - 4  # of the messages that a job pipe holds; the others are for what else may be under way
 
 

@@ -35,6 +35,7 @@ from trilane.unexpected import UnexpectedValue
 
 DEADLINE_PERIODS = 3  # from a frame's release until it must be presented
 HANG_NS = 10_000_000_000
+FRAMES_PER_ISOLATED, LEAST_ISOLATED, MOST_ISOLATED = 15, 4, 16
 SWITCH_S = 0.0002  # the longest that another thread of this process keeps the interpreter
 
 
@@ -61,7 +62,7 @@ def run_pipeline(
     fps: float = 30.0,
     pace_fps: float | None = None,
     assets: Assets | None = None,
-    isolated_frames: int = 16,
+    isolated_frames: int | None = None,
     hang_ns: int = HANG_NS,
     latch_ms: float = 0.0,
     requests: FrameRequestQueue | None = None,
@@ -78,7 +79,7 @@ def run_pipeline(
     `deadline`, which need a rate, at `fps`.
     `assets`: arrays that every stage may read.
     `isolated_frames`: frames measured with the other units quiet, half of them before the run and half after it, which
-    efficiency needs; 0 does a single one, to warm up, and measures nothing.
+    efficiency needs; None: one for every 15 of the run, from 4 to 16; 0 does a single one, to warm up.
     `hang_ns`: a unit whose job takes longer is restarted.
     `latch_ms`: the first stage begins so late that it is expected to end this long before the second can take it; 0: at
     once.
@@ -94,6 +95,7 @@ def run_pipeline(
     start; a failure after that is `RunResult.failure`.
     """
     check_open_files()
+    isolated = _isolated_share(frames) if isolated_frames is None else isolated_frames
     settings = _settings(policy, frames, fps, pace_fps, hang_ns, latch_ms, requests)
     log = RunLog(on_message)
     with (
@@ -107,12 +109,12 @@ def run_pipeline(
         core = Core(pipeline.graph(), settings)
         clock = RealtimeClock(core, processes, interrupts, log, requests, governor, on_progress)
         run = _Run(core, clock, processes, interrupts, log, Recording(core.graph, settings))
-        run.execute(isolated_frames)
+        run.execute(isolated)
     report = core.ledger.report(
         clock="host",
         requested=settings.frames if requests is None else core.source.released,
         target_period_ns=0 if settings.deadline_ns else round(1e9 / fps),
-        isolated_ns=run.isolated.mean_ns if isolated_frames else None,
+        isolated_ns=run.isolated.mean_ns if isolated else None,
     )
     report.update(policy=policy, edge=pipeline.rule, idle_cores=idle_cores, **(governor.report() if governor else {}))
     if governor is not None and governor.power_w is not None and report["fps"]:
@@ -222,6 +224,11 @@ def _settings(
         asked=requests is not None,
         latch_ns=round(latch_ms * 1e6),
     )
+
+
+def _isolated_share(frames: int) -> int:
+    """A short run is measured with fewer frames: its figures are as uncertain as theirs."""
+    return min(max(frames // FRAMES_PER_ISOLATED, LEAST_ISOLATED), MOST_ISOLATED)
 
 
 def _spread(frames: int, count: int) -> list[int]:

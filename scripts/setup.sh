@@ -50,7 +50,7 @@ make_venv() {
 # Exit code 0: a context can be made; 3: it cannot; else the packages themselves do not work.
 try_egl() { .venv/bin/python -c 'import sys
 from trilane.errors import MissingPartError
-from trilane.stages.gpu.context import open_context
+from trilane.stages.gpu.opengl_context import open_context
 try:
     open_context()
 except MissingPartError:
@@ -70,6 +70,7 @@ say "installing packages (${extras:-no extras}); the first time takes a minute o
 .venv/bin/python -m pip install --quiet --disable-pip-version-check --editable ".${extras:+[$extras]}" ||
   lacks "pip could not install the packages (see above): no network, or no wheel for this Python and machine" \
     ".venv/bin/python -m pip install --editable '.${extras:+[$extras]}'"
+.venv/bin/python -m compileall -q src/trilane >&2 || true # units start sooner; a read-only tree does without
 if ! has_egl; then
   apt_or_lacks "no OpenGL 3.3 context can be made through EGL" libegl1 libgl1-mesa-dri
   has_egl || lacks "EGL and Mesa are installed, yet no OpenGL 3.3 context can be made; see: .venv/bin/trilane doctor" \

@@ -22,11 +22,17 @@ class NetworkCut(Model):
 
 
 class RunConfig(Model):
-    """Everything a unit's process is told, as plain data. Paths are absolute and were checked by the parent.
+    """One run of the avatar, as plain data. Paths are absolute and were checked by the parent.
 
-    `out_dir` is the temporary run folder. `runtime` names the DSP runtime. `posed_vertices`: of each avatar, when the
-    CPU unit skins; empty when the GPU does. `pace_ns`: how long a job of a stage is held, at least. `fake` maps a unit
-    to the dotted module of a mock unit and is set by tests alone. `cuts`: of the network; its first part is the DSP's.
+    `scene`: what is shown, and with what avatars.
+    `out_dir`: the temporary run folder.
+    `avatar_dirs`: the bundle's folder of each avatar of the scene.
+    `units`: cores and threads of each unit.
+    `runtime`: that the DSP unit infers with.
+    `record`: whether the frames are encoded to a video.
+    `posed_vertices`: how many of each avatar, when the CPU unit skins; empty when the GPU unit does.
+    `pace_ns`: how long a job of a stage is held, at least.
+    `cuts`: of the network; its first part is the DSP's.
     """
 
     scene: Scene
@@ -37,7 +43,6 @@ class RunConfig(Model):
     record: bool = True
     posed_vertices: tuple[int, ...] = ()
     pace_ns: dict[str, int] = Field(default={})
-    fake: dict[str, str] = Field(default={})
     cuts: tuple[NetworkCut, ...] = ()
 
     @field_validator("units")

@@ -28,7 +28,6 @@ from trilane.scene.staging import stage_scene
 from trilane.stages.avatar_assets import load_avatar, pack_assets, require_one_tensor
 from trilane.stages.config import NetworkCut, RunConfig
 from trilane.stages.dsp.runtime import RUNTIMES, installed, resolve
-from trilane.stages.gpu.background import open_background
 from trilane.stages.machine import gl_facts, machine_facts
 
 ROOM = "room"
@@ -145,6 +144,8 @@ def requested_cuts(texts: Sequence[str], network: NetworkFile) -> tuple[NetworkC
 
 def _check_background(scene: Scene) -> None:
     if scene.background != ROOM:
+        from trilane.stages.gpu.background import open_background  # slow to import, and seldom needed here
+
         open_background(Path(scene.background), (scene.output.height, scene.output.width), scene.fps).close()
 
 

@@ -13,7 +13,6 @@ from typing import Annotated, Any, NoReturn
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from trilane import __version__
 from trilane.errors import TrilaneError, reason
 from trilane.install import install_line
 
@@ -78,6 +77,8 @@ app = typer.Typer(
 
 def _print_version(wanted: bool) -> None:
     if wanted:
+        from trilane import __version__
+
         print(f"trilane {__version__}")
         raise typer.Exit
 

@@ -5,7 +5,10 @@ Rule: after the first run of a session nothing is allocated and nothing is copie
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+import hashlib
+import io
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
 
@@ -16,6 +19,7 @@ from trilane.avatars.integer_network import IntegerNetwork
 from trilane.cache import cache_dir
 from trilane.errors import BadInputError
 from trilane.stages.dsp.runtime import RuntimeOptions
+from trilane.writing import write_bytes
 
 DEVICE = "CPU"
 LAYERS = {"Convolution", "Deconvolution", "FullyConnected", "MatMul"}
@@ -49,30 +53,57 @@ class OpenvinoSession:
 
 
 def load(network: IntegerNetwork, options: RuntimeOptions) -> OpenvinoSession:
-    """Compile `network`. Raises BadInputError when OpenVINO cannot load it or would run a layer in float."""
+    """Compile `network`, or take what was compiled before.
+
+    Raises BadInputError when OpenVINO cannot load it or would run a layer in float.
+    """
     settings = {
         "PERFORMANCE_HINT": "LATENCY",
         "INFERENCE_NUM_THREADS": options.threads,
         "NUM_STREAMS": 1,
         "ENABLE_CPU_PINNING": False,
     }
+    folder = cache_dir("openvino")
+    stored = folder / f"{_key(network, settings)}.blob" if folder else None
+    if stored is not None:
+        with contextlib.suppress(OSError, ValueError, RuntimeError):  # missing or damaged: it is compiled again
+            blob = _without_digest(stored.read_bytes())
+            return OpenvinoSession(_core().import_model(io.BytesIO(blob), DEVICE, settings))
     try:
-        model = _core().read_model(network.model.SerializeToString())
-        compiled = _core().compile_model(model, DEVICE, settings)
+        compiled = _core().compile_model(_core().read_model(network.model.SerializeToString()), DEVICE, settings)
     except RuntimeError as error:
         raise BadInputError(network.where, str(error), "a network that OpenVINO loads") from error
     _check_integer(compiled, network)
+    if stored is not None:
+        with contextlib.suppress(BadInputError):  # a full disk: it is compiled again the next time
+            write_bytes(stored, _with_digest(compiled.export_model().getvalue()))
     return OpenvinoSession(compiled)
+
+
+def _key(network: IntegerNetwork, settings: Mapping[str, Any]) -> str:
+    """What a compiled network depends on, as a file name: also the processor that it was compiled for."""
+    core = _core()
+    machine = [str(core.get_property(DEVICE, name)) for name in ("FULL_DEVICE_NAME", "OPTIMIZATION_CAPABILITIES")]
+    parts = (network.digest, version(), *machine, *(f"{name}={value}" for name, value in settings.items()))
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+
+
+def _with_digest(blob: bytes) -> bytes:
+    return hashlib.sha256(blob).digest() + blob
+
+
+def _without_digest(content: bytes) -> bytes:
+    """The blob of a file of `_with_digest`. Raises ValueError when it is damaged: OpenVINO itself would not notice."""
+    size = hashlib.sha256().digest_size
+    if hashlib.sha256(content[size:]).digest() != content[:size]:
+        raise ValueError("a damaged blob")
+    return content[size:]
 
 
 @cache
 def _core() -> Any:
-    """OpenVINO's core, one for all shapes. It finds compiled networks by network, settings, version and CPU."""
-    core = openvino.Core()
-    folder = cache_dir("openvino")
-    if folder is not None:
-        core.set_property({"CACHE_DIR": str(folder)})
-    return core
+    """OpenVINO's core, one for all shapes."""
+    return openvino.Core()
 
 
 def version() -> str:

@@ -6,21 +6,57 @@ the same configuration finds the same places.
 
 from __future__ import annotations
 
+import json
 import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
 
 from trilane.arrays import U8
 from trilane.avatars.integer_network import NetworkFile
 from trilane.avatars.network_reshape import reshaped
 from trilane.avatars.network_split import NetworkPart, Shapes, split
+from trilane.cache import Arrays, cached_arrays
 from trilane.shapes import Shape
 from trilane.stages.config import RunConfig
 
+VERSION = "network parts 1"  # to be raised when the same network and cuts give other parts
+SHAPES = ("inputs", "outputs", "crossing_in", "crossing_out")
 LINE = 64  # bytes of a cache line, and of the widest vector register
 
 
 def parts_for(config: RunConfig, network: NetworkFile, shape: Shape) -> list[NetworkPart]:
-    """The parts of `network` for tensors of `shape`, cut as `config` says; one part when it is not cut."""
-    return split(reshaped(network, *shape), [cut.at for cut in config.cuts])
+    """The parts of `network` for tensors of `shape`, cut as `config` says; one part when it is not cut.
+
+    They are cached: inferring every shape of the graph again takes longer than reading them.
+    """
+    cuts = [cut.at for cut in config.cuts]
+    sources = (VERSION, onnx.__version__, network.digest, *map(str, shape), *cuts)
+    stored = cached_arrays(VERSION, sources, lambda: _to_arrays(split(reshaped(network, *shape), cuts)))
+    return _from_arrays(stored, network.where)
+
+
+def _to_arrays(parts: Sequence[NetworkPart]) -> dict[str, NDArray[Any]]:
+    """Of each part the model's bytes, and its shapes as JSON."""
+    arrays: dict[str, NDArray[Any]] = {}
+    for number, part in enumerate(parts):
+        shapes = json.dumps({name: list(getattr(part, name).items()) for name in SHAPES})
+        arrays[f"model{number}"] = np.frombuffer(part.model.SerializeToString(), np.uint8)
+        arrays[f"shapes{number}"] = np.frombuffer(shapes.encode(), np.uint8)
+    return arrays
+
+
+def _from_arrays(arrays: Arrays, where: str) -> list[NetworkPart]:
+    parts = []
+    for number in range(len(arrays) // 2):
+        model = onnx.load_from_string(arrays[f"model{number}"].tobytes())
+        rows = json.loads(arrays[f"shapes{number}"].tobytes())
+        shapes = {name: {tensor: tuple(shape) for tensor, shape in rows[name]} for name in SHAPES}
+        parts.append(NetworkPart(where, model, **shapes))
+    return parts
 
 
 def crossing_bytes(config: RunConfig, network: NetworkFile) -> list[int]:
