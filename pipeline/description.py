@@ -128,6 +128,11 @@ class Pipeline(Model):
         """Where the scheduler runs: with the unit of the first stage."""
         return self.units[self.stages[0].unit].cores
 
+    @property
+    def run_cores(self) -> tuple[int, ...]:
+        """The cores of all units."""
+        return tuple(sorted({core for settings in self.units.values() for core in settings.cores}))
+
     def stages_of(self, unit: str) -> tuple[PipelineStage, ...]:
         """The unit's stages, in the order of the chain."""
         return tuple(stage for stage in self.stages if stage.unit == unit)

@@ -5,13 +5,15 @@ Slots are bound once, before the first job.
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import sys
 import time
 import traceback
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 from trilane.errors import TrilaneError, UnitLostError
@@ -42,6 +44,8 @@ from trilane.transport.messages import (
 )
 from trilane.transport.wakeup import UNIT_NS, use_slice
 
+TASKS = Path("/proc/self/task")
+
 
 def serve(raw_spec: dict[str, Any], number_of: Mapping[int, int]) -> int:
     """Build the unit's stages, then answer messages until Close; the process's exit code.
@@ -62,7 +66,8 @@ def serve(raw_spec: dict[str, Any], number_of: Mapping[int, int]) -> int:
 
 def _serve(spec: UnitSpec, link: Link) -> int:
     try:
-        stages = build_stages(spec)
+        with building_cores(spec):
+            stages = build_stages(spec)
     except Exception as error:
         return _fail(link, BUILDING, f"unit {spec.unit}", error)
     gc.collect()
@@ -82,6 +87,23 @@ def _serve(spec: UnitSpec, link: Link) -> int:
             return 1
         else:
             raise MessageError(f"{message} is not for a unit")
+
+
+@contextlib.contextmanager
+def building_cores(spec: UnitSpec) -> Iterator[None]:
+    """While the stages are built, this thread may use every core of the run: the unit is ready sooner.
+
+    Afterwards it and every thread that was started meanwhile are back on the unit's own cores.
+    """
+    before = set(TASKS.iterdir())
+    os.sched_setaffinity(0, spec.run_cores)
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, spec.settings.cores)
+        for task in set(TASKS.iterdir()) - before:
+            with contextlib.suppress(ProcessLookupError):  # it has ended meanwhile
+                os.sched_setaffinity(int(task.name), spec.settings.cores)
 
 
 def build_stages(spec: UnitSpec) -> list[BoundStage]:

@@ -206,6 +206,7 @@ class UnitProcesses:
             assets_fd=self._assets_fd,
             settings=pipeline.units[unit],
             scheduler_cores=pipeline.scheduler_cores,
+            run_cores=pipeline.run_cores,
             stages=stages,
             module_folders=tuple(folder.absolute() for folder in pipeline.module_folders),
             edges={name: self._regions[name] for name in {*inputs.values(), *outputs.values()}},

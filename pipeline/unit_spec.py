@@ -15,7 +15,7 @@ class UnitSpec(Model):
 
     `endpoint`: of the heartbeat socket.
     `job_pipe`, `assets_fd`: descriptors, as are those of the regions.
-    `settings`: the unit's own; `scheduler_cores`: where the scheduler runs.
+    `settings`: the unit's own; `scheduler_cores`: where the scheduler runs; `run_cores`: those of all units.
     `stages`: those of this unit; messages name a stage by its place in this list.
     `module_folders`: put before the module search path.
     `edges`: regions by the edge's name; `inputs`, `outputs`: stage to edge, for those that have one.
@@ -27,6 +27,7 @@ class UnitSpec(Model):
     assets_fd: int
     settings: UnitSettings
     scheduler_cores: tuple[int, ...]
+    run_cores: tuple[int, ...]
     stages: tuple[PipelineStage, ...]
     module_folders: tuple[Path, ...]
     edges: dict[str, EdgeRegion]

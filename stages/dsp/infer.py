@@ -5,8 +5,9 @@ Rule: sessions and bindings are all made in `bind`, a frame allocates nothing, a
 
 from __future__ import annotations
 
-import time
+import os
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -26,6 +27,8 @@ from trilane.stages.dsp.runtime import Binding, RuntimeOptions, Session, load_ru
 from trilane.transport.packets import Packet
 
 Key = tuple[Shape, int, int]
+#: Runtimes that may compile several networks at the same time.
+LOAD_AT_ONCE = ("openvino", "ort")
 
 
 @dataclass(frozen=True)
@@ -60,22 +63,23 @@ class InferStage:
         self._bindings: dict[Key, BoundPart] = {}
         self._inputs: Sequence[Packet] = ()
         self._outputs: Sequence[Packet] = ()
-        self.startup: dict[str, float] = {}
 
     def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
-        """Compile every shape, bind every pair of slots, run each shape once."""
-        begin = time.monotonic_ns()
+        """Compile every shape, bind every pair of slots, run each shape once: as many at a time as there are cores."""
         self._inputs, self._outputs = inputs, outputs
-        for shape in self._shapes:
-            part = parts_for(self._config, self._network, shape)[self._part]
-            session = self._module.load(part, self._options)
-            for (i, source), (o, target) in product(enumerate(inputs), enumerate(outputs)):
-                self._bindings[shape, i, o] = _bound(session, part, source.payload, target.payload)
-        compiled = time.monotonic_ns()
-        for shape in self._shapes:
-            self._bindings[shape, 0, 0].run()
-        self.startup = {"sessions": len(self._shapes), "load_ms": (compiled - begin) / 1e6}
-        self.startup["warm_up_ms"] = (time.monotonic_ns() - compiled) / 1e6
+        at_once = len(os.sched_getaffinity(0)) if self.runtime in LOAD_AT_ONCE else 1
+        with ThreadPoolExecutor(at_once) as pool:
+            for shape, bindings in zip(self._shapes, pool.map(self._prepare, self._shapes), strict=True):
+                self._bindings |= {(shape, *pair): binding for pair, binding in bindings.items()}
+
+    def _prepare(self, shape: Shape) -> dict[tuple[int, int], BoundPart]:
+        """The part for tensors of `shape` on each pair of slots."""
+        part = parts_for(self._config, self._network, shape)[self._part]
+        session = self._module.load(part, self._options)
+        pairs = product(enumerate(self._inputs), enumerate(self._outputs))
+        bindings = {(i, o): _bound(session, part, source.payload, target.payload) for (i, source), (o, target) in pairs}
+        bindings[0, 0].run()
+        return bindings
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
         """Infer the tensor unless nobody is in view; then the picture is transparent. Figures: `inferred`, 0 or 1."""
@@ -87,6 +91,11 @@ class InferStage:
         height, width = pose["tensor_shape"].tolist()
         self._binding((height, width), slot_in, slot_out, frame).run()
         return {"inferred": 1}
+
+    @property
+    def sessions(self) -> int:
+        """How many compiled networks are ready: one for each shape."""
+        return len({shape for shape, _, _ in self._bindings})
 
     def close(self) -> None:
         """Drop sessions and bindings, which hold views of the slots."""

@@ -59,7 +59,7 @@ def random_tensor(shape, seed):
 
 def test_each_shape_and_slot_has_its_own_session(tiny_bundle):
     stage, inputs, outputs = make(tiny_bundle)
-    assert stage.startup["sessions"] == 3
+    assert stage.sessions == 3
     for shape, i, o in (((64, 64), 0, 1), ((32, 128), 1, 0), ((128, 32), 1, 1)):
         tensor = random_tensor(shape, i + o)
         inputs[i].payload[: tensor.size] = tensor.ravel()
@@ -101,7 +101,7 @@ def test_avatars_of_different_networks_are_refused(tiny_bundle, tmp_path):
 
 
 def test_one_network_is_loaded_once(tiny_bundle):
-    assert make(tiny_bundle, avatars=3)[0].startup["sessions"] == 3
+    assert make(tiny_bundle, avatars=3)[0].sessions == 3
 
 
 def test_a_shape_that_is_no_bucket_is_named(tiny_bundle):
@@ -124,5 +124,5 @@ def test_the_factory_builds_a_part_of_the_network(tiny_bundle):
     unit = UnitContext("dsp", units["dsp"], assets_of(config))
     stage = build({"config": config.model_dump(mode="json"), "part": 0}, unit)
     stage.bind(slots(1, 1, 64 * 64 * CHANNELS), slots(1, 1, 64 * 64 * 4))
-    assert stage.startup["sessions"] == 3
+    assert stage.sessions == 3
     assert load_bundle(tiny_bundle).manifest.network.channels == CHANNELS
