@@ -7,12 +7,12 @@ report and keeps the frames that were presented; a run that presented none leave
 from __future__ import annotations
 
 import shutil
+import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from trilane.apps.pace import Pace, compare
 from trilane.apps.report import Report, build_report, write_report
 from trilane.apps.run_folder import RunFolder
 from trilane.errors import TrilaneError
@@ -23,6 +23,9 @@ from trilane.pipeline.signals import Interrupts
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.stages.avatar_pipeline import run_avatar
 from trilane.stages.configure import Checked
+
+if TYPE_CHECKING:
+    from trilane.apps.pace import Pace
 
 BASELINE_POLICY = "sequential"
 HOST = "host"
@@ -84,12 +87,15 @@ def run_to_folder(
     Raises BadInputError when `target` cannot be written, and TrilaneError when no frame was presented.
     """
     with RunFolder(target) as folder:
+        threading.Thread(target=_import_writers, name="imports", daemon=True).start()
         job = _Job(checked, plan, hooks, starter)
         result = job.run(folder.work)
         with Interrupts() as late:  # from here on a signal waits until the folder is whole
             baseline, stopped = job.run_baseline(folder.work) if _is_complete(result) else (None, False)
             facts = {"accuracy": dict(checked.accuracy), "notes": list(checked.notes)}
             if plan.pace is not None:
+                from trilane.apps.pace import compare
+
                 facts["pace"] = compare(plan.pace, plan.policy, checked.config.scene.frames, result.jobs)
             facts |= _write_files(result, folder.work, checked.config.scene.fps)
             report = build_report(result, checked.config, machine=machine, baseline=baseline, facts=facts)
@@ -174,6 +180,12 @@ def _tell(report: Report, hooks: Hooks) -> None:
         hooks.message(f"video.mp4 holds {shown}: a writer was killed before its last")
     if report.stage_metrics.get("pose", {}).get("visible") == 0:
         hooks.message("no avatar was in the picture in any frame")
+
+
+def _import_writers() -> None:
+    """What `_write_files` needs, imported while the units start and this process waits for them."""
+    from trilane.apps import trace, video  # noqa: F401
+    from trilane.stages.cpu import present  # noqa: F401
 
 
 def _write_files(result: RunResult, work: Path, fps: float) -> dict[str, Any]:

@@ -130,8 +130,9 @@ def _decode_each(container: Any, wanted: list[int]) -> Iterator[tuple[int, Image
 
 
 def _thumbnail(frame: Any) -> Image.Image:
-    image: Image.Image = frame.to_image()
-    return image.resize((THUMB_WIDTH, image.height * THUMB_WIDTH // image.width), Image.Resampling.LANCZOS)
+    height = frame.height * THUMB_WIDTH // frame.width
+    image: Image.Image = frame.to_image(width=THUMB_WIDTH, height=height, interpolation="LANCZOS")
+    return image
 
 
 def _paste(pictures: list[tuple[int, Image.Image]]) -> Image.Image:

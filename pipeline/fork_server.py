@@ -4,7 +4,8 @@
 needs, then forks a unit for each request, so that a unit starts in milliseconds instead of importing everything again.
 
 A request is one packet on a SOCK_SEQPACKET socket: JSON, and with it the descriptors of the unit's spec (in a memory
-file), of its stderr, and of what the spec names. The answer is the unit's process number, and with it its pidfd.
+file), of its stderr, and of what the spec names. The answer is the unit's process number, and with it its pidfd. A
+request with `call` names a function instead, whose result goes to the pipe that comes with it; it has no answer.
 """
 
 from __future__ import annotations
@@ -44,15 +45,19 @@ def serve(requests: socket.socket) -> None:
         packet, fds, _flags, _address = socket.recv_fds(requests, PACKET_BYTES, MAX_FDS)
         if not packet:
             break
+        request = json.loads(packet)
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGCHLD})  # a unit that dies at once keeps its number
         pid = os.fork()
         if pid == 0:
             requests.close()
-            os._exit(_run_unit(json.loads(packet), fds, server_pid))
-        pidfd = os.pidfd_open(pid)
+            run = _call if "call" in request else _run_unit
+            os._exit(run(request, fds, server_pid))
+        if "call" not in request:
+            pidfd = os.pidfd_open(pid)
+            socket.send_fds(requests, [str(pid).encode()], [pidfd])
+            os.close(pidfd)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGCHLD})
-        socket.send_fds(requests, [str(pid).encode()], [pidfd])
-        for fd in (pidfd, *fds):
+        for fd in fds:
             os.close(fd)
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     _reap(0)
@@ -89,6 +94,20 @@ def _run_unit(request: dict[str, Any], fds: Sequence[int], server_pid: int) -> i
     return code
 
 
+def _call(request: dict[str, Any], fds: Sequence[int], server_pid: int) -> int:
+    """In a forked process: write what the function `module:name` returns, as JSON, to the descriptor `fds[0]`."""
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    die_with_parent(server_pid)
+    module, _, name = request["call"].partition(":")
+    try:
+        answer = json.dumps(getattr(importlib.import_module(module), name)())
+    except Exception:
+        return 1
+    with os.fdopen(fds[0], "w") as file:
+        file.write(answer)
+    return 0
+
+
 def die_with_parent(parent_pid: int) -> None:
     """SIGKILL this process when the one that made it ends, also when it has ended already."""
     libc = ctypes.CDLL(None, use_errno=True)
@@ -111,6 +130,7 @@ def main() -> None:
     gc.collect()
     gc.freeze()  # a unit's collector then leaves alone, and does not copy, the pages that all units share
     serve(socket.socket(fileno=arguments.socket))
+    os._exit(0)  # taking all the modules down again would keep the parent waiting
 
 
 if __name__ == "__main__":

@@ -5,12 +5,13 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import select
 import signal
 import socket
 import subprocess
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 from trilane.errors import TrilaneError
 from trilane.pipeline.fork_server import THREAD_LIMITS
@@ -28,6 +29,28 @@ class StartedUnit(NamedTuple):
 
     pid: int
     pidfd: int
+
+
+class ForkedCall:
+    """A call that goes on in another process."""
+
+    def __init__(self, reads: int) -> None:
+        self._reads = reads
+        self._is_open = True
+
+    def result(self) -> Any | None:
+        """What the function returned, once; None when it failed, its process died, or no answer came in time."""
+        answer = b""
+        while select.select([self._reads], [], [], ANSWER_S)[0] and (chunk := os.read(self._reads, TAIL_BYTES)):
+            answer += chunk
+        self.close()
+        return json.loads(answer) if answer else None
+
+    def close(self) -> None:
+        """Take no answer any more."""
+        if self._is_open:
+            self._is_open = False
+            os.close(self._reads)
 
 
 class UnitStarter:
@@ -77,6 +100,22 @@ class UnitStarter:
         if not answer:
             raise TrilaneError(f"unit {spec.unit} could not be started: {self._reason(None)}")
         return StartedUnit(int(answer), fds[0])
+
+    def call(self, function: str) -> ForkedCall:
+        """Call `module:name`, which takes nothing and returns what JSON takes, in a process of its own.
+
+        Raises TrilaneError when the fork server has ended.
+        """
+        self._is_used = True
+        reads, writes = os.pipe2(os.O_CLOEXEC)
+        try:
+            socket.send_fds(self._socket, [json.dumps({"call": function}).encode()], [writes])
+        except OSError as error:
+            os.close(reads)
+            raise TrilaneError(f"{function} could not be called: {self._reason(error)}") from None
+        finally:
+            os.close(writes)
+        return ForkedCall(reads)
 
     def close(self) -> None:
         """End the fork server; units that still live end with it."""

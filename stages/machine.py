@@ -5,7 +5,6 @@ Rule: only what was read or tried on this machine is stated; what could not be r
 
 from __future__ import annotations
 
-import contextlib
 import importlib.metadata
 import json
 import os
@@ -35,7 +34,7 @@ OPTIONAL_PACKAGES = {
 }
 
 GL_TIMEOUT_S = 30.0
-GL_PROGRAM = "import json, trilane.stages.machine as m; print(json.dumps(m.open_gl()), flush=True); m.os._exit(0)"
+GL_PROGRAM = "import json, trilane.stages.machine as m; print(json.dumps(m.open_gl()))"
 GL_LIMITS = (
     "GL_MAX_TEXTURE_SIZE", "GL_MAX_DRAW_BUFFERS", "GL_MAX_COLOR_ATTACHMENTS", "GL_MAX_UNIFORM_BLOCK_SIZE",
     "GL_MAX_TEXTURE_BUFFER_SIZE", "GL_MAX_VIEWPORT_DIMS",
@@ -94,46 +93,16 @@ def open_gl() -> dict[str, Any]:
     }
 
 
-class GlProbe:
-    """Looks at the OpenGL driver in a process of its own, because a driver may crash; the caller goes on meanwhile."""
-
-    def __init__(self) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, "-P", "-c", GL_PROGRAM],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            process_group=0,
-        )
-        self._facts: dict[str, Any] | None = None
-        self._is_open = True
-
-    def facts(self) -> dict[str, Any] | None:
-        """The driver that EGL gives; None when none works."""
-        if self._is_open:
-            with contextlib.suppress(subprocess.TimeoutExpired, ValueError):
-                printed, _ = self._process.communicate(timeout=GL_TIMEOUT_S)
-                read = json.loads(printed)
-                self._facts = read if isinstance(read, dict) else None
-            self.close()
-        return self._facts
-
-    def close(self) -> None:
-        """No process is left, whether its answer was asked for or not."""
-        if self._is_open:
-            self._is_open = False
-            self._process.kill()
-            self._process.communicate()
-
-
 @cache
 def gl_facts() -> dict[str, Any] | None:
-    """The OpenGL driver that EGL gives; None when none works, or no process can be started to look at it."""
+    """The OpenGL driver that EGL gives, tried in a process of its own: a driver may crash. None when none works."""
+    command = [sys.executable, "-P", "-c", GL_PROGRAM]
     try:
-        with contextlib.closing(GlProbe()) as probe:
-            return probe.facts()
-    except OSError:
+        done = subprocess.run(command, capture_output=True, timeout=GL_TIMEOUT_S, check=True)
+        facts = json.loads(done.stdout)
+    except (OSError, subprocess.SubprocessError, ValueError):
         return None
+    return facts if isinstance(facts, dict) else None
 
 
 def runtime_facts() -> dict[str, Any]:

@@ -6,7 +6,9 @@ an error that a person can cause ends here as one sentence on stderr and an exit
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+import os
 import sys
 from typing import Annotated, Any, NoReturn
 
@@ -125,5 +127,18 @@ def main() -> None:
         _fail(*_describe(error))
 
 
+def entry() -> NoReturn:
+    """`main` for the command line; the process ends without taking every module down, which would take 0.1 s."""
+    code: object = 0
+    try:
+        main()
+    except SystemExit as left:
+        code = left.code
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):  # closed by whoever was to read it
+            stream.flush()
+    os._exit(code if isinstance(code, int) else 0)
+
+
 if __name__ == "__main__":
-    main()
+    entry()

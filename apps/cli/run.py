@@ -9,6 +9,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from enum import StrEnum
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -34,8 +35,7 @@ if TYPE_CHECKING:
     from trilane.apps.run_job import Hooks, Outcome, Plan
     from trilane.pipeline.unit_starter import UnitStarter
     from trilane.stages.config import RunConfig
-    from trilane.stages.configure import Checked
-    from trilane.stages.machine import GlProbe
+    from trilane.stages.configure import Checked, GlFacts
 
 app = typer.Typer(rich_markup_mode=None, add_completion=False)
 
@@ -144,7 +144,7 @@ def run(
 
         cuts = tuple(split or ())
         request = Request(scene, motion, camera, background, avatar, frames, size, runtime, hud, skinning, cuts)
-        checked = configure(request, Path.cwd(), gl.facts)
+        checked = configure(request, Path.cwd(), gl)
         chip_pace = _pace(checked.config, profile, pace, slow_motion)
         cap = performance_profile and str(performance_profile)
         _refuse_beside_pace(chip_pace, cuts, cap)
@@ -154,14 +154,16 @@ def run(
 
 
 @contextmanager
-def _early_processes() -> Iterator[tuple[UnitStarter, GlProbe]]:
-    """The fork server and the look at OpenGL: both import what they need while this process does the same."""
+def _early_processes() -> Iterator[tuple[UnitStarter, GlFacts]]:
+    """The fork server, which imports what the units need while this process goes on, and what it says of OpenGL.
+
+    The driver is looked at in a process of its own, because it may crash.
+    """
     from trilane.pipeline.unit_starter import UnitStarter
     from trilane.stages.factories import PRELOAD
-    from trilane.stages.machine import GlProbe
 
-    with UnitStarter(PRELOAD) as starter, closing(GlProbe()) as gl:
-        yield starter, gl
+    with UnitStarter(PRELOAD) as starter, closing(starter.call("trilane.stages.machine:open_gl")) as gl:
+        yield starter, cache(gl.result)
 
 
 def _pace(config: RunConfig, profile: str | None, asked: bool, slow_motion: float) -> Pace | None:
@@ -187,7 +189,7 @@ def _refuse_beside_pace(pace: Pace | None, cuts: tuple[str, ...], cap: str | Non
         raise BadInputError("options", "--performance-profile with --pace", "one of them", "a pace is capped already")
 
 
-def _run(checked: Checked, out: Path | None, plan: Plan, starter: UnitStarter, gl: GlProbe) -> Outcome:
+def _run(checked: Checked, out: Path | None, plan: Plan, starter: UnitStarter, gl: GlFacts) -> Outcome:
     """Run `checked` as `plan` says, to the folder `out` or the default one."""
     from trilane.apps.run_folder import default_place
     from trilane.apps.run_job import run_to_folder
@@ -199,7 +201,7 @@ def _run(checked: Checked, out: Path | None, plan: Plan, starter: UnitStarter, g
     with _hooks() as hooks:
         for note in checked.notes:
             hooks.message(note)
-        return run_to_folder(checked, target, plan, hooks, machine=required_machine(gl.facts), starter=starter)
+        return run_to_folder(checked, target, plan, hooks, machine=required_machine(gl), starter=starter)
 
 
 def _print_outcome(outcome: Outcome, as_json: bool) -> None:
