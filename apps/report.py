@@ -16,7 +16,8 @@ from pydantic_core import from_json
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles.host import sensor_c
-from trilane.pipeline.report import (
+from trilane.pipeline.result import RunResult
+from trilane.pipeline.run_metrics import (
     Caps,
     FrameCounts,
     FrameTimes,
@@ -27,7 +28,6 @@ from trilane.pipeline.report import (
     TimeSummary,
     UnitShares,
 )
-from trilane.pipeline.result import RunResult
 from trilane.shapes import Shape
 from trilane.stages.config import RunConfig
 

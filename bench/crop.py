@@ -22,7 +22,7 @@ from trilane.errors import BadInputError
 from trilane.shapes import Shape, shape_buckets
 from trilane.stages.cpu.crop import Rect, choose_bucket
 from trilane.stages.cpu.mesh_bounds import MeshBounds
-from trilane.unexpected import UnexpectedValue
+from trilane.unexpected_value import UnexpectedValue
 
 
 @dataclass(frozen=True)

@@ -20,11 +20,11 @@ from typing import Any
 import psutil
 
 from trilane.errors import BadInputError
-from trilane.pipeline.assets import Assets
 from trilane.pipeline.description import Pipeline
 from trilane.pipeline.fork_server import process_name
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run import run_pipeline
+from trilane.pipeline.shared_assets import Assets
 from trilane.scheduler.events import UnitDied, UnitReady
 from trilane.stages.avatar_pipeline import avatar_pipeline
 from trilane.stages.configure import Request, configure

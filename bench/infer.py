@@ -20,13 +20,13 @@ import onnx
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import read_network
 from trilane.bench import roofline
-from trilane.bench.lib.interleaved import Variant, runners
+from trilane.bench.lib.interleaved_processes import Variant, runners
 from trilane.bench.lib.networks import NetworkFixture, fixture_of_file, untrained, untrained_float
 from trilane.errors import BadInputError
 from trilane.hw_profiles.host import sensor_c
 from trilane.shapes import parse_shape
 from trilane.stages.dsp.runtime import resolve
-from trilane.unexpected import UnexpectedValue
+from trilane.unexpected_value import UnexpectedValue
 
 FP32 = "ort fp32"
 CACHE = "XDG_CACHE_HOME"

@@ -18,12 +18,12 @@ import numpy as np
 import onnx
 
 from trilane.bench import roofline
-from trilane.bench.lib.interleaved import Variant, runners
+from trilane.bench.lib.interleaved_processes import Variant, runners
 from trilane.bench.lib.networks import untrained, untrained_float
 from trilane.errors import BadInputError, MissingPartError, TrilaneError
 from trilane.shapes import parse_shape
 from trilane.stages.dsp.runtime import resolve
-from trilane.unexpected import UnexpectedValue
+from trilane.unexpected_value import UnexpectedValue
 
 ORT, OPENVINO, FP32 = "trilane ort", "trilane openvino", "onnxruntime fp32"
 APP = "benchmark_app"

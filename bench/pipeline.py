@@ -18,15 +18,15 @@ from typing import Any
 from trilane.bench.lib import full_width
 from trilane.errors import BadInputError, TrilaneError
 from trilane.hw_profiles.host import host_units, usable_cores
-from trilane.pipeline.report import RunMetrics
 from trilane.pipeline.result import RunResult
+from trilane.pipeline.run_metrics import RunMetrics
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.policy import policy_named
 from trilane.scheduler.stats import median_interval
 from trilane.stages.avatar_pipeline import run_avatar
 from trilane.stages.configure import Checked, Request, configure
 from trilane.transport.slots import edge_rule
-from trilane.unexpected import UnexpectedValue
+from trilane.unexpected_value import UnexpectedValue
 
 SEQUENTIAL = "sequential"
 MIN_FRAMES = 20

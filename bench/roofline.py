@@ -15,7 +15,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from trilane.bench.lib.interleaved import Variant, runners
+from trilane.bench.lib.interleaved_processes import Variant, runners
 from trilane.stages.dsp.runtime import installed
 
 #: (side, channels, kernel): layers whose weights stay in cache and whose channels fill the registers.

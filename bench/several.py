@@ -29,7 +29,7 @@ from trilane.stages.cpu.tensor_layout import MARGIN_PX, TensorLayout, lay_out
 from trilane.stages.dsp.runtime import Binding, RuntimeOptions, load_runtime
 from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement
 from trilane.stages.gpu.skinned_mesh import SkinnedMesh
-from trilane.unexpected import UnexpectedValue
+from trilane.unexpected_value import UnexpectedValue
 
 BOUND_DB = 0.5
 OUTPUT = (480, 640)

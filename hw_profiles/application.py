@@ -23,7 +23,7 @@ from trilane.hw_profiles.schema import Profile, Unit
 from trilane.scheduler.events import Graph, Settings, chain
 from trilane.scheduler.policy import POLICIES
 from trilane.scheduler.virtual import simulate
-from trilane.unexpected import UnexpectedValue
+from trilane.unexpected_value import UnexpectedValue
 from trilane.units import AFTER_INFER, BEFORE_INFER, INFER, LATENCY_TO, UNITS, UnitName
 
 RUNTIMES: tuple[UnitName, ...] = ("gpu", "dsp")

@@ -13,7 +13,7 @@ from pathlib import Path
 from trilane.errors import BadInputError
 from trilane.hw_profiles.reference_networks import NetworkSpec
 from trilane.shapes import parse_shape
-from trilane.unexpected import UnexpectedValue
+from trilane.unexpected_value import UnexpectedValue
 
 KEYS = ("encoder", "norm", "size", "channels", "layout")
 MAX_BYTES, MAX_ROWS = 32_000_000, 100_000

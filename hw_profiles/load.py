@@ -18,7 +18,7 @@ from pydantic import ValidationError
 from trilane.errors import BadInputError
 from trilane.hw_profiles.host_profile import host_tables
 from trilane.hw_profiles.schema import Profile
-from trilane.unexpected import unexpected_in
+from trilane.unexpected_value import unexpected_in
 
 HOST = "host"
 MAX_BYTES = 1_000_000

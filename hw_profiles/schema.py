@@ -10,7 +10,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
-from trilane.unexpected import UnexpectedValue
+from trilane.unexpected_value import UnexpectedValue
 from trilane.units import PERFORMANCE_PROFILES, UNITS, PerformanceProfile, UnitName
 
 Corner = Literal["max", "turbo", "nominal_plus", "nominal", "svs_plus", "svs", "svs2"]

@@ -17,7 +17,7 @@ from trilane.errors import BadInputError
 from trilane.scheduler.events import Graph, StageSpec
 from trilane.transport.packets import FRAME_FIELDS, header_dtype
 from trilane.transport.slots import edge_rule
-from trilane.unexpected import UnexpectedValue
+from trilane.unexpected_value import UnexpectedValue
 
 FACTORY = r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$"
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from trilane.pipeline.report import RunMetrics
+from trilane.pipeline.run_metrics import RunMetrics
 from trilane.scheduler.causes import Drop, Loss
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.recording import Recording

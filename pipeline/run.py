@@ -10,16 +10,16 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Protocol
 
 from trilane.errors import BadInputError
-from trilane.pipeline.assets import Assets, share_assets
 from trilane.pipeline.description import Pipeline
 from trilane.pipeline.isolated import IsolatedTimes
 from trilane.pipeline.lifecycle import close_units, start_units
 from trilane.pipeline.realtime_clock import Governor, RealtimeClock
 from trilane.pipeline.regions import edge_regions
-from trilane.pipeline.report import RunMetrics, metrics_of
 from trilane.pipeline.requests import FrameRequestQueue
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run_log import RunLog, UnitError, after_stderr
+from trilane.pipeline.run_metrics import RunMetrics, metrics_of
+from trilane.pipeline.shared_assets import Assets, share_assets
 from trilane.pipeline.signals import Interrupts
 from trilane.pipeline.unit_processes import UnitProcesses, check_open_files
 from trilane.pipeline.unit_starter import UnitStarter
@@ -31,7 +31,7 @@ from trilane.scheduler.policy import policy_named
 from trilane.scheduler.recording import Recording
 from trilane.scheduler.stats import energy_score
 from trilane.transport.wakeup import DEFAULT, SHORTEST_NS, awake, use_slice
-from trilane.unexpected import UnexpectedValue
+from trilane.unexpected_value import UnexpectedValue
 
 DEADLINE_PERIODS = 3  # from a frame's release until it must be presented
 HANG_NS = 10_000_000_000

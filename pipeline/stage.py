@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeVar
 
-from trilane.pipeline.assets import Assets
 from trilane.pipeline.description import UnitSettings
+from trilane.pipeline.shared_assets import Assets
 from trilane.transport.packets import Packet
 
 T = TypeVar("T")

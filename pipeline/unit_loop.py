@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from trilane.errors import TrilaneError, UnitLostError
-from trilane.pipeline.assets import map_assets
 from trilane.pipeline.bound_stage import BoundStage
+from trilane.pipeline.shared_assets import map_assets
 from trilane.pipeline.stage import StageFactory, UnitContext
 from trilane.pipeline.unit_spec import UnitSpec
 from trilane.transport.heartbeats import LINGER_MS, context_on_cores

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from trilane.errors import BadInputError
 from trilane.files import read_text
 from trilane.scene.schema import Scene
-from trilane.unexpected import unexpected_in
+from trilane.unexpected_value import unexpected_in
 
 INPUT_SHOULD = "Input should be "
 ENDING = ".toml"

@@ -11,7 +11,7 @@ from typing import Annotated, Literal, Self
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from trilane.shapes import MAX_SIDE, checked_size
-from trilane.unexpected import UnexpectedValue
+from trilane.unexpected_value import UnexpectedValue
 
 MAX_DEPTH_RATIO = 1e6  # of far to near clip plane; beyond it a depth buffer of 24 bits is too coarse
 FARTHEST_M = 1e4  # of an avatar from the scene's origin; there float32 still resolves millimetres

@@ -1,16 +1,12 @@
-"""Handing jobs to units. Rule: only dirty units are looked at, in the order in which they were marked.
-
-What waits in vain before a stage (it is stale, or must be late) is given up in the moment in which the stage is
-considered, and not before.
-"""
+"""Handing jobs to units. Rule: only dirty units are looked at, in the order in which they were marked."""
 
 from __future__ import annotations
 
-from trilane.scheduler.causes import DropCause
 from trilane.scheduler.choice import Choice
 from trilane.scheduler.events import Action, Dispatch
 from trilane.scheduler.flow import Flow
 from trilane.scheduler.frame_source import Source
+from trilane.scheduler.late_frames import LateFrames
 from trilane.scheduler.ledger import ASSIGNED, Ledger
 from trilane.scheduler.policy import Policy
 from trilane.scheduler.state import StageState, UnitState
@@ -30,9 +26,10 @@ class Assignment:
         `choice`: what it asks.
         `ledger`: where it notes why units have no job.
         """
-        self._policy, self._hang_ns = policy, hang_ns
+        self._hang_ns = hang_ns
         self._flow, self._source, self._choice, self._ledger = flow, source, choice, ledger
         self._lead_ns = policy.lead_ns
+        self._late = LateFrames(policy, flow, source, choice)
         self._drops = policy.newest or policy.drop_late
 
     def assign(self, now_ns: int, actions: list[Action]) -> None:
@@ -57,7 +54,7 @@ class Assignment:
         runnable: list[StageState] = []
         for stage in unit.stages:
             if self._drops:
-                self._give_up(stage, now_ns)
+                self._late.drop(stage, now_ns)
             if self._choice.can_begin(stage, now_ns):
                 runnable.append(stage)
         if len(runnable) > 1:
@@ -77,27 +74,3 @@ class Assignment:
             unit.deadline_ns = now_ns + self._hang_ns
         unit.queue.append(job)
         actions.append(Dispatch(job))
-
-    def _give_up(self, stage: StageState, now_ns: int) -> None:
-        """Drop what waits for the stage and is stale or must be late."""
-        edge = stage.input
-        if edge is None:
-            if not self._choice.is_full():
-                self._give_up_at_source(stage, now_ns)
-            return
-        if self._policy.newest:
-            while len(edge.ready) > 1:
-                self._flow.drop_oldest(stage, DropCause.STALE)
-        if self._policy.drop_late:
-            while edge.ready and self._choice.is_late(stage, now_ns):
-                self._flow.drop_oldest(stage, DropCause.LATE)
-
-    def _give_up_at_source(self, first: StageState, now_ns: int) -> None:
-        if self._policy.newest:
-            self._source.keep_newest()
-        if self._policy.drop_late:
-            while self._source.queue and self._choice.is_late(first, now_ns):
-                if not self._flow.frames:  # nothing is in its way: the estimates alone say that it is late
-                    for stage in self._flow.stages:
-                        stage.lower_estimate()
-                self._source.drop_late_head()

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from trilane.scheduler.causes import Outcome
-from trilane.unexpected import UnexpectedValue
+from trilane.unexpected_value import UnexpectedValue
 
 NEVER: Final = (1 << 62) - 1  # ns; the largest integer that mypyc keeps unboxed
 

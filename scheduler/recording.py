@@ -25,7 +25,7 @@ from trilane.scheduler.events import (
     StageSpec,
 )
 from trilane.scheduler.unit_life import UnitLifeError
-from trilane.unexpected import UnexpectedValue
+from trilane.unexpected_value import UnexpectedValue
 
 SCHEMA = 3
 #: Actions that carry one tuple, which is written in their place.

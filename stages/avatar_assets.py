@@ -20,7 +20,7 @@ from trilane.avatars.integer_network import NetworkFile
 from trilane.avatars.network_checks import check_network
 from trilane.body.body import Body, ShapedBody, load_body
 from trilane.errors import BadInputError
-from trilane.pipeline.assets import Assets
+from trilane.pipeline.shared_assets import Assets
 from trilane.scene.staged_arrays import staged_from_arrays, staged_to_arrays
 from trilane.scene.staging import Staged
 from trilane.stages.config import RunConfig

@@ -9,10 +9,10 @@ from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any
 
-from trilane.pipeline.assets import Assets
 from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run import run_pipeline
+from trilane.pipeline.shared_assets import Assets
 from trilane.stages.avatar_assets import network_of
 from trilane.stages.config import RunConfig
 from trilane.stages.dsp.parts import crossing_bytes

@@ -10,7 +10,7 @@ from pydantic import Field, field_validator
 from trilane.pipeline.description import UnitSettings
 from trilane.scene.schema import Model, Scene
 from trilane.shapes import Shape, shape_buckets
-from trilane.unexpected import UnexpectedValue
+from trilane.unexpected_value import UnexpectedValue
 from trilane.units import UnitName
 
 

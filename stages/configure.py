@@ -21,14 +21,14 @@ from trilane.hw_profiles.host import host_units
 from trilane.hw_profiles.load import HOST, load_profile
 from trilane.hw_profiles.runtime_choice import fastest_runtime
 from trilane.install import EGL_LINE
-from trilane.pipeline.assets import Assets
+from trilane.pipeline.shared_assets import Assets
 from trilane.scene.load import find_scene, load_scene, located, scene_from
 from trilane.scene.schema import Scene
 from trilane.scene.staging import stage_scene
 from trilane.stages.avatar_assets import load_avatar, pack_assets, require_one_tensor
 from trilane.stages.config import NetworkCut, RunConfig
 from trilane.stages.dsp.runtime import RUNTIMES, installed, resolve
-from trilane.stages.machine import gl_facts, machine_facts
+from trilane.stages.machine_facts import gl_facts, machine_facts
 
 ROOM = "room"
 COMMAND_LINE = "command line"

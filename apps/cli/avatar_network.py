@@ -54,7 +54,7 @@ def network(
     """Export an untrained float network: ONNX, static shape, input `tensor`, output `rgba`."""
     from trilane.hw_profiles.network_work import graph_facts
     from trilane.shapes import shape_buckets
-    from trilane.unexpected import UnexpectedValue
+    from trilane.unexpected_value import UnexpectedValue
     from trilane.writing import write_bytes
 
     try:
@@ -129,7 +129,7 @@ def _both_sides(size: str) -> str:
 def _shape(size: str) -> Shape:
     """(height, width) of `--size`. Raises BadInputError."""
     from trilane.shapes import parse_shape
-    from trilane.unexpected import UnexpectedValue
+    from trilane.unexpected_value import UnexpectedValue
 
     try:
         return parse_shape(size)

@@ -132,7 +132,7 @@ def show(name: str, measure: Callable[..., Mapping[str, Any]], asked: Mapping[st
     `as_json`: one JSON document, or a table for people.
     """
     from trilane.bench.lib.limits import check_limits
-    from trilane.stages.machine import machine_facts
+    from trilane.stages.machine_facts import machine_facts
 
     check_limits(asked)
     with stderr_console().status(f"measuring {name}"), stdout_kept():

@@ -52,7 +52,7 @@ def _python() -> Check:
 
 
 def _packages() -> list[Check]:
-    from trilane.stages.machine import OPTIONAL_PACKAGES, PACKAGES, package_version
+    from trilane.stages.machine_facts import OPTIONAL_PACKAGES, PACKAGES, package_version
 
     checks = []
     for name in PACKAGES:
@@ -73,7 +73,7 @@ def _gl(facts: dict[str, Any] | None) -> Check:
 
 
 def _runtimes() -> Check:
-    from trilane.stages.machine import runtime_facts
+    from trilane.stages.machine_facts import runtime_facts
 
     try:
         facts = runtime_facts()
@@ -85,7 +85,7 @@ def _runtimes() -> Check:
 
 
 def _cpu() -> Check:
-    from trilane.stages.machine import cpu_facts
+    from trilane.stages.machine_facts import cpu_facts
 
     cpu = cpu_facts()
     flags = " ".join(cpu["flags"]) or "none of those that matter"
@@ -94,7 +94,7 @@ def _cpu() -> Check:
 
 
 def _int8() -> Check:
-    from trilane.stages.machine import cpu_facts
+    from trilane.stages.machine_facts import cpu_facts
 
     present = {"avx512_vnni", "avx_vnni", "amx_int8", "asimddp", "i8mm"} & set(cpu_facts()["flags"])
     found = " ".join(sorted(present)) or "no; INT8 networks run on AVX2 or NEON alone"
@@ -165,7 +165,7 @@ def _print_table(rows: list[Check]) -> None:
 @app.command(epilog=EPILOG)
 def doctor(as_json: JsonOption = False) -> None:
     """Say what this machine has, what is missing and how to install it. Exit code 3 when a needed part is missing."""
-    from trilane.stages.machine import gl_facts, machine_facts
+    from trilane.stages.machine_facts import gl_facts, machine_facts
 
     gl = gl_facts()
     rows = checks(gl)

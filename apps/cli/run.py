@@ -162,7 +162,7 @@ def _early_processes() -> Iterator[tuple[UnitStarter, GlFacts]]:
     from trilane.pipeline.unit_starter import UnitStarter
     from trilane.stages.factories import PRELOAD
 
-    with UnitStarter(PRELOAD) as starter, closing(starter.call("trilane.stages.machine:open_gl")) as gl:
+    with UnitStarter(PRELOAD) as starter, closing(starter.call("trilane.stages.machine_facts:open_gl")) as gl:
         yield starter, cache(gl.result)
 
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from trilane.apps.report import Baseline, PaceComparison, Report
-    from trilane.pipeline.report import Caps, StageTimes, Temperature, UnitShares
+    from trilane.pipeline.run_metrics import Caps, StageTimes, Temperature, UnitShares
 
 DASH = "–"
 IDLE = ("starved", "blocked", "throttled", "overhead")

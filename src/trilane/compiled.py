@@ -12,7 +12,7 @@ import importlib.util
 from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 
-#: Relative to the package's folder. They import each other, trilane.errors, trilane.unexpected, msgpack and the
+#: Relative to the package's folder. They import each other, trilane.errors, trilane.unexpected_value, msgpack and the
 #: standard library alone.
 MODULES = (
     "scheduler/core.py",
@@ -23,6 +23,7 @@ MODULES = (
     "scheduler/watchdog.py",
     "scheduler/completion.py",
     "scheduler/flow.py",
+    "scheduler/late_frames.py",
     "scheduler/ledger.py",
     "scheduler/loop.py",
     "scheduler/policy.py",

@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from trilane.install import install_line
-from trilane.unexpected import UnexpectedValue
+from trilane.unexpected_value import UnexpectedValue
 
 
 def reason(error: Exception) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from trilane.unexpected import UnexpectedValue
+from trilane.unexpected_value import UnexpectedValue
 
 MAX_SIDE = 4096
 BUCKET_STEP = 32

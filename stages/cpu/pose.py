@@ -17,7 +17,7 @@ from trilane.avatars.bundle import CLOTHES_STANDOFF_M
 from trilane.body.kinematics import Posed, Skeleton
 from trilane.body.skinning import FrameSkinner
 from trilane.errors import TrilaneError
-from trilane.pipeline.assets import Assets
+from trilane.pipeline.shared_assets import Assets
 from trilane.pipeline.stage import UnitContext
 from trilane.scene.mover import Mover
 from trilane.stages.avatar_assets import distinct, shaped_body, staged_of

@@ -20,7 +20,7 @@ from trilane.scheduler.events import Graph, StageSpec
 from trilane.scheduler.policy import policy_named
 from trilane.shapes import parse_shape, shape_buckets
 from trilane.transport.slots import edge_rule
-from trilane.unexpected import UnexpectedValue, unexpected_in
+from trilane.unexpected_value import UnexpectedValue, unexpected_in
 
 PACKAGE = Path(trilane.__file__).parent
 

@@ -22,7 +22,7 @@ ROWS = (
         "install",
         "shapes",
         "unet_tables",
-        "unexpected",
+        "unexpected_value",
         "units",
         "writing",
     ),

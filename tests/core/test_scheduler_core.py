@@ -45,6 +45,7 @@ PURE = (
     "events",
     "flow",
     "frame_source",
+    "late_frames",
     "ledger",
     "policy",
     "state",
@@ -52,7 +53,7 @@ PURE = (
     "unit_life",
     "watchdog",
 )
-PURE_BELOW = ("trilane.transport.slots", "trilane.unexpected")  # what of the lower layers the core may import
+PURE_BELOW = ("trilane.transport.slots", "trilane.unexpected_value")  # what of the lower layers the core may import
 
 
 def service(stage: str, _unit: str, _frame: int, _begin_ns: int) -> int:

@@ -93,7 +93,7 @@ def raise_from_doctor(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> 
     def fail() -> None:
         raise error
 
-    monkeypatch.setattr("trilane.stages.machine.gl_facts", fail)
+    monkeypatch.setattr("trilane.stages.machine_facts.gl_facts", fail)
 
 
 @pytest.mark.parametrize(
@@ -125,7 +125,7 @@ def test_an_interrupt_is_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
 def test_doctor_prints_one_document_and_says_what_is_missing(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("trilane.stages.machine.gl_facts", lambda: None)
+    monkeypatch.setattr("trilane.stages.machine_facts.gl_facts", lambda: None)
     assert run_here(monkeypatch, "doctor", "--json") == 3
     out, err = capsys.readouterr()
     document = json.loads(out)

@@ -8,7 +8,7 @@ import onnx
 import pytest
 
 from trilane.bench import infer, roofline
-from trilane.bench.lib.interleaved import Variant, runners
+from trilane.bench.lib.interleaved_processes import Variant, runners
 from trilane.errors import BadInputError, TrilaneError
 
 

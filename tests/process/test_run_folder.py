@@ -13,14 +13,14 @@ from trilane.apps.report import read_report
 from trilane.apps.run_job import Hooks, Outcome, Plan, run_to_folder
 from trilane.errors import TrilaneError
 from trilane.hw_profiles.host import host_units
-from trilane.pipeline.assets import Assets
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run import run_pipeline
+from trilane.pipeline.shared_assets import Assets
 from trilane.scene.schema import OutputSpec, Scene
 from trilane.scheduler.recording import read, replay
 from trilane.stages.config import RunConfig
 from trilane.stages.configure import Checked
-from trilane.stages.machine import machine_facts
+from trilane.stages.machine_facts import machine_facts
 from trilane.testing.doubles import pipeline_of_doubles
 
 FRAMES = 24

@@ -27,7 +27,7 @@ from trilane.arrays import F32
 from trilane.avatars.integer_network import FLOAT_LAYERS_KEY, NetworkFile
 from trilane.avatars.network_checks import check_network
 from trilane.errors import BadInputError
-from trilane.training.quantising.byte_ends import replace_ends_by_bytes
+from trilane.training.quantising.byte_input_output import replace_ends_by_bytes
 from trilane.training.quantising.calibration import limit_logits, measure, share_ranges
 from trilane.training.quantising.power_of_two_scales import (
     CannotRoundAlikeError,

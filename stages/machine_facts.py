@@ -34,7 +34,7 @@ OPTIONAL_PACKAGES = {
 }
 
 GL_TIMEOUT_S = 30.0
-GL_PROGRAM = "import json, trilane.stages.machine as m; print(json.dumps(m.open_gl()))"
+GL_PROGRAM = "import json, trilane.stages.machine_facts as m; print(json.dumps(m.open_gl()))"
 GL_LIMITS = (
     "GL_MAX_TEXTURE_SIZE", "GL_MAX_DRAW_BUFFERS", "GL_MAX_COLOR_ATTACHMENTS", "GL_MAX_UNIFORM_BLOCK_SIZE",
     "GL_MAX_TEXTURE_BUFFER_SIZE", "GL_MAX_VIEWPORT_DIMS",
