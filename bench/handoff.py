@@ -1,6 +1,7 @@
 """How long from the producer's last byte written until the consumer, another process, can read them all?
 
-Rule: one definition for every way, and all take turns; the producer writes every byte anew, then looks at the clock.
+Rule: one definition for every variant, and all run interleaved; the producer writes every byte anew, then reads the
+clock.
 """
 
 from __future__ import annotations
@@ -39,18 +40,24 @@ Times = tuple[list[float], list[float]]
 
 
 def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 200, turns: int = 6) -> dict[str, Any]:
-    """Rows: `way`, `kib`, `frames`, `p50_us` `p99_us` `max_us` until all bytes can be read, `read_p50_us` until all
-    were read (every byte is, and checked).
+    """The time from the producer's last byte written until the consumer can read them all, by variant and size.
 
-    `slot`: a slot of the pipeline's shared memory and the message that announces it, one process to another. `slot,
-    256 KiB of it written`: the same, without what filling all of it does to the caches. `slot through the scheduler`:
-    `slot` between the raster and infer stages of a real run, where the message goes to the scheduler's process,
-    through its core, and on. Peers: `iceoryx2` with an event, `zeromq copied` frames, `pickled queue`
-    (multiprocessing.Queue). Each turn hands over `frames` times in each way and size; before each the consumer waits
-    at least 1 ms, as an idle unit does. `absent`: peers that are not installed. `met`: our two ways against p50 <= 150
-    us and p99 <= 500 us at the largest size. `slower_us`: of each peer and size, what its p50 of a turn is over that
-    of `slot` in the same turn: the ends of the 95 % interval of the median over the turns (with fewer than six of them
-    the least and largest). `ahead`: of each peer, when that interval is above 0 at every size.
+    `kib`: sizes, of 256, 1024, 4096 and 16384.
+    `frames`: hand-overs of each variant and size in a round.
+    `turns`: rounds; all variants take part in each.
+
+    Rows: `way` (the variant), `kib`, `frames`, `p50_us`, `p99_us`, `max_us`, and `read_p50_us` until every byte was
+    read and checked. Before each hand-over the consumer waits at least 1 ms, as an idle unit does.
+
+    Our variants: `slot`: a slot of the pipeline's shared memory and the message that announces it, from one process to
+    another. `slot, 256 KiB of it written`: the same, without what filling all of it does to the caches. `slot through
+    the scheduler`: between two stages of a real run, where the message goes to the scheduler's process, through its
+    core, and on. Peers: `iceoryx2` with an event, `zeromq copied` frames, `pickled queue` (multiprocessing.Queue).
+
+    `absent`: peers that are not installed. `met`: our two variants against p50 <= 150 us and p99 <= 500 us at the
+    largest size. `slower_us`: of each peer and size, its p50 less that of `slot` in the same round: the ends of the
+    95 % interval of the median over the rounds (with fewer than six of them the least and largest). `ahead`: of each
+    peer, whether that interval lies above 0 at every size.
     Raises BadInputError for other sizes than 256, 1024, 4096, 16384 KiB.
     """
     if unknown := set(kib) - set(SIZES_KIB):
@@ -62,14 +69,17 @@ def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 200, turns:
     times: dict[tuple[str, int], list[Times]] = {}
     with awake() as idle_cores, ExitStack() as stack:
         pairs, absent = _pairs(stack, kib)
-        for turn in range(turns):
+        for number in range(turns):
             for size in kib:
-                ways = [way for way, of in pairs if of == size]
-                for way in ways[turn % len(ways) :] + ways[: turn % len(ways)]:
-                    times.setdefault((way, size), []).append(pairs[way, size].run(frames))
+                variants = [variant for variant, of in pairs if of == size]
+                first = number % len(variants)
+                for variant in variants[first:] + variants[:first]:
+                    times.setdefault((variant, size), []).append(pairs[variant, size].run(frames))
                 times.setdefault((PIPELINE, size), []).append(_through_pipeline(size, frames))
     config = {"frames": frames, "turns": turns, "idle_cores": idle_cores}
-    rows = [_row(way, size, taken) for (way, size), taken in sorted(times.items(), key=lambda item: item[0][1])]
+    rows = [
+        _row(variant, size, rounds) for (variant, size), rounds in sorted(times.items(), key=lambda item: item[0][1])
+    ]
     verdicts = {**_verdicts(rows, max(kib)), **_against_peers(times)}
     return {"rows": rows, **verdicts, "absent": absent, "config": config}
 
@@ -174,18 +184,18 @@ def _answer(pipe: Connection) -> Any:
 
 
 def _pairs(stack: ExitStack, sizes: tuple[int, ...]) -> tuple[dict[tuple[str, int], Pair], dict[str, str]]:
-    """Waiting processes for each way and size that there is, and why a way is not there."""
+    """Waiting processes for each variant and size, and why a variant is absent."""
     context = multiprocessing.get_context("spawn")
     pairs, absent = {}, {}
-    for way, make in CHANNELS.items():
+    for variant, make in CHANNELS.items():
         for size in sizes:
             try:
                 channel = make(size * 1024, context)
             except ModuleNotFoundError as error:
-                absent[way] = f"{error.name} is not installed: {install_line('peers')}"
+                absent[variant] = f"{error.name} is not installed: {install_line('peers')}"
                 break
-            pairs[way, size] = Pair(context, channel, WRITTEN.get(way, size * 1024))
-            stack.callback(pairs[way, size].close)
+            pairs[variant, size] = Pair(context, channel, WRITTEN.get(variant, size * 1024))
+            stack.callback(pairs[variant, size].close)
     return pairs, absent
 
 
@@ -205,10 +215,10 @@ def _microseconds(ends_ns: Sequence[int], begins_ns: Sequence[int]) -> list[floa
     return [(end - begin) / 1e3 for end, begin in zip(ends_ns, begins_ns, strict=True)]
 
 
-def _row(way: str, size: int, taken: list[Times]) -> dict[str, Any]:
-    readable, read = ([one for turn in of_turns for one in turn] for of_turns in zip(*taken, strict=True))
+def _row(variant: str, size: int, rounds: list[Times]) -> dict[str, Any]:
+    readable, read = ([us for of_round in of_rounds for us in of_round] for of_rounds in zip(*rounds, strict=True))
     return {
-        "way": way,
+        "way": variant,
         "kib": size,
         "frames": len(readable),
         "p50_us": float(np.percentile(readable, 50)),
@@ -224,16 +234,16 @@ def _verdicts(rows: list[dict[str, Any]], largest: int) -> dict[str, Any]:
     sizes = sorted({size for _, size in p50})
     return {
         "met": {row["way"]: all(row[f"{key}_us"] <= limit for key, limit in LIMITS_US.items()) for row in ours},
-        "p50_largest_over_smallest": {way: p50[way, sizes[-1]] / p50[way, sizes[0]] for way in OURS},
+        "p50_largest_over_smallest": {variant: p50[variant, sizes[-1]] / p50[variant, sizes[0]] for variant in OURS},
     }
 
 
 def _against_peers(times: dict[tuple[str, int], list[Times]]) -> dict[str, Any]:
     sizes = sorted({size for _, size in times})
-    p50 = {key: np.array([np.percentile(readable, 50) for readable, _ in turns]) for key, turns in times.items()}
+    p50 = {key: np.array([np.percentile(readable, 50) for readable, _ in rounds]) for key, rounds in times.items()}
     slower = {
         peer: {size: median_interval((p50[peer, size] - p50[SLOT, size]).tolist()) for size in sizes}
-        for peer in sorted({way for way, _ in times} - {*OURS})
+        for peer in sorted({variant for variant, _ in times} - {*OURS})
     }
     return {
         "ahead": {peer: all(low > 0 for low, _ in of_size.values()) for peer, of_size in slower.items()},

@@ -54,8 +54,9 @@ def measure(
     _check(scenario, judge, {"--seconds": seconds, "--rate": rate, "--limit-ms": limit_ms, "--samples": samples})
     if "loadgen" in judge:
         load_generator()
-    checked = configure(Request(size=size, avatar=avatar, frames=MAX_FRAMES, runtime=runtime), Path.cwd())
-    pipeline = avatar_pipeline(checked.changed(record=False).config, checked.assets, edge)
+    request = Request(size=size, avatar=avatar, frames=MAX_FRAMES, runtime=runtime)
+    checked = configure(request, Path.cwd()).changed(record=False)
+    pipeline = avatar_pipeline(checked.config, checked.assets, edge)
     rows, summaries = [], {}
     for name in scenario:
         load = Load(name, seconds, rate, limit_ms, samples, seed)

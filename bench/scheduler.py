@@ -51,38 +51,51 @@ def measure(minutes: float = 30.0, turns: int = 3, seeds: int = 10, events: str 
     replayed = _replayed(events) if events else {}
     frames = max(2, round(minutes * 60 * FPS))
     graph, service = application_graph(), _service(0, frames)
-    ways: dict[str, Callable[[], list[int]]] = {"trilane": lambda: _trilane(graph, service, frames)}
-    absent = _add_simpy(ways, graph, service, frames)
-    seconds: dict[str, list[float]] = {way: [] for way in ways}
-    ends: dict[str, list[int]] = {}
-    for _ in range(turns):
-        for way, run in ways.items():
-            begin = time.process_time()
-            ends[way] = run()
-            seconds[way].append(time.process_time() - begin)
-    if any(other != ends["trilane"] for other in ends.values()):
-        raise TrilaneError("SimPy's model presents frames at other times than Trilane's scheduler")
+    variants: dict[str, Callable[[], list[int]]] = {"trilane": lambda: _trilane(graph, service, frames)}
+    absent = _add_simpy(variants, graph, service, frames)
+    seconds = _cpu_seconds(variants, turns)
     counts = _processed(graph, service, frames, with_simpy=not absent)
     events_each = frames * (len(graph.stages) + 1)
-    rows = [_row(way, frames, events_each, median(runs), counts[way]) for way, runs in seconds.items()]
-    speeds = {row["way"]: row["events_per_s"] for row in rows}
-    traces = [_traces(seed) for seed in range(seeds)]
+    rows = [_row(variant, frames, events_each, median(runs), counts[variant]) for variant, runs in seconds.items()]
+    config = {"core": form(), "minutes": minutes, "fps": FPS, "turns": turns, "seeds": seeds, "repeats": REPEATS}
     return {
         "rows": rows,
-        "over_simpy": speeds["trilane"] / speeds["simpy"] if "simpy" in speeds else None,
-        "agree": None if absent else frames,
-        "same_traces": sum(len(set(repeats)) == 1 for repeats in traces),
-        "different_traces": len({repeats[0] for repeats in traces}),
-        "config": {
-            "core": form(),
-            "minutes": minutes,
-            "fps": FPS,
-            "turns": turns,
-            "seeds": seeds,
-            "repeats": REPEATS,
-        },
+        **_compared(rows, frames),
+        **_determinism(seeds),
+        "config": config,
         **absent,
         **replayed,
+    }
+
+
+def _cpu_seconds(variants: dict[str, Callable[[], list[int]]], rounds: int) -> dict[str, list[float]]:
+    """CPU time of every round of each variant. Raises TrilaneError when they present frames at different times."""
+    seconds: dict[str, list[float]] = {variant: [] for variant in variants}
+    ends: dict[str, list[int]] = {}
+    for _ in range(rounds):
+        for variant, run in variants.items():
+            begin = time.process_time()
+            ends[variant] = run()
+            seconds[variant].append(time.process_time() - begin)
+    if any(other != ends["trilane"] for other in ends.values()):
+        raise TrilaneError("SimPy's model presents frames at other times than Trilane's scheduler")
+    return seconds
+
+
+def _compared(rows: list[dict[str, Any]], frames: int) -> dict[str, Any]:
+    speeds = {row["way"]: row["events_per_s"] for row in rows}
+    has_simpy = "simpy" in speeds
+    return {
+        "over_simpy": speeds["trilane"] / speeds["simpy"] if has_simpy else None,
+        "agree": frames if has_simpy else None,
+    }
+
+
+def _determinism(seeds: int) -> dict[str, int]:
+    traces = [_traces(seed) for seed in range(seeds)]
+    return {
+        "same_traces": sum(len(set(repeats)) == 1 for repeats in traces),
+        "different_traces": len({repeats[0] for repeats in traces}),
     }
 
 

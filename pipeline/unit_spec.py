@@ -1,4 +1,4 @@
-"""What a unit's process is told when it starts, as one JSON document. Rule: plain data, and descriptors by number."""
+"""What a unit's process gets when it starts, as one JSON document. Rule: plain data, and descriptors by number."""
 
 from __future__ import annotations
 
