@@ -21,6 +21,8 @@ from trilane.errors import BadInputError, TrilaneError
 AHEAD = 4
 MAX_PIXELS = 64_000_000
 DEFAULT_STEP_S = 1 / 30
+ROUNDING_S = 1e-6
+MICROSECONDS = 1e6  # of a second: the unit of a container's duration and of its seeks
 
 
 class VideoReader:
@@ -28,26 +30,40 @@ class VideoReader:
 
     def __init__(self, path: Path, shape: tuple[int, int]) -> None:
         self._path, self._shape = path, shape
-        self._queue: queue.Queue[tuple[float, U8] | TrilaneError] = queue.Queue(AHEAD)
-        self._stop = threading.Event()
-        frames = self._frames()
-        self._next = next(frames)
-        self._thread = threading.Thread(target=self._decode, args=(frames,), name="background video", daemon=True)
-        self._thread.start()
+        self._start_s: float | None = None  # of the file's first frame, in its own time
+        self._period_s = 0.0  # of the loop; 0 until the video has ended once
+        self._shown_s = -1.0
+        self._next: tuple[float, U8]
+        self._queue: queue.Queue[tuple[float, U8] | TrilaneError]
+        self._open(0.0)
 
     def at(self, time_s: float) -> U8 | None:
         """The newest frame (h,w,3) uint8 not after `time_s`; None when the last call returned that frame already.
 
-        Raises BadInputError when the file cannot be decoded.
+        Times may go back, as they do from the frames that are measured before a run to its first one: then the video
+        is opened again. Raises BadInputError when the file cannot be decoded.
         """
+        if time_s + ROUNDING_S < self._shown_s:
+            self.close()
+            self._open(time_s)
         due = None
-        while self._next[0] <= time_s + 1e-6:
-            due = self._next[1]
+        while self._next[0] <= time_s + ROUNDING_S:
+            self._shown_s, due = self._next
             item = self._queue.get()
             if isinstance(item, TrilaneError):
                 raise item
             self._next = item
         return due
+
+    def _open(self, from_s: float) -> None:
+        """Decode from `from_s` on, or from a little earlier."""
+        self._queue = queue.Queue(AHEAD)
+        self._stop = threading.Event()
+        self._shown_s = -1.0
+        frames = self._frames(from_s)
+        self._next = next(frames)
+        self._thread = threading.Thread(target=self._decode, args=(frames,), name="background video", daemon=True)
+        self._thread.start()
 
     def close(self) -> None:
         """Stop the thread and close the file."""
@@ -71,31 +87,38 @@ class VideoReader:
             with suppress(queue.Full):
                 return self._queue.put(item, timeout=0.1)
 
-    def _frames(self) -> Iterator[tuple[float, U8]]:
-        """Pairs of time and picture without end, from time 0. Raises BadInputError for a video without frames."""
-        begin = 0.0
+    def _frames(self, from_s: float) -> Iterator[tuple[float, U8]]:
+        """Pairs of time and picture without end, from `from_s` or a little earlier.
+
+        Raises BadInputError for a video without frames.
+        """
+        begin = from_s // self._period_s * self._period_s if self._period_s else 0.0
+        seek_s = from_s - begin
         while True:
             last, step = -1.0, DEFAULT_STEP_S
-            for time_s, picture in self._one_round():
+            for time_s, picture in self._one_round(seek_s):
                 at = max(time_s, last)  # in some files times decrease
                 step = at - last if at > last >= 0 else step
                 last = at
                 yield begin + at, picture
             if last < 0:
                 raise BadInputError(self._path, "no video frame", "a video with at least one frame")
-            begin += last + step
+            self._period_s = last + step
+            begin, seek_s = begin + self._period_s, 0.0
 
-    def _one_round(self) -> Iterator[tuple[float, U8]]:
+    def _one_round(self, seek_s: float) -> Iterator[tuple[float, U8]]:
+        """The frames from the last key frame before `seek_s` to the end, with their times from the file's first one."""
         try:
             with av.open(str(self._path)) as container:
                 if not container.streams.video:
                     raise BadInputError(self._path, "no video stream", "a video")
                 stream = container.streams.video[0]
-                start: float | None = None
+                if self._start_s is not None and 0 < seek_s < (container.duration or 0) / MICROSECONDS:
+                    container.seek(round((self._start_s + seek_s) * MICROSECONDS))
                 for index, frame in enumerate(container.decode(stream)):
                     time_s = frame.time if frame.time is not None else index * DEFAULT_STEP_S
-                    start = time_s if start is None else start
-                    yield max(time_s - start, 0.0), self._fit(frame)
+                    self._start_s = time_s if self._start_s is None else self._start_s
+                    yield max(time_s - self._start_s, 0.0), self._fit(frame)
         except (av.FFmpegError, ValueError) as error:
             raise BadInputError(self._path, f"no readable video ({error})", "a video that FFmpeg can decode") from error
 

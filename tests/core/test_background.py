@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 
 import av
@@ -69,6 +70,41 @@ BAD_FILES = {
     "text.png": b"hello",
     "cut.png": b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR",
 }
+
+
+@pytest.fixture(scope="module")
+def ramp(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two seconds of video at 30 frames a second, a key frame every 10; frame N has the grey value 40 + 3 N."""
+    path = tmp_path_factory.mktemp("video") / "ramp.mp4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=30, options={"g": "10", "crf": "0"})
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv444p"
+        for number in range(60):
+            frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 40 + 3 * number, np.uint8), format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return path
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        pytest.param(range(60), id="forwards"),
+        pytest.param(range(0, 150, 7), id="looped"),
+        pytest.param([0, 20, 40, 59, *range(60)], id="measured before the run"),
+        pytest.param(range(59, -1, -1), id="backwards"),
+        pytest.param([130, 70, 69, 3, 140, 65, 64, 0], id="across loops"),
+        pytest.param([47], id="after a restart of the unit"),
+    ],
+)
+def test_every_frame_of_a_video_is_shown_at_its_own_time(ramp: Path, numbers: Sequence[int]) -> None:
+    reader, picture = open_background(ramp, (48, 64), 30), None
+    for number in numbers:
+        due = reader.at(number / 30)
+        picture = due if due is not None else picture
+        assert picture is not None
+        assert float(picture.mean()) == pytest.approx(40 + 3 * (number % 60), abs=2), number
+    reader.close()
 
 
 @pytest.mark.parametrize("name", BAD_FILES)
