@@ -128,6 +128,7 @@ class _Job:
         try:
             result = self._run(place, BASELINE_POLICY, frames, 0.0)
         except KeyboardInterrupt:
+            self._hooks.message(f"interrupted: the {BASELINE_POLICY} run to compare with is left out")
             return None, True
         except TrilaneError as error:
             self._hooks.message(f"the {BASELINE_POLICY} run to compare with failed and is left out: {error}")

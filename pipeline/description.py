@@ -29,10 +29,18 @@ class Model(BaseModel):
 
 
 def _header(value: Any) -> np.dtype[Any]:
-    dtype = np.lib.format.descr_to_dtype(ast.literal_eval(value)) if isinstance(value, str) else value
-    if not isinstance(dtype, np.dtype) or (dtype.names or ())[: len(FRAME_FIELDS)] != tuple(n for n, _ in FRAME_FIELDS):
+    try:
+        dtype = np.lib.format.descr_to_dtype(ast.literal_eval(value)) if isinstance(value, str) else value
+    except (SyntaxError, TypeError, ValueError, MemoryError, RecursionError):
+        dtype = None
+    if not isinstance(dtype, np.dtype) or dtype.hasobject or not _begins_with_frame_fields(dtype):
         raise UnexpectedValue(f"header {value!r}", "one made by trilane.transport.packets.header_dtype")
     return dtype
+
+
+def _begins_with_frame_fields(dtype: np.dtype[Any]) -> bool:
+    names = (dtype.names or ())[: len(FRAME_FIELDS)]
+    return [(name, dtype[name]) for name in names] == [(name, np.dtype(field)) for name, field in FRAME_FIELDS]
 
 
 def _header_text(dtype: np.dtype[Any]) -> str:

@@ -125,8 +125,10 @@ def main() -> None:
     arguments = parser.parse_args()
     die_with_parent(arguments.parent)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    for module in (ALWAYS, *filter(None, arguments.preload.split(","))):
-        importlib.import_module(module)
+    importlib.import_module(ALWAYS)
+    for module in filter(None, arguments.preload.split(",")):
+        with contextlib.suppress(ImportError):  # who needs it says what is missing
+            importlib.import_module(module)
     gc.collect()
     gc.freeze()  # a unit's collector then leaves alone, and does not copy, the pages that all units share
     serve(socket.socket(fileno=arguments.socket))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable
 
-from trilane.pipeline.run_log import RunLog, UnitError, after_stderr
+from trilane.pipeline.run_log import RunLog, UnitError
 from trilane.pipeline.signals import Interrupts
 from trilane.pipeline.unit_processes import UnitMessage, UnitProcesses
 from trilane.transport.messages import Close, Closed, Failed, Ready
@@ -47,8 +47,7 @@ def listen_before_run(processes: UnitProcesses, interrupts: Interrupts) -> list[
         if isinstance(message, Failed):
             raise UnitError(message.message, message.exit_code)
         if message is None:
-            tail = after_stderr(processes.stderr_tails.get(unit, ""))
-            raise UnitError(f"unit {unit} ended before the run began{tail}")
+            raise UnitError(f"unit {unit} ended before the run began{processes.why_ended(unit)}")
     return messages
 
 
@@ -63,6 +62,8 @@ def close_units(processes: UnitProcesses, log: RunLog, interrupts: Interrupts) -
             if isinstance(message, Failed):
                 log.fail(message.message, message.exit_code)
                 log.say(message.message)
+            if message is None and unit in waiting:
+                log.fail(f"unit {unit} ended before its files were closed{processes.why_ended(unit)}")
             if message is None or isinstance(message, Closed):
                 waiting.discard(unit)
     if waiting and interrupts.count < 2:

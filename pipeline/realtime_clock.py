@@ -10,8 +10,9 @@ from collections import Counter, defaultdict
 from collections.abc import Callable
 from typing import Protocol
 
+from trilane.errors import TrilaneError
 from trilane.pipeline.requests import FrameRequestQueue
-from trilane.pipeline.run_log import RunLog, after_stderr
+from trilane.pipeline.run_log import RunLog
 from trilane.pipeline.signals import Interrupts
 from trilane.pipeline.unit_processes import UnitMessage, UnitProcesses
 from trilane.scheduler.core import Core
@@ -78,7 +79,7 @@ class RealtimeClock:
         self._last_stage = core.graph.stages[-1].name
         self._open: dict[int, tuple[Job, int]] = {}
         self._unbooked: list[tuple[Job, int, int | None, Done]] = []
-        self._begun = self._stopping = False
+        self._begun = self._stopping = self._is_lost = False
         self._step_ns = self._ping_ns = 0
         self._progress_s = 0.0
         processes.watch(interrupts.fd)
@@ -105,12 +106,20 @@ class RealtimeClock:
                 self._log.say(f"unit {action.unit} did not answer in time and is restarted")
                 self._processes.kill(action.unit)
             elif isinstance(action, Start):
-                self._processes.start(action.unit)
+                self._start(action.unit)
 
     def finish(self) -> None:
         """Book what the last step ended, and show the final progress."""
         self._book()
         self._show_progress(final=True)
+
+    def _start(self, unit: str) -> None:
+        """Start the unit again; where no process can be made for it the run ends, with what was done until then."""
+        try:
+            self._processes.start(unit)
+        except (TrilaneError, OSError) as error:
+            self._log.fail(str(error))
+            self._is_lost = True
 
     def _begin(self) -> list[Event]:
         self._begun = True
@@ -123,6 +132,8 @@ class RealtimeClock:
         return events
 
     def _listen(self, deadline_ns: int) -> list[Event]:
+        if self._is_lost:
+            return [Abort()]
         until_ns = min(self._ping_ns, deadline_ns, NEVER if self._governor is None else self._governor.due_ns)
         timeout_ms = max(0, -((time.monotonic_ns() - until_ns) // 1_000_000))
         messages = self._processes.listen(timeout_ms)
@@ -167,7 +178,7 @@ class RealtimeClock:
         if isinstance(message, messages.Pong):
             return Pong(unit)
         if message is None:
-            self._log.say(f"unit {unit} ended unexpectedly and is started again{self._stderr_tail(unit)}")
+            self._log.say(f"unit {unit} ended unexpectedly and is started again{self._processes.why_ended(unit)}")
             return UnitDied(unit)
         return None
 
@@ -199,9 +210,6 @@ class RealtimeClock:
                 self.jobs.append(JobRecord(job.stage, job.unit, job.frame, *times))
             self.metrics[job.stage].update(done.metrics)
         self._unbooked.clear()
-
-    def _stderr_tail(self, unit: str) -> str:
-        return after_stderr(self._processes.stderr_tails.get(unit, ""))
 
     def _show_progress(self, *, final: bool = False) -> None:
         now_s = time.monotonic()

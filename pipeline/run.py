@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import math
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Protocol
 
 from trilane.errors import BadInputError
+from trilane.pipeline import fork_server
 from trilane.pipeline.description import Pipeline
 from trilane.pipeline.isolated import IsolatedTimes
 from trilane.pipeline.lifecycle import close_units, start_units
@@ -17,7 +19,7 @@ from trilane.pipeline.realtime_clock import Governor, RealtimeClock
 from trilane.pipeline.regions import edge_regions
 from trilane.pipeline.requests import FrameRequestQueue
 from trilane.pipeline.result import RunResult
-from trilane.pipeline.run_log import RunLog, UnitError, after_stderr
+from trilane.pipeline.run_log import RunLog, UnitError
 from trilane.pipeline.run_metrics import RunMetrics, metrics_of
 from trilane.pipeline.shared_assets import Assets, share_assets
 from trilane.pipeline.signals import Interrupts
@@ -91,10 +93,12 @@ def run_pipeline(
     SIGINT or SIGTERM ends the run cleanly with its result marked `interrupted`; a second one ends the units at once;
     before the first frame KeyboardInterrupt is raised instead.
 
-    Raises BadInputError for an unknown policy, TrilaneError (with the exit code of the unit's error) when a unit cannot
-    start; a failure after that is `RunResult.failure`.
+    Raises BadInputError for an unknown policy and in a unit's own process, TrilaneError (with the exit code of the
+    unit's error) when a unit cannot start; a failure after that is `RunResult.failure`.
     """
+    _refuse_in_a_unit()
     check_open_files()
+    _check_cores(pipeline)
     isolated = _isolated_share(frames) if isolated_frames is None else isolated_frames
     settings = _settings(policy, frames, fps, pace_fps, hang_ns, latch_ms, requests)
     log = RunLog(on_message)
@@ -152,8 +156,8 @@ class _Run:
         self._outcome = run_loop(self._core, self._clock, self._recording)
         self._clock.finish()
         if self._outcome.kind is OutcomeKind.GAVE_UP:
-            tail = after_stderr(self._processes.stderr_tails.get(self._outcome.unit, ""))
-            self._log.fail(f"unit {self._outcome.unit} could not be kept alive{tail}")
+            unit = self._outcome.unit
+            self._log.fail(f"unit {unit} could not be kept alive{self._processes.why_ended(unit)}")
         if sample[1::2] and self._outcome.kind is OutcomeKind.DONE:
             self._measure_again(sample[1::2])
         self.pids = {**self.pids, **self._processes.pids}
@@ -189,7 +193,7 @@ class _Run:
         try:
             self.isolated.measure(frames)
         except (UnitError, KeyboardInterrupt) as error:
-            self._log.say(f"the measurement after the run was left out: {error or 'interrupted'}")
+            self._log.say(f"the measurement after the run was left out: {str(error) or 'interrupted'}")
 
     def _mean_metrics(self) -> Mapping[str, Mapping[str, float]]:
         """Of each stage that reported any, the mean of a job."""
@@ -198,6 +202,23 @@ class _Run:
             stage: {name: total / max(jobs[stage], 1) for name, total in sums.items()}
             for stage, sums in self._clock.metrics.items()
         }
+
+
+def _refuse_in_a_unit() -> None:
+    """Raises BadInputError where a unit imports the module of its stages, and that would start units without end."""
+    spec = sys.modules["__main__"].__spec__
+    if spec is not None and spec.name == fork_server.__name__:
+        found = "run_pipeline was called while a unit imported its stages"
+        raise BadInputError("run_pipeline", found, 'a call under `if __name__ == "__main__":`')
+
+
+def _check_cores(pipeline: Pipeline) -> None:
+    """Raises BadInputError for cores that the units could not get."""
+    here = os.sched_getaffinity(0)
+    for unit, settings in pipeline.units.items():
+        if absent := set(settings.cores) - here:
+            found, expected = ", ".join(map(str, sorted(absent))), ", ".join(map(str, sorted(here)))
+            raise BadInputError(f"cores of unit {unit}", found, f"some of this process's: {expected}")
 
 
 def _settings(
@@ -209,6 +230,10 @@ def _settings(
     latch_ms: float,
     requests: FrameRequestQueue | None,
 ) -> Settings:
+    positive = {"frames": frames, "fps": fps, "pace_fps": pace_fps, "hang_ns": hang_ns}
+    for name, value in positive.items():
+        if value is not None and not 0 < value < math.inf:
+            raise BadInputError(name, str(value), "more than 0")
     try:
         paced = policy_named(policy).paced
     except UnexpectedValue as error:

@@ -42,6 +42,6 @@ class RunLog:
 
 
 def after_stderr(tail: str) -> str:
-    """The last line of what a unit wrote to stderr, to be put behind a sentence; empty when it wrote nothing."""
+    """The last line of what a unit wrote to stderr, as part of a sentence; empty when it wrote nothing."""
     lines = tail.splitlines()
-    return f"; it wrote last: {lines[-1]}" if lines else ""
+    return f"it wrote last: {lines[-1]}" if lines else ""

@@ -14,9 +14,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import psutil
 from numpy.typing import NDArray
 
-from trilane.errors import TrilaneError
+from trilane.errors import TrilaneError, reason
 from trilane.transport.memory import F_ADD_SEALS, F_SEAL_GROW, F_SEAL_SHRINK
 from trilane.transport.packets import PAGE
 
@@ -24,11 +25,18 @@ Assets = Mapping[str, NDArray[Any]]
 
 F_SEAL_WRITE = 0x8  # <linux/fcntl.h>
 LENGTH_BYTES = 8
+KINDS = "?biufcmMSU"  # of NumPy types that are their bytes and no more
 
 
 def share_assets(assets: Assets) -> int:
-    """A descriptor of sealed memory that holds `assets`. Raises TrilaneError when there is too little memory."""
+    """A descriptor of sealed memory that holds `assets`.
+
+    Raises TrilaneError when there is too little memory, or for arrays of another kind than numbers, times and text.
+    """
     index, end = _index(assets)
+    free = psutil.virtual_memory().available
+    if end > free:
+        raise TrilaneError(f"assets: found {end >> 20} MiB, expected at most {free >> 20} MiB, which are free")
     head = json.dumps(index).encode()
     start = _page_up(LENGTH_BYTES + len(head))
     fd = os.memfd_create("trilane:assets", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
@@ -40,7 +48,7 @@ def share_assets(assets: Assets) -> int:
         fcntl.fcntl(fd, F_ADD_SEALS, F_SEAL_SHRINK | F_SEAL_GROW | F_SEAL_WRITE)
     except OSError as error:
         os.close(fd)
-        raise TrilaneError(f"{(start + end) >> 20} MiB for the avatar's data: {error.strerror}") from None
+        raise TrilaneError(f"assets: no room for {(start + end) >> 20} MiB: {reason(error)}") from None
     return fd
 
 
@@ -62,6 +70,8 @@ def _index(assets: Assets) -> tuple[dict[str, dict[str, Any]], int]:
     """Type, shape and place of every array, from the first page after the index; and where the last one ends."""
     index, offset = {}, 0
     for name, array in assets.items():
+        if array.dtype.kind not in KINDS:
+            raise TrilaneError(f"assets: found {name} of type {array.dtype}, expected numbers, times or text")
         index[name] = {"dtype": array.dtype.str, "shape": list(array.shape), "offset": offset}
         offset += _page_up(array.nbytes)
     return index, max(offset, PAGE)

@@ -136,7 +136,7 @@ def _run_job(link: Link, stage: BoundStage, job: RunJob) -> None:
     try:
         metrics = stage.run(job.frame, job.slot_in, job.slot_out, job.epoch)
         end_ns = time.monotonic_ns()
-        values = {name: float(value) for name, value in metrics.items()}
+        values = {str(name): float(value) for name, value in metrics.items()}
         link.job_pipe.send(Done(job.id, begin_ns, end_ns, stage.sampled_ns(job.slot_in, job.slot_out), values))
     except UnitLostError:
         raise

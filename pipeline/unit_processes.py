@@ -21,6 +21,7 @@ import zmq
 from trilane.errors import TrilaneError
 from trilane.pipeline.description import Pipeline
 from trilane.pipeline.regions import EdgeRegion
+from trilane.pipeline.run_log import after_stderr
 from trilane.pipeline.unit_spec import UnitSpec
 from trilane.pipeline.unit_starter import StartedUnit, UnitStarter
 from trilane.transport.job_pipe import JobPipe, JobPipeEnd, job_pipe_pair
@@ -62,8 +63,12 @@ class _Process:
             signal.pidfd_send_signal(self.pidfd, signal.SIGKILL)
 
     def wait(self) -> None:
-        """Until the process has ended."""
-        select.select([self.pidfd], [], [])
+        """Until the process has ended; what it started itself, and what stands in its process group, ends here."""
+        poller = select.poll()  # select(2) takes no descriptor above 1023
+        poller.register(self.pidfd, select.POLLIN)
+        poller.poll()
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.pid, signal.SIGKILL)
 
     def release_folder(self) -> None:
         if self.folder_open:
@@ -152,6 +157,11 @@ class UnitProcesses:
             self._forget(process)
             messages.append(UnitMessage(process.unit, None))
         return messages
+
+    def why_ended(self, unit: str) -> str:
+        """What a unit that has ended wrote last, or that the fork server ended; to be put behind a sentence."""
+        end = after_stderr(self.stderr_tails.get(unit, "")) or self._starter.end()
+        return f"; {end}" if end else ""
 
     def close(self) -> None:
         """No process is left when this returns, however it was before."""

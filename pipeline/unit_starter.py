@@ -10,7 +10,8 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 from trilane.errors import TrilaneError
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
 ANSWER_S = 60.0  # the modules to preload may come from a slow disk
 CLOSE_S = 5.0
+NOTICE_S = 0.2  # from the end of its units to its own, which ended them
 TAIL_BYTES = 8192
 
 
@@ -32,18 +34,25 @@ class StartedUnit(NamedTuple):
 
 
 class ForkedCall:
-    """A call that goes on in another process."""
+    """A call that goes on in another process; `server_end` says why the fork server has ended, "" while it lives."""
 
-    def __init__(self, reads: int) -> None:
-        self._reads = reads
+    def __init__(self, reads: int, server_end: Callable[[], str]) -> None:
+        self._reads, self._server_end = reads, server_end
         self._is_open = True
 
     def result(self) -> Any | None:
-        """What the function returned, once; None when it failed, its process died, or no answer came in time."""
+        """What the function returned, once; None when it failed, its process died, or no answer came in time.
+
+        Raises TrilaneError when the fork server has ended, and the call with it.
+        """
         answer = b""
-        while select.select([self._reads], [], [], ANSWER_S)[0] and (chunk := os.read(self._reads, TAIL_BYTES)):
+        poller = select.poll()  # select(2) takes no descriptor above 1023
+        poller.register(self._reads, select.POLLIN)
+        while poller.poll(1000 * ANSWER_S) and (chunk := os.read(self._reads, TAIL_BYTES)):
             answer += chunk
         self.close()
+        if not answer and (end := self._server_end()):
+            raise TrilaneError(end)
         return json.loads(answer) if answer else None
 
     def close(self) -> None:
@@ -69,7 +78,7 @@ class UnitStarter:
             self._server = self._spawn(theirs, preload)
             undo.pop_all()
         self._socket.settimeout(ANSWER_S)
-        self._is_used = False
+        self._has_units = False
 
     def _spawn(self, theirs: socket.socket, preload: Sequence[str]) -> subprocess.Popen[bytes]:
         arguments = [f"--socket={theirs.fileno()}", f"--parent={os.getpid()}", f"--preload={','.join(preload)}"]
@@ -85,7 +94,7 @@ class UnitStarter:
 
     def start(self, spec: UnitSpec, stderr_fd: int) -> StartedUnit:
         """A process for the unit, which writes to `stderr_fd`. Raises TrilaneError when the fork server failed."""
-        self._is_used = True
+        self._has_units = True
         spec_fd = os.memfd_create(f"trilane:spec:{spec.unit}", os.MFD_CLOEXEC)
         try:
             os.write(spec_fd, spec.model_dump_json().encode())
@@ -99,6 +108,8 @@ class UnitStarter:
             os.close(spec_fd)
         if not answer:
             raise TrilaneError(f"unit {spec.unit} could not be started: {self._reason(None)}")
+        if not fds:
+            raise TrilaneError(f"unit {spec.unit} could not be started: too many open files: ulimit -n 4096")
         return StartedUnit(int(answer), fds[0])
 
     def call(self, function: str) -> ForkedCall:
@@ -106,7 +117,6 @@ class UnitStarter:
 
         Raises TrilaneError when the fork server has ended.
         """
-        self._is_used = True
         reads, writes = os.pipe2(os.O_CLOEXEC)
         try:
             socket.send_fds(self._socket, [json.dumps({"call": function}).encode()], [writes])
@@ -115,13 +125,13 @@ class UnitStarter:
             raise TrilaneError(f"{function} could not be called: {self._reason(error)}") from None
         finally:
             os.close(writes)
-        return ForkedCall(reads)
+        return ForkedCall(reads, partial(self.end, NOTICE_S))
 
     def close(self) -> None:
         """End the fork server; units that still live end with it."""
         self._socket.close()
-        if not self._is_used:
-            self._server.kill()  # it may still be importing
+        if not self._has_units:
+            self._server.kill()  # it may still be importing, or a call go on
         try:
             self._server.wait(CLOSE_S)
         except subprocess.TimeoutExpired:
@@ -129,13 +139,22 @@ class UnitStarter:
             self._server.wait()
         os.close(self._stderr)
 
+    def end(self, wait_s: float = 0.0) -> str:
+        """Why the fork server has ended; "" when it still lives after the time."""
+        try:
+            code = self._server.wait(wait_s)
+        except subprocess.TimeoutExpired:
+            return ""
+        how = f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
+        return f"the fork server, which every unit comes from, {how}"
+
     def _reason(self, error: OSError | None) -> str:
-        """The end of what the fork server wrote, else the error's own words."""
+        """The end of what the fork server wrote, else how it ended, else the error's own words."""
         size = os.fstat(self._stderr).st_size
         tail = os.pread(self._stderr, TAIL_BYTES, max(0, size - TAIL_BYTES)).decode(errors="replace").strip()
         if tail:
             return tail.splitlines()[-1]
-        return "the process that forks it has ended" if error is None else error.strerror or str(error)
+        return self.end(NOTICE_S) or ("no answer" if error is None else error.strerror or str(error))
 
     def __enter__(self) -> Self:
         return self

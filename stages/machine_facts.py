@@ -111,7 +111,7 @@ def runtime_facts() -> dict[str, Any]:
 
     facts: dict[str, Any] = {"onnxruntime": list(onnxruntime.get_available_providers())}
     if package_version("openvino"):
-        import openvino
+        from trilane.stages.dsp.quiet_openvino import openvino
 
         facts["openvino"] = list(openvino.Core().available_devices)
     return facts

@@ -30,7 +30,7 @@ COMMANDS = {
     "doctor": ("trilane.apps.cli.doctor", "Say what this machine has, what is missing and how to install it."),
 }
 
-FAILED, MISSING_PART = 1, 3  # 2 is wrong usage and 130 an interrupt, as Typer has them
+FAILED, MISSING_PART, INTERRUPTED = 1, 3, 130  # 2 is wrong usage, as Typer has it, and so is 130
 
 EPILOG = """\b
 Examples:
@@ -134,6 +134,8 @@ def entry() -> NoReturn:
         main()
     except SystemExit as left:
         code = left.code
+    except KeyboardInterrupt:
+        code = INTERRUPTED
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):  # closed by whoever was to read it
             stream.flush()

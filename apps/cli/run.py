@@ -201,7 +201,11 @@ def _run(checked: Checked, out: Path | None, plan: Plan, starter: UnitStarter, g
     with _hooks() as hooks:
         for note in checked.notes:
             hooks.message(note)
-        return run_to_folder(checked, target, plan, hooks, machine=required_machine(gl), starter=starter)
+        try:
+            return run_to_folder(checked, target, plan, hooks, machine=required_machine(gl), starter=starter)
+        except KeyboardInterrupt:
+            hooks.message("interrupted: nothing was written")
+            raise
 
 
 def _print_outcome(outcome: Outcome, as_json: bool) -> None:

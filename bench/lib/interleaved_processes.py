@@ -153,7 +153,7 @@ def _ort_default(variant: Variant) -> Callable[[], object]:
 
 def _openvino_default(variant: Variant) -> Callable[[], object]:
     """As OpenVINO's first example does it: compile a file, call the model with an array."""
-    import openvino
+    from trilane.stages.dsp.quiet_openvino import openvino
 
     settings = {} if variant.threads is None else {"INFERENCE_NUM_THREADS": variant.threads}
     compiled = openvino.Core().compile_model(str(variant.network), "CPU", settings)

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from trilane.errors import BadInputError
 from trilane.writing import write_atomically
 
 ARRAYS = "arrays"
@@ -26,11 +27,11 @@ Arrays = Mapping[str, NDArray[Any]]
 
 def cache_dir(name: str) -> Path | None:
     """The folder of the cache `name`; None when it cannot be written."""
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    folder = Path(home) / "trilane" / name
     try:
+        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        folder = Path(home) / "trilane" / name
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
+    except (OSError, RuntimeError):  # RuntimeError: this user has no home
         return None
     return folder if os.access(folder, os.W_OK) else None
 
@@ -44,18 +45,28 @@ def cached_arrays(name: str, sources: Iterable[NDArray[Any] | str], make: Callab
     if folder is None:
         return make()
     entry = folder / f"{_digest(name, sources)}.npz"
-    with contextlib.suppress(OSError, ValueError, EOFError, KeyError), np.load(entry, allow_pickle=False) as stored:
-        return {key: stored[key] for key in stored.files}
+    stored = _read(entry)
+    if stored is not None:
+        return stored
     made = make()
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(OSError, BadInputError):
         with write_atomically(entry) as draft, draft.open("wb") as file:
             np.savez(file, allow_pickle=False, **made)
         _forget_oldest(folder)
     return made
 
 
+def _read(entry: Path) -> Arrays | None:
+    """The arrays of `entry`, None when it is missing or damaged: whatever the damage raises, they can be made again."""
+    try:
+        with entry.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+            return {key: stored[key] for key in stored.files}
+    except Exception:
+        return None
+
+
 def _digest(name: str, sources: Iterable[NDArray[Any] | str]) -> str:
-    digest = hashlib.blake2b(name.encode(), digest_size=20)
+    digest = hashlib.blake2b(name.encode() + b"\0", digest_size=20)
     for source in sources:
         if isinstance(source, str):
             digest.update(source.encode() + b"\0")

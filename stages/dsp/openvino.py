@@ -12,12 +12,11 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
 
-import openvino
-
 from trilane.arrays import U8
 from trilane.avatars.integer_network import IntegerNetwork
 from trilane.cache import cache_dir
 from trilane.errors import BadInputError
+from trilane.stages.dsp.quiet_openvino import openvino
 from trilane.stages.dsp.runtime import RuntimeOptions
 from trilane.writing import write_bytes
 

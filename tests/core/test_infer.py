@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
+import sys
+from importlib.util import find_spec
 
 import numpy as np
 import onnx
@@ -126,3 +129,15 @@ def test_the_factory_builds_a_part_of_the_network(tiny_bundle):
     stage.bind(slots(1, 1, 64 * 64 * CHANNELS), slots(1, 1, 64 * 64 * 4))
     assert stage.sessions == 3
     assert load_bundle(tiny_bundle).manifest.network.channels == CHANNELS
+
+
+def test_openvino_is_loaded_without_its_telemetry() -> None:
+    """Imported by itself it tells its maker's server; this is its own stand-in, which does nothing."""
+    if find_spec("openvino") is None:
+        pytest.skip("OpenVINO is not installed: pip install 'trilane[openvino]'")
+    program = (
+        "import trilane.stages.dsp.openvino, sys\n"
+        "print(sys.modules['openvino_telemetry'], sys.modules['openvino.tools.ovc.telemetry_utils'].tm.__name__)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.split() == ["None", "openvino.tools.ovc.telemetry_stub"]

@@ -34,6 +34,7 @@ ROWS = (
     ("training",),
     ("bench",),
     ("apps",),
+    ("__main__",),
 )
 ROW_OF = {name: row for row, names in enumerate(ROWS, start=1) for name in names}
 SHADERS = "shaders"  # no Python but its empty __init__

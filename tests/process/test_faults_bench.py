@@ -39,7 +39,14 @@ def test_pace_is_back_with_the_first_of_frames_that_keep_it() -> None:
 
 @pytest.mark.parametrize(
     "asked",
-    [{"unit": ("npu",)}, {"fault": ("x",)}, {"times": 0}, {"seconds": 0.0}, {"fps": float("nan")}, {"stop_s": 99.0}],
+    [
+        {"unit": ("npu",)},
+        {"fault": ("x",)},
+        {"times": 0},
+        {"seconds": 0.0},
+        {"fps": float("nan")},
+        {"stop_s": 99.0, "fault": ("stop",)},
+    ],
 )
 def test_faults_that_cannot_be_are_refused(asked: dict[str, object]) -> None:
     with pytest.raises(BadInputError, match="expected"):

@@ -62,8 +62,8 @@ def module(tmp_path: Path) -> Path:
     return path
 
 
-def run(arguments: list[str], folder: Path) -> str:
-    done = subprocess.run(
+def started(arguments: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
         [sys.executable, *arguments],
         cwd=folder,
         env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},
@@ -72,6 +72,10 @@ def run(arguments: list[str], folder: Path) -> str:
         timeout=60,
         check=False,
     )
+
+
+def run(arguments: list[str], folder: Path) -> str:
+    done = started(arguments, folder)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -98,3 +102,19 @@ def test_a_killed_unit_comes_back_and_no_part_of_the_avatar_is_loaded(module: Pa
         loaded = {part for part in AVATAR_PARTS for name in modules if name == part or name.startswith(part + ".")}
         assert loaded == set()
     assert "trilane.pipeline.unit_loop" in seen["unit"]
+
+
+def test_without_the_guard_no_unit_starts_units(module: Path) -> None:
+    module.write_text(module.read_text().replace('if __name__ == "__main__":', "if True:"), encoding="utf-8")
+    done = started([str(module)], module.parent)
+    assert done.returncode == 1
+    assert "run_pipeline was called while a unit imported its stages" in done.stderr
+    assert 'expected a call under `if __name__ == "__main__":`' in done.stderr
+
+
+def test_a_stage_that_fails_ends_the_file_with_its_error(module: Path) -> None:
+    broken = module.read_text().replace("packet = self.inputs[slot_in]", "raise ValueError(f'frame {frame} is dark')")
+    module.write_text(broken, encoding="utf-8")
+    done = started([str(module)], module.parent)
+    assert done.returncode == 1
+    assert "frame 0 is dark" in done.stderr

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -21,9 +22,10 @@ from trilane.bench.faults import unit_process
 from trilane.errors import BadInputError, TrilaneError
 from trilane.hw_profiles.governor import Governor
 from trilane.hw_profiles.load import load_runnable
-from trilane.pipeline.description import Pipeline
+from trilane.pipeline.description import Pipeline, UnitSettings
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run import run_pipeline
+from trilane.pipeline.unit_starter import CLOSE_S, UnitStarter
 from trilane.scheduler.events import Pong
 from trilane.scheduler.recording import replay
 from trilane.stages.avatar_pipeline import avatar_pipeline
@@ -124,6 +126,72 @@ def test_a_killed_unit_is_restarted_and_the_run_goes_on(unit: str, slowest: str)
     assert result.pids[unit] != victims[0]
     assert any(unit in message for message in result.messages)
     check_accounts(result)
+
+
+def fork_server() -> psutil.Process:
+    return next(
+        process for process in psutil.Process().children() if "trilane.pipeline.fork_server" in process.cmdline()
+    )
+
+
+def test_a_killed_fork_server_ends_the_run_with_what_was_done() -> None:
+    """Every unit ends with it, and none can be started again."""
+    kill = When(10, lambda: fork_server().kill())
+    result = run_pipeline(doubles(infer=10), 60, isolated_frames=0, on_progress=kill)
+    assert result.failure is not None
+    assert "the fork server, which every unit comes from, was killed by signal 9" in result.failure.message
+    assert 10 <= result.presented < 60
+    assert not result.interrupted
+    assert not list(replay(result.recording))
+
+
+def test_a_call_says_that_the_fork_server_was_killed() -> None:
+    with UnitStarter() as starter:
+        call = starter.call("os:getcwd")
+        fork_server().kill()
+        with pytest.raises(TrilaneError, match="was killed by signal 9"):
+            call.result()
+
+
+def test_a_call_that_fails_in_itself_has_no_result() -> None:
+    with UnitStarter(["no.such.module"]) as starter:
+        assert starter.call("os:getcwd").result() == str(Path.cwd())
+        assert starter.call("os:abort").result() is None
+
+
+def test_closing_does_not_wait_for_a_call() -> None:
+    begin_s = time.monotonic()
+    with UnitStarter() as starter:
+        starter.call("signal:pause").close()
+    assert time.monotonic() - begin_s < CLOSE_S
+
+
+def test_a_caller_with_more_than_1024_open_files_can_run_a_pipeline() -> None:
+    """select(2) takes no descriptor above 1023."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(4096, hard), hard))
+    held = [os.open(os.devnull, os.O_RDONLY) for _ in range(1100)]
+    try:
+        assert run_pipeline(doubles(), 5, isolated_frames=0).presented == 5
+    finally:
+        for fd in held:
+            os.close(fd)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"frames": 0}, {"fps": 0.0}, {"fps": float("nan")}, {"hang_ns": 0}, {"pace_fps": -1.0}]
+)
+def test_settings_that_cannot_be_are_refused_before_a_unit_starts(wrong: dict[str, Any]) -> None:
+    with pytest.raises(BadInputError, match=next(iter(wrong))):
+        run_pipeline(doubles(), **{"frames": 5, **wrong})
+
+
+def test_cores_that_this_machine_lacks_are_refused() -> None:
+    pipeline = doubles()
+    units = {**pipeline.units, "gpu": UnitSettings(cores=(0, 4095), threads=1)}
+    with pytest.raises(BadInputError, match=r"cores of unit gpu: found 4095, expected"):
+        run_pipeline(pipeline.model_copy(update={"units": units}), 5)
 
 
 def test_a_stopped_unit_is_found_by_its_deadline() -> None:

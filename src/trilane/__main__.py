@@ -1,0 +1,5 @@
+"""`python -m trilane` is the command `trilane`."""
+
+from trilane.apps.cli.main import entry
+
+entry()

@@ -1,0 +1,71 @@
+"""Arrays that every unit may read: the same values everywhere, and nobody can change them."""
+
+from __future__ import annotations
+
+import mmap
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+from numpy.typing import NDArray
+
+from trilane.errors import TrilaneError
+from trilane.pipeline.shared_assets import map_assets, share_assets
+
+ASSETS: dict[str, NDArray[Any]] = {
+    "weights": np.arange(5000, dtype=np.float32).reshape(50, 100),
+    "one": np.array(3, dtype=np.int64),
+    "none": np.zeros((0, 4), dtype=np.uint8),
+    "turned": np.arange(12).reshape(3, 4).T,
+    "names": np.array(["left", "right arm"]),
+    "big end first": np.arange(3, dtype=">f8"),
+}
+
+
+def shared(assets: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    fd = share_assets(assets)
+    try:
+        return map_assets(fd)
+    finally:
+        os.close(fd)
+
+
+def test_every_array_arrives_as_it_was() -> None:
+    arrived = shared(ASSETS)
+    assert list(arrived) == list(ASSETS)
+    for name, array in ASSETS.items():
+        assert (arrived[name].dtype, arrived[name].shape) == (array.dtype, array.shape)
+        assert np.array_equal(arrived[name], array)
+
+
+def test_nobody_can_write_to_them() -> None:
+    with pytest.raises(ValueError, match="read-only"):
+        shared(ASSETS)["weights"][0, 0] = 1
+    fd = share_assets(ASSETS)
+    try:
+        for change in (
+            lambda: mmap.mmap(fd, 4096, prot=mmap.PROT_READ | mmap.PROT_WRITE),
+            lambda: os.pwrite(fd, b"x", 0),
+            lambda: os.ftruncate(fd, 0),
+        ):
+            with pytest.raises(PermissionError):
+                change()
+    finally:
+        os.close(fd)
+
+
+def test_more_than_the_machine_has_is_refused_before_it_is_taken() -> None:
+    huge = np.broadcast_to(np.zeros(1, np.uint8), (1 << 50,))
+    with pytest.raises(TrilaneError, match=r"found 1073741824 MiB, expected at most"):
+        share_assets({"huge": huge})
+
+
+@pytest.mark.parametrize("array", [np.array([{}]), np.zeros(2, [("a", "u1")]), np.zeros(2, "V3")])
+def test_arrays_whose_bytes_do_not_say_what_they_are_are_refused(array: NDArray[Any]) -> None:
+    before = psutil.Process().num_fds()
+    with pytest.raises(TrilaneError, match="expected numbers, times or text"):
+        share_assets({"odd": array})
+    assert psutil.Process().num_fds() == before
