@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import math
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Protocol
 
 from trilane.errors import BadInputError
-from trilane.pipeline import fork_server
 from trilane.pipeline.description import Pipeline
 from trilane.pipeline.isolated import IsolatedTimes
 from trilane.pipeline.lifecycle import close_units, start_units
+from trilane.pipeline.preconditions import check_cores, check_open_files, check_positive, refuse_in_a_unit
 from trilane.pipeline.realtime_clock import Governor, RealtimeClock
 from trilane.pipeline.regions import edge_regions
 from trilane.pipeline.requests import FrameRequestQueue
@@ -23,7 +22,7 @@ from trilane.pipeline.run_log import RunLog, UnitError
 from trilane.pipeline.run_metrics import RunMetrics, metrics_of
 from trilane.pipeline.shared_assets import Assets, share_assets
 from trilane.pipeline.signals import Interrupts
-from trilane.pipeline.unit_processes import UnitProcesses, check_open_files
+from trilane.pipeline.unit_processes import UnitProcesses
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.causes import Outcome, OutcomeKind
 from trilane.scheduler.core import Core
@@ -96,9 +95,9 @@ def run_pipeline(
     Raises BadInputError for an unknown policy and in a unit's own process, TrilaneError (with the exit code of the
     unit's error) when a unit cannot start; a failure after that is `RunResult.failure`.
     """
-    _refuse_in_a_unit()
+    refuse_in_a_unit()
     check_open_files()
-    _check_cores(pipeline)
+    check_cores(pipeline)
     isolated = _isolated_share(frames) if isolated_frames is None else isolated_frames
     settings = _settings(policy, frames, fps, pace_fps, hang_ns, latch_ms, requests)
     log = RunLog(on_message)
@@ -204,23 +203,6 @@ class _Run:
         }
 
 
-def _refuse_in_a_unit() -> None:
-    """Raises BadInputError where a unit imports the module of its stages, and that would start units without end."""
-    spec = sys.modules["__main__"].__spec__
-    if spec is not None and spec.name == fork_server.__name__:
-        found = "run_pipeline was called while a unit imported its stages"
-        raise BadInputError("run_pipeline", found, 'a call under `if __name__ == "__main__":`')
-
-
-def _check_cores(pipeline: Pipeline) -> None:
-    """Raises BadInputError for cores that the units could not get."""
-    here = os.sched_getaffinity(0)
-    for unit, settings in pipeline.units.items():
-        if absent := set(settings.cores) - here:
-            found, expected = ", ".join(map(str, sorted(absent))), ", ".join(map(str, sorted(here)))
-            raise BadInputError(f"cores of unit {unit}", found, f"some of this process's: {expected}")
-
-
 def _settings(
     policy: str,
     frames: int,
@@ -230,10 +212,7 @@ def _settings(
     latch_ms: float,
     requests: FrameRequestQueue | None,
 ) -> Settings:
-    positive = {"frames": frames, "fps": fps, "pace_fps": pace_fps, "hang_ns": hang_ns}
-    for name, value in positive.items():
-        if value is not None and not 0 < value < math.inf:
-            raise BadInputError(name, str(value), "more than 0")
+    check_positive(frames=frames, fps=fps, pace_fps=pace_fps, hang_ns=hang_ns)
     try:
         paced = policy_named(policy).paced
     except UnexpectedValue as error:

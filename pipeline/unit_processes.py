@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import resource
 import select
 import signal
 import time
@@ -31,8 +30,6 @@ from trilane.transport.socket_folder import SocketFolder
 
 TAIL_BYTES = 8192
 END_S = 2.0
-#: Files and sockets that a run holds open, with room for a unit that is restarted.
-LEAST_FILES = 96
 
 
 class UnitMessage(NamedTuple):
@@ -243,13 +240,6 @@ class UnitProcesses:
     def _unregister(self, fd: int) -> None:
         if self._reactions.pop(fd, None) is not None:
             self._poller.unregister(fd)
-
-
-def check_open_files() -> None:
-    """Raises TrilaneError when this process may open too few files for a run."""
-    limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
-    if limit != resource.RLIM_INFINITY and limit < LEAST_FILES:
-        raise TrilaneError(f"open files: found a limit of {limit}, expected at least {LEAST_FILES}: ulimit -n 1024")
 
 
 def _swallow(fd: int) -> list[UnitMessage]:

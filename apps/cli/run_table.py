@@ -119,7 +119,7 @@ def _of_several(run: Report | Baseline, value: float) -> float | None:
 
 def _rate_rows(runs: Sequence[Report | Baseline]) -> Rows:
     yield "rate", "frames per second", [_number(_of_several(run, run.fps)) for run in runs]
-    yield "efficiency", "slowest unit alone / frame time", [_number(run.efficiency, 2) for run in runs]
+    yield "efficiency", "slowest unit isolated / frame time", [_number(run.efficiency, 2) for run in runs]
     yield "frames", "lost + dropped", [f"{run.frames.lost} + {sum(run.frames.dropped.values())}" for run in runs]
 
 
