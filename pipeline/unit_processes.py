@@ -60,7 +60,7 @@ class _Process:
             signal.pidfd_send_signal(self.pidfd, signal.SIGKILL)
 
     def wait(self) -> None:
-        """Until the process has ended; what it started itself, and what stands in its process group, ends here."""
+        """Until the process has ended; those that it started, which are in its process group, are ended here."""
         poller = select.poll()  # select(2) takes no descriptor above 1023
         poller.register(self.pidfd, select.POLLIN)
         poller.poll()

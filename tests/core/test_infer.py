@@ -13,6 +13,7 @@ import pytest
 
 from trilane.avatars.bundle import load_bundle
 from trilane.errors import BadInputError
+from trilane.install import install_line
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.stage import UnitContext
 from trilane.scene.schema import Scene
@@ -134,7 +135,7 @@ def test_the_factory_builds_a_part_of_the_network(tiny_bundle):
 def test_openvino_is_loaded_without_its_telemetry() -> None:
     """Imported by itself it tells its maker's server; this is its own stand-in, which does nothing."""
     if find_spec("openvino") is None:
-        pytest.skip("OpenVINO is not installed: pip install 'trilane[openvino]'")
+        pytest.skip(f"OpenVINO is not installed: {install_line('openvino')}")
     program = (
         "import trilane.stages.dsp.openvino, sys\n"
         "print(sys.modules['openvino_telemetry'], sys.modules['openvino.tools.ovc.telemetry_utils'].tm.__name__)"
