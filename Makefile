@@ -2,7 +2,7 @@
 # Arguments of `trilane run` go in ARGS: make run ARGS="--frames 60 --size 192"
 SHELL := /bin/bash
 .DELETE_ON_ERROR:
-.PHONY: run test setup format compile interpreted clean
+.PHONY: run test test-all test-device mutants setup format compile interpreted clean
 
 BIN := .venv/bin
 COMPILED := $(shell sed -n 's/^    "\(.*\.py\)",$$/\1/p' src/trilane/compiled.py)
@@ -15,6 +15,20 @@ test: .venv/ready-test .venv/ready-core
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/pytest $(ARGS)
+
+# All that a machine without a GPU can run: every extra is installed, and a skip that is not on the list fails.
+test-all: .venv/ready-all .venv/ready-core
+	$(BIN)/pytest --slow -p trilane.testing.skips $(ARGS)
+
+# What needs a GPU: hardware OpenGL, training on CUDA, the runtime cuda. Exit code 3 where there is none.
+test-device: .venv/ready-device
+	$(BIN)/pytest tests/device $(ARGS)
+	$(BIN)/pytest tests/golden $(ARGS)
+	$(BIN)/pytest tests/conformance/test_runtimes.py --runtime cuda $(ARGS)
+
+# Small faults put into a copy of the code, to see which the tests notice: tests/README.md.
+mutants: .venv/ready-all
+	$(BIN)/python -m trilane.testing.mutants $(ARGS)
 
 setup: .venv/ready-run
 
@@ -42,6 +56,17 @@ interpreted:
 .venv/ready-test: scripts/setup.sh pyproject.toml setup.py
 	scripts/setup.sh openvino,metrics,dev
 	touch $@ .venv/ready-core .venv/ready-run
+
+.venv/ready-all: scripts/setup.sh scripts/tested-versions.txt pyproject.toml setup.py
+	PIP_CONSTRAINT=scripts/tested-versions.txt scripts/setup.sh all,dev
+	touch $@ .venv/ready-test .venv/ready-core .venv/ready-run
+
+.venv/ready-device: scripts/setup.sh pyproject.toml setup.py
+	nvidia-smi >/dev/null || { echo "make test-device: no GPU of NVIDIA here (nvidia-smi finds none)"; exit 3; }
+	scripts/setup.sh train,dev
+	$(BIN)/python -m pip uninstall --quiet --yes onnxruntime
+	$(BIN)/python -m pip install --quiet onnxruntime-gpu
+	touch $@
 
 .venv/ready-core: $(COMPILED) | .venv/ready-test
 	$(BIN)/python setup.py --quiet build_ext --inplace

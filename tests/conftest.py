@@ -14,6 +14,21 @@ from trilane.avatars.bundle import bundle_folder, write_bundle
 from trilane.avatars.manifest import Manifest, network_entry
 from trilane.training.quantising.quantise import Quantised, quantise
 
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """`make test-all` and `make test-device` use them."""
+    parser.addoption("--slow", action="store_true", help="run the tests that are marked slow as well")
+    parser.addoption("--runtime", action="append", help="a runtime for the conformance suite [those without a GPU]")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if config.getoption("--slow"):
+        return
+    slow = [item for item in items if item.get_closest_marker("slow")]
+    config.hook.pytest_deselected(items=slow)
+    items[:] = [item for item in items if item not in slow]
+
+
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 

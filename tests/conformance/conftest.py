@@ -6,6 +6,16 @@ import pytest
 
 from trilane.stages.dsp.runtime import RUNTIMES
 
+#: Needs an NVIDIA GPU: `make test-device` asks for it by name.
+WITH_GPU = "cuda"
+
+
+def pytest_generate_tests(metafunc):
+    """Every test of the contract runs on each runtime, or on those of `--runtime`."""
+    if "name" in metafunc.fixturenames:
+        asked = metafunc.config.getoption("--runtime") or [name for name in RUNTIMES if name != WITH_GPU]
+        metafunc.parametrize("name", asked, indirect=True)
+
 
 @pytest.fixture
 def skip_without():

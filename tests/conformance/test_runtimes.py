@@ -33,7 +33,7 @@ FRAMES = {"openvino": 1000, "ort": 1000, "qnn": 20, "cuda": 1000}
 SMALLEST_OBJECT, INTERPRETERS_OWN = 16, 4096
 
 
-@pytest.fixture(params=RUNTIMES)
+@pytest.fixture
 def name(request, skip_without):
     skip_without(request.param)
     return request.param

@@ -7,7 +7,6 @@ arguments; its stdout is one JSON document. What the lines of the file mean stan
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
 import subprocess
@@ -29,7 +28,6 @@ from trilane.apps.cli import main as cli
 
 FILE = Path(__file__).with_name("json_keys.toml")
 DATA = tomllib.loads(FILE.read_text(encoding="utf-8"))
-SLOW = "TRILANE_SLOW_KEYS"
 TIMEOUT_S = 110
 
 #: Names from the document's root to a key; those of lists end in `[]` where an entry of theirs is meant.
@@ -182,14 +180,14 @@ def check(document: Any, lines: list[str], what: str, where: str) -> None:
         )
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (case.table == "slow")) for name, case in CASES.items()]
+)
 def test_the_keys_are_those_of_the_file(name: str, place: Place) -> None:
     case = CASES[name]
     for package in case.needs:
         if find_spec(package) is None:
             pytest.skip(f"{case.line}: needs the package {package}, which is absent")
-    if case.table == "slow" and SLOW not in os.environ:
-        pytest.skip(f"{case.line}: takes {case.seconds} s; {SLOW}=1 runs it")
     document = one_document(place.run(case), case.line)
     heading = f'[{case.table}."{name}"]'
     check(document, case.keys, case.line, f"`keys` of {heading}")

@@ -1,0 +1,162 @@
+"""Which test files reach which lines. Rule: measured in every process of a test, and again when the test changes.
+
+Python by coverage.py; shaders and tables, which are no Python, by which test files open them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+from trilane.testing.mutants.fault import Fault
+from trilane.testing.mutants.text_faults import COMMENT
+from trilane.testing.mutants.tree_copy import FreeCopies, TreeCopy
+from trilane.writing import write_bytes
+
+LONGEST_S = 900
+SETTINGS = """
+[run]
+parallel = true
+sigterm = true
+source = src/trilane
+patch =
+    _exit
+    fork
+    subprocess
+"""
+#: In every Python process of a measurement: note the files with these endings that it opens.
+SITE = """
+import os, sys
+def note(event, arguments, endings={endings!r}, where=os.environ["TRILANE_OPENED"]):
+    if event == "open" and isinstance(arguments[0], str) and arguments[0].endswith(endings):
+        descriptor = os.open(where, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
+        os.write(descriptor, (os.path.realpath(arguments[0]) + "\\n").encode())
+        os.close(descriptor)
+sys.addaudithook(note)
+"""
+
+
+class Reached(NamedTuple):
+    """What one test file, of this digest, took in seconds, and the lines that it reached in each file ([] for all)."""
+
+    digest: str
+    seconds: float
+    lines: dict[str, list[int]]
+
+
+class Reach:
+    """By test file; `sources`: the digests of the files with the lines, to see which have changed since."""
+
+    def __init__(self, tests: Mapping[str, Reached], sources: Mapping[str, str]) -> None:
+        self.tests = dict(tests)
+        self.sources = dict(sources)
+
+    def tests_of(self, fault: Fault, digest: str) -> list[str]:
+        """The test files that reach the fault's line, quickest first; those that reach its file, when none does."""
+        span = range(fault.line, fault.line + max(1, fault.old.count("\n")))
+        by_file = [name for name, reached in self.tests.items() if fault.path in reached.lines]
+        by_line = [name for name in by_file if self._is_there(self.tests[name].lines[fault.path], span)]
+        unchanged = self.sources.get(fault.path) == digest
+        return sorted(by_line if by_line and unchanged else by_file, key=lambda name: self.tests[name].seconds)
+
+    @staticmethod
+    def _is_there(lines: list[int], span: range) -> bool:
+        return not lines or any(line in span for line in lines)
+
+
+def digest_of(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()[:16]
+
+
+def load_reach(file: Path) -> Reach:
+    """What was measured before; nothing when there is no file."""
+    if not file.is_file():
+        return Reach({}, {})
+    kept = json.loads(file.read_text(encoding="utf-8"))
+    return Reach({name: Reached(*row) for name, row in kept["tests"].items()}, kept["sources"])
+
+
+def measure_reach(
+    trees: Sequence[TreeCopy], test_files: Iterable[str], sources: Iterable[str], file: Path, say: Callable[[str], None]
+) -> Reach:
+    """Measure the test files that are new or changed, as many at a time as there are copies; keep all in `file`."""
+    root = trees[0].root
+    old = load_reach(file)
+    wanted = {name: digest_of(root / name) for name in test_files}
+    reach = Reach({name: row for name, row in old.tests.items() if wanted.get(name) == row.digest}, old.sources)
+    missing = [name for name in wanted if name not in reach.tests]
+    if len(missing) == len(wanted):
+        reach.sources = {path: digest_of(root / path) for path in sources}
+
+    def measure(number: int) -> Reached:
+        with free.taken() as tree:
+            say(f"what {missing[number]} reaches ({number + 1} of {len(missing)})")
+            return _measured(tree, missing[number], wanted[missing[number]])
+
+    free = FreeCopies(trees)
+    with ThreadPoolExecutor(len(trees)) as pool:
+        for name, reached in zip(missing, pool.map(measure, range(len(missing))), strict=True):
+            reach.tests[name] = reached
+            write_bytes(file, json.dumps({"tests": reach.tests, "sources": reach.sources}).encode())
+    return reach
+
+
+def _measured(tree: TreeCopy, test_file: str, digest: str) -> Reached:
+    tree.clean()
+    (tree.temporary / "sitecustomize.py").write_text(SITE.format(endings=tuple(COMMENT)), encoding="utf-8")
+    settings, opened = tree.temporary / "coveragerc", tree.temporary / "opened"
+    settings.write_text(SETTINGS, encoding="utf-8")
+    environment = {
+        **tree.environment(),
+        "COVERAGE_FILE": str(tree.temporary / "coverage"),
+        "TRILANE_OPENED": str(opened),
+    }
+    environment["PYTHONPATH"] += f":{tree.temporary}"
+    words = [sys.executable, "-m", "coverage", "run", f"--rcfile={settings}", "-m", "pytest", "-q", "-p"]
+    begin = time.monotonic()
+    done = subprocess.run(
+        [*words, "no:cacheprovider", test_file],
+        cwd=tree.root,
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=LONGEST_S,
+    )
+    if done.returncode not in (0, 5):
+        raise RuntimeError(f"{test_file} fails without a fault:\n{done.stdout[-4000:]}{done.stderr[-2000:]}")
+    seconds = time.monotonic() - begin
+    found = _lines(tree, opened)
+    return Reached(digest, round(seconds, 2), {path: sorted(lines) for path, lines in sorted(found.items())})
+
+
+def _lines(tree: TreeCopy, opened: Path) -> dict[str, set[int]]:
+    """The lines by file that the processes have noted; none for a file that was only opened."""
+    from coverage import CoverageData
+
+    lines: dict[str, set[int]] = {}
+    for part in tree.temporary.glob("coverage.*"):
+        data = CoverageData(str(part))
+        data.read()
+        for measured in data.measured_files():
+            path = _inside(tree, measured)
+            if path:
+                lines.setdefault(path, set()).update(data.lines(measured) or ())
+    for name in opened.read_text(encoding="utf-8").splitlines() if opened.is_file() else ():
+        path = _inside(tree, name)
+        if path:
+            lines.setdefault(path, set())
+    return lines
+
+
+def _inside(tree: TreeCopy, name: str) -> str:
+    """The path in the tree, links followed; empty for a file outside."""
+    real, root = Path(name).resolve(), tree.root.resolve()
+    return real.relative_to(root).as_posix() if real.is_relative_to(root) else ""

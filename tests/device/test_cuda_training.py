@@ -1,0 +1,41 @@
+"""Training on a GPU: a step changes the avatar as the same step on the CPU does, to float32's rounding."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from trilane.training.network import UNet  # noqa: E402
+from trilane.training.neural_texture import NeuralTexture  # noqa: E402
+from trilane.training.trainable_avatar import TrainableAvatar  # noqa: E402
+from trilane.training.training_loop import train_step  # noqa: E402
+
+#: Gradients are sums of up to N*H*W = 8192 products; the rounding of such a sum differs by about sqrt(8192) * 2**-24 of
+#: it, and one step of plain descent at this rate moves a weight by its gradient times 0.01.
+TOLERANCE = 1e-4
+
+
+def test_one_step_is_the_cpus(cuda: Any) -> None:
+    torch.manual_seed(0)
+    torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = False
+    random = np.random.default_rng(0)
+    start = random.uniform(-0.5, 0.5, (64, 64, 4)).astype(np.float32)
+    avatar = TrainableAvatar(NeuralTexture(start, sides=(64, 32)), UNet(width=8, channels=4))
+    batch = (
+        torch.from_numpy(random.uniform(0, 1, (2, 64, 64, 2)).astype(np.float32)),
+        torch.from_numpy(random.uniform(0, 1, (2, 64, 64)) > 0.5),
+        torch.from_numpy(random.uniform(0, 1, (2, 4, 64, 64)).astype(np.float32)),
+    )
+    on_gpu = copy.deepcopy(avatar).to(cuda)
+    losses = [
+        train_step(each, torch.optim.SGD(each.parameters(), 0.01), *(part.to(device) for part in batch))
+        for each, device in ((avatar, torch.device("cpu")), (on_gpu, cuda))
+    ]
+    assert losses[1] == pytest.approx(losses[0], rel=TOLERANCE)
+    for name, value in avatar.state_dict().items():
+        np.testing.assert_allclose(on_gpu.state_dict()[name].cpu(), value, atol=TOLERANCE, err_msg=name)
