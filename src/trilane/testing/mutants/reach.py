@@ -122,7 +122,7 @@ def _measured(tree: TreeCopy, test_file: str, digest: str) -> Reached:
     words = [sys.executable, "-m", "coverage", "run", f"--rcfile={settings}", "-m", "pytest", "-q", "-p"]
     begin = time.monotonic()
     done = subprocess.run(
-        [*words, "no:cacheprovider", test_file],
+        [*words, "no:cacheprovider", "--timeout=0", test_file],
         cwd=tree.root,
         env=environment,
         stdin=subprocess.DEVNULL,
