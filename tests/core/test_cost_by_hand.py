@@ -1,4 +1,4 @@
-"""The cost model on networks small enough for paper: counts by loops over every product, times by the formula's terms."""
+"""The cost model on networks small enough for paper: counts by loops, times by the terms of the formula."""
 
 from __future__ import annotations
 

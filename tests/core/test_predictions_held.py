@@ -1,7 +1,7 @@
 """What is predicted for every chip stays what it was, number for number: predictions.json.
 
-Rule: these are no truths but what the model says today; how far it is from published times is tested elsewhere. A change
-of the model or of a profile is meant when the file is written anew (`TRILANE_WRITE_PREDICTIONS=1`) and its difference read.
+Rule: these are no truths but what the model says today; how far it is from published times is tested elsewhere. Who
+changes the model or a profile on purpose writes the file anew (`TRILANE_WRITE_PREDICTIONS=1`) and reads the difference.
 """
 
 from __future__ import annotations
