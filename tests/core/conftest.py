@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -43,3 +47,31 @@ def body_arrays() -> dict[str, NDArray[Any]]:
     }
     arrays: dict[str, NDArray[Any]] = {key: value.astype(np.float32) for key, value in floats.items()}
     return arrays | {key: value.astype(np.uint32) for key, value in integers.items()}
+
+
+HELD = Path(__file__).with_name("held.json")
+#: Relative to the sum of the magnitudes: the same sums in another order, or by another library, differ by less.
+CLOSE = 1e-6
+
+
+@pytest.fixture
+def held(request: pytest.FixtureRequest) -> Callable[[str, Any], None]:
+    """Compare numbers with those that held.json has for this test: none changes unless somebody means it.
+
+    Of an array its size and three sums are kept: of the values, of their magnitudes, and weighted by place, so that an
+    exchange is seen. TRILANE_WRITE_HELD=1 writes the file anew; read the difference before committing it.
+    """
+    writes = "TRILANE_WRITE_HELD" in os.environ
+    test = request.node.name
+
+    def check(what: str, values: Any) -> None:
+        array = np.asarray(values, np.float64).ravel()
+        place = np.cos(0.7 * np.arange(len(array)) + 0.3)
+        found = [float(len(array)), float(array.sum()), float(np.abs(array).sum()), float(array @ place)]
+        everything = json.loads(HELD.read_text(encoding="utf-8")) if HELD.is_file() else {}
+        if writes:
+            everything.setdefault(test, {})[what] = [float(f"{value:.10g}") for value in found]
+            HELD.write_text(json.dumps(everything, indent=0, sort_keys=True) + "\n", encoding="utf-8")
+        assert found == pytest.approx(everything[test][what], abs=CLOSE * max(found[2], 1e-9), rel=0), what
+
+    return check

@@ -1,0 +1,284 @@
+"""What the benches measure with: clocks that are told the time, random views that are held, sums by hand."""
+
+from __future__ import annotations
+
+import re
+import signal
+from collections.abc import Callable, Iterator
+from itertools import count
+from typing import Any
+
+import numpy as np
+import pytest
+
+from trilane.bench import crop, faults, joints
+from trilane.bench.lib import fixture, load, timing, views
+from trilane.bench.lib.float_raster import quantise, rasterise, sample
+from trilane.bench.lib.limits import LIMITS, check_limits
+from trilane.bench.lib.load import Load, Queries
+from trilane.errors import BadInputError, TrilaneError
+from trilane.pipeline.requests import FrameRequestQueue
+from trilane.units import UNITS
+
+Held = Callable[[str, Any], None]
+
+
+class Clock:
+    """Stands for a module's `time`: a second of it passes for every look and for what is slept."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def monotonic(self) -> float:
+        self.now += 1.0
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+
+    def perf_counter_ns(self) -> int:
+        return round(self.now * 1e9)
+
+
+def test_variants_take_turns_and_the_warm_up_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`a` takes 2 s, `b` 3 s, and each its round's number of milliseconds more."""
+    clock, rounds, order = Clock(), {"a": count(), "b": count()}, []
+    monkeypatch.setattr(timing, "time", clock)
+
+    def run(name: str, seconds: float) -> None:
+        order.append(name)
+        clock.now += seconds + next(rounds[name]) / 1000
+
+    times = timing.interleaved_ms({"a": lambda: run("a", 2.0), "b": lambda: run("b", 3.0)}, 3)
+    assert "".join(order) == "ab" * (5 + 3)
+    assert times["a"] == pytest.approx([2005, 2006, 2007])
+    assert times["b"] == pytest.approx([3005, 3006, 3007])
+
+
+def test_a_summary_is_median_minimum_and_ninetieth_percentile() -> None:
+    assert timing.summary_ms([float(n) for n in range(11)]) == {"median_ms": 5.0, "min_ms": 0.0, "p90_ms": 9.0}
+    assert timing.summary_ms([5.0, 1.0, 2.0, 4.0])["median_ms"] == 3.0
+
+
+def test_random_views_are_held(held: Held) -> None:
+    random = np.random.default_rng(4)
+    held("poses", [views.everyday_pose(random) for _ in range(40)])
+    held("cameras", [views.random_camera(random, (480, 640)) for _ in range(40)])
+
+
+def test_the_standing_body_is_held(held: Held) -> None:
+    found = fixture.standing(channels=3)
+    for name in ("joints", "view", "projection", "texture"):
+        held(name, getattr(found, name))
+    held("weights", found.arrays.weight)
+    clip = found.projection @ found.view
+    world = np.array([0.0, fixture.HEIGHT_M + fixture.FRAME_M / 2, 0.0, 1.0])
+    place = clip @ world
+    assert place[1] / place[3] == pytest.approx(1.0), "the picture is as high as its frame"
+
+
+def test_what_crops_waste_is_held(held: Held) -> None:
+    report = crop.measure(views=25)
+    for row in report["rows"]:
+        held(row["way"].split(" by ")[0], [row[key] for key in ("wasted_median", "wasted_p90", "cuts_mesh")])
+    assert 0 < report["rect_us"]["best"] <= report["rect_us"]["median"]
+    assert report["config"]["output"] == [480, 640]
+
+
+def test_the_squares_of_a_view_by_hand() -> None:
+    """Joints 10..30 x 20..60, mesh 4..32 x 18..70: the square has side 40 round (20, 40) and would need 60."""
+    view = crop._View(np.array([4.0, 18, 32, 70]), np.array([10.0, 20, 30, 60]), 8000.0, 1.0)
+    assert crop._needed(view) == 2 * (70 - 40)
+    assert crop._area(view.mesh) == 28 * 52
+    row = crop._row("x", np.array([0.0, 0.5, 0.75]), np.array([True, False, False]))
+    assert row == {
+        "way": "x",
+        "wasted_median": 0.5,
+        "wasted_p90": pytest.approx(0.7),
+        "cuts_mesh": pytest.approx(1 / 3),
+    }
+
+
+def test_joints_are_timed_a_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clock stands at 0, 1, 3, 6, 10, 15 s: loops of 20 frames take 1, 3 and 5 s."""
+    ticks = iter([0.0, 1.0, 3.0, 6.0, 10.0, 15.0])
+    monkeypatch.setattr(joints.time, "perf_counter", lambda: next(ticks))
+    found = joints.measure(repeats=3)
+    monkeypatch.undo()
+    assert (found["best_us"], found["median_us"]) == pytest.approx((1e6 / 20, 3e6 / 20))
+    assert found["p90_us"] == pytest.approx((3 + 0.8 * 2) * 1e6 / 20)
+
+
+@pytest.mark.parametrize("option", sorted(set(LIMITS) - {"threads"}))
+def test_both_ends_of_a_range_are_taken_and_no_more(option: str) -> None:
+    low, high = LIMITS[option]
+    step = 1 if isinstance(low, int) else 1e-4
+    check_limits({option: low})
+    check_limits({option: (low, high)})
+    for bad in (low - step, high + 1):
+        with pytest.raises(BadInputError, match=re.escape(f"expected {low:g} to {high:g}")):
+            check_limits({option: [low, bad]})
+
+
+class Pipeline:
+    """Stands for a run: every frame that is asked for is answered `delay` seconds of the clock later."""
+
+    def __init__(self, clock: Clock, queries: Queries, delay: float = 0.25) -> None:
+        self._clock, self._queries, self._delay = clock, queries, delay
+        self.asked: list[int] = []
+
+    def request(self, frames: int) -> None:
+        self.asked.append(frames)
+        for frame in range(frames):
+            self._clock.now += self._delay
+            self._queries.answered(frame)
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    told = Clock()
+    monkeypatch.setattr(load, "time", told)
+    return told
+
+
+def played(clock: Clock, asked: Load) -> tuple[list[int], Queries]:
+    queries = Queries(size=asked.samples if asked.scenario == "multi-stream" else 1)
+    pipeline = Pipeline(clock, queries)
+    load.play(asked, pipeline, queries)  # type: ignore[arg-type]
+    return pipeline.asked, queries
+
+
+def test_one_query_at_a_time_until_there_are_enough_and_the_time_has_passed(clock: Clock) -> None:
+    """Eight to warm up together, then 64 of a frame each; each takes the delay and the clock's next look."""
+    asked, queries = played(clock, Load("single-stream", seconds=1.0))
+    assert asked == [8] + [1] * 64
+    assert queries.latencies_ms == pytest.approx([1250.0] * 64)
+    asked, _ = played(clock, Load("single-stream", seconds=1000.0))
+    assert len(asked) - 1 == pytest.approx(1000 / 3.25, abs=2), "looks at the clock: loop, ask, answer"
+
+
+def test_a_query_of_several_frames_is_answered_with_the_last(clock: Clock) -> None:
+    asked, queries = played(clock, Load("multi-stream", seconds=1.0, samples=3))
+    assert asked == [24] + [3] * 662
+    assert queries.latencies_ms == pytest.approx([3 * 250.0 + 1000.0] * 662)
+
+
+def test_all_at_once_asks_a_tenth_more_than_the_time_takes(clock: Clock) -> None:
+    """64 queries first, answered after 80 s (a look and a quarter each), then 1.1 * 0.8 a second * 201 s."""
+    asked, queries = played(clock, Load("offline", seconds=201.0))
+    assert asked == [8, 64, 177]
+    assert len(queries.asked_s) == 177
+
+
+def test_a_server_is_asked_at_the_moments_of_its_seed(clock: Clock, held: Held) -> None:
+    moments: list[float] = []
+    queries = Queries()
+    pipeline = Pipeline(clock, queries, delay=0.0)
+    monotonic = clock.now
+
+    class Told(Pipeline):
+        def request(self, frames: int) -> None:
+            moments.append(clock.now - monotonic)
+            super().request(frames)
+
+    del pipeline
+    load._poisson(Load("server", 1.0, rate=0.05, seed=3), Told(clock, queries, 0.0), queries)  # type: ignore[arg-type]
+    assert len(moments) == 662
+    held("moments", moments)
+
+
+def test_the_end_of_a_run_ends_the_wait(clock: Clock) -> None:
+    del clock
+    queries = Queries()
+    queries.asked_s = [1.0, 2.0]
+    queries.answered_s = [1.5]
+    queries.ended()
+    with pytest.raises(TrilaneError, match="ended before every query"):
+        queries.wait()
+    queries.answered(0)
+    queries.wait()
+    assert len(queries.answered_s) == 2
+
+
+def test_requests_reach_the_queue_by_frames() -> None:
+    asked: list[int] = []
+
+    class Requests(FrameRequestQueue):
+        def request(self, count: int = 1) -> None:
+            asked.append(count)
+
+    Queries(size=3).ask(Requests(lambda _: None, lambda: None), 5)
+    assert asked == [15]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_kills_are_spread_and_stops_come_early(seed: int) -> None:
+    """Of 4 kills in 50 s the k-th comes around 10 k s, within half of what `SPACE` leaves free of the 10 s."""
+    kills = faults._moments("kill", 4, 50.0, 5.0, seed)
+    assert [number for _, number in kills] == [signal.SIGKILL] * 4
+    free_s = (1 - faults.SPACE) * 10.0
+    off = [at - 10.0 * (k + 1) for k, (at, _) in enumerate(kills)]
+    assert max(map(abs, off)) <= free_s / 2 and len(set(off)) == 4
+    (stop_s, stop), (go_s, go) = faults._moments("stop", 4, 50.0, 5.0, seed)
+    assert (stop, go) == (signal.SIGSTOP, signal.SIGCONT)
+    assert 5.0 <= stop_s <= 15.0 and go_s == stop_s + 5.0
+    assert faults._moments("kill", 4, 50.0, 5.0, seed) == kills != faults._moments("kill", 4, 50.0, 5.0, seed + 1)
+
+
+CHECKED: tuple[Any, ...] = (UNITS, faults.FAULTS, 3, 60.0, 15.0, 5.0, 10.0)
+
+
+@pytest.mark.parametrize(
+    ("place", "bad", "good"),
+    [
+        (2, 0, 1),
+        (2, 1001, 1000),
+        (3, 0.99, 8.0),
+        (3, 3600.1, 3600.0),
+        (4, 0.99, 1.0),
+        (4, 1000.1, 1000.0),
+        (5, 0.0, 0.01),
+        (5, 42.0, 41.9),
+        (6, 0.09, 0.1),
+        (6, 600.1, 600.0),
+    ],
+)
+def test_the_ends_of_what_faults_can_be(place: int, bad: float, good: float) -> None:
+    faults._check(*CHECKED[:place], good, *CHECKED[place + 1 :])
+    with pytest.raises(BadInputError):
+        faults._check(*CHECKED[:place], bad, *CHECKED[place + 1 :])
+
+
+def corners() -> Iterator[np.ndarray]:
+    yield np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, 1.0, 0.0]])
+    yield np.array([[-1.0, -1.0, 0.5], [-1.0, 1.0, 0.5], [1.0, -1.0, 0.5]])
+
+
+@pytest.mark.parametrize("cull", [False, True])
+def test_the_reference_raster_of_a_half_picture(cull: bool) -> None:
+    """A triangle over the lower left half of 4 x 4 pixels: centres on the diagonal belong to neither a left nor a top
+    edge of it. The second triangle winds the other way and is behind; culled or not, it is not seen."""
+    world = np.vstack(list(corners()))
+    uv = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]] * 2)
+    image = rasterise(world, np.array([[0, 1, 2], [3, 4, 5]]), uv, np.eye(4), (4, 4), cull)
+    rows, columns = np.indices((4, 4))
+    assert np.array_equal(image.coverage, columns < rows)
+    assert set(image.triangle[image.coverage]) == {0}
+    expected = np.stack([(columns + 0.5) / 4, 1 - (rows + 0.5) / 4], axis=2)
+    np.testing.assert_allclose(image.uv[image.coverage], expected[image.coverage], atol=1e-12)
+    assert not image.depth[image.coverage].any()
+    turned = rasterise(world[3:], np.array([[0, 1, 2]]), uv[:3], np.eye(4), (4, 4), cull)
+    assert turned.coverage.sum() == (0 if cull else 6)
+    if not cull:
+        np.testing.assert_allclose(turned.depth[turned.coverage], 0.5)
+
+
+def test_bytes_of_the_reference_round_halves_to_even_and_clamp() -> None:
+    real = np.array([-99.0, -0.3, 0.25, 0.75, 1.25, 999.0])
+    assert quantise(real, 0.5, 3).tolist() == [0, 2, 3, 5, 5, 255]
+
+
+def test_the_reference_samples_between_texels_and_clamps_at_the_edge() -> None:
+    texture = np.array([[[0.0], [1.0]], [[2.0], [3.0]]])
+    uv = np.array([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.5, 0.5], [-1.0, 2.0], [0.625, 0.25]])
+    assert sample(texture, uv)[:, 0].tolist() == [0.0, 1.0, 2.0, 1.5, 2.0, 0.75]
