@@ -41,7 +41,7 @@ left_index1 left_index2 left_index3 left_middle1 left_middle2 left_middle3 left_
 left_ring1 left_ring2 left_ring3 left_thumb1 left_thumb2 left_thumb3
 right_index1 right_index2 right_index3 right_middle1 right_middle2 right_middle3 right_pinky1 right_pinky2 right_pinky3
 right_ring1 right_ring2 right_ring3 right_thumb1 right_thumb2 right_thumb3
-""".split()
+"""
 #: The limbs of the skeleton from the root outwards; each name's parent is the one before it.
 CHAINS = """
 pelvis left_hip left_knee left_ankle left_foot
@@ -65,7 +65,7 @@ def shaped(tmp_path: Path, body_arrays: Arrays) -> ShapedBody:
 
 
 def test_joint_names_are_the_published_ones_in_their_order() -> None:
-    assert list(JOINT_NAMES) == [name.removesuffix("_smplhf") for name in PUBLISHED]
+    assert list(JOINT_NAMES) == [name.removesuffix("_smplhf") for name in PUBLISHED.split()]
     assert len(JOINT_NAMES) == JOINTS == 55
     assert [JOINT_INDEX[name] for name in JOINT_NAMES] == list(range(55))
     assert (POSE_SIZE, POSE_FEATURES) == (165, 486)
@@ -83,7 +83,7 @@ def test_every_joint_hangs_on_the_joint_before_it_in_its_limb() -> None:
             chain = [f"{side}_wrist", *(f"{side}_{finger}{part}" for part in (1, 2, 3))]
             parents |= dict(zip(chain[1:], chain[:-1], strict=True))
     found = [None if parent < 0 else JOINT_NAMES[parent] for parent in JOINT_PARENTS]
-    assert found == [parents[name.removesuffix("_smplhf")] for name in PUBLISHED]
+    assert found == [parents[name.removesuffix("_smplhf")] for name in PUBLISHED.split()]
 
 
 def test_the_default_body_has_the_published_tree() -> None:
@@ -416,7 +416,7 @@ def test_branch_sums_and_distances_by_hand() -> None:
 
 
 def two_joints(shaped: ShapedBody, loser: str) -> ShapedBody:
-    """One vertex, 0.3 m from joint `loser`: four joints of weight 0.2375 at its parent's side, and `loser` with 0.05."""
+    """One vertex, 0.3 m from joint `loser`: four joints of the trunk with 0.2375 each, and `loser`."""
     joint = JOINT_INDEX[loser]
     weights = np.zeros((1, 55), np.float32)
     weights[0, [0, 3, 6, 9]] = 0.2375
