@@ -173,16 +173,19 @@ def test_limits_on_either_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 # --- names ---
 
 BODY = """pelvis left_hip right_hip spine1 left_knee right_knee spine2 left_ankle right_ankle spine3 left_foot
-right_foot neck left_collar right_collar head left_shoulder right_shoulder left_elbow right_elbow left_wrist right_wrist"""
+right_foot neck left_collar right_collar head left_shoulder right_shoulder left_elbow right_elbow
+left_wrist right_wrist"""
 #: Names as the programs write them, in the order of BODY ("-": the skeleton has no such joint).
 AS_WRITTEN = {
     "Mixamo": """mixamorig:Hips LeftUpLeg RightUpLeg Spine LeftLeg RightLeg Spine1 LeftFoot RightFoot Spine2
         LeftToeBase RightToeBase Neck LeftShoulder RightShoulder Head LeftArm RightArm LeftForeArm RightForeArm
         LeftHand RightHand""",
     "CMU": """Hips LeftUpLeg RightUpLeg LowerBack LeftLeg RightLeg Spine LeftFoot RightFoot Spine1
-        LeftToeBase RightToeBase Neck LeftShoulder RightShoulder Head LeftArm RightArm LeftForeArm RightForeArm LeftHand RightHand""",
+        LeftToeBase RightToeBase Neck LeftShoulder RightShoulder Head LeftArm RightArm LeftForeArm RightForeArm
+        LeftHand RightHand""",
     "MotionBuilder": """Hips LeftHip RightHip LowerBack LeftKnee RightKnee Chest LeftAnkle RightAnkle Chest2
-        LeftToe RightToe Neck LeftCollar RightCollar Head LeftShoulder RightShoulder LeftElbow RightElbow LeftWrist RightWrist""",
+        LeftToe RightToe Neck LeftCollar RightCollar Head LeftShoulder RightShoulder LeftElbow RightElbow
+        LeftWrist RightWrist""",
     "3ds Max Biped": """Bip01_Pelvis Bip01_L_Thigh Bip01_R_Thigh Bip01_Spine Bip01_L_Calf Bip01_R_Calf Bip01_Spine1
         Bip01_L_Foot Bip01_R_Foot Bip01_Spine2 Bip01_L_Toe0 Bip01_R_Toe0 Bip01_Neck Bip01_L_Clavicle Bip01_R_Clavicle
         Bip01_Head Bip01_L_UpperArm Bip01_R_UpperArm Bip01_L_Forearm Bip01_R_Forearm Bip01_L_Hand Bip01_R_Hand""",
