@@ -118,6 +118,20 @@ def test_a_tum_pose_puts_points_at_their_pixels(tmp_path: Path) -> None:
     assert OPENGL_FROM_OPTICAL.tolist() == [[1, 0, 0], [0, -1, 0], [0, 0, -1]]
 
 
+def test_the_numbers_of_a_tum_quaternion_are_x_y_z_w(tmp_path: Path) -> None:
+    """R written out from Hamilton's product; its columns are right, down and ahead, in a Z-up world."""
+    x, y, z, w = q = np.array([-0.62, 0.13, -0.21, 0.74]) / np.linalg.norm([-0.62, 0.13, -0.21, 0.74])
+    r = np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip
+    (tmp_path / "a.txt").write_text("0 0 0 0 " + " ".join(str(value) for value in 3 * q))
+    turn, _ = load(tmp_path / "a.txt").pose(0.0)
+    z_up = np.column_stack([r[:, 0], -r[:, 1], -r[:, 2]])
+    assert turn == pytest.approx(np.stack([z_up[0], z_up[2], -z_up[1]]), abs=1e-9)
+
+
 def test_a_kinect_held_upright_has_its_width_high(tmp_path: Path) -> None:
     """As above, then rolled by 90 degrees about the line of sight: the quaternions' product by hand."""
     (tmp_path / "a.txt").write_text("10 1 2 3 -0.5 0.5 0.5 0.5\n")  # (w, x, y, z) = ½ (1, -1, 1, 1)
