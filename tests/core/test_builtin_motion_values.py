@@ -262,10 +262,10 @@ def test_swings_of_one_foot_may_not_overlap() -> None:
 
 
 def tracks(count: int, ahead: float = 0.0, load: float = 1.0, heading: float = 0.0) -> tuple[FootTrack, FootTrack]:
-    """Feet that stand, the left one `ahead` of the right one by so much, with `load` on the right foot."""
+    """Feet that stand 0.5 m along +z, the left one `ahead` of the right one by so much, with `load` on the right foot."""
     made = []
     for side in (1, -1):
-        place = np.tile([side * 0.095, 0.077, (1 + side) / 2 * ahead], (count, 1)) @ about(1, heading).T
+        place = np.tile([side * 0.095, 0.077, 0.5 + (1 + side) / 2 * ahead], (count, 1)) @ about(1, heading).T
         weight = np.full(count, 1.0 if side > 0 else load)
         made.append(FootTrack(place, np.full(count, heading), np.zeros(count), weight))
     return made[0], made[1]
@@ -287,7 +287,7 @@ def test_a_stride_turns_hips_and_shoulders_against_each_other(heading: float) ->
         assert angles(poses, name)[:, 1] == pytest.approx(np.full(count, -1.9 * share * yaw))
         assert angles(poses, name)[:, 2] == pytest.approx(np.zeros(count))
     assert angles(poses, "head")[:, 1] == pytest.approx(np.full(count, 0.9 * yaw))
-    ahead = 0.02 + 0.15
+    ahead = 0.5 + 0.02 + 0.15
     assert place[:, [0, 2]] == pytest.approx(
         np.tile([ahead * math.sin(heading), ahead * math.cos(heading)], (count, 1))
     )
@@ -305,7 +305,7 @@ def test_weight_on_one_foot_leans_the_body_to_it() -> None:
     assert angles(poses, "pelvis") == pytest.approx(np.tile([0, 0, 0.05], (count, 1)))
     for name, share in (("spine1", 0.25), ("spine2", 0.35), ("spine3", 0.4)):
         assert angles(poses, name)[:, 2] == pytest.approx(np.full(count, -0.055 * share))
-    assert place[:, [0, 2]] == pytest.approx(np.tile([0.038, 0.02], (count, 1)))
+    assert place[:, [0, 2]] == pytest.approx(np.tile([0.038, 0.52], (count, 1)))
     heights = []
     for side in (1, -1):
         hip = about(2, 0.05) @ [side * 0.117, -0.008, -0.010]

@@ -249,6 +249,8 @@ def test_units_by_hand() -> None:
     for name, metres in (("m", 1.0), ("cm", 0.01), ("in", 0.0254), ("cmu", 0.0254 / 0.45)):
         assert unit_of(0.85 / metres, "auto") == (f"{name}, by the length of the legs", metres)
         assert unit_of(123.0, name) == (f"{name}, as given", metres)
+    for leg_m, name in ((0.85 * 1.48, "cmu"), (0.85 * 1.50, "in")):  # a cmu is 2.22 inches: the middle is 1.49
+        assert unit_of(leg_m / (0.0254 / 0.45), "auto")[0] == f"{name}, by the length of the legs"
     assert unit_of(1.35, "auto") == ("m, by the length of the legs", 1.0)
     assert unit_of(1.37, "auto") == ("unknown, scaled to a leg of 0.85 m", 0.85 / 1.37)
     assert unit_of(0.511, "auto")[1] == 1.0
@@ -430,6 +432,12 @@ def test_a_motion_in_metres_and_seconds_with_its_notes(tmp_path: Path) -> None:
         "betas: none in the format",
     )
     assert recorded(tmp_path / "a.bvh", text_of([{}]), "in").leg_m == pytest.approx((left + right) / 2 * 0.0254)
+
+
+def test_joints_of_the_hands_are_counted_from_the_first_finger(tmp_path: Path) -> None:
+    for name, count in (("left_index1", 2), ("jaw", 1), ("right_thumb3", 2)):
+        text = text_of([{}]).replace("JOINT right_nails", f"JOINT {name}")
+        assert f"24 joints have a partner, {count} of them in the hands" in recorded(tmp_path / "a.bvh", text).notes
 
 
 def test_a_skeleton_that_faces_elsewhere_is_turned_as_a_whole(tmp_path: Path) -> None:
