@@ -14,7 +14,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from trilane.avatars.integer_network import MAX_CHANNELS, NetworkFile
 from trilane.errors import BadInputError
 
-BANDS = ("far", "full_body", "upper_body", "face")
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 #: A shape or expression coefficient in standard deviations; values outside describe no human body.
 Coefficient = Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)]
@@ -102,8 +101,6 @@ def parse_manifest(text: str, path: Path) -> Manifest:
         raise BadInputError(
             f"{path}: {key}", f"{_short(first['input'])} ({first['msg']})", "a valid manifest"
         ) from error
-    except (RecursionError, ValueError) as error:
-        raise BadInputError(path, str(error), "a JSON manifest") from error
 
 
 def _short(value: object) -> str:

@@ -262,7 +262,7 @@ def test_swings_of_one_foot_may_not_overlap() -> None:
 
 
 def tracks(count: int, ahead: float = 0.0, load: float = 1.0, heading: float = 0.0) -> tuple[FootTrack, FootTrack]:
-    """Feet that stand 0.5 m along +z, the left one `ahead` of the right one by so much, with `load` on the right foot."""
+    """Feet that stand 0.5 m along +z, the left one `ahead` of the right one; `load`: on the right foot."""
     made = []
     for side in (1, -1):
         place = np.tile([side * 0.095, 0.077, 0.5 + (1 + side) / 2 * ahead], (count, 1)) @ about(1, heading).T
