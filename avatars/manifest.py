@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from trilane.avatars.integer_network import MAX_CHANNELS, NetworkFile
 from trilane.errors import BadInputError
 
+BANDS = ("far", "full_body", "upper_body", "face")
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 #: A shape or expression coefficient in standard deviations; values outside describe no human body.
 Coefficient = Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)]

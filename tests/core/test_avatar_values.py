@@ -31,7 +31,7 @@ from trilane.avatars.integer_network import (
     constants_of,
     node_name,
 )
-from trilane.avatars.manifest import Manifest, NetworkEntry, network_entry, parse_manifest
+from trilane.avatars.manifest import BANDS, Manifest, NetworkEntry, network_entry, parse_manifest
 from trilane.avatars.network_checks import check_network
 from trilane.avatars.network_file import parse_network, read_network
 from trilane.avatars.network_reshape import reshaped
@@ -482,6 +482,8 @@ def test_a_network_for_another_shape(tiny_quantised: Any) -> None:
     shapes = {value.name: value.type.tensor_type.shape for value in other.model.graph.value_info}
     assert shapes and {shape.dim[0].dim_value for shape in shapes.values() if len(shape.dim) == 4} >= {3}
     assert reshaped(network, 64, 64, batch=2).shape == (2, 64, 64, 5)
+    assert reshaped(other, 32, 96, batch=3) is other
+    assert reshaped(other, 96, 32, batch=3).shape == (3, 96, 32, 5)
 
 
 @pytest.mark.parametrize(
@@ -503,7 +505,7 @@ def test_a_graph_that_is_fixed_to_its_shape_is_refused() -> None:
     network = check_network(model, "here")
     with pytest.raises(BadInputError) as raised:
         reshaped(network, 64, 32)
-    assert "here: found a graph fixed to (1, 32, 32, 3): " in str(raised.value)
+    assert "here: found a graph fixed to (1, 32, 32, 3): [ShapeInferenceError]" in str(raised.value)
     assert str(raised.value).endswith(", expected one for 64x32") and "\n" not in str(raised.value)
 
 
@@ -646,6 +648,10 @@ def test_limits_of_a_manifest_on_either_side(case: int) -> None:
     with pytest.raises(BadInputError) as raised:
         parse_manifest(manifest(**copy.deepcopy(changes)), Path("m"))
     assert f"m: {sentence}" in str(raised.value)
+
+
+def test_bands_go_from_far_to_near() -> None:
+    assert BANDS == ("far", "full_body", "upper_body", "face")
 
 
 def test_a_manifest_that_is_no_json() -> None:

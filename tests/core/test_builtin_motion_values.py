@@ -338,6 +338,19 @@ def test_the_trunk_breathes_and_leans_with_the_pace() -> None:
     assert angles(poses, "head")[:, 0] == pytest.approx(0.01 * breath - 0.03 * pace)
 
 
+def test_the_pace_is_the_mean_speed_of_both_feet() -> None:
+    """Feet that swing ahead and back by 0.3 and 0.1 m: the trunk leans by 0.0125 of 0.2 m times the wave's speed."""
+    count = 120
+    k = np.arange(count)
+    moved = [
+        dataclasses.replace(foot, ankle=foot.ankle + np.outer(reach * np.sin(2 * np.pi * k / count), [0, 0, 1]))
+        for foot, reach in zip(tracks(count), (0.3, 0.1), strict=True)
+    ]
+    poses, _ = builtin._body(k / RATE, moved[0], moved[1], wave=False)
+    speed = 0.2 * np.cos(2 * np.pi * k / count) * math.sin(2 * math.pi / count) * RATE
+    assert angles(poses, "spine1")[:, 0] == pytest.approx(0.0125 * blurred(np.abs(speed), 8))
+
+
 def test_arms_lag_the_stride_by_three_samples_and_the_right_one_waves() -> None:
     count = 600
     times = np.arange(count) / RATE

@@ -104,7 +104,7 @@ def test_a_wrong_amass_file_is_refused_in_one_sentence(tmp_path: Path, case: int
     path = amass(tmp_path / "a.npz", **changes)
     with pytest.raises(BadInputError) as raised:
         load_amass(path)
-    assert f"{path}{sentence}" in str(raised.value)
+    assert str(raised.value).startswith(f"{path}{sentence}")
 
 
 @pytest.mark.parametrize("rate", [1.0, 1000.0])
