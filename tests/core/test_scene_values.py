@@ -231,6 +231,27 @@ def test_quaternions_of_every_largest_component() -> None:
         assert abs(found @ unit) == pytest.approx(1.0, abs=1e-12)
 
 
+def test_many_rotations_at_once_are_each_as_alone() -> None:
+    random = np.random.default_rng(5)
+    vectors = random.normal(0, 2, (2, 3, 3))
+    quats = rot.quat_from_rotvec(vectors)
+    other = rot.quat_from_rotvec(random.normal(0, 2, (2, 3, 3)))
+    share = random.random((2, 3))
+    for i in range(2):
+        for j in range(3):
+            assert quats[i, j] == pytest.approx(rot.quat_from_rotvec(vectors[i, j]))
+            assert rot.rotvec_from_quat(quats)[i, j] == pytest.approx(rot.rotvec_from_quat(quats[i, j]))
+            matrix = rot.matrix_from_quat(quats[i, j])
+            assert rot.matrix_from_quat(quats)[i, j] == pytest.approx(matrix)
+            assert rot.quat_from_matrix(rot.matrix_from_quat(quats))[i, j] == pytest.approx(
+                rot.quat_from_matrix(matrix)
+            )
+            assert rot.slerp(quats, other, share)[i, j] == pytest.approx(
+                rot.slerp(quats[i, j], other[i, j], share[i, j])
+            )
+            assert rot.normalised(vectors)[i, j] == pytest.approx(vectors[i, j] / np.linalg.norm(vectors[i, j]))
+
+
 def test_slerp_by_hand() -> None:
     start, end = np.array([1.0, 0, 0, 0]), rot.quat_from_rotvec([0, 1.2, 0])
     for share in (0.0, 0.25, 1.0):
@@ -417,6 +438,7 @@ def test_how_much_of_the_people_is_seen_from_a_place() -> None:
     f = footage()
     random = np.random.default_rng(1)
     ahead = np.array([20.0, 0.0, -7.0]) + random.uniform([-3, -0.5, -9], [3, 0.5, 1], (300, 3))
+    ahead[200:, 1] = random.uniform(-6, 6, 100)  # many of them wholly above or below the picture
     whole, size = placement._visibility(f, ahead)
     expected = np.array([plain_visibility(f, place) for place in ahead])
     assert set(np.round(expected[:, 0], 3)) == {0.0, 0.333, 0.667, 1.0}
