@@ -120,6 +120,7 @@ def test_a_direction_of_no_length_is_named() -> None:
 
 # --- scene files ---
 
+CHARACTERS = "expected letters, digits, spaces, dots, hyphens and underscores"
 SENTENCES: list[tuple[dict[str, Any], str]] = [
     (
         {"colour": 1},
@@ -130,10 +131,11 @@ SENTENCES: list[tuple[dict[str, Any], str]] = [
     ({"avatars": [{}] * 9}, f"avatars: found {repr([{}] * 9)[:80]}, expected at most 8 of them"),
     ({"camera": 3}, "camera: found 3, expected a table"),
     ({"planes": 3}, "planes: found 3, expected a list"),
-    ({"name": "a/b"}, "name: found 'a/b', expected letters, digits, spaces, dots, hyphens and underscores"),
-    ({"name": "/" * 79}, f"name: found '{'/' * 79}..., expected letters, digits,"),
+    ({"name": "a/b"}, "name: found 'a/b', " + CHARACTERS),
+    ({"name": "/" * 79}, f"name: found '{'/' * 79}..., {CHARACTERS}"),
     ({"frames": 0}, "frames: found 0, expected greater than or equal to 1"),
-    ({"hud": "perhaps"}, "hud: found 'perhaps', expected a valid boolean"),
+    ({"name": "/" * 78}, f"name: found '{'/' * 78}', {CHARACTERS}"),
+    ({"hud": None}, "hud: found None, expected a valid boolean"),
 ]
 
 
@@ -142,7 +144,7 @@ def test_what_is_wrong_with_a_scene_is_one_sentence(case: int) -> None:
     values, sentence = SENTENCES[case]
     with pytest.raises(BadInputError) as raised:
         scene_from("here", values)
-    assert str(raised.value).startswith(f"here: {sentence}")
+    assert str(raised.value) == f"here: {sentence}"
 
 
 def test_places_of_files_and_names_that_are_built_in(tmp_path: Path) -> None:
