@@ -102,8 +102,6 @@ def parse_manifest(text: str, path: Path) -> Manifest:
         raise BadInputError(
             f"{path}: {key}", f"{_short(first['input'])} ({first['msg']})", "a valid manifest"
         ) from error
-    except (RecursionError, ValueError) as error:
-        raise BadInputError(path, str(error), "a JSON manifest") from error
 
 
 def _short(value: object) -> str:

@@ -82,8 +82,9 @@ def _lens(path: Path, content: Mapping[str, Any]) -> tuple[float, float, str]:
         lens = lens if angle_x else "usual, as the file has none"
         tan_y = math.tan((angle_x or DEFAULT_ANGLE_X) / 2) / aspect
     angles = [math.degrees(2 * math.atan(tangent)) for tangent in (tan_y, tan_y * aspect)]
-    if not all(1 < angle < 170 for angle in angles):
-        raise BadInputError(path, f"a field of view of {angles[0]:.3g} degrees", "1 to 170")
+    for side, angle in zip(("height", "width"), angles, strict=True):
+        if not 1 < angle < 170:
+            raise BadInputError(path, f"a field of view of {angle:.4g} degrees over the {side}", "1 to 170")
     return angles[0], angles[1], lens
 
 
