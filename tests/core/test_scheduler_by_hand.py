@@ -218,7 +218,7 @@ def test_of_the_frames_that_were_released_meanwhile_the_newest_is_taken() -> Non
 
 
 def test_a_next_job_is_handed_over_a_lead_before_the_end_that_is_expected() -> None:
-    """Jobs take 8 ms and the lead is 1 ms: 7 ms after the begin; 2 ms in which the scheduler stood still put that off."""
+    """Jobs take 8 ms, the lead is 1 ms: 7 ms after the begin; 2 ms in which the scheduler stood still put that off."""
     core = Core(chain([("b", "dsp")], "double", "b"), Settings(100, "latest", asked=True, hang_ns=100 * MS))
     core.step(0, (UnitReady("dsp"),))
     assert core.step(0, (FrameRequest(1),)).next_deadline_ns == 100 * MS

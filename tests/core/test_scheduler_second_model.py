@@ -1,7 +1,7 @@
 """A second scheduler, written from the rules and not from the code, must do the same on random pipelines.
 
 It looks at every unit at every instant, keeps counts in place of slots and marks nothing as dirty. From the rules of
-docs/conventions.md it works out every job, drop, loss, wait, latency and account; times are integers, so they are equal.
+docs/conventions.md it works out every job, drop, loss, wait, latency and account; times are whole nanoseconds.
 """
 
 from __future__ import annotations
