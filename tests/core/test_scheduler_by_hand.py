@@ -299,3 +299,37 @@ def test_a_graph_knows_its_units_in_order_and_its_edges_by_name() -> None:
 def test_the_defaults_of_a_run_are_the_documented_ones() -> None:
     assert Settings(7) == Settings(7, "pipelined", 0, (), False, 0, 0, 0, 0, 0, 10 * 10**9, 120 * 10**9, 5)
     assert VirtualDriver(TWO, Settings(1), lambda *_: 1).recording is None
+
+
+def test_a_job_that_is_handed_over_to_units_at_rest_is_watched_from_then_on() -> None:
+    core = Core(TWO, Settings(9, asked=True, hang_ns=100))
+    assert core.step(3, (UnitReady("gpu"), UnitReady("cpu"))) == ((), NEVER)
+    assert core.step(5, (FrameRequest(1),)).next_deadline_ns == 105
+    assert core.step(15, (JobDone("gpu", 0, 6, 14, 6),)).next_deadline_ns == 105
+    assert core.step(20, (JobDone("cpu", 1, 16, 19, 0),)).next_deadline_ns == 105
+    assert core.step(105) == ((), NEVER)
+    assert core.step(200, (Pinged("cpu"),)).next_deadline_ns == 300
+
+
+def test_a_simulated_unit_that_hangs_is_killed_and_back_after_its_restart() -> None:
+    """Jobs of 4 ms, but frame 1 never ends: handed over at 0, begun at 4, killed at 14, up again at 34.
+
+    Frame 2, which the unit only held, is lost with it, for it was in no slot yet; then frames 3 and 4 take 8 ms.
+    """
+    graph = chain([("draw", "gpu")], "double", "draw")
+    result = simulate(
+        graph,
+        Settings(5, hang_ns=10 * MS),
+        lambda _stage, _unit, frame, _begin: 10**15 if frame == 1 else 4 * MS,
+        restart_ns=20 * MS,
+        keep=True,
+    )
+    assert [(job.frame, job.begin_ns // MS) for job in result.jobs if job.frame != 2] == [
+        (0, 0),
+        (1, 4),
+        (3, 34),
+        (4, 38),
+    ]
+    assert result.report["frames"]["lost_by_cause"] == {"hung:gpu": 2}
+    assert (result.report["duration_s"], result.report["units"]["gpu"]["restarts"]) == (0.042, 1)
+    assert shares_ms(result.report["units"]["gpu"], 42) == {**dict.fromkeys(GPU, 0), "busy": 12, "overhead": 30}
