@@ -412,3 +412,24 @@ def test_the_constants_of_linux_are_those_of_its_headers() -> None:
     assert (memory.F_ADD_SEALS, memory.F_SEAL_SHRINK, memory.F_SEAL_GROW) == (1033, 2, 4)
     assert packets.PAGE == PAGE
     assert packets.FRAME_FIELDS == (("frame", "<u8"), ("t_sampled_ns", "<i8"), ("epoch", "<u4"))
+
+
+def test_receiving_heartbeats_waits_for_none() -> None:
+    asked: list[Any] = []
+
+    class Socket:
+        def poll(self, timeout_ms: int) -> bool:
+            asked.append(timeout_ms)
+            return len(asked) < 3
+
+        def recv(self, flags: int) -> bytes:
+            assert flags == zmq.DONTWAIT
+            return pack(messages.Pong())
+
+    context = zmq.Context()
+    one = HeartbeatSocket(context)
+    real, one.socket = one.socket, Socket()  # type: ignore[assignment]
+    assert one.receive() == [messages.Pong()] * 2
+    assert asked == [0, 0, 0]
+    real.close()
+    context.term()

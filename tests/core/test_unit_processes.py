@@ -1,4 +1,4 @@
-"""The parent's side of units, with `sleep` in the place of each: what it hands over, hears, keeps of stderr and ends."""
+"""The parent's side of units, with `sleep` in the place of each: what it hands over, hears, keeps and ends."""
 
 from __future__ import annotations
 
@@ -232,7 +232,7 @@ def spec() -> UnitSpec:
 
 @pytest.mark.parametrize(
     ("answer", "passes_fd", "said"),
-    [(b"123", True, ""), (b"123", False, "unit left could not be started: too many open files: ulimit -n 4096")],
+    [(b"123", True, ""), (b"123", False, "^unit left could not be started: too many open files: ulimit -n 4096$")],
 )
 def test_a_unit_is_asked_for_with_its_spec_and_files(answer: bytes, passes_fd: bool, said: str) -> None:
     starter, theirs = starter_with(FakeServer(None))
@@ -338,6 +338,8 @@ def test_the_fork_server_is_started_alone_with_one_thread_a_library(monkeypatch:
         assert (seen["stderr"], starter._socket.gettimeout()) == (starter._stderr, 60)
         with pytest.raises(OSError, match="Bad file"):
             os.fstat(passed)
+    server: Any = starter._server
+    assert server.calls == ["kill", ("wait", 5.0)]  # no unit was started, so nothing has to be waited for
 
 
 # run_metrics.py

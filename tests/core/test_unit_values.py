@@ -401,3 +401,78 @@ def test_a_whole_unit_connects_is_ready_and_ends_when_it_is_told(
     beats.close()
     pipe.close()
     context.term()
+
+
+SERVER_LIFE = """
+import ctypes, json, os, select, signal, socket, sys, time
+from types import SimpleNamespace
+from trilane.pipeline import fork_server
+
+def death_signal():
+    death = ctypes.c_int()
+    ctypes.CDLL(None).prctl(2, ctypes.byref(death), 0, 0, 0)
+    return death.value
+
+def look():
+    blocked = sorted(signal.pthread_sigmask(signal.SIG_BLOCK, []))
+    return [death_signal(), signal.getsignal(signal.SIGCHLD) == signal.SIG_DFL, blocked, os.getppid()]
+
+def serve(spec, number_of):
+    time.sleep(spec)
+    return 5
+
+modules = {"trilane.pipeline.unit_loop": SimpleNamespace(serve=serve), "here": SimpleNamespace(look=look)}
+fork_server.importlib = SimpleNamespace(import_module=modules.__getitem__)
+ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+server = os.fork()
+if server == 0:
+    ours.close()
+    fork_server.serve(theirs)
+    os._exit(9)
+theirs.close()
+
+def call(name):
+    reads, writes = os.pipe()
+    socket.send_fds(ours, [json.dumps({"call": name}).encode()], [writes])
+    os.close(writes)
+    with os.fdopen(reads) as answer:
+        return answer.read()
+
+def unit(seconds):
+    spec = os.memfd_create("spec")
+    os.write(spec, json.dumps(seconds).encode())
+    request = {"unit": "u", "cores": [min(os.sched_getaffinity(0))], "threads": 1, "fds": []}
+    socket.send_fds(ours, [json.dumps(request).encode()], [spec, os.dup(2)])
+    answer, fds, *_ = socket.recv_fds(ours, 99, 9)
+    return int(answer), fds
+
+def until(found):
+    end = time.monotonic() + 5
+    while not found() and time.monotonic() < end:
+        time.sleep(0.005)
+    return found()
+
+def children():
+    return open(f"/proc/{server}/task/{server}/children").read().split()
+
+death, default, blocked, parent = json.loads(call("here:look"))
+files = os.listdir(f"/proc/{server}/fd")
+pid, (pidfd,) = unit(0.2)
+alive = not select.select([pidfd], [], [], 0)[0]
+ended = bool(select.select([pidfd], [], [], 5)[0])
+none = call("no:such")
+print(json.dumps([death, default, blocked, parent == server, pid != server, alive, ended, none,
+                  until(lambda: not children()), until(lambda: os.listdir(f"/proc/{server}/fd") == files)]))
+_, (last,) = unit(0.3)
+ours.close()
+code = os.waitstatus_to_exitcode(os.waitpid(server, 0)[1])
+print(json.dumps([code, bool(select.select([last], [], [], 0)[0])]))
+"""
+
+
+def test_a_fork_server_forks_answers_forgets_and_outlives_its_units() -> None:
+    """A call dies with the server too; units that ended leave no zombie, and no file; the server waits for the last."""
+    done = subprocess.run([sys.executable, "-c", SERVER_LIFE], capture_output=True, text=True, timeout=60, check=True)
+    first, last = map(json.loads, done.stdout.splitlines())
+    assert first == [signal.SIGKILL, True, [], True, True, True, True, "", True, True]
+    assert last == [9, True]
