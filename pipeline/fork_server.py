@@ -76,9 +76,7 @@ def _run_unit(request: dict[str, Any], fds: Sequence[int], server_pid: int) -> i
         spec_fd, stderr_fd, *passed = fds
         os.dup2(stderr_fd, sys.stderr.fileno())
         os.close(stderr_fd)
-        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGCHLD})
-        die_with_parent(server_pid)
+        _leave_server(server_pid)
         os.setpgid(0, 0)
         ctypes.CDLL(None).prctl(PR_SET_NAME, process_name(request["unit"]).encode(), 0, 0, 0)
         os.sched_setaffinity(0, request["cores"])
@@ -96,8 +94,7 @@ def _run_unit(request: dict[str, Any], fds: Sequence[int], server_pid: int) -> i
 
 def _call(request: dict[str, Any], fds: Sequence[int], server_pid: int) -> int:
     """In a forked process: write what the function `module:name` returns, as JSON, to the descriptor `fds[0]`."""
-    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-    die_with_parent(server_pid)
+    _leave_server(server_pid)
     module, _, name = request["call"].partition(":")
     try:
         answer = json.dumps(getattr(importlib.import_module(module), name)())
@@ -106,6 +103,13 @@ def _call(request: dict[str, Any], fds: Sequence[int], server_pid: int) -> int:
     with os.fdopen(fds[0], "w") as file:
         file.write(answer)
     return 0
+
+
+def _leave_server(server_pid: int) -> None:
+    """In a forked process: hear of children of its own as any process does, and end with the server."""
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGCHLD})
+    die_with_parent(server_pid)
 
 
 def die_with_parent(parent_pid: int) -> None:

@@ -1,0 +1,295 @@
+"""A pipeline as data and in memory: what its description says, and what a stage finds in its slots and arrays."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Mapping, Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from trilane.errors import BadInputError, TrilaneError
+from trilane.pipeline import (
+    bound_stage,
+    shared_assets,
+)
+from trilane.pipeline.bound_stage import BoundStage
+from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, UnitSettings
+from trilane.pipeline.regions import EdgeRegion, edge_regions
+from trilane.pipeline.stage import UnitContext
+from trilane.pipeline.unit_spec import UnitSpec
+from trilane.transport.job_pipe import JobPipeEnd
+from trilane.transport.packets import Packet, SlotLayout, header_dtype, view_packet
+
+OWN = header_dtype([("own", "<u2")])
+MS = 1_000_000
+
+
+def packets(header: np.dtype[Any], count: int) -> list[Packet]:
+    layout = SlotLayout(header, 8)
+    return [view_packet(memoryview(bytearray(layout.slot_bytes)), layout) for _ in range(count)]
+
+
+class FakeStage:
+    def __init__(self, error: Exception | None = None) -> None:
+        self.error, self.runs, self.bound, self.closed = error, [], None, False
+
+    def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
+        self.bound = (inputs, outputs)
+
+    def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
+        self.runs.append((frame, slot_in, slot_out))
+        if self.error is not None:
+            raise self.error
+        return {"shade": 3}
+
+    def close(self) -> None:
+        self.closed = True
+        if self.error is not None:
+            raise self.error
+
+
+def test_a_first_stage_gets_a_header_with_frame_time_and_epoch() -> None:
+    inner, outputs = FakeStage(), packets(OWN, 2)
+    stage = BoundStage("pose", inner, [], outputs, 0)
+    before = time.monotonic_ns()
+    assert stage.run(7, -1, 1, 3) == {"shade": 3}
+    header = outputs[1].header
+    assert (int(header["frame"]), int(header["epoch"]), inner.runs) == (7, 3, [(7, None, 1)])
+    assert before <= int(header["t_sampled_ns"]) <= time.monotonic_ns()
+    assert stage.sampled_ns(-1, 1) == int(header["t_sampled_ns"])
+    assert (int(outputs[0].header["frame"]), stage.sampled_ns(0, 1), stage.sampled_ns(-1, -1)) == (0, 0, 0)
+    assert stage.sampled_ns(-1, 0) == 0
+    assert inner.bound == ([], outputs)
+    stage.close()
+    assert inner.closed
+
+
+@pytest.mark.parametrize(("target", "own"), [(OWN, 9), (header_dtype([("other", "<u4")]), 0)])
+def test_a_header_is_passed_on_whole_or_with_its_frame_alone(target: np.dtype[Any], own: int) -> None:
+    inputs, outputs = packets(OWN, 3), packets(target, 2)
+    inputs[2].header["frame"], inputs[2].header["t_sampled_ns"] = 5, 1234
+    inputs[2].header["epoch"], inputs[2].header["own"] = 1, 9
+    inner = FakeStage()
+    BoundStage("raster", inner, inputs, outputs, 0).run(5, 2, 1, 4)
+    header = outputs[1].header
+    assert [int(header[name]) for name in ("frame", "t_sampled_ns", "epoch")] == [5, 1234, 4]
+    assert int(header[target.names[3]]) == own
+    assert (int(inputs[2].header["epoch"]), inner.runs) == (1, [(5, 2, 1)])
+    assert not outputs[0].header.reshape(1).view("u1").any()
+
+
+def test_all_fields_of_a_frame_are_copied_to_another_header() -> None:
+    source, target = packets(OWN, 1)[0].header, packets(header_dtype(), 1)[0].header
+    source["frame"], source["t_sampled_ns"], source["epoch"] = 1, 2, 3
+    bound_stage._copy_fields(source, target)
+    assert target.tolist() == (1, 2, 3)
+
+
+def test_a_last_stage_has_no_slot_to_write() -> None:
+    inner = FakeStage()
+    BoundStage("present", inner, packets(OWN, 1), [], 0).run(5, 0, -1, 4)
+    assert inner.runs == [(5, 0, None)]
+
+
+class FakeTime:
+    """A clock that moves by what is slept, and 1 µs with every look."""
+
+    def __init__(self) -> None:
+        self.now_ns, self.slept = 5 * MS, []
+
+    def monotonic_ns(self) -> int:
+        self.now_ns += 1000
+        return self.now_ns
+
+    def monotonic(self) -> float:
+        return self.monotonic_ns() / 1e9
+
+    def sleep(self, seconds: float) -> None:
+        self.slept.append(round(seconds * 1e9))
+        self.now_ns += round(seconds * 1e9)
+
+
+def test_a_hold_sleeps_until_shortly_before_its_end_and_then_watches(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = FakeTime()
+    monkeypatch.setattr(bound_stage, "time", clock)
+    bound_stage.hold_until(7 * MS)
+    assert clock.slept == [2 * MS - 1000 - 150_000]
+    assert clock.now_ns == 7 * MS
+    bound_stage.hold_until(7 * MS + 151_000)  # 150 µs are left at the first look: too short to sleep
+    assert (len(clock.slept), clock.now_ns) == (1, 7 * MS + 151_000)
+
+
+def test_a_job_is_held_for_its_pace_and_one_without_a_pace_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = FakeTime()
+    monkeypatch.setattr(bound_stage, "time", clock)
+    start = clock.now_ns
+    BoundStage("present", FakeStage(), packets(OWN, 1), [], 3 * MS).run(0, 0, -1, 0)
+    assert clock.now_ns == start + 1000 + 3 * MS
+    BoundStage("present", FakeStage(), packets(OWN, 1), [], 0).run(0, 0, -1, 0)
+    assert (clock.now_ns, len(clock.slept)) == (start + 2000 + 3 * MS, 1)
+
+
+UNITS = {"left": UnitSettings(cores=(1, 0), threads=2), "right": UnitSettings(cores=(3, 1), threads=1, spin=True)}
+STAGES = tuple(
+    PipelineStage(name=name, unit=unit, factory="json:loads", pace_ns=pace)
+    for name, unit, pace in (("in", "left", 0), ("mid", "right", 5), ("out", "left", 0))
+)
+EDGES = (PipelineEdge(payload_bytes=100, header=OWN, rule="single"), PipelineEdge(payload_bytes=5000, rule="fifo:3"))
+
+
+def pipeline(**changes: Any) -> Pipeline:
+    return Pipeline(**{"stages": STAGES, "edges": EDGES, "units": UNITS, **changes})
+
+
+def test_a_description_answers_what_follows_from_it() -> None:
+    described = pipeline()
+    assert described.edge_names == ["in->mid", "mid->out"]
+    assert described.joints["mid->out"] == (STAGES[1], STAGES[2])
+    assert (described.rule, described.with_rule("double").rule) == ("single,fifo:3", "double")
+    assert described.with_rule("double").edges[1] == EDGES[1].model_copy(update={"rule": "double"})
+    assert (described.scheduler_cores, described.run_cores) == ((1, 0), (0, 1, 3))
+    assert described.stages_of("left") == (STAGES[0], STAGES[2])
+    graph = described.graph()
+    assert [(stage.name, stage.unit) for stage in graph.stages] == [("in", "left"), ("mid", "right"), ("out", "left")]
+    assert (graph.edges, graph.latency_to) == (("single", "fifo:3"), "out")
+    assert pipeline(latency_to="mid").graph().latency_to == "mid"
+    assert (PipelineEdge(payload_bytes=0).rule, PipelineEdge(payload_bytes=0).header) == ("double", header_dtype())
+    assert (STAGES[0].settings, STAGES[0].pace_ns, UNITS["left"].spin) == ({}, 0, False)
+    assert (described.module_folders, described.preload, described.latency_to) == ((), (), "")
+
+
+def test_a_description_goes_through_json() -> None:
+    assert Pipeline.model_validate_json(pipeline().model_dump_json()) == pipeline()
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"units": {"left": UNITS["left"]}}, "no settings of unit right, expected them in `units`"),
+        ({"units": {}}, "no settings of unit left, right"),
+        ({"edges": EDGES[:1]}, "1 edges"),
+        ({"edges": (EDGES[0], EDGES[1].model_copy(update={"rule": "no"}))}, "edge 'no'"),
+        ({"stages": (), "edges": ()}, "at least 1 item"),
+        ({"latency_to": "none"}, "latency to 'none'"),
+    ],
+)
+def test_a_description_that_does_not_fit_together_is_refused(changes: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        pipeline(**changes)
+
+
+@pytest.mark.parametrize(
+    ("model", "values"),
+    [
+        (UnitSettings, {"cores": (), "threads": 1}),
+        (UnitSettings, {"cores": (0,), "threads": 0}),
+        (UnitSettings, {"cores": (0,), "threads": 1, "extra": 1}),
+        (PipelineEdge, {"payload_bytes": -1}),
+        (PipelineEdge, {"payload_bytes": 1, "header": np.dtype([("t_sampled_ns", "<i8"), ("frame", "<u8")])}),
+        (PipelineEdge, {"payload_bytes": 1, "header": np.dtype([("frame", "<u8"), ("t_sampled_ns", "<i8")])}),
+        (
+            PipelineEdge,
+            {"payload_bytes": 1, "header": np.dtype([("frame", "<i8"), ("t_sampled_ns", "<i8"), ("epoch", "<u4")])},
+        ),
+        (PipelineEdge, {"payload_bytes": 1, "header": header_dtype([("own", "O")])}),
+        (PipelineEdge, {"payload_bytes": 1, "header": "[('frame'"}),
+        (PipelineEdge, {"payload_bytes": 1, "header": "5"}),
+        (PipelineEdge, {"payload_bytes": 1, "header": None}),
+        (PipelineStage, {"name": "a b", "unit": "u", "factory": "m:f"}),
+        (PipelineStage, {"name": "a", "unit": "u v", "factory": "m:f"}),
+        (PipelineStage, {"name": "a", "unit": "u", "factory": "m.f"}),
+        (PipelineStage, {"name": "a", "unit": "u", "factory": "m:f", "pace_ns": -1}),
+    ],
+)
+def test_values_that_a_description_cannot_have_are_refused(model: Any, values: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=r"validation error"):
+        model(**values)
+
+
+def test_the_rules_of_a_run_are_refused_in_words() -> None:
+    with pytest.raises(BadInputError, match=r"^the run's settings: found edge 'no', expected single"):
+        pipeline().with_rule("no")
+    assert PipelineEdge(payload_bytes=0).rule == "double"
+    assert PipelineStage(name="a-1", unit="u", factory="m.n:f", pace_ns=0).name == "a-1"
+
+
+def test_every_edge_has_a_region_of_its_slots_which_is_closed_at_the_end() -> None:
+    with edge_regions(pipeline()) as regions:
+        assert list(regions) == ["in->mid", "mid->out"]
+        assert [(region.slots, region.payload_bytes) for region in regions.values()] == [(1, 100), (3, 5000)]
+        assert regions["in->mid"].header == OWN
+        assert regions["mid->out"].layout.total_bytes == 3 * (4096 + 8192)
+        sizes = [os.fstat(region.fd).st_size for region in regions.values()]
+        assert sizes == [2 * 4096, 3 * 3 * 4096]
+    for region in regions.values():
+        with pytest.raises(OSError, match=r"Bad file"):
+            os.fstat(region.fd)
+
+
+def spec_of(**changes: Any) -> UnitSpec:
+    values: dict[str, Any] = {
+        "unit": "right",
+        "endpoint": "ipc://none",
+        "job_pipe": JobPipeEnd(10, 11),
+        "assets_fd": 12,
+        "settings": UNITS["right"],
+        "scheduler_cores": (1, 0),
+        "run_cores": (0, 1, 3),
+        "stages": (STAGES[1],),
+        "module_folders": (),
+        "edges": {
+            "in->mid": EdgeRegion(fd=13, slots=1, header=OWN, payload_bytes=100),
+            "mid->out": EdgeRegion(fd=14, slots=3, header=header_dtype(), payload_bytes=5000),
+        },
+        "inputs": {"mid": "in->mid"},
+        "outputs": {"mid": "mid->out"},
+    }
+    return UnitSpec(**{**values, **changes})
+
+
+def test_a_spec_numbers_its_descriptors_anew_and_changes_nothing_else() -> None:
+    spec = spec_of()
+    assert spec.fds == [10, 11, 12, 13, 14]
+    again = spec.renumbered({fd: fd + 100 for fd in spec.fds})
+    assert again.fds == [110, 111, 112, 113, 114]
+    assert again.renumbered({fd + 100: fd for fd in spec.fds}) == spec
+    assert UnitSpec.model_validate_json(spec.model_dump_json()) == spec
+
+
+def test_what_two_stages_share_is_made_once() -> None:
+    made: list[int] = []
+    unit = UnitContext("gpu", UNITS["left"], {})
+    first = unit.shared("context", lambda: made.append(1) or object())
+    assert unit.shared("context", lambda: made.append(2) or object()) is first
+    assert unit.shared("other", lambda: 7) == 7
+    assert made == [1]
+    assert UnitContext("gpu", UNITS["left"], {}).shared("context", lambda: 8) == 8
+
+
+def test_assets_lie_on_pages_of_their_own_behind_the_index() -> None:
+    fd = shared_assets.share_assets({"a": np.arange(5000, dtype=np.uint8), "b": np.array([7], np.uint16)})
+    try:
+        assert os.fstat(fd).st_size == 4 * 4096
+        length = int.from_bytes(os.pread(fd, 8, 0), "little")
+        index = json.loads(os.pread(fd, length, 8))
+        assert index["a"] == {"dtype": "|u1", "shape": [5000], "offset": 0}
+        assert index["b"] == {"dtype": "<u2", "shape": [1], "offset": 8192}
+        assert os.pread(fd, 2, 3 * 4096) == b"\7\0"
+        assert not os.get_inheritable(fd)
+    finally:
+        os.close(fd)
+
+
+def test_assets_that_fit_to_the_byte_are_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    for free, is_refused in ((4096, False), (4095, True)):
+        monkeypatch.setattr("psutil.virtual_memory", lambda free=free: SimpleNamespace(available=free))
+        if is_refused:
+            with pytest.raises(TrilaneError, match=r"^assets: found 0 MiB, expected at most 0 MiB, which are free$"):
+                shared_assets.share_assets({})
+        else:
+            os.close(shared_assets.share_assets({}))

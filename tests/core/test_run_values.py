@@ -1,0 +1,381 @@
+"""Around a run's loop, beside doubles of its units: what must be so before, start, isolated times, close, settings."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import resource
+import signal
+import sys
+import threading
+from collections import deque
+from collections.abc import Mapping, Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from trilane.errors import BadInputError, TrilaneError
+from trilane.pipeline import (
+    isolated,
+    lifecycle,
+    preconditions,
+    run,
+    run_log,
+)
+from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, UnitSettings
+from trilane.pipeline.isolated import IsolatedTimes
+from trilane.pipeline.lifecycle import close_units, listen_before_run, start_units
+from trilane.pipeline.requests import FrameRequestQueue
+from trilane.pipeline.result import Failure
+from trilane.pipeline.run_log import RunLog, UnitError, after_stderr
+from trilane.pipeline.signals import Interrupts
+from trilane.pipeline.unit_processes import UnitMessage
+from trilane.scheduler.events import FrameRequest, Settings, Stop
+from trilane.transport.messages import (
+    Close,
+    Closed,
+    Duration,
+    Failed,
+    Pong,
+    Ready,
+    RunIsolated,
+)
+
+MS = 1_000_000
+
+
+UNITS = {"left": UnitSettings(cores=(1, 0), threads=2), "right": UnitSettings(cores=(3, 1), threads=1, spin=True)}
+STAGES = tuple(
+    PipelineStage(name=name, unit=unit, factory="json:loads", pace_ns=pace)
+    for name, unit, pace in (("in", "left", 0), ("mid", "right", 5), ("out", "left", 0))
+)
+EDGES = (PipelineEdge(payload_bytes=100, rule="single"), PipelineEdge(payload_bytes=5000, rule="fifo:3"))
+
+
+def pipeline(**changes: Any) -> Pipeline:
+    return Pipeline(**{"stages": STAGES, "edges": EDGES, "units": UNITS, **changes})
+
+
+class FakeTime:
+    """A clock that moves by what is slept, and 1 µs with every look."""
+
+    def __init__(self) -> None:
+        self.now_ns, self.slept = 5 * MS, []
+
+    def monotonic_ns(self) -> int:
+        self.now_ns += 1000
+        return self.now_ns
+
+    def monotonic(self) -> float:
+        return self.monotonic_ns() / 1e9
+
+    def sleep(self, seconds: float) -> None:
+        self.slept.append(round(seconds * 1e9))
+        self.now_ns += round(seconds * 1e9)
+
+
+@pytest.mark.parametrize(("limit", "is_enough"), [(95, False), (96, True), (resource.RLIM_INFINITY, True)])
+def test_ninety_six_open_files_are_enough(monkeypatch: pytest.MonkeyPatch, limit: int, is_enough: bool) -> None:
+    asked = []
+    monkeypatch.setattr(resource, "getrlimit", lambda what: asked.append(what) or (limit, 10**6))
+    with (
+        contextlib.nullcontext()
+        if is_enough
+        else pytest.raises(TrilaneError, match=r"limit of 95, expected at least 96")
+    ):
+        preconditions.check_open_files()
+    assert asked == [resource.RLIMIT_NOFILE]
+
+
+def test_cores_that_are_not_there_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+    said = r"^cores of unit right: found 3, expected some of this process's: 0, 1$"
+    with pytest.raises(BadInputError, match=said):
+        preconditions.check_cores(pipeline())
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1, 3})
+    preconditions.check_cores(pipeline())
+
+
+def test_only_finite_values_above_0_are_positive() -> None:
+    preconditions.check_positive(a=None, b=1e-9, c=5)
+    for value in (0, -1, math.inf, math.nan):
+        with pytest.raises(BadInputError, match=rf"fps: found {value}, expected more than 0"):
+            preconditions.check_positive(frames=1, fps=value)
+
+
+def test_a_run_is_refused_where_a_unit_imports_its_stages(monkeypatch: pytest.MonkeyPatch) -> None:
+    preconditions.refuse_in_a_unit()
+    monkeypatch.setitem(sys.modules, "__main__", SimpleNamespace(__spec__=None))
+    preconditions.refuse_in_a_unit()
+    monkeypatch.setitem(
+        sys.modules, "__main__", SimpleNamespace(__spec__=SimpleNamespace(name="trilane.pipeline.fork_server"))
+    )
+    with pytest.raises(BadInputError, match=r"^run_pipeline: found run_pipeline was called while a unit imported"):
+        preconditions.refuse_in_a_unit()
+
+
+def test_the_first_failure_stands_and_every_message_is_said() -> None:
+    said: list[str] = []
+    log = RunLog(said.append)
+    log.say("one")
+    log.fail_with(Failed(1, 3, "two"))
+    log.fail_with(Failed(1, 4, "three"))
+    log.fail("four")
+    assert (log.messages, said, log.failure) == (["one", "two"], ["one", "two"], Failure("two", 3))
+    quiet = RunLog()
+    quiet.fail("five")
+    quiet.say("six")
+    assert (quiet.failure, quiet.messages) == (Failure("five", 1), ["six"])
+    assert (UnitError("x").exit_code, UnitError("x", 4).exit_code, str(UnitError("x"))) == (1, 4, "x")
+    assert (after_stderr("a\nb\n"), after_stderr("")) == ("it wrote last: b", "")
+    assert run_log.Failure("x").exit_code == 1
+
+
+def test_requests_come_in_order_wake_the_run_and_end_with_it() -> None:
+    told: list[Any] = []
+    queue = FrameRequestQueue(told.append, lambda: told.append("ended"))
+    with pytest.raises(BlockingIOError):
+        os.eventfd_read(queue.fd)
+    queue.request()
+    queue.request(3)
+    queue.end()
+    assert os.eventfd_read(queue.fd) == 3
+    assert queue.events() == [FrameRequest(1), FrameRequest(3), Stop()]
+    assert queue.events() == []
+    assert not os.get_inheritable(queue.fd) and not queue.is_open.is_set()
+    queue.answered(5)
+    queue.close()
+    queue.close()
+    queue.request()
+    assert (told, queue.is_open.is_set(), queue.events()) == ([5, "ended"], True, [])
+    with pytest.raises(OSError, match=r"Bad file"):
+        os.fstat(queue.fd)
+
+
+def test_interrupts_are_counted_wake_the_poller_and_are_given_back() -> None:
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGPIPE)
+    mine = signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    before = [signal.getsignal(number) for number in numbers]
+    try:
+        with Interrupts() as interrupts:
+            assert signal.getsignal(signal.SIGPIPE) == signal.SIG_IGN
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGTERM)
+            assert interrupts.count == 2
+            assert os.read(interrupts.fd, 9) == bytes([signal.SIGINT, signal.SIGTERM])
+            with pytest.raises(BlockingIOError):
+                os.read(interrupts.fd, 9)
+            wakes = signal.set_wakeup_fd(-1)
+            assert wakes == interrupts._write_fd
+        assert [signal.getsignal(number) for number in numbers] == before
+        assert signal.set_wakeup_fd(-1) == -1
+        for fd in (interrupts.fd, wakes):
+            with pytest.raises(OSError, match=r"Bad file"):
+                os.fstat(fd)
+    finally:
+        signal.signal(signal.SIGPIPE, mine)
+
+
+def test_interrupts_do_nothing_outside_the_main_thread() -> None:
+    before, seen = signal.getsignal(signal.SIGINT), []
+
+    def enter() -> None:
+        with Interrupts():
+            seen.append(signal.getsignal(signal.SIGINT))
+
+    thread = threading.Thread(target=enter)
+    thread.start()
+    thread.join()
+    assert seen == [before]
+
+
+class FakeProcesses:
+    """Answers each `listen` with the next of `script`; notes what it is told."""
+
+    def __init__(self, script: Sequence[Any] = (), pids: Mapping[str, int] | None = None) -> None:
+        self.script, self.pids = deque(script), dict(pids or {})
+        self.told: list[Any] = []
+        self.places = {"in": 0, "mid": 0, "out": 1}
+
+    def start(self, unit: str) -> None:
+        self.told.append(("start", unit))
+
+    def connected(self, unit: str) -> None:
+        self.told.append(("connected", unit))
+
+    def send(self, unit: str, message: Any) -> None:
+        self.told.append((unit, message))
+
+    def listen(self, timeout_ms: int) -> list[UnitMessage]:
+        assert timeout_ms == 200
+        return [UnitMessage(*row) for row in self.script.popleft()]
+
+    def why_ended(self, unit: str) -> str:
+        return f"; it was {unit}"
+
+    def wait_for_end(self, units: list[str]) -> None:
+        self.told.append(("wait", units))
+
+
+NOBODY: Any = SimpleNamespace(count=0)
+
+
+def test_units_are_started_all_at_once_and_waited_for_until_the_last_is_ready(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Started at 5.001 and 5.002 ms; looks at 5.003 (the end), 5.004, 5.005 (left), 5.006, 5.007 (right)."""
+    monkeypatch.setattr(lifecycle, "time", FakeTime())
+    processes: Any = FakeProcesses([[("left", Ready(4))], [], [("right", Ready(5))]])
+    took = start_units(processes, ["left", "right"], NOBODY)
+    assert {unit: round(ms, 6) for unit, ms in took.items()} == {"left": 0.004, "right": 0.006}
+    assert processes.told == [("start", "left"), ("start", "right"), ("connected", "left"), ("connected", "right")]
+
+
+def test_units_that_are_not_ready_in_time_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = FakeTime()
+    processes: Any = FakeProcesses()
+    processes.listen = lambda _: clock.sleep(60.1) or []
+    monkeypatch.setattr(lifecycle, "time", clock)
+    with pytest.raises(UnitError, match=r"^unit a, b was not ready after 120 s$"):
+        start_units(processes, ["b", "a"], NOBODY)
+    assert len(clock.slept) == 2
+
+
+def test_what_goes_wrong_before_the_run_is_raised() -> None:
+    with pytest.raises(UnitError, match=r"^no network$") as failed:
+        listen_before_run(FakeProcesses([[("left", Failed(-1, 3, "no network"))]]), NOBODY)  # type: ignore[arg-type]
+    assert failed.value.exit_code == 3
+    with pytest.raises(UnitError, match=r"^unit left ended before the run began; it was left$"):
+        listen_before_run(FakeProcesses([[("left", None)]]), NOBODY)  # type: ignore[arg-type]
+    with pytest.raises(KeyboardInterrupt):
+        listen_before_run(FakeProcesses([[]]), SimpleNamespace(count=1))  # type: ignore[arg-type]
+    messages = listen_before_run(FakeProcesses([[("left", Pong())]]), NOBODY)  # type: ignore[arg-type]
+    assert messages == [("left", Pong())]
+
+
+def closed(script: Sequence[Any], interrupts: Any = NOBODY) -> tuple[FakeProcesses, RunLog]:
+    processes, log = FakeProcesses(script, {"left": 1, "right": 2}), RunLog()
+    close_units(processes, log, interrupts)  # type: ignore[arg-type]
+    return processes, log
+
+
+def test_units_close_their_files_and_are_waited_for() -> None:
+    processes, log = closed([[("left", Closed())], [("left", None)], [("right", Closed())]])
+    assert sorted(processes.told[:2]) == [("left", Close()), ("right", Close())]
+    assert processes.told[2:] == [("wait", ["left", "right"])]
+    assert (log.failure, log.messages, len(processes.script)) == (None, [], 0)
+
+
+def test_a_unit_that_fails_or_ends_while_it_closes_is_said() -> None:
+    _, log = closed([[("left", Failed(-3, 4, "disk full")), ("left", Closed()), ("right", Closed())]])
+    assert (log.failure, log.messages) == (Failure("disk full", 4), ["disk full"])
+    _, log = closed([[("left", Closed()), ("right", None)]])
+    assert log.failure == Failure("unit right ended before its files were closed; it was right", 1)
+
+
+def test_units_that_do_not_close_are_named_unless_somebody_has_lost_patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = FakeTime()
+    monkeypatch.setattr(lifecycle, "time", clock)
+    script = [[], []]
+    monkeypatch.setattr(FakeProcesses, "listen", lambda self, _: clock.sleep(15.1) or self.script.popleft())
+    _, log = closed(script)
+    assert log.failure == Failure("unit left, right did not close its files", 1)
+    processes, log = closed([], SimpleNamespace(count=2))
+    assert (log.failure, processes.told[-1]) == (None, ("wait", ["left", "right"]))
+
+
+def answers(*durations: Sequence[int]) -> list[Any]:
+    return [[("right" if unit else "left", Duration(ns)) for unit, ns in enumerate(row) if ns] for row in durations]
+
+
+def test_each_stage_is_measured_on_its_own_unit_without_the_first_repetition() -> None:
+    """in (left) and mid (right); out is the last and not measured. Per frame: the chain once, then each unit thrice.
+
+    Of frame 4 the repetitions take 90, 10, 14: 90 does not count, the median is 12. Of frame 8: 20.
+    """
+    frame_4 = answers([50, 0], [0, 60], [90, 0], [10, 0], [14, 0], [0, 99], [0, 30], [0, 32])
+    frame_8 = answers([50, 0], [0, 60], [90, 0], [20, 0], [20, 0], [0, 99], [0, 41], [0, 41])
+    processes: Any = FakeProcesses([*frame_4, *frame_8])
+    times = IsolatedTimes(pipeline().graph(), processes, NOBODY)
+    assert times.mean_ns == {}
+    times.measure([4, 8])
+    assert times.mean_ns == {"in": 16, "mid": 36}
+    left, right = ("left", RunIsolated(0, 4, -1, 0)), ("right", RunIsolated(0, 4, 0, 0))
+    assert processes.told[:8] == [left, right, left, left, left, right, right, right]
+    assert len(processes.told) == 16
+
+
+def test_a_unit_is_handed_no_more_at_once_than_its_pipe_holds() -> None:
+    assert (isolated.AT_ONCE, isolated.REPEATS, isolated.LIMIT_S) == (12, 2, 10)
+    processes: Any = FakeProcesses([[("left", Duration(1))] * 12, [("right", Duration(5)), ("left", Duration(2))]])
+    times = IsolatedTimes(pipeline().graph(), processes, NOBODY)
+    assert times._durations_ns("left", [0] * 13, 3) == [1] * 12 + [2]
+
+
+def test_measuring_begins_no_frame_after_its_time_and_waits_no_longer_than_for_a_start(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clock = FakeTime()
+    monkeypatch.setattr(isolated, "time", clock)
+    rows = answers([50, 0], [0, 60], [90, 0], [10, 0], [14, 0], [0, 99], [0, 30], [0, 32])
+    processes: Any = FakeProcesses([*rows, *rows])
+    take = processes.listen
+    processes.listen = lambda ms: clock.sleep(1.5) or take(ms)
+    times = IsolatedTimes(pipeline().graph(), processes, NOBODY)
+    times.measure([4, 8, 9])
+    assert len(processes.script) == 8  # 12 s have passed after the first frame
+    processes.listen = lambda _: clock.sleep(121) or []
+    with pytest.raises(UnitError, match=r"^unit left did not end its jobs within 120 s$"):
+        times.measure([4])
+
+
+@pytest.mark.parametrize(("frames", "count"), [(1, 4), (60, 4), (75, 5), (239, 15), (240, 16), (9000, 16)])
+def test_one_frame_in_fifteen_is_measured_alone(frames: int, count: int) -> None:
+    assert run._isolated_share(frames) == count
+
+
+def test_frames_to_measure_are_spread_over_the_run() -> None:
+    assert run._spread(100, 4) == [0, 25, 50, 75]
+    assert run._spread(3, 8) == [0, 1, 2]
+    assert run._spread(10, 3) == [0, 3, 6]
+
+
+def test_settings_follow_from_policy_and_rate() -> None:
+    assert run._settings("pipelined", 9, 30.0, None, 5, 0.0, None) == Settings(9, "pipelined", hang_ns=5)
+    paced = run._settings("pipelined", 9, 30.0, 50.0, 5, 1.5, None)
+    expected = Settings(9, "pipelined", period_ns=20 * MS, deadline_ns=60 * MS, hang_ns=5, latch_ns=1_500_000)
+    assert paced == expected
+    latest = run._settings("latest", 9, 30.0, None, 5, 0.0, None)
+    assert (latest.period_ns, latest.deadline_ns, latest.asked) == (33_333_333, 99_999_999, False)
+    requests: Any = object()
+    assert run._settings("pipelined", 9, 30.0, None, 5, 0.0, requests).asked
+    with pytest.raises(BadInputError, match=r"^the run's settings: found policy 'no'"):
+        run._settings("no", 9, 30.0, None, 5, 0.0, None)
+    assert (run.HANG_NS, run.DEADLINE_PERIODS) == (10 * 10**9, 3)
+
+
+def test_the_scheduler_is_on_its_cores_and_back_afterwards() -> None:
+    before = os.sched_getaffinity(0)
+    with contextlib.suppress(ValueError), run._on_cores((min(before),)):
+        assert os.sched_getaffinity(0) == {min(before)}
+        raise ValueError
+    assert os.sched_getaffinity(0) == before
+
+
+@pytest.mark.parametrize("collects", [True, False])
+def test_answers_are_prompt_inside_the_run_alone(monkeypatch: pytest.MonkeyPatch, collects: bool) -> None:
+    calls: list[Any] = []
+    monkeypatch.setattr(run, "use_slice", calls.append)
+    monkeypatch.setattr(
+        run,
+        "gc",
+        SimpleNamespace(
+            isenabled=lambda: collects, disable=lambda: calls.append("off"), enable=lambda: calls.append("on")
+        ),
+    )
+    before = sys.getswitchinterval()
+    with run._prompt_answers():
+        assert sys.getswitchinterval() == pytest.approx(0.0002)
+        assert calls == ["off", 100_000]
+    assert sys.getswitchinterval() == before
+    assert calls[2:] == ([0, "on"] if collects else [0])

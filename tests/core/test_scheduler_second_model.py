@@ -1,0 +1,428 @@
+"""A second scheduler, written from the rules and not from the code, must do the same on random pipelines.
+
+It looks at every unit at every instant, keeps counts in place of slots and marks nothing as dirty. From the rules of
+docs/conventions.md it works out every job, drop, loss, wait, latency and account; times are whole nanoseconds.
+"""
+
+from __future__ import annotations
+
+import random
+from collections import Counter
+from typing import Any
+
+import pytest
+
+from trilane.scheduler.events import Dispatch, Graph, SetDuty, Settings, StageSpec
+from trilane.scheduler.virtual import VirtualDriver
+
+LEAD_NS = {"sequential": 0, "pipelined": 0, "latest": 1_000_000, "deadline": 1_000_000}
+SLOTS = {"single": 1, "double": 2, "triple": 3, "fifo:1": 1, "fifo:3": 3, "fifo:64": 64, "orphan:4": 4, "orphan": 6}
+BACK_OFF_NS = (0, 100_000_000, 400_000_000, 1_600_000_000)
+RESTART_NS = 3_000_000
+CAUSES = ("starved", "blocked", "throttled", "overhead")
+NO_TIME = (1 << 62) - 1
+
+
+class PlainUnit:
+    def __init__(self, name: str, stages: list[int], duty: int) -> None:
+        self.name, self.stages, self.duty = name, stages, duty
+        self.queue: list[dict[str, int]] = []
+        self.is_up, self.free_ns, self.head_since_ns, self.failures = True, 0, 0, 0
+        self.hold_until_ns: int | None = None
+        self.start_ns: int | None = None
+        self.ready_ns: int | None = None
+        self.account, self.times_ns = "starved", Counter[str]()
+        self.busy: list[tuple[int, int]] = []
+
+    def room(self) -> int:
+        if not self.is_up or self.hold_until_ns is not None:
+            return 0
+        return 2 if self.duty == 1000 else 1
+
+
+class PlainScheduler:
+    """One run of `graph` from 0 to its end; `run` fills the public fields."""
+
+    def __init__(
+        self, graph: Graph, settings: Settings, service: Any, delay_ns: int, faults: list[Any], duties: dict[str, int]
+    ) -> None:
+        self.graph, self.settings, self.service, self.delay_ns = graph, settings, service, delay_ns
+        self.last = len(graph.stages) - 1
+        self.faults = sorted(faults)
+        self.units = [
+            PlainUnit(name, [i for i, s in enumerate(graph.stages) if s.unit == name], duties.get(name, 1000))
+            for name in graph.units
+        ]
+        self.unit_of = [next(u for u in self.units if i in u.stages) for i in range(self.last + 1)]
+        self.waiting: list[list[int]] = [[] for _ in graph.stages]
+        self.epoch = [0] * self.last
+        self.estimate = [0] * len(graph.stages)
+        self.flying: dict[int, dict[str, int]] = {}
+        self.queue: list[tuple[int, int]] = []
+        self.next_frame = self.now_ns = 0
+        self.has_begun = False
+        self.jobs: list[tuple[Any, ...]] = []
+        self.ended: list[tuple[str, int, int, int, int]] = []
+        self.presented: list[tuple[int, int, int, int]] = []
+        self.dropped, self.lost = Counter[str](), Counter[str]()
+
+    # what there is
+
+    @property
+    def is_paced(self) -> bool:
+        return bool(self.settings.period_ns or self.settings.arrivals_ns)
+
+    def release_ns(self, frame: int) -> int:
+        arrivals = self.settings.arrivals_ns
+        return arrivals[frame] if arrivals else frame * self.settings.period_ns
+
+    def used(self, edge: int) -> int:
+        """Slots of the edge that are written, waited in or read."""
+        jobs = [job for unit in self.units for job in unit.queue]
+        return len(self.waiting[edge + 1]) + sum(job["stage"] in (edge, edge + 1) for job in jobs)
+
+    def has_slot(self, stage: int) -> bool:
+        if stage == self.last:
+            return True
+        rule = self.graph.edges[stage]
+        yields = rule.startswith(("triple", "orphan")) and bool(self.waiting[stage + 1])
+        return self.used(stage) < SLOTS[rule] or yields
+
+    def is_full(self) -> bool:
+        limits = [self.settings.in_flight] if self.settings.in_flight else []
+        limits += [1] if self.settings.policy == "sequential" else []
+        return bool(limits) and len(self.flying) >= min(limits)
+
+    def has_source(self) -> bool:
+        return bool(self.queue) if self.is_paced else self.next_frame < self.settings.frames
+
+    def latch_from_ns(self) -> int:
+        if self.settings.latch_ns == 0 or self.last == 0:
+            return self.now_ns
+        if self.waiting[1] or any(job["stage"] == 0 for job in self.unit_of[0].queue):
+            return NO_TIME
+        second = self.unit_of[1]
+        free_ns = second.head_since_ns if second.queue else self.now_ns
+        free_ns += sum(self.estimate[job["stage"]] for job in second.queue)
+        return free_ns - self.estimate[0] - self.settings.latch_ns
+
+    def has_input(self, stage: int) -> bool:
+        return bool(self.waiting[stage]) if stage else self.has_source()
+
+    def may_enter(self) -> bool:
+        return not self.is_full() and self.now_ns >= self.latch_from_ns()
+
+    def can_begin(self, stage: int) -> bool:
+        return self.has_input(stage) and (stage > 0 or self.may_enter()) and self.has_slot(stage)
+
+    def head(self, stage: int) -> tuple[int, int]:
+        """The stage's next frame and its deadline."""
+        if stage:
+            return self.waiting[stage][0], self.flying[self.waiting[stage][0]]["deadline"]
+        frame, released_ns = self.queue[0] if self.queue else (self.next_frame, self.now_ns)
+        return frame, self.deadline(released_ns)
+
+    def deadline(self, released_ns: int) -> int:
+        return released_ns + self.settings.deadline_ns if self.settings.deadline_ns else NO_TIME
+
+    def is_late(self, stage: int) -> bool:
+        """now + max over s of [max(own work before s, work of older frames at s) + own work from s on] > deadline."""
+        frame, deadline_ns = self.head(stage)
+        ends = []
+        for s in range(stage, self.last + 1):
+            older = sum(number < frame and row["at"] <= s for number, row in self.flying.items())
+            unit, backlog_ns = self.unit_of[s], older * self.estimate[s]
+            if older and unit.queue and unit.queue[0]["stage"] == s:
+                backlog_ns -= min(self.now_ns - unit.head_since_ns, self.estimate[s])
+            ends.append(max(sum(self.estimate[stage:s]), backlog_ns) + sum(self.estimate[s:]))
+        return deadline_ns != NO_TIME and self.now_ns + max(ends) > deadline_ns
+
+    # what happens
+
+    def drop(self, stage: int, cause: str) -> None:
+        """The oldest that waits for the stage."""
+        if stage:
+            del self.flying[self.waiting[stage].pop(0)]
+            self.dropped[f"{self.graph.stages[stage - 1].name}->{self.graph.stages[stage].name}:{cause}"] += 1
+        else:
+            self.queue.pop(0)
+            self.dropped[f"source->{self.graph.stages[0].name}:{cause}"] += 1
+
+    def drop_in_vain(self, stage: int) -> None:
+        policy = self.settings.policy
+        if stage == 0 and self.is_full():
+            return
+        line: list[Any] = self.waiting[stage] if stage else self.queue
+        while policy == "latest" and len(line) > 1:
+            self.drop(stage, "stale")
+        while policy == "deadline" and line and self.is_late(stage):
+            if stage == 0 and not self.flying:
+                self.estimate = [ns - (ns >> 4) for ns in self.estimate]
+            self.drop(stage, "late")
+
+    def next_stage(self, unit: PlainUnit) -> int | None:
+        lead_ns = LEAD_NS[self.settings.policy]
+        if lead_ns and unit.queue and self.now_ns < self.expected_end_ns(unit) - lead_ns:
+            return None
+        runnable = []
+        for stage in unit.stages:
+            self.drop_in_vain(stage)
+            if self.can_begin(stage):
+                runnable.append(stage)
+        if self.settings.policy == "latest":
+            return max(runnable, default=None)
+        if self.settings.policy == "deadline":
+            return min(runnable, key=lambda stage: self.head(stage)[::-1], default=None)
+        return min(runnable, key=lambda stage: self.head(stage)[0], default=None)
+
+    def expected_end_ns(self, unit: PlainUnit) -> int:
+        return unit.head_since_ns + self.estimate[unit.queue[0]["stage"]]
+
+    def hand_over(self, unit: PlainUnit, stage: int) -> None:
+        if stage:
+            frame = self.waiting[stage].pop(0)
+        else:
+            frame, released_ns = self.queue.pop(0) if self.queue else (self.next_frame, self.now_ns)
+            self.next_frame = max(self.next_frame, frame + 1)
+            self.flying[frame] = {"at": 0, "ready": released_ns, "deadline": self.deadline(released_ns), "pose": 0}
+        if stage < self.last and self.used(stage) >= SLOTS[self.graph.edges[stage]]:
+            self.drop(stage + 1, "stale" if self.graph.edges[stage] == "triple" else "pool")
+        begin_ns = max(self.now_ns + self.delay_ns, unit.free_ns)
+        name = self.graph.stages[stage].name
+        end_ns = unit.free_ns = begin_ns + self.service(name, unit.name, frame, begin_ns)
+        epoch = self.epoch[min(stage, self.last - 1)] if self.last else 0
+        if not unit.queue:
+            unit.head_since_ns = self.now_ns
+        unit.queue.append({"stage": stage, "frame": frame, "begin": begin_ns, "end": end_ns, "from": self.now_ns})
+        self.jobs.append((name, unit.name, frame, self.flying[frame]["ready"], self.now_ns, begin_ns, end_ns, epoch))
+
+    def job_done(self, unit: PlainUnit) -> None:
+        job = unit.queue.pop(0)
+        stage, end_ns, frame = job["stage"], job["end"], self.flying[job["frame"]]
+        took_ns = end_ns - job["begin"]
+        unit.head_since_ns, unit.failures = self.now_ns, 0
+        unit.busy.append((job["begin"], end_ns))
+        self.ended.append((self.graph.stages[stage].name, job["frame"], took_ns, job["begin"] - frame["ready"], end_ns))
+        learnt = self.estimate[stage]
+        self.estimate[stage] = learnt + ((took_ns - learnt) >> 3) if learnt else took_ns
+        if unit.duty < 1000:
+            unit.hold_until_ns = end_ns + took_ns * (1000 - unit.duty) // unit.duty
+        frame["ready"], frame["at"] = end_ns, stage + 1
+        if stage == 0:
+            frame["pose"] = job["begin"]
+        if self.graph.stages[stage].name == self.graph.latency_to:
+            frame["latency"] = end_ns - frame["pose"]
+        if stage == self.last:
+            del self.flying[job["frame"]]
+            self.presented.append((job["frame"], end_ns, frame["latency"], end_ns - frame["deadline"]))
+            return
+        while self.graph.edges[stage] == "triple" and self.waiting[stage + 1]:
+            self.drop(stage + 1, "stale")
+        self.waiting[stage + 1].append(job["frame"])
+
+    def die(self, unit: PlainUnit) -> None:
+        jobs, unit.queue = unit.queue, []
+        for place, job in enumerate(jobs):
+            if place == 0 or job["stage"] == 0:
+                del self.flying[job["frame"]]
+                self.lost[f"died:{unit.name}"] += 1
+            else:
+                line = self.waiting[job["stage"]]
+                line[:] = sorted([*line, job["frame"]])
+                while self.graph.edges[job["stage"] - 1] == "triple" and len(line) > 1:
+                    self.drop(job["stage"], "stale")
+        for stage in unit.stages:
+            for edge in (stage - 1, stage):
+                if 0 <= edge < self.last:
+                    self.epoch[edge] += 1
+        unit.is_up, unit.ready_ns = False, None
+        unit.start_ns = self.now_ns + BACK_OFF_NS[unit.failures]
+        unit.failures += 1
+
+    def account(self, unit: PlainUnit) -> str:
+        if unit.queue or not unit.is_up:
+            return "assigned"
+        why = "starved"
+        for stage in unit.stages:
+            if self.has_input(stage):
+                if (stage == 0 and not self.may_enter()) or not self.has_slot(stage):
+                    return "blocked"
+                why = "throttled"
+        return why
+
+    # the run
+
+    def run(self) -> None:
+        while True:
+            at_ns, event = self.next_event()
+            for unit in self.units:
+                unit.times_ns[unit.account] += at_ns - self.now_ns
+            self.now_ns = at_ns
+            first: list[PlainUnit] = []
+            if event is not None:
+                first = event()
+            self.clockwork()
+            self.assign([*first, *self.units])
+            for unit in self.units:
+                unit.account = self.account(unit)
+            if not self.flying and not self.queue and self.next_frame >= self.settings.frames:
+                return
+
+    def next_event(self) -> tuple[int, Any]:
+        """Faults come before other events at one time, events before the times that are only looked at."""
+        events: list[tuple[int, int, int, Any]] = []
+        if self.faults:
+            at_ns, name = self.faults[0]
+            events.append((at_ns, 0, 0, lambda: self.fault(name)))
+        for number, unit in enumerate(self.units):
+            if unit.queue:
+                events.append((unit.queue[0]["end"] + self.delay_ns, 1, number, lambda u=unit: self.done(u)))
+            if unit.ready_ns is not None:
+                events.append((unit.ready_ns, 1, number, lambda u=unit: self.ready(u)))
+        looks = [at for unit in self.units for at in (unit.hold_until_ns, unit.start_ns) if at is not None]
+        if self.is_paced and self.next_frame < self.settings.frames:
+            looks.append(self.release_ns(self.next_frame))
+        if self.settings.queue_timeout_ns and self.queue:
+            looks.append(self.queue[0][1] + self.settings.queue_timeout_ns)
+        if lead_ns := LEAD_NS[self.settings.policy]:
+            looks += [self.expected_end_ns(unit) - lead_ns for unit in self.units if len(unit.queue) == 1]
+        if self.has_source():
+            looks.append(self.latch_from_ns())
+        later = [(at, 2, 0, None) for at in looks if self.now_ns < at < NO_TIME]
+        if not self.has_begun:
+            self.has_begun = True
+            later.append((0, 2, 0, None))
+        at_ns, _, _, event = min([*events, *later], key=lambda row: row[:3])
+        return at_ns, event
+
+    def fault(self, name: str) -> list[PlainUnit]:
+        self.faults.pop(0)
+        unit = next(unit for unit in self.units if unit.name == name)
+        if unit.is_up or unit.ready_ns is not None:
+            self.die(unit)
+        return []
+
+    def done(self, unit: PlainUnit) -> list[PlainUnit]:
+        """The unit itself is served first, then the one before its stage, then the one after it."""
+        stage = unit.queue[0]["stage"]
+        self.job_done(unit)
+        before = [self.unit_of[stage - 1]] if stage else []
+        after = [self.unit_of[stage + 1]] if stage < self.last else [self.unit_of[0]]
+        return [unit, *before, *after]
+
+    def ready(self, unit: PlainUnit) -> list[PlainUnit]:
+        unit.is_up, unit.ready_ns = True, None
+        return [unit]
+
+    def clockwork(self) -> None:
+        for unit in self.units:
+            if unit.hold_until_ns is not None and unit.hold_until_ns <= self.now_ns:
+                unit.hold_until_ns = None
+            if unit.start_ns is not None and unit.start_ns <= self.now_ns:
+                unit.start_ns, unit.ready_ns, unit.free_ns = None, self.now_ns + RESTART_NS, 0
+                unit.hold_until_ns = None
+        while self.is_paced and self.next_frame < self.settings.frames:
+            if self.release_ns(self.next_frame) > self.now_ns:
+                break
+            self.queue.append((self.next_frame, self.release_ns(self.next_frame)))
+            self.next_frame += 1
+            if self.settings.in_queue and len(self.queue) > self.settings.in_queue:
+                self.queue.pop()
+                self.dropped[f"source->{self.graph.stages[0].name}:queue_full"] += 1
+        timeout_ns = self.settings.queue_timeout_ns
+        while timeout_ns and self.queue and self.queue[0][1] + timeout_ns <= self.now_ns:
+            self.drop(0, "timeout")
+
+    def assign(self, units: list[PlainUnit]) -> None:
+        changed = True
+        while changed:
+            changed = False
+            for unit in units:
+                while len(unit.queue) < unit.room() and (stage := self.next_stage(unit)) is not None:
+                    self.hand_over(unit, stage)
+                    changed = True
+
+
+def service_of(seed: int) -> Any:
+    """0.2 to 5 ms, other for each stage and frame, so that hardly two jobs end in one instant."""
+    return lambda stage, _unit, frame, _begin_ns: random.Random(f"{seed} {stage} {frame}").randint(200_000, 5_000_000)
+
+
+def drawn(seed: int) -> tuple[Graph, Settings, int, list[tuple[int, str]], dict[str, int]]:
+    draw = random.Random(seed)
+    policy = draw.choice(["sequential", "pipelined", "pipelined", "latest", "deadline"])
+    count = draw.randint(1, 5)
+    stages = tuple(StageSpec(f"s{i}", draw.choice(["cpu", "gpu", "dsp"])) for i in range(count))
+    # a frame that waits for a slot of the next edge is given up as late when its unit is looked at, which need not be
+    # the first instant in which it is late: so the edges of `deadline` are never full
+    rules = ["fifo:64"] if policy == "deadline" else [rule for rule in SLOTS if rule != "fifo:64"]
+    graph = Graph(stages, tuple(draw.choice(rules) for _ in stages[1:]), draw.choice(stages).name)
+    paced = policy in ("latest", "deadline") or draw.random() < 0.5
+    rate = draw.choice(["period_ns", "arrivals_ns"]) if paced else None
+    period_ns = draw.randint(2_000_000, 9_000_000)
+    frames = 40
+    arrivals_ns = tuple(sorted(draw.randint(0, frames * period_ns) for _ in range(frames)))
+    settings = Settings(
+        frames,
+        policy,
+        period_ns=period_ns if rate == "period_ns" else 0,
+        arrivals_ns=arrivals_ns if rate == "arrivals_ns" else (),
+        latch_ns=draw.choice([0, 0, 700_001]) if policy == "pipelined" else 0,
+        deadline_ns=draw.choice([0, 9_000_000, 16_000_001, 30_000_000]) if paced or policy == "pipelined" else 0,
+        in_flight=draw.choice([0, 0, 2, 3, 5]),
+        in_queue=draw.choice([0, 0, 1, 2]),
+        queue_timeout_ns=draw.choice([0, 0, 6_000_001]) if rate else 0,
+    )
+    faults = [(draw.randint(1, 150_000_000), draw.choice(graph.units)) for _ in range(draw.choice([0, 0, 1, 3]))]
+    yields = any(rule.startswith(("triple", "orphan")) for rule in graph.edges)
+    duties = {name: draw.choice([1000, 1000, 500, 333]) for name in graph.units} if not yields and count > 1 else {}
+    return graph, settings, draw.choice([0, 50_001]), faults, duties
+
+
+@pytest.mark.parametrize("seed", range(120))
+def test_the_core_does_what_a_plain_reading_of_the_rules_does(seed: int) -> None:
+    graph, settings, delay_ns, faults, duties = drawn(seed)
+    model = PlainScheduler(graph, settings, service_of(seed), delay_ns, faults, duties)
+    model.run()
+    driver = VirtualDriver(
+        graph,
+        settings,
+        service_of(seed),
+        message_delay_ns=delay_ns,
+        restart_ns=RESTART_NS,
+        faults=faults,
+        inputs=[(0, SetDuty(name, duty)) for name, duty in duties.items()],
+        keep=True,
+    )
+    driver.run()
+    assert driver.recording is not None
+    epochs = [a.job.epoch for _, _, actions in driver.recording.steps for a in actions if isinstance(a, Dispatch)]
+    assert [(*row, epoch) for row, epoch in zip(driver.jobs, epochs, strict=True)] == model.jobs
+    ledger = driver.core.ledger
+    presented = zip(ledger.presented_frames, ledger.presented_ns, ledger.latency_ns, strict=True)
+    assert list(presented) == [row[:3] for row in model.presented]
+    assert ledger.lateness_ns == ([row[3] for row in model.presented] if settings.deadline_ns else [])
+    assert (ledger.dropped_by_cause, ledger.lost_by_cause) == (dict(model.dropped), dict(model.lost))
+    report = ledger.report(clock="virtual", requested=settings.frames)
+    assert report["duration_s"] == model.now_ns / 1e9
+    assert report["deadline_misses"] == sum(late > 0 for late in ledger.lateness_ns)
+    for spec in graph.stages:
+        rows = [row for row in model.ended if row[0] == spec.name]
+        row = report["stages"][spec.name]
+        for key, values in (("service_ms", [r[2] for r in rows]), ("wait_ms", [r[3] for r in rows])):
+            assert row[key]["mean"] == pytest.approx(sum(values) / max(len(values), 1) / 1e6, abs=1e-6)
+            assert row[key]["max"] == pytest.approx(max(values, default=0) / 1e6, abs=1e-6)
+    for unit in model.units:
+        check_account(report["units"][unit.name], unit, model.now_ns)
+
+
+def check_account(row: dict[str, Any], unit: PlainUnit, total_ns: int) -> None:
+    busy_ns, until_ns = 0, 0
+    for begin_ns, end_ns in sorted(unit.busy):
+        busy_ns += max(0, end_ns - max(begin_ns, until_ns))
+        until_ns = max(until_ns, end_ns)
+    idle = {cause: unit.times_ns[cause] / total_ns for cause in CAUSES[:3]}
+    idle["overhead"] = (unit.times_ns["assigned"] - busy_ns) / total_ns
+    assert row["busy"] == pytest.approx(busy_ns / total_ns)
+    assert {cause: row["idle"][cause] for cause in CAUSES} == pytest.approx(idle, abs=1e-12)
+    assert row["jobs"] == len(unit.busy)

@@ -1,0 +1,435 @@
+"""What crosses between processes, to the byte and the flag: layouts, messages, edge rules, sockets, system calls."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import struct
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+import zmq
+
+from trilane.errors import TrilaneError
+from trilane.transport import heartbeats, job_pipe, memory, messages, packets, slots, socket_folder, wakeup
+from trilane.transport.heartbeats import HeartbeatSocket, context_on_cores
+from trilane.transport.job_pipe import JobPipe, job_pipe_pair
+from trilane.transport.link import Link
+from trilane.transport.memory import RegionLayout, create_region, map_region
+from trilane.transport.messages import MessageError, pack, unpack
+from trilane.transport.packets import SlotLayout, header_dtype, view_packet
+from trilane.transport.slots import EdgeRule, EdgeSlots, SlotError, edge_rule
+from trilane.transport.socket_folder import SocketFolder, remove_abandoned
+
+PAGE = 4096
+MIB = 1 << 20
+
+
+def words(*values: int) -> bytes:
+    return b"".join(value.to_bytes(8, "little", signed=True) for value in values)
+
+
+#: Message -> its bytes: which message it is, its integers, and msgpack of what is left when that is not empty.
+BYTES = [
+    (messages.RunJob(1, 2, 3, -1, 5, 6), b"\0" + words(1, 2, 3, -1, 5, 6)),
+    (messages.RunIsolated(1, 2, -1, 4), b"\1" + words(1, 2, -1, 4)),
+    (messages.Ping(), b"\2"),
+    (messages.Close(), b"\3"),
+    (messages.Ready(77), b"\4" + words(77)),
+    (messages.Done(1, 2, 3, 4, {}), b"\5" + words(1, 2, 3, 4)),
+    (messages.Done(1, 2, 3, 4, {"a": 1.5}), b"\5" + words(1, 2, 3, 4) + b"\x81\xa1a\xcb\x3f\xf8" + bytes(6)),
+    (messages.Duration(9), b"\6" + words(9)),
+    (messages.Failed(-1, 2, "no"), b"\7" + words(-1, 2) + b"\xa2no"),
+    (messages.Failed(-3, 2, ""), b"\7" + words(-3, 2)),
+    (messages.Pong(), b"\x08"),
+    (messages.Closed(), b"\x09"),
+]
+
+
+@pytest.mark.parametrize(("message", "data"), BYTES, ids=[type(row[0]).__name__ for row in BYTES])
+def test_a_message_has_the_bytes_that_are_written_down(message: Any, data: bytes) -> None:
+    assert pack(message) == data
+    again = unpack(data)
+    assert (again, type(again)) == (message, type(message))
+    with pytest.raises(MessageError):
+        unpack(data[: len(data) // 2] if len(data) > 1 else b"\x0a")
+
+
+def test_the_numbers_that_both_sides_of_a_message_agree_on() -> None:
+    assert (messages.MAX_BYTES, messages.MAX_TEXT) == (4096, 2000)
+    assert (messages.BUILDING, messages.MEASURING, messages.CLOSING) == (-1, -2, -3)
+
+
+def test_what_is_wrong_with_bytes_is_said() -> None:
+    with pytest.raises(MessageError, match=r"unknown message b'\\nabc'"):
+        unpack(b"\x0aabc")
+    with pytest.raises(MessageError, match="10 bytes for Ready, which takes 9"):
+        unpack(b"\4" + words(1) + b"\0")
+    with pytest.raises(MessageError, match="16 bytes for Failed, which takes 17"):
+        unpack(b"\7" + words(1, 2)[:15])
+    with pytest.raises(MessageError, match="found '1', expected str"):
+        unpack(b"\7" + words(1, 2) + b"\1")
+    with pytest.raises(MessageError, match="not msgpack: "):
+        unpack(b"\7" + words(1, 2) + b"\xc1")
+    with pytest.raises(MessageError, match="Failed of 4096 bytes, expected less than 4096"):
+        pack(messages.Failed(1, 2, "e" * 4093))
+    assert unpack(pack(messages.Done(1, 2, 3, 4, {"a": 1, "b": 2.5}))).metrics == {"a": 1, "b": 2.5}
+
+
+@pytest.mark.parametrize(("payload", "slot_bytes"), [(0, 1), (1, 2), (4095, 2), (4096, 2), (4097, 3), (40_960, 11)])
+def test_a_slot_is_a_page_of_header_and_whole_pages_of_payload(payload: int, slot_bytes: int) -> None:
+    layout = SlotLayout(header_dtype(), payload)
+    assert (layout.header_bytes, layout.slot_bytes) == (PAGE, slot_bytes * PAGE)
+    assert RegionLayout(5, layout).total_bytes == 5 * slot_bytes * PAGE
+
+
+def test_a_header_of_more_than_a_page_takes_two() -> None:
+    layout = SlotLayout(header_dtype([("matrix", "<f8", (512,))]), 1)
+    assert (layout.header_bytes, layout.slot_bytes) == (2 * PAGE, 3 * PAGE)
+
+
+def test_a_packet_shows_the_bytes_of_its_slot_and_no_others() -> None:
+    """Header: frame as 8 bytes, sampling time as 8, epoch as 4, then what is the pipeline's own; payload: a page on."""
+    layout = SlotLayout(header_dtype([("own", "<u2")]), 10)
+    memory_of_slot = bytearray(2 * PAGE + 5)
+    packet = view_packet(memoryview(memory_of_slot), layout)
+    packet.header["frame"], packet.header["t_sampled_ns"] = 2**63, -5
+    packet.header["epoch"], packet.header["own"] = 7, 515
+    packet.payload[:] = range(1, 11)
+    start = (2**63).to_bytes(8, "little") + words(-5) + b"\7\0\0\0" + b"\3\2"
+    assert memory_of_slot[: len(start)] == start
+    assert memory_of_slot[PAGE : PAGE + 12] == bytes([*range(1, 11), 0, 0])
+    assert (packet.header.shape, packet.payload.shape, packet.payload.dtype) == ((), (10,), np.uint8)
+    with pytest.raises(ValueError, match="slot of 8191 bytes, the layout needs 8192"):
+        view_packet(memoryview(memory_of_slot)[: 2 * PAGE - 1], layout)
+
+
+def test_a_region_is_as_long_as_its_slots_and_stays_so() -> None:
+    layout = RegionLayout(3, SlotLayout(header_dtype(), PAGE))
+    fd = create_region("edge", layout)
+    try:
+        assert os.fstat(fd).st_size == 6 * PAGE
+        assert not os.get_inheritable(fd)
+        assert str(Path(f"/proc/self/fd/{fd}").readlink()).startswith("/memfd:trilane:edge")
+        for size in (6 * PAGE - 1, 6 * PAGE + 1):
+            with pytest.raises(PermissionError):
+                os.ftruncate(fd, size)
+        mapped = map_region(fd, layout)
+        mapped[1].payload[0], mapped[2].header["frame"] = 5, 9
+        assert os.pread(fd, 1, 3 * PAGE) == b"\5"
+        assert os.pread(fd, 1, 4 * PAGE) == b"\x09"
+        with pytest.raises(ValueError, match=f"region of {6 * PAGE} bytes, the layout needs {8 * PAGE}"):
+            map_region(fd, RegionLayout(4, layout.slot))
+    finally:
+        os.close(fd)
+
+
+def test_memory_that_is_just_there_is_taken_and_a_byte_more_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    layout = RegionLayout(2, SlotLayout(header_dtype(), MIB - PAGE))
+    said = (
+        r"^edge pose->raster needs 2 MiB of memory for 2 slots and 1 MiB are free; "
+        "lower the tensor or output size, or the number of slots$"
+    )
+    for free, is_refused in ((2 * MIB, False), (2 * MIB - 1, True)):
+        monkeypatch.setattr(psutil, "virtual_memory", lambda free=free: type("Memory", (), {"available": free}))
+        if is_refused:
+            with pytest.raises(TrilaneError, match=said):
+                create_region("pose->raster", layout)
+        else:
+            os.close(create_region("pose->raster", layout))
+
+
+def test_memory_that_cannot_be_reserved_leaves_no_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    before = psutil.Process().num_fds()
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(TrilaneError, match="edge e needs 0 MiB of memory for 1 slots and no space left on device; "):
+        create_region("e", RegionLayout(1, SlotLayout(header_dtype(), 1)))
+    assert psutil.Process().num_fds() == before
+
+
+def test_the_table_of_edges_is_the_documented_one() -> None:
+    rows = {name: (rule.name, rule.slots, rule.mailbox, rule.yields) for name, rule in slots.RULES.items()}
+    assert rows == {
+        "single": ("single", 1, False, False),
+        "double": ("double", 2, False, False),
+        "triple": ("triple", 3, True, True),
+        "fifo": ("fifo", 4, False, False),
+        "orphan": ("orphan", 6, False, True),
+    }
+    assert edge_rule("orphan:4") == EdgeRule("orphan", 4, False, True)
+    assert edge_rule("orphan:64") == EdgeRule("orphan", 64, False, True)
+    assert (edge_rule("fifo:1"), edge_rule("fifo:64")) == (EdgeRule("fifo", 1), EdgeRule("fifo", 64))
+    assert slots.TRANSITIONS == {
+        "claim": ("free", "writing"),
+        "commit": ("writing", "ready"),
+        "abandon": ("writing", "free"),
+        "take": ("ready", "reading"),
+        "drop": ("ready", "free"),
+        "release": ("reading", "free"),
+        "give_back": ("reading", "ready"),
+    }
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("quad", "single, double, triple, fifo:N or orphan:N"),
+        ("double:2", "single, double, triple, fifo:N or orphan:N"),
+        ("fifo:65", "fifo:N with N from 1 to 64"),
+        ("fifo:0", "fifo:N with N from 1 to 64"),
+        ("orphan:3", "orphan:N with N from 4 to 64"),
+        ("fifo:99999", "single, double, triple, fifo:N or orphan:N"),
+    ],
+)
+def test_an_edge_that_there_is_not_is_refused_with_those_that_there_are(text: str, expected: str) -> None:
+    with pytest.raises(ValueError, match=f"found edge '{text}', expected {expected}"):
+        edge_rule(text)
+
+
+def test_the_slots_of_a_fifo_from_claim_to_release() -> None:
+    """Step by step over two slots: which slot, which state, which frame."""
+    edge = EdgeSlots(edge_rule("fifo:2"))
+    assert (edge.state, edge.frame, edge.free, list(edge.ready), edge.epoch) == (["free"] * 2, [-1, -1], [1, 0], [], 0)
+    assert edge.claim(7) == (0, None)
+    assert (edge.state, edge.frame) == (["writing", "free"], [7, -1])
+    assert edge.commit(0) == []
+    assert edge.claim(8) == (1, None)
+    assert not edge.can_claim()
+    with pytest.raises(SlotError, match="no slot to claim"):
+        edge.claim(9)
+    edge.take(0)
+    assert (edge.state, list(edge.ready)) == (["reading", "writing"], [])
+    edge.abandon(1)
+    assert (edge.state, edge.frame, edge.free) == (["reading", "free"], [7, -1], [1])
+    assert edge.can_claim()
+    with pytest.raises(SlotError, match="cannot take slot 0, which is reading"):
+        edge.take(0)
+    edge.release(0)
+    assert (edge.state, edge.frame, edge.free) == (["free"] * 2, [-1, -1], [1, 0])
+
+
+def test_a_claim_evicts_the_oldest_only_when_no_slot_is_free() -> None:
+    edge = EdgeSlots(edge_rule("orphan:4"))
+    for frame in range(3):
+        edge.commit(edge.claim(frame)[0])
+    assert edge.claim(3) == (3, None)
+    assert edge.can_claim()
+    assert edge.claim(4) == (0, 0)
+    assert [edge.frame[slot] for slot in edge.ready] == [1, 2]
+    assert edge.drop(2) == 2
+    assert (edge.frame, edge.free) == ([4, 1, -1, 3], [2])
+
+
+def test_pipes_are_crossed_keep_messages_apart_and_are_not_inherited() -> None:
+    ours, theirs = job_pipe_pair()
+    try:
+        for end, other in ((ours, theirs), (theirs, ours)):
+            os.write(end.writes, b"one")
+            os.write(end.writes, b"two")
+            assert [os.read(other.reads, 99), os.read(other.reads, 99)] == [b"one", b"two"]
+        for fd in (*ours, *theirs):
+            assert not os.get_inheritable(fd)
+        JobPipe(ours, waits=True), JobPipe(theirs)
+        assert [os.get_blocking(fd) for fd in (*ours, *theirs)] == [True, False, False, False]
+        assert (JobPipe(ours).fileno(), JobPipe(ours).ended) == (ours.reads, False)
+    finally:
+        ours.close()
+        theirs.close()
+
+
+def test_a_pipe_of_sixteen_pages_will_do_and_a_smaller_one_will_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert job_pipe.PACKETS == 16
+    monkeypatch.setattr(fcntl, "fcntl", lambda *_: 16 * os.sysconf("SC_PAGESIZE"))
+    for end in job_pipe_pair():
+        end.close()
+    monkeypatch.setattr(fcntl, "fcntl", lambda *_: 16 * os.sysconf("SC_PAGESIZE") - 1)
+    with pytest.raises(TrilaneError, match=r"^no pipe for 16 messages: 65535 bytes for a pipe, by /proc"):
+        job_pipe_pair()
+
+
+def test_a_heartbeat_socket_holds_little_takes_no_large_message_and_is_closed_at_once() -> None:
+    context = zmq.Context()
+    one, other = HeartbeatSocket(context), HeartbeatSocket(context, 5)
+    options = (zmq.TYPE, zmq.LINGER, zmq.MAXMSGSIZE, zmq.SNDHWM, zmq.RCVHWM)
+    assert [one.socket.getsockopt(option) for option in options] == [zmq.PAIR, 0, 4096, 64, 64]
+    assert other.socket.getsockopt(zmq.LINGER) == 5
+    assert one.fileno() == one.socket.getsockopt(zmq.FD)
+    assert heartbeats.LINGER_MS == 1000
+    one.send(messages.Pong())  # nobody is connected: it is dropped, and nobody waits
+    one.close()
+    other.close()
+    assert one.socket.closed
+    context.term()
+
+
+def test_a_link_hands_its_linger_on_and_closes_both_ways() -> None:
+    context = zmq.Context()
+    ours, theirs = job_pipe_pair()
+    link, other = Link(context, JobPipe(ours), 7), Link(context, JobPipe(theirs))
+    assert [each.heartbeat_socket.socket.getsockopt(zmq.LINGER) for each in (link, other)] == [7, 0]
+    assert link.heartbeat_fd == link.heartbeat_socket.fileno()
+    link.close()
+    assert link.heartbeat_socket.socket.closed
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        os.fstat(ours.reads)
+    other.close()
+    context.term()
+
+
+def test_every_heartbeat_that_came_is_received_in_order(tmp_path: Path) -> None:
+    context = zmq.Context()
+    one, other = HeartbeatSocket(context), HeartbeatSocket(context)
+    one.socket.bind(f"ipc://{tmp_path}/h")
+    other.socket.connect(f"ipc://{tmp_path}/h")
+    for pid in range(5):
+        other.send(messages.Ready(pid))
+    other.send(messages.Pong())
+    received: list[Any] = []
+    while len(received) < 6 and one.socket.poll(2000):
+        received += one.receive()
+    assert received == [*(messages.Ready(pid) for pid in range(5)), messages.Pong()]
+    one.close()
+    other.close()
+    context.term()
+
+
+def test_the_thread_of_heartbeats_stays_on_the_schedulers_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its time slice is asked for before it is made, for it inherits it."""
+    slices: list[int] = []
+    monkeypatch.setattr(heartbeats, "use_slice", slices.append)
+    core = max(os.sched_getaffinity(0))
+    tasks = Path("/proc/self/task")
+    before = set(tasks.iterdir())
+    context = context_on_cores((core,))
+    assert slices == [100_000]
+    socket = HeartbeatSocket(context)
+    io_threads: list[Path] = []
+    end = time.monotonic() + 2
+    while not io_threads and time.monotonic() < end:  # a thread names itself once it runs, after it chose its cores
+        io_threads = [t for t in set(tasks.iterdir()) - before if (t / "comm").read_text().startswith("ZMQbg/IO")]
+    assert [os.sched_getaffinity(int(task.name)) for task in io_threads] == [{core}]
+    socket.close()
+    context.term()
+
+
+def test_the_folder_of_a_socket(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with SocketFolder() as folder:
+        assert folder.path.parent == tmp_path and folder.path.name.startswith("trilane-")
+        assert folder.endpoint("cpu") == f"ipc://{folder.path}/cpu"
+        assert (folder.path / "lock").stat().st_mode & 0o777 == 0o600
+        remove_abandoned(tmp_path)
+        assert folder.path.is_dir()
+        fds = psutil.Process().num_fds()
+    assert not folder.path.exists()
+    assert psutil.Process().num_fds() == fds - 1
+
+
+@pytest.mark.parametrize(("length", "is_kept"), [(79, True), (80, False)])
+def test_a_base_whose_name_is_too_long_for_a_socket_gives_way_to_tmp(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, length: int, is_kept: bool
+) -> None:
+    base = "/" + "b" * (length - 1)
+    made: list[str] = []
+    monkeypatch.setattr("tempfile.tempdir", base)
+    monkeypatch.setattr(socket_folder, "remove_abandoned", lambda path: made.append(str(path)))
+    monkeypatch.setattr("tempfile.mkdtemp", lambda prefix, dir: made.append(dir) or str(tmp_path))  # noqa: ARG005
+    SocketFolder().remove()
+    assert made == [base if is_kept else "/tmp"] * 2  # noqa: S108
+
+
+def test_a_folder_of_somebody_else_is_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("trilane-a", "trilane-b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "lock").touch()
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "getuid", lambda: 12345)
+        remove_abandoned(tmp_path)
+    assert len(list(tmp_path.iterdir())) == 2
+    remove_abandoned(tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+class FakeLibc:
+    """Notes the system calls that it is asked for, and answers each with `answer`."""
+
+    def __init__(self, answer: int) -> None:
+        self.answer, self.calls = answer, []
+
+    def syscall(self, *call: Any) -> int:
+        self.calls.append(call)
+        return self.answer
+
+
+@pytest.mark.parametrize(("answer", "accepted"), [(0, True), (-1, False)])
+def test_a_slice_is_asked_for_by_sched_setattr(monkeypatch: pytest.MonkeyPatch, answer: int, accepted: bool) -> None:
+    """48 bytes: size, policy 0, no flags, niceness, priority 0, the slice as runtime, no deadline, no period."""
+    libc = FakeLibc(answer)
+    monkeypatch.setattr("ctypes.CDLL", lambda _: libc)
+    monkeypatch.setattr("os.getpriority", lambda which, who: {(os.PRIO_PROCESS, 0): 3}[which, who])
+    monkeypatch.setattr("platform.machine", lambda: "aarch64")
+    assert wakeup.use_slice(wakeup.UNIT_NS) is accepted
+    assert libc.calls == [(274, 0, struct.pack("=IIQiIQQQ", 48, 0, 0, 3, 0, 1_000_000, 0, 0), 0)]
+    assert (wakeup.SCHED_SETATTR["x86_64"], wakeup.SHORTEST_NS, wakeup.DEFAULT) == (314, 100_000, 0)
+
+
+def test_where_slices_are_unknown_or_not_ours_nothing_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    libc = FakeLibc(0)
+    monkeypatch.setattr("ctypes.CDLL", lambda _: libc)
+    with monkeypatch.context() as patched:
+        patched.setattr("platform.machine", lambda: "riscv64")
+        assert wakeup.use_slice(1) is False
+    monkeypatch.setattr("os.sched_getscheduler", lambda _: os.SCHED_FIFO)
+    assert wakeup.use_slice(1) is False
+    assert libc.calls == []
+
+
+def test_the_file_that_keeps_cores_awake_is_held_open_inside_the_block(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert Path("/dev/cpu_dma_latency") == wakeup.LATENCY_FILE
+    file = tmp_path / "latency"
+    file.touch()
+    monkeypatch.setattr(wakeup, "LATENCY_FILE", file)
+    before = psutil.Process().num_fds()
+    with wakeup.awake() as idle_cores:
+        assert (idle_cores, psutil.Process().num_fds()) == ("wait awake", before + 1)
+        assert file.read_bytes() == bytes(4)
+    assert psutil.Process().num_fds() == before
+    with wakeup.awake(False) as idle_cores:
+        assert idle_cores == "sleep: the performance profile asks for no haste"
+        assert psutil.Process().num_fds() == before
+
+
+def test_the_constants_of_linux_are_those_of_its_headers() -> None:
+    assert (memory.F_ADD_SEALS, memory.F_SEAL_SHRINK, memory.F_SEAL_GROW) == (1033, 2, 4)
+    assert packets.PAGE == PAGE
+    assert packets.FRAME_FIELDS == (("frame", "<u8"), ("t_sampled_ns", "<i8"), ("epoch", "<u4"))
+
+
+def test_receiving_heartbeats_waits_for_none() -> None:
+    asked: list[Any] = []
+
+    class Socket:
+        def poll(self, timeout_ms: int) -> bool:
+            asked.append(timeout_ms)
+            return len(asked) < 3
+
+        def recv(self, flags: int) -> bytes:
+            assert flags == zmq.DONTWAIT
+            return pack(messages.Pong())
+
+    context = zmq.Context()
+    one = HeartbeatSocket(context)
+    real, one.socket = one.socket, Socket()  # type: ignore[assignment]
+    assert one.receive() == [messages.Pong()] * 2
+    assert asked == [0, 0, 0]
+    real.close()
+    context.term()

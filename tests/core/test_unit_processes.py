@@ -1,0 +1,360 @@
+"""The parent's side of units, with `sleep` in the place of each: what it hands over, hears, keeps and ends."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+import zmq
+
+from trilane.errors import TrilaneError
+from trilane.pipeline import unit_processes, unit_starter
+from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, UnitSettings
+from trilane.pipeline.regions import EdgeRegion
+from trilane.pipeline.run_metrics import metrics_of
+from trilane.pipeline.unit_processes import UnitMessage, UnitProcesses
+from trilane.pipeline.unit_spec import UnitSpec
+from trilane.pipeline.unit_starter import ForkedCall, StartedUnit, UnitStarter
+from trilane.scheduler.events import Settings
+from trilane.scheduler.virtual import simulate
+from trilane.transport.heartbeats import HeartbeatSocket
+from trilane.transport.job_pipe import JobPipe, JobPipeEnd
+from trilane.transport.messages import Done, Ping, Pong, Ready
+from trilane.transport.packets import header_dtype
+
+PIPELINE = Pipeline(
+    stages=tuple(
+        PipelineStage(name=name, unit=unit, factory="json:loads")
+        for name, unit in (("in", "left"), ("mid", "right"), ("out", "left"))
+    ),
+    edges=(PipelineEdge(payload_bytes=1),) * 2,
+    units={"left": UnitSettings(cores=(1,), threads=2), "right": UnitSettings(cores=(0,), threads=1)},
+    module_folders=(Path("stages"),),
+)
+REGIONS = {
+    name: EdgeRegion(fd=fd, slots=2, header=header_dtype(), payload_bytes=1)
+    for name, fd in (("in->mid", 90), ("mid->out", 91))
+}
+
+
+class FakeStarter:
+    """Starts `sleep`; the test speaks for it over `pipes` and `stderr`, which are the unit's own ends."""
+
+    def __init__(self) -> None:
+        self.specs: dict[str, UnitSpec] = {}
+        self.pipes: dict[str, JobPipe] = {}
+        self.stderr: dict[str, int] = {}
+        self.sleepers: dict[str, subprocess.Popen[bytes]] = {}
+
+    def start(self, spec: UnitSpec, stderr_fd: int) -> StartedUnit:
+        self.specs[spec.unit] = spec
+        self.pipes[spec.unit] = JobPipe(JobPipeEnd(*(os.dup(fd) for fd in spec.job_pipe)))
+        self.stderr[spec.unit] = os.dup(stderr_fd)
+        sleeper = self.sleepers[spec.unit] = subprocess.Popen(["sleep", "60"], process_group=0)
+        return StartedUnit(sleeper.pid, os.pidfd_open(sleeper.pid))
+
+    def end(self) -> str:
+        return "the server ended"
+
+    def leave(self, unit: str) -> None:
+        self.pipes.pop(unit).close()
+        os.close(self.stderr.pop(unit))
+
+
+@pytest.fixture
+def started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[UnitProcesses, FakeStarter]]:
+    """Both units, started; afterwards no process, file or folder is left."""
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    before = psutil.Process().num_fds()
+    starter = FakeStarter()
+    processes = UnitProcesses(PIPELINE, REGIONS, 92, starter)  # type: ignore[arg-type]
+    for unit in ("left", "right"):
+        processes.start(unit)
+    yield processes, starter
+    processes.close()
+    assert [sleeper.wait(5) for sleeper in starter.sleepers.values()] == [-signal.SIGKILL] * 2
+    for unit in list(starter.pipes):
+        starter.leave(unit)
+    assert processes.pids == {}
+    assert psutil.Process().num_fds() <= before + 1  # a thread of ZeroMQ may still be closing its own
+    assert not list(tmp_path.iterdir())
+
+
+def heard(processes: UnitProcesses, count: int) -> list[UnitMessage]:
+    messages: list[UnitMessage] = []
+    for _ in range(20):
+        messages += processes.listen(500)
+        if len(messages) >= count:
+            break
+    return messages
+
+
+Started = tuple[UnitProcesses, FakeStarter]
+
+
+def test_a_unit_is_told_what_it_needs_and_no_more(started: Started) -> None:
+    processes, starter = started
+    left, right = starter.specs["left"], starter.specs["right"]
+    assert (left.inputs, left.outputs) == ({"out": "mid->out"}, {"in": "in->mid"})
+    assert (right.inputs, right.outputs) == ({"mid": "in->mid"}, {"mid": "mid->out"})
+    assert [stage.name for stage in left.stages] == ["in", "out"]
+    assert left.edges == right.edges == REGIONS
+    assert (left.settings, left.assets_fd, left.module_folders) == (
+        PIPELINE.units["left"],
+        92,
+        (Path.cwd() / "stages",),
+    )
+    assert (right.scheduler_cores, right.run_cores) == ((1,), (0, 1))
+    assert processes.places == {"in": 0, "out": 1, "mid": 0}
+    assert processes.pids == {unit: sleeper.pid for unit, sleeper in starter.sleepers.items()}
+
+
+def test_jobs_go_out_and_answers_come_in(started: Started) -> None:
+    processes, starter = started
+    assert processes.listen(0) == []
+    processes.send("right", Ping())
+    processes.send("nobody", Ping())
+    assert (starter.pipes["right"].receive(), starter.pipes["left"].receive()) == (Ping(), None)
+    done = [Done(number, 1, 2, 3, {}) for number in range(3)]
+    for answer in done:
+        starter.pipes["right"].send(answer)
+    assert heard(processes, 3) == [UnitMessage("right", answer) for answer in done]
+
+
+def test_heartbeats_come_in_and_the_name_of_their_socket_goes(started: Started) -> None:
+    processes, starter = started
+    context = zmq.Context()
+    beats = HeartbeatSocket(context)
+    endpoint = starter.specs["left"].endpoint
+    beats.socket.connect(endpoint)
+    beats.send(Ready(5))
+    assert heard(processes, 1) == [UnitMessage("left", Ready(5))]
+    folder = Path(endpoint.removeprefix("ipc://")).parent
+    assert folder.is_dir()
+    processes.connected("left")
+    processes.connected("left")
+    processes.connected("nobody")
+    assert not folder.exists()
+    beats.send(Pong())
+    assert heard(processes, 1) == [UnitMessage("left", Pong())]
+    beats.close()
+    context.term()
+
+
+def test_what_a_unit_said_comes_before_its_end_and_its_last_line_is_kept(started: Started) -> None:
+    processes, starter = started
+    os.write(starter.stderr["right"], b"x" * 9000 + b"\nlast words\n")
+    for number in range(2):
+        starter.pipes["right"].send(Done(number, 1, 2, 3, {}))
+    processes.kill("nobody")
+    processes.kill("right")
+    starter.sleepers["right"].wait(5)
+    starter.leave("right")
+    assert heard(processes, 3) == [UnitMessage("right", m) for m in (Done(0, 1, 2, 3, {}), Done(1, 1, 2, 3, {}), None)]
+    assert processes.stderr_tails["right"] == "x" * (8192 - 12) + "\nlast words"
+    assert processes.why_ended("right") == "; it wrote last: last words"
+    assert processes.why_ended("left") == "; the server ended"
+    assert list(processes.pids) == ["left"]
+
+
+def test_bytes_that_are_no_message_end_the_run_and_name_the_unit(started: Started) -> None:
+    processes, starter = started
+    os.write(starter.pipes["left"]._writes, b"\xffno")
+    with pytest.raises(TrilaneError, match=r"^unit left sent bytes that are not a message: unknown message"):
+        heard(processes, 1)
+
+
+def test_what_is_watched_wakes_a_listener_once(started: Started) -> None:
+    processes, _ = started
+    fd = os.eventfd(1, os.EFD_NONBLOCK)
+    processes.watch(fd)
+    assert processes.listen(5000) == []
+    with pytest.raises(BlockingIOError):
+        os.eventfd_read(fd)
+    os.close(fd)
+
+
+def test_units_that_leave_by_themselves_are_waited_for_and_others_not_for_ever(started: Started) -> None:
+    processes, starter = started
+    threading.Timer(0.05, starter.sleepers["left"].kill).start()
+    processes.wait_for_end(["left"], 10)
+    assert list(processes.pids) == ["right"]
+    processes.wait_for_end(["right"], 0.01)
+    assert list(processes.pids) == ["right"]
+    assert unit_processes.END_S == 2
+
+
+# the parent's end of the fork server, without one
+
+
+def starter_with(server: Any, stderr: bytes = b"") -> tuple[UnitStarter, socket.socket]:
+    starter = object.__new__(UnitStarter)
+    starter._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    starter._server, starter._has_units = server, False
+    starter._stderr = os.memfd_create("stderr")
+    os.write(starter._stderr, stderr)
+    return starter, theirs
+
+
+class FakeServer:
+    def __init__(self, code: int | None) -> None:
+        self.code, self.calls = code, []
+
+    def wait(self, timeout: float | None = None) -> int:
+        self.calls.append(("wait", timeout))
+        if self.code is None:
+            raise subprocess.TimeoutExpired("server", timeout or 0)
+        return self.code
+
+    def kill(self) -> None:
+        self.calls.append("kill")
+
+    def send_signal(self, number: int) -> None:
+        self.calls.append(number)
+        self.code = -number
+
+
+def spec() -> UnitSpec:
+    return UnitSpec(
+        unit="left", endpoint="ipc://x", job_pipe=JobPipeEnd(0, 1), assets_fd=2, settings=PIPELINE.units["left"],
+        scheduler_cores=(0,), run_cores=(0, 1), stages=(), module_folders=(), edges={}, inputs={}, outputs={},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("answer", "passes_fd", "said"),
+    [(b"123", True, ""), (b"123", False, "^unit left could not be started: too many open files: ulimit -n 4096$")],
+)
+def test_a_unit_is_asked_for_with_its_spec_and_files(answer: bytes, passes_fd: bool, said: str) -> None:
+    starter, theirs = starter_with(FakeServer(None))
+    socket.send_fds(theirs, [answer], [0] if passes_fd else [])
+    if said:
+        with pytest.raises(TrilaneError, match=said):
+            starter.start(spec(), 2)
+    else:
+        unit = starter.start(spec(), 2)
+        os.close(unit.pidfd)
+        assert unit.pid == 123
+    packet, fds, *_ = socket.recv_fds(theirs, 9999, 10)
+    assert json.loads(packet) == {"unit": "left", "cores": [1], "threads": 2, "fds": [0, 1, 2]}
+    assert len(fds) == 5
+    assert UnitSpec.model_validate_json(os.pread(fds[0], 9999, 0)) == spec()
+    for fd in fds:
+        os.close(fd)
+    starter.close()
+    assert starter._server.calls[0] == ("wait", 5.0)  # type: ignore[attr-defined]
+    theirs.close()
+
+
+@pytest.mark.parametrize(
+    ("code", "stderr", "said"),
+    [
+        (None, b"one\ntwo\n", "two"),
+        (-9, b"", "the fork server, which every unit comes from, was killed by signal 9"),
+        (3, b"", "the fork server, which every unit comes from, ended with exit code 3"),
+        (0, b"", "the fork server, which every unit comes from, ended with exit code 0"),
+        (None, b"", "no answer"),
+    ],
+)
+def test_why_a_unit_could_not_be_started_is_said(code: int | None, stderr: bytes, said: str) -> None:
+    starter, theirs = starter_with(FakeServer(code), stderr)
+    theirs.shutdown(socket.SHUT_WR)
+    with pytest.raises(TrilaneError, match=f"^unit left could not be started: {said}$"):
+        starter.start(spec(), 2)
+    assert starter._reason(OSError(5, "Input/output error")) == ("Input/output error" if said == "no answer" else said)
+    assert starter.end() == ("" if code is None else said)
+    theirs.close()
+    starter.close()
+
+
+def test_a_server_that_does_not_leave_is_killed() -> None:
+    starter, theirs = starter_with(FakeServer(None))
+    starter.close()
+    server: Any = starter._server
+    assert server.calls == ["kill", ("wait", 5.0), signal.SIGKILL, ("wait", None)]
+    theirs.close()
+
+
+def test_a_call_names_its_function_and_hands_back_what_was_written() -> None:
+    starter, theirs = starter_with(FakeServer(None))
+    call = starter.call("os:getcwd")
+    packet, fds, *_ = socket.recv_fds(theirs, 999, 1)
+    assert json.loads(packet) == {"call": "os:getcwd"}
+    os.write(fds[0], b'{"a": [1')
+    os.write(fds[0], b", 2]}")
+    os.close(fds[0])
+    assert call.result() == {"a": [1, 2]}
+    call.close()
+    theirs.close()
+    with pytest.raises(TrilaneError, match=r"^os:getcwd could not be called: Broken pipe$"):
+        starter.call("os:getcwd")
+    starter.close()
+
+
+def test_a_call_without_an_answer_is_none_or_the_servers_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    for end, is_closed in (("", True), ("gone", True), ("", False)):
+        monkeypatch.setattr(unit_starter, "ANSWER_S", 60.0 if is_closed else 0.01)
+        reads, writes = os.pipe()
+        if is_closed:
+            os.close(writes)
+        call = ForkedCall(reads, lambda end=end: end)
+        if end:
+            with pytest.raises(TrilaneError, match=r"^gone$"):
+                call.result()
+        else:
+            assert call.result() is None
+        if not is_closed:
+            os.close(writes)
+        with pytest.raises(OSError, match="Bad file"):
+            os.fstat(reads)
+    assert (unit_starter.NOTICE_S, unit_starter.CLOSE_S) == (0.2, 5)
+
+
+def test_the_fork_server_is_started_alone_with_one_thread_a_library(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: dict[str, Any] = {}
+
+    def popen(arguments: list[str], **more: Any) -> Any:
+        seen.update(arguments=arguments, **more)
+        return FakeServer(0)
+
+    monkeypatch.setattr(subprocess, "Popen", popen)
+    with UnitStarter(["a", "b"]) as starter:
+        (passed,) = seen["pass_fds"]
+        assert seen["arguments"][1:4] == ["-P", "-m", "trilane.pipeline.fork_server"]
+        assert seen["arguments"][4:] == [f"--socket={passed}", f"--parent={os.getpid()}", "--preload=a,b"]
+        limits = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+        assert [seen["env"][name] for name in limits] == ["1"] * 4
+        assert seen["env"]["PATH"] == os.environ["PATH"]
+        assert (seen["stdin"], seen["stdout"], seen["process_group"]) == (-3, -3, 0)
+        assert (seen["stderr"], starter._socket.gettimeout()) == (starter._stderr, 60)
+        with pytest.raises(OSError, match="Bad file"):
+            os.fstat(passed)
+    server: Any = starter._server
+    assert server.calls == ["kill", ("wait", 5.0)]  # no unit was started, so nothing has to be waited for
+
+
+# run_metrics.py
+
+
+def test_the_report_of_a_run_is_complete_in_order_and_has_no_other_keys() -> None:
+    times: Any = {"in": 3, "mid": 5, "out": 2}
+    report = simulate(
+        PIPELINE.graph(), Settings(4), lambda stage, *_: times[stage] * 1_000_000, isolated_ns={"in": 3e6}
+    ).report
+    metrics = metrics_of(report)
+    assert metrics.as_json() == report
+    assert list(metrics.as_json()) == [key for key in type(metrics).model_fields if key in report]
+    assert (metrics.policy, metrics.caps, metrics.units["left"].pid) == ("", None, None)
+    with pytest.raises(ValueError, match="Extra inputs"):
+        metrics_of({**report, "speed": 1})
+    with pytest.raises(ValueError, match="Input should be 'host' or 'virtual'"):
+        metrics_of({**report, "clock": "wall"})

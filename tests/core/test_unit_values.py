@@ -1,0 +1,478 @@
+"""Inside a unit's process, beside a double of the scheduler: what it answers, on which cores, what it is born with."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import zmq
+
+from trilane.errors import BadInputError, MissingPartError, TrilaneError, UnitLostError
+from trilane.pipeline import (
+    fork_server,
+    shared_assets,
+    unit_loop,
+)
+from trilane.pipeline.bound_stage import BoundStage
+from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, UnitSettings
+from trilane.pipeline.regions import EdgeRegion, edge_regions
+from trilane.pipeline.stage import UnitContext
+from trilane.pipeline.unit_spec import UnitSpec
+from trilane.transport.heartbeats import HeartbeatSocket
+from trilane.transport.job_pipe import JobPipe, JobPipeEnd, job_pipe_pair
+from trilane.transport.messages import (
+    Close,
+    Closed,
+    Duration,
+    Failed,
+    MessageError,
+    Ping,
+    Pong,
+    Ready,
+    RunIsolated,
+    RunJob,
+)
+from trilane.transport.packets import Packet, SlotLayout, header_dtype, view_packet
+
+OWN = header_dtype([("own", "<u2")])
+MS = 1_000_000
+
+
+def packets(header: np.dtype[Any], count: int) -> list[Packet]:
+    layout = SlotLayout(header, 8)
+    return [view_packet(memoryview(bytearray(layout.slot_bytes)), layout) for _ in range(count)]
+
+
+class FakeStage:
+    def __init__(self, error: Exception | None = None) -> None:
+        self.error, self.runs, self.bound, self.closed = error, [], None, False
+
+    def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
+        self.bound = (inputs, outputs)
+
+    def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
+        self.runs.append((frame, slot_in, slot_out))
+        if self.error is not None:
+            raise self.error
+        return {"shade": 3}
+
+    def close(self) -> None:
+        self.closed = True
+        if self.error is not None:
+            raise self.error
+
+
+UNITS = {"left": UnitSettings(cores=(1, 0), threads=2), "right": UnitSettings(cores=(3, 1), threads=1, spin=True)}
+STAGES = tuple(
+    PipelineStage(name=name, unit=unit, factory="json:loads", pace_ns=pace)
+    for name, unit, pace in (("in", "left", 0), ("mid", "right", 5), ("out", "left", 0))
+)
+EDGES = (PipelineEdge(payload_bytes=100, header=OWN, rule="single"), PipelineEdge(payload_bytes=5000, rule="fifo:3"))
+
+
+def pipeline(**changes: Any) -> Pipeline:
+    return Pipeline(**{"stages": STAGES, "edges": EDGES, "units": UNITS, **changes})
+
+
+def spec_of(**changes: Any) -> UnitSpec:
+    values: dict[str, Any] = {
+        "unit": "right",
+        "endpoint": "ipc://none",
+        "job_pipe": JobPipeEnd(10, 11),
+        "assets_fd": 12,
+        "settings": UNITS["right"],
+        "scheduler_cores": (1, 0),
+        "run_cores": (0, 1, 3),
+        "stages": (STAGES[1],),
+        "module_folders": (),
+        "edges": {
+            "in->mid": EdgeRegion(fd=13, slots=1, header=OWN, payload_bytes=100),
+            "mid->out": EdgeRegion(fd=14, slots=3, header=header_dtype(), payload_bytes=5000),
+        },
+        "inputs": {"mid": "in->mid"},
+        "outputs": {"mid": "mid->out"},
+    }
+    return UnitSpec(**{**values, **changes})
+
+
+class FakeLink:
+    """A unit's end of its link, with the messages that it will receive; notes what it sends."""
+
+    def __init__(self, *script: Any) -> None:
+        self.job_pipe = self
+        self.script, self.sent, self.beats, self.ended = deque(script), [], [], False
+
+    def receive(self) -> Any:
+        if not self.script:
+            self.ended = True
+            return None
+        return self.script.popleft()
+
+    def send(self, message: Any) -> None:
+        self.sent.append(message)
+
+    def send_heartbeat(self, message: Any) -> None:
+        self.beats.append(message)
+
+
+def served(monkeypatch: pytest.MonkeyPatch, link: FakeLink, stages: list[Any]) -> int:
+    core = min(os.sched_getaffinity(0))
+    before = os.sched_getaffinity(0)
+    spec = spec_of(settings=UnitSettings(cores=(core,), threads=1), run_cores=(core,))
+    monkeypatch.setattr(unit_loop, "build_stages", lambda _: stages)
+    monkeypatch.setattr(unit_loop, "gc", SimpleNamespace(collect=lambda: 0, freeze=lambda: None))
+    try:
+        return unit_loop._serve(spec, link)  # type: ignore[arg-type]
+    finally:
+        os.sched_setaffinity(0, before)
+
+
+def test_a_unit_answers_every_message_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second = FakeStage(), FakeStage()
+    outputs = packets(OWN, 2)
+    stages = [BoundStage("a", first, [], outputs, 0), BoundStage("b", second, packets(OWN, 2), [], 0)]
+    link = FakeLink(RunJob(11, 0, 5, -1, 1, 2), Ping(), RunJob(12, 1, 6, 1, -1, 2), RunIsolated(1, 7, 0, -1), Close())
+    before = time.monotonic_ns()
+    assert served(monkeypatch, link, stages) == 0
+    one, two, alone, end = link.sent
+    assert (one.id, two.id, one.metrics) == (11, 12, {"shade": 3.0})
+    assert before <= one.t_begin_ns <= one.t_sampled_ns <= one.t_end_ns <= two.t_begin_ns <= two.t_end_ns
+    assert (two.t_sampled_ns, end) == (0, Closed())
+    assert isinstance(alone, Duration) and 0 <= alone.value < time.monotonic_ns() - before
+    assert link.beats == [Ready(os.getpid()), Pong()]
+    assert (first.runs, second.runs) == ([(5, None, 1)], [(6, 1, None), (7, 0, None)])
+    assert int(outputs[1].header["epoch"]) == 2
+    assert first.closed and second.closed
+
+
+def test_a_unit_ends_when_its_pipe_does_and_refuses_what_is_not_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert served(monkeypatch, FakeLink(), []) == 1
+    with pytest.raises(MessageError, match=r"Pong\(\) is not for a unit"):
+        served(monkeypatch, FakeLink(Pong()), [])
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (ValueError("dark\n  night"), 1, "stage a, frame 5: ValueError: dark night"),
+        (BadInputError("file", "this", "that"), 2, "file: found this, expected that"),
+        (MissingPartError("no part", "get one"), MissingPartError("", "").exit_code, "no part"),
+    ],
+)
+def test_a_stage_that_fails_is_an_answer_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], error: Exception, code: int, said: str
+) -> None:
+    stage = BoundStage("a", FakeStage(error), [], packets(OWN, 1), 0)
+    link = FakeLink(RunJob(11, 0, 5, -1, 0, 0), RunIsolated(0, 5, -1, 0), Close())
+    assert served(monkeypatch, link, [stage]) == code
+    assert [(answer.id, answer.exit_code) for answer in link.sent[:3]] == [(11, code), (-2, code), (-3, code)]
+    assert all(answer.message.startswith(said) for answer in link.sent[:2])
+    assert link.sent[3:] == [Closed()]
+    assert type(error).__name__ in capfd.readouterr().err
+
+
+def test_closing_names_its_stage_and_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    last = FakeStage()
+    stages = [BoundStage("a", FakeStage(ValueError("x")), [], [], 0), BoundStage("b", last, [], [], 0)]
+    link = FakeLink(Close())
+    assert served(monkeypatch, link, stages) == 1
+    assert link.sent == [Failed(-3, 1, "unit right, closing a: ValueError: x"), Closed()]
+    assert last.closed
+
+
+def test_a_lost_unit_does_not_answer_it_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    link = FakeLink(RunJob(11, 0, 5, -1, 0, 0))
+    stage = BoundStage("a", FakeStage(UnitLostError("context lost")), [], packets(OWN, 1), 0)
+    with pytest.raises(UnitLostError):
+        served(monkeypatch, link, [stage])
+    assert link.sent == []
+
+
+def test_a_unit_that_cannot_be_built_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(_: UnitSpec) -> list[BoundStage]:
+        raise KeyError("weights")
+
+    link = FakeLink()
+    core = min(os.sched_getaffinity(0))
+    before = os.sched_getaffinity(0)
+    monkeypatch.setattr(unit_loop, "build_stages", fail)
+    spec: Any = spec_of(settings=UnitSettings(cores=(core,), threads=1), run_cores=(core,))
+    assert unit_loop._serve(spec, link) == 1  # type: ignore[arg-type]
+    os.sched_setaffinity(0, before)
+    assert (link.sent, link.beats) == ([Failed(-1, 1, "unit right: KeyError: 'weights'")], [])
+
+
+def test_a_long_error_is_cut_at_whole_characters() -> None:
+    link = FakeLink()
+    code = unit_loop._fail(link, 5, "stage a", TrilaneError("é" * 1500))  # type: ignore[arg-type]
+    assert (code, link.sent) == (TrilaneError("").exit_code, [Failed(5, TrilaneError("").exit_code, "é" * 1000)])
+    unit_loop._fail(link, 5, "stage a", TrilaneError("x" + "é" * 1500))  # type: ignore[arg-type]
+    assert link.sent[1].message == "x" + "é" * 999
+
+
+def test_threads_that_were_started_while_building_go_back_to_the_units_cores() -> None:
+    """On a machine of one core there is nothing to see."""
+    here = os.sched_getaffinity(0)
+    if len(here) < 2:
+        pytest.skip("one core")
+    core, other = sorted(here)[:2]
+    spec = spec_of(settings=UnitSettings(cores=(core,), threads=1), run_cores=(core, other))
+    end, ids = threading.Event(), []
+
+    def work() -> None:
+        ids.append(threading.get_native_id())
+        end.wait(10)
+
+    early, late = threading.Thread(target=work), threading.Thread(target=work)
+    early.start()
+    try:
+        with unit_loop.building_cores(spec):
+            assert os.sched_getaffinity(0) == {core, other}
+            late.start()
+            while len(ids) < 2:
+                time.sleep(0.001)
+            assert os.sched_getaffinity(ids[1]) == {core, other}
+        assert (os.sched_getaffinity(0), os.sched_getaffinity(ids[1])) == ({core}, {core})
+        assert os.sched_getaffinity(ids[0]) == here
+    finally:
+        end.set()
+        os.sched_setaffinity(0, here)
+        early.join()
+        late.join()
+
+
+class NamedStage(FakeStage):
+    def __init__(self, settings: Mapping[str, Any], unit: UnitContext) -> None:
+        super().__init__()
+        self.settings, self.unit = settings, unit
+
+
+def test_stages_are_built_in_order_on_the_slots_of_their_edges(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(unit_loop, "factory_named", lambda name: NamedStage if name == "json:loads" else None)
+    assets_fd = shared_assets.share_assets({"one": np.arange(3)})
+    stages = (STAGES[0].model_copy(update={"settings": {"a": 1}, "unit": "left"}), STAGES[2])
+    with edge_regions(pipeline()) as regions:
+        spec = spec_of(
+            unit="left", stages=stages, edges=regions, assets_fd=assets_fd, module_folders=(tmp_path,),
+            inputs={"out": "mid->out"}, outputs={"in": "in->mid"},
+        )  # fmt: skip
+        first, last = unit_loop.build_stages(spec)
+    os.close(assets_fd)
+    assert sys.path[0] == str(tmp_path)
+    assert (first.name, last.name) == ("in", "out")
+    inner: Any = [first._stage, last._stage]
+    assert inner[0].settings == {"a": 1} and inner[0].unit is inner[1].unit
+    assert (inner[0].unit.name, inner[0].unit.settings) == ("left", UNITS["right"])
+    assert inner[0].unit.assets["one"].tolist() == [0, 1, 2]
+    assert [[len(side) for side in stage.bound] for stage in inner] == [[0, 1], [3, 0]]
+    assert inner[0].bound[1][0].header.dtype == OWN
+
+
+def test_a_factory_is_found_by_module_and_name() -> None:
+    assert unit_loop.factory_named("json:loads") is json.loads
+    with pytest.raises(AttributeError):
+        unit_loop.factory_named("json:none")
+
+
+class PrctlLibc:
+    def __init__(self, answer: int) -> None:
+        self.answer, self.calls = answer, []
+
+    def prctl(self, *call: Any) -> int:
+        self.calls.append(call)
+        return self.answer
+
+
+def test_a_process_dies_with_its_parent_or_at_once_when_that_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
+    libc, exits = PrctlLibc(0), []
+    monkeypatch.setattr("ctypes.CDLL", lambda *_, **__: libc)
+    monkeypatch.setattr(os, "_exit", exits.append)
+    fork_server.die_with_parent(os.getppid())
+    assert (libc.calls, exits) == ([(1, signal.SIGKILL, 0, 0, 0)], [])
+    fork_server.die_with_parent(os.getppid() + 1)
+    assert exits == [1]
+    libc.answer = -1
+    with pytest.raises(OSError, match=r"PR_SET_PDEATHSIG"):
+        fork_server.die_with_parent(os.getppid())
+
+
+UNIT_LIFE = """
+import ctypes, json, os, signal, sys
+from types import SimpleNamespace
+from trilane.pipeline import fork_server
+
+def serve(spec, number_of):
+    death = ctypes.c_int()
+    ctypes.CDLL(None).prctl(2, ctypes.byref(death), 0, 0, 0)
+    print(json.dumps({
+        "death": death.value, "name": open("/proc/self/comm").read().strip(), "own_group": os.getpgid(0) == os.getpid(),
+        "cores": sorted(os.sched_getaffinity(0)), "threads": [os.environ[name] for name in fork_server.THREAD_LIMITS],
+        "spec": spec, "fds": sorted(number_of), "sigchld": signal.getsignal(signal.SIGCHLD) == signal.SIG_DFL,
+        "blocked": sorted(signal.pthread_sigmask(signal.SIG_BLOCK, [])),
+        "shut": not os.path.exists(f"/proc/self/fd/{spec_fd}"),
+    }), flush=True)
+    print("last words", file=sys.stderr)
+    if spec == "broken":
+        raise ValueError("broken spec")
+    return 7
+
+loops = {"trilane.pipeline.unit_loop": SimpleNamespace(serve=serve)}
+fork_server.importlib = SimpleNamespace(import_module=loops.__getitem__)
+for spec in ("whole", "broken"):
+    spec_fd = os.memfd_create("spec")
+    os.write(spec_fd, json.dumps(spec).encode())
+    said, theirs = os.pipe()
+    signal.signal(signal.SIGCHLD, lambda *_: None)
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGCHLD})
+    request = {"unit": "left-handed-unit", "cores": [min(os.sched_getaffinity(0))], "threads": 3, "fds": [41]}
+    server = os.getpid()
+    if (pid := os.fork()) == 0:
+        os._exit(fork_server._run_unit(request, [spec_fd, theirs, os.dup(1)], server))
+    os.close(theirs)
+    code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+    print(json.dumps([code, os.read(said, 9999).decode().splitlines()]), flush=True)
+"""
+
+
+def test_a_unit_is_forked_into_a_life_of_its_own() -> None:
+    """It dies with the server, has its name, group, cores and thread limits, and its error goes to its own stderr."""
+    done = subprocess.run([sys.executable, "-c", UNIT_LIFE], capture_output=True, text=True, timeout=60, check=True)
+    life, (code, said), other, (broken_code, broken_said) = map(json.loads, done.stdout.splitlines())
+    assert life == {
+        "death": signal.SIGKILL,
+        "name": "trilane-left-ha",
+        "own_group": True,
+        "cores": [min(os.sched_getaffinity(0))],
+        "threads": ["3"] * 4,
+        "spec": "whole",
+        "fds": [41],
+        "sigchld": True,
+        "blocked": [],
+        "shut": True,
+    }
+    assert (code, said, done.stderr) == (7, ["last words"], "")
+    assert (other["spec"], broken_code) == ("broken", 1)
+    assert (broken_said[0], broken_said[-1]) == ("last words", "ValueError: broken spec")
+
+
+def test_a_process_is_called_by_its_unit() -> None:
+    assert fork_server.process_name("dsp") == "trilane-dsp"
+    assert fork_server.process_name("a-long-name-of-a-unit") == "trilane-a-long-"
+
+
+def test_a_whole_unit_connects_is_ready_and_ends_when_it_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In this process; the scheduler's cores carry its heartbeats, and its time slice is a unit's."""
+    ours, theirs = job_pipe_pair()
+    slices: list[int] = []
+    monkeypatch.setattr(unit_loop, "use_slice", slices.append)
+    monkeypatch.setattr(unit_loop, "context_on_cores", lambda cores: slices.append(cores) or zmq.Context())
+    monkeypatch.setattr(unit_loop, "gc", SimpleNamespace(collect=lambda: 0, freeze=lambda: None))
+    monkeypatch.setattr(unit_loop, "build_stages", lambda _: [])
+    here = os.sched_getaffinity(0)
+    context = zmq.Context()
+    beats, pipe = HeartbeatSocket(context), JobPipe(ours)
+    beats.socket.bind(f"ipc://{tmp_path}/h")
+    spec = spec_of(
+        endpoint=f"ipc://{tmp_path}/h", settings=UnitSettings(cores=tuple(here), threads=1), run_cores=tuple(here),
+        job_pipe=theirs,
+    )  # fmt: skip
+    threading.Timer(0.05, pipe.send, [Close()]).start()
+    raw = json.loads(spec.model_dump_json())
+    assert unit_loop.serve(raw, {fd: fd for fd in spec.fds}) == 0
+    assert beats.socket.poll(2000) and beats.receive() == [Ready(os.getpid())]
+    assert pipe.receive() == Closed()
+    assert pipe.receive() is None and pipe.ended
+    assert slices == [(1, 0), 1_000_000]
+    beats.close()
+    pipe.close()
+    context.term()
+
+
+SERVER_LIFE = """
+import ctypes, json, os, select, signal, socket, sys, time
+from types import SimpleNamespace
+from trilane.pipeline import fork_server
+
+def death_signal():
+    death = ctypes.c_int()
+    ctypes.CDLL(None).prctl(2, ctypes.byref(death), 0, 0, 0)
+    return death.value
+
+def look():
+    blocked = sorted(signal.pthread_sigmask(signal.SIG_BLOCK, []))
+    return [death_signal(), signal.getsignal(signal.SIGCHLD) == signal.SIG_DFL, blocked, os.getppid()]
+
+def serve(spec, number_of):
+    time.sleep(spec)
+    return 5
+
+modules = {"trilane.pipeline.unit_loop": SimpleNamespace(serve=serve), "here": SimpleNamespace(look=look)}
+fork_server.importlib = SimpleNamespace(import_module=modules.__getitem__)
+ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+server = os.fork()
+if server == 0:
+    ours.close()
+    fork_server.serve(theirs)
+    os._exit(9)
+theirs.close()
+
+def call(name):
+    reads, writes = os.pipe()
+    socket.send_fds(ours, [json.dumps({"call": name}).encode()], [writes])
+    os.close(writes)
+    with os.fdopen(reads) as answer:
+        return answer.read()
+
+def unit(seconds):
+    spec = os.memfd_create("spec")
+    os.write(spec, json.dumps(seconds).encode())
+    request = {"unit": "u", "cores": [min(os.sched_getaffinity(0))], "threads": 1, "fds": []}
+    socket.send_fds(ours, [json.dumps(request).encode()], [spec, os.dup(2)])
+    answer, fds, *_ = socket.recv_fds(ours, 99, 9)
+    return int(answer), fds
+
+def until(found):
+    end = time.monotonic() + 5
+    while not found() and time.monotonic() < end:
+        time.sleep(0.005)
+    return found()
+
+def children():
+    return open(f"/proc/{server}/task/{server}/children").read().split()
+
+death, default, blocked, parent = json.loads(call("here:look"))
+files = os.listdir(f"/proc/{server}/fd")
+pid, (pidfd,) = unit(0.2)
+alive = not select.select([pidfd], [], [], 0)[0]
+ended = bool(select.select([pidfd], [], [], 5)[0])
+none = call("no:such")
+print(json.dumps([death, default, blocked, parent == server, pid != server, alive, ended, none,
+                  until(lambda: not children()), until(lambda: os.listdir(f"/proc/{server}/fd") == files)]))
+_, (last,) = unit(0.3)
+ours.close()
+code = os.waitstatus_to_exitcode(os.waitpid(server, 0)[1])
+print(json.dumps([code, bool(select.select([last], [], [], 0)[0])]))
+"""
+
+
+def test_a_fork_server_forks_answers_forgets_and_outlives_its_units() -> None:
+    """A call dies with the server too; units that ended leave no zombie, and no file; the server waits for the last."""
+    done = subprocess.run([sys.executable, "-c", SERVER_LIFE], capture_output=True, text=True, timeout=60, check=True)
+    first, last = map(json.loads, done.stdout.splitlines())
+    assert first == [signal.SIGKILL, True, [], True, True, True, True, "", True, True]
+    assert last == [9, True]
