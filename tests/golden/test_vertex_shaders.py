@@ -175,4 +175,3 @@ def test_a_vertex_is_skinned_as_the_formula_says(gl: Any, weights: int, shaped: 
     np.testing.assert_allclose(found["v_normal"], np.einsum("vij,vj->vi", rows[..., :3], normal), **NEAR)
     np.testing.assert_array_equal(found["v_uv"], uv)
     np.testing.assert_array_equal(found["v_colour"], colour)
-
