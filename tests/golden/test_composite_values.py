@@ -25,7 +25,7 @@ from trilane.stages.gpu.detected_planes import PlanePainter, half_sides
 from trilane.stages.packets import pose_dtype
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 
-SHAPE = (20, 28)
+SHAPE = (20, 27)
 EYE = np.eye(4)
 STILL = np.tile(np.eye(3, 4), (55, 1, 1))
 
