@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_split import cuts
@@ -25,7 +26,6 @@ from trilane.stages.dsp.parts import crossing_bytes
 from trilane.stages.factories import FACTORIES, PRELOAD
 from trilane.stages.packets import AVATAR_DTYPE, pose_dtype
 from trilane.testing.assets import assets_of
-from trilane.unexpected_value import UnexpectedValue
 
 
 def configured(folder: Path, **values: Any) -> RunConfig:
@@ -51,7 +51,7 @@ def test_a_configuration_names_the_parts_of_its_network(tmp_path: Path) -> None:
     assert plain.buckets == [(32, 128), (64, 64), (128, 32)]
     assert plain.max_tensor_pixels == 4096
     assert configured(tmp_path, scene=Scene(size="96x32")).max_tensor_pixels == 3072
-    with pytest.raises(UnexpectedValue, match=r"unknown unit \['npu'\]"):
+    with pytest.raises(ValidationError, match=r"unknown unit \['npu'\]"):
         configured(tmp_path, units=dict.fromkeys(("cpu", "npu"), UnitSettings(cores=(0,), threads=1)))
 
 
@@ -89,7 +89,7 @@ def test_the_pipeline_is_the_stages_in_their_order(tiny_bundle: Path) -> None:
         avatar_dirs=(tiny_bundle, tiny_bundle),
         pace_ns={"raster": 5, "infer-2": 7},
     )
-    made = avatar_pipeline.avatar_pipeline(config, assets_of(configured(tiny_bundle)), "latest")
+    made = avatar_pipeline.avatar_pipeline(config, assets_of(configured(tiny_bundle)), "triple")
     said = config.model_dump(mode="json")
     rows = [(stage.name, stage.unit, stage.factory, stage.settings, stage.pace_ns) for stage in made.stages]
     assert rows == [
@@ -112,10 +112,10 @@ def test_a_run_has_the_scenes_frames_unless_told(tiny_bundle: Path, monkeypatch:
     given: dict[str, Any] = {}
     monkeypatch.setattr(avatar_pipeline, "run_pipeline", lambda *a, **k: given.update(args=a, **k) or "result")
     config, assets = configured(tiny_bundle), assets_of(configured(tiny_bundle))
-    assert avatar_pipeline.run_avatar(config, assets, edge="latest", frames=asked, extra=5) == "result"
+    assert avatar_pipeline.run_avatar(config, assets, edge="triple", frames=asked, extra=5) == "result"
     pipeline, count = given["args"]
     assert (count, given["fps"], given["assets"] is assets, given["extra"]) == (frames, 12.5, True, 5)
-    assert pipeline == avatar_pipeline.avatar_pipeline(config, assets, "latest")
+    assert pipeline == avatar_pipeline.avatar_pipeline(config, assets, "triple")
 
 
 def test_factories_are_functions_that_exist() -> None:
