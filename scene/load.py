@@ -26,7 +26,6 @@ EXPECTED = {
     "too_short": "at least {min_length} of them",
     "too_long": "at most {max_length} of them",
     "model_type": "a table",
-    "model_attributes_type": "a table",
     "tuple_type": "a list",
     "string_pattern_mismatch": "letters, digits, spaces, dots, hyphens and underscores",
 }

@@ -17,7 +17,7 @@ from trilane.scene.motion.usable_samples import usable_samples
 from trilane.scene.rotations import about, quat_from_matrix, shortest_turn
 from trilane.scene.schema import CameraSpec
 
-UP = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+UP = {"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 #: The usual up of the format holds when its cosine with the picture's mean up is above this.
 LEAST_UP_COSINE = 0.3
 #: A matrix is taken for a rotation when |R^T R - 1| is below this.

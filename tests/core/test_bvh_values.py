@@ -434,10 +434,11 @@ def test_a_motion_in_metres_and_seconds_with_its_notes(tmp_path: Path) -> None:
     assert recorded(tmp_path / "a.bvh", text_of([{}]), "in").leg_m == pytest.approx((left + right) / 2 * 0.0254)
 
 
-def test_joints_of_the_hands_are_counted_from_the_first_finger(tmp_path: Path) -> None:
+def test_fingers_are_counted_and_begin_as_their_wrist_lies(tmp_path: Path) -> None:
     for name, count in (("left_index1", 2), ("jaw", 1), ("right_thumb3", 2)):
-        text = text_of([{}]).replace("JOINT right_nails", f"JOINT {name}")
-        assert f"24 joints have a partner, {count} of them in the hands" in recorded(tmp_path / "a.bvh", text).notes
+        raw = recorded(tmp_path / "a.bvh", text_of([{}]).replace("JOINT right_nails", f"JOINT {name}"))
+        assert f"24 joints have a partner, {count} of them in the hands" in raw.notes
+        assert our_turn(raw, "left_index1", 0) == pytest.approx(our_turn(raw, "left_wrist", 0), abs=1e-9)
 
 
 def test_a_skeleton_that_faces_elsewhere_is_turned_as_a_whole(tmp_path: Path) -> None:
