@@ -173,6 +173,20 @@ def test_bytes_that_are_no_message_end_the_run_and_name_the_unit(started: Starte
         heard(processes, 1)
 
 
+def test_a_unit_that_has_closed_its_ends_wakes_nobody_again(started: Started) -> None:
+    """Its job pipe and its stderr stay readable for ever; its process still lives."""
+    processes, starter = started
+    starter.pipes["left"].send(Done(0, 1, 2, 3, {}))
+    starter.leave("left")
+    assert heard(processes, 1) == [UnitMessage("left", Done(0, 1, 2, 3, {}))]
+    for _ in range(2):
+        processes.listen(0)
+    assert processes._poller.poll(0) == []
+    assert list(processes.pids) == ["left", "right"]
+    starter.pipes["right"].send(Done(1, 1, 2, 3, {}))
+    assert heard(processes, 1) == [UnitMessage("right", Done(1, 1, 2, 3, {}))]
+
+
 def test_what_is_watched_wakes_a_listener_once(started: Started) -> None:
     processes, _ = started
     fd = os.eventfd(1, os.EFD_NONBLOCK)
@@ -259,6 +273,7 @@ def test_a_unit_is_asked_for_with_its_spec_and_files(answer: bytes, passes_fd: b
     ("code", "stderr", "said"),
     [
         (None, b"one\ntwo\n", "two"),
+        (None, b"x" * 9000 + b"\nno file \xff\n", "no file \ufffd"),
         (-9, b"", "the fork server, which every unit comes from, was killed by signal 9"),
         (3, b"", "the fork server, which every unit comes from, ended with exit code 3"),
         (0, b"", "the fork server, which every unit comes from, ended with exit code 0"),
