@@ -20,7 +20,7 @@ from trilane.errors import TrilaneError
 from trilane.pipeline import unit_processes, unit_starter
 from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, UnitSettings
 from trilane.pipeline.regions import EdgeRegion
-from trilane.pipeline.run_metrics import metrics_of
+from trilane.pipeline.run_metrics import Caps, Temperature, metrics_of
 from trilane.pipeline.unit_processes import UnitMessage, UnitProcesses
 from trilane.pipeline.unit_spec import UnitSpec
 from trilane.pipeline.unit_starter import ForkedCall, StartedUnit, UnitStarter
@@ -368,7 +368,17 @@ def test_the_report_of_a_run_is_complete_in_order_and_has_no_other_keys() -> Non
     metrics = metrics_of(report)
     assert metrics.as_json() == report
     assert list(metrics.as_json()) == [key for key in type(metrics).model_fields if key in report]
-    assert (metrics.policy, metrics.caps, metrics.units["left"].pid) == ("", None, None)
+    left = metrics.units["left"]
+    assert (left.pid, left.cores, left.threads, left.spin) == (None, (), 0, False)
+    unset = (metrics.policy, metrics.edge, metrics.idle_cores, metrics.caps, metrics.temperature_c)
+    assert unset == ("", "", "", None, None)
+    assert Caps(how="none").model_dump(exclude={"how"}) == {
+        "profile": "", "performance_profile": None, "governor": "", "units": {}, "power_w": None,
+        "throttled_share": 0.0, "first_throttled_s": None,
+    }  # fmt: skip
+    assert Temperature().model_dump() == {
+        "kind": "", "device_end": None, "device_max": None, "junction_max": None, "sensor": None
+    }  # fmt: skip
     with pytest.raises(ValueError, match="Extra inputs"):
         metrics_of({**report, "speed": 1})
     with pytest.raises(ValueError, match="Input should be 'host' or 'virtual'"):
