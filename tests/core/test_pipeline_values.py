@@ -53,34 +53,38 @@ class FakeStage:
             raise self.error
 
 
-def test_a_first_stage_gets_a_header_with_frame_time_and_epoch() -> None:
+@pytest.mark.parametrize("slot", [0, 1])
+def test_a_first_stage_gets_a_header_with_frame_time_and_epoch(slot: int) -> None:
     inner, outputs = FakeStage(), packets(OWN, 2)
     stage = BoundStage("pose", inner, [], outputs, 0)
     before = time.monotonic_ns()
-    assert stage.run(7, -1, 1, 3) == {"shade": 3}
-    header = outputs[1].header
-    assert (int(header["frame"]), int(header["epoch"]), inner.runs) == (7, 3, [(7, None, 1)])
+    assert stage.run(7, -1, slot, 3) == {"shade": 3}
+    header = outputs[slot].header
+    assert (int(header["frame"]), int(header["epoch"]), inner.runs) == (7, 3, [(7, None, slot)])
     assert before <= int(header["t_sampled_ns"]) <= time.monotonic_ns()
-    assert stage.sampled_ns(-1, 1) == int(header["t_sampled_ns"])
-    assert (int(outputs[0].header["frame"]), stage.sampled_ns(0, 1), stage.sampled_ns(-1, -1)) == (0, 0, 0)
-    assert stage.sampled_ns(-1, 0) == 0
+    assert stage.sampled_ns(-1, slot) == int(header["t_sampled_ns"])
+    assert (int(outputs[1 - slot].header["frame"]), stage.sampled_ns(-1, 1 - slot)) == (0, 0)
+    assert (stage.sampled_ns(0, slot), stage.sampled_ns(-1, -1)) == (0, 0)
     assert inner.bound == ([], outputs)
     stage.close()
     assert inner.closed
 
 
+@pytest.mark.parametrize(("taken", "given"), [(2, 1), (0, 0)])
 @pytest.mark.parametrize(("target", "own"), [(OWN, 9), (header_dtype([("other", "<u4")]), 0)])
-def test_a_header_is_passed_on_whole_or_with_its_frame_alone(target: np.dtype[Any], own: int) -> None:
+def test_a_header_is_passed_on_whole_or_with_its_frame_alone(
+    target: np.dtype[Any], own: int, taken: int, given: int
+) -> None:
     inputs, outputs = packets(OWN, 3), packets(target, 2)
-    inputs[2].header["frame"], inputs[2].header["t_sampled_ns"] = 5, 1234
-    inputs[2].header["epoch"], inputs[2].header["own"] = 1, 9
+    inputs[taken].header["frame"], inputs[taken].header["t_sampled_ns"] = 5, 1234
+    inputs[taken].header["epoch"], inputs[taken].header["own"] = 1, 9
     inner = FakeStage()
-    BoundStage("raster", inner, inputs, outputs, 0).run(5, 2, 1, 4)
-    header = outputs[1].header
+    BoundStage("raster", inner, inputs, outputs, 0).run(5, taken, given, 4)
+    header = outputs[given].header
     assert [int(header[name]) for name in ("frame", "t_sampled_ns", "epoch")] == [5, 1234, 4]
     assert int(header[target.names[3]]) == own
-    assert (int(inputs[2].header["epoch"]), inner.runs) == (1, [(5, 2, 1)])
-    assert not outputs[0].header.reshape(1).view("u1").any()
+    assert (int(inputs[taken].header["epoch"]), inner.runs) == (1, [(5, taken, given)])
+    assert not outputs[1 - given].header.reshape(1).view("u1").any()
 
 
 def test_all_fields_of_a_frame_are_copied_to_another_header() -> None:
@@ -122,6 +126,8 @@ def test_a_hold_sleeps_until_shortly_before_its_end_and_then_watches(monkeypatch
     assert clock.now_ns == 7 * MS
     bound_stage.hold_until(7 * MS + 151_000)  # 150 µs are left at the first look: too short to sleep
     assert (len(clock.slept), clock.now_ns) == (1, 7 * MS + 151_000)
+    bound_stage.hold_until(clock.now_ns + 1001)  # at the first look a nanosecond is left
+    assert clock.now_ns == 7 * MS + 153_000
 
 
 def test_a_job_is_held_for_its_pace_and_one_without_a_pace_is_not(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -282,3 +282,11 @@ def test_progress_is_shown_ten_times_a_second_and_at_the_end(monkeypatch: pytest
     world.core.ledger.presented(0, START, 1, NEVER)
     clock.finish()
     assert world.progress[2:] == [(1, 9)]
+
+
+def test_a_run_that_shows_no_progress_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World(monkeypatch)
+    clock = RealtimeClock(world.core, world, world.interrupts, world.log, None, None, None)  # type: ignore[arg-type]
+    assert clock.wait(NEVER)[0] == START
+    clock.finish()
+    assert (world.progress, clock.jobs, clock.metrics) == ([], [], {})

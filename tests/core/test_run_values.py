@@ -280,6 +280,8 @@ def test_units_that_do_not_close_are_named_unless_somebody_has_lost_patience(mon
     monkeypatch.setattr(FakeProcesses, "listen", lambda self, _: clock.sleep(15.1) or self.script.popleft())
     _, log = closed(script)
     assert log.failure == Failure("unit left, right did not close its files", 1)
+    _, log = closed([[], []], SimpleNamespace(count=1))
+    assert log.failure == Failure("unit left, right did not close its files", 1)
     processes, log = closed([], SimpleNamespace(count=2))
     assert (log.failure, processes.told[-1]) == (None, ("wait", ["left", "right"]))
 

@@ -292,6 +292,9 @@ def test_a_graph_knows_its_units_in_order_and_its_edges_by_name() -> None:
     graph = Graph((StageSpec("a", "x"), StageSpec("b", "y"), StageSpec("c", "x")), ("single", "fifo:3"), "b")
     assert (graph.units, [graph.edge_name(0), graph.edge_name(1)]) == (("x", "y"), ["a->b", "b->c"])
     assert chain([A, B], "triple", "a") == Graph((StageSpec(*A), StageSpec(*B)), ("triple",), "a")
+    for stages in ((), (StageSpec("a", "x"), StageSpec("a", "y"))):
+        with pytest.raises(ValueError, match=r"found stages \[.*\], expected different names"):
+            Graph(stages, ("single",) * (len(stages) - 1), "a")
     with pytest.raises(ValueError, match=r"found 1 edges and latency to 'b' for .*expected one edge fewer than stages"):
         Graph((StageSpec("b", "x"),), ("single",), "b")
 

@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+from math import comb, exp
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilane.scheduler.stats import ema_range_ms, jitter_ms, median_interval, percentile, summary_ms
+from trilane.scheduler.stats import (
+    ema_range_ms,
+    energy_score,
+    jitter_ms,
+    median_interval,
+    percentile,
+    real_time_score,
+    summary_ms,
+)
 
 TIMES = st.lists(st.integers(0, 10**12), min_size=1, max_size=60)
 
@@ -29,7 +40,8 @@ def test_an_exponential_average_stays_among_the_values(values: list[int]) -> Non
 
 def test_nothing_gives_zeros() -> None:
     assert percentile([], 0.5) == 0
-    assert set(summary_ms([]).values()) == {0.0}
+    assert summary_ms([]) == dict.fromkeys(summary_ms([1]), 0.0)
+    assert list(summary_ms([1])) == ["mean", "p50", "p90", "p95", "p99", "max"]
     assert ema_range_ms([]) == {"ema20_min": 0.0, "ema20_max": 0.0}
     assert jitter_ms([]) == jitter_ms([5]) == 0
 
@@ -47,3 +59,42 @@ def test_the_interval_of_a_median_is_that_of_the_sign_test(count: int, rank: int
 def test_of_no_values_there_is_no_median() -> None:
     with pytest.raises(ValueError, match="no values"):
         median_interval([])
+
+
+@pytest.mark.parametrize("confidence", [0.5, 0.8, 0.9, 0.95, 0.99])
+def test_the_interval_of_a_median_is_that_of_the_binomial_distribution(confidence: float) -> None:
+    """The largest k with P(B(n, 1/2) < k) <= (1 - confidence) / 2, summed in fractions; 1 where there is none."""
+    for count in range(1, 40):
+        below = [sum(Fraction(comb(count, i), 2**count) for i in range(k)) for k in range(count + 1)]
+        rank = max([k for k in range(1, count + 1) if below[k] <= Fraction((1 - confidence) / 2)], default=1)
+        assert median_interval(list(range(1, count + 1)), confidence) == (rank, count + 1 - rank)
+
+
+@pytest.mark.parametrize("count", [1, 2, 19, 20, 21, 45])
+@pytest.mark.parametrize("span", [2, 20])
+def test_an_exponential_average_begins_with_the_first_value_and_counts_from_the_span_on(count: int, span: int) -> None:
+    """Against the closed form: a(n) = (1-w)^n x(0) + sum of w (1-w)^(n-i) x(i), w = 2 / (span + 1)."""
+    values = [(37 * i * i) % 101 * 1_000_000 for i in range(1, count + 1)]
+    w = 2 / (span + 1)
+    averages = [
+        (1 - w) ** n * values[0] + sum(w * (1 - w) ** (n - i) * values[i] for i in range(1, n + 1))
+        for n in range(count)
+    ]
+    settled = averages[span - 1 :] if count >= span else averages[-1:]
+    row = ema_range_ms(values, span)
+    assert row == pytest.approx({f"ema{span}_min": min(settled) / 1e6, f"ema{span}_max": max(settled) / 1e6}, abs=1e-6)
+
+
+def test_scores_are_xrbenchs() -> None:
+    assert real_time_score([]) is None
+    assert real_time_score([0]) == 0.5
+    assert real_time_score([100_000, -200_000]) == pytest.approx((1 / (1 + exp(1.5)) + 1 / (1 + exp(-3))) / 2)
+    assert real_time_score([10**15]) == pytest.approx(0)
+    assert real_time_score([-(10**15), 10**15]) == pytest.approx(0.5)
+    assert [energy_score(mj) for mj in (0, 300, 1500, 1501)] == [1, 0.8, 0, 0]
+
+
+def test_ranks_lie_between_values() -> None:
+    assert [percentile([10, 20, 40], share) for share in (0, 0.25, 0.5, 0.75, 1)] == [10, 15, 20, 30, 40]
+    assert [percentile([7], share) for share in (0, 0.5, 1)] == [7, 7, 7]
+    assert jitter_ms([1_000_000, 1_000_001]) == 1e-6

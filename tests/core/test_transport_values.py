@@ -77,6 +77,11 @@ def test_what_is_wrong_with_bytes_is_said() -> None:
         unpack(b"\7" + words(1, 2) + b"\xc1")
     with pytest.raises(MessageError, match="Failed of 4096 bytes, expected less than 4096"):
         pack(messages.Failed(1, 2, "e" * 4093))
+    assert len(pack(messages.Failed(1, 2, "e" * 4076))) == 4096
+    with pytest.raises(MessageError, match="Failed of 4080 bytes"):
+        pack(messages.Failed(1, 2, "e" * 4077))
+    with pytest.raises(MessageError, match="unknown message b''"):
+        unpack(b"")
     assert unpack(pack(messages.Done(1, 2, 3, 4, {"a": 1, "b": 2.5}))).metrics == {"a": 1, "b": 2.5}
 
 
@@ -104,8 +109,16 @@ def test_a_packet_shows_the_bytes_of_its_slot_and_no_others() -> None:
     assert memory_of_slot[: len(start)] == start
     assert memory_of_slot[PAGE : PAGE + 12] == bytes([*range(1, 11), 0, 0])
     assert (packet.header.shape, packet.payload.shape, packet.payload.dtype) == ((), (10,), np.uint8)
-    with pytest.raises(ValueError, match="slot of 8191 bytes, the layout needs 8192"):
+    with pytest.raises(ValueError, match=r"^slot of 8191 bytes, the layout needs 8192"):
         view_packet(memoryview(memory_of_slot)[: 2 * PAGE - 1], layout)
+
+
+def test_layouts_and_packets_do_not_change() -> None:
+    layout = SlotLayout(header_dtype(), 1)
+    packet = view_packet(memoryview(bytearray(layout.slot_bytes)), layout)
+    for thing, name in ((layout, "payload_bytes"), (packet, "header"), (RegionLayout(1, layout), "slots")):
+        with pytest.raises(AttributeError, match="cannot assign"):
+            setattr(thing, name, None)
 
 
 def test_a_region_is_as_long_as_its_slots_and_stays_so() -> None:
@@ -122,7 +135,7 @@ def test_a_region_is_as_long_as_its_slots_and_stays_so() -> None:
         mapped[1].payload[0], mapped[2].header["frame"] = 5, 9
         assert os.pread(fd, 1, 3 * PAGE) == b"\5"
         assert os.pread(fd, 1, 4 * PAGE) == b"\x09"
-        with pytest.raises(ValueError, match=f"region of {6 * PAGE} bytes, the layout needs {8 * PAGE}"):
+        with pytest.raises(ValueError, match=rf"^region of {6 * PAGE} bytes, the layout needs {8 * PAGE}"):
             map_region(fd, RegionLayout(4, layout.slot))
     finally:
         os.close(fd)
@@ -249,6 +262,12 @@ def test_a_pipe_of_sixteen_pages_will_do_and_a_smaller_one_will_not(monkeypatch:
     monkeypatch.setattr(fcntl, "fcntl", lambda *_: 16 * os.sysconf("SC_PAGESIZE"))
     for end in job_pipe_pair():
         end.close()
+    asked: list[int] = []
+    monkeypatch.setattr(fcntl, "fcntl", lambda fd, _: asked.append(fd) or 1 << 20)
+    ours, theirs = job_pipe_pair()
+    assert asked == [theirs.writes, ours.writes] or asked == [ours.writes, theirs.writes]
+    ours.close()
+    theirs.close()
     monkeypatch.setattr(fcntl, "fcntl", lambda *_: 16 * os.sysconf("SC_PAGESIZE") - 1)
     with pytest.raises(TrilaneError, match=r"^no pipe for 16 messages: 65535 bytes for a pipe, by /proc"):
         job_pipe_pair()

@@ -20,7 +20,7 @@ from trilane.errors import TrilaneError
 from trilane.pipeline import unit_processes, unit_starter
 from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, UnitSettings
 from trilane.pipeline.regions import EdgeRegion
-from trilane.pipeline.run_metrics import metrics_of
+from trilane.pipeline.run_metrics import Caps, Temperature, metrics_of
 from trilane.pipeline.unit_processes import UnitMessage, UnitProcesses
 from trilane.pipeline.unit_spec import UnitSpec
 from trilane.pipeline.unit_starter import ForkedCall, StartedUnit, UnitStarter
@@ -173,6 +173,20 @@ def test_bytes_that_are_no_message_end_the_run_and_name_the_unit(started: Starte
         heard(processes, 1)
 
 
+def test_a_unit_that_has_closed_its_ends_wakes_nobody_again(started: Started) -> None:
+    """Its job pipe and its stderr stay readable for ever; its process still lives."""
+    processes, starter = started
+    starter.pipes["left"].send(Done(0, 1, 2, 3, {}))
+    starter.leave("left")
+    assert heard(processes, 1) == [UnitMessage("left", Done(0, 1, 2, 3, {}))]
+    for _ in range(2):
+        processes.listen(0)
+    assert processes._poller.poll(0) == []
+    assert list(processes.pids) == ["left", "right"]
+    starter.pipes["right"].send(Done(1, 1, 2, 3, {}))
+    assert heard(processes, 1) == [UnitMessage("right", Done(1, 1, 2, 3, {}))]
+
+
 def test_what_is_watched_wakes_a_listener_once(started: Started) -> None:
     processes, _ = started
     fd = os.eventfd(1, os.EFD_NONBLOCK)
@@ -259,6 +273,7 @@ def test_a_unit_is_asked_for_with_its_spec_and_files(answer: bytes, passes_fd: b
     ("code", "stderr", "said"),
     [
         (None, b"one\ntwo\n", "two"),
+        (None, b"x" * 9000 + b"\nno file \xff\n", "no file \ufffd"),
         (-9, b"", "the fork server, which every unit comes from, was killed by signal 9"),
         (3, b"", "the fork server, which every unit comes from, ended with exit code 3"),
         (0, b"", "the fork server, which every unit comes from, ended with exit code 0"),
@@ -353,7 +368,17 @@ def test_the_report_of_a_run_is_complete_in_order_and_has_no_other_keys() -> Non
     metrics = metrics_of(report)
     assert metrics.as_json() == report
     assert list(metrics.as_json()) == [key for key in type(metrics).model_fields if key in report]
-    assert (metrics.policy, metrics.caps, metrics.units["left"].pid) == ("", None, None)
+    left = metrics.units["left"]
+    assert (left.pid, left.cores, left.threads, left.spin) == (None, (), 0, False)
+    unset = (metrics.policy, metrics.edge, metrics.idle_cores, metrics.caps, metrics.temperature_c)
+    assert unset == ("", "", "", None, None)
+    assert Caps(how="none").model_dump(exclude={"how"}) == {
+        "profile": "", "performance_profile": None, "governor": "", "units": {}, "power_w": None,
+        "throttled_share": 0.0, "first_throttled_s": None,
+    }  # fmt: skip
+    assert Temperature().model_dump() == {
+        "kind": "", "device_end": None, "device_max": None, "junction_max": None, "sensor": None
+    }  # fmt: skip
     with pytest.raises(ValueError, match="Extra inputs"):
         metrics_of({**report, "speed": 1})
     with pytest.raises(ValueError, match="Input should be 'host' or 'virtual'"):

@@ -101,6 +101,45 @@ def test_a_run_at_a_pace_has_the_frame_time_of_virtual_time() -> None:
     assert min(job.end_ns - job.begin_ns for job in result.jobs if job.stage == "infer") >= stage_ns["infer"]
 
 
+class Capped:
+    """A governor that holds nobody and knows the power: 3 W."""
+
+    due_ns, is_prompt, power_w = 1 << 61, False, 3.0
+
+    def begin(self, now_ns: int) -> list[Any]:  # noqa: ARG002
+        return []
+
+    def report(self) -> dict[str, Any]:
+        return {"temperature_c": {"sensor": None}}
+
+
+def test_a_report_says_what_was_run_and_where() -> None:
+    """Frames of 5 ms and more: each of the 11 frame times misses a target of 1 ms, and none one of 100 s."""
+    pipeline, cores = doubles(infer=5), os.sched_getaffinity(0)
+    result = run_pipeline(pipeline, 12, fps=1000.0, governor=Capped())
+    report = result.report
+    assert os.sched_getaffinity(0) == cores
+    assert (report.policy, report.edge, report.clock, report.deadline_misses) == ("pipelined", "double", "host", 11)
+    assert report.idle_cores == "sleep: the performance profile asks for no haste"
+    assert report.xrbench.energy == pytest.approx(1 - 3000 / report.fps / 1500)
+    assert (report.xrbench.qoe, report.frames.requested, result.requested) == (1, 12, 12)
+    for unit, row in report.units.items():
+        settings = pipeline.units[unit]
+        assert (row.pid, row.cores, row.threads, row.spin) == (
+            result.pids[unit], settings.cores, settings.threads, settings.spin
+        )  # fmt: skip
+    assert set(result.startup_ms) == set(report.units) and min(result.startup_ms.values()) > 0
+    assert {stage: means["frame"] for stage, means in result.metrics.items()} == dict.fromkeys(report.stages, 5.5)
+    assert set(report.isolated_ms) == set(report.stages) - {"present"}
+    assert report.isolated_ms["infer"] >= 5
+    assert len(result.jobs) == 60 and (result.interrupted, result.messages) == (False, ())
+    assert all(
+        job.ready_ns <= job.dispatch_ns <= job.begin_ns < job.end_ns for job in result.jobs if job.stage != "pose"
+    )
+    slow = run_pipeline(doubles(), 5, fps=0.01, isolated_frames=0)
+    assert (slow.report.deadline_misses, slow.report.isolated_ms, slow.report.xrbench.energy) == (0, {}, None)
+
+
 def test_pipelined_hides_all_but_the_slowest() -> None:
     pipeline = doubles(raster=4, infer=12, composite=3, present=4)
     reports = [run_pipeline(pipeline, 60, policy=policy).report for policy in ("sequential", "pipelined")]
