@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from trilane.pipeline.run_metrics import Caps, StageTimes, Temperature, UnitShares
 
 DASH = "–"
-IDLE = ("starved", "blocked", "throttled", "overhead")
+IDLE = ("starved", "blocked", "throttled", "preempted", "overhead")
 STATISTICS = ("mean", "p50", "p90", "p95", "p99", "max")
 
 #: Name of a row, what it measures, and a cell for each run.
