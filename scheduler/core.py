@@ -249,6 +249,7 @@ class Core:
             if verdict == watchdog.KILL:
                 unit.move(DeadlinePassed, NEVER)
                 unit.update_queue_capacity()
+                self.flow.mark_dirty(unit)
                 self.actions.append(Kill(unit.name))
             elif verdict == watchdog.START:
                 unit.move(DeadlinePassed, self.now_ns + self.settings.start_ns)

@@ -14,7 +14,19 @@ from trilane.apps.trace import write_trace
 from trilane.bench.accounts import virtual_run
 from trilane.scheduler.accounts import LARGEST_DIFFERENCE, compared, idle_slices, second_accounts
 from trilane.scheduler.core import Core
-from trilane.scheduler.events import Dispatch, JobDone, SetDuty, Settings, UnitReady, chain
+from trilane.scheduler.events import (
+    Dispatch,
+    Event,
+    FrameRequest,
+    JobDone,
+    Pinged,
+    SetDuty,
+    Settings,
+    Stop,
+    UnitDied,
+    UnitReady,
+    chain,
+)
 from trilane.scheduler.ledger import STARVED, JobRecord
 from trilane.scheduler.recording import Recording
 from trilane.scheduler.virtual import Simulation, simulate
@@ -143,6 +155,61 @@ def test_a_unit_at_half_duty_is_throttled_half_of_the_time() -> None:
     agrees(done)
 
 
+def test_a_unit_at_a_quarter_of_its_duty_rests_three_times_as_long_as_it_worked() -> None:
+    """b runs from 2 to 7 and again every 20 ms; the fifth rest is after the run's end."""
+    done = run("double", inputs=[(0, SetDuty("v", 250))])
+    assert [begin for _, _, begin, _ in times(done, "b")] == [2, 22, 42, 62, 82]
+    assert parts(done.report, "v") == (25, 2, 0, 60, 0, 0)
+    agrees(done)
+
+
+def test_a_limit_of_frames_in_flight_blocks_the_first_stage() -> None:
+    """One frame at a time: a works for 2 ms, then waits for b's 5 with frames to come, after the last with none."""
+    done = run("double", settings={"in_flight": 1})
+    assert parts(done.report, "u") == (10, 5, 20, 0, 0, 0)
+    assert parts(done.report, "v") == (25, 10, 0, 0, 0, 0)
+    agrees(done)
+
+
+def fed(settings: Settings, steps: list[tuple[int, tuple[Event, ...]]], jobs: list[JobRecord]) -> dict[str, Any]:
+    """The report of a core with one stage on one unit that hears `steps`; `jobs` are those that they end."""
+    graph = chain((("a", "u"),), "single", "a")
+    core, recording = Core(graph, settings), Recording(graph, settings)
+    for now_ns, events in steps:
+        recording.add(now_ns, events, core.step(now_ns, events).actions, core)
+    report = core.ledger.report(clock="host", requested=settings.frames)
+    assert compared(report["units"], recording, jobs)["largest_difference"] < 1e-12
+    return report
+
+
+def test_a_unit_that_answers_no_ping_is_overhead_from_its_killing_on() -> None:
+    """It is starved until it is killed at 10; its end is heard at 13, it is back at 20, starved, and stopped at 24."""
+    settings = Settings(5, asked=True, hang_ns=10 * MS)
+    steps: list[tuple[int, tuple[Event, ...]]] = [
+        (0, (UnitReady("u"), Pinged("u"))),
+        (10 * MS, ()),
+        (13 * MS, (UnitDied("u"),)),
+        (13 * MS, ()),
+        (20 * MS, (UnitReady("u"),)),
+        (24 * MS, (Stop(),)),
+    ]
+    assert parts(fed(settings, steps, []), "u") == (0, 10 + 4, 0, 0, 0, 3 + 7)
+
+
+def test_what_a_unit_waited_for_a_core_before_it_had_a_job_is_not_preempted() -> None:
+    """It waited for 8 ms since its last job, in 2 of which it had the next one: the frame was asked for at 10."""
+    spans = [(0, 4), (12, 15)]
+    done = [JobDone("u", n, begin * MS, end * MS, 0, 0, 0, 8 * MS * n) for n, (begin, end) in enumerate(spans)]
+    jobs = [JobRecord("a", "u", n, 0, 0, b * MS, e * MS, 0, 0, 8 * MS * n) for n, (b, e) in enumerate(spans)]
+    steps: list[tuple[int, tuple[Event, ...]]] = [
+        (0, (UnitReady("u"), FrameRequest(1))),
+        (4 * MS, (done[0],)),
+        (10 * MS, (FrameRequest(1),)),
+        (15 * MS, (done[1],)),
+    ]
+    assert parts(fed(Settings(2, asked=True), steps, jobs), "u") == (4 + 3, 6, 0, 0, 2, 0)
+
+
 def test_what_a_unit_lost_is_booked_under_its_causes() -> None:
     """One stage, jobs as a unit reports them, in ms: (begin, end, preempted, asleep, preempted before).
 
@@ -151,25 +218,21 @@ def test_what_a_unit_lost_is_booked_under_its_causes() -> None:
     there. The fourth slept. The end of the last is heard a ms later.
     """
     reported = [(2, 10, 3, 1, 1), (10, 20, 0, 0, 4), (25, 30, 5, 0, 9), (30, 40, 0, 10, 0), (42, 50, 0, 0, 0)]
-    graph, settings = chain((("a", "u"),), "single", "a"), Settings(5)
-    core, recording, jobs = Core(graph, settings), Recording(graph, settings), []
-    recording.add(0, (UnitReady("u"),), core.step(0, (UnitReady("u"),)).actions, core)
+    steps: list[tuple[int, tuple[Event, ...]]] = [(0, (UnitReady("u"),))]
+    jobs = []
     for number, (begin, end, *lost) in enumerate(reported):
         spans = begin * MS, end * MS
         done = JobDone("u", number, *spans, begin * MS, *(ms * MS for ms in lost))
         jobs.append(JobRecord("a", "u", number, 0, 0, *spans, *(ms * MS for ms in lost)))
-        now_ns = (end + (number == 4)) * MS
-        recording.add(now_ns, (done,), core.step(now_ns, (done,)).actions, core)
-    report = core.ledger.report(clock="host", requested=5)
+        steps.append(((end + (number == 4)) * MS, (done,)))
+    report = fed(Settings(5), steps, jobs)
     assert parts(report, "u") == (4 + 10 + 0 + 0 + 8, 0, 0, 0, 1 + 3 + 5 + 5, 1 + 1 + 10 + 2 + 1)
-    assert core.ledger.busy_ns == {"u": 22 * MS}
     assert report["stages"]["a"]["service_ms"]["mean"] == (8 + 10 + 5 + 10 + 8) / 5  # the wall's time
-    assert compared(report["units"], recording, jobs)["largest_difference"] < 1e-12
 
 
 @pytest.mark.parametrize("seed", range(50))
 def test_both_computations_agree_in_random_runs(seed: int) -> None:
-    report = virtual_run(random.Random(seed), 60)
+    report = virtual_run(random.Random(seed), 40)
     assert report["accounts"]["largest_difference"] <= 1e-12
     for unit, row in report["units"].items():
         assert min(row["busy"], *row["idle"].values()) >= 0
