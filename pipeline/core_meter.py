@@ -30,7 +30,8 @@ class CoreMeter:
 
     def __init__(self, others: Set[int] = frozenset()) -> None:
         self._others = others
-        self._delays: dict[int, tuple[int, int]] = {}  # thread: its open file, its delay so far
+        self._files: dict[int, int] = {}  # of each thread
+        self._seen_ns: dict[int, int] = {}  # of each file, the delay when it was last read
         self._threads = self._born_ns = 0
         self._folder = os.open(TASKS, os.O_RDONLY | os.O_CLOEXEC) if counts_run_delay() else -1
         self._cpu_ns = time.process_time_ns()
@@ -46,14 +47,14 @@ class CoreMeter:
     def delay_ns(self) -> int:
         """Run delay of the threads since the last call, summed up."""
         delay_ns, self._born_ns = self._born_ns, 0
-        for thread, (file, before_ns) in self._delays.items():
+        for file, seen_ns in self._seen_ns.items():
             try:
                 now_ns = int(os.pread(file, LINE_BYTES, 0).split()[1])
             except ProcessLookupError:  # the thread has ended; `look` closes its file
                 continue
-            if now_ns != before_ns:
-                delay_ns += now_ns - before_ns
-                self._delays[thread] = (file, now_ns)
+            if now_ns != seen_ns:
+                delay_ns += now_ns - seen_ns
+                self._seen_ns[file] = now_ns
         return delay_ns
 
     def look(self) -> None:
@@ -65,9 +66,11 @@ class CoreMeter:
             return
         self._threads = threads
         alive = {int(name) for name in os.listdir(self._folder)} - self._others  # noqa: PTH208 - by descriptor
-        for thread in self._delays.keys() - alive:
-            os.close(self._delays.pop(thread)[0])
-        for thread in alive - self._delays.keys():
+        for thread in self._files.keys() - alive:
+            file = self._files.pop(thread)
+            del self._seen_ns[file]
+            os.close(file)
+        for thread in alive - self._files.keys():
             self._open(thread)
 
     def _open(self, thread: int) -> None:
@@ -76,14 +79,15 @@ class CoreMeter:
             delay_ns = int(os.pread(file, LINE_BYTES, 0).split()[1])
         except (FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
             return
-        self._delays[thread] = (file, delay_ns)
+        self._files[thread], self._seen_ns[file] = file, delay_ns
         self._born_ns += delay_ns
 
     def close(self) -> None:
         """Close every file."""
-        for file, _ in self._delays.values():
+        for file in self._seen_ns:
             os.close(file)
-        self._delays.clear()
+        self._files.clear()
+        self._seen_ns.clear()
         if self._folder >= 0:
             os.close(self._folder)
             self._folder = -1

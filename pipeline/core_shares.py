@@ -21,13 +21,14 @@ class Lost(NamedTuple):
 def preempted_ns(wall_ns: int, cpu_ns: int, delay_ns: int, cores: int) -> int:
     """How much of `wall_ns` a unit with `cores` cores waited for them.
 
-    Its threads were ready for cpu + delay, m = (cpu + delay) / wall of them at a time; with 1 <= m <= cores, their
-    waiting took delay / m. It is never more than what the CPU time leaves of the cores. With one core this is
+    Its threads were ready for cpu + delay, m = (cpu + delay) / wall of them at a time, but at least one; their waiting
+    took delay / m. It is never more than what the CPU time leaves of the cores. With one core this is
     min(delay, wall - cpu).
     """
+    if not delay_ns:
+        return 0
     left_ns = max(wall_ns - -(-cpu_ns // cores), 0)
-    ready_ns = min(max(cpu_ns + delay_ns, wall_ns), wall_ns * cores)
-    return min(delay_ns * wall_ns // ready_ns, left_ns) if ready_ns else 0
+    return min(delay_ns * wall_ns // max(cpu_ns + delay_ns, wall_ns), left_ns)
 
 
 def lost_in_job(wall_ns: int, cpu_ns: int, delay_ns: int, cores: int, has_device: bool) -> Lost:
@@ -37,4 +38,5 @@ def lost_in_job(wall_ns: int, cpu_ns: int, delay_ns: int, cores: int, has_device
     works while its threads sleep.
     """
     preempted = preempted_ns(wall_ns, cpu_ns, delay_ns, cores)
-    return Lost(preempted, 0 if has_device else max(wall_ns - preempted - cpu_ns, 0))
+    asleep = 0 if has_device else wall_ns - preempted - cpu_ns
+    return Lost(preempted, asleep if asleep > 0 else 0)

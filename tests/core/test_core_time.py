@@ -5,13 +5,15 @@ from __future__ import annotations
 import random
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from trilane.pipeline import core_meter
+from trilane.pipeline import core_meter, job_times
 from trilane.pipeline.core_meter import CoreMeter
 from trilane.pipeline.core_shares import Lost, lost_in_job, preempted_ns
 from trilane.pipeline.cpu_use import CpuTimes, use_of_cores
+from trilane.pipeline.job_times import JobClock, JobTimes
 from trilane.transport.messages import Done
 
 TICKS = 400
@@ -32,6 +34,7 @@ FILES = Path("/proc/self/fd")
         (100, 60, 40, 2, 40, 0),  # one thread, which had none for 40
         (100, 100, 0, 2, 0, 0),  # one thread, which ran throughout
         (100, 160, 40, 2, 20, 0),  # one of two threads had none for 40
+        (100, 120, 40, 2, 25, 0),  # 1.6 threads were ready at a time
         (0, 0, 7, 1, 0, 0),
     ],
 )
@@ -145,7 +148,8 @@ def test_cpu_time_is_that_of_all_threads_and_files_are_closed() -> None:
         thread.join()
     meter.delay_ns()  # of threads that have ended meanwhile too
     meter.look()
-    assert meter.cpu_ns() > 0
+    first_ns = meter.cpu_ns()
+    assert 0 < meter.cpu_ns() < first_ns
     assert meter.delay_ns() >= 0
     meter.close()
     assert len(list(FILES.iterdir())) == before
@@ -176,3 +180,28 @@ def test_cpu_time_of_the_units_of_some_cores_is_at_most_what_they_had() -> None:
     assert all(row.is_possible for row in rows)
     too_much = use_of_cores({"u": (0,), "v": (0,)}, {"u": 1.2, "v": 0.9}, {"u": 0.6, "v": 0.4}, 2.0)
     assert [row.is_possible for row in too_much] == [False]
+
+
+class ToldMeter:
+    """Says what it is told: (CPU time, run delay) of each piece of time, in turn."""
+
+    def __init__(self, *pieces: tuple[int, int]) -> None:
+        self._cpu_ns, self._delay_ns = ([piece[index] for piece in pieces] for index in (0, 1))
+
+    def look(self) -> None:
+        """There are no threads."""
+
+    def cpu_ns(self) -> int:
+        return self._cpu_ns.pop(0)
+
+    def delay_ns(self) -> int:
+        return self._delay_ns.pop(0)
+
+
+def test_a_job_and_the_time_before_it_are_measured_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ready at 1000. To 1400: 100 on the core, 250 without. The job to 2400: 600 on it, 300 without, 100 asleep."""
+    instants = iter([1000, 1400, 1400, 2400])
+    monkeypatch.setattr(job_times, "time", SimpleNamespace(monotonic_ns=lambda: next(instants)))
+    clock = JobClock(ToldMeter((7, 9), (100, 250), (600, 300)), 1)  # type: ignore[arg-type]
+    clock.begin()
+    assert clock.end(works_asleep=False) == JobTimes(1400, 2400, 300, 100, 250, 600, 100)
