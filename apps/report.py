@@ -19,6 +19,7 @@ from trilane.hw_profiles.host import sensor_c
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run_metrics import (
     Caps,
+    CoreShare,
     FrameCounts,
     FrameTimes,
     Record,
@@ -104,6 +105,7 @@ class Baseline(Record):
     stages: dict[str, StageTimes]
     units: dict[str, UnitShares]
     efficiency: float | None
+    core_shares: tuple[CoreShare, ...] = ()
 
 
 class PaceComparison(Record):

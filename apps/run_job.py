@@ -193,6 +193,7 @@ def _write_files(result: RunResult, work: Path, fps: float) -> dict[str, Any]:
     """Everything but the report; what the report says of it."""
     from trilane.apps.trace import write_trace
     from trilane.apps.video import contact_sheet, join_segments, run_checksum
+    from trilane.scheduler.accounts import idle_slices
     from trilane.stages.cpu.present import SEGMENTS
 
     segments = work / SEGMENTS
@@ -205,5 +206,6 @@ def _write_files(result: RunResult, work: Path, fps: float) -> dict[str, Any]:
             contact_sheet(work / "video.mp4", work / "contact.png", fps)
         shutil.rmtree(segments)
     result.recording.write(work / "events.jsonl")
-    write_trace(result.jobs, result.recording.graph.units, work / "trace.pftrace")
+    idle = idle_slices(result.recording, result.jobs)
+    write_trace(result.jobs, result.recording.graph.units, work / "trace.pftrace", idle)
     return facts

@@ -20,6 +20,7 @@ from trilane.hw_profiles.operator_times import JobTime, job_time, machine_of
 from trilane.hw_profiles.performance_profiles import Corners
 from trilane.hw_profiles.reference_networks import CHANNELS_PER_PASS
 from trilane.hw_profiles.schema import Profile, Unit
+from trilane.scheduler.accounts import compared
 from trilane.scheduler.events import Graph, Settings, chain
 from trilane.scheduler.policy import POLICIES
 from trilane.scheduler.virtual import simulate
@@ -153,6 +154,7 @@ class Steady:
 
     `capped`: whether it waits for the display. `unit_of`: unit of each stage. `stages_ms`: time of a job of each stage.
     `busy`: share of the time in which each unit works; `idle`: shares of the rest by cause. They sum to 1 per unit.
+    `accounts`: how they compare with those that the slices of the run give; empty when that was not asked.
     """
 
     frame_ms: float
@@ -162,6 +164,7 @@ class Steady:
     stages_ms: Mapping[str, float]
     busy: Mapping[str, float]
     idle: Mapping[str, Mapping[str, float]]
+    accounts: Mapping[str, Any]
 
 
 def application_graph(edge: str = "double", infer: Iterable[tuple[str, str]] = (INFER,)) -> Graph:
@@ -171,7 +174,7 @@ def application_graph(edge: str = "double", infer: Iterable[tuple[str, str]] = (
 
 @lru_cache(maxsize=4096)
 def _settled(
-    times: tuple[tuple[str, UnitName, int], ...], variant: Variant, display_ns: int, quick: bool
+    times: tuple[tuple[str, UnitName, int], ...], variant: Variant, display_ns: int, quick: bool, twice: bool
 ) -> tuple[Any, bool]:
     """The report of a run, and whether the display limits its rate.
 
@@ -179,6 +182,7 @@ def _settled(
     `variant`: how the stages are joined.
     `display_ns`: the shortest time between two shown jobs.
     `quick`: whether to run only QUICK_FRAMES where that is enough.
+    `twice`: whether the report has `accounts`, its shares of time computed a second time.
     """
     infer = [(name, unit) for name, unit, _ in times[len(BEFORE_INFER) : -len(AFTER_INFER)]]
     graph = application_graph(variant.edge, infer)
@@ -187,32 +191,36 @@ def _settled(
     regular = variant.edge in ("single", "double") and not paced
     frames = (QUICK_FRAMES if quick else FRAMES) if regular else FRAMES_WITH_DROPS
     settings = Settings(frames, variant.policy, period_ns=display_ns if paced else 0)
-    report = _run(graph, settings, service)
+    report = _run(graph, settings, service, twice)
     if paced or report["frame_time_ms"]["mean"] * NS_PER_MS >= display_ns:
         return report, False
-    return _run(graph, Settings(frames, variant.policy, period_ns=display_ns), service), True
+    return _run(graph, Settings(frames, variant.policy, period_ns=display_ns), service, twice), True
 
 
-def _run(graph: Graph, settings: Settings, service: Mapping[str, int]) -> Any:
+def _run(graph: Graph, settings: Settings, service: Mapping[str, int], twice: bool) -> Any:
     try:
-        return simulate(graph, settings, lambda stage, _unit, _frame, _begin: service[stage]).report
+        done = simulate(graph, settings, lambda stage, _unit, _frame, _begin: service[stage], keep=twice)
+        if done.recording is not None:
+            done.report["accounts"] = compared(done.report["units"], done.recording, done.jobs)
+        return done.report
     except ValueError as error:
         expected = error.expected if isinstance(error, UnexpectedValue) else str(error)
         raise BadInputError("edge", repr(graph.edges[0]), expected) from None
 
 
-def steady(profile: Profile, plan: Plan, corners: Corners, *, quick: bool = False) -> Steady:
+def steady(profile: Profile, plan: Plan, corners: Corners, *, quick: bool = False, twice: bool = False) -> Steady:
     """Frame time, latency and shares of time, by the scheduler in virtual time.
 
     `profile`: of the chip.
     `plan`: what runs on it.
     `corners`: at which the units stay.
     `quick`: whether a short run will do. Its frame time is right; its shares of time include filling and draining.
+    `twice`: whether to compute the shares of time a second time.
     """
     times = stage_times_ms(profile, plan, corners)
     rounded = tuple((name, unit, round(ms * NS_PER_MS)) for (name, unit), ms in times.items())
     batch, display = plan.variant.batch, profile.application.display_ms.or_else(0)
-    report, capped = _settled(rounded, plan.variant, round(batch * display * NS_PER_MS), quick)
+    report, capped = _settled(rounded, plan.variant, round(batch * display * NS_PER_MS), quick, twice)
     units = report["units"]
     frame = max(report["frame_time_ms"]["mean"], *times.values()) / batch
     return Steady(
@@ -223,6 +231,7 @@ def steady(profile: Profile, plan: Plan, corners: Corners, *, quick: bool = Fals
         stages_ms={name: ms for (name, _), ms in times.items()},
         busy={unit: units[unit]["busy"] if unit in units else 0.0 for unit in UNITS},
         idle={unit: units[unit]["idle"] if unit in units else {"starved": 1.0} for unit in UNITS},
+        accounts=report.get("accounts", {}),
     )
 
 

@@ -58,7 +58,7 @@ def predict(
     Raises BadInputError for an unknown name or a time out of range.
     """
     corners = corners_of(profile, performance_profile)
-    now = steady(profile, plan, corners)
+    now = steady(profile, plan, corners, twice=True)
     moments = over_time(profile, plan, performance_profile, minutes, governor) if minutes else []
     frame = _mean([m.frame_ms for m in moments]) if moments else now.frame_ms
     power = _mean([m.power_w for m in moments]) if moments else _settled_power(profile, now, corners)
@@ -104,6 +104,7 @@ def _settled(plan: Plan, now: Steady) -> dict[str, Any]:
         "display_capped": now.capped,
         "stages": {s: {"unit": now.unit_of[s], "service_ms": {"mean": ms}} for s, ms in now.stages_ms.items()},
         "units": {u: {"busy": now.busy[u], "idle": dict(now.idle[u])} for u in UNITS},
+        "accounts": {key: now.accounts[key] for key in ("largest_difference", "agree")},
         "efficiency": max(per_unit.values()) / plan.variant.batch / now.frame_ms,
     }
 

@@ -7,18 +7,20 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from trilane.arrays import U8
-from trilane.pipeline.stage import Stage
+from trilane.pipeline.stage import Stage, UnitContext
 from trilane.transport.packets import FRAME_FIELDS, Packet
 
 WAKE_UP_NS = 150_000  # a sleep ends about this much late
 
 
 class BoundStage:
-    """`stage` with its slots. `pace_ns`: how long a job is held, at least."""
+    """`stage` with its slots. `pace_ns`: how long a job is held, at least. `unit`: that it runs on."""
 
-    def __init__(self, name: str, stage: Stage, inputs: list[Packet], outputs: list[Packet], pace_ns: int) -> None:
+    def __init__(
+        self, name: str, stage: Stage, inputs: list[Packet], outputs: list[Packet], pace_ns: int, unit: UnitContext
+    ) -> None:
         self.name, self._pace_ns = name, pace_ns
-        self._stage, self._outputs = stage, outputs
+        self._stage, self._outputs, self._unit = stage, outputs, unit
         self._pass_on = _header_copier(inputs, outputs)
         stage.bind(inputs, outputs)
 
@@ -36,6 +38,11 @@ class BoundStage:
         if self._pace_ns:
             hold_until(end_ns)
         return metrics
+
+    @property
+    def works_asleep(self) -> bool:
+        """Whether the job goes on while its threads sleep: on hardware of its own, or held to the pace of a chip."""
+        return self._pace_ns > 0 or self._unit.has_device
 
     def sampled_ns(self, slot_in: int, slot_out: int) -> int:
         """Of a pipeline's first stage: when the frame in its output slot was sampled; else 0."""

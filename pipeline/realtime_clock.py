@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from trilane.errors import TrilaneError
+from trilane.pipeline.cpu_use import CpuTimes
 from trilane.pipeline.requests import FrameRequestQueue
 from trilane.pipeline.run_log import RunLog
 from trilane.pipeline.signals import Interrupts
@@ -60,6 +61,7 @@ class RealtimeClock:
     """`trilane.scheduler.loop.Clock` of one run over `processes`; it lets `core` run until that finishes.
 
     `jobs`: of every job that ended, when. `metrics`: of every stage, the sums of what its jobs reported.
+    `cpu`: CPU time of units and stages.
     """
 
     def __init__(
@@ -74,6 +76,7 @@ class RealtimeClock:
     ) -> None:
         self.jobs: list[JobRecord] = []
         self.metrics: dict[str, Counter[str]] = defaultdict(Counter)
+        self.cpu = CpuTimes(processes.core_counts)
         self._core, self._processes, self._interrupts, self._log = core, processes, interrupts, log
         self._requests, self._governor, self._on_progress = requests, governor, on_progress
         self._last_stage = core.graph.stages[-1].name
@@ -188,7 +191,16 @@ class RealtimeClock:
         self._unbooked.append((job, dispatch_ns, None if frame is None else frame.ready_ns, message))
         if frame is not None and self._requests is not None and job.stage == self._last_stage:
             self._requests.answered(job.frame)
-        return JobDone(unit, message.id, message.t_begin_ns, message.t_end_ns, message.t_sampled_ns)
+        return JobDone(
+            unit,
+            message.id,
+            message.t_begin_ns,
+            message.t_end_ns,
+            message.t_sampled_ns,
+            message.preempted_ns,
+            message.asleep_ns,
+            message.preempted_before_ns,
+        )
 
     def _failed(self, unit: str, message: Failed) -> Event | None:
         self._log.fail_with(message)
@@ -206,8 +218,10 @@ class RealtimeClock:
         """Note what the ended jobs took; done after the next jobs were dispatched, while the units work."""
         for job, dispatch_ns, ready_ns, done in self._unbooked:
             if ready_ns is not None:
-                times = (ready_ns, dispatch_ns, done.t_begin_ns, done.t_end_ns)
+                lost = (done.preempted_ns, done.asleep_ns, done.preempted_before_ns)
+                times = (ready_ns, dispatch_ns, done.t_begin_ns, done.t_end_ns, *lost)
                 self.jobs.append(JobRecord(job.stage, job.unit, job.frame, *times))
+            self.cpu.add(job.unit, job.stage, done, self._core.ledger.start_ns)
             self.metrics[job.stage].update(done.metrics)
         self._unbooked.clear()
 

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Protocol
 
 from trilane.errors import BadInputError
+from trilane.pipeline.accounts import add_accounts
 from trilane.pipeline.description import Pipeline
 from trilane.pipeline.isolated import IsolatedTimes
 from trilane.pipeline.lifecycle import close_units, start_units
@@ -124,6 +125,7 @@ def run_pipeline(
         report["xrbench"]["energy"] = energy_score(1e3 * governor.power_w / report["fps"])
     for unit, row in report["units"].items():
         row.update(pid=run.pids[unit], **pipeline.units[unit].model_dump(mode="json"))
+    add_accounts(report, pipeline, clock.cpu, run.recording, clock.jobs, log)
     return run.result(metrics_of(report))
 
 
@@ -140,7 +142,7 @@ class _Run:
         recording: Recording,
     ) -> None:
         self._core, self._clock, self._processes = core, clock, processes
-        self._interrupts, self._log, self._recording = interrupts, log, recording
+        self._interrupts, self._log, self.recording = interrupts, log, recording
         self.isolated = IsolatedTimes(core.graph, processes, interrupts)
         self.pids: dict[str, int] = {}
         self._startup_ms: dict[str, float] = {}
@@ -152,7 +154,7 @@ class _Run:
         self.pids = self._processes.pids
         sample = _spread(self._core.settings.frames, max(isolated_frames, 1))
         self.isolated.measure(sample[::2])
-        self._outcome = run_loop(self._core, self._clock, self._recording)
+        self._outcome = run_loop(self._core, self._clock, self.recording)
         self._clock.finish()
         if self._outcome.kind is OutcomeKind.GAVE_UP:
             unit = self._outcome.unit
@@ -175,7 +177,7 @@ class _Run:
             pids=self.pids,
             startup_ms=self._startup_ms,
             jobs=tuple(self._clock.jobs),
-            recording=self._recording,
+            recording=self.recording,
             metrics=self._mean_metrics(),
             messages=tuple(self._log.messages),
             interrupted=stopped and self._interrupts.count > 0,

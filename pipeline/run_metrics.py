@@ -76,11 +76,18 @@ class XrBench(Record):
 
 
 class StageTimes(Record):
-    """One stage. `unit`: that ran it; `service_ms`: of its jobs; `wait_ms`: from a job's input to its begin."""
+    """One stage.
+
+    `unit`: that ran it.
+    `service_ms`: of its jobs, from begin to end, the time included in which another process had the core.
+    `wait_ms`: from a job's input to its begin.
+    `cpu_ms`: CPU time of its jobs, of all threads of the unit; on the host clock.
+    """
 
     unit: str
     service_ms: TimeSummary
     wait_ms: TimeSummary
+    cpu_ms: TimeSummary | None = None
 
 
 class IdleShares(Record):
@@ -89,23 +96,28 @@ class IdleShares(Record):
     `starved`: it had no input.
     `blocked`: it had input, but no free output slot, or the limit of frames in flight was reached.
     `throttled`: its cap held it.
-    `overhead`: a job was on its way to it, or its process was down.
+    `preempted`: it had a job, but not its core; null where the kernel does not say how long threads wait for one.
+    `overhead`: a job was on its way to it, it slept within a job, or its process was down.
     """
 
     starved: float
     blocked: float
     throttled: float
+    preempted: float | None = None
     overhead: float
 
 
 class UnitShares(Record):
-    """One unit; `busy` and the four parts of `idle` sum to 1.
+    """One unit; `busy` and the five parts of `idle` sum to 1.
 
     `busy`: share of the time in which a job ran.
     `idle`: the rest, by cause.
     `jobs`: that it ended.
     `restarts`: new processes after the first.
-    `pid`: of its last process; on the host clock, as the three below.
+    `cpu_s`: CPU time of all its threads in the run, those included that spin between jobs; on the host clock, as what
+    follows.
+    `cpu_in_jobs_s`: the part of it in jobs.
+    `pid`: of its last process.
     `cores`: that it may use.
     `threads`: that its stages may use.
     `spin`: whether those threads may spin between jobs.
@@ -115,10 +127,38 @@ class UnitShares(Record):
     idle: IdleShares
     jobs: int
     restarts: int
+    cpu_s: float | None = None
+    cpu_in_jobs_s: float | None = None
     pid: int | None = None
     cores: tuple[int, ...] = ()
     threads: int = 0
     spin: bool = False
+
+
+class CoreShare(Record):
+    """Units that may run on `cores` and nowhere else.
+
+    `cpu`: their CPU time as a share of the time that these cores had; at most 1.
+    `busy`: their busy shares as a share of the same; at most 1 where no unit has a device of its own.
+    """
+
+    cores: tuple[int, ...]
+    units: tuple[str, ...]
+    cpu: float
+    busy: float
+
+
+class Accounts(Record):
+    """The busy and idle shares a second time, from the slices of the trace (scheduler/accounts.py).
+
+    `units`: of each unit that has slices, its shares.
+    `largest_difference`: from the shares of `units` of the report, over all units and causes.
+    `agree`: whether that is at most `LARGEST_DIFFERENCE` of the time.
+    """
+
+    units: dict[str, dict[str, float]]
+    largest_difference: float
+    agree: bool
 
 
 class UnitCap(Record):
@@ -185,6 +225,8 @@ class RunMetrics(Record):
     `efficiency`: the slowest unit's stages, measured isolated, over the mean frame time; null when not measured.
     `bottleneck`: that slowest unit; absent when not measured.
     `isolated_ms`: mean time of each stage that was measured while no other unit worked.
+    `core_shares`: what was done on each set of cores that a unit has, and on all; on the host clock.
+    `accounts`: the shares of `units` computed a second time.
     `policy`, `edge`: of the scheduler; `idle_cores`: whether cores without work stayed awake; on the host clock.
     `caps`, `temperature_c`: of a capped run.
     """
@@ -202,6 +244,8 @@ class RunMetrics(Record):
     efficiency: float | None
     bottleneck: str | None = None
     isolated_ms: dict[str, float]
+    core_shares: tuple[CoreShare, ...] = ()
+    accounts: Accounts | None = None
     policy: str = ""
     edge: str = ""
     idle_cores: str = ""

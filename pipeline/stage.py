@@ -41,6 +41,7 @@ class UnitContext:
     settings: UnitSettings
     assets: Assets
     _shared: dict[str, Any] = field(default_factory=dict)
+    _devices: set[str] = field(default_factory=set)
 
     def shared(self, key: str, make: Callable[[], T]) -> T:
         """What `make` returns, made once in this process: such as the context with which two stages draw."""
@@ -48,6 +49,18 @@ class UnitContext:
             self._shared[key] = make()
         made: T = self._shared[key]
         return made
+
+    def use_device(self, name: str) -> None:
+        """The unit's work is done by hardware other than its cores, such as a graphics card.
+
+        Then a job whose threads sleep counts as busy: the device works. Else it would count as idle.
+        """
+        self._devices.add(name)
+
+    @property
+    def has_device(self) -> bool:
+        """Whether a stage said `use_device`."""
+        return bool(self._devices)
 
 
 class StageFactory(Protocol):

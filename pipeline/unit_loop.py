@@ -18,6 +18,8 @@ from typing import Any
 
 from trilane.errors import TrilaneError, UnitLostError
 from trilane.pipeline.bound_stage import BoundStage
+from trilane.pipeline.core_meter import TASKS, CoreMeter
+from trilane.pipeline.job_times import JobClock
 from trilane.pipeline.shared_assets import map_assets
 from trilane.pipeline.stage import StageFactory, UnitContext
 from trilane.pipeline.unit_spec import UnitSpec
@@ -44,8 +46,6 @@ from trilane.transport.messages import (
 )
 from trilane.transport.wakeup import UNIT_NS, use_slice
 
-TASKS = Path("/proc/self/task")
-
 
 def serve(raw_spec: dict[str, Any], number_of: Mapping[int, int]) -> int:
     """Build the unit's stages, then answer messages until Close; the process's exit code.
@@ -65,6 +65,7 @@ def serve(raw_spec: dict[str, Any], number_of: Mapping[int, int]) -> int:
 
 
 def _serve(spec: UnitSpec, link: Link) -> int:
+    others = _threads() - {os.getpid()}
     try:
         with building_cores(spec):
             stages = build_stages(spec)
@@ -72,15 +73,17 @@ def _serve(spec: UnitSpec, link: Link) -> int:
         return _fail(link, BUILDING, f"unit {spec.unit}", error)
     gc.collect()
     gc.freeze()
+    clock = JobClock(CoreMeter(others), len(spec.settings.cores))
     link.send_heartbeat(Ready(os.getpid()))
     while True:
         message = link.job_pipe.receive()
         if isinstance(message, RunJob):
-            _run_job(link, stages[message.stage], message)
+            _run_job(link, stages[message.stage], message, clock)
         elif isinstance(message, Ping):
             link.send_heartbeat(Pong())
         elif isinstance(message, RunIsolated):
             _run_isolated(link, stages[message.stage], message)
+            clock.restart()
         elif isinstance(message, Close):
             return _close(spec.unit, link, stages)
         elif link.job_pipe.ended:
@@ -95,15 +98,20 @@ def building_cores(spec: UnitSpec) -> Iterator[None]:
 
     Afterwards it and every thread that was started meanwhile are back on the unit's own cores.
     """
-    before = set(TASKS.iterdir())
+    before = _threads()
     os.sched_setaffinity(0, spec.run_cores)
     try:
         yield
     finally:
         os.sched_setaffinity(0, spec.settings.cores)
-        for task in set(TASKS.iterdir()) - before:
+        for thread in _threads() - before:
             with contextlib.suppress(ProcessLookupError):  # it has ended meanwhile
-                os.sched_setaffinity(int(task.name), spec.settings.cores)
+                os.sched_setaffinity(thread, spec.settings.cores)
+
+
+def _threads() -> set[int]:
+    """Those of this process, by the kernel's numbers."""
+    return {int(task.name) for task in Path(TASKS).iterdir()}
 
 
 def build_stages(spec: UnitSpec) -> list[BoundStage]:
@@ -119,6 +127,7 @@ def build_stages(spec: UnitSpec) -> list[BoundStage]:
             packets[spec.inputs[described.name]] if described.name in spec.inputs else [],
             packets[spec.outputs[described.name]] if described.name in spec.outputs else [],
             described.pace_ns,
+            unit,
         )
         for described, stage in zip(spec.stages, stages, strict=True)
     ]
@@ -131,17 +140,32 @@ def factory_named(name: str) -> StageFactory:
     return factory
 
 
-def _run_job(link: Link, stage: BoundStage, job: RunJob) -> None:
-    begin_ns = time.monotonic_ns()
+def _run_job(link: Link, stage: BoundStage, job: RunJob, clock: JobClock) -> None:
+    clock.begin()
     try:
         metrics = stage.run(job.frame, job.slot_in, job.slot_out, job.epoch)
-        end_ns = time.monotonic_ns()
+        times = clock.end(stage.works_asleep)
         values = {str(name): float(value) for name, value in metrics.items()}
-        link.job_pipe.send(Done(job.id, begin_ns, end_ns, stage.sampled_ns(job.slot_in, job.slot_out), values))
+        sampled_ns = stage.sampled_ns(job.slot_in, job.slot_out)
+        link.job_pipe.send(
+            Done(
+                job.id,
+                times.begin_ns,
+                times.end_ns,
+                sampled_ns,
+                times.preempted_ns,
+                times.asleep_ns,
+                times.preempted_before_ns,
+                times.cpu_ns,
+                times.cpu_before_ns,
+                values,
+            )
+        )
     except UnitLostError:
         raise
     except Exception as error:
         _fail(link, job.id, f"stage {stage.name}, frame {job.frame}", error)
+    clock.look()
 
 
 def _run_isolated(link: Link, stage: BoundStage, job: RunIsolated) -> None:

@@ -95,6 +95,11 @@ class UnitProcesses:
         self.stderr_tails: dict[str, str] = {}
 
     @property
+    def core_counts(self) -> dict[str, int]:
+        """How many cores each unit has."""
+        return {unit: len(settings.cores) for unit, settings in self._pipeline.units.items()}
+
+    @property
     def pids(self) -> dict[str, int]:
         return {unit: process.pid for unit, process in self._live.items()}
 

@@ -158,7 +158,7 @@ class Core:
     # events of jobs
 
     def _on_done(self, event: JobDone) -> None:
-        name, job_id, begin_ns, end_ns, pose_ns = event
+        name, job_id, begin_ns, end_ns, pose_ns, preempted_ns, asleep_ns, preempted_before_ns = event
         unit = self.units[name]
         if not unit.queue or unit.queue[0].id != job_id:
             return  # it was lost with the process that did it
@@ -167,7 +167,7 @@ class Core:
         unit.failures = 0
         stage, frame = self._stage_named[job.stage], self.frames[job.frame]
         service_ns = end_ns - begin_ns
-        self.ledger.job(job, frame.ready_ns, begin_ns, end_ns)
+        self.ledger.job(job, frame.ready_ns, begin_ns, end_ns, preempted_ns, asleep_ns, preempted_before_ns)
         if self._estimates:
             stage.learn(service_ns)
         if unit.duty < FULL_DUTY:
@@ -249,6 +249,7 @@ class Core:
             if verdict == watchdog.KILL:
                 unit.move(DeadlinePassed, NEVER)
                 unit.update_queue_capacity()
+                self.flow.mark_dirty(unit)
                 self.actions.append(Kill(unit.name))
             elif verdict == watchdog.START:
                 unit.move(DeadlinePassed, self.now_ns + self.settings.start_ns)

@@ -35,13 +35,20 @@ class UnitReady(NamedTuple):
 
 
 class JobDone(NamedTuple):
-    """`t_sampled_ns`: when the frame's pose was sampled, as its header says; 0 but from the first stage."""
+    """`t_sampled_ns`: when the frame's pose was sampled, as its header says; 0 but from the first stage.
+
+    `preempted_ns`, `asleep_ns`: parts of the job in which its unit had no core, and in which nothing of it worked.
+    `preempted_before_ns`: how long the unit had no core between its job before and this one.
+    """
 
     unit: str
     job: int
     t_begin_ns: int
     t_end_ns: int
     t_sampled_ns: int
+    preempted_ns: int = 0
+    asleep_ns: int = 0
+    preempted_before_ns: int = 0
 
 
 class JobFailed(NamedTuple):

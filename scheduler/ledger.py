@@ -1,7 +1,8 @@
-"""Where the time went. Rule: every nanosecond of a unit is busy or idle for one stated cause; the five sum to the run.
+"""Where the time went. Rule: every nanosecond of a unit is busy or idle for one stated cause; the six sum to the run.
 
 busy: a job runs. starved: no input. blocked: input, but no free output slot, or the limit of frames in flight.
-throttled: held by the cap. overhead: a job is assigned but does not run (messages, scheduling), or the unit is down.
+throttled: held by the cap. preempted: the unit has a job, but not its core. overhead: a job is assigned but does not
+run (messages, scheduling, it sleeps), or the unit is down. On the virtual clock every unit has its own core.
 """
 
 from __future__ import annotations
@@ -19,7 +20,10 @@ ASSIGNED, STARVED, BLOCKED, THROTTLED = range(4)
 
 
 class JobRecord(NamedTuple):
-    """One finished job. Times in ns of the run's clock; `ready` is when its input was there."""
+    """One finished job. Times in ns of the run's clock; `ready` is when its input was there.
+
+    `preempted_ns`, `asleep_ns`, `preempted_before_ns`: as in `JobDone`.
+    """
 
     stage: str
     unit: str
@@ -28,6 +32,9 @@ class JobRecord(NamedTuple):
     dispatch_ns: int
     begin_ns: int
     end_ns: int
+    preempted_ns: int = 0
+    asleep_ns: int = 0
+    preempted_before_ns: int = 0
 
 
 class _UnitBook:
@@ -35,15 +42,33 @@ class _UnitBook:
         self.state = STARVED
         self.since_ns = 0
         self.totals = [0, 0, 0, 0]
-        self.busy_ns = 0
-        self.busy_until_ns = 0
+        self.busy_ns = self.preempted_ns = 0
+        self.last_end_ns = 0
         self.jobs = 0
         self.restarts = 0
+
+    def add_job(self, begin_ns: int, end_ns: int, preempted_ns: int, asleep_ns: int, preempted_before_ns: int) -> None:
+        """Book a job, and what was lost of the time before it in which the unit had it and did no other."""
+        self.jobs += 1
+        held_from_ns = max(self.last_end_ns, self.since_ns)
+        if begin_ns > held_from_ns:
+            self.preempted_ns += min(preempted_before_ns, begin_ns - held_from_ns)
+        if end_ns > self.last_end_ns:
+            ran_ns = end_ns - max(begin_ns, self.last_end_ns)
+            self.last_end_ns = end_ns
+            self.preempted_ns += min(preempted_ns, ran_ns)
+            self.busy_ns += ran_ns - min(preempted_ns + asleep_ns, ran_ns)
 
     def shares(self) -> dict[str, Any]:
         total = sum(self.totals) or 1
         assigned, starved, blocked, throttled = self.totals
-        idle = {"starved": starved, "blocked": blocked, "throttled": throttled, "overhead": assigned - self.busy_ns}
+        idle = {
+            "starved": starved,
+            "blocked": blocked,
+            "throttled": throttled,
+            "preempted": self.preempted_ns,
+            "overhead": assigned - self.busy_ns - self.preempted_ns,
+        }
         return {
             "busy": self.busy_ns / total,
             "idle": {cause: ns / total for cause, ns in idle.items()},
@@ -88,14 +113,21 @@ class Ledger:
         book.totals[book.state] += now_ns - book.since_ns
         book.state, book.since_ns = state, now_ns
 
-    def job(self, job: Job, ready_ns: int, begin_ns: int, end_ns: int) -> None:
-        stage, unit = self._stages[job.stage], self._units[job.unit]
+    def job(
+        self,
+        job: Job,
+        ready_ns: int,
+        begin_ns: int,
+        end_ns: int,
+        preempted_ns: int = 0,
+        asleep_ns: int = 0,
+        preempted_before_ns: int = 0,
+    ) -> None:
+        """Book a job that has ended: `ready_ns` is when its input was there, the rest is as in `JobDone`."""
+        stage = self._stages[job.stage]
         stage.service_ns.append(end_ns - begin_ns)
         stage.wait_ns.append(begin_ns - ready_ns)
-        unit.jobs += 1
-        if end_ns > unit.busy_until_ns:
-            unit.busy_ns += end_ns - max(begin_ns, unit.busy_until_ns)
-            unit.busy_until_ns = end_ns
+        self._units[job.unit].add_job(begin_ns, end_ns, preempted_ns, asleep_ns, preempted_before_ns)
 
     @property
     def busy_ns(self) -> dict[str, int]:

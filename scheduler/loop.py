@@ -40,6 +40,6 @@ def run_loop(core: Core, clock: Clock, recording: Recording | None = None) -> Ou
         if actions:
             perform(now_ns, actions)
         if recording is not None:
-            recording.steps.append((now_ns, events, actions))
+            recording.add(now_ns, events, actions, core)
         if core.outcome is not None:
             return core.outcome

@@ -27,7 +27,7 @@ from trilane.scheduler.events import (
 from trilane.scheduler.unit_life import UnitLifeError
 from trilane.unexpected_value import UnexpectedValue
 
-SCHEMA = 3
+SCHEMA = 4
 #: Actions that carry one tuple, which is written in their place.
 CARRIED: dict[Any, Any] = {Dispatch: Job, Finish: Outcome}
 
@@ -42,11 +42,25 @@ _EVENTS, _ACTIONS = _forms(EVENTS), _forms(ACTIONS)
 
 @dataclass
 class Recording:
-    """The steps of one run: (now_ns, events, actions)."""
+    """The steps of one run: (now_ns, events, actions).
+
+    `accounts`: (now_ns, unit, account) each time that a step left a unit with another account (ledger.py) than the step
+    before; not written, for a replay gives them again.
+    """
 
     graph: Graph
     settings: Settings
     steps: list[tuple[int, tuple[Event, ...], tuple[Action, ...]]] = field(default_factory=list)
+    accounts: list[tuple[int, str, int]] = field(default_factory=list, compare=False)
+    _account_of: dict[str, int] = field(default_factory=dict, compare=False, repr=False)
+
+    def add(self, now_ns: int, events: tuple[Event, ...], actions: tuple[Action, ...], core: Core) -> None:
+        """Note a step of `core` that has just been taken."""
+        self.steps.append((now_ns, events, actions))
+        for unit in core.units.values():
+            if self._account_of.get(unit.name) != unit.account:
+                self._account_of[unit.name] = unit.account
+                self.accounts.append((now_ns, unit.name, unit.account))
 
     def write(self, path: Path) -> None:
         """As JSON lines: a header, then a line per step with `t`, `events`, `actions`, each a [name, fields...]."""

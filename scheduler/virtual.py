@@ -79,7 +79,7 @@ class VirtualDriver:
         `restart_ns`: a unit's start-up time.
         `faults`: (t_ns, unit), deaths of units.
         `inputs`: (t_ns, event), events from outside, such as SetDuty or Stop.
-        `keep`: record steps and jobs.
+        `keep`: record steps, and the jobs that end.
         Raises ValueError for an unknown policy or edge.
         """
         self.core = Core(graph, settings)
@@ -88,6 +88,7 @@ class VirtualDriver:
         self._service, self._message_delay_ns, self._restart_ns = service, message_delay_ns, restart_ns
         self._heap: list[tuple[int, int, int, Event, int]] = []
         self._sequence = 0
+        self._begun: dict[int, JobRecord] = {}
         self._units = {unit: _VirtualUnit() for unit in graph.units}
         for unit in graph.units:
             self._push(0, EVENT, UnitReady(unit))
@@ -113,6 +114,8 @@ class VirtualDriver:
             at_ns, _, _, event, epoch = heappop(heap)
             if type(event) is JobDone:
                 if epoch == self._units[event.unit].epoch:
+                    if self._begun:
+                        self.jobs.append(self._begun.pop(event.job))
                     return at_ns, (event,)
             elif self._accept(event, epoch):
                 return at_ns, (event,)
@@ -151,12 +154,12 @@ class VirtualDriver:
         if begin_ns < unit.free_ns:
             begin_ns = unit.free_ns
         end_ns = unit.free_ns = begin_ns + self._service(stage, name, frame, begin_ns)
-        done = JobDone(name, job_id, begin_ns, end_ns, begin_ns)
+        done = JobDone(name, job_id, begin_ns, end_ns, begin_ns, 0, 0, 0)
         self._sequence += 1
         heappush(self._heap, (end_ns + self._message_delay_ns, EVENT, self._sequence, done, unit.epoch))
         if self.recording is not None:
             ready_ns = self.core.frames[frame].ready_ns
-            self.jobs.append(JobRecord(stage, name, frame, ready_ns, now_ns, begin_ns, end_ns))
+            self._begun[job_id] = JobRecord(stage, name, frame, ready_ns, now_ns, begin_ns, end_ns)
 
     def _start(self, now_ns: int, action: Start) -> None:
         unit = self._units[action.unit]

@@ -62,14 +62,22 @@ class Ready(NamedTuple):
 class Done(NamedTuple):
     """From a unit: the job `id` has ended. Times in ns of CLOCK_MONOTONIC.
 
-    `t_sampled_ns`: of the chain's first stage, when it sampled the frame's input; of the others 0. `metrics`: numbers
-    that the stage itself reports of the job, by name.
+    `t_sampled_ns`: of the chain's first stage, when it sampled the frame's input; of the others 0. `preempted_ns`,
+    `asleep_ns`: parts of the job in which the unit had no core, and in which nothing of it worked.
+    `preempted_before_ns`: how long it had no core between the job before and this one. `cpu_ns`, `cpu_before_ns`: CPU
+    time of all its threads in the job, and between the job before and this one. `metrics`: numbers that the stage
+    itself reports of the job, by name.
     """
 
     id: int
     t_begin_ns: int
     t_end_ns: int
     t_sampled_ns: int
+    preempted_ns: int
+    asleep_ns: int
+    preempted_before_ns: int
+    cpu_ns: int
+    cpu_before_ns: int
     metrics: dict[str, float]
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from trilane.hw_profiles.application import Plan
     from trilane.hw_profiles.schema import Profile
 
-IDLE = ("starved", "blocked", "throttled", "overhead")
+IDLE = ("starved", "blocked", "throttled", "preempted", "overhead")
 SHOWN = ("bench_gpu_ms", "bench_dsp_ms", "app_gpu_ms", "app_dsp_ms", "confidence")
 
 
@@ -82,6 +82,9 @@ def show_answer(answer: dict[str, Any], as_json: bool) -> None:
         )
     console.print(f"expected error  ±{100 * answer['expected_error']:.0f} % (confidence {answer['confidence']:.2f})")
     console.print(_unit_table(answer))
+    if not answer["accounts"]["agree"]:
+        found = answer["accounts"]["largest_difference"]
+        console.print(f"the shares of units, computed twice, differ by {found:.2%} of the time: please report this")
     if "alternatives" in answer:
         console.print(_alternatives_table(answer))
 

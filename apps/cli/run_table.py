@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from trilane.pipeline.run_metrics import Caps, StageTimes, Temperature, UnitShares
 
 DASH = "–"
-IDLE = ("starved", "blocked", "throttled", "overhead")
+IDLE = ("starved", "blocked", "throttled", "preempted", "overhead")
 STATISTICS = ("mean", "p50", "p90", "p95", "p99", "max")
 
 #: Name of a row, what it measures, and a cell for each run.
@@ -32,7 +32,7 @@ def run_table(report: Report) -> Table:
     table.add_column("")
     for run in runs:
         table.add_column(f"{run.policy}, {run.frames.presented} frames", justify="right")
-    for section in (_stage_rows, _unit_rows, _time_rows, _rate_rows):
+    for section in (_stage_rows, _unit_rows, _core_rows, _time_rows, _rate_rows):
         for name, measure, cells in section(runs):
             table.add_row(name, measure, *cells)
         table.add_section()
@@ -102,7 +102,20 @@ def _unit_rows(runs: Sequence[Report | Baseline]) -> Rows:
 def _shares(unit: UnitShares | None) -> str:
     if unit is None:
         return DASH
-    return f"{100 * unit.busy:.0f} / " + " ".join(f"{100 * getattr(unit.idle, cause):.0f}" for cause in IDLE)
+    return f"{_percent(unit.busy)} / " + " ".join(_percent(getattr(unit.idle, cause)) for cause in IDLE)
+
+
+def _core_rows(runs: Sequence[Report | Baseline]) -> Rows:
+    """CPU time of the units of each set of cores; none for a report that has no such figures."""
+    for index, first in enumerate(runs[0].core_shares):
+        shares = [run.core_shares[index] if index < len(run.core_shares) else None for run in runs]
+        name = f"core{'s' if len(first.cores) > 1 else ''} {','.join(map(str, first.cores))}"
+        cells = [_percent(share.cpu if share else None) for share in shares]
+        yield name, f"CPU time of {', '.join(first.units)}, %", cells
+
+
+def _percent(share: float | None) -> str:
+    return DASH if share is None else f"{100 * share:.0f}"
 
 
 def _time_rows(runs: Sequence[Report | Baseline]) -> Rows:

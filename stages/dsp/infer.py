@@ -23,7 +23,7 @@ from trilane.shapes import Shape
 from trilane.stages.avatar_assets import network_of
 from trilane.stages.config import RunConfig
 from trilane.stages.dsp.parts import parts_for, views
-from trilane.stages.dsp.runtime import Binding, RuntimeOptions, Session, load_runtime, resolve
+from trilane.stages.dsp.runtime import Binding, RuntimeOptions, Session, has_device, load_runtime, resolve
 from trilane.transport.packets import Packet
 
 Key = tuple[Shape, int, int]
@@ -113,6 +113,8 @@ class InferStage:
 def build(settings: Mapping[str, Any], unit: UnitContext) -> InferStage:
     """The stage that runs part `settings["part"]` of the network. Raises BadInputError, MissingPartError."""
     config = RunConfig.model_validate(settings["config"])
+    if has_device(config.runtime):
+        unit.use_device(config.runtime)
     return InferStage(config, network_of(unit.assets), settings["part"])
 
 

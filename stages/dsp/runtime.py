@@ -6,6 +6,7 @@ Rule: a runtime is chosen by name; it runs the network or the run stops with an 
 from __future__ import annotations
 
 import importlib.util
+import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -17,6 +18,8 @@ from trilane.arrays import U8
 from trilane.avatars.integer_network import IntegerNetwork
 from trilane.errors import BadInputError, MissingPartError
 from trilane.install import install_line, package_line, pip
+
+X86 = ("x86_64", "AMD64")
 
 
 @dataclass(frozen=True)
@@ -110,6 +113,11 @@ def resolve(name: str) -> str:
         what = f"a build of {entry.package} with {entry.file}" if entry.file else f"the package {entry.package}"
         raise MissingPartError(f"runtime {name} needs {what}", entry.install())
     return name
+
+
+def has_device(name: str) -> bool:
+    """Whether runtime `name` computes on hardware of its own; on x86, `qnn` is an emulator that runs on the cores."""
+    return name == "cuda" or (name == "qnn" and platform.machine() not in X86)
 
 
 def load_runtime(name: str) -> Runtime:

@@ -27,7 +27,7 @@ from trilane.stages.gpu.composite_painters import AvatarPainter, PicturePainter,
 from trilane.stages.gpu.contact_shadows import DISCS, floor_discs
 from trilane.stages.gpu.detected_planes import PlanePainter
 from trilane.stages.gpu.head_up_display import Hud
-from trilane.stages.gpu.opengl_context import CONTEXT, checked, open_context
+from trilane.stages.gpu.opengl_context import CONTEXT, checked, describe, open_context
 from trilane.transport.packets import Packet
 
 ROOM = "room"
@@ -136,6 +136,9 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> CompositeStage:
     else:
         background, eyes = open_background(Path(scene.background), shape, scene.fps), []
     ctx = unit.shared(CONTEXT, lambda: open_context(unit.settings.threads))
+    driver = describe(ctx)
+    if driver.hardware:
+        unit.use_device(driver.renderer)
     return CompositeStage(ctx, shape, config.buckets, joints, background, eyes, scene.planes, scene.hud)
 
 

@@ -108,7 +108,10 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> RasterStage:
     ctx = unit.shared(CONTEXT, lambda: open_context(unit.settings.threads))
     folders, filtering = distinct(config), config.scene.texture_filter
     textures = [texture_of(unit.assets, number) for number in range(len(folders))]
-    deferred = filtering == "linear" and not describe(ctx).hardware
+    driver = describe(ctx)
+    if driver.hardware:
+        unit.use_device(driver.renderer)
+    deferred = filtering == "linear" and not driver.hardware
     packed = PackedPass(ctx, textures[0].shape[2], quantisation_of(unit.assets, 0), deferred, filtering)
     drawn = {
         folder: PackedAvatar(packed, _mesh(ctx, shaped_body(unit.assets, number), config), texture)

@@ -21,7 +21,7 @@ from trilane.scheduler.ledger import JobRecord
 TIMES = {"mean": 20.0, "p50": 20.0, "p90": 21.0, "p95": 22.0, "p99": 23.0, "max": 24.0}
 SHARE = {
     "busy": 0.5,
-    "idle": {"starved": 0.25, "blocked": 0.15, "throttled": 0.0, "overhead": 0.1},
+    "idle": {"starved": 0.25, "blocked": 0.15, "throttled": 0.0, "preempted": 0.02, "overhead": 0.08},
     "jobs": 3,
     "restarts": 0,
     "pid": 7,
@@ -63,6 +63,7 @@ def make_report(**changes: Any) -> dict[str, Any]:
         "deadline_misses": 0,
         "stages": {"infer": {"unit": "dsp", "service_ms": TIMES, "wait_ms": TIMES}},
         "units": {"dsp": SHARE},
+        "core_shares": [{"cores": [2, 3], "units": ["cpu", "gpu"], "cpu": 0.8, "busy": 0.75}],
         "efficiency": 0.91,
     }
     config = {
@@ -243,7 +244,8 @@ def test_the_table_shows_both_policies_and_dashes_what_was_not_measured() -> Non
         "pipelined, 3 frames",
         "sequential, 3 frames",
         "20.0 + 20.0",
-        "50 / 25 15 0 10",
+        "50 / 25 15 0 2 8",
+        "CPU time of cpu, gpu, %",
         "0.91",
         "face 31.2 dB",
     ):

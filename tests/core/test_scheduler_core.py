@@ -264,8 +264,8 @@ def test_a_file_that_is_no_recording_is_named(tmp_path: Path, text: str) -> None
 def test_a_recording_of_another_schema_is_not_replayed(tmp_path: Path) -> None:
     path = tmp_path / "events.jsonl"
     run("pipelined", keep=True).recording.write(path)
-    path.write_text(path.read_text().replace('"schema": 3', '"schema": 2', 1))
-    with pytest.raises(BadInputError, match=r"line 1: found schema 2; this Trilane reads 3"):
+    path.write_text(path.read_text().replace('"schema": 4', '"schema": 3', 1))
+    with pytest.raises(BadInputError, match=r"line 1: found schema 3; this Trilane reads 4"):
         read(path)
 
 

@@ -64,10 +64,11 @@ def _check(packet: Packet, frame: int) -> None:
         raise RuntimeError(f"payload {packet.payload[:4]} for frame {frame}")
 
 
-def build(settings: Mapping[str, Any], unit: UnitContext) -> StageDouble:  # noqa: ARG001 - a factory's signature
+def build(settings: Mapping[str, Any], unit: UnitContext) -> StageDouble:
     """The stage that `settings` describe: `behaviour` (also `badbuild`: cannot be built) and `log`."""
     if settings["behaviour"] == "badbuild":
         raise BadInputError("mock.onnx", "nothing", "a network", "train one")
+    unit.use_device("a double, which works while it sleeps")
     return StageDouble(settings["behaviour"], settings["log"])
 
 

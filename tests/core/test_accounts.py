@@ -1,0 +1,327 @@
+"""Where the time of a run goes: timelines of five frames worked out by hand, and the same accounts from the trace."""
+
+from __future__ import annotations
+
+import random
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import pytest
+from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace, TrackEvent
+
+from trilane.apps.trace import write_trace
+from trilane.bench.accounts import virtual_run
+from trilane.scheduler.accounts import LARGEST_DIFFERENCE, compared, idle_slices, second_accounts
+from trilane.scheduler.core import Core
+from trilane.scheduler.events import (
+    Dispatch,
+    Event,
+    FrameRequest,
+    JobDone,
+    Pinged,
+    SetDuty,
+    Settings,
+    Stop,
+    UnitDied,
+    UnitReady,
+    chain,
+)
+from trilane.scheduler.ledger import STARVED, JobRecord
+from trilane.scheduler.recording import Recording
+from trilane.scheduler.virtual import Simulation, simulate
+
+MS = 1_000_000
+SERVICE = {"a": 2, "b": 5}
+TWO_UNITS = (("a", "u"), ("b", "v"))
+#: (busy, starved, blocked, throttled, preempted, overhead) in ms.
+Parts = tuple[float, float, float, float, float, float]
+
+
+def run(edge: str = "single", policy: str = "pipelined", *, b: int = 5, **options: Any) -> Simulation:
+    """Five frames through a (2 ms) and b on two units."""
+    settings = Settings(5, policy, **options.pop("settings", {}))
+    graph, service = chain(TWO_UNITS, edge, "b"), {"a": 2 * MS, "b": b * MS}
+    return simulate(graph, settings, lambda stage, *_: service[stage], keep=True, **options)
+
+
+def parts(report: dict[str, Any], unit: str) -> Parts:
+    row, total = report["units"][unit], report["duration_s"] * 1e3
+    return tuple(round(share * total, 6) for share in (row["busy"], *row["idle"].values()))  # type: ignore[return-value]
+
+
+def times(done: Simulation, stage: str) -> list[tuple[float, ...]]:
+    """(frame, ready, begin, end) in ms of each job that ended."""
+    rows = [
+        (job.frame, job.ready_ns / MS, job.begin_ns / MS, job.end_ns / MS) for job in done.jobs if job.stage == stage
+    ]
+    return sorted(rows)
+
+
+def agrees(done: Simulation) -> None:
+    assert done.recording is not None
+    found = compared(done.report["units"], done.recording, done.jobs)
+    assert found["largest_difference"] < 1e-12
+    assert all(sum(row.values()) == pytest.approx(1, abs=1e-12) for row in found["units"].values())
+
+
+def test_five_frames_through_one_slot() -> None:
+    """A message takes 1 ms each way. The slot is held from a's dispatch until b's end is heard: the units take turns.
+
+    Frame n: a is handed it at 11n, runs from 11n + 1 to 11n + 3 and is heard at 11n + 4; b is handed it then, runs from
+    11n + 5 to 11n + 10 and is heard at 11n + 11. So a has a job for 4 ms of 11 and works for 2; for the other 7 it is
+    blocked, in the last round without a frame to come: starved. b is starved for 4 of 11 and works for 5 of the rest.
+    """
+    done = run(message_delay_ns=MS, target_period_ns=10 * MS)
+    assert times(done, "a") == [(n, 11 * n, 11 * n + 1, 11 * n + 3) for n in range(5)]
+    assert times(done, "b") == [(n, 11 * n + 3, 11 * n + 5, 11 * n + 10) for n in range(5)]
+    report = done.report
+    assert report["duration_s"] == 0.055
+    assert parts(report, "u") == (10, 7, 28, 0, 0, 10)
+    assert parts(report, "v") == (25, 20, 0, 0, 0, 10)
+    assert set(report["stages"]["a"]["wait_ms"].values()) == {1.0}
+    assert set(report["stages"]["b"]["wait_ms"].values()) == {2.0}
+    assert set(report["stages"]["b"]["service_ms"].values()) == {5.0}
+    assert set(report["latency_ms"].values()) == {9.0}  # from a's begin at 11n + 1 to b's end at 11n + 10
+    assert (report["frame_time_ms"]["mean"], report["fps"]) == (11.0, pytest.approx(1000 / 11))
+    assert report["deadline_misses"] == 4  # four intervals of 11 ms, each above 10
+    agrees(done)
+
+
+def test_five_frames_of_which_two_are_replaced_by_newer_ones() -> None:
+    """`latest` through a mailbox, a frame every 10 ms, b takes 25 and no message takes time.
+
+    b runs frame 0 from 2 to 27, holds frame 1 since 12 (it did not know yet how long a job takes) and runs it to 52.
+    Frame 2 waits from 22 and is replaced by 3 at 32, which is replaced by 4 at 42. b runs 4 until 77. Deadlines are at
+    35, 45 and 75: the second and the last are missed.
+    """
+    done = run("triple", "latest", b=25, settings={"period_ns": 10 * MS, "deadline_ns": 35 * MS})
+    assert times(done, "a") == [(n, 10 * n, 10 * n, 10 * n + 2) for n in range(5)]
+    assert times(done, "b") == [(0, 2, 2, 27), (1, 12, 27, 52), (4, 42, 52, 77)]
+    report = done.report
+    assert report["frames"]["dropped"] == {"a->b:stale": 2}
+    assert (report["frames"]["presented"], report["frames"]["lost"]) == (3, 0)
+    assert parts(report, "u") == (10, 67, 0, 0, 0, 0)
+    assert parts(report, "v") == (75, 2, 0, 0, 0, 0)
+    assert report["stages"]["b"]["wait_ms"]["mean"] == pytest.approx((0 + 15 + 10) / 3, abs=1e-5)
+    assert (report["stages"]["b"]["wait_ms"]["p50"], report["stages"]["b"]["wait_ms"]["max"]) == (10, 15)
+    assert report["latency_ms"]["mean"] == pytest.approx((27 + 42 + 37) / 3, abs=1e-5)
+    assert report["latency_ms"]["max"] == 42
+    assert report["deadline_misses"] == 2
+    agrees(done)
+
+
+def test_five_frames_with_a_unit_that_dies() -> None:
+    """v dies at 9, two ms into frame 1, and is back at 29. What it worked for then, and its absence, are overhead.
+
+    a fills both slots, is blocked from 4 until b ends frame 0 at 7, fills the slot again, and the one that the death
+    freed at 9; from 11 on both hold waiting frames, and it is blocked until b has ended frame 2, from 29 to 34.
+    """
+    done = run("double", faults=[(9 * MS, "v")], restart_ns=20 * MS)
+    assert times(done, "a") == [(0, 0, 0, 2), (1, 0, 2, 4), (2, 7, 7, 9), (3, 9, 9, 11), (4, 34, 34, 36)]
+    assert times(done, "b") == [(0, 2, 2, 7), (2, 9, 29, 34), (3, 11, 34, 39), (4, 36, 39, 44)]
+    report = done.report
+    assert report["frames"]["lost_by_cause"] == {"died:v": 1}
+    assert parts(report, "u") == (10, 8, 26, 0, 0, 0)
+    assert parts(report, "v") == (20, 2, 0, 0, 0, 2 + 20)
+    assert report["units"]["v"]["restarts"] == 1
+    assert report["stages"]["b"]["wait_ms"]["mean"] == (0 + 20 + 23 + 3) / 4
+    agrees(done)
+
+
+def test_the_epoch_is_raised_with_each_death() -> None:
+    """Whatever is handed out after v's first and second death carries epoch 1 and 2."""
+    done = run("double", faults=[(9 * MS, "v"), (30 * MS, "v")], restart_ns=5 * MS)
+    assert done.recording is not None
+    handed = [
+        (now_ns // MS, action.job.epoch)
+        for now_ns, _, actions in done.recording.steps
+        for action in actions
+        if isinstance(action, Dispatch)
+    ]
+    assert {epoch for at_ms, epoch in handed if at_ms < 9} == {0}
+    assert {epoch for at_ms, epoch in handed if 9 <= at_ms < 30} == {1}
+    assert {epoch for at_ms, epoch in handed if at_ms >= 30} <= {2}
+
+
+def test_a_unit_at_half_duty_is_throttled_half_of_the_time() -> None:
+    """b rests after each job as long as it took: 5 of 10 ms; the last rest is after the run's end.
+
+    a fills a slot at once when b has ended the job that read it, so its input is always there when b has rested.
+    """
+    done = run("double", inputs=[(0, SetDuty("v", 500))])
+    assert times(done, "b") == [(0, 2, 2, 7), (1, 4, 12, 17), (2, 9, 22, 27), (3, 19, 32, 37), (4, 29, 42, 47)]
+    assert parts(done.report, "v") == (25, 2, 0, 20, 0, 0)
+    agrees(done)
+
+
+def test_a_unit_at_a_quarter_of_its_duty_rests_three_times_as_long_as_it_worked() -> None:
+    """b runs from 2 to 7 and again every 20 ms; the fifth rest is after the run's end."""
+    done = run("double", inputs=[(0, SetDuty("v", 250))])
+    assert [begin for _, _, begin, _ in times(done, "b")] == [2, 22, 42, 62, 82]
+    assert parts(done.report, "v") == (25, 2, 0, 60, 0, 0)
+    agrees(done)
+
+
+def test_a_limit_of_frames_in_flight_blocks_the_first_stage() -> None:
+    """One frame at a time: a works for 2 ms, then waits for b's 5 with frames to come, after the last with none."""
+    done = run("double", settings={"in_flight": 1})
+    assert parts(done.report, "u") == (10, 5, 20, 0, 0, 0)
+    assert parts(done.report, "v") == (25, 10, 0, 0, 0, 0)
+    agrees(done)
+
+
+def fed(settings: Settings, steps: list[tuple[int, tuple[Event, ...]]], jobs: list[JobRecord]) -> dict[str, Any]:
+    """The report of a core with one stage on one unit that hears `steps`; `jobs` are those that they end."""
+    graph = chain((("a", "u"),), "single", "a")
+    core, recording = Core(graph, settings), Recording(graph, settings)
+    for now_ns, events in steps:
+        recording.add(now_ns, events, core.step(now_ns, events).actions, core)
+    report = core.ledger.report(clock="host", requested=settings.frames)
+    assert compared(report["units"], recording, jobs)["largest_difference"] < 1e-12
+    return report
+
+
+def test_a_unit_that_answers_no_ping_is_overhead_from_its_killing_on() -> None:
+    """It is starved until it is killed at 10; its end is heard at 13, it is back at 20, starved, and stopped at 24."""
+    settings = Settings(5, asked=True, hang_ns=10 * MS)
+    steps: list[tuple[int, tuple[Event, ...]]] = [
+        (0, (UnitReady("u"), Pinged("u"))),
+        (10 * MS, ()),
+        (13 * MS, (UnitDied("u"),)),
+        (13 * MS, ()),
+        (20 * MS, (UnitReady("u"),)),
+        (24 * MS, (Stop(),)),
+    ]
+    assert parts(fed(settings, steps, []), "u") == (0, 10 + 4, 0, 0, 0, 3 + 7)
+
+
+def test_what_a_unit_waited_for_a_core_before_it_had_a_job_is_not_preempted() -> None:
+    """It waited for 8 ms since its last job, in 2 of which it had the next one: the frame was asked for at 10."""
+    spans = [(0, 4), (12, 15)]
+    done = [JobDone("u", n, begin * MS, end * MS, 0, 0, 0, 8 * MS * n) for n, (begin, end) in enumerate(spans)]
+    jobs = [JobRecord("a", "u", n, 0, 0, b * MS, e * MS, 0, 0, 8 * MS * n) for n, (b, e) in enumerate(spans)]
+    steps: list[tuple[int, tuple[Event, ...]]] = [
+        (0, (UnitReady("u"), FrameRequest(1))),
+        (4 * MS, (done[0],)),
+        (10 * MS, (FrameRequest(1),)),
+        (15 * MS, (done[1],)),
+    ]
+    assert parts(fed(Settings(2, asked=True), steps, jobs), "u") == (4 + 3, 6, 0, 0, 2, 0)
+
+
+def test_what_a_unit_lost_is_booked_under_its_causes() -> None:
+    """One stage, jobs as a unit reports them, in ms: (begin, end, preempted, asleep, preempted before).
+
+    Before the first the unit waited 1 of 2 ms for its core; in it, it ran for 4 of 8. Nothing lies between the first
+    and the second, so what is said of that time counts for nothing; before the third no more than the 5 ms that lie
+    there. The fourth slept. The end of the last is heard a ms later.
+    """
+    reported = [(2, 10, 3, 1, 1), (10, 20, 0, 0, 4), (25, 30, 5, 0, 9), (30, 40, 0, 10, 0), (42, 50, 0, 0, 0)]
+    steps: list[tuple[int, tuple[Event, ...]]] = [(0, (UnitReady("u"),))]
+    jobs = []
+    for number, (begin, end, *lost) in enumerate(reported):
+        spans = begin * MS, end * MS
+        done = JobDone("u", number, *spans, begin * MS, *(ms * MS for ms in lost))
+        jobs.append(JobRecord("a", "u", number, 0, 0, *spans, *(ms * MS for ms in lost)))
+        steps.append(((end + (number == 4)) * MS, (done,)))
+    report = fed(Settings(5), steps, jobs)
+    assert parts(report, "u") == (4 + 10 + 0 + 0 + 8, 0, 0, 0, 1 + 3 + 5 + 5, 1 + 1 + 10 + 2 + 1)
+    assert report["stages"]["a"]["service_ms"]["mean"] == (8 + 10 + 5 + 10 + 8) / 5  # the wall's time
+
+
+@pytest.mark.parametrize("seed", range(50))
+def test_both_computations_agree_in_random_runs(seed: int) -> None:
+    report = virtual_run(random.Random(seed), 40)
+    assert report["accounts"]["largest_difference"] <= 1e-12
+    for unit, row in report["units"].items():
+        assert min(row["busy"], *row["idle"].values()) >= 0
+        assert row["busy"] + sum(row["idle"].values()) == pytest.approx(1, abs=1e-12)
+        assert sum(report["accounts"]["units"][unit].values()) == pytest.approx(1, abs=1e-12)
+
+
+def test_the_slices_of_the_trace_file_add_up_to_the_report(tmp_path: Path) -> None:
+    """The file is read as any program would: the length of each slice, under its name, on its unit's track."""
+    done = run("double", faults=[(9 * MS, "v")], restart_ns=20 * MS, message_delay_ns=MS // 2)
+    assert done.recording is not None
+    lost = (MS // 8, MS // 16, MS // 4)  # a unit in virtual time loses nothing: put in by hand
+    jobs = [job._replace(preempted_ns=lost[0], asleep_ns=lost[1], preempted_before_ns=lost[2]) for job in done.jobs]
+    path = tmp_path / "trace.pftrace"
+    write_trace(jobs, ("u", "v"), path, idle_slices(done.recording, jobs))
+    expected = second_accounts(done.recording, jobs)
+    for unit, row in added_up(path).items():
+        total = sum(row.values())
+        assert total == round(done.report["duration_s"] * 1e9)
+        assert {cause: ns / total for cause, ns in row.items()} == pytest.approx(
+            {cause: share for cause, share in expected[unit].items() if share}, abs=1e-12
+        )
+
+
+def added_up(path: Path) -> dict[str, dict[str, int]]:
+    """ns by unit and name, from the slices of a trace file; they do not overlap on a track."""
+    trace = Trace()
+    trace.ParseFromString(path.read_bytes())
+    names = {p.track_descriptor.uuid: p.track_descriptor.name for p in trace.packet if p.HasField("track_descriptor")}
+    sums: dict[str, dict[str, int]] = defaultdict(lambda: defaultdict(int))
+    begun: dict[int, Any] = {}
+    for packet in trace.packet:
+        event = packet.track_event
+        if event.type == TrackEvent.TYPE_SLICE_BEGIN:
+            assert event.track_uuid not in begun
+            begun[event.track_uuid] = packet
+        elif event.type == TrackEvent.TYPE_SLICE_END:
+            begin = begun.pop(event.track_uuid)
+            notes = {note.name: note.int_value for note in begin.track_event.debug_annotations}
+            row, name = sums[names[event.track_uuid]], begin.track_event.name
+            lost_ns = notes.get("preempted_ns", 0) + notes.get("asleep_ns", 0)
+            row["busy" if name in SERVICE else name] += packet.timestamp - begin.timestamp - lost_ns
+            row["preempted"] += notes.get("preempted_ns", 0)
+            row["overhead"] += notes.get("asleep_ns", 0)
+    assert not begun
+    return {unit: {name: ns for name, ns in row.items() if ns} for unit, row in sums.items()}
+
+
+# One of the two computations is wrong: the comparison shows it.
+
+
+def a_run() -> Simulation:
+    return run("double", faults=[(9 * MS, "v")], restart_ns=20 * MS, message_delay_ns=MS)
+
+
+@pytest.mark.parametrize(("cause", "wrong"), [("overhead", "starved"), ("blocked", "starved"), ("starved", "blocked")])
+def test_time_under_another_cause_shows(cause: str, wrong: str) -> None:
+    """Such as the time in which a unit was down, booked as starved."""
+    done = a_run()
+    agrees(done)
+    for row in done.report["units"].values():
+        row["idle"][cause], row["idle"][wrong] = row["idle"][cause] / 2, row["idle"][wrong] + row["idle"][cause] / 2
+    assert done.recording is not None
+    moved = compared(done.report["units"], done.recording, done.jobs)["largest_difference"]
+    assert moved == pytest.approx(max(row["idle"][cause] for row in done.report["units"].values()))
+    assert moved > LARGEST_DIFFERENCE
+
+
+def test_a_job_that_is_too_long_or_missing_shows() -> None:
+    done = a_run()
+    assert done.recording is not None
+    first, *others = done.jobs
+    share = 1e6 / (done.report["duration_s"] * 1e9)
+    for jobs in ([first._replace(begin_ns=first.begin_ns - MS), *others], others):
+        found = compared(done.report["units"], done.recording, jobs)
+        assert found["largest_difference"] >= share - 1e-12
+        assert not found["agree"]
+
+
+def test_a_change_of_cause_that_was_never_noted_shows() -> None:
+    """Once a unit has no job, the cause that the core noted last must be one of a unit without a job."""
+    done = a_run()
+    assert done.recording is not None
+    done.recording.accounts[:] = [row for row in done.recording.accounts if row[2] != STARVED]
+    assert not compared(done.report["units"], done.recording, done.jobs)["agree"]
+
+
+def test_a_unit_without_accounts_is_no_agreement() -> None:
+    done = run()
+    assert done.recording is not None
+    only = [job for job in done.jobs if job.unit == "u"]
+    assert compared({"w": done.report["units"]["u"]}, done.recording, only)["largest_difference"] == 1

@@ -1,0 +1,68 @@
+"""The accounts of real processes that compute and sleep on the same core; what they say holds on a busy machine too."""
+
+from __future__ import annotations
+
+import pytest
+
+from trilane.bench.lib.cpu_load import FACTORY
+from trilane.hw_profiles.host import usable_cores
+from trilane.pipeline import accounts
+from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, UnitSettings
+from trilane.pipeline.result import RunResult
+from trilane.pipeline.run import run_pipeline
+
+pytestmark = pytest.mark.usefixtures("nothing_left")
+FRAMES, CPU_MS, SLEEP_MS = 25, 3.0, 2.0
+
+
+def run(*, sleep_ms: float = 0.0, device: bool = False) -> RunResult:
+    """Two stages, each a unit on the same core."""
+    settings = {"cpu_ms": CPU_MS, "sleep_ms": sleep_ms, "device": device}
+    unit = UnitSettings(cores=usable_cores()[:1], threads=1)
+    pipeline = Pipeline(
+        stages=tuple(PipelineStage(name=name, unit=name, factory=FACTORY, settings=settings) for name in "ab"),
+        edges=(PipelineEdge(payload_bytes=64),),
+        units={"a": unit, "b": unit},
+    )
+    return run_pipeline(pipeline, FRAMES, isolated_frames=0)
+
+
+def test_two_units_that_compute_on_one_core_share_it() -> None:
+    """Both have a job nearly all the time; each can have the core for half of it at most, in sum for all of it."""
+    result = run()
+    (core,) = result.report.core_shares
+    assert (core.units, core.busy <= core.cpu <= 1) == (("a", "b"), True)
+    for stage in result.report.stages.values():
+        assert stage.cpu_ms is not None
+        assert stage.cpu_ms.mean >= CPU_MS
+    wall_ms = sum(stage.service_ms.mean * FRAMES for stage in result.report.stages.values())
+    cpu_ms = sum(1e3 * (unit.cpu_in_jobs_s or 0) for unit in result.report.units.values())
+    lost_ms = sum(job.preempted_ns + job.asleep_ns for job in result.jobs) / 1e6
+    assert wall_ms - lost_ms <= cpu_ms
+    assert sum(unit.idle.preempted or 0 for unit in result.report.units.values()) > 0.1
+    assert result.report.accounts is not None
+    assert result.report.accounts.agree
+    assert result.report.accounts.largest_difference < 1e-12
+    assert result.messages == ()
+
+
+@pytest.mark.parametrize("device", [False, True])
+def test_a_job_that_sleeps_works_only_if_it_has_a_device(device: bool) -> None:
+    result = run(sleep_ms=SLEEP_MS, device=device)
+    duration_ms = 1e3 * result.report.duration_s
+    slept = SLEEP_MS * FRAMES / duration_ms
+    for unit in result.report.units.values():
+        computed = (unit.cpu_in_jobs_s or 0) * 1e3 / duration_ms
+        if device:
+            assert unit.busy >= slept
+        else:
+            assert unit.busy <= computed
+            assert unit.idle.overhead >= slept
+        assert unit.busy + sum(unit.idle.as_json().values()) == pytest.approx(1)
+
+
+def test_a_kernel_that_does_not_count_run_delay_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(accounts, "counts_run_delay", lambda: False)
+    result = run()
+    assert [unit.idle.preempted for unit in result.report.units.values()] == [None, None]
+    assert any("CONFIG_SCHED_INFO" in message for message in result.messages)
