@@ -39,12 +39,12 @@ ENDS = ("producer", "consumer")
 Times = tuple[list[float], list[float]]
 
 
-def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 200, turns: int = 6) -> dict[str, Any]:
+def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 200, rounds: int = 6) -> dict[str, Any]:
     """The time from the producer's last byte written until the consumer can read them all, by variant and size.
 
     `kib`: sizes, of 256, 1024, 4096 and 16384.
     `frames`: hand-overs of each variant and size in a round.
-    `turns`: rounds; all variants take part in each.
+    `rounds`: all variants take part in each.
 
     Rows: `way` (the variant), `kib`, `frames`, `p50_us`, `p99_us`, `max_us`, and `read_p50_us` until every byte was
     read and checked. Before each hand-over the consumer waits at least 1 ms, as an idle unit does.
@@ -64,19 +64,19 @@ def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 200, turns:
         raise BadInputError("--kib", str(min(unknown)), ", ".join(map(str, SIZES_KIB)))
     if frames < MIN_FRAMES:
         raise BadInputError("--frames", str(frames), f"at least {MIN_FRAMES}")
-    if turns < 1:
-        raise BadInputError("--turns", str(turns), "at least 1")
+    if rounds < 1:
+        raise BadInputError("--rounds", str(rounds), "at least 1")
     times: dict[tuple[str, int], list[Times]] = {}
     with awake() as idle_cores, ExitStack() as stack:
         pairs, absent = _pairs(stack, kib)
-        for number in range(turns):
+        for number in range(rounds):
             for size in kib:
                 variants = [variant for variant, of in pairs if of == size]
                 first = number % len(variants)
                 for variant in variants[first:] + variants[:first]:
                     times.setdefault((variant, size), []).append(pairs[variant, size].run(frames))
                 times.setdefault((PIPELINE, size), []).append(_through_pipeline(size, frames))
-    config = {"frames": frames, "turns": turns, "idle_cores": idle_cores}
+    config = {"frames": frames, "rounds": rounds, "idle_cores": idle_cores}
     rows = [
         _row(variant, size, rounds) for (variant, size), rounds in sorted(times.items(), key=lambda item: item[0][1])
     ]

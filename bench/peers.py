@@ -32,7 +32,7 @@ APP_TIMEOUT_S = 600
 
 
 def measure(
-    width: int = 64, size: str = "512x512", threads: int = 0, turns: int = 8, seconds: int = 2
+    width: int = 64, size: str = "512x512", threads: int = 0, rounds: int = 8, seconds: int = 2
 ) -> dict[str, Any]:
     """Ratios of speed from medians: 1 is equal, more is faster than what stands after `over`.
 
@@ -55,7 +55,7 @@ def measure(
         integer, plain = Path(folder) / "integer.onnx", Path(folder) / "float.onnx"
         onnx.save(fixture.integer.model, integer)
         onnx.save(untrained_float("resnet18", "batch", width, shape), plain)
-        times = _measure_rounds(_variants(integer, plain, threads), integer, threads, turns, seconds)
+        times = _measure_rounds(_variants(integer, plain, threads), integer, threads, rounds, seconds)
     peak = roofline.measure(threads)
     medians = {name: float(np.median(times_ms)) for name, times_ms in times.items()}
     ours = medians[OPENVINO]
@@ -69,7 +69,7 @@ def measure(
         "rows": [{"way": name, "median_ms": value, "runs": len(times[name])} for name, value in medians.items()],
         "gmac": fixture.gmac,
         "roofline": peak,
-        "config": {"width": width, "size": size, "threads": threads, "turns": turns, "seconds": seconds},
+        "config": {"width": width, "size": size, "threads": threads, "rounds": rounds, "seconds": seconds},
     }
 
 
