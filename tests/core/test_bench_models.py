@@ -1,10 +1,10 @@
-"""The models that `bench scheduler` sets beside the scheduler, against timelines worked out by hand; its ratios."""
+"""The models and ratios of `bench scheduler` and `bench handoff`, against timelines and figures worked out by hand."""
 
 from __future__ import annotations
 
 import pytest
 
-from trilane.bench import scheduler
+from trilane.bench import handoff, scheduler
 from trilane.scheduler.events import Graph, Settings, chain
 from trilane.scheduler.virtual import simulate
 
@@ -49,3 +49,31 @@ def test_ratios_are_those_of_the_same_round() -> None:
     result = scheduler.compared(seconds)
     assert result["over_trilane"] == {"simpy lean": {"median": 0.5, "low": 0.25, "high": 1.0}}
     assert result["over_simpy_lean"] == 0.5 and result["over_simpy"] is None
+
+
+def test_peers_are_set_against_the_run_round_by_round() -> None:
+    """Readable: 5 - 3, 9 - 4; read: 7 - 8, 12 - 10. A peer that is ahead in one round alone is not ahead."""
+    times: dict[tuple[str, int], list[handoff.Times]] = {
+        (handoff.PIPELINE, 256): [([3.0], [8.0]), ([4.0], [10.0])],
+        (handoff.SLOT, 256): [([1.0], [6.0]), ([1.0], [6.0])],
+        ("peer", 256): [([5.0], [7.0]), ([9.0], [12.0])],
+    }
+    assert handoff.against_peers(times) == {
+        "ahead": {"peer": True},
+        "read_ahead": {"peer": False},
+        "slower_us": {"peer": {256: (2.0, 5.0)}},
+        "read_slower_us": {"peer": {256: (-1.0, 2.0)}},
+        "slower_than_slot_us": {"peer": {256: (4.0, 8.0)}},
+        "read_slower_than_slot_us": {"peer": {256: (1.0, 6.0)}},
+    }
+
+
+def test_a_percentile_is_given_of_as_many_values_as_it_needs() -> None:
+    hundred = [float(value) for value in range(101)]
+    assert handoff.over_rounds("p99", [hundred, [value + 2 for value in hundred]], 99) == {
+        "p99_us": 100.0,
+        "p99_low_us": 99.0,
+        "p99_high_us": 101.0,
+    }
+    assert set(handoff.over_rounds("p99", [hundred, hundred[:99]], 99).values()) == {None}
+    assert handoff.over_rounds("p50", [hundred[:3]], 50)["p50_us"] is not None

@@ -66,8 +66,10 @@ def test_every_way_hands_over_the_same_bytes() -> None:
     assert ways | set(result["absent"]) == {*handoff.CHANNELS, handoff.PIPELINE}
     for row in result["rows"]:
         assert row["frames"] == 10
-        assert 0 < row["p50_us"] <= row["p99_us"] <= row["max_us"]
+        assert 0 < row["p50_low_us"] <= row["p50_us"] <= row["p50_high_us"] <= row["max_us"]
+        assert row["p99_us"] is row["read_p99_us"] is None  # of ten frames
         assert row["read_p50_us"] > row["p50_us"]
+    assert result["met"] == {"slot": None, handoff.PIPELINE: None}
     assert peers_files() == before
 
 
