@@ -10,6 +10,7 @@ import gc
 import hashlib
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -166,9 +167,12 @@ def _simpy_ways(graph: Graph, service: Service, frames: int) -> tuple[dict[str, 
         models = _models()
     except ModuleNotFoundError:
         return {}, {"absent": {SIMPY: f"not installed: {install_line('peers')}"}}
-    return {
-        way: lambda model=model: model(graph, service, frames, PERIOD_NS).run() for way, model in models.items()
-    }, {}
+    return {way: partial(_run_model, model, graph, service, frames) for way, model in models.items()}, {}
+
+
+def _run_model(model: Any, graph: Graph, service: Service, frames: int) -> list[int]:
+    presented_ns: list[int] = model(graph, service, frames, PERIOD_NS).run()
+    return presented_ns
 
 
 def _models() -> dict[str, Any]:
