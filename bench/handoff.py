@@ -1,7 +1,7 @@
-"""How long from the producer's last byte written until the consumer, another process, can read them all?
+"""How long from the producer's last byte written until the consumer, another process, can read them all, and has?
 
 Rule: one definition for every variant, and all run interleaved; the producer writes every byte anew, then reads the
-clock.
+clock. What a run does, through the scheduler, is what is judged and set against the peers.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnContext
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -36,51 +37,59 @@ ANSWER_S = 120
 LIMITS_US = {"p50": 150, "p99": 500}
 ENDS = ("producer", "consumer")
 
+#: Microseconds of each frame of a round until every byte could be read, and until it was.
 Times = tuple[list[float], list[float]]
+#: Peer, size: the ends of an interval.
+Intervals = dict[str, dict[int, tuple[float, float]]]
 
 
-def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 200, turns: int = 6) -> dict[str, Any]:
+def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 200, rounds: int = 6) -> dict[str, Any]:
     """The time from the producer's last byte written until the consumer can read them all, by variant and size.
 
     `kib`: sizes, of 256, 1024, 4096 and 16384.
     `frames`: hand-overs of each variant and size in a round.
-    `turns`: rounds; all variants take part in each.
+    `rounds`: all variants take part in each.
 
-    Rows: `way` (the variant), `kib`, `frames`, `p50_us`, `p99_us`, `max_us`, and `read_p50_us` until every byte was
-    read and checked. Before each hand-over the consumer waits at least 1 ms, as an idle unit does.
+    Rows: `way` (the variant), `kib`, `frames`; `p50_us` and `p99_us` until every byte can be read, `read_p50_us` and
+    `read_p99_us` until every byte was read and checked: medians of the rounds' percentiles, with the 95 % interval of
+    that median as `_low_us` and `_high_us` (with fewer than six rounds the least and largest). No p99 is given of fewer
+    than 100 frames a round. `max_us`: of all rounds. Before each hand-over the consumer waits at least 1 ms, as an idle
+    unit does.
 
-    Our variants: `slot`: a slot of the pipeline's shared memory and the message that announces it, from one process to
-    another. `slot, 256 KiB of it written`: the same, without what filling all of it does to the caches. `slot through
-    the scheduler`: between two stages of a real run, where the message goes to the scheduler's process, through its
-    core, and on. Peers: `iceoryx2` with an event, `zeromq copied` frames, `pickled queue` (multiprocessing.Queue).
+    Our variants: `slot through the scheduler`: what a run does; between two stages of a real run the message goes to
+    the scheduler's process, through its core, and on. `slot`: one such message, from process to process; `slot, 256
+    KiB of it written`: the same, without what filling all of it does to the caches. Peers, each in its best form and
+    without a scheduler between: `iceoryx2` with an event, `zeromq` without copies of its own, `pipe` (bytes through
+    multiprocessing.Pipe into an array), and `pickled queue` (multiprocessing.Queue).
 
-    `absent`: peers that are not installed. `met`: our two variants against p50 <= 150 us and p99 <= 500 us at the
-    largest size. `slower_us`: of each peer and size, its p50 less that of `slot` in the same round: the ends of the
-    95 % interval of the median over the rounds (with fewer than six of them the least and largest). `ahead`: of each
-    peer, whether that interval lies above 0 at every size.
+    `absent`: peers that are not installed. `met`: our variants against p50 <= 150 us and p99 <= 500 us at the largest
+    size; null without a p99. `slower_us`: of each peer and size, its p50 less that of `slot through the scheduler` in
+    the same round: the interval of the median. `read_slower_us`: the same, until every byte was read.
+    `slower_than_slot_us`, `read_slower_than_slot_us`: the same less `slot`. `ahead`, `read_ahead`: of each peer,
+    whether ours through the scheduler is the faster at every size (the interval lies above 0).
     Raises BadInputError for other sizes than 256, 1024, 4096, 16384 KiB.
     """
     if unknown := set(kib) - set(SIZES_KIB):
         raise BadInputError("--kib", str(min(unknown)), ", ".join(map(str, SIZES_KIB)))
     if frames < MIN_FRAMES:
         raise BadInputError("--frames", str(frames), f"at least {MIN_FRAMES}")
-    if turns < 1:
-        raise BadInputError("--turns", str(turns), "at least 1")
+    if rounds < 1:
+        raise BadInputError("--rounds", str(rounds), "at least 1")
     times: dict[tuple[str, int], list[Times]] = {}
     with awake() as idle_cores, ExitStack() as stack:
         pairs, absent = _pairs(stack, kib)
-        for number in range(turns):
+        for number in range(rounds):
             for size in kib:
                 variants = [variant for variant, of in pairs if of == size]
                 first = number % len(variants)
                 for variant in variants[first:] + variants[:first]:
                     times.setdefault((variant, size), []).append(pairs[variant, size].run(frames))
                 times.setdefault((PIPELINE, size), []).append(_through_pipeline(size, frames))
-    config = {"frames": frames, "turns": turns, "idle_cores": idle_cores}
+    config = {"frames": frames, "rounds": rounds, "idle_cores": idle_cores}
     rows = [
         _row(variant, size, rounds) for (variant, size), rounds in sorted(times.items(), key=lambda item: item[0][1])
     ]
-    verdicts = {**_verdicts(rows, max(kib)), **_against_peers(times)}
+    verdicts = {**_verdicts(rows, max(kib)), **against_peers(times)}
     return {"rows": rows, **verdicts, "absent": absent, "config": config}
 
 
@@ -216,16 +225,26 @@ def _microseconds(ends_ns: Sequence[int], begins_ns: Sequence[int]) -> list[floa
 
 
 def _row(variant: str, size: int, rounds: list[Times]) -> dict[str, Any]:
-    readable, read = ([us for of_round in of_rounds for us in of_round] for of_rounds in zip(*rounds, strict=True))
+    readable, read = zip(*rounds, strict=True)
     return {
         "way": variant,
         "kib": size,
-        "frames": len(readable),
-        "p50_us": float(np.percentile(readable, 50)),
-        "p99_us": float(np.percentile(readable, 99)),
-        "max_us": max(readable),
-        "read_p50_us": float(np.percentile(read, 50)),
+        "frames": sum(map(len, readable)),
+        **over_rounds("p50", readable, 50),
+        **over_rounds("p99", readable, 99),
+        "max_us": max(map(max, readable)),
+        **over_rounds("read_p50", read, 50),
+        **over_rounds("read_p99", read, 99),
     }
+
+
+def over_rounds(key: str, rounds: Sequence[list[float]], percent: float) -> dict[str, float | None]:
+    """The median of the rounds' percentiles and its interval; None where a round has too few values for it."""
+    names = (f"{key}_us", f"{key}_low_us", f"{key}_high_us")
+    if min(map(len, rounds)) * (100 - percent) < 100:
+        return dict.fromkeys(names)
+    of_each = [float(np.percentile(values, percent)) for values in rounds]
+    return dict(zip(names, (median(of_each), *median_interval(of_each)), strict=True))
 
 
 def _verdicts(rows: list[dict[str, Any]], largest: int) -> dict[str, Any]:
@@ -233,19 +252,40 @@ def _verdicts(rows: list[dict[str, Any]], largest: int) -> dict[str, Any]:
     ours = [row for row in rows if row["way"] in (SLOT, PIPELINE) and row["kib"] == largest]
     sizes = sorted({size for _, size in p50})
     return {
-        "met": {row["way"]: all(row[f"{key}_us"] <= limit for key, limit in LIMITS_US.items()) for row in ours},
+        "met": {row["way"]: _met(row) for row in ours},
         "p50_largest_over_smallest": {variant: p50[variant, sizes[-1]] / p50[variant, sizes[0]] for variant in OURS},
     }
 
 
-def _against_peers(times: dict[tuple[str, int], list[Times]]) -> dict[str, Any]:
-    sizes = sorted({size for _, size in times})
-    p50 = {key: np.array([np.percentile(readable, 50) for readable, _ in rounds]) for key, rounds in times.items()}
-    slower = {
-        peer: {size: median_interval((p50[peer, size] - p50[SLOT, size]).tolist()) for size in sizes}
-        for peer in sorted({variant for variant, _ in times} - {*OURS})
-    }
+def _met(row: dict[str, Any]) -> bool | None:
+    values = {key: row[f"{key}_us"] for key in LIMITS_US}
+    if None in values.values():
+        return None
+    return all(values[key] <= limit for key, limit in LIMITS_US.items())
+
+
+def against_peers(times: dict[tuple[str, int], list[Times]]) -> dict[str, Any]:
+    """How much longer each peer takes than ours, in the same round; see `measure`."""
+    slower, read_slower = _slower(times, PIPELINE, 0), _slower(times, PIPELINE, 1)
     return {
-        "ahead": {peer: all(low > 0 for low, _ in of_size.values()) for peer, of_size in slower.items()},
+        "ahead": _ahead(slower),
+        "read_ahead": _ahead(read_slower),
         "slower_us": slower,
+        "read_slower_us": read_slower,
+        "slower_than_slot_us": _slower(times, SLOT, 0),
+        "read_slower_than_slot_us": _slower(times, SLOT, 1),
     }
+
+
+def _slower(times: dict[tuple[str, int], list[Times]], ours: str, until: int) -> Intervals:
+    """`until`: 0 for readable, 1 for read."""
+    p50 = {key: np.array([np.percentile(of_round[until], 50) for of_round in of]) for key, of in times.items()}
+    sizes = sorted({size for _, size in times})
+    peers = sorted({variant for variant, _ in times} - {*OURS})
+    return {
+        peer: {size: median_interval((p50[peer, size] - p50[ours, size]).tolist()) for size in sizes} for peer in peers
+    }
+
+
+def _ahead(slower: Intervals) -> dict[str, bool]:
+    return {peer: all(low > 0 for low, _ in of_size.values()) for peer, of_size in slower.items()}

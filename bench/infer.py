@@ -50,7 +50,9 @@ def measure(
     Rows: the network's settings, `parameters`, `gmac`, `runtime`, `startup_cold_ms` and `startup_warm_ms` (libraries
     imported and network loaded, with an empty and with a filled cache), `frames`, `min_ms`, `mean_ms`, `p50_ms`,
     `p90_ms`, `p99_ms`, `max_ms`, `periods` (min, mean, max of each), `int8_over_fp32` (how many times faster than ONNX
-    Runtime in FP32), `share_of_roofline` (of the INT8 peak of this machine, measured in the same bench),
+    Runtime in FP32), `share_of_roofline` (of the best INT8 layer of the same runtimes, measured in the same bench),
+    `share_of_instruction_peak` (of what the instruction set allows, by the clock measured in the same bench; null where
+    it is not known),
     `temperature_c` where it can be read.
 
     Raises BadInputError, MissingPartError.
@@ -66,7 +68,7 @@ def measure(
             variants = _variants(Path(folder), fixture, plain, names, threads, spin)
             with _cache(Path(folder) / "cache"):
                 measured = _measure_periods(variants, seconds, period)
-        rows += _rows(fixture, measured, peak["int8_gmac_s"])
+        rows += _rows(fixture, measured, peak)
     return {"rows": rows, "roofline": peak, "config": {"threads": threads, "spin": spin, "seconds": seconds}}
 
 
@@ -134,7 +136,7 @@ def _measure_periods(variants: dict[str, Variant], seconds: float, period: float
     return measured
 
 
-def _rows(fixture: NetworkFixture, measured: dict[str, dict[str, Any]], peak_gmac_s: float) -> list[dict[str, Any]]:
+def _rows(fixture: NetworkFixture, measured: dict[str, dict[str, Any]], peak: dict[str, Any]) -> list[dict[str, Any]]:
     batches = {name: 1 if name == FP32 else fixture.integer.shape[0] for name in measured}
     periods = {
         name: [np.divide(times, batches[name]) for times in facts["periods"]] for name, facts in measured.items()
@@ -160,7 +162,9 @@ def _rows(fixture: NetworkFixture, measured: dict[str, dict[str, Any]], peak_gma
             "temperature_c": sensor_c(),
         }
         if name != FP32:
-            row["share_of_roofline"] = fixture.gmac / (medians[name] / 1e3) / peak_gmac_s
+            rate, allowed = fixture.gmac / (medians[name] / 1e3), peak["int8_instruction_gmac_s"]
+            row["share_of_roofline"] = rate / peak["int8_gmac_s"]
+            row["share_of_instruction_peak"] = rate / allowed if allowed else None
             row["int8_over_fp32"] = medians[FP32] / medians[name] if FP32 in medians else None
         rows.append(row)
     return rows

@@ -11,7 +11,9 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -21,6 +23,7 @@ from trilane.bench import roofline
 from trilane.bench.lib.interleaved_processes import Variant, runners
 from trilane.bench.lib.networks import untrained, untrained_float
 from trilane.errors import BadInputError, MissingPartError, TrilaneError
+from trilane.scheduler.stats import median_interval
 from trilane.shapes import parse_shape
 from trilane.stages.dsp.runtime import resolve
 from trilane.unexpected_value import UnexpectedValue
@@ -29,17 +32,26 @@ ORT, OPENVINO, FP32 = "trilane ort", "trilane openvino", "onnxruntime fp32"
 APP = "benchmark_app"
 APP_STATS = "benchmark_report.json"
 APP_TIMEOUT_S = 600
+#: Ratio: the peak that it is a share of.
+PEAKS = {
+    "openvino_of_roofline": "the best INT8 layer of the same runtimes, measured here (roofline.int8_gmac_s)",
+    "openvino_of_instruction_peak": "the instruction set: documented multiply-accumulates a cycle x clock measured "
+    "under that load x cores (roofline.int8_instruction_gmac_s)",
+}
 
 
 def measure(
-    width: int = 64, size: str = "512x512", threads: int = 0, turns: int = 8, seconds: int = 2
+    width: int = 64, size: str = "512x512", threads: int = 0, rounds: int = 8, seconds: int = 2
 ) -> dict[str, Any]:
     """Ratios of speed from medians: 1 is equal, more is faster than what stands after `over`.
 
     `ratios.ort_over_fp32`, `ratios.openvino_over_fp32`: ours in INT8 over ONNX Runtime in FP32 with its defaults.
-    `ratios.openvino_of_roofline`: share of the INT8 peak measured here. `ratios.openvino_over_benchmark_app`: ours
-    over OpenVINO's own tool on the same file. `rows`: median and number of runs of each variant. Each variant runs for
-    `seconds` in each round.
+    `ratios.openvino_of_roofline`: share of the rate of the best INT8 layer of the same runtimes, measured here.
+    `ratios.openvino_of_instruction_peak`: share of what the instruction set allows (null where that is not known).
+    `peaks`: which peak each of the two is of. `ratios.openvino_over_benchmark_app`: ours over OpenVINO's own tool on
+    the same file. `low`, `high`: of each ratio, the 95 % interval of its median over the rounds (with fewer than six
+    the least and largest). `rows`: median and number of runs of each variant. Each variant runs for `seconds` in each
+    round.
 
     Raises MissingPartError without OpenVINO or PyTorch.
     """
@@ -55,21 +67,44 @@ def measure(
         integer, plain = Path(folder) / "integer.onnx", Path(folder) / "float.onnx"
         onnx.save(fixture.integer.model, integer)
         onnx.save(untrained_float("resnet18", "batch", width, shape), plain)
-        times = _measure_rounds(_variants(integer, plain, threads), integer, threads, turns, seconds)
+        times = _measure_rounds(_variants(integer, plain, threads), integer, threads, rounds, seconds)
     peak = roofline.measure(threads)
-    medians = {name: float(np.median(times_ms)) for name, times_ms in times.items()}
-    ours = medians[OPENVINO]
     return {
-        "ratios": {
-            "ort_over_fp32": medians[FP32] / medians[ORT],
-            "openvino_over_fp32": medians[FP32] / ours,
-            "openvino_of_roofline": fixture.gmac / (ours / 1e3) / peak["int8_gmac_s"],
-            "openvino_over_benchmark_app": medians[APP] / ours,
-        },
-        "rows": [{"way": name, "median_ms": value, "runs": len(times[name])} for name, value in medians.items()],
+        **compared(times, fixture.gmac, peak["int8_gmac_s"], peak["int8_instruction_gmac_s"]),
+        "peaks": PEAKS,
+        "rows": [
+            {"way": name, "median_ms": float(np.median(np.concatenate(of_rounds))), "runs": sum(map(len, of_rounds))}
+            for name, of_rounds in times.items()
+        ],
         "gmac": fixture.gmac,
         "roofline": peak,
-        "config": {"width": width, "size": size, "threads": threads, "turns": turns, "seconds": seconds},
+        "config": {"width": width, "size": size, "threads": threads, "rounds": rounds, "seconds": seconds},
+    }
+
+
+def compared(
+    times: Mapping[str, Sequence[Sequence[float]]], gmac: float, layer_gmac_s: float, instruction_gmac_s: float | None
+) -> dict[str, dict[str, Any]]:
+    """The ratios and their intervals.
+
+    `times`: milliseconds of each variant's runs, by round. `gmac`: 1e9 multiply-accumulates of a run. `layer_gmac_s`,
+    `instruction_gmac_s`: the peaks.
+    """
+    medians = {name: np.array([np.median(of_round) for of_round in of_rounds]) for name, of_rounds in times.items()}
+    rate = gmac / (medians[OPENVINO] / 1e3)
+    by_round = {
+        "ort_over_fp32": medians[FP32] / medians[ORT],
+        "openvino_over_fp32": medians[FP32] / medians[OPENVINO],
+        "openvino_of_roofline": rate / layer_gmac_s,
+        "openvino_of_instruction_peak": rate / instruction_gmac_s if instruction_gmac_s else None,
+        "openvino_over_benchmark_app": medians[APP] / medians[OPENVINO],
+    }
+    known = {key: values.tolist() for key, values in by_round.items() if values is not None}
+    ends = {key: median_interval(values) for key, values in known.items()}
+    return {
+        "ratios": {key: median(known[key]) if key in known else None for key in by_round},
+        "low": {key: ends[key][0] if key in ends else None for key in by_round},
+        "high": {key: ends[key][1] if key in ends else None for key in by_round},
     }
 
 
@@ -85,14 +120,14 @@ def _variants(integer: Path, plain: Path, threads: int) -> dict[str, Variant]:
 
 def _measure_rounds(
     variants: dict[str, Variant], integer: Path, threads: int, rounds: int, seconds: int
-) -> dict[str, list[float]]:
-    """Milliseconds of each variant's runs; of `benchmark_app`, the median that it printed in each round."""
-    times: dict[str, list[float]] = {name: [] for name in (*variants, APP)}
+) -> dict[str, list[list[float]]]:
+    """Milliseconds of each variant's runs, by round; of `benchmark_app`, the median that it printed."""
+    times: dict[str, list[list[float]]] = {name: [] for name in (*variants, APP)}
     with runners(variants) as by_name:
         for _ in range(rounds):
             for name, runner in by_name.items():
-                times[name] += runner.run_for(seconds)
-            times[APP].append(_benchmark_app(integer, threads, seconds))
+                times[name].append(runner.run_for(seconds))
+            times[APP].append([_benchmark_app(integer, threads, seconds)])
     return times
 
 

@@ -53,11 +53,11 @@ def measure(
     edge: tuple[str, ...] = ("double",),
     cores: tuple[int, ...] = (0,),
     frames: int = 60,
-    turns: int = 9,
+    rounds: int = 9,
     runtime: str = "auto",
     video: bool = True,
 ) -> dict[str, Any]:
-    """A row for each avatar, size, number of cores, policy and edge; figures are medians over the rounds (`turns`).
+    """A row for each avatar, size, number of cores, policy and edge; figures are medians over the `rounds`.
 
     Rows: `frame_ms`, `fps`; `efficiency`: the slowest unit's stages, isolated, over the frame time; `slowest`: that
     unit, `alone_ms`: its stages isolated; `busiest`: the unit with the most work, `idle`: its share without a job from
@@ -72,8 +72,8 @@ def measure(
 
     Raises BadInputError, MissingPartError, TrilaneError when a run fails.
     """
-    if frames < MIN_FRAMES or turns < 1:
-        raise BadInputError("bench pipeline", f"--frames {frames}, --turns {turns}", f"at least {MIN_FRAMES} and 1")
+    if frames < MIN_FRAMES or rounds < 1:
+        raise BadInputError("bench pipeline", f"--frames {frames}, --rounds {rounds}", f"at least {MIN_FRAMES} and 1")
     cores = tuple(count or len(usable_cores()) for count in cores)
     _check(policy, edge, cores)
     rows: list[dict[str, Any]] = []
@@ -81,8 +81,8 @@ def measure(
     for name, tensor_size, count in product(avatar, size, cores):
         checked, accuracy[name] = _config(name, tensor_size, count, frames, runtime, video=video)
         settings = [Setting(name, tensor_size, count, *pair) for pair in _pairs(policy, edge)]
-        rows += _measure_rounds(checked, settings, turns)
-    facts = {"frames": frames, "turns": turns, "runtime": checked.config.runtime, "video": video}
+        rows += _measure_rounds(checked, settings, rounds)
+    facts = {"frames": frames, "rounds": rounds, "runtime": checked.config.runtime, "video": video}
     return {"rows": rows, "accuracy": accuracy, "config": facts}
 
 

@@ -1,6 +1,8 @@
 """What is the most this machine's cores can do, in INT8, in FP32, and from memory?
 
-Rule: a peak is the best rate that any kernel reached here, on layers that suit it; no data sheet is read.
+Rule: there are two peaks for INT8, and each figure says which it is of. One is the best rate that any layer of the
+installed runtimes reached here, on layers that suit them. The other is what the instruction set allows: the documented
+multiply-accumulates of a cycle, by the clock measured under that load, by the cores.
 """
 
 from __future__ import annotations
@@ -8,6 +10,7 @@ from __future__ import annotations
 import os
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +18,12 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
+from trilane.bench.lib.instruction_kernels import measure_issued
+from trilane.bench.lib.instruction_sets import instruction_set_of, peak_gmac_s
 from trilane.bench.lib.interleaved_processes import Variant, runners
+from trilane.errors import reason
 from trilane.stages.dsp.runtime import installed
+from trilane.stages.machine_facts import cpu_facts
 
 #: (side, channels, kernel): layers whose weights stay in cache and whose channels fill the registers.
 INT8_LAYERS = ((32, 256, 3), (64, 128, 3), (64, 512, 1))
@@ -29,18 +36,55 @@ COPY_BYTES = 128 << 20
 def measure(threads: int = 0) -> dict[str, Any]:
     """Best rates with `threads` threads; 0: one for each core that this process may use.
 
-    Keys: `int8_gmac_s`, `fp32_gmac_s` (1e9 multiply-accumulates a second), `memory_gb_s` (bytes read and written by one
-    thread), and `rows`: the rate of each INT8 kernel that was tried.
+    Keys: `int8_gmac_s`: of the best layer of the runtimes, and `fp32_gmac_s` likewise (1e9 multiply-accumulates a
+    second); `int8_instruction_gmac_s`: of the instruction set, null where it is not known; `layer_of_instruction`: the
+    first over the last; `memory_gb_s` (bytes read and written by one thread); `instructions`: how the peak of the
+    instruction set follows, or why it is not known; `rows`: the rate of each INT8 layer that was tried.
     """
     threads = threads or len(os.sched_getaffinity(0))
     rows = _int8_rows(threads)
-    fp32 = _best_fp32(threads)
+    best = max(row["gmac_s"] for row in rows)
+    instructions = instruction_peak(cpu_facts()["flags"], threads)
+    peak = instructions.get("gmac_s")
     return {
         "threads": threads,
-        "int8_gmac_s": max(row["gmac_s"] for row in rows),
-        "fp32_gmac_s": fp32,
+        "int8_gmac_s": best,
+        "int8_instruction_gmac_s": peak,
+        "layer_of_instruction": best / peak if peak else None,
+        "fp32_gmac_s": _best_fp32(threads),
         "memory_gb_s": _memory_gb_s(),
+        "instructions": instructions,
         "rows": rows,
+    }
+
+
+def instruction_peak(flags: Sequence[str], threads: int) -> dict[str, Any]:
+    """The INT8 peak of the widest instruction set that `flags` name, on as many cores as `threads` can use.
+
+    `set`, `sequence`, `source`: of the table in lib/instruction_sets.py. `macs_a_cycle`: documented, for one core;
+    `issued_macs_a_cycle`: what a loop of registers alone reached. `clock_ghz` with its 95 % interval: under that load.
+    `cores`, `gmac_s`: macs_a_cycle x clock x cores. `absent` alone: why there is none.
+    """
+    widest = instruction_set_of(flags)
+    if widest is None:
+        return {"absent": "the table of instruction sets has none of this CPU's"}
+    cores = sorted(os.sched_getaffinity(0))[:threads]
+    try:
+        issued = measure_issued(widest.name, cores)
+    except OSError as error:
+        return {"absent": f"{widest.name}: the clock cannot be measured: {reason(error)}"}
+    macs = widest.macs_a_cycle(issued.rate)
+    return {
+        "set": widest.name,
+        "sequence": widest.sequence,
+        "source": widest.source,
+        "macs_a_cycle": macs,
+        "issued_macs_a_cycle": widest.macs * issued.rate,
+        "clock_ghz": issued.clock_ghz,
+        "clock_low_ghz": issued.clock_low_ghz,
+        "clock_high_ghz": issued.clock_high_ghz,
+        "cores": len(cores),
+        "gmac_s": peak_gmac_s(macs, issued.clock_ghz, len(cores)),
     }
 
 

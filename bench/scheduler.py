@@ -1,14 +1,16 @@
 """How fast is the scheduler in virtual time, beside SimPy on the same model, and is it the same every time?
 
-Rule: both present every frame at the same nanosecond or the bench fails; their runs are interleaved, with the same
-service times.
+Rule: all present every frame at the same nanosecond or the bench fails; their runs are interleaved, with the same
+service times, and Python's garbage collector is off in every one of them.
 """
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -21,6 +23,7 @@ from trilane.hw_profiles.application import application_graph
 from trilane.install import install_line
 from trilane.scheduler.events import Graph, Settings
 from trilane.scheduler.recording import read, replay
+from trilane.scheduler.stats import median_interval
 from trilane.scheduler.virtual import Service, VirtualDriver, simulate
 
 MS = 1_000_000
@@ -29,38 +32,52 @@ SERVICE_MS = {"pose": 0.3, "raster": 4.0, "infer": 14.0, "composite": 2.0, "pres
 FPS = 60
 PERIOD_NS = round(1e9 / FPS)
 REPEATS, SEED_FRAMES = 10, 300
+TRILANE, NO_REPORT, RECORDED = "trilane", "trilane, no report", "trilane, recorded"
+SIMPY, LEAN = "simpy", "simpy lean"
+
+#: A run of the model; answers when it presented each frame, in ns.
+Run = Callable[[], list[int]]
 
 
-def measure(minutes: float = 30.0, turns: int = 3, seeds: int = 10, events: str = "") -> dict[str, Any]:
+def measure(minutes: float = 15.0, rounds: int = 7, seeds: int = 10, events: str = "") -> dict[str, Any]:
     """The speed of both, and whether equal inputs give equal runs.
 
     `minutes`: of the avatar's pipeline at 60 frames a second, policy `pipelined`, edges `double`.
-    `turns`: runs of each, interleaved; the median counts.
+    `rounds`: runs of each, interleaved.
     `seeds`: for how many seeds equal runs are compared.
     `events`: a run's folder or events.jsonl, to be replayed.
 
-    Rows: `way`, `frames`, median CPU `seconds`, `events_per_s` (an event: a frame's release or a job's end, the same
-    number in both), `processed` (by the way's own count; SimPy takes several to a job). `agree`: frames that both
-    present at the same nanosecond. `same_traces`: for how many seeds 10 repeats of a run in which a unit dies give one
-    trace; `different_traces`: traces between the seeds. `replay`: of `events`, the `steps` and how many are answered
-    differently.
+    Ways: `trilane` (with its report), the same with `no report` and `recorded` for replay; `simpy`: the model in
+    SimPy's own parts, processes and resources; `simpy lean`: one timeout a job and callbacks. The two of SimPy keep no
+    accounts and know no faults, policies or drops.
+
+    Rows: `way`, `frames`, median CPU `seconds` and the 95 % interval of that median (`seconds_low`, `seconds_high`;
+    with fewer than six rounds the least and largest), `events_per_s` (an event: a frame's release or a job's end, the
+    same number in all), `processed` (by the way's own count; SimPy takes several to a job).
+    `over_trilane`: seconds of each way over those of `trilane` in the same round, median and interval: below 1 is
+    faster than Trilane. `over_simpy`, `over_simpy_lean`: how many times as fast as each Trilane is, from the same.
+    `agree`: frames that all present at the same nanosecond. `same_traces`: for how many seeds 10 repeats of a run in
+    which a unit dies give one trace; `different_traces`: traces between the seeds. `replay`: of `events`, the `steps`
+    and how many are answered differently.
     Raises BadInputError when `events` is not a recording, TrilaneError when SimPy disagrees.
     """
-    if minutes <= 0 or turns < 1 or seeds < 1:
-        raise BadInputError("bench scheduler", f"minutes {minutes:g}, turns {turns}, seeds {seeds}", "positive numbers")
+    if minutes <= 0 or rounds < 1 or seeds < 1:
+        found = f"minutes {minutes:g}, rounds {rounds}, seeds {seeds}"
+        raise BadInputError("bench scheduler", found, "positive numbers")
     replayed = _replayed(events) if events else {}
     frames = max(2, round(minutes * 60 * FPS))
     graph, service = application_graph(), _service(0, frames)
-    variants: dict[str, Callable[[], list[int]]] = {"trilane": lambda: _trilane(graph, service, frames)}
-    absent = _add_simpy(variants, graph, service, frames)
-    seconds = _cpu_seconds(variants, turns)
-    counts = _processed(graph, service, frames, with_simpy=not absent)
+    ways = _trilane_ways(graph, service, frames)
+    simpy_ways, absent = _simpy_ways(graph, service, frames)
+    seconds = _cpu_seconds({**ways, **simpy_ways}, rounds)
     events_each = frames * (len(graph.stages) + 1)
-    rows = [_row(variant, frames, events_each, median(runs), counts[variant]) for variant, runs in seconds.items()]
-    config = {"core": form(), "minutes": minutes, "fps": FPS, "turns": turns, "seeds": seeds, "repeats": REPEATS}
+    processed = {**dict.fromkeys(ways, events_each), **_processed(graph, service, frames, [*simpy_ways])}
+    rows = [_row(way, frames, events_each, runs, processed[way]) for way, runs in seconds.items()]
+    config = {"core": form(), "minutes": minutes, "fps": FPS, "rounds": rounds, "seeds": seeds, "repeats": REPEATS}
     return {
         "rows": rows,
-        **_compared(rows, frames),
+        **compared(seconds),
+        "agree": frames if simpy_ways else None,
         **_determinism(seeds),
         "config": config,
         **absent,
@@ -68,27 +85,54 @@ def measure(minutes: float = 30.0, turns: int = 3, seeds: int = 10, events: str 
     }
 
 
-def _cpu_seconds(variants: dict[str, Callable[[], list[int]]], rounds: int) -> dict[str, list[float]]:
-    """CPU time of every round of each variant. Raises TrilaneError when they present frames at different times."""
-    seconds: dict[str, list[float]] = {variant: [] for variant in variants}
-    ends: dict[str, list[int]] = {}
-    for _ in range(rounds):
-        for variant, run in variants.items():
-            begin = time.process_time()
-            ends[variant] = run()
-            seconds[variant].append(time.process_time() - begin)
-    if any(other != ends["trilane"] for other in ends.values()):
-        raise TrilaneError("SimPy's model presents frames at other times than Trilane's scheduler")
+def compared(seconds: dict[str, list[float]]) -> dict[str, Any]:
+    """Ratios within each round, of the `seconds` of each way's rounds."""
+    ours = seconds[TRILANE]
+    ratios = {
+        way: [other / own for other, own in zip(runs, ours, strict=True)]
+        for way, runs in seconds.items()
+        if way != TRILANE
+    }
+    return {
+        "over_trilane": {way: _with_interval(values) for way, values in ratios.items()},
+        "over_simpy": median(ratios[SIMPY]) if SIMPY in ratios else None,
+        "over_simpy_lean": median(ratios[LEAN]) if LEAN in ratios else None,
+    }
+
+
+def _with_interval(values: list[float]) -> dict[str, float]:
+    low, high = median_interval(values)
+    return {"median": median(values), "low": low, "high": high}
+
+
+def _cpu_seconds(ways: dict[str, Run], rounds: int) -> dict[str, list[float]]:
+    """CPU time of every round of each way. Raises TrilaneError when they present frames at different times."""
+    seconds: dict[str, list[float]] = {way: [] for way in ways}
+    for number in range(rounds):
+        names = list(ways)
+        first = number % len(names)
+        ends: dict[str, list[int]] = {}
+        for way in names[first:] + names[:first]:
+            taken, ends[way] = _timed(ways[way])
+            seconds[way].append(taken)
+        different = [way for way in ends if ends[way] != ends[TRILANE]]
+        if different:
+            raise TrilaneError(f"{', '.join(different)} and trilane present frames at different times")
     return seconds
 
 
-def _compared(rows: list[dict[str, Any]], frames: int) -> dict[str, Any]:
-    speeds = {row["way"]: row["events_per_s"] for row in rows}
-    has_simpy = "simpy" in speeds
-    return {
-        "over_simpy": speeds["trilane"] / speeds["simpy"] if has_simpy else None,
-        "agree": frames if has_simpy else None,
-    }
+def _timed(run: Run) -> tuple[float, list[int]]:
+    """CPU seconds of a run without garbage collection, and its answer."""
+    collects = gc.isenabled()
+    gc.collect()
+    gc.disable()
+    try:
+        begin = time.process_time()
+        answer = run()
+        return time.process_time() - begin, answer
+    finally:
+        if collects:
+            gc.enable()
 
 
 def _determinism(seeds: int) -> dict[str, int]:
@@ -106,38 +150,57 @@ def _service(seed: int, frames: int) -> Service:
     return lambda stage, _unit, frame, _begin_ns: table[stage][frame]
 
 
-def _trilane(graph: Graph, service: Service, frames: int) -> list[int]:
-    driver = VirtualDriver(graph, Settings(frames, "pipelined", period_ns=PERIOD_NS), service)
-    driver.run()
-    driver.core.ledger.report(clock="virtual", requested=frames)
-    return driver.core.ledger.presented_ns
+def _trilane_ways(graph: Graph, service: Service, frames: int) -> dict[str, Run]:
+    def run(*, report: bool = True, keep: bool = False) -> list[int]:
+        driver = VirtualDriver(graph, Settings(frames, "pipelined", period_ns=PERIOD_NS), service, keep=keep)
+        driver.run()
+        if report:
+            driver.core.ledger.report(clock="virtual", requested=frames)
+        return driver.core.ledger.presented_ns
+
+    return {TRILANE: run, NO_REPORT: lambda: run(report=False), RECORDED: lambda: run(keep=True)}
 
 
-def _add_simpy(
-    ways: dict[str, Callable[[], list[int]]], graph: Graph, service: Service, frames: int
-) -> dict[str, dict[str, str]]:
-    """Add SimPy's run to `ways`, or answer why it is absent."""
+def _simpy_ways(graph: Graph, service: Service, frames: int) -> tuple[dict[str, Run], dict[str, dict[str, str]]]:
+    """SimPy's runs, or why they are absent."""
     try:
-        from trilane.bench.lib.simpy_model import SimpyPipeline
+        models = _models()
     except ModuleNotFoundError:
-        return {"absent": {"simpy": f"not installed: {install_line('peers')}"}}
-    ways["simpy"] = lambda: SimpyPipeline(graph, service, frames, PERIOD_NS).run()
-    return {}
+        return {}, {"absent": {SIMPY: f"not installed: {install_line('peers')}"}}
+    return {way: partial(_run_model, model, graph, service, frames) for way, model in models.items()}, {}
 
 
-def _processed(graph: Graph, service: Service, frames: int, *, with_simpy: bool) -> dict[str, int]:
-    """How many events each of the two processes, by its own count."""
-    counts = {"trilane": frames * (len(graph.stages) + 1)}
-    if with_simpy:
-        from trilane.bench.lib.simpy_model import SimpyPipeline
-
-        counts["simpy"] = SimpyPipeline(graph, service, frames, PERIOD_NS).run_counting()
-    return counts
+def _run_model(model: Any, graph: Graph, service: Service, frames: int) -> list[int]:
+    presented_ns: list[int] = model(graph, service, frames, PERIOD_NS).run()
+    return presented_ns
 
 
-def _row(way: str, frames: int, events: int, seconds: float, processed: int) -> dict[str, Any]:
-    rates = {"seconds": seconds, "events_per_s": events / seconds}
-    return {"way": way, "frames": frames, "events": events, **rates, "processed": processed}
+def _models() -> dict[str, Any]:
+    """Way: its model. Raises ModuleNotFoundError without SimPy."""
+    from trilane.bench.lib.simpy_lean import LeanPipeline
+    from trilane.bench.lib.simpy_model import SimpyPipeline
+
+    return {SIMPY: SimpyPipeline, LEAN: LeanPipeline}
+
+
+def _processed(graph: Graph, service: Service, frames: int, ways: list[str]) -> dict[str, int]:
+    """How many events SimPy processes in each of `ways`."""
+    return {way: _count_events(_models()[way](graph, service, frames, PERIOD_NS).env) for way in ways}
+
+
+def _count_events(env: Any) -> int:
+    count = 0
+    while env.peek() != float("inf"):
+        env.step()
+        count += 1
+    return count
+
+
+def _row(way: str, frames: int, events: int, seconds: list[float], processed: int) -> dict[str, Any]:
+    low, high = median_interval(seconds)
+    times = {"seconds": median(seconds), "seconds_low": low, "seconds_high": high}
+    rates = {"events_per_s": events / times["seconds"], "processed": processed}
+    return {"way": way, "frames": frames, "events": events, **times, **rates}
 
 
 def _traces(seed: int) -> list[str]:

@@ -46,7 +46,8 @@ class Flow:
             if evicted is not None:
                 self.drop([evicted], stage.position, DropCause.STALE if sink.rule.mailbox else DropCause.POOL)
         pool = sink or source
-        job = Job(self._jobs, stage.unit.name, stage.name, frame, slot_in, slot_out, pool.epoch if pool else 0)
+        epoch = pool.epoch if pool else 0
+        job = tuple.__new__(Job, (self._jobs, stage.unit.name, stage.name, frame, slot_in, slot_out, epoch))
         self._jobs += 1
         return job
 

@@ -10,13 +10,16 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from trilane.scheduler.causes import Drop, Loss
 from trilane.scheduler.events import NEVER, Graph, Job
 from trilane.scheduler.stats import NS_PER_MS, ema_range_ms, jitter_ms, real_time_score, summary_ms
 
-ASSIGNED, STARVED, BLOCKED, THROTTLED = range(4)
+ASSIGNED: Final = 0
+STARVED: Final = 1
+BLOCKED: Final = 2
+THROTTLED: Final = 3
 
 
 class JobRecord(NamedTuple):

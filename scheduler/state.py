@@ -6,14 +6,15 @@ A time that is not set is NEVER.
 from __future__ import annotations
 
 from collections import deque
+from typing import Final
 
 from trilane.scheduler.events import NEVER, Graph, Job
 from trilane.scheduler.ledger import STARVED
 from trilane.scheduler.unit_life import IGNORED, READY, STARTING, state_after
 from trilane.transport.slots import EdgeSlots, edge_rule
 
-HELD_JOBS = 2  # the one that runs and the one dispatched ahead
-FULL_DUTY = 1000
+HELD_JOBS: Final = 2  # the one that runs and the one dispatched ahead
+FULL_DUTY: Final = 1000
 
 
 class UnitState:

@@ -9,7 +9,7 @@ import gc
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from heapq import heappop, heappush
-from typing import Any
+from typing import Any, Final
 
 from trilane.scheduler.causes import Outcome
 from trilane.scheduler.core import Core
@@ -34,7 +34,9 @@ from trilane.scheduler.recording import Recording
 #: (stage, unit, frame, begin_ns) -> service time in ns.
 Service = Callable[[str, str, int, int], int]
 
-FAULT, EVENT = 0, 1  # priority at equal times; the core's deadline comes after both
+#: Priority at equal times; the core's deadline comes after both.
+FAULT: Final = 0
+EVENT: Final = 1
 
 
 @dataclass(frozen=True)
@@ -148,13 +150,13 @@ class VirtualDriver:
         heappush(self._heap, (at_ns, priority, self._sequence, event, epoch))
 
     def _dispatch(self, now_ns: int, job: Job) -> None:
-        job_id, name, stage, frame, *_ = job
+        job_id, name, stage, frame, _, _, _ = job
         unit = self._units[name]
         begin_ns = now_ns + self._message_delay_ns
         if begin_ns < unit.free_ns:
             begin_ns = unit.free_ns
         end_ns = unit.free_ns = begin_ns + self._service(stage, name, frame, begin_ns)
-        done = JobDone(name, job_id, begin_ns, end_ns, begin_ns, 0, 0, 0)
+        done = tuple.__new__(JobDone, (name, job_id, begin_ns, end_ns, begin_ns, 0, 0, 0))
         self._sequence += 1
         heappush(self._heap, (end_ns + self._message_delay_ns, EVENT, self._sequence, done, unit.epoch))
         if self.recording is not None:

@@ -18,7 +18,10 @@ from typing import Any
 from trilane.compiled import form
 
 #: Instructions that decide how fast INT8 and FP32 networks run; a network's speed means nothing without them.
-CPU_FLAGS = ("avx2", "fma", "f16c", "avx512f", "avx512_vnni", "avx_vnni", "avx512_bf16", "amx_int8", "sha_ni")
+CPU_FLAGS = (
+    "avx2", "fma", "f16c", "avx512f", "avx512bw", "avx512_vnni", "avx_vnni", "avx512_bf16", "amx_tile", "amx_int8",
+    "sha_ni",
+)  # fmt: skip
 ARM_FLAGS = ("asimd", "asimddp", "i8mm", "bf16", "sve", "sve2")
 
 PACKAGES = (

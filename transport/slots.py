@@ -10,10 +10,14 @@ from __future__ import annotations
 import re
 from collections import deque
 from dataclasses import dataclass
+from typing import Final
 
 from trilane.unexpected_value import UnexpectedValue
 
-FREE, WRITING, READY, READING = "free", "writing", "ready", "reading"
+FREE: Final = "free"
+WRITING: Final = "writing"
+READY: Final = "ready"
+READING: Final = "reading"
 
 TRANSITIONS = {
     "claim": (FREE, WRITING),

@@ -61,7 +61,7 @@ MEANINGS = {
     "raster threads": DRIVER_THREADS,
     "readback threads": DRIVER_THREADS,
     "times": "How often the unit is killed in a run.",
-    "turns": "Rounds: each runs every variant once.",
+    "rounds": "Rounds: each runs every variant once.",
     "unit": "cpu, gpu or dsp.",
     "video": "Encode the video, as a run does.",
     "views": "How many random poses and views.",

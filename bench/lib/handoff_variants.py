@@ -9,6 +9,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable
+from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnContext
 from multiprocessing.queues import Queue
 from multiprocessing.reduction import DupFd
@@ -25,7 +26,6 @@ from trilane.transport.messages import RunJob
 from trilane.transport.packets import SlotLayout, header_dtype
 from trilane.transport.socket_folder import SocketFolder
 
-SLOTS = 2
 WAIT_MS = 60_000
 SHM = Path("/dev/shm")  # noqa: S108 - what iceoryx2 leaves there under our prefix is removed
 
@@ -64,10 +64,15 @@ class Channel(Protocol):
 
 
 class SlotChannel:
-    """As the pipeline: slots of a sealed memfd region, announced by a message over a `JobPipe`."""
+    """As the pipeline: a slot of a sealed memfd region, announced by a message over a `JobPipe`.
+
+    One slot, because a run writes the slot that was given back last (transport/slots.py), and here each is given back
+    before the next is written. So does iceoryx2 with its samples: taking two by turns would double the memory that
+    passes through the caches, and with it the time that reading takes.
+    """
 
     def __init__(self, size: int, _context: SpawnContext) -> None:
-        self._layout = RegionLayout(SLOTS, SlotLayout(header_dtype(), size))
+        self._layout = RegionLayout(1, SlotLayout(header_dtype(), size))
         self._fd = create_region("handoff", self._layout)
         self._place = f"/proc/{os.getpid()}/fd/{self._fd}"
         self._ends = job_pipe_pair()
@@ -81,14 +86,15 @@ class SlotChannel:
 
     def producer(self) -> Producer:
         self._ends[1].close()
-        return _SlotEnd(self._slots(), JobPipe(self._ends[0], waits=True))
+        return _SlotEnd(self._slot(), JobPipe(self._ends[0], waits=True))
 
     def consumer(self) -> Consumer:
         self._ends[0].close()
-        return _SlotEnd(self._slots(), JobPipe(self._ends[1], waits=True))
+        return _SlotEnd(self._slot(), JobPipe(self._ends[1], waits=True))
 
-    def _slots(self) -> list[U8]:
-        return [packet.payload for packet in map_region(os.open(self._place, os.O_RDWR), self._layout)]
+    def _slot(self) -> U8:
+        (packet,) = map_region(os.open(self._place, os.O_RDWR), self._layout)
+        return packet.payload
 
     def close(self) -> None:
         os.close(self._fd)
@@ -97,22 +103,21 @@ class SlotChannel:
 
 
 class _SlotEnd:
-    def __init__(self, payloads: list[U8], job_pipe: JobPipe) -> None:
-        self._payloads, self._job_pipe, self._count = payloads, job_pipe, 0
+    def __init__(self, payload: U8, job_pipe: JobPipe) -> None:
+        self._payload, self._job_pipe, self._count = payload, job_pipe, 0
 
     def buffer(self) -> U8:
-        return self._payloads[self._count % SLOTS]
+        return self._payload
 
     def hand_over(self) -> None:
-        slot = self._count % SLOTS
-        self._job_pipe.send(RunJob(self._count, 0, self._count, slot, slot, 0))
+        self._job_pipe.send(RunJob(self._count, 0, self._count, 0, 0, 0))
         self._count += 1
 
     def receive(self) -> U8:
         while True:
             message = self._job_pipe.receive()
             if isinstance(message, RunJob):
-                return self._payloads[message.slot_in]
+                return self._payload
             if self._job_pipe.ended:
                 raise EOFError
 
@@ -154,8 +159,45 @@ class _QueueEnd:
         """Nothing to do: the array belongs to this process."""
 
 
+class PipeChannel:
+    """A `multiprocessing.Pipe` in its best form: raw bytes, received into an array that is there already."""
+
+    def __init__(self, size: int, context: SpawnContext) -> None:
+        self._size, self._ends = size, context.Pipe()
+
+    def producer(self) -> Producer:
+        self._ends[1].close()
+        return _PipeEnd(self._ends[0], self._size)
+
+    def consumer(self) -> Consumer:
+        self._ends[0].close()
+        return _PipeEnd(self._ends[1], self._size)
+
+    def close(self) -> None:
+        for end in self._ends:
+            end.close()
+
+
+class _PipeEnd:
+    def __init__(self, end: Connection, size: int) -> None:
+        self._end, self._own = end, np.zeros(size, np.uint8)
+
+    def buffer(self) -> U8:
+        return self._own
+
+    def hand_over(self) -> None:
+        self._end.send_bytes(self._own.data)
+
+    def receive(self) -> U8:
+        self._end.recv_bytes_into(self._own.data)
+        return self._own
+
+    def release(self) -> None:
+        """Nothing to do: the array belongs to this process."""
+
+
 class ZmqChannel:
-    """The bytes themselves as a ZeroMQ frame, copied as pyzmq does it by default."""
+    """The bytes themselves as a ZeroMQ frame, in pyzmq's best form: it copies neither what is sent nor what comes."""
 
     def __init__(self, size: int, _context: SpawnContext) -> None:
         self._folder = SocketFolder()
@@ -185,10 +227,10 @@ class _ZmqEnd:
         return self._own
 
     def hand_over(self) -> None:
-        self._socket.send(self._own.data)
+        self._socket.send(self._own.data, copy=False)
 
     def receive(self) -> U8:
-        return np.frombuffer(self._socket.recv(), np.uint8)
+        return np.frombuffer(self._socket.recv(copy=False).buffer, np.uint8)
 
     def release(self) -> None:
         """Nothing to do: the bytes belong to this process."""
@@ -196,6 +238,8 @@ class _ZmqEnd:
 
 class IceoryxChannel:
     """iceoryx2: a loaned sample is written in place and sent, an event wakes the other end. Nothing is copied.
+
+    Polling instead of the event would be sooner, but would keep a core busy while there is nothing to do.
 
     iceoryx2 leaves files for the user's next program. Here they get a folder and a prefix of their own and are removed.
     Both are short, because the path of a Unix socket must be.
@@ -277,7 +321,8 @@ CHANNELS: dict[str, Callable[[int, SpawnContext], Channel]] = {
     SLOT: SlotChannel,
     BARE: SlotChannel,
     "iceoryx2": IceoryxChannel,
-    "zeromq copied": ZmqChannel,
+    "zeromq": ZmqChannel,
+    "pipe": PipeChannel,
     "pickled queue": QueueChannel,
 }
 #: Variant: bytes of each slot that are written and read, where it is not all of them.

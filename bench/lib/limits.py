@@ -16,7 +16,7 @@ from trilane.errors import BadInputError
 LIMITS: dict[str, tuple[float, float]] = {
     "repeats": (1, 100_000),
     "threads": (0, 4 * (os.cpu_count() or 1)),
-    "turns": (1, 10_000),
+    "rounds": (1, 10_000),
     "views": (1, 1_000_000),
     "frames": (1, 10_000_000),
     "seeds": (1, 1000),

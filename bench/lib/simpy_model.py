@@ -34,14 +34,6 @@ class SimpyPipeline:
         self.env.run()
         return self.presented_ns
 
-    def run_counting(self) -> int:
-        """The same, and returns how many events SimPy processed."""
-        count = 0
-        while self.env.peek() != simpy.core.Infinity:
-            self.env.step()
-            count += 1
-        return count
-
     def _full(self, slots: int) -> simpy.Container:
         return simpy.Container(self.env, slots, init=slots)
 

@@ -35,16 +35,18 @@ def test_a_variant_that_fails_says_why(tmp_path):
 
 
 def test_a_file_is_measured(file, monkeypatch):
-    monkeypatch.setattr(roofline, "measure", lambda _threads: {"int8_gmac_s": 100.0})
+    monkeypatch.setattr(roofline, "measure", lambda _threads: {"int8_gmac_s": 100.0, "int8_instruction_gmac_s": 400.0})
     result = infer.measure(str(file), runtime=("ort",), threads=1, seconds=0.2, period=0.1)
     (row,) = result["rows"]
     assert row["runtime"] == "ort" and len(row["periods"]) == 2
     assert row["min_ms"] <= row["p50_ms"] <= row["p99_ms"] <= row["max_ms"]
-    assert 0 < row["share_of_roofline"] < 10 and row["int8_over_fp32"] is None
+    assert 0 < row["share_of_roofline"] < 10
+    assert row["share_of_instruction_peak"] == pytest.approx(row["share_of_roofline"] / 4)
+    assert row["int8_over_fp32"] is None
 
 
 def test_times_of_a_batch_are_those_of_a_frame(file, monkeypatch):
-    monkeypatch.setattr(roofline, "measure", lambda _threads: {"int8_gmac_s": 100.0})
+    monkeypatch.setattr(roofline, "measure", lambda _threads: {"int8_gmac_s": 100.0, "int8_instruction_gmac_s": 400.0})
     result = infer.measure(str(file), batch=(1, 8), runtime=("ort",), threads=1, seconds=0.2, period=0.1)
     one, eight = result["rows"]
     assert (one["batch"], eight["batch"]) == (1, 8) and eight["frames"] % 8 == 0

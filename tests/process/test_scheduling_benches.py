@@ -30,7 +30,7 @@ def test_idle_time_between_jobs_has_one_cause_for_every_nanosecond() -> None:
 
 def test_the_pipeline_is_set_against_its_stages_alone(drawable_bundle: Path) -> None:
     result = pipeline.measure(
-        avatar=(str(drawable_bundle),), size=("64x64",), edge=("double", "orphan"), frames=20, turns=1, runtime="ort"
+        avatar=(str(drawable_bundle),), size=("64x64",), edge=("double", "orphan"), frames=20, rounds=1, runtime="ort"
     )
     rows = {(row["policy"], row["edge"]): row for row in result["rows"]}
     assert set(rows) == {("sequential", "double"), ("pipelined", "double"), ("pipelined", "orphan")}
@@ -45,7 +45,8 @@ def test_the_pipeline_is_set_against_its_stages_alone(drawable_bundle: Path) -> 
 
 
 @pytest.mark.parametrize(
-    "asked", [{"frames": 3}, {"turns": 0}, {"cores": (99,)}, {"size": ("63x64",)}, {"policy": ("x",)}, {"edge": ("x",)}]
+    "asked",
+    [{"frames": 3}, {"rounds": 0}, {"cores": (99,)}, {"size": ("63x64",)}, {"policy": ("x",)}, {"edge": ("x",)}],
 )
 def test_a_pipeline_that_cannot_be_measured_is_refused(asked: dict[str, object]) -> None:
     with pytest.raises(BadInputError):
@@ -59,14 +60,16 @@ def peers_files() -> set[Path]:
 
 def test_every_way_hands_over_the_same_bytes() -> None:
     before = peers_files()
-    result = handoff.measure(kib=(256,), frames=10, turns=1)
+    result = handoff.measure(kib=(256,), frames=10, rounds=1)
     ways = {row["way"] for row in result["rows"]}
     assert {"slot", handoff.PIPELINE, "pickled queue"} <= ways
     assert ways | set(result["absent"]) == {*handoff.CHANNELS, handoff.PIPELINE}
     for row in result["rows"]:
         assert row["frames"] == 10
-        assert 0 < row["p50_us"] <= row["p99_us"] <= row["max_us"]
+        assert 0 < row["p50_low_us"] <= row["p50_us"] <= row["p50_high_us"] <= row["max_us"]
+        assert row["p99_us"] is row["read_p99_us"] is None  # of ten frames
         assert row["read_p50_us"] > row["p50_us"]
+    assert result["met"] == {"slot": None, handoff.PIPELINE: None}
     assert peers_files() == before
 
 
@@ -77,17 +80,22 @@ def test_a_size_without_a_tensor_is_refused() -> None:
 
 def test_virtual_time_agrees_with_simpy_and_repeats_itself() -> None:
     pytest.importorskip("simpy")
-    result = scheduler.measure(minutes=0.1, turns=1, seeds=3)
-    assert [row["way"] for row in result["rows"]] == ["trilane", "simpy"]
+    result = scheduler.measure(minutes=0.1, rounds=1, seeds=3)
+    ways = ["trilane", "trilane, no report", "trilane, recorded", "simpy", "simpy lean"]
+    assert [row["way"] for row in result["rows"]] == ways
+    assert set(result["over_trilane"]) == {*ways[1:]}
+    assert {row["way"]: row["processed"] for row in result["rows"]}["simpy lean"] == 360 * 6  # a timeout for each event
     assert result["agree"] == 360
     assert result["same_traces"] == result["different_traces"] == 3
 
 
 def test_without_simpy_the_bench_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "simpy", None)
-    monkeypatch.delitem(sys.modules, "trilane.bench.lib.simpy_model", raising=False)
-    result = scheduler.measure(minutes=0.05, turns=1, seeds=1)
-    assert [row["way"] for row in result["rows"]] == ["trilane"]
+    for model in ("simpy_model", "simpy_lean"):
+        monkeypatch.delitem(sys.modules, f"trilane.bench.lib.{model}", raising=False)
+    result = scheduler.measure(minutes=0.05, rounds=1, seeds=1)
+    assert {row["way"].partition(",")[0] for row in result["rows"]} == {"trilane"}
+    assert result["over_simpy"] is result["over_simpy_lean"] is None
     assert "pip install" in result["absent"]["simpy"]
 
 

@@ -1,0 +1,112 @@
+"""The INT8 peak of an instruction set, worked out by hand; the loops that tell the clock, byte for byte."""
+
+from __future__ import annotations
+
+import pytest
+
+from trilane.bench import peers, roofline
+from trilane.bench.lib import instruction_kernels
+from trilane.bench.lib.instruction_kernels import KERNELS, Issued, Kernel, clock_loop, rate_loop
+from trilane.bench.lib.instruction_sets import INSTRUCTION_SETS, instruction_set_of, peak_gmac_s
+
+#: Multiply-accumulates a cycle of one core: bytes of a register, by registers a cycle (a third of the instructions of
+#: three do the products). AMX: Intel's 2048 operations a cycle are 1024 products and 1024 sums.
+BY_HAND = {
+    "AMX-INT8": (2048 / 2,),
+    "AVX512-VNNI": (512 / 8, 2 * 512 / 8),
+    "AVX-VNNI": (256 / 8, 2 * 256 / 8),
+    "AVX512-BW": (1 * 64 / 3, 2 * 64 / 3),
+    "AVX2": (32 / 2, 32),
+    "NEON dot": (128 / 8, 2 * 128 / 8, 4 * 128 / 8),
+}
+
+
+def test_the_table_has_the_multiply_accumulates_worked_out_by_hand() -> None:
+    assert {each.name for each in INSTRUCTION_SETS} == BY_HAND.keys()
+    for each in INSTRUCTION_SETS:
+        assert [float(each.macs * rate) for rate in each.rates] == pytest.approx(BY_HAND[each.name])
+    assert all(each.source and each.flags for each in INSTRUCTION_SETS)
+
+
+@pytest.mark.parametrize(
+    ("flags", "name"),
+    [
+        (["avx2", "avx512f", "avx512bw", "avx512_vnni", "avx_vnni", "amx_tile", "amx_int8"], "AMX-INT8"),
+        (["avx2", "avx512f", "avx512bw", "avx512_vnni", "amx_int8"], "AVX512-VNNI"),  # a kernel that hides the tiles
+        (["avx2", "avx_vnni"], "AVX-VNNI"),
+        (["avx2", "avx512f", "avx512bw"], "AVX512-BW"),
+        (["fma", "avx2"], "AVX2"),
+        (["asimd", "asimddp"], "NEON dot"),
+    ],
+)
+def test_the_widest_set_of_a_core_is_its_own(flags: list[str], name: str) -> None:
+    found = instruction_set_of(flags)
+    assert found is not None and found.name == name
+
+
+def test_a_core_of_no_known_set_has_no_peak() -> None:
+    assert instruction_set_of(["sse2"]) is None
+    assert list(roofline.instruction_peak(["sse2"], 1)) == ["absent"]
+
+
+def test_the_peak_is_macs_a_cycle_by_clock_by_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    """2 instructions of 64 at 2.5 GHz on 2 cores are 640 G/s; the 1.9 that were issued mean the documented 2."""
+    monkeypatch.setattr(roofline, "measure_issued", lambda _name, _cores: Issued(1.9, 2.5, 2.4, 2.6))
+    monkeypatch.setattr("os.sched_getaffinity", lambda _pid: {4, 5, 6})
+    peak = roofline.instruction_peak(["avx512f", "avx512_vnni"], threads=2)
+    assert peak["gmac_s"] == 640 and peak["cores"] == 2 and peak["macs_a_cycle"] == 128
+    assert peak["issued_macs_a_cycle"] == pytest.approx(121.6)
+    assert peak_gmac_s(1024, 2.0, 3) == 6144
+
+
+def test_one_512_bit_unit_is_told_from_two() -> None:
+    vnni = instruction_set_of(["avx512f", "avx512_vnni"])
+    assert vnni is not None
+    assert (vnni.macs_a_cycle(0.97), vnni.macs_a_cycle(1.9)) == (64, 128)
+
+
+def test_what_cannot_be_measured_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(instruction_kernels.platform, "machine", lambda: "aarch64")
+    assert "no loops for this architecture" in roofline.instruction_peak(["asimddp"], 1)["absent"]
+
+
+def test_the_loops_are_the_bytes_of_the_assembler() -> None:
+    """`1: vpdpbusd ...; [imul %rax,%rax;] dec %rdi; jnz 1b; vzeroupper; ret`, as GNU as writes it with a far jump."""
+    kernel = Kernel("c4c20550c6 c4c20550ce", sequences=2, imuls=1, cycles=1)
+    assert rate_loop(kernel).hex(" ", 1) == (
+        "c4 c2 05 50 c6 c4 c2 05 50 ce 48 ff cf 0f 85 ed ff ff ff c5 f8 77 c3"  # 19 bytes back
+    )
+    assert clock_loop(kernel).hex(" ", 1) == (
+        "c4 c2 05 50 c6 48 0f af c0 c4 c2 05 50 ce 48 0f af c0 48 ff cf 0f 85 e5 ff ff ff c5 f8 77 c3"  # 27
+    )
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_in_the_loop_that_tells_the_clock_the_chain_is_the_longer_path(name: str) -> None:
+    """Each instruction takes less than the three cycles of an `imul`, at the slowest documented rate."""
+    kernel = KERNELS[name]
+    (row,) = [each for each in INSTRUCTION_SETS if each.name == name]
+    instructions = len(kernel.body.split())
+    slowest = kernel.sequences / float(min(row.rates))
+    assert instructions % kernel.sequences == 0
+    assert slowest < instructions * kernel.imuls * 3
+
+
+def test_shares_say_which_peak_they_are_of() -> None:
+    """1 G in 10 ms is 100 G/s: half of a layer's 200, an eighth of the instructions' 800. The second round is twice
+    as slow, and with two rounds the interval is both."""
+    times = {peers.ORT: [[20.0], [20.0]], peers.FP32: [[40.0], [40.0]], peers.APP: [[10.0], [20.0]]}
+    result = peers.compared({**times, peers.OPENVINO: [[9.0, 10.0, 11.0], [20.0]]}, 1.0, 200.0, 800.0)
+    assert result["ratios"] == pytest.approx(
+        {
+            "ort_over_fp32": 2,
+            "openvino_over_fp32": 3,
+            "openvino_of_roofline": 0.375,
+            "openvino_of_instruction_peak": 0.09375,
+            "openvino_over_benchmark_app": 1,
+        }
+    )
+    assert (result["low"]["openvino_of_roofline"], result["high"]["openvino_of_roofline"]) == (0.25, 0.5)
+    assert set(peers.PEAKS) < set(result["ratios"])
+    unknown = peers.compared({**times, peers.OPENVINO: [[10.0], [10.0]]}, 1.0, 200.0, None)
+    assert unknown["ratios"]["openvino_of_instruction_peak"] is None
