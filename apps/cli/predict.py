@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from trilane.apps.cli.commands import Commands
 from trilane.apps.cli.console import stderr_console
 from trilane.apps.cli.options import (
     ChannelsOption,
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from trilane.hw_profiles.network_work import Network
     from trilane.hw_profiles.schema import Profile
 
-app = typer.Typer(rich_markup_mode=None, add_completion=False)
+app = Commands()
 
 EPILOG = """\b
 Examples:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from trilane.apps.cli.commands import Commands
 from trilane.apps.cli.console import print_json, stderr_console, stdout_console
 from trilane.apps.cli.options import (
     PROFILE_HELP,
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
     from trilane.stages.config import RunConfig
     from trilane.stages.configure import Checked, GlFacts
 
-app = typer.Typer(rich_markup_mode=None, add_completion=False)
+app = Commands()
 
 EPILOG = """\b
 Examples:
