@@ -192,6 +192,7 @@ def _refuse_beside_pace(pace: Pace | None, cuts: tuple[str, ...], cap: str | Non
 
 def _run(checked: Checked, out: Path | None, plan: Plan, starter: UnitStarter, gl: GlFacts) -> Outcome:
     """Run `checked` as `plan` says, to the folder `out` or the default one."""
+    from trilane.apps.made import made_facts
     from trilane.apps.run_folder import default_place
     from trilane.apps.run_job import run_to_folder
     from trilane.stages.configure import required_machine
@@ -203,7 +204,9 @@ def _run(checked: Checked, out: Path | None, plan: Plan, starter: UnitStarter, g
         for note in checked.notes:
             hooks.message(note)
         try:
-            return run_to_folder(checked, target, plan, hooks, machine=required_machine(gl), starter=starter)
+            made = made_facts(["trilane", *sys.argv[1:]])
+            machine = required_machine(gl)
+            return run_to_folder(checked, target, plan, hooks, machine=machine, made=made, starter=starter)
         except KeyboardInterrupt:
             hooks.message("interrupted: nothing was written")
             raise
