@@ -67,7 +67,11 @@ CameraOption = Annotated[str | None, typer.Option(help="ARKit log, TUM, transfor
 BackgroundOption = Annotated[str | None, typer.Option(help="room, or a video, image folder or picture.")]
 FramesOption = Annotated[int | None, typer.Option(help="How many frames to present.")]
 HudOption = Annotated[bool | None, typer.Option(help="Write frame, rate and age on the picture.")]
-PolicyOption = Annotated[PolicyName, typer.Option(help="How frames are scheduled.")]
+POLICIES_HELP = (
+    "pipelined: highest rate; sequential: one frame at a time; latest: newest pose wins; deadline: what would be late is "
+    "dropped."
+)
+PolicyOption = Annotated[PolicyName, typer.Option(help=POLICIES_HELP)]
 RuntimeOption = Annotated[str, typer.Option(help=f"What runs the network: {RUNTIME_HELP}")]
 SkinningOption = Annotated[
     str, typer.Option(help="Which unit poses the vertices: cpu, gpu; auto: cpu when OpenGL is software.")
@@ -138,6 +142,7 @@ def run(
     """Run a scene on the three units and write a run folder.
 
     The folder holds report.json, video.mp4, contact.png, trace.pftrace (open it at ui.perfetto.dev) and events.jsonl.
+    docs/report.md explains every key, the policies and the edges.
     """
     with _early_processes() as (starter, gl):
         from trilane.apps.run_job import Plan
