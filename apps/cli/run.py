@@ -68,8 +68,8 @@ BackgroundOption = Annotated[str | None, typer.Option(help="room, or a video, im
 FramesOption = Annotated[int | None, typer.Option(help="How many frames to present.")]
 HudOption = Annotated[bool | None, typer.Option(help="Write frame, rate and age on the picture.")]
 POLICIES_HELP = (
-    "pipelined: highest rate; sequential: one frame at a time; latest: newest pose wins; deadline: what would be late is "
-    "dropped."
+    "pipelined: highest rate; sequential: one frame at a time; latest: newest pose wins; "
+    "deadline: frames that would be late are dropped."
 )
 PolicyOption = Annotated[PolicyName, typer.Option(help=POLICIES_HELP)]
 RuntimeOption = Annotated[str, typer.Option(help=f"What runs the network: {RUNTIME_HELP}")]
