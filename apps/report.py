@@ -101,6 +101,8 @@ class Baseline(Record):
     frame_time_ms: FrameTimes
     latency_ms: TimeSummary
     fps: float
+    fps_low: float | None = None
+    fps_high: float | None = None
     deadline_misses: int
     stages: dict[str, StageTimes]
     units: dict[str, UnitShares]
@@ -142,6 +144,23 @@ class Video(Record):
     seconds: float
 
 
+class Made(Record):
+    """How a report came about.
+
+    `at`: when the command began, UTC as in ISO 8601.
+    `command`: the command line, word by word.
+    `trilane`: its version; null for a Trilane that was never installed.
+    `revision`: git's of the checkout that Trilane ran from, null when it is none.
+    `modified`: whether files of that checkout differed from it; null without one.
+    """
+
+    at: str
+    command: tuple[str, ...]
+    trilane: str | None
+    revision: str | None
+    modified: bool | None
+
+
 class Preamble(Record):
     """The keys that a report begins with.
 
@@ -164,6 +183,7 @@ class Preamble(Record):
 class Report(RunMetrics, Preamble):
     """The whole document: the keys of `Preamble`, those of `RunMetrics` that it has not, and these.
 
+    `made`: when, by which command line and which Trilane; null where it was run by a program.
     `pids`: process of each unit at the end.
     `startup_ms`: until each unit was ready.
     `stage_metrics`: `figures` in the file: mean of each metric that a stage gave with its jobs.
@@ -180,6 +200,7 @@ class Report(RunMetrics, Preamble):
 
     caps: Caps
     temperature_c: Temperature
+    made: Made | None = None
     pids: dict[str, int]
     startup_ms: dict[str, float]
     stage_metrics: dict[str, dict[str, float]] = Field(alias="figures")
@@ -208,7 +229,7 @@ def build_report(
     `config`: that it ran.
     `machine`: what `machine_facts` said.
     `baseline`: of the same scene under another policy, None without one.
-    `facts`: what others know of the run: `video`, `checksum`, and any of `pace`, `accuracy`, `notes`.
+    `facts`: what others know of the run: `video`, `checksum`, and any of `made`, `pace`, `accuracy`, `notes`.
     """
     metrics = result.report
     sensor = {"sensor": sensor_c()}

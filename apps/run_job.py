@@ -74,6 +74,7 @@ def run_to_folder(
     hooks: Hooks,
     *,
     machine: Mapping[str, Any],
+    made: Mapping[str, Any] | None = None,
     starter: UnitStarter | None = None,
 ) -> Outcome:
     """Run what was checked and leave the run folder at `target`.
@@ -83,6 +84,7 @@ def run_to_folder(
     `plan`: how to run.
     `hooks`: who is told.
     `machine`: what `machine_facts` said.
+    `made`: what `trilane.apps.made.made_facts` said of the command line; None where there is none.
     `starter`: a fork server that was started earlier.
     Raises BadInputError when `target` cannot be written, and TrilaneError when no frame was presented.
     """
@@ -92,7 +94,7 @@ def run_to_folder(
         result = job.run(folder.work)
         with Interrupts() as late:  # from here on a signal waits until the folder is whole
             baseline, stopped = job.run_baseline(folder.work) if _is_complete(result) else (None, False)
-            facts = {"accuracy": dict(checked.accuracy), "notes": list(checked.notes)}
+            facts = {"made": made, "accuracy": dict(checked.accuracy), "notes": list(checked.notes)}
             if plan.pace is not None:
                 from trilane.apps.pace import compare
 

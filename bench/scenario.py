@@ -85,8 +85,8 @@ def run_scenario(
     """
     queries = Queries(size=load.samples if load.scenario == "multi-stream" and evaluated_by == "trilane" else 1)
     loadgen = LoadGenPlayer(load, queries) if evaluated_by == "loadgen" else None
-    answered, ended = (queries.answered, queries.ended) if loadgen is None else (loadgen.answered, loadgen.ended)
-    requests = FrameRequestQueue(answered, ended)
+    listener = queries if loadgen is None else loadgen
+    requests = FrameRequestQueue(listener.answered, listener.ended, listener.unanswered)
     work = (lambda: play(load, requests, queries)) if loadgen is None else lambda: loadgen.play(requests)
     player = _Player(requests, work)
     player.start()

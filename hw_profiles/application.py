@@ -153,7 +153,8 @@ class Steady:
     """The application once it has settled.
 
     `capped`: whether it waits for the display. `unit_of`: unit of each stage. `stages_ms`: time of a job of each stage.
-    `busy`: share of the time in which each unit works; `idle`: shares of the rest by cause. They sum to 1 per unit.
+    `busy`: share of the time in which each unit works; `idle`: shares of the rest by cause. They sum to 1 per unit. Of
+    units that share a core, `preempted` is the share in which another one of them works on it.
     `accounts`: how they compare with those that the slices of the run give; empty when that was not asked.
     """
 
@@ -184,8 +185,7 @@ def _settled(
     `quick`: whether to run only QUICK_FRAMES where that is enough.
     `twice`: whether the report has `accounts`, its shares of time computed a second time.
     """
-    infer = [(name, unit) for name, unit, _ in times[len(BEFORE_INFER) : -len(AFTER_INFER)]]
-    graph = application_graph(variant.edge, infer)
+    graph = chain(((name, unit) for name, unit, _ in times), variant.edge, LATENCY_TO)
     service = {name: ns for name, _, ns in times}
     paced = POLICIES[variant.policy].paced
     regular = variant.edge in ("single", "double") and not paced
@@ -218,10 +218,11 @@ def steady(profile: Profile, plan: Plan, corners: Corners, *, quick: bool = Fals
     `twice`: whether to compute the shares of time a second time.
     """
     times = stage_times_ms(profile, plan, corners)
-    rounded = tuple((name, unit, round(ms * NS_PER_MS)) for (name, unit), ms in times.items())
+    worker = _workers(profile)
+    rounded = tuple((name, worker[unit], round(ms * NS_PER_MS)) for (name, unit), ms in times.items())
     batch, display = plan.variant.batch, profile.application.display_ms.or_else(0)
     report, capped = _settled(rounded, plan.variant, round(batch * display * NS_PER_MS), quick, twice)
-    units = report["units"]
+    shares = {unit: _shares(unit, worker, times, report["units"]) for unit in UNITS}
     frame = max(report["frame_time_ms"]["mean"], *times.values()) / batch
     return Steady(
         frame_ms=max(frame, display) if capped else frame,
@@ -229,10 +230,40 @@ def steady(profile: Profile, plan: Plan, corners: Corners, *, quick: bool = Fals
         capped=capped,
         unit_of=dict(times.keys()),
         stages_ms={name: ms for (name, _), ms in times.items()},
-        busy={unit: units[unit]["busy"] if unit in units else 0.0 for unit in UNITS},
-        idle={unit: units[unit]["idle"] if unit in units else {"starved": 1.0} for unit in UNITS},
+        busy={unit: busy for unit, (busy, _) in shares.items()},
+        idle={unit: idle for unit, (_, idle) in shares.items()},
         accounts=report.get("accounts", {}),
     )
+
+
+def _workers(profile: Profile) -> dict[UnitName, UnitName]:
+    """The unit under whose name the scheduler sees each: of units on one core, the first, since one works at a time."""
+    first: dict[str, UnitName] = {}
+    return {unit: first.setdefault(profile.units[unit].core or unit, unit) for unit in UNITS}
+
+
+def _shares(
+    unit: UnitName,
+    worker: Mapping[UnitName, UnitName],
+    times: Mapping[tuple[str, UnitName], float],
+    units: Mapping[str, Any],
+) -> tuple[float, dict[str, float]]:
+    """Busy share of `unit` and shares of its idle time by cause.
+
+    `worker`: of each unit, `_workers`.
+    `times`: of a job of each stage and unit.
+    `units`: what the simulated run says of each worker. Those behind one worker divide its busy time as their jobs do.
+    """
+    own, together = (
+        sum(ms for (_, other), ms in times.items() if other in group)
+        for group in ({unit}, {each for each in UNITS if worker[each] == worker[unit]})
+    )
+    if not own:
+        return 0.0, {"starved": 1.0}
+    share = units[worker[unit]]
+    busy = share["busy"] * own / together
+    preempted = {"preempted": share["busy"] - busy} if own < together else {}
+    return busy, {**share["idle"], **preempted}
 
 
 def reference_frame_ms(profile: Profile, plan: Plan, corners: Corners) -> float:

@@ -11,7 +11,7 @@ from typing import Any
 
 import psutil
 
-from trilane.hw_profiles.host import usable_cores
+from trilane.hw_profiles.host import split_cores, usable_cores
 
 CPU_INFO = Path("/proc/cpuinfo")
 #: CPU flag -> INT8 and FP32 multiply-accumulates per cycle and core. The first flag that the machine has is used.
@@ -45,12 +45,14 @@ def host_tables() -> dict[str, Any]:
     flag = next(name for name in RATES if name in flags or not name)
     clock = f"{known_ghz:.1f} GHz" + ("" if ghz > 0 else " (not told, assumed)")
     dsp_cores = max(1, cores - 2)
+    split = split_cores(usable_cores())
+    core = {unit: f"core {own[0]}" for unit, own in split.items()}
     return {
         "title": f"this machine: {cores} cores, {clock}, {flag or 'no vector products'}",
         "units": {
-            "cpu": _unit(1, known_ghz, flag, clock),
-            "gpu": _unit(1, known_ghz, flag, clock),
-            "dsp": {**_unit(dsp_cores, known_ghz, flag, clock), "runtimes": _runtimes(flag)},
+            "cpu": {**_unit(1, known_ghz, flag, clock), "core": core["cpu"]},
+            "gpu": {**_unit(1, known_ghz, flag, clock), "core": core["gpu"]},
+            "dsp": {**_unit(dsp_cores, known_ghz, flag, clock), "core": core["dsp"], "runtimes": _runtimes(flag)},
         },
     }
 

@@ -20,6 +20,7 @@ from trilane.hw_profiles.application import (
     steady,
 )
 from trilane.hw_profiles.configuration_table import Row
+from trilane.hw_profiles.load import HOST
 from trilane.hw_profiles.network_work import Network
 from trilane.hw_profiles.operator_times import JobTime
 from trilane.hw_profiles.over_time import Moment, over_time, unit_power_w
@@ -35,7 +36,8 @@ ALTERNATIVES: tuple[tuple[str, Variant, float], ...] = (
     ("one frame at a time", Variant("sequential", "single"), 0.0),
     ("pipelined, two buffers", Variant("pipelined", "double"), 0.0),
     ("pipelined, newest of three buffers", Variant("pipelined", "triple"), 0.0),
-    ("newest pose wins", Variant("latest", "triple"), 0.0),
+    ("newest pose wins", Variant("latest", "double"), 0.0),
+    ("newest pose wins, newest of three buffers", Variant("latest", "triple"), 0.0),
     ("pipelined, batches of 2", Variant("pipelined", "double", 2), 0.0),
     ("pipelined, 5 % of the network on the GPU", Variant("pipelined", "double"), 0.05),
 )
@@ -72,15 +74,44 @@ def predict(
         "frame_time_ms": _frame_times(profile, frame, [m.frame_ms for m in moments] or [frame]),
         "latency_ms": {"mean": now.latency_ms},
         "fps": 1e3 / frame,
+        **_ends(moments, now),
         **_settled(plan, now),
         "power_w": power,
+        "base_power_w": profile.thermal.base_power_w.or_else(0),
+        "base_power_kind": profile.thermal.base_power_w.kind,
         "energy_mj_per_frame": power * frame,
         "xrbench": {"energy": energy_score(power * frame)},
         "temperature_c": _temperatures(moments),
         "caps": _caps(moments),
         "timeline": [_shown(m) for m in _thinned(moments)],
         **_expected_error(profile, plan, job),
+        "notes": _notes(profile),
     }
+
+
+def _ends(moments: Sequence[Moment], now: Steady) -> dict[str, float]:
+    """Frames a second at the start, and those to which it settles: the mean of the last fifth of the time."""
+    if not moments:
+        return {"fps_start": 1e3 / now.frame_ms, "fps_settled": 1e3 / now.frame_ms}
+    last = moments[-max(1, len(moments) // 5) :]
+    return {"fps_start": 1e3 / moments[0].frame_ms, "fps_settled": 1e3 / _mean([m.frame_ms for m in last])}
+
+
+def _notes(profile: Profile) -> list[str]:
+    """What a reader of the figures has to know of the profile."""
+    notes = []
+    if profile.name == HOST:
+        notes.append(
+            "of this machine are cores, clock and instructions; its speeds are assumed: `trilane run` measures"
+        )
+    sharing = [unit for unit in UNITS if any(_on_one_core(profile, unit, other) for other in UNITS if other != unit)]
+    if sharing:
+        notes.append(f"{' and '.join(sharing)} share a core and work in turns")
+    return notes
+
+
+def _on_one_core(profile: Profile, one: UnitName, other: UnitName) -> bool:
+    return bool(profile.units[one].core) and profile.units[one].core == profile.units[other].core
 
 
 def _expected_error(profile: Profile, plan: Plan, job: JobTime) -> dict[str, float]:
@@ -194,9 +225,8 @@ def what_if(profile: Profile, network: Network, runtime: UnitName, performance_p
     for name, variant, share in ALTERNATIVES:
         if not share or runtime == "dsp":
             now = steady(profile, Plan(network, runtime, variant, share), corners)
-            rows.append(
-                {"name": name, "frame_ms": now.frame_ms, "fps": 1e3 / now.frame_ms, "latency_ms": now.latency_ms}
-            )
+            means = {"name": name, "policy": variant.policy, "edge": variant.edge}
+            rows.append({**means, "frame_ms": now.frame_ms, "fps": 1e3 / now.frame_ms, "latency_ms": now.latency_ms})
     return rows
 
 

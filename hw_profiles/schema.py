@@ -115,10 +115,12 @@ class Unit(Model):
     comes in several tensors. `corners`: clock at each voltage corner as a fraction of the highest. While a job runs
     the unit takes `power_max_w` times the clock fraction to the power of `power_exponent`, and `idle_w` otherwise.
     `model_error_fraction`: relative error of the roofline itself, apart from that of its numbers. `runtimes`: how many
-    times faster than ONNX Runtime in FP32 each runtime runs an INT8 network; only the host's DSP unit has them.
+    times faster than ONNX Runtime in FP32 each runtime runs an INT8 network; only the host's DSP unit has them. `core`:
+    units with the same one, unless it is empty, work in turns: on a host with too few cores.
     """
 
     title: str
+    core: str = ""
     precision: Literal["int8", "fp16", "fp32"]
     peak_int8_tmac_s: Rate
     peak_fp16_tmac_s: Rate

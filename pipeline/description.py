@@ -11,14 +11,26 @@ from pathlib import Path
 from typing import Annotated, Any, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, PlainSerializer, PlainValidator, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ModelWrapValidatorHandler,
+    PlainSerializer,
+    PlainValidator,
+    ValidationError,
+    model_validator,
+)
 
 from trilane.errors import BadInputError
 from trilane.scheduler.events import Graph, StageSpec
 from trilane.transport.packets import FRAME_FIELDS, header_dtype
 from trilane.transport.slots import edge_rule
-from trilane.unexpected_value import UnexpectedValue
+from trilane.unexpected_value import UnexpectedValue, unexpected_in
 
+LONGEST_FOUND = 120  # of a value, in a message
+LONGEST_NAME = 40  # of a stage or unit: a socket of that name has to fit into a path of 107 bytes
+MOST_EDGES = 200  # of one unit: their memory, and what else a unit gets, has to fit into one message of 250 descriptors
 FACTORY = r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$"
 
 
@@ -52,7 +64,32 @@ HeaderDtype = Annotated[
 ]
 
 
-class UnitSettings(Model):
+class Described(Model):
+    """Base of what a person writes to describe a pipeline: what is wrong is a BadInputError that names the field."""
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _named(cls, values: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        try:
+            return handler(values)
+        except ValidationError as error:
+            raise _bad_input(cls.__name__, error) from None
+
+
+def _bad_input(what: str, error: ValidationError) -> BadInputError:
+    """The first defect that `error` lists of a `what`."""
+    first = error.errors()[0]
+    place = ".".join([what, *(str(part) for part in first["loc"])])
+    unexpected = unexpected_in(first)
+    if unexpected is not None:
+        return BadInputError.at(place, unexpected)
+    if first["type"] in ("missing", "extra_forbidden"):
+        found, expected = ("nothing", "a value") if first["type"] == "missing" else ("an unknown field", "none")
+        return BadInputError(place, found, expected)
+    return BadInputError(place, repr(first["input"])[:LONGEST_FOUND], first["msg"].removeprefix("Input should be "))
+
+
+class UnitSettings(Described):
     """What a unit may use of the host. `cores`: of this machine; `spin`: may threads spin between jobs."""
 
     cores: tuple[int, ...] = Field(min_length=1)
@@ -60,20 +97,20 @@ class UnitSettings(Model):
     spin: bool = False
 
 
-class PipelineStage(Model):
+class PipelineStage(Described):
     """One stage. `factory`: `module:name` of a `trilane.pipeline.stage.StageFactory`, importable in the unit's process.
 
     `settings`: handed to the factory, as JSON takes them. `pace_ns`: how long a job is held, at least.
     """
 
-    name: str = Field(pattern=r"^[\w-]+$")
-    unit: str = Field(pattern=r"^[\w-]+$")
+    name: str = Field(pattern=r"^[\w-]+$", max_length=LONGEST_NAME)
+    unit: str = Field(pattern=r"^[\w-]+$", max_length=LONGEST_NAME)
     factory: str = Field(pattern=FACTORY)
     settings: dict[str, Any] = {}
     pace_ns: int = Field(default=0, ge=0)
 
 
-class PipelineEdge(Model):
+class PipelineEdge(Described):
     """The slots between a stage and the next. `rule`: single, double, triple, fifo:N or orphan[:N].
 
     `header`: of every packet, made by `trilane.transport.packets.header_dtype`. `payload_bytes`: of every packet.
@@ -84,13 +121,14 @@ class PipelineEdge(Model):
     rule: str = "double"
 
 
-class Pipeline(Model):
+class Pipeline(Described):
     """A chain of `stages`, joined by `edges` (one fewer).
 
     `units`: cores and threads of each unit that a stage names; the scheduler runs on the cores of the first stage's.
     `latency_to`: the stage with whose end a frame's latency ends; the last one when it is not given.
     `module_folders`: where a unit's process looks for the modules of factories before anywhere else.
     `preload`: modules that are imported once, before the units' processes are forked; none from `module_folders`.
+    Raises BadInputError naming the field that is wrong, as its parts do.
     """
 
     stages: tuple[PipelineStage, ...] = Field(min_length=1)
@@ -102,13 +140,24 @@ class Pipeline(Model):
 
     @model_validator(mode="after")
     def _joined(self) -> Self:
+        try:
+            self._check()
+        except UnexpectedValue as error:
+            raise BadInputError.at(type(self).__name__, error) from None
+        return self
+
+    def _check(self) -> None:
+        """Raises UnexpectedValue for parts that do not fit each other."""
         missing = {stage.unit for stage in self.stages} - set(self.units)
         if missing:
             raise UnexpectedValue(f"no settings of unit {', '.join(sorted(missing))}", "them in `units`")
         self.graph()
+        for unit in self.units:
+            count = sum(unit in (before.unit, after.unit) for before, after in self.joints.values())
+            if count > MOST_EDGES:
+                raise UnexpectedValue(f"unit {unit} at {count} edges", f"at most {MOST_EDGES}", "use more units")
         for edge in self.edges:
             edge_rule(edge.rule)
-        return self
 
     def graph(self) -> Graph:
         """What the scheduler knows of it."""

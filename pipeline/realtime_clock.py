@@ -93,6 +93,7 @@ class RealtimeClock:
         """What happened until `deadline_ns` at the latest, and what time it is then."""
         self._book()
         self._show_progress()
+        self._tell_unanswered()
         events = self._listen(deadline_ns) if self._begun else self._begin()
         now_ns = time.monotonic_ns()
         if now_ns - self._step_ns > LONGEST_STEP_NS:
@@ -224,6 +225,12 @@ class RealtimeClock:
             self.cpu.add(job.unit, job.stage, done, self._core.ledger.start_ns)
             self.metrics[job.stage].update(done.metrics)
         self._unbooked.clear()
+
+    def _tell_unanswered(self) -> None:
+        """Whoever asked for frames learns at once of those that will not come."""
+        ledger = self._core.ledger
+        if self._requests is not None and (ledger.dropped or ledger.lost):
+            self._requests.tell_unanswered({**ledger.dropped_by_cause, **ledger.lost_by_cause})
 
     def _show_progress(self, *, final: bool = False) -> None:
         now_s = time.monotonic()

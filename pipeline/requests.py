@@ -8,7 +8,7 @@ import contextlib
 import os
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from trilane.scheduler.events import Event, FrameRequest, Stop
 
@@ -17,12 +17,20 @@ class FrameRequestQueue:
     """The way into one run. Frames are numbered from 0 as they are asked for.
 
     `answered(frame)`: it was presented. `ended()`: the run is over, and nothing more is answered.
+    `unanswered(causes)`: frames were dropped or lost, how many by each cause's key in the report; called once, with the
+    first of them.
     """
 
-    def __init__(self, answered: Callable[[int], None], ended: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        answered: Callable[[int], None],
+        ended: Callable[[], None],
+        unanswered: Callable[[Mapping[str, int]], None] = lambda _causes: None,
+    ) -> None:
         self.fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self.is_open = threading.Event()
-        self.answered, self._ended = answered, ended
+        self.answered, self._ended, self._unanswered = answered, ended, unanswered
+        self._told = False
         self._events: deque[Event] = deque()
         self._lock = threading.Lock()
         self._closed = False
@@ -42,6 +50,12 @@ class FrameRequestQueue:
             while True:
                 events.append(self._events.popleft())
         return events
+
+    def tell_unanswered(self, causes: Mapping[str, int]) -> None:
+        """By the run: so many frames were dropped or lost so far, by cause."""
+        if causes and not self._told:
+            self._told = True
+            self._unanswered(causes)
 
     def close(self) -> None:
         """The run is over: `ended` is called, whoever waits for `is_open` goes on."""

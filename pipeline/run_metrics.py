@@ -40,7 +40,11 @@ class FrameCounts(Record):
 
 
 class TimeSummary(Record):
-    """Statistics of times in ms: `mean`, exact percentiles `p50` to `p99`, and `max`; all 0 when there were none."""
+    """Statistics of times in ms: `mean`, exact percentiles `p50` to `p99`, and `max`; all 0 when there were none.
+
+    `samples`: how many times they are of; null in reports of before it was counted. p90 needs 29 of them, p95 59, p99
+    299 (`trilane.scheduler.stats.samples_needed`).
+    """
 
     mean: float
     p50: float
@@ -48,6 +52,7 @@ class TimeSummary(Record):
     p95: float
     p99: float
     max: float
+    samples: int | None = None
 
 
 class FrameTimes(TimeSummary):
@@ -55,11 +60,15 @@ class FrameTimes(TimeSummary):
 
     `ema20_min`, `ema20_max`: smallest and largest exponential average over 20 frames.
     `jitter`: mean absolute difference of successive frame times.
+    `mean_low`, `mean_high`: 95 % interval of the mean by the scatter of this run's frames (batch means), null when they
+    are too few to tell.
     """
 
     ema20_min: float
     ema20_max: float
     jitter: float
+    mean_low: float | None = None
+    mean_high: float | None = None
 
 
 class XrBench(Record):
@@ -218,6 +227,7 @@ class RunMetrics(Record):
     `frame_time_ms`: between presented frames.
     `latency_ms`: from the sampled pose to the end of the stage that the pipeline names (the composited frame).
     `fps`: presented frames a second; 0 for fewer than two.
+    `fps_low`, `fps_high`: its 95 % interval, from that of the mean frame time; null when there are too few frames.
     `deadline_misses`: frames presented after their deadline, or frame times above the target.
     `xrbench`: XRBench's scores.
     `stages`: times of each, in the order of the pipeline.
@@ -237,6 +247,8 @@ class RunMetrics(Record):
     frame_time_ms: FrameTimes
     latency_ms: TimeSummary
     fps: float
+    fps_low: float | None = None
+    fps_high: float | None = None
     deadline_misses: int
     xrbench: XrBench
     stages: dict[str, StageTimes]

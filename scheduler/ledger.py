@@ -15,6 +15,7 @@ from typing import Any, Final, NamedTuple
 from trilane.scheduler.causes import Drop, Loss
 from trilane.scheduler.events import NEVER, Graph, Job
 from trilane.scheduler.stats import NS_PER_MS, ema_range_ms, jitter_ms, real_time_score, summary_ms
+from trilane.scheduler.uncertainty import fps_interval, frame_interval_ms
 
 ASSIGNED: Final = 0
 STARVED: Final = 1
@@ -185,9 +186,15 @@ class Ledger:
                 "dropped": self.dropped_by_cause,
             },
             "duration_s": (self.end_ns - self.start_ns) / 1e9,
-            "frame_time_ms": {**summary_ms(intervals), **ema_range_ms(intervals), "jitter": jitter_ms(intervals)},
+            "frame_time_ms": {
+                **summary_ms(intervals),
+                **ema_range_ms(intervals),
+                "jitter": jitter_ms(intervals),
+                **frame_interval_ms(intervals),
+            },
             "latency_ms": summary_ms(self.latency_ns),
             "fps": len(intervals) * 1e9 / span if span else 0.0,
+            **fps_interval(intervals),
             "deadline_misses": sum(late > 0 for late in late_ns),
             "xrbench": {
                 "real_time": real_time_score(late_ns),

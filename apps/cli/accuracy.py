@@ -11,10 +11,11 @@ from typing import Annotated, Any
 
 import typer
 
+from trilane.apps.cli.commands import Commands
 from trilane.apps.cli.console import print_json, stderr_console, stdout_console, stdout_kept
 from trilane.apps.cli.options import JsonOption, SceneArgument, SceneAvatarOption, SceneSizeOption
 
-app = typer.Typer(rich_markup_mode=None, add_completion=False)
+app = Commands()
 
 EPILOG = """\b
 Examples:

@@ -5,15 +5,12 @@ Rule: this file lists the commands of the group; `avatar_network.py` and `avatar
 
 from __future__ import annotations
 
-import typer
-
 from trilane.apps.cli import avatar_network, avatar_quantise
+from trilane.apps.cli.commands import Commands
 from trilane.apps.cli.console import print_facts
 from trilane.apps.cli.options import AvatarArgument, JsonOption
 
-app = typer.Typer(
-    rich_markup_mode=None,
-    add_completion=False,
+app = Commands(
     no_args_is_help=True,
     help="Look into avatars, export and quantise their networks.",
 )

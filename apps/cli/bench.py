@@ -16,6 +16,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from trilane.apps.cli.bench_options import meaning
+from trilane.apps.cli.commands import Commands
 from trilane.apps.cli.console import print_json, stderr_console, stdout_console, stdout_kept
 from trilane.apps.cli.options import JsonOption
 
@@ -69,10 +70,8 @@ class BenchGroup(TyperGroup):
         return name, bench_command(name), rest
 
 
-app = typer.Typer(
+app = Commands(
     cls=BenchGroup,
-    rich_markup_mode=None,
-    add_completion=False,
     no_args_is_help=True,
     epilog=EPILOG,
     help="Measure this machine; results carry its facts.",
@@ -102,7 +101,7 @@ def bench_command(name: str) -> Any:
             for option, (kind, default) in options.items()
         ]
     )
-    single = typer.Typer(rich_markup_mode=None, add_completion=False)
+    single = Commands()
     single.command(name, help=_help(name, module))(described)
     return typer.main.get_command(single)
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from trilane.apps.cli.commands import Commands
 from trilane.apps.cli.console import print_json, stderr_console, stdout_console
 from trilane.apps.cli.options import BodyFileArgument, BodyFileOption, JsonOption
 from trilane.errors import BadInputError
@@ -24,9 +25,7 @@ if TYPE_CHECKING:
 
     from trilane.body.body import ShapedBody
 
-app = typer.Typer(
-    rich_markup_mode=None,
-    add_completion=False,
+app = Commands(
     no_args_is_help=True,
     help="Look into body files, pose them, build one.",
 )

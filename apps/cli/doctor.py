@@ -15,12 +15,13 @@ from typing import Any
 
 import typer
 
+from trilane.apps.cli.commands import Commands
 from trilane.apps.cli.console import print_json, stdout_console
 from trilane.apps.cli.options import JsonOption
 from trilane.errors import reason
 from trilane.install import EGL_LINE, clone, install_line, package_line
 
-app = typer.Typer(rich_markup_mode=None, add_completion=False)
+app = Commands()
 
 MISSING = 3
 SHM = Path("/dev/shm")  # noqa: S108 - looked at, never written

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from trilane.apps.cli.commands import Commands
 from trilane.apps.cli.console import stderr_console
 from trilane.apps.cli.options import (
     ChannelsOption,
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from trilane.hw_profiles.network_work import Network
     from trilane.hw_profiles.schema import Profile
 
-app = typer.Typer(rich_markup_mode=None, add_completion=False)
+app = Commands()
 
 EPILOG = """\b
 Examples:
@@ -41,6 +42,7 @@ Examples:
   trilane predict --table rows.csv --json
 """
 PLOT_MINUTES = 30.0
+HOST = "host"
 OF_A_FILE = {"encoder", "norm", "size", "channels"}
 #: Option: those that have no effect beside it.
 IGNORED = {
@@ -101,11 +103,16 @@ def predict(
     table: TableOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Predict frame time, idleness, heat and energy on a chip, with the error to expect."""
+    """Predict frame time, idleness, heat and energy on a chip, with the error to expect.
+
+    For the profile `host`, this machine, the performance profile is burst if none is given, as a run has no cap then.
+    """
     from trilane.hw_profiles.application import Plan
     from trilane.hw_profiles.load import load_runnable
 
     _refuse_ignored(ctx)
+    if profile == HOST and "performance_profile" not in _typed(ctx):
+        performance_profile = PerformanceProfile.BURST  # as `trilane run` without a cap
     _check_governor(governor)
     chip, variant = load_runnable(profile), _variant(policy, edge, batch)
     if table is not None:
@@ -122,12 +129,17 @@ def predict(
 
 def _refuse_ignored(ctx: typer.Context) -> None:
     """Raises BadInputError for options that another one leaves without effect."""
-    sources = {name: ctx.get_parameter_source(name) for name in ctx.params}
-    typed = {name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"}
+    typed = _typed(ctx)
     for option, others in IGNORED.items():
         if option in typed and (useless := typed & others):
             names = ", ".join(sorted(f"--{name.replace('_', '-')}" for name in useless))
             raise BadInputError("options", f"{names} beside --{option}", "one or the other", WHY_IGNORED[option])
+
+
+def _typed(ctx: typer.Context) -> set[str]:
+    """The parameters that the command line gives."""
+    sources = {name: ctx.get_parameter_source(name) for name in ctx.params}
+    return {name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"}
 
 
 def _check_governor(governor: str | None) -> None:

@@ -78,9 +78,10 @@ def show_answer(answer: dict[str, Any], as_json: bool) -> None:
         heat, caps = answer["temperature_c"], answer["caps"]
         console.print(
             f"temperature     device {heat['device_max']:.1f} °C, junction {heat['junction_max']:.1f} °C; "
-            f"throttled {100 * caps['throttled_share']:.0f} % of the time"
+            f"lowered for heat {100 * caps['throttled_share']:.0f} % of the time"
         )
-    console.print(f"expected error  ±{100 * answer['expected_error']:.0f} % (confidence {answer['confidence']:.2f})")
+    error = f"±{100 * answer['expected_error']:.0f} % of the network's time"
+    console.print(f"expected error  {error} (confidence {answer['confidence']:.2f})")
     console.print(_unit_table(answer))
     if not answer["accounts"]["agree"]:
         found = answer["accounts"]["largest_difference"]
@@ -92,7 +93,7 @@ def show_answer(answer: dict[str, Any], as_json: bool) -> None:
 def _print_network(console: Console, answer: dict[str, Any]) -> None:
     config, network = answer["config"], answer["network"]
     name = ", ".join(str(config[key]) for key in ("avatar", "network", "encoder", "norm") if key in config)
-    console.print(f"{answer['machine']['title']} (virtual clock)")
+    console.print(f"{answer['machine']['title']} (virtual clock), {config['performance_profile']}")
     console.print(
         f"{name}, {config['size']}x{config['channels']} {config['layout']} "
         f"on the {config['runtime']}: {network['gmac']:.1f} GMAC, {network['parameters_m']:.1f} M parameters"
@@ -103,13 +104,21 @@ def _print_network(console: Console, answer: dict[str, Any]) -> None:
 def _print_times(console: Console, answer: dict[str, Any]) -> None:
     frame = answer["frame_time_ms"]
     capped = ", held by the display" if answer["display_capped"] else ""
-    console.print(
-        f"application     {frame['mean']:.1f} ms, {answer['fps']:.1f} fps{capped}; averages over 20 frames stray from "
-        f"{frame['ema20_min']:.1f} to {frame['ema20_max']:.1f} ms"
-    )
+    stray = f"averages over 20 frames stray from {frame['ema20_min']:.1f} to {frame['ema20_max']:.1f} ms"
+    means = f"{frame['mean']:.1f} ms, {answer['fps']:.1f} fps{capped}; {stray}"
+    if minutes := answer["config"]["minutes"]:
+        console.print(
+            f"application     settles at {answer['fps_settled']:.1f} fps, begins with {answer['fps_start']:.1f} fps"
+        )
+        console.print(f"over {f'{minutes:g} minutes':<11}{means}")
+    else:
+        console.print(f"application     {means}")
     console.print(f"latency         {answer['latency_ms']['mean']:.1f} ms")
     console.print(f"efficiency      {answer['efficiency']:.2f}")
-    console.print(f"power           {answer['power_w']:.1f} W, {answer['energy_mj_per_frame']:.0f} mJ a frame")
+    base = f"{answer['base_power_w']:.1f} W of it {answer['base_power_kind']} for all but the units"
+    console.print(f"power           {answer['power_w']:.1f} W ({base}), {answer['energy_mj_per_frame']:.0f} mJ a frame")
+    for note in answer["notes"]:
+        console.print(f"note            {note}")
 
 
 def _unit_table(answer: dict[str, Any]) -> Table:
@@ -125,7 +134,8 @@ def _unit_table(answer: dict[str, Any]) -> Table:
 def _alternatives_table(answer: dict[str, Any]) -> Table:
     from rich.table import Table
 
-    table = Table("what if", "frame, ms", "fps", "latency, ms")
+    table = Table("what if", "policy", "edge", "frame, ms", "fps", "latency, ms")
     for row in answer["alternatives"]:
-        table.add_row(row["name"], f"{row['frame_ms']:.1f}", f"{row['fps']:.1f}", f"{row['latency_ms']:.1f}")
+        names = (row["name"], row["policy"], row["edge"])
+        table.add_row(*names, f"{row['frame_ms']:.1f}", f"{row['fps']:.1f}", f"{row['latency_ms']:.1f}")
     return table

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from trilane.apps.cli.commands import Commands
 from trilane.apps.cli.console import print_json, stderr_console, stdout_console
 from trilane.apps.cli.options import JsonOption
 from trilane.errors import BadInputError
@@ -19,7 +20,7 @@ from trilane.writing import WRITABLE, write_bytes
 if TYPE_CHECKING:
     from trilane.hw_profiles.fit import Fit
 
-app = typer.Typer(rich_markup_mode=None, add_completion=False, no_args_is_help=True, help="Hardware profiles.")
+app = Commands(no_args_is_help=True, help="Hardware profiles.")
 
 NOT_KNOWN = (
     "A roofline knows how much work there is and how fast the chip can do it. It does not know which kernel the "

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from trilane.apps.cli.commands import Commands
 from trilane.apps.cli.console import print_json, stderr_console, stdout_console
 from trilane.apps.cli.options import (
     PROFILE_HELP,
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
     from trilane.stages.config import RunConfig
     from trilane.stages.configure import Checked, GlFacts
 
-app = typer.Typer(rich_markup_mode=None, add_completion=False)
+app = Commands()
 
 EPILOG = """\b
 Examples:
@@ -66,7 +67,11 @@ CameraOption = Annotated[str | None, typer.Option(help="ARKit log, TUM, transfor
 BackgroundOption = Annotated[str | None, typer.Option(help="room, or a video, image folder or picture.")]
 FramesOption = Annotated[int | None, typer.Option(help="How many frames to present.")]
 HudOption = Annotated[bool | None, typer.Option(help="Write frame, rate and age on the picture.")]
-PolicyOption = Annotated[PolicyName, typer.Option(help="How frames are scheduled.")]
+POLICIES_HELP = (
+    "pipelined: highest rate; sequential: one frame at a time; latest: newest pose wins; "
+    "deadline: frames that would be late are dropped."
+)
+PolicyOption = Annotated[PolicyName, typer.Option(help=POLICIES_HELP)]
 RuntimeOption = Annotated[str, typer.Option(help=f"What runs the network: {RUNTIME_HELP}")]
 SkinningOption = Annotated[
     str, typer.Option(help="Which unit poses the vertices: cpu, gpu; auto: cpu when OpenGL is software.")
@@ -137,6 +142,7 @@ def run(
     """Run a scene on the three units and write a run folder.
 
     The folder holds report.json, video.mp4, contact.png, trace.pftrace (open it at ui.perfetto.dev) and events.jsonl.
+    docs/report.md explains every key, the policies and the edges.
     """
     with _early_processes() as (starter, gl):
         from trilane.apps.run_job import Plan
@@ -191,6 +197,7 @@ def _refuse_beside_pace(pace: Pace | None, cuts: tuple[str, ...], cap: str | Non
 
 def _run(checked: Checked, out: Path | None, plan: Plan, starter: UnitStarter, gl: GlFacts) -> Outcome:
     """Run `checked` as `plan` says, to the folder `out` or the default one."""
+    from trilane.apps.made import made_facts
     from trilane.apps.run_folder import default_place
     from trilane.apps.run_job import run_to_folder
     from trilane.stages.configure import required_machine
@@ -202,7 +209,9 @@ def _run(checked: Checked, out: Path | None, plan: Plan, starter: UnitStarter, g
         for note in checked.notes:
             hooks.message(note)
         try:
-            return run_to_folder(checked, target, plan, hooks, machine=required_machine(gl), starter=starter)
+            made = made_facts(["trilane", *sys.argv[1:]])
+            machine = required_machine(gl)
+            return run_to_folder(checked, target, plan, hooks, machine=machine, made=made, starter=starter)
         except KeyboardInterrupt:
             hooks.message("interrupted: nothing was written")
             raise

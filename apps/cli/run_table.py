@@ -1,6 +1,7 @@
 """The table that `trilane run` ends with.
 
-Rule: every figure is one of report.json's; a figure that was not measured is a dash.
+Rule: every figure is one of report.json's; a figure that was not measured is a dash, and one that rests on too few
+frames says so.
 """
 
 from __future__ import annotations
@@ -8,15 +9,20 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from trilane.scheduler.stats import samples_needed
+
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from trilane.apps.report import Baseline, PaceComparison, Report
-    from trilane.pipeline.run_metrics import Caps, StageTimes, Temperature, UnitShares
+    from trilane.apps.report import Baseline, Made, PaceComparison, Report
+    from trilane.pipeline.run_metrics import Caps, StageTimes, Temperature, TimeSummary, UnitShares
 
 DASH = "–"
 IDLE = ("starved", "blocked", "throttled", "preempted", "overhead")
 STATISTICS = ("mean", "p50", "p90", "p95", "p99", "max")
+TOO_SHORT = "too short to tell"
+TOO_FEW = " *"
+NEEDED = {name: samples_needed(int(name[1:]) / 100) for name in ("p90", "p95", "p99")}
 
 #: Name of a row, what it measures, and a cell for each run.
 Rows = Iterator[tuple[str, str, list[str]]]
@@ -51,12 +57,22 @@ def _caption(report: Report) -> str:
         f"{cpu.model} ({' '.join(cpu.flags)}); cores: {cores}; idle cores {report.idle_cores}",
         f"network on {report.config['runtime']}; OpenGL on {gl.renderer if gl else DASH}",
     ]
+    if report.made:
+        lines.insert(0, _made(report.made))
+    lines.append("in brackets: 95 % interval, by the scatter of this run's frames; two runs may differ by more")
+    if any(_too_few(getattr(report, times), name) for times in ("frame_time_ms", "latency_ms") for name in NEEDED):
+        lines.append(f"{TOO_FEW.strip()} of too few frames: {', '.join(f'{k} needs {n}' for k, n in NEEDED.items())}")
     if report.pace:
         lines.append(_pace(report.pace))
     if report.caps.performance_profile:
         lines.append(_caps(report.caps, report.temperature_c))
     lines += [_accuracy(name, validation) for name, validation in report.accuracy.items()]
     return "\n".join(lines)
+
+
+def _made(made: Made) -> str:
+    revision = f" at {made.revision[:10]}{', modified' if made.modified else ''}" if made.revision else ""
+    return f"{made.at}: trilane {made.trilane or DASH}{revision}"
 
 
 def _pace(pace: PaceComparison) -> str:
@@ -71,8 +87,8 @@ def _pace(pace: PaceComparison) -> str:
 def _caps(caps: Caps, temperature: Temperature) -> str:
     duties = ", ".join(f"{unit} {cap.duty_mean:.0%}" for unit, cap in caps.units.items())
     return (
-        f"capped as {caps.performance_profile}: duty cycles {duties}; throttled "
-        f"{caps.throttled_share:.0%} of the time; {temperature.kind}: at most "
+        f"capped as {caps.performance_profile}: may work {duties} of the time, the rest is throttled; lowered further "
+        f"for heat {caps.throttled_share:.0%} of the time; {temperature.kind}: at most "
         f"{_number(temperature.junction_max)} C"
     )
 
@@ -121,8 +137,25 @@ def _percent(share: float | None) -> str:
 def _time_rows(runs: Sequence[Report | Baseline]) -> Rows:
     for key, name in (("frame_time_ms", "frame time"), ("latency_ms", "latency")):
         for statistic in STATISTICS:
-            cells = [_number(_of_several(run, getattr(getattr(run, key), statistic))) for run in runs]
+            cells = [_time(run, getattr(run, key), statistic) for run in runs]
             yield name if statistic == "mean" else "", f"{statistic}, ms", cells
+
+
+def _time(run: Report | Baseline, times: TimeSummary, statistic: str) -> str:
+    value = _number(_of_several(run, getattr(times, statistic)))
+    if statistic == "mean" and times is run.frame_time_ms:
+        return f"{value} ({_between(run.frame_time_ms.mean_low, run.frame_time_ms.mean_high)})"
+    return value + (TOO_FEW if _too_few(times, statistic) else "")
+
+
+def _too_few(times: TimeSummary, statistic: str) -> bool:
+    """Whether a percentile rests on too few samples; a report of before they were counted does not say."""
+    return times.samples is not None and times.samples < NEEDED.get(statistic, 0)
+
+
+def _between(low: float | None, high: float | None) -> str:
+    """A 95 % interval."""
+    return TOO_SHORT if low is None or high is None else f"{_number(low)} to {_number(high)}"
 
 
 def _of_several(run: Report | Baseline, value: float) -> float | None:
@@ -131,9 +164,11 @@ def _of_several(run: Report | Baseline, value: float) -> float | None:
 
 
 def _rate_rows(runs: Sequence[Report | Baseline]) -> Rows:
-    yield "rate", "frames per second", [_number(_of_several(run, run.fps)) for run in runs]
+    rates = [f"{_number(_of_several(run, run.fps))} ({_between(run.fps_low, run.fps_high)})" for run in runs]
+    yield "rate", "frames per second", rates
     yield "efficiency", "slowest unit isolated / frame time", [_number(run.efficiency, 2) for run in runs]
     yield "frames", "lost + dropped", [f"{run.frames.lost} + {sum(run.frames.dropped.values())}" for run in runs]
+    yield "", "deadline misses", [str(run.deadline_misses) for run in runs]
 
 
 def _number(value: float | None, digits: int = 1) -> str:

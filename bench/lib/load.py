@@ -12,7 +12,7 @@ import math
 import random
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from trilane.errors import TrilaneError
@@ -23,6 +23,7 @@ WARM_UP = 8
 #: Scenario: the percentile of its queries' latency that decides. Offline is decided by its rate.
 PERCENTILES = {"single-stream": 0.90, "multi-stream": 0.99, "server": 0.99, "offline": 0.90}
 STALLED_S = 60.0
+KEEPS_ALL = "single, double and fifo edges drop none, under the policies sequential and pipelined"
 
 
 @dataclass(frozen=True)
@@ -55,14 +56,16 @@ class Queries:
 
     `size`: frames of a query, which is answered with the last of them.
     `asked_s`, `answered_s`: monotonic seconds of the queries that count.
-    `over`: the run has ended.
-    `changed`: notified with every answer and at the end of the run.
+    `over`: nothing more counts: the run has ended, or a frame was dropped or lost.
+    `why`: in the second case, a sentence.
+    `changed`: notified with every answer and when it is over.
     """
 
     size: int = 1
     asked_s: list[float] = field(default_factory=list)
     answered_s: list[float] = field(default_factory=list)
     over: bool = False
+    why: str = ""
     changed: threading.Condition = field(default_factory=threading.Condition)
     _frames: int = 0
 
@@ -79,6 +82,12 @@ class Queries:
                 self.answered_s.append(time.monotonic())
                 self.changed.notify_all()
 
+    def unanswered(self, causes: Mapping[str, int]) -> None:
+        """Called by the `FrameRequestQueue` when a frame was dropped or lost: its query has no answer."""
+        frames = ", ".join(f"{cause} {count}" for cause, count in causes.items())
+        self.why = f"frames of queries were dropped or lost ({frames}), and every query must be answered: {KEEPS_ALL}"
+        self.ended()
+
     def ended(self) -> None:
         """Called by the `FrameRequestQueue` when the run is over."""
         with self.changed:
@@ -88,14 +97,15 @@ class Queries:
     def wait(self) -> None:
         """Wait until every query is answered.
 
-        Raises TrilaneError when the run ends first, or when nothing is answered for `STALLED_S`.
+        Raises TrilaneError when a frame was dropped or lost, when the run ends first, or when nothing is answered for
+        `STALLED_S`.
         """
         with self.changed:
             while len(self.answered_s) < len(self.asked_s) and not self.over:
                 if not self.changed.wait(STALLED_S):
                     raise TrilaneError(f"no query was answered for {STALLED_S:.0f} s")
-            if len(self.answered_s) < len(self.asked_s):
-                raise TrilaneError("the run ended before every query was answered")
+            if self.why or len(self.answered_s) < len(self.asked_s):
+                raise TrilaneError(self.why or "the run ended before every query was answered")
 
     def warm_up(self, requests: FrameRequestQueue) -> None:
         """Ask a few queries that are not counted."""

@@ -9,6 +9,7 @@ import importlib
 import math
 import re
 import tempfile
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -53,12 +54,19 @@ class LoadGenPlayer:
     verdict: LoadGenVerdict = field(default_factory=LoadGenVerdict)
     _ids: list[int] = field(default_factory=list)
     _begun: bool = False
+    _completed: int = 0
 
     def answered(self, frame: int) -> None:
         """Called by the `FrameRequestQueue`: after the warm-up each frame is a sample of LoadGen's."""
         self.queries.answered(frame)
-        if self._begun:
+        if self._begun and not self.queries.over:
+            self._completed = frame - WARM_UP + 1
             self._complete(frame - WARM_UP)
+
+    def unanswered(self, causes: Mapping[str, int]) -> None:
+        """Called by the `FrameRequestQueue` when a frame was dropped or lost: the rest of LoadGen's run is void."""
+        self.queries.unanswered(causes)
+        self.ended()
 
     def ended(self) -> None:
         """Called by the `FrameRequestQueue` when the run is over.
@@ -67,7 +75,10 @@ class LoadGenPlayer:
         """
         self.queries.ended()
         if self._begun:
-            for number in range(len(self.queries.answered_s), len(self._ids)):
+            with self.queries.changed:  # no sample is completed twice, whichever thread comes first
+                numbers = range(self._completed, len(self._ids))
+                self._completed = len(self._ids)
+            for number in numbers:
                 self._complete(number)
 
     def play(self, requests: FrameRequestQueue) -> None:
@@ -92,7 +103,7 @@ class LoadGenPlayer:
             lg.DestroyQSL(library)
             lg.DestroySUT(system)
         if self.queries.over:
-            raise TrilaneError("the run ended before LoadGen had its answers")
+            raise TrilaneError(self.queries.why or "the run ended before LoadGen had its answers")
         line = VERDICT.search(self.verdict.summary)
         self.verdict.valid = line is not None and line[1] == "VALID"
 

@@ -62,6 +62,39 @@ def test_predict_answers_for_an_avatar(
     assert by_file["network"] == document["network"]
 
 
+def test_predict_says_what_it_is_of(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """The settled rate first, the assumed part of the power, and no word that means two things."""
+    assert call(monkeypatch, "predict", "--performance-profile", "burst", "--minutes", "30") == 0
+    text = capsys.readouterr().out
+    lines = {line[:16].strip(): line[16:] for line in text.splitlines()}
+    assert lines["application"].startswith("settles at ")
+    assert lines["over 30 minutes"] > ""
+    assert "1.2 W of it assumed for all but the units" in lines["power"]
+    assert "lowered for heat" in lines["temperature"]
+    assert text.count("throttled") == 1  # the column
+
+
+def test_a_prediction_for_this_machine_is_of_a_run_without_a_cap(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    free, capped = (
+        answer(monkeypatch, capsys, "predict", "--profile", "host", *more)
+        for more in ((), ("--performance-profile", "sustained_high_performance"))
+    )
+    assert free["config"]["performance_profile"] == "burst"
+    assert capped["config"]["performance_profile"] == "sustained_high_performance"
+    assert free["fps"] > capped["fps"]
+    assert "its speeds are assumed" in free["notes"][0]
+
+
+def test_latest_is_the_same_in_predict_and_in_what_if(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    document = answer(monkeypatch, capsys, "predict", "--policy", "latest", "--what-if")
+    row = next(row for row in document["alternatives"] if row["name"] == "newest pose wins")
+    assert row["latency_ms"] == document["latency_ms"]["mean"]
+
+
 def test_predict_draws_heat(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     path = tmp_path / "heat.svg"

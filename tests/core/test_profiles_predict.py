@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from itertools import pairwise
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from trilane.hw_profiles.over_time import over_time
 from trilane.hw_profiles.performance_profiles import corners_of
 from trilane.hw_profiles.predict import predict, predict_table, what_if
 from trilane.hw_profiles.reference_networks import NetworkSpec, reference_network
+from trilane.hw_profiles.schema import Profile
 from trilane.hw_profiles.thermal_state import ThermalState
 from trilane.hw_profiles.throttling import GOVERNORS
 from trilane.units import UNITS, UnitName
@@ -205,3 +207,66 @@ def test_unknown_names_are_refused() -> None:
         predict(profile, plan, minutes=-1)
     with pytest.raises(BadInputError, match="edge"):
         predict(profile, Plan(NETWORK, "dsp", Variant(edge="quadruple")))
+
+
+def test_every_alternative_is_what_predict_says_of_the_same_policy_and_edge() -> None:
+    profile = load_profile("snapdragon-888")
+    for row in what_if(profile, NETWORK, "dsp", SUSTAINED)[:-2]:  # the last two have batches and a share of the GPU
+        alone = predict(profile, Plan(NETWORK, "dsp", Variant(row["policy"], row["edge"])), SUSTAINED)
+        means = {"frame_ms": alone["frame_time_ms"]["mean"], "latency_ms": alone["latency_ms"]["mean"]}
+        assert {key: row[key] for key in means} == pytest.approx(means), row["name"]
+
+
+def test_half_an_hour_says_where_it_begins_and_where_it_settles() -> None:
+    """Under burst the mean of 30 minutes is neither: it lies between the first moment's rate and the last fifth's."""
+    profile, plan = load_profile("snapdragon-888"), Plan(NETWORK, "dsp")
+    answer, moments = predict(profile, plan, BURST, 30), over_time(profile, plan, BURST, 30)
+    last = [m.frame_ms for m in moments if m.t_s > 24 * 60]
+    assert answer["fps_start"] == pytest.approx(1e3 / moments[0].frame_ms)
+    assert answer["fps_settled"] == pytest.approx(1e3 * len(last) / sum(last))
+    assert answer["fps_settled"] < 0.97 * answer["fps"] < 0.97 * answer["fps_start"]
+
+
+def test_without_minutes_the_settled_rate_is_the_rate() -> None:
+    answer = predict(load_profile("snapdragon-888"), Plan(NETWORK, "dsp"))
+    assert answer["fps_start"] == answer["fps_settled"] == pytest.approx(answer["fps"])
+
+
+def with_cores(profile: Profile, **cores: str) -> Profile:
+    """`profile` with the core of each named unit."""
+    units = {name: unit.model_copy(update={"core": cores.get(name, "")}) for name, unit in profile.units.items()}
+    return profile.model_copy(update={"units": units})
+
+
+def test_units_that_share_a_core_work_in_turns() -> None:
+    """The network on the GPU, which has the CPU's core: a frame takes the sum of all stages."""
+    profile = with_cores(load_profile("snapdragon-888"), cpu="core 0", gpu="core 0")
+    plan, corners = Plan(NETWORK, "gpu", Variant("pipelined", "double")), corners_of(profile, SUSTAINED)
+    times = stage_times_ms(profile, plan, corners)
+    cpu, gpu = (sum(ms for (_, unit), ms in times.items() if unit == name) for name in ("cpu", "gpu"))
+    now = steady(profile, plan, corners)
+    assert now.frame_ms == pytest.approx(cpu + gpu, rel=0.01)
+    assert now.busy["cpu"] + now.busy["gpu"] <= 1
+    assert now.busy["cpu"] / now.busy["gpu"] == pytest.approx(cpu / gpu)
+    assert now.idle["cpu"]["preempted"] == pytest.approx(now.busy["gpu"])
+    assert now.idle["gpu"]["preempted"] == pytest.approx(now.busy["cpu"])
+    for unit in UNITS:
+        assert now.busy[unit] + sum(now.idle[unit].values()) == pytest.approx(1.0)
+    assert "preempted" not in now.idle["dsp"]
+    assert "cpu and gpu share a core and work in turns" in predict(profile, plan)["notes"]
+
+
+def test_units_with_cores_of_their_own_are_predicted_as_without() -> None:
+    chip = load_profile("snapdragon-888")
+    apart, plan = with_cores(chip, cpu="core 0", gpu="core 1", dsp="core 2"), Plan(NETWORK, "dsp")
+    assert steady(apart, plan, corners_of(chip, SUSTAINED)) == steady(chip, plan, corners_of(chip, SUSTAINED))
+
+
+@pytest.mark.parametrize(("cores", "shared"), [((3,), "cpu gpu dsp"), ((0, 1), "cpu gpu"), ((0, 1, 2), "")])
+def test_the_units_of_this_machine_share_cores_as_a_run_does(
+    cores: tuple[int, ...], shared: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("trilane.hw_profiles.host_profile.usable_cores", lambda: cores)
+    units = load_profile("host").units
+    counts = Counter(unit.core for unit in units.values())
+    assert " ".join(name for name, unit in units.items() if counts[unit.core] > 1) == shared

@@ -252,3 +252,59 @@ def test_the_table_shows_both_policies_and_dashes_what_was_not_measured() -> Non
         assert expected in text
     efficiency = next(line for line in text.splitlines() if "efficiency" in line)
     assert "–" in efficiency
+
+
+def table_text(report: dict[str, Any]) -> str:
+    """The table as it is printed, each line without its frames and double spaces."""
+    from rich.console import Console
+
+    console = Console(width=240, record=True, file=io.StringIO())
+    console.print(run_table(Report.model_validate(report)))
+    return "\n".join(" ".join(line.replace("│", " ").split()) for line in console.export_text().splitlines())
+
+
+@pytest.mark.parametrize(
+    ("samples", "marked"), [(None, ()), (28, ("p90", "p95", "p99")), (58, ("p95", "p99")), (298, ("p99",)), (299, ())]
+)
+def test_a_percentile_of_too_few_frames_is_marked(samples: int | None, marked: tuple[str, ...]) -> None:
+    report = make_report()
+    report["latency_ms"] = {**TIMES, "samples": samples}
+    text = table_text(report | {"baseline": None})
+    rows = text[text.index("latency mean") :].splitlines()[1:6]
+    assert {row.split(",")[0] for row in rows if row.endswith("*")} == set(marked)
+    assert ("* of too few frames: p90 needs 29, p95 needs 59, p99 needs 299" in text) == bool(marked)
+
+
+def test_mean_and_rate_stand_with_their_interval_or_as_too_short() -> None:
+    known = make_report(fps_low=48.0, fps_high=52.25)
+    known["frame_time_ms"] = {**known["frame_time_ms"], "mean_low": 19.14, "mean_high": 20.83}
+    text = table_text(known | {"baseline": None})
+    assert "frame time mean, ms 20.0 (19.1 to 20.8)" in text
+    assert "rate frames per second 50.0 (48.0 to 52.2)" in text
+    short = table_text(make_report(baseline=None))
+    assert "frame time mean, ms 20.0 (too short to tell)" in short
+    assert "rate frames per second 50.0 (too short to tell)" in short
+
+
+def test_a_cap_is_said_once_and_apart_from_what_heat_did() -> None:
+    """63 % of the time throttled by the duty that was asked for, none of it for heat: no line says throttled 0 %."""
+    cap = {"corner": "svs2", "duty": 0.37, "duty_mean": 0.37}
+    caps = {"how": "x", "performance_profile": "low_power_saver", "units": {"dsp": cap}, "throttled_share": 0.0}
+    share = {**SHARE, "busy": 0.3, "idle": {"starved": 0.07, "blocked": 0.0, "throttled": 0.63, "overhead": 0.0}}
+    text = table_text(make_report(caps=caps, units={"dsp": share}, baseline=None)).replace("\n", " ")
+    assert "30 / 7 0 63 0" in text
+    assert "may work dsp 37% of the time, the rest is throttled; lowered further for heat 0% of the time" in text
+    assert text.count("throttled") == 2  # the column, and the sentence
+
+
+def test_the_table_says_when_and_by_what_it_was_made() -> None:
+    made = {
+        "at": "2026-11-22T01:00:00+00:00",
+        "command": ["trilane", "run"],
+        "trilane": "0.1.0",
+        "revision": "0123456789abcdef",
+        "modified": True,
+    }
+    assert "2026-11-22T01:00:00+00:00: trilane 0.1.0 at 0123456789, modified" in table_text(make_report(made=made))
+    elsewhere = {**made, "revision": None, "modified": None}
+    assert "2026-11-22T01:00:00+00:00: trilane 0.1.0\n" in table_text(make_report(made=elsewhere))

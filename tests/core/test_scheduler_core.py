@@ -50,6 +50,7 @@ PURE = (
     "policy",
     "state",
     "stats",
+    "uncertainty",
     "unit_life",
     "watchdog",
 )

@@ -17,6 +17,7 @@ from trilane.scheduler.stats import (
     median_interval,
     percentile,
     real_time_score,
+    samples_needed,
     summary_ms,
 )
 
@@ -28,6 +29,7 @@ def test_a_summary_is_numpys(values: list[int]) -> None:
     row = summary_ms(values)
     assert row["mean"] == pytest.approx(np.mean(values) / 1e6, abs=1e-5)
     assert row["max"] == pytest.approx(max(values) / 1e6, abs=1e-5)
+    assert row["samples"] == len(values)
     for rank in (50, 90, 95, 99):
         assert row[f"p{rank}"] == pytest.approx(np.percentile(values, rank) / 1e6, rel=1e-9, abs=1e-5)
 
@@ -44,6 +46,13 @@ def test_nothing_gives_zeros() -> None:
     assert list(summary_ms([1])) == ["mean", "p50", "p90", "p95", "p99", "max"]
     assert ema_range_ms([]) == {"ema20_min": 0.0, "ema20_max": 0.0}
     assert jitter_ms([]) == jitter_ms([5]) == 0
+
+
+@pytest.mark.parametrize(("share", "count"), [(0.5, 5), (0.9, 29), (0.95, 59), (0.99, 299)])
+def test_the_samples_that_a_percentile_needs_are_wilks(share: float, count: int) -> None:
+    """The known sizes; one fewer leaves more than 5 % that none of them exceeds the percentile."""
+    assert samples_needed(share) == count
+    assert share**count <= 0.05 < share ** (count - 1)
 
 
 def test_jitter_is_the_mean_step() -> None:

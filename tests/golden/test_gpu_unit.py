@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -236,6 +237,35 @@ def test_alpha_is_blended_in_linear_light(gl: Any, person: Any, camera: Camera) 
     mixed = linear * (127 / 255) + 128 / 255
     expected = 255 * (1.055 * mixed ** (1 / 2.4) - 0.055)
     assert np.abs(frame - expected).max() <= 2
+
+
+class BackgroundDouble:
+    """Notes for which time it was asked, on which thread and during which frame; it has one picture."""
+
+    def __init__(self) -> None:
+        self.frame = -1
+        self.asked: list[tuple[int, float, int]] = []
+
+    def at(self, time_s: float) -> NDArray[np.uint8]:
+        self.asked.append((self.frame, time_s, threading.get_ident()))
+        return np.zeros((*OUTPUT, 3), np.uint8)
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+def test_a_background_is_read_inside_the_composites_job(gl: Any, person: Any, camera: Camera) -> None:
+    """So its time counts: `at`, which decodes or waits for it, is called once in a job, by the job's thread."""
+    background = BackgroundDouble()
+    stage = CompositeStage(gl, OUTPUT, [TENSOR], [person.rest], background)
+    source, target = packet(TENSOR[0] * TENSOR[1] * 4), packet(OUTPUT[0] * OUTPUT[1] * 3)
+    stage.bind([source], [target])
+    fill_pose(source, person.pose(np.zeros(165)), *camera((0, 1, 3), (0, 1, 0)), (-1, -1, 1, 1))
+    for background.frame, source.header["media_time_s"] in ((0, 0.5), (1, 0.75)):
+        stage.run(background.frame, 0, 0)
+    background.frame = 2
+    stage.close()
+    assert background.asked == [(0, 0.5, threading.get_ident()), (1, 0.75, threading.get_ident())]
 
 
 def built(bundle: Path, background: Path) -> tuple[RasterStage, CompositeStage]:

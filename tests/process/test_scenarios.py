@@ -59,6 +59,21 @@ def test_a_stage_that_fails_ends_the_scenario_with_its_sentence(judge: str) -> N
         scenario.run_scenario(doubles(raster="raise"), {}, asked, judge, "pipelined")
 
 
+@pytest.mark.parametrize("judge", ["trilane", "loadgen"])
+@pytest.mark.parametrize("edge", ["triple", "orphan"])
+def test_a_frame_that_an_edge_drops_ends_the_scenario_at_once_with_its_cause(
+    edge: str, judge: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Poses wait for a slow raster: the mailbox keeps the newest alone, so the eight queries of the warm-up have no
+    eight answers. Before, the bench waited until nothing had been answered for `STALLED_S`."""
+    if judge == "loadgen":
+        pytest.importorskip("mlperf_loadgen")
+    monkeypatch.setattr(load, "STALLED_S", 30.0)
+    pipeline = doubles(raster=20).with_rule(edge)
+    with pytest.raises(TrilaneError, match=r"dropped or lost \(.*pose->raster:\w+ \d.*every query must be answered"):
+        scenario.run_scenario(pipeline, {}, Load("server", seconds=60, rate=300), judge, "pipelined")
+
+
 def test_an_interrupt_ends_a_scenario(monkeypatch: pytest.MonkeyPatch) -> None:
     def ask_and_interrupt(_load: Load, requests: FrameRequestQueue, queries: load.Queries) -> None:
         queries.ask(requests, 5)
