@@ -252,6 +252,18 @@ def test_requests_are_heard_and_answered_when_their_frame_is_presented(monkeypat
     assert requests.answers == [0]
 
 
+def test_a_frame_that_nobody_asked_for_is_presented_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World(monkeypatch, settings={"policy": "sequential"})
+    clock = world.begun()
+    for number, unit in ((0, "gpu"), (1, "gpu"), (2, "cpu")):
+        world.inbox = [[(unit, Done(number, 1, 2, 1 if number == 0 else 0, {}))]]
+        now_ns, events = clock.wait(START)
+        clock.perform(now_ns, world.core.step(now_ns, events).actions)
+    clock.finish()
+    assert [job.stage for job in clock.jobs] == ["draw", "mix", "show"]
+    assert world.core.ledger.presented_frames == [0]
+
+
 def test_every_job_that_ended_is_booked_with_its_times_and_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """draw 0 and draw 1 were handed over at the start; draw 1 ends after its frame was lost, and leaves its figures."""
     world = World(monkeypatch)

@@ -92,6 +92,14 @@ def test_a_slot_is_a_page_of_header_and_whole_pages_of_payload(payload: int, slo
     assert RegionLayout(5, layout).total_bytes == 5 * slot_bytes * PAGE
 
 
+def test_the_fields_of_a_header_are_aligned() -> None:
+    """8 + 8 + 4 bytes of the frame's fields, 2 of `own`, 2 of nothing, 8 of `wide`."""
+    header = header_dtype([("own", "<u2"), ("wide", "<f8")])
+    assert header.names is not None
+    assert [header.fields[name][1] for name in header.names] == [0, 8, 16, 20, 24]
+    assert header.itemsize == 32
+
+
 def test_a_header_of_more_than_a_page_takes_two() -> None:
     layout = SlotLayout(header_dtype([("matrix", "<f8", (512,))]), 1)
     assert (layout.header_bytes, layout.slot_bytes) == (2 * PAGE, 3 * PAGE)

@@ -20,7 +20,7 @@ from trilane.errors import TrilaneError
 from trilane.pipeline import unit_processes, unit_starter
 from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, UnitSettings
 from trilane.pipeline.regions import EdgeRegion
-from trilane.pipeline.run_metrics import Caps, Temperature, metrics_of
+from trilane.pipeline.run_metrics import Caps, Temperature, UnitShares, metrics_of
 from trilane.pipeline.unit_processes import UnitMessage, UnitProcesses
 from trilane.pipeline.unit_spec import UnitSpec
 from trilane.pipeline.unit_starter import ForkedCall, StartedUnit, UnitStarter
@@ -372,6 +372,7 @@ def test_the_report_of_a_run_is_complete_in_order_and_has_no_other_keys() -> Non
     assert (left.pid, left.cores, left.threads, left.spin) == (None, (), 0, False)
     unset = (metrics.policy, metrics.edge, metrics.idle_cores, metrics.caps, metrics.temperature_c)
     assert unset == ("", "", "", None, None)
+    assert UnitShares(busy=1, idle=left.idle, jobs=1, restarts=0, cores=(1, 2)).as_json()["cores"] == [1, 2]
     assert Caps(how="none").model_dump(exclude={"how"}) == {
         "profile": "", "performance_profile": None, "governor": "", "units": {}, "power_w": None,
         "throttled_share": 0.0, "first_throttled_s": None,
