@@ -396,8 +396,17 @@ def test_the_core_does_what_a_plain_reading_of_the_rules_does(seed: int) -> None
     )
     driver.run()
     assert driver.recording is not None
-    epochs = [a.job.epoch for _, _, actions in driver.recording.steps for a in actions if isinstance(a, Dispatch)]
-    assert [(*row, epoch) for row, epoch in zip(driver.jobs, epochs, strict=True)] == model.jobs
+    dispatched = [
+        (now, a.job) for now, _, actions in driver.recording.steps for a in actions if isinstance(a, Dispatch)
+    ]
+    assert [(job.stage, job.unit, job.frame, now, job.epoch) for now, job in dispatched] == [
+        (stage, unit, frame, at_ns, epoch) for stage, unit, frame, _, at_ns, _, _, epoch in model.jobs
+    ]
+    rows = [row[:7] for row in driver.jobs]
+    assert [
+        (stage, frame, end - begin, begin - ready, end) for stage, _, frame, ready, _, begin, end in rows
+    ] == model.ended
+    assert set(rows) <= {job[:7] for job in model.jobs}
     ledger = driver.core.ledger
     presented = zip(ledger.presented_frames, ledger.presented_ns, ledger.latency_ns, strict=True)
     assert list(presented) == [row[:3] for row in model.presented]
