@@ -2,44 +2,62 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import pytest
 
 from trilane.bench import handoff, scheduler
 from trilane.scheduler.events import Graph, Settings, chain
 from trilane.scheduler.virtual import simulate
 
-SERVICE_NS = {"a": 2, "b": 5, "c": 3}
-#: `a` and `c` share the CPU; frames 0, 1, 2 are released at 0, 1, 2.
-#: With one slot, frame 1 cannot begin before b0 has given its slot back at 7, and the CPU then does c0 first:
-#: a0 0-2, b0 2-7, c0 7-10, a1 10-12, b1 12-17, c1 17-20, a2 20-22, b2 22-27, c2 27-30.
-#: With two: a0 0-2, a1 2-4, b0 2-7, b1 7-12, c0 7-10, a2 10-12, c1 12-15, b2 12-17, c2 17-20.
-BY_HAND = {"single": [10, 20, 30], "double": [10, 15, 20]}
+
+@dataclass(frozen=True)
+class Case:
+    """Stages `a` and `c` on the CPU, `b` on the GPU, and a frame released every nanosecond from 0 on."""
+
+    edge: str
+    service_ns: dict[str, int]
+    presented_ns: list[int]
+
+    @property
+    def graph(self) -> Graph:
+        return chain((("a", "cpu"), ("b", "gpu"), ("c", "cpu")), self.edge, "c")
+
+    def service(self, stage: str, _unit: str, _frame: int, _begin_ns: int) -> int:
+        return self.service_ns[stage]
 
 
-def graph_with(edge: str) -> Graph:
-    return chain((("a", "cpu"), ("b", "gpu"), ("c", "cpu")), edge, "c")
+CASES = [
+    # Frame 1 cannot begin before b0 has given its slot back at 7, and the CPU then does c0 first:
+    # a0 0-2, b0 2-7, c0 7-10, a1 10-12, b1 12-17, c1 17-20, a2 20-22, b2 22-27, c2 27-30.
+    Case("single", {"a": 2, "b": 5, "c": 3}, [10, 20, 30]),
+    # a0 0-2, a1 2-4, b0 2-7, b1 7-12, c0 7-10, a2 10-12, c1 12-15, b2 12-17, c2 17-20.
+    Case("double", {"a": 2, "b": 5, "c": 3}, [10, 15, 20]),
+    # At 7 the CPU holds a2 behind c0, so c1, ready at 12, waits for it; at 15 both c1 and a3 could be held next, and c1
+    # is the older frame: a0 0-2, a1 2-4, b0 2-7, b1 7-12, c0 7-15, a2 15-17, b2 17-22, c1 17-25, a3 25-27, c2 27-35,
+    # b3 27-32, c3 35-43.
+    Case("double", {"a": 2, "b": 5, "c": 8}, [15, 25, 35, 43]),
+]
 
 
-def service(stage: str, _unit: str, _frame: int, _begin_ns: int) -> int:
-    return SERVICE_NS[stage]
+@pytest.mark.parametrize("case", CASES)
+def test_the_scheduler_presents_at_the_times_worked_out_by_hand(case: Case) -> None:
+    settings = Settings(len(case.presented_ns), "pipelined", period_ns=1)
+    done = simulate(case.graph, settings, case.service, keep=True)
+    assert [job.end_ns for job in done.jobs if job.stage == "c"] == case.presented_ns
 
 
-@pytest.mark.parametrize("edge", BY_HAND)
-def test_the_scheduler_presents_at_the_times_worked_out_by_hand(edge: str) -> None:
-    done = simulate(graph_with(edge), Settings(3, "pipelined", period_ns=1), service, keep=True)
-    assert [job.end_ns for job in done.jobs if job.stage == "c"] == BY_HAND[edge]
-
-
-@pytest.mark.parametrize("edge", BY_HAND)
+@pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("way", [scheduler.SIMPY, scheduler.LEAN])
-def test_simpys_models_present_at_the_times_worked_out_by_hand(way: str, edge: str) -> None:
+def test_simpys_models_present_at_the_times_worked_out_by_hand(way: str, case: Case) -> None:
     pytest.importorskip("simpy")
-    assert scheduler._models()[way](graph_with(edge), service, 3, 1).run() == BY_HAND[edge]
+    model = scheduler._models()[way](case.graph, case.service, len(case.presented_ns), 1)
+    assert model.run() == case.presented_ns
 
 
 def test_the_lean_model_takes_one_timeout_for_each_release_and_job() -> None:
     pytest.importorskip("simpy")
-    model = scheduler._models()[scheduler.LEAN](graph_with("double"), service, 3, 1)
+    model = scheduler._models()[scheduler.LEAN](CASES[1].graph, CASES[1].service, 3, 1)
     assert scheduler._count_events(model.env) == 3 * 4
 
 
