@@ -126,6 +126,15 @@ def test_a_constant_without_its_float_value_is_named():
         noise_model(quantised)
 
 
+@pytest.mark.parametrize(("stored", "half"), [(0, 0.0), (1, math.sqrt(3) * STEP1), (-1, math.sqrt(3) * STEP1)])
+def test_a_constant_of_0_is_exact_or_a_whole_step_off_where_only_odd_multiples_are_used(stored, half):
+    """An error of always one step has the variance step², a uniform one within +-h the variance h²/3."""
+    quantised = layers((stored * STEP1,), (STEP1,), (STEP_OUT,))
+    quantised.facts["rounds_alike"] = True
+    quantised.float_constants["w1"] = np.zeros((1, 1, 1, 1), np.float32)
+    assert noise_model(quantised).constants["w1"][1].item() == pytest.approx(half)
+
+
 def test_copies_of_a_constant_have_its_value():
     """ONNX Runtime calls the second copy of bias `w1` `w11`; but `w1x` is another constant."""
     quantised = layers((W1,), (STEP1,), (STEP_OUT,))

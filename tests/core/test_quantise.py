@@ -43,7 +43,7 @@ def test_saturated_frames_have_all_values_at_the_ends_of_their_common_range():
 def test_what_a_norm_reads_is_not_cut_off_at_the_strongest_contrast(norm):
     """Inputs are -1 to 1 but mostly +-0.1, and the sum of two of them is at most 0.3 where both are small.
 
-    Saturated, the sum is -2 to 2, which a norm's input holds; without a norm the range is that of the frames, or 3/4 of it.
+    Saturated, the sum is -2 to 2, which a norm's input holds; without a norm 3/4 of the frames' range.
     """
     frame = np.full((8, 8, 2), 0.1, np.float32)
     frame[::2] = -0.1

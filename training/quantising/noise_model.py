@@ -137,7 +137,9 @@ class _Graph:
         half = np.broadcast_to(scale * self.multiples / 2, stored.shape)
         # A weight of exactly 0 is stored exactly, if 0 is a multiple that weights may have: biases have odd ones.
         exact = (exact_value == 0) & (stored == 0)
-        self.constants[node.output[0]] = exact_value, np.where(exact, 0.0, half)
+        # Where they have none at 0, the error is always `half`: its variance is that of a uniform one sqrt(3) as wide.
+        farthest = (exact_value == 0) & (stored != 0)
+        self.constants[node.output[0]] = exact_value, np.where(exact, 0.0, np.where(farthest, 3**0.5, 1.0) * half)
 
     def _float_value(self, name: str, shape: tuple[int, ...]) -> F32:
         """The float constant `name`; ONNX Runtime numbers the copies of a bias that several layers read."""
