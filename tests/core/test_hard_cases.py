@@ -6,7 +6,9 @@ import dataclasses
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from trilane.apps.cli.accuracy import app
 from trilane.apps.experiments.hard_cases import EXCEEDED, HOLDS, UNTOLD, Case, wrong_answers
 from trilane.apps.experiments.hard_networks import INPUTS, SIDE, calibration_frames, case_input
 
@@ -48,6 +50,17 @@ def test_an_error_above_the_bound_fails(case, error, verdict):
 @pytest.mark.parametrize("bound", [11.0, 12.0, np.nan])
 def test_a_row_whose_bound_a_wrong_picture_keeps_fails_without_any_error(case, bound):
     assert dataclasses.replace(case, bound=bound).verdict(0.0) == UNTOLD
+
+
+@pytest.mark.parametrize(("verdict", "code"), [(HOLDS, 0), (EXCEEDED, 1), (UNTOLD, 1)])
+def test_rows_that_fail_are_named_and_fail_the_command(monkeypatch, verdict, code):
+    figures = {"error": 1.0, "bound": 2.0, "constant_error": 3.0, "shifted_error": 4.0, "swapped_error": 5.0}
+    row = {"name": "batch, usual, ort", **figures, "verdict": verdict, "passed": verdict == HOLDS}
+    monkeypatch.setattr("trilane.apps.experiments.hard_cases.hard_cases", lambda _: iter([row]))
+    result = CliRunner().invoke(app, ["--hard-cases", "--runtime", "ort"])
+    assert result.exit_code == code
+    assert (f"batch, usual, ort: {verdict}" in result.stderr) == (code == 1)
+    assert "bound: computed" in result.stdout
 
 
 def test_inputs_have_a_figure_on_background_and_are_no_frame_of_the_calibration():

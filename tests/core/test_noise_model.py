@@ -136,10 +136,12 @@ def test_a_constant_of_0_is_exact_or_a_whole_step_off_where_only_odd_multiples_a
 
 
 def test_copies_of_a_constant_have_its_value():
-    """ONNX Runtime calls the second copy of bias `w1` `w11`; but `w1x` is another constant."""
+    """ONNX Runtime calls the second copy of bias `w` `w1`; where there is a `w1`, it is that, and `w1x` is another."""
     quantised = layers((W1,), (STEP1,), (STEP_OUT,))
     value = quantised.float_constants.pop("w1")
     quantised.float_constants["w"] = value
+    assert noise_model(quantised).constants["w1"][0] == value
+    quantised.float_constants = {"w1": value, "w": 2 * value}
     assert noise_model(quantised).constants["w1"][0] == value
     quantised.float_constants = {"w1x": value}
     with pytest.raises(BadInputError, match="w1"):
