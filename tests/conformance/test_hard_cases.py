@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+import itertools
+
 import numpy as np
 import pytest
 
@@ -23,14 +26,13 @@ WRONG = {
 }
 
 
-@pytest.fixture(scope="module", params=NETWORKS)
-def pair(request):
-    return make_pair(request.param)
+pair_of = functools.cache(make_pair)
 
 
-@pytest.fixture(scope="module", params=INPUTS)
-def case(request, pair):
-    return make_case(pair, request.param)
+@pytest.fixture(scope="module", params=itertools.product(NETWORKS, INPUTS), ids=", ".join)
+def case(request):
+    network, name = request.param
+    return make_case(pair_of(network), name)
 
 
 @pytest.mark.parametrize("wrong", WRONG)
