@@ -5,7 +5,7 @@ Rule: every error in the manifest is measured here, on the content of the files 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +69,7 @@ def integer_network(avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int
     chosen = np.random.default_rng(seed).permutation(len(group))[:CALIBRATION_FRAMES]
     frames = _inputs(avatar, group, np.sort(chosen))
     quantised = quantise(export_onnx(avatar.network, *CALIBRATION_SHAPE), frames, METHOD)
-    return Quantised(reshaped(quantised.network, *STORED_SHAPE), quantised.facts)
+    return replace(quantised, network=reshaped(quantised.network, *STORED_SHAPE))
 
 
 def quantise_avatar(

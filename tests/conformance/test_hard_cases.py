@@ -1,24 +1,48 @@
-"""Numerically hard inputs and networks: the picture stays near the float network's, on every runtime."""
+"""Hard inputs and networks: the picture is near the float network's on every runtime, and wrong pictures are not."""
 
 from __future__ import annotations
 
+import functools
+import itertools
+
+import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
 
-from trilane.apps.experiments.hard_cases import INPUTS, NETWORKS, error_of, make_pair  # noqa: E402
+from trilane.apps.experiments.hard_cases import SHIFT, error_of, make_case, make_pair  # noqa: E402
+from trilane.apps.experiments.hard_networks import INPUTS, NETWORKS  # noqa: E402
 from trilane.stages.dsp.runtime import RUNTIMES  # noqa: E402
 
 torch.set_num_threads(1)
 
+WRONG = {
+    "constant": lambda picture: np.broadcast_to(np.median(picture, axis=(0, 1)), picture.shape),
+    "down": lambda picture: np.roll(picture, SHIFT, axis=0),
+    "up, edge repeated": lambda picture: np.pad(picture, ((0, SHIFT), (0, 0), (0, 0)), "edge")[SHIFT:],
+    "right": lambda picture: np.roll(picture, SHIFT, axis=1),
+    "left, edge repeated": lambda picture: np.pad(picture, ((0, 0), (0, SHIFT), (0, 0)), "edge")[:, SHIFT:],
+    "red and blue exchanged": lambda picture: picture[..., [2, 1, 0, 3]],
+}
 
-@pytest.fixture(scope="module", params=NETWORKS)
-def pair(request):
-    return make_pair(request.param)
+
+pair_of = functools.cache(make_pair)
 
 
-@pytest.mark.parametrize("case", INPUTS)
+@pytest.fixture(scope="module", params=itertools.product(NETWORKS, INPUTS), ids=", ".join)
+def case(request):
+    network, name = request.param
+    return make_case(pair_of(network), name)
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_a_wrong_picture_is_above_the_bound(case, wrong):
+    picture = case.wanted[0]
+    assert np.abs(WRONG[wrong](picture) - picture).mean() > case.bound
+    assert case.tells
+
+
 @pytest.mark.parametrize("runtime", [name for name in RUNTIMES if name != "qnn"])
-def test_the_picture_is_near_the_float_networks(skip_without, pair, runtime, case):
+def test_the_picture_is_near_the_float_networks(skip_without, case, runtime):
     skip_without(runtime)
-    assert error_of(pair, case, runtime) <= pair.bounds[case]
+    assert error_of(case, runtime) <= case.bound

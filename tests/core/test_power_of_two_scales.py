@@ -73,6 +73,17 @@ def test_a_layer_without_a_bias_gets_one(tiny_float, tiny_frames):
     )
 
 
+def test_biases_of_0_go_up_and_down_in_turn(tiny_float, tiny_frames):
+    """One unit up in every channel would move all pictures the same way."""
+    model = copy.deepcopy(tiny_float)
+    layer = next(node for node in model.graph.node if node.name == "deep")
+    del layer.input[2]
+    network = quantise(model, tiny_frames).network
+    values, makers = parts(network.model)
+    stored = next(node for node in network.model.graph.node if node.name == "deep")
+    assert values[makers[stored.input[2]].input[0]].tolist() == [1, -1] * 4
+
+
 def test_other_networks_keep_their_measured_scales(tiny_float, tiny_frames):
     model = copy.deepcopy(tiny_float)
     next(node for node in model.graph.node if node.op_type == "Relu").op_type = "HardSwish"

@@ -8,11 +8,11 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
-from onnx import numpy_helper
+from onnx import TensorProto, helper, numpy_helper
 
 from trilane.avatars.network_reshape import reshaped
 from trilane.errors import BadInputError
-from trilane.training.quantising.calibration import METHODS
+from trilane.training.quantising.calibration import METHODS, saturated
 from trilane.training.quantising.quantise import quantise
 
 
@@ -31,6 +31,49 @@ def test_bytes_are_the_picture(tiny_float, tiny_frames, tiny_quantised):
     assert picture.dtype == np.uint8 and picture.shape == (64, 64, 4)
     assert np.abs(picture / 255 - wanted).mean() < 2.5 / 255  # weights of 6 bits
     assert network.output.scale == pytest.approx(1 / 255) and network.output.zero_point == 0
+
+
+def test_saturated_frames_have_all_values_at_the_ends_of_their_common_range():
+    frames = [np.array([-1, 0, 0.5], np.float32), np.array([0.1, -3, 4], np.float32)]
+    assert [frame.tolist() for frame in saturated(frames)] == [[-3, 0, 4], [4, -3, 4]]
+    assert saturated([np.array([1, 2], np.float32)])[0].tolist() == [2, 2]
+
+
+@pytest.mark.parametrize("norm", ["InstanceNormalization", "Relu"])
+def test_what_a_norm_reads_is_not_cut_off_at_the_strongest_contrast(norm):
+    """Inputs are -1 to 1 but mostly +-0.1, and the sum of two of them is at most 0.3 where both are small.
+
+    Saturated, the sum is -2 to 2, which a norm's input holds; without a norm 3/4 of the frames' range.
+    """
+    frame = np.full((8, 8, 2), 0.1, np.float32)
+    frame[::2] = -0.1
+    frame[0, 0], frame[7, 7] = (-1, 0.7), (1, -0.7)
+    model = summing_network(norm)
+    quantised = quantise(model, [frame]).network.model
+    known = {tensor.name: numpy_helper.to_array(tensor) for tensor in quantised.graph.initializer}
+    store = next(n for n in quantised.graph.node if n.op_type == "QuantizeLinear" and n.input[0] in ("sum", "read"))
+    scale, zero = (float(known[name]) for name in store.input[1:])
+    low, high = -zero * scale, (255 - zero) * scale
+    if norm == "Relu":
+        assert low == 0 and 0.2 <= high <= 0.4
+    else:
+        assert low == pytest.approx(-2, abs=0.02) and high == pytest.approx(2, abs=0.02)
+
+
+def summing_network(norm):
+    """The sum of two channels, `norm` and a last sigmoid."""
+    kernels = {"w1": np.ones((1, 2, 1, 1)), "w2": np.ones((4, 1, 1, 1)), "gain": np.ones(1), "offset": np.zeros(1)}
+    nodes = [
+        helper.make_node("Conv", ["tensor", "w1"], ["sum"], "first"),
+        helper.make_node(norm, ["sum", "gain", "offset"] if norm != "Relu" else ["sum"], ["read"], "norm"),
+        helper.make_node("Conv", ["read", "w2"], ["logits"], "second"),
+        helper.make_node("Sigmoid", ["logits"], ["rgba"], "last"),
+    ]
+    weights = [numpy_helper.from_array(value.astype(np.float32), name) for name, value in kernels.items()]
+    ends = [("tensor", 2), ("rgba", 4)]
+    source, target = (helper.make_tensor_value_info(n, TensorProto.FLOAT, [1, c, 8, 8]) for n, c in ends)
+    graph = helper.make_graph(nodes, "sum", [source], [target], weights)
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
 
 
 def test_zero_is_exact(tiny_quantised):

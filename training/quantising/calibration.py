@@ -1,7 +1,7 @@
 """Calibration: the range of each tensor of a network on real frames.
 
-Rule: ranges are measured; after that they are only narrowed where bytes cannot show the difference, or made one range
-where an operator only moves bytes.
+Rule: ranges are measured; after that they are only narrowed where bytes cannot show the difference, widened where a
+norm over the picture reads them, or made one range where an operator only moves bytes.
 """
 
 from __future__ import annotations
@@ -78,6 +78,34 @@ def limit_logits(model: onnx.ModelProto, ranges: Any) -> None:
     logits = ranges[last.input[0]]
     logits.lowest = np.maximum(logits.lowest, np.float32(-LOGIT_LIMIT))
     logits.highest = np.minimum(logits.highest, np.float32(LOGIT_LIMIT))
+
+
+def saturated(frames: Sequence[NDArray[np.float32]]) -> list[NDArray[np.float32]]:
+    """Every value of `frames` at the end of their common range that is on its side of 0; 0 stays.
+
+    These are the bytes of the strongest contrast that the network's input can hold.
+    """
+    low, high = min(frame.min() for frame in frames), max(frame.max() for frame in frames)
+    ends = np.float32(min(low, 0)), np.float32(max(high, 0))
+    return [np.where(frame > 0, ends[1], np.where(frame < 0, ends[0], np.float32(0))) for frame in frames]
+
+
+def norm_inputs(model: onnx.ModelProto) -> set[str]:
+    """The tensors that norms over the picture read, and those that these were moved from."""
+    makers = {out: node for node in model.graph.node for out in node.output}
+    norms = (node for node in model.graph.node if node.op_type == "InstanceNormalization")
+    return {source for node in norms for source in _sources(node.input[0], makers)}
+
+
+def widen(ranges: Any, names: set[str], wider: Any) -> None:
+    """Extend the ranges of tensors `names` to those of `wider`. In place.
+
+    A norm divides by the picture's own deviation, so what it reads carries the same picture at any contrast; cut off at
+    the contrast of usual frames, a stronger picture would be another one.
+    """
+    for name in names & set(ranges.keys()):
+        ranges[name].lowest = np.minimum(ranges[name].lowest, wider[name].lowest)
+        ranges[name].highest = np.maximum(ranges[name].highest, wider[name].highest)
 
 
 def share_ranges(model: onnx.ModelProto, ranges: Any) -> None:

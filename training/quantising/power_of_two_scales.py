@@ -133,9 +133,15 @@ def _round_weights(kernel: onnx.TensorProto, finest: NDArray[np.float64], top: i
 
 
 def _round_bias(bias: onnx.TensorProto, scales: NDArray[np.float64]) -> None:
-    """Round `bias` (O,) to odd multiples of `scales` (O,), in place."""
+    """Round `bias` (O,) to odd multiples of `scales` (O,), in place.
+
+    Half way between two of them, as a bias of 0 is, every second channel goes up and the others go down: all of them
+    going up would move the whole picture.
+    """
     steps = numpy_helper.to_array(bias).astype(np.float64) / scales
-    bias.CopyFrom(_like(bias, (2 * np.rint((steps - 1) / 2) + 1) * scales, steps.shape))
+    below = 2 * np.floor(steps / 2) + 1
+    goes_down = (steps % 2 == 0) & (np.arange(len(steps)) % 2 == 1)
+    bias.CopyFrom(_like(bias, (below - 2 * goes_down) * scales, steps.shape))
 
 
 def _like(tensor: onnx.TensorProto, values: NDArray[np.float64], shape: tuple[int, ...]) -> onnx.TensorProto:

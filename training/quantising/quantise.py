@@ -11,8 +11,8 @@ from __future__ import annotations
 import copy
 import json
 import tempfile
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +24,11 @@ from onnx import TensorProto, TypeProto, helper, numpy_helper
 from onnxruntime.quantization.shape_inference import quant_pre_process
 
 from trilane.arrays import F32
-from trilane.avatars.integer_network import FLOAT_LAYERS_KEY, NetworkFile
+from trilane.avatars.integer_network import FLOAT_LAYERS_KEY, NetworkFile, constants_of
 from trilane.avatars.network_checks import check_network
 from trilane.errors import BadInputError
 from trilane.training.quantising.byte_input_output import replace_ends_by_bytes
-from trilane.training.quantising.calibration import limit_logits, measure, share_ranges
+from trilane.training.quantising.calibration import limit_logits, measure, norm_inputs, saturated, share_ranges, widen
 from trilane.training.quantising.power_of_two_scales import (
     CannotRoundAlikeError,
     may_round_alike,
@@ -42,10 +42,14 @@ MIN_FRAMES, MAX_FRAMES = 1, 1000
 
 @dataclass(frozen=True)
 class Quantised:
-    """An integer network, and the `facts` of how it was made: method, frames, weight bits, float layers, version."""
+    """An integer network, and the `facts` of how it was made: method, frames, weight bits, float layers, version.
+
+    `float_constants`: by name, the weights and biases as they were before rounding.
+    """
 
     network: NetworkFile
     facts: dict[str, Any]
+    float_constants: Mapping[str, NDArray[Any]] = field(repr=False)
 
 
 @dataclass(frozen=True)
@@ -82,6 +86,7 @@ def quantise(
         raise BadInputError("quantise", f"no layer {', '.join(sorted(unknown))}", "names of layers to keep in float")
     limit_logits(plain, ranges)
     calibrated = _calibrated(plain, ranges, reduce_range, keep_float)
+    constants = _float_constants(plain, calibrated.model)
     quantised = insert_scales_and_zero_points(
         calibrated.model, calibrated.ranges, calibrated.overrides, reduce_range, keep_float
     )
@@ -96,7 +101,14 @@ def quantise(
         "float_layers": list(keep_float),
         "onnxruntime": onnxruntime.__version__,
     }
-    return Quantised(check_network(quantised, "quantised network"), facts)
+    return Quantised(check_network(quantised, "quantised network"), facts, constants)
+
+
+def _float_constants(plain: onnx.ModelProto, rounded: onnx.ModelProto) -> dict[str, NDArray[Any]]:
+    """The constants of float model `plain`; those that `rounded` has besides are biases that were 0."""
+    known = {name: numpy_helper.to_array(tensor) for name, tensor in constants_of(plain).items()}
+    added = {name: np.zeros(tensor.dims, np.float32) for name, tensor in constants_of(rounded).items()}
+    return added | known
 
 
 def _measured(model: onnx.ModelProto, frames: Sequence[F32], method: str) -> tuple[onnx.ModelProto, Any]:
@@ -107,7 +119,11 @@ def _measured(model: onnx.ModelProto, frames: Sequence[F32], method: str) -> tup
         onnx.save(model, source)
         quant_pre_process(source, prepared, skip_symbolic_shape=True)
         ranges = measure(prepared, frames, method, QUANTISED_OPERATORS)
-        return onnx.load(prepared), ranges
+        plain = onnx.load(prepared)
+        read_by_norms = norm_inputs(plain)
+        if read_by_norms:
+            widen(ranges, read_by_norms, measure(prepared, saturated(frames), method, QUANTISED_OPERATORS))
+        return plain, ranges
 
 
 def _calibrated(model: onnx.ModelProto, ranges: Any, reduce_range: bool, keep_float: Sequence[str]) -> _Calibrated:

@@ -1,0 +1,219 @@
+"""Predicts how far an integer network's picture is from the float network's, without running integers.
+
+Rule: the float network is computed with an error at every place where the integer network rounds or clips: uniform,
+of half a step to either side, for each stored tensor and each weight. The derivation is in docs/networks.md.
+
+Sources: uniform rounding error, Widrow & Kollar 2008, "Quantization Noise", chapter 4; prediction interval for one more
+draw, Hahn & Meeker 1991, "Statistical Intervals", section 4.2.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+from numpy.typing import NDArray
+from onnx import TensorProto, helper, numpy_helper
+
+from trilane.arrays import F32, U8
+from trilane.errors import BadInputError
+from trilane.training.quantising.power_of_two_scales import SHARING
+from trilane.training.quantising.quantise import Quantised
+
+DRAWS = 16
+#: Probability that one more draw is above the bound.
+RISK = 0.001
+#: Student's t with `DRAWS` - 1 degrees of freedom is above this with the probability `RISK`.
+STUDENT_T = 3.7328
+PROVIDERS = ["CPUExecutionProvider"]
+ERRORS_ONLY = 3
+PICTURE = 255
+#: Operators that keep multiples of a step multiples of it.
+KEEPS_STEPS = (*SHARING, "Relu", "Identity")
+#: Byte of a stored tensor: unsigned, 0 to 255.
+TOP = 255
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """A network in floats that rounds and clips where the integer network does.
+
+    `model`: reads the same bytes; its further inputs are the constants and the offset of each stored tensor's steps.
+    `constants`: name to the float value and the largest error of each element.
+    `offsets`: names of the inputs that are drawn from -½..½.
+    """
+
+    model: onnx.ModelProto = field(repr=False)
+    constants: Mapping[str, tuple[F32, NDArray[np.float64]]]
+    offsets: tuple[str, ...]
+
+    @cached_property
+    def _runner(self) -> Any:
+        return _session(self.model)
+
+    def pictures(self, tensor: U8, draws: int, seed: int) -> Iterator[F32]:
+        """`draws` pictures (N, H, W, 4), of 255, for the bytes `tensor` (N, H, W, C)."""
+        rng = np.random.default_rng(seed)
+        source = self.model.graph.input[0].name
+        for _ in range(draws):
+            feeds: dict[str, Any] = {source: tensor}
+            for name, (value, half) in self.constants.items():
+                feeds[name] = (value + half * rng.uniform(-1, 1, value.shape)).astype(np.float32)
+            for name in self.offsets:
+                feeds[name] = np.asarray(rng.uniform(-0.5, 0.5), np.float32)
+            yield PICTURE * self._runner.run(None, feeds)[0]
+
+
+def float_picture(model: onnx.ModelProto, quantised: Quantised, tensor: U8) -> F32:
+    """The float network's picture (N, H, W, 4), of 255, for the real numbers that `tensor` (N, H, W, C) stands for."""
+    encoding = quantised.network.input
+    real = (tensor.astype(np.float32) - encoding.zero_point) * np.float32(encoding.scale)
+    session = _session(model)
+    nchw = np.ascontiguousarray(real.transpose(0, 3, 1, 2))
+    picture: F32 = PICTURE * session.run(None, {session.get_inputs()[0].name: nchw})[0].transpose(0, 2, 3, 1)
+    return picture
+
+
+def predicted_bound(model: NoiseModel, wanted: F32, tensor: U8, seed: int = 0) -> tuple[float, float]:
+    """The expected mean absolute error of the picture, and the bound that one more draw keeps but for `RISK`.
+
+    `wanted`: the float network's picture (N, H, W, 4), of 255.
+    `tensor`: the bytes (N, H, W, C).
+    bound = m + t s sqrt(1 + 1/n), with m and s of n = `DRAWS` draws and `STUDENT_T`. Both in steps of 1/255.
+    """
+    errors = [float(np.abs(picture - wanted).mean()) for picture in model.pictures(tensor, DRAWS, seed)]
+    mean = float(np.mean(errors))
+    return mean, mean + STUDENT_T * float(np.std(errors, ddof=1)) * math.sqrt(1 + 1 / DRAWS)
+
+
+def noise_model(quantised: Quantised) -> NoiseModel:
+    """The noise model of an integer network. Raises BadInputError when a constant has no float value."""
+    graph = _Graph(quantised)
+    for node in quantised.network.model.graph.node:
+        graph.take(node)
+    return graph.finished()
+
+
+class _Graph:
+    """The graph of a noise model while it is written, node by node."""
+
+    def __init__(self, quantised: Quantised) -> None:
+        self.source = quantised.network.model.graph
+        self.values = {tensor.name: numpy_helper.to_array(tensor) for tensor in self.source.initializer}
+        self.floats = quantised.float_constants
+        #: Rounding alike leaves every second multiple of a scale unused, by weights and biases.
+        self.multiples = 2 if quantised.facts["rounds_alike"] else 1
+        self.makers = {name: node for node in self.source.node for name in node.output}
+        self.nodes: list[onnx.NodeProto] = []
+        self.constants: dict[str, tuple[F32, NDArray[np.float64]]] = {}
+        self.offsets: list[str] = []
+        self.limits: list[onnx.TensorProto] = []
+
+    def take(self, node: onnx.NodeProto) -> None:
+        """Write what stands for `node`."""
+        if node.op_type == "QuantizeLinear":
+            self._store(node)
+        elif node.op_type == "DequantizeLinear" and node.input[0] in self.values:
+            self._constant(node)
+        elif node.op_type == "DequantizeLinear" and node.input[0] != self.source.input[0].name:
+            self.nodes.append(helper.make_node("Identity", [node.input[0]], list(node.output)))
+        else:
+            self.nodes.append(node)
+
+    def _constant(self, node: onnx.NodeProto) -> None:
+        """A weight, bias or vector becomes an input that is drawn about its float value."""
+        stored, scale = self.values[node.input[0]], np.asarray(self.values[node.input[1]], np.float64)
+        axis = next((attribute.i for attribute in node.attribute if attribute.name == "axis"), 1)
+        if scale.ndim and stored.ndim:
+            scale = scale.reshape([-1 if side == axis else 1 for side in range(stored.ndim)])
+        exact_value = self._float_value(node.input[0].removesuffix("_quantized"), stored.shape)
+        half = np.broadcast_to(scale * self.multiples / 2, stored.shape)
+        # A weight of exactly 0 is stored exactly, if 0 is a multiple that weights may have: biases have odd ones.
+        exact = (exact_value == 0) & (stored == 0)
+        # Where they have none at 0, the error is always `half`: its variance is that of a uniform one sqrt(3) as wide.
+        farthest = (exact_value == 0) & (stored != 0)
+        self.constants[node.output[0]] = exact_value, np.where(exact, 0.0, np.where(farthest, 3**0.5, 1.0) * half)
+
+    def _float_value(self, name: str, shape: tuple[int, ...]) -> F32:
+        """The float constant `name`; ONNX Runtime numbers the copies of a bias that several layers read."""
+        originals = [known for known in self.floats if name.startswith(known) and f"0{name[len(known) :]}".isdigit()]
+        value = self.floats[max(originals, key=len)] if originals else None
+        if value is None or value.shape != shape:
+            raise BadInputError("noise model", f"constant {name!r}", "a constant of the float network")
+        return value.astype(np.float32)
+
+    def _store(self, node: onnx.NodeProto) -> None:
+        """A stored tensor is clipped; inside its range, if it rounds at all, it goes to shifted steps."""
+        x, y = node.input[0], node.output[0]
+        step, zero = float(self.values[node.input[1]]), int(self.values[node.input[2]])
+        low, high = (self._limit(f"{y}.{end}", (byte - zero) * step) for end, byte in (("low", 0), ("high", TOP)))
+        rounds = not self._is_multiple(x, step)
+        clipped = f"{y}.clipped" if rounds else y
+        self.nodes.append(helper.make_node("Clip", [x, low, high], [clipped]))
+        if rounds:
+            self._round(x, y, step, (low, high))
+
+    def _round(self, x: str, y: str, step: float, ends: tuple[str, str]) -> None:
+        """Inside the range and off 0, `y` = (round(`x` / step + offset) - offset) step: an error of +-½ step."""
+        step_name, none = self._limit(f"{y}.step", step), self._limit(f"{y}.none", 0.0)
+        offset = f"{y}.offset"
+        self.offsets.append(offset)
+        steps: tuple[tuple[str, list[str], str], ...] = (
+            ("Div", [x, step_name], "steps"),
+            ("Add", [f"{y}.steps", offset], "moved"),
+            ("Round", [f"{y}.moved"], "rounded"),
+            ("Sub", [f"{y}.rounded", offset], "back"),
+            ("Mul", [f"{y}.back", step_name], "real"),
+            ("Greater", [x, ends[0]], "above"),
+            ("Less", [x, ends[1]], "below"),
+            ("And", [f"{y}.above", f"{y}.below"], "inside"),
+            ("Equal", [x, none], "zero"),
+            ("Not", [f"{y}.zero"], "other"),
+            ("And", [f"{y}.inside", f"{y}.other"], "rounds"),
+        )
+        self.nodes.extend(helper.make_node(kind, inputs, [f"{y}.{output}"]) for kind, inputs, output in steps)
+        self.nodes.append(helper.make_node("Where", [f"{y}.rounds", f"{y}.real", f"{y}.clipped"], [y]))
+
+    def _limit(self, name: str, value: float) -> str:
+        self.limits.append(numpy_helper.from_array(np.asarray(value, np.float32), name))
+        return name
+
+    def _is_multiple(self, name: str, step: float) -> bool:
+        """Whether tensor `name` consists of multiples of `step` already."""
+        maker = self.makers.get(name)
+        if maker is None:
+            return False
+        if maker.op_type == "DequantizeLinear":
+            return float(np.ravel(self.values[maker.input[1]])[0]) == step
+        if maker.op_type not in KEEPS_STEPS:
+            return False
+        data = maker.input if maker.op_type in ("Concat", "Add") else maker.input[:1]
+        return all(self._is_multiple(source, step) for source in data)
+
+    def finished(self) -> NoiseModel:
+        """The model, with the constants and offsets as inputs."""
+        inputs = [
+            *(helper.make_tensor_value_info(n, TensorProto.FLOAT, v.shape) for n, (v, _) in self.constants.items()),
+            *(helper.make_tensor_value_info(name, TensorProto.FLOAT, []) for name in self.offsets),
+        ]
+        used = {name for node in self.nodes for name in node.input}
+        kept = [copy.deepcopy(tensor) for tensor in self.source.initializer if tensor.name in used]
+        source, target = self.source.input[0], self.source.output[0]
+        output = helper.make_tensor_value_info(target.name, TensorProto.FLOAT, None)
+        graph = helper.make_graph(self.nodes, "noise", [source, *inputs], [output], [*kept, *self.limits])
+        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+        return NoiseModel(model, self.constants, tuple(self.offsets))
+
+
+def _session(model: onnx.ModelProto) -> Any:
+    settings = onnxruntime.SessionOptions()
+    settings.log_severity_level = ERRORS_ONLY
+    settings.intra_op_num_threads = 1
+    return onnxruntime.InferenceSession(model.SerializeToString(), settings, providers=PROVIDERS)
