@@ -71,6 +71,8 @@ def test_a_bucket_worked_out_by_hand() -> None:
 def test_of_equal_waste_the_larger_bucket_is_chosen() -> None:
     for buckets in ([(64, 64), (96, 96), (32, 32)], [(96, 96), (64, 64)]):
         assert choose_bucket(Rect(-0.4, -0.4, 0.4, 0.4), (300, 300), buckets)[0] == (96, 96)
+    wide, tall = (64, 128), (100, 50)  # both waste half of themselves on a square; the wide one has more pixels
+    assert choose_bucket(Rect(-0.4, -0.4, 0.4, 0.4), (300, 300), [tall, wide])[0] == wide
 
 
 # --- cells -----------------------------------------------------------------------------------------------------------

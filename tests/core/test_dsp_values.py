@@ -451,6 +451,12 @@ def test_three_parts_in_a_row_give_the_bytes_of_the_whole(tiny_bundle: Path) -> 
     assert expected.payload.std() > 1
 
 
+@pytest.mark.parametrize("slots", [(None, 0), (0, None)])
+def test_inference_needs_both_slots(tiny_bundle: Path, slots: Any) -> None:
+    with pytest.raises(AssertionError):
+        InferStage(configured(tiny_bundle), load_bundle(tiny_bundle).read_network()).run(0, *slots)
+
+
 @pytest.mark.parametrize(("name", "at_once"), [("ort", 3), ("openvino", 3), ("cuda", 1), ("qnn", 1)])
 def test_networks_are_compiled_at_once_where_the_runtime_may(
     tiny_bundle: Path, monkeypatch: pytest.MonkeyPatch, name: str, at_once: int

@@ -333,7 +333,7 @@ model name\t: Other
 def test_the_first_cores_facts_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(machine_facts.Path, "read_text", lambda _self, **_: CPUINFO)
     monkeypatch.setattr(machine_facts.os, "cpu_count", lambda: 6)
-    monkeypatch.setattr(machine_facts.os, "sched_getaffinity", lambda _pid: {4, 1})
+    monkeypatch.setattr(machine_facts.os, "sched_getaffinity", lambda pid: {4, 1} if pid == 0 else set())
     monkeypatch.setattr(machine_facts.platform, "machine", lambda: "x86_64")
     assert machine_facts.cpu_facts() == {
         "model": "Some: CPU 3000",

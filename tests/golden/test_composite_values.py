@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from PIL import ImageFont
+from PIL import Image, ImageDraw, ImageFont
 
 from trilane.arrays import F64, U8
 from trilane.bench.lib import float_raster
@@ -253,7 +253,10 @@ def test_the_display_is_blended_at_its_corner(gl: Any, shape: tuple[int, int], m
     assert np.abs(canvas.read() - expected).max() <= 1
     assert np.array_equal(canvas.read()[:, :8], picture[:, :8])
     assert canvas.target.viewport == (0, 0, shape[1], shape[0])
-    assert display[0, 0].tolist() == [0, 0, 0, 150]
+    sheet = Image.new("RGBA", (232, 62), (0, 0, 0, 150))
+    text, font = "\n".join(lines), ImageFont.load_default(15)
+    ImageDraw.Draw(sheet).multiline_text((8, 3), text, (255, 255, 255, 255), font, spacing=3)
+    assert np.array_equal(display, np.asarray(sheet))
     assert display[..., :3].max() == 255 and display.shape == (62, 232, 4)
 
 
