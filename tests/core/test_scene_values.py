@@ -528,10 +528,11 @@ def test_what_is_filmed_is_boxed_in(body: ShapedBody) -> None:
 
 
 def test_a_built_in_camera_stays_and_a_placed_one_is_moved_with_its_path() -> None:
-    camera = path([rot.about(1, 0.4)], [[1.0, 2.0, 3.0]])
+    look = rot.about(0, 0.3) @ rot.about(1, 0.4)
+    camera = path([look], [[1.0, 2.0, 3.0]])
     turn, mount, shift = rot.about(1, 0.7), rot.about(0, 0.1), np.array([0.5, 0.0, -1.0])
     placed = PlacedCamera(camera, turn, shift, mount, ())
-    eye, axes = turn @ [1.0, 2.0, 3.0] + shift, turn @ rot.about(1, 0.4) @ mount
+    eye, axes = turn @ [1.0, 2.0, 3.0] + shift, turn @ look @ mount
     view = placed.sample(0.0)
     assert view[:3, :3] == pytest.approx(axes.T) and view[:3, 3] == pytest.approx(-axes.T @ eye)
     assert placed.projection(2.0) == pytest.approx(camera.projection(2.0))
