@@ -84,6 +84,8 @@ class Validation(Figures):
     `other_runtimes`: the figures of more runtimes, by name.
     `size`: tensor size, as `trilane run --size` takes it.
     `texture_filter`: of the neural texture.
+    More keys: `per_band`, views of each band and seed; `held_out`, motion to digest; `float`, figures of the network
+    before it was quantised, and `psnr_loss_db`, what quantising cost.
     """
 
     date: str = Field(default="", pattern=r"^(\d{4}-\d\d-\d\d)?$")

@@ -15,6 +15,7 @@ from typing import Any
 from trilane.avatars.bundle import DEFAULT, Bundle, bundle_folder
 from trilane.avatars.digests import digests_of
 from trilane.avatars.manifest import Validation
+from trilane.figure_sources import NO_FIGURES, from_validation
 
 #: Part of an avatar to its name in a sentence.
 PARTS = {
@@ -23,8 +24,6 @@ PARTS = {
     "network": "the network",
     "constants": "the manifest's constants (shape, expression, scales and zero points)",
 }
-#: `source` where no figure is shown.
-NO_FIGURES = "no figures"
 VALIDATE = "trilane avatar validate"
 
 
@@ -58,11 +57,19 @@ def accuracy_of(bundle: Bundle, drawn: DrawnAs) -> dict[str, Any]:
         how = f" --size {drawn.size} --runtime {drawn.runtime}" if drawn.avatars == 1 else ""
         return _no_figures(bundle, [], differs, how)
     return {
-        "source": source_of(validation),
+        "source": from_validation(validation.date),
         "runtime": drawn.runtime,
         "size": drawn.size,
         **own.model_dump(mode="json"),
     }
+
+
+def validation_facts(bundle: Bundle) -> dict[str, Any] | None:
+    """The whole validation with its `source`, or what `refused` says; None for an avatar that was never validated."""
+    validation = bundle.manifest.validation
+    if validation is None:
+        return None
+    return refused(bundle) or {"source": from_validation(validation.date), **validation.model_dump(mode="json")}
 
 
 def refused(bundle: Bundle) -> dict[str, Any]:
@@ -82,11 +89,6 @@ def refused(bundle: Bundle) -> dict[str, Any]:
         return {}
     names = " and ".join(PARTS[part] for part in changed)
     return _no_figures(bundle, changed, f"changed since the validation of {validation.date}: {names}")
-
-
-def source_of(validation: Validation) -> str:
-    """Where the figures of `validation` come from, in the words that every report has."""
-    return f"from the avatar's validation of {validation.date}"
 
 
 def _drawn_otherwise(validation: Validation, drawn: DrawnAs) -> str:

@@ -103,6 +103,7 @@ def validate(
             "date": datetime.now(UTC).date().isoformat(),
             "digests": digests,
             "size": plan.size,
+            "per_band": plan.per_band,
             "held_out": {Path(name).name: _origin(name) for name in plan.held_out},
             **_arranged(figures, plan.runtimes, float_network.name if float_network is not None else ""),
         }
