@@ -98,7 +98,9 @@ class Validation(Figures):
 
     def on(self, runtime: str) -> Figures | None:
         """The figures of `runtime`; None when nothing was painted on it."""
-        return (self.integer or self) if runtime == self.runtime else self.other_runtimes.get(runtime)
+        if runtime != self.runtime:
+            return self.other_runtimes.get(runtime)
+        return self.integer or Figures(psnr_db_by_band=self.psnr_db_by_band, iou=self.iou, ssim=self.ssim)
 
 
 class Manifest(_Model):

@@ -34,6 +34,7 @@ def own(tiny_bundle, tmp_path):
 
 def test_an_avatars_own_figures_are_shown_with_their_source(own):
     facts = accuracy_of(load_bundle(own), DRAWN)
+    assert facts.keys() == {"source", "runtime", "size", "psnr_db_by_band", "iou", "ssim"}
     assert facts["source"] == SOURCE
     assert (facts["runtime"], facts["size"]) == ("ort", "256")
     assert facts["psnr_db_by_band"] == {"full_body": PSNR_DB}
