@@ -103,8 +103,7 @@ def _accuracy(name: str, facts: Mapping[str, Any]) -> str:
 def _worst(facts: Mapping[str, Any]) -> str:
     if "worst" not in facts:
         return ""
-    seeds = f" of {len(facts['by_seed'])} seeds" if "by_seed" in facts else ""
-    return f"; worst of {facts['samples']} views{seeds} {facts['worst']['psnr_db']:.1f}"
+    return f"; worst of {facts['samples']} views (seeds {', '.join(facts['by_seed'])}) {facts['worst']['psnr_db']:.1f}"
 
 
 def _stage_rows(runs: Sequence[Report | Baseline]) -> Rows:
