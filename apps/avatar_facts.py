@@ -1,6 +1,7 @@
 """What a bundle and a network are, as plain data for people and for JSON.
 
-Rule: every figure is read from the files or from the manifest, which says how it was measured.
+Rule: every figure is read from the files or from the manifest, which says how it was measured; the manifest's figures
+are left out where the files are not those that were validated.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from typing import Any
 
 from trilane.avatars.bundle import Bundle
 from trilane.avatars.integer_network import NetworkFile
+from trilane.avatars.validation import validation_facts
 from trilane.body.body import load_body
 from trilane.hw_profiles.network_work import graph_facts
 
@@ -32,7 +34,7 @@ def bundle_facts(bundle: Bundle) -> dict[str, Any]:
         "quantisation": manifest.quantisation,
         "provenance": manifest.provenance,
         "training_command": manifest.training_command,
-        "validation": manifest.validation.model_dump() if manifest.validation else None,
+        "validation": validation_facts(bundle),
     }
 
 

@@ -14,6 +14,7 @@ from typing import Any, Literal
 from pydantic import Field, ValidationError
 from pydantic_core import from_json
 
+from trilane.apps.report_sources import sources_of
 from trilane.errors import BadInputError
 from trilane.hw_profiles.host import sensor_c
 from trilane.pipeline.result import RunResult
@@ -192,7 +193,8 @@ class Report(RunMetrics, Preamble):
     `failure`: why it ended early, null when it did not.
     `baseline`: the `sequential` run of the same scene, null when there was none.
     `pace`: of a run at a chip's pace.
-    `accuracy`: of each avatar, `validation` of its manifest; empty when it was never validated.
+    `accuracy`: of each avatar, what `trilane.avatars.validation.accuracy_of` says: its figures, or why there are none.
+    `sources`: key, dotted where it is inside another, to where the figures below it come from; the longest key decides.
     `notes`: the format that each opened file was read as, and what was chosen for the run.
     `video`: null when no frame was recorded.
     `checksum`: SHA-256 over the presented pictures, null when none was recorded.
@@ -210,6 +212,7 @@ class Report(RunMetrics, Preamble):
     baseline: Baseline | None
     pace: PaceComparison | None = None
     accuracy: dict[str, dict[str, Any]] = Field(default={})
+    sources: dict[str, str] = Field(default={})
     notes: tuple[str, ...] = ()
     video: Video | None
     checksum: str | None
@@ -250,7 +253,7 @@ def build_report(
         "baseline": baseline and _compared(baseline.report),
         **facts,
     }
-    return Report.model_validate(document)
+    return Report.model_validate(document | {"sources": sources_of(document)})
 
 
 def _compared(metrics: RunMetrics) -> Baseline:

@@ -15,12 +15,13 @@ import numpy as np
 import onnx
 from numpy.typing import NDArray
 
+from trilane.avatars.digests import digests_of
 from trilane.avatars.integer_network import MAX_SIDE, Affine, NetworkFile
 from trilane.avatars.manifest import ByteRange, Manifest, parse_manifest
 from trilane.avatars.network_file import read_network
 from trilane.errors import BadInputError
 from trilane.files import read_npz, read_text, require_file
-from trilane.writing import write_folder
+from trilane.writing import write_bytes, write_folder
 
 MANIFEST = "manifest.json"
 DEFAULT = "default"
@@ -88,6 +89,8 @@ def write_bundle(
 ) -> None:
     """Write a bundle beside `folder`, read it back, then put its files in `folder`.
 
+    A validation of other parts than these is left out of the manifest.
+
     `folder`: of the bundle; made when it does not exist.
     `manifest`: its content.
     `body`: an .npz file to copy.
@@ -103,10 +106,26 @@ def write_bundle(
         )
         np.savez_compressed(draft / manifest.texture, **arrays)
         onnx.save(network.model, draft / manifest.network.file)
-        (draft / MANIFEST).write_text(manifest.model_dump_json(indent=1) + "\n", encoding="utf-8")
+        (draft / MANIFEST).write_bytes(_content(_with_own_validation(manifest, draft)))
         bundle = load_bundle(draft)
         bundle.read_texture()
         bundle.read_network()
+
+
+def write_manifest(folder: Path, manifest: Manifest) -> None:
+    """Put `manifest` in place of that of the bundle in `folder`, whole or not at all. Raises BadInputError."""
+    write_bytes(folder / MANIFEST, _content(manifest))
+
+
+def _content(manifest: Manifest) -> bytes:
+    return (manifest.model_dump_json(indent=1) + "\n").encode()
+
+
+def _with_own_validation(manifest: Manifest, folder: Path) -> Manifest:
+    """`manifest`, without its validation where that is not of the files in `folder`."""
+    validation = manifest.validation
+    own = validation is not None and validation.digests == digests_of(folder, manifest)
+    return manifest if own else manifest.model_copy(update={"validation": None})
 
 
 def _check_inside(folder: Path, file: str, where: str) -> None:

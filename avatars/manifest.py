@@ -1,4 +1,4 @@
-"""The manifest of an avatar: name, files, scale and zero point of the network's bytes, and how it was trained.
+"""The manifest of an avatar: name, files, scale and zero point of the network's bytes, training and validation.
 
 Rule: every number has a range and every key is known, so what is read needs no further check.
 """
@@ -19,6 +19,7 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 #: A shape or expression coefficient in standard deviations; values outside describe no human body.
 Coefficient = Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)]
 FileName = Annotated[str, Field(min_length=1, max_length=200)]
+Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
 class _Model(BaseModel):
@@ -47,14 +48,59 @@ class NetworkEntry(_Model):
     output: ByteRange = ByteRange(scale=1 / 255, zero_point=0)
 
 
-class Validation(_Model):
-    """Image error on poses and views that were not trained on: PSNR in dB inside the mask's box, IoU and SSIM."""
+class Digests(_Model):
+    """SHA-256, hexadecimal, of all that an avatar's pictures depend on.
+
+    `body`, `texture`, `network`: of the bytes of those files. `constants`: of the manifest's numbers, which are shape,
+    expression, and the scales and zero points of the network's bytes.
+    """
+
+    body: Sha256
+    texture: Sha256
+    network: Sha256
+    constants: Sha256
+
+
+class Figures(_Model):
+    """Image error of one network on one runtime, on poses and views that were not trained on.
+
+    `psnr_db_by_band`: in dB, inside the box of the true mask. `iou`, `ssim`: means. More keys: see `summary` of
+    `training/error_summary.py`.
+    """
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
     psnr_db_by_band: dict[Literal["far", "full_body", "upper_body", "face"], Finite]
     iou: float = Field(ge=0, le=1)
     ssim: float = Field(ge=-1, le=1)
+
+
+class Validation(Figures):
+    """The figures of an avatar, and what they are of.
+
+    `date`: of the validation, YYYY-MM-DD, UTC.
+    `digests`: of what was validated; None in a manifest that an older Trilane wrote.
+    `runtime`: on which the pictures of `integer` were painted, whose errors stand at the top too.
+    `other_runtimes`: the figures of more runtimes, by name.
+    `size`: tensor size, as `trilane run --size` takes it.
+    `texture_filter`: of the neural texture.
+    More keys: `per_band`, views of each band and seed; `held_out`, motion to digest; `float`, figures of the network
+    before it was quantised, and `psnr_loss_db`, what quantising cost.
+    """
+
+    date: str = Field(default="", pattern=r"^(\d{4}-\d\d-\d\d)?$")
+    digests: Digests | None = None
+    runtime: str = ""
+    size: str = ""
+    texture_filter: str = "linear"
+    integer: Figures | None = None
+    other_runtimes: dict[str, Figures] = {}
+
+    def on(self, runtime: str) -> Figures | None:
+        """The figures of `runtime`; None when nothing was painted on it."""
+        if runtime != self.runtime:
+            return self.other_runtimes.get(runtime)
+        return self.integer or Figures(psnr_db_by_band=self.psnr_db_by_band, iou=self.iou, ssim=self.ssim)
 
 
 class Manifest(_Model):

@@ -26,6 +26,18 @@ def read_network(path: Path) -> NetworkFile:
 
 def parse_network(path: Path) -> onnx.ModelProto:
     """The ONNX model in the file, of any kind, with external data read in. Raises BadInputError when unreadable."""
+    model = _parse(path)
+    _load_external(model, path)
+    return model
+
+
+def network_files(path: Path) -> list[Path]:
+    """The ONNX file itself, then every file beside it that holds tensors of it. Raises BadInputError."""
+    kept = {_external_file(tensor, path) for tensor in _external_tensors(_parse(path))}
+    return [path, *sorted(kept)]
+
+
+def _parse(path: Path) -> onnx.ModelProto:
     try:
         size = path.stat().st_size
         if not 0 < size <= MAX_BYTES:
@@ -41,29 +53,34 @@ def parse_network(path: Path) -> onnx.ModelProto:
         raise BadInputError(
             path, "no nodes or no operator set", "an ONNX network", "copy it again: it may be cut short"
         )
-    _load_external(model, path)
     return model
 
 
 def _load_external(model: onnx.ModelProto, path: Path) -> None:
-    folder = path.parent.resolve()
-    for tensor in _tensors(model):
-        if tensor.data_location != TensorProto.EXTERNAL:
-            continue
-        entry = {pair.key: pair.value for pair in tensor.external_data}
-        file = (folder / entry.get("location", "")).resolve()
-        if folder not in file.parents:
-            raise BadInputError(
-                path, f"tensor {tensor.name!r} kept in {file}", f"data inside {folder}", "move it there"
-            )
-        if not file.is_file() or file.stat().st_size > MAX_BYTES:
-            raise BadInputError(path, f"tensor {tensor.name!r} kept in {file}", "a file of the network's folder")
+    for tensor in _external_tensors(model):
+        file = _external_file(tensor, path)
         try:
-            external_data_helper.load_external_data_for_tensor(tensor, str(folder))
+            external_data_helper.load_external_data_for_tensor(tensor, str(path.parent.resolve()))
         except (OSError, ValueError, onnx.checker.ValidationError) as error:
             raise BadInputError(path, f"tensor {tensor.name!r} in {file}: {reason(error)}", "readable data") from error
         tensor.data_location = TensorProto.DEFAULT
         del tensor.external_data[:]
+
+
+def _external_file(tensor: TensorProto, path: Path) -> Path:
+    """The file that holds the data of `tensor`, of the network in `path`. Raises BadInputError when it may not be."""
+    folder = path.parent.resolve()
+    entry = {pair.key: pair.value for pair in tensor.external_data}
+    file: Path = (folder / entry.get("location", "")).resolve()
+    if folder not in file.parents:
+        raise BadInputError(path, f"tensor {tensor.name!r} kept in {file}", f"data inside {folder}", "move it there")
+    if not file.is_file() or file.stat().st_size > MAX_BYTES:
+        raise BadInputError(path, f"tensor {tensor.name!r} kept in {file}", "a file of the network's folder")
+    return file
+
+
+def _external_tensors(model: onnx.ModelProto) -> list[TensorProto]:
+    return [tensor for tensor in _tensors(model) if tensor.data_location == TensorProto.EXTERNAL]
 
 
 def _tensors(model: onnx.ModelProto) -> Iterator[TensorProto]:

@@ -19,6 +19,7 @@ from trilane.bench.lib.fixture import standing
 from trilane.bench.lib.ground_truth import ground_truth
 from trilane.bench.lib.timing import interleaved_ms, summary_ms
 from trilane.errors import BadInputError
+from trilane.figure_sources import MEASURED
 from trilane.shapes import BUCKET_STEP
 from trilane.stages.dsp.runtime import RuntimeOptions, load_runtime
 from trilane.stages.gpu.opengl_context import describe
@@ -33,7 +34,8 @@ def measure(sizes: tuple[int, ...] = (64, 128, 256, 512), repeats: int = 20) -> 
     """The default avatar, standing, in square tensors of `sizes`, read with every filter of the packed pass.
 
     Keys: `rows`, one per size and filter: `raster_ms` (median), `steps_mean` (mean difference from `linear` over the
-    body's bytes), `psnr_db` (of the painted picture; the network was trained with `linear`); `driver`; `config`.
+    body's bytes), `psnr_db` (of the painted picture; the network was trained with `linear`); `sources`; `driver`;
+    `config`.
 
     Raises BadInputError, MissingPartError.
     """
@@ -45,6 +47,7 @@ def measure(sizes: tuple[int, ...] = (64, 128, 256, 512), repeats: int = 20) -> 
     rows = [row for side in sizes for row in fixture.rows((side, side), repeats)]
     return {
         "rows": rows,
+        "sources": {"rows": MEASURED},
         "driver": asdict(describe(fixture.ctx)),
         "config": {"sizes": list(sizes), "repeats": repeats},
     }

@@ -32,7 +32,6 @@ SEQUENTIAL = "sequential"
 MIN_FRAMES = 20
 ALONE = 16  # frames of each run that are measured isolated
 PACE = 1.25  # of the slowest unit's rate: paced policies always get more frames than they can present
-NO_ACCURACY = "untrained: its pictures mean nothing, it is here for its work"
 
 
 @dataclass(frozen=True)
@@ -68,7 +67,8 @@ def measure(
     stages isolated (`all_alone_ms`) and the hand-overs of those sequential runs, and max(t) the slowest unit's stages.
     `gain_of_bound`: one over the other; `of_bound_low`, `of_bound_high`: the 95 % interval of its median (with fewer
     than six rounds the least and largest). `hops_ms`: what a sequential run takes for a frame beyond its stages.
-    `dropped`, `lost`: frames of all rounds. `accuracy`: the error of the avatar's pictures.
+    `dropped`, `lost`: frames of all rounds. `accuracy`: the error of the avatar's pictures and its
+    source, or why there are no figures.
 
     Raises BadInputError, MissingPartError, TrilaneError when a run fails.
     """
@@ -79,7 +79,8 @@ def measure(
     rows: list[dict[str, Any]] = []
     accuracy: dict[str, Any] = {}
     for name, tensor_size, count in product(avatar, size, cores):
-        checked, accuracy[name] = _config(name, tensor_size, count, frames, runtime, video=video)
+        checked = _config(name, tensor_size, count, frames, runtime, video=video)
+        accuracy[name if len(size) == 1 else f"{name} at {tensor_size}"] = next(iter(checked.accuracy.values()))
         settings = [Setting(name, tensor_size, count, *pair) for pair in _pairs(policy, edge)]
         rows += _measure_rounds(checked, settings, rounds)
     facts = {"frames": frames, "rounds": rounds, "runtime": checked.config.runtime, "video": video}
@@ -113,12 +114,11 @@ def _pairs(policies: Sequence[str], edges: Sequence[str]) -> list[tuple[str, str
     return [(SEQUENTIAL, "double"), *(pair for pair in product(policies, edges) if pair != (SEQUENTIAL, "double"))]
 
 
-def _config(avatar: str, size: str, cores: int, frames: int, runtime: str, *, video: bool) -> tuple[Checked, Any]:
+def _config(avatar: str, size: str, cores: int, frames: int, runtime: str, *, video: bool) -> Checked:
     folder = str(full_width.full_width_bundle()) if avatar == full_width.NAME else avatar
     checked = configure(Request(size=size, avatar=folder, frames=frames, runtime=runtime), Path.cwd())
     units = host_units(usable_cores()[:cores])
-    accuracy = next(iter(checked.accuracy.values())) or NO_ACCURACY
-    return checked.changed(units=units, record=video), accuracy
+    return checked.changed(units=units, record=video)
 
 
 def _run_round(checked: Checked, settings: list[Setting]) -> list[dict[str, Any]]:

@@ -20,6 +20,7 @@ from trilane.bench.lib.drawable import load_drawable
 from trilane.bench.lib.ground_truth import ground_truth, shaped_body
 from trilane.body.kinematics import Skeleton
 from trilane.errors import BadInputError
+from trilane.figure_sources import MEASURED
 from trilane.scene.schema import AvatarSpec, Scene
 from trilane.scene.staging import stage_scene
 from trilane.shapes import Shape, shape_buckets
@@ -62,8 +63,8 @@ def measure(
 
     Keys: `rows`, one per margin in tensor pixels: `loss_db_median`, `loss_db_worst` (PSNR of an avatar on its own in
     its cell minus PSNR with its neighbours), `psnr_db_alone` (on its own, median), `bytes_mean`, `bytes_max`
-    (difference of the two pictures inside the cell), `cell_height` (median, tensor pixels); `bound_db`; `margin_px` (of
-    the pipeline); `config`.
+    (difference of the two pictures inside the cell), `cell_height` (median, tensor pixels); `sources`; `bound_db`;
+    `margin_px` (of the pipeline); `config`.
 
     Raises BadInputError, MissingPartError.
     """
@@ -87,7 +88,8 @@ def measure(
             }
         )
     config = {"avatars": avatars, "views": views, "size": size, "output": list(OUTPUT)}
-    return {"rows": rows, "bound_db": BOUND_DB, "margin_px": MARGIN_PX, "config": config}
+    sources = {"rows": MEASURED}
+    return {"rows": rows, "sources": sources, "bound_db": BOUND_DB, "margin_px": MARGIN_PX, "config": config}
 
 
 class _CrowdFixture:

@@ -6,6 +6,7 @@ input ends the command before a process is started or a file is made.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,9 +14,10 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from trilane.avatars.bundle import Bundle, load_bundle
+from trilane.avatars.bundle import load_bundle
 from trilane.avatars.integer_network import NetworkFile
 from trilane.avatars.network_split import split
+from trilane.avatars.validation import DrawnAs, accuracy_of
 from trilane.errors import BadInputError, MissingPartError
 from trilane.hw_profiles.host import host_units
 from trilane.hw_profiles.load import HOST, load_profile
@@ -25,7 +27,7 @@ from trilane.pipeline.shared_assets import Assets
 from trilane.scene.load import find_scene, load_scene, located, scene_from
 from trilane.scene.schema import Scene
 from trilane.scene.staging import stage_scene
-from trilane.stages.avatar_assets import load_avatar, pack_assets, require_one_tensor
+from trilane.stages.avatar_assets import AvatarData, load_avatar, pack_assets, require_one_tensor
 from trilane.stages.config import NetworkCut, RunConfig
 from trilane.stages.dsp.runtime import RUNTIMES, installed, resolve
 from trilane.stages.machine_facts import gl_facts, machine_facts
@@ -58,7 +60,7 @@ class Checked:
     """A configuration that can be run.
 
     `assets`: what was loaded to check it, as the units take it. `notes`: what the loads said of their sources.
-    `accuracy`: of each avatar, by its name, the figures of its validation.
+    `accuracy`: of each avatar, by its name, what `accuracy_of` says of it.
     """
 
     config: RunConfig
@@ -116,7 +118,8 @@ def configure(request: Request, out_dir: Path, gl: GlFacts = gl_facts) -> Checke
         cuts=cuts,
     )
     notes = (*staged.notes, f"runtime: {runtime} ({reason})", f"skinning: {unit} unit ({why})")
-    accuracy = {avatar.bundle.manifest.name: _accuracy(avatar.bundle) for avatar in avatars.values()}
+    drawn = DrawnAs(runtime, scene.size, scene.texture_filter, len(scene.avatars))
+    accuracy = _accuracy(list(avatars.values()), drawn)
     return Checked(config, pack_assets(list(avatars.values()), staged), notes, accuracy)
 
 
@@ -149,10 +152,16 @@ def _check_background(scene: Scene) -> None:
         open_background(Path(scene.background), (scene.output.height, scene.output.width), scene.fps).close()
 
 
-def _accuracy(bundle: Bundle) -> dict[str, Any]:
-    """The error of the avatar's pictures as its manifest has it; empty when it was never validated."""
-    validation = bundle.manifest.validation
-    return {} if validation is None else validation.model_dump(mode="json")
+def _accuracy(avatars: Sequence[AvatarData], drawn: DrawnAs) -> dict[str, Any]:
+    """Of each avatar what may be said of its pictures' error; avatars of one name are told apart by their folders."""
+    bundles = [avatar.bundle for avatar in avatars]
+    names = Counter(bundle.manifest.name for bundle in bundles)
+    return {
+        bundle.manifest.name if names[bundle.manifest.name] == 1 else f"{bundle.manifest.name} in {bundle.folder}": (
+            accuracy_of(bundle, drawn)
+        )
+        for bundle in bundles
+    }
 
 
 def skinning_unit(asked: str, gl: GlFacts = gl_facts) -> tuple[str, str]:

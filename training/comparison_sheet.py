@@ -1,9 +1,11 @@
-"""The sheet that compares pictures: ground truth, float network and integer network side by side.
+"""Sheets that compare pictures: the ground truth and what each painter made of it, side by side.
 
-Rule: one row per band with two samples, those of median and of upper-quartile PSNR, all pictures over mid-grey.
+Rule: all pictures are over mid-grey, and none is enlarged.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,17 +18,29 @@ from trilane.training.sample_renderer import BAND_NAMES
 SHEET_CELL = (256, 192)
 
 
-def comparison_sheet(floats: list[Evaluated], integers: list[Evaluated]) -> NDArray[np.uint8]:
-    """The sheet, (height, width, 3) uint8, of the same samples painted by both networks."""
+def comparison_sheet(samples: Sequence[Evaluated], painters: Sequence[str]) -> NDArray[np.uint8]:
+    """Rows of bands, two samples each: those of median and of upper-quartile PSNR by the last of `painters`.
+
+    Returns (height, width, 3) uint8.
+    """
     rows = []
     for band in BAND_NAMES:
-        places = [place for place, sample in enumerate(integers) if sample.band == band]
-        by_error = sorted(places, key=lambda place: integers[place].error.psnr_db)
-        cells = []
-        for place in (by_error[len(by_error) // 2], by_error[-len(by_error) // 4]):
-            cells += [floats[place].truth, floats[place].picture, integers[place].picture]
-        rows.append(np.hstack([_cell(picture) for picture in cells]))
+        by_error = sorted(
+            (sample for sample in samples if sample.band == band), key=lambda s: s.errors[painters[-1]].psnr_db
+        )
+        chosen = (by_error[len(by_error) // 2], by_error[-len(by_error) // 4])
+        rows.append(np.hstack([_cells(sample, painters) for sample in chosen]))
     return np.vstack(rows)
+
+
+def worst_sheet(samples: Sequence[Evaluated], painters: Sequence[str]) -> NDArray[np.uint8]:
+    """A row for each of `samples`: (height, width, 3) uint8."""
+    return np.vstack([_cells(sample, painters) for sample in samples])
+
+
+def _cells(sample: Evaluated, painters: Sequence[str]) -> NDArray[np.uint8]:
+    """The ground truth and the pictures of `painters` side by side."""
+    return np.hstack([_cell(picture) for picture in (sample.truth, *(sample.pictures[name] for name in painters))])
 
 
 def _cell(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:

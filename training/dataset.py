@@ -25,6 +25,8 @@ from trilane.training.sample_renderer import BAND_NAMES, PoseSource, Sample, Sam
 TRAINING_SHARE = {"far": 0.16, "full_body": 0.34, "upper_body": 0.22, "face": 0.16, "anywhere": 0.12}
 #: Share of each tensor size among the training samples: the default size, and half its side for avatars far away.
 SIZES = {"256": 0.85, "128": 0.15}
+#: Tensor size of validation samples.
+VALIDATION_SIZE = "256"
 #: Samples that a process renders at a time.
 PART = 50
 
@@ -56,17 +58,20 @@ def plan_training(renderer: SampleRenderer, count: int, seed: int, track: Callab
     ]
 
 
-def plan_validation(renderer: SampleRenderer, per_band: int, seed: int, motions: Sequence[Motion]) -> list[Sample]:
-    """Samples for validation, all of the default tensor size.
+def plan_validation(
+    renderer: SampleRenderer, per_band: int, seed: int, motions: Sequence[Motion], size: str = VALIDATION_SIZE
+) -> list[Sample]:
+    """Samples for validation, all of one tensor size.
 
     `renderer`: plans each sample.
     `per_band`: samples of each band.
     `seed`: of all random numbers.
     `motions`: where the poses come from; no training sample uses them.
+    `size`: the tensor size, as `shape_buckets` takes it.
     """
     source = motion_poses(motions)
     return [
-        renderer.plan((seed, 2, number, index), source, band, "256")
+        renderer.plan((seed, 2, number, index), source, band, size)
         for index, band in enumerate(BAND_NAMES)
         for number in range(per_band)
     ]

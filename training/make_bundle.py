@@ -1,6 +1,6 @@
-"""From trained weights to an avatar's bundle: quantise network and texture, evaluate both networks, write the files.
+"""From trained weights to an avatar's bundle: quantise network and texture, write the files.
 
-Rule: every error in the manifest is measured here, on the content of the files that are written.
+Rule: what is written was never validated; `validate` measures the files themselves.
 """
 
 from __future__ import annotations
@@ -14,18 +14,15 @@ import torch
 from numpy.typing import NDArray
 
 from trilane.avatars.bundle import write_bundle
-from trilane.avatars.manifest import Manifest, Validation, network_entry
+from trilane.avatars.manifest import Manifest, network_entry
 from trilane.avatars.network_reshape import reshaped
 from trilane.body.body import ShapedBody
 from trilane.training.body_arrays import body_arrays
-from trilane.training.comparison_sheet import comparison_sheet
-from trilane.training.evaluate import evaluate, float_painter, integer_painter, summary
 from trilane.training.first_texture import used_texels
 from trilane.training.neural_texture import read_texture
 from trilane.training.onnx_export import export_onnx
 from trilane.training.quantising.quantise import Quantised, quantise
 from trilane.training.sample_files import U16, ShapeGroup
-from trilane.training.sample_renderer import BAND_NAMES, Sample, SampleRenderer
 from trilane.training.trainable_avatar import TrainableAvatar
 
 INT8_MAX = 127
@@ -44,15 +41,6 @@ class QuantisedAvatar:
     network: Quantised
     texture: NDArray[np.int8]
     scale: NDArray[np.float32]
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """`float_errors`, `integer_errors`: `summary` of each network. `sheet`: truth, float, integer side by side."""
-
-    float_errors: dict[str, Any]
-    integer_errors: dict[str, Any]
-    sheet: NDArray[np.uint8]
 
 
 def byte_texture(avatar: TrainableAvatar, shaped: ShapedBody) -> tuple[NDArray[np.int8], NDArray[np.float32]]:
@@ -86,28 +74,10 @@ def quantise_avatar(
     return QuantisedAvatar(integer_network(avatar, groups, seed), texture, scale)
 
 
-def evaluate_avatar(
-    avatar: TrainableAvatar, quantised: QuantisedAvatar, renderer: SampleRenderer, held_out: list[Sample], threads: int
-) -> Evaluation:
-    """Evaluate the avatar on samples it was not trained on, in float and in integers.
-
-    `avatar`: the trained weights.
-    `quantised`: the same avatar in integers.
-    `renderer`: renders the samples.
-    `held_out`: the samples.
-    `threads`: of the integer network's runtime.
-    """
-    texture = quantised.texture.astype(np.float32) * quantised.scale
-    floats = evaluate(renderer, held_out, float_painter(avatar))
-    integers = evaluate(renderer, held_out, integer_painter(renderer, quantised.network.network, texture, threads))
-    return Evaluation(summary(floats), summary(integers), comparison_sheet(floats, integers))
-
-
 def write_avatar(
     folder: Path,
     body: Path,
     quantised: QuantisedAvatar,
-    evaluation: Evaluation,
     width: int,
     provenance: dict[str, Any],
     names: dict[str, str],
@@ -117,21 +87,16 @@ def write_avatar(
     `folder`: of the bundle.
     `body`: the body file.
     `quantised`: network and texture.
-    `evaluation`: the errors that go into the manifest.
     `width`: of the network; 64 is full.
     `provenance`: how the avatar was trained.
     `names`: `name` and `training_command` of the manifest.
     """
-    floats, integers = evaluation.float_errors, evaluation.integer_errors
-    errors = {key: integers[key] for key in ("psnr_db_by_band", "iou", "ssim")}
-    loss = {band: round(floats["psnr_db_by_band"][band] - integers["psnr_db_by_band"][band], 2) for band in BAND_NAMES}
     manifest = Manifest(
         name=names["name"],
         network=network_entry(quantised.network.network, "resnet18", "batch", width),
         provenance=provenance,
         training_command=names["training_command"],
         quantisation=quantised.network.facts,
-        validation=Validation.model_validate(errors | {"float": floats, "integer": integers, "psnr_loss_db": loss}),
     )
     write_bundle(folder, manifest, body, quantised.texture, quantised.network.network, quantised.scale)
 

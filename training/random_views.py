@@ -47,6 +47,12 @@ class View:
     projection: F64
     aspect: float
 
+    @property
+    def near_reach_m(self) -> float:
+        """Metres from the camera to a corner of its near plane: what stands farther off is not cut by that plane."""
+        half_height = 1 / self.projection[1, 1]
+        return NEAR_M * float(np.sqrt(1 + half_height**2 * (1 + self.aspect**2)))
+
 
 def random_view(rng: np.random.Generator, band: str, joints: F64) -> View:
     """A random camera of `band` (a name of `BANDS`, or `anywhere`) for a body with `joints` (55,3) in world metres."""

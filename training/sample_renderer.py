@@ -1,6 +1,7 @@
 """Renders one sample of the training: the UV image of the default body and the picture of it clothed.
 
-Rule: crop, tensor shape and both rasters are the pipeline's; a sample depends only on its seed.
+Rule: crop, tensor shape and both rasters are the pipeline's; a sample depends only on its seed; no near plane cuts the
+body or its clothes.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from trilane.stages.gpu.mesh_arrays import mesh_arrays
 from trilane.stages.gpu.opengl_context import open_context
 from trilane.stages.gpu.skinned_mesh import SkinnedMesh
 from trilane.training.body_arrays import body_arrays
+from trilane.training.clear_view import ClothedSurface
 from trilane.training.clothing.clothed_body import ClothedBody
 from trilane.training.clothing.landmarks import find_landmarks
 from trilane.training.clothing.layers import clothing_layers
@@ -65,10 +67,12 @@ class SampleRenderer:
         self.ctx = open_context(threads)
         self.mesh = SkinnedMesh(self.ctx, mesh)
         self._uv = UvRaster(self.ctx, self.mesh)
-        self.clothed_body = ClothedBody(self.ctx, clothing_layers(arrays, landmarks), landmarks, samples)
+        layers = clothing_layers(arrays, landmarks)
+        self._surface = ClothedSurface(layers)
+        self.clothed_body = ClothedBody(self.ctx, layers, landmarks, samples)
 
     def plan(self, seed: Sequence[int], source: PoseSource, band: str, size: str) -> Sample:
-        """The sample of `seed`: draws views until enough of the body is on the screen.
+        """The sample of `seed`: draws views until enough of the body is on the screen and none of it is cut.
 
         `seed`: numbers that alone decide the sample.
         `source`: draws the pose.
@@ -78,8 +82,11 @@ class SampleRenderer:
         rng = np.random.default_rng(seed)
         pose = source(rng)
         posed = self.skeleton.pose(pose)
+        points = self._surface.posed(posed)
         while True:
             view = random_view(rng, band, posed.joints)
+            if not self._surface.is_clear_of(view, points):
+                continue
             crop = self.cropper.crop(posed, view, shape_buckets(size))
             if crop is not None and crop.pixels >= LEAST_PIXELS:
                 return Sample(pose, view, crop, BAND_NAMES.index(band) if band in BANDS else ANYWHERE)

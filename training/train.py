@@ -22,26 +22,38 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from trilane.avatars.bundle import bundle_folder, load_bundle
+from trilane.avatars.manifest import Validation
 from trilane.body.body import ShapedBody, load_body
 from trilane.errors import BadInputError, TrilaneError
-from trilane.scene.motion.load import load_motion
-from trilane.scene.schema import AvatarSpec
 from trilane.training.body_arrays import body_arrays
-from trilane.training.dataset import plan_training, plan_validation, write_dataset
+from trilane.training.comparison_sheet import comparison_sheet
+from trilane.training.dataset import plan_training, write_dataset
+from trilane.training.evaluate import Evaluated
 from trilane.training.first_texture import first_texture
-from trilane.training.make_bundle import evaluate_avatar, quantise_avatar, write_avatar
+from trilane.training.float_painter import float_painter
+from trilane.training.make_bundle import quantise_avatar, write_avatar
 from trilane.training.network import UNet
 from trilane.training.neural_texture import SIDES, NeuralTexture
 from trilane.training.sample_files import open_groups
-from trilane.training.sample_renderer import Sample, SampleRenderer
+from trilane.training.sample_renderer import SampleRenderer
 from trilane.training.trainable_avatar import TrainableAvatar
 from trilane.training.training_loop import FitConfig, fit
+from trilane.training.validate import (
+    BUILTIN_HELD_OUT,
+    FLOAT,
+    PER_BAND,
+    SEEDS,
+    FloatNetwork,
+    ValidationPlan,
+    held_out_motions,
+    revalidate,
+    validate,
+)
 from trilane.training.weights_file import load_avatar, load_network, save_avatar, save_network
 
 CHANNELS = 16
 CHECKPOINT, FINAL, NETWORK = "checkpoint.npz", "final.npz", "network.npz"
 FACTS, TRAINING = "dataset.json", "training"
-BUILTIN_HELD_OUT = "builtin:walk-wave-turn"
 #: Settings of `FitConfig` for a training that starts from a network, and for one that also has a trained texture.
 KNOWN_NETWORK: dict[str, Any] = {"small_until": 0.0, "freeze_norms_at": 0.3}
 RESUMED: dict[str, Any] = {
@@ -59,7 +71,7 @@ class TrainConfig:
 
     `body`: the body file. `out`: folder of the bundle. `name`: of the avatar. `work`: folder of data set and weights.
     `sheet`: picture file that compares held-out samples; None for none.
-    `minutes`: of training. `samples`: of the training set. `per_band`: validation samples of each band.
+    `minutes`: of training. `samples`: of the training set. `per_band`: validation samples of each band and seed.
     `held_out`: motions that validation poses come from. `width`: of the network; 64 is full.
     `weights`: do not train, use these. `resume`: continue from these weights at a lower rate. `network`: start from the
     network of these weights, with a new texture or with `texture`, that of a trained avatar (a name or a folder).
@@ -72,7 +84,7 @@ class TrainConfig:
     sheet: Path | None = None
     minutes: float = 60.0
     samples: int = 4000
-    per_band: int = 24
+    per_band: int = PER_BAND
     held_out: tuple[str, ...] = (BUILTIN_HELD_OUT,)
     width: int = 16
     workers: int = 3
@@ -93,19 +105,34 @@ def train(config: TrainConfig, report: Callable[[str], None]) -> Path:
     torch.manual_seed(config.seed)
     shaped = load_body(config.body).shape()
     renderer = SampleRenderer(shaped, threads=config.workers)
-    held_out = held_out_samples(renderer, config)
+    held_out_motions(config.held_out)  # a motion that cannot be read ends the command here
     _render_training_set(renderer, config, report)
     avatar, steps = _trained(shaped, config, report)
     report("quantising and evaluating")
     torch.set_num_threads(config.workers)
     quantised = quantise_avatar(avatar, shaped, open_groups(config.work / TRAINING), config.seed)
-    evaluation = evaluate_avatar(avatar, quantised, renderer, held_out, config.workers)
     names = {"name": config.name, "training_command": command_of(config)}
-    write_avatar(config.out, config.body, quantised, evaluation, config.width, _provenance(config, steps), names)
-    if config.sheet is not None:
-        Image.fromarray(evaluation.sheet).save(config.sheet, optimize=True)
-    report(json.dumps({"float": evaluation.float_errors, "integer": evaluation.integer_errors}))
+    write_avatar(config.out, config.body, quantised, config.width, _provenance(config, steps), names)
+    validation = _validate(config, avatar, renderer)
+    report(validation.model_dump_json())
     return config.out
+
+
+def _validate(config: TrainConfig, avatar: TrainableAvatar, renderer: SampleRenderer) -> Validation:
+    """Validate the bundle that was written, beside the float weights that it was made of."""
+    bundle, samples = load_bundle(config.out), list[Evaluated]()
+    plan = ValidationPlan(config.held_out, SEEDS, config.per_band, threads=config.workers)
+    paint = float_painter(avatar.network, avatar.texture.image().detach())
+
+    def keep(seed: int, sample: Evaluated) -> None:
+        if seed == plan.seeds[0]:
+            samples.append(sample)
+
+    validation = validate(bundle, plan, renderer, FloatNetwork("the trained weights", paint), keep)
+    revalidate(bundle, validation)
+    if config.sheet is not None:
+        Image.fromarray(comparison_sheet(samples, (FLOAT, *plan.runtimes))).save(config.sheet, optimize=True)
+    return validation
 
 
 def _provenance(config: TrainConfig, steps: int) -> dict[str, Any]:
@@ -132,12 +159,6 @@ def command_of(config: TrainConfig) -> str:
         elif isinstance(value, int | float | str):
             options += [f"--{field.name.replace('_', '-')}", str(value)]
     return shlex.join(["python", "-m", "trilane.training.train", *options])
-
-
-def held_out_samples(renderer: SampleRenderer, config: TrainConfig) -> list[Sample]:
-    """The validation samples of `config`, the same every time."""
-    motions = [load_motion(AvatarSpec(motion=name), Path.cwd()) for name in config.held_out]
-    return plan_validation(renderer, config.per_band, config.seed, motions)
 
 
 def _render_training_set(renderer: SampleRenderer, config: TrainConfig, report: Callable[[str], None]) -> None:

@@ -93,7 +93,8 @@ def _scene(scene: str, avatar: str | None, size: str | None, frames: int, names:
         _print(result["rows"], ("first", "second", "mean", "largest", "worst_frame"))
         bounds = result["bounds"]
         stdout_console().print(
-            f"of 255, over {len(result['frames'])} frames; bounds: mean {bounds['mean']}, largest {bounds['largest']}"
+            f"of 255, over {len(result['frames'])} frames, {result['sources']['rows']}; "
+            f"bounds: mean {bounds['mean']}, largest {bounds['largest']}"
         )
     out = [sentence for row in result["rows"] for sentence in _out_of_bounds(row, result["bounds"])]
     for sentence in out:

@@ -1,18 +1,19 @@
-"""`trilane avatar`: look into avatars, export and quantise their networks.
+"""`trilane avatar`: look into avatars, validate them, export and quantise their networks.
 
-Rule: this file lists the commands of the group; `avatar_network.py` and `avatar_quantise.py` hold those about networks.
+Rule: this file lists the commands of the group; `avatar_validate.py`, `avatar_network.py` and `avatar_quantise.py` hold
+the larger ones.
 """
 
 from __future__ import annotations
 
-from trilane.apps.cli import avatar_network, avatar_quantise
+from trilane.apps.cli import avatar_network, avatar_quantise, avatar_validate
 from trilane.apps.cli.commands import Commands
 from trilane.apps.cli.console import print_facts
 from trilane.apps.cli.options import AvatarArgument, JsonOption
 
 app = Commands(
     no_args_is_help=True,
-    help="Look into avatars, export and quantise their networks.",
+    help="Look into avatars, validate them, export and quantise their networks.",
 )
 
 EPILOG_INSPECT = "\b\nExamples:\n  trilane avatar inspect default\n  trilane avatar inspect my-avatar --json"
@@ -27,6 +28,7 @@ def inspect(name: AvatarArgument, json: JsonOption = False) -> None:
     print_facts(bundle_facts(load_bundle(name)), json)
 
 
+app.command(epilog=avatar_validate.EPILOG_VALIDATE)(avatar_validate.validate)
 app.command(epilog=avatar_network.EPILOG_NETWORK)(avatar_network.network)
 app.command(epilog=avatar_quantise.EPILOG_QUANTISE)(avatar_quantise.quantise)
 app.command("quantize", hidden=True)(avatar_quantise.quantise)  # the name that the command had first

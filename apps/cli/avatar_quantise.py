@@ -14,6 +14,7 @@ import typer
 from trilane.apps.cli.console import print_facts, print_json, spinner, stderr_console, stdout_console
 from trilane.apps.cli.options import METHOD_HELP, FloatNetworkArgument, FramesFileOption, JsonOption, OutFileOption
 from trilane.errors import BadInputError
+from trilane.figure_sources import MEASURED
 
 EPILOG_QUANTISE = """\b
 Examples:
@@ -82,9 +83,9 @@ def calibrations(
     steps = len(methods) * len(COUNTS)
     rows = list(track(table_rows, "quantising", steps, console=console, disable=not console.is_terminal))
     if json:
-        print_json({"rows": rows})
+        print_json({"rows": rows, "sources": {"rows": MEASURED}})
         return
-    table = Table("method", "frames", "PSNR to float, dB", "mean, of 255", "largest")
+    table = Table("method", "frames", "PSNR to float, dB", "mean, of 255", "largest", caption=MEASURED)
     for row in rows:
         figures = (f"{row['psnr_db']:.2f}", f"{row['mean']:.2f}", f"{row['largest']:.0f}")
         table.add_row(row["method"], str(row["count"]), *figures)

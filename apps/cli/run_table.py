@@ -1,7 +1,7 @@
 """The table that `trilane run` ends with.
 
-Rule: every figure is one of report.json's; a figure that was not measured is a dash, and one that rests on too few
-frames says so.
+Rule: every figure is one of report.json's, and its source stands below the table; a figure that was not measured is a
+dash, and one that rests on too few frames says so.
 """
 
 from __future__ import annotations
@@ -9,6 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from rich.markup import escape
+
+from trilane.figure_sources import COMPUTED, MEASURED, NO_FIGURES
 from trilane.scheduler.stats import samples_needed
 
 if TYPE_CHECKING:
@@ -19,6 +22,7 @@ if TYPE_CHECKING:
 
 DASH = "–"
 IDLE = ("starved", "blocked", "throttled", "preempted", "overhead")
+UNSAID = "the report does not say where they come from"
 STATISTICS = ("mean", "p50", "p90", "p95", "p99", "max")
 TOO_SHORT = "too short to tell"
 TOO_FEW = " *"
@@ -54,6 +58,7 @@ def _caption(report: Report) -> str:
     cpu, gl = report.machine.cpu, report.machine.gl
     cores = ", ".join(f"{unit} {','.join(map(str, shares.cores))}" for unit, shares in report.units.items())
     lines = [
+        f"stages, units, times, rates: {MEASURED}",
         f"{cpu.model} ({' '.join(cpu.flags)}); cores: {cores}; idle cores {report.idle_cores}",
         f"network on {report.config['runtime']}; OpenGL on {gl.renderer if gl else DASH}",
     ]
@@ -66,8 +71,8 @@ def _caption(report: Report) -> str:
         lines.append(_pace(report.pace))
     if report.caps.performance_profile:
         lines.append(_caps(report.caps, report.temperature_c))
-    lines += [_accuracy(name, validation) for name, validation in report.accuracy.items()]
-    return "\n".join(lines)
+    lines += [_accuracy(name, facts) for name, facts in report.accuracy.items()]
+    return escape("\n".join(lines))
 
 
 def _made(made: Made) -> str:
@@ -79,8 +84,8 @@ def _pace(pace: PaceComparison) -> str:
     slower = ", ".join(f"{stage} {count}" for stage, count in pace.host_slower.items()) or "none"
     slow_motion = f", {pace.slow_motion:g} times slower" if pace.slow_motion != 1 else ""
     return (
-        f"held to {pace.profile}{slow_motion}: {_number(pace.measured_ms, 2)} ms a frame, in virtual time "
-        f"{_number(pace.virtual_ms, 2)} ms (ratio {_number(pace.ratio, 3)}); jobs too slow here: {slower}"
+        f"held to {pace.profile}{slow_motion}: {_number(pace.measured_ms, 2)} ms a frame ({MEASURED}), in virtual time "
+        f"{_number(pace.virtual_ms, 2)} ms ({COMPUTED}), ratio {_number(pace.ratio, 3)}; jobs too slow here: {slower}"
     )
 
 
@@ -89,15 +94,30 @@ def _caps(caps: Caps, temperature: Temperature) -> str:
     return (
         f"capped as {caps.performance_profile}: may work {duties} of the time, the rest is throttled; lowered further "
         f"for heat {caps.throttled_share:.0%} of the time; {temperature.kind}: at most "
-        f"{_number(temperature.junction_max)} C"
+        f"{_number(temperature.junction_max)} C ({COMPUTED})"
     )
 
 
-def _accuracy(name: str, validation: Mapping[str, Any]) -> str:
-    bands = validation.get("psnr_db_by_band")
-    psnr = ", ".join(f"{band} {value:.1f} dB" for band, value in bands.items()) if bands else DASH
-    iou = f"{validation['iou']:.3f}" if "iou" in validation else DASH
-    return f"avatar {name}: PSNR on held-out views {psnr}; mask IoU {iou}"
+def _accuracy(name: str, facts: Mapping[str, Any]) -> str:
+    """The error of an avatar's pictures, and where its figures come from; else why there are none.
+
+    A report that an older Trilane wrote does not say where its figures come from, so they are not shown.
+    """
+    source = facts.get("source", NO_FIGURES)
+    if source == NO_FIGURES:
+        return f"avatar {name}: {NO_FIGURES} of accuracy: {facts.get('why', UNSAID)}"
+    bands = ", ".join(f"{band} {value:.1f}" for band, value in facts["psnr_db_by_band"].items())
+    body = f"; of the body alone {facts['body_psnr_db']:.1f}" if "body_psnr_db" in facts else ""
+    return (
+        f"avatar {name}: PSNR on held-out views, dB: {bands}{body}{_worst(facts)}; mask IoU {facts['iou']:.3f} "
+        f"({source}, on {facts['runtime']} at tensor size {facts['size']})"
+    )
+
+
+def _worst(facts: Mapping[str, Any]) -> str:
+    if "worst" not in facts:
+        return ""
+    return f"; worst of {facts['samples']} views (seeds {', '.join(facts['by_seed'])}) {facts['worst']['psnr_db']:.1f}"
 
 
 def _stage_rows(runs: Sequence[Report | Baseline]) -> Rows:

@@ -16,6 +16,7 @@ from trilane.arrays import U8
 from trilane.avatars.integer_network import NetworkFile
 from trilane.avatars.network_reshape import reshaped
 from trilane.errors import BadInputError
+from trilane.figure_sources import MEASURED
 from trilane.pipeline.stage import UnitContext
 from trilane.shapes import Shape
 from trilane.stages.avatar_assets import network_of
@@ -39,7 +40,7 @@ def runtime_differences(checked: Checked, runtimes: Sequence[str], frames: int) 
     `runtimes`: two or more, by name.
     `frames`: how many, evenly spread over the scene.
     Keys: `rows`, one per pair: `first`, `second`, `mean`, `largest` (of 255, over all channels and frames),
-    `worst_frame`; `bounds`; `frames` (their numbers); `runtimes` (name to version). Raises BadInputError and
+    `worst_frame`; `sources`; `bounds`; `frames` (their numbers); `runtimes` (name to version). Raises BadInputError and
     MissingPartError.
     """
     if not 1 <= frames <= MAX_FRAMES:
@@ -58,6 +59,7 @@ def runtime_differences(checked: Checked, runtimes: Sequence[str], frames: int) 
             steps_of[pair].append((float(steps.mean()), int(steps.max()), frame))
     return {
         "rows": [_row(pair, steps) for pair, steps in steps_of.items()],
+        "sources": {"rows": MEASURED},
         "bounds": {"mean": MEAN_BOUND, "largest": LARGEST_BOUND},
         "frames": numbers,
         "runtimes": {name: load_runtime(name).version() for name in runtimes},

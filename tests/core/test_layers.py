@@ -18,6 +18,7 @@ ROWS = (
         "cache",
         "compiled",
         "errors",
+        "figure_sources",
         "files",
         "install",
         "shapes",

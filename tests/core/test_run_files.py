@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,24 @@ from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace, TrackEvent
 
 from trilane.apps.cli.run_table import run_table
 from trilane.apps.report import Report, read_report, write_report
+from trilane.apps.report_sources import NO_FIGURES_UNDER, sources_of
 from trilane.apps.run_folder import RunFolder, default_place
 from trilane.apps.trace import write_trace
 from trilane.errors import BadInputError
+from trilane.figure_sources import COMPARED, COMPUTED, MEASURED, NO_FIGURES
 from trilane.scheduler.ledger import JobRecord
 
+SHOWN = {
+    "source": "from the avatar's validation of 2026-01-02",
+    "runtime": "ort",
+    "size": "256",
+    "psnr_db_by_band": {"face": 31.25},
+    "body_psnr_db": 28.75,
+    "iou": 0.9812,
+    "samples": 96,
+    "by_seed": {"1": {}, "2": {}},
+    "worst": {"psnr_db": 21.5},
+}
 TIMES = {"mean": 20.0, "p50": 20.0, "p90": 21.0, "p95": 22.0, "p99": 23.0, "max": 24.0}
 SHARE = {
     "busy": 0.5,
@@ -94,7 +108,8 @@ def make_report(**changes: Any) -> dict[str, Any]:
         "interrupted": False,
         "failure": None,
         "baseline": {"policy": "sequential", **run, "efficiency": None},
-        "accuracy": {"someone": {"psnr_db_by_band": {"face": 31.25}, "iou": 0.9812}},
+        "accuracy": {"someone": SHOWN},
+        "sources": {},
         "video": None,
         "checksum": None,
         **changes,
@@ -234,12 +249,17 @@ def test_a_report_never_holds_nan(tmp_path: Path) -> None:
         write_report(Report.model_validate(make_report(fps=float("nan"))), tmp_path / "report.json")
 
 
-def test_the_table_shows_both_policies_and_dashes_what_was_not_measured() -> None:
+def table_text(report: dict[str, Any]) -> str:
+    """The table as it is printed, each line without its frames and double spaces."""
     from rich.console import Console
 
-    console = Console(width=140, record=True, file=io.StringIO())
-    console.print(run_table(Report.model_validate(make_report())))
-    text = console.export_text()
+    console = Console(width=400, record=True, file=io.StringIO())
+    console.print(run_table(Report.model_validate(report)))
+    return "\n".join(" ".join(line.replace("│", " ").split()) for line in console.export_text().splitlines())
+
+
+def test_the_table_shows_both_policies_and_dashes_what_was_not_measured() -> None:
+    text = table_text(make_report())
     for expected in (
         "pipelined, 3 frames",
         "sequential, 3 frames",
@@ -247,20 +267,13 @@ def test_the_table_shows_both_policies_and_dashes_what_was_not_measured() -> Non
         "50 / 25 15 0 2 8",
         "CPU time of cpu, gpu, %",
         "0.91",
-        "face 31.2 dB",
+        "stages, units, times, rates: measured in this run",
+        "PSNR on held-out views, dB: face 31.2; of the body alone 28.8; worst of 96 views (seeds 1, 2) 21.5; mask IoU",
+        "0.981 (from the avatar's validation of 2026-01-02, on ort at tensor size 256)",
     ):
-        assert expected in text
+        assert expected in " ".join(text.split())
     efficiency = next(line for line in text.splitlines() if "efficiency" in line)
     assert "–" in efficiency
-
-
-def table_text(report: dict[str, Any]) -> str:
-    """The table as it is printed, each line without its frames and double spaces."""
-    from rich.console import Console
-
-    console = Console(width=240, record=True, file=io.StringIO())
-    console.print(run_table(Report.model_validate(report)))
-    return "\n".join(" ".join(line.replace("│", " ").split()) for line in console.export_text().splitlines())
 
 
 @pytest.mark.parametrize(
@@ -290,9 +303,9 @@ def test_a_cap_is_said_once_and_apart_from_what_heat_did() -> None:
     """63 % of the time throttled by the duty that was asked for, none of it for heat: no line says throttled 0 %."""
     cap = {"corner": "svs2", "duty": 0.37, "duty_mean": 0.37}
     caps = {"how": "x", "performance_profile": "low_power_saver", "units": {"dsp": cap}, "throttled_share": 0.0}
-    share = {**SHARE, "busy": 0.3, "idle": {"starved": 0.07, "blocked": 0.0, "throttled": 0.63, "overhead": 0.0}}
+    share = {**SHARE, "busy": 0.3, "idle": {"starved": 0.07, "blocked": 0.0, "throttled": 0.63, "preempted": 0.0, "overhead": 0.0}}
     text = table_text(make_report(caps=caps, units={"dsp": share}, baseline=None)).replace("\n", " ")
-    assert "30 / 7 0 63 0" in text
+    assert "30 / 7 0 63 0 0" in text
     assert "may work dsp 37% of the time, the rest is throttled; lowered further for heat 0% of the time" in text
     assert text.count("throttled") == 2  # the column, and the sentence
 
@@ -308,3 +321,49 @@ def test_the_table_says_when_and_by_what_it_was_made() -> None:
     assert "2026-11-22T01:00:00+00:00: trilane 0.1.0 at 0123456789, modified" in table_text(make_report(made=made))
     elsewhere = {**made, "revision": None, "modified": None}
     assert "2026-11-22T01:00:00+00:00: trilane 0.1.0\n" in table_text(make_report(made=elsewhere))
+
+
+NO_ONES = {"source": NO_FIGURES, "changed": ["texture"], "why": "changed since the validation: [red]the texture[/red]"}
+
+
+@pytest.mark.parametrize(
+    ("facts", "why"),
+    [
+        (NO_ONES, NO_ONES["why"]),
+        (
+            {key: value for key, value in SHOWN.items() if key != "source"},
+            "the report does not say where they come from",
+        ),
+        ({}, "the report does not say where they come from"),
+    ],
+)
+def test_the_table_says_why_there_are_no_figures_and_shows_none(facts: dict[str, Any], why: str) -> None:
+    text = " ".join(table_text(make_report(accuracy={"someone": facts})).split())
+    assert f"avatar someone: no figures of accuracy: {why}" in text
+    assert "31.2" not in text and "0.981" not in text
+
+
+def figures_in(value: Any, above: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """The keys to every number in a document."""
+    if isinstance(value, dict):
+        for key, below in value.items():
+            yield from figures_in(below, (*above, key))
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        yield above
+
+
+def test_every_figure_of_a_report_has_a_source() -> None:
+    paced = {"virtual_ms": 1.0, "ratio": 1.0, "measured_ms": 1.0}
+    document = make_report(video={"frames": 3, "seconds": 0.1}, pace=paced, temperature_c={"sensor": 50.0})
+    sources = sources_of(document)
+    for path in figures_in(document):
+        if path[0] not in NO_FIGURES_UNDER:
+            assert any(".".join(path[:count]) in sources for count in range(1, len(path) + 1)), path
+    assert set(sources.values()) == {MEASURED, COMPUTED, COMPARED, SHOWN["source"]}
+    assert sources["accuracy.someone"] == SHOWN["source"]
+    assert sources["fps"] == sources["stages"] == sources["temperature_c.sensor"] == MEASURED
+    assert sources["temperature_c"] == sources["caps"] == sources["pace"] == COMPUTED
+
+
+def test_what_a_report_has_not_has_no_source() -> None:
+    assert not {"pace", "pace.ratio", "video"} & set(sources_of(make_report()))

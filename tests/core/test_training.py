@@ -13,12 +13,15 @@ from trilane.avatars.bundle import bundle_folder  # noqa: E402
 from trilane.body.joints import JOINT_INDEX  # noqa: E402
 from trilane.errors import BadInputError  # noqa: E402
 from trilane.scene.motion.builtin import BUILTIN  # noqa: E402
-from trilane.training.image_error import image_error  # noqa: E402
+from trilane.training.clear_view import ClothedSurface, vertex_reach  # noqa: E402
+from trilane.training.clothing.layers import Layer  # noqa: E402
+from trilane.training.error_summary import SampleError, summary  # noqa: E402
+from trilane.training.image_error import ImageError, image_error  # noqa: E402
 from trilane.training.losses import loss_terms, total_loss  # noqa: E402
 from trilane.training.network import UNet  # noqa: E402
 from trilane.training.neural_texture import NeuralTexture, read_texture  # noqa: E402
 from trilane.training.random_poses import random_pose  # noqa: E402
-from trilane.training.random_views import BANDS, random_view  # noqa: E402
+from trilane.training.random_views import BANDS, View, look_at, perspective, random_view  # noqa: E402
 from trilane.training.sample_files import U16, batches, create_group, open_groups  # noqa: E402
 from trilane.training.surface_fields import eigenfunctions  # noqa: E402
 from trilane.training.texture_layout import fill_gaps, lay_out  # noqa: E402
@@ -114,6 +117,90 @@ def test_metrics_of_known_pictures():
     assert error.psnr_db == pytest.approx(-20 * np.log10(26 / 255), abs=0.01)
     assert error.iou == 1.0
     assert image_error(truth, np.zeros_like(truth)) is None
+
+
+def test_psnr_in_the_box_and_of_the_body_alone_worked_out_by_hand():
+    """A box of 2 x 4 pixels, three of which are background; one body pixel is wrong by 51 of 255 in every channel.
+
+    In the box the mean square is 0.2**2 / 8 = 0.005, which is 23.01 dB; of the body's five pixels it is 0.2**2 / 5 =
+    0.008, which is 20.97 dB.
+    """
+    truth = np.zeros((5, 6, 4), np.uint8)
+    truth[1:3, 1:5] = (100, 100, 100, 255)
+    truth[1, 2:5, 3] = 0
+    picture = truth.copy()
+    picture[2, 3, :3] = 151
+    error = image_error(picture, truth)
+    assert error.psnr_db == pytest.approx(23.0103, abs=1e-4)
+    assert error.body_psnr_db == pytest.approx(20.9691, abs=1e-4)
+    assert (error.background, error.iou) == (0.375, 1.0)
+
+
+def test_what_is_painted_beside_the_body_counts_in_the_box_alone():
+    """One background pixel of eight is painted over grey (0.5) with 255, alpha too: a square of about 0.25 / 8."""
+    truth = np.zeros((5, 6, 4), np.uint8)
+    truth[1:3, 1:5] = (100, 100, 100, 255)
+    truth[1, 2:4, 3] = 0
+    picture = truth.copy()
+    picture[1, 2] = 255
+    error = image_error(picture, truth)
+    assert error.psnr_db == pytest.approx(-10 * np.log10(0.25 / 8), abs=1e-6)
+    assert error.body_psnr_db == 100.0, "the body itself is exact"
+    assert error.iou == pytest.approx(6 / 7)
+
+
+def an_error(psnr_db, body_psnr_db, iou=1.0):
+    return ImageError(psnr_db=psnr_db, body_psnr_db=body_psnr_db, background=0.5, ssim=0.75, iou=iou)
+
+
+def test_a_summary_has_means_and_the_worst_sample_of_all_seeds():
+    errors = [
+        SampleError(1, 0, "far", an_error(30.0, 28.0)),
+        SampleError(1, 24, "face", an_error(20.0, 19.0, iou=0.5)),
+        SampleError(9, 0, "far", an_error(34.0, 30.0)),
+        SampleError(9, 25, "face", an_error(22.0, 15.0)),
+    ]
+    facts = summary(errors)
+    assert facts["psnr_db_by_band"] == {"far": 32.0, "face": 21.0}
+    assert facts["body_psnr_db_by_band"] == {"far": 29.0, "face": 17.0}
+    assert (facts["psnr_db"], facts["body_psnr_db"], facts["samples"]) == (26.5, 23.0, 4)
+    assert (facts["background"], facts["ssim"], facts["iou"]) == (0.5, 0.75, 0.875)
+    assert (facts["least_psnr_db"], facts["least_body_psnr_db"]) == (20.0, 15.0)
+    assert facts["worst"] == {"seed": 1, "number": 24, "band": "face", "psnr_db": 20.0, "body_psnr_db": 19.0}
+    assert facts["by_seed"] == {
+        "1": {"psnr_db": 25.0, "body_psnr_db": 23.5, "least_psnr_db": 20.0},
+        "9": {"psnr_db": 28.0, "body_psnr_db": 22.5, "least_psnr_db": 22.0},
+    }
+
+
+def test_points_reach_over_their_triangles():
+    """The middle of an equilateral triangle of side 0.3 is 0.3 / sqrt(3) from its corners; a free vertex reaches 0."""
+    vertices = np.array([[0, 0, 0], [0.3, 0, 0], [0.15, 0.3 * np.sqrt(0.75), 0], [9, 9, 9]], np.float64)
+    reach = vertex_reach(vertices, np.array([[0, 1, 2]]))
+    assert reach == pytest.approx([0.1732, 0.1732, 0.1732, 0.0], abs=1e-4)
+    middle = vertices[:3].mean(axis=0)
+    assert np.linalg.norm(vertices[:3] - middle, axis=1) == pytest.approx(reach[:3])
+
+
+def test_a_camera_stands_clear_when_nothing_reaches_into_the_sphere_round_its_near_plane():
+    """Half the height is 1 at 45 degrees, so a square screen's near corner is 0.05 * sqrt(3) = 0.0866 m away."""
+    view = View(look_at(np.array([0.0, 0.0, 2.0]), np.zeros(3)), perspective(np.pi / 2, 1.0), 1.0)
+    assert view.near_reach_m == pytest.approx(0.0866, abs=1e-4)
+    eye = np.array([0.0, 0.0, 2.0])
+    layer = a_layer(np.array([[0.0, 0, 0], [0.03, 0, 0], [0, 0.03, 0]]))
+    surface = ClothedSurface([layer])
+    reach = 0.03 * np.sqrt(2) / np.sqrt(3)
+    for distance, clear in ((0.0866 + reach + 0.001, True), (0.0866 + reach - 0.001, False)):
+        points = eye + np.array([[distance, 0, 0], [5, 0, 0], [0, 5, 0]])
+        assert surface.is_clear_of(view, points) == clear
+
+
+def a_layer(vertices):
+    """One triangle that the root joint moves."""
+    count = len(vertices)
+    weights = np.eye(1, 55).repeat(count, axis=0)
+    ones = np.ones(count)
+    return Layer("skin", vertices, np.array([[0, 1, 2]]), vertices, weights, vertices, ones, ones)
 
 
 def test_fields_are_smooth_and_gaps_filled():

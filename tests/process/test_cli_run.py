@@ -23,6 +23,7 @@ from PIL import Image
 from trilane.apps.report import read_report
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_split import cuts
+from trilane.figure_sources import NO_FIGURES
 from trilane.pipeline.fork_server import process_name
 from trilane.scheduler.recording import read, replay
 
@@ -121,7 +122,8 @@ def test_the_report_says_what_was_asked_for(finished: Finished) -> None:
     assert report.machine.gl is not None
     assert report.machine.gl.renderer
     assert report.machine.cpu.cores_allowed
-    assert report.accuracy == {"tiny": {}}, "the tiny avatar was never validated, and nothing is made up"
+    assert report.accuracy["tiny"].keys() == {"source", "changed", "why"}, "never validated: nothing is made up"
+    assert report.sources["accuracy.tiny"] == NO_FIGURES
     assert all(report.stage_metrics["present"][key] > 0 for key in ("digest_ms", "encode_ms"))
 
 

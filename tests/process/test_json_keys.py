@@ -25,6 +25,8 @@ import pytest
 from numpy.typing import NDArray
 
 from trilane.apps.cli import main as cli
+from trilane.avatars.bundle import load_bundle, write_manifest
+from trilane.testing.validated import validated
 
 FILE = Path(__file__).with_name("json_keys.toml")
 DATA = tomllib.loads(FILE.read_text(encoding="utf-8"))
@@ -90,9 +92,8 @@ def place(
 ) -> Place:
     folder = tmp_path_factory.mktemp("keys")
     shutil.copytree(drawable_bundle, folder / "bundle")
-    manifest = folder / "bundle" / "manifest.json"
-    validation = {"psnr_db_by_band": {"full_body": 30.0}, "iou": 0.9, "ssim": 0.9}
-    manifest.write_text(json.dumps(json.loads(manifest.read_text()) | {"validation": validation}))
+    shutil.copytree(drawable_bundle, folder / "unvalidated")
+    write_manifest(folder / "bundle", validated(load_bundle(drawable_bundle), size="64x64"))
     onnx.save(tiny_float, folder / "float.onnx")
     np.save(folder / "frames.npy", np.stack(tiny_frames * 3)[:16])
     np.save(folder / "poses.npy", np.zeros((1, 165)))

@@ -10,6 +10,7 @@ import pytest
 from trilane.bench import handoff, pipeline, scheduler
 from trilane.bench.lib import handoff_variants
 from trilane.errors import BadInputError
+from trilane.figure_sources import NO_FIGURES
 from trilane.scheduler.ledger import JobRecord
 
 
@@ -41,7 +42,9 @@ def test_the_pipeline_is_set_against_its_stages_alone(drawable_bundle: Path) -> 
         assert row["of_bound_low"] <= row["gain_of_bound"] <= row["of_bound_high"]
         assert row["gain_of_bound"] == pytest.approx(row["gain"] / row["bound"])
     assert rows["sequential", "double"]["gain"] == 1
-    assert list(result["accuracy"].values()) == [pipeline.NO_ACCURACY]
+    (accuracy,) = result["accuracy"].values()
+    assert accuracy["source"] == NO_FIGURES
+    assert "never validated" in accuracy["why"]
 
 
 @pytest.mark.parametrize(

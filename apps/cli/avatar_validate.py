@@ -1,0 +1,131 @@
+"""`trilane avatar validate`: how good an avatar is on views that it was not trained on, measured anew.
+
+Rule: this file talks to the person; the work is done in `trilane.training.validate`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from trilane.apps.cli.console import print_facts, stderr_console, stdout_kept
+from trilane.apps.cli.options import SIZE_HELP, AvatarArgument, JsonOption
+from trilane.avatars.manifest import BANDS
+from trilane.errors import BadInputError, MissingPartError
+
+if TYPE_CHECKING:
+    from trilane.avatars.bundle import Bundle
+    from trilane.training.evaluate import Evaluated
+    from trilane.training.validate import FloatNetwork, ValidationPlan
+
+EPILOG_VALIDATE = """\b
+Examples:
+  trilane avatar validate my-avatar
+  trilane avatar validate my-avatar --held-out builtin:walk-wave-turn --held-out jump.bvh --runtime openvino
+  trilane avatar validate default --seed 1 --seed 2 --sheet worst.png
+"""
+#: Runtimes that are validated when none is given, where they are installed; the first one's figures are the avatar's.
+RUNTIMES = ("ort", "openvino")
+
+
+def validate(
+    name: AvatarArgument,
+    held_out: Annotated[
+        list[str] | None,
+        typer.Option(help="Motion that no training had: builtin:NAME or a file. Repeat it; walk-wave-turn if none."),
+    ] = None,
+    seed: Annotated[
+        list[int] | None, typer.Option(min=0, help="Seed of views and poses. Repeat it; 1 to 8 if none.")
+    ] = None,
+    per_band: Annotated[int, typer.Option(min=1, max=1000, help="Views of each band for each seed.")] = 24,
+    runtime: Annotated[
+        list[str] | None,
+        typer.Option(help="ort, openvino, qnn or cuda. Repeat it; ort, and openvino where installed, if none."),
+    ] = None,
+    size: Annotated[str, typer.Option(help=SIZE_HELP)] = "256",
+    float_network: Annotated[
+        Path | None, typer.Option(help="Weights before quantising (.npz), to say what quantising costs.")
+    ] = None,
+    sheet: Annotated[
+        Path | None, typer.Option(help="Write a picture: the worst view of each seed beside its ground truth.")
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Measure an avatar's image error on held-out views, and write it into the manifest with digests of the files.
+
+    What the manifest said before is replaced.
+    """
+    from trilane.avatars.bundle import load_bundle
+    from trilane.avatars.validation import validation_facts
+    from trilane.shapes import shape_buckets
+    from trilane.stages.dsp.runtime import installed, resolve
+    from trilane.unexpected_value import UnexpectedValue
+
+    runtimes = [resolve(each) for each in runtime or [each for each in RUNTIMES if each in installed()]]
+    try:
+        shape_buckets(size)
+    except UnexpectedValue as error:
+        raise BadInputError.at("--size", error) from error
+    bundle = load_bundle(name)
+    try:
+        from trilane.training import validate as work
+    except ImportError as error:
+        raise MissingPartError(f"validating needs {error.name}", extra="metrics") from None
+    seeds = tuple(dict.fromkeys(seed)) if seed else work.SEEDS
+    plan = work.ValidationPlan(
+        tuple(held_out or (work.BUILTIN_HELD_OUT,)), seeds, per_band, tuple(dict.fromkeys(runtimes)), size
+    )
+    validated = _validate(bundle, plan, float_network, sheet)
+    print_facts({"name": bundle.manifest.name, "validation": validation_facts(validated)}, json)
+
+
+def _validate(bundle: Bundle, plan: ValidationPlan, float_network: Path | None, sheet: Path | None) -> Bundle:
+    """Validate `bundle`, write its manifest and, where asked, the sheet; the bundle as it is then."""
+    from rich.progress import Progress
+
+    from trilane.training import validate as work
+
+    beside = _float_network(bundle, float_network) if float_network is not None else None
+    worst: dict[int, Evaluated] = {}
+    console = stderr_console()
+    with stdout_kept(), Progress(console=console, disable=not console.is_terminal) as progress:
+        task = progress.add_task("validating", total=len(plan.seeds) * plan.per_band * len(BANDS))
+
+        def look(seed: int, sample: Evaluated) -> None:
+            progress.advance(task)
+            if seed not in worst or _psnr_db(sample, plan) < _psnr_db(worst[seed], plan):
+                worst[seed] = sample
+
+        renderer = work.open_renderer(bundle, plan.threads)
+        validated = work.revalidate(bundle, work.validate(bundle, plan, renderer, beside, look))
+    if sheet is not None:
+        _write_sheet(sheet, list(worst.values()), plan.runtimes[0])
+    return validated
+
+
+def _psnr_db(sample: Evaluated, plan: ValidationPlan) -> float:
+    return sample.errors[plan.runtimes[0]].psnr_db
+
+
+def _float_network(bundle: Bundle, weights: Path) -> FloatNetwork:
+    """The network of the file `weights`. Raises BadInputError, MissingPartError."""
+    try:
+        from trilane.training.float_painter import float_painter_of
+    except ImportError as error:
+        raise MissingPartError(f"the float network needs {error.name}", extra="train") from None
+    from trilane.avatars.digests import sha256_of
+    from trilane.training.validate import FloatNetwork
+
+    return FloatNetwork(f"{weights.name}, sha256 {sha256_of([weights])}", float_painter_of(bundle, weights))
+
+
+def _write_sheet(path: Path, samples: list[Evaluated], runtime: str) -> None:
+    from PIL import Image
+
+    from trilane.training.comparison_sheet import worst_sheet
+    from trilane.writing import write_atomically
+
+    with write_atomically(path) as draft:
+        Image.fromarray(worst_sheet(samples, (runtime,))).save(draft, "png", optimize=True)

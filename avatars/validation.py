@@ -1,0 +1,117 @@
+"""Which figures of accuracy are an avatar's own, and what is said in place of those that are not.
+
+Rule: a figure is shown only where the bytes, the constants and the way of drawing are those that it was measured with;
+everything else is a sentence that names what differs and the command that measures it.
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from trilane.avatars.bundle import DEFAULT, Bundle, bundle_folder
+from trilane.avatars.digests import digests_of
+from trilane.avatars.manifest import Validation
+from trilane.figure_sources import NO_FIGURES, from_validation
+
+#: Part of an avatar to its name in a sentence.
+PARTS = {
+    "body": "the body",
+    "texture": "the neural texture",
+    "network": "the network",
+    "constants": "the manifest's constants (shape, expression, scales and zero points)",
+}
+VALIDATE = "trilane avatar validate"
+
+
+@dataclass(frozen=True)
+class DrawnAs:
+    """How a run draws an avatar.
+
+    `runtime`: of the network. `size`: tensor size of the scene. `texture_filter`: of the neural texture. `avatars`: how
+    many share the tensor.
+    """
+
+    runtime: str
+    size: str
+    texture_filter: str = "linear"
+    avatars: int = 1
+
+
+def accuracy_of(bundle: Bundle, drawn: DrawnAs) -> dict[str, Any]:
+    """What may be said of the error of the avatar's pictures in a run that draws it as `drawn`.
+
+    With figures: `source`, which names the validation and its date; `runtime`, `size`; the keys of `Figures`.
+    Without: what `refused` says, also where the avatar is drawn otherwise than it was when it was validated.
+    Raises BadInputError for a file that cannot be read.
+    """
+    validation = bundle.manifest.validation
+    refusal = refused(bundle)
+    if validation is None or refusal:
+        return refusal
+    own, differs = validation.on(drawn.runtime), _drawn_otherwise(validation, drawn)
+    if own is None or differs:
+        how = f" --size {drawn.size} --runtime {drawn.runtime}" if drawn.avatars == 1 else ""
+        return _no_figures(bundle, [], differs, how)
+    return {
+        "source": from_validation(validation.date),
+        "runtime": drawn.runtime,
+        "size": drawn.size,
+        **own.model_dump(mode="json"),
+    }
+
+
+def validation_facts(bundle: Bundle) -> dict[str, Any] | None:
+    """The whole validation with its `source`, or what `refused` says; None for an avatar that was never validated."""
+    validation = bundle.manifest.validation
+    if validation is None:
+        return None
+    return refused(bundle) or {"source": from_validation(validation.date), **validation.model_dump(mode="json")}
+
+
+def refused(bundle: Bundle) -> dict[str, Any]:
+    """Why no figure of the manifest may be shown; empty when the files are those that were validated.
+
+    Keys: `source`, which is `NO_FIGURES`; `changed`: keys of `PARTS` that were changed since; `why`: a sentence.
+    Raises BadInputError for a file that cannot be read.
+    """
+    validation = bundle.manifest.validation
+    if validation is None:
+        return _no_figures(bundle, [], "it was never validated")
+    if validation.digests is None:
+        return _no_figures(bundle, [], "the validation in its manifest does not say what it is of: it has no digests")
+    now = digests_of(bundle.folder, bundle.manifest)
+    changed = [part for part in PARTS if getattr(now, part) != getattr(validation.digests, part)]
+    if not changed:
+        return {}
+    names = " and ".join(PARTS[part] for part in changed)
+    return _no_figures(bundle, changed, f"changed since the validation of {validation.date}: {names}")
+
+
+def _drawn_otherwise(validation: Validation, drawn: DrawnAs) -> str:
+    """What of `drawn` differs from how the avatar was drawn when it was validated; empty when nothing does."""
+    runtimes = [validation.runtime, *validation.other_runtimes]
+    if drawn.avatars > 1:
+        return f"it was validated alone in its tensor, and here {drawn.avatars} avatars share one"
+    if drawn.size != validation.size:
+        return f"it was validated at tensor size {validation.size}, and this is {drawn.size}"
+    if drawn.texture_filter != validation.texture_filter:
+        found = f"and this is {drawn.texture_filter}"
+        return f"it was validated with the {validation.texture_filter} texture filter, {found}"
+    if drawn.runtime not in runtimes:
+        return f"it was validated on {' and '.join(runtimes)}, and this is {drawn.runtime}"
+    return ""
+
+
+def _no_figures(bundle: Bundle, changed: Sequence[str], why: str, how: str = "") -> dict[str, Any]:
+    """`why`, and the command that measures what there is now, with the options `how`."""
+    command = f"{VALIDATE} {shlex.quote(_name_of(bundle.folder))}{how}"
+    return {"source": NO_FIGURES, "changed": list(changed), "why": f"{why}; `{command}` measures it"}
+
+
+def _name_of(folder: Path) -> str:
+    """What a person types for `folder`: `default`, or the folder."""
+    return DEFAULT if folder.absolute() == bundle_folder(DEFAULT).absolute() else str(folder)
