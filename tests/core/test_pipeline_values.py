@@ -159,6 +159,7 @@ def test_a_description_answers_what_follows_from_it() -> None:
     assert (described.rule, described.with_rule("double").rule) == ("single,fifo:3", "double")
     assert described.with_rule("double").edges[1] == EDGES[1].model_copy(update={"rule": "double"})
     assert (described.scheduler_cores, described.run_cores) == ((1, 0), (0, 1, 3))
+    assert pipeline(stages=STAGES[:2], edges=EDGES[:1]).scheduler_cores == (1, 0)
     assert described.stages_of("left") == (STAGES[0], STAGES[2])
     graph = described.graph()
     assert [(stage.name, stage.unit) for stage in graph.stages] == [("in", "left"), ("mid", "right"), ("out", "left")]
@@ -299,3 +300,14 @@ def test_assets_that_fit_to_the_byte_are_taken(monkeypatch: pytest.MonkeyPatch) 
                 shared_assets.share_assets({})
         else:
             os.close(shared_assets.share_assets({}))
+
+
+def test_assets_that_find_no_room_leave_no_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    before = len(os.listdir("/proc/self/fd"))  # noqa: PTH208
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(TrilaneError, match=r"^assets: no room for 3 MiB: no space left on device$"):
+        shared_assets.share_assets({"a": np.zeros(3 << 20, np.uint8)})
+    assert len(os.listdir("/proc/self/fd")) == before  # noqa: PTH208

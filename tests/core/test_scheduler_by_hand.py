@@ -336,3 +336,15 @@ def test_a_simulated_unit_that_hangs_is_killed_and_back_after_its_restart() -> N
     assert result.report["frames"]["lost_by_cause"] == {"hung:gpu": 2}
     assert (result.report["duration_s"], result.report["units"]["gpu"]["restarts"]) == (0.042, 1)
     assert shares_ms(result.report["units"]["gpu"], 42) == {**dict.fromkeys(GPU, 0), "busy": 12, "overhead": 30}
+
+
+def test_a_unit_that_is_being_killed_has_room_for_no_job_and_is_asked_nothing() -> None:
+    core = Core(TWO, Settings(9, asked=True, hang_ns=100))
+    core.step(0, (UnitReady("gpu"), UnitReady("cpu")))
+    gpu = core.units["gpu"]
+    assert (gpu.is_ready, gpu.awaits_nothing, gpu.queue_capacity) == (True, True, 2)
+    core.step(1, (Pinged("gpu"),))
+    assert (gpu.is_ready, gpu.awaits_nothing) == (True, False)
+    assert core.step(101, (FrameRequest(0),)).actions == (Kill("gpu"),)
+    assert (gpu.is_ready, gpu.awaits_nothing, gpu.queue_capacity) == (False, False, 0)
+    assert core.step(102, (FrameRequest(1),)).actions == ()

@@ -85,6 +85,7 @@ def started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[U
     for unit in list(starter.pipes):
         starter.leave(unit)
     assert processes.pids == {}
+    assert processes._poller.closed and processes._context.closed
     assert psutil.Process().num_fds() <= before + 1  # a thread of ZeroMQ may still be closing its own
     assert not list(tmp_path.iterdir())
 
@@ -171,6 +172,18 @@ def test_bytes_that_are_no_message_end_the_run_and_name_the_unit(started: Starte
     os.write(starter.pipes["left"]._writes, b"\xffno")
     with pytest.raises(TrilaneError, match=r"^unit left sent bytes that are not a message: unknown message"):
         heard(processes, 1)
+
+
+def test_heartbeats_that_are_no_message_end_the_run_too(started: Started) -> None:
+    processes, starter = started
+    context = zmq.Context()
+    beats = HeartbeatSocket(context)
+    beats.socket.connect(starter.specs["right"].endpoint)
+    beats.socket.send(b"\xffno")
+    with pytest.raises(TrilaneError, match=r"^unit right sent bytes that are not a message: unknown message"):
+        heard(processes, 1)
+    beats.close()
+    context.term()
 
 
 def test_a_unit_that_has_closed_its_ends_wakes_nobody_again(started: Started) -> None:

@@ -460,11 +460,12 @@ def children():
 
 death, default, blocked, parent = json.loads(call("here:look"))
 files = os.listdir(f"/proc/{server}/fd")
-pid, (pidfd,) = unit(0.2)
+pid, (pidfd,) = unit(0.5)
+named = until(lambda: open(f"/proc/{pid}/comm").read() == "trilane-u\\n")
 alive = not select.select([pidfd], [], [], 0)[0]
 ended = bool(select.select([pidfd], [], [], 5)[0])
 none = call("no:such")
-print(json.dumps([death, default, blocked, parent == server, pid != server, alive, ended, none,
+print(json.dumps([death, default, blocked, parent == server, named, alive, ended, none,
                   until(lambda: not children()), until(lambda: os.listdir(f"/proc/{server}/fd") == files)]))
 _, (last,) = unit(0.3)
 ours.close()
