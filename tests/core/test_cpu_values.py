@@ -302,6 +302,20 @@ def test_a_segments_clock_is_a_fraction(tmp_path: Path, fps: float, rate: str) -
     segment.close()
 
 
+def test_a_segment_is_on_the_disk_before_it_is_closed(tmp_path: Path) -> None:
+    """All but the last frame can be read, and every digest, as when the writer is killed now."""
+    path = tmp_path / "a.mp4"
+    segment = Segment(path, 30.0, 32, 48)
+    for frame in range(5):
+        segment.digest(frame, colours(32, 48))
+        segment.add(frame, colours(32, 48))
+    with av.open(str(path)) as container:
+        assert len(list(container.decode(video=0))) >= 4
+    lines = path.with_suffix(".sha256").read_text().splitlines()
+    assert [int(line.split()[0]) for line in lines] == list(range(5))
+    segment.close()
+
+
 def test_a_jobs_figures_are_milliseconds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = Scene(output=OutputSpec(width=96, height=64), fps=24.0)
     units = {"cpu": UnitSettings(cores=(0,), threads=1)}
