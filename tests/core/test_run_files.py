@@ -303,7 +303,8 @@ def test_a_cap_is_said_once_and_apart_from_what_heat_did() -> None:
     """63 % of the time throttled by the duty that was asked for, none of it for heat: no line says throttled 0 %."""
     cap = {"corner": "svs2", "duty": 0.37, "duty_mean": 0.37}
     caps = {"how": "x", "performance_profile": "low_power_saver", "units": {"dsp": cap}, "throttled_share": 0.0}
-    share = {**SHARE, "busy": 0.3, "idle": {"starved": 0.07, "blocked": 0.0, "throttled": 0.63, "preempted": 0.0, "overhead": 0.0}}
+    idle = {"starved": 0.07, "blocked": 0.0, "throttled": 0.63, "preempted": 0.0, "overhead": 0.0}
+    share = {**SHARE, "busy": 0.3, "idle": idle}
     text = table_text(make_report(caps=caps, units={"dsp": share}, baseline=None)).replace("\n", " ")
     assert "30 / 7 0 63 0 0" in text
     assert "may work dsp 37% of the time, the rest is throttled; lowered further for heat 0% of the time" in text
