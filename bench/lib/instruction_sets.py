@@ -78,7 +78,7 @@ INSTRUCTION_SETS = (
         "vpmaddubsw, vpmaddwd, vpaddd ymm: 8 sums of 4 products",
         8 * 4,
         (Fraction(1, 2), ONE),
-        "uops.info: two multiplications on ports 0 and 1 (Haswell and later, Zen 2 and later), the addition on a third",
+        "uops.info VPMADDUBSW_YMM, VPMADDWD_YMM: on ports 0 and 1 from Skylake and Zen on, on port 0 alone on Haswell",
     ),
     InstructionSet(
         "NEON dot",
