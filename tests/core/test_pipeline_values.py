@@ -53,10 +53,14 @@ class FakeStage:
             raise self.error
 
 
+def context() -> UnitContext:
+    return UnitContext("left", UnitSettings(cores=(0,), threads=1), {})
+
+
 @pytest.mark.parametrize("slot", [0, 1])
 def test_a_first_stage_gets_a_header_with_frame_time_and_epoch(slot: int) -> None:
     inner, outputs = FakeStage(), packets(OWN, 2)
-    stage = BoundStage("pose", inner, [], outputs, 0)
+    stage = BoundStage("pose", inner, [], outputs, 0, context())
     before = time.monotonic_ns()
     assert stage.run(7, -1, slot, 3) == {"shade": 3}
     header = outputs[slot].header
@@ -79,7 +83,7 @@ def test_a_header_is_passed_on_whole_or_with_its_frame_alone(
     inputs[taken].header["frame"], inputs[taken].header["t_sampled_ns"] = 5, 1234
     inputs[taken].header["epoch"], inputs[taken].header["own"] = 1, 9
     inner = FakeStage()
-    BoundStage("raster", inner, inputs, outputs, 0).run(5, taken, given, 4)
+    BoundStage("raster", inner, inputs, outputs, 0, context()).run(5, taken, given, 4)
     header = outputs[given].header
     assert [int(header[name]) for name in ("frame", "t_sampled_ns", "epoch")] == [5, 1234, 4]
     assert int(header[target.names[3]]) == own
@@ -96,7 +100,7 @@ def test_all_fields_of_a_frame_are_copied_to_another_header() -> None:
 
 def test_a_last_stage_has_no_slot_to_write() -> None:
     inner = FakeStage()
-    BoundStage("present", inner, packets(OWN, 1), [], 0).run(5, 0, -1, 4)
+    BoundStage("present", inner, packets(OWN, 1), [], 0, context()).run(5, 0, -1, 4)
     assert inner.runs == [(5, 0, None)]
 
 
@@ -134,10 +138,18 @@ def test_a_job_is_held_for_its_pace_and_one_without_a_pace_is_not(monkeypatch: p
     clock = FakeTime()
     monkeypatch.setattr(bound_stage, "time", clock)
     start = clock.now_ns
-    BoundStage("present", FakeStage(), packets(OWN, 1), [], 3 * MS).run(0, 0, -1, 0)
+    BoundStage("present", FakeStage(), packets(OWN, 1), [], 3 * MS, context()).run(0, 0, -1, 0)
     assert clock.now_ns == start + 1000 + 3 * MS
-    BoundStage("present", FakeStage(), packets(OWN, 1), [], 0).run(0, 0, -1, 0)
+    BoundStage("present", FakeStage(), packets(OWN, 1), [], 0, context()).run(0, 0, -1, 0)
     assert (clock.now_ns, len(clock.slept)) == (start + 2000 + 3 * MS, 1)
+
+
+def test_a_stage_works_asleep_on_a_device_of_its_unit_or_at_the_pace_of_a_chip() -> None:
+    unit = context()
+    plain, paced = (BoundStage("a", FakeStage(), [], [], pace_ns, unit) for pace_ns in (0, 1))
+    assert (plain.works_asleep, paced.works_asleep) == (False, True)
+    unit.use_device("card")  # by another stage of the unit, or in a later job
+    assert (plain.works_asleep, paced.works_asleep) == (True, True)
 
 
 UNITS = {"left": UnitSettings(cores=(1, 0), threads=2), "right": UnitSettings(cores=(3, 1), threads=1, spin=True)}
@@ -174,48 +186,59 @@ def test_a_description_goes_through_json() -> None:
     assert Pipeline.model_validate_json(pipeline().model_dump_json()) == pipeline()
 
 
+NAMES = "['in', 'mid', 'out']"
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"units": {"left": UNITS["left"]}}, "no settings of unit right, expected them in `units`"),
-        ({"units": {}}, "no settings of unit left, right"),
-        ({"edges": EDGES[:1]}, "1 edges"),
-        ({"edges": (EDGES[0], EDGES[1].model_copy(update={"rule": "no"}))}, "edge 'no'"),
-        ({"stages": (), "edges": ()}, "at least 1 item"),
-        ({"latency_to": "none"}, "latency to 'none'"),
+        ({"units": {"left": UNITS["left"]}}, ": found no settings of unit right, expected them in `units`"),
+        ({"units": {}}, ": found no settings of unit left, right, expected them in `units`"),
+        ({"edges": EDGES[:1]}, f": found 1 edges and latency to 'out' for stages {NAMES}, expected one edge fewer "),
+        ({"edges": (EDGES[0], EDGES[1].model_copy(update={"rule": "no"}))}, ": found edge 'no', expected single, "),
+        ({"stages": (), "edges": ()}, ".stages: found (), expected Tuple should have at least 1 item "),
+        ({"latency_to": "none"}, f": found 2 edges and latency to 'none' for stages {NAMES}, expected one edge fewer "),
     ],
 )
 def test_a_description_that_does_not_fit_together_is_refused(changes: dict[str, Any], said: str) -> None:
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(BadInputError) as caught:
         pipeline(**changes)
+    assert str(caught.value).startswith("Pipeline" + said)
 
 
 @pytest.mark.parametrize(
-    ("model", "values"),
+    ("model", "values", "wrong", "found"),
     [
-        (UnitSettings, {"cores": (), "threads": 1}),
-        (UnitSettings, {"cores": (0,), "threads": 0}),
-        (UnitSettings, {"cores": (0,), "threads": 1, "extra": 1}),
-        (PipelineEdge, {"payload_bytes": -1}),
-        (PipelineEdge, {"payload_bytes": 1, "header": np.dtype([("t_sampled_ns", "<i8"), ("frame", "<u8")])}),
-        (PipelineEdge, {"payload_bytes": 1, "header": np.dtype([("frame", "<u8"), ("t_sampled_ns", "<i8")])}),
-        (
-            PipelineEdge,
-            {"payload_bytes": 1, "header": np.dtype([("frame", "<i8"), ("t_sampled_ns", "<i8"), ("epoch", "<u4")])},
+        (UnitSettings, {"cores": (), "threads": 1}, "cores", "()"),
+        (UnitSettings, {"cores": (0,), "threads": 0}, "threads", "0"),
+        (UnitSettings, {"cores": (0,), "threads": 1, "extra": 1}, "extra", "an unknown field"),
+        (UnitSettings, {"threads": 1}, "cores", "nothing"),
+        (PipelineEdge, {"payload_bytes": -1}, "payload_bytes", "-1"),
+        *(
+            (PipelineEdge, {"payload_bytes": 1, "header": header}, "header", f"header {header!r}")
+            for header in (
+                np.dtype([("t_sampled_ns", "<i8"), ("frame", "<u8")]),
+                np.dtype([("frame", "<u8"), ("t_sampled_ns", "<i8")]),
+                np.dtype([("frame", "<i8"), ("t_sampled_ns", "<i8"), ("epoch", "<u4")]),
+                header_dtype([("own", "O")]),
+                "5",
+                None,
+            )
         ),
-        (PipelineEdge, {"payload_bytes": 1, "header": header_dtype([("own", "O")])}),
-        (PipelineEdge, {"payload_bytes": 1, "header": "[('frame'"}),
-        (PipelineEdge, {"payload_bytes": 1, "header": "5"}),
-        (PipelineEdge, {"payload_bytes": 1, "header": None}),
-        (PipelineStage, {"name": "a b", "unit": "u", "factory": "m:f"}),
-        (PipelineStage, {"name": "a", "unit": "u v", "factory": "m:f"}),
-        (PipelineStage, {"name": "a", "unit": "u", "factory": "m.f"}),
-        (PipelineStage, {"name": "a", "unit": "u", "factory": "m:f", "pace_ns": -1}),
+        (PipelineEdge, {"payload_bytes": 1, "header": "[('frame'"}, "header", """header "[('frame'\""""),
+        (PipelineStage, {"name": "a b", "unit": "u", "factory": "m:f"}, "name", "'a b'"),
+        (PipelineStage, {"name": "a", "unit": "u v", "factory": "m:f"}, "unit", "'u v'"),
+        (PipelineStage, {"name": "a", "unit": "u", "factory": "m.f"}, "factory", "'m.f'"),
+        (PipelineStage, {"name": "a", "unit": "u", "factory": "m:f", "pace_ns": -1}, "pace_ns", "-1"),
     ],
 )
-def test_values_that_a_description_cannot_have_are_refused(model: Any, values: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=r"validation error"):
+def test_values_that_a_description_cannot_have_are_refused(
+    model: Any, values: dict[str, Any], wrong: str, found: str
+) -> None:
+    """The field is named, and what stands in it."""
+    with pytest.raises(BadInputError) as caught:
         model(**values)
+    assert (caught.value.where, caught.value.found) == (f"{model.__name__}.{wrong}", found)
 
 
 def test_the_rules_of_a_run_are_refused_in_words() -> None:

@@ -60,6 +60,7 @@ class World:
         self.watched: list[int] = []
         self.inbox: list[list[tuple[str, Any]]] = []
         self.places = {"draw": 0, "mix": 1, "show": 0}
+        self.core_counts = {"gpu": 2, "cpu": 1}
         self.refuses: Exception | None = None
         self.interrupts: Any = SimpleNamespace(fd=50, count=0)
         monkeypatch.setattr(realtime_clock, "time", self)
@@ -195,10 +196,10 @@ def test_what_units_say_becomes_events_in_order(monkeypatch: pytest.MonkeyPatch)
     world.said.clear()
     job_error = Failed(1, 3, "dark")
     world.inbox = [
-        [("gpu", Done(0, 5, 9, 6, {})), ("cpu", messages.Pong()), ("cpu", Closed())],
+        [("gpu", Done(0, 5, 9, 6, 1, 2, 3, 7, 8, {})), ("cpu", messages.Pong()), ("cpu", Closed())],
         [("gpu", job_error), ("cpu", None), ("cpu", Ready(8)), ("gpu", Failed(-1, 1, "unbuilt"))],
     ]
-    assert clock.wait(NEVER)[1] == (JobDone("gpu", 0, 5, 9, 6), Pong("cpu"))
+    assert clock.wait(NEVER)[1] == (JobDone("gpu", 0, 5, 9, 6, 1, 2, 3), Pong("cpu"))
     assert clock.wait(NEVER)[1] == (JobFailed("gpu", 1), UnitDied("cpu"), UnitReady("cpu"))
     assert world.said == [("connected", "cpu")]
     assert world.log.failure == Failure("dark", 3)
@@ -247,7 +248,7 @@ def test_requests_are_heard_and_answered_when_their_frame_is_presented(monkeypat
         decision = world.core.step(now_ns, events)
         clock.perform(now_ns, decision.actions)
         assert requests.answers == []
-        world.inbox = [[(unit, Done(number, 1, 2, 1 if number == 0 else 0, {}))]]
+        world.inbox = [[(unit, Done(number, 1, 2, 1 if number == 0 else 0, 0, 0, 0, 1, 0, {}))]]
         now_ns, events = clock.wait(START)
     assert requests.answers == [0]
 
@@ -256,7 +257,7 @@ def test_a_frame_that_nobody_asked_for_is_presented_all_the_same(monkeypatch: py
     world = World(monkeypatch, settings={"policy": "sequential"})
     clock = world.begun()
     for number, unit in ((0, "gpu"), (1, "gpu"), (2, "cpu")):
-        world.inbox = [[(unit, Done(number, 1, 2, 1 if number == 0 else 0, {}))]]
+        world.inbox = [[(unit, Done(number, 1, 2, 1 if number == 0 else 0, 0, 0, 0, 1, 0, {}))]]
         now_ns, events = clock.wait(START)
         clock.perform(now_ns, world.core.step(now_ns, events).actions)
     clock.finish()
@@ -265,20 +266,29 @@ def test_a_frame_that_nobody_asked_for_is_presented_all_the_same(monkeypatch: py
 
 
 def test_every_job_that_ended_is_booked_with_its_times_and_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """draw 0 and draw 1 were handed over at the start; draw 1 ends after its frame was lost, and leaves its figures."""
+    """draw 0 and draw 1 were handed over at the start; draw 1 ends after its frame was lost, and leaves its figures.
+
+    The GPU has two cores: in the 1 ns from the run's begin to its first job it cannot have had more than 2 ns of CPU
+    time, in the 3 ns between its jobs 5 are possible.
+    """
     world = World(monkeypatch)
     clock = world.begun()
     released = world.core.frames[0].ready_ns
-    world.inbox = [[("gpu", Done(0, START + 1, START + 9, START + 2, {"area": 3.0}))]]
+    world.inbox = [[("gpu", Done(0, START + 1, START + 9, START + 2, 3, 2, 1, 4, 99, {"area": 3.0}))]]
     clock.wait(START)
     assert clock.jobs == []
     del world.core.frames[1]
-    world.inbox = [[("gpu", Done(1, START + 9, START + 11, 0, {"area": 4.0, "new": 1.0}))]]
+    world.inbox = [[("gpu", Done(1, START + 12, START + 20, 0, 0, 0, 0, 16, 5, {"area": 4.0, "new": 1.0}))]]
     clock.wait(START)
     clock.finish()
     clock.finish()
-    assert clock.jobs == [JobRecord("draw", "gpu", 0, released, START, START + 1, START + 9)]
+    assert clock.jobs == [JobRecord("draw", "gpu", 0, released, START, START + 1, START + 9, 3, 2, 1)]
     assert clock.metrics == {"draw": Counter(area=7.0, new=1.0)}
+    assert (clock.cpu.stage_ns, clock.cpu.in_jobs_ns, clock.cpu.between_ns) == (
+        {"draw": [4, 16]},
+        {"gpu": 20},
+        {"gpu": 7},
+    )
 
 
 def test_progress_is_shown_ten_times_a_second_and_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:

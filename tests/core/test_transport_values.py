@@ -40,8 +40,11 @@ BYTES = [
     (messages.Ping(), b"\2"),
     (messages.Close(), b"\3"),
     (messages.Ready(77), b"\4" + words(77)),
-    (messages.Done(1, 2, 3, 4, {}), b"\5" + words(1, 2, 3, 4)),
-    (messages.Done(1, 2, 3, 4, {"a": 1.5}), b"\5" + words(1, 2, 3, 4) + b"\x81\xa1a\xcb\x3f\xf8" + bytes(6)),
+    (messages.Done(1, 2, 3, 4, 5, 6, 7, 8, 9, {}), b"\5" + words(1, 2, 3, 4, 5, 6, 7, 8, 9)),
+    (
+        messages.Done(9, 8, 7, 6, 5, 4, 3, 2, 1, {"a": 1.5}),
+        b"\5" + words(9, 8, 7, 6, 5, 4, 3, 2, 1) + b"\x81\xa1a\xcb\x3f\xf8" + bytes(6),
+    ),
     (messages.Duration(9), b"\6" + words(9)),
     (messages.Failed(-1, 2, "no"), b"\7" + words(-1, 2) + b"\xa2no"),
     (messages.Failed(-3, 2, ""), b"\7" + words(-3, 2)),
@@ -57,6 +60,11 @@ def test_a_message_has_the_bytes_that_are_written_down(message: Any, data: bytes
     assert (again, type(again)) == (message, type(message))
     with pytest.raises(MessageError):
         unpack(data[: len(data) // 2] if len(data) > 1 else b"\x0a")
+
+
+def test_the_times_of_a_job_that_ended_are_told_in_this_order() -> None:
+    times = ("t_begin_ns", "t_end_ns", "t_sampled_ns", "preempted_ns", "asleep_ns", "preempted_before_ns", "cpu_ns")
+    assert messages.Done._fields == ("id", *times, "cpu_before_ns", "metrics")
 
 
 def test_the_numbers_that_both_sides_of_a_message_agree_on() -> None:
@@ -82,7 +90,7 @@ def test_what_is_wrong_with_bytes_is_said() -> None:
         pack(messages.Failed(1, 2, "e" * 4077))
     with pytest.raises(MessageError, match="unknown message b''"):
         unpack(b"")
-    assert unpack(pack(messages.Done(1, 2, 3, 4, {"a": 1, "b": 2.5}))).metrics == {"a": 1, "b": 2.5}
+    assert unpack(pack(messages.Done(1, 2, 3, 4, 5, 6, 7, 8, 9, {"a": 1, "b": 2.5}))).metrics == {"a": 1, "b": 2.5}
 
 
 @pytest.mark.parametrize(("payload", "slot_bytes"), [(0, 1), (1, 2), (4095, 2), (4096, 2), (4097, 3), (40_960, 11)])

@@ -46,6 +46,10 @@ REGIONS = {
 }
 
 
+def done(number: int) -> Done:
+    return Done(number, 1, 2, 3, 4, 5, 6, 7, 8, {})
+
+
 class FakeStarter:
     """Starts `sleep`; the test speaks for it over `pipes` and `stderr`, which are the unit's own ends."""
 
@@ -125,10 +129,10 @@ def test_jobs_go_out_and_answers_come_in(started: Started) -> None:
     processes.send("right", Ping())
     processes.send("nobody", Ping())
     assert (starter.pipes["right"].receive(), starter.pipes["left"].receive()) == (Ping(), None)
-    done = [Done(number, 1, 2, 3, {}) for number in range(3)]
-    for answer in done:
+    answers = [done(number) for number in range(3)]
+    for answer in answers:
         starter.pipes["right"].send(answer)
-    assert heard(processes, 3) == [UnitMessage("right", answer) for answer in done]
+    assert heard(processes, 3) == [UnitMessage("right", answer) for answer in answers]
 
 
 def test_heartbeats_come_in_and_the_name_of_their_socket_goes(started: Started) -> None:
@@ -155,12 +159,12 @@ def test_what_a_unit_said_comes_before_its_end_and_its_last_line_is_kept(started
     processes, starter = started
     os.write(starter.stderr["right"], b"x" * 9000 + b"\nlast words\n")
     for number in range(2):
-        starter.pipes["right"].send(Done(number, 1, 2, 3, {}))
+        starter.pipes["right"].send(done(number))
     processes.kill("nobody")
     processes.kill("right")
     starter.sleepers["right"].wait(5)
     starter.leave("right")
-    assert heard(processes, 3) == [UnitMessage("right", m) for m in (Done(0, 1, 2, 3, {}), Done(1, 1, 2, 3, {}), None)]
+    assert heard(processes, 3) == [UnitMessage("right", m) for m in (done(0), done(1), None)]
     assert processes.stderr_tails["right"] == "x" * (8192 - 12) + "\nlast words"
     assert processes.why_ended("right") == "; it wrote last: last words"
     assert processes.why_ended("left") == "; the server ended"
@@ -189,15 +193,15 @@ def test_heartbeats_that_are_no_message_end_the_run_too(started: Started) -> Non
 def test_a_unit_that_has_closed_its_ends_wakes_nobody_again(started: Started) -> None:
     """Its job pipe and its stderr stay readable for ever; its process still lives."""
     processes, starter = started
-    starter.pipes["left"].send(Done(0, 1, 2, 3, {}))
+    starter.pipes["left"].send(done(0))
     starter.leave("left")
-    assert heard(processes, 1) == [UnitMessage("left", Done(0, 1, 2, 3, {}))]
+    assert heard(processes, 1) == [UnitMessage("left", done(0))]
     for _ in range(2):
         processes.listen(0)
     assert processes._poller.poll(0) == []
     assert list(processes.pids) == ["left", "right"]
-    starter.pipes["right"].send(Done(1, 1, 2, 3, {}))
-    assert heard(processes, 1) == [UnitMessage("right", Done(1, 1, 2, 3, {}))]
+    starter.pipes["right"].send(done(1))
+    assert heard(processes, 1) == [UnitMessage("right", done(1))]
 
 
 def test_what_is_watched_wakes_a_listener_once(started: Started) -> None:

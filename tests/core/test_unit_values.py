@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -53,6 +53,26 @@ MS = 1_000_000
 def packets(header: np.dtype[Any], count: int) -> list[Packet]:
     layout = SlotLayout(header, 8)
     return [view_packet(memoryview(bytearray(layout.slot_bytes)), layout) for _ in range(count)]
+
+
+def context() -> UnitContext:
+    return UnitContext("right", UNITS["right"], {})
+
+
+class ToldMeter:
+    """Each piece of time had 100 ns of CPU time and its threads waited for 2 ns; notes how often it looked."""
+
+    def __init__(self, others: Set[int]) -> None:
+        self.others, self.looks = others, 0
+
+    def cpu_ns(self) -> int:
+        return 100
+
+    def delay_ns(self) -> int:
+        return 2
+
+    def look(self) -> None:
+        self.looks += 1
 
 
 class FakeStage:
@@ -142,16 +162,26 @@ def served(monkeypatch: pytest.MonkeyPatch, link: FakeLink, stages: list[Any]) -
 def test_a_unit_answers_every_message_once(monkeypatch: pytest.MonkeyPatch) -> None:
     first, second = FakeStage(), FakeStage()
     outputs = packets(OWN, 2)
-    stages = [BoundStage("a", first, [], outputs, 0), BoundStage("b", second, packets(OWN, 2), [], 0)]
+    stages = [
+        BoundStage("a", first, [], outputs, 0, context()),
+        BoundStage("b", second, packets(OWN, 2), [], 1, context()),
+    ]
     outputs[0].header["epoch"] = 9
     alone = RunIsolated(1, 7, 0, -1), RunIsolated(0, 8, -1, 0)
     link = FakeLink(RunJob(11, 0, 5, -1, 1, 2), Ping(), RunJob(12, 1, 6, 1, -1, 2), *alone, Close())
+    meters: list[ToldMeter] = []
+    monkeypatch.setattr(unit_loop, "CoreMeter", lambda others: meters.append(ToldMeter(others)) or meters[0])
+    others = unit_loop._threads() - {os.getpid()}
     before = time.monotonic_ns()
     assert served(monkeypatch, link, stages) == 0
     one, two, three, four, end = link.sent
     assert (one.id, two.id, one.metrics) == (11, 12, {"shade": 3.0})
     assert before <= one.t_begin_ns <= one.t_sampled_ns <= one.t_end_ns <= two.t_begin_ns <= two.t_end_ns
     assert (two.t_sampled_ns, end) == (0, Closed())
+    wall_ns = one.t_end_ns - one.t_begin_ns  # on one core: 100 ns worked, 2 ns waited for it, the rest slept
+    assert one[4:9] == (2, wall_ns - 102, 2, 100, 100)
+    assert two[4:9] == (2, 0, 2, 100, 100)  # held to a pace: the chip worked
+    assert [(meter.others, meter.looks) for meter in meters] == [(others, 5)]  # at the start, after a job or the like
     assert all(isinstance(took, Duration) and 0 <= took.value < time.monotonic_ns() - before for took in (three, four))
     assert link.beats == [Ready(os.getpid()), Pong()]
     assert (first.runs, second.runs) == ([(5, None, 1), (8, None, 0)], [(6, 1, None), (7, 0, None)])
@@ -176,7 +206,7 @@ def test_a_unit_ends_when_its_pipe_does_and_refuses_what_is_not_for_it(monkeypat
 def test_a_stage_that_fails_is_an_answer_in_one_line(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], error: Exception, code: int, said: str
 ) -> None:
-    stage = BoundStage("a", FakeStage(error), [], packets(OWN, 1), 0)
+    stage = BoundStage("a", FakeStage(error), [], packets(OWN, 1), 0, context())
     link = FakeLink(RunJob(11, 0, 5, -1, 0, 0), RunIsolated(0, 5, -1, 0), Close())
     assert served(monkeypatch, link, [stage]) == code
     assert [(answer.id, answer.exit_code) for answer in link.sent[:3]] == [(11, code), (-2, code), (-3, code)]
@@ -187,7 +217,10 @@ def test_a_stage_that_fails_is_an_answer_in_one_line(
 
 def test_closing_names_its_stage_and_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
     last = FakeStage()
-    stages = [BoundStage("a", FakeStage(ValueError("x")), [], [], 0), BoundStage("b", last, [], [], 0)]
+    stages = [
+        BoundStage("a", FakeStage(ValueError("x")), [], [], 0, context()),
+        BoundStage("b", last, [], [], 0, context()),
+    ]
     link = FakeLink(Close())
     assert served(monkeypatch, link, stages) == 1
     assert link.sent == [Failed(-3, 1, "unit right, closing a: ValueError: x"), Closed()]
@@ -196,7 +229,7 @@ def test_closing_names_its_stage_and_goes_on(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_a_lost_unit_does_not_answer_it_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     link = FakeLink(RunJob(11, 0, 5, -1, 0, 0))
-    stage = BoundStage("a", FakeStage(UnitLostError("context lost")), [], packets(OWN, 1), 0)
+    stage = BoundStage("a", FakeStage(UnitLostError("context lost")), [], packets(OWN, 1), 0, context())
     with pytest.raises(UnitLostError):
         served(monkeypatch, link, [stage])
     assert link.sent == []
@@ -282,6 +315,9 @@ def test_stages_are_built_in_order_on_the_slots_of_their_edges(tmp_path: Path, m
     assert inner[0].unit.assets["one"].tolist() == [0, 1, 2]
     assert [[len(side) for side in stage.bound] for stage in inner] == [[0, 1], [3, 0]]
     assert inner[0].bound[1][0].header.dtype == OWN
+    assert not first.works_asleep
+    inner[0].unit.use_device("card")
+    assert first.works_asleep and last.works_asleep
 
 
 def test_a_factory_is_found_by_module_and_name() -> None:
