@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 from dataclasses import fields, replace
 from importlib import import_module
@@ -15,8 +16,10 @@ from pydantic import ValidationError
 
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_split import cuts
+from trilane.avatars.validation import DrawnAs
 from trilane.body.body import Body
 from trilane.errors import BadInputError, MissingPartError
+from trilane.figure_sources import NO_FIGURES
 from trilane.pipeline.description import UnitSettings
 from trilane.scene.schema import AvatarSpec, OutputSpec, Scene
 from trilane.scene.staging import stage_scene
@@ -297,13 +300,28 @@ def test_a_request_becomes_a_checked_configuration(tiny_bundle: Path, tmp_path: 
     assert config.avatar_dirs == (tiny_bundle.absolute(),) and config.posed_vertices == (vertices,)
     assert (config.out_dir, config.runtime, config.cuts, config.scene.frames) == (tmp_path, "ort", (), 3)
     assert software.notes[-2:] == ("runtime: ort (as asked)", "skinning: cpu unit (the OpenGL driver is software)")
-    assert software.accuracy == {"tiny": {}}
+    why = f"it was never validated; `trilane avatar validate {tiny_bundle}` measures it"
+    assert software.accuracy == {"tiny": {"source": NO_FIGURES, "changed": [], "why": why}}
     changed = software.changed(record=False, runtime="openvino")
     assert (changed.config.record, changed.config.runtime, config.record) == (False, "openvino", True)
     assert changed.assets is software.assets and changed.notes == software.notes
     assert configure.configure(request, tmp_path, lambda: {"hardware": True}).config.posed_vertices == ()
-    validated = load_bundle("default")
-    assert configure._accuracy(validated) == validated.manifest.validation.model_dump(mode="json")  # type: ignore[union-attr]
+
+
+def test_the_accuracy_of_a_run_is_of_each_avatar_as_the_run_draws_it(
+    tiny_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two avatars of one name in one tensor: each has its row, under its folder."""
+    monkeypatch.setattr(configure, "accuracy_of", lambda bundle, drawn: {"of": bundle.folder, "drawn": drawn})
+    other = Path(shutil.copytree(tiny_bundle, tmp_path / "other"))
+    scene = tmp_path / "two.toml"
+    rows = "".join(f'[[avatars]]\nbundle = "{folder}"\n' for folder in (tiny_bundle, other))
+    scene.write_text('name = "two"\nsize = "64"\ntexture_filter = "mipmap"\n' + rows)
+    request = configure.Request(scene=str(scene), runtime="ort", frames=1)
+    drawn = DrawnAs("ort", "64", "mipmap", 2)
+    assert configure.configure(request, tmp_path, lambda: None).accuracy == {
+        f"tiny in {folder}": {"of": folder, "drawn": drawn} for folder in (tiny_bundle.absolute(), other)
+    }
 
 
 def test_a_background_is_opened_in_its_size_before_the_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

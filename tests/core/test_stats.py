@@ -43,7 +43,7 @@ def test_an_exponential_average_stays_among_the_values(values: list[int]) -> Non
 def test_nothing_gives_zeros() -> None:
     assert percentile([], 0.5) == 0
     assert summary_ms([]) == dict.fromkeys(summary_ms([1]), 0.0)
-    assert list(summary_ms([1])) == ["mean", "p50", "p90", "p95", "p99", "max"]
+    assert list(summary_ms([1])) == ["mean", "p50", "p90", "p95", "p99", "max", "samples"]
     assert ema_range_ms([]) == {"ema20_min": 0.0, "ema20_max": 0.0}
     assert jitter_ms([]) == jitter_ms([5]) == 0
 
