@@ -22,6 +22,7 @@ from trilane.testing.mutants.trial import run_tests
 ROOT = Path(__file__).resolve().parents[4]
 UNCHANGING = ROOT / "tests" / "unchanging.toml"
 REACH = ROOT / ".venv" / "mutants-reach.json"
+TESTS = ("tests/core/", "tests/conformance/", "tests/golden/", "tests/process/")
 RESULTS = ROOT / ".venv" / "mutants.jsonl"
 
 
@@ -56,7 +57,7 @@ def main() -> int:
     options.out.write_text("", encoding="utf-8")
     with ExitStack() as stack:
         trees = [stack.enter_context(copied_tree(ROOT, tracked)) for _ in range(options.workers)]
-        tests = [path for path in tracked if path.startswith("tests/") and Path(path).name.startswith("test_")]
+        tests = [path for path in tracked if path.startswith(TESTS) and Path(path).name.startswith("test_")]
         reach = measure_reach(trees, tests, code_files(tracked), options.reach, _say)
         results = list(_tried(options, faults, reach, trees))
     return _report(results, len(faults))
