@@ -37,7 +37,7 @@ PIPELINE = Pipeline(
         for name, unit in (("in", "left"), ("mid", "right"), ("out", "left"))
     ),
     edges=(PipelineEdge(payload_bytes=1),) * 2,
-    units={"left": UnitSettings(cores=(1,), threads=2), "right": UnitSettings(cores=(0,), threads=1)},
+    units={"left": UnitSettings(cores=(1, 0), threads=3), "right": UnitSettings(cores=(0,), threads=1)},
     module_folders=(Path("stages"),),
 )
 REGIONS = {
@@ -118,8 +118,9 @@ def test_a_unit_is_told_what_it_needs_and_no_more(started: Started) -> None:
         92,
         (Path.cwd() / "stages",),
     )
-    assert (right.scheduler_cores, right.run_cores) == ((1,), (0, 1))
+    assert (right.scheduler_cores, right.run_cores) == ((1, 0), (0, 1))
     assert processes.places == {"in": 0, "out": 1, "mid": 0}
+    assert processes.core_counts == {"left": 2, "right": 1}
     assert processes.pids == {unit: sleeper.pid for unit, sleeper in starter.sleepers.items()}
 
 
