@@ -120,6 +120,15 @@ def test_quick_tests_that_reach_the_line_come_first() -> None:
     assert reach.tests_of(Fault("t.toml", 7, "", "x\n", ""), "") == ["quick"]
 
 
+def test_the_start_of_the_tests_counts_once() -> None:
+    """Starts take 1 s: a and b take 1 + 1 + 3 s, c would make it 9."""
+    reach = Reach({name: Reached("", s, {}) for name, s in {"a": 2.0, "b": 4.0, "c": 5.0, "d": 1.0}.items()}, {})
+    assert reach.within(["a", "b", "c"], 8.0) == (["a", "b"], 5.0)
+    assert reach.within(["a", "b", "c"], 9.0) == (["a", "b", "c"], 9.0)
+    assert reach.within(["c", "a"], 0.5) == (["c"], 5.0)
+    assert reach.within([], 8.0) == ([], 1.0)
+
+
 def test_the_verdict_counts_each_folder_and_all() -> None:
     """scheduler 8 of 10 (enough), body 3 of 5 (too few), shaders 1 of 4 (too few to judge): 12 of 19 in all."""
     counts = {"scheduler": (8, 10), "body": (3, 5), "shaders": (1, 4)}

@@ -95,14 +95,7 @@ def _tried(
 
 def _try(fault: Fault, reach: Reach, tree: TreeCopy, most_s: float) -> Result:
     reaching = reach.tests_of(fault, digest_of(tree.root / fault.path))
-    chosen: list[str] = []
-    usual_s = 0.0
-    for name in reaching:
-        seconds = reach.tests[name].seconds
-        if chosen and usual_s + seconds > most_s:
-            break
-        chosen.append(name)
-        usual_s += seconds
+    chosen, usual_s = reach.within(reaching, most_s)
     if not chosen:
         return Result(fault, "", 0.0, 0, 0)
     with tree.with_fault(fault):
