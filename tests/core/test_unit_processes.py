@@ -277,7 +277,7 @@ def test_a_unit_is_asked_for_with_its_spec_and_files(answer: bytes, passes_fd: b
         os.close(unit.pidfd)
         assert unit.pid == 123
     packet, fds, *_ = socket.recv_fds(theirs, 9999, 10)
-    assert json.loads(packet) == {"unit": "left", "cores": [1], "threads": 2, "fds": [0, 1, 2]}
+    assert json.loads(packet) == {"unit": "left", "cores": [1, 0], "threads": 3, "fds": [0, 1, 2]}
     assert len(fds) == 5
     assert UnitSpec.model_validate_json(os.pread(fds[0], 9999, 0)) == spec()
     for fd in fds:
