@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from trilane.apps.cli.console import print_facts, print_json, spinner, stdout_console
+from trilane.apps.cli.console import print_facts, print_json, spinner, stdout_console, stdout_kept
 from trilane.apps.cli.options import (
     AvatarArgument,
     ChannelsOption,
@@ -116,7 +116,7 @@ def export(
 
     whole = load_bundle(name).read_network()
     chosen = reshaped(whole, *_shape(size)) if size else whole
-    with spinner(f"compiling for {soc}"):
+    with spinner(f"compiling for {soc}"), stdout_kept():
         write_context(chosen, soc, out)
     print_facts({"file": str(out), "bytes": out.stat().st_size, "soc": soc, "compiler": version()}, json)
 
