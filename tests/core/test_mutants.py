@@ -9,9 +9,10 @@ import pytest
 
 from trilane.testing.mutants.draw import code_files, draw
 from trilane.testing.mutants.fault import Fault, fault_between
-from trilane.testing.mutants.reach import Reach, Reached
+from trilane.testing.mutants.reach import Reach, Reached, load_reach, measure_reach
 from trilane.testing.mutants.results import Result, Unchanging, fails, table
 from trilane.testing.mutants.text_faults import text_faults
+from trilane.testing.mutants.tree_copy import TreeCopy
 
 SHADER = """\
 // clamp(x, 0.0, 255.0)
@@ -127,6 +128,41 @@ def test_the_start_of_the_tests_counts_once() -> None:
     assert reach.within(["a", "b", "c"], 9.0) == (["a", "b", "c"], 9.0)
     assert reach.within(["c", "a"], 0.5) == (["c"], 5.0)
     assert reach.within([], 8.0) == ([], 1.0)
+
+
+TEST_OF_BOTH = """\
+import subprocess, sys
+from trilane.folder.double import double
+def test_double():
+    assert double(2) == 4
+def test_in_a_process():
+    subprocess.run([sys.executable, "-c", "from trilane.folder.double import half; half(4)"], check=True)
+    open("folder/numbers.toml").close()
+"""
+
+
+def test_reach_follows_links_and_processes_and_notes_opened_tables(tmp_path: Path) -> None:
+    """A folder behind a link: lines 1 and 4 are met when it is imported, 2 by a test, 5 by a process of it."""
+    pytest.importorskip("coverage")
+    root = tmp_path / "tree"
+    (root / "src" / "trilane").mkdir(parents=True)
+    (root / "src" / "trilane" / "__init__.py").touch()
+    (root / "folder").mkdir()
+    (root / "src" / "trilane" / "folder").symlink_to("../../folder")
+    source = "def double(x):\n    return 2 * x\n\ndef half(x):\n    return x / 2\n"
+    (root / "folder" / "double.py").write_text(source)
+    (root / "folder" / "numbers.toml").write_text("a = 1\n")
+    (root / "test_both.py").write_text(TEST_OF_BOTH)
+    (root / "test_broken.py").write_text("def test_broken():\n    assert False\n")
+    said: list[str] = []
+    tests = ["test_both.py", "test_broken.py"]
+    reach = measure_reach([TreeCopy(root)], tests, ["folder/double.py"], tmp_path / "reach.json", said.append)
+    assert list(reach.tests) == ["test_both.py"]
+    assert said[-1].endswith("fails without a fault: test_broken.py")
+    lines = reach.tests["test_both.py"].lines
+    assert lines["folder/double.py"] == [1, 2, 4, 5]
+    assert lines["folder/numbers.toml"] == []
+    assert load_reach(tmp_path / "reach.json").tests == reach.tests
 
 
 def test_the_verdict_counts_each_folder_and_all() -> None:

@@ -38,6 +38,7 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--seconds", type=float, default=60.0, help="tests run for one fault, quickest first [60]")
     parser.add_argument("--workers", type=int, default=os.cpu_count(), help="trials at a time [the cores]")
     parser.add_argument("--only", action="append", default=[], metavar="PREFIX", help="only files that begin so; often")
+    parser.add_argument("--tests", action="append", metavar="PREFIX", help="only tests that begin so; often [all]")
     parser.add_argument("--again", type=Path, metavar="FILE", help="instead of drawing: the survivors of these results")
     parser.add_argument("--list", action="store_true", help="print the faults and try none")
     parser.add_argument("--reach", type=Path, default=REACH, help="where to keep which tests reach which lines")
@@ -57,7 +58,11 @@ def main() -> int:
     options.out.write_text("", encoding="utf-8")
     with ExitStack() as stack:
         trees = [stack.enter_context(copied_tree(ROOT, tracked)) for _ in range(options.workers)]
-        tests = [path for path in tracked if path.startswith(TESTS) and Path(path).name.startswith("test_")]
+        tests = [
+            path
+            for path in tracked
+            if path.startswith(tuple(options.tests or TESTS)) and Path(path).name.startswith("test_")
+        ]
         reach = measure_reach(trees, tests, code_files(tracked), options.reach, _say)
         results = list(_tried(options, faults, reach, trees))
     return _report(results, len(faults))
