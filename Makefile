@@ -24,7 +24,7 @@ test-all: .venv/ready-all .venv/ready-core
 test-device: .venv/ready-device
 	$(BIN)/pytest tests/device $(ARGS)
 	$(BIN)/pytest tests/golden $(ARGS)
-	$(BIN)/pytest tests/conformance/test_runtimes.py --runtime cuda $(ARGS)
+	$(BIN)/pytest tests/conformance/test_runtimes.py tests/conformance/test_hard_cases.py --runtime cuda $(ARGS)
 
 # Small faults put into a copy of the code, to see which the tests notice: tests/README.md.
 mutants: .venv/ready-all

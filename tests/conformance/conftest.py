@@ -10,11 +10,23 @@ from trilane.stages.dsp.runtime import RUNTIMES
 WITH_GPU = "cuda"
 
 
+#: An emulator: a frame of the hard cases takes it seconds.
+SLOW = "qnn"
+
+
 def pytest_generate_tests(metafunc):
-    """Every test of the contract runs on each runtime, or on those of `--runtime`."""
-    if "name" in metafunc.fixturenames:
-        asked = metafunc.config.getoption("--runtime") or [name for name in RUNTIMES if name != WITH_GPU]
-        metafunc.parametrize("name", asked, indirect=True)
+    """Every test of a contract runs on each runtime without a GPU, or on those of `--runtime`."""
+    for fixture, left_out in (("name", {WITH_GPU}), ("quick_runtime", {WITH_GPU, SLOW})):
+        if fixture in metafunc.fixturenames:
+            asked = metafunc.config.getoption("--runtime") or [name for name in RUNTIMES if name not in left_out]
+            metafunc.parametrize(fixture, asked, indirect=True)
+
+
+@pytest.fixture
+def quick_runtime(request, skip_without):
+    """The name of a runtime that is installed and quick."""
+    skip_without(request.param)
+    return request.param
 
 
 @pytest.fixture

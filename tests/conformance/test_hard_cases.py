@@ -12,7 +12,6 @@ torch = pytest.importorskip("torch")
 
 from trilane.apps.experiments.hard_cases import SHIFT, error_of, make_case, make_pair  # noqa: E402
 from trilane.apps.experiments.hard_networks import INPUTS, NETWORKS  # noqa: E402
-from trilane.stages.dsp.runtime import RUNTIMES  # noqa: E402
 
 torch.set_num_threads(1)
 
@@ -42,7 +41,5 @@ def test_a_wrong_picture_is_above_the_bound(case, wrong):
     assert case.tells
 
 
-@pytest.mark.parametrize("runtime", [name for name in RUNTIMES if name != "qnn"])
-def test_the_picture_is_near_the_float_networks(skip_without, case, runtime):
-    skip_without(runtime)
-    assert error_of(case, runtime) <= case.bound
+def test_the_picture_is_near_the_float_networks(quick_runtime, case):
+    assert error_of(case, quick_runtime) <= case.bound
