@@ -2,7 +2,7 @@
 
 CPU time is CLOCK_PROCESS_CPUTIME_ID, of all threads. The run delay of a thread is the second number of
 `/proc/self/task/TID/schedstat` (Documentation/scheduler/sched-stats.rst of the kernel): ns in which it was ready and
-another thread had the core. Its file is opened once and read again for each job.
+another thread had the core. Its file is opened once and read again.
 """
 
 from __future__ import annotations
@@ -11,32 +11,41 @@ import os
 import time
 from collections.abc import Set
 
-TASKS = "/proc/self/task"
+PROCESS = "/proc/self"
+TASKS = f"{PROCESS}/task"
 LINE_BYTES = 64  # three numbers of 64 bits
 LINKS_BESIDE_THREADS = 2  # a folder has a link for each folder in it, `.` and its own name
 
 
-def counts_run_delay() -> bool:
+def counts_run_delay(process: str = PROCESS) -> bool:
     """Whether this kernel says how long threads waited for a core (CONFIG_SCHED_INFO)."""
     try:
-        with open("/proc/self/schedstat", "rb") as file:  # noqa: PTH123 - as the meter reads it
+        with open(f"{process}/schedstat", "rb") as file:  # noqa: PTH123 - as the meter reads it
             return int(file.read(LINE_BYTES).split()[0]) > 0
     except (OSError, ValueError, IndexError):
         return False
 
 
 class CoreMeter:
-    """Counts from its making on. Threads that appear later are found by `look`; those in `others` are left out."""
+    """Counts from its making on. Threads that appear later are found by `look`; those in `others` are left out.
 
-    def __init__(self, others: Set[int] = frozenset()) -> None:
-        self._others = others
+    `process`: the kernel's folder of this process.
+    """
+
+    def __init__(self, others: Set[int] = frozenset(), process: str = PROCESS) -> None:
+        self._others, self._tasks = others, f"{process}/task"
         self._files: dict[int, int] = {}  # of each thread
         self._seen_ns: dict[int, int] = {}  # of each file, the delay when it was last read
         self._threads = self._born_ns = 0
-        self._folder = os.open(TASKS, os.O_RDONLY | os.O_CLOEXEC) if counts_run_delay() else -1
+        self._folder = os.open(self._tasks, os.O_RDONLY | os.O_CLOEXEC) if counts_run_delay(process) else -1
         self._cpu_ns = time.process_time_ns()
         self.look()
         self._born_ns = 0  # what these threads waited before does not count
+
+    @property
+    def threads(self) -> int:
+        """How many the last look has found."""
+        return len(self._files)
 
     def cpu_ns(self) -> int:
         """CPU time of all threads since the last call."""
@@ -75,7 +84,7 @@ class CoreMeter:
 
     def _open(self, thread: int) -> None:
         try:
-            file = os.open(f"{TASKS}/{thread}/schedstat", os.O_RDONLY | os.O_CLOEXEC)
+            file = os.open(f"{self._tasks}/{thread}/schedstat", os.O_RDONLY | os.O_CLOEXEC)
             delay_ns = int(os.pread(file, LINE_BYTES, 0).split()[1])
         except (FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
             return

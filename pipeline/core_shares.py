@@ -18,6 +18,11 @@ class Lost(NamedTuple):
     asleep_ns: int
 
 
+def most_preempted_ns(wall_ns: int, cpu_ns: int, cores: int) -> int:
+    """The most of `wall_ns` that a unit with `cores` cores can have waited for them: what its CPU time leaves of it."""
+    return max(wall_ns - -(-cpu_ns // cores), 0)
+
+
 def preempted_ns(wall_ns: int, cpu_ns: int, delay_ns: int, cores: int) -> int:
     """How much of `wall_ns` a unit with `cores` cores waited for them.
 
@@ -27,8 +32,8 @@ def preempted_ns(wall_ns: int, cpu_ns: int, delay_ns: int, cores: int) -> int:
     """
     if not delay_ns:
         return 0
-    left_ns = max(wall_ns - -(-cpu_ns // cores), 0)
-    return min(delay_ns * wall_ns // max(cpu_ns + delay_ns, wall_ns), left_ns)
+    waited_ns = delay_ns * wall_ns // max(cpu_ns + delay_ns, wall_ns)
+    return min(waited_ns, most_preempted_ns(wall_ns, cpu_ns, cores))
 
 
 def lost_in_job(wall_ns: int, cpu_ns: int, delay_ns: int, cores: int, has_device: bool) -> Lost:
@@ -39,4 +44,4 @@ def lost_in_job(wall_ns: int, cpu_ns: int, delay_ns: int, cores: int, has_device
     """
     preempted = preempted_ns(wall_ns, cpu_ns, delay_ns, cores)
     asleep = 0 if has_device else wall_ns - preempted - cpu_ns
-    return Lost(preempted, asleep if asleep > 0 else 0)
+    return tuple.__new__(Lost, (preempted, asleep if asleep > 0 else 0))

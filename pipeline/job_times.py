@@ -1,61 +1,110 @@
-"""What a unit's process measures around its jobs. Rule: every ns from one job's end to the next one's is in one piece.
+"""What a unit's process measures around its jobs. Rule: the kernel is asked where no frame waits for the answer.
 
-A piece is a job, or the time between two jobs. The files of the kernel are read between jobs, so that a service time
-has nothing of it but one look at the CPU clock, about a microsecond.
+A piece of time is a job, or the time between two jobs. Every ns of CPU time is in one piece. Run delay is read after
+the answer to a job; before that only if the job may have lost more than LOSS_NS. Nothing is read before a job, unless
+the unit has had it for longer than HELD_NS, its stage's last job lost time, or other threads may have run between the
+jobs. docs/decisions/preempted-time.md says what the two thresholds can hide.
 """
 
 from __future__ import annotations
 
 import time
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Final, Protocol
 
-from trilane.pipeline.core_meter import CoreMeter
-from trilane.pipeline.core_shares import lost_in_job, preempted_ns
+from trilane.pipeline.core_shares import lost_in_job, most_preempted_ns, preempted_ns
+from trilane.transport.messages import Done
+
+LOSS_NS: Final = 20_000
+HELD_NS: Final = 100_000  # longer than a hand-over takes
+JOBS_PER_LOOK: Final = 64  # for new threads, where no job loses time
 
 
-class JobTimes(NamedTuple):
-    """Of a job; the fields mean what they mean in `trilane.transport.messages.Done`."""
+class Meter(Protocol):
+    """`trilane.pipeline.core_meter.CoreMeter`."""
 
-    begin_ns: int
-    end_ns: int
-    preempted_ns: int
-    asleep_ns: int
-    preempted_before_ns: int
-    cpu_ns: int
-    cpu_before_ns: int
+    @property
+    def threads(self) -> int: ...
+
+    def cpu_ns(self) -> int: ...
+
+    def delay_ns(self) -> int: ...
+
+    def look(self) -> None: ...
 
 
 class JobClock:
-    """For a unit with `cores` cores. `meter`: counts for its process."""
+    """For a unit with `cores` cores and `stages` stages. `meter`: counts for its process. `now_ns`: the time."""
 
-    def __init__(self, meter: CoreMeter, cores: int) -> None:
-        self._meter, self._cores = meter, cores
-        self._begin_ns = self._end_ns = self._cpu_before_ns = self._preempted_before_ns = 0
+    def __init__(self, meter: Meter, cores: int, stages: int, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        self._meter, self._cores, self._now_ns = meter, cores, now_ns
+        self._loses = [False] * stages  # whether the stage's last job may have lost more than LOSS_NS
+        self._used_cores = 1  # at a time, at most, by the threads that there are
+        self._stage = self._jobs = 0
+        self._begin_ns = self._end_ns = self._cpu_ns = self._cpu_before_ns = 0
+        self._preempted_ns = self._asleep_ns = self._preempted_before_ns = 0
+        self._delay_before_ns = 0  # since the last job's end, as far as it was read
+        self._was_read = False  # the run delay, at the last job's end
+        self._knows_cpu = True  # of the time before the job
+        self._has_one_thread = False
         self.restart()
 
     def restart(self) -> None:
         """The time between two jobs begins now, with the threads that there are."""
-        self._meter.look()
+        self._look()
         self._meter.delay_ns()
         self._meter.cpu_ns()
-        self._end_ns = time.monotonic_ns()
+        self._delay_before_ns = self._cpu_before_ns = 0
+        self._end_ns = self._now_ns()
 
-    def begin(self) -> None:
-        """A job begins."""
-        delay_ns = self._meter.delay_ns()
-        cpu_ns = self._cpu_before_ns = self._meter.cpu_ns()
-        self._preempted_before_ns = preempted_ns(time.monotonic_ns() - self._end_ns, cpu_ns, delay_ns, self._cores)
-        self._begin_ns = time.monotonic_ns()
+    def begin(self, stage: int, dispatch_ns: int) -> None:
+        """A job of the unit's `stage`-th stage begins, which was dispatched at `dispatch_ns`."""
+        self._stage = stage
+        begin_ns = self._now_ns()
+        is_long = begin_ns - max(dispatch_ns, self._end_ns) > HELD_NS
+        self._knows_cpu = is_long or self._loses[stage] or not self._has_one_thread
+        if self._knows_cpu:
+            if is_long or self._loses[stage]:
+                self._delay_before_ns += self._meter.delay_ns()
+            self._cpu_before_ns += self._meter.cpu_ns()
+            begin_ns = self._now_ns()
+        gap_ns = begin_ns - self._end_ns
+        self._preempted_before_ns = preempted_ns(gap_ns, self._cpu_before_ns, self._delay_before_ns, self._cores)
+        self._begin_ns = begin_ns
 
-    def end(self, works_asleep: bool) -> JobTimes:
+    def end(self, works_asleep: bool) -> None:
         """The job has ended. `works_asleep`: it went on while its threads slept."""
         cpu_ns = self._meter.cpu_ns()
-        end_ns = self._end_ns = time.monotonic_ns()
-        delay_ns = self._meter.delay_ns()
-        lost = lost_in_job(end_ns - self._begin_ns, cpu_ns, delay_ns, self._cores, works_asleep)
-        before = self._preempted_before_ns
-        return JobTimes(self._begin_ns, end_ns, *lost, before, cpu_ns, self._cpu_before_ns)
+        end_ns = self._end_ns = self._now_ns()
+        wall_ns = end_ns - self._begin_ns
+        if not self._knows_cpu and cpu_ns > wall_ns:  # of one thread: the rest is of the time since the last answer
+            self._cpu_before_ns += cpu_ns - wall_ns
+            cpu_ns = wall_ns
+        self._cpu_ns = cpu_ns
+        loses = most_preempted_ns(wall_ns, cpu_ns, self._used_cores) > LOSS_NS
+        self._was_read = self._loses[self._stage] = loses
+        delay_ns = self._meter.delay_ns() if loses else 0
+        self._preempted_ns, self._asleep_ns = lost_in_job(wall_ns, cpu_ns, delay_ns, self._cores, works_asleep)
 
-    def look(self) -> None:
-        """Find the threads that the last job began or ended: to be called when its end has been told."""
+    def done(self, job_id: int, sampled_ns: int, metrics: dict[str, float]) -> Done:
+        """The answer to the job that has ended."""
+        lost = (self._preempted_ns, self._asleep_ns, self._preempted_before_ns)
+        times = (self._begin_ns, self._end_ns, sampled_ns, *lost, self._cpu_ns, self._cpu_before_ns)
+        return tuple.__new__(Done, (job_id, *times, metrics))
+
+    def answered(self) -> None:
+        """To be called when the job was answered, for what took place in it and since is read now.
+
+        This thread did not sleep since the job's end: of a delay that may be the job's, the time since is the most.
+        """
+        delay_ns = self._meter.delay_ns()
+        self._cpu_before_ns = self._meter.cpu_ns()
+        self._delay_before_ns = delay_ns if self._was_read else min(delay_ns, self._now_ns() - self._end_ns)
+        self._jobs += 1
+        if self._was_read or self._jobs % JOBS_PER_LOOK == 0:
+            self._look()
+
+    def _look(self) -> None:
         self._meter.look()
+        self._used_cores = min(self._cores, max(self._meter.threads, 1))
+        self._has_one_thread = self._meter.threads == 1

@@ -91,7 +91,6 @@ class RealtimeClock:
 
     def wait(self, deadline_ns: int) -> tuple[int, tuple[Event, ...]]:
         """What happened until `deadline_ns` at the latest, and what time it is then."""
-        self._book()
         self._show_progress()
         self._tell_unanswered()
         events = self._listen(deadline_ns) if self._begun else self._begin()
@@ -113,7 +112,7 @@ class RealtimeClock:
                 self._start(action.unit)
 
     def finish(self) -> None:
-        """Book what the last step ended, and show the final progress."""
+        """Book all jobs that have ended, and show the final progress."""
         self._book()
         self._show_progress(final=True)
 
@@ -192,16 +191,7 @@ class RealtimeClock:
         self._unbooked.append((job, dispatch_ns, None if frame is None else frame.ready_ns, message))
         if frame is not None and self._requests is not None and job.stage == self._last_stage:
             self._requests.answered(job.frame)
-        return JobDone(
-            unit,
-            message.id,
-            message.t_begin_ns,
-            message.t_end_ns,
-            message.t_sampled_ns,
-            message.preempted_ns,
-            message.asleep_ns,
-            message.preempted_before_ns,
-        )
+        return tuple.__new__(JobDone, (unit, *message[:7]))  # the same fields; the constructor is slow
 
     def _failed(self, unit: str, message: Failed) -> Event | None:
         self._log.fail_with(message)
@@ -213,10 +203,11 @@ class RealtimeClock:
     def _dispatch(self, now_ns: int, job: Job) -> None:
         self._open[job.id] = (job, now_ns)
         place = self._processes.places[job.stage]
-        self._processes.send(job.unit, RunJob(job.id, place, job.frame, job.slot_in, job.slot_out, job.epoch))
+        fields = (job.id, place, job.frame, job.slot_in, job.slot_out, job.epoch, now_ns)
+        self._processes.send(job.unit, tuple.__new__(RunJob, fields))
 
     def _book(self) -> None:
-        """Note what the ended jobs took; done after the next jobs were dispatched, while the units work."""
+        """Note what the ended jobs took; done when the run is over, for units share the scheduler's core."""
         for job, dispatch_ns, ready_ns, done in self._unbooked:
             if ready_ns is not None:
                 lost = (done.preempted_ns, done.asleep_ns, done.preempted_before_ns)
@@ -228,8 +219,10 @@ class RealtimeClock:
 
     def _tell_unanswered(self) -> None:
         """Whoever asked for frames learns at once of those that will not come."""
+        if self._requests is None:
+            return
         ledger = self._core.ledger
-        if self._requests is not None and (ledger.dropped or ledger.lost):
+        if ledger.dropped or ledger.lost:
             self._requests.tell_unanswered({**ledger.dropped_by_cause, **ledger.lost_by_cause})
 
     def _show_progress(self, *, final: bool = False) -> None:

@@ -34,7 +34,6 @@ from trilane.transport.messages import (
     MEASURING,
     Close,
     Closed,
-    Done,
     Duration,
     Failed,
     MessageError,
@@ -73,7 +72,7 @@ def _serve(spec: UnitSpec, link: Link) -> int:
         return _fail(link, BUILDING, f"unit {spec.unit}", error)
     gc.collect()
     gc.freeze()
-    clock = JobClock(CoreMeter(others), len(spec.settings.cores))
+    clock = JobClock(CoreMeter(others), len(spec.settings.cores), len(stages))
     link.send_heartbeat(Ready(os.getpid()))
     while True:
         message = link.job_pipe.receive()
@@ -141,31 +140,17 @@ def factory_named(name: str) -> StageFactory:
 
 
 def _run_job(link: Link, stage: BoundStage, job: RunJob, clock: JobClock) -> None:
-    clock.begin()
+    clock.begin(job.stage, job.t_dispatch_ns)
     try:
         metrics = stage.run(job.frame, job.slot_in, job.slot_out, job.epoch)
-        times = clock.end(stage.works_asleep)
+        clock.end(stage.works_asleep)
         values = {str(name): float(value) for name, value in metrics.items()}
-        sampled_ns = stage.sampled_ns(job.slot_in, job.slot_out)
-        link.job_pipe.send(
-            Done(
-                job.id,
-                times.begin_ns,
-                times.end_ns,
-                sampled_ns,
-                times.preempted_ns,
-                times.asleep_ns,
-                times.preempted_before_ns,
-                times.cpu_ns,
-                times.cpu_before_ns,
-                values,
-            )
-        )
+        link.job_pipe.send(clock.done(job.id, stage.sampled_ns(job.slot_in, job.slot_out), values))
     except UnitLostError:
         raise
     except Exception as error:
         _fail(link, job.id, f"stage {stage.name}, frame {job.frame}", error)
-    clock.look()
+    clock.answered()
 
 
 def _run_isolated(link: Link, stage: BoundStage, job: RunIsolated) -> None:

@@ -26,6 +26,7 @@ class RunJob(NamedTuple):
 
     `id`: of the job; its answer, `Done` or `Failed`, carries the same. `stage`: place in the unit's list of stages,
     from 0. `slot_in`, `slot_out`: slots of the stage's edges, -1 where it has no such edge. `epoch`: of `slot_out`.
+    `t_dispatch_ns`: since when the unit has the job, in ns of CLOCK_MONOTONIC.
     """
 
     id: int
@@ -34,6 +35,7 @@ class RunJob(NamedTuple):
     slot_in: int
     slot_out: int
     epoch: int
+    t_dispatch_ns: int
 
 
 class RunIsolated(NamedTuple):

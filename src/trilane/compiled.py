@@ -1,8 +1,8 @@
 """Which modules are compiled, and whether they are here. Rule: what runs is what the sources say, or nothing runs.
 
-mypyc turns the core, and the job pipe over which units get jobs and answer, into C while the package is installed
-(setup.py); without a C compiler the same files run as Python, less than half as fast. The name of the compiled library
-holds a digest of the sources it was made from.
+mypyc turns the core, the job pipe over which units get jobs and answer, and the clock around a job into C while the
+package is installed (setup.py); without a C compiler the same files run as Python, less than half as fast. The name of
+the compiled library holds a digest of the sources it was made from.
 """
 
 from __future__ import annotations
@@ -36,6 +36,9 @@ MODULES = (
     "transport/job_pipe.py",
     "transport/messages.py",
     "transport/slots.py",
+    "pipeline/core_meter.py",
+    "pipeline/core_shares.py",
+    "pipeline/job_times.py",
 )
 PREFIX = "trilane_core_"
 STALE = "the scheduler's sources were changed after they were compiled"

@@ -5,15 +5,14 @@ from __future__ import annotations
 import random
 import threading
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
-from trilane.pipeline import core_meter, job_times
 from trilane.pipeline.core_meter import CoreMeter
-from trilane.pipeline.core_shares import Lost, lost_in_job, preempted_ns
+from trilane.pipeline.core_shares import Lost, lost_in_job, most_preempted_ns, preempted_ns
 from trilane.pipeline.cpu_use import CpuTimes, use_of_cores
-from trilane.pipeline.job_times import JobClock, JobTimes
+from trilane.pipeline.job_times import HELD_NS, JOBS_PER_LOOK, LOSS_NS, JobClock
+from trilane.scheduler.events import JobDone
 from trilane.transport.messages import Done
 
 TICKS = 400
@@ -102,12 +101,12 @@ def test_a_device_works_while_its_unit_sleeps_but_not_while_it_is_preempted() ->
 
 
 @pytest.fixture
-def tasks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def tasks(tmp_path: Path) -> Path:
     """A folder in the place of the kernel's, with a thread 7 that has waited for 500 ns."""
-    monkeypatch.setattr(core_meter, "TASKS", str(tmp_path))
-    monkeypatch.setattr(core_meter, "counts_run_delay", lambda: True)
-    waited(tmp_path, 7, 500)
-    return tmp_path
+    (tmp_path / "schedstat").write_text("123456 0 9\n")
+    (tmp_path / "task").mkdir()
+    waited(tmp_path / "task", 7, 500)
+    return tmp_path / "task"
 
 
 def waited(tasks: Path, thread: int, delay_ns: int) -> None:
@@ -117,7 +116,8 @@ def waited(tasks: Path, thread: int, delay_ns: int) -> None:
 
 def test_the_meter_counts_from_its_making_on_and_finds_new_threads(tasks: Path) -> None:
     waited(tasks, 3, 10**9)  # not the unit's
-    meter = CoreMeter(others={3})
+    meter = CoreMeter({3}, str(tasks.parent))
+    assert meter.threads == 1
     assert meter.delay_ns() == 0
     waited(tasks, 7, 750)
     waited(tasks, 3, 2 * 10**9)
@@ -125,6 +125,7 @@ def test_the_meter_counts_from_its_making_on_and_finds_new_threads(tasks: Path) 
     waited(tasks, 8, 40)
     assert meter.delay_ns() == 0
     meter.look()
+    assert meter.threads == 2
     waited(tasks, 7, 751)
     assert meter.delay_ns() == 41
     assert meter.delay_ns() == 0
@@ -182,26 +183,181 @@ def test_cpu_time_of_the_units_of_some_cores_is_at_most_what_they_had() -> None:
     assert [row.is_possible for row in too_much] == [False]
 
 
-class ToldMeter:
-    """Says what it is told: (CPU time, run delay) of each piece of time, in turn."""
+def test_what_cpu_time_leaves_of_the_cores_is_the_most_that_can_be_preempted() -> None:
+    assert [most_preempted_ns(100, cpu, 1) for cpu in (0, 60, 100, 130)] == [100, 40, 0, 0]
+    assert most_preempted_ns(100, 61, 2) == 69
 
-    def __init__(self, *pieces: tuple[int, int]) -> None:
-        self._cpu_ns, self._delay_ns = ([piece[index] for piece in pieces] for index in (0, 1))
+
+def test_the_end_of_a_job_has_the_fields_of_the_unit_s_answer() -> None:
+    """The clock of a run passes them on by their places."""
+    assert JobDone._fields[2:] == Done._fields[1:7]
+    assert (JobDone._fields[1], Done._fields[0]) == ("job", "id")
+
+
+class Told:
+    """The time, and a meter of `threads` threads: what they say next, in us."""
+
+    def __init__(self, threads: int = 1) -> None:
+        self.threads, self.looks = threads, 0
+        self.times: list[int] = []
+        self.cpu: list[int] = []
+        self.delay: list[int] = []
+
+    def say(self, times: list[int], cpu: list[int], delay: list[int]) -> None:
+        """All that is asked until the next call, no less: what was said before has been asked."""
+        assert (self.times, self.cpu, self.delay) == ([], [], [])
+        self.times, self.cpu, self.delay = times, cpu, delay
 
     def look(self) -> None:
-        """There are no threads."""
+        self.looks += 1
+
+    def now_ns(self) -> int:
+        return self.times.pop(0) * 1000
 
     def cpu_ns(self) -> int:
-        return self._cpu_ns.pop(0)
+        return self.cpu.pop(0) * 1000
 
     def delay_ns(self) -> int:
-        return self._delay_ns.pop(0)
+        return self.delay.pop(0) * 1000
 
 
-def test_a_job_and_the_time_before_it_are_measured_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ready at 1000. To 1400: 100 on the core, 250 without. The job to 2400: 600 on it, 300 without, 100 asleep."""
-    instants = iter([1000, 1400, 1400, 2400])
-    monkeypatch.setattr(job_times, "time", SimpleNamespace(monotonic_ns=lambda: next(instants)))
-    clock = JobClock(ToldMeter((7, 9), (100, 250), (600, 300)), 1)  # type: ignore[arg-type]
-    clock.begin()
-    assert clock.end(works_asleep=False) == JobTimes(1400, 2400, 300, 100, 250, 600, 100)
+def ready(cores: int = 1, threads: int = 1) -> tuple[JobClock, Told]:
+    """Of a unit with two stages, at 0."""
+    told = Told(threads)
+    told.say([0], [9], [9])
+    return JobClock(told, cores, 2, told.now_ns), told
+
+
+def measured(clock: JobClock, stage: int, dispatch_us: int, *, works_asleep: bool = False) -> tuple[float, ...]:
+    """A job's begin, end, preempted, asleep, preempted before, CPU time and CPU time before, in us."""
+    clock.begin(stage, dispatch_us * 1000)
+    clock.end(works_asleep)
+    _, begin, end, _, *rest, _ = clock.done(3, 0, {})
+    return tuple(value / 1000 for value in (begin, end, *rest))
+
+
+def test_a_job_that_computes_costs_one_look_at_the_cpu_clock_before_its_answer() -> None:
+    """Of 1010 us of CPU time since 0, 1000 are the job's, for that is how long it took."""
+    clock, told = ready()
+    told.say([50, 1050], [1010], [])
+    assert measured(clock, 0, 20) == (50, 1050, 0, 0, 0, 1000, 10)
+    told.say([1060], [5], [30])  # of 30 us without a core at most 10 were after the job
+    clock.answered()
+    told.say([1065, 1165], [100], [])  # 5 us on the core and 10 without from 1050 to 1065
+    assert measured(clock, 0, 0) == (1065, 1165, 0, 0, 10, 100, 5)
+
+
+def test_a_unit_that_had_its_job_for_long_asks_what_it_waited_for() -> None:
+    """From 0 to 400: 100 on the core, 250 without. The job to 1400: 600 on it, 300 without, 100 asleep."""
+    clock, told = ready()
+    told.say([399, 400, 1400], [100, 600], [250, 300])
+    assert measured(clock, 0, 290) == (400, 1400, 300, 100, 250, 600, 100)
+    told.say([], [3], [40])
+    clock.answered()
+    told.say([1501, 1502, 1602], [7, 100], [20])  # since the end: 60 without a core, 10 on it
+    assert measured(clock, 1, 0) == (1502, 1602, 0, 0, 60, 100, 10)
+
+
+def test_a_job_is_given_its_core_s_loss_above_the_threshold_alone() -> None:
+    clock, told = ready()
+    told.say([50, 150], [80], [])  # 20 us, unread: it slept, for all that is known
+    assert measured(clock, 0, 40) == (50, 150, 0, 20, 0, 80, 0)
+    told.say([160], [5], [18])
+    clock.answered()
+    told.say([160, 260], [79], [15])
+    assert measured(clock, 0, 150) == (160, 260, 15, 6, 5, 79, 5)
+    assert told.looks == 1
+    told.say([], [0], [0])
+    clock.answered()
+    assert told.looks == 2  # where time is lost a new thread may be the reason
+
+
+def test_a_stage_that_lost_time_is_measured_from_its_begin_the_other_one_is_not() -> None:
+    """A device works while stage 0 sleeps for 400 of 500 us; 60 more before each job's begin it had no core."""
+    clock, told = ready()
+    told.say([50, 550], [100], [0])
+    assert measured(clock, 0, 20, works_asleep=True) == (50, 550, 0, 0, 0, 100, 0)
+    told.say([], [5], [0])
+    clock.answered()
+    told.say([700, 740], [40], [])
+    assert measured(clock, 1, 620) == (700, 740, 0, 0, 0, 40, 5)
+    told.say([750], [5], [0])
+    clock.answered()
+    told.say([839, 840, 1340], [10, 100], [60, 30])
+    assert measured(clock, 0, 760, works_asleep=True) == (840, 1340, 30, 0, 60, 100, 15)
+
+
+def test_cpu_time_of_further_threads_between_jobs_is_not_the_job_s() -> None:
+    """Two threads on four cores: 200 us of spinning before the job; in it two threads can have had 2 x 100 us."""
+    clock, told = ready(4, 2)
+    told.say([50, 51, 151], [200, 170], [])
+    assert measured(clock, 0, 40) == (51, 151, 0, 0, 0, 170, 200)
+    told.say([151], [0], [0])
+    clock.answered()
+    told.say([160, 161, 261], [0, 150], [50])  # 25 us of one core may be lost
+    assert measured(clock, 0, 151) == (161, 261, 25, 0, 0, 150, 0)
+
+
+def test_threads_are_looked_for_now_and_then_where_no_job_loses_time() -> None:
+    clock, told = ready()
+    for job in range(1, 2 * JOBS_PER_LOOK + 1):
+        told.say([10 * job, 10 * job + 5, 10 * job + 6], [5, 0], [0])
+        assert measured(clock, 0, 10 * job)[5] == 5
+        clock.answered()
+        assert told.looks == 1 + job // JOBS_PER_LOOK
+
+
+class OneThread:
+    """The time, and a meter of a unit's only thread, which runs, waits for its core and sleeps as it is told."""
+
+    threads = 1
+
+    def __init__(self) -> None:
+        self.now = self.cpu = self.delay = self.told_cpu = self.told_delay = 0
+
+    def spend(self, ran: int, waited: int, slept: int) -> None:
+        self.now += ran + waited + slept
+        self.cpu += ran
+        self.delay += waited
+
+    def look(self) -> None:
+        """There is one thread."""
+
+    def now_ns(self) -> int:
+        return self.now
+
+    def cpu_ns(self) -> int:
+        passed, self.told_cpu = self.cpu - self.told_cpu, self.cpu
+        return passed
+
+    def delay_ns(self) -> int:
+        passed, self.told_delay = self.delay - self.told_delay, self.delay
+        return passed
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_no_time_is_counted_twice_and_the_thresholds_hide_no_more_than_they_may(seed: int) -> None:
+    """Truth: what one thread did in and between 60 jobs. It goes to sleep and is woken in RECEIVE ns of CPU time."""
+    draw = random.Random(seed)
+    thread, receive = OneThread(), 15_000
+    clock = JobClock(thread, 1, 1, thread.now_ns)
+    cpu = sum_of_cpu = 0
+    for _ in range(60):
+        thread.spend(0, 0, draw.choice((0, 10**6)))
+        dispatch_ns = thread.now
+        before = draw.choice((0, 5_000, 60_000, 3 * 10**6)), draw.choice((0, 0, 50_000))
+        thread.spend(receive, *before)
+        clock.begin(0, dispatch_ns)
+        lost = draw.choice((0, 9_000, 30_000, 2 * 10**6)), draw.choice((0, 0, 9_000, 10**6))
+        thread.spend(draw.randrange(10**6), *lost)
+        clock.end(False)
+        done = clock.done(0, 0, {})
+        wall = done.t_end_ns - done.t_begin_ns
+        assert abs(done.preempted_ns - lost[0]) <= LOSS_NS + receive + HELD_NS
+        assert 0 <= wall - done.preempted_ns - done.asleep_ns <= done.cpu_ns
+        assert abs(done.preempted_before_ns - before[0]) <= HELD_NS
+        sum_of_cpu += done.cpu_ns + done.cpu_before_ns
+        cpu = thread.cpu
+        thread.spend(4_000, 0, 0)
+        clock.answered()
+    assert sum_of_cpu == cpu

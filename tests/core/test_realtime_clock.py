@@ -210,7 +210,7 @@ def test_actions_become_messages(monkeypatch: pytest.MonkeyPatch) -> None:
     world = World(monkeypatch)
     job = Job(7, "gpu", "mix", 4, 1, 0, 3)
     world.clock.perform(START, (Dispatch(job), Kill("cpu"), Start("cpu"), Finish(Outcome(OutcomeKind.DONE))))
-    assert world.said == [("gpu", RunJob(7, 1, 4, 1, 0, 3)), ("kill", "cpu"), ("start", "cpu")]
+    assert world.said == [("gpu", RunJob(7, 1, 4, 1, 0, 3, START)), ("kill", "cpu"), ("start", "cpu")]
     assert world.log.messages == ["unit cpu did not answer in time and is restarted"]
 
 

@@ -27,6 +27,7 @@ from trilane.pipeline import (
 )
 from trilane.pipeline.bound_stage import BoundStage
 from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, UnitSettings
+from trilane.pipeline.job_times import LOSS_NS
 from trilane.pipeline.regions import EdgeRegion, edge_regions
 from trilane.pipeline.stage import UnitContext
 from trilane.pipeline.unit_spec import UnitSpec
@@ -59,8 +60,16 @@ def context() -> UnitContext:
     return UnitContext("right", UNITS["right"], {})
 
 
+LATER_NS = 1 << 62  # so no job was dispatched long before it began
+
+
 class ToldMeter:
-    """Each piece of time had 100 ns of CPU time and its threads waited for 2 ns; notes how often it looked."""
+    """Each look at the CPU clock is 100 ns after the one before, each at the run delay 2; notes how often it looked.
+
+    There are two threads, so that the CPU clock is read before each job.
+    """
+
+    threads = 2
 
     def __init__(self, others: Set[int]) -> None:
         self.others, self.looks = others, 0
@@ -84,6 +93,7 @@ class FakeStage:
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
         self.runs.append((frame, slot_in, slot_out))
+        time.sleep(2 * LOSS_NS / 1e9)
         if self.error is not None:
             raise self.error
         return {"shade": 3}
@@ -168,7 +178,7 @@ def test_a_unit_answers_every_message_once(monkeypatch: pytest.MonkeyPatch) -> N
     ]
     outputs[0].header["epoch"] = 9
     alone = RunIsolated(1, 7, 0, -1), RunIsolated(0, 8, -1, 0)
-    link = FakeLink(RunJob(11, 0, 5, -1, 1, 2), Ping(), RunJob(12, 1, 6, 1, -1, 2), *alone, Close())
+    link = FakeLink(RunJob(11, 0, 5, -1, 1, 2, LATER_NS), Ping(), RunJob(12, 1, 6, 1, -1, 2, LATER_NS), *alone, Close())
     meters: list[ToldMeter] = []
     monkeypatch.setattr(unit_loop, "CoreMeter", lambda others: meters.append(ToldMeter(others)) or meters[0])
     others = unit_loop._threads() - {os.getpid()}
@@ -179,8 +189,8 @@ def test_a_unit_answers_every_message_once(monkeypatch: pytest.MonkeyPatch) -> N
     assert before <= one.t_begin_ns <= one.t_sampled_ns <= one.t_end_ns <= two.t_begin_ns <= two.t_end_ns
     assert (two.t_sampled_ns, end) == (0, Closed())
     wall_ns = one.t_end_ns - one.t_begin_ns  # on one core: 100 ns worked, 2 ns waited for it, the rest slept
-    assert one[4:9] == (2, wall_ns - 102, 2, 100, 100)
-    assert two[4:9] == (2, 0, 2, 100, 100)  # held to a pace: the chip worked
+    assert one[4:9] == (2, wall_ns - 102, 0, 100, 100)
+    assert two[4:9] == (2, 0, 2, 100, 200)  # held to a pace: the chip worked
     assert [(meter.others, meter.looks) for meter in meters] == [(others, 5)]  # at the start, after a job or the like
     assert all(isinstance(took, Duration) and 0 <= took.value < time.monotonic_ns() - before for took in (three, four))
     assert link.beats == [Ready(os.getpid()), Pong()]
@@ -207,7 +217,7 @@ def test_a_stage_that_fails_is_an_answer_in_one_line(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], error: Exception, code: int, said: str
 ) -> None:
     stage = BoundStage("a", FakeStage(error), [], packets(OWN, 1), 0, context())
-    link = FakeLink(RunJob(11, 0, 5, -1, 0, 0), RunIsolated(0, 5, -1, 0), Close())
+    link = FakeLink(RunJob(11, 0, 5, -1, 0, 0, 0), RunIsolated(0, 5, -1, 0), Close())
     assert served(monkeypatch, link, [stage]) == code
     assert [(answer.id, answer.exit_code) for answer in link.sent[:3]] == [(11, code), (-2, code), (-3, code)]
     assert all(answer.message.startswith(said) for answer in link.sent[:2])
@@ -228,7 +238,7 @@ def test_closing_names_its_stage_and_goes_on(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_a_lost_unit_does_not_answer_it_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    link = FakeLink(RunJob(11, 0, 5, -1, 0, 0))
+    link = FakeLink(RunJob(11, 0, 5, -1, 0, 0, 0))
     stage = BoundStage("a", FakeStage(UnitLostError("context lost")), [], packets(OWN, 1), 0, context())
     with pytest.raises(UnitLostError):
         served(monkeypatch, link, [stage])

@@ -13,6 +13,7 @@ from trilane.pipeline.run import run_pipeline
 
 pytestmark = pytest.mark.usefixtures("nothing_left")
 FRAMES, CPU_MS, SLEEP_MS = 25, 3.0, 2.0
+ROUNDING = 1e-12  # of shares: far less than 1 ns of the run
 
 
 def run(*, sleep_ms: float = 0.0, device: bool = False) -> RunResult:
@@ -35,10 +36,8 @@ def test_two_units_that_compute_on_one_core_share_it() -> None:
     for stage in result.report.stages.values():
         assert stage.cpu_ms is not None
         assert stage.cpu_ms.mean >= CPU_MS
-    wall_ms = sum(stage.service_ms.mean * FRAMES for stage in result.report.stages.values())
-    cpu_ms = sum(1e3 * (unit.cpu_in_jobs_s or 0) for unit in result.report.units.values())
-    lost_ms = sum(job.preempted_ns + job.asleep_ns for job in result.jobs) / 1e6
-    assert wall_ms - lost_ms <= cpu_ms
+    busy_ns = sum(job.end_ns - job.begin_ns - job.preempted_ns - job.asleep_ns for job in result.jobs)
+    assert busy_ns <= round(sum(1e9 * (unit.cpu_in_jobs_s or 0) for unit in result.report.units.values()))
     assert sum(unit.idle.preempted or 0 for unit in result.report.units.values()) > 0.1
     assert result.report.accounts is not None
     assert result.report.accounts.agree
@@ -56,7 +55,7 @@ def test_a_job_that_sleeps_works_only_if_it_has_a_device(device: bool) -> None:
         if device:
             assert unit.busy >= slept
         else:
-            assert unit.busy <= computed
+            assert unit.busy <= computed + ROUNDING
             assert unit.idle.overhead >= slept
         assert unit.busy + sum(unit.idle.as_json().values()) == pytest.approx(1)
 
