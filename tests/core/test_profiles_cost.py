@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import onnx
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
@@ -168,6 +168,7 @@ def test_time_is_the_sum_of_its_parts_and_falls_with_the_clock() -> None:
     assert fast.total_ms < slow.total_ms < 2 * fast.total_ms + 1e-9
 
 
+@settings(deadline=None)
 @given(
     encoder=st.sampled_from(ENCODERS),
     norm=st.sampled_from(NORMS),

@@ -26,7 +26,7 @@ class TreeCopy:
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        self.temporary = root.parent / "temporary"
+        self.temporary = root.parent / "t"  # short, since the paths of sockets may have 108 bytes
         self.temporary.mkdir()
 
     def environment(self) -> dict[str, str]:
@@ -59,7 +59,7 @@ class TreeCopy:
 @contextmanager
 def copied_tree(root: Path, paths: Sequence[str]) -> Iterator[TreeCopy]:
     """A copy of the files `paths` of `root`, a checkout of its own for git, with the real inputs beside it."""
-    with TemporaryDirectory(prefix="trilane-mutants-") as folder:
+    with TemporaryDirectory(prefix="faults-") as folder:
         copy = Path(folder) / "tree"
         for path in paths:
             (copy / path).parent.mkdir(parents=True, exist_ok=True)
