@@ -153,7 +153,7 @@ def test_rotations_between_directions() -> None:
 
 
 def assert_same_quads(found: NDArray[Any], wanted: NDArray[Any]) -> None:
-    """The faces are halves of quads, two by two; which diagonal halves a quad may depend on a tie, in ten quads at most."""
+    """Faces are halves of quads, two by two; in ten quads at most a tie may decide which diagonal halves them."""
     other = np.flatnonzero((found != wanted).reshape(-1, 6).any(axis=1))
     assert len(other) <= 10
     for quad in other:
