@@ -368,3 +368,35 @@ def test_every_figure_of_a_report_has_a_source() -> None:
 
 def test_what_a_report_has_not_has_no_source() -> None:
     assert not {"pace", "pace.ratio", "video"} & set(sources_of(make_report()))
+
+
+def test_the_whole_table_is_as_it_was() -> None:
+    """Every line of a report that has everything, in printed/run-table.txt; TRILANE_WRITE_PRINTED=1 writes it anew."""
+    made = {
+        "at": "2026-11-22T01:00:00+00:00",
+        "command": ["trilane"],
+        "trilane": "0.1.0",
+        "revision": None,
+        "modified": None,
+    }
+    cap = {"corner": "svs", "duty": 0.5, "duty_mean": 0.45}
+    caps = {"how": "x", "performance_profile": "balanced", "units": {"dsp": cap}, "throttled_share": 0.25}
+    pace = {
+        "profile": "snapdragon-888",
+        "performance_profile": "burst",
+        "slow_motion": 4.0,
+        "stage_ms": {"infer": 12.0},
+        "host_slower": {"infer": 2},
+        "late_frames": [3],
+        "virtual_ms": 21.5,
+        "measured_ms": 21.75,
+        "compared_share": 0.5,
+        "ratio": 1.0116,
+    }
+    temperature = {"sensor": None, "kind": "modelled", "device_end": 30.0, "device_max": 31.0, "junction_max": 44.5}
+    report = make_report(made=made, caps=caps, pace=pace, temperature_c=temperature, fps_low=48.0, fps_high=52.0)
+    text = table_text(report).splitlines()
+    file = Path(__file__).with_name("printed") / "run-table.txt"
+    if "TRILANE_WRITE_PRINTED" in os.environ:
+        file.write_text("\n".join(text) + "\n", encoding="utf-8")
+    assert text == file.read_text(encoding="utf-8").splitlines()
