@@ -66,7 +66,7 @@ has_egl() {
 has_pip() { .venv/bin/python -m pip --version >/dev/null 2>&1; }
 
 { is_new_enough .venv/bin/python && has_pip; } || make_venv
-say "installing packages (${extras:-no extras}); the first time takes a minute or more, and up to 1 GB"
+say "installing packages (${extras:-no extras}); the first time takes a minute or more and up to 1 GB, with all extras minutes and 3 GB"
 .venv/bin/python -m pip install --quiet --disable-pip-version-check --editable ".${extras:+[$extras]}" ||
   lacks "pip could not install the packages (see above): no network, or no wheel for this Python and machine" \
     ".venv/bin/python -m pip install --editable '.${extras:+[$extras]}'"

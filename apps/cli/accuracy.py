@@ -14,6 +14,7 @@ import typer
 from trilane.apps.cli.commands import Commands
 from trilane.apps.cli.console import print_json, stderr_console, stdout_console, stdout_kept
 from trilane.apps.cli.options import JsonOption, SceneArgument, SceneAvatarOption, SceneSizeOption
+from trilane.errors import BadInputError
 
 app = Commands()
 
@@ -24,18 +25,24 @@ Examples:
   trilane accuracy --hard-cases --json
 """
 OUT_OF_BOUNDS = 1
+SCENE, FRAMES = "default", 8
 HARD_COLUMNS = ("name", "error", "bound", "constant_error", "shifted_error", "swapped_error", "verdict")
 
 
 @app.command(epilog=EPILOG)
 def accuracy(
-    scene: SceneArgument = "default",
+    scene: SceneArgument = SCENE,
     avatar: SceneAvatarOption = None,
     size: SceneSizeOption = None,
-    frames: Annotated[int, typer.Option(help="How many frames, evenly spread over the scene.")] = 8,
+    frames: Annotated[
+        int | None, typer.Option(help="How many frames, evenly spread over the scene.  [default: 8]")
+    ] = None,
     runtime: Annotated[
         list[str] | None,
-        typer.Option(help="ort, openvino, qnn or cuda, once for each; all that are installed if none."),
+        typer.Option(
+            help="ort, openvino, qnn or cuda, once for each; all that are installed if none, on hard cases but the "
+            "emulator qnn, which takes minutes."
+        ),
     ] = None,
     hard_cases: Annotated[
         bool, typer.Option("--hard-cases", help="Compare with float on hard inputs and networks instead.")
@@ -51,11 +58,20 @@ def accuracy(
 
     names = list(runtime or installed())
     if hard_cases:
+        _refuse_a_scene(scene, {"--avatar": avatar, "--size": size, "--frames": frames})
         passed = _hard_cases([name for name in names if runtime or name != "qnn"], as_json)
     else:
-        passed = _scene(scene, avatar, size, frames, names, as_json)
+        passed = _scene(scene, avatar, size, FRAMES if frames is None else frames, names, as_json)
     if not passed:
         raise typer.Exit(OUT_OF_BOUNDS)
+
+
+def _refuse_a_scene(scene: str, options: dict[str, object]) -> None:
+    """Hard cases bring their own inputs. Raises BadInputError for what they would leave aside."""
+    asked = [name for name, value in options.items() if value is not None]
+    if scene != SCENE or asked:
+        found = ", ".join(asked) or scene
+        raise BadInputError("--hard-cases", f"{found} beside it", "it alone", "hard cases have their own inputs")
 
 
 def _hard_cases(names: list[str], as_json: bool) -> bool:

@@ -65,7 +65,9 @@ def _caption(report: Report) -> str:
     if report.made:
         lines.insert(0, _made(report.made))
     lines.append("in brackets: 95 % interval, by the scatter of this run's frames; two runs may differ by more")
-    if any(_too_few(getattr(report, times), name) for times in ("frame_time_ms", "latency_ms") for name in NEEDED):
+    runs: list[Report | Baseline] = [report, report.baseline] if report.baseline else [report]
+    summaries = [times for run in runs for times in (run.frame_time_ms, run.latency_ms)]
+    if any(_too_few(times, name) for times in summaries for name in NEEDED):
         lines.append(f"{TOO_FEW.strip()} of too few frames: {', '.join(f'{k} needs {n}' for k, n in NEEDED.items())}")
     if report.pace:
         lines.append(_pace(report.pace))
@@ -92,8 +94,8 @@ def _pace(pace: PaceComparison) -> str:
 def _caps(caps: Caps, temperature: Temperature) -> str:
     duties = ", ".join(f"{unit} {cap.duty_mean:.0%}" for unit, cap in caps.units.items())
     return (
-        f"capped as {caps.performance_profile}: may work {duties} of the time, the rest is throttled; lowered further "
-        f"for heat {caps.throttled_share:.0%} of the time; {temperature.kind}: at most "
+        f"capped as {caps.performance_profile}: duty cycles {duties}, which is the most that units may work; lowered "
+        f"further for heat {caps.throttled_share:.0%} of the time; {temperature.kind}: at most "
         f"{_number(temperature.junction_max)} C ({COMPUTED})"
     )
 
