@@ -48,6 +48,7 @@ KEPT = (
     "units.gpu.idle.starved",
     "temperature_c.",
     "caps.",
+    "fps_",
     "timeline[-1].",
 )
 
