@@ -6,18 +6,21 @@ import re
 import signal
 from collections.abc import Callable, Iterator
 from itertools import count
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 
 from trilane.bench import crop, faults, joints
+from trilane.bench import pipeline as pipeline_bench
 from trilane.bench.lib import fixture, load, timing, views
 from trilane.bench.lib.float_raster import quantise, rasterise, sample
 from trilane.bench.lib.limits import LIMITS, check_limits
 from trilane.bench.lib.load import Load, Queries
 from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline.requests import FrameRequestQueue
+from trilane.pipeline.run_metrics import StageTimes, TimeSummary
+from trilane.scheduler.ledger import JobRecord
 from trilane.units import UNITS
 
 Held = Callable[[str, Any], None]
@@ -282,3 +285,83 @@ def test_the_reference_samples_between_texels_and_clamps_at_the_edge() -> None:
     texture = np.array([[[0.0], [1.0]], [[2.0], [3.0]]])
     uv = np.array([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.5, 0.5], [-1.0, 2.0], [0.625, 0.25]])
     assert sample(texture, uv)[:, 0].tolist() == [0.0, 1.0, 2.0, 1.5, 2.0, 0.75]
+
+
+def job(ready: int, dispatch: int, begin: int, end: int) -> JobRecord:
+    return JobRecord("infer", "dsp", 0, ready, dispatch, begin, end)
+
+
+def test_idle_between_jobs_by_hand() -> None:
+    """0-10 a job; the next one's input comes at 14 (starved 4), it is dispatched at 17 (3), begins at 20 (overhead 3); the
+    last one's was there and it is dispatched at once, but begins at 41: overhead 1. Span 50, idle 11.
+    """
+    jobs = [job(14, 17, 20, 40), job(0, 0, 0, 10), job(5, 6, 41, 50)]
+    assert pipeline_bench.idle_between_jobs(jobs) == pytest.approx(
+        {"idle": 11 / 50, "starved": 4 / 50, "undispatched": 3 / 50, "overhead": 4 / 50}
+    )
+
+
+def test_runs_are_compared_with_the_sequential_ones_before_and_after() -> None:
+    """Sequential frames of 30 and 34 ms, hops 2 and 4: gain 32 / 16 = 2, bound (20 + 3) / 10, of the bound 2 / 2.3."""
+    base = {"frame_ms": 30.0, "hops_ms": 2.0, "all_alone_ms": 21.0, "alone_ms": 10.0}
+    row = {"frame_ms": 16.0, "hops_ms": None, "all_alone_ms": 20.0, "alone_ms": 10.0}
+    pipeline_bench._compare([base, row], {"frame_ms": 34.0, "hops_ms": 4.0})
+    assert (row["gain"], row["bound"], row["gain_of_bound"]) == pytest.approx((2.0, 2.3, 2 / 2.3))
+    assert (base["gain"], base["bound"]) == pytest.approx((1.0, 2.3))
+
+
+def test_a_row_is_medians_sums_and_the_commonest_name() -> None:
+    def run(fps: float, slowest: str, lost: int) -> dict[str, Any]:
+        return {"fps": fps, "slowest": slowest, "lost": lost, "hops_ms": None, "gain_of_bound": fps / 10}
+
+    setting = pipeline_bench.Setting("default", "256", 2, "pipelined", "double")
+    row = pipeline_bench._summary(setting, [run(5.0, "gpu", 1), run(9.0, "dsp", 2), run(6.0, "gpu", 4)])
+    assert row == vars(setting) | {
+        "fps": 6.0,
+        "slowest": "gpu",
+        "lost": 7,
+        "hops_ms": None,
+        "gain_of_bound": 0.6,
+        "of_bound_low": 0.5,
+        "of_bound_high": 0.9,
+    }
+
+
+def test_sequential_comes_first_and_once() -> None:
+    pairs = pipeline_bench._pairs(("sequential", "pipelined"), ("double", "single"))
+    assert pairs == [
+        ("sequential", "double"),
+        ("sequential", "single"),
+        ("pipelined", "double"),
+        ("pipelined", "single"),
+    ]
+    with pytest.raises(BadInputError, match="--policy"):
+        pipeline_bench._check(("best",), ("double",), (1,))
+    with pytest.raises(BadInputError, match="--edge"):
+        pipeline_bench._check(("latest",), ("quadruple",), (1,))
+    with pytest.raises(BadInputError, match="--cores"):
+        pipeline_bench._check(("latest",), ("double",), (0,))
+
+
+def stage(unit: str, mean: float) -> StageTimes:
+    times = TimeSummary(mean=mean, p50=mean, p90=mean, p95=mean, p99=mean, max=mean)
+    return StageTimes(unit=unit, service_ms=times, wait_ms=times)
+
+
+def test_a_units_isolated_time_has_its_last_stage_as_in_the_run() -> None:
+    class Metrics:
+        units: ClassVar = {"cpu": None, "gpu": None}
+        stages: ClassVar = {"pose": stage("cpu", 3.0), "raster": stage("gpu", 5.0), "present": stage("cpu", 2.0)}
+        isolated_ms: ClassVar = {"pose": 2.5, "raster": 4.0}
+
+    assert pipeline_bench._isolated_ms(Metrics) == {"cpu": 4.5, "gpu": 4.0}  # type: ignore[arg-type]
+    assert pipeline_bench._in_run_ms(Metrics, "cpu") == 5.0  # type: ignore[arg-type]
+
+
+def test_the_pace_is_back_with_five_frames_within_a_fifth_more() -> None:
+    """Of a period of 10: five frames in 48 are in pace, in 49 they are not."""
+    ms = 1_000_000
+    in_pace = [100 * ms + n * 12 * ms for n in range(5)]
+    late = [*in_pace[:4], in_pace[4] + 1]
+    assert faults.back_to_pace_ms([50 * ms], in_pace, 10 * ms) == [50.0]
+    assert faults.back_to_pace_ms([50 * ms], late, 10 * ms) == []

@@ -170,11 +170,15 @@ def _run_under_coverage(tree: TreeCopy, test_file: str, settings: str) -> Path |
 def _lines(tree: TreeCopy, opened: Path) -> dict[str, set[int]]:
     """The lines by file that the processes have noted; none for a file that was only opened."""
     from coverage import CoverageData
+    from coverage.exceptions import DataError
 
     lines: dict[str, set[int]] = {}
     for part in tree.temporary.glob("coverage.*"):
         data = CoverageData(str(part))
-        data.read()
+        try:
+            data.read()
+        except DataError:  # its process was killed while it wrote
+            continue
         for measured in data.measured_files():
             path, reached = _inside(tree, measured), data.lines(measured)
             if path and reached:
