@@ -292,7 +292,7 @@ def job(ready: int, dispatch: int, begin: int, end: int) -> JobRecord:
 
 
 def test_idle_between_jobs_by_hand() -> None:
-    """0-10 a job; the next one's input comes at 14 (starved 4), it is dispatched at 17 (3), begins at 20 (overhead 3); the
+    """0-10 a job; the next input comes at 14 (starved 4), is dispatched at 17 (3) and begun at 20 (overhead 3); the
     last one's was there and it is dispatched at once, but begins at 41: overhead 1. Span 50, idle 11.
     """
     jobs = [job(14, 17, 20, 40), job(0, 0, 0, 10), job(5, 6, 41, 50)]
