@@ -244,7 +244,7 @@ WORST = {"seed": 1, "number": 2, "band": "face", "psnr_db": 20.0, "body_psnr_db"
 MALFORMED = {
     "no day": ({"date": ""}, "date"),
     "a day that is not": ({"date": "2999-99-99"}, "date"),
-    "no date": ({"date": 20261122}, "date"),
+    "seconds since 1970": ({"date": 1763769600}, "date"),
     "a word": ({"body_psnr_db": "much"}, "body_psnr_db"),
     "another worst": ({"worst": {"x": 1}}, "worst"),
     "worst of unknown views": ({"worst": WORST}, "needs 'by_seed' and 'samples'"),
