@@ -21,7 +21,7 @@ from trilane.avatars.manifest import ByteRange, Manifest, parse_manifest
 from trilane.avatars.network_file import read_network
 from trilane.errors import BadInputError
 from trilane.files import read_npz, read_text, require_file
-from trilane.writing import write_bytes, write_folder
+from trilane.writing import require_writable, write_bytes, write_folder
 
 MANIFEST = "manifest.json"
 DEFAULT = "default"
@@ -113,8 +113,20 @@ def write_bundle(
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
-    """Put `manifest` in place of that of the bundle in `folder`, whole or not at all. Raises BadInputError."""
-    write_bytes(folder / MANIFEST, _content(manifest))
+    """Put `manifest` in place of that of the bundle in `folder`, whole or not at all. Raises BadInputError.
+
+    Where the manifest is a symbolic link, the file that it leads to is replaced and the link stays.
+    """
+    write_bytes(_manifest_file(folder), _content(manifest))
+
+
+def require_writable_manifest(folder: Path) -> None:
+    """Whether `write_manifest` can write, found out before the work. Raises BadInputError when it cannot."""
+    require_writable(_manifest_file(folder))
+
+
+def _manifest_file(folder: Path) -> Path:
+    return (folder / MANIFEST).resolve()
 
 
 def _content(manifest: Manifest) -> bytes:

@@ -9,8 +9,9 @@ import hashlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-from trilane.avatars.manifest import Digests, Manifest
+from trilane.avatars.manifest import Digests, Manifest, Validation
 from trilane.avatars.network_file import network_files
 from trilane.errors import BadInputError
 
@@ -25,6 +26,20 @@ def digests_of(folder: Path, manifest: Manifest) -> Digests:
         network=sha256_of(network_files(folder / manifest.network.file)),
         constants=hashlib.sha256(_constants(manifest).encode()).hexdigest(),
     )
+
+
+def figures_digest(validation: Validation) -> str:
+    """SHA-256, hexadecimal, of all that `validation` says but this digest, written in one way.
+
+    A key that is None counts as not there, so an optional key that a later Trilane adds changes no older digest.
+    """
+    said = validation.model_dump(mode="json", exclude={"figures_digest"})
+    return hashlib.sha256(_in_one_way(said).encode()).hexdigest()
+
+
+def with_figures_digest(validation: Validation) -> Validation:
+    """`validation`, which has just been measured, with the digest of its figures."""
+    return validation.model_copy(update={"figures_digest": figures_digest(validation)})
 
 
 def sha256_of(files: Sequence[Path]) -> str:
@@ -50,4 +65,8 @@ def _constants(manifest: Manifest) -> str:
         "input": network.input.model_dump(),
         "output": network.output.model_dump(),
     }
-    return json.dumps(numbers, sort_keys=True, separators=(",", ":"))
+    return _in_one_way(numbers)
+
+
+def _in_one_way(values: dict[str, Any]) -> str:
+    return json.dumps(values, sort_keys=True, separators=(",", ":"))

@@ -5,11 +5,20 @@ Rule: every number has a range and every key is known, so what is read needs no 
 
 from __future__ import annotations
 
+import datetime
 import json
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+    model_validator,
+)
 
 from trilane.avatars.integer_network import MAX_CHANNELS, NetworkFile
 from trilane.errors import BadInputError
@@ -20,6 +29,10 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Coefficient = Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)]
 FileName = Annotated[str, Field(min_length=1, max_length=200)]
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+#: In JSON as YYYY-MM-DD, a day that there is.
+Day = Annotated[datetime.date, Field(strict=True)]
+Band = Literal["far", "full_body", "upper_body", "face"]
+Share = Annotated[float, Field(ge=0, le=1)]
 
 
 class _Model(BaseModel):
@@ -61,25 +74,78 @@ class Digests(_Model):
     constants: Sha256
 
 
+class WorstView(_Model):
+    """The view of the least PSNR, by which it is found again. `number`: among the views of `seed`."""
+
+    seed: int
+    number: int
+    band: Band
+    psnr_db: Finite
+    body_psnr_db: Finite
+
+
+class SeedFigures(_Model):
+    """Of the views of one seed, in dB: two means and the least."""
+
+    psnr_db: Finite
+    body_psnr_db: Finite
+    least_psnr_db: Finite
+
+
 class Figures(_Model):
     """Image error of one network on one runtime, on poses and views that were not trained on.
 
-    `psnr_db_by_band`: in dB, inside the box of the true mask. `iou`, `ssim`: means. More keys: see `summary` of
-    `training/error_summary.py`.
+    `psnr_db_by_band`: in dB, inside the box of the true mask. `iou`, `ssim`: means. The other keys, see `summary` of
+    `training/error_summary.py`, are None where nobody measured them, and then not written.
     """
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
-    psnr_db_by_band: dict[Literal["far", "full_body", "upper_body", "face"], Finite]
-    iou: float = Field(ge=0, le=1)
+    psnr_db_by_band: dict[Band, Finite]
+    iou: Share
     ssim: float = Field(ge=-1, le=1)
+    body_psnr_db_by_band: dict[Band, Finite] | None = None
+    psnr_db: Finite | None = None
+    body_psnr_db: Finite | None = None
+    background: Share | None = None
+    least_psnr_db: Finite | None = None
+    least_body_psnr_db: Finite | None = None
+    worst: WorstView | None = None
+    by_seed: dict[str, SeedFigures] | None = None
+    samples: int | None = Field(default=None, ge=1)
+
+    @model_validator(mode="after")
+    def _worst_of_something(self) -> Self:
+        if self.worst is not None and (self.by_seed is None or self.samples is None):
+            raise ValueError("'worst' needs 'by_seed' and 'samples' beside it")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _known(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {key: value for key, value in write(self).items() if value is not None}
+
+
+class MadeWith(_Model):
+    """What measured the figures, beside the avatar's files. No digest covers it.
+
+    `trilane`: its version; `revision`, `modified`: of its checkout in git; all three None where not known.
+    `renderer`: of OpenGL. `runtimes`: name to name and version of the library.
+    """
+
+    trilane: str | None
+    revision: str | None = None
+    modified: bool | None = None
+    renderer: str
+    runtimes: dict[str, str]
 
 
 class Validation(Figures):
     """The figures of an avatar, and what they are of.
 
-    `date`: of the validation, YYYY-MM-DD, UTC.
-    `digests`: of what was validated; None in a manifest that an older Trilane wrote.
+    `date`: of the validation, UTC; None in a manifest that an older Trilane wrote, as the next two and `made_with`.
+    `digests`: of what was validated.
+    `figures_digest`: of all other keys here, by `figures_digest` of `avatars/digests.py`.
+    `made_with`: by which code.
     `runtime`: on which the pictures of `integer` were painted, whose errors stand at the top too.
     `other_runtimes`: the figures of more runtimes, by name.
     `size`: tensor size, as `trilane run --size` takes it.
@@ -88,8 +154,10 @@ class Validation(Figures):
     before it was quantised, and `psnr_loss_db`, what quantising cost.
     """
 
-    date: str = Field(default="", pattern=r"^(\d{4}-\d\d-\d\d)?$")
+    date: Day | None = None
     digests: Digests | None = None
+    figures_digest: Sha256 | None = None
+    made_with: MadeWith | None = None
     runtime: str = ""
     size: str = ""
     texture_filter: str = "linear"

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from trilane.avatars.bundle import DEFAULT, Bundle, bundle_folder
-from trilane.avatars.digests import digests_of
+from trilane.avatars.digests import digests_of, figures_digest
 from trilane.avatars.manifest import Validation
 from trilane.figure_sources import NO_FIGURES, from_validation
 
@@ -83,6 +83,11 @@ def refused(bundle: Bundle) -> dict[str, Any]:
         return _no_figures(bundle, [], "it was never validated")
     if validation.digests is None:
         return _no_figures(bundle, [], "the validation in its manifest does not say what it is of: it has no digests")
+    if validation.date is None or validation.figures_digest is None:
+        why = "it has no date or no digest of its figures"
+        return _no_figures(bundle, [], f"the validation in its manifest is not whole: {why}")
+    if validation.figures_digest != figures_digest(validation):
+        return _no_figures(bundle, [], f"the figures were changed since the validation of {validation.date}")
     now = digests_of(bundle.folder, bundle.manifest)
     changed = [part for part in PARTS if getattr(now, part) != getattr(validation.digests, part)]
     if not changed:

@@ -29,6 +29,7 @@ from trilane.scheduler.virtual import simulate
 MS = 1_000_000
 EDGES = ("single", "double", "triple", "fifo:1", "fifo:3", "orphan", "orphan:4")
 UNITS = ("a", "b", "c")
+LEAST_FRAMES = 2  # a unit is killed after the first and before the last
 
 
 def measure(runs: int = 50, frames: int = 40, seed: int = 1) -> dict[str, Any]:
@@ -43,8 +44,10 @@ def measure(runs: int = 50, frames: int = 40, seed: int = 1) -> dict[str, Any]:
     `preempted`: the largest share of a unit. `deaths`: of units.
     Raises BadInputError.
     """
-    if runs < 1 or frames < 1:
-        raise BadInputError("bench accounts", f"runs {runs}, frames {frames}", "positive numbers")
+    if runs < 1:
+        raise BadInputError("--runs", str(runs), "at least 1")
+    if frames < LEAST_FRAMES:
+        raise BadInputError("--frames", str(frames), f"at least {LEAST_FRAMES}")
     draws = [random.Random(f"{seed} {run}") for run in range(runs)]
     with UnitStarter([FACTORY.partition(":")[0]]) as starter:
         host = [host_run(draw, frames, starter) for draw in draws]

@@ -25,7 +25,7 @@ from trilane.errors import BadInputError, TrilaneError
 from trilane.hw_profiles.host import host_units
 from trilane.install import install_line
 from trilane.pipeline.run import run_pipeline
-from trilane.scheduler.stats import median_interval
+from trilane.scheduler.stats import median_interval, samples_needed
 from trilane.transport.wakeup import UNIT_NS, awake, use_slice
 
 #: KiB of a tensor of 16 channels at 128, 256, 512 and 1024 squared; other sizes are not asked for.
@@ -43,7 +43,7 @@ Times = tuple[list[float], list[float]]
 Intervals = dict[str, dict[int, tuple[float, float]]]
 
 
-def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 200, rounds: int = 6) -> dict[str, Any]:
+def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 300, rounds: int = 6) -> dict[str, Any]:
     """The time from the producer's last byte written until the consumer can read them all, by variant and size.
 
     `kib`: sizes, of 256, 1024, 4096 and 16384.
@@ -53,8 +53,8 @@ def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 200, rounds
     Rows: `way` (the variant), `kib`, `frames`; `p50_us` and `p99_us` until every byte can be read, `read_p50_us` and
     `read_p99_us` until every byte was read and checked: medians of the rounds' percentiles, with the 95 % interval of
     that median as `_low_us` and `_high_us` (with fewer than six rounds the least and largest). No p99 is given of fewer
-    than 100 frames a round. `max_us`: of all rounds. Before each hand-over the consumer waits at least 1 ms, as an idle
-    unit does.
+    than 299 frames a round (`samples_needed`). `max_us`: of all rounds. Before each hand-over the consumer waits at
+    least 1 ms, as an idle unit does.
 
     Our variants: `slot through the scheduler`: what a run does; between two stages of a real run the message goes to
     the scheduler's process, through its core, and on. `slot`: one such message, from process to process; `slot, 256
@@ -241,7 +241,7 @@ def _row(variant: str, size: int, rounds: list[Times]) -> dict[str, Any]:
 def over_rounds(key: str, rounds: Sequence[list[float]], percent: float) -> dict[str, float | None]:
     """The median of the rounds' percentiles and its interval; None where a round has too few values for it."""
     names = (f"{key}_us", f"{key}_low_us", f"{key}_high_us")
-    if min(map(len, rounds)) * (100 - percent) < 100:
+    if min(map(len, rounds)) < samples_needed(percent / 100):
         return dict.fromkeys(names)
     of_each = [float(np.percentile(values, percent)) for values in rounds]
     return dict(zip(names, (median(of_each), *median_interval(of_each)), strict=True))

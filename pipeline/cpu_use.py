@@ -38,15 +38,20 @@ class CpuTimes:
         self.in_jobs_ns: Counter[str] = Counter()
         self.between_ns: Counter[str] = Counter()
         self.stage_ns: defaultdict[str, list[int]] = defaultdict(list)
-        self._last_end_ns: dict[str, int] = {}
+        self._begun: set[str] = set()
 
     def add(self, unit: str, stage: str, done: Done, run_begin_ns: int) -> None:
-        """Book a job. What the unit did before the run began does not count."""
+        """Book a job. Of the CPU time before a unit's first job at most what its cores had since the run began counts.
+
+        What is between two jobs counts as it was read: a figure that cannot be must stay visible (`is_possible`).
+        """
         self.in_jobs_ns[unit] += done.cpu_ns
         self.stage_ns[stage].append(done.cpu_ns)
-        before_ns = done.t_begin_ns - max(self._last_end_ns.get(unit, 0), run_begin_ns)
-        self.between_ns[unit] += min(done.cpu_before_ns, max(before_ns, 0) * self._cores[unit])
-        self._last_end_ns[unit] = done.t_end_ns
+        before_ns = done.cpu_before_ns
+        if unit not in self._begun:
+            self._begun.add(unit)
+            before_ns = min(before_ns, max(done.t_begin_ns - run_begin_ns, 0) * self._cores[unit])
+        self.between_ns[unit] += before_ns
 
     def of_unit_s(self, unit: str) -> float:
         """In jobs and between them, from the begin of the run to the end of the unit's last job."""

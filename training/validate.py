@@ -12,12 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from trilane.avatars.bundle import Bundle, write_manifest
-from trilane.avatars.digests import digests_of, sha256_of
-from trilane.avatars.manifest import Validation
+from trilane.avatars.digests import digests_of, sha256_of, with_figures_digest
+from trilane.avatars.manifest import MadeWith, Validation
 from trilane.body.body import load_body
 from trilane.scene.motion.load import load_motion
 from trilane.scene.motion.motion import Motion
 from trilane.scene.schema import AvatarSpec
+from trilane.stages.dsp.runtime import load_runtime
+from trilane.stages.machine_facts import package_version
 from trilane.training.dataset import VALIDATION_SIZE, plan_validation
 from trilane.training.error_summary import SampleError, summary
 from trilane.training.evaluate import Evaluated, Painter, evaluate, integer_painter
@@ -39,7 +41,8 @@ class ValidationPlan:
 
     `held_out`: motions that poses come from, `builtin:NAME` or files. `seeds`: of the samples, `per_band` of each band
     for each. `runtimes`: the first one's figures are the avatar's, the others stand beside. `size`: tensor size.
-    `threads`: of a software OpenGL driver and of each runtime.
+    `threads`: of a software OpenGL driver and of each runtime. `revision`, `modified`: of Trilane's checkout, where
+    known.
     """
 
     held_out: tuple[str, ...] = (BUILTIN_HELD_OUT,)
@@ -48,6 +51,8 @@ class ValidationPlan:
     runtimes: tuple[str, ...] = ("ort",)
     size: str = VALIDATION_SIZE
     threads: int = 1
+    revision: str | None = None
+    modified: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -98,16 +103,18 @@ def validate(
             for name, error in sample.errors.items():
                 errors[name].append(SampleError(seed, sample.number, sample.band, error))
     figures = {name: summary(found) for name, found in errors.items()}
-    return Validation.model_validate(
+    validation = Validation.model_validate(
         {
-            "date": datetime.now(UTC).date().isoformat(),
+            "date": datetime.now(UTC).date(),
             "digests": digests,
+            "made_with": _made_with(plan, renderer),
             "size": plan.size,
             "per_band": plan.per_band,
             "held_out": {Path(name).name: _origin(name) for name in plan.held_out},
             **_arranged(figures, plan.runtimes, float_network.name if float_network is not None else ""),
         }
     )
+    return with_figures_digest(validation)
 
 
 def revalidate(bundle: Bundle, validation: Validation) -> Bundle:
@@ -115,6 +122,16 @@ def revalidate(bundle: Bundle, validation: Validation) -> Bundle:
     manifest = bundle.manifest.model_copy(update={"validation": validation})
     write_manifest(bundle.folder, manifest)
     return Bundle(bundle.folder, manifest)
+
+
+def _made_with(plan: ValidationPlan, renderer: SampleRenderer) -> MadeWith:
+    return MadeWith(
+        trilane=package_version("trilane"),
+        revision=plan.revision,
+        modified=plan.modified,
+        renderer=str(renderer.ctx.info["GL_RENDERER"]),
+        runtimes={name: load_runtime(name).version() for name in plan.runtimes},
+    )
 
 
 def _arranged(figures: Mapping[str, dict[str, Any]], runtimes: tuple[str, ...], float_network: str) -> dict[str, Any]:

@@ -57,7 +57,8 @@ def validate(
 
     What the manifest said before is replaced.
     """
-    from trilane.avatars.bundle import load_bundle
+    from trilane.apps.made import made_facts
+    from trilane.avatars.bundle import load_bundle, require_writable_manifest
     from trilane.avatars.validation import validation_facts
     from trilane.shapes import shape_buckets
     from trilane.stages.dsp.runtime import installed, resolve
@@ -74,8 +75,16 @@ def validate(
     except ImportError as error:
         raise MissingPartError(f"validating needs {error.name}", extra="metrics") from None
     seeds = tuple(dict.fromkeys(seed)) if seed else work.SEEDS
+    require_writable_manifest(bundle.folder)
+    made = made_facts(())
     plan = work.ValidationPlan(
-        tuple(held_out or (work.BUILTIN_HELD_OUT,)), seeds, per_band, tuple(dict.fromkeys(runtimes)), size
+        held_out=tuple(held_out or (work.BUILTIN_HELD_OUT,)),
+        seeds=seeds,
+        per_band=per_band,
+        runtimes=tuple(dict.fromkeys(runtimes)),
+        size=size,
+        revision=made["revision"],
+        modified=made["modified"],
     )
     validated = _validate(bundle, plan, float_network, sheet)
     print_facts({"name": bundle.manifest.name, "validation": validation_facts(validated)}, json)

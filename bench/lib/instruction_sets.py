@@ -69,8 +69,8 @@ INSTRUCTION_SETS = (
         ("avx512f", "avx512bw"),
         "vpmaddubsw, vpmaddwd, vpaddd zmm: 16 sums of 4 products",
         16 * 4,
-        (Fraction(1, 3), Fraction(2, 3)),
-        "uops.info: three instructions on ports 0 and 5 of Xeons with two 512-bit units, on one of others",
+        (Fraction(1, 2), Fraction(2, 3)),
+        "uops.info: three on ports 0 and 5 of Xeons with two 512-bit units; on others both products on 0, the sum on 5",
     ),
     InstructionSet(
         "AVX2",

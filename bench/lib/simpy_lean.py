@@ -1,6 +1,8 @@
 """The same model as simpy_model.py, as lean as SimPy allows: one timeout for each job, callbacks instead of processes.
 
 Rule: SimPy keeps the clock and the order of events; slots, held jobs and queues are plain numbers. Nothing is checked.
+The frames' instants are those of simpy_model.py to the nanosecond unless events tie, as with service times in whole
+milliseconds: which of two events at one instant comes first may differ.
 """
 
 from __future__ import annotations

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import datetime
+
 MEASURED = "measured in this run"
 COMPUTED = "computed"
 #: Of two figures, one measured and one computed.
@@ -10,6 +12,6 @@ COMPARED = "measured in this run, over computed"
 NO_FIGURES = "no figures"
 
 
-def from_validation(date: str) -> str:
-    """The source of a figure that an avatar's validation of `date`, YYYY-MM-DD, brought."""
+def from_validation(date: datetime.date | None) -> str:
+    """The source of a figure that an avatar's validation of `date` brought."""
     return f"from the avatar's validation of {date}"

@@ -41,6 +41,15 @@ def write_atomically(path: Path, remedy: str = "") -> Iterator[Path]:
             draft.unlink(missing_ok=True)
 
 
+def require_writable(path: Path) -> None:
+    """Find out before long work whether `write_atomically` can write `path`, an existing file or none.
+
+    Raises BadInputError when it cannot.
+    """
+    with _os_errors_about(path), tempfile.TemporaryFile(prefix=PREFIX, dir=path.parent):
+        pass
+
+
 def write_bytes(path: Path, content: bytes, remedy: str = "") -> None:
     """`content` as the file `path`, by `write_atomically`. Raises BadInputError."""
     with write_atomically(path, remedy) as draft:

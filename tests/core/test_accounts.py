@@ -11,7 +11,8 @@ import pytest
 from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace, TrackEvent
 
 from trilane.apps.trace import write_trace
-from trilane.bench.accounts import virtual_run
+from trilane.bench.accounts import measure, virtual_run
+from trilane.errors import BadInputError
 from trilane.scheduler.accounts import LARGEST_DIFFERENCE, compared, idle_slices, second_accounts
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import (
@@ -330,3 +331,9 @@ def test_a_unit_without_accounts_is_no_agreement() -> None:
     assert done.recording is not None
     only = [job for job in done.jobs if job.unit == "u"]
     assert compared({"w": done.report["units"]["u"]}, done.recording, only)["largest_difference"] == 1
+
+
+@pytest.mark.parametrize(("sizes", "where"), [({"frames": 1}, "--frames: found 1"), ({"runs": 0}, "--runs: found 0")])
+def test_too_few_frames_or_runs_are_refused_by_name(sizes: dict[str, int], where: str) -> None:
+    with pytest.raises(BadInputError, match=where):
+        measure(**sizes)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
 from dataclasses import dataclass
 
 import pytest
 
 from trilane.bench import handoff, scheduler
 from trilane.scheduler.events import Graph, Settings, chain
+from trilane.scheduler.stats import samples_needed
 from trilane.scheduler.virtual import simulate
 
 
@@ -87,11 +89,14 @@ def test_peers_are_set_against_the_run_round_by_round() -> None:
 
 
 def test_a_percentile_is_given_of_as_many_values_as_it_needs() -> None:
-    hundred = [float(value) for value in range(101)]
-    assert handoff.over_rounds("p99", [hundred, [value + 2 for value in hundred]], 99) == {
-        "p99_us": 100.0,
-        "p99_low_us": 99.0,
-        "p99_high_us": 101.0,
+    """299 for p99: 1 - 0.99^298 is 0.94997, 1 - 0.99^299 is 0.95047. Of 0 to 300 p99 is 297. Five for p50."""
+    values = [float(value) for value in range(301)]
+    assert handoff.over_rounds("p99", [values, [value + 2 for value in values]], 99) == {
+        "p99_us": 298.0,
+        "p99_low_us": 297.0,
+        "p99_high_us": 299.0,
     }
-    assert set(handoff.over_rounds("p99", [hundred, hundred[:99]], 99).values()) == {None}
-    assert handoff.over_rounds("p50", [hundred[:3]], 50)["p50_us"] is not None
+    assert None not in handoff.over_rounds("p99", [values, values[:299]], 99).values()
+    assert set(handoff.over_rounds("p99", [values, values[:298]], 99).values()) == {None}
+    assert handoff.over_rounds("p50", [values[:5]], 50)["p50_us"] is not None
+    assert inspect.signature(handoff.measure).parameters["frames"].default >= samples_needed(0.99)

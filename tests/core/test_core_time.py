@@ -170,6 +170,16 @@ def test_cpu_time_before_the_run_does_not_count_and_spinning_between_jobs_does()
     assert dict(times.stage_ns) == {"a": [50], "b": [30]}
 
 
+def test_cpu_time_between_jobs_that_cannot_be_is_not_hidden() -> None:
+    """Ten jobs on one core, one every 10 ns, each after 37 ns of CPU time: of the first 37 only 10 count."""
+    times = CpuTimes({"u": 1})
+    for begin in range(110, 210, 10):
+        times.add("u", "a", done(begin, begin, 0, 37), 100)
+    assert times.between_ns["u"] == 10 + 9 * 37
+    (row,) = use_of_cores({"u": (0,)}, {"u": times.of_unit_s("u")}, {"u": 0.0}, 100e-9)
+    assert row.cpu == pytest.approx(3.43) and not row.is_possible
+
+
 def test_cpu_time_of_the_units_of_some_cores_is_at_most_what_they_had() -> None:
     """u and v on core 0, w on both cores; a run of 2 s."""
     rows = use_of_cores(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import hashlib
 import json
 import shutil
 from dataclasses import replace
@@ -15,6 +17,7 @@ from trilane.apps.cli.avatar import app
 from trilane.avatars.bundle import load_bundle, write_bundle, write_manifest
 from trilane.avatars.digests import digests_of
 from trilane.avatars.validation import DrawnAs, accuracy_of, validation_facts
+from trilane.errors import BadInputError
 from trilane.figure_sources import NO_FIGURES
 from trilane.stages.configure import Request, configure
 from trilane.testing.spoilt import SPOILT, numbers_in, spoil
@@ -186,3 +189,94 @@ def test_a_run_of_a_spoilt_copy_beside_the_avatar_shows_only_the_avatars_source(
 def test_a_run_asks_for_what_it_draws(own, tmp_path, size, runtime, shown):
     checked = configure(Request(avatar=str(own), size=size, runtime=runtime), tmp_path, gl=lambda: None)
     assert (checked.accuracy["tiny"]["source"] == SOURCE) == shown
+
+
+def changed_by_hand(folder, **changes):
+    path = folder / "manifest.json"
+    manifest = json.loads(path.read_text())
+    manifest["validation"].update(changes)
+    path.write_text(json.dumps(manifest))
+
+
+BY_HAND = {
+    "a figure": {"iou": 0.9754},
+    "a figure of another runtime": {"other_runtimes": {}},
+    "the runtime": {"runtime": "qnn"},
+    "a figure that was not there": {"body_psnr_db": 40.0},
+    "a key that no run shows": {"psnr_loss_db": {"face": 0.1}},
+}
+
+
+@pytest.mark.parametrize("case", BY_HAND)
+def test_figures_that_were_changed_by_hand_are_not_shown(own, case):
+    changed_by_hand(own, **BY_HAND[case])
+    bundle = load_bundle(own)
+    for facts in (accuracy_of(bundle, DRAWN), validation_facts(bundle)):
+        assert facts.keys() == {"source", "changed", "why"}
+        assert facts["why"].startswith("the figures were changed since the validation of 2026-01-02; `trilane avatar")
+
+
+@pytest.mark.parametrize("key", ["date", "figures_digest"])
+def test_without_date_or_digest_of_the_figures_none_is_shown(own, key):
+    changed_by_hand(own, **{key: None})
+    facts = accuracy_of(load_bundle(own), DRAWN)
+    assert facts["source"] == NO_FIGURES and "no date or no digest of its figures" in facts["why"]
+
+
+def test_the_digest_of_figures_is_of_their_values_in_one_way_of_writing(own):
+    """By hand: sorted keys, no spaces, every key but the digest itself; the order in the file does not matter."""
+    path = own / "manifest.json"
+    said = json.loads(path.read_text())["validation"]
+    found = said.pop("figures_digest")
+    written = json.dumps(said, sort_keys=True, separators=(",", ":"))
+    assert found == hashlib.sha256(written.encode()).hexdigest()
+    manifest = json.loads(path.read_text())
+    manifest["validation"] = dict(reversed(manifest["validation"].items()))
+    path.write_text(json.dumps(manifest))
+    assert accuracy_of(load_bundle(own), DRAWN)["source"] == SOURCE
+
+
+def test_the_default_avatars_figures_are_those_of_its_validation():
+    assert validation_facts(load_bundle("default"))["source"] == "from the avatar's validation of 2026-11-22"
+
+
+WORST = {"seed": 1, "number": 2, "band": "face", "psnr_db": 20.0, "body_psnr_db": 19.0}
+MALFORMED = {
+    "no day": ({"date": ""}, "date"),
+    "a day that is not": ({"date": "2999-99-99"}, "date"),
+    "seconds since 1970": ({"date": 1763769600}, "date"),
+    "a word": ({"body_psnr_db": "much"}, "body_psnr_db"),
+    "another worst": ({"worst": {"x": 1}}, "worst"),
+    "worst of unknown views": ({"worst": WORST}, "needs 'by_seed' and 'samples'"),
+    "a seed": ({"by_seed": {"1": 20.0}}, "by_seed"),
+    "no views": ({"samples": 0}, "samples"),
+    "another runtime's": ({"other_runtimes": {"qnn": {"iou": 0.9, "ssim": 0.9, "psnr_db_by_band": 3}}}, "qnn"),
+}
+
+
+@pytest.mark.parametrize("case", MALFORMED)
+def test_a_malformed_figure_is_found_when_the_manifest_is_read(own, case):
+    changes, where = MALFORMED[case]
+    changed_by_hand(own, **changes)
+    with pytest.raises(BadInputError, match=rf"manifest\.json: validation.*{where}"):
+        load_bundle(own)
+
+
+def test_a_linked_manifest_is_written_where_it_leads(own, tmp_path):
+    kept = (own / "manifest.json").rename(tmp_path / "kept.json")
+    (own / "manifest.json").symlink_to(kept)
+    write_manifest(own, load_bundle(own).manifest.model_copy(update={"name": "renamed"}))
+    assert (own / "manifest.json").is_symlink()
+    assert json.loads(kept.read_text())["name"] == "renamed"
+
+
+def test_a_manifest_that_cannot_be_written_ends_the_validation_before_its_work(own, monkeypatch):
+    pytest.importorskip("skimage")
+
+    def refuse(*_args, **_options):
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr("trilane.writing.tempfile.TemporaryFile", refuse)
+    monkeypatch.setattr("trilane.training.validate.open_renderer", lambda *_: pytest.fail("the work began"))
+    with pytest.raises(BadInputError, match=r"manifest\.json: found read-only file system"):
+        CliRunner().invoke(app, ["validate", str(own)], catch_exceptions=False)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from datetime import date
+
 from trilane.avatars.bundle import Bundle
-from trilane.avatars.digests import digests_of
+from trilane.avatars.digests import digests_of, with_figures_digest
 from trilane.avatars.manifest import Manifest, Validation
 
 #: Of the made-up figures, PSNR in dB: that of the avatar's runtime, and of `openvino`.
@@ -15,5 +17,6 @@ def validated(bundle: Bundle, size: str = "256") -> Manifest:
     figures = {"psnr_db_by_band": {"full_body": PSNR_DB}, "iou": 0.9753, "ssim": 0.8642}
     others = {"openvino": figures | {"psnr_db_by_band": {"full_body": OTHER_PSNR_DB}}}
     digests = digests_of(bundle.folder, bundle.manifest)
-    about = {"date": "2026-01-02", "digests": digests, "runtime": "ort", "size": size, "other_runtimes": others}
-    return bundle.manifest.model_copy(update={"validation": Validation.model_validate(figures | about)})
+    about = {"date": date(2026, 1, 2), "digests": digests, "runtime": "ort", "size": size, "other_runtimes": others}
+    validation = with_figures_digest(Validation.model_validate(figures | about))
+    return bundle.manifest.model_copy(update={"validation": validation})
