@@ -24,7 +24,7 @@ Examples:
   trilane accuracy --hard-cases --json
 """
 OUT_OF_BOUNDS = 1
-HARD_COLUMNS = ("name", "error", "bound", "constant_error", "shifted_error", "swapped_error", "verdict")
+HARD_COLUMNS = ("name", "error", "bound", "constant_error", "shifted_error", "swapped_error", "source", "verdict")
 
 
 @app.command(epilog=EPILOG)
