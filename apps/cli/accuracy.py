@@ -26,7 +26,7 @@ Examples:
 """
 OUT_OF_BOUNDS = 1
 SCENE, FRAMES = "default", 8
-HARD_COLUMNS = ("name", "error", "bound", "constant_error", "shifted_error", "swapped_error", "verdict")
+HARD_COLUMNS = ("name", "error", "bound", "constant_error", "shifted_error", "swapped_error", "source", "verdict")
 
 
 @app.command(epilog=EPILOG)

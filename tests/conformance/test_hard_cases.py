@@ -10,8 +10,10 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from trilane.apps.experiments.hard_cases import SHIFT, error_of, make_case, make_pair  # noqa: E402
+from trilane.apps.experiments.hard_cases import EXCEEDED, IDEAL_STEPS, SHIFT, error_of, make_case, make_pair  # noqa: E402
 from trilane.apps.experiments.hard_networks import INPUTS, NETWORKS  # noqa: E402
+from trilane.training.quantising import power_of_two_scales  # noqa: E402
+from trilane.training.quantising import quantise as quantise_module  # noqa: E402
 
 torch.set_num_threads(1)
 
@@ -25,12 +27,27 @@ WRONG = {
 }
 
 
+#: Rows that fail: more than an ideal quantiser's error, by docs/networks.md. On one runtime or the other some hold.
+ABOVE_IDEAL = {
+    ("batch", "constant patches"),
+    ("batch", "saturating"),
+    ("instance", "constant patches"),
+    ("instance", "saturating"),
+    ("group", "constant patches"),
+    ("outlier channel", "saturating"),
+}
+
 pair_of = functools.cache(make_pair)
 
 
 @pytest.fixture(scope="module", params=itertools.product(NETWORKS, INPUTS), ids=", ".join)
-def case(request):
-    network, name = request.param
+def row(request):
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def case(row):
+    network, name = row
     return make_case(pair_of(network), name)
 
 
@@ -41,5 +58,34 @@ def test_a_wrong_picture_is_above_the_bound(case, wrong):
     assert case.tells
 
 
-def test_the_picture_is_near_the_float_networks(quick_runtime, case):
-    assert error_of(case, quick_runtime) <= case.bound
+def test_the_picture_is_near_the_float_networks(quick_runtime, row, case):
+    """Every picture keeps the bound of its own network's steps; only named rows do not keep that of ideal steps."""
+    error = error_of(case, quick_runtime)
+    assert error <= case.own_bound
+    assert error <= case.bound or row in ABOVE_IDEAL
+
+
+def test_ranges_four_times_as_wide_fail(monkeypatch):
+    """Every step is four times as coarse; the float network's pictures are the same."""
+    sound = quantise_module.limit_logits
+
+    def widen(model, ranges):
+        sound(model, ranges)
+        for name in ranges.keys():  # noqa: SIM118 - no dict
+            ranges[name].lowest, ranges[name].highest = 4 * ranges[name].lowest, 4 * ranges[name].highest
+
+    monkeypatch.setattr(quantise_module, "limit_logits", widen)
+    assert_rows_fail_that_hold_when_sound("instance")
+
+
+def test_weights_of_a_quarter_of_the_steps_fail(monkeypatch):
+    monkeypatch.setattr(power_of_two_scales, "WEIGHT_TOP", {True: 16, False: 16})
+    assert_rows_fail_that_hold_when_sound("batch")
+
+
+def assert_rows_fail_that_hold_when_sound(network):
+    pair = make_pair(network)
+    for name in ("usual", "little but background"):
+        case = make_case(pair, name)
+        assert case.source == IDEAL_STEPS
+        assert case.verdict(error_of(case, "ort")) == EXCEEDED

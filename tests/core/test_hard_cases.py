@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from trilane.apps.cli.accuracy import app
-from trilane.apps.experiments.hard_cases import EXCEEDED, HOLDS, UNTOLD, Case, wrong_answers
+from trilane.apps.experiments.hard_cases import EXCEEDED, HOLDS, IDEAL_STEPS, UNTOLD, Case, wrong_answers
 from trilane.apps.experiments.hard_networks import INPUTS, SIDE, calibration_frames, case_input
 
 
@@ -39,7 +39,7 @@ def test_a_shift_is_by_8_pixels_in_the_direction_that_costs_least():
 def case():
     """Bound 10; the nearest wrong picture is at 11."""
     wrong = {"constant_error": 20.0, "shifted_error": 11.0, "swapped_error": 30.0}
-    return Case(None, np.zeros(1, np.uint8), np.zeros(1, np.float32), 8.0, 10.0, wrong)
+    return Case(None, np.zeros(1, np.uint8), np.zeros(1, np.float32), 8.0, 10.0, IDEAL_STEPS, 12.0, wrong)
 
 
 @pytest.mark.parametrize(("error", "verdict"), [(0.0, HOLDS), (10.0, HOLDS), (10.01, EXCEEDED), (np.nan, EXCEEDED)])
@@ -54,7 +54,14 @@ def test_a_row_whose_bound_a_wrong_picture_keeps_fails_without_any_error(case, b
 
 @pytest.mark.parametrize(("verdict", "code"), [(HOLDS, 0), (EXCEEDED, 1), (UNTOLD, 1)])
 def test_rows_that_fail_are_named_and_fail_the_command(monkeypatch, verdict, code):
-    figures = {"error": 1.0, "bound": 2.0, "constant_error": 3.0, "shifted_error": 4.0, "swapped_error": 5.0}
+    figures = {
+        "error": 1.0,
+        "bound": 2.0,
+        "constant_error": 3.0,
+        "shifted_error": 4.0,
+        "swapped_error": 5.0,
+        "source": IDEAL_STEPS,
+    }
     row = {"name": "batch, usual, ort", **figures, "verdict": verdict, "passed": verdict == HOLDS}
     monkeypatch.setattr("trilane.apps.experiments.hard_cases.hard_cases", lambda _: iter([row]))
     result = CliRunner().invoke(app, ["--hard-cases", "--runtime", "ort"])

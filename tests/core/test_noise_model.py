@@ -13,6 +13,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from trilane.errors import BadInputError
+from trilane.training.quantising.ideal_noise import float_ranges, ideal_noise_model
 from trilane.training.quantising.noise_model import (
     DRAWS,
     RISK,
@@ -196,3 +197,44 @@ def test_a_layer_that_is_half_too_large_breaks_the_bound(tiny_quantised, predict
     scale = next(t for t in model.graph.initializer if t.name == f"{layer}.w_scale")
     scale.CopyFrom(numpy_helper.from_array(1.5 * numpy_helper.to_array(scale), scale.name))
     assert error_in_integers(onnx.ModelProto.FromString(model.SerializeToString()), tensor, wanted) > bound
+
+
+def plain_network(*rectified):
+    """A float network of which only the names of its rectifiers' outputs count."""
+    nodes = [helper.make_node("Relu", ["x"], [name]) for name in rectified]
+    return helper.make_model(helper.make_graph(nodes, "float", [], []))
+
+
+def test_ideal_ranges_are_those_of_the_float_network_with_its_rectifiers():
+    """0.6 * 0.7 = 0.42, times -0.9 is -0.378, which a rectifier makes 0; ranges include 0."""
+    tensor = np.full((1, 1, 1, 1), 6, np.uint8)
+    quantised = layers((W1, W2), (STEP1, STEP2), (STEP_BETWEEN, STEP_OUT))
+    ranges = float_ranges(plain_network(), quantised, tensor)
+    assert ranges["q1"] == pytest.approx((0, 0.42)) and ranges["q2"] == pytest.approx((-0.378, 0))
+    assert float_ranges(plain_network("y2"), quantised, tensor)["q2"] == (0, 0)
+
+
+@pytest.mark.parametrize("factor", [0.5, 4.0])
+def test_ideal_noise_does_not_depend_on_the_quantisers_steps(factor):
+    """The same draws give the same pictures, whatever the steps of weights and of the tensor between are."""
+    tensor = np.full((1, 1, 1, 1), 6, np.uint8)
+
+    def pictures(times):
+        quantised = layers((W1, -W2), (times * STEP1, times * STEP2), (times * STEP_BETWEEN, times * STEP_OUT))
+        return np.array(list(ideal_noise_model(plain_network(), quantised, tensor).pictures(tensor, 50, seed=1)))
+
+    assert (pictures(factor) == pictures(1.0)).all()
+    assert np.ptp(pictures(1.0)) > 0
+
+
+@pytest.mark.parametrize(("alike", "widened"), [(False, 1), (True, 2)])
+def test_ideal_weights_have_127_steps_to_either_side_and_powers_of_two_at_most_twice_as_wide_ones(alike, widened):
+    quantised = layers((W1, W2), (STEP1, STEP2), (STEP_BETWEEN, STEP_OUT))
+    quantised.facts["rounds_alike"] = alike
+    model = ideal_noise_model(plain_network(), quantised, np.full((1, 1, 1, 1), 6, np.uint8))
+    halves = [half.item() for _, half in model.constants.values()]
+    assert halves == pytest.approx([widened * 0.7 / 127 / 2, widened * 0.9 / 127 / 2])
+    limits = {
+        t.name: numpy_helper.to_array(t).item() for t in model.model.graph.initializer if t.name.endswith(".step")
+    }
+    assert limits == pytest.approx({"q1.step": widened * 0.42 / 255, "q2.step": 1 / 255})

@@ -56,7 +56,7 @@ class NoiseModel:
 
     @cached_property
     def _runner(self) -> Any:
-        return _session(self.model)
+        return session(self.model)
 
     def pictures(self, tensor: U8, draws: int, seed: int) -> Iterator[F32]:
         """`draws` pictures (N, H, W, 4), of 255, for the bytes `tensor` (N, H, W, C)."""
@@ -75,9 +75,9 @@ def float_picture(model: onnx.ModelProto, quantised: Quantised, tensor: U8) -> F
     """The float network's picture (N, H, W, 4), of 255, for the real numbers that `tensor` (N, H, W, C) stands for."""
     encoding = quantised.network.input
     real = (tensor.astype(np.float32) - encoding.zero_point) * np.float32(encoding.scale)
-    session = _session(model)
+    runner = session(model)
     nchw = np.ascontiguousarray(real.transpose(0, 3, 1, 2))
-    picture: F32 = PICTURE * session.run(None, {session.get_inputs()[0].name: nchw})[0].transpose(0, 2, 3, 1)
+    picture: F32 = PICTURE * runner.run(None, {runner.get_inputs()[0].name: nchw})[0].transpose(0, 2, 3, 1)
     return picture
 
 
@@ -95,14 +95,14 @@ def predicted_bound(model: NoiseModel, wanted: F32, tensor: U8, seed: int = 0) -
 
 def noise_model(quantised: Quantised) -> NoiseModel:
     """The noise model of an integer network. Raises BadInputError when a constant has no float value."""
-    graph = _Graph(quantised)
+    graph = NoiseGraph(quantised)
     for node in quantised.network.model.graph.node:
         graph.take(node)
     return graph.finished()
 
 
-class _Graph:
-    """The graph of a noise model while it is written, node by node."""
+class NoiseGraph:
+    """The graph of a noise model while it is written, node by node; its steps and ranges are the integer network's."""
 
     def __init__(self, quantised: Quantised) -> None:
         self.source = quantised.network.model.graph
@@ -119,7 +119,7 @@ class _Graph:
     def take(self, node: onnx.NodeProto) -> None:
         """Write what stands for `node`."""
         if node.op_type == "QuantizeLinear":
-            self._store(node)
+            self.store(node)
         elif node.op_type == "DequantizeLinear" and node.input[0] in self.values:
             self._constant(node)
         elif node.op_type == "DequantizeLinear" and node.input[0] != self.source.input[0].name:
@@ -129,36 +129,46 @@ class _Graph:
 
     def _constant(self, node: onnx.NodeProto) -> None:
         """A weight, bias or vector becomes an input that is drawn about its float value."""
+        self.constants[node.output[0]] = self.constant(node)
+
+    def constant(self, node: onnx.NodeProto) -> tuple[F32, NDArray[np.float64]]:
+        """The float value of what `node` reads, and the largest error of each element."""
         stored, scale = self.values[node.input[0]], np.asarray(self.values[node.input[1]], np.float64)
         axis = next((attribute.i for attribute in node.attribute if attribute.name == "axis"), 1)
         if scale.ndim and stored.ndim:
             scale = scale.reshape([-1 if side == axis else 1 for side in range(stored.ndim)])
-        exact_value = self._float_value(node.input[0].removesuffix("_quantized"), stored.shape)
+        exact_value = self.float_value(node.input[0], stored.shape)
         half = np.broadcast_to(scale * self.multiples / 2, stored.shape)
         # A weight of exactly 0 is stored exactly, if 0 is a multiple that weights may have: biases have odd ones.
         exact = (exact_value == 0) & (stored == 0)
         # Where they have none at 0, the error is always `half`: its variance is that of a uniform one sqrt(3) as wide.
         farthest = (exact_value == 0) & (stored != 0)
-        self.constants[node.output[0]] = exact_value, np.where(exact, 0.0, np.where(farthest, 3**0.5, 1.0) * half)
+        return exact_value, np.where(exact, 0.0, np.where(farthest, 3**0.5, 1.0) * half)
 
-    def _float_value(self, name: str, shape: tuple[int, ...]) -> F32:
-        """The float constant `name`; ONNX Runtime numbers the copies of a bias that several layers read."""
+    def float_value(self, stored: str, shape: tuple[int, ...]) -> F32:
+        """The float constant of `stored`; ONNX Runtime numbers the copies of a bias that several layers read."""
+        name = stored.removesuffix("_quantized")
         originals = [known for known in self.floats if name.startswith(known) and f"0{name[len(known) :]}".isdigit()]
         value = self.floats[max(originals, key=len)] if originals else None
         if value is None or value.shape != shape:
             raise BadInputError("noise model", f"constant {name!r}", "a constant of the float network")
         return value.astype(np.float32)
 
-    def _store(self, node: onnx.NodeProto) -> None:
+    def store(self, node: onnx.NodeProto) -> None:
         """A stored tensor is clipped; inside its range, if it rounds at all, it goes to shifted steps."""
         x, y = node.input[0], node.output[0]
-        step, zero = float(self.values[node.input[1]]), int(self.values[node.input[2]])
-        low, high = (self._limit(f"{y}.{end}", (byte - zero) * step) for end, byte in (("low", 0), ("high", TOP)))
-        rounds = not self._is_multiple(x, step)
+        lowest, highest, step = self.bytes_of(node)
+        low, high = self._limit(f"{y}.low", lowest), self._limit(f"{y}.high", highest)
+        rounds = not self.is_multiple(x, step)
         clipped = f"{y}.clipped" if rounds else y
         self.nodes.append(helper.make_node("Clip", [x, low, high], [clipped]))
         if rounds:
             self._round(x, y, step, (low, high))
+
+    def bytes_of(self, node: onnx.NodeProto) -> tuple[float, float, float]:
+        """The real numbers of bytes 0 and 255 of the tensor that `node` stores, and its step."""
+        step, zero = float(self.values[node.input[1]]), int(self.values[node.input[2]])
+        return -zero * step, (TOP - zero) * step, step
 
     def _round(self, x: str, y: str, step: float, ends: tuple[str, str]) -> None:
         """Inside the range and off 0, `y` = (round(`x` / step + offset) - offset) step: an error of +-½ step."""
@@ -185,7 +195,7 @@ class _Graph:
         self.limits.append(numpy_helper.from_array(np.asarray(value, np.float32), name))
         return name
 
-    def _is_multiple(self, name: str, step: float) -> bool:
+    def is_multiple(self, name: str, step: float) -> bool:
         """Whether tensor `name` consists of multiples of `step` already."""
         maker = self.makers.get(name)
         if maker is None:
@@ -195,7 +205,7 @@ class _Graph:
         if maker.op_type not in KEEPS_STEPS:
             return False
         data = maker.input if maker.op_type in ("Concat", "Add") else maker.input[:1]
-        return all(self._is_multiple(source, step) for source in data)
+        return all(self.is_multiple(source, step) for source in data)
 
     def finished(self) -> NoiseModel:
         """The model, with the constants and offsets as inputs."""
@@ -212,7 +222,7 @@ class _Graph:
         return NoiseModel(model, self.constants, tuple(self.offsets))
 
 
-def _session(model: onnx.ModelProto) -> Any:
+def session(model: onnx.ModelProto) -> Any:
     settings = onnxruntime.SessionOptions()
     settings.log_severity_level = ERRORS_ONLY
     settings.intra_op_num_threads = 1
