@@ -27,6 +27,11 @@ PARTS = {
 VALIDATE = "trilane avatar validate"
 
 
+#: What a validation at another size or on another runtime costs.
+REPLACES = ", in place of what the manifest says now"
+NEIGHBOURS = "`trilane bench several` measures what an avatar loses to its neighbours"
+
+
 @dataclass(frozen=True)
 class DrawnAs:
     """How a run draws an avatar.
@@ -54,8 +59,9 @@ def accuracy_of(bundle: Bundle, drawn: DrawnAs) -> dict[str, Any]:
         return refusal
     own, differs = validation.on(drawn.runtime), _drawn_otherwise(validation, drawn)
     if own is None or differs:
-        how = f" --size {drawn.size} --runtime {drawn.runtime}" if drawn.avatars == 1 else ""
-        return _no_figures(bundle, [], differs, how)
+        if drawn.avatars > 1:
+            return {"source": NO_FIGURES, "changed": [], "why": f"{differs}; {NEIGHBOURS}"}
+        return _no_figures(bundle, [], differs, f" --size {drawn.size} --runtime {drawn.runtime}", REPLACES)
     return {
         "source": from_validation(validation.date),
         "runtime": drawn.runtime,
@@ -111,10 +117,10 @@ def _drawn_otherwise(validation: Validation, drawn: DrawnAs) -> str:
     return ""
 
 
-def _no_figures(bundle: Bundle, changed: Sequence[str], why: str, how: str = "") -> dict[str, Any]:
-    """`why`, and the command that measures what there is now, with the options `how`."""
+def _no_figures(bundle: Bundle, changed: Sequence[str], why: str, how: str = "", remark: str = "") -> dict[str, Any]:
+    """`why`, and the command that measures what there is now, with the options `how` and a `remark` on it."""
     command = f"{VALIDATE} {shlex.quote(_name_of(bundle.folder))}{how}"
-    return {"source": NO_FIGURES, "changed": list(changed), "why": f"{why}; `{command}` measures it"}
+    return {"source": NO_FIGURES, "changed": list(changed), "why": f"{why}; `{command}` measures it{remark}"}
 
 
 def _name_of(folder: Path) -> str:

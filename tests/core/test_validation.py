@@ -93,7 +93,9 @@ def test_drawn_otherwise_than_validated_no_figure_is_shown(own, case):
 
 def test_the_command_that_mends_measures_what_is_drawn(own):
     facts = accuracy_of(load_bundle(own), DrawnAs("qnn", "192"))
-    assert facts["why"].endswith(f"`trilane avatar validate {own} --size 192 --runtime qnn` measures it")
+    assert facts["why"].endswith(
+        f"`trilane avatar validate {own} --size 192 --runtime qnn` measures it, in place of what the manifest says now"
+    )
 
 
 def test_a_validation_without_digests_is_of_unknown_parts(own):
