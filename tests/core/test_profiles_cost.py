@@ -149,14 +149,16 @@ def test_a_dynamic_shape_is_refused() -> None:
 
 @pytest.mark.parametrize(("key", "value"), [("encoder", "vgg"), ("norm", "layer"), ("layout", "loose")])
 def test_unknown_words_are_named(key: str, value: str) -> None:
-    with pytest.raises(BadInputError, match=value):
+    with pytest.raises(BadInputError, match=value) as error:
         replace(spec(), **{key: value})  # type: ignore[arg-type]
+    assert error.value.where == key
 
 
 @pytest.mark.parametrize(("key", "value"), [("height", 100), ("width", 0), ("channels", 0), ("channels", 17)])
 def test_numbers_out_of_range_are_named(key: str, value: int) -> None:
-    with pytest.raises(BadInputError, match=str(value)):
+    with pytest.raises(BadInputError, match=str(value)) as error:
         replace(spec(), **{key: value})  # type: ignore[arg-type]
+    assert (error.value.where, key in error.value.found) in {("size", True), ("channels", False)}
 
 
 def test_time_is_the_sum_of_its_parts_and_falls_with_the_clock() -> None:
