@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from trilane.apps.cli.avatar import app
 from trilane.avatars.bundle import load_bundle, write_bundle, write_manifest
-from trilane.avatars.digests import digests_of
+from trilane.avatars.digests import digests_of, sha256_of
 from trilane.avatars.validation import DrawnAs, accuracy_of, validation_facts
 from trilane.errors import BadInputError
 from trilane.figure_sources import NO_FIGURES
@@ -282,3 +282,9 @@ def test_a_manifest_that_cannot_be_written_ends_the_validation_before_its_work(o
     monkeypatch.setattr("trilane.training.validate.open_renderer", lambda *_: pytest.fail("the work began"))
     with pytest.raises(BadInputError, match=r"manifest\.json: found read-only file system"):
         CliRunner().invoke(app, ["validate", str(own)], catch_exceptions=False)
+
+
+def test_a_part_that_cannot_be_read_is_named(tmp_path):
+    (tmp_path / "texture.npz").mkdir()
+    with pytest.raises(BadInputError, match=r"texture\.npz"):
+        sha256_of([tmp_path / "texture.npz"])

@@ -16,6 +16,8 @@ def test_neighbours_cost_less_than_the_bound() -> None:
     """Three avatars in one tensor, at the pipeline's own margin: none loses half a decibel."""
     found = several.measure(avatars=3, views=1, size="256", margins=(MARGIN_PX,))
     (row,) = found["rows"]
+    assert found["config"] == {"avatars": 3, "views": 1, "size": "256", "output": [480, 640]}
+    assert (row["margin"], found["margin_px"], found["bound_db"]) == (MARGIN_PX, MARGIN_PX, 0.5)
     assert row["loss_db_worst"] <= found["bound_db"]
     assert row["psnr_db_alone"] > 15
     assert row["cell_height"] > 64
