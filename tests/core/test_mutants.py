@@ -63,6 +63,7 @@ def test_a_fault_is_put_where_it_was_drawn() -> None:
     fault = fault_between("f.py", "Number", text, "a = 1\nb = 0\n\n\na = 2\nc = 0\n")
     assert fault == Fault("f.py", 5, "Number", "a = 1\n", "a = 2\n")
     assert fault.put_into("# new\n" + text) == "# new\na = 1\nb = 0\n\n\na = 2\nc = 0\n"
+    assert fault.still_fits(text) and not fault.still_fits("b = 0\n") and not fault.still_fits("aa = 1\n")
     with pytest.raises(ValueError, match="no longer"):
         fault.put_into("b = 0\n")
 

@@ -72,7 +72,9 @@ def _faults(options: argparse.Namespace, sources: Sequence[str]) -> list[Fault]:
     unchanging = load_unchanging(UNCHANGING)
     drawn: Iterable[Fault] = draw(ROOT, sources, options.seed)
     if options.again:
-        drawn = [result.fault for result in load_results(options.again) if not result.noticed_by]
+        survivors = [result.fault for result in load_results(options.again) if not result.noticed_by]
+        drawn = [fault for fault in survivors if fault.still_fits((ROOT / fault.path).read_text(encoding="utf-8"))]
+        _say(f"{len(survivors)} survivors, {len(survivors) - len(drawn)} of them in lines that are no longer there")
     return list(islice((fault for fault in drawn if not any(row.is_it(fault) for row in unchanging)), options.count))
 
 

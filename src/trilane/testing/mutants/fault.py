@@ -45,14 +45,22 @@ class Fault(NamedTuple):
     def __str__(self) -> str:
         return f"{self.path}:{self.line} [{self.kind}] {self.before}  ->  {self.after}"
 
+    def still_fits(self, text: str) -> bool:
+        """Whether the file with this text still has its lines."""
+        return bool(self._places(text))
+
     def put_into(self, text: str) -> str:
         """The text with the fault, where `old` stands nearest to its line. Raises ValueError when it does not."""
         wanted = sum(len(line) for line in text.splitlines(keepends=True)[: self.line - 1])
-        places = [place for place in _places(text, self.old) if place == 0 or text[place - 1] == "\n"]
+        places = self._places(text)
         if not places:
             raise ValueError(f"{self.path}: no longer has the lines {self.before!r}")
         place = min(places, key=lambda each: abs(each - wanted))
         return text[:place] + self.new + text[place + len(self.old) :]
+
+    def _places(self, text: str) -> list[int]:
+        """Where `old` stands from the begin of a line."""
+        return [place for place in _places(text, self.old) if place == 0 or text[place - 1] == "\n"]
 
 
 def fault_between(path: str, kind: str, text: str, changed: str) -> Fault:
