@@ -18,19 +18,9 @@ from trilane.scene.camera.recorded import OPENGL_FROM_OPTICAL, RawCamera, path_f
 from trilane.scene.camera.text_table import column_count, elapsed, read_table
 from trilane.scene.motion.motion import Wrap
 from trilane.scene.schema import CameraSpec
+from trilane.testing.camera_files import HEIGHT, angle, load, nerf_text, pixel, pose_z_up, rows_of
 
-WIDTH, HEIGHT = 640, 480
 SPEC = CameraSpec()
-
-
-def load(source: Path | str, **spec: Any) -> CameraPath:
-    return load_camera(CameraSpec(source=str(source), **spec), Path("/"))
-
-
-def pixel(camera: CameraPath, point: list[float], t_s: float = 0.0) -> tuple[float, float]:
-    """Column and row of a world point in a picture of 640x480, origin top left."""
-    x, y, _, w = camera.projection(WIDTH / HEIGHT) @ camera.sample(t_s) @ [*point, 1.0]
-    return (x / w + 1) / 2 * WIDTH, (1 - y / w) / 2 * HEIGHT
 
 
 def focal(fov_y_deg: float) -> float:
@@ -175,10 +165,6 @@ def test_the_usual_up_holds_above_a_cosine_of_0_3(cosine: float, turned: bool) -
     assert note == ("Y up" if turned else "-Z up, as the camera is held (not Y, usual for the format)")
 
 
-def rows_of(matrix: np.ndarray) -> str:
-    return "0 " + " ".join(f"{value:.12g}" for value in np.column_stack([matrix, np.zeros(3)]).ravel())
-
-
 @pytest.mark.parametrize(
     ("matrix", "fine"),
     [
@@ -246,29 +232,12 @@ def test_times_too_far_apart_for_a_number_are_left_out(tmp_path: Path) -> None:
 # --- NeRF ---
 
 
-def nerf_text(*matrices: np.ndarray, **extra: Any) -> str:
-    return json.dumps({"frames": [{"transform_matrix": matrix.tolist()} for matrix in matrices], **extra})
-
-
-def pose_z_up(degrees: float, place: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
-    """4x4 of a level camera in a Z-up world that looks along +Y, turned left about +Z."""
-    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
-    matrix[:3, 3] = place
-    return matrix
-
-
 def test_a_nerf_view_puts_points_at_their_pixels(tmp_path: Path) -> None:
     """fl_y = 600 of 480 rows: at (1, 2, 3), 4 m along +Y, 0.5 m right (+X), 1 m up (+Z) is at 75 right, 150 above."""
     (tmp_path / "a.json").write_text(nerf_text(pose_z_up(0, (1, 2, 3)), fl_y=600, h=480, fl_x=300, w=640))
     assert pixel(load(tmp_path / "a.json"), [1.5, 4.0, -6.0]) == pytest.approx((395, 90))
     (tmp_path / "a.json").write_text(nerf_text(pose_z_up(0, (1, 2, 3))[:3]))  # 3x4 is enough
     load(tmp_path / "a.json")
-
-
-def angle(tangent: float) -> float:
-    return math.degrees(2 * math.atan(tangent))
 
 
 #: Keys of the file -> field of view of height and width (by tangents of their halves), and where they come from.

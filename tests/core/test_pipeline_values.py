@@ -19,19 +19,14 @@ from trilane.pipeline import (
 )
 from trilane.pipeline.bound_stage import BoundStage
 from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, UnitSettings
-from trilane.pipeline.regions import EdgeRegion, edge_regions
+from trilane.pipeline.regions import edge_regions
 from trilane.pipeline.stage import UnitContext
 from trilane.pipeline.unit_spec import UnitSpec
-from trilane.transport.job_pipe import JobPipeEnd
-from trilane.transport.packets import Packet, SlotLayout, header_dtype, view_packet
+from trilane.testing.small_pipeline import EDGES, OWN, STAGES, UNITS, packets, pipeline, spec_of
+from trilane.testing.told_time import ToldTime
+from trilane.transport.packets import Packet, header_dtype
 
-OWN = header_dtype([("own", "<u2")])
 MS = 1_000_000
-
-
-def packets(header: np.dtype[Any], count: int) -> list[Packet]:
-    layout = SlotLayout(header, 8)
-    return [view_packet(memoryview(bytearray(layout.slot_bytes)), layout) for _ in range(count)]
 
 
 class FakeStage:
@@ -104,26 +99,8 @@ def test_a_last_stage_has_no_slot_to_write() -> None:
     assert inner.runs == [(5, 0, None)]
 
 
-class FakeTime:
-    """A clock that moves by what is slept, and 1 µs with every look."""
-
-    def __init__(self) -> None:
-        self.now_ns, self.slept = 5 * MS, []
-
-    def monotonic_ns(self) -> int:
-        self.now_ns += 1000
-        return self.now_ns
-
-    def monotonic(self) -> float:
-        return self.monotonic_ns() / 1e9
-
-    def sleep(self, seconds: float) -> None:
-        self.slept.append(round(seconds * 1e9))
-        self.now_ns += round(seconds * 1e9)
-
-
 def test_a_hold_sleeps_until_shortly_before_its_end_and_then_watches(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = FakeTime()
+    clock = ToldTime()
     monkeypatch.setattr(bound_stage, "time", clock)
     bound_stage.hold_until(7 * MS)
     assert clock.slept == [2 * MS - 1000 - 150_000]
@@ -135,7 +112,7 @@ def test_a_hold_sleeps_until_shortly_before_its_end_and_then_watches(monkeypatch
 
 
 def test_a_job_is_held_for_its_pace_and_one_without_a_pace_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = FakeTime()
+    clock = ToldTime()
     monkeypatch.setattr(bound_stage, "time", clock)
     start = clock.now_ns
     BoundStage("present", FakeStage(), packets(OWN, 1), [], 3 * MS, context()).run(0, 0, -1, 0)
@@ -150,18 +127,6 @@ def test_a_stage_works_asleep_on_a_device_of_its_unit_or_at_the_pace_of_a_chip()
     assert (plain.works_asleep, paced.works_asleep) == (False, True)
     unit.use_device("card")  # by another stage of the unit, or in a later job
     assert (plain.works_asleep, paced.works_asleep) == (True, True)
-
-
-UNITS = {"left": UnitSettings(cores=(1, 0), threads=2), "right": UnitSettings(cores=(3, 1), threads=1, spin=True)}
-STAGES = tuple(
-    PipelineStage(name=name, unit=unit, factory="json:loads", pace_ns=pace)
-    for name, unit, pace in (("in", "left", 0), ("mid", "right", 5), ("out", "left", 0))
-)
-EDGES = (PipelineEdge(payload_bytes=100, header=OWN, rule="single"), PipelineEdge(payload_bytes=5000, rule="fifo:3"))
-
-
-def pipeline(**changes: Any) -> Pipeline:
-    return Pipeline(**{"stages": STAGES, "edges": EDGES, "units": UNITS, **changes})
 
 
 def test_a_description_answers_what_follows_from_it() -> None:
@@ -259,27 +224,6 @@ def test_every_edge_has_a_region_of_its_slots_which_is_closed_at_the_end() -> No
     for region in regions.values():
         with pytest.raises(OSError, match=r"Bad file"):
             os.fstat(region.fd)
-
-
-def spec_of(**changes: Any) -> UnitSpec:
-    values: dict[str, Any] = {
-        "unit": "right",
-        "endpoint": "ipc://none",
-        "job_pipe": JobPipeEnd(10, 11),
-        "assets_fd": 12,
-        "settings": UNITS["right"],
-        "scheduler_cores": (1, 0),
-        "run_cores": (0, 1, 3),
-        "stages": (STAGES[1],),
-        "module_folders": (),
-        "edges": {
-            "in->mid": EdgeRegion(fd=13, slots=1, header=OWN, payload_bytes=100),
-            "mid->out": EdgeRegion(fd=14, slots=3, header=header_dtype(), payload_bytes=5000),
-        },
-        "inputs": {"mid": "in->mid"},
-        "outputs": {"mid": "mid->out"},
-    }
-    return UnitSpec(**{**values, **changes})
 
 
 def test_a_spec_numbers_its_descriptors_anew_and_changes_nothing_else() -> None:

@@ -24,7 +24,6 @@ from trilane.pipeline import (
     run,
     run_log,
 )
-from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, UnitSettings
 from trilane.pipeline.isolated import IsolatedTimes
 from trilane.pipeline.lifecycle import close_units, listen_before_run, start_units
 from trilane.pipeline.requests import FrameRequestQueue
@@ -33,6 +32,8 @@ from trilane.pipeline.run_log import RunLog, UnitError, after_stderr
 from trilane.pipeline.signals import Interrupts
 from trilane.pipeline.unit_processes import UnitMessage
 from trilane.scheduler.events import FrameRequest, Settings, Stop
+from trilane.testing.small_pipeline import pipeline
+from trilane.testing.told_time import ToldTime
 from trilane.transport.messages import (
     Close,
     Closed,
@@ -44,36 +45,6 @@ from trilane.transport.messages import (
 )
 
 MS = 1_000_000
-
-
-UNITS = {"left": UnitSettings(cores=(1, 0), threads=2), "right": UnitSettings(cores=(3, 1), threads=1, spin=True)}
-STAGES = tuple(
-    PipelineStage(name=name, unit=unit, factory="json:loads", pace_ns=pace)
-    for name, unit, pace in (("in", "left", 0), ("mid", "right", 5), ("out", "left", 0))
-)
-EDGES = (PipelineEdge(payload_bytes=100, rule="single"), PipelineEdge(payload_bytes=5000, rule="fifo:3"))
-
-
-def pipeline(**changes: Any) -> Pipeline:
-    return Pipeline(**{"stages": STAGES, "edges": EDGES, "units": UNITS, **changes})
-
-
-class FakeTime:
-    """A clock that moves by what is slept, and 1 µs with every look."""
-
-    def __init__(self) -> None:
-        self.now_ns, self.slept = 5 * MS, []
-
-    def monotonic_ns(self) -> int:
-        self.now_ns += 1000
-        return self.now_ns
-
-    def monotonic(self) -> float:
-        return self.monotonic_ns() / 1e9
-
-    def sleep(self, seconds: float) -> None:
-        self.slept.append(round(seconds * 1e9))
-        self.now_ns += round(seconds * 1e9)
 
 
 @pytest.mark.parametrize(("limit", "is_enough"), [(95, False), (96, True), (resource.RLIM_INFINITY, True)])
@@ -224,7 +195,7 @@ NOBODY: Any = SimpleNamespace(count=0)
 
 def test_units_are_started_all_at_once_and_waited_for_until_the_last_is_ready(monkeypatch: pytest.MonkeyPatch) -> None:
     """Started at 5.001 and 5.002 ms; looks at 5.003 (the end), 5.004, 5.005 (left), 5.006, 5.007 (right)."""
-    monkeypatch.setattr(lifecycle, "time", FakeTime())
+    monkeypatch.setattr(lifecycle, "time", ToldTime())
     processes: Any = FakeProcesses([[("left", Ready(4))], [], [("right", Ready(5))]])
     took = start_units(processes, ["left", "right"], NOBODY)
     assert {unit: round(ms, 6) for unit, ms in took.items()} == {"left": 0.004, "right": 0.006}
@@ -232,7 +203,7 @@ def test_units_are_started_all_at_once_and_waited_for_until_the_last_is_ready(mo
 
 
 def test_units_that_are_not_ready_in_time_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = FakeTime()
+    clock = ToldTime()
     processes: Any = FakeProcesses()
     processes.listen = lambda _: clock.sleep(60.1) or []
     monkeypatch.setattr(lifecycle, "time", clock)
@@ -274,7 +245,7 @@ def test_a_unit_that_fails_or_ends_while_it_closes_is_said() -> None:
 
 
 def test_units_that_do_not_close_are_named_unless_somebody_has_lost_patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = FakeTime()
+    clock = ToldTime()
     monkeypatch.setattr(lifecycle, "time", clock)
     script = [[], []]
     monkeypatch.setattr(FakeProcesses, "listen", lambda self, _: clock.sleep(15.1) or self.script.popleft())
@@ -317,7 +288,7 @@ def test_a_unit_is_handed_no_more_at_once_than_its_pipe_holds() -> None:
 def test_measuring_begins_no_frame_after_its_time_and_waits_no_longer_than_for_a_start(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    clock = FakeTime()
+    clock = ToldTime()
     monkeypatch.setattr(isolated, "time", clock)
     rows = answers([50, 0], [0, 60], [90, 0], [10, 0], [14, 0], [0, 99], [0, 30], [0, 32])
     processes: Any = FakeProcesses([*rows, *rows])

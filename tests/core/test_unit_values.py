@@ -26,13 +26,14 @@ from trilane.pipeline import (
     unit_loop,
 )
 from trilane.pipeline.bound_stage import BoundStage
-from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, UnitSettings
+from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.job_times import LOSS_NS
-from trilane.pipeline.regions import EdgeRegion, edge_regions
+from trilane.pipeline.regions import edge_regions
 from trilane.pipeline.stage import UnitContext
 from trilane.pipeline.unit_spec import UnitSpec
+from trilane.testing.small_pipeline import OWN, STAGES, UNITS, packets, pipeline, spec_of
 from trilane.transport.heartbeats import HeartbeatSocket
-from trilane.transport.job_pipe import JobPipe, JobPipeEnd, job_pipe_pair
+from trilane.transport.job_pipe import JobPipe, job_pipe_pair
 from trilane.transport.messages import (
     Close,
     Closed,
@@ -45,15 +46,9 @@ from trilane.transport.messages import (
     RunIsolated,
     RunJob,
 )
-from trilane.transport.packets import Packet, SlotLayout, header_dtype, view_packet
+from trilane.transport.packets import Packet
 
-OWN = header_dtype([("own", "<u2")])
 MS = 1_000_000
-
-
-def packets(header: np.dtype[Any], count: int) -> list[Packet]:
-    layout = SlotLayout(header, 8)
-    return [view_packet(memoryview(bytearray(layout.slot_bytes)), layout) for _ in range(count)]
 
 
 def context() -> UnitContext:
@@ -102,39 +97,6 @@ class FakeStage:
         self.closed = True
         if self.error is not None:
             raise self.error
-
-
-UNITS = {"left": UnitSettings(cores=(1, 0), threads=2), "right": UnitSettings(cores=(3, 1), threads=1, spin=True)}
-STAGES = tuple(
-    PipelineStage(name=name, unit=unit, factory="json:loads", pace_ns=pace)
-    for name, unit, pace in (("in", "left", 0), ("mid", "right", 5), ("out", "left", 0))
-)
-EDGES = (PipelineEdge(payload_bytes=100, header=OWN, rule="single"), PipelineEdge(payload_bytes=5000, rule="fifo:3"))
-
-
-def pipeline(**changes: Any) -> Pipeline:
-    return Pipeline(**{"stages": STAGES, "edges": EDGES, "units": UNITS, **changes})
-
-
-def spec_of(**changes: Any) -> UnitSpec:
-    values: dict[str, Any] = {
-        "unit": "right",
-        "endpoint": "ipc://none",
-        "job_pipe": JobPipeEnd(10, 11),
-        "assets_fd": 12,
-        "settings": UNITS["right"],
-        "scheduler_cores": (1, 0),
-        "run_cores": (0, 1, 3),
-        "stages": (STAGES[1],),
-        "module_folders": (),
-        "edges": {
-            "in->mid": EdgeRegion(fd=13, slots=1, header=OWN, payload_bytes=100),
-            "mid->out": EdgeRegion(fd=14, slots=3, header=header_dtype(), payload_bytes=5000),
-        },
-        "inputs": {"mid": "in->mid"},
-        "outputs": {"mid": "mid->out"},
-    }
-    return UnitSpec(**{**values, **changes})
 
 
 class FakeLink:
