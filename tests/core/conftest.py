@@ -12,9 +12,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from trilane.avatars.bundle import bundle_folder
+from trilane.body.body import ShapedBody, load_body
 from trilane.body.joints import JOINT_PARENTS
 
 VERTICES, FACES, CORNERS = 90, 120, 130
+
+
+@pytest.fixture(scope="session")
+def body() -> ShapedBody:
+    """The default body in its mean shape."""
+    return load_body(bundle_folder("default") / "body.npz").shape()
 
 
 @pytest.fixture

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import signal
-import subprocess
 import sys
 import threading
 import time
@@ -17,11 +15,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-import zmq
 
 from trilane.errors import BadInputError, MissingPartError, TrilaneError, UnitLostError
 from trilane.pipeline import (
-    fork_server,
     shared_assets,
     unit_loop,
 )
@@ -32,8 +28,6 @@ from trilane.pipeline.regions import edge_regions
 from trilane.pipeline.stage import UnitContext
 from trilane.pipeline.unit_spec import UnitSpec
 from trilane.testing.small_pipeline import OWN, STAGES, UNITS, packets, pipeline, spec_of
-from trilane.transport.heartbeats import HeartbeatSocket
-from trilane.transport.job_pipe import JobPipe, job_pipe_pair
 from trilane.transport.messages import (
     Close,
     Closed,
@@ -296,195 +290,3 @@ def test_a_factory_is_found_by_module_and_name() -> None:
     assert unit_loop.factory_named("json:loads") is json.loads
     with pytest.raises(AttributeError):
         unit_loop.factory_named("json:none")
-
-
-class PrctlLibc:
-    def __init__(self, answer: int) -> None:
-        self.answer, self.calls = answer, []
-
-    def prctl(self, *call: Any) -> int:
-        self.calls.append(call)
-        return self.answer
-
-
-def test_a_process_dies_with_its_parent_or_at_once_when_that_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
-    libc, exits = PrctlLibc(0), []
-    monkeypatch.setattr("ctypes.CDLL", lambda *_, **__: libc)
-    monkeypatch.setattr(os, "_exit", exits.append)
-    fork_server.die_with_parent(os.getppid())
-    assert (libc.calls, exits) == ([(1, signal.SIGKILL, 0, 0, 0)], [])
-    fork_server.die_with_parent(os.getppid() + 1)
-    assert exits == [1]
-    libc.answer = -1
-    with pytest.raises(OSError, match=r"PR_SET_PDEATHSIG"):
-        fork_server.die_with_parent(os.getppid())
-
-
-UNIT_LIFE = """
-import ctypes, json, os, signal, sys
-from types import SimpleNamespace
-from trilane.pipeline import fork_server
-
-def serve(spec, number_of):
-    death = ctypes.c_int()
-    ctypes.CDLL(None).prctl(2, ctypes.byref(death), 0, 0, 0)
-    print(json.dumps({
-        "death": death.value, "name": open("/proc/self/comm").read().strip(), "own_group": os.getpgid(0) == os.getpid(),
-        "cores": sorted(os.sched_getaffinity(0)), "threads": [os.environ[name] for name in fork_server.THREAD_LIMITS],
-        "spec": spec, "fds": sorted(number_of), "sigchld": signal.getsignal(signal.SIGCHLD) == signal.SIG_DFL,
-        "blocked": sorted(signal.pthread_sigmask(signal.SIG_BLOCK, [])),
-        "shut": not os.path.exists(f"/proc/self/fd/{spec_fd}"),
-    }), flush=True)
-    print("last words", file=sys.stderr)
-    if spec == "broken":
-        raise ValueError("broken spec")
-    return 7
-
-loops = {"trilane.pipeline.unit_loop": SimpleNamespace(serve=serve)}
-fork_server.importlib = SimpleNamespace(import_module=loops.__getitem__)
-for spec in ("whole", "broken"):
-    spec_fd = os.memfd_create("spec")
-    os.write(spec_fd, json.dumps(spec).encode())
-    said, theirs = os.pipe()
-    signal.signal(signal.SIGCHLD, lambda *_: None)
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGCHLD})
-    request = {"unit": "left-handed-unit", "cores": [min(os.sched_getaffinity(0))], "threads": 3, "fds": [41]}
-    server = os.getpid()
-    if (pid := os.fork()) == 0:
-        os._exit(fork_server._run_unit(request, [spec_fd, theirs, os.dup(1)], server))
-    os.close(theirs)
-    code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-    print(json.dumps([code, os.read(said, 9999).decode().splitlines()]), flush=True)
-"""
-
-
-def test_a_unit_is_forked_into_a_life_of_its_own() -> None:
-    """It dies with the server, has its name, group, cores and thread limits, and its error goes to its own stderr."""
-    done = subprocess.run([sys.executable, "-c", UNIT_LIFE], capture_output=True, text=True, timeout=60, check=True)
-    life, (code, said), other, (broken_code, broken_said) = map(json.loads, done.stdout.splitlines())
-    assert life == {
-        "death": signal.SIGKILL,
-        "name": "trilane-left-ha",
-        "own_group": True,
-        "cores": [min(os.sched_getaffinity(0))],
-        "threads": ["3"] * 4,
-        "spec": "whole",
-        "fds": [41],
-        "sigchld": True,
-        "blocked": [],
-        "shut": True,
-    }
-    assert (code, said, done.stderr) == (7, ["last words"], "")
-    assert (other["spec"], broken_code) == ("broken", 1)
-    assert (broken_said[0], broken_said[-1]) == ("last words", "ValueError: broken spec")
-
-
-def test_a_process_is_called_by_its_unit() -> None:
-    assert fork_server.process_name("dsp") == "trilane-dsp"
-    assert fork_server.process_name("a-long-name-of-a-unit") == "trilane-a-long-"
-
-
-def test_a_whole_unit_connects_is_ready_and_ends_when_it_is_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """In this process; the scheduler's cores carry its heartbeats, and its time slice is a unit's."""
-    ours, theirs = job_pipe_pair()
-    slices: list[int] = []
-    monkeypatch.setattr(unit_loop, "use_slice", slices.append)
-    monkeypatch.setattr(unit_loop, "context_on_cores", lambda cores: slices.append(cores) or zmq.Context())
-    monkeypatch.setattr(unit_loop, "gc", SimpleNamespace(collect=lambda: 0, freeze=lambda: None))
-    monkeypatch.setattr(unit_loop, "build_stages", lambda _: [])
-    here = os.sched_getaffinity(0)
-    context = zmq.Context()
-    beats, pipe = HeartbeatSocket(context), JobPipe(ours)
-    beats.socket.bind(f"ipc://{tmp_path}/h")
-    spec = spec_of(
-        endpoint=f"ipc://{tmp_path}/h", settings=UnitSettings(cores=tuple(here), threads=1), run_cores=tuple(here),
-        job_pipe=theirs,
-    )  # fmt: skip
-    threading.Timer(0.05, pipe.send, [Close()]).start()
-    raw = json.loads(spec.model_dump_json())
-    assert unit_loop.serve(raw, {fd: fd for fd in spec.fds}) == 0
-    assert beats.socket.poll(2000) and beats.receive() == [Ready(os.getpid())]
-    assert pipe.receive() == Closed()
-    assert pipe.receive() is None and pipe.ended
-    assert slices == [(1, 0), 1_000_000]
-    beats.close()
-    pipe.close()
-    context.term()
-
-
-SERVER_LIFE = """
-import ctypes, json, os, select, signal, socket, sys, time
-from types import SimpleNamespace
-from trilane.pipeline import fork_server
-
-def death_signal():
-    death = ctypes.c_int()
-    ctypes.CDLL(None).prctl(2, ctypes.byref(death), 0, 0, 0)
-    return death.value
-
-def look():
-    blocked = sorted(signal.pthread_sigmask(signal.SIG_BLOCK, []))
-    return [death_signal(), signal.getsignal(signal.SIGCHLD) == signal.SIG_DFL, blocked, os.getppid()]
-
-def serve(spec, number_of):
-    time.sleep(spec)
-    return 5
-
-modules = {"trilane.pipeline.unit_loop": SimpleNamespace(serve=serve), "here": SimpleNamespace(look=look)}
-fork_server.importlib = SimpleNamespace(import_module=modules.__getitem__)
-ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-server = os.fork()
-if server == 0:
-    ours.close()
-    fork_server.serve(theirs)
-    os._exit(9)
-theirs.close()
-
-def call(name):
-    reads, writes = os.pipe()
-    socket.send_fds(ours, [json.dumps({"call": name}).encode()], [writes])
-    os.close(writes)
-    with os.fdopen(reads) as answer:
-        return answer.read()
-
-def unit(seconds):
-    spec = os.memfd_create("spec")
-    os.write(spec, json.dumps(seconds).encode())
-    request = {"unit": "u", "cores": [min(os.sched_getaffinity(0))], "threads": 1, "fds": []}
-    socket.send_fds(ours, [json.dumps(request).encode()], [spec, os.dup(2)])
-    answer, fds, *_ = socket.recv_fds(ours, 99, 9)
-    return int(answer), fds
-
-def until(found):
-    end = time.monotonic() + 5
-    while not found() and time.monotonic() < end:
-        time.sleep(0.005)
-    return found()
-
-def children():
-    return open(f"/proc/{server}/task/{server}/children").read().split()
-
-death, default, blocked, parent = json.loads(call("here:look"))
-files = os.listdir(f"/proc/{server}/fd")
-pid, (pidfd,) = unit(0.5)
-named = until(lambda: open(f"/proc/{pid}/comm").read() == "trilane-u\\n")
-alive = not select.select([pidfd], [], [], 0)[0]
-ended = bool(select.select([pidfd], [], [], 5)[0])
-none = call("no:such")
-print(json.dumps([death, default, blocked, parent == server, named, alive, ended, none,
-                  until(lambda: not children()), until(lambda: os.listdir(f"/proc/{server}/fd") == files)]))
-_, (last,) = unit(0.3)
-ours.close()
-code = os.waitstatus_to_exitcode(os.waitpid(server, 0)[1])
-print(json.dumps([code, bool(select.select([last], [], [], 0)[0])]))
-"""
-
-
-def test_a_fork_server_forks_answers_forgets_and_outlives_its_units() -> None:
-    """A call dies with the server too; units that ended leave no zombie, and no file; the server waits for the last."""
-    done = subprocess.run([sys.executable, "-c", SERVER_LIFE], capture_output=True, text=True, timeout=60, check=True)
-    first, last = map(json.loads, done.stdout.splitlines())
-    assert first == [signal.SIGKILL, True, [], True, True, True, True, "", True, True]
-    assert last == [9, True]

@@ -1,0 +1,74 @@
+"""Built-in cameras by their formulas, paths between samples, projections and views by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from trilane.scene.camera.path import CameraPath, Lens, look_at, projection_matrix, view_from_pose
+from trilane.scene.motion.motion import Wrap
+from trilane.testing.camera_files import load
+
+BUILT_IN = [
+    ("orbit", 0.93, 1.35, 3.9, 3.4, 28.0, 20.0, "whole person, going round, coming nearer"),
+    ("static", 0.93, 1.30, 3.8, 3.8, 0.0, 20.0, "whole person, standing still"),
+    ("closeup", 1.50, 1.58, 1.15, 0.95, 16.0, 12.0, "head and shoulders"),
+    ("far", 1.00, 1.60, 10.0, 8.0, 10.0, 20.0, "whole person, far off"),
+]
+
+
+@pytest.mark.parametrize(("name", "target", "eye", "far", "near", "swing", "period", "what"), BUILT_IN)
+def test_a_built_in_camera_is_where_its_formula_says(
+    name: str, target: float, eye: float, far: float, near: float, swing: float, period: float, what: str
+) -> None:
+    """Farthest at 0, nearest at half the period; the swing is a sine that is 0.6 rad late."""
+    camera = load(f"builtin:{name}", near_m=0.1, far_m=50.0)
+    assert (camera.duration_s, camera.wrap, camera.recorded) == (period, Wrap.LOOP, False)
+    assert (len(camera.times_s), camera.lens) == (round(period * 30) + 1, Lens(40.0, 0.1, 50.0))
+    assert camera.notes == (f"built in: {what}, {period:g} s a cycle, field of view 40 degrees high",)
+    for share, distance in ((0.0, far), (0.25, (far + near) / 2), (0.5, near), (0.75, (far + near) / 2)):
+        angle = math.radians(swing) * math.sin(2 * math.pi * share - 0.6)
+        place = np.array([distance * math.sin(angle), eye, distance * math.cos(angle)])
+        turn, found = camera.pose(share * period)
+        assert found == pytest.approx(place, abs=1e-9)
+        back = (place - [0, target, 0]) / np.linalg.norm(place - [0, target, 0])
+        right = np.array([back[2], 0, -back[0]]) / math.hypot(back[0], back[2])
+        assert turn == pytest.approx(np.column_stack([right, np.cross(back, right), back]), abs=1e-9)
+        assert turn[1, 1] > 0
+    assert load(f"builtin:{name}", fov_y_deg=33.5).lens.fov_y_deg == 33.5
+
+
+def test_a_path_between_and_after_its_samples() -> None:
+    """A quarter turn about +Y in 2 s while the camera moves 4 m along x."""
+    h = math.sqrt(0.5)
+    quats, places = np.array([[1.0, 0, 0, 0], [h, 0, h, 0]]), np.array([[0.0, 1, 0], [4.0, 1, 0]])
+    bounce = CameraPath(np.array([0.0, 2.0]), quats, places, Lens(90.0, 0.1, 10.0), ())
+    loop = CameraPath(np.array([0.0, 2.0]), quats, places, Lens(90.0, 0.1, 10.0), (), Wrap.LOOP)
+    assert bounce.wrap is Wrap.BOUNCE and bounce.recorded and bounce.duration_s == 2.0
+    for path, t_s, share in ((bounce, 0.5, 0.25), (bounce, 3.5, 0.25), (bounce, 4.5, 0.25), (loop, 3.5, 0.75)):
+        turn, place = path.pose(t_s)
+        a = share * math.pi / 2
+        assert place == pytest.approx([4 * share, 1, 0])
+        assert turn == pytest.approx(
+            np.array([[math.cos(a), 0, math.sin(a)], [0, 1, 0], [-math.sin(a), 0, math.cos(a)]])
+        )
+        assert path.sample(t_s) @ [*place, 1.0] == pytest.approx([0, 0, 0, 1])
+    assert bounce.projection(2.0) == pytest.approx(projection_matrix(90.0, 2.0, 0.1, 10.0))
+
+
+def test_a_projection_by_hand() -> None:
+    """90 degrees high, twice as wide as high, from 2 m to 6 m: depth = (-2 z - 6) / -z, written out."""
+    assert projection_matrix(90.0, 2.0, 2.0, 6.0) == pytest.approx(
+        np.array([[0.5, 0, 0, 0], [0, 1, 0, 0], [0, 0, -2, -6], [0, 0, -1, 0]])
+    )
+
+
+def test_views_by_hand() -> None:
+    quarter = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])  # about +Y by 90 degrees: looks along -X
+    view = view_from_pose(quarter, np.array([1.0, 2.0, 3.0]))
+    assert view == pytest.approx(np.array([[0, 0, -1, 3], [0, 1, 0, -2], [1, 0, 0, -1], [0, 0, 0, 1]]))
+    assert look_at(np.array([5.0, 0.0, 0.0]), np.zeros(3)) == pytest.approx(
+        np.array([[0, 0, -1, 0], [0, 1, 0, 0], [1, 0, 0, -5], [0, 0, 0, 1]])
+    )
