@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -59,8 +60,8 @@ class Fault(NamedTuple):
         return text[:place] + self.new + text[place + len(self.old) :]
 
     def _places(self, text: str) -> list[int]:
-        """Where `old` stands from the begin of a line."""
-        return [place for place in _places(text, self.old) if place == 0 or text[place - 1] == "\n"]
+        """Where `old` stands from the begin of a line; places may overlap."""
+        return [found.start() for found in re.finditer(f"^(?={re.escape(self.old)})", text, re.MULTILINE)]
 
 
 def fault_between(path: str, kind: str, text: str, changed: str) -> Fault:
@@ -74,14 +75,6 @@ def fault_between(path: str, kind: str, text: str, changed: str) -> Fault:
     return Fault(
         path, head + 1, kind, "".join(before[head : len(before) - tail]), "".join(after[head : len(after) - tail])
     )
-
-
-def _places(text: str, part: str) -> list[int]:
-    places, place = [], text.find(part)
-    while place >= 0:
-        places.append(place)
-        place = text.find(part, place + 1)
-    return places
 
 
 def _one_line(lines: str) -> str:
