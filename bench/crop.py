@@ -19,8 +19,8 @@ from trilane.bench.lib.views import everyday_pose, random_camera
 from trilane.body.body import load_body
 from trilane.body.kinematics import Skeleton
 from trilane.errors import BadInputError
+from trilane.scene.crop import Rect, choose_bucket
 from trilane.shapes import Shape, shape_buckets
-from trilane.stages.cpu.crop import Rect, choose_bucket
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 from trilane.unexpected_value import UnexpectedValue
 

@@ -19,12 +19,12 @@ from trilane.body.skinning import FrameSkinner
 from trilane.errors import TrilaneError
 from trilane.pipeline.shared_assets import Assets
 from trilane.pipeline.stage import UnitContext
+from trilane.scene.crop import Rect
 from trilane.scene.mover import Mover
+from trilane.scene.tensor_layout import lay_out
 from trilane.stages.avatar_assets import distinct, shaped_body, staged_of
 from trilane.stages.config import RunConfig
-from trilane.stages.cpu.crop import Rect
 from trilane.stages.cpu.mesh_bounds import MeshBounds
-from trilane.stages.cpu.tensor_layout import lay_out
 from trilane.stages.packets import posed_vertices
 from trilane.transport.packets import Packet
 

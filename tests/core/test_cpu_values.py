@@ -18,17 +18,17 @@ from trilane.body.kinematics import Skeleton
 from trilane.body.skinning import FrameSkinner
 from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline.description import UnitSettings
+from trilane.scene.crop import Rect, choose_bucket, grow
 from trilane.scene.schema import AvatarSpec, OutputSpec, Scene
+from trilane.scene.tensor_layout import lay_out
 from trilane.shapes import shape_buckets
 from trilane.stages.avatar_assets import shaped_body, staged_of
 from trilane.stages.config import RunConfig
 from trilane.stages.cpu import present as present_stage
 from trilane.stages.cpu import tensor_layout
-from trilane.stages.cpu.crop import Rect, choose_bucket, grow
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 from trilane.stages.cpu.pose import PoseStage
 from trilane.stages.cpu.present import PresentStage, Segment
-from trilane.stages.cpu.tensor_layout import lay_out
 from trilane.stages.packets import pose_dtype, posed_vertices, posed_vertices_bytes
 from trilane.testing.assets import assets_of
 from trilane.transport.packets import Packet, SlotLayout, view_packet

@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.stage import UnitContext
+from trilane.scene.crop import Rect
 from trilane.scene.schema import AvatarSpec, CameraSpec, Scene
+from trilane.scene.tensor_layout import MARGIN_PX, lay_out
 from trilane.shapes import shape_buckets
 from trilane.stages.config import RunConfig
-from trilane.stages.cpu.crop import Rect
 from trilane.stages.cpu.pose import PoseStage, build
-from trilane.stages.cpu.tensor_layout import MARGIN_PX, lay_out
 from trilane.stages.packets import pose_dtype
 from trilane.testing.assets import assets_of
 from trilane.transport.packets import Packet, SlotLayout, view_packet

@@ -12,8 +12,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from trilane.errors import BadInputError
+from trilane.scene.crop import LEAST_PIXELS, Rect, choose_bucket, grow
 from trilane.shapes import Shape
-from trilane.stages.cpu.crop import LEAST_PIXELS, Rect, choose_bucket, grow
 
 #: top, left, height, width in tensor pixels.
 Cell = tuple[int, int, int, int]
