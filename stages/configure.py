@@ -30,6 +30,7 @@ from trilane.scene.staging import stage_scene
 from trilane.stages.avatar_assets import AvatarData, load_avatar, pack_assets, require_one_tensor
 from trilane.stages.config import NetworkCut, RunConfig
 from trilane.stages.dsp.runtime import RUNTIMES, installed, resolve
+from trilane.stages.foresee import foresee
 from trilane.stages.machine_facts import gl_facts, machine_facts
 
 ROOM = "room"
@@ -99,25 +100,33 @@ def requested_scene(request: Request) -> Scene:
 def configure(request: Request, out_dir: Path, gl: GlFacts = gl_facts) -> Checked:
     """Look at every part of what was asked for. Raises BadInputError or MissingPartError."""
     scene = requested_scene(request)
+    if scene.plan == "full":
+        raise BadInputError(
+            "plan", "full", "planned or fixed", "`trilane bench planner` draws the full plan to compare"
+        )
     runtime, reason = requested_runtime(request.runtime)
     _check_background(scene)
     bundles = {spec.bundle: load_bundle(spec.bundle) for spec in scene.avatars}
     avatars = {bundle.folder.absolute(): load_avatar(bundle) for bundle in bundles.values()}
     folders = tuple(bundles[spec.bundle].folder.absolute() for spec in scene.avatars)
     require_one_tensor(list(avatars.values()))
-    staged = stage_scene(scene, [avatars[folder].shaped for folder in folders], Path.cwd())
+    bodies = [avatars[folder].shaped for folder in folders]
+    staged = stage_scene(scene, bodies, Path.cwd())
     cuts = requested_cuts(request.split, avatars[folders[0]].network)
     unit, why = skinning_unit(request.skinning, gl)
+    foreseen = foresee(scene, staged, bodies, avatars[folders[0]].network) if scene.plans_tensor else None
     config = RunConfig(
         scene=scene,
         out_dir=out_dir,
         avatar_dirs=folders,
         units=host_units(),
         runtime=runtime,
+        shapes=foreseen.shapes.shapes if foreseen else (),
         posed_vertices=tuple(len(avatars[folder].shaped.vertices) for folder in folders) if unit == "cpu" else (),
         cuts=cuts,
     )
     notes = (*staged.notes, f"runtime: {runtime} ({reason})", f"skinning: {unit} unit ({why})")
+    notes += (foreseen.note,) if foreseen else ()
     drawn = DrawnAs(runtime, scene.size, scene.texture_filter, len(scene.avatars))
     accuracy = _accuracy(list(avatars.values()), drawn)
     return Checked(config, pack_assets(list(avatars.values()), staged), notes, accuracy)

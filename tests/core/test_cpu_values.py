@@ -18,6 +18,7 @@ from trilane.body.kinematics import Skeleton
 from trilane.body.skinning import FrameSkinner
 from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline.description import UnitSettings
+from trilane.scene import tensor_layout
 from trilane.scene.crop import Rect, choose_bucket, grow
 from trilane.scene.schema import AvatarSpec, OutputSpec, Scene
 from trilane.scene.tensor_layout import lay_out
@@ -25,7 +26,6 @@ from trilane.shapes import shape_buckets
 from trilane.stages.avatar_assets import shaped_body, staged_of
 from trilane.stages.config import RunConfig
 from trilane.stages.cpu import present as present_stage
-from trilane.stages.cpu import tensor_layout
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 from trilane.stages.cpu.pose import PoseStage
 from trilane.stages.cpu.present import PresentStage, Segment
