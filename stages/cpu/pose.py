@@ -20,6 +20,7 @@ from trilane.pipeline.stage import UnitContext
 from trilane.scene.mover import Mover
 from trilane.scene.planner import Held, plan_tensor
 from trilane.scene.tensor_layout import lay_out
+from trilane.shapes import Shape
 from trilane.stages.avatar_assets import distinct, shaped_body, staged_of
 from trilane.stages.config import RunConfig
 from trilane.stages.cpu.actor import ModelledBody, Seen
@@ -35,8 +36,17 @@ class _Actor:
     body: ModelledBody
 
 
+@dataclass(frozen=True)
+class FramePlan:
+    """What was decided for a frame: the tensor's shape, None with nobody in view; each visible avatar by its number."""
+
+    shape: Shape | None
+    density: float | None
+    seen: Mapping[int, Seen]
+
+
 class PoseStage:
-    """Stage `pose` of the CPU unit: no input edge, an output edge of headers."""
+    """Stage `pose` of the CPU unit: no input edge, an output edge of headers. `plan`: of the frame that it did last."""
 
     def __init__(self, config: RunConfig, assets: Assets) -> None:
         """The scene of `config`, whose avatars, motions and camera lie in `assets`."""
@@ -45,6 +55,7 @@ class PoseStage:
         self._output = (scene.output.height, scene.output.width)
         self._buckets, self._plans_tensor = config.buckets, scene.plans_tensor
         self._held: Held | None = None
+        self.plan = FramePlan(None, None, {})
         folders = distinct(config)
         bodies = {
             folder: ModelledBody(shaped_body(assets, number), bool(config.posed_vertices), config.budget_px)
@@ -94,27 +105,24 @@ class PoseStage:
             for actor, place in zip(self._actors, vertices, strict=True)
             if (one := self._pose(actor, avatar := packet["avatars"][actor.index], place, t_s, frame, clip)) is not None
         ]
-        metrics = {"visible": float(len(seen))}
+        self.plan = self._lay_out(packet, seen)
+        return _metrics(self.plan)
+
+    def _lay_out(self, packet: NDArray[np.void], seen: list[tuple[NDArray[np.void], Seen]]) -> FramePlan:
+        """Crop rectangles, cells and the tensor's shape; the smallest shape when nothing is to be drawn."""
         if not seen:
             packet["tensor_shape"] = min(self._buckets, key=lambda shape: shape[0] * shape[1])
-            return metrics
-        metrics |= {"level": float(max(one.level for _, one in seen)), "error_px": max(one.error_px for _, one in seen)}
-        return metrics | self._lay_out(packet, seen)
-
-    def _lay_out(self, packet: NDArray[np.void], seen: list[tuple[NDArray[np.void], Seen]]) -> dict[str, float]:
-        """Crop rectangles, cells and the tensor's shape; the metrics of a tensor that is planned."""
-        rects = [one.rect for _, one in seen]
-        metrics: dict[str, float] = {}
+            return FramePlan(None, None, {})
+        rects, density = [one.rect for _, one in seen], None
         if self._plans_tensor:
             plan = plan_tensor(rects, self._output, self._buckets, self._held)
-            layout, self._held = plan.dense.layout, plan.held
-            metrics["density"] = plan.dense.density
+            layout, density, self._held = plan.dense.layout, plan.dense.density, plan.held
         else:
             layout = lay_out(rects, self._output, self._buckets)
         packet["tensor_shape"] = layout.shape
         for (avatar, _), (crop, cell) in zip(seen, layout.crops, strict=True):
             avatar["rect"], avatar["tensor_rect"] = crop, cell
-        return metrics
+        return FramePlan(layout.shape, density, {int(avatar["avatar"]): one for avatar, one in seen})
 
     def _pose(
         self,
@@ -145,6 +153,14 @@ class PoseStage:
 def build(settings: Mapping[str, Any], unit: UnitContext) -> PoseStage:
     """The pose stage of the configuration in `settings`."""
     return PoseStage(RunConfig.model_validate(settings["config"]), unit.assets)
+
+
+def _metrics(plan: FramePlan) -> dict[str, float]:
+    metrics = {"visible": float(len(plan.seen))}
+    if plan.seen:
+        metrics["level"] = float(max(one.level for one in plan.seen.values()))
+        metrics["error_px"] = max(one.error_px for one in plan.seen.values())
+    return metrics if plan.density is None else {**metrics, "density": plan.density}
 
 
 def _require_finite(values: NDArray[np.floating], frame: int, what: str) -> None:
