@@ -77,6 +77,7 @@ OTHERWISE = {
     "qnn": ({"runtime": "qnn"}, "validated on ort and openvino, and this is qnn"),
     "192": ({"size": "192"}, "validated at tensor size 256, and this is 192"),
     "256x256": ({"size": "256x256"}, "validated at tensor size 256, and this is 256x256"),
+    "auto": ({"size": "auto"}, "at tensor size 256, and this is auto; `trilane bench planner` measures scenes whose"),
     "mipmap": ({"texture_filter": "mipmap"}, "with the linear texture filter, and this is mipmap"),
     "several": ({"avatars": 3}, "alone in its tensor, and here 3 avatars share one"),
 }
