@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -133,7 +134,8 @@ def test_places_of_files_and_names_that_are_built_in(tmp_path: Path) -> None:
     assert find_scene("pair").name == "pair.toml" and find_scene("pair").is_file()
     with pytest.raises(BadInputError) as raised:
         find_scene("beach")
-    assert str(raised.value) == "scene: found 'beach', expected a .toml file or one of closeup, default, far, pair"
+    names = "closeup, crowd, default, far, full-body, leave-and-return, pair, portrait, top-to-floor, walk-past"
+    assert str(raised.value) == f"scene: found 'beach', expected a .toml file or one of {names}"
     path = tmp_path / "my.toml"
     path.write_text("[camera]\nnear_m = 0.1\n[[avatars]]\nheading_deg = 3.0\n")
     loaded = load_scene(path)
@@ -148,7 +150,8 @@ def test_places_of_files_and_names_that_are_built_in(tmp_path: Path) -> None:
         load_scene(path)
 
 
-WALK, STAND = {"bundle": "default", "motion": "builtin:walk-wave-turn"}, {"bundle": "default", "motion": "builtin:idle"}
+MOTIONS = ("walk-wave-turn", "idle", "there-and-back")
+WALK, STAND, GO = ({"bundle": "default", "motion": f"builtin:{name}"} for name in MOTIONS)
 
 
 SCENES: dict[str, tuple[int, str, list[dict[str, Any]]]] = {
@@ -159,13 +162,27 @@ SCENES: dict[str, tuple[int, str, list[dict[str, Any]]]] = {
         {**WALK, "position": [-0.55, 0.0, 0.0], "heading_deg": 8.0},
         {**STAND, "position": [0.6, 0.0, 0.0], "heading_deg": -12.0},
     ]),
+    "portrait": (240, "builtin:closeup", [STAND]),
+    "full-body": (300, "builtin:static", [WALK]),
+    "crowd": (300, "builtin:far", [
+        {**WALK, "position": [0.0, 0.0, 0.3], "heading_deg": 0.0},
+        {**STAND, "position": [-1.1, 0.0, -0.6], "heading_deg": 25.0},
+        {**WALK, "position": [1.2, 0.0, -0.5], "heading_deg": -20.0},
+        {**STAND, "position": [-2.1, 0.0, -1.4], "heading_deg": 40.0},
+        {**STAND, "position": [2.2, 0.0, -1.3], "heading_deg": -30.0},
+    ]),
+    "walk-past": (450, "builtin:wayside", [GO]),
+    "top-to-floor": (360, "builtin:top-to-floor", [STAND]),
+    "leave-and-return": (450, "builtin:static", [{**GO, "position": [1.6, 0.0, -0.6], "heading_deg": 90.0}]),
 }  # fmt: skip
 
 
 def test_the_scenes_that_come_along_are_what_they_are() -> None:
     assert scene_names() == sorted(SCENES)
     for name, (frames, camera, avatars) in SCENES.items():
+        output = {"width": 480, "height": 640} if name == "portrait" else {"width": 640, "height": 480}
+        assert re.match(r"# [A-Z].*\.\n", find_scene(name).read_text())
         assert tomllib.loads(find_scene(name).read_text()) == {
             "name": name, "fps": 30, "frames": frames, "size": "256", "background": "room",
-            "output": {"width": 640, "height": 480}, "camera": {"source": camera}, "avatars": avatars,
+            "output": output, "camera": {"source": camera}, "avatars": avatars,
         }  # fmt: skip
