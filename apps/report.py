@@ -240,7 +240,11 @@ def build_report(
         **metrics.as_json(),
         "schema": SCHEMA,
         "machine": machine,
-        "config": {**config.model_dump(mode="json", exclude={"out_dir"}), "policy": metrics.policy},
+        "config": {
+            **config.model_dump(mode="json", exclude={"out_dir"}),
+            "policy": metrics.policy,
+            "edge": metrics.edge,
+        },
         "plan": {"tensor_shapes": config.buckets},
         "caps": metrics.caps.as_json() if metrics.caps else {"how": NO_CAP},
         "temperature_c": (metrics.temperature_c.as_json() if metrics.temperature_c else {}) | sensor,
