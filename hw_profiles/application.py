@@ -196,16 +196,20 @@ def _settled(
     paced = POLICIES[variant.policy].paced
     regular = variant.edge in ("single", "double") and not paced
     frames = (QUICK_FRAMES if quick else FRAMES) if regular else FRAMES_WITH_DROPS
-    period_ns = scene_period_ns(variant, display_ns)
-    report = _run(graph, run_settings(variant.policy, frames, period_ns), service, twice)
+    report = _run(graph, settings_of(variant, frames, display_ns), service, twice)
     if paced or report["frame_time_ms"]["mean"] * NS_PER_MS >= display_ns:
         return report, False
-    return _run(graph, run_settings(variant.policy, frames, period_ns, display_ns), service, twice), True
+    return _run(graph, settings_of(variant, frames, display_ns, held=True), service, twice), True
 
 
-def scene_period_ns(variant: Variant, display_ns: int) -> int:
-    """Time between two jobs at the scene's rate, or at the display's (`display_ns`) when that is slower."""
-    return max(display_ns, round(variant.batch * 1e9 / variant.fps))
+def settings_of(variant: Variant, frames: int, display_ns: int, *, held: bool = False) -> Settings:
+    """The scheduler's settings of a simulated run.
+
+    `variant`: its policy and the scene's rate. `frames`: how many jobs of each stage. `display_ns`: the shortest time
+    between two of them. `held`: whether the display holds every policy to its rate.
+    """
+    scene_period_ns = max(display_ns, round(variant.batch * 1e9 / variant.fps))
+    return run_settings(variant.policy, frames, scene_period_ns, display_ns if held else 0)
 
 
 def _run(graph: Graph, settings: Settings, service: Mapping[str, int], twice: bool) -> Any:
