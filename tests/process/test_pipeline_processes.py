@@ -92,7 +92,7 @@ def test_a_paced_run_drops_what_it_cannot_do_and_counts_it(policy: str, edge: st
 
 @pytest.mark.parametrize("policy", ["latest", "deadline"])
 def test_a_prediction_has_the_rules_of_a_run(policy: str) -> None:
-    """The events of a run, told to a core as predictions set it up, get the same answers; at another rate they do not."""
+    """The events of a run, told to a core as predictions set it up, get the same answers; at another rate others."""
     result = run_pipeline(doubles(infer=40), 25, policy=policy, fps=50, isolated_frames=0)
     assert sum(result.dropped.values()) > 5
 
