@@ -168,7 +168,7 @@ class Preamble(Record):
     `schema_`: `schema` in the file, 1.
     `clock`: of the times.
     `machine`: that the run was measured on.
-    `config`: the RunConfig as JSON without its folder, and the `policy`.
+    `config`: the RunConfig as JSON without its folder, and `policy` and `edge`.
     `plan`: what followed from it.
     `caps`: what held the units.
     """

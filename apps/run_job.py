@@ -38,19 +38,19 @@ class Plan:
     """How to run.
 
     `policy`: of the scheduler.
-    `edge`: rule of every edge.
     `baseline_frames`: of a sequential run after it, to compare with; 0: none.
     `pace`: of a chip, to keep; None: as fast as it goes.
     `performance_profile`: whose caps hold; None: no cap.
     `latch_ms`: how long before it is needed a pose is sampled; not in the run that is compared with.
+    `edge`: rule of every edge.
     """
 
     policy: str = "pipelined"
-    edge: str = "double"
     baseline_frames: int = 60
     pace: Pace | None = None
     performance_profile: str | None = None
     latch_ms: float = 0.0
+    edge: str = "double"
 
 
 @dataclass(frozen=True)

@@ -164,7 +164,7 @@ def run(
         chip_pace = _pace(checked.config, profile, pace, slow_motion)
         cap = performance_profile and str(performance_profile)
         _refuse_beside_pace(chip_pace, cuts, cap)
-        outcome = _run(checked, out, Plan(str(policy), rule, baseline, chip_pace, cap, latch), starter, gl)
+        outcome = _run(checked, out, Plan(str(policy), baseline, chip_pace, cap, latch, rule), starter, gl)
     _print_outcome(outcome, as_json)
     raise typer.Exit(outcome.exit_code)
 
