@@ -10,6 +10,7 @@ import pytest
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import (
+    MOST_FPS,
     Plan,
     Variant,
     reference_frame_ms,
