@@ -17,6 +17,8 @@ MAX_DEPTH_RATIO = 1e6  # of far to near clip plane; beyond it a depth buffer of 
 AUTO = "auto"  # size of a tensor that is planned
 FARTHEST_M = 1e4  # of an avatar from the scene's origin; there float32 still resolves millimetres
 
+NAME = r"^[\w .-]+$"
+
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Metres = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan=False)]
 
@@ -37,10 +39,12 @@ class OutputSpec(Model):
 class AvatarSpec(Model):
     """One avatar.
 
+    `name`: no other avatar of the scene has it; `avatar1`, `avatar2`, ... by its place when it is not given.
     `bundle`: `default` or a folder. `motion`: `builtin:NAME` or a file. `position`: metres. `up_axis`, `units`: of the
     motion file. `ground`: how the motion is put on the floor (`floor.py`).
     """
 
+    name: str | None = Field(default=None, min_length=1, max_length=80, pattern=NAME)
     bundle: str = "default"
     motion: str = "builtin:walk-wave-turn"
     position: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
@@ -111,7 +115,7 @@ class Scene(Model):
     how far a vertex may be off on the picture. `memory_mb`: of the networks that are made ready for the planned shapes.
     """
 
-    name: str = Field(default="scene", min_length=1, max_length=80, pattern=r"^[\w .-]+$")
+    name: str = Field(default="scene", min_length=1, max_length=80, pattern=NAME)
     fps: float = Field(default=30.0, gt=0, le=1000, allow_inf_nan=False)
     frames: int = Field(default=300, ge=1, le=10_000_000)
     size: Annotated[str, AfterValidator(_scene_size)] = "256"
@@ -125,7 +129,20 @@ class Scene(Model):
     memory_mb: int = Field(default=512, ge=1, le=1_000_000)
     output: OutputSpec = OutputSpec()
     camera: CameraSpec = CameraSpec()
-    avatars: tuple[AvatarSpec, ...] = Field(default=(AvatarSpec(),), min_length=1, max_length=8)
+    avatars: tuple[AvatarSpec, ...] = Field(default=(AvatarSpec(),), min_length=1, max_length=8, validate_default=True)
+
+    @field_validator("avatars")
+    @classmethod
+    def _avatars_named(cls, avatars: tuple[AvatarSpec, ...]) -> tuple[AvatarSpec, ...]:
+        """The avatars, each with a name of its own."""
+        places: dict[str, int] = {}
+        for place, avatar in enumerate(avatars):
+            name = avatar.name or f"avatar{place + 1}"
+            if name in places:
+                found = f"{name!r} as the name of avatars.{places[name]} and of avatars.{place}"
+                raise UnexpectedValue(found, "a name of its own for each", "change `name` of one of them")
+            places[name] = place
+        return tuple(spec.model_copy(update={"name": name}) for name, spec in zip(places, avatars, strict=True))
 
     @model_validator(mode="after")
     def _sized(self) -> Self:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from trilane.apps.pace import SLACK_NS, Pace, compare, pace_of
+from trilane.apps.pace import SLACK_NS, Pace, compare, pace_of, release_fps
 from trilane.avatars.bundle import bundle_folder
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import application_graph
@@ -51,6 +52,23 @@ def test_a_late_job_is_counted_and_its_neighbours_are_not_compared() -> None:
     assert comparison["late_frames"] == [20]
     assert comparison["ratio"] == pytest.approx(1.0)
     assert 0.7 < comparison["compared_share"] < 1
+
+
+@pytest.mark.parametrize("policy", ["latest", "deadline"])
+def test_a_policy_with_a_rate_has_the_scenes_slowed_down_as_the_chip_is(policy: str) -> None:
+    """40 a second, 3 times slower: a frame every 75 ms, of which any of these takes less."""
+    slow = replace(PACE, slow_motion=3.0)
+    assert release_fps(slow, 40.0) == pytest.approx(40 / 3)
+    assert sum(STAGE_NS.values()) < 75_000_000
+    for edge in ("single", "triple"):
+        assert compare(slow, policy, 20, jobs(), edge=edge, fps=40.0)["virtual_ms"] == pytest.approx(75)
+
+
+def test_the_edge_counts_in_virtual_time_too() -> None:
+    """With one slot between them, raster, infer and composite take turns; with two the slowest unit decides."""
+    turns = sum(STAGE_NS[stage] for stage in ("raster", "infer", "composite"))
+    assert compare(PACE, "pipelined", 40, jobs(), edge="single")["virtual_ms"] == pytest.approx(turns / 1e6)
+    assert compare(PACE, "pipelined", 40, jobs(), edge="double")["virtual_ms"] < turns / 1e6
 
 
 def test_nothing_is_compared_when_every_frame_is_late() -> None:
