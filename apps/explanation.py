@@ -113,7 +113,7 @@ def _why(group: Sequence[PlannedFrame]) -> str:
     if first.density is None:
         return "the scene fixes the tensor's size"
     if _least(group) < 1.0:
-        return "the body has more pixels on the screen than most_side allows: the densest shape"
+        return "more pixels on the screen than any shape that is ready has: the densest one"
     return "a tensor pixel for each pixel of the picture, in the smallest shape that is ready"
 
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 from trilane.errors import BadInputError
 from trilane.scene.crop import LEAST_PIXELS, Rect, choose_bucket, grow, grow_on_grid, on_grid
-from trilane.shapes import BUCKET_STEP, Shape
+from trilane.shapes import BUCKET_STEP, MOST_ASPECT, Shape
 
 #: top, left, height, width in tensor pixels.
 Cell = tuple[int, int, int, int]
@@ -101,6 +101,8 @@ def lay_out_at(
 def tight_shape(rects: Sequence[Rect], output: Shape, density: float = 1.0, margin_px: int = MARGIN_PX) -> Shape:
     """The shape of least area, sides in multiples of `BUCKET_STEP`, with room for the avatars at `density`.
 
+    Of several avatars' arrangements none is longer than `MOST_ASPECT` times its width, unless all are.
+
     Arguments as of `lay_out_at`.
     """
     whole = [_pixels(on_grid(rect, output), output) for rect in rects]
@@ -108,7 +110,7 @@ def tight_shape(rects: Sequence[Rect], output: Shape, density: float = 1.0, marg
     if len(sizes) == 1:
         return _whole_steps(sizes[0][0]), _whole_steps(sizes[0][1])
     shapes = [_extent(sizes, rows, margin_px) for rows in _rows(sizes)]
-    return min(shapes, key=lambda shape: shape[0] * shape[1])
+    return min(shapes, key=lambda shape: (max(shape) > MOST_ASPECT * min(shape), shape[0] * shape[1], max(shape)))
 
 
 def _pixels(rect: Rect, output: Shape) -> tuple[int, int]:

@@ -23,7 +23,8 @@ from trilane.scene.staging import Staged
 from trilane.shapes import Shape
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 
-FORESEEN_FRAMES = 48
+#: Of the scene, over all avatars; but at least so many of each.
+FORESEEN_FRAMES, LEAST_FRAMES = 96, 24
 #: A network that is ready to run holds its tensors once, and a runtime may lay each of them out anew.
 COPIES = 2
 MB = 1_000_000
@@ -58,7 +59,7 @@ def foresee(scene: Scene, staged: Staged, bodies: Sequence[ShapedBody], network:
     `bodies`: of its avatars, in order.
     `network`: that all of them share.
     """
-    count = min(scene.frames, FORESEEN_FRAMES)
+    count = min(scene.frames, max(FORESEEN_FRAMES // len(bodies), LEAST_FRAMES))
     frames = tuple(index * scene.frames // count for index in range(count))
     output = (scene.output.height, scene.output.width)
     tight = tuple(

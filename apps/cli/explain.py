@@ -92,13 +92,8 @@ def _show(document: dict[str, Any]) -> None:
     )
     shapes = ", ".join(f"{h}x{w}" for h, w in document["shapes"])
     console.print(f"tensor shapes that are made ready: {shapes}", soft_wrap=True)
-    for row in document["avatars"]:
-        console.print(
-            f"avatar {row['avatar']} ({row['bundle']}): skinned by the {row['skinned_on']} unit; "
-            f"detail: {row['detail']}; texture filter {row['texture_filter']}; expression: {row['expression']}",
-            soft_wrap=True,
-            markup=False,
-        )
+    for line in dict.fromkeys(_drawn(row) for row in document["avatars"]):
+        console.print(line, soft_wrap=True, markup=False)
     console.print(_table(document["phases"]))
     left = len(document["phases"]) - MOST_ROWS
     if left > 0:
@@ -107,6 +102,14 @@ def _show(document: dict[str, Any]) -> None:
         console.print(f"frame {first} and others like it: {why}", soft_wrap=True)
     for line in _totals(document["totals"], config):
         console.print(line, soft_wrap=True)
+
+
+def _drawn(row: dict[str, Any]) -> str:
+    """How an avatar is drawn in every frame; avatars of one bundle are drawn alike."""
+    return (
+        f"avatar {row['bundle']}: skinned by the {row['skinned_on']} unit; detail: {row['detail']}; "
+        f"texture filter {row['texture_filter']}; expression: {row['expression']}"
+    )
 
 
 def _table(phases: list[dict[str, Any]]) -> Table:
@@ -119,15 +122,22 @@ def _table(phases: list[dict[str, Any]]) -> Table:
             f"{phase['first_frame']}-{phase['last_frame']}",
             f"{tensor[0]}x{tensor[1]}" if tensor else "none",
             f"{density[0]:.2f}-{density[1]:.2f}" if density else "-",
-            "\n".join(_avatar(row) for row in phase["avatars"]) or "-",
+            _modelled(phase["avatars"]) or "-",
             f"{phase['saved']['work_ms']:.1f}",
         )
     return table
 
 
-def _avatar(row: dict[str, Any]) -> str:
-    measured = "-" if row["measured_px"] is None else f"{row['measured_px']:.2f}"
-    return f"{row['avatar']}: {row['modelled']}, {row['bound_px']:.2f} / {measured}"
+def _modelled(rows: list[dict[str, Any]]) -> str:
+    """A line for each way in which avatars are modelled, with the largest errors of those that are modelled so."""
+    lines = []
+    for modelled in dict.fromkeys(row["modelled"] for row in rows):
+        own = [row for row in rows if row["modelled"] == modelled]
+        known = [row["measured_px"] for row in own if row["measured_px"] is not None]
+        measured = f"{max(known):.2f}" if known else "-"
+        names = ", ".join(str(row["avatar"]) for row in own)
+        lines.append(f"{names}: {modelled}, {max(row['bound_px'] for row in own):.2f} / {measured}")
+    return "\n".join(lines)
 
 
 def _totals(totals: dict[str, Any], config: dict[str, Any]) -> list[str]:

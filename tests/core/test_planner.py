@@ -137,11 +137,18 @@ def test_five_avatars_in_a_tensor_of_32_pixels_have_no_room() -> None:
         ([pixels(0, 0, 128.5, 320)], 1.0, (320, 160)),
         ([pixels(0, 0, 100, 300)], 0.5, (160, 64)),
         # three of 100x60: in one row 100 + 1 by 3 * 60 + 2 * 16 + 3 = 215; in two 218 by 138; in three 335 by 61
-        ([pixels(70 * k, 0, 60, 100) for k in range(3)], 1.0, (352, 64)),
+        # the last is more than four times as long as wide, and of the others the first has less area
+        ([pixels(70 * k, 0, 60, 100) for k in range(3)], 1.0, (128, 224)),
+        # of 20x100: 101 by 95, 218 by 58 and 335 by 21
+        ([pixels(70 * k, 0, 20, 100) for k in range(3)], 1.0, (128, 96)),
+        ([pixels(0, 70 * k, 630, 10) for k in range(2)], 1.0, (64, 640)),
     ],
 )
 def test_the_tight_shape(rects: list[Rect], density: float, expected: tuple[int, int]) -> None:
-    """128 x 224 = 28,672 pixels, 224 x 160 = 35,840, and 352 x 64 = 22,528, the least of the three."""
+    """128 x 224 = 28,672 pixels, 224 x 160 = 35,840, and 352 x 64 = 22,528.
+
+    Two of 630x10 are too long in any arrangement: 38 by 631 pixels, or 11 by 1278.
+    """
     assert tight_shape(rects, OUTPUT, density) == expected
 
 
