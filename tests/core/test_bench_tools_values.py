@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -111,7 +112,8 @@ def test_loadgen_asks_and_judges(loadgen: LoadGen, summary: str, valid: bool) ->
         "schedule_rng_seed": 7,
     }
     assert loadgen.logs.enable_trace is loadgen.logs.log_output.copy_summary_to_stdout is False
-    assert not Path(loadgen.logs.log_output.outdir).exists()
+    folder = Path(loadgen.logs.log_output.outdir)
+    assert not folder.exists() and re.fullmatch(r"trilane-loadgen-\w{8}", folder.name)
     assert loadgen.calls == [("library", 64, 64), ("destroyed", "library"), ("destroyed", "system")]
 
 

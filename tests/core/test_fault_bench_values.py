@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import random
+import re
+import signal
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -91,7 +93,8 @@ def test_faults_run_every_unit_under_every_fault(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(faults, "run_under", run_under)
 
     def avatar_pipeline(config: ToldConfig, assets: str) -> Any:
-        return config.values["out_dir"].is_dir(), assets
+        folder = config.values["out_dir"]
+        return folder.is_dir() and bool(re.fullmatch(r"trilane-bench-\w{8}", folder.name)), assets
 
     monkeypatch.setattr(faults, "avatar_pipeline", avatar_pipeline)
     result = faults.measure(
@@ -158,6 +161,59 @@ def test_what_a_run_leaves_behind_is_counted(monkeypatch: pytest.MonkeyPatch) ->
     assert signals.over.is_set() and not signals.is_alive()
     options = {"pace_fps": 12.5, "assets": "assets", "isolated_frames": 0, "hang_ns": 1_500_000_000}
     assert asked == [(("pipeline", 50), options)]
+
+
+class Event:
+    """Stands for an event that a told clock waits for: `over` is set at `at_s`."""
+
+    def __init__(self, clock: list[float], at_s: float) -> None:
+        self.clock, self.at_s = clock, at_s
+        self.waited: list[float] = []
+
+    def is_set(self) -> bool:
+        return self.clock[0] >= self.at_s
+
+    def wait(self, seconds: float = 0.0) -> bool:
+        self.waited.append(seconds)
+        self.clock[0] += seconds
+        return self.is_set()
+
+
+def test_signals_are_sent_at_their_moments_until_the_run_is_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From 100 s on: a stop at 101, its end at 103, a kill whose process has gone at 104, one of which there is none
+    yet at 105 (looked for every 20 ms, there at the third look), and one at 110, when the run has ended."""
+    clock = [100.0]
+    told = SimpleNamespace(monotonic=lambda: clock[0], monotonic_ns=lambda: round(clock[0] * 1e3))
+    monkeypatch.setattr(faults, "time", told)
+    sent: list[Any] = []
+
+    def send(number: signal.Signals) -> None:
+        sent.append((number, clock[0]))
+        if clock[0] == 104.0:
+            raise psutil.NoSuchProcess(1)
+
+    looks: list[float] = []
+
+    def unit_process(unit: str) -> Any:
+        assert unit == "gpu"
+        looks.append(clock[0])
+        if len(looks) in (4, 5):
+            raise LookupError if len(looks) == 4 else psutil.NoSuchProcess(1)
+        return SimpleNamespace(send_signal=send)
+
+    monkeypatch.setattr(faults, "unit_process", unit_process)
+    stop, go, kill = signal.SIGSTOP, signal.SIGCONT, signal.SIGKILL
+    signals = faults.Signals("gpu", [(1.0, stop), (3.0, go), (4.0, kill), (5.0, kill), (10.0, kill)])
+    begun, over = Event(clock, 0.0), Event(clock, 107.0)
+    signals.begun, signals.over = begun, over  # type: ignore[assignment]
+    signals.run()
+    assert sent == [(stop, 101.0), (go, 103.0), (kill, 104.0), (kill, pytest.approx(105.04))]
+    assert signals.sent_ns == [101_000, 105_040]
+    assert begun.waited == [0.0] and over.waited[:3] == [1.0, 2.0, 1.0]
+    assert looks[3:] == [105.0, pytest.approx(105.02), pytest.approx(105.04)]
+    late = faults.Signals("gpu", [(1.0, kill)])
+    late.over = Event(clock, 0.0)  # type: ignore[assignment]
+    assert late._process() is None and hash(late) == id(late) and late.name == "signals"
 
 
 def test_a_units_process_is_found_by_its_name_in_any_generation(monkeypatch: pytest.MonkeyPatch) -> None:

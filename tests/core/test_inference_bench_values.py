@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -89,7 +90,7 @@ def test_a_file_in_batches_of_two(monkeypatch: pytest.MonkeyPatch, network: Path
     assert told.variants[0] == told.variants[1] and len(told.variants) == 2
     assert (variant.kind, variant.runtime, variant.threads, variant.spin) == ("runtime", "ort", 3, True)
     assert set(caches) == {str(variant.network.parent / "cache")}
-    assert not variant.network.parent.exists()
+    assert not variant.network.parent.exists() and re.fullmatch(r"trilane-bench-\w{8}", variant.network.parent.name)
     assert os.environ["XDG_CACHE_HOME"] == "/before"
 
 
@@ -195,6 +196,7 @@ def test_peers_run_interleaved_on_the_same_files(monkeypatch: pytest.MonkeyPatch
     assert made == [("resnet18", "batch", 5, (64, 64))] * 2
     assert saved == [("integer.onnx", True), ("float.onnx", False)]
     first = next(iter(told.variants[0].values())).network.parent
+    assert not first.exists() and re.fullmatch(r"trilane-peers-\w{8}", first.name)
     integer, plain = first / "integer.onnx", first / "float.onnx"
     assert told.variants == [
         {
@@ -283,7 +285,9 @@ def test_rates_are_work_over_the_best_time(monkeypatch: pytest.MonkeyPatch) -> N
     assert len(told.asked) == 6 * (6 + 1)
     for name, variant in told.variants[0].items():
         assert (variant.kind, variant.threads) == (name.split()[0], 3) and variant.network.name in saved
+        assert re.fullmatch(r"trilane-roofline-\w{8}", variant.network.parent.name)
     assert told.variants[1]["fp32"].threads == 3 and told.variants[1]["fp32"].kind == "ort"
+    assert re.fullmatch(r"trilane-roofline-\w{8}", told.variants[1]["fp32"].network.parent.name)
 
 
 def test_a_copy_is_read_and_written(monkeypatch: pytest.MonkeyPatch) -> None:

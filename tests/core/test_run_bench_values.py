@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -53,7 +56,7 @@ def test_a_rounds_runs_are_set_against_the_sequential_ones(
 
     def run_avatar(config: ToldConfig, assets: str, **options: Any) -> Any:
         folder = config.values["out_dir"]
-        assert folder.is_dir() and not list(folder.iterdir())
+        assert folder.is_dir() and re.fullmatch(r"trilane-bench-\w{8}", folder.name)
         asked.append({**options, "assets": assets, "values": {**config.values, "out_dir": None}})
         policy = options["policy"]
         return result_of(policy, next(sequential) if policy == "sequential" else 10.0)
@@ -192,6 +195,80 @@ def test_every_scenario_is_asked_of_every_judge(monkeypatch: pytest.MonkeyPatch,
     assert looked == ["there"]
     scenario.measure(scenario=names[:1], avatar="x")
     assert len(looked) == 1
+
+
+class Loadgen:
+    """Stands for the player that lets LoadGen ask."""
+
+    def __init__(self, load: Load, queries: Queries) -> None:
+        self.load, self.queries = load, queries
+        self.verdict = SimpleNamespace(valid=True, summary="its summary")
+        self.answered, self.ended, self.unanswered = queries.answered, queries.ended, queries.unanswered
+
+    def play(self, requests: Any) -> None:
+        scenario.play(self.load, requests, self.queries)
+
+
+@pytest.mark.parametrize(
+    ("judge", "name", "size"),
+    [("trilane", "multi-stream", 3), ("trilane", "offline", 1), ("loadgen", "multi-stream", 1)],
+)
+def test_a_run_is_asked_on_a_thread_while_it_goes_on(
+    monkeypatch: pytest.MonkeyPatch, judge: str, name: str, size: int
+) -> None:
+    load, threads, asked = Load(name, 1.0, samples=3), [], []
+
+    def play(what: Load, requests: Any, queries: Queries) -> None:
+        threads.append(threading.current_thread())
+        assert (what, queries.size) == (load, size)
+        queries.asked_s, queries.answered_s = [1.0], [2.0]
+        queries.over = requests.answered == queries.answered
+
+    def run_pipeline(*what: Any, requests: Any, **options: Any) -> Any:
+        asked.append((what, options))
+        assert not threads, "asking begins when the queue is open"
+        requests.is_open.set()
+        while not (events := requests.events()):
+            time.sleep(0.001)
+        assert [type(event).__name__ for event in events] == ["Stop"]
+        return SimpleNamespace(failure=None, interrupted=False)
+
+    monkeypatch.setattr(scenario, "play", play)
+    monkeypatch.setattr(scenario, "LoadGenPlayer", Loadgen)
+    monkeypatch.setattr(scenario, "run_pipeline", run_pipeline)
+    row, summary = scenario.run_scenario("pipeline", "assets", load, judge, "latest")  # type: ignore[arg-type]
+    assert (row["judge"], summary) == (judge, "its summary" if judge == "loadgen" else "")
+    assert (row["p50_ms"], row["queries"], row["max_ms"]) == (1000.0, 1, 1000.0)
+    assert asked == [(("pipeline", 1_000_000), {"policy": "latest", "assets": "assets", "isolated_frames": 0})]
+    (player,) = threads
+    assert (player.name, player.daemon, player.is_alive()) == ("player", True, False) and hash(player) == id(player)
+
+
+@pytest.mark.parametrize(
+    ("failure", "interrupted", "error", "words"),
+    [
+        (Failure("it broke"), True, TrilaneError, "^it broke$"),
+        (None, True, KeyboardInterrupt, "^$"),
+        (None, False, TrilaneError, "^nobody answered$"),
+    ],
+)
+def test_what_ends_a_scenario(
+    monkeypatch: pytest.MonkeyPatch, failure: Any, interrupted: bool, error: type[BaseException], words: str
+) -> None:
+    def play(*_: Any) -> None:
+        raise TrilaneError("nobody answered")
+
+    closed: list[Any] = []
+
+    def run_pipeline(*_: Any, requests: Any, **__: Any) -> Any:
+        closed.append(requests)
+        return SimpleNamespace(failure=failure, interrupted=interrupted)
+
+    monkeypatch.setattr(scenario, "play", play)
+    monkeypatch.setattr(scenario, "run_pipeline", run_pipeline)
+    with pytest.raises(error, match=words):
+        scenario.run_scenario("pipeline", {}, Load("offline", 1.0), "trilane", "latest")  # type: ignore[arg-type]
+    assert closed[0].is_open.is_set(), "a queue that is closed lets whoever waits for it go on"
 
 
 @pytest.mark.parametrize(
