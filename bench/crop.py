@@ -91,7 +91,7 @@ def _area(rect: F64) -> float:
 def _needed(view: _View) -> float:
     """Side of the smallest square around the middle of the joints' rectangle that holds the mesh."""
     middle = (view.joints[:2] + view.joints[2:]) / 2.0
-    return float(2.0 * max((view.mesh[2:] - middle).max(), (middle - view.mesh[:2]).max()))
+    return float(2.0 * np.abs(view.mesh.reshape(2, 2) - middle).max())
 
 
 def _views(count: int, output: Shape, buckets: list[Shape]) -> list[_View]:

@@ -62,6 +62,7 @@ def order(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         done.append("asleep")
 
     def absent(_size: int, _context: Any) -> Any:
+        done.append("asked for what is absent")
         raise ModuleNotFoundError("nothing", name="nothing")
 
     names = (SLOT, BARE, "peer")
@@ -83,7 +84,7 @@ def test_two_rounds_at_two_sizes(order: list[Any]) -> None:
     first = [(name, kib) for kib in (1024, 256) for name in (SLOT, BARE, "peer", PIPELINE)]
     second = [(name, kib) for kib in (1024, 256) for name in (BARE, "peer", SLOT, PIPELINE)]
     closed = [("closed", name, kib) for name in ours for kib in (1024, 256)]
-    assert order == [*made, *first, *second, *reversed(closed), "asleep"]
+    assert order == [*made, "asked for what is absent", *first, *second, *reversed(closed), "asleep"]
     assert [(row["kib"], row["way"]) for row in result["rows"]] == [
         (kib, name) for kib in (256, 1024) for name in (*ours, PIPELINE)
     ]

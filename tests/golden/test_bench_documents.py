@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import Any
 
+import moderngl
 import numpy as np
 import pytest
 
@@ -23,14 +24,14 @@ Variants = Mapping[str, Callable[[], object]]
 
 
 class Told:
-    """Stands for `interleaved_ms`: every variant runs twice and took its place from 1, three times as long, then 2."""
+    """Stands for `interleaved_ms`: every variant runs once and took three times its place from 1, once, and twice."""
 
     def __init__(self) -> None:
         self.asked: list[tuple[dict[str, Any], int]] = []
 
     def __call__(self, variants: Variants, repeats: int) -> dict[str, list[float]]:
         self.asked.append((dict(variants), repeats))
-        for run in (*variants.values(), *variants.values()):
+        for run in variants.values():
             run()
         return {name: [3.0 * place, place, 2.0 * place] for place, name in enumerate(variants, start=1)}
 
@@ -140,6 +141,7 @@ def test_split_passes_fill_a_tensor_that_is_no_square(gl: Any) -> None:
     placement = raster.Placement(body.joints, body.projection, (0, 0, *shape))
     tensors = np.zeros((2, *shape, 8), np.uint8)
     for _ in range(2):  # the second draw begins where the first has left its targets
+        gl.disable(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
         split.draw(body.view, placement)
         split.read_into(tensors[0].reshape(-1))
     packed(tensors[1].reshape(-1))
@@ -155,12 +157,12 @@ def test_readbacks_and_uploads_have_rows_of_what_was_told(
     driver = describe(gl)
     told = Told()
     monkeypatch.setattr(readback, "interleaved_ms", told)
-    result = readback.measure(sizes=(32, 64), channels=(4, 8), repeats=5, threads=2)
+    result = readback.measure(sizes=(32, 64), channels=(4,), repeats=5, threads=2)
     reads = [
         {"kind": "readback", "size": size, "channels": count, "way": way, "lag": lag}
         | {"move": summary(place), "turn": summary(place)}
         for size in (32, 64)
-        for count in (4, 8)
+        for count in (4,)
         for place, (way, lag) in enumerate((("direct", 0), ("pbo", 0), ("pbo-orphan", 0), ("pbo-ring", 2)), start=1)
     ]
     writes = [
