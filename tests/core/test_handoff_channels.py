@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -33,6 +34,7 @@ def test_a_slot_is_shared_and_announced_by_a_job(monkeypatch: pytest.MonkeyPatch
     before = open_files()
     channel = SlotChannel(64, None)  # type: ignore[arg-type]
     monkeypatch.setattr(handoff_variants, "DupFd", lambda fd: SimpleNamespace(detach=lambda: os.dup(fd)))
+    assert re.search(r"handoff\b(?!_)", str(Path(channel._place).readlink()))
     copies = []
     for _ in range(2):
         copies.append(SlotChannel.__new__(SlotChannel))

@@ -44,11 +44,15 @@ def rounds(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return ran
 
 
-def test_a_document_of_two_rounds(rounds: list[str]) -> None:
+def test_a_document_of_two_rounds(rounds: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """A minute in a hundred is 36 frames: 36 releases and as many jobs of each of the five stages. Medians of 1 and 2
     times the seconds are 1.5 times, the ratios those of either round."""
     pytest.importorskip("simpy")
+    drawn: list[Any] = []
+    service = scheduler._service
+    monkeypatch.setattr(scheduler, "_service", lambda *asked: drawn.append(asked) or service(*asked))
     result = scheduler.measure(minutes=0.01, rounds=2, seeds=3)
+    assert drawn == [(0, 36)]
     ways = [TRILANE, NO_REPORT, RECORDED, SIMPY, LEAN]
     assert rounds == [*ways, *ways[1:], TRILANE]
     processed = result["rows"][3].pop("processed")

@@ -156,7 +156,23 @@ def test_readbacks_and_uploads_have_rows_of_what_was_told(
 ) -> None:
     driver = describe(gl)
     told = Told()
-    monkeypatch.setattr(readback, "interleaved_ms", told)
+    done: list[str] = []
+
+    class Noted:
+        """The context, of which it is noted what it finishes and copies, and when times are taken."""
+
+        def __getattr__(self, name: str) -> Any:
+            if name in ("finish", "copy_framebuffer"):
+                done.append(name)
+            return getattr(gl, name)
+
+    def timed(variants: Variants, repeats: int) -> dict[str, list[float]]:
+        done.append("timed")
+        return told(variants, repeats)
+
+    monkeypatch.setattr(readback, "describe", lambda _: driver)
+    monkeypatch.setattr(readback, "open_context", lambda *asked: opened.extend(asked) or Noted())
+    monkeypatch.setattr(readback, "interleaved_ms", timed)
     result = readback.measure(sizes=(32, 64), channels=(4,), repeats=5, threads=2)
     reads = [
         {"kind": "readback", "size": size, "channels": count, "way": way, "lag": lag}
@@ -178,6 +194,8 @@ def test_readbacks_and_uploads_have_rows_of_what_was_told(
         "config": {"repeats": 5, "threads": 2},
     }
     assert opened == [2] and {repeats for _, repeats in told.asked} == {5}
+    read, written = ["timed", "finish", "timed"], ["timed", *["copy_framebuffer", "finish"] * 3]
+    assert done == [*read, *read, *written, *written]
 
 
 def test_the_fastest_has_the_least_sum_of_medians() -> None:
