@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trilane.bench import crop
+from trilane.bench import crop, joints
 from trilane.bench.lib import gpu_buffering, load
 from trilane.bench.lib.gpu_buffering import READBACKS, UPLOADS
 from trilane.bench.lib.load import Load, Queries, bound_ms, queries_needed, tail, verdict
@@ -173,6 +173,25 @@ def test_ways_to_crop_are_compared_by_hand(monkeypatch: pytest.MonkeyPatch) -> N
     for bad, words in (({"views": 0}, "--views: found 0, expected at least 1"), ({"size": "33"}, "--size: ")):
         with pytest.raises(BadInputError, match=f"^{words}"):
             crop.measure(**bad)  # type: ignore[arg-type]
+
+
+def test_the_poses_of_a_loop_are_those_of_a_seed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each of two loops poses the same twenty; the clock goes on by 1, 2 and 3 s between its looks."""
+    posed: list[np.ndarray] = []
+    looks = iter([0.0, 1.0, 3.0, 6.0])
+    monkeypatch.setattr(joints, "Skeleton", lambda *_: SimpleNamespace(pose=posed.append))
+    monkeypatch.setattr(joints, "time", SimpleNamespace(perf_counter=lambda: next(looks)))
+    assert joints.measure(repeats=2) == {
+        "best_us": pytest.approx(50_000),
+        "median_us": pytest.approx(100_000),
+        "p90_us": pytest.approx(140_000),
+        "limit_us": 200.0,
+        "config": {"repeats": 2, "frames_per_loop": 20, "joints": 55},
+    }
+    poses = np.random.default_rng(0).normal(0.0, 0.5, (20, 165))
+    assert np.array_equal(posed, [*poses, *poses])
+    with pytest.raises(BadInputError, match=r"^--repeats: found 0, expected at least 1$"):
+        joints.measure(repeats=0)
 
 
 class Condition:

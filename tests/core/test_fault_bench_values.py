@@ -74,7 +74,7 @@ def test_the_row_of_a_run_under_signals_by_hand() -> None:
     }
     quiet = SimpleNamespace(steps=[])
     failed = run_with_deaths(failure=Failure("it broke"), recording=quiet, jobs=[])
-    row = faults._row(failed, faults.Signals("cpu", []), 10 * MS)  # type: ignore[arg-type]
+    row = faults._row(failed, faults.Signals("host", []), 10 * MS)  # type: ignore[arg-type]
     assert (row["ended"], row["lost_per_death"], row["restarts"]) == ("failed: it broke", 7.0, 5)
     assert (row["ready_ms"], row["back_ms"], row["back_max_ms"], row["not_back"]) == (None, None, None, 0)
 

@@ -262,6 +262,21 @@ def test_a_drawable_is_the_bundles_avatar() -> None:
         drawable.load_drawable("nobody")
 
 
+def test_ground_truth_is_drawn_as_training_draws_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the body in the shape that the manifest says; needs what the error of a picture needs."""
+    pytest.importorskip("skimage")
+    from trilane.training import sample_renderer
+    from trilane.training.image_error import image_error
+
+    asked: list[Any] = []
+    body = SimpleNamespace(shape=lambda *shape: asked.append(shape) or "shaped")
+    monkeypatch.setattr(ground_truth, "load_body", lambda path: asked.append(path) or body)
+    monkeypatch.setattr(sample_renderer, "SampleRenderer", lambda shaped: ("studio", shaped))
+    bundle: Any = SimpleNamespace(body_path="path", manifest=SimpleNamespace(betas="betas", expression="expression"))
+    assert ground_truth.ground_truth(bundle) == (("studio", "shaped"), image_error)
+    assert asked == ["path", ("betas", "expression")]
+
+
 def test_ground_truth_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "trilane.training.image_error", None)
     with pytest.raises(MissingPartError, match=r"ground truth needs trilane\.training\.image_error; .*train"):

@@ -13,6 +13,7 @@ import pytest
 
 from trilane.bench import oracle, raster, readback
 from trilane.bench.lib.fixture import ENCODING, standing
+from trilane.bench.lib.gpu_buffering import SubUpload
 from trilane.bench.lib.split_pass import SplitPass
 from trilane.errors import BadInputError, TrilaneError
 from trilane.stages.gpu.opengl_context import Driver, describe
@@ -170,6 +171,14 @@ def test_readbacks_and_uploads_have_rows_of_what_was_told(
         done.append("timed")
         return told(variants, repeats)
 
+    images: list[np.ndarray] = []
+
+    class Kept(SubUpload):
+        def write(self, texture: Any, image: np.ndarray) -> None:
+            images.append(image.copy())
+            super().write(texture, image)
+
+    monkeypatch.setitem(readback.UPLOADS, "sub", Kept)
     monkeypatch.setattr(readback, "describe", lambda _: driver)
     monkeypatch.setattr(readback, "open_context", lambda *asked: opened.extend(asked) or Noted())
     monkeypatch.setattr(readback, "interleaved_ms", timed)
@@ -195,6 +204,8 @@ def test_readbacks_and_uploads_have_rows_of_what_was_told(
     }
     assert opened == [2] and {repeats for _, repeats in told.asked} == {5}
     read, written = ["timed", "finish", "timed"], ["timed", *["copy_framebuffer", "finish"] * 3]
+    for image, size in zip(images, (32, 64), strict=True):
+        assert np.array_equal(image, np.random.default_rng(0).integers(0, 256, size * size * 4, dtype=np.uint8))
     assert done == [*read, *read, *written, *written]
 
 
@@ -289,10 +300,16 @@ def test_the_oracle_sees_bytes_that_are_wrong(gl: Any, more: int, monkeypatch: p
             super().read_into(shape, tensor)
             tensor += np.uint8(more)
 
+    begun: list[Any] = []
+    pose = oracle.everyday_pose
+    monkeypatch.setattr(
+        oracle, "everyday_pose", lambda seeded: begun.append(seeded.bit_generator.state) or pose(seeded)
+    )
     monkeypatch.setattr(oracle, "PackedPass", Wrong)
     rows = oracle._compare(gl, 3, (64, 96))
     assert passes == [((16, ENCODING), {"deferred": not describe(gl).hardware})]
     assert rows.shape == (3, 5) and rows.dtype == np.int64
+    assert begun[0] == np.random.default_rng(0).bit_generator.state
     for pixels, differ, values, near, wrong in rows:
         assert 50 < pixels < 64 * 96 / 2 and differ <= 2
         assert 16 * (pixels - differ) <= values <= 16 * pixels and values % 16 == 0

@@ -29,8 +29,11 @@ def _times(mean: float) -> SimpleNamespace:
 
 
 def result_of(policy: str, frame_ms: float, **changes: Any) -> SimpleNamespace:
-    """A run of `pose` (2 ms, 1.5 isolated) and `present` (3 ms) on the CPU, and `raster` (10 ms, 8 isolated)."""
-    stage = {"pose": ("cpu", 2.0), "raster": ("gpu", 10.0), "present": ("cpu", 3.0)}
+    """A run of `pose` (2 ms, 1.5 isolated) and `present` (3 ms) on the unit `host`, and `raster` (10 ms, 8 isolated).
+
+    The unit of `raster` is the slowest and the busiest, and is not the last by its name.
+    """
+    stage = {"pose": ("host", 2.0), "raster": ("gpu", 10.0), "present": ("host", 3.0)}
     report = SimpleNamespace(
         policy=policy,
         fps=1000 / frame_ms,
@@ -38,9 +41,9 @@ def result_of(policy: str, frame_ms: float, **changes: Any) -> SimpleNamespace:
         frame_time_ms=_times(frame_ms),
         isolated_ms={"pose": 1.5, "raster": 8.0},
         stages={name: SimpleNamespace(unit=unit, service_ms=_times(mean)) for name, (unit, mean) in stage.items()},
-        units={"cpu": SimpleNamespace(busy=0.3, restarts=5), "gpu": SimpleNamespace(busy=0.6, restarts=2)},
+        units={"host": SimpleNamespace(busy=0.3, restarts=5), "gpu": SimpleNamespace(busy=0.6, restarts=2)},
     )
-    jobs = [("gpu", 0, 0, 0, 10), ("gpu", 14, 17, 20, 50), ("cpu", 0, 0, 30, 40)]
+    jobs = [("gpu", 0, 0, 0, 10), ("gpu", 14, 17, 20, 50), ("host", 0, 0, 30, 40)]
     told = {
         "report": report,
         "jobs": [JobRecord("raster", unit, 0, *instants) for unit, *instants in jobs],
