@@ -147,10 +147,11 @@ def test_bytes_are_a_frame_of_zeromq_and_neither_side_copies(monkeypatch: pytest
     assert not folder.exists()
 
 
-def test_a_sample_of_iceoryx_is_written_in_place() -> None:
+def test_a_sample_of_iceoryx_is_written_in_place(request: pytest.FixtureRequest) -> None:
     """Two samples reach the other end; a folder and a prefix of its own keep what iceoryx2 leaves, until `close`."""
     pytest.importorskip("iceoryx2")
     channel = IceoryxChannel(64, None)  # type: ignore[arg-type]
+    request.addfinalizer(channel.close)
     folder = Path(channel._folder)
     assert folder.parent == Path("/tmp") and folder.name.startswith("iox-") and channel._prefix == f"{folder.name}_"  # noqa: S108
     consumer, producer = channel.consumer(), channel.producer()
