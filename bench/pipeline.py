@@ -118,7 +118,7 @@ def _pairs(policies: Sequence[str], edges: Sequence[str]) -> list[tuple[str, str
     return [(SEQUENTIAL, "double"), *(pair for pair in product(policies, edges) if pair != (SEQUENTIAL, "double"))]
 
 
-def _config(avatar: str, size: str, cores: int, frames: int, runtime: str, *, video: bool) -> Checked:
+def _config(avatar: str, size: str, cores: int, frames: int, runtime: str, video: bool) -> Checked:
     folder = str(full_width.full_width_bundle()) if avatar == full_width.NAME else avatar
     checked = configure(Request(size=size, avatar=folder, frames=frames, runtime=runtime), Path.cwd())
     units = host_units(usable_cores()[:cores])
