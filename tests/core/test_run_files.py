@@ -5,20 +5,25 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator
+from datetime import UTC, datetime, tzinfo
 from pathlib import Path
 from typing import Any
 
 import pytest
-from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace, TrackEvent
+from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace, TrackDescriptor, TrackEvent
 
+from trilane.apps import report as report_module
+from trilane.apps import run_folder
 from trilane.apps.report import Report, read_report, write_report
 from trilane.apps.report_sources import NO_FIGURES_UNDER, sources_of
 from trilane.apps.run_folder import RunFolder, default_place
 from trilane.apps.trace import write_trace
 from trilane.errors import BadInputError
 from trilane.figure_sources import COMPARED, COMPUTED, MEASURED
+from trilane.scheduler.accounts import IdleSlice
 from trilane.scheduler.ledger import JobRecord
-from trilane.testing.run_report import SHOWN, make_report
+from trilane.testing.run_report import SHARE, SHOWN, make_report
+from trilane.writing import WRITABLE
 
 JOBS = (
     JobRecord("pose", "cpu", 0, 1_000, 1_500, 2_000, 3_000),
@@ -77,6 +82,52 @@ def test_the_default_place_is_free_and_named_after_the_scene(tmp_path: Path, mon
     assert first.name.endswith("Z----my-scene")
 
 
+def test_a_second_run_of_the_same_second_has_a_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Clock:
+        @staticmethod
+        def now(zone: tzinfo) -> datetime:
+            assert zone is UTC
+            return datetime(2026, 11, 22, 3, 4, 5, tzinfo=UTC)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(run_folder, "datetime", Clock)
+    for name in ("20261122T030405Z-a_b-1", "20261122T030405Z-a_b-1-2", "20261122T030405Z-a_b-1-3"):
+        assert default_place("a_b-1") == Path("runs") / name
+        (Path("runs") / name).mkdir(parents=True)
+
+
+def refusal(target: Path) -> str:
+    with pytest.raises(BadInputError) as refused, RunFolder(target):
+        pass
+    return str(refused.value)
+
+
+def test_refusals_word_by_word(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Relative names are made absolute; what was made on the way is removed again."""
+    monkeypatch.chdir(tmp_path)
+    Path("taken").mkdir()
+    Path("file").touch()
+    taken = f"{tmp_path}/taken: found a file or folder, expected a name that is free; choose another --out"
+    assert refusal(Path("taken")) == taken
+    below = f"{tmp_path}/file/run: found not a directory, expected {WRITABLE}; choose another --out"
+    assert refusal(Path("file/run")) == below
+    too_long = refusal(Path("new/folder") / ("a" * 250))
+    assert too_long.endswith(f"found file name too long, expected {WRITABLE}; choose another --out")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "taken"]
+    with pytest.raises(BadInputError) as refused, RunFolder(tmp_path / "run") as folder:
+        (tmp_path / "run" / "other").mkdir(parents=True)
+        folder.complete()
+    said = f"found directory not empty, expected a name that is free; the run is in {folder.work}"
+    assert str(refused.value) == f"{tmp_path}/run: {said}"
+
+
+def test_a_parent_that_others_use_by_then_stays(tmp_path: Path) -> None:
+    with pytest.raises(KeyError), RunFolder(tmp_path / "a" / "b" / "run"):
+        (tmp_path / "a" / "other").touch()
+        raise KeyError
+    assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")] == ["a", "a/other"]
+
+
 def test_the_trace_has_a_track_per_unit_and_a_flow_per_frame(tmp_path: Path) -> None:
     write_trace(JOBS, ("cpu", "gpu", "dsp"), tmp_path / "trace.pftrace")
     trace = Trace()
@@ -100,6 +151,51 @@ def test_tracks_are_in_the_order_of_the_units_of_the_graph(tmp_path: Path) -> No
     trace.ParseFromString((tmp_path / "trace.pftrace").read_bytes())
     tracks = [p.track_descriptor for p in trace.packet if p.HasField("track_descriptor")]
     assert [(track.name, track.sibling_order_rank) for track in tracks[1:]] == [("npu", 0), ("gpu", 2)]
+
+
+def test_every_packet_of_a_trace(tmp_path: Path) -> None:
+    """The process is track 1, units follow in their order; a wait is in us, and flows begin at 1."""
+    jobs = [
+        JobRecord("raster", "gpu", 4, 10_000, 15_000, 22_999, 30_000, 700, 80),
+        JobRecord("pose", "cpu", 5, 40_000, 40_000, 40_000, 41_000),
+    ]
+    idle = [
+        IdleSlice("gpu", "blocked", 30_000, 36_000, 500),
+        IdleSlice("cpu", "starved", 0, 40_000),
+        IdleSlice("dsp", "starved", 0, 9),
+    ]
+    write_trace(jobs, ("dsp", "gpu", "npu", "cpu"), tmp_path / "trace", idle)
+    trace = Trace()
+    trace.ParseFromString((tmp_path / "trace").read_bytes())
+    tracks = [p.track_descriptor for p in trace.packet if p.HasField("track_descriptor")]
+    assert [(t.uuid, t.parent_uuid, t.name, t.sibling_order_rank) for t in tracks] == [
+        (1, 0, "trilane", 0),
+        (3, 1, "gpu", 1),
+        (5, 1, "cpu", 3),
+    ]
+    assert tracks[0].child_ordering == TrackDescriptor.EXPLICIT
+    packets = [p for p in trace.packet if p.HasField("track_event")]
+    assert len(packets) + len(tracks) == len(trace.packet)
+    assert {p.trusted_packet_sequence_id for p in packets} == {1}  # 0 is none
+    begin, end = TrackEvent.TYPE_SLICE_BEGIN, TrackEvent.TYPE_SLICE_END
+    found = [
+        (
+            *(p.timestamp, p.track_event.type, p.track_event.track_uuid, p.track_event.name),
+            {note.name: note.int_value for note in p.track_event.debug_annotations},
+            list(p.track_event.flow_ids),
+        )
+        for p in packets
+    ]
+    assert found == [
+        (0, begin, 5, "starved", {}, []),
+        (40_000, end, 5, "", {}, []),
+        (22_999, begin, 3, "raster", {"frame": 4, "wait_us": 12, "preempted_ns": 700, "asleep_ns": 80}, [5]),
+        (30_000, end, 3, "", {}, []),
+        (30_000, begin, 3, "blocked", {"preempted_ns": 500}, []),
+        (36_000, end, 3, "", {}, []),
+        (40_000, begin, 5, "pose", {"frame": 5, "wait_us": 0}, [6]),
+        (41_000, end, 5, "", {}, []),
+    ]
 
 
 def test_a_report_is_read_back_from_its_folder(tmp_path: Path) -> None:
@@ -153,6 +249,36 @@ def test_a_damaged_report_is_named_with_its_key(tmp_path: Path, change: dict[str
 def test_a_missing_report_is_a_bad_input(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="no such file"):
         read_report(tmp_path / "nothing")
+
+
+def test_what_is_no_report_is_named_word_by_word(tmp_path: Path) -> None:
+    def said(text: str) -> str:
+        (tmp_path / "report.json").write_text(text)
+        with pytest.raises(BadInputError) as refused:
+            read_report(tmp_path)
+        return str(refused.value).removeprefix(f"{tmp_path}/report.json: ")
+
+    expected = "expected a run folder or its report.json"
+    assert said("null") == f"the document: found input should be a valid dictionary or instance of report, {expected}"
+    damaged = make_report(units={"dsp": {**SHARE, "idle": {}}})
+    assert said(json.dumps(damaged)) == f"units.dsp.idle.starved: found field required, {expected}"
+    assert said("{").startswith("the document: found EOF while parsing") and said("{").endswith(expected)
+    newer = "expected 1; a newer Trilane wrote it: update this one"
+    assert said('{"schema": 7}') == f"schema: found 7, {newer}"
+    assert said('{"schema": "7"}') == f"schema: found input should be 1, {expected}"
+    assert not said(json.dumps(make_report(schema=0))).endswith(newer)
+
+
+def test_a_file_that_is_too_large_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "any.json"
+    write_report(Report.model_validate(make_report()), file)
+    size = file.stat().st_size
+    monkeypatch.setattr(report_module, "MAX_REPORT_BYTES", size)
+    assert read_report(file).fps == 50.0
+    monkeypatch.setattr(report_module, "MAX_REPORT_BYTES", size - 1)
+    with pytest.raises(BadInputError) as refused:
+        read_report(file)
+    assert str(refused.value) == f"{file}: found {size} bytes, expected a report of at most {size - 1}"
 
 
 def test_a_report_never_holds_nan(tmp_path: Path) -> None:
