@@ -82,8 +82,9 @@ def test_a_scene_is_compared_as_the_options_say(asked: list[Any], command: Comma
         ),
     ],
 )
+@pytest.mark.usefixtures("asked")
 def test_what_is_out_of_its_bounds_is_said(
-    row: dict[str, Any], said: list[str], asked: list[Any], monkeypatch: pytest.MonkeyPatch, command: Command
+    row: dict[str, Any], said: list[str], monkeypatch: pytest.MonkeyPatch, command: Command
 ) -> None:
     monkeypatch.setattr(accuracy, "runtime_differences", lambda *_: {**RESULT, "rows": [{**ROW, **row}]})
     for words in ((), ("--json",)):
@@ -97,10 +98,9 @@ def test_hard_cases_run_on_all_but_the_emulator(asked: list[Any], command: Comma
     assert asked == [["ort"], ["qnn", "cuda"]]
 
 
+@pytest.mark.usefixtures("asked")
 @pytest.mark.parametrize("passed", [True, False])
-def test_a_hard_case_that_fails_is_named(
-    passed: bool, asked: list[Any], monkeypatch: pytest.MonkeyPatch, command: Command
-) -> None:
+def test_a_hard_case_that_fails_is_named(passed: bool, monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
     figures = dict.fromkeys(cli.HARD_COLUMNS, 1.0)
     row = {**figures, "name": "batch, [odd], ort", "verdict": "above", "passed": passed}
     good = {**row, "name": "good", "passed": True}
@@ -223,7 +223,8 @@ def test_what_cannot_be_compared(names: tuple[str, ...], frames: int, said: str,
     assert (str(refused.value), loaded) == (said, [])
 
 
+@pytest.mark.usefixtures("loaded")
 @pytest.mark.parametrize("frames", [1, 10000])
-def test_the_ends_of_the_range_are_in_it(frames: int, loaded: list[Any]) -> None:
+def test_the_ends_of_the_range_are_in_it(frames: int) -> None:
     checked: Any = SimpleNamespace(assets=None)
     assert runtime_differences(checked, ("ort", "qnn"), frames)["frames"] == [0, 5, 9]

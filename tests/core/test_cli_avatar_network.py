@@ -93,9 +93,7 @@ def test_a_network_is_asked_for_as_the_options_say(
     assert out.read_bytes() == double.model.SerializeToString()
     double.asked.clear()
     words = ("--encoder", "mobilenetv3", "--norm", "group", "--width", 8, "--channels", 4, "--seed", 5)
-    assert "parameters 42" in " ".join(
-        command("avatar", "network", "--out", out, *words, "--size", "64x32")[0].split()
-    )
+    assert "parameters 42" in " ".join(command("avatar", "network", "--out", out, *words, "--size", "64x32")[0].split())
     assert double.asked == [("seed", 5), ("mobilenetv3", "group", 8, 4), (64, 32)]
     double.asked.clear()
     command("avatar", "network", "--out", out, "--size", "96")

@@ -240,8 +240,9 @@ def test_what_validate_refuses(
         assert ("[metrics]" in err) == (name == "validate") and ("[train]" in err) == (name != "validate")
 
 
+@pytest.mark.usefixtures("work")
 def test_a_bar_counts_the_views_on_a_terminal(
-    work: Work, monkeypatch: pytest.MonkeyPatch, tiny_bundle: Path, command: Command
+    monkeypatch: pytest.MonkeyPatch, tiny_bundle: Path, command: Command
 ) -> None:
     """Two seeds with as many views of each of the bands; six of them are shown."""
     import io

@@ -24,7 +24,7 @@ from trilane.transport import wakeup
 Command = Callable[..., tuple[str, str]]
 CPU = {"model": "a processor", "flags": ["avx2", "avx512_vnni", "amx_int8"], "cores": 8, "cores_allowed": [0, 2, 5]}
 GL = {"renderer": "a [driver]", "version": "4.5", "hardware": True}
-Version = namedtuple("Version", "major minor")  # noqa: PYI024 - compared as the tuple that it is
+Version = namedtuple("Version", "major minor")
 
 
 @pytest.fixture
@@ -60,7 +60,8 @@ MEMFD = "needs Linux 3.17 or newer with memfd_create allowed"
 COMPILE = "make compile  # it takes gcc and python3-dev"
 
 
-def test_a_machine_that_has_everything(machine: pytest.MonkeyPatch, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("machine")
+def test_a_machine_that_has_everything(tmp_path: Path) -> None:
     assert doctor.checks(GL) == [
         Check("Python", "3.11.9", True, True, PYTHON),
         Check("CPU", "a processor, 3 of 8 cores allowed, avx2 avx512_vnni amx_int8", True, True, ""),
@@ -133,14 +134,15 @@ def test_a_stale_core_stops_a_run(machine: pytest.MonkeyPatch) -> None:
     assert doctor._core() == Check("scheduler core", compiled.STALE, False, True, compiled.MEND)
 
 
-def test_a_driver_on_the_cpu_is_named(machine: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("machine")
+def test_a_driver_on_the_cpu_is_named() -> None:
     assert doctor._gl({**GL, "hardware": False}).found == "a [driver], 4.5 (software, on the CPU)"
 
 
 def test_memory_is_tried_and_given_back() -> None:
-    before = len(os.listdir("/proc/self/fd"))
+    before = len(list(Path("/proc/self/fd").iterdir()))
     assert doctor._memfd() == Check("memfd", "anonymous shared memory works", True)
-    assert len(os.listdir("/proc/self/fd")) == before
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
 
 
 def test_memory_that_cannot_grow_does_not_work(monkeypatch: pytest.MonkeyPatch) -> None:

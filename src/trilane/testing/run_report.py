@@ -1,4 +1,4 @@
-"""A report of a run that has everything. Rule: every figure in it is written by hand, and nothing depends on a machine."""
+"""A report of a run. Rule: every figure in it is written by hand, and nothing depends on a machine."""
 
 from __future__ import annotations
 
@@ -42,6 +42,8 @@ MACHINE = {
     "gl": None,
     "packages": {"numpy": "2.0"},
 }
+
+
 def make_report(**changes: Any) -> dict[str, Any]:
     """What a run writes, with `changes`."""
     counts = {"requested": 3, "presented": 3, "lost": 0, "lost_by_cause": {}, "dropped": {"raster->infer:stale": 1}}
