@@ -281,6 +281,13 @@ def test_a_file_that_is_too_large_is_not_read(tmp_path: Path, monkeypatch: pytes
     assert str(refused.value) == f"{file}: found {size} bytes, expected a report of at most {size - 1}"
 
 
+def test_a_report_that_could_not_be_read_back_is_never_written(tmp_path: Path) -> None:
+    wrong = Report.model_validate(make_report()).model_copy(update={"fps": "fast"})
+    with pytest.warns(UserWarning, match="fast"), pytest.raises(ValueError, match="fps"):
+        write_report(wrong, tmp_path / "report.json")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_report_never_holds_nan(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="JSON"):
         write_report(Report.model_validate(make_report(fps=float("nan"))), tmp_path / "report.json")

@@ -161,6 +161,12 @@ def test_both_ways_to_decode_give_the_frames_that_are_wanted(
     assert greys_of.ravel() == pytest.approx([grey_of(round(k * 39 / 19)) for k in range(20)], abs=4)
 
 
+def test_a_sheet_is_compressed(tmp_path: Path) -> None:
+    """Even grey pictures with labels: far below a byte for each of the 320 x 213 x 3."""
+    sheet_of(tmp_path, range(1))
+    assert (tmp_path / "contact.png").stat().st_size < 320 * 213
+
+
 def test_frames_are_labelled_with_their_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Frames 2, 3 and 7 of a run: the time of a frame tells its number."""
     said: list[Any] = []
