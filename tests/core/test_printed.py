@@ -6,8 +6,7 @@ depends on the machine is not here.
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -41,21 +40,6 @@ COMMANDS = {
 @pytest.mark.parametrize("name", COMMANDS)
 def test_commands(printed: Printed, check_printed: Check, name: str) -> None:
     check_printed(name, printed(*COMMANDS[name]))
-
-
-def commands(printed: Printed, *words: str) -> Iterator[tuple[str, ...]]:
-    """Every command below `words`, those of benches aside: their defaults are of this machine."""
-    yield words
-    _, _, below = printed(*words, "--help").partition("\nCommands:\n")
-    for name in re.findall(r"^  (\S+)", below.partition("\n\n")[0], re.MULTILINE):
-        if words != ("bench",):
-            yield from commands(printed, *words, name)
-
-
-def test_helps(printed: Printed, check_printed: Check) -> None:
-    texts = [f"$ trilane {' '.join(words)}\n{printed(*words, '--help')}" for words in commands(printed)]
-    assert len(texts) > 20
-    check_printed("helps", "\n".join(texts))
 
 
 @pytest.fixture

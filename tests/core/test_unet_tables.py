@@ -56,7 +56,7 @@ PUBLISHED = {
 
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_parameters_and_work_are_the_published_ones(name: str) -> None:
-    """But for one squeeze of MobileNetV3: of 72 channels the published one keeps 24, where a quarter is nearer to 16."""
+    """But for one squeeze of MobileNetV3: of 72 channels the published one keeps 24, where a quarter is near 16."""
     last, parameters, classifier, mega_macs = PUBLISHED[name]
     own, macs = work_of(MOBILE_ENCODERS[name], last)
     narrower = 2 * 72 * 8 + 8 if name == "mobilenetv3" else 0
