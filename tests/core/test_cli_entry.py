@@ -12,6 +12,7 @@ import click
 import pytest
 import typer
 
+import trilane
 from trilane.apps.cli import main as cli
 from trilane.apps.cli.commands import Commands, OnceCommand
 from trilane.errors import BadInputError, MissingPartError, TrilaneError
@@ -87,6 +88,10 @@ def test_a_command_that_is_none_and_an_option_that_is_none(command: Command) -> 
     assert group.get_command(context, "fly") is None
     for name, (_, line) in cli.COMMANDS.items():
         assert (group.get_command(context, name).name, group.get_command(context, name).help) == (name, line)
+
+
+def test_the_version_is_all_that_is_printed(command: Command) -> None:
+    assert command("--version", "doctor") == (f"trilane {trilane.__version__}\n", "")
 
 
 def test_markup_and_shells_leave_a_command_alone() -> None:

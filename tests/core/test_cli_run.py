@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -231,8 +232,8 @@ def test_a_bar_for_each_run_when_stderr_is_a_terminal(monkeypatch: pytest.Monkey
         hooks.message("[b]said")
     last = screen.getvalue().rpartition("[b]said")[2]
     assert "starting" not in last
-    assert "pipelined" in last and "4/8" in last
-    assert "sequential" in last and "1/3" in last
+    assert re.search(r"pipelined  ?[━╸╺ ]+4/8 \S", last)
+    assert re.search(r"sequential [━╸╺ ]+1/3 \S", last)
 
 
 def test_the_call_is_closed_though_the_command_fails(asked: Asked, command: Command) -> None:
