@@ -161,6 +161,20 @@ def test_both_ways_to_decode_give_the_frames_that_are_wanted(
     assert greys_of.ravel() == pytest.approx([grey_of(round(k * 39 / 19)) for k in range(20)], abs=4)
 
 
+def test_each_frame_is_sought_in_the_time_of_its_stream(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A seek without a stream counts in microseconds: it would end at the first key frame, and all would be decoded."""
+    sought: list[Any] = []
+    frames = [SimpleNamespace(pts=pts) for pts in (0, 512, 1024)]
+    container = SimpleNamespace(
+        streams=SimpleNamespace(video=["the stream"]),
+        seek=lambda pts, **settings: sought.append((pts, settings)),
+        decode=lambda stream: iter(frames) if stream == "the stream" else iter(()),
+    )
+    monkeypatch.setattr(video, "_thumbnail", lambda frame: f"of {frame.pts}")
+    assert list(video._decode_each(container, [512, 1000])) == [(512, "of 512"), (1000, "of 1024")]
+    assert sought == [(512, {"stream": "the stream"}), (1000, {"stream": "the stream"})]
+
+
 def test_a_sheet_is_compressed(tmp_path: Path) -> None:
     """Even grey pictures with labels: far below a byte for each of the 320 x 213 x 3."""
     sheet_of(tmp_path, range(1))
