@@ -99,6 +99,7 @@ def test_a_network_without_pytorch(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def torch(monkeypatch: pytest.MonkeyPatch) -> Any:
     torch = pytest.importorskip("torch")
+    torch.set_num_threads(1)
     from trilane.training import onnx_export
 
     monkeypatch.setattr(onnx_export, "export_onnx", lambda network, *shape: (network, shape))
@@ -194,7 +195,9 @@ def test_what_a_network_of_hard_cases_is(torch: Any, monkeypatch: pytest.MonkeyP
     assert not network.training and network.encoder.stem[0].weight.shape[:2] == (8, 4)
 
 
-def test_networks_have_the_norms_of_their_names(torch: Any) -> None:
+def test_networks_have_the_norms_of_their_names(torch: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hard_networks, "_draw", lambda *_: None)
+    monkeypatch.setattr(hard_networks, "_give_contrast", lambda *_: None)
     assert NETWORKS == {
         "batch": ("batch", False),
         "instance": ("instance", False),
