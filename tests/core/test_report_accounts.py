@@ -1,7 +1,9 @@
-"""What a report says beside a ledger's shares, by hand: CPU time, cores, and each contradiction in words."""
+"""What a report says beside a ledger's shares, by hand: CPU time, cores, contradictions in words."""
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from typing import Any
 
 import pytest
@@ -52,3 +54,16 @@ def test_accounts_that_contradict_themselves_are_told(monkeypatch: pytest.Monkey
         "right had 125.0% of the time of cores (1, 3): please report this",
         accounts.NO_RUN_DELAY,
     ]
+
+
+def test_a_process_of_one_thread_has_one_that_is_counted() -> None:
+    """And nothing of what it waited before counts."""
+    program = """
+from trilane.pipeline.core_meter import CoreMeter, counts_run_delay
+meter = CoreMeter()
+print(meter.threads, int(counts_run_delay()), meter._born_ns)
+meter.close()
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    threads, counts, born_ns = map(int, done.stdout.split())
+    assert (threads, born_ns) == (counts, 0)
