@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import moderngl
 import numpy as np
 import pytest
+from PIL import Image
 
 from trilane.arrays import F64
 from trilane.stages.gpu.shader_program import shader_source
@@ -68,7 +70,7 @@ def test_the_colours_of_every_garment_are_as_they_were(
     gl: Any, golden: Any, arrays: BodyArrays, landmarks: Landmarks, material: str
 ) -> None:
     """A pixel for each of 6,144 points, in places and lights drawn at random. Between drivers a sine or a power differs
-    by a few roundings of float32, so a byte by one; where an edge is soft over half a millimetre, seldom by more."""
+    by a few roundings of float32, so a byte by one; by more where one side of an edge becomes the other."""
     number = MATERIALS.index(material)
     random = np.random.default_rng((3, number))
     count = SHAPE[0] * SHAPE[1]
@@ -96,4 +98,8 @@ def test_the_colours_of_every_garment_are_as_they_were(
     vertices.render(moderngl.POINTS)
     found = np.frombuffer(target.read(components=4, dtype="f4"), np.float32).reshape(*SHAPE, 4)
     assert set(np.unique(found[..., 3])) <= {0.0, 1.0}
-    golden(f"paint-{material}", np.round(255 * found[..., :3].clip(0, 1) ** (1 / 2.2)).astype(np.uint8), 0.005, 0.0005)
+    picture = np.round(255 * found[..., :3].clip(0, 1) ** (1 / 2.2)).astype(np.uint8)
+    golden(f"paint-{material}", picture, 0.005, 0.0005)
+    with Image.open(Path(__file__).with_name(f"paint-{material}.png")) as image:
+        off = np.abs(picture.astype(int) - np.asarray(image))
+    assert (off > 1).sum() <= 6, "small parts, as the line between the lips, are few of the points"
