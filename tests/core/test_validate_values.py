@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import shutil
 from datetime import UTC, date, datetime
 from pathlib import Path
 from types import SimpleNamespace
@@ -167,12 +168,13 @@ def test_a_validation_by_hand(parts, tiny_bundle, tmp_path, with_float):
     assert {key: value for key, value in found.items() if value} == wanted
 
 
-def test_a_validation_is_written_into_its_manifest(parts, tiny_bundle):
-    bundle = load_bundle(tiny_bundle)
+def test_a_validation_is_written_into_its_manifest(parts, tiny_bundle, tmp_path):
+    own = shutil.copytree(tiny_bundle, tmp_path / "own")
+    bundle = load_bundle(own)
     said = validate.validate(bundle, ValidationPlan(seeds=(1, 2), per_band=2), Renderer())
     written = validate.revalidate(bundle, said)
     assert written == Bundle(bundle.folder, bundle.manifest.model_copy(update={"validation": said}))
-    assert load_bundle(tiny_bundle) == written
+    assert load_bundle(own) == written
     assert len(parts) == 1
 
 
