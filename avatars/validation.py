@@ -69,7 +69,7 @@ def accuracy_of(bundle: Bundle, drawn: DrawnAs) -> dict[str, Any]:
         "source": from_validation(validation.date),
         "runtime": drawn.runtime,
         "size": drawn.size,
-        **own.model_dump(mode="json"),
+        **own.model_dump(),
     }
 
 

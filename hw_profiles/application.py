@@ -188,14 +188,16 @@ def _settled(
     `times`: stage, unit and nanoseconds of a job.
     `variant`: how the stages are joined.
     `display_ns`: the shortest time between two shown jobs.
-    `quick`: whether to run only QUICK_FRAMES where that is enough.
+    `quick`: whether to run only QUICK_FRAMES where that is enough, which is with one buffer between stages: with two,
+    the buffers fill first, and meanwhile frames come faster.
     `twice`: whether the report has `accounts`, its shares of time computed a second time.
     """
     graph = chain(((name, unit) for name, unit, _ in times), variant.edge, LATENCY_TO)
     service = {name: ns for name, _, ns in times}
     paced = POLICIES[variant.policy].paced
     regular = variant.edge in ("single", "double") and not paced
-    frames = (QUICK_FRAMES if quick else FRAMES) if regular else FRAMES_WITH_DROPS
+    short = quick and variant.edge == "single"
+    frames = (QUICK_FRAMES if short else FRAMES) if regular else FRAMES_WITH_DROPS
     report = _run(graph, settings_of(variant, frames, display_ns), service, twice)
     if paced or report["frame_time_ms"]["mean"] * NS_PER_MS >= display_ns:
         return report, False
@@ -229,7 +231,8 @@ def steady(profile: Profile, plan: Plan, corners: Corners, *, quick: bool = Fals
     `profile`: of the chip.
     `plan`: what runs on it.
     `corners`: at which the units stay.
-    `quick`: whether a short run will do. Its frame time is right; its shares of time include filling and draining.
+    `quick`: whether a short run will do where it can. Its frame time is right to a hundredth; its shares of time
+    include filling and draining.
     `twice`: whether to compute the shares of time a second time.
     """
     times = stage_times_ms(profile, plan, corners)

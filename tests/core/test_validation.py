@@ -37,7 +37,7 @@ def own(tiny_bundle, tmp_path):
 
 def test_an_avatars_own_figures_are_shown_with_their_source(own):
     facts = accuracy_of(load_bundle(own), DRAWN)
-    assert facts.keys() == {"source", "runtime", "size", "psnr_db_by_band", "iou", "ssim"}
+    assert list(facts) == ["source", "runtime", "size", "psnr_db_by_band", "iou", "ssim"]
     assert facts["source"] == SOURCE
     assert (facts["runtime"], facts["size"]) == ("ort", "256")
     assert facts["psnr_db_by_band"] == {"full_body": PSNR_DB}
@@ -287,5 +287,6 @@ def test_a_manifest_that_cannot_be_written_ends_the_validation_before_its_work(o
 
 def test_a_part_that_cannot_be_read_is_named(tmp_path):
     (tmp_path / "texture.npz").mkdir()
-    with pytest.raises(BadInputError, match=r"texture\.npz"):
+    with pytest.raises(BadInputError) as caught:
         sha256_of([tmp_path / "texture.npz"])
+    assert str(caught.value) == f"{tmp_path / 'texture.npz'}: found is a directory, expected a readable file"
