@@ -105,7 +105,7 @@ def test_the_network_of_an_avatar_or_a_file(tiny_bundle: Path, asked: dict[str, 
 
 @pytest.mark.parametrize(("edge", "batch"), [(None, 1), (REFERENCE.edge, 4)])
 def test_the_reference_keeps_its_edge(edge: str | None, batch: int) -> None:
-    assert cli._variant("reference", edge, batch) == REFERENCE._replace(batch=batch)
+    assert cli._variant("reference", edge, batch, None) == REFERENCE._replace(batch=batch)
 
 
 ONE = "expected one or the other"
