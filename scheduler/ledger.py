@@ -218,7 +218,8 @@ class Ledger:
 
     def _stage_row(self, name: str, unit: str) -> dict[str, Any]:
         book = self._stages[name]
-        return {"unit": unit, "service_ms": summary_ms(book.service_ns), "wait_ms": summary_ms(book.wait_ns)}
+        times = {"service_ms": summary_ms(book.service_ns), "wait_ms": summary_ms(book.wait_ns)}
+        return {"unit": unit, "jobs": len(book.service_ns), **times}
 
     def _efficiency(self, isolated_ns: Mapping[str, float] | None, interval_ns: float) -> dict[str, Any]:
         """Isolated service time of the slowest unit over the mean interval between presented frames.
