@@ -7,8 +7,8 @@ not do in time is counted, never hidden.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ from trilane.scheduler.events import Settings
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.virtual import simulate
 from trilane.stages.config import RunConfig
-from trilane.units import SUSTAINED
+from trilane.units import BEFORE_INFER, BYPASS, SUSTAINED
 
 MAX_SLOW_MOTION = 1000.0
 #: A job that ends this much after its pace was done in time: waking up takes this long on a quiet machine.
@@ -69,7 +69,7 @@ def compare(pace: Pace, policy: str, frames: int, jobs: Sequence[JobRecord]) -> 
     """
     late = [job for job in jobs if job.end_ns - job.begin_ns > pace.stage_ns[job.stage] + SLACK_NS]
     late_frames = sorted({job.frame for job in late})
-    virtual = _virtual_ms(pace, policy, frames)
+    virtual = _virtual_ms(pace, policy, frames, _skipping(jobs))
     measured = _measured_ms(jobs, late_frames)
     return {
         "profile": pace.profile,
@@ -85,9 +85,22 @@ def compare(pace: Pace, policy: str, frames: int, jobs: Sequence[JobRecord]) -> 
     }
 
 
-def _virtual_ms(pace: Pace, policy: str, frames: int) -> float:
-    """Median time between presented frames of the same run in virtual time."""
-    result = simulate(application_graph(), Settings(frames, policy), lambda stage, *_: pace.stage_ns[stage], keep=True)
+def _skipping(jobs: Sequence[JobRecord]) -> set[int]:
+    """Numbers of the frames that took the pipeline's bypass."""
+    ends, between = ({job.frame for job in jobs if job.stage == stage} for stage in (BYPASS[1], BEFORE_INFER[-1][0]))
+    return ends - between
+
+
+def _virtual_ms(pace: Pace, policy: str, frames: int, skipping: Set[int]) -> float:
+    """Median time between presented frames of the same run in virtual time, in which the frames `skipping` skip."""
+    graph = replace(application_graph(), bypass=BYPASS)
+    result = simulate(
+        graph,
+        Settings(frames, policy),
+        lambda stage, *_: pace.stage_ns[stage],
+        skips=lambda frame, _fresh: frame in skipping,
+        keep=True,
+    )
     return float(np.median(np.diff(_presented(result.jobs)[1]))) / 1e6
 
 

@@ -69,8 +69,8 @@ class Done(NamedTuple):
     `t_sampled_ns`: of the chain's first stage, when it sampled the frame's input; of the others 0. `preempted_ns`,
     `asleep_ns`: parts of the job in which the unit had no core, and in which nothing of it worked.
     `preempted_before_ns`: how long it had no core between the job before and this one. `skips`: 1 when the frame takes
-    the pipeline's bypass, else 0. `cpu_ns`, `cpu_before_ns`: CPU time of all its threads in the job, and between the job
-    before and this one. `metrics`: numbers that the stage itself reports of the job, by name.
+    the pipeline's bypass, else 0. `cpu_ns`, `cpu_before_ns`: CPU time of all its threads in the job, and between the
+    job before and this one. `metrics`: numbers that the stage itself reports of the job, by name.
     """
 
     id: int

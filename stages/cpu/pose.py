@@ -1,6 +1,7 @@
 """The pose stage: from a frame's number to everything that the other stages have to know about it.
 
-Rule: motion and camera are asked for the frame's media time, frame / fps; nothing that is not finite leaves here.
+Rule: motion and camera are asked for the frame's media time, frame / fps; nothing that is not finite leaves here. A
+frame that shows what an earlier one showed, or nobody, is told so, skins nothing and skips the stages that would draw.
 """
 
 from __future__ import annotations
@@ -13,20 +14,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from trilane.arrays import F64
 from trilane.avatars.bundle import CLOTHES_STANDOFF_M
 from trilane.body.kinematics import Posed, Skeleton
 from trilane.body.skinning import FrameSkinner
 from trilane.errors import TrilaneError
 from trilane.pipeline.shared_assets import Assets
-from trilane.pipeline.stage import UnitContext
+from trilane.pipeline.stage import Skip, UnitContext
 from trilane.scene.mover import Mover
+from trilane.scene.work import Work, shown_by, work_of
 from trilane.stages.avatar_assets import distinct, shaped_body, staged_of
 from trilane.stages.config import RunConfig
 from trilane.stages.cpu.crop import Rect
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 from trilane.stages.cpu.tensor_layout import lay_out
 from trilane.stages.packets import posed_vertices
-from trilane.transport.packets import Packet
+from trilane.transport.packets import FRAME_FIELDS, Packet
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,18 @@ class _Actor:
     skeleton: Skeleton
     bounds: MeshBounds
     skinner: FrameSkinner | None
+
+
+@dataclass(frozen=True)
+class _Made:
+    """What a frame showed, and its header."""
+
+    shown: bytes
+    header: NDArray[np.void]
+
+
+#: Fields of the header in which frames that show the same differ.
+OF_THE_FRAME = {*(name for name, _ in FRAME_FIELDS), "media_time_s", "work"}
 
 
 class PoseStage:
@@ -62,6 +77,7 @@ class PoseStage:
         self._camera = staged.camera
         self._projection = staged.camera.projection(scene.output.width / scene.output.height)
         self._counts = config.posed_vertices
+        self._made: dict[Work, _Made] = {}
         self._slots: list[NDArray[np.void]] = []
         self._vertices: list[list[NDArray[np.float32]]] = []
 
@@ -73,7 +89,7 @@ class PoseStage:
         self._vertices = [posed_vertices(packet.payload, self._counts) for packet in outputs]
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:  # noqa: ARG002
-        """Fill `outputs[slot_out]` for `frame`; the figure is how many avatars are visible.
+        """Fill `outputs[slot_out]` for `frame`; the figure is how many avatars are visible. Unless work is full: a `Skip`.
 
         Raises ValueError without `slot_out`, TrilaneError when a number of the frame is not finite.
         """
@@ -84,20 +100,55 @@ class PoseStage:
         packet["frame"] = frame
         packet["t_sampled_ns"] = time.monotonic_ns()
         packet["media_time_s"] = t_s
-        packet["avatar_count"] = len(self._actors)
         view = self._camera.sample(t_s)
+        moved = [actor.mover.sample(t_s) for actor in self._actors]
+        _require_all_finite(view, moved, frame)
+        shown = shown_by([view, *(array for pair in moved for array in pair)])
+        work = work_of(
+            shown,
+            self._shown_by(Work.FULL),
+            self._shown_by(Work.NONE),
+            lambda: self._make(slot_out, frame, view, moved),
+        )
+        packet["work"] = work
+        known = self._made.get(Work.FULL if work is Work.REUSE else work)
+        if known is not None and known.shown == shown:
+            _copy_same(known.header, packet)
+        else:
+            packet["picture"] = frame if work is Work.FULL else -1
+            self._made[work] = _Made(shown, packet.copy())
+        visible = float(sum(packet["avatars"]["visible"]))
+        return {"visible": visible} if work is Work.FULL else Skip(visible=visible)
+
+    def forget(self) -> None:
+        """The next frame in which anybody is seen is a full one."""
+        self._made.pop(Work.FULL, None)
+
+    def _shown_by(self, work: Work) -> bytes | None:
+        return self._made[work].shown if work in self._made else None
+
+    def _make(self, slot_out: int, frame: int, view: F64, moved: Sequence[tuple[F64, F64]]) -> bool:
+        """Fill what the header of slot `slot_out` says of camera and avatars; whether an avatar is visible.
+
+        `view` (4,4), and `moved`, each avatar's pose and place, are those of `frame`.
+        """
+        packet = self._slots[slot_out]
+        packet["avatar_count"] = len(self._actors)
         packet["view"], packet["projection"] = view, self._projection
-        _require_finite(view, frame, "camera")
         clip = self._projection @ view
         vertices: Sequence[NDArray[np.float32] | None] = self._vertices[slot_out] or [None] * len(self._actors)
         seen = [
             (avatar, rect)
             for index, actor in enumerate(self._actors)
-            if (rect := _pose(actor, avatar := packet["avatars"][index], vertices[index], index, t_s, frame, clip))
+            if (
+                rect := _pose(
+                    actor, avatar := packet["avatars"][index], vertices[index], index, moved[index], frame, clip
+                )
+            )
             is not None
         ]
         self._lay_out(packet, seen)
-        return {"visible": float(len(seen))}
+        return bool(seen)
 
     def _lay_out(self, packet: NDArray[np.void], seen: list[tuple[NDArray[np.void], Rect]]) -> None:
         """Crop rectangles, cells and the tensor's shape; the smallest shape when nothing is to be drawn."""
@@ -124,22 +175,37 @@ def _pose(
     avatar: NDArray[np.void],
     vertices: NDArray[np.float32] | None,
     index: int,
-    t_s: float,
+    moved: tuple[F64, F64],
     frame: int,
-    clip: NDArray[np.float64],
+    clip: F64,
 ) -> Rect | None:
     """Fill one avatar's joints, and `vertices` if given; its rectangle on the screen, None when nothing is visible."""
-    pose, translation = actor.mover.sample(t_s)
-    _require_finite(pose, frame, f"pose of avatar {index}")
-    _require_finite(translation, frame, f"place of avatar {index}")
+    pose, translation = moved
     posed: Posed = actor.skeleton.pose(pose, translation, actor.mover.world)
     _require_finite(posed.matrices, frame, f"joints of avatar {index}")
-    if actor.skinner is not None and vertices is not None:
-        actor.skinner.skin_into(posed, vertices)
-    rect = actor.bounds.rect(posed, clip, vertices)
+    if not actor.bounds.may_be_seen(posed, clip):
+        rect = None
+    else:
+        if actor.skinner is not None and vertices is not None:
+            actor.skinner.skin_into(posed, vertices)
+        rect = actor.bounds.rect(posed, clip, vertices)
     avatar["avatar"], avatar["visible"] = index, rect is not None
     avatar["joints"], avatar["pose_feature"] = posed.matrices, posed.feature
     return rect
+
+
+def _copy_same(source: NDArray[np.void], target: NDArray[np.void]) -> None:
+    """All of a header but what belongs to its frame alone."""
+    for name in source.dtype.names or ():
+        if name not in OF_THE_FRAME:
+            target[name] = source[name]
+
+
+def _require_all_finite(view: F64, moved: Sequence[tuple[F64, F64]], frame: int) -> None:
+    _require_finite(view, frame, "camera")
+    for index, (pose, translation) in enumerate(moved):
+        _require_finite(pose, frame, f"pose of avatar {index}")
+        _require_finite(translation, frame, f"place of avatar {index}")
 
 
 def _require_finite(values: NDArray[np.floating], frame: int, what: str) -> None:
