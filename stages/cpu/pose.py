@@ -89,7 +89,7 @@ class PoseStage:
         self._vertices = [posed_vertices(packet.payload, self._counts) for packet in outputs]
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:  # noqa: ARG002
-        """Fill `outputs[slot_out]` for `frame`; the figure is how many avatars are visible. Unless work is full: a `Skip`.
+        """Fill `outputs[slot_out]` for `frame`; the figure is how many avatars are visible. A `Skip` but for full work.
 
         Raises ValueError without `slot_out`, TrilaneError when a number of the frame is not finite.
         """
