@@ -78,6 +78,7 @@ class PoseStage:
         self._projection = staged.camera.projection(scene.output.width / scene.output.height)
         self._counts = config.posed_vertices
         self._made: dict[Work, _Made] = {}
+        self._was_seen = [False] * len(self._actors)
         self._slots: list[NDArray[np.void]] = []
         self._vertices: list[list[NDArray[np.float32]]] = []
 
@@ -137,16 +138,13 @@ class PoseStage:
         packet["view"], packet["projection"] = view, self._projection
         clip = self._projection @ view
         vertices: Sequence[NDArray[np.float32] | None] = self._vertices[slot_out] or [None] * len(self._actors)
-        seen = [
-            (avatar, rect)
-            for index, actor in enumerate(self._actors)
-            if (
-                rect := _pose(
-                    actor, avatar := packet["avatars"][index], vertices[index], index, moved[index], frame, clip
-                )
-            )
-            is not None
-        ]
+        seen: list[tuple[NDArray[np.void], Rect]] = []
+        for index, actor in enumerate(self._actors):
+            avatar = packet["avatars"][index]
+            rect = _pose(actor, avatar, vertices[index], index, moved[index], frame, clip, self._was_seen[index])
+            self._was_seen[index] = rect is not None
+            if rect is not None:
+                seen.append((avatar, rect))
         self._lay_out(packet, seen)
         return bool(seen)
 
@@ -178,14 +176,17 @@ def _pose(
     moved: tuple[F64, F64],
     frame: int,
     clip: F64,
+    was_seen: bool,
 ) -> Rect | None:
-    """Fill one avatar's joints, and `vertices` if given; its rectangle on the screen, None when nothing is visible."""
+    """Fill one avatar's joints, and `vertices` if given; its rectangle on the screen, None when nothing is visible.
+
+    `was_seen`: in the last frame that was made; if not, it is looked for by its patches before it is skinned.
+    """
     pose, translation = moved
     posed: Posed = actor.skeleton.pose(pose, translation, actor.mover.world)
     _require_finite(posed.matrices, frame, f"joints of avatar {index}")
-    if not actor.bounds.may_be_seen(posed, clip):
-        rect = None
-    else:
+    rect = None
+    if was_seen or actor.bounds.may_be_seen(posed, clip):
         if actor.skinner is not None and vertices is not None:
             actor.skinner.skin_into(posed, vertices)
         rect = actor.bounds.rect(posed, clip, vertices)
