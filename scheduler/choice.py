@@ -110,9 +110,13 @@ class Choice:
 
     def _candidate(self, stage: StageState, now_ns: int) -> Candidate:
         """The frame that the stage would do next."""
-        if stage.input is None:
+        edge = stage.input
+        if edge is None:
             frame, release_ns = self._source.head(now_ns)
             return Candidate(frame, stage.position, self.deadline_from_ns(release_ns))
-        edge, slot = side_of(stage, next_slot(stage, self._frames))
+        if stage.bypassed is None:
+            slot = edge.ready[0]
+        else:
+            edge, slot = side_of(stage, next_slot(stage, self._frames))
         frame = edge.frame[slot]
         return Candidate(frame, stage.position, self._frames[frame].deadline_ns)

@@ -31,7 +31,7 @@ class LateFrames:
         if self._policy.newest:
             while len(edge.ready) > 1:
                 self._flow.drop_waiting(stage, edge.ready[0], DropCause.STALE)
-            while (slot := stale_slot(stage, self._flow.frames)) >= 0:
+            while stage.bypassed is not None and (slot := stale_slot(stage, self._flow.frames)) >= 0:
                 self._flow.drop_waiting(stage, slot, DropCause.STALE)
         if self._policy.drop_late:
             while (slot := next_slot(stage, self._flow.frames)) >= 0 and self._choice.is_late(stage, now_ns):

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from trilane.scheduler.completion import earliest_completion_ns
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import (
     Dispatch,
@@ -18,6 +19,7 @@ from trilane.scheduler.events import (
     UnitDied,
     UnitReady,
 )
+from trilane.scheduler.state import FrameState
 from trilane.scheduler.virtual import simulate
 from trilane.transport.slots import EdgeSlots, edge_rule
 from trilane.unexpected_value import UnexpectedValue
@@ -140,6 +142,22 @@ def test_what_is_lost_before_the_end_makes_the_next_frame_fresh() -> None:
     done = core.step(70, (JobDone("gpu", 6, 61, 69, 0),))
     assert done.actions == (Dispatch(Job(7, "cpu", "pose", 4, -1, 0, 2, False)),)
     assert core.ledger.skipped == 1
+
+
+def test_the_bound_on_a_frame_that_will_skip_is_that_of_its_own_way() -> None:
+    """Frame 0 is at net, 1 and 2 at pose. 2 skips after pose 1 and 2 (6), and waits for net 0 (7): show ends at 8.
+
+    If none skips, net does 0 and 1 (14), then 2 (21), show ends at 22. Frame 0 itself: 7 + 1.
+    """
+    core = Core(GRAPH, Settings(9))
+    for stage in core.stages:
+        stage.estimate_ns = TIMES[stage.name]
+    for number, position in enumerate((1, 0, 0)):
+        core.frames[number] = FrameState(0, 0)
+        core.frames[number].position = position
+    assert earliest_completion_ns(0, 2, 0, core.stages, core.frames, (0, 2)) == 8 * MS
+    assert earliest_completion_ns(0, 2, 0, core.stages, core.frames) == 22 * MS
+    assert earliest_completion_ns(0, 0, 1, core.stages, core.frames, (0, 2)) == 8 * MS
 
 
 def test_a_frame_that_skips_where_no_bypass_begins_is_a_drivers_defect() -> None:
