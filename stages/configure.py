@@ -27,6 +27,7 @@ from trilane.install import EGL_LINE
 from trilane.near_miss import did_you_mean
 from trilane.pipeline.shared_assets import Assets
 from trilane.scene.load import find_scene, load_scene, located, scene_from
+from trilane.scene.planner import TensorBudget
 from trilane.scene.schema import Scene
 from trilane.scene.staging import stage_scene
 from trilane.stages.avatar_assets import AvatarData, load_avatar, pack_assets, require_one_tensor
@@ -138,9 +139,11 @@ def configure(request: Request, out_dir: Path, gl: GlFacts = gl_facts) -> Checke
     require_one_tensor(list(avatars.values()))
     bodies = [avatars[folder].shaped for folder in folders]
     staged = stage_scene(scene, bodies, Path.cwd())
-    cuts = requested_cuts(request.split, avatars[folders[0]].network)
+    network = avatars[folders[0]].network
+    cuts = requested_cuts(request.split, network)
     unit, why = skinning_unit(request.skinning, gl)
-    foreseen = foresee(scene, staged, bodies, avatars[folders[0]].network) if scene.plans_tensor else None
+    budget = TensorBudget(network.shape[1] * network.shape[2], scene.most_side**2)
+    foreseen = foresee(scene, staged, bodies, network, budget) if scene.plans_tensor else None
     config = RunConfig(
         scene=scene,
         out_dir=out_dir,
@@ -148,6 +151,7 @@ def configure(request: Request, out_dir: Path, gl: GlFacts = gl_facts) -> Checke
         units=host_units(),
         runtime=runtime,
         shapes=foreseen.shapes.shapes if foreseen else (),
+        own_pixels=budget.own,
         posed_vertices=tuple(len(avatars[folder].shaped.vertices) for folder in folders) if unit == "cpu" else (),
         cuts=cuts,
     )
