@@ -95,6 +95,8 @@ def run_to_folder(
         with Interrupts() as late:  # from here on a signal waits until the folder is whole
             baseline, stopped = job.run_baseline(folder.work) if _is_complete(result) else (None, False)
             facts = {"made": made, "accuracy": dict(checked.accuracy), "notes": list(checked.notes)}
+            if checked.placement is not None:
+                facts["placement"] = checked.placement
             if plan.pace is not None:
                 from trilane.apps.pace import compare
 

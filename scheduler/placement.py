@@ -28,9 +28,11 @@ from typing import Final, NamedTuple
 FULL: Final = 1000
 #: Two threads on the siblings of a physical core do 1.25 times what one does: what vendors and SPEC rate runs show.
 SIBLINGS: Final = 1.25
-#: Assumed: a change of threads with what it evicts of the caches, and a move to another core's cold ones.
+#: Assumed: a change of threads, with the first-level cache; a move, with a second-level one of 2 MiB at 8 GB/s.
 CHANGE_NS: Final = 30_000
-MOVE_NS: Final = 100_000
+MOVE_NS: Final = 250_000
+#: Predictions this near to the shortest are as good: the model's own error is not less.
+WORTH: Final = 0.03
 #: What the scheduler takes for a job: measured as CPU time of its process (docs/decisions/placement.md).
 SCHEDULER_NS: Final = 100_000
 #: With more cores than this, no unit floats: there is a core for each.
@@ -98,9 +100,27 @@ def ranked(cores: Sequence[Core], times: Times, rules: Rules, fixed: Placement |
     return sorted(found, key=lambda each: (each.frame_ns, *_tie(each.placement, times)))
 
 
-def _tie(placement: Placement, times: Times) -> tuple[int, int, tuple[tuple[int, ...], ...]]:
+def chosen(found: Sequence[Ranked], rule: Ranked) -> Ranked:
+    """What to take of `found`, which is `ranked`: never one that is predicted longer than the `rule`'s.
+
+    `rule`: the placement for any run; it stays unless another is shorter by more than WORTH. Then, of those within
+    WORTH of the shortest, the one that shares least.
+    """
+    near = [each for each in found if each.frame_ns * (1 - WORTH) <= found[0].frame_ns]
+    if rule.frame_ns * (1 - WORTH) <= found[0].frame_ns:
+        return rule
+    return min(near, key=lambda each: _sharing(each.placement))
+
+
+def _tie(placement: Placement, times: Times) -> tuple[tuple[int, int], int, tuple[tuple[int, ...], ...]]:
     serial_ns = sum(times[unit][place.threads].serial_ns for unit, place in placement.items())
-    return len(shared_cores(placement)), serial_ns, tuple(place.cores for place in placement.values())
+    return _sharing(placement), serial_ns, tuple(place.cores for place in placement.values())
+
+
+def _sharing(placement: Placement) -> tuple[int, int]:
+    """How many cores are shared, and how often a unit has one of them: a unit that floats has more."""
+    shared = shared_cores(placement)
+    return len(shared), sum(len(shared.intersection(place.cores)) for place in placement.values())
 
 
 def shared_cores(placement: Placement) -> set[int]:

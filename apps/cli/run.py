@@ -46,6 +46,7 @@ Examples:
   trilane run --frames 60 --size 192 --out /tmp/run
   trilane run --motion walk.bvh --camera arkit.txt --frames 200 --json
   trilane run --latch 3
+  trilane run --cores cpu=1 --cores gpu=0 --cores dsp=0,1
   trilane run --split /Concat_4_output_0_QuantizeLinear_Output=cpu
   trilane run --performance-profile sustained_high_performance
   trilane run --profile snapdragon-888 --pace --slow-motion 24 --frames 60
@@ -79,6 +80,12 @@ SkinningOption = Annotated[
 SplitOption = Annotated[
     list[str] | None,
     typer.Option(help="TENSOR=UNIT: cut the network there, the rest runs on UNIT. `trilane avatar split` lists."),
+]
+CoresOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="UNIT=LIST: the unit's cores, such as dsp=0,1; once for each. Else they follow from measured times."
+    ),
 ]
 PacedProfileOption = Annotated[str | None, typer.Option("--profile", help=f"{PROFILE_HELP} With --pace.")]
 PaceOption = Annotated[bool, typer.Option("--pace", help="Hold each job until its modelled time has passed.")]
@@ -130,6 +137,7 @@ def run(
     runtime: RuntimeOption = "auto",
     skinning: SkinningOption = "auto",
     split: SplitOption = None,
+    cores: CoresOption = None,
     profile: PacedProfileOption = None,
     pace: PaceOption = False,
     slow_motion: SlowMotionOption = 1.0,
@@ -149,7 +157,9 @@ def run(
         from trilane.stages.configure import Request, configure
 
         cuts = tuple(split or ())
-        request = Request(scene, motion, camera, background, avatar, frames, size, runtime, hud, skinning, cuts)
+        request = Request(
+            scene, motion, camera, background, avatar, frames, size, runtime, hud, skinning, cuts, tuple(cores or ())
+        )
         checked = configure(request, Path.cwd(), gl)
         chip_pace = _pace(checked.config, profile, pace, slow_motion)
         cap = performance_profile and str(performance_profile)
@@ -201,16 +211,18 @@ def _run(checked: Checked, out: Path | None, plan: Plan, starter: UnitStarter, g
     from trilane.apps.run_folder import default_place
     from trilane.apps.run_job import run_to_folder
     from trilane.stages.configure import required_machine
+    from trilane.stages.placing import place
 
     if plan.pace is not None:
         checked = checked.changed(pace_ns=dict(plan.pace.stage_ns))
     target = out or default_place(checked.config.scene.name)
     with _hooks() as hooks:
-        for note in checked.notes:
-            hooks.message(note)
         try:
             made = made_facts(["trilane", *sys.argv[1:]])
             machine = required_machine(gl)
+            checked = place(checked, plan.policy, starter, str(machine["gl"]))
+            for note in checked.notes:
+                hooks.message(note)
             return run_to_folder(checked, target, plan, hooks, machine=machine, made=made, starter=starter)
         except KeyboardInterrupt:
             hooks.message("interrupted: nothing was written")
