@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from trilane.cache import cached_arrays
 from trilane.hw_profiles.host import host_cores, rule_placement, settings_of, usable_cores
+from trilane.hw_profiles.placement_facts import NS_PER_MS, described, placement_of, predictions, unit_rows
 from trilane.pipeline.rehearsal import rehearse
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.placement import Core, Place, Placement, Ranked, Rules, Times, Work, chosen, frame_ns, ranked
@@ -33,11 +34,9 @@ from trilane.units import BEFORE_INFER, UNITS
 #: Shorter runs do not gain what a rehearsal takes, about a second.
 LEAST_FRAMES = 100
 FRAMES = 5  # of the scene, evenly spread, that are rehearsed
-SHOWN = 8  # placements in the report, beside the chosen one
 CACHE = "placement-1"
 FIRST = BEFORE_INFER[0][1]
 SEQUENTIAL = "sequential"
-NS_PER_MS = 1e6
 
 RULE, MEASURED, ASKED = "rule", "measured", "asked"
 
@@ -53,33 +52,22 @@ def place(checked: Checked, policy: str, starter: UnitStarter, driver: str = "")
     rule = rule_placement(usable_cores(), checked.asked_cores)
     why = _why_not(checked, cores)
     if why:
-        facts = {"how": ASKED if len(asked) == len(UNITS) else RULE, "why": why, **_units(rule)}
+        facts = {"how": ASKED if len(asked) == len(UNITS) else RULE, "why": why, "units": unit_rows(rule)}
         return _placed(checked, rule, facts)
     times, at = _times(checked, cores, rule, starter, driver)
     rules = Rules(FIRST, policy == SEQUENTIAL)
     found = ranked(cores, times, rules, asked)
     by_rule = Ranked(rule, frame_ns(rule, cores, times, rules))
     best = chosen(found, by_rule)
-    facts = {
+    facts: dict[str, Any] = {
         "how": MEASURED,
         "why": "as asked, the others by their times" if asked else "the least predicted frame time",
-        **_units(best.placement),
+        "units": unit_rows(best.placement),
         "measured_at": at,
         **predictions(best, by_rule, found),
         "times": times_rows(times),
     }
     return _placed(checked, best.placement, facts)
-
-
-def predictions(best: Ranked, rule: Ranked, found: Sequence[Ranked]) -> dict[str, Any]:
-    """The keys of the report that were computed: frame times in ms of the placement that was taken and of others."""
-    others = [each for each in found if each.placement != best.placement][:SHOWN]
-    return {
-        "predicted_ms": best.frame_ns / NS_PER_MS,
-        "rule_ms": rule.frame_ns / NS_PER_MS,
-        "rule": _units(rule.placement)["units"],
-        "alternatives": [{**_units(each.placement), "predicted_ms": each.frame_ns / NS_PER_MS} for each in others],
-    }
 
 
 def times_rows(times: Times) -> list[dict[str, Any]]:
@@ -89,22 +77,6 @@ def times_rows(times: Times) -> list[dict[str, Any]]:
         for unit, works in times.items()
         for threads, work in works.items()
     ]
-
-
-def described(placement: Placement) -> str:
-    """Such as `cpu 0, gpu 1, dsp 0,1 (2 threads)`."""
-    return ", ".join(f"{unit} {_cores(place)}" for unit, place in placement.items())
-
-
-def _cores(place: Place) -> str:
-    listed = ",".join(map(str, place.cores))
-    if len(place.cores) == 1:
-        return listed
-    return f"{listed} ({place.threads} thread{'s' if place.threads > 1 else ''})"
-
-
-def _units(placement: Placement) -> dict[str, Any]:
-    return {"units": {unit: {"cores": list(own.cores), "threads": own.threads} for unit, own in placement.items()}}
 
 
 def _why_not(checked: Checked, cores: Sequence[Core]) -> str:
@@ -130,13 +102,13 @@ def _reason(facts: Mapping[str, Any]) -> str:
     if facts["how"] != MEASURED:
         return str(facts["why"])
     text = f"{facts['why']}: {facts['predicted_ms']:.1f} ms, by times of {facts['measured_at']}"
-    beside = [f"{_text(facts['rule'])}: {facts['rule_ms']:.1f}"] if facts["rule"] != facts["units"] else []
-    beside += [f"{_text(row['units'])}: {row['predicted_ms']:.1f}" for row in facts["alternatives"][:2]]
+    beside = (
+        [f"{described(placement_of(facts['rule']))}: {facts['rule_ms']:.1f}"] if facts["rule"] != facts["units"] else []
+    )
+    beside += [
+        f"{described(placement_of(row['units']))}: {row['predicted_ms']:.1f}" for row in facts["alternatives"][:2]
+    ]
     return f"{text}; {'; '.join(dict.fromkeys(beside))}" if beside else text
-
-
-def _text(units: Mapping[str, Any]) -> str:
-    return described({unit: Place(tuple(row["cores"]), row["threads"]) for unit, row in units.items()})
 
 
 def _times(

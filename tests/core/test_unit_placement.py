@@ -100,10 +100,11 @@ def test_threads_on_shared_cores_wait_for_the_slowest() -> None:
 
 
 def test_a_network_that_is_much_the_slowest_has_threads_on_both_cores() -> None:
+    """T (1 - 25/T) = 130 with the others on one of the cores, T (1 - 8/T)(1 - 17/T) = 130 with one on each."""
     of = times(8, 17, {1: 250, 2: 130})
-    best = chosen(ranked(equal(2), of, FIRST), Ranked(on(0, 0, 1), 250 * MS))
-    assert best.placement == on(0, 1, (0, 1), 2)
-    assert (best.frame_ns / MS - 8) * (best.frame_ns / MS - 17) == pytest.approx(130 * best.frame_ns / MS, rel=1e-6)
+    found = ranked(equal(2), of, FIRST)
+    assert chosen(found, Ranked(on(0, 0, 1), 250 * MS)) == Ranked(on(0, 0, (0, 1), 2), 155 * MS)
+    assert ms(on(0, 1, (0, 1), 2), of, equal(2)) == pytest.approx((155 + (155**2 - 4 * 136) ** 0.5) / 2)
 
 
 def test_on_three_cores_each_unit_has_one_if_they_need_as_much() -> None:
@@ -236,7 +237,7 @@ def machines(draw: st.DrawFn) -> tuple[list[Core], Times]:
     return cores, times(draw(POSITIVE), draw(POSITIVE), network)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(machines(), st.booleans())
 def test_what_is_chosen_is_never_predicted_worse_than_the_rule(machine: tuple[list[Core], Times], one: bool) -> None:
     cores, of = machine
@@ -247,7 +248,7 @@ def test_what_is_chosen_is_never_predicted_worse_than_the_rule(machine: tuple[li
     assert found[0].frame_ns * (1 + 0.04) >= chosen(found, rule).frame_ns
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(machines(), st.randoms(use_true_random=False), st.booleans())
 def test_which_number_a_core_has_changes_no_prediction(
     machine: tuple[list[Core], Times], random: Random, one: bool
@@ -260,7 +261,7 @@ def test_which_number_a_core_has_changes_no_prediction(
     assert [each.frame_ns for each in before] == [each.frame_ns for each in after]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(machines(), st.sampled_from(["cpu", "gpu", "dsp"]), st.integers(1, 50), st.booleans())
 def test_more_work_never_makes_a_frame_shorter(
     machine: tuple[list[Core], Times], unit: str, more: int, one: bool
