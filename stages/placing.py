@@ -47,19 +47,19 @@ def place(checked: Checked, policy: str, starter: UnitStarter, driver: str = "")
     `policy`: of the run. `starter`: a fork server. `driver`: OpenGL's, which the times depend on.
     Raises TrilaneError when a unit cannot start or a stage fails, KeyboardInterrupt when interrupted.
     """
-    cores = host_cores(sorted({*usable_cores(), *(core for own in checked.asked_cores.values() for core in own)}))
     asked = {unit: Place(own, len(own)) for unit, own in checked.asked_cores.items()}
+    cores = host_cores(sorted({*usable_cores(), *(core for place in asked.values() for core in place.cores)}))
     rule = rule_placement(usable_cores(), checked.asked_cores)
     why = _why_not(checked, cores)
     if why:
-        facts = {"how": ASKED if len(asked) == len(UNITS) else RULE, "why": why, "units": unit_rows(rule)}
-        return _placed(checked, rule, facts)
-    times, at = _times(checked, cores, rule, starter, driver)
+        how = ASKED if len(asked) == len(UNITS) else RULE
+        return _placed(checked, rule, {"how": how, "why": why, "units": unit_rows(rule)})
+    times, at = _kept_times(checked, cores, rule, starter, driver)
     rules = Rules(FIRST, policy == SEQUENTIAL)
     found = ranked(cores, times, rules, asked)
     by_rule = Ranked(rule, frame_ns(rule, cores, times, rules))
     best = chosen(found, by_rule)
-    facts: dict[str, Any] = {
+    facts = {
         "how": MEASURED,
         "why": "as asked, the others by their times" if asked else "the least predicted frame time",
         "units": unit_rows(best.placement),
@@ -101,33 +101,27 @@ def _placed(checked: Checked, placement: Placement, facts: Mapping[str, Any]) ->
 def _reason(facts: Mapping[str, Any]) -> str:
     if facts["how"] != MEASURED:
         return str(facts["why"])
-    text = f"{facts['why']}: {facts['predicted_ms']:.1f} ms, by times of {facts['measured_at']}"
-    beside = (
-        [f"{described(placement_of(facts['rule']))}: {facts['rule_ms']:.1f}"] if facts["rule"] != facts["units"] else []
-    )
-    beside += [
-        f"{described(placement_of(row['units']))}: {row['predicted_ms']:.1f}" for row in facts["alternatives"][:2]
-    ]
-    return f"{text}; {'; '.join(dict.fromkeys(beside))}" if beside else text
+    others = [(row["units"], row["predicted_ms"]) for row in facts["alternatives"][:2]]
+    if facts["rule"] not in (facts["units"], *(units for units, _ in others)):
+        others.insert(0, (facts["rule"], facts["rule_ms"]))
+    text = f"{facts['why']}: {facts['predicted_ms']:.1f} ms by times of {facts['measured_at']}"
+    return "; ".join([text, *(f"{described(placement_of(units))}: {ms:.1f}" for units, ms in others)])
 
 
-def _times(
+def _kept_times(
     checked: Checked, cores: Sequence[Core], rule: Placement, starter: UnitStarter, driver: str
 ) -> tuple[Times, str]:
     """What each unit needs for a frame, and when that was measured, UTC."""
-    fastest = [core.number for core in sorted(cores, key=lambda core: (-core.permille, core.number))]
-    counts = thread_counts(len(cores), rule)
 
     def measured() -> dict[str, NDArray[Any]]:
-        works = _rehearsed(checked, fastest, counts, starter)
         rows = [
             (UNITS.index(unit), threads, *work)
-            for unit, of_threads in works.items()
-            for threads, work in of_threads.items()
+            for unit, works in measured_times(checked, cores, rule, starter).items()
+            for threads, work in works.items()
         ]
         return {"works": np.array(rows, np.int64), "at_s": np.array(time.time(), np.int64)}
 
-    made = cached_arrays(CACHE, [*_made_from(checked, cores, counts), driver], measured)
+    made = cached_arrays(CACHE, [*_made_from(checked, cores, rule), driver], measured)
     times: dict[str, dict[int, Work]] = {unit: {} for unit in UNITS}
     for unit, threads, *work in made["works"].tolist():
         times[UNITS[unit]][threads] = Work(*work)
@@ -145,37 +139,39 @@ def thread_counts(cores: int, rule: Placement) -> dict[str, list[int]]:
     return {unit: sorted(count for count in of if count > 1) for unit, of in counts.items()}
 
 
-def _made_from(checked: Checked, cores: Sequence[Core], counts: Mapping[str, Sequence[int]]) -> list[str]:
+def _made_from(checked: Checked, cores: Sequence[Core], rule: Placement) -> list[str]:
     """All that the times depend on."""
     config = checked.config
     said = config.model_dump_json(exclude={"out_dir", "units", "scene", "pace_ns"})
     scene = config.scene.model_dump_json(exclude={"name", "frames", "fps"})
-    machine = [str(cpu_facts()), str([tuple(core) for core in cores]), str(counts)]
+    machine = [str(cpu_facts()), str([tuple(core) for core in cores]), str(thread_counts(len(cores), rule))]
     network = network_of(checked.assets).digest
     return [said, scene, *machine, network, load_runtime(config.runtime).version(), str(package_version("trilane"))]
 
 
-def _rehearsed(
-    checked: Checked, fastest: Sequence[int], counts: Mapping[str, Sequence[int]], starter: UnitStarter
-) -> dict[str, dict[int, Work]]:
-    """Rehearse with one of the scene's tensor shapes, which is prepared soonest; all have about the same area."""
+def measured_times(checked: Checked, cores: Sequence[Core], rule: Placement, starter: UnitStarter) -> Times:
+    """What each unit needs for a frame, measured now.
+
+    `checked`: what is to be run. `cores`: there are. `rule`: whose numbers of threads are measured too. `starter`: a
+    fork server. One of the scene's tensor shapes is used, which is prepared soonest; all have about the same area.
+    Raises as `place`.
+    """
+    fastest = [core.number for core in sorted(cores, key=lambda core: (-core.permille, core.number))]
     one = {unit: Place((fastest[0],), 1) for unit in UNITS}
     variants = [
-        {**one, unit: Place(tuple(sorted(fastest[:count])), count)} for unit, of in counts.items() for count in of
+        {**one, unit: Place(tuple(sorted(fastest[:count])), count)}
+        for unit, counts in thread_counts(len(cores), rule).items()
+        for count in counts
     ]
-    frames = checked.config.scene.frames
+    scene = checked.config.scene
     with tempfile.TemporaryDirectory(prefix="trilane-rehearsal-") as folder:
-        config = checked.config.model_copy(
-            update={
-                "out_dir": Path(folder),
-                "scene": checked.config.scene.model_copy(update={"size": _one_shape(checked.config)}),
-            }
-        )
+        one_shape = scene.model_copy(update={"size": _one_shape(checked.config)})
+        config = checked.config.model_copy(update={"out_dir": Path(folder), "scene": one_shape})
         first, *others = (
-            avatar_pipeline(config.model_copy(update={"units": _spinning(placement, len(fastest))}), checked.assets)
+            avatar_pipeline(config.model_copy(update={"units": _spinning(placement, len(cores))}), checked.assets)
             for placement in (one, *variants)
         )
-        spread = [number * frames // FRAMES for number in range(FRAMES)]
+        spread = [number * scene.frames // FRAMES for number in range(FRAMES)]
         return rehearse(first, others, spread, checked.assets, starter)
 
 
