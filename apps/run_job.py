@@ -23,6 +23,7 @@ from trilane.pipeline.signals import Interrupts
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.stages.avatar_pipeline import run_avatar
 from trilane.stages.configure import Checked
+from trilane.stages.placing import placed
 
 if TYPE_CHECKING:
     from trilane.apps.pace import Pace
@@ -85,10 +86,13 @@ def run_to_folder(
     `hooks`: who is told.
     `machine`: what `machine_facts` said.
     `made`: what `trilane.apps.made.made_facts` said of the command line; None where there is none.
-    `starter`: a fork server that was started earlier.
+    `starter`: a fork server that was started earlier; without one, the units stay where `checked` has them.
     Raises BadInputError when `target` cannot be written, and TrilaneError when no frame was presented.
     """
     with RunFolder(target) as folder:
+        if starter is not None:
+            checked = placed(checked, plan.policy, starter, str(machine.get("gl")))
+            hooks.message(checked.notes[-1])
         threading.Thread(target=_import_writers, name="imports", daemon=True).start()
         job = _Job(checked, plan, hooks, starter)
         result = job.run(folder.work)

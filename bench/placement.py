@@ -33,18 +33,18 @@ from trilane.stages.placing import FIRST, measured_times, times_rows
 from trilane.units import BURST
 
 MIN_FRAMES = 20
-ISOLATED = 4  # frames of each run of a finalist that are measured isolated
+ISOLATED = 2  # frames of each run of a finalist that are measured isolated
 VIRTUAL_CORES = (1, 2, 3, 4, 8)
 POLICY, EDGE = "pipelined", "double"
 
 
 def measure(
     avatar: str = "default",
-    size: tuple[str, ...] = ("256", "512"),
+    size: tuple[str, ...] = ("256x256", "512x512"),
     cores: tuple[int, ...] = (0,),
-    frames: int = 60,
+    frames: int = 48,
     rounds: int = 6,
-    finalists: int = 3,
+    finalists: int = 2,
     runtime: str = "auto",
 ) -> dict[str, Any]:
     """A row for each size, number of cores and placement; frame times are medians of the runs' means.

@@ -41,7 +41,7 @@ SEQUENTIAL = "sequential"
 RULE, MEASURED, ASKED = "rule", "measured", "asked"
 
 
-def place(checked: Checked, policy: str, starter: UnitStarter, driver: str = "") -> Checked:
+def placed(checked: Checked, policy: str, starter: UnitStarter, driver: str = "") -> Checked:
     """`checked` with its units on the cores that are best for it, and what is to be said of that.
 
     `policy`: of the run. `starter`: a fork server. `driver`: OpenGL's, which the times depend on.
@@ -53,7 +53,7 @@ def place(checked: Checked, policy: str, starter: UnitStarter, driver: str = "")
     why = _why_not(checked, cores)
     if why:
         how = ASKED if len(asked) == len(UNITS) else RULE
-        return _placed(checked, rule, {"how": how, "why": why, "units": unit_rows(rule)})
+        return _with(checked, rule, {"how": how, "why": why, "units": unit_rows(rule)})
     times, at = _kept_times(checked, cores, rule, starter, driver)
     rules = Rules(FIRST, policy == SEQUENTIAL)
     found = ranked(cores, times, rules, asked)
@@ -67,7 +67,7 @@ def place(checked: Checked, policy: str, starter: UnitStarter, driver: str = "")
         **predictions(best, by_rule, found),
         "times": times_rows(times),
     }
-    return _placed(checked, best.placement, facts)
+    return _with(checked, best.placement, facts)
 
 
 def times_rows(times: Times) -> list[dict[str, Any]]:
@@ -92,7 +92,7 @@ def _why_not(checked: Checked, cores: Sequence[Core]) -> str:
     return ""
 
 
-def _placed(checked: Checked, placement: Placement, facts: Mapping[str, Any]) -> Checked:
+def _with(checked: Checked, placement: Placement, facts: Mapping[str, Any]) -> Checked:
     note = f"placement: {described(placement)} ({_reason(facts)})"
     config = checked.config.model_copy(update={"units": settings_of(placement)})
     return replace(checked, config=config, notes=(*checked.notes, note), placement=facts)
@@ -154,7 +154,7 @@ def measured_times(checked: Checked, cores: Sequence[Core], rule: Placement, sta
 
     `checked`: what is to be run. `cores`: there are. `rule`: whose numbers of threads are measured too. `starter`: a
     fork server. One of the scene's tensor shapes is used, which is prepared soonest; all have about the same area.
-    Raises as `place`.
+    Raises as `placed`.
     """
     fastest = [core.number for core in sorted(cores, key=lambda core: (-core.permille, core.number))]
     one = {unit: Place((fastest[0],), 1) for unit in UNITS}

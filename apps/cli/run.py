@@ -211,18 +211,16 @@ def _run(checked: Checked, out: Path | None, plan: Plan, starter: UnitStarter, g
     from trilane.apps.run_folder import default_place
     from trilane.apps.run_job import run_to_folder
     from trilane.stages.configure import required_machine
-    from trilane.stages.placing import place
 
     if plan.pace is not None:
         checked = checked.changed(pace_ns=dict(plan.pace.stage_ns))
     target = out or default_place(checked.config.scene.name)
     with _hooks() as hooks:
+        for note in checked.notes:
+            hooks.message(note)
         try:
             made = made_facts(["trilane", *sys.argv[1:]])
             machine = required_machine(gl)
-            checked = place(checked, plan.policy, starter, str(machine["gl"]))
-            for note in checked.notes:
-                hooks.message(note)
             return run_to_folder(checked, target, plan, hooks, machine=machine, made=made, starter=starter)
         except KeyboardInterrupt:
             hooks.message("interrupted: nothing was written")
