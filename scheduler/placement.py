@@ -6,7 +6,7 @@ frame, and how long each of its cores is taken meanwhile. With T the frame time,
 - *A unit does one job at a time.* Its jobs of a frame take at most T.
 - *A core does one thing at a time.* What the units need of it is at most T. A unit with one thread and several cores
   *floats*: the kernel runs it where there is room. So for every set of cores, what cannot go elsewhere is at most what
-  they can do in T (Hall's condition: then, and only then, is there a way to divide it).
+  they can do in T (Hall's condition: then, and only then, is there a way to divide it), less what the kernel misses.
 - *Each of a job's parallel regions waits for its slowest thread.* Where others have core c for the share o(c) of the
   time, a job of several threads goes on only while all its cores are free: a share of the product of 1 - o(c) over its
   cores, as if the others came independently. So much longer it takes, and that is at most T too.
@@ -14,8 +14,8 @@ frame, and how long each of its cores is taken meanwhile. With T the frame time,
 
 The least such T is the answer. A sequential run has one stage at work at any time: T is the sum, and nothing waits.
 
-Every job of a unit on a shared core costs a change of threads more, one of a floating unit a move. What the scheduler
-takes of the cores that it runs on counts like a unit's work that nothing waits for.
+Every job of a unit on a shared core costs a change of threads more; and a floating unit is moved by every job of others
+that begins where it runs. What the scheduler takes of its cores counts like work that nothing waits for.
 """
 
 from __future__ import annotations
@@ -33,6 +33,9 @@ CHANGE_NS: Final = 30_000
 MOVE_NS: Final = 250_000
 #: Predictions this near to the shortest are as good: the model's own error is not less.
 WORTH: Final = 0.03
+#: Assumed, of what several cores can do for units that float: the kernel moves a waiting thread to a core that has just
+#: become idle, a running one hardly ever; so a core may idle while a unit that has no other one waits.
+ROOM_USED: Final = 0.9
 #: What the scheduler takes for a job: measured as CPU time of its process (docs/decisions/placement.md).
 SCHEDULER_NS: Final = 100_000
 #: With more cores than this, no unit floats: there is a core for each.
@@ -90,14 +93,14 @@ class Ranked(NamedTuple):
 def ranked(cores: Sequence[Core], times: Times, rules: Rules, fixed: Placement | None = None) -> list[Ranked]:
     """All placements, the smallest frame time first.
 
-    Ties go to fewer shared cores, then to less time in all stages together (latency), then to lower numbers.
+    Ties go to fewer shared cores, then less work that floats, less time in all stages (latency), lower numbers.
 
     `fixed`: places that are given. Raises ValueError for no cores, or a unit of which no number of threads fits.
     """
     found = [Ranked(each, frame_ns(each, cores, times, rules)) for each in placements(cores, times, fixed or {})]
     if not found:
         raise ValueError("no placement: a unit has no number of threads that fits the cores")
-    return sorted(found, key=lambda each: (each.frame_ns, *_tie(each.placement, times)))
+    return sorted(found, key=lambda each: (each.frame_ns, _tie(each.placement, times)))
 
 
 def chosen(found: Sequence[Ranked], rule: Ranked) -> Ranked:
@@ -112,9 +115,11 @@ def chosen(found: Sequence[Ranked], rule: Ranked) -> Ranked:
     return min(near, key=lambda each: _sharing(each.placement))
 
 
-def _tie(placement: Placement, times: Times) -> tuple[tuple[int, int], int, tuple[tuple[int, ...], ...]]:
-    serial_ns = sum(times[unit][place.threads].serial_ns for unit, place in placement.items())
-    return _sharing(placement), serial_ns, tuple(place.cores for place in placement.values())
+def _tie(placement: Placement, times: Times) -> tuple[tuple[int, ...], tuple[tuple[int, ...], ...]]:
+    works = {unit: times[unit][place.threads] for unit, place in placement.items()}
+    floating_ns = sum(works[unit].core_ns for unit, place in placement.items() if place.threads < len(place.cores))
+    total_ns = sum(work.serial_ns for work in works.values())
+    return (*_sharing(placement), floating_ns, total_ns), tuple(place.cores for place in placement.values())
 
 
 def _sharing(placement: Placement) -> tuple[int, int]:
@@ -250,23 +255,30 @@ class _Model:
     def __init__(self, placement: Placement, cores: Sequence[Core], times: Times, rules: Rules) -> None:
         self._speed = {core.number: core.permille / FULL for core in cores}
         self._physical = {core.number: core.physical for core in cores}
-        shared = shared_cores(placement)
-        self._units = [self._load(place, times[unit][place.threads], shared) for unit, place in placement.items()]
-        jobs = sum(times[unit][place.threads].jobs for unit, place in placement.items())
+        works = {unit: times[unit][place.threads] for unit, place in placement.items()}
+        self._units = []
+        for unit, place in placement.items():
+            beside = [other for other, its in placement.items() if other != unit and set(its.cores) & set(place.cores)]
+            moves = sum(works[other].jobs for other in beside) if place.threads < len(place.cores) else 0
+            changes = works[unit].jobs if beside else 0
+            self._units.append(self._load(place, works[unit], changes * CHANGE_NS + moves * MOVE_NS))
+        jobs = sum(work.jobs for work in works.values())
         where = placement[rules.first].cores
         self._scheduler_ns = float(jobs * SCHEDULER_NS)
         taken_ns = self._scheduler_ns / min(self._speed[core] for core in where)
         self._loads = [*self._units, _Load(where, 0.0, taken_ns, taken_ns, len(where) > 1)]
 
-    def _load(self, place: Place, work: Work, shared: set[int]) -> _Load:
-        """The unit's needs on these very cores: the slowest decides, and siblings of which both are used are slower."""
+    def _load(self, place: Place, work: Work, cost_ns: int) -> _Load:
+        """The unit's needs on these very cores: the slowest decides, and siblings of which both are used are slower.
+
+        `cost_ns`: what others on its cores cost it.
+        """
         floats = place.threads < len(place.cores)
         speed = min(self._speed[core] for core in place.cores)
         physical = [self._physical[core] for core in place.cores]
         was_measured_so = len(physical) > len(list(self._physical_cores))
         both = not floats and len(set(physical)) < len(physical) and not was_measured_so
         slower = 2 / SIBLINGS if both else 1.0
-        cost_ns = work.jobs * (CHANGE_NS * bool(shared & set(place.cores)) + MOVE_NS * floats)
         serial_ns, core_ns = work.serial_ns / speed + cost_ns, work.core_ns / speed + cost_ns
         return _Load(place.cores, serial_ns * slower, core_ns * slower, core_ns, floats)
 
@@ -288,12 +300,14 @@ class _Model:
     def _crowded(self) -> Iterator[float]:
         """For each set of cores that can be too full, what it needs over what it can do."""
         floating = [load for load in self._loads if load.floats]
-        sets = [frozenset([core]) for core in self._speed]
-        sets += [frozenset(core for core in self._speed if self._physical[core] == one) for one in self._physical_cores]
+        sets = {frozenset([core]): 1.0 for core in self._speed}
+        for one in self._physical_cores:
+            sets[frozenset(core for core in self._speed if self._physical[core] == one)] = 1.0
         for count in range(1, len(floating) + 1):
-            sets += [frozenset().union(*(load.cores for load in some)) for some in combinations(floating, count)]
-        for these in dict.fromkeys(sets):
-            yield sum(self._within(load, these) for load in self._loads) / self._capacity(these)
+            for some in combinations(floating, count):
+                sets[frozenset().union(*(load.cores for load in some))] = ROOM_USED
+        for these, used in sets.items():
+            yield sum(self._within(load, these) for load in self._loads) / (self._capacity(these) * used)
 
     @property
     def _physical_cores(self) -> Iterable[int]:

@@ -27,7 +27,7 @@ from trilane.stages.avatar_assets import network_of
 from trilane.stages.avatar_pipeline import avatar_pipeline
 from trilane.stages.config import RunConfig
 from trilane.stages.configure import Checked
-from trilane.stages.dsp.runtime import load_runtime
+from trilane.stages.dsp.runtime import RUNTIMES
 from trilane.stages.machine_facts import cpu_facts, package_version
 from trilane.units import BEFORE_INFER, UNITS
 
@@ -146,7 +146,8 @@ def _made_from(checked: Checked, cores: Sequence[Core], rule: Placement) -> list
     scene = config.scene.model_dump_json(exclude={"name", "frames", "fps"})
     machine = [str(cpu_facts()), str([tuple(core) for core in cores]), str(thread_counts(len(cores), rule))]
     network = network_of(checked.assets).digest
-    return [said, scene, *machine, network, load_runtime(config.runtime).version(), str(package_version("trilane"))]
+    versions = [str(package_version(name)) for name in (RUNTIMES[config.runtime].package, "trilane")]
+    return [said, scene, *machine, network, *versions]
 
 
 def measured_times(checked: Checked, cores: Sequence[Core], rule: Placement, starter: UnitStarter) -> Times:

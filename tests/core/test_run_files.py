@@ -394,7 +394,9 @@ def test_the_whole_table_is_as_it_was() -> None:
         "ratio": 1.0116,
     }
     temperature = {"sensor": None, "kind": "modelled", "device_end": 30.0, "device_max": 31.0, "junction_max": 44.5}
-    report = make_report(made=made, caps=caps, pace=pace, temperature_c=temperature, fps_low=48.0, fps_high=52.0)
+    report = make_report(
+        made=made, caps=caps, pace=pace, temperature_c=temperature, fps_low=48.0, fps_high=52.0, core_efficiency=0.93
+    )
     text = table_text(report).splitlines()
     file = Path(__file__).with_name("printed") / "run-table.txt"
     if "TRILANE_WRITE_PRINTED" in os.environ:

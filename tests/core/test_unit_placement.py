@@ -42,6 +42,7 @@ def without_costs(monkeypatch: pytest.MonkeyPatch) -> None:
     """By hand, nothing but the work counts; one test is about the costs."""
     for name in ("SCHEDULER_NS", "CHANGE_NS", "MOVE_NS"):
         monkeypatch.setattr(placement, name, 0)
+    monkeypatch.setattr(placement, "ROOM_USED", 1.0)
 
 
 def equal(count: int) -> list[Core]:
@@ -172,11 +173,19 @@ def test_what_a_change_of_threads_a_move_and_the_scheduler_take(monkeypatch: pyt
     monkeypatch.setattr(placement, "CHANGE_NS", MS)
     assert [ms(on(0, 0, 1), of, equal(2)), ms(on(0, 1, 0), of, equal(2))] == [20, 28]
     monkeypatch.setattr(placement, "MOVE_NS", 2 * MS)
-    assert ms(on(0, 0, (0, 1)), of, equal(2)) == 23
+    assert ms(on(0, 0, (0, 1)), of, equal(2)) == 20 + 1 + 4 * 2  # four jobs of the others may move it
     monkeypatch.setattr(placement, "SCHEDULER_NS", 4 * MS)
     assert ms(on(0, 0, 1), of, equal(2)) == 5 + 10 + 4 + 5 * 4
     assert ms(on(0, 0, 1), of, equal(2), Rules("dsp")) == 20 + 5 * 4
     assert ms(on(0, 1, 2), of, equal(3), Rules("cpu", sequential=True)) == 35 + 5 * 4
+
+
+def test_of_what_cores_can_do_for_units_that_float_a_tenth_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(placement, "ROOM_USED", 0.9)
+    of = times(9, 9, 9)
+    assert ms(on((0, 1), 0, 1), of, equal(2)) == 15  # 27 / 2 / 0.9
+    assert ms(on(0, 0, 1), of, equal(2)) == 18
+    assert ranked(equal(2), of, FIRST)[0].placement == on(0, (0, 1), 1)
 
 
 def test_ties_go_to_fewer_shared_cores_then_to_lower_numbers() -> None:
