@@ -13,6 +13,7 @@ from statistics import median
 from typing import Any
 
 from trilane.avatars.network_reshape import reshaped
+from trilane.bench.lib import full_width
 from trilane.errors import BadInputError, TrilaneError
 from trilane.hw_profiles.application import Plan, Variant, steady
 from trilane.hw_profiles.host import host_cores, rule_placement, settings_of, usable_cores
@@ -69,16 +70,17 @@ def measure(
     rows: list[dict[str, Any]] = []
     sizes: list[dict[str, Any]] = []
     virtual: list[dict[str, Any]] = []
+    folder = str(full_width.full_width_bundle()) if avatar == full_width.NAME else avatar
     with UnitStarter(PRELOAD) as starter:
         for tensor in size:
-            checked = configure(Request(size=tensor, avatar=avatar, frames=frames, runtime=runtime), Path.cwd())
+            checked = configure(Request(size=tensor, avatar=folder, frames=frames, runtime=runtime), Path.cwd())
             for count in counts:
                 tried = _Trial(checked, host_cores(usable_cores()[:count]), starter)
                 tried.run(rounds, finalists)
                 named = {"size": tensor, "cores": count}
                 rows += [{**named, **row} for row in tried.rows()]
                 sizes.append({**named, **tried.summary()})
-            virtual += [{"size": tensor, **_virtual(checked, tensor, count)} for count in VIRTUAL_CORES]
+            virtual += [{"size": tensor, **_virtual(checked, avatar, count)} for count in VIRTUAL_CORES]
     config = {"avatar": avatar, "frames": frames, "rounds": rounds, "finalists": finalists, "runtime": runtime}
     return {"rows": rows, "sizes": sizes, "virtual": virtual, "config": config}
 
@@ -189,12 +191,12 @@ def _interval(prefix: str, values: Sequence[float]) -> dict[str, float]:
     return {f"{prefix}low": low, f"{prefix}high": high}
 
 
-def _virtual(checked: Checked, size: str, count: int) -> Mapping[str, Any]:
+def _virtual(checked: Checked, avatar: str, count: int) -> Mapping[str, Any]:
     """What virtual time says of the placements on `count` equal cores without siblings."""
     height, width = min(checked.config.buckets, key=lambda shape: (abs(shape[0] - shape[1]), shape))
     network = reshaped(network_of(checked.assets), height, width)
     _, _, _, channels = network.shape
-    work = Network({"avatar": size}, height, width, channels, "packed", count_work(network.model))
+    work = Network({"avatar": avatar}, height, width, channels, "packed", count_work(network.model))
     profile, plan = load_profile(HOST), Plan(work, "dsp", Variant(POLICY, EDGE))
     corners = corners_of(profile, BURST)
     placed = place_units(profile, plan, corners, [Core(number, number) for number in range(count)])

@@ -26,7 +26,7 @@ from math import prod
 from typing import Final, NamedTuple
 
 FULL: Final = 1000
-#: Two threads on the siblings of a physical core do 1.25 times what one does: what vendors and SPEC rate runs show.
+#: Assumed: what two threads on the siblings of a physical core do together, over what one alone does.
 SIBLINGS: Final = 1.25
 #: Assumed: a change of threads, with the first-level cache; a move, with a second-level one of 2 MiB at 8 GB/s.
 CHANGE_NS: Final = 30_000
