@@ -119,13 +119,13 @@ def _tie(placement: Placement, times: Times) -> tuple[tuple[int, ...], tuple[tup
     works = {unit: times[unit][place.threads] for unit, place in placement.items()}
     floating_ns = sum(works[unit].core_ns for unit, place in placement.items() if place.threads < len(place.cores))
     total_ns = sum(work.serial_ns for work in works.values())
-    return (*_sharing(placement), floating_ns, total_ns), tuple(place.cores for place in placement.values())
+    return (_sharing(placement), floating_ns, total_ns), tuple(place.cores for place in placement.values())
 
 
-def _sharing(placement: Placement) -> tuple[int, int]:
-    """How many cores are shared, and how often a unit has one of them: a unit that floats has more."""
+def _sharing(placement: Placement) -> int:
+    """How often a unit has a core that is shared: more with each shared core, and with each unit that floats there."""
     shared = shared_cores(placement)
-    return len(shared), sum(len(shared.intersection(place.cores)) for place in placement.values())
+    return sum(len(shared.intersection(place.cores)) for place in placement.values())
 
 
 def shared_cores(placement: Placement) -> set[int]:

@@ -152,6 +152,7 @@ def test_two_threads_on_one_physical_core_are_slower_than_on_two() -> None:
     of = times(1, 1, {2: 10})
     assert ms(on(2, 3, (0, 4), 2), of, cores) == 10
     assert ms(on(2, 3, (0, 1), 2), of, cores) == 16
+    assert ms(on(2, 3, (0, 1), 2), of, cores, Rules("cpu", sequential=True)) == 1 + 1 + 16
 
 
 def test_the_slowest_unit_has_the_fastest_core() -> None:
@@ -159,6 +160,14 @@ def test_the_slowest_unit_has_the_fastest_core() -> None:
     best = ranked(cores, times(4, 5, 20), FIRST)[0]
     assert best == Ranked(on(0, 1, 2), 20 * MS)
     assert ms(on(2, 1, 0), times(4, 5, 20), cores) == 40
+    assert ms(on(1, 1, (0, 2), 2), times(4, 5, {2: 15}), cores) == 30  # its threads wait for the slower core
+
+
+def test_units_that_float_between_different_cores_share_what_these_can_do() -> None:
+    """10 + 10 + 8 + 8 on three cores; on two of them it is never more than 10 + 8."""
+    where = {"cpu": Place((0, 1), 1), "b": Place((1, 2), 1), "c": Place((0,), 1), "d": Place((2,), 1)}
+    of = {unit: {1: work(ms)} for unit, ms in (("cpu", 10), ("b", 10), ("c", 8), ("d", 8))}
+    assert ms(where, of, equal(3)) == 12
 
 
 def test_a_device_needs_its_core_only_to_be_told() -> None:
@@ -212,24 +221,38 @@ def test_given_places_stay() -> None:
         ranked(equal(1), {**times(1, 1, 1), "dsp": {2: work(1)}}, FIRST)
 
 
-@pytest.mark.parametrize("count", [1, 2, 3])
-def test_every_placement_is_there_once(count: int) -> None:
+#: What may be exchanged of two physical cores with two siblings each: the siblings of each, and the cores.
+OF_SIBLINGS = [(a, b, c, d) for a, b, c, d in permutations(range(4)) if {a, b} in ({0, 1}, {2, 3})]
+
+
+@pytest.mark.parametrize(
+    ("cores", "exchanges", "network"),
+    [
+        (equal(1), list(permutations(range(1))), {1: 8}),
+        (equal(2), list(permutations(range(2))), {1: 8, 2: 5}),
+        (equal(3), list(permutations(range(3))), {1: 8, 2: 5, 3: 4}),
+        ([Core(0, 0), Core(1, 0), Core(2, 2), Core(3, 2)], OF_SIBLINGS, {1: 8}),
+    ],
+)
+def test_every_placement_is_there_once(
+    cores: list[Core], exchanges: list[tuple[int, ...]], network: dict[int, float]
+) -> None:
     """Against all of them, without a thought for symmetry; the predictions of equal ones are equal."""
-    of, cores = times(3, 5, {1: 8, 2: 5, 3: 4}), equal(count)
+    of, count = times(3, 5, network), len(cores)
     numbers = range(count)
     single = [Place(own, 1) for own in [(n,) for n in numbers] + [(a, b) for a in numbers for b in numbers if a < b]]
     gangs = [Place((0, 1), 2), Place((0, 2), 2), Place((1, 2), 2), Place((0, 1, 2), 3)]
-    network = [*single, *(gang for gang in gangs if max(gang.cores) < count)]
+    of_network = [*single, *(gang for gang in gangs if gang.threads in network and max(gang.cores) < count)]
 
     def kind(where: Placement) -> tuple[object, ...]:
         renumbered = [
             tuple((tuple(sorted(to[core] for core in place.cores)), place.threads) for place in where.values())
-            for to in permutations(numbers)
+            for to in exchanges
         ]
         return min(renumbered)
 
     everything: dict[tuple[object, ...], set[int]] = {}
-    for cpu, gpu, dsp in product(single, single, network):
+    for cpu, gpu, dsp in product(single, single, of_network):
         where = {"cpu": cpu, "gpu": gpu, "dsp": dsp}
         everything.setdefault(kind(where), set()).add(frame_ns(where, cores, of, FIRST))
     found = list(placements(cores, of, {}))
