@@ -35,6 +35,7 @@ from trilane.units import BEFORE_INFER, UNITS
 LEAST_FRAMES = 100
 FRAMES = 5  # of the scene, evenly spread, that are rehearsed
 CACHE = "placement-1"
+MOST_LOGICAL, MOST_CORES = 8, 16
 FIRST = BEFORE_INFER[0][1]
 SEQUENTIAL = "sequential"
 
@@ -56,7 +57,7 @@ def placed(checked: Checked, policy: str, starter: UnitStarter, driver: str = ""
         return _with(checked, rule, {"how": how, "why": why, "units": unit_rows(rule)})
     times, at = _kept_times(checked, cores, rule, starter, driver)
     rules = Rules(FIRST, policy == SEQUENTIAL)
-    found = ranked(cores, times, rules, asked)
+    found = ranked(considered(cores, asked), times, rules, asked)
     by_rule = Ranked(rule, frame_ns(rule, cores, times, rules))
     best = chosen(found, by_rule)
     facts = {
@@ -68,6 +69,19 @@ def placed(checked: Checked, policy: str, starter: UnitStarter, driver: str = ""
         "times": times_rows(times),
     }
     return _with(checked, best.placement, facts)
+
+
+def considered(cores: Sequence[Core], asked: Placement) -> list[Core]:
+    """Those to place units on: all, or of more than MOST_LOGICAL one of each physical core, and the first MOST_CORES.
+
+    Placements on more are too many to list. Cores that were `asked` for stay.
+    """
+    if len(cores) <= MOST_LOGICAL:
+        return list(cores)
+    fixed = {core for place in asked.values() for core in place.cores}
+    first = {core.physical: core.number for core in reversed(cores)}
+    chosen_numbers = {*sorted(first.values())[:MOST_CORES], *fixed}
+    return [core for core in cores if core.number in chosen_numbers]
 
 
 def times_rows(times: Times) -> list[dict[str, Any]]:
