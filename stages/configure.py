@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from trilane.avatars.integer_network import NetworkFile
 from trilane.avatars.network_split import split
 from trilane.avatars.validation import DrawnAs, accuracy_of
 from trilane.errors import BadInputError, MissingPartError
-from trilane.hw_profiles.host import host_units
+from trilane.hw_profiles.host import asked_cores, rule_placement, settings_of, usable_cores
 from trilane.hw_profiles.load import HOST, load_profile
 from trilane.hw_profiles.runtime_choice import fastest_runtime
 from trilane.install import EGL_LINE
@@ -61,6 +61,7 @@ class Request:
     split: tuple[str, ...] = ()
     fps: float | None = None
     output: str | None = None
+    cores: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -68,13 +69,16 @@ class Checked:
     """A configuration that can be run.
 
     `assets`: what was loaded to check it, as the units take it. `notes`: what the loads said of their sources.
-    `accuracy`: of each avatar, by its name, what `accuracy_of` says of it.
+    `accuracy`: of each avatar, by its name, what `accuracy_of` says of it. `asked_cores`: of units, by the options.
+    `placement`: what `trilane.stages.placing` says of the units' cores.
     """
 
     config: RunConfig
     assets: Assets
     notes: tuple[str, ...]
     accuracy: Mapping[str, Any]
+    asked_cores: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    placement: Mapping[str, Any] | None = None
 
     def changed(self, **values: Any) -> Checked:
         """The same with other `values` of the configuration, such as `out_dir`, `record` or `units`."""
@@ -131,6 +135,7 @@ def configure(request: Request, out_dir: Path, gl: GlFacts = gl_facts) -> Checke
         raise BadInputError(
             "plan", "full", "planned or fixed", "`trilane bench planner` draws the full plan to compare"
         )
+    asked = asked_cores(request.cores)
     runtime, reason = requested_runtime(request.runtime)
     _check_background(scene)
     bundles = {spec.bundle: load_bundle(spec.bundle) for spec in scene.avatars}
@@ -148,7 +153,7 @@ def configure(request: Request, out_dir: Path, gl: GlFacts = gl_facts) -> Checke
         scene=scene,
         out_dir=out_dir,
         avatar_dirs=folders,
-        units=host_units(),
+        units=settings_of(rule_placement(usable_cores(), asked)),
         runtime=runtime,
         shapes=foreseen.shapes.shapes if foreseen else (),
         own_pixels=budget.own,
@@ -159,7 +164,7 @@ def configure(request: Request, out_dir: Path, gl: GlFacts = gl_facts) -> Checke
     notes += (foreseen.note,) if foreseen else ()
     drawn = DrawnAs(runtime, scene.size, scene.texture_filter, len(scene.avatars))
     accuracy = _accuracy(list(avatars.values()), drawn)
-    return Checked(config, pack_assets(list(avatars.values()), staged), notes, accuracy)
+    return Checked(config, pack_assets(list(avatars.values()), staged), notes, accuracy, asked)
 
 
 def requested_runtime(asked: str) -> tuple[str, str]:
