@@ -19,6 +19,7 @@ LIMITS: dict[str, tuple[float, float]] = {
     "rounds": (1, 10_000),
     "views": (1, 1_000_000),
     "frames": (1, 10_000_000),
+    "pictures": (1, 10_000),
     "seeds": (1, 1000),
     "times": (1, 1000),
     "width": (1, 8192),
