@@ -135,7 +135,7 @@ class _Scene:
         for number in (index * total // pictures for index in range(pictures)):
             background, boxes = first.background(number), cast.boxes(number)
             made = {plan: chain.frame(number) for plan, chain in chains.items()}
-            tensors.append(chains["planned"].tensor_shape(number))
+            tensors.append(tuple(chains["planned"].posed(number)["tensor_shape"].tolist()))
             wanted = full.frame(number, background)
             for plan, errors in against_full.items():
                 errors.add(made[plan], wanted, boxes)

@@ -117,8 +117,11 @@ def unrounded(network: NetworkFile) -> onnx.ModelProto:
     for node in nodes:
         node.input[:] = [ends.get(name, name) for name in node.input]
         node.output[:] = [ends.get(name, name) for name in node.output]
-    del graph.node[:], graph.value_info[:]
+    read = {name for node in nodes for name in node.input}
+    kept = [tensor for tensor in graph.initializer if tensor.name in read]
+    del graph.node[:], graph.value_info[:], graph.initializer[:]
     graph.node.extend(nodes)
+    graph.initializer.extend(kept)
     for value in (graph.input[0], graph.output[0]):
         value.name = ends[value.name]
         value.type.tensor_type.elem_type = onnx.TensorProto.FLOAT

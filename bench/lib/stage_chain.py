@@ -9,6 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from trilane.arrays import U8
 from trilane.pipeline.bound_stage import BoundStage
 from trilane.pipeline.description import Pipeline
@@ -76,10 +79,12 @@ class AvatarFrames:
         picture.payload[:] = 0
         return self._picture(self._chain.run(number, self._composite))
 
-    def tensor_shape(self, number: int) -> tuple[int, int]:
-        """(height, width) of the tensor that frame `number` is painted from."""
-        height, width = self._chain.run(number, last=0).header["tensor_shape"].tolist()
-        return height, width
+    def posed(self, number: int) -> NDArray[np.void]:
+        """What the pose stage says of frame `number`, the shape of its tensor too: a header as in `stages/packets.py`.
+
+        It is overwritten by the next frame.
+        """
+        return self._chain.run(number, last=0).header
 
     def _picture(self, packet: Packet) -> U8:
         height, width, channels = self._shape
