@@ -10,7 +10,6 @@ Difference Evaluator for Alternating Images", HPG 2020, by its authors' flip-eva
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from importlib.util import find_spec
 
 import numpy as np
@@ -24,29 +23,28 @@ MODULES = ("skimage", "flip_evaluator")
 LEAST_SQUARE = 1e-10
 
 
-@dataclass
 class PictureErrors:
-    """Sums over pictures. `squares`, `similar`, `flip`: of the pixels, for the whole frames and for the boxes."""
+    """The errors of pictures that were added, one after the other."""
 
-    pixels: F64 = field(default_factory=lambda: np.zeros(2))
-    squares: F64 = field(default_factory=lambda: np.zeros(2))
-    similar: F64 = field(default_factory=lambda: np.zeros(2))
-    flip: F64 = field(default_factory=lambda: np.zeros(2))
+    def __init__(self) -> None:
+        # Of pixels, first of the whole frames, then of the boxes.
+        self._pixels = np.zeros(2)
+        self._squares, self._similar, self._flip = np.zeros(2), np.zeros(2), np.zeros(2)
 
     def add(self, picture: U8, reference: U8, boxes: Sequence[Box]) -> None:
         """Count `picture` against `reference`, both (h,w,3) sRGB, with avatars in `boxes`."""
         maps = error_maps(picture, reference)
         for part, mask in enumerate((np.ones(picture.shape[:2], bool), inside(boxes, picture))):
-            self.pixels[part] += mask.sum()
-            for total, values in zip((self.squares, self.similar, self.flip), maps, strict=True):
+            self._pixels[part] += mask.sum()
+            for total, values in zip((self._squares, self._similar, self._flip), maps, strict=True):
                 total[part] += values[mask].sum()
 
     def figures(self, plan: str) -> dict[str, float | None]:
         """`psnr_PLAN_db`, `ssim_PLAN`, `flip_PLAN` of the frames, the same with `box_` before, None without boxes."""
         found: dict[str, float | None] = {}
         for part, prefix in enumerate(("", "box_")):
-            count = self.pixels[part]
-            means = [total[part] / count if count else None for total in (self.squares, self.similar, self.flip)]
+            count = self._pixels[part]
+            means = [total[part] / count if count else None for total in (self._squares, self._similar, self._flip)]
             found[f"{prefix}psnr_{plan}_db"] = None if means[0] is None else psnr_db(means[0])
             found[f"{prefix}ssim_{plan}"] = None if means[1] is None else float(means[1])
             found[f"{prefix}flip_{plan}"] = None if means[2] is None else float(means[2])
