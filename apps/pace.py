@@ -22,6 +22,7 @@ from trilane.hw_profiles.network_work import Network, count_work
 from trilane.hw_profiles.performance_profiles import corners_of
 from trilane.scheduler.events import Settings
 from trilane.scheduler.ledger import JobRecord
+from trilane.scheduler.release import run_settings
 from trilane.scheduler.virtual import simulate
 from trilane.stages.config import RunConfig
 from trilane.units import SUSTAINED
@@ -60,8 +61,17 @@ def pace_of(config: RunConfig, profile: str, slow_motion: float = 1.0, performan
     return Pace(chip.name, performance_profile, slow_motion, held)
 
 
-def compare(pace: Pace, policy: str, frames: int, jobs: Sequence[JobRecord]) -> dict[str, Any]:
+def release_fps(pace: Pace, scene_fps: float) -> float:
+    """Frames released a second under a policy that needs a rate: the scene's, as much slower as the chip is."""
+    return scene_fps / pace.slow_motion
+
+
+def compare(
+    pace: Pace, policy: str, frames: int, jobs: Sequence[JobRecord], *, edge: str = "double", fps: float = 30.0
+) -> dict[str, Any]:
     """What report.json says of a paced run: the block `pace`.
+
+    `pace`, `policy`, `frames`, `edge`: of the run. `fps`: of its scene. `jobs`: that it did.
 
     `host_slower`: of each stage, jobs that the host did not do in time; `late_frames`: numbers of their frames.
     `virtual_ms`, `measured_ms`: median time between presented frames in virtual time and here, here only of frames with
@@ -69,7 +79,8 @@ def compare(pace: Pace, policy: str, frames: int, jobs: Sequence[JobRecord]) -> 
     """
     late = [job for job in jobs if job.end_ns - job.begin_ns > pace.stage_ns[job.stage] + SLACK_NS]
     late_frames = sorted({job.frame for job in late})
-    virtual = _virtual_ms(pace, policy, frames)
+    settings = run_settings(policy, frames, round(1e9 / release_fps(pace, fps)))
+    virtual = _virtual_ms(pace, settings, edge)
     measured = _measured_ms(jobs, late_frames)
     return {
         "profile": pace.profile,
@@ -85,9 +96,9 @@ def compare(pace: Pace, policy: str, frames: int, jobs: Sequence[JobRecord]) -> 
     }
 
 
-def _virtual_ms(pace: Pace, policy: str, frames: int) -> float:
+def _virtual_ms(pace: Pace, settings: Settings, edge: str) -> float:
     """Median time between presented frames of the same run in virtual time."""
-    result = simulate(application_graph(), Settings(frames, policy), lambda stage, *_: pace.stage_ns[stage], keep=True)
+    result = simulate(application_graph(edge), settings, lambda stage, *_: pace.stage_ns[stage], keep=True)
     return float(np.median(np.diff(_presented(result.jobs)[1]))) / 1e6
 
 

@@ -168,7 +168,7 @@ class Preamble(Record):
     `schema_`: `schema` in the file, 1.
     `clock`: of the times.
     `machine`: that the run was measured on.
-    `config`: the RunConfig as JSON without its folder, and the `policy`.
+    `config`: the RunConfig as JSON without its folder, and `policy` and `edge`.
     `plan`: what followed from it.
     `caps`: what held the units.
     """
@@ -240,7 +240,11 @@ def build_report(
         **metrics.as_json(),
         "schema": SCHEMA,
         "machine": machine,
-        "config": {**config.model_dump(mode="json", exclude={"out_dir"}), "policy": metrics.policy},
+        "config": {
+            **config.model_dump(mode="json", exclude={"out_dir"}),
+            "policy": metrics.policy,
+            "edge": metrics.edge,
+        },
         "plan": {"tensor_shapes": config.buckets},
         "caps": metrics.caps.as_json() if metrics.caps else {"how": NO_CAP},
         "temperature_c": (metrics.temperature_c.as_json() if metrics.temperature_c else {}) | sensor,

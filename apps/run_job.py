@@ -21,6 +21,7 @@ from trilane.hw_profiles.load import load_runnable
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.signals import Interrupts
 from trilane.pipeline.unit_starter import UnitStarter
+from trilane.scheduler.policy import policy_named
 from trilane.stages.avatar_pipeline import run_avatar
 from trilane.stages.configure import Checked
 
@@ -41,6 +42,7 @@ class Plan:
     `pace`: of a chip, to keep; None: as fast as it goes.
     `performance_profile`: whose caps hold; None: no cap.
     `latch_ms`: how long before it is needed a pose is sampled; not in the run that is compared with.
+    `edge`: rule of every edge.
     """
 
     policy: str = "pipelined"
@@ -48,6 +50,7 @@ class Plan:
     pace: Pace | None = None
     performance_profile: str | None = None
     latch_ms: float = 0.0
+    edge: str = "double"
 
 
 @dataclass(frozen=True)
@@ -98,7 +101,10 @@ def run_to_folder(
             if plan.pace is not None:
                 from trilane.apps.pace import compare
 
-                facts["pace"] = compare(plan.pace, plan.policy, checked.config.scene.frames, result.jobs)
+                scene = checked.config.scene
+                facts["pace"] = compare(
+                    plan.pace, plan.policy, scene.frames, result.jobs, edge=plan.edge, fps=scene.fps
+                )
             facts |= _write_files(result, folder.work, checked.config.scene.fps)
             report = build_report(result, checked.config, machine=machine, baseline=baseline, facts=facts)
             _tell(report, hooks)
@@ -145,7 +151,9 @@ class _Job:
             self._checked.config.model_copy(update={"out_dir": folder}),
             self._checked.assets,
             policy=policy,
+            edge=self._plan.edge,
             frames=frames,
+            pace_fps=self._release_fps(policy),
             latch_ms=latch_ms,
             governor=None if profile is None else Governor(load_runnable(HOST), profile),
             starter=self._starter,
@@ -157,6 +165,14 @@ class _Job:
         if result.interrupted:
             raise KeyboardInterrupt
         raise _error_of(result)
+
+    def _release_fps(self, policy: str) -> float | None:
+        """At a chip's pace, the rate of policies that need one; else they have the scene's."""
+        if self._plan.pace is None or not policy_named(policy).paced:
+            return None
+        from trilane.apps.pace import release_fps
+
+        return release_fps(self._plan.pace, self._checked.config.scene.fps)
 
 
 def _is_complete(result: RunResult) -> bool:

@@ -30,6 +30,7 @@ VALIDATE = "trilane avatar validate"
 #: What a validation at another size or on another runtime costs.
 REPLACES = ", in place of what the manifest says now"
 NEIGHBOURS = "`trilane bench several` measures what an avatar loses to its neighbours"
+PLANNED, BY_FRAME = "auto", "`trilane bench planner` measures scenes whose tensor is planned"
 
 
 @dataclass(frozen=True)
@@ -61,12 +62,14 @@ def accuracy_of(bundle: Bundle, drawn: DrawnAs) -> dict[str, Any]:
     if own is None or differs:
         if drawn.avatars > 1:
             return {"source": NO_FIGURES, "changed": [], "why": f"{differs}; {NEIGHBOURS}"}
+        if drawn.size == PLANNED:
+            return {"source": NO_FIGURES, "changed": [], "why": f"{differs}; {BY_FRAME}"}
         return _no_figures(bundle, [], differs, f" --size {drawn.size} --runtime {drawn.runtime}", REPLACES)
     return {
         "source": from_validation(validation.date),
         "runtime": drawn.runtime,
         "size": drawn.size,
-        **own.model_dump(mode="json"),
+        **own.model_dump(),
     }
 
 

@@ -116,7 +116,7 @@ def host_run(draw: random.Random, frames: int, starter: UnitStarter) -> dict[str
         on_progress=_Killer(dies_at, lambda: unit_process(victim)),
     )
     devices = {stage.unit for stage in pipeline.stages if stage.settings["device"]}
-    return {**result.report.as_json(), "devices": devices, "messages": result.messages}
+    return {**result.report.as_json(), "devices": devices}
 
 
 def random_pipeline(draw: random.Random) -> Pipeline:

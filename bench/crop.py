@@ -19,8 +19,8 @@ from trilane.bench.lib.views import everyday_pose, random_camera
 from trilane.body.body import load_body
 from trilane.body.kinematics import Skeleton
 from trilane.errors import BadInputError
+from trilane.scene.crop import Rect, choose_bucket
 from trilane.shapes import Shape, shape_buckets
-from trilane.stages.cpu.crop import Rect, choose_bucket
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 from trilane.unexpected_value import UnexpectedValue
 
@@ -91,7 +91,7 @@ def _area(rect: F64) -> float:
 def _needed(view: _View) -> float:
     """Side of the smallest square around the middle of the joints' rectangle that holds the mesh."""
     middle = (view.joints[:2] + view.joints[2:]) / 2.0
-    return float(2.0 * max((view.mesh[2:] - middle).max(), (middle - view.mesh[:2]).max()))
+    return float(2.0 * np.abs(view.mesh.reshape(2, 2) - middle).max())
 
 
 def _views(count: int, output: Shape, buckets: list[Shape]) -> list[_View]:
@@ -105,7 +105,7 @@ def _views(count: int, output: Shape, buckets: list[Shape]) -> list[_View]:
         start = time.perf_counter()
         rect = bounds.rect(posed, clip)
         rect_us = (time.perf_counter() - start) * 1e6
-        if rect is None or max(-rect.x0, -rect.y0, rect.x1, rect.y1) >= 1.0:
+        if rect is None or max(map(abs, rect)) >= 1.0:
             continue
         points = posed.joints @ clip[:, :3].T + clip[:, 3]
         places = points[:, :2] / points[:, 3:]

@@ -39,8 +39,6 @@ ENDS = ("producer", "consumer")
 
 #: Microseconds of each frame of a round until every byte could be read, and until it was.
 Times = tuple[list[float], list[float]]
-#: Peer, size: the ends of an interval.
-Intervals = dict[str, dict[int, tuple[float, float]]]
 
 
 def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 300, rounds: int = 6) -> dict[str, Any]:
@@ -277,8 +275,10 @@ def against_peers(times: dict[tuple[str, int], list[Times]]) -> dict[str, Any]:
     }
 
 
-def _slower(times: dict[tuple[str, int], list[Times]], ours: str, until: int) -> Intervals:
-    """`until`: 0 for readable, 1 for read."""
+def _slower(
+    times: dict[tuple[str, int], list[Times]], ours: str, until: int
+) -> dict[str, dict[int, tuple[float, float]]]:
+    """The ends of an interval, by peer and size. `until`: 0 for readable, 1 for read."""
     p50 = {key: np.array([np.percentile(of_round[until], 50) for of_round in of]) for key, of in times.items()}
     sizes = sorted({size for _, size in times})
     peers = sorted({variant for variant, _ in times} - {*OURS})
@@ -287,5 +287,5 @@ def _slower(times: dict[tuple[str, int], list[Times]], ours: str, until: int) ->
     }
 
 
-def _ahead(slower: Intervals) -> dict[str, bool]:
+def _ahead(slower: dict[str, dict[int, tuple[float, float]]]) -> dict[str, bool]:
     return {peer: all(low > 0 for low, _ in of_size.values()) for peer, of_size in slower.items()}

@@ -22,15 +22,17 @@ from trilane.pipeline.result import RunResult
 from trilane.pipeline.run_metrics import RunMetrics
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.policy import policy_named
-from trilane.scheduler.stats import median_interval
+from trilane.scheduler.stats import NS_PER_MS, median_interval, percentile, samples_needed
 from trilane.stages.avatar_pipeline import run_avatar
 from trilane.stages.configure import Checked, Request, configure
 from trilane.transport.slots import edge_rule
 from trilane.unexpected_value import UnexpectedValue
+from trilane.units import BEFORE_INFER, LATENCY_TO
 
 SEQUENTIAL = "sequential"
 MIN_FRAMES = 20
 ALONE = 16  # frames of each run that are measured isolated
+LATENCIES = "latencies_ns"  # of a run; a row has their percentiles over all rounds
 PACE = 1.25  # of the slowest unit's rate: paced policies always get more frames than they can present
 
 
@@ -58,10 +60,12 @@ def measure(
 ) -> dict[str, Any]:
     """A row for each avatar, size, number of cores, policy and edge; figures are medians over the `rounds`.
 
-    Rows: `frame_ms`, `fps`; `efficiency`: the slowest unit's stages, isolated, over the frame time; `slowest`: that
-    unit, `alone_ms`: its stages isolated; `busiest`: the unit with the most work, `idle`: its share without a job from
-    its first job's begin to its last one's end, and the causes: `starved` (no input), `undispatched` (input, but no
-    free slot, or not dispatched yet), `overhead` (dispatched, but not begun).
+    Rows: `frame_ms`, `fps`; `latency_p50_ms`, `latency_p99_ms`: from the beginning of a frame's pose to its composited
+    picture, over the frames of all rounds (no p99 of fewer than 299); `efficiency`: the slowest unit's stages,
+    isolated, over the frame time; `slowest`: that unit, `alone_ms`: its stages isolated; `busiest`: the unit with the
+    most work, `idle`: its share without a job from its first job's begin to its last one's end, and the causes:
+    `starved` (no input), `undispatched` (input, but no free slot, or not dispatched yet), `overhead` (dispatched, but
+    not begun).
 
     `gain`: over the mean of the `sequential` runs before and after. `bound`: sum(t) / max(t), where sum(t) is all
     stages isolated (`all_alone_ms`) and the hand-overs of those sequential runs, and max(t) the slowest unit's stages.
@@ -114,7 +118,7 @@ def _pairs(policies: Sequence[str], edges: Sequence[str]) -> list[tuple[str, str
     return [(SEQUENTIAL, "double"), *(pair for pair in product(policies, edges) if pair != (SEQUENTIAL, "double"))]
 
 
-def _config(avatar: str, size: str, cores: int, frames: int, runtime: str, *, video: bool) -> Checked:
+def _config(avatar: str, size: str, cores: int, frames: int, runtime: str, video: bool) -> Checked:
     folder = str(full_width.full_width_bundle()) if avatar == full_width.NAME else avatar
     checked = configure(Request(size=size, avatar=folder, frames=frames, runtime=runtime), Path.cwd())
     units = host_units(usable_cores()[:cores])
@@ -163,6 +167,7 @@ def _figures(result: RunResult) -> dict[str, Any]:
     return {
         "fps": metrics.fps,
         "frame_ms": metrics.frame_time_ms.mean,
+        LATENCIES: latencies_ns(result.jobs),
         "efficiency": metrics.efficiency,
         "slowest": slowest,
         "alone_ms": isolated[slowest],
@@ -203,14 +208,31 @@ def idle_between_jobs(jobs: Sequence[JobRecord]) -> dict[str, float]:
     return {"idle": sum(shares.values()), **shares}
 
 
+def latencies_ns(jobs: Sequence[JobRecord]) -> list[int]:
+    """Of each composited frame: from the beginning of its first stage to the end of the one with which latency ends."""
+    begins = {job.frame: job.begin_ns for job in jobs if job.stage == BEFORE_INFER[0][0]}
+    return [job.end_ns - begins[job.frame] for job in jobs if job.stage == LATENCY_TO]
+
+
+def _latency_ms(runs: list[dict[str, Any]]) -> dict[str, float | None]:
+    """Percentiles over the frames of all `runs`; None where there are too few."""
+    ordered = sorted(ns for run in runs for ns in run[LATENCIES])
+    enough = {percent: len(ordered) >= samples_needed(percent / 100) for percent in (50, 99)}
+    return {
+        f"latency_p{percent}_ms": percentile(ordered, percent / 100) / NS_PER_MS if fine else None
+        for percent, fine in enough.items()
+    }
+
+
 def _summary(setting: Setting, runs: list[dict[str, Any]]) -> dict[str, Any]:
     """Of the runs of one setting: medians of numbers, the commonest of names, sums of frames."""
     names = ("slowest", "busiest")
     sums = ("dropped", "lost")
     row: dict[str, Any] = {**vars(setting)}
-    for key in runs[0]:
+    for key in (key for key in runs[0] if key != LATENCIES):
         values = [run[key] for run in runs]
         pick: Callable[[list[Any]], Any] = sum if key in sums else median
         row[key] = None if None in values else max(set(values), key=values.count) if key in names else pick(values)
+    row |= _latency_ms(runs)
     row["of_bound_low"], row["of_bound_high"] = median_interval([run["gain_of_bound"] for run in runs])
     return row

@@ -21,12 +21,12 @@ from trilane.bench.lib.ground_truth import ground_truth, shaped_body
 from trilane.body.kinematics import Skeleton
 from trilane.errors import BadInputError
 from trilane.figure_sources import MEASURED
+from trilane.scene.crop import crop_projection
 from trilane.scene.schema import AvatarSpec, Scene
 from trilane.scene.staging import stage_scene
+from trilane.scene.tensor_layout import MARGIN_PX, TensorLayout, lay_out
 from trilane.shapes import Shape, shape_buckets
-from trilane.stages.cpu.crop import crop_projection
 from trilane.stages.cpu.mesh_bounds import MeshBounds
-from trilane.stages.cpu.tensor_layout import MARGIN_PX, TensorLayout, lay_out
 from trilane.stages.dsp.runtime import Binding, RuntimeOptions, load_runtime
 from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement
 from trilane.stages.gpu.skinned_mesh import SkinnedMesh

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from trilane.arrays import F32, F64
 from trilane.body.body import ShapedBody
+from trilane.body.detail import EVERYTHING, Detail
 from trilane.body.joints import JOINTS, POSE_FEATURES
 from trilane.body.kinematics import Posed, Skeleton
 from trilane.body.skin_weights import largest_weights
@@ -61,12 +62,13 @@ class FrameSkinner:
     in one row, then y, then z.
     """
 
-    def __init__(self, shaped: ShapedBody) -> None:
+    def __init__(self, shaped: ShapedBody, detail: Detail = EVERYTHING) -> None:
+        """`detail`: how much of the body is modelled."""
         body = shaped.body
         count = len(body.weights)
         blocks = -(-count // _BLOCK_ROWS)
         weights = np.zeros((blocks * _BLOCK_ROWS, JOINTS), np.float32)
-        weights[:count] = body.weights
+        weights[:count] = detail.weights(shaped)
         per_block = weights.reshape(blocks, _BLOCK_ROWS, JOINTS).transpose(0, 2, 1)
         used = (per_block != 0).any(axis=2)
         self._joints = np.argsort(~used, axis=1, kind="stable")[:, : int(used.sum(axis=1).max())]
@@ -75,7 +77,8 @@ class FrameSkinner:
         self._rest = np.zeros((3, blocks * _BLOCK_ROWS), np.float32)
         self._rest[:, :count] = shaped.vertices.T
         self._blended = self._rest.copy()
-        self._blend = body.posedirs.reshape(-1, POSE_FEATURES) if body.posedirs is not None else None
+        posedirs = body.posedirs if detail.pose_blend else None
+        self._blend = None if posedirs is None else posedirs.reshape(-1, POSE_FEATURES)
         self._sum = np.empty((blocks, _BLOCK_ROWS), np.float32)
         self._term = np.empty_like(self._sum)
 

@@ -23,6 +23,7 @@ from trilane.hw_profiles.schema import Profile, Unit
 from trilane.scheduler.accounts import compared
 from trilane.scheduler.events import Graph, Settings, chain
 from trilane.scheduler.policy import POLICIES
+from trilane.scheduler.release import run_settings
 from trilane.scheduler.virtual import simulate
 from trilane.unexpected_value import UnexpectedValue
 from trilane.units import AFTER_INFER, BEFORE_INFER, INFER, LATENCY_TO, UNITS, UnitName
@@ -32,17 +33,20 @@ PACKED_BYTES_PER_PIXEL = 16
 #: Frames of a simulated run: for shares of time, for a frame time alone, and where dropped frames vary the intervals.
 FRAMES, QUICK_FRAMES, FRAMES_WITH_DROPS = 192, 12, 480
 NS_PER_MS = 1_000_000
+MOST_FPS = 1000.0  # as of a scene
 
 
 class Variant(NamedTuple):
     """How the stages are joined.
 
     `policy`: of the scheduler. `edge`: rule of the edges between stages, the same for all. `batch`: frames per job.
+    `fps`: the scene's rate, at which `latest` and `deadline` release frames, but no faster than the display shows them.
     """
 
     policy: str = "pipelined"
     edge: str = "single"
     batch: int = 1
+    fps: float = 30.0
 
 
 REFERENCE = Variant()
@@ -68,6 +72,8 @@ class Plan:
             raise BadInputError("policy", repr(self.variant.policy), "one of " + ", ".join(POLICIES))
         if not 1 <= self.variant.batch <= 64:
             raise BadInputError("batch", str(self.variant.batch), "1 to 64")
+        if not 0 < self.variant.fps <= MOST_FPS:
+            raise BadInputError("fps", f"{self.variant.fps:g}", f"above 0, at most {MOST_FPS:g}")
         if not 0 <= self.gpu_share < 1 or (self.gpu_share and self.runtime == "gpu"):
             raise BadInputError("gpu-share", f"{self.gpu_share:g} on {self.runtime}", "0 to below 1, on the dsp")
 
@@ -182,19 +188,30 @@ def _settled(
     `times`: stage, unit and nanoseconds of a job.
     `variant`: how the stages are joined.
     `display_ns`: the shortest time between two shown jobs.
-    `quick`: whether to run only QUICK_FRAMES where that is enough.
+    `quick`: whether to run only QUICK_FRAMES where that is enough, which is with one buffer between stages: with two,
+    the buffers fill first, and meanwhile frames come faster.
     `twice`: whether the report has `accounts`, its shares of time computed a second time.
     """
     graph = chain(((name, unit) for name, unit, _ in times), variant.edge, LATENCY_TO)
     service = {name: ns for name, _, ns in times}
     paced = POLICIES[variant.policy].paced
     regular = variant.edge in ("single", "double") and not paced
-    frames = (QUICK_FRAMES if quick else FRAMES) if regular else FRAMES_WITH_DROPS
-    settings = Settings(frames, variant.policy, period_ns=display_ns if paced else 0)
-    report = _run(graph, settings, service, twice)
+    short = quick and variant.edge == "single"
+    frames = (QUICK_FRAMES if short else FRAMES) if regular else FRAMES_WITH_DROPS
+    report = _run(graph, settings_of(variant, frames, display_ns), service, twice)
     if paced or report["frame_time_ms"]["mean"] * NS_PER_MS >= display_ns:
         return report, False
-    return _run(graph, Settings(frames, variant.policy, period_ns=display_ns), service, twice), True
+    return _run(graph, settings_of(variant, frames, display_ns, held=True), service, twice), True
+
+
+def settings_of(variant: Variant, frames: int, display_ns: int, *, held: bool = False) -> Settings:
+    """The scheduler's settings of a simulated run.
+
+    `variant`: its policy and the scene's rate. `frames`: how many jobs of each stage. `display_ns`: the shortest time
+    between two of them. `held`: whether the display holds every policy to its rate.
+    """
+    scene_period_ns = max(display_ns, round(variant.batch * 1e9 / variant.fps))
+    return run_settings(variant.policy, frames, scene_period_ns, display_ns if held else 0)
 
 
 def _run(graph: Graph, settings: Settings, service: Mapping[str, int], twice: bool) -> Any:
@@ -214,7 +231,8 @@ def steady(profile: Profile, plan: Plan, corners: Corners, *, quick: bool = Fals
     `profile`: of the chip.
     `plan`: what runs on it.
     `corners`: at which the units stay.
-    `quick`: whether a short run will do. Its frame time is right; its shares of time include filling and draining.
+    `quick`: whether a short run will do where it can. Its frame time is right to a hundredth; its shares of time
+    include filling and draining.
     `twice`: whether to compute the shares of time a second time.
     """
     times = stage_times_ms(profile, plan, corners)

@@ -13,7 +13,7 @@ channels, so channel counts are rounded up to the unit's block before they are m
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,7 +54,7 @@ class Machine:
 class JobTime:
     """Milliseconds of one job by part: `fixed`, `input`, `weights`, `fallback` and the operator classes."""
 
-    parts: Mapping[str, float] = field(default_factory=dict)
+    parts: Mapping[str, float]
 
     @property
     def total_ms(self) -> float:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from trilane.hw_profiles.application import (
+    MOST_FPS,
     REFERENCE,
     RUNTIMES,
     Plan,
@@ -27,17 +28,19 @@ from trilane.hw_profiles.over_time import Moment, over_time, unit_power_w
 from trilane.hw_profiles.performance_profiles import Corners, corners_of
 from trilane.hw_profiles.reference_networks import reference_network
 from trilane.hw_profiles.schema import Profile
+from trilane.scheduler.policy import POLICIES
 from trilane.scheduler.stats import energy_score
 from trilane.units import SUSTAINED, UNITS, UnitName
 
-#: Rows of `what_if`: name, how the stages are joined, share of the network on the GPU.
+#: Rows of `what_if`: name, how the stages are joined, share of the network on the GPU. All have frames as often as the
+#: display can show them, for they are compared with each other.
 ALTERNATIVES: tuple[tuple[str, Variant, float], ...] = (
     ("reference application", REFERENCE, 0.0),
     ("one frame at a time", Variant("sequential", "single"), 0.0),
     ("pipelined, two buffers", Variant("pipelined", "double"), 0.0),
     ("pipelined, newest of three buffers", Variant("pipelined", "triple"), 0.0),
-    ("newest pose wins", Variant("latest", "double"), 0.0),
-    ("newest pose wins, newest of three buffers", Variant("latest", "triple"), 0.0),
+    ("newest pose wins", Variant("latest", "double", fps=MOST_FPS), 0.0),
+    ("newest pose wins, newest of three buffers", Variant("latest", "triple", fps=MOST_FPS), 0.0),
     ("pipelined, batches of 2", Variant("pipelined", "double", 2), 0.0),
     ("pipelined, 5 % of the network on the GPU", Variant("pipelined", "double"), 0.05),
 )
@@ -85,7 +88,7 @@ def predict(
         "caps": _caps(moments),
         "timeline": [_shown(m) for m in _thinned(moments)],
         **_expected_error(profile, plan, job),
-        "notes": _notes(profile),
+        "notes": _notes(profile, plan.variant),
     }
 
 
@@ -97,9 +100,13 @@ def _ends(moments: Sequence[Moment], now: Steady) -> dict[str, float]:
     return {"fps_start": 1e3 / moments[0].frame_ms, "fps_settled": 1e3 / _mean([m.frame_ms for m in last])}
 
 
-def _notes(profile: Profile) -> list[str]:
-    """What a reader of the figures has to know of the profile."""
+def _notes(profile: Profile, variant: Variant) -> list[str]:
+    """What a reader of the figures has to know of the profile and of the policy."""
     notes = []
+    if POLICIES[variant.policy].paced:
+        notes.append(
+            f"under {variant.policy}, {variant.fps:g} frames are released a second, whether there is room or not"
+        )
     if profile.name == HOST:
         notes.append(
             "of this machine are cores, clock and instructions; its speeds are assumed: `trilane run` measures"
@@ -151,6 +158,7 @@ def _config(plan: Plan, performance_profile: str, minutes: float, governor: str)
         "policy": variant.policy,
         "edge": variant.edge,
         "batch": variant.batch,
+        "fps": variant.fps,
         "gpu_share": plan.gpu_share,
         "performance_profile": performance_profile,
         "minutes": minutes,

@@ -29,13 +29,12 @@ from trilane.scheduler.causes import Outcome, OutcomeKind
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import Settings
 from trilane.scheduler.loop import run_loop
-from trilane.scheduler.policy import policy_named
 from trilane.scheduler.recording import Recording
+from trilane.scheduler.release import run_settings
 from trilane.scheduler.stats import energy_score
 from trilane.transport.wakeup import DEFAULT, SHORTEST_NS, awake, use_slice
 from trilane.unexpected_value import UnexpectedValue
 
-DEADLINE_PERIODS = 3  # from a frame's release until it must be presented
 HANG_NS = 10_000_000_000
 FRAMES_PER_ISOLATED, LEAST_ISOLATED, MOST_ISOLATED = 15, 4, 16
 SWITCH_S = 0.0002  # the longest that another thread of this process keeps the interpreter
@@ -216,20 +215,17 @@ def _settings(
 ) -> Settings:
     check_positive(frames=frames, fps=fps, pace_fps=pace_fps, hang_ns=hang_ns)
     try:
-        paced = policy_named(policy).paced
+        return run_settings(
+            policy,
+            frames,
+            round(1e9 / fps),
+            round(1e9 / pace_fps) if pace_fps else 0,
+            hang_ns=hang_ns,
+            asked=requests is not None,
+            latch_ns=round(latch_ms * 1e6),
+        )
     except UnexpectedValue as error:
         raise BadInputError.at("the run's settings", error) from None
-    release_fps = pace_fps or (fps if paced else None)
-    period_ns = round(1e9 / release_fps) if release_fps else 0
-    return Settings(
-        frames=frames,
-        policy=policy,
-        period_ns=period_ns,
-        deadline_ns=DEADLINE_PERIODS * period_ns,
-        hang_ns=hang_ns,
-        asked=requests is not None,
-        latch_ns=round(latch_ms * 1e6),
-    )
 
 
 def _isolated_share(frames: int) -> int:

@@ -9,12 +9,13 @@ import tomllib
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from trilane.errors import BadInputError
 from trilane.files import read_text
+from trilane.near_miss import did_you_mean
 from trilane.scene.schema import Scene
 from trilane.unexpected_value import unexpected_in
 
@@ -29,6 +30,8 @@ EXPECTED = {
     "tuple_type": "a list",
     "string_pattern_mismatch": "letters, digits, spaces, dots, hyphens and underscores",
 }
+#: Key of the scene -> why it cannot be what it was, where the range alone does not tell.
+REASONS = {"error_budget_px": "numbers are rounded, so nothing is drawn without an error"}
 BUILT_IN_PREFIX = "builtin:"
 BUILT_IN = ("room", "default")  # a background, an avatar
 
@@ -39,7 +42,8 @@ def bad_input(where: str | Path, error: ValidationError) -> BadInputError:
     key = ".".join(str(part) for part in first["loc"])
     place = f"{where}: {key}" if key else str(where)
     if first["type"] == "extra_forbidden":
-        return BadInputError(place, "an unknown key", "a key of the scene schema", "correct its spelling or remove it")
+        remedy = did_you_mean(str(first["loc"][-1]), _keys_beside(first["loc"])) or "correct its spelling or remove it"
+        return BadInputError(place, "an unknown key", "a key of the scene schema", remedy)
     if first["type"] == "missing":
         return BadInputError(place, "nothing", "a value", "add the key")
     unexpected = unexpected_in(first)
@@ -48,7 +52,35 @@ def bad_input(where: str | Path, error: ValidationError) -> BadInputError:
     value = repr(first["input"])
     short = value if len(value) <= LONGEST_FOUND else value[:LONGEST_FOUND] + "..."
     expected = EXPECTED.get(first["type"], "").format(**first.get("ctx", {}))
-    return BadInputError(place, short, expected or str(first["msg"]).removeprefix(INPUT_SHOULD))
+    return BadInputError(place, short, expected or str(first["msg"]).removeprefix(INPUT_SHOULD), _remedy(first))
+
+
+def _remedy(first: Mapping[str, Any]) -> str:
+    """How to mend a value, of one of the `errors()` of a scene; empty when what was expected says all."""
+    if first["type"] == "literal_error":
+        return did_you_mean(str(first["input"]), _choices(first["loc"]))
+    return REASONS.get(".".join(map(str, first["loc"])), "")
+
+
+def _keys_beside(loc: tuple[int | str, ...]) -> list[str]:
+    """The keys of the table in which the key at `loc` stands."""
+    return list(_table_of(loc).model_fields)
+
+
+def _choices(loc: tuple[int | str, ...]) -> list[str]:
+    """The words that the key at `loc` may be; of a key that may be nothing else."""
+    return [str(word) for word in get_args(_table_of(loc).model_fields[str(loc[-1])].annotation)]
+
+
+def _table_of(loc: tuple[int | str, ...]) -> type[BaseModel]:
+    """The schema of the table in which the key at `loc` stands."""
+    table: type[BaseModel] = Scene
+    for key in loc[:-1]:
+        if isinstance(key, str):
+            kind = table.model_fields[key].annotation
+            kinds = (each for each in (kind, *get_args(kind)) if isinstance(each, type))
+            table = next(each for each in kinds if issubclass(each, BaseModel))
+    return table
 
 
 def scene_from(where: str | Path, values: Mapping[str, Any]) -> Scene:
@@ -71,7 +103,8 @@ def find_scene(name: str) -> Path:
         return Path(str(files("trilane.scene.scenes") / f"{name}{ENDING}"))
     path = Path(name)
     if path.suffix != ENDING:
-        raise BadInputError("scene", repr(name), f"a {ENDING} file or one of {', '.join(scene_names())}")
+        expected = f"a {ENDING} file or one of {', '.join(scene_names())}"
+        raise BadInputError("scene", repr(name), expected, did_you_mean(name, scene_names()))
     return path
 
 

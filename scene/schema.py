@@ -10,11 +10,14 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from trilane.shapes import MAX_SIDE, checked_size
+from trilane.shapes import BUCKET_STEP, MAX_SIDE, checked_size
 from trilane.unexpected_value import UnexpectedValue
 
 MAX_DEPTH_RATIO = 1e6  # of far to near clip plane; beyond it a depth buffer of 24 bits is too coarse
+AUTO = "auto"  # size of a tensor that is planned
 FARTHEST_M = 1e4  # of an avatar from the scene's origin; there float32 still resolves millimetres
+
+NAME = r"^[\w .-]+$"
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Metres = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan=False)]
@@ -36,10 +39,12 @@ class OutputSpec(Model):
 class AvatarSpec(Model):
     """One avatar.
 
+    `name`: no other avatar of the scene has it; `avatar1`, `avatar2`, ... by its place when it is not given.
     `bundle`: `default` or a folder. `motion`: `builtin:NAME` or a file. `position`: metres. `up_axis`, `units`: of the
     motion file. `ground`: how the motion is put on the floor (`floor.py`).
     """
 
+    name: str | None = Field(default=None, min_length=1, max_length=80, pattern=NAME)
     bundle: str = "default"
     motion: str = "builtin:walk-wave-turn"
     position: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
@@ -94,23 +99,58 @@ class PlaneSpec(Model):
         return normal
 
 
+def _scene_size(size: str) -> str:
+    return size if size == AUTO else checked_size(size)
+
+
 class Scene(Model):
     """A scene.
 
     `background`: `room`, or a video, a folder of images or a picture. `hud`: whether frame, rate and age are written on
     the picture. `planes`: detected ones, shown over the background. `texture_filter`: of the neural texture.
-    `error_budget_px`: accepted, but nothing reads it.
+
+    What may be left out: `plan` is `planned` (what the picture does not show is not modelled), `fixed` (everything is,
+    in every frame) or `full` (to compare with: float64 body, supersampled raster, FP32 network; nothing runs it in real
+    time). `size`: `auto` plans the tensor, up to `most_side`² pixels; else it is fixed to that size. `error_budget_px`:
+    how far a vertex may be off on the picture. `memory_mb`: of the networks that are made ready for the planned shapes.
     """
 
-    name: str = Field(default="scene", min_length=1, max_length=80, pattern=r"^[\w .-]+$")
+    name: str = Field(default="scene", min_length=1, max_length=80, pattern=NAME)
     fps: float = Field(default=30.0, gt=0, le=1000, allow_inf_nan=False)
     frames: int = Field(default=300, ge=1, le=10_000_000)
-    size: Annotated[str, AfterValidator(checked_size)] = "256"
+    size: Annotated[str, AfterValidator(_scene_size)] = "256"
     background: str = "room"
     hud: bool = False
     planes: tuple[PlaneSpec, ...] = Field(default=(), max_length=32)
     texture_filter: Literal["linear", "mipmap", "anisotropic"] = "linear"
-    error_budget_px: float = Field(default=0.5, ge=0, allow_inf_nan=False)
+    plan: Literal["planned", "fixed", "full"] = "planned"
+    error_budget_px: float = Field(default=0.5, gt=0, le=100, allow_inf_nan=False)
+    most_side: int = Field(default=512, ge=BUCKET_STEP, le=MAX_SIDE, multiple_of=BUCKET_STEP)
+    memory_mb: int = Field(default=512, ge=1, le=1_000_000)
     output: OutputSpec = OutputSpec()
     camera: CameraSpec = CameraSpec()
-    avatars: tuple[AvatarSpec, ...] = Field(default=(AvatarSpec(),), min_length=1, max_length=8)
+    avatars: tuple[AvatarSpec, ...] = Field(default=(AvatarSpec(),), min_length=1, max_length=8, validate_default=True)
+
+    @field_validator("avatars")
+    @classmethod
+    def _avatars_named(cls, avatars: tuple[AvatarSpec, ...]) -> tuple[AvatarSpec, ...]:
+        """The avatars, each with a name of its own."""
+        places: dict[str, int] = {}
+        for place, avatar in enumerate(avatars):
+            name = avatar.name or f"avatar{place + 1}"
+            if name in places:
+                found = f"{name!r} as the name of avatars.{places[name]} and of avatars.{place}"
+                raise UnexpectedValue(found, "a name of its own for each", "change `name` of one of them")
+            places[name] = place
+        return tuple(spec.model_copy(update={"name": name}) for name, spec in zip(places, avatars, strict=True))
+
+    @model_validator(mode="after")
+    def _sized(self) -> Self:
+        if self.size == AUTO and self.plan != "planned":
+            raise UnexpectedValue(f'size = "{AUTO}" with plan = "{self.plan}"', "a size such as 512x512")
+        return self
+
+    @property
+    def plans_tensor(self) -> bool:
+        """Whether the tensor's shapes follow from the scene."""
+        return self.size == AUTO

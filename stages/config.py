@@ -29,6 +29,7 @@ class RunConfig(Model):
     `avatar_dirs`: the bundle's folder of each avatar of the scene.
     `units`: cores and threads of each unit.
     `runtime`: that the DSP unit infers with.
+    `shapes`: of the tensor, where the scene plans it; else those of its size are used.
     `record`: whether the frames are encoded to a video.
     `posed_vertices`: how many of each avatar, when the CPU unit skins; empty when the GPU unit does.
     `pace_ns`: how long a job of a stage is held, at least.
@@ -40,6 +41,7 @@ class RunConfig(Model):
     avatar_dirs: tuple[Path, ...]
     units: dict[str, UnitSettings]
     runtime: str = "ort"
+    shapes: tuple[Shape, ...] = ()
     record: bool = True
     posed_vertices: tuple[int, ...] = ()
     pace_ns: dict[str, int] = Field(default={})
@@ -55,7 +57,12 @@ class RunConfig(Model):
 
     @property
     def buckets(self) -> list[Shape]:
-        return shape_buckets(self.scene.size)
+        return list(self.shapes) or shape_buckets(self.scene.size)
+
+    @property
+    def budget_px(self) -> float:
+        """How far a vertex may be off on the picture; 0 when everything is modelled."""
+        return self.scene.error_budget_px if self.scene.plan == "planned" else 0.0
 
     @property
     def infer_units(self) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ input ends the command before a process is started or a file is made.
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,6 +24,7 @@ from trilane.hw_profiles.host import host_units
 from trilane.hw_profiles.load import HOST, load_profile
 from trilane.hw_profiles.runtime_choice import fastest_runtime
 from trilane.install import EGL_LINE
+from trilane.near_miss import did_you_mean
 from trilane.pipeline.shared_assets import Assets
 from trilane.scene.load import find_scene, load_scene, located, scene_from
 from trilane.scene.schema import Scene
@@ -30,7 +32,10 @@ from trilane.scene.staging import stage_scene
 from trilane.stages.avatar_assets import AvatarData, load_avatar, pack_assets, require_one_tensor
 from trilane.stages.config import NetworkCut, RunConfig
 from trilane.stages.dsp.runtime import RUNTIMES, installed, resolve
+from trilane.stages.foresee import foresee
 from trilane.stages.machine_facts import gl_facts, machine_facts
+from trilane.transport.slots import RULES, edge_rule
+from trilane.unexpected_value import UnexpectedValue
 
 ROOM = "room"
 COMMAND_LINE = "command line"
@@ -53,6 +58,8 @@ class Request:
     hud: bool | None = None
     skinning: str = "auto"
     split: tuple[str, ...] = ()
+    fps: float | None = None
+    output: str | None = None
 
 
 @dataclass(frozen=True)
@@ -80,9 +87,10 @@ def requested_scene(request: Request) -> Scene:
     """
     values = load_scene(find_scene(request.scene))
     here = Path.cwd()
-    values.update(
-        {key: getattr(request, key) for key in ("frames", "size", "hud") if getattr(request, key) is not None}
-    )
+    laid_over = {key: getattr(request, key) for key in ("frames", "fps", "size", "hud")}
+    values.update({key: value for key, value in laid_over.items() if value is not None})
+    if request.output is not None:
+        values["output"] = _output(request.output)
     if request.background is not None:
         values["background"] = located(request.background, here)
     if request.camera is not None:
@@ -96,28 +104,55 @@ def requested_scene(request: Request) -> Scene:
     return scene_from(COMMAND_LINE, values)
 
 
+def _output(text: str) -> dict[str, int]:
+    """WIDTHxHEIGHT as the scene's `output`. Raises BadInputError."""
+    match = re.fullmatch(r"([0-9]{1,9})x([0-9]{1,9})", text)
+    if match is None:
+        raise BadInputError("--output", repr(text), "WIDTHxHEIGHT in pixels, such as 640x480")
+    return {"width": int(match[1]), "height": int(match[2])}
+
+
+def requested_edge(text: str) -> str:
+    """`text`, the rule of every edge. Raises BadInputError."""
+    try:
+        edge_rule(text)
+    except UnexpectedValue as error:
+        name = text.partition(":")[0]
+        remedy = "" if name in RULES else did_you_mean(name, RULES)
+        raise BadInputError("--edge", repr(text), error.expected, remedy) from None
+    return text
+
+
 def configure(request: Request, out_dir: Path, gl: GlFacts = gl_facts) -> Checked:
     """Look at every part of what was asked for. Raises BadInputError or MissingPartError."""
     scene = requested_scene(request)
+    if scene.plan == "full":
+        raise BadInputError(
+            "plan", "full", "planned or fixed", "`trilane bench planner` draws the full plan to compare"
+        )
     runtime, reason = requested_runtime(request.runtime)
     _check_background(scene)
     bundles = {spec.bundle: load_bundle(spec.bundle) for spec in scene.avatars}
     avatars = {bundle.folder.absolute(): load_avatar(bundle) for bundle in bundles.values()}
     folders = tuple(bundles[spec.bundle].folder.absolute() for spec in scene.avatars)
     require_one_tensor(list(avatars.values()))
-    staged = stage_scene(scene, [avatars[folder].shaped for folder in folders], Path.cwd())
+    bodies = [avatars[folder].shaped for folder in folders]
+    staged = stage_scene(scene, bodies, Path.cwd())
     cuts = requested_cuts(request.split, avatars[folders[0]].network)
     unit, why = skinning_unit(request.skinning, gl)
+    foreseen = foresee(scene, staged, bodies, avatars[folders[0]].network) if scene.plans_tensor else None
     config = RunConfig(
         scene=scene,
         out_dir=out_dir,
         avatar_dirs=folders,
         units=host_units(),
         runtime=runtime,
+        shapes=foreseen.shapes.shapes if foreseen else (),
         posed_vertices=tuple(len(avatars[folder].shaped.vertices) for folder in folders) if unit == "cpu" else (),
         cuts=cuts,
     )
     notes = (*staged.notes, f"runtime: {runtime} ({reason})", f"skinning: {unit} unit ({why})")
+    notes += (foreseen.note,) if foreseen else ()
     drawn = DrawnAs(runtime, scene.size, scene.texture_filter, len(scene.avatars))
     accuracy = _accuracy(list(avatars.values()), drawn)
     return Checked(config, pack_assets(list(avatars.values()), staged), notes, accuracy)
@@ -128,7 +163,8 @@ def requested_runtime(asked: str) -> tuple[str, str]:
     if asked == "auto":
         return fastest_runtime(load_profile(HOST), installed())
     if asked not in RUNTIMES:
-        raise BadInputError("runtime", repr(asked), f"auto or one of {', '.join(RUNTIMES)}")
+        expected = f"auto or one of {', '.join(RUNTIMES)}"
+        raise BadInputError("runtime", repr(asked), expected, did_you_mean(asked, ["auto", *RUNTIMES]))
     return resolve(asked), "as asked"
 
 

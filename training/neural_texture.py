@@ -27,7 +27,7 @@ class NeuralTexture(nn.Module):
         super().__init__()
         target = torch.from_numpy(np.ascontiguousarray(start.transpose(2, 0, 1)))[None]
         scales: list[Tensor] = []
-        coarser = torch.zeros(1, target.shape[1], 1, 1)
+        coarser = torch.zeros(1, 1, 1, 1)
         for side in sorted(sides):
             shrunk = functional.interpolate(target, size=(side, side), mode="area")
             scales.append(shrunk - _enlarged(coarser, side))

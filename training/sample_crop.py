@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from trilane.avatars.bundle import CLOTHES_STANDOFF_M
 from trilane.body.body import ShapedBody
 from trilane.body.kinematics import Posed
+from trilane.scene.crop import choose_bucket, crop_projection
 from trilane.shapes import Shape
-from trilane.stages.cpu.crop import choose_bucket, crop_projection
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 from trilane.training.random_views import View
 

@@ -56,7 +56,7 @@ def _cotangent(vertices: F64, faces: Ints) -> tuple[Any, F64]:
         mass += np.bincount(o, weights=double_area / 6, minlength=count)
     off = sparse.coo_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), (count, count))
     laplacian = (off - sparse.diags(np.asarray(off.sum(axis=1)).ravel())).tocsr()
-    return laplacian, np.maximum(mass, 1e-10)
+    return laplacian, mass
 
 
 def _largest_part(laplacian: Any) -> NDArray[np.int64]:

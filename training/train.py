@@ -131,7 +131,7 @@ def _validate(config: TrainConfig, avatar: TrainableAvatar, renderer: SampleRend
     validation = validate(bundle, plan, renderer, FloatNetwork("the trained weights", paint), keep)
     revalidate(bundle, validation)
     if config.sheet is not None:
-        Image.fromarray(comparison_sheet(samples, (FLOAT, *plan.runtimes))).save(config.sheet, optimize=True)
+        Image.fromarray(comparison_sheet(samples, (FLOAT, *plan.runtimes))).save(config.sheet)
     return validation
 
 
@@ -245,7 +245,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     started = time.monotonic()
 
     def report(line: str) -> None:
-        print(f"{time.monotonic() - started:7.0f} s  {line}", file=sys.stderr, flush=True)
+        print(f"{time.monotonic() - started:7.0f} s  {line}", file=sys.stderr)
 
     try:
         folder = train(TrainConfig(**values), report)

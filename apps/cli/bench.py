@@ -95,7 +95,6 @@ def bench_command(name: str) -> Any:
     asked = {p.name: (_option(name, p), p.default) for p in inspect.signature(measure).parameters.values()}
     options = {"json": (JsonOption, False), **asked}
     described: Any = run
-    described.__annotations__ = {option: kind for option, (kind, _) in options.items()}
     described.__signature__ = inspect.Signature(
         [
             inspect.Parameter(option, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)

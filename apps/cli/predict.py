@@ -37,11 +37,13 @@ Examples:
   trilane predict --encoder resnet18 --size 512 --channels 16
   trilane predict --runtime gpu --norm instance --minutes 30
   trilane predict --policy pipelined --edge double --what-if
+  trilane predict --policy latest --fps 24
   trilane predict --performance-profile burst --minutes 30 --plot temperature.svg
   trilane predict --avatar default --runtime gpu
   trilane predict --table rows.csv --json
 """
 PLOT_MINUTES = 30.0
+PACED = ("latest", "deadline")  # policies that release frames at a rate
 HOST = "host"
 OF_A_FILE = {"encoder", "norm", "size", "channels"}
 #: Option: those that have no effect beside it.
@@ -72,6 +74,9 @@ EdgeOption = Annotated[
     str | None, typer.Option(help="Buffers between stages: single, double (if not given), triple, fifo:N, orphan.")
 ]
 BatchOption = Annotated[int, typer.Option(help="Frames per job of the network.")]
+RateOption = Annotated[
+    float | None, typer.Option("--fps", help="Frames released a second under latest and deadline; 30 if not given.")
+]
 GpuShareOption = Annotated[float, typer.Option(help="Share of the network that the GPU does for the DSP.")]
 GovernorOption = Annotated[str | None, typer.Option(help="step_wise or power_allocator; the profile's if not given.")]
 WhatIfOption = Annotated[bool, typer.Option("--what-if", help="Compare policies and edges for the same network.")]
@@ -95,6 +100,7 @@ def predict(
     policy: PolicyOption = "reference",
     edge: EdgeOption = None,
     batch: BatchOption = 1,
+    fps: RateOption = None,
     gpu_share: GpuShareOption = 0.0,
     performance_profile: PerformanceProfileChoice = PerformanceProfile.SUSTAINED_HIGH_PERFORMANCE,
     governor: GovernorOption = None,
@@ -114,7 +120,7 @@ def predict(
     if profile == HOST and "performance_profile" not in _typed(ctx):
         performance_profile = PerformanceProfile.BURST  # as `trilane run` without a cap
     _check_governor(governor)
-    chip, variant = load_runnable(profile), _variant(policy, edge, batch)
+    chip, variant = load_runnable(profile), _variant(policy, edge, batch, fps)
     if table is not None:
         answers = _predict_table(chip, table, performance_profile, variant)
         show_table(chip.name, performance_profile, answers, json)
@@ -149,11 +155,14 @@ def _check_governor(governor: str | None) -> None:
         raise BadInputError("--governor", repr(governor), " or ".join(GOVERNORS))
 
 
-def _variant(policy: str, edge: str | None, batch: int) -> Variant:
+def _variant(policy: str, edge: str | None, batch: int, fps: float | None) -> Variant:
     from trilane.hw_profiles.application import REFERENCE, Variant
 
+    if fps is not None and policy not in PACED:
+        remedy = "the others take a frame as soon as they can"
+        raise BadInputError("options", f"--fps with --policy {policy}", f"--policy {' or '.join(PACED)}", remedy)
     if policy != "reference":
-        return Variant(policy, edge or "double", batch)
+        return Variant(policy, edge or "double", batch, **({} if fps is None else {"fps": fps}))
     if edge not in (None, REFERENCE.edge):
         remedy = "choose a --policy of your own, such as pipelined"
         raise BadInputError("--edge", repr(edge), f"{REFERENCE.edge}, which the reference application has", remedy)

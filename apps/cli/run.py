@@ -8,6 +8,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from enum import StrEnum
 from functools import cache
 from pathlib import Path
@@ -46,6 +47,7 @@ Examples:
   trilane run --frames 60 --size 192 --out /tmp/run
   trilane run --motion walk.bvh --camera arkit.txt --frames 200 --json
   trilane run --latch 3
+  trilane run walk-past --policy latest --edge triple --fps 24 --output 1280x720
   trilane run --split /Concat_4_output_0_QuantizeLinear_Output=cpu
   trilane run --performance-profile sustained_high_performance
   trilane run --profile snapdragon-888 --pace --slow-motion 24 --frames 60
@@ -65,6 +67,10 @@ class PolicyName(StrEnum):
 MotionOption = Annotated[str | None, typer.Option(help="SMPL-X .npy, AMASS .npz, .bvh, or builtin:NAME.")]
 CameraOption = Annotated[str | None, typer.Option(help="ARKit log, TUM, transforms.json, or builtin:NAME.")]
 BackgroundOption = Annotated[str | None, typer.Option(help="room, or a video, image folder or picture.")]
+EDGE_HELP = "Buffers between stages: single, double, triple, fifo:N, orphan or orphan:N (docs/policies-and-edges.md)."
+FpsOption = Annotated[float | None, typer.Option(help="Frames a second of the scene's time, and of the video.")]
+OutputOption = Annotated[str | None, typer.Option(help="Size of the picture in pixels: WIDTHxHEIGHT.")]
+EdgeOption = Annotated[str, typer.Option(help=EDGE_HELP)]
 FramesOption = Annotated[int | None, typer.Option(help="How many frames to present.")]
 HudOption = Annotated[bool | None, typer.Option(help="Write frame, rate and age on the picture.")]
 POLICIES_HELP = (
@@ -124,9 +130,12 @@ def run(
     background: BackgroundOption = None,
     avatar: SceneAvatarOption = None,
     frames: FramesOption = None,
+    fps: FpsOption = None,
+    output: OutputOption = None,
     size: SceneSizeOption = None,
     hud: HudOption = None,
     policy: PolicyOption = PolicyName.PIPELINED,
+    edge: EdgeOption = "double",
     runtime: RuntimeOption = "auto",
     skinning: SkinningOption = "auto",
     split: SplitOption = None,
@@ -146,15 +155,16 @@ def run(
     """
     with _early_processes() as (starter, gl):
         from trilane.apps.run_job import Plan
-        from trilane.stages.configure import Request, configure
+        from trilane.stages.configure import Request, configure, requested_edge
 
-        cuts = tuple(split or ())
+        cuts, rule = tuple(split or ()), requested_edge(edge)
         request = Request(scene, motion, camera, background, avatar, frames, size, runtime, hud, skinning, cuts)
+        request = replace(request, fps=fps, output=output)
         checked = configure(request, Path.cwd(), gl)
         chip_pace = _pace(checked.config, profile, pace, slow_motion)
         cap = performance_profile and str(performance_profile)
         _refuse_beside_pace(chip_pace, cuts, cap)
-        outcome = _run(checked, out, Plan(str(policy), baseline, chip_pace, cap, latch), starter, gl)
+        outcome = _run(checked, out, Plan(str(policy), baseline, chip_pace, cap, latch, rule), starter, gl)
     _print_outcome(outcome, as_json)
     raise typer.Exit(outcome.exit_code)
 

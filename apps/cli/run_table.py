@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from trilane.apps.report import Baseline, Made, PaceComparison, Report
     from trilane.pipeline.run_metrics import Caps, StageTimes, Temperature, TimeSummary, UnitShares
 
+    #: Name of a row, what it measures, and a cell for each run.
+    Rows = Iterator[tuple[str, str, list[str]]]
+
 DASH = "–"
 IDLE = ("starved", "blocked", "throttled", "preempted", "overhead")
 UNSAID = "the report does not say where they come from"
@@ -27,9 +30,6 @@ STATISTICS = ("mean", "p50", "p90", "p95", "p99", "max")
 TOO_SHORT = "too short to tell"
 TOO_FEW = " *"
 NEEDED = {name: samples_needed(int(name[1:]) / 100) for name in ("p90", "p95", "p99")}
-
-#: Name of a row, what it measures, and a cell for each run.
-Rows = Iterator[tuple[str, str, list[str]]]
 
 
 def run_table(report: Report) -> Table:

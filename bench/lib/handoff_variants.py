@@ -217,7 +217,7 @@ class ZmqChannel:
 
 
 class _ZmqEnd:
-    def __init__(self, endpoint: str, size: int, *, bind: bool) -> None:
+    def __init__(self, endpoint: str, size: int, bind: bool) -> None:
         self._own = np.zeros(size, np.uint8)
         self._socket = zmq.Context().socket(zmq.PAIR)
         self._socket.setsockopt(zmq.RCVTIMEO, WAIT_MS)

@@ -53,7 +53,7 @@ class SplitPass:
         self._mesh.prepare(self._ctx)
         for layer, target in enumerate(self._targets):
             target.use()
-            target.clear(*self._background, depth=1.0)
+            target.clear(*self._background)
             self._draw.set({"layer": layer})
             self._draw.draw(placement.pose, view, placement.clip_projection)
 
@@ -61,5 +61,5 @@ class SplitPass:
         """Read every pass and interleave them into `tensor`, (h * w * C,) uint8."""
         image = tensor.reshape(*self._shape, 4 * len(self._targets))
         for layer, target in enumerate(self._targets):
-            target.read_into(self._planes[layer], components=4, alignment=1)
+            target.read_into(self._planes[layer], components=4)
             image[..., 4 * layer : 4 * layer + 4] = self._planes[layer]

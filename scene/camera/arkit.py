@@ -21,7 +21,8 @@ LONG_SIDE_DEG, SHORT_SIDE_DEG = 60.0, 36.0
 
 def load_arkit(path: Path) -> RawCamera:
     """Read `path`. Raises BadInputError with the line."""
-    table = read_table(path, COLUMNS, EXPECTED)
+    read = read_table(path, COLUMNS, EXPECTED)
+    table = read.numbers
     times, step = elapsed(table[:, 0])
     unit, scale = ("ns", 1e-9) if step > LEAST_STEP_NS else ("s", 1.0)
     matrices = table[:, 1:].reshape(-1, 3, 4)
@@ -36,4 +37,5 @@ def load_arkit(path: Path) -> RawCamera:
         LONG_SIDE_DEG,
         "usual for a phone",
         notes,
+        read.place_of,
     )

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from trilane.arrays import F64
 from trilane.scene.camera.path import CameraPath, Lens, axes_towards
 from trilane.scene.motion.motion import Wrap
 from trilane.scene.rotations import quat_from_matrix
@@ -30,6 +31,45 @@ class Orbit:
     swing_deg: float
     period_s: float
 
+    def places(self, phase: F64) -> F64:
+        """Places (N, 3), metres, at `phase` (N,) of the cycle, radians."""
+        angle = np.radians(self.swing_deg) * np.sin(phase - 0.6)
+        distance = self.far_m + (self.near_m - self.far_m) * (1 - np.cos(phase)) / 2
+        return np.column_stack([distance * np.sin(angle), np.full(len(phase), self.height_m), distance * np.cos(angle)])
+
+
+@dataclass(frozen=True)
+class Descent:
+    """From `top_deg` above `target`, on an arc of radius `distance_m` in the plane x = 0, to `low_m` and back."""
+
+    what: str
+    target: tuple[float, float, float]
+    distance_m: float
+    top_deg: float
+    low_m: float
+    period_s: float
+
+    def places(self, phase: F64) -> F64:
+        """As `Orbit.places`: at the top at 0, at `low_m` after half a cycle."""
+        top, low = np.radians(self.top_deg), np.arcsin((self.low_m - self.target[1]) / self.distance_m)
+        angle = low + (top - low) * (1 + np.cos(phase)) / 2
+        arc = np.column_stack([np.zeros(len(phase)), np.sin(angle), np.cos(angle)])
+        return np.asarray(np.array(self.target) + self.distance_m * arc)
+
+
+@dataclass(frozen=True)
+class Stand:
+    """Stands at `place` and looks at `target`."""
+
+    what: str
+    target: tuple[float, float, float]
+    place: tuple[float, float, float]
+    period_s: float = 1.0
+
+    def places(self, phase: F64) -> F64:
+        """As `Orbit.places`."""
+        return np.tile(self.place, (len(phase), 1))
+
 
 ORBITS = {
     "orbit": Orbit("whole person, going round, coming nearer", (0.0, 0.93, 0.0), 1.35, 3.9, 3.4, 28.0, 20.0),
@@ -39,18 +79,23 @@ ORBITS = {
 }
 
 
+#: Name: the camera.
+BUILTIN: dict[str, Orbit | Descent | Stand] = {
+    **ORBITS,
+    "top-to-floor": Descent("whole person, from above down to the floor", (0.0, 0.90, 0.0), 3.9, 80.0, 0.12, 12.0),
+    "wayside": Stand("beside the way of one who walks along z", (-0.1, 1.05, -2.5), (0.9, 1.45, 1.9)),
+}
+
+
 def load_builtin(name: str, spec: CameraSpec) -> CameraPath | None:
     """The camera `name`, or None when there is none of that name."""
-    orbit = ORBITS.get(name)
-    if orbit is None:
+    camera = BUILTIN.get(name)
+    if camera is None:
         return None
-    count = int(orbit.period_s * RATE_HZ)
+    count = int(camera.period_s * RATE_HZ)
     times = np.arange(count + 1) / RATE_HZ
-    phase = 2 * np.pi * times / orbit.period_s
-    angle = np.radians(orbit.swing_deg) * np.sin(phase - 0.6)
-    distance = orbit.far_m + (orbit.near_m - orbit.far_m) * (1 - np.cos(phase)) / 2
-    places = np.column_stack([distance * np.sin(angle), np.full(len(times), orbit.height_m), distance * np.cos(angle)])
+    places = camera.places(2 * np.pi * times / camera.period_s)
     fov = FOV_Y_DEG if spec.fov_y_deg is None else spec.fov_y_deg
-    notes = (f"built in: {orbit.what}, {orbit.period_s:g} s a cycle, field of view {fov:g} degrees high",)
-    quats = quat_from_matrix(axes_towards(places, np.array(orbit.target)))
+    notes = (f"built in: {camera.what}, {camera.period_s:g} s a cycle, field of view {fov:g} degrees high",)
+    quats = quat_from_matrix(axes_towards(places, np.array(camera.target)))
     return CameraPath(times, quats, places, Lens(fov, spec.near_m, spec.far_m), notes, Wrap.LOOP, recorded=False)

@@ -12,9 +12,10 @@ import numpy as np
 
 from trilane.errors import BadInputError
 from trilane.files import require_file
+from trilane.near_miss import did_you_mean
 from trilane.scene.camera import arkit, tum
 from trilane.scene.camera.arkit import load_arkit
-from trilane.scene.camera.builtin import ORBITS, load_builtin
+from trilane.scene.camera.builtin import BUILTIN, load_builtin
 from trilane.scene.camera.nerf import load_nerf
 from trilane.scene.camera.path import CameraPath
 from trilane.scene.camera.recorded import RawCamera, path_from_recording
@@ -37,7 +38,8 @@ def load_camera(spec: CameraSpec, base: Path) -> CameraPath:
     if spec.source.startswith(PREFIX):
         built_in = load_builtin(spec.source.removeprefix(PREFIX), spec)
         if built_in is None:
-            raise BadInputError("camera", repr(spec.source), f"{PREFIX}{{{', '.join(ORBITS)}}} or a file")
+            near = did_you_mean(spec.source.removeprefix(PREFIX), BUILTIN, PREFIX)
+            raise BadInputError("camera", repr(spec.source), f"{PREFIX}{{{', '.join(BUILTIN)}}} or a file", near)
         return built_in
     path = base / spec.source
     require_file(path, EXPECTED)

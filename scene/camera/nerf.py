@@ -25,6 +25,8 @@ FILM_STEP_DEG = 6.0
 DEFAULT_ANGLE_X = math.radians(50.0)
 DEFAULT_ASPECT = 4 / 3
 MAX_FRAMES = 100_000
+#: Of a matrix whose columns have unit length; that of a rotation is 1. A place far off makes it less: 1e-5 at 100 km.
+LEAST_DETERMINANT = 1e-9
 
 
 def load_nerf(path: Path) -> RawCamera:
@@ -43,12 +45,16 @@ def load_nerf(path: Path) -> RawCamera:
     tall, wide, lens = _lens(path, content)
     notes = (f"NeRF transforms, {len(frames)} views, no times: {how}, camera to world",)
     return RawCamera(
-        np.arange(len(frames)) / rate, matrices[:, :3, :3], matrices[:, :3, 3], "z", tall, wide, lens, notes
+        np.arange(len(frames)) / rate, matrices[:, :3, :3], matrices[:, :3, 3], "z", tall, wide, lens, notes, _place_of
     )
 
 
+def _place_of(index: int) -> str:
+    return f"frames[{index}].transform_matrix"
+
+
 def _matrix(path: Path, index: int, frame: Any) -> NDArray[np.float64]:
-    where = f"{path}: frames[{index}].transform_matrix"
+    where = f"{path}: {_place_of(index)}"
     value = frame.get("transform_matrix") if isinstance(frame, dict) else None
     try:
         matrix = np.array(value, dtype=np.float64)
@@ -56,7 +62,20 @@ def _matrix(path: Path, index: int, frame: Any) -> NDArray[np.float64]:
         raise BadInputError(where, "something else than numbers", "a 4x4 matrix") from None
     if matrix.shape not in ((4, 4), (3, 4)):
         raise BadInputError(where, f"shape {matrix.shape}", "a 4x4 matrix")
+    if _is_singular(matrix):
+        raise BadInputError(
+            where, "a matrix without an inverse", "a 4x4 matrix, camera to world", "leave this view out"
+        )
     return matrix[:3]
+
+
+def _is_singular(matrix: NDArray[np.float64]) -> bool:
+    """Whether the columns of `matrix` (3 or 4, 4), however long they are, span less than all directions."""
+    square = matrix[:, : len(matrix)]
+    if not np.isfinite(square).all():
+        return False  # a hole in a recording, which is interpolated across
+    lengths = np.linalg.norm(square, axis=0)
+    return bool(not lengths.all() or abs(np.linalg.det(square / lengths)) < LEAST_DETERMINANT)
 
 
 def _rate(turns: NDArray[np.float64]) -> tuple[float, str]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F64
 from trilane.scene.camera.path import CameraPath, Lens
-from trilane.scene.motion.usable_samples import usable_samples
+from trilane.scene.motion.usable_samples import PlaceOf, by_number, usable_samples
 from trilane.scene.rotations import about, quat_from_matrix, shortest_turn
 from trilane.scene.schema import CameraSpec
 
@@ -33,7 +33,7 @@ class RawCamera:
     `times_s` (N,): seconds. `turns` (N, 3, 3) and `places` (N, 3), metres: camera to world, OpenGL axes. `usual_up`:
     the axis of the world that is usually up in the format. `fov_y_deg`: field of view of the picture's height with the
     device held level; `portrait_fov_y_deg`: held upright; `lens`: where these two come from. `notes`: on the file, for
-    people.
+    people. `place_of`: where a sample stands in the file.
     """
 
     times_s: F64
@@ -44,6 +44,7 @@ class RawCamera:
     portrait_fov_y_deg: float
     lens: str
     notes: tuple[str, ...]
+    place_of: PlaceOf = by_number
 
 
 def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraPath:
@@ -52,7 +53,7 @@ def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraP
     `raw`: its content. `where`: its path, for messages. `spec`: of the scene, with the lens. Raises BadInputError when
     more than half of the poses are unusable.
     """
-    usable, repairs = usable_samples(where, raw.times_s, _readable(raw.turns, raw.places))
+    usable, repairs = usable_samples(where, raw.times_s, _readable(raw.turns, raw.places), raw.place_of)
     times, turns, places = raw.times_s[usable], raw.turns[usable], raw.places[usable]
     up, quarter, note = _upright(turns, raw.usual_up)
     world = shortest_turn(np.array(up), np.array(UP["y"]))

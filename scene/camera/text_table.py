@@ -6,6 +6,7 @@ Rule: every line has the same count of numbers; the error names the first line t
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,19 +17,31 @@ from trilane.files import read_text
 MAX_ROWS = 1_000_000
 
 
-def read_table(path: Path, columns: int, expected: str) -> NDArray[np.float64]:
-    """The numbers (N, columns) of `path`, N >= 1; `nan` and `inf` stay. Raises BadInputError with the line."""
-    rows = []
+class Table(NamedTuple):
+    """`numbers` (N, columns): of each pose. `lines` (N,): in which it stands, from 1 on."""
+
+    numbers: NDArray[np.float64]
+    lines: NDArray[np.int64]
+
+    def place_of(self, index: int) -> str:
+        """Where pose `index` stands in the file."""
+        return f"line {self.lines[index]}"
+
+
+def read_table(path: Path, columns: int, expected: str) -> Table:
+    """The poses of `path`, at least one; `nan` and `inf` stay. Raises BadInputError with the line."""
+    rows, lines = [], []
     for number, words in _lines(path, expected):
         if len(words) != columns:
             raise BadInputError(f"{path}, line {number}", f"{len(words)} columns", expected)
         try:
             rows.append([float(word) for word in words])
+            lines.append(number)
         except ValueError as error:
             raise BadInputError(f"{path}, line {number}", str(error), expected) from None
     if not rows or len(rows) > MAX_ROWS:
         raise BadInputError(path, f"{len(rows)} poses", f"1 to {MAX_ROWS}; {expected}")
-    return np.array(rows)
+    return Table(np.array(rows), np.array(lines))
 
 
 def column_count(path: Path, expected: str) -> int:

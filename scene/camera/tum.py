@@ -20,9 +20,11 @@ KINECT_DEG, KINECT_UPRIGHT_DEG = 49.8, 63.5
 
 def load_tum(path: Path) -> RawCamera:
     """Read `path`. Raises BadInputError with the line."""
-    table = read_table(path, COLUMNS, EXPECTED)
+    read = read_table(path, COLUMNS, EXPECTED)
+    table = read.numbers
     times, step = elapsed(table[:, 0])
     turns = matrix_from_quat(normalised(table[:, [7, 4, 5, 6]])) @ OPENGL_FROM_OPTICAL
     rate = f", {1 / step:.4g}/s" if step > 0 else ""
     notes = (f"TUM trajectory, {len(table)} poses{rate}, optical axes, camera to world",)
-    return RawCamera(times, turns, table[:, 1:4], "z", KINECT_DEG, KINECT_UPRIGHT_DEG, "usual for a Kinect", notes)
+    lens = (KINECT_DEG, KINECT_UPRIGHT_DEG, "usual for a Kinect")
+    return RawCamera(times, turns, table[:, 1:4], "z", *lens, notes, read.place_of)

@@ -1,4 +1,4 @@
-"""The built-in motions: a person who walks, waves and turns; a person who stands; the T pose.
+"""The built-in motions: a person who walks, waves and turns; one who walks there and back; one who stands; the T pose.
 
 Rule: the tables below say what happens when; the curves between are computed, and a cycle ends where it began.
 """
@@ -30,6 +30,8 @@ BUILD = Build(
 #: Largest distance of an ankle from its hip, as a part of the leg's length.
 REACH = 0.993
 
+Changes = tuple[tuple[float, float, float], ...]
+
 #: Start in seconds, end in seconds, and by how much the route changes in between: z in metres, heading in radians.
 WALKS = ((0.25, 2.65, 1.5), (6.45, 8.85, -1.5))
 TURNS = ((5.25, 6.55, np.pi), (8.75, 9.95, np.pi))
@@ -52,6 +54,14 @@ SWINGS = (
     Swing(-1, 9.58, 9.88),
 )
 PERIOD_S = 10.0
+
+#: Of one who walks there and back: as above, over FAR_M metres either way in FAR_STEPS steps of STEP_S seconds.
+FAR_M, FAR_STEPS, STEP_S = 5.0, 10, 0.58
+FAR_WALKS = ((0.50, 6.38, FAR_M), (7.90, 13.78, -FAR_M))
+FAR_TURNS = ((6.40, 7.60, np.pi), (13.80, 15.00, np.pi))
+FAR_PERIOD_S = 15.0
+#: Steps of a turn: lift and landing after the turn begins, seconds.
+TURN_STEPS = ((0.09, 0.41), (0.47, 0.77), (0.83, 1.13))
 #: The waving arm, seconds: starts to rise, is up, starts to sink, is down.
 WAVE_S = (2.45, 3.05, 4.75, 5.45)
 WAVES_PER_S = 1.7
@@ -63,6 +73,24 @@ def walk_wave_turn() -> Motion:
     walker = Walker(BUILD, _route, SWINGS, PERIOD_S)
     left, right = walker.foot(1, times), walker.foot(-1, times)
     return _closed(times, *_body(times, left, right), "walks, waves and turns")
+
+
+def there_and_back() -> Motion:
+    """Fifteen seconds of a person who walks five metres, turns, walks back and turns again, along z."""
+    times = np.arange(int(FAR_PERIOD_S * RATE_HZ)) / RATE_HZ
+    walker = Walker(BUILD, _far_route, far_swings(), FAR_PERIOD_S)
+    left, right = walker.foot(1, times), walker.foot(-1, times)
+    return _closed(times, *_body(times, left, right, wave=False), "walks five metres, turns and walks back")
+
+
+def far_swings() -> tuple[Swing, ...]:
+    """Steps of the one who walks there and back; the feet take turns, the right one first."""
+    spans = []
+    for (walk_s, _, _), (turn_s, _, _) in zip(FAR_WALKS, FAR_TURNS, strict=True):
+        lifts = (walk_s + 0.05 + k * STEP_S for k in range(FAR_STEPS))
+        spans += [(lift_s, lift_s + 0.46) for lift_s in lifts]
+        spans += [(turn_s + lift_s, turn_s + landing_s) for lift_s, landing_s in TURN_STEPS]
+    return tuple(Swing(1 if k % 2 else -1, *span) for k, span in enumerate(spans))
 
 
 def idle() -> Motion:
@@ -80,7 +108,12 @@ def t_pose() -> Motion:
     return Motion(np.zeros(1), poses, places, None, ("built in: the T pose, one frame: held",), Wrap.LOOP, None, False)
 
 
-BUILTIN: dict[str, Callable[[], Motion]] = {"walk-wave-turn": walk_wave_turn, "idle": idle, "t-pose": t_pose}
+BUILTIN: dict[str, Callable[[], Motion]] = {
+    "walk-wave-turn": walk_wave_turn,
+    "there-and-back": there_and_back,
+    "idle": idle,
+    "t-pose": t_pose,
+}
 
 
 def _closed(times: F64, poses: F64, places: F64, what: str) -> Motion:
@@ -92,8 +125,17 @@ def _closed(times: F64, poses: F64, places: F64, what: str) -> Motion:
 
 
 def _route(times: F64) -> tuple[F64, F64, F64]:
-    z = START_Z_M + sum(far * _eased((times - start) / (end - start)) for start, end, far in WALKS)
-    heading = sum(angle * smooth_step((times - start) / (end - start)) for start, end, angle in TURNS)
+    return _along_z(times, START_Z_M, WALKS, TURNS)
+
+
+def _far_route(times: F64) -> tuple[F64, F64, F64]:
+    return _along_z(times, -FAR_M / 2, FAR_WALKS, FAR_TURNS)
+
+
+def _along_z(times: F64, start_m: float, walks: Changes, turns: Changes) -> tuple[F64, F64, F64]:
+    """A route (see `Route`) that begins at z = `start_m` and changes by the tables `walks` and `turns`."""
+    z = start_m + sum(far * _eased((times - start) / (end - start)) for start, end, far in walks)
+    heading = sum(angle * smooth_step((times - start) / (end - start)) for start, end, angle in turns)
     return np.zeros_like(times), np.asarray(z), np.asarray(heading)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from trilane.errors import BadInputError
 from trilane.files import require_file
+from trilane.near_miss import did_you_mean
 from trilane.scene.motion.amass import load_amass
 from trilane.scene.motion.builtin import BUILTIN
 from trilane.scene.motion.bvh_retarget import load_retargeted
@@ -37,7 +38,8 @@ def load_motion(spec: AvatarSpec, base: Path) -> Motion:
     if spec.motion.startswith(PREFIX):
         make = BUILTIN.get(spec.motion.removeprefix(PREFIX))
         if make is None:
-            raise BadInputError("motion", repr(spec.motion), f"{PREFIX}{{{', '.join(BUILTIN)}}} or a file")
+            near = did_you_mean(spec.motion.removeprefix(PREFIX), BUILTIN, PREFIX)
+            raise BadInputError("motion", repr(spec.motion), f"{PREFIX}{{{', '.join(BUILTIN)}}} or a file", near)
         return make()
     path = base / spec.motion
     reader = _READERS.get(path.suffix.lower())

@@ -6,6 +6,8 @@ Sampling interpolates across the hole. A file in which more than half of the sam
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,29 +17,39 @@ from trilane.errors import BadInputError
 #: An interval longer than this many median intervals is reported as a gap.
 GAP = 1.5
 
+#: The index of a sample -> where it stands in its file, for messages.
+PlaceOf = Callable[[int], str]
 
-def usable_samples(where: str, times_s: F64, readable: NDArray[np.bool_]) -> tuple[NDArray[np.intp], tuple[str, ...]]:
+
+def by_number(index: int) -> str:
+    """Of a file in which samples have no other places."""
+    return f"number {index}"
+
+
+def usable_samples(
+    where: str, times_s: F64, readable: NDArray[np.bool_], place_of: PlaceOf = by_number
+) -> tuple[NDArray[np.intp], tuple[str, ...]]:
     """Indices of the usable samples, and notes on the others and on gaps in time.
 
     `where`: the file, for messages. `times_s` (T,): of the samples. `readable` (T,): whether their values are readable.
-    Raises BadInputError when less than half of the samples are usable.
+    `place_of`: where each stands in the file. Raises BadInputError when less than half of the samples are usable.
     """
     timed = readable & np.isfinite(times_s)
     broken = int(len(times_s) - timed.sum())
     indices = np.flatnonzero(timed)
     increasing = indices[_strictly_increasing(times_s[indices])]
     late = len(indices) - len(increasing)
+    first = f" (first: {place_of(int(np.flatnonzero(~timed)[0]))})" if broken else ""
     if not len(increasing) or 2 * len(increasing) < len(times_s):
         raise BadInputError(
             where,
-            f"{broken} samples that are not finite numbers or no rotation and {late} times that do not increase, "
-            f"of {len(times_s)}",
+            f"{broken} samples that are not finite numbers or no rotation{first} and {late} times that do not "
+            f"increase, of {len(times_s)}",
             "at least half of the samples sound",
         )
     notes = []
     if broken:
-        first = int(np.flatnonzero(~timed)[0])
-        notes.append(f"{broken} samples not finite or no rotation (first: number {first}), interpolated across")
+        notes.append(f"{broken} samples not finite or no rotation{first}, interpolated across")
     if late:
         notes.append(f"{late} samples with repeated or decreasing times left out")
     return increasing, (*notes, *_gap_notes(times_s[increasing]))

@@ -92,7 +92,7 @@ def read_npz(path: Path, keys: Collection[str], expected: str) -> dict[str, NDAr
 def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
     where = f"{path}[{info.filename.removesuffix('.npy')}]"
     with archive.open(info) as file:
-        wanted = _checked_bytes(where, file, "numbers")
+        wanted = _checked_bytes(where, file, "numbers") + file.tell()
         if info.file_size < wanted:
             raise BadInputError(where, f"{info.file_size} bytes, truncated", f"{wanted} by its own header")
     with archive.open(info) as file:

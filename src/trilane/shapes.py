@@ -8,6 +8,7 @@ from trilane.unexpected_value import UnexpectedValue
 
 MAX_SIDE = 4096
 BUCKET_STEP = 32
+MOST_ASPECT = 4  # of a bucket's longer side to its shorter one
 
 Shape = tuple[int, int]
 
@@ -35,7 +36,7 @@ def shape_buckets(size: str) -> list[Shape]:
 
 def _shapes_of_area(side: int) -> list[Shape]:
     widest = [(h, side * side // h // BUCKET_STEP * BUCKET_STEP) for h in range(BUCKET_STEP, 2 * side + 1, BUCKET_STEP)]
-    shapes = [(h, w) for h, w in widest if w and max(h, w) <= min(4 * min(h, w), MAX_SIDE)]
+    shapes = [(h, w) for h, w in widest if w and max(h, w) <= min(MOST_ASPECT * min(h, w), MAX_SIDE)]
     return [(h, w) for h, w in shapes if not any(b > h and v >= w for b, v in shapes)]
 
 

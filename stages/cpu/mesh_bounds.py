@@ -22,7 +22,7 @@ from trilane.body.joints import JOINTS
 from trilane.body.kinematics import Posed
 from trilane.body.skin_weights import largest_weights
 from trilane.body.skinning import blend_matrices
-from trilane.stages.cpu.crop import Rect
+from trilane.scene.crop import Rect
 from trilane.stages.cpu.mesh_patches import Level, build_levels, join
 
 #: Margins for rounding, added to every radius (metres) and to every side of the rectangle (NDC).

@@ -13,51 +13,58 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.avatars.bundle import CLOTHES_STANDOFF_M
 from trilane.body.kinematics import Posed, Skeleton
-from trilane.body.skinning import FrameSkinner
 from trilane.errors import TrilaneError
 from trilane.pipeline.shared_assets import Assets
 from trilane.pipeline.stage import UnitContext
 from trilane.scene.mover import Mover
+from trilane.scene.planner import Held, plan_tensor
+from trilane.scene.tensor_layout import lay_out
+from trilane.shapes import Shape
 from trilane.stages.avatar_assets import distinct, shaped_body, staged_of
 from trilane.stages.config import RunConfig
-from trilane.stages.cpu.crop import Rect
-from trilane.stages.cpu.mesh_bounds import MeshBounds
-from trilane.stages.cpu.tensor_layout import lay_out
+from trilane.stages.cpu.actor import ModelledBody, Seen
 from trilane.stages.packets import posed_vertices
 from trilane.transport.packets import Packet
 
 
 @dataclass(frozen=True)
 class _Actor:
+    index: int
     mover: Mover
     skeleton: Skeleton
-    bounds: MeshBounds
-    skinner: FrameSkinner | None
+    body: ModelledBody
+
+
+@dataclass(frozen=True)
+class FramePlan:
+    """What was decided for a frame: the tensor's shape, None with nobody in view; each visible avatar by its number."""
+
+    shape: Shape | None
+    density: float | None
+    seen: Mapping[int, Seen]
 
 
 class PoseStage:
-    """Stage `pose` of the CPU unit: no input edge, an output edge of headers."""
+    """Stage `pose` of the CPU unit: no input edge, an output edge of headers. `plan`: of the frame that it did last."""
 
     def __init__(self, config: RunConfig, assets: Assets) -> None:
         """The scene of `config`, whose avatars, motions and camera lie in `assets`."""
         scene = config.scene
         self._fps = scene.fps
         self._output = (scene.output.height, scene.output.width)
-        self._buckets = config.buckets
+        self._buckets, self._plans_tensor = config.buckets, scene.plans_tensor
+        self._held: Held | None = None
+        self.plan = FramePlan(None, None, {})
         folders = distinct(config)
-        bodies = {folder: shaped_body(assets, number) for number, folder in enumerate(folders)}
-        bounds = {folder: MeshBounds(body, standoff_m=CLOTHES_STANDOFF_M) for folder, body in bodies.items()}
+        bodies = {
+            folder: ModelledBody(shaped_body(assets, number), bool(config.posed_vertices), config.budget_px)
+            for number, folder in enumerate(folders)
+        }
         staged = staged_of(assets)
         self._actors = [
-            _Actor(
-                mover,
-                Skeleton(bodies[folder].joints, bodies[folder].body.parents),
-                bounds[folder],
-                FrameSkinner(bodies[folder]) if config.posed_vertices else None,
-            )
-            for folder, mover in zip(config.avatar_dirs, staged.movers, strict=True)
+            _Actor(index, mover, bodies[folder].skeleton(), bodies[folder])
+            for index, (folder, mover) in enumerate(zip(config.avatar_dirs, staged.movers, strict=True))
         ]
         self._camera = staged.camera
         self._projection = staged.camera.projection(scene.output.width / scene.output.height)
@@ -73,7 +80,10 @@ class PoseStage:
         self._vertices = [posed_vertices(packet.payload, self._counts) for packet in outputs]
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:  # noqa: ARG002
-        """Fill `outputs[slot_out]` for `frame`; the figure is how many avatars are visible.
+        """Fill `outputs[slot_out]` for `frame`.
+
+        Metrics: `visible`, how many avatars are; of a frame with any, `level` of `body.detail.DETAILS` and `error_px`,
+        the bound on what it moves on the picture, both of the worst avatar; `density` of a planned tensor.
 
         Raises ValueError without `slot_out`, TrilaneError when a number of the frame is not finite.
         """
@@ -91,23 +101,49 @@ class PoseStage:
         clip = self._projection @ view
         vertices: Sequence[NDArray[np.float32] | None] = self._vertices[slot_out] or [None] * len(self._actors)
         seen = [
-            (avatar, rect)
-            for index, actor in enumerate(self._actors)
-            if (rect := _pose(actor, avatar := packet["avatars"][index], vertices[index], index, t_s, frame, clip))
-            is not None
+            (avatar, one)
+            for actor, place in zip(self._actors, vertices, strict=True)
+            if (one := self._pose(actor, avatar := packet["avatars"][actor.index], place, t_s, frame, clip)) is not None
         ]
-        self._lay_out(packet, seen)
-        return {"visible": float(len(seen))}
+        self.plan = self._lay_out(packet, seen)
+        return _metrics(self.plan)
 
-    def _lay_out(self, packet: NDArray[np.void], seen: list[tuple[NDArray[np.void], Rect]]) -> None:
+    def _lay_out(self, packet: NDArray[np.void], seen: list[tuple[NDArray[np.void], Seen]]) -> FramePlan:
         """Crop rectangles, cells and the tensor's shape; the smallest shape when nothing is to be drawn."""
         if not seen:
             packet["tensor_shape"] = min(self._buckets, key=lambda shape: shape[0] * shape[1])
-            return
-        layout = lay_out([rect for _, rect in seen], self._output, self._buckets)
+            return FramePlan(None, None, {})
+        rects, density = [one.rect for _, one in seen], None
+        if self._plans_tensor:
+            plan = plan_tensor(rects, self._output, self._buckets, self._held)
+            layout, density, self._held = plan.dense.layout, plan.dense.density, plan.held
+        else:
+            layout = lay_out(rects, self._output, self._buckets)
         packet["tensor_shape"] = layout.shape
         for (avatar, _), (crop, cell) in zip(seen, layout.crops, strict=True):
             avatar["rect"], avatar["tensor_rect"] = crop, cell
+        return FramePlan(layout.shape, density, {int(avatar["avatar"]): one for avatar, one in seen})
+
+    def _pose(
+        self,
+        actor: _Actor,
+        avatar: NDArray[np.void],
+        vertices: NDArray[np.float32] | None,
+        t_s: float,
+        frame: int,
+        clip: NDArray[np.float64],
+    ) -> Seen | None:
+        """Fill one avatar's joints, and `vertices` if given; where it is on the screen, None when it is not visible."""
+        index = actor.index
+        pose, translation = actor.mover.sample(t_s)
+        _require_finite(pose, frame, f"pose of avatar {index}")
+        _require_finite(translation, frame, f"place of avatar {index}")
+        posed: Posed = actor.skeleton.pose(pose, translation, actor.mover.world)
+        _require_finite(posed.matrices, frame, f"joints of avatar {index}")
+        seen = actor.body.see(posed, clip, self._output, vertices)
+        avatar["avatar"], avatar["visible"] = index, seen is not None
+        avatar["joints"], avatar["pose_feature"] = posed.matrices, posed.feature
+        return seen
 
     def close(self) -> None:
         """Let go of the slots."""
@@ -119,27 +155,12 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> PoseStage:
     return PoseStage(RunConfig.model_validate(settings["config"]), unit.assets)
 
 
-def _pose(
-    actor: _Actor,
-    avatar: NDArray[np.void],
-    vertices: NDArray[np.float32] | None,
-    index: int,
-    t_s: float,
-    frame: int,
-    clip: NDArray[np.float64],
-) -> Rect | None:
-    """Fill one avatar's joints, and `vertices` if given; its rectangle on the screen, None when nothing is visible."""
-    pose, translation = actor.mover.sample(t_s)
-    _require_finite(pose, frame, f"pose of avatar {index}")
-    _require_finite(translation, frame, f"place of avatar {index}")
-    posed: Posed = actor.skeleton.pose(pose, translation, actor.mover.world)
-    _require_finite(posed.matrices, frame, f"joints of avatar {index}")
-    if actor.skinner is not None and vertices is not None:
-        actor.skinner.skin_into(posed, vertices)
-    rect = actor.bounds.rect(posed, clip, vertices)
-    avatar["avatar"], avatar["visible"] = index, rect is not None
-    avatar["joints"], avatar["pose_feature"] = posed.matrices, posed.feature
-    return rect
+def _metrics(plan: FramePlan) -> dict[str, float]:
+    metrics = {"visible": float(len(plan.seen))}
+    if plan.seen:
+        metrics["level"] = float(max(one.level for one in plan.seen.values()))
+        metrics["error_px"] = max(one.error_px for one in plan.seen.values())
+    return metrics if plan.density is None else {**metrics, "density": plan.density}
 
 
 def _require_finite(values: NDArray[np.floating], frame: int, what: str) -> None:

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from trilane.body.body import ShapedBody
 from trilane.errors import TrilaneError
 from trilane.pipeline.stage import UnitContext
+from trilane.scene.crop import Rect, crop_projection
 from trilane.shapes import Shape
 from trilane.stages.avatar_assets import distinct, quantisation_of, shaped_body, texture_of
 from trilane.stages.config import RunConfig
-from trilane.stages.cpu.crop import Rect, crop_projection
 from trilane.stages.gpu.avatar_mesh import avatar_mesh
 from trilane.stages.gpu.opengl_context import CONTEXT, checked, describe, open_context
 from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -81,5 +82,45 @@ def held(request: pytest.FixtureRequest) -> Callable[[str, Any], None]:
             everything.setdefault(test, {})[what] = [float(f"{value:.10g}") for value in found]
             HELD.write_text(json.dumps(everything, indent=0, sort_keys=True) + "\n", encoding="utf-8")
         assert found == pytest.approx(everything[test][what], abs=CLOSE * max(found[2], 1e-9), rel=0), what
+
+    return check
+
+
+PRINTED = Path(__file__).with_name("printed")
+#: `trilane ARGUMENTS` in this process: what it prints on stdout and on stderr; it must end with the exit code `code`.
+Command = Callable[..., tuple[str, str]]
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
+    monkeypatch.setenv("COLUMNS", "160")
+    monkeypatch.setenv("NO_COLOR", "1")
+
+    def run(*arguments: object, code: int = 0) -> tuple[str, str]:
+        from trilane.apps.cli.main import main
+
+        monkeypatch.setattr("sys.argv", ["trilane", *map(str, arguments)])
+        with pytest.raises(SystemExit) as left:
+            main()
+        out, err = capsys.readouterr()
+        assert int(left.value.code or 0) == code, err
+        return out, err
+
+    return run
+
+
+@pytest.fixture
+def check_printed() -> Callable[[str, str], None]:
+    """Compare with printed/NAME.txt, line by line and word by word: how a table is framed is its library's matter.
+
+    TRILANE_WRITE_PRINTED=1 writes the file anew; read the difference before committing it.
+    """
+
+    def check(name: str, text: str) -> None:
+        lines = [" ".join(re.sub(r"[─-╿|]", " ", line).split()) for line in text.splitlines()]
+        file, text = PRINTED / f"{name}.txt", "".join(f"{line}\n" for line in lines if line)
+        if "TRILANE_WRITE_PRINTED" in os.environ:
+            file.write_text(text, encoding="utf-8")
+        assert text.splitlines() == file.read_text(encoding="utf-8").splitlines()
 
     return check

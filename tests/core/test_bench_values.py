@@ -312,7 +312,9 @@ def test_runs_are_compared_with_the_sequential_ones_before_and_after() -> None:
 
 def test_a_row_is_medians_sums_and_the_commonest_name() -> None:
     def run(fps: float, slowest: str, lost: int) -> dict[str, Any]:
-        return {"fps": fps, "slowest": slowest, "lost": lost, "hops_ms": None, "gain_of_bound": fps / 10}
+        latencies = [round(fps * 1e6) + 1000 * k for k in range(100)]
+        row = {"fps": fps, "slowest": slowest, "lost": lost, "hops_ms": None, "gain_of_bound": fps / 10}
+        return row | {"latencies_ns": latencies}
 
     setting = pipeline_bench.Setting("default", "256", 2, "pipelined", "double")
     row = pipeline_bench._summary(setting, [run(5.0, "gpu", 1), run(9.0, "dsp", 2), run(6.0, "gpu", 4)])
@@ -324,7 +326,26 @@ def test_a_row_is_medians_sums_and_the_commonest_name() -> None:
         "gain_of_bound": 0.6,
         "of_bound_low": 0.5,
         "of_bound_high": 0.9,
+        "latency_p50_ms": pytest.approx(
+            6.0495
+        ),  # of the 300: the 50 th and 51 st of those from 6 ms on, in steps of 1 µs
+        "latency_p99_ms": pytest.approx(9.09601),  # at rank 0.99 * 299 = 296.01, which is 96.01 of those from 9 ms on
     }
+    few = pipeline_bench._summary(setting, [run(5.0, "gpu", 1), run(9.0, "dsp", 2)])
+    assert (few["latency_p50_ms"], few["latency_p99_ms"]) == (pytest.approx(7.0495), None)
+
+
+def test_latency_is_from_the_pose_to_the_composited_picture() -> None:
+    """Frame 1 was dropped after its pose."""
+    spans = [
+        ("pose", 0, 2, 5),
+        ("pose", 1, 10, 12),
+        ("composite", 0, 20, 24),
+        ("pose", 2, 30, 33),
+        ("composite", 2, 40, 47),
+    ]
+    jobs = [JobRecord(stage, "u", frame, 0, 0, begin, end) for stage, frame, begin, end in spans]
+    assert pipeline_bench.latencies_ns(jobs) == [22, 17]
 
 
 def test_sequential_comes_first_and_once() -> None:

@@ -411,7 +411,27 @@ def test_the_motions_say_what_they_are() -> None:
         assert motion.poses[0].tolist() == motion.poses[-1].tolist() and motion.betas is None
         assert motion.translation[0].tolist() == motion.translation[-1].tolist()
     assert rest.translation.tolist() == [[0, 0.94, 0]] and not rest.poses.any()
-    assert list(BUILTIN) == ["walk-wave-turn", "idle", "t-pose"]
+    assert list(BUILTIN) == ["walk-wave-turn", "there-and-back", "idle", "t-pose"]
+
+
+def test_one_who_walks_there_and_back_takes_ten_steps_either_way_and_three_to_turn() -> None:
+    """Right, left, right, ... without end: 26 steps; walks begin at 0.5 and 7.9 s, turns at 6.4 and 13.8 s of 15."""
+    lifts = [0.55 + 0.58 * k for k in range(10)] + [6.49, 6.87, 7.23] + [7.95 + 0.58 * k for k in range(10)]
+    swings = builtin.far_swings()
+    assert [swing.side for swing in swings] == [-1, 1] * 13
+    assert [swing.start_s for swing in swings] == pytest.approx([*lifts, 13.89, 14.27, 14.63])
+    lengths = [0.46] * 10 + [0.32, 0.30, 0.30]
+    assert [swing.end_s - swing.start_s for swing in swings] == pytest.approx(lengths * 2)
+    x, z, heading = builtin._far_route(np.array([0.5, 3.44, 6.39, 7.0, 7.7, 10.84, 13.79, 14.4, 15.0]))
+    assert not x.any()
+    assert z == pytest.approx([-2.5, 0, 2.5, 2.5, 2.5, 0, -2.5, -2.5, -2.5], abs=1e-9)
+    assert heading == pytest.approx(np.pi * np.array([0, 0, 0, 0.5, 1, 1, 1, 1.5, 2]))
+    motion = BUILTIN["there-and-back"]()
+    assert motion.notes == ("built in: walks five metres, turns and walks back, 15 s at 60/s, loops",)
+    assert (len(motion.times_s), motion.leg_m, motion.travels) == (901, BUILD.leg_m, False)
+    assert np.abs(motion.translation[:, 0]).max() < 0.1  # sways, and leans to the loaded foot
+    assert motion.translation[:, 2].min() == pytest.approx(-2.5, abs=0.1)
+    assert motion.translation[:, 2].max() == pytest.approx(2.5, abs=0.1)
 
 
 def test_one_who_stands_shifts_the_weight_and_looks_about() -> None:

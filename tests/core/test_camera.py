@@ -119,7 +119,7 @@ def test_holes_in_a_log_are_mended_and_said(tmp_path: Path) -> None:
     lines[8] = arkit_line(1e14 + 160e6, np.eye(3) * 2, np.zeros(3))
     camera = load(write_arkit(tmp_path / "a.txt", lines))
     notes = " ".join(camera.notes)
-    assert "2 samples not finite or no rotation (first: number 8)" in notes
+    assert "2 samples not finite or no rotation (first: line 10)" in notes
     assert "2 samples with repeated or decreasing times left out" in notes
     assert "gaps, the longest 60 ms" in notes
     assert (np.diff(camera.times_s) > 0).all()

@@ -40,6 +40,30 @@ def test_a_built_in_camera_is_where_its_formula_says(
     assert load(f"builtin:{name}", fov_y_deg=33.5).lens.fov_y_deg == 33.5
 
 
+def test_a_camera_goes_from_above_down_to_the_floor() -> None:
+    """3.9 m from (0, 0.9, 0): 80 degrees above it, after half of 12 s at a height of 0.12 m, between by a cosine."""
+    camera = load("builtin:top-to-floor")
+    low = math.degrees(math.asin((0.12 - 0.9) / 3.9))
+    for t_s, degrees in ((0.0, 80.0), (3.0, (80 + low) / 2), (6.0, low), (9.0, (80 + low) / 2), (12.0, 80.0)):
+        angle = math.radians(degrees)
+        _, place = camera.pose(t_s)
+        assert place == pytest.approx([0, 0.9 + 3.9 * math.sin(angle), 3.9 * math.cos(angle)], abs=1e-9)
+        assert camera.sample(t_s) @ [0, 0.9, 0, 1] == pytest.approx([0, 0, -3.9, 1], abs=1e-9)
+    assert camera.pose(6.0)[1][1] == pytest.approx(0.12)
+    what = "whole person, from above down to the floor, 12 s a cycle"
+    assert camera.notes == (f"built in: {what}, field of view 40 degrees high",)
+
+
+def test_a_camera_stands_by_the_wayside() -> None:
+    """The way, x = 0, is behind the camera from z = 1.9 on, and left of it."""
+    camera = load("builtin:wayside")
+    assert camera.pose(0.0)[1] == pytest.approx([0.9, 1.45, 1.9]) == camera.pose(0.7)[1]
+    far, past = (camera.sample(0.3) @ [0.0, 1.0, z, 1.0] for z in (-2.5, 2.5))
+    assert far[2] < 0 < past[2] and abs(far[0] / far[2]) < 0.1
+    distance = math.sqrt(1.0 + 0.4**2 + 4.4**2)
+    assert camera.sample(0.0) @ [-0.1, 1.05, -2.5, 1] == pytest.approx([0, 0, -distance, 1], abs=1e-9)
+
+
 def test_a_path_between_and_after_its_samples() -> None:
     """A quarter turn about +Y in 2 s while the camera moves 4 m along x."""
     h = math.sqrt(0.5)

@@ -18,7 +18,9 @@ from trilane.testing.camera_files import load, nerf_text, pose_z_up, rows_of
 def test_a_table_has_comments_commas_and_blank_lines(tmp_path: Path) -> None:
     path = tmp_path / "a.txt"
     path.write_text("# 9 9 9\n\n1, 2,3 # not 4\n  4 5\tnan\n")
-    assert read_table(path, 3, "three") == pytest.approx(np.array([[1, 2, 3], [4, 5, np.nan]]), nan_ok=True)
+    table = read_table(path, 3, "three")
+    assert table.numbers == pytest.approx(np.array([[1, 2, 3], [4, 5, np.nan]]), nan_ok=True)
+    assert [table.place_of(index) for index in (0, 1)] == ["line 3", "line 4"]
     assert column_count(path, "three") == 3
     path.write_text("# only this\n")
     assert column_count(path, "three") == 0
@@ -37,7 +39,7 @@ def test_a_table_may_have_a_million_rows(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(text_table, "MAX_ROWS", 2)
     path = tmp_path / "a.txt"
     path.write_text("1\n2\n")
-    assert len(read_table(path, 1, "one")) == 2
+    assert len(read_table(path, 1, "one").numbers) == 2
     for text, count in (("1\n2\n3\n", 3), ("# 1\n", 0)):
         path.write_text(text)
         with pytest.raises(BadInputError, match=f"found {count} poses, expected 1 to 2; one"):
@@ -80,8 +82,10 @@ def test_the_format_is_told_by_columns_or_given(tmp_path: Path) -> None:
     with pytest.raises(BadInputError) as raised:
         load("builtin:drone")
     assert str(raised.value) == (
-        "camera: found 'builtin:drone', expected builtin:{orbit, static, closeup, far} or a file"
+        "camera: found 'builtin:drone', expected builtin:{orbit, static, closeup, far, top-to-floor, wayside} or a file"
     )
+    with pytest.raises(BadInputError, match=r"; did you mean 'builtin:wayside'\?$"):
+        load("builtin:waside")
     with pytest.raises(BadInputError) as raised:
         load(tmp_path / "nowhere.txt")
     assert str(raised.value) == (

@@ -182,8 +182,8 @@ def test_only_rotations_are_taken_for_cameras(tmp_path: Path, matrix: np.ndarray
     with pytest.raises(BadInputError) as raised:
         load(tmp_path / "a.txt")
     assert str(raised.value) == (
-        f"{tmp_path}/a.txt: found 1 samples that are not finite numbers or no rotation and 0 times that do not "
-        "increase, of 1, expected at least half of the samples sound"
+        f"{tmp_path}/a.txt: found 1 samples that are not finite numbers or no rotation (first: line 1) and 0 times "
+        "that do not increase, of 1, expected at least half of the samples sound"
     )
 
 

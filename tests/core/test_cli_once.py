@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from enum import Enum
 from importlib import import_module
 from typing import Annotated, Any
 
@@ -85,3 +86,30 @@ def test_a_second_value_is_refused_though_it_is_the_same(command: Any, words: li
         command.main(words, standalone_mode=False)
     assert str(refused.value) == f"options: found {named} given 2 times, expected it once; it takes one value"
     assert refused.value.exit_code == 2
+
+
+class Size(Enum):
+    SMALL = "small"
+    LARGE = "large"
+
+
+def test_a_value_of_another_kind_is_said_as_everywhere() -> None:
+    """Found, expected, and for a misspelt word the one that was probably meant."""
+    app = Commands()
+
+    @app.command()
+    def one(
+        size: Annotated[Size, typer.Option()] = Size.SMALL,
+        count: int = 1,
+        share: Annotated[float, typer.Option(min=0, max=2)] = 0.0,
+    ) -> None: ...
+
+    for words, sentence in (
+        (["--size", "smal"], "--size: found 'smal', expected one of small, large; did you mean 'small'?"),
+        (["--size", "7"], "--size: found '7', expected one of small, large"),
+        (["--count", "abc"], "--count: found 'abc', expected a valid integer"),
+        (["--share", "2.5"], "--share: found '2.5', expected less than or equal to 2"),
+    ):
+        with pytest.raises(BadInputError) as refused:
+            typer.main.get_command(app).main(words, standalone_mode=False)
+        assert str(refused.value) == sentence

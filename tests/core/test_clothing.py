@@ -70,6 +70,14 @@ def test_weights_sum_to_one_and_all_is_finite(layers):
         assert layer.light.min() >= 0 and layer.light.max() <= 1 + 1e-9
 
 
+def test_layers_are_as_they_were(held, layers):
+    """Outer ones first."""
+    assert list(layers) == ["trousers", "shirt", "hair", "shoe", "sole", "skin"]
+    for material, layer in layers.items():
+        for name in ("vertices", "faces", "below", "weights", "normal", "light", "mark"):
+            held(f"{material} {name}", getattr(layer, name))
+
+
 def test_shell_keeps_its_distance():
     square = np.array([[x, 0.0, z] for x in range(6) for z in range(6)], np.float64)
     corner = [(6 * x + z, 6 * x + z + 1, 6 * x + z + 6) for x in range(5) for z in range(5)]

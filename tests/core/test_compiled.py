@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
 import subprocess
@@ -82,3 +83,13 @@ def test_sources_that_changed_after_they_were_compiled_do_not_run(tmp_path: Path
     assert form(package) == "stale"
     with pytest.raises(MissingPartError, match="make compile"):
         check(package)
+
+
+def test_the_library_is_named_after_the_sources_that_there_are() -> None:
+    """Every module that is compiled is a file; a renamed or forgotten one would stop the build."""
+    assert all((PACKAGE / name).is_file() for name in MODULES)
+    joined = b"\0".join((PACKAGE / name).read_bytes() for name in MODULES)
+    assert library(PACKAGE) == f"trilane_core_{hashlib.sha256(joined).hexdigest()[:16]}"
+    folder = PACKAGE / "scheduler"
+    compiled = {name.removeprefix("scheduler/") for name in MODULES if name.startswith("scheduler/")}
+    assert {path.name for path in folder.glob("*.py")} - compiled == {"__init__.py", "accounts.py", "uncertainty.py"}

@@ -1,19 +1,128 @@
-"""What goes to stdout: results alone, whatever libraries print."""
+"""What goes to stdout: results alone, whatever libraries print; and how facts are shown to people."""
 
 from __future__ import annotations
 
+import io
 import json
 import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
+from rich.console import Console
 
-from trilane.apps.cli.console import print_json, stdout_kept
+from trilane.apps.cli import console as module
+from trilane.apps.cli.console import print_facts, print_json, spinner, stderr_console, stdout_console, stdout_kept
+
+
+def open_descriptors() -> int:
+    return len(list(Path("/proc/self/fd").iterdir()))
 
 
 def test_what_a_library_prints_is_no_result(capfd: pytest.CaptureFixture[str]) -> None:
+    before = open_descriptors()
     with stdout_kept():
         os.write(1, b"a library says hello\n")
     print_json({"answer": 42})
     out, err = capfd.readouterr()
     assert json.loads(out) == {"answer": 42}
     assert "a library says hello" in err
+    assert open_descriptors() == before
+
+
+def test_what_was_printed_before_and_inside_goes_where_it_was_meant_to() -> None:
+    """What Python still holds back is written out at both ends of the block."""
+    program = """
+import os, sys
+from trilane.apps.cli.console import stdout_kept
+sys.stdout.write("before;")
+try:
+    with stdout_kept():
+        sys.stdout.write("inside;")
+        os.write(1, b"library;")
+        raise KeyError
+except KeyError:
+    sys.stdout.write("after")
+"""
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, env=environment)
+    assert (done.stdout, done.stderr) == ("before;after", "library;inside;")
+
+
+def test_json_is_one_indented_document_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Stream(io.StringIO):
+        flushed = 0
+
+        def flush(self) -> None:
+            self.flushed = self.tell()
+
+    stream = Stream()
+    monkeypatch.setattr(sys, "stdout", stream)
+    print_json({"a": [1], "b": None})
+    assert stream.getvalue() == '{\n "a": [\n  1\n ],\n "b": null\n}\n'
+    assert stream.flushed == len(stream.getvalue())
+    with pytest.raises(ValueError, match="JSON"):
+        print_json({"a": float("nan")})
+
+
+FACTS = {
+    "name": "tiny",
+    "files": {"body": {"bytes": 1234567}, "share": {"a": {"b": 1 / 3}}},
+    "layers": [{"name": "stem", "sqnr_db": 12.5}, {"name": "head", "kind": "conv"}, {"sqnr_db": 1.0}],
+    "empty": [],
+    "numbers": [1, 2],
+    "large": 123456.789,
+    "flag": True,
+    "none": None,
+}
+
+
+def test_facts_are_a_row_for_every_key(capsys: pytest.CaptureFixture[str]) -> None:
+    print_facts(FACTS, as_json=False)
+    assert [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()] == [
+        "name tiny",
+        "files.body.bytes 1234567",
+        "files.share.a.b 0.3333",
+        "stem {'sqnr_db': 12.5}",
+        "head {'kind': 'conv'}",
+        "None {'sqnr_db': 1.0}",
+        "empty []",
+        "numbers [1, 2]",
+        "large 1.235e+05",
+        "flag True",
+        "none None",
+    ]
+    print_facts(FACTS, as_json=True)
+    assert json.loads(capsys.readouterr().out) == FACTS
+
+
+@pytest.mark.parametrize(("is_terminal", "width"), [(False, 120), (True, 77)])
+def test_a_pipe_has_120_columns(is_terminal: bool, width: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "77")
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: is_terminal, raising=False)
+    console = stdout_console()
+    assert (console.width, console.stderr) == (width, False)
+
+
+def test_numbers_in_sentences_have_no_colour(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rich would paint them on a terminal."""
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    assert stderr_console().stderr
+    for console in (stdout_console(), stderr_console()):
+        console.file = io.StringIO()
+        console.print("found 12, expected 'x'")
+        assert console.file.getvalue() == "found 12, expected 'x'\n"
+
+
+@pytest.mark.parametrize("is_terminal", [True, False])
+def test_a_spinner_is_for_terminals(is_terminal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    screen = io.StringIO()
+    console = Console(file=screen, force_terminal=is_terminal)
+    monkeypatch.setattr(module, "stderr_console", lambda: console)
+    done = []
+    with spinner("working"):
+        done.append(1)
+    assert done == [1]
+    assert ("working" in screen.getvalue()) == is_terminal

@@ -193,6 +193,11 @@ def test_cpu_time_of_the_units_of_some_cores_is_at_most_what_they_had() -> None:
     assert [row.is_possible for row in too_much] == [False]
 
 
+def test_a_run_without_any_time_used_nothing() -> None:
+    (row,) = use_of_cores({"u": (0, 1)}, {"u": 1.0}, {"u": 0.5}, 0.0)
+    assert (row.cpu, row.busy) == (0.0, 0.25)
+
+
 def test_what_cpu_time_leaves_of_the_cores_is_the_most_that_can_be_preempted() -> None:
     assert [most_preempted_ns(100, cpu, 1) for cpu in (0, 60, 100, 130)] == [100, 40, 0, 0]
     assert most_preempted_ns(100, 61, 2) == 69

@@ -18,17 +18,18 @@ from trilane.body.kinematics import Skeleton
 from trilane.body.skinning import FrameSkinner
 from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline.description import UnitSettings
+from trilane.scene import tensor_layout
+from trilane.scene.crop import Rect, choose_bucket, grow
+from trilane.scene.planner import plan_tensor
 from trilane.scene.schema import AvatarSpec, OutputSpec, Scene
+from trilane.scene.tensor_layout import lay_out
 from trilane.shapes import shape_buckets
 from trilane.stages.avatar_assets import shaped_body, staged_of
 from trilane.stages.config import RunConfig
 from trilane.stages.cpu import present as present_stage
-from trilane.stages.cpu import tensor_layout
-from trilane.stages.cpu.crop import Rect, choose_bucket, grow
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 from trilane.stages.cpu.pose import PoseStage
 from trilane.stages.cpu.present import PresentStage, Segment
-from trilane.stages.cpu.tensor_layout import lay_out
 from trilane.stages.packets import pose_dtype, posed_vertices, posed_vertices_bytes
 from trilane.testing.assets import assets_of
 from trilane.transport.packets import Packet, SlotLayout, view_packet
@@ -181,14 +182,15 @@ PAIR = (AvatarSpec(position=(-0.5, 0, 0)), AvatarSpec(position=(0.5, 0, 0.3), mo
 @pytest.mark.parametrize("skinned", [False, True], ids=["GPU skins", "CPU skins"])
 def test_a_packet_holds_what_motion_camera_and_layout_give(tiny_bundle: Path, tmp_path: Path, skinned: bool) -> None:
     """Two avatars at frame 40 of 25 a second, from the same parts put together here."""
-    first = configured(tiny_bundle, tmp_path, fps=25.0, avatars=PAIR, output=OutputSpec(width=320, height=200))
+    output = OutputSpec(width=320, height=200)
+    first = configured(tiny_bundle, tmp_path, fps=25.0, avatars=PAIR, output=output, plan="fixed")
     assets = assets_of(first)
     body, staged = shaped_body(assets, 0), staged_of(assets)
     total = len(body.vertices)
     config = first.model_copy(update={"posed_vertices": (total, total) if skinned else ()})
     stage, slots = PoseStage(config, assets), [packet(2, posed_vertices_bytes(config.posed_vertices)) for _ in range(2)]
     stage.bind([], slots)
-    assert stage.run(40, None, 1) == {"visible": 2.0}
+    assert stage.run(40, None, 1) == {"visible": 2.0, "level": 5.0, "error_px": 0.0}
     assert not slots[0].header["avatar_count"]
     pose = slots[1].header
     assert (int(pose["frame"]), int(pose["avatar_count"]), float(pose["media_time_s"])) == (40, 2, 1.6)
@@ -214,6 +216,32 @@ def test_a_packet_holds_what_motion_camera_and_layout_give(tiny_bundle: Path, tm
         np.testing.assert_allclose(pose["avatars"][number]["rect"], crop, rtol=1e-6)
         assert tuple(pose["avatars"][number]["tensor_rect"]) == cell
     stage.close()
+
+
+def test_a_planned_packet_is_what_the_planner_says_of_the_avatars_on_the_screen(
+    tiny_bundle: Path, tmp_path: Path
+) -> None:
+    """Frame by frame, each after what was held before it: shape, cells, rectangles and density."""
+    config = configured(tiny_bundle, tmp_path, size="auto").model_copy(update={"shapes": ((256, 128), (480, 320))})
+    assets = assets_of(config)
+    body, staged = shaped_body(assets, 0), staged_of(assets)
+    stage, slot, held = PoseStage(config, assets), packet(1), None
+    stage.bind([], [slot])
+    bounds, skeleton = MeshBounds(body, standoff_m=CLOTHES_STANDOFF_M), Skeleton(body.joints, body.body.parents)
+    projection = staged.camera.projection(640 / 480)
+    for frame in range(0, 300, 20):
+        metrics, t_s = stage.run(frame, None, 0), frame / 30
+        posed = skeleton.pose(*staged.movers[0].sample(t_s), staged.movers[0].world)
+        rect = bounds.rect(posed, projection @ staged.camera.sample(t_s))
+        assert rect is not None
+        plan = plan_tensor([rect], (480, 640), config.shapes, held)
+        held = plan.held
+        ((crop, cell),) = plan.dense.layout.crops
+        avatar = slot.header["avatars"][0]
+        assert tuple(slot.header["tensor_shape"]) == plan.dense.layout.shape == stage.plan.shape
+        assert tuple(avatar["tensor_rect"]) == cell
+        np.testing.assert_allclose(avatar["rect"], crop, atol=1e-6)
+        assert metrics["density"] == plan.dense.density
 
 
 def test_with_nobody_in_view_the_tensor_is_the_smallest(tiny_bundle: Path, tmp_path: Path) -> None:

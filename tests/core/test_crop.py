@@ -17,8 +17,8 @@ from trilane.body.body import ShapedBody, load_body
 from trilane.body.kinematics import Skeleton, rodrigues
 from trilane.body.skinning import CpuSkinner
 from trilane.errors import BadInputError
+from trilane.scene.crop import SCREEN, Rect, choose_bucket, crop_projection
 from trilane.shapes import shape_buckets
-from trilane.stages.cpu.crop import SCREEN, Rect, choose_bucket, crop_projection
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 
 DEFAULT = Path(__file__).resolve().parents[2] / "avatars" / "default" / "body.npz"

@@ -117,7 +117,11 @@ SCENES: dict[str, tuple[dict[str, Any], str]] = {
     "the schema's": ({"frames": 0}, "s: frames: found 0, expected greater than or equal to 1"),
     "unknown key": (
         {"size_": 1},
-        "s: size_: found an unknown key, expected a key of the scene schema; correct its spelling or remove it",
+        "s: size_: found an unknown key, expected a key of the scene schema; did you mean 'size'?",
+    ),
+    "key like no other": (
+        {"zzz": 1},
+        "s: zzz: found an unknown key, expected a key of the scene schema; correct its spelling or remove it",
     ),
 }
 

@@ -1,19 +1,14 @@
-"""Data of the house as a whole: every profile's numbers are held, and no dataclass is changed by chance."""
+"""Data of the house as a whole: every profile's numbers are held."""
 
 from __future__ import annotations
 
-import ast
 import tomllib
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from trilane.hw_profiles.load import profile_folder, profile_names
-
-PACKAGE = Path(__file__).resolve().parents[2] / "src" / "trilane"
-KINDS = ("measured", "published", "fitted", "assumed", "unknown")
 
 
 def leaves(data: Any, key: str = "") -> Iterator[tuple[str, Any]]:
@@ -35,37 +30,3 @@ def test_the_numbers_and_words_of_a_profile_are_held(held: Callable[[str, Any], 
     held("keys", [sum(key.encode()) for key, _ in found])
     held("numbers", [value for _, value in found if isinstance(value, int | float)])
     held("words", [sum(value.encode()) for _, value in found if isinstance(value, str)])
-
-
-#: Dataclasses that are filled bit by bit; every other one is frozen.
-FILLED = {
-    "BvhJoint",
-    "LoadGenPlayer",
-    "LoadGenVerdict",
-    "Queries",
-    "Recording",
-    "Signals",
-    "ThermalState",
-    "Throttle",
-    "_Extent",
-    "_Hierarchy",
-    "_Player",
-    "_VirtualUnit",
-    "_Words",
-}
-
-
-def dataclasses() -> Iterator[tuple[str, str]]:
-    """Name of every dataclass of the package, and how it is decorated; links are followed."""
-    tops = [path.resolve() for path in PACKAGE.iterdir() if path.is_dir() and path.name != "testing"]
-    for file in (*PACKAGE.glob("*.py"), *(file for top in tops for file in top.rglob("*.py"))):
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ClassDef):
-                decorators = [ast.unparse(each) for each in node.decorator_list]
-                yield from ((node.name, each) for each in decorators if each.startswith("dataclass"))
-
-
-def test_what_is_not_filled_bit_by_bit_is_frozen() -> None:
-    found = list(dataclasses())
-    assert len(found) > 60
-    assert {name for name, decorator in found if "frozen=True" not in decorator} == FILLED

@@ -21,6 +21,7 @@ ROWS = (
         "figure_sources",
         "files",
         "install",
+        "near_miss",
         "shapes",
         "unet_tables",
         "unexpected_value",

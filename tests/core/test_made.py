@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import subprocess
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from trilane.apps import made
 from trilane.apps.made import made_facts
 
 
@@ -40,6 +42,51 @@ def test_what_is_no_checkout_has_no_revision_though_a_folder_above_is_one(checko
     assert (facts["revision"], facts["modified"]) == (None, None)
     assert facts["command"] == ["trilane", "run", "--out", "a b"]
     assert timedelta(0) <= datetime.now(UTC) - datetime.fromisoformat(facts["at"]) < timedelta(minutes=5)
+
+
+def test_every_key_of_what_was_made(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Clock:
+        @staticmethod
+        def now(zone: tzinfo) -> datetime:
+            assert zone is UTC
+            return datetime(2026, 11, 22, 3, 4, 5, 678, tzinfo=UTC)
+
+    monkeypatch.setattr(made, "datetime", Clock)
+    monkeypatch.setattr(made, "package_version", lambda name: f"{name} 9.9")
+    assert made_facts(("trilane", "run"), checkout) == {
+        "at": "2026-11-22T03:04:05+00:00",
+        "command": ["trilane", "run"],
+        "trilane": "trilane 9.9",
+        "revision": git(checkout, "rev-parse", "HEAD"),
+        "modified": False,
+    }
+
+
+def test_a_command_of_this_checkout_has_its_revision() -> None:
+    root = Path(__file__).resolve().parents[2]
+    expected = git(root, "rev-parse", "HEAD") if (root / ".git").exists() else None
+    assert (root / "apps").is_dir() and made_facts([])["revision"] == expected
+
+
+def test_git_is_asked_without_locks_and_may_hang(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+
+    def run(words: list[str], **settings: Any) -> Any:
+        asked.append((words, settings))
+        if "status" in words:
+            raise subprocess.TimeoutExpired(words, 5.0)
+        return subprocess.CompletedProcess(words, 0, " abc \n", "")
+
+    monkeypatch.setattr("shutil.which", lambda name: f"/bin/{name}")
+    monkeypatch.setattr(subprocess, "run", run)
+    facts = made_facts([], checkout)
+    assert (facts["revision"], facts["modified"]) == ("abc", None)
+    first = ["/bin/git", "--no-optional-locks", "-C", str(checkout)]
+    settings = {"capture_output": True, "text": True, "check": False, "timeout": 5.0}
+    status = [*first, "status", "--porcelain", "--untracked-files=no"]
+    assert asked == [([*first, "rev-parse", "HEAD"], settings), (status, settings)]
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: (_ for _ in ()).throw(PermissionError("no")))
+    assert made_facts([], checkout)["revision"] is None
 
 
 def test_without_git_or_with_a_broken_checkout_nothing_fails(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:

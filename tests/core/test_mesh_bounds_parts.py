@@ -14,8 +14,8 @@ from trilane.body.body import ShapedBody, load_body
 from trilane.body.kinematics import Skeleton
 from trilane.body.skin_weights import branch_sums, joint_distance, largest_weights
 from trilane.body.skinning import CpuSkinner
+from trilane.scene.crop import Rect
 from trilane.stages.cpu import mesh_bounds, mesh_patches
-from trilane.stages.cpu.crop import Rect
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 
 LENS = np.array([(1.5, 0, 0.2, 0), (0, 2.0, -0.1, 0), (0, 0, -1.02, -0.202), (0, 0, -1, 0.0)])  # near 0.1, far 10

@@ -206,8 +206,10 @@ def test_the_ending_says_which_reader(tmp_path: Path) -> None:
     assert load_motion(AvatarSpec(motion="A.NPY"), tmp_path).notes[0] == "SMPL-X .npy, 2 frames"
     amass(tmp_path / "a.npz")
     assert load_motion(AvatarSpec(motion="a.npz"), tmp_path).notes[0].startswith("AMASS")
+    names = "builtin:{walk-wave-turn, there-and-back, idle, t-pose}"
     for motion, sentence in (
-        ("builtin:dance", "motion: found 'builtin:dance', expected builtin:{walk-wave-turn, idle, t-pose} or a file"),
+        ("builtin:dance", f"motion: found 'builtin:dance', expected {names} or a file"),
+        ("builtin:tpose", f"motion: found 'builtin:tpose', expected {names} or a file; did you mean 'builtin:t-pose'?"),
         ("a.fbx", f"{tmp_path}/a.fbx: found the ending '.fbx', expected a motion file: .npy, .npz, .bvh"),
         ("b.bvh", f"{tmp_path}/b.bvh: found no such file, expected a motion file"),
     ):
@@ -363,9 +365,10 @@ def test_half_of_the_samples_is_enough() -> None:
     for times, bad, broken, late in (([0, 1, 2], (0, 1), 2, 0), ([3, 2, 1], (), 0, 2), ([0], (0,), 1, 0)):
         with pytest.raises(BadInputError) as raised:
             usable(times, bad)
+        first = f" (first: number {bad[0]})" if bad else ""
         assert str(raised.value) == (
-            f"here: found {broken} samples that are not finite numbers or no rotation and {late} times that do not "
-            f"increase, of {len(times)}, expected at least half of the samples sound"
+            f"here: found {broken} samples that are not finite numbers or no rotation{first} and {late} times that do "
+            f"not increase, of {len(times)}, expected at least half of the samples sound"
         )
 
 

@@ -57,6 +57,18 @@ def test_table_faults_change_numbers_and_rows_but_no_text() -> None:
     }
 
 
+def test_what_may_stand_in_any_order_is_not_exchanged() -> None:
+    pytest.importorskip("cosmic_ray")
+    from trilane.testing.mutants.python_faults import python_faults
+
+    source = "try:\n    a = max(b, c) in (d, e)\nexcept (F, G):\n    h = min(p(q, r), s), np.hypot(t, u)\n"
+    made = [edit.make() for edit in python_faults(source) if edit.kind.endswith("Exchanged")]
+    assert made == [
+        source.replace("min(p(q, r), s), np.hypot(t, u)", "np.hypot(t, u), min(p(q, r), s)"),
+        source.replace("(q, r)", "(r, q)"),
+    ]
+
+
 def test_a_fault_is_put_where_it_was_drawn() -> None:
     """Of two places with the same line the one nearest to the fault's; lines added above move it along."""
     text = "a = 1\nb = 0\n\n\na = 1\nc = 0\n"

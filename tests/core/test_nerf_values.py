@@ -84,6 +84,23 @@ REFUSED: dict[str, tuple[Any, str]] = {
         {"frames": [{"transform_matrix": [[1] * 4] * 5}]},
         ": frames[0].transform_matrix: found shape (5, 4), exp",
     ),
+    "no directions": (
+        {"frames": [{"transform_matrix": ONE}] * 3 + [{"transform_matrix": [[0] * 4] * 4}]},
+        ": frames[3].transform_matrix: found a matrix without an inverse, expected a 4x4 matrix, camera to world; "
+        "leave this view out",
+    ),
+    "two directions": (
+        {"frames": [{"transform_matrix": [[1, 2, 0, 5], [0, 0, 1, 5], [0, 0, 0, 5]]}]},
+        ": frames[0].transform_matrix: found a matrix without an inverse",
+    ),
+    "no last row": (
+        {"frames": [{"transform_matrix": [[1, 0, 0, 5], [0, 1, 0, 5], [0, 0, 1, 5], [0] * 4]}]},
+        ": frames[0].transform_matrix: found a matrix without an inverse",
+    ),
+    "no rotation": (
+        {"frames": [{"transform_matrix": [[2, 0, 0, 5], [0, 1, 0, 5], [0, 0, 1, 5], [0, 0, 0, 1]]}]},
+        ": found 1 samples that are not finite numbers or no rotation (first: frames[0].transform_matrix) and 0 times",
+    ),
     "true": ({"frames": [{"transform_matrix": ONE}], "w": True}, ": w: found True, expected a positive number"),
     "zero": ({"frames": [{"transform_matrix": ONE}], "h": 0}, ": h: found 0, expected a positive number"),
     "words": (

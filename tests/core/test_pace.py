@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
-from trilane.apps.pace import SLACK_NS, Pace, compare, pace_of
-from trilane.avatars.bundle import bundle_folder
+from trilane.apps import pace as module
+from trilane.apps.pace import SLACK_NS, Pace, compare, pace_of, release_fps
+from trilane.avatars.bundle import bundle_folder, load_bundle
+from trilane.avatars.network_reshape import reshaped
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import application_graph
+from trilane.hw_profiles.network_work import count_work
 from trilane.pipeline.bound_stage import hold_until
 from trilane.pipeline.description import UnitSettings
 from trilane.scene.schema import Scene
@@ -51,6 +57,103 @@ def test_a_late_job_is_counted_and_its_neighbours_are_not_compared() -> None:
     assert comparison["late_frames"] == [20]
     assert comparison["ratio"] == pytest.approx(1.0)
     assert 0.7 < comparison["compared_share"] < 1
+
+
+@pytest.mark.parametrize("policy", ["latest", "deadline"])
+def test_a_policy_with_a_rate_has_the_scenes_slowed_down_as_the_chip_is(policy: str) -> None:
+    """40 a second, 3 times slower: a frame every 75 ms, of which any of these takes less."""
+    slow = replace(PACE, slow_motion=3.0)
+    assert release_fps(slow, 40.0) == pytest.approx(40 / 3)
+    assert sum(STAGE_NS.values()) < 75_000_000
+    for edge in ("single", "triple"):
+        assert compare(slow, policy, 20, jobs(), edge=edge, fps=40.0)["virtual_ms"] == pytest.approx(75)
+
+
+def test_the_edge_counts_in_virtual_time_too() -> None:
+    """With one slot between them, raster, infer and composite take turns; with two the slowest unit decides."""
+    turns = sum(STAGE_NS[stage] for stage in ("raster", "infer", "composite"))
+    assert compare(PACE, "pipelined", 40, jobs(), edge="single")["virtual_ms"] == pytest.approx(turns / 1e6)
+    assert compare(PACE, "pipelined", 40, jobs(), edge="double")["virtual_ms"] < turns / 1e6
+
+
+def test_each_key_of_the_comparison_by_hand() -> None:
+    """Frames presented 9 ms apart, but 30 and 12 between 20, 21 and 22; a late frame spoils itself, the one before it
+    and seven after it: of 39 intervals, those that end with frames 19 to 27 are left out."""
+    moved = [
+        job._replace(end_ns=job.end_ns + {20: 21 * MS, 21: 24 * MS}.get(job.frame, 24 * MS * (job.frame > 21)))
+        if job.stage == "present"
+        else job
+        for job in jobs()
+    ]
+    held = [job._replace(begin_ns=job.end_ns - MS) if job.stage == "present" else job for job in moved]
+    late = [
+        job._replace(begin_ns=job.begin_ns - 1 - SLACK_NS) if (job.stage, job.frame) == ("pose", 20) else job
+        for job in held
+    ]
+    pace = Pace("chip", "burst", 2.5, STAGE_NS)
+    assert compare(pace, "pipelined", 40, late) == {
+        "profile": "chip",
+        "performance_profile": "burst",
+        "slow_motion": 2.5,
+        "stage_ms": {"pose": 1.0, "raster": 4.0, "infer": 9.0, "composite": 3.0, "present": 1.0},
+        "host_slower": {"pose": 1},
+        "late_frames": [20],
+        "virtual_ms": 9.0,
+        "measured_ms": 9.0,
+        "compared_share": 30 / 39,
+        "ratio": 1.0,
+    }
+    just = [job._replace(begin_ns=job.begin_ns - SLACK_NS) if job.frame == 20 else job for job in held]
+    assert compare(pace, "pipelined", 40, just)["late_frames"] == []
+
+
+def test_one_frame_has_no_interval() -> None:
+    """Nor any share: 0 of none are compared."""
+    first = [job for job in jobs() if job.frame == 0]
+    comparison = compare(PACE, "pipelined", 40, first)
+    assert (comparison["measured_ms"], comparison["compared_share"], comparison["virtual_ms"]) == (None, 0.0, 9.0)
+
+
+def test_the_policy_decides_the_virtual_frame_time() -> None:
+    """One frame at a time takes 1 + 4 + 9 + 3 + 1 ms."""
+    assert compare(PACE, "sequential", 40, jobs())["virtual_ms"] == 18.0
+    assert compare(PACE, "sequential", 40, jobs())["ratio"] == 0.5
+
+
+def test_a_pace_is_that_of_the_largest_tensor_of_the_first_avatar(
+    monkeypatch: pytest.MonkeyPatch, tiny_bundle: Path
+) -> None:
+    """Times in ms as nanoseconds, twice as long in slow motion; the corners are those of the performance profile."""
+    asked: list[Any] = []
+
+    def times(chip: Any, plan: Any, corners: Any) -> dict[tuple[str, str], float]:
+        asked.append((chip, plan, corners))
+        return {("pose", "cpu"): 0.25, ("infer", "dsp"): 1.0000004}
+
+    monkeypatch.setattr(module, "load_runnable", lambda name: SimpleNamespace(name=f"chip {name}"))
+    monkeypatch.setattr(module, "stage_times_ms", times)
+    monkeypatch.setattr(module, "corners_of", lambda chip, name: (chip.name, name))
+    given = config().model_copy(update={"avatar_dirs": (tiny_bundle, Path("/other"))})
+    pace = pace_of(given, "x", 2, "burst")
+    assert pace == Pace("chip x", "burst", 2, {"pose": 500_000, "infer": 2_000_001})
+    ((chip, plan, corners),) = asked
+    assert (chip.name, plan.runtime, corners) == ("chip x", "dsp", ("chip x", "burst"))
+    largest = max(given.buckets, key=lambda shape: shape[0] * shape[1])
+    network = plan.network
+    assert (network.height, network.width, network.channels, network.layout) == (*largest, 5, "packed")
+    assert network.facts == {"avatar": "tiny"}
+    file = load_bundle(tiny_bundle).read_network()
+    assert network.work == count_work(reshaped(file, *largest).model)
+    assert pace_of(given, "x").performance_profile == "sustained_high_performance"
+
+
+@pytest.mark.parametrize(("slow_motion", "said"), [(0, "0"), (-1.5, "-1.5"), (1001, "1001"), (float("nan"), "nan")])
+def test_slow_motion_is_refused_word_by_word(slow_motion: float, said: str) -> None:
+    with pytest.raises(BadInputError) as refused:
+        pace_of(config(), "nowhere", slow_motion)
+    assert str(refused.value) == f"--slow-motion: found {said}, expected above 0, at most 1000"
+    with pytest.raises(BadInputError, match="nowhere"):
+        pace_of(config(), "nowhere", 1000)
 
 
 def test_nothing_is_compared_when_every_frame_is_late() -> None:

@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.stage import UnitContext
+from trilane.scene.crop import Rect
 from trilane.scene.schema import AvatarSpec, CameraSpec, Scene
+from trilane.scene.tensor_layout import MARGIN_PX, lay_out
 from trilane.shapes import shape_buckets
 from trilane.stages.config import RunConfig
-from trilane.stages.cpu.crop import Rect
 from trilane.stages.cpu.pose import PoseStage, build
-from trilane.stages.cpu.tensor_layout import MARGIN_PX, lay_out
 from trilane.stages.packets import pose_dtype
 from trilane.testing.assets import assets_of
 from trilane.transport.packets import Packet, SlotLayout, view_packet
@@ -48,7 +48,7 @@ def test_a_packet_says_everything_of_its_frame(tiny_bundle: Path, tmp_path: Path
     stage = pose_stage(config(tiny_bundle, tmp_path, fps=25.0))
     packet = bound(stage)
     before = time.monotonic_ns()
-    assert stage.run(50, None, 0) == {"visible": 1.0}
+    assert stage.run(50, None, 0) == {"visible": 1.0, "level": 5.0, "error_px": 0.0}
     pose, avatar = packet.header, packet.header["avatars"][0]
     assert (int(pose["frame"]), float(pose["media_time_s"]), int(pose["avatar_count"])) == (50, 2.0, 1)
     assert before <= int(pose["t_sampled_ns"]) <= time.monotonic_ns()
@@ -84,7 +84,7 @@ def test_an_avatar_out_of_the_picture_is_not_visible(tiny_bundle: Path, tmp_path
     spec = AvatarSpec(position=(0.0, 0.0, 40.0))
     stage = pose_stage(config(tiny_bundle, tmp_path, avatars=(AvatarSpec(), spec)))
     packet = bound(stage, 2)
-    assert stage.run(0, None, 0) == {"visible": 1.0}
+    assert stage.run(0, None, 0)["visible"] == 1.0
     assert packet.header["avatars"]["visible"].tolist() == [1, 0]
     only_hidden = pose_stage(config(tiny_bundle, tmp_path, avatars=(spec,)))
     packet = bound(only_hidden)

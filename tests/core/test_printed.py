@@ -6,47 +6,24 @@ depends on the machine is not here.
 
 from __future__ import annotations
 
-import os
-import re
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 
 from trilane.apps.cli import bench
-from trilane.apps.cli.main import main
 from trilane.apps.experiments import accuracy, hard_cases
 from trilane.stages import configure, machine_facts
 
-FOLDER = Path(__file__).with_name("printed")
 MACHINE = {"cpu": {"model": "a processor", "cores": 2}}
 Printed = Callable[..., str]
+Check = Callable[[str, str], None]
 
 
 @pytest.fixture
-def printed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Printed:
+def printed(command: Callable[..., tuple[str, str]]) -> Printed:
     """What `trilane ARGUMENTS` prints on stdout; it must end with the exit code `code`."""
-    monkeypatch.setenv("COLUMNS", "160")
-    monkeypatch.setenv("NO_COLOR", "1")
-
-    def run(*arguments: str, code: int = 0) -> str:
-        monkeypatch.setattr("sys.argv", ["trilane", *arguments])
-        with pytest.raises(SystemExit) as left:
-            main()
-        assert int(left.value.code or 0) == code
-        return capsys.readouterr().out
-
-    return run
-
-
-def check(name: str, text: str) -> None:
-    """Compare with printed/NAME.txt, line by line and word by word: how a table is framed is its library's matter."""
-    lines = [" ".join(re.sub(r"[─-╿|]", " ", line).split()) for line in text.splitlines()]
-    file, text = FOLDER / f"{name}.txt", "".join(f"{line}\n" for line in lines if line)
-    if "TRILANE_WRITE_PRINTED" in os.environ:
-        file.write_text(text, encoding="utf-8")
-    assert text.splitlines() == file.read_text(encoding="utf-8").splitlines()
+    return lambda *arguments, code=0: command(*arguments, code=code)[0]
 
 
 CHIP = ("predict", "--profile", "snapdragon-888", "--encoder", "resnet18")
@@ -61,23 +38,8 @@ COMMANDS = {
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_commands(printed: Printed, name: str) -> None:
-    check(name, printed(*COMMANDS[name]))
-
-
-def commands(printed: Printed, *words: str) -> Iterator[tuple[str, ...]]:
-    """Every command below `words`, those of benches aside: their defaults are of this machine."""
-    yield words
-    _, _, below = printed(*words, "--help").partition("\nCommands:\n")
-    for name in re.findall(r"^  (\S+)", below.partition("\n\n")[0], re.MULTILINE):
-        if words != ("bench",):
-            yield from commands(printed, *words, name)
-
-
-def test_helps(printed: Printed) -> None:
-    texts = [f"$ trilane {' '.join(words)}\n{printed(*words, '--help')}" for words in commands(printed)]
-    assert len(texts) > 20
-    check("helps", "\n".join(texts))
+def test_commands(printed: Printed, check_printed: Check, name: str) -> None:
+    check_printed(name, printed(*COMMANDS[name]))
 
 
 @pytest.fixture
@@ -92,7 +54,7 @@ ROW = {"first": "ort", "second": "qnn", "mean": 0.0123456, "largest": 3, "worst_
 @pytest.mark.usefixtures("known_machine")
 @pytest.mark.parametrize(("mean", "code"), [(0.0123456, 0), (0.75, 1)])
 def test_differences_between_runtimes(
-    printed: Printed, monkeypatch: pytest.MonkeyPatch, mean: float, code: int
+    printed: Printed, check_printed: Check, monkeypatch: pytest.MonkeyPatch, mean: float, code: int
 ) -> None:
     result = {
         "rows": [ROW | {"mean": mean}],
@@ -102,24 +64,26 @@ def test_differences_between_runtimes(
     }
     monkeypatch.setattr(accuracy, "runtime_differences", lambda *_: result)
     asked = ("accuracy", "--runtime", "ort", "--runtime", "openvino")
-    check(f"accuracy-{code}", printed(*asked, code=code))
+    check_printed(f"accuracy-{code}", printed(*asked, code=code))
 
 
-def test_hard_cases(printed: Printed, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hard_cases(printed: Printed, check_printed: Check, monkeypatch: pytest.MonkeyPatch) -> None:
     figures = ("error", "bound", "predicted_error", "constant_error", "shifted_error", "swapped_error")
     row: dict[str, Any] = {name: 1.25 * (n + 1) for n, name in enumerate(figures)}
     row |= {"name": "batch, usual, ort", "verdict": "holds", "passed": True, "unit": "u", "source": "s"}
     bad = row | {"name": "batch, odd, ort", "verdict": "above its bound", "passed": False}
     monkeypatch.setattr(hard_cases, "hard_cases", lambda _: iter([row, bad]))
-    check("hard-cases", printed("accuracy", "--hard-cases", "--runtime", "ort", code=1))
+    check_printed("hard-cases", printed("accuracy", "--hard-cases", "--runtime", "ort", code=1))
 
 
 @pytest.mark.usefixtures("known_machine")
 @pytest.mark.parametrize("columns", [3, 30])
-def test_benches(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, columns: int) -> None:
+def test_benches(
+    capsys: pytest.CaptureFixture[str], check_printed: Check, monkeypatch: pytest.MonkeyPatch, columns: int
+) -> None:
     """Rows as they come, or turned where there are many columns; mappings in them are joined by dots."""
     monkeypatch.setenv("COLUMNS", "160")
     monkeypatch.setenv("NO_COLOR", "1")
     rows = [{f"c{n}": n / 7 + k for n in range(columns)} | {"inner": {"a": k, "b": "[x]"}} for k in (0, 1)]
     bench.show("raster", lambda **_: {"rows": rows, "ratios": {"r": 1 / 3}, "note": "n"}, {}, as_json=False)
-    check(f"bench-{columns}", capsys.readouterr().out)
+    check_printed(f"bench-{columns}", capsys.readouterr().out)

@@ -136,5 +136,8 @@ def test_a_near_miss_is_suggested() -> None:
 
 
 def test_a_template_cannot_be_run() -> None:
-    with pytest.raises(BadInputError, match="template"):
+    with pytest.raises(BadInputError) as caught:
         load_runnable("phone-template")
+    chips = "agx-orin, host, snapdragon-8-elite, snapdragon-8-gen-1, snapdragon-8-gen-2, snapdragon-8-gen-3"
+    chips += ", snapdragon-865, snapdragon-888, snapdragon-xr2-gen-2"
+    assert str(caught.value) == f"profile: found the template phone-template, expected one of {chips}"

@@ -131,6 +131,10 @@ class FakeRequests:
     def __init__(self) -> None:
         self.fd, self.is_open, self.answers = 51, threading.Event(), []
         self.waiting: list[Any] = []
+        self.unanswered: list[Any] = []
+
+    def tell_unanswered(self, causes: Mapping[str, int]) -> None:
+        self.unanswered.append(dict(causes))
 
     def answered(self, frame: int) -> None:
         self.answers.append(frame)
@@ -251,6 +255,22 @@ def test_requests_are_heard_and_answered_when_their_frame_is_presented(monkeypat
         world.inbox = [[(unit, Done(number, 1, 2, 1 if number == 0 else 0, 0, 0, 0, 1, 0, {}))]]
         now_ns, events = clock.wait(START)
     assert requests.answers == [0]
+
+
+def test_frames_that_will_not_come_are_told_at_the_next_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    requests = FakeRequests()
+    world = World(monkeypatch, requests=requests, settings={"asked": True})
+    clock = world.begun()
+    clock.wait(START)
+    assert requests.unanswered == []
+    ledger = world.core.ledger
+    monkeypatch.setattr(type(ledger), "lost_by_cause", {"died:gpu": 1})
+    monkeypatch.setattr(type(ledger), "dropped_by_cause", {"draw->mix:stale": 2})
+    for counts in ("dropped", "lost"):
+        monkeypatch.setattr(ledger, counts, {"any": 1})
+        clock.wait(START)
+        monkeypatch.setattr(ledger, counts, {})
+    assert requests.unanswered == [{"draw->mix:stale": 2, "died:gpu": 1}] * 2
 
 
 def test_a_frame_that_nobody_asked_for_is_presented_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:

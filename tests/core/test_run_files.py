@@ -1,119 +1,35 @@
-"""The run folder, the trace, the report and the table of a run, made from a run written by hand."""
+"""The run folder, the trace and the report of a run, made from a run written by hand."""
 
 from __future__ import annotations
 
-import io
 import json
 import os
 from collections.abc import Iterator
+from datetime import UTC, datetime, tzinfo
 from pathlib import Path
 from typing import Any
 
 import pytest
-from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace, TrackEvent
+from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace, TrackDescriptor, TrackEvent
 
-from trilane.apps.cli.run_table import run_table
+from trilane.apps import report as report_module
+from trilane.apps import run_folder
 from trilane.apps.report import Report, read_report, write_report
 from trilane.apps.report_sources import NO_FIGURES_UNDER, sources_of
 from trilane.apps.run_folder import RunFolder, default_place
 from trilane.apps.trace import write_trace
 from trilane.errors import BadInputError
-from trilane.figure_sources import COMPARED, COMPUTED, MEASURED, NO_FIGURES
+from trilane.figure_sources import COMPARED, COMPUTED, MEASURED
+from trilane.scheduler.accounts import IdleSlice
 from trilane.scheduler.ledger import JobRecord
+from trilane.testing.run_report import SHARE, SHOWN, make_report
+from trilane.writing import WRITABLE
 
-SHOWN = {
-    "source": "from the avatar's validation of 2026-01-02",
-    "runtime": "ort",
-    "size": "256",
-    "psnr_db_by_band": {"face": 31.25},
-    "body_psnr_db": 28.75,
-    "iou": 0.9812,
-    "samples": 96,
-    "by_seed": {"1": {}, "2": {}},
-    "worst": {"psnr_db": 21.5},
-}
-TIMES = {"mean": 20.0, "p50": 20.0, "p90": 21.0, "p95": 22.0, "p99": 23.0, "max": 24.0}
-SHARE = {
-    "busy": 0.5,
-    "idle": {"starved": 0.25, "blocked": 0.15, "throttled": 0.0, "preempted": 0.02, "overhead": 0.08},
-    "jobs": 3,
-    "restarts": 0,
-    "pid": 7,
-    "cores": [2, 3],
-    "threads": 2,
-    "spin": True,
-}
-MACHINE = {
-    "system": "Linux",
-    "python": "3.11",
-    "trilane": None,
-    "scheduler_core": "interpreted",
-    "cpu": {
-        "model": "a processor",
-        "architecture": "x86_64",
-        "flags": ["avx2"],
-        "cores": 4,
-        "cores_allowed": [0, 1, 2, 3],
-    },
-    "memory_bytes": 1 << 34,
-    "gl": None,
-    "packages": {"numpy": "2.0"},
-}
 JOBS = (
     JobRecord("pose", "cpu", 0, 1_000, 1_500, 2_000, 3_000),
     JobRecord("raster", "gpu", 0, 3_000, 3_500, 4_000, 9_000),
     JobRecord("pose", "cpu", 1, 3_000, 3_000, 4_000, 5_000),
 )
-
-
-def make_report(**changes: Any) -> dict[str, Any]:
-    """What a run writes, with `changes`."""
-    counts = {"requested": 3, "presented": 3, "lost": 0, "lost_by_cause": {}, "dropped": {"raster->infer:stale": 1}}
-    run = {
-        "frames": counts,
-        "frame_time_ms": {**TIMES, "ema20_min": 19.0, "ema20_max": 21.0, "jitter": 0.5},
-        "latency_ms": TIMES,
-        "fps": 50.0,
-        "deadline_misses": 0,
-        "stages": {"infer": {"unit": "dsp", "service_ms": TIMES, "wait_ms": TIMES}},
-        "units": {"dsp": SHARE},
-        "core_shares": [{"cores": [2, 3], "units": ["cpu", "gpu"], "cpu": 0.8, "busy": 0.75}],
-        "efficiency": 0.91,
-    }
-    config = {
-        "policy": "pipelined",
-        "runtime": "ort",
-        "units": {"dsp": {"cores": [2, 3], "threads": 2, "spin": True}},
-        "scene": {"name": "test", "size": "256", "output": {"width": 640, "height": 480}},
-    }
-    return {
-        "schema": 1,
-        "clock": "host",
-        "machine": MACHINE,
-        "config": config,
-        "plan": {"tensor_shapes": [[256, 256]]},
-        "caps": {"how": "none"},
-        **run,
-        "duration_s": 1.0,
-        "xrbench": {"real_time": None, "qoe": 1.0, "energy": None},
-        "isolated_ms": {},
-        "policy": "pipelined",
-        "edge": "double",
-        "idle_cores": "wait awake",
-        "temperature_c": {"sensor": None},
-        "pids": {"dsp": 7},
-        "startup_ms": {"dsp": 1.0},
-        "figures": {"infer": {"a_ms": 1.0}},
-        "messages": [],
-        "interrupted": False,
-        "failure": None,
-        "baseline": {"policy": "sequential", **run, "efficiency": None},
-        "accuracy": {"someone": SHOWN},
-        "sources": {},
-        "video": None,
-        "checksum": None,
-        **changes,
-    }
 
 
 def test_a_folder_has_its_name_once_it_is_complete(tmp_path: Path) -> None:
@@ -166,6 +82,52 @@ def test_the_default_place_is_free_and_named_after_the_scene(tmp_path: Path, mon
     assert first.name.endswith("Z----my-scene")
 
 
+def test_a_second_run_of_the_same_second_has_a_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Clock:
+        @staticmethod
+        def now(zone: tzinfo) -> datetime:
+            assert zone is UTC
+            return datetime(2026, 11, 22, 3, 4, 5, tzinfo=UTC)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(run_folder, "datetime", Clock)
+    for name in ("20261122T030405Z-a_b-1", "20261122T030405Z-a_b-1-2", "20261122T030405Z-a_b-1-3"):
+        assert default_place("a_b-1") == Path("runs") / name
+        (Path("runs") / name).mkdir(parents=True)
+
+
+def refusal(target: Path) -> str:
+    with pytest.raises(BadInputError) as refused, RunFolder(target):
+        pass
+    return str(refused.value)
+
+
+def test_refusals_word_by_word(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Relative names are made absolute; what was made on the way is removed again."""
+    monkeypatch.chdir(tmp_path)
+    Path("taken").mkdir()
+    Path("file").touch()
+    taken = f"{tmp_path}/taken: found a file or folder, expected a name that is free; choose another --out"
+    assert refusal(Path("taken")) == taken
+    below = f"{tmp_path}/file/run: found not a directory, expected {WRITABLE}; choose another --out"
+    assert refusal(Path("file/run")) == below
+    too_long = refusal(Path("new/folder") / ("a" * 250))
+    assert too_long.endswith(f"found file name too long, expected {WRITABLE}; choose another --out")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "taken"]
+    with pytest.raises(BadInputError) as refused, RunFolder(tmp_path / "run") as folder:
+        (tmp_path / "run" / "other").mkdir(parents=True)
+        folder.complete()
+    said = f"found directory not empty, expected a name that is free; the run is in {folder.work}"
+    assert str(refused.value) == f"{tmp_path}/run: {said}"
+
+
+def test_a_parent_that_others_use_by_then_stays(tmp_path: Path) -> None:
+    with pytest.raises(KeyError), RunFolder(tmp_path / "a" / "b" / "run"):
+        (tmp_path / "a" / "other").touch()
+        raise KeyError
+    assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")] == ["a", "a/other"]
+
+
 def test_the_trace_has_a_track_per_unit_and_a_flow_per_frame(tmp_path: Path) -> None:
     write_trace(JOBS, ("cpu", "gpu", "dsp"), tmp_path / "trace.pftrace")
     trace = Trace()
@@ -189,6 +151,51 @@ def test_tracks_are_in_the_order_of_the_units_of_the_graph(tmp_path: Path) -> No
     trace.ParseFromString((tmp_path / "trace.pftrace").read_bytes())
     tracks = [p.track_descriptor for p in trace.packet if p.HasField("track_descriptor")]
     assert [(track.name, track.sibling_order_rank) for track in tracks[1:]] == [("npu", 0), ("gpu", 2)]
+
+
+def test_every_packet_of_a_trace(tmp_path: Path) -> None:
+    """The process is track 1, units follow in their order; a wait is in us, and flows begin at 1."""
+    jobs = [
+        JobRecord("raster", "gpu", 4, 10_000, 15_000, 22_999, 30_000, 700, 80),
+        JobRecord("pose", "cpu", 5, 40_000, 40_000, 40_000, 41_000),
+    ]
+    idle = [
+        IdleSlice("gpu", "blocked", 30_000, 36_000, 500),
+        IdleSlice("cpu", "starved", 0, 40_000),
+        IdleSlice("dsp", "starved", 0, 9),
+    ]
+    write_trace(jobs, ("dsp", "gpu", "npu", "cpu"), tmp_path / "trace", idle)
+    trace = Trace()
+    trace.ParseFromString((tmp_path / "trace").read_bytes())
+    tracks = [p.track_descriptor for p in trace.packet if p.HasField("track_descriptor")]
+    assert [(t.uuid, t.parent_uuid, t.name, t.sibling_order_rank) for t in tracks] == [
+        (1, 0, "trilane", 0),
+        (3, 1, "gpu", 1),
+        (5, 1, "cpu", 3),
+    ]
+    assert tracks[0].child_ordering == TrackDescriptor.EXPLICIT
+    packets = [p for p in trace.packet if p.HasField("track_event")]
+    assert len(packets) + len(tracks) == len(trace.packet)
+    assert {p.trusted_packet_sequence_id for p in packets} == {1}  # 0 is none
+    begin, end = TrackEvent.TYPE_SLICE_BEGIN, TrackEvent.TYPE_SLICE_END
+    found = [
+        (
+            *(p.timestamp, p.track_event.type, p.track_event.track_uuid, p.track_event.name),
+            {note.name: note.int_value for note in p.track_event.debug_annotations},
+            list(p.track_event.flow_ids),
+        )
+        for p in packets
+    ]
+    assert found == [
+        (0, begin, 5, "starved", {}, []),
+        (40_000, end, 5, "", {}, []),
+        (22_999, begin, 3, "raster", {"frame": 4, "wait_us": 12, "preempted_ns": 700, "asleep_ns": 80}, [5]),
+        (30_000, end, 3, "", {}, []),
+        (30_000, begin, 3, "blocked", {"preempted_ns": 500}, []),
+        (36_000, end, 3, "", {}, []),
+        (40_000, begin, 5, "pose", {"frame": 5, "wait_us": 0}, [6]),
+        (41_000, end, 5, "", {}, []),
+    ]
 
 
 def test_a_report_is_read_back_from_its_folder(tmp_path: Path) -> None:
@@ -244,104 +251,46 @@ def test_a_missing_report_is_a_bad_input(tmp_path: Path) -> None:
         read_report(tmp_path / "nothing")
 
 
+def test_what_is_no_report_is_named_word_by_word(tmp_path: Path) -> None:
+    def said(text: str) -> str:
+        (tmp_path / "report.json").write_text(text)
+        with pytest.raises(BadInputError) as refused:
+            read_report(tmp_path)
+        return str(refused.value).removeprefix(f"{tmp_path}/report.json: ")
+
+    expected = "expected a run folder or its report.json"
+    assert said("null") == f"the document: found input should be a valid dictionary or instance of report, {expected}"
+    damaged = make_report(units={"dsp": {**SHARE, "idle": {}}})
+    assert said(json.dumps(damaged)) == f"units.dsp.idle.starved: found field required, {expected}"
+    assert said("{").startswith("the document: found EOF while parsing") and said("{").endswith(expected)
+    newer = "expected 1; a newer Trilane wrote it: update this one"
+    assert said('{"schema": 7}') == f"schema: found 7, {newer}"
+    assert said('{"schema": "7"}') == f"schema: found input should be 1, {expected}"
+    assert not said(json.dumps(make_report(schema=0))).endswith(newer)
+
+
+def test_a_file_that_is_too_large_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "any.json"
+    write_report(Report.model_validate(make_report()), file)
+    size = file.stat().st_size
+    monkeypatch.setattr(report_module, "MAX_REPORT_BYTES", size)
+    assert read_report(file).fps == 50.0
+    monkeypatch.setattr(report_module, "MAX_REPORT_BYTES", size - 1)
+    with pytest.raises(BadInputError) as refused:
+        read_report(file)
+    assert str(refused.value) == f"{file}: found {size} bytes, expected a report of at most {size - 1}"
+
+
+def test_a_report_that_could_not_be_read_back_is_never_written(tmp_path: Path) -> None:
+    wrong = Report.model_validate(make_report()).model_copy(update={"fps": "fast"})
+    with pytest.warns(UserWarning, match="fast"), pytest.raises(ValueError, match="fps"):
+        write_report(wrong, tmp_path / "report.json")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_report_never_holds_nan(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="JSON"):
         write_report(Report.model_validate(make_report(fps=float("nan"))), tmp_path / "report.json")
-
-
-def table_text(report: dict[str, Any]) -> str:
-    """The table as it is printed, each line without its frames and double spaces."""
-    from rich.console import Console
-
-    console = Console(width=400, record=True, file=io.StringIO())
-    console.print(run_table(Report.model_validate(report)))
-    return "\n".join(" ".join(line.replace("│", " ").split()) for line in console.export_text().splitlines())
-
-
-def test_the_table_shows_both_policies_and_dashes_what_was_not_measured() -> None:
-    text = table_text(make_report())
-    for expected in (
-        "pipelined, 3 frames",
-        "sequential, 3 frames",
-        "20.0 + 20.0",
-        "50 / 25 15 0 2 8",
-        "CPU time of cpu, gpu, %",
-        "0.91",
-        "stages, units, times, rates: measured in this run",
-        "PSNR on held-out views, dB: face 31.2; of the body alone 28.8; worst of 96 views (seeds 1, 2) 21.5; mask IoU",
-        "0.981 (from the avatar's validation of 2026-01-02, on ort at tensor size 256)",
-    ):
-        assert expected in " ".join(text.split())
-    efficiency = next(line for line in text.splitlines() if "efficiency" in line)
-    assert "–" in efficiency
-
-
-@pytest.mark.parametrize(
-    ("samples", "marked"), [(None, ()), (28, ("p90", "p95", "p99")), (58, ("p95", "p99")), (298, ("p99",)), (299, ())]
-)
-def test_a_percentile_of_too_few_frames_is_marked(samples: int | None, marked: tuple[str, ...]) -> None:
-    report = make_report()
-    report["latency_ms"] = {**TIMES, "samples": samples}
-    text = table_text(report | {"baseline": None})
-    rows = text[text.index("latency mean") :].splitlines()[1:6]
-    assert {row.split(",")[0] for row in rows if row.endswith("*")} == set(marked)
-    assert ("* of too few frames: p90 needs 29, p95 needs 59, p99 needs 299" in text) == bool(marked)
-
-
-def test_mean_and_rate_stand_with_their_interval_or_as_too_short() -> None:
-    known = make_report(fps_low=48.0, fps_high=52.25)
-    known["frame_time_ms"] = {**known["frame_time_ms"], "mean_low": 19.14, "mean_high": 20.83}
-    text = table_text(known | {"baseline": None})
-    assert "frame time mean, ms 20.0 (19.1 to 20.8)" in text
-    assert "rate frames per second 50.0 (48.0 to 52.2)" in text
-    short = table_text(make_report(baseline=None))
-    assert "frame time mean, ms 20.0 (too short to tell)" in short
-    assert "rate frames per second 50.0 (too short to tell)" in short
-
-
-def test_a_cap_is_said_once_and_apart_from_what_heat_did() -> None:
-    """63 % of the time throttled by the duty that was asked for, none of it for heat: no line says throttled 0 %."""
-    cap = {"corner": "svs2", "duty": 0.37, "duty_mean": 0.37}
-    caps = {"how": "x", "performance_profile": "low_power_saver", "units": {"dsp": cap}, "throttled_share": 0.0}
-    idle = {"starved": 0.07, "blocked": 0.0, "throttled": 0.63, "preempted": 0.0, "overhead": 0.0}
-    share = {**SHARE, "busy": 0.3, "idle": idle}
-    text = table_text(make_report(caps=caps, units={"dsp": share}, baseline=None)).replace("\n", " ")
-    assert "30 / 7 0 63 0 0" in text
-    assert "duty cycles dsp 37%, which is the most that units may work; lowered further for heat 0% of the time" in text
-    assert text.count("throttled") == 1  # the column
-
-
-def test_the_table_says_when_and_by_what_it_was_made() -> None:
-    made = {
-        "at": "2026-11-22T01:00:00+00:00",
-        "command": ["trilane", "run"],
-        "trilane": "0.1.0",
-        "revision": "0123456789abcdef",
-        "modified": True,
-    }
-    assert "2026-11-22T01:00:00+00:00: trilane 0.1.0 at 0123456789, modified" in table_text(make_report(made=made))
-    elsewhere = {**made, "revision": None, "modified": None}
-    assert "2026-11-22T01:00:00+00:00: trilane 0.1.0\n" in table_text(make_report(made=elsewhere))
-
-
-NO_ONES = {"source": NO_FIGURES, "changed": ["texture"], "why": "changed since the validation: [red]the texture[/red]"}
-
-
-@pytest.mark.parametrize(
-    ("facts", "why"),
-    [
-        (NO_ONES, NO_ONES["why"]),
-        (
-            {key: value for key, value in SHOWN.items() if key != "source"},
-            "the report does not say where they come from",
-        ),
-        ({}, "the report does not say where they come from"),
-    ],
-)
-def test_the_table_says_why_there_are_no_figures_and_shows_none(facts: dict[str, Any], why: str) -> None:
-    text = " ".join(table_text(make_report(accuracy={"someone": facts})).split())
-    assert f"avatar someone: no figures of accuracy: {why}" in text
-    assert "31.2" not in text and "0.981" not in text
 
 
 def figures_in(value: Any, above: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
@@ -368,35 +317,3 @@ def test_every_figure_of_a_report_has_a_source() -> None:
 
 def test_what_a_report_has_not_has_no_source() -> None:
     assert not {"pace", "pace.ratio", "video"} & set(sources_of(make_report()))
-
-
-def test_the_whole_table_is_as_it_was() -> None:
-    """Every line of a report that has everything, in printed/run-table.txt; TRILANE_WRITE_PRINTED=1 writes it anew."""
-    made = {
-        "at": "2026-11-22T01:00:00+00:00",
-        "command": ["trilane"],
-        "trilane": "0.1.0",
-        "revision": None,
-        "modified": None,
-    }
-    cap = {"corner": "svs", "duty": 0.5, "duty_mean": 0.45}
-    caps = {"how": "x", "performance_profile": "balanced", "units": {"dsp": cap}, "throttled_share": 0.25}
-    pace = {
-        "profile": "snapdragon-888",
-        "performance_profile": "burst",
-        "slow_motion": 4.0,
-        "stage_ms": {"infer": 12.0},
-        "host_slower": {"infer": 2},
-        "late_frames": [3],
-        "virtual_ms": 21.5,
-        "measured_ms": 21.75,
-        "compared_share": 0.5,
-        "ratio": 1.0116,
-    }
-    temperature = {"sensor": None, "kind": "modelled", "device_end": 30.0, "device_max": 31.0, "junction_max": 44.5}
-    report = make_report(made=made, caps=caps, pace=pace, temperature_c=temperature, fps_low=48.0, fps_high=52.0)
-    text = table_text(report).splitlines()
-    file = Path(__file__).with_name("printed") / "run-table.txt"
-    if "TRILANE_WRITE_PRINTED" in os.environ:
-        file.write_text("\n".join(text) + "\n", encoding="utf-8")
-    assert text == file.read_text(encoding="utf-8").splitlines()

@@ -31,6 +31,7 @@ from trilane.pipeline.result import Failure
 from trilane.pipeline.run_log import RunLog, UnitError, after_stderr
 from trilane.pipeline.signals import Interrupts
 from trilane.pipeline.unit_processes import UnitMessage
+from trilane.scheduler import release
 from trilane.scheduler.events import FrameRequest, Settings, Stop
 from trilane.testing.small_pipeline import pipeline
 from trilane.testing.told_time import ToldTime
@@ -324,7 +325,7 @@ def test_settings_follow_from_policy_and_rate() -> None:
     assert run._settings("pipelined", 9, 30.0, None, 5, 0.0, requests).asked
     with pytest.raises(BadInputError, match=r"^the run's settings: found policy 'no'"):
         run._settings("no", 9, 30.0, None, 5, 0.0, None)
-    assert (run.HANG_NS, run.DEADLINE_PERIODS) == (10 * 10**9, 3)
+    assert (run.HANG_NS, release.DEADLINE_PERIODS) == (10 * 10**9, 3)
 
 
 def test_the_scheduler_is_on_its_cores_and_back_afterwards() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -17,13 +18,15 @@ from trilane.scene.schema import AvatarSpec, CameraSpec, OutputSpec, PlaneSpec, 
 def test_what_a_scene_leaves_out() -> None:
     assert Scene().model_dump() == {
         "name": "scene", "fps": 30.0, "frames": 300, "size": "256", "background": "room", "hud": False, "planes": (),
-        "texture_filter": "linear", "error_budget_px": 0.5, "output": {"width": 640, "height": 480},
+        "texture_filter": "linear", "plan": "planned", "error_budget_px": 0.5, "most_side": 512, "memory_mb": 512,
+        "output": {"width": 640, "height": 480},
         "camera": {
             "source": "builtin:orbit", "format": "auto", "fov_y_deg": None, "near_m": 0.05, "far_m": 100.0,
             "place": "auto",
         },
         "avatars": ({
-            "bundle": "default", "motion": "builtin:walk-wave-turn", "position": (0.0, 0.0, 0.0), "heading_deg": 0.0,
+            "name": "avatar1", "bundle": "default", "motion": "builtin:walk-wave-turn",
+            "position": (0.0, 0.0, 0.0), "heading_deg": 0.0,
             "up_axis": "auto", "units": "auto", "ground": "auto",
         },),
     }  # fmt: skip
@@ -42,6 +45,7 @@ LIMITS: list[tuple[type, str, list[Any], list[Any]]] = [
         [(-1e4, 1e4, 0)],
         [(1.1e4, 0, 0), (0, -1.1e4, 0), (0, 0, 1.1e4), (0, math.nan, 0), (0, 0)],
     ),
+    (AvatarSpec, "name", ["x" * 80, "a b.c-d_e"], ["", "x" * 81, "a/b", "a\n"]),
     (AvatarSpec, "heading_deg", [-3600, 3600], [-3601, 3601, math.nan]),
     (AvatarSpec, "up_axis", ["auto", "y", "z"], ["x"]),
     (AvatarSpec, "units", ["auto", "m", "cm", "in", "cmu"], ["mm"]),
@@ -62,7 +66,7 @@ LIMITS: list[tuple[type, str, list[Any], list[Any]]] = [
     (Scene, "size", ["32", "64x96"], ["33", "64x95"]),
     (Scene, "planes", [({},) * 32], [({},) * 33]),
     (Scene, "texture_filter", ["linear", "mipmap", "anisotropic"], ["nearest"]),
-    (Scene, "error_budget_px", [0], [-0.1, math.inf]),
+    (Scene, "error_budget_px", [1e-9, 100], [0, -0.1, 100.1, math.inf]),
     (Scene, "avatars", [({},) * 8], [(), ({},) * 9]),
 ]
 
@@ -100,6 +104,41 @@ SENTENCES: list[tuple[dict[str, Any], str]] = [
         {"colour": 1},
         "colour: found an unknown key, expected a key of the scene schema; correct its spelling or remove it",
     ),
+    (
+        {"camera": {"sorce": "builtin:far"}},
+        "camera.sorce: found an unknown key, expected a key of the scene schema; did you mean 'source'?",
+    ),
+    (
+        {"avatars": [{}, {"positon": [0, 0, 0]}]},
+        "avatars.1.positon: found an unknown key, expected a key of the scene schema; did you mean 'position'?",
+    ),
+    (
+        {"planes": [{"widthm": 1}]},
+        "planes.0.widthm: found an unknown key, expected a key of the scene schema; did you mean 'width_m'?",
+    ),
+    ({"avatar": []}, "avatar: found an unknown key, expected a key of the scene schema; did you mean 'avatars'?"),
+    (
+        {"texture_filter": "mipmaps"},
+        "texture_filter: found 'mipmaps', expected 'linear', 'mipmap' or 'anisotropic'; did you mean 'mipmap'?",
+    ),
+    (
+        {"avatars": [{"ground": "frames"}]},
+        "avatars.0.ground: found 'frames', expected 'auto', 'sequence', 'frame' or 'none'; did you mean 'frame'?",
+    ),
+    (
+        {"avatars": [{"name": "anna"}, {}, {"name": "anna"}]},
+        "avatars: found 'anna' as the name of avatars.0 and of avatars.2, expected a name of its own for each; "
+        "change `name` of one of them",
+    ),
+    (
+        {"avatars": [{"name": "avatar2"}, {}]},
+        "avatars: found 'avatar2' as the name of avatars.0 and of avatars.1, expected a name of its own for each; "
+        "change `name` of one of them",
+    ),
+    (
+        {"error_budget_px": 0},
+        "error_budget_px: found 0, expected greater than 0; numbers are rounded, so nothing is drawn without an error",
+    ),
     ({"planes": [{"centre": [0, 0]}]}, "planes.0.centre.2: found nothing, expected a value; add the key"),
     ({"avatars": []}, "avatars: found [], expected at least 1 of them"),
     ({"avatars": [{}] * 9}, f"avatars: found {repr([{}] * 9)[:80]}, expected at most 8 of them"),
@@ -121,6 +160,13 @@ def test_what_is_wrong_with_a_scene_is_one_sentence(case: int) -> None:
     assert str(raised.value) == f"here: {sentence}"
 
 
+def test_avatars_are_named_by_their_places_and_keep_their_names() -> None:
+    """Also when a scene is checked again, as it is after the options of the command line were laid over it."""
+    scene = scene_from("here", {"avatars": [{}, {"name": "anna"}, {}]})
+    assert [avatar.name for avatar in scene.avatars] == ["avatar1", "anna", "avatar3"]
+    assert scene_from("here", scene.model_dump(mode="json")) == scene
+
+
 def test_places_of_files_and_names_that_are_built_in(tmp_path: Path) -> None:
     base = Path("/base")
     for name in ("room", "default", "builtin:orbit"):
@@ -131,9 +177,12 @@ def test_places_of_files_and_names_that_are_built_in(tmp_path: Path) -> None:
     assert str(raised.value) == "name of a file: found nothing, expected a path, or the name of something built in"
     assert find_scene("x/y.toml") == Path("x/y.toml")
     assert find_scene("pair").name == "pair.toml" and find_scene("pair").is_file()
+    with pytest.raises(BadInputError, match=r"; did you mean 'portrait'\?$"):
+        find_scene("portait")
     with pytest.raises(BadInputError) as raised:
         find_scene("beach")
-    assert str(raised.value) == "scene: found 'beach', expected a .toml file or one of closeup, default, far, pair"
+    names = "closeup, crowd, default, far, full-body, leave-and-return, pair, portrait, top-to-floor, walk-past"
+    assert str(raised.value) == f"scene: found 'beach', expected a .toml file or one of {names}"
     path = tmp_path / "my.toml"
     path.write_text("[camera]\nnear_m = 0.1\n[[avatars]]\nheading_deg = 3.0\n")
     loaded = load_scene(path)
@@ -148,7 +197,8 @@ def test_places_of_files_and_names_that_are_built_in(tmp_path: Path) -> None:
         load_scene(path)
 
 
-WALK, STAND = {"bundle": "default", "motion": "builtin:walk-wave-turn"}, {"bundle": "default", "motion": "builtin:idle"}
+MOTIONS = ("walk-wave-turn", "idle", "there-and-back")
+WALK, STAND, GO = ({"bundle": "default", "motion": f"builtin:{name}"} for name in MOTIONS)
 
 
 SCENES: dict[str, tuple[int, str, list[dict[str, Any]]]] = {
@@ -159,13 +209,27 @@ SCENES: dict[str, tuple[int, str, list[dict[str, Any]]]] = {
         {**WALK, "position": [-0.55, 0.0, 0.0], "heading_deg": 8.0},
         {**STAND, "position": [0.6, 0.0, 0.0], "heading_deg": -12.0},
     ]),
+    "portrait": (240, "builtin:closeup", [STAND]),
+    "full-body": (300, "builtin:static", [WALK]),
+    "crowd": (300, "builtin:far", [
+        {**WALK, "position": [0.0, 0.0, 0.3], "heading_deg": 0.0},
+        {**STAND, "position": [-1.1, 0.0, -0.6], "heading_deg": 25.0},
+        {**WALK, "position": [1.2, 0.0, -0.5], "heading_deg": -20.0},
+        {**STAND, "position": [-2.1, 0.0, -1.4], "heading_deg": 40.0},
+        {**STAND, "position": [2.2, 0.0, -1.3], "heading_deg": -30.0},
+    ]),
+    "walk-past": (450, "builtin:wayside", [GO]),
+    "top-to-floor": (360, "builtin:top-to-floor", [STAND]),
+    "leave-and-return": (450, "builtin:static", [{**GO, "position": [1.6, 0.0, -0.6], "heading_deg": 90.0}]),
 }  # fmt: skip
 
 
 def test_the_scenes_that_come_along_are_what_they_are() -> None:
     assert scene_names() == sorted(SCENES)
     for name, (frames, camera, avatars) in SCENES.items():
+        output = {"width": 480, "height": 640} if name == "portrait" else {"width": 640, "height": 480}
+        assert re.match(r"# [A-Z].*\.\n", find_scene(name).read_text())
         assert tomllib.loads(find_scene(name).read_text()) == {
             "name": name, "fps": 30, "frames": frames, "size": "256", "background": "room",
-            "output": {"width": 640, "height": 480}, "camera": {"source": camera}, "avatars": avatars,
+            "output": output, "camera": {"source": camera}, "avatars": avatars,
         }  # fmt: skip

@@ -204,6 +204,37 @@ def test_what_is_packed_is_what_the_units_find(tiny_bundle: Path) -> None:
 # --- options ---------------------------------------------------------------------------------------------------------
 
 
+def test_rate_and_output_are_laid_over_the_scene() -> None:
+    scene = configure.requested_scene(configure.Request("walk-past", fps=24.0, output="320x482"))
+    assert (scene.name, scene.fps, scene.output.width, scene.output.height) == ("walk-past", 24.0, 320, 482)
+    for output, sentence in (
+        ("320", "--output: found '320', expected WIDTHxHEIGHT in pixels, such as 640x480"),
+        ("-2x64", "--output: found '-2x64', expected WIDTHxHEIGHT in pixels, such as 640x480"),
+        ("62x64", "command line: output.width: found 62, expected greater than or equal to 64"),
+        ("64x67", "command line: output.height: found 67, expected a multiple of 2"),
+    ):
+        with pytest.raises(BadInputError) as raised:
+            configure.requested_scene(configure.Request(output=output))
+        assert str(raised.value) == sentence
+
+
+def test_an_edge_is_one_of_the_rules() -> None:
+    for edge in ("single", "double", "triple", "fifo", "fifo:1", "fifo:64", "orphan", "orphan:4"):
+        assert configure.requested_edge(edge) == edge
+    kinds = "single, double, triple, fifo:N or orphan:N"
+    for edge, sentence in (
+        ("doubel", f"expected {kinds}; did you mean 'double'?"),
+        ("fifi:3", f"expected {kinds}; did you mean 'fifo'?"),
+        ("double:3", f"expected {kinds}"),
+        ("", f"expected {kinds}"),
+        ("orphan:3", "expected orphan:N with N from 4 to 64"),
+        ("fifo:65", "expected fifo:N with N from 1 to 64"),
+    ):
+        with pytest.raises(BadInputError) as raised:
+            configure.requested_edge(edge)
+        assert str(raised.value) == f"--edge: found {edge!r}, {sentence}"
+
+
 def test_options_are_laid_over_the_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tiny_bundle: Path) -> None:
     values = {
         "frames": 20,

@@ -161,6 +161,10 @@ def test_a_summary_has_means_and_the_worst_sample_of_all_seeds():
         SampleError(9, 25, "face", an_error(22.0, 15.0)),
     ]
     facts = summary(errors)
+    assert list(facts) == [
+        *("psnr_db_by_band", "body_psnr_db_by_band", "psnr_db", "body_psnr_db", "background", "iou", "ssim"),
+        *("least_psnr_db", "least_body_psnr_db", "worst", "by_seed", "samples"),
+    ]
     assert facts["psnr_db_by_band"] == {"far": 32.0, "face": 21.0}
     assert facts["body_psnr_db_by_band"] == {"far": 29.0, "face": 17.0}
     assert (facts["psnr_db"], facts["body_psnr_db"], facts["samples"]) == (26.5, 23.0, 4)

@@ -269,7 +269,10 @@ def test_only_a_folder_whose_lock_is_free_is_removed(tmp_path: Path, monkeypatch
     (tmp_path / "trilane-other").mkdir()
     (tmp_path / "trilane-link").symlink_to(locked.path)
     expected = [locked.path.name, "trilane-other", "trilane-link"]
+    descriptors = Path("/proc/self/fd")
+    open_before = sorted(descriptors.iterdir())
     remove_abandoned(tmp_path)
+    assert sorted(descriptors.iterdir()) == open_before, "neither lock stays open"
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(expected)
     locked.remove()
 

@@ -111,6 +111,50 @@ def test_a_unit_is_forked_into_a_life_of_its_own() -> None:
     assert (broken_said[0], broken_said[-1]) == ("last words", "ValueError: broken spec")
 
 
+def test_the_fork_servers_life(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """It ends with its parent, leaves Ctrl-C to it, imports what it is told to, and freezes what all units share."""
+    lived: list[Any] = []
+
+    def imported(name: str) -> None:
+        lived.append(name)
+        if name == "absent":
+            raise ImportError(name)
+
+    def note(*what: Any, then: Any = None) -> Any:
+        return lambda *given: lived.append((*what, *given)) or then
+
+    monkeypatch.setattr(fork_server, "die_with_parent", note("dies with"))
+    monkeypatch.setattr(fork_server, "importlib", SimpleNamespace(import_module=imported))
+    monkeypatch.setattr(fork_server, "signal", SimpleNamespace(signal=note("signal"), SIGINT=2, SIG_IGN="ignored"))
+    monkeypatch.setattr(fork_server, "gc", SimpleNamespace(collect=note("collect"), freeze=note("freeze")))
+    monkeypatch.setattr(fork_server, "socket", SimpleNamespace(socket=lambda *, fileno: f"socket {fileno}"))
+    monkeypatch.setattr(fork_server, "serve", note("serve"))
+    monkeypatch.setattr(fork_server, "os", SimpleNamespace(_exit=note("exit")))
+    words = ["fork_server", "--socket", "7", "--parent", "99", "--preload", "json,absent,,ast"]
+    monkeypatch.setattr("sys.argv", words)
+    fork_server.main()
+    assert lived == [
+        ("dies with", 99),
+        ("signal", 2, "ignored"),
+        *("trilane.pipeline.unit_loop", "json", "absent", "ast"),
+        ("collect",),
+        ("freeze",),
+        ("serve", "socket 7"),
+        ("exit", 0),
+    ]
+    lived.clear()
+    monkeypatch.setattr("sys.argv", words[:5])
+    fork_server.main()
+    assert lived[2:4] == ["trilane.pipeline.unit_loop", ("collect",)]
+    for missing, said in ((words[:3], "--parent"), ([words[0], *words[3:]], "--socket"), ([*words, "-h"], "")):
+        monkeypatch.setattr("sys.argv", missing)
+        with pytest.raises(SystemExit) as left:
+            fork_server.main()
+        out, err = capsys.readouterr()
+        assert (left.value.code == 2, said in err) == (bool(said), True)
+    assert "Forks the units of a run; started by Trilane, not by hand." in " ".join(out.split())
+
+
 def test_a_process_is_called_by_its_unit() -> None:
     assert fork_server.process_name("dsp") == "trilane-dsp"
     assert fork_server.process_name("a-long-name-of-a-unit") == "trilane-a-long-"

@@ -118,10 +118,13 @@ def served(monkeypatch: pytest.MonkeyPatch, link: FakeLink, stages: list[Any]) -
     before = os.sched_getaffinity(0)
     spec = spec_of(settings=UnitSettings(cores=(core,), threads=1), run_cores=(core,))
     monkeypatch.setattr(unit_loop, "build_stages", lambda _: stages)
-    monkeypatch.setattr(unit_loop, "gc", SimpleNamespace(collect=lambda: 0, freeze=lambda: None))
+    collector: list[str] = []
+    tidy = SimpleNamespace(collect=lambda: collector.append("collect"), freeze=lambda: collector.append("freeze"))
+    monkeypatch.setattr(unit_loop, "gc", tidy)
     try:
         return unit_loop._serve(spec, link)  # type: ignore[arg-type]
     finally:
+        assert collector == ["collect", "freeze"]  # what was built is never looked at again
         os.sched_setaffinity(0, before)
 
 

@@ -66,6 +66,24 @@ def person(gl: Any) -> Person:
     return Person(body, arrays, SkinnedMesh(gl, arrays), Skeleton(shaped.joints, body.parents), shaped.joints)
 
 
+@pytest.fixture(scope="session")
+def opened_renderer() -> Any:
+    """The renderer of training's samples, with a context of its own."""
+    from trilane.training.sample_renderer import SampleRenderer
+
+    try:
+        return SampleRenderer(load_body(bundle_folder("default") / "body.npz").shape(), threads=2)
+    except MissingPartError as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture
+def renderer(opened_renderer: Any) -> Any:
+    """The renderer, its context the current one."""
+    opened_renderer.ctx.__enter__()
+    return opened_renderer
+
+
 def perspective(fov_y_deg: float, aspect: float, near: float = 0.05, far: float = 100.0) -> F64:
     """An OpenGL projection."""
     q = 1 / np.tan(np.radians(fov_y_deg) / 2)

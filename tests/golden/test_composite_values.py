@@ -15,7 +15,9 @@ from PIL import Image, ImageDraw, ImageFont
 
 from trilane.arrays import F64, U8
 from trilane.bench.lib import float_raster
+from trilane.scene.crop import Rect
 from trilane.scene.schema import PlaneSpec
+from trilane.scene.tensor_layout import lay_out_at
 from trilane.stages.gpu import composite, composite_painters, head_up_display, opengl_calls
 from trilane.stages.gpu.builtin_room import Extent, room_mesh
 from trilane.stages.gpu.composite import CompositeStage
@@ -154,6 +156,26 @@ def test_an_avatar_is_blended_at_its_rectangle(gl: Any, name: str) -> None:
     expected = np.where(inside[..., None], code(light), picture)
     assert inside.any()
     assert np.abs(canvas.read() - expected).max() <= 1.5  # FP16 keeps 0.05 % of the light: less than half a code
+
+
+def test_a_tensor_of_the_pictures_density_is_copied_pixel_by_pixel(gl: Any) -> None:
+    """An opaque picture of 12x8 at a rectangle of the planner in a frame of 20x27: no pixel is resampled."""
+    shape = (12, 8)
+    mesh = Rect(-0.3, -0.4, 0.1, 0.5)
+    dense = lay_out_at([mesh], SHAPE, shape)
+    assert dense is not None
+    assert dense.density == 1.0
+    ((rect, cell),) = dense.layout.crops
+    image = noise(shape, 4, seed=5)
+    image[..., 3] = 255
+    picture = noise(SHAPE)
+    canvas, painter = Canvas(gl, picture), AvatarPainter(gl, [shape])
+    painter.upload(shape, image.reshape(-1))
+    painter.draw(canvas.target, shape, tuple(rect), cell)
+    left, top = round((rect.x0 + 1) / 2 * SHAPE[1]), round((1 - rect.y1) / 2 * SHAPE[0])
+    expected = picture.astype(int)
+    expected[top : top + 12, left : left + 8] = image[..., :3]
+    assert np.abs(canvas.read().astype(int) - expected).max() <= 1  # FP16 in linear light, to a byte and back
 
 
 @pytest.mark.parametrize("eye", [(0.5, 1.4, 2.5), (6.5, 3.4, -1.0)], ids=["inside", "where it must grow"])

@@ -82,6 +82,10 @@ CAMERAS = {
     "missing": (None, "no such file"),
     "empty": ("", "an empty file"),
     "wrong columns": ("1 2 3\n4 5 6\n", "3 columns"),
+    "no rotation": (
+        "0 1 0 0 0 0 1 0 0 0 0 1 0\n1 1 0 0 0 0 1 0 0 0 0 0 0\n" + "2 0 0 0 0 0 0 0 0 0 0 0 0\n" * 2,
+        "first: line 2",
+    ),
     "not a number": ("nan nan nan nan nan nan nan nan\n" * 3, "c.txt"),
 }
 
@@ -100,6 +104,12 @@ OPTIONS = {
     "no frames": (["--frames", "0"], "frames", "found 0"),
     "odd size": (["--size", "100"], "size", "multiple of 32"),
     "huge size": (["--size", "999999968"], "size", "32 to 4096"),
+    "no rate": (["--fps", "0"], "fps", "found 0"),
+    "a misspelt edge": (["--edge", "tripel"], "--edge", "found 'tripel', expected single, double, triple, fifo:N or"),
+    "too long a queue": (["--edge", "fifo:65"], "--edge", "found 'fifo:65', expected fifo:N with N from 1 to 64"),
+    "an output without height": (["--output", "640"], "--output", "expected WIDTHxHEIGHT in pixels, such as 640x480"),
+    "an odd output": (["--output", "641x480"], "output.width", "found 641, expected a multiple of 2"),
+    "a huge output": (["--output", "640x4098"], "output.height", "found 4098, expected less than or equal to 4096"),
     "unknown scene": (["beach"], "scene", "default"),
     "unknown runtime": (["--runtime", "abacus"], "runtime", "'abacus'"),
     "unknown skinning": (["--skinning", "npu"], "--skinning", "'npu'"),

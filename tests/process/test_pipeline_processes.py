@@ -20,6 +20,7 @@ import pytest
 from trilane.apps.pace import Pace, compare
 from trilane.bench.faults import unit_process
 from trilane.errors import BadInputError, TrilaneError
+from trilane.hw_profiles.application import Variant, application_graph, settings_of
 from trilane.hw_profiles.governor import Governor
 from trilane.hw_profiles.load import load_runnable
 from trilane.pipeline.description import Pipeline, UnitSettings
@@ -27,7 +28,7 @@ from trilane.pipeline.result import RunResult
 from trilane.pipeline.run import run_pipeline
 from trilane.pipeline.unit_starter import CLOSE_S, UnitStarter
 from trilane.scheduler.events import Pong
-from trilane.scheduler.recording import replay
+from trilane.scheduler.recording import Recording, replay
 from trilane.stages.avatar_pipeline import avatar_pipeline
 from trilane.stages.configure import Request, configure
 from trilane.testing import lost_context
@@ -87,6 +88,20 @@ def test_a_paced_run_drops_what_it_cannot_do_and_counts_it(policy: str, edge: st
     assert result.presented > 20
     assert result.report.efficiency is None
     check_accounts(result)
+
+
+@pytest.mark.parametrize("policy", ["latest", "deadline"])
+def test_a_prediction_has_the_rules_of_a_run(policy: str) -> None:
+    """The events of a run, told to a core as predictions set it up, get the same answers; at another rate others."""
+    result = run_pipeline(doubles(infer=40), 25, policy=policy, fps=50, isolated_frames=0)
+    assert sum(result.dropped.values()) > 5
+
+    def differences(fps: float) -> list[str]:
+        settings = settings_of(Variant(policy, "double", fps=fps), 25, display_ns=1_000_000)
+        return list(replay(Recording(application_graph("double"), settings, result.recording.steps)))
+
+    assert differences(50.0) == []
+    assert differences(60.0)
 
 
 def test_a_run_at_a_pace_has_the_frame_time_of_virtual_time() -> None:

@@ -46,8 +46,8 @@ def behaviour(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
     """Runs are of doubles; what is put in here is how they behave, by stage."""
     asked: dict[str, object] = {}
 
-    def run_doubles(config: RunConfig, assets: Assets, frames: int | None, **options: Any) -> RunResult:
-        pipeline = pipeline_of_doubles(**asked)
+    def run_doubles(config: RunConfig, assets: Assets, frames: int | None, edge: str, **options: Any) -> RunResult:
+        pipeline = pipeline_of_doubles(**asked).with_rule(edge)
         return run_pipeline(pipeline, frames or config.scene.frames, fps=config.scene.fps, assets=assets, **options)
 
     monkeypatch.setattr("trilane.apps.run_job.run_avatar", run_doubles)
@@ -93,6 +93,11 @@ def test_the_report_has_the_keys_of_the_schema_and_the_baseline(tmp_path: Path) 
 def test_the_events_of_a_run_replay_to_the_same_answers(tmp_path: Path) -> None:
     outcome = run_mocks(tmp_path / "run", Listener(), Plan(baseline_frames=0))
     assert list(replay(read(outcome.folder / "events.jsonl"))) == []
+
+
+def test_a_run_has_the_edge_that_was_asked_for(tmp_path: Path) -> None:
+    report = read_report(run_mocks(tmp_path / "run", Listener(), Plan(baseline_frames=0, edge="fifo:3")).folder)
+    assert (report.edge, report.config["edge"], report.config["policy"]) == ("fifo:3", "fifo:3", "pipelined")
 
 
 def test_no_baseline_beside_a_sequential_run(tmp_path: Path) -> None:

@@ -5,7 +5,6 @@ Rule: shaders write linear light; samples are averaged in linear light, then wri
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,6 @@ import moderngl
 import numpy as np
 
 from trilane.arrays import F32, U8, Floats
-from trilane.stages.gpu import opengl_calls
 from trilane.stages.gpu.camera_matrices import eye_of
 from trilane.stages.gpu.mesh_draw import MeshDraw
 from trilane.stages.gpu.shader_program import build_program, set_uniforms
@@ -24,63 +22,43 @@ class ShadedMesh:
     """One mesh with its fragment shader and textures.
 
     The mesh must have `normal` and `colour`. The shader reads `v_position`, `v_normal` (world, not normalised),
-    `v_rest`, `v_uv`, `v_colour`, `gl_FrontFacing`, the uniforms `view` (mat4) and `eye` (vec3) and a sampler2D for each
-    texture. It writes one vec4: linear light and alpha, which is 1; `discard` makes holes.
+    `v_rest`, `v_uv`, `v_colour`, `gl_FrontFacing` and the uniforms `view` (mat4) and `eye` (vec3). It writes one vec4:
+    linear light and alpha, which is 1; `discard` makes holes.
     """
 
-    def __init__(
-        self,
-        ctx: Any,
-        mesh: SkinnedMesh,
-        fragment: str | Path,
-        textures: Mapping[str, U8] | None = None,
-        uniforms: Mapping[str, Any] | None = None,
-    ) -> None:
-        """Compile the shader and upload the textures.
+    def __init__(self, ctx: Any, mesh: SkinnedMesh, fragment: Path, uniforms: dict[str, Any]) -> None:
+        """Compile the shader.
 
         `ctx`: the OpenGL context.
         `mesh`: what to draw.
-        `fragment`: a file of `trilane.shaders`, or a path.
-        `textures`: name to (h,w,4) uint8 sRGB image with row 0 at v = 0; read in linear light, mipmapped, repeated.
-        `uniforms`: that never change.
+        `fragment`: the shader's file.
+        `uniforms`: its own, which never change.
         Raises TrilaneError when the shader does not compile.
         """
         self._draw = MeshDraw(ctx, mesh, fragment)
-        self._textures = {name: _srgb_texture(ctx, image) for name, image in (textures or {}).items()}
-        self._draw.set(dict(uniforms or {}))
+        self._draw.set(uniforms)
 
-    def draw(self, joints: F32, view: Floats, projection: Floats, uniforms: Mapping[str, Any]) -> None:
+    def draw(self, joints: F32, view: Floats, projection: Floats) -> None:
         """Draw into the target in use.
 
         `joints`: (55,3,4) skinning matrices.
         `view`, `projection`: (4,4) the camera.
-        `uniforms`: of this draw.
         """
-        for location, (name, texture) in enumerate(self._textures.items()):
-            texture.use(location)
-            self._draw.set({name: location})
-        camera = {"view": tuple(np.asarray(view, np.float64).T.ravel()), "eye": tuple(eye_of(view))}
-        self._draw.set(camera | dict(uniforms))
+        self._draw.set({"view": tuple(np.asarray(view, np.float64).T.ravel()), "eye": tuple(eye_of(view))})
         self._draw.draw(BodyPose(joints), view, projection)
 
 
 class ShadedRaster:
     """Supersampled pictures of shaded meshes. `samples`: samples along each side of a pixel (2 is 2x2), even."""
 
-    def __init__(self, ctx: Any, samples: int = 4) -> None:
+    def __init__(self, ctx: Any, samples: int) -> None:
         self._ctx, self._samples = ctx, samples
         self._resolve = build_program(ctx, "whole_screen.vert", "tent_filter.frag", SAMPLES=samples)
         self._screen = ctx.vertex_array(self._resolve, [])
         self._targets: dict[tuple[int, int], tuple[Any, Any, Any]] = {}
 
     def render(
-        self,
-        meshes: list[ShadedMesh],
-        joints: F32,
-        view: Floats,
-        projection: Floats,
-        shape: tuple[int, int],
-        uniforms: Mapping[str, Any] | None = None,
+        self, meshes: list[ShadedMesh], joints: F32, view: Floats, projection: Floats, shape: tuple[int, int]
     ) -> U8:
         """The picture (h,w,4) uint8, sRGB, straight alpha, row 0 on top; pixels that no mesh covers are 0, 0, 0, 0.
 
@@ -88,7 +66,6 @@ class ShadedRaster:
         `joints`: (55,3,4) skinning matrices of all meshes.
         `view`, `projection`: (4,4) the camera.
         `shape`: (height, width) of the picture.
-        `uniforms`: set on every mesh's shader.
         """
         large, samples, small = self._target(shape)
         large.use()
@@ -96,7 +73,7 @@ class ShadedRaster:
         self._ctx.depth_func = "<"
         large.clear(0.0, 0.0, 0.0, 0.0, depth=1.0)
         for mesh in meshes:
-            mesh.draw(joints, view, projection, uniforms or {})
+            mesh.draw(joints, view, projection)
         small.use()
         self._ctx.enable_only(moderngl.NOTHING)
         samples.use(0)
@@ -114,12 +91,3 @@ class ShadedRaster:
             small = self._ctx.framebuffer([self._ctx.texture(shape[::-1], 4)])
             self._targets[shape] = (large, samples, small)
         return self._targets[shape]
-
-
-def _srgb_texture(ctx: Any, image: U8) -> Any:
-    texture = ctx.texture(
-        (image.shape[1], image.shape[0]), 4, image.tobytes(), internal_format=opengl_calls.SRGB8_ALPHA8
-    )
-    texture.build_mipmaps()
-    texture.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
-    return texture

@@ -83,14 +83,16 @@ def obscurance(points: F64, normals: F64, emitters: F64, emitter_normals: F64, a
     `reach`: metres at which a disc's effect has faded out.
     """
     left = np.empty(len(points))
-    for start in range(0, len(points), 512):
-        part = slice(start, start + 512)
-        away = emitters[None] - points[part, None]
+    for part in np.array_split(np.argsort(points[:, 1]), max(1, len(points) // 256)):
+        low, high = points[part].min(axis=0) - reach, points[part].max(axis=0) + reach
+        near = ((emitters >= low) & (emitters <= high)).all(axis=1)
+        away = emitters[near][None] - points[part, None]
         square = np.einsum("ijk,ijk->ij", away, away) + 1e-6
         distance = np.sqrt(square)
         at_point = np.einsum("ijk,ik->ij", away, normals[part]) / distance
-        at_emitter = -np.einsum("ijk,jk->ij", away, emitter_normals) / distance
-        factor = np.clip(at_point, 0.0, 1.0) * np.clip(at_emitter, 0.0, 1.0) * areas / (np.pi * square + areas)
+        at_emitter = -np.einsum("ijk,jk->ij", away, emitter_normals[near]) / distance
+        area = areas[near]
+        factor = np.clip(at_point, 0.0, 1.0) * np.clip(at_emitter, 0.0, 1.0) * area / (np.pi * square + area)
         fade = np.clip(1.0 - distance / reach, 0.0, 1.0)
         left[part] = 1.0 - np.minimum((factor * fade).sum(axis=1), 1.0)
     return left

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from onnx import numpy_helper
 
 ROUNDS = 3
-#: Least and greatest factor between two layers; a channel that would need more is dead and gets the limit.
+#: Least and greatest factor between two layers in one round.
 SCALE_LIMITS = (1e-2, 1e2)
 
 

@@ -37,6 +37,8 @@ LIKE = {
     "width": "height",
     "height": "width",
 }
+#: Functions that give the same for their arguments in any order.
+ANY_ORDER = {"max", "min", "maximum", "minimum", "hypot", "gcd", "suppress"}
 WORD = r"[A-Za-z_][\w.:/-]*"
 #: cosmic-ray operators that need arguments, or that change what nobody tests.
 LEFT_OUT = {"VariableReplacer", "VariableInserter", "RemoveDecorator"}
@@ -105,9 +107,10 @@ def _mutated(mutate_code: Any, text: str, operator: Any, occurrence: int) -> str
 
 def _by_hand(text: str, tree: ast.Module) -> Iterator[tuple[Span, Edit]]:
     source = _Source(text)
+    unordered = {id(part) for node in ast.walk(tree) for part in _unordered(node)}
     for node in ast.walk(tree):
         for kind, span, new in _rewrites(node, source):
-            if new != source.at(span):
+            if new != source.at(span) and not (kind.endswith("Exchanged") and id(node) in unordered):
                 yield span, Edit(span[0][0], kind, partial(source.with_, span, new))
 
 
@@ -131,6 +134,17 @@ def _rewrites(node: ast.AST, source: _Source) -> Iterator[tuple[str, Span, str]]
         if name in LIKE:
             (_, _), end = _span(node)
             yield "NameLikeIt", ((end[0], end[1] - len(name)), end), LIKE[name]
+
+
+def _unordered(node: ast.AST) -> Iterator[ast.AST]:
+    """The parts of `node` in which order changes nothing: arguments of `ANY_ORDER`, kinds of exceptions, and rows that
+    something is looked for `in`."""
+    if isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] in ANY_ORDER:
+        yield node
+    elif isinstance(node, ast.ExceptHandler) and node.type:
+        yield node.type
+    elif isinstance(node, ast.Compare) and isinstance(node.ops[0], ast.In | ast.NotIn):
+        yield node.comparators[0]
 
 
 def _can_be_forgotten(node: ast.AST) -> bool:

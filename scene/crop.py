@@ -5,6 +5,7 @@ Rule: rectangles are x0, y0, x1, y1 in normalised device coordinates, y up; a te
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -17,6 +18,7 @@ from trilane.shapes import Shape
 
 #: Least height and width of a crop, in output pixels, however small the body is on the screen.
 LEAST_PIXELS = 1.0
+ROUNDING_PX = 1e-4  # so far over the edge of a pixel is still that edge
 
 
 class Rect(NamedTuple):
@@ -72,6 +74,39 @@ def grow(low: float, high: float, length: float) -> tuple[float, float]:
         return -length / 2.0, length / 2.0
     start = min(max((low + high - length) / 2.0, -1.0), 1.0 - length)
     return min(start, low), max(start + length, high)
+
+
+def on_grid(rect: Rect, output: Shape) -> Rect:
+    """`rect` widened to whole pixels of a picture of `output` (height, width); at least one each way."""
+    x0, x1 = _whole_pixels(rect.x0, rect.x1, output[1])
+    y0, y1 = _whole_pixels(rect.y0, rect.y1, output[0])
+    return Rect(x0, y0, x1, y1)
+
+
+def _whole_pixels(low: float, high: float, side: int) -> tuple[float, float]:
+    first = math.floor((low + 1.0) / 2.0 * side + ROUNDING_PX)
+    last = max(math.ceil((high + 1.0) / 2.0 * side - ROUNDING_PX), first + 1)
+    return 2.0 * first / side - 1.0, 2.0 * last / side - 1.0
+
+
+def grow_on_grid(rect: Rect, output: Shape, size: tuple[float, float]) -> Rect:
+    """`rect`, which lies on the grid of a picture of `output` pixels, grown to `size` (height, width) in its pixels.
+
+    It begins on the grid, so where `size` is whole each of its pixels is a pixel of the picture. It has `rect` in its
+    middle, unless it has to be moved onto the screen, where it fits.
+    """
+    x0, x1 = _grow_from_pixel(rect.x0, rect.x1, size[1], output[1])
+    y0, y1 = _grow_from_pixel(rect.y0, rect.y1, size[0], output[0])
+    return Rect(x0, y0, x1, y1)
+
+
+def _grow_from_pixel(low: float, high: float, length: float, side: int) -> tuple[float, float]:
+    first, last = round((low + 1.0) / 2.0 * side), round((high + 1.0) / 2.0 * side)
+    start = math.floor((first + last - length) / 2.0)
+    if length < side:
+        start = min(max(start, 0), math.floor(side - length))
+    begin = min(max(float(start), last - length), first)
+    return 2.0 * begin / side - 1.0, 2.0 * (begin + length) / side - 1.0
 
 
 def crop_projection(projection: ArrayLike, rect: Rect) -> F64:

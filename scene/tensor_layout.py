@@ -3,6 +3,9 @@
 Rule: one visible avatar has the whole tensor. Several are drawn at one scale in rows, so each has a share of the tensor
 in proportion to its area on the screen, with at least `MARGIN_PX` of background between them. Tensor pixels are square
 on the screen.
+
+`lay_out` fills the tensor: the scale is what the tensor has room for. `lay_out_at` stops at a density: at 1 a tensor
+pixel is a pixel of the picture, on its grid, and what the avatars leave of the tensor is background.
 """
 
 from __future__ import annotations
@@ -12,8 +15,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from trilane.errors import BadInputError
-from trilane.shapes import Shape
-from trilane.stages.cpu.crop import LEAST_PIXELS, Rect, choose_bucket, grow
+from trilane.scene.crop import LEAST_PIXELS, Rect, choose_bucket, grow, grow_on_grid, on_grid
+from trilane.shapes import BUCKET_STEP, MOST_ASPECT, Shape
 
 #: top, left, height, width in tensor pixels.
 Cell = tuple[int, int, int, int]
@@ -29,6 +32,14 @@ class TensorLayout:
 
     shape: Shape
     crops: tuple[tuple[Rect, Cell], ...]
+
+
+@dataclass(frozen=True)
+class DenseLayout:
+    """A layout, and its `density`: tensor pixels for one pixel of the picture, along a side."""
+
+    layout: TensorLayout
+    density: float
 
 
 @dataclass(frozen=True)
@@ -63,16 +74,77 @@ def lay_out(rects: Sequence[Rect], output: Shape, buckets: Sequence[Shape], marg
     return lay_out(rects, output, buckets, margin_px // 2)
 
 
+def lay_out_at(
+    rects: Sequence[Rect], output: Shape, shape: Shape, most_density: float = 1.0, margin_px: int = MARGIN_PX
+) -> DenseLayout | None:
+    """Place the visible avatars in a tensor of `shape`, no denser than `most_density`.
+
+    `rects`: the avatars' mesh rectangles on the screen, at least one; each is widened to whole pixels of the picture.
+    `output`: (height, width) of the picture in pixels.
+    `margin_px`: background between two avatars, tensor pixels.
+    None when the tensor has no room for them all.
+    """
+    whole = [on_grid(rect, output) for rect in rects]
+    sizes = [_pixels(rect, output) for rect in whole]
+    if len(rects) == 1:
+        density = min(most_density, shape[0] / sizes[0][0], shape[1] / sizes[0][1])
+        grown = grow_on_grid(whole[0], output, (shape[0] / density, shape[1] / density))
+        return DenseLayout(TensorLayout(shape, ((grown, (0, 0, *shape)),)), density)
+    best = max(_arrangements(sizes, [shape], margin_px), key=lambda one: min(one.scale, most_density))
+    if best.scale <= 0:
+        return None
+    density = min(best.scale, most_density)
+    scaled = _Arrangement(best.shape, best.rows, density)
+    return DenseLayout(TensorLayout(shape, _crops(whole, sizes, output, scaled, margin_px)), density)
+
+
+def tight_shape(rects: Sequence[Rect], output: Shape, density: float = 1.0, margin_px: int = MARGIN_PX) -> Shape:
+    """The shape of least area, sides in multiples of `BUCKET_STEP`, with room for the avatars at `density`.
+
+    Of several avatars' arrangements none is longer than `MOST_ASPECT` times its width, unless all are.
+
+    Arguments as of `lay_out_at`.
+    """
+    whole = [_pixels(on_grid(rect, output), output) for rect in rects]
+    sizes = [(math.ceil(height * density), math.ceil(width * density)) for height, width in whole]
+    if len(sizes) == 1:
+        return _whole_steps(sizes[0][0]), _whole_steps(sizes[0][1])
+    shapes = [_extent(sizes, rows, margin_px) for rows in _rows(sizes)]
+    return min(shapes, key=lambda shape: (max(shape) > MOST_ASPECT * min(shape), shape[0] * shape[1], max(shape)))
+
+
+def _pixels(rect: Rect, output: Shape) -> tuple[int, int]:
+    """Height and width of a rectangle on the grid."""
+    return round(rect.height * output[0] / 2), round(rect.width * output[1] / 2)
+
+
+def _extent(sizes: Sequence[tuple[int, int]], rows: Sequence[Sequence[int]], margin: int) -> Shape:
+    """What `rows` need; a pixel of each side is reserved for rounding up, as in `_scale`."""
+    height = sum(max(sizes[k][0] for k in row) for row in rows) + margin * (len(rows) - 1) + len(rows)
+    width = max(sum(sizes[k][1] for k in row) + margin * (len(row) - 1) + len(row) for row in rows)
+    return _whole_steps(height), _whole_steps(width)
+
+
+def _whole_steps(side: int) -> int:
+    """`side` rounded up to a multiple of `BUCKET_STEP`."""
+    return -(-side // BUCKET_STEP) * BUCKET_STEP
+
+
 def _arrangements(
     sizes: Sequence[tuple[float, float]], buckets: Sequence[Shape], margin: int
 ) -> Iterator[_Arrangement]:
     """In every bucket, the avatars, tallest first, in one row, in two rows, and so on up to a row for each."""
+    for rows in _rows(sizes):
+        for shape in buckets:
+            yield _Arrangement(shape, rows, _scale(sizes, shape, rows, margin))
+
+
+def _rows(sizes: Sequence[tuple[float, float]]) -> Iterator[tuple[tuple[int, ...], ...]]:
+    """The avatars' numbers, tallest first, in one row, in two, and so on."""
     order = sorted(range(len(sizes)), key=lambda k: -sizes[k][0])
     for count in range(1, len(order) + 1):
         each = math.ceil(len(order) / count)
-        rows = tuple(tuple(order[start : start + each]) for start in range(0, len(order), each))
-        for shape in buckets:
-            yield _Arrangement(shape, rows, _scale(sizes, shape, rows, margin))
+        yield tuple(tuple(order[start : start + each]) for start in range(0, len(order), each))
 
 
 def _scale(sizes: Sequence[tuple[float, float]], shape: Shape, rows: Sequence[Sequence[int]], margin: int) -> float:

@@ -1,0 +1,151 @@
+"""`trilane explain`: what is modelled of a scene, what is left out and why, as a database explains a query.
+
+Rule: this module reads options and shows results; everything is decided and computed elsewhere.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from trilane.apps.cli.commands import Commands
+from trilane.apps.cli.console import print_json, spinner, stderr_console, stdout_console
+from trilane.apps.cli.options import (
+    PROFILE_HELP,
+    JsonOption,
+    PerformanceProfileOption,
+    SceneArgument,
+    SceneAvatarOption,
+    SceneSizeOption,
+)
+from trilane.units import PerformanceProfile
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+app = Commands()
+
+EPILOG = """\b
+Examples:
+  trilane explain
+  trilane explain far --size auto
+  trilane explain myscene.toml --picture plan.png
+  trilane explain closeup --profile snapdragon-888 --json
+"""
+MOST_ROWS = 24
+
+ChipOption = Annotated[str, typer.Option("--profile", help=f"{PROFILE_HELP} Its times are those that are saved.")]
+FramesOption = Annotated[int | None, typer.Option(min=1, help="How many frames to look at; the scene's if none.")]
+PictureOption = Annotated[Path | None, typer.Option(help="Draw bodies, their rectangles and the tensor's here (.png).")]
+CapOption = Annotated[PerformanceProfile, PerformanceProfileOption]
+
+
+@app.command(epilog=EPILOG)
+def explain(
+    scene: SceneArgument = "default",
+    avatar: SceneAvatarOption = None,
+    frames: FramesOption = None,
+    size: SceneSizeOption = None,
+    profile: ChipOption = "host",
+    performance_profile: CapOption = PerformanceProfile.SUSTAINED_HIGH_PERFORMANCE,
+    picture: PictureOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Explain the plan of a scene: what is modelled, what is left out, the error it costs and the work it saves."""
+    from trilane.apps.explanation import explain as explained
+    from trilane.stages.configure import Request, configure
+    from trilane.writing import require_writable
+
+    if picture is not None:
+        require_writable(picture)
+    with spinner("planning"):
+        checked = configure(Request(scene, avatar=avatar, frames=frames, size=size), Path.cwd())
+        document = explained(checked, profile, str(performance_profile))
+    if picture is not None:
+        _draw(checked, picture)
+        stderr_console().print(f"picture: {picture}", soft_wrap=True, markup=False)
+    if json:
+        print_json(document)
+        return
+    _show(document)
+
+
+def _draw(checked: Any, picture: Path) -> None:
+    """The first frame of each phase."""
+    from trilane.apps.plan_picture import draw_plan
+    from trilane.apps.scene_plan import ScenePlan, phases
+
+    plan = ScenePlan(checked.config, checked.assets)
+    frames = [plan.decide(frame) for frame in range(checked.config.scene.frames)]
+    draw_plan(plan, [group[0] for group in phases(frames)], picture)
+
+
+def _show(document: dict[str, Any]) -> None:
+    console, config = stdout_console(), document["config"]
+    height, width = config["output"]
+    console.print(
+        f"Scene {document['scene']}: {config['frames']} frames of {width}x{height}, plan {config['plan']}, tensor size "
+        f"{config['size']}, error budget {config['error_budget_px']:g} px",
+        soft_wrap=True,
+    )
+    shapes = ", ".join(f"{h}x{w}" for h, w in document["shapes"])
+    console.print(f"tensor shapes that are made ready: {shapes}", soft_wrap=True)
+    for line in dict.fromkeys(_drawn(row) for row in document["avatars"]):
+        console.print(line, soft_wrap=True, markup=False)
+    console.print(_table(document["phases"]))
+    left = len(document["phases"]) - MOST_ROWS
+    if left > 0:
+        console.print(f"{left} more phases: --json has all of them")
+    for why, first in {phase["why"]: phase["first_frame"] for phase in reversed(document["phases"])}.items():
+        console.print(f"frame {first} and others like it: {why}", soft_wrap=True)
+    for line in _totals(document["totals"], config):
+        console.print(line, soft_wrap=True)
+
+
+def _drawn(row: dict[str, Any]) -> str:
+    """How an avatar is drawn in every frame; avatars of one bundle are drawn alike."""
+    return (
+        f"avatar {row['bundle']}: skinned by the {row['skinned_on']} unit; detail: {row['detail']}; "
+        f"texture filter {row['texture_filter']}; expression: {row['expression']}"
+    )
+
+
+def _table(phases: list[dict[str, Any]]) -> Table:
+    from rich.table import Table
+
+    table = Table("frames", "tensor", "density", "avatar: modelled, bound / measured px", "work saved, ms")
+    for phase in phases[:MOST_ROWS]:
+        tensor, density = phase["tensor"], phase["density"]
+        table.add_row(
+            f"{phase['first_frame']}-{phase['last_frame']}",
+            f"{tensor[0]}x{tensor[1]}" if tensor else "none",
+            f"{density[0]:.2f}-{density[1]:.2f}" if density else "-",
+            _modelled(phase["avatars"]) or "-",
+            f"{phase['saved']['work_ms']:.1f}",
+        )
+    return table
+
+
+def _modelled(rows: list[dict[str, Any]]) -> str:
+    """A line for each way in which avatars are modelled, with the largest errors of those that are modelled so."""
+    lines = []
+    for modelled in dict.fromkeys(row["modelled"] for row in rows):
+        own = [row for row in rows if row["modelled"] == modelled]
+        known = [row["measured_px"] for row in own if row["measured_px"] is not None]
+        measured = f"{max(known):.2f}" if known else "-"
+        names = ", ".join(str(row["avatar"]) for row in own)
+        lines.append(f"{names}: {modelled}, {max(row['bound_px'] for row in own):.2f} / {measured}")
+    return "\n".join(lines)
+
+
+def _totals(totals: dict[str, Any], config: dict[str, Any]) -> list[str]:
+    """The whole scene beside the fixed square, as sentences."""
+    share = 1 - totals["work_ms"] / totals["fixed_work_ms"]
+    return [
+        f"beside a fixed tensor of 512x512: {totals['pixels'] / totals['fixed_pixels']:.1%} of the tensor's pixels, "
+        f"{totals['gmac']:.1f} of {totals['fixed_gmac']:.1f} GMAC",
+        f"work of all stages: {totals['work_ms']:.0f} of {totals['fixed_work_ms']:.0f} ms, {share:.0%} saved "
+        f"(computed by the profile {config['profile']}; `trilane bench planner` measures)",
+    ]

@@ -1,0 +1,142 @@
+"""The plan of a scene in words and figures: what is modelled, what is left out, why, and what it saves.
+
+Rule: decisions come from `scene_plan.py`, costs from `plan_cost.py`; every figure says whether it is a bound, measured
+or computed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from trilane.apps.plan_cost import CostModel, FrameCost
+from trilane.apps.scene_plan import PlannedFrame, ScenePlan, phases
+from trilane.body.detail import DETAILS
+from trilane.figure_sources import COMPUTED, MEASURED
+from trilane.shapes import Shape
+from trilane.stages.avatar_assets import network_of
+from trilane.stages.configure import Checked
+
+#: What every plan is compared with: the square that the reference application fills.
+FIXED: Shape = (512, 512)
+BOUND = "proved bound, in pixels of the picture"
+
+
+def explain(checked: Checked, profile: str, performance_profile: str, most_measured: int = 24) -> dict[str, Any]:
+    """The document of `trilane explain --json`.
+
+    `profile`, `performance_profile`: whose times the costs are computed with.
+    `most_measured`: phases whose error is measured, at one frame each.
+    Raises BadInputError for an unknown profile.
+    """
+    scene, plan = checked.config.scene, ScenePlan(checked.config, checked.assets)
+    costs = CostModel(network_of(checked.assets), profile, performance_profile)
+    rows: list[list[float | None]] = []
+    frames: list[PlannedFrame] = []
+    for frame in range(scene.frames):
+        planned = plan.decide(frame)
+        if len(phases([*frames[-1:], planned])) > len(frames[-1:]):
+            measured = len(rows) < most_measured
+            rows.append([plan.measured_px(frame, avatar) if measured else None for avatar in planned.plan.seen])
+        frames.append(planned)
+    groups = phases(frames)
+    return {
+        "scene": scene.name,
+        "config": {
+            "frames": scene.frames,
+            "output": [scene.output.height, scene.output.width],
+            "plan": scene.plan,
+            "size": scene.size,
+            "error_budget_px": scene.error_budget_px,
+            "profile": profile,
+            "performance_profile": performance_profile,
+        },
+        "shapes": [list(shape) for shape in checked.config.buckets],
+        "avatars": [_avatar(checked, number) for number in range(len(scene.avatars))],
+        "phases": [_phase(group, errors, costs) for group, errors in zip(groups, rows, strict=True)],
+        "totals": _totals(frames, costs),
+        "notes": list(checked.notes),
+        "sources": {"bound_px": BOUND, "measured_px": MEASURED, "pixels, gmac": "counted", "ms": COMPUTED},
+    }
+
+
+def _avatar(checked: Checked, number: int) -> dict[str, Any]:
+    config = checked.config
+    where = "cpu" if config.posed_vertices else "gpu"
+    return {
+        "avatar": number,
+        "bundle": config.scene.avatars[number].bundle,
+        "skinned_on": where,
+        "expression": "part of the avatar's shape: it costs nothing per frame",
+        "detail": "by its bound in pixels" if where == "cpu" and config.budget_px else "everything",
+        "texture_filter": config.scene.texture_filter,
+    }
+
+
+def _phase(group: Sequence[PlannedFrame], errors: Sequence[float | None], costs: CostModel) -> dict[str, Any]:
+    first = group[0].plan
+    cost = costs.of(first.shape)
+    return {
+        "first_frame": group[0].frame,
+        "last_frame": group[-1].frame,
+        "frames": len(group),
+        "tensor": list(first.shape) if first.shape else None,
+        "density": [_least(group), _most(group)] if first.shape and first.density is not None else None,
+        "avatars": [
+            {
+                "avatar": number,
+                "modelled": DETAILS[one.level].name,
+                "bound_px": max(planned.plan.seen[number].error_px for planned in group),
+                "measured_px": error,
+            }
+            for (number, one), error in zip(first.seen.items(), errors, strict=True)
+        ],
+        "why": _why(group),
+        "cost": cost.as_json(),
+        "saved": _saved(cost, costs.of(FIXED)),
+    }
+
+
+def _least(group: Sequence[PlannedFrame]) -> float:
+    return min(planned.plan.density or 0.0 for planned in group)
+
+
+def _most(group: Sequence[PlannedFrame]) -> float:
+    return max(planned.plan.density or 0.0 for planned in group)
+
+
+def _why(group: Sequence[PlannedFrame]) -> str:
+    """Why the tensor of a phase is as it is."""
+    first = group[0].plan
+    if first.shape is None:
+        return "nobody is on the screen: nothing is drawn, packed or inferred"
+    if first.density is None:
+        return "the scene fixes the tensor's size"
+    if _least(group) < 1.0:
+        return "more pixels on the screen than any shape that is ready has: the densest one"
+    return "a tensor pixel for each pixel of the picture, in the smallest shape that is ready"
+
+
+def _saved(cost: FrameCost, fixed: FrameCost) -> dict[str, float]:
+    return {
+        "pixels": fixed.pixels - cost.pixels,
+        "gmac": fixed.gmac - cost.gmac,
+        "work_ms": fixed.work_ms - cost.work_ms,
+    }
+
+
+def _totals(frames: Sequence[PlannedFrame], costs: CostModel) -> dict[str, Any]:
+    """Of all frames, planned and with the fixed square."""
+    planned = [costs.of(one.plan.shape) for one in frames]
+    fixed = costs.of(FIXED)
+    work, whole = sum(cost.work_ms for cost in planned), fixed.work_ms * len(frames)
+    return {
+        "pixels": sum(cost.pixels for cost in planned),
+        "fixed_pixels": fixed.pixels * len(frames),
+        "gmac": sum(cost.gmac for cost in planned),
+        "fixed_gmac": fixed.gmac * len(frames),
+        "work_ms": work,
+        "fixed_work_ms": whole,
+        "frame_ms": sum(cost.frame_ms for cost in planned) / len(frames),
+        "fixed_frame_ms": fixed.frame_ms,
+    }

@@ -1,0 +1,60 @@
+"""What a tensor of a shape costs: pixels, products, and milliseconds by a hardware profile. Rule: computed, never
+measured, by the same model as `trilane predict`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+from trilane.avatars.integer_network import NetworkFile
+from trilane.avatars.network_reshape import reshaped
+from trilane.hw_profiles.application import Plan, Variant, stage_times_ms, steady
+from trilane.hw_profiles.load import load_runnable
+from trilane.hw_profiles.network_work import Network, count_work
+from trilane.hw_profiles.performance_profiles import corners_of
+from trilane.shapes import Shape
+
+PIPELINED = Variant("pipelined", "double")
+#: Stages that a frame needs even with nobody in view.
+ALWAYS = ("pose", "composite", "present")
+
+
+@dataclass(frozen=True)
+class FrameCost:
+    """Of one frame. `pixels`: of its tensor. `gmac`: of the network. `work_ms`: of all stages, one after the other.
+
+    `frame_ms`: between frames of its kind when they are pipelined.
+    """
+
+    pixels: int
+    gmac: float
+    work_ms: float
+    frame_ms: float
+
+    def as_json(self) -> dict[str, Any]:
+        return {"pixels": self.pixels, "gmac": self.gmac, "work_ms": self.work_ms, "frame_ms": self.frame_ms}
+
+
+class CostModel:
+    """Costs of frames of one avatar's network on the chip `profile`. Raises BadInputError for an unknown profile."""
+
+    def __init__(self, network: NetworkFile, profile: str, performance_profile: str) -> None:
+        self._network, self._chip = network, load_runnable(profile)
+        self._corners = corners_of(self._chip, performance_profile)
+        self.of = cache(self._of)
+
+    def _of(self, shape: Shape | None) -> FrameCost:
+        """The cost of a frame whose tensor has `shape`; None for one that needs none."""
+        plan = Plan(self._described(shape or self._network.shape[1:3]), "dsp", PIPELINED)
+        times = stage_times_ms(self._chip, plan, self._corners)
+        if shape is None:
+            kept = [ms for (stage, _), ms in times.items() if stage in ALWAYS]
+            return FrameCost(0, 0.0, sum(kept), max(kept))
+        steady_ms = steady(self._chip, plan, self._corners, quick=True).frame_ms
+        return FrameCost(shape[0] * shape[1], plan.network.work.macs / 1e9, sum(times.values()), steady_ms)
+
+    def _described(self, shape: Shape) -> Network:
+        work = count_work(reshaped(self._network, *shape).model)
+        return Network({}, *shape, self._network.channels, "packed", work)

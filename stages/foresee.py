@@ -1,0 +1,104 @@
+"""What a scene will put on the screen, looked at before the run. Rule: the same bounds and the same layouts as in the
+run, on a fixed number of frames spread over the scene.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from trilane.avatars.bundle import CLOTHES_STANDOFF_M
+from trilane.avatars.integer_network import NetworkFile
+from trilane.avatars.network_reshape import STRIDE, reshaped
+from trilane.body.body import ShapedBody
+from trilane.body.kinematics import Skeleton
+from trilane.scene.crop import Rect
+from trilane.scene.planner import foreseen_shape
+from trilane.scene.schema import Scene
+from trilane.scene.shape_set import ShapeSet, choose_shapes
+from trilane.scene.staging import Staged
+from trilane.shapes import Shape
+from trilane.stages.cpu.mesh_bounds import MeshBounds
+
+#: Of the scene, over all avatars; but at least so many of each.
+FORESEEN_FRAMES, LEAST_FRAMES = 96, 24
+#: A network that is ready to run holds its tensors once, and a runtime may lay each of them out anew.
+COPIES = 2
+MB = 1_000_000
+BYTE_TYPES = (2, 3)  # of ONNX: uint8 and int8
+
+
+@dataclass(frozen=True)
+class Foreseen:
+    """`shapes`: to make ready. `tight`: the smallest shape of each frame that was looked at, None with nobody on it.
+
+    `frames`: their numbers.
+    """
+
+    shapes: ShapeSet
+    frames: tuple[int, ...]
+    tight: tuple[Shape | None, ...]
+
+    @property
+    def note(self) -> str:
+        """What a person should know of it."""
+        names = ", ".join(f"{height}x{width}" for height, width in self.shapes.shapes)
+        seen = sum(shape is not None for shape in self.tight)
+        text = f"tensor: planned in shapes {names} (somebody is seen in {seen} of {len(self.tight)} frames looked at)"
+        if self.shapes.over_limit:
+            text += f"; their networks take {self.shapes.memory_bytes / MB:.0f} MB, more than memory_mb allows"
+        return text
+
+
+def foresee(scene: Scene, staged: Staged, bodies: Sequence[ShapedBody], network: NetworkFile) -> Foreseen:
+    """The tensor shapes that `scene` needs.
+
+    `bodies`: of its avatars, in order.
+    `network`: that all of them share.
+    """
+    count = min(scene.frames, max(FORESEEN_FRAMES // len(bodies), LEAST_FRAMES))
+    frames = tuple(index * scene.frames // count for index in range(count))
+    output = (scene.output.height, scene.output.width)
+    tight = tuple(
+        foreseen_shape(rects, output, scene.most_side) if rects else None
+        for rects in foreseen_rects(scene, staged, bodies, frames)
+    )
+    demands = [shape for shape in tight if shape is not None] or [(STRIDE, STRIDE)]
+    per_pixel = bytes_per_pixel(network)
+    return Foreseen(choose_shapes(demands, scene.most_side**2, per_pixel, scene.memory_mb * MB), frames, tight)
+
+
+def foreseen_rects(
+    scene: Scene, staged: Staged, bodies: Sequence[ShapedBody], frames: Sequence[int]
+) -> Iterator[list[Rect]]:
+    """For each of `frames` the rectangles of the avatars that are visible, in the order of the scene."""
+    distinct = {id(body): MeshBounds(body, standoff_m=CLOTHES_STANDOFF_M) for body in bodies}
+    skeletons = [Skeleton(body.joints, body.body.parents) for body in bodies]
+    projection = staged.camera.projection(scene.output.width / scene.output.height)
+    for frame in frames:
+        t_s = frame / scene.fps
+        clip = projection @ staged.camera.sample(t_s)
+        rects = []
+        for body, skeleton, mover in zip(bodies, skeletons, staged.movers, strict=True):
+            pose, translation = mover.sample(t_s)
+            posed = skeleton.pose(pose, translation, mover.world)
+            rect = distinct[id(body)].rect(posed, clip) if np.isfinite(posed.matrices).all() else None
+            rects += [rect] if rect is not None else []
+        yield rects
+
+
+def bytes_per_pixel(network: NetworkFile) -> float:
+    """Memory of `network`, ready to run, for each pixel of its tensor: COPIES of all its tensors of bytes."""
+    _, height, width, _ = network.shape
+    if not network.model.graph.value_info:
+        network = reshaped(network, height + STRIDE, width)
+        height += STRIDE
+    sizes = [
+        math.prod(dim.dim_value for dim in value.type.tensor_type.shape.dim)
+        for value in network.model.graph.value_info
+        if value.type.tensor_type.elem_type in BYTE_TYPES
+    ]
+    return float(COPIES * sum(sizes) / (height * width))

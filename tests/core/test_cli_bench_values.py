@@ -1,0 +1,76 @@
+"""`trilane bench`: the options of every bench, word for word, and what a bench that a test makes up prints."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+import click
+import pytest
+import typer
+
+from trilane.apps.cli import bench
+from trilane.apps.cli.bench import BENCHES, bench_command
+from trilane.stages import machine_facts
+
+Command = Callable[..., tuple[str, str]]
+
+
+def described(name: str) -> list[str]:
+    """The bench, its line and its options, with the types of their values, without their defaults."""
+    command = bench_command(name)
+    lines = [f"$ trilane bench {name}", (command.help or "").partition("\n")[0]]
+    for option in command.params:
+        kind = option.type_descriptor.annotation.__name__ + (", often" if option.multiple else "")
+        lines.append(f"{'/'.join(option.opts)} {option.metavar or ''} ({kind}): {option.help}")
+    return lines
+
+
+def test_the_options_of_every_bench(check_printed: Callable[..., None]) -> None:
+    check_printed("benches", "\n".join(line for name in BENCHES for line in described(name)))
+
+
+def test_a_bench_is_asked_by_its_options(monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
+    """Of the bench `crop`, with another measure: options as values of their types, results beside the machine."""
+    from trilane.bench import crop
+
+    asked: list[dict[str, Any]] = []
+
+    def measure(views: int = 3, seconds: float = 1.5, size: str = "256", spin: bool = False, runs: tuple = (1, 2)):  # type: ignore[no-untyped-def, type-arg]
+        """Rows."""
+        asked.append({"views": views, "seconds": seconds, "size": size, "spin": spin, "runs": runs})
+        return {"rows": [], "driver": {"renderer": "r"}, "share": 1 / 3, "inner": {"a": 1}, "tag": "[x]"}
+
+    monkeypatch.setattr(crop, "measure", measure)
+    monkeypatch.setattr(machine_facts, "machine_facts", lambda gl: {"cpu": {"model": "a cpu", "cores": 2}, "gl": gl})
+    out, _ = command("bench", "crop", "--json")
+    assert json.loads(out) == {
+        "bench": "crop",
+        "rows": [],
+        "driver": {"renderer": "r"},
+        "share": 1 / 3,
+        "inner": {"a": 1},
+        "tag": "[x]",
+        "machine": {"cpu": {"model": "a cpu", "cores": 2}, "gl": {"renderer": "r"}},
+    }
+    words = ("--views", 7, "--seconds", 0.25, "--size", "64", "--spin", "--runs", 5, "--runs", 6)
+    out, _ = command("bench", "crop", *words)
+    assert [dict(row, runs=list(row["runs"])) for row in asked] == [
+        {"views": 3, "seconds": 1.5, "size": "256", "spin": False, "runs": [1, 2]},
+        {"views": 7, "seconds": 0.25, "size": "64", "spin": True, "runs": [5, 6]},
+    ]
+    lines = ["driver.renderer: r", "share: 0.3333", "inner.a: 1", "tag: [x]", "cpu: a cpu, 2 cores"]
+    assert out.splitlines() == lines
+
+
+def test_the_group_knows_its_benches_and_nothing_else(command: Command) -> None:
+    out, err = command("bench", "nothing", code=2)
+    assert (out, "No such command 'nothing'" in err) == ("", True)
+    out, err = command("bench", code=2)
+    assert "Measure this machine; results carry its facts." in out + err
+    group: Any = typer.main.get_command(bench.app)
+    context = click.Context(group)
+    assert group.list_commands(context) == list(BENCHES)
+    assert group.get_command(context, "nothing") is None
+    assert group.get_command(context, "crop").help == BENCHES["crop"][1]

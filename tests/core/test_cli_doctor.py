@@ -1,0 +1,180 @@
+"""`trilane doctor` on machines that a test makes up: what each part is said to have, and the line that mends it."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import shutil
+from collections import namedtuple
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from trilane import compiled
+from trilane.apps.cli import doctor
+from trilane.apps.cli.doctor import Check
+from trilane.stages import machine_facts
+from trilane.transport import wakeup
+
+Command = Callable[..., tuple[str, str]]
+CPU = {"model": "a processor", "flags": ["avx2", "avx512_vnni", "amx_int8"], "cores": 8, "cores_allowed": [0, 2, 5]}
+GL = {"renderer": "a [driver]", "version": "4.5", "hardware": True}
+Version = namedtuple("Version", "major minor")
+
+
+@pytest.fixture
+def machine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> pytest.MonkeyPatch:
+    """A machine that has everything."""
+
+    @contextmanager
+    def awake() -> Iterator[str]:
+        yield wakeup.AWAKE
+
+    monkeypatch.setattr(doctor.sys, "version_info", Version(3, 11))
+    monkeypatch.setattr(platform, "python_version", lambda: "3.11.9")
+    monkeypatch.setattr(machine_facts, "PACKAGES", ("numpy", "av"))
+    monkeypatch.setattr(machine_facts, "OPTIONAL_PACKAGES", {"openvino": "openvino", "torch": "train"})
+    monkeypatch.setattr(machine_facts, "package_version", lambda name: f"{name}-1.2")
+    monkeypatch.setattr(machine_facts, "cpu_facts", lambda: CPU)
+    monkeypatch.setattr(machine_facts, "runtime_facts", lambda: {"onnxruntime": ["CPU", "QNN"], "openvino": ["GPU"]})
+    monkeypatch.setattr(machine_facts, "gl_facts", lambda: GL)
+    monkeypatch.setattr(machine_facts, "machine_facts", lambda gl: {"gl": gl})
+    monkeypatch.setattr(wakeup, "awake", awake)
+    monkeypatch.setattr(compiled, "form", lambda: "compiled")
+    monkeypatch.setattr(doctor, "SHM", tmp_path)
+    monkeypatch.setattr(doctor, "package_line", lambda name: f"pip install {name}")
+    monkeypatch.setattr(doctor, "install_line", lambda extra: f"pip install trilane[{extra}]")
+    monkeypatch.setattr(doctor, "clone", lambda: Path("/clone"))
+    monkeypatch.setattr(shutil, "disk_usage", lambda place: SimpleNamespace(free=3 * 2**20 + (place != tmp_path)))
+    return monkeypatch
+
+
+PYTHON = "apt-get install python3.11 python3.11-venv"
+ACL = f'apt-get install acl; setfacl -m "u:$USER:w" {wakeup.LATENCY_FILE}'
+MEMFD = "needs Linux 3.17 or newer with memfd_create allowed"
+COMPILE = "make compile  # it takes gcc and python3-dev"
+
+
+@pytest.mark.usefixtures("machine")
+def test_a_machine_that_has_everything(tmp_path: Path) -> None:
+    assert doctor.checks(GL) == [
+        Check("Python", "3.11.9", True, True, PYTHON),
+        Check("CPU", "a processor, 3 of 8 cores allowed, avx2 avx512_vnni amx_int8", True, True, ""),
+        Check("INT8 dot product", "amx_int8 avx512_vnni", True, False, "needs another CPU"),
+        Check("memfd", "anonymous shared memory works", True, True, ""),
+        Check(str(tmp_path), "3 MiB free; Trilane leaves nothing there", True, False, ""),
+        Check("idle cores", wakeup.AWAKE, True, False, ACL),
+        Check("scheduler core", "compiled", True, False, COMPILE),
+        Check("EGL and OpenGL", "a [driver], 4.5 (hardware)", True, True, ""),
+        Check("inference runtimes", "onnxruntime: CPU, QNN; openvino: GPU", True, True, ""),
+        Check("numpy", "numpy-1.2", True, True, "pip install numpy"),
+        Check("av", "av-1.2", True, True, "pip install av"),
+        Check("openvino", "openvino-1.2", True, False, "pip install trilane[openvino]"),
+        Check("torch", "torch-1.2", True, False, "pip install trilane[train]"),
+    ]
+
+
+def test_a_machine_that_has_nothing(machine: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    @contextmanager
+    def asleep() -> Iterator[str]:
+        yield "may sleep"
+
+    def refused(*_: object) -> int:
+        raise PermissionError(1, "Operation not permitted")
+
+    def broken() -> dict[str, Any]:
+        raise ImportError("no libonnxruntime.so")
+
+    machine.setattr(doctor.sys, "version_info", Version(3, 10))
+    machine.setattr(machine_facts, "package_version", lambda _: None)
+    machine.setattr(machine_facts, "cpu_facts", lambda: {**CPU, "flags": []})
+    machine.setattr(machine_facts, "runtime_facts", broken)
+    machine.setattr(wakeup, "awake", asleep)
+    machine.setattr(compiled, "form", lambda: "interpreted")
+    machine.setattr(doctor, "clone", lambda: None)
+    machine.setattr(doctor, "SHM", tmp_path / "none")
+    machine.setattr(os, "memfd_create", refused)
+    no_mesa = "apt-get install libegl1 libgl1-mesa-dri"
+    again = "install Trilane again from its sources, where there are gcc and python3-dev"
+    assert doctor.checks(None) == [
+        Check("Python", "3.11.9", False, True, PYTHON),
+        Check("CPU", "a processor, 3 of 8 cores allowed, none of those that matter", True, True, ""),
+        Check("INT8 dot product", "no; INT8 networks run on AVX2 or NEON alone", False, False, "needs another CPU"),
+        Check("memfd", "operation not permitted", False, True, MEMFD),
+        Check(str(tmp_path / "none"), "absent", False, False, "mount -t tmpfs tmpfs /dev/shm"),
+        Check("idle cores", "may sleep", False, False, ACL),
+        Check("scheduler core", "interpreted", False, False, again),
+        Check("EGL and OpenGL", "no OpenGL 3.3 context can be made", False, True, no_mesa),
+        Check("inference runtimes", "ImportError: no libonnxruntime.so", False, True, "pip install onnxruntime"),
+        Check("numpy", "missing", False, True, "pip install numpy"),
+        Check("av", "missing", False, True, "pip install av"),
+        Check("openvino", "missing", False, False, "pip install trilane[openvino]"),
+        Check("torch", "missing", False, False, "pip install trilane[train]"),
+    ]
+
+
+@pytest.mark.parametrize("flag", ["avx512_vnni", "avx_vnni", "amx_int8", "asimddp", "i8mm"])
+def test_any_instruction_for_dot_products_is_enough(flag: str, machine: pytest.MonkeyPatch) -> None:
+    machine.setattr(machine_facts, "cpu_facts", lambda: {**CPU, "flags": ["avx2", flag]})
+    assert doctor._int8() == Check("INT8 dot product", flag, True, False, "needs another CPU")
+
+
+def test_a_runtime_without_a_place_to_run_does_not_work(machine: pytest.MonkeyPatch) -> None:
+    machine.setattr(machine_facts, "runtime_facts", lambda: {"onnxruntime": []})
+    assert not doctor._runtimes().works
+
+
+def test_a_stale_core_stops_a_run(machine: pytest.MonkeyPatch) -> None:
+    machine.setattr(compiled, "form", lambda: "stale")
+    assert doctor._core() == Check("scheduler core", compiled.STALE, False, True, compiled.MEND)
+
+
+@pytest.mark.usefixtures("machine")
+def test_a_driver_on_the_cpu_is_named() -> None:
+    assert doctor._gl({**GL, "hardware": False}).found == "a [driver], 4.5 (software, on the CPU)"
+
+
+def test_memory_is_tried_and_given_back() -> None:
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    assert doctor._memfd() == Check("memfd", "anonymous shared memory works", True)
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
+
+
+def test_memory_that_cannot_grow_does_not_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def full(_descriptor: int, size: int) -> None:
+        asked.append(size)
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "ftruncate", full)
+    assert (doctor._memfd().found, doctor._memfd().works, asked[0]) == ("no space left on device", False, 4096)
+
+
+ROWS = [
+    Check("first", "1.2 [x]", True, True, "never shown"),
+    Check("second", "missing", False, True, "pip install x[y]"),
+    Check("third", "absent", False, False, "mount it"),
+]
+
+
+@pytest.mark.parametrize(("rows", "code"), [(ROWS, 3), ([ROWS[0], ROWS[2]], 0)])
+def test_the_table_and_the_exit_code(
+    rows: list[Check], code: int, machine: pytest.MonkeyPatch, command: Command, check_printed: Callable[..., None]
+) -> None:
+    machine.setattr(doctor, "checks", lambda gl: rows if gl is GL else [])
+    out, err = command("doctor", code=code)
+    assert err == ""
+    check_printed(f"doctor-{code}", out)
+    document = json.loads(command("doctor", "--json", code=code)[0])
+    keys = ("name", "found", "works", "needed", "install")
+    assert document == {
+        "complete": code == 0,
+        "checks": [{key: getattr(row, key) for key in keys} for row in rows],
+        "machine": {"gl": GL},
+    }

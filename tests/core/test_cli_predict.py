@@ -1,0 +1,290 @@
+"""`trilane predict` beside doubles of what predicts: what is asked, each refusal, and answers that a test wrote."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from trilane.apps.cli import predict as cli
+from trilane.apps.cli import predict_output
+from trilane.avatars.bundle import load_bundle
+from trilane.hw_profiles import configuration_table, load, over_time, plot
+from trilane.hw_profiles import predict as predictions
+from trilane.hw_profiles.application import REFERENCE, Plan, Variant
+from trilane.hw_profiles.network_work import Network, count_work
+from trilane.hw_profiles.reference_networks import NetworkSpec
+from trilane.units import BURST, SUSTAINED
+
+Command = Callable[..., tuple[str, str]]
+CHIP = SimpleNamespace(name="chip", title="A Chip", thermal=SimpleNamespace(skin_limit_c=SimpleNamespace(or_else=max)))
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """What the command asked of its parts, by their names."""
+    found: dict[str, Any] = {}
+
+    def answer(chip: Any, plan: Plan, *others: Any) -> dict[str, Any]:
+        found["predict"] = (chip, plan, *others)
+        return {"fps": 12.5}
+
+    def what_if(*given: Any) -> list[str]:
+        found["what_if"] = given
+        return ["alternatives"]
+
+    def draw(*given: Any) -> None:
+        found["draw"] = given
+
+    def show(answer: Any, as_json: bool) -> None:
+        found["shown"] = (answer, as_json)
+
+    monkeypatch.setattr(load, "load_runnable", lambda name: found.setdefault("profile", name) and CHIP)
+    monkeypatch.setattr(predictions, "predict", answer)
+    monkeypatch.setattr(predictions, "what_if", what_if)
+    monkeypatch.setattr(cli, "draw", draw)
+    monkeypatch.setattr(cli, "show_answer", show)
+    monkeypatch.setattr("trilane.hw_profiles.reference_networks.reference_network", lambda spec: spec)
+    return found
+
+
+USUAL = NetworkSpec("resnet18", "batch", 512, 512, 16, "packed")
+
+
+def test_without_options(asked: dict[str, Any], command: Command) -> None:
+    command("predict")
+    assert asked["profile"] == "snapdragon-888"
+    assert asked["predict"] == (CHIP, Plan(USUAL, "dsp", REFERENCE, 0.0), SUSTAINED, 0.0, None)  # type: ignore[arg-type]
+    assert asked["shown"] == ({"fps": 12.5}, False)
+    assert "what_if" not in asked and "draw" not in asked
+
+
+def test_every_option_arrives_where_it_belongs(asked: dict[str, Any], command: Command) -> None:
+    command(
+        *("predict", "--profile", "mine", "--encoder", "mobilenetv2", "--norm", "group", "--size", "96x64"),
+        *("--channels", 4, "--layout", "split", "--runtime", "gpu", "--minutes", 2.5, "--policy", "latest"),
+        *("--edge", "triple", "--batch", 3, "--gpu-share", 0, "--performance-profile", "power_saver"),
+        *("--governor", "step_wise", "--what-if", "--plot", "heat.svg", "--json"),
+    )
+    spec: Any = NetworkSpec("mobilenetv2", "group", 96, 64, 4, "split")
+    plan = Plan(spec, "gpu", Variant("latest", "triple", 3), 0.0)
+    assert asked["profile"] == "mine"
+    assert asked["predict"] == (CHIP, plan, "power_saver", 2.5, "step_wise")
+    assert asked["what_if"] == (CHIP, spec, "gpu", "power_saver")
+    assert asked["draw"] == (CHIP, plan, "power_saver", 2.5, "step_wise", Path("heat.svg"))
+    assert asked["shown"] == ({"fps": 12.5, "alternatives": ["alternatives"]}, True)
+    command("predict", "--gpu-share", 0.25)
+    assert asked["predict"][1].gpu_share == 0.25
+
+
+def test_a_drawing_is_of_half_an_hour_where_no_time_is_given(asked: dict[str, Any], command: Command) -> None:
+    command("predict", "--plot", "heat.svg", "--policy", "pipelined")
+    assert asked["draw"][2:] == (SUSTAINED, 30.0, None, Path("heat.svg"))
+    assert asked["predict"][1].variant == Variant("pipelined", "double", 1)
+
+
+def test_this_machine_is_not_capped_unless_it_is_said(asked: dict[str, Any], command: Command) -> None:
+    command("predict", "--profile", "host")
+    assert asked["predict"][2] == BURST
+    command("predict", "--profile", "host", "--performance-profile", SUSTAINED)
+    assert asked["predict"][2] == SUSTAINED
+
+
+def test_the_network_of_an_avatar_or_a_file(tiny_bundle: Path, asked: dict[str, Any], command: Command) -> None:
+    work = count_work(load_bundle(tiny_bundle).read_network().model)
+    file = tiny_bundle / "network.onnx"
+    for option, value in (("avatar", tiny_bundle), ("network", file)):
+        command("predict", f"--{option}", value, "--layout", "split")
+        assert asked["predict"][1].network == Network({option: str(value)}, 64, 64, 5, "split", work)
+
+
+@pytest.mark.parametrize(("edge", "batch"), [(None, 1), (REFERENCE.edge, 4)])
+def test_the_reference_keeps_its_edge(edge: str | None, batch: int) -> None:
+    assert cli._variant("reference", edge, batch, None) == REFERENCE._replace(batch=batch)
+
+
+ONE = "expected one or the other"
+REFUSED = {
+    ("--runtime", "npu"): "--runtime: found 'npu', expected gpu or dsp",
+    ("--governor", "x"): "--governor: found 'x', expected step_wise or power_allocator",
+    ("--edge", "triple"): (
+        f"--edge: found 'triple', expected {REFERENCE.edge}, which the reference application has; "
+        "choose a --policy of your own, such as pipelined"
+    ),
+    ("--network", "n", "--avatar", "a"): "options: found --network and --avatar, expected one of them",
+    ("--avatar", "a", "--layout", "odd"): "--layout: found 'odd', expected packed or split",
+    **{
+        (f"--{option}", "x", f"--{other}", "1"): f"options: found --{other} beside --{option}, {ONE}; {why}"
+        for option, why in (
+            ("avatar", "the avatar's network says so itself"),
+            ("network", "the file says so itself"),
+            ("table", "each row says so itself"),
+        )
+        for other in ("encoder", "norm", "size", "channels")
+    },
+    **{
+        ("--table", "x", f"--{other}", "1"): f"options: found --{other} beside --table, {ONE}; each row says so itself"
+        for other in ("layout", "avatar", "network", "runtime", "minutes", "gpu-share", "governor", "plot")
+    },
+    ("--table", "x", "--what-if", "--norm", "a", "--gpu-share", "1"): (
+        f"options: found --gpu-share, --norm, --what-if beside --table, {ONE}; each row says so itself"
+    ),
+}
+
+
+@pytest.mark.parametrize("options", REFUSED, ids=" ".join)
+def test_refusals_word_by_word(options: tuple[str, ...], asked: dict[str, Any], command: Command) -> None:
+    assert command("predict", *options, code=2) == ("", f"error: {REFUSED[options]}\n")
+    assert "predict" not in asked
+
+
+ROWS = [
+    {
+        "encoder": encoder,
+        "norm": "batch",
+        "size": "512",
+        "channels": "16",
+        "layout": "packed",
+        **{key: 10.25 * (n + 1) + place for n, key in enumerate(predict_output.SHOWN[:-1])},
+        "confidence": 0.876 - place / 10,
+    }
+    for place, encoder in enumerate(("resnet18", "mobilenetv2"))
+]
+
+
+@pytest.mark.usefixtures("asked")
+def test_a_table_of_answers(
+    monkeypatch: pytest.MonkeyPatch, command: Command, check_printed: Callable[..., None]
+) -> None:
+    given: list[Any] = []
+
+    def predict_table(*arguments: Any) -> Any:
+        given.append(arguments[:-1])
+        arguments[-1](1)
+        return iter(ROWS)
+
+    monkeypatch.setattr(configuration_table, "read_table", lambda path: [path] * 2)
+    monkeypatch.setattr(predictions, "predict_table", predict_table)
+    words = ("predict", "--table", "rows.csv", "--policy", "latest", "--batch", 2, "--performance-profile", "balanced")
+    check_printed("predict-table", command(*words)[0])
+    assert given == [(CHIP, [Path("rows.csv")] * 2, "balanced", Variant("latest", "double", 2))]
+    assert json.loads(command(*words, "--json")[0]) == {
+        "schema": 1,
+        "clock": "virtual",
+        "profile": "chip",
+        "performance_profile": "balanced",
+        "rows": ROWS,
+    }
+
+
+@pytest.mark.usefixtures("asked")
+def test_a_table_has_a_bar_on_a_terminal(monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
+    from rich.console import Console
+
+    def predict_table(*arguments: Any) -> Any:
+        arguments[-1](2)
+        return iter(ROWS)
+
+    screen = io.StringIO()
+    console = Console(file=screen, force_terminal=True, width=100)
+    monkeypatch.setattr(cli, "stderr_console", lambda: console)
+    monkeypatch.setattr(configuration_table, "read_table", lambda _: [0] * 4)
+    monkeypatch.setattr(predictions, "predict_table", predict_table)
+    command("predict", "--table", "rows.csv")
+    assert "predicting" in screen.getvalue() and "50%" in screen.getvalue()
+    assert screen.getvalue().endswith("\x1b[2K")  # the bar is gone
+
+
+def an_answer(**changes: Any) -> dict[str, Any]:
+    idle = {"starved": 0.101, "blocked": 0.202, "preempted": 0.003, "overhead": 0.044}
+    return {
+        "machine": {"title": "A Chip"},
+        "config": {
+            **{"encoder": "resnet18", "norm": "batch", "size": "64x32", "channels": 4, "layout": "packed"},
+            **{"runtime": "gpu", "performance_profile": "burst", "minutes": 0.0},
+        },
+        "network": {"gmac": 1.25, "parameters_m": 2.35, "alone_ms": 3.45},
+        "frame_time_ms": {"mean": 4.55, "ema20_min": 4.15, "ema20_max": 5.75},
+        "latency_ms": {"mean": 6.85},
+        "fps": 219.78,
+        "fps_settled": 200.12,
+        "fps_start": 230.34,
+        "efficiency": 0.756,
+        "display_capped": False,
+        "power_w": 3.21,
+        "base_power_w": 1.2,
+        "base_power_kind": "assumed",
+        "energy_mj_per_frame": 14.6,
+        "notes": [],
+        "temperature_c": None,
+        "caps": None,
+        "expected_error": 0.123,
+        "confidence": 0.877,
+        "units": {"gpu": {"busy": 0.65, "idle": idle}, "dsp": {"busy": 0.25, "idle": {"throttled": 0.755}}},
+        "accounts": {"agree": True, "largest_difference": 0.0},
+        **changes,
+    }
+
+
+def everything() -> dict[str, Any]:
+    """Of an avatar for ten minutes, hot, held by the display, with notes, shares that differ and alternatives."""
+    config = {**an_answer()["config"], "avatar": "someone", "network": "a.onnx", "minutes": 10.0}
+    return an_answer(
+        config=config,
+        display_capped=True,
+        notes=["first", "second"],
+        temperature_c={"device_max": 41.25, "junction_max": 77.75},
+        caps={"throttled_share": 0.125},
+        accounts={"agree": False, "largest_difference": 0.0321},
+        alternatives=[
+            {
+                "name": "newest",
+                "policy": "latest",
+                "edge": "triple",
+                "frame_ms": 7.77,
+                "fps": 128.7,
+                "latency_ms": 9.99,
+            },
+            {
+                "name": "slow",
+                "policy": "sequential",
+                "edge": "single",
+                "frame_ms": 17.7,
+                "fps": 56.5,
+                "latency_ms": 18.8,
+            },
+        ],
+    )
+
+
+@pytest.mark.parametrize(("name", "answer"), [("least", an_answer()), ("everything", everything())])
+def test_an_answer_is_shown(
+    name: str, answer: dict[str, Any], capsys: pytest.CaptureFixture[str], check_printed: Callable[..., None]
+) -> None:
+    predict_output.show_answer(answer, as_json=False)
+    check_printed(f"predict-{name}", capsys.readouterr().out)
+    predict_output.show_answer(answer, as_json=True)
+    assert json.loads(capsys.readouterr().out) == answer
+
+
+@pytest.mark.parametrize(("asked_for", "names"), [("balanced", 3), (BURST, 2), (SUSTAINED, 2)])
+def test_a_drawing_has_the_usual_profiles_beside_the_one_asked_for(
+    asked_for: str, names: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[Any] = []
+    monkeypatch.setattr(over_time, "over_time", lambda *given: given)
+    monkeypatch.setattr(plot, "plot_over_time", lambda *given: drawn.append(given))
+    network: Any = SimpleNamespace(facts={"encoder": "resnet18", "norm": "batch"}, height=64, width=32, channels=4)
+    plan = Plan(network, "gpu")
+    chip: Any = SimpleNamespace(
+        title="A Chip", thermal=SimpleNamespace(skin_limit_c=SimpleNamespace(or_else=lambda other: 43.5 + other))
+    )
+    predict_output.draw(chip, plan, asked_for, 5.0, "step_wise", Path("heat.svg"))
+    runs = {name: (chip, plan, name, 5.0, "step_wise") for name in [SUSTAINED, BURST, asked_for]}
+    assert drawn == [(runs, 43.5, "A Chip\nresnet18, batch, 64x32x4 on the gpu", Path("heat.svg"))]
+    assert list(drawn[0][0])[:2] == [SUSTAINED, BURST] and len(drawn[0][0]) == names

@@ -1,0 +1,218 @@
+"""`trilane explain`: phases, costs and totals of a scene, each against the parts that they are put together from."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+from trilane.apps.cli.explain import app
+from trilane.apps.plan_cost import ALWAYS, PIPELINED, CostModel
+from trilane.apps.plan_picture import BODY, MESH, TENSOR, draw_plan
+from trilane.apps.scene_plan import PlannedFrame, ScenePlan, phases
+from trilane.avatars.bundle import load_bundle
+from trilane.avatars.network_reshape import reshaped
+from trilane.body.detail import DETAILS
+from trilane.body.kinematics import Skeleton
+from trilane.body.skinning import CpuSkinner
+from trilane.hw_profiles.application import Plan, stage_times_ms, steady
+from trilane.hw_profiles.load import load_profile
+from trilane.hw_profiles.network_work import Network, count_work
+from trilane.hw_profiles.performance_profiles import corners_of
+from trilane.scene.crop import Rect
+from trilane.stages.avatar_assets import shaped_body, staged_of
+from trilane.stages.configure import Checked, Request, configure
+from trilane.stages.cpu.actor import Seen
+from trilane.stages.cpu.pose import FramePlan
+
+CHIP, CAP = "snapdragon-888", "sustained_high_performance"
+SCENE = """
+frames = 40
+size = "auto"
+error_budget_px = 2.0
+[output]
+width = 320
+height = 240
+[camera]
+source = "builtin:far"
+[[avatars]]
+bundle = "{bundle}"
+"""
+
+
+@pytest.fixture
+def checked(tiny_bundle: Path, tmp_path: Path) -> Checked:
+    (tmp_path / "small.toml").write_text(SCENE.format(bundle=tiny_bundle))
+    return configure(Request(str(tmp_path / "small.toml"), runtime="ort"), tmp_path, lambda: {"hardware": False})
+
+
+def explained(tmp_path: Path, *options: str) -> Any:
+    result = CliRunner().invoke(app, [str(tmp_path / "small.toml"), "--profile", CHIP, *options])
+    assert result.exit_code == 0, result.output
+    return result
+
+
+@pytest.fixture
+def document(checked: Checked, tmp_path: Path) -> Any:  # noqa: ARG001 - it writes the scene
+    return json.loads(explained(tmp_path, "--json").stdout)
+
+
+def planned(frame: int, shape: tuple[int, int] | None, *levels: int) -> PlannedFrame:
+    seen = {number: Seen(Rect(0, 0, 1, 1), level, 0.1) for number, level in enumerate(levels)}
+    return PlannedFrame(frame, FramePlan(shape, None, seen), {})
+
+
+def test_frames_of_one_kind_are_a_phase() -> None:
+    """Another shape, another level of detail or another avatar begins the next one."""
+    small, large = (64, 64), (96, 64)
+    frames = [
+        planned(0, small, 2),
+        planned(1, small, 2),
+        planned(2, large, 2),
+        planned(3, large, 3),
+        planned(4, large, 3, 3),
+        planned(5, None),
+        planned(6, None),
+        planned(7, small, 2),
+    ]
+    assert [[one.frame for one in group] for group in phases(frames)] == [[0, 1], [2], [3], [4], [5, 6], [7]]
+
+
+def test_phases_cover_the_scene_and_add_up(document: Any) -> None:
+    rows, totals = document["phases"], document["totals"]
+    assert [row["first_frame"] for row in rows] == [0, *(row["last_frame"] + 1 for row in rows[:-1])]
+    assert rows[-1]["last_frame"] == 39
+    assert [row["frames"] for row in rows] == [row["last_frame"] - row["first_frame"] + 1 for row in rows]
+    for key in ("pixels", "gmac", "work_ms"):
+        assert totals[key] == pytest.approx(sum(row["frames"] * row["cost"][key] for row in rows))
+        assert totals[f"fixed_{key}"] - totals[key] == pytest.approx(
+            sum(row["frames"] * row["saved"][key] for row in rows)
+        )
+    assert totals["frame_ms"] == pytest.approx(sum(row["frames"] * row["cost"]["frame_ms"] for row in rows) / 40)
+    assert totals["fixed_pixels"] == 40 * 512 * 512
+    assert {tuple(row["tensor"]) for row in rows} <= {tuple(shape) for shape in document["shapes"]}
+
+
+def test_a_phase_says_what_is_modelled_and_its_error(document: Any) -> None:
+    for row in document["phases"]:
+        assert row["density"] == [1.0, 1.0]
+        assert row["cost"]["pixels"] == row["tensor"][0] * row["tensor"][1]
+        (avatar,) = row["avatars"]
+        assert avatar["modelled"] in [detail.name for detail in DETAILS[:-1]]
+        assert 0 <= avatar["measured_px"] <= avatar["bound_px"] <= 2.0
+        assert row["why"] == "a tensor pixel for each pixel of the picture, in the smallest shape that is ready"
+    assert document["sources"] == {
+        "bound_px": "proved bound, in pixels of the picture",
+        "measured_px": "measured in this run",
+        "pixels, gmac": "counted",
+        "ms": "computed",
+    }
+
+
+def test_a_fixed_size_is_explained_as_such(checked: Checked, tmp_path: Path) -> None:  # noqa: ARG001
+    rows = json.loads(explained(tmp_path, "--json", "--size", "64x64").stdout)["phases"]
+    assert {tuple(row["tensor"]) for row in rows} == {(64, 64)}
+    assert {row["why"] for row in rows} == {"the scene fixes the tensor's size"}
+    assert all(row["density"] is None for row in rows)
+
+
+def test_the_table_names_frames_tensors_and_totals(document: Any, tmp_path: Path) -> None:
+    text = explained(tmp_path).stdout
+    first = document["phases"][0]
+    assert "Scene small: 40 frames of 320x240, plan planned, tensor size auto, error budget 2 px" in text
+    assert f"{first['first_frame']}-{first['last_frame']}" in text
+    assert f"{first['tensor'][0]}x{first['tensor'][1]}" in text
+    totals = document["totals"]
+    assert f"{totals['gmac']:.1f} of {totals['fixed_gmac']:.1f} GMAC" in text
+    assert f"{1 - totals['work_ms'] / totals['fixed_work_ms']:.0%} saved (computed by the profile {CHIP};" in text
+
+
+def test_costs_are_those_of_the_profile(tiny_bundle: Path) -> None:
+    """As `trilane predict` computes them; a frame with nobody in view needs neither raster nor network."""
+    network, chip = load_bundle(tiny_bundle).read_network(), load_profile(CHIP)
+    costs, corners = CostModel(network, CHIP, CAP), corners_of(chip, CAP)
+    work = count_work(reshaped(network, 96, 64).model)
+    plan = Plan(Network({}, 96, 64, network.channels, "packed", work), "dsp", PIPELINED)
+    times = {stage: ms for (stage, _), ms in stage_times_ms(chip, plan, corners).items()}
+    cost = costs.of((96, 64))
+    assert (cost.pixels, cost.gmac) == (96 * 64, work.macs / 1e9)
+    assert cost.work_ms == pytest.approx(sum(times.values()))
+    assert cost.frame_ms == pytest.approx(steady(chip, plan, corners, quick=True).frame_ms)
+    nothing = costs.of(None)
+    assert (nothing.pixels, nothing.gmac) == (0, 0.0)
+    assert nothing.work_ms == pytest.approx(times["pose"] + times["composite"] + times["present"])
+    assert set(ALWAYS) == {"pose", "composite", "present"}
+
+
+def test_measured_errors_are_those_of_the_drawn_vertices(checked: Checked) -> None:
+    """Of the vertices on the picture, the furthest between the whole body and what the pose stage wrote."""
+    plan = ScenePlan(checked.config, checked.assets)
+    frame = plan.decide(7)
+    body, staged = shaped_body(checked.assets, 0), staged_of(checked.assets)
+    t_s = 7 / checked.config.scene.fps
+    posed = Skeleton(body.joints, body.body.parents).pose(*staged.movers[0].sample(t_s), staged.movers[0].world)
+    clip = staged.camera.projection(320 / 240) @ staged.camera.sample(t_s)
+
+    def places(vertices: Any) -> Any:
+        points = np.concatenate([vertices, np.ones((len(vertices), 1))], axis=1) @ clip.T
+        ndc = points[:, :3] / points[:, 3:]
+        pixels = np.stack([(ndc[:, 0] + 1) * 160, (1 - ndc[:, 1]) * 120], axis=1)
+        return np.where((np.abs(ndc) <= 1).all(axis=1)[:, None], pixels, np.nan)
+
+    exact = places(CpuSkinner(body).vertices(posed))
+    np.testing.assert_allclose(plan.places(7, 0), exact, atol=1e-6)
+    drawn = places(plan._drawn[0].astype(np.float64))
+    assert plan.measured_px(7, 0) == pytest.approx(np.nanmax(np.linalg.norm(exact - drawn, axis=1)), abs=1e-6)
+    assert frame.plan.seen[0].level < len(DETAILS) - 1
+
+
+def test_the_picture_shows_bodies_and_rectangles(checked: Checked, tmp_path: Path) -> None:
+    plan = ScenePlan(checked.config, checked.assets)
+    frame = plan.decide(0)
+    draw_plan(plan, [frame], tmp_path / "plan.png")
+    pixels = np.array(Image.open(tmp_path / "plan.png"))
+    assert pixels.shape == (240, 320, 3)
+    for colour, rect in ((TENSOR, frame.crops[0]), (MESH, frame.plan.seen[0].rect)):
+        rows, columns = np.nonzero((pixels == colour).all(axis=2))
+        assert columns.min() == pytest.approx((rect.x0 + 1) * 160, abs=1)
+        assert columns.max() == pytest.approx((rect.x1 + 1) * 160, abs=2)
+        assert rows.min() == pytest.approx((1 - rect.y1) * 120, abs=1)
+        assert rows.max() == pytest.approx((1 - rect.y0) * 120, abs=2)
+    assert (pixels == BODY).all(axis=2).sum() > 5
+
+
+def test_a_sheet_has_at_most_nine_frames(checked: Checked, tmp_path: Path) -> None:
+    plan = ScenePlan(checked.config, checked.assets)
+    frames = [plan.decide(frame) for frame in range(20)]
+    draw_plan(plan, frames, tmp_path / "plan.png")
+    with Image.open(tmp_path / "plan.png") as sheet:
+        assert sheet.size == (3 * 320, 3 * 240)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--profile", "no-such-chip"], "no-such-chip"),
+        (["--frames", "0"], "--frames"),
+        (["--size", "300"], "a multiple of 32"),
+        (["--picture", "/nowhere/at/all.png"], "/nowhere"),
+    ],
+)
+def test_wrong_options_are_named(checked: Checked, tmp_path: Path, options: list[str], words: str) -> None:  # noqa: ARG001
+    result = CliRunner().invoke(app, [str(tmp_path / "small.toml"), *options])
+    assert result.exit_code != 0
+    assert words in result.output + str(result.exception)
+
+
+def test_the_full_plan_is_not_run(tiny_bundle: Path, tmp_path: Path) -> None:
+    (tmp_path / "full.toml").write_text(f'plan = "full"\n[[avatars]]\nbundle = "{tiny_bundle}"\n')
+    result = CliRunner().invoke(app, [str(tmp_path / "full.toml")])
+    assert "plan: found full, expected planned or fixed; `trilane bench planner` draws" in str(result.exception)
+    (tmp_path / "both.toml").write_text('plan = "fixed"\nsize = "auto"\n')
+    result = CliRunner().invoke(app, [str(tmp_path / "both.toml")])
+    assert 'size = "auto" with plan = "fixed"' in str(result.exception)

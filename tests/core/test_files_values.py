@@ -1,0 +1,150 @@
+"""Input files, refused word by word: each kind of damage, and each limit at its two sides."""
+
+from __future__ import annotations
+
+import io
+import os
+import struct
+import warnings
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from trilane import files
+from trilane.errors import BadInputError
+from trilane.files import as_numbers, read_npy, read_npz, read_text, require_file
+
+WANTED = "numbers of mine"
+
+
+def said(call: Callable[[], Any]) -> str:
+    with pytest.raises(BadInputError) as refused:
+        call()
+    return str(refused.value)
+
+
+def header(shape: str, descr: str = "'<f8'", version: int = 1) -> bytes:
+    text = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    return b"\x93NUMPY" + bytes([version, 0]) + struct.pack("<H" if version == 1 else "<I", len(text)) + text
+
+
+def test_what_is_no_file(tmp_path: Path) -> None:
+    file = tmp_path / "f"
+    assert said(lambda: require_file(file, WANTED)) == f"{file}: found no such file, expected {WANTED}"
+    file.mkdir()
+    assert said(lambda: require_file(file, WANTED)) == f"{file}: found a folder, expected {WANTED}"
+    nul = Path("a\0b")
+    found = said(lambda: require_file(nul, WANTED))
+    assert found in (
+        f"{nul}: found a file that cannot be read (embedded null byte), expected {WANTED}",
+        f"{nul}: found no such file, expected {WANTED}",
+    )
+    os.mkfifo(tmp_path / "pipe")
+    pipe = tmp_path / "pipe"
+    assert said(lambda: require_file(pipe, WANTED)) == f"{pipe}: found no such file, expected {WANTED}"
+
+
+def test_sizes_of_files(tmp_path: Path) -> None:
+    file = tmp_path / "f"
+    for size in (1, 5):
+        file.write_bytes(b"x" * size)
+        assert require_file(file, WANTED) == size
+    file.write_bytes(b"")
+    assert said(lambda: require_file(file, WANTED)) == f"{file}: found an empty file, expected {WANTED}"
+
+
+def test_text(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "t.txt"
+    file.write_bytes(b"\xef\xbb\xbfna\xc3\xafve\n")
+    assert read_text(file, WANTED) == "naïve\n"
+    monkeypatch.setattr(files, "MAX_TEXT_BYTES", 10)
+    assert read_text(file, WANTED) == "naïve\n"
+    monkeypatch.setattr(files, "MAX_TEXT_BYTES", 9)
+    assert said(lambda: read_text(file, WANTED)) == f"{file}: found 10 bytes, expected at most 9"
+    file.write_bytes(b"a\xff")
+    found = said(lambda: read_text(file, WANTED))
+    assert found.startswith(f"{file}: found a file that cannot be read as text ('utf-8")
+    assert found.endswith(f"), expected {WANTED}")
+
+
+DAMAGED = {
+    "short": (header("(3, 5)") + b"x" * 119, "{size} bytes, truncated, expected {whole} by its own header"),
+    "negative": (header("(-3, 5)") + b"x" * 120, f"shape (-3, 5), expected {WANTED}"),
+    "version": (b"\x93NUMPY\x03\x00" + b"x" * 50, ".npy version (3, 0), expected 1.0 or 2.0"),
+    "objects": (header("(3,)", "'|O'"), "pickled objects, expected numbers; save it as a plain number array"),
+    "huge": (
+        header("(134217729,)") + b"x",
+        "shape (134217729,), 1073741832 bytes, expected at most 1073741824 bytes",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", DAMAGED)
+def test_damaged_arrays(case: str, tmp_path: Path) -> None:
+    content, found = DAMAGED[case]
+    file = tmp_path / "a.npy"
+    file.write_bytes(content)
+    found = found.format(size=len(content), whole=len(content) + 1)
+    assert said(lambda: read_npy(file, WANTED)) == f"{file}: found {found}"
+
+
+@pytest.mark.parametrize("content", [b"no magic at all", header("(3,")[:-1], header("3")])
+def test_broken_headers(content: bytes, tmp_path: Path) -> None:
+    file = tmp_path / "a.npy"
+    file.write_bytes(content)
+    found = said(lambda: read_npy(file, WANTED))
+    assert found.startswith(f"{file}: found no readable NumPy array (") and found.endswith(f"), expected {WANTED}")
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_arrays_come_as_they_were(version: int, tmp_path: Path) -> None:
+    """Also in Fortran's order, and with bytes behind the end."""
+    file = tmp_path / "a.npy"
+    array = np.arange(15.0).reshape(3, 5)
+    file.write_bytes(header("(3, 5)", version=version) + array.tobytes() + b"more")
+    np.testing.assert_array_equal(read_npy(file, WANTED), array)
+    np.save(file, np.asfortranarray(array))
+    np.testing.assert_array_equal(read_npy(file, WANTED), array)
+
+
+def test_an_old_header_is_read_without_a_warning(tmp_path: Path) -> None:
+    """Python 2 wrote long numbers with an L."""
+    file = tmp_path / "a.npy"
+    file.write_bytes(header("(2L,)") + np.array([1.0, 2.0]).tobytes())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert read_npy(file, WANTED).tolist() == [1.0, 2.0]
+
+
+def test_archives(tmp_path: Path) -> None:
+    """Members that nobody asked for are not opened; one that is wrong is named."""
+    file = tmp_path / "a.npz"
+    with zipfile.ZipFile(file, "w") as archive:
+        buffer = io.BytesIO()
+        np.save(buffer, np.arange(3))
+        archive.writestr("good.npy", buffer.getvalue())
+        archive.writestr("short.npy", header("(2,)") + b"x" * 15)
+        archive.writestr("objects.npy", header("(2,)", "'|O'"))
+        archive.writestr("text.txt", "text")
+    found = read_npz(file, ("good", "absent", "text"), WANTED)
+    assert list(found) == ["good"] and found["good"].tolist() == [0, 1, 2]
+    size = len(header("(2,)")) + 15
+    truncated = f"{file}[short]: found {size} bytes, truncated, expected {size + 1} by its own header"
+    assert said(lambda: read_npz(file, ("good", "short"), WANTED)) == truncated
+    assert said(lambda: read_npz(file, ("objects",), WANTED)).startswith(f"{file}[objects]: found pickled objects")
+    file.write_bytes(b"PK no archive")
+    assert said(lambda: read_npz(file, ("good",), WANTED)) == (
+        f"{file}: found no readable .npz archive (File is not a zip file), expected {WANTED}"
+    )
+
+
+def test_what_are_numbers() -> None:
+    for kind in (np.float32, np.int8, np.uint64):
+        given = as_numbers("f", np.array([1, 2], kind), WANTED)
+        assert (given.dtype, given.tolist()) == (np.float64, [1.0, 2.0])
+    for array in (np.array(["x"]), np.array([True]), np.array([1j])):
+        assert said(lambda: as_numbers("f", array, WANTED)) == f"f: found dtype {array.dtype}, expected {WANTED}"  # noqa: B023

@@ -1,0 +1,339 @@
+"""`bench infer`, `peers` and `roofline`: whole documents of runs whose times are told, worked out by hand."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+from onnx import shape_inference
+
+from trilane.avatars.bundle import load_bundle
+from trilane.avatars.network_file import read_network
+from trilane.bench import infer, peers, roofline
+from trilane.bench.lib.instruction_kernels import Issued
+from trilane.bench.lib.interleaved_processes import Variant
+from trilane.bench.lib.networks import NetworkFixture, fixture_of_file
+from trilane.errors import BadInputError, MissingPartError, TrilaneError
+from trilane.testing.told_runners import ToldRunners
+
+PEAK = {"int8_gmac_s": 1000.0, "int8_instruction_gmac_s": 4000.0}
+
+
+@pytest.fixture
+def network(tiny_quantised: Any, tmp_path: Path) -> Path:
+    path = tmp_path / "network.onnx"
+    onnx.save(tiny_quantised.network.model, path)
+    return path
+
+
+@pytest.fixture
+def peaks(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The threads for which the peaks were asked."""
+    asked: list[int] = []
+    monkeypatch.setattr(roofline, "measure", lambda threads: asked.append(threads) or PEAK)
+    return asked
+
+
+def test_a_file_in_batches_of_two(monkeypatch: pytest.MonkeyPatch, network: Path, peaks: list[int]) -> None:
+    """Three periods (2 / 0.75 rounded) of two runs: 8 and 12, 18 and 22, 28 and 32 ms for two frames each."""
+    caches: list[str] = []
+    told = ToldRunners(lambda _, turn: caches.append(os.environ["XDG_CACHE_HOME"]) or [8.0 + 10 * turn, 12 + 10 * turn])
+    monkeypatch.setattr(infer, "runners", told)
+    monkeypatch.setattr(infer, "sensor_c", lambda: 41.5)
+    monkeypatch.setenv("XDG_CACHE_HOME", "/before")
+    result = infer.measure(str(network), batch=(2,), runtime=("ort",), threads=3, spin=True, seconds=2.0, period=0.75)
+    file = read_network(network)
+    fixture = fixture_of_file(file, 2)
+    assert fixture.integer.shape == (2, *file.shape[1:])
+    rate = fixture.gmac / 0.010
+    assert result == {
+        "rows": [
+            {
+                "network": str(network),
+                "size": [64, 64],
+                "parameters": fixture.parameters,
+                "gmac": fixture.gmac,
+                "runtime": "ort",
+                "batch": 2,
+                "startup_cold_ms": 100.0,
+                "startup_warm_ms": 200.0,
+                "frames": 12,
+                "p50_ms": 10.0,
+                "p90_ms": pytest.approx(15.0),  # half-way from 14 to 16: place 4.5 of 0 to 5
+                "p99_ms": pytest.approx(15.9),
+                "min_ms": 4.0,
+                "mean_ms": 10.0,
+                "max_ms": 16.0,
+                "periods": [{"min_ms": ms - 1, "mean_ms": ms, "max_ms": ms + 1} for ms in (5.0, 10.0, 15.0)],
+                "temperature_c": 41.5,
+                "share_of_roofline": pytest.approx(rate / 1000),
+                "share_of_instruction_peak": pytest.approx(rate / 4000),
+                "int8_over_fp32": None,
+            }
+        ],
+        "roofline": PEAK,
+        "config": {"threads": 3, "spin": True, "seconds": 2.0},
+    }
+    assert peaks == [3]
+    assert told.asked == [("ort", 0.75)] * 3
+    (variant,) = told.variants[0].values()
+    assert told.variants[0] == told.variants[1] and len(told.variants) == 2
+    assert (variant.kind, variant.runtime, variant.threads, variant.spin) == ("runtime", "ort", 3, True)
+    assert set(caches) == {str(variant.network.parent / "cache")}
+    assert not variant.network.parent.exists() and re.fullmatch(r"trilane-bench-\w{8}", variant.network.parent.name)
+    assert os.environ["XDG_CACHE_HOME"] == "/before"
+
+
+def test_each_network_is_set_against_itself_in_float(
+    monkeypatch: pytest.MonkeyPatch, network: Path, peaks: list[int]
+) -> None:
+    """Eight milliseconds a batch of two frames beside twelve a frame: three times as fast, and one row for each."""
+    file, made = read_network(network), []
+
+    def untrained(*settings: Any, **more: Any) -> NetworkFixture:
+        made.append((*settings, more))
+        return NetworkFixture({"encoder": settings[0]}, fixture_of_file(file, more["batch"]).integer, 7, 2.0)
+
+    plain = onnx.ModelProto(producer_name="in float")
+    monkeypatch.setattr(infer, "untrained", untrained)
+    monkeypatch.setattr(infer, "untrained_float", lambda *settings: made.append((*settings, "float")) or plain)
+    saved: dict[str, str] = {}
+
+    def look(name: str, _turn: int) -> list[float]:
+        variant = told.variants[-1][name]
+        saved[name] = onnx.load(variant.network).producer_name
+        return [12.0] if name == infer.FP32 else [8.0]
+
+    told = ToldRunners(look)
+    monkeypatch.setattr(infer, "runners", told)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {0, 1, 2, 5})
+    result = infer.measure(
+        encoder=("a", "b"), norm=("n",), width=9, size=("64x96",), batch=(2,), runtime=("ort",), seconds=1, period=1
+    )
+    assert made == [(encoder, "n", 9, (64, 96), last) for encoder in "ab" for last in ({"batch": 2}, "float")]
+    assert [(row["encoder"], row["runtime"], row["batch"]) for row in result["rows"]] == [
+        (encoder, *way) for encoder in "ab" for way in (("ort", 2), (infer.FP32, 1))
+    ]
+    ours, float_row = result["rows"][:2]
+    assert (ours["int8_over_fp32"], ours["share_of_roofline"]) == (3.0, pytest.approx(2 / 0.004 / 1000))
+    assert (float_row["p50_ms"], float_row["frames"], ours["frames"]) == (12.0, 1, 2)
+    assert "share_of_roofline" not in float_row and (ours["parameters"], ours["gmac"]) == (7, 2.0)
+    assert (peaks, result["config"]["threads"]) == ([4], 4)
+    fp32 = told.variants[0][infer.FP32]
+    assert (fp32.kind, fp32.threads, saved[infer.FP32]) == ("ort", 4, "in float") and saved["ort"] != "in float"
+    assert "XDG_CACHE_HOME" not in os.environ
+
+
+def test_a_bundle_is_measured_by_its_name_and_an_unknown_peak_leaves_its_share_open(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(roofline, "measure", lambda _: {"int8_gmac_s": 10.0, "int8_instruction_gmac_s": None})
+    monkeypatch.setattr(infer, "runners", ToldRunners(lambda *_: [5.0]))
+    (row,) = infer.measure("default", runtime=("ort",), threads=1, seconds=1, period=1)["rows"]
+    assert row["network"] == load_bundle("default").read_network().where
+    assert row["share_of_instruction_peak"] is None
+    with pytest.raises(BadInputError, match="--size"):
+        infer.measure(size=("6",), runtime=("ort",), seconds=1, period=1)
+    with pytest.raises(BadInputError, match="--period: found 3, expected more than 0, at most --seconds 2"):
+        infer.measure("default", seconds=2, period=3)
+
+
+def told_app(monkeypatch: pytest.MonkeyPatch, stats: str, code: int = 0) -> list[list[str]]:
+    """`benchmark_app` writes `stats`, if any, where it is told to; its command lines."""
+    commands: list[list[str]] = []
+
+    def run(command: list[str], **options: Any) -> None:
+        assert options == {"check": True, "capture_output": True, "timeout": 600}
+        commands.append(command)
+        if code:
+            raise subprocess.CalledProcessError(code, command)
+        if not stats:
+            return
+        folder = Path(command[command.index("-report_folder") + 1])
+        (folder / "benchmark_report.json").write_text(stats, encoding="utf-8")
+
+    monkeypatch.setattr(peers.subprocess, "run", run)
+    monkeypatch.setattr(peers.shutil, "which", lambda name, path: f"{path.partition(':')[0]}/{name}")
+    return commands
+
+
+STATS = json.dumps({"execution_results": {"latency (ms)": "25.0"}})
+
+
+def test_peers_run_interleaved_on_the_same_files(monkeypatch: pytest.MonkeyPatch, network: Path) -> None:
+    """1 G in 20 ms is 50 G/s, in both rounds; ONNX Runtime in float takes 60, and 80 in the second."""
+    ms = {"trilane ort": 30.0, "trilane openvino": 20.0, "onnxruntime fp32": 60.0}
+    told = ToldRunners(lambda name, turn: [ms.get(name, 40.0) + (20 * turn if "fp32" in name else 0)] * (2 + turn))
+    monkeypatch.setattr(peers, "runners", told)
+    resolved: list[str] = []
+    monkeypatch.setattr(peers, "resolve", resolved.append)
+    monkeypatch.setattr(roofline, "measure", lambda threads: {**PEAK, "threads": threads})
+    file, made = read_network(network), []
+    saved: list[bool] = []
+
+    def untrained(*settings: Any) -> NetworkFixture:
+        made.append(settings)
+        return NetworkFixture({}, file, 7, 1.0)
+
+    monkeypatch.setattr(peers, "untrained", untrained)
+    monkeypatch.setattr(peers, "untrained_float", lambda *settings: made.append(settings) or onnx.ModelProto())
+    commands = told_app(monkeypatch, STATS)
+    monkeypatch.setattr(
+        peers.onnx, "save", lambda model, path: saved.append((path.name, model == file.model)) or path.touch()
+    )
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {0, 3, 4})
+    result = peers.measure(width=5, size="64x64", rounds=2, seconds=1)
+    assert resolved == ["openvino", "ort"]
+    assert made == [("resnet18", "batch", 5, (64, 64))] * 2
+    assert saved == [("integer.onnx", True), ("float.onnx", False)]
+    first = next(iter(told.variants[0].values())).network.parent
+    assert not first.exists() and re.fullmatch(r"trilane-peers-\w{8}", first.name)
+    integer, plain = first / "integer.onnx", first / "float.onnx"
+    assert told.variants == [
+        {
+            "trilane ort": Variant("runtime", integer, "ort", 3),
+            "trilane openvino": Variant("runtime", integer, "openvino", 3),
+            "onnxruntime fp32": Variant("ort", plain),
+            "onnxruntime int8": Variant("ort", integer),
+            "openvino int8": Variant("openvino", integer),
+        }
+    ]
+    names = list(told.variants[0])
+    assert told.asked == [(name, 1) for _ in range(2) for name in names]
+    assert result["ratios"] == pytest.approx(
+        {
+            "ort_over_fp32": 7 / 3,
+            "openvino_over_fp32": 3.5,
+            "openvino_of_roofline": 0.05,
+            "openvino_of_instruction_peak": 0.0125,
+            "openvino_over_benchmark_app": 1.25,
+        }
+    )
+    assert (result["low"]["openvino_over_fp32"], result["high"]["openvino_over_fp32"]) == (3.0, 4.0)
+    assert (result["low"]["ort_over_fp32"], result["high"]["ort_over_fp32"]) == (2.0, pytest.approx(8 / 3))
+    assert result["rows"] == [
+        {"way": "trilane ort", "median_ms": 30.0, "runs": 5},
+        {"way": "trilane openvino", "median_ms": 20.0, "runs": 5},
+        {"way": "onnxruntime fp32", "median_ms": 80.0, "runs": 5},
+        {"way": "onnxruntime int8", "median_ms": 40.0, "runs": 5},
+        {"way": "openvino int8", "median_ms": 40.0, "runs": 5},
+        {"way": "benchmark_app", "median_ms": 25.0, "runs": 2},
+    ]
+    assert result["peaks"] == peers.PEAKS and result["gmac"] == 1.0 and result["roofline"] == {**PEAK, "threads": 3}
+    assert result["config"] == {"width": 5, "size": "64x64", "threads": 3, "rounds": 2, "seconds": 1}
+    assert commands[0] == [
+        f"{Path(sys.executable).parent}/benchmark_app",
+        *("-m", str(integer), "-d", "CPU", "-hint", "none", "-api", "sync", "-nthreads", "3", "-nstreams", "1"),
+        *("-t", "1", "-report_type", "no_counters", "-report_folder", str(first), "-json_stats"),
+    ]
+    with pytest.raises(BadInputError, match="--size"):
+        peers.measure(size="6")
+
+
+@pytest.mark.parametrize(("stats", "code"), [("{}", 0), ("no JSON", 0), ("", 0), (STATS, 3)])
+def test_openvinos_tool_may_fail(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, stats: str, code: int) -> None:
+    told_app(monkeypatch, stats, code)
+    with pytest.raises(TrilaneError, match="benchmark_app failed: "):
+        peers._benchmark_app(tmp_path / "n.onnx", 1, 1)
+    monkeypatch.setattr(peers.shutil, "which", lambda *_, **__: None)
+    with pytest.raises(MissingPartError, match="benchmark_app is not there") as raised:
+        peers._benchmark_app(tmp_path / "n.onnx", 1, 1)
+    assert "openvino" in str(raised.value)
+
+
+def test_rates_are_work_over_the_best_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs of 9, 5 and 7 ms in the first round, 6 in the others: 5 counts. Four layers of (side x channels x kernel)^2
+    each; a product of 1536^3."""
+    told = ToldRunners(lambda _, turn: [9.0, 5.0, 7.0] if turn == 0 else [6.0])
+    monkeypatch.setattr(roofline, "runners", told)
+    monkeypatch.setattr(roofline, "installed", lambda: ["ort", "qnn", "openvino"])
+    monkeypatch.setattr(roofline, "cpu_facts", lambda: {"flags": ["avx2"]})
+    monkeypatch.setattr(roofline, "_memory_gb_s", lambda: 12.5)
+    issued: list[Any] = []
+    monkeypatch.setattr(roofline, "measure_issued", lambda *asked: issued.append(asked) or Issued(0.9, 2.0, 1.9, 2.1))
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {7, 2, 5})
+    saved: dict[str, onnx.ModelProto] = {}
+    monkeypatch.setattr(roofline.onnx, "save", lambda model, path: saved.update({Path(path).name: model}))
+    result = roofline.measure()
+    work = {(32, 256, 3): 4 * 24576**2, (64, 128, 3): 4 * 24576**2, (64, 512, 1): 4 * 32768**2}
+    assert result["rows"] == [
+        {"kernel": f"{name} {side}x{side}x{channels} {k}x{k}", "gmac_s": pytest.approx(macs / 1e9 / 0.005)}
+        for (side, channels, k), macs in work.items()
+        for name in ("ort", "openvino")
+    ]
+    best = 4 * 32768**2 / 1e9 / 0.005
+    peak = 32 * 2.0 * 3  # AVX2: 32 a cycle at the nearest documented rate
+    assert result["int8_gmac_s"] == pytest.approx(best) and result["int8_instruction_gmac_s"] == peak
+    assert result["layer_of_instruction"] == pytest.approx(best / peak)
+    assert result["fp32_gmac_s"] == pytest.approx(1536**3 / 1e9 / 0.005)
+    assert (result["memory_gb_s"], result["threads"], issued) == (12.5, 3, [("AVX2", [2, 5, 7])])
+    clocks = {key: result["instructions"][f"clock_{key}"] for key in ("ghz", "low_ghz", "high_ghz")}
+    assert clocks == {"ghz": 2.0, "low_ghz": 1.9, "high_ghz": 2.1}
+    assert [result["instructions"][key] for key in ("set", "cores", "gmac_s")] == ["AVX2", 3, peak]
+    assert result["instructions"]["issued_macs_a_cycle"] == pytest.approx(28.8)
+    assert "vpmaddubsw" in result["instructions"]["sequence"] and "uops.info" in result["instructions"]["source"]
+    assert told.asked[:6] == [(name, 4) for name in told.variants[0]]
+    assert len(told.asked) == 6 * (6 + 1)
+    for name, variant in told.variants[0].items():
+        assert (variant.kind, variant.threads) == (name.split()[0], 3) and variant.network.name in saved
+        assert re.fullmatch(r"trilane-roofline-\w{8}", variant.network.parent.name)
+    assert told.variants[1]["fp32"].threads == 3 and told.variants[1]["fp32"].kind == "ort"
+    assert re.fullmatch(r"trilane-roofline-\w{8}", told.variants[1]["fp32"].network.parent.name)
+
+
+def test_a_copy_is_read_and_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clock's looks are 3, 1, 2, 5, 4 and 6 s apart: at best 2 x 8e6 bytes in 1 s."""
+    gaps = iter([3.0, 1.0, 2.0, 5.0, 4.0, 6.0])
+    looks = [at for gap in gaps for at in (10.0, 10.0 + gap)]
+    told = iter(looks)
+    copied: list[tuple[int, int]] = []
+    monkeypatch.setattr(roofline, "time", SimpleNamespace(perf_counter=lambda: next(told)))
+    monkeypatch.setattr(roofline, "COPY_BYTES", 8_000_000)
+    copy = np.copyto
+    monkeypatch.setattr(
+        roofline.np,
+        "copyto",
+        lambda target, source: copied.append((target.nbytes, source.nbytes)) or copy(target, source),
+    )
+    assert roofline._memory_gb_s() == pytest.approx(0.016)
+    assert copied == [(8_000_000, 8_000_000)] * 6
+
+
+def test_the_layers_are_convolutions_between_bytes() -> None:
+    """Bytes in and out of the same shape, four convolutions of (c,c,k,k) that keep the size; ONNX Runtime runs them."""
+    model = shape_inference.infer_shapes(roofline._layers(8, 16, 3), check_type=True, strict_mode=True)
+    shapes = {
+        value.name: [dim.dim_value for dim in value.type.tensor_type.shape.dim]
+        for value in (*model.graph.input, *model.graph.output, *model.graph.value_info)
+    }
+    assert shapes["x"] == shapes["y"] == [1, 8, 8, 16]
+    assert [shapes[f"conv{i}"] for i in range(4)] == [[1, 16, 8, 8]] * 4
+    assert [node.op_type for node in model.graph.node].count("Conv") == 4
+    weights = {tensor.name: onnx.numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
+    assert np.array_equal(weights["w"], np.random.default_rng(0).integers(-63, 64, (16, 16, 3, 3)))
+    assert weights["w_scale"] == pytest.approx(0.05 / 12) and not weights["w_zero"].any() and weights["zero"] == 0
+    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    source = np.random.default_rng(0).integers(0, 256, (1, 8, 8, 16), dtype=np.uint8)
+    found = session.run(None, {"x": source})[0]
+    real = source.astype(np.float64) * 0.05
+    for _ in range(4):
+        padded = np.pad(real, ((0, 0), (1, 1), (1, 1), (0, 0)))
+        windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3), axis=(1, 2))
+        out = np.einsum("nhwcyx,ocyx->nhwo", windows, weights["w"] * 0.05 / 12)
+        real = np.clip(np.rint(out / 0.05), 0, 255) * 0.05
+    assert np.abs(found - np.rint(real / 0.05)).max() <= 1, "halves may round to either side in float32"
+    product = roofline._product()
+    assert [len(product.graph.node), product.graph.node[0].op_type] == [1, "MatMul"]
+    factor = np.random.default_rng(0).normal(size=(1536, 1536)).astype(np.float32)
+    assert np.array_equal(onnx.numpy_helper.to_array(product.graph.initializer[0]), factor)

@@ -1,0 +1,192 @@
+"""Parts of the quantiser by value: equalised weights by hand, tables of calibrations computed again, layers' noise."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+
+from trilane.errors import BadInputError
+from trilane.training.quantising import calibration_table as table
+from trilane.training.quantising.cross_layer_equalisation import equalised
+from trilane.training.quantising.layer_noise import _sqnr_db, layer_report
+from trilane.training.quantising.quantise import quantise
+
+Kernels = dict[str, Any]
+
+
+def chain(kernels: Kernels, nodes: list[tuple[str, list[str], str, dict[str, Any]]]) -> onnx.ModelProto:
+    """A network of `nodes` (operator, inputs, output, attributes) with 1 x 1 kernels (O, I) and biases (O,)."""
+    constants = [
+        numpy_helper.from_array(np.asarray(value, np.float32)[(...,) + (None,) * (2 * (np.ndim(value) == 2))], name)
+        for name, value in kernels.items()
+    ]
+    made = [helper.make_node(kind, inputs, [output], output, **more) for kind, inputs, output, more in nodes]
+    ends = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 2, 4, 4]) for name in ("x", nodes[-1][2])]
+    return helper.make_model(helper.make_graph(made, "chain", ends[:1], ends[1:], constants))
+
+
+def weights_of(model: onnx.ModelProto) -> Kernels:
+    return {tensor.name: np.squeeze(numpy_helper.to_array(tensor)) for tensor in model.graph.initializer}
+
+
+PLAIN = [
+    ("Conv", ["x", "a", "b"], "first", {}),
+    ("Relu", ["first"], "relu", {}),
+    ("Conv", ["relu", "c", "d"], "second", {}),
+]
+
+
+def test_neighbours_meet_at_the_root_of_their_ranges() -> None:
+    """Channel 0: made with 8, read with 2, so s = sqrt(8 / 2) = 2; channel 1: 1 and 9, s = 1/3. The last bias stays."""
+    kernels = {"a": [[8, -4], [0.5, 1]], "b": [6, 3], "c": [[2, 9], [-1, 3]], "d": [5, 7]}
+    model = chain(kernels, PLAIN)
+    found = weights_of(equalised(model))
+    np.testing.assert_allclose(found["a"], [[4, -2], [1.5, 3]], rtol=1e-6)
+    np.testing.assert_allclose(found["b"], [3, 9], rtol=1e-6)
+    np.testing.assert_allclose(found["c"], [[4, 3], [-2, 1]], rtol=1e-6)
+    assert found["d"].tolist() == [5, 7]
+    assert {name: value.tolist() for name, value in weights_of(model).items()} == kernels, "the network is a copy"
+
+
+def test_dead_channels_stay_and_no_factor_of_a_round_is_beyond_a_hundred() -> None:
+    """Channel 0 is not read, channel 1 is made 1e16 times as large as it is read: s = 1e8, but 100 in each round."""
+    found = weights_of(equalised(chain({"a": [[3, 1], [1e8, 0]], "b": [1, 5], "c": [[0, 1e-8], [0, 0]]}, unbiased())))
+    assert found["a"].tolist()[0] == [3, 1] and found["b"][0] == 1
+    np.testing.assert_allclose(found["a"][1, 0], 1e2, rtol=1e-5)
+    np.testing.assert_allclose(found["c"][0, 1], 1e-2, rtol=1e-5)
+
+
+def unbiased() -> list[Any]:
+    return [*PLAIN[:2], ("Conv", ["relu", "c"], "second", {})]
+
+
+def test_three_layers_are_equalised_three_times() -> None:
+    random = np.random.default_rng(1)
+    kernels = {name: random.uniform(0.1, 9, (2, 2)) for name in "ace"}
+    nodes = [
+        *PLAIN[:2],
+        ("Conv", ["relu", "c"], "second", {}),
+        ("Relu", ["second"], "again", {}),
+        ("Conv", ["again", "e"], "third", {}),
+    ]
+    nodes[0] = ("Conv", ["x", "a"], "first", {})
+    found = weights_of(equalised(chain(kernels, nodes)))
+    wanted = {name: value.copy() for name, value in kernels.items()}
+    for _ in range(3):
+        for first, second in (("a", "c"), ("c", "e")):
+            made, read = wanted[first], wanted[second]
+            scale = np.sqrt(made.max(axis=1) / read.max(axis=0))
+            wanted[first], wanted[second] = made / scale[:, None], read * scale[None]
+    for name, value in wanted.items():
+        np.testing.assert_allclose(found[name], value, rtol=1e-5)
+
+
+OTHER_CHAINS = {
+    "another reader": [*PLAIN, ("Relu", ["first"], "other", {})],
+    "no rectifier": [PLAIN[0], ("Sigmoid", ["first"], "relu", {}), PLAIN[2]],
+    "groups": [PLAIN[0], PLAIN[1], ("Conv", ["relu", "c", "d"], "second", {"group": 2})],
+    "a shared weight": [PLAIN[0], PLAIN[1], ("Conv", ["relu", "a", "d"], "second", {})],
+    "a shared bias": [PLAIN[0], PLAIN[1], ("Conv", ["relu", "c", "b"], "second", {})],
+    "a weight that is computed": [PLAIN[0], PLAIN[1], ("Conv", ["relu", "x", "d"], "second", {})],
+}
+
+
+@pytest.mark.parametrize("case", OTHER_CHAINS)
+def test_other_chains_are_left_alone(case: str) -> None:
+    kernels = {"a": [[8, -4], [0.5, 1]], "b": [6, 3], "c": [[2, 9], [-1, 3]], "d": [5, 7]}
+    found = weights_of(equalised(chain(kernels, OTHER_CHAINS[case])))
+    assert {name: value.tolist() for name, value in found.items()} == kernels
+
+
+def test_a_single_group_is_equalised() -> None:
+    kernels = {"a": [[8, -4], [0.5, 1]], "b": [6, 3], "c": [[2, 9], [-1, 3]], "d": [5, 7]}
+    nodes = [(kind, inputs, output, {"group": 1} if kind == "Conv" else {}) for kind, inputs, output, _ in PLAIN]
+    assert weights_of(equalised(chain(kernels, nodes)))["b"].tolist() == pytest.approx([3, 9])
+
+
+# --- the table of calibrations ------------------------------------------------------------------------------------
+
+
+def run(model: onnx.ModelProto, feed: Any) -> Any:
+    settings = onnxruntime.SessionOptions()
+    settings.log_severity_level = 3
+    session = onnxruntime.InferenceSession(model.SerializeToString(), settings, providers=["CPUExecutionProvider"])
+    return session.run(None, {session.get_inputs()[0].name: feed})[0]
+
+
+def test_calibrations_are_judged_on_the_last_five_frames(tiny_float: Any, tiny_frames: Any) -> None:
+    frames = [frame * np.float32(1 + 0.1 * k) for k, frame in enumerate([*tiny_frames] * 2)][:9]
+    rows = list(table.calibration_table(tiny_float, frames, ("minmax",), (3, 4, 5)))
+    assert [(row["method"], row["count"]) for row in rows] == [("minmax", 3), ("minmax", 4)]
+    for row in rows:
+        network = quantise(tiny_float, frames[: row["count"]], "minmax").network
+        off = []
+        for frame in frames[4:]:
+            wanted = 255 * run(tiny_float, np.ascontiguousarray(frame.transpose(2, 0, 1)[None]))
+            tensor = np.clip(np.round(frame / network.input.scale) + network.input.zero_point, 0, 255)
+            picture = run(network.model, tensor.astype(np.uint8)[None])
+            off.append(np.abs(wanted.transpose(0, 2, 3, 1) - picture).astype(np.float64))
+        decibels = [10 * math.log10(255**2 / np.mean(each**2)) for each in off]
+        assert row["psnr_db"] == pytest.approx(np.mean(decibels), abs=1e-4)
+        assert row["mean"] == pytest.approx(np.mean(off), rel=1e-5)
+        assert row["largest"] == pytest.approx(np.max(off), rel=1e-6)
+
+
+def test_what_a_table_is_made_of_when_nothing_is_asked_for() -> None:
+    assert (table.COUNTS, table.EVALUATED) == ((5, 10, 20, 50, 100), 5)
+
+
+def test_equal_pictures_have_a_finite_psnr() -> None:
+    """A mean square of 1e-12 at the least: 20 log10(255) + 120."""
+    same = [np.zeros((1, 2, 2, 4), np.float32)]
+    found = table._errors(same, [np.zeros((1, 2, 2, 4), np.uint8)])
+    assert found == {"psnr_db": pytest.approx(20 * math.log10(255) + 120), "mean": 0.0, "largest": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("frames", "methods", "message"),
+    [
+        (9, ("minmax",), "frames: found 9 of them, expected at least 10"),
+        (10, ("mean",), "--method: found 'mean', expected one of minmax, percentile, entropy"),
+    ],
+)
+def test_tables_that_cannot_be_made_are_refused(
+    tiny_float: Any, tiny_frames: Any, frames: int, methods: tuple[str, ...], message: str
+) -> None:
+    with pytest.raises(BadInputError) as caught:
+        next(table.calibration_table(tiny_float, ([*tiny_frames] * 2)[:frames], methods))
+    assert str(caught.value) == message
+
+
+# --- the noise of layers ------------------------------------------------------------------------------------------
+
+
+def test_the_noise_of_each_layer(held: Any, tiny_float: Any, tiny_frames: Any, tiny_quantised: Any) -> None:
+    rows = layer_report(tiny_float, tiny_quantised, tiny_frames[2])
+    assert all(row["op_type"] == "Conv" for row in rows)
+    assert [row["sqnr_db"] for row in rows] == sorted(row["sqnr_db"] for row in rows)
+    by_name = {row["name"]: round(row["sqnr_db"], 3) for row in rows}
+    assert by_name.keys() == {"stem", "deep", "level", "head"}
+    held("decibels", [by_name[name] for name in ("stem", "deep", "level", "head")])
+
+
+@pytest.mark.parametrize(
+    ("exact", "rounded", "decibels"),
+    [
+        ([3.0, 4.0], [3.0, 4.5], 20.0),
+        ([3.0, 4.0], [3.0, 4.0], 200.0),
+        ([0.0, 0.0], [0.0, 0.0], 200.0),
+        ([0.0, 0.0], [0.0, 1.0], -200.0),
+        ([1e-12, 0.0], [1e12, 0.0], -200.0),
+        ([1e12, 0.0], [1e12, 1e-12], 200.0),
+    ],
+)
+def test_a_ratio_is_in_decibels_and_has_ends(exact: list[float], rounded: list[float], decibels: float) -> None:
+    """25 over 0.25 is a hundred, which is 20 dB."""
+    assert _sqnr_db(np.array(exact, np.float32), np.array(rounded, np.float32)) == pytest.approx(decibels)

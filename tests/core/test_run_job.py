@@ -1,0 +1,328 @@
+"""From a checked configuration to a run folder, around runs that were made in virtual time: what is run, kept, told."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from trilane.apps import run_job
+from trilane.apps.pace import Pace
+from trilane.apps.report import read_report
+from trilane.apps.run_job import Hooks, Outcome, Plan, run_to_folder
+from trilane.errors import BadInputError, TrilaneError
+from trilane.figure_sources import COMPARED, COMPUTED, MEASURED
+from trilane.hw_profiles.application import application_graph
+from trilane.hw_profiles.governor import Governor
+from trilane.pipeline.description import UnitSettings
+from trilane.pipeline.result import Failure, RunResult
+from trilane.pipeline.run_metrics import metrics_of
+from trilane.scene.schema import OutputSpec, Scene
+from trilane.scheduler.events import Settings
+from trilane.scheduler.virtual import simulate
+from trilane.stages.config import RunConfig
+from trilane.stages.configure import Checked
+from trilane.stages.cpu.present import SEGMENTS, PresentStage
+from trilane.stages.packets import pose_dtype
+from trilane.transport.packets import SlotLayout, view_packet
+from trilane.units import PerformanceProfile
+
+MS = 1_000_000
+FRAMES, WIDTH, HEIGHT = 6, 96, 64
+#: The slowest stage takes 4 ms: pipelined frames are 4 ms apart, frames one at a time 1 + 2 + 4 + 2 + 1 ms.
+STAGE_NS = {"pose": MS, "raster": 2 * MS, "infer": 4 * MS, "composite": 2 * MS, "present": MS}
+MACHINE = {
+    "system": "Linux",
+    "python": "3.11",
+    "trilane": None,
+    "scheduler_core": "interpreted",
+    "cpu": {"model": "a processor", "architecture": "x86_64", "flags": [], "cores": 2, "cores_allowed": [0, 1]},
+    "memory_bytes": 1,
+    "gl": None,
+    "packages": {},
+}
+MADE = {"at": "2026-11-22T01:00:00+00:00", "command": ["trilane"], "trilane": None, "revision": None, "modified": None}
+
+
+def checked() -> Checked:
+    units = {unit: UnitSettings(cores=(0,), threads=1) for unit in ("cpu", "gpu", "dsp")}
+    scene = Scene(frames=FRAMES, fps=25.0, size="64x64", output=OutputSpec(width=WIDTH, height=HEIGHT))
+    config = RunConfig(scene=scene, out_dir=Path("/nowhere"), avatar_dirs=(Path("/avatar"),), units=units)
+    return Checked(config, {}, ("the motion is short", "runtime: ort"), {"someone": {"source": "no figures"}})
+
+
+def a_result(frames: int = FRAMES, policy: str = "pipelined", **changes: Any) -> RunResult:
+    """What a run of so many frames hands back."""
+    run = simulate(application_graph(), Settings(frames, policy), lambda stage, *_: STAGE_NS[stage], keep=True)
+    assert run.recording is not None
+    report = metrics_of({**run.report, "clock": "host", "policy": policy, "edge": "double", "isolated_ms": {}})
+    result = RunResult(
+        report=report,
+        requested=frames,
+        presented=frames,
+        lost={},
+        dropped={},
+        pids={"cpu": 11, "gpu": 12, "dsp": 13},
+        startup_ms={"cpu": 1.5},
+        jobs=run.jobs,
+        recording=run.recording,
+        metrics={"pose": {"visible": 0.5}},
+        messages=("the unit gpu was slow",),
+    )
+    return replace(result, **changes)
+
+
+def record(out_dir: Path, numbers: range) -> None:
+    """The video of a run, as its last stage leaves it."""
+    config = checked().config.model_copy(update={"out_dir": out_dir})
+    layout = SlotLayout(pose_dtype(1), payload_bytes=WIDTH * HEIGHT * 3)
+    slot = view_packet(memoryview(bytearray(layout.slot_bytes)), layout)
+    stage = PresentStage(config)
+    stage.bind([slot], [])
+    for number in numbers:
+        slot.payload[:] = np.uint8(40 + number)
+        stage.run(number, 0, None)
+    stage.close()
+
+
+@dataclass
+class Runs:
+    """In place of `run_avatar`: each call takes the next of `answers`, a result, an error, or what makes one."""
+
+    answers: list[Any]
+    calls: list[dict[str, Any]] = field(default_factory=list)
+    said: list[Any] = field(default_factory=list)
+
+    def __call__(self, config: RunConfig, assets: Any, **options: Any) -> RunResult:
+        self.calls.append({"config": config, "assets": assets, **options})
+        options["on_progress"](2, 5)
+        options["on_message"]("hello")
+        answer = self.answers.pop(0)
+        if isinstance(answer, BaseException):
+            raise answer
+        return answer(config.out_dir) if callable(answer) else answer
+
+    @property
+    def hooks(self) -> Hooks:
+        return Hooks(lambda *progress: self.said.append(progress), self.said.append)
+
+
+@pytest.fixture
+def runs(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Runs]:
+    def made(*answers: Any) -> Runs:
+        double = Runs(list(answers))
+        monkeypatch.setattr(run_job, "run_avatar", double)
+        return double
+
+    return made
+
+
+def go(runs: Runs, target: Path, plan: Plan | None = None, made: Mapping[str, Any] | None = None) -> Outcome:
+    starter: Any = "the starter"
+    return run_to_folder(checked(), target, plan or Plan(), runs.hooks, machine=MACHINE, made=made, starter=starter)
+
+
+def test_a_run_and_its_baseline(runs: Callable[..., Runs], tmp_path: Path) -> None:
+    """The baseline is of at most so many frames, one at a time, without a latch, and leaves no picture."""
+    double = runs(a_result(), a_result(4, "sequential"))
+    outcome = go(double, tmp_path / "run", Plan("deadline", 4, latch_ms=3.0), MADE)
+    assert (outcome.exit_code, outcome.folder) == (0, tmp_path / "run")
+    first, second = double.calls
+    assert [(call["policy"], call["frames"], call["latch_ms"]) for call in double.calls] == [
+        ("deadline", None, 3.0),
+        ("sequential", 4, 0.0),
+    ]
+    assert second["config"].out_dir == first["config"].out_dir / "sequential"
+    assert first["config"].out_dir.name.endswith(".partial")
+    assert first["config"].model_copy(update={"out_dir": Path("/nowhere")}) == checked().config
+    assert (first["starter"], first["governor"], first["assets"]) == ("the starter", None, {})
+    assert double.said == [("deadline", 2, 5), "hello", ("sequential", 2, 5), "hello"]
+    assert sorted(file.name for file in outcome.folder.iterdir()) == ["events.jsonl", "report.json", "trace.pftrace"]
+    report = read_report(outcome.folder)
+    assert report == outcome.report
+    assert (report.frames.presented, report.policy) == (FRAMES, "pipelined")
+    assert report.baseline is not None
+    assert (report.baseline.policy, report.baseline.frames.presented) == ("sequential", 4)
+    assert report.baseline.frame_time_ms.mean == 10.0
+
+
+def test_what_the_report_says_of_a_run(runs: Callable[..., Runs], tmp_path: Path) -> None:
+    outcome = go(runs(a_result(), a_result(FRAMES, "sequential")), tmp_path / "run", made=MADE)
+    document = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert document["schema"] == 1
+    assert document["clock"] == "host"
+    assert document["machine"] == {**MACHINE, "gl": None}
+    assert document["made"] == MADE
+    assert "out_dir" not in document["config"]
+    assert document["config"]["policy"] == "pipelined"
+    assert document["config"]["scene"]["frames"] == FRAMES
+    assert document["plan"] == {"tensor_shapes": [[64, 64]]}
+    assert document["caps"] == {"how": "none: every unit works as much as its cores and threads allow"}
+    assert set(document["temperature_c"]) == {"sensor"}
+    assert document["pids"] == {"cpu": 11, "gpu": 12, "dsp": 13}
+    assert document["startup_ms"] == {"cpu": 1.5}
+    assert document["figures"] == {"pose": {"visible": 0.5}}
+    assert document["messages"] == ["the unit gpu was slow"]
+    assert document["notes"] == ["the motion is short", "runtime: ort"]
+    assert document["accuracy"] == {"someone": {"source": "no figures"}}
+    assert (document["interrupted"], document["failure"]) == (False, None)
+    assert (document["video"], document["checksum"]) == (None, None)
+    assert "pace" not in document
+    assert document["frame_time_ms"]["mean"] == 4.0
+    assert document["baseline"]["fps"] == pytest.approx(100.0)
+    assert document["sources"] == {
+        **dict.fromkeys(("frames", "duration_s", "frame_time_ms", "latency_ms", "fps", "deadline_misses"), MEASURED),
+        **dict.fromkeys(("xrbench", "stages", "units", "isolated_ms", "startup_ms", "figures", "baseline"), MEASURED),
+        **dict.fromkeys(("caps", "temperature_c"), COMPUTED),
+        **({"temperature_c.sensor": MEASURED} if document["temperature_c"]["sensor"] is not None else {}),
+        "accuracy.someone": "no figures",
+    }
+    text = (tmp_path / "run" / "report.json").read_text()
+    assert text.startswith('{\n "schema": 1,\n') and text.endswith("}\n")
+    assert outcome.report.made is not None and outcome.report.made.at == MADE["at"]
+
+
+@pytest.mark.parametrize("plan", [Plan(baseline_frames=0), Plan("sequential")])
+def test_no_baseline_where_none_is_asked_for_or_the_run_is_one(
+    plan: Plan, runs: Callable[..., Runs], tmp_path: Path
+) -> None:
+    double = runs(a_result())
+    outcome = go(double, tmp_path / "run", plan)
+    assert (len(double.calls), outcome.report.baseline, outcome.exit_code) == (1, None, 0)
+
+
+def test_a_baseline_has_no_more_frames_than_the_scene(runs: Callable[..., Runs], tmp_path: Path) -> None:
+    double = runs(a_result(), a_result(policy="sequential"))
+    go(double, tmp_path / "run", Plan(baseline_frames=1000))
+    assert double.calls[1]["frames"] == FRAMES
+
+
+STOPPED = "interrupted: the sequential run to compare with is left out"
+FAILED = "the sequential run to compare with failed and is left out: no memory"
+BASELINES = {
+    "interrupted before a frame": (KeyboardInterrupt(), STOPPED, 130),
+    "failed": (TrilaneError("no memory"), FAILED, 0),
+    "interrupted": (a_result(3, "sequential", interrupted=True), None, 130),
+    "cut short": (a_result(3, "sequential", failure=Failure("the unit gpu is gone")), None, 0),
+    "without a frame": (a_result(3, "sequential", presented=0, interrupted=True), STOPPED, 130),
+}
+
+
+@pytest.mark.parametrize("case", BASELINES)
+def test_a_baseline_that_is_not_whole_is_left_out(case: str, runs: Callable[..., Runs], tmp_path: Path) -> None:
+    answer, said, code = BASELINES[case]
+    double = runs(a_result(), answer)
+    outcome = go(double, tmp_path / "run")
+    assert (outcome.exit_code, outcome.report.baseline) == (code, None)
+    assert double.said[4:] == ([said] if said else [])
+    assert sorted(file.name for file in outcome.folder.iterdir()) == ["events.jsonl", "report.json", "trace.pftrace"]
+
+
+RUNS = {
+    "interrupted": (a_result(interrupted=True), 130, None),
+    "failed": (a_result(failure=Failure("the unit gpu is gone", 3)), 3, "the unit gpu is gone"),
+    "both": (a_result(failure=Failure("late", 1), interrupted=True), 130, "late"),
+}
+
+
+@pytest.mark.parametrize("case", RUNS)
+def test_a_run_cut_short_keeps_its_frames_and_has_no_baseline(
+    case: str, runs: Callable[..., Runs], tmp_path: Path
+) -> None:
+    answer, code, failure = RUNS[case]
+    double = runs(answer)
+    outcome = go(double, tmp_path / "run")
+    assert (outcome.exit_code, len(double.calls)) == (code, 1)
+    assert (outcome.report.failure, outcome.report.interrupted) == (failure, answer.interrupted)
+
+
+NO_FRAME = {
+    "failed": (a_result(presented=0, failure=Failure("no context", 3)), "no context", 3),
+    "unknown": (
+        a_result(presented=0, messages=("first", "second")),
+        "no frame was presented: first; second",
+        TrilaneError.exit_code,
+    ),
+}
+
+
+@pytest.mark.parametrize("case", NO_FRAME)
+def test_a_run_without_a_frame_leaves_no_folder(case: str, runs: Callable[..., Runs], tmp_path: Path) -> None:
+    answer, said, code = NO_FRAME[case]
+    with pytest.raises(TrilaneError) as raised:
+        go(runs(answer), tmp_path / "run")
+    assert (str(raised.value), raised.value.exit_code) == (said, code)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interrupt_before_the_first_frame_is_one(runs: Callable[..., Runs], tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        go(runs(a_result(presented=0, interrupted=True)), tmp_path / "run")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_taken_place_is_refused_before_anything_runs(runs: Callable[..., Runs], tmp_path: Path) -> None:
+    double = runs()
+    with pytest.raises(BadInputError, match="a name that is free"):
+        go(double, tmp_path)
+    assert double.calls == []
+
+
+def test_a_run_at_a_chips_pace_is_compared(runs: Callable[..., Runs], tmp_path: Path) -> None:
+    pace = Pace("chip", "burst", 2.0, STAGE_NS)
+    report = go(runs(a_result(), a_result(policy="sequential")), tmp_path / "run", Plan(pace=pace)).report
+    assert report.pace is not None
+    assert (report.pace.profile, report.pace.virtual_ms, report.pace.ratio) == ("chip", 4.0, 1.0)
+    assert (report.sources["pace"], report.sources["pace.ratio"]) == (COMPUTED, COMPARED)
+
+
+def test_a_cap_is_kept_by_a_governor_of_this_machine(runs: Callable[..., Runs], tmp_path: Path) -> None:
+    caps = {"how": "duty cycles", "profile": "host", "performance_profile": "balanced"}
+    capped = a_result()
+    capped = replace(
+        capped,
+        report=metrics_of({**capped.report.as_json(), "caps": caps, "temperature_c": {"kind": "modelled"}}),
+    )
+    double = runs(capped, a_result(policy="sequential"))
+    report = go(double, tmp_path / "run", Plan(performance_profile=PerformanceProfile.BALANCED)).report
+    governors = [call["governor"] for call in double.calls]
+    assert all(isinstance(governor, Governor) for governor in governors) and governors[0] is not governors[1]
+    assert report.caps.as_json() == caps
+    assert report.temperature_c.kind == "modelled" and "sensor" in report.temperature_c.as_json()
+
+
+def test_the_video_is_joined_and_what_it_lacks_is_told(runs: Callable[..., Runs], tmp_path: Path) -> None:
+    """Five of six frames recorded at 25 a second, the last of them number 4."""
+
+    def recorded(out_dir: Path) -> RunResult:
+        record(out_dir, range(2))
+        record(out_dir, range(2, 5))
+        return a_result(metrics={"pose": {"visible": 0.0}})
+
+    double = runs(recorded)
+    outcome = go(double, tmp_path / "run", Plan(baseline_frames=0))
+    assert outcome.report.video is not None
+    assert (outcome.report.video.frames, outcome.report.video.seconds) == (5, pytest.approx(0.2))
+    assert len(outcome.report.checksum or "") == 64
+    assert double.said[2:] == [
+        "video.mp4 holds 5 of 6 frames: a writer was killed before its last",
+        "no avatar was in the picture in any frame",
+    ]
+    files = {file.name for file in outcome.folder.iterdir()}
+    assert files == {"contact.png", "events.jsonl", "report.json", "trace.pftrace", "video.mp4"}
+    assert SEGMENTS not in files
+
+
+def test_a_whole_video_is_worth_no_word(runs: Callable[..., Runs], tmp_path: Path) -> None:
+    def recorded(out_dir: Path) -> RunResult:
+        record(out_dir, range(FRAMES))
+        return a_result()
+
+    double = runs(recorded)
+    assert go(double, tmp_path / "run", Plan(baseline_frames=0)).report.sources["video"] == MEASURED
+    assert double.said[2:] == []

@@ -1,0 +1,227 @@
+"""The table of a run: every line of it, from reports that were written by hand."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from trilane.apps.cli.run_table import run_table
+from trilane.apps.report import Report
+from trilane.figure_sources import NO_FIGURES
+from trilane.testing.run_report import SHARE, SHOWN, TIMES, make_report
+
+
+def table_text(report: dict[str, Any]) -> str:
+    """The table as it is printed, each line without its frames and double spaces."""
+    from rich.console import Console
+
+    console = Console(width=400, record=True, file=io.StringIO())
+    console.print(run_table(Report.model_validate(report)))
+    return "\n".join(" ".join(line.replace("│", " ").split()) for line in console.export_text().splitlines())
+
+
+def test_the_table_shows_both_policies_and_dashes_what_was_not_measured() -> None:
+    text = table_text(make_report())
+    for expected in (
+        "pipelined, 3 frames",
+        "sequential, 3 frames",
+        "20.0 + 20.0",
+        "50 / 25 15 0 2 8",
+        "CPU time of cpu, gpu, %",
+        "0.91",
+        "stages, units, times, rates: measured in this run",
+        "PSNR on held-out views, dB: face 31.2; of the body alone 28.8; worst of 96 views (seeds 1, 2) 21.5; mask IoU",
+        "0.981 (from the avatar's validation of 2026-01-02, on ort at tensor size 256)",
+    ):
+        assert expected in " ".join(text.split())
+    efficiency = next(line for line in text.splitlines() if "efficiency" in line)
+    assert "–" in efficiency
+
+
+@pytest.mark.parametrize(
+    ("samples", "marked"), [(None, ()), (28, ("p90", "p95", "p99")), (58, ("p95", "p99")), (298, ("p99",)), (299, ())]
+)
+def test_a_percentile_of_too_few_frames_is_marked(samples: int | None, marked: tuple[str, ...]) -> None:
+    report = make_report()
+    report["latency_ms"] = {**TIMES, "samples": samples}
+    text = table_text(report | {"baseline": None})
+    rows = text[text.index("latency mean") :].splitlines()[1:6]
+    assert {row.split(",")[0] for row in rows if row.endswith("*")} == set(marked)
+    assert ("* of too few frames: p90 needs 29, p95 needs 59, p99 needs 299" in text) == bool(marked)
+
+
+def test_mean_and_rate_stand_with_their_interval_or_as_too_short() -> None:
+    known = make_report(fps_low=48.0, fps_high=52.25)
+    known["frame_time_ms"] = {**known["frame_time_ms"], "mean_low": 19.14, "mean_high": 20.83}
+    text = table_text(known | {"baseline": None})
+    assert "frame time mean, ms 20.0 (19.1 to 20.8)" in text
+    assert "rate frames per second 50.0 (48.0 to 52.2)" in text
+    short = table_text(make_report(baseline=None))
+    assert "frame time mean, ms 20.0 (too short to tell)" in short
+    assert "rate frames per second 50.0 (too short to tell)" in short
+
+
+def test_a_cap_is_said_once_and_apart_from_what_heat_did() -> None:
+    """63 % of the time throttled by the duty that was asked for, none of it for heat: no line says throttled 0 %."""
+    cap = {"corner": "svs2", "duty": 0.37, "duty_mean": 0.37}
+    caps = {"how": "x", "performance_profile": "low_power_saver", "units": {"dsp": cap}, "throttled_share": 0.0}
+    idle = {"starved": 0.07, "blocked": 0.0, "throttled": 0.63, "preempted": 0.0, "overhead": 0.0}
+    share = {**SHARE, "busy": 0.3, "idle": idle}
+    text = table_text(make_report(caps=caps, units={"dsp": share}, baseline=None)).replace("\n", " ")
+    assert "30 / 7 0 63 0 0" in text
+    assert "duty cycles dsp 37%, which is the most that units may work; lowered further for heat 0% of the time" in text
+    assert text.count("throttled") == 1  # the column
+
+
+def test_the_table_says_when_and_by_what_it_was_made() -> None:
+    made = {**MADE, "revision": "0123456789abcdef", "modified": True}
+    assert "2026-11-22T01:00:00+00:00: trilane 0.1.0 at 0123456789, modified" in table_text(make_report(made=made))
+    elsewhere = {**made, "revision": None, "modified": None}
+    assert "2026-11-22T01:00:00+00:00: trilane 0.1.0\n" in table_text(make_report(made=elsewhere))
+
+
+NO_ONES = {"source": NO_FIGURES, "changed": ["texture"], "why": "changed since the validation: [red]the texture[/red]"}
+
+
+@pytest.mark.parametrize(
+    ("facts", "why"),
+    [
+        (NO_ONES, NO_ONES["why"]),
+        (
+            {key: value for key, value in SHOWN.items() if key != "source"},
+            "the report does not say where they come from",
+        ),
+        ({}, "the report does not say where they come from"),
+    ],
+)
+def test_the_table_says_why_there_are_no_figures_and_shows_none(facts: dict[str, Any], why: str) -> None:
+    text = " ".join(table_text(make_report(accuracy={"someone": facts})).split())
+    assert f"avatar someone: no figures of accuracy: {why}" in text
+    assert "31.2" not in text and "0.981" not in text
+
+
+MADE = {
+    "at": "2026-11-22T01:00:00+00:00",
+    "command": ["trilane"],
+    "trilane": "0.1.0",
+    "revision": None,
+    "modified": None,
+}
+CAP = {"corner": "svs", "duty": 0.5, "duty_mean": 0.45}
+PACE = {
+    "profile": "snapdragon-888",
+    "performance_profile": "burst",
+    "slow_motion": 4.0,
+    "stage_ms": {"infer": 12.0},
+    "host_slower": {"infer": 2, "pose": 1},
+    "late_frames": [3],
+    "virtual_ms": 21.5,
+    "measured_ms": 21.75,
+    "compared_share": 0.5,
+    "ratio": 1.0116,
+}
+
+
+def everything() -> dict[str, Any]:
+    """A report that has everything there is to say."""
+    caps = {
+        "how": "x",
+        "performance_profile": "balanced",
+        "units": {"dsp": CAP, "gpu": {**CAP, "duty_mean": 0.5}},
+        "throttled_share": 0.25,
+    }
+    temperature = {"sensor": None, "kind": "modelled", "device_end": 30.0, "device_max": 31.0, "junction_max": 44.5}
+    others = {name: SHOWN | {"source": NO_FIGURES, "why": f"the {name} was changed"} for name in ("body", "texture")}
+    return make_report(
+        made=MADE,
+        caps=caps,
+        pace=PACE,
+        temperature_c=temperature,
+        fps_low=48.0,
+        fps_high=52.0,
+        accuracy={"someone": SHOWN, **others},
+    )
+
+
+def least() -> dict[str, Any]:
+    """One frame without a baseline, of which nothing more is known than of any."""
+    report = make_report(baseline=None, accuracy={}, core_shares=[], efficiency=None, deadline_misses=4)
+    report["frames"] = {"requested": 5, "presented": 1, "lost": 2, "lost_by_cause": {"died:gpu": 2}, "dropped": {}}
+    idle = {**SHARE["idle"], "preempted": None}
+    report["units"] = {"dsp": {**SHARE, "idle": idle}, "cpu": {**SHARE, "cores": [0]}}
+    made = {**MADE, "trilane": None, "revision": "0123456789abcdef", "modified": False}
+    pace = {**PACE, "slow_motion": 1.0, "host_slower": {}, "measured_ms": None, "ratio": None}
+    gl = {"vendor": "v", "renderer": "a [driver]", "version": "4", "hardware": True, "limits": {}}
+    return report | {"made": made, "pace": pace, "machine": {**report["machine"], "gl": gl}}
+
+
+def unlike() -> dict[str, Any]:
+    """A run of three stages and units whose baseline has other figures, one stage, unit and set of cores less."""
+
+    def times(base: float) -> dict[str, float]:
+        return {name: base + place for place, name in enumerate(("mean", "p50", "p90", "p95", "p99", "max"))}
+
+    def run(base: float, names: tuple[str, ...], lost: int, dropped: dict[str, int]) -> dict[str, Any]:
+        units = dict(zip(("cpu", "gpu", "dsp"), names, strict=False))
+        return {
+            "frames": {
+                "requested": 400,
+                "presented": 300 + lost,
+                "lost": lost,
+                "lost_by_cause": {},
+                "dropped": dropped,
+            },
+            "frame_time_ms": {**times(base), "samples": 299, "ema20_min": 1.0, "ema20_max": 2.0, "jitter": 0.5}
+            | {"mean_low": base - 0.25, "mean_high": base + 0.25},
+            "latency_ms": {**times(base + 30), "samples": 300},
+            "fps": 1000 / base,
+            "fps_low": 10.0 + lost,
+            "fps_high": 20.0 + lost,
+            "deadline_misses": 10 + lost,
+            "stages": {
+                name: {"unit": unit, "service_ms": times(base + 40 + len(name)), "wait_ms": times(base + 50)}
+                for unit, name in units.items()
+            },
+            "units": {unit: {**SHARE, "busy": base / 100, "cores": [0, len(unit)]} for unit in units},
+            "core_shares": [
+                {"cores": list(range(cores + 1)), "units": list(units)[: cores + 1], "cpu": base / 50, "busy": 0.75}
+                for cores in range(len(names) - 1)
+            ],
+            "efficiency": base / 20,
+        }
+
+    first = run(11.25, ("pose", "raster", "infer"), 3, {"pose->raster:stale": 4, "raster->infer:late": 5})
+    second = run(17.5, ("pose", "raster"), 0, {})
+    return make_report(**first, policy="latest", baseline={"policy": "sequential", **second})
+
+
+@pytest.mark.parametrize(("name", "make"), [("", everything), ("-least", least), ("-unlike", unlike)])
+def test_the_whole_table_is_as_it_was(
+    name: str, make: Callable[[], dict[str, Any]], check_printed: Callable[[str, str], None]
+) -> None:
+    """Every line, in printed/run-table*.txt."""
+    check_printed(f"run-table{name}", table_text(make()))
+
+
+def test_figures_stand_to_the_right_and_words_to_the_left() -> None:
+    table = run_table(Report.model_validate(make_report()))
+    assert [column.justify for column in table.columns] == ["left", "left", "right", "right"]
+    assert [column.header for column in table.columns[:2]] == ["", ""]
+    assert (table.title_justify, table.caption_justify) == ("left", "left")
+
+
+def test_rows_of_one_kind_stand_together() -> None:
+    """A line is drawn below the stages, the units, the cores, the times and the rates."""
+    table = run_table(Report.model_validate(make_report()))
+    assert [place for place, row in enumerate(table.rows) if row.end_section] == [0, 1, 2, 14, 18]
+
+
+def test_no_line_of_marks_when_no_percentile_is_marked() -> None:
+    text = table_text(unlike())
+    assert "of too few frames" not in text and "*" not in text
+    report = unlike()
+    report["baseline"]["latency_ms"]["samples"] = 28
+    assert "* of too few frames: p90 needs 29, p95 needs 59, p99 needs 299" in table_text(report)

@@ -1,0 +1,326 @@
+"""A whole run on a clock of virtual time: its steps in order, what it reports, and what goes wrong around its loop."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from trilane.errors import BadInputError
+from trilane.pipeline import accounts, run
+from trilane.pipeline.cpu_use import CpuTimes
+from trilane.pipeline.requests import FrameRequestQueue
+from trilane.pipeline.result import RunResult
+from trilane.pipeline.run_log import UnitError
+from trilane.scheduler.causes import Outcome, OutcomeKind
+from trilane.scheduler.events import Settings
+from trilane.scheduler.stats import energy_score
+from trilane.scheduler.virtual import VirtualDriver
+from trilane.testing.small_pipeline import pipeline
+from trilane.transport.messages import Done
+
+MS = 1_000_000
+STAGE_NS = {"in": MS, "mid": 4 * MS, "out": MS}
+PIPELINE = pipeline().with_rule("double")
+
+
+@dataclass
+class World:
+    """In place of everything round a run; `steps`: what it did, in order. What is `told` changes it."""
+
+    steps: list[Any] = field(default_factory=list)
+    told: dict[str, Any] = field(default_factory=dict)
+    count: int = 0
+    core: Any = None
+
+    # The parts that a run is made of.
+    def processes(self, given: Any, assets: Any, starter: Any) -> Any:
+        self.steps.append(("processes", given is PIPELINE, assets, starter))
+        pids = {"left": 11, "right": 12}
+        return contextlib.nullcontext(SimpleNamespace(pids=pids, why_ended=lambda unit: f": {unit} is broken"))
+
+    def clock(self, core: Any, _processes: Any, _interrupts: Any, log: Any, *others: Any) -> Any:
+        self.core, self.log, self.others = core, log, others
+        driver = VirtualDriver(core.graph, core.settings, lambda stage, *_: STAGE_NS[stage], keep=True)
+        driver.core = core
+        self.driver = driver
+        cpu = CpuTimes({"left": 2, "right": 2})
+        for number in range(4):
+            cpu.add("right", "mid", Done(number, 0, 0, 0, 0, 0, 0, 3 * MS, 0, {}), 0)
+        metrics = {"mid": Counter({"visible": 12.0}), "none": Counter({"x": 5.0})}
+        return SimpleNamespace(
+            cpu=cpu, jobs=driver.jobs, metrics=metrics, finish=lambda: self.steps.append("finish"), driver=driver
+        )
+
+    def run_loop(self, core: Any, clock: Any, recording: Any) -> Outcome:
+        self.steps.append("loop")
+        outcome = run_loop(core, clock.driver, recording)
+        self.count = self.told.get("interrupts", 0)
+        return self.told.get("outcome", outcome)
+
+    def isolated(self, *_: Any) -> Any:
+        def measure(frames: list[int]) -> None:
+            self.steps.append(("measure", frames))
+            if "loop" in self.steps and "broken" in self.told:
+                raise self.told["broken"]
+
+        return SimpleNamespace(measure=measure, mean_ns={"in": MS, "mid": 3 * MS})
+
+    def start(self, _processes: Any, units: Any, _interrupts: Any) -> dict[str, float]:
+        self.steps.append(("start", tuple(units)))
+        return {"left": 1.5, "right": 2.5}
+
+    def close(self, *_: Any) -> None:
+        self.steps.append("close")
+
+
+run_loop = run.run_loop
+
+
+@pytest.fixture
+def world(monkeypatch: pytest.MonkeyPatch) -> World:
+    world = World()
+
+    @contextlib.contextmanager
+    def awake(prompt: bool) -> Iterator[str]:
+        world.steps.append(("awake", prompt))
+        yield "kept awake"
+
+    @contextlib.contextmanager
+    def interrupts() -> Iterator[Any]:
+        yield world
+
+    @contextlib.contextmanager
+    def on_cores(cores: Any) -> Iterator[None]:
+        world.steps.append(("cores", cores))
+        yield
+
+    for name, part in (
+        ("check_cores", lambda given: world.steps.append(("check cores", given is PIPELINE))),
+        ("check_open_files", lambda: world.steps.append("check files")),
+        ("refuse_in_a_unit", lambda: world.steps.append("refuse")),
+        ("_on_cores", on_cores),
+        ("_processes", world.processes),
+        ("_prompt_answers", contextlib.nullcontext),
+        ("awake", awake),
+        ("Interrupts", interrupts),
+        ("RealtimeClock", world.clock),
+        ("IsolatedTimes", world.isolated),
+        ("run_loop", world.run_loop),
+        ("start_units", world.start),
+        ("close_units", world.close),
+    ):
+        monkeypatch.setattr(run, name, part)
+    monkeypatch.setattr(accounts, "counts_run_delay", lambda: True)
+    return world
+
+
+def go(frames: int = 60, **options: Any) -> RunResult:
+    return run.run_pipeline(PIPELINE, frames, **options)
+
+
+def test_the_steps_of_a_run_and_its_report(world: World) -> None:
+    """Four frames of 60 are measured alone, two before and two after; the slowest unit takes 4 ms a frame."""
+    result = go(assets={"a": 1}, starter="starter")
+    assert world.steps == [
+        *("refuse", "check files", ("check cores", True), ("cores", PIPELINE.scheduler_cores), ("awake", True)),
+        ("processes", True, {"a": 1}, "starter"),
+        ("start", ("left", "right")),
+        *(("measure", [0, 30]), "loop", "finish", ("measure", [15, 45]), "close"),
+    ]
+    assert (result.requested, result.presented, result.lost, result.dropped) == (60, 60, {}, {})
+    assert (result.pids, result.startup_ms) == ({"left": 11, "right": 12}, {"left": 1.5, "right": 2.5})
+    assert (len(result.jobs), result.messages, result.interrupted, result.failure) == (180, (), False, None)
+    assert result.metrics == {"mid": {"visible": 0.2}, "none": {"x": 5.0}}
+    assert result.recording.steps and result.recording.settings == Settings(60, "pipelined", hang_ns=10_000_000_000)
+    report = result.report
+    assert (report.clock, report.policy, report.edge, report.idle_cores) == (
+        "host",
+        "pipelined",
+        "double",
+        "kept awake",
+    )
+    assert report.frame_time_ms.mean == 4.0
+    assert (report.deadline_misses, report.isolated_ms) == (0, {"in": 1.0, "mid": 3.0})
+    assert (report.efficiency, report.bottleneck) == (0.75, "right")
+    left, right = report.units["left"], report.units["right"]
+    assert (left.pid, left.cores, left.threads, left.spin) == (11, (1, 0), 2, False)
+    assert (right.pid, right.cores, right.threads, right.spin) == (12, (3, 1), 1, True)
+    assert (left.cpu_s, right.cpu_s, right.cpu_in_jobs_s) == (0.0, 0.012, 0.012)
+    assert report.stages["mid"].cpu_ms is not None and report.stages["mid"].cpu_ms.mean == 3.0
+    assert [(row.cores, row.units) for row in report.core_shares] == [
+        ((0, 1), ("left",)),
+        ((1, 3), ("right",)),
+        ((0, 1, 3), ("left", "right")),
+    ]
+    assert report.core_shares[1].cpu == pytest.approx(0.012 / (2 * report.duration_s))
+    assert report.accounts is not None and report.accounts.agree
+    assert (report.caps, report.xrbench.energy) == (None, None)
+
+
+def test_a_frame_time_above_the_rates_is_a_missed_deadline(world: World) -> None:
+    """4 ms a frame; at 251 frames a second each may take 3.98."""
+    assert go(fps=251.0).report.deadline_misses == 59
+    assert go(fps=250.0).report.deadline_misses == 0
+    assert world.core.settings.deadline_ns == 0
+
+
+@pytest.mark.parametrize(
+    ("frames", "isolated", "measured"), [(3, 0, ([0], [])), (3, None, ([0, 2], [1])), (9, 1, ([0], []))]
+)
+def test_how_many_frames_are_measured_alone(world: World, frames: int, isolated: int | None, measured: Any) -> None:
+    result = go(frames, isolated_frames=isolated)
+    before, after = measured
+    found = [step[1] for step in world.steps if step[0] == "measure"]
+    assert found == ([before, after] if after else [before])
+    assert (result.report.efficiency is None) == (isolated == 0)
+
+
+def test_a_governor_is_reported_with_its_energy(world: World) -> None:
+    """2 W at 250 frames a second are 8 mJ a frame."""
+    temperature = {"kind": "modelled"}
+    governor: Any = SimpleNamespace(
+        is_prompt=False, power_w=2.0, report=lambda: {"caps": {"how": "told"}, "temperature_c": temperature}
+    )
+    report = go(governor=governor).report
+    assert ("awake", False) in world.steps
+    assert report.caps is not None and report.caps.how == "told"
+    assert report.temperature_c is not None and report.temperature_c.kind == "modelled"
+    assert report.xrbench.energy == pytest.approx(energy_score(8.0))
+    governor.power_w = None
+    assert go(governor=governor).report.xrbench.energy is None
+    governor.power_w = 2.0
+    assert go(1, governor=governor).report.xrbench.energy is None  # one frame has no rate
+
+
+def test_what_a_clock_is_given(world: World) -> None:
+    governor: Any = SimpleNamespace(is_prompt=True, power_w=None, report=dict)
+    progress: Any = "progress"
+    go(governor=governor, on_progress=progress)
+    assert world.others == (None, governor, "progress")
+
+
+def test_a_run_that_was_interrupted_says_so(world: World) -> None:
+    world.told = {"outcome": Outcome(OutcomeKind.STOPPED), "interrupts": 1}
+    result = go()
+    assert result.interrupted
+    assert [step for step in world.steps if step == "close" or step[0] == "measure"] == [("measure", [0, 30]), "close"]
+    world.told["interrupts"] = 0
+    assert not go().interrupted  # it was its requests' end that stopped it
+
+
+def test_a_run_that_was_aborted_closes_nothing(world: World) -> None:
+    world.told = {"outcome": Outcome(OutcomeKind.ABORTED), "interrupts": 2}
+    assert go().interrupted
+    assert "close" not in world.steps
+
+
+def test_a_unit_that_cannot_be_kept_alive_is_named(world: World) -> None:
+    world.told = {"outcome": Outcome(OutcomeKind.GAVE_UP, "right"), "interrupts": 1}
+    result = go()
+    assert result.failure is not None
+    assert result.failure.message == "unit right could not be kept alive: right is broken"
+    assert not result.interrupted
+    assert world.steps[-1] == "close" and ("measure", [15, 45]) not in world.steps
+
+
+LEFT_OUT = "the measurement after the run was left out: "
+
+
+@pytest.mark.parametrize(("error", "said"), [(UnitError("it broke"), "it broke"), (KeyboardInterrupt(), "interrupted")])
+def test_what_goes_wrong_after_the_run_leaves_its_result(world: World, error: BaseException, said: str) -> None:
+    world.told = {"broken": error}
+    heard: list[str] = []
+    result = go(on_message=heard.append)
+    assert result.messages == (LEFT_OUT + said,) and heard == [LEFT_OUT + said]
+    assert (result.failure, result.presented, world.steps[-1]) == (None, 60, "close")
+
+
+@pytest.mark.parametrize("spoils", ["failure", "unit"])
+def test_nothing_is_measured_after_a_run_that_failed(
+    world: World, monkeypatch: pytest.MonkeyPatch, spoils: str
+) -> None:
+    def looped(core: Any, clock: Any, recording: Any) -> Outcome:
+        outcome = world.run_loop(core, clock, recording)
+        if spoils == "failure":
+            world.log.fail("a stage failed")
+        else:
+            core.units["left"].account = None
+            monkeypatch.setattr(type(core.units["left"]), "is_ready", property(lambda unit: unit.name != "left"))
+        return outcome
+
+    monkeypatch.setattr(run, "run_loop", looped)
+    go()
+    assert ("measure", [15, 45]) not in world.steps
+
+
+def test_settings_that_make_no_sense(world: World) -> None:
+    with pytest.raises(BadInputError, match=r"^the run's settings: found policy 'warp', expected one of"):
+        go(policy="warp")
+    with pytest.raises(BadInputError, match="frames: found 0"):
+        go(0)
+    assert "start" not in [step[0] for step in world.steps]
+
+
+def test_settings_reach_the_core(world: World) -> None:
+    go(3, policy="deadline", fps=50.0, latch_ms=2.5, hang_ns=7 * MS * 1000)
+    settings = world.core.settings
+    assert (settings.period_ns, settings.deadline_ns, settings.latch_ns) == (20 * MS, 60 * MS, 2_500_000)
+    assert settings.hang_ns == 7 * MS * 1000
+    go(3, pace_fps=100.0)
+    assert (world.core.settings.policy, world.core.settings.period_ns) == ("pipelined", 10 * MS)
+
+
+def test_frames_that_will_not_come_are_told_once() -> None:
+    told: list[Any] = []
+    queue = FrameRequestQueue(lambda _: None, lambda: None, told.append)
+    for causes in ({}, {"raster->infer:stale": 1}, {"raster->infer:stale": 2}):
+        queue.tell_unanswered(causes)
+    queue.close()
+    assert told == [{"raster->infer:stale": 1}]
+
+
+def test_memory_and_processes_are_closed_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Units first, then the slots, the assets and, where the run made it, the fork server."""
+    steps: list[Any] = []
+
+    def part(name: str) -> Any:
+        @contextlib.contextmanager
+        def entered(*arguments: Any) -> Iterator[str]:
+            steps.append((name, *arguments))
+            yield name
+            steps.append(f"{name} closed")
+
+        return entered
+
+    class Units:
+        def __init__(self, *arguments: Any) -> None:
+            steps.append(("units", *arguments))
+
+        def close(self) -> None:
+            steps.append("units closed")
+
+    monkeypatch.setattr(run, "UnitStarter", part("server"))
+    monkeypatch.setattr(run, "edge_regions", part("regions"))
+    monkeypatch.setattr(run, "UnitProcesses", Units)
+    monkeypatch.setattr(run, "share_assets", lambda assets: steps.append(("assets", assets)) or 77)
+    monkeypatch.setattr(os, "close", lambda fd: steps.append(("close", fd)))
+    assets: Any = {"a": 1}
+    with run._processes(PIPELINE, assets, None) as processes:
+        steps.append("inside")
+    assert isinstance(processes, Units)
+    made = [("assets", assets), ("regions", PIPELINE)]
+    ended = ["inside", "units closed", "regions closed", ("close", 77)]
+    begun = [("server", PIPELINE.preload), *made, ("units", PIPELINE, "regions", 77, "server")]
+    assert steps == [*begun, *ended, "server closed"]
+    steps.clear()
+    starter: Any = "mine"
+    with run._processes(PIPELINE, assets, starter):
+        steps.append("inside")
+    assert steps == [*made, ("units", PIPELINE, "regions", 77, "mine"), *ended]

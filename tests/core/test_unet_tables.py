@@ -1,0 +1,100 @@
+"""The encoders' tables against what is published of the networks: parameters, multiply-accumulates, activations."""
+
+from __future__ import annotations
+
+import pytest
+
+from trilane.unet_tables import (
+    DECODER,
+    ENCODERS,
+    HEADS,
+    MOBILE_ENCODERS,
+    NORM_GROUPS,
+    NORMS,
+    RESNET18_STAGES,
+    RESNET18_STEM,
+    MobileEncoder,
+    squeeze_channels,
+)
+
+SIDE = 224  # pixels, for which the work is published
+
+
+def conv(kernel: int, c_in: int, c_out: int, side: int, groups: int = 1) -> tuple[int, int]:
+    """Parameters of a convolution with its batch norm, and multiply-accumulates on `side` x `side` pixels."""
+    weights = kernel * kernel * c_in // groups * c_out
+    return weights + 2 * c_out, weights * side * side
+
+
+def work_of(encoder: MobileEncoder, last: int) -> tuple[int, int]:
+    """Parameters and multiply-accumulates up to a last 1x1 convolution of `last` channels, by the papers' blocks."""
+    side, channels = SIDE // 2, encoder.stem
+    parts = [conv(3, 3, channels, side)]
+    for row in encoder.rows:
+        if row.expanded != channels:
+            parts.append(conv(1, channels, row.expanded, side))
+        side //= row.stride
+        parts.append(conv(row.kernel, row.expanded, row.expanded, side, row.expanded))
+        if row.squeeze:
+            inner = squeeze_channels(row.expanded)
+            parts.append((2 * row.expanded * inner + row.expanded + inner, 2 * row.expanded * inner))
+        parts.append(conv(1, row.expanded, row.channels, side))
+        channels = row.channels
+    parts.append(conv(1, channels, last, side))
+    assert side == SIDE // 32
+    return sum(part[0] for part in parts), sum(part[1] for part in parts)
+
+
+#: Of the published network: channels of its last layer, its parameters and those of its classifier, and million
+#: multiply-accumulates (of the whole network: the papers' Table 4, Table 3, and the table of EfficientNet-Lite).
+PUBLISHED = {
+    "mobilenetv2": (1280, 3_504_872, 1_281_000, 300),
+    "mobilenetv3": (960, 5_483_032, 960 * 1280 + 1280 + 1_281_000, 219),
+    "efficientnet-lite0": (1280, 4_652_008, 1_281_000, 407),
+}
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_parameters_and_work_are_the_published_ones(name: str) -> None:
+    """But for one squeeze of MobileNetV3: of 72 channels the published one keeps 24, where a quarter is near 16."""
+    last, parameters, classifier, mega_macs = PUBLISHED[name]
+    own, macs = work_of(MOBILE_ENCODERS[name], last)
+    narrower = 2 * 72 * 8 + 8 if name == "mobilenetv3" else 0
+    assert own + narrower == parameters - classifier
+    assert (macs + classifier) / 1e6 == pytest.approx(mega_macs, rel=0.06)
+
+
+def test_activations_and_squeezes_are_the_published_ones() -> None:
+    """MobileNetV3 large: ReLU in the first six blocks; squeeze-and-excitation in blocks 4 to 6 and 11 to 15."""
+    third = MOBILE_ENCODERS["mobilenetv3"]
+    assert [row.activation for row in third.rows] == ["relu"] * 6 + ["hardswish"] * 9
+    assert [number for number, row in enumerate(third.rows, 1) if row.squeeze] == [4, 5, 6, 11, 12, 13, 14, 15]
+    assert (third.activation, third.stem, third.last) == ("hardswish", 16, 960)
+    for name, last in (("mobilenetv2", 1280), ("efficientnet-lite0", 512)):
+        encoder = MOBILE_ENCODERS[name]
+        assert {encoder.activation, *(row.activation for row in encoder.rows)} == {"relu6"}
+        assert (encoder.stem, encoder.last, any(row.squeeze for row in encoder.rows)) == (32, last, False)
+
+
+def test_strides_of_the_blocks() -> None:
+    strides = {
+        "mobilenetv2": [2, 4, 7, 14],
+        "mobilenetv3": [2, 4, 7, 13],
+        "efficientnet-lite0": [2, 4, 6, 12],
+    }
+    for name, places in strides.items():
+        rows = MOBILE_ENCODERS[name].rows
+        assert [number for number, row in enumerate(rows, 1) if row.stride == 2] == places
+        assert {row.stride for row in rows} == {1, 2}
+
+
+def test_squeezed_channels_are_multiples_of_8_near_a_quarter() -> None:
+    """72 / 4 = 18 is nearest to 16, 120 / 4 = 30 to 32; 16 / 4 = 4 is raised to 8."""
+    assert [squeeze_channels(count) for count in (16, 72, 120, 480, 672, 960)] == [8, 16, 32, 120, 168, 240]
+
+
+def test_resnet18_and_what_all_share() -> None:
+    assert (RESNET18_STEM, RESNET18_STAGES) == (64, ((64, 1), (128, 2), (256, 2), (512, 2)))
+    assert (DECODER, HEADS, NORM_GROUPS) == ((256, 128, 64, 64, 64), (3, 1), 8)
+    assert NORMS == ("batch", "instance", "group")
+    assert ENCODERS == ("resnet18", "mobilenetv2", "mobilenetv3", "efficientnet-lite0")

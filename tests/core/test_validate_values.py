@@ -1,0 +1,282 @@
+"""A validation worked out by hand: what is planned, drawn, measured and written, on pictures of one grey each."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import shutil
+from datetime import UTC, date, datetime
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("skimage")
+
+from trilane.avatars.bundle import Bundle, load_bundle
+from trilane.avatars.digests import digests_of
+from trilane.training import dataset, evaluate, validate
+from trilane.training.random_poses import random_pose
+from trilane.training.validate import FloatNetwork, ValidationPlan
+
+BANDS = ("far", "full_body", "upper_body", "face")
+GREY = 100
+
+
+class Renderer:
+    """Its samples are the numbers that they were asked for; each shows a square of one grey."""
+
+    ctx = SimpleNamespace(info={"GL_RENDERER": "a renderer", "GL_VENDOR": "another word"})
+
+    def __init__(self):
+        self.planned = []
+
+    def plan(self, seed, source, band, size):
+        self.planned.append((seed, band, size))
+        return SimpleNamespace(seed=seed, source=source, band=BANDS.index(band) if band in BANDS else 4)
+
+    def render(self, sample):
+        """A square of 8 x 8 pixels; the first sample of seed 2 shows nobody."""
+        truth = np.zeros((32, 32, 4), np.uint8)
+        if sample.seed != (2, 2, 0, 0):
+            truth[8:16, 12:20] = (GREY, GREY, GREY, 255)
+        return np.full((32, 32, 3), sample.band, np.float32), truth
+
+
+def painter(times):
+    """Off by 10, 20, 30 and 40 by band, `times` over; the second sample of seed 2's upper bodies by 60.
+
+    Where nobody is, it paints a corner.
+    """
+
+    def paint(sample, uv):
+        assert (uv == sample.band).all()
+        _, picture = Renderer().render(sample)
+        off = 60 if sample.seed == (2, 2, 1, 2) else 10 * (sample.band + 1)
+        picture[8:16, 12:20, :3] += np.uint8(off * times)
+        if sample.seed == (2, 2, 0, 0):
+            picture[0, 0] = 255
+        return picture
+
+    return paint
+
+
+def db(off):
+    return -20 * math.log10(off / 255)
+
+
+def likeness(off):
+    """SSIM of two constant pictures: the means' part alone, with the constant 0.01 squared."""
+    a, b = GREY / 255, (GREY + off) / 255
+    return (2 * a * b + 1e-4) / (a * a + b * b + 1e-4)
+
+
+def figures(times):
+    """By band and seed the offsets that `painter` makes, and what they come to."""
+    offs = {1: [10, 10, 20, 20, 30, 30, 40, 40], 2: [10, 20, 20, 30, 60, 40, 40]}
+    offs = {seed: [off * times for off in row] for seed, row in offs.items()}
+    every = offs[1] + offs[2]
+    by_band = {"far": [10] * 3, "full_body": [20] * 4, "upper_body": [30] * 3 + [60], "face": [40] * 4}
+    means = {band: round(np.mean([db(off * times) for off in row]), 2) for band, row in by_band.items()}
+    mean = round(np.mean([db(off) for off in every]), 2)
+    least = round(db(60 * times), 2)
+    seeds = {
+        str(seed): {
+            "psnr_db": round(np.mean([db(off) for off in row]), 2),
+            "body_psnr_db": round(np.mean([db(off) for off in row]), 2),
+            "least_psnr_db": round(db(max(row)), 2),
+        }
+        for seed, row in offs.items()
+    }
+    return {
+        "psnr_db_by_band": means,
+        "body_psnr_db_by_band": means,
+        "psnr_db": mean,
+        "body_psnr_db": mean,
+        "background": 0.0,
+        "iou": 1.0,
+        "ssim": round(np.mean([likeness(off) for off in every]), 4),
+        "least_psnr_db": least,
+        "least_body_psnr_db": least,
+        "worst": {"seed": 2, "number": 5, "band": "upper_body", "psnr_db": least, "body_psnr_db": least},
+        "by_seed": seeds,
+        "samples": 15,
+    }
+
+
+@pytest.fixture
+def parts(monkeypatch):
+    """Painters by runtime's name, and the outside world of a validation; what the painters were asked for."""
+    asked = []
+
+    def integer_painter(renderer, bundle, name, threads):
+        asked.append((renderer, bundle, name, threads))
+        return painter({"ort": 1, "openvino": 2}[name])
+
+    monkeypatch.setattr(validate, "integer_painter", integer_painter)
+    monkeypatch.setattr(validate, "load_motion", lambda spec, folder: (spec.motion, folder))
+    monkeypatch.setattr(validate, "load_runtime", lambda name: SimpleNamespace(version=lambda: f"{name} 3.2"))
+    monkeypatch.setattr(validate, "package_version", {"trilane": "9.8"}.__getitem__)
+    now = {UTC: datetime(2026, 1, 2, 23, 30, tzinfo=UTC)}
+    monkeypatch.setattr(validate, "datetime", SimpleNamespace(now=now.__getitem__))
+    return asked
+
+
+@pytest.mark.parametrize("with_float", [False, True])
+def test_a_validation_by_hand(parts, tiny_bundle, tmp_path, with_float):
+    (tmp_path / "jump.bvh").write_bytes(b"a motion")
+    held_out = ("builtin:walk-wave-turn", str(tmp_path / "jump.bvh"))
+    plan = ValidationPlan(held_out, (1, 2), 2, ("ort", "openvino"), "128", 3, "a1b2", True)
+    bundle, renderer, looked = load_bundle(tiny_bundle), Renderer(), []
+    network = FloatNetwork("floats of somewhere", painter(0.5)) if with_float else None
+    said = validate.validate(bundle, plan, renderer, network, lambda seed, sample: looked.append((seed, sample.number)))
+    assert parts == [(renderer, bundle, name, 3) for name in ("ort", "openvino")]
+    assert renderer.planned == [
+        ((seed, 2, number, index), band, "128")
+        for seed in (1, 2) for index, band in enumerate(BANDS) for number in (0, 1)
+    ]  # fmt: skip
+    assert looked == [(1, number) for number in range(8)] + [(2, number) for number in range(1, 8)]
+    integer, other = figures(1), figures(2)
+    wanted = {
+        "date": date(2026, 1, 2),
+        "digests": digests_of(tiny_bundle, bundle.manifest).model_dump(),
+        "made_with": {
+            "trilane": "9.8", "revision": "a1b2", "modified": True, "renderer": "a renderer",
+            "runtimes": {"ort": "ort 3.2", "openvino": "openvino 3.2"},
+        },
+        "size": "128",
+        "per_band": 2,
+        "held_out": {
+            "builtin:walk-wave-turn": "built in",
+            "jump.bvh": f"sha256 {hashlib.sha256(b'a motion').hexdigest()}",
+        },
+        "psnr_db_by_band": integer["psnr_db_by_band"],
+        "iou": 1.0,
+        "ssim": integer["ssim"],
+        "runtime": "ort",
+        "integer": integer,
+        "other_runtimes": {"openvino": other},
+    }  # fmt: skip
+    if with_float:
+        floats = figures(0.5)
+        loss = {band: round(floats["psnr_db_by_band"][band] - integer["psnr_db_by_band"][band], 2) for band in BANDS}
+        wanted |= {"float": {"network": "floats of somewhere", **floats}, "psnr_loss_db": loss}
+    found = said.model_dump(exclude_none=True)
+    assert len(found.pop("figures_digest")) == 64
+    assert found.pop("texture_filter") == "linear"
+    assert {key: value for key, value in found.items() if value} == wanted
+
+
+def test_a_validation_is_written_into_its_manifest(parts, tiny_bundle, tmp_path):
+    own = shutil.copytree(tiny_bundle, tmp_path / "own")
+    bundle = load_bundle(own)
+    said = validate.validate(bundle, ValidationPlan(seeds=(1, 2), per_band=2), Renderer())
+    written = validate.revalidate(bundle, said)
+    assert written == Bundle(bundle.folder, bundle.manifest.model_copy(update={"validation": said}))
+    assert load_bundle(own) == written
+    assert len(parts) == 1
+
+
+def test_what_a_plan_leaves_out():
+    assert ValidationPlan() == ValidationPlan(
+        ("builtin:walk-wave-turn",), (1, 2, 3, 4, 5, 6, 7, 8), 24, ("ort",), "256", 1, None, None
+    )
+    assert (validate.FLOAT, evaluate.BAND_NAMES) == ("float", BANDS)
+
+
+def test_motions_are_found_from_where_one_is(parts):
+    assert validate.held_out_motions(["a.bvh", "builtin:idle"]) == [("a.bvh", Path.cwd()), ("builtin:idle", Path.cwd())]
+    assert not parts
+
+
+def test_samples_are_of_the_avatars_own_shape(monkeypatch, tiny_bundle):
+    bundle = load_bundle(tiny_bundle)
+    bundle = Bundle(bundle.folder, bundle.manifest.model_copy(update={"betas": (1.0,), "expression": (2.0,)}))
+    monkeypatch.setattr(validate, "load_body", lambda path: SimpleNamespace(shape=lambda *shape: (path, shape)))
+    monkeypatch.setattr(validate, "SampleRenderer", lambda *words: words)
+    assert validate.open_renderer(bundle, 4) == ((tiny_bundle / "body.npz", ((1.0,), (2.0,))), 4)
+
+
+# --- what samples are made of -------------------------------------------------------------------------------------
+
+
+def test_training_samples_are_drawn_by_share():
+    renderer, tracked = Renderer(), []
+    samples = dataset.plan_training(renderer, 50, 7, lambda rows: tracked.append(len(rows)) or rows)
+    rng = np.random.default_rng((7, 0))
+    bands = rng.choice([*BANDS, "anywhere"], 50, p=[0.16, 0.34, 0.22, 0.16, 0.12])
+    sizes = rng.choice(["256", "128"], 50, p=[0.85, 0.15])
+    assert renderer.planned == [((7, 1, n), str(bands[n]), str(sizes[n])) for n in range(50)]
+    assert {sample.source for sample in samples} == {random_pose} and tracked == [50]
+
+
+def test_poses_of_motions_are_at_any_time_of_any_of_them():
+    motions = [SimpleNamespace(duration_s=s, sample=lambda t, s=s: ((s, t), "no place")) for s in (2.0, 5.0, 9.0)]
+    rng = np.random.default_rng(3)
+    length_s = motions[rng.integers(3)].duration_s
+    pose = dataset.motion_poses(motions)(np.random.default_rng(3))
+    assert pose == (length_s, rng.uniform(0, length_s))
+
+
+class Packed:
+    """A packed pass of 5 channels that counts what it draws."""
+
+    channels = 5
+
+    def __init__(self, ctx, channels, quantisation, deferred):
+        self.made = (ctx, channels, quantisation, deferred)
+        self.drawn = []
+
+    def begin(self, shape):
+        return ("target", shape)
+
+    def read_into(self, shape, tensor):
+        assert tensor.shape == (shape[0] * shape[1] * 5,)
+        tensor[:] = np.arange(tensor.size) % 251
+
+
+def test_the_integer_network_is_run_as_in_the_pipeline(monkeypatch):
+    """On tensors that the packed pass has drawn; one session for each shape."""
+    made, loaded = [], []
+
+    class Session:
+        def __init__(self, network, options):
+            loaded.append((network, options.threads))
+
+        def bind(self, tensors, pictures):
+            ((tensor,), (picture,)) = tensors, pictures
+            assert tensor.shape[:3] == picture.shape[:3] and (tensor.shape[3], picture.shape[3]) == (5, 4)
+
+            def run():
+                picture[..., :4] = tensor[..., 1:]
+
+            return SimpleNamespace(run=run)
+
+    def packed_pass(*words, **options):
+        made.append(Packed(*words, **options))
+        return made[-1]
+
+    def packed_avatar(packed, mesh, texture):
+        assert (mesh, texture.shape) == ("mesh", (8, 8, 5))
+        return SimpleNamespace(draw=lambda *words: packed.drawn.append(words))
+
+    monkeypatch.setattr(evaluate, "PackedPass", packed_pass)
+    monkeypatch.setattr(evaluate, "PackedAvatar", packed_avatar)
+    monkeypatch.setattr(evaluate, "reshaped", lambda network, *shape: (network, shape))
+    monkeypatch.setattr(evaluate, "load_runtime", lambda name: SimpleNamespace(load=Session, name=name))
+    network = SimpleNamespace(input=SimpleNamespace(scale=0.5, zero_point=7))
+    bundle = SimpleNamespace(read_network=lambda: network, read_texture=lambda: np.zeros((8, 8, 5)))
+    skeleton = SimpleNamespace(pose=lambda pose: SimpleNamespace(matrices=f"joints of {pose}"))
+    renderer = SimpleNamespace(ctx="context", mesh="mesh", skeleton=skeleton)
+    paint = evaluate.integer_painter(renderer, bundle, "ort", 3)
+    assert made[0].made == ("context", 5, evaluate.Quantisation(0.5, 7), True)
+    for number, shape in enumerate(((2, 3), (4, 2), (2, 3))):
+        crop = SimpleNamespace(shape=shape, projection=f"projection {number}")
+        sample = SimpleNamespace(pose=number, crop=crop, view=SimpleNamespace(view=f"view {number}"))
+        picture = paint(sample, None)
+        tensor = (np.arange(shape[0] * shape[1] * 5) % 251).reshape(*shape, 5)
+        assert picture.dtype == np.uint8 and (picture == tensor[..., 1:]).all()
+    placement = evaluate.Placement("joints of 1", "projection 1", (0, 0, 4, 2))
+    assert made[0].drawn[1] == (("target", (4, 2)), "view 1", placement)
+    assert loaded == [((network, (2, 3)), 3), ((network, (4, 2)), 3)]
