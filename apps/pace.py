@@ -7,8 +7,8 @@ not do in time is counted, never hidden.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -25,7 +25,7 @@ from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.release import run_settings
 from trilane.scheduler.virtual import simulate
 from trilane.stages.config import RunConfig
-from trilane.units import SUSTAINED
+from trilane.units import BEFORE_INFER, BYPASS, SUSTAINED
 
 MAX_SLOW_MOTION = 1000.0
 #: A job that ends this much after its pace was done in time: waking up takes this long on a quiet machine.
@@ -80,7 +80,7 @@ def compare(
     late = [job for job in jobs if job.end_ns - job.begin_ns > pace.stage_ns[job.stage] + SLACK_NS]
     late_frames = sorted({job.frame for job in late})
     settings = run_settings(policy, frames, round(1e9 / release_fps(pace, fps)))
-    virtual = _virtual_ms(pace, settings, edge)
+    virtual = _virtual_ms(pace, settings, edge, _skipping(jobs))
     measured = _measured_ms(jobs, late_frames)
     return {
         "profile": pace.profile,
@@ -96,9 +96,22 @@ def compare(
     }
 
 
-def _virtual_ms(pace: Pace, settings: Settings, edge: str) -> float:
-    """Median time between presented frames of the same run in virtual time."""
-    result = simulate(application_graph(edge), settings, lambda stage, *_: pace.stage_ns[stage], keep=True)
+def _skipping(jobs: Sequence[JobRecord]) -> set[int]:
+    """Numbers of the frames that took the pipeline's bypass."""
+    ends, between = ({job.frame for job in jobs if job.stage == stage} for stage in (BYPASS[1], BEFORE_INFER[-1][0]))
+    return ends - between
+
+
+def _virtual_ms(pace: Pace, settings: Settings, edge: str, skipping: Set[int]) -> float:
+    """Median time between presented frames of the same run in virtual time, in which the frames `skipping` skip."""
+    graph = replace(application_graph(edge), bypass=BYPASS)
+    result = simulate(
+        graph,
+        settings,
+        lambda stage, *_: pace.stage_ns[stage],
+        skips=lambda frame, _fresh: frame in skipping,
+        keep=True,
+    )
     return float(np.median(np.diff(_presented(result.jobs)[1]))) / 1e6
 
 

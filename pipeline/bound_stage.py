@@ -4,28 +4,43 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, cast
 
 from trilane.arrays import U8
-from trilane.pipeline.stage import Stage, UnitContext
+from trilane.errors import TrilaneError
+from trilane.pipeline.stage import Skip, SkippingStage, Stage, UnitContext
 from trilane.transport.packets import FRAME_FIELDS, Packet
 
 WAKE_UP_NS = 150_000  # a sleep ends about this much late
 
 
 class BoundStage:
-    """`stage` with its slots. `pace_ns`: how long a job is held, at least. `unit`: that it runs on."""
+    """`stage` with its slots."""
 
     def __init__(
-        self, name: str, stage: Stage, inputs: list[Packet], outputs: list[Packet], pace_ns: int, unit: UnitContext
+        self,
+        name: str,
+        stage: Stage,
+        inputs: list[Packet],
+        outputs: list[Packet],
+        pace_ns: int,
+        unit: UnitContext,
+        may_skip: bool = False,
     ) -> None:
-        self.name, self._pace_ns = name, pace_ns
+        """`pace_ns`: how long a job is held, at least. `unit`: that it runs on. `may_skip`: a bypass begins at it."""
+        self.name, self._pace_ns, self._may_skip = name, pace_ns, may_skip
         self._stage, self._outputs, self._unit = stage, outputs, unit
         self._pass_on = _header_copier(inputs, outputs)
         stage.bind(inputs, outputs)
 
-    def run(self, frame: int, slot_in: int, slot_out: int, epoch: int) -> Mapping[str, float]:
-        """Do the job, and hold it until its pace has passed. A slot is -1 where the stage has no such edge."""
+    def run(self, frame: int, slot_in: int, slot_out: int, epoch: int, fresh: bool = False) -> Mapping[str, float]:
+        """Do the job, and hold it until its pace has passed; the stage's metrics, a `Skip` where the frame skips.
+
+        A slot is -1 where the stage has no such edge. `fresh`: the stage must not count on earlier frames. Raises
+        TrilaneError for a `Skip` of a stage that may not.
+        """
+        if fresh and self._may_skip:
+            cast(SkippingStage, self._stage).forget()
         end_ns = time.monotonic_ns() + self._pace_ns
         if slot_out >= 0:
             if slot_in >= 0:
@@ -35,6 +50,8 @@ class BoundStage:
                 header["frame"], header["t_sampled_ns"] = frame, time.monotonic_ns()
             self._outputs[slot_out].header["epoch"] = epoch
         metrics = self._stage.run(frame, slot_in if slot_in >= 0 else None, slot_out if slot_out >= 0 else None)
+        if isinstance(metrics, Skip) and not self._may_skip:
+            raise TrilaneError(f"stage {self.name} returned a Skip, and the pipeline's bypass does not begin at it")
         if self._pace_ns:
             hold_until(end_ns)
         return metrics

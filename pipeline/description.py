@@ -126,6 +126,8 @@ class Pipeline(Described):
 
     `units`: cores and threads of each unit that a stage names; the scheduler runs on the cores of the first stage's.
     `latency_to`: the stage with whose end a frame's latency ends; the last one when it is not given.
+    `bypass`: names of two stages. A frame for which the first returns a `Skip` goes from it to the second, past those
+    between; the edges behind the first and before the second have the same header.
     `module_folders`: where a unit's process looks for the modules of factories before anywhere else.
     `preload`: modules that are imported once, before the units' processes are forked; none from `module_folders`.
     Raises BadInputError naming the field that is wrong, as its parts do.
@@ -135,6 +137,7 @@ class Pipeline(Described):
     edges: tuple[PipelineEdge, ...]
     units: dict[str, UnitSettings]
     latency_to: str = ""
+    bypass: tuple[str, str] | None = None
     module_folders: tuple[Path, ...] = ()
     preload: tuple[str, ...] = ()
 
@@ -158,12 +161,20 @@ class Pipeline(Described):
                 raise UnexpectedValue(f"unit {unit} at {count} edges", f"at most {MOST_EDGES}", "use more units")
         for edge in self.edges:
             edge_rule(edge.rule)
+        if self.bypass is not None:
+            self._check_headers(self.edges_into(self.bypass[1]))
+
+    def _check_headers(self, names: tuple[str, ...]) -> None:
+        """Raises UnexpectedValue when the edges at a bypass's end have different headers."""
+        headers = {edge.header for name, edge in zip(self.edge_names, self.edges, strict=True) if name in names}
+        if len(headers) > 1:
+            raise UnexpectedValue(f"different headers of edges {', '.join(names)}", "one, as a bypass joins them")
 
     def graph(self) -> Graph:
         """What the scheduler knows of it."""
         stages = tuple(StageSpec(stage.name, stage.unit) for stage in self.stages)
         rules = tuple(edge.rule for edge in self.edges)
-        return Graph(stages, rules, self.latency_to or self.stages[-1].name)
+        return Graph(stages, rules, self.latency_to or self.stages[-1].name, self.bypass)
 
     @property
     def joints(self) -> dict[str, tuple[PipelineStage, PipelineStage]]:
@@ -173,6 +184,13 @@ class Pipeline(Described):
     @property
     def edge_names(self) -> list[str]:
         return list(self.joints)
+
+    def edges_into(self, stage: str) -> tuple[str, ...]:
+        """Names of the edges from which the stage takes frames: its own, then the one that a bypass to it begins on."""
+        begin, end = self.bypass or ("", "")
+        own = [name for name, (_, after) in self.joints.items() if after.name == stage]
+        bypassed = [name for name, (before, _) in self.joints.items() if before.name == begin and stage == end]
+        return (*own, *bypassed)
 
     @property
     def rule(self) -> str:

@@ -86,10 +86,10 @@ class JobClock:
         delay_ns = self._meter.delay_ns() if loses else 0
         self._preempted_ns, self._asleep_ns = lost_in_job(wall_ns, cpu_ns, delay_ns, self._cores, works_asleep)
 
-    def done(self, job_id: int, sampled_ns: int, metrics: dict[str, float]) -> Done:
-        """The answer to the job that has ended."""
+    def done(self, job_id: int, sampled_ns: int, metrics: dict[str, float], skips: bool = False) -> Done:
+        """The answer to the job that has ended. `skips`: its frame takes the bypass."""
         lost = (self._preempted_ns, self._asleep_ns, self._preempted_before_ns)
-        times = (self._begin_ns, self._end_ns, sampled_ns, *lost, self._cpu_ns, self._cpu_before_ns)
+        times = (self._begin_ns, self._end_ns, sampled_ns, *lost, int(skips), self._cpu_ns, self._cpu_before_ns)
         return tuple.__new__(Done, (job_id, *times, metrics))
 
     def answered(self) -> None:

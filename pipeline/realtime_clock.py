@@ -191,7 +191,7 @@ class RealtimeClock:
         self._unbooked.append((job, dispatch_ns, None if frame is None else frame.ready_ns, message))
         if frame is not None and self._requests is not None and job.stage == self._last_stage:
             self._requests.answered(job.frame)
-        return tuple.__new__(JobDone, (unit, *message[:7]))  # the same fields; the constructor is slow
+        return tuple.__new__(JobDone, (unit, *message[:7], message.skips > 0))  # the constructor is slow
 
     def _failed(self, unit: str, message: Failed) -> Event | None:
         self._log.fail_with(message)
@@ -203,7 +203,7 @@ class RealtimeClock:
     def _dispatch(self, now_ns: int, job: Job) -> None:
         self._open[job.id] = (job, now_ns)
         place = self._processes.places[job.stage]
-        fields = (job.id, place, job.frame, job.slot_in, job.slot_out, job.epoch, now_ns)
+        fields = (job.id, place, job.frame, job.slot_in, job.slot_out, job.epoch, now_ns, int(job.fresh))
         self._processes.send(job.unit, tuple.__new__(RunJob, fields))
 
     def _book(self) -> None:

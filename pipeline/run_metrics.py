@@ -30,6 +30,7 @@ class FrameCounts(Record):
     `lost`: begun and never presented, because a unit died or a stage failed.
     `lost_by_cause`: the same by `cause:unit`.
     `dropped`: left out by the policy, by `edge:cause`.
+    `skipped`: of those presented, how many took the pipeline's bypass; absent where it has none.
     """
 
     requested: int
@@ -37,6 +38,7 @@ class FrameCounts(Record):
     lost: int
     lost_by_cause: dict[str, int]
     dropped: dict[str, int]
+    skipped: int = 0
 
 
 class TimeSummary(Record):
@@ -88,12 +90,14 @@ class StageTimes(Record):
     """One stage.
 
     `unit`: that ran it.
+    `jobs`: how many it ended.
     `service_ms`: of its jobs, from begin to end, the time included in which another process had the core.
     `wait_ms`: from a job's input to its begin.
     `cpu_ms`: CPU time of its jobs, of all threads of the unit; on the host clock.
     """
 
     unit: str
+    jobs: int = 0
     service_ms: TimeSummary
     wait_ms: TimeSummary
     cpu_ms: TimeSummary | None = None

@@ -13,8 +13,19 @@ from trilane.transport.packets import Packet
 T = TypeVar("T")
 
 
+class Skip(dict[str, float]):
+    """What `Stage.run` returns, in place of other metrics, for a frame that takes the pipeline's bypass.
+
+    Only the stage at which `Pipeline.bypass` begins may return it.
+    """
+
+
 class Stage(Protocol):
-    """One stage inside a unit's process, made by a `StageFactory`."""
+    """One stage inside a unit's process, made by a `StageFactory`.
+
+    At the end of `Pipeline.bypass` a stage has two edges from which frames come: `inputs` holds the slots of its own
+    edge, then those of the edge that frames skip from.
+    """
 
     def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
         """Called once, with every slot of the stage's edges, before the first job: allocate here, never later."""
@@ -28,6 +39,17 @@ class Stage(Protocol):
 
     def close(self) -> None:
         """Release what the stage holds (files are completed and renamed here)."""
+
+
+class SkippingStage(Stage, Protocol):
+    """The stage at which a pipeline's bypass begins. Its `run` may return a `Skip`."""
+
+    def forget(self) -> None:
+        """The next frame must not skip because of what earlier frames brought to the bypass's end.
+
+        Called before `run` for the first frame, and whenever a frame that did not skip has not come to the bypass's
+        end, or the unit there was started anew.
+        """
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from trilane.pipeline.bound_stage import BoundStage
 from trilane.pipeline.core_meter import TASKS, CoreMeter
 from trilane.pipeline.job_times import JobClock
 from trilane.pipeline.shared_assets import map_assets
-from trilane.pipeline.stage import StageFactory, UnitContext
+from trilane.pipeline.stage import Skip, StageFactory, UnitContext
 from trilane.pipeline.unit_spec import UnitSpec
 from trilane.transport.heartbeats import LINGER_MS, context_on_cores
 from trilane.transport.job_pipe import JobPipe
@@ -123,10 +123,11 @@ def build_stages(spec: UnitSpec) -> list[BoundStage]:
         BoundStage(
             described.name,
             stage,
-            packets[spec.inputs[described.name]] if described.name in spec.inputs else [],
+            [packet for edge in spec.inputs.get(described.name, ()) for packet in packets[edge]],
             packets[spec.outputs[described.name]] if described.name in spec.outputs else [],
             described.pace_ns,
             unit,
+            described.name == spec.may_skip,
         )
         for described, stage in zip(spec.stages, stages, strict=True)
     ]
@@ -142,10 +143,11 @@ def factory_named(name: str) -> StageFactory:
 def _run_job(link: Link, stage: BoundStage, job: RunJob, clock: JobClock) -> None:
     clock.begin(job.stage, job.t_dispatch_ns)
     try:
-        metrics = stage.run(job.frame, job.slot_in, job.slot_out, job.epoch)
+        metrics = stage.run(job.frame, job.slot_in, job.slot_out, job.epoch, job.fresh > 0)
         clock.end(stage.works_asleep)
         values = {str(name): float(value) for name, value in metrics.items()}
-        link.job_pipe.send(clock.done(job.id, stage.sampled_ns(job.slot_in, job.slot_out), values))
+        sampled_ns = stage.sampled_ns(job.slot_in, job.slot_out)
+        link.job_pipe.send(clock.done(job.id, sampled_ns, values, isinstance(metrics, Skip)))
     except UnitLostError:
         raise
     except Exception as error:
@@ -156,7 +158,7 @@ def _run_job(link: Link, stage: BoundStage, job: RunJob, clock: JobClock) -> Non
 def _run_isolated(link: Link, stage: BoundStage, job: RunIsolated) -> None:
     begin_ns = time.monotonic_ns()
     try:
-        stage.run(job.frame, job.slot_in, job.slot_out, 0)
+        stage.run(job.frame, job.slot_in, job.slot_out, 0, fresh=True)
     except Exception as error:
         _fail(link, MEASURING, f"stage {stage.name}, frame {job.frame}", error)
         return

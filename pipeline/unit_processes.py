@@ -13,6 +13,7 @@ import signal
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
+from itertools import chain
 from typing import NamedTuple
 
 import zmq
@@ -209,7 +210,7 @@ class UnitProcesses:
 
     def _spec(self, unit: str, folder: SocketFolder, job_pipe: JobPipeEnd) -> UnitSpec:
         pipeline, stages = self._pipeline, self._pipeline.stages_of(unit)
-        inputs = {after.name: name for name, (_, after) in pipeline.joints.items() if after.unit == unit}
+        inputs = {stage.name: edges for stage in stages if (edges := pipeline.edges_into(stage.name))}
         outputs = {before.name: name for name, (before, _) in pipeline.joints.items() if before.unit == unit}
         return UnitSpec(
             unit=unit,
@@ -221,9 +222,10 @@ class UnitProcesses:
             run_cores=pipeline.run_cores,
             stages=stages,
             module_folders=tuple(folder.absolute() for folder in pipeline.module_folders),
-            edges={name: self._regions[name] for name in {*inputs.values(), *outputs.values()}},
+            edges={name: self._regions[name] for name in {*chain.from_iterable(inputs.values()), *outputs.values()}},
             inputs=inputs,
             outputs=outputs,
+            may_skip=pipeline.bypass[0] if pipeline.bypass else "",
         )
 
     def _forget(self, process: _Process) -> None:

@@ -18,7 +18,8 @@ class UnitSpec(Model):
     `settings`: the unit's own; `scheduler_cores`: where the scheduler runs; `run_cores`: those of all units.
     `stages`: those of this unit; messages name a stage by its place in this list.
     `module_folders`: put before the module search path.
-    `edges`: regions by the edge's name; `inputs`, `outputs`: stage to edge, for those that have one.
+    `edges`: regions by the edge's name; `inputs`, `outputs`: stage to edges, for those that have any.
+    `may_skip`: the stage at which the pipeline's bypass begins.
     """
 
     unit: str
@@ -31,8 +32,9 @@ class UnitSpec(Model):
     stages: tuple[PipelineStage, ...]
     module_folders: tuple[Path, ...]
     edges: dict[str, EdgeRegion]
-    inputs: dict[str, str]
+    inputs: dict[str, tuple[str, ...]]
     outputs: dict[str, str]
+    may_skip: str = ""
 
     @property
     def fds(self) -> list[int]:

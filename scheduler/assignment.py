@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from trilane.scheduler.bypass import next_slot, side_of
 from trilane.scheduler.choice import Choice
 from trilane.scheduler.events import Action, Dispatch
 from trilane.scheduler.flow import Flow
@@ -63,12 +64,18 @@ class Assignment:
 
     def _dispatch(self, unit: UnitState, stage: StageState, now_ns: int, actions: list[Action]) -> None:
         edge = stage.input
+        slot_in = -1
         if edge is None:
             frame, release_ns = self._source.take(now_ns)
             self._flow.admit(frame, release_ns, self._choice.deadline_from_ns(release_ns))
+        elif stage.bypassed is None:
+            slot_in = edge.ready[0]
+            frame = edge.frame[slot_in]
         else:
-            frame = edge.frame[edge.ready[0]]
-        job = self._flow.begin(stage, frame)
+            slot_in = next_slot(stage, self._flow.frames)
+            edge, slot = side_of(stage, slot_in)
+            frame = edge.frame[slot]
+        job = self._flow.begin(stage, frame, slot_in)
         if not unit.queue:
             unit.head_since_ns = now_ns
             unit.deadline_ns = now_ns + self._hang_ns

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from trilane.scheduler.bypass import Bypass, next_slot, side_of
 from trilane.scheduler.completion import earliest_completion_ns
 from trilane.scheduler.events import NEVER, Settings
 from trilane.scheduler.frame_source import Source
@@ -24,6 +25,7 @@ class Choice:
         stages: list[StageState],
         source: Source,
         frames: dict[int, FrameState],
+        bypass: Bypass | None,
     ) -> None:
         """The view of one run.
 
@@ -31,7 +33,9 @@ class Choice:
         `stages`: the chain.
         `source`: where its frames come from.
         `frames`: those in flight, by number.
+        `bypass`: the chain's, if it has one.
         """
+        self._bypass = bypass
         self._policy, self._stages, self._source, self._frames = policy, stages, source, frames
         self._stage_named = {stage.name: stage for stage in stages}
         self._deadline_ns, self._latch_ns = settings.deadline_ns, settings.latch_ns
@@ -44,7 +48,7 @@ class Choice:
         if source is None:
             if self._source.is_empty or self.is_full() or (self.latches and now_ns < self.latch_from_ns(now_ns)):
                 return False
-        elif not source.ready:
+        elif not source.ready and (stage.bypassed is None or next_slot(stage, self._frames) < 0):
             return False
         return sink is None or bool(sink.free) or sink.can_claim()
 
@@ -77,7 +81,9 @@ class Choice:
         waiting = self._candidate(stage, now_ns)
         if waiting.deadline_ns == NEVER:
             return False
-        end_ns = earliest_completion_ns(now_ns, waiting.frame, waiting.position, self._stages, self._frames)
+        bypass = self._bypass
+        ends = (bypass.begin.position, bypass.end.position) if bypass is not None and bypass.was_taken else (0, 0)
+        end_ns = earliest_completion_ns(now_ns, waiting.frame, waiting.position, self._stages, self._frames, ends)
         return end_ns > waiting.deadline_ns
 
     def deadline_from_ns(self, release_ns: int) -> int:
@@ -95,7 +101,7 @@ class Choice:
                     continue
                 if self.is_full() or (self.latches and now_ns < self.latch_from_ns(now_ns)):
                     return BLOCKED
-            elif not stage.input.ready:
+            elif not stage.input.ready and (stage.bypassed is None or next_slot(stage, self._frames) < 0):
                 continue
             if stage.output and not stage.output.can_claim():
                 return BLOCKED
@@ -108,5 +114,9 @@ class Choice:
         if edge is None:
             frame, release_ns = self._source.head(now_ns)
             return Candidate(frame, stage.position, self.deadline_from_ns(release_ns))
-        frame = edge.frame[edge.ready[0]]
+        if stage.bypassed is None:
+            slot = edge.ready[0]
+        else:
+            edge, slot = side_of(stage, next_slot(stage, self._frames))
+        frame = edge.frame[slot]
         return Candidate(frame, stage.position, self._frames[frame].deadline_ns)

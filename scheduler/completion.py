@@ -2,7 +2,8 @@
 so that no frame is given up that could be in time.
 
 It is a lower bound as far as service times are what they were lately. At every stage older frames go first: a frame
-begins there after their work at that stage, or after its own work at the stages before, whichever ends later.
+begins there after their work at that stage, or after its own work at the stages before, whichever ends later. Where
+there is a bypass, a frame that has not come to its beginning is taken to do what the last frame there did.
 """
 
 from __future__ import annotations
@@ -13,7 +14,12 @@ from trilane.scheduler.state import FrameState, StageState
 
 
 def earliest_completion_ns(
-    now_ns: int, frame: int, position: int, stages: Sequence[StageState], frames: Mapping[int, FrameState]
+    now_ns: int,
+    frame: int,
+    position: int,
+    stages: Sequence[StageState],
+    frames: Mapping[int, FrameState],
+    bypass: tuple[int, int] = (0, 0),
 ) -> int:
     """The bound for the end of the last stage of `frame`.
 
@@ -22,6 +28,7 @@ def earliest_completion_ns(
     `position`: of its next stage in the chain.
     `stages`: the chain, with the estimates of service times.
     `frames`: those in flight, by number.
+    `bypass`: positions of two stages; a frame that has yet to do the first skips those between them.
 
     It is now + max over s >= position of [ max(own work before s, work of older frames at s) + own work from s on ].
     """
@@ -29,14 +36,19 @@ def earliest_completion_ns(
     for number, state in frames.items():
         if number < frame:
             older[state.position] += 1
+    begin, end = bypass
+    skipping = sum(older[: begin + 1])
     before, own, latest = sum(older[:position]), 0, 0
-    rest = sum(stage.estimate_ns for stage in stages[position:])
+    rest = sum(stage.estimate_ns for stage in stages[position:] if position > begin or not begin < stage.position < end)
     for stage in stages[position:]:
         before += older[stage.position]
-        backlog = before * stage.estimate_ns - _done_of_running(now_ns, stage) if before else 0
+        is_skipped = begin < stage.position < end
+        count = before - skipping if is_skipped else before
+        backlog = count * stage.estimate_ns - _done_of_running(now_ns, stage) if count else 0
         latest = max(latest, max(own, backlog) + rest)
-        own += stage.estimate_ns
-        rest -= stage.estimate_ns
+        if position > begin or not is_skipped:
+            own += stage.estimate_ns
+            rest -= stage.estimate_ns
     return now_ns + latest
 
 

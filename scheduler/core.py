@@ -11,6 +11,9 @@ Slots. Between two stages lies an edge with a fixed number of slots (transport/s
 and its output slot from dispatch until it is done, so a stage can begin only when a frame waits before it and a slot is
 free behind it. That is all that holds back the stages before a slow one.
 
+Bypass. A frame may skip the stages between two others, when the first of these says so. It then waits for the second in
+the slot that it has, and overtakes no frame (bypass.py).
+
 Dirty units. A step looks only at units for which something has changed: the unit's own job ended, a frame came to one
 of its stages, a slot got free behind one, its life or duty changed. Whoever changes such a thing calls `mark_dirty`;
 a dispatch may make a unit dirty that this step has already looked at, and it is looked at again.
@@ -55,7 +58,7 @@ from trilane.scheduler.flow import Flow
 from trilane.scheduler.frame_source import Source
 from trilane.scheduler.ledger import Ledger
 from trilane.scheduler.policy import policy_named
-from trilane.scheduler.state import FULL_DUTY, UnitState
+from trilane.scheduler.state import FULL_DUTY, FrameState, StageState, UnitState
 from trilane.scheduler.unit_life import READY, STOPPING, DeadlinePassed
 
 
@@ -71,7 +74,8 @@ class Core:
         self.source = Source(settings, self._count_drop_at_source)
         self.flow = Flow(graph, self.ledger, policy.newest or policy.drop_late)
         self.stages, self.units, self.frames = self.flow.stages, self.flow.units, self.flow.frames
-        self.choice = Choice(settings, policy, self.stages, self.source, self.frames)
+        self.bypass = self.flow.bypass
+        self.choice = Choice(settings, policy, self.stages, self.source, self.frames, self.bypass)
         self.assignment = Assignment(policy, settings.hang_ns, self.flow, self.source, self.choice, self.ledger)
         self.actions: list[Action] = []
         self.now_ns = self.alarm_ns = 0
@@ -79,6 +83,7 @@ class Core:
         self.outcome: Outcome | None = None
         self._stage_named = self.flow.stage_named
         self._latency_position = self._stage_named[graph.latency_to].position
+        self._bypass_end = self.bypass.end.position if self.bypass is not None else 0
         self._hang_ns, self._lead_ns, self._latches = settings.hang_ns, policy.lead_ns, self.choice.latches
         self._estimates = self._lead_ns > 0 or policy.drop_late or self._latches
         self._handlers = {
@@ -97,7 +102,8 @@ class Core:
     def step(self, now_ns: int, events: tuple[Event, ...] = ()) -> Decision:
         """Tell the core what happened and what time it is; times never go back. Nothing is heard after the finish.
 
-        Raises KeyError for a unit that there is not, UnitLifeError for an event that cannot happen to a unit now.
+        Raises KeyError for a unit that there is not, UnitLifeError for an event that cannot happen to a unit now,
+        ValueError for a frame that skips where no bypass begins.
         """
         self.now_ns = now_ns
         self.actions = []
@@ -160,7 +166,7 @@ class Core:
     # events of jobs
 
     def _on_done(self, event: JobDone) -> None:
-        name, job_id, begin_ns, end_ns, pose_ns, preempted_ns, asleep_ns, preempted_before_ns = event
+        name, job_id, begin_ns, end_ns, pose_ns, preempted_ns, asleep_ns, preempted_before_ns, skips = event
         unit = self.units[name]
         if not unit.queue or unit.queue[0].id != job_id:
             return  # it was lost with the process that did it
@@ -169,7 +175,11 @@ class Core:
         unit.failures = 0
         stage, frame = self._stage_named[job.stage], self.frames[job.frame]
         service_ns = end_ns - begin_ns
-        self.ledger.job(job, frame.ready_ns, begin_ns, end_ns, preempted_ns, asleep_ns, preempted_before_ns)
+        if skips:
+            self._on_skip(stage, frame)
+        self.ledger.job(
+            job, frame.ready_ns, begin_ns, end_ns, preempted_ns, asleep_ns, preempted_before_ns, frame.skips
+        )
         if self._estimates:
             stage.learn(service_ns)
         if unit.duty < FULL_DUTY:
@@ -177,13 +187,19 @@ class Core:
             unit.update_queue_capacity()
             self._reset_alarm()
         position = stage.position
-        frame.ready_ns, frame.position = end_ns, position + 1
+        frame.ready_ns, frame.position = end_ns, self._bypass_end if skips else position + 1
         if position == 0:
             frame.pose_ns = pose_ns
         if position == self._latency_position:
             frame.latency_ns = end_ns - frame.pose_ns
         self.flow.mark_dirty(unit)
         self.flow.pass_on(stage, job, end_ns)
+
+    def _on_skip(self, stage: StageState, frame: FrameState) -> None:
+        """The stage at which the bypass begins says that the frame takes it."""
+        if self.bypass is None or stage is not self.bypass.begin:
+            raise ValueError(f"stage {stage.name} skips, but no bypass begins there")
+        frame.skips = True
 
     def _begin_next(self, unit: UnitState) -> None:
         """The unit's job is over, and the one that it holds, if any, begins."""

@@ -17,7 +17,11 @@ NEVER: Final = (1 << 62) - 1  # ns; the largest integer that mypyc keeps unboxed
 
 
 class Job(NamedTuple):
-    """One stage of one frame on one unit, from a slot to a slot."""
+    """One stage of one frame on one unit, from a slot to a slot.
+
+    `slot_in` counts through the slots of the stage's input edge and, where a bypass ends at it, on through those of the
+    bypassed edge. `fresh`: the stage at which the bypass begins must not count on what earlier frames left behind.
+    """
 
     id: int
     unit: str
@@ -26,6 +30,7 @@ class Job(NamedTuple):
     slot_in: int
     slot_out: int
     epoch: int
+    fresh: bool = False
 
 
 class UnitReady(NamedTuple):
@@ -39,6 +44,7 @@ class JobDone(NamedTuple):
 
     `preempted_ns`, `asleep_ns`: parts of the job in which its unit had no core, and in which nothing of it worked.
     `preempted_before_ns`: how long the unit had no core between its job before and this one.
+    `skips`: the frame takes the bypass; False but from the stage at which that begins.
     """
 
     unit: str
@@ -49,6 +55,7 @@ class JobDone(NamedTuple):
     preempted_ns: int = 0
     asleep_ns: int = 0
     preempted_before_ns: int = 0
+    skips: bool = False
 
 
 class JobFailed(NamedTuple):
@@ -152,11 +159,15 @@ class StageSpec:
 
 @dataclass(frozen=True)
 class Graph:
-    """A chain of stages. `edges[i]`: the rule between stages i and i + 1. Latency ends with stage `latency_to`."""
+    """A chain of stages. `edges[i]`: the rule between stages i and i + 1. Latency ends with stage `latency_to`.
+
+    `bypass`: names of two stages; a frame for which the first says so skips those between them (bypass.py).
+    """
 
     stages: tuple[StageSpec, ...]
     edges: tuple[str, ...]
     latency_to: str
+    bypass: tuple[str, str] | None = None
 
     def __post_init__(self) -> None:
         names = [stage.name for stage in self.stages]
@@ -165,10 +176,28 @@ class Graph:
         if len(self.edges) != len(names) - 1 or self.latency_to not in names:
             found = f"{len(self.edges)} edges and latency to {self.latency_to!r} for stages {names}"
             raise UnexpectedValue(found, "one edge fewer than stages, and latency to one of them")
+        if self.bypass is not None:
+            self._check_bypass(names, self.bypass)
+
+    def _check_bypass(self, names: list[str], bypass: tuple[str, str]) -> None:
+        """Raises UnexpectedValue for one that skips nothing, or skips the end of the latency."""
+        if not set(bypass) <= set(names) or names.index(bypass[0]) + 1 >= names.index(bypass[1]):
+            raise UnexpectedValue(f"bypass {bypass} of stages {names}", "a stage, and one at least two places after it")
+        if self.latency_to in self.bypassed:
+            found = f"latency to {self.latency_to!r}, which bypass {bypass} skips"
+            raise UnexpectedValue(found, "latency to a stage that every frame meets")
 
     @property
     def units(self) -> tuple[str, ...]:
         return tuple(dict.fromkeys([stage.unit for stage in self.stages]))
+
+    @property
+    def bypassed(self) -> tuple[str, ...]:
+        """The stages that a frame on the bypass skips."""
+        if self.bypass is None:
+            return ()
+        names = [stage.name for stage in self.stages]
+        return tuple(names[names.index(self.bypass[0]) + 1 : names.index(self.bypass[1])])
 
     def edge_name(self, index: int) -> str:
         return f"{self.stages[index].name}->{self.stages[index + 1].name}"

@@ -5,16 +5,19 @@ It moves frames and slots as it is told, and notes for which units that changed 
 
 from __future__ import annotations
 
+from trilane.scheduler.bypass import Bypass, side_of
 from trilane.scheduler.causes import Drop, DropCause, Loss
 from trilane.scheduler.events import Graph, Job
 from trilane.scheduler.ledger import Ledger
 from trilane.scheduler.state import FrameState, StageState, UnitState, build
+from trilane.transport.slots import EdgeSlots
 
 
 class Flow:
     """Stages, units, edges and the frames in flight. Raises ValueError for an unknown edge.
 
     `dirty`: the units that a step must look at, in the order in which they were marked; a unit may be there twice.
+    `bypass`: of the chain, if it has one.
     """
 
     def __init__(self, graph: Graph, ledger: Ledger, drops: bool) -> None:
@@ -25,6 +28,10 @@ class Flow:
         self.dirty: list[UnitState] = []
         self._graph, self._ledger, self._drops = graph, ledger, drops
         self._jobs = 0
+        self.bypass: Bypass | None = None
+        if graph.bypass is not None:
+            begin, end = graph.bypass
+            self.bypass = Bypass(self.stage_named[begin], self.stage_named[end])
 
     def mark_dirty(self, unit: UnitState) -> None:
         """Something has changed for the unit: this step looks at it."""
@@ -34,31 +41,42 @@ class Flow:
         """The frame is in flight from now on."""
         self.frames[frame] = FrameState(release_ns, deadline_ns)
 
-    def begin(self, stage: StageState, frame: int) -> Job:
-        """The stage's job for `frame`: one just admitted, or the oldest that waits for the stage."""
+    def begin(self, stage: StageState, frame: int, slot_in: int) -> Job:
+        """The stage's job for `frame`: one just admitted, or the one that waits for the stage in `slot_in`."""
         source, sink = stage.input, stage.output
-        slot_in = slot_out = -1
+        slot_out = -1
         if source is not None:
-            slot_in = source.ready[0]
-            source.take(slot_in)
+            if stage.bypassed is None:
+                source.take(slot_in)
+            else:
+                edge, slot = side_of(stage, slot_in)
+                edge.take(slot)
         if sink is not None:
             slot_out, evicted = sink.claim(frame)
             if evicted is not None:
                 self.drop([evicted], stage.position, DropCause.STALE if sink.rule.mailbox else DropCause.POOL)
         pool = sink or source
         epoch = pool.epoch if pool else 0
-        job = tuple.__new__(Job, (self._jobs, stage.unit.name, stage.name, frame, slot_in, slot_out, epoch))
+        bypass, fresh = self.bypass, False
+        if bypass is not None and stage is bypass.begin:
+            fresh, bypass.must_be_fresh = bypass.must_be_fresh, False
+        job = tuple.__new__(Job, (self._jobs, stage.unit.name, stage.name, frame, slot_in, slot_out, epoch, fresh))
         self._jobs += 1
         return job
 
     def pass_on(self, stage: StageState, job: Job, end_ns: int) -> None:
         """The job is done: its frame waits for the next stage, or is presented."""
-        source, sink = stage.input, stage.output
+        source, sink, bypass = stage.input, stage.output, self.bypass
         if source is not None:
-            if not source.free:
-                self.mark_dirty(self.stages[stage.position - 1].unit)
-            source.release(job.slot_in)
+            if stage.bypassed is None:
+                if not source.free:
+                    self.mark_dirty(self.stages[stage.position - 1].unit)
+                source.release(job.slot_in)
+            else:
+                self._release(stage, job.slot_in)
         if sink is not None:
+            if bypass is not None and stage is bypass.begin and self._take(bypass, job):
+                return
             replaced = sink.commit(job.slot_out)
             if replaced:
                 self.drop(replaced, stage.position, DropCause.STALE)
@@ -66,8 +84,29 @@ class Flow:
                 self.mark_dirty(self.stages[stage.position + 1].unit)
         else:
             frame = self.frames.pop(job.frame)
-            self._ledger.presented(job.frame, end_ns, frame.latency_ns, frame.deadline_ns)
+            self._ledger.presented(job.frame, end_ns, frame.latency_ns, frame.deadline_ns, frame.skips)
             self.mark_dirty(self.stages[0].unit)
+
+    def _take(self, bypass: Bypass, job: Job) -> bool:
+        """Whether the frame takes the bypass; it then waits for the stage at its end."""
+        bypass.was_taken = self.frames[job.frame].skips
+        if bypass.was_taken:
+            self.drop(bypass.edge.commit(job.slot_out, skips=True), bypass.begin.position, DropCause.STALE)
+            self.mark_dirty(bypass.end.unit)
+        return bypass.was_taken
+
+    def _release(self, stage: StageState, slot_in: int) -> None:
+        """The slot from which the stage at a bypass's end took its frame is free again."""
+        edge, slot = side_of(stage, slot_in)
+        if not edge.free:
+            self.mark_dirty(self._producer(stage, edge).unit)
+        edge.release(slot)
+
+    def _producer(self, stage: StageState, edge: EdgeSlots) -> StageState:
+        """The stage that fills `edge`, from which `stage` takes frames."""
+        if edge is not stage.input and self.bypass is not None:
+            return self.bypass.begin
+        return self.stages[stage.position - 1]
 
     def drop(self, frames: list[int], edge: int, cause: DropCause) -> None:
         """Count frames whose slots on the edge behind stage `edge` were given to others."""
@@ -76,16 +115,17 @@ class Flow:
             self.mark_dirty(self.stages[edge].unit)
             self.mark_dirty(self.stages[0].unit)
 
-    def drop_oldest(self, stage: StageState, cause: DropCause) -> None:
-        """Take the oldest frame that waits for the stage out of its slot."""
-        if stage.input is not None:
-            self.drop([stage.input.drop(stage.input.ready[0])], stage.position - 1, cause)
+    def drop_waiting(self, stage: StageState, slot_in: int, cause: DropCause) -> None:
+        """Take the frame that waits for the stage in `slot_in` out of its slot."""
+        edge, slot = side_of(stage, slot_in)
+        self.drop([edge.drop(slot)], self._producer(stage, edge).position, cause)
 
     def mark_lost(self, frame: int, loss: Loss) -> None:
         """Count a frame that was in flight as lost; its slots, if it had any, are another's business."""
-        del self.frames[frame]
+        state = self.frames.pop(frame)
         self._ledger.lost[loss] += 1
         self.mark_dirty(self.stages[0].unit)
+        self._tell_bypass(state)
 
     def reclaim(self, unit: UnitState, loss: Loss) -> None:
         """Give the slots of a unit whose process is gone back to their edges, under a new epoch.
@@ -100,16 +140,19 @@ class Flow:
         for job in reversed(jobs[1:]):
             self._put_back(job, loss)
         for stage in unit.stages:
-            for edge in (stage.input, stage.output):
+            for edge in (stage.input, stage.output, stage.bypassed):
                 if edge is not None:
                     edge.epoch += 1
+            if stage.bypassed is not None and self.bypass is not None:
+                self.bypass.must_be_fresh = True
 
     def free_slots(self, job: Job) -> None:
         """Both slots of a job that will not end are free again."""
         stage = self.stage_named[job.stage]
         if stage.input:
-            stage.input.release(job.slot_in)
-            self.mark_dirty(self.stages[stage.position - 1].unit)
+            edge, slot = side_of(stage, job.slot_in)
+            edge.release(slot)
+            self.mark_dirty(self._producer(stage, edge).unit)
         if stage.output:
             stage.output.abandon(job.slot_out)
             self.mark_dirty(stage.unit)
@@ -122,10 +165,28 @@ class Flow:
         if stage.input is None:
             self.mark_lost(job.frame, loss)
             return
-        for frame in stage.input.give_back(job.slot_in):
-            self._count_drop(frame, stage.position - 1, DropCause.STALE)
-        self.mark_dirty(self.stages[stage.position - 1].unit)
+        if job.fresh and self.bypass is not None:
+            self.bypass.must_be_fresh = True
+        edge, slot = side_of(stage, job.slot_in)
+        producer = self._producer(stage, edge)
+        for frame in edge.give_back(slot, skips=edge is not stage.input):
+            self._count_drop(frame, producer.position, DropCause.STALE)
+        self.mark_dirty(producer.unit)
 
     def _count_drop(self, frame: int, edge: int, cause: DropCause) -> None:
-        del self.frames[frame]
-        self._ledger.dropped[Drop(self._graph.edge_name(edge), cause)] += 1
+        state, bypass = self.frames.pop(frame), self.bypass
+        name = self._graph.edge_name(edge)
+        if bypass is not None and state.skips and edge == bypass.begin.position:
+            name = f"{bypass.begin.name}->{bypass.end.name}"
+        self._ledger.dropped[Drop(name, cause)] += 1
+        self._tell_bypass(state)
+
+    def _tell_bypass(self, gone: FrameState) -> None:
+        """A frame that was in flight is no more."""
+        bypass = self.bypass
+        if bypass is None:
+            return
+        if not gone.skips and gone.position <= bypass.end.position:
+            bypass.must_be_fresh = True
+        if gone.skips or bypass.edge.passing:
+            self.mark_dirty(bypass.end.unit)  # it waited there, or what waits there may have waited for it alone

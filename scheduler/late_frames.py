@@ -6,6 +6,7 @@ rule, the policy says.
 
 from __future__ import annotations
 
+from trilane.scheduler.bypass import next_slot, stale_slot
 from trilane.scheduler.causes import DropCause
 from trilane.scheduler.choice import Choice
 from trilane.scheduler.flow import Flow
@@ -29,10 +30,12 @@ class LateFrames:
             return
         if self._policy.newest:
             while len(edge.ready) > 1:
-                self._flow.drop_oldest(stage, DropCause.STALE)
+                self._flow.drop_waiting(stage, edge.ready[0], DropCause.STALE)
+            while stage.bypassed is not None and (slot := stale_slot(stage, self._flow.frames)) >= 0:
+                self._flow.drop_waiting(stage, slot, DropCause.STALE)
         if self._policy.drop_late:
-            while edge.ready and self._choice.is_late(stage, now_ns):
-                self._flow.drop_oldest(stage, DropCause.LATE)
+            while (slot := next_slot(stage, self._flow.frames)) >= 0 and self._choice.is_late(stage, now_ns):
+                self._flow.drop_waiting(stage, slot, DropCause.LATE)
 
     def _drop_at_source(self, first: StageState, now_ns: int) -> None:
         if self._policy.newest:

@@ -85,6 +85,7 @@ class _StageBook:
     def __init__(self) -> None:
         self.service_ns: list[int] = []
         self.wait_ns: list[int] = []
+        self.skipping_ns: list[int] = []
 
 
 class Ledger:
@@ -97,6 +98,7 @@ class Ledger:
         self.start_ns = self.end_ns = 0
         self.lost: Counter[Loss] = Counter()
         self.dropped: Counter[Drop] = Counter()
+        self.skipped = 0
         self.presented_frames: list[int] = []
         self.presented_ns: list[int] = []
         self.latency_ns: list[int] = []
@@ -126,9 +128,15 @@ class Ledger:
         preempted_ns: int = 0,
         asleep_ns: int = 0,
         preempted_before_ns: int = 0,
+        skips: bool = False,
     ) -> None:
-        """Book a job that has ended: `ready_ns` is when its input was there, the rest is as in `JobDone`."""
+        """Book a job that has ended: `ready_ns` is when its input was there, the rest is as in `JobDone`.
+
+        `skips`: its frame takes the bypass.
+        """
         stage = self._stages[job.stage]
+        if skips:
+            stage.skipping_ns.append(end_ns - begin_ns)
         stage.service_ns.append(end_ns - begin_ns)
         stage.wait_ns.append(begin_ns - ready_ns)
         self._units[job.unit].add_job(begin_ns, end_ns, preempted_ns, asleep_ns, preempted_before_ns)
@@ -141,8 +149,9 @@ class Ledger:
     def restart(self, unit: str) -> None:
         self._units[unit].restarts += 1
 
-    def presented(self, frame: int, end_ns: int, latency_ns: int, deadline_ns: int) -> None:
-        """`deadline_ns`: NEVER when the frame has none."""
+    def presented(self, frame: int, end_ns: int, latency_ns: int, deadline_ns: int, skipped: bool = False) -> None:
+        """`deadline_ns`: NEVER when the frame has none. `skipped`: it took the bypass."""
+        self.skipped += skipped
         self.presented_frames.append(frame)
         self.presented_ns.append(end_ns)
         self.latency_ns.append(latency_ns)
@@ -184,6 +193,7 @@ class Ledger:
                 "lost": sum(self.lost.values()),
                 "lost_by_cause": self.lost_by_cause,
                 "dropped": self.dropped_by_cause,
+                **({"skipped": self.skipped} if self._graph.bypass else {}),
             },
             "duration_s": (self.end_ns - self.start_ns) / 1e9,
             "frame_time_ms": {
@@ -208,22 +218,32 @@ class Ledger:
 
     def _stage_row(self, name: str, unit: str) -> dict[str, Any]:
         book = self._stages[name]
-        return {"unit": unit, "service_ms": summary_ms(book.service_ns), "wait_ms": summary_ms(book.wait_ns)}
+        times = {"service_ms": summary_ms(book.service_ns), "wait_ms": summary_ms(book.wait_ns)}
+        return {"unit": unit, "jobs": len(book.service_ns), **times}
 
     def _efficiency(self, isolated_ns: Mapping[str, float] | None, interval_ns: float) -> dict[str, Any]:
         """Isolated service time of the slowest unit over the mean interval between presented frames.
 
-        A stage that was not measured isolated (it writes files) counts with its mean in the run.
+        A stage that was not measured isolated (it writes files) counts with its mean in the run; so do, of frames that
+        took the bypass, their jobs, which are none of the stages that it skips.
         """
         if not isolated_ns or not interval_ns:
             return {"efficiency": None, "isolated_ms": {}}
         per_unit: dict[str, float] = dict.fromkeys(self._units, 0.0)
+        share = self.skipped / len(self.presented_ns)
         for stage in self._graph.stages:
-            in_run = self._stages[stage.name].service_ns
+            book = self._stages[stage.name]
             isolated = isolated_ns.get(stage.name)
-            per_unit[stage.unit] += isolated if isolated is not None else sum(in_run) / max(len(in_run), 1)
+            if isolated is None:
+                per_unit[stage.unit] += _mean(book.service_ns)
+            else:
+                per_unit[stage.unit] += (1 - share) * isolated + share * _mean(book.skipping_ns)
         return {
             "efficiency": max(per_unit.values()) / interval_ns,
             "bottleneck": max(per_unit, key=per_unit.__getitem__),
             "isolated_ms": {name: ns / NS_PER_MS for name, ns in isolated_ns.items()},
         }
+
+
+def _mean(times_ns: list[int]) -> float:
+    return sum(times_ns) / max(len(times_ns), 1)

@@ -27,7 +27,7 @@ from trilane.scheduler.events import (
 from trilane.scheduler.unit_life import UnitLifeError
 from trilane.unexpected_value import UnexpectedValue
 
-SCHEMA = 4
+SCHEMA = 5
 #: Actions that carry one tuple, which is written in their place.
 CARRIED: dict[Any, Any] = {Dispatch: Job, Finish: Outcome}
 
@@ -136,7 +136,9 @@ def _parse(row: list[Any], forms: dict[str, tuple[Any, list[Any]]]) -> Any:
 
 
 def _graph(data: dict[str, Any]) -> Graph:
-    return Graph(tuple(StageSpec(**stage) for stage in data["stages"]), tuple(data["edges"]), data["latency_to"])
+    bypass = data["bypass"]
+    ends = None if bypass is None else (bypass[0], bypass[1])
+    return Graph(tuple(StageSpec(**stage) for stage in data["stages"]), tuple(data["edges"]), data["latency_to"], ends)
 
 
 def _tuples(data: dict[str, Any]) -> dict[str, Any]:

@@ -91,14 +91,18 @@ class UnitState:
 
 
 class StageState:
-    """`estimate_ns`: running mean of its service time (weight 1/8), 0 before the first."""
+    """`estimate_ns`: running mean of its service time (weight 1/8), 0 before the first.
 
-    __slots__ = ("estimate_ns", "input", "name", "output", "position", "unit")
+    `bypassed`: of the stage at which a bypass ends, the edge whose frames may skip to it.
+    """
+
+    __slots__ = ("bypassed", "estimate_ns", "input", "name", "output", "position", "unit")
 
     def __init__(self, name: str, unit: UnitState, position: int) -> None:
         self.name, self.unit, self.position = name, unit, position
         self.input: EdgeSlots | None = None
         self.output: EdgeSlots | None = None
+        self.bypassed: EdgeSlots | None = None
         self.estimate_ns = 0
 
     def learn(self, service_ns: int) -> None:
@@ -113,15 +117,16 @@ class StageState:
 class FrameState:
     """`position`: of its next stage. `ready_ns`: when its last stage ended.
 
-    `latency_ns`: from the pose to the composited frame, once known.
+    `latency_ns`: from the pose to the composited frame, once known. `skips`: whether it takes the bypass.
     """
 
-    __slots__ = ("deadline_ns", "latency_ns", "pose_ns", "position", "ready_ns")
+    __slots__ = ("deadline_ns", "latency_ns", "pose_ns", "position", "ready_ns", "skips")
 
     def __init__(self, release_ns: int, deadline_ns: int) -> None:
         self.position, self.ready_ns = 0, release_ns
         self.deadline_ns = deadline_ns
         self.pose_ns = self.latency_ns = 0
+        self.skips = False
 
 
 def build(graph: Graph) -> tuple[list[StageState], dict[str, UnitState], list[EdgeSlots]]:

@@ -33,10 +33,16 @@ from trilane.scheduler.recording import Recording
 
 #: (stage, unit, frame, begin_ns) -> service time in ns.
 Service = Callable[[str, str, int, int], int]
+#: (frame, `Job.fresh`) -> whether the frame takes the bypass.
+Skips = Callable[[int, bool], bool]
 
 #: Priority at equal times; the core's deadline comes after both.
 FAULT: Final = 0
 EVENT: Final = 1
+
+
+def _none_skips(_frame: int, _fresh: bool) -> bool:
+    return False
 
 
 @dataclass(frozen=True)
@@ -71,6 +77,7 @@ class VirtualDriver:
         restart_ns: int = 1_000_000_000,
         faults: Iterable[tuple[int, str]] = (),
         inputs: Iterable[tuple[int, Event]] = (),
+        skips: Skips = _none_skips,
         keep: bool = False,
     ) -> None:
         """All times are `int`, those of `service` too (no NumPy integers).
@@ -81,6 +88,7 @@ class VirtualDriver:
         `restart_ns`: a unit's start-up time.
         `faults`: (t_ns, unit), deaths of units.
         `inputs`: (t_ns, event), events from outside, such as SetDuty or Stop.
+        `skips`: which frames take the bypass of `graph`, if it has one.
         `keep`: record steps, and the jobs that end.
         Raises ValueError for an unknown policy or edge.
         """
@@ -88,6 +96,7 @@ class VirtualDriver:
         self.recording = Recording(graph, settings) if keep else None
         self.jobs: list[JobRecord] = []
         self._service, self._message_delay_ns, self._restart_ns = service, message_delay_ns, restart_ns
+        self._skips, self._bypass_begin = skips, graph.bypass[0] if graph.bypass is not None else ""
         self._heap: list[tuple[int, int, int, Event, int]] = []
         self._sequence = 0
         self._begun: dict[int, JobRecord] = {}
@@ -150,13 +159,14 @@ class VirtualDriver:
         heappush(self._heap, (at_ns, priority, self._sequence, event, epoch))
 
     def _dispatch(self, now_ns: int, job: Job) -> None:
-        job_id, name, stage, frame, _, _, _ = job
+        job_id, name, stage, frame, _, _, _, fresh = job
         unit = self._units[name]
         begin_ns = now_ns + self._message_delay_ns
         if begin_ns < unit.free_ns:
             begin_ns = unit.free_ns
         end_ns = unit.free_ns = begin_ns + self._service(stage, name, frame, begin_ns)
-        done = tuple.__new__(JobDone, (name, job_id, begin_ns, end_ns, begin_ns, 0, 0, 0))
+        skips = stage == self._bypass_begin and self._skips(frame, fresh)
+        done = tuple.__new__(JobDone, (name, job_id, begin_ns, end_ns, begin_ns, 0, 0, 0, skips))
         self._sequence += 1
         heappush(self._heap, (end_ns + self._message_delay_ns, EVENT, self._sequence, done, unit.epoch))
         if self.recording is not None:

@@ -18,7 +18,7 @@ from trilane.stages.config import RunConfig
 from trilane.stages.dsp.parts import crossing_bytes
 from trilane.stages.factories import FACTORIES, PRELOAD
 from trilane.stages.packets import pose_dtype, posed_vertices_bytes
-from trilane.units import AFTER_INFER, BEFORE_INFER, LATENCY_TO
+from trilane.units import AFTER_INFER, BEFORE_INFER, BYPASS, LATENCY_TO
 
 MAX_CHANNELS = 16  # of a tensor: what the GPU packs in one pass
 
@@ -31,6 +31,7 @@ def avatar_pipeline(config: RunConfig, assets: Assets, edge: str = "double") -> 
         edges=tuple(PipelineEdge(payload_bytes=size, header=header) for size in edge_bytes(config, assets).values()),
         units=dict(config.units),
         latency_to=LATENCY_TO,
+        bypass=BYPASS,
         preload=PRELOAD,
     ).with_rule(edge)
 

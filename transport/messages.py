@@ -25,8 +25,9 @@ class RunJob(NamedTuple):
     """To a unit: run one of its stages for one frame.
 
     `id`: of the job; its answer, `Done` or `Failed`, carries the same. `stage`: place in the unit's list of stages,
-    from 0. `slot_in`, `slot_out`: slots of the stage's edges, -1 where it has no such edge. `epoch`: of `slot_out`.
-    `t_dispatch_ns`: since when the unit has the job, in ns of CLOCK_MONOTONIC.
+    from 0. `slot_in`, `slot_out`: slots of the stage's edges, -1 where it has no such edge; where a bypass ends, those
+    of the bypassed edge are counted after the stage's own. `epoch`: of `slot_out`. `t_dispatch_ns`: since when the unit
+    has the job, in ns of CLOCK_MONOTONIC. `fresh`: 1 when the stage must not count on earlier frames, else 0.
     """
 
     id: int
@@ -36,6 +37,7 @@ class RunJob(NamedTuple):
     slot_out: int
     epoch: int
     t_dispatch_ns: int
+    fresh: int
 
 
 class RunIsolated(NamedTuple):
@@ -66,9 +68,9 @@ class Done(NamedTuple):
 
     `t_sampled_ns`: of the chain's first stage, when it sampled the frame's input; of the others 0. `preempted_ns`,
     `asleep_ns`: parts of the job in which the unit had no core, and in which nothing of it worked.
-    `preempted_before_ns`: how long it had no core between the job before and this one. `cpu_ns`, `cpu_before_ns`: CPU
-    time of all its threads in the job, and between the job before and this one. `metrics`: numbers that the stage
-    itself reports of the job, by name.
+    `preempted_before_ns`: how long it had no core between the job before and this one. `skips`: 1 when the frame takes
+    the pipeline's bypass, else 0. `cpu_ns`, `cpu_before_ns`: CPU time of all its threads in the job, and between the
+    job before and this one. `metrics`: numbers that the stage itself reports of the job, by name.
     """
 
     id: int
@@ -78,6 +80,7 @@ class Done(NamedTuple):
     preempted_ns: int
     asleep_ns: int
     preempted_before_ns: int
+    skips: int
     cpu_ns: int
     cpu_before_ns: int
     metrics: dict[str, float]

@@ -72,7 +72,11 @@ def edge_rule(text: str) -> EdgeRule:
 
 
 class EdgeSlots:
-    """The slots of one edge. `frame[i]` is -1 when none, `ready` is oldest first, `epoch` grows at each fault."""
+    """The slots of one edge.
+
+    `frame[i]` is -1 when none. `ready`: slots that wait for the edge's consumer, oldest first. `passing`: those that
+    wait for the stage at which a bypass of this edge ends. `epoch` grows at each fault.
+    """
 
     def __init__(self, rule: EdgeRule) -> None:
         self.rule = rule
@@ -80,20 +84,22 @@ class EdgeSlots:
         self.frame = [-1] * rule.slots
         self.free = list(range(rule.slots - 1, -1, -1))
         self.ready: deque[int] = deque()
+        self.passing: deque[int] = deque()
         self.epoch = 0
 
     def can_claim(self) -> bool:
         """Whether a slot is free, or may be taken from the oldest waiting frame."""
-        return bool(self.free) or (self.rule.yields and bool(self.ready))
+        return bool(self.free) or (self.rule.yields and bool(self.ready or self.passing))
 
     def claim(self, frame: int) -> tuple[int, int | None]:
         """A slot to write `frame` into, and the waiting frame that was evicted from it, if one was.
 
+        A frame on the bypass is evicted before any other, for no frame can need it.
         Raises SlotError when none is free and none may be evicted.
         """
         dropped = None
-        if not self.free and self.rule.yields and self.ready:
-            dropped = self.drop(self.ready[0])
+        if not self.free and self.rule.yields and (self.ready or self.passing):
+            dropped = self.drop((self.passing or self.ready)[0])
         if not self.free:
             raise SlotError("no slot to claim")
         slot = self.free.pop()
@@ -101,20 +107,21 @@ class EdgeSlots:
         self.frame[slot] = frame
         return slot, dropped
 
-    def commit(self, slot: int) -> list[int]:
-        """The slot's frame is complete; returns the frames that it replaces."""
+    def commit(self, slot: int, skips: bool = False) -> list[int]:
+        """The slot's frame is complete; returns the frames that it replaces. `skips`: it takes the bypass."""
         self._move("commit", slot)
-        replaced = [self.drop(old) for old in list(self.ready)] if self.rule.mailbox else []
-        self.ready.append(slot)
+        line = self.passing if skips else self.ready
+        replaced = [self.drop(old) for old in list(line)] if self.rule.mailbox else []
+        line.append(slot)
         return replaced
 
     def take(self, slot: int) -> None:
-        """The consumer's unit reads the slot from now on."""
+        """The unit of the stage that the slot waits for reads it from now on."""
         self._move("take", slot)
-        self.ready.remove(slot)
+        self._line_of(slot).remove(slot)
 
     def release(self, slot: int) -> None:
-        """The consumer's unit has read the slot."""
+        """The unit that took the slot has read it."""
         self._move("release", slot)
         self._empty(slot)
 
@@ -126,18 +133,25 @@ class EdgeSlots:
     def drop(self, slot: int) -> int:
         """Take a waiting frame out; returns its number."""
         self._move("drop", slot)
-        self.ready.remove(slot)
+        self._line_of(slot).remove(slot)
         frame = self.frame[slot]
         self._empty(slot)
         return frame
 
-    def give_back(self, slot: int) -> list[int]:
+    def give_back(self, slot: int, skips: bool = False) -> list[int]:
         """A taken frame waits again, in its old place; returns it when a newer one waits in a mailbox."""
         self._move("give_back", slot)
-        self.ready = deque(sorted([*self.ready, slot], key=self.frame.__getitem__))
+        line = deque(sorted([*(self.passing if skips else self.ready), slot], key=self.frame.__getitem__))
+        if skips:
+            self.passing = line
+        else:
+            self.ready = line
         if not self.rule.mailbox:
             return []
-        return [self.drop(old) for old in list(self.ready)[:-1]]
+        return [self.drop(old) for old in list(line)[:-1]]
+
+    def _line_of(self, slot: int) -> deque[int]:
+        return self.passing if self.passing and slot in self.passing else self.ready
 
     def _move(self, verb: str, slot: int) -> None:
         before, after = TRANSITIONS[verb]

@@ -64,6 +64,8 @@ def _caption(report: Report) -> str:
     ]
     if report.made:
         lines.insert(0, _made(report.made))
+    if report.frames.skipped:
+        lines.append(_skipped(report))
     lines.append("in brackets: 95 % interval, by the scatter of this run's frames; two runs may differ by more")
     runs: list[Report | Baseline] = [report, report.baseline] if report.baseline else [report]
     summaries = [times for run in runs for times in (run.frame_time_ms, run.latency_ms)]
@@ -178,6 +180,16 @@ def _too_few(times: TimeSummary, statistic: str) -> bool:
 def _between(low: float | None, high: float | None) -> str:
     """A 95 % interval."""
     return TOO_SHORT if low is None or high is None else f"{_number(low)} to {_number(high)}"
+
+
+def _skipped(report: Report) -> str:
+    """Which of the presented frames needed no new picture of the avatars, and why."""
+    frames, composite = report.frames, report.stages["composite"]
+    means = report.stage_metrics.get("composite", {})
+    why = {"reused": "reused", "nobody on the screen": "nobody", "without their picture": "stale"}
+    counts = {said: round(means.get(key, 0.0) * composite.jobs) for said, key in why.items()}
+    parts = ", ".join(f"{said} {count}" for said, count in counts.items() if count)
+    return f"skipped raster and infer: {frames.skipped} of {frames.presented} frames ({parts})"
 
 
 def _of_several(run: Report | Baseline, value: float) -> float | None:

@@ -110,7 +110,7 @@ class _SlotEnd:
         return self._payload
 
     def hand_over(self) -> None:
-        self._job_pipe.send(RunJob(self._count, 0, self._count, 0, 0, 0, 0))
+        self._job_pipe.send(RunJob(self._count, 0, self._count, 0, 0, 0, 0, 0))
         self._count += 1
 
     def receive(self) -> U8:

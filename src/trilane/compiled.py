@@ -17,6 +17,7 @@ from pathlib import Path
 MODULES = (
     "scheduler/core.py",
     "scheduler/assignment.py",
+    "scheduler/bypass.py",
     "scheduler/causes.py",
     "scheduler/choice.py",
     "scheduler/events.py",

@@ -30,3 +30,5 @@ BEFORE_INFER: tuple[tuple[str, UnitName], ...] = (("pose", "cpu"), ("raster", "g
 INFER: tuple[str, UnitName] = ("infer", "dsp")
 AFTER_INFER: tuple[tuple[str, UnitName], ...] = (("composite", "gpu"), ("present", "cpu"))
 LATENCY_TO = "composite"
+#: Frames that need no new picture of the avatars go from the first of these to the second.
+BYPASS = ("pose", "composite")

@@ -112,6 +112,13 @@ class MeshBounds:
         self._blend = body.posedirs if pose_blend else None
         self._levels = build_levels(shaped, self._weights)
 
+    def may_be_seen(self, posed: Posed, clip: ArrayLike) -> bool:
+        """Whether the mesh may be on the screen, by its largest patches: no when it surely is not, at little cost."""
+        view = _View.of(posed, clip)
+        level = self._levels[0]
+        touching, cut = self._sort_out(level, np.arange(len(level.centres)), view, _Extent())
+        return bool(len(touching) or len(cut))
+
     def rect(self, posed: Posed, clip: ArrayLike, vertices: NDArray[np.float32] | None = None) -> Rect | None:
         """The mesh's rectangle on the screen, clipped to it; None when nothing is visible.
 

@@ -1,31 +1,34 @@
 """The pose stage: from a frame's number to everything that the other stages have to know about it.
 
-Rule: motion and camera are asked for the frame's media time, frame / fps; nothing that is not finite leaves here.
+Rule: motion and camera are asked for the frame's media time, frame / fps; nothing that is not finite leaves here. A
+frame that shows what an earlier one showed, or nobody, is told so, skins nothing and skips the stages that would draw.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from trilane.arrays import F64
 from trilane.body.kinematics import Posed, Skeleton
 from trilane.errors import TrilaneError
 from trilane.pipeline.shared_assets import Assets
-from trilane.pipeline.stage import UnitContext
+from trilane.pipeline.stage import Skip, UnitContext
 from trilane.scene.mover import Mover
 from trilane.scene.planner import Held, plan_tensor
 from trilane.scene.tensor_layout import lay_out
+from trilane.scene.work import Work, shown_by, work_of
 from trilane.shapes import Shape
 from trilane.stages.avatar_assets import distinct, shaped_body, staged_of
 from trilane.stages.config import RunConfig
 from trilane.stages.cpu.actor import ModelledBody, Seen
 from trilane.stages.packets import posed_vertices
-from trilane.transport.packets import Packet
+from trilane.transport.packets import FRAME_FIELDS, Packet
 
 
 @dataclass(frozen=True)
@@ -38,11 +41,27 @@ class _Actor:
 
 @dataclass(frozen=True)
 class FramePlan:
-    """What was decided for a frame: the tensor's shape, None with nobody in view; each visible avatar by its number."""
+    """What was decided for a frame: its work, the tensor's shape, None with nobody in view, and by its number each
+    visible avatar.
+    """
 
+    work: Work
     shape: Shape | None
     density: float | None
     seen: Mapping[int, Seen]
+
+
+@dataclass(frozen=True)
+class _Made:
+    """What a frame showed, its header, and what was decided for it."""
+
+    shown: bytes
+    header: NDArray[np.void]
+    plan: FramePlan
+
+
+#: Fields of the header in which frames that show the same differ.
+OF_THE_FRAME = {*(name for name, _ in FRAME_FIELDS), "media_time_s", "work"}
 
 
 class PoseStage:
@@ -55,7 +74,8 @@ class PoseStage:
         self._output = (scene.output.height, scene.output.width)
         self._buckets, self._plans_tensor = config.buckets, scene.plans_tensor
         self._held: Held | None = None
-        self.plan = FramePlan(None, None, {})
+        self._skips = scene.plan == "planned"
+        self.plan = FramePlan(Work.NONE, None, None, {})
         folders = distinct(config)
         bodies = {
             folder: ModelledBody(shaped_body(assets, number), bool(config.posed_vertices), config.budget_px)
@@ -69,6 +89,8 @@ class PoseStage:
         self._camera = staged.camera
         self._projection = staged.camera.projection(scene.output.width / scene.output.height)
         self._counts = config.posed_vertices
+        self._made: dict[Work, _Made] = {}
+        self._was_seen = [False] * len(self._actors)
         self._slots: list[NDArray[np.void]] = []
         self._vertices: list[list[NDArray[np.float32]]] = []
 
@@ -80,10 +102,10 @@ class PoseStage:
         self._vertices = [posed_vertices(packet.payload, self._counts) for packet in outputs]
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:  # noqa: ARG002
-        """Fill `outputs[slot_out]` for `frame`.
+        """Fill `outputs[slot_out]` for `frame`. A `Skip` but for full work, which all frames of a fixed plan are.
 
-        Metrics: `visible`, how many avatars are; of a frame with any, `level` of `body.detail.DETAILS` and `error_px`,
-        the bound on what it moves on the picture, both of the worst avatar; `density` of a planned tensor.
+        Metrics: `visible`, how many avatars are; of a full frame `level` of `body.detail.DETAILS` and `error_px`, the
+        bound on what it moves on the picture, both of the worst avatar; `density` of a planned tensor.
 
         Raises ValueError without `slot_out`, TrilaneError when a number of the frame is not finite.
         """
@@ -94,25 +116,59 @@ class PoseStage:
         packet["frame"] = frame
         packet["t_sampled_ns"] = time.monotonic_ns()
         packet["media_time_s"] = t_s
-        packet["avatar_count"] = len(self._actors)
         view = self._camera.sample(t_s)
+        moved = [actor.mover.sample(t_s) for actor in self._actors]
+        _require_all_finite(view, moved, frame)
+        shown = shown_by([view, *(array for pair in moved for array in pair)])
+        work = self._work_of(shown, lambda: self._make(slot_out, frame, view, moved))
+        packet["work"] = work
+        known = self._made.get(Work.FULL if work is Work.REUSE else work)
+        if self._skips and known is not None and known.shown == shown:
+            _copy_same(known.header, packet)
+            self.plan = replace(known.plan, work=work)
+        else:
+            packet["picture"] = frame if work is Work.FULL else -1
+            self.plan = replace(self.plan, work=work)
+            self._made[work] = _Made(shown, packet.copy(), self.plan)
+        return _metrics(self.plan)
+
+    def _work_of(self, shown: bytes, is_anybody_seen: Callable[[], bool]) -> Work:
+        if self._skips:
+            return work_of(shown, self._shown_by(Work.FULL), self._shown_by(Work.NONE), is_anybody_seen)
+        is_anybody_seen()
+        return Work.FULL
+
+    def forget(self) -> None:
+        """The next frame in which anybody is seen is a full one."""
+        self._made.pop(Work.FULL, None)
+
+    def _shown_by(self, work: Work) -> bytes | None:
+        return self._made[work].shown if work in self._made else None
+
+    def _make(self, slot_out: int, frame: int, view: F64, moved: Sequence[tuple[F64, F64]]) -> bool:
+        """Fill what the header of slot `slot_out` says of camera and avatars; whether an avatar is visible.
+
+        `view` (4,4), and `moved`, each avatar's pose and place, are those of `frame`.
+        """
+        packet = self._slots[slot_out]
+        packet["avatar_count"] = len(self._actors)
         packet["view"], packet["projection"] = view, self._projection
-        _require_finite(view, frame, "camera")
         clip = self._projection @ view
         vertices: Sequence[NDArray[np.float32] | None] = self._vertices[slot_out] or [None] * len(self._actors)
         seen = [
             (avatar, one)
             for actor, place in zip(self._actors, vertices, strict=True)
-            if (one := self._pose(actor, avatar := packet["avatars"][actor.index], place, t_s, frame, clip)) is not None
+            if (one := self._see(actor, avatar := packet["avatars"][actor.index], place, moved, frame, clip))
+            is not None
         ]
         self.plan = self._lay_out(packet, seen)
-        return _metrics(self.plan)
+        return bool(seen)
 
     def _lay_out(self, packet: NDArray[np.void], seen: list[tuple[NDArray[np.void], Seen]]) -> FramePlan:
         """Crop rectangles, cells and the tensor's shape; the smallest shape when nothing is to be drawn."""
         if not seen:
             packet["tensor_shape"] = min(self._buckets, key=lambda shape: shape[0] * shape[1])
-            return FramePlan(None, None, {})
+            return FramePlan(Work.NONE, None, None, {})
         rects, density = [one.rect for _, one in seen], None
         if self._plans_tensor:
             plan = plan_tensor(rects, self._output, self._buckets, self._held)
@@ -122,26 +178,29 @@ class PoseStage:
         packet["tensor_shape"] = layout.shape
         for (avatar, _), (crop, cell) in zip(seen, layout.crops, strict=True):
             avatar["rect"], avatar["tensor_rect"] = crop, cell
-        return FramePlan(layout.shape, density, {int(avatar["avatar"]): one for avatar, one in seen})
+        return FramePlan(Work.FULL, layout.shape, density, {int(avatar["avatar"]): one for avatar, one in seen})
 
-    def _pose(
+    def _see(
         self,
         actor: _Actor,
         avatar: NDArray[np.void],
         vertices: NDArray[np.float32] | None,
-        t_s: float,
+        moved: Sequence[tuple[F64, F64]],
         frame: int,
         clip: NDArray[np.float64],
     ) -> Seen | None:
-        """Fill one avatar's joints, and `vertices` if given; where it is on the screen, None when it is not visible."""
-        index = actor.index
-        pose, translation = actor.mover.sample(t_s)
-        _require_finite(pose, frame, f"pose of avatar {index}")
-        _require_finite(translation, frame, f"place of avatar {index}")
+        """Fill one avatar's joints, and `vertices` if given; where it is on the screen, None when it is not visible.
+
+        One that was not seen in the last frame that was made is looked for by its patches before it is skinned.
+        """
+        pose, translation = moved[actor.index]
         posed: Posed = actor.skeleton.pose(pose, translation, actor.mover.world)
-        _require_finite(posed.matrices, frame, f"joints of avatar {index}")
-        seen = actor.body.see(posed, clip, self._output, vertices)
-        avatar["avatar"], avatar["visible"] = index, seen is not None
+        _require_finite(posed.matrices, frame, f"joints of avatar {actor.index}")
+        seen = None
+        if self._was_seen[actor.index] or actor.body.bounds.may_be_seen(posed, clip):
+            seen = actor.body.see(posed, clip, self._output, vertices)
+        self._was_seen[actor.index] = seen is not None
+        avatar["avatar"], avatar["visible"] = actor.index, seen is not None
         avatar["joints"], avatar["pose_feature"] = posed.matrices, posed.feature
         return seen
 
@@ -155,12 +214,28 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> PoseStage:
     return PoseStage(RunConfig.model_validate(settings["config"]), unit.assets)
 
 
-def _metrics(plan: FramePlan) -> dict[str, float]:
+def _metrics(plan: FramePlan) -> Mapping[str, float]:
     metrics = {"visible": float(len(plan.seen))}
+    if plan.work is not Work.FULL:
+        return Skip(metrics)
     if plan.seen:
         metrics["level"] = float(max(one.level for one in plan.seen.values()))
         metrics["error_px"] = max(one.error_px for one in plan.seen.values())
     return metrics if plan.density is None else {**metrics, "density": plan.density}
+
+
+def _copy_same(source: NDArray[np.void], target: NDArray[np.void]) -> None:
+    """All of a header but what belongs to its frame alone."""
+    for name in source.dtype.names or ():
+        if name not in OF_THE_FRAME:
+            target[name] = source[name]
+
+
+def _require_all_finite(view: F64, moved: Sequence[tuple[F64, F64]], frame: int) -> None:
+    _require_finite(view, frame, "camera")
+    for index, (pose, translation) in enumerate(moved):
+        _require_finite(pose, frame, f"pose of avatar {index}")
+        _require_finite(translation, frame, f"place of avatar {index}")
 
 
 def _require_finite(values: NDArray[np.floating], frame: int, what: str) -> None:

@@ -49,18 +49,30 @@ class Segment:
         context.colorspace, context.color_range = Colorspace.ITU709, ColorRange.MPEG
         self._reformatter: Any = VideoReformatter()
         self._last = -1
+        self._digest = ""
+        self._picture: Any = None
         self._digests = path.with_suffix(".sha256").open("w", encoding="ascii", buffering=1)
 
-    def digest(self, frame: int, pixels: NDArray[np.uint8]) -> None:
-        """Note the digest of `pixels`, (height, width, 3) and C-contiguous."""
-        self._digests.write(f"{frame} {hashlib.sha256(pixels.data).hexdigest()}\n")
+    def digest(self, frame: int, pixels: NDArray[np.uint8], repeats: bool = False) -> None:
+        """Note the digest of `pixels`, (height, width, 3) and C-contiguous.
 
-    def add(self, frame: int, pixels: NDArray[np.uint8]) -> None:
-        """Show `pixels`, (height, width, 3) RGB, from the instant of frame number `frame` on."""
-        rgb = av.VideoFrame.from_numpy_buffer(pixels, format="rgb24")
-        picture = self._reformatter.reformat(
-            rgb, format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG
-        )
+        `repeats`: they are those of the last call.
+        """
+        if not repeats:
+            self._digest = hashlib.sha256(pixels.data).hexdigest()
+        self._digests.write(f"{frame} {self._digest}\n")
+
+    def add(self, frame: int, pixels: NDArray[np.uint8], repeats: bool = False) -> None:
+        """Show `pixels`, (height, width, 3) RGB, from the instant of frame number `frame` on.
+
+        `repeats`: they are those of the last call, which was converted for the encoder already.
+        """
+        if not repeats:
+            rgb = av.VideoFrame.from_numpy_buffer(pixels, format="rgb24")
+            self._picture = self._reformatter.reformat(
+                rgb, format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG
+            )
+        picture = self._picture
         self._last = max(self._last + 1, frame)
         picture.pts, picture.time_base = self._last, self._stream.codec_context.time_base
         self._container.mux(self._stream.encode(picture))
@@ -83,6 +95,8 @@ class PresentStage:
         self._fps = config.scene.fps
         self._folder = config.out_dir / SEGMENTS if config.record else None
         self._frames: list[NDArray[np.uint8]] = []
+        self._headers: list[NDArray[np.void]] = []
+        self._drawn = -1
         self._segment: Segment | None = None
 
     def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
@@ -90,6 +104,7 @@ class PresentStage:
         if outputs:
             raise ValueError("the present stage has no output edge")
         size = self._height * self._width * 3
+        self._headers = [packet.header for packet in inputs]
         self._frames = [packet.payload[:size].reshape(self._height, self._width, 3) for packet in inputs]
         if self._folder is not None:
             self._folder.mkdir(parents=True, exist_ok=True)
@@ -102,11 +117,13 @@ class PresentStage:
             raise ValueError("the present stage needs an input slot")
         if self._segment is None:
             return {}
-        pixels = self._frames[slot_in]
+        pixels, drawn = self._frames[slot_in], int(self._headers[slot_in]["repeats"]) - 1
+        repeats = drawn == self._drawn >= 0
+        self._drawn = drawn if drawn >= 0 else frame
         start = time.perf_counter_ns()
-        self._segment.digest(frame, pixels)
+        self._segment.digest(frame, pixels, repeats)
         digested = time.perf_counter_ns()
-        self._segment.add(frame, pixels)
+        self._segment.add(frame, pixels, repeats)
         return {"digest_ms": (digested - start) * MS, "encode_ms": (time.perf_counter_ns() - digested) * MS}
 
     def close(self) -> None:

@@ -1,6 +1,7 @@
 """The composite stage: background, planes, contact shadow, avatars, display, in that order, to the presented frame.
 
-Rule: avatars are drawn far to near; one that is not visible leaves no trace.
+Rule: avatars are drawn far to near; one that is not visible leaves no trace. A frame that would be drawn as one that an
+output slot still holds is copied, not drawn.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from trilane.arrays import F64, Floats
 from trilane.pipeline.stage import UnitContext
 from trilane.scene.placed_camera import PlacedCamera
 from trilane.scene.schema import PlaneSpec, Scene
+from trilane.scene.work import Work
 from trilane.shapes import Shape
 from trilane.stages.avatar_assets import distinct, shaped_body, staged_of
 from trilane.stages.config import RunConfig
@@ -26,6 +28,7 @@ from trilane.stages.gpu.camera_matrices import eye_of
 from trilane.stages.gpu.composite_painters import AvatarPainter, PicturePainter, RoomPainter, ShadowPainter
 from trilane.stages.gpu.contact_shadows import DISCS, floor_discs
 from trilane.stages.gpu.detected_planes import PlanePainter
+from trilane.stages.gpu.drawn_frames import Drawing, DrawnFrames
 from trilane.stages.gpu.head_up_display import Hud
 from trilane.stages.gpu.opengl_context import CONTEXT, checked, describe, open_context
 from trilane.transport.packets import Packet
@@ -65,6 +68,9 @@ class CompositeStage:
         self._hud = Hud(ctx) if hud else None
         self._shadow = ShadowPainter(ctx, len(DISCS) * len(rest))
         self._painter = AvatarPainter(ctx, list(shapes))
+        self._held: NDArray[np.void] | None = None  # header of the frame whose picture of the avatars was uploaded
+        self._shows_background = 0  # grows with each picture of it
+        self._drawn = DrawnFrames()
         self._inputs: Sequence[Packet] = ()
         self._outputs: Sequence[Packet] = ()
 
@@ -72,28 +78,78 @@ class CompositeStage:
         """Keep the slots."""
         self._inputs, self._outputs = inputs, outputs
 
-    def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:  # noqa: ARG002
-        """Write the frame, (h,w,3) uint8 sRGB, row 0 on top."""
+    def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
+        """Write the frame, (h,w,3) uint8 sRGB, row 0 on top.
+
+        Figures: of a job, 1 or 0 for `nobody` (on the screen), `reused` (the picture of an earlier frame is the right
+        one), `stale` (it is not, but that one never came), and `copied` (not drawn: it is an earlier frame's).
+        """
         if slot_in is None or slot_out is None:
             raise ValueError("composite needs an input and an output slot")
-        packet = self._inputs[slot_in]
-        frame_bytes = self._outputs[slot_out].payload[: math.prod(self._shape) * 3]
+        packet, out = self._inputs[slot_in], self._outputs[slot_out]
+        pose = packet.header
         with checked(self._ctx):
-            self.draw(packet.header, packet.payload)
-            self._target.read_into(frame_bytes, components=3, alignment=1)
-        return {}
+            self._take(pose, packet.payload)
+            drawing = self._drawing(pose)
+            repeated = None if int(pose["work"]) == Work.FULL else self._drawn.slot_of(drawing, slot_out)
+            if repeated is None:
+                self._draw(pose)
+                self._target.read_into(out.payload[: math.prod(self._shape) * 3], components=3, alignment=1)
+            elif repeated != slot_out:
+                out.payload[:] = self._outputs[repeated].payload
+        out.header["repeats"] = self._drawn.note(slot_out, drawing, frame, repeated)
+        work, is_right = Work(int(pose["work"])), self._holds(int(pose["picture"]))
+        said = {
+            "nobody": work is Work.NONE,
+            "reused": work is Work.REUSE and is_right,
+            "stale": work is Work.REUSE and not is_right,
+            "copied": repeated is not None,
+        }
+        return {name: float(value) for name, value in said.items()}
 
     def draw(self, pose: NDArray[np.void], image: NDArray[np.uint8]) -> None:
         """Draw the frame that `pose` and the network's `image` (h * w * 4 bytes or more) describe."""
-        avatars = list(pose["avatars"][: int(pose["avatar_count"])])
-        visible = [avatar for avatar in avatars if avatar["visible"]]
-        shape = (int(pose["tensor_shape"][0]), int(pose["tensor_shape"][1]))
-        if visible:
-            self._painter.upload(shape, image[: math.prod(shape) * 4])
+        self._take(pose, image)
+        self._draw(pose)
+
+    def _take(self, pose: NDArray[np.void], image: NDArray[np.uint8]) -> None:
+        """Upload what is new in this frame: the background's picture, and the avatars' of a full one."""
+        if self._background is not None and self._picture is not None:
+            picture = self._background.at(float(pose["media_time_s"]))
+            if picture is not None:
+                self._shows_background += 1
+                self._picture.upload(picture)
+        if int(pose["work"]) == Work.FULL:
+            self._held = pose.copy()
+            if _visible(pose):
+                shape = _tensor_shape(pose)
+                self._painter.upload(shape, image[: math.prod(shape) * 4])
+
+    def _holds(self, picture: int) -> bool:
+        """Whether the picture of the avatars that was uploaded is that of frame `picture`."""
+        return self._held is not None and int(self._held["picture"]) == picture
+
+    def _drawing(self, pose: NDArray[np.void]) -> Drawing | None:
+        """What the frame's bytes depend on; None when it is like no other."""
+        if self._hud is not None:
+            return None
+        nobody = self._held is None or int(pose["work"]) == Work.NONE
+        picture = -1 if self._held is None or nobody else int(self._held["picture"])
+        return picture, self._shows_background, pose["view"].tobytes(), pose["projection"].tobytes()
+
+    def _draw(self, pose: NDArray[np.void]) -> None:
+        """Draw the frame of `pose` with the picture of the avatars that was uploaded last."""
         self._target.use()
         self._draw_background(pose)
         if self._planes is not None:
             self._planes.draw(pose["view"], pose["projection"])
+        if self._held is not None and int(pose["work"]) != Work.NONE:
+            self._draw_avatars(self._held)
+        if self._hud is not None:
+            self._hud.draw(self._target, pose)
+
+    def _draw_avatars(self, pose: NDArray[np.void]) -> None:
+        visible, shape = _visible(pose), _tensor_shape(pose)
         if visible:
             discs = [floor_discs(avatar["joints"], self._rest[int(avatar["avatar"])]) for avatar in visible]
             self._shadow.draw(pose["view"], pose["projection"], np.concatenate(discs))
@@ -101,8 +157,6 @@ class CompositeStage:
             rect = tuple(float(side) for side in avatar["rect"])
             top, left, height, width = (int(side) for side in avatar["tensor_rect"])
             self._painter.draw(self._target, shape, rect, (top, left, height, width))
-        if self._hud is not None:
-            self._hud.draw(self._target, pose)
 
     def close(self) -> None:
         """Close the background's file."""
@@ -112,17 +166,21 @@ class CompositeStage:
     def _draw_background(self, pose: NDArray[np.void]) -> None:
         if self._room is not None:
             self._room.draw(self._target, pose["view"], pose["projection"])
-        if self._background is None or self._picture is None:
-            return
-        picture = self._background.at(float(pose["media_time_s"]))
-        if picture is not None:
-            self._picture.upload(picture)
-        self._picture.draw()
+        if self._picture is not None:
+            self._picture.draw()
 
     def _depth(self, pose: NDArray[np.void], avatar: Any) -> float:
         """Camera z of the pelvis: the most negative is the farthest."""
         pelvis = avatar["joints"][0] @ np.append(self._rest[int(avatar["avatar"])][0], 1.0)
         return float(pose["view"][2, :3] @ pelvis + pose["view"][2, 3])
+
+
+def _visible(pose: NDArray[np.void]) -> list[Any]:
+    return [avatar for avatar in pose["avatars"][: int(pose["avatar_count"])] if avatar["visible"]]
+
+
+def _tensor_shape(pose: NDArray[np.void]) -> Shape:
+    return int(pose["tensor_shape"][0]), int(pose["tensor_shape"][1])
 
 
 def build(settings: Mapping[str, Any], unit: UnitContext) -> CompositeStage:

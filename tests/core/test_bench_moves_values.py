@@ -13,7 +13,7 @@ from trilane.bench.lib import gpu_buffering, load
 from trilane.bench.lib.gpu_buffering import READBACKS, UPLOADS
 from trilane.bench.lib.load import Load, Queries, bound_ms, queries_needed, tail, verdict
 from trilane.errors import BadInputError, TrilaneError
-from trilane.stages.cpu.crop import Rect
+from trilane.scene.crop import Rect
 
 
 class Noted:

@@ -157,7 +157,7 @@ def test_cpu_time_is_that_of_all_threads_and_files_are_closed() -> None:
 
 
 def done(begin: int, end: int, cpu: int, cpu_before: int) -> Done:
-    return Done(0, begin, end, 0, 0, 0, 0, cpu, cpu_before, {})
+    return Done(0, begin, end, 0, 0, 0, 0, 0, cpu, cpu_before, {})
 
 
 def test_cpu_time_before_the_run_does_not_count_and_spinning_between_jobs_does() -> None:
@@ -205,7 +205,7 @@ def test_what_cpu_time_leaves_of_the_cores_is_the_most_that_can_be_preempted() -
 
 def test_the_end_of_a_job_has_the_fields_of_the_unit_s_answer() -> None:
     """The clock of a run passes them on by their places."""
-    assert JobDone._fields[2:] == Done._fields[1:7]
+    assert JobDone._fields[2:] == Done._fields[1:8]
     assert (JobDone._fields[1], Done._fields[0]) == ("job", "id")
 
 
@@ -247,8 +247,9 @@ def measured(clock: JobClock, stage: int, dispatch_us: int, *, works_asleep: boo
     """A job's begin, end, preempted, asleep, preempted before, CPU time and CPU time before, in us."""
     clock.begin(stage, dispatch_us * 1000)
     clock.end(works_asleep)
-    _, begin, end, _, *rest, _ = clock.done(3, 0, {})
-    return tuple(value / 1000 for value in (begin, end, *rest))
+    _, begin, end, _, *lost, skips, cpu, cpu_before, _ = clock.done(3, 0, {})
+    assert skips == 0
+    return tuple(value / 1000 for value in (begin, end, *lost, cpu, cpu_before))
 
 
 def test_a_job_that_computes_costs_one_look_at_the_cpu_clock_before_its_answer() -> None:

@@ -356,7 +356,7 @@ def test_a_jobs_figures_are_milliseconds(tmp_path: Path, monkeypatch: pytest.Mon
     times = [0, 2_000_000, 7_000_000]
     monkeypatch.setattr(present_stage.time, "perf_counter_ns", lambda: times[next(ticks) % 3])
     seen: list[Any] = []
-    monkeypatch.setattr(stage._segment, "add", lambda frame, pixels: seen.append((frame, pixels)))
+    monkeypatch.setattr(stage._segment, "add", lambda frame, pixels, _repeats: seen.append((frame, pixels)))
     assert stage.run(4, 1, None) == {"digest_ms": pytest.approx(2.0), "encode_ms": pytest.approx(5.0)}
     (frame, pixels), folder = seen[0], tmp_path / "segments"
     assert frame == 4 and pixels.shape == (64, 96, 3)

@@ -15,7 +15,7 @@ from trilane.bench import filters, several
 from trilane.bench.lib import drawable, ground_truth
 from trilane.bench.lib.ground_truth import shaped_body
 from trilane.errors import BadInputError, MissingPartError
-from trilane.stages.cpu.crop import Rect, crop_projection
+from trilane.scene.crop import Rect, crop_projection
 from trilane.stages.dsp.runtime import RuntimeOptions
 from trilane.stages.gpu.opengl_context import Driver
 

@@ -200,10 +200,10 @@ def test_what_units_say_becomes_events_in_order(monkeypatch: pytest.MonkeyPatch)
     world.said.clear()
     job_error = Failed(1, 3, "dark")
     world.inbox = [
-        [("gpu", Done(0, 5, 9, 6, 1, 2, 3, 7, 8, {})), ("cpu", messages.Pong()), ("cpu", Closed())],
+        [("gpu", Done(0, 5, 9, 6, 1, 2, 3, 1, 7, 8, {})), ("cpu", messages.Pong()), ("cpu", Closed())],
         [("gpu", job_error), ("cpu", None), ("cpu", Ready(8)), ("gpu", Failed(-1, 1, "unbuilt"))],
     ]
-    assert clock.wait(NEVER)[1] == (JobDone("gpu", 0, 5, 9, 6, 1, 2, 3), Pong("cpu"))
+    assert clock.wait(NEVER)[1] == (JobDone("gpu", 0, 5, 9, 6, 1, 2, 3, True), Pong("cpu"))
     assert clock.wait(NEVER)[1] == (JobFailed("gpu", 1), UnitDied("cpu"), UnitReady("cpu"))
     assert world.said == [("connected", "cpu")]
     assert world.log.failure == Failure("dark", 3)
@@ -212,9 +212,9 @@ def test_what_units_say_becomes_events_in_order(monkeypatch: pytest.MonkeyPatch)
 
 def test_actions_become_messages(monkeypatch: pytest.MonkeyPatch) -> None:
     world = World(monkeypatch)
-    job = Job(7, "gpu", "mix", 4, 1, 0, 3)
+    job = Job(7, "gpu", "mix", 4, 1, 0, 3, True)
     world.clock.perform(START, (Dispatch(job), Kill("cpu"), Start("cpu"), Finish(Outcome(OutcomeKind.DONE))))
-    assert world.said == [("gpu", RunJob(7, 1, 4, 1, 0, 3, START)), ("kill", "cpu"), ("start", "cpu")]
+    assert world.said == [("gpu", RunJob(7, 1, 4, 1, 0, 3, START, 1)), ("kill", "cpu"), ("start", "cpu")]
     assert world.log.messages == ["unit cpu did not answer in time and is restarted"]
 
 
@@ -252,7 +252,7 @@ def test_requests_are_heard_and_answered_when_their_frame_is_presented(monkeypat
         decision = world.core.step(now_ns, events)
         clock.perform(now_ns, decision.actions)
         assert requests.answers == []
-        world.inbox = [[(unit, Done(number, 1, 2, 1 if number == 0 else 0, 0, 0, 0, 1, 0, {}))]]
+        world.inbox = [[(unit, Done(number, 1, 2, 1 if number == 0 else 0, 0, 0, 0, 0, 1, 0, {}))]]
         now_ns, events = clock.wait(START)
     assert requests.answers == [0]
 
@@ -277,7 +277,7 @@ def test_a_frame_that_nobody_asked_for_is_presented_all_the_same(monkeypatch: py
     world = World(monkeypatch, settings={"policy": "sequential"})
     clock = world.begun()
     for number, unit in ((0, "gpu"), (1, "gpu"), (2, "cpu")):
-        world.inbox = [[(unit, Done(number, 1, 2, 1 if number == 0 else 0, 0, 0, 0, 1, 0, {}))]]
+        world.inbox = [[(unit, Done(number, 1, 2, 1 if number == 0 else 0, 0, 0, 0, 0, 1, 0, {}))]]
         now_ns, events = clock.wait(START)
         clock.perform(now_ns, world.core.step(now_ns, events).actions)
     clock.finish()
@@ -294,11 +294,11 @@ def test_every_job_that_ended_is_booked_with_its_times_and_figures(monkeypatch: 
     world = World(monkeypatch)
     clock = world.begun()
     released = world.core.frames[0].ready_ns
-    world.inbox = [[("gpu", Done(0, START + 1, START + 9, START + 2, 3, 2, 1, 4, 99, {"area": 3.0}))]]
+    world.inbox = [[("gpu", Done(0, START + 1, START + 9, START + 2, 3, 2, 1, 0, 4, 99, {"area": 3.0}))]]
     clock.wait(START)
     assert clock.jobs == []
     del world.core.frames[1]
-    world.inbox = [[("gpu", Done(1, START + 12, START + 20, 0, 0, 0, 0, 16, 5, {"area": 4.0, "new": 1.0}))]]
+    world.inbox = [[("gpu", Done(1, START + 12, START + 20, 0, 0, 0, 0, 0, 16, 5, {"area": 4.0, "new": 1.0}))]]
     clock.wait(START)
     clock.finish()
     clock.finish()

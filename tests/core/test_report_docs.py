@@ -97,7 +97,7 @@ def test_every_event_and_action_stands_with_its_fields_in_order(form: list[str])
 def test_every_key_of_a_recording_is_explained() -> None:
     shown = {path for cells in rows("## events.jsonl") for path in expanded(cells[0].strip("`")) if '"' not in path}
     settings = {f"settings.{field.name}" for field in fields(events.Settings)}
-    graph = {"graph.stages[].name", "graph.stages[].unit", "graph.edges", "graph.latency_to"}
+    graph = {"graph.stages[].name", "graph.stages[].unit", "graph.edges", "graph.latency_to", "graph.bypass"}
     assert shown == {"schema", "t", "events", "actions"} | settings | graph
     assert {f"graph.{field.name}" for field in fields(events.Graph)} == {
         path.replace("[]", "").removesuffix(".name").removesuffix(".unit") for path in graph

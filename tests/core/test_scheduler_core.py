@@ -38,6 +38,7 @@ SERVICE_MS = {"pose": 0.3, "raster": 4.0, "infer": 16.0, "composite": 2.0, "pres
 FRAMES = 200
 PURE = (
     "assignment",
+    "bypass",
     "causes",
     "choice",
     "completion",
@@ -265,8 +266,8 @@ def test_a_file_that_is_no_recording_is_named(tmp_path: Path, text: str) -> None
 def test_a_recording_of_another_schema_is_not_replayed(tmp_path: Path) -> None:
     path = tmp_path / "events.jsonl"
     run("pipelined", keep=True).recording.write(path)
-    path.write_text(path.read_text().replace('"schema": 4', '"schema": 3', 1))
-    with pytest.raises(BadInputError, match=r"line 1: found schema 3; this Trilane reads 4"):
+    path.write_text(path.read_text().replace('"schema": 5', '"schema": 4', 1))
+    with pytest.raises(BadInputError, match=r"line 1: found schema 4; this Trilane reads 5"):
         read(path)
 
 

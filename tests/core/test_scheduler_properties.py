@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from trilane.scheduler.causes import Outcome, OutcomeKind
 from trilane.scheduler.core import Core
-from trilane.scheduler.events import Graph, Settings, StageSpec
+from trilane.scheduler.events import Dispatch, Graph, Job, JobDone, Settings, StageSpec
 from trilane.scheduler.virtual import VirtualDriver
 from trilane.transport.slots import FREE, READING, READY, WRITING
 
@@ -26,12 +26,30 @@ def graphs(draw: st.DrawFn, edges: list[str] = EDGES) -> Graph:
     units = draw(st.lists(st.sampled_from(UNITS), min_size=1, max_size=6))
     stages = tuple(StageSpec(f"s{index}", unit) for index, unit in enumerate(units))
     rules = draw(st.lists(st.sampled_from(edges), min_size=len(units) - 1, max_size=len(units) - 1))
-    return Graph(stages, tuple(rules), draw(st.sampled_from(stages)).name)
+    pairs = [(first, last) for first in range(len(units)) for last in range(first + 2, len(units))]
+    first, last = draw(st.sampled_from([(0, 0), *pairs]))
+    met = draw(st.sampled_from([*stages[: first + 1], *stages[last:]])).name  # by every frame
+    return Graph(stages, tuple(rules), met, (f"s{first}", f"s{last}") if last else None)
+
+
+def skips_of(seed: int, share: float) -> Any:
+    """`share` of the frames skip, of those that are told to be fresh a tenth of that."""
+
+    def skips(frame: int, fresh: bool) -> bool:
+        return random.Random(f"{seed} skip {frame}").random() < (share / 10 if fresh else share)
+
+    return skips
 
 
 def service_of(seed: int) -> Any:
     """Service times from 1 to 1000 ns that depend on stage and frame alone."""
     return lambda stage, _unit, frame, _begin_ns: random.Random(f"{seed} {stage} {frame}").randint(1, 1000)
+
+
+def first_of(graph: Graph) -> StageSpec:
+    """The stage at which the bypass begins."""
+    assert graph.bypass is not None
+    return next(stage for stage in graph.stages if stage.name == graph.bypass[0])
 
 
 def check(core: Core) -> None:
@@ -44,7 +62,9 @@ def check(core: Core) -> None:
             position = core.flow.stage_named[job.stage].position
             held.append(job.frame)
             if job.slot_in >= 0:
-                read[position - 1].append(job.slot_in)
+                own = len(core.flow.edges[position - 1].state)
+                bypassed = core.graph.stages.index(first_of(core.graph)) if job.slot_in >= own else position - 1
+                read[bypassed].append(job.slot_in - own if job.slot_in >= own else job.slot_in)
             if job.slot_out >= 0:
                 written[position].append(job.slot_out)
     for index, edge in enumerate(core.flow.edges):
@@ -53,11 +73,13 @@ def check(core: Core) -> None:
             by_state[state].append(slot)
         assert sorted(written[index]) == by_state[WRITING]
         assert sorted(read[index]) == by_state[READING]
-        assert sorted(edge.ready) == by_state[READY]
+        assert sorted([*edge.ready, *edge.passing]) == by_state[READY]
         assert sorted(edge.free) == by_state[FREE]
-        held += [edge.frame[slot] for slot in edge.ready]
-        waiting = [edge.frame[slot] for slot in edge.ready]
-        assert waiting == sorted(waiting)
+        for line in (edge.ready, edge.passing):
+            waiting = [edge.frame[slot] for slot in line]
+            assert waiting == sorted(waiting)
+            assert {core.frames[frame].skips for frame in waiting if line is edge.passing} <= {True}
+            held += waiting
     assert sorted(held) == sorted(core.frames)
 
 
@@ -71,6 +93,7 @@ def check(core: Core) -> None:
     limits=st.tuples(st.integers(0, 5), st.integers(0, 3), st.integers(0, 3000)),
     latch_ns=st.integers(0, 1500),
     faults=st.lists(st.tuples(st.integers(0, 60_000), st.sampled_from(UNITS)), max_size=4),
+    skipping=st.sampled_from([0.0, 0.3, 0.7, 1.0]),
 )
 def test_no_slot_is_owned_twice_no_frame_is_lost_or_out_of_order(
     graph: Graph,
@@ -81,6 +104,7 @@ def test_no_slot_is_owned_twice_no_frame_is_lost_or_out_of_order(
     limits: tuple[int, int, int],
     latch_ns: int,
     faults: list[tuple[int, str]],
+    skipping: float,
 ) -> None:
     in_flight, in_queue, timeout_ns = limits
     run = Settings(
@@ -97,7 +121,14 @@ def test_no_slot_is_owned_twice_no_frame_is_lost_or_out_of_order(
     )
     faults = [fault for fault in faults if fault[1] in graph.units]
     driver = VirtualDriver(
-        graph, run, service_of(seed), message_delay_ns=message_delay_ns, restart_ns=5000, faults=faults, keep=True
+        graph,
+        run,
+        service_of(seed),
+        message_delay_ns=message_delay_ns,
+        restart_ns=5000,
+        faults=faults,
+        skips=skips_of(seed, skipping),
+        keep=True,
     )
     assert driver.run() == Outcome(OutcomeKind.DONE)
     frames = driver.core.ledger.report(clock="virtual", requested=60)["frames"]
@@ -109,18 +140,44 @@ def test_no_slot_is_owned_twice_no_frame_is_lost_or_out_of_order(
         assert sum(parts) == pytest.approx(1)
         assert min(parts) >= 0
     assert driver.recording is not None
+    check_bypass(graph, driver.recording.steps, faults)
     core = Core(graph, run)
     for now_ns, events, actions in driver.recording.steps:
         assert core.step(now_ns, events).actions == actions
         check(core)
 
 
+def check_bypass(graph: Graph, steps: Any, faults: list[tuple[int, str]]) -> None:
+    """No skipped stage has a job of a frame that skips; no stage does frames out of order, but after a fault again."""
+    jobs: dict[int, Job] = {}
+    skipped: set[int] = set()
+    for _, events, actions in steps:
+        skipped |= {jobs[event.job].frame for event in events if isinstance(event, JobDone) and event.skips}
+        jobs |= {action.job.id: action.job for action in actions if isinstance(action, Dispatch)}
+    assert not {job.frame for job in jobs.values() if job.stage in graph.bypassed} & skipped
+    assert all(not job.fresh or job.stage == first_of(graph).name for job in jobs.values())
+    for stage in graph.stages:
+        order = [job.frame for job in jobs.values() if job.stage == stage.name]
+        assert order == sorted(order) or faults
+        assert order == sorted(set(order)) or faults
+
+
 @settings(max_examples=150, deadline=None)
-@given(graph=graphs(KEEPING), seed=st.integers(0, 2**32), message_delay_ns=st.integers(0, 100))
-def test_pipelined_is_never_slower_than_sequential(graph: Graph, seed: int, message_delay_ns: int) -> None:
+@given(
+    graph=graphs(KEEPING),
+    seed=st.integers(0, 2**32),
+    message_delay_ns=st.integers(0, 100),
+    skipping=st.sampled_from([0.0, 0.5]),
+)
+def test_pipelined_is_never_slower_than_sequential(
+    graph: Graph, seed: int, message_delay_ns: int, skipping: float
+) -> None:
     took = {}
     for policy in ("sequential", "pipelined"):
-        driver = VirtualDriver(graph, Settings(40, policy), service_of(seed), message_delay_ns=message_delay_ns)
+        skips = skips_of(seed, skipping)
+        driver = VirtualDriver(
+            graph, Settings(40, policy), service_of(seed), message_delay_ns=message_delay_ns, skips=skips
+        )
         driver.run()
         ledger = driver.core.ledger
         assert len(ledger.presented_ns) == 40

@@ -44,8 +44,16 @@ class PlainScheduler:
     """One run of `graph` from 0 to its end; `run` fills the public fields."""
 
     def __init__(
-        self, graph: Graph, settings: Settings, service: Any, delay_ns: int, faults: list[Any], duties: dict[str, int]
+        self,
+        graph: Graph,
+        settings: Settings,
+        service: Any,
+        delay_ns: int,
+        faults: list[Any],
+        duties: dict[str, int],
+        will_skip: Any = None,
     ) -> None:
+        self.will_skip = will_skip
         self.graph, self.settings, self.service, self.delay_ns = graph, settings, service, delay_ns
         self.last = len(graph.stages) - 1
         self.faults = sorted(faults)
@@ -65,6 +73,10 @@ class PlainScheduler:
         self.ended: list[tuple[str, int, int, int, int]] = []
         self.presented: list[tuple[int, int, int, int]] = []
         self.dropped, self.lost = Counter[str](), Counter[str]()
+        names = [stage.name for stage in graph.stages]
+        self.begin, self.end = [names.index(name) for name in graph.bypass or ()] or (-9, -9)
+        self.passing: list[int] = []  # frames on the bypass that wait for its end
+        self.fresh, self.last_skipped = True, False
 
     # what there is
 
@@ -79,13 +91,29 @@ class PlainScheduler:
     def used(self, edge: int) -> int:
         """Slots of the edge that are written, waited in or read."""
         jobs = [job for unit in self.units for job in unit.queue]
-        return len(self.waiting[edge + 1]) + sum(job["stage"] in (edge, edge + 1) for job in jobs)
+        reads = [edge + 1 if job["stage"] != self.end or not self.skips(job["frame"]) else -1 for job in jobs]
+        count = sum(edge == job["stage"] or job["stage"] == at for job, at in zip(jobs, reads, strict=True))
+        if edge == self.begin:
+            count += len(self.passing) + sum(job["stage"] == self.end and self.skips(job["frame"]) for job in jobs)
+        return len(self.waiting[edge + 1]) + count
+
+    def skips(self, frame: int) -> bool:
+        return bool(self.flying[frame].get("skips"))
+
+    def line(self, stage: int) -> list[int]:
+        """The frames that the stage takes, in order: one on the bypass waits until no older one is before its end."""
+        frames = list(self.waiting[stage])
+        if stage == self.end:
+            before = min((number for number, row in self.flying.items() if row["at"] < stage), default=NO_TIME)
+            frames += [frame for frame in self.passing if frame < before]
+        return sorted(frames)
 
     def has_slot(self, stage: int) -> bool:
         if stage == self.last:
             return True
         rule = self.graph.edges[stage]
-        yields = rule.startswith(("triple", "orphan")) and bool(self.waiting[stage + 1])
+        waits = self.waiting[stage + 1] or (stage == self.begin and self.passing)
+        yields = rule.startswith(("triple", "orphan")) and bool(waits)
         return self.used(stage) < SLOTS[rule] or yields
 
     def is_full(self) -> bool:
@@ -99,7 +127,8 @@ class PlainScheduler:
     def latch_from_ns(self) -> int:
         if self.settings.latch_ns == 0 or self.last == 0:
             return self.now_ns
-        if self.waiting[1] or any(job["stage"] == 0 for job in self.unit_of[0].queue):
+        waits = self.waiting[1] or (self.begin == 0 and self.passing)
+        if waits or any(job["stage"] == 0 for job in self.unit_of[0].queue):
             return NO_TIME
         second = self.unit_of[1]
         free_ns = second.head_since_ns if second.queue else self.now_ns
@@ -107,7 +136,7 @@ class PlainScheduler:
         return free_ns - self.estimate[0] - self.settings.latch_ns
 
     def has_input(self, stage: int) -> bool:
-        return bool(self.waiting[stage]) if stage else self.has_source()
+        return bool(self.line(stage)) if stage else self.has_source()
 
     def may_enter(self) -> bool:
         return not self.is_full() and self.now_ns >= self.latch_from_ns()
@@ -118,7 +147,8 @@ class PlainScheduler:
     def head(self, stage: int) -> tuple[int, int]:
         """The stage's next frame and its deadline."""
         if stage:
-            return self.waiting[stage][0], self.flying[self.waiting[stage][0]]["deadline"]
+            frame = self.line(stage)[0]
+            return frame, self.flying[frame]["deadline"]
         frame, released_ns = self.queue[0] if self.queue else (self.next_frame, self.now_ns)
         return frame, self.deadline(released_ns)
 
@@ -126,15 +156,21 @@ class PlainScheduler:
         return released_ns + self.settings.deadline_ns if self.settings.deadline_ns else NO_TIME
 
     def is_late(self, stage: int) -> bool:
-        """now + max over s of [max(own work before s, work of older frames at s) + own work from s on] > deadline."""
+        """now + max over s of [max(own work before s, work of older frames at s) + own work from s on] > deadline.
+
+        A frame that has still to do the stage where the bypass begins will skip if the last one there did.
+        """
         frame, deadline_ns = self.head(stage)
         ends = []
+        skipped = range(self.begin + 1, self.end) if self.last_skipped else range(0)
+        own = [0 if s in skipped and stage <= self.begin else ns for s, ns in enumerate(self.estimate)]
         for s in range(stage, self.last + 1):
-            older = sum(number < frame and row["at"] <= s for number, row in self.flying.items())
+            least = self.begin + 1 if s in skipped else 0
+            older = sum(number < frame and least <= row["at"] <= s for number, row in self.flying.items())
             unit, backlog_ns = self.unit_of[s], older * self.estimate[s]
             if older and unit.queue and unit.queue[0]["stage"] == s:
                 backlog_ns -= min(self.now_ns - unit.head_since_ns, self.estimate[s])
-            ends.append(max(sum(self.estimate[stage:s]), backlog_ns) + sum(self.estimate[s:]))
+            ends.append(max(sum(own[stage:s]), backlog_ns) + sum(own[s:]))
         return deadline_ns != NO_TIME and self.now_ns + max(ends) > deadline_ns
 
     # what happens
@@ -142,11 +178,38 @@ class PlainScheduler:
     def drop(self, stage: int, cause: str) -> None:
         """The oldest that waits for the stage."""
         if stage:
-            del self.flying[self.waiting[stage].pop(0)]
-            self.dropped[f"{self.graph.stages[stage - 1].name}->{self.graph.stages[stage].name}:{cause}"] += 1
+            self.drop_frame(self.waiting[stage][0], cause)
         else:
             self.queue.pop(0)
             self.dropped[f"source->{self.graph.stages[0].name}:{cause}"] += 1
+
+    def drop_frame(self, frame: int, cause: str) -> None:
+        """One that waits for its next stage."""
+        stages, at = self.graph.stages, self.flying[frame]["at"]
+        came_from = at - 1
+        if frame in self.passing:
+            came_from = self.begin
+            self.passing.remove(frame)
+        else:
+            self.waiting[at].remove(frame)
+        self.dropped[f"{stages[came_from].name}->{stages[at].name}:{cause}"] += 1
+        self.remove(frame)
+
+    def remove(self, frame: int) -> None:
+        """It did not get through: what it would have brought to the bypass's end is missing there."""
+        row = self.flying.pop(frame)
+        self.fresh |= not row.get("skips") and row["at"] <= self.end
+
+    def stale(self) -> list[int]:
+        """On the bypass: those that wait although a newer frame waits there that could go as soon."""
+        return [
+            frame
+            for frame in self.passing
+            if any(
+                newer > frame and not any(frame < n < newer and row["at"] < self.end for n, row in self.flying.items())
+                for newer in self.waiting[self.end] + self.passing
+            )
+        ]
 
     def drop_in_vain(self, stage: int) -> None:
         policy = self.settings.policy
@@ -155,10 +218,15 @@ class PlainScheduler:
         line: list[Any] = self.waiting[stage] if stage else self.queue
         while policy == "latest" and len(line) > 1:
             self.drop(stage, "stale")
-        while policy == "deadline" and line and self.is_late(stage):
+        while policy == "latest" and stage == self.end and self.stale():
+            self.drop_frame(self.stale()[0], "stale")
+        while policy == "deadline" and (self.line(stage) if stage else self.queue) and self.is_late(stage):
             if stage == 0 and not self.flying:
                 self.estimate = [ns - (ns >> 4) for ns in self.estimate]
-            self.drop(stage, "late")
+            if stage:
+                self.drop_frame(self.line(stage)[0], "late")
+            else:
+                self.drop(0, "late")
 
     def next_stage(self, unit: PlainUnit) -> int | None:
         lead_ns = LEAD_NS[self.settings.policy]
@@ -180,21 +248,30 @@ class PlainScheduler:
 
     def hand_over(self, unit: PlainUnit, stage: int) -> None:
         if stage:
-            frame = self.waiting[stage].pop(0)
+            frame = self.line(stage)[0]
+            (self.passing if frame in self.passing else self.waiting[stage]).remove(frame)
         else:
             frame, released_ns = self.queue.pop(0) if self.queue else (self.next_frame, self.now_ns)
             self.next_frame = max(self.next_frame, frame + 1)
             self.flying[frame] = {"at": 0, "ready": released_ns, "deadline": self.deadline(released_ns), "pose": 0}
         if stage < self.last and self.used(stage) >= SLOTS[self.graph.edges[stage]]:
-            self.drop(stage + 1, "stale" if self.graph.edges[stage] == "triple" else "pool")
+            first = self.passing[:1] if stage == self.begin else []
+            victim = (first or self.waiting[stage + 1])[0]
+            self.drop_frame(victim, "stale" if self.graph.edges[stage] == "triple" else "pool")
         begin_ns = max(self.now_ns + self.delay_ns, unit.free_ns)
         name = self.graph.stages[stage].name
         end_ns = unit.free_ns = begin_ns + self.service(name, unit.name, frame, begin_ns)
         epoch = self.epoch[min(stage, self.last - 1)] if self.last else 0
         if not unit.queue:
             unit.head_since_ns = self.now_ns
-        unit.queue.append({"stage": stage, "frame": frame, "begin": begin_ns, "end": end_ns, "from": self.now_ns})
-        self.jobs.append((name, unit.name, frame, self.flying[frame]["ready"], self.now_ns, begin_ns, end_ns, epoch))
+        skips, fresh = False, False
+        if stage == self.begin:
+            fresh, self.fresh = self.fresh, False
+            skips = self.will_skip(frame, fresh)
+        job = {"stage": stage, "frame": frame, "begin": begin_ns, "end": end_ns, "from": self.now_ns, "skips": skips}
+        unit.queue.append(job | {"fresh": fresh})
+        times = (self.flying[frame]["ready"], self.now_ns, begin_ns, end_ns)
+        self.jobs.append((name, unit.name, frame, *times, epoch, fresh))
 
     def job_done(self, unit: PlainUnit) -> None:
         job = unit.queue.pop(0)
@@ -212,6 +289,14 @@ class PlainScheduler:
             frame["pose"] = job["begin"]
         if self.graph.stages[stage].name == self.graph.latency_to:
             frame["latency"] = end_ns - frame["pose"]
+        if stage == self.begin:
+            self.last_skipped = bool(job["skips"])
+        if job["skips"]:
+            frame["at"], frame["skips"] = self.end, 1
+            while self.graph.edges[stage] == "triple" and self.passing:
+                self.drop_frame(self.passing[0], "stale")
+            self.passing.append(job["frame"])
+            return
         if stage == self.last:
             del self.flying[job["frame"]]
             self.presented.append((job["frame"], end_ns, frame["latency"], end_ns - frame["deadline"]))
@@ -223,16 +308,20 @@ class PlainScheduler:
     def die(self, unit: PlainUnit) -> None:
         jobs, unit.queue = unit.queue, []
         for place, job in enumerate(jobs):
+            self.fresh |= bool(job["fresh"]) and place == 1
             if place == 0 or job["stage"] == 0:
-                del self.flying[job["frame"]]
+                self.remove(job["frame"])
                 self.lost[f"died:{unit.name}"] += 1
             else:
-                line = self.waiting[job["stage"]]
+                skips = job["stage"] == self.end and self.skips(job["frame"])
+                line = self.passing if skips else self.waiting[job["stage"]]
                 line[:] = sorted([*line, job["frame"]])
-                while self.graph.edges[job["stage"] - 1] == "triple" and len(line) > 1:
-                    self.drop(job["stage"], "stale")
+                edge = self.begin if skips else job["stage"] - 1
+                while self.graph.edges[edge] == "triple" and len(line) > 1:
+                    self.drop_frame(line[0], "stale")
+        self.fresh |= self.end in unit.stages
         for stage in unit.stages:
-            for edge in (stage - 1, stage):
+            for edge in (stage - 1, stage, *([self.begin] if stage == self.end else [])):
                 if 0 <= edge < self.last:
                     self.epoch[edge] += 1
         unit.is_up, unit.ready_ns = False, None
@@ -304,10 +393,12 @@ class PlainScheduler:
 
     def done(self, unit: PlainUnit) -> list[PlainUnit]:
         """The unit itself is served first, then the one before its stage, then the one after it."""
-        stage = unit.queue[0]["stage"]
+        stage, frame = unit.queue[0]["stage"], unit.queue[0]["frame"]
+        came_from = self.begin if stage == self.end and self.skips(frame) else stage - 1
+        goes_to = self.end if unit.queue[0]["skips"] else stage + 1
         self.job_done(unit)
-        before = [self.unit_of[stage - 1]] if stage else []
-        after = [self.unit_of[stage + 1]] if stage < self.last else [self.unit_of[0]]
+        before = [self.unit_of[came_from]] if stage else []
+        after = [self.unit_of[goes_to]] if stage < self.last else [self.unit_of[0]]
         return [unit, *before, *after]
 
     def ready(self, unit: PlainUnit) -> list[PlainUnit]:
@@ -338,9 +429,11 @@ class PlainScheduler:
         while changed:
             changed = False
             for unit in units:
+                dropped = self.dropped.total()
                 while len(unit.queue) < unit.room() and (stage := self.next_stage(unit)) is not None:
                     self.hand_over(unit, stage)
                     changed = True
+                changed |= self.dropped.total() > dropped  # a frame less in flight: another may begin
 
 
 def service_of(seed: int) -> Any:
@@ -379,10 +472,33 @@ def drawn(seed: int) -> tuple[Graph, Settings, int, list[tuple[int, str]], dict[
     return graph, settings, draw.choice([0, 50_001]), faults, duties
 
 
+def skips_of(seed: int) -> Any:
+    """Six of ten frames skip; of those that are told to be fresh one of ten, as one in which there is nobody."""
+
+    def skips(frame: int, fresh: bool) -> bool:
+        return random.Random(f"{seed} skip {frame}").random() < (0.1 if fresh else 0.6)
+
+    return skips
+
+
+def with_bypass(seed: int, graph: Graph) -> Graph:
+    """`graph` with a bypass between two stages drawn at random, if it is long enough for one."""
+    draw, count = random.Random(f"{seed} bypass"), len(graph.stages)
+    ends = [(begin, end) for begin in range(count) for end in range(begin + 2, count)]
+    if not ends:
+        return graph
+    begin, end = draw.choice(ends)
+    names = [stage.name for stage in graph.stages]
+    return Graph(graph.stages, graph.edges, draw.choice(names[: begin + 1] + names[end:]), (names[begin], names[end]))
+
+
+@pytest.mark.parametrize("bypassed", [False, True])
 @pytest.mark.parametrize("seed", range(120))
-def test_the_core_does_what_a_plain_reading_of_the_rules_does(seed: int) -> None:
+def test_the_core_does_what_a_plain_reading_of_the_rules_does(seed: int, bypassed: bool) -> None:
     graph, settings, delay_ns, faults, duties = drawn(seed)
-    model = PlainScheduler(graph, settings, service_of(seed), delay_ns, faults, duties)
+    if bypassed:
+        graph = with_bypass(seed, graph)
+    model = PlainScheduler(graph, settings, service_of(seed), delay_ns, faults, duties, skips_of(seed))
     model.run()
     driver = VirtualDriver(
         graph,
@@ -392,6 +508,7 @@ def test_the_core_does_what_a_plain_reading_of_the_rules_does(seed: int) -> None
         restart_ns=RESTART_NS,
         faults=faults,
         inputs=[(0, SetDuty(name, duty)) for name, duty in duties.items()],
+        skips=skips_of(seed),
         keep=True,
     )
     driver.run()
@@ -399,8 +516,8 @@ def test_the_core_does_what_a_plain_reading_of_the_rules_does(seed: int) -> None
     dispatched = [
         (now, a.job) for now, _, actions in driver.recording.steps for a in actions if isinstance(a, Dispatch)
     ]
-    assert [(job.stage, job.unit, job.frame, now, job.epoch) for now, job in dispatched] == [
-        (stage, unit, frame, at_ns, epoch) for stage, unit, frame, _, at_ns, _, _, epoch in model.jobs
+    assert [(job.stage, job.unit, job.frame, now, job.epoch, job.fresh) for now, job in dispatched] == [
+        (stage, unit, frame, at_ns, epoch, fresh) for stage, unit, frame, _, at_ns, _, _, epoch, fresh in model.jobs
     ]
     rows = [row[:7] for row in driver.jobs]
     assert [

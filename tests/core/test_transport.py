@@ -44,12 +44,12 @@ from trilane.transport.socket_folder import LOCK, SocketFolder, remove_abandoned
 from trilane.transport.wakeup import AWAKE, DEFAULT, SHORTEST_NS, awake, use_slice
 
 MESSAGES = [
-    RunJob(1, 0, 2, -1, 0, 3, 0),
+    RunJob(1, 0, 2, -1, 0, 3, 0, 0),
     RunIsolated(1, 4, 0, 1),
     Ping(),
     Close(),
     Ready(1234),
-    Done(1, 2**62, 2**62 + 1, 0, 5, 6, 7, 8, 9, {"encode_ms": 1.5}),
+    Done(1, 2**62, 2**62 + 1, 0, 5, 6, 7, 1, 8, 9, {"encode_ms": 1.5}),
     Duration(2**40),
     Failed(-1, 2, "a failure"),
     Pong(),
@@ -73,7 +73,7 @@ def test_bytes_that_are_no_message_are_refused(data: bytes) -> None:
 @pytest.mark.parametrize("metrics", [None, [], 1, "text", {"a": "b"}, {1: 2.0}, {"a": True}])
 def test_values_that_are_no_metrics_are_refused(metrics: object) -> None:
     with pytest.raises(MessageError, match=r"expected dict|not msgpack"):
-        unpack(pack(Done(1, 2, 3, 4, 5, 6, 7, 8, 9, {})) + msgpack.packb(metrics))
+        unpack(pack(Done(1, 2, 3, 4, 5, 6, 7, 0, 8, 9, {})) + msgpack.packb(metrics))
 
 
 def test_a_text_field_of_another_type_is_refused() -> None:
@@ -163,7 +163,7 @@ def test_jobs_go_over_the_job_pipe_and_heartbeats_over_zeromq(tmp_path: Path) ->
     parent, child = Link(context, JobPipe(ends[0])), Link(context, JobPipe(ends[1], waits=True))
     parent.bind(f"ipc://{tmp_path}/bus")
     child.connect(f"ipc://{tmp_path}/bus")
-    job, done = RunJob(1, 0, 7, 0, 1, 0, 0), Done(1, 2, 3, 4, 5, 6, 7, 8, 9, {"inferred": 1.0})
+    job, done = RunJob(1, 0, 7, 0, 1, 0, 0, 0), Done(1, 2, 3, 4, 5, 6, 7, 0, 8, 9, {"inferred": 1.0})
     parent.job_pipe.send(job)
     assert child.job_pipe.receive() == job
     child.send_heartbeat(Pong())
@@ -191,23 +191,23 @@ def test_a_job_pipe_waits_for_a_message_or_not_at_all() -> None:
 def test_sending_to_an_end_that_is_closed_or_full_does_nothing() -> None:
     ours, theirs = (JobPipe(end) for end in job_pipe_pair())
     for number in range(10_000):
-        ours.send(RunJob(number, 0, 0, 0, 0, 0, 0))
+        ours.send(RunJob(number, 0, 0, 0, 0, 0, 0, 0))
     assert [theirs.receive() for _ in range(PACKETS + 1)] == [
-        *(RunJob(n, 0, 0, 0, 0, 0, 0) for n in range(PACKETS)),
+        *(RunJob(n, 0, 0, 0, 0, 0, 0, 0) for n in range(PACKETS)),
         None,
     ]
     theirs.close()
-    ours.send(Done(1, 2, 3, 4, 5, 6, 7, 8, 9, {}))
+    ours.send(Done(1, 2, 3, 4, 5, 6, 7, 0, 8, 9, {}))
     assert ours.receive() is None and ours.ended
     ours.close()
 
 
 def test_messages_sent_before_an_end_closed_with_work_unread_are_received() -> None:
     ours, theirs = (JobPipe(end) for end in job_pipe_pair())
-    theirs.send(Done(1, 2, 3, 4, 5, 6, 7, 8, 9, {}))
-    ours.send(RunJob(2, 0, 0, 0, 0, 0, 0))
+    theirs.send(Done(1, 2, 3, 4, 5, 6, 7, 0, 8, 9, {}))
+    ours.send(RunJob(2, 0, 0, 0, 0, 0, 0, 0))
     theirs.close()
-    assert ours.receive() == Done(1, 2, 3, 4, 5, 6, 7, 8, 9, {}) and not ours.ended
+    assert ours.receive() == Done(1, 2, 3, 4, 5, 6, 7, 0, 8, 9, {}) and not ours.ended
     assert ours.receive() is None and ours.ended
     ours.close()
 

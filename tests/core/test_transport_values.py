@@ -35,15 +35,15 @@ def words(*values: int) -> bytes:
 
 #: Message -> its bytes: which message it is, its integers, and msgpack of what is left when that is not empty.
 BYTES = [
-    (messages.RunJob(1, 2, 3, -1, 5, 6, 7), b"\0" + words(1, 2, 3, -1, 5, 6, 7)),
+    (messages.RunJob(1, 2, 3, -1, 5, 6, 7, 8), b"\0" + words(1, 2, 3, -1, 5, 6, 7, 8)),
     (messages.RunIsolated(1, 2, -1, 4), b"\1" + words(1, 2, -1, 4)),
     (messages.Ping(), b"\2"),
     (messages.Close(), b"\3"),
     (messages.Ready(77), b"\4" + words(77)),
-    (messages.Done(1, 2, 3, 4, 5, 6, 7, 8, 9, {}), b"\5" + words(1, 2, 3, 4, 5, 6, 7, 8, 9)),
+    (messages.Done(1, 2, 3, 4, 5, 6, 7, 8, 9, 10, {}), b"\5" + words(1, 2, 3, 4, 5, 6, 7, 8, 9, 10)),
     (
-        messages.Done(9, 8, 7, 6, 5, 4, 3, 2, 1, {"a": 1.5}),
-        b"\5" + words(9, 8, 7, 6, 5, 4, 3, 2, 1) + b"\x81\xa1a\xcb\x3f\xf8" + bytes(6),
+        messages.Done(9, 8, 7, 6, 5, 4, 3, 2, 1, 0, {"a": 1.5}),
+        b"\5" + words(9, 8, 7, 6, 5, 4, 3, 2, 1, 0) + b"\x81\xa1a\xcb\x3f\xf8" + bytes(6),
     ),
     (messages.Duration(9), b"\6" + words(9)),
     (messages.Failed(-1, 2, "no"), b"\7" + words(-1, 2) + b"\xa2no"),
@@ -63,7 +63,8 @@ def test_a_message_has_the_bytes_that_are_written_down(message: Any, data: bytes
 
 
 def test_the_times_of_a_job_that_ended_are_told_in_this_order() -> None:
-    times = ("t_begin_ns", "t_end_ns", "t_sampled_ns", "preempted_ns", "asleep_ns", "preempted_before_ns", "cpu_ns")
+    lost = ("preempted_ns", "asleep_ns", "preempted_before_ns")
+    times = ("t_begin_ns", "t_end_ns", "t_sampled_ns", *lost, "skips", "cpu_ns")
     assert messages.Done._fields == ("id", *times, "cpu_before_ns", "metrics")
 
 
@@ -90,7 +91,7 @@ def test_what_is_wrong_with_bytes_is_said() -> None:
         pack(messages.Failed(1, 2, "e" * 4077))
     with pytest.raises(MessageError, match="unknown message b''"):
         unpack(b"")
-    assert unpack(pack(messages.Done(1, 2, 3, 4, 5, 6, 7, 8, 9, {"a": 1, "b": 2.5}))).metrics == {"a": 1, "b": 2.5}
+    assert unpack(pack(messages.Done(1, 2, 3, 4, 5, 6, 7, 8, 9, 10, {"a": 1, "b": 2.5}))).metrics == {"a": 1, "b": 2.5}
 
 
 @pytest.mark.parametrize(("payload", "slot_bytes"), [(0, 1), (1, 2), (4095, 2), (4096, 2), (4097, 3), (40_960, 11)])

@@ -47,7 +47,7 @@ REGIONS = {
 
 
 def done(number: int) -> Done:
-    return Done(number, 1, 2, 3, 4, 5, 6, 7, 8, {})
+    return Done(number, 1, 2, 3, 4, 5, 6, 0, 7, 8, {})
 
 
 class FakeStarter:
@@ -109,8 +109,8 @@ Started = tuple[UnitProcesses, FakeStarter]
 def test_a_unit_is_told_what_it_needs_and_no_more(started: Started) -> None:
     processes, starter = started
     left, right = starter.specs["left"], starter.specs["right"]
-    assert (left.inputs, left.outputs) == ({"out": "mid->out"}, {"in": "in->mid"})
-    assert (right.inputs, right.outputs) == ({"mid": "in->mid"}, {"mid": "mid->out"})
+    assert (left.inputs, left.outputs) == ({"out": ("mid->out",)}, {"in": "in->mid"})
+    assert (right.inputs, right.outputs) == ({"mid": ("in->mid",)}, {"mid": "mid->out"})
     assert [stage.name for stage in left.stages] == ["in", "out"]
     assert left.edges == right.edges == REGIONS
     assert (left.settings, left.assets_fd, left.module_folders) == (

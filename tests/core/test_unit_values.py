@@ -137,7 +137,9 @@ def test_a_unit_answers_every_message_once(monkeypatch: pytest.MonkeyPatch) -> N
     ]
     outputs[0].header["epoch"] = 9
     alone = RunIsolated(1, 7, 0, -1), RunIsolated(0, 8, -1, 0)
-    link = FakeLink(RunJob(11, 0, 5, -1, 1, 2, LATER_NS), Ping(), RunJob(12, 1, 6, 1, -1, 2, LATER_NS), *alone, Close())
+    link = FakeLink(
+        RunJob(11, 0, 5, -1, 1, 2, LATER_NS, 0), Ping(), RunJob(12, 1, 6, 1, -1, 2, LATER_NS, 0), *alone, Close()
+    )
     meters: list[ToldMeter] = []
     monkeypatch.setattr(unit_loop, "CoreMeter", lambda others: meters.append(ToldMeter(others)) or meters[0])
     others = unit_loop._threads() - {os.getpid()}
@@ -148,8 +150,8 @@ def test_a_unit_answers_every_message_once(monkeypatch: pytest.MonkeyPatch) -> N
     assert before <= one.t_begin_ns <= one.t_sampled_ns <= one.t_end_ns <= two.t_begin_ns <= two.t_end_ns
     assert (two.t_sampled_ns, end) == (0, Closed())
     wall_ns = one.t_end_ns - one.t_begin_ns  # on one core: 100 ns worked, 2 ns waited for it, the rest slept
-    assert one[4:9] == (2, wall_ns - 102, 0, 100, 100)
-    assert two[4:9] == (2, 0, 2, 100, 200)  # held to a pace: the chip worked
+    assert one[4:10] == (2, wall_ns - 102, 0, 0, 100, 100)
+    assert two[4:10] == (2, 0, 2, 0, 100, 200)  # held to a pace: the chip worked
     assert [(meter.others, meter.looks) for meter in meters] == [(others, 5)]  # at the start, after a job or the like
     assert all(isinstance(took, Duration) and 0 <= took.value < time.monotonic_ns() - before for took in (three, four))
     assert link.beats == [Ready(os.getpid()), Pong()]
@@ -176,7 +178,7 @@ def test_a_stage_that_fails_is_an_answer_in_one_line(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], error: Exception, code: int, said: str
 ) -> None:
     stage = BoundStage("a", FakeStage(error), [], packets(OWN, 1), 0, context())
-    link = FakeLink(RunJob(11, 0, 5, -1, 0, 0, 0), RunIsolated(0, 5, -1, 0), Close())
+    link = FakeLink(RunJob(11, 0, 5, -1, 0, 0, 0, 0), RunIsolated(0, 5, -1, 0), Close())
     assert served(monkeypatch, link, [stage]) == code
     assert [(answer.id, answer.exit_code) for answer in link.sent[:3]] == [(11, code), (-2, code), (-3, code)]
     assert all(answer.message.startswith(said) for answer in link.sent[:2])
@@ -197,7 +199,7 @@ def test_closing_names_its_stage_and_goes_on(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_a_lost_unit_does_not_answer_it_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    link = FakeLink(RunJob(11, 0, 5, -1, 0, 0, 0))
+    link = FakeLink(RunJob(11, 0, 5, -1, 0, 0, 0, 0))
     stage = BoundStage("a", FakeStage(UnitLostError("context lost")), [], packets(OWN, 1), 0, context())
     with pytest.raises(UnitLostError):
         served(monkeypatch, link, [stage])
@@ -272,7 +274,7 @@ def test_stages_are_built_in_order_on_the_slots_of_their_edges(tmp_path: Path, m
     with edge_regions(pipeline()) as regions:
         spec = spec_of(
             unit="left", stages=stages, edges=regions, assets_fd=assets_fd, module_folders=(tmp_path,),
-            inputs={"out": "mid->out"}, outputs={"in": "in->mid"},
+            inputs={"out": ("mid->out",)}, outputs={"in": "in->mid"},
         )  # fmt: skip
         first, last = unit_loop.build_stages(spec)
     os.close(assets_fd)

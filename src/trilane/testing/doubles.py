@@ -15,7 +15,7 @@ import numpy as np
 from trilane.errors import BadInputError
 from trilane.hw_profiles.host import host_units
 from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage
-from trilane.pipeline.stage import UnitContext
+from trilane.pipeline.stage import Skip, UnitContext
 from trilane.transport.packets import Packet
 from trilane.units import AFTER_INFER, BEFORE_INFER, INFER, LATENCY_TO
 
@@ -24,6 +24,7 @@ FACTORY = "trilane.testing.doubles:build"
 BAD_FRAME = 3
 PAYLOAD_BYTES = 4096
 CHECKED_BYTES = 64
+FULL_EVERY = 7
 
 
 class StageDouble:
@@ -57,6 +58,20 @@ class StageDouble:
             self._log.close()
 
 
+class SkippingDouble(StageDouble):
+    """A first stage after which six of seven frames skip, but not one that must be fresh."""
+
+    _must_be_fresh = False
+
+    def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
+        is_full, self._must_be_fresh = self._must_be_fresh or frame % FULL_EVERY == 0, False
+        metrics = super().run(frame, slot_in, slot_out)
+        return {**metrics, "full": 1.0} if is_full else Skip(metrics, full=0.0)
+
+    def forget(self) -> None:
+        self._must_be_fresh = True
+
+
 def _check(packet: Packet, frame: int) -> None:
     if int(packet.header["frame"]) != frame:
         raise RuntimeError(f"header of frame {packet.header['frame']} for frame {frame}")
@@ -70,6 +85,12 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> StageDouble:
         raise BadInputError("mock.onnx", "nothing", "a network", "train one")
     unit.use_device("a double, which works while it sleeps")
     return StageDouble(settings["behaviour"], settings["log"])
+
+
+def build_skipping(settings: Mapping[str, Any], unit: UnitContext) -> SkippingDouble:
+    """A first stage like that of `build`, at which a bypass begins."""
+    unit.use_device("a double, which works while it sleeps")
+    return SkippingDouble(settings["behaviour"], settings["log"])
 
 
 def pipeline_of_doubles(

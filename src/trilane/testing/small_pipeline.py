@@ -43,7 +43,7 @@ def spec_of(**changes: Any) -> UnitSpec:
             "in->mid": EdgeRegion(fd=13, slots=1, header=OWN, payload_bytes=100),
             "mid->out": EdgeRegion(fd=14, slots=3, header=header_dtype(), payload_bytes=5000),
         },
-        "inputs": {"mid": "in->mid"},
+        "inputs": {"mid": ("in->mid",)},
         "outputs": {"mid": "mid->out"},
     }
     return UnitSpec(**{**values, **changes})
