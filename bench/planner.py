@@ -31,7 +31,7 @@ from trilane.stages.configure import Checked, Request, configure
 from trilane.stages.gpu.opengl_context import describe
 from trilane.writing import write_folder
 
-SCENES = ("closeup", "default", "far", "pair")
+SCENES = ("portrait", "full-body", "crowd", "walk-past", "top-to-floor", "leave-and-return")
 PLANS = {"fixed": fixed, "planned": planned}
 LEAST_FRAMES = 20
 #: By what differences from `full` are multiplied in the sheets.
@@ -52,7 +52,8 @@ def measure(
     Keys: `scenes`, one entry each: `name`; `speedup` (median over the rounds of the fixed frame time over the planned
     one), `speedup_low`, `speedup_high` (its 95 % interval; with fewer than six rounds the least and largest),
     `fixed_ms`, `planned_ms`; `psnr_fixed_db`, `psnr_planned_db`, `ssim_*`, `flip_*` of the frames against those of
-    `full`, the same with `box_` in the avatars' rectangles; `truth`: the same against the clothed body that the default
+    `full`, the same with `box_` in the avatars' rectangles, None with nobody in view; PSNR is that of the mean square
+    over all frames; `truth`: the same against the clothed body that the default
     avatar was trained on, `full` too; `network`: what paints `full`; `tensors`: the planned ones. `median_speedup`,
     `least_speedup`, `largest_loss_db` (fixed minus planned); `sources`; `driver`; `config`.
 
@@ -135,7 +136,7 @@ class _Scene:
         for number in (index * total // pictures for index in range(pictures)):
             background, boxes = first.background(number), cast.boxes(number)
             made = {plan: chain.frame(number) for plan, chain in chains.items()}
-            tensors.append(tuple(chains["planned"].posed(number)["tensor_shape"].tolist()))
+            tensors.append(chains["planned"].tensor)
             wanted = full.frame(number, background)
             for plan, errors in against_full.items():
                 errors.add(made[plan], wanted, boxes)
@@ -148,7 +149,7 @@ class _Scene:
             **_figures(against_full),
             "truth": _figures(against_true) if true is not None else None,
             "network": "; ".join(full.networks),
-            "tensors": [f"{height}x{width}" for height, width in sorted(set(tensors))],
+            "tensors": sorted(set(tensors)),
         }, sheets
 
 

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from trilane.arrays import F64, U8, Floats
+from trilane.scene.crop import Rect
 from trilane.shapes import BUCKET_STEP, Shape
-from trilane.stages.cpu.crop import Rect
 
 
 class Box(NamedTuple):
@@ -33,6 +33,11 @@ class Box(NamedTuple):
         across, down = 2.0 / output[1], 2.0 / output[0]
         return Rect(self.left * across - 1, 1 - self.bottom * down, self.right * across - 1, 1 - self.top * down)
 
+    def within(self, other: Box) -> Rect:
+        """The same in normalised device coordinates of a picture that fills `other`."""
+        moved = Box(self.top - other.top, self.left - other.left, self.bottom - other.top, self.right - other.left)
+        return moved.rect(other.shape)
+
     def on(self, output: Shape) -> Box:
         """The part that lies on a picture of `output` (height, width)."""
         return Box(max(self.top, 0), max(self.left, 0), min(self.bottom, output[0]), min(self.right, output[1]))
@@ -51,12 +56,17 @@ def box_around(rect: Rect, output: Shape) -> Box:
     """Whole pixels that hold `rect`, and so many around it that both sides are multiples of 32."""
     top, bottom = np.floor((1 - rect.y1) / 2 * output[0]), np.ceil((1 - rect.y0) / 2 * output[0])
     left, right = np.floor((1 + rect.x0) / 2 * output[1]), np.ceil((1 + rect.x1) / 2 * output[1])
-    rows, columns = _grown(int(top), int(bottom)), _grown(int(left), int(right))
+    return grown(Box(int(top), int(left), int(bottom), int(right)), BUCKET_STEP)
+
+
+def grown(box: Box, step: int) -> Box:
+    """`box` with pixels around it until `step` divides both sides; an odd one goes to the bottom or the right."""
+    rows, columns = _grown(box.top, box.bottom, step), _grown(box.left, box.right, step)
     return Box(rows[0], columns[0], rows[1], columns[1])
 
 
-def _grown(first: int, last: int) -> tuple[int, int]:
-    more = -(last - first) % BUCKET_STEP
+def _grown(first: int, last: int, step: int) -> tuple[int, int]:
+    more = -(last - first) % step
     return first - more // 2, last + more - more // 2
 
 
@@ -72,6 +82,22 @@ def shrunk(light: F64, factor: int) -> F64:
     height, width, channels = light.shape
     squares = light.reshape(height // factor, factor, width // factor, factor, channels)
     return np.asarray(squares.mean(axis=(1, 3)))
+
+
+def enlarged(light: F64, factor: int) -> F64:
+    """(h * factor, w * factor, C): `light` (h,w,C) read bilinearly at the middles of smaller pixels.
+
+    Each pixel becomes a square of `factor` x `factor`, with the same middle; beyond the middles of the outermost pixels their values go on.
+    """
+    return _enlarged_down(_enlarged_down(light, factor).swapaxes(0, 1), factor).swapaxes(0, 1)
+
+
+def _enlarged_down(light: F64, factor: int) -> F64:
+    places = np.clip((np.arange(len(light) * factor) + 0.5) / factor - 0.5, 0, len(light) - 1)
+    above = np.floor(places).astype(int)
+    below = np.minimum(above + 1, len(light) - 1)
+    share = (places - above)[:, None, None]
+    return np.asarray((1 - share) * light[above] + share * light[below])
 
 
 def blended(background: U8, layers: Iterable[Layer]) -> U8:

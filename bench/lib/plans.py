@@ -10,11 +10,12 @@ FIXED = "512x512"
 
 def fixed(checked: Checked) -> Checked:
     """The reference application's plan: one square tensor for everything, and every skin weight (12 at most)."""
-    return _sized(checked, FIXED)
+    scene = checked.config.scene.model_copy(update={"size": FIXED, "plan": "fixed"})
+    return checked.changed(scene=scene, shapes=())
 
 
 def planned(checked: Checked) -> Checked:
-    """What the scene says itself."""
+    """What the scene says itself; the shapes of a planned tensor are in the configuration."""
     return checked
 
 
@@ -25,7 +26,3 @@ def in_frames(checked: Checked, frames: int) -> Checked:
         return checked
     fewer = {"frames": frames, "fps": scene.fps * frames / scene.frames}
     return checked.changed(scene=scene.model_copy(update=fewer))
-
-
-def _sized(checked: Checked, size: str) -> Checked:
-    return checked.changed(scene=checked.config.scene.model_copy(update={"size": size}))

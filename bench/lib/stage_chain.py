@@ -1,7 +1,8 @@
 """The composited frames of a run, made by its own stages, one after the other in this process.
 
 Rule: the stages are built by the pipeline's factories and bound as a unit's process binds them, so a frame has the
-bytes that a run presents.
+bytes that a run presents. Frames come in any order, so none is made from an earlier one's picture; one with nobody in
+view takes the pipeline's bypass, as in a run.
 """
 
 from __future__ import annotations
@@ -16,8 +17,9 @@ from trilane.arrays import U8
 from trilane.pipeline.bound_stage import BoundStage
 from trilane.pipeline.description import Pipeline
 from trilane.pipeline.shared_assets import Assets
-from trilane.pipeline.stage import UnitContext
+from trilane.pipeline.stage import Skip, UnitContext
 from trilane.pipeline.unit_loop import factory_named
+from trilane.scene.work import Work
 from trilane.stages.avatar_pipeline import avatar_pipeline
 from trilane.stages.configure import Checked
 from trilane.stages.gpu.opengl_context import CONTEXT, open_context
@@ -36,20 +38,32 @@ class StageChain:
 
     def __init__(self, pipeline: Pipeline, units: Units) -> None:
         """Build and bind the stages. Raises what their factories raise."""
-        self._packets = [_packet(SlotLayout(edge.header, edge.payload_bytes)) for edge in pipeline.edges]
+        self.packets = [_packet(SlotLayout(edge.header, edge.payload_bytes)) for edge in pipeline.edges]
+        named = dict(zip(pipeline.edge_names, self.packets, strict=True))
+        begin, end = pipeline.bypass or (None, None)
+        self._end = [stage.name for stage in pipeline.stages].index(end) if end is not None else 0
         self._stages = []
-        for number, stage in enumerate(pipeline.stages[:-1]):
+        for stage, output in zip(pipeline.stages, self.packets, strict=False):  # the last stage has no output
             unit = units[stage.unit]
-            inputs, outputs = self._packets[max(number - 1, 0) : number], self._packets[number : number + 1]
+            inputs = [named[edge] for edge in pipeline.edges_into(stage.name)]
             made = factory_named(stage.factory)(stage.settings, unit)
-            self._stages.append(BoundStage(stage.name, made, inputs, outputs, 0, unit))
+            self._stages.append(BoundStage(stage.name, made, inputs, [output], 0, unit, stage.name == begin))
 
-    def run(self, frame: int, first: int = 0, last: int | None = None) -> Packet:
-        """Do frame `frame` from stage number `first` on; what stage number `last`, or the last one, handed on."""
+    def run(self, frame: int, last: int | None = None) -> Packet:
+        """Do frame `frame` to stage number `last`, or the last one; what comes to the stage behind it."""
+        self._next, self._slot_in = 0, -1
+        return self.go_on(frame, last)
+
+    def go_on(self, frame: int, last: int | None = None) -> Packet:
+        """The same for the stages that an earlier `run` of the frame left out."""
         last = len(self._stages) - 1 if last is None else last
-        for number in range(first, last + 1):
-            self._stages[number].run(frame, 0 if number else -1, 0, 0)
-        return self._packets[last]
+        while self._next <= last:
+            number = self._next
+            metrics = self._stages[number].run(frame, self._slot_in, 0, 0, fresh=True)
+            # Each edge has one slot, so at the bypass's end slot 1 is that of the edge behind its beginning.
+            self._next, self._slot_in = (self._end, 1) if isinstance(metrics, Skip) else (number + 1, 0)
+            self._handed = self.packets[number]
+        return self._handed
 
 
 class AvatarFrames:
@@ -74,17 +88,19 @@ class AvatarFrames:
 
     def background(self, number: int) -> U8:
         """(h,w,3) uint8: the same with everything that is under the avatars, their shadows too, but without them."""
-        self._chain.run(number, last=self._composite - 2)
-        picture = self._chain.run(number, self._composite - 1, self._composite - 1)
-        picture.payload[:] = 0
-        return self._picture(self._chain.run(number, self._composite))
+        self._chain.run(number, self._composite - 1).payload[:] = 0
+        return self._picture(self._chain.go_on(number))
 
-    def posed(self, number: int) -> NDArray[np.void]:
-        """What the pose stage says of frame `number`, the shape of its tensor too: a header as in `stages/packets.py`.
+    @property
+    def posed(self) -> NDArray[np.void]:
+        """What the pose stage said of the frame that was made last: a header as in `stages/packets.py`."""
+        return self._chain.packets[0].header
 
-        It is overwritten by the next frame.
-        """
-        return self._chain.run(number, last=0).header
+    @property
+    def tensor(self) -> str:
+        """Height x width of the last frame's tensor; `none` when nobody was seen and none was made."""
+        height, width = self.posed["tensor_shape"].tolist()
+        return f"{height}x{width}" if int(self.posed["work"]) == Work.FULL else "none"
 
     def _picture(self, packet: Packet) -> U8:
         height, width, channels = self._shape

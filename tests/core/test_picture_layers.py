@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 
-from trilane.bench.lib.full_picture import FINE_SIDE, fineness
-from trilane.bench.lib.layers import Box, Layer, blended, box_around, premultiplied, shrunk, to_code, to_light
-from trilane.stages.cpu.crop import Rect
+from trilane.bench.lib.full_picture import fineness
+from trilane.bench.lib.layers import (
+    Box,
+    Layer,
+    blended,
+    box_around,
+    enlarged,
+    grown,
+    premultiplied,
+    shrunk,
+    to_code,
+    to_light,
+)
+from trilane.scene.crop import Rect
 
 CODES = np.arange(256, dtype=np.uint8)
 
@@ -29,13 +42,38 @@ def test_the_rectangle_of_a_box_is_where_its_pixels_are() -> None:
     assert Box(25, -50, 75, 250).on((60, 200)) == Box(25, 0, 60, 200)
 
 
+def test_a_box_grows_evenly_to_a_coarser_grid_and_knows_the_rectangle_that_it_came_from() -> None:
+    """Of 96 x 64 pixels to multiples of 64: 16 rows on either side. One row too many goes to the end."""
+    box = Box(10, 20, 106, 84)
+    wide = grown(box, 64)
+    assert wide == Box(-6, 20, 122, 84)
+    assert grown(Box(0, 0, 31, 33), 32) == Box(0, -15, 32, 49)
+    assert wide.within(box) == pytest.approx((-1, -1 - 32 / 96, 1, 1 + 32 / 96))
+    assert Box(10, 20, 58, 36).within(box) == pytest.approx((-1, 0, -0.5, 1))
+
+
 @pytest.mark.parametrize(
-    ("shape", "times"),
-    [((160, 96), 3), ((96, 128), 4), ((257, 32), 1), ((256, 32), 2), ((640, 480), 1), ((32, 32), 16)],
+    ("shape", "area", "times"),
+    [
+        ((256, 256), 65536, 1),
+        ((160, 96), 65536, 2),  # of 65536: 0.94, and thrice 2.1
+        ((96, 128), 65536, 2),  # 0.75 is nearer than 1.69
+        ((32, 32), 65536, 8),
+        ((320, 288), 65536, 1),  # 1.41 is nearer than 0.35
+        ((640, 480), 65536, Fraction(1, 2)),  # 1.17; a third would be 0.52
+        ((640, 640), 65536, Fraction(1, 3)),  # 0.69 is nearer than 1.56
+        ((32, 64), 4096, 1),  # 0.5 and 2 are as near: the smaller tensor
+        ((64, 128), 4096, 1),  # the same of 2 and 0.5: the finer one, which loses nothing
+    ],
 )
-def test_a_small_box_has_a_finer_tensor_of_at_most_512(shape: tuple[int, int], times: int) -> None:
-    assert fineness(shape) == times
-    assert times == 1 or max(shape) * times <= FINE_SIDE
+def test_the_tensor_is_as_near_to_the_area_of_the_network_as_whole_pixels_allow(
+    shape: tuple[int, int], area: int, times: Fraction
+) -> None:
+    assert fineness(shape, area) == times
+    got = max(shape[0] * shape[1] * times**2, area) / min(shape[0] * shape[1] * times**2, area)
+    for other in (*range(1, 9), *(Fraction(1, n) for n in range(2, 9))):
+        there = shape[0] * shape[1] * other**2
+        assert got <= max(there, area) / min(there, area)
 
 
 def test_light_and_code_are_srgb() -> None:
@@ -72,3 +110,31 @@ def test_colour_counts_by_its_alpha_when_pixels_become_one() -> None:
     fine[:, 2:] = 1, 1, 1, 1
     once = shrunk(premultiplied(fine), 2)
     assert np.allclose(once, [[[0.25] * 4, [1] * 4]])
+
+
+def test_one_row_becomes_two_by_hand() -> None:
+    """The middles of four pixels over two lie at -1/4, 1/4, 3/4 and 5/4 of their distance."""
+    pair = np.array([[[0.0], [1.0]]])
+    assert np.array_equal(enlarged(pair, 2), np.array([[[0], [0.25], [0.75], [1]]] * 2))
+    assert np.array_equal(enlarged(pair.swapaxes(0, 1), 2), np.array([[[v]] * 2 for v in (0, 0.25, 0.75, 1)]))
+    thirds = enlarged(pair, 3)[0, :, 0]
+    assert thirds == pytest.approx([0, 0, 1 / 3, 2 / 3, 1, 1])
+
+
+@pytest.mark.parametrize("factor", [1, 2, 3, 4])
+def test_a_ramp_stays_a_ramp_and_a_constant_a_constant_when_enlarged(factor: int) -> None:
+    """At the middle of picture pixel i the ramp has its value at (i + 1/2) / factor - 1/2: nothing is shifted."""
+    shape = (5, 7)
+    rows, columns = np.indices(shape).astype(float)
+    light = np.stack([2 + 3 * rows - columns, np.full(shape, 0.3)], axis=-1)
+    own = enlarged(light, factor)
+    assert own.shape == (5 * factor, 7 * factor, 2)
+    row, column = ((place + 0.5) / factor - 0.5 for place in np.indices(own.shape[:2]))
+    clear = (row >= 0) & (row <= 4) & (column >= 0) & (column <= 6)
+    assert clear[factor:-factor, factor:-factor].all()
+    assert np.abs(own[..., 0] - (2 + 3 * row - column))[clear].max() < 1e-12
+    assert own[..., 1] == pytest.approx(0.3)
+    # Beyond the outermost middles the value goes on: the corner is the corner's.
+    assert own[0, 0, 0] == light[0, 0, 0] and own[-1, -1, 0] == light[-1, -1, 0]
+    # What was enlarged and is shrunk again is a ramp away from the border: a square has its pixel's value as mean.
+    assert shrunk(own, factor)[1:-1, 1:-1] == pytest.approx(light[1:-1, 1:-1])

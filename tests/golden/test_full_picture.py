@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trilane.bench.lib import full_picture
 from trilane.bench.lib.cast import Cast
 from trilane.bench.lib.full_picture import FullPictures
 from trilane.bench.lib.layers import Box, Layer, blended, premultiplied
@@ -59,9 +58,8 @@ def test_blending_is_what_the_painter_does_on_the_same_grid(gl: Any) -> None:
         assert changed[:22, 30:].mean() > 0.95 and changed.sum() == changed[:22, 30:].sum()
 
 
-def test_full_changes_nothing_where_nobody_is(checked: Checked, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_changes_nothing_where_nobody_is(checked: Checked) -> None:
     """Outside the boxes, `full` and the composite stage's own frame have the bytes of the background."""
-    monkeypatch.setattr(full_picture, "FINE_SIDE", 1)
     frames, cast = AvatarFrames(checked), Cast(checked)
     background, frame = frames.background(5), frames.frame(5)
     (box,) = cast.boxes(5)
@@ -81,10 +79,15 @@ def test_only_the_default_avatar_has_a_truth(checked: Checked) -> None:
     assert not has_truth(Cast(checked))
 
 
-def test_plans_change_the_size_alone_and_fewer_frames_show_the_whole_scene(checked: Checked) -> None:
+def test_the_fixed_plan_is_the_square_and_fewer_frames_show_the_whole_scene(checked: Checked) -> None:
     scene = checked.config.scene
     assert planned(checked) is checked
-    assert fixed(checked).config.scene == scene.model_copy(update={"size": FIXED})
+    auto = checked.changed(scene=scene.model_copy(update={"size": "auto"}), shapes=((64, 32), (96, 64)))
+    for given in (checked, auto):
+        config = fixed(given).config
+        assert config.scene == scene.model_copy(update={"size": FIXED, "plan": "fixed"})
+        assert config.buckets == [(512, 512)]
+        assert config.budget_px == 0
     fewer = in_frames(checked, 4).config.scene
     assert (fewer.frames, fewer.fps) == (4, 2.0)  # both last two seconds
     assert in_frames(checked, 12) is checked
@@ -94,7 +97,9 @@ def test_the_cast_is_where_the_pose_stage_says(checked: Checked) -> None:
     """The same moment, joints and camera to the bit, and a box around the rectangle that the stages crop by."""
     cast = Cast(checked)
     (seen,) = cast.seen(5)
-    pose = AvatarFrames(checked).posed(5)
+    frames = AvatarFrames(checked)
+    frames.frame(5)
+    pose = frames.posed
     avatar = pose["avatars"][0]
     assert np.array_equal(seen.joints, avatar["joints"])
     assert np.array_equal(seen.view.astype(np.float32), pose["view"])
