@@ -87,7 +87,8 @@ def shrunk(light: F64, factor: int) -> F64:
 def enlarged(light: F64, factor: int) -> F64:
     """(h * factor, w * factor, C): `light` (h,w,C) read bilinearly at the middles of smaller pixels.
 
-    Each pixel becomes a square of `factor` x `factor`, with the same middle; beyond the middles of the outermost pixels their values go on.
+    Each pixel becomes a square of `factor` x `factor`, with the same middle; beyond the middles of the outermost pixels
+    their values go on.
     """
     return _enlarged_down(_enlarged_down(light, factor).swapaxes(0, 1), factor).swapaxes(0, 1)
 
