@@ -41,6 +41,7 @@ BENCHES = {
     "accounts": ("trilane.bench.accounts", "Busy and idle shares of random runs, computed twice, beside CPU time."),
     "handoff": ("trilane.bench.handoff", "A slot from process to process, beside pickling, copying and iceoryx2."),
     "scheduler": ("trilane.bench.scheduler", "The scheduler in virtual time beside SimPy, and its determinism."),
+    "planner": ("trilane.bench.planner", "Planned work against a fixed square: speed and image error."),
     "joints": ("trilane.bench.joints", "What the joint transforms of a frame cost."),
 }
 
@@ -144,7 +145,7 @@ def show(name: str, measure: Callable[..., Mapping[str, Any]], asked: Mapping[st
     if as_json:
         print_json(document)
         return
-    rows = result.pop("rows", [])
+    rows = result.pop("rows", None) or result.pop("scenes", [])
     console = stdout_console()
     if rows:
         console.print(_table([flat(row) for row in rows]))

@@ -20,6 +20,7 @@ LIMITS: dict[str, tuple[float, float]] = {
     "views": (1, 1_000_000),
     "finalists": (1, 1000),
     "frames": (1, 10_000_000),
+    "pictures": (1, 10_000),
     "seeds": (1, 1000),
     "times": (1, 1000),
     "width": (1, 8192),

@@ -1,0 +1,100 @@
+"""Who is seen in a frame and where, for pictures of a scene that are made without the stages.
+
+Rule: motion, camera and media time are the pose stage's, so a picture shows the moment that the run's frame shows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from trilane.arrays import F32, F64
+from trilane.avatars.bundle import CLOTHES_STANDOFF_M, load_bundle
+from trilane.bench.lib.layers import Box, box_around
+from trilane.body.kinematics import Skeleton
+from trilane.scene.crop import crop_projection
+from trilane.scene.mover import Mover
+from trilane.shapes import Shape
+from trilane.stages.avatar_assets import AvatarData, load_avatar, staged_of
+from trilane.stages.configure import Checked
+from trilane.stages.cpu.mesh_bounds import MeshBounds
+
+
+@dataclass(frozen=True)
+class Seen:
+    """One avatar in one frame.
+
+    `folder`: of its bundle. `pose` (55,3), `translation` (3,), `world` (4,4): as `Mover.sample` and `Mover` have them.
+    `joints` (55,3,4): its skinning matrices, of the house. `box`: the pixels of the picture that hold it, clothes
+    included. `depth`: camera z of the pelvis. `view` (4,4); `projection` (4,4): of the box.
+    """
+
+    folder: Path
+    pose: F64
+    translation: F64
+    world: F64
+    joints: F32
+    box: Box
+    depth: float
+    view: F64
+    projection: F64
+
+
+@dataclass(frozen=True)
+class _Actor:
+    folder: Path
+    mover: Mover
+    data: AvatarData
+    skeleton: Skeleton
+    bounds: MeshBounds
+
+
+class Cast:
+    """The avatars and the camera of a scene. `avatars`: each distinct one by the folder of its bundle."""
+
+    def __init__(self, checked: Checked) -> None:
+        """Raises BadInputError."""
+        scene, folders = checked.config.scene, checked.config.avatar_dirs
+        self._fps = scene.fps
+        self._output: Shape = (scene.output.height, scene.output.width)
+        staged = staged_of(checked.assets)
+        self._camera = staged.camera
+        self._projection = staged.camera.projection(scene.output.width / scene.output.height)
+        self.avatars = {folder: load_avatar(load_bundle(folder)) for folder in dict.fromkeys(folders)}
+        bounds = {
+            folder: MeshBounds(data.shaped, standoff_m=CLOTHES_STANDOFF_M) for folder, data in self.avatars.items()
+        }
+        self._actors = [
+            _Actor(folder, mover, data := self.avatars[folder], _skeleton(data), bounds[folder])
+            for folder, mover in zip(folders, staged.movers, strict=True)
+        ]
+
+    def seen(self, frame: int) -> list[Seen]:
+        """The avatars that are on the screen in frame number `frame`."""
+        t_s = frame / self._fps
+        view = self._camera.sample(t_s)
+        found = (self._seen(actor, t_s, view) for actor in self._actors)
+        return [seen for seen in found if seen is not None]
+
+    def boxes(self, frame: int) -> list[Box]:
+        """The parts of the picture that hold avatars in frame number `frame`."""
+        return [seen.box.on(self._output) for seen in self.seen(frame)]
+
+    def _seen(self, actor: _Actor, t_s: float, view: F64) -> Seen | None:
+        pose, translation = actor.mover.sample(t_s)
+        world = actor.mover.world
+        posed = actor.skeleton.pose(pose, translation, world)
+        rect = actor.bounds.rect(posed, self._projection @ view)
+        if rect is None:
+            return None
+        box = box_around(rect, self._output)
+        pelvis = world @ np.append(actor.data.shaped.joints[0] + translation, 1.0)
+        projection = crop_projection(self._projection, box.rect(self._output))
+        depth = float(view[2] @ pelvis)
+        return Seen(actor.folder, pose, translation, world, posed.matrices.copy(), box, depth, view, projection)
+
+
+def _skeleton(data: AvatarData) -> Skeleton:
+    return Skeleton(data.shaped.joints, data.shaped.body.parents)

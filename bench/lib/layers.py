@@ -1,0 +1,124 @@
+"""Layers of a picture, blended in linear light in float64: what the composite does, written a second time.
+
+Rule: a layer lies on the pixel grid of the picture, so it is never resampled; it may hang over the picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from trilane.arrays import F64, U8, Floats
+from trilane.scene.crop import Rect
+from trilane.shapes import BUCKET_STEP, Shape
+
+
+class Box(NamedTuple):
+    """Rows `top` to `bottom` and columns `left` to `right` of a picture, in pixels; the last of each are outside."""
+
+    top: int
+    left: int
+    bottom: int
+    right: int
+
+    @property
+    def shape(self) -> Shape:
+        return self.bottom - self.top, self.right - self.left
+
+    def rect(self, output: Shape) -> Rect:
+        """The same in normalised device coordinates of a picture of `output` (height, width)."""
+        across, down = 2.0 / output[1], 2.0 / output[0]
+        return Rect(self.left * across - 1, 1 - self.bottom * down, self.right * across - 1, 1 - self.top * down)
+
+    def within(self, other: Box) -> Rect:
+        """The same in normalised device coordinates of a picture that fills `other`."""
+        moved = Box(self.top - other.top, self.left - other.left, self.bottom - other.top, self.right - other.left)
+        return moved.rect(other.shape)
+
+    def on(self, output: Shape) -> Box:
+        """The part that lies on a picture of `output` (height, width)."""
+        return Box(max(self.top, 0), max(self.left, 0), min(self.bottom, output[0]), min(self.right, output[1]))
+
+
+@dataclass(frozen=True)
+class Layer:
+    """`light` (h,w,4): linear light times alpha, then alpha, 0..1. `depth`: camera z; the least is the farthest."""
+
+    box: Box
+    depth: float
+    light: F64
+
+
+def box_around(rect: Rect, output: Shape) -> Box:
+    """Whole pixels that hold `rect`, and so many around it that both sides are multiples of 32."""
+    top, bottom = np.floor((1 - rect.y1) / 2 * output[0]), np.ceil((1 - rect.y0) / 2 * output[0])
+    left, right = np.floor((1 + rect.x0) / 2 * output[1]), np.ceil((1 + rect.x1) / 2 * output[1])
+    return grown(Box(int(top), int(left), int(bottom), int(right)), BUCKET_STEP)
+
+
+def grown(box: Box, step: int) -> Box:
+    """`box` with pixels around it until `step` divides both sides; an odd one goes to the bottom or the right."""
+    rows, columns = _grown(box.top, box.bottom, step), _grown(box.left, box.right, step)
+    return Box(rows[0], columns[0], rows[1], columns[1])
+
+
+def _grown(first: int, last: int, step: int) -> tuple[int, int]:
+    more = -(last - first) % step
+    return first - more // 2, last + more - more // 2
+
+
+def premultiplied(rgba: Floats) -> F64:
+    """(h,w,4) linear light times alpha, and alpha, of `rgba` (h,w,4): sRGB with straight alpha, 0..1."""
+    straight = np.asarray(rgba, np.float64)
+    alpha = straight[..., 3:]
+    return np.concatenate([to_light(straight[..., :3]) * alpha, alpha], axis=-1)
+
+
+def shrunk(light: F64, factor: int) -> F64:
+    """(h,w,C): the means of squares of `factor` x `factor` pixels of `light` (h * factor, w * factor, C)."""
+    height, width, channels = light.shape
+    squares = light.reshape(height // factor, factor, width // factor, factor, channels)
+    return np.asarray(squares.mean(axis=(1, 3)))
+
+
+def enlarged(light: F64, factor: int) -> F64:
+    """(h * factor, w * factor, C): `light` (h,w,C) read bilinearly at the middles of smaller pixels.
+
+    Each pixel becomes a square of `factor` x `factor`, with the same middle; beyond the middles of the outermost pixels
+    their values go on.
+    """
+    return _enlarged_down(_enlarged_down(light, factor).swapaxes(0, 1), factor).swapaxes(0, 1)
+
+
+def _enlarged_down(light: F64, factor: int) -> F64:
+    places = np.clip((np.arange(len(light) * factor) + 0.5) / factor - 0.5, 0, len(light) - 1)
+    above = np.floor(places).astype(int)
+    below = np.minimum(above + 1, len(light) - 1)
+    share = (places - above)[:, None, None]
+    return np.asarray((1 - share) * light[above] + share * light[below])
+
+
+def blended(background: U8, layers: Iterable[Layer]) -> U8:
+    """`layers` over `background`, both sRGB, (h,w,3) uint8; the farthest layer first."""
+    output = (background.shape[0], background.shape[1])
+    light = to_light(background / 255.0)
+    for layer in sorted(layers, key=lambda layer: layer.depth):
+        box = layer.box.on(output)
+        own = layer.light[box.top - layer.box.top :, box.left - layer.box.left :][: box.shape[0], : box.shape[1]]
+        part = np.s_[box.top : box.bottom, box.left : box.right]
+        light[part] = own[..., :3] + (1 - own[..., 3:]) * light[part]
+    return np.asarray(np.rint(to_code(light) * 255), np.uint8)
+
+
+def to_light(code: F64) -> F64:
+    """sRGB in 0..1 to linear light, IEC 61966-2-1."""
+    return np.asarray(np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4))
+
+
+def to_code(light: F64) -> F64:
+    """Linear light to sRGB in 0..1, IEC 61966-2-1; light beyond 0..1 is cut off."""
+    light = np.clip(light, 0.0, 1.0)
+    return np.asarray(np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055))

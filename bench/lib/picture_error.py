@@ -1,0 +1,83 @@
+"""How far the frames of one plan are from those of another: PSNR, SSIM and FLIP.
+
+Rule: all pictures count alike, those with nobody in view too; so the PSNR is that of the mean square over all of them.
+In the box, that is where avatars are, the same, over the pixels of the boxes alone.
+
+Sources: Wang et al., "Image Quality Assessment", IEEE TIP 13 (2004), by scikit-image; Andersson et al., "FLIP: A
+Difference Evaluator for Alternating Images", HPG 2020, by its authors' flip-evaluator, at 67 pixels a degree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib.util import find_spec
+
+import numpy as np
+
+from trilane.arrays import F64, U8, Mask
+from trilane.bench.lib.layers import Box
+from trilane.errors import MissingPartError
+
+MODULES = ("skimage", "flip_evaluator")
+#: The least mean square, of values in 0..1, that a PSNR is computed of, which makes 100 dB the most.
+LEAST_SQUARE = 1e-10
+
+
+class PictureErrors:
+    """The errors of pictures that were added, one after the other."""
+
+    def __init__(self) -> None:
+        # Of pixels, first of the whole frames, then of the boxes.
+        self._pixels = np.zeros(2)
+        self._squares, self._similar, self._flip = np.zeros(2), np.zeros(2), np.zeros(2)
+
+    def add(self, picture: U8, reference: U8, boxes: Sequence[Box]) -> None:
+        """Count `picture` against `reference`, both (h,w,3) sRGB, with avatars in `boxes`."""
+        maps = error_maps(picture, reference)
+        for part, mask in enumerate((np.ones(picture.shape[:2], bool), inside(boxes, picture))):
+            self._pixels[part] += mask.sum()
+            for total, values in zip((self._squares, self._similar, self._flip), maps, strict=True):
+                total[part] += values[mask].sum()
+
+    def figures(self, plan: str) -> dict[str, float | None]:
+        """`psnr_PLAN_db`, `ssim_PLAN`, `flip_PLAN` of the frames, the same with `box_` before, None without boxes."""
+        found: dict[str, float | None] = {}
+        for part, prefix in enumerate(("", "box_")):
+            count = self._pixels[part]
+            means = [total[part] / count if count else None for total in (self._squares, self._similar, self._flip)]
+            found[f"{prefix}psnr_{plan}_db"] = None if means[0] is None else psnr_db(means[0])
+            found[f"{prefix}ssim_{plan}"] = None if means[1] is None else float(means[1])
+            found[f"{prefix}flip_{plan}"] = None if means[2] is None else float(means[2])
+        return found
+
+
+def require_metrics() -> None:
+    """Raises MissingPartError when a library that computes an error is missing: found out before long work."""
+    for module in MODULES:
+        if find_spec(module) is None:
+            raise MissingPartError(f"image errors need {module}", extra="metrics")
+
+
+def error_maps(picture: U8, reference: U8) -> tuple[F64, F64, F64]:
+    """For each pixel (h,w): the mean square of the differences, in 0..1; SSIM; FLIP."""
+    import flip_evaluator
+    from skimage.metrics import structural_similarity
+
+    square = (((picture.astype(np.float64) - reference) / 255) ** 2).mean(axis=2)
+    _, similar = structural_similarity(picture, reference, channel_axis=2, data_range=255, full=True)
+    real = [np.ascontiguousarray(image, np.float32) / np.float32(255) for image in (reference, picture)]
+    flip, _, _ = flip_evaluator.evaluate(*real, "LDR", inputsRGB=True, applyMagma=False, computeMeanError=False)
+    return square, similar.mean(axis=2), np.asarray(flip, np.float64).reshape(square.shape)
+
+
+def inside(boxes: Sequence[Box], picture: U8) -> Mask:
+    """(h,w): which pixels of `picture` lie in one of `boxes`."""
+    mask = np.zeros(picture.shape[:2], bool)
+    for box in boxes:
+        mask[box.top : box.bottom, box.left : box.right] = True
+    return mask
+
+
+def psnr_db(square: float) -> float:
+    """PSNR in dB of values in 0..1 whose differences have the mean square `square`; at most 100."""
+    return float(-10 * np.log10(max(square, LEAST_SQUARE)))

@@ -1,0 +1,112 @@
+"""The composited frames of a run, made by its own stages, one after the other in this process.
+
+Rule: the stages are built by the pipeline's factories and bound as a unit's process binds them, so a frame has the
+bytes that a run presents. Frames come in any order, so none is made from an earlier one's picture; one with nobody in
+view takes the pipeline's bypass, as in a run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.arrays import U8
+from trilane.pipeline.bound_stage import BoundStage
+from trilane.pipeline.description import Pipeline
+from trilane.pipeline.shared_assets import Assets
+from trilane.pipeline.stage import Skip, UnitContext
+from trilane.pipeline.unit_loop import factory_named
+from trilane.scene.work import Work
+from trilane.stages.avatar_pipeline import avatar_pipeline
+from trilane.stages.configure import Checked
+from trilane.stages.gpu.opengl_context import CONTEXT, open_context
+from trilane.transport.packets import Packet, SlotLayout, view_packet
+
+Units = Mapping[str, UnitContext]
+
+
+def units_of(pipeline: Pipeline, assets: Assets) -> Units:
+    """What the stages of each unit share. Chains that draw in one process must share them too: one OpenGL context."""
+    return {name: UnitContext(name, settings, assets) for name, settings in pipeline.units.items()}
+
+
+class StageChain:
+    """All stages of a pipeline but the last, on one slot an edge."""
+
+    def __init__(self, pipeline: Pipeline, units: Units) -> None:
+        """Build and bind the stages. Raises what their factories raise."""
+        self.packets = [_packet(SlotLayout(edge.header, edge.payload_bytes)) for edge in pipeline.edges]
+        named = dict(zip(pipeline.edge_names, self.packets, strict=True))
+        begin, end = pipeline.bypass or (None, None)
+        self._end = [stage.name for stage in pipeline.stages].index(end) if end is not None else 0
+        self._stages = []
+        for stage, output in zip(pipeline.stages, self.packets, strict=False):  # the last stage has no output
+            unit = units[stage.unit]
+            inputs = [named[edge] for edge in pipeline.edges_into(stage.name)]
+            made = factory_named(stage.factory)(stage.settings, unit)
+            self._stages.append(BoundStage(stage.name, made, inputs, [output], 0, unit, stage.name == begin))
+
+    def run(self, frame: int, last: int | None = None) -> Packet:
+        """Do frame `frame` to stage number `last`, or the last one; what comes to the stage behind it."""
+        self._next, self._slot_in = 0, -1
+        return self.go_on(frame, last)
+
+    def go_on(self, frame: int, last: int | None = None) -> Packet:
+        """The same for the stages that an earlier `run` of the frame left out."""
+        last = len(self._stages) - 1 if last is None else last
+        while self._next <= last:
+            number = self._next
+            metrics = self._stages[number].run(frame, self._slot_in, 0, 0, fresh=True)
+            # Each edge has one slot, so at the bypass's end slot 1 is that of the edge behind its beginning.
+            self._next, self._slot_in = (self._end, 1) if isinstance(metrics, Skip) else (number + 1, 0)
+            self._handed = self.packets[number]
+        return self._handed
+
+
+class AvatarFrames:
+    """The frames of a scene, as a run presents them."""
+
+    def __init__(self, checked: Checked, units: Units | None = None) -> None:
+        """`units`: of other frames that are made in this process. Raises BadInputError, MissingPartError."""
+        pipeline = avatar_pipeline(checked.config, checked.assets)
+        self.units = units_of(pipeline, checked.assets) if units is None else units
+        self._chain = StageChain(pipeline, self.units)
+        self._composite = len(pipeline.stages) - 2
+        self._shape = (checked.config.scene.output.height, checked.config.scene.output.width, 3)
+
+    def frame(self, number: int) -> U8:
+        """(h,w,3) uint8, sRGB: frame `number`, composited."""
+        return self._picture(self._chain.run(number))
+
+    @property
+    def gl(self) -> Any:
+        """The OpenGL context that the stages draw with."""
+        return self.units["gpu"].shared(CONTEXT, open_context)
+
+    def background(self, number: int) -> U8:
+        """(h,w,3) uint8: the same with everything that is under the avatars, their shadows too, but without them."""
+        self._chain.run(number, self._composite - 1).payload[:] = 0
+        return self._picture(self._chain.go_on(number))
+
+    @property
+    def posed(self) -> NDArray[np.void]:
+        """What the pose stage said of the frame that was made last: a header as in `stages/packets.py`."""
+        return self._chain.packets[0].header
+
+    @property
+    def tensor(self) -> str:
+        """Height x width of the last frame's tensor; `none` when nobody was seen and none was made."""
+        height, width = self.posed["tensor_shape"].tolist()
+        return f"{height}x{width}" if int(self.posed["work"]) == Work.FULL else "none"
+
+    def _picture(self, packet: Packet) -> U8:
+        height, width, channels = self._shape
+        picture: U8 = packet.payload[: height * width * channels].reshape(self._shape).copy()
+        return picture
+
+
+def _packet(layout: SlotLayout) -> Packet:
+    return view_packet(memoryview(bytearray(layout.slot_bytes)), layout)

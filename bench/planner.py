@@ -1,0 +1,187 @@
+"""What does planning save against a fixed square of 512 x 512, and what does it cost in image error?
+
+Rule: both plans run interleaved, on the same moments of the same scenes; the pictures that are compared are made by the
+runs' own stages from the very configurations that were timed. What they are compared with, the plan `full`, is written
+a second time (`bench/lib/full_picture.py`).
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from trilane.arrays import U8
+from trilane.bench.lib.cast import Cast
+from trilane.bench.lib.full_picture import FullPictures
+from trilane.bench.lib.picture_error import PictureErrors, require_metrics
+from trilane.bench.lib.plans import fixed, in_frames, planned
+from trilane.bench.lib.stage_chain import AvatarFrames
+from trilane.bench.lib.true_picture import TruePictures, has_truth
+from trilane.errors import BadInputError, TrilaneError
+from trilane.figure_sources import MEASURED
+from trilane.scheduler.stats import median_interval
+from trilane.stages.avatar_pipeline import run_avatar
+from trilane.stages.configure import Checked, Request, configure
+from trilane.stages.gpu.opengl_context import describe
+from trilane.writing import write_folder
+
+SCENES = ("portrait", "full-body", "crowd", "walk-past", "top-to-floor", "leave-and-return")
+PLANS = {"fixed": fixed, "planned": planned}
+LEAST_FRAMES = 20
+#: By what differences from `full` are multiplied in the sheets.
+SHOWN = 8
+
+
+def measure(
+    scene: tuple[str, ...] = SCENES,
+    frames: int = 100,
+    rounds: int = 6,
+    pictures: int = 8,
+    runtime: str = "auto",
+    video: bool = True,
+    out: str = "",
+) -> dict[str, Any]:
+    """For each scene: how many times as fast the planned run is as the fixed one, and both image errors.
+
+    Keys: `scenes`, one entry each: `name`; `speedup` (median over the rounds of the fixed frame time over the planned
+    one), `speedup_low`, `speedup_high` (its 95 % interval; with fewer than six rounds the least and largest),
+    `fixed_ms`, `planned_ms`; `psnr_fixed_db`, `psnr_planned_db`, `ssim_*`, `flip_*` of the frames against those of
+    `full`, the same with `box_` in the avatars' rectangles, None with nobody in view; PSNR is that of the mean square
+    over all frames; `truth`: the same against the clothed body that the default
+    avatar was trained on, `full` too; `network`: what paints `full`; `tensors`: the planned ones. `median_speedup`,
+    `least_speedup`, `largest_loss_db` (fixed minus planned); `sources`; `driver`; `config`.
+
+    Raises BadInputError, MissingPartError, TrilaneError when a run fails.
+    """
+    _check(frames, pictures)
+    require_metrics()
+    if out:
+        with write_folder(Path(out)):
+            pass  # that it can be written is found out before the work
+    found = [_Scene(name, frames, runtime, video=video) for name in scene]
+    rows = []
+    for one in found:
+        row, sheets = one.compare(pictures)
+        rows.append({"name": one.name, **one.time(rounds), **row})
+        if out:
+            _write(Path(out), one.name, sheets)
+    return {
+        "scenes": rows,
+        "median_speedup": median(row["speedup"] for row in rows),
+        "least_speedup": min(row["speedup"] for row in rows),
+        "largest_loss_db": max(row["psnr_fixed_db"] - row["psnr_planned_db"] for row in rows),
+        "sources": {"scenes": MEASURED},
+        "driver": found[-1].driver,
+        "config": {"frames": frames, "rounds": rounds, "pictures": pictures, "runtime": runtime, "video": video},
+    }
+
+
+def _check(frames: int, pictures: int) -> None:
+    if frames < LEAST_FRAMES:
+        raise BadInputError("--frames", str(frames), f"at least {LEAST_FRAMES}")
+    if not 1 <= pictures <= frames:
+        raise BadInputError("--pictures", str(pictures), f"1 to {frames}, the frames of a run")
+
+
+@dataclass(frozen=True)
+class _Moment:
+    """One frame by every plan, (h,w,3) uint8 each. `true`: None where there is no truth."""
+
+    number: int
+    full: U8
+    plans: Mapping[str, U8]
+    true: U8 | None
+
+
+class _Scene:
+    """One scene by both plans. `name`: the scene's. `driver`: of OpenGL, once it was compared."""
+
+    def __init__(self, name: str, frames: int, runtime: str, *, video: bool) -> None:
+        """Raises BadInputError, MissingPartError."""
+        asked = Request(scene=name, runtime=runtime, hud=False)
+        checked = in_frames(configure(asked, Path.cwd()).changed(record=video), frames)
+        self.name = checked.config.scene.name
+        self.driver: dict[str, Any] = {}
+        self._checked = checked
+        self._plans = {plan: make(checked) for plan, make in PLANS.items()}
+
+    def time(self, rounds: int) -> dict[str, Any]:
+        """Frame times of both plans in turns, and their ratio. Raises TrilaneError when a run fails."""
+        times: dict[str, list[float]] = {plan: [] for plan in self._plans}
+        for _ in range(rounds):
+            for plan, checked in self._plans.items():
+                times[plan].append(_frame_ms(checked, f"{self.name}, {plan}"))
+        ratios = [slow / fast for slow, fast in zip(times["fixed"], times["planned"], strict=True)]
+        low, high = median_interval(ratios)
+        middle = {f"{plan}_ms": median(values) for plan, values in times.items()}
+        return {"speedup": median(ratios), "speedup_low": low, "speedup_high": high, **middle}
+
+    def compare(self, pictures: int) -> tuple[dict[str, Any], list[tuple[int, U8]]]:
+        """Image errors over `pictures` frames, evenly spread, and a sheet of each with its number."""
+        cast, total = Cast(self._checked), self._checked.config.scene.frames
+        full = FullPictures(cast)
+        first = AvatarFrames(self._checked)
+        chains = {plan: AvatarFrames(checked, first.units) for plan, checked in self._plans.items()}
+        self.driver = asdict(describe(first.gl))
+        true = TruePictures(cast, first.gl) if has_truth(cast) else None
+        against_full = {plan: PictureErrors() for plan in chains}
+        against_true = {plan: PictureErrors() for plan in ("full", *chains)}
+        sheets, tensors = [], []
+        for number in (index * total // pictures for index in range(pictures)):
+            background, boxes = first.background(number), cast.boxes(number)
+            made = {plan: chain.frame(number) for plan, chain in chains.items()}
+            tensors.append(chains["planned"].tensor)
+            wanted = full.frame(number, background)
+            for plan, errors in against_full.items():
+                errors.add(made[plan], wanted, boxes)
+            shown = true.frame(number, background) if true is not None else None
+            if shown is not None:
+                for plan, errors in against_true.items():
+                    errors.add({"full": wanted, **made}[plan], shown, boxes)
+            sheets.append((number, sheet(_Moment(number, wanted, made, shown))))
+        return {
+            **_figures(against_full),
+            "truth": _figures(against_true) if true is not None else None,
+            "network": "; ".join(full.networks),
+            "tensors": sorted(set(tensors)),
+        }, sheets
+
+
+def _figures(errors: Mapping[str, PictureErrors]) -> dict[str, float | None]:
+    return {key: value for plan, each in errors.items() for key, value in each.figures(plan).items()}
+
+
+def _frame_ms(checked: Checked, what: str) -> float:
+    with tempfile.TemporaryDirectory(prefix="trilane-bench-") as folder:
+        placed = checked.changed(out_dir=Path(folder))
+        result = run_avatar(placed.config, placed.assets, isolated_frames=0)
+    if result.interrupted:
+        raise KeyboardInterrupt
+    if result.failure is not None or result.presented < 2:
+        raise TrilaneError(f"{what}: {result.failure.message if result.failure else 'no frames were presented'}")
+    return result.report.frame_time_ms.mean
+
+
+def sheet(moment: _Moment) -> U8:
+    """Above: full, fixed, planned. Below: the truth (grey without), then what differs from full, around grey."""
+    above = [moment.full, *moment.plans.values()]
+    below = [np.full_like(moment.full, 128) if moment.true is None else moment.true]
+    for picture in moment.plans.values():
+        steps = (picture.astype(np.int16) - moment.full) * SHOWN + 128
+        below.append(np.clip(steps, 0, 255).astype(np.uint8))
+    return np.vstack([np.hstack(above), np.hstack(below)])
+
+
+def _write(folder: Path, name: str, sheets: Sequence[tuple[int, U8]]) -> None:
+    """`NAME-FRAME.png` of each sheet. Raises BadInputError."""
+    from PIL import Image
+
+    with write_folder(folder) as draft:
+        for number, picture in sheets:
+            Image.fromarray(picture).save(draft / f"{name}-{number}.png")

@@ -1,0 +1,113 @@
+"""Pictures of whole scenes made in this process: those of the stages and of the plan `full`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from trilane.bench.lib.cast import Cast
+from trilane.bench.lib.full_picture import FullPictures
+from trilane.bench.lib.layers import Box, Layer, blended, premultiplied
+from trilane.bench.lib.plans import FIXED, fixed, in_frames, planned
+from trilane.bench.lib.stage_chain import AvatarFrames
+from trilane.bench.lib.true_picture import has_truth
+from trilane.stages.configure import Checked, Request, configure
+from trilane.stages.gpu import opengl_calls
+from trilane.stages.gpu.composite_painters import AvatarPainter, PicturePainter
+
+SCENE = """
+frames = 12
+fps = 6
+size = "64x64"
+output = {{width = 160, height = 128}}
+camera = {{source = "builtin:far"}}
+[[avatars]]
+bundle = "{bundle}"
+"""
+
+
+@pytest.fixture
+def checked(drawable_bundle: Path, tmp_path: Path) -> Checked:
+    """A small scene of the avatar with the tiny network."""
+    file = tmp_path / "small.toml"
+    file.write_text(SCENE.format(bundle=drawable_bundle), encoding="utf-8")
+    return configure(Request(scene=str(file), runtime="ort", skinning="cpu"), tmp_path)
+
+
+def test_blending_is_what_the_painter_does_on_the_same_grid(gl: Any) -> None:
+    """Bytes as the network gives them, a tensor pixel for each pixel: one byte off at most, as drivers round sRGB."""
+    rng = np.random.default_rng(0)
+    output, box = (48, 80), Box(-10, 30, 22, 94)
+    background, rgba = (rng.integers(0, 256, (*shape, n), dtype=np.uint8) for shape, n in ((output, 3), (box.shape, 4)))
+    texture = gl.texture(output[::-1], 4, internal_format=opengl_calls.SRGB8_ALPHA8)
+    target = gl.framebuffer([texture])
+    below, avatar = PicturePainter(gl, output), AvatarPainter(gl, [box.shape])
+    below.upload(background)
+    avatar.upload(box.shape, rgba.reshape(-1))
+    target.use()
+    below.draw()
+    avatar.draw(target, box.shape, tuple(box.rect(output)), (0, 0, *box.shape))
+    drawn = np.frombuffer(target.read(components=3, alignment=1), np.uint8).reshape(*output, 3)
+    own = blended(background, [Layer(box, -1.0, premultiplied(rgba / 255.0))])
+    assert np.abs(drawn.astype(int) - own).max() <= 1
+    for picture in (own, drawn):
+        changed = (picture != background).any(axis=-1)
+        assert changed[:22, 30:].mean() > 0.95 and changed.sum() == changed[:22, 30:].sum()
+
+
+def test_full_changes_nothing_where_nobody_is(checked: Checked) -> None:
+    """Outside the boxes, `full` and the composite stage's own frame have the bytes of the background."""
+    frames, cast = AvatarFrames(checked), Cast(checked)
+    background, frame = frames.background(5), frames.frame(5)
+    (box,) = cast.boxes(5)
+    picture = FullPictures(cast).frame(5, background)
+    reach = max(box.shape) // 2 + 2  # the stages' rectangle is a square, as their tensor is
+    row, column = (box.top + box.bottom) // 2, (box.left + box.right) // 2
+    around = Box(row - reach, column - reach, row + reach, column + reach).on((128, 160))
+    for found, place in ((picture, box), (frame, around)):
+        outside = np.ones(found.shape[:2], bool)
+        outside[place.top : place.bottom, place.left : place.right] = False
+        assert outside.mean() > 0.3
+        assert np.array_equal(found[outside], background[outside])
+        assert (found != background).any(axis=-1)[~outside].mean() > 0.2
+
+
+def test_only_the_default_avatar_has_a_truth(checked: Checked) -> None:
+    assert not has_truth(Cast(checked))
+
+
+def test_the_fixed_plan_is_the_square_and_fewer_frames_show_the_whole_scene(checked: Checked) -> None:
+    scene = checked.config.scene
+    assert planned(checked) is checked
+    auto = checked.changed(scene=scene.model_copy(update={"size": "auto"}), shapes=((64, 32), (96, 64)))
+    for given in (checked, auto):
+        config = fixed(given).config
+        assert config.scene == scene.model_copy(update={"size": FIXED, "plan": "fixed"})
+        assert config.buckets == [(512, 512)]
+        assert config.budget_px == 0
+    fewer = in_frames(checked, 4).config.scene
+    assert (fewer.frames, fewer.fps) == (4, 2.0)  # both last two seconds
+    assert in_frames(checked, 12) is checked
+
+
+def test_the_cast_is_where_the_pose_stage_says(checked: Checked) -> None:
+    """The same moment, joints and camera to the bit, and a box around the rectangle that the stages crop by."""
+    cast = Cast(checked)
+    (seen,) = cast.seen(5)
+    frames = AvatarFrames(checked)
+    frames.frame(5)
+    pose = frames.posed
+    avatar = pose["avatars"][0]
+    assert np.array_equal(seen.joints, avatar["joints"])
+    assert np.array_equal(seen.view.astype(np.float32), pose["view"])
+    own, cropped = seen.box.rect((128, 160)), avatar["rect"]
+    pixel = 2 / 128
+    assert own.y0 <= cropped[1] + pixel and own.y1 >= cropped[3] - pixel  # the body is tall: its height decides
+    (data,) = cast.avatars.values()
+    pelvis = avatar["joints"][0] @ np.append(data.shaped.joints[0], 1.0)
+    clip = seen.projection @ seen.view @ np.append(pelvis, 1.0)
+    assert np.abs(clip[:2] / clip[3]).max() < 0.5  # the hips are in the middle of the box
+    assert seen.depth == pytest.approx(-clip[3], abs=1e-5)
