@@ -66,7 +66,8 @@ def core_efficiency(report: Mapping[str, Any], pipeline: Pipeline) -> float | No
 
     `report`: of a ledger, with its accounts; `pipeline`: that ran. A stage takes its isolated time of each core on
     which its unit has a thread, but no more than its CPU time for each thread: a core that sleeps does no work. Of the
-    last stage, which is not measured isolated, its CPU time counts.
+    last stage, which is not measured isolated, its CPU time counts. A stage that frames have skipped counts with its
+    jobs for a frame.
     """
     frame_ms: float = report["frame_time_ms"]["mean"]
     if not report["isolated_ms"] or not frame_ms:
@@ -75,5 +76,6 @@ def core_efficiency(report: Mapping[str, Any], pipeline: Pipeline) -> float | No
     core_ms = dict.fromkeys(placement, 0.0)
     for name, row in report["stages"].items():
         cpu_ms = row["cpu_ms"]["mean"] / placement[row["unit"]].threads
-        core_ms[row["unit"]] += min(report["isolated_ms"].get(name, cpu_ms), cpu_ms)
+        jobs = row["jobs"] / report["frames"]["presented"]
+        core_ms[row["unit"]] += jobs * min(report["isolated_ms"].get(name, cpu_ms), cpu_ms)
     return busiest_core_ns(placement, core_ms) / frame_ms

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from itertools import permutations, product
 from pathlib import Path
 from random import Random
-from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -14,8 +13,6 @@ from hypothesis import strategies as st
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles.host import asked_cores, host_cores, rule_placement, settings_of
-from trilane.pipeline.accounts import core_efficiency
-from trilane.pipeline.description import Pipeline, PipelineStage, UnitSettings
 from trilane.scheduler import placement
 from trilane.scheduler.placement import (
     Core,
@@ -387,30 +384,3 @@ def test_what_the_kernel_says_of_cores(tmp_path: Path) -> None:
         (tmp_path / f"cpu{number}" / "cpufreq").mkdir()
         (tmp_path / f"cpu{number}" / "cpufreq" / "cpuinfo_max_freq").write_text(f"{clock}\n")
     assert [core.permille for core in host_cores((0, 1), tmp_path)] == [750, 1000]
-
-
-def pipeline_of(units: dict[str, UnitSettings]) -> Pipeline:
-    stages = tuple(PipelineStage(name=f"{unit}-stage", unit=unit, factory="m:f") for unit in units)
-    return Pipeline.model_construct(stages=stages, units=units)
-
-
-def measured(isolated_ms: dict[str, float], cpu_ms: dict[str, float], frame_ms: float = 20.0) -> dict[str, Any]:
-    stages = {f"{unit}-stage": {"unit": unit, "cpu_ms": {"mean": ms}} for unit, ms in cpu_ms.items()}
-    isolated = {f"{unit}-stage": ms for unit, ms in isolated_ms.items()}
-    return {"frame_time_ms": {"mean": frame_ms}, "isolated_ms": isolated, "stages": stages}
-
-
-def test_core_efficiency_is_of_the_busiest_core() -> None:
-    one, two = (UnitSettings(cores=(core,), threads=1) for core in (0, 1))
-    both = UnitSettings(cores=(0, 1), threads=2)
-    cpu_ms = {"a": 7.0, "b": 6.0, "c": 8.0}
-    apart = pipeline_of({"a": one, "b": one, "c": two})
-    # a and b are on core 0: 5 alone, and 6 of CPU time in the run, of 20
-    assert core_efficiency(measured({"a": 5.0}, cpu_ms), apart) == pytest.approx((5 + 6) / 20)
-    # a core that slept, or that others had, did no work: of 30 ms only the 7 of CPU time count
-    assert core_efficiency(measured({"a": 30.0}, cpu_ms), apart) == pytest.approx((7 + 6) / 20)
-    # c has a thread on each core, with half of its CPU time
-    with_threads = pipeline_of({"a": one, "b": two, "c": both})
-    assert core_efficiency(measured({"a": 5.0}, cpu_ms), with_threads) == pytest.approx((6 + 4) / 20)
-    assert core_efficiency(measured({}, cpu_ms), apart) is None
-    assert core_efficiency(measured({"a": 5.0}, cpu_ms, frame_ms=0.0), apart) is None
