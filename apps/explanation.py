@@ -13,13 +13,20 @@ from trilane.apps.plan_cost import CostModel, FrameCost
 from trilane.apps.scene_plan import PlannedFrame, ScenePlan, phases
 from trilane.body.detail import DETAILS
 from trilane.figure_sources import COMPUTED, MEASURED
+from trilane.scene.planner import MOST_DENSITY
+from trilane.scene.work import Work
 from trilane.shapes import Shape
 from trilane.stages.avatar_assets import network_of
 from trilane.stages.configure import Checked
+from trilane.stages.cpu.pose import FramePlan
 
 #: What every plan is compared with: the square that the reference application fills.
 FIXED: Shape = (512, 512)
 BOUND = "proved bound, in pixels of the picture"
+WHY = {
+    Work.NONE: "nobody is on the screen: nothing is drawn, packed or inferred",
+    Work.REUSE: "nothing has changed: the picture that is there is shown again",
+}
 
 
 def explain(checked: Checked, profile: str, performance_profile: str, most_measured: int = 24) -> dict[str, Any]:
@@ -75,11 +82,12 @@ def _avatar(checked: Checked, number: int) -> dict[str, Any]:
 
 def _phase(group: Sequence[PlannedFrame], errors: Sequence[float | None], costs: CostModel) -> dict[str, Any]:
     first = group[0].plan
-    cost = costs.of(first.shape)
+    cost = _cost(first, costs)
     return {
         "first_frame": group[0].frame,
         "last_frame": group[-1].frame,
         "frames": len(group),
+        "work": first.work.name.lower(),
         "tensor": list(first.shape) if first.shape else None,
         "density": [_least(group), _most(group)] if first.shape and first.density is not None else None,
         "avatars": [
@@ -97,6 +105,10 @@ def _phase(group: Sequence[PlannedFrame], errors: Sequence[float | None], costs:
     }
 
 
+def _cost(plan: FramePlan, costs: CostModel) -> FrameCost:
+    return costs.of(plan.shape if plan.work is Work.FULL else None)
+
+
 def _least(group: Sequence[PlannedFrame]) -> float:
     return min(planned.plan.density or 0.0 for planned in group)
 
@@ -108,13 +120,13 @@ def _most(group: Sequence[PlannedFrame]) -> float:
 def _why(group: Sequence[PlannedFrame]) -> str:
     """Why the tensor of a phase is as it is."""
     first = group[0].plan
-    if first.shape is None:
-        return "nobody is on the screen: nothing is drawn, packed or inferred"
+    if first.work in WHY:
+        return WHY[first.work]
     if first.density is None:
         return "the scene fixes the tensor's size"
-    if _least(group) < 1.0:
-        return "more pixels on the screen than any shape that is ready has: the densest one"
-    return "a tensor pixel for each pixel of the picture, in the smallest shape that is ready"
+    if _most(group) >= MOST_DENSITY:
+        return f"{MOST_DENSITY:g} tensor pixels along a side of a pixel of the picture: more could not be seen"
+    return "the pixels that the network was trained to paint, in the shape that fits best of those that are ready"
 
 
 def _saved(cost: FrameCost, fixed: FrameCost) -> dict[str, float]:
@@ -127,7 +139,7 @@ def _saved(cost: FrameCost, fixed: FrameCost) -> dict[str, float]:
 
 def _totals(frames: Sequence[PlannedFrame], costs: CostModel) -> dict[str, Any]:
     """Of all frames, planned and with the fixed square."""
-    planned = [costs.of(one.plan.shape) for one in frames]
+    planned = [_cost(one.plan, costs) for one in frames]
     fixed = costs.of(FIXED)
     work, whole = sum(cost.work_ms for cost in planned), fixed.work_ms * len(frames)
     return {

@@ -108,6 +108,7 @@ class Baseline(Record):
     stages: dict[str, StageTimes]
     units: dict[str, UnitShares]
     efficiency: float | None
+    core_efficiency: float | None = None
     core_shares: tuple[CoreShare, ...] = ()
 
 
@@ -162,6 +163,57 @@ class Made(Record):
     modified: bool | None
 
 
+class UnitPlace(Record):
+    """`cores` of a unit and `threads`: as many, or one that the kernel runs on any of them."""
+
+    cores: tuple[int, ...]
+    threads: int
+
+
+class OtherPlacement(Record):
+    """A placement that was not chosen. `units`: place of each; `predicted_ms`: time of a frame."""
+
+    units: dict[str, UnitPlace]
+    predicted_ms: float
+
+
+class UnitTime(Record):
+    """What a unit was measured to need for a frame with so many `threads`, in ms.
+
+    `ms`: how long its jobs took, without the time in which it had no core.
+    `core_ms`: CPU time for each thread.
+    """
+
+    unit: str
+    threads: int
+    ms: float
+    core_ms: float
+
+
+class PlacementFacts(Record):
+    """Why the units have the cores that they have (`trilane.stages.placing`).
+
+    `how`: measured, asked or rule.
+    `why`: in words.
+    `units`: place of each.
+    `measured_at`: when the times were measured, UTC; absent, as all below, when nothing was.
+    `predicted_ms`: time of a frame of the policy of the run.
+    `rule_ms`, `rule`: of the placement for any run.
+    `alternatives`: the next best, the shortest frame time first.
+    `times`: what was measured, a row for each unit and number of threads.
+    """
+
+    how: Literal["measured", "asked", "rule"]
+    why: str
+    units: dict[str, UnitPlace]
+    measured_at: str = ""
+    predicted_ms: float | None = None
+    rule_ms: float | None = None
+    rule: dict[str, UnitPlace] = Field(default={})
+    alternatives: tuple[OtherPlacement, ...] = ()
+    times: tuple[UnitTime, ...] = ()
+
+
 class Preamble(Record):
     """The keys that a report begins with.
 
@@ -192,6 +244,7 @@ class Report(RunMetrics, Preamble):
     `interrupted`: whether a signal ended the run.
     `failure`: why it ended early, null when it did not.
     `baseline`: the `sequential` run of the same scene, null when there was none.
+    `placement`: why the units have the cores that they have; absent for a run by a program.
     `pace`: of a run at a chip's pace.
     `accuracy`: of each avatar, what `trilane.avatars.validation.accuracy_of` says: its figures, or why there are none.
     `sources`: key, dotted where it is inside another, to where the figures below it come from; the longest key decides.
@@ -210,6 +263,7 @@ class Report(RunMetrics, Preamble):
     interrupted: bool
     failure: str | None
     baseline: Baseline | None
+    placement: PlacementFacts | None = None
     pace: PaceComparison | None = None
     accuracy: dict[str, dict[str, Any]] = Field(default={})
     sources: dict[str, str] = Field(default={})
@@ -232,7 +286,8 @@ def build_report(
     `config`: that it ran.
     `machine`: what `machine_facts` said.
     `baseline`: of the same scene under another policy, None without one.
-    `facts`: what others know of the run: `video`, `checksum`, and any of `made`, `pace`, `accuracy`, `notes`.
+    `facts`: what others know of the run: `video`, `checksum`, and any of `made`, `placement`, `pace`, `accuracy`,
+    `notes`.
     """
     metrics = result.report
     sensor = {"sensor": sensor_c()}

@@ -24,6 +24,7 @@ from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.policy import policy_named
 from trilane.stages.avatar_pipeline import run_avatar
 from trilane.stages.configure import Checked
+from trilane.stages.placing import placed
 
 if TYPE_CHECKING:
     from trilane.apps.pace import Pace
@@ -88,16 +89,21 @@ def run_to_folder(
     `hooks`: who is told.
     `machine`: what `machine_facts` said.
     `made`: what `trilane.apps.made.made_facts` said of the command line; None where there is none.
-    `starter`: a fork server that was started earlier.
+    `starter`: a fork server that was started earlier; without one, the units stay where `checked` has them.
     Raises BadInputError when `target` cannot be written, and TrilaneError when no frame was presented.
     """
     with RunFolder(target) as folder:
+        if starter is not None:
+            checked = placed(checked, plan.policy, starter, str(machine.get("gl")))
+            hooks.message(checked.notes[-1])
         threading.Thread(target=_import_writers, name="imports", daemon=True).start()
         job = _Job(checked, plan, hooks, starter)
         result = job.run(folder.work)
         with Interrupts() as late:  # from here on a signal waits until the folder is whole
             baseline, stopped = job.run_baseline(folder.work) if _is_complete(result) else (None, False)
             facts = {"made": made, "accuracy": dict(checked.accuracy), "notes": list(checked.notes)}
+            if checked.placement is not None:
+                facts["placement"] = checked.placement
             if plan.pace is not None:
                 from trilane.apps.pace import compare
 

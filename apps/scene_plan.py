@@ -87,7 +87,7 @@ def _packet(config: RunConfig) -> Packet:
 
 
 def phases(frames: Sequence[PlannedFrame]) -> list[list[PlannedFrame]]:
-    """Frames in a row that have the same tensor shape and model the same avatars at the same levels of detail."""
+    """Frames in a row of the same work and tensor shape, which model the same avatars at the same levels of detail."""
     groups: list[list[PlannedFrame]] = []
     for planned in frames:
         if groups and _kind(groups[-1][-1]) == _kind(planned):
@@ -99,4 +99,4 @@ def phases(frames: Sequence[PlannedFrame]) -> list[list[PlannedFrame]]:
 
 def _kind(planned: PlannedFrame) -> tuple[object, ...]:
     levels = tuple((number, one.level) for number, one in sorted(planned.plan.seen.items()))
-    return planned.plan.shape, levels
+    return planned.plan.work, planned.plan.shape, levels

@@ -1,21 +1,28 @@
-"""This machine as three units: which cores each has. Rule: units share cores only when there are too few.
+"""This machine's cores, and the units on them where nothing was measured. Rule: they share only when there are too few.
 
 The cores are those that this process may use; a quota of the control group lowers their number. The threads of a unit
-spin between jobs only when no other unit shares its cores.
+spin between jobs only when no other unit shares its cores. `trilane.scheduler.placement` places what was measured.
 """
 
 from __future__ import annotations
 
 import math
 import os
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import psutil
 
+from trilane.errors import BadInputError
 from trilane.pipeline.description import UnitSettings
+from trilane.scheduler.placement import FULL, Core, Place, Placement, has_own_cores
+from trilane.units import UNITS
 
 CGROUP = Path("/sys/fs/cgroup")
+CPUS = Path("/sys/devices/system/cpu")
+CORES = "UNIT=LIST, such as dsp=0,1 or dsp=2-5"
 
 
 def usable_cores() -> tuple[int, ...]:
@@ -55,16 +62,82 @@ def split_cores(cores: tuple[int, ...]) -> dict[str, tuple[int, ...]]:
     return {"cpu": cores[:1], "gpu": cores[1:end], "dsp": cores[end:]}
 
 
+def rule_placement(cores: tuple[int, ...], asked: Mapping[str, tuple[int, ...]] | None = None) -> Placement:
+    """`split_cores` with a thread for each core of a unit; `asked`: units whose cores were asked for."""
+    split = {**split_cores(cores), **(asked or {})}
+    return {unit: Place(own, len(own)) for unit, own in split.items()}
+
+
 def host_units(cores: tuple[int, ...] | None = None) -> dict[str, UnitSettings]:
-    """Settings of the three units on `cores` of this machine, None for all usable ones."""
-    split = split_cores(cores or usable_cores())
+    """Settings of the three units on `cores` of this machine, None for all usable ones, by `split_cores`."""
+    return settings_of(rule_placement(cores or usable_cores()))
+
+
+def settings_of(placement: Placement) -> dict[str, UnitSettings]:
+    """The settings of units that are placed so."""
     return {
-        unit: UnitSettings(cores=own, threads=len(own), spin=_has_own_cores(unit, split)) for unit, own in split.items()
+        unit: UnitSettings(cores=place.cores, threads=place.threads, spin=has_own_cores(unit, placement))
+        for unit, place in placement.items()
     }
 
 
-def _has_own_cores(unit: str, split: dict[str, tuple[int, ...]]) -> bool:
-    return all(not set(split[unit]) & set(cores) for other, cores in split.items() if other != unit)
+def asked_cores(texts: Sequence[str]) -> dict[str, tuple[int, ...]]:
+    """`UNIT=LIST` texts as the cores of each unit, ascending. Raises BadInputError naming what is wrong."""
+    asked: dict[str, tuple[int, ...]] = {}
+    usable = sorted(os.sched_getaffinity(0))
+    for text in texts:
+        unit, equals, listed = text.partition("=")
+        if not equals:
+            raise BadInputError("--cores", repr(text), CORES)
+        if unit not in UNITS:
+            raise BadInputError("--cores", f"unknown unit {unit!r}", f"one of {', '.join(UNITS)}")
+        if unit in asked:
+            raise BadInputError("--cores", f"unit {unit} twice", "each unit once", f"such as {unit}=0,1 for two cores")
+        asked[unit] = _listed(text, listed)
+        if absent := set(asked[unit]) - set(usable):
+            found = f"core {', '.join(map(str, sorted(absent)))} for unit {unit}"
+            raise BadInputError("--cores", found, f"cores that this process may use: {', '.join(map(str, usable))}")
+    return asked
+
+
+def _listed(text: str, listed: str) -> tuple[int, ...]:
+    """The numbers of a list such as `0,2-5`."""
+    cores: list[int] = []
+    for part in listed.split(","):
+        ends = re.fullmatch(r"(\d{1,5})(?:-(\d{1,5}))?", part.strip())
+        if ends is None or int(ends[1]) > int(ends[2] or ends[1]):
+            raise BadInputError("--cores", repr(text), CORES)
+        cores += range(int(ends[1]), int(ends[2] or ends[1]) + 1)
+    if len(set(cores)) < len(cores):
+        raise BadInputError("--cores", f"a core twice in {text!r}", "each core once")
+    return tuple(sorted(cores))
+
+
+def host_cores(numbers: Sequence[int], root: Path = CPUS) -> tuple[Core, ...]:
+    """What the kernel says of the cores with these numbers: which are siblings, and how fast each type is.
+
+    `root`: where its files are. Where it says nothing, a core is a physical one, and as fast as the others.
+    """
+    siblings = {number: _number(root / f"cpu{number}/topology/thread_siblings_list", number) for number in numbers}
+    # cpu_capacity is 1024 for the fastest type of core; kernels without it have the highest clock
+    for file in ("cpu_capacity", "cpufreq/cpuinfo_max_freq"):
+        speed = {number: _number(root / f"cpu{number}/{file}", 0) for number in numbers}
+        if len(set(speed.values())) > 1 and min(speed.values()) > 0:
+            break
+    fastest = max(speed.values())
+    return tuple(
+        Core(number, siblings[number], round(FULL * speed[number] / fastest) if min(speed.values()) else FULL)
+        for number in numbers
+    )
+
+
+def _number(file: Path, otherwise: int) -> int:
+    """The first number in a file."""
+    try:
+        found = re.match(r"\d+", file.read_text())
+    except OSError:
+        return otherwise
+    return int(found[0]) if found else otherwise
 
 
 def sensor_c() -> float | None:

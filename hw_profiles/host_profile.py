@@ -44,7 +44,6 @@ def host_tables() -> dict[str, Any]:
     flags = set(CPU_INFO.read_text(encoding="utf-8", errors="replace").split()) if CPU_INFO.is_file() else set()
     flag = next(name for name in RATES if name in flags or not name)
     clock = f"{known_ghz:.1f} GHz" + ("" if ghz > 0 else " (not told, assumed)")
-    dsp_cores = max(1, cores - 2)
     split = split_cores(usable_cores())
     core = {unit: f"core {own[0]}" for unit, own in split.items()}
     return {
@@ -52,9 +51,18 @@ def host_tables() -> dict[str, Any]:
         "units": {
             "cpu": {**_unit(1, known_ghz, flag, clock), "core": core["cpu"]},
             "gpu": {**_unit(1, known_ghz, flag, clock), "core": core["gpu"]},
-            "dsp": {**_unit(dsp_cores, known_ghz, flag, clock), "core": core["dsp"], "runtimes": _runtimes(flag)},
+            "dsp": {
+                **_unit(network_threads(), known_ghz, flag, clock),
+                "core": core["dsp"],
+                "runtimes": _runtimes(flag),
+            },
         },
     }
+
+
+def network_threads() -> int:
+    """The cores whose rates the DSP unit of this profile has."""
+    return max(1, len(usable_cores()) - 2)
 
 
 def _runtimes(flag: str) -> dict[str, Any]:

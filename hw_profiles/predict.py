@@ -21,13 +21,17 @@ from trilane.hw_profiles.application import (
     steady,
 )
 from trilane.hw_profiles.configuration_table import Row
+from trilane.hw_profiles.host import host_cores, usable_cores
 from trilane.hw_profiles.load import HOST
 from trilane.hw_profiles.network_work import Network
 from trilane.hw_profiles.operator_times import JobTime
 from trilane.hw_profiles.over_time import Moment, over_time, unit_power_w
 from trilane.hw_profiles.performance_profiles import Corners, corners_of
+from trilane.hw_profiles.placed_host import Placed, on_cores, place_units
+from trilane.hw_profiles.placement_facts import NS_PER_MS, described
 from trilane.hw_profiles.reference_networks import reference_network
 from trilane.hw_profiles.schema import Profile
+from trilane.scheduler.placement import Ranked
 from trilane.scheduler.policy import POLICIES
 from trilane.scheduler.stats import energy_score
 from trilane.units import SUSTAINED, UNITS, UnitName
@@ -63,6 +67,9 @@ def predict(
     Raises BadInputError for an unknown name or a time out of range.
     """
     corners = corners_of(profile, performance_profile)
+    placed = place_units(profile, plan, corners, host_cores(usable_cores())) if profile.name == HOST else None
+    if placed is not None:
+        profile = on_cores(profile, placed.best.placement)
     now = steady(profile, plan, corners, twice=True)
     moments = over_time(profile, plan, performance_profile, minutes, governor) if minutes else []
     frame = _mean([m.frame_ms for m in moments]) if moments else now.frame_ms
@@ -88,7 +95,8 @@ def predict(
         "caps": _caps(moments),
         "timeline": [_shown(m) for m in _thinned(moments)],
         **_expected_error(profile, plan, job),
-        "notes": _notes(profile, plan.variant),
+        **({} if placed is None else {"placement": placed.facts}),
+        "notes": _notes(profile, plan.variant, placed),
     }
 
 
@@ -100,8 +108,8 @@ def _ends(moments: Sequence[Moment], now: Steady) -> dict[str, float]:
     return {"fps_start": 1e3 / moments[0].frame_ms, "fps_settled": 1e3 / _mean([m.frame_ms for m in last])}
 
 
-def _notes(profile: Profile, variant: Variant) -> list[str]:
-    """What a reader of the figures has to know of the profile and of the policy."""
+def _notes(profile: Profile, variant: Variant, placed: Placed | None) -> list[str]:
+    """What a reader of the figures has to know of the profile, of the policy and of the placement."""
     notes = []
     if POLICIES[variant.policy].paced:
         notes.append(
@@ -111,10 +119,17 @@ def _notes(profile: Profile, variant: Variant) -> list[str]:
         notes.append(
             "of this machine are cores, clock and instructions; its speeds are assumed: `trilane run` measures"
         )
+    if placed is not None:
+        beside = f"; {_predicted(placed.rule)}" if placed.rule.placement != placed.best.placement else ""
+        notes.append(f"placement: {_predicted(placed.best)} ms, the least by the placement's model{beside}")
     sharing = [unit for unit in UNITS if any(_on_one_core(profile, unit, other) for other in UNITS if other != unit)]
     if sharing:
         notes.append(f"{' and '.join(sharing)} share a core and work in turns")
     return notes
+
+
+def _predicted(ranked: Ranked) -> str:
+    return f"{described(ranked.placement)}: {ranked.frame_ns / NS_PER_MS:.1f}"
 
 
 def _on_one_core(profile: Profile, one: UnitName, other: UnitName) -> bool:

@@ -6,7 +6,7 @@ contradict each other, or were not measured, a message says so.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from trilane.pipeline.core_meter import counts_run_delay
@@ -15,6 +15,7 @@ from trilane.pipeline.description import Pipeline
 from trilane.pipeline.run_log import RunLog
 from trilane.scheduler.accounts import compared
 from trilane.scheduler.ledger import JobRecord
+from trilane.scheduler.placement import Place, busiest_core_ns
 from trilane.scheduler.recording import Recording
 from trilane.scheduler.stats import summary_ms
 
@@ -58,3 +59,21 @@ def add_accounts(
         for row in report["units"].values():
             row["idle"]["preempted"] = None
         log.say(NO_RUN_DELAY)
+
+
+def core_efficiency(report: Mapping[str, Any], pipeline: Pipeline) -> float | None:
+    """The work of the busiest core for a frame over the mean frame time; None without isolated times.
+
+    `report`: of a ledger, with its accounts; `pipeline`: that ran. A stage takes its isolated time of each core on
+    which its unit has a thread, but no more than its CPU time for each thread: a core that sleeps does no work. Of the
+    last stage, which is not measured isolated, its CPU time counts.
+    """
+    frame_ms: float = report["frame_time_ms"]["mean"]
+    if not report["isolated_ms"] or not frame_ms:
+        return None
+    placement = {unit: Place(settings.cores, settings.threads) for unit, settings in pipeline.units.items()}
+    core_ms = dict.fromkeys(placement, 0.0)
+    for name, row in report["stages"].items():
+        cpu_ms = row["cpu_ms"]["mean"] / placement[row["unit"]].threads
+        core_ms[row["unit"]] += min(report["isolated_ms"].get(name, cpu_ms), cpu_ms)
+    return busiest_core_ns(placement, core_ms) / frame_ms

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Protocol
 
 from trilane.errors import BadInputError
-from trilane.pipeline.accounts import add_accounts
+from trilane.pipeline.accounts import add_accounts, core_efficiency
 from trilane.pipeline.description import Pipeline
 from trilane.pipeline.isolated import IsolatedTimes
 from trilane.pipeline.lifecycle import close_units, start_units
@@ -125,6 +125,7 @@ def run_pipeline(
     for unit, row in report["units"].items():
         row.update(pid=run.pids[unit], **pipeline.units[unit].model_dump(mode="json"))
     add_accounts(report, pipeline, clock.cpu, run.recording, clock.jobs, log)
+    report["core_efficiency"] = core_efficiency(report, pipeline)
     return run.result(metrics_of(report))
 
 

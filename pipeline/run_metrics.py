@@ -238,6 +238,7 @@ class RunMetrics(Record):
     `units`: shares of each.
     `efficiency`: the slowest unit's stages, measured isolated, over the mean frame time; null when not measured.
     `bottleneck`: that slowest unit; absent when not measured.
+    `core_efficiency`: the work of the busiest core alone over the mean frame time; null when not measured.
     `isolated_ms`: mean time of each stage that was measured while no other unit worked.
     `core_shares`: what was done on each set of cores that a unit has, and on all; on the host clock.
     `accounts`: the shares of `units` computed a second time.
@@ -259,6 +260,7 @@ class RunMetrics(Record):
     units: dict[str, UnitShares]
     efficiency: float | None
     bottleneck: str | None = None
+    core_efficiency: float | None = None
     isolated_ms: dict[str, float]
     core_shares: tuple[CoreShare, ...] = ()
     accounts: Accounts | None = None

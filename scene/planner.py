@@ -1,8 +1,12 @@
-"""The planner: which tensor a frame gets. Rule: as dense as the picture and never denser, in the smallest shape that is
-ready; pure functions of what is on the screen, and of what was chosen before.
+"""The planner: which tensor a frame gets. Rule: each avatar in view gets the pixels that its network was trained to
+paint, no more than the picture can show, in a shape that is ready; pure functions of what is on the screen and held.
 
-A larger shape is taken at once. A smaller one is taken only when it would have done for `PATIENCE` frames in a row, so
-that a body at the edge of two shapes does not go to and fro between them (hysteresis).
+A network paints a body best at the size that it has learnt, whatever the distance: smaller it loses the face, larger it
+paints ragged edges (docs/decisions/planner.md has the figures). So the pixels follow from how many avatars are seen,
+and the shape from where they are.
+
+A shape is changed at once when another would be denser, and after `PATIENCE` frames in a row when a smaller one would
+have done, so that a body at the edge of two shapes does not go to and fro between them (hysteresis).
 """
 
 from __future__ import annotations
@@ -13,14 +17,26 @@ from dataclasses import dataclass
 from trilane.errors import BadInputError
 from trilane.scene.crop import Rect
 from trilane.scene.tensor_layout import DenseLayout, lay_out_at, tight_shape
-from trilane.shapes import Shape, shape_buckets
+from trilane.shapes import Shape, shapes_within
 
-#: Tensor pixels for one pixel of the picture: more would paint what the picture cannot show.
-FULL_DENSITY = 1.0
+#: Tensor pixels for one pixel of the picture, along a side: more could not be seen.
+MOST_DENSITY = 4.0
+#: A density is as good as the best one when it is at least this share of it.
+AS_GOOD = 0.95
 #: Frames for which a smaller shape has to do before it is taken.
 PATIENCE = 10
-#: A density is as good as another one that is larger by less than this share.
-AS_GOOD = 1e-6
+
+
+@dataclass(frozen=True)
+class TensorBudget:
+    """Pixels of a tensor. `own`: of each avatar, those of its network's own shape. `most`: of all together."""
+
+    own: int
+    most: int
+
+    def of(self, avatars: int) -> int:
+        """For so many avatars in view."""
+        return min(avatars * self.own, self.most)
 
 
 @dataclass(frozen=True)
@@ -40,42 +56,43 @@ class TensorPlan:
 
 
 def plan_tensor(
-    rects: Sequence[Rect],
-    output: Shape,
-    shapes: Sequence[Shape],
-    before: Held | None,
-    density: float = FULL_DENSITY,
+    rects: Sequence[Rect], output: Shape, shapes: Sequence[Shape], budget: TensorBudget, before: Held | None
 ) -> TensorPlan:
     """The tensor for the avatars at `rects`, at least one.
 
     `output`: (height, width) of the picture in pixels.
-    `shapes`: that are ready.
+    `shapes`: that are ready. Where all of them are larger than the budget allows, any may be taken.
     `before`: of the frame before, None for the first.
-    `density`: that is wanted; a frame for which no shape is large enough has less.
     Raises BadInputError when no shape has room for all avatars.
     """
-    fits = {shape: fit for shape in shapes if (fit := lay_out_at(rects, output, shape, density)) is not None}
+    allowed = [shape for shape in shapes if area(shape) <= budget.of(len(rects))] or shapes
+    fits = {shape: fit for shape in allowed if (fit := lay_out_at(rects, output, shape, MOST_DENSITY)) is not None}
     if not fits:
         raise BadInputError("tensor shapes", f"{list(shapes)}", f"room for {len(rects)} avatars", "use a larger --size")
-    enough = max(fit.density for fit in fits.values()) * (1 - AS_GOOD)
-    best = min((shape for shape, fit in fits.items() if fit.density >= enough), key=lambda one: (one[0] * one[1], one))
+    enough = AS_GOOD * max(fit.density for fit in fits.values())
+    best = min((shape for shape, fit in fits.items() if fit.density >= enough), key=lambda one: (area(one), one))
     held = _held(best, before, before is not None and before.shape in fits and fits[before.shape].density >= enough)
     return TensorPlan(fits[held.shape], held)
 
 
-def _held(best: Shape, before: Held | None, still_fits: bool) -> Held:
-    if before is None or not still_fits or best == before.shape:
-        return Held(best)
+def _held(best: Shape, before: Held | None, still_good: bool) -> Held:
+    if before is None or not still_good or area(best) >= area(before.shape):
+        return Held(before.shape if before is not None and still_good else best)
     waited = before.smaller_for + 1
     return Held(best) if waited > PATIENCE else Held(before.shape, waited)
 
 
-def foreseen_shape(rects: Sequence[Rect], output: Shape, side: int) -> Shape:
-    """The smallest shape for the avatars at `rects` at full density; with more pixels than `side`², the densest shape
-    of `shape_buckets(side)`.
-    """
-    tight = tight_shape(rects, output)
-    if tight[0] * tight[1] <= side * side:
-        return tight
-    fits = [(fit.density, shape) for shape in shape_buckets(str(side)) if (fit := lay_out_at(rects, output, shape))]
-    return max(fits)[1] if fits else (side, side)
+def ideal_shape(rects: Sequence[Rect], output: Shape, budget: TensorBudget) -> Shape:
+    """The shape in which the avatars at `rects` are densest within the budget; of equal ones the smallest."""
+    pixels = budget.of(len(rects))
+    tight = tight_shape(rects, output, MOST_DENSITY)
+    shapes = [*shapes_within(pixels), *([tight] if area(tight) <= pixels else [])]
+    fits = [(fit.density, shape) for shape in shapes if (fit := lay_out_at(rects, output, shape, MOST_DENSITY))]
+    if not fits:
+        return max(shapes, key=area)
+    return max(fits, key=lambda one: (one[0], -area(one[1]), one[1]))[1]
+
+
+def area(shape: Shape) -> int:
+    """Pixels of a tensor."""
+    return shape[0] * shape[1]

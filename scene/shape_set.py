@@ -1,8 +1,9 @@
 """Which tensor shapes a scene needs. Rule: chosen before the run from the frames that can be foreseen, so that every
 shape has its network ready; their number and their memory have stated limits.
 
-A shape serves a frame when it has room for the frame's tight shape. The first shapes serve all frames; further ones are
-added, the one that saves most first, as long as it saves enough and fits into the memory.
+A shape serves a frame when it is within the frame's budget of pixels and nearly as dense as the frame's ideal shape.
+First come the shapes that serve most frames, until all are served; then those that save work, as long as they save
+enough.
 """
 
 from __future__ import annotations
@@ -11,7 +12,9 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
+from trilane.scene.planner import AS_GOOD, area
 from trilane.shapes import Shape
 
 MOST_SHAPES = 10
@@ -19,68 +22,69 @@ MOST_SHAPES = 10
 LEAST_SAVING = 0.02
 
 
+class Demand(NamedTuple):
+    """Of a frame: its ideal shape (height, width), and the pixels that its tensor may have."""
+
+    ideal: Shape
+    pixels: int
+
+
 @dataclass(frozen=True)
 class ShapeSet:
-    """`shapes` (height, width), the smallest first.
+    """`shapes` (height, width), the smallest first. `memory_bytes`: what their networks take.
 
-    `memory_bytes`: what their networks take. `over_limit`: whether that is more than was allowed, because fewer shapes
-    cannot serve all frames.
+    `unserved`: frames that none of them serves, because there may be no more; they are drawn less densely.
     """
 
     shapes: tuple[Shape, ...]
     memory_bytes: int
-    over_limit: bool
+    unserved: int
 
 
 def choose_shapes(
-    tight: Iterable[Shape],
-    most_pixels: int,
-    bytes_per_pixel: float,
-    memory_bytes: int,
-    most_shapes: int = MOST_SHAPES,
+    demands: Iterable[Demand], bytes_per_pixel: float, memory_bytes: int, most_shapes: int = MOST_SHAPES
 ) -> ShapeSet:
-    """The shapes to prepare.
+    """The shapes to prepare: at least one, whatever its memory.
 
-    `tight`: shape of least area for each foreseen frame, at least one.
-    `most_pixels`: of a tensor that is not itself some frame's tight shape.
+    `demands`: of the frames that can be foreseen, at least one.
     `bytes_per_pixel`: memory of a network that is ready to run, for each pixel of its tensor.
     `memory_bytes`: what all of them may take.
-    `most_shapes`: how many there may be, unless the frames need more.
+    `most_shapes`: how many there may be.
     """
-    demands = Counter(tight)
-    chosen = _serving_all(demands, most_pixels)
-    total = _work(demands, chosen)
+    frames = Counter(demands)
+    chosen: list[Shape] = []
     while len(chosen) < most_shapes:
-        better = min(demands, key=lambda shape: (_work(demands, [*chosen, shape]), shape))
-        work = _work(demands, [*chosen, better])
-        memory = bytes_per_pixel * sum(map(_area, (*chosen, better)))
-        if total - work < LEAST_SAVING * total or memory > memory_bytes:
+        shape = _next(frames, chosen)
+        if shape is None or (chosen and bytes_per_pixel * sum(map(area, (*chosen, shape))) > memory_bytes):
             break
-        chosen, total = [*chosen, better], work
-    needed = math.ceil(bytes_per_pixel * sum(map(_area, chosen)))
-    return ShapeSet(tuple(sorted(chosen, key=lambda shape: (_area(shape), shape))), needed, needed > memory_bytes)
+        chosen.append(shape)
+    unserved = sum(count for demand, count in frames.items() if not any(serves(shape, demand) for shape in chosen))
+    memory = math.ceil(bytes_per_pixel * sum(map(area, chosen)))
+    return ShapeSet(tuple(sorted(chosen, key=lambda shape: (area(shape), shape))), memory, unserved)
 
 
-def serves(shape: Shape, tight: Shape) -> bool:
-    """Whether a tensor of `shape` has room for what `tight` has room for."""
-    return shape[0] >= tight[0] and shape[1] >= tight[1]
+def serves(shape: Shape, demand: Demand) -> bool:
+    """Whether the frame of `demand` can be drawn well in a tensor of `shape`."""
+    (height, width), (ideal_height, ideal_width) = shape, demand.ideal
+    large_enough = height >= AS_GOOD * ideal_height and width >= AS_GOOD * ideal_width
+    return large_enough and area(shape) <= demand.pixels
 
 
-def _serving_all(demands: Iterable[Shape], most_pixels: int) -> list[Shape]:
-    """One shape with room for everything; where that is too large, every demand that no other one has room for."""
-    shapes = sorted(set(demands))
-    whole = max(height for height, _ in shapes), max(width for _, width in shapes)
-    if _area(whole) <= most_pixels:
-        return [whole]
-    return [shape for shape in shapes if not any(serves(other, shape) for other in shapes if other != shape)]
+def _next(frames: Mapping[Demand, int], chosen: Sequence[Shape]) -> Shape | None:
+    """The shape to add, None when a further one is not worth it."""
+    candidates = sorted({demand.ideal for demand in frames} - set(chosen))
+    if not candidates:
+        return None
+    unserved = {d: count for d, count in frames.items() if not any(serves(shape, d) for shape in chosen)}
+    if unserved:
+        return max(candidates, key=lambda one: (sum(c for d, c in unserved.items() if serves(one, d)), -area(one)))
+    work = _work(frames, chosen)
+    best = min(candidates, key=lambda shape: _work(frames, [*chosen, shape]))
+    return best if work - _work(frames, [*chosen, best]) >= LEAST_SAVING * work else None
 
 
-def _work(demands: Mapping[Shape, int], chosen: Sequence[Shape]) -> int:
+def _work(frames: Mapping[Demand, int], chosen: Sequence[Shape]) -> int:
     """Pixels of all frames, each in the smallest shape that serves it."""
     return sum(
-        count * min(_area(shape) for shape in chosen if serves(shape, tight)) for tight, count in demands.items()
+        count * min(area(shape) for shape in chosen if serves(shape, demand)) for demand, count in frames.items()
     )
-
-
-def _area(shape: Shape) -> int:
-    return shape[0] * shape[1]

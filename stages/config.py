@@ -8,6 +8,7 @@ from pathlib import Path
 from pydantic import Field, field_validator
 
 from trilane.pipeline.description import UnitSettings
+from trilane.scene.planner import TensorBudget
 from trilane.scene.schema import Model, Scene
 from trilane.shapes import Shape, shape_buckets
 from trilane.unexpected_value import UnexpectedValue
@@ -30,6 +31,7 @@ class RunConfig(Model):
     `units`: cores and threads of each unit.
     `runtime`: that the DSP unit infers with.
     `shapes`: of the tensor, where the scene plans it; else those of its size are used.
+    `own_pixels`: of the tensor at which the network was trained.
     `record`: whether the frames are encoded to a video.
     `posed_vertices`: how many of each avatar, when the CPU unit skins; empty when the GPU unit does.
     `pace_ns`: how long a job of a stage is held, at least.
@@ -42,6 +44,7 @@ class RunConfig(Model):
     units: dict[str, UnitSettings]
     runtime: str = "ort"
     shapes: tuple[Shape, ...] = ()
+    own_pixels: int = 0
     record: bool = True
     posed_vertices: tuple[int, ...] = ()
     pace_ns: dict[str, int] = Field(default={})
@@ -58,6 +61,11 @@ class RunConfig(Model):
     @property
     def buckets(self) -> list[Shape]:
         return list(self.shapes) or shape_buckets(self.scene.size)
+
+    @property
+    def tensor_budget(self) -> TensorBudget:
+        """Of a tensor that is planned."""
+        return TensorBudget(self.own_pixels, self.scene.most_side**2)
 
     @property
     def budget_px(self) -> float:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +20,14 @@ from trilane.avatars.integer_network import NetworkFile
 from trilane.avatars.network_split import split
 from trilane.avatars.validation import DrawnAs, accuracy_of
 from trilane.errors import BadInputError, MissingPartError
-from trilane.hw_profiles.host import host_units
+from trilane.hw_profiles.host import asked_cores, rule_placement, settings_of, usable_cores
 from trilane.hw_profiles.load import HOST, load_profile
 from trilane.hw_profiles.runtime_choice import fastest_runtime
 from trilane.install import EGL_LINE
 from trilane.near_miss import did_you_mean
 from trilane.pipeline.shared_assets import Assets
 from trilane.scene.load import find_scene, load_scene, located, scene_from
+from trilane.scene.planner import TensorBudget
 from trilane.scene.schema import Scene
 from trilane.scene.staging import stage_scene
 from trilane.stages.avatar_assets import AvatarData, load_avatar, pack_assets, require_one_tensor
@@ -60,6 +61,7 @@ class Request:
     split: tuple[str, ...] = ()
     fps: float | None = None
     output: str | None = None
+    cores: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -67,13 +69,16 @@ class Checked:
     """A configuration that can be run.
 
     `assets`: what was loaded to check it, as the units take it. `notes`: what the loads said of their sources.
-    `accuracy`: of each avatar, by its name, what `accuracy_of` says of it.
+    `accuracy`: of each avatar, by its name, what `accuracy_of` says of it. `asked_cores`: of units, by the options.
+    `placement`: what `trilane.stages.placing` says of the units' cores.
     """
 
     config: RunConfig
     assets: Assets
     notes: tuple[str, ...]
     accuracy: Mapping[str, Any]
+    asked_cores: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    placement: Mapping[str, Any] | None = None
 
     def changed(self, **values: Any) -> Checked:
         """The same with other `values` of the configuration, such as `out_dir`, `record` or `units`."""
@@ -130,6 +135,7 @@ def configure(request: Request, out_dir: Path, gl: GlFacts = gl_facts) -> Checke
         raise BadInputError(
             "plan", "full", "planned or fixed", "`trilane bench planner` draws the full plan to compare"
         )
+    asked = asked_cores(request.cores)
     runtime, reason = requested_runtime(request.runtime)
     _check_background(scene)
     bundles = {spec.bundle: load_bundle(spec.bundle) for spec in scene.avatars}
@@ -138,16 +144,19 @@ def configure(request: Request, out_dir: Path, gl: GlFacts = gl_facts) -> Checke
     require_one_tensor(list(avatars.values()))
     bodies = [avatars[folder].shaped for folder in folders]
     staged = stage_scene(scene, bodies, Path.cwd())
-    cuts = requested_cuts(request.split, avatars[folders[0]].network)
+    network = avatars[folders[0]].network
+    cuts = requested_cuts(request.split, network)
     unit, why = skinning_unit(request.skinning, gl)
-    foreseen = foresee(scene, staged, bodies, avatars[folders[0]].network) if scene.plans_tensor else None
+    budget = TensorBudget(network.shape[1] * network.shape[2], scene.most_side**2)
+    foreseen = foresee(scene, staged, bodies, network, budget) if scene.plans_tensor else None
     config = RunConfig(
         scene=scene,
         out_dir=out_dir,
         avatar_dirs=folders,
-        units=host_units(),
+        units=settings_of(rule_placement(usable_cores(), asked)),
         runtime=runtime,
         shapes=foreseen.shapes.shapes if foreseen else (),
+        own_pixels=budget.own,
         posed_vertices=tuple(len(avatars[folder].shaped.vertices) for folder in folders) if unit == "cpu" else (),
         cuts=cuts,
     )
@@ -155,7 +164,7 @@ def configure(request: Request, out_dir: Path, gl: GlFacts = gl_facts) -> Checke
     notes += (foreseen.note,) if foreseen else ()
     drawn = DrawnAs(runtime, scene.size, scene.texture_filter, len(scene.avatars))
     accuracy = _accuracy(list(avatars.values()), drawn)
-    return Checked(config, pack_assets(list(avatars.values()), staged), notes, accuracy)
+    return Checked(config, pack_assets(list(avatars.values()), staged), notes, accuracy, asked)
 
 
 def requested_runtime(asked: str) -> tuple[str, str]:

@@ -16,11 +16,10 @@ from trilane.avatars.network_reshape import STRIDE, reshaped
 from trilane.body.body import ShapedBody
 from trilane.body.kinematics import Skeleton
 from trilane.scene.crop import Rect
-from trilane.scene.planner import foreseen_shape
+from trilane.scene.planner import TensorBudget, ideal_shape
 from trilane.scene.schema import Scene
-from trilane.scene.shape_set import ShapeSet, choose_shapes
+from trilane.scene.shape_set import Demand, ShapeSet, choose_shapes
 from trilane.scene.staging import Staged
-from trilane.shapes import Shape
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 
 #: Of the scene, over all avatars; but at least so many of each.
@@ -33,42 +32,42 @@ BYTE_TYPES = (2, 3)  # of ONNX: uint8 and int8
 
 @dataclass(frozen=True)
 class Foreseen:
-    """`shapes`: to make ready. `tight`: the smallest shape of each frame that was looked at, None with nobody on it.
-
-    `frames`: their numbers.
-    """
+    """`shapes`: to make ready. `frames`: numbers of those that were looked at. `seen`: on how many somebody is."""
 
     shapes: ShapeSet
     frames: tuple[int, ...]
-    tight: tuple[Shape | None, ...]
+    seen: int
 
     @property
     def note(self) -> str:
         """What a person should know of it."""
         names = ", ".join(f"{height}x{width}" for height, width in self.shapes.shapes)
-        seen = sum(shape is not None for shape in self.tight)
-        text = f"tensor: planned in shapes {names} (somebody is seen in {seen} of {len(self.tight)} frames looked at)"
-        if self.shapes.over_limit:
-            text += f"; their networks take {self.shapes.memory_bytes / MB:.0f} MB, more than memory_mb allows"
+        looked_at = f"somebody is seen in {self.seen} of {len(self.frames)} frames looked at"
+        text = f"tensor: planned in shapes {names} ({looked_at})"
+        if self.shapes.unserved:
+            text += f"; {self.shapes.unserved} of them have no shape of their own within memory_mb and are less dense"
         return text
 
 
-def foresee(scene: Scene, staged: Staged, bodies: Sequence[ShapedBody], network: NetworkFile) -> Foreseen:
+def foresee(
+    scene: Scene, staged: Staged, bodies: Sequence[ShapedBody], network: NetworkFile, budget: TensorBudget
+) -> Foreseen:
     """The tensor shapes that `scene` needs.
 
     `bodies`: of its avatars, in order.
     `network`: that all of them share.
+    `budget`: of its tensors.
     """
     count = min(scene.frames, max(FORESEEN_FRAMES // len(bodies), LEAST_FRAMES))
     frames = tuple(index * scene.frames // count for index in range(count))
     output = (scene.output.height, scene.output.width)
-    tight = tuple(
-        foreseen_shape(rects, output, scene.most_side) if rects else None
+    demands = [
+        Demand(ideal_shape(rects, output, budget), budget.of(len(rects)))
         for rects in foreseen_rects(scene, staged, bodies, frames)
-    )
-    demands = [shape for shape in tight if shape is not None] or [(STRIDE, STRIDE)]
-    per_pixel = bytes_per_pixel(network)
-    return Foreseen(choose_shapes(demands, scene.most_side**2, per_pixel, scene.memory_mb * MB), frames, tight)
+        if rects
+    ]
+    anyway = demands or [Demand((STRIDE, STRIDE), budget.of(1))]
+    return Foreseen(choose_shapes(anyway, bytes_per_pixel(network), scene.memory_mb * MB), frames, len(demands))
 
 
 def foreseen_rects(

@@ -32,6 +32,10 @@ BENCHES = {
     "peers": ("trilane.bench.peers", "Trilane's runtimes beside the libraries' own examples and benchmark_app."),
     "roofline": ("trilane.bench.roofline", "The machine's INT8 and FP32 peaks and its memory bandwidth."),
     "pipeline": ("trilane.bench.pipeline", "Efficiency, idleness and gain of policies, edges and cores."),
+    "placement": (
+        "trilane.bench.placement",
+        "Every placement of the units on the cores, beside the one that is chosen.",
+    ),
     "scenario": ("trilane.bench.scenario", "MLPerf's load patterns, evaluated here and by MLCommons LoadGen."),
     "faults": ("trilane.bench.faults", "Units killed and stopped: what is lost, how soon the pace is back."),
     "accounts": ("trilane.bench.accounts", "Busy and idle shares of random runs, computed twice, beside CPU time."),

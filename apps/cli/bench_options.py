@@ -33,6 +33,7 @@ MEANINGS = {
     "judge": "Who evaluates the run: trilane or loadgen.",
     "kib": "Size of the slot in KiB: 256, 1024, 4096 or 16384.",
     "limit_ms": "Longest latency of the server scenario that counts as in time.",
+    "finalists": "How many placements are measured again, beside the chosen one and that of the rule.",
     "margins": "Pixels of the tensor between two avatars.",
     "minutes": "Virtual minutes.",
     "network": "An .onnx file or an avatar, at its own size; if none, one of --encoder, --norm, --width and --size.",

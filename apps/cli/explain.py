@@ -120,7 +120,7 @@ def _table(phases: list[dict[str, Any]]) -> Table:
         tensor, density = phase["tensor"], phase["density"]
         table.add_row(
             f"{phase['first_frame']}-{phase['last_frame']}",
-            f"{tensor[0]}x{tensor[1]}" if tensor else "none",
+            f"{tensor[0]}x{tensor[1]}" if tensor and phase["work"] == "full" else phase["work"],
             f"{density[0]:.2f}-{density[1]:.2f}" if density else "-",
             _modelled(phase["avatars"]) or "-",
             f"{phase['saved']['work_ms']:.1f}",

@@ -26,7 +26,7 @@ OutFileOption = Annotated[Path, typer.Option("--out", help="File to write.")]
 SceneArgument = Annotated[str, typer.Argument(help="A scene file (TOML), or the name of one that comes with Trilane.")]
 SceneAvatarOption = Annotated[str | None, typer.Option("--avatar", help="`default`, or the folder of an avatar.")]
 SceneSizeOption = Annotated[
-    str | None, typer.Option("--size", help=f"{SIZE_HELP} auto: planned, as dense as the picture.")
+    str | None, typer.Option("--size", help=f"{SIZE_HELP} auto: planned, as the network paints best.")
 ]
 PerformanceProfileOption = typer.Option(help="Which power and speed the units ask for, by SNPE's names.")
 PerformanceProfileChoice = Annotated[PerformanceProfile, PerformanceProfileOption]

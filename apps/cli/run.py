@@ -48,6 +48,7 @@ Examples:
   trilane run --motion walk.bvh --camera arkit.txt --frames 200 --json
   trilane run --latch 3
   trilane run walk-past --policy latest --edge triple --fps 24 --output 1280x720
+  trilane run --cores cpu=1 --cores gpu=0 --cores dsp=0,1
   trilane run --split /Concat_4_output_0_QuantizeLinear_Output=cpu
   trilane run --performance-profile sustained_high_performance
   trilane run --profile snapdragon-888 --pace --slow-motion 24 --frames 60
@@ -85,6 +86,12 @@ SkinningOption = Annotated[
 SplitOption = Annotated[
     list[str] | None,
     typer.Option(help="TENSOR=UNIT: cut the network there, the rest runs on UNIT. `trilane avatar split` lists."),
+]
+CoresOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="UNIT=LIST: the unit's cores, such as dsp=0,1; once for each. Else they follow from measured times."
+    ),
 ]
 PacedProfileOption = Annotated[str | None, typer.Option("--profile", help=f"{PROFILE_HELP} With --pace.")]
 PaceOption = Annotated[bool, typer.Option("--pace", help="Hold each job until its modelled time has passed.")]
@@ -139,6 +146,7 @@ def run(
     runtime: RuntimeOption = "auto",
     skinning: SkinningOption = "auto",
     split: SplitOption = None,
+    cores: CoresOption = None,
     profile: PacedProfileOption = None,
     pace: PaceOption = False,
     slow_motion: SlowMotionOption = 1.0,
@@ -159,7 +167,7 @@ def run(
 
         cuts, rule = tuple(split or ()), requested_edge(edge)
         request = Request(scene, motion, camera, background, avatar, frames, size, runtime, hud, skinning, cuts)
-        request = replace(request, fps=fps, output=output)
+        request = replace(request, fps=fps, output=output, cores=tuple(cores or ()))
         checked = configure(request, Path.cwd(), gl)
         chip_pace = _pace(checked.config, profile, pace, slow_motion)
         cap = performance_profile and str(performance_profile)

@@ -201,6 +201,7 @@ def _rate_rows(runs: Sequence[Report | Baseline]) -> Rows:
     rates = [f"{_number(_of_several(run, run.fps))} ({_between(run.fps_low, run.fps_high)})" for run in runs]
     yield "rate", "frames per second", rates
     yield "efficiency", "slowest unit isolated / frame time", [_number(run.efficiency, 2) for run in runs]
+    yield "", "busiest core's work / frame time", [_number(run.core_efficiency, 2) for run in runs]
     yield "frames", "lost + dropped", [f"{run.frames.lost} + {sum(run.frames.dropped.values())}" for run in runs]
     yield "", "deadline misses", [str(run.deadline_misses) for run in runs]
 

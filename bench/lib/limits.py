@@ -18,6 +18,7 @@ LIMITS: dict[str, tuple[float, float]] = {
     "threads": (0, 4 * (os.cpu_count() or 1)),
     "rounds": (1, 10_000),
     "views": (1, 1_000_000),
+    "finalists": (1, 1000),
     "frames": (1, 10_000_000),
     "pictures": (1, 10_000),
     "seeds": (1, 1000),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 
 from trilane.unexpected_value import UnexpectedValue
@@ -29,13 +30,18 @@ def shape_buckets(size: str) -> list[Shape]:
     between. Raises UnexpectedValue when a side is no multiple of 32 or out of range.
     """
     if re.fullmatch(r"\d+", size):
-        return _shapes_of_area(_check_side(int(size)))
+        return shapes_within(_check_side(int(size)) ** 2)
     height, width = parse_shape(size)
     return [(_check_side(height), _check_side(width))]
 
 
-def _shapes_of_area(side: int) -> list[Shape]:
-    widest = [(h, side * side // h // BUCKET_STEP * BUCKET_STEP) for h in range(BUCKET_STEP, 2 * side + 1, BUCKET_STEP)]
+def shapes_within(pixels: int) -> list[Shape]:
+    """The shapes (height, width) of at most so many pixels, at least `BUCKET_STEP`², of which none holds another.
+
+    Their sides are multiples of `BUCKET_STEP`, the longer one at most `MOST_ASPECT` times the shorter one.
+    """
+    longest = math.isqrt(MOST_ASPECT * pixels)
+    widest = [(h, pixels // h // BUCKET_STEP * BUCKET_STEP) for h in range(BUCKET_STEP, longest + 1, BUCKET_STEP)]
     shapes = [(h, w) for h, w in widest if w and max(h, w) <= min(MOST_ASPECT * min(h, w), MAX_SIDE)]
     return [(h, w) for h, w in shapes if not any(b > h and v >= w for b, v in shapes)]
 

@@ -73,6 +73,7 @@ class PoseStage:
         self._fps = scene.fps
         self._output = (scene.output.height, scene.output.width)
         self._buckets, self._plans_tensor = config.buckets, scene.plans_tensor
+        self._budget = config.tensor_budget
         self._held: Held | None = None
         self._skips = scene.plan == "planned"
         self.plan = FramePlan(Work.NONE, None, None, {})
@@ -171,7 +172,7 @@ class PoseStage:
             return FramePlan(Work.NONE, None, None, {})
         rects, density = [one.rect for _, one in seen], None
         if self._plans_tensor:
-            plan = plan_tensor(rects, self._output, self._buckets, self._held)
+            plan = plan_tensor(rects, self._output, self._buckets, self._budget, self._held)
             layout, density, self._held = plan.dense.layout, plan.dense.density, plan.held
         else:
             layout = lay_out(rects, self._output, self._buckets)

@@ -20,7 +20,7 @@ from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline.description import UnitSettings
 from trilane.scene import tensor_layout
 from trilane.scene.crop import Rect, choose_bucket, grow
-from trilane.scene.planner import plan_tensor
+from trilane.scene.planner import TensorBudget, plan_tensor
 from trilane.scene.schema import AvatarSpec, OutputSpec, Scene
 from trilane.scene.tensor_layout import lay_out
 from trilane.shapes import shape_buckets
@@ -222,7 +222,8 @@ def test_a_planned_packet_is_what_the_planner_says_of_the_avatars_on_the_screen(
     tiny_bundle: Path, tmp_path: Path
 ) -> None:
     """Frame by frame, each after what was held before it: shape, cells, rectangles and density."""
-    config = configured(tiny_bundle, tmp_path, size="auto").model_copy(update={"shapes": ((256, 128), (480, 320))})
+    planned = {"shapes": ((256, 128), (288, 224), (160, 96)), "own_pixels": 256**2}
+    config = configured(tiny_bundle, tmp_path, size="auto").model_copy(update=planned)
     assets = assets_of(config)
     body, staged = shaped_body(assets, 0), staged_of(assets)
     stage, slot, held = PoseStage(config, assets), packet(1), None
@@ -234,7 +235,7 @@ def test_a_planned_packet_is_what_the_planner_says_of_the_avatars_on_the_screen(
         posed = skeleton.pose(*staged.movers[0].sample(t_s), staged.movers[0].world)
         rect = bounds.rect(posed, projection @ staged.camera.sample(t_s))
         assert rect is not None
-        plan = plan_tensor([rect], (480, 640), config.shapes, held)
+        plan = plan_tensor([rect], (480, 640), config.shapes, TensorBudget(256**2, 512**2), held)
         held = plan.held
         ((crop, cell),) = plan.dense.layout.crops
         avatar = slot.header["avatars"][0]

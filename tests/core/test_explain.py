@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,8 @@ from trilane.hw_profiles.load import load_profile
 from trilane.hw_profiles.network_work import Network, count_work
 from trilane.hw_profiles.performance_profiles import corners_of
 from trilane.scene.crop import Rect
+from trilane.scene.planner import MOST_DENSITY
+from trilane.scene.work import Work
 from trilane.stages.avatar_assets import shaped_body, staged_of
 from trilane.stages.configure import Checked, Request, configure
 from trilane.stages.cpu.actor import Seen
@@ -64,7 +67,7 @@ def document(checked: Checked, tmp_path: Path) -> Any:  # noqa: ARG001 - it writ
 
 def planned(frame: int, shape: tuple[int, int] | None, *levels: int) -> PlannedFrame:
     seen = {number: Seen(Rect(0, 0, 1, 1), level, 0.1) for number, level in enumerate(levels)}
-    return PlannedFrame(frame, FramePlan(shape, None, seen), {})
+    return PlannedFrame(frame, FramePlan(Work.FULL if shape else Work.NONE, shape, None, seen), {})
 
 
 def test_frames_of_one_kind_are_a_phase() -> None:
@@ -80,7 +83,8 @@ def test_frames_of_one_kind_are_a_phase() -> None:
         planned(6, None),
         planned(7, small, 2),
     ]
-    assert [[one.frame for one in group] for group in phases(frames)] == [[0, 1], [2], [3], [4], [5, 6], [7]]
+    frames.append(PlannedFrame(8, replace(frames[-1].plan, work=Work.REUSE), {}))
+    assert [[one.frame for one in group] for group in phases(frames)] == [[0, 1], [2], [3], [4], [5, 6], [7], [8]]
 
 
 def test_phases_cover_the_scene_and_add_up(document: Any) -> None:
@@ -100,12 +104,17 @@ def test_phases_cover_the_scene_and_add_up(document: Any) -> None:
 
 def test_a_phase_says_what_is_modelled_and_its_error(document: Any) -> None:
     for row in document["phases"]:
-        assert row["density"] == [1.0, 1.0]
+        assert 0 < row["density"][0] <= row["density"][1] <= MOST_DENSITY
+        assert row["work"] == "full"
         assert row["cost"]["pixels"] == row["tensor"][0] * row["tensor"][1]
         (avatar,) = row["avatars"]
         assert avatar["modelled"] in [detail.name for detail in DETAILS[:-1]]
         assert 0 <= avatar["measured_px"] <= avatar["bound_px"] <= 2.0
-        assert row["why"] == "a tensor pixel for each pixel of the picture, in the smallest shape that is ready"
+        assert row["why"] == (
+            "4 tensor pixels along a side of a pixel of the picture: more could not be seen"
+            if row["density"][1] == MOST_DENSITY
+            else "the pixels that the network was trained to paint, in the shape that fits best of those that are ready"
+        )
     assert document["sources"] == {
         "bound_px": "proved bound, in pixels of the picture",
         "measured_px": "measured in this run",

@@ -64,13 +64,14 @@ def test_a_slot_is_shared_and_announced_by_a_job(monkeypatch: pytest.MonkeyPatch
 
 def test_a_slots_messages_are_numbered_and_others_are_passed_over() -> None:
     sent: list[Any] = []
-    answers = iter([None, "something else", RunJob(5, 0, 5, 0, 0, 0, 0)])
+    answers = iter([None, "something else", RunJob(5, 0, 5, 0, 0, 0, 0, 0)])
     pipe = SimpleNamespace(send=sent.append, receive=lambda: next(answers), ended=False)
     payload = np.zeros(8, np.uint8)
     end = _SlotEnd(payload, pipe)  # type: ignore[arg-type]
     for _ in range(3):
         end.hand_over()
-    assert sent == [RunJob(id=n, stage=0, frame=n, slot_in=0, slot_out=0, epoch=0, t_dispatch_ns=0) for n in range(3)]
+    still = {"stage": 0, "slot_in": 0, "slot_out": 0, "epoch": 0, "t_dispatch_ns": 0, "fresh": 0}
+    assert sent == [RunJob(id=n, frame=n, **still) for n in range(3)]
     assert end.receive() is payload is end.buffer()
 
 

@@ -95,7 +95,7 @@ def power_of(profile: Profile, corners: Any) -> dict[str, float]:
 
 def test_an_answer_about_the_settled_application(asked: list[Any]) -> None:
     profile = changed(STATED)
-    plan = Plan(NETWORK, "dsp", Variant("pipelined", "double", 2), 0.25)
+    plan = Plan(NETWORK, "dsp", Variant("pipelined", "double", 2, 24.0), 0.25)
     found = predict.predict(profile, plan, "burst")
     corners = tuple(profile.performance_profiles["burst"].corner(unit) for unit in UNITS)
     assert asked == [("snapdragon-888", plan, corners, {"twice": True})]
@@ -111,8 +111,8 @@ def test_an_answer_about_the_settled_application(asked: list[Any]) -> None:
         "machine": {"profile": "snapdragon-888", "title": profile.title},
         "config": {
             "encoder": "e", "norm": "n", "size": "320x192", "channels": 12, "layout": "packed", "runtime": "dsp",
-            "policy": "pipelined", "edge": "double", "batch": 2, "gpu_share": 0.25, "performance_profile": "burst",
-            "minutes": 0.0, "governor": profile.thermal.governor,
+            "policy": "pipelined", "edge": "double", "batch": 2, "fps": 24.0, "gpu_share": 0.25,
+            "performance_profile": "burst", "minutes": 0.0, "governor": profile.thermal.governor,
         },
         "network": {
             "parameters_m": 3.0, "gmac": 5.0, "alone_ms": 18.0, "parts_ms": {"fixed": 2.0, "convolution": 16.0},
@@ -214,8 +214,8 @@ def test_alternatives_are_answered_row_by_row(asked: list[Any]) -> None:
         ("one frame at a time", Variant("sequential", "single"), 0.0),
         ("pipelined, two buffers", Variant("pipelined", "double"), 0.0),
         ("pipelined, newest of three buffers", Variant("pipelined", "triple"), 0.0),
-        ("newest pose wins", Variant("latest", "double"), 0.0),
-        ("newest pose wins, newest of three buffers", Variant("latest", "triple"), 0.0),
+        ("newest pose wins", Variant("latest", "double", 1, 1000.0), 0.0),
+        ("newest pose wins, newest of three buffers", Variant("latest", "triple", 1, 1000.0), 0.0),
         ("pipelined, batches of 2", Variant("pipelined", "double", 2), 0.0),
         ("pipelined, 5 % of the network on the GPU", Variant("pipelined", "double"), 0.05),
     ]

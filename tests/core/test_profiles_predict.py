@@ -22,11 +22,13 @@ from trilane.hw_profiles.configuration_table import read_table
 from trilane.hw_profiles.load import load_profile
 from trilane.hw_profiles.over_time import over_time
 from trilane.hw_profiles.performance_profiles import corners_of
+from trilane.hw_profiles.placed_host import on_cores, place_units
 from trilane.hw_profiles.predict import predict, predict_table, what_if
 from trilane.hw_profiles.reference_networks import NetworkSpec, reference_network
 from trilane.hw_profiles.schema import Profile
 from trilane.hw_profiles.thermal_state import ThermalState
 from trilane.hw_profiles.throttling import GOVERNORS
+from trilane.scheduler.placement import Core
 from trilane.units import UNITS, UnitName
 
 NETWORK = reference_network(NetworkSpec("resnet18", "batch", 512, 512, 16))
@@ -284,3 +286,26 @@ def test_a_quick_answer_is_the_settled_one(variant: Variant, within: float, runt
     corners = corners_of(profile, "power_saver")
     settled = steady(profile, plan, corners).frame_ms
     assert steady(profile, plan, corners, quick=True).frame_ms == pytest.approx(settled, rel=within)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4])
+def test_this_machine_in_virtual_time_is_placed_as_its_times_ask(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The scheduler in virtual time finds no placement better by more than the model's margin."""
+    cores = tuple(range(count))
+    for module in ("host_profile", "predict"):
+        monkeypatch.setattr(f"trilane.hw_profiles.{module}.usable_cores", lambda: cores)
+    profile, plan = load_profile("host"), Plan(NETWORK, "dsp", Variant("pipelined", "double"))
+    corners = corners_of(profile, SUSTAINED)
+    placed = place_units(profile, plan, corners, [Core(number, number) for number in cores])
+    frames = {each.frame_ns: steady(on_cores(profile, each.placement), plan, corners).frame_ms for each in placed.found}
+    chosen = steady(on_cores(profile, placed.best.placement), plan, corners).frame_ms
+    assert chosen <= 1.05 * min(frames.values())
+    assert chosen <= 1.03 * steady(on_cores(profile, placed.rule.placement), plan, corners).frame_ms
+    answer = predict(profile, plan)
+    assert answer["placement"] == placed.facts
+    assert answer["fps"] == pytest.approx(1e3 / chosen)
+    assert any("placement: cpu 0" in note for note in answer["notes"])
+
+
+def test_a_chip_with_units_of_its_own_has_no_placement() -> None:
+    assert "placement" not in predict(load_profile("snapdragon-888"), Plan(NETWORK, "dsp"))

@@ -34,7 +34,7 @@ def test_accounts_that_contradict_themselves_are_told(monkeypatch: pytest.Monkey
     monkeypatch.setattr(accounts, "compared", lambda *given: asked.append(given) or compared)
     monkeypatch.setattr(accounts, "counts_run_delay", lambda: False)
     cpu = CpuTimes({"left": 2, "right": 2})
-    cpu.add("right", "mid", Done(0, MS, 2 * MS, 0, 0, 0, 0, 2 * MS, MS // 2, {}), 0)
+    cpu.add("right", "mid", Done(0, MS, 2 * MS, 0, 0, 0, 0, 0, 2 * MS, MS // 2, {}), 0)
     report, heard = a_report(), []
     recording: Any = "recording"
     accounts.add_accounts(report, PIPELINE, cpu, recording, [], RunLog(heard.append))

@@ -90,6 +90,9 @@ def record(out_dir: Path, numbers: range) -> None:
     stage.close()
 
 
+PLACED = "placement: cpu 0, gpu 1, dsp 0"
+
+
 @dataclass
 class Runs:
     """In place of `run_avatar`: each call takes the next of `answers`, a result, an error, or what makes one."""
@@ -117,9 +120,15 @@ def runs(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Runs]:
     def made(*answers: Any) -> Runs:
         double = Runs(list(answers))
         monkeypatch.setattr(run_job, "run_avatar", double)
+        monkeypatch.setattr(run_job, "placed", with_a_place)
         return double
 
     return made
+
+
+def with_a_place(given: Checked, _policy: str, _starter: Any, _driver: str) -> Checked:
+    """In place of the placement: it adds a note and leaves the units where they are."""
+    return replace(given, notes=(*given.notes, PLACED))
 
 
 def go(runs: Runs, target: Path, plan: Plan | None = None, made: Mapping[str, Any] | None = None) -> Outcome:
@@ -141,7 +150,7 @@ def test_a_run_and_its_baseline(runs: Callable[..., Runs], tmp_path: Path) -> No
     assert first["config"].out_dir.name.endswith(".partial")
     assert first["config"].model_copy(update={"out_dir": Path("/nowhere")}) == checked().config
     assert (first["starter"], first["governor"], first["assets"]) == ("the starter", None, {})
-    assert double.said == [("deadline", 2, 5), "hello", ("sequential", 2, 5), "hello"]
+    assert double.said == [PLACED, ("deadline", 2, 5), "hello", ("sequential", 2, 5), "hello"]
     assert sorted(file.name for file in outcome.folder.iterdir()) == ["events.jsonl", "report.json", "trace.pftrace"]
     report = read_report(outcome.folder)
     assert report == outcome.report
@@ -168,7 +177,7 @@ def test_what_the_report_says_of_a_run(runs: Callable[..., Runs], tmp_path: Path
     assert document["startup_ms"] == {"cpu": 1.5}
     assert document["figures"] == {"pose": {"visible": 0.5}}
     assert document["messages"] == ["the unit gpu was slow"]
-    assert document["notes"] == ["the motion is short", "runtime: ort"]
+    assert document["notes"] == ["the motion is short", "runtime: ort", PLACED]
     assert document["accuracy"] == {"someone": {"source": "no figures"}}
     assert (document["interrupted"], document["failure"]) == (False, None)
     assert (document["video"], document["checksum"]) == (None, None)
@@ -219,7 +228,7 @@ def test_a_baseline_that_is_not_whole_is_left_out(case: str, runs: Callable[...,
     double = runs(a_result(), answer)
     outcome = go(double, tmp_path / "run")
     assert (outcome.exit_code, outcome.report.baseline) == (code, None)
-    assert double.said[4:] == ([said] if said else [])
+    assert double.said[5:] == ([said] if said else [])
     assert sorted(file.name for file in outcome.folder.iterdir()) == ["events.jsonl", "report.json", "trace.pftrace"]
 
 
@@ -309,7 +318,7 @@ def test_the_video_is_joined_and_what_it_lacks_is_told(runs: Callable[..., Runs]
     assert outcome.report.video is not None
     assert (outcome.report.video.frames, outcome.report.video.seconds) == (5, pytest.approx(0.2))
     assert len(outcome.report.checksum or "") == 64
-    assert double.said[2:] == [
+    assert double.said[3:] == [
         "video.mp4 holds 5 of 6 frames: a writer was killed before its last",
         "no avatar was in the picture in any frame",
     ]
@@ -325,4 +334,4 @@ def test_a_whole_video_is_worth_no_word(runs: Callable[..., Runs], tmp_path: Pat
 
     double = runs(recorded)
     assert go(double, tmp_path / "run", Plan(baseline_frames=0)).report.sources["video"] == MEASURED
-    assert double.said[2:] == []
+    assert double.said[3:] == []

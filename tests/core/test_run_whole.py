@@ -21,6 +21,7 @@ from trilane.pipeline.run_log import UnitError
 from trilane.scheduler.causes import Outcome, OutcomeKind
 from trilane.scheduler.events import Settings
 from trilane.scheduler.stats import energy_score
+from trilane.scheduler.unit_life import STOPPING
 from trilane.scheduler.virtual import VirtualDriver
 from trilane.testing.small_pipeline import pipeline
 from trilane.transport.messages import Done
@@ -52,7 +53,7 @@ class World:
         self.driver = driver
         cpu = CpuTimes({"left": 2, "right": 2})
         for number in range(4):
-            cpu.add("right", "mid", Done(number, 0, 0, 0, 0, 0, 0, 3 * MS, 0, {}), 0)
+            cpu.add("right", "mid", Done(number, 0, 0, 0, 0, 0, 0, 0, 3 * MS, 0, {}), 0)
         metrics = {"mid": Counter({"visible": 12.0}), "none": Counter({"x": 5.0})}
         return SimpleNamespace(
             cpu=cpu, jobs=driver.jobs, metrics=metrics, finish=lambda: self.steps.append("finish"), driver=driver
@@ -251,8 +252,7 @@ def test_nothing_is_measured_after_a_run_that_failed(
         if spoils == "failure":
             world.log.fail("a stage failed")
         else:
-            core.units["left"].account = None
-            monkeypatch.setattr(type(core.units["left"]), "is_ready", property(lambda unit: unit.name != "left"))
+            core.units["left"].life = STOPPING
         return outcome
 
     monkeypatch.setattr(run, "run_loop", looped)

@@ -223,13 +223,17 @@ SCENES: dict[str, tuple[int, str, list[dict[str, Any]]]] = {
     "leave-and-return": (450, "builtin:static", [{**GO, "position": [1.6, 0.0, -0.6], "heading_deg": 90.0}]),
 }  # fmt: skip
 
+#: Their size is chosen; in the others it is planned from what is on the screen.
+CHOSEN = ("closeup", "default", "far", "pair")
+
 
 def test_the_scenes_that_come_along_are_what_they_are() -> None:
     assert scene_names() == sorted(SCENES)
     for name, (frames, camera, avatars) in SCENES.items():
         output = {"width": 480, "height": 640} if name == "portrait" else {"width": 640, "height": 480}
+        size = "256" if name in CHOSEN else "auto"
         assert re.match(r"# [A-Z].*\.\n", find_scene(name).read_text())
         assert tomllib.loads(find_scene(name).read_text()) == {
-            "name": name, "fps": 30, "frames": frames, "size": "256", "background": "room",
+            "name": name, "fps": 30, "frames": frames, "size": size, "background": "room",
             "output": output, "camera": {"source": camera}, "avatars": avatars,
         }  # fmt: skip

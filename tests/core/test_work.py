@@ -79,7 +79,7 @@ def test_who_is_off_the_screen_is_neither_skinned_nor_drawn(
 ) -> None:
     """Behind the camera; that the body moves changes nothing, and to forget makes no frame full in which nobody is."""
     stage, (header, _) = bound_pose(tiny_bundle, tmp_path, avatars=(AvatarSpec(position=(0.0, 0.0, 40.0)),))
-    monkeypatch.setattr(type(stage._actors[0].bounds), "rect", lambda *_: never())
+    monkeypatch.setattr(type(stage._actors[0].body.bounds), "rect", lambda *_: never())
     for frame in (0, 1, 30):
         assert stage.run(frame, None, 0) == Skip(visible=0.0)
         assert (int(header["work"]), int(header["picture"])) == (Work.NONE, -1)

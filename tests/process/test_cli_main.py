@@ -72,14 +72,22 @@ def test_version(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[
     assert capsys.readouterr().out == f"trilane {__version__}\n"
 
 
-@pytest.mark.parametrize("arguments", [["fly"], ["run", "--fly"], ["run", "--policy", "fly"], ["run", "--frames", "x"]])
+WRONG_USAGE = {
+    ("fly",): "Error: No such command 'fly'.",
+    ("run", "--fly"): "Error: No such option: --fly",
+    ("run", "--policy", "fly"): "error: --policy: found 'fly', expected one of pipelined, sequential, latest, deadline",
+    ("run", "--frames", "x"): "error: --frames: found 'x', expected a valid integer",
+}
+
+
+@pytest.mark.parametrize("arguments", WRONG_USAGE, ids=" ".join)
 def test_wrong_usage_is_2_and_said_on_stderr(
-    arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    arguments: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run_here(monkeypatch, *arguments) == 2
     out, err = capsys.readouterr()
     assert out == ""
-    assert "Error: " in err
+    assert WRONG_USAGE[arguments] in err
 
 
 def test_debug_shows_the_traceback_wherever_it_stands() -> None:

@@ -1,0 +1,99 @@
+"""The units of the profile `host` on cores, in virtual time. Rule: they are placed as a run's are, by modelled times.
+
+The scheduler in virtual time knows units that have cores of their own and units that work in turns on one core. So
+these placements are the ones to choose from: no unit floats, and none with several cores shares one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from trilane.hw_profiles.application import Plan, stage_times_ms
+from trilane.hw_profiles.host import rule_placement
+from trilane.hw_profiles.host_profile import network_threads
+from trilane.hw_profiles.performance_profiles import Corners
+from trilane.hw_profiles.placement_facts import NS_PER_MS, predictions, unit_rows
+from trilane.hw_profiles.schema import Profile, Quantity, Unit
+from trilane.scheduler.placement import (
+    Core,
+    Placement,
+    Ranked,
+    Rules,
+    Times,
+    Work,
+    chosen,
+    frame_ns,
+    ranked,
+    shared_cores,
+)
+from trilane.units import BEFORE_INFER, UNITS, UnitName
+
+NETWORK: UnitName = "dsp"
+SEQUENTIAL = "sequential"
+PEAKS = ("peak_int8_tmac_s", "peak_fp16_tmac_s", "peak_fp32_tmac_s")
+
+
+class Placed(NamedTuple):
+    """`best`: the placement that was taken. `rule`: that for any run. `found`: all, the least frame time first."""
+
+    best: Ranked
+    rule: Ranked
+    found: Sequence[Ranked]
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """`placement` of a prediction."""
+        return {"units": unit_rows(self.best.placement), **predictions(self.best, self.rule, self.found)}
+
+
+def place_units(profile: Profile, plan: Plan, corners: Corners, cores: Sequence[Core]) -> Placed:
+    """Place the units of `profile` for `plan`, at these `corners`, on `cores`, by what the model says they need."""
+    times = _times(profile, plan, corners, len(cores))
+    rules = Rules(BEFORE_INFER[0][1], plan.variant.policy == SEQUENTIAL)
+    where = rule_placement(tuple(core.number for core in cores))
+    found = [each for each in ranked(cores, times, rules) if _can_be_simulated(each.placement)]
+    rule = Ranked(where, frame_ns(where, cores, times, rules))
+    return Placed(chosen(found, rule), rule, found)
+
+
+def on_cores(profile: Profile, placement: Placement) -> Profile:
+    """`profile` with its units placed so; the network's has the rates of its threads."""
+    units = {}
+    for name, unit in profile.units.items():
+        place = placement[name]
+        core = f"core {place.cores[0]}" if len(place.cores) == 1 else ""
+        placed = _with_threads(unit, place.threads) if name == NETWORK else unit
+        units[name] = placed.model_copy(update={"core": core})
+    return profile.model_copy(update={"units": units})
+
+
+def _can_be_simulated(placement: Placement) -> bool:
+    shared = shared_cores(placement)
+    return all(len(place.cores) == place.threads for place in placement.values()) and not any(
+        shared.intersection(place.cores) for place in placement.values() if place.threads > 1
+    )
+
+
+def _times(profile: Profile, plan: Plan, corners: Corners, cores: int) -> Times:
+    """The model's times of a frame. The network's unit may have as many threads as there are cores."""
+    rule = rule_placement(tuple(range(cores)))
+    counts = {unit: {1, rule[unit].threads} for unit in UNITS}
+    counts[NETWORK] |= set(range(1, cores + 1))
+    times: dict[str, dict[int, Work]] = {unit: {} for unit in UNITS}
+    for unit, threads in ((unit, each) for unit, of in counts.items() for each in sorted(of)):
+        network = _with_threads(profile.units[NETWORK], threads if unit == NETWORK else 1)
+        with_threads = profile.model_copy(update={"units": {**profile.units, NETWORK: network}})
+        stages = stage_times_ms(with_threads, plan, corners)
+        own = [ms / plan.variant.batch for (_, other), ms in stages.items() if other == unit]
+        ns = round(sum(own) * NS_PER_MS)
+        times[unit][threads] = Work(ns, ns, len(own))
+    return times
+
+
+def _with_threads(unit: Unit, threads: int) -> Unit:
+    """The network's unit of the profile with the peak rates of so many threads, each of which has a core's."""
+    scale = threads / network_threads()
+    rates: dict[str, Quantity] = {name: getattr(unit, name) for name in PEAKS}
+    scaled = {name: rate.model_copy(update={"value": rate.or_else(0.0) * scale}) for name, rate in rates.items()}
+    return unit.model_copy(update=scaled)

@@ -1,0 +1,88 @@
+"""Where a run's units are placed: measured once and kept, or as asked; with real units around a tiny network."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from trilane.hw_profiles.host import rule_placement, usable_cores
+from trilane.pipeline.unit_starter import UnitStarter
+from trilane.scheduler.placement import Times
+from trilane.stages import placing
+from trilane.stages.configure import Checked, Request, configure
+from trilane.stages.factories import PRELOAD
+
+SEVERAL = pytest.mark.skipif(len(usable_cores()) < 2, reason="there is one core")
+
+
+@pytest.fixture
+def checked(drawable_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Checked:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    asked = Request(avatar=str(drawable_bundle), size="64x64", frames=4, runtime="ort", skinning="cpu")
+    return configure(asked, tmp_path)
+
+
+@SEVERAL
+def test_a_run_is_rehearsed_once_and_what_was_found_is_kept(
+    checked: Checked, monkeypatch: pytest.MonkeyPatch, nothing_left: Path
+) -> None:
+    monkeypatch.setattr(placing, "LEAST_FRAMES", 4)
+    with UnitStarter(PRELOAD) as starter:
+        first = placing.placed(checked, "pipelined", starter).placement
+        monkeypatch.setattr(placing, "measured_times", None)  # whoever calls it fails
+        again = placing.placed(checked, "pipelined", starter)
+    assert first is not None
+    assert first["how"] == "measured"
+    assert first == again.placement
+    assert 0 < first["predicted_ms"] <= first["rule_ms"]
+    assert {unit: {"cores": list(s.cores), "threads": s.threads} for unit, s in again.config.units.items()} == first[
+        "units"
+    ]
+    rows = {(row["unit"], row["threads"]): row for row in first["times"]}
+    assert {unit for unit, _ in rows} == {"cpu", "gpu", "dsp"}
+    assert {threads for unit, threads in rows if unit == "dsp"} >= {1, 2}
+    assert all(0 < row["core_ms"] <= row["ms"] for row in rows.values())
+    assert "by times of" in again.notes[-1]
+    assert not list(nothing_left.glob("trilane-rehearsal-*"))
+
+
+def test_a_short_run_and_one_at_a_chips_pace_are_not_rehearsed(
+    checked: Checked, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def never(*_: object) -> Times:
+        raise AssertionError("measured")
+
+    monkeypatch.setattr(placing, "measured_times", never)
+    rule = rule_placement(usable_cores())
+    with UnitStarter() as starter:
+        short = placing.placed(checked, "pipelined", starter)
+        monkeypatch.setattr(placing, "LEAST_FRAMES", 1)
+        held = placing.placed(checked.changed(pace_ns={"infer": 1}), "pipelined", starter)
+    for run in (short, held):
+        assert run.placement is not None
+        assert run.placement["how"] == "rule"
+        assert {unit: settings.cores for unit, settings in run.config.units.items()} == {
+            unit: place.cores for unit, place in rule.items()
+        }
+
+
+def test_units_have_the_cores_that_were_asked_for(drawable_bundle: Path, tmp_path: Path) -> None:
+    cores = sorted(os.sched_getaffinity(0))
+    wanted = {"cpu": [cores[-1]], "gpu": [cores[0]], "dsp": sorted({cores[0], cores[-1]})}
+    options = [part for unit, own in wanted.items() for part in ("--cores", f"{unit}={','.join(map(str, own))}")]
+    command = [sys.executable, "-m", "trilane.apps.cli.main", "run", "--avatar", str(drawable_bundle), *options]
+    command += ["--size", "64x64", "--frames", "3", "--baseline", "0", "--runtime", "ort", "--json"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert report["placement"]["how"] == "asked"
+    assert report["notes"][-1].endswith("(as asked)")
+    assert {unit: row["cores"] for unit, row in report["units"].items()} == wanted
+    assert {unit: row["threads"] for unit, row in report["units"].items()} == {u: len(own) for u, own in wanted.items()}
+    assert {unit: row["spin"] for unit, row in report["units"].items()} == dict.fromkeys(wanted, False)
+    assert 0 < report["core_efficiency"] <= 1.01
