@@ -6,7 +6,6 @@ import json
 from collections.abc import Callable
 from typing import Any
 
-import click
 import pytest
 import typer
 
@@ -70,7 +69,7 @@ def test_the_group_knows_its_benches_and_nothing_else(command: Command) -> None:
     out, err = command("bench", code=2)
     assert "Measure this machine; results carry its facts." in out + err
     group: Any = typer.main.get_command(bench.app)
-    context = click.Context(group)
+    context = typer.Context(group)
     assert group.list_commands(context) == list(BENCHES)
     assert group.get_command(context, "nothing") is None
     assert group.get_command(context, "crop").help == BENCHES["crop"][1]

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
-import click
 import pytest
 import typer
 
@@ -83,7 +82,7 @@ def test_a_command_that_is_none_and_an_option_that_is_none(command: Command) -> 
     out, err = command("doctor", "--fly", code=2)
     assert (out, "Usage: trilane doctor" in err, "No such option: --fly" in err) == ("", True, True)
     group: Any = typer.main.get_command(cli.app)
-    context = click.Context(group)
+    context = typer.Context(group)
     assert group.list_commands(context) == list(cli.COMMANDS)
     assert group.get_command(context, "fly") is None
     for name, (_, line) in cli.COMMANDS.items():
