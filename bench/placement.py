@@ -24,7 +24,9 @@ from trilane.hw_profiles.placed_host import on_cores, place_units
 from trilane.hw_profiles.placement_facts import NS_PER_MS, described
 from trilane.pipeline.run_metrics import RunMetrics
 from trilane.pipeline.unit_starter import UnitStarter
-from trilane.scheduler.placement import Core, Placement, Ranked, Rules, chosen, frame_ns, ranked
+from trilane.scheduler.placement import Ranked, chosen, ranked
+from trilane.scheduler.placement_model import Rules, frame_ns
+from trilane.scheduler.places import Core, Placement
 from trilane.scheduler.stats import median_interval
 from trilane.stages.avatar_assets import network_of
 from trilane.stages.avatar_pipeline import run_avatar

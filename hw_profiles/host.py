@@ -17,7 +17,7 @@ import psutil
 
 from trilane.errors import BadInputError
 from trilane.pipeline.description import UnitSettings
-from trilane.scheduler.placement import FULL, Core, Place, Placement, has_own_cores
+from trilane.scheduler.places import FULL, Core, Place, Placement, has_own_cores
 from trilane.units import UNITS
 
 CGROUP = Path("/sys/fs/cgroup")

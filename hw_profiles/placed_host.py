@@ -15,18 +15,9 @@ from trilane.hw_profiles.host_profile import network_threads
 from trilane.hw_profiles.performance_profiles import Corners
 from trilane.hw_profiles.placement_facts import NS_PER_MS, predictions, unit_rows
 from trilane.hw_profiles.schema import Profile, Quantity, Unit
-from trilane.scheduler.placement import (
-    Core,
-    Placement,
-    Ranked,
-    Rules,
-    Times,
-    Work,
-    chosen,
-    frame_ns,
-    ranked,
-    shared_cores,
-)
+from trilane.scheduler.placement import Ranked, chosen, ranked
+from trilane.scheduler.placement_model import Rules, frame_ns
+from trilane.scheduler.places import Core, Placement, Times, Work, shared_cores
 from trilane.units import BEFORE_INFER, UNITS, UnitName
 
 NETWORK: UnitName = "dsp"

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from trilane.scheduler.placement import Place, Placement, Ranked
+from trilane.scheduler.placement import Ranked
+from trilane.scheduler.places import Place, Placement
 
 SHOWN = 8  # placements, beside the one that was taken
 NS_PER_MS = 1e6

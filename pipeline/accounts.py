@@ -15,7 +15,7 @@ from trilane.pipeline.description import Pipeline
 from trilane.pipeline.run_log import RunLog
 from trilane.scheduler.accounts import compared
 from trilane.scheduler.ledger import JobRecord
-from trilane.scheduler.placement import Place, busiest_core_ns
+from trilane.scheduler.places import Place, busiest_core_ns
 from trilane.scheduler.recording import Recording
 from trilane.scheduler.stats import summary_ms
 

@@ -20,7 +20,7 @@ from trilane.pipeline.shared_assets import Assets, share_assets
 from trilane.pipeline.signals import Interrupts
 from trilane.pipeline.unit_processes import UnitProcesses
 from trilane.pipeline.unit_starter import UnitStarter
-from trilane.scheduler.placement import Work
+from trilane.scheduler.places import Work
 from trilane.transport.messages import Done, RunJob
 
 REPEATS = 3  # of a stage for each frame, after one that warms up; the shortest counts

@@ -22,7 +22,9 @@ from trilane.hw_profiles.host import host_cores, rule_placement, settings_of, us
 from trilane.hw_profiles.placement_facts import NS_PER_MS, described, placement_of, predictions, unit_rows
 from trilane.pipeline.rehearsal import rehearse
 from trilane.pipeline.unit_starter import UnitStarter
-from trilane.scheduler.placement import Core, Place, Placement, Ranked, Rules, Times, Work, chosen, frame_ns, ranked
+from trilane.scheduler.placement import Ranked, chosen, ranked
+from trilane.scheduler.placement_model import Rules, frame_ns
+from trilane.scheduler.places import Core, Place, Placement, Times, Work
 from trilane.stages.avatar_assets import network_of
 from trilane.stages.avatar_pipeline import avatar_pipeline
 from trilane.stages.config import RunConfig

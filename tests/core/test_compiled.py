@@ -92,5 +92,14 @@ def test_the_library_is_named_after_the_sources_that_there_are() -> None:
     assert library(PACKAGE) == f"trilane_core_{hashlib.sha256(joined).hexdigest()[:16]}"
     folder = PACKAGE / "scheduler"
     compiled = {name.removeprefix("scheduler/") for name in MODULES if name.startswith("scheduler/")}
-    interpreted = {"__init__.py", "accounts.py", "placement.py", "release.py", "uncertainty.py"}
+    interpreted = {
+        "__init__.py",
+        "accounts.py",
+        "placement.py",
+        "placement_list.py",
+        "placement_model.py",
+        "places.py",
+        "release.py",
+        "uncertainty.py",
+    }
     assert {path.name for path in folder.glob("*.py")} - compiled == interpreted

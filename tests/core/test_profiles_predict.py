@@ -28,7 +28,7 @@ from trilane.hw_profiles.reference_networks import NetworkSpec, reference_networ
 from trilane.hw_profiles.schema import Profile
 from trilane.hw_profiles.thermal_state import ThermalState
 from trilane.hw_profiles.throttling import GOVERNORS
-from trilane.scheduler.placement import Core
+from trilane.scheduler.places import Core
 from trilane.units import UNITS, UnitName
 
 NETWORK = reference_network(NetworkSpec("resnet18", "batch", 512, 512, 16))

@@ -13,21 +13,11 @@ from hypothesis import strategies as st
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles.host import asked_cores, host_cores, rule_placement, settings_of
-from trilane.scheduler import placement
-from trilane.scheduler.placement import (
-    Core,
-    Place,
-    Placement,
-    Ranked,
-    Rules,
-    Times,
-    Work,
-    busiest_core_ns,
-    chosen,
-    frame_ns,
-    placements,
-    ranked,
-)
+from trilane.scheduler import placement_model, places
+from trilane.scheduler.placement import Ranked, chosen, ranked
+from trilane.scheduler.placement_list import placements
+from trilane.scheduler.placement_model import Rules, frame_ns
+from trilane.scheduler.places import Core, Place, Placement, Times, Work, busiest_core_ns
 
 MS = 1_000_000
 FIRST = Rules("cpu")
@@ -38,8 +28,8 @@ ALONE, TWO = Place((0,), 1), Place((1,), 1)
 def without_costs(monkeypatch: pytest.MonkeyPatch) -> None:
     """By hand, nothing but the work counts; one test is about the costs."""
     for name in ("SCHEDULER_NS", "CHANGE_NS", "MOVE_NS"):
-        monkeypatch.setattr(placement, name, 0)
-    monkeypatch.setattr(placement, "ROOM_USED", 1.0)
+        monkeypatch.setattr(placement_model, name, 0)
+    monkeypatch.setattr(placement_model, "ROOM_USED", 1.0)
 
 
 def equal(count: int) -> list[Core]:
@@ -176,18 +166,18 @@ def test_a_device_needs_its_core_only_to_be_told() -> None:
 
 def test_what_a_change_of_threads_a_move_and_the_scheduler_take(monkeypatch: pytest.MonkeyPatch) -> None:
     of = times(5, 10, 20)  # two, two and one jobs
-    monkeypatch.setattr(placement, "CHANGE_NS", MS)
+    monkeypatch.setattr(placement_model, "CHANGE_NS", MS)
     assert [ms(on(0, 0, 1), of, equal(2)), ms(on(0, 1, 0), of, equal(2))] == [20, 28]
-    monkeypatch.setattr(placement, "MOVE_NS", 2 * MS)
+    monkeypatch.setattr(placement_model, "MOVE_NS", 2 * MS)
     assert ms(on(0, 0, (0, 1)), of, equal(2)) == 20 + 1 + 4 * 2  # four jobs of the others may move it
-    monkeypatch.setattr(placement, "SCHEDULER_NS", 4 * MS)
+    monkeypatch.setattr(placement_model, "SCHEDULER_NS", 4 * MS)
     assert ms(on(0, 0, 1), of, equal(2)) == 5 + 10 + 4 + 5 * 4
     assert ms(on(0, 0, 1), of, equal(2), Rules("dsp")) == 20 + 5 * 4
     assert ms(on(0, 1, 2), of, equal(3), Rules("cpu", sequential=True)) == 35 + 5 * 4
 
 
 def test_of_what_cores_can_do_for_units_that_float_a_tenth_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(placement, "ROOM_USED", 0.9)
+    monkeypatch.setattr(placement_model, "ROOM_USED", 0.9)
     of = times(9, 9, 9)
     assert ms(on((0, 1), 0, 1), of, equal(2)) == 15  # 27 / 2 / 0.9
     assert ms(on(0, 0, 1), of, equal(2)) == 18
@@ -198,7 +188,7 @@ def test_ties_go_to_fewer_shared_cores_then_to_lower_numbers() -> None:
     found = ranked(equal(3), times(5, 5, 5), FIRST)
     assert found[0].placement == on(0, 1, 2)
     same = [each.placement for each in found if each.frame_ns == found[0].frame_ns]
-    assert [len(placement.shared_cores(each)) for each in same] == sorted(len(placement.shared_cores(e)) for e in same)
+    assert [len(places.shared_cores(each)) for each in same] == sorted(len(places.shared_cores(e)) for e in same)
 
 
 def test_what_is_hardly_better_than_the_rule_is_not_taken() -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from trilane.hw_profiles.host import rule_placement, usable_cores
 from trilane.pipeline.unit_starter import UnitStarter
-from trilane.scheduler.placement import Times
+from trilane.scheduler.places import Times
 from trilane.stages import placing
 from trilane.stages.configure import Checked, Request, configure
 from trilane.stages.factories import PRELOAD
