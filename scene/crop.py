@@ -103,8 +103,8 @@ def grow_on_grid(rect: Rect, output: Shape, size: tuple[float, float]) -> Rect:
 def _grow_from_pixel(low: float, high: float, length: float, side: int) -> tuple[float, float]:
     first, last = round((low + 1.0) / 2.0 * side), round((high + 1.0) / 2.0 * side)
     start = math.floor((first + last - length) / 2.0)
-    if length < side:
-        start = min(max(start, 0), math.floor(side - length))
+    if length < side + ROUNDING_PX:
+        start = min(max(start, 0), math.floor(side - length + ROUNDING_PX))
     begin = min(max(float(start), last - length), first)
     return 2.0 * begin / side - 1.0, 2.0 * (begin + length) / side - 1.0
 
