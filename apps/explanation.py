@@ -6,6 +6,7 @@ or computed.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -62,6 +63,7 @@ def explain(checked: Checked, profile: str, performance_profile: str, most_measu
         "avatars": [_avatar(checked, number) for number in range(len(scene.avatars))],
         "phases": [_phase(group, errors, costs) for group, errors in zip(groups, rows, strict=True)],
         "totals": _totals(frames, costs),
+        "placement": costs.placement(_usual_shape(frames)),
         "notes": list(checked.notes),
         "sources": {"bound_px": BOUND, "measured_px": MEASURED, "pixels, gmac": "counted", "ms": COMPUTED},
     }
@@ -135,6 +137,12 @@ def _saved(cost: FrameCost, fixed: FrameCost) -> dict[str, float]:
         "gmac": fixed.gmac - cost.gmac,
         "work_ms": fixed.work_ms - cost.work_ms,
     }
+
+
+def _usual_shape(frames: Sequence[PlannedFrame]) -> Shape | None:
+    """The shape of most full frames; None without any."""
+    shapes = Counter(planned.plan.shape for planned in frames if planned.plan.work is Work.FULL)
+    return shapes.most_common(1)[0][0] if shapes else None
 
 
 def _totals(frames: Sequence[PlannedFrame], costs: CostModel) -> dict[str, Any]:

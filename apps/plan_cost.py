@@ -11,9 +11,12 @@ from typing import Any
 from trilane.avatars.integer_network import NetworkFile
 from trilane.avatars.network_reshape import reshaped
 from trilane.hw_profiles.application import Plan, Variant, stage_times_ms, steady
-from trilane.hw_profiles.load import load_runnable
+from trilane.hw_profiles.host import host_cores, usable_cores
+from trilane.hw_profiles.load import HOST, load_runnable
 from trilane.hw_profiles.network_work import Network, count_work
 from trilane.hw_profiles.performance_profiles import corners_of
+from trilane.hw_profiles.placed_host import place_units
+from trilane.hw_profiles.placement_facts import NS_PER_MS, described
 from trilane.shapes import Shape
 
 PIPELINED = Variant("pipelined", "double")
@@ -54,6 +57,21 @@ class CostModel:
             return FrameCost(0, 0.0, sum(kept), max(kept))
         steady_ms = steady(self._chip, plan, self._corners, quick=True).frame_ms
         return FrameCost(shape[0] * shape[1], plan.network.work.macs / 1e9, sum(times.values()), steady_ms)
+
+    def placement(self, shape: Shape | None) -> dict[str, Any]:
+        """Where the units are best placed for frames of `shape`, and why: by the model, as `trilane predict` has it."""
+        if self._chip.name != HOST:
+            return {
+                "units": None,
+                "predicted_ms": None,
+                "why": f"each unit of {self._chip.name} is hardware of its own",
+            }
+        plan = Plan(self._described(shape or self._network.shape[1:3]), "dsp", PIPELINED)
+        placed = place_units(self._chip, plan, self._corners, host_cores(usable_cores()))
+        rule = f"{described(placed.rule.placement)}, {placed.rule.frame_ns / NS_PER_MS:.1f} ms"
+        why = f"{described(placed.best.placement)}: the least predicted frame time; by the rule for any run, {rule}"
+        chosen = {key: placed.facts[key] for key in ("units", "predicted_ms")}
+        return {**chosen, "why": f"{why}. A run measures and decides anew"}
 
     def _described(self, shape: Shape) -> Network:
         work = count_work(reshaped(self._network, *shape).model)

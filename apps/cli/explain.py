@@ -100,6 +100,7 @@ def _show(document: dict[str, Any]) -> None:
         console.print(f"{left} more phases: --json has all of them")
     for why, first in {phase["why"]: phase["first_frame"] for phase in reversed(document["phases"])}.items():
         console.print(f"frame {first} and others like it: {why}", soft_wrap=True)
+    console.print(f"placement: {document['placement']['why']}", soft_wrap=True, markup=False)
     for line in _totals(document["totals"], config):
         console.print(line, soft_wrap=True)
 

@@ -25,6 +25,7 @@ from trilane.hw_profiles.application import Plan, stage_times_ms, steady
 from trilane.hw_profiles.load import load_profile
 from trilane.hw_profiles.network_work import Network, count_work
 from trilane.hw_profiles.performance_profiles import corners_of
+from trilane.hw_profiles.predict import predict
 from trilane.scene.crop import Rect
 from trilane.scene.planner import MOST_DENSITY
 from trilane.scene.work import Work
@@ -55,7 +56,8 @@ def checked(tiny_bundle: Path, tmp_path: Path) -> Checked:
 
 
 def explained(tmp_path: Path, *options: str) -> Any:
-    result = CliRunner().invoke(app, [str(tmp_path / "small.toml"), "--profile", CHIP, *options])
+    chip = [] if "--profile" in options else ["--profile", CHIP]
+    result = CliRunner().invoke(app, [str(tmp_path / "small.toml"), *chip, *options])
     assert result.exit_code == 0, result.output
     return result
 
@@ -156,6 +158,34 @@ def test_costs_are_those_of_the_profile(tiny_bundle: Path) -> None:
     assert (nothing.pixels, nothing.gmac) == (0, 0.0)
     assert nothing.work_ms == pytest.approx(times["pose"] + times["composite"] + times["present"])
     assert set(ALWAYS) == {"pose", "composite", "present"}
+
+
+def test_a_chips_units_are_hardware_of_their_own(document: Any) -> None:
+    assert document["placement"] == {
+        "units": None,
+        "predicted_ms": None,
+        "why": "each unit of snapdragon-888 is hardware of its own",
+    }
+
+
+def test_on_this_machine_units_are_placed_as_in_a_prediction(
+    checked: Checked, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """For the shape of most frames, on two cores."""
+    for module in ("host_profile", "predict"):
+        monkeypatch.setattr(f"trilane.hw_profiles.{module}.usable_cores", lambda: (0, 1))
+    monkeypatch.setattr("trilane.apps.plan_cost.usable_cores", lambda: (0, 1))
+    document = json.loads(explained(tmp_path, "--json", "--profile", "host").stdout)
+    frames = {tuple(row["tensor"]): 0 for row in document["phases"]}
+    for row in document["phases"]:
+        frames[tuple(row["tensor"])] += row["frames"]
+    shape = max(frames, key=lambda one: frames[one])
+    network = load_bundle(checked.config.avatar_dirs[0]).read_network()
+    described = Network({}, *shape, network.channels, "packed", count_work(reshaped(network, *shape).model))
+    expected = predict(load_profile("host"), Plan(described, "dsp", PIPELINED), CAP)["placement"]
+    assert document["placement"]["units"] == expected["units"]
+    assert document["placement"]["predicted_ms"] == expected["predicted_ms"]
+    assert f"{expected['rule_ms']:.1f} ms. A run measures and decides anew" in document["placement"]["why"]
 
 
 def test_measured_errors_are_those_of_the_drawn_vertices(checked: Checked) -> None:
