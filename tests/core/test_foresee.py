@@ -1,0 +1,101 @@
+"""What is foreseen of a scene before the run: its frames, the shapes that they ask for, and what a network needs."""
+
+from __future__ import annotations
+
+from collections import Counter
+from math import prod
+from pathlib import Path
+
+import pytest
+
+from trilane.avatars.bundle import load_bundle
+from trilane.avatars.network_reshape import reshaped
+from trilane.pipeline.description import UnitSettings
+from trilane.scene.planner import TensorBudget, ideal_shape
+from trilane.scene.schema import AvatarSpec, OutputSpec, Scene
+from trilane.scene.shape_set import Demand, ShapeSet, choose_shapes
+from trilane.scene.staging import Staged, stage_scene
+from trilane.shapes import shape_buckets
+from trilane.stages.avatar_assets import AvatarData, load_avatar
+from trilane.stages.config import RunConfig
+from trilane.stages.configure import Request, configure
+from trilane.stages.foresee import COPIES, MB, Foreseen, bytes_per_pixel, foresee, foreseen_rects
+
+OWN = TensorBudget(own=128 * 128, most=512 * 512)
+
+
+@pytest.fixture
+def avatar(tiny_bundle: Path) -> AvatarData:
+    return load_avatar(load_bundle(tiny_bundle))
+
+
+def staged(scene: Scene, avatar: AvatarData) -> Staged:
+    return stage_scene(scene, [avatar.shaped] * len(scene.avatars), Path.cwd())
+
+
+def test_the_shapes_are_those_of_frames_spread_over_the_scene(avatar: AvatarData) -> None:
+    """96 of 500 frames; each one's ideal shape by itself, and the choice among them."""
+    scene = Scene(size="auto", frames=500, output=OutputSpec(width=320, height=240))
+    place = staged(scene, avatar)
+    found = foresee(scene, place, [avatar.shaped], avatar.network, OWN)
+    assert found.frames == tuple(k * 500 // 96 for k in range(96))
+    seen = [rects for rects in foreseen_rects(scene, place, [avatar.shaped], found.frames) if rects]
+    assert found.seen == len(seen) > 90
+    demands = Counter(Demand(ideal_shape(rects, (240, 320), OWN), OWN.own) for rects in seen)
+    assert found.shapes == choose_shapes(demands.elements(), bytes_per_pixel(avatar.network), 512 * MB)
+
+
+@pytest.mark.parametrize(("frames", "avatars", "looked_at"), [(500, 1, 96), (40, 1, 40), (500, 3, 32), (500, 8, 24)])
+def test_so_many_frames_are_looked_at(avatar: AvatarData, frames: int, avatars: int, looked_at: int) -> None:
+    """96 over all avatars, but at least 24 of each, and no more than there are."""
+    specs = tuple(AvatarSpec(position=(0.5 * k - 2, 0, 0), motion="builtin:idle") for k in range(avatars))
+    scene = Scene(size="auto", frames=frames, avatars=specs)
+    found = foresee(scene, staged(scene, avatar), [avatar.shaped] * avatars, avatar.network, OWN)
+    assert len(found.frames) == looked_at
+
+
+def test_with_nobody_in_view_one_least_shape_is_made_ready(avatar: AvatarData) -> None:
+    scene = Scene(size="auto", frames=50, avatars=(AvatarSpec(position=(0.0, 0.0, 40.0)),))
+    found = foresee(scene, staged(scene, avatar), [avatar.shaped], avatar.network, OWN)
+    assert (found.shapes.shapes, found.seen) == (((32, 32),), 0)
+
+
+def test_a_networks_memory_is_all_its_bytes_twice(avatar: AvatarData) -> None:
+    """By the shapes that ONNX infers for the file's own tensor, and again for a network without them."""
+    network = avatar.network
+    _, height, width, _ = network.shape
+    values = [value.type.tensor_type for value in reshaped(network, height + 32, width).model.graph.value_info]
+    sizes = [prod(dim.dim_value for dim in value.shape.dim) for value in values if value.elem_type in (2, 3)]
+    expected = COPIES * sum(sizes) / ((height + 32) * width)
+    assert COPIES == 2 and sizes
+    del network.model.graph.value_info[:]
+    assert bytes_per_pixel(network) == pytest.approx(expected)
+    assert bytes_per_pixel(reshaped(network, height + 32, width)) == pytest.approx(expected)
+
+
+def test_the_note_says_shapes_frames_and_what_is_less_dense() -> None:
+    shapes = ShapeSet(((64, 96), (128, 32)), 1, 0)
+    text = "tensor: planned in shapes 64x96, 128x32 (somebody is seen in 2 of 3 frames looked at)"
+    assert Foreseen(shapes, (0, 5, 9), 2).note == text
+    less = Foreseen(ShapeSet(shapes.shapes, 1, 4), (0, 5, 9), 2).note
+    assert less == f"{text}; 4 of them have no shape of their own within memory_mb and are less dense"
+
+
+def test_a_configuration_has_the_shapes_the_note_and_the_networks_pixels(tiny_bundle: Path, tmp_path: Path) -> None:
+    asked = Request("default", avatar=str(tiny_bundle), frames=30, runtime="ort", size="auto")
+    planned = configure(asked, tmp_path, lambda: {"hardware": False})
+    assert planned.config.shapes and list(planned.config.shapes) == planned.config.buckets
+    assert planned.config.own_pixels == 64 * 64
+    assert planned.config.tensor_budget == TensorBudget(64 * 64, 512 * 512)
+    names = ", ".join(f"{height}x{width}" for height, width in planned.config.shapes)
+    assert f"tensor: planned in shapes {names} (somebody is seen in 30 of 30 frames looked at)" in planned.notes
+    fixed = configure(Request("default", avatar=str(tiny_bundle), runtime="ort"), tmp_path, lambda: None)
+    assert (fixed.config.shapes, fixed.config.buckets) == ((), shape_buckets("256"))
+    assert not any(note.startswith("tensor:") for note in fixed.notes)
+
+
+@pytest.mark.parametrize(("plan", "budget"), [("planned", 0.75), ("fixed", 0.0)])
+def test_a_fixed_plan_has_no_error_budget(plan: str, budget: float, tmp_path: Path) -> None:
+    units = {unit: UnitSettings(cores=(0,), threads=1) for unit in ("cpu", "gpu", "dsp")}
+    scene = Scene.model_validate({"plan": plan, "error_budget_px": 0.75})
+    assert RunConfig(scene=scene, out_dir=tmp_path, avatar_dirs=(), units=units).budget_px == budget
