@@ -10,6 +10,7 @@ import pytest
 
 from trilane.bench.lib.handoff_variants import BARE, CHANNELS, SLOT, WRITTEN
 from trilane.body import body
+from trilane.hw_profiles.host_profile import RATES
 from trilane.hw_profiles.network_work import CLASSES, KIND_OF, LAYOUT_CHANGES, STATISTICS
 from trilane.scene import camera_placement
 from trilane.stages.machine_facts import OPTIONAL_PACKAGES
@@ -29,6 +30,22 @@ def test_every_operator_has_a_class_that_there_is() -> None:
     assert {KIND_OF[name] for name in ("Add", "Sub", "Mul", "Div")} == {"elementwise"}
     assert {KIND_OF[name] for name in STATISTICS} == {"normalisation"}
     assert LAYOUT_CHANGES == ((0, 3, 1, 2), (0, 2, 3, 1))
+
+
+def test_multiplications_in_a_cycle_follow_from_the_width_of_an_instruction() -> None:
+    """FP32: two fused multiply-adds a cycle of 16, 8, 8 and 4 numbers, as two such units have; half of that in scalar.
+
+    INT8: a dot product of bytes has four in the place of one FP32 number; AVX2 without it multiplies and adds in two.
+    """
+    assert {flag: fp32 for flag, (_, fp32) in RATES.items()} == {
+        "avx512_vnni": 2 * 16,
+        "avx_vnni": 2 * 8,
+        "avx2": 2 * 8,
+        "asimddp": 2 * 4,
+        "": 4,
+    }
+    dot_product = {"avx512_vnni", "avx_vnni", "asimddp"}
+    assert all(int8 == fp32 * (4 if flag in dot_product else 2) for flag, (int8, fp32) in RATES.items())
 
 
 def test_a_body_may_have_three_texture_coordinates_for_each_face() -> None:
