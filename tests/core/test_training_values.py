@@ -149,7 +149,7 @@ def test_the_average_keeps_its_share():
 
 @pytest.mark.parametrize("frozen", [False, True])
 def test_frozen_norms_keep_their_statistics(frozen):
-    made = avatar()
+    made = avatar().eval()
     training_loop._set_mode(made, frozen)
     norms = [module for module in made.modules() if isinstance(module, torch.nn.BatchNorm2d)]
     assert norms and made.network.colour[0].training

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import msgpack
 import numpy as np
 import psutil
 import pytest
@@ -71,6 +72,16 @@ def test_the_times_of_a_job_that_ended_are_told_in_this_order() -> None:
 def test_the_numbers_that_both_sides_of_a_message_agree_on() -> None:
     assert (messages.MAX_BYTES, messages.MAX_TEXT) == (4096, 2000)
     assert (messages.BUILDING, messages.MEASURING, messages.CLOSING) == (-1, -2, -3)
+
+
+@pytest.mark.parametrize("rest", [{1: 2.0}, {"ms": "2"}, {"ms": True}, {"ms": None}, [1.0], "ms"])
+def test_metrics_are_numbers_by_name(rest: Any) -> None:
+    empty = pack(messages.Done(*range(10), {}))
+    assert empty.endswith(msgpack.packb({}))
+    begin = empty[: -len(msgpack.packb({}))]
+    assert unpack(begin + msgpack.packb({"ms": 2.5, "n": 3})) == messages.Done(*range(10), {"ms": 2.5, "n": 3})
+    with pytest.raises(MessageError, match="expected dict"):
+        unpack(begin + msgpack.packb(rest))
 
 
 def test_what_is_wrong_with_bytes_is_said() -> None:
