@@ -76,11 +76,9 @@ def test_the_numbers_that_both_sides_of_a_message_agree_on() -> None:
 
 @pytest.mark.parametrize("rest", [{1: 2.0}, {"ms": "2"}, {"ms": True}, {"ms": None}, [1.0], "ms"])
 def test_metrics_are_numbers_by_name(rest: Any) -> None:
-    empty = pack(messages.Done(*range(10), {}))
-    assert empty.endswith(msgpack.packb({}))
-    begin = empty[: -len(msgpack.packb({}))]
+    begin = pack(messages.Done(*range(10), {}))  # without metrics nothing follows the integers
     assert unpack(begin + msgpack.packb({"ms": 2.5, "n": 3})) == messages.Done(*range(10), {"ms": 2.5, "n": 3})
-    with pytest.raises(MessageError, match="expected dict"):
+    with pytest.raises(MessageError, match="expected dict|not msgpack"):
         unpack(begin + msgpack.packb(rest))
 
 
