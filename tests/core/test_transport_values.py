@@ -78,7 +78,7 @@ def test_the_numbers_that_both_sides_of_a_message_agree_on() -> None:
 def test_metrics_are_numbers_by_name(rest: Any) -> None:
     begin = pack(messages.Done(*range(10), {}))  # without metrics nothing follows the integers
     assert unpack(begin + msgpack.packb({"ms": 2.5, "n": 3})) == messages.Done(*range(10), {"ms": 2.5, "n": 3})
-    with pytest.raises(MessageError, match="expected dict|not msgpack"):
+    with pytest.raises(MessageError, match=r"expected dict|not msgpack"):
         unpack(begin + msgpack.packb(rest))
 
 
