@@ -67,14 +67,11 @@ def person(gl: Any) -> Person:
 
 
 @pytest.fixture(scope="session")
-def opened_renderer() -> Any:
+def opened_renderer(gl: Any) -> Any:  # noqa: ARG001 - where no context can be made, `gl` skips the test
     """The renderer of training's samples, with a context of its own."""
     from trilane.training.sample_renderer import SampleRenderer
 
-    try:
-        return SampleRenderer(load_body(bundle_folder("default") / "body.npz").shape(), threads=2)
-    except MissingPartError as error:
-        pytest.skip(str(error))
+    return SampleRenderer(load_body(bundle_folder("default") / "body.npz").shape(), threads=2)
 
 
 @pytest.fixture
