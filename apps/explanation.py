@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from trilane.apps.plan_cost import CostModel, FrameCost
@@ -30,8 +31,17 @@ WHY = {
 }
 
 
-def explain(checked: Checked, profile: str, performance_profile: str, most_measured: int = 24) -> dict[str, Any]:
-    """The document of `trilane explain --json`.
+@dataclass(frozen=True)
+class Explanation:
+    """`document`: of `trilane explain --json`. `plan`, `first_frames`: of each phase, to be drawn."""
+
+    document: dict[str, Any]
+    plan: ScenePlan
+    first_frames: Sequence[PlannedFrame]
+
+
+def explain(checked: Checked, profile: str, performance_profile: str, most_measured: int = 24) -> Explanation:
+    """The plan of a scene that was checked.
 
     `profile`, `performance_profile`: whose times the costs are computed with.
     `most_measured`: phases whose error is measured, at one frame each.
@@ -48,7 +58,7 @@ def explain(checked: Checked, profile: str, performance_profile: str, most_measu
             rows.append([plan.measured_px(frame, avatar) if measured else None for avatar in planned.plan.seen])
         frames.append(planned)
     groups = phases(frames)
-    return {
+    document = {
         "scene": scene.name,
         "config": {
             "frames": scene.frames,
@@ -67,6 +77,7 @@ def explain(checked: Checked, profile: str, performance_profile: str, most_measu
         "notes": list(checked.notes),
         "sources": {"bound_px": BOUND, "measured_px": MEASURED, "pixels, gmac": "counted", "ms": COMPUTED},
     }
+    return Explanation(document, plan, [group[0] for group in groups])
 
 
 def _avatar(checked: Checked, number: int) -> dict[str, Any]:

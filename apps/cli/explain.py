@@ -55,6 +55,7 @@ def explain(
 ) -> None:
     """Explain the plan of a scene: what is modelled, what is left out, the error it costs and the work it saves."""
     from trilane.apps.explanation import explain as explained
+    from trilane.apps.plan_picture import draw_plan
     from trilane.stages.configure import Request, configure
     from trilane.writing import require_writable
 
@@ -62,24 +63,14 @@ def explain(
         require_writable(picture)
     with spinner("planning"):
         checked = configure(Request(scene, avatar=avatar, frames=frames, size=size), Path.cwd())
-        document = explained(checked, profile, str(performance_profile))
+        explanation = explained(checked, profile, str(performance_profile))
     if picture is not None:
-        _draw(checked, picture)
+        draw_plan(explanation.plan, explanation.first_frames, picture)
         stderr_console().print(f"picture: {picture}", soft_wrap=True, markup=False)
     if json:
-        print_json(document)
+        print_json(explanation.document)
         return
-    _show(document)
-
-
-def _draw(checked: Any, picture: Path) -> None:
-    """The first frame of each phase."""
-    from trilane.apps.plan_picture import draw_plan
-    from trilane.apps.scene_plan import ScenePlan, phases
-
-    plan = ScenePlan(checked.config, checked.assets)
-    frames = [plan.decide(frame) for frame in range(checked.config.scene.frames)]
-    draw_plan(plan, [group[0] for group in phases(frames)], picture)
+    _show(explanation.document)
 
 
 def _show(document: dict[str, Any]) -> None:
