@@ -61,7 +61,8 @@ class Operator(NamedTuple):
 
     `op_type`: of ONNX. `kind`: of CLASSES. `macs`: multiply-accumulates. `moved`: activation elements read and written.
     `weights`: elements of its weights. `c_in`, `c_out`: input and output channels per group, 0 for an operator without
-    products. `out`: elements of the result. `live`: elements that later operators still need after it.
+    products. `out`: elements of the result. `live`: elements that later operators still need after it. `ruled`: whether
+    the tables above know the operator; one that they do not know counts as the movement of its elements.
     """
 
     name: str
@@ -74,6 +75,7 @@ class Operator(NamedTuple):
     c_out: int
     out: int
     live: int = 0
+    ruled: bool = True
 
 
 @dataclass(frozen=True)
@@ -132,7 +134,8 @@ Shapes = Mapping[str, tuple[int, ...]]
 def count_work(model: Any) -> Work:
     """The work of `model`, an `onnx.ModelProto` with static shapes, NCHW, in floats or quantised with QDQ.
 
-    Raises BadInputError for a tensor without a static shape and for an operator that is in none of the tables above.
+    An operator that is in none of the tables above counts as the movement of its elements, with `ruled` False. Raises
+    BadInputError for a tensor without a static shape.
     """
     shapes = _shapes(model)
     graph = model.graph
@@ -207,13 +210,11 @@ def _live_counts(graph: Any, shapes: Shapes, weights: set[str]) -> list[int]:
 def _operator(node: Any, shapes: Shapes, weights: set[str]) -> Operator:
     if node.op_type in ("Conv", "ConvTranspose"):
         return _convolution(node, shapes, weights)
-    if node.op_type not in KIND_OF:
-        known = ", ".join(sorted({"Conv", "ConvTranspose", *KIND_OF, *FOLDED}))
-        raise BadInputError(f"node {node.name}", f"operator {node.op_type}", f"one of {known}")
     read = sum(_size(shapes, name) for name in node.input if name and name in shapes and name not in weights)
     out = _size(shapes, node.output[0])
     moved = read * (2 if node.op_type in STATISTICS else 1) + out
-    return Operator(node.name, node.op_type, KIND_OF[node.op_type], 0, moved, 0, 0, 0, out)
+    kind, ruled = KIND_OF.get(node.op_type, "elementwise"), node.op_type in KIND_OF
+    return Operator(node.name, node.op_type, kind, 0, moved, 0, 0, 0, out, ruled=ruled)
 
 
 def _convolution(node: Any, shapes: Shapes, weights: set[str]) -> Operator:
