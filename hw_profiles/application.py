@@ -15,7 +15,8 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 from trilane.errors import BadInputError
-from trilane.hw_profiles.network_work import CLASSES, Network, Work
+from trilane.hw_profiles.network_work import Network, Work
+from trilane.hw_profiles.operator_kinds import CLASSES
 from trilane.hw_profiles.operator_times import JobTime, job_time, machine_of
 from trilane.hw_profiles.performance_profiles import Corners
 from trilane.hw_profiles.reference_networks import CHANNELS_PER_PASS

@@ -5,6 +5,7 @@ Rule: nothing here knows any hardware; `operator_times.py` turns the counts into
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,44 +17,25 @@ import onnx
 from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
+from trilane.hw_profiles.operator_kinds import (
+    CLASSES,
+    CONVOLUTIONS,
+    DOMAINS,
+    FOLDED,
+    KIND_OF,
+    LAYOUT_CHANGES,
+    OF_SHAPES,
+    PRODUCTS,
+    RECURRENT,
+    STATISTICS,
+    UNKNOWN,
+    WEIGHTED,
+    has_rule,
+)
+from trilane.hw_profiles.product_counts import product_of
 
-ARITHMETIC = ("convolution", "pointwise", "depthwise")
-TRAFFIC = ("normalisation", "resize", "elementwise", "permute")
-CLASSES = ARITHMETIC + TRAFFIC
-
-#: Operators that cost nothing: a runtime folds them into the convolution before them, or they only rename a tensor.
-FOLDED = frozenset(
-    ("Relu", "Clip", "Sigmoid", "BatchNormalization", "QuantizeLinear", "DequantizeLinear", "Identity")
-) | frozenset(("Reshape", "Flatten", "Squeeze", "Unsqueeze", "Constant", "Dropout"))
-#: ONNX operator -> its class, for all but convolutions.
-KIND_OF = {
-    "InstanceNormalization": "normalisation",
-    "GroupNormalization": "normalisation",
-    "GlobalAveragePool": "normalisation",
-    "ReduceMean": "normalisation",
-    "Resize": "resize",
-    "Upsample": "resize",
-    "Concat": "resize",
-    "MaxPool": "resize",
-    "AveragePool": "resize",
-    "Slice": "resize",
-    "Split": "resize",
-    "Pad": "resize",
-    "Transpose": "permute",
-    "Add": "elementwise",
-    "Mul": "elementwise",
-    "Sub": "elementwise",
-    "Div": "elementwise",
-    "HardSwish": "elementwise",
-    "HardSigmoid": "elementwise",
-    "Tanh": "elementwise",
-    "LeakyRelu": "elementwise",
-}
-#: Permutations between channels first and channels last. They cost nothing: the units work with channels last, and
-#: these operators are in the file only because its order is the other one.
-LAYOUT_CHANGES = ((0, 3, 1, 2), (0, 2, 3, 1))
-#: Normalisations that read their input twice: once for its mean and variance and once to apply them.
-STATISTICS = frozenset(["InstanceNormalization", "GroupNormalization"])
+#: Name of a weight in a graph without weights, where each is an input.
+WEIGHT_INPUT = re.compile(r"w\d+")
 
 
 class Operator(NamedTuple):
@@ -62,7 +44,7 @@ class Operator(NamedTuple):
     `op_type`: of ONNX. `kind`: of CLASSES. `macs`: multiply-accumulates. `moved`: activation elements read and written.
     `weights`: elements of its weights. `c_in`, `c_out`: input and output channels per group, 0 for an operator without
     products. `out`: elements of the result. `live`: elements that later operators still need after it. `ruled`: whether
-    the tables above know the operator; one that they do not know counts as the movement of its elements.
+    `operator_kinds.py` knows the operator; one that it does not know counts as the movement of its elements.
     """
 
     name: str
@@ -134,20 +116,20 @@ Shapes = Mapping[str, tuple[int, ...]]
 def count_work(model: Any) -> Work:
     """The work of `model`, an `onnx.ModelProto` with static shapes, NCHW, in floats or quantised with QDQ.
 
-    An operator that is in none of the tables above counts as the movement of its elements, with `ruled` False. Raises
-    BadInputError for a tensor without a static shape.
+    What follows from constants and shapes alone costs nothing. An operator without a rule counts as the movement of its
+    elements, with `ruled` False. Raises BadInputError for a tensor without a static shape.
     """
     shapes = _shapes(model)
     graph = model.graph
-    weights = {i.name for i in graph.initializer} | _weight_inputs(graph)
-    weights |= {n.output[0] for n in graph.node if n.op_type == "DequantizeLinear" and n.input[0] in weights}
-    live_counts = _live_counts(graph, shapes, weights)
+    constants = constant_tensors(graph)
+    live_counts = _live_counts(graph, shapes, constants)
+    read = {name for node in graph.node for name in node.input} | {output.name for output in graph.output}
     operators = tuple(
-        _operator(n, shapes, weights)._replace(live=live)
+        _operator(n, shapes, constants, read)._replace(live=live)
         for n, live in zip(graph.node, live_counts, strict=True)
-        if n.op_type not in FOLDED and not _changes_layout(n)
+        if not _costs_nothing(n, constants)
     )
-    inputs = [i.name for i in graph.input if i.name not in weights]
+    inputs = [i.name for i in graph.input if i.name not in constants]
     return Work(
         operators,
         sum(_size(shapes, name) for name in inputs),
@@ -162,6 +144,18 @@ def graph_facts(model: Any) -> dict[str, Any]:
     return {"parameters": work.weights, "gmac": work.macs / 1e9}
 
 
+def constant_tensors(graph: Any) -> set[str]:
+    """Names of the tensors that do not depend on what the network is given: weights, and what follows from them.
+
+    In a graph without weights, these are the inputs named `w<n>`, and those that a layer has after its first input.
+    """
+    names = {i.name for i in graph.initializer} | _weight_inputs(graph)
+    for node in graph.node:
+        if node.op_type in OF_SHAPES or all(name in names for name in node.input if name):
+            names.update(name for name in node.output if name)
+    return names
+
+
 def _shapes(model: Any) -> dict[str, tuple[int, ...]]:
     shapes = {i.name: tuple(i.dims) for i in model.graph.initializer}
     known = {v.name for v in model.graph.value_info}
@@ -173,31 +167,35 @@ def _shapes(model: Any) -> dict[str, tuple[int, ...]]:
 
 
 def _weight_inputs(graph: Any) -> set[str]:
-    """Graph inputs that are weights: those that a convolution or normalisation has as its second or a later input."""
     names = {i.name for i in graph.input}
     kinds = ("Conv", "ConvTranspose", "InstanceNormalization", "GroupNormalization")
-    return {name for node in graph.node if node.op_type in kinds for name in node.input[1:] if name in names}
+    after_first = {name for node in graph.node if node.op_type in kinds for name in node.input[1:] if name in names}
+    numbered = {name for name in names if WEIGHT_INPUT.fullmatch(name)}
+    return after_first | (numbered if numbered != names else set())
 
 
 def _size(shapes: Shapes, name: str) -> int:
-    size = prod(shapes.get(name, (0,)))
-    if size <= 0:
+    if name not in shapes or min(shapes[name], default=1) <= 0:
         raise BadInputError(f"tensor {name}", "no static shape", "a network exported with fixed sizes")
-    return size
+    return prod(shapes[name])
 
 
-def _changes_layout(node: Any) -> bool:
-    return node.op_type == "Transpose" and any(tuple(a.ints) in LAYOUT_CHANGES for a in node.attribute)
+def _costs_nothing(node: Any, constants: set[str]) -> bool:
+    return (
+        (node.op_type in FOLDED and node.domain in DOMAINS)
+        or (node.op_type == "Transpose" and any(tuple(a.ints) in LAYOUT_CHANGES for a in node.attribute))
+        or all(name in constants for name in node.output if name)
+    )
 
 
-def _live_counts(graph: Any, shapes: Shapes, weights: set[str]) -> list[int]:
+def _live_counts(graph: Any, shapes: Shapes, constants: set[str]) -> list[int]:
     """After each node: elements of all results so far that later nodes, or the caller, still need."""
-    last_use = {name: index for index, node in enumerate(graph.node) for name in node.input if name not in weights}
+    last_use = {name: index for index, node in enumerate(graph.node) for name in node.input if name not in constants}
     last_use |= {output.name: len(graph.node) for output in graph.output}
     freed: dict[int, int] = {}
     live, counts = 0, []
     for index, node in enumerate(graph.node):
-        for name in node.output[:1]:
+        for name in node.output:
             size = prod(shapes.get(name, (0,)))
             if last_use.get(name, index) > index:
                 live += size
@@ -207,24 +205,32 @@ def _live_counts(graph: Any, shapes: Shapes, weights: set[str]) -> list[int]:
     return counts
 
 
-def _operator(node: Any, shapes: Shapes, weights: set[str]) -> Operator:
-    if node.op_type in ("Conv", "ConvTranspose"):
-        return _convolution(node, shapes, weights)
-    read = sum(_size(shapes, name) for name in node.input if name and name in shapes and name not in weights)
-    out = _size(shapes, node.output[0])
-    moved = read * (2 if node.op_type in STATISTICS else 1) + out
-    kind, ruled = KIND_OF.get(node.op_type, "elementwise"), node.op_type in KIND_OF
-    return Operator(node.name, node.op_type, kind, 0, moved, 0, 0, 0, out, ruled=ruled)
+def _operator(node: Any, shapes: Shapes, constants: set[str], read: set[str]) -> Operator:
+    """Counts of `node`. `constants`: tensors that are given once. `read`: tensors that somebody reads."""
+    known = has_rule(node.op_type, node.domain)
+    weighted = node.op_type in WEIGHTED and known
+    weights = sum(_size(shapes, name) for name in node.input if name in constants) if weighted else 0
+    moved_in = [_size(shapes, name) for name in node.input if name and name not in constants]
+    out = sum(_size(shapes, name) for name in node.output if name and (name in read or name == node.output[0]))
+    moved = sum(moved_in) * (2 if node.op_type in STATISTICS else 1) + out
+    plain = Operator(node.name, node.op_type, KIND_OF.get(node.op_type, UNKNOWN), 0, moved, weights, 0, 0, out)
+    if known and node.op_type in CONVOLUTIONS:
+        return _convolution(node, shapes, plain)
+    if known and (node.op_type in PRODUCTS or node.op_type in RECURRENT):
+        product = product_of(node, [shapes.get(name, ()) for name in node.input], shapes[node.output[0]])
+        return plain if product is None else plain._replace(kind="pointwise", **product._asdict())
+    return plain if known else plain._replace(kind=UNKNOWN, ruled=False)
 
 
-def _convolution(node: Any, shapes: Shapes, weights: set[str]) -> Operator:
+def _convolution(node: Any, shapes: Shapes, plain: Operator) -> Operator:
+    """Counts of a convolution. `plain`: what it moves and its weights."""
     groups = next((a.i for a in node.attribute if a.name == "group"), 1)
-    weight = shapes[node.input[1]]
-    source, out = _size(shapes, node.input[0]), _size(shapes, node.output[0])
-    c_in, c_out = shapes[node.input[0]][1] // groups, shapes[node.output[0]][1] // groups
+    weight, source, result = (
+        shapes[name] for name in (node.input[CONVOLUTIONS[node.op_type]], node.input[0], node.output[0])
+    )
+    c_in, c_out = source[1] // groups, result[1] // groups
     kernel = prod(weight[2:])
-    positions = source // shapes[node.input[0]][1] if node.op_type == "ConvTranspose" else out // (c_out * groups)
+    positions = prod(source) // source[1] if node.op_type == "ConvTranspose" else prod(result) // (c_out * groups)
     kind = "depthwise" if groups > 1 and c_in == 1 else "pointwise" if kernel == 1 else "convolution"
-    size = sum(prod(shapes[name]) for name in node.input[1:] if name in weights)
     macs = positions * kernel * c_in * c_out * groups
-    return Operator(node.name, node.op_type, kind, macs, source + out, size, c_in, c_out, out)
+    return plain._replace(kind=kind, macs=macs, c_in=c_in, c_out=c_out)

@@ -18,7 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.hw_profiles.network_work import ARITHMETIC, CLASSES, TRAFFIC, Work
+from trilane.hw_profiles.network_work import Work
+from trilane.hw_profiles.operator_kinds import ARITHMETIC, CLASSES, TRAFFIC
 from trilane.hw_profiles.schema import Memory, Unit
 
 TRAFFIC_KEYS = tuple(f"{kind}_traffic" for kind in ARITHMETIC) + TRAFFIC

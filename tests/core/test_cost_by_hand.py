@@ -12,7 +12,8 @@ import pytest
 from onnx import TensorProto, helper
 
 from trilane.hw_profiles.load import load_profile
-from trilane.hw_profiles.network_work import CLASSES, Operator, Work, count_work
+from trilane.hw_profiles.network_work import Operator, Work, count_work
+from trilane.hw_profiles.operator_kinds import CLASSES
 from trilane.hw_profiles.operator_times import Machine, job_time, machine_of
 from trilane.hw_profiles.schema import CORNERS
 from trilane.hw_profiles.thermal_state import ThermalState, headroom_k

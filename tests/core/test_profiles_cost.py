@@ -14,7 +14,8 @@ from onnx import TensorProto, helper
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import isolated_job_time, split_work
 from trilane.hw_profiles.load import load_profile
-from trilane.hw_profiles.network_work import CLASSES, count_work
+from trilane.hw_profiles.network_work import Operator, count_work
+from trilane.hw_profiles.operator_kinds import CLASSES, has_rule
 from trilane.hw_profiles.operator_times import job_time, machine_of
 from trilane.hw_profiles.performance_profiles import corners_of
 from trilane.hw_profiles.published_times import PUBLISHED_MS, check_published, resnet18_work, unet_work
@@ -133,10 +134,11 @@ def test_a_quantised_avatar_counts_as_its_float_network(tiny_quantised: Quantise
 
 def test_an_operator_without_a_rule_counts_as_movement() -> None:
     x = helper.make_tensor_value_info("x", TensorProto.FLOAT, (1, 4, 16, 16))
-    y = helper.make_tensor_value_info("y", TensorProto.FLOAT, (1, 4, 16, 16))
-    graph = helper.make_graph([helper.make_node("Erf", ["x"], ["y"], name="odd")], "g", [x], [y])
-    (odd,) = count_work(helper.make_model(graph)).operators
-    assert (odd.name, odd.kind, odd.moved, odd.ruled) == ("odd", "elementwise", 2 * 4 * 256, False)
+    y = helper.make_tensor_value_info("y", TensorProto.FLOAT, (1, 4, 8, 8))
+    graph = helper.make_graph([helper.make_node("Odd", ["x"], ["y"], name="odd", domain="mine")], "g", [x], [y])
+    (operator,) = count_work(helper.make_model(graph)).operators
+    assert operator == Operator("odd", "Odd", "elementwise", 0, 1024 + 256, 0, 0, 0, 256, 256, ruled=False)
+    assert not has_rule("Odd", "mine") and not has_rule("Conv", "mine") and has_rule("Conv")
 
 
 def test_a_dynamic_shape_is_refused() -> None:
