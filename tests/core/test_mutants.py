@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
 
 import pytest
 
+from trilane.testing.mutants.control import Controls
 from trilane.testing.mutants.draw import code_files, draw
 from trilane.testing.mutants.fault import Fault, fault_between
 from trilane.testing.mutants.reach import Reach, Reached, load_reach, measure_reach
-from trilane.testing.mutants.results import Result, Unchanging, fails, table
+from trilane.testing.mutants.results import Result, Unchanging, controls_table, fails, table
 from trilane.testing.mutants.text_faults import text_faults
 from trilane.testing.mutants.tree_copy import TreeCopy
+from trilane.testing.mutants.trial import Trial, noticed
 
 SHADER = """\
 // clamp(x, 0.0, 255.0)
@@ -189,6 +192,100 @@ def test_the_verdict_counts_each_folder_and_all() -> None:
     assert fails(rows) == ["body", "in all"]
     assert [line.split() for line in table(rows)][-1] == ["in", "all", "12", "of", "19", "63.2%"]
     assert fails(rows[:8]) == []
+
+
+def test_an_untried_fault_is_named_and_a_limit_of_time_is_counted() -> None:
+    """Three trials: one noticed by a limit that its control kept, one whose control failed, one that survived."""
+    fault = Fault("body/a.py", 3, "Number", "x = 1\n", "x = 2\n")
+    rows = [
+        Result(fault, "tests/process/test_a.py::test_b", 9.0, 2, 2, by_time=True, control="passed"),
+        Result(fault, "tests/process/test_a.py::test_b", 9.0, 2, 2, by_time=True, control="failed"),
+        Result(fault, "", 1.0, 2, 2),
+    ]
+    assert [row.counts for row in rows] == [True, False, True]
+    assert controls_table(rows) == [
+        "Noticed by a limit of time: 1. Controls without the fault: 1 passed, 1 failed.",
+        "  not tried  body/a.py:3 [Number] x = 1  ->  x = 2: tests/process/test_a.py::test_b fails without it too",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("code", "output", "found"),
+    [
+        (0, "3 passed", ("", False)),
+        (5, "no tests ran", ("", False)),
+        (1, "F\nFAILED tests/a.py::test_b - assert 1 == 2\n", ("tests/a.py::test_b", False)),
+        (1, "FAILED tests/a.py::test_b - Failed: Timeout (>60.0s) from pytest-timeout.", ("tests/a.py::test_b", True)),
+        (1, "FAILED tests/a.py::test_timeout - TypeError: x", ("tests/a.py::test_timeout", False)),
+        (1, "FAILED tests/a.py::test_b - subprocess.TimeoutExpired: Command", ("tests/a.py::test_b", True)),
+        (2, "ERROR tests/a.py - NameError: name 'x'", ("tests/a.py", False)),
+        (-11, "", ("pytest ended with -11", False)),
+        (1, "+++++ Timeout +++++", ("pytest ended with 1", True)),
+    ],
+)
+def test_how_a_trial_ended_is_read_from_what_pytest_says(code: int, output: str, found: tuple[str, bool]) -> None:
+    assert noticed(code, output) == found
+
+
+#: A fault, and the tests that reach it.
+WRONG = Fault("a.py", 1, "Number", "x = 1\n", "x = 2\n")
+FILES = ("tests/core/test_a.py", "tests/process/test_b.py", "tests/process/test_c.py")
+
+
+class Script:
+    """Runs no tests: says `ends` in turn, and notes whether the fault was there and which files were to run."""
+
+    def __init__(self, *ends: str) -> None:
+        self.ends = list(ends)
+        self.seen: list[tuple[bool, int]] = []
+
+    def __call__(self, tree: TreeCopy, files: Sequence[str], usual_s: float) -> Trial:
+        assert usual_s == 7.0
+        self.seen.append(((tree.root / "a.py").read_text() == "x = 2\n", len(files)))
+        end = self.ends.pop(0)
+        return Trial(end.removesuffix(" late"), end.endswith(" late"), 1.0)
+
+
+A, B = f"{FILES[0]}::test_x", f"{FILES[1]}::test_y"
+
+
+@pytest.mark.parametrize(
+    ("ends", "answer", "control", "seen"),
+    [
+        pytest.param([""], "", "", [(True, 3)], id="a survivor needs no control"),
+        pytest.param([A, ""], A, "passed", [(True, 3), (False, 1)], id="as far as the file that noticed"),
+        pytest.param([B, ""], B, "passed", [(True, 3), (False, 2)], id="a process test"),
+        pytest.param(["the end late", ""], "the end", "passed", [(True, 3), (False, 3)], id="the tests did not end"),
+        pytest.param([B, B, ""], "", "", [(True, 3), (False, 2), (True, 3)], id="survives"),
+        pytest.param([B, B, A, ""], A, "passed", [(True, 3), (False, 2), (True, 3), (False, 1)], id="repeated"),
+        pytest.param([B, A, B, B], B, "failed", [(True, 3), (False, 2)] * 2, id="never without the fault either"),
+    ],
+)
+def test_what_fails_without_the_fault_is_not_noticed(
+    ends: list[str], answer: str, control: str, seen: list[tuple[bool, int]], tmp_path: Path
+) -> None:
+    (tmp_path / "tree").mkdir()
+    (tmp_path / "tree" / "a.py").write_text("x = 1\n")
+    script = Script(*ends)
+    trial, came = Controls(script).tried(WRONG, TreeCopy(tmp_path / "tree"), FILES, 7.0)
+    assert (trial.noticed_by, came) == (answer, control)
+    assert script.seen == seen and script.ends == []
+
+
+def test_a_control_holds_for_a_test_that_feels_no_load_until_a_limit_of_time_ends_it(tmp_path: Path) -> None:
+    """The first of two trials has one; the third, which a limit ended, has its own; one of processes always has."""
+    (tmp_path / "tree").mkdir()
+    (tmp_path / "tree" / "a.py").write_text("x = 1\n")
+    tree, script = TreeCopy(tmp_path / "tree"), Script(A, "", A, f"{A} late", "", B, "", B, "")
+    controls = Controls(script)
+    assert [controls.tried(WRONG, tree, FILES, 7.0)[1] for _ in range(5)] == [
+        "passed",
+        "",
+        "passed",
+        "passed",
+        "passed",
+    ]
+    assert script.ends == []
 
 
 def test_a_fault_on_the_list_is_known_by_its_lines() -> None:

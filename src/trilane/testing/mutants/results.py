@@ -19,13 +19,21 @@ FEWEST = 5
 @dataclass(frozen=True)
 class Result:
     """`noticed_by`: a test, or how the tests ended; empty for a survivor. `tests`: how many test files were tried of
-    the `reaching` ones that reach the line."""
+    the `reaching` ones that reach the line. `by_time`: a limit of time ended the trial. `control`: what the same tests
+    did without the fault, `passed` or `failed`; empty where none was needed."""
 
     fault: Fault
     noticed_by: str
     seconds: float
     tests: int
     reaching: int
+    by_time: bool = False
+    control: str = ""
+
+    @property
+    def counts(self) -> bool:
+        """Whether the trial says anything: its tests pass without the fault."""
+        return self.control != "failed"
 
 
 @dataclass(frozen=True)
@@ -58,7 +66,7 @@ def load_results(file: Path) -> list[Result]:
 
 
 def table(results: Iterable[Result]) -> list[str]:
-    """A line for each folder: noticed of tried, and the share."""
+    """A line for each folder: noticed of tried, and the share. All results have to count."""
     counts: dict[str, list[int]] = defaultdict(lambda: [0, 0])
     for result in results:
         for name in (result.fault.folder, "in all"):
@@ -68,8 +76,19 @@ def table(results: Iterable[Result]) -> list[str]:
     return [f"{name:14} {counts[name][0]:4} of {counts[name][1]:4}  {_share(*counts[name]):6.1%}" for name in order]
 
 
+def controls_table(results: Sequence[Result]) -> list[str]:
+    """How many trials a limit of time ended, how many controls there were, and the faults that count as not tried."""
+    untried = [result for result in results if not result.counts]
+    held = sum(result.control == "passed" for result in results)
+    by_time = sum(result.by_time and result.counts for result in results)
+    return [
+        f"Noticed by a limit of time: {by_time}. Controls without the fault: {held} passed, {len(untried)} failed.",
+        *(f"  not tried  {result.fault}: {result.noticed_by} fails without it too" for result in untried),
+    ]
+
+
 def fails(results: Sequence[Result]) -> list[str]:
-    """The folders that notice too few."""
+    """The folders that notice too few. All results have to count."""
     by_folder: dict[str, list[Result]] = defaultdict(list)
     for result in results:
         by_folder[result.fault.folder].append(result)

@@ -1,4 +1,4 @@
-"""One fault against the tests. Rule: noticed is a test that fails or never ends, and nothing of a trial outlives it."""
+"""The tests of one fault, with it and without. Rule: one limit of time holds for both, and nothing outlives them."""
 
 from __future__ import annotations
 
@@ -17,13 +17,17 @@ from trilane.testing.mutants.tree_copy import TreeCopy
 #: A trial may take this many times as long as its tests took, and this long besides.
 TIMES, BESIDES_S = 5.0, 60.0
 NO_TESTS = 5
+#: How pytest, pytest-timeout, subprocess, queues and sockets name the end of a limit.
+OF_TIME = r"(?i)time-?out|timed out|did not (?:end|answer|come)"
 PYTEST = ("-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "--no-header", "--tb=no", "--timeout=60")
 
 
 class Trial(NamedTuple):
-    """`noticed_by`: the first test that failed, or how pytest ended; empty when all passed. `seconds`: of the wall."""
+    """`noticed_by`: the first test that failed, or how pytest ended; empty when all passed. `by_time`: whether it was a
+    limit of time that ended it, of pytest or of the test itself. `seconds`: of the wall."""
 
     noticed_by: str
+    by_time: bool
     seconds: float
 
 
@@ -43,20 +47,23 @@ def run_tests(tree: TreeCopy, test_files: Sequence[str], usual_s: float) -> Tria
     )
     try:
         output, _ = process.communicate(timeout=TIMES * usual_s + BESIDES_S)
-        noticed_by = _noticed_by(process.returncode, output)
+        noticed_by, by_time = noticed(process.returncode, output)
     except subprocess.TimeoutExpired:
-        noticed_by = "the tests did not end"
+        noticed_by, by_time = "the tests did not end", True
     finally:
         _end(process)
         tree.clean()
-    return Trial(noticed_by, time.monotonic() - begin)
+    return Trial(noticed_by, by_time, time.monotonic() - begin)
 
 
-def _noticed_by(code: int, output: str) -> str:
+def noticed(code: int, output: str) -> tuple[str, bool]:
+    """(what noticed the fault, whether a limit of time did) from pytest's exit code and what it printed."""
     if code in (0, NO_TESTS):
-        return ""
-    failed = re.search(r"^(?:FAILED|ERROR) (\S+)", output, re.MULTILINE)
-    return failed[1] if failed else f"pytest ended with {code}"
+        return "", False
+    failed = re.search(r"^(?:FAILED|ERROR) (\S+)(.*)", output, re.MULTILINE)
+    if failed:
+        return failed[1], bool(re.search(OF_TIME, failed[2]))
+    return f"pytest ended with {code}", bool(re.search(OF_TIME, output))
 
 
 def _end(process: subprocess.Popen[str]) -> None:
