@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -13,6 +14,7 @@ from PIL import Image
 
 from trilane.errors import BadInputError
 from trilane.stages.gpu.background import open_background
+from trilane.stages.gpu.video_reader import VideoReader
 
 
 def write_video(path: Path, levels: list[int], fps: int = 10) -> None:
@@ -132,3 +134,52 @@ def test_sound_without_video_is_refused(tmp_path: Path) -> None:
         container.mux(stream.encode(frame))
     with pytest.raises(BadInputError, match="no video stream"):
         open_background(tmp_path / "sound.wav", (8, 8), 30)
+
+
+class Turned:
+    """A frame of 2 x 4 pixels, whose file says how it is to be turned; scaled by repeating pixels."""
+
+    width, height = 4, 2
+
+    def __init__(self, rotation: float) -> None:
+        self.rotation = rotation
+        self.pixels = np.arange(8, dtype=np.uint8).reshape(2, 4)
+
+    def reformat(self, width: int, height: int, format: str) -> Any:
+        assert format == "rgb24" and width * self.height == height * self.width
+        scale = width // self.width
+        self.pixels = self.pixels.repeat(scale, 0).repeat(scale, 1)
+        return self
+
+    def to_ndarray(self) -> np.ndarray:
+        return self.pixels[..., None].repeat(3, 2)
+
+
+@pytest.mark.parametrize(
+    ("rotation", "picture"),
+    [
+        (0, [[0, 1, 2, 3], [4, 5, 6, 7]]),
+        (90, [[3, 7], [2, 6], [1, 5], [0, 4]]),  # counter-clockwise
+        (-90, [[4, 0], [5, 1], [6, 2], [7, 3]]),
+        (180, [[7, 6, 5, 4], [3, 2, 1, 0]]),
+        (-180, [[7, 6, 5, 4], [3, 2, 1, 0]]),
+        (270, [[4, 0], [5, 1], [6, 2], [7, 3]]),
+        (89.6, [[3, 7], [2, 6], [1, 5], [0, 4]]),
+    ],
+)
+def test_a_frame_is_turned_as_its_file_says(rotation: float, picture: list[list[int]]) -> None:
+    """At its own size, and at twice the size."""
+    wanted = np.array(picture, np.uint8)
+    for scale in (1, 2):
+        reader = object.__new__(VideoReader)
+        reader._shape = (wanted.shape[0] * scale, wanted.shape[1] * scale)
+        found = reader._fit(Turned(rotation))
+        assert np.array_equal(found[..., 1], wanted.repeat(scale, 0).repeat(scale, 1))
+
+
+def test_a_frame_that_is_too_wide_or_too_high_loses_both_sides_equally() -> None:
+    reader = object.__new__(VideoReader)
+    reader._shape = (2, 2)
+    assert reader._fit(Turned(0))[..., 0].tolist() == [[1, 2], [5, 6]]
+    reader._shape = (2, 8)  # twice the size, 4 x 8, of which the middle rows stay
+    assert reader._fit(Turned(0))[..., 0].tolist() == [[0, 0, 1, 1, 2, 2, 3, 3], [4, 4, 5, 5, 6, 6, 7, 7]]

@@ -92,3 +92,20 @@ def test_a_cache_folder_that_cannot_be_made(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     asked(Maker())
     assert cache.cache_dir("openvino") is None
+
+
+def test_the_cache_lies_in_the_home_of_who_has_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(Path, "home", lambda: tmp_path)
+    assert cache.cache_dir("openvino") == tmp_path / ".cache" / "trilane" / "openvino"
+    assert (tmp_path / ".cache" / "trilane" / "openvino").is_dir()
+
+    def nobodys() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "home", nobodys)
+    assert cache.cache_dir("openvino") is None
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "other"))
+    assert cache.cache_dir("openvino") == tmp_path / "other" / "trilane" / "openvino"
+    monkeypatch.setattr(cache.os, "access", lambda _path, _mode: False)
+    assert cache.cache_dir("openvino") is None

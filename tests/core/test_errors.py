@@ -13,7 +13,7 @@ import pytest
 from pydantic import BaseModel, ValidationError, field_validator
 
 import trilane
-from trilane.errors import BadInputError, MissingPartError, TrilaneError, reason
+from trilane.errors import BadInputError, MissingPartError, TrilaneError, UnitLostError, reason
 from trilane.hw_profiles.load import merged_tables, parse_profile, profile_folder
 from trilane.scene.load import scene_from
 from trilane.scheduler.events import Graph, StageSpec
@@ -178,6 +178,12 @@ def test_a_systems_error_about_a_file(tmp_path: Path) -> None:
         path.read_bytes()
     error = BadInputError.of_os_error(path, raised.value, "a file", "make it")
     assert str(error) == f"{path}: found no such file or directory, expected a file; make it"
+
+
+def test_each_kind_of_error_has_its_exit_code() -> None:
+    """README: 1 the run failed, 2 wrong input, 3 something is missing."""
+    kinds = (TrilaneError, UnitLostError, BadInputError, MissingPartError)
+    assert [kind.exit_code for kind in kinds] == [1, 1, 2, 3]
 
 
 def test_a_missing_part_names_a_line_or_an_extra() -> None:

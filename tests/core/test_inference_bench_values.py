@@ -310,6 +310,15 @@ def test_a_copy_is_read_and_written(monkeypatch: pytest.MonkeyPatch) -> None:
     assert copied == [(8_000_000, 8_000_000)] * 6
 
 
+def test_the_float_peak_is_of_one_matrix_product(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(roofline, "MATRIX", 5)
+    model = roofline._product()
+    weights = np.random.default_rng(0).normal(size=(5, 5)).astype(np.float32)
+    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    source = np.arange(25, dtype=np.float32).reshape(5, 5)
+    assert np.allclose(session.run(["y"], {"x": source})[0], source @ weights, rtol=1e-5, atol=1e-4)
+
+
 def test_the_layers_are_convolutions_between_bytes() -> None:
     """Bytes in and out of the same shape, four convolutions of (c,c,k,k) that keep the size; ONNX Runtime runs them."""
     model = shape_inference.infer_shapes(roofline._layers(8, 16, 3), check_type=True, strict_mode=True)

@@ -35,6 +35,8 @@ def test_the_table_has_the_multiply_accumulates_worked_out_by_hand() -> None:
         (["avx2", "avx512f", "avx512bw", "avx512_vnni", "avx_vnni", "amx_tile", "amx_int8"], "AMX-INT8"),
         (["avx2", "avx512f", "avx512bw", "avx512_vnni", "amx_int8"], "AVX512-VNNI"),  # a kernel that hides the tiles
         (["avx2", "avx_vnni"], "AVX-VNNI"),
+        (["avx2", "avx512f", "avx512bw", "avx_vnni"], "AVX-VNNI"),
+        (["avx2", "avx512f", "avx512bw", "asimddp"], "AVX512-BW"),
         (["avx2", "avx512f", "avx512bw"], "AVX512-BW"),
         (["fma", "avx2"], "AVX2"),
         (["asimd", "asimddp"], "NEON dot"),

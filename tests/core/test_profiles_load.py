@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
+from typing import Any
 
 import pytest
+from pydantic import TypeAdapter, ValidationError
 
 from trilane.errors import BadInputError
+from trilane.hw_profiles import schema
 from trilane.hw_profiles.load import (
     load_profile,
     load_runnable,
@@ -15,6 +19,7 @@ from trilane.hw_profiles.load import (
     profile_folder,
     profile_names,
 )
+from trilane.unexpected_value import UnexpectedValue
 from trilane.units import UNITS
 
 CHIPS = (
@@ -95,6 +100,31 @@ def test_a_bad_file_is_named_with_its_key(case: str, tmp_path: Path) -> None:
     assert str(path) in message
     assert key in message
     assert word in message
+
+
+@pytest.mark.parametrize(
+    ("kind", "low", "high"),
+    [
+        (schema.Rate, 1e-6, 1e5),
+        (schema.Fraction, 1e-6, 1.0),
+        (schema.Efficiency, 1e-6, 4.0),
+        (schema.Cost, 0.0, 1e6),
+        (schema.Power, 0.0, 1000.0),
+        (schema.Celsius, -50.0, 200.0),
+        (schema.Resistance, 1e-3, 1000.0),
+        (schema.Seconds, 1e-3, 1e6),
+        (schema.Count, 1.0, 1e6),
+    ],
+)
+def test_a_number_is_within_the_range_of_its_kind(kind: Any, low: float, high: float) -> None:
+    """Ends included; a value that is not known is of any kind."""
+    reader = TypeAdapter(kind)
+    for value in (low, high):
+        assert reader.validate_python({"value": value, "kind": "assumed", "source": "s"}).value == value
+    for value in (low - 1e-7, high + 1e-3):
+        with pytest.raises((ValidationError, UnexpectedValue), match=re.escape(f"{low:g} to {high:g}")):
+            reader.validate_python({"value": value, "kind": "assumed", "source": "s"})
+    assert reader.validate_python({"kind": "unknown", "source": "s"}).value is None
 
 
 def test_a_missing_corner_is_named() -> None:

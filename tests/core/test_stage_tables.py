@@ -323,6 +323,14 @@ def test_a_machine_without_a_driver_is_refused() -> None:
     assert configure.required_machine(lambda: {"vendor": "v"})["gl"] == {"vendor": "v"}
 
 
+def test_a_configuration_has_the_runtime_that_was_chosen(
+    tiny_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(configure, "requested_runtime", lambda asked: ("qnn", f"not {asked}"))
+    checked = configure.configure(configure.Request(avatar=str(tiny_bundle), runtime="ort"), tmp_path, lambda: None)
+    assert checked.config.runtime == "qnn" and "runtime: qnn (not ort)" in checked.notes
+
+
 def test_a_request_becomes_a_checked_configuration(tiny_bundle: Path, tmp_path: Path) -> None:
     request = configure.Request(avatar=str(tiny_bundle), size="64", runtime="ort", frames=3)
     software = configure.configure(request, tmp_path, lambda: {"hardware": False})

@@ -7,6 +7,7 @@ import os
 import struct
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgpack
@@ -74,7 +75,9 @@ def test_the_numbers_that_both_sides_of_a_message_agree_on() -> None:
     assert (messages.BUILDING, messages.MEASURING, messages.CLOSING) == (-1, -2, -3)
 
 
-@pytest.mark.parametrize("rest", [{1: 2.0}, {"ms": "2"}, {"ms": True}, {"ms": None}, [1.0], "ms"])
+@pytest.mark.parametrize(
+    "rest", [{1: 2.0}, {"ms": "2"}, {"ms": True}, {"ms": None}, {"ms": 1.0, "n": "2"}, [1.0], "ms"]
+)
 def test_metrics_are_numbers_by_name(rest: Any) -> None:
     begin = pack(messages.Done(*range(10), {}))  # without metrics nothing follows the integers
     assert unpack(begin + msgpack.packb({"ms": 2.5, "n": 3})) == messages.Done(*range(10), {"ms": 2.5, "n": 3})
@@ -400,6 +403,18 @@ def test_a_folder_of_somebody_else_is_left_alone(tmp_path: Path, monkeypatch: py
     assert len(list(tmp_path.iterdir())) == 2
     remove_abandoned(tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def test_what_stands_before_a_folder_that_is_left_alone_is_still_removed(tmp_path: Path) -> None:
+    """A link, a folder without a lock, then an abandoned one."""
+    for name in ("without", "abandoned", "elsewhere"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "elsewhere")
+    for name in ("abandoned", "elsewhere"):
+        (tmp_path / name / "lock").touch()
+    names = ("link", "without", "abandoned")
+    remove_abandoned(SimpleNamespace(glob=lambda _pattern: [tmp_path / name for name in names]))  # type: ignore[arg-type]
+    assert {path.name for path in tmp_path.iterdir()} == {"link", "without", "elsewhere"}
 
 
 class FakeLibc:

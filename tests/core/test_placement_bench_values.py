@@ -1,0 +1,189 @@
+"""`bench placement` and `bench planner`: what they say of runs whose times are told, worked out by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+
+from trilane.bench import placement, planner
+from trilane.errors import BadInputError, TrilaneError
+from trilane.scheduler.placement import Ranked
+from trilane.scheduler.places import Core, Place, Work
+
+HERE = {"cpu": Place((0,), 1), "gpu": Place((1,), 1)}
+A, B, C, RULE = ({**HERE, "dsp": dsp} for dsp in (Place((0,), 1), Place((1,), 1), Place((0, 1), 1), Place((0, 1), 2)))
+NAMES = {"A": "dsp 0", "B": "dsp 1", "C": "dsp 0,1 (1 thread)", "RULE": "dsp 0,1 (2 threads)"}
+
+
+def name_of(where: Any) -> str:
+    return {str(each["dsp"]): name for each, name in zip((A, B, C, RULE), NAMES, strict=True)}[str(where["dsp"])]
+
+
+@pytest.fixture
+def trial(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Two rounds of runs: of each placement the time in the round in which all are tried, then in the others, in ms."""
+    told = {"A": [10.0, 10.0, 14.0], "B": [13.0, 8.0, 20.0], "C": [12.0, 12.0, 12.0], "RULE": [20.0, 30.0, 21.0]}
+    runs: list[tuple[str, int]] = []
+
+    def run(_self: Any, where: Any, isolated: int) -> Any:
+        runs.append((name_of(where), isolated))
+        frame_ms = told[name_of(where)][[name for name, _ in runs].count(name_of(where)) - 1]
+        efficiency = None if name_of(where) == "A" and frame_ms == 14 else frame_ms / 100
+        return SimpleNamespace(frame_time_ms=SimpleNamespace(mean=frame_ms), core_efficiency=efficiency)
+
+    found = [Ranked(each, ms * 1_000_000) for each, ms in ((A, 9), (B, 10), (C, 11))]
+    monkeypatch.setattr(placement, "rule_placement", lambda cores: RULE if cores == (0, 1) else {})
+    monkeypatch.setattr(placement, "measured_times", lambda *_: {"cpu": {1: Work(2_000_000, 1_500_000)}})
+    monkeypatch.setattr(placement, "ranked", lambda *_: list(found))
+    monkeypatch.setattr(placement, "frame_ns", lambda *_: 15_000_000)
+    monkeypatch.setattr(placement, "chosen", lambda ranking, rule: ranking[0])  # noqa: ARG005
+    monkeypatch.setattr(placement._Trial, "_run", run)
+    made = placement._Trial(None, [Core(0, 0), Core(1, 1)], None)  # type: ignore[arg-type]
+    return SimpleNamespace(made=made, runs=runs)
+
+
+def test_the_chosen_placement_is_set_against_the_best_other_and_the_rules(trial: Any) -> None:
+    """Tried: A 10, B 13, C 12, the rule's 20. A and the rule's are always in, and one more, the fastest of the others:
+    C, 12 and 12 in two rounds; A 10 and 14, so 10/12 and 14/12 of the best other; the rule's 30 and 21: 3 and 1.5."""
+    trial.made.run(2, 1)
+    first = [("A", 0), ("B", 0), ("C", 0), ("RULE", 0)]
+    assert trial.runs == [*first, *([("A", 2), ("RULE", 2), ("C", 2)] * 2)]
+    keys = ("predicted_ms", "tried_ms", "frame_ms", "is_chosen", "is_rule")
+    assert [tuple(row[key] for key in keys) for row in trial.made.rows()] == [
+        (9.0, 10.0, 12.0, True, False),
+        (10.0, 13.0, None, False, False),
+        (11.0, 12.0, 12.0, False, False),
+        (15.0, 20.0, 25.5, False, True),
+    ]
+    assert [row["placement"] for row in trial.made.rows()] == [f"cpu 0, gpu 1, {dsp}" for dsp in NAMES.values()]
+    assert trial.made.summary() == {
+        "chosen": "cpu 0, gpu 1, dsp 0",
+        "best": "cpu 0, gpu 1, dsp 0",  # as fast as C, and chosen
+        "rule": "cpu 0, gpu 1, dsp 0,1 (2 threads)",
+        "chosen_over_best": pytest.approx(1.0),
+        "low": pytest.approx(10 / 12),
+        "high": pytest.approx(14 / 12),
+        "rule_over_chosen": pytest.approx(2.25),
+        "rule_low": 1.5,
+        "rule_high": 3.0,
+        "core_efficiency": pytest.approx(0.05),  # 0.1, and nothing
+        "rule_core_efficiency": pytest.approx(0.255),
+        "times": [{"unit": "cpu", "threads": 1, "ms": 2.0, "core_ms": 1.5}],
+    }
+
+
+def test_the_best_of_the_further_rounds_may_be_another(trial: Any) -> None:
+    """With two finalists B is in: 8 and 20, a median of 14, so C is the best of all and the rival."""
+    trial.made.run(2, 2)
+    assert [name for name, _ in trial.runs[4:8]] == ["A", "RULE", "C", "B"]
+    trial.made._runs[0][0].frame_time_ms.mean = 16.0
+    found = trial.made.summary()
+    assert (found["best"], found["chosen_over_best"]) == ("cpu 0, gpu 1, dsp 0,1 (1 thread)", pytest.approx(15 / 12))
+
+
+def test_a_run_that_shows_too_few_frames_ends_the_bench(monkeypatch: pytest.MonkeyPatch) -> None:
+    results = [
+        SimpleNamespace(interrupted=True, failure=None, presented=30, report=1),
+        SimpleNamespace(interrupted=False, failure=SimpleNamespace(message="no driver"), presented=30, report=1),
+        SimpleNamespace(interrupted=False, failure=None, presented=19, report=1),
+        SimpleNamespace(interrupted=False, failure=None, presented=20, report=7),
+    ]
+    asked: list[Any] = []
+
+    def run(config: Any, assets: Any, **options: Any) -> Any:
+        asked.append((config["units"], assets, options))
+        return results.pop(0)
+
+    monkeypatch.setattr(placement, "run_avatar", run)
+    monkeypatch.setattr(placement, "settings_of", lambda where: {"of": where})
+    trial = object.__new__(placement._Trial)
+    trial._checked = SimpleNamespace(changed=lambda **new: SimpleNamespace(config=new, assets="assets"))  # type: ignore[assignment]
+    trial._starter = "starter"  # type: ignore[assignment]
+    with pytest.raises(KeyboardInterrupt):
+        trial._run(A, 2)
+    with pytest.raises(TrilaneError, match=r"^cpu 0, gpu 1, dsp 0: no driver$"):
+        trial._run(A, 2)
+    with pytest.raises(TrilaneError, match=r"^cpu 0, gpu 1, dsp 0: 19 frames were presented$"):
+        trial._run(A, 2)
+    assert trial._run(A, 2) == 7
+    options = {"policy": "pipelined", "edge": "double", "isolated_frames": 2, "starter": "starter"}
+    assert asked == [({"of": A}, "assets", options)] * 4
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        ({"cores": (3,)}, r"--cores: found \[3\], expected numbers from 1 to the 2 that this process may use"),
+        ({"cores": (1, -1)}, r"--cores: found \[1, -1\], "),
+        (
+            {"frames": 19},
+            "bench placement: found --frames 19, --rounds 6, --finalists 2",
+        ),
+        ({"rounds": 0}, "bench placement: found --frames 48, --rounds 0, --finalists 2"),
+        ({"finalists": 0}, "bench placement: found --frames 48, --rounds 6, --finalists 0"),
+    ],
+)
+def test_what_cannot_be_placed_is_refused(asked: dict[str, Any], words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(placement, "usable_cores", lambda: (0, 1))
+    with pytest.raises(BadInputError, match=f"^{words}"):
+        placement.measure(**asked)
+
+
+class Scene:
+    """What `bench planner` asks of a scene, told."""
+
+    ROWS: ClassVar = {"a": (1.5, 30.0, 31.0), "b": (0.5, 42.0, 41.75), "c": (2.5, 20.0, 19.875)}
+
+    def __init__(self, name: str, frames: int, runtime: str, *, video: bool) -> None:
+        self.name, self.asked = f"scene {name}", (frames, runtime, video)
+        self.speedup, self.fixed, self.planned = self.ROWS[name]
+        self.driver = {"renderer": f"driver of {name}"}
+
+    def compare(self, pictures: int) -> Any:
+        row = {"psnr_fixed_db": self.fixed, "psnr_planned_db": self.planned, "asked": (*self.asked, pictures)}
+        return row, [(3, np.full((2, 2, 3), 9, np.uint8))]
+
+    def time(self, rounds: int) -> Any:
+        return {"speedup": self.speedup, "rounds": rounds}
+
+
+def test_plans_are_compared_by_scene_and_in_all(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Speed-ups 1.5, 0.5 and 2.5; the planned pictures lose -1, 0.25 and 0.125 dB."""
+    monkeypatch.setattr(planner, "_Scene", Scene)
+    monkeypatch.setattr(planner, "require_metrics", lambda: None)
+    out = str(tmp_path / "pictures")
+    found = planner.measure(("a", "b", "c"), frames=20, rounds=4, pictures=2, runtime="ort", video=False, out=out)
+    assert found["scenes"][1] == {
+        "name": "scene b",
+        "speedup": 0.5,
+        "rounds": 4,
+        "psnr_fixed_db": 42.0,
+        "psnr_planned_db": 41.75,
+        "asked": (20, "ort", False, 2),
+    }
+    assert [row["name"] for row in found["scenes"]] == ["scene a", "scene b", "scene c"]
+    assert (found["median_speedup"], found["least_speedup"], found["largest_loss_db"]) == (1.5, 0.5, 0.25)
+    assert found["driver"] == {"renderer": "driver of c"}
+    assert found["config"] == {"frames": 20, "rounds": 4, "pictures": 2, "runtime": "ort", "video": False}
+    assert sorted(path.name for path in (tmp_path / "pictures").iterdir()) == [f"scene {name}-3.png" for name in "abc"]
+
+
+def test_both_plans_are_timed_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fixed 20, 30, 24; planned 10, 20, 8: ratios 2, 1.5, 3."""
+    told = iter([20.0, 10.0, 30.0, 20.0, 24.0, 8.0])
+    asked: list[Any] = []
+    monkeypatch.setattr(planner, "_frame_ms", lambda *what: asked.append(what) or next(told))
+    scene = object.__new__(planner._Scene)
+    scene.name, scene._plans = "s", {"fixed": "f", "planned": "p"}  # type: ignore[dict-item]
+    assert scene.time(3) == {
+        "speedup": 2.0,
+        "speedup_low": 1.5,
+        "speedup_high": 3.0,
+        "fixed_ms": 24.0,
+        "planned_ms": 10.0,
+    }
+    assert asked == [("f", "s, fixed"), ("p", "s, planned")] * 3
