@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -208,6 +209,22 @@ def test_measured_errors_are_those_of_the_drawn_vertices(checked: Checked) -> No
     drawn = places(plan._drawn[0].astype(np.float64))
     assert plan.measured_px(7, 0) == pytest.approx(np.nanmax(np.linalg.norm(exact - drawn, axis=1)), abs=1e-6)
     assert frame.plan.seen[0].level < len(DETAILS) - 1
+
+
+def test_a_vertex_is_on_the_picture_from_the_near_plane_to_the_far_one(checked: Checked) -> None:
+    """A camera that looks along -z from the origin, 90 degrees high and wide, near 1 and far 3: a point at depth d has
+    the clip depth 2 d - 3, from -1 to 3 = w, so the nearer half of the depths has a negative one."""
+    plan = ScenePlan(checked.config, checked.assets)
+    projection = np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, -2, -3], [0, 0, -1, 0]])
+    plan._staged = SimpleNamespace(  # type: ignore[assignment]
+        camera=SimpleNamespace(projection=lambda aspect: projection * aspect / (4 / 3), sample=lambda _t_s: np.eye(4))
+    )
+    points = np.array(
+        [(0.5, 0.5, -1.0), (0.6, -0.3, -1.2), (0, 0, -3), (0, 0, -0.99), (0, 0, -3.01), (0, 0, 2), (2, 0, -1.5)]
+    )
+    found = plan._places(points, 5)
+    np.testing.assert_allclose(found[:3], [(240, 60), (240, 150), (160, 120)])
+    assert np.isnan(found[3:]).all()
 
 
 def test_the_picture_shows_bodies_and_rectangles(checked: Checked, tmp_path: Path) -> None:

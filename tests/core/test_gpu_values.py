@@ -77,6 +77,18 @@ def test_the_avatars_mesh_is_the_bodys_and_is_the_same_from_the_cache(body_array
         assert found.weights_per_vertex == 8
 
 
+def test_a_closed_body_is_closed_from_the_cache_too(
+    body_arrays: Any, tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from trilane.body.body import load_body
+
+    np.savez(tmp_path / "body.npz", allow_pickle=False, **body_arrays)
+    shaped = load_body(tmp_path / "body.npz").shape()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr("trilane.stages.gpu.mesh_arrays.is_closed", lambda *_: True)
+    assert [avatar_mesh(shaped).closed for _ in range(2)] == [True, True]
+
+
 SQUARE = np.array([(0.0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (9, 9, 9)])
 
 

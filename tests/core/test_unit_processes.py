@@ -402,3 +402,22 @@ def test_the_report_of_a_run_is_complete_in_order_and_has_no_other_keys() -> Non
         metrics_of({**report, "speed": 1})
     with pytest.raises(ValueError, match="Input should be 'host' or 'virtual'"):
         metrics_of({**report, "clock": "wall"})
+
+
+def test_a_unit_that_ends_by_itself_is_waited_for_and_what_it_started_is_ended() -> None:
+    """Its shell leaves a sleeper in its group, and ends with 3 after a while."""
+    shell = subprocess.Popen(["sh", "-c", "sleep 60 & sleep 0.15; exit 3"], process_group=0)
+    process = object.__new__(unit_processes._Process)
+    process.pid, process.pidfd = shell.pid, os.pidfd_open(shell.pid)
+    process.wait()
+    os.close(process.pidfd)
+    assert shell.wait(5) == 3
+    left = [each for each in psutil.process_iter(["name"]) if each.pid != shell.pid and _group(each.pid) == shell.pid]
+    assert psutil.wait_procs(left, timeout=2)[1] == []
+
+
+def _group(pid: int) -> int | None:
+    try:
+        return os.getpgid(pid)
+    except (ProcessLookupError, PermissionError):
+        return None

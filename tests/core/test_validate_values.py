@@ -17,6 +17,7 @@ pytest.importorskip("skimage")
 from trilane.avatars.bundle import Bundle, load_bundle
 from trilane.avatars.digests import digests_of
 from trilane.training import dataset, evaluate, validate
+from trilane.training.image_error import image_error
 from trilane.training.random_poses import random_pose
 from trilane.training.validate import FloatNetwork, ValidationPlan
 
@@ -280,3 +281,30 @@ def test_the_integer_network_is_run_as_in_the_pipeline(monkeypatch):
     placement = evaluate.Placement("joints of 1", "projection 1", (0, 0, 4, 2))
     assert made[0].drawn[1] == (("target", (4, 2)), "view 1", placement)
     assert loaded == [((network, (2, 3)), 3), ((network, (4, 2)), 3)]
+
+
+@pytest.mark.parametrize(("side", "window"), [(12, 7), (8, 7), (6, 5), (3, 3)])
+def test_ssim_by_loops(side, window):
+    """Wang et al. (2004) with a flat window, as large as fits up to 7, and variances of a sample; over where it fits."""
+    rng = np.random.default_rng(side)
+    truth, picture = (rng.integers(0, 256, (side, side, 4), dtype=np.uint8) for _ in range(2))
+    truth[..., 3] = picture[..., 3] = 255
+    a, b = truth / 255, picture / 255
+    values = []
+    for row in range(side - window + 1):
+        for column in range(side - window + 1):
+            for channel in range(3):
+                x, y = (each[row : row + window, column : column + window, channel].ravel() for each in (a, b))
+                (xx, xy), (_, yy) = np.cov(x, y)
+                means, c1, c2 = x.mean() * y.mean(), 0.01**2, 0.03**2
+                top = (2 * means + c1) * (2 * xy + c2)
+                values.append(top / ((x.mean() ** 2 + y.mean() ** 2 + c1) * (xx + yy + c2)))
+    found = image_error(picture, truth)
+    assert found.ssim == pytest.approx(np.mean(values), rel=1e-9)
+    assert found.psnr_db == found.body_psnr_db == pytest.approx(-10 * np.log10(((a - b)[..., :3] ** 2).mean()))
+    assert (found.background, found.iou) == (0.0, 1.0)
+
+
+def test_a_picture_too_small_for_a_window_is_like():
+    truth = np.full((2, 9, 4), 255, np.uint8)
+    assert image_error(truth // 2 + 128, truth).ssim == 1.0
