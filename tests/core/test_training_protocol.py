@@ -1,8 +1,8 @@
 """What avatars are trained, quantised and validated with is held: printed/training-protocol.txt has every number.
 
-Rule: the committed avatar and its figures were made with these numbers; other ones make another avatar. A change is meant
-when the file is written anew (`TRILANE_WRITE_PRINTED=1`) and its difference is read. Read from the sources, so that the
-test needs no PyTorch.
+Rule: the committed avatar and its figures were made with these numbers; others make another avatar. A change is meant
+when the file is written anew (`TRILANE_WRITE_PRINTED=1`) and its difference is read. The numbers are read from the
+sources, since some of the modules need PyTorch.
 """
 
 from __future__ import annotations

@@ -285,7 +285,7 @@ def test_the_integer_network_is_run_as_in_the_pipeline(monkeypatch):
 
 @pytest.mark.parametrize(("side", "window"), [(12, 7), (8, 7), (6, 5), (3, 3)])
 def test_ssim_by_loops(side, window):
-    """Wang et al. (2004) with a flat window, as large as fits up to 7, and variances of a sample; over where it fits."""
+    """Wang et al. (2004) with a flat window, as large as fits up to 7, and variances of samples."""
     rng = np.random.default_rng(side)
     truth, picture = (rng.integers(0, 256, (side, side, 4), dtype=np.uint8) for _ in range(2))
     truth[..., 3] = picture[..., 3] = 255
