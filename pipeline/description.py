@@ -37,7 +37,7 @@ FACTORY = r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$"
 class Model(BaseModel):
     """Strict base: unknown keys are errors, values never change."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 def _header(value: Any) -> np.dtype[Any]:
