@@ -29,10 +29,13 @@ def product_of(node: Any, shapes: list[Shape], out: Shape) -> Product | None:
     `out`: shape of its first result.
     """
     if node.op_type in RECURRENT:
-        return _recurrent(shapes)
+        return _recurrent(shapes) if [len(shape) for shape in shapes[:3]] == [3, 3, 3] else None
     if node.op_type == "Einsum":
         return _einsum(node, shapes)
-    first, second = shapes[0], shapes[PRODUCTS[node.op_type]]
+    at = PRODUCTS[node.op_type]
+    if len(shapes) <= at or not shapes[0] or not shapes[at]:
+        return None
+    first, second = shapes[0], shapes[at]
     turned = {a.name: a.i for a in node.attribute if a.name in ("transA", "transB")}
     depth = first[-2] if turned.get("transA") else first[-1]
     width = 1 if len(second) == 1 else second[-2] if turned.get("transB") else second[-1]

@@ -1,0 +1,139 @@
+"""Reads any ONNX graph for its operators and shapes: float, quantised, or without weights.
+
+Rule: a file is a stranger's. Sizes are checked before anything is taken in, weights are forgotten as soon as their
+shape is known, and no other file is ever opened: data that a graph keeps beside it is only its weights' values, which
+nothing here needs.
+"""
+
+from __future__ import annotations
+
+import stat
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import onnx
+from google.protobuf.message import DecodeError
+from onnx import AttributeProto, TensorProto
+
+from trilane.errors import BadInputError
+from trilane.hw_profiles.graph_shapes import Shape, with_shapes
+from trilane.hw_profiles.graph_structure import check_structure, in_order
+from trilane.hw_profiles.graph_tensors import forget_data
+from trilane.hw_profiles.network_work import constant_tensors
+from trilane.hw_profiles.operator_kinds import CONVOLUTIONS, PRODUCTS
+from trilane.unexpected_value import UnexpectedValue
+
+MAX_BYTES = 512 << 20
+MAX_NODES = 50_000
+#: Before it, operators broadcast only where an attribute said so; a graph of that time has other shapes.
+OLDEST_OPSET = 7
+NOT_A_FILE = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
+EXPORT_AGAIN = "copy or export it again: it may be cut short"
+
+#: What a file says of its numbers: 8-bit weights and activations, floats, or nothing, as it has no weights.
+Numbers = Literal["w8a8", "float", "not said"]
+
+
+class GraphFile(NamedTuple):
+    """A checked graph. `model`: with a static shape for every tensor and without the values of weights."""
+
+    path: Path
+    model: onnx.ModelProto
+    numbers: Numbers
+
+
+def read_graph(path: Path, input_shapes: Mapping[str, Shape] | None = None) -> GraphFile:
+    """The graph in the file, with static shapes.
+
+    `path`: of an ONNX file.
+    `input_shapes`: of inputs by name, in place of what the file says.
+    Raises BadInputError that says what is wrong and how to mend it.
+    """
+    model = _parse(path)
+    try:
+        _check_version(model)
+        _check_names(model)
+        check_structure(model.graph)
+        for tensor in _tensors(model):
+            forget_data(tensor, path.parent)
+        in_order(model.graph)
+        model = with_shapes(model, input_shapes or {})
+    except UnexpectedValue as error:
+        raise BadInputError.at(path, error) from None
+    return GraphFile(path, model, _numbers(model))
+
+
+def _parse(path: Path) -> onnx.ModelProto:
+    expected = f"an ONNX file of at most {MAX_BYTES >> 20} MiB"
+    try:
+        facts = path.stat()
+        if not stat.S_ISREG(facts.st_mode):
+            raise BadInputError(path, NOT_A_FILE.get(stat.S_IFMT(facts.st_mode), "a device"), expected)
+        if facts.st_size == 0:
+            raise BadInputError(path, "an empty file", expected, EXPORT_AGAIN)
+        if facts.st_size > MAX_BYTES:
+            remedy = "keep its weights beside it: onnx.save(model, path, save_as_external_data=True)"
+            raise BadInputError(path, f"{facts.st_size >> 20} MiB", expected, remedy)
+        return onnx.load_model_from_string(path.read_bytes())
+    except OSError as error:
+        raise BadInputError.of_os_error(path, error, expected) from None
+    except ValueError as error:
+        raise BadInputError(path, str(error), expected) from None
+    except DecodeError:
+        raise BadInputError(path, "bytes that do not parse", expected, EXPORT_AGAIN) from None
+
+
+def _check_version(model: onnx.ModelProto) -> None:
+    newest = onnx.defs.onnx_opset_version()
+    versions = [entry.version for entry in model.opset_import if entry.domain in ("", "ai.onnx")]
+    if not model.graph.node:
+        raise UnexpectedValue("no operators", "a graph with operators", EXPORT_AGAIN)
+    if len(versions) != 1:
+        raise UnexpectedValue(f"{len(versions)} operator sets of ONNX", "one in opset_import", EXPORT_AGAIN)
+    if not OLDEST_OPSET <= versions[0] <= newest:
+        remedy = "convert it: onnx.version_converter.convert_version(model, 17)"
+        raise UnexpectedValue(f"operator set {versions[0]}", f"{OLDEST_OPSET} to {newest}", remedy)
+    if len(model.graph.node) > MAX_NODES:
+        raise UnexpectedValue(f"{len(model.graph.node)} operators", f"at most {MAX_NODES}")
+    if model.functions:
+        names = ", ".join(function.name for function in model.functions[:3])
+        remedy = "put them in place: onnx.inliner.inline_local_functions(model)"
+        raise UnexpectedValue(f"functions of its own ({names})", "operators only", remedy)
+
+
+def _check_names(model: onnx.ModelProto) -> None:
+    """A name whose bytes are no UTF-8 is given as bytes."""
+    graph = model.graph
+    names = [entry.name for entry in (*graph.input, *graph.output, *graph.initializer)]
+    for node in graph.node:
+        names += [node.name, node.op_type, node.domain, *node.input, *node.output, *(a.name for a in node.attribute)]
+    wrong = [name for name in names if not isinstance(name, str)]
+    if wrong:
+        raise UnexpectedValue(f"the name {wrong[0]!r}", "text in UTF-8", EXPORT_AGAIN)
+
+
+def _tensors(model: onnx.ModelProto) -> Iterator[TensorProto]:
+    yield from model.graph.initializer
+    for node in model.graph.node:
+        for attribute in node.attribute:
+            if attribute.type == AttributeProto.TENSOR:
+                yield attribute.t
+            yield from attribute.tensors
+
+
+def _numbers(model: onnx.ModelProto) -> Numbers:
+    """In integers is a graph whose layers get dequantised activations, or one with layers of integers."""
+    graph, constants = model.graph, constant_tensors(model.graph)
+    dequantised = {
+        name
+        for node in graph.node
+        if node.op_type == "DequantizeLinear" and node.input[0] not in constants
+        for name in node.output
+    }
+    layers = [node for node in graph.node if node.op_type in CONVOLUTIONS or node.op_type in PRODUCTS]
+    if any(node.input[0] in dequantised or "Integer" in node.op_type or "QLinear" in node.op_type for node in layers):
+        return "w8a8"
+    weights = {name for node in layers for name in node.input[1:] if name in constants}
+    given = {value.name for value in graph.input}
+    return "not said" if weights & given else "float"

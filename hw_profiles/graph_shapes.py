@@ -1,0 +1,192 @@
+"""Static shapes of all tensors of a graph, by ONNX's own inference.
+
+Rule: a shape is inferred, or the file states it where ONNX knows no rule; a shape that stays unknown is an error that
+names the first operator behind it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from math import prod
+from typing import Any
+
+import onnx
+from onnx import TensorProto
+
+from trilane.hw_profiles.graph_structure import EXPORT_AGAIN, called
+from trilane.hw_profiles.graph_tensors import KEPT_ELEMENTS, check_size
+from trilane.hw_profiles.network_work import constant_tensors
+from trilane.hw_profiles.operator_kinds import CONVOLUTIONS
+from trilane.unexpected_value import UnexpectedValue
+
+Shape = tuple[int, ...]
+LONGEST_FOUND = 240
+SIZES_INSIDE = "save it with small tensors inside: onnx.save(..., size_threshold=1024)"
+#: Operators whose result has the shape of their first input, though ONNX does not infer it. They are looked at as
+#: another operator that says the same of shapes and types.
+STAND_INS = {
+    ("", "GroupNormalization"): "Identity",
+    ("com.microsoft", "BiasGelu"): "Identity",
+    ("com.microsoft", "FastGelu"): "Identity",
+    ("com.microsoft", "Gelu"): "Identity",
+    ("com.microsoft", "QuickGelu"): "Identity",
+    ("com.microsoft", "SkipLayerNormalization"): "Identity",
+    ("com.microsoft", "QuantizeLinear"): "QuantizeLinear",
+    ("com.microsoft", "DequantizeLinear"): "DequantizeLinear",
+}
+
+
+def with_shapes(model: onnx.ModelProto, given: Mapping[str, Shape]) -> onnx.ModelProto:
+    """`model` with the shape of every tensor among its value_info.
+
+    `model`: is changed.
+    `given`: shapes of inputs by name, instead of those of the file.
+    Raises UnexpectedValue where a shape is unknown, contradictory or too large.
+    """
+    weights = {tensor.name for tensor in model.graph.initializer}
+    inputs = [value for value in model.graph.input if value.name not in weights]
+    _give(model.graph, inputs, given)
+    for value in inputs:
+        _check_input(value)
+    inferred = _inferred(model)
+    _check_all(model.graph, inferred)
+    _check_convolutions(model.graph, inferred)
+    del model.graph.value_info[:]
+    model.graph.value_info.extend(inferred.values())
+    del model.graph.input[:]
+    model.graph.input.extend(inputs)
+    for output in model.graph.output:
+        output.CopyFrom(inferred.get(output.name, output))
+    return model
+
+
+def _give(graph: onnx.GraphProto, inputs: Sequence[onnx.ValueInfoProto], given: Mapping[str, Shape]) -> None:
+    """Set the shapes of inputs. What the file says of other shapes may be wrong then, and is forgotten."""
+    changed = [value for value in inputs if value.name in given]
+    for value in changed:
+        kind = value.type.tensor_type
+        if kind.HasField("shape") and len(kind.shape.dim) != len(given[value.name]):
+            shown = "x".join(map(str, given[value.name]))
+            raise UnexpectedValue(f"--input-shape {value.name}={shown}", f"{len(kind.shape.dim)} sizes", _shown(value))
+        value.CopyFrom(onnx.helper.make_tensor_value_info(value.name, kind.elem_type, given[value.name]))
+    if changed:
+        del graph.value_info[:]
+        for output in graph.output:
+            output.type.tensor_type.ClearField("shape")
+
+
+def _check_input(value: onnx.ValueInfoProto) -> None:
+    kind = value.type.tensor_type
+    sizes = _sizes(value)
+    if sizes is None:
+        known = [str(d.dim_value) if d.dim_value > 0 else "N" for d in kind.shape.dim]
+        shape = "x".join(["1", *known[1:]] if known[:1] == ["N"] else known) or "1x3x224x224"
+        remedy = f"give it: --input-shape {value.name}={shape}" + (", a number for each N" if "N" in shape else "")
+        raise UnexpectedValue(f"input {_shown(value)}", "fixed sizes of 1 and more", remedy)
+    check_size(sizes, kind.elem_type, f"input {value.name!r}")
+
+
+def _inferred(model: onnx.ModelProto) -> dict[str, onnx.ValueInfoProto]:
+    """The shape of each tensor that is known, by name."""
+    looked_at = model
+    if any((node.domain, node.op_type) in STAND_INS for node in model.graph.node):
+        looked_at = onnx.ModelProto()
+        looked_at.CopyFrom(model)
+        for node in looked_at.graph.node:
+            if stand_in := STAND_INS.get((node.domain, node.op_type)):
+                _replace(node, stand_in)
+    try:
+        result = onnx.shape_inference.infer_shapes(looked_at, strict_mode=True, data_prop=True)
+    except (onnx.shape_inference.InferenceError, RuntimeError, ValueError) as error:
+        found = " ".join(str(error).replace("Inference error(s):", "").split())[:LONGEST_FOUND]
+        remedy = SIZES_INSIDE if _keeps_sizes_outside(model.graph) else "export it again"
+        raise UnexpectedValue(f"shapes that do not fit: {found}", "operators whose inputs fit", remedy) from None
+    return {value.name: value for value in (*result.graph.value_info, *result.graph.output)}
+
+
+def _replace(node: onnx.NodeProto, op_type: str) -> None:
+    inputs = node.input[:1] if op_type == "Identity" else node.input
+    node.CopyFrom(onnx.helper.make_node(op_type, inputs, node.output[:1], node.name))
+
+
+def _check_all(graph: onnx.GraphProto, inferred: Mapping[str, onnx.ValueInfoProto]) -> None:
+    constants = constant_tensors(graph)
+    for node in graph.node:
+        for name in node.output:
+            if not name or (name in constants and _sizes(inferred.get(name), least=0) is not None):
+                continue
+            sizes = _sizes(inferred.get(name))
+            if sizes is None:
+                raise _unknown(graph, node, inferred.get(name), name)
+            check_size(sizes, inferred[name].type.tensor_type.elem_type, f"the result of {called(node)}")
+
+
+def _check_convolutions(graph: onnx.GraphProto, inferred: Mapping[str, onnx.ValueInfoProto]) -> None:
+    """What ONNX does not look at: whether the weight has as many channels as what it is given and what comes out."""
+    shapes = {tensor.name: tuple(tensor.dims) for tensor in graph.initializer}
+    shapes |= {value.name: _sizes(value, least=0) or () for value in (*graph.input, *inferred.values())}
+    for node in graph.node:
+        if node.op_type not in CONVOLUTIONS:
+            continue
+        at = CONVOLUTIONS[node.op_type]
+        if len(node.input) <= at:
+            raise UnexpectedValue(f"{called(node)} without a weight", "one", EXPORT_AGAIN)
+        source, weight, result = (shapes[name] for name in (node.input[0], node.input[at], node.output[0]))
+        groups = next((a.i for a in node.attribute if a.name == "group"), 1)
+        if not _channels_fit(node.op_type == "ConvTranspose", source, weight, result, groups):
+            sizes = ", ".join("x".join(map(str, shape)) for shape in (source, weight, result))
+            found = f"{called(node)} from {sizes.replace(', ', ' by ', 1).replace(', ', ' to ')} in {groups} groups"
+            raise UnexpectedValue(found, "channels that fit", EXPORT_AGAIN)
+
+
+def _channels_fit(transposed: bool, source: Shape, weight: Shape, result: Shape, groups: int) -> bool:
+    """Whether a convolution can be. `weight`: (out, in, ...), or (in, out, ...) of a transposed one, by group."""
+    if not (groups > 0 and len(source) == len(weight) == len(result) > 2):
+        return False
+    if transposed:
+        return weight[0] == source[1] and weight[1] * groups == result[1] and source[1] % groups == 0
+    return weight[0] == result[1] and weight[1] * groups == source[1] and result[1] % groups == 0 and min(weight) > 0
+
+
+def _unknown(
+    graph: onnx.GraphProto, node: onnx.NodeProto, value: onnx.ValueInfoProto | None, name: str
+) -> UnexpectedValue:
+    found = f"no static shape for {_shown(value) if value is not None else repr(name)}, made by {called(node)}"
+    if _keeps_sizes_outside(graph):
+        remedy = SIZES_INSIDE
+    elif not _has_schema(node):
+        remedy = "ONNX has no such operator: state the shape of its result in the graph's value_info"
+    else:
+        remedy = "export it with fixed sizes; a result whose size depends on the picture cannot be priced"
+    return UnexpectedValue(found, "fixed sizes of 1 and more", remedy)
+
+
+def _keeps_sizes_outside(graph: onnx.GraphProto) -> bool:
+    """Whether the data of a small tensor of integers, as sizes and axes are, is in another file."""
+    return any(
+        tensor.data_type == TensorProto.INT64 and 0 < prod(tensor.dims) <= KEPT_ELEMENTS
+        for tensor in graph.initializer
+        if not tensor.raw_data and not tensor.int64_data
+    )
+
+
+def _has_schema(node: onnx.NodeProto) -> bool:
+    return bool(onnx.defs.has(node.op_type, node.domain))
+
+
+def _sizes(value: Any, least: int = 1) -> Shape | None:
+    """The static shape of a tensor of sizes from `least` on; None when it has none."""
+    if value is None or not value.type.tensor_type.HasField("shape"):
+        return None
+    dims = value.type.tensor_type.shape.dim
+    if all(d.HasField("dim_value") and d.dim_value >= least for d in dims):
+        return tuple(d.dim_value for d in dims)
+    return None
+
+
+def _shown(value: onnx.ValueInfoProto) -> str:
+    kind = value.type.tensor_type
+    if not kind.HasField("shape"):
+        return f"{value.name!r} of unknown shape"
+    sizes = (str(d.dim_value) if d.HasField("dim_value") else d.dim_param or "?" for d in kind.shape.dim)
+    return f"{value.name!r} of [{', '.join(sizes)}]"
