@@ -41,7 +41,8 @@ FAULT: Final = 0
 EVENT: Final = 1
 
 
-def _none_skips(_frame: int, _fresh: bool) -> bool:
+def none_skips(_frame: int, _fresh: bool) -> bool:
+    """No frame does."""
     return False
 
 
@@ -77,7 +78,7 @@ class VirtualDriver:
         restart_ns: int = 1_000_000_000,
         faults: Iterable[tuple[int, str]] = (),
         inputs: Iterable[tuple[int, Event]] = (),
-        skips: Skips = _none_skips,
+        skips: Skips = none_skips,
         keep: bool = False,
     ) -> None:
         """All times are `int`, those of `service` too (no NumPy integers).

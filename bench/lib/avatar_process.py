@@ -1,0 +1,119 @@
+"""Runs of an avatar, each asked of a process of its own, so that two can go on at once on the same cores.
+
+Rule: the process is what `trilane run` is: its own scheduler, its own units; two of them share nothing but the machine.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from trilane.errors import TrilaneError
+from trilane.scheduler.ledger import JobRecord
+
+START_S, RUN_S = 120.0, 600.0
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A run's avatar and scene, as `trilane.stages.configure.Request` has them. `cores`: that its units share."""
+
+    scene: str
+    avatar: str | None
+    size: str | None
+    frames: int
+    runtime: str
+    cores: tuple[int, ...]
+    video: bool
+    edge: str = "double"
+
+
+class Ran(NamedTuple):
+    """`jobs`: all that ended. `seats`: unit -> its cores, as text."""
+
+    jobs: tuple[JobRecord, ...]
+    seats: dict[str, str]
+
+
+class AvatarProcess:
+    """The parent's end."""
+
+    def __init__(self, pipe: Connection, name: str) -> None:
+        self._pipe, self._name = pipe, name
+
+    def begin(self, policy: str) -> None:
+        """A run under `policy` begins."""
+        self._pipe.send(policy)
+
+    def result(self) -> Ran:
+        """Of the run that was begun. Raises TrilaneError when it failed."""
+        return Ran(*self.receive(RUN_S))
+
+    def receive(self, wait_s: float) -> Any:
+        """The process's next answer. Raises TrilaneError."""
+        if not self._pipe.poll(wait_s):
+            raise TrilaneError(f"{self._name}: no answer in {wait_s:g} s")
+        try:
+            answer = self._pipe.recv()
+        except EOFError as error:
+            raise TrilaneError(f"{self._name}: its process ended") from error
+        if isinstance(answer, str):
+            raise TrilaneError(f"{self._name}: {answer}")
+        return answer
+
+
+@contextmanager
+def avatar_processes(asked: Sequence[Asked]) -> Iterator[list[AvatarProcess]]:
+    """A process for each, ready to run; they end with the block. Raises TrilaneError when one does not start."""
+    context = multiprocessing.get_context("spawn")
+    processes, pipes = [], []
+    try:
+        for each in asked:
+            ours, theirs = context.Pipe()
+            process = context.Process(target=serve, args=(theirs, each), daemon=True)
+            process.start()
+            theirs.close()
+            processes.append(process)
+            pipes.append(ours)
+        found = [AvatarProcess(pipe, each.scene) for pipe, each in zip(pipes, asked, strict=True)]
+        for one in found:
+            one.receive(START_S)
+        yield found
+    finally:
+        for pipe in pipes:
+            pipe.close()
+        for process in processes:
+            process.join(5)
+            process.kill()
+
+
+def serve(pipe: Connection, asked: Asked) -> None:
+    """The process: say that it is ready, then run under each policy that comes, until `pipe` closes."""
+    from trilane.hw_profiles.host import host_units
+    from trilane.stages.avatar_pipeline import run_avatar
+    from trilane.stages.configure import Request, configure
+
+    try:
+        request = Request(asked.scene, avatar=asked.avatar, size=asked.size, frames=asked.frames, runtime=asked.runtime)
+        checked = configure(request, Path.cwd()).changed(units=host_units(asked.cores), record=asked.video)
+        seats = {unit: ",".join(map(str, settings.cores)) for unit, settings in checked.config.units.items()}
+        pipe.send(True)
+        while True:
+            policy = pipe.recv()
+            with tempfile.TemporaryDirectory(prefix="trilane-bench-") as folder:
+                placed = checked.changed(out_dir=Path(folder))
+                result = run_avatar(placed.config, placed.assets, policy=policy, edge=asked.edge, isolated_frames=0)
+            if result.failure is not None:
+                pipe.send(result.failure.message)
+                return
+            pipe.send(([tuple(job) for job in result.jobs], seats))
+    except (EOFError, BrokenPipeError):
+        return
+    except Exception as error:
+        pipe.send(f"{type(error).__name__}: {error}")

@@ -1,0 +1,309 @@
+"""Several pipelines in virtual time, each with a core of its own, on the same hardware.
+
+Rule: nothing here decides which job a pipeline does next; that is its core's part. What is decided here is whose job a
+unit takes that several have handed one to (turns.py), and how fast the jobs go on that run at the same time.
+
+Theory of operation. Each pipeline has its own `Core` with its own policy, ledger and recording, as two applications on
+one phone have, and none knows of the others. A unit of a pipeline stands for a *seat*: the hardware that does its jobs.
+On a seat with turns one job runs at a time; the others wait, and their units are preempted. On a seat that is *divided*,
+such as a core of this machine between whose processes the kernel switches, all jobs run at once, each with an equal
+share. A unit does its own jobs in the order in which they were handed to it.
+
+One instant: first all events and all deadlines of the cores at that time, each of which is a step of one core; only then
+are jobs begun, so that of all jobs that are ready at one time none is passed over because it was named later. Jobs that
+run change their speed when others begin or end: what is left of a job is kept as a whole number of ns / `ONE`.
+
+Accounts. A job that waits while another pipeline has its seat was preempted before (`JobDone.preempted_before_ns`); on a
+divided seat it is preempted within (`preempted_ns`). A job that the memory makes slower is busy all the while.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from heapq import heappop, heappush
+from typing import Any, Final, NamedTuple
+
+from trilane.scheduler.causes import Outcome
+from trilane.scheduler.core import Core
+from trilane.scheduler.events import NEVER, Action, Dispatch, Event, Graph, Job, JobDone, Settings, UnitReady
+from trilane.scheduler.ledger import JobRecord
+from trilane.scheduler.recording import Recording
+from trilane.scheduler.turns import ROUND_ROBIN, Waiting, turns_named
+from trilane.scheduler.virtual import Service, Simulation, Skips, none_skips
+
+#: The speed of a job that nothing slows. Divisible by 1 to 10, so that equal shares of a core are exact.
+ONE: Final = 2520 * 1024
+
+
+@dataclass(frozen=True)
+class Member:
+    """One of the pipelines.
+
+    `graph`, `settings`: of its core. `service`: gives the service time of each job, in ns, on hardware that no other
+    pipeline uses meanwhile. `seats`: unit -> the seat that does its jobs; a unit that is not in it has the seat of its
+    own name. `skips`: which frames take the bypass of the graph. `inputs`: (t_ns, event), events from outside, such as
+    `Stop`.
+    """
+
+    graph: Graph
+    settings: Settings
+    service: Service
+    seats: Mapping[str, str] = field(default_factory=dict)
+    skips: Skips = none_skips
+    inputs: tuple[tuple[int, Event], ...] = ()
+
+
+@dataclass(frozen=True)
+class Runs:
+    """A job that runs: number of its pipeline, stage, unit, seat and frame."""
+
+    member: int
+    stage: str
+    unit: str
+    seat: str
+    frame: int
+
+
+#: (a job that runs, the others that run) -> its speed beside them, of `ONE`, above 0. It knows of no shares of a seat.
+Speed = Callable[[Runs, Sequence[Runs]], int]
+
+
+class _Waits(NamedTuple):
+    """A job that was handed to its unit. `order`: of all jobs of the run."""
+
+    job: Job
+    order: int
+    dispatch_ns: int
+
+
+class _Running:
+    """`left`: of its work, ns * ONE. `speed`: now, `held`: its seat's share in it. `had`: of its seat so far, ns * ONE.
+
+    `preempted_before_ns`: how long its unit waited for its seat, since the job was there and the one before was done.
+    """
+
+    __slots__ = ("begin_ns", "had", "held", "left", "preempted_before_ns", "runs", "speed", "waited")
+
+    def __init__(self, waited: _Waits, runs: Runs, begin_ns: int, service_ns: int, preempted_before_ns: int) -> None:
+        self.waited, self.runs, self.begin_ns = waited, runs, begin_ns
+        self.left, self.preempted_before_ns = service_ns * ONE, preempted_before_ns
+        self.speed = self.held = ONE
+        self.had = 0
+
+    def end_ns(self, now_ns: int) -> int:
+        """When it ends if its speed stays; one that has nothing left ends now."""
+        return now_ns - (-self.left // self.speed) if self.left > 0 else now_ns
+
+
+class _Unit:
+    """A unit of one pipeline. `queue`: its jobs that wait."""
+
+    __slots__ = ("is_running", "last_end_ns", "name", "queue", "seat")
+
+    def __init__(self, name: str, seat: str) -> None:
+        self.name, self.seat = name, seat
+        self.queue: deque[_Waits] = deque()
+        self.is_running = False
+        self.last_end_ns = 0
+
+
+class _Line:
+    """A pipeline under way."""
+
+    def __init__(self, number: int, member: Member, keep: bool) -> None:
+        self.number, self.member = number, member
+        self.core = Core(member.graph, member.settings)
+        self.recording = Recording(member.graph, member.settings) if keep else None
+        self.jobs: list[JobRecord] = []
+        self.units = {name: _Unit(name, member.seats.get(name, name)) for name in member.graph.units}
+        self.deadline_ns: int = NEVER
+        self.bypass_begin = member.graph.bypass[0] if member.graph.bypass is not None else ""
+
+
+class BesideDriver:
+    """The clock of several cores. Equal inputs give equal runs."""
+
+    def __init__(
+        self,
+        members: Sequence[Member],
+        *,
+        turns: str = ROUND_ROBIN,
+        divided: Iterable[str] = (),
+        speed: Speed | None = None,
+        keep: bool = False,
+    ) -> None:
+        """`members`: the pipelines.
+
+        `turns`: of `TURNS`, on every seat that is not among the `divided` ones.
+        `speed`: how fast jobs are beside each other; None: a job is slowed by nothing but shares of its seat.
+        `keep`: record the steps of each core, and the jobs that end.
+        Raises ValueError for an unknown policy, edge or rule of turns.
+        """
+        self._choose, self._divided, self._speed = turns_named(turns), frozenset(divided), speed
+        self.lines = [_Line(number, member, keep) for number, member in enumerate(members)]
+        self._heap: list[tuple[int, int, int, Event]] = []
+        self._running: list[_Running] = []
+        self._last: dict[str, int] = {}
+        self._now_ns = self._order = 0
+        self._is_changed = False
+        for line in self.lines:
+            for unit in line.member.graph.units:
+                self._push(0, line.number, UnitReady(unit))
+            for at_ns, event in line.member.inputs:
+                self._push(at_ns, line.number, event)
+
+    def run(self) -> list[Outcome]:
+        """Until every core finishes. Raises RuntimeError when nothing can ever happen again."""
+        while not all(line.core.finished for line in self.lines):
+            self._advance(self._next_ns())
+            while self._step_one():
+                pass
+            self._begin_jobs()
+            if self._is_changed:
+                self._set_speeds()
+        return [line.core.outcome for line in self.lines if line.core.outcome is not None]
+
+    def _next_ns(self) -> int:
+        """When something happens next."""
+        at_ns = min((line.deadline_ns for line in self.lines), default=NEVER)
+        if self._heap:
+            at_ns = min(at_ns, self._heap[0][0])
+        for running in self._running:
+            at_ns = min(at_ns, running.end_ns(self._now_ns))
+        if at_ns >= NEVER:
+            raise RuntimeError("the simulation stands still: no event and no deadline is left")
+        return at_ns
+
+    def _advance(self, now_ns: int) -> None:
+        passed_ns, self._now_ns = now_ns - self._now_ns, now_ns
+        if passed_ns:
+            for running in self._running:
+                running.left -= passed_ns * running.speed
+                running.had += passed_ns * running.held
+
+    def _step_one(self) -> bool:
+        """Tell one core of one thing that happens now: an event from outside, a job's end, its deadline; else False."""
+        now_ns = self._now_ns
+        if self._heap and self._heap[0][0] <= now_ns:
+            _, _, number, event = heappop(self._heap)
+            self._step(self.lines[number], (event,))
+            return True
+        ended = [running for running in self._running if running.left <= 0]
+        if ended:
+            self._end(min(ended, key=lambda running: running.waited.order))
+            return True
+        for line in self.lines:
+            if line.deadline_ns <= now_ns:
+                self._step(line, ())
+                return True
+        return False
+
+    def _step(self, line: _Line, events: tuple[Event, ...]) -> None:
+        if line.core.finished:
+            return
+        actions, line.deadline_ns = line.core.step(self._now_ns, events)
+        for action in actions:
+            if type(action) is Dispatch:
+                self._order += 1
+                line.units[action.job.unit].queue.append(_Waits(action.job, self._order, self._now_ns))
+            else:
+                self._check(line, action)
+        if line.recording is not None:
+            line.recording.add(self._now_ns, events, actions, line.core)
+
+    @staticmethod
+    def _check(line: _Line, action: Action) -> None:
+        """Raises RuntimeError for one that only a unit that hangs calls for: here a job ends, however long it takes."""
+        if not line.core.finished:
+            raise RuntimeError(f"{action} of pipeline {line.number}: its hang_ns is shorter than a job takes")
+
+    def _end(self, running: _Running) -> None:
+        """The job is done; its seat is free for the next one."""
+        self._running.remove(running)
+        self._is_changed = True
+        line, job, now_ns = self.lines[running.runs.member], running.waited.job, self._now_ns
+        unit = line.units[job.unit]
+        unit.is_running, unit.last_end_ns = False, now_ns
+        begin_ns, before_ns = running.begin_ns, running.preempted_before_ns
+        preempted_ns = now_ns - begin_ns - running.had // ONE
+        if line.recording is not None and job.frame in line.core.frames:
+            ready_ns = line.core.frames[job.frame].ready_ns
+            times = (ready_ns, running.waited.dispatch_ns, begin_ns, now_ns, preempted_ns, 0, before_ns)
+            line.jobs.append(JobRecord(job.stage, job.unit, job.frame, *times))
+        skips = job.stage == line.bypass_begin and line.member.skips(job.frame, job.fresh)
+        done = JobDone(job.unit, job.id, begin_ns, now_ns, begin_ns, preempted_ns, 0, before_ns, skips)
+        self._step(line, (done,))
+
+    def _begin_jobs(self) -> None:
+        """Begin what can begin: on a divided seat the first job of each unit, on any other one job."""
+        waiting: dict[str, list[tuple[_Line, _Unit]]] = {}
+        for line in self.lines:
+            for unit in line.units.values():
+                if unit.queue and not unit.is_running:
+                    waiting.setdefault(unit.seat, []).append((line, unit))
+        taken = {running.runs.seat for running in self._running}
+        for seat, those in waiting.items():
+            if seat in self._divided:
+                for line, unit in those:
+                    self._begin(line, unit)
+            elif seat not in taken:
+                self._begin(*self._next_in(seat, those))
+
+    def _next_in(self, seat: str, those: Sequence[tuple[_Line, _Unit]]) -> tuple[_Line, _Unit]:
+        last, count = self._last.get(seat, -1), len(self.lines)
+        found: dict[Waiting, tuple[_Line, _Unit]] = {}
+        for line, unit in those:
+            job, order, _ = unit.queue[0]
+            behind = (line.number - last - 1) % count
+            found[Waiting(behind, line.core.frames[job.frame].deadline_ns, order)] = line, unit
+        return found[self._choose(list(found))]
+
+    def _begin(self, line: _Line, unit: _Unit) -> None:
+        waited = unit.queue.popleft()
+        job = waited.job
+        now_ns = self._now_ns
+        unit.is_running = self._is_changed = True
+        self._last[unit.seat] = line.number
+        service_ns = line.member.service(job.stage, unit.name, job.frame, now_ns)
+        runs = Runs(line.number, job.stage, unit.name, unit.seat, job.frame)
+        before_ns = now_ns - max(waited.dispatch_ns, unit.last_end_ns)
+        self._running.append(_Running(waited, runs, now_ns, service_ns, before_ns))
+
+    def _set_speeds(self) -> None:
+        """Of all jobs that run, now that others began or ended."""
+        self._is_changed = False
+        if not self._divided and self._speed is None:
+            return
+        for running in self._running:
+            seat = running.runs.seat
+            running.held = ONE
+            if seat in self._divided:
+                running.held = ONE // sum(other.runs.seat == seat for other in self._running)
+            running.speed = running.held
+            if self._speed is not None:
+                others = [other.runs for other in self._running if other is not running]
+                running.speed = max(1, running.held * self._speed(running.runs, others) // ONE)
+
+    def _push(self, at_ns: int, number: int, event: Event) -> None:
+        self._order += 1
+        heappush(self._heap, (at_ns, self._order, number, event))
+
+
+def simulate_beside(members: Sequence[Member], *, keep: bool = False, **driver: Any) -> list[Simulation]:
+    """Run all `members` to their ends, and what each hands back, in their order.
+
+    `keep`, `driver`: see BesideDriver. Raises as it does.
+    """
+    beside = BesideDriver(members, keep=keep, **driver)
+    outcomes = beside.run()
+    return [
+        Simulation(
+            line.core.ledger.report(clock="virtual", requested=line.core.source.released),
+            line.recording,
+            tuple(line.jobs),
+            outcome,
+        )
+        for line, outcome in zip(beside.lines, outcomes, strict=True)
+    ]
