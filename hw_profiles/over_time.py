@@ -6,10 +6,12 @@ else changes the power.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Protocol
 
 from trilane.errors import BadInputError
-from trilane.hw_profiles.application import Plan, Steady, steady
+from trilane.hw_profiles.application import Plan, steady
 from trilane.hw_profiles.performance_profiles import Corners, corners_of
 from trilane.hw_profiles.schema import CORNERS, Profile
 from trilane.hw_profiles.thermal_state import ThermalState
@@ -36,6 +38,16 @@ class Moment:
     corners: Corners
 
 
+class Settled(Protocol):
+    """What runs at constant corners, once it has settled. `frame_ms`: its frame time. `busy`: share of each unit."""
+
+    @property
+    def frame_ms(self) -> float: ...
+
+    @property
+    def busy(self) -> Mapping[str, float]: ...
+
+
 def over_time(
     profile: Profile, plan: Plan, performance_profile: str, minutes: float, governor: str | None = None
 ) -> list[Moment]:
@@ -48,6 +60,17 @@ def over_time(
     `governor`: of GOVERNORS; None for the profile's own.
     Raises BadInputError for an unknown name or a time out of range.
     """
+    return warm_up(profile, lambda corners: steady(profile, plan, corners), performance_profile, minutes, governor)
+
+
+def warm_up(
+    profile: Profile,
+    at: Callable[[Corners], Settled],
+    performance_profile: str,
+    minutes: float,
+    governor: str | None = None,
+) -> list[Moment]:
+    """`over_time` of whatever settles `at` given corners as it says; it is asked once for each."""
     name = governor or profile.thermal.governor
     if name not in GOVERNORS:
         raise BadInputError("governor", repr(name), " or ".join(GOVERNORS))
@@ -55,12 +78,12 @@ def over_time(
         raise BadInputError("minutes", f"{minutes:g}", f"above 0, at most {MAX_MINUTES}")
     requested = dict(zip(UNITS, map(CORNERS.index, corners_of(profile, performance_profile)), strict=True))
     thermal_state, throttle, moments = ThermalState.at_rest(profile), Throttle(), []
-    poll_s, steady_at = profile.thermal.poll_s.or_else(1.0), dict[Corners, Steady]()
+    poll_s, steady_at = profile.thermal.poll_s.or_else(1.0), dict[Corners, Settled]()
     for tick in range(max(1, round(60 * minutes / poll_s))):
         cpu, gpu, dsp = (CORNERS[throttle.corner_index(unit, requested[unit])] for unit in UNITS)
         corners = (cpu, gpu, dsp)
         if corners not in steady_at:
-            steady_at[corners] = steady(profile, plan, corners)
+            steady_at[corners] = at(corners)
         now = steady_at[corners]
         power = unit_power_w(profile, now, corners)
         thermal_state.advance(profile, power, poll_s)
@@ -73,7 +96,7 @@ def over_time(
     return moments
 
 
-def unit_power_w(profile: Profile, now: Steady, corners: Corners) -> dict[UnitName, float]:
+def unit_power_w(profile: Profile, now: Settled, corners: Corners) -> dict[UnitName, float]:
     """Mean power in watts of each unit while the application runs as in `now` with the units at `corners`."""
     return {
         name: profile.units[name].power_w(corner, now.busy[name]) for name, corner in zip(UNITS, corners, strict=True)

@@ -5,16 +5,16 @@ unit takes that several have handed one to (turns.py), and how fast the jobs go 
 
 Theory of operation. Each pipeline has its own `Core` with its own policy, ledger and recording, as two applications on
 one phone have, and none knows of the others. A unit of a pipeline stands for a *seat*: the hardware that does its jobs.
-On a seat with turns one job runs at a time; the others wait, and their units are preempted. On a seat that is *divided*,
-such as a core of this machine between whose processes the kernel switches, all jobs run at once, each with an equal
-share. A unit does its own jobs in the order in which they were handed to it.
+On a seat with turns one job runs at a time; the others wait, and their units are preempted. On a *divided* seat, such
+as a core of this machine between whose processes the kernel switches, all jobs run at once, each with an equal share.
+A unit does its own jobs in the order in which they were handed to it.
 
-One instant: first all events and all deadlines of the cores at that time, each of which is a step of one core; only then
-are jobs begun, so that of all jobs that are ready at one time none is passed over because it was named later. Jobs that
-run change their speed when others begin or end: what is left of a job is kept as a whole number of ns / `ONE`.
+One instant: first all events and all deadlines of the cores at that time, each of which is a step of one core; only
+then are jobs begun, so that of all jobs that are ready at one time none is passed over because it was named later. Jobs
+that run change their speed when others begin or end: what is left of a job is kept as a whole number of ns / `ONE`.
 
-Accounts. A job that waits while another pipeline has its seat was preempted before (`JobDone.preempted_before_ns`); on a
-divided seat it is preempted within (`preempted_ns`). A job that the memory makes slower is busy all the while.
+Accounts. A job that waits while another pipeline has its seat was preempted before (`JobDone.preempted_before_ns`); on
+a divided seat it is preempted within (`preempted_ns`). A job that the memory makes slower is busy all the while.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from trilane.scheduler.core import Core
 from trilane.scheduler.events import NEVER, Action, Dispatch, Event, Graph, Job, JobDone, Settings, UnitReady
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.recording import Recording
+from trilane.scheduler.stats import summary_ms
 from trilane.scheduler.turns import ROUND_ROBIN, Waiting, turns_named
 from trilane.scheduler.virtual import Service, Simulation, Skips, none_skips
 
@@ -294,16 +295,18 @@ class BesideDriver:
 def simulate_beside(members: Sequence[Member], *, keep: bool = False, **driver: Any) -> list[Simulation]:
     """Run all `members` to their ends, and what each hands back, in their order.
 
+    The reports have one more key: `response_ms`, from a frame's release to presented, of frames with a deadline.
     `keep`, `driver`: see BesideDriver. Raises as it does.
     """
     beside = BesideDriver(members, keep=keep, **driver)
     outcomes = beside.run()
     return [
-        Simulation(
-            line.core.ledger.report(clock="virtual", requested=line.core.source.released),
-            line.recording,
-            tuple(line.jobs),
-            outcome,
-        )
+        Simulation(_report(line), line.recording, tuple(line.jobs), outcome)
         for line, outcome in zip(beside.lines, outcomes, strict=True)
     ]
+
+
+def _report(line: _Line) -> dict[str, Any]:
+    ledger, due_ns = line.core.ledger, line.member.settings.deadline_ns
+    report = ledger.report(clock="virtual", requested=line.core.source.released)
+    return {**report, "response_ms": summary_ms(late_ns + due_ns for late_ns in ledger.lateness_ns)}

@@ -1,10 +1,9 @@
 """Whose job a unit takes next that several pipelines share. Rule: a rule of turns is a row of the table.
 
-Each pipeline hands its unit jobs by its own policy and knows nothing of the others; of those that wait, the first job of
-each pipeline is a candidate. A job that runs is never taken off its unit.
+Each pipeline hands its unit jobs by its own policy and knows nothing of the others; of those that wait, the first job
+of each pipeline is a candidate. A job that runs is never taken off its unit.
 
-Source of `deadline`: Liu and Layland, Journal of the ACM 20 (1973); of `round-robin`, with one job for each turn: Nagle,
-IEEE Transactions on Communications COM-35 (1987).
+Source of `deadline`: Liu and Layland, Journal of the ACM 20 (1973).
 """
 
 from __future__ import annotations

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from trilane.apps.cli.beside import BesideOption, Joined, OnChip, SceneToPredict, TurnsOption, predict_pipelines
 from trilane.apps.cli.commands import Commands
 from trilane.apps.cli.console import stderr_console
 from trilane.apps.cli.options import (
@@ -41,6 +42,7 @@ Examples:
   trilane predict --performance-profile burst --minutes 30 --plot temperature.svg
   trilane predict --avatar default --runtime gpu
   trilane predict --table rows.csv --json
+  trilane predict portrait --beside default --beside network.onnx@30
 """
 PLOT_MINUTES = 30.0
 PACED = ("latest", "deadline")  # policies that release frames at a rate
@@ -87,6 +89,9 @@ TableOption = Annotated[Path | None, typer.Option(help="CSV of configurations: o
 @app.command(epilog=EPILOG)
 def predict(
     ctx: typer.Context,
+    scene: SceneToPredict = None,
+    beside: BesideOption = None,
+    turns: TurnsOption = "round-robin",
     profile: ProfileOption = "snapdragon-888",
     encoder: EncoderOption = "resnet18",
     norm: NormOption = "batch",
@@ -120,6 +125,10 @@ def predict(
     if profile == HOST and "performance_profile" not in _typed(ctx):
         performance_profile = PerformanceProfile.BURST  # as `trilane run` without a cap
     _check_governor(governor)
+    if scene is not None or beside:
+        chip_at = OnChip(profile, performance_profile, minutes, governor)
+        predict_pipelines(scene, beside or [], _typed(ctx), chip_at, Joined(policy, edge, turns), json)
+        return
     chip, variant = load_runnable(profile), _variant(policy, edge, batch, fps)
     if table is not None:
         answers = _predict_table(chip, table, performance_profile, variant)

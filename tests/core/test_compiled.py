@@ -95,11 +95,13 @@ def test_the_library_is_named_after_the_sources_that_there_are() -> None:
     interpreted = {
         "__init__.py",
         "accounts.py",
+        "beside.py",
         "placement.py",
         "placement_list.py",
         "placement_model.py",
         "places.py",
         "release.py",
+        "turns.py",
         "uncertainty.py",
     }
     assert {path.name for path in folder.glob("*.py")} - compiled == interpreted

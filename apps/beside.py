@@ -1,0 +1,119 @@
+"""The pipelines that `trilane predict` puts beside each other, from what was typed: scenes, and networks at a rate.
+
+Rule: a scene is planned by the pose stage of a run, frame by frame, as `trilane explain` does; a network is its file.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from trilane.apps.scene_plan import ScenePlan
+from trilane.avatars.network_file import parse_network
+from trilane.avatars.network_reshape import reshaped
+from trilane.errors import BadInputError
+from trilane.hw_profiles.application import MOST_FPS, RUNTIMES, Variant
+from trilane.hw_profiles.beside import MOST_TENANTS, NEWEST, SKIPS, Tenant
+from trilane.hw_profiles.network_work import Network, count_work
+from trilane.scene.load import ENDING
+from trilane.scene.work import Work
+from trilane.shapes import Shape
+from trilane.stages.avatar_assets import network_of
+from trilane.stages.configure import Request, configure
+from trilane.units import INFER, UnitName
+
+NETWORK_ENDING = ".onnx"
+#: Frames of a scene that are planned, the first ones; they are taken again from the first on.
+MOST_FRAMES = 600
+FORM = "SCENE, SCENE@RATE or NETWORK.onnx@RATE, with :gpu or :dsp behind the rate"
+
+
+class Asked(NamedTuple):
+    """`what`: a scene or a file. `fps`: None for the scene's own rate. `unit`: of the network."""
+
+    text: str
+    what: str
+    fps: float | None
+    unit: UnitName
+
+
+def asked(text: str) -> Asked:
+    """What was typed, read. Raises BadInputError.
+
+    An @ belongs to the file's name unless a rate follows it, so that a file may have one in its name.
+    """
+    what, at, rate = text.rpartition("@")
+    if not at or text.endswith((ENDING, NETWORK_ENDING)):
+        what, rate = text, ""
+        if text.endswith(NETWORK_ENDING):
+            raise BadInputError(_where(text), "a network without a rate", FORM, f"such as {text}@30")
+    if not what:
+        raise BadInputError(_where(text), "no scene and no file", FORM)
+    number, _, unit = rate.partition(":")
+    return Asked(text, what, _rate(text, number) if at and what != text else None, _unit(text, unit))
+
+
+def _where(text: str) -> str:
+    return f"--beside {text!r}"
+
+
+def _rate(text: str, number: str) -> float:
+    if not re.fullmatch(r"\d+(\.\d+)?", number) or not 0 < float(number) <= MOST_FPS:
+        expected = f"frames a second, above 0, at most {MOST_FPS:g}"
+        raise BadInputError(_where(text), f"rate {number!r}", expected, "such as @30")
+    return float(number)
+
+
+def _unit(text: str, asked_for: str) -> UnitName:
+    for unit in RUNTIMES:
+        if unit == (asked_for or INFER[1]):
+            return unit
+    raise BadInputError(_where(text), f"unit {asked_for!r}", " or ".join(RUNTIMES))
+
+
+def tenants(texts: Sequence[str], variant: Variant = NEWEST) -> list[Tenant]:
+    """A pipeline for each text, in their order. `variant`: of the avatars. Raises BadInputError."""
+    if len(texts) > MOST_TENANTS:
+        raise BadInputError("--beside", f"{len(texts)} pipelines", f"at most {MOST_TENANTS} with the first one")
+    read = [asked(text) for text in texts]
+    names = _names([Path(each.what).stem for each in read])
+    return [
+        _bare(each, name) if each.what.endswith(NETWORK_ENDING) else _avatar(each, name, variant)
+        for each, name in zip(read, names, strict=True)
+    ]
+
+
+def _names(stems: Sequence[str]) -> list[str]:
+    """A name of its own for each: those of one name are numbered."""
+    return [
+        stem if stems.count(stem) == 1 else f"{stem} ({stems[: place + 1].count(stem)})"
+        for place, stem in enumerate(stems)
+    ]
+
+
+def _bare(each: Asked, name: str) -> Tenant:
+    path = Path(each.what)
+    model = parse_network(path)
+    network = Network({"network": str(path)}, 1, 1, 1, "packed", count_work(model))
+    return Tenant(name, each.text, (network,), (0,), each.fps or 0.0, each.unit, NEWEST, is_bare=True)
+
+
+def _avatar(each: Asked, name: str, variant: Variant) -> Tenant:
+    checked = configure(Request(each.what, skinning="gpu"), Path.cwd())
+    scene, file = checked.config.scene, network_of(checked.assets)
+    plan = ScenePlan(checked.config, checked.assets)
+    plans = [plan.decide(frame).plan for frame in range(min(scene.frames, MOST_FRAMES))]
+    shapes = [one.shape if one.work is Work.FULL else None for one in plans]
+    distinct = list(dict.fromkeys(shape for shape in shapes if shape is not None)) or [_own(file.shape)]
+    networks = tuple(
+        Network({"scene": each.what}, *shape, file.shape[3], "packed", count_work(reshaped(file, *shape).model))
+        for shape in distinct
+    )
+    frames = tuple(SKIPS if shape is None else distinct.index(shape) for shape in shapes)
+    return Tenant(name, each.text, networks, frames, each.fps or scene.fps, each.unit, variant)
+
+
+def _own(shape: Sequence[int]) -> Shape:
+    return shape[1], shape[2]

@@ -1,0 +1,165 @@
+"""`trilane predict SCENE --beside …`: several pipelines on one chip, as options and as tables.
+
+Rule: nothing is computed here; what the pipelines are is read by `trilane.apps.beside`, and answered by
+`trilane.hw_profiles.beside_answer`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence, Set
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+import typer
+
+from trilane.apps.cli.console import print_json, spinner, stdout_console
+from trilane.apps.cli.predict_output import IDLE
+from trilane.errors import BadInputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+    from trilane.hw_profiles.application import Variant
+
+SceneToPredict = Annotated[
+    str | None,
+    typer.Argument(help="A scene, priced frame by frame, instead of one network: a name, a file, or SCENE@RATE."),
+]
+BesideOption = Annotated[
+    list[str] | None,
+    typer.Option(help="What else the chip does: SCENE, SCENE@RATE, NETWORK.onnx@RATE or @RATE:gpu. Once for each."),
+]
+TurnsOption = Annotated[
+    str, typer.Option(help="Whose job a unit takes that several pipelines wait for: round-robin or deadline.")
+]
+#: Options that mean something beside a scene.
+USED = {"scene", "beside", "turns", "profile", "minutes", "policy", "edge", "performance_profile", "governor", "json"}
+
+
+class OnChip(NamedTuple):
+    """Options of the chip: its profile and performance profile, minutes of heat and who governs them."""
+
+    profile: str
+    performance_profile: str
+    minutes: float
+    governor: str | None
+
+
+class Joined(NamedTuple):
+    """Options of the scheduler: the avatars' policy and edge, and who takes turns on a unit."""
+
+    policy: str
+    edge: str | None
+    turns: str
+
+
+def predict_pipelines(
+    scene: str | None, beside: Sequence[str], typed: Set[str], on: OnChip, joined: Joined, as_json: bool
+) -> None:
+    """Print how `scene` and the pipelines `beside` it do on one chip. `typed`: the options that the command line has.
+
+    Raises BadInputError for options that do not go with a scene and for what is wrong in one of them.
+    """
+    from trilane.apps.beside import tenants
+    from trilane.hw_profiles.beside_answer import predict_beside
+    from trilane.hw_profiles.load import load_runnable
+    from trilane.scheduler.turns import TURNS
+
+    if scene is None:
+        raise BadInputError("options", "--beside without a scene", "a scene, such as `trilane predict default`")
+    if useless := typed - USED:
+        names = ", ".join(sorted(f"--{name.replace('_', '-')}" for name in useless))
+        raise BadInputError("options", f"{names} beside a scene", "none of them", "the scene says so itself")
+    if joined.turns not in TURNS:
+        raise BadInputError("--turns", repr(joined.turns), " or ".join(TURNS))
+    chip, variant = load_runnable(on.profile), _variant(joined.policy if "policy" in typed else "", joined.edge)
+    with spinner("predicting"):
+        found = tenants([scene, *beside], variant)
+        answer = predict_beside(chip, found, on.performance_profile, on.minutes, on.governor, joined.turns)
+    if as_json:
+        print_json(answer)
+        return
+    _show(answer)
+
+
+def _variant(policy: str, edge: str | None) -> Variant:
+    """How the avatars' stages are joined. `policy`: "" where none was asked for."""
+    from trilane.hw_profiles.application import REFERENCE
+    from trilane.hw_profiles.beside import NEWEST
+    from trilane.scheduler.policy import POLICIES
+    from trilane.transport.slots import edge_rule
+    from trilane.unexpected_value import UnexpectedValue
+
+    if policy == "reference":
+        return REFERENCE
+    if policy and policy not in POLICIES:
+        raise BadInputError("--policy", repr(policy), "reference or one of " + ", ".join(POLICIES))
+    try:
+        edge_rule(edge or NEWEST.edge)
+    except UnexpectedValue as error:
+        raise BadInputError.at("--edge", error) from None
+    return NEWEST._replace(policy=policy or NEWEST.policy, edge=edge or NEWEST.edge)
+
+
+def _show(answer: dict[str, Any]) -> None:
+    console, config = stdout_console(), answer["config"]
+    console.print(f"{answer['machine']['title']} (virtual clock), {config['performance_profile']}")
+    console.print(_pipelines(answer))
+    console.print(_idle(answer))
+    _show_chip(console, answer)
+    for note in answer["notes"]:
+        console.print(f"note            {note}", soft_wrap=True)
+    for row in answer["pipelines"]:
+        if not row["accounts"]["agree"]:
+            found = row["accounts"]["largest_difference"]
+            console.print(
+                f"{row['name']}: the shares of units, computed twice, differ by {found:.2%}: please report this"
+            )
+
+
+def _pipelines(answer: dict[str, Any]) -> Table:
+    from rich.table import Table
+
+    minutes = answer["config"]["minutes"]
+    settled = [f"after {minutes:g} min, ms"] if minutes else []
+    table = Table(
+        "pipeline", "asked fps", "frame, ms", *settled, "alone, ms", "response, ms", "in time", "late", "dropped"
+    )
+    for row in answer["pipelines"]:
+        after = [f"{row['frame_ms_settled']:.1f}"] if minutes else []
+        table.add_row(
+            row["name"],
+            f"{row['rate_fps']:g}",
+            f"{row['frame_time_ms']['mean']:.1f}",
+            *after,
+            f"{row['alone']['frame_time_ms']['mean']:.1f}",
+            f"{row['response_ms']['mean']:.1f}",
+            f"{row['in_time']:.1%}",
+            f"{row['deadline_misses']}",
+            f"{sum(row['frames']['dropped'].values())}",
+        )
+    return table
+
+
+def _idle(answer: dict[str, Any]) -> Table:
+    """Of each unit the busy time of all, then of each pipeline its own and why its part of the unit was idle."""
+    from rich.table import Table
+
+    table = Table("unit", "pipeline", "busy", *IDLE)
+    for unit, row in answer["units"].items():
+        table.add_row(unit, "all", f"{row['busy']:.1%}")
+        for one in answer["pipelines"]:
+            own = one["units"].get(unit)
+            if own is not None:
+                table.add_row("", one["name"], f"{own['busy']:.1%}", *(f"{own['idle'][cause]:.1%}" for cause in IDLE))
+    return table
+
+
+def _show_chip(console: Console, answer: dict[str, Any]) -> None:
+    base = f"{answer['base_power_w']:.1f} W of it {answer['base_power_kind']} for all but the units"
+    console.print(f"power           {answer['power_w']:.1f} W ({base})")
+    if heat := answer["temperature_c"]:
+        console.print(
+            f"temperature     device {heat['device_max']:.1f} °C, junction {heat['junction_max']:.1f} °C; "
+            f"lowered for heat {answer['caps']['throttled_share']:.0%} of the time"
+        )

@@ -1,0 +1,213 @@
+"""Pipelines that share a chip: the memory that they take from each other, heat, and one alone, in closed form."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper
+
+from trilane.apps import beside as sources
+from trilane.errors import BadInputError
+from trilane.hw_profiles.application import Plan, Variant, stage_times_ms, steady
+from trilane.hw_profiles.beside import SKIPS, Tenant, Together, moved_bytes, together
+from trilane.hw_profiles.beside_answer import predict_beside
+from trilane.hw_profiles.load import load_profile
+from trilane.hw_profiles.network_work import Network, count_work
+from trilane.hw_profiles.performance_profiles import corners_of
+from trilane.hw_profiles.reference_networks import NetworkSpec, reference_network
+from trilane.units import SUSTAINED
+
+CHIP = load_profile("snapdragon-888")
+CORNERS = corners_of(CHIP, SUSTAINED)
+SIDE, ADDITIONS = 512, 60
+
+
+def additions(side: int = SIDE) -> onnx.ModelProto:
+    """A network that adds a picture of 32 channels to itself, ADDITIONS times: all traffic, no arithmetic."""
+    names = [f"t{number}" for number in range(ADDITIONS + 1)]
+    values = [helper.make_tensor_value_info(name, TensorProto.FLOAT, (1, 32, side, side)) for name in names]
+    nodes = [helper.make_node("Add", [one, one], [other], other) for one, other in pairwise(names)]
+    return helper.make_model(helper.make_graph(nodes, "g", values[:1], values[-1:], value_info=values[1:-1]))
+
+
+def bare(unit: Any, fps: float = 0.5, side: int = SIDE) -> Tenant:
+    network = Network({}, 1, 1, 1, "packed", count_work(additions(side)))
+    return Tenant(f"additions on {unit}", "", (network,), (0,), fps, unit, is_bare=True)
+
+
+def avatar(size: int = 256, fps: float = 30.0, frames: tuple[int, ...] = (0,)) -> Tenant:
+    spec = NetworkSpec("mobilenetv2", "batch", size, size, 16, "packed")
+    return Tenant("avatar", "", (reference_network(spec),), frames, fps)
+
+
+def response_ms(found: Together, number: int) -> float:
+    value: float = found.runs[number].report["response_ms"]["mean"]
+    return value
+
+
+def time_ms(tenant: Tenant, use: float) -> float:
+    """Of an addition while `use` of the bandwidth is taken: the application's infer stage less its hand-over."""
+    memory = CHIP.memory.model_copy(
+        update={"application_use_fraction": CHIP.memory.application_use_fraction.model_copy(update={"value": use})}
+    )
+    chip = CHIP.model_copy(update={"memory": memory})
+    times = stage_times_ms(chip, Plan(tenant.networks[0], tenant.unit), CORNERS)
+    return times["infer", tenant.unit] - CHIP.application.handover_ms.or_else(0.0)
+
+
+def test_networks_on_two_units_take_memory_from_each_other_while_both_run() -> None:
+    """Both begin at once. The longer one is slow until the shorter one has ended, then as fast as alone."""
+    two = [bare("gpu"), bare("dsp")]
+    alone = [time_ms(each, 0.0) for each in two]
+    bandwidth = CHIP.memory.bandwidth_gb_s.or_else(0.0) * 1e9
+    elements = 3 * ADDITIONS * 32 * SIDE * SIDE
+    bytes_ = [elements * CHIP.units[each.unit].element_bytes for each in two]
+    assert [moved_bytes(each.networks[0], CHIP.units[each.unit]) for each in two] == bytes_
+    demand = [count / (ms / 1e3) / bandwidth for count, ms in zip(bytes_, alone, strict=True)]
+    beside = [time_ms(each, demand[1 - number]) for number, each in enumerate(two)]
+    assert all(slow > 1.05 * ms for slow, ms in zip(beside, alone, strict=True))
+    shorter = min((0, 1), key=lambda number: beside[number])
+    longer = 1 - shorter
+    done = beside[shorter] / beside[longer]
+    expected = beside[shorter] + (1 - done) * alone[longer]
+    found = together(CHIP, two, CORNERS)
+    assert response_ms(found, shorter) == pytest.approx(beside[shorter], rel=1e-4)
+    assert response_ms(found, longer) == pytest.approx(expected, rel=1e-4)
+    assert found.runs[longer].report["units"][two[longer].unit]["idle"]["preempted"] == 0
+
+
+def test_networks_on_one_unit_follow_each_other_and_do_not_slow_each_other() -> None:
+    two = [bare("dsp"), bare("dsp")]
+    found = together(CHIP, two, CORNERS)
+    alone = time_ms(two[0], 0.0)
+    assert [response_ms(found, number) for number in (0, 1)] == pytest.approx([alone, 2 * alone], rel=1e-4)
+
+
+def test_an_avatar_takes_its_share_of_the_memory_all_the_time_and_two_take_twice_as_much() -> None:
+    own = CHIP.memory.application_use_fraction.or_else(0.0)
+    for avatars in (1, 2):
+        network = bare("dsp", 5, 64)
+        found = together(CHIP, [network, *[avatar() for _ in range(avatars)]], CORNERS)
+        assert found.stages_ms[0]["infer"] == pytest.approx(time_ms(network, avatars * own), rel=1e-5)
+
+
+def test_an_avatar_alone_is_what_predict_says_of_its_network() -> None:
+    one = avatar()
+    single = steady(CHIP, Plan(one.networks[0], "dsp", Variant("latest", "double")), CORNERS)
+    found = together(CHIP, [one], CORNERS)
+    assert found.runs[0].report["latency_ms"]["mean"] == pytest.approx(single.latency_ms, rel=1e-5)
+    assert found.frame_ms == pytest.approx(single.frame_ms, rel=1e-5)
+
+
+def test_frames_that_show_nobody_new_skip_the_network() -> None:
+    found = together(CHIP, [avatar(frames=(0, SKIPS, SKIPS))], CORNERS)
+    row = found.runs[0].report
+    assert row["stages"]["infer"]["jobs"] == pytest.approx(row["frames"]["presented"] / 3, abs=1)
+
+
+def test_a_display_holds_an_avatar_but_no_network() -> None:
+    found = together(CHIP, [avatar(fps=500), bare("dsp", 100, 32)], CORNERS)
+    assert found.frame_ms == pytest.approx(CHIP.application.display_ms.or_else(0.0), rel=1e-3)
+    assert found.runs[1].report["frame_time_ms"]["mean"] == pytest.approx(10, rel=1e-3)
+
+
+def test_more_than_a_unit_can_do_is_dropped_and_late_and_counted() -> None:
+    """Twice what fits: each has half of its frames, and none of those is there before the next one comes."""
+    fps = 1e3 / time_ms(bare("dsp"), 0.0)
+    answer = predict_beside(CHIP, [replace(bare("dsp", fps), name=name) for name in "ab"])
+    for row in answer["pipelines"]:
+        assert row["in_time"] < 0.05
+        assert row["frame_time_ms"]["mean"] == pytest.approx(2e3 / fps, rel=0.01)
+        assert row["alone"]["in_time"] > 0.95
+        assert row["accounts"]["agree"]
+        shares = row["units"]["dsp"]
+        assert shares["busy"] + sum(shares["idle"].values()) == pytest.approx(1)
+        assert shares["idle"]["preempted"] == pytest.approx(0.5, abs=0.02)
+    assert answer["units"]["dsp"]["busy"] == pytest.approx(1, abs=0.01)
+    assert sum(answer["units"]["dsp"]["by_pipeline"].values()) == pytest.approx(answer["units"]["dsp"]["busy"])
+
+
+def test_heat_is_that_of_all_together() -> None:
+    """Power of the DSP by the share of time in which both keep it busy; so the device ends hotter than with one."""
+    two = [avatar(512, 30), replace(avatar(512, 15), name="second")]
+    one, both = (predict_beside(CHIP, which, minutes=10) for which in (two[:1], two))
+    dsp = CHIP.units["dsp"]
+    assert both["unit_power_w"]["dsp"] == pytest.approx(dsp.power_w(CORNERS[2], both["units"]["dsp"]["busy"]))
+    assert both["units"]["dsp"]["busy"] > 1.3 * one["units"]["dsp"]["busy"]
+    assert both["temperature_c"]["device_end"] > one["temperature_c"]["device_end"] + 0.5
+    assert all(row["frame_ms_settled"] > 0 for row in both["pipelines"])
+
+
+def test_what_is_typed_is_read() -> None:
+    read = sources.asked
+    assert read("portrait") == ("portrait", "portrait", None, "dsp")
+    assert read("a@home.toml")[1:3] == ("a@home.toml", None)
+    assert read("a@home.toml@24")[1:3] == ("a@home.toml", 24.0)
+    assert read("n@b.onnx@7.5:gpu")[1:] == ("n@b.onnx", 7.5, "gpu")
+
+
+BAD = {
+    "a rate of zero": ("network.onnx@0", "rate '0', expected frames a second, above 0"),
+    "a negative rate": ("network.onnx@-30", "rate '-30'"),
+    "no number": ("network.onnx@fast", "rate 'fast'"),
+    "an infinite rate": ("network.onnx@inf", "rate 'inf'"),
+    "a huge rate": ("network.onnx@1e9", "rate '1e9'"),
+    "above the most": ("network.onnx@1000.5", "at most 1000"),
+    "an empty rate": ("network.onnx@", "rate ''"),
+    "no file": ("@30", "no scene and no file"),
+    "an unknown unit": ("network.onnx@30:npu", "unit 'npu', expected gpu or dsp"),
+    "a network without a rate": ("net@work.onnx", "such as net@work.onnx@30"),
+    "a missing network": ("missing.onnx@30", "missing.onnx"),
+    "an unknown scene": ("beach", "'beach'"),
+    "a missing scene": ("missing.toml@20", "missing.toml"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_named(
+    case: str, command: Callable[..., tuple[str, str]], monkeypatch: Any, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    text, said = BAD[case]
+    _, message = command("predict", "builtin-not-reached.toml" if "scene" in case else text, code=2)
+    _, beside = command("predict", text, "--beside", text, code=2)
+    assert said in beside
+    assert said in message or "scene" in case
+
+
+def test_options_that_do_not_go_with_a_scene_are_refused(command: Callable[..., tuple[str, str]]) -> None:
+    for arguments, said in (
+        (("--beside", "portrait"), "--beside without a scene"),
+        (("portrait", "--encoder", "resnet18", "--what-if"), "--encoder, --what-if beside a scene"),
+        (("portrait", "--turns", "lottery"), "--turns: found 'lottery', expected round-robin or deadline"),
+        (("portrait", "--policy", "none"), "--policy: found 'none'"),
+        (("portrait", "--edge", "tripel"), "--edge: found edge 'tripel'"),
+        (("portrait", *["--beside", "portrait"] * 8), "9 pipelines, expected at most 8"),
+    ):
+        assert said in command("predict", *arguments, code=2)[1]
+
+
+def test_too_high_a_rate_of_a_tenant_is_refused() -> None:
+    with pytest.raises(BadInputError, match="above 0"):
+        bare("dsp", float("nan"))
+
+
+def test_two_networks_as_a_table_and_as_json(
+    command: Callable[..., tuple[str, str]], check_printed: Callable[[str, str], None], tmp_path: Path, monkeypatch: Any
+) -> None:
+    """Of networks alone, which say nothing of this machine."""
+    monkeypatch.chdir(tmp_path)
+    onnx.save(additions(64), "add.onnx")
+    two = ("predict", "add.onnx@60", "--beside", "add.onnx@20:gpu", "--profile", "snapdragon-888")
+    check_printed("predict-beside", command(*two, "--minutes", 5)[0])
+    answer = json.loads(command(*two, "--json")[0])
+    assert [row["name"] for row in answer["pipelines"]] == ["add (1)", "add (2)"]
+    assert np.isclose(answer["units"]["dsp"]["by_pipeline"]["add (1)"], answer["units"]["dsp"]["busy"])
