@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from trilane.apps.scene_plan import ScenePlan
-from trilane.avatars.network_file import parse_network
 from trilane.avatars.network_reshape import reshaped
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import MOST_FPS, RUNTIMES, Variant
 from trilane.hw_profiles.beside import MOST_TENANTS, NEWEST, SKIPS, Tenant
+from trilane.hw_profiles.graph_file import read_graph
 from trilane.hw_profiles.network_work import Network, count_work
 from trilane.scene.load import ENDING
 from trilane.scene.work import Work
@@ -95,8 +95,7 @@ def _names(stems: Sequence[str]) -> list[str]:
 
 def _bare(each: Asked, name: str) -> Tenant:
     path = Path(each.what)
-    model = parse_network(path)
-    network = Network({"network": str(path)}, 1, 1, 1, "packed", count_work(model))
+    network = Network({"network": str(path)}, 1, 1, 1, "packed", count_work(read_graph(path).model))
     return Tenant(name, each.text, (network,), (0,), each.fps or 0.0, each.unit, NEWEST, is_bare=True)
 
 
