@@ -168,7 +168,7 @@ def _table(rows: list[dict[str, Any]]) -> Any:
 
     columns = list(dict.fromkeys(key for row in rows for key in row))
     if len(columns) > MOST_COLUMNS:
-        turned = Table(*([""] * (len(rows) + 1)), show_header=False)
+        turned = Table(show_header=False)  # which has as many columns as its longest row
         for column in columns:
             turned.add_row(column, *(_text(row.get(column, "")) for row in rows))
         return turned

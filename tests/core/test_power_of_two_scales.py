@@ -179,3 +179,17 @@ def test_what_rounds_alike(tiny_float):
     other.CopyFrom(tiny_float)
     other.graph.node[0].op_type = "InstanceNormalization"
     assert not may_round_alike(other)
+
+
+@pytest.mark.parametrize(
+    ("kind", "alike"),
+    [
+        *((name, True) for name in ("Resize", "MaxPool", "Reshape", "Transpose", "Slice", "Split", "SpaceToDepth")),
+        *((name, True) for name in ("Concat", "Add", "Conv", "Relu", "Sigmoid", "Constant", "Identity")),
+        *((name, False) for name in ("ReduceMean", "Mul", "Clip", "ConvTranspose", "AveragePool", "Softmax")),
+    ],
+)
+def test_operators_that_round_nothing_or_in_one_way(kind, alike):
+    """What moves, joins or adds, and what has one rounding at its end; not what rounds inside."""
+    node = helper.make_node(kind, ["x"], ["y"])
+    assert may_round_alike(helper.make_model(helper.make_graph([node], "g", [], []))) == alike

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from trilane.errors import BadInputError
+from trilane.hw_profiles import placed_host
 from trilane.hw_profiles.application import (
     MOST_FPS,
     REFERENCE,
@@ -28,7 +29,7 @@ from trilane.hw_profiles.reference_networks import NetworkSpec, reference_networ
 from trilane.hw_profiles.schema import Profile
 from trilane.hw_profiles.thermal_state import ThermalState
 from trilane.hw_profiles.throttling import GOVERNORS
-from trilane.scheduler.places import Core
+from trilane.scheduler.places import Core, Place
 from trilane.units import UNITS, UnitName
 
 NETWORK = reference_network(NetworkSpec("resnet18", "batch", 512, 512, 16))
@@ -259,6 +260,24 @@ def test_units_that_share_a_core_work_in_turns() -> None:
         assert now.busy[unit] + sum(now.idle[unit].values()) == pytest.approx(1.0)
     assert "preempted" not in now.idle["dsp"]
     assert "cpu and gpu share a core and work in turns" in predict(profile, plan)["notes"]
+
+
+def test_a_placed_network_has_the_rates_of_its_threads_and_no_other_unit_changes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The profile's rates are those of as many threads as the rule gives, here 4."""
+    monkeypatch.setattr(placed_host, "network_threads", lambda: 4)
+    profile = load_profile("host")
+    placement = {"cpu": Place((2,), 1), "gpu": Place((0, 1), 1), "dsp": Place((0, 1, 3), 3)}
+    units = on_cores(profile, placement).units
+    assert {name: unit.core for name, unit in units.items()} == {"cpu": "core 2", "gpu": "", "dsp": ""}
+    for name in ("cpu", "gpu"):
+        assert units[name].model_copy(update={"core": ""}) == profile.units[name].model_copy(update={"core": ""})
+    for peak in ("peak_int8_tmac_s", "peak_fp16_tmac_s", "peak_fp32_tmac_s"):
+        before, after = getattr(profile.units["dsp"], peak), getattr(units["dsp"], peak)
+        assert after.value == pytest.approx(0.75 * before.or_else(0.0)) and after.kind == before.kind
+    others = units["dsp"].model_dump(exclude={"core", *placed_host.PEAKS})
+    assert others == profile.units["dsp"].model_dump(exclude={"core", *placed_host.PEAKS})
 
 
 def test_units_with_cores_of_their_own_are_predicted_as_without() -> None:

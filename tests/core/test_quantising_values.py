@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from trilane.errors import BadInputError
 from trilane.training.quantising import calibration_table as table
+from trilane.training.quantising.calibration import share_ranges, widen
 from trilane.training.quantising.cross_layer_equalisation import equalised
 from trilane.training.quantising.layer_noise import _sqnr_db, layer_report
 from trilane.training.quantising.quantise import quantise
@@ -33,6 +35,39 @@ def chain(kernels: Kernels, nodes: list[tuple[str, list[str], str, dict[str, Any
 
 def weights_of(model: onnx.ModelProto) -> Kernels:
     return {tensor.name: np.squeeze(numpy_helper.to_array(tensor)) for tensor in model.graph.initializer}
+
+
+def test_every_concat_whose_tensors_may_have_one_range_gets_one() -> None:
+    """The second is left alone, since `relu` would lose its clamp; the one before it and the one after it are joined,
+    the last through a Resize."""
+    nodes = [
+        helper.make_node("Conv", ["x", "k"], ["a"]),
+        helper.make_node("Concat", ["a", "x"], ["first"], axis=1),
+        helper.make_node("Relu", ["a"], ["relu"]),
+        helper.make_node("Concat", ["relu", "x"], ["second"], axis=1),
+        helper.make_node("Sigmoid", ["first"], ["s"]),
+        helper.make_node("Resize", ["s"], ["large"]),
+        helper.make_node("Concat", ["large", "far"], ["third"], axis=1),
+    ]
+    model = helper.make_model(helper.make_graph(nodes, "g", [], []))
+    told = {"a": (-3, 2), "x": (-1, 4), "first": (-2, 1), "relu": (0, 9), "second": (-1, 8), "s": (0, 1)}
+    told |= {"large": (0.1, 0.9), "far": (0.5, 3), "third": (0.2, 2)}
+    ranges = {name: SimpleNamespace(lowest=low, highest=high) for name, (low, high) in told.items()}
+    share_ranges(model, ranges)
+    joined = dict.fromkeys(("a", "x", "first"), (-3, 4)) | dict.fromkeys(("s", "large", "far", "third"), (0, 3))
+    assert {name: (each.lowest, each.highest) for name, each in ranges.items()} == told | joined
+
+
+def test_a_range_is_widened_on_both_sides_where_the_other_is_wider() -> None:
+    ranges = {name: SimpleNamespace(lowest=-1.0, highest=1.0) for name in "abc"}
+    wider = {
+        "a": SimpleNamespace(lowest=-2.0, highest=0.5),
+        "b": SimpleNamespace(lowest=-0.5, highest=3.0),
+        "c": SimpleNamespace(lowest=-9.0, highest=9.0),
+    }
+    widen(ranges, {"a", "b", "absent"}, wider)
+    found = {name: (each.lowest, each.highest) for name, each in ranges.items()}
+    assert found == {"a": (-2, 1), "b": (-1, 3), "c": (-1, 1)}
 
 
 PLAIN = [

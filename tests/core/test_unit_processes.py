@@ -305,6 +305,7 @@ def test_why_a_unit_could_not_be_started_is_said(code: int | None, stderr: bytes
         starter.start(spec(), 2)
     assert starter._reason(OSError(5, "Input/output error")) == ("Input/output error" if said == "no answer" else said)
     assert starter.end() == ("" if code is None else said)
+    assert starter._server.calls[-1] == ("wait", 0.0)  # type: ignore[attr-defined]
     theirs.close()
     starter.close()
 

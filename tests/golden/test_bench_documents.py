@@ -71,6 +71,8 @@ def test_the_raster_bench_draws_the_same_body_in_every_way(
             passes.append(deferred)
 
     monkeypatch.setattr(raster, "PackedPass", Noted)
+    compared: list[Any] = []
+    monkeypatch.setattr(raster, "_check_equal", compared.append)
     result = raster.measure(size=96, channels=8, repeats=7, threads=3)
     soft = not driver.hardware
     names = [
@@ -82,6 +84,7 @@ def test_the_raster_bench_draws_the_same_body_in_every_way(
         "UV bytes alone",
     ]
     covered = result.pop("covered")
+    assert [list(tensors) for tensors in compared] == [names[:3]]
     assert result == {
         "raster_ms": 8.0 if soft else 2.0,
         "packed_ms": 2.0,

@@ -65,14 +65,49 @@ def points_of(material: str, body: BodyArrays, landmarks: Landmarks, random: np.
     return points, eyes[face].astype(float)
 
 
+def painted(gl: Any, landmarks: Landmarks, material: str, content: F64, turn: F64, shape: tuple[int, int]) -> Any:
+    """(h,w,4) of the points of `content`, whose columns are `POINTS`'s inputs, seen by a camera that is turned so."""
+    program = gl.program(POINTS, shader_source(PAINT))
+    view = np.eye(4)
+    view[:3, :3] = turn
+    places = {"material": MATERIALS.index(material), "view": tuple(view.T.ravel()), "eye": (0.3, 0.4, 3.0)}
+    for name, value in (_places(landmarks) | places).items():
+        if name in program:
+            program[name].value = value
+    buffer = gl.buffer(content.astype(np.float32).tobytes())
+    vertices = gl.vertex_array(program, [(buffer, "2f 3f 3f 3f 4f", "at", "rest", "place", "normal", "colour")])
+    target = gl.framebuffer([gl.texture(shape[::-1], 4, dtype="f4")])
+    target.use()
+    target.clear(0, 0, 0, 0)
+    gl.enable_only(moderngl.NOTHING)
+    vertices.render(moderngl.POINTS)
+    return np.frombuffer(target.read(components=4, dtype="f4"), np.float32).reshape(*shape, 4)
+
+
+def test_a_sole_has_a_dark_line_84_mm_under_the_ankle(gl: Any, landmarks: Landmarks) -> None:
+    """4.4 mm wide, its edges softened over 2 mm; there rubber has 0.62 of its colour, 0.62^2.2 of its light, wherever
+    else the point is. Points above the line, in it and below."""
+    under_mm = np.array([70.0, 80.7, 82.9, 84.0, 85.1, 87.3, 95.0])
+    line = np.array([0, 0, 1, 1, 1, 0, 0])
+    count = len(under_mm)
+    at = np.stack([(np.arange(count) + 0.5) / count * 2 - 1, np.zeros(count)], axis=1)
+    height = landmarks.joints[7, 1] - under_mm / 1000
+    rest = np.stack([np.linspace(-0.2, 0.2, count), height, np.linspace(-0.1, 0.2, count)], axis=1)
+    same = np.tile([*(0.1, 0.2, 0.3), *(0.0, 0.0, 1.0), *(1.0, 0.0, 0.0, 0.0)], (count, 1))
+    found = painted(gl, landmarks, "sole", np.concatenate([at, rest, same], axis=1), np.eye(3), (1, count))[0]
+    wanted = np.array([0.88, 0.85, 0.80]) ** 2.2 * np.where(line, 0.62**2.2, 1.0)[:, None]
+    light = found[0, :3] / wanted[0]
+    assert np.ptp(light) < 1e-4 * light[0]
+    np.testing.assert_allclose(found[:, :3], wanted * light, rtol=1e-4)
+
+
 @pytest.mark.parametrize("material", MATERIALS)
 def test_the_colours_of_every_garment_are_as_they_were(
     gl: Any, golden: Any, arrays: BodyArrays, landmarks: Landmarks, material: str
 ) -> None:
     """A pixel for each of 6,144 points, in places and lights drawn at random. Between drivers a sine or a power differs
     by a few roundings of float32, so a byte by one; by more where one side of an edge becomes the other."""
-    number = MATERIALS.index(material)
-    random = np.random.default_rng((3, number))
+    random = np.random.default_rng((3, MATERIALS.index(material)))
     count = SHAPE[0] * SHAPE[1]
     points, eyeball = points_of(material, arrays, landmarks, random)
     row, column = np.divmod(np.arange(count), SHAPE[1])
@@ -81,22 +116,8 @@ def test_the_colours_of_every_garment_are_as_they_were(
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     colour = np.stack([random.uniform(-0.1, 1.1, count), eyeball, np.zeros(count), np.zeros(count)], axis=1)
     content = np.concatenate([at, points, random.normal(0, 1, (count, 3)), 2 * normals, colour], axis=1)
-    program = gl.program(POINTS, shader_source(PAINT))
     turn, _ = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))
-    view = np.eye(4)
-    view[:3, :3] = turn
-    uniforms = _places(landmarks) | {"material": number, "view": tuple(view.T.ravel()), "eye": (0.3, 0.4, 3.0)}
-    for name, value in uniforms.items():
-        if name in program:
-            program[name].value = value
-    buffer = gl.buffer(content.astype(np.float32).tobytes())
-    vertices = gl.vertex_array(program, [(buffer, "2f 3f 3f 3f 4f", "at", "rest", "place", "normal", "colour")])
-    target = gl.framebuffer([gl.texture(SHAPE[::-1], 4, dtype="f4")])
-    target.use()
-    target.clear(0, 0, 0, 0)
-    gl.enable_only(moderngl.NOTHING)
-    vertices.render(moderngl.POINTS)
-    found = np.frombuffer(target.read(components=4, dtype="f4"), np.float32).reshape(*SHAPE, 4)
+    found = painted(gl, landmarks, material, content, turn, SHAPE)
     assert set(np.unique(found[..., 3])) <= {0.0, 1.0}
     picture = np.round(255 * found[..., :3].clip(0, 1) ** (1 / 2.2)).astype(np.uint8)
     golden(f"paint-{material}", picture, 0.005, 0.0005)
