@@ -197,6 +197,24 @@ def test_hung_slow_and_failed_units_are_killed_started_and_given_jobs_as_worked_
     assert dsp == pytest.approx({"busy": 111, "starved": 10, "blocked": 0, "throttled": 0, "overhead": total - 121})
 
 
+@pytest.mark.parametrize("failing", ["b", "c"])
+def test_the_slots_of_a_job_that_failed_serve_the_frames_behind_it(failing: str) -> None:
+    """The edge from b to c has one slot: frame 1, which is under way, needs the one that frame 0 held."""
+    stages = tuple(StageSpec(name, unit) for name, unit in (("a", "cpu"), ("b", "gpu"), ("c", "dsp")))
+    core = Core(Graph(stages, ("double", "single"), "c"), Settings(9))
+    actions = list(core.step(0, tuple(UnitReady(unit) for unit in core.units)).actions)
+    for now_ns in range(10, 100, 10):
+        if not isinstance(actions[0], Dispatch):
+            break
+        job = actions.pop(0).job  # type: ignore[union-attr]
+        failed = (job.stage, job.frame) == (failing, 0)
+        event = JobFailed(job.unit, job.id) if failed else JobDone(job.unit, job.id, now_ns - 10, now_ns, now_ns - 10)
+        actions += core.step(now_ns, (event,)).actions
+    assert actions == [Finish(Outcome(OutcomeKind.STOPPED))]
+    assert core.ledger.lost_by_cause == {f"failed:{failing}": 1}
+    assert core.ledger.presented_frames == ([1] if failing == "b" else [1, 2])
+
+
 def test_a_unit_that_fails_too_often_ends_the_run_and_its_frames() -> None:
     """The DSP works on frame 0 and holds none; frames 1 and 2 are on the CPU."""
     core = Core(chain([A, B], "fifo:3", "b"), Settings(10, max_failures=0))
