@@ -160,6 +160,25 @@ def test_the_bound_on_a_frame_that_will_skip_is_that_of_its_own_way() -> None:
     assert earliest_completion_ns(0, 0, 1, core.stages, core.frames, (0, 2)) == 8 * MS
 
 
+def test_frames_at_and_before_the_stage_at_which_a_bypass_begins_are_taken_to_skip() -> None:
+    """read 5, pose 3, net 20, show 1; the bypass begins at pose. Frame 0 is at net, 1 at pose, 2 at read.
+
+    1 and 2 skip: net does 0 alone (20), and 2 can be shown at 21 at the earliest. Without a bypass net does 0 and 1
+    (40), then 2 (60), shown at 61.
+    """
+    times = {"read": 5 * MS, "pose": 3 * MS, "net": 20 * MS, "show": MS}
+    stages = tuple(StageSpec(name, unit) for name, unit in zip(times, ("io", "cpu", "dsp", "gpu"), strict=True))
+    core = Core(Graph(stages, ("double",) * 3, "show", ("pose", "show")), Settings(9))
+    for stage in core.stages:
+        stage.estimate_ns = times[stage.name]
+    for number, position in enumerate((2, 1, 0)):
+        core.frames[number] = FrameState(0, 0)
+        core.frames[number].position = position
+    assert earliest_completion_ns(0, 2, 0, core.stages, core.frames, (1, 3)) == 21 * MS
+    assert earliest_completion_ns(0, 2, 0, core.stages, core.frames) == 61 * MS
+    assert earliest_completion_ns(0, 1, 1, core.stages, core.frames, (1, 3)) == 21 * MS
+
+
 def test_a_frame_that_skips_where_no_bypass_begins_is_a_drivers_defect() -> None:
     core = Core(Graph(STAGES, ("double", "double"), "show"), Settings(1))
     core.step(0, tuple(UnitReady(unit) for unit in ("cpu", "dsp", "gpu")))

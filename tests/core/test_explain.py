@@ -242,6 +242,21 @@ def test_the_picture_shows_bodies_and_rectangles(checked: Checked, tmp_path: Pat
     assert (pixels == BODY).all(axis=2).sum() > 5
 
 
+def test_the_name_of_a_picture_stays_in_one_line(
+    checked: Checked,  # noqa: ARG001 - it writes the scene
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    told = SimpleNamespace(plan="plan", first_frames=[1, 2], document={"a": 1})
+    drawn: list[Any] = []
+    monkeypatch.setattr("trilane.apps.explanation.explain", lambda *_: told)
+    monkeypatch.setattr("trilane.apps.plan_picture.draw_plan", lambda *what: drawn.append(what))
+    file = tmp_path / f"{'wide' * 40}.png"
+    result = explained(tmp_path, "--json", "--picture", str(file))
+    assert drawn == [("plan", [1, 2], file)]
+    assert f"picture: {file}" in result.stderr.splitlines() and json.loads(result.stdout) == {"a": 1}
+
+
 def test_a_sheet_has_at_most_nine_frames(checked: Checked, tmp_path: Path) -> None:
     plan = ScenePlan(checked.config, checked.assets)
     frames = [plan.decide(frame) for frame in range(20)]

@@ -63,6 +63,7 @@ def test_idle_units_stay_cool_and_unthrottled(phone: Profile) -> None:
 
 def test_power_is_that_of_the_units_and_of_the_rest(phone: Profile) -> None:
     governor = Governor(phone, "burst")
+    assert governor.due_ns == 0  # whoever asks before the run begins
     governor.begin(0)
     assert governor.power_w is None
     governor.tick(S, dict.fromkeys(UNITS, 0))
