@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 import threading
 from pathlib import Path
@@ -129,6 +130,20 @@ def test_the_meter_counts_from_its_making_on_and_finds_new_threads(tasks: Path) 
     waited(tasks, 7, 751)
     assert meter.delay_ns() == 41
     assert meter.delay_ns() == 0
+    meter.close()
+
+
+def test_threads_are_listed_only_when_their_number_has_changed(tasks: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    meter = CoreMeter(frozenset(), str(tasks.parent))
+    listed: list[int] = []
+    real = os.listdir
+    monkeypatch.setattr(os, "listdir", lambda folder: listed.append(folder) or real(folder))
+    meter.look()
+    assert listed == []
+    waited(tasks, 8, 40)
+    for _ in range(3):
+        meter.look()
+    assert len(listed) == 1 and meter.threads == 2
     meter.close()
 
 

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -280,6 +281,20 @@ def test_a_taken_place_is_refused_before_anything_runs(runs: Callable[..., Runs]
     with pytest.raises(BadInputError, match="a name that is free"):
         go(double, tmp_path)
     assert double.calls == []
+
+
+@pytest.mark.parametrize(
+    ("slow_motion", "policy", "fps"),
+    [(4.0, "latest", 7.5), (4.0, "deadline", 7.5), (4.0, "pipelined", None), (None, "latest", None)],
+)
+def test_policies_that_need_a_rate_are_as_slow_as_the_chip(
+    slow_motion: float | None, policy: str, fps: float | None
+) -> None:
+    """The scene has 30 frames a second, of which the chip's pace leaves a quarter."""
+    job = object.__new__(run_job._Job)
+    job._plan = Plan(pace=slow_motion and Pace("chip", "burst", slow_motion, {}))  # type: ignore[arg-type]
+    job._checked = SimpleNamespace(config=SimpleNamespace(scene=SimpleNamespace(fps=30.0)))  # type: ignore[assignment]
+    assert job._release_fps(policy) == fps
 
 
 def test_a_run_at_a_chips_pace_is_compared(runs: Callable[..., Runs], tmp_path: Path) -> None:

@@ -291,6 +291,7 @@ def test_a_unit_is_asked_for_with_its_spec_and_files(answer: bytes, passes_fd: b
     ("code", "stderr", "said"),
     [
         (None, b"one\ntwo\n", "two"),
+        (None, b"one\ntwo\nthree\n", "three"),
         (None, b"x" * 9000 + b"\nno file \xff\n", "no file \ufffd"),
         (-9, b"", "the fork server, which every unit comes from, was killed by signal 9"),
         (3, b"", "the fork server, which every unit comes from, ended with exit code 3"),
