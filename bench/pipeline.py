@@ -15,8 +15,11 @@ from pathlib import Path
 from statistics import fmean, median
 from typing import Any
 
+from trilane.bench.beside import measure_beside
 from trilane.bench.lib import full_width
+from trilane.bench.lib.avatar_process import Asked
 from trilane.errors import BadInputError, TrilaneError
+from trilane.figure_sources import COMPARED, COMPUTED, MEASURED
 from trilane.hw_profiles.host import host_units, usable_cores
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run_metrics import RunMetrics
@@ -57,6 +60,8 @@ def measure(
     rounds: int = 9,
     runtime: str = "auto",
     video: bool = True,
+    beside: str = "",
+    beside_size: str = "512x512",
 ) -> dict[str, Any]:
     """A row for each avatar, size, number of cores, policy and edge; figures are medians over the `rounds`.
 
@@ -74,12 +79,21 @@ def measure(
     `dropped`, `lost`: frames of all rounds. `accuracy`: the error of the avatar's pictures and its
     source, or why there are no figures.
 
+    With `beside`, a second avatar of `beside_size`, two runs go on at once, each with a scheduler and units of its own
+    on the same cores, `pipelined`. Rows, one for each: `frame_ms`: mean time between frames while both ran;
+    `virtual_ms`: the same, computed from `isolated_ms`, its stages in sequential runs before and after; `ratio`:
+    measured over computed, with its interval; `strangers`: how many threads of others were ready where its stages
+    worked, in the mean: the ratio says nothing unless they are a few hundredths.
+
     Raises BadInputError, MissingPartError, TrilaneError when a run fails.
     """
     if frames < MIN_FRAMES or rounds < 1:
         raise BadInputError("bench pipeline", f"--frames {frames}, --rounds {rounds}", f"at least {MIN_FRAMES} and 1")
     cores = tuple(count or len(usable_cores()) for count in cores)
     _check(policy, edge, cores)
+    if beside:
+        one, other = (avatar[0], size[0]), (beside, beside_size)
+        return _measure_two([one, other], edge[0], cores[0], frames, rounds, runtime, video=video)
     rows: list[dict[str, Any]] = []
     accuracy: dict[str, Any] = {}
     for name, tensor_size, count in product(avatar, size, cores):
@@ -89,6 +103,23 @@ def measure(
         rows += _measure_rounds(checked, settings, rounds)
     facts = {"frames": frames, "rounds": rounds, "runtime": checked.config.runtime, "video": video}
     return {"rows": rows, "accuracy": accuracy, "config": facts}
+
+
+def _measure_two(
+    which: Sequence[tuple[str, str]], edge: str, cores: int, frames: int, rounds: int, runtime: str, *, video: bool
+) -> dict[str, Any]:
+    """Two avatars at once, each a name and a size."""
+    asked = [
+        Asked(_folder(name), size, frames, runtime, usable_cores()[:cores], video=video, edge=edge)
+        for name, size in which
+    ]
+    facts = {"frames": frames, "rounds": rounds, "runtime": runtime, "video": video, "cores": cores}
+    sources = {"frame_ms, isolated_ms, strangers": MEASURED, "virtual_ms": COMPUTED, "ratio": COMPARED}
+    return {"rows": measure_beside(asked, rounds), "sources": sources, "config": facts}
+
+
+def _folder(avatar: str) -> str:
+    return str(full_width.full_width_bundle()) if avatar == full_width.NAME else avatar
 
 
 def _measure_rounds(checked: Checked, settings: list[Setting], rounds: int) -> list[dict[str, Any]]:
@@ -119,8 +150,7 @@ def _pairs(policies: Sequence[str], edges: Sequence[str]) -> list[tuple[str, str
 
 
 def _config(avatar: str, size: str, cores: int, frames: int, runtime: str, video: bool) -> Checked:
-    folder = str(full_width.full_width_bundle()) if avatar == full_width.NAME else avatar
-    checked = configure(Request(size=size, avatar=folder, frames=frames, runtime=runtime), Path.cwd())
+    checked = configure(Request(size=size, avatar=_folder(avatar), frames=frames, runtime=runtime), Path.cwd())
     units = host_units(usable_cores()[:cores])
     return checked.changed(units=units, record=video)
 

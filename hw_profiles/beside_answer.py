@@ -141,7 +141,8 @@ def _notes(profile: Profile, tenants: Sequence[Tenant], turns: str) -> list[str]
     if profile.name == HOST:
         notes.append(
             "units on one core of this machine divide it in equal shares; cores are given by the rule for any run; of "
-            "this machine are cores, clock and instructions, its speeds are assumed: `trilane run` measures"
+            "this machine are cores, clock and instructions, its speeds are assumed: `trilane bench pipeline --beside` "
+            "measures"
         )
     elif len(tenants) > 1:
         notes.append(f"a unit that several pipelines have handed a job takes them by {turns}, each job to its end")

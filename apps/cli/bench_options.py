@@ -17,6 +17,8 @@ DRIVER_THREADS = "Threads of the software OpenGL driver."
 MEANINGS = {
     "avatar": "`default`, the folder of an avatar, or `resnet18`: the full-width network, untrained.",
     "avatars": "How many avatars share the tensor.",
+    "beside": "A second avatar, run at the same time and set beside the virtual clock.",
+    "beside_size": "Tensor size of the second avatar in pixels: HEIGHTxWIDTH, or a side.",
     "batch": "Frames inferred at once.",
     "channels": "Channels of the neural texture: 4, 8, 12 or 16.",
     "cores": "Cores of the three units together; 0: all that this process may use.",

@@ -22,11 +22,14 @@ START_S, RUN_S = 120.0, 600.0
 
 @dataclass(frozen=True)
 class Asked:
-    """A run's avatar and scene, as `trilane.stages.configure.Request` has them. `cores`: that its units share."""
+    """A run of the default scene.
 
-    scene: str
-    avatar: str | None
-    size: str | None
+    `avatar`, `size`, `frames`, `runtime`: as `trilane.stages.configure.Request` has them. `cores`: that its units share
+    by the rule for any run. `video`: whether one is encoded. `edge`: the rule of all edges.
+    """
+
+    avatar: str
+    size: str
     frames: int
     runtime: str
     cores: tuple[int, ...]
@@ -53,7 +56,8 @@ class AvatarProcess:
 
     def result(self) -> Ran:
         """Of the run that was begun. Raises TrilaneError when it failed."""
-        return Ran(*self.receive(RUN_S))
+        jobs, seats = self.receive(RUN_S)
+        return Ran(tuple(JobRecord(*job) for job in jobs), seats)
 
     def receive(self, wait_s: float) -> Any:
         """The process's next answer. Raises TrilaneError."""
@@ -81,7 +85,7 @@ def avatar_processes(asked: Sequence[Asked]) -> Iterator[list[AvatarProcess]]:
             theirs.close()
             processes.append(process)
             pipes.append(ours)
-        found = [AvatarProcess(pipe, each.scene) for pipe, each in zip(pipes, asked, strict=True)]
+        found = [AvatarProcess(pipe, f"{each.avatar} at {each.size}") for pipe, each in zip(pipes, asked, strict=True)]
         for one in found:
             one.receive(START_S)
         yield found
@@ -100,7 +104,7 @@ def serve(pipe: Connection, asked: Asked) -> None:
     from trilane.stages.configure import Request, configure
 
     try:
-        request = Request(asked.scene, avatar=asked.avatar, size=asked.size, frames=asked.frames, runtime=asked.runtime)
+        request = Request(avatar=asked.avatar, size=asked.size, frames=asked.frames, runtime=asked.runtime)
         checked = configure(request, Path.cwd()).changed(units=host_units(asked.cores), record=asked.video)
         seats = {unit: ",".join(map(str, settings.cores)) for unit, settings in checked.config.units.items()}
         pipe.send(True)
@@ -113,7 +117,7 @@ def serve(pipe: Connection, asked: Asked) -> None:
                 pipe.send(result.failure.message)
                 return
             pipe.send(([tuple(job) for job in result.jobs], seats))
-    except (EOFError, BrokenPipeError):
+    except (EOFError, BrokenPipeError, KeyboardInterrupt):
         return
     except Exception as error:
         pipe.send(f"{type(error).__name__}: {error}")
