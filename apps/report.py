@@ -177,6 +177,13 @@ class OtherPlacement(Record):
     predicted_ms: float
 
 
+class TriedPlacement(Record):
+    """A placement that real frames went through. `units`: place of each; `frame_ms`: time of a frame."""
+
+    units: dict[str, UnitPlace]
+    frame_ms: float
+
+
 class UnitTime(Record):
     """What a unit was measured to need for a frame with so many `threads`, in ms.
 
@@ -193,7 +200,7 @@ class UnitTime(Record):
 class PlacementFacts(Record):
     """Why the units have the cores that they have (`trilane.stages.placing`).
 
-    `how`: measured, asked or rule.
+    `how`: tried, measured, asked or rule.
     `why`: in words.
     `units`: place of each.
     `measured_at`: when the times were measured, UTC; absent, as all below, when nothing was.
@@ -201,9 +208,10 @@ class PlacementFacts(Record):
     `rule_ms`, `rule`: of the placement for any run.
     `alternatives`: the next best, the shortest frame time first.
     `times`: what was measured, a row for each unit and number of threads.
+    `tried`: what real frames went through before the run, or before an earlier one; absent when none was.
     """
 
-    how: Literal["measured", "asked", "rule"]
+    how: Literal["tried", "measured", "asked", "rule"]
     why: str
     units: dict[str, UnitPlace]
     measured_at: str = ""
@@ -212,6 +220,7 @@ class PlacementFacts(Record):
     rule: dict[str, UnitPlace] = Field(default={})
     alternatives: tuple[OtherPlacement, ...] = ()
     times: tuple[UnitTime, ...] = ()
+    tried: tuple[TriedPlacement, ...] = ()
 
 
 class Preamble(Record):

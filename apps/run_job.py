@@ -94,7 +94,7 @@ def run_to_folder(
     """
     with RunFolder(target) as folder:
         if starter is not None:
-            checked = placed(checked, plan.policy, starter, str(machine.get("gl")))
+            checked = placed(checked, plan.policy, starter, str(machine.get("gl")), hooks.message)
             hooks.message(checked.notes[-1])
         threading.Thread(target=_import_writers, name="imports", daemon=True).start()
         job = _Job(checked, plan, hooks, starter)

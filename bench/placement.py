@@ -1,12 +1,14 @@
-"""Is the placement that a run chooses the best one, and what does it gain over the rule for any run?
+"""Is the placement that a run chooses the best one, what does it gain over the rule, and does the model predict it?
 
-Rule: every placement is tried on this machine's processes, in turns; those that could be the best are then measured
-against the chosen one in further rounds, which alone decide. Other numbers of cores are in virtual time, which is said.
+Rule: a run's own choice is made first, then everything is tried anew: all placements in turns, a few frames each, then
+those that could be the best, in further rounds which alone decide. Whole runs of the chosen one and the rule's stand
+beside them. Other numbers of cores are in virtual time, which is said.
 """
 
 from __future__ import annotations
 
 import tempfile
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import median
@@ -14,6 +16,7 @@ from typing import Any
 
 from trilane.avatars.network_reshape import reshaped
 from trilane.bench.lib import full_width
+from trilane.bench.lib.rank_correlation import rank_correlation
 from trilane.errors import BadInputError, TrilaneError
 from trilane.hw_profiles.application import Plan, Variant, steady
 from trilane.hw_profiles.host import host_cores, rule_placement, settings_of, usable_cores
@@ -23,20 +26,23 @@ from trilane.hw_profiles.performance_profiles import corners_of
 from trilane.hw_profiles.placed_host import on_cores, place_units
 from trilane.hw_profiles.placement_facts import NS_PER_MS, described
 from trilane.pipeline.run_metrics import RunMetrics
+from trilane.pipeline.trial import Round
 from trilane.pipeline.unit_starter import UnitStarter
-from trilane.scheduler.placement import Ranked, chosen, ranked
+from trilane.scheduler.placement import Ranked, ranked, worth_trying
 from trilane.scheduler.placement_model import Rules, frame_ns
 from trilane.scheduler.places import Core, Placement
 from trilane.scheduler.stats import median_interval
 from trilane.stages.avatar_assets import network_of
 from trilane.stages.avatar_pipeline import run_avatar
+from trilane.stages.choosing import choice
 from trilane.stages.configure import Checked, Request, configure
 from trilane.stages.factories import PRELOAD
-from trilane.stages.placing import FIRST, measured_times, times_rows
+from trilane.stages.placing import FIRST, considered, times_rows
+from trilane.stages.rehearsing import measured_times, tried
 from trilane.units import BURST
 
 MIN_FRAMES = 20
-ISOLATED = 2  # frames of each run of a finalist that are measured isolated
+ISOLATED = 4  # frames of each whole run that are measured isolated
 VIRTUAL_CORES = (1, 2, 3, 4, 8)
 POLICY, EDGE = "pipelined", "double"
 
@@ -45,55 +51,64 @@ def measure(
     avatar: str = "default",
     size: tuple[str, ...] = ("256x256", "512x512"),
     cores: tuple[int, ...] = (0,),
-    frames: int = 48,
+    frames: int = 96,
     rounds: int = 6,
-    finalists: int = 2,
+    finalists: int = 3,
+    further: int = 24,
+    runs: int = 4,
     runtime: str = "auto",
 ) -> dict[str, Any]:
-    """A row for each size, number of cores and placement; frame times are medians of the runs' means.
+    """A row for each size, number of cores and placement.
 
-    Rows: `placement`; `predicted_ms`; `tried_ms`: of the one round in which all are tried; `frame_ms`: of the further
-    `rounds`, null for placements that are not in them: in them are the chosen one, that of the rule for any run and the
-    `finalists` that were fastest beside them; `is_chosen`, `is_rule`.
+    Rows: `predicted_ms`; `tried_ms`: median of the `rounds` in which all are tried, in turns of 16 frames, 10 of which
+    count; `frame_ms`: of the `further` rounds, null for placements that are not in them: in them are the chosen one,
+    that of the rule for any run and the `finalists` that were fastest beside them; `is_chosen`, `is_rule`.
 
-    `sizes`: a row for each size and number of cores. `chosen_over_best`: frame time of the chosen placement over that
-    of the best other one in the further rounds, the median of the ratios within a round, with its 95 % interval `low`
-    and `high` (with fewer than six rounds the least and largest); 1 and below: the chosen one is the best.
-    `rule_over_chosen`: how many times faster than with the rule, `rule_low`, `rule_high`: its interval.
-    `core_efficiency`, `rule_core_efficiency`: medians. `times`: what was measured first.
+    `sizes`: a row for each size and number of cores. `how`: what chose: the run's own trial, or the prediction.
+    `chosen_over_best`: frame time of the chosen placement over that of the best other one in the further rounds, the
+    median of the ratios within a round, with its 95 % interval `low` and `high` (with fewer than six rounds the least
+    and largest); 1 and below: the chosen one is the best. `rule_over_chosen`: how many times faster than with the rule,
+    `rule_low`, `rule_high`: its interval. `rank_correlation`: Spearman's, of predicted and tried times of all.
+    `predicted_over_tried`, `predicted_least`, `predicted_largest`: median, least and largest ratio of all. `others`:
+    share of the cores that other programs had in the further rounds: with more than a tenth the row says little.
+    `run_ms`, `rule_run_ms`, `core_efficiency`, `efficiency`, `rule_core_efficiency`: medians of `runs` whole runs of
+    `frames` frames each, in turns. `took_s`: a run's rehearsal and trial. `times`: what was measured first.
 
-    `virtual`: the same for other numbers of cores, by the profile `host` in virtual time: `frame_ms` is computed by the
-    scheduler, for every placement that virtual time knows.
+    `virtual`: other numbers of cores, by the profile `host` in virtual time: `frame_ms` is computed by the scheduler,
+    for every placement that virtual time knows.
 
     Raises BadInputError, MissingPartError, TrilaneError when a run fails.
     """
     counts = tuple(count or len(usable_cores()) for count in cores)
-    _check(counts, frames, rounds, finalists)
+    _check(counts, frames, rounds, finalists, further, runs)
     rows: list[dict[str, Any]] = []
     sizes: list[dict[str, Any]] = []
+    times: list[dict[str, Any]] = []
     virtual: list[dict[str, Any]] = []
     folder = str(full_width.full_width_bundle()) if avatar == full_width.NAME else avatar
     with UnitStarter(PRELOAD) as starter:
         for tensor in size:
             checked = configure(Request(size=tensor, avatar=folder, frames=frames, runtime=runtime), Path.cwd())
             for count in counts:
-                tried = _Trial(checked, host_cores(usable_cores()[:count]), starter)
-                tried.run(rounds, finalists)
+                trial = _Trial(checked, host_cores(usable_cores()[:count]), starter)
+                trial.run(rounds, finalists, further, runs)
                 named = {"size": tensor, "cores": count}
-                rows += [{**named, **row} for row in tried.rows()]
-                sizes.append({**named, **tried.summary()})
+                rows += [{**named, **row} for row in trial.rows()]
+                sizes.append({**named, **trial.summary()})
+                times += [{**named, **row} for row in trial.times()]
             virtual += [{"size": tensor, **_virtual(checked, avatar, count)} for count in VIRTUAL_CORES]
-    config = {"avatar": avatar, "frames": frames, "rounds": rounds, "finalists": finalists, "runtime": runtime}
-    return {"rows": rows, "sizes": sizes, "virtual": virtual, "config": config}
+    config = {"avatar": avatar, "frames": frames, "rounds": rounds, "finalists": finalists}
+    config |= {"further": further, "runs": runs, "runtime": runtime}
+    return {"rows": rows, "sizes": sizes, "times": times, "virtual": virtual, "config": config}
 
 
-def _check(counts: Sequence[int], frames: int, rounds: int, finalists: int) -> None:
+def _check(counts: Sequence[int], frames: int, rounds: int, finalists: int, further: int, runs: int) -> None:
     have = len(usable_cores())
     if not all(1 <= count <= have for count in counts):
         raise BadInputError("--cores", str(list(counts)), f"numbers from 1 to the {have} that this process may use")
-    if frames < MIN_FRAMES or rounds < 1 or finalists < 1:
-        found = f"--frames {frames}, --rounds {rounds}, --finalists {finalists}"
-        raise BadInputError("bench placement", found, f"at least {MIN_FRAMES}, 1 and 1")
+    if frames < MIN_FRAMES or min(rounds, finalists, further, runs) < 1:
+        found = f"--frames {frames}, --rounds {rounds}, --finalists {finalists}, --further {further}, --runs {runs}"
+        raise BadInputError("bench placement", found, f"at least {MIN_FRAMES}, and 1 of each other")
 
 
 class _Trial:
@@ -101,27 +116,36 @@ class _Trial:
 
     def __init__(self, checked: Checked, cores: Sequence[Core], starter: UnitStarter) -> None:
         self._checked, self._starter = checked, starter
+        begin_s = time.monotonic()
         where = rule_placement(tuple(core.number for core in cores))
         self._times = measured_times(checked, cores, where, starter)
-        rules = Rules(FIRST)
-        self._found = ranked(cores, self._times, rules)
-        self._rule = Ranked(where, frame_ns(where, cores, self._times, rules))
-        self._chosen = chosen(self._found, self._rule)
-        if self._rule.placement not in [each.placement for each in self._found]:
-            self._found.append(self._rule)
-        self._tried_ms: list[float] = []
-        self._runs: dict[int, list[RunMetrics]] = {}
+        self._found = ranked(considered(cores, {}), self._times, Rules(FIRST))
+        self._rule = Ranked(where, frame_ns(where, cores, self._times, Rules(FIRST)))
+        candidates = worth_trying(self._found, self._rule)
+        self._choice = choice(checked, [core.number for core in cores], candidates, starter)
+        self._chosen = candidates[self._choice.best]
+        self._took_s = time.monotonic() - begin_s
+        known = [each.placement for each in self._found]
+        self._found += [] if where in known else [self._rule]
+        self._places = {of: self._place(each) for of, each in (("chosen", self._chosen), ("rule", self._rule))}
+        self._rounds: Sequence[Round] = ()
+        self._further: dict[int, list[float]] = {}
+        self._others = 0.0
+        self._runs: dict[str, list[RunMetrics]] = {of: [] for of in self._places}
 
-    def run(self, rounds: int, finalists: int) -> None:
-        """One round of all, then `rounds` of those that could be the best."""
-        self._tried_ms = [self._run(each.placement, 0).frame_time_ms.mean for each in self._found]
-        always = [self._place(self._chosen), self._place(self._rule)]
-        fastest = sorted(range(len(self._found)), key=self._tried_ms.__getitem__)
-        others = [place for place in fastest if place not in always][:finalists]
-        self._runs = {place: [] for place in dict.fromkeys([*always, *others])}
-        for _ in range(rounds):
-            for place, runs in self._runs.items():
-                runs.append(self._run(self._found[place].placement, ISOLATED))
+    def run(self, rounds: int, finalists: int, further: int, runs: int) -> None:
+        """`rounds` of all, `further` of those that could be the best, and whole runs."""
+        self._rounds = self._try(range(len(self._found)), rounds)
+        tried_ms = self._tried_ms()
+        always = list(dict.fromkeys(self._places.values()))
+        others = [place for place in sorted(range(len(self._found)), key=tried_ms.__getitem__) if place not in always]
+        finals = [*always, *others[:finalists]]
+        found = self._try(finals, further)
+        self._further = {place: [each.frame_ns[n] / NS_PER_MS for each in found] for n, place in enumerate(finals)}
+        self._others = median(each.others for each in found)
+        for _ in range(runs):
+            for of, place in self._places.items():
+                self._runs[of].append(self._run(self._found[place].placement))
 
     def rows(self) -> list[dict[str, Any]]:
         """One of each placement, in the order of the predictions."""
@@ -129,56 +153,67 @@ class _Trial:
             {
                 "placement": described(each.placement),
                 "predicted_ms": each.frame_ns / NS_PER_MS,
-                "tried_ms": self._tried_ms[place],
-                "frame_ms": median(self._frames_ms(place)) if place in self._runs else None,
-                "is_chosen": place == self._place(self._chosen),
-                "is_rule": place == self._place(self._rule),
+                "tried_ms": tried_ms,
+                "frame_ms": median(self._further[place]) if place in self._further else None,
+                "is_chosen": place == self._places["chosen"],
+                "is_rule": place == self._places["rule"],
             }
-            for place, each in enumerate(self._found)
+            for place, (each, tried_ms) in enumerate(zip(self._found, self._tried_ms(), strict=True))
         ]
 
     def summary(self) -> dict[str, Any]:
-        """The chosen placement beside the best of the others and beside the rule's."""
-        place, by_rule = self._place(self._chosen), self._place(self._rule)
-        mine = self._frames_ms(place)
-        best = min(self._runs, key=lambda other: (median(self._frames_ms(other)), other != place))
-        rivals = [other for other in self._runs if other != place] or [place]
-        rival = min(rivals, key=lambda other: median(self._frames_ms(other)))
-        ratios = [a / b for a, b in zip(mine, self._frames_ms(rival), strict=True)]
-        gains = [b / a for a, b in zip(mine, self._frames_ms(by_rule), strict=True)]
+        """The chosen placement beside the best of the others and beside the rule's, and the model beside the trial."""
+        place = self._places["chosen"]
+        mine = self._further[place]
+        best = min(self._further, key=lambda other: (median(self._further[other]), other != place))
+        rivals = [other for other in self._further if other != place] or [place]
+        rival = min(rivals, key=lambda other: median(self._further[other]))
+        ratios = [a / b for a, b in zip(mine, self._further[rival], strict=True)]
+        gains = [b / a for a, b in zip(mine, self._further[self._places["rule"]], strict=True)]
+        predicted_ms, tried_ms = [each.frame_ns / NS_PER_MS for each in self._found], self._tried_ms()
+        off = [a / b for a, b in zip(predicted_ms, tried_ms, strict=True)]
         return {
             "chosen": described(self._chosen.placement),
+            "how": self._choice.why,
             "best": described(self._found[best].placement),
             "rule": described(self._rule.placement),
             "chosen_over_best": median(ratios),
             **_interval("", ratios),
             "rule_over_chosen": median(gains),
             **_interval("rule_", gains),
-            "core_efficiency": self._core_efficiency(place),
-            "rule_core_efficiency": self._core_efficiency(by_rule),
-            "times": times_rows(self._times),
+            "rank_correlation": rank_correlation(predicted_ms, tried_ms),
+            "predicted_over_tried": median(off),
+            "predicted_least": min(off),
+            "predicted_largest": max(off),
+            "others": self._others,
+            "run_ms": median(run.frame_time_ms.mean for run in self._runs["chosen"]),
+            "rule_run_ms": median(run.frame_time_ms.mean for run in self._runs["rule"]),
+            "core_efficiency": median(run.core_efficiency or 0.0 for run in self._runs["chosen"]),
+            "efficiency": median(run.efficiency or 0.0 for run in self._runs["chosen"]),
+            "rule_core_efficiency": median(run.core_efficiency or 0.0 for run in self._runs["rule"]),
+            "took_s": self._took_s,
         }
 
-    def _frames_ms(self, place: int) -> list[float]:
-        return [run.frame_time_ms.mean for run in self._runs[place]]
+    def times(self) -> list[dict[str, Any]]:
+        """What the units were measured to need."""
+        return times_rows(self._times)
 
-    def _core_efficiency(self, place: int) -> float:
-        return median(run.core_efficiency or 0.0 for run in self._runs[place])
+    def _tried_ms(self) -> list[float]:
+        """Of each placement, in the rounds of all."""
+        return [median(each.frame_ns[place] for each in self._rounds) / NS_PER_MS for place in range(len(self._found))]
 
     def _place(self, one: Ranked) -> int:
         """Where a placement stands among those that were found."""
         return [each.placement for each in self._found].index(one.placement)
 
-    def _run(self, placement: Placement, isolated: int) -> RunMetrics:
+    def _try(self, places: Sequence[int], rounds: int) -> Sequence[Round]:
+        return tried(self._checked, [self._found[place].placement for place in places], rounds, self._starter)
+
+    def _run(self, placement: Placement) -> RunMetrics:
         with tempfile.TemporaryDirectory(prefix="trilane-bench-") as folder:
             placed = self._checked.changed(out_dir=Path(folder), units=settings_of(placement))
             result = run_avatar(
-                placed.config,
-                placed.assets,
-                policy=POLICY,
-                edge=EDGE,
-                isolated_frames=isolated,
-                starter=self._starter,
+                placed.config, placed.assets, policy=POLICY, edge=EDGE, isolated_frames=ISOLATED, starter=self._starter
             )
         if result.interrupted:
             raise KeyboardInterrupt

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import gc
-import os
-import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 from trilane.errors import BadInputError
@@ -16,13 +13,13 @@ from trilane.pipeline.isolated import IsolatedTimes
 from trilane.pipeline.lifecycle import close_units, start_units
 from trilane.pipeline.preconditions import check_cores, check_open_files, check_positive, refuse_in_a_unit
 from trilane.pipeline.realtime_clock import Governor, RealtimeClock
-from trilane.pipeline.regions import edge_regions
 from trilane.pipeline.requests import FrameRequestQueue
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run_log import RunLog, UnitError
 from trilane.pipeline.run_metrics import RunMetrics, metrics_of
-from trilane.pipeline.shared_assets import Assets, share_assets
+from trilane.pipeline.shared_assets import Assets
 from trilane.pipeline.signals import Interrupts
+from trilane.pipeline.surroundings import on_cores, prompt_answers, unit_processes
 from trilane.pipeline.unit_processes import UnitProcesses
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.causes import Outcome, OutcomeKind
@@ -32,12 +29,11 @@ from trilane.scheduler.loop import run_loop
 from trilane.scheduler.recording import Recording
 from trilane.scheduler.release import run_settings
 from trilane.scheduler.stats import energy_score
-from trilane.transport.wakeup import DEFAULT, SHORTEST_NS, awake, use_slice
+from trilane.transport.wakeup import awake
 from trilane.unexpected_value import UnexpectedValue
 
 HANG_NS = 10_000_000_000
 FRAMES_PER_ISOLATED, LEAST_ISOLATED, MOST_ISOLATED = 15, 4, 16
-SWITCH_S = 0.0002  # the longest that another thread of this process keeps the interpreter
 
 
 class ReportingGovernor(Governor, Protocol):
@@ -104,10 +100,10 @@ def run_pipeline(
     with (
         contextlib.closing(requests) if requests is not None else contextlib.nullcontext(),
         Interrupts() as interrupts,
-        _on_cores(pipeline.scheduler_cores),
-        _prompt_answers(),
+        on_cores(pipeline.scheduler_cores),
+        prompt_answers(),
         awake(governor is None or governor.is_prompt) as idle_cores,
-        _processes(pipeline, assets or {}, starter) as processes,
+        unit_processes(pipeline, assets or {}, starter, UnitProcesses) as processes,
     ):
         core = Core(pipeline.graph(), settings)
         clock = RealtimeClock(core, processes, interrupts, log, requests, governor, on_progress)
@@ -238,45 +234,3 @@ def _spread(frames: int, count: int) -> list[int]:
     """`count` frame numbers, evenly over the run."""
     count = min(count, frames)
     return [index * frames // count for index in range(count)]
-
-
-@contextlib.contextmanager
-def _on_cores(cores: tuple[int, ...]) -> Iterator[None]:
-    """The scheduler runs on `cores`, off those of the other units."""
-    before = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, cores)
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, before)
-
-
-@contextlib.contextmanager
-def _prompt_answers() -> Iterator[None]:
-    """The scheduler answers at once.
-
-    It does not wait for another unit's time slice on its core, for a thread that draws a progress bar, or for garbage
-    collection: a run makes no garbage in cycles.
-    """
-    switch_s, collects = sys.getswitchinterval(), gc.isenabled()
-    sys.setswitchinterval(SWITCH_S)
-    gc.disable()
-    use_slice(SHORTEST_NS)
-    try:
-        yield
-    finally:
-        use_slice(DEFAULT)
-        sys.setswitchinterval(switch_s)
-        if collects:
-            gc.enable()
-
-
-@contextlib.contextmanager
-def _processes(pipeline: Pipeline, assets: Assets, starter: UnitStarter | None) -> Iterator[UnitProcesses]:
-    """The fork server, unless the caller has one; the memory; then the processes that map it."""
-    with contextlib.ExitStack() as stack:
-        used = starter or stack.enter_context(UnitStarter(pipeline.preload))
-        assets_fd = share_assets(assets)
-        stack.callback(os.close, assets_fd)
-        regions = stack.enter_context(edge_regions(pipeline))
-        yield stack.enter_context(contextlib.closing(UnitProcesses(pipeline, regions, assets_fd, used)))

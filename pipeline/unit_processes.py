@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import chain
+from pathlib import Path
 from typing import NamedTuple
 
 import zmq
@@ -105,8 +106,9 @@ class UnitProcesses:
         return {unit: process.pid for unit, process in self._live.items()}
 
     def watch(self, fd: int) -> None:
-        """Let `listen` return early when `fd` becomes readable."""
-        self._register(fd, partial(_swallow, fd))
+        """Let `listen` return early when `fd` becomes readable, from the first call on."""
+        if fd not in self._reactions:
+            self._register(fd, partial(_swallow, fd))
 
     def start(self, unit: str) -> None:
         """A fresh process for the unit; `Ready` or `Failed` follows, or its end. Raises TrilaneError, OSError."""
@@ -146,6 +148,13 @@ class UnitProcesses:
     def kill(self, unit: str) -> None:
         if unit in self._live:
             self._live[unit].kill()
+
+    def move(self, unit: str, cores: tuple[int, ...]) -> None:
+        """Every thread of the unit may run on `cores` alone, from now until its process ends."""
+        with contextlib.suppress(ProcessLookupError, FileNotFoundError):  # its end is heard of by `listen`
+            for thread in Path(f"/proc/{self._live[unit].pid}/task").iterdir():
+                with contextlib.suppress(ProcessLookupError):  # the thread has ended meanwhile
+                    os.sched_setaffinity(int(thread.name), cores)
 
     def listen(self, timeout_ms: int) -> list[UnitMessage]:
         """What came within the time; at once when something waits. A unit's messages come before its end."""

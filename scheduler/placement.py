@@ -1,11 +1,13 @@
 """Which cores and how many threads each unit gets. Rule: it follows from measured times alone, by one formula.
 
-`places.py` has the words, `placement_list.py` the placements that there are, `placement_model.py` the formula.
+`places.py` has the words, `placement_list.py` the placements that there are, `placement_model.py` the formula. The
+formula is not exact; where real frames can be had, the few placements that it cannot tell apart are told by them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from statistics import median
 from typing import Final, NamedTuple
 
 from trilane.scheduler.placement_list import placements
@@ -14,6 +16,11 @@ from trilane.scheduler.places import Core, Placement, Times, shared_cores
 
 #: Predictions this near to the shortest are as good: the model's own error is not less.
 WORTH: Final = 0.03
+#: Placements that are predicted so much longer than the shortest may be the best all the same; and so many are tried.
+UNCERTAIN: Final = 0.25
+MOST_TRIED: Final = 5
+#: Measured frame times this near to each other are the same.
+SAME: Final = 0.01
 
 
 class Ranked(NamedTuple):
@@ -46,6 +53,24 @@ def chosen(found: Sequence[Ranked], rule: Ranked) -> Ranked:
     if rule.frame_ns * (1 - WORTH) <= found[0].frame_ns:
         return rule
     return min(near, key=lambda each: _sharing(each.placement))
+
+
+def worth_trying(found: Sequence[Ranked], rule: Ranked) -> list[Ranked]:
+    """Which of `found`, which is `ranked`, may be the best; the `chosen` one first, that of the `rule` always."""
+    best, longest = chosen(found, rule), found[0].frame_ns * (1 + UNCERTAIN)
+    first = [best] if best.placement == rule.placement else [best, rule]
+    known = [each.placement for each in first]
+    return [*first, *(each for each in found if each.placement not in known and each.frame_ns <= longest)][:MOST_TRIED]
+
+
+def fastest(rounds: Sequence[Sequence[float]]) -> int:
+    """Place of the placement with the shortest measured frames; the first of those that are the `SAME`.
+
+    `rounds`: of each the frame times of all placements, which count relative to the median of their round.
+    """
+    relative = [[frame / median(times) for frame in times] for times in rounds]
+    middle = [median(of) for of in zip(*relative, strict=True)]
+    return next(place for place, value in enumerate(middle) if value <= min(middle) * (1 + SAME))
 
 
 def _tie(placement: Placement, times: Times) -> tuple[tuple[int, ...], tuple[tuple[int, ...], ...]]:

@@ -1,17 +1,17 @@
-"""Which cores the units of a run get. Rule: as asked; else the least predicted frame time; else the rule for any run.
+"""Which cores the units of a run get. Rule: as asked; else the shortest frames, tried or predicted; else by the rule.
 
 A run that is long enough is rehearsed for a moment: what each unit needs for a frame is measured, with the numbers of
-threads that it may have, and kept for the next run of the same network, shapes, runtime, output and machine. A run
-that is too short to gain by it, or is held to a chip's pace, is placed by the rule of `trilane.hw_profiles.host`.
+threads that it may have; the few placements with the least predicted frame times are then tried with real frames. Both
+are kept for the next run of the same network, shapes, runtime, output and machine. While other programs use the cores
+nothing is tried, and the prediction decides: times of a unit without its core are known, those of a pipeline are not.
+A run that is too short to gain by it, or is held to a chip's pace, is placed by the rule of `trilane.hw_profiles.host`.
 """
 
 from __future__ import annotations
 
-import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,34 +20,36 @@ from numpy.typing import NDArray
 from trilane.cache import cached_arrays
 from trilane.hw_profiles.host import host_cores, rule_placement, settings_of, usable_cores
 from trilane.hw_profiles.placement_facts import NS_PER_MS, described, placement_of, predictions, unit_rows
-from trilane.pipeline.rehearsal import rehearse
 from trilane.pipeline.unit_starter import UnitStarter
-from trilane.scheduler.placement import Ranked, chosen, ranked
+from trilane.scheduler.placement import Ranked, chosen, ranked, worth_trying
 from trilane.scheduler.placement_model import Rules, frame_ns
 from trilane.scheduler.places import Core, Place, Placement, Times, Work
 from trilane.stages.avatar_assets import network_of
-from trilane.stages.avatar_pipeline import avatar_pipeline
-from trilane.stages.config import RunConfig
+from trilane.stages.choosing import choice
 from trilane.stages.configure import Checked
 from trilane.stages.dsp.runtime import RUNTIMES
 from trilane.stages.machine_facts import cpu_facts, package_version
+from trilane.stages.rehearsing import measured_times, thread_counts
 from trilane.units import BEFORE_INFER, UNITS
 
-#: Shorter runs do not gain what a rehearsal takes, about a second.
+#: Shorter runs do not gain what a rehearsal takes.
 LEAST_FRAMES = 100
-FRAMES = 5  # of the scene, evenly spread, that are rehearsed
-CACHE = "placement-1"
+CACHE, TRIAL_CACHE = "placement-1", "placement-trial-1"
 MOST_LOGICAL, MOST_CORES = 8, 16
 FIRST = BEFORE_INFER[0][1]
 SEQUENTIAL = "sequential"
 
-RULE, MEASURED, ASKED = "rule", "measured", "asked"
+RULE, MEASURED, TRIED, ASKED = "rule", "measured", "tried", "asked"
+MEASURING = "measuring the stages for their placement on cores (once for this avatar, scene and machine) ..."
 
 
-def placed(checked: Checked, policy: str, starter: UnitStarter, driver: str = "") -> Checked:
+def placed(
+    checked: Checked, policy: str, starter: UnitStarter, driver: str = "", say: Callable[[str], None] = lambda _: None
+) -> Checked:
     """`checked` with its units on the cores that are best for it, and what is to be said of that.
 
-    `policy`: of the run. `starter`: a fork server. `driver`: OpenGL's, which the times depend on.
+    `policy`: of the run. `starter`: a fork server. `driver`: OpenGL's, which the times depend on. `say`: is told before
+    something takes seconds.
     Raises TrilaneError when a unit cannot start or a stage fails, KeyboardInterrupt when interrupted.
     """
     asked = {unit: Place(own, len(own)) for unit, own in checked.asked_cores.items()}
@@ -57,19 +59,29 @@ def placed(checked: Checked, policy: str, starter: UnitStarter, driver: str = ""
     if why:
         how = ASKED if len(asked) == len(UNITS) else RULE
         return _with(checked, rule, {"how": how, "why": why, "units": unit_rows(rule)})
-    times, at = _kept_times(checked, cores, rule, starter, driver)
+    made_from = [*_made_from(checked, cores, rule), driver]
+    times, at = _kept_times(checked, cores, rule, starter, made_from, say)
     rules = Rules(FIRST, policy == SEQUENTIAL)
     found = ranked(considered(cores, asked), times, rules, asked)
     by_rule = Ranked(rule, frame_ns(rule, cores, times, rules))
-    best = chosen(found, by_rule)
+    candidates = [chosen(found, by_rule)] if rules.sequential else worth_trying(found, by_rule)
+    key = [*made_from, at, *(described(each.placement) for each in candidates)]
+    numbers = [core.number for core in cores]
+    trial = choice(checked, numbers, candidates, starter, say, lambda make: cached_arrays(TRIAL_CACHE, key, make))
+    best = candidates[trial.best]
     facts = {
-        "how": MEASURED,
-        "why": "as asked, the others by their times" if asked else "the least predicted frame time",
+        "how": TRIED if trial.frame_ms else MEASURED,
+        "why": "; ".join([*(["as asked, the others by their times"] if asked else []), trial.why]),
         "units": unit_rows(best.placement),
         "measured_at": at,
         **predictions(best, by_rule, found),
         "times": times_rows(times),
     }
+    if trial.frame_ms:
+        facts["tried"] = [
+            {"units": unit_rows(each.placement), "frame_ms": frame_ms}
+            for each, frame_ms in zip(candidates, trial.frame_ms, strict=True)
+        ]
     return _with(checked, best.placement, facts)
 
 
@@ -115,21 +127,33 @@ def _with(checked: Checked, placement: Placement, facts: Mapping[str, Any]) -> C
 
 
 def _reason(facts: Mapping[str, Any]) -> str:
-    if facts["how"] != MEASURED:
+    if facts["how"] == TRIED:
+        others = [(row["units"], row["frame_ms"]) for row in sorted(facts["tried"], key=lambda row: row["frame_ms"])]
+        frame_ms = next(ms for units, ms in others if units == facts["units"])
+    elif facts["how"] == MEASURED:
+        others = [(row["units"], row["predicted_ms"]) for row in facts["alternatives"][:2]]
+        frame_ms = facts["predicted_ms"]
+        if facts["rule"] not in (facts["units"], *(units for units, _ in others)):
+            others.insert(0, (facts["rule"], facts["rule_ms"]))
+    else:
         return str(facts["why"])
-    others = [(row["units"], row["predicted_ms"]) for row in facts["alternatives"][:2]]
-    if facts["rule"] not in (facts["units"], *(units for units, _ in others)):
-        others.insert(0, (facts["rule"], facts["rule_ms"]))
-    text = f"{facts['why']}: {facts['predicted_ms']:.1f} ms by times of {facts['measured_at']}"
-    return "; ".join([text, *(f"{described(placement_of(units))}: {ms:.1f}" for units, ms in others)])
+    text = f"{facts['why']}: {frame_ms:.1f} ms by times of {facts['measured_at']}"
+    rest = [f"{described(placement_of(units))}: {ms:.1f}" for units, ms in others if units != facts["units"]]
+    return "; ".join([text, *rest])
 
 
 def _kept_times(
-    checked: Checked, cores: Sequence[Core], rule: Placement, starter: UnitStarter, driver: str
+    checked: Checked,
+    cores: Sequence[Core],
+    rule: Placement,
+    starter: UnitStarter,
+    made_from: Sequence[str],
+    say: Callable[[str], None],
 ) -> tuple[Times, str]:
     """What each unit needs for a frame, and when that was measured, UTC."""
 
     def measured() -> dict[str, NDArray[Any]]:
+        say(MEASURING)
         rows = [
             (UNITS.index(unit), threads, *work)
             for unit, works in measured_times(checked, cores, rule, starter).items()
@@ -137,22 +161,11 @@ def _kept_times(
         ]
         return {"works": np.array(rows, np.int64), "at_s": np.array(time.time(), np.int64)}
 
-    made = cached_arrays(CACHE, [*_made_from(checked, cores, rule), driver], measured)
+    made = cached_arrays(CACHE, made_from, measured)
     times: dict[str, dict[int, Work]] = {unit: {} for unit in UNITS}
     for unit, threads, *work in made["works"].tolist():
         times[UNITS[unit]][threads] = Work(*work)
     return times, time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(int(made["at_s"])))
-
-
-def thread_counts(cores: int, rule: Placement) -> dict[str, list[int]]:
-    """The numbers of threads, beside 1, that each unit is measured with: those that a placement may give it.
-
-    Each, what the `rule` for any run and the options give it. The network also up to four, half of the cores, all, and
-    all but those of the others.
-    """
-    counts = {unit: {place.threads} for unit, place in rule.items()}
-    counts["dsp"] |= {*range(2, min(cores, 4) + 1), cores // 2, cores - 2, cores - 1, cores}
-    return {unit: sorted(count for count in of if count > 1) for unit, of in counts.items()}
 
 
 def _made_from(checked: Checked, cores: Sequence[Core], rule: Placement) -> list[str]:
@@ -164,43 +177,3 @@ def _made_from(checked: Checked, cores: Sequence[Core], rule: Placement) -> list
     network = network_of(checked.assets).digest
     versions = [str(package_version(name)) for name in (RUNTIMES[config.runtime].package, "trilane")]
     return [said, scene, *machine, network, *versions]
-
-
-def measured_times(checked: Checked, cores: Sequence[Core], rule: Placement, starter: UnitStarter) -> Times:
-    """What each unit needs for a frame, measured now.
-
-    `checked`: what is to be run. `cores`: there are. `rule`: whose numbers of threads are measured too. `starter`: a
-    fork server. One of the scene's tensor shapes is used, which is prepared soonest; all have about the same area.
-    Raises as `placed`.
-    """
-    fastest = [core.number for core in sorted(cores, key=lambda core: (-core.permille, core.number))]
-    one = {unit: Place((fastest[0],), 1) for unit in UNITS}
-    variants = [
-        {**one, unit: Place(tuple(sorted(fastest[:count])), count)}
-        for unit, counts in thread_counts(len(cores), rule).items()
-        for count in counts
-    ]
-    scene = checked.config.scene
-    with tempfile.TemporaryDirectory(prefix="trilane-rehearsal-") as folder:
-        one_shape = scene.model_copy(update={"size": _one_shape(checked.config)})
-        config = checked.config.model_copy(update={"out_dir": Path(folder), "scene": one_shape, "shapes": ()})
-        first, *others = (
-            avatar_pipeline(config.model_copy(update={"units": _spinning(placement, len(cores))}), checked.assets)
-            for placement in (one, *variants)
-        )
-        spread = [number * scene.frames // FRAMES for number in range(FRAMES)]
-        return rehearse(first, others, spread, checked.assets, starter)
-
-
-def _spinning(placement: Placement, cores: int) -> dict[str, Any]:
-    """Settings in which a unit's threads spin if there are cores for it alone, as they then will in the run."""
-    return {
-        unit: settings.model_copy(update={"spin": 1 < settings.threads <= cores - len(UNITS) + 1})
-        for unit, settings in settings_of(placement).items()
-    }
-
-
-def _one_shape(config: RunConfig) -> str:
-    """The tensor shape nearest to a square."""
-    height, width = min(config.buckets, key=lambda shape: (abs(shape[0] - shape[1]), shape))
-    return f"{height}x{width}"

@@ -150,7 +150,11 @@ def show(name: str, measure: Callable[..., Mapping[str, Any]], asked: Mapping[st
     if rows:
         console.print(_table([flat(row) for row in rows]))
     for key, value in flat(result).items():
-        console.print(f"{key}: {_text(value)}", soft_wrap=True)
+        if value and isinstance(value, list) and isinstance(value[0], Mapping):
+            console.print(f"{key}:")
+            console.print(_table([flat(row) for row in value]))
+        else:
+            console.print(f"{key}: {_text(value)}", soft_wrap=True)
     console.print(f"cpu: {document['machine']['cpu']['model']}, {document['machine']['cpu']['cores']} cores")
 
 

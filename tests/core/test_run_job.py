@@ -127,7 +127,7 @@ def runs(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Runs]:
     return made
 
 
-def with_a_place(given: Checked, _policy: str, _starter: Any, _driver: str) -> Checked:
+def with_a_place(given: Checked, _policy: str, _starter: Any, _driver: str, _say: Any) -> Checked:
     """In place of the placement: it adds a note and leaves the units where they are."""
     return replace(given, notes=(*given.notes, PLACED))
 

@@ -23,6 +23,7 @@ from trilane.pipeline import (
     preconditions,
     run,
     run_log,
+    surroundings,
 )
 from trilane.pipeline.isolated import IsolatedTimes
 from trilane.pipeline.lifecycle import close_units, listen_before_run, start_units
@@ -330,7 +331,7 @@ def test_settings_follow_from_policy_and_rate() -> None:
 
 def test_the_scheduler_is_on_its_cores_and_back_afterwards() -> None:
     before = os.sched_getaffinity(0)
-    with contextlib.suppress(ValueError), run._on_cores((min(before),)):
+    with contextlib.suppress(ValueError), surroundings.on_cores((min(before),)):
         assert os.sched_getaffinity(0) == {min(before)}
         raise ValueError
     assert os.sched_getaffinity(0) == before
@@ -339,16 +340,16 @@ def test_the_scheduler_is_on_its_cores_and_back_afterwards() -> None:
 @pytest.mark.parametrize("collects", [True, False])
 def test_answers_are_prompt_inside_the_run_alone(monkeypatch: pytest.MonkeyPatch, collects: bool) -> None:
     calls: list[Any] = []
-    monkeypatch.setattr(run, "use_slice", calls.append)
+    monkeypatch.setattr(surroundings, "use_slice", calls.append)
     monkeypatch.setattr(
-        run,
+        surroundings,
         "gc",
         SimpleNamespace(
             isenabled=lambda: collects, disable=lambda: calls.append("off"), enable=lambda: calls.append("on")
         ),
     )
     before = sys.getswitchinterval()
-    with run._prompt_answers():
+    with surroundings.prompt_answers():
         assert sys.getswitchinterval() == pytest.approx(0.0002)
         assert calls == ["off", 100_000]
     assert sys.getswitchinterval() == before

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from trilane.errors import BadInputError
 from trilane.hw_profiles.host import asked_cores, host_cores, rule_placement, settings_of
 from trilane.scheduler import placement_model, places
-from trilane.scheduler.placement import Ranked, chosen, ranked
+from trilane.scheduler.placement import Ranked, chosen, fastest, ranked, worth_trying
 from trilane.scheduler.placement_list import placements
 from trilane.scheduler.placement_model import Rules, frame_ns
 from trilane.scheduler.places import Core, Place, Placement, Times, Work, busiest_core_ns
@@ -197,6 +197,25 @@ def test_what_is_hardly_better_than_the_rule_is_not_taken() -> None:
     assert chosen([better, rule], rule) == rule
     assert chosen([shared, floating, much_better, rule], rule) == much_better
     assert chosen([Ranked(shared.placement, 80), much_better, rule], rule).frame_ns == 80
+
+
+def test_what_the_model_cannot_tell_apart_is_tried_and_the_rule_always() -> None:
+    """The one that the model would take comes first; a quarter more than the shortest is the limit; five at most."""
+    rule = Ranked(on(0, 0, 1), 200)
+    shortest, near, far = Ranked(on(0, 1, (0, 1)), 100), Ranked(on(0, 1, 0), 102), Ranked(on(0, 1, 1), 126)
+    assert worth_trying([shortest, near, far, rule], rule) == [near, rule, shortest]
+    many = [Ranked(on(0, 1, n), 100 + 5 * n) for n in range(9)]
+    assert worth_trying([*many, rule], rule) == [many[0], rule, *many[1:4]]
+    best = rule._replace(frame_ns=100)
+    assert worth_trying([best, near, far], best) == [best, near]
+
+
+def test_the_fastest_in_most_rounds_is_the_fastest() -> None:
+    """The second is 10 % faster in three rounds; in the fourth all are slow, and it is the slowest by chance."""
+    assert fastest([[100, 90, 120], [100, 90, 120], [100, 90, 120], [500, 900, 600]]) == 1
+    assert fastest([[100, 99.5, 120]]) == 0  # the same: the first stays
+    assert fastest([[100, 98.5, 98.0]]) == 1
+    assert fastest([[7.0]]) == 0
 
 
 def test_given_places_stay() -> None:

@@ -13,7 +13,7 @@ import pytest
 from trilane.hw_profiles.host import rule_placement, usable_cores
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.places import Times
-from trilane.stages import placing
+from trilane.stages import choosing, placing
 from trilane.stages.configure import Checked, Request, configure
 from trilane.stages.factories import PRELOAD
 
@@ -31,15 +31,28 @@ def checked(drawable_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
 def test_a_run_is_rehearsed_once_and_what_was_found_is_kept(
     checked: Checked, monkeypatch: pytest.MonkeyPatch, nothing_left: Path
 ) -> None:
+    """However busy the machine is; one round of the placements is enough."""
     monkeypatch.setattr(placing, "LEAST_FRAMES", 4)
+    for name, value in (("MOST_OTHERS", 9.0), ("ROUNDS", 1), ("LOOK_S", 0.0)):
+        monkeypatch.setattr(choosing, name, value)
+    said: list[str] = []
     with UnitStarter(PRELOAD) as starter:
-        first = placing.placed(checked, "pipelined", starter).placement
+        first = placing.placed(checked, "pipelined", starter, "", said.append).placement
         monkeypatch.setattr(placing, "measured_times", None)  # whoever calls it fails
-        again = placing.placed(checked, "pipelined", starter)
+        monkeypatch.setattr(choosing, "tried", None)
+        again = placing.placed(checked, "pipelined", starter, "", said.append)
+        one_at_a_time = placing.placed(checked, "sequential", starter, "", said.append).placement
     assert first is not None
-    assert first["how"] == "measured"
     assert first == again.placement
-    assert 0 < first["predicted_ms"] <= first["rule_ms"]
+    assert [text.split()[0] for text in said] == ["measuring", "trying"]
+    assert first["how"] == "tried"
+    frame_ms = {str(row["units"]): row["frame_ms"] for row in first["tried"]}
+    assert frame_ms[str(first["units"])] <= 1.01 * min(frame_ms.values())
+    assert str(first["rule"]) in frame_ms
+    assert f"the fastest of {len(frame_ms)} that were tried: {frame_ms[str(first['units'])]:.1f} ms" in again.notes[-1]
+    assert one_at_a_time is not None
+    assert (one_at_a_time["how"], one_at_a_time["why"]) == ("measured", "the least predicted frame time")
+    assert 0 < one_at_a_time["predicted_ms"] <= one_at_a_time["rule_ms"]
     assert {unit: {"cores": list(s.cores), "threads": s.threads} for unit, s in again.config.units.items()} == first[
         "units"
     ]

@@ -1,0 +1,43 @@
+"""What other programs have of the cores meanwhile. Rule: what is not ours is theirs, by the kernel's own counts."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import psutil
+
+STAT = Path("/proc/stat")
+
+
+class OtherPrograms:
+    """Counts from its making on. `cores`: of which; `pids`: of processes that are ours beside this one."""
+
+    def __init__(self, cores: Sequence[int], pids: Sequence[int] = (), stat: Path = STAT) -> None:
+        self._cores, self._processes, self._stat = cores, [psutil.Process(pid) for pid in (os.getpid(), *pids)], stat
+        self._begin_s, self._before_s = time.monotonic(), self._others_s()
+
+    def share(self) -> float:
+        """Theirs of the time of the cores; known to some percent of a second, for the kernel counts steps of 10 ms."""
+        took_s = max(time.monotonic() - self._begin_s, 1e-9)
+        return max(self._others_s() - self._before_s, 0.0) / (took_s * len(self._cores))
+
+    def _others_s(self) -> float:
+        own = [process.cpu_times() for process in self._processes]
+        own_s: float = sum(times.user + times.system for times in own)
+        return busy_s(self._stat.read_text(), self._cores) - own_s
+
+
+def busy_s(stat: str, cores: Sequence[int]) -> float:
+    """How long `cores` were not idle since the system began, what a hypervisor took of them included.
+
+    `stat`: what /proc/stat said (proc_stat(5)): cpuN user nice system idle iowait irq softirq steal guest guest_nice,
+    the guests' time counted in user and nice too.
+    """
+    names = {f"cpu{core}" for core in cores}
+    rows = [line.split() for line in stat.splitlines()]
+    busy = [[*map(int, fields[:3]), *map(int, fields[5:8])] for name, *fields in rows if name in names]
+    steps = sum(map(sum, busy))
+    return steps / os.sysconf("SC_CLK_TCK")

@@ -1,0 +1,121 @@
+"""What runs before a run, to place its units: each unit alone, then whole placements in turns.
+
+Rule: it is the run's own stages on its own frames, with one tensor shape, and what they write is thrown away.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from trilane.hw_profiles.host import settings_of
+from trilane.pipeline.rehearsal import rehearse
+from trilane.pipeline.trial import SLICE, Group, Round, try_in_turns
+from trilane.pipeline.unit_starter import UnitStarter
+from trilane.scheduler.places import Core, Place, Placement, Times
+from trilane.stages.avatar_pipeline import avatar_pipeline
+from trilane.stages.config import RunConfig
+from trilane.stages.configure import Checked
+from trilane.units import UNITS
+
+FRAMES = 5  # of the scene, evenly spread, that each unit does alone
+
+
+def thread_counts(cores: int, rule: Placement) -> dict[str, list[int]]:
+    """The numbers of threads, beside 1, that each unit is measured with: those that a placement may give it.
+
+    Each, what the `rule` for any run and the options give it. The network also up to four, half of the cores, all, and
+    all but those of the others.
+    """
+    counts = {unit: {place.threads} for unit, place in rule.items()}
+    counts["dsp"] |= {*range(2, min(cores, 4) + 1), cores // 2, cores - 2, cores - 1, cores}
+    return {unit: sorted(count for count in of if count > 1) for unit, of in counts.items()}
+
+
+def measured_times(checked: Checked, cores: Sequence[Core], rule: Placement, starter: UnitStarter) -> Times:
+    """What each unit needs for a frame, measured now.
+
+    `checked`: what is to be run. `cores`: there are. `rule`: whose numbers of threads are measured too. `starter`: a
+    fork server. Raises TrilaneError when a unit cannot start or a stage fails, KeyboardInterrupt when interrupted.
+    """
+    fastest = [core.number for core in sorted(cores, key=lambda core: (-core.permille, core.number))]
+    one = {unit: Place((fastest[0],), 1) for unit in UNITS}
+    variants = [
+        {**one, unit: Place(tuple(sorted(fastest[:count])), count)}
+        for unit, counts in thread_counts(len(cores), rule).items()
+        for count in counts
+    ]
+    with _thrown_away(checked) as config:
+        first, *others = (
+            avatar_pipeline(config.model_copy(update={"units": _spinning(placement, len(cores))}), checked.assets)
+            for placement in (one, *variants)
+        )
+        frames = config.scene.frames
+        spread = [number * frames // FRAMES for number in range(FRAMES)]
+        return rehearse(first, others, spread, checked.assets, starter)
+
+
+def tried(
+    checked: Checked,
+    placements: Sequence[Placement],
+    rounds: int,
+    starter: UnitStarter,
+    limit_s: float = math.inf,
+    least: int = 1,
+) -> list[Round]:
+    """Frame times of `placements`, in turns.
+
+    `rounds`: how many, on frames from all over the scene; after `limit_s` seconds no further one than the `least`.
+    `checked`, `starter`, and what is raised: as `measured_times`.
+    """
+    groups: dict[tuple[tuple[int, bool], ...], list[int]] = {}
+    for number, placement in enumerate(placements):
+        settings = settings_of(placement).values()
+        kind = tuple((each.threads, each.spin and each.threads > 1) for each in settings)
+        groups.setdefault(kind, []).append(number)
+    windows = [turn * max(checked.config.scene.frames - SLICE, 0) // rounds for turn in range(rounds)]
+    end = time.monotonic() + limit_s
+    with _thrown_away(checked) as config:
+        of_kind = [
+            Group(
+                avatar_pipeline(config.model_copy(update={"units": settings_of(placements[own[0]])}), checked.assets),
+                [{unit: place.cores for unit, place in placements[number].items()} for number in own],
+            )
+            for own in groups.values()
+        ]
+        found = try_in_turns(
+            of_kind, windows, checked.assets, starter, lambda done: len(done) >= least and time.monotonic() > end
+        )
+    order = [number for own in groups.values() for number in own]
+    places = sorted(range(len(order)), key=order.__getitem__)
+    return [Round(tuple(each.frame_ns[place] for place in places), each.others) for each in found]
+
+
+@contextmanager
+def _thrown_away(checked: Checked) -> Iterator[RunConfig]:
+    """The configuration with one of its tensor shapes, prepared soonest, and a folder that is then removed.
+
+    All shapes have about the same area.
+    """
+    with tempfile.TemporaryDirectory(prefix="trilane-rehearsal-") as folder:
+        scene = checked.config.scene.model_copy(update={"size": _one_shape(checked.config)})
+        yield checked.config.model_copy(update={"out_dir": Path(folder), "scene": scene, "shapes": ()})
+
+
+def _spinning(placement: Placement, cores: int) -> dict[str, Any]:
+    """Settings in which a unit's threads spin if there are cores for it alone, as they then will in the run."""
+    return {
+        unit: settings.model_copy(update={"spin": 1 < settings.threads <= cores - len(UNITS) + 1})
+        for unit, settings in settings_of(placement).items()
+    }
+
+
+def _one_shape(config: RunConfig) -> str:
+    """The tensor shape nearest to a square."""
+    height, width = min(config.buckets, key=lambda shape: (abs(shape[0] - shape[1]), shape))
+    return f"{height}x{width}"
