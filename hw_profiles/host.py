@@ -16,6 +16,7 @@ from typing import Any
 import psutil
 
 from trilane.errors import BadInputError
+from trilane.near_miss import did_you_mean
 from trilane.pipeline.description import UnitSettings
 from trilane.scheduler.places import FULL, Core, Place, Placement, has_own_cores
 from trilane.units import UNITS
@@ -90,7 +91,8 @@ def asked_cores(texts: Sequence[str]) -> dict[str, tuple[int, ...]]:
         if not equals:
             raise BadInputError("--cores", repr(text), CORES)
         if unit not in UNITS:
-            raise BadInputError("--cores", f"unknown unit {unit!r}", f"one of {', '.join(UNITS)}")
+            expected = f"one of {', '.join(UNITS)}"
+            raise BadInputError("--cores", f"unknown unit {unit!r}", expected, did_you_mean(unit.lower(), UNITS))
         if unit in asked:
             raise BadInputError("--cores", f"unit {unit} twice", "each unit once", f"such as {unit}=0,1 for two cores")
         asked[unit] = _listed(text, listed)

@@ -2,7 +2,8 @@
 
 busy: a job runs. starved: no input. blocked: input, but no free output slot, or the limit of frames in flight.
 throttled: held by the cap. preempted: the unit has a job, but not its core. overhead: a job is assigned but does not
-run (messages, scheduling, it sleeps), or the unit is down. On the virtual clock every unit has its own core.
+run (messages, scheduling, it sleeps), or the unit is down. On the virtual clock no unit is preempted here: those on one
+core are one unit to the scheduler, whose share trilane.hw_profiles.application divides.
 """
 
 from __future__ import annotations
@@ -85,7 +86,8 @@ class _StageBook:
     def __init__(self) -> None:
         self.service_ns: list[int] = []
         self.wait_ns: list[int] = []
-        self.skipping_ns: list[int] = []
+        self.on_core_ns: list[int] = []  # the service times without the time in which another thread had the core
+        self.skipping_ns: list[int] = []  # the same of jobs whose frame took the bypass
 
 
 class Ledger:
@@ -135,8 +137,9 @@ class Ledger:
         `skips`: its frame takes the bypass.
         """
         stage = self._stages[job.stage]
+        stage.on_core_ns.append(end_ns - begin_ns - preempted_ns)
         if skips:
-            stage.skipping_ns.append(end_ns - begin_ns)
+            stage.skipping_ns.append(end_ns - begin_ns - preempted_ns)
         stage.service_ns.append(end_ns - begin_ns)
         stage.wait_ns.append(begin_ns - ready_ns)
         self._units[job.unit].add_job(begin_ns, end_ns, preempted_ns, asleep_ns, preempted_before_ns)
@@ -224,8 +227,9 @@ class Ledger:
     def _efficiency(self, isolated_ns: Mapping[str, float] | None, interval_ns: float) -> dict[str, Any]:
         """Isolated service time of the slowest unit over the mean interval between presented frames.
 
-        A stage that was not measured isolated (it writes files) counts with its mean in the run; so do, of frames that
-        took the bypass, their jobs, which are none of the stages that it skips.
+        A stage that was not measured isolated (it writes files) counts with its mean in the run, without the time in
+        which another thread had its core; so do, of frames that took the bypass, their jobs, which are none of the
+        stages that it skips.
         """
         if not isolated_ns or not interval_ns:
             return {"efficiency": None, "isolated_ms": {}}
@@ -235,7 +239,7 @@ class Ledger:
             book = self._stages[stage.name]
             isolated = isolated_ns.get(stage.name)
             if isolated is None:
-                per_unit[stage.unit] += _mean(book.service_ns)
+                per_unit[stage.unit] += _mean(book.on_core_ns)
             else:
                 per_unit[stage.unit] += (1 - share) * isolated + share * _mean(book.skipping_ns)
         return {

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from trilane.errors import BadInputError
-from trilane.pipeline import accounts, run
+from trilane.pipeline import accounts, run, surroundings
 from trilane.pipeline.cpu_use import CpuTimes
 from trilane.pipeline.requests import FrameRequestQueue
 from trilane.pipeline.result import RunResult
@@ -41,7 +41,7 @@ class World:
     core: Any = None
 
     # The parts that a run is made of.
-    def processes(self, given: Any, assets: Any, starter: Any) -> Any:
+    def processes(self, given: Any, assets: Any, starter: Any, _kind: Any) -> Any:
         self.steps.append(("processes", given is PIPELINE, assets, starter))
         pids = {"left": 11, "right": 12}
         return contextlib.nullcontext(SimpleNamespace(pids=pids, why_ended=lambda unit: f": {unit} is broken"))
@@ -106,9 +106,9 @@ def world(monkeypatch: pytest.MonkeyPatch) -> World:
         ("check_cores", lambda given: world.steps.append(("check cores", given is PIPELINE))),
         ("check_open_files", lambda: world.steps.append("check files")),
         ("refuse_in_a_unit", lambda: world.steps.append("refuse")),
-        ("_on_cores", on_cores),
-        ("_processes", world.processes),
-        ("_prompt_answers", contextlib.nullcontext),
+        ("on_cores", on_cores),
+        ("unit_processes", world.processes),
+        ("prompt_answers", contextlib.nullcontext),
         ("awake", awake),
         ("Interrupts", interrupts),
         ("RealtimeClock", world.clock),
@@ -306,13 +306,13 @@ def test_memory_and_processes_are_closed_in_turn(monkeypatch: pytest.MonkeyPatch
         def close(self) -> None:
             steps.append("units closed")
 
-    monkeypatch.setattr(run, "UnitStarter", part("server"))
-    monkeypatch.setattr(run, "edge_regions", part("regions"))
-    monkeypatch.setattr(run, "UnitProcesses", Units)
-    monkeypatch.setattr(run, "share_assets", lambda assets: steps.append(("assets", assets)) or 77)
+    monkeypatch.setattr(surroundings, "UnitStarter", part("server"))
+    monkeypatch.setattr(surroundings, "edge_regions", part("regions"))
+    monkeypatch.setattr(surroundings, "share_assets", lambda assets: steps.append(("assets", assets)) or 77)
     monkeypatch.setattr(os, "close", lambda fd: steps.append(("close", fd)))
     assets: Any = {"a": 1}
-    with run._processes(PIPELINE, assets, None) as processes:
+    kind: Any = Units
+    with surroundings.unit_processes(PIPELINE, assets, None, kind) as processes:
         steps.append("inside")
     assert isinstance(processes, Units)
     made = [("assets", assets), ("regions", PIPELINE)]
@@ -321,6 +321,6 @@ def test_memory_and_processes_are_closed_in_turn(monkeypatch: pytest.MonkeyPatch
     assert steps == [*begun, *ended, "server closed"]
     steps.clear()
     starter: Any = "mine"
-    with run._processes(PIPELINE, assets, starter):
+    with surroundings.unit_processes(PIPELINE, assets, starter, kind):
         steps.append("inside")
     assert steps == [*made, ("units", PIPELINE, "regions", 77, "mine"), *ended]

@@ -115,6 +115,19 @@ def test_efficiency_is_the_slowest_units_time_alone_over_the_frame_time() -> Non
     assert (unmeasured["efficiency"], unmeasured["isolated_ms"], "bottleneck" in unmeasured) == (None, {}, False)
 
 
+def test_waiting_for_a_core_is_no_work_of_a_stage_that_was_not_measured_alone() -> None:
+    """show takes 9 ms each time, but another thread has its core for 5 and 3 of them; a frame every 10 ms."""
+    ledger = Ledger(TWO)
+    for frame, lost_ms in enumerate((5, 3)):
+        end_ns = 10 * (frame + 1) * MS
+        job = Job(frame, "cpu", "show", frame, 0, -1, 0)
+        ledger.job(job, end_ns - 9 * MS, end_ns - 9 * MS, end_ns, preempted_ns=lost_ms * MS)
+        ledger.presented(frame, end_ns, 9 * MS, NEVER)
+    report = ledger.report(clock="host", requested=2, isolated_ns={"draw": 4.0 * MS})
+    assert (report["efficiency"], report["bottleneck"]) == (pytest.approx((4 + 6) / 2 / 10), "cpu")
+    assert report["stages"]["show"]["service_ms"]["mean"] == 9
+
+
 def test_a_run_without_frames_divides_by_nothing() -> None:
     report = Ledger(TWO).report(clock="virtual", requested=0, isolated_ns={"draw": 1.0})
     assert (report["fps"], report["xrbench"]["qoe"], report["efficiency"]) == (0, 0, None)

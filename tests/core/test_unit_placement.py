@@ -366,7 +366,9 @@ def test_cores_as_asked() -> None:
 @pytest.mark.parametrize(
     ("texts", "said"),
     [
-        (["npu=1"], "unknown unit 'npu', expected one of cpu, gpu, dsp"),
+        (["tpm=1"], "unknown unit 'tpm', expected one of cpu, gpu, dsp$"),
+        (["dps=1"], "unknown unit 'dps', expected one of cpu, gpu, dsp; did you mean 'dsp'"),
+        (["GPU=1"], "unknown unit 'GPU', expected one of cpu, gpu, dsp; did you mean 'gpu'"),
         (["cpu=1", "cpu=0"], "unit cpu twice"),
         (["cpu=0,2"], "core 2 for unit cpu, expected cores that this process may use: 0, 1, 3"),
         (["cpu="], "'cpu=', expected UNIT=LIST"),
