@@ -9,6 +9,7 @@ hand-over.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -57,7 +58,9 @@ REFERENCE = Variant()
 class Plan:
     """One application on one chip. `runtime`: the unit of the network.
 
-    `gpu_share`: the part of the network's products that the GPU does when the rest runs on the DSP. Raises
+    `gpu_share`: the part of the network's products that the GPU does when the rest runs on the DSP. `most_fps`: a rate
+    that the application is held to, as the display would, None for the display's own; policies that release frames at
+    a rate have it in their variant. `stretch`: by which the network's time differs from what is expected. Raises
     BadInputError for a value outside its range.
     """
 
@@ -65,6 +68,8 @@ class Plan:
     runtime: UnitName
     variant: Variant = REFERENCE
     gpu_share: float = 0.0
+    most_fps: float | None = None
+    stretch: float = 1.0
 
     def __post_init__(self) -> None:
         if self.runtime not in RUNTIMES:
@@ -75,6 +80,8 @@ class Plan:
             raise BadInputError("batch", str(self.variant.batch), "1 to 64")
         if not 0 < self.variant.fps <= MOST_FPS:
             raise BadInputError("fps", f"{self.variant.fps:g}", f"above 0, at most {MOST_FPS:g}")
+        if self.most_fps is not None and not 0 < self.most_fps <= MOST_FPS:
+            raise BadInputError("fps", f"{self.most_fps:g}", f"above 0, at most {MOST_FPS:g}")
         if not 0 <= self.gpu_share < 1 or (self.gpu_share and self.runtime == "gpu"):
             raise BadInputError("gpu-share", f"{self.gpu_share:g} on {self.runtime}", "0 to below 1, on the dsp")
 
@@ -132,11 +139,11 @@ def _network_ms(profile: Profile, plan: Plan, corners: Corners) -> dict[tuple[st
     work, batch = plan.network.work, plan.variant.batch
     if not plan.gpu_share:
         job = _job(profile, work, plan.runtime, corners, batch=batch)
-        return {("infer", plan.runtime): handover + job.total_ms}
+        return {("infer", plan.runtime): handover + plan.stretch * job.total_ms}
     head, tail = split_work(work, plan.gpu_share)
     return {
-        ("infer_head", "gpu"): handover + _job(profile, head, "gpu", corners, batch=batch).total_ms,
-        ("infer", "dsp"): handover + _job(profile, tail, "dsp", corners, batch=batch).total_ms,
+        ("infer_head", "gpu"): handover + plan.stretch * _job(profile, head, "gpu", corners, batch=batch).total_ms,
+        ("infer", "dsp"): handover + plan.stretch * _job(profile, tail, "dsp", corners, batch=batch).total_ms,
     }
 
 
@@ -159,7 +166,8 @@ def split_work(work: Work, share: float) -> tuple[Work, Work]:
 class Steady:
     """The application once it has settled.
 
-    `capped`: whether it waits for the display. `unit_of`: unit of each stage. `stages_ms`: time of a job of each stage.
+    `capped`: whether it waits for the display, or is held to a rate. `dropped`: share of the
+    frames that are not shown. `unit_of`: unit of each stage. `stages_ms`: time of a job of each stage.
     `busy`: share of the time in which each unit works; `idle`: shares of the rest by cause. They sum to 1 per unit. Of
     units that share a core, `preempted` is the share in which another one of them works on it.
     `accounts`: how they compare with those that the slices of the run give; empty when that was not asked.
@@ -173,6 +181,7 @@ class Steady:
     busy: Mapping[str, float]
     idle: Mapping[str, Mapping[str, float]]
     accounts: Mapping[str, Any]
+    dropped: float
 
 
 def application_graph(edge: str = "double", infer: Iterable[tuple[str, str]] = (INFER,)) -> Graph:
@@ -239,7 +248,10 @@ def steady(profile: Profile, plan: Plan, corners: Corners, *, quick: bool = Fals
     times = stage_times_ms(profile, plan, corners)
     worker = _workers(profile)
     rounded = tuple((name, worker[unit], round(ms * NS_PER_MS)) for (name, unit), ms in times.items())
-    batch, display = plan.variant.batch, profile.application.display_ms.or_else(0)
+    batch, display = (
+        plan.variant.batch,
+        max(profile.application.display_ms.or_else(0), 1e3 / (plan.most_fps or math.inf)),
+    )
     report, capped = _settled(rounded, plan.variant, round(batch * display * NS_PER_MS), quick, twice)
     shares = {unit: _shares(unit, worker, times, report["units"]) for unit in UNITS}
     frame = max(report["frame_time_ms"]["mean"], *times.values()) / batch
@@ -252,6 +264,7 @@ def steady(profile: Profile, plan: Plan, corners: Corners, *, quick: bool = Fals
         busy={unit: busy for unit, (busy, _) in shares.items()},
         idle={unit: idle for unit, (_, idle) in shares.items()},
         accounts=report.get("accounts", {}),
+        dropped=1 - report["frames"]["presented"] / report["frames"]["requested"],
     )
 
 

@@ -59,6 +59,11 @@ class Interval(NamedTuple):
     why: tuple[str, ...]
 
 
+def spread_of(around: Interval) -> float:
+    """The standard deviation of the time's logarithm."""
+    return math.log(around.high_ms / around.low_ms) / 2 / NORMAL_80
+
+
 def price(profile: Profile, work: Work, unit: UnitName, corners: Corners) -> NetworkTime:
     """The time of one job of the network when nothing else runs.
 

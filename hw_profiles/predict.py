@@ -20,17 +20,31 @@ from trilane.hw_profiles.application import (
     relative_error,
     steady,
 )
+from trilane.hw_profiles.application_rates import (
+    around_frame,
+    at_rate,
+    every_variant,
+    held_to,
+    least_ms,
+    load_of,
+    power_of,
+    settled_power_w,
+    unheld_times,
+)
 from trilane.hw_profiles.configuration_table import Row
 from trilane.hw_profiles.host import host_cores, usable_cores
 from trilane.hw_profiles.load import HOST
+from trilane.hw_profiles.network_time import interval, price
 from trilane.hw_profiles.network_work import Network
 from trilane.hw_profiles.operator_times import JobTime
-from trilane.hw_profiles.over_time import Moment, over_time, unit_power_w
+from trilane.hw_profiles.over_time import over_time
 from trilane.hw_profiles.performance_profiles import Corners, corners_of
 from trilane.hw_profiles.placed_host import Placed, on_cores, place_units
 from trilane.hw_profiles.placement_facts import NS_PER_MS, described
+from trilane.hw_profiles.rates import NOTHING, Wanted, answers
 from trilane.hw_profiles.reference_networks import reference_network
 from trilane.hw_profiles.schema import Profile
+from trilane.hw_profiles.timeline import caps_of, ends_of, settled_corners, temperatures_of, timeline_of
 from trilane.scheduler.placement import Ranked
 from trilane.scheduler.policy import POLICIES
 from trilane.scheduler.stats import energy_score
@@ -56,6 +70,7 @@ def predict(
     performance_profile: str = SUSTAINED,
     minutes: float = 0.0,
     governor: str | None = None,
+    wanted: Wanted = NOTHING,
 ) -> dict[str, Any]:
     """Everything about one configuration, as plain data with the keys of report.json and more.
 
@@ -64,48 +79,49 @@ def predict(
     `performance_profile`: by name.
     `minutes`: of virtual time from a cold start; 0 for the settled application at constant temperature.
     `governor`: of GOVERNORS; None for the profile's own.
+    `wanted`: a rate, to which the application is held, and a limit of power.
     Raises BadInputError for an unknown name or a time out of range.
     """
     corners = corners_of(profile, performance_profile)
     placed = place_units(profile, plan, corners, host_cores(usable_cores())) if profile.name == HOST else None
     if placed is not None:
         profile = on_cores(profile, placed.best.placement)
+    plan = held_to(plan, wanted.fps)
     now = steady(profile, plan, corners, twice=True)
     moments = over_time(profile, plan, performance_profile, minutes, governor) if minutes else []
     frame = _mean([m.frame_ms for m in moments]) if moments else now.frame_ms
-    power = _mean([m.power_w for m in moments]) if moments else _settled_power(profile, now, corners)
+    power = _mean([m.power_w for m in moments]) if moments else settled_power_w(profile, now, corners)
     job = isolated_job_time(profile, plan.network, plan.runtime, corners)
+    around = interval(profile, plan.network.work, price(profile, plan.network.work, plan.runtime, corners))
+    times = unheld_times(profile, plan, corners, around, job.total_ms)
     return {
         "schema": 1,
         "clock": "virtual",
         "machine": {"profile": profile.name, "title": profile.title},
         "config": _config(plan, performance_profile, minutes, governor or profile.thermal.governor),
-        "network": _network(plan, job),
-        "frame_time_ms": _frame_times(profile, frame, [m.frame_ms for m in moments] or [frame]),
+        "network": {**_network(plan, job), "low_ms": around.low_ms, "high_ms": around.high_ms, "why": list(around.why)},
+        "frame_time_ms": {
+            **_frame_times(profile, frame, [m.frame_ms for m in moments] or [frame]),
+            **around_frame(frame, times, least_ms(profile, plan)),
+        },
         "latency_ms": {"mean": now.latency_ms},
         "fps": 1e3 / frame,
-        **_ends(moments, now),
+        **(ends_of(moments) if moments else dict.fromkeys(("fps_start", "fps_settled"), 1e3 / now.frame_ms)),
         **_settled(plan, now),
         "power_w": power,
         "base_power_w": profile.thermal.base_power_w.or_else(0),
         "base_power_kind": profile.thermal.base_power_w.kind,
+        "power": power_of(profile, plan, settled_corners(moments) if moments else corners, around),
         "energy_mj_per_frame": power * frame,
         "xrbench": {"energy": energy_score(power * frame)},
-        "temperature_c": _temperatures(moments),
-        "caps": _caps(moments),
-        "timeline": [_shown(m) for m in _thinned(moments)],
+        "temperature_c": temperatures_of(moments),
+        "caps": caps_of(moments),
+        "timeline": timeline_of(moments),
+        **answers(profile, load_of(profile, plan), corners, wanted, times),
         **_expected_error(profile, plan, job),
         **({} if placed is None else {"placement": placed.facts}),
         "notes": _notes(profile, plan.variant, placed),
     }
-
-
-def _ends(moments: Sequence[Moment], now: Steady) -> dict[str, float]:
-    """Frames a second at the start, and those to which it settles: the mean of the last fifth of the time."""
-    if not moments:
-        return {"fps_start": 1e3 / now.frame_ms, "fps_settled": 1e3 / now.frame_ms}
-    last = moments[-max(1, len(moments) // 5) :]
-    return {"fps_start": 1e3 / moments[0].frame_ms, "fps_settled": 1e3 / _mean([m.frame_ms for m in last])}
 
 
 def _notes(profile: Profile, variant: Variant, placed: Placed | None) -> list[str]:
@@ -173,16 +189,12 @@ def _config(plan: Plan, performance_profile: str, minutes: float, governor: str)
         "policy": variant.policy,
         "edge": variant.edge,
         "batch": variant.batch,
-        "fps": variant.fps,
+        "fps": plan.most_fps or variant.fps,
         "gpu_share": plan.gpu_share,
         "performance_profile": performance_profile,
         "minutes": minutes,
         "governor": governor,
     }
-
-
-def _settled_power(profile: Profile, now: Steady, corners: Corners) -> float:
-    return sum(unit_power_w(profile, now, corners).values()) + profile.thermal.base_power_w.or_else(0)
 
 
 def _frame_times(profile: Profile, mean_ms: float, frames: Sequence[float]) -> dict[str, float]:
@@ -198,52 +210,24 @@ def ema_range_ms(profile: Profile, mean_ms: float) -> tuple[float, float]:
     return max(profile.application.display_ms.or_else(0), mean_ms - half), mean_ms + half
 
 
-def _temperatures(moments: Sequence[Moment]) -> dict[str, float]:
-    if not moments:
-        return {}
-    return {
-        "device_end": moments[-1].device_c,
-        "device_max": max(m.device_c for m in moments),
-        "junction_max": max(m.junction_c for m in moments),
-    }
-
-
-def _caps(moments: Sequence[Moment]) -> dict[str, Any]:
-    throttled_s = [m.t_s for m in moments if m.throttled]
-    return {
-        "throttled_share": len(throttled_s) / len(moments) if moments else 0.0,
-        "first_throttled_s": throttled_s[0] if throttled_s else None,
-    }
-
-
-def _thinned(moments: Sequence[Moment], most: int = 360) -> Sequence[Moment]:
-    return moments[:: max(1, len(moments) // most)]
-
-
-def _shown(moment: Moment) -> dict[str, Any]:
-    return {
-        "t_s": moment.t_s,
-        "fps": 1e3 / moment.frame_ms,
-        "device_c": moment.device_c,
-        "junction_c": moment.junction_c,
-        "power_w": moment.power_w,
-        "corners": dict(zip(UNITS, moment.corners, strict=True)),
-    }
-
-
 def _mean(values: Sequence[float]) -> float:
     return sum(values) / len(values)
 
 
-def what_if(profile: Profile, network: Network, runtime: UnitName, performance_profile: str) -> list[dict[str, Any]]:
-    """The same network under every row of `ALTERNATIVES` that the runtime allows.
+def what_if(
+    profile: Profile, network: Network, runtime: UnitName, performance_profile: str, fps: float | None = None
+) -> list[dict[str, Any]]:
+    """The same network under every row of `ALTERNATIVES` that the runtime allows, or under all policies at a rate.
 
     `profile`: of the chip.
     `network`: that runs.
     `runtime`: the unit that runs it.
     `performance_profile`: by name; raises BadInputError for an unknown one.
+    `fps`: the rate, for every policy with every edge; rows say whether it holds and at which power.
     """
     corners = corners_of(profile, performance_profile)
+    if fps is not None:
+        return [at_rate(profile, Plan(network, runtime, variant), corners, fps) for variant in every_variant()]
     rows = []
     for name, variant, share in ALTERNATIVES:
         if not share or runtime == "dsp":

@@ -5,6 +5,7 @@ Rule: this module reads options; every figure comes from `trilane.hw_profiles`, 
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,13 +23,14 @@ from trilane.apps.cli.options import (
     PerformanceProfileChoice,
     ProfileOption,
 )
-from trilane.apps.cli.predict_output import draw, show_answer, show_table
+from trilane.apps.cli.predict_output import draw, show_answer, show_networks, show_table
 from trilane.errors import BadInputError
-from trilane.units import PerformanceProfile
+from trilane.units import PerformanceProfile, UnitName
 
 if TYPE_CHECKING:
     from trilane.hw_profiles.application import Plan, Variant
     from trilane.hw_profiles.network_work import Network
+    from trilane.hw_profiles.rates import Wanted
     from trilane.hw_profiles.schema import Profile
 
 app = Commands()
@@ -41,32 +43,58 @@ Examples:
   trilane predict --policy latest --fps 24
   trilane predict --performance-profile burst --minutes 30 --plot temperature.svg
   trilane predict --avatar default --runtime gpu
+  trilane predict --network midas.onnx --network unet.onnx --profile snapdragon-8-gen-3
+  trilane predict --network net.onnx --input-shape image=1x3x224x224 --precision w8a8
+  trilane predict --network net.onnx --fps 30 --minutes 30
+  trilane predict --network net.onnx --power-limit-w 3
+  trilane predict --network unet.onnx --application --fps 30 --what-if
   trilane predict --table rows.csv --json
   trilane predict portrait --beside default --beside network.onnx@30
 """
 PLOT_MINUTES = 30.0
-PACED = ("latest", "deadline")  # policies that release frames at a rate
 HOST = "host"
 OF_A_FILE = {"encoder", "norm", "size", "channels"}
+OF_THE_APPLICATION = {"layout", "policy", "edge", "batch", "gpu_share", "what_if", "plot"}
 #: Option: those that have no effect beside it.
 IGNORED = {
-    "avatar": OF_A_FILE,
+    "avatar": OF_A_FILE | {"input_shape"},
     "network": OF_A_FILE,
     "table": OF_A_FILE
-    | {"layout", "avatar", "network", "runtime", "minutes", "gpu_share", "governor", "what_if", "plot"},
+    | {"layout", "avatar", "network", "application", "runtime", "minutes", "gpu_share", "governor", "what_if", "plot"}
+    | {"fps", "power_limit_w", "precision", "input_shape"},
 }
 WHY_IGNORED = {
     "avatar": "the avatar's network says so itself",
     "network": "the file says so itself",
     "table": "each row says so itself",
 }
+#: How people call precisions -> as a hardware profile does.
+PRECISIONS = {"w8a8": "int8", "int8": "int8", "float": "fp16", "fp16": "fp16", "fp32": "fp32"}
 
 AvatarOption = Annotated[
     str | None, typer.Option(help="An avatar's network instead: `default`, or the folder of an avatar.")
 ]
-NetworkOption = Annotated[Path | None, typer.Option(help="A quantised network instead: an ONNX file.")]
+NetworkOption = Annotated[
+    list[Path] | None,
+    typer.Option(help="A network by itself, without raster and composite: an ONNX file. May be given again."),
+]
+ApplicationOption = Annotated[
+    bool, typer.Option("--application", help="The application with the --network instead of the network by itself.")
+]
+ShapeOption = Annotated[
+    list[str] | None,
+    typer.Option("--input-shape", help="Shape of an input of a --network: NAME=1x3x224x224. May be given again."),
+]
+PrecisionOption = Annotated[
+    str | None, typer.Option(help="w8a8 (int8), float (fp16) or fp32; as the network says and its unit has it.")
+]
+PowerOption = Annotated[
+    float | None, typer.Option("--power-limit-w", help="Also the highest rate within so many watts of the device.")
+]
 LayoutOption = Annotated[str, typer.Option(help="packed: one raster pass; split: one for every 4 channels.")]
-UnitOption = Annotated[str, typer.Option("--runtime", help="Unit of the network: gpu or dsp.")]
+UnitOption = Annotated[
+    str, typer.Option("--runtime", help="Unit of the network: gpu or dsp; cpu too for a --network by itself.")
+]
 MinutesOption = Annotated[float, typer.Option(help="Virtual minutes with heat; 0: settled, without heat.")]
 PolicyOption = Annotated[
     str,
@@ -77,11 +105,14 @@ EdgeOption = Annotated[
 ]
 BatchOption = Annotated[int, typer.Option(help="Frames per job of the network.")]
 RateOption = Annotated[
-    float | None, typer.Option("--fps", help="Frames released a second under latest and deadline; 30 if not given.")
+    float | None,
+    typer.Option("--fps", help="A rate: does it hold, at which power? latest and deadline have 30 without."),
 ]
 GpuShareOption = Annotated[float, typer.Option(help="Share of the network that the GPU does for the DSP.")]
 GovernorOption = Annotated[str | None, typer.Option(help="step_wise or power_allocator; the profile's if not given.")]
-WhatIfOption = Annotated[bool, typer.Option("--what-if", help="Compare policies and edges for the same network.")]
+WhatIfOption = Annotated[
+    bool, typer.Option("--what-if", help="Compare policies and edges for the same network, at --fps all.")
+]
 PlotOption = Annotated[Path | None, typer.Option(help="Draw frame rate and temperature here (.png, .svg, .pdf).")]
 TableOption = Annotated[Path | None, typer.Option(help="CSV of configurations: one answer per row.")]
 
@@ -100,12 +131,16 @@ def predict(
     layout: LayoutOption = "packed",
     avatar: AvatarOption = None,
     network: NetworkOption = None,
+    application: ApplicationOption = False,
+    input_shape: ShapeOption = None,
+    precision: PrecisionOption = None,
     runtime: UnitOption = "dsp",
     minutes: MinutesOption = 0.0,
     policy: PolicyOption = "reference",
     edge: EdgeOption = None,
     batch: BatchOption = 1,
     fps: RateOption = None,
+    power_limit_w: PowerOption = None,
     gpu_share: GpuShareOption = 0.0,
     performance_profile: PerformanceProfileChoice = PerformanceProfile.SUSTAINED_HIGH_PERFORMANCE,
     governor: GovernorOption = None,
@@ -116,12 +151,16 @@ def predict(
 ) -> None:
     """Predict frame time, idleness, heat and energy on a chip, with the error to expect.
 
+    Without --network, or with --application: the avatar's application. With --network: each network by itself.
+
     For the profile `host`, this machine, the performance profile is burst if none is given, as a run has no cap then.
     """
     from trilane.hw_profiles.application import Plan
     from trilane.hw_profiles.load import load_runnable
 
-    _refuse_ignored(ctx)
+    networks = network or []
+    _refuse_ignored(ctx, bare=bool(networks) and not application)
+    _check_application(application, len(networks))
     if profile == HOST and "performance_profile" not in _typed(ctx):
         performance_profile = PerformanceProfile.BURST  # as `trilane run` without a cap
     _check_governor(governor)
@@ -129,26 +168,71 @@ def predict(
         chip_at = OnChip(profile, performance_profile, minutes, governor)
         predict_pipelines(scene, beside or [], _typed(ctx), chip_at, Joined(policy, edge, turns), json)
         return
+    wanted, shapes = _wanted(fps, power_limit_w), _shapes(input_shape or [], len(networks))
     chip, variant = load_runnable(profile), _variant(policy, edge, batch, fps)
     if table is not None:
         answers = _predict_table(chip, table, performance_profile, variant)
         show_table(chip.name, performance_profile, answers, json)
         return
-    file = _network_of(network, avatar, layout)
-    plan = Plan(file or _reference(encoder, norm, size, channels, layout), _unit(runtime), variant, gpu_share)
-    answer = _answer(chip, plan, performance_profile, minutes, governor, what_if)
+    if networks and not application:
+        unit, over = _unit(runtime, "cpu"), (performance_profile, minutes, governor, wanted)
+        show_networks(chip, over, _predict_networks(chip, networks, shapes, unit, _precision(precision), over), json)
+        return
+    chip, described = _network_of(chip, networks, shapes, avatar, layout, _unit(runtime), _precision(precision))
+    plan = Plan(described or _reference(encoder, norm, size, channels, layout), _unit(runtime), variant, gpu_share)
+    answer = _answer(chip, plan, performance_profile, minutes, governor, what_if, wanted)
     if plot is not None:
         draw(chip, plan, performance_profile, minutes or PLOT_MINUTES, governor, plot)
     show_answer(answer, json)
 
 
-def _refuse_ignored(ctx: typer.Context) -> None:
-    """Raises BadInputError for options that another one leaves without effect."""
+def _refuse_ignored(ctx: typer.Context, *, bare: bool) -> None:
+    """Raises BadInputError for options that another one leaves without effect. `bare`: a network by itself is asked."""
     typed = _typed(ctx)
     for option, others in IGNORED.items():
         if option in typed and (useless := typed & others):
             names = ", ".join(sorted(f"--{name.replace('_', '-')}" for name in useless))
             raise BadInputError("options", f"{names} beside --{option}", "one or the other", WHY_IGNORED[option])
+    if bare and "table" not in typed and (useless := typed & OF_THE_APPLICATION):
+        names = ", ".join(sorted(f"--{name.replace('_', '-')}" for name in useless))
+        remedy = "they are of the application: add --application for it with this network"
+        raise BadInputError("options", f"{names} with a network by itself", "it without them", remedy)
+
+
+def _check_application(application: bool, networks: int) -> None:
+    if application and networks != 1:
+        remedy = "it says that the application runs the network of the file"
+        raise BadInputError("options", f"--application with {networks} networks", "one --network", remedy)
+
+
+def _wanted(fps: float | None, power_limit_w: float | None) -> Wanted:
+    from trilane.hw_profiles.application import MOST_FPS
+    from trilane.hw_profiles.rates import Wanted
+
+    if fps is not None and not 0 < fps <= MOST_FPS:
+        raise BadInputError("--fps", f"{fps:g}", f"above 0, at most {MOST_FPS:g}")
+    if power_limit_w is not None and not 0 < power_limit_w < float("inf"):
+        raise BadInputError("--power-limit-w", f"{power_limit_w:g}", "watts above 0")
+    return Wanted(fps, power_limit_w)
+
+
+def _shapes(texts: list[str], networks: int) -> dict[str, tuple[int, ...]]:
+    """Shapes of inputs by name."""
+    if texts and not networks:
+        raise BadInputError("options", "--input-shape without --network", "a network whose input it is")
+    shapes = {}
+    for text in texts:
+        found = re.fullmatch(r"(.+)=(\d{1,9}(?:x\d{1,9})*)", text)
+        if found is None or 0 in (sizes := tuple(map(int, found[2].split("x")))):
+            raise BadInputError("--input-shape", repr(text), "a name and sizes, such as image=1x3x224x224")
+        shapes[found[1]] = sizes
+    return shapes
+
+
+def _precision(text: str | None) -> str | None:
+    if text is not None and text not in PRECISIONS:
+        raise BadInputError("--precision", repr(text), "w8a8 (int8), float (fp16) or fp32")
+    return None if text is None else PRECISIONS[text]
 
 
 def _typed(ctx: typer.Context) -> set[str]:
@@ -167,9 +251,6 @@ def _check_governor(governor: str | None) -> None:
 def _variant(policy: str, edge: str | None, batch: int, fps: float | None) -> Variant:
     from trilane.hw_profiles.application import REFERENCE, Variant
 
-    if fps is not None and policy not in PACED:
-        remedy = "the others take a frame as soon as they can"
-        raise BadInputError("options", f"--fps with --policy {policy}", f"--policy {' or '.join(PACED)}", remedy)
     if policy != "reference":
         return Variant(policy, edge or "double", batch, **({} if fps is None else {"fps": fps}))
     if edge not in (None, REFERENCE.edge):
@@ -178,9 +259,10 @@ def _variant(policy: str, edge: str | None, batch: int, fps: float | None) -> Va
     return REFERENCE._replace(batch=batch)
 
 
-def _unit(runtime: str) -> Any:
-    if runtime not in ("gpu", "dsp"):
-        raise BadInputError("--runtime", repr(runtime), "gpu or dsp")
+def _unit(runtime: str, *more: str) -> Any:
+    units = (*more, "gpu", "dsp")
+    if runtime not in units:
+        raise BadInputError("--runtime", repr(runtime), " or ".join(", ".join(units).rsplit(", ", 1)))
     return runtime
 
 
@@ -192,33 +274,71 @@ def _reference(encoder: str, norm: str, size: str, channels: int, layout: str) -
     return reference_network(spec_of(cells, "options"))
 
 
-def _network_of(path: Path | None, avatar: str | None, layout: str) -> Network | None:
-    """The network of a file, or of an avatar; None when neither was named."""
+def _predict_networks(
+    chip: Profile,
+    paths: list[Path],
+    shapes: dict[str, tuple[int, ...]],
+    unit: UnitName,
+    precision: str | None,
+    over: tuple[str, float, str | None, Wanted],
+) -> list[dict[str, Any]]:
+    """What is predicted of each network. `over`: performance profile, minutes, governor, and what is wanted."""
+    from trilane.hw_profiles.bare_network import in_precision, predict_network
+    from trilane.hw_profiles.graph_file import read_graph
+
+    graphs = [read_graph(path, shapes) for path in paths]
+    inputs = {value.name for graph in graphs for value in graph.model.graph.input}
+    if missing := [name for name in shapes if name not in inputs]:
+        raise BadInputError("--input-shape", f"no input {missing[0]!r}", f"one of {', '.join(sorted(inputs))}")
+    return [predict_network(in_precision(chip, unit, graph.numbers, precision), graph, unit, *over) for graph in graphs]
+
+
+def _network_of(
+    chip: Profile,
+    networks: list[Path],
+    shapes: dict[str, tuple[int, ...]],
+    avatar: str | None,
+    layout: str,
+    unit: UnitName,
+    precision: str | None,
+) -> tuple[Profile, Network | None]:
+    """The network of a file, or of an avatar, None when neither was named; and the chip in its precision."""
     from trilane.avatars.bundle import load_bundle
-    from trilane.avatars.network_file import read_network
+    from trilane.hw_profiles.bare_network import in_precision
+    from trilane.hw_profiles.graph_file import read_graph
+    from trilane.hw_profiles.image_network import image_network
     from trilane.hw_profiles.network_work import Network, count_work
 
-    if path is None and avatar is None:
-        return None
-    if path is not None and avatar is not None:
-        raise BadInputError("options", "--network and --avatar", "one of them")
     if layout not in ("packed", "split"):
         raise BadInputError("--layout", repr(layout), "packed or split")
-    file = read_network(path) if path is not None else load_bundle(avatar or "default").read_network()
+    if networks and avatar is not None:
+        raise BadInputError("options", "--network and --avatar", "one of them")
+    if networks:
+        graph = read_graph(networks[0], shapes)
+        return in_precision(chip, unit, graph.numbers, precision), image_network(graph, layout)
+    chip = in_precision(chip, unit, "not said", precision)
+    if avatar is None:
+        return chip, None
+    file = load_bundle(avatar or "default").read_network()
     _, height, width, channels = file.shape
-    facts = {"network": str(path)} if path is not None else {"avatar": str(avatar)}
-    return Network(facts, height, width, channels, layout, count_work(file.model))
+    return chip, Network({"avatar": str(avatar)}, height, width, channels, layout, count_work(file.model))
 
 
 def _answer(
-    chip: Profile, plan: Plan, performance_profile: str, minutes: float, governor: str | None, what_if: bool
+    chip: Profile,
+    plan: Plan,
+    performance_profile: str,
+    minutes: float,
+    governor: str | None,
+    what_if: bool,
+    wanted: Wanted,
 ) -> dict[str, Any]:
     """The prediction, with the alternatives to it when they were asked for."""
     from trilane.hw_profiles import predict as predictions
 
-    answer = predictions.predict(chip, plan, performance_profile, minutes, governor)
+    answer = predictions.predict(chip, plan, performance_profile, minutes, governor, wanted)
     if what_if:
-        answer["alternatives"] = predictions.what_if(chip, plan.network, plan.runtime, performance_profile)
+        answer["alternatives"] = predictions.what_if(chip, plan.network, plan.runtime, performance_profile, wanted.fps)
     return answer
 
 

@@ -16,9 +16,13 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from trilane.hw_profiles.application import Plan
+    from trilane.hw_profiles.rates import Wanted
     from trilane.hw_profiles.schema import Profile
 
 IDLE = ("starved", "blocked", "throttled", "preempted", "overhead")
+MOST_EXPENSIVE = 10
+RANGES = "ranges in brackets hold 80 %"
+AT_RATE = ("holds", "dropped", "W")
 SHOWN = ("bench_gpu_ms", "bench_dsp_ms", "app_gpu_ms", "app_dsp_ms", "confidence")
 
 
@@ -66,6 +70,115 @@ def draw(chip: Profile, plan: Plan, asked: str, minutes: float, governor: str | 
     plot_over_time(runs, chip.thermal.skin_limit_c.or_else(0.0), title, path)
 
 
+def show_networks(
+    chip: Profile, over: tuple[str, float, str | None, Wanted], answers: list[dict[str, Any]], as_json: bool
+) -> None:
+    """Print what is predicted of networks by themselves.
+
+    `chip`: its hardware profile.
+    `over`: performance profile, minutes, governor, and what is wanted.
+    `answers`: of `predict_network`.
+    `as_json`: one JSON document, or text and tables for people.
+    """
+    performance_profile, minutes, governor, wanted = over
+    if as_json:
+        config = {"performance_profile": performance_profile, "minutes": minutes, **wanted._asdict()}
+        print_json(
+            {
+                "schema": 1,
+                "clock": "virtual",
+                "machine": {"profile": chip.name, "title": chip.title},
+                "config": {**config, "governor": governor or chip.thermal.governor},
+                "networks": answers,
+            }
+        )
+        return
+    console = stdout_console()
+    console.print(f"{chip.title} (virtual clock), {performance_profile}; nothing else runs; {RANGES}")
+    for answer in answers:
+        console.print()
+        _print_bare(console, answer, minutes)
+        console.print(_operator_table(answer))
+
+
+def _print_bare(console: Console, answer: dict[str, Any], minutes: float) -> None:
+    said = "" if answer["numbers"] == "w8a8" else f" (numbers of the file: {answer['numbers']})"
+    console.print(
+        f"{Path(answer['file']).name} on the {answer['unit']} in {answer['precision']}{said}: {_size(answer)}"
+    )
+    if minutes:
+        _print_settled(console, answer, minutes)
+    span = f"{answer['low_ms']:.2f} to {answer['high_ms']:.2f} ms"
+    console.print(f"network alone   {answer['network_ms']:.2f} ms ({span}), {answer['fps']:.1f} a second")
+    for why in answer["why"]:
+        console.print(f"                {why}")
+    for kind in answer["without_rule"]:
+        share = f"{100 * kind['share_of_elements']:.1f} % of the moved elements"
+        console.print(f"no rule for     {kind['op_type']}: {kind['count']} with {share}, priced as data movement")
+    _print_wanted(console, answer)
+    _print_power(console, answer)
+    if minutes:
+        _print_heat(console, answer)
+
+
+def _print_settled(console: Console, answer: dict[str, Any], minutes: float) -> None:
+    name = f"after {minutes:g} min"
+    console.print(f"{name:<16}{answer['fps_settled']:.1f} fps, begins with {answer['fps_start']:.1f} fps")
+
+
+def _size(answer: dict[str, Any]) -> str:
+    count = len(answer["operators"])
+    return f"{answer['gmac']:.3g} GMAC, {answer['parameters_m']:.3g} M parameters, {count} operators"
+
+
+def _print_wanted(console: Console, answer: dict[str, Any]) -> None:
+    if rate := answer.get("rate"):
+        name = f"{rate['fps']:g} a second"
+        console.print(f"{name:<16}{rate['words']}")
+        console.print(f"                {_reserve(rate)}")
+    if limit := answer.get("power_limit"):
+        name = f"within {limit['limit_w']:g} W"
+        corners = ", ".join(f"{unit} {corner}" for unit, corner in limit["corners"].items())
+        reason = "its full speed" if limit["limited_by"] == "speed" else "by power"
+        console.print(f"{name:<16}{limit['fps']:.1f} fps, {reason}, at {limit['power_w']:.2f} W ({corners})")
+
+
+def _reserve(rate: dict[str, Any]) -> str:
+    if rate["holds"]:
+        span = f"{100 * rate['reserve_low']:.0f} to {100 * rate['reserve_high']:.0f} %"
+        return f"reserve {100 * rate['reserve']:.0f} % of a frame's time ({span})"
+    needed, most, least = (1 - rate[key] for key in ("reserve", "reserve_low", "reserve_high"))
+    return f"needs {needed:.2f} times a frame's time ({least:.2f} to {most:.2f})"
+
+
+def _print_power(console: Console, answer: dict[str, Any]) -> None:
+    power = answer["power"]
+    units = ", ".join(f"{unit} {_watts(watts)}" for unit, watts in power["units"].items())
+    console.print(f"settled at      {_watts(power)} W: {units}")
+    console.print(f"of it base      {_watts(power['base'])} W, {power['base']['kind']}: memory, screen, radio")
+
+
+def _watts(watts: dict[str, Any]) -> str:
+    return f"{watts['w']:.2f} ({watts['low_w']:.2f} to {watts['high_w']:.2f})"
+
+
+def _print_heat(console: Console, answer: dict[str, Any]) -> None:
+    heat, caps = answer["temperature_c"], answer["caps"]
+    console.print(
+        f"temperature     device {heat['device_max']:.1f} °C, junction {heat['junction_max']:.1f} °C; "
+        f"lowered for heat {100 * caps['throttled_share']:.0f} % of the time"
+    )
+
+
+def _operator_table(answer: dict[str, Any]) -> Table:
+    from rich.table import Table
+
+    table = Table("operator", "type", "ms", "share", "bound by")
+    for row in sorted(answer["operators"], key=lambda row: -row["ms"])[:MOST_EXPENSIVE]:
+        table.add_row(row["name"], row["op_type"], f"{row['ms']:.3f}", f"{100 * row['share']:.1f} %", row["bound"])
+    return table
+
+
 def show_answer(answer: dict[str, Any], as_json: bool) -> None:
     """Print one answer of `predict`."""
     if as_json:
@@ -75,11 +188,7 @@ def show_answer(answer: dict[str, Any], as_json: bool) -> None:
     _print_network(console, answer)
     _print_times(console, answer)
     if answer["temperature_c"]:
-        heat, caps = answer["temperature_c"], answer["caps"]
-        console.print(
-            f"temperature     device {heat['device_max']:.1f} °C, junction {heat['junction_max']:.1f} °C; "
-            f"lowered for heat {100 * caps['throttled_share']:.0f} % of the time"
-        )
+        _print_heat(console, answer)
     error = f"±{100 * answer['expected_error']:.0f} % of the network's time"
     console.print(f"expected error  {error} (confidence {answer['confidence']:.2f})")
     console.print(_unit_table(answer))
@@ -93,30 +202,28 @@ def show_answer(answer: dict[str, Any], as_json: bool) -> None:
 def _print_network(console: Console, answer: dict[str, Any]) -> None:
     config, network = answer["config"], answer["network"]
     name = ", ".join(str(config[key]) for key in ("avatar", "network", "encoder", "norm") if key in config)
-    console.print(f"{answer['machine']['title']} (virtual clock), {config['performance_profile']}")
+    console.print(f"{answer['machine']['title']} (virtual clock), {config['performance_profile']}; {RANGES}")
     console.print(
         f"{name}, {config['size']}x{config['channels']} {config['layout']} "
         f"on the {config['runtime']}: {network['gmac']:.1f} GMAC, {network['parameters_m']:.1f} M parameters"
     )
-    console.print(f"network alone   {network['alone_ms']:.1f} ms")
+    if minutes := config["minutes"]:
+        _print_settled(console, answer, minutes)
+    span = f"{network['low_ms']:.1f} to {network['high_ms']:.1f}"
+    console.print(f"network alone   {network['alone_ms']:.1f} ms ({span})")
 
 
 def _print_times(console: Console, answer: dict[str, Any]) -> None:
     frame = answer["frame_time_ms"]
     capped = ", held by the display" if answer["display_capped"] else ""
-    stray = f"averages over 20 frames stray from {frame['ema20_min']:.1f} to {frame['ema20_max']:.1f} ms"
-    means = f"{frame['mean']:.1f} ms, {answer['fps']:.1f} fps{capped}; {stray}"
-    if minutes := answer["config"]["minutes"]:
-        console.print(
-            f"application     settles at {answer['fps_settled']:.1f} fps, begins with {answer['fps_start']:.1f} fps"
-        )
-        console.print(f"over {f'{minutes:g} minutes':<11}{means}")
-    else:
-        console.print(f"application     {means}")
+    stray = f"averages over 20 frames {frame['ema20_min']:.1f} to {frame['ema20_max']:.1f} ms"
+    means = f"{frame['mean']:.1f} ms ({frame['low']:.1f} to {frame['high']:.1f}), {answer['fps']:.1f} fps{capped}"
+    console.print(f"{'over all' if answer['config']['minutes'] else 'application':<16}{means}; {stray}")
     console.print(f"latency         {answer['latency_ms']['mean']:.1f} ms")
     console.print(f"efficiency      {answer['efficiency']:.2f}")
-    base = f"{answer['base_power_w']:.1f} W of it {answer['base_power_kind']} for all but the units"
-    console.print(f"power           {answer['power_w']:.1f} W ({base}), {answer['energy_mj_per_frame']:.0f} mJ a frame")
+    _print_wanted(console, answer)
+    console.print(f"power           {answer['power_w']:.1f} W, {answer['energy_mj_per_frame']:.0f} mJ a frame")
+    _print_power(console, answer)
     for note in answer["notes"]:
         console.print(f"note            {note}")
 
@@ -134,8 +241,15 @@ def _unit_table(answer: dict[str, Any]) -> Table:
 def _alternatives_table(answer: dict[str, Any]) -> Table:
     from rich.table import Table
 
-    table = Table("what if", "policy", "edge", "frame, ms", "fps", "latency, ms")
-    for row in answer["alternatives"]:
+    rows = answer["alternatives"]
+    at_rate = "holds" in rows[0]
+    table = Table("what if", "policy", "edge", "frame, ms", "fps", "latency, ms", *(AT_RATE if at_rate else ()))
+    for row in rows:
         names = (row["name"], row["policy"], row["edge"])
-        table.add_row(*names, f"{row['frame_ms']:.1f}", f"{row['fps']:.1f}", f"{row['latency_ms']:.1f}")
+        figures = (f"{row['frame_ms']:.1f}", f"{row['fps']:.1f}", f"{row['latency_ms']:.1f}")
+        table.add_row(*names, *figures, *(_at_rate(row) if at_rate else ()))
     return table
+
+
+def _at_rate(row: dict[str, Any]) -> tuple[str, str, str]:
+    return "yes" if row["holds"] else "no", f"{100 * row['dropped']:.0f} %", f"{row['power_w']:.2f}"

@@ -18,11 +18,12 @@ from trilane.hw_profiles import configuration_table, load, over_time, plot
 from trilane.hw_profiles import predict as predictions
 from trilane.hw_profiles.application import REFERENCE, Plan, Variant
 from trilane.hw_profiles.network_work import Network, count_work
+from trilane.hw_profiles.rates import NOTHING, Wanted
 from trilane.hw_profiles.reference_networks import NetworkSpec
 from trilane.units import BURST, SUSTAINED
 
 Command = Callable[..., tuple[str, str]]
-CHIP = SimpleNamespace(name="chip", title="A Chip", thermal=SimpleNamespace(skin_limit_c=SimpleNamespace(or_else=max)))
+CHIP = load.load_profile("snapdragon-888").model_copy(update={"name": "chip", "title": "A Chip"})
 
 
 @pytest.fixture
@@ -59,7 +60,7 @@ USUAL = NetworkSpec("resnet18", "batch", 512, 512, 16, "packed")
 def test_without_options(asked: dict[str, Any], command: Command) -> None:
     command("predict")
     assert asked["profile"] == "snapdragon-888"
-    assert asked["predict"] == (CHIP, Plan(USUAL, "dsp", REFERENCE, 0.0), SUSTAINED, 0.0, None)  # type: ignore[arg-type]
+    assert asked["predict"] == (CHIP, Plan(USUAL, "dsp", REFERENCE, 0.0), SUSTAINED, 0.0, None, NOTHING)  # type: ignore[arg-type]
     assert asked["shown"] == ({"fps": 12.5}, False)
     assert "what_if" not in asked and "draw" not in asked
 
@@ -74,8 +75,8 @@ def test_every_option_arrives_where_it_belongs(asked: dict[str, Any], command: C
     spec: Any = NetworkSpec("mobilenetv2", "group", 96, 64, 4, "split")
     plan = Plan(spec, "gpu", Variant("latest", "triple", 3), 0.0)
     assert asked["profile"] == "mine"
-    assert asked["predict"] == (CHIP, plan, "power_saver", 2.5, "step_wise")
-    assert asked["what_if"] == (CHIP, spec, "gpu", "power_saver")
+    assert asked["predict"] == (CHIP, plan, "power_saver", 2.5, "step_wise", NOTHING)
+    assert asked["what_if"] == (CHIP, spec, "gpu", "power_saver", None)
     assert asked["draw"] == (CHIP, plan, "power_saver", 2.5, "step_wise", Path("heat.svg"))
     assert asked["shown"] == ({"fps": 12.5, "alternatives": ["alternatives"]}, True)
     command("predict", "--gpu-share", 0.25)
@@ -96,11 +97,21 @@ def test_this_machine_is_not_capped_unless_it_is_said(asked: dict[str, Any], com
 
 
 def test_the_network_of_an_avatar_or_a_file(tiny_bundle: Path, asked: dict[str, Any], command: Command) -> None:
+    """Both are the same network; only its file is read as any graph is."""
     work = count_work(load_bundle(tiny_bundle).read_network().model)
     file = tiny_bundle / "network.onnx"
-    for option, value in (("avatar", tiny_bundle), ("network", file)):
-        command("predict", f"--{option}", value, "--layout", "split")
-        assert asked["predict"][1].network == Network({option: str(value)}, 64, 64, 5, "split", work)
+    command("predict", "--avatar", tiny_bundle, "--layout", "split")
+    assert asked["predict"][1].network == Network({"avatar": str(tiny_bundle)}, 64, 64, 5, "split", work)
+    command("predict", "--network", file, "--application", "--layout", "split")
+    assert asked["predict"][1].network == Network({"network": str(file)}, 64, 64, 5, "split", work)
+
+
+def test_a_rate_a_limit_and_a_precision(asked: dict[str, Any], command: Command) -> None:
+    command("predict", "--fps", 24, "--power-limit-w", 3.5, "--what-if", "--precision", "float")
+    chip, plan, *_, wanted = asked["predict"]
+    assert wanted == Wanted(24.0, 3.5) and plan.variant == REFERENCE
+    assert asked["what_if"][-1] == 24.0
+    assert chip.units["dsp"].precision == "fp16" and CHIP.units["dsp"].precision == "int8"
 
 
 @pytest.mark.parametrize(("edge", "batch"), [(None, 1), (REFERENCE.edge, 4)])
@@ -116,7 +127,24 @@ REFUSED = {
         f"--edge: found 'triple', expected {REFERENCE.edge}, which the reference application has; "
         "choose a --policy of your own, such as pipelined"
     ),
-    ("--network", "n", "--avatar", "a"): "options: found --network and --avatar, expected one of them",
+    ("--network", "n", "--application", "--avatar", "a"): "options: found --network and --avatar, expected one of them",
+    ("--network", "n", "--policy", "latest", "--batch", "2"): (
+        "options: found --batch, --policy with a network by itself, expected it without them; "
+        "they are of the application: add --application for it with this network"
+    ),
+    ("--application",): (
+        "options: found --application with 0 networks, expected one --network; "
+        "it says that the application runs the network of the file"
+    ),
+    ("--fps", "0"): "--fps: found 0, expected above 0, at most 1000",
+    ("--power-limit-w", "-1"): "--power-limit-w: found -1, expected watts above 0",
+    ("--precision", "int4"): "--precision: found 'int4', expected w8a8 (int8), float (fp16) or fp32",
+    ("--input-shape", "image=1"): (
+        "options: found --input-shape without --network, expected a network whose input it is"
+    ),
+    ("--network", "n", "--input-shape", "image=1x0"): (
+        "--input-shape: found 'image=1x0', expected a name and sizes, such as image=1x3x224x224"
+    ),
     ("--avatar", "a", "--layout", "odd"): "--layout: found 'odd', expected packed or split",
     **{
         (f"--{option}", "x", f"--{other}", "1"): f"options: found --{other} beside --{option}, {ONE}; {why}"
@@ -200,6 +228,15 @@ def test_a_table_has_a_bar_on_a_terminal(monkeypatch: pytest.MonkeyPatch, comman
     assert screen.getvalue().endswith("\x1b[2K")  # the bar is gone
 
 
+POWER = {
+    **{"w": 3.215, "low_w": 2.115, "high_w": 4.325},
+    "units": {"gpu": {"w": 0.515, "low_w": 0.415, "high_w": 0.625}, "dsp": {"w": 1.5, "low_w": 0.755, "high_w": 2.25}},
+    "base": {"w": 1.2, "low_w": 0.6, "high_w": 1.9, "kind": "assumed"},
+}
+RATE = {"fps": 30.0, "holds": True, "words": "holds", "reserve": 0.255, "reserve_low": 0.1, "reserve_high": 0.375}
+LIMIT = {"limit_w": 3.0, "fps": 28.76, "power_w": 2.995, "limited_by": "power", "corners": {"gpu": "svs", "dsp": "max"}}
+
+
 def an_answer(**changes: Any) -> dict[str, Any]:
     idle = {"starved": 0.101, "blocked": 0.202, "preempted": 0.003, "overhead": 0.044}
     return {
@@ -208,8 +245,8 @@ def an_answer(**changes: Any) -> dict[str, Any]:
             **{"encoder": "resnet18", "norm": "batch", "size": "64x32", "channels": 4, "layout": "packed"},
             **{"runtime": "gpu", "performance_profile": "burst", "minutes": 0.0},
         },
-        "network": {"gmac": 1.25, "parameters_m": 2.35, "alone_ms": 3.45},
-        "frame_time_ms": {"mean": 4.55, "ema20_min": 4.15, "ema20_max": 5.75},
+        "network": {"gmac": 1.25, "parameters_m": 2.35, "alone_ms": 3.45, "low_ms": 3.05, "high_ms": 3.95},
+        "frame_time_ms": {"mean": 4.55, "ema20_min": 4.15, "ema20_max": 5.75, "low": 4.25, "high": 4.95},
         "latency_ms": {"mean": 6.85},
         "fps": 219.78,
         "fps_settled": 200.12,
@@ -217,8 +254,7 @@ def an_answer(**changes: Any) -> dict[str, Any]:
         "efficiency": 0.756,
         "display_capped": False,
         "power_w": 3.21,
-        "base_power_w": 1.2,
-        "base_power_kind": "assumed",
+        "power": POWER,
         "energy_mj_per_frame": 14.6,
         "notes": [],
         "temperature_c": None,
@@ -240,6 +276,8 @@ def everything() -> dict[str, Any]:
         notes=["first", "second"],
         temperature_c={"device_max": 41.25, "junction_max": 77.75},
         caps={"throttled_share": 0.125},
+        rate=RATE,
+        power_limit=LIMIT,
         accounts={"agree": False, "largest_difference": 0.0321},
         alternatives=[
             {
@@ -249,6 +287,7 @@ def everything() -> dict[str, Any]:
                 "frame_ms": 7.77,
                 "fps": 128.7,
                 "latency_ms": 9.99,
+                **{"holds": True, "dropped": 0.125, "power_w": 4.565},
             },
             {
                 "name": "slow",
@@ -257,6 +296,7 @@ def everything() -> dict[str, Any]:
                 "frame_ms": 17.7,
                 "fps": 56.5,
                 "latency_ms": 18.8,
+                **{"holds": False, "dropped": 0.0, "power_w": 2.345},
             },
         ],
     )
@@ -270,6 +310,44 @@ def test_an_answer_is_shown(
     check_printed(f"predict-{name}", capsys.readouterr().out)
     predict_output.show_answer(answer, as_json=True)
     assert json.loads(capsys.readouterr().out) == answer
+
+
+def a_network(**changes: Any) -> dict[str, Any]:
+    operator = {"op_type": "Conv", "share": 0.1, "bound": "arithmetic", "macs": 1, "elements": 1}
+    return {
+        **{"file": "folder/net.onnx", "unit": "dsp", "numbers": "w8a8", "precision": "int8"},
+        **{"gmac": 1.255, "parameters_m": 2.355, "network_ms": 3.456, "low_ms": 3.012, "high_ms": 3.987},
+        **{"fps": 289.35, "job_ms": 0.5, "why": ["as it is"], "without_rule": [], "power": POWER},
+        "operators": [{"name": f"n{n}", "ms": 0.1 * n, **operator} for n in range(12)],
+        **changes,
+    }
+
+
+def test_networks_are_shown_with_their_ten_most_expensive_operators(
+    capsys: pytest.CaptureFixture[str], check_printed: Callable[..., None]
+) -> None:
+    asked = ("burst", 30.0, None, Wanted(30.0, 3.0))
+    over = {"fps_settled": 25.55, "fps_start": 40.0, "caps": {"throttled_share": 0.5}, "without_rule": [ODD]}
+    heat = {"device_max": 41.25, "junction_max": 77.75}
+    rate = {**RATE, "holds": False, "reserve": -0.5, "reserve_low": -0.75, "reserve_high": -0.255, "words": "no"}
+    answers = [a_network(rate=RATE, temperature_c=heat, **over)]
+    answers.append(a_network(**over, temperature_c=heat, numbers="not said", rate=rate, power_limit=LIMIT))
+    predict_output.show_networks(CHIP, asked, answers, as_json=False)
+    check_printed("predict-networks", capsys.readouterr().out)
+    predict_output.show_networks(CHIP, asked, answers, as_json=True)
+    assert json.loads(capsys.readouterr().out) == {
+        "schema": 1,
+        "clock": "virtual",
+        "machine": {"profile": "chip", "title": "A Chip"},
+        "config": {
+            **{"performance_profile": "burst", "minutes": 30.0, "governor": CHIP.thermal.governor},
+            **{"fps": 30.0, "power_limit_w": 3.0},
+        },
+        "networks": answers,
+    }
+
+
+ODD = {"op_type": "Warp", "count": 3, "share_of_elements": 0.125}
 
 
 @pytest.mark.parametrize(("asked_for", "names"), [("balanced", 3), (BURST, 2), (SUSTAINED, 2)])

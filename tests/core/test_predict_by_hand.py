@@ -10,11 +10,13 @@ from typing import Any
 import pytest
 
 from trilane.errors import BadInputError
-from trilane.hw_profiles import over_time, predict
+from trilane.hw_profiles import over_time, predict, timeline
 from trilane.hw_profiles.application import REFERENCE, Plan, Steady, Variant
 from trilane.hw_profiles.load import load_tables, parse_profile
+from trilane.hw_profiles.network_time import Interval
 from trilane.hw_profiles.operator_times import JobTime
 from trilane.hw_profiles.over_time import Moment
+from trilane.hw_profiles.rates import FrameTimes
 from trilane.hw_profiles.schema import CORNERS, Profile
 from trilane.hw_profiles.thermal_state import ThermalState
 from trilane.hw_profiles.throttling import Throttle
@@ -69,6 +71,7 @@ def settled(plan: Plan, capped: bool = False) -> Steady:
         busy={"cpu": 0.1, "gpu": 0.6, "dsp": 0.8},
         idle={unit: {"starved": 0.01 * n, "blocked": 0.02} for n, unit in enumerate(UNITS)},
         accounts={"largest_difference": 0.0, "agree": True, "rows": ["more"]},
+        dropped=0.125,
     )
 
 
@@ -85,7 +88,16 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     monkeypatch.setattr(over_time, "steady", steady)
     monkeypatch.setattr(predict, "isolated_job_time", lambda *_: JobTime({"fixed": 2.0, "convolution": 16.0}))
     monkeypatch.setattr(predict, "relative_error", lambda job, unit: {18.0: 0.125}[job.total_ms] * (unit is not None))
+    monkeypatch.setattr(predict, "price", lambda *_: None)
+    monkeypatch.setattr(predict, "interval", lambda *_: AROUND)
+    monkeypatch.setattr(predict, "unheld_times", lambda *_: TIMES)
+    monkeypatch.setattr(predict, "power_of", lambda *given: list(given))
     return asked
+
+
+AROUND = Interval(15.0, 22.0, ("it is so",))
+#: Held to 16 ms by the display, 20 to 24 ms are left of 12, 20 and 24.
+TIMES = FrameTimes(20.0, 12.0, 24.0)
 
 
 def power_of(profile: Profile, corners: Any) -> dict[str, float]:
@@ -100,6 +112,7 @@ def test_an_answer_about_the_settled_application(asked: list[Any]) -> None:
     corners = tuple(profile.performance_profiles["burst"].corner(unit) for unit in UNITS)
     assert asked == [("snapdragon-888", plan, corners, {"twice": True})]
     power = sum(power_of(profile, corners).values()) + 1.5
+    assert found.pop("power") == [profile, plan, corners, AROUND]
     assert found.pop("power_w") == pytest.approx(power)
     assert found.pop("energy_mj_per_frame") == pytest.approx(25 * power)
     energy = found.pop("xrbench")
@@ -116,10 +129,11 @@ def test_an_answer_about_the_settled_application(asked: list[Any]) -> None:
         },
         "network": {
             "parameters_m": 3.0, "gmac": 5.0, "alone_ms": 18.0, "parts_ms": {"fixed": 2.0, "convolution": 16.0},
+            "low_ms": 15.0, "high_ms": 22.0, "why": ["it is so"],
         },
         "frame_time_ms": {
             "mean": 25.0, "p50": 25.0, "p90": 25.0, "p95": 25.0, "p99": 25.0, "max": 25.0,
-            "ema20_min": 18.75, "ema20_max": 31.25,
+            "ema20_min": 18.75, "ema20_max": 31.25, "low": 20.0, "high": 30.0,
         },
         "latency_ms": {"mean": 41.0},
         "fps": 40.0,
@@ -165,7 +179,9 @@ def test_an_answer_about_minutes_is_of_its_moments(asked: list[Any], monkeypatch
     found = predict.predict(profile, plan, "burst", 0.5, "power_allocator")
     assert words == [(profile, plan, "burst", 0.5, "power_allocator")] and len(asked) == 1
     assert found["power_w"] == 11.0 and found["energy_mj_per_frame"] == pytest.approx(11 * 24)
+    assert found["power"][2] == ("max", "turbo", "svs")
     assert found["frame_time_ms"] == {
+        "low": 24 * 16 / 20, "high": 24 * 24 / 20,
         "mean": 24.0, "p50": 20.0, "p90": 40.0, "p95": 40.0, "p99": 40.0, "max": 40.0, "ema20_min": 18.0,
         "ema20_max": 30.0,
     }  # fmt: skip
@@ -181,12 +197,11 @@ def test_an_answer_about_minutes_is_of_its_moments(asked: list[Any], monkeypatch
 
 
 def test_a_long_timeline_is_thinned_and_few_moments_settle_at_their_last() -> None:
-    assert [each.t_s for each in predict._thinned([moment(n, 1.0) for n in range(1080)])] == [
+    assert [each["t_s"] for each in timeline.timeline_of([moment(n, 1.0) for n in range(1080)])] == [
         6.0 * n for n in range(360)
     ]
-    assert len(predict._thinned([moment(n, 1.0) for n in range(719)])) == 719
-    now: Any = None
-    assert predict._ends([moment(1, 10.0), moment(2, 40.0)], now) == {"fps_start": 100.0, "fps_settled": 25.0}
+    assert len(timeline.timeline_of([moment(n, 1.0) for n in range(719)])) == 719
+    assert timeline.ends_of([moment(1, 10.0), moment(2, 40.0)]) == {"fps_start": 100.0, "fps_settled": 25.0}
 
 
 def test_percentiles_of_a_hundred_moments() -> None:
