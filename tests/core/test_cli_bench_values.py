@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 import typer
+from rich.console import Console
 
 from trilane.apps.cli import bench
 from trilane.apps.cli.bench import BENCHES, bench_command
@@ -73,3 +75,25 @@ def test_the_group_knows_its_benches_and_nothing_else(command: Command) -> None:
     assert group.list_commands(context) == list(BENCHES)
     assert group.get_command(context, "nothing") is None
     assert group.get_command(context, "crop").help == BENCHES["crop"][1]
+
+
+def test_a_table_of_many_columns_is_turned_and_has_no_header() -> None:
+    """Ten columns are rows; of a value that a row does not have the place is blank."""
+    rows = [{f"column {n}": n for n in range(10)}, {"column 0": 0.25, "column 9": "[x]"}]
+    console = Console(width=60, file=io.StringIO())
+    console.print(bench._table(rows))
+    lines = [line.strip("┌┐└┘│├┤─┬┴┼ ").split("│") for line in console.file.getvalue().splitlines()]  # type: ignore[attr-defined]
+    told = [[cell.strip() for cell in line] for line in lines if line != [""]]
+    assert [line[0] for line in told] == [f"column {n}" for n in range(10)]
+    assert (
+        told[0] == ["column 0", "0", "0.25"]
+        and told[9] == ["column 9", "9", "[x]"]
+        and told[1][:2] == ["column 1", "1"]
+    )
+
+
+def test_a_table_of_few_columns_has_their_names() -> None:
+    console = Console(width=60, file=io.StringIO())
+    console.print(bench._table([{"a": 1, "b": 2.0}, {"a": 3}]))
+    words = console.file.getvalue().translate(str.maketrans(dict.fromkeys("┏┓┗┛┃┡┩━┳╇└┘│─┴", " "))).split()  # type: ignore[attr-defined]
+    assert words == ["a", "b", "1", "2", "3"]

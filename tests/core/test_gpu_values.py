@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from trilane.body.joints import JOINT_INDEX, JOINTS
 from trilane.errors import BadInputError, MissingPartError, TrilaneError, UnitLostError
 from trilane.scene.schema import PlaneSpec
-from trilane.stages.gpu import opengl_calls, opengl_context
+from trilane.stages.gpu import opengl_calls, opengl_context, raster
 from trilane.stages.gpu.avatar_mesh import avatar_mesh, enough_weights
 from trilane.stages.gpu.builtin_room import Extent, floor_texture, room_mesh, room_textures, wall_texture
 from trilane.stages.gpu.camera_matrices import eye_of, target_clip
@@ -87,6 +87,34 @@ def test_a_closed_body_is_closed_from_the_cache_too(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr("trilane.stages.gpu.mesh_arrays.is_closed", lambda *_: True)
     assert [avatar_mesh(shaped).closed for _ in range(2)] == [True, True]
+
+
+@pytest.mark.parametrize(
+    ("filtering", "hardware", "deferred"),
+    [("linear", False, True), ("linear", True, False), ("bicubic", False, False), ("mipmap", False, False)],
+)
+def test_uvs_are_drawn_first_where_that_is_quicker(
+    monkeypatch: pytest.MonkeyPatch, filtering: str, hardware: bool, deferred: bool
+) -> None:
+    """On a driver that is software, and with the filter of four texels alone."""
+    asked: list[Any] = []
+
+    def passed(*given: Any) -> Any:
+        asked.append(given)
+        raise StopIteration
+
+    config = SimpleNamespace(scene=SimpleNamespace(texture_filter=filtering))
+    monkeypatch.setattr(raster, "RunConfig", SimpleNamespace(model_validate=lambda _: config))
+    monkeypatch.setattr(raster, "distinct", lambda _: ["folder"])
+    monkeypatch.setattr(raster, "texture_of", lambda *_: np.zeros((2, 2, 8)))
+    monkeypatch.setattr(raster, "quantisation_of", lambda *_: "bytes")
+    monkeypatch.setattr(raster, "describe", lambda _: SimpleNamespace(hardware=hardware, renderer="r"))
+    monkeypatch.setattr(raster, "PackedPass", passed)
+    devices: list[str] = []
+    unit: Any = SimpleNamespace(shared=lambda *_: "context", assets={}, use_device=devices.append)
+    with pytest.raises(StopIteration):
+        raster.build({"config": {}}, unit)
+    assert asked == [("context", 8, "bytes", deferred, filtering)] and devices == (["r"] if hardware else [])
 
 
 SQUARE = np.array([(0.0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (9, 9, 9)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar
@@ -13,6 +14,8 @@ from trilane.bench import placement, planner
 from trilane.errors import BadInputError, TrilaneError
 from trilane.scheduler.placement import Ranked
 from trilane.scheduler.places import Core, Place, Work
+from trilane.stages.configure import Request
+from trilane.stages.factories import PRELOAD
 
 HERE = {"cpu": Place((0,), 1), "gpu": Place((1,), 1)}
 A, B, C, RULE = ({**HERE, "dsp": dsp} for dsp in (Place((0,), 1), Place((1,), 1), Place((0, 1), 1), Place((0, 1), 2)))
@@ -131,6 +134,43 @@ def test_what_cannot_be_placed_is_refused(asked: dict[str, Any], words: str, mon
     monkeypatch.setattr(placement, "usable_cores", lambda: (0, 1))
     with pytest.raises(BadInputError, match=f"^{words}"):
         placement.measure(**asked)
+
+
+def test_every_size_is_placed_on_every_number_of_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two sizes on one core and on both; in virtual time on 1, 2, 3, 4 and 8."""
+    asked: list[Any] = []
+
+    class Trial:
+        def __init__(self, checked: Any, cores: Any, starter: Any) -> None:
+            asked.append((checked, cores, starter))
+
+        def run(self, *rounds: int) -> None:
+            asked.append(rounds)
+
+        def rows(self) -> list[Any]:
+            return [{"row": len(asked)}]
+
+        def summary(self) -> Any:
+            return {"summary": len(asked)}
+
+    monkeypatch.setattr(placement, "usable_cores", lambda: (4, 6))
+    monkeypatch.setattr(placement, "host_cores", lambda numbers: ("cores", numbers))
+    monkeypatch.setattr(placement, "UnitStarter", lambda preload: nullcontext(preload))
+    monkeypatch.setattr(placement, "configure", lambda request, _folder: request)
+    monkeypatch.setattr(placement, "_Trial", Trial)
+    monkeypatch.setattr(placement, "_virtual", lambda checked, avatar, count: {"of": (checked.size, avatar, count)})
+    found = placement.measure("a", ("32x32", "64x64"), (1, 0), frames=20, rounds=3, finalists=1, runtime="ort")
+    requests = [Request(size=size, avatar="a", frames=20, runtime="ort") for size in ("32x32", "64x64")]
+    trials = [(request, ("cores", cores), PRELOAD) for request in requests for cores in ((4,), (4, 6))]
+    assert asked == [part for trial in trials for part in (trial, (3, 1))]
+    named = [{"size": size, "cores": count} for size in ("32x32", "64x64") for count in (1, 2)]
+    assert found["rows"] == [{**name, "row": 2 * place} for place, name in enumerate(named, 1)]
+    assert found["sizes"] == [{**name, "summary": 2 * place} for place, name in enumerate(named, 1)]
+    counts = (1, 2, 3, 4, 8)
+    assert found["virtual"] == [
+        {"size": size, "of": (size, "a", count)} for size in ("32x32", "64x64") for count in counts
+    ]
+    assert found["config"] == {"avatar": "a", "frames": 20, "rounds": 3, "finalists": 1, "runtime": "ort"}
 
 
 class Scene:
