@@ -29,10 +29,7 @@ def _arrays(shaped: ShapedBody) -> Arrays:
     body = shaped.body
     top = largest_weights(body.weights, enough_weights(body))
     mesh = mesh_arrays(shaped.vertices, body.faces, body.uv, body.uv_faces, top.joints, top.weights)
-    arrays = {
-        field.name: getattr(mesh, field.name) for field in fields(mesh) if field.name not in ("surface", "closed")
-    }
-    return {**arrays, "closed": np.array(mesh.closed)}
+    return {field.name: np.asarray(getattr(mesh, field.name)) for field in fields(mesh) if field.name != "surface"}
 
 
 def enough_weights(body: Body) -> int:

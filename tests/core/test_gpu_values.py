@@ -23,7 +23,7 @@ from trilane.stages.gpu.mesh_arrays import is_closed, mesh_arrays, patch_order, 
 from trilane.stages.gpu.packed_pass import PackedPass, Quantisation
 from trilane.stages.gpu.raster import RasterStage
 from trilane.stages.gpu.shader_program import shader_source
-from trilane.stages.gpu.skinned_mesh import _index_bytes
+from trilane.stages.gpu.skinned_mesh import BodyPose, PosedMesh, SkinnedMesh, _index_bytes
 from trilane.stages.gpu.texture_array import check_texture
 
 # --- camera ----------------------------------------------------------------------------------------------------------
@@ -115,6 +115,21 @@ def test_uvs_are_drawn_first_where_that_is_quicker(
     with pytest.raises(StopIteration):
         raster.build({"config": {}}, unit)
     assert asked == [("context", 8, "bytes", deferred, filtering)] and devices == (["r"] if hardware else [])
+
+
+def test_a_mesh_says_what_a_pose_lacks() -> None:
+    written: list[bytes] = []
+    joints: Any = SimpleNamespace(write=lambda data: written.append(data.tobytes()))
+    pose = BodyPose(np.arange(6, dtype=np.float32).reshape(2, 3))
+    posed, skinned = object.__new__(PosedMesh), object.__new__(SkinnedMesh)
+    skinned._joints, skinned.posedirs = joints, None
+    with pytest.raises(ValueError, match=r"^a posed mesh needs the frame's vertices$"):
+        posed.upload_pose(pose)
+    skinned.upload_pose(pose)
+    skinned.posedirs = object()
+    with pytest.raises(ValueError, match=r"^a mesh with pose blend shapes needs the pose feature$"):
+        skinned.upload_pose(pose)
+    assert written == [pose.joints.tobytes()] * 2
 
 
 SQUARE = np.array([(0.0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (9, 9, 9)])
