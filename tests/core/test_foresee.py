@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from math import prod
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -43,6 +44,19 @@ def test_the_shapes_are_those_of_frames_spread_over_the_scene(avatar: AvatarData
     assert found.seen == len(seen) > 90
     demands = Counter(Demand(ideal_shape(rects, (240, 320), OWN), OWN.own) for rects in seen)
     assert found.shapes == choose_shapes(demands.elements(), bytes_per_pixel(avatar.network), 512 * MB)
+
+
+def test_a_scenes_megabytes_are_a_million_bytes(avatar: AvatarData, monkeypatch: pytest.MonkeyPatch) -> None:
+    budgets: list[Any] = []
+
+    def chosen(demands: Any, pixel_bytes: Any, budget: Any) -> Any:
+        budgets.append(budget)
+        return choose_shapes(demands, pixel_bytes, budget)
+
+    monkeypatch.setattr("trilane.stages.foresee.choose_shapes", chosen)
+    scene = Scene(size="auto", frames=1, memory_mb=300)
+    foresee(scene, staged(scene, avatar), [avatar.shaped], avatar.network, OWN)
+    assert budgets == [300_000_000]
 
 
 @pytest.mark.parametrize(("frames", "avatars", "looked_at"), [(500, 1, 96), (40, 1, 40), (500, 3, 32), (500, 8, 24)])
