@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import pytest
 
+from trilane.hw_profiles.graph_builder import GraphBuilder
+from trilane.hw_profiles.reference_encoders import encode
 from trilane.unet_tables import (
     DECODER,
     ENCODERS,
@@ -98,3 +102,34 @@ def test_resnet18_and_what_all_share() -> None:
     assert (DECODER, HEADS, NORM_GROUPS) == ((256, 128, 64, 64, 64), (3, 1), 8)
     assert NORMS == ("batch", "instance", "group")
     assert ENCODERS == ("resnet18", "mobilenetv2", "mobilenetv3", "efficientnet-lite0")
+
+
+@pytest.mark.parametrize(
+    ("name", "kinds"),
+    [
+        # 17 blocks of three convolutions, the first of two; each but the last of a block has its activation
+        ("mobilenetv2", {"Conv": 1 + 2 + 16 * 3 + 1, "Clip": 1 + 1 + 16 * 2 + 1, "Add": 10}),
+        ("efficientnet-lite0", {"Conv": 1 + 2 + 15 * 3 + 1, "Clip": 1 + 1 + 15 * 2 + 1, "Add": 9}),
+        # the paper's Table 1: six blocks with ReLU, nine with hard swish; eight squeeze, each with a ReLU
+        (
+            "mobilenetv3",
+            {
+                "Conv": 1 + 2 + 14 * 3 + 8 * 2 + 1,
+                "Relu": 1 + 5 * 2 + 8,
+                "HardSwish": 1 + 9 * 2 + 1,
+                "Add": 10,
+                **dict.fromkeys(("GlobalAveragePool", "HardSigmoid", "Mul"), 8),
+            },
+        ),
+        # the stem, eight blocks of two and a shortcut where a stage changes the channels
+        ("resnet18", {"Conv": 1 + 8 * 2 + 3, "Relu": 1 + 8 * 2, "MaxPool": 1, "Add": 8}),
+    ],
+)
+def test_an_encoders_operators_are_those_of_its_paper(name: str, kinds: dict[str, int]) -> None:
+    """And each is named by its result, so that it can be told from the others."""
+    builder = GraphBuilder("batch")
+    features = encode(builder, builder.input("x", 3, 64, 64), name)
+    assert Counter(node.op_type for node in builder.nodes) == kinds
+    assert [node.name for node in builder.nodes] == [node.output[0] for node in builder.nodes]
+    assert len({node.name for node in builder.nodes}) == len(builder.nodes)
+    assert [(each.height, each.width) for each in features] == [(64 >> k, 64 >> k) for k in range(1, 6)]
