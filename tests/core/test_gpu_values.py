@@ -6,6 +6,7 @@ import os
 from types import SimpleNamespace
 from typing import Any
 
+import moderngl
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -22,7 +23,7 @@ from trilane.stages.gpu.detected_planes import half_sides
 from trilane.stages.gpu.mesh_arrays import is_closed, mesh_arrays, patch_order, weight_batches
 from trilane.stages.gpu.packed_pass import PackedPass, Quantisation
 from trilane.stages.gpu.raster import RasterStage
-from trilane.stages.gpu.shader_program import shader_source
+from trilane.stages.gpu.shader_program import build_program, shader_source
 from trilane.stages.gpu.skinned_mesh import BodyPose, PosedMesh, SkinnedMesh, _index_bytes
 from trilane.stages.gpu.texture_array import check_texture
 
@@ -130,6 +131,17 @@ def test_a_mesh_says_what_a_pose_lacks() -> None:
     with pytest.raises(ValueError, match=r"^a mesh with pose blend shapes needs the pose feature$"):
         skinned.upload_pose(pose)
     assert written == [pose.joints.tobytes()] * 2
+
+
+def test_shaders_that_do_not_compile_are_named_with_the_compilers_log() -> None:
+    def refused(_vertex: str, fragment: str) -> None:
+        raise moderngl.Error(f"0:7: {fragment.splitlines()[1]}")
+
+    said = r"^shaders whole_screen\.vert and uv_only\.frag: 0:7: #define K 3$"
+    with pytest.raises(TrilaneError, match=said):
+        build_program(SimpleNamespace(program=refused), "whole_screen.vert", "uv_only.frag", K=3)
+    made = build_program(SimpleNamespace(program=lambda *texts: texts), "whole_screen.vert", "uv_only.frag", K=3)
+    assert made == (shader_source("whole_screen.vert", K=3), shader_source("uv_only.frag", K=3))
 
 
 SQUARE = np.array([(0.0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (9, 9, 9)])
