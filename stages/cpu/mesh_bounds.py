@@ -20,15 +20,15 @@ from trilane.arrays import F64, I64, Mask
 from trilane.body.body import ShapedBody
 from trilane.body.joints import JOINTS
 from trilane.body.kinematics import Posed
-from trilane.body.skin_weights import largest_weights
+from trilane.body.skin_weights import branch_sums, joint_distance, largest_weights
 from trilane.body.skinning import blend_matrices
 from trilane.scene.crop import Rect
 from trilane.stages.cpu.mesh_patches import Level, build_levels, join
+from trilane.stages.cpu.outermost import W_LEAST, Outermost
 
 #: Margins for rounding, added to every radius (metres) and to every side of the rectangle (NDC).
 ROUNDING_M = 1e-4
 ROUNDING_NDC = 1e-6
-_W_LEAST = 1e-9
 
 
 @dataclass
@@ -111,6 +111,18 @@ class MeshBounds:
         self._standoff = standoff_m
         self._blend = body.posedirs if pose_blend else None
         self._levels = build_levels(shaped, self._weights)
+        self._outermost: Outermost | None = None
+        self.reach_m = _reach(shaped, self._weights, self._levels) + standoff_m + ROUNDING_M
+
+    def is_off_screen(self, root: F64, clip: ArrayLike) -> bool:
+        """Whether the mesh is surely off the screen, in any pose, with its root joint at `root` (3,), world metres.
+
+        The body lies in a sphere about its root joint, which is compared with the six planes of the clip volume.
+        """
+        camera = np.asarray(clip, np.float64)
+        planes = np.concatenate([camera[3] + camera[:3], camera[3] - camera[:3]])
+        away = planes[:, :3] @ root + planes[:, 3]
+        return bool((away < -self.reach_m * np.linalg.norm(planes[:, :3], axis=1)).any())
 
     def may_be_seen(self, posed: Posed, clip: ArrayLike) -> bool:
         """Whether the mesh may be on the screen, by its largest patches: no when it surely is not, at little cost."""
@@ -141,17 +153,15 @@ class MeshBounds:
 
     def _rect_of_whole(self, vertices: NDArray[np.float32], view: _View) -> Rect | None:
         """The rectangle of a body that is wholly on the screen; None when a part of it may be off the screen."""
-        flat = vertices @ view.camera[:, :3].T.astype(np.float32) + view.camera[:, 3].astype(np.float32)
-        points = flat.astype(np.float64)
         radius = self._standoff + ROUNDING_M
-        near, far = points[:, 3] + points[:, 2], points[:, 3] - points[:, 2]
-        if near.min() <= radius * view.near_norm or far.min() < radius * view.far_norm:
+        if self._outermost is None or self._outermost.count != len(vertices):
+            self._outermost = Outermost(len(vertices))
+        rows = self._outermost.of(vertices, view.camera, radius)
+        if rows is None:
             return None
-        if points[:, 3].min() <= radius * view.norms[3] + _W_LEAST:
-            return None
-        low, high = _quotients(points, np.full(len(points), radius), view)
+        points = vertices[rows].astype(np.float64) @ view.camera[:, :3].T + view.camera[:, 3]
         seen = _Extent()
-        seen.add(low, high)
+        seen.add(*_quotients(points, np.full(len(points), radius), view))
         return seen.rect() if (seen.low > -1.0).all() and (seen.high < 1.0).all() else None
 
     def _sort_out(self, level: Level, rows: I64, view: _View, seen: _Extent) -> tuple[I64, I64]:
@@ -189,6 +199,21 @@ class MeshBounds:
         seen.add(*_quotients(clipped, np.full(len(clipped), self._standoff), view))
 
 
+def _reach(shaped: ShapedBody, weights: F64, levels: list[Level]) -> float:
+    """Metres: the furthest that any pose brings a vertex from the root joint.
+
+    A joint is no further from the root than the bones between them are long, a point that it moves no further from it
+    than at rest, and a skinned vertex is a mean of such points. |R - I| of a joint is at most 2 sqrt(2).
+    """
+    parents, joints = shaped.body.parents, shaped.joints
+    bones = np.linalg.norm(joints - np.where(parents[:, None] < 0, joints, joints[parents]), axis=1)
+    bones[0] = 0.0
+    chain = branch_sums(parents, np.eye(JOINTS)) @ bones  # of all joints from the root to each
+    furthest = np.where(weights > 0, joint_distance(shaped) + chain, 0.0).max()
+    blend = max(float(level.blend.sum(axis=1).max()) for level in levels) * 2.0 * np.sqrt(2.0)
+    return float(furthest + blend)
+
+
 def _against_near(centres: F64, radius: F64, view: _View) -> tuple[Mask, Mask]:
     """(N,) which spheres lie wholly in front of the near plane (and W = 0), and (N,) which cross it.
 
@@ -196,7 +221,7 @@ def _against_near(centres: F64, radius: F64, view: _View) -> tuple[Mask, Mask]:
     """
     near, far = centres[:, 3] + centres[:, 2], centres[:, 3] - centres[:, 2]
     within = far + radius * view.far_norm >= 0.0
-    front = (near - radius * view.near_norm > 0.0) & (centres[:, 3] - radius * view.norms[3] > _W_LEAST)
+    front = (near - radius * view.near_norm > 0.0) & (centres[:, 3] - radius * view.norms[3] > W_LEAST)
     return front & within, (near + radius * view.near_norm > 0.0) & ~front & within
 
 
@@ -206,8 +231,8 @@ def _quotients(points: F64, radius: F64, view: _View) -> tuple[F64, F64]:
     X, Y and W are linear in the point, so over a sphere each varies by the radius times the norm of its matrix row.
     """
     reach = radius[:, None] * view.norms[:2]
-    least = np.maximum(points[:, 3] - radius * view.norms[3], _W_LEAST)[:, None]
-    most = np.maximum(points[:, 3] + radius * view.norms[3], _W_LEAST)[:, None]
+    least = np.maximum(points[:, 3] - radius * view.norms[3], W_LEAST)[:, None]
+    most = np.maximum(points[:, 3] + radius * view.norms[3], W_LEAST)[:, None]
     low, high = points[:, :2] - reach, points[:, :2] + reach
     return low / np.where(low > 0.0, most, least), high / np.where(high > 0.0, least, most)
 

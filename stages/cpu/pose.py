@@ -38,6 +38,11 @@ class _Actor:
     skeleton: Skeleton
     body: ModelledBody
 
+    def is_off_screen(self, translation: F64, clip: F64) -> bool:
+        """Whether no pose at `translation` (3,), before the mover's `world`, brings the body onto the screen."""
+        root = self.mover.world[:3, :3] @ (self.body.shaped.joints[0] + translation) + self.mover.world[:3, 3]
+        return self.body.bounds.is_off_screen(root, clip)
+
 
 @dataclass(frozen=True)
 class FramePlan:
@@ -192,16 +197,21 @@ class PoseStage:
     ) -> Seen | None:
         """Fill one avatar's joints, and `vertices` if given; where it is on the screen, None when it is not visible.
 
-        One that was not seen in the last frame that was made is looked for by its patches before it is skinned.
+        One that is far off the screen is not posed; one that was not seen in the last frame that was made is looked for
+        by its patches before it is skinned.
         """
         pose, translation = moved[actor.index]
+        avatar["avatar"], avatar["visible"] = actor.index, False
+        if actor.is_off_screen(translation, clip):
+            self._was_seen[actor.index] = False
+            return None
         posed: Posed = actor.skeleton.pose(pose, translation, actor.mover.world)
         _require_finite(posed.matrices, frame, f"joints of avatar {actor.index}")
         seen = None
         if self._was_seen[actor.index] or actor.body.bounds.may_be_seen(posed, clip):
             seen = actor.body.see(posed, clip, self._output, vertices)
         self._was_seen[actor.index] = seen is not None
-        avatar["avatar"], avatar["visible"] = actor.index, seen is not None
+        avatar["visible"] = seen is not None
         avatar["joints"], avatar["pose_feature"] = posed.matrices, posed.feature
         return seen
 

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from trilane.body.kinematics import Skeleton
 from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.stage import UnitContext
@@ -90,6 +91,26 @@ def test_an_avatar_out_of_the_picture_is_not_visible(tiny_bundle: Path, tmp_path
     packet = bound(only_hidden)
     assert only_hidden.run(0, None, 0) == {"visible": 0.0}
     assert tuple(packet.header["tensor_shape"]) in shape_buckets("256")
+
+
+def test_an_avatar_that_no_pose_brings_into_the_picture_is_not_posed(
+    tiny_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It stands behind the camera; the other one is posed in every frame."""
+    posed: list[float] = []
+    pose = Skeleton.pose
+
+    def noted(self: Skeleton, *args: Any) -> Any:
+        posed.append(float(args[2][2, 3]))
+        return pose(self, *args)
+
+    away = AvatarSpec(position=(0.0, 0.0, 40.0), heading_deg=30.0)
+    stage = pose_stage(config(tiny_bundle, tmp_path, avatars=(away, AvatarSpec())))
+    bound(stage, 2)
+    monkeypatch.setattr(Skeleton, "pose", noted)
+    for frame in range(3):
+        assert stage.run(frame, None, 0)["visible"] == 1.0
+    assert posed == [0.0] * 3
 
 
 def test_two_avatars_share_the_tensor(tiny_bundle: Path, tmp_path: Path) -> None:
