@@ -31,6 +31,7 @@ from trilane.stages.gpu.detected_planes import PlanePainter
 from trilane.stages.gpu.drawn_frames import Drawing, DrawnFrames
 from trilane.stages.gpu.head_up_display import Hud
 from trilane.stages.gpu.opengl_context import CONTEXT, checked, describe, open_context
+from trilane.stages.gpu.still_background import StillBackground
 from trilane.transport.packets import Packet
 
 ROOM = "room"
@@ -62,6 +63,7 @@ class CompositeStage:
         self._ctx, self._shape, self._rest, self._background = ctx, shape, rest, background
         colour = ctx.texture(shape[::-1], 4, internal_format=opengl_calls.SRGB8_ALPHA8)
         self._target = ctx.framebuffer([colour])
+        self._still = StillBackground(self._target)
         self._room = RoomPainter(ctx, eyes) if background is None else None
         self._picture = None if background is None else PicturePainter(ctx, shape)
         self._planes = PlanePainter(ctx, planes) if planes else None
@@ -140,9 +142,8 @@ class CompositeStage:
     def _draw(self, pose: NDArray[np.void]) -> None:
         """Draw the frame of `pose` with the picture of the avatars that was uploaded last."""
         self._target.use()
-        self._draw_background(pose)
-        if self._planes is not None:
-            self._planes.draw(pose["view"], pose["projection"])
+        shown = self._shows_background, pose["view"].tobytes(), pose["projection"].tobytes()
+        self._still.draw(shown, lambda: self._draw_background(pose))
         if self._held is not None and int(pose["work"]) != Work.NONE:
             self._draw_avatars(self._held)
         if self._hud is not None:
@@ -168,6 +169,8 @@ class CompositeStage:
             self._room.draw(self._target, pose["view"], pose["projection"])
         if self._picture is not None:
             self._picture.draw()
+        if self._planes is not None:
+            self._planes.draw(pose["view"], pose["projection"])
 
     def _depth(self, pose: NDArray[np.void], avatar: Any) -> float:
         """Camera z of the pelvis: the most negative is the farthest."""
