@@ -1,6 +1,7 @@
 """What does planning save against a fixed square of 512 x 512, and what does it cost in image error?
 
-Rule: both plans run interleaved, on the same moments of the same scenes; the pictures that are compared are made by the
+Rule: both plans run interleaved, on the same moments of the same scenes, each on the cores that are best for it, as
+`trilane run` places it; the pictures that are compared are made by the
 runs' own stages from the very configurations that were timed. What they are compared with, the plan `full`, is written
 a second time (`bench/lib/full_picture.py`).
 """
@@ -25,14 +26,18 @@ from trilane.bench.lib.stage_chain import AvatarFrames
 from trilane.bench.lib.true_picture import TruePictures, has_truth
 from trilane.errors import BadInputError, TrilaneError
 from trilane.figure_sources import MEASURED
+from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.stats import median_interval
 from trilane.stages.avatar_pipeline import run_avatar
 from trilane.stages.configure import Checked, Request, configure
+from trilane.stages.factories import PRELOAD
 from trilane.stages.gpu.opengl_context import describe
+from trilane.stages.placing import placed
 from trilane.writing import write_folder
 
 SCENES = ("portrait", "full-body", "crowd", "walk-past", "top-to-floor", "leave-and-return")
 PLANS = {"fixed": fixed, "planned": planned}
+POLICY = "pipelined"
 LEAST_FRAMES = 20
 #: By what differences from `full` are multiplied in the sheets.
 SHOWN = 8
@@ -51,7 +56,8 @@ def measure(
 
     Keys: `scenes`, one entry each: `name`; `speedup` (median over the rounds of the fixed frame time over the planned
     one), `speedup_low`, `speedup_high` (its 95 % interval; with fewer than six rounds the least and largest),
-    `fixed_ms`, `planned_ms`; `psnr_fixed_db`, `psnr_planned_db`, `ssim_*`, `flip_*` of the frames against those of
+    `fixed_ms`, `planned_ms`; `placements`: by plan, on which cores its units were and why; `psnr_fixed_db`,
+    `psnr_planned_db`, `ssim_*`, `flip_*` of the frames against those of
     `full`, the same with `box_` in the avatars' rectangles, None with nobody in view; PSNR is that of the mean square
     over all frames; `truth`: the same against the clothed body that the default
     avatar was trained on, `full` too; `network`: what paints `full`; `tensors`: the planned ones. `median_speedup`,
@@ -66,11 +72,12 @@ def measure(
             pass  # that it can be written is found out before the work
     found = [_Scene(name, frames, runtime, video=video) for name in scene]
     rows = []
-    for one in found:
-        row, sheets = one.compare(pictures)
-        rows.append({"name": one.name, **one.time(rounds), **row})
-        if out:
-            _write(Path(out), one.name, sheets)
+    with UnitStarter(PRELOAD) as starter:
+        for one in found:
+            row, sheets = one.compare(pictures)
+            rows.append({"name": one.name, **one.time(rounds, starter), **row})
+            if out:
+                _write(Path(out), one.name, sheets)
     return {
         "scenes": rows,
         "median_speedup": median(row["speedup"] for row in rows),
@@ -111,16 +118,21 @@ class _Scene:
         self._checked = checked
         self._plans = {plan: make(checked) for plan, make in PLANS.items()}
 
-    def time(self, rounds: int) -> dict[str, Any]:
-        """Frame times of both plans in turns, and their ratio. Raises TrilaneError when a run fails."""
+    def time(self, rounds: int, starter: UnitStarter) -> dict[str, Any]:
+        """Frame times of both plans in turns, and their ratio. Raises TrilaneError when a run fails.
+
+        `starter`: of all units. Scenes too short to be rehearsed are placed by the rule for any run.
+        """
+        on_cores = {plan: placed(one, POLICY, starter, str(self.driver)) for plan, one in self._plans.items()}
         times: dict[str, list[float]] = {plan: [] for plan in self._plans}
         for _ in range(rounds):
-            for plan, checked in self._plans.items():
-                times[plan].append(_frame_ms(checked, f"{self.name}, {plan}"))
+            for plan, checked in on_cores.items():
+                times[plan].append(_frame_ms(checked, f"{self.name}, {plan}", starter))
         ratios = [slow / fast for slow, fast in zip(times["fixed"], times["planned"], strict=True)]
         low, high = median_interval(ratios)
         middle = {f"{plan}_ms": median(values) for plan, values in times.items()}
-        return {"speedup": median(ratios), "speedup_low": low, "speedup_high": high, **middle}
+        said = {plan: checked.notes[-1] for plan, checked in on_cores.items()}
+        return {"speedup": median(ratios), "speedup_low": low, "speedup_high": high, **middle, "placements": said}
 
     def compare(self, pictures: int) -> tuple[dict[str, Any], list[tuple[int, U8]]]:
         """Image errors over `pictures` frames, evenly spread, and a sheet of each with its number."""
@@ -157,10 +169,10 @@ def _figures(errors: Mapping[str, PictureErrors]) -> dict[str, float | None]:
     return {key: value for plan, each in errors.items() for key, value in each.figures(plan).items()}
 
 
-def _frame_ms(checked: Checked, what: str) -> float:
+def _frame_ms(checked: Checked, what: str, starter: UnitStarter) -> float:
     with tempfile.TemporaryDirectory(prefix="trilane-bench-") as folder:
-        placed = checked.changed(out_dir=Path(folder))
-        result = run_avatar(placed.config, placed.assets, isolated_frames=0)
+        here = checked.changed(out_dir=Path(folder))
+        result = run_avatar(here.config, here.assets, policy=POLICY, isolated_frames=0, starter=starter)
     if result.interrupted:
         raise KeyboardInterrupt
     if result.failure is not None or result.presented < 2:

@@ -187,7 +187,8 @@ class Scene:
         row = {"psnr_fixed_db": self.fixed, "psnr_planned_db": self.planned, "asked": (*self.asked, pictures)}
         return row, [(3, np.full((2, 2, 3), 9, np.uint8))]
 
-    def time(self, rounds: int) -> Any:
+    def time(self, rounds: int, starter: str) -> Any:
+        assert starter == "fork server"
         return {"speedup": self.speedup, "rounds": rounds}
 
 
@@ -195,6 +196,7 @@ def test_plans_are_compared_by_scene_and_in_all(monkeypatch: pytest.MonkeyPatch,
     """Speed-ups 1.5, 0.5 and 2.5; the planned pictures lose -1, 0.25 and 0.125 dB."""
     monkeypatch.setattr(planner, "_Scene", Scene)
     monkeypatch.setattr(planner, "require_metrics", lambda: None)
+    monkeypatch.setattr(planner, "UnitStarter", lambda _modules: nullcontext("fork server"))
     out = str(tmp_path / "pictures")
     found = planner.measure(("a", "b", "c"), frames=20, rounds=4, pictures=2, runtime="ort", video=False, out=out)
     assert found["scenes"][1] == {
@@ -213,17 +215,26 @@ def test_plans_are_compared_by_scene_and_in_all(monkeypatch: pytest.MonkeyPatch,
 
 
 def test_both_plans_are_timed_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fixed 20, 30, 24; planned 10, 20, 8: ratios 2, 1.5, 3."""
+    """Fixed 20, 30, 24; planned 10, 20, 8: ratios 2, 1.5, 3. Each is placed once, before any is timed."""
     told = iter([20.0, 10.0, 30.0, 20.0, 24.0, 8.0])
     asked: list[Any] = []
     monkeypatch.setattr(planner, "_frame_ms", lambda *what: asked.append(what) or next(told))
     scene = object.__new__(planner._Scene)
     scene.name, scene._plans = "s", {"fixed": "f", "planned": "p"}  # type: ignore[dict-item]
-    assert scene.time(3) == {
+    scene.driver = {"renderer": "r"}
+    starter: Any = object()
+
+    def on_cores(plan: str, policy: str, by: Any, driver: str) -> SimpleNamespace:
+        assert (policy, by, driver) == ("pipelined", starter, "{'renderer': 'r'}") and not asked
+        return SimpleNamespace(plan=plan, notes=["first", f"{plan} on its cores"])
+
+    monkeypatch.setattr(planner, "placed", on_cores)
+    assert scene.time(3, starter) == {
         "speedup": 2.0,
         "speedup_low": 1.5,
         "speedup_high": 3.0,
         "fixed_ms": 24.0,
         "planned_ms": 10.0,
+        "placements": {"fixed": "f on its cores", "planned": "p on its cores"},
     }
-    assert asked == [("f", "s, fixed"), ("p", "s, planned")] * 3
+    assert [(one.plan, *rest) for one, *rest in asked] == [("f", "s, fixed", starter), ("p", "s, planned", starter)] * 3

@@ -41,7 +41,7 @@ def packet(payload: int) -> Packet:
 
 
 def test_frames_over_a_kept_room_are_those_over_a_drawn_one(gl: Any) -> None:
-    """An avatar moves before a camera that stands still for five frames, then goes on: every frame as by a new stage."""
+    """An avatar moves before a camera that stands still for five frames, then goes on: all frames as by a new stage."""
     source = packet(8 * 8 * 4)
     source.payload[:] = np.random.default_rng(0).integers(0, 256, 8 * 8 * 4, dtype=np.uint8)
     pose = source.header
