@@ -14,8 +14,10 @@ frame, and how long each of its cores is taken meanwhile. With T the frame time,
 
 The least such T is the answer. A sequential run has one stage at work at any time: T is the sum, and nothing waits.
 
-Every job of a unit on a shared core costs a change of threads more; and a floating unit is moved by every job of others
-that begins where it runs. What the scheduler takes of its cores counts like work that nothing waits for.
+A floating unit of which one core is nobody else's *stays* there: the kernel moves a thread only when it has to wait.
+
+Every job of a unit on a shared core costs a change of threads more; a floating unit that does not stay is moved once a
+frame. What the scheduler takes of its cores counts like work that nothing waits for.
 """
 
 from __future__ import annotations
@@ -25,11 +27,12 @@ from itertools import combinations
 from math import prod
 from typing import Final, NamedTuple
 
-from trilane.scheduler.places import FULL, Core, Place, Placement, Times, Work, share_ns
+from trilane.scheduler.places import FULL, Core, Place, Placement, Times, Work, has_own_cores, share_ns, shared_cores
 
 #: Assumed: what two threads on the siblings of a physical core do together, over what one alone does.
 SIBLINGS: Final = 1.25
-#: Assumed: a change of threads, with the first-level cache; a move, with a second-level one of 2 MiB at 8 GB/s.
+#: Assumed: a change of threads, with the first-level cache; a move, with a second-level one of 2 MiB at 8 GB/s. A
+#: simulated fair scheduler moved units that float 0.5 to 1.2 times a frame (docs/decisions/placement.md).
 CHANGE_NS: Final = 30_000
 MOVE_NS: Final = 250_000
 #: Assumed, of what several cores can do for units that float: the kernel moves a waiting thread to a core that has just
@@ -72,6 +75,17 @@ class _Load(NamedTuple):
         return self.core_ns / len(self.cores) if self.floats else self.core_ns
 
 
+def _settled(placement: Placement) -> Placement:
+    """`placement` with each floating unit that has one core to itself on that one alone; it leaves the others free."""
+    shared = shared_cores(placement)
+    settled = dict(placement)
+    for unit, place in placement.items():
+        own = [core for core in place.cores if core not in shared]
+        if len(own) == 1 and place.threads < len(place.cores):
+            settled[unit] = Place((own[0],), 1)
+    return settled if settled == placement else _settled(settled)
+
+
 class _Model:
     """One placement."""
 
@@ -80,10 +94,10 @@ class _Model:
         self._physical = {core.number: core.physical for core in cores}
         works = {unit: times[unit][place.threads] for unit, place in placement.items()}
         self._units = []
-        for unit, place in placement.items():
-            beside = [other for other, its in placement.items() if other != unit and set(its.cores) & set(place.cores)]
-            moves = sum(works[other].jobs for other in beside) if place.threads < len(place.cores) else 0
-            changes = works[unit].jobs if beside else 0
+        settled = _settled(placement)
+        for unit, place in settled.items():
+            changes = 0 if has_own_cores(unit, settled) else works[unit].jobs
+            moves = place.threads < len(place.cores)
             self._units.append(self._load(place, works[unit], changes * CHANGE_NS + moves * MOVE_NS))
         jobs = sum(work.jobs for work in works.values())
         where = placement[rules.first].cores

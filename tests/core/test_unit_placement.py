@@ -169,11 +169,22 @@ def test_what_a_change_of_threads_a_move_and_the_scheduler_take(monkeypatch: pyt
     monkeypatch.setattr(placement_model, "CHANGE_NS", MS)
     assert [ms(on(0, 0, 1), of, equal(2)), ms(on(0, 1, 0), of, equal(2))] == [20, 28]
     monkeypatch.setattr(placement_model, "MOVE_NS", 2 * MS)
-    assert ms(on(0, 0, (0, 1)), of, equal(2)) == 20 + 1 + 4 * 2  # four jobs of the others may move it
+    assert ms(on(0, 1, (0, 1)), of, equal(2)) == 20 + 1 + 2  # its one job, and the move of a frame
+    assert ms(on(0, 0, (0, 1)), of, equal(2)) == 20  # it stays on core 1, where nobody else is
     monkeypatch.setattr(placement_model, "SCHEDULER_NS", 4 * MS)
     assert ms(on(0, 0, 1), of, equal(2)) == 5 + 10 + 4 + 5 * 4
     assert ms(on(0, 0, 1), of, equal(2), Rules("dsp")) == 20 + 5 * 4
     assert ms(on(0, 1, 2), of, equal(3), Rules("cpu", sequential=True)) == 35 + 5 * 4
+
+
+def test_a_unit_that_floats_stays_where_nobody_else_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And what it leaves may be the core where another one that floats can stay."""
+    for name, value in (("MOVE_NS", 99 * MS), ("ROOM_USED", 0.5)):
+        monkeypatch.setattr(placement_model, name, value)
+    of = times(6, 13, 7)
+    assert ms(on(0, (0, 1), 0), of, equal(2)) == ms(on(0, 1, 0), of, equal(2)) == 13
+    assert ms(on((0, 1), (1, 2), 0), of, equal(3)) == 13  # the GPU unit on core 2, then the CPU unit on core 1
+    assert ms(on((0, 1), 1, 0), of, equal(3)) > 99  # nowhere, so it is moved
 
 
 def test_of_what_cores_can_do_for_units_that_float_a_tenth_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
