@@ -204,7 +204,7 @@ class _Costs:
 
     @staticmethod
     def _competes(job: Runs, other: Runs) -> bool:
-        return other.stage == INFER[0] and other.member != job.member and other.unit != job.unit
+        return other.stage == INFER[0] and other.seat != job.seat
 
     def _job(self, runs: Runs) -> _Job:
         return _Job(runs.member, max(self._tenants[runs.member].kind(runs.frame), 0))

@@ -295,6 +295,7 @@ class BesideDriver:
 def simulate_beside(members: Sequence[Member], *, keep: bool = False, **driver: Any) -> list[Simulation]:
     """Run all `members` to their ends, and what each hands back, in their order.
 
+    Frames that still waited before the first stage at a `Stop` became nothing, and are not among the requested.
     The reports have one more key: `response_ms`, from a frame's release to presented, of frames with a deadline.
     `keep`, `driver`: see BesideDriver. Raises as it does.
     """
@@ -308,5 +309,6 @@ def simulate_beside(members: Sequence[Member], *, keep: bool = False, **driver: 
 
 def _report(line: _Line) -> dict[str, Any]:
     ledger, due_ns = line.core.ledger, line.member.settings.deadline_ns
-    report = ledger.report(clock="virtual", requested=line.core.source.released)
+    requested = len(ledger.presented_ns) + sum(ledger.dropped.values()) + sum(ledger.lost.values())
+    report = ledger.report(clock="virtual", requested=requested)
     return {**report, "response_ms": summary_ms(late_ns + due_ns for late_ns in ledger.lateness_ns)}

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from onnx import TensorProto, helper
 
 from trilane.apps import beside as sources
 from trilane.errors import BadInputError
+from trilane.hw_profiles import beside_answer
 from trilane.hw_profiles.application import Plan, Variant, stage_times_ms, steady
 from trilane.hw_profiles.beside import SKIPS, Tenant, Together, moved_bytes, together
 from trilane.hw_profiles.beside_answer import predict_beside
@@ -91,6 +93,15 @@ def test_networks_on_one_unit_follow_each_other_and_do_not_slow_each_other() -> 
     assert [response_ms(found, number) for number in (0, 1)] == pytest.approx([alone, 2 * alone], rel=1e-4)
 
 
+def test_networks_that_divide_a_core_do_not_slow_each_other_by_the_memory() -> None:
+    """Two at once on half of the core each: both take twice as long, and no more."""
+    units = {**CHIP.units, "dsp": CHIP.units["dsp"].model_copy(update={"core": "core 1"})}
+    two = [bare("dsp"), bare("dsp")]
+    found = together(CHIP.model_copy(update={"units": units}), two, CORNERS)
+    alone = time_ms(two[0], 0.0)
+    assert [response_ms(found, number) for number in (0, 1)] == pytest.approx([2 * alone] * 2, rel=1e-4)
+
+
 def test_an_avatar_takes_its_share_of_the_memory_all_the_time_and_two_take_twice_as_much() -> None:
     own = CHIP.memory.application_use_fraction.or_else(0.0)
     for avatars in (1, 2):
@@ -133,6 +144,35 @@ def test_more_than_a_unit_can_do_is_dropped_and_late_and_counted() -> None:
         assert shares["idle"]["preempted"] == pytest.approx(0.5, abs=0.02)
     assert answer["units"]["dsp"]["busy"] == pytest.approx(1, abs=0.01)
     assert sum(answer["units"]["dsp"]["by_pipeline"].values()) == pytest.approx(answer["units"]["dsp"]["busy"])
+
+
+def test_a_policy_that_keeps_old_frames_lets_one_wait_and_turns_others_away() -> None:
+    """Released four times as often as the network can take them."""
+    one = avatar(512, 30)
+    times = stage_times_ms(CHIP, Plan(one.networks[0], "dsp"), CORNERS)
+    chip = CHIP.model_copy(
+        update={
+            "application": CHIP.application.model_copy(
+                update={"display_ms": CHIP.application.display_ms.model_copy(update={"value": 0.1})}
+            )
+        }
+    )
+    fast = replace(one, fps=4e3 / times["infer", "dsp"], variant=Variant("pipelined", "double"))
+    report = together(chip, [fast], CORNERS).runs[0].report
+    frames = report["frames"]
+    assert frames["dropped"] == {"source->pose:queue_full": frames["requested"] - frames["presented"]}
+    assert frames["presented"] == pytest.approx(frames["requested"] / 4, rel=0.05)
+
+
+def test_what_it_settles_to_is_the_last_fifth_of_the_time() -> None:
+    """Ten moments, of which the last two have frames of 30 and 40 ms."""
+    reports = {
+        corner: SimpleNamespace(runs=[None, SimpleNamespace(report={"frame_time_ms": {"mean": ms}})])
+        for corner, ms in (("early", 20.0), ("late", 30.0), ("last", 40.0))
+    }
+    moments: list[Any] = [SimpleNamespace(corners=corner) for corner in ["early"] * 8 + ["late", "last"]]
+    assert beside_answer._settled_ms(moments, reports.__getitem__, 1) == 35.0  # type: ignore[arg-type]
+    assert beside_answer._settled_ms([], reports.__getitem__, 1) is None  # type: ignore[arg-type]
 
 
 def test_heat_is_that_of_all_together() -> None:

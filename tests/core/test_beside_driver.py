@@ -90,6 +90,27 @@ def test_the_earliest_deadline_goes_first_and_what_has_none_last() -> None:
     assert (a.report["deadline_misses"], b.report["deadline_misses"]) == (0, 0)
 
 
+def test_releases_of_one_instant_count_whoever_is_told_first() -> None:
+    """At 10 ms frames of A and B are released onto an idle unit, which A had last: B has it first."""
+    a, b = simulate_beside(
+        [
+            member(ALONE, Settings(2, period_ns=10 * MS), infer=3),
+            member(ALONE, Settings(1, arrivals_ns=(10 * MS,)), infer=4),
+        ],
+        keep=True,
+    )
+    assert rows(a.jobs) == [(0, 0, 3), (1, 14, 17)]
+    assert rows(b.jobs) == [(0, 10, 14)]
+
+
+def test_of_equal_deadlines_the_next_in_turn_goes_first() -> None:
+    """Both release at 0 and 10 ms, due 10 ms later. B had the unit last at 10, so A begins again."""
+    paced = Settings(2, period_ns=10 * MS, deadline_ns=10 * MS)
+    a, b = simulate_beside([member(ALONE, paced, infer=3)] * 2, turns="deadline", keep=True)
+    assert rows(a.jobs) == [(0, 0, 3), (1, 10, 13)]
+    assert rows(b.jobs) == [(0, 3, 6), (1, 13, 16)]
+
+
 def test_a_pipeline_of_two_stages_beside_a_network_at_a_rate() -> None:
     """A draws (2 ms, its own gpu) and infers (4 ms); N infers every 10 ms for 5 ms on the same dsp.
 
