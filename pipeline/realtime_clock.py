@@ -60,8 +60,8 @@ class Governor(Protocol):
 class RealtimeClock:
     """`trilane.scheduler.loop.Clock` of one run over `processes`; it lets `core` run until that finishes.
 
-    `jobs`: of every job that ended, when. `metrics`: of every stage, the sums of what its jobs reported.
-    `cpu`: CPU time of units and stages.
+    `jobs`: of every job that ended, when. `metrics`: of every stage, the sums of what its jobs reported,
+    and `reported`, how many of them reported each. `cpu`: CPU time of units and stages.
     """
 
     def __init__(
@@ -76,6 +76,7 @@ class RealtimeClock:
     ) -> None:
         self.jobs: list[JobRecord] = []
         self.metrics: dict[str, Counter[str]] = defaultdict(Counter)
+        self.reported: dict[str, Counter[str]] = defaultdict(Counter)
         self.cpu = CpuTimes(processes.core_counts)
         self._core, self._processes, self._interrupts, self._log = core, processes, interrupts, log
         self._requests, self._governor, self._on_progress = requests, governor, on_progress
@@ -215,6 +216,7 @@ class RealtimeClock:
                 self.jobs.append(JobRecord(job.stage, job.unit, job.frame, *times))
             self.cpu.add(job.unit, job.stage, done, self._core.ledger.start_ns)
             self.metrics[job.stage].update(done.metrics)
+            self.reported[job.stage].update(done.metrics.keys())
         self._unbooked.clear()
 
     def _tell_unanswered(self) -> None:

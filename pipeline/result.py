@@ -24,7 +24,8 @@ class RunResult:
     """A finished run.
 
     `report`: what the run measured; who calls it adds the machine and the configuration.
-    `lost`, `dropped`: frames by cause. `startup_ms`: of each unit. `metrics`: of each stage, the mean of a job's.
+    `lost`, `dropped`: frames by cause. `startup_ms`: of each unit. `metrics`: of each stage, the means
+    over the jobs that gave them.
     `messages`: what went wrong on the way, such as a unit that died and was restarted.
     `failure`: set when a stage failed or a unit could not be kept alive; what was done until then is still here.
     """

@@ -193,10 +193,9 @@ class _Run:
             self._log.say(f"the measurement after the run was left out: {str(error) or 'interrupted'}")
 
     def _mean_metrics(self) -> Mapping[str, Mapping[str, float]]:
-        """Of each stage that reported any, the mean of a job."""
-        jobs = {stage: sum(job.stage == stage for job in self._clock.jobs) for stage in self._clock.metrics}
+        """Of each stage that reported any, the mean over the jobs that reported it."""
         return {
-            stage: {name: total / max(jobs[stage], 1) for name, total in sums.items()}
+            stage: {name: total / self._clock.reported[stage][name] for name, total in sums.items()}
             for stage, sums in self._clock.metrics.items()
         }
 

@@ -304,6 +304,7 @@ def test_every_job_that_ended_is_booked_with_its_times_and_figures(monkeypatch: 
     clock.finish()
     assert clock.jobs == [JobRecord("draw", "gpu", 0, released, START, START + 1, START + 9, 3, 2, 1)]
     assert clock.metrics == {"draw": Counter(area=7.0, new=1.0)}
+    assert clock.reported == {"draw": Counter(area=2, new=1)}
     assert (clock.cpu.stage_ns, clock.cpu.in_jobs_ns, clock.cpu.between_ns) == (
         {"draw": [4, 16]},
         {"gpu": 20},

@@ -55,8 +55,10 @@ class World:
         for number in range(4):
             cpu.add("right", "mid", Done(number, 0, 0, 0, 0, 0, 0, 0, 3 * MS, 0, {}), 0)
         metrics = {"mid": Counter({"visible": 12.0}), "none": Counter({"x": 5.0})}
+        reported = {"mid": Counter({"visible": 40}), "none": Counter({"x": 1})}
+        said = {"metrics": metrics, "reported": reported}
         return SimpleNamespace(
-            cpu=cpu, jobs=driver.jobs, metrics=metrics, finish=lambda: self.steps.append("finish"), driver=driver
+            cpu=cpu, jobs=driver.jobs, finish=lambda: self.steps.append("finish"), driver=driver, **said
         )
 
     def run_loop(self, core: Any, clock: Any, recording: Any) -> Outcome:
@@ -138,7 +140,7 @@ def test_the_steps_of_a_run_and_its_report(world: World) -> None:
     assert (result.requested, result.presented, result.lost, result.dropped) == (60, 60, {}, {})
     assert (result.pids, result.startup_ms) == ({"left": 11, "right": 12}, {"left": 1.5, "right": 2.5})
     assert (len(result.jobs), result.messages, result.interrupted, result.failure) == (180, (), False, None)
-    assert result.metrics == {"mid": {"visible": 0.2}, "none": {"x": 5.0}}
+    assert result.metrics == {"mid": {"visible": 0.3}, "none": {"x": 5.0}}
     assert result.recording.steps and result.recording.settings == Settings(60, "pipelined", hang_ns=10_000_000_000)
     report = result.report
     assert (report.clock, report.policy, report.edge, report.idle_cores) == (
