@@ -57,7 +57,7 @@ def explain(checked: Checked, profile: str, performance_profile: str, most_measu
             measured = len(rows) < most_measured
             rows.append([plan.measured_px(frame, avatar) if measured else None for avatar in planned.plan.seen])
         frames.append(planned)
-    groups = phases(frames)
+    groups, names = phases(frames), [str(spec.name) for spec in scene.avatars]
     document = {
         "scene": scene.name,
         "config": {
@@ -71,11 +71,16 @@ def explain(checked: Checked, profile: str, performance_profile: str, most_measu
         },
         "shapes": [list(shape) for shape in checked.config.buckets],
         "avatars": [_avatar(checked, number) for number in range(len(scene.avatars))],
-        "phases": [_phase(group, errors, costs) for group, errors in zip(groups, rows, strict=True)],
+        "phases": [_phase(group, errors, costs, names) for group, errors in zip(groups, rows, strict=True)],
         "totals": _totals(frames, costs),
         "placement": costs.placement(_usual_shape(frames)),
         "notes": list(checked.notes),
-        "sources": {"bound_px": BOUND, "measured_px": MEASURED, "pixels, gmac": "counted", "ms": COMPUTED},
+        "sources": {
+            "bound_px": BOUND,
+            "measured_px": f"{MEASURED}, at a phase's first frame",
+            "pixels, gmac": "counted",
+            "ms": COMPUTED,
+        },
     }
     return Explanation(document, plan, [group[0] for group in groups])
 
@@ -85,6 +90,7 @@ def _avatar(checked: Checked, number: int) -> dict[str, Any]:
     where = "cpu" if config.posed_vertices else "gpu"
     return {
         "avatar": number,
+        "name": config.scene.avatars[number].name,
         "bundle": config.scene.avatars[number].bundle,
         "skinned_on": where,
         "expression": "part of the avatar's shape: it costs nothing per frame",
@@ -93,7 +99,9 @@ def _avatar(checked: Checked, number: int) -> dict[str, Any]:
     }
 
 
-def _phase(group: Sequence[PlannedFrame], errors: Sequence[float | None], costs: CostModel) -> dict[str, Any]:
+def _phase(
+    group: Sequence[PlannedFrame], errors: Sequence[float | None], costs: CostModel, names: Sequence[str]
+) -> dict[str, Any]:
     first = group[0].plan
     cost = _cost(first, costs)
     return {
@@ -106,6 +114,7 @@ def _phase(group: Sequence[PlannedFrame], errors: Sequence[float | None], costs:
         "avatars": [
             {
                 "avatar": number,
+                "name": names[number],
                 "modelled": DETAILS[one.level].name,
                 "bound_px": max(planned.plan.seen[number].error_px for planned in group),
                 "measured_px": error,

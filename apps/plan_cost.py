@@ -4,20 +4,23 @@ measured, by the same model as `trilane predict`.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 from trilane.avatars.integer_network import NetworkFile
 from trilane.avatars.network_reshape import reshaped
-from trilane.hw_profiles.application import Plan, Variant, stage_times_ms, steady
+from trilane.hw_profiles.application import Plan, Variant, stage_times_ms, steady, workers_of
 from trilane.hw_profiles.host import host_cores, usable_cores
 from trilane.hw_profiles.load import HOST, load_runnable
 from trilane.hw_profiles.network_work import Network, count_work
 from trilane.hw_profiles.performance_profiles import corners_of
 from trilane.hw_profiles.placed_host import place_units
 from trilane.hw_profiles.placement_facts import NS_PER_MS, described
+from trilane.hw_profiles.schema import Profile
 from trilane.shapes import Shape
+from trilane.units import UnitName
 
 PIPELINED = Variant("pipelined", "double")
 #: Stages that a frame needs even with nobody in view.
@@ -40,6 +43,13 @@ class FrameCost:
         return {"pixels": self.pixels, "gmac": self.gmac, "work_ms": self.work_ms, "frame_ms": self.frame_ms}
 
 
+def least_frame_ms(chip: Profile, times: Mapping[tuple[str, UnitName], float]) -> float:
+    """Time between frames whose jobs take `times`, by stage and unit: the busiest core's, or that of the display."""
+    worker = workers_of(chip)
+    busy = (sum(ms for (_, unit), ms in times.items() if worker[unit] == one) for one in set(worker.values()))
+    return max(*busy, chip.application.display_ms.or_else(0))
+
+
 class CostModel:
     """Costs of frames of one avatar's network on the chip `profile`. Raises BadInputError for an unknown profile."""
 
@@ -53,8 +63,8 @@ class CostModel:
         plan = Plan(self._described(shape or self._network.shape[1:3]), "dsp", PIPELINED)
         times = stage_times_ms(self._chip, plan, self._corners)
         if shape is None:
-            kept = [ms for (stage, _), ms in times.items() if stage in ALWAYS]
-            return FrameCost(0, 0.0, sum(kept), max(kept))
+            kept = {key: ms for key, ms in times.items() if key[0] in ALWAYS}
+            return FrameCost(0, 0.0, sum(kept.values()), least_frame_ms(self._chip, kept))
         steady_ms = steady(self._chip, plan, self._corners, quick=True).frame_ms
         return FrameCost(shape[0] * shape[1], plan.network.work.macs / 1e9, sum(times.values()), steady_ms)
 

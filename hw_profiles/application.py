@@ -35,7 +35,7 @@ PACKED_BYTES_PER_PIXEL = 16
 #: Frames of a simulated run: for shares of time, for a frame time alone, and where dropped frames vary the intervals.
 FRAMES, QUICK_FRAMES, FRAMES_WITH_DROPS = 192, 12, 480
 NS_PER_MS = 1_000_000
-MOST_FPS = 1000.0  # as of a scene
+LEAST_FPS, MOST_FPS = 1e-3, 1000.0  # as of a scene
 
 
 class Variant(NamedTuple):
@@ -78,10 +78,10 @@ class Plan:
             raise BadInputError("policy", repr(self.variant.policy), "one of " + ", ".join(POLICIES))
         if not 1 <= self.variant.batch <= 64:
             raise BadInputError("batch", str(self.variant.batch), "1 to 64")
-        if not 0 < self.variant.fps <= MOST_FPS:
-            raise BadInputError("fps", f"{self.variant.fps:g}", f"above 0, at most {MOST_FPS:g}")
-        if self.most_fps is not None and not 0 < self.most_fps <= MOST_FPS:
-            raise BadInputError("fps", f"{self.most_fps:g}", f"above 0, at most {MOST_FPS:g}")
+        if not LEAST_FPS <= self.variant.fps <= MOST_FPS:
+            raise BadInputError("fps", f"{self.variant.fps:g}", f"{LEAST_FPS:g} to {MOST_FPS:g}")
+        if self.most_fps is not None and not LEAST_FPS <= self.most_fps <= MOST_FPS:
+            raise BadInputError("fps", f"{self.most_fps:g}", f"{LEAST_FPS:g} to {MOST_FPS:g}")
         if not 0 <= self.gpu_share < 1 or (self.gpu_share and self.runtime == "gpu"):
             raise BadInputError("gpu-share", f"{self.gpu_share:g} on {self.runtime}", "0 to below 1, on the dsp")
 
@@ -246,7 +246,7 @@ def steady(profile: Profile, plan: Plan, corners: Corners, *, quick: bool = Fals
     `twice`: whether to compute the shares of time a second time.
     """
     times = stage_times_ms(profile, plan, corners)
-    worker = _workers(profile)
+    worker = workers_of(profile)
     rounded = tuple((name, worker[unit], round(ms * NS_PER_MS)) for (name, unit), ms in times.items())
     batch, display = (
         plan.variant.batch,
@@ -268,7 +268,7 @@ def steady(profile: Profile, plan: Plan, corners: Corners, *, quick: bool = Fals
     )
 
 
-def _workers(profile: Profile) -> dict[UnitName, UnitName]:
+def workers_of(profile: Profile) -> dict[UnitName, UnitName]:
     """The unit under whose name the scheduler sees each: of units on one core, the first, since one works at a time."""
     first: dict[str, UnitName] = {}
     return {unit: first.setdefault(profile.units[unit].core or unit, unit) for unit in UNITS}
@@ -282,7 +282,7 @@ def _shares(
 ) -> tuple[float, dict[str, float]]:
     """Busy share of `unit` and shares of its idle time by cause.
 
-    `worker`: of each unit, `_workers`.
+    `worker`: of each unit, `workers_of`.
     `times`: of a job of each stage and unit.
     `units`: what the simulated run says of each worker. Those behind one worker divide its busy time as their jobs do.
     """

@@ -35,10 +35,16 @@ Examples:
   trilane explain closeup --profile snapdragon-888 --json
 """
 MOST_ROWS = 24
+READ_SO = (
+    "density: tensor pixels for one pixel of the picture, along a side; bound: the largest of these frames; measured: "
+    "in the first of them"
+)
+
+RECTANGLES = "in blue how far each reaches with its clothes, in orange what the tensor shows"
 
 ChipOption = Annotated[str, typer.Option("--profile", help=f"{PROFILE_HELP} Its times are those that are saved.")]
 FramesOption = Annotated[int | None, typer.Option(min=1, help="How many frames to look at; the scene's if none.")]
-PictureOption = Annotated[Path | None, typer.Option(help="Draw bodies, their rectangles and the tensor's here (.png).")]
+PictureOption = Annotated[Path | None, typer.Option(help=f"Draw bodies, {RECTANGLES}, here (.png).")]
 CapOption = Annotated[PerformanceProfile, PerformanceProfileOption]
 
 
@@ -56,17 +62,22 @@ def explain(
     """Explain the plan of a scene: what is modelled, what is left out, the error it costs and the work it saves."""
     from trilane.apps.explanation import explain as explained
     from trilane.apps.plan_picture import draw_plan
+    from trilane.errors import BadInputError
     from trilane.stages.configure import Request, configure
     from trilane.writing import require_writable
 
     if picture is not None:
+        if picture.suffix.lower() not in (".png", ""):
+            raise BadInputError("--picture", f"'{picture}'", "a name that ends in .png")
         require_writable(picture)
     with spinner("planning"):
         checked = configure(Request(scene, avatar=avatar, frames=frames, size=size), Path.cwd())
         explanation = explained(checked, profile, str(performance_profile))
+    for note in checked.notes:
+        stderr_console().print(note, soft_wrap=True, markup=False)
     if picture is not None:
         draw_plan(explanation.plan, explanation.first_frames, picture)
-        stderr_console().print(f"picture: {picture}", soft_wrap=True, markup=False)
+        stderr_console().print(f"picture: {picture}\nin the picture: {RECTANGLES}", soft_wrap=True, markup=False)
     if json:
         print_json(explanation.document)
         return
@@ -89,7 +100,9 @@ def _show(document: dict[str, Any]) -> None:
     left = len(document["phases"]) - MOST_ROWS
     if left > 0:
         console.print(f"{left} more phases: --json has all of them")
-    for why, first in {phase["why"]: phase["first_frame"] for phase in reversed(document["phases"])}.items():
+    console.print(READ_SO, soft_wrap=True)
+    firsts = {phase["why"]: phase["first_frame"] for phase in reversed(document["phases"])}
+    for why, first in sorted(firsts.items(), key=lambda one: one[1]):
         console.print(f"frame {first} and others like it: {why}", soft_wrap=True)
     console.print(f"placement: {document['placement']['why']}", soft_wrap=True, markup=False)
     for line in _totals(document["totals"], config):
@@ -127,7 +140,7 @@ def _modelled(rows: list[dict[str, Any]]) -> str:
         own = [row for row in rows if row["modelled"] == modelled]
         known = [row["measured_px"] for row in own if row["measured_px"] is not None]
         measured = f"{max(known):.2f}" if known else "-"
-        names = ", ".join(str(row["avatar"]) for row in own)
+        names = ", ".join(row["name"] for row in own)
         lines.append(f"{names}: {modelled}, {max(row['bound_px'] for row in own):.2f} / {measured}")
     return "\n".join(lines)
 

@@ -6,7 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from trilane.apps.cli.explain import app
-from trilane.apps.plan_cost import ALWAYS, PIPELINED, CostModel
+from trilane.apps.plan_cost import ALWAYS, PIPELINED, CostModel, least_frame_ms
 from trilane.apps.plan_picture import BODY, MESH, TENSOR, draw_plan
 from trilane.apps.scene_plan import PlannedFrame, ScenePlan, phases
 from trilane.avatars.bundle import load_bundle
@@ -120,7 +120,7 @@ def test_a_phase_says_what_is_modelled_and_its_error(document: Any) -> None:
         )
     assert document["sources"] == {
         "bound_px": "proved bound, in pixels of the picture",
-        "measured_px": "measured in this run",
+        "measured_px": "measured in this run, at a phase's first frame",
         "pixels, gmac": "counted",
         "ms": "computed",
     }
@@ -144,6 +144,17 @@ def test_the_table_names_frames_tensors_and_totals(document: Any, tmp_path: Path
     assert f"{1 - totals['work_ms'] / totals['fixed_work_ms']:.0%} saved (computed by the profile {CHIP};" in text
 
 
+def test_the_table_names_avatars_reasons_in_order_and_how_to_read_it(checked: Checked, tmp_path: Path) -> None:
+    """The scene's notes are on stderr, as those of a run, so that nothing that was decided is silent."""
+    result = explained(tmp_path)
+    assert "avatar1: " in result.stdout
+    assert "density: tensor pixels for one pixel of the picture, along a side; bound: the largest" in result.stdout
+    firsts = [int(line.split()[1]) for line in result.stdout.splitlines() if "and others like it" in line]
+    assert firsts and firsts == sorted(firsts)
+    told = [note for note in checked.notes if not note.startswith(("runtime", "skinning"))]
+    assert told and all(note in result.stderr and note not in result.stdout for note in told)
+
+
 def test_costs_are_those_of_the_profile(tiny_bundle: Path) -> None:
     """As `trilane predict` computes them; a frame with nobody in view needs neither raster nor network."""
     network, chip = load_bundle(tiny_bundle).read_network(), load_profile(CHIP)
@@ -158,7 +169,30 @@ def test_costs_are_those_of_the_profile(tiny_bundle: Path) -> None:
     nothing = costs.of(None)
     assert (nothing.pixels, nothing.gmac) == (0, 0.0)
     assert nothing.work_ms == pytest.approx(times["pose"] + times["composite"] + times["present"])
+    assert nothing.frame_ms == chip.application.display_ms.or_else(0) == 16.6
     assert set(ALWAYS) == {"pose", "composite", "present"}
+
+
+def test_a_frame_without_network_takes_as_long_as_its_busiest_core() -> None:
+    """No display: pose and present follow each other on the CPU; on one core all three stages do."""
+    times: Any = {("pose", "cpu"): 2.0, ("composite", "gpu"): 3.0, ("present", "cpu"): 1.5}
+
+    def chip(display: float, **cores: str) -> Any:
+        units = {unit: SimpleNamespace(core=cores.get(unit)) for unit in ("cpu", "gpu", "dsp")}
+        return SimpleNamespace(units=units, application=SimpleNamespace(display_ms=Known(display)))
+
+    assert least_frame_ms(chip(0.0), times) == 3.5
+    assert least_frame_ms(chip(0.0, cpu="a", gpu="a"), times) == 6.5
+    assert least_frame_ms(chip(16.6), times) == 16.6
+
+
+class Known(NamedTuple):
+    """A cost that a profile has."""
+
+    value: float
+
+    def or_else(self, _other: float) -> float:
+        return self.value
 
 
 def test_a_chips_units_are_hardware_of_their_own(document: Any) -> None:
@@ -272,6 +306,7 @@ def test_a_sheet_has_at_most_nine_frames(checked: Checked, tmp_path: Path) -> No
         (["--frames", "0"], "--frames"),
         (["--size", "300"], "a multiple of 32"),
         (["--picture", "/nowhere/at/all.png"], "/nowhere"),
+        (["--picture", "plan.jpg"], "--picture: found 'plan.jpg', expected a name that ends in .png"),
     ],
 )
 def test_wrong_options_are_named(checked: Checked, tmp_path: Path, options: list[str], words: str) -> None:  # noqa: ARG001

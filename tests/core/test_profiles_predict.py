@@ -328,3 +328,10 @@ def test_this_machine_in_virtual_time_is_placed_as_its_times_ask(count: int, mon
 
 def test_a_chip_with_units_of_its_own_has_no_placement() -> None:
     assert "placement" not in predict(load_profile("snapdragon-888"), Plan(NETWORK, "dsp"))
+
+
+@pytest.mark.parametrize("fps", [0.0, 1e-300, 0.0009, 1001.0, float("nan")])
+def test_a_rate_whose_period_is_no_number_of_nanoseconds_is_refused(fps: float) -> None:
+    with pytest.raises(BadInputError, match=r"^fps: found .*, expected 0\.001 to 1000$"):
+        Plan(NETWORK, "dsp", Variant(fps=fps))
+    assert Plan(NETWORK, "dsp", Variant(fps=0.001)).variant.fps == 0.001
