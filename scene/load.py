@@ -28,6 +28,9 @@ EXPECTED = {
     "too_long": "at most {max_length} of them",
     "model_type": "a table",
     "tuple_type": "a list",
+    "string_type": "text in quotes",
+    "string_too_short": "at least one character",
+    "int_from_float": "a whole number",
     "string_pattern_mismatch": "letters, digits, spaces, dots, hyphens and underscores",
 }
 #: Key of the scene -> why it cannot be what it was, where the range alone does not tell.
@@ -59,7 +62,7 @@ def _remedy(first: Mapping[str, Any]) -> str:
     """How to mend a value, of one of the `errors()` of a scene; empty when what was expected says all."""
     if first["type"] == "literal_error":
         return did_you_mean(str(first["input"]), _choices(first["loc"]))
-    return REASONS.get(".".join(map(str, first["loc"])), "")
+    return REASONS.get(".".join(map(str, first["loc"])), "") if first["type"] == "greater_than" else ""
 
 
 def _keys_beside(loc: tuple[int | str, ...]) -> list[str]:

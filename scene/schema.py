@@ -15,6 +15,7 @@ from trilane.unexpected_value import UnexpectedValue
 
 MAX_DEPTH_RATIO = 1e6  # of far to near clip plane; beyond it a depth buffer of 24 bits is too coarse
 AUTO = "auto"  # size of a tensor that is planned
+LEAST_FPS = 1e-3  # far below that a period in nanoseconds is no number any more
 FARTHEST_M = 1e4  # of an avatar from the scene's origin; there float32 still resolves millimetres
 
 NAME = r"^[\w .-]+$"
@@ -100,7 +101,12 @@ class PlaneSpec(Model):
 
 
 def _scene_size(size: str) -> str:
-    return size if size == AUTO else checked_size(size)
+    if size == AUTO:
+        return size
+    try:
+        return checked_size(size)
+    except UnexpectedValue as error:
+        raise UnexpectedValue(error.found, f"{error.expected}, or {AUTO}") from None
 
 
 class Scene(Model):
@@ -116,7 +122,7 @@ class Scene(Model):
     """
 
     name: str = Field(default="scene", min_length=1, max_length=80, pattern=NAME)
-    fps: float = Field(default=30.0, gt=0, le=1000, allow_inf_nan=False)
+    fps: float = Field(default=30.0, ge=LEAST_FPS, le=1000, allow_inf_nan=False)
     frames: int = Field(default=300, ge=1, le=10_000_000)
     size: Annotated[str, AfterValidator(_scene_size)] = "256"
     background: str = "room"

@@ -161,7 +161,7 @@ def configure(request: Request, out_dir: Path, gl: GlFacts = gl_facts) -> Checke
         cuts=cuts,
     )
     notes = (*staged.notes, f"runtime: {runtime} ({reason})", f"skinning: {unit} unit ({why})")
-    notes += (foreseen.note,) if foreseen else ()
+    notes += foreseen.notes(scene.memory_mb) if foreseen else ()
     drawn = DrawnAs(runtime, scene.size, scene.texture_filter, len(scene.avatars))
     accuracy = _accuracy(list(avatars.values()), drawn)
     return Checked(config, pack_assets(list(avatars.values()), staged), notes, accuracy, asked)

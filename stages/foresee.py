@@ -48,6 +48,16 @@ class Foreseen:
             text += f"; {self.shapes.unserved} of them have no shape of their own within memory_mb and are less dense"
         return text
 
+    def notes(self, memory_mb: int) -> tuple[str, ...]:
+        """`note`, and whether the networks' memory, computed, is more than `memory_mb`."""
+        needed = math.ceil(self.shapes.memory_bytes / MB)
+        if needed <= memory_mb:
+            return (self.note,)
+        return (
+            self.note,
+            f"memory: the network may take {needed} MB, more than memory_mb {memory_mb}: one is always ready",
+        )
+
 
 def foresee(
     scene: Scene, staged: Staged, bodies: Sequence[ShapedBody], network: NetworkFile, budget: TensorBudget

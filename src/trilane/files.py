@@ -43,14 +43,19 @@ def require_file(path: Path, expected: str) -> int:
     """Size of a regular, non-empty file in bytes. Raises BadInputError."""
     try:
         if not path.is_file():
-            found = "a folder" if path.is_dir() else "no such file"
-            raise BadInputError(path, found, expected)
+            raise BadInputError(path, _instead_of_file(path), expected)
         size = path.stat().st_size
     except (OSError, ValueError) as error:
         raise BadInputError(path, f"a file that cannot be read ({reason(error)})", expected) from error
     if size == 0:
         raise BadInputError(path, "an empty file", expected)
     return size
+
+
+def _instead_of_file(path: Path) -> str:
+    if path.is_dir():
+        return "a folder"
+    return "a device, a pipe or a socket" if path.exists() else "no such file"
 
 
 def read_text(path: Path, expected: str) -> str:

@@ -45,7 +45,7 @@ def test_what_is_no_file(tmp_path: Path) -> None:
     )
     os.mkfifo(tmp_path / "pipe")
     pipe = tmp_path / "pipe"
-    assert said(lambda: require_file(pipe, WANTED)) == f"{pipe}: found no such file, expected {WANTED}"
+    assert said(lambda: require_file(pipe, WANTED)) == f"{pipe}: found a device, a pipe or a socket, expected {WANTED}"
 
 
 def test_sizes_of_files(tmp_path: Path) -> None:

@@ -95,6 +95,15 @@ def test_the_note_says_shapes_frames_and_what_is_less_dense() -> None:
     assert less == f"{text}; 4 of them have no shape of their own within memory_mb and are less dense"
 
 
+def test_a_network_that_takes_more_than_the_limit_is_told_of() -> None:
+    found = Foreseen(ShapeSet(((64, 96),), 2_000_001, 0), (0,), 1)
+    assert found.notes(3) == (found.note,)
+    assert found.notes(2) == (
+        found.note,
+        "memory: the network may take 3 MB, more than memory_mb 2: one is always ready",
+    )
+
+
 def test_a_configuration_has_the_shapes_the_note_and_the_networks_pixels(tiny_bundle: Path, tmp_path: Path) -> None:
     asked = Request("default", avatar=str(tiny_bundle), frames=30, runtime="ort", size="auto")
     planned = configure(asked, tmp_path, lambda: {"hardware": False})

@@ -12,7 +12,11 @@ from trilane.scene.schema import Scene
 
 WRONG = {
     "size = '100'": ("size", "found side 100", "a multiple of 32"),
-    "size = 'wide'": ("size", "found 'wide'", "HEIGHTxWIDTH"),
+    "size = 'wide'": ("size", "found 'wide'", "expected HEIGHTxWIDTH such as 256x256, or auto"),
+    "size = 256": ("size", "found 256", "expected text in quotes"),
+    "name = ''": ("name", "found ''", "expected at least one character"),
+    "memory_mb = 1.5": ("memory_mb", "found 1.5", "expected a whole number"),
+    "[camera]\nfov = 30": ("camera.fov", "an unknown key", "did you mean 'fov_y_deg'?"),
     "frames = 0": ("frames", "found 0", "greater than or equal to 1"),
     "fps = nan": ("fps", "found nan", "a finite number"),
     "colour = 1": ("colour", "an unknown key", "a key of the scene schema"),
@@ -44,6 +48,16 @@ def test_what_is_wrong_is_named_by_file_and_key(tmp_path: Path, text: str) -> No
     assert "\n" not in str(raised.value)
     for part in parts:
         assert part in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("budget", "said"), [("0", "greater than 0; numbers are rounded"), ("inf", "a finite number"), ("101", "to 100")]
+)
+def test_why_there_is_no_budget_of_nothing_is_said_of_nothing_else(tmp_path: Path, budget: str, said: str) -> None:
+    with pytest.raises(BadInputError) as raised:
+        load_scene(write(tmp_path, f"error_budget_px = {budget}"))
+    assert said in str(raised.value)
+    assert ("rounded" in str(raised.value)) is (budget == "0")
 
 
 @pytest.mark.parametrize(("content", "part"), [(b"", "an empty file"), (b"\xff\xfe\x00", "cannot be read as text")])

@@ -61,7 +61,7 @@ LIMITS: list[tuple[type, str, list[Any], list[Any]]] = [
     (PlaneSpec, "centre", [(1e9, 0, 0)], [(0, 0, math.inf), (0, 0)]),
     (PlaneSpec, "normal", [(0, 0, 1.1e-6), (0, 0, 0.9e6)], [(0, 0, 1e-6), (0, 0, 1e6), (0, 0, 0), (0, math.nan, 0)]),
     (Scene, "name", ["x" * 80, "a b.c-d_e"], ["", "x" * 81, "a/b", "a\n"]),
-    (Scene, "fps", [0.01, 1000], [0, 1001, math.nan]),
+    (Scene, "fps", [0.001, 1000], [0, 1e-300, 0.0009, 1001, math.nan]),
     (Scene, "frames", [1, 10_000_000], [0, 10_000_001]),
     (Scene, "size", ["32", "64x96"], ["33", "64x95"]),
     (Scene, "planes", [({},) * 32], [({},) * 33]),
