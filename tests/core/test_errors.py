@@ -109,7 +109,10 @@ def test_pydantic_hands_the_error_on_as_it_was_raised(value: Any) -> None:
 
 
 SCENES: dict[str, tuple[dict[str, Any], str]] = {
-    "a validator's own": ({"size": "100"}, "s: size: found side 100, expected a multiple of 32 from 32 to 4096, or auto"),
+    "a validator's own": (
+        {"size": "100"},
+        "s: size: found side 100, expected a multiple of 32 from 32 to 4096, or auto",
+    ),
     "of two keys": (
         {"camera": {"near_m": 2, "far_m": 1}},
         "s: camera: found near_m 2 and far_m 1, expected near_m below far_m and far_m at most 1e+06 times near_m",
