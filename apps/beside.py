@@ -13,7 +13,7 @@ from typing import NamedTuple
 from trilane.apps.scene_plan import ScenePlan
 from trilane.avatars.network_reshape import reshaped
 from trilane.errors import BadInputError
-from trilane.hw_profiles.application import MOST_FPS, RUNTIMES, Variant
+from trilane.hw_profiles.application import LEAST_FPS, MOST_FPS, RUNTIMES, Variant
 from trilane.hw_profiles.beside import MOST_TENANTS, NEWEST, SKIPS, Tenant
 from trilane.hw_profiles.graph_file import read_graph
 from trilane.hw_profiles.network_work import Network, count_work
@@ -60,8 +60,8 @@ def _where(text: str) -> str:
 
 
 def _rate(text: str, number: str) -> float:
-    if not re.fullmatch(r"\d+(\.\d+)?", number) or not 0 < float(number) <= MOST_FPS:
-        expected = f"frames a second, above 0, at most {MOST_FPS:g}"
+    if not re.fullmatch(r"\d+(\.\d+)?", number) or not LEAST_FPS <= float(number) <= MOST_FPS:
+        expected = f"frames a second, {LEAST_FPS:g} to {MOST_FPS:g}"
         raise BadInputError(_where(text), f"rate {number!r}", expected, "such as @30")
     return float(number)
 

@@ -19,7 +19,15 @@ from functools import cache
 from typing import Any, NamedTuple
 
 from trilane.errors import BadInputError
-from trilane.hw_profiles.application import MOST_FPS, RUNTIMES, Plan, Variant, application_graph, stage_times_ms
+from trilane.hw_profiles.application import (
+    LEAST_FPS,
+    MOST_FPS,
+    RUNTIMES,
+    Plan,
+    Variant,
+    application_graph,
+    stage_times_ms,
+)
 from trilane.hw_profiles.network_work import Network
 from trilane.hw_profiles.performance_profiles import Corners
 from trilane.hw_profiles.schema import Profile, Unit
@@ -66,8 +74,8 @@ class Tenant:
     def __post_init__(self) -> None:
         if self.unit not in RUNTIMES:
             raise BadInputError(f"{self.name}: unit", repr(self.unit), " or ".join(RUNTIMES))
-        if not 0 < self.fps <= MOST_FPS:
-            raise BadInputError(f"{self.name}: rate", f"{self.fps:g}", f"above 0, at most {MOST_FPS:g} frames a second")
+        if not LEAST_FPS <= self.fps <= MOST_FPS:
+            raise BadInputError(f"{self.name}: rate", f"{self.fps:g}", f"{LEAST_FPS:g} to {MOST_FPS:g} frames a second")
 
     @property
     def graph(self) -> Graph:

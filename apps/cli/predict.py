@@ -206,11 +206,11 @@ def _check_application(application: bool, networks: int) -> None:
 
 
 def _wanted(fps: float | None, power_limit_w: float | None) -> Wanted:
-    from trilane.hw_profiles.application import MOST_FPS
+    from trilane.hw_profiles.application import LEAST_FPS, MOST_FPS
     from trilane.hw_profiles.rates import Wanted
 
-    if fps is not None and not 0 < fps <= MOST_FPS:
-        raise BadInputError("--fps", f"{fps:g}", f"above 0, at most {MOST_FPS:g}")
+    if fps is not None and not LEAST_FPS <= fps <= MOST_FPS:
+        raise BadInputError("--fps", f"{fps:g}", f"{LEAST_FPS:g} to {MOST_FPS:g}")
     if power_limit_w is not None and not 0 < power_limit_w < float("inf"):
         raise BadInputError("--power-limit-w", f"{power_limit_w:g}", "watts above 0")
     return Wanted(fps, power_limit_w)

@@ -136,7 +136,7 @@ REFUSED = {
         "options: found --application with 0 networks, expected one --network; "
         "it says that the application runs the network of the file"
     ),
-    ("--fps", "0"): "--fps: found 0, expected above 0, at most 1000",
+    ("--fps", "0"): "--fps: found 0, expected 0.001 to 1000",
     ("--power-limit-w", "-1"): "--power-limit-w: found -1, expected watts above 0",
     ("--precision", "int4"): "--precision: found 'int4', expected w8a8 (int8), float (fp16) or fp32",
     ("--input-shape", "image=1"): (
