@@ -44,7 +44,7 @@ MOST_TENANTS = 8
 #: Of the bandwidth, what others can take at most: something is always left.
 MOST_USE = 0.95
 #: Virtual seconds of a run, at least; and so many frames of the slowest tenant.
-SECONDS, LEAST_FRAMES, MOST_SECONDS = 10.0, 64, 600.0
+LEAST_S, LEAST_FRAMES, MOST_S = 10.0, 64, 600.0
 #: How frames are taken if nothing else is asked for: the newest counts, as of a camera; a staler one is dropped.
 NEWEST = Variant("latest", "double")
 NS_PER_MS, NS_PER_S = 1_000_000, 1_000_000_000
@@ -160,7 +160,7 @@ def _seconds(tenants: Sequence[Tenant], costs: _Costs) -> float:
     slowest = max(
         max(1 / tenant.fps, sum(means.values()) / 1e3) for tenant, means in zip(tenants, costs.mean_ms, strict=True)
     )
-    return min(max(SECONDS, LEAST_FRAMES * slowest), MOST_SECONDS)
+    return min(max(LEAST_S, LEAST_FRAMES * slowest), MOST_S)
 
 
 class _Job(NamedTuple):
