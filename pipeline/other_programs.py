@@ -20,9 +20,9 @@ class OtherPrograms:
         self._begin_s, self._before_s = time.monotonic(), self._others_s()
 
     def share(self) -> float:
-        """Theirs of the time of the cores; known to some percent of a second, for the kernel counts steps of 10 ms."""
-        took_s = max(time.monotonic() - self._begin_s, 1e-9)
-        return max(self._others_s() - self._before_s, 0.0) / (took_s * len(self._cores))
+        """Theirs of the time of the cores, at most 1; counted in steps of 10 ms, so under 0.1 s it says little."""
+        had_s = max(time.monotonic() - self._begin_s, 1e-9) * len(self._cores)
+        return min(max(self._others_s() - self._before_s, 0.0) / had_s, 1.0)
 
     def _others_s(self) -> float:
         own = [process.cpu_times() for process in self._processes]

@@ -137,7 +137,7 @@ def _reason(facts: Mapping[str, Any]) -> str:
             others.insert(0, (facts["rule"], facts["rule_ms"]))
     else:
         return str(facts["why"])
-    text = f"{facts['why']}: {frame_ms:.1f} ms by times of {facts['measured_at']}"
+    text = f"{frame_ms:.1f} ms, {facts['why']}; by times of {facts['measured_at']}"
     rest = [f"{described(placement_of(units))}: {ms:.1f}" for units, ms in others if units != facts["units"]]
     return "; ".join([text, *rest])
 

@@ -12,8 +12,10 @@ import pytest
 
 from trilane.bench import placement, planner
 from trilane.errors import BadInputError, TrilaneError
+from trilane.pipeline.trial import Round
 from trilane.scheduler.placement import Ranked
 from trilane.scheduler.places import Core, Place, Work
+from trilane.stages.choosing import Choice
 from trilane.stages.configure import Request
 from trilane.stages.factories import PRELOAD
 
@@ -26,35 +28,52 @@ def name_of(where: Any) -> str:
     return {str(each["dsp"]): name for each, name in zip((A, B, C, RULE), NAMES, strict=True)}[str(where["dsp"])]
 
 
+#: Of each placement the times in the round in which all are tried, then in the further ones, in ms.
+TOLD = {"A": [10.0, 10.0, 14.0], "B": [13.0, 8.0, 20.0], "C": [12.0, 12.0, 12.0], "RULE": [20.0, 30.0, 21.0]}
+#: Of each whole run: frame time in ms, core efficiency, efficiency.
+RUNS = {"A": [(11.0, None, 0.4), (13.0, 0.1, 0.6)], "RULE": [(25.0, 0.2, 0.5), (27.0, 0.4, 0.5)]}
+
+
 @pytest.fixture
 def trial(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Two rounds of runs: of each placement the time in the round in which all are tried, then in the others, in ms."""
-    told = {"A": [10.0, 10.0, 14.0], "B": [13.0, 8.0, 20.0], "C": [12.0, 12.0, 12.0], "RULE": [20.0, 30.0, 21.0]}
-    runs: list[tuple[str, int]] = []
+    """What was tried and run, by name, in `asked`."""
+    asked: list[Any] = []
+    others = iter([0.9, 0.1, 0.3])
 
-    def run(_self: Any, where: Any, isolated: int) -> Any:
-        runs.append((name_of(where), isolated))
-        frame_ms = told[name_of(where)][[name for name, _ in runs].count(name_of(where)) - 1]
-        efficiency = None if name_of(where) == "A" and frame_ms == 14 else frame_ms / 100
-        return SimpleNamespace(frame_time_ms=SimpleNamespace(mean=frame_ms), core_efficiency=efficiency)
+    def tried(_checked: Any, placements: Any, rounds: int, _starter: Any) -> list[Round]:
+        names = [name_of(where) for where in placements]
+        first = 0 if not asked else 1
+        asked.append((names, rounds))
+        return [
+            Round(tuple(1e6 * TOLD[name][first + number] for name in names), next(others)) for number in range(rounds)
+        ]
+
+    def run(_self: Any, where: Any) -> Any:
+        asked.append(name_of(where))
+        frame_ms, core_efficiency, efficiency = RUNS[name_of(where)][asked.count(name_of(where)) - 1]
+        mean = SimpleNamespace(mean=frame_ms)
+        return SimpleNamespace(frame_time_ms=mean, core_efficiency=core_efficiency, efficiency=efficiency)
 
     found = [Ranked(each, ms * 1_000_000) for each, ms in ((A, 9), (B, 10), (C, 11))]
     monkeypatch.setattr(placement, "rule_placement", lambda cores: RULE if cores == (0, 1) else {})
     monkeypatch.setattr(placement, "measured_times", lambda *_: {"cpu": {1: Work(2_000_000, 1_500_000)}})
     monkeypatch.setattr(placement, "ranked", lambda *_: list(found))
     monkeypatch.setattr(placement, "frame_ns", lambda *_: 15_000_000)
-    monkeypatch.setattr(placement, "chosen", lambda ranking, rule: ranking[0])  # noqa: ARG005
+    monkeypatch.setattr(placement, "worth_trying", lambda ranking, rule: [ranking[1], ranking[0], rule])
+    monkeypatch.setattr(placement, "choice", lambda _checked, cores, *_: Choice(1, f"told of {cores}"))
+    monkeypatch.setattr(placement, "tried", tried)
+    monkeypatch.setattr(placement, "time", SimpleNamespace(monotonic=iter([5.0, 7.5]).__next__))
     monkeypatch.setattr(placement._Trial, "_run", run)
     made = placement._Trial(None, [Core(0, 0), Core(1, 1)], None)  # type: ignore[arg-type]
-    return SimpleNamespace(made=made, runs=runs)
+    return SimpleNamespace(made=made, asked=asked)
 
 
 def test_the_chosen_placement_is_set_against_the_best_other_and_the_rules(trial: Any) -> None:
     """Tried: A 10, B 13, C 12, the rule's 20. A and the rule's are always in, and one more, the fastest of the others:
-    C, 12 and 12 in two rounds; A 10 and 14, so 10/12 and 14/12 of the best other; the rule's 30 and 21: 3 and 1.5."""
-    trial.made.run(2, 1)
-    first = [("A", 0), ("B", 0), ("C", 0), ("RULE", 0)]
-    assert trial.runs == [*first, *([("A", 2), ("RULE", 2), ("C", 2)] * 2)]
+    C, 12 and 12 in two rounds; A 10 and 14, so 10/12 and 14/12 of the best other; the rule's 30 and 21: 3 and 1.5.
+    Predicted 9, 10, 11 and 15: ranks 1 2 3 4 beside 1 3 2 4."""
+    trial.made.run(1, 1, 2, 2)
+    assert trial.asked == [(["A", "B", "C", "RULE"], 1), (["A", "RULE", "C"], 2), "A", "RULE", "A", "RULE"]
     keys = ("predicted_ms", "tried_ms", "frame_ms", "is_chosen", "is_rule")
     assert [tuple(row[key] for key in keys) for row in trial.made.rows()] == [
         (9.0, 10.0, 12.0, True, False),
@@ -65,6 +84,7 @@ def test_the_chosen_placement_is_set_against_the_best_other_and_the_rules(trial:
     assert [row["placement"] for row in trial.made.rows()] == [f"cpu 0, gpu 1, {dsp}" for dsp in NAMES.values()]
     assert trial.made.summary() == {
         "chosen": "cpu 0, gpu 1, dsp 0",
+        "how": "told of [0, 1]",
         "best": "cpu 0, gpu 1, dsp 0",  # as fast as C, and chosen
         "rule": "cpu 0, gpu 1, dsp 0,1 (2 threads)",
         "chosen_over_best": pytest.approx(1.0),
@@ -73,17 +93,26 @@ def test_the_chosen_placement_is_set_against_the_best_other_and_the_rules(trial:
         "rule_over_chosen": pytest.approx(2.25),
         "rule_low": 1.5,
         "rule_high": 3.0,
-        "core_efficiency": pytest.approx(0.05),  # 0.1, and nothing
-        "rule_core_efficiency": pytest.approx(0.255),
-        "times": [{"unit": "cpu", "threads": 1, "ms": 2.0, "core_ms": 1.5}],
+        "rank_correlation": pytest.approx(1 - 6 * 2 / (4 * 15)),
+        "predicted_over_tried": pytest.approx((10 / 13 + 9 / 10) / 2),
+        "predicted_least": 15 / 20,
+        "predicted_largest": pytest.approx(11 / 12),
+        "others": pytest.approx(0.2),
+        "run_ms": 12.0,
+        "rule_run_ms": 26.0,
+        "core_efficiency": pytest.approx(0.05),  # nothing, and 0.1
+        "efficiency": pytest.approx(0.5),
+        "rule_core_efficiency": pytest.approx(0.3),
+        "took_s": 2.5,
     }
+    assert trial.made.times() == [{"unit": "cpu", "threads": 1, "ms": 2.0, "core_ms": 1.5}]
 
 
 def test_the_best_of_the_further_rounds_may_be_another(trial: Any) -> None:
     """With two finalists B is in: 8 and 20, a median of 14, so C is the best of all and the rival."""
-    trial.made.run(2, 2)
-    assert [name for name, _ in trial.runs[4:8]] == ["A", "RULE", "C", "B"]
-    trial.made._runs[0][0].frame_time_ms.mean = 16.0
+    trial.made.run(1, 2, 2, 1)
+    assert trial.asked[1] == (["A", "RULE", "C", "B"], 2)
+    trial.made._further[0][0] = 16.0
     found = trial.made.summary()
     assert (found["best"], found["chosen_over_best"]) == ("cpu 0, gpu 1, dsp 0,1 (1 thread)", pytest.approx(15 / 12))
 
@@ -107,13 +136,13 @@ def test_a_run_that_shows_too_few_frames_ends_the_bench(monkeypatch: pytest.Monk
     trial._checked = SimpleNamespace(changed=lambda **new: SimpleNamespace(config=new, assets="assets"))  # type: ignore[assignment]
     trial._starter = "starter"  # type: ignore[assignment]
     with pytest.raises(KeyboardInterrupt):
-        trial._run(A, 2)
+        trial._run(A)
     with pytest.raises(TrilaneError, match=r"^cpu 0, gpu 1, dsp 0: no driver$"):
-        trial._run(A, 2)
+        trial._run(A)
     with pytest.raises(TrilaneError, match=r"^cpu 0, gpu 1, dsp 0: 19 frames were presented$"):
-        trial._run(A, 2)
-    assert trial._run(A, 2) == 7
-    options = {"policy": "pipelined", "edge": "double", "isolated_frames": 2, "starter": "starter"}
+        trial._run(A)
+    assert trial._run(A) == 7
+    options = {"policy": "pipelined", "edge": "double", "isolated_frames": 4, "starter": "starter"}
     assert asked == [({"of": A}, "assets", options)] * 4
 
 
@@ -122,12 +151,11 @@ def test_a_run_that_shows_too_few_frames_ends_the_bench(monkeypatch: pytest.Monk
     [
         ({"cores": (3,)}, r"--cores: found \[3\], expected numbers from 1 to the 2 that this process may use"),
         ({"cores": (1, -1)}, r"--cores: found \[1, -1\], "),
-        (
-            {"frames": 19},
-            "bench placement: found --frames 19, --rounds 6, --finalists 2",
-        ),
-        ({"rounds": 0}, "bench placement: found --frames 48, --rounds 0, --finalists 2"),
-        ({"finalists": 0}, "bench placement: found --frames 48, --rounds 6, --finalists 0"),
+        ({"frames": 19}, "bench placement: found --frames 19, --rounds 6, --finalists 3, --further 24, --runs 4"),
+        ({"rounds": 0}, "bench placement: found --frames 96, --rounds 0, "),
+        ({"finalists": 0}, "bench placement: found --frames 96, --rounds 6, --finalists 0"),
+        ({"further": 0}, "bench placement: found --frames 96, --rounds 6, --finalists 3, --further 0"),
+        ({"runs": 0}, "bench placement: found .* --runs 0, expected at least 20, and 1 of each other"),
     ],
 )
 def test_what_cannot_be_placed_is_refused(asked: dict[str, Any], words: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -153,24 +181,31 @@ def test_every_size_is_placed_on_every_number_of_cores(monkeypatch: pytest.Monke
         def summary(self) -> Any:
             return {"summary": len(asked)}
 
+        def times(self) -> list[Any]:
+            return [{"times": len(asked)}]
+
     monkeypatch.setattr(placement, "usable_cores", lambda: (4, 6))
     monkeypatch.setattr(placement, "host_cores", lambda numbers: ("cores", numbers))
     monkeypatch.setattr(placement, "UnitStarter", lambda preload: nullcontext(preload))
     monkeypatch.setattr(placement, "configure", lambda request, _folder: request)
     monkeypatch.setattr(placement, "_Trial", Trial)
     monkeypatch.setattr(placement, "_virtual", lambda checked, avatar, count: {"of": (checked.size, avatar, count)})
-    found = placement.measure("a", ("32x32", "64x64"), (1, 0), frames=20, rounds=3, finalists=1, runtime="ort")
+    found = placement.measure(
+        "a", ("32x32", "64x64"), (1, 0), frames=20, rounds=3, finalists=1, further=5, runs=2, runtime="ort"
+    )
     requests = [Request(size=size, avatar="a", frames=20, runtime="ort") for size in ("32x32", "64x64")]
     trials = [(request, ("cores", cores), PRELOAD) for request in requests for cores in ((4,), (4, 6))]
-    assert asked == [part for trial in trials for part in (trial, (3, 1))]
+    assert asked == [part for trial in trials for part in (trial, (3, 1, 5, 2))]
     named = [{"size": size, "cores": count} for size in ("32x32", "64x64") for count in (1, 2)]
     assert found["rows"] == [{**name, "row": 2 * place} for place, name in enumerate(named, 1)]
     assert found["sizes"] == [{**name, "summary": 2 * place} for place, name in enumerate(named, 1)]
+    assert found["times"] == [{**name, "times": 2 * place} for place, name in enumerate(named, 1)]
     counts = (1, 2, 3, 4, 8)
     assert found["virtual"] == [
         {"size": size, "of": (size, "a", count)} for size in ("32x32", "64x64") for count in counts
     ]
-    assert found["config"] == {"avatar": "a", "frames": 20, "rounds": 3, "finalists": 1, "runtime": "ort"}
+    config = {"avatar": "a", "frames": 20, "rounds": 3, "finalists": 1, "further": 5, "runs": 2, "runtime": "ort"}
+    assert found["config"] == config
 
 
 class Scene:

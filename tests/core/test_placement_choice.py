@@ -120,6 +120,8 @@ def test_the_share_of_others_is_what_is_not_ours(tmp_path: Path, monkeypatch: py
     assert others.share() == pytest.approx(0.25)
     used[77] = 9.0
     assert others.share() == 0
+    used[77] = -9.0
+    assert others.share() == 1
 
 
 def test_ranks_that_agree_and_ranks_that_do_not() -> None:

@@ -154,6 +154,6 @@ def test_a_placement_is_explained_by_its_rivals(best: Any, found: list[Any], sai
     rule = next(each for each in listed if each.placement == RULE)
     facts = {"how": MEASURED, "why": "the least", "units": unit_rows(best), "measured_at": "noon"}
     facts |= predictions(Ranked(best, 3_500_000), rule, listed)
-    assert _reason(facts) == f"the least: 3.5 ms by times of noon{said}"
+    assert _reason(facts) == f"3.5 ms, the least; by times of noon{said}"
     assert _reason({"how": "rule", "why": "there is one core"}) == "there is one core"
     assert placement_of(unit_rows(RULE)) == RULE
