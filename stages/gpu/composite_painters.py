@@ -5,6 +5,7 @@ Rule: background bytes are copied unchanged, as sRGB; whatever is blended over t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import reduce
 from typing import Any
@@ -12,13 +13,16 @@ from typing import Any
 import moderngl
 import numpy as np
 
-from trilane.arrays import F32, U8, Floats
+from trilane.arrays import F32, U8, Floats, Mask
 from trilane.stages.gpu import opengl_calls
 from trilane.stages.gpu.builtin_room import Extent, room_mesh, room_textures
 from trilane.stages.gpu.camera_matrices import eye_of, target_clip
+from trilane.stages.gpu.picture_spans import BAND, WHOLE, spans
 from trilane.stages.gpu.shader_program import build_program
 
 MAX_TAPS = 8
+#: Pixels of the screen from which on less is drawn in the time that it takes to find what is transparent.
+WORTH_CUTTING_PX = 60_000
 HALF_TEXEL_INWARD = np.array([0.5, 0.5, -0.5, -0.5])
 UNDER_THE_FLOOR = (70, 66, 60)
 
@@ -113,11 +117,14 @@ class AvatarPainter:
         self._premultiply = build_program(ctx, "whole_screen.vert", "premultiply.frag")
         self._screen = ctx.vertex_array(self._premultiply, [])
         programs = [build_program(ctx, "avatar.vert", "avatar.frag", TAPS=taps) for taps in range(1, MAX_TAPS + 1)]
-        self._quads = [(program, ctx.vertex_array(program, [])) for program in programs]
+        self._parts = ctx.buffer(reserve=max(-(-height // BAND) for height, _ in shapes) * WHOLE.nbytes, dynamic=True)
+        self._quads = [(made, ctx.vertex_array(made, [(self._parts, "4f/i", "part")])) for made in programs]
+        self._shown: Mask = np.zeros((0, 0), np.bool_)
         self._pictures = {shape: self._picture(shape) for shape in shapes}
 
     def upload(self, shape: tuple[int, int], image: U8) -> None:
         """Write `image` (h * w * 4,) uint8, sRGB with straight alpha, to the GPU as the picture of `shape`."""
+        self._shown = image.reshape(*shape, 4)[:, :, 3] > 0
         straight, target, _ = self._pictures[shape]
         straight.write(image)
         target.use()
@@ -137,7 +144,14 @@ class AvatarPainter:
         """
         top, left, height, width = tensor_rect
         rows, columns = (rect[3] - rect[1]) / 2 * target.height, (rect[2] - rect[0]) / 2 * target.width
-        taps = int(np.clip(np.ceil(max(height / max(rows, 1e-6), width / max(columns, 1e-6)) - 0.25), 1, MAX_TAPS))
+        density = max(height / max(rows, 1e-6), width / max(columns, 1e-6))
+        taps = int(np.clip(np.ceil(density - 0.25), 1, MAX_TAPS))
+        parts = WHOLE
+        if rows * columns >= WORTH_CUTTING_PX:
+            parts = spans(self._shown[top : top + height, left : left + width], math.ceil(density / 2) + 1)
+        if not len(parts):
+            return
+        self._parts.write(parts)
         program, quad = self._quads[taps - 1]
         size = np.array([shape[1], shape[0]] * 2)
         edge = np.array([left, top, left + width, top + height])
@@ -149,7 +163,7 @@ class AvatarPainter:
         program["inside"].value = tuple((edge + HALF_TEXEL_INWARD) / size)
         self._pictures[shape][2].use(0)
         with opengl_calls.srgb_target():
-            quad.render(moderngl.TRIANGLE_STRIP, vertices=4)
+            quad.render(moderngl.TRIANGLE_STRIP, vertices=4, instances=len(parts))
 
     def _picture(self, shape: tuple[int, int]) -> tuple[Any, Any, Any]:
         straight = self._ctx.texture(shape[::-1], 4, internal_format=opengl_calls.SRGB8_ALPHA8)

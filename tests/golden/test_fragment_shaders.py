@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F64
 from trilane.bench.lib.float_raster import sample
+from trilane.stages.gpu.picture_spans import WHOLE
 from trilane.stages.gpu.shader_program import build_program
 
 #: Metres and shares of a few units, after some ten roundings of float32.
@@ -202,7 +203,8 @@ def test_the_avatars_picture_is_averaged_over_the_pixel(gl: Any, taps: int) -> N
     source, inside = np.array([0.08, 0.05, 0.83, 0.9]), np.array([0.15, 0.2, 0.8, 0.77])
     uniforms = {"picture": 0, "rect": (-1.0, -1.0, 1.0, 1.0), "source": tuple(source), "inside": tuple(inside)}
     strip = moderngl.TRIANGLE_STRIP
-    found = drawn(gl, "avatar.vert", "avatar.frag", shape, 4, uniforms, strip, TAPS=taps)
+    whole = [(gl.buffer(WHOLE.tobytes()), "4f/i", "part")]
+    found = drawn(gl, "avatar.vert", "avatar.frag", shape, 4, uniforms, strip, whole, TAPS=taps)
     column, row = centres(shape)
     size = (source[2:] - source[:2]) / shape[::-1]
     expected = np.zeros((*shape, 4))
