@@ -77,6 +77,16 @@ def test_where_float32_is_exact_only_the_outermost_are_handed_on() -> None:
     assert found is not None and set(found.tolist()) == {0, 1, 2, 3}
 
 
+def test_beside_the_middle_the_far_end_of_the_sphere_counts() -> None:
+    """Left ends at radius 0.1, by x - 0.1 over depth + 0.1: 0.5 / 1.1 = 0.45 is left of 2.0 / 4.1 = 0.49, though over
+    depth - 0.1 it would be 0.5 / 0.9 = 0.56 against 2.0 / 3.9 = 0.51. The last two are outermost on the other sides.
+    """
+    vertices = np.array([(0.6, 0, -1), (2.1, 0, -4), (0.75, 0.3, -1), (0.75, -0.3, -1)], np.float32)
+    lens = np.array([(1.0, 0, 0, 0), (0, 1, 0, 0), LENS[2], LENS[3]])
+    found = Outermost(4).of(vertices, lens, 0.1)
+    assert found is not None and set(found.tolist()) == {0, 2, 3}
+
+
 def test_a_number_that_is_none_is_left_to_the_slow_way() -> None:
     vertices = np.array([(0, 0, -2), (0.1, np.nan, -2)], np.float32)
     assert Outermost(2).of(vertices, LENS, 0.0) is None
