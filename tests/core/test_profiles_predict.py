@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -29,6 +31,7 @@ from trilane.hw_profiles.reference_networks import NetworkSpec, reference_networ
 from trilane.hw_profiles.schema import Profile
 from trilane.hw_profiles.thermal_state import ThermalState
 from trilane.hw_profiles.throttling import GOVERNORS
+from trilane.scheduler.placement_model import Rules
 from trilane.scheduler.places import Core, Place
 from trilane.units import UNITS, UnitName
 
@@ -242,6 +245,25 @@ def with_cores(profile: Profile, **cores: str) -> Profile:
     """`profile` with the core of each named unit."""
     units = {name: unit.model_copy(update={"core": cores.get(name, "")}) for name, unit in profile.units.items()}
     return profile.model_copy(update={"units": units})
+
+
+@pytest.mark.parametrize(("policy", "in_turns"), [("pipelined", False), ("".join(["sequ", "ential"]), True)])
+def test_units_are_placed_by_the_rules_of_the_policy(
+    monkeypatch: pytest.MonkeyPatch, policy: str, in_turns: bool
+) -> None:
+    asked: list[Any] = []
+
+    def ranked(*given: Any) -> Any:
+        asked.append(given)
+        raise StopIteration
+
+    monkeypatch.setattr(placed_host, "ranked", ranked)
+    monkeypatch.setattr(placed_host, "_times", lambda *given: given)
+    plan: Any = SimpleNamespace(variant=SimpleNamespace(policy=policy))
+    cores = [Core(0, 0), Core(1, 1)]
+    with pytest.raises(StopIteration):
+        place_units("profile", plan, "corners", cores)  # type: ignore[arg-type]
+    assert asked == [(cores, ("profile", plan, "corners", 2), Rules("cpu", in_turns))]
 
 
 def test_units_that_share_a_core_work_in_turns() -> None:
