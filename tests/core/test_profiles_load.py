@@ -161,7 +161,8 @@ def test_an_unreadable_file_is_named(text: str, word: str, tmp_path: Path) -> No
 
 
 def test_a_near_miss_is_suggested() -> None:
-    with pytest.raises(BadInputError, match="did you mean snapdragon-888"):
+    said = f"found no profile 'snapdragon888', expected a .toml file or one of {', '.join(profile_names())}"
+    with pytest.raises(BadInputError, match=f"^profile: {re.escape(said)}; did you mean snapdragon-888[?]$"):
         load_profile("snapdragon888")
 
 

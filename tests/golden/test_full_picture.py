@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from trilane.arrays import F32, F64
+from trilane.avatars.bundle import CLOTHES_STANDOFF_M
 from trilane.bench.lib import full_picture
 from trilane.bench.lib.cast import Cast
 from trilane.bench.lib.full_picture import FullPictures
@@ -19,6 +20,7 @@ from trilane.bench.lib.plans import FIXED, fixed, in_frames, planned
 from trilane.bench.lib.stage_chain import AvatarFrames
 from trilane.bench.lib.true_picture import has_truth
 from trilane.stages.configure import Checked, Request, configure
+from trilane.stages.cpu.mesh_bounds import MeshBounds
 from trilane.stages.gpu import opengl_calls
 from trilane.stages.gpu.composite_painters import AvatarPainter, PicturePainter
 
@@ -120,6 +122,20 @@ def test_the_fixed_plan_is_the_square_and_fewer_frames_show_the_whole_scene(chec
     fewer = in_frames(checked, 4).config.scene
     assert (fewer.frames, fewer.fps) == (4, 2.0)  # both last two seconds
     assert in_frames(checked, 12) is checked
+
+
+def test_the_cast_has_room_for_its_clothes(checked: Checked) -> None:
+    """Its rectangle is that of the mesh and what stands off it, which is larger than the mesh's alone on every side."""
+    cast = Cast(checked)
+    (actor,) = cast._actors
+    posed = actor.skeleton.pose(*actor.mover.sample(0.5), actor.mover.world)
+    clip = cast._projection @ cast._camera.sample(0.5)
+    clothed, bare = (
+        MeshBounds(actor.data.shaped, standoff_m=off).rect(posed, clip) for off in (CLOTHES_STANDOFF_M, 0.0)
+    )
+    found = actor.bounds.rect(posed, clip)
+    assert found == clothed and bare is not None and found is not None
+    assert found.x0 < bare.x0 and found.y0 < bare.y0 and found.x1 > bare.x1 and found.y1 > bare.y1
 
 
 def test_the_cast_is_where_the_pose_stage_says(checked: Checked) -> None:
