@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageDraw
 from typer.testing import CliRunner
 
 from trilane.apps.cli.explain import app
 from trilane.apps.plan_cost import ALWAYS, PIPELINED, CostModel, least_frame_ms
-from trilane.apps.plan_picture import BODY, MESH, TENSOR, draw_plan
+from trilane.apps.plan_picture import BODY, GROUND, MESH, TENSOR, _tile, draw_plan
 from trilane.apps.scene_plan import PlannedFrame, ScenePlan, phases
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_reshape import reshaped
@@ -289,6 +289,16 @@ def test_the_name_of_a_picture_stays_in_one_line(
     result = explained(tmp_path, "--json", "--picture", str(file))
     assert drawn == [("plan", [1, 2], file)]
     assert f"picture: {file}" in result.stderr.splitlines() and json.loads(result.stdout) == {"a": 1}
+
+
+def test_a_tiles_label_is_at_its_upper_left(checked: Checked) -> None:
+    """Where Pillow says that a text which begins 6 pixels from the left and 4 from the top has its letters."""
+    plan = ScenePlan(checked.config, checked.assets)
+    tile = _tile(plan, planned(3, None))
+    rows, columns = np.nonzero((np.array(tile) != GROUND).any(axis=2))
+    left, top, right, bottom = ImageDraw.Draw(tile).textbbox((6, 4), "frame 3: nobody in view")
+    assert left - 1 <= columns.min() <= left + 1 and right - 3 <= columns.max() <= right
+    assert top - 1 <= rows.min() <= top + 1 and bottom - 4 <= rows.max() <= bottom
 
 
 def test_a_sheet_has_at_most_nine_frames(checked: Checked, tmp_path: Path) -> None:

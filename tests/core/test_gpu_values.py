@@ -467,6 +467,13 @@ def test_a_raster_needs_both_slots(slots: Any) -> None:
         RasterStage(None, [], []).run(0, *slots)  # type: ignore[arg-type]
 
 
+def test_every_shape_has_its_target_before_the_first_frame() -> None:
+    made: list[Any] = []
+    packed: Any = SimpleNamespace(target=made.append)
+    RasterStage(packed, [], [(32, 64), (64, 32)]).bind([], [])
+    assert made == [(32, 64), (64, 32)]
+
+
 def test_definitions_come_after_the_version_and_lines_keep_their_numbers() -> None:
     text = shader_source("whole_screen.vert", A=1, B="x")
     assert text.splitlines()[:4] == ["#version 330", "#define A 1", "#define B x", "#line 2"]

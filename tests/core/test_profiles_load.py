@@ -160,6 +160,13 @@ def test_an_unreadable_file_is_named(text: str, word: str, tmp_path: Path) -> No
         load_profile(str(path))
 
 
+def test_what_is_no_toml_is_found_and_toml_is_expected(tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_bytes(b"a = \xff")
+    with pytest.raises(BadInputError) as raised:
+        load_profile(str(tmp_path / "mine.toml"))
+    assert raised.value.expected == "TOML in UTF-8" and "can't decode byte 0xff" in raised.value.found
+
+
 def test_a_near_miss_is_suggested() -> None:
     said = f"found no profile 'snapdragon888', expected a .toml file or one of {', '.join(profile_names())}"
     with pytest.raises(BadInputError, match=f"^profile: {re.escape(said)}; did you mean snapdragon-888[?]$"):

@@ -266,6 +266,40 @@ def test_units_are_placed_by_the_rules_of_the_policy(
     assert asked == [(cores, ("profile", plan, "corners", 2), Rules("cpu", in_turns))]
 
 
+@pytest.mark.parametrize(("layout", "raster_ms"), [("split", 0.0252), ("packed", 0.0094)])
+def test_stages_beside_the_network_by_hand(monkeypatch: pytest.MonkeyPatch, layout: str, raster_ms: float) -> None:
+    """Clocks of 1/4 and 1/2; batches of two. 10 channels take three passes of four, each with 1000 vertices at 2 ns
+    where they are split; 100 pixels at 0.5 ns for each of the three: 6150 ns and 2150. Read at 0.25 ns: of each pixel
+    4 bytes a pass, or 16 in all: 300 ns and 400."""
+    known = SimpleNamespace
+    app = known(
+        **{
+            name: known(or_else=lambda _, value=value: value)
+            for name, value in {
+                "vertices": 1000,
+                "raster_ns_per_vertex": 2.0,
+                "raster_ns_per_pixel": 0.5,
+                "readback_ns_per_byte": 0.25,
+                "pose_ms": 3.0,
+                "composite_ms": 1.0,
+                "present_ms": 2.0,
+            }.items()
+        }
+    )
+    units = {"cpu": known(clock=lambda corner: corner / 4), "gpu": known(clock=lambda corner: corner / 2)}
+    plan: Any = known(network=known(layout=layout, channels=10, pixels=100), variant=known(batch=2))
+    monkeypatch.setattr("trilane.hw_profiles.application._network_ms", lambda *_: {("infer", "dsp"): 7.0})
+    found = stage_times_ms(known(application=app, units=units), plan, (1, 1, 1))  # type: ignore[arg-type]
+    assert list(found) == [
+        ("pose", "cpu"),
+        ("raster", "gpu"),
+        ("infer", "dsp"),
+        ("composite", "gpu"),
+        ("present", "cpu"),
+    ]
+    assert [*found.values()] == pytest.approx([24.0, raster_ms, 7.0, 4.0, 16.0], rel=1e-12)
+
+
 def test_units_that_share_a_core_work_in_turns() -> None:
     """The network on the GPU, which has the CPU's core: a frame takes the sum of all stages."""
     profile = with_cores(load_profile("snapdragon-888"), cpu="core 0", gpu="core 0")
