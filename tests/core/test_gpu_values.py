@@ -92,7 +92,7 @@ def test_a_closed_body_is_closed_from_the_cache_too(
 
 @pytest.mark.parametrize(
     ("filtering", "hardware", "deferred"),
-    [("linear", False, True), ("linear", True, False), ("bicubic", False, False), ("mipmap", False, False)],
+    [("linear", False, True), ("linear", True, False), ("anisotropic", False, False), ("mipmap", False, False)],
 )
 def test_uvs_are_drawn_first_where_that_is_quicker(
     monkeypatch: pytest.MonkeyPatch, filtering: str, hardware: bool, deferred: bool
@@ -465,6 +465,20 @@ def test_a_frame_without_avatars_is_the_zero_point() -> None:
 def test_a_raster_needs_both_slots(slots: Any) -> None:
     with pytest.raises(ValueError, match="input and an output slot"):
         RasterStage(None, [], []).run(0, *slots)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("deferred", "filtering", "channels", "said"),
+    [
+        (False, "cubic", 4, "texture filter: found 'cubic', expected one of linear, mipmap, anisotropic"),
+        (True, "mipmap", 4, "texture filter: found mipmap, expected linear; draw mesh and texture in one pass"),
+        (False, "linear", 5, "network input: found 5 channels, expected 4, 8, 12 or 16; pad with zero channels"),
+    ],
+)
+def test_what_a_packed_pass_cannot_do_is_said(deferred: bool, filtering: str, channels: int, said: str) -> None:
+    with pytest.raises(BadInputError) as raised:
+        PackedPass(None, channels, Quantisation(1.0, 0), deferred, filtering)
+    assert str(raised.value) == said
 
 
 def test_every_shape_has_its_target_before_the_first_frame() -> None:

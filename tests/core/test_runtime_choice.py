@@ -8,6 +8,7 @@ from trilane.errors import MissingPartError
 from trilane.hw_profiles import host_profile
 from trilane.hw_profiles.load import load_profile
 from trilane.hw_profiles.runtime_choice import fastest_runtime
+from trilane.stages.dsp import runtime
 from trilane.stages.dsp.runtime import RUNTIMES
 
 
@@ -31,3 +32,19 @@ def test_nothing_to_take_says_what_to_install():
 def test_the_table_knows_only_runtimes_that_there_are():
     assert {name for speeds, *_ in host_profile.RUNTIMES.values() for name in speeds} <= set(RUNTIMES)
     assert set(host_profile.RUNTIMES) == set(host_profile.RATES)
+
+
+@pytest.mark.parametrize(
+    ("name", "machine", "device"),
+    [
+        ("cuda", "x86_64", True),
+        ("cuda", "aarch64", True),
+        ("qnn", "x86_64", False),
+        ("qnn", "aarch64", True),
+        ("ort", "aarch64", False),
+        ("openvino", "x86_64", False),
+    ],
+)
+def test_which_runtimes_have_hardware_of_their_own(monkeypatch, name, machine, device):
+    monkeypatch.setattr(runtime.platform, "machine", lambda: machine)
+    assert runtime.has_device(name) is device
