@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from functools import cache
 from typing import Any, NamedTuple
 
 from trilane.hw_profiles.device_power import device_power
@@ -67,9 +66,12 @@ def predict_network(
     time = price(profile, work, unit, corners)
     around = interval(profile, work, time)
 
-    @cache
+    known = {corners: time.total_ms}
+
     def ms_at(at: Corners) -> float:
-        return price(profile, work, unit, at).total_ms
+        if at not in known:
+            known[at] = price(profile, work, unit, at).total_ms
+        return known[at]
 
     def running(at: Corners) -> Running:
         frame_ms = max(ms_at(at), 1e3 / wanted.fps if wanted.fps else 0.0)
@@ -108,12 +110,13 @@ def _times(time: NetworkTime, around: Interval) -> dict[str, Any]:
 
 def operator_rows(work: Work, time: NetworkTime) -> list[dict[str, Any]]:
     """The operators in the order of the file, with what bounds each, and its share of the network's time."""
+    total_ms = time.total_ms
     return [
         {
             "name": one.name,
             "op_type": one.op_type,
             "ms": one.ms,
-            "share": one.ms / time.total_ms,
+            "share": one.ms / total_ms,
             "bound": one.bound,
             "macs": operator.macs,
             "elements": operator.moved,

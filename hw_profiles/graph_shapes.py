@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from math import prod
-from typing import Any
 
 import onnx
 from onnx import TensorProto
@@ -49,8 +48,11 @@ def with_shapes(model: onnx.ModelProto, given: Mapping[str, Shape]) -> onnx.Mode
     for value in inputs:
         _check_input(value)
     inferred = _inferred(model)
-    _check_all(model.graph, inferred)
-    _check_convolutions(model.graph, inferred)
+    shapes = {tensor.name: tuple(tensor.dims) for tensor in model.graph.initializer}
+    values = (*inputs, *inferred.values())
+    shapes |= {value.name: sizes for value in values if (sizes := _sizes(value, least=0)) is not None}
+    _check_all(model.graph, inferred, shapes)
+    _check_convolutions(model.graph, shapes)
     del model.graph.value_info[:]
     model.graph.value_info.extend(inferred.values())
     del model.graph.input[:]
@@ -109,22 +111,23 @@ def _replace(node: onnx.NodeProto, op_type: str) -> None:
     node.CopyFrom(onnx.helper.make_node(op_type, inputs, node.output[:1], node.name))
 
 
-def _check_all(graph: onnx.GraphProto, inferred: Mapping[str, onnx.ValueInfoProto]) -> None:
+def _check_all(
+    graph: onnx.GraphProto, inferred: Mapping[str, onnx.ValueInfoProto], shapes: Mapping[str, Shape]
+) -> None:
+    """Every result has a shape, which may be empty only where it follows from constants."""
     constants = constant_tensors(graph)
     for node in graph.node:
         for name in node.output:
-            if not name or (name in constants and _sizes(inferred.get(name), least=0) is not None):
+            if not name or (name in constants and name in shapes):
                 continue
-            sizes = _sizes(inferred.get(name))
-            if sizes is None:
+            sizes = shapes.get(name, (0,))
+            if 0 in sizes:
                 raise _unknown(graph, node, inferred.get(name), name)
             check_size(sizes, inferred[name].type.tensor_type.elem_type, f"the result of {called(node)}")
 
 
-def _check_convolutions(graph: onnx.GraphProto, inferred: Mapping[str, onnx.ValueInfoProto]) -> None:
+def _check_convolutions(graph: onnx.GraphProto, shapes: Mapping[str, Shape]) -> None:
     """What ONNX does not look at: whether the weight has as many channels as what it is given and what comes out."""
-    shapes = {tensor.name: tuple(tensor.dims) for tensor in graph.initializer}
-    shapes |= {value.name: _sizes(value, least=0) or () for value in (*graph.input, *inferred.values())}
     for node in graph.node:
         if node.op_type not in CONVOLUTIONS:
             continue
@@ -174,14 +177,17 @@ def _has_schema(node: onnx.NodeProto) -> bool:
     return bool(onnx.defs.has(node.op_type, node.domain))
 
 
-def _sizes(value: Any, least: int = 1) -> Shape | None:
+def _sizes(value: onnx.ValueInfoProto, least: int = 1) -> Shape | None:
     """The static shape of a tensor of sizes from `least` on; None when it has none."""
-    if value is None or not value.type.tensor_type.HasField("shape"):
+    kind = value.type.tensor_type
+    if not kind.HasField("shape"):
         return None
-    dims = value.type.tensor_type.shape.dim
-    if all(d.HasField("dim_value") and d.dim_value >= least for d in dims):
-        return tuple(d.dim_value for d in dims)
-    return None
+    sizes = []
+    for dim in kind.shape.dim:
+        if not dim.HasField("dim_value") or dim.dim_value < least:
+            return None
+        sizes.append(dim.dim_value)
+    return tuple(sizes)
 
 
 def _shown(value: onnx.ValueInfoProto) -> str:

@@ -149,11 +149,11 @@ def constant_tensors(graph: Any) -> set[str]:
 
     In a graph without weights, these are the inputs named `w<n>`, and those that a layer has after its first input.
     """
-    names = {i.name for i in graph.initializer} | _weight_inputs(graph)
+    names = {i.name for i in graph.initializer} | _weight_inputs(graph) | {""}  # "" is an input that is left out
     for node in graph.node:
-        if node.op_type in OF_SHAPES or all(name in names for name in node.input if name):
-            names.update(name for name in node.output if name)
-    return names
+        if names.issuperset(node.input) or node.op_type in OF_SHAPES:
+            names.update(node.output)
+    return names - {""}
 
 
 def _shapes(model: Any) -> dict[str, tuple[int, ...]]:

@@ -45,6 +45,7 @@ _BY_CLASS = {
     "permute": ("Transpose",),
     "elementwise": (
         *("Add", "Sub", "Mul", "Div", "Pow", "Mod", "Min", "Max", "Sum", "Mean", "PRelu", "Where", "CumSum"),
+        *("ConstantOfShape", "Range", "RandomNormalLike", "RandomUniformLike", "NonMaxSuppression"),
         *("And", "Or", "Not", "Xor", "Equal", "Greater", "GreaterOrEqual", "Less", "LessOrEqual", "IsNaN", "IsInf"),
         *("BitwiseAnd", "BitwiseOr", "BitwiseNot", "BitwiseXor", "BitShift", "Trilu", "EyeLike"),
         *(
