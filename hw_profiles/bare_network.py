@@ -13,12 +13,16 @@ from trilane.hw_profiles.device_power import device_power
 from trilane.hw_profiles.graph_file import GraphFile, Numbers
 from trilane.hw_profiles.network_time import Interval, NetworkTime, interval, price, spread_of
 from trilane.hw_profiles.network_work import Work, count_work
+from trilane.hw_profiles.operator_kinds import COMPILED
 from trilane.hw_profiles.over_time import Moment, warm_up
 from trilane.hw_profiles.performance_profiles import Corners, corners_of
 from trilane.hw_profiles.rates import NOTHING, FrameTimes, Load, Wanted, answers
 from trilane.hw_profiles.schema import Profile
 from trilane.hw_profiles.timeline import caps_of, ends_of, settled_corners, temperatures_of, timeline_of
 from trilane.units import SUSTAINED, UNITS, UnitName
+
+#: Said of a time that is only a lower bound.
+INSIDE = "it holds a compiled network, of which only the ends are seen: price the network that it was made from"
 
 
 class Running(NamedTuple):
@@ -102,7 +106,7 @@ def _times(time: NetworkTime, around: Interval) -> dict[str, Any]:
         "network_ms": time.total_ms,
         "low_ms": around.low_ms,
         "high_ms": around.high_ms,
-        "why": list(around.why),
+        "why": [*around.why, *([INSIDE] if any(o.op_type in COMPILED for o in time.operators) else [])],
         "fps": 1e3 / time.total_ms,
         "job_ms": time.job_ms,
     }

@@ -12,6 +12,7 @@ from math import prod
 import onnx
 from onnx import TensorProto
 
+from trilane.hw_profiles.graph_folding import fold
 from trilane.hw_profiles.graph_structure import EXPORT_AGAIN, called
 from trilane.hw_profiles.graph_tensors import KEPT_ELEMENTS, check_size
 from trilane.hw_profiles.network_work import constant_tensors
@@ -48,9 +49,12 @@ def with_shapes(model: onnx.ModelProto, given: Mapping[str, Shape]) -> onnx.Mode
     for value in inputs:
         _check_input(value)
     inferred = _inferred(model)
-    shapes = {tensor.name: tuple(tensor.dims) for tensor in model.graph.initializer}
-    values = (*inputs, *inferred.values())
-    shapes |= {value.name: sizes for value in values if (sizes := _sizes(value, least=0)) is not None}
+    shapes = _known(model.graph, inputs, inferred)
+    while any(shapes.get(name) is None for node in model.graph.node for name in node.output if name):
+        if not fold(model, shapes):
+            break
+        inferred = _inferred(model)
+        shapes = _known(model.graph, inputs, inferred)
     _check_all(model.graph, inferred, shapes)
     _check_convolutions(model.graph, shapes)
     del model.graph.value_info[:]
@@ -60,6 +64,15 @@ def with_shapes(model: onnx.ModelProto, given: Mapping[str, Shape]) -> onnx.Mode
     for output in model.graph.output:
         output.CopyFrom(inferred.get(output.name, output))
     return model
+
+
+def _known(
+    graph: onnx.GraphProto, inputs: Sequence[onnx.ValueInfoProto], inferred: Mapping[str, onnx.ValueInfoProto]
+) -> dict[str, Shape]:
+    """The static shapes of all tensors that have one, by name."""
+    shapes = {tensor.name: tuple(tensor.dims) for tensor in graph.initializer}
+    values = (*inputs, *inferred.values())
+    return shapes | {value.name: sizes for value in values if (sizes := _sizes(value, least=0)) is not None}
 
 
 def _give(graph: onnx.GraphProto, inputs: Sequence[onnx.ValueInfoProto], given: Mapping[str, Shape]) -> None:

@@ -80,6 +80,8 @@ WEIGHTED = frozenset(
 LAYOUT_CHANGES = ((0, 3, 1, 2), (0, 2, 3, 1))
 #: Where operators are defined whose names mean what the tables say: ONNX itself and ONNX Runtime.
 DOMAINS = ("", "ai.onnx", "com.microsoft")
+#: Operators that hold a network which was compiled for a chip: what it computes is not in the file.
+COMPILED = frozenset(["EPContext"])
 #: What an operator without a rule is priced as: it reads its inputs and writes its results.
 UNKNOWN = "elementwise"
 

@@ -11,8 +11,9 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from trilane.hw_profiles.bare_network import in_precision, predict_network
+from trilane.hw_profiles.bare_network import INSIDE, in_precision, predict_network
 from trilane.hw_profiles.graph_file import read_graph
+from trilane.hw_profiles.graph_folding import _is_small
 from trilane.hw_profiles.load import load_profile
 from trilane.hw_profiles.network_work import Work, count_work
 from trilane.hw_profiles.operator_kinds import KIND_OF, has_rule
@@ -258,3 +259,55 @@ def test_operators_are_of_onnx() -> None:
     assert all(name.startswith(("QLinear", "Skip", "Simplified", "Quick", "Fast", "Bias")) for name in runtimes), (
         runtimes
     )
+
+
+def test_chains_of_sizes_are_followed_where_onnx_does_not(tmp_path: Path) -> None:
+    """As an exporter writes a repeat: where the wanted sizes are -1, one, and elsewhere they themselves."""
+    work = work_of(
+        tmp_path,
+        [
+            "Shape x -> s",
+            "Size s -> rank",
+            "Unsqueeze rank zero -> ranks",
+            ("ConstantOfShape ranks -> zeros", {"value": integers("whole", 0)}),
+            "Add zeros one -> ones",
+            "Equal wanted minus -> free",
+            "Where free ones wanted -> sizes",
+            "Expand x sizes -> e",
+            "Range start stop step -> r",
+            "Gather sizes r -> again",
+            "Expand e again -> t",
+            "Tanh t -> y",
+        ],
+        (2, 1, 4),
+        [
+            *(integers("zero", 0), integers("one", 1), integers("minus", -1), integers("wanted", -1, 3, -1)),
+            *(numpy_helper.from_array(np.int64(n), name) for name, n in (("start", 0), ("stop", 3), ("step", 1))),
+        ],
+    )
+    assert counts(work) == [
+        ("Expand", "resize", 0, 8 + 24, 0),
+        ("Expand", "resize", 0, 24 + 24, 0),
+        ("Tanh", "elementwise", 0, 48, 0),
+    ]
+
+
+@pytest.mark.parametrize("op_type", ["ConstantOfShape", "Expand", "Range"])
+def test_no_chain_makes_large_tensors(op_type: str) -> None:
+    """What would be made is bounded before it is made; a billion numbers would take 8 GB."""
+    huge, one = np.int64(1 << 30), np.int64(1)
+    values = {"Range": [np.int64(0), huge, one], "Expand": [one, np.array([huge])]}.get(op_type, [np.array([huge])])
+    assert not _is_small(helper.make_node(op_type, ["a", "b", "c"], ["d"]), values)
+    small = {"Range": [np.int64(0), one, one], "Expand": [one, np.array([7])]}.get(op_type, [np.array([7])])
+    assert _is_small(helper.make_node(op_type, ["a", "b", "c"], ["d"]), small)
+
+
+def test_a_compiled_network_is_said_to_hide_what_it_computes(tmp_path: Path) -> None:
+    """As `trilane avatar export` writes it: one operator of ONNX Runtime, whose result has the shape that is stated."""
+    ends = [helper.make_tensor_value_info(n, TensorProto.UINT8, (1, 8, 8, c)) for n, c in (("x", 16), ("y", 4))]
+    node = helper.make_node("EPContext", ["x"], ["y"], name="all", domain="com.microsoft", ep_cache_context=b"\0\1")
+    graph = helper.make_graph([node], "g", ends[:1], ends[1:])
+    opsets = [helper.make_opsetid("", 17), helper.make_opsetid("com.microsoft", 1)]
+    found = priced(saved(helper.make_model(graph, opset_imports=opsets), tmp_path))
+    assert found["without_rule"] == [{"op_type": "EPContext", "count": 1, "share_of_elements": 1.0}]
+    assert found["why"][-1] == INSIDE
