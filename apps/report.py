@@ -223,6 +223,34 @@ class PlacementFacts(Record):
     tried: tuple[TriedPlacement, ...] = ()
 
 
+class TensorSize(Record):
+    """Of one size of a planned tensor.
+
+    `work`: share of the pixels that the network was trained for.
+    `most_pixels`: of an avatar.
+    `frames`: presented ones that were given it.
+    `psnr_loss_db`: what it costs, by the avatars' validation; null where an avatar has no figures by size.
+    """
+
+    work: float
+    most_pixels: int
+    frames: int
+    psnr_loss_db: float | None
+
+
+class Resolution(Record):
+    """How the tensor was stepped down so that frames were in time.
+
+    `sizes`: the largest first.
+    `switches`: how often a presented frame had another size than the one before.
+    `loss_source`: where the losses come from, or why there are none.
+    """
+
+    sizes: tuple[TensorSize, ...]
+    switches: int
+    loss_source: str
+
+
 class Preamble(Record):
     """The keys that a report begins with.
 
@@ -254,6 +282,7 @@ class Report(RunMetrics, Preamble):
     `failure`: why it ended early, null when it did not.
     `baseline`: the `sequential` run of the same scene, null when there was none.
     `placement`: why the units have the cores that they have; absent for a run by a program.
+    `resolution`: of a run whose frames had to be in time and whose tensor was planned; absent for others.
     `pace`: of a run at a chip's pace.
     `accuracy`: of each avatar, what `trilane.avatars.validation.accuracy_of` says: its figures, or why there are none.
     `sources`: key, dotted where it is inside another, to where the figures below it come from; the longest key decides.
@@ -273,6 +302,7 @@ class Report(RunMetrics, Preamble):
     failure: str | None
     baseline: Baseline | None
     placement: PlacementFacts | None = None
+    resolution: Resolution | None = None
     pace: PaceComparison | None = None
     accuracy: dict[str, dict[str, Any]] = Field(default={})
     sources: dict[str, str] = Field(default={})
@@ -295,8 +325,8 @@ def build_report(
     `config`: that it ran.
     `machine`: what `machine_facts` said.
     `baseline`: of the same scene under another policy, None without one.
-    `facts`: what others know of the run: `video`, `checksum`, and any of `made`, `placement`, `pace`, `accuracy`,
-    `notes`.
+    `facts`: what others know of the run: `video`, `checksum`, and any of `made`, `placement`, `resolution`, `pace`,
+    `accuracy`, `notes`.
     """
     metrics = result.report
     sensor = {"sensor": sensor_c()}

@@ -33,6 +33,7 @@ SOURCES = {
     "baseline": MEASURED,
     "placement": COMPUTED,
     "placement.times": MEASURED,
+    "resolution": MEASURED,
     "pace": COMPUTED,
     "pace.host_slower": MEASURED,
     "pace.late_frames": MEASURED,

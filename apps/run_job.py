@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from trilane.apps.report import Report, build_report, write_report
+from trilane.apps.resolution import resolution_note, resolution_of
 from trilane.apps.run_folder import RunFolder
 from trilane.errors import TrilaneError
 from trilane.hw_profiles.governor import Governor
@@ -104,6 +105,8 @@ def run_to_folder(
             facts = {"made": made, "accuracy": dict(checked.accuracy), "notes": list(checked.notes)}
             if checked.placement is not None:
                 facts["placement"] = checked.placement
+            if result.rungs:
+                facts["resolution"] = resolution_of(result.rungs, checked.config, checked.losses)
             if plan.pace is not None:
                 from trilane.apps.pace import compare
 
@@ -203,6 +206,8 @@ def _tell(report: Report, hooks: Hooks) -> None:
     if report.video is not None and report.video.frames < report.frames.presented:
         shown = f"{report.video.frames} of {report.frames.presented} frames"
         hooks.message(f"video.mp4 holds {shown}: a writer was killed before its last")
+    if report.resolution is not None and (stepped := resolution_note(report.resolution)):
+        hooks.message(stepped)
     if report.stage_metrics.get("pose", {}).get("visible") == 0:
         hooks.message("no avatar was in the picture in any frame")
 

@@ -139,6 +139,21 @@ class MadeWith(_Model):
     runtimes: dict[str, str]
 
 
+class BySize(_Model):
+    """What smaller tensors cost: the same views painted at several sizes, and enlarged to the first one's.
+
+    `date`: UTC. `runtime`: that painted. `seed`, `per_band`, `held_out`: of the views. `psnr_db`: mean over them inside
+    the box of the true mask, by HEIGHTxWIDTH of the tensor; the network's own size first.
+    """
+
+    date: Day
+    runtime: str
+    seed: int
+    per_band: int = Field(ge=1)
+    held_out: tuple[str, ...]
+    psnr_db: dict[Annotated[str, Field(pattern=r"^[0-9]{1,4}x[0-9]{1,4}$")], Finite] = Field(min_length=1)
+
+
 class Validation(Figures):
     """The figures of an avatar, and what they are of.
 
@@ -150,6 +165,7 @@ class Validation(Figures):
     `other_runtimes`: the figures of more runtimes, by name.
     `size`: tensor size, as `trilane run --size` takes it.
     `texture_filter`: of the neural texture.
+    `by_size`: what smaller tensors cost; None where nobody measured it.
     More keys: `per_band`, views of each band and seed; `held_out`, motion to digest; `float`, figures of the network
     before it was quantised, and `psnr_loss_db`, what quantising cost.
     """
@@ -163,6 +179,7 @@ class Validation(Figures):
     texture_filter: str = "linear"
     integer: Figures | None = None
     other_runtimes: dict[str, Figures] = {}
+    by_size: BySize | None = None
 
     def on(self, runtime: str) -> Figures | None:
         """The figures of `runtime`; None when nothing was painted on it."""

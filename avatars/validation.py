@@ -122,10 +122,10 @@ def _drawn_otherwise(validation: Validation, drawn: DrawnAs) -> str:
 
 def _no_figures(bundle: Bundle, changed: Sequence[str], why: str, how: str = "", remark: str = "") -> dict[str, Any]:
     """`why`, and the command that measures what there is now, with the options `how` and a `remark` on it."""
-    command = f"{VALIDATE} {shlex.quote(_name_of(bundle.folder))}{how}"
+    command = f"{VALIDATE} {shlex.quote(name_of(bundle.folder))}{how}"
     return {"source": NO_FIGURES, "changed": list(changed), "why": f"{why}; `{command}` measures it{remark}"}
 
 
-def _name_of(folder: Path) -> str:
+def name_of(folder: Path) -> str:
     """What a person types for `folder`: `default`, or the folder."""
     return DEFAULT if folder.absolute() == bundle_folder(DEFAULT).absolute() else str(folder)

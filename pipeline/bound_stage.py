@@ -8,7 +8,7 @@ from typing import Any, cast
 
 from trilane.arrays import U8
 from trilane.errors import TrilaneError
-from trilane.pipeline.stage import Skip, SkippingStage, Stage, UnitContext
+from trilane.pipeline.stage import Skip, SkippingStage, Stage, SteppedStage, UnitContext
 from trilane.transport.packets import FRAME_FIELDS, Packet
 
 WAKE_UP_NS = 150_000  # a sleep ends about this much late
@@ -30,17 +30,23 @@ class BoundStage:
         """`pace_ns`: how long a job is held, at least. `unit`: that it runs on. `may_skip`: a bypass begins at it."""
         self.name, self._pace_ns, self._may_skip = name, pace_ns, may_skip
         self._stage, self._outputs, self._unit = stage, outputs, unit
+        self._is_first, self._rung = not inputs, 0
         self._pass_on = _header_copier(inputs, outputs)
         stage.bind(inputs, outputs)
 
-    def run(self, frame: int, slot_in: int, slot_out: int, epoch: int, fresh: bool = False) -> Mapping[str, float]:
+    def run(
+        self, frame: int, slot_in: int, slot_out: int, epoch: int, fresh: bool = False, rung: int = 0
+    ) -> Mapping[str, float]:
         """Do the job, and hold it until its pace has passed; the stage's metrics, a `Skip` where the frame skips.
 
-        A slot is -1 where the stage has no such edge. `fresh`: the stage must not count on earlier frames. Raises
-        TrilaneError for a `Skip` of a stage that may not.
+        A slot is -1 where the stage has no such edge. `fresh`: the stage must not count on earlier frames. `rung`: of
+        the frame's work, which the first stage is told. Raises TrilaneError for a `Skip` of a stage that may not.
         """
         if fresh and self._may_skip:
             cast(SkippingStage, self._stage).forget()
+        if self._is_first and rung != self._rung:
+            self._rung = rung
+            cast(SteppedStage, self._stage).step_to(rung)
         end_ns = time.monotonic_ns() + self._pace_ns
         if slot_out >= 0:
             if slot_in >= 0:

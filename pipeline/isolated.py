@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
+from collections.abc import Sequence
+from itertools import pairwise
 from statistics import fmean, median
 
 from trilane.pipeline.lifecycle import START_S, listen_before_run
 from trilane.pipeline.run_log import UnitError
 from trilane.pipeline.signals import Interrupts
 from trilane.pipeline.unit_processes import UnitProcesses
-from trilane.scheduler.events import Graph
+from trilane.scheduler.events import Graph, StageAlone
 from trilane.transport.job_pipe import PACKETS
 from trilane.transport.messages import Duration, RunIsolated
 
@@ -54,14 +56,36 @@ class IsolatedTimes:
                 for index, position in enumerate(own):
                     self._times_ns[chain[position].name].append(median(times[index :: len(own)]))
 
-    def _durations_ns(self, unit: str, positions: list[int], frame: int) -> list[int]:
+    def of_rungs(self, frames: Sequence[int], rungs: int, follow: Sequence[str]) -> list[StageAlone]:
+        """What each stage of `follow` takes, alone, on each of so many `rungs` of a ladder: the most of `frames`.
+
+        Nothing is said of one that does not take less on every further rung, such as where nobody is on the screen in
+        any of the frames. Raises as `measure`.
+        """
+        chain = self._graph.stages[:-1]
+        times = {name: [0] * rungs for name in follow}
+        for frame in frames:
+            for rung in range(rungs):
+                for position, stage in enumerate(chain):
+                    repeats = REPEATS if stage.name in follow else 0
+                    took = min(self._durations_ns(stage.unit, [position] * (1 + repeats), frame, rung)[-REPEATS:])
+                    if stage.name in follow:
+                        times[stage.name][rung] = max(times[stage.name][rung], took)
+        return [
+            StageAlone(name, rung, ns)
+            for name, of_rungs in times.items()
+            if all(more > less for more, less in pairwise(of_rungs))
+            for rung, ns in enumerate(of_rungs)
+        ]
+
+    def _durations_ns(self, unit: str, positions: list[int], frame: int, rung: int = 0) -> list[int]:
         """Of jobs of the unit's stages at `positions`, as many handed to it at once as its pipe holds."""
         durations: list[int] = []
         for first in range(0, len(positions), AT_ONCE):
             batch = positions[first : first + AT_ONCE]
             for position in batch:
                 place = self._processes.places[self._graph.stages[position].name]
-                self._processes.send(unit, RunIsolated(place, frame, 0 if position else -1, 0))
+                self._processes.send(unit, RunIsolated(place, frame, 0 if position else -1, 0, rung))
             durations += self._answers(unit, len(batch))
         return durations
 

@@ -61,7 +61,8 @@ class RealtimeClock:
     """`trilane.scheduler.loop.Clock` of one run over `processes`; it lets `core` run until that finishes.
 
     `jobs`: of every job that ended, when. `metrics`: of every stage, the sums of what its jobs reported,
-    and `reported`, how many of them reported each. `cpu`: CPU time of units and stages.
+    and `reported`, how many of them reported each. `cpu`: CPU time of units and stages. `first`: events
+    that come before all others.
     """
 
     def __init__(
@@ -78,6 +79,7 @@ class RealtimeClock:
         self.metrics: dict[str, Counter[str]] = defaultdict(Counter)
         self.reported: dict[str, Counter[str]] = defaultdict(Counter)
         self.cpu = CpuTimes(processes.core_counts)
+        self.first: list[Event] = []
         self._core, self._processes, self._interrupts, self._log = core, processes, interrupts, log
         self._requests, self._governor, self._on_progress = requests, governor, on_progress
         self._last_stage = core.graph.stages[-1].name
@@ -128,7 +130,7 @@ class RealtimeClock:
     def _begin(self) -> list[Event]:
         self._begun = True
         self._step_ns = time.monotonic_ns()
-        events: list[Event] = [UnitReady(unit) for unit in self._core.graph.units]
+        events: list[Event] = [*self.first, *(UnitReady(unit) for unit in self._core.graph.units)]
         if self._requests is not None:
             self._requests.is_open.set()
         if self._governor is not None:
@@ -204,7 +206,7 @@ class RealtimeClock:
     def _dispatch(self, now_ns: int, job: Job) -> None:
         self._open[job.id] = (job, now_ns)
         place = self._processes.places[job.stage]
-        fields = (job.id, place, job.frame, job.slot_in, job.slot_out, job.epoch, now_ns, int(job.fresh))
+        fields = (job.id, place, job.frame, job.slot_in, job.slot_out, job.epoch, now_ns, int(job.fresh), job.rung)
         self._processes.send(job.unit, tuple.__new__(RunJob, fields))
 
     def _book(self) -> None:

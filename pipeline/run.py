@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, Protocol
 
 from trilane.errors import BadInputError
@@ -34,6 +35,7 @@ from trilane.unexpected_value import UnexpectedValue
 
 HANG_NS = 10_000_000_000
 FRAMES_PER_ISOLATED, LEAST_ISOLATED, MOST_ISOLATED = 15, 4, 16
+FRAMES_ON_RUNGS = 3
 
 
 class ReportingGovernor(Governor, Protocol):
@@ -62,6 +64,8 @@ def run_pipeline(
     isolated_frames: int | None = None,
     hang_ns: int = HANG_NS,
     latch_ms: float = 0.0,
+    works: tuple[int, ...] = (),
+    follow: tuple[str, ...] = (),
     requests: FrameRequestQueue | None = None,
     governor: ReportingGovernor | None = None,
     starter: UnitStarter | None = None,
@@ -80,6 +84,9 @@ def run_pipeline(
     `hang_ns`: a unit whose job takes longer is restarted.
     `latch_ms`: the first stage begins so late that it is expected to end this long before the second can take it; 0: at
     once.
+    `works`: of each rung of a ladder of work in thousandths, the most first: a frame that would be late is given less
+    (`trilane.scheduler.work_ladder`), of which the first stage is told (`SteppedStage`). Used where frames are released
+    at a rate. `follow`: the stages whose time follows the work.
     `requests`: frames are released as somebody asks for them, `frames` at most; it is closed when this returns.
     `governor`: holds the units to shares of the time, and says in the report what it did.
     `starter`: a fork server that was started earlier; None makes one for this run.
@@ -95,7 +102,7 @@ def run_pipeline(
     check_open_files()
     check_cores(pipeline)
     isolated = _isolated_share(frames) if isolated_frames is None else isolated_frames
-    settings = _settings(policy, frames, fps, pace_fps, hang_ns, latch_ms, requests)
+    settings = _stepped(_settings(policy, frames, fps, pace_fps, hang_ns, latch_ms, requests), works, follow)
     log = RunLog(on_message)
     with (
         contextlib.closing(requests) if requests is not None else contextlib.nullcontext(),
@@ -150,6 +157,10 @@ class _Run:
         self.pids = self._processes.pids
         sample = _spread(self._core.settings.frames, max(isolated_frames, 1))
         self.isolated.measure(sample[::2])
+        settings = self._core.settings
+        if settings.works:
+            few = _spread(settings.frames, FRAMES_ON_RUNGS)
+            self._clock.first += self.isolated.of_rungs(few, len(settings.works), settings.follow)
         self._outcome = run_loop(self._core, self._clock, self.recording)
         self._clock.finish()
         if self._outcome.kind is OutcomeKind.GAVE_UP:
@@ -175,6 +186,7 @@ class _Run:
             jobs=tuple(self._clock.jobs),
             recording=self.recording,
             metrics=self._mean_metrics(),
+            rungs=tuple(ledger.rungs) if self._core.ladder is not None else (),
             messages=tuple(self._log.messages),
             interrupted=stopped and self._interrupts.count > 0,
             failure=self._log.failure,
@@ -222,6 +234,11 @@ def _settings(
         )
     except UnexpectedValue as error:
         raise BadInputError.at("the run's settings", error) from None
+
+
+def _stepped(settings: Settings, works: tuple[int, ...], follow: tuple[str, ...]) -> Settings:
+    """With the ladder, where frames are released at a rate, and so can be late."""
+    return replace(settings, works=works, follow=follow) if works and settings.period_ns else settings
 
 
 def _isolated_share(frames: int) -> int:

@@ -41,6 +41,13 @@ class Stage(Protocol):
         """Release what the stage holds (files are completed and renamed here)."""
 
 
+class SteppedStage(Stage, Protocol):
+    """The first stage of a pipeline whose frames may be given less work (`run_pipeline`'s `works`)."""
+
+    def step_to(self, rung: int) -> None:
+        """From now on frames are given the work of `rung`, 0 at first. Called before `run`, where it changes."""
+
+
 class SkippingStage(Stage, Protocol):
     """The stage at which a pipeline's bypass begins. Its `run` may return a `Skip`."""
 

@@ -143,7 +143,7 @@ def factory_named(name: str) -> StageFactory:
 def _run_job(link: Link, stage: BoundStage, job: RunJob, clock: JobClock) -> None:
     clock.begin(job.stage, job.t_dispatch_ns)
     try:
-        metrics = stage.run(job.frame, job.slot_in, job.slot_out, job.epoch, job.fresh > 0)
+        metrics = stage.run(job.frame, job.slot_in, job.slot_out, job.epoch, job.fresh > 0, job.rung)
         clock.end(stage.works_asleep)
         values = {str(name): float(value) for name, value in metrics.items()}
         sampled_ns = stage.sampled_ns(job.slot_in, job.slot_out)
@@ -158,7 +158,7 @@ def _run_job(link: Link, stage: BoundStage, job: RunJob, clock: JobClock) -> Non
 def _run_isolated(link: Link, stage: BoundStage, job: RunIsolated) -> None:
     begin_ns = time.monotonic_ns()
     try:
-        stage.run(job.frame, job.slot_in, job.slot_out, 0, fresh=True)
+        stage.run(job.frame, job.slot_in, job.slot_out, 0, fresh=True, rung=job.rung)
     except Exception as error:
         _fail(link, MEASURING, f"stage {stage.name}, frame {job.frame}", error)
         return

@@ -11,6 +11,7 @@ have done, so that a body at the edge of two shapes does not go to and fro betwe
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -25,6 +26,15 @@ MOST_DENSITY = 4.0
 AS_GOOD = 0.95
 #: Frames for which a smaller shape has to do before it is taken.
 PATIENCE = 10
+#: Sides of a tensor, in parts of those that its network was trained to paint: the sizes that it may be stepped down to
+#: when frames would be late, or that an error budget allows.
+SIDES = (1.0, 0.75, 0.5)
+ALL_WORK = 1000
+
+
+def work_of_side(side: float) -> int:
+    """Thousandths of all the pixels that a tensor has whose sides are `side` times as long."""
+    return math.ceil(ALL_WORK * side * side)
 
 
 @dataclass(frozen=True)
@@ -33,6 +43,10 @@ class TensorBudget:
 
     own: int
     most: int
+
+    def scaled(self, work: int) -> TensorBudget:
+        """With so many thousandths of the pixels."""
+        return TensorBudget(self.own * work // ALL_WORK, self.most * work // ALL_WORK)
 
     def of(self, avatars: int) -> int:
         """For so many avatars in view."""

@@ -118,7 +118,9 @@ class Scene(Model):
     What may be left out: `plan` is `planned` (what the picture does not show is not modelled), `fixed` (everything is,
     in every frame) or `full` (to compare with: float64 body, supersampled raster, FP32 network; nothing runs it in real
     time). `size`: `auto` plans the tensor, up to `most_side`² pixels; else it is fixed to that size. `error_budget_px`:
-    how far a vertex may be off on the picture. `memory_mb`: of the networks that are made ready for the planned shapes.
+    how far a vertex may be off on the picture. `error_budget_db`: how much worse avatars may be painted, in dB of PSNR,
+    than in tensors of the size that their network was trained for; None: no worse, unless frames would be late.
+    `memory_mb`: of the networks that are made ready for the planned shapes.
     """
 
     name: str = Field(default="scene", min_length=1, max_length=80, pattern=NAME)
@@ -131,6 +133,7 @@ class Scene(Model):
     texture_filter: Literal["linear", "mipmap", "anisotropic"] = "linear"
     plan: Literal["planned", "fixed", "full"] = "planned"
     error_budget_px: float = Field(default=0.5, gt=0, le=100, allow_inf_nan=False)
+    error_budget_db: float | None = Field(default=None, gt=0, le=100, allow_inf_nan=False)
     most_side: int = Field(default=512, ge=BUCKET_STEP, le=MAX_SIDE, multiple_of=BUCKET_STEP)
     memory_mb: int = Field(default=512, ge=1, le=1_000_000)
     output: OutputSpec = OutputSpec()
@@ -154,6 +157,8 @@ class Scene(Model):
     def _sized(self) -> Self:
         if self.size == AUTO and self.plan != "planned":
             raise UnexpectedValue(f'size = "{AUTO}" with plan = "{self.plan}"', "a size such as 512x512")
+        if self.error_budget_db is not None and self.size != AUTO:
+            raise UnexpectedValue(f'error_budget_db with size = "{self.size}"', f'size = "{AUTO}"')
         return self
 
     @property

@@ -63,6 +63,13 @@ def choose_shapes(
     return ShapeSet(tuple(sorted(chosen, key=lambda shape: (area(shape), shape))), memory, unserved)
 
 
+def joined(first: ShapeSet, second: ShapeSet) -> ShapeSet:
+    """Both sets. `unserved` is that of the first, unless it has no shapes. A shape of both counts twice as memory."""
+    shapes = sorted({*first.shapes, *second.shapes}, key=lambda shape: (area(shape), shape))
+    unserved = first.unserved if first.shapes else second.unserved
+    return ShapeSet(tuple(shapes), first.memory_bytes + second.memory_bytes, unserved)
+
+
 def serves(shape: Shape, demand: Demand) -> bool:
     """Whether the frame of `demand` can be drawn well in a tensor of `shape`."""
     (height, width), (ideal_height, ideal_width) = shape, demand.ideal

@@ -49,6 +49,7 @@ from trilane.scheduler.events import (
     SchedulerStalled,
     SetDuty,
     Settings,
+    StageAlone,
     Start,
     Stop,
     UnitDied,
@@ -60,6 +61,7 @@ from trilane.scheduler.ledger import Ledger
 from trilane.scheduler.policy import policy_named
 from trilane.scheduler.state import FULL_DUTY, FrameState, StageState, UnitState
 from trilane.scheduler.unit_life import READY, STOPPING, DeadlinePassed
+from trilane.scheduler.work_ladder import WorkLadder
 
 
 class Core:
@@ -86,6 +88,12 @@ class Core:
         self._bypass_end = self.bypass.end.position if self.bypass is not None else 0
         self._hang_ns, self._lead_ns, self._latches = settings.hang_ns, policy.lead_ns, self.choice.latches
         self._estimates = self._lead_ns > 0 or policy.drop_late or self._latches
+        self.ladder: WorkLadder | None = None
+        if settings.works:
+            if not settings.period_ns:
+                raise ValueError("a ladder of work needs a period")
+            lengths = (settings.period_ns, settings.deadline_ns)
+            self.ladder = WorkLadder(self.stages, settings.works, settings.follow, *lengths)
         self._handlers = {
             UnitReady: self._on_ready,
             JobFailed: self._on_failed,
@@ -94,6 +102,7 @@ class Core:
             Pong: self._on_pong,
             SchedulerStalled: self._on_stalled,
             SetDuty: self._on_duty,
+            StageAlone: self._on_alone,
             Stop: self._on_stop,
             FrameRequest: self._on_request,
             Abort: self._on_abort,
@@ -102,8 +111,8 @@ class Core:
     def step(self, now_ns: int, events: tuple[Event, ...] = ()) -> Decision:
         """Tell the core what happened and what time it is; times never go back. Nothing is heard after the finish.
 
-        Raises KeyError for a unit that there is not, UnitLifeError for an event that cannot happen to a unit now,
-        ValueError for a frame that skips where no bypass begins.
+        Raises KeyError for a unit or stage that there is not, UnitLifeError for an event that cannot happen to a unit
+        now, ValueError for a frame that skips where no bypass begins.
         """
         self.now_ns = now_ns
         self.actions = []
@@ -182,6 +191,8 @@ class Core:
         )
         if self._estimates:
             stage.learn(service_ns)
+        if self.ladder is not None and not frame.skips:
+            self._step_work(self.ladder, stage, frame, service_ns)
         if unit.duty < FULL_DUTY:
             unit.hold_until_ns = end_ns + service_ns * (FULL_DUTY - unit.duty) // unit.duty
             unit.update_queue_capacity()
@@ -200,6 +211,14 @@ class Core:
         if self.bypass is None or stage is not self.bypass.begin:
             raise ValueError(f"stage {stage.name} skips, but no bypass begins there")
         frame.skips = True
+
+    def _step_work(self, ladder: WorkLadder, stage: StageState, frame: FrameState, service_ns: int) -> None:
+        """Learn what the frame's work takes; on another rung the estimates are of that rung at once."""
+        ladder.learn(stage.position, frame.rung, service_ns)
+        if stage.position == ladder.last and ladder.consider():
+            self.flow.rung = ladder.rung
+            for each in self.stages:
+                each.estimate_ns = ladder.service_ns(each.position, ladder.rung)
 
     def _begin_next(self, unit: UnitState) -> None:
         """The unit's job is over, and the one that it holds, if any, begins."""
@@ -288,6 +307,10 @@ class Core:
             unit.deadline_ns = watchdog.extended_deadline_ns(unit, event.ns)
             unit.head_since_ns += event.ns
         self._reset_alarm()
+
+    def _on_alone(self, event: StageAlone) -> None:
+        if self.ladder is not None:
+            self.ladder.set_alone(self._stage_named[event.stage].position, event.rung, event.ns)
 
     def _on_stop(self, _event: Stop) -> None:
         self.stopping = True

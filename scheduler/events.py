@@ -21,6 +21,7 @@ class Job(NamedTuple):
 
     `slot_in` counts through the slots of the stage's input edge and, where a bypass ends at it, on through those of the
     bypassed edge. `fresh`: the stage at which the bypass begins must not count on what earlier frames left behind.
+    `rung`: of the frame's work (work_ladder.py).
     """
 
     id: int
@@ -31,6 +32,7 @@ class Job(NamedTuple):
     slot_out: int
     epoch: int
     fresh: bool = False
+    rung: int = 0
 
 
 class UnitReady(NamedTuple):
@@ -96,6 +98,14 @@ class SetDuty(NamedTuple):
     permille: int
 
 
+class StageAlone(NamedTuple):
+    """The stage takes `ns` for a frame on `rung` while other units are quiet; said of all rungs, before the start."""
+
+    stage: str
+    rung: int
+    ns: int
+
+
 class Stop(NamedTuple):
     """Admit no more frames; end when those in flight are done."""
 
@@ -135,10 +145,24 @@ class Finish(NamedTuple):
 
 
 UnitEvent = UnitReady | UnitDied | Pinged | Pong | SetDuty
-Event = JobDone | JobFailed | UnitEvent | SchedulerStalled | Stop | FrameRequest | Abort
+RunEvent = SchedulerStalled | StageAlone | Stop | FrameRequest | Abort
+Event = JobDone | JobFailed | UnitEvent | RunEvent
 Action = Dispatch | Kill | Start | Finish
 
-EVENTS = (UnitReady, JobDone, JobFailed, UnitDied, Pinged, Pong, SchedulerStalled, SetDuty, Stop, FrameRequest, Abort)
+EVENTS = (
+    UnitReady,
+    JobDone,
+    JobFailed,
+    UnitDied,
+    Pinged,
+    Pong,
+    SchedulerStalled,
+    SetDuty,
+    StageAlone,
+    Stop,
+    FrameRequest,
+    Abort,
+)
 ACTIONS = (Dispatch, Kill, Start, Finish)
 
 
@@ -222,6 +246,8 @@ class Settings:
     `latch_ns`: the first stage of a frame begins so late that it is expected to end this long before the second can
     take it: the pose is newer, and waits less.
     `deadline_ns`: a frame's time from release to presented.
+    `works`: of each rung of the ladder on which a frame's work is stepped down when it would be late (work_ladder.py),
+    in thousandths, 1000 first, falling; empty: there is none. `follow`: the stages whose time follows the work.
     `in_flight`: frames between pose and presented.
     `in_queue`: released frames that may wait; more are turned away.
     `queue_timeout_ns`: the longest wait there.
@@ -237,6 +263,8 @@ class Settings:
     asked: bool = False
     latch_ns: int = 0
     deadline_ns: int = 0
+    works: tuple[int, ...] = ()
+    follow: tuple[str, ...] = ()
     in_flight: int = 0
     in_queue: int = 0
     queue_timeout_ns: int = 0

@@ -17,7 +17,7 @@ class Flow:
     """Stages, units, edges and the frames in flight. Raises ValueError for an unknown edge.
 
     `dirty`: the units that a step must look at, in the order in which they were marked; a unit may be there twice.
-    `bypass`: of the chain, if it has one.
+    `bypass`: of the chain, if it has one. `rung`: of the work of frames that are admitted from now on.
     """
 
     def __init__(self, graph: Graph, ledger: Ledger, drops: bool) -> None:
@@ -28,6 +28,7 @@ class Flow:
         self.dirty: list[UnitState] = []
         self._graph, self._ledger, self._drops = graph, ledger, drops
         self._jobs = 0
+        self.rung = 0
         self.bypass: Bypass | None = None
         if graph.bypass is not None:
             begin, end = graph.bypass
@@ -39,7 +40,7 @@ class Flow:
 
     def admit(self, frame: int, release_ns: int, deadline_ns: int) -> None:
         """The frame is in flight from now on."""
-        self.frames[frame] = FrameState(release_ns, deadline_ns)
+        self.frames[frame] = FrameState(release_ns, deadline_ns, self.rung)
 
     def begin(self, stage: StageState, frame: int, slot_in: int) -> Job:
         """The stage's job for `frame`: one just admitted, or the one that waits for the stage in `slot_in`."""
@@ -60,7 +61,8 @@ class Flow:
         bypass, fresh = self.bypass, False
         if bypass is not None and stage is bypass.begin:
             fresh, bypass.must_be_fresh = bypass.must_be_fresh, False
-        job = tuple.__new__(Job, (self._jobs, stage.unit.name, stage.name, frame, slot_in, slot_out, epoch, fresh))
+        slots = (slot_in, slot_out, epoch, fresh, self.frames[frame].rung)
+        job = tuple.__new__(Job, (self._jobs, stage.unit.name, stage.name, frame, *slots))
         self._jobs += 1
         return job
 
@@ -84,7 +86,7 @@ class Flow:
                 self.mark_dirty(self.stages[stage.position + 1].unit)
         else:
             frame = self.frames.pop(job.frame)
-            self._ledger.presented(job.frame, end_ns, frame.latency_ns, frame.deadline_ns, frame.skips)
+            self._ledger.presented(job.frame, end_ns, frame.latency_ns, frame.deadline_ns, frame.skips, frame.rung)
             self.mark_dirty(self.stages[0].unit)
 
     def _take(self, bypass: Bypass, job: Job) -> bool:

@@ -102,6 +102,7 @@ class Ledger:
         self.dropped: Counter[Drop] = Counter()
         self.skipped = 0
         self.presented_frames: list[int] = []
+        self.rungs: list[int] = []
         self.presented_ns: list[int] = []
         self.latency_ns: list[int] = []
         self.lateness_ns: list[int] = []
@@ -152,9 +153,12 @@ class Ledger:
     def restart(self, unit: str) -> None:
         self._units[unit].restarts += 1
 
-    def presented(self, frame: int, end_ns: int, latency_ns: int, deadline_ns: int, skipped: bool = False) -> None:
-        """`deadline_ns`: NEVER when the frame has none. `skipped`: it took the bypass."""
+    def presented(
+        self, frame: int, end_ns: int, latency_ns: int, deadline_ns: int, skipped: bool = False, rung: int = 0
+    ) -> None:
+        """`deadline_ns`: NEVER when the frame has none. `skipped`: it took the bypass. `rung`: of its work."""
         self.skipped += skipped
+        self.rungs.append(rung)
         self.presented_frames.append(frame)
         self.presented_ns.append(end_ns)
         self.latency_ns.append(latency_ns)

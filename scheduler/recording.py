@@ -27,7 +27,7 @@ from trilane.scheduler.events import (
 from trilane.scheduler.unit_life import UnitLifeError
 from trilane.unexpected_value import UnexpectedValue
 
-SCHEMA = 5
+SCHEMA = 6
 #: Actions that carry one tuple, which is written in their place.
 CARRIED: dict[Any, Any] = {Dispatch: Job, Finish: Outcome}
 

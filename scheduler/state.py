@@ -117,14 +117,15 @@ class StageState:
 class FrameState:
     """`position`: of its next stage. `ready_ns`: when its last stage ended.
 
-    `latency_ns`: from the pose to the composited frame, once known. `skips`: whether it takes the bypass.
+    `latency_ns`: from the pose to the composited frame, once known. `skips`: whether it takes the bypass. `rung`:
+    of its work.
     """
 
-    __slots__ = ("deadline_ns", "latency_ns", "pose_ns", "position", "ready_ns", "skips")
+    __slots__ = ("deadline_ns", "latency_ns", "pose_ns", "position", "ready_ns", "rung", "skips")
 
-    def __init__(self, release_ns: int, deadline_ns: int) -> None:
+    def __init__(self, release_ns: int, deadline_ns: int, rung: int = 0) -> None:
         self.position, self.ready_ns = 0, release_ns
-        self.deadline_ns = deadline_ns
+        self.deadline_ns, self.rung = deadline_ns, rung
         self.pose_ns = self.latency_ns = 0
         self.skips = False
 

@@ -160,7 +160,7 @@ class VirtualDriver:
         heappush(self._heap, (at_ns, priority, self._sequence, event, epoch))
 
     def _dispatch(self, now_ns: int, job: Job) -> None:
-        job_id, name, stage, frame, _, _, _, fresh = job
+        job_id, name, stage, frame, _, _, _, fresh, _ = job
         unit = self._units[name]
         begin_ns = now_ns + self._message_delay_ns
         if begin_ns < unit.free_ns:

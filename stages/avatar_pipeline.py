@@ -71,4 +71,6 @@ def run_avatar(
     `options`: what `run_pipeline` takes. Raises as `run_pipeline`.
     """
     pipeline = avatar_pipeline(config, assets, edge)
+    if len(config.works) > 1 and not config.pace_ns:
+        options |= {"works": config.works, "follow": config.infer_names}
     return run_pipeline(pipeline, frames or config.scene.frames, fps=config.scene.fps, assets=assets, **options)

@@ -8,7 +8,7 @@ from pathlib import Path
 from pydantic import Field, field_validator
 
 from trilane.pipeline.description import UnitSettings
-from trilane.scene.planner import TensorBudget
+from trilane.scene.planner import ALL_WORK, TensorBudget
 from trilane.scene.schema import Model, Scene
 from trilane.shapes import Shape, shape_buckets
 from trilane.unexpected_value import UnexpectedValue
@@ -32,6 +32,8 @@ class RunConfig(Model):
     `runtime`: that the DSP unit infers with.
     `shapes`: of the tensor, where the scene plans it; else those of its size are used.
     `own_pixels`: of the tensor at which the network was trained.
+    `works`: of a planned tensor in thousandths of those pixels, the most first; a further one is stepped down to when
+    frames would be late.
     `record`: whether the frames are encoded to a video.
     `posed_vertices`: how many of each avatar, when the CPU unit skins; empty when the GPU unit does.
     `pace_ns`: how long a job of a stage is held, at least.
@@ -45,6 +47,7 @@ class RunConfig(Model):
     runtime: str = "ort"
     shapes: tuple[Shape, ...] = ()
     own_pixels: int = 0
+    works: tuple[int, ...] = (ALL_WORK,)
     record: bool = True
     posed_vertices: tuple[int, ...] = ()
     pace_ns: dict[str, int] = Field(default={})
@@ -63,9 +66,10 @@ class RunConfig(Model):
         return list(self.shapes) or shape_buckets(self.scene.size)
 
     @property
-    def tensor_budget(self) -> TensorBudget:
-        """Of a tensor that is planned."""
-        return TensorBudget(self.own_pixels, self.scene.most_side**2)
+    def tensor_budgets(self) -> tuple[TensorBudget, ...]:
+        """Of a tensor that is planned, for each of `works`."""
+        whole = TensorBudget(self.own_pixels, self.scene.most_side**2)
+        return tuple(whole.scaled(work) for work in self.works)
 
     @property
     def budget_px(self) -> float:

@@ -18,6 +18,7 @@ from pydantic import ValidationError
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.integer_network import NetworkFile
 from trilane.avatars.network_split import split
+from trilane.avatars.size_loss import SizeLoss, size_loss
 from trilane.avatars.validation import DrawnAs, accuracy_of
 from trilane.errors import BadInputError, MissingPartError
 from trilane.hw_profiles.host import asked_cores, rule_placement, settings_of, usable_cores
@@ -35,6 +36,7 @@ from trilane.stages.config import NetworkCut, RunConfig
 from trilane.stages.dsp.runtime import RUNTIMES, installed, resolve
 from trilane.stages.foresee import foresee
 from trilane.stages.machine_facts import gl_facts, machine_facts
+from trilane.stages.tensor_works import tensor_works
 from trilane.transport.slots import RULES, edge_rule
 from trilane.unexpected_value import UnexpectedValue
 
@@ -62,6 +64,7 @@ class Request:
     fps: float | None = None
     output: str | None = None
     cores: tuple[str, ...] = ()
+    policy: str = "pipelined"
 
 
 @dataclass(frozen=True)
@@ -70,7 +73,8 @@ class Checked:
 
     `assets`: what was loaded to check it, as the units take it. `notes`: what the loads said of their sources.
     `accuracy`: of each avatar, by its name, what `accuracy_of` says of it. `asked_cores`: of units, by the options.
-    `placement`: what `trilane.stages.placing` says of the units' cores.
+    `placement`: what `trilane.stages.placing` says of the units' cores. `losses`: of each distinct avatar, what smaller
+    tensors cost.
     """
 
     config: RunConfig
@@ -79,6 +83,7 @@ class Checked:
     accuracy: Mapping[str, Any]
     asked_cores: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     placement: Mapping[str, Any] | None = None
+    losses: tuple[SizeLoss, ...] = ()
 
     def changed(self, **values: Any) -> Checked:
         """The same with other `values` of the configuration, such as `out_dir`, `record` or `units`."""
@@ -147,8 +152,11 @@ def configure(request: Request, out_dir: Path, gl: GlFacts = gl_facts) -> Checke
     network = avatars[folders[0]].network
     cuts = requested_cuts(request.split, network)
     unit, why = skinning_unit(request.skinning, gl)
-    budget = TensorBudget(network.shape[1] * network.shape[2], scene.most_side**2)
-    foreseen = foresee(scene, staged, bodies, network, budget) if scene.plans_tensor else None
+    whole = TensorBudget(network.shape[1] * network.shape[2], scene.most_side**2)
+    losses = tuple(size_loss(avatar.bundle) for avatar in avatars.values())
+    works, sizes = tensor_works(scene, request.policy, losses)
+    budgets = [whole.scaled(work) for work in works]
+    foreseen = foresee(scene, staged, bodies, network, budgets) if scene.plans_tensor else None
     config = RunConfig(
         scene=scene,
         out_dir=out_dir,
@@ -156,15 +164,18 @@ def configure(request: Request, out_dir: Path, gl: GlFacts = gl_facts) -> Checke
         units=settings_of(rule_placement(usable_cores(), asked)),
         runtime=runtime,
         shapes=foreseen.shapes.shapes if foreseen else (),
-        own_pixels=budget.own,
+        own_pixels=whole.own,
+        works=works,
         posed_vertices=tuple(len(avatars[folder].shaped.vertices) for folder in folders) if unit == "cpu" else (),
         cuts=cuts,
     )
     notes = (*staged.notes, f"runtime: {runtime} ({reason})", f"skinning: {unit} unit ({why})")
     notes += foreseen.notes(scene.memory_mb) if foreseen else ()
+    notes += (sizes,) if sizes else ()
     drawn = DrawnAs(runtime, scene.size, scene.texture_filter, len(scene.avatars))
     accuracy = _accuracy(list(avatars.values()), drawn)
-    return Checked(config, pack_assets(list(avatars.values()), staged), notes, accuracy, asked)
+    packed = pack_assets(list(avatars.values()), staged)
+    return Checked(config, packed, notes, accuracy, asked, losses=losses)
 
 
 def requested_runtime(asked: str) -> tuple[str, str]:

@@ -18,12 +18,14 @@ from trilane.body.kinematics import Skeleton
 from trilane.scene.crop import Rect
 from trilane.scene.planner import TensorBudget, ideal_shape
 from trilane.scene.schema import Scene
-from trilane.scene.shape_set import Demand, ShapeSet, choose_shapes
+from trilane.scene.shape_set import MOST_SHAPES, Demand, ShapeSet, choose_shapes, joined
 from trilane.scene.staging import Staged
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 
 #: Of the scene, over all avatars; but at least so many of each.
 FORESEEN_FRAMES, LEAST_FRAMES = 96, 24
+#: Shapes of each size that is stepped down to.
+MOST_SMALLER = 3
 #: A network that is ready to run holds its tensors once, and a runtime may lay each of them out anew.
 COPIES = 2
 MB = 1_000_000
@@ -60,24 +62,26 @@ class Foreseen:
 
 
 def foresee(
-    scene: Scene, staged: Staged, bodies: Sequence[ShapedBody], network: NetworkFile, budget: TensorBudget
+    scene: Scene, staged: Staged, bodies: Sequence[ShapedBody], network: NetworkFile, budgets: Sequence[TensorBudget]
 ) -> Foreseen:
     """The tensor shapes that `scene` needs.
 
     `bodies`: of its avatars, in order.
     `network`: that all of them share.
-    `budget`: of its tensors.
+    `budgets`: of its tensors, the largest first; the further ones are stepped down to.
     """
     count = min(scene.frames, max(FORESEEN_FRAMES // len(bodies), LEAST_FRAMES))
     frames = tuple(index * scene.frames // count for index in range(count))
     output = (scene.output.height, scene.output.width)
-    demands = [
-        Demand(ideal_shape(rects, output, budget), budget.of(len(rects)))
-        for rects in foreseen_rects(scene, staged, bodies, frames)
-        if rects
-    ]
-    anyway = demands or [Demand((STRIDE, STRIDE), budget.of(1))]
-    return Foreseen(choose_shapes(anyway, bytes_per_pixel(network), scene.memory_mb * MB), frames, len(demands))
+    seen = [rects for rects in foreseen_rects(scene, staged, bodies, frames) if rects]
+    per_pixel = bytes_per_pixel(network)
+    chosen = ShapeSet((), 0, 0)
+    for budget in budgets:
+        demands = [Demand(ideal_shape(rects, output, budget), budget.of(len(rects))) for rects in seen]
+        anyway = demands or [Demand((STRIDE, STRIDE), budget.of(1))]
+        left = scene.memory_mb * MB - chosen.memory_bytes
+        chosen = joined(chosen, choose_shapes(anyway, per_pixel, left, MOST_SMALLER if chosen.shapes else MOST_SHAPES))
+    return Foreseen(chosen, frames, len(seen))
 
 
 def foreseen_rects(

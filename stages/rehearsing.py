@@ -116,6 +116,7 @@ def _spinning(placement: Placement, cores: int) -> dict[str, Any]:
 
 
 def _one_shape(config: RunConfig) -> str:
-    """The tensor shape nearest to a square."""
-    height, width = min(config.buckets, key=lambda shape: (abs(shape[0] - shape[1]), shape))
+    """The tensor shape nearest to a square, of those that are not stepped down to when frames would be late."""
+    large = [shape for shape in config.buckets if 2 * shape[0] * shape[1] > config.max_tensor_pixels]
+    height, width = min(large, key=lambda shape: (abs(shape[0] - shape[1]), shape))
     return f"{height}x{width}"

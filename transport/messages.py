@@ -27,7 +27,8 @@ class RunJob(NamedTuple):
     `id`: of the job; its answer, `Done` or `Failed`, carries the same. `stage`: place in the unit's list of stages,
     from 0. `slot_in`, `slot_out`: slots of the stage's edges, -1 where it has no such edge; where a bypass ends, those
     of the bypassed edge are counted after the stage's own. `epoch`: of `slot_out`. `t_dispatch_ns`: since when the unit
-    has the job, in ns of CLOCK_MONOTONIC. `fresh`: 1 when the stage must not count on earlier frames, else 0.
+    has the job, in ns of CLOCK_MONOTONIC. `fresh`: 1 when the stage must not count on earlier frames, else 0. `rung`:
+    of the frame's work, 0 for all of it.
     """
 
     id: int
@@ -38,6 +39,7 @@ class RunJob(NamedTuple):
     epoch: int
     t_dispatch_ns: int
     fresh: int
+    rung: int = 0
 
 
 class RunIsolated(NamedTuple):
@@ -47,6 +49,7 @@ class RunIsolated(NamedTuple):
     frame: int
     slot_in: int
     slot_out: int
+    rung: int = 0
 
 
 class Ping(NamedTuple):

@@ -25,6 +25,7 @@ Examples:
   trilane avatar validate my-avatar
   trilane avatar validate my-avatar --held-out builtin:walk-wave-turn --held-out jump.bvh --runtime openvino
   trilane avatar validate default --seed 1 --seed 2 --sheet worst.png
+  trilane avatar validate my-avatar --sizes
 """
 #: Runtimes that are validated when none is given, where they are installed; the first one's figures are the avatar's.
 RUNTIMES = ("ort", "openvino")
@@ -51,6 +52,9 @@ def validate(
     sheet: Annotated[
         Path | None, typer.Option(help="Write a picture: the worst view of each seed beside its ground truth.")
     ] = None,
+    sizes: Annotated[
+        bool, typer.Option("--sizes", help="Only measure what smaller tensors cost; the other figures stay.")
+    ] = False,
     json: JsonOption = False,
 ) -> None:
     """Measure an avatar's image error on held-out views, and write it into the manifest with digests of the files.
@@ -86,7 +90,7 @@ def validate(
         revision=made["revision"],
         modified=made["modified"],
     )
-    validated = _validate(bundle, plan, float_network, sheet)
+    validated = _add_sizes(bundle, plan) if sizes else _validate(bundle, plan, float_network, sheet)
     print_facts({"name": bundle.manifest.name, "validation": validation_facts(validated)}, json)
 
 
@@ -112,6 +116,27 @@ def _validate(bundle: Bundle, plan: ValidationPlan, float_network: Path | None, 
     if sheet is not None:
         _write_sheet(sheet, list(worst.values()), plan.runtimes[0])
     return validated
+
+
+def _add_sizes(bundle: Bundle, plan: ValidationPlan) -> Bundle:
+    """The figures by size of tensor, written beside those that the manifest of `bundle` has, which must be its own."""
+    from rich.progress import Progress
+
+    from trilane.avatars.validation import VALIDATE, name_of, refused
+    from trilane.training import size_figures
+    from trilane.training import validate as work
+
+    validation = bundle.manifest.validation
+    if validation is None or (why := refused(bundle)):
+        found = "no validation" if validation is None else why["why"]
+        command = f"`{VALIDATE} {name_of(bundle.folder)}`"
+        raise BadInputError(bundle.folder, found, "an avatar that was validated as it is", f"{command} comes first")
+    console = stderr_console()
+    with stdout_kept(), Progress(console=console, disable=not console.is_terminal) as progress:
+        task = progress.add_task("painting at several sizes", total=plan.per_band * len(BANDS))
+        renderer = work.open_renderer(bundle, plan.threads)
+        by_size = size_figures.measure_sizes(bundle, plan, renderer, lambda: progress.advance(task))
+    return work.revalidate(bundle, size_figures.with_sizes(validation, by_size))
 
 
 def _psnr_db(sample: Evaluated, plan: ValidationPlan) -> float:

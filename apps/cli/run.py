@@ -167,7 +167,7 @@ def run(
 
         cuts, rule = tuple(split or ()), requested_edge(edge)
         request = Request(scene, motion, camera, background, avatar, frames, size, runtime, hud, skinning, cuts)
-        request = replace(request, fps=fps, output=output, cores=tuple(cores or ()))
+        request = replace(request, fps=fps, output=output, cores=tuple(cores or ()), policy=str(policy))
         checked = configure(request, Path.cwd(), gl)
         chip_pace = _pace(checked.config, profile, pace, slow_motion)
         cap = performance_profile and str(performance_profile)

@@ -34,6 +34,7 @@ MODULES = (
     "scheduler/stats.py",
     "scheduler/unit_life.py",
     "scheduler/virtual.py",
+    "scheduler/work_ladder.py",
     "transport/job_pipe.py",
     "transport/messages.py",
     "transport/slots.py",

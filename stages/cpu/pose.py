@@ -78,7 +78,8 @@ class PoseStage:
         self._fps = scene.fps
         self._output = (scene.output.height, scene.output.width)
         self._buckets, self._plans_tensor = config.buckets, scene.plans_tensor
-        self._budget = config.tensor_budget
+        self._budgets = config.tensor_budgets
+        self._budget = self._budgets[0]
         self._held: Held | None = None
         self._skips = scene.plan == "planned"
         self.plan = FramePlan(Work.NONE, None, None, {})
@@ -147,6 +148,10 @@ class PoseStage:
     def forget(self) -> None:
         """The next frame in which anybody is seen is a full one."""
         self._made.pop(Work.FULL, None)
+
+    def step_to(self, rung: int) -> None:
+        """Tensors have the pixels of `RunConfig.works[rung]` from now on."""
+        self._budget = self._budgets[rung]
 
     def _shown_by(self, work: Work) -> bytes | None:
         return self._made[work].shown if work in self._made else None

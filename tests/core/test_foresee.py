@@ -38,7 +38,7 @@ def test_the_shapes_are_those_of_frames_spread_over_the_scene(avatar: AvatarData
     """96 of 500 frames; each one's ideal shape by itself, and the choice among them."""
     scene = Scene(size="auto", frames=500, output=OutputSpec(width=320, height=240))
     place = staged(scene, avatar)
-    found = foresee(scene, place, [avatar.shaped], avatar.network, OWN)
+    found = foresee(scene, place, [avatar.shaped], avatar.network, [OWN])
     assert found.frames == tuple(k * 500 // 96 for k in range(96))
     seen = [rects for rects in foreseen_rects(scene, place, [avatar.shaped], found.frames) if rects]
     assert found.seen == len(seen) > 90
@@ -64,13 +64,13 @@ def test_so_many_frames_are_looked_at(avatar: AvatarData, frames: int, avatars: 
     """96 over all avatars, but at least 24 of each, and no more than there are."""
     specs = tuple(AvatarSpec(position=(0.5 * k - 2, 0, 0), motion="builtin:idle") for k in range(avatars))
     scene = Scene(size="auto", frames=frames, avatars=specs)
-    found = foresee(scene, staged(scene, avatar), [avatar.shaped] * avatars, avatar.network, OWN)
+    found = foresee(scene, staged(scene, avatar), [avatar.shaped] * avatars, avatar.network, [OWN])
     assert len(found.frames) == looked_at
 
 
 def test_with_nobody_in_view_one_least_shape_is_made_ready(avatar: AvatarData) -> None:
     scene = Scene(size="auto", frames=50, avatars=(AvatarSpec(position=(0.0, 0.0, 40.0)),))
-    found = foresee(scene, staged(scene, avatar), [avatar.shaped], avatar.network, OWN)
+    found = foresee(scene, staged(scene, avatar), [avatar.shaped], avatar.network, [OWN])
     assert (found.shapes.shapes, found.seen) == (((32, 32),), 0)
 
 
@@ -109,7 +109,7 @@ def test_a_configuration_has_the_shapes_the_note_and_the_networks_pixels(tiny_bu
     planned = configure(asked, tmp_path, lambda: {"hardware": False})
     assert planned.config.shapes and list(planned.config.shapes) == planned.config.buckets
     assert planned.config.own_pixels == 64 * 64
-    assert planned.config.tensor_budget == TensorBudget(64 * 64, 512 * 512)
+    assert planned.config.tensor_budgets == (TensorBudget(64 * 64, 512 * 512),)
     names = ", ".join(f"{height}x{width}" for height, width in planned.config.shapes)
     assert f"tensor: planned in shapes {names} (somebody is seen in 30 of 30 frames looked at)" in planned.notes
     fixed = configure(Request("default", avatar=str(tiny_bundle), runtime="ort"), tmp_path, lambda: None)

@@ -18,7 +18,8 @@ from trilane.scene.schema import AvatarSpec, CameraSpec, OutputSpec, PlaneSpec, 
 def test_what_a_scene_leaves_out() -> None:
     assert Scene().model_dump() == {
         "name": "scene", "fps": 30.0, "frames": 300, "size": "256", "background": "room", "hud": False, "planes": (),
-        "texture_filter": "linear", "plan": "planned", "error_budget_px": 0.5, "most_side": 512, "memory_mb": 512,
+        "texture_filter": "linear", "plan": "planned", "error_budget_px": 0.5, "error_budget_db": None,
+        "most_side": 512, "memory_mb": 512,
         "output": {"width": 640, "height": 480},
         "camera": {
             "source": "builtin:orbit", "format": "auto", "fov_y_deg": None, "near_m": 0.05, "far_m": 100.0,

@@ -331,7 +331,7 @@ def test_a_graph_knows_its_units_in_order_and_its_edges_by_name() -> None:
 
 
 def test_the_defaults_of_a_run_are_the_documented_ones() -> None:
-    assert Settings(7) == Settings(7, "pipelined", 0, (), False, 0, 0, 0, 0, 0, 10 * 10**9, 120 * 10**9, 5)
+    assert Settings(7) == Settings(7, "pipelined", 0, (), False, 0, 0, (), (), 0, 0, 0, 10 * 10**9, 120 * 10**9, 5)
     assert VirtualDriver(TWO, Settings(1), lambda *_: 1).recording is None
 
 

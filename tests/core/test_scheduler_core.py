@@ -54,6 +54,7 @@ PURE = (
     "uncertainty",
     "unit_life",
     "watchdog",
+    "work_ladder",
 )
 PURE_BELOW = ("trilane.transport.slots", "trilane.unexpected_value")  # what of the lower layers the core may import
 
@@ -266,8 +267,8 @@ def test_a_file_that_is_no_recording_is_named(tmp_path: Path, text: str) -> None
 def test_a_recording_of_another_schema_is_not_replayed(tmp_path: Path) -> None:
     path = tmp_path / "events.jsonl"
     run("pipelined", keep=True).recording.write(path)
-    path.write_text(path.read_text().replace('"schema": 5', '"schema": 4', 1))
-    with pytest.raises(BadInputError, match=r"line 1: found schema 4; this Trilane reads 5"):
+    path.write_text(path.read_text().replace('"schema": 6', '"schema": 5', 1))
+    with pytest.raises(BadInputError, match=r"line 1: found schema 5; this Trilane reads 6"):
         read(path)
 
 

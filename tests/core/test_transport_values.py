@@ -37,8 +37,8 @@ def words(*values: int) -> bytes:
 
 #: Message -> its bytes: which message it is, its integers, and msgpack of what is left when that is not empty.
 BYTES = [
-    (messages.RunJob(1, 2, 3, -1, 5, 6, 7, 8), b"\0" + words(1, 2, 3, -1, 5, 6, 7, 8)),
-    (messages.RunIsolated(1, 2, -1, 4), b"\1" + words(1, 2, -1, 4)),
+    (messages.RunJob(1, 2, 3, -1, 5, 6, 7, 8, 9), b"\0" + words(1, 2, 3, -1, 5, 6, 7, 8, 9)),
+    (messages.RunIsolated(1, 2, -1, 4, 5), b"\1" + words(1, 2, -1, 4, 5)),
     (messages.Ping(), b"\2"),
     (messages.Close(), b"\3"),
     (messages.Ready(77), b"\4" + words(77)),

@@ -25,6 +25,8 @@ BAD_FRAME = 3
 PAYLOAD_BYTES = 4096
 CHECKED_BYTES = 64
 FULL_EVERY = 7
+STEPPED_WORKS = (1000, 200)
+SLOW_FRAMES = range(10, 30)
 
 
 class StageDouble:
@@ -72,6 +74,34 @@ class SkippingDouble(StageDouble):
         self._must_be_fresh = True
 
 
+class SteppedDouble(StageDouble):
+    """A first stage that hands the rung of the frame's work on in the payload."""
+
+    _rung = 0
+
+    def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
+        metrics = super().run(frame, slot_in, slot_out)
+        assert slot_out is not None
+        self._outputs[slot_out].payload[CHECKED_BYTES] = self._rung
+        return {**metrics, "rung": float(self._rung)}
+
+    def step_to(self, rung: int) -> None:
+        self._rung = rung
+
+
+class SteppingDouble(StageDouble):
+    """A second stage that takes its time in proportion to the work of the frame's rung, three times as long if slow.
+
+    `behaviour`: milliseconds of all the work.
+    """
+
+    def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
+        assert slot_in is not None
+        work = STEPPED_WORKS[int(self._inputs[slot_in].payload[CHECKED_BYTES])] / STEPPED_WORKS[0]
+        self._spend_s = float(self._behaviour) / 1000 * work * (3 if frame in SLOW_FRAMES else 1)
+        return super().run(frame, slot_in, slot_out)
+
+
 def _check(packet: Packet, frame: int) -> None:
     if int(packet.header["frame"]) != frame:
         raise RuntimeError(f"header of frame {packet.header['frame']} for frame {frame}")
@@ -91,6 +121,31 @@ def build_skipping(settings: Mapping[str, Any], unit: UnitContext) -> SkippingDo
     """A first stage like that of `build`, at which a bypass begins."""
     unit.use_device("a double, which works while it sleeps")
     return SkippingDouble(settings["behaviour"], settings["log"])
+
+
+def build_stepped(settings: Mapping[str, Any], unit: UnitContext) -> StageDouble:
+    """A first stage that is told the rung of a frame's work, or a stage that follows the work, or any other."""
+    unit.use_device("a double, which works while it sleeps")
+    kinds = {"pose": SteppedDouble, "infer": SteppingDouble}
+    return kinds.get(settings["stage"], StageDouble)(settings["behaviour"], None)
+
+
+def stepped_pipeline(ms: float) -> Pipeline:
+    """Three stages, of which `infer` takes `ms` for all the work of a frame."""
+    return Pipeline(
+        stages=tuple(
+            PipelineStage(
+                name=name,
+                unit=unit,
+                factory="trilane.testing.doubles:build_stepped",
+                settings={"stage": name, "behaviour": behaviour},
+            )
+            for name, unit, behaviour in (("pose", "cpu", "0"), ("infer", "dsp", str(ms)), ("present", "cpu", "0"))
+        ),
+        edges=(PipelineEdge(payload_bytes=PAYLOAD_BYTES),) * 2,
+        units=host_units(),
+        latency_to="infer",
+    )
 
 
 def pipeline_of_doubles(

@@ -1,0 +1,63 @@
+"""What it cost to be in time: for how many frames the tensor was stepped down, to what size, and the error of that.
+
+Rule: frames are counted by the run; the error is the avatars' own, from their validation, or said to be unknown.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+from trilane.apps.report import Resolution, TensorSize
+from trilane.avatars.size_loss import SizeLoss
+from trilane.scene.planner import ALL_WORK
+from trilane.stages.config import RunConfig
+
+
+def resolution_of(rungs: Sequence[int], config: RunConfig, losses: Sequence[SizeLoss]) -> dict[str, Any]:
+    """The report's `resolution`.
+
+    `rungs`: of each presented frame. `losses`: of the scene's avatars.
+    """
+    counts = Counter(rungs)
+    sizes = [
+        {
+            "work": work / ALL_WORK,
+            "most_pixels": budget.own,
+            "frames": counts[rung],
+            "psnr_loss_db": _worst(work, losses),
+        }
+        for rung, (work, budget) in enumerate(zip(config.works, config.tensor_budgets, strict=True))
+    ]
+    return {
+        "sizes": sizes,
+        "switches": sum(before != after for before, after in pairwise(rungs)),
+        "loss_source": "; ".join(dict.fromkeys(loss.source for loss in losses)),
+    }
+
+
+def _worst(work: int, losses: Sequence[SizeLoss]) -> float | None:
+    """The largest loss of an avatar; None when one's is not known."""
+    found = [loss.at(work) for loss in losses]
+    known = [db for db in found if db is not None]
+    return max(known) if known and len(known) == len(found) else None
+
+
+def resolution_note(resolution: Resolution) -> str:
+    """A sentence for a person; empty when every frame had all its pixels."""
+    less = [size for size in resolution.sizes[1:] if size.frames]
+    if not less:
+        return ""
+    total = sum(size.frames for size in resolution.sizes)
+    parts = ", ".join(_said(size) for size in less)
+    return (
+        f"resolution: to be in time {sum(size.frames for size in less)} of {total} presented frames had smaller "
+        f"tensors: {parts}; {resolution.switches} switches (error: {resolution.loss_source})"
+    )
+
+
+def _said(size: TensorSize) -> str:
+    loss = f", {size.psnr_loss_db:.1f} dB worse" if size.psnr_loss_db is not None else ""
+    return f"{size.frames} of at most {size.most_pixels} pixels an avatar{loss}"
