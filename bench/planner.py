@@ -22,6 +22,7 @@ from trilane.bench.lib.cast import Cast
 from trilane.bench.lib.full_picture import FullPictures
 from trilane.bench.lib.picture_error import PictureErrors, require_metrics
 from trilane.bench.lib.plans import fixed, in_frames, planned
+from trilane.bench.lib.shape_changes import shape_changes, summed_up
 from trilane.bench.lib.stage_chain import AvatarFrames
 from trilane.bench.lib.true_picture import TruePictures, has_truth
 from trilane.errors import BadInputError, TrilaneError
@@ -60,7 +61,8 @@ def measure(
     `psnr_planned_db`, `ssim_*`, `flip_*` of the frames against those of
     `full`, the same with `box_` in the avatars' rectangles, None with nobody in view; PSNR is that of the mean square
     over all frames; `truth`: the same against the clothed body that the default
-    avatar was trained on, `full` too; `network`: what paints `full`; `tensors`: the planned ones. `median_speedup`,
+    avatar was trained on, `full` too; `network`: what paints `full`; `tensors`: the planned ones; `shape_changes`: what
+    `trilane.bench.lib.shape_changes.summed_up` says of the planned frames, all of the scene's. `median_speedup`,
     `least_speedup`, `largest_loss_db` (fixed minus planned); `sources`; `driver`; `config`.
 
     Raises BadInputError, MissingPartError, TrilaneError when a run fails.
@@ -162,6 +164,7 @@ class _Scene:
             "truth": _figures(against_true) if true is not None else None,
             "network": "; ".join(full.networks),
             "tensors": sorted(set(tensors)),
+            "shape_changes": summed_up(shape_changes(chains["planned"], cast, total)),
         }, sheets
 
 

@@ -31,6 +31,7 @@ from trilane.stages.gpu.detected_planes import PlanePainter
 from trilane.stages.gpu.drawn_frames import Drawing, DrawnFrames
 from trilane.stages.gpu.head_up_display import Hud
 from trilane.stages.gpu.opengl_context import CONTEXT, checked, describe, open_context
+from trilane.stages.gpu.shape_change import ShapeChange
 from trilane.stages.gpu.still_background import StillBackground
 from trilane.transport.packets import Packet
 
@@ -70,6 +71,7 @@ class CompositeStage:
         self._hud = Hud(ctx) if hud else None
         self._shadow = ShadowPainter(ctx, len(DISCS) * len(rest))
         self._painter = AvatarPainter(ctx, list(shapes))
+        self._change = ShapeChange(rest)
         self._held: NDArray[np.void] | None = None  # header of the frame whose picture of the avatars was uploaded
         self._shows_background = 0  # grows with each picture of it
         self._drawn = DrawnFrames()
@@ -122,10 +124,13 @@ class CompositeStage:
                 self._shows_background += 1
                 self._picture.upload(picture)
         if int(pose["work"]) == Work.FULL:
+            self._change.note(self._held, pose)
             self._held = pose.copy()
             if _visible(pose):
                 shape = _tensor_shape(pose)
                 self._painter.upload(shape, image[: math.prod(shape) * 4])
+                for change in self._change.blends(pose):
+                    self._painter.blend(shape, change)
 
     def _holds(self, picture: int) -> bool:
         """Whether the picture of the avatars that was uploaded is that of frame `picture`."""

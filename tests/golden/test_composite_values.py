@@ -24,6 +24,7 @@ from trilane.stages.gpu.composite import CompositeStage
 from trilane.stages.gpu.composite_painters import AvatarPainter, PicturePainter, RoomPainter, ShadowPainter
 from trilane.stages.gpu.contact_shadows import floor_discs
 from trilane.stages.gpu.detected_planes import PlanePainter, half_sides
+from trilane.stages.gpu.shape_change import Blend
 from trilane.stages.packets import pose_dtype
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 
@@ -455,3 +456,29 @@ def test_the_room_holds_the_camera_at_eight_instants_of_the_scene(frames: int, e
     eyes = composite.room_eyes(SimpleNamespace(sample=sample), SimpleNamespace(frames=frames, fps=25.0))  # type: ignore[arg-type]
     assert asked == pytest.approx([frame / 25 for frame in expected])
     np.testing.assert_allclose(eyes, [(-3.0, -2.0, frame / 25) for frame in expected], rtol=1e-6)
+
+
+def test_an_older_picture_of_another_shape_is_blended_in_light_times_alpha(gl: Any) -> None:
+    """A quarter of the new picture and three of the old one, where both have it; elsewhere the new one alone."""
+    shape, old_shape = (12, 16), (24, 20)
+    image, old = noise(shape, 4, seed=3), noise(old_shape, 4, seed=4)
+    painter = AvatarPainter(gl, [shape, old_shape])
+    painter.upload(old_shape, old.reshape(-1))
+    painter.upload(shape, image.reshape(-1))
+    cell, part = (2, 3, 8, 10), (3, 4, 14, 12)
+    change = Blend(old_shape, cell, part, (1.5, 2.0), (-2.0, -3.0), 0.75)
+    painter.blend(shape, change)
+
+    def light(picture: NDArray[np.uint8]) -> NDArray[np.float64]:
+        alpha = picture[..., 3:] / 255
+        return np.concatenate([linear(picture[..., :3]) * alpha, alpha], axis=-1)
+
+    rows, columns = np.mgrid[: shape[0], : shape[1]] + 0.5
+    x, y = columns * 1.5 - 2.0, rows * 2.0 - 3.0
+    inside = (columns > 3) & (columns < 13) & (rows > 2) & (rows < 10) & (x >= 4) & (x <= 16) & (y >= 3) & (y <= 17)
+    u, v = np.clip(x, 4.5, 15.5) / old_shape[1], np.clip(y, 3.5, 16.5) / old_shape[0]
+    mixed = 0.25 * light(image) + 0.75 * float_raster.sample(light(old), np.stack([u, v], axis=-1))
+    expected = np.where(inside[..., None], mixed, light(image))
+    found = np.frombuffer(painter._pictures[shape][2].read(), np.float16).reshape(*shape, 4)
+    assert inside.sum() == 7 * 8
+    assert np.abs(found - expected).max() < 4e-3  # FP16, and the driver's weights of eight bits
