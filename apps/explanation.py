@@ -9,16 +9,18 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 from trilane.apps.plan_cost import CostModel, FrameCost
+from trilane.apps.resolution import worst_loss
 from trilane.apps.scene_plan import PlannedFrame, ScenePlan, phases
-from trilane.body.detail import DETAILS
+from trilane.body.detail import DETAILS, left_out
 from trilane.figure_sources import COMPUTED, MEASURED
-from trilane.scene.planner import MOST_DENSITY
+from trilane.scene.planner import ALL_WORK, MOST_DENSITY
 from trilane.scene.work import Work
 from trilane.shapes import Shape
-from trilane.stages.avatar_assets import network_of
+from trilane.stages.avatar_assets import distinct, network_of, shaped_body
 from trilane.stages.configure import Checked
 from trilane.stages.cpu.pose import FramePlan
 
@@ -57,7 +59,8 @@ def explain(checked: Checked, profile: str, performance_profile: str, most_measu
             measured = len(rows) < most_measured
             rows.append([plan.measured_px(frame, avatar) if measured else None for avatar in planned.plan.seen])
         frames.append(planned)
-    groups, names = phases(frames), [str(spec.name) for spec in scene.avatars]
+    groups, bodies = phases(frames), _Bodies(checked)
+    names = [str(spec.name) for spec in scene.avatars]
     document = {
         "scene": scene.name,
         "config": {
@@ -66,12 +69,14 @@ def explain(checked: Checked, profile: str, performance_profile: str, most_measu
             "plan": scene.plan,
             "size": scene.size,
             "error_budget_px": scene.error_budget_px,
+            "error_budget_db": scene.error_budget_db,
             "profile": profile,
             "performance_profile": performance_profile,
         },
         "shapes": [list(shape) for shape in checked.config.buckets],
         "avatars": [_avatar(checked, number) for number in range(len(scene.avatars))],
-        "phases": [_phase(group, errors, costs, names) for group, errors in zip(groups, rows, strict=True)],
+        "phases": [_phase(group, errors, costs, names, bodies) for group, errors in zip(groups, rows, strict=True)],
+        "image": _image(checked),
         "totals": _totals(frames, costs),
         "placement": costs.placement(_usual_shape(frames)),
         "notes": list(checked.notes),
@@ -83,6 +88,28 @@ def explain(checked: Checked, profile: str, performance_profile: str, most_measu
         },
     }
     return Explanation(document, plan, [group[0] for group in groups])
+
+
+class _Bodies:
+    """What levels of detail leave out of the avatars' bodies."""
+
+    def __init__(self, checked: Checked) -> None:
+        folders = distinct(checked.config)
+        bodies = [shaped_body(checked.assets, number).body for number in range(len(folders))]
+        self._bodies = [bodies[folders.index(folder)] for folder in checked.config.avatar_dirs]
+        self.left_out = cache(self._left_out)
+
+    def _left_out(self, avatar: int, level: int) -> list[str]:
+        return left_out(DETAILS[level], self._bodies[avatar])
+
+
+def _image(checked: Checked) -> dict[str, Any]:
+    """The share of its network's own pixels that a planned tensor may have, and what that costs the avatars."""
+    if not checked.config.scene.plans_tensor:
+        return {"work": None, "psnr_loss_db": None, "source": "the scene fixes the tensor's size"}
+    work = checked.config.works[0]
+    sources = "; ".join(dict.fromkeys(loss.source for loss in checked.losses))
+    return {"work": work / ALL_WORK, "psnr_loss_db": worst_loss(work, checked.losses), "source": sources}
 
 
 def _avatar(checked: Checked, number: int) -> dict[str, Any]:
@@ -100,7 +127,11 @@ def _avatar(checked: Checked, number: int) -> dict[str, Any]:
 
 
 def _phase(
-    group: Sequence[PlannedFrame], errors: Sequence[float | None], costs: CostModel, names: Sequence[str]
+    group: Sequence[PlannedFrame],
+    errors: Sequence[float | None],
+    costs: CostModel,
+    names: Sequence[str],
+    bodies: _Bodies,
 ) -> dict[str, Any]:
     first = group[0].plan
     cost = _cost(first, costs)
@@ -116,6 +147,7 @@ def _phase(
                 "avatar": number,
                 "name": names[number],
                 "modelled": DETAILS[one.level].name,
+                "left_out": bodies.left_out(number, one.level),
                 "bound_px": max(planned.plan.seen[number].error_px for planned in group),
                 "measured_px": error,
             }

@@ -27,7 +27,7 @@ def resolution_of(rungs: Sequence[int], config: RunConfig, losses: Sequence[Size
             "work": work / ALL_WORK,
             "most_pixels": budget.own,
             "frames": counts[rung],
-            "psnr_loss_db": _worst(work, losses),
+            "psnr_loss_db": worst_loss(work, losses),
         }
         for rung, (work, budget) in enumerate(zip(config.works, config.tensor_budgets, strict=True))
     ]
@@ -38,7 +38,7 @@ def resolution_of(rungs: Sequence[int], config: RunConfig, losses: Sequence[Size
     }
 
 
-def _worst(work: int, losses: Sequence[SizeLoss]) -> float | None:
+def worst_loss(work: int, losses: Sequence[SizeLoss]) -> float | None:
     """The largest loss of an avatar; None when one's is not known."""
     found = [loss.at(work) for loss in losses]
     known = [db for db in found if db is not None]

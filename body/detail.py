@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import F32, F64
-from trilane.body.body import ShapedBody
+from trilane.body.body import Body, ShapedBody
 from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINTS
 from trilane.body.kinematics import Posed
 from trilane.body.skin_weights import branch_sums, joint_distance, largest_weights
@@ -56,6 +56,22 @@ class Detail:
         if count is None or np.count_nonzero(weights, axis=1).max() <= count:
             return weights
         return largest_weights(weights, count).dense()
+
+
+def left_out(detail: Detail, body: Body) -> list[str]:
+    """What `detail` does not model of `body`, in words; empty when that is nothing."""
+    found = []
+    weights = body.weights
+    if not detail.hands_and_face:
+        found.append("turns of fingers, jaw and eyes")
+        weights = carried(weights)
+    count = detail.weight_count
+    cut = 0 if count is None else int((np.count_nonzero(weights, axis=1) > count).sum())
+    if cut:
+        found.append(f"all but the {count} largest skin weights of {cut} of {len(weights)} vertices")
+    if not detail.pose_blend and body.posedirs is not None:
+        found.append("pose blend shapes")
+    return found
 
 
 #: From the least work to all of it.

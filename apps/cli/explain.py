@@ -100,6 +100,8 @@ def _show(document: dict[str, Any]) -> None:
     left = len(document["phases"]) - MOST_ROWS
     if left > 0:
         console.print(f"{left} more phases: --json has all of them")
+    for line in (*_left_out(document["phases"]), _image(document["image"])):
+        console.print(line, soft_wrap=True, markup=False)
     console.print(READ_SO, soft_wrap=True)
     firsts = {phase["why"]: phase["first_frame"] for phase in reversed(document["phases"])}
     for why, first in sorted(firsts.items(), key=lambda one: one[1]):
@@ -120,7 +122,7 @@ def _drawn(row: dict[str, Any]) -> str:
 def _table(phases: list[dict[str, Any]]) -> Table:
     from rich.table import Table
 
-    table = Table("frames", "tensor", "density", "avatar: modelled, bound / measured px", "work saved, ms")
+    table = Table("frames", "tensor", "density", "avatar: modelled, bound / measured px", "saved: kpixel, GMAC, ms")
     for phase in phases[:MOST_ROWS]:
         tensor, density = phase["tensor"], phase["density"]
         table.add_row(
@@ -128,9 +130,30 @@ def _table(phases: list[dict[str, Any]]) -> Table:
             f"{tensor[0]}x{tensor[1]}" if tensor and phase["work"] == "full" else phase["work"],
             f"{density[0]:.2f}-{density[1]:.2f}" if density else "-",
             _modelled(phase["avatars"]) or "-",
-            f"{phase['saved']['work_ms']:.1f}",
+            _saved(phase["saved"]),
         )
     return table
+
+
+def _saved(saved: dict[str, float]) -> str:
+    return f"{saved['pixels'] / 1000:.0f}, {saved['gmac']:.1f}, {saved['work_ms']:.1f}"
+
+
+def _left_out(phases: list[dict[str, Any]]) -> list[str]:
+    """A line for each way in which avatars are modelled: what it leaves out of them."""
+    rows = [row for phase in phases for row in phase["avatars"]]
+    lines = {}
+    for row in rows:
+        out = ", ".join(row["left_out"]) or "nothing that this body has"
+        lines[row["modelled"], out] = f'"{row["modelled"]}" leaves out {out}'
+    return list(lines.values())
+
+
+def _image(image: dict[str, Any]) -> str:
+    if image["work"] is None:
+        return f"image: {image['source']}"
+    loss = "an unknown loss" if image["psnr_loss_db"] is None else f"{image['psnr_loss_db']:.1f} dB lost"
+    return f"image: {image['work']:.0%} of the pixels that the network was trained for, {loss} ({image['source']})"
 
 
 def _modelled(rows: list[dict[str, Any]]) -> str:

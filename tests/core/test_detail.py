@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F64
 from trilane.body.body import ShapedBody, load_body
-from trilane.body.detail import CARRIED_BY, DETAILS, EVERYTHING, ROUNDING_M, DetailBounds, carried
+from trilane.body.detail import CARRIED_BY, DETAILS, EVERYTHING, ROUNDING_M, DetailBounds, carried, left_out
 from trilane.body.joints import JOINT_INDEX, JOINTS
 from trilane.body.kinematics import Skeleton
 from trilane.body.skinning import CpuSkinner, FrameSkinner
@@ -247,3 +248,19 @@ def test_a_rectangle_grows_by_the_error() -> None:
     grown = widened(Rect(-half, -half, half, half), 3.2, OUTPUT)
     assert grown == pytest.approx((-half - x, -half - y, half + x, half + y))
     assert widened(Rect(-1.0, -1.0, 1.0, 0.0), 3.2, OUTPUT) == pytest.approx((-1.0, -1.0, 1.0, y))
+
+
+def test_what_a_level_leaves_out_is_said_in_words() -> None:
+    """Of three vertices the first has five weights, all on the body, the second two of a hand, the third one."""
+    weights = np.zeros((3, JOINTS), np.float32)
+    weights[0, :5] = 0.2
+    weights[1, [JOINT_INDEX["left_index1"], JOINT_INDEX["left_index2"]]] = 0.5
+    weights[2, 0] = 1.0
+    body = SimpleNamespace(weights=weights, posedirs=None)
+    cut = "all but the 4 largest skin weights of 1 of 3 vertices"
+    assert left_out(DETAILS[0], body) == ["turns of fingers, jaw and eyes", cut]  # type: ignore[arg-type]
+    assert left_out(DETAILS[1], body) == [cut]  # type: ignore[arg-type]
+    assert left_out(DETAILS[2], body) == left_out(EVERYTHING, body) == []  # type: ignore[arg-type]
+    body.posedirs = np.zeros((3, 3, 486))
+    assert left_out(DETAILS[2], body) == ["pose blend shapes"]  # type: ignore[arg-type]
+    assert left_out(DETAILS[3], body) == []  # type: ignore[arg-type]
