@@ -1,7 +1,9 @@
-"""What softens a change of the tensor's shape: for some frames the last picture of the old shape is blended in.
+"""What softens a change of the tensor's size: for some frames the last picture of the old size is blended in.
 
 Rule: the old picture is moved and scaled with the avatar's pelvis, so that it lies where the avatar is now; it is
-blended in only where its frame came shortly before.
+blended in only where its frame came shortly before, and where an avatar has clearly more or fewer pixels than then:
+between shapes of about the same density there is nothing to soften, and the old pose would be seen
+(docs/decisions/planner.md has the figures).
 """
 
 from __future__ import annotations
@@ -20,6 +22,8 @@ from trilane.shapes import Shape
 FRAMES = 3
 #: The old picture is at most so many frames older than the first one of the new shape; a policy may have dropped some.
 MOST_GAP = 3
+#: Of the pixels along a side that an avatar has, from one shape to the other.
+LEAST_CHANGE = 1.2
 
 
 class Blend(NamedTuple):
@@ -73,6 +77,8 @@ class ShapeChange:
         grown = old_w / w
         across = _axis(now, old, (0, 1), (x, old_x), grown)
         down = _axis(now, old, (1, -1), (y, old_y), grown)
+        if max(max(scale, 1 / scale) for scale, _ in (across, down)) < LEAST_CHANGE:
+            return None
         cell, part = (_cell(avatar) for avatar in (now, old))
         shape = (int(before["tensor_shape"][0]), int(before["tensor_shape"][1]))
         return Blend(shape, cell, part, (across[0], down[0]), (across[1], down[1]), share)

@@ -64,11 +64,16 @@ def test_the_old_picture_goes_where_the_pelvis_goes_and_grows_with_it() -> None:
     assert only.offset == pytest.approx((48, -16))
 
 
-def test_nothing_is_blended_of_long_ago_of_one_shape_of_the_unseen_or_of_one_behind_the_camera() -> None:
+def test_nothing_is_blended_of_long_ago_of_one_density_of_the_unseen_or_of_one_behind_the_camera() -> None:
     before = header(10, *LARGE, (0, 0, -2))
     for frame, count in ((10 + MOST_GAP, 1), (11 + MOST_GAP, 0), (9, 0)):
         assert len(change(before, header(frame, *SMALL, (0, 0, -2)))[0]) == count
     assert change(before, header(11, *LARGE, (0, 0, -2))) == [[]]
+    as_dense = header(11, (64, 96), (-0.375, -0.25, 0.375, 0.25), (0, 0, -2))
+    assert change(before, as_dense) == [[]]
+    nearer = header(11, (76, 152), LARGE[1], (0, 0, -2))
+    assert change(before, nearer) == [[]]  # 19 % more along a side
+    assert len(change(before, header(11, (78, 156), LARGE[1], (0, 0, -2)))[0]) == 1  # 22 %
     unseen = header(11, *SMALL, (0, 0, -2))
     unseen["avatars"][0]["visible"] = 0
     assert change(before, unseen) == [[]]
