@@ -46,17 +46,25 @@ def test_the_shapes_are_those_of_frames_spread_over_the_scene(avatar: AvatarData
     assert found.shapes == choose_shapes(demands.elements(), bytes_per_pixel(avatar.network), 512 * MB)
 
 
-def test_a_scenes_megabytes_are_a_million_bytes(avatar: AvatarData, monkeypatch: pytest.MonkeyPatch) -> None:
-    budgets: list[Any] = []
+def test_a_scenes_megabytes_are_a_million_bytes_and_smaller_sizes_get_what_is_left(
+    avatar: AvatarData, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ten shapes of the first size, three of each further one."""
+    given: list[tuple[int, int]] = []
+    taken: list[int] = []
 
-    def chosen(demands: Any, pixel_bytes: Any, budget: Any) -> Any:
-        budgets.append(budget)
-        return choose_shapes(demands, pixel_bytes, budget)
+    def chosen(demands: Any, pixel_bytes: Any, memory_bytes: int, most_shapes: int) -> Any:
+        given.append((memory_bytes, most_shapes))
+        found = choose_shapes(demands, pixel_bytes, memory_bytes, most_shapes)
+        taken.append(found.memory_bytes)
+        return found
 
     monkeypatch.setattr("trilane.stages.foresee.choose_shapes", chosen)
     scene = Scene(size="auto", frames=1, memory_mb=300)
-    foresee(scene, staged(scene, avatar), [avatar.shaped], avatar.network, OWN)
-    assert budgets == [300_000_000]
+    found = foresee(scene, staged(scene, avatar), [avatar.shaped], avatar.network, [OWN, OWN.scaled(563)])
+    assert given == [(300_000_000, 10), (300_000_000 - taken[0], 3)]
+    assert found.shapes.memory_bytes == sum(taken)
+    assert [area <= 128 * 128 * 563 // 1000 for area in map(prod, found.shapes.shapes)] == [True, False]
 
 
 @pytest.mark.parametrize(("frames", "avatars", "looked_at"), [(500, 1, 96), (40, 1, 40), (500, 3, 32), (500, 8, 24)])
