@@ -78,7 +78,7 @@ def explain(checked: Checked, profile: str, performance_profile: str, most_measu
         "phases": [_phase(group, errors, costs, names, bodies) for group, errors in zip(groups, rows, strict=True)],
         "image": _image(checked),
         "totals": _totals(frames, costs),
-        "placement": costs.placement(_usual_shape(frames)),
+        "placement": costs.placement(*_usual(frames)),
         "notes": list(checked.notes),
         "sources": {
             "bound_px": BOUND,
@@ -155,12 +155,12 @@ def _phase(
         ],
         "why": _why(group),
         "cost": cost.as_json(),
-        "saved": _saved(cost, costs.of(FIXED)),
+        "saved": _saved(cost, costs.of(FIXED, len(first.seen))),
     }
 
 
 def _cost(plan: FramePlan, costs: CostModel) -> FrameCost:
-    return costs.of(plan.shape if plan.work is Work.FULL else None)
+    return costs.of(plan.shape, len(plan.seen)) if plan.work is Work.FULL else costs.of(None)
 
 
 def _least(group: Sequence[PlannedFrame]) -> float:
@@ -191,24 +191,23 @@ def _saved(cost: FrameCost, fixed: FrameCost) -> dict[str, float]:
     }
 
 
-def _usual_shape(frames: Sequence[PlannedFrame]) -> Shape | None:
-    """The shape of most full frames; None without any."""
-    shapes = Counter(planned.plan.shape for planned in frames if planned.plan.work is Work.FULL)
-    return shapes.most_common(1)[0][0] if shapes else None
+def _usual(frames: Sequence[PlannedFrame]) -> tuple[Shape | None, int]:
+    """The shape of most full frames, and how many avatars are in view there; None and 0 without any."""
+    kinds = Counter((one.plan.shape, len(one.plan.seen)) for one in frames if one.plan.work is Work.FULL)
+    return kinds.most_common(1)[0][0] if kinds else (None, 0)
 
 
 def _totals(frames: Sequence[PlannedFrame], costs: CostModel) -> dict[str, Any]:
-    """Of all frames, planned and with the fixed square."""
+    """Of all frames, planned and with the fixed square, which shows the same avatars."""
     planned = [_cost(one.plan, costs) for one in frames]
-    fixed = costs.of(FIXED)
-    work, whole = sum(cost.work_ms for cost in planned), fixed.work_ms * len(frames)
+    fixed = [costs.of(FIXED, len(one.plan.seen)) for one in frames]
     return {
         "pixels": sum(cost.pixels for cost in planned),
-        "fixed_pixels": fixed.pixels * len(frames),
+        "fixed_pixels": sum(cost.pixels for cost in fixed),
         "gmac": sum(cost.gmac for cost in planned),
-        "fixed_gmac": fixed.gmac * len(frames),
-        "work_ms": work,
-        "fixed_work_ms": whole,
+        "fixed_gmac": sum(cost.gmac for cost in fixed),
+        "work_ms": sum(cost.work_ms for cost in planned),
+        "fixed_work_ms": sum(cost.work_ms for cost in fixed),
         "frame_ms": sum(cost.frame_ms for cost in planned) / len(frames),
-        "fixed_frame_ms": fixed.frame_ms,
+        "fixed_frame_ms": sum(cost.frame_ms for cost in fixed) / len(frames),
     }

@@ -47,7 +47,7 @@ class Pace:
 def pace_of(config: RunConfig, profile: str, slow_motion: float = 1.0, performance_profile: str = SUSTAINED) -> Pace:
     """The pace of `config` on the chip `profile`: a name or a TOML file. Raises BadInputError.
 
-    The network's time is that of the largest tensor that the scene's size allows.
+    Times are those of the largest tensor that the scene's size allows, with all of its avatars in view.
     """
     if not 0 < slow_motion <= MAX_SLOW_MOTION:
         raise BadInputError("--slow-motion", f"{slow_motion:g}", f"above 0, at most {MAX_SLOW_MOTION:g}")
@@ -56,7 +56,8 @@ def pace_of(config: RunConfig, profile: str, slow_motion: float = 1.0, performan
     file = load_bundle(config.avatar_dirs[0]).read_network()
     facts = {"avatar": config.avatar_dirs[0].name}
     network = Network(facts, height, width, file.shape[3], "packed", count_work(reshaped(file, height, width).model))
-    times = stage_times_ms(chip, Plan(network, "dsp"), corners_of(chip, performance_profile))
+    plan = Plan(network, "dsp", avatars=len(config.avatar_dirs))
+    times = stage_times_ms(chip, plan, corners_of(chip, performance_profile))
     held = {stage: round(ms * slow_motion * 1e6) for (stage, _), ms in times.items()}
     return Pace(chip.name, performance_profile, slow_motion, held)
 

@@ -1,5 +1,5 @@
 """What a tensor of a shape costs: pixels, products, and milliseconds by a hardware profile. Rule: computed, never
-measured, by the same model as `trilane predict`.
+measured, by the same model as `trilane predict`; joints and vertices count for each avatar in view.
 """
 
 from __future__ import annotations
@@ -51,16 +51,19 @@ def least_frame_ms(chip: Profile, times: Mapping[tuple[str, UnitName], float]) -
 
 
 class CostModel:
-    """Costs of frames of one avatar's network on the chip `profile`. Raises BadInputError for an unknown profile."""
+    """Costs of frames on the chip `profile`. Raises BadInputError for an unknown profile."""
 
     def __init__(self, network: NetworkFile, profile: str, performance_profile: str) -> None:
         self._network, self._chip = network, load_runnable(profile)
         self._corners = corners_of(self._chip, performance_profile)
         self.of = cache(self._of)
 
-    def _of(self, shape: Shape | None) -> FrameCost:
-        """The cost of a frame whose tensor has `shape`; None for one that needs none."""
-        plan = Plan(self._described(shape or self._network.shape[1:3]), "dsp", PIPELINED)
+    def _of(self, shape: Shape | None, avatars: int = 1) -> FrameCost:
+        """The cost of a frame whose tensor has `shape`, None for one that needs none, with so many `avatars` in view.
+
+        With nobody in view somebody is looked for, which counts as one avatar's pose.
+        """
+        plan = self._plan(shape, avatars)
         times = stage_times_ms(self._chip, plan, self._corners)
         if shape is None:
             kept = {key: ms for key, ms in times.items() if key[0] in ALWAYS}
@@ -68,20 +71,27 @@ class CostModel:
         steady_ms = steady(self._chip, plan, self._corners, quick=True).frame_ms
         return FrameCost(shape[0] * shape[1], plan.network.work.macs / 1e9, sum(times.values()), steady_ms)
 
-    def placement(self, shape: Shape | None) -> dict[str, Any]:
-        """Where the units are best placed for frames of `shape`, and why: by the model, as `trilane predict` has it."""
+    def placement(self, shape: Shape | None, avatars: int = 1) -> dict[str, Any]:
+        """Where the units are best placed for frames of `shape` with so many `avatars` in view, and why.
+
+        By the model, as `trilane predict` has it.
+        """
         if self._chip.name != HOST:
             return {
                 "units": None,
                 "predicted_ms": None,
                 "why": f"each unit of {self._chip.name} is hardware of its own",
             }
-        plan = Plan(self._described(shape or self._network.shape[1:3]), "dsp", PIPELINED)
+        plan = self._plan(shape, avatars)
         placed = place_units(self._chip, plan, self._corners, host_cores(usable_cores()))
         rule = f"{described(placed.rule.placement)}, {placed.rule.frame_ns / NS_PER_MS:.1f} ms"
         why = f"{described(placed.best.placement)}: the least predicted frame time; by the rule for any run, {rule}"
         chosen = {key: placed.facts[key] for key in ("units", "predicted_ms")}
         return {**chosen, "why": f"{why}. A run measures and decides anew"}
+
+    def _plan(self, shape: Shape | None, avatars: int) -> Plan:
+        described = self._described(shape or self._network.shape[1:3])
+        return Plan(described, "dsp", PIPELINED, avatars=max(1, avatars))
 
     def _described(self, shape: Shape) -> Network:
         work = count_work(reshaped(self._network, *shape).model)

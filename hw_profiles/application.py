@@ -60,8 +60,8 @@ class Plan:
 
     `gpu_share`: the part of the network's products that the GPU does when the rest runs on the DSP. `most_fps`: a rate
     that the application is held to, as the display would, None for the display's own; policies that release frames at
-    a rate have it in their variant. `stretch`: by which the network's time differs from what is expected. Raises
-    BadInputError for a value outside its range.
+    a rate have it in their variant. `stretch`: by which the network's time differs from what is expected. `avatars`:
+    in view, whose tensor is one and the same. Raises BadInputError for a value outside its range.
     """
 
     network: Network
@@ -70,6 +70,7 @@ class Plan:
     gpu_share: float = 0.0
     most_fps: float | None = None
     stretch: float = 1.0
+    avatars: int = 1
 
     def __post_init__(self) -> None:
         if self.runtime not in RUNTIMES:
@@ -82,6 +83,8 @@ class Plan:
             raise BadInputError("fps", f"{self.variant.fps:g}", f"{LEAST_FPS:g} to {MOST_FPS:g}")
         if self.most_fps is not None and not LEAST_FPS <= self.most_fps <= MOST_FPS:
             raise BadInputError("fps", f"{self.most_fps:g}", f"{LEAST_FPS:g} to {MOST_FPS:g}")
+        if self.avatars < 1:
+            raise BadInputError("avatars", str(self.avatars), "at least 1")
         if not 0 <= self.gpu_share < 1 or (self.gpu_share and self.runtime == "gpu"):
             raise BadInputError("gpu-share", f"{self.gpu_share:g} on {self.runtime}", "0 to below 1, on the dsp")
 
@@ -114,18 +117,21 @@ def _job(
 
 
 def stage_times_ms(profile: Profile, plan: Plan, corners: Corners) -> dict[tuple[str, UnitName], float]:
-    """Milliseconds of one job of each (stage, unit), in data-flow order. A job has `plan.variant.batch` frames."""
+    """Milliseconds of one job of each (stage, unit), in data-flow order. A job has `plan.variant.batch` frames.
+
+    Joints and vertices are those of each avatar in view, pixels those of the tensor that all of them share.
+    """
     app, network, batch = profile.application, plan.network, plan.variant.batch
     cpu, gpu = (profile.units[u].clock(corners[UNITS.index(u)]) for u in ("cpu", "gpu"))
     passes = 1 if network.layout == "packed" else -(-network.channels // CHANNELS_PER_PASS)
     moved_bytes = network.pixels * (
         PACKED_BYTES_PER_PIXEL if network.layout == "packed" else CHANNELS_PER_PASS * passes
     )
-    draw_ns = app.vertices.or_else(0) * app.raster_ns_per_vertex.or_else(0) * passes
+    draw_ns = plan.avatars * app.vertices.or_else(0) * app.raster_ns_per_vertex.or_else(0) * passes
     draw_ns += network.pixels * app.raster_ns_per_pixel.or_else(0) * -(-network.channels // CHANNELS_PER_PASS)
     raster_ns = draw_ns / gpu + moved_bytes * app.readback_ns_per_byte.or_else(0)
     times: dict[tuple[str, UnitName], float] = {
-        ("pose", "cpu"): batch * app.pose_ms.or_else(0) / cpu,
+        ("pose", "cpu"): batch * plan.avatars * app.pose_ms.or_else(0) / cpu,
         ("raster", "gpu"): batch * raster_ns / 1e6,
     }
     times |= _network_ms(profile, plan, corners)

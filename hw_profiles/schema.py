@@ -177,6 +177,7 @@ class Application(Model):
     `raster_ns_per_pixel` and `raster_ns_per_vertex` on the GPU; `readback_ns_per_byte` from GPU memory to the network's
     input, done with the GPU held; `handover_ms` from the end of the read-back to the network's start, with its unit
     held; `composite_ms` on the GPU; `pose_ms` on the CPU; `display_ms` the shortest interval between shown frames.
+    `vertices` and `pose_ms` are those of one avatar.
     `ema20_half_range_fraction`: how far the exponential average over 20 frames strays from the mean.
     """
 

@@ -22,6 +22,7 @@ from trilane.avatars.network_reshape import reshaped
 from trilane.body.detail import DETAILS
 from trilane.body.kinematics import Skeleton
 from trilane.body.skinning import CpuSkinner
+from trilane.errors import BadInputError
 from trilane.hw_profiles.application import Plan, stage_times_ms, steady
 from trilane.hw_profiles.load import load_profile
 from trilane.hw_profiles.network_work import Network, count_work
@@ -34,6 +35,7 @@ from trilane.stages.avatar_assets import shaped_body, staged_of
 from trilane.stages.configure import Checked, Request, configure
 from trilane.stages.cpu.actor import Seen
 from trilane.stages.cpu.pose import FramePlan
+from trilane.units import UNITS
 
 CHIP, CAP = "snapdragon-888", "sustained_high_performance"
 SCENE = """
@@ -171,6 +173,55 @@ def test_costs_are_those_of_the_profile(tiny_bundle: Path) -> None:
     assert nothing.work_ms == pytest.approx(times["pose"] + times["composite"] + times["present"])
     assert nothing.frame_ms == chip.application.display_ms.or_else(0) == 16.6
     assert set(ALWAYS) == {"pose", "composite", "present"}
+
+
+def test_each_avatar_in_view_has_its_joints_and_vertices(tiny_bundle: Path) -> None:
+    """0.3 ms of pose and 10,475 vertices of 5 ns each, by clocks; the tensor, network and picture are shared."""
+    network, chip = load_bundle(tiny_bundle).read_network(), load_profile(CHIP)
+    costs, corners = CostModel(network, CHIP, CAP), corners_of(chip, CAP)
+    app, described = chip.application, Network({}, 96, 64, 16, "packed", count_work(reshaped(network, 96, 64).model))
+    one, five = (stage_times_ms(chip, Plan(described, "dsp", avatars=count), corners) for count in (1, 5))
+    cpu, gpu = (chip.units[unit].clock(corner) for unit, corner in zip(("cpu", "gpu"), corners, strict=False))
+    drawn = app.vertices.or_else(0) * app.raster_ns_per_vertex.or_else(0) / gpu / 1e6
+    more = {stage: five[stage, unit] - ms for (stage, unit), ms in one.items()}
+    assert app.pose_ms.or_else(0) > 0 < drawn
+    assert more["pose"] == pytest.approx(4 * app.pose_ms.or_else(0) / cpu)
+    assert more["raster"] == pytest.approx(4 * drawn)
+    assert {more[stage] for stage in ("infer", "composite", "present")} == {0}
+    assert costs.of((96, 64), 5).work_ms - costs.of((96, 64), 1).work_ms == pytest.approx(more["pose"] + more["raster"])
+    assert costs.of((96, 64), 5).gmac == costs.of((96, 64)).gmac
+    with pytest.raises(BadInputError, match="avatars: found 0"):
+        Plan(described, "dsp", avatars=0)
+
+
+def test_phases_and_the_fixed_square_count_the_avatars_in_view(tiny_bundle: Path, tmp_path: Path) -> None:
+    """Two of three: the third stands behind the camera in every frame."""
+    more = '[[avatars]]\nbundle = "{bundle}"\nmotion = "builtin:idle"\nposition = [{x}, 0.0, {z}]\n'
+    text = SCENE + more.replace("{x}", "0.8").replace("{z}", "0.0") + more.replace("{x}", "0.0").replace("{z}", "90.0")
+    (tmp_path / "small.toml").write_text(text.format(bundle=tiny_bundle))
+    document = json.loads(explained(tmp_path, "--json", "--frames", "4").stdout)
+    costs = CostModel(load_bundle(tiny_bundle).read_network(), CHIP, CAP)
+    for row in document["phases"]:
+        cost, fixed = costs.of(tuple(row["tensor"]), 2), costs.of((512, 512), 2)
+        assert [one["avatar"] for one in row["avatars"]] == [0, 1]
+        assert (row["cost"]["work_ms"], row["cost"]["frame_ms"]) == (cost.work_ms, cost.frame_ms)
+        assert row["saved"]["work_ms"] == fixed.work_ms - cost.work_ms
+    assert document["totals"]["fixed_work_ms"] == pytest.approx(4 * costs.of((512, 512), 2).work_ms)
+
+
+def test_a_crowds_units_are_placed_by_the_crowds_times(tiny_bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Five avatars on one core: 4 poses and 4 meshes more than one, whatever the placement."""
+    for module in ("hw_profiles.host_profile", "hw_profiles.predict", "apps.plan_cost"):
+        monkeypatch.setattr(f"trilane.{module}.usable_cores", lambda: (0,))
+    costs = CostModel(load_bundle(tiny_bundle).read_network(), "host", CAP)
+    chip = load_profile("host")
+    app, (cpu, gpu, _) = (
+        chip.application,
+        (chip.units[u].clock(c) for u, c in zip(UNITS, corners_of(chip, CAP), strict=True)),
+    )
+    drawn = app.vertices.or_else(0) * app.raster_ns_per_vertex.or_else(0) / gpu / 1e6
+    one, five = (costs.placement((96, 64), count)["predicted_ms"] for count in (1, 5))
+    assert five - one == pytest.approx(4 * (app.pose_ms.or_else(0) / cpu + drawn), rel=1e-3)
 
 
 def test_a_frame_without_network_takes_as_long_as_its_busiest_core() -> None:

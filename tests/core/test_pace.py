@@ -137,7 +137,7 @@ def test_a_pace_is_that_of_the_largest_tensor_of_the_first_avatar(
     pace = pace_of(given, "x", 2, "burst")
     assert pace == Pace("chip x", "burst", 2, {"pose": 500_000, "infer": 2_000_001})
     ((chip, plan, corners),) = asked
-    assert (chip.name, plan.runtime, corners) == ("chip x", "dsp", ("chip x", "burst"))
+    assert (chip.name, plan.runtime, plan.avatars, corners) == ("chip x", "dsp", 2, ("chip x", "burst"))
     largest = max(given.buckets, key=lambda shape: shape[0] * shape[1])
     network = plan.network
     assert (network.height, network.width, network.channels, network.layout) == (*largest, 5, "packed")
