@@ -69,6 +69,8 @@ class Load(NamedTuple):
 def within_power(profile: Profile, requested: Corners, load: Load, limit_w: float) -> dict[str, Any]:
     """The highest rate at which the device takes at most `limit_w`, and the corners of its units there.
 
+    It is limited by `speed` where it is that of the requested corners, by `power` otherwise.
+
     The units may be at any corner up to the `requested` ones. At one choice of corners the power is linear in the
     rate: what idle units take, and for each frame the energy of the work.
 
@@ -96,19 +98,18 @@ def within_power(profile: Profile, requested: Corners, load: Load, limit_w: floa
         "corners": {
             unit: corner for unit, corner in zip(UNITS, best.corners, strict=True) if load.work_ms(requested).get(unit)
         },
-        "limited_by": "speed" if best.corners == requested and fps < best.fps_by_power else "power",
+        "limited_by": "speed" if fps >= (1 - 1e-9) * 1e3 / load.frame_ms(requested) else "power",
     }
 
 
 class _Choice(NamedTuple):
     """One choice of corners.
 
-    `most_fps`: that power and the busiest unit allow; `fps_by_power`: that power alone allows. `idle_w`: of the device
-    when no unit works. `joules`: of a frame, beside that.
+    `most_fps`: that power and the busiest unit allow. `idle_w`: of the device when no unit works. `joules`: of a frame,
+    beside that.
     """
 
     most_fps: float
-    fps_by_power: float
     corners: Corners
     idle_w: float
     joules: float
@@ -121,7 +122,7 @@ def _by_power(profile: Profile, corners: Corners, load: Load, limit_w: float) ->
     work = load.work_ms(corners)
     joules = sum((units[unit][0].power_w(units[unit][1], 1.0) - idle[unit]) * ms / 1e3 for unit, ms in work.items())
     by_power = max(0.0, limit_w - idle_w) / max(joules, 1e-12)
-    return _Choice(min(by_power, 1e3 / max(work.values())), by_power, corners, idle_w, joules)
+    return _Choice(min(by_power, 1e3 / max(work.values())), corners, idle_w, joules)
 
 
 def _allowed(requested: Corners, load: Load) -> list[Corners]:

@@ -106,6 +106,28 @@ def test_the_network_of_an_avatar_or_a_file(tiny_bundle: Path, asked: dict[str, 
     assert asked["predict"][1].network == Network({"network": str(file)}, 64, 64, 5, "split", work)
 
 
+def test_networks_by_themselves(
+    tiny_bundle: Path, tmp_path: Path, asked: dict[str, Any], monkeypatch: pytest.MonkeyPatch, command: Command
+) -> None:
+    """Each is read on its own, priced in the precision of its numbers, and nothing of the application is asked."""
+    monkeypatch.setattr(load, "load_runnable", lambda _: CHIP)
+    file = tiny_bundle / "network.onnx"
+    words = ("predict", "--network", file, "--network", file, "--fps", 20, "--json")
+    found = json.loads(command(*words)[0])
+    assert [each["file"] for each in found["networks"]] == [str(file)] * 2
+    assert found["networks"][0] == found["networks"][1]
+    assert found["networks"][0]["precision"] == "int8" and found["config"]["fps"] == 20
+    slow = json.loads(command(*words, "--precision", "float", "--runtime", "cpu")[0])["networks"][0]
+    assert (slow["precision"], slow["unit"]) == ("fp16", "cpu")
+    assert command("predict", "--network", file, "--input-shape", "other=1x2", code=2)[1] == (
+        "error: --input-shape: found no input 'other', expected one of tensor\n"
+    )
+    (tmp_path / "cut.onnx").write_bytes(file.read_bytes()[:5000])
+    out, err = command("predict", "--network", file, "--network", tmp_path / "cut.onnx", code=2)
+    assert out == "" and err.startswith(f"error: {tmp_path / 'cut.onnx'}: found bytes that do not parse, expected")
+    assert "predict" not in asked
+
+
 def test_a_rate_a_limit_and_a_precision(asked: dict[str, Any], command: Command) -> None:
     command("predict", "--fps", 24, "--power-limit-w", 3.5, "--what-if", "--precision", "float")
     chip, plan, *_, wanted = asked["predict"]
