@@ -139,6 +139,8 @@ def test_cuda_takes_all_nodes_or_none(network: Any, monkeypatch: pytest.MonkeyPa
     probe, settings, options = made.pop()
     assert [node.op_type for node in onnx.load_from_string(probe).graph.node] == ["Identity"]
     onnx.checker.check_model(onnx.load_from_string(probe))
+    told = onnx.load_from_string(probe)  # versions that ONNX Runtime has known for years, whatever this onnx writes
+    assert [(each.domain, each.version) for each in told.opset_import] == [("", 17)] and told.ir_version == 8
     assert settings.log_severity_level == 4 and options == {"providers": ["CUDAExecutionProvider"]}
     made = noted(monkeypatch, get_providers=lambda _self: ["CUDAExecutionProvider", "CPUExecutionProvider"])
     session = cuda.load(network, RuntimeOptions(device={"device_id": "1"}))

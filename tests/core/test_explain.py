@@ -14,6 +14,7 @@ from PIL import Image, ImageDraw
 from typer.testing import CliRunner
 
 from trilane.apps.cli.explain import app
+from trilane.apps.explanation import _why
 from trilane.apps.plan_cost import ALWAYS, PIPELINED, CostModel, least_frame_ms
 from trilane.apps.plan_picture import BODY, GROUND, MESH, TENSOR, _tile, draw_plan
 from trilane.apps.scene_plan import PlannedFrame, ScenePlan, phases
@@ -126,6 +127,25 @@ def test_a_phase_says_what_is_modelled_and_its_error(document: Any) -> None:
         "pixels, gmac": "counted",
         "ms": "computed",
     }
+
+
+@pytest.mark.parametrize(
+    ("work", "densities", "why"),
+    [
+        (Work.NONE, [None], "nobody is on the screen: nothing is drawn, packed or inferred"),
+        (Work.REUSE, [None], "nothing has changed: the picture that is there is shown again"),
+        (Work.FULL, [None], "the scene fixes the tensor's size"),
+        (Work.FULL, [3.0, 4.0], "4 tensor pixels along a side of a pixel of the picture: more could not be seen"),
+        (
+            Work.FULL,
+            [3.0, 3.9],
+            "the pixels that the network was trained to paint, in the shape that fits best of those ",
+        ),
+    ],
+)
+def test_why_a_tensor_is_as_it_is(work: Work, densities: list[float | None], why: str) -> None:
+    group = [PlannedFrame(0, FramePlan(work, (32, 32), density, {}), {}) for density in densities]
+    assert _why(group).startswith(why)
 
 
 def test_a_fixed_size_is_explained_as_such(checked: Checked, tmp_path: Path) -> None:  # noqa: ARG001
