@@ -8,7 +8,7 @@ from statistics import median
 import pytest
 
 from trilane.errors import BadInputError
-from trilane.hw_profiles.configuration_table import read_table
+from trilane.hw_profiles.configuration_table import read_table, spec_of
 from trilane.hw_profiles.fit import (
     Fit,
     as_toml,
@@ -152,3 +152,15 @@ def test_a_range_that_ends_before_it_begins_is_named(tmp_path: Path) -> None:
     (row,) = read_table(path)
     with pytest.raises(BadInputError, match=r"line 2: app_dsp_ms_min: found 57, expected at most app_dsp_ms_max"):
         row.range("app_dsp_ms")
+
+
+@pytest.mark.parametrize(
+    ("text", "fine"), [("16", True), ("0016", True), ("00016", False), ("1.6e1", False), ("", False)]
+)
+def test_a_number_of_channels_has_four_digits_at_most(text: str, fine: bool) -> None:
+    cells = {"encoder": "resnet18", "norm": "batch", "size": "64", "channels": text, "layout": "packed"}
+    if fine:
+        assert spec_of(cells, "a.csv: line 2").channels == 16
+        return
+    with pytest.raises(BadInputError, match=f"^a[.]csv: line 2: channels: found '{text}', expected 1 to 16$"):
+        spec_of(cells, "a.csv: line 2")
