@@ -282,7 +282,7 @@ def test_a_slot_is_written_whole_and_read_whole(monkeypatch: pytest.MonkeyPatch)
     assert by_name["infer"].run(255, 1, None) == {}
     by_name["present"].run(255, 1, None)
     with pytest.raises(TrilaneError, match="a slot of 64 bytes holds others than were written"):
-        by_name["infer"].run(256, 1, None)
+        by_name["infer"].run(256, 1, 0)
     with pytest.raises(TrilaneError, match="64 bytes"):
         by_name["infer"].run(255, 0, None)
     slots[1].payload[63] = 5
