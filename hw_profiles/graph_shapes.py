@@ -195,12 +195,10 @@ def _sizes(value: onnx.ValueInfoProto, least: int = 1) -> Shape | None:
     kind = value.type.tensor_type
     if not kind.HasField("shape"):
         return None
-    sizes = []
-    for dim in kind.shape.dim:
-        if not dim.HasField("dim_value") or dim.dim_value < least:
-            return None
-        sizes.append(dim.dim_value)
-    return tuple(sizes)
+    sizes = tuple([dim.dim_value for dim in kind.shape.dim])  # a size that is not stated is read as 0
+    if min(sizes, default=1) < least or (0 in sizes and not all(dim.HasField("dim_value") for dim in kind.shape.dim)):
+        return None
+    return sizes
 
 
 def _shown(value: onnx.ValueInfoProto) -> str:

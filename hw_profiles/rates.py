@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from itertools import product
 from typing import Any, NamedTuple
 
+from trilane.hw_profiles.device_power import device_power
 from trilane.hw_profiles.performance_profiles import Corners
 from trilane.hw_profiles.schema import CORNERS, Corner, Profile
 from trilane.units import UNITS, UnitName
@@ -69,7 +70,8 @@ class Load(NamedTuple):
 def within_power(profile: Profile, requested: Corners, load: Load, limit_w: float) -> dict[str, Any]:
     """The highest rate at which the device takes at most `limit_w`, and the corners of its units there.
 
-    It is limited by `speed` where it is that of the requested corners, by `power` otherwise.
+    It is limited by `speed` where it is that of the requested corners, by `power` otherwise. `low_fps`, `high_fps`: the
+    rates if the device takes as much more or less than expected as the 80 % interval of its power says.
 
     The units may be at any corner up to the `requested` ones. At one choice of corners the power is linear in the
     rate: what idle units take, and for each frame the energy of the work.
@@ -79,6 +81,25 @@ def within_power(profile: Profile, requested: Corners, load: Load, limit_w: floa
     `load`: what runs.
     `limit_w`: watts of the whole device.
     """
+    best, fps = _best(profile, requested, load, limit_w)
+    work = load.work_ms(best.corners)
+    power = device_power(profile, {u: work.get(u, 0.0) * fps / 1e3 for u in UNITS}, best.corners, {})
+    slow, fast = (limit_w * power["w"] / power[end] for end in ("high_w", "low_w"))
+    working = load.work_ms(requested)
+    return {
+        "limit_w": limit_w,
+        "fps": fps,
+        "low_fps": _best(profile, requested, load, slow)[1],
+        "high_fps": _best(profile, requested, load, fast)[1],
+        "power_w": best.idle_w + best.joules * fps,
+        "idle_w": best.idle_w,
+        "corners": {unit: corner for unit, corner in zip(UNITS, best.corners, strict=True) if working.get(unit)},
+        "limited_by": "speed" if fps >= (1 - 1e-9) * 1e3 / load.frame_ms(requested) else "power",
+    }
+
+
+def _best(profile: Profile, requested: Corners, load: Load, limit_w: float) -> tuple[_Choice, float]:
+    """The choice of corners with the highest rate, and the rate."""
     choices = sorted(
         (_by_power(profile, corners, load, limit_w) for corners in _allowed(requested, load)),
         key=lambda choice: -choice.most_fps,
@@ -90,16 +111,7 @@ def within_power(profile: Profile, requested: Corners, load: Load, limit_w: floa
         reached = min(choice.most_fps, 1e3 / load.frame_ms(choice.corners))
         if reached > fps:
             best, fps = choice, reached
-    return {
-        "limit_w": limit_w,
-        "fps": fps,
-        "power_w": best.idle_w + best.joules * fps,
-        "idle_w": best.idle_w,
-        "corners": {
-            unit: corner for unit, corner in zip(UNITS, best.corners, strict=True) if load.work_ms(requested).get(unit)
-        },
-        "limited_by": "speed" if fps >= (1 - 1e-9) * 1e3 / load.frame_ms(requested) else "power",
-    }
+    return best, fps
 
 
 class _Choice(NamedTuple):

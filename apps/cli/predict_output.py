@@ -139,8 +139,9 @@ def _print_wanted(console: Console, answer: dict[str, Any]) -> None:
     if limit := answer.get("power_limit"):
         name = f"within {limit['limit_w']:g} W"
         corners = ", ".join(f"{unit} {corner}" for unit, corner in limit["corners"].items())
+        span = f"{limit['low_fps']:.1f} to {limit['high_fps']:.1f}"
         reason = "its full speed" if limit["limited_by"] == "speed" else "by power"
-        console.print(f"{name:<16}{limit['fps']:.1f} fps, {reason}, at {limit['power_w']:.2f} W ({corners})")
+        console.print(f"{name:<16}{limit['fps']:.1f} fps ({span}), {reason}, at {limit['power_w']:.2f} W ({corners})")
 
 
 def _reserve(rate: dict[str, Any]) -> str:

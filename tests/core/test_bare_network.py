@@ -117,6 +117,19 @@ def test_the_rate_within_a_power(limit: float, fps: float, corner: str, by: str)
     assert found["corners"] == {"dsp": corner}
 
 
+def test_the_rate_within_a_power_is_as_uncertain_as_the_power() -> None:
+    """The rate within the limit that would be kept if the device took what the ends of its interval say."""
+    profile, load = chip(0.3), on_dsp(10.0)
+    found = within_power(profile, TOP, load, 5.0)
+    power = device_power(profile, {"cpu": 0.0, "gpu": 0.0, "dsp": found["fps"] / 100}, TOP, {})
+    assert power["w"] == pytest.approx(5.0) == found["power_w"]
+    for key, end in (("low_fps", "high_w"), ("high_fps", "low_w")):
+        assert found[key] == pytest.approx(within_power(profile, TOP, load, 5.0 * 5.0 / power[end])["fps"])
+    assert found["low_fps"] < found["fps"] < found["high_fps"]
+    sure = within_power(chip(), TOP, load, 5.0)
+    assert sure["low_fps"] == pytest.approx(sure["fps"]) == pytest.approx(sure["high_fps"])
+
+
 def test_the_rate_within_a_power_is_the_best_of_all_corners() -> None:
     """By trying every rate of every choice of corners, for work on two units that follow each other."""
     profile, limit = load_profile("snapdragon-888"), 3.3

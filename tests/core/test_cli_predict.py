@@ -256,7 +256,15 @@ POWER = {
     "base": {"w": 1.2, "low_w": 0.6, "high_w": 1.9, "kind": "assumed"},
 }
 RATE = {"fps": 30.0, "holds": True, "words": "holds", "reserve": 0.255, "reserve_low": 0.1, "reserve_high": 0.375}
-LIMIT = {"limit_w": 3.0, "fps": 28.76, "power_w": 2.995, "limited_by": "power", "corners": {"gpu": "svs", "dsp": "max"}}
+LIMIT = {
+    "limit_w": 3.0,
+    "fps": 28.76,
+    "low_fps": 20.34,
+    "high_fps": 33.3,
+    "power_w": 2.995,
+    "limited_by": "power",
+    "corners": {"gpu": "svs", "dsp": "max"},
+}
 
 
 def an_answer(**changes: Any) -> dict[str, Any]:
