@@ -268,26 +268,26 @@ def test_units_are_placed_by_the_rules_of_the_policy(
 
 @pytest.mark.parametrize(("layout", "raster_ms"), [("split", 0.0252), ("packed", 0.0094)])
 def test_stages_beside_the_network_by_hand(monkeypatch: pytest.MonkeyPatch, layout: str, raster_ms: float) -> None:
-    """Clocks of 1/4 and 1/2; batches of two. 10 channels take three passes of four, each with 1000 vertices at 2 ns
-    where they are split; 100 pixels at 0.5 ns for each of the three: 6150 ns and 2150. Read at 0.25 ns: of each pixel
-    4 bytes a pass, or 16 in all: 300 ns and 400."""
+    """Clocks of 1/4 and 1/2; batches of two. 10 channels take three passes of four, each with the 500 vertices of two
+    avatars at 2 ns where they are split; 100 pixels at 0.5 ns for each of the three: 6150 ns and 2150. Read at 0.25 ns:
+    of each pixel 4 bytes a pass, or 16 in all: 300 ns and 400."""
     known = SimpleNamespace
     app = known(
         **{
             name: known(or_else=lambda _, value=value: value)
             for name, value in {
-                "vertices": 1000,
+                "vertices": 500,
                 "raster_ns_per_vertex": 2.0,
                 "raster_ns_per_pixel": 0.5,
                 "readback_ns_per_byte": 0.25,
-                "pose_ms": 3.0,
+                "pose_ms": 1.5,
                 "composite_ms": 1.0,
                 "present_ms": 2.0,
             }.items()
         }
     )
     units = {"cpu": known(clock=lambda corner: corner / 4), "gpu": known(clock=lambda corner: corner / 2)}
-    plan: Any = known(network=known(layout=layout, channels=10, pixels=100), variant=known(batch=2))
+    plan: Any = known(network=known(layout=layout, channels=10, pixels=100), variant=known(batch=2), avatars=2)
     monkeypatch.setattr("trilane.hw_profiles.application._network_ms", lambda *_: {("infer", "dsp"): 7.0})
     found = stage_times_ms(known(application=app, units=units), plan, (1, 1, 1))  # type: ignore[arg-type]
     assert list(found) == [
