@@ -65,6 +65,7 @@ def explain(checked: Checked, profile: str, performance_profile: str, most_measu
         "scene": scene.name,
         "config": {
             "frames": scene.frames,
+            "fps": scene.fps,
             "output": [scene.output.height, scene.output.width],
             "plan": scene.plan,
             "size": scene.size,
@@ -78,7 +79,7 @@ def explain(checked: Checked, profile: str, performance_profile: str, most_measu
         "phases": [_phase(group, errors, costs, names, bodies) for group, errors in zip(groups, rows, strict=True)],
         "image": _image(checked),
         "totals": _totals(frames, costs),
-        "placement": costs.placement(*_usual(frames)),
+        "placement": costs.placement(*_usual(frames), checked.asked_cores),
         "notes": list(checked.notes),
         "sources": {
             "bound_px": BOUND,

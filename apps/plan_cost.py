@@ -11,6 +11,7 @@ from typing import Any
 
 from trilane.avatars.integer_network import NetworkFile
 from trilane.avatars.network_reshape import reshaped
+from trilane.errors import BadInputError
 from trilane.hw_profiles.application import Plan, Variant, stage_times_ms, steady, workers_of
 from trilane.hw_profiles.host import host_cores, usable_cores
 from trilane.hw_profiles.load import HOST, load_runnable
@@ -19,8 +20,9 @@ from trilane.hw_profiles.performance_profiles import corners_of
 from trilane.hw_profiles.placed_host import place_units
 from trilane.hw_profiles.placement_facts import NS_PER_MS, described
 from trilane.hw_profiles.schema import Profile
+from trilane.scheduler.placement import Ranked
 from trilane.shapes import Shape
-from trilane.units import UnitName
+from trilane.units import UNITS, UnitName
 
 PIPELINED = Variant("pipelined", "double")
 #: Stages that a frame needs even with nobody in view.
@@ -71,23 +73,28 @@ class CostModel:
         steady_ms = steady(self._chip, plan, self._corners, quick=True).frame_ms
         return FrameCost(shape[0] * shape[1], plan.network.work.macs / 1e9, sum(times.values()), steady_ms)
 
-    def placement(self, shape: Shape | None, avatars: int = 1) -> dict[str, Any]:
+    def placement(
+        self, shape: Shape | None, avatars: int = 1, asked: Mapping[str, tuple[int, ...]] | None = None
+    ) -> dict[str, Any]:
         """Where the units are best placed for frames of `shape` with so many `avatars` in view, and why.
 
-        By the model, as `trilane predict` has it.
+        By the model, as `trilane predict` has it. `asked`: cores of units of this machine. Raises BadInputError when a
+        chip's are asked for.
         """
+        asked = asked or {}
         if self._chip.name != HOST:
+            if asked:
+                raise BadInputError("--cores", f"cores of {self._chip.name}", f"--profile {HOST}, which has cores")
             return {
                 "units": None,
                 "predicted_ms": None,
                 "why": f"each unit of {self._chip.name} is hardware of its own",
             }
         plan = self._plan(shape, avatars)
-        placed = place_units(self._chip, plan, self._corners, host_cores(usable_cores()))
-        rule = f"{described(placed.rule.placement)}, {placed.rule.frame_ns / NS_PER_MS:.1f} ms"
-        why = f"{described(placed.best.placement)}: the least predicted frame time; by the rule for any run, {rule}"
+        cores = sorted({*usable_cores(), *(core for own in asked.values() for core in own)})
+        placed = place_units(self._chip, plan, self._corners, host_cores(cores), asked)
         chosen = {key: placed.facts[key] for key in ("units", "predicted_ms")}
-        return {**chosen, "why": f"{why}. A run measures and decides anew"}
+        return {**chosen, "why": f"{described(placed.best.placement)}: {_why(asked, placed.rule)}"}
 
     def _plan(self, shape: Shape | None, avatars: int) -> Plan:
         described = self._described(shape or self._network.shape[1:3])
@@ -96,3 +103,11 @@ class CostModel:
     def _described(self, shape: Shape) -> Network:
         work = count_work(reshaped(self._network, *shape).model)
         return Network({}, *shape, self._network.channels, "packed", work)
+
+
+def _why(asked: Mapping[str, tuple[int, ...]], rule: Ranked) -> str:
+    if len(asked) == len(UNITS):
+        return "as asked"
+    how = "as asked, the others for the least predicted frame time" if asked else "the least predicted frame time"
+    by_rule = f"{described(rule.placement)}, {rule.frame_ns / NS_PER_MS:.1f} ms"
+    return f"{how}; by the rule for any run, {by_rule}. A run measures and decides anew"

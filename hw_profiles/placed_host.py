@@ -1,12 +1,13 @@
 """The units of the profile `host` on cores, in virtual time. Rule: they are placed as a run's are, by modelled times.
 
 The scheduler in virtual time knows units that have cores of their own and units that work in turns on one core. So
-these placements are the ones to choose from: no unit floats, and none with several cores shares one.
+these placements are the ones to choose from: no unit floats, and none with several cores shares one. Where cores are
+asked for, which is not simulated, all are.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from trilane.hw_profiles.application import Plan, stage_times_ms
@@ -17,7 +18,7 @@ from trilane.hw_profiles.placement_facts import NS_PER_MS, predictions, unit_row
 from trilane.hw_profiles.schema import Profile, Quantity, Unit
 from trilane.scheduler.placement import Ranked, chosen, ranked
 from trilane.scheduler.placement_model import Rules, frame_ns
-from trilane.scheduler.places import Core, Placement, Times, Work, shared_cores
+from trilane.scheduler.places import Core, Place, Placement, Times, Work, shared_cores
 from trilane.units import BEFORE_INFER, UNITS, UnitName
 
 NETWORK: UnitName = "dsp"
@@ -38,12 +39,22 @@ class Placed(NamedTuple):
         return {"units": unit_rows(self.best.placement), **predictions(self.best, self.rule, self.found)}
 
 
-def place_units(profile: Profile, plan: Plan, corners: Corners, cores: Sequence[Core]) -> Placed:
-    """Place the units of `profile` for `plan`, at these `corners`, on `cores`, by what the model says they need."""
-    times = _times(profile, plan, corners, len(cores))
+def place_units(
+    profile: Profile,
+    plan: Plan,
+    corners: Corners,
+    cores: Sequence[Core],
+    asked: Mapping[str, tuple[int, ...]] | None = None,
+) -> Placed:
+    """Place the units of `profile` for `plan`, at these `corners`, on `cores`, by what the model says they need.
+
+    `asked`: cores of units that are given, all of them among `cores`.
+    """
+    given = {unit: Place(own, len(own)) for unit, own in (asked or {}).items()}
+    times = _times(profile, plan, corners, len(cores), given)
     rules = Rules(BEFORE_INFER[0][1], plan.variant.policy == SEQUENTIAL)
-    where = rule_placement(tuple(core.number for core in cores))
-    found = [each for each in ranked(cores, times, rules) if _can_be_simulated(each.placement)]
+    where = rule_placement(tuple(core.number for core in cores), asked)
+    found = [each for each in ranked(cores, times, rules, given) if given or _can_be_simulated(each.placement)]
     rule = Ranked(where, frame_ns(where, cores, times, rules))
     return Placed(chosen(found, rule), rule, found)
 
@@ -66,11 +77,16 @@ def _can_be_simulated(placement: Placement) -> bool:
     )
 
 
-def _times(profile: Profile, plan: Plan, corners: Corners, cores: int) -> Times:
-    """The model's times of a frame. The network's unit may have as many threads as there are cores."""
+def _times(profile: Profile, plan: Plan, corners: Corners, cores: int, given: Placement) -> Times:
+    """The model's times of a frame. The network's unit may have as many threads as there are cores.
+
+    `given`: places of units, whose threads are known too.
+    """
     rule = rule_placement(tuple(range(cores)))
     counts = {unit: {1, rule[unit].threads} for unit in UNITS}
     counts[NETWORK] |= set(range(1, cores + 1))
+    for unit in UNITS:
+        counts[unit] |= {place.threads for name, place in given.items() if name == unit}
     times: dict[str, dict[int, Work]] = {unit: {} for unit in UNITS}
     for unit, threads in ((unit, each) for unit, of in counts.items() for each in sorted(of)):
         network = _with_threads(profile.units[NETWORK], threads if unit == NETWORK else 1)

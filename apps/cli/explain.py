@@ -5,6 +5,7 @@ Rule: this module reads options and shows results; everything is decided and com
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,11 +15,17 @@ from trilane.apps.cli.commands import Commands
 from trilane.apps.cli.console import print_json, spinner, stderr_console, stdout_console
 from trilane.apps.cli.options import (
     PROFILE_HELP,
+    CameraOption,
+    CoresOption,
+    FpsOption,
     JsonOption,
+    MotionOption,
+    OutputOption,
     PerformanceProfileOption,
     SceneArgument,
     SceneAvatarOption,
     SceneSizeOption,
+    SkinningOption,
 )
 from trilane.units import PerformanceProfile
 
@@ -31,6 +38,7 @@ EPILOG = """\b
 Examples:
   trilane explain
   trilane explain far --size auto
+  trilane explain walk-past --output 1280x720 --fps 24
   trilane explain myscene.toml --picture plan.png
   trilane explain closeup --profile snapdragon-888 --json
 """
@@ -51,9 +59,15 @@ CapOption = Annotated[PerformanceProfile, PerformanceProfileOption]
 @app.command(epilog=EPILOG)
 def explain(
     scene: SceneArgument = "default",
+    motion: MotionOption = None,
+    camera: CameraOption = None,
     avatar: SceneAvatarOption = None,
     frames: FramesOption = None,
+    fps: FpsOption = None,
+    output: OutputOption = None,
     size: SceneSizeOption = None,
+    skinning: SkinningOption = "auto",
+    cores: CoresOption = None,
     profile: ChipOption = "host",
     performance_profile: CapOption = PerformanceProfile.SUSTAINED_HIGH_PERFORMANCE,
     picture: PictureOption = None,
@@ -71,7 +85,8 @@ def explain(
             raise BadInputError("--picture", f"'{picture}'", "a name that ends in .png")
         require_writable(picture)
     with spinner("planning"):
-        checked = configure(Request(scene, avatar=avatar, frames=frames, size=size), Path.cwd())
+        asked = Request(scene, motion, camera, None, avatar, frames, size, skinning=skinning)
+        checked = configure(replace(asked, fps=fps, output=output, cores=tuple(cores or ())), Path.cwd())
         explanation = explained(checked, profile, str(performance_profile))
     for note in checked.notes:
         stderr_console().print(note, soft_wrap=True, markup=False)

@@ -28,6 +28,19 @@ SceneAvatarOption = Annotated[str | None, typer.Option("--avatar", help="`defaul
 SceneSizeOption = Annotated[
     str | None, typer.Option("--size", help=f"{SIZE_HELP} auto: planned, as the network paints best.")
 ]
+MotionOption = Annotated[str | None, typer.Option(help="SMPL-X .npy, AMASS .npz, .bvh, or builtin:NAME.")]
+CameraOption = Annotated[str | None, typer.Option(help="ARKit log, TUM, transforms.json, or builtin:NAME.")]
+FpsOption = Annotated[float | None, typer.Option(help="Frames a second of the scene's time, and of the video.")]
+OutputOption = Annotated[str | None, typer.Option(help="Size of the picture in pixels: WIDTHxHEIGHT.")]
+SkinningOption = Annotated[
+    str, typer.Option(help="Which unit poses the vertices: cpu, gpu; auto: cpu when OpenGL is software.")
+]
+CoresOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="UNIT=LIST: the unit's cores, such as dsp=0,1; once for each. Else they follow from measured times."
+    ),
+]
 PerformanceProfileOption = typer.Option(help="Which power and speed the units ask for, by SNPE's names.")
 PerformanceProfileChoice = Annotated[PerformanceProfile, PerformanceProfileOption]
 

@@ -21,11 +21,17 @@ from trilane.apps.cli.console import print_json, stderr_console, stdout_console
 from trilane.apps.cli.options import (
     PROFILE_HELP,
     RUNTIME_HELP,
+    CameraOption,
+    CoresOption,
+    FpsOption,
     JsonOption,
+    MotionOption,
+    OutputOption,
     PerformanceProfileOption,
     SceneArgument,
     SceneAvatarOption,
     SceneSizeOption,
+    SkinningOption,
 )
 from trilane.errors import BadInputError
 from trilane.units import PerformanceProfile
@@ -65,12 +71,8 @@ class PolicyName(StrEnum):
     DEADLINE = "deadline"
 
 
-MotionOption = Annotated[str | None, typer.Option(help="SMPL-X .npy, AMASS .npz, .bvh, or builtin:NAME.")]
-CameraOption = Annotated[str | None, typer.Option(help="ARKit log, TUM, transforms.json, or builtin:NAME.")]
 BackgroundOption = Annotated[str | None, typer.Option(help="room, or a video, image folder or picture.")]
 EDGE_HELP = "Buffers between stages: single, double, triple, fifo:N, orphan or orphan:N (docs/policies-and-edges.md)."
-FpsOption = Annotated[float | None, typer.Option(help="Frames a second of the scene's time, and of the video.")]
-OutputOption = Annotated[str | None, typer.Option(help="Size of the picture in pixels: WIDTHxHEIGHT.")]
 EdgeOption = Annotated[str, typer.Option(help=EDGE_HELP)]
 FramesOption = Annotated[int | None, typer.Option(help="How many frames to present.")]
 HudOption = Annotated[bool | None, typer.Option(help="Write frame, rate and age on the picture.")]
@@ -80,18 +82,9 @@ POLICIES_HELP = (
 )
 PolicyOption = Annotated[PolicyName, typer.Option(help=POLICIES_HELP)]
 RuntimeOption = Annotated[str, typer.Option(help=f"What runs the network: {RUNTIME_HELP}")]
-SkinningOption = Annotated[
-    str, typer.Option(help="Which unit poses the vertices: cpu, gpu; auto: cpu when OpenGL is software.")
-]
 SplitOption = Annotated[
     list[str] | None,
     typer.Option(help="TENSOR=UNIT: cut the network there, the rest runs on UNIT. `trilane avatar split` lists."),
-]
-CoresOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        help="UNIT=LIST: the unit's cores, such as dsp=0,1; once for each. Else they follow from measured times."
-    ),
 ]
 PacedProfileOption = Annotated[str | None, typer.Option("--profile", help=f"{PROFILE_HELP} With --pace.")]
 PaceOption = Annotated[bool, typer.Option("--pace", help="Hold each job until its modelled time has passed.")]

@@ -6,14 +6,15 @@ import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_type_hints
 
 import numpy as np
 import pytest
 from PIL import Image, ImageDraw
 from typer.testing import CliRunner
 
-from trilane.apps.cli.explain import app
+from trilane.apps.cli.explain import app, explain
+from trilane.apps.cli.run import run
 from trilane.apps.explanation import _why
 from trilane.apps.plan_cost import ALWAYS, PIPELINED, CostModel, least_frame_ms
 from trilane.apps.plan_picture import BODY, GROUND, MESH, TENSOR, _tile, draw_plan
@@ -292,6 +293,48 @@ def test_on_this_machine_units_are_placed_as_in_a_prediction(
     assert document["placement"]["units"] == expected["units"]
     assert document["placement"]["predicted_ms"] == expected["predicted_ms"]
     assert f"{expected['rule_ms']:.1f} ms. A run measures and decides anew" in document["placement"]["why"]
+
+
+def test_what_a_run_may_be_asked_can_be_explained(checked: Checked, tmp_path: Path) -> None:  # noqa: ARG001
+    """The same scene as a run with these options has: its picture, rate, motion and camera, and where it is skinned."""
+    picture, scene = ["--fps", "24", "--output", "200x120"], ["--motion", "builtin:idle", "--camera", "builtin:closeup"]
+    options = [*picture, *scene, "--skinning", "gpu", "--frames", "6"]
+    document = json.loads(explained(tmp_path, "--json", *options).stdout)
+    request = Request(str(tmp_path / "small.toml"), "builtin:idle", "builtin:closeup", frames=6, skinning="gpu")
+    asked = configure(replace(request, runtime="ort", fps=24, output="200x120"), tmp_path)
+    plan = ScenePlan(asked.config, asked.assets)
+    groups = phases([plan.decide(frame) for frame in range(6)])
+    assert (document["config"]["fps"], document["config"]["output"]) == (24, [120, 200])
+    assert [row["tensor"] for row in document["phases"]] == [list(group[0].plan.shape or ()) for group in groups]
+    assert document["avatars"][0]["skinned_on"] == "gpu"
+    assert "--output: found '12', expected WIDTHxHEIGHT" in str(
+        CliRunner().invoke(app, [str(tmp_path / "small.toml"), "--output", "12"]).exception
+    )
+
+
+def test_options_of_both_commands_are_the_same_objects() -> None:
+    run_has, explain_has = (get_type_hints(command, include_extras=True) for command in (run, explain))
+    both = ("motion", "camera", "avatar", "fps", "output", "size", "skinning", "cores")
+    assert all(explain_has[name] is run_has[name] for name in both)
+
+
+def test_cores_that_are_asked_for_are_kept(tiny_bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two cores: the other units go where frames are shortest; a network on both cores may share them."""
+    for module in ("hw_profiles.host_profile", "hw_profiles.predict", "apps.plan_cost"):
+        monkeypatch.setattr(f"trilane.{module}.usable_cores", lambda: (0, 1))
+    costs = CostModel(load_bundle(tiny_bundle).read_network(), "host", CAP)
+    free = costs.placement((96, 64))
+    every = {"cpu": (1,), "gpu": (0,), "dsp": (0, 1)}
+    placed = costs.placement((96, 64), 1, every)
+    assert {unit: tuple(row["cores"]) for unit, row in placed["units"].items()} == every
+    assert placed["units"]["dsp"]["threads"] == 2
+    assert placed["why"] == "cpu 1, gpu 0, dsp 0,1 (2 threads): as asked"
+    one = costs.placement((96, 64), 1, {"gpu": (1,)})
+    assert one["units"]["gpu"] == {"cores": [1], "threads": 1} and "gpu 1, dsp" in one["why"]
+    assert "as asked, the others for the least predicted frame time; by the rule" in one["why"]
+    assert one["predicted_ms"] <= 1.03 * free["predicted_ms"]
+    with pytest.raises(BadInputError, match="--cores: found cores of snapdragon-888, expected --profile host"):
+        CostModel(load_bundle(tiny_bundle).read_network(), CHIP, CAP).placement(None, 1, {"gpu": (0,)})
 
 
 def test_measured_errors_are_those_of_the_drawn_vertices(checked: Checked) -> None:

@@ -263,7 +263,7 @@ def test_units_are_placed_by_the_rules_of_the_policy(
     cores = [Core(0, 0), Core(1, 1)]
     with pytest.raises(StopIteration):
         place_units("profile", plan, "corners", cores)  # type: ignore[arg-type]
-    assert asked == [(cores, ("profile", plan, "corners", 2), Rules("cpu", in_turns))]
+    assert asked == [(cores, ("profile", plan, "corners", 2, {}), Rules("cpu", in_turns), {})]
 
 
 @pytest.mark.parametrize(("layout", "raster_ms"), [("split", 0.0252), ("packed", 0.0094)])
