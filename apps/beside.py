@@ -56,7 +56,7 @@ def asked(text: str) -> Asked:
 
 
 def _where(text: str) -> str:
-    return f"--beside {text!r}"
+    return f"pipeline {text!r}"
 
 
 def _rate(text: str, number: str) -> float:

@@ -6,7 +6,7 @@ Rule: nothing is computed here; what the pipelines are is read by `trilane.apps.
 
 from __future__ import annotations
 
-from collections.abc import Sequence, Set
+from collections.abc import Mapping, Sequence, Set
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
@@ -130,15 +130,20 @@ def _pipelines(answer: dict[str, Any]) -> Table:
         table.add_row(
             row["name"],
             f"{row['rate_fps']:g}",
-            f"{row['frame_time_ms']['mean']:.1f}",
+            _mean(row["frame_time_ms"]),
             *after,
-            f"{row['alone']['frame_time_ms']['mean']:.1f}",
-            f"{row['response_ms']['mean']:.1f}",
+            _mean(row["alone"]["frame_time_ms"]),
+            _mean(row["response_ms"]),
             f"{row['in_time']:.1%}",
             f"{row['deadline_misses']}",
             f"{sum(row['frames']['dropped'].values())}",
         )
     return table
+
+
+def _mean(times: Mapping[str, float]) -> str:
+    """Of some times in ms, where there are any."""
+    return f"{times['mean']:.1f}" if times["samples"] else "-"
 
 
 def _idle(answer: dict[str, Any]) -> Table:

@@ -235,6 +235,15 @@ def test_options_that_do_not_go_with_a_scene_are_refused(command: Callable[..., 
         assert said in command("predict", *arguments, code=2)[1]
 
 
+def test_a_network_of_one_frame_has_no_frame_time(
+    command: Callable[..., tuple[str, str]], tmp_path: Path, monkeypatch: Any
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    onnx.save(additions(32), "add.onnx")
+    row = next(line for line in command("predict", "add.onnx@0.001")[0].splitlines() if "add" in line)
+    assert row.split("│")[3].strip() == "-"
+
+
 def test_too_high_a_rate_of_a_tenant_is_refused() -> None:
     with pytest.raises(BadInputError, match=r"0\.001 to 1000"):
         bare("dsp", float("nan"))
