@@ -28,6 +28,8 @@ MAX_BYTES = 512 << 20
 MAX_NODES = 50_000
 #: Before it, operators broadcast only where an attribute said so; a graph of that time has other shapes.
 OLDEST_OPSET = 7
+#: Operators that have a tensor among their attributes.
+WITH_VALUES = frozenset(["Constant", "ConstantOfShape"])
 NOT_A_FILE = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
 EXPORT_AGAIN = "copy or export it again: it may be cut short"
 
@@ -108,18 +110,18 @@ def _check_names(model: onnx.ModelProto) -> None:
     names = [entry.name for entry in (*graph.input, *graph.output, *graph.initializer)]
     for node in graph.node:
         names += [node.name, node.op_type, node.domain, *node.input, *node.output, *(a.name for a in node.attribute)]
-    wrong = [name for name in names if not isinstance(name, str)]
-    if wrong:
-        raise UnexpectedValue(f"the name {wrong[0]!r}", "text in UTF-8", EXPORT_AGAIN)
+    try:
+        "".join(names)
+    except TypeError:
+        wrong = next(name for name in names if not isinstance(name, str))
+        raise UnexpectedValue(f"the name {wrong!r}", "text in UTF-8", EXPORT_AGAIN) from None
 
 
 def _tensors(model: onnx.ModelProto) -> Iterator[TensorProto]:
     yield from model.graph.initializer
     for node in model.graph.node:
-        for attribute in node.attribute:
-            if attribute.type == AttributeProto.TENSOR:
-                yield attribute.t
-            yield from attribute.tensors
+        if node.op_type in WITH_VALUES:
+            yield from (attribute.t for attribute in node.attribute if attribute.type == AttributeProto.TENSOR)
 
 
 def _numbers(model: onnx.ModelProto) -> Numbers:

@@ -14,7 +14,7 @@ from onnx import TensorProto
 
 from trilane.hw_profiles.graph_folding import fold
 from trilane.hw_profiles.graph_structure import EXPORT_AGAIN, called
-from trilane.hw_profiles.graph_tensors import KEPT_ELEMENTS, check_size
+from trilane.hw_profiles.graph_tensors import KEPT_ELEMENTS, check_size, is_ordinary
 from trilane.hw_profiles.network_work import constant_tensors
 from trilane.hw_profiles.operator_kinds import CONVOLUTIONS
 from trilane.unexpected_value import UnexpectedValue
@@ -136,7 +136,9 @@ def _check_all(
             sizes = shapes.get(name, (0,))
             if 0 in sizes:
                 raise _unknown(graph, node, inferred.get(name), name)
-            check_size(sizes, inferred[name].type.tensor_type.elem_type, f"the result of {called(node)}")
+            kind = inferred[name].type.tensor_type.elem_type
+            if not is_ordinary(sizes, kind):
+                check_size(sizes, kind, f"the result of {called(node)}")
 
 
 def _check_convolutions(graph: onnx.GraphProto, shapes: Mapping[str, Shape]) -> None:

@@ -44,6 +44,11 @@ def bytes_of(shape: tuple[int, ...], kind: int) -> int:
     return -(-prod(shape) * _BITS[kind] // 8)
 
 
+def is_ordinary(shape: tuple[int, ...], kind: int) -> bool:
+    """Whether a tensor is of numbers and not too large: what `check_size` lets pass."""
+    return prod(shape) * _BITS.get(kind, 8 * MAX_TENSOR_BYTES + 1) <= 8 * MAX_TENSOR_BYTES
+
+
 def check_size(shape: tuple[int, ...], kind: int, what: str) -> None:
     """Raises UnexpectedValue when a tensor is too large or its elements are no numbers.
 
