@@ -29,8 +29,10 @@ EXPECTED = {
     "model_type": "a table",
     "tuple_type": "a list",
     "string_type": "text in quotes",
+    "float_type": "a number, without quotes",
+    "bool_type": "true or false, without quotes",
+    "int_type": "a whole number, without quotes or decimal point",
     "string_too_short": "at least one character",
-    "int_from_float": "a whole number",
     "string_pattern_mismatch": "letters, digits, spaces, dots, hyphens and underscores",
 }
 #: Key of the scene -> why it cannot be what it was, where the range alone does not tell.

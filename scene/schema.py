@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict, field_validator, model_validator
 
 from trilane.shapes import BUCKET_STEP, MAX_SIDE, checked_size
 from trilane.unexpected_value import UnexpectedValue
@@ -20,6 +20,7 @@ FARTHEST_M = 1e4  # of an avatar from the scene's origin; there float32 still re
 
 NAME = r"^[\w .-]+$"
 
+LISTED = Strict(strict=False)  # of a tuple, which is a list in a file
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Metres = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan=False)]
 
@@ -30,14 +31,23 @@ class Model(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class OutputSpec(Model):
+class Table(Model):
+    """A table of a scene file: a value has the type of its key, and nothing else is read as one.
+
+    A number that need not be whole may be written as a whole one, though; and tuples are lists there.
+    """
+
+    model_config = ConfigDict(strict=True)
+
+
+class OutputSpec(Table):
     """Size of the picture that is shown, in pixels."""
 
     width: int = Field(default=640, ge=64, le=MAX_SIDE, multiple_of=2)
     height: int = Field(default=480, ge=64, le=MAX_SIDE, multiple_of=2)
 
 
-class AvatarSpec(Model):
+class AvatarSpec(Table):
     """One avatar.
 
     `name`: no other avatar of the scene has it; `avatar1`, `avatar2`, ... by its place when it is not given.
@@ -48,14 +58,14 @@ class AvatarSpec(Model):
     name: str | None = Field(default=None, min_length=1, max_length=80, pattern=NAME)
     bundle: str = "default"
     motion: str = "builtin:walk-wave-turn"
-    position: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
+    position: Annotated[tuple[Metres, Metres, Metres], LISTED] = (0.0, 0.0, 0.0)
     heading_deg: float = Field(default=0.0, ge=-3600, le=3600, allow_inf_nan=False)
     up_axis: Literal["auto", "y", "z"] = "auto"
     units: Literal["auto", "m", "cm", "in", "cmu"] = "auto"
     ground: Literal["auto", "sequence", "frame", "none"] = "auto"
 
 
-class CameraSpec(Model):
+class CameraSpec(Table):
     """The camera.
 
     `source`: `builtin:NAME` or a file. `fov_y_deg`: of the picture's height; None for that of the file, or the usual
@@ -80,14 +90,14 @@ class CameraSpec(Model):
         return self
 
 
-class PlaneSpec(Model):
+class PlaneSpec(Table):
     """A detected plane to show: a rectangle round `centre` (world, metres) with `normal` (of any length but 0).
 
     `turn_deg`: about the normal. At 0 the first side lies along the world's x if the plane is level, else it points up.
     """
 
-    centre: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
-    normal: tuple[Finite, Finite, Finite] = (0.0, 1.0, 0.0)
+    centre: Annotated[tuple[Finite, Finite, Finite], LISTED] = (0.0, 0.0, 0.0)
+    normal: Annotated[tuple[Finite, Finite, Finite], LISTED] = (0.0, 1.0, 0.0)
     width_m: float = Field(default=2.0, gt=0, le=1000, allow_inf_nan=False)
     depth_m: float = Field(default=2.0, gt=0, le=1000, allow_inf_nan=False)
     turn_deg: Finite = 0.0
@@ -109,7 +119,7 @@ def _scene_size(size: str) -> str:
         raise UnexpectedValue(error.found, f"{error.expected}, or {AUTO}") from None
 
 
-class Scene(Model):
+class Scene(Table):
     """A scene.
 
     `background`: `room`, or a video, a folder of images or a picture. `hud`: whether frame, rate and age are written on
@@ -129,7 +139,7 @@ class Scene(Model):
     size: Annotated[str, AfterValidator(_scene_size)] = "256"
     background: str = "room"
     hud: bool = False
-    planes: tuple[PlaneSpec, ...] = Field(default=(), max_length=32)
+    planes: Annotated[tuple[PlaneSpec, ...], LISTED] = Field(default=(), max_length=32)
     texture_filter: Literal["linear", "mipmap", "anisotropic"] = "linear"
     plan: Literal["planned", "fixed", "full"] = "planned"
     error_budget_px: float = Field(default=0.5, gt=0, le=100, allow_inf_nan=False)
@@ -138,7 +148,9 @@ class Scene(Model):
     memory_mb: int = Field(default=512, ge=1, le=1_000_000)
     output: OutputSpec = OutputSpec()
     camera: CameraSpec = CameraSpec()
-    avatars: tuple[AvatarSpec, ...] = Field(default=(AvatarSpec(),), min_length=1, max_length=8, validate_default=True)
+    avatars: Annotated[tuple[AvatarSpec, ...], LISTED] = Field(
+        default=(AvatarSpec(),), min_length=1, max_length=8, validate_default=True
+    )
 
     @field_validator("avatars")
     @classmethod

@@ -28,6 +28,16 @@ WRONG = {
     "[camera]\nnear_m = 1e-9": ("camera", "far_m 100", "at most 1e+06 times near_m"),
     "name = '../x'": ("name", "found '../x'"),
     "[[avatars]]\nposition = [1e5, 0, 0]": ("avatars.0.position.0", "found 100000.0", "less than or equal to 10000"),
+    "error_budget_px = true": ("error_budget_px", "found True", "a number, without quotes"),
+    "error_budget_px = '0.5'": ("error_budget_px", "found '0.5'", "a number, without quotes"),
+    "hud = 'yes'": ("hud", "found 'yes'", "true or false, without quotes"),
+    "hud = 1": ("hud", "found 1", "true or false, without quotes"),
+    "most_side = 64.0": ("most_side", "found 64.0", "a whole number, without quotes or decimal point"),
+    "frames = true": ("frames", "found True", "a whole number"),
+    "[output]\nwidth = '640'": ("output.width", "found '640'", "a whole number"),
+    "[camera]\nfov_y_deg = '30'": ("camera.fov_y_deg", "found '30'", "a number"),
+    "[[avatars]]\nposition = [0, '1', 0]": ("avatars.0.position.1", "found '1'", "a number"),
+    "[[planes]]\nnormal = [0, true, 0]": ("planes.0.normal.1", "found True", "a number"),
     "frames 3": ("", "no valid TOML", "line 1"),
 }
 
@@ -90,3 +100,13 @@ def test_the_default_scene_says_what_the_schema_says() -> None:
 def test_a_scene_that_is_neither_file_nor_name_is_refused() -> None:
     with pytest.raises(BadInputError, match=r"one of .*default"):
         find_scene("beach")
+
+
+def test_whole_numbers_and_lists_are_read_for_others(tmp_path: Path) -> None:
+    """TOML tells 1 from 1.0 and knows no tuples; a scene that was written as JSON is read again."""
+    lines = ["fps = 24", "error_budget_px = 1", "[camera]", "near_m = 1", "[[planes]]", "centre = [1, 2, 3]"]
+    scene = scene_from("here", load_scene(write(tmp_path, "\n".join([*lines, "[[avatars]]", "position = [0, 1, 2]"]))))
+    numbers = (scene.fps, scene.error_budget_px, scene.camera.near_m, *scene.planes[0].centre)
+    assert numbers == (24, 1, 1, 1, 2, 3) and {type(number) for number in numbers} == {float}
+    assert scene.avatars[0].position == (0.0, 1.0, 2.0)
+    assert Scene.model_validate(scene.model_dump(mode="json")) == scene

@@ -149,7 +149,7 @@ SENTENCES: list[tuple[dict[str, Any], str]] = [
     ({"name": "/" * 79}, f"name: found '{'/' * 79}..., {CHARACTERS}"),
     ({"frames": 0}, "frames: found 0, expected greater than or equal to 1"),
     ({"name": "/" * 78}, f"name: found '{'/' * 78}', {CHARACTERS}"),
-    ({"hud": None}, "hud: found None, expected a valid boolean"),
+    ({"hud": None}, "hud: found None, expected true or false, without quotes"),
 ]
 
 
