@@ -42,9 +42,14 @@ class ShapeSet:
 
 
 def choose_shapes(
-    demands: Iterable[Demand], bytes_per_pixel: float, memory_bytes: int, most_shapes: int = MOST_SHAPES
+    demands: Iterable[Demand],
+    bytes_per_pixel: float,
+    memory_bytes: int,
+    most_shapes: int = MOST_SHAPES,
+    *,
+    optional: bool = False,
 ) -> ShapeSet:
-    """The shapes to prepare: at least one, whatever its memory.
+    """The shapes to prepare: at least one, whatever its memory, unless they are `optional`.
 
     `demands`: of the frames that can be foreseen, at least one.
     `bytes_per_pixel`: memory of a network that is ready to run, for each pixel of its tensor.
@@ -55,7 +60,9 @@ def choose_shapes(
     chosen: list[Shape] = []
     while len(chosen) < most_shapes:
         shape = _next(frames, chosen)
-        if shape is None or (chosen and bytes_per_pixel * sum(map(area, (*chosen, shape))) > memory_bytes):
+        if shape is None or (
+            (chosen or optional) and bytes_per_pixel * sum(map(area, (*chosen, shape))) > memory_bytes
+        ):
             break
         chosen.append(shape)
     unserved = sum(count for demand, count in frames.items() if not any(serves(shape, demand) for shape in chosen))

@@ -34,11 +34,15 @@ BYTE_TYPES = (2, 3)  # of ONNX: uint8 and int8
 
 @dataclass(frozen=True)
 class Foreseen:
-    """`shapes`: to make ready. `frames`: numbers of those that were looked at. `seen`: on how many somebody is."""
+    """`shapes`: to make ready. `frames`: numbers of those that were looked at. `seen`: on how many somebody is.
+
+    `left_out`: how many of the sizes that are stepped down to have no shape, because `memory_mb` has no room for one.
+    """
 
     shapes: ShapeSet
     frames: tuple[int, ...]
     seen: int
+    left_out: int = 0
 
     @property
     def note(self) -> str:
@@ -51,14 +55,18 @@ class Foreseen:
         return text
 
     def notes(self, memory_mb: int) -> tuple[str, ...]:
-        """`note`, and whether the networks' memory, computed, is more than `memory_mb`."""
+        """`note`, and what `memory_mb` has no room for: smaller sizes, or even one network, by computed memory."""
+        notes = [self.note]
+        if self.left_out:
+            notes.append(
+                f"memory: {self.left_out} of the smaller tensor sizes have no shape within memory_mb {memory_mb}"
+            )
         needed = math.ceil(self.shapes.memory_bytes / MB)
-        if needed <= memory_mb:
-            return (self.note,)
-        return (
-            self.note,
-            f"memory: the network may take {needed} MB, more than memory_mb {memory_mb}: one is always ready",
-        )
+        if needed > memory_mb:
+            notes.append(
+                f"memory: the network may take {needed} MB, more than memory_mb {memory_mb}: one is always ready"
+            )
+        return tuple(notes)
 
 
 def foresee(
@@ -68,20 +76,24 @@ def foresee(
 
     `bodies`: of its avatars, in order.
     `network`: that all of them share.
-    `budgets`: of its tensors, the largest first; the further ones are stepped down to.
+    `budgets`: of its tensors, the largest first; the further ones are stepped down to, where memory has room for them.
     """
     count = min(scene.frames, max(FORESEEN_FRAMES // len(bodies), LEAST_FRAMES))
     frames = tuple(index * scene.frames // count for index in range(count))
     output = (scene.output.height, scene.output.width)
     seen = [rects for rects in foreseen_rects(scene, staged, bodies, frames) if rects]
     per_pixel = bytes_per_pixel(network)
-    chosen = ShapeSet((), 0, 0)
+    chosen, left_out = ShapeSet((), 0, 0), 0
     for budget in budgets:
         demands = [Demand(ideal_shape(rects, output, budget), budget.of(len(rects))) for rects in seen]
         anyway = demands or [Demand((STRIDE, STRIDE), budget.of(1))]
         left = scene.memory_mb * MB - chosen.memory_bytes
-        chosen = joined(chosen, choose_shapes(anyway, per_pixel, left, MOST_SMALLER if chosen.shapes else MOST_SHAPES))
-    return Foreseen(chosen, frames, len(seen))
+        is_smaller = bool(chosen.shapes)
+        most = MOST_SMALLER if is_smaller else MOST_SHAPES
+        found = choose_shapes(anyway, per_pixel, left, most, optional=is_smaller)
+        left_out += not found.shapes
+        chosen = joined(chosen, found)
+    return Foreseen(chosen, frames, len(seen), left_out)
 
 
 def foreseen_rects(

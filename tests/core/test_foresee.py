@@ -50,19 +50,19 @@ def test_a_scenes_megabytes_are_a_million_bytes_and_smaller_sizes_get_what_is_le
     avatar: AvatarData, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Ten shapes of the first size, three of each further one."""
-    given: list[tuple[int, int]] = []
+    given: list[tuple[int, int, bool]] = []
     taken: list[int] = []
 
-    def chosen(demands: Any, pixel_bytes: Any, memory_bytes: int, most_shapes: int) -> Any:
-        given.append((memory_bytes, most_shapes))
-        found = choose_shapes(demands, pixel_bytes, memory_bytes, most_shapes)
+    def chosen(demands: Any, pixel_bytes: Any, memory_bytes: int, most_shapes: int, *, optional: bool) -> Any:
+        given.append((memory_bytes, most_shapes, optional))
+        found = choose_shapes(demands, pixel_bytes, memory_bytes, most_shapes, optional=optional)
         taken.append(found.memory_bytes)
         return found
 
     monkeypatch.setattr("trilane.stages.foresee.choose_shapes", chosen)
     scene = Scene(size="auto", frames=1, memory_mb=300)
     found = foresee(scene, staged(scene, avatar), [avatar.shaped], avatar.network, [OWN, OWN.scaled(563)])
-    assert given == [(300_000_000, 10), (300_000_000 - taken[0], 3)]
+    assert given == [(300_000_000, 10, False), (300_000_000 - taken[0], 3, True)]
     assert found.shapes.memory_bytes == sum(taken)
     assert [area <= 128 * 128 * 563 // 1000 for area in map(prod, found.shapes.shapes)] == [True, False]
 
@@ -101,6 +101,28 @@ def test_the_note_says_shapes_frames_and_what_is_less_dense() -> None:
     assert Foreseen(shapes, (0, 5, 9), 2).note == text
     less = Foreseen(ShapeSet(shapes.shapes, 1, 4), (0, 5, 9), 2).note
     assert less == f"{text}; 4 of them have no shape of their own within memory_mb and are less dense"
+
+
+@pytest.mark.parametrize("room", [False, True])
+def test_smaller_sizes_never_pass_the_memory_of_the_scene(
+    avatar: AvatarData, monkeypatch: pytest.MonkeyPatch, room: bool
+) -> None:
+    """One frame of a size of 128 x 128 pixels, and of 563 and 250 thousandths: each asks for one shape. With as much
+    memory as the first takes, or a pixel less than it and the second, the second has none; the third is smaller."""
+    scene = Scene(size="auto", frames=1, memory_mb=1)
+    budgets = [OWN, OWN.scaled(563), OWN.scaled(250)]
+    place = staged(scene, avatar)
+    rects = next(foreseen_rects(scene, place, [avatar.shaped], (0,)))
+    output = (scene.output.height, scene.output.width)
+    first, second, third = (prod(ideal_shape(rects, output, budget)) for budget in budgets)
+    assert first > second > third
+    pixels = first + second - 1 if room else first
+    monkeypatch.setattr("trilane.stages.foresee.bytes_per_pixel", lambda _: (MB - 0.5) / pixels)
+    found = foresee(scene, place, [avatar.shaped], avatar.network, budgets)
+    assert [prod(shape) for shape in found.shapes.shapes] == ([third, first] if room else [first])
+    assert found.shapes.memory_bytes <= MB and found.left_out == (1 if room else 2)
+    sizes = f"memory: {found.left_out} of the smaller tensor sizes have no shape within memory_mb 1"
+    assert found.notes(1) == (found.note, sizes)
 
 
 def test_a_network_that_takes_more_than_the_limit_is_told_of() -> None:
