@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from math import prod
 from typing import Any, NamedTuple
@@ -17,6 +17,7 @@ import onnx
 from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
+from trilane.hw_profiles.engine_layers import NO_LAYERS, Layers, layers_of
 from trilane.hw_profiles.operator_kinds import (
     CLASSES,
     CONVOLUTIONS,
@@ -62,12 +63,16 @@ class Operator(NamedTuple):
 
 @dataclass(frozen=True)
 class Work:
-    """The operators of a network, in order, and the sizes of its inputs and outputs in elements."""
+    """The operators of a network, in order, and the sizes of its inputs and outputs in elements.
+
+    `layers`: the same as a tensor engine runs it.
+    """
 
     operators: tuple[Operator, ...]
     input_elements: int
     input_tensors: int
     output_elements: int
+    layers: Layers = field(default=NO_LAYERS, compare=False)
 
     @cached_property
     def table(self) -> NDArray[np.float64]:
@@ -135,6 +140,7 @@ def count_work(model: Any) -> Work:
         sum(_size(shapes, name) for name in inputs),
         len(inputs),
         sum(_size(shapes, o.name) for o in graph.output),
+        layers_of(graph, shapes, constants),
     )
 
 

@@ -107,6 +107,62 @@ class Efficiencies(Model):
     permute: Efficiency
 
 
+#: An engine's numbers are those of a precision under a runtime.
+EngineName = Literal["int8_tflite", "int8_qnn_dlc", "fp16_tflite", "fp16_qnn_dlc"]
+ENGINES: tuple[EngineName, ...] = ("int8_tflite", "int8_qnn_dlc", "fp16_tflite", "fp16_qnn_dlc")
+
+
+class EngineRates(Model):
+    """The six numbers of a chip: products, activations on the chip, activations that do not fit there, weights; what an
+    operator and a job cost besides.
+    """
+
+    arithmetic_tmac_s: Rate
+    activation_gb_s: Rate
+    spill_gb_s: Rate
+    weight_gb_s: Rate
+    operator_us: Cost
+    job_us: Cost
+
+
+#: Rate of a term -> key of `EngineRates`, and how many of what it counts are one of the key's unit of measure.
+KEY_OF_RATE = {
+    "arithmetic": ("arithmetic_tmac_s", 1e12),
+    "activation": ("activation_gb_s", 1e9),
+    "spill": ("spill_gb_s", 1e9),
+    "weight": ("weight_gb_s", 1e9),
+    "operator": ("operator_us", 1e-6),
+    "job": ("job_us", 1e-6),
+}
+
+
+class Engine(Model):
+    """A tensor engine at one precision under one runtime.
+
+    `on_chip_mb`: activations that it holds. `factors`: how much dearer each term of `engine_layers.py` is than a plain
+    convolution's; 1 where none is given. `error_fraction`: relative error of the model itself, apart from that of its
+    numbers.
+    """
+
+    element_bytes: Literal[1, 2]
+    on_chip_mb: Rate
+    rates: EngineRates
+    factors: dict[str, Rate] = {}
+    error_fraction: Annotated[Quantity, AfterValidator(_Range(0, 5))]
+
+    def factor(self, term: str) -> float:
+        """How much dearer `term` is."""
+        return self.factors[term].or_else(1.0) if term in self.factors else 1.0
+
+    def seconds_per_unit(self, rate: str) -> float:
+        """Seconds of one product, one element of one activation or weight, one operator, or one job."""
+        key, unit = KEY_OF_RATE[rate]
+        value: float = getattr(self.rates, key).or_else(1.0)
+        if rate in ("operator", "job"):
+            return value * unit
+        return (1 if rate == "arithmetic" else self.element_bytes) / (value * unit)
+
+
 class Unit(Model):
     """One unit. `fallback`: ONNX operators that it cannot run and hands to the CPU.
 
@@ -116,7 +172,8 @@ class Unit(Model):
     the unit takes `power_max_w` times the clock fraction to the power of `power_exponent`, and `idle_w` otherwise.
     `model_error_fraction`: relative error of the roofline itself, apart from that of its numbers. `runtimes`: how many
     times faster than ONNX Runtime in FP32 each runtime runs an INT8 network; only the host's DSP unit has them. `core`:
-    units with the same one, unless it is empty, work in turns: on a host with too few cores.
+    units with the same one, unless it is empty, work in turns: on a host with too few cores. `engine`: which of
+    `engines` runs networks; a unit without one is priced by `efficiency`.
     """
 
     title: str
@@ -136,6 +193,8 @@ class Unit(Model):
     model_error_fraction: Annotated[Quantity, AfterValidator(_Range(0, 5))]
     efficiency: Efficiencies
     runtimes: dict[str, Rate] = {}
+    engine: EngineName | None = None
+    engines: dict[EngineName, Engine] = {}
     corners: dict[Corner, Fraction]
     power_max_w: Power
     power_exponent: Annotated[Quantity, AfterValidator(_Range(0, 6))]

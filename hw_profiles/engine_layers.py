@@ -1,0 +1,275 @@
+"""The layers of a network as a tensor engine runs them: what its runtime folds together, and how much of each term is left.
+
+Rule: a pure function of an ONNX graph's shapes; nothing here knows a chip. A term is a kind of work with a rate of its
+own (`TERMS`). Products are counted with the channels rounded up to the blocks in which the Hexagon keeps them: inputs of
+a convolution to 16, its outputs to 32, all other activations to 8. A ReLU, a clip, a padding and a bias disappear in
+the convolution before or behind them, a sum of two tensors in the layer that makes the second.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from math import prod
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Rate = Literal["arithmetic", "activation", "spill", "weight", "operator", "job"]
+RATES: tuple[Rate, ...] = ("arithmetic", "activation", "spill", "weight", "operator", "job")
+
+#: Each term -> the rate that its amount is divided by. Amounts are products for the first, elements for the next three.
+TERMS: dict[str, Rate] = {
+    "convolution": "arithmetic",
+    "grouped": "arithmetic",
+    "first": "arithmetic",
+    "depthwise": "arithmetic",
+    "stride": "arithmetic",
+    "depthwise_stride": "arithmetic",
+    "dilation": "arithmetic",
+    "moved": "activation",
+    "moved_depthwise": "activation",
+    "pool": "activation",
+    "reduction": "activation",
+    "bilinear": "activation",
+    "nearest": "activation",
+    "concat": "activation",
+    "constant": "activation",
+    "divide": "activation",
+    "elementwise": "activation",
+    "batch_norm": "activation",
+    "normalisation": "activation",
+    "shuffle": "activation",
+    "depth_to_space": "activation",
+    "activation": "activation",
+    "leaky": "activation",
+    "swish": "activation",
+    "clip": "activation",
+    "pad": "activation",
+    "other": "activation",
+    "input": "activation",
+    "output": "activation",
+    "spill": "spill",
+    "weights": "weight",
+    "operator": "operator",
+    "job": "job",
+}
+NAMES = tuple(TERMS)
+INDEX = {name: index for index, name in enumerate(NAMES)}
+
+#: Operators that only rename their input.
+RENAMES = frozenset(
+    ("Identity", "Reshape", "Flatten", "Squeeze", "Unsqueeze", "Dropout", "Cast", "QuantizeLinear", "DequantizeLinear")
+)
+#: Activations that disappear in the layer before them.
+FOLDED = frozenset(["Relu", "Clip"])
+#: Layers that take up such an activation.
+TAKES = frozenset(
+    ("Conv", "ConvTranspose", "Gemm", "MatMul", "Add", "Mul", "Concat", "BatchNormalization", "MaxPool", "Resize")
+)
+PRODUCTS = frozenset(["Conv", "ConvTranspose", "Gemm", "MatMul"])
+ARITHMETIC_OF_TWO = frozenset(["Add", "Sub", "Mul", "Div"])
+_BY_TERM = {
+    "pool": ("MaxPool", "AveragePool", "LpPool"),
+    "reduction": ("GlobalAveragePool", "GlobalMaxPool", "ReduceMean", "ReduceSum", "ReduceMax", "ReduceMin", "ArgMax"),
+    "concat": ("Concat",),
+    "batch_norm": ("BatchNormalization",),
+    "normalisation": ("InstanceNormalization", "GroupNormalization", "LayerNormalization"),
+    "shuffle": ("Slice", "Split", "Transpose", "Gather", "Expand", "Tile"),
+    "depth_to_space": ("DepthToSpace", "SpaceToDepth"),
+    "activation": ("Relu", "Clip", "Sigmoid", "HardSwish", "HardSigmoid", "Tanh", "Gelu", "Erf", "Elu", "Softmax"),
+    "leaky": ("LeakyRelu", "PRelu"),
+    "swish": ("Swish",),
+    "pad": ("Pad",),
+}
+TERM_OF = {operator: term for term, operators in _BY_TERM.items() for operator in operators}
+INPUT_BLOCK, OUTPUT_BLOCK, ACTIVATION_BLOCK = 16, 32, 8
+#: A convolution of at most so many channels reads a picture.
+PICTURE_CHANNELS = 4
+
+
+class Layer(NamedTuple):
+    """One layer. `amounts`: of each term. `reads`, `writes`: names of tensors that are not weights."""
+
+    name: str
+    op_type: str
+    amounts: Mapping[str, float]
+    reads: tuple[str, ...]
+    writes: str
+
+
+@dataclass(frozen=True, eq=False)
+class Layers:
+    """The layers of a network in order, equal to nothing but themselves. `sizes`: elements of each tensor. `input`, `output`: elements of the network's."""
+
+    layers: tuple[Layer, ...]
+    sizes: Mapping[str, int]
+    input: int
+    output: int
+
+    @cached_property
+    def table(self) -> NDArray[np.float64]:
+        """Amounts (layers, terms)."""
+        table = np.zeros((len(self.layers), len(NAMES)))
+        for row, layer in zip(table, self.layers, strict=True):
+            for term, amount in layer.amounts.items():
+                row[INDEX[term]] = amount
+        return table
+
+    def since(self, name: str, crossing: int) -> Layers:
+        """The layers from the one called `name` on. `crossing`: elements that the layers before hand over."""
+        first = next((i for i, layer in enumerate(self.layers) if layer.name == name), 0)
+        return Layers(self.layers[first:], self.sizes, crossing, self.output)
+
+
+NO_LAYERS = Layers((), {}, 0, 0)
+
+Shapes = Mapping[str, tuple[int, ...]]
+
+
+class _Graph:
+    """A graph without what only renames: `name_of` a tensor, how often it is read, and which tensors are given."""
+
+    def __init__(self, graph: Any, shapes: Shapes, constants: set[str]) -> None:
+        self.shapes, self.constants = shapes, constants
+        self.nodes = [n for n in graph.node if not all(name in constants for name in n.output if name)]
+        self._renamed: dict[str, str] = {}
+        for node in self.nodes:
+            if node.op_type in RENAMES and node.input:
+                self.rename(node.output[0], node.input[0])
+        self.reads = Counter(self.name_of(name) for n in self.nodes if n.op_type not in RENAMES for name in n.input)
+
+    def rename(self, name: str, original: str) -> None:
+        """From now on `name` means `original`."""
+        self._renamed[name] = original
+
+    def name_of(self, name: str) -> str:
+        """The tensor that `name` is another name of."""
+        while name in self._renamed:
+            name = self._renamed[name]
+        return name
+
+    def given(self, node: Any) -> tuple[str, ...]:
+        """The tensors that `node` reads, without its weights."""
+        return tuple(self.name_of(name) for name in node.input if name and name not in self.constants)
+
+
+def layers_of(graph: Any, shapes: Shapes, constants: set[str]) -> Layers:
+    """The layers of an ONNX graph.
+
+    `graph`: of a model.
+    `shapes`: of its tensors.
+    `constants`: names of tensors that do not depend on the input.
+    """
+    names = _Graph(graph, shapes, constants)
+    layers: dict[str, Layer] = {}
+    for node in names.nodes:
+        if node.op_type in RENAMES or not names.given(node):
+            continue
+        before = [layers[name] for name in names.given(node) if name in layers]
+        sigmoid = next((layer for layer in before if _is_swish(node, layer, names)), None)
+        if node.op_type in FOLDED and before and _folds(before[0], names):
+            layers[before[0].writes] = before[0]._replace(amounts={**before[0].amounts, **_clip(node, shapes)})
+            names.rename(node.output[0], before[0].writes)
+        elif sigmoid is not None:
+            del layers[sigmoid.writes]
+            layers[node.output[0]] = _layer(node, names, "Swish", sigmoid.reads)
+        else:
+            layers[node.output[0]] = _layer(node, names, node.op_type, names.given(node))
+    sizes = {name: _padded(shape, ACTIVATION_BLOCK) for name, shape in shapes.items() if name not in constants}
+    ends = ([i.name for i in graph.input if i.name not in constants], [o.name for o in graph.output])
+    whole = tuple(layers.values())
+    return Layers(whole, sizes, *(sum(prod(shapes[name]) for name in end) for end in ends))
+
+
+def _folds(before: Layer, names: _Graph) -> bool:
+    return before.op_type in TAKES and names.reads[before.writes] == 1
+
+
+def _clip(node: Any, shapes: Shapes) -> dict[str, float]:
+    return {"clip": 2.0 * _padded(shapes[node.output[0]], ACTIVATION_BLOCK)} if node.op_type == "Clip" else {}
+
+
+def _is_swish(node: Any, before: Layer, names: _Graph) -> bool:
+    """Whether `node` multiplies a tensor with its own sigmoid, which is `before`."""
+    if node.op_type != "Mul" or before.op_type != "Sigmoid":
+        return False
+    return set(names.given(node)) == {*before.reads, before.writes} and names.reads[before.writes] == 1
+
+
+def _layer(node: Any, names: _Graph, kind: str, reads: tuple[str, ...]) -> Layer:
+    amounts: Counter[str] = Counter()
+    amounts["operator"] = 1
+    amounts["weights"] = sum(prod(names.shapes.get(n, ())) for n in node.input if n and n in names.constants)
+    if kind in PRODUCTS and len(names.shapes[node.input[0]]) > 1:
+        amounts.update(dict(_products(node, names.shapes)))
+    else:
+        amounts["weights"] = 0
+        moved = [names.shapes[n] for n in node.input if n and n not in names.constants] + [names.shapes[node.output[0]]]
+        amounts.update(dict(_movement(node, kind, sum(_padded(s, ACTIVATION_BLOCK) for s in moved), names)))
+    return Layer(node.name, node.op_type, {t: float(a) for t, a in amounts.items() if a}, reads, node.output[0])
+
+
+def _movement(node: Any, kind: str, moved: int, names: _Graph) -> Iterator[tuple[str, float]]:
+    """The term of a layer without products. `kind`: its type; `moved`: elements that it reads and writes."""
+    if kind == "Resize":
+        mode = next((a.s for a in node.attribute if a.name == "mode"), b"nearest")
+        yield "nearest" if mode == b"nearest" else "bilinear", moved
+    elif kind in ARITHMETIC_OF_TWO:
+        yield from _of_two(kind, moved, any(name in names.constants for name in node.input))
+    else:
+        yield TERM_OF.get(kind, "other"), moved
+
+
+def _of_two(kind: str, moved: int, with_constant: bool) -> Iterator[tuple[str, float]]:
+    """A sum of two tensors of the network is free: the layer that makes the second adds the first."""
+    if kind == "Add" and not with_constant:
+        yield "operator", -1
+    else:
+        yield "divide" if kind == "Div" else "constant" if with_constant else "elementwise", moved
+
+
+def _padded(shape: tuple[int, ...], block: int) -> int:
+    """Elements of a tensor whose channels, its second axis, are rounded up to whole blocks."""
+    if len(shape) != 4:
+        return prod(shape)
+    return shape[0] * _up(shape[1], block) * shape[2] * shape[3]
+
+
+def _up(count: int, block: int) -> int:
+    return -(-count // block) * block
+
+
+def _products(node: Any, shapes: Shapes) -> Iterator[tuple[str, float]]:
+    source, out = shapes[node.input[0]], shapes[node.output[0]]
+    yield "moved", _padded(source, ACTIVATION_BLOCK) + _padded(out, ACTIVATION_BLOCK)
+    if node.op_type in ("Gemm", "MatMul"):
+        yield "convolution", prod(out[:-1]) * _up(source[-1], INPUT_BLOCK) * _up(out[-1], OUTPUT_BLOCK)
+        return
+    attributes = {a.name: a for a in node.attribute}
+    groups = attributes["group"].i if "group" in attributes else 1
+    stride, dilation = (max(attributes[k].ints) if k in attributes else 1 for k in ("strides", "dilations"))
+    places = prod(source[2:] if node.op_type == "ConvTranspose" else out[2:]) * prod(shapes[node.input[1]][2:])
+    if groups > 1:
+        yield from _grouped(places, source[1], out[1], groups, stride)
+        return
+    macs = places * _up(source[1], INPUT_BLOCK) * _up(out[1], OUTPUT_BLOCK)
+    picture = source[1] <= PICTURE_CHANNELS
+    yield "first" if picture else "convolution", macs
+    if stride > 1 and not picture and node.op_type == "Conv":
+        yield "stride", macs
+    if dilation > 1:
+        yield "dilation", macs
+
+
+def _grouped(places: int, c_in: int, c_out: int, groups: int, stride: int) -> Iterator[tuple[str, float]]:
+    """A convolution in groups. `places`: output positions times the kernel's. `c_in`, `c_out`: of all groups."""
+    if c_in > groups:
+        yield "grouped", places * _up(c_in // groups, INPUT_BLOCK) * _up(c_out, OUTPUT_BLOCK)
+        return
+    yield "depthwise", places * _up(c_out, OUTPUT_BLOCK)
+    if stride > 1:
+        yield "depthwise_stride", places * _up(c_out, OUTPUT_BLOCK)

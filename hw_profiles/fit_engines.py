@@ -1,0 +1,247 @@
+"""Fits the shared terms of tensor engines and the six numbers of each chip to published latencies.
+
+Rule: every number has a prior (`fit_priors.py`); the fit minimises, over all logarithms of numbers,
+
+    sum over rows of (NU + 1) log(1 + r^2 / NU) + sum over numbers of (log(number / prior) / spread)^2,
+    r = log(predicted / published) / NOISE,
+
+which gives the most probable numbers if errors follow Student's t distribution, so that a row far off counts little.
+Solved by Gauss and Newton's method with Levenberg's damping; the derivatives of `engine_times.join` are exact. Whatever
+is said of errors comes from fits that have seen none of a network's rows.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from trilane.arrays import F64, I64
+from trilane.hw_profiles.engine_layers import NAMES, RATES, TERMS, Layers
+from trilane.hw_profiles.engine_times import amounts, join
+from trilane.hw_profiles.fit_priors import ON_CHIP_MB, STEP, Prior, factor_prior, rate_prior
+from trilane.hw_profiles.latency_rows import Latency
+from trilane.hw_profiles.schema import KEY_OF_RATE, EngineName
+
+NOISE, NU = 0.08, 3.0
+STEPS, ENOUGH = 60, 1e-5
+#: The only network that pins the peak rate: it is in every fit.
+ALWAYS = "unet_segmentation"
+FOLDS = 5
+RATE_OF_TERM = np.array([RATES.index(TERMS[name]) for name in NAMES])
+COSTS = ("operator", "job")
+
+
+class Numbers(NamedTuple):
+    """Logarithms of an engine's numbers. `factors` (terms,); `rates` (chips, 6): seconds per unit of each rate."""
+
+    factors: F64
+    rates: F64
+
+    @property
+    def flat(self) -> F64:
+        return np.concatenate([self.factors, self.rates.ravel()])
+
+
+def _from_flat(flat: F64) -> Numbers:
+    return Numbers(flat[: len(NAMES)], flat[len(NAMES) :].reshape(-1, len(RATES)))
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """An engine's numbers for `chips`, and the spread that the fit leaves of each."""
+
+    engine: EngineName
+    chips: tuple[str, ...]
+    numbers: Numbers
+    spreads: Numbers
+
+    def rates_of(self, chip: str) -> dict[str, Prior]:
+        """The six numbers of `chip`, as profiles state them, with their spreads."""
+        row = self.chips.index(chip)
+        values, spreads = self.numbers.rates[row], self.spreads.rates[row]
+        return {
+            KEY_OF_RATE[rate][0]: Prior(as_stated(self.engine, rate, math.exp(value)), float(spread))
+            for rate, value, spread in zip(RATES, values, spreads, strict=True)
+        }
+
+
+def as_stated(engine: EngineName, rate: str, seconds: float) -> float:
+    """A rate as profiles state it, from seconds per unit."""
+    unit = KEY_OF_RATE[rate][1]
+    return seconds / unit if rate in COSTS else _bytes(engine, rate) / (seconds * unit)
+
+
+def _seconds(engine: EngineName, rate: str, stated: float) -> float:
+    unit = KEY_OF_RATE[rate][1]
+    return stated * unit if rate in COSTS else _bytes(engine, rate) / (stated * unit)
+
+
+def _bytes(engine: EngineName, rate: str) -> int:
+    return 2 if engine.startswith("fp16") and rate != "arithmetic" else 1
+
+
+class _Rows:
+    """Rows as arrays: amounts of each row's layers (equal ones once, with their count), and which chip each is of."""
+
+    def __init__(self, rows: Sequence[Latency], layers: Mapping[str, Layers], chips: Sequence[str]) -> None:
+        tables = [_distinct(layers[row.network], _room(row)) for row in rows]
+        self.chip: I64 = np.array([chips.index(row.chip) for row in rows])
+        self.ms: F64 = np.array([row.ms for row in rows])
+        self.table = np.concatenate([table for table, _ in tables])
+        self.count = np.concatenate([count for _, count in tables])
+        self.starts = np.cumsum([0, *(len(table) for table, _ in tables[:-1])])
+        self.row = np.repeat(np.arange(len(rows)), [len(table) for table, _ in tables])
+
+    def predict(self, numbers: Numbers) -> tuple[F64, F64]:
+        """Milliseconds of each row (rows,), and each term's share in their growth (rows, terms)."""
+        seconds = np.exp(numbers.factors + numbers.rates[self.chip][:, RATE_OF_TERM])
+        costs = self.table * seconds[self.row]
+        joined, slopes = join(costs)
+        whole = np.add.reduceat(joined.sum(axis=1) * self.count, self.starts)
+        grown = np.add.reduceat(costs * slopes * self.count[:, None], self.starts, axis=0)
+        return 1e3 * whole, grown / whole[:, None]
+
+    def slopes(self, shares: F64, chips: int) -> F64:
+        """How the logarithm of each row's time grows with each number's (rows, numbers)."""
+        by_rate = np.stack([shares[:, rate == RATE_OF_TERM].sum(axis=1) for rate in range(len(RATES))], axis=1)
+        of_chips = np.zeros((len(shares), chips, len(RATES)))
+        of_chips[np.arange(len(shares)), self.chip] = by_rate
+        return np.concatenate([shares, of_chips.reshape(len(shares), -1)], axis=1)
+
+
+def _room(row: Latency) -> int:
+    return ON_CHIP_MB[row.hexagon] * 2**20 // (2 if row.engine.startswith("fp16") else 1)
+
+
+_tables: dict[tuple[Layers, int], tuple[F64, F64]] = {}
+
+
+def _distinct(layers: Layers, room: int) -> tuple[F64, F64]:
+    """Amounts of layers that differ, and how often each is there."""
+    if (layers, room) not in _tables:
+        table, count = np.unique(amounts(layers, room), axis=0, return_counts=True)
+        _tables[layers, room] = table, count.astype(np.float64)
+    return _tables[layers, room]
+
+
+def priors(engine: EngineName, chips: Sequence[str]) -> tuple[Numbers, Numbers]:
+    """Values and spreads before the fit."""
+    factors = [factor_prior(engine, name) for name in NAMES]
+    rates = [[rate_prior(engine, chip, KEY_OF_RATE[rate][0]) for rate in RATES] for chip in chips]
+    values = [[math.log(_seconds(engine, r, p.value)) for r, p in zip(RATES, row, strict=True)] for row in rates]
+    return (
+        Numbers(np.log([p.value for p in factors]), np.array(values)),
+        Numbers(np.array([p.spread for p in factors]), np.array([[p.spread for p in row] for row in rates])),
+    )
+
+
+def fit_engine(rows: Sequence[Latency], layers: Mapping[str, Layers], start: Numbers | None = None) -> Fitted:
+    """The numbers that `rows`, all of one engine, speak for.
+
+    `layers`: of each network.
+    `start`: where to begin, if not at the priors.
+    """
+    engine, chips = rows[0].engine, tuple(sorted({row.chip for row in rows}))
+    return solve(engine, chips, _Rows(rows, layers, chips), priors(engine, chips), start)
+
+
+def solve(
+    engine: EngineName, chips: tuple[str, ...], data: _Rows, prior: tuple[Numbers, Numbers], start: Numbers | None = None
+) -> Fitted:
+    """The most probable numbers. `prior`: their values and spreads before."""
+    mean, spread = (numbers.flat for numbers in prior)
+    at, damping = (mean if start is None else start.flat), 1e-2
+    cost = _cost(at, data, mean, spread)
+    for _ in range(STEPS):
+        gradient, curvature = _derivatives(at, data, mean, spread, len(chips))
+        while damping < 1e6:
+            step = np.clip(np.linalg.solve(curvature + damping * np.diag(np.diag(curvature)), -gradient), -1, 1)
+            lower = _cost(at + step, data, mean, spread)
+            if lower <= cost:
+                break
+            damping *= 4
+        else:
+            break
+        at, damping, gain, cost = at + step, damping / 5, cost - lower, lower
+        if gain < ENOUGH * abs(cost):
+            break
+    covariance = np.linalg.inv(_derivatives(at, data, mean, spread, len(chips))[1])
+    return Fitted(engine, chips, _from_flat(at), _from_flat(np.sqrt(np.diag(covariance))))
+
+
+def _cost(at: F64, data: _Rows, mean: F64, spread: F64) -> float:
+    misses = np.log(data.predict(_from_flat(at))[0] / data.ms) / NOISE
+    return float(((NU + 1) * np.log1p(misses**2 / NU)).sum() + (((at - mean) / spread) ** 2).sum())
+
+
+def _derivatives(at: F64, data: _Rows, mean: F64, spread: F64, chips: int) -> tuple[F64, F64]:
+    """Half the gradient of `_cost`, and half its curvature as if `predict` were linear."""
+    ms, shares = data.predict(_from_flat(at))
+    misses = np.log(ms / data.ms) / NOISE
+    weights = (NU + 1) / (NU + misses**2)
+    slopes = data.slopes(shares, chips) / NOISE
+    gradient = slopes.T @ (weights * misses) + (at - mean) / spread**2
+    return gradient, slopes.T @ (weights[:, None] * slopes) + np.diag(1 / spread**2)
+
+
+class LeftOut(NamedTuple):
+    """A row beside what a fit without its network predicts. `unsure`: that network's share of ill-known factors."""
+
+    row: Latency
+    predicted_ms: float
+    unsure: float
+
+    @property
+    def error(self) -> float:
+        return self.predicted_ms / self.row.ms - 1
+
+
+def folds(networks: Sequence[str], seed: int = 0) -> Iterator[frozenset[str]]:
+    """FOLDS parts of the networks, drawn by `seed`; ALWAYS is in none."""
+    others = sorted(set(networks) - {ALWAYS})
+    drawn = np.random.default_rng(seed).permutation(len(others))
+    for fold in range(FOLDS):
+        yield frozenset(others[index] for index in drawn[fold::FOLDS])
+
+
+def cross_validate(
+    rows: Sequence[Latency], layers: Mapping[str, Layers], start: Numbers, parts: Sequence[frozenset[str]] | None = None
+) -> list[LeftOut]:
+    """Every row predicted by a fit that has seen none of its network's rows.
+
+    `rows`: of one engine.
+    `layers`: of each network.
+    `start`: numbers to begin each fit at.
+    `parts`: networks that are left out together; those of `folds` if None.
+    """
+    result = []
+    for out in folds([row.network for row in rows]) if parts is None else parts:
+        fitted = fit_engine([row for row in rows if row.network not in out], layers, start)
+        result += predict_rows(fitted, [row for row in rows if row.network in out], layers)
+    return result
+
+
+def predict_rows(fitted: Fitted, rows: Sequence[Latency], layers: Mapping[str, Layers]) -> list[LeftOut]:
+    """Each of `rows` beside what `fitted` predicts."""
+    known = [row for row in rows if row.chip in fitted.chips]
+    ms, shares = _Rows(known, layers, fitted.chips).predict(fitted.numbers)
+    unsure = np.sqrt(((shares * fitted.spreads.factors) ** 2).sum(axis=1))
+    return [LeftOut(row, float(m), float(u)) for row, m, u in zip(known, ms, unsure, strict=True)]
+
+
+def fit_anchors(fitted: Fitted, before: str, rows: Sequence[Latency], layers: Mapping[str, Layers]) -> Fitted:
+    """A chip of which only `rows` are known: its rates are those of the chip `before` it, one STEP on.
+
+    `fitted`: all other chips; its factors stay.
+    `layers`: of each network.
+    """
+    chip = (rows[0].chip,)
+    rates = fitted.numbers.rates[[fitted.chips.index(before)]] - math.log(STEP.value)
+    prior = Numbers(fitted.numbers.factors, rates), Numbers(
+        np.full(len(NAMES), 1e-6), np.full((1, len(RATES)), STEP.spread)
+    )
+    return solve(fitted.engine, chip, _Rows(rows, layers, chip), prior)
