@@ -18,10 +18,11 @@ from typing import Any, NamedTuple
 from trilane.errors import BadInputError
 from trilane.hw_profiles.network_work import Network, Work
 from trilane.hw_profiles.operator_kinds import CLASSES
-from trilane.hw_profiles.operator_times import JobTime, job_time, machine_of
+from trilane.hw_profiles.operator_times import JobTime
 from trilane.hw_profiles.performance_profiles import Corners
 from trilane.hw_profiles.reference_networks import CHANNELS_PER_PASS
 from trilane.hw_profiles.schema import Profile, Unit
+from trilane.hw_profiles.unit_times import time_on
 from trilane.scheduler.accounts import compared
 from trilane.scheduler.events import Graph, Settings, chain
 from trilane.scheduler.policy import POLICIES
@@ -113,7 +114,7 @@ def _job(
     `batch`: frames of the job.
     """
     clock = profile.units[unit].clock(corners[UNITS.index(unit)])
-    return job_time(work, machine_of(profile.units[unit], profile.memory, clock, contended), batch)
+    return time_on(profile.units[unit], profile.memory, work, clock, contended=contended, batch=batch)
 
 
 def stage_times_ms(profile: Profile, plan: Plan, corners: Corners) -> dict[tuple[str, UnitName], float]:
@@ -165,7 +166,9 @@ def split_work(work: Work, share: float) -> tuple[Work, Work]:
             break
     crossing = work.operators[cut - 1].live
     head = Work(work.operators[:cut], work.input_elements, work.input_tensors, crossing)
-    return head, Work(work.operators[cut:], crossing, 1, work.output_elements)
+    rest = work.operators[cut:]
+    layers = work.layers.since(rest[0].name if rest else "", crossing)
+    return head, Work(rest, crossing, 1, work.output_elements, layers)
 
 
 @dataclass(frozen=True)
@@ -320,6 +323,8 @@ def relative_error(job: JobTime, unit: Unit) -> float:
 
     It joins the error of the number that each part of the time is computed from, and that of the model itself.
     """
+    if job.unsure is not None and unit.engine is not None:
+        return math.hypot(job.unsure, unit.engine.error_fraction.or_else(0.5))
     computed_from = {
         "fixed": unit.job_fixed_ms,
         "input": unit.input_ns_per_element,

@@ -1,9 +1,9 @@
-"""The layers of a network as a tensor engine runs them: what its runtime folds together, and how much of each term is left.
+"""The layers of a network as a tensor engine runs them: what its runtime folds, and how much of each term is left.
 
-Rule: a pure function of an ONNX graph's shapes; nothing here knows a chip. A term is a kind of work with a rate of its
-own (`TERMS`). Products are counted with the channels rounded up to the blocks in which the Hexagon keeps them: inputs of
-a convolution to 16, its outputs to 32, all other activations to 8. A ReLU, a clip, a padding and a bias disappear in
-the convolution before or behind them, a sum of two tensors in the layer that makes the second.
+Rule: a pure function of an ONNX graph's shapes; nothing here knows a chip. A term is a kind of work with a price of its
+own (`TERMS`). Products are counted with the channels rounded up to the blocks in which the Hexagon keeps them: a
+convolution's inputs to 16, its outputs to 32, all other activations to 8. A ReLU and a clip disappear in the layer
+before them, a sum of two tensors in the layer that makes the second.
 """
 
 from __future__ import annotations
@@ -103,7 +103,10 @@ class Layer(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Layers:
-    """The layers of a network in order, equal to nothing but themselves. `sizes`: elements of each tensor. `input`, `output`: elements of the network's."""
+    """The layers of a network in order, equal to nothing but themselves.
+
+    `sizes`: elements of each tensor. `input`, `output`: elements of the network's.
+    """
 
     layers: tuple[Layer, ...]
     sizes: Mapping[str, int]
@@ -121,7 +124,7 @@ class Layers:
 
     def since(self, name: str, crossing: int) -> Layers:
         """The layers from the one called `name` on. `crossing`: elements that the layers before hand over."""
-        first = next((i for i, layer in enumerate(self.layers) if layer.name == name), 0)
+        first = next((i for i, layer in enumerate(self.layers) if layer.name == name), len(self.layers))
         return Layers(self.layers[first:], self.sizes, crossing, self.output)
 
 
@@ -245,12 +248,14 @@ def _up(count: int, block: int) -> int:
 
 def _products(node: Any, shapes: Shapes) -> Iterator[tuple[str, float]]:
     source, out = shapes[node.input[0]], shapes[node.output[0]]
-    yield "moved", _padded(source, ACTIVATION_BLOCK) + _padded(out, ACTIVATION_BLOCK)
+    moved = _padded(source, ACTIVATION_BLOCK) + _padded(out, ACTIVATION_BLOCK)
     if node.op_type in ("Gemm", "MatMul"):
+        yield "moved", moved
         yield "convolution", prod(out[:-1]) * _up(source[-1], INPUT_BLOCK) * _up(out[-1], OUTPUT_BLOCK)
         return
     attributes = {a.name: a for a in node.attribute}
     groups = attributes["group"].i if "group" in attributes else 1
+    yield "moved_depthwise" if groups == source[1] > 1 else "moved", moved
     stride, dilation = (max(attributes[k].ints) if k in attributes else 1 for k in ("strides", "dilations"))
     places = prod(source[2:] if node.op_type == "ConvTranspose" else out[2:]) * prod(shapes[node.input[1]][2:])
     if groups > 1:

@@ -150,7 +150,11 @@ def fit_engine(rows: Sequence[Latency], layers: Mapping[str, Layers], start: Num
 
 
 def solve(
-    engine: EngineName, chips: tuple[str, ...], data: _Rows, prior: tuple[Numbers, Numbers], start: Numbers | None = None
+    engine: EngineName,
+    chips: tuple[str, ...],
+    data: _Rows,
+    prior: tuple[Numbers, Numbers],
+    start: Numbers | None = None,
 ) -> Fitted:
     """The most probable numbers. `prior`: their values and spreads before."""
     mean, spread = (numbers.flat for numbers in prior)
@@ -189,7 +193,7 @@ def _derivatives(at: F64, data: _Rows, mean: F64, spread: F64, chips: int) -> tu
 
 
 class LeftOut(NamedTuple):
-    """A row beside what a fit without its network predicts. `unsure`: that network's share of ill-known factors."""
+    """A row beside what a fit without its network predicts. `unsure`: relative error that the fit's numbers leave."""
 
     row: Latency
     predicted_ms: float
@@ -228,8 +232,9 @@ def cross_validate(
 def predict_rows(fitted: Fitted, rows: Sequence[Latency], layers: Mapping[str, Layers]) -> list[LeftOut]:
     """Each of `rows` beside what `fitted` predicts."""
     known = [row for row in rows if row.chip in fitted.chips]
-    ms, shares = _Rows(known, layers, fitted.chips).predict(fitted.numbers)
-    unsure = np.sqrt(((shares * fitted.spreads.factors) ** 2).sum(axis=1))
+    data = _Rows(known, layers, fitted.chips)
+    ms, shares = data.predict(fitted.numbers)
+    unsure = np.linalg.norm(data.slopes(shares, len(fitted.chips)) * fitted.spreads.flat, axis=1)
     return [LeftOut(row, float(m), float(u)) for row, m, u in zip(known, ms, unsure, strict=True)]
 
 
@@ -241,7 +246,8 @@ def fit_anchors(fitted: Fitted, before: str, rows: Sequence[Latency], layers: Ma
     """
     chip = (rows[0].chip,)
     rates = fitted.numbers.rates[[fitted.chips.index(before)]] - math.log(STEP.value)
-    prior = Numbers(fitted.numbers.factors, rates), Numbers(
-        np.full(len(NAMES), 1e-6), np.full((1, len(RATES)), STEP.spread)
+    prior = (
+        Numbers(fitted.numbers.factors, rates),
+        Numbers(np.full(len(NAMES), 1e-6), np.full((1, len(RATES)), STEP.spread)),
     )
     return solve(fitted.engine, chip, _Rows(rows, layers, chip), prior)

@@ -20,15 +20,15 @@ class Prior(NamedTuple):
 
 #: Terms whose factor is 1 by definition: those that the six rates are counted in.
 UNITS_OF_RATES = ("convolution", "moved", "spill", "weights", "operator", "job")
-#: How much dearer a term is than a plain convolution's, in INT8. Vector unit instead of matrix unit for depthwise
-#: products; strides break the blocks in which activations lie; bilinear interpolation reads four elements and multiplies.
+#: How much dearer a term is than a plain convolution's, in INT8. Depthwise products are the vector unit's; strides
+#: break the blocks in which activations lie; bilinear interpolation reads four elements; bytes cannot be divided.
 FACTORS: dict[str, Prior] = {
     "grouped": Prior(1, 0.7),
     "first": Prior(1, 0.7),
     "depthwise": Prior(10, 1),
-    "stride": Prior(0.5, 1),
+    "stride": Prior(1, 0.7),
     "depthwise_stride": Prior(100, 1),
-    "dilation": Prior(0.5, 1),
+    "dilation": Prior(1, 0.7),
     "moved_depthwise": Prior(1, 0.7),
     "pool": Prior(1, 0.7),
     "reduction": Prior(1, 0.7),
@@ -36,7 +36,7 @@ FACTORS: dict[str, Prior] = {
     "nearest": Prior(1, 0.7),
     "concat": Prior(0.3, 1),
     "constant": Prior(1, 0.3),
-    "divide": Prior(10, 1),
+    "divide": Prior(40, 1),
     "elementwise": Prior(1, 0.7),
     "batch_norm": Prior(10, 0.7),
     "normalisation": Prior(10, 1),

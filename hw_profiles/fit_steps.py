@@ -30,22 +30,18 @@ def _efficiency(unit: str, *names: str) -> Keys:
     return tuple(f"units.{unit}.efficiency.{name}" for name in names)
 
 
+def _engine(name: str) -> Keys:
+    return (f"units.dsp.engines.int8_tflite.{name}",)
+
+
 STEPS = (
     Step(
         "network on the DSP",
         ("bench_dsp_ms",),
         (
-            _efficiency("dsp", "convolution", "pointwise"),
-            _efficiency(
-                "dsp",
-                "convolution_traffic",
-                "depthwise_traffic",
-                "pointwise_traffic",
-                "normalisation",
-                "resize",
-                "elementwise",
-            ),
-            _efficiency("dsp", "permute"),
+            _engine("rates.arithmetic_tmac_s"),
+            _engine("rates.spill_gb_s"),
+            _engine("factors.normalisation"),
             ("units.dsp.input_ns_per_element",),
             ("units.dsp.permute_fixed_ms",),
             ("units.dsp.fallback_ns_per_element",),

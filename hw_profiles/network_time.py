@@ -14,17 +14,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
+from trilane.arrays import F64
+from trilane.hw_profiles.application import relative_error
+from trilane.hw_profiles.engine_layers import NAMES, Layer
+from trilane.hw_profiles.engine_times import BOUNDS, Bound, engine_time, numbers_of
 from trilane.hw_profiles.network_work import Operator, Work
-from trilane.hw_profiles.operator_times import Machine, job_time, machine_of
+from trilane.hw_profiles.operator_times import JobTime, Machine, job_time, machine_of
 from trilane.hw_profiles.performance_profiles import Corners
-from trilane.hw_profiles.schema import Profile
+from trilane.hw_profiles.schema import Profile, Unit
+from trilane.hw_profiles.unit_times import layer_times, time_on
 from trilane.units import UNITS, UnitName
 
-#: What decides an operator's time: products, activations to and from memory, its weights, activations that do not fit
-#: into the on-chip memory, or the fixed cost of an operator.
-Bound = Literal["arithmetic", "activation traffic", "weight traffic", "spill", "fixed"]
+#: A term is named where it alone makes the time uncertain by so much.
+NAMED_FROM = 0.05
 #: Of a normal distribution: how many standard deviations have 80 % between them and their negative.
 NORMAL_80 = 1.2816
 
@@ -40,11 +44,15 @@ class OperatorTime(NamedTuple):
 
 @dataclass(frozen=True)
 class NetworkTime:
-    """Milliseconds of one job. `job_ms`: what belongs to no operator. `operators`: in the order of the file."""
+    """Milliseconds of one job. `job_ms`: what belongs to no operator. `operators`: in the order of the file.
+
+    `job`: the same by part.
+    """
 
     unit: UnitName
     job_ms: float
     operators: tuple[OperatorTime, ...]
+    job: JobTime
 
     @property
     def total_ms(self) -> float:
@@ -72,12 +80,22 @@ def price(profile: Profile, work: Work, unit: UnitName, corners: Corners) -> Net
     `unit`: that runs it.
     `corners`: of all units.
     """
-    machine = machine_of(profile.units[unit], profile.memory, profile.units[unit].clock(corners[UNITS.index(unit)]))
-    operators = tuple(_operator_time(o, machine) for o in work.operators)
-    return NetworkTime(unit, job_time(work, machine).total_ms - sum(o.ms for o in operators), operators)
+    of_unit, clock = profile.units[unit], profile.units[unit].clock(corners[UNITS.index(unit)])
+    whole = time_on(of_unit, profile.memory, work, clock)
+    if of_unit.engine is None:
+        machine = machine_of(of_unit, profile.memory, clock)
+        operators = tuple(_by_roofline(o, machine) for o in work.operators)
+    else:
+        seconds = layer_times(of_unit, profile.memory, work, clock).layers
+        operators = tuple(_by_engine(layer, row) for layer, row in zip(work.layers.layers, seconds, strict=True))
+    return NetworkTime(unit, whole.total_ms - sum(o.ms for o in operators), operators, whole)
 
 
-def _operator_time(operator: Operator, machine: Machine) -> OperatorTime:
+def _by_engine(layer: Layer, seconds: F64) -> OperatorTime:
+    return OperatorTime(layer.name, layer.op_type, 1e3 * float(seconds.sum()), BOUNDS[int(seconds.argmax())])
+
+
+def _by_roofline(operator: Operator, machine: Machine) -> OperatorTime:
     bare = job_time(Work((), 0, 1, 0), machine).total_ms
     parts = dict(job_time(Work((operator,), 0, 1, 0), machine).parts)
     parts["fixed"] -= bare
@@ -90,16 +108,32 @@ def _operator_time(operator: Operator, machine: Machine) -> OperatorTime:
 
 
 def interval(profile: Profile, work: Work, time: NetworkTime) -> Interval:
-    """The 80 % interval around `time`.
+    """The 80 % interval around `time`: the model's own error, and what its numbers leave open for this network.
 
     `profile`: of the chip.
     `work`: of the network.
     `time`: of `price`.
     """
-    error = profile.units[time.unit].model_error_fraction.or_else(1.0)
-    factor = math.exp(NORMAL_80 * error)
-    why = [f"the profile states a relative error of {error:.0%} for networks on its {time.unit}"]
+    unit = profile.units[time.unit]
+    error = relative_error(time.job, unit)
+    if unit.engine is None:
+        why = [f"the profile states a relative error of {error:.0%} for networks on its {time.unit}"]
+    else:
+        own = unit.engine.error_fraction.or_else(0.5)
+        why = [f"networks that the fit had not seen were off by {own:.0%} besides what its numbers leave open"]
+        why += [f"those leave {time.job.unsure or 0:.0%} open for this one"]
+        why += [f"{share:.0%} of it is {term}, known to {spread:.0%}" for term, share, spread in _ill_known(work, unit)]
     odd = sorted({o.op_type for o in work.operators if not o.ruled})
     if odd:
         why.append(f"no rule for {', '.join(odd)}: counted as the movement of its elements")
+    factor = math.exp(NORMAL_80 * error)
     return Interval(time.total_ms / factor, time.total_ms * factor, tuple(why))
+
+
+def _ill_known(work: Work, unit: Unit) -> list[tuple[str, float, float]]:
+    """The terms that make the time uncertain: name, share of the time, relative spread of what they cost."""
+    assert unit.engine is not None
+    factors = unit.engine.factors
+    shares = engine_time(work.layers, numbers_of(unit.engine)).shares
+    all_terms = [(n, float(s), factors[n].relative_error) for n, s in zip(NAMES, shares, strict=True) if n in factors]
+    return [term for term in all_terms if term[1] * term[2] >= NAMED_FROM]

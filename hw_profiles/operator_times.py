@@ -53,9 +53,14 @@ class Machine:
 
 @dataclass(frozen=True)
 class JobTime:
-    """Milliseconds of one job by part: `fixed`, `input`, `weights`, `fallback` and the operator classes."""
+    """Milliseconds of one job by part: `fixed`, `input`, `weights`, `fallback` and the operator classes.
+
+    On a tensor engine `arithmetic`, `activation` and `spill` in place of the classes, and `unsure`: the relative error
+    that its numbers leave.
+    """
 
     parts: Mapping[str, float]
+    unsure: float | None = None
 
     @property
     def total_ms(self) -> float:

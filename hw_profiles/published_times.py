@@ -15,10 +15,10 @@ from typing import NamedTuple
 
 from trilane.hw_profiles.graph_builder import GraphBuilder, TensorRef
 from trilane.hw_profiles.network_work import Work, count_work
-from trilane.hw_profiles.operator_times import job_time, machine_of
 from trilane.hw_profiles.performance_profiles import corners_of
 from trilane.hw_profiles.reference_encoders import resnet18
 from trilane.hw_profiles.schema import Profile
+from trilane.hw_profiles.unit_times import time_on
 from trilane.units import UNITS
 
 UNET_SIZE = (640, 1280)
@@ -94,9 +94,6 @@ def check_published(name: str, profile: Profile) -> list[Check]:
     """Published times of the chip `name` beside those that `profile` predicts under `burst`; none if none is known."""
     unit = profile.units["dsp"]
     clock = unit.clock(corners_of(profile, "burst")[UNITS.index("dsp")])
-    machine = machine_of(unit, profile.memory, clock)
-    return [
-        Check(name, network, network != CARRIED_OVER, ms, job_time(WORK[network](), machine).total_ms)
-        for (network, chip), ms in PUBLISHED_MS.items()
-        if chip == name
-    ]
+    known = {network: ms for (network, chip), ms in PUBLISHED_MS.items() if chip == name}
+    times = {network: time_on(unit, profile.memory, WORK[network](), clock).total_ms for network in known}
+    return [Check(name, network, network != CARRIED_OVER, ms, times[network]) for network, ms in known.items()]

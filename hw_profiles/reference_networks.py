@@ -6,7 +6,7 @@ the normalisation, the size and the input's layout differ. Batch normalisation i
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from math import prod
 from typing import Any
@@ -22,8 +22,6 @@ from trilane.unet_tables import DECODER, ENCODERS, HEADS, NORMS
 LAYOUTS = ("packed", "split")
 CHANNELS_PER_PASS = 4
 MAX_SIDE = 4096
-#: Sides of the two graphs from which the work at every other size follows.
-REFERENCE_SIDES = (64, 128)
 
 
 @dataclass(frozen=True)
@@ -114,25 +112,5 @@ def reference_network(spec: NetworkSpec) -> Network:
 
 @lru_cache(maxsize=4096)
 def network_work(spec: NetworkSpec) -> Work:
-    """The work of the network of `spec`.
-
-    The strides divide every side that `NetworkSpec` allows, so every count is a constant plus a multiple of the number
-    of pixels. It is counted on graphs of two sizes; the counts at every other size follow from these exactly.
-    """
-    small, large = (_counted(replace(spec, height=side, width=side)) for side in REFERENCE_SIDES)
-    first, second = (side * side for side in REFERENCE_SIDES)
-
-    def at(a: int, b: int) -> int:
-        return a + (b - a) * (spec.pixels - first) // (second - first)
-
-    operators = tuple(
-        s._replace(macs=at(s.macs, b.macs), moved=at(s.moved, b.moved), out=at(s.out, b.out), live=at(s.live, b.live))
-        for s, b in zip(small.operators, large.operators, strict=True)
-    )
-    ends = (at(small.input_elements, large.input_elements), at(small.output_elements, large.output_elements))
-    return Work(operators, ends[0], small.input_tensors, ends[1])
-
-
-@lru_cache(maxsize=512)
-def _counted(spec: NetworkSpec) -> Work:
+    """The work of the network of `spec`."""
     return count_work(build_network(spec))

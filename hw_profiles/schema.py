@@ -172,8 +172,9 @@ class Unit(Model):
     the unit takes `power_max_w` times the clock fraction to the power of `power_exponent`, and `idle_w` otherwise.
     `model_error_fraction`: relative error of the roofline itself, apart from that of its numbers. `runtimes`: how many
     times faster than ONNX Runtime in FP32 each runtime runs an INT8 network; only the host's DSP unit has them. `core`:
-    units with the same one, unless it is empty, work in turns: on a host with too few cores. `engine`: which of
-    `engines` runs networks; a unit without one is priced by `efficiency`.
+    units with the same one, unless it is empty, work in turns: on a host with too few cores. `engines`: a tensor
+    engine's numbers by precision and runtime, of which `engine_runtime` is taken; a unit without is priced by
+    `efficiency`.
     """
 
     title: str
@@ -193,8 +194,8 @@ class Unit(Model):
     model_error_fraction: Annotated[Quantity, AfterValidator(_Range(0, 5))]
     efficiency: Efficiencies
     runtimes: dict[str, Rate] = {}
-    engine: EngineName | None = None
     engines: dict[EngineName, Engine] = {}
+    engine_runtime: Literal["tflite", "qnn_dlc"] = "tflite"
     corners: dict[Corner, Fraction]
     power_max_w: Power
     power_exponent: Annotated[Quantity, AfterValidator(_Range(0, 6))]
@@ -223,6 +224,11 @@ class Unit(Model):
         """Highest multiply-accumulates per second at the unit's precision."""
         peak: Quantity = getattr(self, f"peak_{self.precision}_tmac_s")
         return peak.or_else(0.1) * 1e12
+
+    @property
+    def engine(self) -> Engine | None:
+        """The tensor engine at the unit's precision, if it has one."""
+        return next((e for name, e in self.engines.items() if name == f"{self.precision}_{self.engine_runtime}"), None)
 
     @property
     def element_bytes(self) -> int:

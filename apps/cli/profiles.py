@@ -15,6 +15,7 @@ from trilane.apps.cli.commands import Commands
 from trilane.apps.cli.console import print_json, stderr_console, stdout_console
 from trilane.apps.cli.options import JsonOption
 from trilane.errors import BadInputError
+from trilane.files import read_text
 from trilane.writing import WRITABLE, write_bytes
 
 if TYPE_CHECKING:
@@ -140,6 +141,39 @@ def fit(
         title = result.data["title"].removesuffix(", before the fit")
         command = f"trilane profiles fit --from {source}"
         write_bytes(write, as_toml(result, name, title, profile, command).encode())
+
+
+@app.command(
+    "fit-chips",
+    epilog="\b\nExamples:\n  trilane profiles fit-chips ../shared/data/chips\n"
+    "  trilane profiles fit-chips ../shared/data/chips --write hw_profiles --table docs/predict.md",
+)
+def fit_chips(
+    folder: Annotated[Path, typer.Argument(help="Folder with chip_rows.csv, networks.csv and networks/.")],
+    write: Annotated[Path | None, typer.Option(help="Folder of profiles, into which the numbers go.")] = None,
+    table: Annotated[Path | None, typer.Option(help="Markdown file in which the table of errors is renewed.")] = None,
+    plot: Annotated[Path | None, typer.Option(help="Picture of predicted against published times.")] = None,
+    json: JsonOption = False,
+) -> None:
+    """Fit tensor engines to published latencies: shared terms, six numbers a chip, and how far off both are."""
+    from trilane.hw_profiles.engine_report import as_markdown, errors_of, plot_errors, with_table
+    from trilane.hw_profiles.engine_study import study_engines
+    from trilane.hw_profiles.engine_tables import profile_texts
+
+    with stderr_console().status("fitting, a fifth of the networks left out in turn"):
+        study = study_engines(folder)
+    texts = profile_texts(study, write, f"profiles fit-chips {folder}") if write is not None else {}
+    if table is not None:
+        texts[table] = with_table(read_text(table, "a file in Markdown"), as_markdown(study), table)
+    for path, text in texts.items():
+        write_bytes(path, text.encode())
+    if plot is not None:
+        plot_errors(study, plot)
+    if json:
+        engines = {name: {**errors_of(e.left_out), "covered": e.coverage} for name, e in study.engines.items()}
+        print_json({"engines": engines, "chips": list(study.chips), "written": [str(path) for path in texts]})
+        return
+    stdout_console().print(as_markdown(study), highlight=False)
 
 
 def _fit_document(result: Fit) -> dict[str, Any]:
