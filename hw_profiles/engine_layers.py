@@ -67,8 +67,9 @@ RENAMES = frozenset(
 #: Activations that disappear in the layer before them.
 FOLDED = frozenset(["Relu", "Clip"])
 #: Layers that take up such an activation.
+NORMALISATIONS = ("BatchNormalization", "InstanceNormalization", "GroupNormalization", "LayerNormalization")
 TAKES = frozenset(
-    ("Conv", "ConvTranspose", "Gemm", "MatMul", "Add", "Mul", "Concat", "BatchNormalization", "MaxPool", "Resize")
+    ("Conv", "ConvTranspose", "Gemm", "MatMul", "Add", "Mul", "Concat", "MaxPool", "Resize", *NORMALISATIONS)
 )
 PRODUCTS = frozenset(["Conv", "ConvTranspose", "Gemm", "MatMul"])
 ARITHMETIC_OF_TWO = frozenset(["Add", "Sub", "Mul", "Div"])
@@ -77,7 +78,7 @@ _BY_TERM = {
     "reduction": ("GlobalAveragePool", "GlobalMaxPool", "ReduceMean", "ReduceSum", "ReduceMax", "ReduceMin", "ArgMax"),
     "concat": ("Concat",),
     "batch_norm": ("BatchNormalization",),
-    "normalisation": ("InstanceNormalization", "GroupNormalization", "LayerNormalization"),
+    "normalisation": NORMALISATIONS[1:],
     "shuffle": ("Slice", "Split", "Transpose", "Gather", "Expand", "Tile"),
     "depth_to_space": ("DepthToSpace", "SpaceToDepth"),
     "activation": ("Relu", "Clip", "Sigmoid", "HardSwish", "HardSigmoid", "Tanh", "Gelu", "Erf", "Elu", "Softmax"),

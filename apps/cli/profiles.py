@@ -107,7 +107,7 @@ def check(
         return
     table = Table("profile", "network", "published, ms", "predicted, ms", "error", "")
     for row in latencies:
-        note = "" if row.independent else "sets the profile's peak rate"
+        note = "" if row.independent else "among the rows of the fit"
         figures = (f"{row.published_ms:g}", f"{row.predicted_ms:.2f}", f"{100 * row.error:+.0f} %")
         table.add_row(row.profile, row.network, *figures, note)
     console.print(table)

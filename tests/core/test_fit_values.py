@@ -149,16 +149,9 @@ def keys(unit: str, *names: str) -> tuple[str, ...]:
 
 
 def test_the_steps_of_the_fit() -> None:
-    traffic = (
-        "convolution_traffic",
-        "depthwise_traffic",
-        "pointwise_traffic",
-        "normalisation",
-        "resize",
-        "elementwise",
-    )
+    engine = ("rates.arithmetic_tmac_s", "rates.spill_gb_s", "factors.normalisation")
     own = ("input_ns_per_element", "permute_fixed_ms", "fallback_ns_per_element")
-    dsp = {keys("dsp", "convolution", "pointwise"), keys("dsp", *traffic), keys("dsp", "permute")}
+    dsp: set[tuple[str, ...]] = {(f"units.dsp.engines.int8_tflite.{name}",) for name in engine}
     gpu = {keys("gpu", "convolution", "pointwise"), keys("gpu", "depthwise_traffic", "pointwise_traffic")}
     gpu |= {keys("gpu", "normalisation"), keys("gpu", "permute")}
     found = [(step.name, step.columns, {frozenset(free) for free in step.free}, step.noise) for step in STEPS]

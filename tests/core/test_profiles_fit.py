@@ -110,7 +110,7 @@ def test_the_written_profile_can_be_read(fitted: Fit, tmp_path: Path) -> None:
     profile = load_profile(str(path))
     assert profile.name == "mine"
     assert not profile.template
-    assert profile.units["dsp"].efficiency.convolution.kind == "fitted"
+    assert profile.units["gpu"].efficiency.convolution.kind == "fitted"
 
 
 def test_too_few_rows_are_refused(tmp_path: Path) -> None:
