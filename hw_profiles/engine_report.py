@@ -14,11 +14,12 @@ from trilane.errors import BadInputError, MissingPartError
 from trilane.hw_profiles.engine_study import Study
 from trilane.hw_profiles.fit_engines import LeftOut
 from trilane.hw_profiles.plot import SUFFIXES
+from trilane.hw_profiles.schema import EngineName
 from trilane.writing import write_atomically
 
 BEGIN, END = "<!-- errors: written by `trilane profiles fit-chips` -->", "<!-- end of errors -->"
 #: The engine whose errors are told by family and chip: bytes under the phone's usual runtime.
-USUAL = "int8_tflite"
+USUAL: EngineName = "int8_tflite"
 CLOSE = 0.15
 
 

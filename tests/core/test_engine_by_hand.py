@@ -1,0 +1,196 @@
+"""A tensor engine's layers and their times, worked out by hand; and what has to hold for every network."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from onnx import TensorProto, helper
+
+from trilane.hw_profiles.engine_layers import INDEX, NAMES, Layer, Layers
+from trilane.hw_profiles.engine_times import EngineNumbers, engine_time, join, numbers_of
+from trilane.hw_profiles.load import load_profile, profile_names
+from trilane.hw_profiles.network_work import count_work
+from trilane.hw_profiles.on_chip import spilled
+from trilane.hw_profiles.reference_networks import NetworkSpec, network_work
+from trilane.hw_profiles.unit_times import time_on
+
+
+def layers_of_nodes(nodes: list[Any], shapes: dict[str, tuple[int, ...]]) -> tuple[Layer, ...]:
+    """Layers of a chain of nodes from `x` to `y`; other shapes are weights where they begin with w."""
+    values = {n: helper.make_tensor_value_info(n, TensorProto.FLOAT, shape) for n, shape in shapes.items()}
+    inputs = [value for name, value in values.items() if name == "x" or name.startswith("w")]
+    others = [value for name, value in values.items() if value not in inputs and name != "y"]
+    graph = helper.make_graph(nodes, "g", inputs, [values["y"]], value_info=others)
+    return count_work(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)])).layers.layers
+
+
+def node(kind: str, sources: str, result: str, **attributes: Any) -> Any:
+    return helper.make_node(kind, sources.split(), [result], name=result, **attributes)
+
+
+def test_a_network_of_three_layers() -> None:
+    """A picture's 3x3 convolution with a ReLU, a depthwise one of stride 2 with a clip, and a sum.
+
+    Channels: 3 count as 16, 20 outputs as 32; activations of 20 as 24, of 3 as 8. 8x8 places, then 4x4.
+    """
+    first, middle, last = layers_of_nodes(
+        [
+            node("Conv", "x w0", "a", kernel_shape=[3, 3], pads=[1] * 4),
+            node("Relu", "a", "b"),
+            node("Conv", "b w1", "c", kernel_shape=[3, 3], pads=[1] * 4, strides=[2, 2], group=20),
+            node("Clip", "c", "d"),
+            node("Add", "d d", "y"),
+        ],
+        {
+            **{"x": (1, 3, 8, 8), "w0": (20, 3, 3, 3), "w1": (20, 1, 3, 3)},
+            **{"a": (1, 20, 8, 8), "b": (1, 20, 8, 8)},
+            **dict.fromkeys("cdy", (1, 20, 4, 4)),
+        },
+    )
+    weights = {"operator": 1, "weights": 20 * 27}
+    assert first.amounts == {**weights, "first": 64 * 9 * 16 * 32, "moved": 64 * (8 + 24)}
+    products = 16 * 9 * 32
+    assert middle.amounts == {
+        **{"operator": 1, "weights": 20 * 9, "depthwise": products, "depthwise_stride": products},
+        **{"moved_depthwise": (64 + 16) * 24, "clip": 2 * 16 * 24},
+    }
+    assert (middle.reads, middle.writes) == (("a",), "c")
+    assert last.amounts == {}, "a sum is free"
+
+
+def test_what_is_folded_and_what_is_not() -> None:
+    """x times its own sigmoid is one layer; a reshape is none; a second reader keeps a ReLU apart."""
+    shape = (1, 8, 4, 4)
+    kinds = layers_of_nodes(
+        [
+            *(node("Sigmoid", "x", "a"), node("Mul", "x a", "b"), node("Identity", "b", "c")),
+            *(node("Conv", "c w0", "d", kernel_shape=[1, 1]), node("Relu", "d", "e"), node("Mul", "d e", "y")),
+        ],
+        {**dict.fromkeys(("x", *"abcdey"), shape), "w0": (8, 8, 1, 1)},
+    )
+    assert [(layer.op_type, sorted(layer.amounts)) for layer in kinds] == [
+        ("Mul", ["operator", "swish"]),
+        ("Conv", ["convolution", "moved", "operator", "weights"]),
+        ("Relu", ["activation", "operator"]),
+        ("Mul", ["elementwise", "operator"]),
+    ]
+    assert kinds[0].amounts["swish"] == 3 * 128 - 0, "x, its sigmoid, and the result"
+
+
+@pytest.mark.parametrize(
+    ("kind", "attributes", "term"),
+    [
+        ("Div", {}, "divide"),
+        ("Sub", {}, "constant"),
+        ("MaxPool", {"kernel_shape": [1, 1]}, "pool"),
+        ("LeakyRelu", {}, "leaky"),
+        ("Erf", {}, "activation"),
+        ("Sin", {}, "other"),
+    ],
+)
+def test_terms_of_operators(kind: str, attributes: dict[str, Any], term: str) -> None:
+    sources = "x w0" if kind in ("Div", "Sub") else "x"
+    (layer,) = layers_of_nodes(
+        [node(kind, sources, "y", **attributes)], {"x": (1, 8, 2, 2), "y": (1, 8, 2, 2), "w0": (1, 8, 1, 1)}
+    )
+    assert layer.amounts == {"operator": 1, term: 64}
+
+
+def chain(*sizes: int) -> Layers:
+    """Layers from tensor 0 to tensor n, of so many elements."""
+    layers = tuple(Layer(f"l{i}", "Conv", {}, (str(i),), str(i + 1)) for i in range(len(sizes) - 1))
+    return Layers(layers, {str(i): size for i, size in enumerate(sizes)}, sizes[0], sizes[-1])
+
+
+def test_what_does_not_fit_goes_out_and_comes_back() -> None:
+    """The input of 10 is read; of the 30 that follow, 20 fit, so 10 go out and come back; the result of 5 goes out."""
+    assert spilled(chain(10, 30, 5), 20) == (10 + 10, 10 + 5)
+    assert spilled(chain(10, 30, 5), 30) == (10, 5)
+
+
+def test_what_is_read_last_goes_first() -> None:
+    """Of `a` (8) and `b` (8), 12 fit. `a` is read by the last layer, so 4 of it go out when `b` comes, and return."""
+    layers = (
+        *(Layer("0", "Conv", {}, ("x",), "a"), Layer("1", "Conv", {}, ("a",), "b")),
+        *(Layer("2", "Conv", {}, ("b",), "c"), Layer("3", "Add", {}, ("c", "a"), "y")),
+    )
+    network = Layers(layers, {"x": 1, "a": 8, "b": 8, "c": 1, "y": 1}, 1, 1)
+    assert spilled(network, 12) == (1, 4, 0, 4 + 1)
+
+
+def test_a_concatenation_moves_nothing() -> None:
+    layers = (Layer("0", "Concat", {}, ("x", "z"), "c"), Layer("1", "Conv", {}, ("c",), "y"))
+    assert spilled(Layers(layers, {"x": 5, "z": 6, "c": 11, "y": 2}, 11, 2), 100) == (0, 5 + 6 + 2)
+
+
+def test_what_goes_on_at_once_is_joined_by_its_fourth_power() -> None:
+    """3 of products, 2 of movement, 1 of spill: (81 + 16 + 1)^(1/4); 5 of weights and 7 of an operator add to it."""
+    costs = np.zeros((1, len(NAMES)))
+    for name, seconds in (("convolution", 3), ("moved", 2), ("spill", 1), ("weights", 5), ("operator", 7)):
+        costs[0, INDEX[name]] = seconds
+    by_bound, slopes = join(costs)
+    whole = 98**0.25
+    assert by_bound[0] == pytest.approx([whole * 81 / 98, whole * 16 / 98, whole / 98, 5, 7])
+    assert slopes[0, INDEX["convolution"]] == pytest.approx((3 / whole) ** 3)
+    assert slopes[0, INDEX["weights"]] == 1
+
+
+def test_the_slopes_are_those_of_the_time() -> None:
+    rng = np.random.default_rng(1)
+    costs = rng.random((1, len(NAMES)))
+    _, slopes = join(costs)
+    for index in range(len(NAMES)):
+        more = costs.copy()
+        more[0, index] += 1e-6
+        grown = (join(more)[0].sum() - join(costs)[0].sum()) / 1e-6
+        assert slopes[0, index] == pytest.approx(grown, abs=1e-4)
+
+
+def test_an_engine_at_half_its_clock_with_half_the_memory() -> None:
+    """Spill and weights are the memory's, everything else is the clock's."""
+    engine = load_profile("snapdragon-8-gen-2").units["dsp"].engines["fp16_tflite"]
+    whole, half = numbers_of(engine), numbers_of(engine, 0.5)
+    of_memory = np.isin(NAMES, ("spill", "weights"))
+    assert half.seconds[~of_memory] == pytest.approx(2 * whole.seconds[~of_memory])
+    assert half.seconds[of_memory] == pytest.approx(whole.seconds[of_memory])
+    assert numbers_of(engine, 1, 0.25).seconds[of_memory] == pytest.approx(4 * whole.seconds[of_memory])
+    rate = engine.rates.activation_gb_s.value or 0
+    assert whole.seconds[INDEX["moved"]] == pytest.approx(2 / (rate * 1e9)), "two bytes an element"
+    assert whole.room == 8 * 2**20 / 2
+
+
+def test_a_batch_pays_weights_and_fixed_costs_once() -> None:
+    network = network_work(NetworkSpec("resnet18", "batch", 64, 64, 8)).layers
+    numbers = EngineNumbers(np.ones(len(NAMES)), 10**9)
+    one, four = engine_time(network, numbers), engine_time(network, numbers, batch=4)
+    assert four.layers[:, :3] == pytest.approx(4 * one.layers[:, :3])
+    assert four.layers[:, 3:] == pytest.approx(one.layers[:, 3:])
+
+
+@settings(deadline=None, max_examples=20)
+@given(side=st.integers(1, 12), channels=st.integers(1, 15), room=st.integers(1, 2**22))
+def test_more_to_do_and_less_room_never_take_less_time(side: int, channels: int, room: int) -> None:
+    def seconds(side: int, channels: int, room: int) -> float:
+        network = network_work(NetworkSpec("mobilenetv2", "instance", 32 * side, 32 * side, channels)).layers
+        return engine_time(network, EngineNumbers(np.ones(len(NAMES)), room)).total
+
+    least = seconds(side, channels, room)
+    assert least <= seconds(side + 1, channels, room)
+    assert least <= seconds(side, channels + 1, room)
+    assert least <= seconds(side, channels, room // 2) * (1 + 1e-9)
+
+
+def test_shares_add_up_and_every_engine_names_known_terms() -> None:
+    work = network_work(NetworkSpec("resnet18", "batch", 64, 64, 8))
+    for name in profile_names():
+        profile = load_profile(name)
+        for engine in profile.units["dsp"].engines.values():
+            assert engine.factors.keys() <= INDEX.keys()
+            assert engine_time(work.layers, numbers_of(engine)).shares.sum() == pytest.approx(1)
+        job = time_on(profile.units["dsp"], profile.memory, work)
+        assert job.total_ms == pytest.approx(sum(job.parts.values()))
+        assert (job.unsure is None) == (profile.units["dsp"].engine is None)
