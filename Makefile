@@ -2,7 +2,7 @@
 # Arguments of `trilane run` go in ARGS: make run ARGS="--frames 60 --size 192"
 SHELL := /bin/bash
 .DELETE_ON_ERROR:
-.PHONY: run test test-all test-device mutants setup format compile interpreted clean
+.PHONY: run test test-all test-device mutants results setup format compile interpreted clean
 
 BIN := .venv/bin
 COMPILED := $(shell sed -n 's/^    "\(.*\.py\)",$$/\1/p' src/trilane/compiled.py)
@@ -29,6 +29,10 @@ test-device: .venv/ready-device
 # Small faults put into a copy of the code, to see which the tests notice: tests/README.md.
 mutants: .venv/ready-all
 	$(BIN)/python -m trilane.testing.mutants $(ARGS)
+
+# Tables and pictures of the documents that are computed from data beside this repository: docs/predict.md.
+results: .venv/ready-all
+	$(BIN)/trilane profiles fit-chips ../shared/data/chips --table docs/predict.md --plot docs/images/chip-errors.png
 
 setup: .venv/ready-run
 
