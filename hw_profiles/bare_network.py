@@ -113,7 +113,11 @@ def _times(time: NetworkTime, around: Interval) -> dict[str, Any]:
 
 
 def operator_rows(work: Work, time: NetworkTime) -> list[dict[str, Any]]:
-    """The operators in the order of the file, with what bounds each, and its share of the network's time."""
+    """The operators in the order of the file, with what bounds each, and its share of the network's time.
+
+    An operator that the unit's runtime folds into another one is not among those of `time`.
+    """
+    counts = {operator.name: (operator.macs, operator.moved) for operator in work.operators}
     total_ms = time.total_ms
     return [
         {
@@ -122,10 +126,10 @@ def operator_rows(work: Work, time: NetworkTime) -> list[dict[str, Any]]:
             "ms": one.ms,
             "share": one.ms / total_ms,
             "bound": one.bound,
-            "macs": operator.macs,
-            "elements": operator.moved,
+            "macs": counts.get(one.name, (0, 0))[0],
+            "elements": counts.get(one.name, (0, 0))[1],
         }
-        for one, operator in zip(time.operators, work.operators, strict=True)
+        for one in time.operators
     ]
 
 

@@ -28,7 +28,9 @@ from trilane.hw_profiles.application import (
     application_graph,
     stage_times_ms,
 )
+from trilane.hw_profiles.engine_times import numbers_of
 from trilane.hw_profiles.network_work import Network
+from trilane.hw_profiles.on_chip import spilled
 from trilane.hw_profiles.performance_profiles import Corners
 from trilane.hw_profiles.schema import Profile, Unit
 from trilane.scheduler.accounts import compared
@@ -254,6 +256,11 @@ def _used(profile: Profile, use: float) -> Profile:
 
 
 def moved_bytes(network: Network, unit: Unit) -> float:
-    """Bytes that a network reads and writes in a job on `unit`: every operator's elements, and the weights once."""
+    """Bytes that a network reads and writes in a job on `unit`: every operator's elements, and the weights once.
+
+    On a tensor engine only what does not stay on the chip.
+    """
     work = network.work
+    if unit.engine is not None:
+        return float(sum(spilled(work.layers, numbers_of(unit.engine).room)) + work.weights) * unit.element_bytes
     return float(work.table[:, 1].sum() + work.weights) * unit.element_bytes

@@ -3,7 +3,7 @@
 Rule: a pure function of an ONNX graph's shapes; nothing here knows a chip. A term is a kind of work with a price of its
 own (`TERMS`). Products are counted with the channels rounded up to the blocks in which the Hexagon keeps them: a
 convolution's inputs to 16, its outputs to 32, all other activations to 8. A ReLU and a clip disappear in the layer
-before them, a sum of two tensors in the layer that makes the second.
+before them, a sum of two tensors in the convolution that makes one of them.
 """
 
 from __future__ import annotations
@@ -181,6 +181,8 @@ def layers_of(graph: Any, shapes: Shapes, constants: set[str]) -> Layers:
         elif sigmoid is not None:
             del layers[sigmoid.writes]
             layers[node.output[0]] = _layer(node, names, "Swish", sigmoid.reads)
+        elif node.op_type == "Add" and any(layer.op_type in PRODUCTS for layer in before):
+            layers[node.output[0]] = Layer(node.name or node.output[0], "Add", {}, names.given(node), node.output[0])
         else:
             layers[node.output[0]] = _layer(node, names, node.op_type, names.given(node))
     sizes = {name: _padded(shape, ACTIVATION_BLOCK) for name, shape in shapes.items() if name not in constants}
@@ -214,7 +216,9 @@ def _layer(node: Any, names: _Graph, kind: str, reads: tuple[str, ...]) -> Layer
         amounts["weights"] = 0
         moved = [names.shapes[n] for n in node.input if n and n not in names.constants] + [names.shapes[node.output[0]]]
         amounts.update(dict(_movement(node, kind, sum(_padded(s, ACTIVATION_BLOCK) for s in moved), names)))
-    return Layer(node.name, node.op_type, {t: float(a) for t, a in amounts.items() if a}, reads, node.output[0])
+    return Layer(
+        node.name or node.output[0], node.op_type, {t: float(a) for t, a in amounts.items() if a}, reads, node.output[0]
+    )
 
 
 def _movement(node: Any, kind: str, moved: int, names: _Graph) -> Iterator[tuple[str, float]]:
@@ -223,17 +227,10 @@ def _movement(node: Any, kind: str, moved: int, names: _Graph) -> Iterator[tuple
         mode = next((a.s for a in node.attribute if a.name == "mode"), b"nearest")
         yield "nearest" if mode == b"nearest" else "bilinear", moved
     elif kind in ARITHMETIC_OF_TWO:
-        yield from _of_two(kind, moved, any(name in names.constants for name in node.input))
+        with_constant = any(name in names.constants for name in node.input)
+        yield "divide" if kind == "Div" else "constant" if with_constant else "elementwise", moved
     else:
         yield TERM_OF.get(kind, "other"), moved
-
-
-def _of_two(kind: str, moved: int, with_constant: bool) -> Iterator[tuple[str, float]]:
-    """A sum of two tensors of the network is free: the layer that makes the second adds the first."""
-    if kind == "Add" and not with_constant:
-        yield "operator", -1
-    else:
-        yield "divide" if kind == "Div" else "constant" if with_constant else "elementwise", moved
 
 
 def _padded(shape: tuple[int, ...], block: int) -> int:

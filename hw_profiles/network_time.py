@@ -21,7 +21,7 @@ from trilane.hw_profiles.application import relative_error
 from trilane.hw_profiles.engine_layers import NAMES, Layer
 from trilane.hw_profiles.engine_times import BOUNDS, Bound, engine_time, numbers_of
 from trilane.hw_profiles.network_work import Operator, Work
-from trilane.hw_profiles.operator_times import JobTime, Machine, job_time, machine_of
+from trilane.hw_profiles.operator_times import Machine, job_time, machine_of
 from trilane.hw_profiles.performance_profiles import Corners
 from trilane.hw_profiles.schema import Profile, Unit
 from trilane.hw_profiles.unit_times import layer_times, time_on
@@ -44,15 +44,11 @@ class OperatorTime(NamedTuple):
 
 @dataclass(frozen=True)
 class NetworkTime:
-    """Milliseconds of one job. `job_ms`: what belongs to no operator. `operators`: in the order of the file.
-
-    `job`: the same by part.
-    """
+    """Milliseconds of one job. `job_ms`: what belongs to no operator. `operators`: in the order of the file."""
 
     unit: UnitName
     job_ms: float
     operators: tuple[OperatorTime, ...]
-    job: JobTime
 
     @property
     def total_ms(self) -> float:
@@ -88,7 +84,7 @@ def price(profile: Profile, work: Work, unit: UnitName, corners: Corners) -> Net
     else:
         seconds = layer_times(of_unit, profile.memory, work, clock).layers
         operators = tuple(_by_engine(layer, row) for layer, row in zip(work.layers.layers, seconds, strict=True))
-    return NetworkTime(unit, whole.total_ms - sum(o.ms for o in operators), operators, whole)
+    return NetworkTime(unit, whole.total_ms - sum(o.ms for o in operators), operators)
 
 
 def _by_engine(layer: Layer, seconds: F64) -> OperatorTime:
@@ -115,13 +111,14 @@ def interval(profile: Profile, work: Work, time: NetworkTime) -> Interval:
     `time`: of `price`.
     """
     unit = profile.units[time.unit]
-    error = relative_error(time.job, unit)
+    job = time_on(unit, profile.memory, work)
+    error = relative_error(job, unit)
     if unit.engine is None:
         why = [f"the profile states a relative error of {error:.0%} for networks on its {time.unit}"]
     else:
         own = unit.engine.error_fraction.or_else(0.5)
         why = [f"networks that the fit had not seen were off by {own:.0%} besides what its numbers leave open"]
-        why += [f"those leave {time.job.unsure or 0:.0%} open for this one"]
+        why += [f"those leave {job.unsure or 0:.0%} open for this one"]
         why += [f"{share:.0%} of it is {term}, known to {spread:.0%}" for term, share, spread in _ill_known(work, unit)]
     odd = sorted({o.op_type for o in work.operators if not o.ruled})
     if odd:

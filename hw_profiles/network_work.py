@@ -219,7 +219,9 @@ def _operator(node: Any, shapes: Shapes, constants: set[str], read: set[str]) ->
     moved_in = [_size(shapes, name) for name in node.input if name and name not in constants]
     out = sum(_size(shapes, name) for name in node.output if name and (name in read or name == node.output[0]))
     moved = sum(moved_in) * (2 if node.op_type in STATISTICS else 1) + out
-    plain = Operator(node.name, node.op_type, KIND_OF.get(node.op_type, UNKNOWN), 0, moved, weights, 0, 0, out)
+    plain = Operator(
+        node.name or node.output[0], node.op_type, KIND_OF.get(node.op_type, UNKNOWN), 0, moved, weights, 0, 0, out
+    )
     if known and node.op_type in CONVOLUTIONS:
         return _convolution(node, shapes, plain)
     if known and (node.op_type in PRODUCTS or node.op_type in RECURRENT):

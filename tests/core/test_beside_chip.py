@@ -70,8 +70,8 @@ def test_networks_on_two_units_take_memory_from_each_other_while_both_run() -> N
     two = [bare("gpu"), bare("dsp")]
     alone = [time_ms(each, 0.0) for each in two]
     bandwidth = CHIP.memory.bandwidth_gb_s.or_else(0.0) * 1e9
-    elements = 3 * ADDITIONS * 32 * SIDE * SIDE
-    bytes_ = [elements * CHIP.units[each.unit].element_bytes for each in two]
+    tensor = 32 * SIDE * SIDE  # 8 MB, of which the DSP holds 4: half of each travels twice, the first and last whole
+    bytes_ = [3 * ADDITIONS * tensor * CHIP.units["gpu"].element_bytes, (ADDITIONS + 1) * tensor]
     assert [moved_bytes(each.networks[0], CHIP.units[each.unit]) for each in two] == bytes_
     demand = [count / (ms / 1e3) / bandwidth for count, ms in zip(bytes_, alone, strict=True)]
     beside = [time_ms(each, demand[1 - number]) for number, each in enumerate(two)]

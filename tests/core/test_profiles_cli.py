@@ -177,7 +177,7 @@ def test_profiles_are_listed_shown_and_checked(
     listed = answer(monkeypatch, capsys, "profiles", "list")["profiles"]
     assert {"snapdragon-888", "host", "agx-orin"} <= {row["name"] for row in listed}
     shown = answer(monkeypatch, capsys, "profiles", "show", "snapdragon-888")
-    assert shown["units"]["dsp"]["efficiency"]["convolution"]["kind"] == "fitted"
+    assert shown["units"]["gpu"]["efficiency"]["convolution"]["kind"] == "fitted"
     checked = answer(monkeypatch, capsys, "profiles", "check")
     assert any(row["independent"] for row in checked["published"])
     for command in ("list", "check"):

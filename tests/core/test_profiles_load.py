@@ -176,6 +176,7 @@ def test_a_near_miss_is_suggested() -> None:
 def test_a_template_cannot_be_run() -> None:
     with pytest.raises(BadInputError) as caught:
         load_runnable("phone-template")
-    chips = "agx-orin, host, snapdragon-8-elite, snapdragon-8-gen-1, snapdragon-8-gen-2, snapdragon-8-gen-3"
-    chips += ", snapdragon-865, snapdragon-888, snapdragon-xr2-gen-2"
+    chips = "agx-orin, host, qcs6490, sa8295p, snapdragon-8-elite, snapdragon-8-elite-gen-5, snapdragon-8-gen-1"
+    chips += ", snapdragon-8-gen-2, snapdragon-8-gen-3, snapdragon-865, snapdragon-888, snapdragon-x-elite"
+    chips += ", snapdragon-xr2-gen-2"
     assert str(caught.value) == f"profile: found the template phone-template, expected one of {chips}"
