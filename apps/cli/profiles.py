@@ -153,10 +153,9 @@ def fit_chips(
     write: Annotated[Path | None, typer.Option(help="Folder of profiles, into which the numbers go.")] = None,
     table: Annotated[Path | None, typer.Option(help="Markdown file in which the table of errors is renewed.")] = None,
     plot: Annotated[Path | None, typer.Option(help="Picture of predicted against published times.")] = None,
-    json: JsonOption = False,
 ) -> None:
     """Fit tensor engines to published latencies: shared terms, six numbers a chip, and how far off both are."""
-    from trilane.hw_profiles.engine_report import as_markdown, errors_of, plot_errors, with_table
+    from trilane.hw_profiles.engine_report import as_markdown, plot_errors, with_table
     from trilane.hw_profiles.engine_study import study_engines
     from trilane.hw_profiles.engine_tables import profile_texts
 
@@ -169,10 +168,6 @@ def fit_chips(
         write_bytes(path, text.encode())
     if plot is not None:
         plot_errors(study, plot)
-    if json:
-        engines = {name: {**errors_of(e.left_out), "covered": e.coverage} for name, e in study.engines.items()}
-        print_json({"engines": engines, "chips": list(study.chips), "written": [str(path) for path in texts]})
-        return
     stdout_console().print(as_markdown(study), highlight=False)
 
 
