@@ -78,9 +78,10 @@ def _double(b: GraphBuilder, x: TensorRef, width: int) -> TensorRef:
 
 @lru_cache(maxsize=1)
 def resnet18_work() -> Work:
-    """ResNet18 as a classifier of 224x224 pictures into 1000 classes."""
+    """ResNet18 as a classifier of 224x224 pictures, which it normalises, into 1000 classes."""
     b = GraphBuilder("batch")
-    x = resnet18(b, b.input("image", 3, 224, 224))[-1]
+    picture = b.same("Sub", b.input("image", 3, 224, 224), b.weight((1, 3, 1, 1)))
+    x = resnet18(b, b.same("Div", picture, b.weight((1, 3, 1, 1))))[-1]
     out = b.conv(b.op("GlobalAveragePool", [x.name], (x.channels, 1, 1)), 1000, 1, bias=True)
     return count_work(b.model("resnet18", [out]))
 
