@@ -181,19 +181,19 @@ def assert_holds(rect: Rect | None, seen: F64) -> None:
 
 
 def test_nothing_on_screen_falls_outside() -> None:
-    """2,000 random poses, cameras and lenses: every visible point of the surface is in the rectangle."""
+    """400 random poses, cameras and lenses: every visible point of the surface is in the rectangle."""
     random = np.random.default_rng(2)
     shaped, bounds = default_body(), default_bounds()
     skeleton, skinner = Skeleton(shaped.joints, shaped.body.parents), CpuSkinner(shaped)
     visible = 0
-    for _ in range(2000):
+    for _ in range(400):
         posed, clip = skeleton.pose(random_pose(random)), random_clip(random)
         vertices = skinner.vertices(posed)
         seen = visible_points(surface_points(vertices, shaped.body.faces, random), clip)
         assert_holds(bounds.rect(posed, clip), seen)
         assert_holds(bounds.rect(posed, clip, vertices.astype(np.float32)), seen)
         visible += bool(len(seen))
-    assert visible > 1000
+    assert visible > 200
 
 
 def test_rectangle_is_tight_on_whole_bodies() -> None:
