@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +59,7 @@ def test_predict_answers_for_an_avatar(
     document = answer(monkeypatch, capsys, "predict", "--avatar", str(tiny_bundle))
     assert document["config"]["avatar"] == str(tiny_bundle)
     assert document["config"]["size"] == "64x64"
-    by_file = answer(monkeypatch, capsys, "predict", "--network", str(tiny_bundle / "network.onnx"))
+    by_file = answer(monkeypatch, capsys, "predict", "--application", "--network", str(tiny_bundle / "network.onnx"))
     assert by_file["network"] == document["network"]
 
 
@@ -67,9 +68,9 @@ def test_predict_says_what_it_is_of(monkeypatch: pytest.MonkeyPatch, capsys: pyt
     assert call(monkeypatch, "predict", "--performance-profile", "burst", "--minutes", "30") == 0
     text = capsys.readouterr().out
     lines = {line[:16].strip(): line[16:] for line in text.splitlines()}
-    assert lines["application"].startswith("settles at ")
-    assert lines["over 30 minutes"] > ""
-    assert "1.2 W of it assumed for all but the units" in lines["power"]
+    settled, first = re.fullmatch(r"([0-9.]+) fps, begins with ([0-9.]+) fps", lines["after 30 min"]).groups()
+    assert float(settled) < float(re.search(r"([0-9.]+) fps", lines["over all"])[1]) < float(first)
+    assert re.match(r"1\.20 \(.*\) W, assumed: ", lines["of it base"])
     assert "lowered for heat" in lines["temperature"]
     assert text.count("throttled") == 1  # the column
 
@@ -92,7 +93,7 @@ def test_latest_is_the_same_in_predict_and_in_what_if(
 ) -> None:
     """At the display's rate, that is: no frame is released faster than it can be shown."""
     document = answer(monkeypatch, capsys, "predict", "--policy", "latest", "--fps", "1000", "--what-if")
-    row = next(row for row in document["alternatives"] if row["name"] == "newest pose wins")
+    row = next(row for row in document["alternatives"] if row["name"] == "latest, double")
     assert row["latency_ms"] == document["latency_ms"]["mean"]
 
 
