@@ -21,6 +21,7 @@ from trilane.avatars.manifest import ByteRange, Manifest, parse_manifest
 from trilane.avatars.network_file import read_network
 from trilane.errors import BadInputError
 from trilane.files import read_npz, read_text, require_file
+from trilane.near_miss import did_you_mean
 from trilane.writing import require_writable, write_bytes, write_folder
 
 MANIFEST = "manifest.json"
@@ -78,6 +79,9 @@ def load_bundle(name: str | Path) -> Bundle:
     """Read a bundle's manifest. Raises BadInputError naming file and key."""
     folder = bundle_folder(name)
     path = folder / MANIFEST
+    meant = did_you_mean(folder.name, [DEFAULT])
+    if meant and not folder.exists():
+        raise BadInputError(folder, "no such folder", "an avatar's folder, or default", meant)
     manifest = parse_manifest(read_text(path, "an avatar's manifest"), path)
     for key, file in (("body", manifest.body), ("texture", manifest.texture), ("network.file", manifest.network.file)):
         _check_inside(folder, file, f"{path}: {key}")

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 
 from trilane.errors import BadInputError
 from trilane.files import read_text
@@ -35,6 +36,8 @@ EXPECTED = {
     "string_too_short": "at least one character",
     "string_pattern_mismatch": "letters, digits, spaces, dots, hyphens and underscores",
 }
+#: Types of pydantic errors of numbers out of range, or between two steps.
+IN_STEPS = ("multiple_of", "greater_than_equal", "less_than_equal")
 #: Key of the scene -> why it cannot be what it was, where the range alone does not tell.
 REASONS = {"error_budget_px": "numbers are rounded, so nothing is drawn without an error"}
 BUILT_IN_PREFIX = "builtin:"
@@ -56,8 +59,17 @@ def bad_input(where: str | Path, error: ValidationError) -> BadInputError:
         return BadInputError.at(place, unexpected)
     value = repr(first["input"])
     short = value if len(value) <= LONGEST_FOUND else value[:LONGEST_FOUND] + "..."
-    expected = EXPECTED.get(first["type"], "").format(**first.get("ctx", {}))
+    expected = _steps(first) or EXPECTED.get(first["type"], "").format(**first.get("ctx", {}))
     return BadInputError(place, short, expected or str(first["msg"]).removeprefix(INPUT_SHOULD), _remedy(first))
+
+
+def _steps(first: Mapping[str, Any]) -> str:
+    """All that a number must be that has to be a multiple of another; empty for other errors."""
+    if first["type"] not in IN_STEPS or not isinstance(first["loc"][-1], str):
+        return ""
+    limits = ("multiple_of", "ge", "le")
+    known = {key: getattr(one, key) for one in _field(first["loc"]).metadata for key in limits if hasattr(one, key)}
+    return "a multiple of {multiple_of} from {ge} to {le}".format(**known) if len(known) == len(limits) else ""
 
 
 def _remedy(first: Mapping[str, Any]) -> str:
@@ -74,7 +86,12 @@ def _keys_beside(loc: tuple[int | str, ...]) -> list[str]:
 
 def _choices(loc: tuple[int | str, ...]) -> list[str]:
     """The words that the key at `loc` may be; of a key that may be nothing else."""
-    return [str(word) for word in get_args(_table_of(loc).model_fields[str(loc[-1])].annotation)]
+    return [str(word) for word in get_args(_field(loc).annotation)]
+
+
+def _field(loc: tuple[int | str, ...]) -> FieldInfo:
+    """The schema's field of the key at `loc`."""
+    return _table_of(loc).model_fields[str(loc[-1])]
 
 
 def _table_of(loc: tuple[int | str, ...]) -> type[BaseModel]:

@@ -138,7 +138,10 @@ def configure(request: Request, out_dir: Path, gl: GlFacts = gl_facts) -> Checke
     scene = requested_scene(request)
     if scene.plan == "full":
         raise BadInputError(
-            "plan", "full", "planned or fixed", "`trilane bench planner` draws the full plan to compare"
+            f"{find_scene(request.scene)}: plan",
+            "full",
+            "planned or fixed",
+            "`trilane bench planner` draws the full plan to compare",
         )
     asked = asked_cores(request.cores)
     runtime, reason = requested_runtime(request.runtime)

@@ -59,14 +59,13 @@ COUNTED = {"fifo": 1, "orphan": 4}  # least count: an orphan edge has two slots 
 
 def edge_rule(text: str) -> EdgeRule:
     """`single`, `double`, `triple`, `fifo[:N]`, `orphan[:N]`. Raises UnexpectedValue."""
-    match = re.fullmatch(r"([a-z]+)(?::(\d{1,4}))?", text)
-    name, count = (match[1], match[2]) if match else (text, None)
-    if name not in RULES or (count and name not in COUNTED):
+    name, colon, count = text.partition(":")
+    if name not in RULES or (colon and name not in COUNTED):
         raise UnexpectedValue(f"edge {text!r}", "single, double, triple, fifo:N or orphan:N")
     rule = RULES[name]
-    if count is None:
+    if not colon:
         return rule
-    if not COUNTED[name] <= int(count) <= MAX_SLOTS:
+    if not re.fullmatch(r"[0-9]{1,4}", count) or not COUNTED[name] <= int(count) <= MAX_SLOTS:
         raise UnexpectedValue(f"edge {text!r}", f"{name}:N with N from {COUNTED[name]} to {MAX_SLOTS}")
     return EdgeRule(name, int(count), rule.mailbox, rule.yields)
 

@@ -87,6 +87,10 @@ BUILTIN: dict[str, Orbit | Descent | Stand] = {
 }
 
 
+def _pace(camera: Orbit | Descent | Stand) -> str:
+    return "fixed" if isinstance(camera, Stand) else f"{camera.period_s:g} s a cycle"
+
+
 def load_builtin(name: str, spec: CameraSpec) -> CameraPath | None:
     """The camera `name`, or None when there is none of that name."""
     camera = BUILTIN.get(name)
@@ -96,6 +100,6 @@ def load_builtin(name: str, spec: CameraSpec) -> CameraPath | None:
     times = np.arange(count + 1) / RATE_HZ
     places = camera.places(2 * np.pi * times / camera.period_s)
     fov = FOV_Y_DEG if spec.fov_y_deg is None else spec.fov_y_deg
-    notes = (f"built in: {camera.what}, {camera.period_s:g} s a cycle, field of view {fov:g} degrees high",)
+    notes = (f"built in: {camera.what}, {_pace(camera)}, field of view {fov:g} degrees high",)
     quats = quat_from_matrix(axes_towards(places, np.array(camera.target)))
     return CameraPath(times, quats, places, Lens(fov, spec.near_m, spec.far_m), notes, Wrap.LOOP, recorded=False)

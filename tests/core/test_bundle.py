@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -135,3 +136,12 @@ def test_a_network_that_is_not_the_manifests_is_named(copied):
     edit(copied, network__channels=6)
     with pytest.raises(BadInputError, match="5 channels"):
         load_bundle(copied).read_network()
+
+
+def test_a_word_like_default_is_no_folder(tmp_path: Path) -> None:
+    """But a folder of that name is one."""
+    with pytest.raises(BadInputError, match=r"defalt: found no such folder, expected .*; did you mean 'default'\?"):
+        load_bundle(tmp_path / "defalt")
+    (tmp_path / "defalt").mkdir()
+    with pytest.raises(BadInputError, match="expected an avatar's manifest"):
+        load_bundle(tmp_path / "defalt")

@@ -57,6 +57,7 @@ def test_a_camera_goes_from_above_down_to_the_floor() -> None:
 def test_a_camera_stands_by_the_wayside() -> None:
     """The way, x = 0, is behind the camera from z = 1.9 on, and left of it."""
     camera = load("builtin:wayside")
+    assert camera.notes == ("built in: beside the way of one who walks along z, fixed, field of view 40 degrees high",)
     assert camera.pose(0.0)[1] == pytest.approx([0.9, 1.45, 1.9]) == camera.pose(0.7)[1]
     far, past = (camera.sample(0.3) @ [0.0, 1.0, z, 1.0] for z in (-2.5, 2.5))
     assert far[2] < 0 < past[2] and abs(far[0] / far[2]) < 0.1

@@ -442,7 +442,8 @@ def test_wrong_options_are_named(checked: Checked, tmp_path: Path, options: list
 def test_the_full_plan_is_not_run(tiny_bundle: Path, tmp_path: Path) -> None:
     (tmp_path / "full.toml").write_text(f'plan = "full"\n[[avatars]]\nbundle = "{tiny_bundle}"\n')
     result = CliRunner().invoke(app, [str(tmp_path / "full.toml")])
-    assert "plan: found full, expected planned or fixed; `trilane bench planner` draws" in str(result.exception)
+    said = f"{tmp_path / 'full.toml'}: plan: found full, expected planned or fixed; `trilane bench planner` draws"
+    assert said in str(result.exception)
     (tmp_path / "both.toml").write_text('plan = "fixed"\nsize = "auto"\n')
     result = CliRunner().invoke(app, [str(tmp_path / "both.toml")])
     assert 'size = "auto" with plan = "fixed"' in str(result.exception)

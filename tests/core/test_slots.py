@@ -31,6 +31,16 @@ def test_an_unknown_edge_is_named(text: str) -> None:
         edge_rule(text)
 
 
+@pytest.mark.parametrize("count", ["", "0", "65", "12345", "x", "4 ", "+4", "4:4"])
+def test_a_count_that_is_none_is_told_what_it_may_be(count: str) -> None:
+    with pytest.raises(ValueError, match="expected fifo:N with N from 1 to 64"):
+        edge_rule(f"fifo:{count}")
+    with pytest.raises(ValueError, match="expected orphan:N with N from 4 to 64"):
+        edge_rule(f"orphan:{count if count != '65' else '3'}")
+    with pytest.raises(ValueError, match="expected single, double, triple, fifo:N or orphan:N"):
+        edge_rule(f"double:{count}")
+
+
 @pytest.mark.parametrize("verb", sorted(TRANSITIONS))
 @pytest.mark.parametrize("state", [FREE, WRITING, READY, READING])
 def test_what_the_table_does_not_have_is_refused(verb: str, state: str) -> None:

@@ -227,7 +227,7 @@ def test_the_table_of_edges_is_the_documented_one() -> None:
         ("fifo:65", "fifo:N with N from 1 to 64"),
         ("fifo:0", "fifo:N with N from 1 to 64"),
         ("orphan:3", "orphan:N with N from 4 to 64"),
-        ("fifo:99999", "single, double, triple, fifo:N or orphan:N"),
+        ("fifo:99999", "fifo:N with N from 1 to 64"),
     ],
 )
 def test_an_edge_that_there_is_not_is_refused_with_those_that_there_are(text: str, expected: str) -> None:

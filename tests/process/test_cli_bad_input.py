@@ -109,7 +109,11 @@ OPTIONS = {
     "too long a queue": (["--edge", "fifo:65"], "--edge", "found 'fifo:65', expected fifo:N with N from 1 to 64"),
     "an output without height": (["--output", "640"], "--output", "expected WIDTHxHEIGHT in pixels, such as 640x480"),
     "an odd output": (["--output", "641x480"], "output.width", "found 641, expected a multiple of 2"),
-    "a huge output": (["--output", "640x4098"], "output.height", "found 4098, expected less than or equal to 4096"),
+    "a huge output": (
+        ["--output", "640x4098"],
+        "output.height",
+        "found 4098, expected a multiple of 2 from 64 to 4096",
+    ),
     "unknown scene": (["beach"], "scene", "default"),
     "unknown runtime": (["--runtime", "abacus"], "runtime", "'abacus'"),
     "unknown skinning": (["--skinning", "npu"], "--skinning", "'npu'"),

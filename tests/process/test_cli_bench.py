@@ -77,3 +77,9 @@ def test_help_says_what_is_measured(name: str) -> None:
     assert answer
     assert "Raises" not in answer
     assert all(option.help for option in command.params)
+
+
+@pytest.mark.parametrize(("bench", "least"), [("planner", "LEAST_FRAMES"), ("placement", "MIN_FRAMES")])
+def test_the_least_number_of_frames_is_in_the_help(bench: str, least: str) -> None:
+    count = getattr(importlib.import_module(f"trilane.bench.{bench}"), least)
+    assert f"at least {count}" in MEANINGS[f"{bench} frames"]
