@@ -63,14 +63,20 @@ def worth_trying(found: Sequence[Ranked], rule: Ranked) -> list[Ranked]:
     return [*first, *(each for each in found if each.placement not in known and each.frame_ns <= longest)][:MOST_TRIED]
 
 
-def fastest(rounds: Sequence[Sequence[float]]) -> int:
-    """Place of the placement with the shortest measured frames; the first of those that are the `SAME`.
+def typical(rounds: Sequence[Sequence[float]]) -> list[float]:
+    """The frame time of each placement, in the unit of `rounds`.
 
-    `rounds`: of each the frame times of all placements, which count relative to the median of their round.
+    `rounds`: of each the frame times of all placements. They count relative to the median of their round, so that a
+    slow second of the machine slows all alike; what they are relative to is the median of these medians.
     """
-    relative = [[frame / median(times) for frame in times] for times in rounds]
-    middle = [median(of) for of in zip(*relative, strict=True)]
-    return next(place for place, value in enumerate(middle) if value <= min(middle) * (1 + SAME))
+    medians = [median(times) for times in rounds]
+    relative = [[frame / middle for frame in times] for times, middle in zip(rounds, medians, strict=True)]
+    return [median(of) * median(medians) for of in zip(*relative, strict=True)]
+
+
+def fastest(frame_ns: Sequence[float]) -> int:
+    """Place of the placement with the shortest measured frames; the first of those that are the `SAME`."""
+    return next(place for place, value in enumerate(frame_ns) if value <= min(frame_ns) * (1 + SAME))
 
 
 def _tie(placement: Placement, times: Times) -> tuple[tuple[int, ...], tuple[tuple[int, ...], ...]]:

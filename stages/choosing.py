@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from trilane.hw_profiles.placement_facts import NS_PER_MS
 from trilane.pipeline.other_programs import OtherPrograms
 from trilane.pipeline.unit_starter import UnitStarter
-from trilane.scheduler.placement import Ranked, fastest
+from trilane.scheduler.placement import Ranked, fastest, typical
 from trilane.stages.configure import Checked
 from trilane.stages.rehearsing import tried
 
@@ -75,11 +75,11 @@ def choice(
         return {"frame_ns": np.array([each.frame_ns for each in rounds])}
 
     try:
-        frame_ns = kept(measured)["frame_ns"]
+        frame_ns = typical(kept(measured)["frame_ns"].tolist())
     except _BusyError as busy:
         return Choice(0, f"{PREDICTED}; not tried while other programs have {busy.share:.0%} of the cores")
-    frame_ms = tuple(float(value) / NS_PER_MS for value in np.median(frame_ns, axis=0))
-    return Choice(fastest(frame_ns.tolist()), f"the fastest of {len(candidates)} that were tried", frame_ms)
+    frame_ms = tuple(value / NS_PER_MS for value in frame_ns)
+    return Choice(fastest(frame_ns), f"the fastest of {len(candidates)} that were tried", frame_ms)
 
 
 def _refuse_when_busy(share: float) -> None:
