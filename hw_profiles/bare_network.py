@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from trilane.errors import BadInputError
 from trilane.hw_profiles.device_power import device_power
 from trilane.hw_profiles.graph_file import GraphFile, Numbers
 from trilane.hw_profiles.network_time import Interval, NetworkTime, interval, price, spread_of
@@ -17,9 +18,9 @@ from trilane.hw_profiles.operator_kinds import COMPILED
 from trilane.hw_profiles.over_time import Moment, warm_up
 from trilane.hw_profiles.performance_profiles import Corners, corners_of
 from trilane.hw_profiles.rates import NOTHING, FrameTimes, Load, Wanted, answers
-from trilane.hw_profiles.schema import Profile
+from trilane.hw_profiles.schema import EngineRuntime, Profile
 from trilane.hw_profiles.timeline import caps_of, ends_of, settled_corners, temperatures_of, timeline_of
-from trilane.units import SUSTAINED, UNITS, UnitName
+from trilane.units import BURST, UNITS, UnitName
 
 #: Said of a time that is only a lower bound.
 INSIDE = "it holds a compiled network, of which only the ends are seen: price the network that it was made from"
@@ -46,11 +47,28 @@ def in_precision(profile: Profile, unit: UnitName, numbers: Numbers, asked: str 
     return profile.model_copy(update={"units": {**profile.units, unit: changed}})
 
 
+def under_runtime(profile: Profile, unit: UnitName, runtime: EngineRuntime | None) -> Profile:
+    """`profile` with the tensor engine of the unit under `runtime`, None for the unit's own.
+
+    `unit`: that runs the network, in the network's precision.
+    Raises BadInputError where the profile has no numbers for it.
+    """
+    if runtime is None:
+        return profile
+    changed = profile.units[unit].model_copy(update={"engine_runtime": runtime})
+    if changed.engine is None:
+        found = f"{runtime} for the {unit} of {profile.name} in {changed.precision}"
+        known = [f"{', '.join(each.engines)} of the {name}" for name, each in profile.units.items() if each.engines]
+        expected = " or ".join(known) or "a chip with a tensor engine"
+        raise BadInputError("engine runtime", found, expected, "without it a unit is priced as its profile says")
+    return profile.model_copy(update={"units": {**profile.units, unit: changed}})
+
+
 def predict_network(
     profile: Profile,
     graph: GraphFile,
     unit: UnitName,
-    performance_profile: str = SUSTAINED,
+    performance_profile: str = BURST,
     minutes: float = 0.0,
     governor: str | None = None,
     wanted: Wanted = NOTHING,
@@ -60,7 +78,7 @@ def predict_network(
     `profile`: of the chip, with the unit in the precision of the network.
     `graph`: of the network.
     `unit`: that runs it.
-    `performance_profile`: by name.
+    `performance_profile`: by name; published latencies are taken to be of `burst`.
     `minutes`: of virtual time from a cold start, at the wanted rate or as fast as it can; 0 for none.
     `governor`: of GOVERNORS; None for the profile's own.
     `wanted`: a rate that may hold or not, and a limit of power.
@@ -88,6 +106,7 @@ def predict_network(
         "unit": unit,
         "numbers": graph.numbers,
         "precision": profile.units[unit].precision,
+        "engine_runtime": profile.units[unit].engine_runtime if profile.units[unit].engine else None,
         "parameters_m": work.weights / 1e6,
         "gmac": work.macs / 1e9,
         **_times(time, around),

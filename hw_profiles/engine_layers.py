@@ -3,7 +3,8 @@
 Rule: a pure function of an ONNX graph's shapes; nothing here knows a chip. A term is a kind of work with a price of its
 own (`TERMS`). Products are counted with the channels rounded up to the blocks in which the Hexagon keeps them: a
 convolution's inputs to 16, its outputs to 32, all other activations to 8. A ReLU and a clip disappear in the layer
-before them, a sum of two tensors in the convolution that makes one of them.
+before them, a batch normalisation in the convolution before it, a sum of two tensors in the convolution that makes one
+of them.
 """
 
 from __future__ import annotations
@@ -178,6 +179,8 @@ def layers_of(graph: Any, shapes: Shapes, constants: set[str]) -> Layers:
         if node.op_type in FOLDED and before and _folds(before[0], names):
             layers[before[0].writes] = before[0]._replace(amounts={**before[0].amounts, **_clip(node, shapes)})
             names.rename(node.output[0], before[0].writes)
+        elif node.op_type == "BatchNormalization" and before and _takes_up(before[0], names):
+            names.rename(node.output[0], before[0].writes)
         elif sigmoid is not None:
             del layers[sigmoid.writes]
             layers[node.output[0]] = _layer(node, names, "Swish", sigmoid.reads)
@@ -193,6 +196,11 @@ def layers_of(graph: Any, shapes: Shapes, constants: set[str]) -> Layers:
 
 def _folds(before: Layer, names: _Graph) -> bool:
     return before.op_type in TAKES and names.reads[before.writes] == 1
+
+
+def _takes_up(before: Layer, names: _Graph) -> bool:
+    """Whether a batch normalisation behind `before` becomes part of its weights."""
+    return before.op_type in PRODUCTS and names.reads[before.writes] == 1
 
 
 def _clip(node: Any, shapes: Shapes) -> dict[str, float]:
@@ -255,7 +263,7 @@ def _products(node: Any, shapes: Shapes) -> Iterator[tuple[str, float]]:
     groups = attributes["group"].i if "group" in attributes else 1
     yield "moved_depthwise" if groups == source[1] > 1 else "moved", moved
     stride, dilation = (max(attributes[k].ints) if k in attributes else 1 for k in ("strides", "dilations"))
-    places = prod(source[2:] if node.op_type == "ConvTranspose" else out[2:]) * prod(shapes[node.input[1]][2:])
+    places = out[0] * prod(source[2:] if node.op_type == "ConvTranspose" else out[2:]) * prod(shapes[node.input[1]][2:])
     if groups > 1:
         yield from _grouped(places, source[1], out[1], groups, stride)
         return

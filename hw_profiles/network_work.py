@@ -6,6 +6,7 @@ Rule: nothing here knows any hardware; `operator_times.py` turns the counts into
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -17,7 +18,7 @@ import onnx
 from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
-from trilane.hw_profiles.engine_layers import NO_LAYERS, Layers, layers_of
+from trilane.hw_profiles.engine_layers import NO_LAYERS, RENAMES, Layers, layers_of
 from trilane.hw_profiles.operator_kinds import (
     CLASSES,
     CONVOLUTIONS,
@@ -37,6 +38,8 @@ from trilane.hw_profiles.product_counts import product_of
 
 #: Name of a weight in a graph without weights, where each is an input.
 WEIGHT_INPUT = re.compile(r"w\d+")
+#: Inputs of a batch normalisation up to those that are learned; mean and variance become part of them.
+SCALE_AND_SHIFT = 3
 
 
 class Operator(NamedTuple):
@@ -65,7 +68,8 @@ class Operator(NamedTuple):
 class Work:
     """The operators of a network, in order, and the sizes of its inputs and outputs in elements.
 
-    `layers`: the same as a tensor engine runs it.
+    `input_tensors`: those that its picture comes in, joined by the first operator; 1 for inputs that are no parts of
+    one picture. `layers`: the same as a tensor engine runs it.
     """
 
     operators: tuple[Operator, ...]
@@ -129,19 +133,32 @@ def count_work(model: Any) -> Work:
     constants = constant_tensors(graph)
     live_counts = _live_counts(graph, shapes, constants)
     read = {name for node in graph.node for name in node.input} | {output.name for output in graph.output}
+    lone = _lone_normalisations(graph)
     operators = tuple(
         _operator(n, shapes, constants, read)._replace(live=live)
         for n, live in zip(graph.node, live_counts, strict=True)
-        if not _costs_nothing(n, constants)
+        if n.output[0] in lone or not _costs_nothing(n, constants)
     )
     inputs = [i.name for i in graph.input if i.name not in constants]
     return Work(
         operators,
         sum(_size(shapes, name) for name in inputs),
-        len(inputs),
+        _picture_tensors(graph, inputs),
         sum(_size(shapes, o.name) for o in graph.output),
         layers_of(graph, shapes, constants),
     )
+
+
+def _picture_tensors(graph: Any, inputs: list[str]) -> int:
+    """How many tensors a picture comes in: all inputs, where one concatenation is the only one that reads them."""
+    given, readers = set(inputs), []
+    for node in graph.node:
+        if given.intersection(node.input):
+            if node.op_type in RENAMES:
+                given.update(node.output)
+            else:
+                readers.append(node.op_type)
+    return len(inputs) if readers == ["Concat"] else 1
 
 
 def graph_facts(model: Any) -> dict[str, Any]:
@@ -186,6 +203,18 @@ def _size(shapes: Shapes, name: str) -> int:
     return prod(shapes[name])
 
 
+def _lone_normalisations(graph: Any) -> set[str]:
+    """Results of batch normalisations that no product before them takes up."""
+    maker = {name: node.op_type for node in graph.node for name in node.output}
+    reads = Counter(name for node in graph.node for name in node.input)
+    return {
+        node.output[0]
+        for node in graph.node
+        if node.op_type == "BatchNormalization"
+        and (maker.get(node.input[0]) not in (*CONVOLUTIONS, *PRODUCTS) or reads[node.input[0]] > 1)
+    }
+
+
 def _costs_nothing(node: Any, constants: set[str]) -> bool:
     return (
         (node.op_type in FOLDED and node.domain in DOMAINS)
@@ -215,7 +244,8 @@ def _operator(node: Any, shapes: Shapes, constants: set[str], read: set[str]) ->
     """Counts of `node`. `constants`: tensors that are given once. `read`: tensors that somebody reads."""
     known = has_rule(node.op_type, node.domain)
     weighted = node.op_type in WEIGHTED and known
-    weights = sum(_size(shapes, name) for name in node.input if name in constants) if weighted else 0
+    own = node.input[:SCALE_AND_SHIFT] if node.op_type == "BatchNormalization" else node.input
+    weights = sum(_size(shapes, name) for name in own if name in constants) if weighted else 0
     moved_in = [_size(shapes, name) for name in node.input if name and name not in constants]
     out = sum(_size(shapes, name) for name in node.output if name and (name in read or name == node.output[0]))
     moved = sum(moved_in) * (2 if node.op_type in STATISTICS else 1) + out

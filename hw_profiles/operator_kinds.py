@@ -9,7 +9,8 @@ ARITHMETIC = ("convolution", "pointwise", "depthwise")
 TRAFFIC = ("normalisation", "resize", "elementwise", "permute")
 CLASSES = ARITHMETIC + TRAFFIC
 
-#: Operators that cost nothing: a runtime folds them into the convolution before them, or they only rename a tensor.
+#: Operators that cost nothing: a runtime folds them into the convolution before them, or they only rename a tensor. A
+#: batch normalisation that stands behind no convolution does cost something.
 FOLDED = frozenset(
     ("Relu", "Clip", "Sigmoid", "BatchNormalization", "QuantizeLinear", "DequantizeLinear", "Identity")
 ) | frozenset(("Reshape", "Flatten", "Squeeze", "Unsqueeze", "Constant", "Dropout"))

@@ -32,7 +32,7 @@ class Machine:
     `arithmetic`: multiply-accumulates per second of each of CLASSES, infinite for those without products. `traffic`:
     bytes per second of each of CLASSES. `stream`: bytes of weights per second. `element_bytes`: of one element.
     `block`: channel counts are rounded up to a multiple of it. `job`: fixed time of a job; `operator`: of an operator;
-    `input`: of an element of the network's input; `permute`: of an input in several tensors. `fallback`: types of the
+    `input`: of an element of the network's input; `permute`: of a picture in several tensors. `fallback`: types of the
     ONNX operators that run on the CPU; `fallback_job`: fixed time of each; `fallback_element`: of an element of its
     result.
     """

@@ -109,6 +109,8 @@ class Efficiencies(Model):
 
 #: An engine's numbers are those of a precision under a runtime.
 EngineName = Literal["int8_tflite", "int8_qnn_dlc", "fp16_tflite", "fp16_qnn_dlc"]
+EngineRuntime = Literal["tflite", "qnn_dlc"]
+ENGINE_RUNTIMES: tuple[EngineRuntime, ...] = ("tflite", "qnn_dlc")
 ENGINES: tuple[EngineName, ...] = ("int8_tflite", "int8_qnn_dlc", "fp16_tflite", "fp16_qnn_dlc")
 
 
@@ -167,7 +169,7 @@ class Unit(Model):
     """One unit. `fallback`: ONNX operators that it cannot run and hands to the CPU.
 
     `channel_block`: channel counts are rounded up to it. `job_fixed_ms` is paid once a job, `operator_fixed_us` once
-    an operator, `input_ns_per_element` for each element of the network's input, `permute_fixed_ms` where the input
+    an operator, `input_ns_per_element` for each element of the network's input, `permute_fixed_ms` where the picture
     comes in several tensors. `corners`: clock at each voltage corner as a fraction of the highest. While a job runs
     the unit takes `power_max_w` times the clock fraction to the power of `power_exponent`, and `idle_w` otherwise.
     `model_error_fraction`: relative error of the roofline itself, apart from that of its numbers. `runtimes`: how many
@@ -195,7 +197,7 @@ class Unit(Model):
     efficiency: Efficiencies
     runtimes: dict[str, Rate] = {}
     engines: dict[EngineName, Engine] = {}
-    engine_runtime: Literal["tflite", "qnn_dlc"] = "tflite"
+    engine_runtime: EngineRuntime = "tflite"
     corners: dict[Corner, Fraction]
     power_max_w: Power
     power_exponent: Annotated[Quantity, AfterValidator(_Range(0, 6))]

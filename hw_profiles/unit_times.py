@@ -54,7 +54,7 @@ def layer_times(
 
 
 def permutes_ms(unit: Unit, work: Work) -> float:
-    """What an input in several tensors costs."""
+    """What a picture in several tensors costs."""
     return unit.permute_fixed_ms.or_else(0.0) if work.input_tensors > 1 else 0.0
 
 

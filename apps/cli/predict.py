@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from trilane.hw_profiles.application import Plan, Variant
     from trilane.hw_profiles.network_work import Network
     from trilane.hw_profiles.rates import Wanted
-    from trilane.hw_profiles.schema import Profile
+    from trilane.hw_profiles.schema import EngineRuntime, Profile
 
 app = Commands()
 
@@ -45,6 +45,7 @@ Examples:
   trilane predict --avatar default --runtime gpu
   trilane predict --network midas.onnx --network unet.onnx --profile snapdragon-8-gen-3
   trilane predict --network net.onnx --input-shape image=1x3x224x224 --precision w8a8
+  trilane predict --network net.onnx --engine-runtime qnn_dlc --performance-profile sustained_high_performance
   trilane predict --network net.onnx --fps 30 --minutes 30
   trilane predict --network net.onnx --power-limit-w 3
   trilane predict --network unet.onnx --application --fps 30 --what-if
@@ -87,6 +88,10 @@ ShapeOption = Annotated[
 ]
 PrecisionOption = Annotated[
     str | None, typer.Option(help="w8a8 (int8), float (fp16) or fp32; as the network says and its unit has it.")
+]
+EngineRuntimeOption = Annotated[
+    str | None,
+    typer.Option(help="Of a tensor engine that runs a --network by itself: tflite (if not given) or qnn_dlc."),
 ]
 PowerOption = Annotated[
     float | None, typer.Option("--power-limit-w", help="Also the highest rate within so many watts of the device.")
@@ -134,6 +139,7 @@ def predict(
     application: ApplicationOption = False,
     input_shape: ShapeOption = None,
     precision: PrecisionOption = None,
+    engine_runtime: EngineRuntimeOption = None,
     runtime: UnitOption = "dsp",
     minutes: MinutesOption = 0.0,
     policy: PolicyOption = "reference",
@@ -153,16 +159,18 @@ def predict(
 
     Without --network, or with --application: the avatar's application. With --network: each network by itself.
 
-    For the profile `host`, this machine, the performance profile is burst if none is given, as a run has no cap then.
+    The performance profile is burst, if none is given, for a network by itself, as published latencies are, and for the
+    profile `host`, this machine, where a run has no cap.
     """
     from trilane.hw_profiles.application import Plan
     from trilane.hw_profiles.load import load_runnable
 
     networks = network or []
-    _refuse_ignored(ctx, bare=bool(networks) and not application)
+    bare = bool(networks) and not application
+    _refuse_ignored(ctx, bare=bare)
     _check_application(application, len(networks))
-    if profile == HOST and "performance_profile" not in _typed(ctx):
-        performance_profile = PerformanceProfile.BURST  # as `trilane run` without a cap
+    if (profile == HOST or bare) and "performance_profile" not in _typed(ctx):
+        performance_profile = PerformanceProfile.BURST
     _check_governor(governor)
     if scene is not None or beside:
         chip_at = OnChip(profile, performance_profile, minutes, governor)
@@ -174,9 +182,10 @@ def predict(
         answers = _predict_table(chip, table, performance_profile, variant)
         show_table(chip.name, performance_profile, answers, json)
         return
-    if networks and not application:
-        unit, over = _unit(runtime, "cpu"), (performance_profile, minutes, governor, wanted)
-        show_networks(chip, over, _predict_networks(chip, networks, shapes, unit, _precision(precision), over), json)
+    if bare:
+        on = (_unit(runtime, "cpu"), _precision(precision), _engine_runtime(engine_runtime))
+        over = (performance_profile, minutes, governor, wanted)
+        show_networks(chip, over, _predict_networks(chip, networks, shapes, on, over), json)
         return
     chip, described = _network_of(chip, networks, shapes, avatar, layout, _unit(runtime), _precision(precision))
     plan = Plan(described or _reference(encoder, norm, size, channels, layout), _unit(runtime), variant, gpu_share)
@@ -193,6 +202,9 @@ def _refuse_ignored(ctx: typer.Context, *, bare: bool) -> None:
         if option in typed and (useless := typed & others):
             names = ", ".join(sorted(f"--{name.replace('_', '-')}" for name in useless))
             raise BadInputError("options", f"{names} beside --{option}", "one or the other", WHY_IGNORED[option])
+    if "engine_runtime" in typed and not bare:
+        remedy = "the application runs as its profile says"
+        raise BadInputError("options", "--engine-runtime", "a --network by itself beside it", remedy)
     if bare and "table" not in typed and (useless := typed & OF_THE_APPLICATION):
         names = ", ".join(sorted(f"--{name.replace('_', '-')}" for name in useless))
         remedy = "they are of the application: add --application for it with this network"
@@ -233,6 +245,15 @@ def _precision(text: str | None) -> str | None:
     if text is not None and text not in PRECISIONS:
         raise BadInputError("--precision", repr(text), "w8a8 (int8), float (fp16) or fp32")
     return None if text is None else PRECISIONS[text]
+
+
+def _engine_runtime(text: str | None) -> EngineRuntime | None:
+    from trilane.hw_profiles.schema import ENGINE_RUNTIMES
+
+    found = next((runtime for runtime in ENGINE_RUNTIMES if runtime == text), None)
+    if text is not None and found is None:
+        raise BadInputError("--engine-runtime", repr(text), " or ".join(ENGINE_RUNTIMES))
+    return found
 
 
 def _typed(ctx: typer.Context) -> set[str]:
@@ -278,19 +299,25 @@ def _predict_networks(
     chip: Profile,
     paths: list[Path],
     shapes: dict[str, tuple[int, ...]],
-    unit: UnitName,
-    precision: str | None,
+    on: tuple[UnitName, str | None, EngineRuntime | None],
     over: tuple[str, float, str | None, Wanted],
 ) -> list[dict[str, Any]]:
-    """What is predicted of each network. `over`: performance profile, minutes, governor, and what is wanted."""
-    from trilane.hw_profiles.bare_network import in_precision, predict_network
+    """What is predicted of each network.
+
+    `on`: unit, its precision and the runtime of its tensor engine. `over`: performance profile, minutes, governor, and
+    what is wanted.
+    """
+    from trilane.hw_profiles.bare_network import in_precision, predict_network, under_runtime
     from trilane.hw_profiles.graph_file import read_graph
 
     graphs = [read_graph(path, shapes) for path in paths]
     inputs = {value.name for graph in graphs for value in graph.model.graph.input}
     if missing := [name for name in shapes if name not in inputs]:
         raise BadInputError("--input-shape", f"no input {missing[0]!r}", f"one of {', '.join(sorted(inputs))}")
-    return [predict_network(in_precision(chip, unit, graph.numbers, precision), graph, unit, *over) for graph in graphs]
+    unit, precision, engine_runtime = on
+    chips = [in_precision(chip, unit, graph.numbers, precision) for graph in graphs]
+    chips = [under_runtime(each, unit, engine_runtime) for each in chips]
+    return [predict_network(each, graph, unit, *over) for each, graph in zip(chips, graphs, strict=True)]
 
 
 def _network_of(

@@ -102,9 +102,10 @@ def show_networks(
 
 
 def _print_bare(console: Console, answer: dict[str, Any], minutes: float) -> None:
+    under = f" under {answer['engine_runtime']}" if answer["engine_runtime"] else ""
     said = "" if answer["numbers"] == "w8a8" else f" (numbers of the file: {answer['numbers']})"
     console.print(
-        f"{Path(answer['file']).name} on the {answer['unit']} in {answer['precision']}{said}: {_size(answer)}"
+        f"{Path(answer['file']).name} on the {answer['unit']} in {answer['precision']}{under}{said}: {_size(answer)}"
     )
     if minutes:
         _print_settled(console, answer, minutes)

@@ -14,7 +14,7 @@ from onnx import TensorProto, helper
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles import bare_network
-from trilane.hw_profiles.bare_network import in_precision, operator_rows, predict_network, without_rule
+from trilane.hw_profiles.bare_network import in_precision, operator_rows, predict_network, under_runtime, without_rule
 from trilane.hw_profiles.device_power import device_power
 from trilane.hw_profiles.graph_file import read_graph
 from trilane.hw_profiles.image_network import image_network
@@ -23,7 +23,7 @@ from trilane.hw_profiles.network_time import Interval, NetworkTime, OperatorTime
 from trilane.hw_profiles.network_work import Operator, Work, count_work
 from trilane.hw_profiles.performance_profiles import Corners, corners_of
 from trilane.hw_profiles.rates import FrameTimes, Load, Wanted, answers, holding, within_power
-from trilane.hw_profiles.schema import CORNERS, Profile, Quantity
+from trilane.hw_profiles.schema import CORNERS, ENGINE_RUNTIMES, Profile, Quantity
 from trilane.units import UNITS, UnitName
 
 
@@ -199,6 +199,25 @@ def test_precision(unit: UnitName, numbers: Any, asked: str | None, precision: s
     assert found.units["cpu"] == load_profile("snapdragon-888").units["cpu"]
 
 
+def test_the_runtime_of_an_engine(tmp_path: Path) -> None:
+    """Both runtimes have numbers of their own; None is the profile's; who has no engine is told."""
+    graph, profile = graph_of(tmp_path), load_profile("snapdragon-8-gen-3")
+    under = {name: under_runtime(profile, "dsp", name) for name in ENGINE_RUNTIMES}
+    usual, other = (predict_network(under[name], graph, "dsp") for name in ("tflite", "qnn_dlc"))
+    assert (usual["engine_runtime"], other["engine_runtime"]) == ("tflite", "qnn_dlc")
+    assert usual["network_ms"] != other["network_ms"]
+    assert under_runtime(profile, "dsp", None) is profile
+    assert under_runtime(profile, "dsp", "qnn_dlc").units["gpu"] == profile.units["gpu"]
+    assert predict_network(profile, graph, "gpu")["engine_runtime"] is None
+    engines = ", ".join(profile.units["dsp"].engines)
+    for unit, precision in (("gpu", "fp16"), ("dsp", "fp32")):
+        told = f"found tflite for the {unit} .* in {precision}, expected {engines} of the"
+        with pytest.raises(BadInputError, match=told):
+            under_runtime(in_precision(profile, unit, "not said", precision), unit, "tflite")  # type: ignore[arg-type]
+    with pytest.raises(BadInputError, match="expected a chip with a tensor engine"):
+        under_runtime(load_profile("agx-orin"), "gpu", "tflite")
+
+
 def image_graph(shape: tuple[int, ...]) -> onnx.ModelProto:
     """A convolution of three channels to four where these come first, else a hyperbolic tangent."""
     ends = [
@@ -244,7 +263,7 @@ def test_a_network_at_a_rate_is_busy_for_its_share(tmp_path: Path, monkeypatch: 
         monkeypatch.setattr(bare_network, "price", lambda *_, time=time: time)
         monkeypatch.setattr(bare_network, "interval", lambda *_, ms=ms: Interval(ms / 2, 2 * ms, ()))
         found = predict_network(chip(), graph_of(tmp_path), "dsp", wanted=Wanted(25.0))
-        corner = corners_of(chip(), "sustained_high_performance")[2]
+        corner = corners_of(chip(), "burst")[2]
         assert found["power"]["units"]["dsp"]["w"] == pytest.approx(chip().units["dsp"].power_w(corner, share))
         assert found["rate"]["reserve"] == pytest.approx(1 - ms / 40)
         assert found["rate"]["reserve_low"] == pytest.approx(1 - 2 * ms / 40)

@@ -104,6 +104,7 @@ def test_the_network_of_an_avatar_or_a_file(tiny_bundle: Path, asked: dict[str, 
     assert asked["predict"][1].network == Network({"avatar": str(tiny_bundle)}, 64, 64, 5, "split", work)
     command("predict", "--network", file, "--application", "--layout", "split")
     assert asked["predict"][1].network == Network({"network": str(file)}, 64, 64, 5, "split", work)
+    assert asked["predict"][2] == SUSTAINED, "the application's, with a network of one's own too"
 
 
 def test_networks_by_themselves(
@@ -117,6 +118,11 @@ def test_networks_by_themselves(
     assert [each["file"] for each in found["networks"]] == [str(file)] * 2
     assert found["networks"][0] == found["networks"][1]
     assert found["networks"][0]["precision"] == "int8" and found["config"]["fps"] == 20
+    assert found["config"]["performance_profile"] == BURST, "as published latencies are"
+    capped = json.loads(command(*words, "--performance-profile", SUSTAINED, "--engine-runtime", "qnn_dlc")[0])
+    assert capped["config"]["performance_profile"] == SUSTAINED
+    assert [each["engine_runtime"] for each in capped["networks"]] == ["qnn_dlc"] * 2
+    assert found["networks"][0]["engine_runtime"] == "tflite"
     slow = json.loads(command(*words, "--precision", "float", "--runtime", "cpu")[0])["networks"][0]
     assert (slow["precision"], slow["unit"]) == ("fp16", "cpu")
     assert command("predict", "--network", file, "--input-shape", "other=1x2", code=2)[1] == (
@@ -157,6 +163,11 @@ REFUSED = {
     ("--application",): (
         "options: found --application with 0 networks, expected one --network; "
         "it says that the application runs the network of the file"
+    ),
+    ("--network", "n", "--engine-runtime", "snpe"): "--engine-runtime: found 'snpe', expected tflite or qnn_dlc",
+    ("--network", "n", "--application", "--engine-runtime", "tflite"): (
+        "options: found --engine-runtime, expected a --network by itself beside it; "
+        "the application runs as its profile says"
     ),
     ("--fps", "0"): "--fps: found 0, expected 0.001 to 1000",
     ("--power-limit-w", "-1"): "--power-limit-w: found -1, expected watts above 0",
@@ -346,6 +357,7 @@ def a_network(**changes: Any) -> dict[str, Any]:
     operator = {"op_type": "Conv", "share": 0.1, "bound": "arithmetic", "macs": 1, "elements": 1}
     return {
         **{"file": "folder/net.onnx", "unit": "dsp", "numbers": "w8a8", "precision": "int8"},
+        "engine_runtime": "tflite",
         **{"gmac": 1.255, "parameters_m": 2.355, "network_ms": 3.456, "low_ms": 3.012, "high_ms": 3.987},
         **{"fps": 289.35, "job_ms": 0.5, "why": ["as it is"], "without_rule": [], "power": POWER},
         "operators": [{"name": f"n{n}", "ms": 0.1 * n, **operator} for n in range(12)],
@@ -361,7 +373,9 @@ def test_networks_are_shown_with_their_ten_most_expensive_operators(
     heat = {"device_max": 41.25, "junction_max": 77.75}
     rate = {**RATE, "holds": False, "reserve": -0.5, "reserve_low": -0.75, "reserve_high": -0.255, "words": "no"}
     answers = [a_network(rate=RATE, temperature_c=heat, **over)]
-    answers.append(a_network(**over, temperature_c=heat, numbers="not said", rate=rate, power_limit=LIMIT))
+    answers.append(
+        a_network(**over, engine_runtime=None, temperature_c=heat, numbers="not said", rate=rate, power_limit=LIMIT)
+    )
     predict_output.show_networks(CHIP, asked, answers, as_json=False)
     check_printed("predict-networks", capsys.readouterr().out)
     predict_output.show_networks(CHIP, asked, answers, as_json=True)

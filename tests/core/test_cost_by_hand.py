@@ -109,6 +109,28 @@ def test_a_small_graph_is_counted_by_hand() -> None:
     assert (work.input_elements, work.input_tensors, work.output_elements) == (32, 1, 64)
 
 
+@pytest.mark.parametrize(
+    ("nodes", "tensors"),
+    [
+        ("Concat a b -> y", 2),
+        ("QuantizeLinear a w0 -> q; DequantizeLinear q w0 -> d; Concat d b -> y", 2),
+        ("Relu a -> r; Concat r b -> y", 1),  # what an encoder hands to a decoder
+        ("Concat a b -> c; Relu a -> r; Concat c r -> y", 1),
+        ("Relu a -> y", 1),
+    ],
+)
+def test_a_picture_in_several_tensors_and_inputs_that_are_none(nodes: str, tensors: int) -> None:
+    made = []
+    for text in nodes.split("; "):
+        kind, *sources, _, result = text.split()
+        made.append(helper.make_node(kind, sources, [result], **({"axis": 1} if kind == "Concat" else {})))
+    names = sorted({name for node in made for name in node.input} & {"a", "b"})
+    infos = {name: helper.make_tensor_value_info(name, TensorProto.FLOAT, (1, 2, 4, 4)) for name in "abcqdry"}
+    weights = [helper.make_tensor("w0", TensorProto.FLOAT, (), [1.0])]
+    graph = helper.make_graph(made, "g", [infos[n] for n in names], [infos["y"]], weights, value_info=infos.values())
+    assert count_work(helper.make_model(graph)).input_tensors == tensors
+
+
 #: Powers of two, so that the sums below are exact.
 MACHINE = Machine(
     arithmetic=np.array([1024.0, 2048.0, 512.0, np.inf, np.inf, np.inf, np.inf]),

@@ -62,6 +62,18 @@ def test_a_network_of_three_layers() -> None:
     assert last.amounts == {}, "a sum is free"
 
 
+def test_two_pictures_are_twice_the_products_with_the_same_weights() -> None:
+    first, second = (
+        layers_of_nodes(
+            [node("Conv", "x w0", "y", kernel_shape=[3, 3], pads=[1] * 4, group=group)],
+            {"x": (2, 32, 4, 4), "y": (2, 32, 4, 4), "w0": (32, 32 // group, 3, 3)},
+        )[0]
+        for group in (1, 32)
+    )
+    assert first.amounts == {"operator": 1, "weights": 32 * 32 * 9, "convolution": 32 * 9 * 32 * 32, "moved": 32 * 64}
+    assert (second.amounts["depthwise"], second.amounts["moved_depthwise"]) == (32 * 9 * 32, 32 * 64)
+
+
 def test_what_is_folded_and_what_is_not() -> None:
     """x times its own sigmoid is one layer; a reshape is none; a second reader keeps a ReLU apart."""
     shape = (1, 8, 4, 4)
@@ -79,6 +91,21 @@ def test_what_is_folded_and_what_is_not() -> None:
         ("Mul", ["elementwise", "operator"]),
     ]
     assert kinds[0].amounts["swish"] == 3 * 128 - 0, "x, its sigmoid, and the result"
+
+
+def test_a_batch_normalisation_behind_a_convolution_is_part_of_it() -> None:
+    """The first stands behind a convolution whose only reader it is; the last, of a sum, is a layer."""
+    shape = (1, 8, 4, 4)
+    numbers = "w1 w2 w3 w4"
+    kinds = layers_of_nodes(
+        [
+            *(node("Conv", "x w0", "a", kernel_shape=[1, 1]), node("BatchNormalization", f"a {numbers}", "b")),
+            *(node("Relu", "b", "c"), node("Add", "c x", "d"), node("BatchNormalization", f"d {numbers}", "y")),
+        ],
+        {**dict.fromkeys(("x", *"abcdy"), shape), "w0": (8, 8, 1, 1), **dict.fromkeys(numbers.split(), (8,))},
+    )
+    assert [layer.op_type for layer in kinds] == ["Conv", "Add", "BatchNormalization"]
+    assert kinds[-1].amounts == {"operator": 1, "batch_norm": 2 * 128}
 
 
 @pytest.mark.parametrize(
