@@ -110,6 +110,33 @@ def test_an_avatar_takes_its_share_of_the_memory_all_the_time_and_two_take_twice
         assert found.stages_ms[0]["infer"] == pytest.approx(time_ms(network, avatars * own), rel=1e-5)
 
 
+def test_others_take_at_most_nearly_all_of_the_memory() -> None:
+    """Nine tenths are the application's own, so two avatars would take 1.8 of it: a twentieth is left."""
+    use = CHIP.memory.application_use_fraction.model_copy(update={"value": 0.9})
+    chip = CHIP.model_copy(update={"memory": CHIP.memory.model_copy(update={"application_use_fraction": use})})
+    one = bare("dsp", 5, 64)
+    found = together(chip, [one, avatar(64), avatar(64)], CORNERS)
+    assert found.stages_ms[0]["infer"] == pytest.approx(time_ms(one, 0.95), rel=1e-5)
+
+
+@pytest.mark.parametrize(("fps", "seconds"), [(30.0, 10.0), (4.0, 16.0), (0.08, 600.0)])
+def test_a_run_lasts_ten_seconds_or_64_frames_but_no_more_than_ten_minutes(fps: float, seconds: float) -> None:
+    """A stop ends it with the frame in flight: at most one period before it, or a job of a millisecond behind it."""
+    found = together(CHIP, [bare("dsp", 10 * fps, 32), bare("gpu", fps, 32)], CORNERS)
+    assert seconds - 0.11 / fps <= found.runs[0].report["duration_s"] <= seconds + 0.001
+
+
+def test_a_tenant_is_refused_for_its_unit_and_its_mean_skips_frames_without_a_network() -> None:
+    with pytest.raises(BadInputError, match=r"^additions on cpu: unit: found 'cpu', expected gpu or dsp$"):
+        bare("cpu")
+    small, large = avatar(128), avatar(256)
+    both = replace(small, networks=(*small.networks, *large.networks))
+    means = [together(CHIP, [each], CORNERS).stages_ms[0]["infer"] for each in (small, large)]
+    for frames, mean in (((0, 1, SKIPS, 1), (means[0] + 2 * means[1]) / 3), ((SKIPS,), means[0])):
+        found = together(CHIP, [replace(both, frames=frames)], CORNERS)
+        assert found.stages_ms[0]["infer"] == pytest.approx(mean, rel=1e-6)
+
+
 def test_an_avatar_alone_is_what_predict_says_of_its_network() -> None:
     one = avatar()
     single = steady(CHIP, Plan(one.networks[0], "dsp", Variant("latest", "double")), CORNERS)
@@ -173,6 +200,59 @@ def test_what_it_settles_to_is_the_last_fifth_of_the_time() -> None:
     moments: list[Any] = [SimpleNamespace(corners=corner) for corner in ["early"] * 8 + ["late", "last"]]
     assert beside_answer._settled_ms(moments, reports.__getitem__, 1) == 35.0  # type: ignore[arg-type]
     assert beside_answer._settled_ms([], reports.__getitem__, 1) is None  # type: ignore[arg-type]
+
+
+def test_temperatures_by_hand() -> None:
+    moments: list[Any] = [SimpleNamespace(device_c=device, junction_c=80 - device) for device in (30.0, 41.0, 35.0)]
+    assert beside_answer._temperatures(moments) == {"device_end": 35.0, "device_max": 41.0, "junction_max": 50.0}
+    assert beside_answer._temperatures([]) == {}
+
+
+def test_what_is_said_of_a_machine_and_of_turns() -> None:
+    host: Any = SimpleNamespace(name="host")
+    one, two = [beside_answer._notes(CHIP, [avatar()] * count, "deadline") for count in (1, 2)]
+    assert len(one) == 1 and one[0].startswith("frames are released from one instant on")
+    assert two[1:] == ["a unit that several pipelines have handed a job takes them by deadline, each job to its end"]
+    assert "divide it in equal shares" in beside_answer._notes(host, [avatar()] * 2, "deadline")[1]
+
+
+def test_pipelines_of_one_name_are_numbered() -> None:
+    assert sources._names(["a", "b", "a", "a"]) == ["a (1)", "b", "a (2)", "a (3)"]
+
+
+def test_a_scene_is_planned_frame_by_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames of 64x96 and 32x32 with some that skip; a network for each shape, in the order in which they come."""
+    from trilane.scene.work import Work
+
+    works = [(Work.FULL, (64, 96)), (Work.REUSE, (64, 96)), (Work.FULL, (32, 32)), (Work.FULL, (64, 96))]
+    scene = SimpleNamespace(frames=700, fps=24.0)
+    checked: Any = SimpleNamespace(config=SimpleNamespace(scene=scene), assets="assets")
+
+    class Plans:
+        def __init__(self, config: Any, assets: str) -> None:
+            assert (config, assets) == (checked.config, "assets")
+
+        def decide(self, frame: int) -> Any:
+            work, shape = works[frame % len(works)]
+            return SimpleNamespace(plan=SimpleNamespace(work=work, shape=shape))
+
+    asked: list[Any] = []
+    monkeypatch.setattr(sources, "configure", lambda request, _folder: asked.append(request) or checked)
+    monkeypatch.setattr(sources, "network_of", lambda _: SimpleNamespace(shape=(1, 80, 112, 12)))
+    monkeypatch.setattr(sources, "ScenePlan", Plans)
+    monkeypatch.setattr(sources, "reshaped", lambda _file, *shape: SimpleNamespace(model=shape))
+    monkeypatch.setattr(sources, "count_work", lambda shape: shape)
+    (found,) = sources.tenants(["home.toml@12:gpu"], Variant("deadline", "single"))
+    assert [(each.skinning, each.scene) for each in asked] == [("gpu", "home.toml")]
+    assert (found.name, found.source, found.fps, found.unit) == ("home", "home.toml@12:gpu", 12.0, "gpu")
+    assert (found.variant, found.is_bare) == (Variant("deadline", "single"), False)
+    assert [tuple(each) for each in found.networks] == [
+        ({"scene": "home.toml"}, *shape, 12, "packed", shape) for shape in ((64, 96), (32, 32))
+    ]
+    assert found.frames == (0, SKIPS, 1, 0) * 150
+    works[:] = [(Work.NONE, (1, 1))]
+    (nobody,) = sources.tenants(["home.toml"])
+    assert (nobody.fps, nobody.frames[:2], nobody.networks[0].height) == (24.0, (SKIPS, SKIPS), 80)
 
 
 def test_heat_is_that_of_all_together() -> None:

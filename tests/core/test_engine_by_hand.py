@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
-from trilane.hw_profiles.engine_layers import INDEX, NAMES, Layer, Layers
+from trilane.hw_profiles.engine_layers import INDEX, NAMES, TERM_OF, TERMS, Layer, Layers
 from trilane.hw_profiles.engine_times import EngineNumbers, engine_time, join, numbers_of
 from trilane.hw_profiles.load import load_profile, profile_names
 from trilane.hw_profiles.network_work import count_work
@@ -29,7 +29,7 @@ def layers_of_nodes(nodes: list[Any], shapes: dict[str, tuple[int, ...]]) -> tup
 
 
 def node(kind: str, sources: str, result: str, **attributes: Any) -> Any:
-    return helper.make_node(kind, sources.split(), [result], name=result, **attributes)
+    return helper.make_node(kind, sources.split(" "), [result], name=result, **attributes)
 
 
 def test_a_network_of_three_layers() -> None:
@@ -125,6 +125,114 @@ def test_terms_of_operators(kind: str, attributes: dict[str, Any], term: str) ->
         [node(kind, sources, "y", **attributes)], {"x": (1, 8, 2, 2), "y": (1, 8, 2, 2), "w0": (1, 8, 1, 1)}
     )
     assert layer.amounts == {"operator": 1, term: 64}
+
+
+#: Name -> (nodes, shapes beside x and y of 1x8x4x4, terms of the last layer beside `operator`).
+SINGLE: dict[str, tuple[list[Any], dict[str, tuple[int, ...]], dict[str, float]]] = {
+    "transposed: by the places of its input": (
+        [node("ConvTranspose", "x w0", "y", kernel_shape=[2, 2], strides=[2, 2])],
+        {"w0": (8, 40, 2, 2), "y": (1, 40, 8, 8)},
+        {"convolution": 16 * 4 * 16 * 64, "moved": 16 * 8 + 64 * 40, "weights": 8 * 40 * 4},
+    ),
+    "stride and dilation count besides": (
+        [node("Conv", "x w0", "y", kernel_shape=[3, 3], strides=[1, 2], dilations=[2, 1], pads=[2, 1, 2, 1])],
+        {"w0": (33, 8, 3, 3), "y": (1, 33, 4, 2)},
+        {
+            **dict.fromkeys(("convolution", "stride", "dilation"), 8 * 9 * 16 * 64),
+            **{"moved": 16 * 8 + 8 * 40, "weights": 33 * 72},
+        },
+    ),
+    "a picture with a stride": (
+        [node("Conv", "x w0", "y", kernel_shape=[2, 2], strides=[2, 2])],
+        {"x": (1, 4, 4, 4), "w0": (8, 4, 2, 2), "y": (1, 8, 2, 2)},
+        {"first": 4 * 4 * 16 * 32, "moved": 16 * 8 + 4 * 8, "weights": 8 * 16},
+    ),
+    "five channels are no picture": (
+        [node("Conv", "x w0", "y", kernel_shape=[1, 1])],
+        {"x": (1, 5, 4, 4), "w0": (8, 5, 1, 1)},
+        {"convolution": 16 * 16 * 32, "moved": 2 * 16 * 8, "weights": 40},
+    ),
+    "groups of two": (
+        [node("Conv", "x w0", "y", kernel_shape=[1, 1], group=4)],
+        {"w0": (8, 2, 1, 1)},
+        {"grouped": 16 * 16 * 32, "moved": 2 * 16 * 8, "weights": 16},
+    ),
+    "a depthwise one without a stride": (
+        [node("Conv", "x w0", "y", kernel_shape=[3, 3], group=8, pads=[1] * 4)],
+        {"w0": (8, 1, 3, 3)},
+        {"depthwise": 16 * 9 * 32, "moved_depthwise": 2 * 16 * 8, "weights": 72},
+    ),
+    "rows by a matrix": (
+        [node("MatMul", "x w0", "y")],
+        {"x": (5, 17), "w0": (17, 33), "y": (5, 33)},
+        {"convolution": 5 * 32 * 64, "moved": 5 * 17 + 5 * 33, "weights": 17 * 33},
+    ),
+    "nearest": ([node("Resize", "x  w0", "y", mode="nearest")], {"w0": (4,)}, {"nearest": 256}),
+    "bilinear": ([node("Resize", "x  w0", "y", mode="linear")], {"w0": (4,)}, {"bilinear": 256}),
+    "usually nearest": ([node("Resize", "x  w0", "y")], {"w0": (4,)}, {"nearest": 256}),
+    "two pictures": ([node("Sub", "x x", "y")], {}, {"elementwise": 3 * 128}),
+    "a constant": ([node("Mul", "x w0", "y")], {"w0": (1,)}, {"constant": 256}),
+    "divided": ([node("Div", "x x", "y")], {}, {"divide": 3 * 128}),
+    "a clip behind what takes none": ([node("Tanh", "x", "a"), node("Clip", "a", "y")], {}, {"activation": 256}),
+    "a clip behind a pool": (
+        [node("MaxPool", "x", "a", kernel_shape=[1, 1]), node("Clip", "a", "y")],
+        {},
+        {"pool": 256, "clip": 256},
+    ),
+    "two relus behind a sum": (
+        [node("Add", "x x", "a"), node("Relu", "a", "b"), node("Relu", "b", "y")],
+        {},
+        {"elementwise": 384},
+    ),
+    "a sigmoid that two read": (
+        [node("Sigmoid", "x", "a"), node("Mul", "x a", "b"), node("Add", "a b", "y")],
+        {},
+        {"elementwise": 384},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SINGLE)
+def test_layers_by_hand(name: str) -> None:
+    """Inputs of convolutions count to the next 16 channels, outputs to the next 32, what is moved to the next 8."""
+    nodes, shapes, terms = SINGLE[name]
+    own = dict.fromkeys(("x", "a", "b", "y"), (1, 8, 4, 4))
+    names = {"x", *(result for one in nodes for result in one.output)}
+    last = layers_of_nodes(nodes, {**{key: shape for key, shape in own.items() if key in names}, **shapes})[-1]
+    assert last.amounts == {"operator": 1, **terms}
+
+
+OF_TERMS = {
+    "pool": "MaxPool AveragePool LpPool",
+    "reduction": "GlobalAveragePool GlobalMaxPool ReduceMean ReduceSum ReduceMax ReduceMin ArgMax",
+    "concat": "Concat",
+    "batch_norm": "BatchNormalization",
+    "normalisation": "InstanceNormalization GroupNormalization LayerNormalization",
+    "shuffle": "Slice Split Transpose Gather Expand Tile",
+    "depth_to_space": "DepthToSpace SpaceToDepth",
+    "activation": "Relu Clip Sigmoid HardSwish HardSigmoid Tanh Gelu Erf Elu Softmax",
+    "leaky": "LeakyRelu PRelu",
+    "swish": "Swish",
+    "pad": "Pad",
+}
+
+
+def test_every_term_of_an_operator_is_priced_by_the_rate_that_it_uses() -> None:
+    """Products by arithmetic, what lies on the chip by activations; each term once, and a name for each index."""
+    assert {kind: term for term, kinds in OF_TERMS.items() for kind in kinds.split()} == TERM_OF
+    products = {"convolution", "grouped", "first", "depthwise", "stride", "depthwise_stride", "dilation"}
+    own = {"spill": "spill", "weights": "weight", "operator": "operator", "job": "job"}
+    assert {term: own.get(term, "arithmetic" if term in products else "activation") for term in NAMES} == TERMS
+    assert [INDEX[name] for name in NAMES] == list(range(len(NAMES)))
+    assert set(OF_TERMS) <= set(NAMES)
+
+
+def test_the_layers_from_one_on() -> None:
+    """What the others hand over is the input then; from one that is not there on there is none."""
+    whole = chain(10, 30, 20, 5)
+    part = whole.since("l1", 7)
+    assert (part.layers, part.input, part.output, part.sizes) == (whole.layers[1:], 7, 5, whole.sizes)
+    assert whole.since("none", 7).layers == ()
 
 
 def chain(*sizes: int) -> Layers:
