@@ -99,6 +99,26 @@ def test_a_last_stage_has_no_slot_to_write() -> None:
     assert inner.runs == [(5, 0, None)]
 
 
+def test_the_first_stage_is_told_of_another_rung_before_its_frame() -> None:
+    """Once for each change; a later stage is told of none."""
+
+    class Stepped(FakeStage):
+        def step_to(self, rung: int) -> None:
+            self.runs.append(f"rung {rung}")
+
+    first, later = Stepped(), Stepped()
+    stages = (
+        BoundStage("pose", first, [], packets(OWN, 1), 0, context()),
+        BoundStage("present", later, packets(OWN, 1), [], 0, context()),
+    )
+    for frame, rung in enumerate((0, 2, 2, 0)):
+        stages[0].run(frame, -1, 0, 1, rung=rung)
+        stages[1].run(frame, 0, -1, 1, rung=rung)
+    frames = [(frame, None, 0) for frame in range(4)]
+    assert first.runs == [frames[0], "rung 2", *frames[1:3], "rung 0", frames[3]]
+    assert later.runs == [(frame, 0, None) for frame in range(4)]
+
+
 def test_a_hold_sleeps_until_shortly_before_its_end_and_then_watches(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = ToldTime()
     monkeypatch.setattr(bound_stage, "time", clock)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from trilane.errors import BadInputError
 from trilane.scene.crop import ROUNDING_PX, SCREEN, Rect, grow_on_grid, on_grid
 from trilane.scene.planner import AS_GOOD, MOST_DENSITY, PATIENCE, Held, TensorBudget, area, ideal_shape, plan_tensor
-from trilane.scene.shape_set import Demand, ShapeSet, choose_shapes, serves
+from trilane.scene.shape_set import Demand, ShapeSet, choose_shapes, joined, serves
 from trilane.scene.tensor_layout import MARGIN_PX, lay_out_at, tight_shape
 from trilane.shapes import shapes_within
 
@@ -326,6 +326,20 @@ def test_a_further_shape_has_to_save_enough() -> None:
     assert choose_shapes(often_small, 1.0, 10**9).shapes == ((64, 64), (512, 512))
     seldom_small = wanted((64, 64), *[(512, 512)] * 99)
     assert choose_shapes(seldom_small, 1.0, 10**9).shapes == ((512, 512),)
+
+
+def test_two_sets_of_shapes_are_one() -> None:
+    """The smallest first; frames without a shape are those of the first set, unless that is empty."""
+    first, second = ShapeSet(((32, 64), (64, 64)), 5, 3), ShapeSet(((64, 32), (32, 32), (64, 64)), 7, 4)
+    assert joined(first, second) == ShapeSet(((32, 32), (32, 64), (64, 32), (64, 64)), 12, 3)
+    assert joined(ShapeSet((), 0, 9), second).unserved == 4
+
+
+def test_shapes_that_are_optional_may_have_no_memory_at_all() -> None:
+    demands = [Demand((64, 64), 64 * 64)]
+    assert choose_shapes(demands, 1.0, 64 * 64 - 1, optional=True) == ShapeSet((), 0, 1)
+    assert choose_shapes(demands, 1.0, 64 * 64, optional=True) == ShapeSet(((64, 64),), 64 * 64, 0)
+    assert choose_shapes(demands, 1.5, 1) == ShapeSet(((64, 64),), 6144, 0)
 
 
 def test_memory_is_a_limit_but_for_the_first_shape() -> None:

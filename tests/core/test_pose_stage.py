@@ -113,6 +113,23 @@ def test_an_avatar_that_no_pose_brings_into_the_picture_is_not_posed(
     assert posed == [0.0] * 3
 
 
+def test_a_rung_limits_the_pixels_of_the_tensor(tiny_bundle: Path, tmp_path: Path) -> None:
+    """Of 160 x 160 pixels all, then a quarter; the shape that is taken is the densest within them."""
+    own = config(tiny_bundle, tmp_path, size="auto")
+    stepped = own.model_copy(
+        update={"own_pixels": 160 * 160, "works": (1000, 250), "shapes": ((64, 32), (96, 64), (160, 96), (192, 128))}
+    )
+    stage = pose_stage(stepped)
+    packet = bound(stage)
+    shapes = []
+    for rung in (0, 1, 0):
+        stage.step_to(rung)
+        stage.run(30 + rung, None, 0)
+        shapes.append(tuple(packet.header["tensor_shape"].tolist()))
+    assert shapes == [(192, 128), (96, 64), (192, 128)]
+    assert 192 * 128 <= 160 * 160 and 96 * 64 <= 160 * 160 // 4 < 160 * 96
+
+
 def test_two_avatars_share_the_tensor(tiny_bundle: Path, tmp_path: Path) -> None:
     pair = (AvatarSpec(position=(-0.6, 0, 0)), AvatarSpec(position=(0.6, 0, 0), motion="builtin:idle"))
     stage = pose_stage(config(tiny_bundle, tmp_path, avatars=pair))

@@ -33,7 +33,7 @@ from trilane.pipeline.run_log import RunLog, UnitError, after_stderr
 from trilane.pipeline.signals import Interrupts
 from trilane.pipeline.unit_processes import UnitMessage
 from trilane.scheduler import release
-from trilane.scheduler.events import FrameRequest, Settings, Stop
+from trilane.scheduler.events import FrameRequest, Settings, StageAlone, Stop
 from trilane.testing.small_pipeline import pipeline
 from trilane.testing.told_time import ToldTime
 from trilane.transport.messages import (
@@ -278,6 +278,35 @@ def test_each_stage_is_measured_on_its_own_unit_without_the_first_repetition() -
     left, right = ("left", RunIsolated(0, 4, -1, 0)), ("right", RunIsolated(0, 4, 0, 0))
     assert processes.told[:8] == [left, right, left, left, left, right, right, right]
     assert len(processes.told) == 16
+
+
+def test_what_a_stage_takes_on_each_rung_is_its_most_of_the_frames() -> None:
+    """in is followed, mid is not. Each frame and rung: in three times, the first of which does not count, and mid once.
+
+    Frame 4: 20 and 9; frame 8: 18 and 10.
+    """
+    rows = [(99, 21, 20), (1, 9, 12), (99, 18, 50), (1, 99, 10)]
+    script = [row for told in rows for row in ([("left", Duration(ns)) for ns in told], [("right", Duration(7))])]
+    processes: Any = FakeProcesses(script)
+    times = IsolatedTimes(pipeline().graph(), processes, NOBODY)
+    assert times.of_rungs([4, 8], 2, ["in"]) == [StageAlone("in", 0, 20), StageAlone("in", 1, 10)]
+    assert processes.told[:8] == [
+        *[("left", RunIsolated(0, 4, -1, 0, 0))] * 3,
+        ("right", RunIsolated(0, 4, 0, 0, 0)),
+        *[("left", RunIsolated(0, 4, -1, 0, 1))] * 3,
+        ("right", RunIsolated(0, 4, 0, 0, 1)),
+    ]
+    assert times.mean_ns == {}
+
+
+def test_nothing_is_said_of_a_stage_that_takes_no_less_on_a_further_rung() -> None:
+    """Three rungs: in takes 20, 10 and 10 ns, mid 9, 8 and 7."""
+    script = []
+    for left, right in ((20, 9), (10, 8), (10, 7)):
+        script += [[("left", Duration(left))] * 3, [("right", Duration(right))] * 3]
+    processes: Any = FakeProcesses(script)
+    times = IsolatedTimes(pipeline().graph(), processes, NOBODY)
+    assert times.of_rungs([0], 3, ["in", "mid"]) == [StageAlone("mid", rung, 9 - rung) for rung in range(3)]
 
 
 def test_a_unit_is_handed_no_more_at_once_than_its_pipe_holds() -> None:

@@ -19,7 +19,7 @@ from trilane.pipeline.requests import FrameRequestQueue
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run_log import UnitError
 from trilane.scheduler.causes import Outcome, OutcomeKind
-from trilane.scheduler.events import Settings
+from trilane.scheduler.events import Settings, StageAlone
 from trilane.scheduler.stats import energy_score
 from trilane.scheduler.unit_life import STOPPING
 from trilane.scheduler.virtual import VirtualDriver
@@ -37,6 +37,7 @@ class World:
 
     steps: list[Any] = field(default_factory=list)
     told: dict[str, Any] = field(default_factory=dict)
+    first: list[Any] = field(default_factory=list)
     count: int = 0
     core: Any = None
 
@@ -56,7 +57,7 @@ class World:
             cpu.add("right", "mid", Done(number, 0, 0, 0, 0, 0, 0, 0, 3 * MS, 0, {}), 0)
         metrics = {"mid": Counter({"visible": 12.0}), "none": Counter({"x": 5.0})}
         reported = {"mid": Counter({"visible": 40}), "none": Counter({"x": 1})}
-        said = {"metrics": metrics, "reported": reported}
+        said = {"metrics": metrics, "reported": reported, "first": self.first}
         return SimpleNamespace(
             cpu=cpu, jobs=driver.jobs, finish=lambda: self.steps.append("finish"), driver=driver, **said
         )
@@ -73,7 +74,11 @@ class World:
             if "loop" in self.steps and "broken" in self.told:
                 raise self.told["broken"]
 
-        return SimpleNamespace(measure=measure, mean_ns={"in": MS, "mid": 3 * MS})
+        def of_rungs(frames: list[int], rungs: int, follow: tuple[str, ...]) -> list[StageAlone]:
+            self.steps.append(("rungs", frames, rungs, follow))
+            return [StageAlone("mid", rung, (3 - rung) * MS) for rung in range(rungs)]
+
+        return SimpleNamespace(measure=measure, of_rungs=of_rungs, mean_ns={"in": MS, "mid": 3 * MS})
 
     def start(self, _processes: Any, units: Any, _interrupts: Any) -> dict[str, float]:
         self.steps.append(("start", tuple(units)))
@@ -200,6 +205,18 @@ def test_a_governor_is_reported_with_its_energy(world: World) -> None:
     assert go(governor=governor).report.xrbench.energy is None
     governor.power_w = 2.0
     assert go(1, governor=governor).report.xrbench.energy is None  # one frame has no rate
+
+
+def test_a_ladder_of_work_is_measured_before_a_run_at_a_rate(world: World) -> None:
+    """Three frames of nine, on both rungs, before the loop, which is told of it. Without a rate there is no ladder."""
+    result = go(9, policy="latest", fps=50.0, isolated_frames=1, works=(1000, 250), follow=("mid",))
+    assert world.steps.index(("rungs", [0, 3, 6], 2, ("mid",))) < world.steps.index("loop")
+    assert world.first == [StageAlone("mid", 0, 3 * MS), StageAlone("mid", 1, 2 * MS)]
+    assert (world.core.settings.works, world.core.settings.follow) == ((1000, 250), ("mid",))
+    assert result.rungs == (0,) * 9
+    world.first.clear()
+    without = go(9, isolated_frames=1, works=(1000, 250), follow=("mid",))
+    assert (world.first, world.core.ladder, without.rungs) == ([], None, ())
 
 
 def test_what_a_clock_is_given(world: World) -> None:
