@@ -18,7 +18,7 @@ from onnx import TensorProto, helper
 from trilane.apps import beside as sources
 from trilane.errors import BadInputError
 from trilane.hw_profiles import beside_answer
-from trilane.hw_profiles.application import Plan, Variant, stage_times_ms, steady
+from trilane.hw_profiles.application import REFERENCE, Plan, Variant, stage_times_ms, steady
 from trilane.hw_profiles.beside import SKIPS, Tenant, Together, moved_bytes, together
 from trilane.hw_profiles.beside_answer import predict_beside
 from trilane.hw_profiles.load import load_profile
@@ -327,6 +327,32 @@ def test_a_network_of_one_frame_has_no_frame_time(
 def test_too_high_a_rate_of_a_tenant_is_refused() -> None:
     with pytest.raises(BadInputError, match=r"0\.001 to 1000"):
         bare("dsp", float("nan"))
+
+
+def test_accounts_that_differ_and_what_joins_the_stages_are_shown_and_asked(
+    command: Callable[..., tuple[str, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[Any] = []
+
+    def told(chip: Any, found: Any, *over: Any) -> Any:
+        asked.append((chip.name, found, *over))
+        answer = predict_beside(CHIP, [bare("dsp", 10, 32), bare("gpu", 10, 32)])
+        answer["pipelines"][1]["accounts"] = {"agree": False, "largest_difference": 0.0123}
+        return answer
+
+    monkeypatch.setattr(sources, "tenants", lambda texts, variant: (tuple(texts), variant))
+    monkeypatch.setattr(beside_answer, "predict_beside", told)
+    out, _ = command("predict", "a.toml", "--beside", "b.toml", "--edge", "triple", "--turns", "deadline")
+    said = [line for line in out.splitlines() if "differ" in line]
+    assert said == ["additions on gpu: the shares of units, computed twice, differ by 1.23%: please report this"]
+    command("predict", "a.toml", "--policy", "pipelined", "--minutes", 3, "--governor", "step_wise")
+    command("predict", "a.toml", "--policy", "reference", "--performance-profile", "burst")
+    chip, usual = "snapdragon-888", ("sustained_high_performance", 0.0, None, "round-robin")
+    assert asked == [
+        (chip, (("a.toml", "b.toml"), Variant("latest", "triple")), *usual[:3], "deadline"),
+        (chip, (("a.toml",), Variant("pipelined", "double")), usual[0], 3.0, "step_wise", usual[3]),
+        (chip, (("a.toml",), REFERENCE), "burst", *usual[1:]),
+    ]
 
 
 def test_two_networks_as_a_table_and_as_json(

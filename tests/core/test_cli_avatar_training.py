@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -17,9 +18,10 @@ from PIL import Image
 import trilane.training
 from trilane.apps import made
 from trilane.apps.cli import avatar_quantise, avatar_validate
-from trilane.avatars.bundle import load_bundle
+from trilane.avatars.bundle import load_bundle, write_manifest
 from trilane.avatars.digests import sha256_of
 from trilane.stages.dsp import runtime
+from trilane.testing.validated import validated
 from trilane.training.quantising import calibration_table, cross_layer_equalisation, layer_noise, quantise
 
 Command = Callable[..., tuple[str, str]]
@@ -215,6 +217,36 @@ def test_validate_with_every_option(work: Work, tiny_bundle: Path, tmp_path: Pat
     assert work.asked[2] == ([(3, 1), (6, 2)], ("resolved qnn",))
     with Image.open(tmp_path / "sheet.png") as picture:
         assert (picture.size, picture.getpixel((0, 0))) == ((3, 2), (9, 9, 9))
+
+
+def test_sizes_are_added_to_figures_that_are_the_avatars_own(
+    work: Work, tiny_bundle: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Measured for an avatar that was validated as it is, and for no other; nothing else is validated anew."""
+    own = shutil.copytree(tiny_bundle, tmp_path / "own")
+    words = ("avatar", "validate", own, "--sizes", "--json")
+    sizes = ModuleType("size_figures")
+    sizes.__dict__["measure_sizes"] = lambda bundle, plan, renderer, look: (
+        bundle.manifest.name,
+        plan is work.plan,
+        renderer,
+        look() or "looked",
+    )
+    added: list[Any] = []
+    sizes.__dict__["with_sizes"] = lambda before, by_size: added.append((before, by_size)) or "the validation"
+    monkeypatch.setattr(trilane.training, "size_figures", sizes, raising=False)
+    monkeypatch.setitem(sys.modules, "trilane.training.size_figures", sizes)
+    refused = command(*words, code=2)[1]
+    assert "no validation" in refused and f"`trilane avatar validate {own}` comes first" in refused
+    write_manifest(own, validated(load_bundle(own)))
+    printed = json.loads(command(*words)[0])
+    assert printed["validation"]["ssim"] == 0.8642
+    assert added == [(load_bundle(own).manifest.validation, ("tiny", True, "a renderer", "looked"))]
+    assert work.asked == [("renderer", "tiny", 7)]
+    text = (own / "manifest.json").read_text()
+    (own / "manifest.json").write_text(text.replace("0.8642", "0.8643"))
+    assert "comes first" in command(*words, code=2)[1]
+    assert len(added) == 1
 
 
 def test_runtimes_that_are_not_installed_are_left_out(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from random import Random
 from typing import Any
 
 import numpy as np
@@ -255,6 +256,63 @@ def test_what_is_read_last_goes_first() -> None:
     )
     network = Layers(layers, {"x": 1, "a": 8, "b": 8, "c": 1, "y": 1}, 1, 1)
     assert spilled(network, 12) == (1, 4, 0, 4 + 1)
+
+
+def drawn_network(random: Random) -> Layers:
+    """Ten layers, a few of them concatenations, each of up to three tensors that are there."""
+    names, layers = ["x"], []
+    for index in range(10):
+        reads = tuple(random.sample(names, min(len(names), random.randint(1, 3))))
+        layers.append(Layer(f"l{index}", random.choice(["Conv", "Conv", "Add", "Concat"]), {}, reads, f"t{index}"))
+        names.append(f"t{index}")
+    return Layers(tuple(layers), {name: random.randint(0, 9) for name in names}, 1, 1)
+
+
+def spilled_one_by_one(network: Layers, room: int) -> list[int]:
+    """A second implementation: elements go out one after the other, each time of the tensor that is read last."""
+    parts: dict[str, list[str]] = {}
+    reads: list[list[str]] = []
+    for layer in network.layers:
+        whole = list(dict.fromkeys(part for name in layer.reads for part in parts.get(name, [name])))
+        if layer.op_type == "Concat":
+            parts[layer.writes] = whole
+        reads.append([] if layer.op_type == "Concat" else whole)
+    never = len(reads)
+    held: dict[str, int] = {}
+    moved = []
+
+    def again(name: str, now: int) -> int:
+        return min((later for later in range(now + 1, never) if name in reads[later]), default=never)
+
+    for now, layer in enumerate(network.layers):
+        if layer.op_type == "Concat":
+            moved.append(0)
+            continue
+        count = sum(network.sizes[name] - held.get(name, 0) for name in reads[now])
+        held = {name: own for name, own in held.items() if name not in reads[now] or again(name, now) < never}
+        own, made = again(layer.writes, now), 0
+        for _ in range(network.sizes[layer.writes]):
+            there = [name for name in held if held[name]]
+            last = max(there, key=lambda name: again(name, now), default="")
+            if own < never and sum(held.values()) + made < room:
+                made += 1
+            elif own < never and last and again(last, now) > own:
+                held[last] -= 1
+                made, count = made + 1, count + 1
+            else:
+                count += 1
+        if own < never:
+            held[layer.writes] = made
+        moved.append(count)
+    return moved
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_drawn_networks_move_what_goes_out_one_by_one(seed: int) -> None:
+    random = Random(seed)
+    network = drawn_network(random)
+    for room in (0, random.randint(1, 12), random.randint(12, 40)):
+        assert list(spilled(network, room)) == spilled_one_by_one(network, room)
 
 
 def test_a_concatenation_moves_nothing() -> None:

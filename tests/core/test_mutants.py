@@ -157,9 +157,16 @@ def test_in_a_process():
 """
 
 
-def test_reach_follows_links_and_processes_and_notes_opened_tables(tmp_path: Path) -> None:
-    """A folder behind a link: lines 1 and 4 are met when it is imported, 2 by a test, 5 by a process of it."""
+def test_reach_follows_links_and_processes_and_notes_opened_tables(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A folder behind a link: lines 1 and 4 are met when it is imported, 2 by a test, 5 by a process of it.
+
+    The tests in it need none of pytest's plugins but the one whose limit they are given.
+    """
     pytest.importorskip("coverage")
+    monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")
+    monkeypatch.setenv("PYTEST_PLUGINS", "pytest_timeout")
     root = tmp_path / "tree"
     (root / "src" / "trilane").mkdir(parents=True)
     (root / "src" / "trilane" / "__init__.py").touch()

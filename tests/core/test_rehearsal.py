@@ -12,8 +12,8 @@ from trilane.pipeline import rehearsal
 from trilane.pipeline.rehearsal import _in_proportion, _Rehearsal
 from trilane.pipeline.run_log import UnitError
 from trilane.scheduler.placement import Ranked
-from trilane.scheduler.places import Place, Work
-from trilane.stages.placing import MEASURED, _reason, thread_counts
+from trilane.scheduler.places import Core, Place, Work
+from trilane.stages.placing import MEASURED, _reason, considered, thread_counts, times_rows
 from trilane.transport.messages import Done, Pong, RunJob
 
 STAGES = (("pose", "cpu"), ("raster", "gpu"), ("infer", "dsp"), ("present", "cpu"))
@@ -117,6 +117,28 @@ def test_the_network_is_measured_with_every_number_of_threads_that_it_may_have()
     assert thread_counts(12, rule) == {"cpu": [], "gpu": [], "dsp": [2, 3, 4, 6, 10, 11, 12]}
     assert thread_counts(1, {**rule, "dsp": Place((0,), 1)})["dsp"] == []
     assert thread_counts(2, {**rule, "cpu": Place((0, 1), 2)})["cpu"] == [2]
+
+
+def test_of_many_cores_one_of_each_physical_is_considered() -> None:
+    """Up to eight all; of more, the first sibling of each, sixteen of them; those that were asked for stay."""
+    siblings = [Core(number, number // 2) for number in range(40)]
+    assert considered(siblings[:8], {}) == siblings[:8]
+    assert considered(siblings[:10], {}) == siblings[:10:2]
+    assert considered(siblings, {}) == siblings[:32:2]
+    asked = {"dsp": Place((3, 39), 2), "gpu": Place((4,), 1)}
+    assert [core.number for core in considered(siblings, asked)] == sorted([*range(0, 32, 2), 3, 39])
+
+
+def test_times_are_rows_in_milliseconds() -> None:
+    times = {
+        "cpu": {1: Work(2_500_000, 500_000)},
+        "dsp": {1: Work(9_000_000, 8_000_000), 2: Work(5_000_000, 4_500_000)},
+    }
+    assert times_rows(times) == [
+        {"unit": "cpu", "threads": 1, "ms": 2.5, "core_ms": 0.5},
+        {"unit": "dsp", "threads": 1, "ms": 9.0, "core_ms": 8.0},
+        {"unit": "dsp", "threads": 2, "ms": 5.0, "core_ms": 4.5},
+    ]
 
 
 ONE, TWO, THREE, RULE = (

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -13,6 +15,7 @@ from trilane.avatars.bundle import bundle_folder  # noqa: E402
 from trilane.body.joints import JOINT_INDEX  # noqa: E402
 from trilane.errors import BadInputError  # noqa: E402
 from trilane.scene.motion.builtin import BUILTIN  # noqa: E402
+from trilane.training import training_loop  # noqa: E402
 from trilane.training.clear_view import ClothedSurface, vertex_reach  # noqa: E402
 from trilane.training.clothing.layers import Layer  # noqa: E402
 from trilane.training.error_summary import SampleError, summary  # noqa: E402
@@ -219,6 +222,22 @@ def test_fields_are_smooth_and_gaps_filled():
     assert np.allclose(filled[known], image[known]) and np.isfinite(filled).all()
 
 
+@pytest.fixture
+def in_this_process(monkeypatch):
+    """A worker in this process instead of one of its own, which `process/test_training_command.py` has."""
+    threads = torch.get_num_threads()
+
+    def spawn(worker, work, nprocs, join):
+        assert (nprocs, join) == (1, False)
+        worker(0, *work)
+        return SimpleNamespace(join=lambda timeout: timeout > 0)
+
+    monkeypatch.setattr(training_loop.tmp, "spawn", spawn)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.mark.usefixtures("in_this_process")
 def test_two_steps_of_training_run_and_are_saved(groups, tmp_path):
     made, steps = fit(
         avatar(),
