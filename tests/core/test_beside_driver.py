@@ -152,6 +152,23 @@ def test_units_of_one_pipeline_divide_a_core_too() -> None:
     assert shares_ms(done.report, "gpu") == {"busy": 4, "preempted": 2, "starved": 4}
 
 
+def test_of_one_pipelines_jobs_on_a_seat_the_first_handed_out_goes_first() -> None:
+    """A draws (2 ms) and shows (1 ms) on core 0, and infers (3 ms) elsewhere. B has core 0 from 2 to 12.
+
+    Meanwhile A has handed out draw 1, at 2, then show 0, at 5, and so they follow. Infer 1 is done at 17.
+    """
+    graph = chain([("draw", "gpu"), ("infer", "dsp"), ("show", "cpu")], "double", "infer")
+    times = {"draw": 2 * MS, "infer": 3 * MS, "show": MS}
+    core = {"gpu": "core 0", "cpu": "core 0"}
+    one = Member(graph, Settings(2), lambda stage, *_: times[stage], core)
+    other = Member(ALONE, Settings(1), lambda *_: 10 * MS, {"dsp": "core 0"})
+    a, b = simulate_beside([one, other], keep=True)
+    assert rows(b.jobs) == [(0, 2, 12)]
+    assert rows(a.jobs, "gpu") == [(0, 0, 2), (1, 12, 14)]
+    assert rows(a.jobs) == [(0, 2, 5), (1, 14, 17)]
+    assert rows(a.jobs, "cpu") == [(0, 14, 15), (1, 17, 18)]
+
+
 def test_a_job_is_slower_only_while_what_slows_it_runs() -> None:
     """A: 4 ms on the dsp; B: 3 ms on the gpu, at half A's speed: 1.5 ms of A are done by 3, the rest alone until 5.5.
 

@@ -34,13 +34,19 @@ def staged(scene: Scene, avatar: AvatarData) -> Staged:
     return stage_scene(scene, [avatar.shaped] * len(scene.avatars), Path.cwd())
 
 
-def test_the_shapes_are_those_of_frames_spread_over_the_scene(avatar: AvatarData) -> None:
+def test_the_shapes_are_those_of_frames_spread_over_the_scene(
+    avatar: AvatarData, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """96 of 500 frames; each one's ideal shape by itself, and the choice among them."""
     scene = Scene(size="auto", frames=500, output=OutputSpec(width=320, height=240))
     place = staged(scene, avatar)
+    frames = tuple(k * 500 // 96 for k in range(96))
+    rows = list(foreseen_rects(scene, place, [avatar.shaped], frames))
+    asked: list[Any] = []
+    monkeypatch.setattr("trilane.stages.foresee.foreseen_rects", lambda *what: asked.append(what) or iter(rows))
     found = foresee(scene, place, [avatar.shaped], avatar.network, [OWN])
-    assert found.frames == tuple(k * 500 // 96 for k in range(96))
-    seen = [rects for rects in foreseen_rects(scene, place, [avatar.shaped], found.frames) if rects]
+    assert asked == [(scene, place, [avatar.shaped], frames)] and found.frames == frames
+    seen = [rects for rects in rows if rects]
     assert found.seen == len(seen) > 90
     demands = Counter(Demand(ideal_shape(rects, (240, 320), OWN), OWN.own) for rects in seen)
     assert found.shapes == choose_shapes(demands.elements(), bytes_per_pixel(avatar.network), 512 * MB)
@@ -68,8 +74,11 @@ def test_a_scenes_megabytes_are_a_million_bytes_and_smaller_sizes_get_what_is_le
 
 
 @pytest.mark.parametrize(("frames", "avatars", "looked_at"), [(500, 1, 96), (40, 1, 40), (500, 3, 32), (500, 8, 24)])
-def test_so_many_frames_are_looked_at(avatar: AvatarData, frames: int, avatars: int, looked_at: int) -> None:
-    """96 over all avatars, but at least 24 of each, and no more than there are."""
+def test_so_many_frames_are_looked_at(
+    avatar: AvatarData, monkeypatch: pytest.MonkeyPatch, frames: int, avatars: int, looked_at: int
+) -> None:
+    """96 over all avatars, but at least 24 of each, and no more than there are; nobody is in view of any."""
+    monkeypatch.setattr("trilane.stages.foresee.foreseen_rects", lambda *what: [[] for _ in what[3]])
     specs = tuple(AvatarSpec(position=(0.5 * k - 2, 0, 0), motion="builtin:idle") for k in range(avatars))
     scene = Scene(size="auto", frames=frames, avatars=specs)
     found = foresee(scene, staged(scene, avatar), [avatar.shaped] * avatars, avatar.network, [OWN])

@@ -64,6 +64,18 @@ def test_the_old_picture_goes_where_the_pelvis_goes_and_grows_with_it() -> None:
     assert only.offset == pytest.approx((48, -16))
 
 
+def test_an_old_cell_that_is_not_at_the_corner_is_read_where_it_was() -> None:
+    """As before it in all else: 9 columns and 5 rows further; the new cell begins at column 3 and row 7."""
+    before = header(10, *LARGE, (0, 0, -2))
+    before["avatars"][0]["tensor_rect"] = (5, 9, 64, 128)
+    after = header(11, (32, 64), (0.0, 0.0, 1.0, 1.0), (0.25, 0.25, -1))
+    after["avatars"][0]["tensor_rect"] = (7, 3, 32, 64)
+    ((only,),) = change(before, after)
+    assert (only.cell, only.part) == ((7, 3, 32, 64), (5, 9, 64, 128))
+    assert only.scale == pytest.approx((1, 2))
+    assert only.offset == pytest.approx((48 + 9 - 3, -16 + 5 - 2 * 7))
+
+
 def test_nothing_is_blended_of_long_ago_of_one_density_of_the_unseen_or_of_one_behind_the_camera() -> None:
     before = header(10, *LARGE, (0, 0, -2))
     for frame, count in ((10 + MOST_GAP, 1), (11 + MOST_GAP, 0), (9, 0)):

@@ -63,10 +63,16 @@ def live(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     def made(interrupts: int = 0) -> Any:
         processes = Processes()
         one = trial._Live(Group(PIPELINE, PLACES), processes, SimpleNamespace(count=interrupts))  # type: ignore[arg-type]
-        return SimpleNamespace(one=one, processes=processes, own=own)
+        return SimpleNamespace(one=one, processes=processes, own=own, settings=settings)
 
     own: list[Any] = []
-    monkeypatch.setattr(trial, "RealtimeClock", VirtualClock)
+    settings: list[Any] = []
+
+    def clock(core: Core, *others: Any) -> VirtualClock:
+        settings.append(core.settings)
+        return VirtualClock(core, *others)
+
+    monkeypatch.setattr(trial, "RealtimeClock", clock)
     monkeypatch.setattr(trial, "os", SimpleNamespace(sched_setaffinity=lambda pid, cores: own.append((pid, cores))))
     return made
 
@@ -80,6 +86,9 @@ def test_a_frame_takes_what_the_unit_takes_where_it_is(live: Any, turn: int, ord
     assert made.own == [(0, (8, 9))] * 3
     assert made.processes.first == 40
     assert made.one.pids == [71, 72]
+    (settings,) = made.settings
+    assert (settings.frames, settings.policy, settings.period_ns) == (3 * 16 + 6, "pipelined", 0)
+    assert (settings.hang_ns, SKIPPED) == (10_000_000_000, 6)
 
 
 def test_the_frames_that_were_under_way_do_not_count() -> None:
