@@ -4,7 +4,8 @@ Rule: a pure function of an ONNX graph's shapes; nothing here knows a chip. A te
 own (`TERMS`). Products are counted with the channels rounded up to the blocks in which the Hexagon keeps them: a
 convolution's inputs to 16, its outputs to 32, all other activations to 8. A ReLU and a clip disappear in the layer
 before them, a batch normalisation in the convolution before it, a sum of two tensors in the convolution that makes one
-of them.
+of them. A permutation between channels first and channels last is none: the engine has channels last, whichever the
+file says.
 """
 
 from __future__ import annotations
@@ -18,6 +19,10 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from trilane.hw_profiles.operator_kinds import CONVOLUTIONS, DOMAINS, LAYOUT_CHANGES, RECURRENT
+from trilane.hw_profiles.operator_kinds import PRODUCTS as MATRIX_PRODUCTS
+from trilane.hw_profiles.product_counts import product_of
 
 Rate = Literal["arithmetic", "activation", "spill", "weight", "operator", "job"]
 RATES: tuple[Rate, ...] = ("arithmetic", "activation", "spill", "weight", "operator", "job")
@@ -73,6 +78,15 @@ TAKES = frozenset(
     ("Conv", "ConvTranspose", "Gemm", "MatMul", "Add", "Mul", "Concat", "MaxPool", "Resize", *NORMALISATIONS)
 )
 PRODUCTS = frozenset(["Conv", "ConvTranspose", "Gemm", "MatMul"])
+WITH_PRODUCTS = frozenset([*CONVOLUTIONS, *MATRIX_PRODUCTS, *RECURRENT])
+#: Operators of integers, or joined with others -> the one of floats whose work they do.
+PLAIN = {
+    **{"QLinearConv": "Conv", "ConvInteger": "Conv", "FusedConv": "Conv", "DeformConv": "Conv"},
+    **{"QLinearMatMul": "MatMul", "MatMulInteger": "MatMul", "FusedMatMul": "MatMul"},
+    **{"QLinearAdd": "Add", "QLinearMul": "Mul", "QLinearConcat": "Concat", "QLinearAveragePool": "AveragePool"},
+    **{"QLinearGlobalAveragePool": "GlobalAveragePool", "QLinearSigmoid": "Sigmoid", "QLinearSoftmax": "Softmax"},
+    "QLinearLeakyRelu": "LeakyRelu",
+}
 ARITHMETIC_OF_TWO = frozenset(["Add", "Sub", "Mul", "Div"])
 _BY_TERM = {
     "pool": ("MaxPool", "AveragePool", "LpPool"),
@@ -94,13 +108,22 @@ PICTURE_CHANNELS = 4
 
 
 class Layer(NamedTuple):
-    """One layer. `amounts`: of each term. `reads`, `writes`: names of tensors that are not weights."""
+    """One layer. `amounts`: of each term. `reads`, `writes`: names of tensors that are not weights.
+
+    `more`: its other results, as a split has them, that somebody needs.
+    """
 
     name: str
     op_type: str
     amounts: Mapping[str, float]
     reads: tuple[str, ...]
     writes: str
+    more: tuple[str, ...] = ()
+
+    @property
+    def kind(self) -> str:
+        """Its type as that of floats."""
+        return PLAIN.get(self.op_type, self.op_type)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +155,8 @@ class Layers:
 
 NO_LAYERS = Layers((), {}, 0, 0)
 
-Shapes = Mapping[str, tuple[int, ...]]
+Shape = tuple[int, ...]
+Shapes = Mapping[str, Shape]
 
 
 class _Graph:
@@ -143,9 +167,10 @@ class _Graph:
         self.nodes = [n for n in graph.node if not all(name in constants for name in n.output if name)]
         self._renamed: dict[str, str] = {}
         for node in self.nodes:
-            if node.op_type in RENAMES and node.input:
+            if _renames(node) and node.input:
                 self.rename(node.output[0], node.input[0])
-        self.reads = Counter(self.name_of(name) for n in self.nodes if n.op_type not in RENAMES for name in n.input)
+        self.reads = Counter(self.name_of(name) for n in self.nodes if not _renames(n) for name in n.input)
+        self._ends = {self.name_of(output.name) for output in graph.output}
 
     def rename(self, name: str, original: str) -> None:
         """From now on `name` means `original`."""
@@ -161,6 +186,28 @@ class _Graph:
         """The tensors that `node` reads, without its weights."""
         return tuple(self.name_of(name) for name in node.input if name and name not in self.constants)
 
+    def more(self, node: Any) -> tuple[str, ...]:
+        """The results of `node` besides the first that somebody needs."""
+        others = (name for name in node.output if name and name != first_result(node))
+        return tuple(name for name in others if self.reads[name] or name in self._ends)
+
+
+def first_result(node: Any) -> str:
+    """The first result that `node` makes: a recurrent layer may leave out what stands first."""
+    name: str = next(name for name in node.output if name)
+    return name
+
+
+def _kind(node: Any) -> str:
+    """The type of an operator as that of floats; nothing of a domain whose operators nobody knows."""
+    return PLAIN.get(node.op_type, node.op_type) if node.domain in DOMAINS else ""
+
+
+def _renames(node: Any) -> bool:
+    """Whether `node` moves nothing."""
+    kind = _kind(node)
+    return kind in RENAMES or (kind == "Transpose" and any(tuple(a.ints) in LAYOUT_CHANGES for a in node.attribute))
+
 
 def layers_of(graph: Any, shapes: Shapes, constants: set[str]) -> Layers:
     """The layers of an ONNX graph.
@@ -172,22 +219,23 @@ def layers_of(graph: Any, shapes: Shapes, constants: set[str]) -> Layers:
     names = _Graph(graph, shapes, constants)
     layers: dict[str, Layer] = {}
     for node in names.nodes:
-        if node.op_type in RENAMES or not names.given(node):
+        if _renames(node) or not names.given(node):
             continue
+        kind = _kind(node)
         before = [layers[name] for name in names.given(node) if name in layers]
         sigmoid = next((layer for layer in before if _is_swish(node, layer, names)), None)
-        if node.op_type in FOLDED and before and _folds(before[0], names):
+        if kind in FOLDED and before and _folds(before[0], names):
             layers[before[0].writes] = before[0]._replace(amounts={**before[0].amounts, **_clip(node, shapes)})
             names.rename(node.output[0], before[0].writes)
         elif node.op_type == "BatchNormalization" and before and _takes_up(before[0], names):
             names.rename(node.output[0], before[0].writes)
         elif sigmoid is not None:
             del layers[sigmoid.writes]
-            layers[node.output[0]] = _layer(node, names, "Swish", sigmoid.reads)
-        elif node.op_type == "Add" and any(layer.op_type in PRODUCTS for layer in before):
+            layers[first_result(node)] = _layer(node, names, "Swish", sigmoid.reads)
+        elif kind == "Add" and any(layer.kind in PRODUCTS for layer in before):
             layers[node.output[0]] = Layer(node.name or node.output[0], "Add", {}, names.given(node), node.output[0])
         else:
-            layers[node.output[0]] = _layer(node, names, node.op_type, names.given(node))
+            layers[first_result(node)] = _layer(node, names, kind, names.given(node))
     sizes = {name: _padded(shape, ACTIVATION_BLOCK) for name, shape in shapes.items() if name not in constants}
     ends = ([i.name for i in graph.input if i.name not in constants], [o.name for o in graph.output])
     whole = tuple(layers.values())
@@ -195,12 +243,12 @@ def layers_of(graph: Any, shapes: Shapes, constants: set[str]) -> Layers:
 
 
 def _folds(before: Layer, names: _Graph) -> bool:
-    return before.op_type in TAKES and names.reads[before.writes] == 1
+    return before.kind in TAKES and names.reads[before.writes] == 1
 
 
 def _takes_up(before: Layer, names: _Graph) -> bool:
     """Whether a batch normalisation behind `before` becomes part of its weights."""
-    return before.op_type in PRODUCTS and names.reads[before.writes] == 1
+    return before.kind in PRODUCTS and names.reads[before.writes] == 1
 
 
 def _clip(node: Any, shapes: Shapes) -> dict[str, float]:
@@ -209,24 +257,23 @@ def _clip(node: Any, shapes: Shapes) -> dict[str, float]:
 
 def _is_swish(node: Any, before: Layer, names: _Graph) -> bool:
     """Whether `node` multiplies a tensor with its own sigmoid, which is `before`."""
-    if node.op_type != "Mul" or before.op_type != "Sigmoid":
+    if _kind(node) != "Mul" or before.kind != "Sigmoid":
         return False
     return set(names.given(node)) == {*before.reads, before.writes} and names.reads[before.writes] == 1
 
 
 def _layer(node: Any, names: _Graph, kind: str, reads: tuple[str, ...]) -> Layer:
-    amounts: Counter[str] = Counter()
-    amounts["operator"] = 1
-    amounts["weights"] = sum(prod(names.shapes.get(n, ())) for n in node.input if n and n in names.constants)
-    if kind in PRODUCTS and len(names.shapes[node.input[0]]) > 1:
-        amounts.update(dict(_products(node, names.shapes)))
+    writes, more = first_result(node), names.more(node)
+    amounts: Counter[str] = Counter(dict(_products(node, names.shapes)) if kind else {})
+    if amounts:
+        amounts["weights"] = sum(prod(names.shapes.get(n, ())) for n in node.input if n and n in names.constants)
     else:
-        amounts["weights"] = 0
-        moved = [names.shapes[n] for n in node.input if n and n not in names.constants] + [names.shapes[node.output[0]]]
+        moved = [names.shapes[n] for n in node.input if n and n not in names.constants]
+        moved += [names.shapes[n] for n in (writes, *more)]
         amounts.update(dict(_movement(node, kind, sum(_padded(s, ACTIVATION_BLOCK) for s in moved), names)))
-    return Layer(
-        node.name or node.output[0], node.op_type, {t: float(a) for t, a in amounts.items() if a}, reads, node.output[0]
-    )
+    amounts["operator"] = 1
+    counted = {t: float(a) for t, a in amounts.items() if a}
+    return Layer(node.name or writes, node.op_type, counted, reads, writes, more)
 
 
 def _movement(node: Any, kind: str, moved: int, names: _Graph) -> Iterator[tuple[str, float]]:
@@ -235,7 +282,7 @@ def _movement(node: Any, kind: str, moved: int, names: _Graph) -> Iterator[tuple
         mode = next((a.s for a in node.attribute if a.name == "mode"), b"nearest")
         yield "nearest" if mode == b"nearest" else "bilinear", moved
     elif kind in ARITHMETIC_OF_TWO:
-        with_constant = any(name in names.constants for name in node.input)
+        with_constant = len(names.given(node)) < 2
         yield "divide" if kind == "Div" else "constant" if with_constant else "elementwise", moved
     else:
         yield TERM_OF.get(kind, "other"), moved
@@ -253,24 +300,40 @@ def _up(count: int, block: int) -> int:
 
 
 def _products(node: Any, shapes: Shapes) -> Iterator[tuple[str, float]]:
-    source, out = shapes[node.input[0]], shapes[node.output[0]]
-    moved = _padded(source, ACTIVATION_BLOCK) + _padded(out, ACTIVATION_BLOCK)
-    if node.op_type in ("Gemm", "MatMul"):
-        yield "moved", moved
-        yield "convolution", prod(out[:-1]) * _up(source[-1], INPUT_BLOCK) * _up(out[-1], OUTPUT_BLOCK)
+    """Products, and what is moved for them; nothing of an operator that multiplies no tensors."""
+    if node.op_type not in WITH_PRODUCTS:
         return
+    source, out = shapes[node.input[0]], shapes[first_result(node)]
+    moved = _padded(source, ACTIVATION_BLOCK) + _padded(out, ACTIVATION_BLOCK)
+    if node.op_type in CONVOLUTIONS:
+        yield from _convolution(node, source, shapes[node.input[CONVOLUTIONS[node.op_type]]], out, moved)
+        return
+    product = product_of(node, [shapes.get(name, ()) for name in node.input], out)
+    if product is None or len(source) < 2:
+        return
+    yield "moved", moved
+    yield "convolution", product.macs * _padding(product.c_in, INPUT_BLOCK) * _padding(product.c_out, OUTPUT_BLOCK)
+
+
+def _padding(count: int, block: int) -> float:
+    """Channels rounded up to whole blocks, over channels."""
+    return _up(count, block) / count
+
+
+def _convolution(node: Any, source: Shape, weight: Shape, out: Shape, moved: int) -> Iterator[tuple[str, float]]:
+    """Terms of a convolution. `moved`: elements that it reads and writes."""
     attributes = {a.name: a for a in node.attribute}
     groups = attributes["group"].i if "group" in attributes else 1
     yield "moved_depthwise" if groups == source[1] > 1 else "moved", moved
     stride, dilation = (max(attributes[k].ints) if k in attributes else 1 for k in ("strides", "dilations"))
-    places = out[0] * prod(source[2:] if node.op_type == "ConvTranspose" else out[2:]) * prod(shapes[node.input[1]][2:])
+    places = source[0] * prod(source[2:] if node.op_type == "ConvTranspose" else out[2:]) * prod(weight[2:])
     if groups > 1:
         yield from _grouped(places, source[1], out[1], groups, stride)
         return
     macs = places * _up(source[1], INPUT_BLOCK) * _up(out[1], OUTPUT_BLOCK)
     picture = source[1] <= PICTURE_CHANNELS
     yield "first" if picture else "convolution", macs
-    if stride > 1 and not picture and node.op_type == "Conv":
+    if stride > 1 and not picture and _kind(node) == "Conv":
         yield "stride", macs
     if dilation > 1:
         yield "dilation", macs

@@ -13,6 +13,7 @@ operators, in the order of the file. An operator that the runtime folds into ano
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -24,7 +25,7 @@ from trilane.hw_profiles.network_work import Operator, Work
 from trilane.hw_profiles.operator_times import Machine, job_time, machine_of
 from trilane.hw_profiles.performance_profiles import Corners
 from trilane.hw_profiles.schema import Profile, Unit
-from trilane.hw_profiles.unit_times import layer_times, time_on
+from trilane.hw_profiles.unit_times import fallback_ms, layer_times, time_on
 from trilane.units import UNITS, UnitName
 
 #: A term is named where it alone makes the time uncertain by so much.
@@ -83,12 +84,20 @@ def price(profile: Profile, work: Work, unit: UnitName, corners: Corners) -> Net
         operators = tuple(_by_roofline(o, machine) for o in work.operators)
     else:
         seconds = layer_times(of_unit, profile.memory, work, clock).layers
-        operators = tuple(_by_engine(layer, row) for layer, row in zip(work.layers.layers, seconds, strict=True))
+        on_cpu = dict(fallback_ms(of_unit, work))
+        operators = tuple(
+            _on_cpu(layer, on_cpu) if layer.op_type in of_unit.fallback else _by_engine(layer, row)
+            for layer, row in zip(work.layers.layers, seconds, strict=True)
+        )
     return NetworkTime(unit, whole.total_ms - sum(o.ms for o in operators), operators)
 
 
 def _by_engine(layer: Layer, seconds: F64) -> OperatorTime:
     return OperatorTime(layer.name, layer.op_type, 1e3 * float(seconds.sum()), BOUNDS[int(seconds.argmax())])
+
+
+def _on_cpu(layer: Layer, on_cpu: Mapping[str, float]) -> OperatorTime:
+    return OperatorTime(layer.name, layer.op_type, on_cpu.get(layer.name, 0.0), "activation traffic")
 
 
 def _by_roofline(operator: Operator, machine: Machine) -> OperatorTime:

@@ -18,7 +18,7 @@ import onnx
 from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
-from trilane.hw_profiles.engine_layers import NO_LAYERS, RENAMES, Layers, layers_of
+from trilane.hw_profiles.engine_layers import NO_LAYERS, RENAMES, Layers, first_result, layers_of
 from trilane.hw_profiles.operator_kinds import (
     CLASSES,
     CONVOLUTIONS,
@@ -247,15 +247,15 @@ def _operator(node: Any, shapes: Shapes, constants: set[str], read: set[str]) ->
     own = node.input[:SCALE_AND_SHIFT] if node.op_type == "BatchNormalization" else node.input
     weights = sum(_size(shapes, name) for name in own if name in constants) if weighted else 0
     moved_in = [_size(shapes, name) for name in node.input if name and name not in constants]
-    out = sum(_size(shapes, name) for name in node.output if name and (name in read or name == node.output[0]))
+    out = sum(_size(shapes, name) for name in node.output if name and (name in read or name == first_result(node)))
     moved = sum(moved_in) * (2 if node.op_type in STATISTICS else 1) + out
     plain = Operator(
-        node.name or node.output[0], node.op_type, KIND_OF.get(node.op_type, UNKNOWN), 0, moved, weights, 0, 0, out
+        node.name or first_result(node), node.op_type, KIND_OF.get(node.op_type, UNKNOWN), 0, moved, weights, 0, 0, out
     )
     if known and node.op_type in CONVOLUTIONS:
         return _convolution(node, shapes, plain)
     if known and (node.op_type in PRODUCTS or node.op_type in RECURRENT):
-        product = product_of(node, [shapes.get(name, ()) for name in node.input], shapes[node.output[0]])
+        product = product_of(node, [shapes.get(name, ()) for name in node.input], shapes[first_result(node)])
         return plain if product is None else plain._replace(kind="pointwise", **product._asdict())
     return plain if known else plain._replace(kind=UNKNOWN, ruled=False)
 

@@ -32,7 +32,7 @@ class _Chip:
         self._readers: dict[str, list[int]] = defaultdict(list)
         self._held: dict[str, int] = {}
         for index, layer in enumerate(network.layers):
-            if layer.op_type == "Concat":
+            if layer.kind == "Concat":
                 self._parts[layer.writes] = self._read(layer.reads)
                 continue
             for name in self._read(layer.reads):
@@ -49,14 +49,14 @@ class _Chip:
     def run(self, index: int) -> int:
         """Run the layer `index`; return what it moves."""
         layer = self._layers[index]
-        if layer.op_type == "Concat":
+        if layer.kind == "Concat":
             return 0
         moved = 0
         for name in self._read(layer.reads):
             moved += self._sizes[name] - self._held.get(name, 0)
             if self._next(name, index) == len(self._layers):
                 self._held.pop(name, None)
-        return moved + self._keep(layer.writes, index)
+        return moved + sum(self._keep(name, index) for name in (layer.writes, *layer.more))
 
     def _keep(self, name: str, index: int) -> int:
         """Put the result of the layer `index` on the chip; return what has to go out for want of room."""

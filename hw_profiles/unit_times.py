@@ -30,13 +30,11 @@ def time_on(
         return job_time(work, machine_of(unit, memory, clock_fraction, contended), batch)
     time = layer_times(unit, memory, work, clock_fraction, contended=contended, batch=batch)
     by_bound = 1e3 * time.layers.sum(axis=0)
-    on_cpu = [o.out for o in work.operators if o.op_type in unit.fallback]
     parts = {
         "fixed": float(by_bound[4]) + permutes_ms(unit, work),
         "input": 1e3 * time.job + batch * work.input_elements * unit.input_ns_per_element.or_else(0.0) / 1e6,
         "weights": float(by_bound[3]),
-        "fallback": len(on_cpu) * unit.fallback_fixed_ms.or_else(0.0)
-        + batch * sum(on_cpu) * unit.fallback_ns_per_element.or_else(0.0) / 1e6,
+        "fallback": sum(ms for _, ms in fallback_ms(unit, work, batch)),
     }
     parts |= dict(zip(("arithmetic", "activation", "spill"), by_bound[:3].tolist(), strict=True))
     return JobTime(parts, unsure(unit.engine, time.shares))
@@ -51,6 +49,12 @@ def layer_times(
     time = engine_time(work.layers, numbers_of(unit.engine, clock_fraction, left), batch)
     on_engine = np.array([layer.op_type not in unit.fallback for layer in work.layers.layers], dtype=bool)
     return EngineTime(time.layers * on_engine[:, None], time.job, time.shares)
+
+
+def fallback_ms(unit: Unit, work: Work, batch: int = 1) -> list[tuple[str, float]]:
+    """What each operator costs that the unit hands to the CPU, with its name."""
+    fixed, each = unit.fallback_fixed_ms.or_else(0.0), unit.fallback_ns_per_element.or_else(0.0) / 1e6
+    return [(o.name, fixed + batch * o.out * each) for o in work.operators if o.op_type in unit.fallback]
 
 
 def permutes_ms(unit: Unit, work: Work) -> float:

@@ -139,6 +139,9 @@ def _print_wanted(console: Console, answer: dict[str, Any]) -> None:
         console.print(f"                {_reserve(rate)}")
     if limit := answer.get("power_limit"):
         name = f"within {limit['limit_w']:g} W"
+        if not limit["fps"]:
+            console.print(f"{name:<16}never: the device takes {limit['power_w']:.2f} W when no unit works")
+            return
         corners = ", ".join(f"{unit} {corner}" for unit, corner in limit["corners"].items())
         span = f"{limit['low_fps']:.1f} to {limit['high_fps']:.1f}"
         reason = "its full speed" if limit["limited_by"] == "speed" else "by power"

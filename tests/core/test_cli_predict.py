@@ -391,6 +391,12 @@ def test_networks_are_shown_with_their_ten_most_expensive_operators(
     }
 
 
+def test_a_limit_below_what_an_idle_device_takes(capsys: pytest.CaptureFixture[str]) -> None:
+    limit = {**LIMIT, "fps": 0.0, "low_fps": 0.0, "high_fps": 0.0, "power_w": 3.25}
+    predict_output.show_answer(an_answer(power_limit=limit), as_json=False)
+    assert "within 3 W      never: the device takes 3.25 W when no unit works\n" in capsys.readouterr().out
+
+
 ODD = {"op_type": "Warp", "count": 3, "share_of_elements": 0.125}
 
 

@@ -109,6 +109,90 @@ def test_a_batch_normalisation_behind_a_convolution_is_part_of_it() -> None:
     assert kinds[-1].amounts == {"operator": 1, "batch_norm": 2 * 128}
 
 
+def test_a_batch_in_the_file_has_its_products_as_often() -> None:
+    """Four pictures, each of 8x8 places by 9 by 16 by 32 products; the weights are read once."""
+    (layer,) = layers_of_nodes(
+        [node("Conv", "x w0", "y", kernel_shape=[3, 3], pads=[1] * 4)],
+        {"x": (4, 16, 8, 8), "y": (4, 32, 8, 8), "w0": (32, 16, 3, 3)},
+    )
+    products = {"convolution": 4 * 64 * 9 * 16 * 32, "moved": 4 * 64 * (16 + 32)}
+    assert layer.amounts == {**products, "weights": 32 * 16 * 9, "operator": 1}
+
+
+@pytest.mark.parametrize(
+    ("kind", "given", "attributes", "products"),
+    [
+        ("QLinearConv", "x s0 s0 w0 s0 s0 s0 s0", {"kernel_shape": [3, 3], "pads": [1] * 4}, 64 * 9 * 16 * 32),
+        ("ConvInteger", "x w0", {"kernel_shape": [3, 3], "pads": [1] * 4}, 64 * 9 * 16 * 32),
+        ("QLinearMatMul", "x s0 s0 w1 s0 s0 s0 s0", {}, 16 * 8 * 16 * 32),  # depth 8 as 16, width 24 as 32
+        ("MatMulInteger", "x w1", {}, 16 * 8 * 16 * 32),
+        ("Einsum", "x w1", {"equation": "bchw,wk->bchk"}, 16 * 8 * 16 * 32),
+    ],
+)
+def test_products_of_integers_and_of_any_indices(
+    kind: str, given: str, attributes: dict[str, Any], products: int
+) -> None:
+    """They are counted as those of a convolution or a matrix product of floats, and their weights with them."""
+    out = (1, 32, 8, 8) if "Conv" in kind else (1, 16, 8, 24)
+    nodes = [helper.make_node(kind, given.split(), ["y"])]
+    nodes[0].attribute.extend(helper.make_attribute(key, value) for key, value in attributes.items())
+    weights = {"w0": (32, 16, 3, 3), "w1": (8, 24)}
+    used = {name: weights[name] for name in weights if name in given.split()}
+    values = [helper.make_tensor_value_info(n, TensorProto.UINT8, s) for n, s in (("x", (1, 16, 8, 8)), ("y", out))]
+    tensors = [helper.make_tensor(n, TensorProto.UINT8, s, bytes(int(np.prod(s))), raw=True) for n, s in used.items()]
+    tensors += [helper.make_tensor("s0", TensorProto.FLOAT, (), [1.0])] * ("s0" in given)
+    graph = helper.make_graph(nodes, "g", values[:1], values[1:], tensors)
+    (layer,) = count_work(helper.make_model(graph)).layers.layers
+    assert layer.amounts["convolution"] == products
+    assert layer.amounts["weights"] == pytest.approx(np.prod(next(iter(used.values()))), abs=8), "its scales too"
+
+
+def test_a_recurrent_layer_multiplies_in_every_step() -> None:
+    """5 steps of 16 values by 4 gates of 32, and of the 32 before; its first result may be left out."""
+    (layer,) = layers_of_nodes(
+        [helper.make_node("LSTM", ["x", "w0", "w1"], ["", "y"], hidden_size=32)],
+        {"x": (5, 1, 16), "w0": (1, 128, 16), "w1": (1, 128, 32), "y": (1, 1, 32)},
+    )
+    assert layer.amounts["convolution"] == 5 * 128 * (16 + 32)
+    assert layer.amounts["weights"] == 128 * (16 + 32)
+    assert layer.writes == "y"
+
+
+def test_an_operator_of_another_domain_is_no_convolution() -> None:
+    (layer,) = layers_of_nodes([node("Conv", "x", "y", domain="elsewhere")], {"x": (1, 8, 2, 2), "y": (1, 8, 2, 2)})
+    assert layer.amounts == {"operator": 1, "other": 64}
+
+
+def test_channels_last_at_the_ends_cost_nothing() -> None:
+    """As other frameworks' graphs have them. A permutation of anything else is a shuffle."""
+    shapes = {"x": (1, 8, 8, 16), "a": (1, 16, 8, 8), "b": (1, 32, 8, 8), "w0": (32, 16, 1, 1), "y": (1, 8, 8, 32)}
+    nodes = [
+        *(node("Transpose", "x", "a", perm=[0, 3, 1, 2]), node("Conv", "a w0", "b", kernel_shape=[1, 1])),
+        node("Transpose", "b", "y", perm=[0, 2, 3, 1]),
+    ]
+    (layer,) = layers_of_nodes(nodes, shapes)
+    assert (layer.op_type, layer.reads, layer.writes) == ("Conv", ("x",), "b")
+    (other,) = layers_of_nodes([node("Transpose", "x", "y", perm=[0, 2, 1, 3])], {"x": (1, 8, 8, 2), "y": (1, 8, 8, 2)})
+    assert other.amounts == {"operator": 1, "shuffle": 256}
+
+
+def test_all_results_of_a_split_stay_on_the_chip() -> None:
+    """Parts of 64, of which the product reads two: they need not come in, and only its result goes out."""
+    parts = dict.fromkeys("abcy", (1, 8, 2, 4))
+    nodes = [helper.make_node("Split", ["x"], ["a", "b", "c"], axis=1), node("Mul", "b c", "y")]
+    model = helper.make_graph(
+        nodes,
+        "g",
+        [helper.make_tensor_value_info("x", TensorProto.FLOAT, (1, 24, 2, 4))],
+        [helper.make_tensor_value_info("y", TensorProto.FLOAT, (1, 8, 2, 4))],
+        value_info=[helper.make_tensor_value_info(n, TensorProto.FLOAT, s) for n, s in parts.items() if n != "y"],
+    )
+    layers = count_work(helper.make_model(model)).layers
+    assert (layers.layers[0].writes, layers.layers[0].more) == ("a", ("b", "c"))
+    assert layers.layers[0].amounts["shuffle"] == 192 + 3 * 64
+    assert spilled(layers, 1000)[1] == 64, "the result"
+
+
 @pytest.mark.parametrize(
     ("kind", "attributes", "term"),
     [

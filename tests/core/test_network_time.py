@@ -216,3 +216,16 @@ def test_what_is_said_of_minutes() -> None:
     }
     assert [row["t_s"] for row in timeline_of([moment(t_s, "max") for t_s in range(1100)])] == list(range(0, 1100, 3))
     assert len(timeline_of([moment(t_s, "max") for t_s in range(719)])) == 719
+
+
+def test_what_the_cpu_does_for_the_dsp_has_its_time() -> None:
+    """Each group normalisation: a fixed time and that of its elements, 64 channels at half the size for the first."""
+    profile = load_profile("snapdragon-888")
+    work, unit = reference_network(NetworkSpec("resnet18", "group", 256, 256, 16)).work, profile.units["dsp"]
+    time = price(profile, work, "dsp", corners_of(profile, "burst"))
+    each = unit.fallback_ns_per_element.or_else(0) / 1e6
+    first = next(o for o in time.operators if o.op_type == "GroupNormalization")
+    assert first.ms == pytest.approx(unit.fallback_fixed_ms.or_else(0) + 64 * 128 * 128 * each)
+    assert first.bound == "activation traffic"
+    outside = work.input_elements * unit.input_ns_per_element.or_else(0) / 1e6
+    assert time.job_ms - outside < 1, "waking the unit, and what it reads and writes"
