@@ -212,6 +212,14 @@ def test_a_job_longer_than_its_core_waits_for_one_is_a_defect_of_the_caller() ->
         simulate_beside([member(ALONE, Settings(1, hang_ns=MS), infer=3)])
 
 
+def test_a_driver_in_which_nothing_can_happen_says_so() -> None:
+    """Units that never begin: their first events are taken away."""
+    driver = BesideDriver([member(ALONE, Settings(1), infer=3)])
+    driver._heap.clear()
+    with pytest.raises(RuntimeError, match=r"^the simulation stands still: no event and no deadline is left$"):
+        driver.run()
+
+
 def member_of(seed: int, *, bypassed: bool) -> Member:
     """A drawn pipeline; no faults."""
     graph, settings, _, _, duties = drawn(seed)

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from trilane.apps.cli.main import main
+from trilane.hw_profiles.fit import Fit
 
 
 def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
@@ -188,12 +189,15 @@ def test_profiles_are_listed_shown_and_checked(
 
 
 def test_a_fit_prints_its_errors_and_writes_a_profile(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, shared_data: Path
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, fitted: Fit, shared_data: Path
 ) -> None:
-    pytest.importorskip("scipy")
+    """The fit itself is the one that other tests look at."""
     path = tmp_path / "mine.toml"
     source = str(shared_data / "snapdragon888_measured.csv")
+    asked: list[Any] = []
+    monkeypatch.setattr("trilane.hw_profiles.fit.fit_profile", lambda *what: asked.append(what) or fitted)
     document = answer(monkeypatch, capsys, "profiles", "fit", "--from", source, "--name", "mine", "--write", str(path))
+    assert asked == [("snapdragon-888-facts", Path(source))]
     assert document["free_numbers"] < document["measurements"]
     assert document["medians"]["bench_dsp_ms"]["error"] <= 0.06
     assert answer(monkeypatch, capsys, "predict", "--profile", str(path))["machine"]["profile"] == "mine"
