@@ -193,6 +193,19 @@ def test_the_interval_on_an_engine_names_what_is_ill_known() -> None:
     )
 
 
+def test_an_engine_whose_error_is_unknown_is_off_by_half() -> None:
+    own = CHIP.units["dsp"]
+    unknown = Quantity(kind="unknown", source="by hand")
+    engines = {key: each.model_copy(update={"error_fraction": unknown}) for key, each in own.engines.items()}
+    chip = CHIP.model_copy(update={"units": {**CHIP.units, "dsp": own.model_copy(update={"engines": engines})}})
+    work = reference_network(NetworkSpec("resnet18", "batch", 64, 64, 8)).work
+    time = price(chip, work, "dsp", TOP)
+    found = interval(chip, work, time)
+    assert found.why[0] == "networks that the fit had not seen were off by 50% besides what its numbers leave open"
+    left = time_on(chip.units["dsp"], chip.memory, work).unsure or 0.0
+    assert spread_of(found) == pytest.approx(math.hypot(0.5, left), rel=1e-6)
+
+
 def moment(t_s: int, corner: str, **told: float) -> Any:
     defaults = {"frame_ms": 20.0, "device_c": 30.0 + t_s, "junction_c": 50.0 - t_s, "power_w": 2.0}
     return SimpleNamespace(t_s=t_s, corners=("max", corner, "max"), throttled=3 <= t_s < 5, **(defaults | told))
