@@ -48,7 +48,8 @@ def asked(text: str) -> Asked:
     if not at or text.endswith((ENDING, NETWORK_ENDING)):
         what, rate = text, ""
         if text.endswith(NETWORK_ENDING):
-            raise BadInputError(_where(text), "a network without a rate", FORM, f"such as {text}@30")
+            remedy = f"such as {text}@30; by itself: --network {text}"
+            raise BadInputError(_where(text), "a network without a rate", FORM, remedy)
     if not what:
         raise BadInputError(_where(text), "no scene and no file", FORM)
     number, _, unit = rate.partition(":")

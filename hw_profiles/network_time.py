@@ -124,6 +124,11 @@ def interval(profile: Profile, work: Work, time: NetworkTime) -> Interval:
     error = relative_error(job, unit)
     if unit.engine is None:
         why = [f"the profile states a relative error of {error:.0%} for networks on its {time.unit}"]
+        peak = unit.peak
+        if peak.value is None:
+            error = math.hypot(error, peak.relative_error)
+            assumed = f"{unit.peak_mac_s / 1e12:g} TMAC/s are assumed"
+            why.append(f"it does not know how fast its {time.unit} is in {unit.precision}: {assumed}")
     else:
         own = unit.engine.error_fraction.or_else(0.5)
         why = [f"networks that the fit had not seen were off by {own:.0%} besides what its numbers leave open"]

@@ -10,6 +10,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
+from trilane.hw_profiles.engine_layers import TERMS
 from trilane.unexpected_value import UnexpectedValue
 from trilane.units import PERFORMANCE_PROFILES, UNITS, PerformanceProfile, UnitName
 
@@ -152,6 +153,13 @@ class Engine(Model):
     factors: dict[str, Rate] = {}
     error_fraction: Annotated[Quantity, AfterValidator(_Range(0, 5))]
 
+    @model_validator(mode="after")
+    def _known_factors(self) -> Self:
+        for name in self.factors:
+            if name not in TERMS:
+                raise UnexpectedValue(f"the unknown factor `{name}`", "one of " + ", ".join(TERMS))
+        return self
+
     def factor(self, term: str) -> float:
         """How much dearer `term` is."""
         return self.factors[term].or_else(1.0) if term in self.factors else 1.0
@@ -222,10 +230,15 @@ class Unit(Model):
         return busy * active + (1 - busy) * self.idle_w.or_else(0.0)
 
     @property
+    def peak(self) -> Quantity:
+        """Highest multiply-accumulates per second at the unit's precision, in tera."""
+        peak: Quantity = getattr(self, f"peak_{self.precision}_tmac_s")
+        return peak
+
+    @property
     def peak_mac_s(self) -> float:
         """Highest multiply-accumulates per second at the unit's precision."""
-        peak: Quantity = getattr(self, f"peak_{self.precision}_tmac_s")
-        return peak.or_else(0.1) * 1e12
+        return self.peak.or_else(0.1) * 1e12
 
     @property
     def engine(self) -> Engine | None:

@@ -59,7 +59,7 @@ OF_THE_APPLICATION = {"layout", "policy", "edge", "batch", "gpu_share", "what_if
 #: Option: those that have no effect beside it.
 IGNORED = {
     "avatar": OF_A_FILE | {"input_shape"},
-    "network": OF_A_FILE,
+    "network": OF_A_FILE | {"avatar"},
     "table": OF_A_FILE
     | {"layout", "avatar", "network", "application", "runtime", "minutes", "gpu_share", "governor", "what_if", "plot"}
     | {"fps", "power_limit_w", "precision", "input_shape"},
@@ -237,6 +237,8 @@ def _shapes(texts: list[str], networks: int) -> dict[str, tuple[int, ...]]:
         found = re.fullmatch(r"(.+)=(\d{1,9}(?:x\d{1,9})*)", text)
         if found is None or 0 in (sizes := tuple(map(int, found[2].split("x")))):
             raise BadInputError("--input-shape", repr(text), "a name and sizes, such as image=1x3x224x224")
+        if found[1] in shapes:
+            raise BadInputError("--input-shape", f"{found[1]!r} twice", "each input once")
         shapes[found[1]] = sizes
     return shapes
 
@@ -309,11 +311,13 @@ def _predict_networks(
     """
     from trilane.hw_profiles.bare_network import in_precision, predict_network, under_runtime
     from trilane.hw_profiles.graph_file import read_graph
+    from trilane.hw_profiles.network_work import constant_tensors
 
     graphs = [read_graph(path, shapes) for path in paths]
     inputs = {value.name for graph in graphs for value in graph.model.graph.input}
     if missing := [name for name in shapes if name not in inputs]:
-        raise BadInputError("--input-shape", f"no input {missing[0]!r}", f"one of {', '.join(sorted(inputs))}")
+        given = inputs.difference(*(constant_tensors(graph.model.graph) for graph in graphs))
+        raise BadInputError("--input-shape", f"no input {missing[0]!r}", f"one of {', '.join(sorted(given))}")
     unit, precision, engine_runtime = on
     chips = [in_precision(chip, unit, graph.numbers, precision) for graph in graphs]
     chips = [under_runtime(each, unit, engine_runtime) for each in chips]
@@ -338,8 +342,6 @@ def _network_of(
 
     if layout not in ("packed", "split"):
         raise BadInputError("--layout", repr(layout), "packed or split")
-    if networks and avatar is not None:
-        raise BadInputError("options", "--network and --avatar", "one of them")
     if networks:
         graph = read_graph(networks[0], shapes)
         return in_precision(chip, unit, graph.numbers, precision), image_network(graph, layout)

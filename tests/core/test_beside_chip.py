@@ -284,7 +284,7 @@ BAD = {
     "an empty rate": ("network.onnx@", "rate ''"),
     "no file": ("@30", "no scene and no file"),
     "an unknown unit": ("network.onnx@30:npu", "unit 'npu', expected gpu or dsp"),
-    "a network without a rate": ("net@work.onnx", "such as net@work.onnx@30"),
+    "a network without a rate": ("net@work.onnx", "such as net@work.onnx@30; by itself: --network net@work.onnx"),
     "a missing network": ("missing.onnx@30", "missing.onnx"),
     "an unknown scene": ("beach", "'beach'"),
     "a missing scene": ("missing.toml@20", "missing.toml"),

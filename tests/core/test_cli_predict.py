@@ -9,11 +9,13 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import onnx
 import pytest
 
 from trilane.apps.cli import predict as cli
 from trilane.apps.cli import predict_output
 from trilane.avatars.bundle import load_bundle
+from trilane.errors import BadInputError
 from trilane.hw_profiles import configuration_table, load, over_time, plot
 from trilane.hw_profiles import predict as predictions
 from trilane.hw_profiles.application import REFERENCE, Plan, Variant
@@ -155,7 +157,10 @@ REFUSED = {
         f"--edge: found 'triple', expected {REFERENCE.edge}, which the reference application has; "
         "choose a --policy of your own, such as pipelined"
     ),
-    ("--network", "n", "--application", "--avatar", "a"): "options: found --network and --avatar, expected one of them",
+    ("--network", "n", "--avatar", "a"): "options: found --avatar beside --network, expected one or the other; "
+    "the file says so itself",
+    ("--network", "n", "--input-shape", "x=1", "--input-shape", "x=2"): "--input-shape: found 'x' twice, expected each "
+    "input once",
     ("--network", "n", "--policy", "latest", "--batch", "2"): (
         "options: found --batch, --policy with a network by itself, expected it without them; "
         "they are of the application: add --application for it with this network"
@@ -389,6 +394,16 @@ def test_networks_are_shown_with_their_ten_most_expensive_operators(
         },
         "networks": answers,
     }
+
+
+def test_inputs_that_may_have_another_shape_are_told_without_the_weights(tmp_path: Path) -> None:
+    ends = [(n, s) for n, s in (("image", (1, 3, 8, 8)), ("w0", (4, 3, 1, 1)), ("y", (1, 4, 8, 8)))]
+    values = [onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, shape) for name, shape in ends]
+    graph = onnx.helper.make_graph([onnx.helper.make_node("Conv", ["image", "w0"], ["y"])], "g", values[:2], values[2:])
+    onnx.save(onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)]), tmp_path / "net.onnx")
+    with pytest.raises(BadInputError, match=r"found no input 'picture', expected one of image$"):
+        over: Any = None
+        cli._predict_networks(CHIP, [tmp_path / "net.onnx"], {"picture": (1,)}, ("dsp", None, None), over)
 
 
 def test_a_limit_below_what_an_idle_device_takes(capsys: pytest.CaptureFixture[str]) -> None:

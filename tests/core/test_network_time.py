@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trilane.hw_profiles.application import isolated_job_time
+from trilane.hw_profiles.application import isolated_job_time, relative_error
 from trilane.hw_profiles.engine_layers import NAMES, Layer, Layers
 from trilane.hw_profiles.load import load_profile
 from trilane.hw_profiles.network_time import Interval, NetworkTime, OperatorTime, interval, price, spread_of
@@ -231,11 +231,21 @@ def test_what_is_said_of_minutes() -> None:
     assert len(timeline_of([moment(t_s, "max") for t_s in range(719)])) == 719
 
 
+def test_a_precision_whose_speed_nobody_states_is_said_and_less_certain() -> None:
+    """Of FP32 on the 888's DSP nothing is known but its work; what is unknown is known to a factor e."""
+    work = reference_network(NetworkSpec("resnet18", "batch", 64, 64, 16)).work
+    dsp = CHIP.units["dsp"].model_copy(update={"precision": "fp32"})
+    profile = CHIP.model_copy(update={"units": {**CHIP.units, "dsp": dsp}})
+    around = interval(profile, work, price(profile, work, "dsp", TOP))
+    assert around.why[-1] == "it does not know how fast its dsp is in fp32: 0.1 TMAC/s are assumed"
+    stated = relative_error(time_on(dsp, profile.memory, work), dsp)
+    assert spread_of(around) == pytest.approx(math.hypot(stated, 1.0))
+
+
 def test_what_the_cpu_does_for_the_dsp_has_its_time() -> None:
     """Each group normalisation: a fixed time and that of its elements, 64 channels at half the size for the first."""
-    profile = load_profile("snapdragon-888")
-    work, unit = reference_network(NetworkSpec("resnet18", "group", 256, 256, 16)).work, profile.units["dsp"]
-    time = price(profile, work, "dsp", corners_of(profile, "burst"))
+    work, unit = reference_network(NetworkSpec("resnet18", "group", 256, 256, 16)).work, CHIP.units["dsp"]
+    time = price(CHIP, work, "dsp", TOP)
     each = unit.fallback_ns_per_element.or_else(0) / 1e6
     first = next(o for o in time.operators if o.op_type == "GroupNormalization")
     assert first.ms == pytest.approx(unit.fallback_fixed_ms.or_else(0) + 64 * 128 * 128 * each)

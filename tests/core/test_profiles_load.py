@@ -76,6 +76,7 @@ BAD = {
     "text for a number": ("[units.dsp]\npower_max_w = {T}", "units.dsp.power_max_w.value", "number"),
     "infinite": ("[units.dsp]\npower_max_w = {I}", "units.dsp.power_max_w.value", "finite"),
     "no value": ("[units.dsp]\npower_max_w = {V}", "units.dsp.power_max_w", "no value"),
+    "unknown factor": ("[units.dsp.engines.int8_tflite.factors]\nwarp = {Q}", "int8_tflite", "unknown factor `warp`"),
     "limit below the room": ("[thermal]\nskin_limit_c = {Q}", "skin_limit_c", "above"),
 }
 QUANTITIES = {
