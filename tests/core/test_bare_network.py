@@ -117,6 +117,14 @@ def test_the_rate_within_a_power(limit: float, fps: float, corner: str, by: str)
     assert found["corners"] == {"dsp": corner}
 
 
+def test_only_corners_that_may_be_the_best_are_simulated() -> None:
+    """At the highest clock 100 a second are within the power; no lower one can pass that."""
+    load, asked = on_dsp(10.0), list[Corners]()
+    told = Load(load.work_ms, lambda corners: asked.append(corners) or load.frame_ms(corners))
+    assert within_power(chip(), TOP, told, 9.0)["fps"] == 100.0
+    assert set(asked) == {TOP}
+
+
 def test_the_rate_within_a_power_is_as_uncertain_as_the_power() -> None:
     """The rate within the limit that would be kept if the device took what the ends of its interval say."""
     profile, load = chip(0.3), on_dsp(10.0)

@@ -259,6 +259,10 @@ def test_heat_is_that_of_all_together() -> None:
     """Power of the DSP by the share of time in which both keep it busy; so the device ends hotter than with one."""
     two = [avatar(512, 30), replace(avatar(512, 15), name="second")]
     one, both = (predict_beside(CHIP, which, minutes=10) for which in (two[:1], two))
+    assert [(row["name"], row["kind"], row["unit"]) for row in both["pipelines"]] == [
+        ("avatar", "avatar", "dsp"),
+        ("second", "avatar", "dsp"),
+    ]
     dsp = CHIP.units["dsp"]
     assert both["unit_power_w"]["dsp"] == pytest.approx(dsp.power_w(CORNERS[2], both["units"]["dsp"]["busy"]))
     assert both["units"]["dsp"]["busy"] > 1.3 * one["units"]["dsp"]["busy"]
@@ -364,5 +368,8 @@ def test_two_networks_as_a_table_and_as_json(
     two = ("predict", "add.onnx@60", "--beside", "add.onnx@20:gpu", "--profile", "snapdragon-888")
     check_printed("predict-beside", command(*two, "--minutes", 5)[0])
     answer = json.loads(command(*two, "--json")[0])
-    assert [row["name"] for row in answer["pipelines"]] == ["add (1)", "add (2)"]
+    assert [(row["name"], row["kind"], row["unit"]) for row in answer["pipelines"]] == [
+        ("add (1)", "network", "dsp"),
+        ("add (2)", "network", "gpu"),
+    ]
     assert np.isclose(answer["units"]["dsp"]["by_pipeline"]["add (1)"], answer["units"]["dsp"]["busy"])

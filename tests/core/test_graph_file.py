@@ -202,7 +202,7 @@ MALFORMED: dict[str, tuple[Callable[[], onnx.ModelProto], tuple[str, ...]]] = {
         ("Conv 'the Conv' from 1x3x8x8 by 4x5x3x3 to 1x4x8x8 in 1 groups", "channels that fit"),
     ),
     "no groups": (lambda: model([conv(group=0)], weights=[weight("w", 4, 3, 3, 3)]), ("in 0 groups",)),
-    "no text": (lambda: _not_utf8(), ("the name b'\\xff", "text in UTF-8")),
+    "no text": (lambda: _not_utf8(), ("the name b'\\xff", "expected text in UTF-8")),
     "a shape that is not so": (
         lambda: model([node("Relu", "image", "a"), node("Relu", "a", "y")], value_info=[value("a", (1, 3, 9, 9))]),
         ("shapes that do not fit", "(8) vs (9)"),
