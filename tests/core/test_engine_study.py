@@ -16,7 +16,7 @@ from trilane.hw_profiles import engine_study, latency_rows
 from trilane.hw_profiles.engine_layers import NAMES, RATES, TERMS
 from trilane.hw_profiles.engine_report import BEGIN, END, as_markdown, plot_errors
 from trilane.hw_profiles.engine_study import NORMAL_80, EngineStudy, Rate, Study, misses_of, study_engines
-from trilane.hw_profiles.engine_tables import MARK, profile_texts
+from trilane.hw_profiles.engine_tables import HEXAGON_OF, MARK, PROFILE_OF, profile_texts
 from trilane.hw_profiles.fit_engines import Fitted, LeftOut, Numbers
 from trilane.hw_profiles.fit_priors import FACTORS, ON_CHIP_MB, UNITS_OF_RATES, Prior, factor_prior, rate_prior
 from trilane.hw_profiles.latency_rows import Latency, layers_in, layers_of_rows, read_latencies
@@ -249,6 +249,14 @@ def test_what_is_written_into_profiles(tmp_path: Path) -> None:
     assert half["rates"]["job_us"] == {"value": 30.0, "kind": "fitted", "spread": 0.5, "source": source}
     factor = {"value": 3.0, "kind": "fitted", "spread": 0.25, "source": 'fit "it", factors shared by all chips'}
     assert plain["factors"] == half["factors"] == {name: factor for name in NAMES if name not in UNITS_OF_RATES}
+
+
+def test_each_chip_has_the_engine_of_its_generation() -> None:
+    """As Qualcomm's product pages name them."""
+    generations = {"v68": "qcs6490 sa8295p", "v69": "8gen1", "v73": "8gen2 xelite", "v75": "8gen3", "v79": "8elite"}
+    generations["v81"] = "8elite5"
+    assert {chip: name for name, chips in generations.items() for chip in chips.split()} == HEXAGON_OF
+    assert HEXAGON_OF.keys() == PROFILE_OF.keys()
 
 
 def test_priors_by_hand() -> None:

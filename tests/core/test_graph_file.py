@@ -253,7 +253,7 @@ def test_what_is_no_onnx_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         "cut.onnx": (whole[: len(whole) // 2], "bytes that do not parse"),
         "words.onnx": (b"This is no network at all.", "expected an ONNX file"),
         "picture.onnx": (b"\x89PNG\r\n\x1a\n" + bytes(64), "expected an ONNX file"),
-        "nothing.onnx": (b"", "an empty file"),
+        "nothing.onnx": (b"", "an empty file, expected an ONNX file of at most 512 MiB"),
         "zeros.onnx": (bytes(100), "expected an ONNX file"),
     }
     for name, (data, words) in files.items():
