@@ -263,6 +263,7 @@ def test_heat_is_that_of_all_together() -> None:
         ("avatar", "avatar", "dsp"),
         ("second", "avatar", "dsp"),
     ]
+    assert {(row["policy"], row["edge"]) for row in both["pipelines"]} == {("latest", "double")}
     dsp = CHIP.units["dsp"]
     assert both["unit_power_w"]["dsp"] == pytest.approx(dsp.power_w(CORNERS[2], both["units"]["dsp"]["busy"]))
     assert both["units"]["dsp"]["busy"] > 1.3 * one["units"]["dsp"]["busy"]
