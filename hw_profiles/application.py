@@ -324,7 +324,7 @@ def relative_error(job: JobTime, unit: Unit) -> float:
     It joins the error of the number that each part of the time is computed from, and that of the model itself.
     """
     if job.unsure is not None and unit.engine is not None:
-        return math.hypot(job.unsure, unit.engine.error_fraction.or_else(0.5))
+        return math.hypot(job.unsure, unit.engine.error_fraction.or_else(0.5) * job.unlike)
     computed_from = {
         "fixed": unit.job_fixed_ms,
         "input": unit.input_ns_per_element,

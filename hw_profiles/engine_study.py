@@ -50,7 +50,10 @@ class Rate(NamedTuple):
 
 @dataclass(frozen=True)
 class EngineStudy:
-    """One engine. `left_out`: of the cross-validation. `error`: the model's own, so that intervals cover COVERED."""
+    """One engine. `left_out`: of the cross-validation.
+
+    `error`: the model's own for a network that is wholly unlike those of the fit, so that intervals cover COVERED.
+    """
 
     fitted: Fitted
     left_out: tuple[LeftOut, ...]
@@ -59,8 +62,8 @@ class EngineStudy:
     @property
     def coverage(self) -> float:
         """Share of the left-out rows that lie in the interval around their prediction."""
-        misses, unsure = misses_of(self.left_out)
-        return float(np.mean(misses <= NORMAL_80 * np.hypot(unsure, self.error)))
+        misses, unsure, unlike = misses_of(self.left_out)
+        return float(np.mean(misses <= NORMAL_80 * np.hypot(unsure, self.error * unlike)))
 
 
 @dataclass(frozen=True)
@@ -75,16 +78,18 @@ class Study:
         return tuple(sorted({chip for chip, _ in self.rates}))
 
 
-def misses_of(rows: Sequence[LeftOut]) -> tuple[F64, F64]:
-    """Absolute logarithms of predicted over published (rows,), and what the numbers leave open of each (rows,)."""
+def misses_of(rows: Sequence[LeftOut]) -> tuple[F64, F64, F64]:
+    """Absolute logarithms of predicted over published (rows,); what the numbers leave open; how unlike each is."""
     misses = [abs(math.log(row.predicted_ms / row.row.ms)) for row in rows]
-    return np.array(misses), np.array([row.unsure for row in rows])
+    return np.array(misses), np.array([row.unsure for row in rows]), np.array([row.unlike for row in rows])
 
 
 def own_error(rows: Sequence[LeftOut]) -> float:
-    """The least error of the model with which intervals around `rows` cover COVERED of them."""
-    misses, unsure = misses_of(rows)
-    beyond = np.sqrt(np.maximum((misses / NORMAL_80) ** 2 - unsure**2, 0))
+    """The least error of the model, grown in proportion to how unlike a network is, with which intervals around `rows`
+    cover COVERED of them.
+    """
+    misses, unsure, unlike = misses_of(rows)
+    beyond = np.sqrt(np.maximum((misses / NORMAL_80) ** 2 - unsure**2, 0)) / unlike
     return float(np.quantile(beyond, COVERED))
 
 

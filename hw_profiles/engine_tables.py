@@ -37,6 +37,8 @@ HEXAGON_OF = {"8gen1": "v69", "8gen2": "v73", "8gen3": "v75", "8elite": "v79", "
 V68 = ("qcs6490", "sa8295p")
 MARK = "# From here on written by `trilane profiles fit-chips`."
 VTCM = "VTCM of its generation"
+#: Shares of a network's time below it are not written.
+LEAST_SHARE = 0.001
 
 
 def profile_texts(study: Study, folder: Path, command: str) -> dict[Path, str]:
@@ -65,6 +67,12 @@ def _shared(study: Study, command: str) -> Iterator[str]:
         yield _number("on_chip_mb", Rate(ON_CHIP_MB["v68"], 0.1, "published"), VTCM)
         yield _number("error_fraction", Rate(engine.error, 0.3, "fitted"), _errors(engine))
         yield from _rates(name, _middle_of(study, name), f"{command}, mean of the chips of Hexagon v68")
+        yield f"\n[units.dsp.engines.{name}.seen]"
+        for network, shares in engine.fitted.seen.items():
+            stated = [
+                f"{term} = {share:.3f}" for term, share in zip(NAMES, shares, strict=True) if share >= LEAST_SHARE
+            ]
+            yield f"{network} = {{ {', '.join(stated)} }}"
         yield f"\n[units.dsp.engines.{name}.factors]"
         numbers, spreads = engine.fitted.numbers.factors, engine.fitted.spreads.factors
         for term, value, spread in zip(NAMES, numbers, spreads, strict=True):

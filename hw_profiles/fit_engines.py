@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -52,12 +52,20 @@ def _from_flat(flat: F64) -> Numbers:
 
 @dataclass(frozen=True)
 class Fitted:
-    """An engine's numbers for `chips`, and the spread that the fit leaves of each."""
+    """An engine's numbers for `chips`, and the spread that the fit leaves of each.
+
+    `seen`: each network of the fit with the terms' shares in its time (terms,), the mean of all chips.
+    """
 
     engine: EngineName
     chips: tuple[str, ...]
     numbers: Numbers
     spreads: Numbers
+    seen: Mapping[str, F64] = field(default_factory=dict)
+
+    def unlike(self, shares: F64) -> float:
+        """How far `shares` (terms,) are from those of the nearest network of the fit, 0 to 1."""
+        return min((float(np.abs(shares - others).sum()) / 2 for others in self.seen.values()), default=1.0)
 
     def rates_of(self, chip: str) -> dict[str, Prior]:
         """The six numbers of `chip`, as profiles state them, with their spreads."""
@@ -90,6 +98,7 @@ class _Rows:
     def __init__(self, rows: Sequence[Latency], layers: Mapping[str, Layers], chips: Sequence[str]) -> None:
         tables = [_distinct(layers[row.network], _room(row)) for row in rows]
         self.chip: I64 = np.array([chips.index(row.chip) for row in rows])
+        self.network = np.array([row.network for row in rows])
         self.ms: F64 = np.array([row.ms for row in rows])
         self.table = np.concatenate([table for table, _ in tables])
         self.count = np.concatenate([count for _, count in tables])
@@ -174,7 +183,9 @@ def solve(
         if gain < ENOUGH * abs(cost):
             break
     covariance = np.linalg.inv(_derivatives(at, data, mean, spread, len(chips))[1])
-    return Fitted(engine, chips, _from_flat(at), _from_flat(np.sqrt(np.diag(covariance))))
+    shares = data.predict(_from_flat(at))[1]
+    seen = {str(name): shares[data.network == name].mean(axis=0) for name in np.unique(data.network)}
+    return Fitted(engine, chips, _from_flat(at), _from_flat(np.sqrt(np.diag(covariance))), seen)
 
 
 def _cost(at: F64, data: _Rows, mean: F64, spread: F64) -> float:
@@ -193,11 +204,15 @@ def _derivatives(at: F64, data: _Rows, mean: F64, spread: F64, chips: int) -> tu
 
 
 class LeftOut(NamedTuple):
-    """A row beside what a fit without its network predicts. `unsure`: relative error that the fit's numbers leave."""
+    """A row beside what a fit without its network predicts.
+
+    `unsure`: relative error that the fit's numbers leave. `unlike`: how unlike the network is to those of the fit.
+    """
 
     row: Latency
     predicted_ms: float
     unsure: float
+    unlike: float = 1.0
 
     @property
     def error(self) -> float:
@@ -235,7 +250,9 @@ def predict_rows(fitted: Fitted, rows: Sequence[Latency], layers: Mapping[str, L
     data = _Rows(known, layers, fitted.chips)
     ms, shares = data.predict(fitted.numbers)
     unsure = np.linalg.norm(data.slopes(shares, len(fitted.chips)) * fitted.spreads.flat, axis=1)
-    return [LeftOut(row, float(m), float(u)) for row, m, u in zip(known, ms, unsure, strict=True)]
+    unlike = [fitted.unlike(of_row) for of_row in shares]
+    found = zip(known, ms, unsure, unlike, strict=True)
+    return [LeftOut(row, float(m), float(u), distance) for row, m, u, distance in found]
 
 
 def fit_anchors(fitted: Fitted, before: str, rows: Sequence[Latency], layers: Mapping[str, Layers]) -> Fitted:

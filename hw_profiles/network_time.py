@@ -25,7 +25,7 @@ from trilane.hw_profiles.network_work import Operator, Work
 from trilane.hw_profiles.operator_times import Machine, job_time, machine_of
 from trilane.hw_profiles.performance_profiles import Corners
 from trilane.hw_profiles.schema import Profile, Unit
-from trilane.hw_profiles.unit_times import fallback_ms, layer_times, time_on
+from trilane.hw_profiles.unit_times import fallback_ms, layer_times, nearest, time_on
 from trilane.units import UNITS, UnitName
 
 #: A term is named where it alone makes the time uncertain by so much.
@@ -130,15 +130,24 @@ def interval(profile: Profile, work: Work, time: NetworkTime) -> Interval:
             assumed = f"{unit.peak_mac_s / 1e12:g} TMAC/s are assumed"
             why.append(f"it does not know how fast its {time.unit} is in {unit.precision}: {assumed}")
     else:
-        own = unit.engine.error_fraction.or_else(0.5)
-        why = [f"networks that the fit had not seen were off by {own:.0%} besides what its numbers leave open"]
-        why += [f"those leave {job.unsure or 0:.0%} open for this one"]
+        own = unit.engine.error_fraction.or_else(0.5) * job.unlike
+        why = [f"networks as unlike those of the fit were off by {own:.0%} besides what its numbers leave open"]
+        why += [_likeness(work, unit), f"the numbers leave {job.unsure or 0:.0%} open for this one"]
         why += [f"{share:.0%} of it is {term}, known to {spread:.0%}" for term, share, spread in _ill_known(work, unit)]
     odd = sorted({o.op_type for o in work.operators if not o.ruled})
     if odd:
         why.append(f"no rule for {', '.join(odd)}: counted as the movement of its elements")
     factor = math.exp(NORMAL_80 * error)
     return Interval(time.total_ms / factor, time.total_ms * factor, tuple(why))
+
+
+def _likeness(work: Work, unit: Unit) -> str:
+    """How unlike the network is to the nearest of the fit, in words."""
+    assert unit.engine is not None
+    distance, name = nearest(unit.engine, engine_time(work.layers, numbers_of(unit.engine)).shares)
+    if not name:
+        return "its profile names no network that its numbers were fitted to"
+    return f"of those {name} is most like it; {distance:.0%} of the time goes into other work"
 
 
 def _ill_known(work: Work, unit: Unit) -> list[tuple[str, float, float]]:

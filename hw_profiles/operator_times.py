@@ -55,12 +55,13 @@ class Machine:
 class JobTime:
     """Milliseconds of one job by part: `fixed`, `input`, `weights`, `fallback` and the operator classes.
 
-    On a tensor engine `arithmetic`, `activation` and `spill` in place of the classes, and `unsure`: the relative error
-    that its numbers leave.
+    On a tensor engine `arithmetic`, `activation` and `spill` in place of the classes, `unsure`: the relative error
+    that its numbers leave, and `unlike`: how unlike the network is to those that they were fitted to, 0 to 1.
     """
 
     parts: Mapping[str, float]
     unsure: float | None = None
+    unlike: float = 1.0
 
     @property
     def total_ms(self) -> float:

@@ -144,13 +144,15 @@ class Engine(Model):
 
     `on_chip_mb`: activations that it holds. `factors`: how much dearer each term of `engine_layers.py` is than a plain
     convolution's; 1 where none is given. `error_fraction`: relative error of the model itself, apart from that of its
-    numbers.
+    numbers, for a network that shares no term with those that the numbers were fitted to; `seen`: each of these, with
+    the terms' shares in its time.
     """
 
     element_bytes: Literal[1, 2]
     on_chip_mb: Rate
     rates: EngineRates
     factors: dict[str, Rate] = {}
+    seen: dict[str, dict[str, Annotated[float, Field(ge=0, le=1)]]] = {}
     error_fraction: Annotated[Quantity, AfterValidator(_Range(0, 5))]
 
     @model_validator(mode="after")

@@ -5,6 +5,8 @@ Rule: both give a `JobTime`; who asks need not know which it was.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from trilane.arrays import F64
@@ -37,7 +39,7 @@ def time_on(
         "fallback": sum(ms for _, ms in fallback_ms(unit, work, batch)),
     }
     parts |= dict(zip(("arithmetic", "activation", "spill"), by_bound[:3].tolist(), strict=True))
-    return JobTime(parts, unsure(unit.engine, time.shares))
+    return JobTime(parts, unsure(unit.engine, time.shares), nearest(unit.engine, time.shares)[0])
 
 
 def layer_times(
@@ -60,6 +62,24 @@ def fallback_ms(unit: Unit, work: Work, batch: int = 1) -> list[tuple[str, float
 def permutes_ms(unit: Unit, work: Work) -> float:
     """What a picture in several tensors costs."""
     return unit.permute_fixed_ms.or_else(0.0) if work.input_tensors > 1 else 0.0
+
+
+def nearest(engine: Engine, shares: F64) -> tuple[float, str]:
+    """How unlike a network is to the nearest one that the engine's numbers were fitted to, and which one that is.
+
+    The total variation distance of both networks' shares: the part of the time that goes into other terms, 0 to 1.
+    `shares`: of the terms in the network's time. 1 and "" where the engine names no networks.
+    """
+    own = dict(zip(NAMES, shares.tolist(), strict=True))
+    return min(
+        ((apart(own, others), name) for name, others in engine.seen.items()),
+        default=(1.0, ""),
+    )
+
+
+def apart(some: Mapping[str, float], others: Mapping[str, float]) -> float:
+    """Half the sum of absolute differences of two networks' shares."""
+    return sum(abs(share - others.get(name, 0.0)) for name, share in some.items()) / 2
 
 
 def unsure(engine: Engine, shares: F64) -> float:

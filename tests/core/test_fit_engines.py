@@ -37,6 +37,7 @@ from trilane.hw_profiles.network_time import interval, price
 from trilane.hw_profiles.network_work import count_work
 from trilane.hw_profiles.performance_profiles import corners_of
 from trilane.hw_profiles.reference_networks import NetworkSpec, network_work
+from trilane.hw_profiles.unit_times import nearest
 
 SPECS = {
     f"{encoder}-{norm}-{side}": NetworkSpec(encoder, norm, side, side, 8)
@@ -149,6 +150,31 @@ def test_the_models_own_error_makes_intervals_cover_four_fifths() -> None:
     rows = [left_out(sign * k / 100, 0.0) for k, sign in zip(range(1, 11), [1, -1] * 5, strict=True)]
     assert 0.08 <= NORMAL_80 * own_error(rows) <= 0.09
     assert own_error([left_out(0.05, 1.0)] * 3) == 0, "doubt about numbers covers them"
+    halfway = [row._replace(unlike=0.5) for row in rows]
+    assert own_error(halfway) == pytest.approx(2 * own_error(rows)), "it is that of a network wholly unlike"
+
+
+def test_a_network_is_as_unlike_as_the_nearest_of_the_fit() -> None:
+    """Half of its time goes into products, half into pools: 0.5 from one of products alone, 0.4 from the other."""
+    engine = load_profile("hexagon").units["dsp"].engines["int8_tflite"]
+    shares = np.zeros(len(NAMES))
+    shares[[INDEX["convolution"], INDEX["pool"]]] = 0.5
+    others = {"plain": {"convolution": 1.0}, "mixed": {"convolution": 0.1, "pool": 0.9}, "none": {"clip": 1.0}}
+    assert nearest(engine.model_copy(update={"seen": others}), shares) == (pytest.approx(0.4), "mixed")
+    assert nearest(engine.model_copy(update={"seen": {}}), shares) == (1.0, "")
+    tables = {name: np.array([of.get(term, 0.0) for term in NAMES]) for name, of in others.items()}
+    numbers, spreads = priors("int8_tflite", ("8gen2",))
+    assert Fitted("int8_tflite", ("8gen2",), numbers, spreads, tables).unlike(shares) == pytest.approx(0.4)
+
+
+def test_the_fit_knows_the_networks_that_it_has_seen(layers: dict[str, Layers]) -> None:
+    numbers, _ = priors("int8_tflite", ("8gen2",))
+    rows = rows_of(numbers, layers, ("8gen2",))
+    fitted = fit_engine([row for row in rows if row.network != "resnet18-batch-64"], layers, numbers)
+    assert set(fitted.seen) == set(layers) - {"resnet18-batch-64"}
+    unlike = {row.row.network: row.unlike for row in predict_rows(fitted, rows, layers)}
+    assert unlike.pop("resnet18-batch-64") > 0.01
+    assert max(unlike.values()) < 1e-9
 
 
 def test_errors_of_rows() -> None:
