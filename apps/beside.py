@@ -96,7 +96,7 @@ def _names(stems: Sequence[str]) -> list[str]:
 
 def _bare(each: Asked, name: str) -> Tenant:
     path = Path(each.what)
-    network = Network({"network": str(path)}, 1, 1, 1, "packed", count_work(read_graph(path).model))
+    network = Network({"network": str(path)}, 1, 1, 1, "packed", read_graph(path).work)
     return Tenant(name, each.text, (network,), (0,), each.fps or 0.0, each.unit, NEWEST, is_bare=True)
 
 

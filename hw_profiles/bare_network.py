@@ -13,7 +13,7 @@ from trilane.errors import BadInputError
 from trilane.hw_profiles.device_power import device_power
 from trilane.hw_profiles.graph_file import GraphFile, Numbers
 from trilane.hw_profiles.network_time import Interval, NetworkTime, interval, price, spread_of
-from trilane.hw_profiles.network_work import Work, count_work
+from trilane.hw_profiles.network_work import Work
 from trilane.hw_profiles.operator_kinds import COMPILED
 from trilane.hw_profiles.over_time import Moment, warm_up
 from trilane.hw_profiles.performance_profiles import Corners, corners_of
@@ -84,7 +84,7 @@ def predict_network(
     `wanted`: a rate that may hold or not, and a limit of power.
     Raises BadInputError for an unknown name, a time out of range, and operators that cannot be counted.
     """
-    work, corners = count_work(graph.model), corners_of(profile, performance_profile)
+    work, corners = graph.work, corners_of(profile, performance_profile)
     time = price(profile, work, unit, corners)
     around = interval(profile, work, time)
 

@@ -8,7 +8,8 @@ nothing here needs.
 from __future__ import annotations
 
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -20,12 +21,14 @@ from trilane.errors import BadInputError
 from trilane.hw_profiles.graph_shapes import Shape, with_shapes
 from trilane.hw_profiles.graph_structure import check_structure, in_order
 from trilane.hw_profiles.graph_tensors import forget_data
-from trilane.hw_profiles.network_work import constant_tensors
+from trilane.hw_profiles.network_work import Work, constant_tensors, count_work
 from trilane.hw_profiles.operator_kinds import CONVOLUTIONS, PRODUCTS
 from trilane.unexpected_value import UnexpectedValue
 
 MAX_BYTES = 512 << 20
 MAX_NODES = 50_000
+#: Files that are remembered, none larger than so many bytes: a graph without weights, or with few.
+REMEMBERED, REMEMBERED_BYTES = 16, 1 << 20
 #: Before it, operators broadcast only where an attribute said so; a graph of that time has other shapes.
 OLDEST_OPSET = 7
 #: Operators that have a tensor among their attributes.
@@ -38,52 +41,73 @@ Numbers = Literal["w8a8", "float", "not said"]
 
 
 class GraphFile(NamedTuple):
-    """A checked graph. `model`: with a static shape for every tensor and without the values of weights."""
+    """A checked graph. `model`: with a static shape for every tensor and without the values of weights; it may be the
+    one of an earlier reading, so nobody changes it. `work`: what it asks of a unit.
+    """
 
     path: Path
     model: onnx.ModelProto
     numbers: Numbers
+    work: Work
 
 
 def read_graph(path: Path, input_shapes: Mapping[str, Shape] | None = None) -> GraphFile:
-    """The graph in the file, with static shapes.
+    """The graph in the file, with static shapes. A small file of the same bytes as an earlier one is not checked again.
 
     `path`: of an ONNX file.
     `input_shapes`: of inputs by name, in place of what the file says.
     Raises BadInputError that says what is wrong and how to mend it.
     """
-    model = _parse(path)
+    data = _bytes(path)
+    check = _checked_before if len(data) <= REMEMBERED_BYTES else _checked
     try:
-        _check_version(model)
-        _check_names(model)
-        check_structure(model.graph)
-        for tensor in _tensors(model):
-            forget_data(tensor, path.parent)
-        in_order(model.graph)
-        model = with_shapes(model, input_shapes or {})
+        return GraphFile(path, *check(data, path.parent, tuple(sorted((input_shapes or {}).items()))))
     except UnexpectedValue as error:
         raise BadInputError.at(path, error) from None
-    return GraphFile(path, model, _numbers(model))
 
 
-def _parse(path: Path) -> onnx.ModelProto:
-    expected = f"an ONNX file of at most {MAX_BYTES >> 20} MiB"
+def _checked(data: bytes, folder: Path, given: Sequence[tuple[str, Shape]]) -> tuple[onnx.ModelProto, Numbers, Work]:
+    """`data`: of a file in `folder`. `given`: shapes of inputs by name."""
+    model = _parse(data)
+    _check_version(model)
+    _check_names(model)
+    check_structure(model.graph)
+    for tensor in _tensors(model):
+        forget_data(tensor, folder)
+    in_order(model.graph)
+    model = with_shapes(model, dict(given))
+    return model, _numbers(model), count_work(model)
+
+
+_checked_before = lru_cache(maxsize=REMEMBERED)(_checked)
+
+
+def _bytes(path: Path) -> bytes:
     try:
         facts = path.stat()
         if not stat.S_ISREG(facts.st_mode):
-            raise BadInputError(path, NOT_A_FILE.get(stat.S_IFMT(facts.st_mode), "a device"), expected)
+            raise BadInputError(path, NOT_A_FILE.get(stat.S_IFMT(facts.st_mode), "a device"), _expected())
         if facts.st_size == 0:
-            raise BadInputError(path, "an empty file", expected, EXPORT_AGAIN)
+            raise BadInputError(path, "an empty file", _expected(), EXPORT_AGAIN)
         if facts.st_size > MAX_BYTES:
             remedy = "keep its weights beside it: onnx.save(model, path, save_as_external_data=True)"
-            raise BadInputError(path, f"{facts.st_size >> 20} MiB", expected, remedy)
-        return onnx.load_model_from_string(path.read_bytes())
+            raise BadInputError(path, f"{facts.st_size >> 20} MiB", _expected(), remedy)
+        return path.read_bytes()
     except OSError as error:
-        raise BadInputError.of_os_error(path, error, expected) from None
+        raise BadInputError.of_os_error(path, error, _expected()) from None
     except ValueError as error:
-        raise BadInputError(path, str(error), expected) from None
+        raise BadInputError(path, str(error), _expected()) from None
+
+
+def _expected() -> str:
+    return f"an ONNX file of at most {MAX_BYTES >> 20} MiB"
+
+
+def _parse(data: bytes) -> onnx.ModelProto:
+    try:
+        return onnx.load_model_from_string(data)
     except DecodeError:
-        raise BadInputError(path, "bytes that do not parse", expected, EXPORT_AGAIN) from None
+        raise UnexpectedValue("bytes that do not parse", _expected(), EXPORT_AGAIN) from None
 
 
 def _check_version(model: onnx.ModelProto) -> None:

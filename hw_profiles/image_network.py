@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles.graph_file import GraphFile
-from trilane.hw_profiles.network_work import Network, constant_tensors, count_work
+from trilane.hw_profiles.network_work import Network, constant_tensors
 
 MOST_CHANNELS = 64
 
@@ -31,4 +31,4 @@ def image_network(graph: GraphFile, layout: str) -> Network:
         raise BadInputError(graph.path, f"inputs {found}", expected, "without --application it is predicted by itself")
     _, first, second, third = shapes[0]
     height, width, channels = (second, third, first) if first <= third else (first, second, third)
-    return Network({"network": str(graph.path)}, height, width, channels, layout, count_work(graph.model))
+    return Network({"network": str(graph.path)}, height, width, channels, layout, graph.work)

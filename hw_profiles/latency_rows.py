@@ -14,7 +14,6 @@ from typing import NamedTuple
 from trilane.errors import BadInputError
 from trilane.hw_profiles.engine_layers import Layers
 from trilane.hw_profiles.graph_file import read_graph
-from trilane.hw_profiles.network_work import count_work
 from trilane.hw_profiles.schema import EngineName
 
 ENGINE_OF: dict[tuple[str, str], EngineName] = {
@@ -72,7 +71,7 @@ def _table(path: Path) -> list[dict[str, str]]:
 @lru_cache(maxsize=128)
 def layers_in(folder: Path, network: str) -> Layers:
     """The layers of a network of the folder."""
-    return count_work(read_graph(folder / "networks" / f"{network}.onnx").model).layers
+    return read_graph(folder / "networks" / f"{network}.onnx").work.layers
 
 
 def layers_of_rows(folder: Path, rows: Sequence[Latency]) -> dict[str, Layers]:

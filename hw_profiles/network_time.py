@@ -22,10 +22,10 @@ from trilane.hw_profiles.application import relative_error
 from trilane.hw_profiles.engine_layers import NAMES, Layer
 from trilane.hw_profiles.engine_times import BOUNDS, Bound, engine_time, numbers_of
 from trilane.hw_profiles.network_work import Operator, Work
-from trilane.hw_profiles.operator_times import Machine, job_time, machine_of
+from trilane.hw_profiles.operator_times import JobTime, Machine, job_time, machine_of
 from trilane.hw_profiles.performance_profiles import Corners
 from trilane.hw_profiles.schema import Profile, Unit
-from trilane.hw_profiles.unit_times import fallback_ms, layer_times, nearest, time_on
+from trilane.hw_profiles.unit_times import fallback_ms, layer_times, time_on
 from trilane.units import UNITS, UnitName
 
 #: A term is named where it alone makes the time uncertain by so much.
@@ -132,7 +132,7 @@ def interval(profile: Profile, work: Work, time: NetworkTime) -> Interval:
     else:
         own = unit.engine.error_fraction.or_else(0.5) * job.unlike
         why = [f"networks as unlike those of the fit were off by {own:.0%} besides what its numbers leave open"]
-        why += [_likeness(work, unit), f"the numbers leave {job.unsure or 0:.0%} open for this one"]
+        why += [_likeness(job), f"the numbers leave {job.unsure or 0:.0%} open for this one"]
         why += [f"{share:.0%} of it is {term}, known to {spread:.0%}" for term, share, spread in _ill_known(work, unit)]
     odd = sorted({o.op_type for o in work.operators if not o.ruled})
     if odd:
@@ -141,13 +141,11 @@ def interval(profile: Profile, work: Work, time: NetworkTime) -> Interval:
     return Interval(time.total_ms / factor, time.total_ms * factor, tuple(why))
 
 
-def _likeness(work: Work, unit: Unit) -> str:
+def _likeness(job: JobTime) -> str:
     """How unlike the network is to the nearest of the fit, in words."""
-    assert unit.engine is not None
-    distance, name = nearest(unit.engine, engine_time(work.layers, numbers_of(unit.engine)).shares)
-    if not name:
+    if not job.like:
         return "its profile names no network that its numbers were fitted to"
-    return f"of those {name} is most like it; {distance:.0%} of the time goes into other work"
+    return f"of those {job.like} is most like it; {job.unlike:.0%} of the time goes into other work"
 
 
 def _ill_known(work: Work, unit: Unit) -> list[tuple[str, float, float]]:

@@ -56,12 +56,14 @@ class JobTime:
     """Milliseconds of one job by part: `fixed`, `input`, `weights`, `fallback` and the operator classes.
 
     On a tensor engine `arithmetic`, `activation` and `spill` in place of the classes, `unsure`: the relative error
-    that its numbers leave, and `unlike`: how unlike the network is to those that they were fitted to, 0 to 1.
+    that its numbers leave, and `unlike`: how unlike the network is to `like`, the nearest one of those that they were
+    fitted to, 0 to 1.
     """
 
     parts: Mapping[str, float]
     unsure: float | None = None
     unlike: float = 1.0
+    like: str = ""
 
     @property
     def total_ms(self) -> float:

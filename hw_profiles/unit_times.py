@@ -39,7 +39,7 @@ def time_on(
         "fallback": sum(ms for _, ms in fallback_ms(unit, work, batch)),
     }
     parts |= dict(zip(("arithmetic", "activation", "spill"), by_bound[:3].tolist(), strict=True))
-    return JobTime(parts, unsure(unit.engine, time.shares), nearest(unit.engine, time.shares)[0])
+    return JobTime(parts, unsure(unit.engine, time.shares), *nearest(unit.engine, time.shares))
 
 
 def layer_times(
@@ -71,15 +71,12 @@ def nearest(engine: Engine, shares: F64) -> tuple[float, str]:
     `shares`: of the terms in the network's time. 1 and "" where the engine names no networks.
     """
     own = dict(zip(NAMES, shares.tolist(), strict=True))
-    return min(
-        ((apart(own, others), name) for name, others in engine.seen.items()),
-        default=(1.0, ""),
-    )
+    return min(((_apart(own, others), name) for name, others in engine.seen.items()), default=(1.0, ""))
 
 
-def apart(some: Mapping[str, float], others: Mapping[str, float]) -> float:
-    """Half the sum of absolute differences of two networks' shares."""
-    return sum(abs(share - others.get(name, 0.0)) for name, share in some.items()) / 2
+def _apart(own: Mapping[str, float], others: Mapping[str, float]) -> float:
+    """Half the sum of absolute differences of two networks' shares. What `others` do not name, they have none of."""
+    return (1 + sum([abs(own[name] - share) - own[name] for name, share in others.items()])) / 2
 
 
 def unsure(engine: Engine, shares: F64) -> float:

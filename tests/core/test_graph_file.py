@@ -400,3 +400,22 @@ def test_channels_last(tmp_path: Path) -> None:
     nodes = [node("Transpose", "image", "x", perm=[0, 3, 1, 2]), node("Conv", "x w", "y", pads=[1] * 4)]
     graph = read(model(nodes, [value("image", (1, 8, 10, 3))], weights=[weight("w", 4, 3, 3, 3)]), tmp_path)
     assert [(o.op_type, o.macs) for o in count_work(graph.model).operators] == [("Conv", 80 * 27 * 4)]
+
+
+def test_a_file_of_the_same_bytes_is_read_once_but_for_other_shapes(tmp_path: Path) -> None:
+    """The same bytes elsewhere are another folder's; a file that was written anew is read anew."""
+    path = tmp_path / "net.onnx"
+
+    def write(channels: int) -> None:
+        ends = [onnx.helper.make_tensor_value_info(n, onnx.TensorProto.FLOAT, (1, channels, 4, 4)) for n in "xy"]
+        graph = onnx.helper.make_graph([onnx.helper.make_node("Tanh", ["x"], ["y"])], "g", ends[:1], ends[1:])
+        model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)])
+        path.write_bytes(model.SerializeToString())
+
+    write(8)
+    first = read_graph(path)
+    assert read_graph(path).work is first.work
+    assert first.work == count_work(first.model)
+    assert read_graph(path, {"x": (1, 16, 4, 4)}).work.input_elements == 256
+    write(24)
+    assert read_graph(path).work.input_elements == 24 * 16
