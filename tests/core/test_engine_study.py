@@ -6,6 +6,7 @@ import math
 import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -70,8 +71,9 @@ def test_a_folder_without_the_tables_is_refused(folder: Path) -> None:
 
 
 def test_each_network_of_the_rows_is_read_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(latency_rows, "read_graph", lambda path: type("Graph", (), {"model": path}))
-    monkeypatch.setattr(latency_rows, "count_work", lambda path: type("Work", (), {"layers": str(path)}))
+    monkeypatch.setattr(
+        latency_rows, "read_graph", lambda path: SimpleNamespace(work=SimpleNamespace(layers=str(path)))
+    )
     layers_in.cache_clear()
     found = layers_of_rows(folder, read_latencies(folder))
     assert found == {name: str(folder / "networks" / f"{name}.onnx") for name in ("more", "net")}
@@ -174,12 +176,15 @@ def test_how_many_rows_lie_in_their_intervals() -> None:
     """Logarithms of 0.1, 0.2 and 0.3; intervals reach 1.2816 times as far as the error and what is open, together."""
     rows = [left_out("int8_tflite", "c", "f", math.exp(log) - 1, unsure) for log, unsure in ((0.1, 0), (-0.2, 0.12))]
     rows.append(left_out("int8_tflite", "c", "f", math.exp(0.3) - 1, 0.15))
-    misses, unsure = misses_of(rows)
+    misses, unsure, unlike = misses_of(rows)
+    assert unlike.tolist() == [1, 1, 1]
     assert misses == pytest.approx([0.1, 0.2, 0.3]) and unsure == pytest.approx([0, 0.12, 0.15])
     fitted = numbers_of("int8_tflite", ["c"])
     # 1.2816 * (0.1, 0.1562, 0.1803) = 0.128, 0.2002, 0.231
     assert EngineStudy(fitted, tuple(rows), 0.1).coverage == pytest.approx(2 / 3)
     assert EngineStudy(fitted, tuple(rows), 0.099).coverage == pytest.approx(1 / 3)
+    halfway = tuple(row._replace(unlike=0.5) for row in rows)
+    assert EngineStudy(fitted, halfway, 0.2).coverage == pytest.approx(2 / 3)
     assert NORMAL_80 == 1.2816
 
 
