@@ -210,8 +210,8 @@ def test_rate_and_output_are_laid_over_the_scene() -> None:
     for output, sentence in (
         ("320", "--output: found '320', expected WIDTHxHEIGHT in pixels, such as 640x480"),
         ("-2x64", "--output: found '-2x64', expected WIDTHxHEIGHT in pixels, such as 640x480"),
-        ("62x64", "command line: output.width: found 62, expected greater than or equal to 64"),
-        ("64x67", "command line: output.height: found 67, expected a multiple of 2"),
+        ("62x64", "command line: output.width: found 62, expected a multiple of 2 from 64 to 4096"),
+        ("64x67", "command line: output.height: found 67, expected a multiple of 2 from 64 to 4096"),
     ):
         with pytest.raises(BadInputError) as raised:
             configure.requested_scene(configure.Request(output=output))
