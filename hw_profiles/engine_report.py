@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from trilane.errors import BadInputError, MissingPartError
+from trilane.errors import BadInputError
 from trilane.hw_profiles.engine_study import Study
 from trilane.hw_profiles.fit_engines import LeftOut
-from trilane.hw_profiles.plot import SUFFIXES
+from trilane.hw_profiles.plot import figure_for
 from trilane.hw_profiles.schema import EngineName
 from trilane.writing import write_atomically
 
@@ -75,16 +75,10 @@ def with_table(text: str, table: str, path: Path) -> str:
 def plot_errors(study: Study, path: Path) -> None:
     """Draw each left-out row: published against predicted time, by engine, on logarithmic axes.
 
-    `path`: of the file; its ending is one of SUFFIXES.
+    `path`: of the file; its ending is one of `trilane.hw_profiles.plot.SUFFIXES`.
     Raises MissingPartError without Matplotlib, BadInputError for another ending or a file that cannot be written.
     """
-    if path.suffix not in SUFFIXES:
-        raise BadInputError(path, f"the ending {path.suffix!r}", "one of " + ", ".join(SUFFIXES))
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise MissingPartError("drawing needs Matplotlib", extra="plot") from None
-    figure = Figure(figsize=(6.4, 6), layout="constrained")
+    figure = figure_for(path, (6.4, 6))
     axes = figure.subplots()
     for name, engine in study.engines.items():
         rows = engine.left_out

@@ -7,12 +7,28 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from trilane.errors import BadInputError, MissingPartError
 from trilane.hw_profiles.over_time import Moment
 from trilane.writing import write_atomically
 
 SUFFIXES = (".png", ".svg", ".pdf")
+
+
+def figure_for(path: Path, inches: tuple[float, float]) -> Any:
+    """An empty `matplotlib.figure.Figure`, `inches` wide and high, that can be drawn into the file.
+
+    `path`: of the file; its ending is one of SUFFIXES.
+    Raises MissingPartError without Matplotlib, BadInputError for another ending.
+    """
+    if path.suffix not in SUFFIXES:
+        raise BadInputError(path, f"the ending {path.suffix!r}", "one of " + ", ".join(SUFFIXES))
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise MissingPartError("drawing needs Matplotlib", extra="plot") from None
+    return Figure(figsize=inches, layout="constrained")
 
 
 def plot_over_time(runs: Mapping[str, Sequence[Moment]], limit_c: float, title: str, path: Path) -> None:
@@ -24,13 +40,7 @@ def plot_over_time(runs: Mapping[str, Sequence[Moment]], limit_c: float, title: 
     `path`: of the file; its ending is one of SUFFIXES.
     Raises MissingPartError without Matplotlib, BadInputError for another ending or a file that cannot be written.
     """
-    if path.suffix not in SUFFIXES:
-        raise BadInputError(path, f"the ending {path.suffix!r}", "one of " + ", ".join(SUFFIXES))
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise MissingPartError("drawing needs Matplotlib", extra="plot") from None
-    figure = Figure(figsize=(8, 6), layout="constrained")
+    figure = figure_for(path, (8, 6))
     rate, temperature = figure.subplots(2, 1, sharex=True)
     for label, moments in runs.items():
         minutes = [m.t_s / 60 for m in moments]
