@@ -323,5 +323,12 @@ def test_the_command_writes_what_is_asked_for(
     assert asked == [Path("data")]
     written = profile_texts(made_study(), profiles, "profiles fit-chips data")
     assert {path: path.read_text() for path in profiles.iterdir()} == written
+
+
+def test_the_command_draws_what_is_asked_for(
+    command: Callable[..., tuple[str, str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("matplotlib.figure")
+    monkeypatch.setattr(engine_study, "study_engines", lambda _: made_study())
     out, _ = command("profiles", "fit-chips", "data", "--plot", tmp_path / "errors.svg")
     assert out.strip() == as_markdown(made_study()) and (tmp_path / "errors.svg").stat().st_size > 1000
