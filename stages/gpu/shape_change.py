@@ -22,6 +22,8 @@ from trilane.shapes import Shape
 FRAMES = 3
 #: The old picture is at most so many frames older than the first one of the new shape; a policy may have dropped some.
 MOST_GAP = 3
+#: And at most so many seconds of the scene: at a low rate the body is elsewhere.
+MOST_GAP_S = 0.2
 #: Of the pixels along a side that an avatar has, from one shape to the other.
 LEAST_CHANGE = 1.2
 
@@ -50,7 +52,7 @@ class ShapeChange:
 
     def note(self, held: NDArray[np.void] | None, pose: NDArray[np.void]) -> None:
         """The full frame of header `pose` comes after that of `held`, if there was one."""
-        if held is None or not 0 < int(pose["picture"]) - int(held["picture"]) <= MOST_GAP:
+        if held is None or not _shortly_before(held, pose):
             self._before = None if held is None or int(pose["picture"]) != int(held["picture"]) else self._before
         elif pose["tensor_shape"].tolist() != held["tensor_shape"].tolist():
             self._before, self._first = held, int(pose["picture"])
@@ -82,6 +84,11 @@ class ShapeChange:
         cell, part = (_cell(avatar) for avatar in (now, old))
         shape = (int(before["tensor_shape"][0]), int(before["tensor_shape"][1]))
         return Blend(shape, cell, part, (across[0], down[0]), (across[1], down[1]), share)
+
+
+def _shortly_before(held: NDArray[np.void], pose: NDArray[np.void]) -> bool:
+    frames = int(pose["picture"]) - int(held["picture"])
+    return 0 < frames <= MOST_GAP and float(pose["media_time_s"]) - float(held["media_time_s"]) <= MOST_GAP_S
 
 
 def _cell(avatar: Any) -> Cell:

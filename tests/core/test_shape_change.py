@@ -95,6 +95,15 @@ def test_nothing_is_blended_of_long_ago_of_one_density_of_the_unseen_or_of_one_b
     assert not list(made.blends(before))
 
 
+def test_nothing_is_blended_of_a_frame_seconds_ago() -> None:
+    """At one frame in three seconds the last one is of another place."""
+    before = header(10, *LARGE, (0, 0, -2))
+    for seconds, count in ((0.19, 1), (0.21, 0), (3.0, 0)):
+        after = header(11, *SMALL, (0, 0, -2))
+        before["media_time_s"], after["media_time_s"] = 5.0, 5.0 + seconds
+        assert len(change(before, after)[0]) == count
+
+
 def test_a_frame_that_is_drawn_twice_gets_the_same_share_twice() -> None:
     made, before, after = ShapeChange(REST), header(10, *LARGE, (0, 0, -2)), header(11, *SMALL, (0, 0, -2))
     made.note(before, after)
