@@ -30,7 +30,7 @@ _BOUNDED = frozenset(
     )
 )
 #: What a damaged chain makes the evaluator raise.
-_FAILURES = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError, NotImplementedError)
+_FAILURES = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
 
 
 def fold(model: onnx.ModelProto, shapes: Mapping[str, tuple[int, ...]]) -> bool:

@@ -1,0 +1,177 @@
+"""What surrounds an avatar, by its values: camera matrices, the built-in room, contact shadows, planes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from trilane.body.joints import JOINT_INDEX, JOINTS
+from trilane.scene.schema import PlaneSpec
+from trilane.stages.gpu.builtin_room import Extent, floor_texture, room_mesh, room_textures, wall_texture
+from trilane.stages.gpu.camera_matrices import eye_of, target_clip
+from trilane.stages.gpu.contact_shadows import floor_discs
+from trilane.stages.gpu.detected_planes import half_sides
+
+
+def test_the_targets_first_row_is_the_top_one() -> None:
+    """The product of both matrices with its second row negated, column by column."""
+    view, projection = np.random.default_rng(0).normal(size=(2, 4, 4))
+    product = projection @ view
+    found = np.frombuffer(target_clip(view, projection), np.float32).reshape(4, 4).T
+    np.testing.assert_allclose(found, [product[0], -product[1], product[2], product[3]], rtol=1e-6)
+
+
+def test_the_eye_is_where_the_view_puts_the_origin() -> None:
+    turn = np.array([[0.0, 0, -1], [0.6, 0.8, 0], [0.8, -0.6, 0]])
+    view = np.eye(4)
+    view[:3, :3], view[:3, 3] = turn, (1.0, 2.0, 3.0)
+    np.testing.assert_allclose(view @ [*eye_of(view), 1], [0, 0, 0, 1], atol=1e-12)
+
+
+def test_a_room_grows_to_sixty_centimetres_beyond_the_camera() -> None:
+    grown = Extent().holding(np.array([3.6, 2.9, -7.0]))
+    assert (grown.low, grown.high) == ((-4.0, 0.0, -7.6), (4.2, 3.5, 4.0))
+    assert grown.holding(np.array([-9.0, -5.0, 0.0])).low == (-9.6, 0.0, -7.6)
+    assert Extent().holding(np.array([3.4, 2.4, -3.4])) == Extent()
+
+
+def test_the_rooms_vertices_have_place_uv_and_light_of_their_side() -> None:
+    """Every side on its own: a grid of seven by seven, finer in the corners, and the formulas of its light."""
+    extent = Extent(low=(-5.0, 0.0, -4.0), high=(4.0, 3.5, 6.0))
+    low, high = np.array(extent.low), np.array(extent.high)
+    mesh = room_mesh(extent)
+    vertices = mesh.vertices.astype(float).reshape(6, 49, 8)
+    shares = [0, 0.04, 0.12, 0.5, 0.88, 0.96, 1]
+    for vertex, (axis, end) in zip(vertices, [(1, 0), (1, 1), (0, 0), (0, 1), (2, 0), (2, 1)], strict=True):
+        place = vertex[:, :3]
+        np.testing.assert_allclose(place[:, axis], (low, high)[end][axis], rtol=1e-6)
+        others = [k for k in range(3) if k != axis]
+        expected = {
+            tuple(np.round([low[k] + s * (high - low)[k] for k, s in zip(others, pair, strict=True)], 4))
+            for pair in ((a, b) for a in shares for b in shares)
+        }
+        assert {tuple(row) for row in np.round(place[:, others], 4)} == expected
+        if (axis, end) == (1, 0):
+            np.testing.assert_allclose(vertex[:, 3:5], place[:, [0, 2]] / 2.4, atol=1e-5)
+        elif axis == 1:
+            np.testing.assert_allclose(vertex[:, 3:5], [(0.3, 0.7)] * 49, rtol=1e-6)
+        else:
+            along = place[:, 2] if axis == 0 else place[:, 0]
+            np.testing.assert_allclose(vertex[:, 3:5], np.c_[along / 2.0, place[:, 1] / 4.0], atol=1e-5)
+        for row in vertex:
+            dim = 1.0
+            for k in others:
+                dim *= (1 - 0.26 * np.exp(-(row[k] - low[k]) / 0.45)) * (1 - 0.26 * np.exp(-(high[k] - row[k]) / 0.45))
+            window = (high[0] - row[0]) / (high[0] - low[0]) / 2 + (row[2] - low[2]) / (high[2] - low[2]) / 2
+            strength = dim * (0.86 + 0.2 * window) * (0.97 if axis == 1 else 1)
+            colour = np.array([1 - 0.02 * window, 0.985, 0.955 + 0.035 * window])
+            np.testing.assert_allclose(row[5:], strength * colour, rtol=1e-5)
+    assert mesh.floor.max() == 48 and mesh.floor.shape == (72, 3) and mesh.rest.shape == (360, 3)
+    assert sorted(np.unique(mesh.rest).tolist()) == list(range(49, 294))
+    for triangles in (mesh.floor, mesh.rest):
+        corners = mesh.vertices[triangles, :3].astype(float)
+        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+        sides = (high - low) @ np.diag([1, 1, 1])
+        walls = 2 * (sides[0] + sides[2]) * sides[1] + sides[0] * sides[2]
+        assert area.sum() == pytest.approx(sides[0] * sides[2] if triangles is mesh.floor else walls, rel=1e-5)
+
+
+def test_the_floor_is_of_sixteen_planks_with_dark_seams() -> None:
+    """Each plank has the tone of its draw; the seam between two is 0.58 as bright, and 0.81 a pixel beside it."""
+    floor = floor_texture()
+    assert floor.shape == (1024, 1024, 4) and (floor[..., 3] == 255).all()
+    assert np.array_equal(room_textures()[0], floor)
+    pixels = floor[..., :3].astype(float)
+    columns = pixels.mean(axis=(0, 2)).reshape(16, 64).mean(axis=0)
+    inner = columns[4:60].mean()
+    np.testing.assert_allclose(columns[[0, 1, 63]] / inner, [0.58, 1 - 0.42 * 0.4583, 1 - 0.42 * 0.4583], atol=0.02)
+    np.testing.assert_allclose(columns[2:63] / inner, 1, atol=0.02)
+    random = np.random.default_rng(7)
+    start, tones = random.random(16), np.clip(random.normal(0, 0.05, (16, 2)), -0.09, 0.09)
+    for plank in range(16):
+        along = np.arange(1024) / 512 + start[plank]
+        for length in range(2):
+            rows = (along.astype(int) % 2 == length) & (np.abs(along % 1 - 0.5) < 0.49)
+            tone = tones[plank, length]
+            found = pixels[rows, 64 * plank + 4 : 64 * plank + 60].mean(axis=(0, 1))
+            wanted = (1 + tone) * (np.array([176, 134, 96]) + np.array([7, 2, -3]) * tone / 0.05)
+            np.testing.assert_allclose(found, wanted, rtol=0.02)  # the grain's mean over 56 columns, four deviations
+        ends = np.abs(along % 1 - 0.5) * 2 > 0.998
+        assert pixels[ends, 64 * plank + 4 : 64 * plank + 60].mean() < 0.7 * inner
+    assert 0.03 < (pixels[:, 4:60].std(axis=0) / inner).mean() < 0.08
+
+
+def test_the_wall_is_paint_above_a_board() -> None:
+    """Rows by their height, each the mean of its columns: the noise of the paint is 0.7 %."""
+    wall = wall_texture()
+    assert wall.shape == (1024, 256, 4) and (wall[..., 3] == 255).all()
+    assert np.array_equal(room_textures()[1], wall)
+    height = (np.arange(1024) + 0.5) / 256
+    found = wall[..., :3].astype(float).mean(axis=1)
+    for row, at in enumerate(height):
+        if at < 0.11:
+            rising = (at - (0.11 - 0.012)) / 0.012
+            expected = np.array([243, 241, 236]) * (1 - 0.25 * min(max(rising, 0), 1)) * (0.6 if at < 0.012 else 1)
+            np.testing.assert_allclose(found[row], expected, atol=0.5)
+        else:
+            expected = np.array([218, 213, 201]) * (1 - 0.12 * np.exp(-(at - 0.11) / 0.02))
+            np.testing.assert_allclose(found[row], expected, rtol=0.01)
+    paint = wall[200:, :, :3].astype(float)
+    assert 0.006 < (paint / paint.mean(axis=(0, 1))).std() < 0.008
+    assert not np.array_equal(paint[0], paint[12])
+
+
+#: Radius on the floor, strength there, height over which it fades to 1/e.
+SHADOWS = {
+    "ankle": (0.15, 0.65, 0.18),
+    "foot": (0.16, 0.70, 0.15),
+    "knee": (0.22, 0.45, 0.30),
+    "pelvis": (0.50, 0.60, 1.20),
+    "spine3": (0.45, 0.45, 0.60),
+    "head": (0.30, 0.45, 0.30),
+    "wrist": (0.16, 0.45, 0.15),
+}
+
+
+@pytest.mark.parametrize("height", [-0.3, 0.0, 0.2, 0.45])
+def test_a_disc_widens_and_fades_with_its_joints_height(height: float) -> None:
+    """Joint k is moved to (k / 10, height, k); discs fainter than 0.02 are left out."""
+    random = np.random.default_rng(0)
+    rest = random.normal(size=(JOINTS, 3))
+    joints = random.normal(size=(JOINTS, 3, 4))
+    place = np.stack([np.arange(JOINTS) / 10, np.full(JOINTS, height), np.arange(JOINTS)], axis=1)
+    joints[:, :, 3] = place - np.einsum("nij,nj->ni", joints[:, :, :3], rest)
+    found = {round(float(row[1])): row for row in floor_discs(joints, rest)}
+    above = max(height, 0)
+    expected = {}
+    for name, index in JOINT_INDEX.items():
+        part = SHADOWS.get(name.removeprefix("left_").removeprefix("right_"))
+        if part is not None and name not in ("jaw",):
+            radius, strength, fade = part
+            shown = strength * np.exp(-above / fade)
+            if shown > 0.02:
+                expected[index] = (index / 10, index, radius + 0.35 * above, shown)
+    assert set(found) == set(expected)
+    for index, row in expected.items():
+        np.testing.assert_allclose(found[index], row, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("normal", "turn", "across", "along"),
+    [
+        ((0, 2, 0), 0, (1, 0, 0), (0, 0, -1)),
+        ((0, 1, 0), 90, (0, 0, -1), (-1, 0, 0)),
+        ((0, -1, 0), 0, (1, 0, 0), (0, 0, 1)),
+        ((0, 0, 3), 0, (0, 1, 0), (-1, 0, 0)),
+        ((0, 0, 1), 30, (-0.5, 3**0.5 / 2, 0), (-(3**0.5) / 2, -0.5, 0)),
+        ((1, 0, 0), 0, (0, 1, 0), (0, 0, 1)),
+        ((0.6, 0.8, 0), 0, (-0.8, 0.6, 0), (0, 0, 1)),
+        ((0, 0.96, 0.28), 0, (1, 0, 0), (0, 0.28, -0.96)),
+    ],
+)
+def test_a_planes_sides_point_as_the_normal_and_its_turn_say(normal: Any, turn: float, across: Any, along: Any) -> None:
+    found = half_sides(PlaneSpec(normal=normal, width_m=3, depth_m=1, turn_deg=turn))
+    np.testing.assert_allclose(found[0], 1.5 * np.array(across), atol=1e-6)
+    np.testing.assert_allclose(found[1], 0.5 * np.array(along), atol=1e-6)
