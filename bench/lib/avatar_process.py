@@ -5,7 +5,6 @@ Rule: the process is what `trilane run` is: its own scheduler, its own units; tw
 
 from __future__ import annotations
 
-import multiprocessing
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -14,7 +13,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from trilane.errors import TrilaneError
+from trilane.bench.lib.asked_processes import answer_of, asked_processes
 from trilane.scheduler.ledger import JobRecord
 
 START_S, RUN_S = 120.0, 600.0
@@ -61,40 +60,17 @@ class AvatarProcess:
 
     def receive(self, wait_s: float) -> Any:
         """The process's next answer. Raises TrilaneError."""
-        if not self._pipe.poll(wait_s):
-            raise TrilaneError(f"{self._name}: no answer in {wait_s:g} s")
-        try:
-            answer = self._pipe.recv()
-        except EOFError as error:
-            raise TrilaneError(f"{self._name}: its process ended") from error
-        if isinstance(answer, str):
-            raise TrilaneError(f"{self._name}: {answer}")
-        return answer
+        return answer_of(self._pipe, self._name, wait_s)
 
 
 @contextmanager
 def avatar_processes(asked: Sequence[Asked]) -> Iterator[list[AvatarProcess]]:
     """A process for each, ready to run; they end with the block. Raises TrilaneError when one does not start."""
-    context = multiprocessing.get_context("spawn")
-    processes, pipes = [], []
-    try:
-        for each in asked:
-            ours, theirs = context.Pipe()
-            process = context.Process(target=serve, args=(theirs, each), daemon=True)
-            process.start()
-            theirs.close()
-            processes.append(process)
-            pipes.append(ours)
-        found = [AvatarProcess(pipe, f"{each.avatar} at {each.size}") for pipe, each in zip(pipes, asked, strict=True)]
+    with asked_processes() as start:
+        found = [AvatarProcess(start(serve, each), f"{each.avatar} at {each.size}") for each in asked]
         for one in found:
             one.receive(START_S)
         yield found
-    finally:
-        for pipe in pipes:
-            pipe.close()
-        for process in processes:
-            process.join(5)
-            process.kill()
 
 
 def serve(pipe: Connection, asked: Asked) -> None:

@@ -5,7 +5,6 @@ Rule: only one process computes at a time; the others wait on a pipe.
 
 from __future__ import annotations
 
-import multiprocessing
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -16,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from trilane.errors import TrilaneError
+from trilane.bench.lib.asked_processes import answer_of, asked_processes
 
 START_S = 300.0
 WARM_UP = 3
@@ -45,12 +44,12 @@ class Runner:
 
     def __init__(self, pipe: Connection, name: str) -> None:
         self._pipe, self._name = pipe, name
-        self.startup_ms = float(self._receive())
+        self.startup_ms = float(answer_of(pipe, name, START_S))
 
     def run(self, count: int) -> list[float]:
         """Milliseconds of `count` runs in a row."""
         self._pipe.send(count)
-        times: list[float] = self._receive()
+        times: list[float] = answer_of(self._pipe, self._name, START_S)
         return times
 
     def run_for(self, seconds: float) -> list[float]:
@@ -61,40 +60,12 @@ class Runner:
             times += self.run(max(1, int(left * 1e3 / (2 * times[-1]))) if times else 1)
         return times
 
-    def _receive(self) -> Any:
-        if not self._pipe.poll(START_S):
-            raise TrilaneError(f"{self._name}: no answer in {START_S:g} s")
-        try:
-            answer = self._pipe.recv()
-        except EOFError as error:
-            raise TrilaneError(f"{self._name}: its process ended") from error
-        if isinstance(answer, str):
-            raise TrilaneError(f"{self._name}: {answer}")
-        return answer
-
 
 @contextmanager
 def runners(variants: Mapping[str, Variant]) -> Iterator[dict[str, Runner]]:
     """A waiting process for each variant; they end with the block. Raises TrilaneError when one does not start."""
-    context = multiprocessing.get_context("spawn")
-    processes, pipes = [], []
-    try:
-        by_name = {}
-        for name, variant in variants.items():
-            ours, theirs = context.Pipe()
-            process = context.Process(target=serve, args=(theirs, variant), daemon=True)
-            process.start()
-            theirs.close()
-            processes.append(process)
-            pipes.append(ours)
-            by_name[name] = Runner(ours, name)
-        yield by_name
-    finally:
-        for pipe in pipes:
-            pipe.close()
-        for process in processes:
-            process.join(5)
-            process.kill()
+    with asked_processes() as start:
+        yield {name: Runner(start(serve, variant), name) for name, variant in variants.items()}
 
 
 def serve(pipe: Connection, variant: Variant) -> None:

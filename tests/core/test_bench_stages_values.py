@@ -12,7 +12,7 @@ import numpy as np
 import onnx
 import pytest
 
-from trilane.bench.lib import cpu_load, handoff_stages, interleaved_processes, networks
+from trilane.bench.lib import asked_processes, cpu_load, handoff_stages, interleaved_processes, networks
 from trilane.bench.lib.interleaved_processes import KINDS, Runner, Variant
 from trilane.errors import TrilaneError
 from trilane.pipeline.description import UnitSettings
@@ -133,7 +133,7 @@ class Processes:
 def test_runners_have_a_process_each_and_end_them_all(monkeypatch: pytest.MonkeyPatch) -> None:
     told = Processes()
     asked: list[str] = []
-    monkeypatch.setattr(interleaved_processes.multiprocessing, "get_context", lambda how: asked.append(how) or told)
+    monkeypatch.setattr(asked_processes.multiprocessing, "get_context", lambda how: asked.append(how) or told)
     variants = {"a": Variant("ort", Path("a"), threads=3), "b": Variant("ort", Path("b"), threads=4)}
     with interleaved_processes.runners(variants) as by_name:
         assert {name: each.startup_ms for name, each in by_name.items()} == {"a": 3.0, "b": 4.0}
