@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -68,7 +68,7 @@ class Recording:
         with path.open("w", encoding="utf-8") as file:
             file.write(json.dumps(header) + "\n")
             for now_ns, events, actions in self.steps:
-                row = {"t": now_ns, "events": [_row(e) for e in events], "actions": [_row(a) for a in actions]}
+                row = {"t": now_ns, "events": [row_of(e) for e in events], "actions": [row_of(a) for a in actions]}
                 file.write(json.dumps(row, separators=(",", ":")) + "\n")
 
 
@@ -80,15 +80,14 @@ def read(path: Path) -> Recording:
             header = json.loads(next(file, ""))
             if header["schema"] != SCHEMA:
                 raise ValueError(f"schema {header['schema']!r}; this Trilane reads {SCHEMA}")
-            recording = Recording(_graph(header["graph"]), Settings(**_tuples(header["settings"])))
+            recording = Recording(graph_of(header["graph"]), settings_of(header["settings"]))
             Core(recording.graph, recording.settings)  # says what is wrong with them
             for number, line in enumerate(file, start=1):  # noqa: B007 - named in the message below
                 row = json.loads(line)
                 now_ns = row["t"]
                 if type(now_ns) is not int or (recording.steps and now_ns < recording.steps[-1][0]):
                     raise UnexpectedValue(f"time {now_ns!r}", "ns that do not go back")
-                events = tuple(_parse(item, _EVENTS) for item in row["events"])
-                recording.steps.append((now_ns, events, tuple(_parse(item, _ACTIONS) for item in row["actions"])))
+                recording.steps.append((now_ns, events_of(row["events"]), actions_of(row["actions"])))
     except OSError as error:
         raise BadInputError.of_os_error(path, error, "a recorded run") from None
     except UnexpectedValue as error:
@@ -117,12 +116,23 @@ def replay(recording: Recording) -> Iterator[str]:
             yield f"at {now_ns} ns: recorded {actions}, replayed {answer}"
 
 
-def _row(item: Any) -> list[Any]:
-    fields = item[0] if type(item) in CARRIED else item
+def row_of(item: Event | Action) -> list[Any]:
+    """An event or action as it is written: its name and its fields."""
+    fields: Any = item[0] if type(item) in CARRIED else item
     return [type(item).__name__, *fields]
 
 
-def _parse(row: list[Any], forms: dict[str, tuple[Any, list[Any]]]) -> Any:
+def events_of(rows: Iterable[Sequence[Any]]) -> tuple[Event, ...]:
+    """The events that were written as `rows`. Raises UnexpectedValue for a row that is none."""
+    return tuple(_parse(row, _EVENTS) for row in rows)
+
+
+def actions_of(rows: Iterable[Sequence[Any]]) -> tuple[Action, ...]:
+    """The actions that were written as `rows`. Raises UnexpectedValue for a row that is none."""
+    return tuple(_parse(row, _ACTIONS) for row in rows)
+
+
+def _parse(row: Sequence[Any], forms: dict[str, tuple[Any, list[Any]]]) -> Any:
     """Raises UnexpectedValue for a name, for types of fields or for a kind of outcome that none of `forms` has."""
     name, *fields = row
     if name not in forms:
@@ -135,11 +145,14 @@ def _parse(row: list[Any], forms: dict[str, tuple[Any, list[Any]]]) -> Any:
     return kind(CARRIED[kind](*values)) if kind in CARRIED else kind(*values)
 
 
-def _graph(data: dict[str, Any]) -> Graph:
+def graph_of(data: Mapping[str, Any]) -> Graph:
+    """The graph that was written as `data`. Raises KeyError and TypeError for one that is none."""
     bypass = data["bypass"]
     ends = None if bypass is None else (bypass[0], bypass[1])
     return Graph(tuple(StageSpec(**stage) for stage in data["stages"]), tuple(data["edges"]), data["latency_to"], ends)
 
 
-def _tuples(data: dict[str, Any]) -> dict[str, Any]:
-    return {key: tuple(value) if isinstance(value, list) else value for key, value in data.items()}
+def settings_of(data: Mapping[str, Any]) -> Settings:
+    """The settings that were written as `data`. Raises TypeError for data that are none."""
+    fields: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in data.items()}
+    return Settings(**fields)

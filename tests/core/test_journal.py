@@ -1,0 +1,115 @@
+"""The journal gives back what was added, as it grows and after; whatever else is in the file is refused by name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgpack
+import pytest
+
+from trilane.errors import BadInputError
+from trilane.hw_profiles.application import application_graph
+from trilane.pipeline.journal import (
+    SCHEMA,
+    Accounted,
+    Begun,
+    Counted,
+    Ended,
+    JournalReader,
+    JournalWriter,
+    Record,
+    Said,
+    Sampled,
+    Stepped,
+    Worked,
+    read_journal,
+)
+from trilane.scheduler.causes import Outcome, OutcomeKind
+from trilane.scheduler.events import Dispatch, Finish, Job, JobDone, Settings, UnitReady
+from trilane.scheduler.ledger import JobRecord
+
+BEGUN = Begun(SCHEMA, application_graph(), Settings(3, works=(1000, 500), follow=("infer",)), {"clock": "host"})
+REST: tuple[Record, ...] = (
+    Stepped(5, (UnitReady("cpu"),), (Dispatch(Job(0, "cpu", "pose", 0, -1, 0, 0, fresh=True, rung=1)),)),
+    Accounted(5, "gpu", 1),
+    Stepped(9, (JobDone("cpu", 0, 6, 8, 6, skips=True),), (Finish(Outcome(OutcomeKind.GAVE_UP, "gpu")),)),
+    Worked(JobRecord("pose", "cpu", 0, 5, 5, 6, 8, preempted_ns=1), {"visible": 1.0}),
+    Counted(9, {"died:gpu": 1}, {"raster->infer:stale": 2}),
+    Sampled(9, {"temperature_c.device": 31.5}),
+    Said(9, "unit gpu could not be kept alive"),
+    Ended(9, {"fps": 0.0, "frames": {"presented": 1}}),
+)
+
+
+def _write(path: Path, records: Sequence[Record]) -> Path:
+    with JournalWriter(path) as journal:
+        for record in records:
+            journal.add(record)
+    return path
+
+
+def test_what_was_added_is_read(tmp_path: Path) -> None:
+    assert list(read_journal(_write(tmp_path / "j", (BEGUN, *REST)))) == [BEGUN, *REST]
+
+
+def test_a_reader_follows_a_file_that_grows_by_single_bytes(tmp_path: Path) -> None:
+    whole = _write(tmp_path / "whole", (BEGUN, *REST)).read_bytes()
+    reader, seen = JournalReader(tmp_path / "growing"), []
+    with (tmp_path / "growing").open("wb", buffering=0) as file:
+        for place in range(len(whole)):
+            file.write(whole[place : place + 1])
+            seen.append(list(reader.new()))
+    assert [record for records in seen for record in records] == [BEGUN, *REST]
+    assert max(map(len, seen)) == 1
+
+
+def test_only_flushed_records_are_seen_while_it_is_written(tmp_path: Path) -> None:
+    with JournalWriter(tmp_path / "j") as journal:
+        reader = JournalReader(tmp_path / "j")
+        journal.add(BEGUN)
+        assert list(reader.new()) == []
+        journal.flush()
+        assert list(reader.new()) == [BEGUN]
+
+
+def test_a_record_cut_off_at_the_end_is_left_out(tmp_path: Path) -> None:
+    path = _write(tmp_path / "j", (BEGUN, *REST))
+    path.write_bytes(path.read_bytes()[:-1])
+    assert list(read_journal(path)) == [BEGUN, *REST[:-1]]
+
+
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [
+        (b"", "no record"),
+        (b"\xc1", "byte 1"),
+        (msgpack.packb([1, 5, [], []]), "a record before the header"),
+        (msgpack.packb([0, 99, {}, {}, {}]), "schema 99"),
+        (msgpack.packb([7, 5]), r"\(7, 5\)"),
+        (msgpack.packb([-1, 5, {}]), r"\(-1, 5"),
+        (msgpack.packb(3), "unpack|iterable"),
+        (msgpack.packb([1, 5, [["Burn"]], []]), "'Burn'"),
+    ],
+)
+def test_what_is_no_journal_is_refused(tmp_path: Path, content: bytes, found: str) -> None:
+    path = tmp_path / "j"
+    path.write_bytes(content)
+    with pytest.raises(BadInputError, match=found):
+        list(read_journal(path))
+
+
+def test_a_second_header_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="a second header"):
+        list(read_journal(_write(tmp_path / "j", (BEGUN, BEGUN))))
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match=r"none\.msgpack"):
+        list(read_journal(tmp_path / "none.msgpack"))
+
+
+def test_no_journal_is_written_over(tmp_path: Path) -> None:
+    (tmp_path / "j").touch()
+    with pytest.raises(FileExistsError):
+        JournalWriter(tmp_path / "j")
