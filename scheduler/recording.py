@@ -118,8 +118,8 @@ def replay(recording: Recording) -> Iterator[str]:
 
 def row_of(item: Event | Action) -> list[Any]:
     """An event or action as it is written: its name and its fields."""
-    fields: Any = item[0] if type(item) in CARRIED else item
-    return [type(item).__name__, *fields]
+    row: Any = item
+    return [type(item).__name__, *(row[0] if type(item) in CARRIED else row)]
 
 
 def events_of(rows: Iterable[Sequence[Any]]) -> tuple[Event, ...]:
