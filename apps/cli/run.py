@@ -1,18 +1,16 @@
 """`trilane run`: a scene through the three units, to a run folder and a table.
 
-Rule: this file talks to the person; what is done is in `trilane.stages.configure` and `trilane.apps.run_job`.
+Rule: this file talks to the person; what is done is in `trilane.apps.asked_run`.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
-from dataclasses import replace
+from contextlib import contextmanager
 from enum import StrEnum
-from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -39,11 +37,7 @@ from trilane.units import PerformanceProfile
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
-    from trilane.apps.pace import Pace
-    from trilane.apps.run_job import Hooks, Outcome, Plan
-    from trilane.pipeline.unit_starter import UnitStarter
-    from trilane.stages.config import RunConfig
-    from trilane.stages.configure import Checked, GlFacts
+    from trilane.apps.run_job import Hooks, Outcome
 
 app = Commands()
 
@@ -154,37 +148,36 @@ def run(
     The folder holds report.json, video.mp4, contact.png, trace.pftrace (open it at ui.perfetto.dev) and events.jsonl.
     docs/report.md explains every key, the policies and the edges.
     """
-    with _early_processes() as (starter, gl):
-        from trilane.apps.run_job import Plan
-        from trilane.stages.configure import Request, configure, requested_edge
+    from trilane.apps.asked_run import AskedRun, run_asked
 
-        cuts, rule = tuple(split or ()), requested_edge(edge)
-        request = Request(scene, motion, camera, background, avatar, frames, size, runtime, hud, skinning, cuts)
-        request = replace(request, fps=fps, output=output, cores=tuple(cores or ()), policy=str(policy))
-        checked = configure(request, Path.cwd(), gl)
-        chip_pace = _pace(checked.config, profile, pace, slow_motion)
-        cap = performance_profile and str(performance_profile)
-        _refuse_beside_pace(chip_pace, cuts, cap)
-        outcome = _run(checked, out, Plan(str(policy), baseline, chip_pace, cap, latch, rule), starter, gl)
+    cuts, cap = tuple(split or ()), performance_profile and str(performance_profile)
+    _check_pace(profile, pace, slow_motion, cuts, cap)
+    request: dict[str, Any] = {
+        "scene": scene,
+        "motion": motion,
+        "camera": camera,
+        "background": background,
+        "avatar": avatar,
+        "frames": frames,
+        "size": size,
+        "runtime": runtime,
+        "hud": hud,
+        "skinning": skinning,
+        "split": cuts,
+        "fps": fps,
+        "output": output,
+        "cores": tuple(cores or ()),
+        "policy": str(policy),
+    }
+    paced_by = None if profile is None else (profile, slow_motion)
+    command = ("trilane", *sys.argv[1:])
+    outcome = run_asked(AskedRun(request, edge, baseline, paced_by, cap, latch, out, command), _hooks)
     _print_outcome(outcome, as_json)
     raise typer.Exit(outcome.exit_code)
 
 
-@contextmanager
-def _early_processes() -> Iterator[tuple[UnitStarter, GlFacts]]:
-    """The fork server, which imports what the units need while this process goes on, and what it says of OpenGL.
-
-    The driver is looked at in a process of its own, because it may crash.
-    """
-    from trilane.pipeline.unit_starter import UnitStarter
-    from trilane.stages.factories import PRELOAD
-
-    with UnitStarter(PRELOAD) as starter, closing(starter.call("trilane.stages.machine_facts:open_gl")) as gl:
-        yield starter, cache(gl.result)
-
-
-def _pace(config: RunConfig, profile: str | None, asked: bool, slow_motion: float) -> Pace | None:
-    """The pace of the chip `profile`, when `--pace` was `asked` for. Raises BadInputError."""
+def _check_pace(profile: str | None, asked: bool, slow_motion: float, cuts: tuple[str, ...], cap: str | None) -> None:
+    """Raises BadInputError for options of a chip's pace that lack another, or that it leaves no room for."""
     if (profile is not None) != asked:
         found = "--profile without --pace" if profile is not None else "--pace without --profile"
         remedy = "give both; `trilane predict --profile` answers without running"
@@ -192,40 +185,11 @@ def _pace(config: RunConfig, profile: str | None, asked: bool, slow_motion: floa
     if profile is None:
         if slow_motion != 1.0:
             raise BadInputError("options", "--slow-motion without --pace", "--pace and --profile with it")
-        return None
-    from trilane.apps.pace import pace_of
-
-    return pace_of(config, profile, slow_motion)
-
-
-def _refuse_beside_pace(pace: Pace | None, cuts: tuple[str, ...], cap: str | None) -> None:
-    """Raises BadInputError for an option that a chip's pace leaves no room for."""
-    if pace is not None and cuts:
+        return
+    if cuts:
         raise BadInputError("options", "--split with --pace", "one of them", "a chip's pace is that of a whole network")
-    if pace is not None and cap is not None:
+    if cap is not None:
         raise BadInputError("options", "--performance-profile with --pace", "one of them", "a pace is capped already")
-
-
-def _run(checked: Checked, out: Path | None, plan: Plan, starter: UnitStarter, gl: GlFacts) -> Outcome:
-    """Run `checked` as `plan` says, to the folder `out` or the default one."""
-    from trilane.apps.made import made_facts
-    from trilane.apps.run_folder import default_place
-    from trilane.apps.run_job import run_to_folder
-    from trilane.stages.configure import required_machine
-
-    if plan.pace is not None:
-        checked = checked.changed(pace_ns=dict(plan.pace.stage_ns))
-    target = out or default_place(checked.config.scene.name)
-    with _hooks() as hooks:
-        for note in checked.notes:
-            hooks.message(note)
-        try:
-            made = made_facts(["trilane", *sys.argv[1:]])
-            machine = required_machine(gl)
-            return run_to_folder(checked, target, plan, hooks, machine=machine, made=made, starter=starter)
-        except KeyboardInterrupt:
-            hooks.message("interrupted: nothing was written")
-            raise
 
 
 def _print_outcome(outcome: Outcome, as_json: bool) -> None:

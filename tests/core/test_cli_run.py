@@ -247,6 +247,6 @@ def test_a_bar_for_each_run_when_stderr_is_a_terminal(monkeypatch: pytest.Monkey
 
 def test_the_call_is_closed_though_the_command_fails(asked: Asked, command: Command) -> None:
     before = Call.closed
-    command("run", "--pace", code=2)
+    command("run", "--edge", "none", code=2)
     assert Call.closed == before + 1
     assert asked.others["starter closed"]

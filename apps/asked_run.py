@@ -1,0 +1,104 @@
+"""A run as somebody asked for it, from options to a run folder: the same for a command line and for a program.
+
+Rule: nothing is printed here. The fork server starts first and imports what the units need while this process goes on,
+so what this process needs is imported inside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, closing, contextmanager
+from dataclasses import dataclass, field, replace
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from trilane.apps.run_job import Hooks, Outcome, Plan
+    from trilane.pipeline.unit_starter import UnitStarter
+    from trilane.stages.configure import Checked, GlFacts
+
+
+@dataclass(frozen=True)
+class AskedRun:
+    """What was asked for.
+
+    `request`: fields of `trilane.stages.configure.Request`; what is not there is as it has it.
+    `edge`: rule of every edge.
+    `baseline_frames`: of the `sequential` run that follows; 0: none.
+    `paced_by`: a chip at whose pace jobs are held, and how many times slower; None: as fast as it goes.
+    `performance_profile`: whose caps hold; None: no cap.
+    `latch_ms`: how long before it is needed a pose is sampled.
+    `out`: the run folder; None: `runs/TIME-SCENE`.
+    `command`: the words by which it was asked for.
+    """
+
+    request: Mapping[str, Any] = field(default_factory=dict)
+    edge: str = "double"
+    baseline_frames: int = 60
+    paced_by: tuple[str, float] | None = None
+    performance_profile: str | None = None
+    latch_ms: float = 0.0
+    out: Path | None = None
+    command: tuple[str, ...] = ()
+
+
+def run_asked(asked: AskedRun, hooks: Callable[[], AbstractContextManager[Hooks]]) -> Outcome:
+    """Check what was asked for, run it and leave its run folder.
+
+    `hooks`: opened when the input is checked and the units start.
+    Raises BadInputError and MissingPartError for what cannot be run, TrilaneError when no frame was presented.
+    """
+    with _early_processes() as (starter, gl):
+        from trilane.apps.run_job import Plan
+        from trilane.stages.configure import Request, configure, requested_edge
+
+        rule, request = requested_edge(asked.edge), Request(**asked.request)
+        checked = configure(request, Path.cwd(), gl)
+        plan = Plan(request.policy, asked.baseline_frames, None, asked.performance_profile, asked.latch_ms, rule)
+        return _run(checked, asked, plan, hooks, starter, gl)
+
+
+@contextmanager
+def _early_processes() -> Iterator[tuple[UnitStarter, GlFacts]]:
+    """The fork server, which imports what the units need while this process goes on, and what it says of OpenGL.
+
+    The driver is looked at in a process of its own, because it may crash.
+    """
+    from trilane.pipeline.unit_starter import UnitStarter
+    from trilane.stages.factories import PRELOAD
+
+    with UnitStarter(PRELOAD) as starter, closing(starter.call("trilane.stages.machine_facts:open_gl")) as gl:
+        yield starter, cache(gl.result)
+
+
+def _run(
+    checked: Checked,
+    asked: AskedRun,
+    plan: Plan,
+    hooks: Callable[[], AbstractContextManager[Hooks]],
+    starter: UnitStarter,
+    gl: GlFacts,
+) -> Outcome:
+    """Run `checked` as `plan` says, held to a chip's pace where one was asked for."""
+    from trilane.apps.made import made_facts
+    from trilane.apps.run_folder import default_place
+    from trilane.apps.run_job import run_to_folder
+    from trilane.stages.configure import required_machine
+
+    if asked.paced_by is not None:
+        from trilane.apps.pace import pace_of
+
+        pace = pace_of(checked.config, *asked.paced_by)
+        plan, checked = replace(plan, pace=pace), checked.changed(pace_ns=dict(pace.stage_ns))
+    target = asked.out or default_place(checked.config.scene.name)
+    with hooks() as told:
+        for note in checked.notes:
+            told.message(note)
+        try:
+            made = made_facts(list(asked.command))
+            machine = required_machine(gl)
+            return run_to_folder(checked, target, plan, told, machine=machine, made=made, starter=starter)
+        except KeyboardInterrupt:
+            told.message("interrupted: nothing was written")
+            raise
