@@ -21,7 +21,7 @@ from trilane.hw_profiles.host import usable_cores
 from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, UnitSettings
 from trilane.pipeline.run import run_pipeline
 from trilane.pipeline.unit_starter import UnitStarter
-from trilane.scheduler.accounts import compared
+from trilane.scheduler.accounts import compared, second_accounts
 from trilane.scheduler.events import Event, Graph, SetDuty, Settings, StageSpec
 from trilane.scheduler.policy import POLICIES
 from trilane.scheduler.virtual import simulate
@@ -96,7 +96,7 @@ def virtual_run(draw: random.Random, frames: int) -> dict[str, Any]:
         keep=True,
     )
     assert done.recording is not None
-    return {**done.report, "accounts": compared(done.report["units"], done.recording, done.jobs)}
+    return {**done.report, "accounts": compared(done.report["units"], second_accounts(done.recording, done.jobs))}
 
 
 def host_run(draw: random.Random, frames: int, starter: UnitStarter) -> dict[str, Any]:

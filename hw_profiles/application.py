@@ -23,7 +23,7 @@ from trilane.hw_profiles.performance_profiles import Corners
 from trilane.hw_profiles.reference_networks import CHANNELS_PER_PASS
 from trilane.hw_profiles.schema import Profile, Unit
 from trilane.hw_profiles.unit_times import time_on
-from trilane.scheduler.accounts import compared
+from trilane.scheduler.accounts import compared, second_accounts
 from trilane.scheduler.events import Graph, Settings, chain
 from trilane.scheduler.policy import POLICIES
 from trilane.scheduler.release import run_settings
@@ -237,7 +237,7 @@ def _run(graph: Graph, settings: Settings, service: Mapping[str, int], twice: bo
     try:
         done = simulate(graph, settings, lambda stage, _unit, _frame, _begin: service[stage], keep=twice)
         if done.recording is not None:
-            done.report["accounts"] = compared(done.report["units"], done.recording, done.jobs)
+            done.report["accounts"] = compared(done.report["units"], second_accounts(done.recording, done.jobs))
         return done.report
     except ValueError as error:
         expected = error.expected if isinstance(error, UnexpectedValue) else str(error)

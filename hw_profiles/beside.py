@@ -33,7 +33,7 @@ from trilane.hw_profiles.network_work import Network
 from trilane.hw_profiles.on_chip import spilled
 from trilane.hw_profiles.performance_profiles import Corners
 from trilane.hw_profiles.schema import Profile, Unit
-from trilane.scheduler.accounts import compared
+from trilane.scheduler.accounts import compared, second_accounts
 from trilane.scheduler.beside import ONE, Member, Runs, simulate_beside
 from trilane.scheduler.events import Graph, Settings, Stop, chain
 from trilane.scheduler.policy import POLICIES
@@ -145,7 +145,7 @@ def together(
     if twice:
         for run in runs:
             assert run.recording is not None
-            run.report["accounts"] = compared(run.report["units"], run.recording, run.jobs)
+            run.report["accounts"] = compared(run.report["units"], second_accounts(run.recording, run.jobs))
     seconds = max(run.report["duration_s"] for run in runs)
     shares: list[dict[str, float]] = [{unit: _busy_s(run, unit) / seconds for unit in UNITS} for run in runs]
     busy: dict[str, float] = {unit: sum(each[unit] for each in shares) for unit in UNITS}

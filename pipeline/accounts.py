@@ -6,7 +6,7 @@ contradict each other, or were not measured, a message says so.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from trilane.pipeline.core_meter import counts_run_delay
@@ -14,9 +14,7 @@ from trilane.pipeline.cpu_use import CpuTimes, use_of_cores
 from trilane.pipeline.description import Pipeline
 from trilane.pipeline.run_log import RunLog
 from trilane.scheduler.accounts import compared
-from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.places import Place, busiest_core_ns
-from trilane.scheduler.recording import Recording
 from trilane.scheduler.stats import summary_ms
 
 NO_RUN_DELAY = (
@@ -29,22 +27,21 @@ def add_accounts(
     report: dict[str, Any],
     pipeline: Pipeline,
     cpu: CpuTimes,
-    recording: Recording,
-    jobs: Sequence[JobRecord],
+    second: Mapping[str, Mapping[str, float]],
     log: RunLog,
 ) -> None:
     """Add `cpu_s`, `cpu_ms`, `core_shares` and `accounts` to a ledger's report.
 
     `pipeline`: that ran.
     `cpu`: CPU time of its units and stages.
-    `recording`, `jobs`: of the run.
+    `second`: its second accounts.
     `log`: is told what was not measured, and what contradicts itself.
     """
     for unit, row in report["units"].items():
         row.update(cpu_s=cpu.of_unit_s(unit), cpu_in_jobs_s=cpu.in_jobs_ns[unit] / 1e9)
     for stage, row in report["stages"].items():
         row["cpu_ms"] = summary_ms(cpu.stage_ns[stage])
-    report["accounts"] = compared(report["units"], recording, jobs)
+    report["accounts"] = compared(report["units"], second)
     if not report["accounts"]["agree"]:
         found = report["accounts"]["largest_difference"]
         log.say(f"the shares of units, computed twice, differ by {found:.2%} of the time: please report this")

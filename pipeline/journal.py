@@ -10,7 +10,7 @@ record, or without `Ended`, is of a run that was killed, or that still goes on.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
@@ -19,9 +19,11 @@ from typing import IO, Any, Final, NamedTuple, Self
 import msgpack
 
 from trilane.errors import BadInputError
+from trilane.scheduler.accounts import in_order
+from trilane.scheduler.core import Core
 from trilane.scheduler.events import Action, Event, Graph, Settings
 from trilane.scheduler.ledger import JobRecord
-from trilane.scheduler.recording import actions_of, events_of, graph_of, row_of, settings_of
+from trilane.scheduler.recording import Recording, actions_of, events_of, graph_of, row_of, settings_of
 from trilane.unexpected_value import UnexpectedValue
 
 NAME = "journal.msgpack"
@@ -178,6 +180,28 @@ def read_journal(path: Path) -> Iterator[Record]:
         yield record
     if is_empty:
         raise BadInputError(path, "no record", EXPECTED)
+
+
+def journal_of(
+    recording: Recording, jobs: Iterable[JobRecord], facts: Mapping[str, Any], report: Mapping[str, Any]
+) -> Iterator[Record]:
+    """The records of a run that is in memory, such as one in virtual time (`Simulation` with `keep`).
+
+    Frames lost and dropped are counted by a core that hears the same events. `facts`: of `Begun`. `report`: of `Ended`.
+    """
+    core, counted, now_ns = Core(recording.graph, recording.settings), 0, 0
+    yield Begun(SCHEMA, recording.graph, recording.settings, facts)
+    for now_ns, events, actions, accounts, ended in in_order(recording, jobs):
+        yield Stepped(now_ns, events, actions)
+        for unit, account in accounts:
+            yield Accounted(now_ns, unit, account)
+        for job in ended:
+            yield Worked(job, {})
+        core.step(now_ns, events)
+        if (count := core.ledger.left_out) != counted:
+            counted = count
+            yield Counted(now_ns, core.ledger.lost_by_cause, core.ledger.dropped_by_cause)
+    yield Ended(now_ns, report)
 
 
 def _fields(record: Record) -> list[Any]:

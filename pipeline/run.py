@@ -23,6 +23,7 @@ from trilane.pipeline.signals import Interrupts
 from trilane.pipeline.surroundings import on_cores, prompt_answers, unit_processes
 from trilane.pipeline.unit_processes import UnitProcesses
 from trilane.pipeline.unit_starter import UnitStarter
+from trilane.scheduler.accounts import second_accounts
 from trilane.scheduler.causes import Outcome, OutcomeKind
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import Settings
@@ -127,7 +128,7 @@ def run_pipeline(
         report["xrbench"]["energy"] = energy_score(1e3 * governor.power_w / report["fps"])
     for unit, row in report["units"].items():
         row.update(pid=run.pids[unit], **pipeline.units[unit].model_dump(mode="json"))
-    add_accounts(report, pipeline, clock.cpu, run.recording, clock.jobs, log)
+    add_accounts(report, pipeline, clock.cpu, second_accounts(run.recording, clock.jobs), log)
     report["core_efficiency"] = core_efficiency(report, pipeline)
     return run.result(metrics_of(report))
 

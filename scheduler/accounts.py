@@ -1,21 +1,24 @@
 """The accounts a second time, from the slices that a trace shows. Rule: nothing here is asked of the ledger.
 
 A unit's timeline is cut into slices: a job, or idle for one cause. Whether it had a job and whether its process was up
-follows from the recorded events and actions; why it had none is what the core noted of it after each step. The ledger
-adds up as the run goes on, this file afterwards; where they differ, one of them is wrong.
+follows from the recorded events and actions; why it had none is what the core noted of it after each step. What is held
+of a run while it is cut is bounded by what it has in flight, however long it lasts.
 """
 
 from __future__ import annotations
 
-from bisect import bisect_left
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import pairwise
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping
+from heapq import heappop, heappush
 from typing import Any, NamedTuple
 
 from trilane.scheduler.events import (
+    NEVER,
     Action,
     Dispatch,
+    Event,
     Finish,
+    Graph,
     JobDone,
     JobFailed,
     Kill,
@@ -51,55 +54,173 @@ class Span(NamedTuple):
     end_ns: int
 
 
-def span_of(recording: Recording) -> Span | None:
-    """The time that the accounts are about; None for a run in which not every unit got ready, or that has no end."""
-    missing, begin_ns = set(recording.graph.units), None
-    for now_ns, events, actions in recording.steps:
-        if begin_ns is None:
-            missing -= {event.unit for event in events if isinstance(event, UnitReady)}
-            begin_ns = None if missing else now_ns
-        if begin_ns is not None and any(isinstance(action, Finish) for action in actions):
-            return Span(begin_ns, now_ns)
-    return None
+class Moment(NamedTuple):
+    """A step of the scheduler, the (unit, account) that were noted after it, and the jobs whose end it heard."""
+
+    now_ns: int
+    events: tuple[Event, ...]
+    actions: tuple[Action, ...]
+    accounts: list[tuple[str, int]]
+    jobs: list[JobRecord]
 
 
-def idle_slices(recording: Recording, jobs: Sequence[JobRecord]) -> list[IdleSlice]:
-    """The time of each unit in which none of `jobs` ran, in order, cut where its cause changes."""
-    span = span_of(recording)
-    if span is None:
-        return []
-    of_unit: dict[str, list[JobRecord]] = {unit: [] for unit in recording.graph.units}
+def in_order(recording: Recording, jobs: Iterable[JobRecord]) -> Iterator[Moment]:
+    """The steps of a run that is in memory, each with what follows from it."""
+    accounts = deque(recording.accounts)
+    ended: dict[str, deque[JobRecord]] = {unit: deque() for unit in recording.graph.units}
     for job in sorted(jobs, key=lambda job: job.begin_ns):
-        of_unit[job.unit].append(job)
-    return [
-        piece
-        for unit, begin_ns, end_ns, cause in _causes(recording, span)
-        for piece in _without_jobs(IdleSlice(unit, cause, begin_ns, end_ns), of_unit[unit])
-    ]
+        ended[job.unit].append(job)
+    for now_ns, events, actions in recording.steps:
+        moment = Moment(now_ns, events, actions, [], [])
+        while accounts and accounts[0][0] <= now_ns:
+            moment.accounts.append(accounts.popleft()[1:])
+        for event in events:
+            while type(event) is JobDone and ended[event.unit] and ended[event.unit][0].end_ns <= event.t_end_ns:
+                moment.jobs.append(ended[event.unit].popleft())
+        yield moment
 
 
-def shares(span: Span, jobs: Iterable[JobRecord], idle: Iterable[IdleSlice]) -> dict[str, dict[str, float]]:
-    """Of each unit that has a slice: the share of `busy` and of each cause in the time of the span."""
-    total_ns = max(span.end_ns - span.begin_ns, 1)
-    sums: dict[str, dict[str, int]] = {}
-    for piece in idle:
-        row = sums.setdefault(piece.unit, dict.fromkeys((BUSY, *CAUSES, UNEXPLAINED), 0))
-        row[PREEMPTED] += piece.preempted_ns
-        row[piece.cause] += piece.end_ns - piece.begin_ns - piece.preempted_ns
-    for job in jobs:
-        row = sums.setdefault(job.unit, dict.fromkeys((BUSY, *CAUSES, UNEXPLAINED), 0))
+class IdleCutter:
+    """Cuts the idle time of a run into slices, while the run goes on or afterwards.
+
+    To be told a `step`, then each `account` that was noted after it and each `job` whose end it heard, then the next
+    step; after the last one `end`. What `step` and `end` hand back are the slices that are known by then, in the order
+    of their ends.
+
+    `span`: the time that the accounts are about; None until the run has finished, and of one in which not every unit
+    got ready, which has no slices.
+    """
+
+    def __init__(self, graph: Graph) -> None:
+        self.span: Span | None = None
+        self._units = {unit: _UnitState(unit) for unit in graph.units}
+        self._missing = set(graph.units)
+        self._begin_ns: int | None = None
+        self._now_ns = 0
+        self._held: list[tuple[int, int, IdleSlice]] = []
+        self._count = 0
+
+    def step(self, now_ns: int, events: Iterable[Event], actions: Iterable[Action]) -> list[IdleSlice]:
+        """The next step of the scheduler, with which the one before is complete."""
+        slices = self._settle()
+        self._now_ns = now_ns
+        for event in events:
+            self._hear(event)
+        if self._begin_ns is None and not self._missing:
+            self._begin_ns = now_ns
+        for action in actions:
+            _hear_action(self._units, action)
+            if type(action) is Finish and self._begin_ns is not None:
+                self.span = Span(self._begin_ns, now_ns)
+        return slices
+
+    def account(self, unit: str, account: int) -> None:
+        """From the last step on the time of `unit` without a job goes to `account` (`trilane.scheduler.ledger`)."""
+        self._units[unit].account = account
+
+    def job(self, job: JobRecord) -> None:
+        """A job whose end the last step heard; those of a unit come in the order in which it did them."""
+        self._hold(self._units[job.unit].cut(job))
+
+    def end(self) -> list[IdleSlice]:
+        """The slices that are left, until the last step; nothing may be told after it."""
+        if self._begin_ns is not None:
+            for unit in self._units.values():
+                self._hold(unit.note(self._now_ns, ""))
+        return self._take(NEVER)
+
+    def _hear(self, event: Any) -> None:
+        unit = self._units.get(getattr(event, "unit", ""))
+        if unit is not None:
+            unit.hear(event)
+            if type(event) is UnitReady:
+                self._missing.discard(unit.name)
+
+    def _settle(self) -> list[IdleSlice]:
+        """Note what the last step left each unit with; the slices of all units that end before any that may follow."""
+        if self._begin_ns is None:
+            return []
+        for unit in self._units.values():
+            self._hold(unit.note(self._now_ns, unit.cause))
+        return self._take(min(unit.cut_until_ns(self._now_ns) for unit in self._units.values()))
+
+    def _hold(self, slices: Iterable[IdleSlice]) -> None:
+        for piece in slices:
+            self._count += 1
+            heappush(self._held, (piece.end_ns, self._count, piece))
+
+    def _take(self, until_ns: int) -> list[IdleSlice]:
+        taken = []
+        while self._held and self._held[0][0] <= until_ns:
+            taken.append(heappop(self._held)[2])
+        return taken
+
+
+def slices_of(cutter: IdleCutter, recording: Recording, jobs: Iterable[JobRecord]) -> Iterator[IdleSlice]:
+    """Tell `cutter` a whole run that is in memory; what it hands back."""
+    for moment in in_order(recording, jobs):
+        yield from cutter.step(moment.now_ns, moment.events, moment.actions)
+        for unit, account in moment.accounts:
+            cutter.account(unit, account)
+        for job in moment.jobs:
+            cutter.job(job)
+    yield from cutter.end()
+
+
+def idle_slices(recording: Recording, jobs: Iterable[JobRecord]) -> list[IdleSlice]:
+    """The time of each unit in which none of `jobs` ran, cut where its cause changes, in the order of their ends.
+
+    Of a run that is in memory; none of one that has no span.
+    """
+    cutter = IdleCutter(recording.graph)
+    slices = list(slices_of(cutter, recording, jobs))
+    return slices if cutter.span is not None else []
+
+
+class ShareSums:
+    """Adds up a run's jobs and idle slices, in any order."""
+
+    def __init__(self) -> None:
+        self._sums: dict[str, dict[str, int]] = {}
+
+    def add_job(self, job: JobRecord) -> None:
+        """One that has ended."""
+        row = self._row(job.unit)
         row[PREEMPTED] += job.preempted_ns
         row[OVERHEAD] += job.asleep_ns
         row[BUSY] += job.end_ns - job.begin_ns - job.preempted_ns - job.asleep_ns
-    return {
-        unit: {name: ns / total_ns for name, ns in row.items() if name != UNEXPLAINED} for unit, row in sums.items()
-    }
+
+    def add_idle(self, piece: IdleSlice) -> None:
+        """One that `IdleCutter` handed back."""
+        row = self._row(piece.unit)
+        row[PREEMPTED] += piece.preempted_ns
+        row[piece.cause] += piece.end_ns - piece.begin_ns - piece.preempted_ns
+
+    def shares(self, span: Span | None) -> dict[str, dict[str, float]]:
+        """Of each unit that has a slice: the share of `busy` and of each cause in the time of the span.
+
+        Empty for a run that has none.
+        """
+        if span is None:
+            return {}
+        total_ns = max(span.end_ns - span.begin_ns, 1)
+        return {
+            unit: {name: ns / total_ns for name, ns in row.items() if name != UNEXPLAINED}
+            for unit, row in self._sums.items()
+        }
+
+    def _row(self, unit: str) -> dict[str, int]:
+        return self._sums.setdefault(unit, dict.fromkeys((BUSY, *CAUSES, UNEXPLAINED), 0))
 
 
-def second_accounts(recording: Recording, jobs: Sequence[JobRecord]) -> dict[str, dict[str, float]]:
-    """`shares` of a whole run; empty for one that has no span."""
-    span = span_of(recording)
-    return {} if span is None else shares(span, jobs, idle_slices(recording, jobs))
+def second_accounts(recording: Recording, jobs: Iterable[JobRecord]) -> dict[str, dict[str, float]]:
+    """The shares of a whole run that is in memory, as `ShareSums` has them."""
+    cutter, sums, ended = IdleCutter(recording.graph), ShareSums(), list(jobs)
+    for job in ended:
+        sums.add_job(job)
+    for piece in slices_of(cutter, recording, ended):
+        sums.add_idle(piece)
+    return sums.shares(cutter.span)
 
 
 def largest_difference(units: Mapping[str, Mapping[str, Any]], second: Mapping[str, Mapping[str, float]]) -> float:
@@ -115,45 +236,27 @@ def largest_difference(units: Mapping[str, Mapping[str, Any]], second: Mapping[s
     return max(found, default=0.0)
 
 
-def compared(units: Mapping[str, Mapping[str, Any]], recording: Recording, jobs: Sequence[JobRecord]) -> dict[str, Any]:
+def compared(units: Mapping[str, Mapping[str, Any]], second: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
     """`accounts` of a report: the second accounts of a run beside its `units`, as the ledger reported them."""
-    second = second_accounts(recording, jobs)
     difference = largest_difference(units, second)
     return {"units": second, "largest_difference": difference, "agree": difference <= LARGEST_DIFFERENCE}
 
 
-def _causes(recording: Recording, span: Span) -> list[tuple[str, int, int, str]]:
-    """(unit, begin, end, cause) over the span: overhead while the unit had a job or its process was not up."""
-    units = {unit: _UnitState() for unit in recording.graph.units}
-    noted: dict[int, list[tuple[str, int]]] = {}
-    for now_ns, name, account in recording.accounts:
-        noted.setdefault(now_ns, []).append((name, account))
-    for now_ns, events, actions in recording.steps:
-        for event in events:
-            if (name := getattr(event, "unit", "")) in units:
-                units[name].hear(event)
-        for action in actions:
-            _hear_action(units, action)
-        for name, account in noted.get(now_ns, ()):
-            units[name].account = account
-        for unit in units.values():
-            unit.note(max(now_ns, span.begin_ns))
-    return [
-        (name, begin_ns, end_ns, cause)
-        for name, unit in units.items()
-        for (begin_ns, cause), (end_ns, _) in pairwise([*unit.changes, (span.end_ns, "")])
-        if end_ns > begin_ns
-    ]
-
-
 class _UnitState:
-    """Which jobs a unit holds, whether its process is up, and what its time was when that changed."""
+    """Which jobs a unit holds and whether its process is up; of its idle slice that goes on, how far it is cut."""
 
-    def __init__(self) -> None:
-        self.jobs: set[int] = set()
-        self.is_up = False
+    def __init__(self, name: str) -> None:
+        self.name = name
         self.account = STARVED
-        self.changes: list[tuple[int, str]] = []
+        self.is_up = False
+        self.jobs: set[int] = set()
+        self._cause = ""
+        self._begin_ns = self._cut_ns = 0
+
+    @property
+    def cause(self) -> str:
+        """Of its time now: overhead while it has a job or its process is not up."""
+        return OVERHEAD if self.jobs or not self.is_up else NAMES.get(self.account, UNEXPLAINED)
 
     def hear(self, event: Any) -> None:
         if type(event) in (JobDone, JobFailed):
@@ -164,10 +267,24 @@ class _UnitState:
             self.jobs.clear()
             self.is_up = False
 
-    def note(self, now_ns: int) -> None:
-        cause = OVERHEAD if self.jobs or not self.is_up else NAMES.get(self.account, UNEXPLAINED)
-        if not self.changes or self.changes[-1][1] != cause:
-            self.changes.append((now_ns, cause))
+    def note(self, now_ns: int, cause: str) -> Iterator[IdleSlice]:
+        """From now on its time has this cause; what is left of the slice before, if that had another."""
+        if cause != self._cause:
+            if self._cause and now_ns > self._cut_ns:
+                yield IdleSlice(self.name, self._cause, self._cut_ns, now_ns)
+            self._cause, self._begin_ns, self._cut_ns = cause, now_ns, now_ns
+
+    def cut(self, job: JobRecord) -> Iterator[IdleSlice]:
+        """The piece between the job before and this one; only of a slice of overhead, for in others it has no job."""
+        if self._cause == OVERHEAD and job.begin_ns >= self._begin_ns:
+            if job.begin_ns > self._cut_ns:
+                lost_ns = min(job.preempted_before_ns, job.begin_ns - self._cut_ns)
+                yield IdleSlice(self.name, OVERHEAD, self._cut_ns, job.begin_ns, lost_ns)
+            self._cut_ns = max(self._cut_ns, job.end_ns)
+
+    def cut_until_ns(self, now_ns: int) -> int:
+        """No slice that may still come ends before this: those between jobs that it holds, or later than now."""
+        return self._cut_ns if self.jobs else now_ns
 
 
 def _hear_action(units: Mapping[str, _UnitState], action: Action) -> None:
@@ -175,20 +292,3 @@ def _hear_action(units: Mapping[str, _UnitState], action: Action) -> None:
         units[action.job.unit].jobs.add(action.job.id)
     elif type(action) is Kill:
         units[action.unit].is_up = False
-
-
-def _without_jobs(idle: IdleSlice, jobs: Sequence[JobRecord]) -> Iterator[IdleSlice]:
-    """The pieces of a slice between `jobs`, which are of its unit and in order; other causes have none."""
-    if idle.cause != OVERHEAD:
-        yield idle
-        return
-    begin_ns = idle.begin_ns
-    for job in jobs[bisect_left(jobs, begin_ns, key=lambda job: job.begin_ns) :]:
-        if job.begin_ns >= idle.end_ns:
-            break
-        if job.begin_ns > begin_ns:
-            lost_ns = min(job.preempted_before_ns, job.begin_ns - begin_ns)
-            yield idle._replace(begin_ns=begin_ns, end_ns=job.begin_ns, preempted_ns=lost_ns)
-        begin_ns = max(begin_ns, job.end_ns)
-    if begin_ns < idle.end_ns:
-        yield idle._replace(begin_ns=begin_ns)

@@ -166,6 +166,11 @@ class Ledger:
             self.lateness_ns.append(end_ns - deadline_ns)
 
     @property
+    def left_out(self) -> int:
+        """How many frames were lost or dropped so far."""
+        return sum(self.lost.values()) + sum(self.dropped.values())
+
+    @property
     def lost_by_cause(self) -> dict[str, int]:
         """Frames lost, by the cause's key in the report."""
         return dict(sorted((str(loss), count) for loss, count in self.lost.items()))

@@ -61,7 +61,7 @@ def times(done: Simulation, stage: str) -> list[tuple[float, ...]]:
 
 def agrees(done: Simulation) -> None:
     assert done.recording is not None
-    found = compared(done.report["units"], done.recording, done.jobs)
+    found = compared(done.report["units"], second_accounts(done.recording, done.jobs))
     assert found["largest_difference"] < 1e-12
     assert all(sum(row.values()) == pytest.approx(1, abs=1e-12) for row in found["units"].values())
 
@@ -184,7 +184,7 @@ def fed(settings: Settings, steps: list[tuple[int, tuple[Event, ...]]], jobs: li
     for now_ns, events in steps:
         recording.add(now_ns, events, core.step(now_ns, events).actions, core)
     report = core.ledger.report(clock="host", requested=settings.frames)
-    assert compared(report["units"], recording, jobs)["largest_difference"] < 1e-12
+    assert compared(report["units"], second_accounts(recording, jobs))["largest_difference"] < 1e-12
     return report
 
 
@@ -302,7 +302,7 @@ def test_time_under_another_cause_shows(cause: str, wrong: str) -> None:
     for row in done.report["units"].values():
         row["idle"][cause], row["idle"][wrong] = row["idle"][cause] / 2, row["idle"][wrong] + row["idle"][cause] / 2
     assert done.recording is not None
-    moved = compared(done.report["units"], done.recording, done.jobs)["largest_difference"]
+    moved = compared(done.report["units"], second_accounts(done.recording, done.jobs))["largest_difference"]
     assert moved == pytest.approx(max(row["idle"][cause] for row in done.report["units"].values()))
     assert moved > LARGEST_DIFFERENCE
 
@@ -313,7 +313,7 @@ def test_a_job_that_is_too_long_or_missing_shows() -> None:
     first, *others = done.jobs
     share = 1e6 / (done.report["duration_s"] * 1e9)
     for jobs in ([first._replace(begin_ns=first.begin_ns - MS), *others], others):
-        found = compared(done.report["units"], done.recording, jobs)
+        found = compared(done.report["units"], second_accounts(done.recording, jobs))
         assert found["largest_difference"] >= share - 1e-12
         assert not found["agree"]
 
@@ -323,14 +323,14 @@ def test_a_change_of_cause_that_was_never_noted_shows() -> None:
     done = a_run()
     assert done.recording is not None
     done.recording.accounts[:] = [row for row in done.recording.accounts if row[2] != STARVED]
-    assert not compared(done.report["units"], done.recording, done.jobs)["agree"]
+    assert not compared(done.report["units"], second_accounts(done.recording, done.jobs))["agree"]
 
 
 def test_a_unit_without_accounts_is_no_agreement() -> None:
     done = run()
     assert done.recording is not None
     only = [job for job in done.jobs if job.unit == "u"]
-    assert compared({"w": done.report["units"]["u"]}, done.recording, only)["largest_difference"] == 1
+    assert compared({"w": done.report["units"]["u"]}, second_accounts(done.recording, only))["largest_difference"] == 1
 
 
 @pytest.mark.parametrize(("sizes", "where"), [({"frames": 1}, "--frames: found 1"), ({"runs": 0}, "--runs: found 0")])

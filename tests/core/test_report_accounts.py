@@ -36,9 +36,9 @@ def test_accounts_that_contradict_themselves_are_told(monkeypatch: pytest.Monkey
     cpu = CpuTimes({"left": 2, "right": 2})
     cpu.add("right", "mid", Done(0, MS, 2 * MS, 0, 0, 0, 0, 0, 2 * MS, MS // 2, {}), 0)
     report, heard = a_report(), []
-    recording: Any = "recording"
-    accounts.add_accounts(report, PIPELINE, cpu, recording, [], RunLog(heard.append))
-    assert asked == [(report["units"], "recording", [])]
+    second = {"left": {"busy": 0.25}}
+    accounts.add_accounts(report, PIPELINE, cpu, second, RunLog(heard.append))
+    assert asked == [(report["units"], second)]
     assert report["accounts"] == compared
     right = report["units"]["right"]
     assert (right["cpu_s"], right["cpu_in_jobs_s"], right["idle"]) == (0.0025, 0.002, {"preempted": None})

@@ -1,0 +1,58 @@
+"""The idle slices of a run from its journal. Rule: they are cut from what the journal says, and from nothing else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from trilane.pipeline.journal import Accounted, Begun, Record, Stepped, Worked, read_journal
+from trilane.scheduler.accounts import IdleCutter, IdleSlice, ShareSums, Span
+from trilane.scheduler.events import Graph
+
+
+class JournalSlices:
+    """Fed the records of a journal in order, whether or not the run still goes on.
+
+    `add` hands back the slices that are known by then, in the order of their ends; `end`, after the last record, the
+    rest. `span`: as of `IdleCutter`.
+    """
+
+    def __init__(self, graph: Graph) -> None:
+        self._cutter = IdleCutter(graph)
+
+    @property
+    def span(self) -> Span | None:
+        return self._cutter.span
+
+    def add(self, record: Record) -> list[IdleSlice]:
+        """The next record."""
+        match record:
+            case Stepped():
+                return self._cutter.step(*record)
+            case Accounted():
+                self._cutter.account(record.unit, record.account)
+            case Worked():
+                self._cutter.job(record.job)
+        return []
+
+    def end(self) -> list[IdleSlice]:
+        """Until the last step."""
+        return self._cutter.end()
+
+
+def shares_of_journal(path: Path) -> dict[str, dict[str, float]]:
+    """The second accounts of the run whose journal is at `path`. Raises BadInputError for a file that is none."""
+    sums = ShareSums()
+    slices: JournalSlices | None = None
+    for record in read_journal(path):
+        if isinstance(record, Begun):
+            slices = JournalSlices(record.graph)
+        elif slices is not None:
+            if isinstance(record, Worked):
+                sums.add_job(record.job)
+            for piece in slices.add(record):
+                sums.add_idle(piece)
+    if slices is None:
+        return {}
+    for piece in slices.end():
+        sums.add_idle(piece)
+    return sums.shares(slices.span)
