@@ -1,0 +1,244 @@
+"""Figures of a run at any moment, from its journal as it grows. Rule: pure, and of bounded memory.
+
+Of the last `WINDOW_NS` every time is kept, so that percentiles are exact; of the whole run sums and counts alone.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from typing import Any, Final, NamedTuple
+
+from trilane.apps.figures import DropCount, Figures, FrameFigures, Moved, Note, StageFigures, UnitFigures
+from trilane.apps.frame_flow import Done, FrameFlow, Presented
+from trilane.apps.time_histogram import TimeHistogram
+from trilane.apps.unit_time import UnitTime
+from trilane.figure_sources import COMPUTED, MEASURED
+from trilane.pipeline.journal import Accounted, Begun, Counted, Ended, Record, Said, Sampled, Stepped, Worked
+from trilane.scheduler.events import Event, Finish, Start, UnitDied, UnitReady
+from trilane.scheduler.ledger import STARVED
+from trilane.scheduler.stats import NS_PER_MS, summary_ms
+
+WINDOW_NS: Final = 5_000_000_000
+NS_PER_S: Final = 1e9
+MOST_NOTES = 5
+BYTES = "bytes_"
+TEMPERATURE, DUTY = "temperature_c.", "duty."
+SENSOR = "sensor"  # this machine's own, beside those that are modelled
+OF_THE_RUN = ("fps", "run_fps", "frame_time_ms", "latency_ms", "frames", "units", "stages", "frame_times", "latencies")
+
+
+class _Work(NamedTuple):
+    """A job of a stage: its end, how long it took, and the bytes that it moved by kind."""
+
+    end_ns: int
+    service_ns: int
+    bytes: Mapping[str, float]
+
+
+class _StageBook:
+    """Jobs of a stage: those of the window, and the bytes of all."""
+
+    def __init__(self) -> None:
+        self.recent: deque[_Work] = deque()
+        self.bytes: Counter[str] = Counter()
+
+    def add(self, work: _Work) -> None:
+        self.bytes.update(work.bytes)
+        self.recent.append(work)
+        while self.recent[0].end_ns < work.end_ns - WINDOW_NS:
+            self.recent.popleft()
+
+    def now(self, unit: str, waiting: int, from_ns: int) -> StageFigures:
+        works = [work for work in self.recent if work.end_ns > from_ns]
+        count = max(len(works), 1)
+        moved = {
+            kind: Moved(float(total), sum(work.bytes.get(kind, 0.0) for work in works) / count)
+            for kind, total in sorted(self.bytes.items())
+        }
+        return StageFigures(unit, waiting, sum(work.service_ns for work in works) / count / NS_PER_MS, moved)
+
+
+class LiveFigures:
+    """`add` the records that follow `begun`, in order; `now` gives the figures of a moment that is not before them."""
+
+    def __init__(self, begun: Begun) -> None:
+        self._graph, self._facts, self._settings = begun.graph, begun.facts, begun.settings
+        self._flow = FrameFlow(begun.graph, begun.settings)
+        self._first_ns: int | None = None
+        self._start_ns: int | None = None
+        self._last_ns = 0
+        self._is_over = False
+        self._up: set[str] = set()
+        self._accounts = dict.fromkeys(begun.graph.units, STARVED)
+        self._times: dict[str, UnitTime] = {}
+        self._jobs, self._restarts = Counter[str](), Counter[str]()
+        self._stages = {stage.name: _StageBook() for stage in begun.graph.stages}
+        self._recent: deque[Presented] = deque()
+        self._first_end_ns = 0
+        self._frame_times, self._latencies = TimeHistogram(), TimeHistogram()
+        self._lost: Mapping[str, int] = {}
+        self._dropped: Mapping[str, int] = {}
+        self._sampled: dict[str, float] = {}
+        self._notes: deque[Note] = deque(maxlen=MOST_NOTES)
+        self._adders: dict[type[Any], Callable[[Any], None]] = {
+            Stepped: self._add_step,
+            Accounted: self._add_account,
+            Worked: self._add_work,
+            Counted: self._add_counts,
+            Sampled: self._add_sample,
+            Said: self._add_note,
+            Ended: self._add_end,
+        }
+
+    @property
+    def last_ns(self) -> int:
+        """The time of the last record that has one; 0 before the first."""
+        return self._last_ns
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the run's last record was added."""
+        return self._is_over
+
+    def add(self, record: Record) -> None:
+        """A record of the journal, but for the first."""
+        self._adders[type(record)](record)
+
+    def now(self, now_ns: int | None = None) -> Figures:
+        """At `now_ns`, of the run's clock; where it is None or earlier, at the last record."""
+        now_ns = max(now_ns or 0, self._last_ns)
+        start_ns = now_ns if self._start_ns is None else self._start_ns
+        window_s = min(now_ns - start_ns, WINDOW_NS) / NS_PER_S
+        recent = [each for each in self._recent if each.end_ns > now_ns - WINDOW_NS]
+        clock = str(self._facts.get("clock", ""))
+        return Figures(
+            t_ms=self._since_first_ms(now_ns),
+            window_s=window_s,
+            run_s=(now_ns - start_ns) / NS_PER_S,
+            clock=clock,
+            is_over=self._is_over,
+            fps=len(recent) / window_s if window_s else 0.0,
+            run_fps=self._run_fps(),
+            frame_time_ms=summary_ms(each.interval_ns for each in recent if each.interval_ns is not None),
+            latency_ms=summary_ms(each.latency_ns for each in recent),
+            frames=self._frame_figures(),
+            units={unit: self._unit_figures(unit, now_ns) for unit in self._graph.units},
+            stages=self._stage_figures(now_ns),
+            temperature_c=self._values(TEMPERATURE),
+            duty=self._values(DUTY),
+            notes=tuple(self._notes),
+            frame_times=self._frame_times.now(),
+            latencies=self._latencies.now(),
+            began_at=str(self._facts.get("began_at", "")),
+            accuracy=dict(self._facts.get("accuracy") or {}),
+            sources=self._sources(clock),
+        )
+
+    # records
+
+    def _add_step(self, step: Stepped) -> None:
+        self._last_ns = step.now_ns
+        if self._first_ns is None:
+            self._first_ns = step.now_ns
+        for event in step.events:
+            self._hear(step.now_ns, event)
+        for outcome in self._flow.step(step.now_ns, step.events, step.actions):
+            if isinstance(outcome, Done):
+                self._jobs[outcome.job.unit] += 1
+                self._times[outcome.job.unit].add_job(outcome.event)
+            else:
+                self._add_presented(outcome)
+        for action in step.actions:
+            if type(action) is Start:
+                self._restarts[action.unit] += 1
+            elif type(action) is Finish:
+                self._flow.end()
+
+    def _hear(self, now_ns: int, event: Event) -> None:
+        if type(event) is UnitReady:
+            self._up.add(event.unit)
+            if self._start_ns is None and self._up.issuperset(self._graph.units):
+                self._start_ns = now_ns
+                self._times = {unit: UnitTime(now_ns, WINDOW_NS, self._accounts[unit]) for unit in self._graph.units}
+        elif type(event) is UnitDied:
+            self._up.discard(event.unit)
+
+    def _add_presented(self, presented: Presented) -> None:
+        if presented.interval_ns is None:
+            self._first_end_ns = presented.end_ns
+        else:
+            self._frame_times.add(presented.interval_ns)
+        self._latencies.add(presented.latency_ns)
+        self._recent.append(presented)
+        while self._recent[0].end_ns < presented.end_ns - WINDOW_NS:
+            self._recent.popleft()
+
+    def _add_account(self, entry: Accounted) -> None:
+        self._accounts[entry.unit] = entry.account
+        if entry.unit in self._times:
+            self._times[entry.unit].enter(entry.now_ns, entry.account)
+
+    def _add_work(self, work: Worked) -> None:
+        job = work.job
+        moved = {name.removeprefix(BYTES): value for name, value in work.figures.items() if name.startswith(BYTES)}
+        self._stages[job.stage].add(_Work(job.end_ns, job.end_ns - job.begin_ns, moved))
+
+    def _add_counts(self, counts: Counted) -> None:
+        self._lost, self._dropped = counts.lost, counts.dropped
+        self._flow.count(counts.lost, counts.dropped)
+
+    def _add_sample(self, sample: Sampled) -> None:
+        self._sampled.update(sample.values)
+
+    def _add_note(self, said: Said) -> None:
+        self._notes.append(Note(self._since_first_ms(said.now_ns), said.text))
+
+    def _add_end(self, ended: Ended) -> None:
+        self._last_ns = max(self._last_ns, ended.now_ns)
+        self._is_over = True
+
+    # figures
+
+    def _since_first_ms(self, now_ns: int) -> float:
+        return 0.0 if self._first_ns is None else (now_ns - self._first_ns) / NS_PER_MS
+
+    def _run_fps(self) -> float:
+        span_ns = self._recent[-1].end_ns - self._first_end_ns if self._recent else 0
+        return (self._flow.presented - 1) * NS_PER_S / span_ns if span_ns else 0.0
+
+    def _frame_figures(self) -> FrameFigures:
+        flow = self._flow
+        dropped = tuple(_drop_count(key, count) for key, count in self._dropped.items())
+        requested = self._settings.frames
+        return FrameFigures(requested, flow.presented, flow.skipped, flow.in_flight, dict(self._lost), dropped)
+
+    def _unit_figures(self, unit: str, now_ns: int) -> UnitFigures:
+        held = next(iter(self._flow.held[unit]), None)
+        times = self._times.get(unit) or UnitTime(now_ns, WINDOW_NS)
+        window, run = times.shares(now_ns, held and held.since_ns)
+        stage, frame = (held.job.stage, held.job.frame) if held else ("", -1)
+        return UnitFigures(window, run, self._jobs[unit], self._restarts[unit], unit in self._up, stage, frame)
+
+    def _stage_figures(self, now_ns: int) -> dict[str, StageFigures]:
+        running_ns = None if self._start_ns is None else self._last_ns - self._start_ns
+        waiting = self._flow.waiting | {self._graph.stages[0].name: self._flow.waiting_at_source(running_ns)}
+        return {
+            stage.name: self._stages[stage.name].now(stage.unit, waiting[stage.name], now_ns - WINDOW_NS)
+            for stage in self._graph.stages
+        }
+
+    def _values(self, prefix: str) -> dict[str, float]:
+        return {name.removeprefix(prefix): value for name, value in self._sampled.items() if name.startswith(prefix)}
+
+    def _sources(self, clock: str) -> dict[str, str]:
+        """Key to source; the longest key decides."""
+        sources = dict.fromkeys(OF_THE_RUN, COMPUTED if clock == "virtual" else MEASURED)
+        sources |= {"temperature_c": COMPUTED, f"{TEMPERATURE}{SENSOR}": MEASURED, "duty": COMPUTED}
+        accuracy = self._facts.get("accuracy") or {}
+        return sources | {f"accuracy.{name}": facts["source"] for name, facts in accuracy.items() if "source" in facts}
+
+
+def _drop_count(key: str, frames: int) -> DropCount:
+    edge, _, cause = key.rpartition(":")
+    return DropCount(edge, cause, frames)

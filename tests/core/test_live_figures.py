@@ -1,0 +1,320 @@
+"""The figures of a moment: by hand from a small journal, and at every step beside what the scheduler has."""
+
+from __future__ import annotations
+
+import json
+import random
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from trilane.apps.figures import DropCount, Figures, Moved, Shares
+from trilane.apps.live_figures import LiveFigures
+from trilane.pipeline.journal import SCHEMA, Accounted, Begun, Counted, Ended, Record, Said, Sampled, Stepped, Worked
+from trilane.scheduler.causes import Outcome, OutcomeKind
+from trilane.scheduler.core import Core
+from trilane.scheduler.events import (
+    NEVER,
+    Dispatch,
+    Finish,
+    FrameRequest,
+    Graph,
+    Job,
+    JobDone,
+    SetDuty,
+    Settings,
+    StageSpec,
+    Start,
+    Stop,
+    UnitDied,
+    UnitReady,
+    chain,
+)
+from trilane.scheduler.ledger import ASSIGNED, BLOCKED, STARVED, JobRecord
+from trilane.scheduler.virtual import VirtualDriver
+
+MS = 1_000_000
+S = 1_000_000_000
+TWO = chain((("a", "u"), ("b", "v")), "double", "b")
+
+
+def followed(core: Core, driver: VirtualDriver) -> Iterator[list[Record]]:
+    """The journal of a run in virtual time, as a run writes it: the records of each step."""
+    accounts: dict[str, int] = {}
+    counts: Any = ({}, {})
+    deadline_ns, booked = NEVER, 0
+    while core.outcome is None:
+        now_ns, events = driver.wait(deadline_ns)
+        actions, deadline_ns = core.step(now_ns, events)
+        driver.perform(now_ns, actions)
+        changed = [unit for unit in core.units.values() if accounts.get(unit.name) != unit.account]
+        accounts.update((unit.name, unit.account) for unit in changed)
+        found = (core.ledger.lost_by_cause, core.ledger.dropped_by_cause)
+        yield [
+            Stepped(now_ns, events, actions),
+            *(Accounted(now_ns, unit.name, unit.account) for unit in changed),
+            *(Worked(job, {}) for job in driver.jobs[booked:]),
+            *([Counted(now_ns, *found)] if found != counts else []),
+        ]
+        booked, counts = len(driver.jobs), found
+
+
+def hand_made() -> tuple[Begun, list[Record]]:
+    """Two frames through a on u and b on v. Times in ms of a clock that shows 1000 at the start.
+
+    u: does a0 0-20 and a1 25-50, of which 5 are preempted, and waits 10 more until it is told at 60 that none is left.
+    v: starved until 20, b0 20-40, starved 40-50, b1 from 50 on, which has not ended at 70.
+    """
+    t = 1000 * MS
+
+    def job(number: int, stage: str, frame: int) -> Dispatch:
+        return Dispatch(Job(number, "u" if stage == "a" else "v", stage, frame, -1, 0, 0))
+
+    def done(number: int, unit: str, begin: int, end: int, sampled: int = 0, preempted: int = 0) -> JobDone:
+        times = (t + begin * MS, t + end * MS, t + sampled * MS if unit == "u" else 0)
+        return JobDone(unit, number, *times, preempted_ns=preempted * MS)
+
+    def worked(stage: str, frame: int, begin: int, end: int, **figures: float) -> Worked:
+        unit = "u" if stage == "a" else "v"
+        return Worked(JobRecord(stage, unit, frame, t, t, t + begin * MS, t + end * MS), figures)
+
+    begun = Begun(
+        SCHEMA,
+        TWO,
+        Settings(9),
+        {
+            "clock": "host",
+            "began_at": "2026-11-22T10:00:00+00:00",
+            "accuracy": {"default": {"source": "no figures", "why": "never validated"}},
+        },
+    )
+    return begun, [
+        Stepped(t, (UnitReady("u"), UnitReady("v")), (job(0, "a", 0),)),
+        Accounted(t, "u", ASSIGNED),
+        Accounted(t, "v", STARVED),
+        Stepped(t + 20 * MS, (done(0, "u", 0, 20, sampled=2),), (job(1, "a", 1), job(2, "b", 0))),
+        Accounted(t + 20 * MS, "v", ASSIGNED),
+        worked("a", 0, 0, 20, bytes_written=100.0, visible=1.0),
+        Sampled(t + 30 * MS, {"temperature_c.device": 31.5, "duty.u": 0.5, "temperature_c.sensor": 60.0, "load": 3.0}),
+        Stepped(t + 40 * MS, (done(2, "v", 20, 40),), ()),
+        Accounted(t + 40 * MS, "v", STARVED),
+        worked("b", 0, 20, 40, bytes_read=100.0, bytes_written=7.0),
+        Stepped(t + 50 * MS, (done(1, "u", 25, 50, sampled=26, preempted=5),), (job(3, "b", 1),)),
+        Accounted(t + 50 * MS, "v", ASSIGNED),
+        worked("a", 1, 25, 50, bytes_written=300.0),
+        Stepped(t + 60 * MS, (), ()),
+        Accounted(t + 60 * MS, "u", BLOCKED),
+        Said(t + 60 * MS, "so it is"),
+    ]
+
+
+def of(begun: Begun, records: list[Record]) -> LiveFigures:
+    figures = LiveFigures(begun)
+    for record in records:
+        figures.add(record)
+    return figures
+
+
+def rounded(shares: Shares, total_ms: float) -> dict[str, float]:
+    """In ms, without those that are 0."""
+    row = {"busy": shares.busy, **shares.idle}
+    assert sum(row.values()) == pytest.approx(1)
+    return {name: round(share * total_ms, 3) for name, share in row.items() if share}
+
+
+def test_a_journal_by_hand() -> None:
+    figures = of(*hand_made()).now(1070 * MS)
+    assert (figures.t_ms, figures.window_s, figures.run_s, figures.clock, figures.is_over) == (
+        70,
+        0.07,
+        0.07,
+        "host",
+        0,
+    )
+    u, v = figures.units["u"], figures.units["v"]
+    # u was assigned 0-60: busy 20 + 25 - 5, preempted 5, overhead the rest
+    assert rounded(u.run, 70) == {"busy": 40, "preempted": 5, "overhead": 15, "blocked": 10}
+    assert rounded(v.run, 70) == {"busy": 40, "starved": 30}  # b1 still runs, from 50 on
+    assert (u.window, v.window) == (u.run, v.run)
+    assert [(each.jobs, each.restarts, each.is_up, each.stage, each.frame) for each in (u, v)] == [
+        (2, 0, True, "", -1),
+        (1, 0, True, "b", 1),
+    ]
+    frames = figures.frames
+    assert (frames.requested, frames.presented, frames.in_flight, frames.lost, frames.dropped) == (9, 1, 1, {}, ())
+    assert figures.latency_ms["p50"] == 40 - 2
+    assert (figures.latency_ms["samples"], figures.frame_time_ms["samples"]) == (1, 0)
+    assert (figures.fps, figures.run_fps) == (pytest.approx(1 / 0.07), 0)
+    a, b = figures.stages["a"], figures.stages["b"]
+    assert (a.unit, a.waiting, a.service_ms, a.bytes) == ("u", 0, 22.5, {"written": Moved(400, 200)})
+    assert (b.waiting, b.service_ms, b.bytes) == (0, 20, {"read": Moved(100, 100), "written": Moved(7, 7)})
+    assert figures.temperature_c == {"device": 31.5, "sensor": 60}
+    assert figures.duty == {"u": 0.5}
+    assert [(note.t_ms, note.text) for note in figures.notes] == [(60, "so it is")]
+
+
+def test_the_latency_histogram_has_the_frame_between_its_bounds() -> None:
+    latencies = of(*hand_made()).now().latencies
+    place = latencies.bounds_s.index(0.04)
+    assert latencies.counts[place] == latencies.count == 1
+    assert latencies.sum_s == pytest.approx(0.038)
+    assert list(latencies.bounds_s) == sorted(set(latencies.bounds_s))
+
+
+def test_sources_and_error_stand_beside_the_figures() -> None:
+    begun, records = hand_made()
+    figures = of(begun, records).now()
+    assert figures.accuracy == {"default": {"source": "no figures", "why": "never validated"}}
+    assert figures.sources["fps"] == figures.sources["temperature_c.sensor"] == "measured in this run"
+    assert figures.sources["temperature_c"] == "computed"
+    assert figures.sources["accuracy.default"] == "no figures"
+    computed = LiveFigures(begun._replace(facts={"clock": "virtual"})).now()
+    assert (computed.sources["fps"], computed.accuracy, computed.began_at) == ("computed", {}, "")
+
+
+def test_as_json_can_be_written() -> None:
+    document = of(*hand_made()).now().as_json()
+    assert json.loads(json.dumps(document, allow_nan=False))["units"]["v"]["window"]["idle"]["starved"] == 0.5
+
+
+def test_before_the_first_record_everything_is_nothing() -> None:
+    figures = LiveFigures(hand_made()[0]).now(5)
+    assert (figures.t_ms, figures.fps, figures.run_s, figures.frames.in_flight) == (0, 0, 0, 0)
+    assert figures.units["u"].run == Shares(0, dict.fromkeys(figures.units["u"].run.idle, 0))
+    assert not figures.units["u"].is_up
+
+
+def test_the_window_forgets_and_the_run_does_not() -> None:
+    begun, records = hand_made()
+    figures = of(begun, records)
+    half = figures.now(1020 * MS + 5 * S)
+    # the window begins at 20: v was busy 20-40, starved 40-50, and b1 has run ever since
+    assert rounded(half.units["v"].window, 5000) == {"busy": 4990, "starved": 10}
+    assert rounded(half.units["v"].run, 5020) == {"busy": 4990, "starved": 30}
+    cut = figures.now(1030 * MS + 5 * S)
+    # a1 began at 25 and is cut at 30: of its 20 busy and 5 preempted ms four fifths are left; assigned 30-60
+    assert rounded(cut.units["u"].window, 5000) == {"busy": 16, "preempted": 4, "overhead": 10, "blocked": 4970}
+    later = figures.now(1041 * MS + 5 * S)
+    assert (later.fps, later.latency_ms["samples"], later.latencies.count) == (0, 0, 1)
+    assert later.stages["b"].service_ms == 0
+    assert later.stages["b"].bytes == {"read": Moved(100, 0), "written": Moved(7, 0)}
+
+
+def test_a_moment_before_the_last_record_is_the_last_record() -> None:
+    figures = of(*hand_made())
+    assert figures.now(0) == figures.now() == figures.now(1060 * MS)
+
+
+def test_a_unit_that_dies_has_no_job_and_comes_back() -> None:
+    begun, records = hand_made()
+    death = Stepped(1070 * MS, (UnitDied("v"),), (Start("v"),))
+    figures = of(begun, [*records, death, Counted(1070 * MS, {"died:v": 1}, {})])
+    now = figures.now(1080 * MS)
+    assert (now.units["v"].is_up, now.units["v"].restarts, now.units["v"].stage) == (False, 1, "")
+    assert (now.frames.in_flight, now.frames.lost) == (0, {"died:v": 1})
+    assert rounded(now.units["v"].run, 80) == {"busy": 20, "starved": 30, "overhead": 30}
+    figures.add(Stepped(1090 * MS, (UnitReady("v"),), ()))
+    assert figures.now().units["v"].is_up
+
+
+def test_drops_by_edge_and_cause() -> None:
+    begun, records = hand_made()
+    dropped = {"a->b:stale": 2, "source->a:queue_full": 3}
+    now = of(begun, [*records, Counted(1061 * MS, {}, dropped)]).now()
+    assert now.frames.dropped == (DropCount("a->b", "stale", 2), DropCount("source->a", "queue_full", 3))
+
+
+def test_drops_of_the_step_that_ends_the_run_leave_no_queue_behind() -> None:
+    begun, records = hand_made()
+    finish = Stepped(1061 * MS, (), (Finish(Outcome(OutcomeKind.GAVE_UP, "u")),))
+    now = of(begun, [*records, finish, Counted(1061 * MS, {}, {"a->b:stale": 2})]).now()
+    assert (now.stages["b"].waiting, now.units["v"].stage) == (0, "")
+
+
+def test_the_end_is_told() -> None:
+    begun, records = hand_made()
+    now = of(begun, [*records, Ended(1090 * MS, {})]).now()
+    assert (now.is_over, now.t_ms) == (True, 90)
+
+
+BYPASS = Graph(
+    tuple(StageSpec(name, unit) for name, unit in zip("abcd", "uvwv", strict=True)),
+    ("double",) * 3,
+    "d",
+    ("a", "d"),
+)
+FOUR = chain(zip("abcd", "uvwv", strict=True), "double", "c")
+PACE: dict[str, Any] = {"period_ns": 6 * MS, "deadline_ns": 18 * MS}
+CASES: dict[str, tuple[Graph, Settings, dict[str, Any]]] = {
+    "pipelined": (FOUR, Settings(60), {}),
+    "sequential": (FOUR, Settings(30, "sequential"), {}),
+    "latest": (FOUR, Settings(90, "latest", **PACE), {}),
+    "mailbox": (chain(zip("abcd", "uvwv", strict=True), "orphan:4", "d"), Settings(90, "latest", **PACE), {}),
+    "triple": (chain(zip("abcd", "uvwv", strict=True), "triple", "d"), Settings(90), {}),
+    "deadline": (FOUR, Settings(90, "deadline", **PACE), {}),
+    "queue": (FOUR, Settings(90, in_queue=2, queue_timeout_ns=30 * MS, **PACE), {}),
+    "arrivals": (FOUR, Settings(40, arrivals_ns=tuple(3 * n * MS for n in range(40))), {}),
+    "asked": (FOUR, Settings(40, asked=True), {"inputs": [(1, FrameRequest(9)), (50 * MS, FrameRequest(40))]}),
+    "faults": (FOUR, Settings(90, max_failures=9), {"faults": [(31 * MS, "v"), (77 * MS, "u"), (99 * MS, "w")]}),
+    "given up": (FOUR, Settings(90, max_failures=0, **PACE), {"faults": [(150 * MS, "v")]}),
+    "stopped": (FOUR, Settings(90, **PACE), {"inputs": [(100 * MS, Stop())]}),
+    "duty": (FOUR, Settings(40), {"inputs": [(20 * MS, SetDuty("w", 400))]}),
+    "bypass": (BYPASS, Settings(90, "latest", **PACE), {"skips": lambda frame, fresh: frame % 3 > 0 and not fresh}),
+    "bypass, faults": (
+        BYPASS,
+        Settings(90, max_failures=9),
+        {"skips": lambda frame, fresh: frame % 4 > 1 and not fresh, "faults": [(40 * MS, "v"), (90 * MS, "u")]},
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_at_every_step_frames_are_where_the_scheduler_has_them(case: str) -> None:
+    """And at the end the shares and times are those of the ledger, which keeps them by itself."""
+    graph, settings, options = CASES[case]
+    luck = random.Random(7)
+
+    def service(*_: Any) -> int:
+        return luck.randrange(MS, 9 * MS)
+
+    driver = VirtualDriver(graph, settings, service, message_delay_ns=MS // 4, restart_ns=5 * MS, keep=True, **options)
+    core, figures = driver.core, LiveFigures(Begun(SCHEMA, graph, settings, {"clock": "virtual"}))
+    for records in followed(core, driver):
+        for record in records:
+            figures.add(record)
+        if core.outcome is None:
+            assert_frames(figures.now(), core)
+    now, report = figures.now(), core.ledger.report(clock="virtual", requested=settings.frames)
+    assert_shares(now, report)
+    frames = report["frames"]
+    assert (now.frames.presented, now.frames.lost) == (frames["presented"], frames["lost_by_cause"])
+    assert {f"{drop.edge}:{drop.cause}": drop.frames for drop in now.frames.dropped} == frames["dropped"]
+    assert (now.frames.skipped, now.frames.in_flight) == (frames.get("skipped", 0), 0)
+    assert {stage.waiting for stage in now.stages.values()} == {0}
+    assert now.run_fps == pytest.approx(report["fps"])
+    assert now.frame_time_ms == {key: report["frame_time_ms"][key] for key in now.frame_time_ms}
+    assert now.latency_ms == report["latency_ms"]
+    assert now.frame_times.count == report["frame_time_ms"]["samples"] == max(frames["presented"] - 1, 0)
+    assert now.latencies.sum_s == pytest.approx(sum(core.ledger.latency_ns) / S)
+
+
+def assert_frames(now: Figures, core: Core) -> None:
+    """Where frames are and what units do, beside the slots and queues of the scheduler."""
+    assert now.frames.in_flight == len(core.frames)
+    for stage in core.stages:
+        waiting = len(core.source.queue) if stage.input is None else len(stage.input.ready)
+        waiting += len(stage.bypassed.passing) if stage.bypassed is not None else 0
+        assert now.stages[stage.name].waiting == waiting, stage.name
+    for name, unit in core.units.items():
+        job = unit.queue[0] if unit.queue else None
+        assert (now.units[name].stage, now.units[name].frame) == ((job.stage, job.frame) if job else ("", -1))
+        assert sum((now.units[name].window.busy, *now.units[name].window.idle.values())) in (0, pytest.approx(1))
+
+
+def assert_shares(now: Figures, report: dict[str, Any]) -> None:
+    for unit, row in report["units"].items():
+        own = now.units[unit]
+        assert (own.run.busy, own.run.idle) == (pytest.approx(row["busy"]), pytest.approx(row["idle"]))
+        assert own.window.idle == pytest.approx(own.run.idle, abs=1e-6)  # the run is shorter than the window
+        assert (own.jobs, own.restarts) == (row["jobs"], row["restarts"])
