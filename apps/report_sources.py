@@ -25,6 +25,7 @@ SOURCES = {
     "efficiency": MEASURED,
     "core_efficiency": MEASURED,
     "isolated_ms": MEASURED,
+    "other_programs": MEASURED,
     "caps": COMPUTED,
     "temperature_c": COMPUTED,
     "temperature_c.sensor": MEASURED,

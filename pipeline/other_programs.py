@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import psutil
@@ -28,6 +29,25 @@ class OtherPrograms:
         own = [process.cpu_times() for process in self._processes]
         own_s: float = sum(times.user + times.system for times in own)
         return busy_s(self._stat.read_text(), self._cores) - own_s
+
+
+def beside_units(cores: Sequence[int], pids: Mapping[str, int]) -> Callable[[Mapping[str, int]], float | None]:
+    """Counts from now on, on `cores`, beside the processes `pids` of units.
+
+    What it hands back, called with the units' processes of then, says the others' share; None where a unit has died in
+    between, for then nobody knows what it had.
+    """
+    try:
+        others = OtherPrograms(cores, [*pids.values()])
+    except (psutil.Error, OSError):
+        return lambda _: None
+
+    def share(now: Mapping[str, int]) -> float | None:
+        with contextlib.suppress(psutil.Error, OSError):
+            return others.share() if now == pids else None
+        return None
+
+    return share
 
 
 def busy_s(stat: str, cores: Sequence[int]) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
@@ -12,6 +12,7 @@ from trilane.pipeline.accounts import add_accounts, core_efficiency
 from trilane.pipeline.description import Pipeline
 from trilane.pipeline.isolated import IsolatedTimes
 from trilane.pipeline.lifecycle import close_units, start_units
+from trilane.pipeline.other_programs import beside_units
 from trilane.pipeline.preconditions import check_cores, check_open_files, check_positive, refuse_in_a_unit
 from trilane.pipeline.realtime_clock import Governor, RealtimeClock
 from trilane.pipeline.requests import FrameRequestQueue
@@ -115,7 +116,8 @@ def run_pipeline(
     ):
         core = Core(pipeline.graph(), settings)
         clock = RealtimeClock(core, processes, interrupts, log, requests, governor, on_progress)
-        run = _Run(core, clock, processes, interrupts, log, Recording(core.graph, settings))
+        cores = sorted({core for unit in pipeline.units.values() for core in unit.cores})
+        run = _Run(core, clock, processes, interrupts, log, Recording(core.graph, settings), cores)
         run.execute(isolated)
     report = core.ledger.report(
         clock="host",
@@ -123,7 +125,8 @@ def run_pipeline(
         target_period_ns=0 if settings.deadline_ns else round(1e9 / fps),
         isolated_ns=run.isolated.mean_ns if isolated else None,
     )
-    report.update(policy=policy, edge=pipeline.rule, idle_cores=idle_cores, **(governor.report() if governor else {}))
+    report.update(policy=policy, edge=pipeline.rule, idle_cores=idle_cores, other_programs=run.other_programs)
+    report.update(governor.report() if governor else {})
     if governor is not None and governor.power_w is not None and report["fps"]:
         report["xrbench"]["energy"] = energy_score(1e3 * governor.power_w / report["fps"])
     for unit, row in report["units"].items():
@@ -144,11 +147,13 @@ class _Run:
         interrupts: Interrupts,
         log: RunLog,
         recording: Recording,
+        cores: Sequence[int],
     ) -> None:
-        self._core, self._clock, self._processes = core, clock, processes
+        self._core, self._clock, self._processes, self._cores = core, clock, processes, cores
         self._interrupts, self._log, self.recording = interrupts, log, recording
         self.isolated = IsolatedTimes(core.graph, processes, interrupts)
         self.pids: dict[str, int] = {}
+        self.other_programs: float | None = None
         self._startup_ms: dict[str, float] = {}
         self._outcome = Outcome(OutcomeKind.ABORTED)
 
@@ -162,7 +167,9 @@ class _Run:
         if settings.works:
             few = _spread(settings.frames, FRAMES_ON_RUNGS)
             self._clock.first += self.isolated.of_rungs(few, len(settings.works), settings.follow)
+        others = beside_units(self._cores, self.pids)
         self._outcome = run_loop(self._core, self._clock, self.recording)
+        self.other_programs = others(self._processes.pids)
         self._clock.finish()
         if self._outcome.kind is OutcomeKind.GAVE_UP:
             unit = self._outcome.unit

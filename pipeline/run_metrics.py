@@ -243,6 +243,7 @@ class RunMetrics(Record):
     `core_shares`: what was done on each set of cores that a unit has, and on all; on the host clock.
     `accounts`: the shares of `units` computed a second time.
     `policy`, `edge`: of the scheduler; `idle_cores`: whether cores without work stayed awake; on the host clock.
+    `other_programs`: their share of the time of the run's cores; null where a unit died.
     `caps`, `temperature_c`: of a capped run.
     """
 
@@ -267,6 +268,7 @@ class RunMetrics(Record):
     policy: str = ""
     edge: str = ""
     idle_cores: str = ""
+    other_programs: float | None = None
     caps: Caps | None = None
     temperature_c: Temperature | None = None
 

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 
 from trilane.bench.lib.rank_correlation import rank_correlation
@@ -134,6 +135,30 @@ def test_the_share_of_others_is_what_is_not_ours(tmp_path: Path, monkeypatch: py
     assert others.share() == 0
     used[77] = -9.0
     assert others.share() == 1
+
+
+def test_beside_units_that_live_others_have_a_share_and_beside_a_dead_one_nobody_knows(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[Any] = []
+
+    class Others:
+        def __init__(self, cores: Any, pids: Any) -> None:
+            asked.append((cores, pids))
+            if 13 in pids:
+                raise psutil.NoSuchProcess(13)
+
+        def share(self) -> float:
+            if len(asked) > 1:
+                raise psutil.NoSuchProcess(12)
+            return 0.5
+
+    monkeypatch.setattr(other_programs, "OtherPrograms", Others)
+    share = other_programs.beside_units((0, 1), {"cpu": 11, "gpu": 12})
+    assert asked == [((0, 1), [11, 12])]
+    assert (share({"cpu": 11, "gpu": 12}), share({"cpu": 11, "gpu": 14})) == (0.5, None)
+    assert other_programs.beside_units((0,), {"cpu": 13})({"cpu": 13}) is None
+    assert share({"cpu": 11, "gpu": 12}) is None
 
 
 def test_ranks_that_agree_and_ranks_that_do_not() -> None:

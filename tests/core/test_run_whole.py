@@ -123,6 +123,7 @@ def world(monkeypatch: pytest.MonkeyPatch) -> World:
         ("run_loop", world.run_loop),
         ("start_units", world.start),
         ("close_units", world.close),
+        ("beside_units", lambda cores, pids: lambda now: 0.25 if (cores, pids == now) == ([0, 1, 3], True) else None),
     ):
         monkeypatch.setattr(run, name, part)
     monkeypatch.setattr(accounts, "counts_run_delay", lambda: True)
@@ -154,7 +155,7 @@ def test_the_steps_of_a_run_and_its_report(world: World) -> None:
         "double",
         "kept awake",
     )
-    assert report.frame_time_ms.mean == 4.0
+    assert (report.frame_time_ms.mean, report.other_programs) == (4.0, 0.25)
     assert (report.deadline_misses, report.isolated_ms) == (0, {"in": 1.0, "mid": 3.0})
     assert (report.efficiency, report.bottleneck) == (0.75, "right")
     left, right = report.units["left"], report.units["right"]
