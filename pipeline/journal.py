@@ -129,14 +129,14 @@ class JournalWriter:
 
 
 class JournalReader:
-    """The records of the journal at `path`, again and again as it grows.
+    """The records of the journal at `path`, again and again as it grows; where it was moved, set `path` anew.
 
     `new()`: those that came whole since the last call. Raises BadInputError for a file that is none, or whose bytes are
     no records.
     """
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self.path = path
         self._unpacker = msgpack.Unpacker(max_buffer_size=MAX_RECORD_BYTES, use_list=False)
         self._read_bytes = 0
         self._has_begun = False
@@ -144,14 +144,14 @@ class JournalReader:
     def new(self) -> Iterator[Record]:
         """Each record once, in order."""
         try:
-            with self._path.open("rb") as file:
+            with self.path.open("rb") as file:
                 file.seek(self._read_bytes)
                 while chunk := file.read(CHUNK_BYTES):
                     self._read_bytes += len(chunk)
                     self._unpacker.feed(chunk)
                     yield from map(self._parsed, self._unpacker)
         except OSError as error:
-            raise BadInputError.of_os_error(self._path, error, EXPECTED) from None
+            raise BadInputError.of_os_error(self.path, error, EXPECTED) from None
         except (ValueError, msgpack.UnpackException, RecursionError) as error:
             self._refuse(str(error) or type(error).__name__)
 
@@ -159,7 +159,7 @@ class JournalReader:
         try:
             record = _parse(row)
         except UnexpectedValue as error:
-            raise BadInputError.at(f"{self._path}, before byte {self._read_bytes}", error) from None
+            raise BadInputError.at(f"{self.path}, before byte {self._read_bytes}", error) from None
         except (ValueError, TypeError, KeyError, IndexError) as error:
             self._refuse(str(error) or type(error).__name__)
         if isinstance(record, Begun) == self._has_begun:
@@ -168,7 +168,7 @@ class JournalReader:
         return record
 
     def _refuse(self, found: str) -> Any:
-        raise BadInputError(f"{self._path}, before byte {self._read_bytes}", found, EXPECTED) from None
+        raise BadInputError(f"{self.path}, before byte {self._read_bytes}", found, EXPECTED) from None
 
 
 def read_journal(path: Path) -> Iterator[Record]:

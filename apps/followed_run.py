@@ -1,0 +1,151 @@
+"""A run that others look at while it goes on, or after: where its journal is, and what has become of it.
+
+Rule: whoever follows a run touches nothing of it. A run that goes on writes into `NAME.PID.partial` beside its place
+(run_folder.py); whoever asks for NAME is given that, and follows it when the folder gets its name.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable, Iterator
+from enum import StrEnum
+from pathlib import Path
+
+import psutil
+
+from trilane.errors import BadInputError
+from trilane.near_miss import did_you_mean
+from trilane.pipeline.journal import NAME, JournalReader, Record
+
+RUNS = Path("runs")
+LOOK_S = 0.2
+SILENCE_NS = 1_000_000_000
+EXPECTED = "a run folder with a journal"
+PARTIAL = re.compile(r"(?P<name>.+)\.(?P<pid>[0-9]{1,9})\.partial")
+
+
+class RunState(StrEnum):
+    """GOES_ON: its process lives. FINISHED: the folder has its name. KILLED: the process left the folder behind.
+
+    REMOVED: the folder is gone, which a run does to its own that ends before any frame.
+    """
+
+    GOES_ON = "goes on"
+    FINISHED = "finished"
+    KILLED = "killed"
+    REMOVED = "removed"
+
+
+class FollowedRun:
+    """The run whose journal is in `folder`. `name`: that it has, or will have.
+
+    Raises BadInputError where `folder` has no journal.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        journal = folder / NAME
+        if not journal.is_file():
+            remedy = "an older Trilane wrote it; run the scene again" if (folder / "report.json").is_file() else ""
+            raise BadInputError(folder, f"no {NAME}" if folder.is_dir() else "no such folder", EXPECTED, remedy)
+        self.folder = folder
+        matched = PARTIAL.fullmatch(folder.name)
+        self.name = matched["name"] if matched else folder.name
+        self._pid = int(matched["pid"]) if matched else 0
+        self._reader = JournalReader(journal)
+        self._heard_ns = time.monotonic_ns()
+
+    @property
+    def state(self) -> RunState:
+        """As it is now."""
+        self._find_again()
+        if not self.folder.is_dir():
+            return RunState.REMOVED
+        if PARTIAL.fullmatch(self.folder.name) is None:
+            return RunState.FINISHED
+        return RunState.GOES_ON if psutil.pid_exists(self._pid) else RunState.KILLED
+
+    @property
+    def silent_ns(self) -> int:
+        """How long the run, which still goes on, has written nothing; 0 where that is no longer than it may be."""
+        silent_ns = time.monotonic_ns() - self._heard_ns
+        return silent_ns if silent_ns > SILENCE_NS and self.state is RunState.GOES_ON else 0
+
+    def new(self) -> list[Record]:
+        """What was written since the last call; nothing of a run that was removed. Raises BadInputError."""
+        self._find_again()
+        if not self.folder.is_dir():
+            return []
+        try:
+            records = list(self._reader.new())
+        except BadInputError:
+            if self._reader.path.exists():
+                raise
+            return []  # it was moved this very moment: the next call finds it
+        if records:
+            self._heard_ns = time.monotonic_ns()
+        return records
+
+    def _find_again(self) -> None:
+        """A run that has become complete has its own name."""
+        target = self.folder.with_name(self.name)
+        if not self.folder.exists() and target.is_dir():
+            self.folder = target
+            self._reader.path = target / NAME
+
+
+def follow(given: Path | None, *, wait: bool = False, sleep: Callable[[float], None] = time.sleep) -> FollowedRun:
+    """The run that is meant.
+
+    `given`: its folder, its journal, or its name below runs/; None: the newest below runs/.
+    `wait`: until it has begun; without, one that has not begun is an error. `sleep`: how.
+    Raises BadInputError.
+    """
+    while True:
+        found = _newest(RUNS.glob(f"*/{NAME}")) if given is None else _folder_of(given)
+        if found is not None:
+            return FollowedRun(found)
+        if not wait:
+            raise _missing(given)
+        sleep(LOOK_S)
+
+
+def _folder_of(given: Path) -> Path | None:
+    """The folder of a run that has begun, or what is there in its place."""
+    if given.name == NAME:
+        return given.parent
+    places = [given] if given.is_absolute() or len(given.parts) > 1 else [given, RUNS / given]
+    for place in places:
+        if place.exists():
+            return place
+        if (found := _newest(place.parent.glob(f"*.partial/{NAME}"), place.name)) is not None:
+            return found
+    return None
+
+
+def _newest(journals: Iterator[Path], name: str = "") -> Path | None:
+    """The folder whose journal was written to last; with `name`, of those of that run alone."""
+    found = []
+    for journal in journals:
+        matched = PARTIAL.fullmatch(journal.parent.name)
+        if not name or (matched and matched["name"] == name):
+            try:
+                found.append((journal.stat().st_mtime_ns, journal.parent))
+            except OSError:  # it was moved this very moment
+                continue
+    return max(found)[1] if found else None
+
+
+def _missing(given: Path | None) -> BadInputError:
+    if given is None:
+        return BadInputError(
+            RUNS, "no run with a journal", EXPECTED, "start one with `trilane run`, or name its folder"
+        )
+    parent = given.parent if len(given.parts) > 1 else RUNS
+    names = [_name(each) for each in parent.iterdir() if each.is_dir()] if parent.is_dir() else []
+    return BadInputError(given, "no such run", EXPECTED, did_you_mean(given.name, names))
+
+
+def _name(folder: Path) -> str:
+    matched = PARTIAL.fullmatch(folder.name)
+    return matched["name"] if matched else folder.name
