@@ -22,6 +22,10 @@ WIDTH_HELP = "Width of the network: 64 is full, every channel count scales with 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else there.")]
 OutFileOption = Annotated[Path, typer.Option("--out", help="File to write.")]
 
+PortOption = Annotated[
+    int | None, typer.Option(min=1024, max=65535, help="Port of this machine to listen on; a free one if none.")
+]
+
 # A scene and what it is run with.
 SceneArgument = Annotated[str, typer.Argument(help="A scene file (TOML), or the name of one that comes with Trilane.")]
 SceneAvatarOption = Annotated[str | None, typer.Option("--avatar", help="`default`, or the folder of an avatar.")]

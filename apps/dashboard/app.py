@@ -1,0 +1,156 @@
+"""The server's answers: the page's files, one WebSocket, metrics and the trace. Rule: it decides nothing of the run.
+
+Pictures are pulled: a client that asked gets the newest one when there is one that it has not had, and none before it
+asks again. Everything else is told to all clients as it happens.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any, Final
+
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import FileResponse, PlainTextResponse, Response
+from starlette.routing import Mount, Route, WebSocketRoute
+from starlette.staticfiles import StaticFiles
+from starlette.websockets import WebSocket
+
+from trilane.apps.dashboard.clients import Client, Clients
+from trilane.apps.dashboard.guard import Asgi, Guard
+from trilane.apps.dashboard.refusals import Refusal, Refusals
+from trilane.apps.dashboard.view import View
+from trilane.apps.dashboard.wire import ControlSaid, MalformedError, PictureAsked, Seek, heard, said
+
+PAGE: Final = Path(__file__).with_name("page")
+NEWS_S: Final = 0.1
+PICTURE_S: Final = 0.01
+MOST_FAULTS: Final = 16
+OPENMETRICS: Final = "application/openmetrics-text; version=1.0.0; charset=utf-8"
+#: Codes with which a WebSocket ends that said what it may not.
+PROTOCOL_FAULTS: Final = {1009: Refusal.OVERSIZED, 1002: Refusal.MALFORMED, 1007: Refusal.MALFORMED}
+REFUSED_HELP: Final = (
+    "# HELP trilane_dashboard_refused Requests, messages and clients that the dashboard refused or dropped.\n"
+    "# TYPE trilane_dashboard_refused counter\n"
+)
+
+
+class DashboardApp:
+    """The ASGI application `asgi` for `view` on `port`, for those who know `token`."""
+
+    def __init__(self, view: View, port: int, token: str) -> None:
+        self._view = view
+        self._refusals = Refusals()
+        self._clients = Clients()
+        self._asked = asyncio.Event()
+        routes = [
+            Route("/", self._index),
+            Route("/metrics", self._metrics),
+            Route("/trace.pftrace", self._trace),
+            WebSocketRoute("/live", self._live),
+            Mount("/", StaticFiles(directory=PAGE, check_dir=False)),
+        ]
+        app = Starlette(routes=routes, lifespan=self._lifespan)
+        self.asgi: Asgi = Guard(app, port, token, self._refusals)
+
+    @contextlib.asynccontextmanager
+    async def _lifespan(self, _app: Starlette) -> AsyncIterator[None]:
+        tasks = [asyncio.create_task(self._tell_news()), asyncio.create_task(self._hand_out_pictures())]
+        try:
+            yield
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _index(self, _request: Request) -> Response:
+        return FileResponse(PAGE / "index.html")
+
+    async def _metrics(self, _request: Request) -> Response:
+        rows = [f'trilane_dashboard_refused_total{{why="{why}"}} {n}\n' for why, n in self._refusals.as_json().items()]
+        return Response("".join([self._view.metrics(), REFUSED_HELP, *rows, "# EOF\n"]), media_type=OPENMETRICS)
+
+    async def _trace(self, _request: Request) -> Response:
+        trace = self._view.trace
+        if trace is None or not trace.is_file():
+            return PlainTextResponse("this run has no trace yet\n", 404)
+        return FileResponse(trace, media_type="application/octet-stream", filename=trace.name)
+
+    async def _live(self, socket: WebSocket) -> None:
+        if self._clients.are_full:
+            self._refusals.add(Refusal.TOO_MANY_CLIENTS)
+            await socket.close(1013)
+            return
+        client = Client(socket, lambda: self._refusals.add(Refusal.SLOW_CLIENT))
+        with self._clients.joined(client):
+            await socket.accept()
+            for message in self._view.greeting():
+                client.put(said(message))
+            client.put(said(self._refused()))
+            tasks = [asyncio.create_task(client.send_all()), asyncio.create_task(self._listen(socket, client))]
+            try:
+                await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            finally:
+                for task in tasks:
+                    task.cancel()
+                await asyncio.gather(*tasks, return_exceptions=True)
+        with contextlib.suppress(RuntimeError):  # the client has closed it already
+            await socket.close(1008)
+
+    async def _listen(self, socket: WebSocket, client: Client) -> None:
+        """Do what the client says until it leaves, or has said too much that it may not."""
+        while client.faults < MOST_FAULTS:
+            event = await socket.receive()
+            if event["type"] == "websocket.disconnect":
+                if event.get("code") in PROTOCOL_FAULTS:
+                    self._refusals.add(PROTOCOL_FAULTS[event["code"]])
+                return
+            try:
+                await self._do(client, heard(event.get("bytes") or b""))
+            except MalformedError as error:
+                client.faults += 1
+                self._refuse(client, Refusal.MALFORMED, "", str(error))
+
+    async def _do(self, client: Client, message: PictureAsked | ControlSaid | Seek) -> None:
+        if isinstance(message, PictureAsked):
+            client.asks_picture = True
+            self._asked.set()
+        elif isinstance(message, Seek):
+            for answer in await self._view.seek(client, message):
+                client.put(said(answer))
+        elif why := self._view.control(message):
+            self._refuse(client, Refusal.CONTROL, message.name, why)
+
+    def _refuse(self, client: Client, kind: Refusal, control: str, why: str) -> None:
+        self._refusals.add(kind)
+        client.put(said({"type": "refused", "control": control, "why": why}))
+
+    def _refused(self) -> dict[str, Any]:
+        return {"type": "refusals", "counts": self._refusals.as_json()}
+
+    async def _tell_news(self) -> None:
+        counts = self._refusals.as_json()
+        while True:
+            await asyncio.sleep(NEWS_S)
+            for message in await self._view.news():
+                self._clients.tell(said(message))
+            if counts != self._refusals.as_json():
+                counts = self._refusals.as_json()
+                self._clients.tell(said(self._refused()))
+
+    async def _hand_out_pictures(self) -> None:
+        while True:
+            await self._asked.wait()
+            waiting = self._clients.waiting
+            if not waiting:
+                self._asked.clear()
+                continue
+            for client in waiting:
+                picture = await self._view.picture(client)
+                if picture is not None:
+                    client.asks_picture = False
+                    client.put(picture)
+            await asyncio.sleep(PICTURE_S)

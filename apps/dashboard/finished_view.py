@@ -1,0 +1,210 @@
+"""A run that is over, as a server shows it: any moment of it, from its journal and its video.
+
+Rule: the journal is read once; what is kept of it lies in temporary files, so a run may have lasted for days.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import threading
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, Final
+from weakref import WeakKeyDictionary
+
+import av
+import numpy as np
+
+from trilane.apps.dashboard.clients import Client
+from trilane.apps.dashboard.meter import Meter
+from trilane.apps.dashboard.run_facts import RunFacts, facts_of_folder
+from trilane.apps.dashboard.text_store import TextStore
+from trilane.apps.dashboard.time_table import TimeTable
+from trilane.apps.dashboard.timeline import Timeline, described, note, slices
+from trilane.apps.dashboard.video_frames import VideoFrames
+from trilane.apps.dashboard.view import Message
+from trilane.apps.dashboard.wire import ControlSaid, Seek, shown
+from trilane.errors import BadInputError
+from trilane.pipeline.journal import NAME, Begun, Record, Stepped, read_journal
+from trilane.scheduler.accounts import CAUSES, UNEXPLAINED
+
+FIRST_SPAN_MS: Final = 5000.0
+FIGURES_EVERY_MS: Final = 1000.0
+MOST_JOBS: Final = 6000
+MOST_IDLE: Final = 6000
+MOST_NOTES: Final = 100
+OVER: Final = "the run is over"
+
+CAUSE_NAMES: Final = (*CAUSES, UNEXPLAINED)
+TIMES: Final = [("begin", "<f8"), ("end", "<f8")]
+JOB: Final = np.dtype([("unit", "u1"), ("stage", "u1"), ("frame", "<u4"), *TIMES, ("wait", "<f8")])
+IDLE: Final = np.dtype([("unit", "u1"), ("cause", "u1"), *TIMES])
+PRESENTED: Final = np.dtype([("frame", "<u4"), *TIMES])
+FIGURES: Final = np.dtype([("offset", "<u8"), ("size", "<u4"), *TIMES])
+
+
+class FinishedRun:
+    """What is known of a finished run, and where; `read_run` makes it.
+
+    `end_ms`: of its last step.
+    """
+
+    def __init__(self, begun: Begun, facts: RunFacts) -> None:
+        self.begun, self.facts = begun, facts
+        self.end_ms = 0.0
+        self.jobs, self.idle, self.presented, self.figures = map(TimeTable, (JOB, IDLE, PRESENTED, FIGURES))
+        self._written = TextStore()
+        self._timeline, self._meter = Timeline(begun), Meter(begun)
+        self._last_stage = len(begun.graph.stages) - 1
+        self._due_ms = 0.0
+        self.metrics = ""
+        self.notes: list[tuple[float, str]] = []
+
+    def add(self, record: Record) -> None:
+        """The next record."""
+        self._timeline.add(record)
+        self._meter.add(record)
+        if isinstance(record, Stepped):
+            self._keep()
+            if self._timeline.now_ms >= self._due_ms:
+                self._keep_figures()
+
+    def end(self) -> None:
+        """After the last record."""
+        self._timeline.end()
+        self._keep()
+        self._keep_figures()
+        self.end_ms, self.metrics = self._timeline.now_ms, self._meter.metrics()
+        for table in (self.jobs, self.idle, self.presented, self.figures):
+            table.complete()
+
+    def figures_at(self, t_ms: float) -> Mapping[str, Any]:
+        """The figures that were kept last before `t_ms`, or the first."""
+        row = self.figures.last_before(t_ms)
+        row = self.figures.near(t_ms, FIGURES_EVERY_MS, 1)[0] if row is None else row
+        figures: Mapping[str, Any] = json.loads(self._written.read(int(row["offset"]), int(row["size"])))
+        return figures
+
+    def slices_near(self, t_ms: float, span_ms: float) -> Message:
+        """Jobs and idle slices from `span_ms` before to as long after."""
+        jobs = [
+            (int(r["unit"]), int(r["stage"]), int(r["frame"]), float(r["begin"]), float(r["end"]), float(r["wait"]))
+            for r in self.jobs.near(t_ms, span_ms, MOST_JOBS)
+        ]
+        idle = [
+            (int(r["unit"]), CAUSE_NAMES[int(r["cause"])], float(r["begin"]), float(r["end"]))
+            for r in self.idle.near(t_ms, span_ms, MOST_IDLE)
+        ]
+        return slices(jobs, idle)
+
+    def frame_at(self, t_ms: float) -> int | None:
+        """The frame that was presented last at `t_ms`, None before the first."""
+        row = self.presented.last_before(t_ms)
+        return None if row is None else int(row["frame"])
+
+    def close(self) -> None:
+        """The temporary files are gone."""
+        for table in (self.jobs, self.idle, self.presented, self.figures, self._written):
+            table.close()
+
+    def _keep(self) -> None:
+        jobs, idle, notes = self._timeline.take()
+        for unit, stage, frame, begin, end, wait in jobs:
+            self.jobs.add((unit, stage, frame, begin, end, wait))
+            if stage == self._last_stage:
+                self.presented.add((frame, end, end))
+        for unit, cause, begin, end in idle:
+            self.idle.add((unit, CAUSE_NAMES.index(cause), begin, end))
+        self.notes = [*self.notes, *notes][-MOST_NOTES:]
+
+    def _keep_figures(self) -> None:
+        offset, size = self._written.add(json.dumps(self._meter.message()).encode())
+        self.figures.add((offset, size, self._timeline.now_ms, self._timeline.now_ms))
+        self._due_ms = self._timeline.now_ms + FIGURES_EVERY_MS
+
+
+def read_run(folder: Path) -> FinishedRun:
+    """The run in `folder`. Raises BadInputError for a folder that has none, or whose journal cannot be read."""
+    if not (folder / NAME).is_file():
+        raise BadInputError(folder, f"no {NAME}", "the folder of a run", "`trilane run` writes one into runs/")
+    run: FinishedRun | None = None
+    for record in read_journal(folder / NAME):
+        if isinstance(record, Begun):
+            run = FinishedRun(record, facts_of_folder(folder, record))
+        elif run is not None:
+            run.add(record)
+    assert run is not None, "a journal begins with its header"
+    run.end()
+    return run
+
+
+class FinishedView:
+    """`trilane.apps.dashboard.view.View` of the run in `folder`. Raises as `read_run`."""
+
+    def __init__(self, folder: Path) -> None:
+        self._run = read_run(folder)
+        self._video = Pictures(folder / "video.mp4", self._run.facts.fps)
+        self.trace: Path | None = folder / "trace.pftrace"
+        self._at_ms: WeakKeyDictionary[Client, float] = WeakKeyDictionary()
+
+    def greeting(self) -> Iterable[Message]:
+        run = self._run
+        told = {**run.facts.hello(), **described(run.begun.graph)}
+        span = [0.0, run.end_ms]
+        yield {"type": "hello", "run": told, "controls": [], "is_live": False, "span_ms": span}
+        yield run.facts.state("ended")
+        yield from (note(t_ms, text) for t_ms, text in run.notes)
+        yield from self._moment(run.end_ms, FIRST_SPAN_MS)
+
+    async def news(self) -> Iterable[Message]:
+        return ()
+
+    async def picture(self, client: Client) -> bytes | None:
+        frame = self._run.frame_at(self._at_ms.get(client, self._run.end_ms))
+        if frame is None or frame == client.had_frame:
+            return None
+        jpeg = await asyncio.to_thread(self._video.jpeg, frame)
+        client.had_frame = frame
+        return None if jpeg is None else shown(frame, 1000 * frame / self._run.facts.fps, 0.0, jpeg)
+
+    def control(self, asked: ControlSaid) -> str:  # noqa: ARG002 - a view's signature
+        return OVER
+
+    async def seek(self, client: Client, to: Seek) -> Iterable[Message]:
+        t_ms = min(to.t_ms, self._run.end_ms)
+        self._at_ms[client] = t_ms
+        return await asyncio.to_thread(lambda: list(self._moment(t_ms, to.span_ms)))
+
+    def metrics(self) -> str:
+        return self._run.metrics
+
+    def close(self) -> None:
+        """Let go of the files."""
+        self._run.close()
+        self._video.close()
+
+    def _moment(self, t_ms: float, span_ms: float) -> Iterable[Message]:
+        yield self._run.slices_near(t_ms, span_ms)
+        yield self._run.figures_at(t_ms)
+
+
+class Pictures:
+    """Pictures of a video that may be missing, for one thread at a time."""
+
+    def __init__(self, path: Path, fps: float) -> None:
+        self._lock = threading.Lock()
+        try:
+            self._frames: VideoFrames | None = VideoFrames(path, fps)
+        except (OSError, av.error.FFmpegError):
+            self._frames = None  # the run was not recorded
+
+    def jpeg(self, frame: int) -> bytes | None:
+        """What was shown with frame `frame`; None where there is no picture."""
+        with self._lock:
+            return None if self._frames is None else self._frames.jpeg(frame)
+
+    def close(self) -> None:
+        """No picture is asked for any more."""
+        if self._frames is not None:
+            self._frames.close()
