@@ -71,20 +71,18 @@ class FollowedRun:
         silent_ns = time.monotonic_ns() - self._heard_ns
         return silent_ns if silent_ns > SILENCE_NS and self.state is RunState.GOES_ON else 0
 
-    def new(self) -> list[Record]:
+    def new(self) -> Iterator[Record]:
         """What was written since the last call; nothing of a run that was removed. Raises BadInputError."""
         self._find_again()
         if not self.folder.is_dir():
-            return []
+            return
         try:
-            records = list(self._reader.new())
+            for record in self._reader.new():
+                self._heard_ns = time.monotonic_ns()
+                yield record
         except BadInputError:
             if self._reader.path.exists():
-                raise
-            return []  # it was moved this very moment: the next call finds it
-        if records:
-            self._heard_ns = time.monotonic_ns()
-        return records
+                raise  # else it was moved this very moment, and the next call finds it
 
     def _find_again(self) -> None:
         """A run that has become complete has its own name."""

@@ -22,7 +22,8 @@ from trilane.scheduler.stats import NS_PER_MS, summary_ms
 WINDOW_NS: Final = 5_000_000_000
 NS_PER_S: Final = 1e9
 MOST_NOTES = 5
-BYTES = "bytes_"
+BYTES, LEAST = "bytes_", "least"  # bytes that a stage moved, and those that would have done
+LEAST_KEY = f"stages.*.bytes.{LEAST}"
 TEMPERATURE, DUTY = "temperature_c.", "duty."
 SENSOR = "sensor"  # this machine's own, beside those that are modelled
 OF_THE_RUN = ("fps", "run_fps", "frame_time_ms", "latency_ms", "frames", "units", "stages", "frame_times", "latencies")
@@ -234,7 +235,12 @@ class LiveFigures:
     def _sources(self, clock: str) -> dict[str, str]:
         """Key to source; the longest key decides."""
         sources = dict.fromkeys(OF_THE_RUN, COMPUTED if clock == "virtual" else MEASURED)
-        sources |= {"temperature_c": COMPUTED, f"{TEMPERATURE}{SENSOR}": MEASURED, "duty": COMPUTED}
+        sources |= {
+            LEAST_KEY: COMPUTED,
+            "temperature_c": COMPUTED,
+            f"{TEMPERATURE}{SENSOR}": MEASURED,
+            "duty": COMPUTED,
+        }
         accuracy = self._facts.get("accuracy") or {}
         return sources | {f"accuracy.{name}": facts["source"] for name, facts in accuracy.items() if "source" in facts}
 

@@ -1,0 +1,154 @@
+"""`/metrics`: what a journal made by hand says, read by Prometheus's parser; no rows that a longer run adds."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import pytest
+
+from trilane.apps.live_figures import LiveFigures
+from trilane.apps.metrics_table import COUNTERS, GAUGES, HISTOGRAMS, SOURCE
+from trilane.pipeline.journal import SCHEMA, Accounted, Begun, Counted, Ended, Sampled, Stepped, Worked
+from trilane.scheduler.events import Dispatch, Job, JobDone, Settings, UnitReady, chain
+from trilane.scheduler.ledger import ASSIGNED, STARVED, JobRecord
+
+pytest.importorskip("prometheus_client")
+
+MS = 1_000_000
+GRAPH = chain((("a", "u"), ("b", "v")), "double", "b")
+ACCURACY = {
+    "default": {
+        "source": "from the avatar's validation of today",
+        "psnr_db_by_band": {"far": 31.7, "face": 28.3},
+        "iou": 0.98,
+    },
+    'own "one"\n': {"source": "no figures", "why": "never validated"},
+}
+FACTS = {"clock": "host", "began_at": "2026-11-22T10:00:00+00:00", "accuracy": ACCURACY}
+BEGAN = 1_795_341_600  # seconds of the Unix epoch at FACTS["began_at"]
+
+
+def run(frames: int, frame_ms: int = 20) -> LiveFigures:
+    """So many frames, one every `frame_ms`: 5 ms on u, where the pose is sampled after 1, and then 10 ms on v."""
+    figures = LiveFigures(Begun(SCHEMA, GRAPH, Settings(frames), FACTS))
+    figures.add(Stepped(0, (UnitReady("u"), UnitReady("v")), ()))
+    for frame in range(frames):
+        t = frame * frame_ms * MS
+        jobs = (Job(2 * frame, "u", "a", frame, -1, 0, 0), Job(2 * frame + 1, "v", "b", frame, 0, -1, 0))
+        figures.add(Stepped(t, (), (Dispatch(jobs[0]),)))
+        figures.add(Accounted(t, "u", ASSIGNED))
+        ended = JobDone("u", 2 * frame, t, t + 5 * MS, t + MS)
+        figures.add(Stepped(t + 5 * MS, (ended,), (Dispatch(jobs[1]),)))
+        figures.add(Accounted(t + 5 * MS, "u", STARVED))
+        figures.add(Accounted(t + 5 * MS, "v", ASSIGNED))
+        figures.add(Worked(JobRecord("a", "u", frame, t, t, t, t + 5 * MS), {"bytes_written": 8, "bytes_least": 6}))
+        figures.add(Stepped(t + 15 * MS, (JobDone("v", 2 * frame + 1, t + 5 * MS, t + 15 * MS, 0),), ()))
+        figures.add(Accounted(t + 15 * MS, "v", STARVED))
+    figures.add(Counted(0, {"died:v": 2}, {"a->b:stale": 3, "source->a:late": 4}))
+    figures.add(Sampled(0, {"temperature_c.sensor": 61.5, "duty.v": 0.25}))
+    figures.add(Ended(frames * frame_ms * MS, {}))
+    return figures
+
+
+def parsed(figures: LiveFigures) -> dict[str, Any]:
+    from prometheus_client.openmetrics.parser import text_string_to_metric_families
+
+    from trilane.apps.openmetrics import openmetrics
+
+    return {family.name: family for family in text_string_to_metric_families(openmetrics(figures.now()).decode())}
+
+
+def value(families: dict[str, Any], family: str, sample: str, **labels: str) -> float:
+    [found] = [each.value for each in families[family].samples if (each.name, each.labels) == (sample, labels)]
+    return float(found)
+
+
+def test_every_metric_is_there_with_its_unit_and_kind() -> None:
+    families = parsed(run(3))
+    every = {each.name for each in (*HISTOGRAMS, *COUNTERS, *GAUGES, SOURCE)}
+    assert families.keys() == every
+    assert len(every) == len(HISTOGRAMS) + len(COUNTERS) + len(GAUGES) + 1
+    for metric in (*COUNTERS, *GAUGES):
+        family = families[metric.name]
+        assert (family.type, family.unit) == ("counter" if metric in COUNTERS else "gauge", metric.unit)
+        assert family.documentation == metric.help
+        assert family.samples, metric.name
+        assert {frozenset(sample.labels) for sample in family.samples} == {frozenset(metric.labels)}
+
+
+def test_the_histograms_hold_the_whole_run_and_are_cumulative() -> None:
+    families = parsed(run(300))  # 6 s, of which the window is 5
+    for name, count, total_s, bound in (
+        ("trilane_frame_time_seconds", 299, 299 * 0.020, "0.02"),
+        ("trilane_latency_seconds", 300, 300 * 0.014, "0.015"),
+    ):
+        assert value(families, name, f"{name}_count") == count
+        assert value(families, name, f"{name}_sum") == pytest.approx(total_s)
+        assert value(families, name, f"{name}_created") == BEGAN
+        buckets = [each for each in families[name].samples if each.name.endswith("_bucket")]
+        assert all(less.value <= more.value for less, more in pairwise(buckets))
+        below = [each.labels["le"] for each in buckets if each.value == 0]
+        assert buckets[len(below)].labels["le"] == bound
+        assert (buckets[-1].labels["le"], buckets[-1].value) == ("+Inf", count)
+
+
+def test_counters_and_gauges_by_hand() -> None:
+    families = parsed(run(300))
+    for sample, labels, wanted in (
+        ("trilane_frames_presented_total", {}, 300),
+        ("trilane_frames_dropped_total", {"edge": "a->b", "cause": "stale"}, 3),
+        ("trilane_frames_dropped_total", {"edge": "source->a", "cause": "late"}, 4),
+        ("trilane_frames_dropped_created", {"edge": "source->a", "cause": "late"}, BEGAN),
+        ("trilane_frames_lost_total", {"cause": "died:v"}, 2),
+        ("trilane_bytes_moved_total", {"stage": "a", "kind": "written"}, 2400),
+        ("trilane_bytes_needed_total", {"stage": "a"}, 1800),
+        ("trilane_unit_busy_ratio", {"unit": "u"}, 0.25),
+        ("trilane_unit_busy_ratio", {"unit": "v"}, 0.5),
+        ("trilane_unit_idle_ratio", {"unit": "u", "cause": "starved"}, 0.75),
+        ("trilane_unit_duty_ratio", {"unit": "v"}, 0.25),
+        ("trilane_unit_up", {"unit": "v"}, 1),
+        ("trilane_temperature_celsius", {"place": "sensor"}, 61.5),
+        ("trilane_avatar_psnr_decibels", {"avatar": "default", "band": "face"}, 28.3),
+        ("trilane_avatar_mask_iou_ratio", {"avatar": "default"}, 0.98),
+        ("trilane_avatar_error_known", {"avatar": "default"}, 1),
+        ("trilane_avatar_error_known", {"avatar": 'own "one"\n'}, 0),
+        ("trilane_run_ended", {}, 1),
+    ):
+        family = sample.removesuffix("_total").removesuffix("_created")
+        assert value(families, family, sample, **labels) == pytest.approx(wanted), (sample, labels)
+
+
+def test_each_metric_says_where_it_comes_from() -> None:
+    sources = {
+        (each.labels["metric"], each.labels["part"]): each.labels["source"]
+        for each in parsed(run(3))["trilane_source"].samples
+    }
+    assert (
+        sources["trilane_frame_time_seconds", ""]
+        == sources["trilane_temperature_celsius", "sensor"]
+        == "measured in this run"
+    )
+    assert sources["trilane_temperature_celsius", ""] == sources["trilane_bytes_needed", ""] == "computed"
+    assert sources["trilane_avatar_psnr_decibels", "default"] == "from the avatar's validation of today"
+    unsaid = {each.name for each in (*HISTOGRAMS, *COUNTERS, *GAUGES)} - {metric for metric, _ in sources}
+    assert unsaid == {"trilane_avatar_error_known", "trilane_run_ended"}
+
+
+def test_a_longer_run_has_no_more_rows() -> None:
+    short, long = parsed(run(3)), parsed(run(600))
+    assert sum(len(family.samples) for family in long.values()) == sum(len(family.samples) for family in short.values())
+
+
+def test_without_a_beginning_there_are_no_creation_times() -> None:
+    figures = LiveFigures(Begun(SCHEMA, GRAPH, Settings(1), {}))
+    assert not [
+        each for family in parsed(figures).values() for each in family.samples if each.name.endswith("_created")
+    ]
+
+
+def test_the_document_ends_as_the_format_asks() -> None:
+    from trilane.apps.openmetrics import CONTENT_TYPE, openmetrics
+
+    assert openmetrics(run(1).now()).endswith(b"\n# EOF\n")
+    assert CONTENT_TYPE.startswith("application/openmetrics-text; version=1.0.0")
