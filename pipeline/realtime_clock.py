@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from trilane.errors import TrilaneError
+from trilane.pipeline.controls import RunControls
 from trilane.pipeline.cpu_use import CpuTimes
 from trilane.pipeline.requests import FrameRequestQueue
 from trilane.pipeline.run_log import RunLog
@@ -85,12 +86,18 @@ class RealtimeClock:
         self._last_stage = core.graph.stages[-1].name
         self._open: dict[int, tuple[Job, int]] = {}
         self._unbooked: list[tuple[Job, int, int | None, Done]] = []
+        self._controls: RunControls | None = None
         self._begun = self._stopping = self._is_lost = False
         self._step_ns = self._ping_ns = 0
         self._progress_s = 0.0
         processes.watch(interrupts.fd)
         if requests is not None:
             processes.watch(requests.fd)
+
+    def heed(self, controls: RunControls) -> None:
+        """Do what is asked of the run by `controls`."""
+        self._controls = controls
+        self._processes.watch(controls.fd)
 
     def wait(self, deadline_ns: int) -> tuple[int, tuple[Event, ...]]:
         """What happened until `deadline_ns` at the latest, and what time it is then."""
@@ -145,6 +152,8 @@ class RealtimeClock:
         messages = self._processes.listen(timeout_ms)
         events = [event for message in messages if (event := self._event(message)) is not None]
         events += self._interrupted()
+        if self._controls is not None:
+            events += self._asked(self._controls)
         if self._requests is not None:
             events += self._requests.events()
         now_ns = time.monotonic_ns()
@@ -163,6 +172,13 @@ class RealtimeClock:
             self._log.say("interrupted: the frames in flight are finished; interrupt again to end at once")
             return [Stop()]
         return []
+
+    def _asked(self, controls: RunControls) -> list[Event]:
+        events, kills = controls.taken()
+        for unit in kills:
+            self._log.say(f"unit {unit} is killed, as was asked")
+            self._processes.kill(unit)
+        return events
 
     def _ping(self, now_ns: int) -> list[Event]:
         """Ask idle units whether they live; a busy one is heard of when its job ends."""

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 from trilane.errors import BadInputError
 from trilane.pipeline.accounts import add_accounts, core_efficiency
+from trilane.pipeline.controls import RunControls
 from trilane.pipeline.description import Pipeline
 from trilane.pipeline.isolated import IsolatedTimes
 from trilane.pipeline.lifecycle import close_units, start_units
@@ -69,6 +70,7 @@ def run_pipeline(
     works: tuple[int, ...] = (),
     follow: tuple[str, ...] = (),
     requests: FrameRequestQueue | None = None,
+    controls: RunControls | None = None,
     governor: ReportingGovernor | None = None,
     starter: UnitStarter | None = None,
     on_progress: Callable[[int, int], None] | None = None,
@@ -90,6 +92,8 @@ def run_pipeline(
     (`trilane.scheduler.work_ladder`), of which the first stage is told (`SteppedStage`). Used where frames are released
     at a rate. `follow`: the stages whose time follows the work.
     `requests`: frames are released as somebody asks for them, `frames` at most; it is closed when this returns.
+    `controls`: what somebody asks of the run; the frames that it has released when it ends count as requested. It is
+    closed when this returns.
     `governor`: holds the units to shares of the time, and says in the report what it did.
     `starter`: a fork server that was started earlier; None makes one for this run.
     `on_progress(presented, requested)`, `on_message(text)`: called from this thread.
@@ -108,6 +112,7 @@ def run_pipeline(
     log = RunLog(on_message)
     with (
         contextlib.closing(requests) if requests is not None else contextlib.nullcontext(),
+        contextlib.closing(controls) if controls is not None else contextlib.nullcontext(),
         Interrupts() as interrupts,
         on_cores(pipeline.scheduler_cores),
         prompt_answers(),
@@ -117,11 +122,13 @@ def run_pipeline(
         core = Core(pipeline.graph(), settings)
         clock = RealtimeClock(core, processes, interrupts, log, requests, governor, on_progress)
         cores = sorted({core for unit in pipeline.units.values() for core in unit.cores})
+        if controls is not None:
+            clock.heed(controls)
         run = _Run(core, clock, processes, interrupts, log, Recording(core.graph, settings), cores)
         run.execute(isolated)
     report = core.ledger.report(
         clock="host",
-        requested=settings.frames if requests is None else core.source.released,
+        requested=settings.frames if requests is None and controls is None else core.source.released,
         target_period_ns=0 if settings.deadline_ns else round(1e9 / fps),
         isolated_ns=run.isolated.mean_ns if isolated else None,
     )

@@ -41,6 +41,7 @@ from trilane.scheduler.events import (
     Finish,
     FrameRequest,
     Graph,
+    Hold,
     JobDone,
     JobFailed,
     Kill,
@@ -105,6 +106,7 @@ class Core:
             StageAlone: self._on_alone,
             Stop: self._on_stop,
             FrameRequest: self._on_request,
+            Hold: self._on_hold,
             Abort: self._on_abort,
         }
 
@@ -318,6 +320,10 @@ class Core:
 
     def _on_request(self, event: FrameRequest) -> None:
         self.source.request(event.frames, self.now_ns)
+        self.flow.mark_dirty(self.stages[0].unit)
+
+    def _on_hold(self, event: Hold) -> None:
+        self.source.hold(event.frames, self.now_ns)
         self.flow.mark_dirty(self.stages[0].unit)
 
     def _on_abort(self, _event: Abort) -> None:

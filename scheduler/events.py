@@ -116,6 +116,15 @@ class FrameRequest(NamedTuple):
     frames: int
 
 
+class Hold(NamedTuple):
+    """From now on only `frames` more frames are released, and none by its time; -1: all are again.
+
+    Frames that were released before go on. A rate goes on from the moment in which the hold ends.
+    """
+
+    frames: int
+
+
 class Abort(NamedTuple):
     """End at once: every frame in flight is lost."""
 
@@ -145,7 +154,7 @@ class Finish(NamedTuple):
 
 
 UnitEvent = UnitReady | UnitDied | Pinged | Pong | SetDuty
-RunEvent = SchedulerStalled | StageAlone | Stop | FrameRequest | Abort
+RunEvent = SchedulerStalled | StageAlone | Stop | FrameRequest | Hold | Abort
 Event = JobDone | JobFailed | UnitEvent | RunEvent
 Action = Dispatch | Kill | Start | Finish
 
@@ -161,6 +170,7 @@ EVENTS = (
     StageAlone,
     Stop,
     FrameRequest,
+    Hold,
     Abort,
 )
 ACTIONS = (Dispatch, Kill, Start, Finish)

@@ -15,6 +15,9 @@ class Source:
     Without a rate (no period, no arrivals, no requests) a frame counts as released in the moment in which it can be
     taken. `drop` is called with the cause of each frame that is dropped here. `due_ns`: when the next frame is
     released or the oldest waiting one runs out of time. `is_empty`: whether no frame can be taken now.
+
+    While frames are held, `hold` alone releases them, a few at a time. Afterwards the next one is due at once, and
+    those that follow it as long after it as they would have been.
     """
 
     def __init__(self, settings: Settings, drop: Callable[[DropCause], None]) -> None:
@@ -24,9 +27,15 @@ class Source:
         self._end = settings.frames
         self._start_ns = 0
         self._paced = bool(settings.period_ns or settings.arrivals_ns or settings.asked)
+        self._held = False
         self.queue: deque[tuple[int, int]] = deque()
         self.due_ns = NEVER
         self.is_empty = self._paced or not self._end
+
+    @property
+    def _waits(self) -> bool:
+        """Whether a frame has to be released before it is taken."""
+        return self._paced or self._held
 
     def start(self, now_ns: int) -> None:
         """The run begins: periods and arrivals count from here."""
@@ -51,7 +60,7 @@ class Source:
     def advance(self, now_ns: int) -> bool:
         """Release what is due, drop what waited too long; True when something changed."""
         changed = False
-        while self._paced and self._next < self._end and self._release_ns(self._next) <= now_ns:
+        while self._paced and not self._held and self._next < self._end and self._release_ns(self._next) <= now_ns:
             self._admit(self._next, self._release_ns(self._next))
             self._next += 1
             changed = True
@@ -69,6 +78,17 @@ class Source:
             self._admit(frame, now_ns)
             self._next += 1
         self._set_due()
+
+    def hold(self, frames: int, now_ns: int) -> None:
+        """Release `frames` frames and no more until the next call; -1: the hold is over."""
+        if frames >= 0:
+            self._held = True
+            self.request(frames, now_ns)
+        elif self._held:
+            self._held = False
+            if self._paced and not self._settings.asked and self._next < self._end:
+                self._start_ns += now_ns - self._release_ns(self._next)
+            self._set_due()
 
     def head(self, now_ns: int) -> tuple[int, int]:
         """The frame that is next and its release time; `is_empty` says whether there is one."""
@@ -105,8 +125,9 @@ class Source:
             self.queue.append((frame, release_ns))
 
     def _set_due(self) -> None:
-        self.is_empty = not self.queue and (self._paced or self._next >= self._end)
-        self.due_ns = self._release_ns(self._next) if self._paced and self._next < self._end else NEVER
+        self.is_empty = not self.queue and (self._waits or self._next >= self._end)
+        is_timed = self._paced and not self._held and self._next < self._end
+        self.due_ns = self._release_ns(self._next) if is_timed else NEVER
         if self._settings.queue_timeout_ns and self.queue:
             self.due_ns = min(self.due_ns, self.queue[0][1] + self._settings.queue_timeout_ns)
 

@@ -11,6 +11,7 @@ from trilane.pipeline.description import UnitSettings
 from trilane.scene.planner import ALL_WORK, TensorBudget
 from trilane.scene.schema import Model, Scene
 from trilane.shapes import Shape, shape_buckets
+from trilane.transport.live_window import LiveWindow
 from trilane.unexpected_value import UnexpectedValue
 from trilane.units import UnitName
 
@@ -38,6 +39,7 @@ class RunConfig(Model):
     `posed_vertices`: how many of each avatar, when the CPU unit skins; empty when the GPU unit does.
     `pace_ns`: how long a job of a stage is held, at least.
     `cuts`: of the network; its first part is the DSP's.
+    `window`: where somebody looks at the pictures and steers the camera while the run goes on; None: nowhere.
     """
 
     scene: Scene
@@ -52,6 +54,7 @@ class RunConfig(Model):
     posed_vertices: tuple[int, ...] = ()
     pace_ns: dict[str, int] = Field(default={})
     cuts: tuple[NetworkCut, ...] = ()
+    window: Path | None = None
 
     @field_validator("units")
     @classmethod
@@ -60,6 +63,11 @@ class RunConfig(Model):
         if unknown:
             raise UnexpectedValue(f"unknown unit {sorted(unknown)}", "cpu, gpu, dsp")
         return units
+
+    def opened_window(self) -> LiveWindow | None:
+        """The window, mapped. Raises OSError when whoever made it is gone."""
+        output = self.scene.output
+        return None if self.window is None else LiveWindow.opened(self.window, output.height, output.width)
 
     @property
     def buckets(self) -> list[Shape]:

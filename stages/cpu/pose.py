@@ -21,6 +21,7 @@ from trilane.pipeline.shared_assets import Assets
 from trilane.pipeline.stage import Skip, UnitContext
 from trilane.scene.mover import Mover
 from trilane.scene.planner import Held, plan_tensor
+from trilane.scene.steering import steered
 from trilane.scene.tensor_layout import lay_out
 from trilane.scene.work import Work, shown_by, work_of
 from trilane.shapes import Shape
@@ -40,8 +41,13 @@ class _Actor:
 
     def is_off_screen(self, translation: F64, clip: F64) -> bool:
         """Whether no pose at `translation` (3,), before the mover's `world`, brings the body onto the screen."""
-        root = self.mover.world[:3, :3] @ (self.body.shaped.joints[0] + translation) + self.mover.world[:3, 3]
-        return self.body.bounds.is_off_screen(root, clip)
+        return self.body.bounds.is_off_screen(self.pivot(translation), clip)
+
+    def pivot(self, translation: F64) -> F64:
+        """Where the body's root is (3,) at `translation` (3,), in the scene."""
+        return np.asarray(
+            self.mover.world[:3, :3] @ (self.body.shaped.joints[0] + translation) + self.mover.world[:3, 3]
+        )
 
 
 @dataclass(frozen=True)
@@ -96,6 +102,7 @@ class PoseStage:
         self._camera = staged.camera
         self._projection = staged.camera.projection(scene.output.width / scene.output.height)
         self._counts = config.posed_vertices
+        self._window = config.opened_window()
         self._made: dict[Work, _Made] = {}
         self._was_seen = [False] * len(self._actors)
         self._slots: list[NDArray[np.void]] = []
@@ -123,8 +130,8 @@ class PoseStage:
         packet["frame"] = frame
         packet["t_sampled_ns"] = time.monotonic_ns()
         packet["media_time_s"] = t_s
-        view = self._camera.sample(t_s)
         moved = [actor.mover.sample(t_s) for actor in self._actors]
+        view = self._view(t_s, moved)
         _require_all_finite(view, moved, frame)
         shown = shown_by([view, *(array for pair in moved for array in pair)])
         work = self._work_of(shown, lambda: self._make(slot_out, frame, view, moved))
@@ -138,6 +145,13 @@ class PoseStage:
             self.plan = replace(self.plan, work=work)
             self._made[work] = _Made(shown, packet.copy(), self.plan)
         return _metrics(self.plan)
+
+    def _view(self, t_s: float, moved: Sequence[tuple[F64, F64]]) -> F64:
+        """World to camera (4, 4): the scene's camera, turned about the first avatar as somebody steers it."""
+        view = self._camera.sample(t_s)
+        if self._window is None:
+            return view
+        return steered(view, self._actors[0].pivot(moved[0][1]), *self._window.steering)
 
     def _work_of(self, shown: bytes, is_anybody_seen: Callable[[], bool]) -> Work:
         if self._skips:

@@ -98,6 +98,7 @@ class PresentStage:
         self._headers: list[NDArray[np.void]] = []
         self._drawn = -1
         self._segment: Segment | None = None
+        self._window = config.opened_window()
 
     def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
         """Views of the slots as frames, and the encoder, made ready. Raises ValueError when the stage has outputs."""
@@ -115,6 +116,10 @@ class PresentStage:
         """Present `inputs[slot_in]` as frame `frame`. Raises ValueError when `slot_in` is None."""
         if slot_in is None:
             raise ValueError("the present stage needs an input slot")
+        if self._window is not None and self._window.is_looked_at:
+            header = self._headers[slot_in]
+            times = float(header["media_time_s"]), int(header["t_sampled_ns"])
+            self._window.show(frame, *times, self._frames[slot_in])
         if self._segment is None:
             return {}
         pixels, drawn = self._frames[slot_in], int(self._headers[slot_in]["repeats"]) - 1

@@ -1,0 +1,60 @@
+"""What somebody asks of a run while it goes on. Rule: any thread may ask; the run does it between two of its steps.
+
+What is asked becomes an event of the scheduler, so the recording holds it and a replay does the same. A kill becomes
+one when the unit's end is heard.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+
+from trilane.scheduler.events import Event, Hold, Stop
+
+ALL = -1
+
+
+class RunControls:
+    """The way into one run. Once the run is over nothing that is asked does anything."""
+
+    def __init__(self) -> None:
+        self.fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._events: list[Event] = []
+        self._kills: list[str] = []
+        self._lock = threading.Lock()
+        self._closed = False
+
+    def hold(self, frames: int) -> None:
+        """Release `frames` more frames and then none; `ALL`: go on."""
+        self._ask(Hold(frames))
+
+    def stop(self) -> None:
+        """Finish the frames in flight and end."""
+        self._ask(Stop())
+
+    def kill(self, unit: str) -> None:
+        """End the unit's process at once; the scheduler starts it again."""
+        with self._lock:
+            if not self._closed:
+                self._kills.append(unit)
+                os.eventfd_write(self.fd, 1)
+
+    def taken(self) -> tuple[list[Event], list[str]]:
+        """By the run: events and units to kill that were asked for since the last call."""
+        with self._lock:
+            taken = self._events, self._kills
+            self._events, self._kills = [], []
+            return taken
+
+    def close(self) -> None:
+        """By the run: it is over."""
+        with self._lock:
+            if not self._closed:
+                self._closed = True
+                os.close(self.fd)
+
+    def _ask(self, event: Event) -> None:
+        with self._lock:
+            if not self._closed:
+                self._events.append(event)
+                os.eventfd_write(self.fd, 1)
