@@ -335,7 +335,7 @@ def build_report(
         "schema": SCHEMA,
         "machine": machine,
         "config": {
-            **config.model_dump(mode="json", exclude={"out_dir"}),
+            **config.model_dump(mode="json", exclude={"out_dir", "window"}),
             "policy": metrics.policy,
             "edge": metrics.edge,
         },
