@@ -7,6 +7,11 @@ SHELL := /bin/bash
 BIN := .venv/bin
 COMPILED := $(shell sed -n 's/^    "\(.*\.py\)",$$/\1/p' src/trilane/compiled.py)
 
+# Tests that stand for themselves share the cores; after them those that run units, which have the cores to themselves.
+# With ARGS the tests that it names, as pytest takes them.
+tests = $(if $(ARGS),$(BIN)/pytest $(1) $(ARGS),\
+  $(BIN)/pytest $(1) --numprocesses auto --dist loadfile tests/core tests/golden && $(BIN)/pytest $(1) tests/conformance tests/process)
+
 run: .venv/ready-run
 	$(BIN)/trilane run $(ARGS)
 
@@ -14,11 +19,11 @@ test: .venv/ready-test .venv/ready-core
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/pytest $(ARGS)
+	$(call tests)
 
 # All that a machine without a GPU can run: every extra is installed, and a skip that is not on the list fails.
 test-all: .venv/ready-all .venv/ready-core
-	$(BIN)/pytest --slow -p trilane.testing.skips $(ARGS)
+	$(call tests,--slow -p trilane.testing.skips)
 
 # What needs a GPU: hardware OpenGL, training on CUDA, the runtime cuda. Exit code 3 where there is none.
 test-device: .venv/ready-device
