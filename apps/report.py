@@ -334,11 +334,7 @@ def build_report(
         **metrics.as_json(),
         "schema": SCHEMA,
         "machine": machine,
-        "config": {
-            **config.model_dump(mode="json", exclude={"out_dir", "window"}),
-            "policy": metrics.policy,
-            "edge": metrics.edge,
-        },
+        "config": config_facts(config, metrics.policy, metrics.edge),
         "plan": {"tensor_shapes": config.buckets},
         "caps": metrics.caps.as_json() if metrics.caps else {"how": NO_CAP},
         "temperature_c": (metrics.temperature_c.as_json() if metrics.temperature_c else {}) | sensor,
@@ -352,6 +348,11 @@ def build_report(
         **facts,
     }
     return Report.model_validate(document | {"sources": sources_of(document)})
+
+
+def config_facts(config: RunConfig, policy: str, edge: str) -> dict[str, Any]:
+    """`config` of the report."""
+    return {**config.model_dump(mode="json", exclude={"out_dir", "window"}), "policy": policy, "edge": edge}
 
 
 def _compared(metrics: RunMetrics) -> Baseline:

@@ -13,13 +13,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from trilane.apps.report import Report, build_report, write_report
+from trilane.apps.report import Report, build_report, config_facts, write_report
 from trilane.apps.resolution import resolution_note, resolution_of
 from trilane.apps.run_folder import RunFolder
 from trilane.errors import TrilaneError
 from trilane.hw_profiles.governor import Governor
+from trilane.hw_profiles.host import sensor_c
 from trilane.hw_profiles.load import load_runnable
+from trilane.pipeline import journal
+from trilane.pipeline.journal_slices import jobs_of
 from trilane.pipeline.result import RunResult
+from trilane.pipeline.run_record import JournalFile
 from trilane.pipeline.signals import Interrupts
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.policy import policy_named
@@ -99,7 +103,10 @@ def run_to_folder(
             hooks.message(checked.notes[-1])
         threading.Thread(target=_import_writers, name="imports", daemon=True).start()
         job = _Job(checked, plan, hooks, starter)
-        result = job.run(folder.work)
+        result = job.run(
+            folder.work,
+            {"config": config_facts(checked.config, plan.policy, plan.edge), "machine": machine, "made": made},
+        )
         with Interrupts() as late:  # from here on a signal waits until the folder is whole
             baseline, stopped = job.run_baseline(folder.work) if _is_complete(result) else (None, False)
             facts = {"made": made, "accuracy": dict(checked.accuracy), "notes": list(checked.notes)}
@@ -111,10 +118,9 @@ def run_to_folder(
                 from trilane.apps.pace import compare
 
                 scene = checked.config.scene
-                facts["pace"] = compare(
-                    plan.pace, plan.policy, scene.frames, result.jobs, edge=plan.edge, fps=scene.fps
-                )
-            facts |= _write_files(result, folder.work, checked.config.scene.fps)
+                jobs = list(jobs_of(folder.work / journal.NAME))
+                facts["pace"] = compare(plan.pace, plan.policy, scene.frames, jobs, edge=plan.edge, fps=scene.fps)
+            facts |= _write_files(folder.work, checked.config.scene.fps)
             report = build_report(result, checked.config, machine=machine, baseline=baseline, facts=facts)
             _tell(report, hooks)
             write_report(report, folder.work / "report.json")
@@ -128,9 +134,13 @@ class _Job:
     def __init__(self, checked: Checked, plan: Plan, hooks: Hooks, starter: UnitStarter | None) -> None:
         self._checked, self._plan, self._hooks, self._starter = checked, plan, hooks, starter
 
-    def run(self, folder: Path) -> RunResult:
-        """The run that was asked for. Raises TrilaneError when it ended before any frame was presented."""
-        return self._run(folder, self._plan.policy, None, self._plan.latch_ms)
+    def run(self, folder: Path, facts: Mapping[str, Any]) -> RunResult:
+        """The run that was asked for, with its journal, which begins with `facts`.
+
+        Raises TrilaneError when it ended before any frame was presented.
+        """
+        file = JournalFile(folder / journal.NAME, facts, _sensors)
+        return self._run(folder, self._plan.policy, None, self._plan.latch_ms, file)
 
     def run_baseline(self, folder: Path) -> tuple[RunResult | None, bool]:
         """The first frames of the same scene again, one frame at a time; its pictures are not kept.
@@ -154,7 +164,9 @@ class _Job:
             shutil.rmtree(place)
         return (result if _is_complete(result) else None), result.interrupted
 
-    def _run(self, folder: Path, policy: str, frames: int | None, latch_ms: float) -> RunResult:
+    def _run(
+        self, folder: Path, policy: str, frames: int | None, latch_ms: float, file: JournalFile | None = None
+    ) -> RunResult:
         profile = self._plan.performance_profile
         result = run_avatar(
             self._checked.config.model_copy(update={"out_dir": folder}),
@@ -165,6 +177,7 @@ class _Job:
             pace_fps=self._release_fps(policy),
             latch_ms=latch_ms,
             governor=None if profile is None else Governor(load_runnable(HOST), profile),
+            journal=file,
             starter=self._starter,
             on_progress=lambda presented, requested: self._hooks.progress(policy, presented, requested),
             on_message=self._hooks.message,
@@ -182,6 +195,12 @@ class _Job:
         from trilane.apps.pace import release_fps
 
         return release_fps(self._plan.pace, self._checked.config.scene.fps)
+
+
+def _sensors() -> dict[str, float]:
+    """What is looked at in passing."""
+    celsius = sensor_c()
+    return {} if celsius is None else {"temperature_c.sensor": celsius}
 
 
 def _is_complete(result: RunResult) -> bool:
@@ -214,15 +233,14 @@ def _tell(report: Report, hooks: Hooks) -> None:
 
 def _import_writers() -> None:
     """What `_write_files` needs, imported while the units start and this process waits for them."""
-    from trilane.apps import trace, video  # noqa: F401
+    from trilane.apps import journal_files, video  # noqa: F401
     from trilane.stages.cpu import present  # noqa: F401
 
 
-def _write_files(result: RunResult, work: Path, fps: float) -> dict[str, Any]:
+def _write_files(work: Path, fps: float) -> dict[str, Any]:
     """Everything but the report; what the report says of it."""
-    from trilane.apps.trace import write_trace
+    from trilane.apps.journal_files import write_from_journal
     from trilane.apps.video import contact_sheet, join_segments, run_checksum
-    from trilane.scheduler.accounts import idle_slices
     from trilane.stages.cpu.present import SEGMENTS
 
     segments = work / SEGMENTS
@@ -234,7 +252,5 @@ def _write_files(result: RunResult, work: Path, fps: float) -> dict[str, Any]:
             facts["video"] = {"frames": joined.frames, "seconds": joined.seconds}
             contact_sheet(work / "video.mp4", work / "contact.png", fps)
         shutil.rmtree(segments)
-    result.recording.write(work / "events.jsonl")
-    idle = idle_slices(result.recording, result.jobs)
-    write_trace(result.jobs, result.recording.graph.units, work / "trace.pftrace", idle)
+    write_from_journal(work / journal.NAME, work)
     return facts

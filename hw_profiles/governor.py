@@ -86,6 +86,12 @@ class Governor:
         seconds = (self._last_ns - self._start_ns) / NS
         return self._joules / seconds if seconds > 0 else None
 
+    @property
+    def temperatures_c(self) -> dict[str, float]:
+        """Modelled, now: of the device's body (`device`) and of each unit's junction."""
+        junctions = {str(unit): celsius for unit, celsius in self._thermal_state.junction_c.items()}
+        return {"device": self._thermal_state.device_c, **junctions}
+
     def report(self) -> dict[str, Any]:
         """The keys `caps` and `temperature_c` of report.json."""
         ticks = max(self._ticks, 1)

@@ -10,7 +10,7 @@ record, or without `Ended`, is of a run that was killed, or that still goes on.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
@@ -113,7 +113,9 @@ class JournalWriter:
         self._packer = msgpack.Packer()
 
     def add(self, record: Record) -> None:
-        self._file.write(self._packer.pack([_PLACES[type(record)], *_fields(record)]))
+        kind = type(record)
+        fields = _FIELDS[kind](record) if kind in _FIELDS else record
+        self._file.write(self._packer.pack([_PLACES[kind], *fields]))
 
     def flush(self) -> None:
         """Whoever follows the journal sees all that was added."""
@@ -204,15 +206,11 @@ def journal_of(
     yield Ended(now_ns, report)
 
 
-def _fields(record: Record) -> list[Any]:
-    match record:
-        case Begun():
-            return [record.schema, asdict(record.graph), asdict(record.settings), record.facts]
-        case Stepped():
-            return [record.now_ns, [*map(row_of, record.events)], [*map(row_of, record.actions)]]
-        case Worked():
-            return [[*record.job], record.figures]
-    return [*record]
+#: The fields of a record as they are written, where they are not its own.
+_FIELDS: dict[type[Any], Callable[[Any], list[Any]]] = {
+    Begun: lambda record: [record.schema, asdict(record.graph), asdict(record.settings), record.facts],
+    Stepped: lambda record: [record.now_ns, [*map(row_of, record.events)], [*map(row_of, record.actions)]],
+}
 
 
 def _parse(row: Any) -> Record:

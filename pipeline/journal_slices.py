@@ -1,12 +1,14 @@
-"""The idle slices of a run from its journal. Rule: they are cut from what the journal says, and from nothing else."""
+"""The jobs and idle slices of a run from its journal. Rule: what the journal says, and nothing else, one by one."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 from trilane.pipeline.journal import Accounted, Begun, Record, Stepped, Worked, read_journal
 from trilane.scheduler.accounts import IdleCutter, IdleSlice, ShareSums, Span
 from trilane.scheduler.events import Graph
+from trilane.scheduler.ledger import JobRecord
 
 
 class JournalSlices:
@@ -37,6 +39,11 @@ class JournalSlices:
     def end(self) -> list[IdleSlice]:
         """Until the last step."""
         return self._cutter.end()
+
+
+def jobs_of(path: Path) -> Iterator[JobRecord]:
+    """The jobs of the journal at `path`, in the order in which their ends were heard. Raises BadInputError."""
+    return (record.job for record in read_journal(path) if isinstance(record, Worked))
 
 
 def shares_of_journal(path: Path) -> dict[str, dict[str, float]]:

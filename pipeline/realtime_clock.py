@@ -13,6 +13,7 @@ from typing import Protocol
 from trilane.errors import TrilaneError
 from trilane.pipeline.controls import RunControls
 from trilane.pipeline.cpu_use import CpuTimes
+from trilane.pipeline.journal import Worked
 from trilane.pipeline.requests import FrameRequestQueue
 from trilane.pipeline.run_log import RunLog
 from trilane.pipeline.signals import Interrupts
@@ -61,9 +62,8 @@ class Governor(Protocol):
 class RealtimeClock:
     """`trilane.scheduler.loop.Clock` of one run over `processes`; it lets `core` run until that finishes.
 
-    `jobs`: of every job that ended, when. `metrics`: of every stage, the sums of what its jobs reported,
-    and `reported`, how many of them reported each. `cpu`: CPU time of units and stages. `first`: events
-    that come before all others.
+    Of the jobs that `ended` has told of: `metrics`, the sums of what those of each stage reported, and `reported`, how
+    many of them reported each; `cpu`, CPU time of units and stages. `first`: events that come before all others.
     """
 
     def __init__(
@@ -76,8 +76,7 @@ class RealtimeClock:
         governor: Governor | None,
         on_progress: Callable[[int, int], None] | None,
     ) -> None:
-        self.jobs: list[JobRecord] = []
-        self.metrics: dict[str, Counter[str]] = defaultdict(Counter)
+        self.metrics: dict[str, dict[str, float]] = defaultdict(dict)
         self.reported: dict[str, Counter[str]] = defaultdict(Counter)
         self.cpu = CpuTimes(processes.core_counts)
         self.first: list[Event] = []
@@ -121,9 +120,24 @@ class RealtimeClock:
             elif isinstance(action, Start):
                 self._start(action.unit)
 
+    def ended(self) -> list[Worked]:
+        """Book the jobs that have ended since the last call; those whose frame was still there, with their times."""
+        found = []
+        for job, dispatch_ns, ready_ns, done in self._unbooked:
+            if ready_ns is not None:
+                lost = (done.preempted_ns, done.asleep_ns, done.preempted_before_ns)
+                times = (ready_ns, dispatch_ns, done.t_begin_ns, done.t_end_ns, *lost)
+                found.append(Worked(JobRecord(job.stage, job.unit, job.frame, *times), done.metrics))
+            self.cpu.add(job.unit, job.stage, done, self._core.ledger.start_ns)
+            sums, counts = self.metrics[job.stage], self.reported[job.stage]
+            for name, value in done.metrics.items():
+                sums[name] = sums.get(name, 0.0) + value
+                counts[name] += 1
+        self._unbooked.clear()
+        return found
+
     def finish(self) -> None:
-        """Book all jobs that have ended, and show the final progress."""
-        self._book()
+        """Show the final progress."""
         self._show_progress(final=True)
 
     def _start(self, unit: str) -> None:
@@ -224,18 +238,6 @@ class RealtimeClock:
         place = self._processes.places[job.stage]
         fields = (job.id, place, job.frame, job.slot_in, job.slot_out, job.epoch, now_ns, int(job.fresh), job.rung)
         self._processes.send(job.unit, tuple.__new__(RunJob, fields))
-
-    def _book(self) -> None:
-        """Note what the ended jobs took; done when the run is over, for units share the scheduler's core."""
-        for job, dispatch_ns, ready_ns, done in self._unbooked:
-            if ready_ns is not None:
-                lost = (done.preempted_ns, done.asleep_ns, done.preempted_before_ns)
-                times = (ready_ns, dispatch_ns, done.t_begin_ns, done.t_end_ns, *lost)
-                self.jobs.append(JobRecord(job.stage, job.unit, job.frame, *times))
-            self.cpu.add(job.unit, job.stage, done, self._core.ledger.start_ns)
-            self.metrics[job.stage].update(done.metrics)
-            self.reported[job.stage].update(done.metrics.keys())
-        self._unbooked.clear()
 
     def _tell_unanswered(self) -> None:
         """Whoever asked for frames learns at once of those that will not come."""

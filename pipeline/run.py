@@ -20,17 +20,16 @@ from trilane.pipeline.requests import FrameRequestQueue
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run_log import RunLog, UnitError
 from trilane.pipeline.run_metrics import RunMetrics, metrics_of
+from trilane.pipeline.run_record import JournalFile, RunRecord, recorded
 from trilane.pipeline.shared_assets import Assets
 from trilane.pipeline.signals import Interrupts
 from trilane.pipeline.surroundings import on_cores, prompt_answers, unit_processes
 from trilane.pipeline.unit_processes import UnitProcesses
 from trilane.pipeline.unit_starter import UnitStarter
-from trilane.scheduler.accounts import second_accounts
 from trilane.scheduler.causes import Outcome, OutcomeKind
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import Settings
 from trilane.scheduler.loop import run_loop
-from trilane.scheduler.recording import Recording
 from trilane.scheduler.release import run_settings
 from trilane.scheduler.stats import energy_score
 from trilane.transport.wakeup import awake
@@ -52,6 +51,10 @@ class ReportingGovernor(Governor, Protocol):
     def power_w(self) -> float | None:
         """Mean power of the run so far, None when it is not known."""
 
+    @property
+    def temperatures_c(self) -> Mapping[str, float]:
+        """Those that it goes by, in degrees Celsius."""
+
     def report(self) -> dict[str, Any]:
         """`caps` and `temperature_c` of the report."""
 
@@ -72,6 +75,7 @@ def run_pipeline(
     requests: FrameRequestQueue | None = None,
     controls: RunControls | None = None,
     governor: ReportingGovernor | None = None,
+    journal: JournalFile | None = None,
     starter: UnitStarter | None = None,
     on_progress: Callable[[int, int], None] | None = None,
     on_message: Callable[[str], None] | None = None,
@@ -95,6 +99,8 @@ def run_pipeline(
     `controls`: what somebody asks of the run; the frames that it has released when it ends count as requested. It is
     closed when this returns.
     `governor`: holds the units to shares of the time, and says in the report what it did.
+    `journal`: everything that happens is written there while it happens, and nothing of it is kept in memory; None
+    keeps all of it, in `RunResult.recording` and `RunResult.jobs`.
     `starter`: a fork server that was started earlier; None makes one for this run.
     `on_progress(presented, requested)`, `on_message(text)`: called from this thread.
 
@@ -109,38 +115,48 @@ def run_pipeline(
     check_cores(pipeline)
     isolated = _isolated_share(frames) if isolated_frames is None else isolated_frames
     settings = _stepped(_settings(policy, frames, fps, pace_fps, hang_ns, latch_ms, requests), works, follow)
-    log = RunLog(on_message)
-    with (
-        contextlib.closing(requests) if requests is not None else contextlib.nullcontext(),
-        contextlib.closing(controls) if controls is not None else contextlib.nullcontext(),
-        Interrupts() as interrupts,
-        on_cores(pipeline.scheduler_cores),
-        prompt_answers(),
-        awake(governor is None or governor.is_prompt) as idle_cores,
-        unit_processes(pipeline, assets or {}, starter, UnitProcesses) as processes,
-    ):
-        core = Core(pipeline.graph(), settings)
-        clock = RealtimeClock(core, processes, interrupts, log, requests, governor, on_progress)
-        cores = sorted({core for unit in pipeline.units.values() for core in unit.cores})
-        if controls is not None:
-            clock.heed(controls)
-        run = _Run(core, clock, processes, interrupts, log, Recording(core.graph, settings), cores)
-        run.execute(isolated)
-    report = core.ledger.report(
-        clock="host",
-        requested=settings.frames if requests is None and controls is None else core.source.released,
-        target_period_ns=0 if settings.deadline_ns else round(1e9 / fps),
-        isolated_ns=run.isolated.mean_ns if isolated else None,
-    )
-    report.update(policy=policy, edge=pipeline.rule, idle_cores=idle_cores, other_programs=run.other_programs)
-    report.update(governor.report() if governor else {})
-    if governor is not None and governor.power_w is not None and report["fps"]:
+    with recorded(journal, pipeline.graph(), settings, governor) as record:
+        log = RunLog(record.say, *([on_message] if on_message is not None else []))
+        with (
+            contextlib.closing(requests) if requests is not None else contextlib.nullcontext(),
+            contextlib.closing(controls) if controls is not None else contextlib.nullcontext(),
+            Interrupts() as interrupts,
+            on_cores(pipeline.scheduler_cores),
+            prompt_answers(),
+            awake(governor is None or governor.is_prompt) as idle_cores,
+            unit_processes(pipeline, assets or {}, starter, UnitProcesses) as processes,
+        ):
+            core = Core(pipeline.graph(), settings)
+            clock = RealtimeClock(core, processes, interrupts, log, requests, governor, on_progress)
+            cores = sorted({core for unit in pipeline.units.values() for core in unit.cores})
+            if controls is not None:
+                clock.heed(controls)
+            run = _Run(core, clock, processes, interrupts, log, record, cores)
+            run.execute(isolated)
+        report = core.ledger.report(
+            clock="host",
+            requested=settings.frames if requests is None and controls is None else core.source.released,
+            target_period_ns=0 if settings.deadline_ns else round(1e9 / fps),
+            isolated_ns=run.isolated.mean_ns if isolated else None,
+        )
+        report.update(policy=policy, edge=pipeline.rule, idle_cores=idle_cores, other_programs=run.other_programs)
+        _add_caps(report, governor)
+        for unit, row in report["units"].items():
+            row.update(pid=run.pids[unit], **pipeline.units[unit].model_dump(mode="json"))
+        add_accounts(report, pipeline, clock.cpu, record.second_accounts(), log)
+        report["core_efficiency"] = core_efficiency(report, pipeline)
+        metrics = metrics_of(report)
+        record.end(metrics.as_json())
+    return run.result(metrics)
+
+
+def _add_caps(report: dict[str, Any], governor: ReportingGovernor | None) -> None:
+    """What the governor says of the run, and the score of the energy that it modelled."""
+    if governor is None:
+        return
+    report.update(governor.report())
+    if governor.power_w is not None and report["fps"]:
         report["xrbench"]["energy"] = energy_score(1e3 * governor.power_w / report["fps"])
-    for unit, row in report["units"].items():
-        row.update(pid=run.pids[unit], **pipeline.units[unit].model_dump(mode="json"))
-    add_accounts(report, pipeline, clock.cpu, second_accounts(run.recording, clock.jobs), log)
-    report["core_efficiency"] = core_efficiency(report, pipeline)
-    return run.result(metrics_of(report))
 
 
 class _Run:
@@ -153,11 +169,11 @@ class _Run:
         processes: UnitProcesses,
         interrupts: Interrupts,
         log: RunLog,
-        recording: Recording,
+        record: RunRecord,
         cores: Sequence[int],
     ) -> None:
         self._core, self._clock, self._processes, self._cores = core, clock, processes, cores
-        self._interrupts, self._log, self.recording = interrupts, log, recording
+        self._interrupts, self._log, self._record = interrupts, log, record
         self.isolated = IsolatedTimes(core.graph, processes, interrupts)
         self.pids: dict[str, int] = {}
         self.other_programs: float | None = None
@@ -175,7 +191,8 @@ class _Run:
             few = _spread(settings.frames, FRAMES_ON_RUNGS)
             self._clock.first += self.isolated.of_rungs(few, len(settings.works), settings.follow)
         others = beside_units(self._cores, self.pids)
-        self._outcome = run_loop(self._core, self._clock, self.recording)
+        self._record.begin(self._clock, lambda: self._processes.pids)
+        self._outcome = run_loop(self._core, self._clock, self._record)
         self.other_programs = others(self._processes.pids)
         self._clock.finish()
         if self._outcome.kind is OutcomeKind.GAVE_UP:
@@ -198,8 +215,8 @@ class _Run:
             dropped=dict(ledger.dropped),
             pids=self.pids,
             startup_ms=self._startup_ms,
-            jobs=tuple(self._clock.jobs),
-            recording=self.recording,
+            jobs=tuple(self._record.jobs),
+            recording=self._record.recording,
             metrics=self._mean_metrics(),
             rungs=tuple(ledger.rungs) if self._core.ladder is not None else (),
             messages=tuple(self._log.messages),

@@ -8,6 +8,8 @@ from trilane.errors import TrilaneError
 from trilane.pipeline.result import Failure
 from trilane.transport.messages import Failed
 
+MOST_MESSAGES = 1000
+
 
 class UnitError(TrilaneError):
     """A unit could not start or be measured; `exit_code` is the one of the error in the unit."""
@@ -18,17 +20,26 @@ class UnitError(TrilaneError):
 
 
 class RunLog:
-    """`messages` in order, and the run's first `failure`. `on_message` is called with each message."""
+    """`messages`: in order, the first MOST_MESSAGES; the run's first `failure`. Each of `hears` is called with all."""
 
-    def __init__(self, on_message: Callable[[str], None] | None = None) -> None:
-        self.messages: list[str] = []
+    def __init__(self, *hears: Callable[[str], None]) -> None:
         self.failure: Failure | None = None
-        self._on_message = on_message
+        self._hears = hears
+        self._first: list[str] = []
+        self._more = 0
+
+    @property
+    def messages(self) -> list[str]:
+        more = f"{self._more} more messages are in the journal of the run alone"
+        return [*self._first, more] if self._more else [*self._first]
 
     def say(self, text: str) -> None:
-        self.messages.append(text)
-        if self._on_message is not None:
-            self._on_message(text)
+        if len(self._first) < MOST_MESSAGES:
+            self._first.append(text)
+        else:
+            self._more += 1
+        for hear in self._hears:
+            hear(text)
 
     def fail(self, text: str, exit_code: int = 1) -> None:
         """Note the failure, unless there was one before; the result shows it."""

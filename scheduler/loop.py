@@ -7,7 +7,6 @@ from typing import Protocol
 from trilane.scheduler.causes import Outcome
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import NEVER, Action, Event
-from trilane.scheduler.recording import Recording
 
 
 class Clock(Protocol):
@@ -27,7 +26,15 @@ class Clock(Protocol):
         ...
 
 
-def run_loop(core: Core, clock: Clock, recording: Recording | None = None) -> Outcome:
+class Recorder(Protocol):
+    """What the steps of a run are added to, such as `trilane.scheduler.recording.Recording`."""
+
+    def add(self, now_ns: int, events: tuple[Event, ...], actions: tuple[Action, ...], core: Core) -> None:
+        """A step of `core` that has just been taken, and whose actions were performed."""
+        ...
+
+
+def run_loop(core: Core, clock: Clock, recording: Recorder | None = None) -> Outcome:
     """Run `core` until it finishes; every step is added to `recording`.
 
     Raises what `clock` raises, KeyError and UnitLifeError (see Core.step).

@@ -27,14 +27,14 @@ from trilane.scheduler.events import (
 from trilane.scheduler.unit_life import UnitLifeError
 from trilane.unexpected_value import UnexpectedValue
 
-SCHEMA = 6
+SCHEMA = 7
 #: Actions that carry one tuple, which is written in their place.
 CARRIED: dict[Any, Any] = {Dispatch: Job, Finish: Outcome}
 
 
-def _forms(kinds: tuple[Any, ...]) -> dict[str, tuple[Any, list[Any]]]:
-    """Name -> the event or action, and the types of the fields of its row."""
-    return {kind.__name__: (kind, list(get_type_hints(CARRIED.get(kind, kind)).values())) for kind in kinds}
+def _forms(kinds: tuple[Any, ...]) -> dict[str, tuple[Any, dict[str, Any]]]:
+    """Name -> the event or action, and its fields with their types, in the order of its row."""
+    return {kind.__name__: (kind, get_type_hints(CARRIED.get(kind, kind))) for kind in kinds}
 
 
 _EVENTS, _ACTIONS = _forms(EVENTS), _forms(ACTIONS)
@@ -63,13 +63,28 @@ class Recording:
                 self.accounts.append((now_ns, unit.name, unit.account))
 
     def write(self, path: Path) -> None:
-        """As JSON lines: a header, then a line per step with `t`, `events`, `actions`, each a [name, fields...]."""
-        header = {"schema": SCHEMA, "graph": asdict(self.graph), "settings": asdict(self.settings)}
+        """As JSON lines (`header_line`, `step_line`)."""
         with path.open("w", encoding="utf-8") as file:
-            file.write(json.dumps(header) + "\n")
+            file.write(header_line(self.graph, self.settings))
             for now_ns, events, actions in self.steps:
-                row = {"t": now_ns, "events": [row_of(e) for e in events], "actions": [row_of(a) for a in actions]}
-                file.write(json.dumps(row, separators=(",", ":")) + "\n")
+                file.write(step_line(now_ns, events, actions))
+
+
+def header_line(graph: Graph, settings: Settings) -> str:
+    """The first line of a recording: `schema`, `graph`, `settings`."""
+    return json.dumps({"schema": SCHEMA, "graph": asdict(graph), "settings": asdict(settings)}) + "\n"
+
+
+def step_line(now_ns: int, events: Iterable[Event], actions: Iterable[Action]) -> str:
+    """The line of a step: `t`, `events`, `actions`; each of these an object of its name and its fields."""
+    told = [{"event": type(event).__name__, **_fields_of(event)} for event in events]
+    answered = [{"action": type(action).__name__, **_fields_of(action)} for action in actions]
+    return json.dumps({"t": now_ns, "events": told, "actions": answered}, separators=(",", ":")) + "\n"
+
+
+def _fields_of(item: Any) -> dict[str, Any]:
+    fields: dict[str, Any] = (item[0] if type(item) in CARRIED else item)._asdict()
+    return fields
 
 
 def read(path: Path) -> Recording:
@@ -87,7 +102,9 @@ def read(path: Path) -> Recording:
                 now_ns = row["t"]
                 if type(now_ns) is not int or (recording.steps and now_ns < recording.steps[-1][0]):
                     raise UnexpectedValue(f"time {now_ns!r}", "ns that do not go back")
-                recording.steps.append((now_ns, events_of(row["events"]), actions_of(row["actions"])))
+                events = events_of(_listed(each, "event", _EVENTS) for each in row["events"])
+                actions = actions_of(_listed(each, "action", _ACTIONS) for each in row["actions"])
+                recording.steps.append((now_ns, events, actions))
     except OSError as error:
         raise BadInputError.of_os_error(path, error, "a recorded run") from None
     except UnexpectedValue as error:
@@ -132,12 +149,27 @@ def actions_of(rows: Iterable[Sequence[Any]]) -> tuple[Action, ...]:
     return tuple(_parse(row, _ACTIONS) for row in rows)
 
 
-def _parse(row: Sequence[Any], forms: dict[str, tuple[Any, list[Any]]]) -> Any:
+def _listed(row: Mapping[str, Any], key: str, forms: dict[str, tuple[Any, dict[str, Any]]]) -> list[Any]:
+    """An object of a recording's line as a row. Raises UnexpectedValue for other fields than those of its name."""
+    name = row[key]
+    _, types = _form(name, forms)
+    if row.keys() != {key, *types}:
+        raise UnexpectedValue(f"{name} with {', '.join(row)}"[:80], f"{key}, {', '.join(types)}")
+    return [name, *(row[field] for field in types)]
+
+
+def _form(name: Any, forms: dict[str, tuple[Any, dict[str, Any]]]) -> tuple[Any, dict[str, Any]]:
+    """Raises UnexpectedValue for a name that none of `forms` has."""
+    if not isinstance(name, str) or name not in forms:
+        raise UnexpectedValue(repr(str(name)[:80]), f"one of {', '.join(forms)}")
+    return forms[name]
+
+
+def _parse(row: Sequence[Any], forms: dict[str, tuple[Any, dict[str, Any]]]) -> Any:
     """Raises UnexpectedValue for a name, for types of fields or for a kind of outcome that none of `forms` has."""
     name, *fields = row
-    if name not in forms:
-        raise UnexpectedValue(repr(str(name)[:80]), f"one of {', '.join(forms)}")
-    kind, types = forms[name]
+    kind, hints = _form(name, forms)
+    types = list(hints.values())
     written = [str if issubclass(each, StrEnum) else each for each in types]
     if [type(field) for field in fields] != written:
         raise UnexpectedValue(str(row)[:80], f"fields of {', '.join(each.__name__ for each in written)}")

@@ -15,6 +15,7 @@ import pytest
 
 from trilane.errors import TrilaneError
 from trilane.pipeline import realtime_clock
+from trilane.pipeline.journal import Worked
 from trilane.pipeline.realtime_clock import RealtimeClock
 from trilane.pipeline.result import Failure
 from trilane.pipeline.run_log import RunLog
@@ -280,8 +281,7 @@ def test_a_frame_that_nobody_asked_for_is_presented_all_the_same(monkeypatch: py
         world.inbox = [[(unit, Done(number, 1, 2, 1 if number == 0 else 0, 0, 0, 0, 0, 1, 0, {}))]]
         now_ns, events = clock.wait(START)
         clock.perform(now_ns, world.core.step(now_ns, events).actions)
-    clock.finish()
-    assert [job.stage for job in clock.jobs] == ["draw", "mix", "show"]
+    assert [worked.job.stage for worked in clock.ended()] == ["draw", "mix", "show"]
     assert world.core.ledger.presented_frames == [0]
 
 
@@ -296,14 +296,14 @@ def test_every_job_that_ended_is_booked_with_its_times_and_figures(monkeypatch: 
     released = world.core.frames[0].ready_ns
     world.inbox = [[("gpu", Done(0, START + 1, START + 9, START + 2, 3, 2, 1, 0, 4, 99, {"area": 3.0}))]]
     clock.wait(START)
-    assert clock.jobs == []
+    job = JobRecord("draw", "gpu", 0, released, START, START + 1, START + 9, 3, 2, 1)
+    assert clock.ended() == [Worked(job, {"area": 3.0})]
     del world.core.frames[1]
     world.inbox = [[("gpu", Done(1, START + 12, START + 20, 0, 0, 0, 0, 0, 16, 5, {"area": 4.0, "new": 1.0}))]]
     clock.wait(START)
-    clock.finish()
-    clock.finish()
-    assert clock.jobs == [JobRecord("draw", "gpu", 0, released, START, START + 1, START + 9, 3, 2, 1)]
-    assert clock.metrics == {"draw": Counter(area=7.0, new=1.0)}
+    assert clock.ended() == []
+    assert clock.ended() == []
+    assert clock.metrics == {"draw": {"area": 7.0, "new": 1.0}}
     assert clock.reported == {"draw": Counter(area=2, new=1)}
     assert (clock.cpu.stage_ns, clock.cpu.in_jobs_ns, clock.cpu.between_ns) == (
         {"draw": [4, 16]},
@@ -332,4 +332,4 @@ def test_a_run_that_shows_no_progress_goes_on(monkeypatch: pytest.MonkeyPatch) -
     clock = RealtimeClock(world.core, world, world.interrupts, world.log, None, None, None)  # type: ignore[arg-type]
     assert clock.wait(NEVER)[0] == START
     clock.finish()
-    assert (world.progress, clock.jobs, clock.metrics) == ([], [], {})
+    assert (world.progress, clock.ended(), clock.metrics) == ([], [], {})

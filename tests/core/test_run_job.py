@@ -21,10 +21,13 @@ from trilane.figure_sources import COMPARED, COMPUTED, MEASURED
 from trilane.hw_profiles.application import application_graph
 from trilane.hw_profiles.governor import Governor
 from trilane.pipeline.description import UnitSettings
+from trilane.pipeline.journal import JournalWriter, journal_of
 from trilane.pipeline.result import Failure, RunResult
 from trilane.pipeline.run_metrics import metrics_of
+from trilane.pipeline.run_record import JournalFile
 from trilane.scene.schema import OutputSpec, Scene
 from trilane.scheduler.events import Settings
+from trilane.scheduler.recording import Recording
 from trilane.scheduler.virtual import simulate
 from trilane.stages.config import RunConfig
 from trilane.stages.configure import Checked
@@ -35,6 +38,7 @@ from trilane.units import PerformanceProfile
 
 MS = 1_000_000
 FRAMES, WIDTH, HEIGHT = 6, 96, 64
+FILES = ["events.jsonl", "journal.msgpack", "report.json", "trace.pftrace"]
 #: The slowest stage takes 4 ms: pipelined frames are 4 ms apart, frames one at a time 1 + 2 + 4 + 2 + 1 ms.
 STAGE_NS = {"pose": MS, "raster": 2 * MS, "infer": 4 * MS, "composite": 2 * MS, "present": MS}
 MACHINE = {
@@ -91,6 +95,14 @@ def record(out_dir: Path, numbers: range) -> None:
     stage.close()
 
 
+def journaled(result: RunResult, file: JournalFile) -> RunResult:
+    """The run with its jobs and steps in the journal, and nowhere else."""
+    with JournalWriter(file.path) as journal:
+        for each in journal_of(result.recording, result.jobs, file.facts, result.report.as_json()):
+            journal.add(each)
+    return replace(result, jobs=(), recording=Recording(result.recording.graph, result.recording.settings))
+
+
 PLACED = "placement: cpu 0, gpu 1, dsp 0"
 
 
@@ -109,7 +121,8 @@ class Runs:
         answer = self.answers.pop(0)
         if isinstance(answer, BaseException):
             raise answer
-        return answer(config.out_dir) if callable(answer) else answer
+        result: RunResult = answer(config.out_dir) if callable(answer) else answer
+        return result if options["journal"] is None else journaled(result, options["journal"])
 
     @property
     def hooks(self) -> Hooks:
@@ -152,7 +165,7 @@ def test_a_run_and_its_baseline(runs: Callable[..., Runs], tmp_path: Path) -> No
     assert first["config"].model_copy(update={"out_dir": Path("/nowhere")}) == checked().config
     assert (first["starter"], first["governor"], first["assets"]) == ("the starter", None, {})
     assert double.said == [PLACED, ("deadline", 2, 5), "hello", ("sequential", 2, 5), "hello"]
-    assert sorted(file.name for file in outcome.folder.iterdir()) == ["events.jsonl", "report.json", "trace.pftrace"]
+    assert sorted(file.name for file in outcome.folder.iterdir()) == FILES
     report = read_report(outcome.folder)
     assert report == outcome.report
     assert (report.frames.presented, report.policy) == (FRAMES, "pipelined")
@@ -230,7 +243,7 @@ def test_a_baseline_that_is_not_whole_is_left_out(case: str, runs: Callable[...,
     outcome = go(double, tmp_path / "run")
     assert (outcome.exit_code, outcome.report.baseline) == (code, None)
     assert double.said[5:] == ([said] if said else [])
-    assert sorted(file.name for file in outcome.folder.iterdir()) == ["events.jsonl", "report.json", "trace.pftrace"]
+    assert sorted(file.name for file in outcome.folder.iterdir()) == FILES
 
 
 RUNS = {
@@ -338,7 +351,7 @@ def test_the_video_is_joined_and_what_it_lacks_is_told(runs: Callable[..., Runs]
         "no avatar was in the picture in any frame",
     ]
     files = {file.name for file in outcome.folder.iterdir()}
-    assert files == {"contact.png", "events.jsonl", "report.json", "trace.pftrace", "video.mp4"}
+    assert files == {"contact.png", "video.mp4", *FILES}
     assert SEGMENTS not in files
 
 

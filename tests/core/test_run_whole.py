@@ -7,17 +7,33 @@ import os
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from trilane.errors import BadInputError
+from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline import accounts, run, surroundings
 from trilane.pipeline.cpu_use import CpuTimes
+from trilane.pipeline.journal import (
+    Accounted,
+    Begun,
+    Counted,
+    Ended,
+    JournalWriter,
+    Said,
+    Sampled,
+    Stepped,
+    Worked,
+    read_journal,
+)
+from trilane.pipeline.journal_slices import jobs_of
 from trilane.pipeline.requests import FrameRequestQueue
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run_log import UnitError
+from trilane.pipeline.run_metrics import metrics_of
+from trilane.pipeline.run_record import JournalFile, memory_bytes
 from trilane.scheduler.causes import Outcome, OutcomeKind
 from trilane.scheduler.events import Settings, StageAlone
 from trilane.scheduler.stats import energy_score
@@ -58,9 +74,12 @@ class World:
         metrics = {"mid": Counter({"visible": 12.0}), "none": Counter({"x": 5.0})}
         reported = {"mid": Counter({"visible": 40}), "none": Counter({"x": 1})}
         said = {"metrics": metrics, "reported": reported, "first": self.first}
-        return SimpleNamespace(
-            cpu=cpu, jobs=driver.jobs, finish=lambda: self.steps.append("finish"), driver=driver, **said
-        )
+
+        def ended() -> list[Worked]:
+            found, driver.jobs[:] = [Worked(job, {"n": 1.0}) for job in driver.jobs], []
+            return found
+
+        return SimpleNamespace(cpu=cpu, ended=ended, finish=lambda: self.steps.append("finish"), driver=driver, **said)
 
     def run_loop(self, core: Any, clock: Any, recording: Any) -> Outcome:
         self.steps.append("loop")
@@ -171,6 +190,63 @@ def test_the_steps_of_a_run_and_its_report(world: World) -> None:
     assert report.core_shares[1].cpu == pytest.approx(0.012 / (2 * report.duration_s))
     assert report.accounts is not None and report.accounts.agree
     assert (report.caps, report.xrbench.energy) == (None, None)
+
+
+@pytest.mark.usefixtures("world")
+def test_a_run_with_a_journal_keeps_nothing_and_writes_the_same(tmp_path: Path) -> None:
+    """Steps, jobs and accounts are those of the same run in memory; each job follows the step that heard its end."""
+    kept = go()
+    file = JournalFile(tmp_path / "j", {"made": "today", "clock": "host"}, lambda: {"temperature_c.sensor": 41.5})
+    result = go(journal=file)
+    assert (result.jobs, result.recording.steps, result.recording.accounts) == ((), [], [])
+    begun, *records, ended = read_journal(tmp_path / "j")
+    assert isinstance(begun, Begun)
+    assert (begun.graph, begun.settings, begun.facts["made"]) == (PIPELINE.graph(), kept.recording.settings, "today")
+    assert (begun.facts["clock"], begun.facts["began_at"][-6:]) == ("host", "+00:00")
+    assert [tuple(each) for each in records if isinstance(each, Stepped)] == kept.recording.steps
+    assert [tuple(each) for each in records if isinstance(each, Accounted)] == kept.recording.accounts
+    assert sorted(jobs_of(tmp_path / "j")) == sorted(kept.jobs)
+    now_ns = 0
+    for each in records:
+        now_ns = each.now_ns if isinstance(each, Stepped) else now_ns
+        assert not isinstance(each, Worked) or (each.job.end_ns, each.figures) == (now_ns, {"n": 1.0})
+    samples = [each for each in records if isinstance(each, Sampled)]
+    assert len(samples) == 1  # the run takes a quarter of a second
+    assert samples[0].values["temperature_c.sensor"] == 41.5
+    assert samples[0].values["memory_bytes.scheduler"] > 1 << 20
+    assert isinstance(ended, Ended) and metrics_of(ended.report) == result.report
+    assert result.report.accounts == kept.report.accounts
+
+
+def test_messages_and_frames_left_out_are_in_the_journal(world: World, tmp_path: Path) -> None:
+    world.told = {"broken": UnitError("it broke")}
+    governor: Any = SimpleNamespace(is_prompt=True, power_w=None, report=dict, temperatures_c={"device": 30.0})
+    go(journal=JournalFile(tmp_path / "j", {}), policy="latest", fps=2000.0, governor=governor)
+    records = list(read_journal(tmp_path / "j"))
+    assert [each.text for each in records if isinstance(each, Said)] == [LEFT_OUT + "it broke"]
+    counts = [each for each in records if isinstance(each, Counted)]
+    assert counts[-1].dropped == world.core.ledger.dropped_by_cause and counts[-1].lost == {}
+    assert [sum(each.dropped.values()) for each in counts] == sorted({sum(each.dropped.values()) for each in counts})
+    sampled = next(each for each in records if isinstance(each, Sampled))
+    assert (sampled.values["duty.left"], sampled.values["temperature_c.device"]) == (1.0, 30.0)
+
+
+@pytest.mark.usefixtures("world")
+def test_a_journal_that_cannot_be_begun_or_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(BadInputError, match="a place that can be written"):
+        go(journal=JournalFile(tmp_path / "none" / "j", {}))
+
+    def full(_self: Any, record: Any) -> None:
+        if isinstance(record, Stepped):
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(JournalWriter, "add", full)
+    with pytest.raises(TrilaneError, match="the journal cannot be written: No space left on device"):
+        go(journal=JournalFile(tmp_path / "j", {}))
+
+
+def test_memory_of_a_process_that_has_ended_is_none() -> None:
+    assert memory_bytes(1 << 30) == 0
 
 
 def test_a_frame_time_above_the_rates_is_a_missed_deadline(world: World) -> None:

@@ -267,9 +267,14 @@ def test_a_file_that_is_no_recording_is_named(tmp_path: Path, text: str) -> None
 def test_a_recording_of_another_schema_is_not_replayed(tmp_path: Path) -> None:
     path = tmp_path / "events.jsonl"
     run("pipelined", keep=True).recording.write(path)
-    path.write_text(path.read_text().replace('"schema": 6', '"schema": 5', 1))
-    with pytest.raises(BadInputError, match=r"line 1: found schema 5; this Trilane reads 6"):
+    path.write_text(path.read_text().replace('"schema": 7', '"schema": 6', 1))
+    with pytest.raises(BadInputError, match=r"line 1: found schema 6; this Trilane reads 7"):
         read(path)
+
+
+def event(fields: str) -> str:
+    """A line of one event."""
+    return f'{{"t": 9000000000000, "events": [{{{fields}}}], "actions": []}}'
 
 
 @pytest.mark.parametrize(
@@ -277,10 +282,18 @@ def test_a_recording_of_another_schema_is_not_replayed(tmp_path: Path) -> None:
     [
         ('{"t": "abc", "events": [], "actions": []}', "time 'abc'"),
         ('{"t": -1, "events": [], "actions": []}', "time -1"),
-        ('{"t": 9e9, "events": [["Kill", "dsp"]], "actions": []}', "time"),
-        ('{"t": 9000000000000, "events": [["Kill", "dsp"]], "actions": []}', "'Kill', expected one of UnitReady"),
-        ('{"t": 9000000000000, "events": [["UnitDied", 1]], "actions": []}', "expected fields of str"),
-        ('{"t": 9000000000000, "events": [], "actions": [["Kill"]]}', "expected fields of str"),
+        ('{"t": 9e9, "events": [], "actions": []}', "time"),
+        (event('"event": "Kill", "unit": "dsp"'), "'Kill', expected one of UnitReady"),
+        (event('"event": "UnitDied", "unit": 1'), "expected fields of str"),
+        (event('"event": "UnitDied"'), "UnitDied with event, expected event, unit"),
+        (event('"event": "UnitDied", "unit": "dsp", "job": 1'), "UnitDied with event, unit, job, expected event, unit"),
+        (event('"event": ["UnitDied"], "unit": "dsp"'), "expected one of UnitReady"),
+        (event('"unit": "dsp"'), "found 'event'"),
+        ('{"t": 9000000000000, "events": ["UnitDied"], "actions": []}', "string indices"),
+        (
+            '{"t": 9000000000000, "events": [], "actions": [{"action": "Kill"}]}',
+            "Kill with action, expected action, unit",
+        ),
         ("[" * 100_000, "line 4"),
         ('{"t": 9', "line 4"),
     ],

@@ -97,8 +97,9 @@ def test_an_outcome_that_there_is_not_is_no_recording(tmp_path: Path) -> None:
     assert recording is not None
     recording.write(path)
     text = path.read_text()
-    assert '["Finish","done",""]' in text
-    path.write_text(text.replace('["Finish","done",""]', '["Finish","bored",""]'))
+    done = '{"action":"Finish","kind":"done","unit":""}'
+    assert done in text
+    path.write_text(text.replace(done, done.replace("done", "bored")))
     with pytest.raises(BadInputError, match="bored"):
         read(path)
 

@@ -29,7 +29,7 @@ from trilane.scheduler.recording import read, replay
 
 FRAMES = 20
 PATIENCE_S = 60.0
-WHOLE = {"report.json", "video.mp4", "contact.png", "trace.pftrace", "events.jsonl"}
+WHOLE = {"report.json", "video.mp4", "contact.png", "trace.pftrace", "events.jsonl", "journal.msgpack"}
 
 
 def command(bundle: Path, *arguments: str) -> list[str]:

@@ -1,0 +1,217 @@
+"""Where the steps and jobs of a run go: into memory, or into its journal. Rule: one of the two, never both.
+
+In memory they are for who runs a few frames and wants them all. Of a run with a journal nothing is kept that grows with
+its frames: each step is written when the units have been told what follows from it, which no unit waits for.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Protocol
+
+from trilane.errors import BadInputError, TrilaneError
+from trilane.pipeline.journal import (
+    SCHEMA,
+    Accounted,
+    Begun,
+    Counted,
+    Ended,
+    JournalWriter,
+    Said,
+    Sampled,
+    Stepped,
+    Worked,
+)
+from trilane.pipeline.journal_slices import shares_of_journal
+from trilane.scheduler.accounts import second_accounts
+from trilane.scheduler.core import Core
+from trilane.scheduler.events import Action, Event, Graph, Settings
+from trilane.scheduler.ledger import JobRecord
+from trilane.scheduler.recording import Recording
+from trilane.scheduler.state import FULL_DUTY
+from trilane.writing import WRITABLE
+
+FLUSH_NS = 250_000_000
+SAMPLE_NS = 5_000_000_000
+PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
+
+
+@dataclass(frozen=True)
+class JournalFile:
+    """Where a run writes its journal, and what else goes there.
+
+    `path`: does not exist yet. `facts`: of its `Begun`. `sensors`: what is looked at every `SAMPLE_NS`, by dotted name.
+    """
+
+    path: Path
+    facts: Mapping[str, Any]
+    sensors: Callable[[], Mapping[str, float]] = dict
+
+
+class Source(Protocol):
+    """The clock of the run (`trilane.pipeline.realtime_clock.RealtimeClock`), once there is one."""
+
+    def ended(self) -> list[Worked]:
+        """Jobs that have ended since the last call."""
+
+
+class Caps(Protocol):
+    """The governor of a run."""
+
+    @property
+    def temperatures_c(self) -> Mapping[str, float]:
+        """Those that it goes by, in degrees Celsius."""
+
+
+class RunRecord(Protocol):
+    """Fed by the scheduler's loop through `add`. `recording`, `jobs`: what of the run is in memory."""
+
+    recording: Recording
+    jobs: list[JobRecord]
+
+    def begin(self, source: Source, pids: Callable[[], Mapping[str, int]]) -> None:
+        """The loop begins. `pids`: gives the units' processes at any time."""
+
+    def add(self, now_ns: int, events: tuple[Event, ...], actions: tuple[Action, ...], core: Core) -> None:
+        """Note a step of `core`, whose actions were carried out."""
+
+    def say(self, text: str) -> None:
+        """Note a message to a person."""
+
+    def second_accounts(self) -> dict[str, dict[str, float]]:
+        """Of the whole run; the loop is over."""
+
+    def end(self, report: Mapping[str, Any]) -> None:
+        """The run is over, with this report."""
+
+
+class KeptRun:
+    """All in memory."""
+
+    def __init__(self, graph: Graph, settings: Settings) -> None:
+        self.recording = Recording(graph, settings)
+        self.jobs: list[JobRecord] = []
+        self._source: Source | None = None
+
+    def begin(self, source: Source, pids: Callable[[], Mapping[str, int]]) -> None:  # noqa: ARG002 - a `RunRecord`
+        """Jobs are asked for when the run is over, for units share the scheduler's core."""
+        self._source = source
+
+    def add(self, now_ns: int, events: tuple[Event, ...], actions: tuple[Action, ...], core: Core) -> None:
+        self.recording.add(now_ns, events, actions, core)
+
+    def say(self, text: str) -> None:
+        """Messages are kept by the log of the run."""
+
+    def second_accounts(self) -> dict[str, dict[str, float]]:
+        if self._source is not None:
+            self.jobs += [worked.job for worked in self._source.ended()]
+        return second_accounts(self.recording, self.jobs)
+
+    def end(self, report: Mapping[str, Any]) -> None:
+        """Nothing is left to do."""
+
+
+class JournaledRun:
+    """All in the journal of `file`; `recording` has no steps and `jobs` stays empty.
+
+    `writer`: of that file. `caps`: what sets the units' duties; it and they are sampled.
+    """
+
+    def __init__(
+        self, file: JournalFile, writer: JournalWriter, graph: Graph, settings: Settings, caps: Caps | None
+    ) -> None:
+        self.recording = Recording(graph, settings)
+        self.jobs: list[JobRecord] = []
+        self._file, self._writer, self._caps = file, writer, caps
+        self._source: Source | None = None
+        self._pids: Callable[[], Mapping[str, int]] = dict
+        self._accounts = dict.fromkeys(graph.units, -1)
+        self._left_out = self._flush_ns = self._sample_ns = 0
+        facts = {"clock": "host", "began_at": datetime.now(UTC).isoformat(timespec="seconds"), **file.facts}
+        self._writer.add(Begun(SCHEMA, graph, settings, facts))
+        self._writer.flush()
+
+    def begin(self, source: Source, pids: Callable[[], Mapping[str, int]]) -> None:
+        self._source, self._pids = source, pids
+
+    def add(self, now_ns: int, events: tuple[Event, ...], actions: tuple[Action, ...], core: Core) -> None:
+        try:
+            self._add(now_ns, events, actions, core)
+        except OSError as error:
+            raise TrilaneError(f"{self._file.path}: the journal cannot be written: {error.strerror}") from None
+
+    def _add(self, now_ns: int, events: tuple[Event, ...], actions: tuple[Action, ...], core: Core) -> None:
+        add = self._writer.add
+        add(Stepped(now_ns, events, actions))
+        accounts = self._accounts
+        for unit in core.units.values():
+            if accounts[unit.name] != unit.account:
+                accounts[unit.name] = unit.account
+                add(Accounted(now_ns, unit.name, unit.account))
+        for worked in self._source.ended() if self._source is not None else ():
+            add(worked)
+        ledger = core.ledger
+        if ledger.left_out != self._left_out:
+            self._left_out = ledger.left_out
+            add(Counted(now_ns, ledger.lost_by_cause, ledger.dropped_by_cause))
+        if now_ns >= self._flush_ns:
+            self._sample(now_ns, core)
+
+    def say(self, text: str) -> None:
+        self._writer.add(Said(time.monotonic_ns(), text))
+        self._writer.flush()
+
+    def second_accounts(self) -> dict[str, dict[str, float]]:
+        self._writer.flush()
+        return shares_of_journal(self._file.path)
+
+    def end(self, report: Mapping[str, Any]) -> None:
+        self._writer.add(Ended(time.monotonic_ns(), report))
+
+    def _sample(self, now_ns: int, core: Core) -> None:
+        """Look at what is sampled, and let whoever follows the journal see it."""
+        self._flush_ns = now_ns + FLUSH_NS
+        values: dict[str, float] = {}
+        if self._caps is not None:
+            values = {f"duty.{unit.name}": unit.duty / FULL_DUTY for unit in core.units.values()}
+            values |= {f"temperature_c.{name}": celsius for name, celsius in self._caps.temperatures_c.items()}
+        if now_ns >= self._sample_ns:
+            self._sample_ns = now_ns + SAMPLE_NS
+            values |= self._file.sensors()
+            pids = {"scheduler": os.getpid(), **self._pids()}
+            values |= {f"memory_bytes.{name}": memory_bytes(pid) for name, pid in pids.items()}
+        if values:
+            self._writer.add(Sampled(now_ns, values))
+        self._writer.flush()
+
+
+@contextmanager
+def recorded(file: JournalFile | None, graph: Graph, settings: Settings, caps: Caps | None) -> Iterator[RunRecord]:
+    """The record of one run, in memory or, with `file`, there. Raises BadInputError when that cannot be written.
+
+    Whatever becomes of the run, what was noted until then is in the file.
+    """
+    if file is None:
+        yield KeptRun(graph, settings)
+        return
+    try:
+        writer = JournalWriter(file.path)
+    except OSError as error:
+        raise BadInputError.of_os_error(file.path, error, WRITABLE) from None
+    with writer:
+        yield JournaledRun(file, writer, graph, settings, caps)
+
+
+def memory_bytes(pid: int) -> int:
+    """Memory of a process that is in use (RSS), the part included that it shares; 0 for one that has ended."""
+    try:
+        return int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]) * PAGE_BYTES
+    except (OSError, IndexError):
+        return 0
