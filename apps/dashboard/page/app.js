@@ -1,0 +1,228 @@
+// The page. Rule: a message goes to the panels that show it, and one loop a browser picture draws what has changed.
+
+import { Chart } from "./charts.js";
+import { Connection, withToken } from "./connection.js";
+import { Controls } from "./controls.js";
+import { listen } from "./keys.js";
+import {
+  buildLegend,
+  Notes,
+  showDrops,
+  showFacts,
+  showSources,
+  showSpeed,
+  showStages,
+  showUnits,
+} from "./panels.js";
+import { causePattern } from "./patterns.js";
+import { openInPerfetto } from "./perfetto.js";
+import { Picture } from "./picture.js";
+import { Seek } from "./seek.js";
+import { Slices } from "./slices.js";
+import { byId, clock, isNumber, setText, words } from "./text.js";
+import { followThemeSwitch, onThemeChange } from "./theme.js";
+import { Timeline } from "./timeline.js";
+
+const PERCENTILES = ["p50", "p90", "p95", "p99"];
+const STATES = {
+  running: "running",
+  paused: "paused",
+  restarting: "restarting with the new configuration",
+  ended: "ended",
+  failed: "failed",
+};
+
+let slices = null;
+let accuracy = null;
+let run = { name: "" };
+let isLive = true;
+let isOver = false;
+let state = "";
+let turned = [0, 0];
+
+const notes = new Notes(byId("notes"));
+const connection = new Connection({ message: received, picture: pictured, link: linked });
+const controls = new Controls(
+  { live: byId("live-controls"), restart: byId("restart-controls"), actions: byId("transport") },
+  (name, value) => connection.control(name, value),
+);
+const camera = {
+  orbit(dx, dy) {
+    turned = [turned[0] + dx, turned[1] + dy];
+    controls.use("orbit", [dx, dy]);
+  },
+  zoom: (factor) => controls.scale("zoom", factor),
+  reset() {
+    if (turned[0] || turned[1]) this.orbit(-turned[0], -turned[1]);
+    if (controls.has("zoom")) controls.use("zoom", controls.first("zoom"));
+  },
+};
+const picture = new Picture(byId("picture"), camera);
+const timeline = new Timeline(byId("timeline"), {
+  say: (text) => setText(byId("slice"), text || "Point at a slice, or use the keys [ and ]."),
+  changed(view) {
+    byId("follow").setAttribute("aria-pressed", String(view.isFollowing));
+    if (!isLive && Math.abs(view.middle - seek.time) > 0.01) seek.go(view.middle);
+  },
+});
+const seek = new Seek(
+  (time, span) => connection.send({ type: "seek", t_ms: time, span_ms: span }),
+  (time) => timeline.showMoment(time),
+);
+
+const of = (key) => (figures) => Object.fromEntries(PERCENTILES.map((name) => [name, figures[key]?.[name]]));
+const shares = (table, share) =>
+  Object.fromEntries(Object.entries(table ?? {}).map(([name, row]) => [words(name), 100 * share(row)]));
+const charts = [
+  new Chart(byId("chart-frame-time"), "ms", 1, of("frame_time_ms")),
+  new Chart(byId("chart-latency"), "ms", 1, of("latency_ms")),
+  new Chart(byId("chart-queues"), "frames", 0, (figures) => ({
+    "in flight": figures.frames?.in_flight,
+    ...Object.fromEntries(Object.entries(figures.stages ?? {}).map(([name, stage]) => [name, stage.waiting])),
+  })),
+  new Chart(byId("chart-busy"), "%", 0, (figures) => shares(figures.units, (unit) => unit.window?.busy)),
+  new Chart(byId("chart-temperature"), "°C", 1, (figures) => figures.temperature_c ?? {}),
+  new Chart(byId("chart-duty"), "%", 0, (figures) => shares(figures.duty, (duty) => duty)),
+];
+
+function received(message) {
+  const handlers = { hello, slices: sliced, figures: figured, state: stated, note: noted, refused, refusals };
+  handlers[message.type]?.(message);
+}
+
+function hello(message) {
+  run = message.run;
+  isLive = message.is_live;
+  isOver = false;
+  slices = new Slices(run.stages, run.units);
+  timeline.show(slices, isLive);
+  for (const chart of charts) chart.clear();
+  notes.clear();
+  controls.build(message.controls ?? []);
+  setText(byId("run-name"), run.name ?? "");
+  document.title = `${run.name ?? "run"} – Trilane`;
+  setText(byId("machine"), [run.scene, run.clock && `${run.clock} clock`, run.machine].filter(Boolean).join(" · "));
+  byId("seek-row").hidden = isLive;
+  byId("follow").hidden = !isLive;
+  if (isLive) seek.end();
+  else seek.begin(message.span_ms);
+}
+
+function sliced(message) {
+  if (!slices) return;
+  if (!isLive) {
+    if (!seek.isNewStretch) return;
+    slices.clear();
+  }
+  slices.add(message);
+  timeline.fed();
+}
+
+function figured(figures) {
+  if (Object.keys(figures.accuracy ?? {}).length) accuracy = figures.accuracy;
+  showSpeed(figures, accuracy);
+  showUnits(figures);
+  showStages(figures);
+  showDrops(figures);
+  showSources(figures);
+  if (isLive) for (const chart of charts) chart.add(figures);
+  else {
+    for (const chart of charts) chart.add(figures);
+    seek.answered();
+  }
+}
+
+function stated(message) {
+  state = message.is;
+  isOver = state === "ended" || state === "failed";
+  timeline.isRunning = state === "running";
+  byId("state").dataset.is = state;
+  setText(byId("state"), `${isLive ? "run" : "finished run"}: ${STATES[state] ?? state}`);
+  controls.config(message.config);
+  if (message.accuracy) accuracy = message.accuracy;
+  if ("plan" in message) showFacts(byId("plan"), message.plan);
+  if ("placement" in message) showFacts(byId("placement"), message.placement);
+}
+
+function noted(message) {
+  notes.add(isNumber(message.t_ms) ? clock(message.t_ms) : "", message.text);
+}
+
+function refused(message) {
+  if (!controls.refused(message.control, message.why)) notes.add("", `refused: ${message.control} ${message.why}`);
+}
+
+function refusals(message) {
+  const counts = Object.entries(message.counts ?? {}).filter(([, count]) => count);
+  const text = counts.map(([why, count]) => `${words(why)} ${count}`).join(", ");
+  setText(byId("refusals"), text ? `The server has refused or dropped: ${text}.` : "");
+}
+
+async function pictured(shown) {
+  if (!(await picture.show(shown))) return;
+  const age = shown.ageMs > 0 ? `, ${shown.ageMs.toFixed(0)} ms old when it was sent` : "";
+  setText(byId("picture-note"), `frame ${shown.frame}, ${clock(shown.mediaMs)} in the scene${age}`);
+}
+
+function linked(link, text) {
+  byId("link").dataset.is = link;
+  const isServerGone = link === "lost" && isOver && isLive;
+  setText(byId("link"), isServerGone ? "the run is over and its server gone; `trilane dashboard` shows it again" : text);
+}
+
+function playOrPause() {
+  if (!isLive) seek.toggle();
+  else controls.use(state === "paused" ? "play" : "pause");
+}
+
+function draw(now) {
+  if (connection.isOpen && picture.isWanted) connection.pullPicture();
+  picture.tick(now);
+  seek.tick(now, timeline.span);
+  timeline.tick(now);
+  for (const chart of charts) chart.tick();
+  requestAnimationFrame(draw);
+}
+
+function drawLegend() {
+  for (const swatch of document.querySelectorAll("canvas.swatch")) {
+    const pen = swatch.getContext("2d");
+    pen.fillStyle = causePattern(pen, swatch.dataset.cause, 1);
+    pen.fillRect(0, 0, swatch.width, swatch.height);
+  }
+}
+
+function toggleHelp() {
+  const sheet = byId("help");
+  if (sheet.open) sheet.close();
+  else sheet.showModal();
+}
+
+buildLegend(byId("legend"));
+onThemeChange(drawLegend);
+followThemeSwitch(byId("theme"));
+byId("show-help").addEventListener("click", toggleHelp);
+byId("close-help").addEventListener("click", toggleHelp);
+byId("follow").addEventListener("click", () => timeline.follow());
+byId("zoom-in").addEventListener("click", () => timeline.zoom(0.5));
+byId("zoom-out").addEventListener("click", () => timeline.zoom(2));
+byId("perfetto").addEventListener("click", () =>
+  openInPerfetto(withToken("trace.pftrace"), `Trilane: ${run.name}`, (text) => setText(byId("perfetto-note"), text)),
+);
+listen(
+  [
+    { keys: [" ", "k"], text: "pause, or go on", run: playOrPause },
+    { keys: ["."], text: "one frame further, while paused", run: () => controls.use("step") },
+    { keys: ["f"], text: "the timeline follows the run", run: () => timeline.follow() },
+    { keys: ["t"], text: "to the timeline", run: () => byId("timeline").focus() },
+    { keys: ["v"], text: "to the avatar", run: () => byId("picture").focus() },
+    { keys: ["p"], text: "open the trace in Perfetto", run: () => byId("perfetto").click() },
+    { keys: ["?"], text: "this sheet", run: toggleHelp },
+    { keys: [], label: "← → ↑ ↓", text: "turn the camera", run: () => {} },
+    { keys: [], label: "+ −", text: "zoom the camera", run: () => {} },
+    { keys: [], label: "0", text: "the camera as it was (so does a double click)", run: () => {} },
+  ],
+  (key) => picture.key(key),
+);
+connection.open();
+requestAnimationFrame(draw);

@@ -1,0 +1,104 @@
+// Figures over time. Rule: the last two minutes and no more; a chart that nobody sees is not drawn.
+/* global uPlot */
+
+import { colour, onThemeChange } from "./theme.js";
+import { isNumber, number } from "./text.js";
+
+const POINTS = 480; // two minutes, at four a second
+const HEIGHT = 150;
+const DASHES = [[], [6, 3], [2, 3], [8, 3, 2, 3], [4, 4], [1, 2]];
+
+// One chart in the element `home`. `read(figures)` gives {name: number or null}; series come and go with its names.
+export class Chart {
+  constructor(home, unit, digits, read) {
+    this.home = home;
+    this.unit = unit;
+    this.digits = digits;
+    this.read = read;
+    this.isSeen = false;
+    this.clear();
+    new ResizeObserver(() => this.plot?.setSize(this.#size())).observe(home);
+    new IntersectionObserver((entries) => {
+      this.isSeen = entries.at(-1).isIntersecting;
+      this.isDirty = true;
+    }).observe(home);
+    onThemeChange(() => {
+      this.#drop();
+      this.isDirty = true;
+    });
+  }
+
+  clear() {
+    this.times = [];
+    this.rows = [];
+    this.names = [];
+    this.#drop();
+    this.isDirty = true;
+  }
+
+  #drop() {
+    this.plot?.destroy();
+    this.plot = null;
+  }
+
+  add(figures) {
+    const row = this.read(figures);
+    const time = figures.t_ms / 1000;
+    while (this.times.length && (this.times.at(-1) >= time || this.times.length >= POINTS)) {
+      if (this.times.at(-1) >= time) this.#remove(this.times.length - 1);
+      else this.#remove(0);
+    }
+    this.times.push(time);
+    this.rows.push(row);
+    const added = Object.keys(row).filter((name) => !this.names.includes(name));
+    if (added.length) {
+      this.names.push(...added);
+      this.#drop();
+    }
+    this.isDirty = true;
+  }
+
+  #remove(index) {
+    this.times.splice(index, 1);
+    this.rows.splice(index, 1);
+  }
+
+  tick() {
+    if (!this.isDirty || !this.isSeen) return;
+    this.isDirty = false;
+    this.home.classList.toggle("empty", this.names.length === 0);
+    if (this.names.length === 0) return;
+    const columns = this.names.map((name) => this.rows.map((row) => (isNumber(row[name]) ? row[name] : null)));
+    if (this.plot) this.plot.setData([this.times, ...columns]);
+    else this.plot = new uPlot(this.#options(), [this.times, ...columns], this.home);
+  }
+
+  #size() {
+    return { width: Math.max(120, this.home.clientWidth), height: HEIGHT };
+  }
+
+  #options() {
+    const axis = { stroke: colour("muted"), grid: { stroke: colour("grid"), width: 1 }, ticks: { show: false } };
+    const value = (_, raw) => `${number(raw, this.digits)} ${this.unit}`;
+    return {
+      ...this.#size(),
+      scales: { x: { time: false }, y: { range: (_, low, high) => [Math.min(0, low), high > 0 ? high * 1.08 : 1] } },
+      cursor: { drag: { x: false, y: false }, points: { size: 6 } },
+      axes: [
+        { ...axis, size: 26, values: (_, ticks) => ticks.map((time) => `${time} s`) },
+        { ...axis, size: 46, values: (_, ticks) => ticks.map((tick) => `${tick}`) },
+      ],
+      series: [
+        { label: "time", value: (_, raw) => (isNumber(raw) ? `${raw.toFixed(1)} s` : "–") },
+        ...this.names.map((label, index) => ({
+          label,
+          value,
+          stroke: colour(`series-${index % 6}`),
+          width: 1.6,
+          dash: DASHES[index % DASHES.length],
+          points: { show: false },
+        })),
+      ],
+    };
+  }
+}

@@ -1,0 +1,202 @@
+// The controls, from the table in the server's `hello`. Rule: none is known here by what it does, only by its kind; what
+// restarts the run says so before it is used, and a refusal stands where the control is.
+
+import { element, isNumber, setText, words } from "./text.js";
+
+const KILLS = "kill";
+const SLIDER_STEPS = 200;
+
+export class Controls {
+  // send(name, value) sends; homes: {live, restart, actions}, the elements that they go into.
+  constructor(homes, send) {
+    this.homes = homes;
+    this.send = send;
+    this.table = new Map();
+  }
+
+  build(table) {
+    this.table = new Map(table.map((control) => [control.name, { ...control, first: control.value }]));
+    for (const home of Object.values(this.homes)) home.replaceChildren();
+    for (const control of this.table.values()) {
+      const made = this.#make(control);
+      if (made) this.#home(control).append(made);
+    }
+    this.homes.restart.closest("section").hidden = this.homes.restart.children.length === 0;
+  }
+
+  #home(control) {
+    if (control.kind === "action" && control.live) return this.homes.actions;
+    return control.live ? this.homes.live : this.homes.restart;
+  }
+
+  has(name) {
+    return this.table.has(name) && !this.table.get(name).why_not;
+  }
+
+  value(name) {
+    return this.table.get(name)?.value;
+  }
+
+  first(name) {
+    return this.table.get(name)?.first;
+  }
+
+  use(name, value = null) {
+    const control = this.table.get(name);
+    if (!control || control.why_not) return;
+    this.refused(name, "");
+    if (control.kind === "number") this.config({ [name]: value });
+    this.send(name, value);
+  }
+
+  // The value within the control's range that is `factor` times the one in force.
+  scale(name, factor) {
+    const control = this.table.get(name);
+    if (!control) return;
+    const value = (isNumber(control.value) ? control.value : 1) * factor;
+    this.use(name, Math.min(Math.max(value, control.min ?? -Infinity), control.max ?? Infinity));
+  }
+
+  // What is in force, by name.
+  config(values) {
+    for (const [name, value] of Object.entries(values ?? {})) {
+      const control = this.table.get(name);
+      if (!control) continue;
+      control.value = value;
+      control.show?.(value);
+    }
+  }
+
+  refused(name, why) {
+    const control = this.table.get(name);
+    if (!control?.problem) return false;
+    setText(control.problem, why ? `refused: ${why}` : "");
+    control.problem.hidden = !why;
+    control.field?.setAttribute("aria-invalid", why ? "true" : "false");
+    if (why) control.show?.(control.value);
+    return true;
+  }
+
+  #make(control) {
+    const makers = {
+      choice: () => (this.#actsAtOnce(control) ? this.#buttons(control) : this.#list(control)),
+      number: () => this.#number(control),
+      action: () => this.#action(control),
+      drag: () => this.#drag(control),
+    };
+    const made = makers[control.kind]?.();
+    if (made && control.why_not) made.classList.add("off");
+    return made;
+  }
+
+  // A choice without a value in force, such as a unit to kill, is something to do: a button for each.
+  #actsAtOnce(control) {
+    return control.live && (control.value === null || control.value === undefined);
+  }
+
+  #shell(control, ...children) {
+    const id = `control-${control.name}`;
+    control.problem = element("p", { class: "problem", id: `${id}-problem`, role: "alert", hidden: true });
+    const why = control.why_not ? element("p", { class: "hint", text: `not now: ${control.why_not}` }) : "";
+    return element("div", { class: "control", "data-control": control.name }, ...children, why, control.problem);
+  }
+
+  #label(control) {
+    const text = words(control.name);
+    return text[0].toUpperCase() + text.slice(1);
+  }
+
+  #list(control) {
+    const id = `control-${control.name}`;
+    const select = element(
+      "select",
+      { id, disabled: Boolean(control.why_not), "aria-describedby": `${id}-problem` },
+      ...(control.choices ?? []).map((choice) => element("option", { value: String(choice), text: words(String(choice)) })),
+    );
+    const label = element("label", { for: id, text: this.#label(control) });
+    control.field = select;
+    const chosen = () => (control.choices ?? []).find((choice) => String(choice) === select.value);
+    if (control.live) {
+      select.addEventListener("change", () => this.use(control.name, chosen()));
+      control.show = (value) => this.#select(select, value);
+      control.show(control.value);
+      return this.#shell(control, label, select);
+    }
+    const apply = element("button", { type: "button", text: "Restart with it", disabled: true });
+    apply.setAttribute("aria-label", `Restart the run with this ${words(control.name)}`);
+    apply.addEventListener("click", () => this.use(control.name, chosen()));
+    const update = () => {
+      apply.disabled = select.disabled || select.value === String(control.value);
+    };
+    select.addEventListener("change", update);
+    control.show = (value) => {
+      this.#select(select, value);
+      update();
+    };
+    control.show(control.value);
+    return this.#shell(control, label, element("div", { class: "pair" }, select, apply));
+  }
+
+  // A value in force that is none of the choices (set on the command line) is one of the list all the same.
+  #select(select, value) {
+    const text = String(value);
+    if (value !== null && value !== undefined && ![...select.options].some((option) => option.value === text)) {
+      select.append(element("option", { value: text, text: `${words(text)} (as started)`, disabled: true }));
+    }
+    select.value = text;
+  }
+
+  #buttons(control) {
+    const buttons = (control.choices ?? []).map((choice) => {
+      const verb = control.name === KILLS ? "Kill" : this.#label(control);
+      const button = element("button", {
+        type: "button",
+        class: control.name === KILLS ? "danger" : null,
+        "data-choice": choice,
+        disabled: Boolean(control.why_not),
+        text: `${verb} ${choice}`,
+      });
+      button.addEventListener("click", () => this.use(control.name, choice));
+      return button;
+    });
+    const group = element("div", { class: "buttons", role: "group", "aria-label": this.#label(control) }, ...buttons);
+    return this.#shell(control, element("span", { class: "label", text: this.#label(control) }), group);
+  }
+
+  #number(control) {
+    const id = `control-${control.name}`;
+    const [min, max] = [control.min ?? 0, control.max ?? 1];
+    const input = element("input", {
+      id,
+      type: "range",
+      min,
+      max,
+      step: (max - min) / SLIDER_STEPS,
+      disabled: Boolean(control.why_not),
+      "aria-describedby": `${id}-problem`,
+    });
+    const shown = element("output", { for: id });
+    control.field = input;
+    control.show = (value) => {
+      input.value = value;
+      setText(shown, isNumber(value) ? Number(value.toPrecision(3)).toString() : "");
+    };
+    control.show(control.value);
+    const event = control.live ? "input" : "change";
+    input.addEventListener(event, () => this.use(control.name, Number(input.value)));
+    return this.#shell(control, element("label", { for: id }, this.#label(control), " ", shown), input);
+  }
+
+  #action(control) {
+    const button = element("button", { type: "button", disabled: Boolean(control.why_not), text: this.#label(control) });
+    button.dataset.action = control.name;
+    button.addEventListener("click", () => this.use(control.name));
+    return this.#shell(control, button);
+  }
+
+  // What is dragged is the picture; here stands only where its refusals go.
+  #drag(control) {
+    const hint = element("p", { class: "hint", text: `${this.#label(control)}: drag the picture, or use the arrow keys` });
+    return this.#shell(control, hint);
+  }
+}

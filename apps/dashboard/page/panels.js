@@ -1,0 +1,184 @@
+// Figures as text and tables. Rule: no speed is written without the avatar's error beside it.
+
+import { CAUSES, CAUSE_MEANINGS } from "./slices.js";
+import { byId, bytes, DASH, element, isNumber, ms, number, percent, setRows, setText, words } from "./text.js";
+
+const MOST_NOTES = 200;
+
+// "PSNR 30.6 dB, worst frame 19.5 dB (source)" for each avatar, or why there is no figure.
+export function errorText(accuracy) {
+  const avatars = Object.entries(accuracy ?? {});
+  if (avatars.length === 0) return "error not known: the run does not say how exact its avatar is";
+  return avatars.map(([name, facts]) => `${avatars.length > 1 ? `${name}: ` : ""}${oneError(facts)}`).join("; ");
+}
+
+function oneError(facts) {
+  if (isNumber(facts?.psnr_db)) {
+    const worst = isNumber(facts.least_psnr_db) ? `, worst frame ${number(facts.least_psnr_db)} dB` : "";
+    return `PSNR ${number(facts.psnr_db)} dB${worst} (${facts.source ?? "source not said"})`;
+  }
+  const bands = Object.values(facts?.psnr_db_by_band ?? {}).filter(isNumber);
+  if (bands.length) {
+    const range = `${number(Math.min(...bands))} to ${number(Math.max(...bands))}`;
+    return `PSNR ${range} dB by distance (${facts.source ?? "source not said"})`;
+  }
+  return `error not known: ${facts?.why ?? facts?.source ?? "no figures"}`;
+}
+
+export function showSpeed(figures, accuracy) {
+  const clock = figures.clock === "virtual" ? "computed, virtual clock" : "measured, host clock";
+  setText(byId("fps"), number(figures.fps));
+  setText(byId("speed-note"), `frames a second, last ${number(figures.window_s, 0)} s (${clock})`);
+  setText(byId("error"), errorText(accuracy));
+  for (const [key, id] of [
+    ["frame_time_ms", "frame-time"],
+    ["latency_ms", "latency"],
+  ]) {
+    const times = figures[key] ?? {};
+    setText(byId(id), ms(times.p50));
+    const rest = ["p90", "p95", "p99"].map((name) => `${name} ${number(times[name])}`).join(" · ");
+    setText(byId(`${id}-rest`), `p50; ${rest} ms, of ${number(times.samples, 0)}`);
+  }
+  const frames = figures.frames ?? {};
+  setText(byId("presented"), number(frames.presented, 0));
+  const lost = total(frames.lost);
+  const dropped = (frames.dropped ?? []).reduce((sum, drop) => sum + drop.frames, 0);
+  setText(byId("presented-rest"), `presented; ${lost} lost · ${dropped} dropped · ${frames.in_flight ?? DASH} in flight`);
+}
+
+function total(counts) {
+  return Object.values(counts ?? {}).reduce((sum, count) => sum + count, 0);
+}
+
+// The timeline's figures as a table: each unit's busy share and idle by cause.
+export function showUnits(figures) {
+  const causes = CAUSES.filter((cause) => cause !== "unexplained");
+  const rows = Object.entries(figures.units ?? {}).map(([name, unit]) => [
+    name,
+    unit.is_up ? "up" : "down",
+    unit.stage ? `${unit.stage} of frame ${unit.frame}` : "idle",
+    percent(unit.window?.busy),
+    ...causes.map((cause) => percent(unit.window?.idle?.[cause])),
+    percent(unit.run?.busy),
+    number(unit.restarts, 0),
+    isNumber(figures.duty?.[name]) ? percent(figures.duty[name]) : DASH,
+  ]);
+  setRows(byId("units").tBodies[0], rows);
+  for (const row of byId("units").tBodies[0].rows) {
+    row.dataset.unit = row.cells[0].textContent;
+    row.cells[1].className = row.cells[1].textContent;
+  }
+}
+
+export function showStages(figures) {
+  const stages = Object.entries(figures.stages ?? {});
+  const kinds = [...new Set(stages.flatMap(([, stage]) => Object.keys(stage.bytes ?? {})))];
+  const head = byId("stages").tHead.rows[0];
+  const titles = ["stage", "unit", "frames waiting", "service", ...kinds.map((kind) => `${words(kind)} a job`)];
+  while (head.cells.length > titles.length) head.deleteCell(-1);
+  while (head.cells.length < titles.length) head.append(element("th", { scope: "col" }));
+  titles.forEach((title, place) => setText(head.cells[place], title));
+  setRows(
+    byId("stages").tBodies[0],
+    stages.map(([name, stage]) => [
+      name,
+      stage.unit,
+      number(stage.waiting, 0),
+      ms(stage.service_ms),
+      ...kinds.map((kind) => bytes(stage.bytes?.[kind]?.per_job)),
+    ]),
+  );
+  byId("no-bytes").hidden = kinds.length > 0;
+}
+
+export function showDrops(figures) {
+  const frames = figures.frames ?? {};
+  const rows = [
+    ...(frames.dropped ?? []).map((drop) => [drop.edge, `dropped, ${words(drop.cause)}`, number(drop.frames, 0)]),
+    ...Object.entries(frames.lost ?? {}).map(([cause, count]) => [cause.split(":")[1] ?? "", lostText(cause), `${count}`]),
+  ];
+  setRows(byId("drops").tBodies[0], rows);
+  byId("no-drops").hidden = rows.length > 0;
+  byId("drops").hidden = rows.length === 0;
+}
+
+function lostText(cause) {
+  return `lost, ${words(cause.split(":")[0])}`;
+}
+
+// Plain data as nested lists of terms, for plan and placement, whatever they hold.
+export function showFacts(home, facts) {
+  const text = JSON.stringify(facts ?? null);
+  if (home.dataset.shown === text) return;
+  home.dataset.shown = text;
+  home.replaceChildren(facts === null || facts === undefined ? "not known" : factNode(facts));
+}
+
+function factNode(facts) {
+  if (Array.isArray(facts)) {
+    const isPlain = facts.every((fact) => fact === null || typeof fact !== "object" || isFlat(fact));
+    if (isPlain) return facts.length ? facts.map(plain).join(", ") : "none";
+    return element("ol", {}, ...facts.map((fact) => element("li", {}, factNode(fact))));
+  }
+  if (facts !== null && typeof facts === "object") {
+    const entries = Object.entries(facts);
+    if (entries.length === 0) return "none";
+    const pairs = entries.map(([name, fact]) =>
+      element("div", {}, element("dt", { text: words(name) }), element("dd", {}, factNode(fact))),
+    );
+    return element("dl", {}, ...pairs);
+  }
+  return plain(facts);
+}
+
+function isFlat(fact) {
+  return Array.isArray(fact) && fact.every((part) => part === null || typeof part !== "object");
+}
+
+function plain(fact) {
+  if (Array.isArray(fact)) return fact.map(plain).join("×");
+  if (isNumber(fact) && !Number.isInteger(fact)) return String(Number(fact.toPrecision(6)));
+  if (fact === null) return "none";
+  if (typeof fact === "boolean") return fact ? "yes" : "no";
+  return String(fact);
+}
+
+export function showSources(figures) {
+  const rows = Object.entries(figures.sources ?? {}).map(([key, source]) => [words(key), source]);
+  setRows(byId("sources").tBodies[0], rows);
+}
+
+export function buildLegend(home) {
+  home.replaceChildren(
+    element("li", {}, element("span", { class: "swatch job", "aria-hidden": "true" }), "busy: a colour for each frame"),
+    ...CAUSES.map((cause) =>
+      element(
+        "li",
+        { title: CAUSE_MEANINGS[cause] },
+        element("canvas", { class: "swatch", "data-cause": cause, width: 28, height: 14, "aria-hidden": "true" }),
+        cause === "unexplained" ? cause : `${cause}: ${CAUSE_MEANINGS[cause]}`,
+      ),
+    ),
+  );
+}
+
+// The newest message on top; the oldest go.
+export class Notes {
+  constructor(home) {
+    this.home = home;
+    this.last = null;
+  }
+
+  add(timeText, text) {
+    const key = `${timeText} ${text}`;
+    if (key === this.last) return;
+    this.last = key;
+    this.home.prepend(element("li", {}, element("time", { text: timeText }), ` ${text}`));
+    while (this.home.children.length > MOST_NOTES) this.home.lastElementChild.remove();
+  }
+
+  clear() {
+    this.last = null;
+    this.home.replaceChildren();
+  }
+}

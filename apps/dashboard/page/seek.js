@@ -1,0 +1,106 @@
+// A finished run. Rule: one question at a time is on its way to the server, and it is always about the newest wish.
+
+import { byId, clock, setText } from "./text.js";
+
+const ANSWER_LIMIT_MS = 2000;
+const ASK_EVERY_MS = 40;
+const FIRST_MS = 1000;
+const BAR_STEP_MS = 10;
+const LEAST_SPAN_MS = 1;
+// Asked for around a moment, in views of the timeline: the view stays within it while the run plays on.
+const MARGIN_VIEWS = 1.5;
+
+export class Seek {
+  // send(t_ms, span_ms) asks for what was span_ms before and after; moved(t_ms) hears of each new moment.
+  constructor(send, moved) {
+    this.send = send;
+    this.moved = moved;
+    this.isOn = false;
+    this.bar = byId("seek");
+    this.bar.addEventListener("input", () => this.go(Number(this.bar.value)));
+    byId("seek-play").addEventListener("click", () => this.toggle());
+    byId("seek-rate").addEventListener("change", () => {
+      this.rate = Number(byId("seek-rate").value);
+    });
+  }
+
+  begin([from, to]) {
+    this.isOn = true;
+    this.from = from;
+    this.to = to;
+    this.rate = Number(byId("seek-rate").value);
+    this.isPlaying = false;
+    this.asked = null;
+    this.sentAt = -Infinity;
+    this.loaded = [Infinity, -Infinity];
+    this.bar.min = from;
+    this.bar.max = to;
+    this.bar.step = BAR_STEP_MS;
+    this.go(Math.min(from + FIRST_MS, to));
+  }
+
+  end() {
+    this.isOn = false;
+  }
+
+  go(time) {
+    if (!this.isOn) return;
+    this.time = Math.min(Math.max(time, this.from), this.to);
+    this.wanted = this.time;
+    this.#show();
+    this.moved(this.time);
+  }
+
+  toggle() {
+    if (!this.isOn) return;
+    this.isPlaying = !this.isPlaying;
+    this.playedAt = performance.now();
+    if (this.isPlaying && this.time >= this.to) this.go(this.from);
+    this.#show();
+  }
+
+  // Whether the slices of the answer that comes now are those of a new stretch, which take the place of the old ones.
+  get isNewStretch() {
+    return Boolean(this.asked?.stretch);
+  }
+
+  // The server has answered the last question.
+  answered() {
+    if (this.asked?.stretch) this.loaded = this.asked.stretch;
+    this.asked = null;
+  }
+
+  #show() {
+    this.bar.value = this.time;
+    const text = `${clock(this.time - this.from)} of ${clock(this.to - this.from)}`;
+    this.bar.setAttribute("aria-valuetext", text);
+    setText(byId("seek-time"), text);
+    setText(byId("seek-play"), this.isPlaying ? "Pause" : "Play");
+  }
+
+  // `viewMs`: how much time the timeline shows, the moment in its middle.
+  tick(now, viewMs) {
+    if (!this.isOn) return;
+    if (this.isPlaying) this.#play(now);
+    const isFree = this.asked === null || now - this.sentAt > ANSWER_LIMIT_MS;
+    if (this.#needs(this.time, viewMs)) this.wanted = this.time;
+    if (this.wanted === null || !isFree || now - this.sentAt < ASK_EVERY_MS) return;
+    const span = this.#needs(this.wanted, viewMs) ? MARGIN_VIEWS * viewMs : LEAST_SPAN_MS;
+    if (!this.send(this.wanted, span)) return;
+    this.asked = { stretch: span > LEAST_SPAN_MS ? [this.wanted - span, this.wanted + span] : null };
+    this.sentAt = now;
+    this.wanted = null;
+  }
+
+  // Whether a view around `time` reaches beyond the slices that are there.
+  #needs(time, viewMs) {
+    return time - viewMs / 2 < this.loaded[0] || time + viewMs / 2 > this.loaded[1];
+  }
+
+  #play(now) {
+    const time = this.time + (now - this.playedAt) * this.rate;
+    this.playedAt = now;
+    if (time >= this.to) this.isPlaying = false;
+    this.go(time);
+  }
+}

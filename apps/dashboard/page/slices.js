@@ -1,0 +1,78 @@
+// What the timeline shows: the jobs and the idle time of each unit. Rule: bounded, whatever the length of the run.
+
+import { SliceRing } from "./ring.js";
+
+// At 60 frames a second a unit with two stages fills this many in over two minutes.
+export const SLICES_PER_UNIT = 16384;
+export const CAUSES = ["starved", "blocked", "throttled", "preempted", "overhead", "unexplained"];
+export const CAUSE_MEANINGS = {
+  starved: "no input",
+  blocked: "no free slot behind, or as many frames in flight as may be",
+  throttled: "held by its duty",
+  preempted: "it has a job, but another thread has its core",
+  overhead: "a job is assigned but does not run yet, or the process is down",
+  unexplained: "no cause was noted",
+};
+
+export class Slices {
+  constructor(stages, units) {
+    this.stages = stages;
+    this.units = units;
+    this.jobs = units.map(() => new SliceRing(SLICES_PER_UNIT));
+    this.idle = units.map(() => new SliceRing(SLICES_PER_UNIT));
+  }
+
+  clear() {
+    for (const ring of [...this.jobs, ...this.idle]) ring.clear();
+  }
+
+  // A message of type slices.
+  add({ jobs = [], idle = [] }) {
+    for (const [unit, stage, frame, begin, end, wait] of jobs) this.jobs[unit]?.add(begin, end, frame, stage, wait);
+    for (const [unit, cause, begin, end] of idle) {
+      const kind = CAUSES.indexOf(cause);
+      this.idle[unit]?.add(begin, end, 0, kind < 0 ? CAUSES.length - 1 : kind, 0);
+    }
+  }
+
+  get lastEnd() {
+    return Math.max(...this.jobs.map((ring) => ring.lastEnd), ...this.idle.map((ring) => ring.lastEnd));
+  }
+
+  // What `unit` did at `time`: {unit, isJob, …slice}, or null.
+  find(unit, time, toleranceMs = 0) {
+    for (const [ring, isJob] of [
+      [this.jobs[unit], true],
+      [this.idle[unit], false],
+    ]) {
+      const index = ring.firstAfter(time - toleranceMs);
+      if (index < ring.count) {
+        const slice = ring.slice(index);
+        if (slice.begin <= time + toleranceMs) return { unit, isJob, index, ...slice };
+      }
+    }
+    return null;
+  }
+
+  // The jobs of `frame` that ended after `from` and began before `to`, in the order of their begin.
+  jobsOf(frame, from, to) {
+    const found = [];
+    this.jobs.forEach((ring, unit) => {
+      for (let index = ring.firstAfter(from); index < ring.count; index += 1) {
+        const slot = ring.at(index);
+        if (ring.begins[slot] > to) break;
+        if (ring.frames[slot] === frame) found.push({ unit, isJob: true, index, ...ring.slice(index) });
+      }
+    });
+    return found.sort((a, b) => a.begin - b.begin);
+  }
+
+  // A sentence about a slice.
+  describe(slice) {
+    const unit = this.units[slice.unit];
+    const length = `${(slice.end - slice.begin).toFixed(2)} ms`;
+    if (!slice.isJob) return `${unit} idle, ${CAUSES[slice.kind]} (${CAUSE_MEANINGS[CAUSES[slice.kind]]}) for ${length}`;
+    const stage = this.stages[slice.kind]?.name ?? "?";
+    return `frame ${slice.frame}: ${stage} on ${unit} for ${length}, after a wait of ${slice.wait.toFixed(2)} ms`;
+  }
+}
