@@ -63,6 +63,9 @@ has_egl() {
   fi
   [ "$code" -eq 0 ]
 }
+# Only the tests of the dashboard's page need a browser; where it cannot be installed they are skipped, with the reason.
+wants_browser() { [[ ",$extras," == *,all,* || ",$extras," == *,browser,* ]]; }
+has_browser() { command -v chromium >/dev/null || command -v chromium-browser >/dev/null || command -v google-chrome >/dev/null; }
 has_pip() { .venv/bin/python -m pip --version >/dev/null 2>&1; }
 
 { is_new_enough .venv/bin/python && has_pip; } || make_venv
@@ -75,6 +78,9 @@ if ! has_egl; then
   apt_or_lacks "no OpenGL 3.3 context can be made through EGL" libegl1 libgl1-mesa-dri
   has_egl || lacks "EGL and Mesa are installed, yet no OpenGL 3.3 context can be made; see: .venv/bin/trilane doctor" \
     "sudo apt-get install --reinstall -y libegl1 libgl1-mesa-dri"
+fi
+if wants_browser && ! has_browser; then
+  (apt_or_lacks "no Chromium for the tests of the dashboard's page" chromium) || say "without it they are skipped"
 fi
 if [ ! -e .venv/interpreted ] && [ "$(.venv/bin/python -c 'from trilane.compiled import form; print(form())')" = interpreted ]; then
   say "not compiled, for want of a C compiler: the scheduler runs as Python, less than half as fast in virtual time"

@@ -17,7 +17,7 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
-from starlette.websockets import WebSocket
+from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from trilane.apps.dashboard.clients import Client, Clients
 from trilane.apps.dashboard.guard import Asgi, Guard
@@ -97,7 +97,7 @@ class DashboardApp:
                 for task in tasks:
                     task.cancel()
                 await asyncio.gather(*tasks, return_exceptions=True)
-        with contextlib.suppress(RuntimeError):  # the client has closed it already
+        with contextlib.suppress(RuntimeError, WebSocketDisconnect):  # the client has closed it already
             await socket.close(1008)
 
     async def _listen(self, socket: WebSocket, client: Client) -> None:

@@ -38,6 +38,7 @@ let run = { name: "" };
 let isLive = true;
 let isOver = false;
 let state = "";
+let span = [0, 0];
 let turned = [0, 0];
 
 const notes = new Notes(byId("notes"));
@@ -104,8 +105,9 @@ function hello(message) {
   setText(byId("machine"), [run.scene, run.clock && `${run.clock} clock`, run.machine].filter(Boolean).join(" · "));
   byId("seek-row").hidden = isLive;
   byId("follow").hidden = !isLive;
-  if (isLive) seek.end();
-  else seek.begin(message.span_ms);
+  setText(byId("charts-title"), isLive ? "The last two minutes" : "Over the run");
+  seek.end();
+  span = message.span_ms;
 }
 
 function sliced(message) {
@@ -120,16 +122,27 @@ function sliced(message) {
 
 function figured(figures) {
   if (Object.keys(figures.accuracy ?? {}).length) accuracy = figures.accuracy;
-  showSpeed(figures, accuracy);
-  showUnits(figures);
-  showStages(figures);
-  showDrops(figures);
-  showSources(figures);
-  if (isLive) for (const chart of charts) chart.add(figures);
+  for (const chart of charts) chart.add(figures);
+  const isSurvey = !isLive && seek.isSurveying;
+  if (!isLive) answered(figures);
+  if (!isSurvey) showFigures(figures);
+}
+
+// The first figures of a finished run end what the server says unasked; from then on it answers.
+function answered(figures) {
+  if (!seek.isOn) seek.begin(span);
   else {
-    for (const chart of charts) chart.add(figures);
+    if (!seek.isSurveying) for (const chart of charts) chart.mark(figures.t_ms);
     seek.answered();
   }
+}
+
+function showFigures(figures) {
+  showSpeed(figures, accuracy);
+  showUnits(figures);
+  showStages(figures, run.edges ?? []);
+  showDrops(figures);
+  showSources(figures);
 }
 
 function stated(message) {
@@ -137,7 +150,8 @@ function stated(message) {
   isOver = state === "ended" || state === "failed";
   timeline.isRunning = state === "running";
   byId("state").dataset.is = state;
-  setText(byId("state"), `${isLive ? "run" : "finished run"}: ${STATES[state] ?? state}`);
+  const why = message.why ? `: ${message.why}` : "";
+  setText(byId("state"), isLive ? `run: ${STATES[state] ?? state}${why}` : "finished run");
   controls.config(message.config);
   if (message.accuracy) accuracy = message.accuracy;
   if ("plan" in message) showFacts(byId("plan"), message.plan);
@@ -176,7 +190,7 @@ function playOrPause() {
 }
 
 function draw(now) {
-  if (connection.isOpen && picture.isWanted) connection.pullPicture();
+  if (picture.isWanted && !seek.isSurveying && (isLive || seek.isOn)) connection.pullPicture();
   picture.tick(now);
   seek.tick(now, timeline.span);
   timeline.tick(now);

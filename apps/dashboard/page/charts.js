@@ -1,4 +1,4 @@
-// Figures over time. Rule: the last two minutes and no more; a chart that nobody sees is not drawn.
+// Figures over time. Rule: as many moments as two minutes of a live run have, no more; what nobody sees is not drawn.
 /* global uPlot */
 
 import { colour, onThemeChange } from "./theme.js";
@@ -32,6 +32,7 @@ export class Chart {
     this.times = [];
     this.rows = [];
     this.names = [];
+    this.marked = null;
     this.#drop();
     this.isDirty = true;
   }
@@ -41,15 +42,19 @@ export class Chart {
     this.plot = null;
   }
 
+  // In the order of time, whatever the order of the calls; the oldest go when there are too many.
   add(figures) {
     const row = this.read(figures);
     const time = figures.t_ms / 1000;
-    while (this.times.length && (this.times.at(-1) >= time || this.times.length >= POINTS)) {
-      if (this.times.at(-1) >= time) this.#remove(this.times.length - 1);
-      else this.#remove(0);
+    let place = this.times.length;
+    while (place > 0 && this.times[place - 1] >= time) place -= 1;
+    const isThere = this.times[place] === time;
+    this.times.splice(place, isThere ? 1 : 0, time);
+    this.rows.splice(place, isThere ? 1 : 0, row);
+    if (this.times.length > POINTS) {
+      this.times.shift();
+      this.rows.shift();
     }
-    this.times.push(time);
-    this.rows.push(row);
     const added = Object.keys(row).filter((name) => !this.names.includes(name));
     if (added.length) {
       this.names.push(...added);
@@ -58,9 +63,10 @@ export class Chart {
     this.isDirty = true;
   }
 
-  #remove(index) {
-    this.times.splice(index, 1);
-    this.rows.splice(index, 1);
+  // The moment of a finished run that is shown.
+  mark(time) {
+    this.marked = time / 1000;
+    this.isDirty = true;
   }
 
   tick() {
@@ -71,6 +77,15 @@ export class Chart {
     const columns = this.names.map((name) => this.rows.map((row) => (isNumber(row[name]) ? row[name] : null)));
     if (this.plot) this.plot.setData([this.times, ...columns]);
     else this.plot = new uPlot(this.#options(), [this.times, ...columns], this.home);
+    this.#point();
+  }
+
+  // While nobody points at the chart, its legend has the newest values, or those of the moment that is marked.
+  #point() {
+    const { plot } = this;
+    if (plot.over.matches(":hover")) return;
+    if (this.marked === null) plot.setLegend({ idx: this.times.length - 1 });
+    else plot.setCursor({ left: plot.valToPos(this.marked, "x"), top: -10 });
   }
 
   #size() {

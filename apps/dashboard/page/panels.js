@@ -4,6 +4,7 @@ import { CAUSES, CAUSE_MEANINGS } from "./slices.js";
 import { byId, bytes, DASH, element, isNumber, ms, number, percent, setRows, setText, words } from "./text.js";
 
 const MOST_NOTES = 200;
+const LONG_TEXT = 24;
 
 // "PSNR 30.6 dB, worst frame 19.5 dB (source)" for each avatar, or why there is no figure.
 export function errorText(accuracy) {
@@ -70,19 +71,21 @@ export function showUnits(figures) {
   }
 }
 
-export function showStages(figures) {
+// `edges`: {name, rule} of each edge; the first stage has none before it.
+export function showStages(figures, edges) {
   const stages = Object.entries(figures.stages ?? {});
   const kinds = [...new Set(stages.flatMap(([, stage]) => Object.keys(stage.bytes ?? {})))];
   const head = byId("stages").tHead.rows[0];
-  const titles = ["stage", "unit", "frames waiting", "service", ...kinds.map((kind) => `${words(kind)} a job`)];
+  const titles = ["stage", "unit", "edge before it", "frames waiting", "service", ...kinds.map((kind) => `${words(kind)} a job`)];
   while (head.cells.length > titles.length) head.deleteCell(-1);
   while (head.cells.length < titles.length) head.append(element("th", { scope: "col" }));
   titles.forEach((title, place) => setText(head.cells[place], title));
   setRows(
     byId("stages").tBodies[0],
-    stages.map(([name, stage]) => [
+    stages.map(([name, stage], place) => [
       name,
       stage.unit,
+      edges[place - 1]?.rule ?? DASH,
       number(stage.waiting, 0),
       ms(stage.service_ms),
       ...kinds.map((kind) => bytes(stage.bytes?.[kind]?.per_job)),
@@ -116,7 +119,7 @@ export function showFacts(home, facts) {
 
 function factNode(facts) {
   if (Array.isArray(facts)) {
-    const isPlain = facts.every((fact) => fact === null || typeof fact !== "object" || isFlat(fact));
+    const isPlain = facts.every((fact) => (fact === null || typeof fact !== "object" ? !isLong(fact) : isFlat(fact)));
     if (isPlain) return facts.length ? facts.map(plain).join(", ") : "none";
     return element("ol", {}, ...facts.map((fact) => element("li", {}, factNode(fact))));
   }
@@ -129,6 +132,10 @@ function factNode(facts) {
     return element("dl", {}, ...pairs);
   }
   return plain(facts);
+}
+
+function isLong(fact) {
+  return typeof fact === "string" && fact.length > LONG_TEXT;
 }
 
 function isFlat(fact) {

@@ -4,14 +4,16 @@ import { byId, clock, setText } from "./text.js";
 
 const ANSWER_LIMIT_MS = 2000;
 const ASK_EVERY_MS = 40;
-const FIRST_MS = 1000;
+const BEFORE_END_MS = 200;
+const SURVEY_MOMENTS = 120;
 const BAR_STEP_MS = 10;
 const LEAST_SPAN_MS = 1;
 // Asked for around a moment, in views of the timeline: the view stays within it while the run plays on.
 const MARGIN_VIEWS = 1.5;
 
 export class Seek {
-  // send(t_ms, span_ms) asks for what was span_ms before and after; moved(t_ms) hears of each new moment.
+  // send(t_ms, span_ms) asks for what was span_ms before and after; moved(t_ms) hears of each new moment. First the
+  // figures of moments all over the run are asked for, one after the other, for the charts: `isSurveying`.
   constructor(send, moved) {
     this.send = send;
     this.moved = moved;
@@ -36,7 +38,13 @@ export class Seek {
     this.bar.min = from;
     this.bar.max = to;
     this.bar.step = BAR_STEP_MS;
-    this.go(Math.min(from + FIRST_MS, to));
+    const step = Math.max((to - from) / SURVEY_MOMENTS, 1000);
+    this.moments = Array.from({ length: Math.floor((to - from) / step) }, (_, place) => from + (place + 1) * step);
+    this.go(Math.max(to - BEFORE_END_MS, from));
+  }
+
+  get isSurveying() {
+    return this.isOn && (this.moments.length > 0 || Boolean(this.asked?.isSurvey));
   }
 
   end() {
@@ -67,6 +75,7 @@ export class Seek {
   // The server has answered the last question.
   answered() {
     if (this.asked?.stretch) this.loaded = this.asked.stretch;
+    if (this.asked?.isSurvey) this.moments.shift();
     this.asked = null;
   }
 
@@ -83,13 +92,21 @@ export class Seek {
     if (!this.isOn) return;
     if (this.isPlaying) this.#play(now);
     const isFree = this.asked === null || now - this.sentAt > ANSWER_LIMIT_MS;
+    if (this.moments.length) {
+      if (isFree && this.send(this.moments[0], LEAST_SPAN_MS)) this.#sent(now, { isSurvey: true });
+      return;
+    }
     if (this.#needs(this.time, viewMs)) this.wanted = this.time;
     if (this.wanted === null || !isFree || now - this.sentAt < ASK_EVERY_MS) return;
     const span = this.#needs(this.wanted, viewMs) ? MARGIN_VIEWS * viewMs : LEAST_SPAN_MS;
     if (!this.send(this.wanted, span)) return;
-    this.asked = { stretch: span > LEAST_SPAN_MS ? [this.wanted - span, this.wanted + span] : null };
-    this.sentAt = now;
+    this.#sent(now, { stretch: span > LEAST_SPAN_MS ? [this.wanted - span, this.wanted + span] : null });
     this.wanted = null;
+  }
+
+  #sent(now, asked) {
+    this.asked = asked;
+    this.sentAt = now;
   }
 
   // Whether a view around `time` reaches beyond the slices that are there.

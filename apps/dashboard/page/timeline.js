@@ -11,6 +11,8 @@ const GAP = 6;
 const LABEL = 44;
 const SHORTEST_SPAN_MS = 2;
 const LONGEST_SPAN_MS = 60_000;
+// Three views' slices of a finished run come in one answer, which is bounded.
+const LONGEST_FINISHED_SPAN_MS = 5000;
 const FIRST_SPAN_MS = 400;
 // Live slices come a few times a second; so much later than the newest one the view runs evenly.
 const LAG_MS = 300;
@@ -297,7 +299,8 @@ export class Timeline {
   zoom(factor, x = this.width) {
     const isFollowing = this.isFollowing;
     const fixed = this.isLive ? (isFollowing ? this.right : this.time(x)) : this.middle;
-    const span = Math.min(Math.max(this.span * factor, SHORTEST_SPAN_MS), LONGEST_SPAN_MS);
+    const longest = this.isLive ? LONGEST_SPAN_MS : LONGEST_FINISHED_SPAN_MS;
+    const span = Math.min(Math.max(this.span * factor, SHORTEST_SPAN_MS), longest);
     this.right = fixed + ((this.right - fixed) * span) / this.span;
     this.span = span;
     this.#moved();

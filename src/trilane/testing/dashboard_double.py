@@ -1,19 +1,26 @@
 """A run that is none, for tests of the page: a `View` with figures that a formula makes, 60 frames a second.
 
-Rule: it says what the server's own views say, in the same messages, and does nothing that takes time.
+Rule: it says what the server's own views say, in the same messages, and does nothing that takes time. It is served by
+the dashboard's own server, so the page meets the real headers, token and limits.
 """
 
 from __future__ import annotations
 
+import asyncio
 import io
+import threading
 import time
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from PIL import Image, ImageDraw
 
+from trilane.apps.dashboard.app import DashboardApp
 from trilane.apps.dashboard.clients import Client
+from trilane.apps.dashboard.serve import listen, server
 from trilane.apps.dashboard.wire import ControlSaid, Seek, shown
 
 PERIOD_MS = 1000 / 60
@@ -24,6 +31,9 @@ JOBS = ((0.0, 3.0), (4.0, 9.5), (10.0, 25.8), (27.0, 32.5), (21.0 + PERIOD_MS, 2
 CAUSES = ("starved", "blocked", "throttled", "preempted", "overhead")
 SPAN_MS = 20_000.0
 KINDS = ("read", "written", "uploaded", "read_back", "least_read", "least_written")
+POLICIES = ("pipelined", "sequential", "latest", "deadline")
+EDGES = ("single", "double", "triple", "fifo:4", "orphan:6")
+PROFILES = ("burst", "balanced")
 CONTROLS: tuple[dict[str, Any], ...] = (
     {"name": "play", "kind": "action", "live": True},
     {"name": "pause", "kind": "action", "live": True},
@@ -31,15 +41,16 @@ CONTROLS: tuple[dict[str, Any], ...] = (
     {"name": "orbit", "kind": "drag", "live": True},
     {"name": "zoom", "kind": "number", "live": True, "min": 0.25, "max": 4.0, "value": 1.0},
     {"name": "kill", "kind": "choice", "live": True, "choices": UNITS},
-    {"name": "policy", "kind": "choice", "choices": ("pipelined", "sequential", "latest", "deadline"), "value": "pipelined"},
-    {"name": "edge", "kind": "choice", "choices": ("single", "double", "triple", "fifo:4", "orphan:6"), "value": "double"},
-    {"name": "performance_profile", "kind": "choice", "choices": ("burst", "balanced"), "why_not": "no hardware profile"},
+    {"name": "policy", "kind": "choice", "choices": POLICIES, "value": "pipelined"},
+    {"name": "edge", "kind": "choice", "choices": EDGES, "value": "double"},
+    {"name": "performance_profile", "kind": "choice", "choices": PROFILES, "why_not": "no hardware profile"},
     {"name": "size", "kind": "choice", "choices": ("128", "192", "256", "auto"), "value": "128"},
     {"name": "runtime", "kind": "choice", "choices": ("openvino", "ort"), "value": "openvino"},
     {"name": "avatar", "kind": "choice", "choices": ("default",), "value": "default"},
 )
 HELLO_KEYS = {"choices": (), "min": None, "max": None, "live": False, "value": None, "why_not": ""}
-ACCURACY = {"default": {"source": "from the avatar's validation of 2026-11-22", "psnr_db": 30.56, "least_psnr_db": 19.48}}
+SOURCE = "from the avatar's validation of 2026-11-22"
+ACCURACY = {"default": {"source": SOURCE, "psnr_db": 30.56, "least_psnr_db": 19.48}}
 
 
 def slices(begin_ms: float, end_ms: float) -> dict[str, Any]:
@@ -56,10 +67,14 @@ def slices(begin_ms: float, end_ms: float) -> dict[str, Any]:
     idle: list[list[Any]] = []
     for unit, taken in spans.items():
         taken.sort()
-        for number, ((_, left), (right, _)) in enumerate(zip(taken, taken[1:], strict=False)):
+        for number, ((_, left), (right, _)) in enumerate(pairwise(taken)):
             if right > left and left >= 0 and begin_ms < right <= end_ms:
                 idle.append([unit, CAUSES[(number // 8 + unit) % len(CAUSES)], left, right])
-    return {"type": "slices", "jobs": sorted(jobs, key=lambda row: row[4]), "idle": sorted(idle, key=lambda row: row[3])}
+    return {
+        "type": "slices",
+        "jobs": sorted(jobs, key=lambda row: row[4]),
+        "idle": sorted(idle, key=lambda row: row[3]),
+    }
 
 
 def figures(t_ms: float, restarts: int = 0) -> dict[str, Any]:
@@ -82,8 +97,9 @@ def figures(t_ms: float, restarts: int = 0) -> dict[str, Any]:
         | {"bytes": {kind: {"total": 1e8, "per_job": 65536.0 * (place + 1)} for kind in KINDS}}
         for place, (name, unit) in enumerate(STAGES)
     }
-    frames = {"requested": 1200, "presented": int(t_ms / PERIOD_MS), "skipped": 0, "in_flight": 4, "lost": {"died:dsp": 2}}
-    dropped = [{"edge": "pose->raster", "cause": "stale", "frames": 3}, {"edge": "raster->infer", "cause": "late", "frames": 1}]
+    frames = {"requested": 1200, "presented": int(t_ms / PERIOD_MS), "skipped": 0, "in_flight": 4}
+    drops = (("pose->raster", "stale", 3), ("raster->infer", "late", 1))
+    dropped = [{"edge": edge, "cause": cause, "frames": count} for edge, cause, count in drops]
     return {
         "type": "figures",
         "t_ms": t_ms,
@@ -95,7 +111,7 @@ def figures(t_ms: float, restarts: int = 0) -> dict[str, Any]:
         "run_fps": 59.8,
         "frame_time_ms": {**times, "samples": 299},
         "latency_ms": {**{key: value + 16 for key, value in times.items()}, "samples": 299},
-        "frames": {**frames, "dropped": dropped},
+        "frames": {**frames, "lost": {"died:dsp": 2}, "dropped": dropped},
         "units": units,
         "stages": stages,
         "temperature_c": {"device": 38 + wave, "gpu": 51 + 3 * wave, "dsp": 55 + 4 * wave},
@@ -146,8 +162,15 @@ class DoubleView:
 
     def greeting(self) -> Iterable[dict[str, Any]]:
         """Hello, state, and of a live run what happened lately."""
-        run = {"name": "20261122-default", "scene": "default", "clock": "host", "machine": "a machine of the tests"}
-        run |= {"stages": [{"name": name, "unit": unit} for name, unit in STAGES], "units": UNITS, "edges": ["double"] * 4}
+        run = {
+            "name": "20261122-default",
+            "scene": "default",
+            "clock": "host",
+            "machine": "a machine of the tests",
+            "stages": [{"name": name, "unit": unit} for name, unit in STAGES],
+            "units": UNITS,
+            "edges": [{"name": f"{a}->{b}", "rule": "double"} for (a, _), (b, _) in pairwise(STAGES)],
+        }
         controls = [{**HELLO_KEYS, **row} for row in CONTROLS] if self.is_live else []
         span = [0.0, SPAN_MS]
         yield {"type": "hello", "run": run, "controls": controls, "is_live": self.is_live, "span_ms": span}
@@ -155,6 +178,8 @@ class DoubleView:
         if self.is_live:
             yield slices(max(0.0, self._told_ms - 2000), self._told_ms)
             yield {"type": "note", "t_ms": 0.0, "text": "runtime: openvino; placement: cpu 0, gpu 1, dsp 0"}
+        else:
+            yield figures(SPAN_MS)
 
     async def news(self) -> list[dict[str, Any]]:
         """Slices since the last call, four figures a second."""
@@ -186,10 +211,12 @@ class DoubleView:
         if asked.name == "orbit" and isinstance(asked.value, list):
             self.turn_deg += asked.value[0]
         elif asked.name == "zoom" and isinstance(asked.value, float | int):
-            self.zoom = asked.value
+            self.zoom = self.config["zoom"] = asked.value
         elif asked.name == "kill":
             self.restarts += 1
-            self._notes.append({"type": "note", "t_ms": self._now_ms, "text": f"{asked.value} died; it is started again"})
+            self._notes.append(
+                {"type": "note", "t_ms": self._now_ms, "text": f"{asked.value} died; it is started again"}
+            )
         elif asked.name in ("play", "pause"):
             self.state = "running" if asked.name == "play" else "paused"
         else:
@@ -212,3 +239,33 @@ class DoubleView:
     def trace(self) -> Path | None:
         """None."""
         return None
+
+
+class Served:
+    """Context manager: a server of `view` in a thread; `url` is the page's address.
+
+    `port`, `token`: of its own if none.
+    """
+
+    def __init__(self, view: DoubleView, port: int | None = None, token: str | None = None) -> None:
+        place = listen(port)
+        self.place = replace(place, token=token or place.token)
+        self._server = server(DashboardApp(view, self.place.port, self.place.token).asgi)
+        self._thread = threading.Thread(target=self._serve)
+
+    @property
+    def url(self) -> str:
+        """The page's."""
+        return self.place.url
+
+    def _serve(self) -> None:
+        asyncio.run(self._server.serve(sockets=[self.place.listener]))
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._server.should_exit = True
+        self._thread.join()
+        self.place.close()

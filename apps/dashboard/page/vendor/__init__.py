@@ -1,0 +1,1 @@
+"""Files of others that the page needs, unchanged, each with its licence."""

@@ -1,0 +1,279 @@
+"""The dashboard's page in a real browser: what a person sees moves, and what a person does gets through."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+
+pytest.importorskip("starlette", reason="the extra dashboard is not installed")
+pytest.importorskip("uvicorn", reason="the extra dashboard is not installed")
+pytest.importorskip("websockets", reason="the extra dashboard is not installed")
+playwright = pytest.importorskip("playwright.sync_api", reason="the extra browser is not installed")
+
+from trilane.apps.dashboard.wire import ControlSaid, Seek  # noqa: E402
+from trilane.testing.dashboard_double import DoubleView, Served  # noqa: E402
+
+pytestmark = pytest.mark.slow
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+PHONE = {"width": 360, "height": 740}
+DESKTOP = {"width": 1440, "height": 900}
+PATIENCE_MS = 20_000
+PIXELS = "id => document.getElementById(id).toDataURL()"
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Any]:
+    """A headless browser."""
+    if CHROMIUM is None:
+        pytest.skip("no Chromium on this machine: scripts/setup.sh all installs it")
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+class Watched:
+    """A page, and what went wrong in it: errors in its console, requests to other hosts."""
+
+    def __init__(self, chromium: Any, url: str, **settings: Any) -> None:
+        self.context = chromium.new_context(viewport=settings.pop("viewport", DESKTOP), **settings)
+        self.page = self.context.new_page()
+        self.page.set_default_timeout(PATIENCE_MS)
+        self.errors: list[str] = []
+        self.foreign: list[str] = []
+        self.page.on("console", self._said)
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.on("request", self._asked)
+        self.page.on("websocket", lambda socket: self._check(socket.url))
+        self.page.goto(url)
+
+    def _said(self, message: Any) -> None:
+        if message.type in ("error", "warning"):
+            self.errors.append(message.text)
+
+    def _asked(self, request: Any) -> None:
+        self._check(request.url)
+
+    def _check(self, url: str) -> None:
+        parts = urlsplit(url)
+        if parts.scheme not in ("data", "blob") and parts.hostname != "127.0.0.1":
+            self.foreign.append(url)
+
+    def pixels(self, canvas: str) -> str:
+        """What the canvas shows, as a PNG in text."""
+        return str(self.page.evaluate(PIXELS, canvas))
+
+    def wait_for(self, condition: str, argument: Any = None) -> None:
+        """Until `condition`, JavaScript, is true. (Playwright's own waiting needs eval, which the page forbids.)"""
+        self.wait_until(lambda: bool(self.page.evaluate(condition, argument)))
+
+    def wait_for_other_pixels(self, canvas: str, than: str) -> None:
+        """Until the canvas shows something else."""
+        self.wait_for(f"([id, than]) => ({PIXELS})(id) !== than", [canvas, than])
+
+    def wait_until(self, condition: Callable[[], bool]) -> None:
+        """Until it is so."""
+        for _ in range(PATIENCE_MS // 20):
+            if condition():
+                return
+            self.page.wait_for_timeout(20)
+        raise AssertionError(f"it never became so; errors in the page: {self.errors}")
+
+    def text(self, selector: str) -> str:
+        """What is written there."""
+        return str(self.page.inner_text(selector))
+
+    def is_well(self) -> bool:
+        """Nothing went wrong; says what."""
+        assert self.errors == []
+        assert self.foreign == []
+        return True
+
+
+@pytest.fixture
+def opened(chromium: Any) -> Iterator[Callable[..., Watched]]:
+    """Opens pages, which are closed after the test."""
+    pages: list[Watched] = []
+
+    def open_page(url: str, **settings: Any) -> Watched:
+        pages.append(Watched(chromium, url, **settings))
+        return pages[-1]
+
+    yield open_page
+    for page in pages:
+        page.context.close()
+
+
+def drag(page: Any, selector: str, dx: float, dy: float) -> None:
+    """From the middle of what `selector` names."""
+    box = page.locator(selector).bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + dx, y + dy, steps=4)
+    page.mouse.up()
+
+
+def controls(view: DoubleView, name: str) -> list[Any]:
+    """The values that the page asked for."""
+    return [said.value for said in view.said if isinstance(said, ControlSaid) and said.name == name]
+
+
+def test_pictures_timeline_and_figures_of_a_live_run(opened: Callable[..., Watched]) -> None:
+    with Served(DoubleView()) as served:
+        seen = opened(served.url)
+        seen.wait_for("() => document.getElementById('picture').dataset.frame > 0")
+        seen.wait_for("() => document.querySelectorAll('#chart-frame-time canvas').length === 1")
+        for canvas in ("picture", "timeline"):
+            seen.wait_for_other_pixels(canvas, seen.pixels(canvas))
+        assert seen.text("#fps") == "60.0"
+        assert "30.6 dB, worst frame 19.5 dB" in seen.text("#error")
+        assert [row.split("\t")[3] for row in seen.text("#units tbody").splitlines()] == ["39 %", "66 %", "95 %"]
+        assert "pose->raster" in seen.text("#drops") and "64.0 KiB" in seen.text("#stages")
+        assert "running" in seen.text("#state") and seen.text("#link") == "connected"
+        assert seen.is_well()
+
+
+def test_the_camera_follows_mouse_wheel_and_keys(opened: Callable[..., Watched]) -> None:
+    view = DoubleView()
+    with Served(view) as served:
+        seen = opened(served.url)
+        seen.wait_for("() => document.getElementById('picture').dataset.frame > 0")
+        drag(seen.page, "#picture", 50, 0)
+        seen.wait_until(lambda: sum(dx for dx, _ in controls(view, "orbit")) == pytest.approx(20))
+        seen.page.mouse.wheel(0, -400)
+        seen.wait_until(lambda: view.zoom == pytest.approx(2.718281828**0.6))
+        seen.page.focus("#picture")
+        seen.page.keyboard.press("ArrowLeft")
+        seen.wait_until(lambda: view.turn_deg == pytest.approx(15))
+        seen.page.keyboard.press("-")
+        seen.wait_until(lambda: view.zoom == pytest.approx(2.718281828**0.6 / 1.1))
+        seen.page.dblclick("#picture")
+        seen.wait_until(lambda: view.turn_deg == pytest.approx(0) and view.zoom == 1.0)
+        assert seen.is_well()
+
+
+def test_controls_act_restart_or_say_why_not(opened: Callable[..., Watched]) -> None:
+    view = DoubleView(refuses={"runtime": "ort is not installed"})
+    with Served(view) as served:
+        seen = opened(served.url)
+        seen.page.keyboard.press("Space")
+        seen.wait_for("() => document.getElementById('state').textContent.includes('paused')")
+        seen.page.keyboard.press("Space")
+        seen.wait_for("() => document.getElementById('state').textContent.includes('running')")
+        policy = seen.page.locator("[data-control=policy]")
+        assert policy.get_by_role("button").is_disabled()
+        policy.locator("select").select_option("sequential")
+        assert controls(view, "policy") == []
+        policy.get_by_role("button", name="Restart the run with this policy").click()
+        seen.wait_until(lambda: controls(view, "policy") == ["sequential"])
+        seen.wait_for("() => document.querySelector('[data-control=policy] button').disabled")
+        runtime = seen.page.locator("[data-control=runtime]")
+        runtime.locator("select").select_option("ort")
+        runtime.get_by_role("button").click()
+        runtime.get_by_role("alert").wait_for()
+        assert runtime.get_by_role("alert").inner_text() == "refused: ort is not installed"
+        assert runtime.locator("select").input_value() == "openvino"
+        profile = seen.page.locator("[data-control=performance_profile]")
+        assert profile.locator("select").is_disabled() and "no hardware profile" in profile.inner_text()
+        seen.page.get_by_role("button", name="Kill dsp").click()
+        seen.wait_for("() => document.querySelector('#units tr[data-unit=dsp]').cells[10].textContent === '1'")
+        assert "dsp died" in seen.text("#notes")
+        assert seen.is_well()
+
+
+def test_the_timeline_is_pointed_at_moved_and_read_by_keys(opened: Callable[..., Watched]) -> None:
+    with Served(DoubleView()) as served:
+        seen = opened(served.url)
+        seen.wait_for("() => document.getElementById('picture').dataset.frame > 0")
+        seen.page.focus("#timeline")
+        seen.page.keyboard.press("[")
+        seen.wait_for("() => /^frame \\d+: \\w+ on cpu for 3.\\d+ ms, after a wait/.test(slice.textContent)")
+        assert seen.page.get_attribute("#follow", "aria-pressed") == "false"
+        still = seen.pixels("timeline")
+        drag(seen.page, "#timeline", 100, 0)
+        seen.wait_for_other_pixels("timeline", still)
+        seen.page.click("#follow")
+        assert seen.page.get_attribute("#follow", "aria-pressed") == "true"
+        assert seen.is_well()
+
+
+def test_a_lost_connection_comes_back_and_says_so(opened: Callable[..., Watched]) -> None:
+    with Served(DoubleView()) as served:
+        port = served.place.port
+        seen = opened(served.url)
+        seen.wait_for("() => document.getElementById('picture').dataset.frame > 0")
+    seen.wait_for("() => document.getElementById('link').textContent.startsWith('connection lost; trying again')")
+    with Served(DoubleView(), port, served.place.token):
+        seen.wait_for("() => document.getElementById('link').textContent === 'connected'")
+        frame = int(seen.page.get_attribute("#picture", "data-frame"))
+        seen.wait_for("frame => document.getElementById('picture').dataset.frame !== String(frame)", frame)
+    assert seen.foreign == []
+
+
+def test_a_finished_run_is_sought_and_played(opened: Callable[..., Watched]) -> None:
+    view = DoubleView(is_live=False)
+    with Served(view) as served:
+        seen = opened(served.url)
+        seen.wait_for("() => document.getElementById('picture').dataset.frame > 0")
+        asked = [said.t_ms for said in view.said if isinstance(said, Seek)]
+        assert asked[:20] == pytest.approx([1000.0 * (second + 1) for second in range(20)])
+        seen.page.locator("#seek").fill("5000")
+        seen.wait_for("() => document.getElementById('picture').dataset.frame === '300'")
+        seen.wait_for("() => document.getElementById('presented').textContent === '300'")
+        assert "0:05.0 of 0:20.0" in seen.text("#seek-time")
+        still = seen.pixels("timeline")
+        seen.page.click("#seek-play")
+        seen.wait_for("() => Number(document.getElementById('picture').dataset.frame) > 310")
+        seen.wait_for_other_pixels("timeline", still)
+        seen.page.click("#seek-play")
+        assert seen.page.locator("#transport button").count() == 0
+        assert seen.is_well()
+
+
+@pytest.mark.parametrize("theme", ["dark", "light"])
+def test_a_phone_shows_all_of_it_without_scrolling_sideways(opened: Callable[..., Watched], theme: str) -> None:
+    with Served(DoubleView()) as served:
+        seen = opened(served.url, viewport=PHONE, color_scheme=theme, has_touch=True, reduced_motion="reduce")
+        seen.wait_for("() => document.getElementById('picture').dataset.frame > 0")
+        assert seen.page.evaluate("document.documentElement.scrollWidth") == PHONE["width"]
+        light = seen.page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(244, 246, 248)"
+        assert light == (theme == "light")
+        seen.page.select_option("#theme", "light" if theme == "dark" else "dark")
+        assert light != (seen.page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(244, 246, 248)")
+        assert seen.is_well()
+
+
+def test_everything_to_use_has_a_name_and_the_keys_are_listed(opened: Callable[..., Watched]) -> None:
+    with Served(DoubleView()) as served:
+        seen = opened(served.url)
+        seen.page.locator("[data-control=policy]").wait_for()
+        nameless = """() => [...document.querySelectorAll('button, select, input, canvas[tabindex]')].filter(each =>
+          !(each.textContent.trim() || each.ariaLabel || each.labels?.length) || (each.matches('select, input') &&
+          !each.labels?.length && !each.ariaLabel)).map(each => each.outerHTML)"""
+        assert seen.page.evaluate(nameless) == []
+        seen.page.keyboard.press("?")
+        assert seen.page.locator("#help").is_visible() and "pause, or go on" in seen.text("#help")
+        seen.page.keyboard.press("Escape")
+        assert not seen.page.locator("#help").is_visible()
+        assert seen.is_well()
+
+
+def test_memory_of_the_timeline_is_bounded_and_its_slices_stay_in_order(opened: Callable[..., Watched]) -> None:
+    fill = """async () => {
+      const { SliceRing } = await import("./ring.js");
+      const ring = new SliceRing(8);
+      for (const end of [3, 1, 2, 10, 11, 12, 13, 14, 9, 4]) ring.add(end - 0.5, end, end, 0, 0);
+      const kept = Array.from({ length: ring.count }, (_, index) => ring.slice(index).frame);
+      return [kept, ring.firstAfter(3), ring.firstAfter(10), ring.firstAfter(14), ring.ends.length];
+    }"""
+    with Served(DoubleView()) as served:
+        seen = opened(served.url)
+        # Of ten slices into eight places: 1 goes for the ninth, 2 for the tenth.
+        assert seen.page.evaluate(fill) == [[3, 4, 9, 10, 11, 12, 13, 14], 1, 4, 8, 8]
+        assert seen.is_well()
