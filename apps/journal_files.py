@@ -4,33 +4,24 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from trilane.apps.trace import write_trace
-from trilane.pipeline.journal import Begun, Stepped, Worked, read_journal
-from trilane.pipeline.journal_slices import JournalSlices
-from trilane.scheduler.accounts import IdleSlice
-from trilane.scheduler.ledger import JobRecord
+from trilane.apps.tracing.writer import NAME, TraceWriter
+from trilane.pipeline.journal import Begun, Stepped, read_journal
 from trilane.scheduler.recording import header_line, step_line
 
-EVENTS, TRACE = "events.jsonl", "trace.pftrace"
+EVENTS = "events.jsonl"
 
 
 def write_from_journal(journal: Path, folder: Path) -> None:
-    """Write EVENTS and TRACE into `folder`. Raises BadInputError for a journal that is none."""
-    jobs: list[JobRecord] = []
-    idle: list[IdleSlice] = []
-    units: tuple[str, ...] = ()
-    with (folder / EVENTS).open("w", encoding="utf-8") as events:
-        slices: JournalSlices | None = None
+    """Write the recording and the trace into `folder`. Raises BadInputError for a journal that is none."""
+    trace: TraceWriter | None = None
+    with (folder / EVENTS).open("w", encoding="utf-8") as events, (folder / NAME).open("wb") as file:
         for record in read_journal(journal):
             if isinstance(record, Begun):
-                slices, units = JournalSlices(record.graph), record.graph.units
+                trace = TraceWriter(file, record)
                 events.write(header_line(record.graph, record.settings))
-            elif slices is not None:
-                idle += slices.add(record)
+            elif trace is not None:
+                trace.add(record)
                 if isinstance(record, Stepped):
                     events.write(step_line(*record))
-                elif isinstance(record, Worked):
-                    jobs.append(record.job)
-        if slices is not None:
-            idle += slices.end()
-    write_trace(jobs, units, folder / TRACE, idle)
+        if trace is not None:
+            trace.close()
