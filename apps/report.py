@@ -23,6 +23,7 @@ from trilane.pipeline.run_metrics import (
     CoreShare,
     FrameCounts,
     FrameTimes,
+    MovedInAll,
     Record,
     RunMetrics,
     StageTimes,
@@ -106,6 +107,7 @@ class Baseline(Record):
     fps_high: float | None = None
     deadline_misses: int
     stages: dict[str, StageTimes]
+    bytes: MovedInAll | None = None
     units: dict[str, UnitShares]
     efficiency: float | None
     core_efficiency: float | None = None

@@ -21,6 +21,9 @@ SOURCES = {
     "xrbench": MEASURED,
     "xrbench.energy": COMPUTED,
     "stages": MEASURED,
+    "bytes": MEASURED,
+    "bytes.least": COMPUTED,
+    "bytes.ratio": COMPARED,
     "units": MEASURED,
     "efficiency": MEASURED,
     "core_efficiency": MEASURED,
@@ -50,7 +53,13 @@ NO_FIGURES_UNDER = ("schema", "machine", "config", "plan", "pids")
 def sources_of(document: Mapping[str, Any]) -> dict[str, str]:
     """The sources of the figures in `document`, the content of a report; those of `accuracy` by avatar."""
     sources = {key: source for key, source in SOURCES.items() if _holds(document, key.split("."))}
-    return sources | dict(_of_accuracy(document.get("accuracy", {})))
+    return sources | _of_bytes(document["stages"]) | dict(_of_accuracy(document.get("accuracy", {})))
+
+
+def _of_bytes(stages: Mapping[str, Any]) -> dict[str, str]:
+    """Of the stages that count what they move, what is not counted."""
+    counting = [f"stages.{name}.bytes" for name, row in stages.items() if row.get("bytes")]
+    return {f"{key}.{figure}": SOURCES[f"bytes.{figure}"] for key in counting for figure in ("least", "ratio")}
 
 
 def _of_accuracy(accuracy: Mapping[str, Any]) -> Iterator[tuple[str, str]]:

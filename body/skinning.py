@@ -82,6 +82,12 @@ class FrameSkinner:
         self._sum = np.empty((blocks, _BLOCK_ROWS), np.float32)
         self._term = np.empty_like(self._sum)
 
+    @property
+    def constant_bytes(self) -> int:
+        """What every frame reads besides its pose: rest positions, weights, pose blend shapes."""
+        kept = (self._rest, self._weights, self._joints, *(() if self._blend is None else (self._blend,)))
+        return sum(array.nbytes for array in kept)
+
     def skin_into(self, posed: Posed, vertices: F32) -> None:
         """Write the skinned vertices of a frame of `Skeleton.pose` into `vertices` (V,3), world metres."""
         count = len(vertices)

@@ -13,6 +13,7 @@ from trilane.pipeline.controls import RunControls
 from trilane.pipeline.description import Pipeline
 from trilane.pipeline.isolated import IsolatedTimes
 from trilane.pipeline.lifecycle import close_units, start_units
+from trilane.pipeline.moved_bytes import BYTES, add_bytes
 from trilane.pipeline.other_programs import beside_units
 from trilane.pipeline.preconditions import check_cores, check_open_files, check_positive, refuse_in_a_unit
 from trilane.pipeline.realtime_clock import Governor, RealtimeClock
@@ -145,6 +146,7 @@ def run_pipeline(
             row.update(pid=run.pids[unit], **pipeline.units[unit].model_dump(mode="json"))
         add_accounts(report, pipeline, clock.cpu, record.second_accounts(), log)
         report["core_efficiency"] = core_efficiency(report, pipeline)
+        add_bytes(report, clock.metrics)
         metrics = metrics_of(report)
         record.end(metrics.as_json())
     return run.result(metrics)
@@ -237,9 +239,10 @@ class _Run:
             self._log.say(f"the measurement after the run was left out: {str(error) or 'interrupted'}")
 
     def _mean_metrics(self) -> Mapping[str, Mapping[str, float]]:
-        """Of each stage that reported any, the mean over the jobs that reported it."""
+        """Of each stage that reported any, the mean over the jobs that reported it; of bytes see `add_bytes`."""
+        reported = self._clock.reported
         return {
-            stage: {name: total / self._clock.reported[stage][name] for name, total in sums.items()}
+            stage: {name: total / reported[stage][name] for name, total in sums.items() if name not in BYTES}
             for stage, sums in self._clock.metrics.items()
         }
 

@@ -86,6 +86,35 @@ class XrBench(Record):
     energy: float | None
 
 
+class MovedBytes(Record):
+    """Bytes that were moved for a presented frame, means (`trilane.pipeline.moved_bytes`).
+
+    `read`: from slots, shared assets, samples.
+    `written`: into slots and files.
+    `uploaded`, `read_back`: into the GPU's memory, and out of it.
+    `least`: what the frames needed.
+    `ratio`: the first four in sum over the least; null where that is 0.
+    """
+
+    read: float
+    written: float
+    uploaded: float
+    read_back: float
+    least: float
+    ratio: float | None
+
+    @property
+    def all(self) -> float:
+        """That passed through the memories."""
+        return self.read + self.written + self.uploaded + self.read_back
+
+
+class MovedInAll(MovedBytes):
+    """The same of all stages. `gb_per_second`: of what was moved, over the time of the run, in 1e9 bytes a second."""
+
+    gb_per_second: float | None
+
+
 class StageTimes(Record):
     """One stage.
 
@@ -94,6 +123,7 @@ class StageTimes(Record):
     `service_ms`: of its jobs, from begin to end, the time included in which another process had the core.
     `wait_ms`: from a job's input to its begin.
     `cpu_ms`: CPU time of its jobs, of all threads of the unit; on the host clock.
+    `bytes`: that it moved for a presented frame; absent where it does not count them.
     """
 
     unit: str
@@ -101,6 +131,7 @@ class StageTimes(Record):
     service_ms: TimeSummary
     wait_ms: TimeSummary
     cpu_ms: TimeSummary | None = None
+    bytes: MovedBytes | None = None
 
 
 class IdleShares(Record):
@@ -235,6 +266,7 @@ class RunMetrics(Record):
     `deadline_misses`: frames presented after their deadline, or frame times above the target.
     `xrbench`: XRBench's scores.
     `stages`: times of each, in the order of the pipeline.
+    `bytes`: moved for a presented frame by all stages that count them; absent where none does.
     `units`: shares of each.
     `efficiency`: the slowest unit's stages, measured isolated, over the mean frame time; null when not measured.
     `bottleneck`: that slowest unit; absent when not measured.
@@ -258,6 +290,7 @@ class RunMetrics(Record):
     deadline_misses: int
     xrbench: XrBench
     stages: dict[str, StageTimes]
+    bytes: MovedInAll | None = None
     units: dict[str, UnitShares]
     efficiency: float | None
     bottleneck: str | None = None

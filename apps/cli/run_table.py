@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from trilane.apps.report import Baseline, Made, PaceComparison, Report
-    from trilane.pipeline.run_metrics import Caps, StageTimes, Temperature, TimeSummary, UnitShares
+    from trilane.pipeline.run_metrics import Caps, MovedBytes, StageTimes, Temperature, TimeSummary, UnitShares
 
     #: Name of a row, what it measures, and a cell for each run.
     Rows = Iterator[tuple[str, str, list[str]]]
@@ -42,7 +42,7 @@ def run_table(report: Report) -> Table:
     table.add_column("")
     for run in runs:
         table.add_column(f"{run.policy}, {run.frames.presented} frames", justify="right")
-    for section in (_stage_rows, _unit_rows, _core_rows, _time_rows, _rate_rows):
+    for section in (_stage_rows, _byte_rows, _unit_rows, _core_rows, _time_rows, _rate_rows):
         for name, measure, cells in section(runs):
             table.add_row(name, measure, *cells)
         table.add_section()
@@ -132,6 +132,30 @@ def _stage_rows(runs: Sequence[Report | Baseline]) -> Rows:
 
 def _service_and_wait(times: StageTimes | None) -> str:
     return f"{_number(times.service_ms.mean)} + {_number(times.wait_ms.mean)}" if times else DASH
+
+
+def _byte_rows(runs: Sequence[Report | Baseline]) -> Rows:
+    """What every stage moved for a frame, and beside all of it the least; none where no run counted it."""
+    if not any(run.bytes for run in runs):
+        return
+    counting = [stage for stage, times in runs[0].stages.items() if times.bytes]
+    rows = [" ".join(_megabytes(_bytes_of(run, stage)) for stage in counting) for run in runs]
+    yield "moved a frame", f"{' '.join(counting)}, MB", rows
+    yield "", "all, MB (times the least); GB/s", [_all_moved(run) for run in runs]
+
+
+def _bytes_of(run: Report | Baseline, stage: str) -> MovedBytes | None:
+    return run.stages[stage].bytes if stage in run.stages else None
+
+
+def _all_moved(run: Report | Baseline) -> str:
+    if run.bytes is None:
+        return DASH
+    return f"{_megabytes(run.bytes)} ({_number(run.bytes.ratio, 2)}); {_number(run.bytes.gb_per_second, 2)}"
+
+
+def _megabytes(moved: MovedBytes | None) -> str:
+    return DASH if moved is None else f"{moved.all / 1e6:.2f}"
 
 
 def _unit_rows(runs: Sequence[Report | Baseline]) -> Rows:

@@ -15,10 +15,12 @@ from trilane.body.body import ShapedBody
 from trilane.body.detail import DETAILS, DetailBounds
 from trilane.body.kinematics import Posed, Skeleton
 from trilane.body.skinning import FrameSkinner
+from trilane.pipeline.moved_bytes import ByteCounter
 from trilane.scene.crop import SCREEN, Rect
 from trilane.scene.pixel_error import cheapest_within, error_px, least_w
 from trilane.shapes import Shape
 from trilane.stages.cpu.mesh_bounds import MeshBounds
+from trilane.stages.last_level_cache import moved_of_kept
 
 FINEST = len(DETAILS) - 1
 
@@ -44,6 +46,7 @@ class ModelledBody:
         self.bounds = MeshBounds(shaped, standoff_m=CLOTHES_STANDOFF_M)
         self.budget_px = budget_px if skins else 0.0
         self.skinners = self._skinners() if skins else []
+        self.moved_to_skin = [moved_of_kept(skinner.constant_bytes) for skinner in self.skinners]
 
     def _skinners(self) -> list[FrameSkinner]:
         """One for each level; only the finest when nothing may be left out."""
@@ -67,14 +70,18 @@ class ModelledBody:
         level = cheapest_within(errors, self.budget_px)
         return level, errors[level]
 
-    def see(self, posed: Posed, clip: F64, output: Shape, vertices: F32 | None) -> Seen | None:
+    def see(self, posed: Posed, clip: F64, output: Shape, vertices: F32 | None, moved: ByteCounter) -> Seen | None:
         """Skin the body into `vertices`, if given, and find its rectangle; None when nothing of it is visible.
 
-        `posed`: the frame. `clip` (4,4): projection @ view. `output`: (height, width) of the picture.
+        `posed`: the frame. `clip` (4,4): projection @ view. `output`: (height, width) of the picture. `moved`: counts
+        the vertices, which are written, then read to find the rectangle, and what skinning reads from memory.
         """
         level, error = self.choose(posed, clip, output)
         if vertices is not None:
             self.skinners[level].skin_into(posed, vertices)
+            moved.copied(vertices.nbytes)
+            moved.read += self.moved_to_skin[level]
+            moved.least += self.moved_to_skin[level] + vertices.nbytes
         rect = self.bounds.rect(posed, clip, vertices)
         return None if rect is None else Seen(widened(rect, error, output), level, error)
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from trilane.arrays import F64
 from trilane.body.kinematics import Posed, Skeleton
 from trilane.errors import TrilaneError
+from trilane.pipeline.moved_bytes import ByteCounter
 from trilane.pipeline.shared_assets import Assets
 from trilane.pipeline.stage import Skip, UnitContext
 from trilane.scene.mover import Mover
@@ -104,6 +105,7 @@ class PoseStage:
         self._counts = config.posed_vertices
         self._window = config.opened_window()
         self._made: dict[Work, _Made] = {}
+        self._moved = ByteCounter()
         self._was_seen = [False] * len(self._actors)
         self._slots: list[NDArray[np.void]] = []
         self._vertices: list[list[NDArray[np.float32]]] = []
@@ -119,13 +121,15 @@ class PoseStage:
         """Fill `outputs[slot_out]` for `frame`. A `Skip` but for full work, which all frames of a fixed plan are.
 
         Metrics: `visible`, how many avatars are; of a full frame `level` of `body.detail.DETAILS` and `error_px`, the
-        bound on what it moves on the picture, both of the worst avatar; `density` of a planned tensor.
+        bound on what it moves on the picture, both of the worst avatar; `density` of a planned tensor; the bytes moved.
+        The least: what was sampled of motions and camera, the header, and of avatars that were skinned the vertices.
 
         Raises ValueError without `slot_out`, TrilaneError when a number of the frame is not finite.
         """
         if slot_out is None:
             raise ValueError("the pose stage needs an output slot")
         packet = self._slots[slot_out]
+        self._moved.start()
         t_s = frame / self._fps
         packet["frame"] = frame
         packet["t_sampled_ns"] = time.monotonic_ns()
@@ -133,6 +137,7 @@ class PoseStage:
         moved = [actor.mover.sample(t_s) for actor in self._actors]
         view = self._view(t_s, moved)
         _require_all_finite(view, moved, frame)
+        self._count(packet, view, moved)
         shown = shown_by([view, *(array for pair in moved for array in pair)])
         work = self._work_of(shown, lambda: self._make(slot_out, frame, view, moved))
         packet["work"] = work
@@ -144,7 +149,14 @@ class PoseStage:
             packet["picture"] = frame if work is Work.FULL else -1
             self.plan = replace(self.plan, work=work)
             self._made[work] = _Made(shown, packet.copy(), self.plan)
-        return _metrics(self.plan)
+        return _metrics(self.plan, self._moved)
+
+    def _count(self, packet: NDArray[np.void], view: F64, moved: Sequence[tuple[F64, F64]]) -> None:
+        """The bytes of every frame: what was sampled, and the header."""
+        sampled = view.nbytes + sum(array.nbytes for pair in moved for array in pair)
+        self._moved.read += sampled
+        self._moved.written += packet.nbytes
+        self._moved.least += sampled + packet.nbytes
 
     def _view(self, t_s: float, moved: Sequence[tuple[F64, F64]]) -> F64:
         """World to camera (4, 4): the scene's camera, turned about the first avatar as somebody steers it."""
@@ -228,7 +240,7 @@ class PoseStage:
         _require_finite(posed.matrices, frame, f"joints of avatar {actor.index}")
         seen = None
         if self._was_seen[actor.index] or actor.body.bounds.may_be_seen(posed, clip):
-            seen = actor.body.see(posed, clip, self._output, vertices)
+            seen = actor.body.see(posed, clip, self._output, vertices, self._moved)
         self._was_seen[actor.index] = seen is not None
         avatar["visible"] = seen is not None
         avatar["joints"], avatar["pose_feature"] = posed.matrices, posed.feature
@@ -244,8 +256,8 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> PoseStage:
     return PoseStage(RunConfig.model_validate(settings["config"]), unit.assets)
 
 
-def _metrics(plan: FramePlan) -> Mapping[str, float]:
-    metrics = {"visible": float(len(plan.seen))}
+def _metrics(plan: FramePlan, moved: ByteCounter) -> Mapping[str, float]:
+    metrics = {"visible": float(len(plan.seen)), **moved.figures()}
     if plan.work is not Work.FULL:
         return Skip(metrics)
     if plan.seen:

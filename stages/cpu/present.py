@@ -20,6 +20,7 @@ import numpy as np
 from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 from numpy.typing import NDArray
 
+from trilane.pipeline.moved_bytes import ByteCounter
 from trilane.pipeline.stage import UnitContext
 from trilane.stages.config import RunConfig
 from trilane.transport.packets import Packet
@@ -31,12 +32,14 @@ ENCODER_OPTIONS = {"preset": "ultrafast", "crf": "20", "tune": "zerolatency"}
 #: Every frame is a fragment of its own and goes to the file at once.
 FRAGMENTS = {"movflags": "empty_moov+default_base_moof+frag_every_frame", "flush_packets": "1"}
 MS = 1e-6  # of a nanosecond
+NOTHING = ByteCounter().figures()
 
 
 class Segment:
     """One file of H.264 video, written frame by frame, and beside it a text file of digests.
 
-    A digest line is the frame's number and the SHA-256 of its bytes (row 0 first, RGB).
+    A digest line is the frame's number and the SHA-256 of its bytes (row 0 first, RGB). `moved`: bytes of the frame
+    that was begun last; the least of them are a new frame's, and those that the encoder gave.
     """
 
     def __init__(self, path: Path, fps: float, height: int, width: int) -> None:
@@ -51,6 +54,7 @@ class Segment:
         self._last = -1
         self._digest = ""
         self._picture: Any = None
+        self.moved = ByteCounter()
         self._digests = path.with_suffix(".sha256").open("w", encoding="ascii", buffering=1)
 
     def digest(self, frame: int, pixels: NDArray[np.uint8], repeats: bool = False) -> None:
@@ -60,7 +64,8 @@ class Segment:
         """
         if not repeats:
             self._digest = hashlib.sha256(pixels.data).hexdigest()
-        self._digests.write(f"{frame} {self._digest}\n")
+            self.moved.read += pixels.nbytes
+        self.moved.written += self._digests.write(f"{frame} {self._digest}\n")
 
     def add(self, frame: int, pixels: NDArray[np.uint8], repeats: bool = False) -> None:
         """Show `pixels`, (height, width, 3) RGB, from the instant of frame number `frame` on.
@@ -72,10 +77,16 @@ class Segment:
             self._picture = self._reformatter.reformat(
                 rgb, format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG
             )
+            self.moved.read += pixels.nbytes
+            self.moved.least += pixels.nbytes
         picture = self._picture
         self._last = max(self._last + 1, frame)
         picture.pts, picture.time_base = self._last, self._stream.codec_context.time_base
-        self._container.mux(self._stream.encode(picture))
+        packets = self._stream.encode(picture)
+        self._container.mux(packets)
+        encoded = sum(packet.size for packet in packets)
+        self.moved.written += encoded
+        self.moved.least += encoded
 
     def close(self) -> None:
         """Flush the encoder and complete the file."""
@@ -87,7 +98,7 @@ class Segment:
 class PresentStage:
     """Stage `present` of the CPU unit: one input edge of frames, no output.
 
-    Figures of a job that is recorded: `digest_ms` and `encode_ms`.
+    Figures of a job that is recorded: `digest_ms`, `encode_ms`, and the bytes moved; of another, that none were.
     """
 
     def __init__(self, config: RunConfig) -> None:
@@ -121,15 +132,17 @@ class PresentStage:
             times = float(header["media_time_s"]), int(header["t_sampled_ns"])
             self._window.show(frame, *times, self._frames[slot_in])
         if self._segment is None:
-            return {}
+            return NOTHING
         pixels, drawn = self._frames[slot_in], int(self._headers[slot_in]["repeats"]) - 1
         repeats = drawn == self._drawn >= 0
         self._drawn = drawn if drawn >= 0 else frame
+        self._segment.moved.start()
         start = time.perf_counter_ns()
         self._segment.digest(frame, pixels, repeats)
         digested = time.perf_counter_ns()
         self._segment.add(frame, pixels, repeats)
-        return {"digest_ms": (digested - start) * MS, "encode_ms": (time.perf_counter_ns() - digested) * MS}
+        encode_ms = (time.perf_counter_ns() - digested) * MS
+        return {"digest_ms": (digested - start) * MS, "encode_ms": encode_ms, **self._segment.moved.figures()}
 
     def close(self) -> None:
         """Complete the segment."""

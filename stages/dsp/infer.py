@@ -18,12 +18,22 @@ from trilane.arrays import U8
 from trilane.avatars.integer_network import NetworkFile
 from trilane.avatars.network_split import NetworkPart
 from trilane.errors import BadInputError
+from trilane.pipeline.moved_bytes import ByteCounter
 from trilane.pipeline.stage import UnitContext
 from trilane.shapes import Shape
 from trilane.stages.avatar_assets import network_of
 from trilane.stages.config import RunConfig
-from trilane.stages.dsp.parts import parts_for, views
-from trilane.stages.dsp.runtime import Binding, RuntimeOptions, Session, has_device, load_runtime, resolve
+from trilane.stages.dsp.parts import constant_bytes, parts_for, views
+from trilane.stages.dsp.runtime import (
+    Binding,
+    RuntimeOptions,
+    Session,
+    copies_slots,
+    has_device,
+    load_runtime,
+    resolve,
+)
+from trilane.stages.last_level_cache import moved_of_kept
 from trilane.transport.packets import Packet
 
 Key = tuple[Shape, int, int]
@@ -33,15 +43,24 @@ LOAD_AT_ONCE = ("openvino", "ort")
 
 @dataclass(frozen=True)
 class BoundPart:
-    """A part on a pair of slots. `passed`: (from, to) tensors that a later part reads as this one was given them."""
+    """A part on a pair of slots. `passed`: (from, to) tensors that a later part reads as this one was given them.
+
+    `in_bytes`, `out_bytes`: of what the network reads, its weights included where they come from memory, and writes.
+    """
 
     binding: Binding
     passed: Sequence[tuple[U8, U8]]
+    in_bytes: int
+    out_bytes: int
 
-    def run(self) -> None:
+    def run(self, moved: ByteCounter) -> None:
         for source, target in self.passed:
             np.copyto(target, source)
+            moved.copied(source.nbytes)
         self.binding.run()
+        moved.read += self.in_bytes
+        moved.written += self.out_bytes
+        moved.least += self.in_bytes + self.out_bytes
 
 
 class InferStage:
@@ -60,6 +79,8 @@ class InferStage:
         self._options = RuntimeOptions(settings.threads, settings.spin)
         self._shapes = config.buckets
         self._network = network
+        self._moved = ByteCounter()
+        self._copies = copies_slots(self.runtime)
         self._bindings: dict[Key, BoundPart] = {}
         self._inputs: Sequence[Packet] = ()
         self._outputs: Sequence[Packet] = ()
@@ -77,20 +98,32 @@ class InferStage:
         part = parts_for(self._config, self._network, shape)[self._part]
         session = self._module.load(part, self._options)
         pairs = product(enumerate(self._inputs), enumerate(self._outputs))
-        bindings = {(i, o): _bound(session, part, source.payload, target.payload) for (i, source), (o, target) in pairs}
-        bindings[0, 0].run()
+        weights = 0 if has_device(self.runtime) else moved_of_kept(constant_bytes(part.model))
+        bindings = {
+            (i, o): _bound(session, part, source.payload, target.payload, weights) for (i, source), (o, target) in pairs
+        }
+        bindings[0, 0].run(ByteCounter())
         return bindings
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
-        """Infer the tensor unless nobody is in view; then the picture is transparent. Figures: `inferred`, 0 or 1."""
+        """Infer the tensor unless nobody is in view; then the picture is transparent.
+
+        Figures: `inferred`, 0 or 1, and the bytes moved. The least: what the network is given and what it gives, and
+        its weights where they do not fit into the last-level cache.
+        """
         assert slot_in is not None and slot_out is not None
-        pose = self._inputs[slot_in].header
+        pose, picture, moved = self._inputs[slot_in].header, self._outputs[slot_out].payload, self._moved
+        moved.start(pose.nbytes)
         if not pose["avatars"]["visible"].any():
-            self._outputs[slot_out].payload[:] = 0
-            return {"inferred": 0}
+            picture[:] = 0
+            moved.written += picture.nbytes
+            return {"inferred": 0, **moved.figures()}
         height, width = pose["tensor_shape"].tolist()
-        self._binding((height, width), slot_in, slot_out, frame).run()
-        return {"inferred": 1}
+        bound = self._binding((height, width), slot_in, slot_out, frame)
+        bound.run(moved)
+        if self._copies:
+            moved.uploaded, moved.read_back = bound.in_bytes, bound.out_bytes
+        return {"inferred": 1, **moved.figures()}
 
     @property
     def sessions(self) -> int:
@@ -118,7 +151,10 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> InferStage:
     return InferStage(config, network_of(unit.assets), settings["part"])
 
 
-def _bound(session: Session, part: NetworkPart, source: U8, target: U8) -> BoundPart:
+def _bound(session: Session, part: NetworkPart, source: U8, target: U8, weights: int) -> BoundPart:
+    """`weights`: bytes of the network's own that each run reads from memory."""
     given, handed_on = views(source, part.crossing_in), views(target, part.crossing_out)
-    binding = session.bind([given[name] for name in part.inputs], [handed_on[name] for name in part.outputs])
-    return BoundPart(binding, [(given[name], handed_on[name]) for name in handed_on if name not in part.outputs])
+    inputs, outputs = [given[name] for name in part.inputs], [handed_on[name] for name in part.outputs]
+    passed = [(given[name], handed_on[name]) for name in handed_on if name not in part.outputs]
+    in_bytes, out_bytes = (sum(tensor.nbytes for tensor in tensors) for tensors in (inputs, outputs))
+    return BoundPart(session.bind(inputs, outputs), passed, weights + in_bytes, out_bytes)

@@ -16,7 +16,7 @@ import onnx
 from numpy.typing import NDArray
 
 from trilane.arrays import U8
-from trilane.avatars.integer_network import NetworkFile
+from trilane.avatars.integer_network import NetworkFile, constants_of
 from trilane.avatars.network_reshape import reshaped
 from trilane.avatars.network_split import NetworkPart, Shapes, split
 from trilane.cache import Arrays, cached_arrays
@@ -65,6 +65,14 @@ def crossing_bytes(config: RunConfig, network: NetworkFile) -> list[int]:
         return []
     shapes = [[part.crossing_out for part in parts_for(config, network, shape)[:-1]] for shape in config.buckets]
     return [max(extent(crossing) for crossing in crossings) for crossings in zip(*shapes, strict=True)]
+
+
+def constant_bytes(model: onnx.ModelProto) -> int:
+    """Of the constants of `model`: weights, biases, scales."""
+    return sum(
+        math.prod(tensor.dims) * onnx.helper.tensor_dtype_to_np_dtype(tensor.data_type).itemsize
+        for tensor in constants_of(model).values()
+    )
 
 
 def extent(shapes: Shapes) -> int:

@@ -66,12 +66,14 @@ class RuntimeEntry:
     """A runtime: its module, the package it needs, the command that installs it, and a file the package must contain.
 
     `file`: relative to the package's folder; empty when the package alone suffices.
+    `copies`: whether each run copies the slots to memory of a device, and back.
     """
 
     module: str
     package: str
     install: Callable[[], str]
     file: str = ""
+    copies: bool = False
 
     @property
     def is_installed(self) -> bool:
@@ -95,6 +97,7 @@ RUNTIMES = {
         "onnxruntime",
         cuda_line,
         "capi/libonnxruntime_providers_cuda.so",
+        copies=True,
     ),
 }
 
@@ -118,6 +121,11 @@ def resolve(name: str) -> str:
 def has_device(name: str) -> bool:
     """Whether runtime `name` computes on hardware of its own; on x86, `qnn` is an emulator that runs on the cores."""
     return name == "cuda" or (name == "qnn" and platform.machine() not in X86)
+
+
+def copies_slots(name: str) -> bool:
+    """Whether runtime `name` copies slots to its device and back in every run; the others work in the slots."""
+    return RUNTIMES[name].copies
 
 
 def load_runtime(name: str) -> Runtime:

@@ -33,6 +33,7 @@ from trilane.stages.gpu.head_up_display import Hud
 from trilane.stages.gpu.opengl_context import CONTEXT, checked, describe, open_context
 from trilane.stages.gpu.shape_change import ShapeChange
 from trilane.stages.gpu.still_background import StillBackground
+from trilane.stages.gpu.transfers import counter_of, read_into
 from trilane.transport.packets import Packet
 
 ROOM = "room"
@@ -86,21 +87,28 @@ class CompositeStage:
         """Write the frame, (h,w,3) uint8 sRGB, row 0 on top.
 
         Figures: of a job, 1 or 0 for `nobody` (on the screen), `reused` (the picture of an earlier frame is the right
-        one), `stale` (it is not, but that one never came), and `copied` (not drawn: it is an earlier frame's).
+        one), `stale` (it is not, but that one never came), and `copied` (not drawn: it is an earlier frame's). And the
+        bytes moved. The least: what is new of the background, and of the network's picture in the cells of avatars in
+        view; and the frame, where it is not one that a slot holds already.
         """
         if slot_in is None or slot_out is None:
             raise ValueError("composite needs an input and an output slot")
         packet, out = self._inputs[slot_in], self._outputs[slot_out]
-        pose = packet.header
+        pose, moved = packet.header, counter_of(self._ctx)
+        moved.start(pose.nbytes)
         with checked(self._ctx):
             self._take(pose, packet.payload)
             drawing = self._drawing(pose)
             repeated = None if int(pose["work"]) == Work.FULL else self._drawn.slot_of(drawing, slot_out)
+            frame_bytes = math.prod(self._shape) * 3
             if repeated is None:
                 self._draw(pose)
-                self._target.read_into(out.payload[: math.prod(self._shape) * 3], components=3, alignment=1)
+                read_into(self._ctx, self._target, out.payload[:frame_bytes], components=3, alignment=1)
+                moved.written += frame_bytes
+                moved.least += frame_bytes
             elif repeated != slot_out:
-                out.payload[:] = self._outputs[repeated].payload
+                out.payload[:frame_bytes] = self._outputs[repeated].payload[:frame_bytes]
+                moved.copied(frame_bytes)
         out.header["repeats"] = self._drawn.note(slot_out, drawing, frame, repeated)
         work, is_right = Work(int(pose["work"])), self._holds(int(pose["picture"]))
         said = {
@@ -109,7 +117,7 @@ class CompositeStage:
             "stale": work is Work.REUSE and not is_right,
             "copied": repeated is not None,
         }
-        return {name: float(value) for name, value in said.items()}
+        return {**{name: float(value) for name, value in said.items()}, **moved.figures()}
 
     def draw(self, pose: NDArray[np.void], image: NDArray[np.uint8]) -> None:
         """Draw the frame that `pose` and the network's `image` (h * w * 4 bytes or more) describe."""
@@ -123,12 +131,14 @@ class CompositeStage:
             if picture is not None:
                 self._shows_background += 1
                 self._picture.upload(picture)
+                counter_of(self._ctx).least += picture.nbytes
         if int(pose["work"]) == Work.FULL:
             self._change.note(self._held, pose)
             self._held = pose.copy()
             if _visible(pose):
                 shape = _tensor_shape(pose)
                 self._painter.upload(shape, image[: math.prod(shape) * 4])
+                counter_of(self._ctx).least += _cells_bytes(pose)
                 for change in self._change.blends(pose):
                     self._painter.blend(shape, change)
 
@@ -185,6 +195,11 @@ class CompositeStage:
 
 def _visible(pose: NDArray[np.void]) -> list[Any]:
     return [avatar for avatar in pose["avatars"][: int(pose["avatar_count"])] if avatar["visible"]]
+
+
+def _cells_bytes(pose: NDArray[np.void]) -> int:
+    """Of the network's picture, in the rectangles of the avatars in view."""
+    return sum(4 * int(avatar["tensor_rect"][2]) * int(avatar["tensor_rect"][3]) for avatar in _visible(pose))
 
 
 def _tensor_shape(pose: NDArray[np.void]) -> Shape:

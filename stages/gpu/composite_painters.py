@@ -20,6 +20,7 @@ from trilane.stages.gpu.camera_matrices import eye_of, target_clip
 from trilane.stages.gpu.picture_spans import BAND, WHOLE, spans
 from trilane.stages.gpu.shader_program import build_program
 from trilane.stages.gpu.shape_change import Blend
+from trilane.stages.gpu.transfers import counter_of, upload, uploaded_buffer
 
 MAX_TAPS = 8
 #: Pixels of the screen from which on less is drawn in the time that it takes to find what is transparent.
@@ -53,7 +54,7 @@ class RoomPainter:
         self._ctx.enable_only(moderngl.CULL_FACE)
         self._ctx.front_face = "cw"  # row 0 is on top, see `skinned_mesh`
         target.clear(*(value / 255 for value in UNDER_THE_FLOOR))
-        self._program["clip_from_world"].write(target_clip(view, projection))
+        upload(self._ctx, self._program["clip_from_world"], target_clip(view, projection))
         for texture, batch in zip(self._textures, self._batches, strict=True):
             texture.use(0)
             batch.render()
@@ -62,10 +63,11 @@ class RoomPainter:
         mesh = room_mesh(self._extent)
         for batch in self._batches:
             batch.release()
-        vertices = self._ctx.buffer(mesh.vertices.tobytes())
+        vertices = uploaded_buffer(self._ctx, mesh.vertices.tobytes())
         content = [(vertices, "3f 2f 3f", "position", "uv", "light")]
         parts = (mesh.floor, mesh.rest)
-        self._batches = [self._ctx.vertex_array(self._program, content, self._ctx.buffer(p.tobytes())) for p in parts]
+        indices = [uploaded_buffer(self._ctx, part.tobytes()) for part in parts]
+        self._batches = [self._ctx.vertex_array(self._program, content, index) for index in indices]
 
 
 class PicturePainter:
@@ -79,7 +81,7 @@ class PicturePainter:
 
     def upload(self, picture: U8) -> None:
         """Write `picture` (h,w,3) to the GPU; `draw` shows it from now on."""
-        self._texture.write(picture, alignment=1)
+        upload(self._ctx, self._texture, picture, alignment=1)
 
     def draw(self) -> None:
         """Copy the picture to the target in use."""
@@ -102,10 +104,10 @@ class ShadowPainter:
             return
         self._ctx.enable_only(moderngl.BLEND)
         self._ctx.blend_func = moderngl.ZERO, moderngl.ONE_MINUS_SRC_ALPHA
-        self._program["clip_from_world"].write(target_clip(view, projection))
+        upload(self._ctx, self._program["clip_from_world"], target_clip(view, projection))
         padded = np.zeros((self._count, 4), np.float32)
         padded[: len(blobs)] = blobs
-        self._program["blob"].write(padded)
+        upload(self._ctx, self._program["blob"], padded)
         with opengl_calls.srgb_target():
             self._discs.render(vertices=6 * len(blobs))
 
@@ -129,7 +131,8 @@ class AvatarPainter:
         """Write `image` (h * w * 4,) uint8, sRGB with straight alpha, to the GPU as the picture of `shape`."""
         self._shown = image.reshape(*shape, 4)[:, :, 3] > 0
         straight, target, _ = self._pictures[shape]
-        straight.write(image)
+        upload(self._ctx, straight, image)
+        counter_of(self._ctx).read += self._shown.nbytes + image.nbytes
         target.use()
         self._ctx.enable_only(moderngl.NOTHING)
         straight.use(0)
@@ -167,7 +170,7 @@ class AvatarPainter:
             parts = spans(self._shown[top : top + height, left : left + width], math.ceil(density / 2) + 1)
         if not len(parts):
             return
-        self._parts.write(parts)
+        upload(self._ctx, self._parts, parts)
         program, quad = self._quads[taps - 1]
         size = np.array([shape[1], shape[0]] * 2)
         edge = np.array([left, top, left + width, top + height])

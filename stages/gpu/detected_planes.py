@@ -16,6 +16,7 @@ from trilane.scene.schema import PlaneSpec
 from trilane.stages.gpu import opengl_calls
 from trilane.stages.gpu.camera_matrices import target_clip
 from trilane.stages.gpu.shader_program import build_program
+from trilane.stages.gpu.transfers import upload
 
 UPRIGHT = 0.9  # sides of a plane whose unit normal has |y| above this are aligned with the world's x, others with its y
 
@@ -36,7 +37,7 @@ class PlanePainter:
         """Blend the planes over the target, as seen by `view` and `projection`."""
         self._ctx.enable_only(moderngl.BLEND)
         self._ctx.blend_func = moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA
-        self._program["clip_from_world"].write(target_clip(view, projection))
+        upload(self._ctx, self._program["clip_from_world"], target_clip(view, projection))
         with opengl_calls.srgb_target():
             self._sheets.render(vertices=6 * self._count)
 

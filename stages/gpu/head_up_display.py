@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from trilane.stages.gpu.shader_program import build_program
+from trilane.stages.gpu.transfers import upload
 
 SIZE = (232, 62)  # width, height
 MARGIN_PX = 8
@@ -41,7 +42,7 @@ class Hud:
     def draw(self, target: Any, pose: NDArray[np.void]) -> None:
         """Blend the display for the frame of pose packet `pose` over `target`."""
         lines = self._lines(pose, time.monotonic_ns())
-        self._texture.write(hud_picture(lines, self._font).tobytes())
+        upload(self._ctx, self._texture, hud_picture(lines, self._font).tobytes())
         corner = MARGIN_PX, target.height - MARGIN_PX - SIZE[1]
         self._program["corner"].value = corner
         target.viewport = (*corner, *SIZE)

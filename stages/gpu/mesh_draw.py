@@ -13,6 +13,7 @@ from trilane.arrays import Floats
 from trilane.stages.gpu.camera_matrices import target_clip
 from trilane.stages.gpu.shader_program import build_program, set_uniforms
 from trilane.stages.gpu.skinned_mesh import BodyPose, Mesh
+from trilane.stages.gpu.transfers import upload
 
 
 class MeshDraw:
@@ -44,5 +45,5 @@ class MeshDraw:
         self._mesh.upload_pose(pose)
         for program, vertices in self._parts:
             self._mesh.bind_pose(program)
-            program["clip_from_world"].write(clip)
+            upload(self._ctx, program["clip_from_world"], clip)
             vertices.render()

@@ -19,6 +19,7 @@ from trilane.stages.gpu.mesh_draw import MeshDraw
 from trilane.stages.gpu.shader_program import build_program, set_uniforms
 from trilane.stages.gpu.skinned_mesh import BodyPose, Mesh
 from trilane.stages.gpu.texture_array import FILTERS, check_texture, texture_array
+from trilane.stages.gpu.transfers import read_into, upload
 
 CHANNELS = (4, 8, 12, 16)
 WORD_TYPES = {1: "uint", 2: "uvec2", 3: "uvec4", 4: "uvec4"}
@@ -128,14 +129,15 @@ class PackedPass:
         if target.blank is None:
             opengl_calls.clear_unsigned(self._background)
         else:
-            target.words.color_attachments[0].write(target.blank)
+            upload(self.ctx, target.words.color_attachments[0], target.blank)
         opengl_calls.clear_depth()
         return target
 
     def read_into(self, shape: Shape, tensor: U8) -> None:
         """Copy the target of `shape` to `tensor`, (h * w * channels,) uint8."""
         box = (0, 0, shape[1], shape[0])
-        self.target(shape).words.read_into(tensor, box, components=self.layers, dtype="u4", alignment=1)
+        words = self.target(shape).words
+        read_into(self.ctx, words, tensor, box, components=self.layers, dtype="u4", alignment=1)
 
     def background(self, tensor: U8) -> None:
         """Fill `tensor` with the zero point, the content of a frame without avatars."""
@@ -158,7 +160,7 @@ class PackedAvatar:
     def __init__(self, packed: PackedPass, mesh: Mesh, texture: Floats) -> None:
         """`texture` (H,W,C) is uploaded here. Raises BadInputError when FP16 cannot hold it or C is not the pass's."""
         check_texture(texture, packed.channels)
-        self._mesh, self._ctx = mesh, packed.ctx
+        self.mesh, self._ctx = mesh, packed.ctx
         self._texture = texture_array(packed.ctx, texture, packed.filtering)
         defines: dict[str, int | str] = {"LAYERS": packed.layers, "WORDS": WORD_TYPES[packed.layers]}
         if packed.deferred:
@@ -180,7 +182,7 @@ class PackedAvatar:
         top, left, height, width = placement.rect
         box = (left, top, width, height)
         self._texture.use(0)
-        self._mesh.prepare(self._ctx)
+        self.mesh.prepare(self._ctx)
         first = target.words if target.uv is None else target.uv
         first.use()
         first.viewport = box

@@ -23,6 +23,7 @@ from trilane.stages.gpu.avatar_mesh import avatar_mesh
 from trilane.stages.gpu.opengl_context import CONTEXT, checked, describe, open_context
 from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement
 from trilane.stages.gpu.skinned_mesh import Mesh, PosedMesh, SkinnedMesh
+from trilane.stages.gpu.transfers import counter_of
 from trilane.stages.packets import posed_vertices
 from trilane.transport.packets import Packet
 
@@ -55,17 +56,21 @@ class RasterStage:
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
         """Write frame `frame`'s tensor, (h,w,C) uint8.
 
+        Figures: the bytes moved. The least: of each avatar in view the pose that its mesh takes, and the tensor.
+
         Raises TrilaneError when a joint is not a finite number, UnitLostError with the context.
         """
         if slot_in is None or slot_out is None:
             raise ValueError("raster needs an input and an output slot")
-        pose = self._inputs[slot_in].header
+        pose, moved = self._inputs[slot_in].header, counter_of(self._packed.ctx)
+        moved.start(pose.nbytes)
         shape = (int(pose["tensor_shape"][0]), int(pose["tensor_shape"][1]))
         tensor = self._outputs[slot_out].payload[: math.prod(shape) * self._packed.channels]
         visible = [a for a in pose["avatars"][: int(pose["avatar_count"])] if a["visible"]]
         if not visible:
             self._packed.background(tensor)
-            return {}
+            moved.written += tensor.nbytes
+            return moved.figures()
         _refuse_nan(frame, visible)
         skinned = self._vertices[slot_in]
         with checked(self._packed.ctx):
@@ -74,8 +79,11 @@ class RasterStage:
                 number = int(avatar["avatar"])
                 placement = _placement(pose, avatar, skinned[number] if skinned else None)
                 self._avatars[number].draw(target, pose["view"], placement)
+                moved.least += self._avatars[number].mesh.pose_bytes
             self._packed.read_into(shape, tensor)
-        return {}
+        moved.written += tensor.nbytes
+        moved.least += tensor.nbytes
+        return moved.figures()
 
     def close(self) -> None:
         """Let go of the slots; the context goes with the process."""

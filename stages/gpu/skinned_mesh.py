@@ -17,6 +17,7 @@ from trilane.body.joints import JOINTS, POSE_FEATURES
 from trilane.body.skin_weights import WEIGHT_COUNTS
 from trilane.errors import BadInputError
 from trilane.stages.gpu.mesh_arrays import MeshArrays, weight_batches
+from trilane.stages.gpu.transfers import counter_of, upload
 
 POSEDIRS_ROW = 8192  # texels in a row of the pose blend shape texture
 GROUPS = "abc"
@@ -38,11 +39,13 @@ class Mesh(Protocol):
     """What `MeshDraw` draws: buffers, a vertex shader, and the pose of a frame.
 
     `batches`: pairs of a number of skin weights and the index buffer of the triangles drawn with as many.
+    `pose_bytes`: of a frame's pose, each number of it once.
     """
 
     arrays: MeshArrays
     vertex_shader: str
     batches: list[tuple[int, Any]]
+    pose_bytes: int
 
     @property
     def defines(self) -> dict[str, int | str]:
@@ -70,6 +73,7 @@ class PosedMesh:
         self.arrays, self._ctx = arrays, ctx
         self.defines: dict[str, int | str] = {}
         self._corners = np.empty((len(arrays.source), 3), np.float32)
+        self.pose_bytes = len(np.unique(arrays.source)) * self._corners.itemsize * 3
         self._positions = ctx.buffer(reserve=self._corners.nbytes, dynamic=True)
         self._uv = ctx.buffer(arrays.uv.tobytes())
         self.batches = [(WEIGHT_COUNTS[0], ctx.buffer(_index_bytes(arrays, arrays.triangles)))]
@@ -89,7 +93,8 @@ class PosedMesh:
             raise ValueError("a posed mesh needs the frame's vertices")
         np.take(pose.vertices, self.arrays.source, axis=0, out=self._corners, mode="clip")  # "raise" copies twice
         self._positions.orphan()
-        self._positions.write(self._corners)
+        counter_of(self._ctx).read += self._corners.nbytes
+        upload(self._ctx, self._positions, self._corners)
 
     def bind_pose(self, program: Any) -> None:
         """Does nothing: the positions are vertex attributes."""
@@ -109,6 +114,7 @@ class SkinnedMesh:
         self.batches = [(k, ctx.buffer(_index_bytes(arrays, part))) for k, part in weight_batches(arrays).items()]
         self._joints = ctx.buffer(reserve=JOINTS * 48)
         self._feature = ctx.buffer(reserve=-(-POSE_FEATURES // 4) * 16)
+        self.pose_bytes = 4 * (JOINTS * 12 + (0 if posedirs is None else POSE_FEATURES))
         self._ctx = ctx
 
     @property
@@ -131,12 +137,12 @@ class SkinnedMesh:
 
     def upload_pose(self, pose: BodyPose) -> None:
         """Write the skinning matrices, and for a mesh with pose blend shapes the pose feature. Raises ValueError."""
-        self._joints.write(np.ascontiguousarray(pose.joints, np.float32))
+        upload(self._ctx, self._joints, np.ascontiguousarray(pose.joints, np.float32))
         if self.posedirs is None:
             return
         if pose.feature is None:
             raise ValueError("a mesh with pose blend shapes needs the pose feature")
-        self._feature.write(np.ascontiguousarray(pose.feature, np.float32))
+        upload(self._ctx, self._feature, np.ascontiguousarray(pose.feature, np.float32))
 
     def bind_pose(self, program: Any) -> None:
         """Make `program` read the uploaded matrices, pose feature and pose blend shapes."""

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from trilane.stages.gpu.transfers import read_into, upload
+
 
 class StillBackground:
     """Keeps the background of `target`, a framebuffer with one colour of four bytes."""
@@ -25,10 +27,10 @@ class StillBackground:
     def draw(self, shown: Hashable, draw: Callable[[], None]) -> None:
         """Fill the target with the background that `shown`, which is not None, stands for: by `draw`, or a copy."""
         if shown == self._shown and self._is_kept:
-            self._target.color_attachments[0].write(self._bytes)
+            upload(self._target.ctx, self._target.color_attachments[0], self._bytes)
             return
         draw()
         self._is_kept = shown == self._shown
         self._shown = shown
         if self._is_kept:
-            self._target.read_into(self._bytes, components=4, alignment=1)
+            read_into(self._target.ctx, self._target, self._bytes, components=4, alignment=1)

@@ -26,12 +26,14 @@ from trilane.scene.tensor_layout import lay_out
 from trilane.shapes import shape_buckets
 from trilane.stages.avatar_assets import shaped_body, staged_of
 from trilane.stages.config import RunConfig
+from trilane.stages.cpu import actor
 from trilane.stages.cpu import present as present_stage
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 from trilane.stages.cpu.pose import PoseStage
 from trilane.stages.cpu.present import PresentStage, Segment
 from trilane.stages.packets import pose_dtype, posed_vertices, posed_vertices_bytes
 from trilane.testing.assets import assets_of
+from trilane.testing.told_bytes import without_bytes
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 # --- crop ------------------------------------------------------------------------------------------------------------
@@ -180,8 +182,11 @@ PAIR = (AvatarSpec(position=(-0.5, 0, 0)), AvatarSpec(position=(0.5, 0, 0.3), mo
 
 
 @pytest.mark.parametrize("skinned", [False, True], ids=["GPU skins", "CPU skins"])
-def test_a_packet_holds_what_motion_camera_and_layout_give(tiny_bundle: Path, tmp_path: Path, skinned: bool) -> None:
+def test_a_packet_holds_what_motion_camera_and_layout_give(
+    tiny_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, skinned: bool
+) -> None:
     """Two avatars at frame 40 of 25 a second, from the same parts put together here."""
+    monkeypatch.setattr(actor, "moved_of_kept", lambda _: 1000)
     output = OutputSpec(width=320, height=200)
     first = configured(tiny_bundle, tmp_path, fps=25.0, avatars=PAIR, output=output, plan="fixed")
     assets = assets_of(first)
@@ -190,7 +195,16 @@ def test_a_packet_holds_what_motion_camera_and_layout_give(tiny_bundle: Path, tm
     config = first.model_copy(update={"posed_vertices": (total, total) if skinned else ()})
     stage, slots = PoseStage(config, assets), [packet(2, posed_vertices_bytes(config.posed_vertices)) for _ in range(2)]
     stage.bind([], slots)
-    assert stage.run(40, None, 1) == {"visible": 2.0, "level": 5.0, "error_px": 0.0}
+    figures = stage.run(40, None, 1)
+    assert without_bytes(figures) == {"visible": 2.0, "level": 5.0, "error_px": 0.0}
+    # A camera of 4 x 4, of each avatar 55 x 3 angles and a place, as float64; a header of two avatars; 3 x 4 bytes a
+    # vertex, which are read again for the rectangle; and what skinning reads from memory.
+    sampled, header, skin = 128 + 2 * 1344, 24 + 168 + 2 * 4624, 2 * total * 12 if skinned else 0
+    tables = 2 * 1000 if skinned else 0
+    least = sampled + tables + header + skin
+    assert [figures[f"bytes_{name}"] for name in ("read", "written", "uploaded", "read_back", "least")] == [
+        sampled + tables + skin, header + skin, 0, 0, least
+    ]  # fmt: skip
     assert not slots[0].header["avatar_count"]
     pose = slots[1].header
     assert (int(pose["frame"]), int(pose["avatar_count"]), float(pose["media_time_s"])) == (40, 2, 1.6)
@@ -358,7 +372,10 @@ def test_a_jobs_figures_are_milliseconds(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(present_stage.time, "perf_counter_ns", lambda: times[next(ticks) % 3])
     seen: list[Any] = []
     monkeypatch.setattr(stage._segment, "add", lambda frame, pixels, _repeats: seen.append((frame, pixels)))
-    assert stage.run(4, 1, None) == {"digest_ms": pytest.approx(2.0), "encode_ms": pytest.approx(5.0)}
+    assert without_bytes(stage.run(4, 1, None)) == {
+        "digest_ms": pytest.approx(2.0),
+        "encode_ms": pytest.approx(5.0),
+    }
     (frame, pixels), folder = seen[0], tmp_path / "segments"
     assert frame == 4 and pixels.shape == (64, 96, 3)
     assert np.array_equal(pixels.ravel(), slots[1].payload[: 96 * 64 * 3])

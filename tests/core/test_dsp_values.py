@@ -439,7 +439,7 @@ def test_three_parts_in_a_row_give_the_bytes_of_the_whole(tiny_bundle: Path) -> 
         stage = InferStage(config, whole, number)
         stage.bind([slots[number]], [slots[number + 1]])
         slots[number + 1].payload[:] = 77
-        assert stage.run(0, 0, 0) == {"inferred": 1}
+        assert stage.run(0, 0, 0)["inferred"] == 1
         passed += len(stage._bindings[shape, 0, 0].passed)
         assert stage.sessions == 1
         stage.close()

@@ -94,7 +94,7 @@ def test_a_mesh_says_what_a_pose_lacks() -> None:
     joints: Any = SimpleNamespace(write=lambda data: written.append(data.tobytes()))
     pose = BodyPose(np.arange(6, dtype=np.float32).reshape(2, 3))
     posed, skinned = object.__new__(PosedMesh), object.__new__(SkinnedMesh)
-    skinned._joints, skinned.posedirs = joints, None
+    skinned._joints, skinned.posedirs, skinned._ctx = joints, None, SimpleNamespace(extra=None)
     with pytest.raises(ValueError, match=r"^a posed mesh needs the frame's vertices$"):
         posed.upload_pose(pose)
     skinned.upload_pose(pose)

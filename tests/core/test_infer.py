@@ -12,13 +12,16 @@ import onnx
 import pytest
 
 from trilane.avatars.bundle import load_bundle
+from trilane.avatars.integer_network import constants_of
 from trilane.errors import BadInputError
 from trilane.install import install_line
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.stage import UnitContext
 from trilane.scene.schema import Scene
 from trilane.stages.config import RunConfig
+from trilane.stages.dsp import infer
 from trilane.stages.dsp.infer import InferStage, build
+from trilane.stages.dsp.runtime import RUNTIMES, copies_slots
 from trilane.stages.packets import pose_dtype
 from trilane.testing.assets import assets_of
 from trilane.transport.packets import SlotLayout, view_packet
@@ -68,15 +71,45 @@ def test_each_shape_and_slot_has_its_own_session(tiny_bundle):
         tensor = random_tensor(shape, i + o)
         inputs[i].payload[: tensor.size] = tensor.ravel()
         show(inputs[i], shape, [1])
-        assert stage.run(0, i, o) == {"inferred": 1}
+        assert stage.run(0, i, o)["inferred"] == 1
         assert (outputs[o].payload[: shape[0] * shape[1] * 4] == run_alone(tiny_bundle, shape, tensor)).all()
+
+
+@pytest.mark.parametrize("kept", [0, 1])
+def test_the_bytes_of_an_inference_are_tensor_picture_and_weights(tiny_bundle, monkeypatch, kept):
+    """A tensor of 128 x 32 with 5 channels, a picture of 4, a header of 4816 bytes, and all that the network keeps."""
+    monkeypatch.setattr(infer, "moved_of_kept", lambda size: kept * size)
+    stage, inputs, _ = make(tiny_bundle)
+    show(inputs[0], (128, 32), [1])
+    model = load_bundle(tiny_bundle).read_network().model
+    weights = kept * sum(onnx.numpy_helper.to_array(tensor).nbytes for tensor in constants_of(model).values())
+    figures = stage.run(0, 0, 0)
+    read, written = weights + 128 * 32 * 5, 128 * 32 * 4
+    names = ("read", "written", "uploaded", "read_back", "least")
+    assert [figures[f"bytes_{name}"] for name in names] == [4816 + read, 4816 + written, 0, 0, read + written]
+
+
+def test_a_device_that_copies_slots_is_given_the_tensor_and_gives_the_picture(tiny_bundle, monkeypatch):
+    """Its weights stay with it."""
+    monkeypatch.setattr(infer, "copies_slots", lambda _: True)
+    monkeypatch.setattr(infer, "has_device", lambda _: True)
+    monkeypatch.setattr(infer, "moved_of_kept", lambda size: size)
+    stage, inputs, _ = make(tiny_bundle)
+    show(inputs[0], (64, 64), [1])
+    figures = stage.run(0, 0, 0)
+    assert (figures["bytes_uploaded"], figures["bytes_read_back"]) == (64 * 64 * 5, 64 * 64 * 4)
+    assert figures["bytes_least"] == 64 * 64 * 9
+
+
+def test_only_cuda_copies_slots():
+    assert [name for name in RUNTIMES if copies_slots(name)] == ["cuda"]
 
 
 def test_nothing_visible_is_transparent_and_not_inferred(tiny_bundle):
     stage, inputs, outputs = make(tiny_bundle)
     outputs[0].payload[:] = 9
     show(inputs[0], (0, 0), [0])
-    assert stage.run(0, 0, 0) == {"inferred": 0}
+    assert stage.run(0, 0, 0)["inferred"] == 0
     assert not outputs[0].payload.any()
 
 
@@ -86,7 +119,7 @@ def test_avatars_share_one_inference(tiny_bundle):
     tensor = random_tensor(shape, 0)
     inputs[0].payload[: tensor.size] = tensor.ravel()
     show(inputs[0], shape, [1, 0, 1])
-    assert stage.run(0, 0, 0) == {"inferred": 1}
+    assert stage.run(0, 0, 0)["inferred"] == 1
     found = outputs[0].payload[: shape[0] * shape[1] * 4]
     assert (found == run_alone(tiny_bundle, shape, tensor)).all()
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from trilane.pipeline.description import UnitSettings
+from trilane.pipeline.moved_bytes import BYTES
 from trilane.scene.schema import Scene
 from trilane.stages.config import RunConfig
 from trilane.stages.cpu.present import PresentStage
@@ -60,6 +61,6 @@ def test_the_present_stage_has_an_input_alone(tmp_path: Path) -> None:
 def test_without_a_recording_nothing_is_written_or_measured(tmp_path: Path) -> None:
     stage = PresentStage(config(tmp_path / "run", record=False))
     stage.bind([Packet(np.zeros(1, "u8")[0], np.zeros(1 << 22, np.uint8))], [])
-    assert stage.run(0, 0, None) == {}
+    assert stage.run(0, 0, None) == dict.fromkeys(BYTES, 0)
     stage.close()
     assert not (tmp_path / "run").exists()

@@ -26,6 +26,7 @@ from trilane.stages.gpu.contact_shadows import floor_discs
 from trilane.stages.gpu.detected_planes import PlanePainter, half_sides
 from trilane.stages.gpu.shape_change import Blend
 from trilane.stages.packets import pose_dtype
+from trilane.testing.told_bytes import without_bytes
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 SHAPE = (20, 27)
@@ -363,7 +364,7 @@ def frame_of(made: CompositeStage, pose: NDArray[np.void], image: U8) -> NDArray
     source.header[...] = pose
     source.payload[:] = image
     made.bind([source], [target])
-    assert set(made.run(0, 0, 0).values()) == {0.0}
+    assert set(without_bytes(made.run(0, 0, 0)).values()) == {0.0}
     assert not target.payload[math_prod(SHAPE) :].any()
     return target.payload[: math_prod(SHAPE)].reshape(*SHAPE, 3).astype(np.int64)
 
