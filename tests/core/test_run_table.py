@@ -53,6 +53,18 @@ def test_a_percentile_of_too_few_frames_is_marked(samples: int | None, marked: t
     assert ("* of too few frames: p90 needs 29, p95 needs 59, p99 needs 299" in text) == bool(marked)
 
 
+def test_bytes_stand_by_stage_and_in_all_beside_the_least() -> None:
+    """0.5 + 0.25 + 1 + 0.75 MB of one stage, nothing of another; a third does not count, nor did the baseline."""
+    moved = {"read": 5e5, "written": 2.5e5, "uploaded": 1e6, "read_back": 7.5e5, "least": 1e6, "ratio": 2.5}
+    nothing = dict.fromkeys(moved, 0.0) | {"ratio": None}
+    made = make_report(bytes=moved | {"gb_per_second": 0.125})
+    row = made["stages"]["infer"]
+    made["stages"] = {"raster": row | {"bytes": moved}, "infer": row | {"bytes": nothing}, "other": row}
+    text = table_text(made)
+    assert "moved a frame raster infer, MB 2.50 0.00 – –\nall, MB (times the least); GB/s 2.50 (2.50); 0.12 –\n" in text
+    assert "moved" not in table_text(make_report())
+
+
 def test_mean_and_rate_stand_with_their_interval_or_as_too_short() -> None:
     known = make_report(fps_low=48.0, fps_high=52.25)
     known["frame_time_ms"] = {**known["frame_time_ms"], "mean_low": 19.14, "mean_high": 20.83}

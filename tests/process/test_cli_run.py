@@ -23,7 +23,7 @@ from PIL import Image
 from trilane.apps.report import read_report
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_split import cuts
-from trilane.figure_sources import NO_FIGURES
+from trilane.figure_sources import COMPUTED, NO_FIGURES
 from trilane.pipeline.fork_server import process_name
 from trilane.scheduler.recording import read, replay
 
@@ -125,6 +125,9 @@ def test_the_report_says_what_was_asked_for(finished: Finished) -> None:
     assert report.accuracy["tiny"].keys() == {"source", "changed", "why"}, "never validated: nothing is made up"
     assert report.sources["accuracy.tiny"] == NO_FIGURES
     assert all(report.stage_metrics["present"][key] > 0 for key in ("digest_ms", "encode_ms"))
+    assert report.bytes is not None and all(stage.bytes is not None for stage in report.stages.values())
+    assert report.bytes.all == pytest.approx(sum(stage.bytes.all for stage in report.stages.values() if stage.bytes))
+    assert {report.sources[f"{key}.least"] for key in ("bytes", "stages.infer.bytes")} == {COMPUTED}
 
 
 def test_the_video_has_every_frame_and_the_sheet_shows_it(finished: Finished) -> None:
