@@ -75,7 +75,7 @@ def _caption(report: Report) -> str:
         lines.append(_pace(report.pace))
     if report.caps.performance_profile:
         lines.append(_caps(report.caps, report.temperature_c))
-    lines += [_accuracy(name, facts) for name, facts in report.accuracy.items()]
+    lines += [accuracy_line(name, facts) for name, facts in report.accuracy.items()]
     return escape("\n".join(lines))
 
 
@@ -102,7 +102,7 @@ def _caps(caps: Caps, temperature: Temperature) -> str:
     )
 
 
-def _accuracy(name: str, facts: Mapping[str, Any]) -> str:
+def accuracy_line(name: str, facts: Mapping[str, Any]) -> str:
     """The error of an avatar's pictures, and where its figures come from; else why there are none.
 
     A report that an older Trilane wrote does not say where its figures come from, so they are not shown.

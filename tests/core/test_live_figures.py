@@ -11,17 +11,14 @@ import pytest
 
 from trilane.apps.figures import DropCount, Figures, Moved, Shares
 from trilane.apps.live_figures import LiveFigures
-from trilane.pipeline.journal import SCHEMA, Accounted, Begun, Counted, Ended, Record, Said, Sampled, Stepped, Worked
+from trilane.pipeline.journal import SCHEMA, Accounted, Begun, Counted, Ended, Record, Stepped, Worked
 from trilane.scheduler.causes import Outcome, OutcomeKind
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import (
     NEVER,
-    Dispatch,
     Finish,
     FrameRequest,
     Graph,
-    Job,
-    JobDone,
     SetDuty,
     Settings,
     StageSpec,
@@ -31,12 +28,11 @@ from trilane.scheduler.events import (
     UnitReady,
     chain,
 )
-from trilane.scheduler.ledger import ASSIGNED, BLOCKED, STARVED, JobRecord
 from trilane.scheduler.virtual import VirtualDriver
+from trilane.testing.told_journal import told_journal
 
 MS = 1_000_000
 S = 1_000_000_000
-TWO = chain((("a", "u"), ("b", "v")), "double", "b")
 
 
 def followed(core: Core, driver: VirtualDriver) -> Iterator[list[Record]]:
@@ -60,55 +56,6 @@ def followed(core: Core, driver: VirtualDriver) -> Iterator[list[Record]]:
         booked, counts = len(driver.jobs), found
 
 
-def hand_made() -> tuple[Begun, list[Record]]:
-    """Two frames through a on u and b on v. Times in ms of a clock that shows 1000 at the start.
-
-    u: does a0 0-20 and a1 25-50, of which 5 are preempted, and waits 10 more until it is told at 60 that none is left.
-    v: starved until 20, b0 20-40, starved 40-50, b1 from 50 on, which has not ended at 70.
-    """
-    t = 1000 * MS
-
-    def job(number: int, stage: str, frame: int) -> Dispatch:
-        return Dispatch(Job(number, "u" if stage == "a" else "v", stage, frame, -1, 0, 0))
-
-    def done(number: int, unit: str, begin: int, end: int, sampled: int = 0, preempted: int = 0) -> JobDone:
-        times = (t + begin * MS, t + end * MS, t + sampled * MS if unit == "u" else 0)
-        return JobDone(unit, number, *times, preempted_ns=preempted * MS)
-
-    def worked(stage: str, frame: int, begin: int, end: int, **figures: float) -> Worked:
-        unit = "u" if stage == "a" else "v"
-        return Worked(JobRecord(stage, unit, frame, t, t, t + begin * MS, t + end * MS), figures)
-
-    begun = Begun(
-        SCHEMA,
-        TWO,
-        Settings(9),
-        {
-            "clock": "host",
-            "began_at": "2026-11-22T10:00:00+00:00",
-            "accuracy": {"default": {"source": "no figures", "why": "never validated"}},
-        },
-    )
-    return begun, [
-        Stepped(t, (UnitReady("u"), UnitReady("v")), (job(0, "a", 0),)),
-        Accounted(t, "u", ASSIGNED),
-        Accounted(t, "v", STARVED),
-        Stepped(t + 20 * MS, (done(0, "u", 0, 20, sampled=2),), (job(1, "a", 1), job(2, "b", 0))),
-        Accounted(t + 20 * MS, "v", ASSIGNED),
-        worked("a", 0, 0, 20, bytes_written=100.0, visible=1.0),
-        Sampled(t + 30 * MS, {"temperature_c.device": 31.5, "duty.u": 0.5, "temperature_c.sensor": 60.0, "load": 3.0}),
-        Stepped(t + 40 * MS, (done(2, "v", 20, 40),), ()),
-        Accounted(t + 40 * MS, "v", STARVED),
-        worked("b", 0, 20, 40, bytes_read=100.0, bytes_written=7.0),
-        Stepped(t + 50 * MS, (done(1, "u", 25, 50, sampled=26, preempted=5),), (job(3, "b", 1),)),
-        Accounted(t + 50 * MS, "v", ASSIGNED),
-        worked("a", 1, 25, 50, bytes_written=300.0),
-        Stepped(t + 60 * MS, (), ()),
-        Accounted(t + 60 * MS, "u", BLOCKED),
-        Said(t + 60 * MS, "so it is"),
-    ]
-
-
 def of(begun: Begun, records: list[Record]) -> LiveFigures:
     figures = LiveFigures(begun)
     for record in records:
@@ -124,7 +71,7 @@ def rounded(shares: Shares, total_ms: float) -> dict[str, float]:
 
 
 def test_a_journal_by_hand() -> None:
-    figures = of(*hand_made()).now(1070 * MS)
+    figures = of(*told_journal()).now(1070 * MS)
     assert (figures.t_ms, figures.window_s, figures.run_s, figures.clock, figures.is_over) == (
         70,
         0.07,
@@ -155,7 +102,7 @@ def test_a_journal_by_hand() -> None:
 
 
 def test_the_latency_histogram_has_the_frame_between_its_bounds() -> None:
-    latencies = of(*hand_made()).now().latencies
+    latencies = of(*told_journal()).now().latencies
     place = latencies.bounds_s.index(0.04)
     assert latencies.counts[place] == latencies.count == 1
     assert latencies.sum_s == pytest.approx(0.038)
@@ -163,7 +110,7 @@ def test_the_latency_histogram_has_the_frame_between_its_bounds() -> None:
 
 
 def test_sources_and_error_stand_beside_the_figures() -> None:
-    begun, records = hand_made()
+    begun, records = told_journal()
     figures = of(begun, records).now()
     assert figures.accuracy == {"default": {"source": "no figures", "why": "never validated"}}
     assert figures.sources["fps"] == figures.sources["temperature_c.sensor"] == "measured in this run"
@@ -174,19 +121,19 @@ def test_sources_and_error_stand_beside_the_figures() -> None:
 
 
 def test_as_json_can_be_written() -> None:
-    document = of(*hand_made()).now().as_json()
+    document = of(*told_journal()).now().as_json()
     assert json.loads(json.dumps(document, allow_nan=False))["units"]["v"]["window"]["idle"]["starved"] == 0.5
 
 
 def test_before_the_first_record_everything_is_nothing() -> None:
-    figures = LiveFigures(hand_made()[0]).now(5)
+    figures = LiveFigures(told_journal()[0]).now(5)
     assert (figures.t_ms, figures.fps, figures.run_s, figures.frames.in_flight) == (0, 0, 0, 0)
     assert figures.units["u"].run == Shares(0, dict.fromkeys(figures.units["u"].run.idle, 0))
     assert not figures.units["u"].is_up
 
 
 def test_the_window_forgets_and_the_run_does_not() -> None:
-    begun, records = hand_made()
+    begun, records = told_journal()
     figures = of(begun, records)
     half = figures.now(1020 * MS + 5 * S)
     # the window begins at 20: v was busy 20-40, starved 40-50, and b1 has run ever since
@@ -202,12 +149,12 @@ def test_the_window_forgets_and_the_run_does_not() -> None:
 
 
 def test_a_moment_before_the_last_record_is_the_last_record() -> None:
-    figures = of(*hand_made())
+    figures = of(*told_journal())
     assert figures.now(0) == figures.now() == figures.now(1060 * MS)
 
 
 def test_a_unit_that_dies_has_no_job_and_comes_back() -> None:
-    begun, records = hand_made()
+    begun, records = told_journal()
     death = Stepped(1070 * MS, (UnitDied("v"),), (Start("v"),))
     figures = of(begun, [*records, death, Counted(1070 * MS, {"died:v": 1}, {})])
     now = figures.now(1080 * MS)
@@ -219,21 +166,21 @@ def test_a_unit_that_dies_has_no_job_and_comes_back() -> None:
 
 
 def test_drops_by_edge_and_cause() -> None:
-    begun, records = hand_made()
+    begun, records = told_journal()
     dropped = {"a->b:stale": 2, "source->a:queue_full": 3}
     now = of(begun, [*records, Counted(1061 * MS, {}, dropped)]).now()
     assert now.frames.dropped == (DropCount("a->b", "stale", 2), DropCount("source->a", "queue_full", 3))
 
 
 def test_drops_of_the_step_that_ends_the_run_leave_no_queue_behind() -> None:
-    begun, records = hand_made()
+    begun, records = told_journal()
     finish = Stepped(1061 * MS, (), (Finish(Outcome(OutcomeKind.GAVE_UP, "u")),))
     now = of(begun, [*records, finish, Counted(1061 * MS, {}, {"a->b:stale": 2})]).now()
     assert (now.stages["b"].waiting, now.units["v"].stage) == (0, "")
 
 
 def test_the_end_is_told() -> None:
-    begun, records = hand_made()
+    begun, records = told_journal()
     now = of(begun, [*records, Ended(1090 * MS, {})]).now()
     assert (now.is_over, now.t_ms) == (True, 90)
 

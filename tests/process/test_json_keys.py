@@ -26,6 +26,9 @@ from numpy.typing import NDArray
 
 from trilane.apps.cli import main as cli
 from trilane.avatars.bundle import load_bundle, write_manifest
+from trilane.pipeline.journal import NAME as JOURNAL
+from trilane.pipeline.journal import Counted, JournalWriter
+from trilane.testing.told_journal import told_journal
 from trilane.testing.validated import validated
 
 FILE = Path(__file__).with_name("json_keys.toml")
@@ -96,6 +99,11 @@ def place(
     write_manifest(folder / "bundle", validated(load_bundle(drawable_bundle), size="64x64"))
     onnx.save(tiny_float, folder / "float.onnx")
     np.save(folder / "frames.npy", np.stack(tiny_frames * 3)[:16])
+    (folder / "told-run").mkdir()
+    with JournalWriter(folder / "told-run" / JOURNAL) as journal:
+        begun, records = told_journal()
+        for record in (begun, *records, Counted(0, {"died:v": 1}, {"a->b:stale": 1})):
+            journal.add(record)
     np.save(folder / "poses.npy", np.zeros((1, 165)))
     for name, text in DATA["inputs"].items():
         (folder / name).write_text(text.lstrip(), encoding="utf-8")

@@ -1,0 +1,150 @@
+"""`trilane top`: what it shows of a run that is over, goes on, was killed or has nothing to show, and how it ends."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from trilane.apps.cli import top as cli_top
+from trilane.apps.cli.top_view import screen
+from trilane.apps.followed_run import RunState
+from trilane.apps.live_figures import LiveFigures
+from trilane.apps.run_looks import Look
+from trilane.pipeline.journal import NAME, Counted, Ended, JournalWriter, Record, Stepped
+from trilane.scheduler.events import Start, UnitDied
+from trilane.testing.told_journal import told_journal
+
+Command = Callable[..., tuple[str, str]]
+Check = Callable[[str, str], None]
+MS = 1_000_000
+BEGUN, RECORDS = told_journal()
+#: Unit v dies in its second frame, and the run ends.
+END: tuple[Record, ...] = (
+    Stepped(1070 * MS, (UnitDied("v"),), (Start("v"),)),
+    Counted(1070 * MS, {"died:v": 1}, {"source->a:late": 2}),
+    Ended(1090 * MS, {}),
+)
+FIGURES = LiveFigures(BEGUN)
+for record in (*RECORDS, *END):
+    FIGURES.add(record)
+
+
+@pytest.fixture(autouse=True)
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def written(folder: str, *records: Record) -> None:
+    Path(folder).mkdir(parents=True)
+    with JournalWriter(Path(folder) / NAME) as journal:
+        for record in records:
+            journal.add(record)
+
+
+def test_a_finished_run_is_a_line_where_stdout_is_no_terminal(command: Command, check_printed: Check) -> None:
+    written("runs/walk", BEGUN, *RECORDS, *END)
+    check_printed("top-lines", command("top")[0])
+
+
+def test_the_screen(check_printed: Check) -> None:
+    console = Console(file=io.StringIO(), width=120)
+    console.print(screen(Look("walk", RunState.FINISHED, FIGURES.now())))
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert text.count("█") == round(20 * 40 / 90) + round(20 * 20 / 90)  # of 20, by the busy shares of u and v
+    check_printed("top-screen", text)
+
+
+def test_a_terminal_is_drawn_anew(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    written("runs/walk", BEGUN, *RECORDS, *END)
+    console = Console(file=io.StringIO(), force_terminal=True, width=120)
+    monkeypatch.setattr(cli_top, "stdout_console", lambda: console)
+    assert command("top", "walk")[0] == ""
+    assert "run walk: finished, over" in console.file.getvalue()  # type: ignore[attr-defined]
+
+
+def test_once_as_json_is_one_document(command: Command) -> None:
+    written("runs/walk", BEGUN, *RECORDS, *END)
+    document = json.loads(command("top", "runs/walk", "--once", "--json")[0])
+    assert (document.pop("run"), document.pop("state")) == ("walk", "finished")
+    assert document == json.loads(json.dumps(FIGURES.now().as_json()))
+
+
+def test_a_run_that_goes_on_is_looked_at_until_it_ends(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = Path(f"runs/walk.{os.getpid()}.partial")
+    folder.mkdir(parents=True)
+    slept: list[float] = []
+    with JournalWriter(folder / NAME) as journal:
+        journal.add(BEGUN)
+        journal.flush()
+        parts = iter((RECORDS, END))
+
+        def sleep(seconds: float) -> None:
+            slept.append(seconds)
+            for record in next(parts):
+                journal.add(record)
+            journal.flush()
+
+        monkeypatch.setattr(time, "sleep", sleep)
+        out, _ = command("top", "--json", "--interval", "0.5")
+    looks = [json.loads(line) for line in out.splitlines()]
+    assert [(look["state"], look["frames"]["presented"], look["is_over"]) for look in looks] == [
+        ("goes on", 0, False),
+        ("goes on", 1, False),
+        ("goes on", 1, True),
+    ]
+    assert slept == [0.5, 0.5]
+
+
+def test_a_run_that_was_killed_is_shown_as_it_was(command: Command) -> None:
+    written("runs/walk.999999999.partial", BEGUN, *RECORDS)
+    assert command("top", "walk")[0].startswith("run walk: killed")
+
+
+def test_openmetrics(command: Command) -> None:
+    pytest.importorskip("prometheus_client")
+    written("runs/walk", BEGUN, *RECORDS, *END)
+    out, _ = command("top", "walk", "--openmetrics")
+    assert 'trilane_frames_lost_total{cause="died:v"} 1.0\n' in out
+    assert out.endswith("# EOF\n")
+
+
+def test_openmetrics_without_its_library(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    written("runs/walk", BEGUN)
+    monkeypatch.setitem(__import__("sys").modules, "trilane.apps.openmetrics", None)
+    _, err = command("top", "walk", "--openmetrics", code=3)
+    assert "[dashboard]" in err
+
+
+def test_an_interrupt_ends_it_without_a_word(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    written(f"runs/walk.{os.getpid()}.partial", BEGUN)
+
+    def interrupt(_: float) -> Any:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(time, "sleep", interrupt)
+    out, err = command("top", "walk", code=130)
+    assert len(out.splitlines()) == 4  # three of the heading, and one look
+    assert "Traceback" not in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["walk", "--json", "--openmetrics"], "options: found --json and --openmetrics, expected one of them"),
+        (["empty"], "runs/empty: found a journal without a record, expected a run folder with a journal"),
+        (["wolk"], "wolk: found no such run"),
+        (["--interval", "0"], "--interval"),
+    ],
+)
+def test_what_cannot_be_shown_is_refused(command: Command, arguments: list[str], said: str) -> None:
+    written("runs/empty")
+    assert said in " ".join(command("top", *arguments, code=2)[1].split())
