@@ -57,6 +57,12 @@ def _may_be_repeated(option: TyperOption) -> bool:
     return option.multiple or option.count or (option.is_flag and not option.secondary_opts)
 
 
+def given(ctx: typer.Context) -> set[str]:
+    """The parameters that the command line gives."""
+    sources = {name: ctx.get_parameter_source(name) for name in ctx.params}
+    return {name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"}
+
+
 class Commands(typer.Typer):
     """A Typer application without markup and shell completion; its commands are `OnceCommand`s."""
 

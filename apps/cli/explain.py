@@ -1,4 +1,4 @@
-"""`trilane explain`: what is modelled of a scene, what is left out and why, as a database explains a query.
+"""`trilane explain`: what is modelled of a scene, as a database explains a query; where the time of a run went.
 
 Rule: this module reads options and shows results; everything is decided and computed elsewhere.
 """
@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from trilane.apps.cli.commands import Commands
+from trilane.apps.cli.commands import Commands, given
 from trilane.apps.cli.console import print_json, spinner, stderr_console, stdout_console
+from trilane.apps.cli.explain_run import MOST_SLOWEST, SLOWEST, explain_folder, is_run, refuse_options
 from trilane.apps.cli.options import (
     PROFILE_HELP,
     CameraOption,
@@ -22,7 +23,6 @@ from trilane.apps.cli.options import (
     MotionOption,
     OutputOption,
     PerformanceProfileOption,
-    SceneArgument,
     SceneAvatarOption,
     SceneSizeOption,
     SkinningOption,
@@ -41,6 +41,8 @@ Examples:
   trilane explain walk-past --output 1280x720 --fps 24
   trilane explain myscene.toml --picture plan.png
   trilane explain closeup --profile snapdragon-888 --json
+  trilane explain runs/20261122T070136Z-default --slowest 20
+  trilane explain /tmp/run --jobs jobs.csv
 """
 MOST_ROWS = 24
 READ_SO = (
@@ -54,11 +56,17 @@ ChipOption = Annotated[str, typer.Option("--profile", help=f"{PROFILE_HELP} Its 
 FramesOption = Annotated[int | None, typer.Option(min=1, help="How many frames to look at; the scene's if none.")]
 PictureOption = Annotated[Path | None, typer.Option(help=f"Draw bodies, {RECTANGLES}, here (.png).")]
 CapOption = Annotated[PerformanceProfile, PerformanceProfileOption]
+SceneOrRunArgument = Annotated[str, typer.Argument(help="A scene, by file (TOML) or name; or the folder of a run.")]
+SlowestOption = Annotated[
+    int, typer.Option(min=1, max=MOST_SLOWEST, help="Of a run: how many of the slowest frames are explained.")
+]
+JobsOption = Annotated[Path | None, typer.Option(help="Of a run: write every job here (.csv, .parquet).")]
 
 
 @app.command(epilog=EPILOG)
 def explain(
-    scene: SceneArgument = "default",
+    ctx: typer.Context,
+    scene: SceneOrRunArgument = "default",
     motion: MotionOption = None,
     camera: CameraOption = None,
     avatar: SceneAvatarOption = None,
@@ -71,9 +79,20 @@ def explain(
     profile: ChipOption = "host",
     performance_profile: CapOption = PerformanceProfile.SUSTAINED_HIGH_PERFORMANCE,
     picture: PictureOption = None,
+    slowest: SlowestOption = SLOWEST,
+    jobs: JobsOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Explain the plan of a scene: what is modelled, what is left out, the error it costs and the work it saves."""
+    """Explain the plan of a scene: what is modelled, what is left out, the error it costs and the work it saves.
+
+    With a run folder instead: which stage or wait bounded the frame time, why jobs waited, and why the slowest frames
+    were slow (docs/explain.md).
+    """
+    of_a_run = is_run(scene)
+    refuse_options(given(ctx), of_a_run=of_a_run)
+    if of_a_run:
+        explain_folder(Path(scene), slowest, jobs, json)
+        return
     from trilane.apps.explanation import explain as explained
     from trilane.apps.plan_picture import draw_plan
     from trilane.errors import BadInputError

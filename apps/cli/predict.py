@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from trilane.apps.cli.beside import BesideOption, Joined, OnChip, SceneToPredict, TurnsOption, predict_pipelines
-from trilane.apps.cli.commands import Commands
+from trilane.apps.cli.commands import Commands, given
 from trilane.apps.cli.console import stderr_console
 from trilane.apps.cli.options import (
     ChannelsOption,
@@ -169,12 +169,12 @@ def predict(
     bare = bool(networks) and not application
     _refuse_ignored(ctx, bare=bare)
     _check_application(application, len(networks))
-    if (profile == HOST or bare) and "performance_profile" not in _typed(ctx):
+    if (profile == HOST or bare) and "performance_profile" not in given(ctx):
         performance_profile = PerformanceProfile.BURST
     _check_governor(governor)
     if scene is not None or beside:
         chip_at = OnChip(profile, performance_profile, minutes, governor)
-        predict_pipelines(scene, beside or [], _typed(ctx), chip_at, Joined(policy, edge, turns), json)
+        predict_pipelines(scene, beside or [], given(ctx), chip_at, Joined(policy, edge, turns), json)
         return
     wanted, shapes = _wanted(fps, power_limit_w), _shapes(input_shape or [], len(networks))
     chip, variant = load_runnable(profile), _variant(policy, edge, batch, fps)
@@ -197,7 +197,7 @@ def predict(
 
 def _refuse_ignored(ctx: typer.Context, *, bare: bool) -> None:
     """Raises BadInputError for options that another one leaves without effect. `bare`: a network by itself is asked."""
-    typed = _typed(ctx)
+    typed = given(ctx)
     for option, others in IGNORED.items():
         if option in typed and (useless := typed & others):
             names = ", ".join(sorted(f"--{name.replace('_', '-')}" for name in useless))
@@ -256,12 +256,6 @@ def _engine_runtime(text: str | None) -> EngineRuntime | None:
     if text is not None and found is None:
         raise BadInputError("--engine-runtime", repr(text), " or ".join(ENGINE_RUNTIMES))
     return found
-
-
-def _typed(ctx: typer.Context) -> set[str]:
-    """The parameters that the command line gives."""
-    sources = {name: ctx.get_parameter_source(name) for name in ctx.params}
-    return {name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"}
 
 
 def _check_governor(governor: str | None) -> None:

@@ -11,17 +11,19 @@ any other waited for one of the ends that the scheduler heard of in the step in 
 from __future__ import annotations
 
 from collections import OrderedDict, deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Reversible
 from typing import Final, NamedTuple
 
 from trilane.apps.explained.waits import (
     DOWN,
     HELD,
     KEPT,
+    LOST,
     OVERHEAD,
     PREEMPTED,
     THROTTLED,
     UNKNOWN,
+    Down,
     ExplainedJob,
     Key,
 )
@@ -36,20 +38,22 @@ WHATS = {
     ASLEEP: "the stage slept in its job, and no device of its own worked for it",
     OVERHEAD: "messages and hand-over before the stage's job",
     THROTTLED: "the unit's cap held the stage's job",
-    DOWN: "the unit's process was down",
+    LOST: "the unit was at a job that was lost with its process",
+    DOWN: "a unit's process was down",
     HELD: "the policy, or the order of frames, held the stage's job",
     RELEASE: "no frame was released yet: the rate from outside",
     UNKNOWN: "before what is known",
 }
 #: Of a gap between two jobs, in the order in which it is divided; the rest is overhead.
-OF_GAPS = (DOWN, THROTTLED, HELD, PREEMPTED)
+OF_GAPS = (LOST, DOWN, THROTTLED, HELD, PREEMPTED)
 MARGIN: Final = 32  # presented frames after which paths that end with different frames have met
 
 
 class Piece(NamedTuple):
-    """A part of a path. `job`: whose it is, or before which it lies."""
+    """A part of a path. `job`: whose it is, or before which it lies. `stage`: its, or one of a unit that was down."""
 
     what: str
+    stage: str
     job: JobRecord
     begin_ns: int
     end_ns: int
@@ -58,18 +62,19 @@ class Piece(NamedTuple):
 class Paths:
     """Keeps the last jobs of a run, and walks back through them.
 
-    `graph`, `settings`: of the run. `kept`: jobs.
+    `graph`, `settings`: of the run. `downs`: of its units so far, as `Waits` notes them. `kept`: jobs.
     """
 
-    def __init__(self, graph: Graph, settings: Settings, kept: int = KEPT) -> None:
+    def __init__(self, graph: Graph, settings: Settings, downs: Reversible[Down] = (), kept: int = KEPT) -> None:
         names = [stage.name for stage in graph.stages]
         self._first, self._last = names[0], names[-1]
-        self._next = {name: names[place + 1 : place + 2] + [self._last] for place, name in enumerate(names)}
+        self._next = {name: [*names[place + 1 : place + 2], self._last] for place, name in enumerate(names)}
         if graph.bypass is not None:
             self._next[graph.bypass[0]].append(graph.bypass[1])
         self._paced = bool(settings.period_ns or settings.arrivals_ns or settings.asked)
         self._latches = settings.latch_ns > 0
-        self._kept = kept
+        self._stage_of = {stage.unit: stage.name for stage in reversed(graph.stages)}
+        self._downs, self._kept = downs, kept
         self._jobs: OrderedDict[Key, ExplainedJob] = OrderedDict()
         self._before: dict[Key, Key] = {}  # the job that the same unit did before
         self._last_of_unit: dict[str, Key] = {}
@@ -113,7 +118,7 @@ class Paths:
         end_ns = last.job.end_ns
         while now is not None and end_ns > until_ns:
             job = now.job
-            yield Piece(WORK, job, max(job.begin_ns, until_ns), end_ns)
+            yield Piece(WORK, job.stage, job, max(job.begin_ns, until_ns), end_ns)
             before, released = self._bound_by(now)
             from_ns = until_ns if before is None else max(min(before.job.end_ns, job.begin_ns), until_ns)
             for piece in self._gap(now, from_ns, released, before is None):
@@ -126,12 +131,25 @@ class Paths:
         if released:
             ready_ns = min(max(job.ready_ns, from_ns), job.begin_ns)
             yield from _divided(now, ready_ns, OVERHEAD)
-            yield Piece(RELEASE, job, from_ns, ready_ns)
+            yield from self._unreleased(job, from_ns, ready_ns)
         elif is_first:
-            yield Piece(UNKNOWN, job, from_ns, job.begin_ns)
+            yield Piece(UNKNOWN, job.stage, job, from_ns, job.begin_ns)
         else:
             is_latched = self._latches and job.stage == self._first and not now.after
             yield from _divided(now, from_ns, HELD if is_latched else OVERHEAD)
+
+    def _unreleased(self, job: JobRecord, from_ns: int, end_ns: int) -> Iterator[Piece]:
+        """The time before a frame was released; a unit that was down then is why no frame before it got through."""
+        for down in reversed(self._downs):
+            if end_ns <= from_ns or down.end_ns <= from_ns:
+                break
+            begin_ns = max(down.begin_ns, from_ns)
+            if begin_ns < end_ns:
+                until_ns = min(down.end_ns, end_ns)
+                yield Piece(RELEASE, job.stage, job, until_ns, end_ns)
+                yield Piece(DOWN, self._stage_of[down.unit], job, begin_ns, until_ns)
+                end_ns = begin_ns
+        yield Piece(RELEASE, job.stage, job, from_ns, end_ns)
 
     def _bound_by(self, now: ExplainedJob) -> tuple[ExplainedJob | None, bool]:
         """The job whose end let `now` begin, and whether `now` had to wait for its release after that."""
@@ -168,7 +186,7 @@ def _divided(now: ExplainedJob, from_ns: int, rest: str) -> Iterator[Piece]:
         taken.append((cause, ns))
     for cause, ns in [(rest, left_ns), *taken]:
         if ns > 0:
-            yield Piece(cause, now.job, end_ns - ns, end_ns)
+            yield Piece(cause, now.job.stage, now.job, end_ns - ns, end_ns)
             end_ns -= ns
 
 
@@ -191,7 +209,7 @@ def parts(piece: Piece, begin_ns: int, end_ns: int) -> dict[Part, int]:
         return {}
     job = piece.job
     if piece.what != WORK:
-        return {(piece.what, job.stage): ns}
+        return {(piece.what, piece.stage): ns}
     length_ns = job.end_ns - job.begin_ns
     preempted_ns = ns * min(job.preempted_ns, length_ns) // length_ns
     asleep_ns = ns * min(job.asleep_ns, length_ns - min(job.preempted_ns, length_ns)) // length_ns

@@ -1,26 +1,27 @@
 """Why jobs that were ready did not begin: each wait cut into causes, from the records of a journal.
 
 Rule: every ns from a job's `ready_ns` to its `begin_ns` has one cause, the first of these that holds: the unit did
-another job; its process was down; the scheduler had not heard yet that the input was there (overhead); the unit's cap
-held it; no output slot was free, or enough frames were in flight; the policy or the order of frames held it; and, from
-the moment in which the job was handed over, the unit had no core, or the job was on its way (overhead). What is kept is
-bounded: a wait that reaches further back than `KEPT` jobs or changes of its unit is `unknown` there.
+another job; it was at one that was lost with its process, or that was down; the scheduler had not heard yet that the
+input was there (overhead); the unit's cap held it; no output slot was free, or enough frames were in flight; the policy
+or the order of frames held it; and, from the moment in which the job was handed over, the unit had no core, or the job
+was on its way (overhead). What is kept is bounded: a wait that reaches further back than `KEPT` jobs or changes of its
+unit is `unknown` there.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Mapping
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from trilane.pipeline.journal import Accounted, Record, Stepped, Worked
 from trilane.scheduler.accounts import NAMES
 from trilane.scheduler.events import Dispatch, Graph, Job, JobDone, JobFailed, Kill, UnitDied, UnitReady
 from trilane.scheduler.ledger import ASSIGNED, STARVED, JobRecord
 
-BUSY, DOWN, THROTTLED, BLOCKED = "busy", "down", "throttled", "blocked"
+BUSY, LOST, DOWN, THROTTLED, BLOCKED = "busy", "lost", "down", "throttled", "blocked"
 HELD, PREEMPTED, OVERHEAD, UNKNOWN = "held", "preempted", "overhead", "unknown"
-CAUSES = (BUSY, DOWN, THROTTLED, BLOCKED, HELD, PREEMPTED, OVERHEAD, UNKNOWN)
+CAUSES = (BUSY, LOST, DOWN, THROTTLED, BLOCKED, HELD, PREEMPTED, OVERHEAD, UNKNOWN)
 #: What the account of a unit without this job means for the job, once the scheduler has heard of its input.
 MEANING = {**NAMES, ASSIGNED: OVERHEAD, STARVED: HELD}
 KEPT: Final = 4096
@@ -59,10 +60,19 @@ class ExplainedJob(NamedTuple):
         return max(self.waits_ns, key=self.waits_ns.__getitem__, default="")
 
 
+class Down(NamedTuple):
+    """A unit's process was down; it was up again at `end_ns`."""
+
+    unit: str
+    begin_ns: int
+    end_ns: int
+
+
 class _Handed(NamedTuple):
     """A job that its unit has. `heard_ns`: when the scheduler heard of its input; `after`: as of an ExplainedJob."""
 
     job: Job
+    dispatch_ns: int
     heard_ns: int
     after: tuple[Key, ...]
 
@@ -75,11 +85,24 @@ class _Unit:
         self.changes: deque[tuple[int, str]] = deque(maxlen=kept)
         self.account = STARVED
         self.is_up = False
+        self.down_ns: int | None = None  # since when, after it was up
 
     def note(self, now_ns: int) -> None:
         cause = MEANING[self.account] if self.is_up else DOWN
         if not self.changes or self.changes[-1][1] != cause:
             self.changes.append((now_ns, cause))
+
+    def fall(self, now_ns: int, handed_ns: int | None) -> None:
+        """Its process is gone, and with it what it did since its last job, if it was handed one, at `handed_ns`."""
+        if handed_ns is not None and self.is_up:
+            since_ns = max(handed_ns, self.jobs[-1].end_ns if self.jobs else 0)
+            while self.changes and self.changes[-1][0] >= since_ns:
+                self.changes.pop()
+            self.changes.append((since_ns, LOST))
+        if self.is_up:
+            self.down_ns = now_ns
+        self.is_up = False
+        self.note(now_ns)
 
     @property
     def known_from_ns(self) -> int:
@@ -109,10 +132,12 @@ class Waits:
     """Takes the records of a journal in order; `add` gives back the job that a record ends, with its wait explained.
 
     `graph`: of the run. `kept`: jobs and changes of each unit that are remembered.
+    `downs`: the last times in which a unit was down after its start, in the order of their ends.
     """
 
     def __init__(self, graph: Graph, kept: int = KEPT) -> None:
         self._kept = kept
+        self.downs: deque[Down] = deque(maxlen=kept)
         self._units = {unit: _Unit(kept) for unit in graph.units}
         self._handed: dict[int, _Handed] = {}
         self._ended: dict[Key, tuple[_Handed, JobDone]] = {}
@@ -144,10 +169,9 @@ class Waits:
         for action in actions:
             if isinstance(action, Dispatch):
                 heard_ns = self._heard_ns.get(action.job.frame, 0)
-                self._handed[action.job.id] = _Handed(action.job, heard_ns, tuple(after))
+                self._handed[action.job.id] = _Handed(action.job, now_ns, heard_ns, tuple(after))
             elif isinstance(action, Kill):
-                self._units[action.unit].is_up = False
-                self._units[action.unit].note(now_ns)
+                self._fall(action.unit, now_ns)
 
     def _end(self, event: JobDone, now_ns: int) -> list[Key]:
         handed = self._handed.pop(event.job, None)
@@ -156,21 +180,22 @@ class Waits:
         key = handed.job.stage, handed.job.frame
         self._ended[key] = handed, event
         self._heard_ns[handed.job.frame] = now_ns
-        for kept in (self._ended, self._heard_ns):  # of frames that were lost or dropped nobody says which
-            if len(kept) > self._kept:
-                del kept[next(iter(kept))]  # type: ignore[attr-defined]
+        _limit(self._ended, self._kept)  # of frames that were lost or dropped nobody says which
+        _limit(self._heard_ns, self._kept)
         return [key]
 
     def _rise(self, name: str, now_ns: int) -> None:
         unit = self._units[name]
-        unit.is_up = True
+        if unit.down_ns is not None:
+            self.downs.append(Down(name, unit.down_ns, now_ns))
+        unit.is_up, unit.down_ns = True, None
         unit.note(now_ns)
 
     def _fall(self, name: str, now_ns: int) -> None:
-        unit = self._units[name]
-        unit.is_up = False
-        unit.note(now_ns)
-        self._handed = {number: handed for number, handed in self._handed.items() if handed.job.unit != name}
+        own = [handed for handed in self._handed.values() if handed.job.unit == name]
+        self._units[name].fall(now_ns, min((handed.dispatch_ns for handed in own), default=None))
+        for handed in own:
+            del self._handed[handed.job.id]
 
     def _explain(self, worked: Worked) -> ExplainedJob:
         job = worked.job
@@ -184,6 +209,12 @@ class Waits:
         after, rung = (handed.after, handed.job.rung) if handed is not None else ((), 0)
         sampled_ns, skips = (done.t_sampled_ns, done.skips) if done is not None else (0, False)
         return ExplainedJob(job, worked.figures, waits_ns, behind, after, sampled_ns, rung, skips)
+
+
+def _limit(kept: dict[Any, Any], most: int) -> None:
+    """Forget the oldest entry of a dict that has more than `most`."""
+    if len(kept) > most:
+        del kept[next(iter(kept))]
 
 
 def _waits(unit: _Unit, job: JobRecord, heard_ns: int, others: list[JobRecord]) -> dict[str, int]:
@@ -213,7 +244,7 @@ def _add_not_handed(found: dict[str, int], unit: _Unit, begin_ns: int, end_ns: i
         return
     explained_ns = 0
     for cause, since_ns, until_ns in unit.causes(begin_ns, end_ns):
-        unheard_ns = 0 if cause == DOWN else max(min(until_ns, heard_ns) - since_ns, 0)
+        unheard_ns = 0 if cause in (LOST, DOWN) else max(min(until_ns, heard_ns) - since_ns, 0)
         found[OVERHEAD] += unheard_ns
         found[cause] += until_ns - since_ns - unheard_ns
         explained_ns += until_ns - since_ns

@@ -1,0 +1,197 @@
+"""`trilane explain RUN`: where the time of a run went, as a document; the figures come from its journal and its report.
+
+Rule: everything is computed from the journal in one reading, in memory that does not grow with the run; the report adds
+what a journal does not know: the units' cores and the avatars' error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from trilane.apps.explained.advice import advice
+from trilane.apps.explained.path import WHATS, Budget, Part, Paths
+from trilane.apps.explained.sharing import Sharing, Taken
+from trilane.apps.explained.slow_frames import MOST_SAMPLES, Shown, SlowFrames, Usual, notes, reasons
+from trilane.apps.explained.waits import ExplainedJob, Waits
+from trilane.apps.report import Report, read_report
+from trilane.errors import BadInputError
+from trilane.figure_sources import COMPUTED, MEASURED
+from trilane.pipeline.journal import NAME, Begun, Record, read_journal
+from trilane.scheduler.stats import NS_PER_MS
+
+SCHEMA = 1
+HOST = "host"
+
+
+def explained_jobs(begun: Begun, records: Iterable[Record]) -> Iterator[ExplainedJob]:
+    """Every job of a journal with its wait explained. `records`: those that follow `begun`."""
+    waits = Waits(begun.graph)
+    for record in records:
+        if explained := waits.add(record):
+            yield explained
+
+
+def open_journal(folder: Path) -> tuple[Begun, Iterator[Record]]:
+    """The first record of the journal of a run folder, and those that follow it.
+
+    Raises BadInputError for a folder without one, and, also while it is read, for a file that is none.
+    """
+    path = folder / NAME
+    if not path.is_file():
+        raise BadInputError(
+            folder, f"no {NAME}", "the folder of a run", "a run of an older Trilane has none: run again"
+        )
+    records = read_journal(path)
+    begun = next(records)
+    assert isinstance(begun, Begun)  # the reader sees to it
+    return begun, records
+
+
+class Explanation:
+    """Takes the records of a journal after the first; `document` is what follows from them.
+
+    `begun`: the journal's first record. `report`: of the run, None where there is none. `slowest`: frames to name.
+    """
+
+    def __init__(self, begun: Begun, report: Report | None, slowest: int) -> None:
+        units = report.units if report is not None else {}
+        cores = {unit: shares.cores for unit, shares in units.items() if shares.cores}
+        self._begun, self._report, self._cores = begun, report, cores
+        self._explainer = Waits(begun.graph)
+        self._paths = Paths(begun.graph, begun.settings, self._explainer.downs)
+        self._sharing = Sharing(cores)
+        self._slow = SlowFrames(begun.graph, self._paths, self._sharing, slowest)
+        self._budget = Budget(self._paths)
+        self._waits: dict[str, dict[str, int]] = {stage.name: {} for stage in begun.graph.stages}
+        self._jobs = dict.fromkeys(self._waits, 0)
+        self._frames, self._first_ns, self._last_ns = 0, 0, 0
+
+    def add(self, record: Record) -> None:
+        """The next record."""
+        if explained := self._explainer.add(record):
+            self._count(explained)
+
+    def _count(self, explained: ExplainedJob) -> None:
+        job = explained.job
+        self._paths.add(explained)
+        self._sharing.add(job)
+        self._slow.add(explained)
+        self._jobs[job.stage] += 1
+        sums = self._waits[job.stage]
+        for cause, ns in explained.waits_ns.items():
+            sums[cause] = sums.get(cause, 0) + ns
+        if self._paths.is_presented(explained):
+            self._budget.present(explained)
+            self._frames += 1
+            self._first_ns, self._last_ns = self._first_ns or job.end_ns, job.end_ns
+
+    def document(self) -> dict[str, Any]:
+        """After the last job: the keys of `trilane explain RUN --json`."""
+        budget, taken = self._budget.close(), self._sharing.close()
+        slowest, usual = self._slow.close()
+        unit_of = {stage.name: stage.unit for stage in self._begun.graph.stages}
+        intervals = max(self._frames - 1, 1)
+        clock = str(self._begun.facts.get("clock", HOST))
+        rows = _budget_rows(budget, unit_of, intervals)
+        shared = [self._shared(stage, row) for stage, row in taken.items() if row.preempted_ns]
+        return {
+            "schema": SCHEMA,
+            "clock": clock,
+            **self._of_report(),
+            "frames": self._frames,
+            "frame_ms": (self._last_ns - self._first_ns) / intervals / NS_PER_MS if self._frames > 1 else None,
+            "budget": rows,
+            "shared_cores": shared,
+            "waits": [_wait_row(name, unit_of[name], self._jobs[name], self._waits[name]) for name in self._waits],
+            "usual": {
+                "frame_ms": usual.frame_ns / NS_PER_MS,
+                "service_ms": {name: ns / NS_PER_MS for name, ns in usual.service_ns.items()},
+            },
+            "slowest": [_slow_row(shown, usual) for shown in slowest],
+            "advice": advice(rows, shared, self._begun.settings.policy),
+            "sources": {
+                "frames, waits_ms, service_ms, preempted_ms": MEASURED if clock == HOST else COMPUTED,
+                "budget": "the same times along the path that ends with the last frame",
+                "taken_ms": "computed: whose jobs ran then on the same cores",
+                "usual": f"medians of all frames, of at most {MOST_SAMPLES} evenly spaced ones in a long run",
+            },
+        }
+
+    def _of_report(self) -> dict[str, Any]:
+        report = self._report
+        return {
+            "scene": report.config["scene"]["name"] if report is not None else None,
+            "policy": self._begun.settings.policy,
+            "edges": list(self._begun.graph.edges),
+            "accuracy": report.accuracy if report is not None else {},
+            "interrupted": report.interrupted if report is not None else None,
+            "failure": report.failure if report is not None else None,
+        }
+
+    def _shared(self, stage: str, taken: Taken) -> dict[str, Any]:
+        per_job = taken.jobs * NS_PER_MS
+        cores = self._cores.get(taken.unit, ())
+        return {
+            "stage": stage,
+            "unit": taken.unit,
+            "cores": list(cores),
+            "service_ms": taken.service_ns / per_job,
+            "preempted_ms": taken.preempted_ns / per_job,
+            "taken_ms": {unit: ns / per_job for unit, ns in taken.of.items()},
+            "shared": {unit: sorted(set(cores) & set(self._cores[unit])) for unit in taken.of},
+            "others_ms": taken.other_ns / per_job,
+        }
+
+
+def explain_run(folder: Path, slowest: int = 10) -> dict[str, Any]:
+    """Where the time of the run in `folder` went, as plain data. `slowest`: how many frames are named.
+
+    Raises BadInputError for a folder that is none, or whose journal or report cannot be read.
+    """
+    report = read_report(folder) if (folder / "report.json").exists() else None  # there is none while a run goes on
+    begun, records = open_journal(folder)
+    explanation = Explanation(begun, report, slowest)
+    for record in records:
+        explanation.add(record)
+    return {"run": str(folder), **explanation.document()}
+
+
+def _budget_rows(budget: Mapping[Part, int], unit_of: Mapping[str, str], intervals: int) -> list[dict[str, Any]]:
+    total_ns = max(sum(budget.values()), 1)
+    return [
+        {
+            "stage": stage,
+            "unit": unit_of[stage],
+            "what": what,
+            "why": WHATS[what],
+            "ms": ns / intervals / NS_PER_MS,
+            "share": ns / total_ns,
+        }
+        for (what, stage), ns in sorted(budget.items(), key=lambda row: -row[1])
+    ]
+
+
+def _wait_row(stage: str, unit: str, jobs: int, waits_ns: Mapping[str, int]) -> dict[str, Any]:
+    per_job = max(jobs, 1) * NS_PER_MS
+    causes = sorted(waits_ns.items(), key=lambda row: -row[1])
+    return {
+        "stage": stage,
+        "unit": unit,
+        "jobs": jobs,
+        "wait_ms": sum(waits_ns.values()) / per_job,
+        "causes_ms": {cause: ns / per_job for cause, ns in causes},
+    }
+
+
+def _slow_row(shown: Shown, usual: Usual) -> dict[str, Any]:
+    return {
+        "frame": shown.frame,
+        "presented_ns": shown.presented_ns,
+        "frame_ms": shown.frame_ns / NS_PER_MS,
+        "longer_ms": (shown.frame_ns - usual.frame_ns) / NS_PER_MS,
+        "latency_ms": None if shown.latency_ns is None else shown.latency_ns / NS_PER_MS,
+        "why": [reason._asdict() for reason in reasons(shown, usual)],
+        "notes": notes(shown),
+    }

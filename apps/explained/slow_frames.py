@@ -1,0 +1,274 @@
+"""The slowest frames of a run, and why each was slow.
+
+Rule: a frame's time, from the presented frame before it to its own, is the path that ends with it, cut at both. What is
+usual is the median of each part over the run's frames; a frame was slow for the parts that were longer.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from heapq import heappush, heappushpop
+from statistics import median
+from typing import Final, Generic, NamedTuple, TypeVar
+
+from trilane.apps.explained.path import (
+    ASLEEP,
+    RELEASE,
+    WORK,
+    Part,
+    Paths,
+    parts,
+)
+from trilane.apps.explained.sharing import Sharing
+from trilane.apps.explained.waits import DOWN, HELD, LOST, OVERHEAD, PREEMPTED, THROTTLED, ExplainedJob
+from trilane.scheduler.events import Graph
+from trilane.scheduler.ledger import JobRecord
+from trilane.scheduler.stats import NS_PER_MS
+
+DELAY: Final = 16  # presented frames; of the jobs beside a frame's all have ended by then
+MOST_SAMPLES: Final = 4096
+LEAST_LONGER: Final = 0.05  # of the median; what took hardly longer than usual has no reason
+LEAST_SHARE: Final = 0.1  # of what a frame took longer than usual, for a reason to be named
+MOST_REASONS: Final = 3
+
+T = TypeVar("T")
+
+
+class Shown(NamedTuple):
+    """A presented frame.
+
+    `frame`, `presented_ns`: which, and when. `before`: the frame that was presented before it.
+    `frame_ns`: since then. `latency_ns`: from its sampled pose to the end of the stage that the pipeline names, None
+    where that is not kept.
+    `parts_ns`: of its frame time. `longest`: of each part, the job that most of it belongs to.
+    `taken_ns`: of each of these jobs that had no core for a while, by unit whose jobs had it.
+    `rung`, `skips`: of its work, and whether it took the bypass; `rung_before`, `skipped_before`: of the frame before.
+    """
+
+    frame: int
+    presented_ns: int
+    before: int
+    frame_ns: int
+    latency_ns: int | None
+    parts_ns: Mapping[Part, int]
+    longest: Mapping[Part, JobRecord]
+    taken_ns: Mapping[Part, Mapping[str, int]]
+    rung: int
+    rung_before: int
+    skips: bool
+    skipped_before: bool
+
+
+class Usual(NamedTuple):
+    """Medians over a run: of the frame time, of its parts, and of each stage's service time, ns; each stage's unit."""
+
+    frame_ns: float
+    parts_ns: Mapping[Part, float]
+    service_ns: Mapping[str, float]
+    unit_of: Mapping[str, str]
+
+
+class Reason(NamedTuple):
+    """Why a frame was slow. `longer_ms`: than usual, for this reason. `stage`, `text`: where, and in words."""
+
+    cause: str
+    stage: str
+    longer_ms: float
+    text: str
+
+
+class Sample(Generic[T]):
+    """At most MOST_SAMPLES of the values that were added, evenly spaced over them: all of the first so many."""
+
+    def __init__(self) -> None:
+        self.values: list[T] = []
+        self._stride = 1
+        self._count = 0
+
+    def add(self, value: T) -> None:
+        if self._count % self._stride == 0:
+            if len(self.values) == MOST_SAMPLES:
+                del self.values[1::2]
+                self._stride *= 2
+            if self._count % self._stride == 0:
+                self.values.append(value)
+        self._count += 1
+
+
+class SlowFrames:
+    """Takes the jobs of a run in order, after `paths` and `sharing` have taken them.
+
+    `most`: how many of the slowest frames are kept.
+    """
+
+    def __init__(self, graph: Graph, paths: Paths, sharing: Sharing, most: int) -> None:
+        self._paths, self._sharing, self._most = paths, sharing, most
+        self._first, self._latency_to = graph.stages[0].name, graph.latency_to
+        self._unit_of = {stage.name: stage.unit for stage in graph.stages}
+        self._said_by = graph.bypass[0] if graph.bypass is not None else ""
+        self._waiting: deque[ExplainedJob] = deque()
+        self._before: ExplainedJob | None = None
+        self._slowest: list[tuple[int, int, Shown]] = []
+        self._frames: Sample[tuple[int, Mapping[Part, int]]] = Sample()
+        self._services: dict[str, Sample[int]] = {stage.name: Sample() for stage in graph.stages}
+        self._facts: deque[tuple[int, int, bool]] = deque(maxlen=2)
+
+    def add(self, explained: ExplainedJob) -> None:
+        """The next job that has ended."""
+        job = explained.job
+        self._services[job.stage].add(job.end_ns - job.begin_ns)
+        if self._paths.is_presented(explained):
+            self._waiting.append(explained)
+        if len(self._waiting) > DELAY:
+            self._look(self._waiting.popleft())
+
+    def close(self) -> tuple[list[Shown], Usual]:
+        """After the last job: the slowest frames, the slowest first, and what is usual."""
+        while self._waiting:
+            self._look(self._waiting.popleft())
+        slowest = [shown for _, _, shown in sorted(self._slowest, reverse=True)]
+        return slowest, self._usual()
+
+    def _usual(self) -> Usual:
+        frames = self._frames.values
+        kinds = {part for _, parts_ns in frames for part in parts_ns}
+        return Usual(
+            _median([frame_ns for frame_ns, _ in frames]),
+            {part: _median([parts_ns.get(part, 0) for _, parts_ns in frames]) for part in kinds},
+            {stage: _median(sample.values) for stage, sample in self._services.items()},
+            self._unit_of,
+        )
+
+    def _look(self, shown: ExplainedJob) -> None:
+        frame = shown.job.frame
+        self._facts.append((frame, self._rung(frame), self._skips(frame)))
+        before, self._before = self._before, shown
+        if before is None:
+            return
+        begin_ns, end_ns = before.job.end_ns, shown.job.end_ns
+        sums: dict[Part, int] = {}
+        longest: dict[Part, tuple[int, JobRecord]] = {}
+        for piece in self._paths.walk(shown, begin_ns):
+            for part, ns in parts(piece, begin_ns, end_ns).items():
+                sums[part] = sums.get(part, 0) + ns
+                if ns > longest.get(part, (0, piece.job))[0]:
+                    longest[part] = (ns, piece.job)
+        self._frames.add((end_ns - begin_ns, sums))
+        if len(self._slowest) == self._most and self._slowest[0][0] >= end_ns - begin_ns:
+            return
+        jobs = {part: job for part, (_, job) in longest.items()}
+        self._keep(self._shown(shown, begin_ns, sums, jobs))
+
+    def _shown(
+        self, shown: ExplainedJob, begin_ns: int, sums: Mapping[Part, int], jobs: Mapping[Part, JobRecord]
+    ) -> Shown:
+        (before, rung_before, skipped_before), (frame, rung, skips) = self._facts
+        taken = {part: self._sharing.taken(job) for part, job in jobs.items() if part[0] == PREEMPTED}
+        return Shown(
+            frame,
+            shown.job.end_ns,
+            before,
+            shown.job.end_ns - begin_ns,
+            self._latency_ns(frame),
+            sums,
+            jobs,
+            taken,
+            rung,
+            rung_before,
+            skips,
+            skipped_before,
+        )
+
+    def _keep(self, shown: Shown) -> None:
+        entry = (shown.frame_ns, -shown.frame, shown)
+        if len(self._slowest) < self._most:
+            heappush(self._slowest, entry)
+        else:
+            heappushpop(self._slowest, entry)
+
+    def _latency_ns(self, frame: int) -> int | None:
+        first, last = self._paths.job((self._first, frame)), self._paths.job((self._latency_to, frame))
+        return None if first is None or last is None else last.job.end_ns - first.sampled_ns
+
+    def _rung(self, frame: int) -> int:
+        first = self._paths.job((self._first, frame))
+        return first.rung if first is not None else 0
+
+    def _skips(self, frame: int) -> bool:
+        said = self._paths.job((self._said_by, frame))
+        return said is not None and said.skips
+
+
+def _median(values: Sequence[int]) -> float:
+    return float(median(values)) if values else 0.0
+
+
+def reasons(shown: Shown, usual: Usual) -> list[Reason]:
+    """Why a frame took longer than the median, the most important first; empty for one that hardly did."""
+    longer_ns = shown.frame_ns - usual.frame_ns
+    found = [
+        (ns - usual.parts_ns.get(part, 0.0), part)
+        for part, ns in shown.parts_ns.items()
+        if ns - usual.parts_ns.get(part, 0.0) > max(LEAST_SHARE * longer_ns, 0)
+    ]
+    if longer_ns <= LEAST_LONGER * usual.frame_ns:
+        return []
+    return [
+        Reason(part[0], part[1], ns / NS_PER_MS, _text(shown, usual, part, ns))
+        for ns, part in sorted(found, reverse=True)[:MOST_REASONS]
+    ]
+
+
+def notes(shown: Shown) -> list[str]:
+    """What else was unlike the frame before."""
+    said = []
+    missing = shown.frame - shown.before - 1
+    if missing > 0:
+        which = f"frame {shown.before + 1}" if missing == 1 else f"frames {shown.before + 1} to {shown.frame - 1}"
+        said.append(f"{which} before it {'was' if missing == 1 else 'were'} dropped or lost")
+    if shown.rung != shown.rung_before:
+        said.append(f"its work changed from rung {shown.rung_before} to {shown.rung}")
+    if shown.skips != shown.skipped_before:
+        said.append("it took the bypass" if shown.skips else "the frame before took the bypass, it did not")
+    return said
+
+
+def _text(shown: Shown, usual: Usual, part: Part, longer_ns: float) -> str:
+    what, stage = part
+    job, unit = shown.longest[part], usual.unit_of[stage]
+    whose = "" if job.frame == shown.frame else f" of frame {job.frame}"
+    if what == WORK:
+        return _work(shown, usual, job, longer_ns)
+    if what == PREEMPTED:
+        return f"{stage}{whose}: {unit} had no core{_whose_core(shown, part)}"
+    words = {
+        ASLEEP: f"{stage}{whose} slept in its job",
+        OVERHEAD: f"{stage}{whose} was handed over late",
+        THROTTLED: f"the cap of {unit} held {stage}{whose}",
+        LOST: f"a job of {unit} was lost with its process",
+        DOWN: f"{unit} was restarted",
+        HELD: f"the policy or the order of frames held {stage}{whose}",
+        RELEASE: "its input was late: no frame was released yet",
+    }
+    return words.get(what, "before what is known")
+
+
+def _work(shown: Shown, usual: Usual, job: JobRecord, longer_ns: float) -> str:
+    """Of a stage that had a larger part: its job was long, or more of it lay between the two frames."""
+    service_ns, usual_ns = job.end_ns - job.begin_ns, usual.service_ns.get(job.stage, 0.0)
+    times = f"{service_ns / NS_PER_MS:.1f} ms, median {usual_ns / NS_PER_MS:.1f}"
+    whose = "" if job.frame == shown.frame else f" of frame {job.frame}"
+    if service_ns - usual_ns >= longer_ns / 2:
+        return f"{job.stage}{whose} was slow: {times}"
+    if whose:
+        return f"it waited for {job.stage}{whose} ({times})"
+    return f"less of its {job.stage} overlapped with the frame before ({times})"
+
+
+def _whose_core(shown: Shown, part: Part) -> str:
+    """Which units of the run had the core."""
+    taken = {unit: ns for unit, ns in shown.taken_ns.get(part, {}).items() if ns}
+    if not taken:
+        return ": no job of this run had it"
+    return ": " + ", ".join(f"jobs of {unit} had it for {ns / NS_PER_MS:.1f} ms" for unit, ns in taken.items())
