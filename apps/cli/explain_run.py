@@ -116,7 +116,7 @@ def _budget(document: Mapping[str, Any]) -> Table:
             table.add_row(f"{row['stage']} ({row['unit']})", row["why"], f"{row['ms']:.2f}", f"{row['share']:.1%}")
     if small:
         ms, share = (sum(row[key] for row in small) for key in ("ms", "share"))
-        table.add_row("", f"{len(small)} smaller parts: --json has them", f"{ms:.2f}", f"{share:.1%}")
+        table.add_row("", f"smaller parts, {len(small)}: --json has them", f"{ms:.2f}", f"{share:.1%}")
     return table
 
 
@@ -125,13 +125,13 @@ def _shared(rows: list[dict[str, Any]]) -> Iterator[str]:
     for row in rows:
         if row["preempted_ms"] < LEAST_SHARE * row["service_ms"]:
             continue
-        lead = f"{row['stage']}: {row['preempted_ms']:.1f} of {row['service_ms']:.1f} ms a job without a core"
+        lead = f"{row['stage']}: {row['preempted_ms']:.2f} of {row['service_ms']:.2f} ms a job without a core"
         found = [
-            f"{ms:.1f} ms of it jobs of {unit} had it: {row['unit']} and {unit} share core"
+            f"{ms:.2f} ms of it jobs of {unit} had it: {row['unit']} and {unit} share core"
             f"{'s' if len(row['shared'][unit]) > 1 else ''} {','.join(map(str, row['shared'][unit]))}"
             for unit, ms in row["taken_ms"].items()
         ]
-        found.append(f"{row['others_ms']:.1f} ms nobody of this run")
+        found.append(f"{row['others_ms']:.2f} ms nobody of this run")
         yield f"{lead}; {'; '.join(found)}"
 
 

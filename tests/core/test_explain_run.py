@@ -1,0 +1,218 @@
+"""`trilane explain RUN` and the table of jobs: figures by hand, what is printed of them, and what is refused."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from trilane.apps.explained.advice import advice
+from trilane.apps.explained.job_table import COLUMNS, write_jobs
+from trilane.apps.explained.run import explain_run
+from trilane.apps.explained.slow_frames import MOST_SAMPLES, Sample
+from trilane.errors import BadInputError, MissingPartError
+from trilane.hw_profiles.application import application_graph
+from trilane.pipeline.journal import NAME
+from trilane.scheduler.events import Settings
+from trilane.scheduler.virtual import Simulation, simulate
+from trilane.testing.run_folders import write_run
+
+MS = 1_000_000
+STAGE_MS = {"pose": 1, "raster": 2, "infer": 4, "composite": 2, "present": 1}
+CORES = {"cpu": (0,), "gpu": (1,), "dsp": (0,)}
+Command = Callable[..., tuple[str, str]]
+
+
+def simulated(slow: dict[tuple[str, int], int], settings: Settings | None = None, **driver: Any) -> Simulation:
+    """A run of 40 frames, whose jobs in `slow` (stage, frame) take so many ms."""
+
+    def service(stage: str, _unit: str, frame: int, _begin_ns: int) -> int:
+        return slow.get((stage, frame), STAGE_MS[stage]) * MS
+
+    return simulate(application_graph(), settings or Settings(40), service, keep=True, **driver)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A composite of 20 ms, a killed GPU unit, and poses that lack their core for 0.25 ms while infer has it."""
+    run = simulated({("composite", 20): 20}, faults=[(125 * MS, "gpu")], restart_ns=50 * MS)
+    jobs = [job._replace(preempted_ns=MS // 4) if job.stage == "pose" else job for job in run.jobs]
+    return write_run(tmp_path / "run", run, jobs, cores=CORES, figures={"pose": {"visible": 1.0}, "infer": {"b": 2.5}})
+
+
+def test_the_slowest_frames_and_why(folder: Path) -> None:
+    found = explain_run(folder, 2)
+    first, second = found["slowest"]
+    assert found["usual"]["frame_ms"] == 4.0
+    assert first["frame_ms"] > 50
+    assert first["why"][0]["text"] == "gpu was restarted"
+    assert first["why"][0]["longer_ms"] == pytest.approx(50, abs=3)
+    assert second["frame"] == 20
+    assert (second["frame_ms"], second["longer_ms"]) == (22.0, 18.0)
+    assert second["why"] == [
+        {
+            "cause": "work",
+            "stage": "composite",
+            "longer_ms": 18.0,
+            "text": "composite was slow: 20.0 ms, median 2.0",
+        }
+    ]
+    assert found["usual"]["service_ms"] == STAGE_MS
+
+
+def test_the_budget_sums_to_the_frame_time_and_names_shared_cores(folder: Path) -> None:
+    found = explain_run(folder)
+    assert sum(row["ms"] for row in found["budget"]) == pytest.approx(found["frame_ms"])
+    assert sum(row["share"] for row in found["budget"]) == pytest.approx(1)
+    assert found["frames"] == 39  # one was lost with the unit
+    (row,) = found["shared_cores"]
+    assert (row["stage"], row["cores"], row["shared"]) == ("pose", [0], {"dsp": [0]})
+    assert (row["service_ms"], row["preempted_ms"]) == (1.0, 0.25)
+    assert row["taken_ms"]["dsp"] + row["others_ms"] == pytest.approx(0.25)
+    assert row["taken_ms"]["dsp"] > 0.2  # infer nearly always works while a pose does
+
+
+def test_a_frame_that_skips_or_has_another_rung_says_so(tmp_path: Path) -> None:
+    """Frames 0 to 9 skip raster and infer; a full frame after them takes all stages."""
+    graph = replace(application_graph(), bypass=("pose", "composite"))
+    settings = Settings(20, "sequential")
+
+    def skips(frame: int, fresh: bool) -> bool:
+        return 0 < frame < 10 and not fresh
+
+    run = simulate(graph, settings, lambda stage, *_: STAGE_MS[stage] * MS, skips=skips, keep=True)
+    found = explain_run(write_run(tmp_path / "run", run), 40)
+    rows = {row["frame"]: row for row in found["slowest"]}
+    assert rows[10]["notes"] == ["the frame before took the bypass, it did not"]
+    assert rows[1]["notes"] == ["it took the bypass"]
+    assert rows[10]["frame_ms"] == 10.0
+    assert rows[1]["frame_ms"] == 4.0
+
+
+def test_dropped_frames_and_late_input_are_named(tmp_path: Path) -> None:
+    """A frame every 10 ms; infer of frame 5 takes 200 ms, so that frames are dropped behind it."""
+    settings = Settings(40, "latest", period_ns=10 * MS, deadline_ns=30 * MS)
+    found = explain_run(write_run(tmp_path / "run", simulated({("infer", 5): 200}, settings)), 40)
+    assert any("before it were dropped or lost" in note for row in found["slowest"] for note in row["notes"])
+    assert found["slowest"][0]["why"][0]["text"] == "infer was slow: 200.0 ms, median 4.0"
+    assert any(row["what"] == "release" for row in found["budget"])
+    usual = explain_run(write_run(tmp_path / "usual", simulated({}, replace(settings, period_ns=40 * MS))))
+    assert usual["budget"][0]["what"] == "release"
+    assert usual["advice"][0].endswith("there is time to spare")
+
+
+def test_what_is_printed(folder: Path, command: Command, check_printed: Callable[[str, str], None]) -> None:
+    out, err = command("explain", folder, "--slowest", 3)
+    check_printed("explain-run", out.replace(str(folder), "RUN"))
+    assert err == ""
+
+
+def test_json_is_the_document(folder: Path, command: Command) -> None:
+    out, _ = command("explain", folder, "--slowest", 3, "--json")
+    assert json.loads(out) == json.loads(json.dumps(explain_run(folder, 3)))
+
+
+def test_jobs_as_csv_are_those_of_the_run(folder: Path, command: Command) -> None:
+    target = folder / "jobs.csv"
+    _, err = command("explain", folder, "--jobs", target)
+    with target.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert err == f"jobs: {target}, {len(rows)} rows\n"
+    assert list(rows[0]) == [*COLUMNS, "b", "visible"]
+    assert {(row["stage"], row["visible"], row["b"]) for row in rows} == {
+        ("pose", "1.0", ""),
+        ("raster", "", ""),
+        ("infer", "", "2.5"),
+        ("composite", "", ""),
+        ("present", "", ""),
+    }
+    for row in rows:
+        assert int(row["wait_ns"]) == int(row["begin_ns"]) - int(row["ready_ns"]) >= int(row["wait_cause_ns"])
+        assert (row["wait_cause"] == "") == (row["wait_ns"] == "0")
+    busy = [row for row in rows if row["wait_cause"] == "busy"]
+    assert busy
+    assert all(row["behind_stage"] for row in busy)
+
+
+def test_jobs_as_parquet_are_those_of_the_csv(folder: Path) -> None:
+    pandas = pytest.importorskip("pandas")
+    pytest.importorskip("pyarrow")
+    assert write_jobs(folder, folder / "jobs.parquet") == write_jobs(folder, folder / "jobs.csv")
+    table, read = pandas.read_parquet(folder / "jobs.parquet"), pandas.read_csv(folder / "jobs.csv")
+    for name, (kind, _) in COLUMNS.items():
+        expected = read[name].fillna("") if kind is str else read[name].astype(kind)
+        assert list(table[name]) == list(expected), name
+    assert table["visible"].sum() == read["visible"].sum() > 0
+
+
+def test_parquet_without_its_library_names_the_extra(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(MissingPartError, match="as Parquet needs pyarrow"):
+        write_jobs(folder, folder / "jobs.parquet")
+    assert not (folder / "jobs.parquet").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "found"),
+    [
+        (["--frames", 3], "--frames with a run folder"),
+        (["--jobs", "jobs.txt"], "a name that ends in .csv or .parquet"),
+        (["--jobs", "none/jobs.csv"], "a place that can be written"),
+        (["--slowest", 0], "greater than or equal to 1"),
+    ],
+)
+def test_what_is_refused_of_a_run(folder: Path, command: Command, arguments: list[Any], found: str) -> None:
+    assert found in command("explain", folder, *arguments, code=2)[1]
+
+
+def test_what_is_refused_of_a_scene(command: Command) -> None:
+    assert "--slowest with a scene" in command("explain", "default", "--slowest", 3, code=2)[1]
+
+
+def test_a_run_without_a_journal_or_a_report(folder: Path, tmp_path: Path) -> None:
+    (folder / "report.json").unlink()
+    found = explain_run(folder)
+    assert (found["scene"], found["shared_cores"][0]["taken_ms"], found["accuracy"]) == (None, {}, {})
+    (folder / NAME).unlink()
+    with pytest.raises(BadInputError, match=f"no {NAME}"):
+        explain_run(folder)
+    with pytest.raises(BadInputError, match="none"):
+        explain_run(tmp_path / "none")
+
+
+def test_a_run_of_one_frame_has_no_frame_time(tmp_path: Path, command: Command) -> None:
+    folder = write_run(tmp_path / "run", simulated({}, Settings(1)))
+    found = explain_run(folder)
+    assert (found["frames"], found["frame_ms"], found["budget"], found["slowest"]) == (1, None, [], [])
+    assert "fewer than two frames" in command("explain", folder)[0]
+
+
+def test_a_sample_is_evenly_spaced() -> None:
+    sample: Sample[int] = Sample()
+    for value in range(3 * MOST_SAMPLES):
+        sample.add(value)
+    assert sample.values == list(range(0, 3 * MOST_SAMPLES, 4))
+
+
+def test_advice_is_about_what_bounds_a_tenth_at_least() -> None:
+    rows = [
+        {"stage": "pose", "unit": "cpu", "what": "preempted", "share": 0.5, "ms": 5.0},
+        {"stage": "own", "unit": "gpu", "what": "work", "share": 0.3, "ms": 3.0},
+        {"stage": "infer", "unit": "dsp", "what": "throttled", "share": 0.11, "ms": 1.1},
+        {"stage": "present", "unit": "cpu", "what": "work", "share": 0.09, "ms": 0.9},
+    ]
+    shared = [{"stage": "pose", "taken_ms": {"dsp": 4.0, "gpu": 0.0}}]
+    assert advice(rows, shared, "pipelined") == [
+        "5.0 ms a frame, pose (preempted): cpu and dsp share a core: `--cores` gives them cores of their own",
+        "3.0 ms a frame, own (work): shorter work of own, or a unit of its own for it",
+        "1.1 ms a frame, infer (throttled): a performance profile with more power, such as `--performance-profile "
+        "burst`, caps dsp less",
+    ]
+    assert advice(rows[:1], [], "pipelined")[0].endswith("or threads that spin between jobs")
+    assert "`--policy pipelined`" in advice(rows, [], "sequential")[0]
