@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from trilane.apps.run_job import Hooks, Outcome, Plan
+    from trilane.apps.run_job import Hooks, Outcome, Plan, Watched
     from trilane.pipeline.unit_starter import UnitStarter
     from trilane.stages.configure import Checked, GlFacts
 
@@ -43,24 +43,43 @@ class AskedRun:
     command: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True)
+class Prepared:
+    """What was `asked` for, `checked`, and how it is to be run."""
+
+    asked: AskedRun
+    checked: Checked
+    plan: Plan
+
+
 def run_asked(asked: AskedRun, hooks: Callable[[], AbstractContextManager[Hooks]]) -> Outcome:
     """Check what was asked for, run it and leave its run folder.
 
     `hooks`: opened when the input is checked and the units start.
     Raises BadInputError and MissingPartError for what cannot be run, TrilaneError when no frame was presented.
     """
-    with _early_processes() as (starter, gl):
-        from trilane.apps.run_job import Plan
-        from trilane.stages.configure import Request, configure, requested_edge
+    with early_processes() as (starter, gl):
+        return run_prepared(prepare(asked, gl), hooks=hooks, starter=starter, gl=gl)
 
-        rule, request = requested_edge(asked.edge), Request(**asked.request)
-        checked = configure(request, Path.cwd(), gl)
-        plan = Plan(request.policy, asked.baseline_frames, None, asked.performance_profile, asked.latch_ms, rule)
-        return _run(checked, asked, plan, hooks, starter, gl)
+
+def prepare(asked: AskedRun, gl: GlFacts) -> Prepared:
+    """Check what was asked for. Raises BadInputError and MissingPartError for what cannot be run."""
+    from trilane.apps.run_job import Plan
+    from trilane.stages.configure import Request, configure, requested_edge
+
+    rule, request = requested_edge(asked.edge), Request(**asked.request)
+    checked = configure(request, Path.cwd(), gl)
+    plan = Plan(request.policy, asked.baseline_frames, None, asked.performance_profile, asked.latch_ms, rule)
+    if asked.paced_by is not None:
+        from trilane.apps.pace import pace_of
+
+        pace = pace_of(checked.config, *asked.paced_by)
+        plan, checked = replace(plan, pace=pace), checked.changed(pace_ns=dict(pace.stage_ns))
+    return Prepared(asked, checked, plan)
 
 
 @contextmanager
-def _early_processes() -> Iterator[tuple[UnitStarter, GlFacts]]:
+def early_processes() -> Iterator[tuple[UnitStarter, GlFacts]]:
     """The fork server, which imports what the units need while this process goes on, and what it says of OpenGL.
 
     The driver is looked at in a process of its own, because it may crash.
@@ -72,25 +91,25 @@ def _early_processes() -> Iterator[tuple[UnitStarter, GlFacts]]:
         yield starter, cache(gl.result)
 
 
-def _run(
-    checked: Checked,
-    asked: AskedRun,
-    plan: Plan,
+def run_prepared(
+    prepared: Prepared,
+    *,
     hooks: Callable[[], AbstractContextManager[Hooks]],
     starter: UnitStarter,
     gl: GlFacts,
+    watched: Watched | None = None,
 ) -> Outcome:
-    """Run `checked` as `plan` says, held to a chip's pace where one was asked for."""
+    """Run what was checked and leave its run folder.
+
+    `hooks`: as of `run_asked`. `starter`, `gl`: of `early_processes`. `watched`: by whom; None: by nobody.
+    Raises as `run_asked`.
+    """
     from trilane.apps.made import made_facts
     from trilane.apps.run_folder import default_place
     from trilane.apps.run_job import run_to_folder
     from trilane.stages.configure import required_machine
 
-    if asked.paced_by is not None:
-        from trilane.apps.pace import pace_of
-
-        pace = pace_of(checked.config, *asked.paced_by)
-        plan, checked = replace(plan, pace=pace), checked.changed(pace_ns=dict(pace.stage_ns))
+    asked, checked, plan = prepared.asked, prepared.checked, prepared.plan
     target = asked.out or default_place(checked.config.scene.name)
     with hooks() as told:
         for note in checked.notes:
@@ -98,7 +117,9 @@ def _run(
         try:
             made = made_facts(list(asked.command))
             machine = required_machine(gl)
-            return run_to_folder(checked, target, plan, told, machine=machine, made=made, starter=starter)
+            return run_to_folder(
+                checked, target, plan, told, machine=machine, made=made, starter=starter, watched=watched
+            )
         except KeyboardInterrupt:
             told.message("interrupted: nothing was written")
             raise

@@ -21,6 +21,7 @@ from trilane.hw_profiles.governor import Governor
 from trilane.hw_profiles.host import sensor_c
 from trilane.hw_profiles.load import load_runnable
 from trilane.pipeline import journal
+from trilane.pipeline.controls import RunControls
 from trilane.pipeline.journal_slices import jobs_of
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run_record import JournalFile
@@ -68,6 +69,20 @@ class Hooks:
 
 
 @dataclass(frozen=True)
+class Watched:
+    """A run that somebody looks at and steers while it goes on.
+
+    `frames`: how many; None: the scene's. `window`: to look through (`trilane.transport.live_window`).
+    `controls`: what is asked of it. `begins(folder, checked)`: called when its units are placed, before they start.
+    """
+
+    frames: int | None
+    window: Path
+    controls: RunControls
+    begins: Callable[[Path, Checked], None]
+
+
+@dataclass(frozen=True)
 class Outcome:
     """`report` as written, `folder` that holds it, and the exit code that the run asks for."""
 
@@ -85,6 +100,7 @@ def run_to_folder(
     machine: Mapping[str, Any],
     made: Mapping[str, Any] | None = None,
     starter: UnitStarter | None = None,
+    watched: Watched | None = None,
 ) -> Outcome:
     """Run what was checked and leave the run folder at `target`.
 
@@ -95,14 +111,18 @@ def run_to_folder(
     `machine`: what `machine_facts` said.
     `made`: what `trilane.apps.made.made_facts` said of the command line; None where there is none.
     `starter`: a fork server that was started earlier; without one, the units stay where `checked` has them.
+    `watched`: by whom; None: by nobody.
     Raises BadInputError when `target` cannot be written, and TrilaneError when no frame was presented.
     """
     with RunFolder(target) as folder:
         if starter is not None:
             checked = placed(checked, plan.policy, starter, str(machine.get("gl")), hooks.message)
             hooks.message(checked.notes[-1])
+        if watched is not None:
+            checked = checked.changed(window=watched.window)
+            watched.begins(folder.work, checked)
         threading.Thread(target=_import_writers, name="imports", daemon=True).start()
-        job = _Job(checked, plan, hooks, starter)
+        job = _Job(checked, plan, hooks, starter, watched)
         result = job.run(
             folder.work,
             {"config": config_facts(checked.config, plan.policy, plan.edge), "machine": machine, "made": made},
@@ -131,16 +151,20 @@ def run_to_folder(
 class _Job:
     """The runs of one job: the one that was asked for, and the sequential one to compare with."""
 
-    def __init__(self, checked: Checked, plan: Plan, hooks: Hooks, starter: UnitStarter | None) -> None:
+    def __init__(
+        self, checked: Checked, plan: Plan, hooks: Hooks, starter: UnitStarter | None, watched: Watched | None
+    ) -> None:
         self._checked, self._plan, self._hooks, self._starter = checked, plan, hooks, starter
+        self._watched = watched
 
     def run(self, folder: Path, facts: Mapping[str, Any]) -> RunResult:
         """The run that was asked for, with its journal, which begins with `facts`.
 
         Raises TrilaneError when it ended before any frame was presented.
         """
-        file = JournalFile(folder / journal.NAME, facts, _sensors)
-        return self._run(folder, self._plan.policy, None, self._plan.latch_ms, file)
+        file, watched = JournalFile(folder / journal.NAME, facts, _sensors), self._watched
+        frames, controls = (None, None) if watched is None else (watched.frames, watched.controls)
+        return self._run(folder, self._plan.policy, frames, self._plan.latch_ms, file, controls)
 
     def run_baseline(self, folder: Path) -> tuple[RunResult | None, bool]:
         """The first frames of the same scene again, one frame at a time; its pictures are not kept.
@@ -165,7 +189,13 @@ class _Job:
         return (result if _is_complete(result) else None), result.interrupted
 
     def _run(
-        self, folder: Path, policy: str, frames: int | None, latch_ms: float, file: JournalFile | None = None
+        self,
+        folder: Path,
+        policy: str,
+        frames: int | None,
+        latch_ms: float,
+        file: JournalFile | None = None,
+        controls: RunControls | None = None,
     ) -> RunResult:
         profile = self._plan.performance_profile
         result = run_avatar(
@@ -178,6 +208,7 @@ class _Job:
             latch_ms=latch_ms,
             governor=None if profile is None else Governor(load_runnable(HOST), profile),
             journal=file,
+            controls=controls,
             starter=self._starter,
             on_progress=lambda presented, requested: self._hooks.progress(policy, presented, requested),
             on_message=self._hooks.message,

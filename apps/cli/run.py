@@ -26,6 +26,7 @@ from trilane.apps.cli.options import (
     MotionOption,
     OutputOption,
     PerformanceProfileOption,
+    PortOption,
     SceneArgument,
     SceneAvatarOption,
     SceneSizeOption,
@@ -37,6 +38,7 @@ from trilane.units import PerformanceProfile
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
+    from trilane.apps.asked_run import AskedRun
     from trilane.apps.run_job import Hooks, Outcome
 
 app = Commands()
@@ -51,6 +53,7 @@ Examples:
   trilane run --cores cpu=1 --cores gpu=0 --cores dsp=0,1
   trilane run --split /Concat_4_output_0_QuantizeLinear_Output=cpu
   trilane run --performance-profile sustained_high_performance
+  trilane run --dashboard
   trilane run --profile snapdragon-888 --pace --slow-motion 24 --frames 60
   trilane run myscene.toml --background street.mp4 --policy sequential
 """
@@ -87,6 +90,9 @@ LatchOption = Annotated[
     float, typer.Option(min=0, max=1000, help="Sample poses late: ready so many ms before the raster; 0: at once.")
 ]
 CapOption = Annotated[PerformanceProfile | None, PerformanceProfileOption]
+DashboardOption = Annotated[
+    bool, typer.Option("--dashboard", help="Show the run in a browser; without --frames it runs until Ctrl-C.")
+]
 BaselineOption = Annotated[
     int, typer.Option(min=0, help="Frames of the `sequential` run of the same scene that follows; 0: none.")
 ]
@@ -141,6 +147,8 @@ def run(
     performance_profile: CapOption = None,
     baseline: BaselineOption = 60,
     out: FolderOption = None,
+    dashboard: DashboardOption = False,
+    port: PortOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Run a scene on the three units and write a run folder.
@@ -171,9 +179,19 @@ def run(
     }
     paced_by = None if profile is None else (profile, slow_motion)
     command = ("trilane", *sys.argv[1:])
-    outcome = run_asked(AskedRun(request, edge, baseline, paced_by, cap, latch, out, command), _hooks)
+    asked = AskedRun(request, edge, baseline, paced_by, cap, latch, out, command)
+    outcome = _run_live(asked, port) if dashboard else run_asked(asked, _hooks)
     _print_outcome(outcome, as_json)
     raise typer.Exit(outcome.exit_code)
+
+
+def _run_live(asked: AskedRun, port: int | None) -> Outcome:
+    from trilane.apps.dashboard.serve import require_server
+
+    require_server()
+    from trilane.apps.dashboard.live_run import run_live
+
+    return run_live(asked, _hooks, port, lambda text: stderr_console().print(text, soft_wrap=True, markup=False))
 
 
 def _check_pace(profile: str | None, asked: bool, slow_motion: float, cuts: tuple[str, ...], cap: str | None) -> None:

@@ -11,7 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from trilane.apps.report import Report, read_report
+from trilane.apps.run_job import Plan
 from trilane.pipeline.journal import Begun
+from trilane.stages.configure import Checked
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,12 @@ class RunFacts:
     plan: Mapping[str, Any]
     placement: Mapping[str, Any] | None
     accuracy: Mapping[str, Any]
+
+    @classmethod
+    def of_row(cls, row: Mapping[str, Any]) -> RunFacts:
+        """The facts that were sent as `asdict` has them."""
+        width, height = row["output"]
+        return cls(**{**row, "output": (width, height)})
 
     def hello(self) -> dict[str, Any]:
         """Its part of the hello."""
@@ -69,6 +77,25 @@ def machine_line(machine: Mapping[str, Any]) -> str:
     cores = f"{len(cpu['cores_allowed'])} of {cpu['cores']} cores"
     drawn = f", {driver['renderer']}" if driver else ""
     return f"{cpu['model']}, {cores}{drawn}"
+
+
+def facts_of_checked(name: str, checked: Checked, plan: Plan, machine: Mapping[str, Any]) -> RunFacts:
+    """Of a run that begins."""
+    config = checked.config
+    scene = config.scene
+    said = {**config.model_dump(mode="json", exclude={"out_dir", "window"}), "policy": plan.policy, "edge": plan.edge}
+    return RunFacts(
+        name,
+        scene.name,
+        "host",
+        machine_line(machine),
+        scene.fps,
+        (scene.output.width, scene.output.height),
+        config_in_force(said, plan.performance_profile),
+        {"tensor_shapes": [list(shape) for shape in config.buckets], "notes": list(checked.notes)},
+        checked.placement,
+        checked.accuracy,
+    )
 
 
 def facts_of_report(name: str, report: Report) -> RunFacts:

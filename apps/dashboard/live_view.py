@@ -1,0 +1,221 @@
+"""A run that goes on, as a server shows it: its journal as it grows, its newest picture, its controls.
+
+Rule: nothing here makes the run wait. The journal is read behind it, pictures are pulled through the window, and what
+is asked of the run is handed over; what the run answers is told to all pages.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from itertools import islice
+from pathlib import Path
+from typing import Any, Final
+
+from PIL import Image
+
+from trilane.apps.dashboard.channel import Asked, Refused, RunBegins, StateIs
+from trilane.apps.dashboard.channel import Message as FromRun
+from trilane.apps.dashboard.clients import Client
+from trilane.apps.dashboard.controls import OF_THE_CAMERA, Control, Value, control_of
+from trilane.apps.dashboard.meter import Meter
+from trilane.apps.dashboard.run_facts import RunFacts
+from trilane.apps.dashboard.timeline import IdleRow, JobRow, Timeline, described, note, slices
+from trilane.apps.dashboard.video_frames import jpeg_of
+from trilane.apps.dashboard.view import Message
+from trilane.apps.dashboard.wire import ControlSaid, Seek, shown
+from trilane.apps.followed_run import FollowedRun
+from trilane.pipeline.journal import NAME, Begun, Record
+from trilane.transport.live_window import LiveWindow, Shown, Steering
+
+FIGURES_S: Final = 0.25
+PICTURE_S: Final = 1 / 30  # between two that are encoded
+MOST_RAISED_DEG: Final = 90.0
+MOST_JOBS: Final = 4000
+MOST_IDLE: Final = 4000
+MOST_NOTES: Final = 100
+RECORDS_AT_ONCE: Final = 500
+ASKED_A_SECOND: Final = 10
+ACCEPTED: Final = ""
+GOES_ON: Final = "a run that goes on has no other time than now"
+MS: Final = 1e-6  # of a nanosecond
+
+
+class Course:
+    """What is known of one run since its journal began."""
+
+    def __init__(self, begun: Begun) -> None:
+        self.begun = begun
+        self.timeline, self.meter = Timeline(begun), Meter(begun)
+        self.jobs: deque[JobRow] = deque(maxlen=MOST_JOBS)
+        self.idle: deque[IdleRow] = deque(maxlen=MOST_IDLE)
+        self.notes: deque[Message] = deque(maxlen=MOST_NOTES)
+
+    def add(self, record: Record) -> None:
+        self.timeline.add(record)
+        self.meter.add(record)
+
+    def fresh(self) -> Iterable[Message]:
+        """What came since the last call, which is kept for who joins later."""
+        jobs, idle, said = self.timeline.take()
+        notes = [note(t_ms, text) for t_ms, text in said]
+        self.jobs.extend(jobs)
+        self.idle.extend(idle)
+        self.notes.extend(notes)
+        return [*([slices(jobs, idle)] if jobs or idle else []), *notes]
+
+
+class LiveView:
+    """`trilane.apps.dashboard.view.View` of the runs that `hear` tells of, one after the other.
+
+    `window`: into them. `ask`: hands something over to the run; whether it could.
+    """
+
+    def __init__(self, window: LiveWindow, ask: Callable[[Asked], bool]) -> None:
+        self._window, self._ask = window, ask
+        self._steering = Steering()
+        self._facts: RunFacts | None = None
+        self._controls: dict[str, Control] = {}
+        self._folder: Path | None = None
+        self._followed: FollowedRun | None = None
+        self._course: Course | None = None
+        self._state, self._why = "restarting", ""
+        self._told: list[Message] = []
+        self._is_news = False
+        self._figures_s = self._picture_s = 0.0
+        self._jpeg: tuple[int, bytes] = (-1, b"")
+        self._asked_s: deque[float] = deque(maxlen=ASKED_A_SECOND)
+
+    def hear(self, message: FromRun) -> None:
+        """What the process of the runs says."""
+        if isinstance(message, RunBegins):
+            self._facts = RunFacts.of_row(message.facts)
+            self._controls = {control.name: control for control in map(control_of, message.controls)}
+            self._folder, self._followed, self._course = Path(message.folder), None, None
+        elif isinstance(message, StateIs):
+            self._state, self._why, self._is_news = message.state, message.why, True
+        elif isinstance(message, Refused):
+            self._told.append({"type": "refused", "control": message.control, "why": message.why})
+
+    def greeting(self) -> Iterable[Message]:
+        course = self._course
+        if course is not None and self._facts is not None:
+            yield self._hello(course, self._facts)
+        if self._facts is not None:
+            yield self._stated(self._facts)
+        if course is not None:
+            yield slices(list(course.jobs), list(course.idle))
+            yield from course.notes
+            yield course.meter.message(self._now_ns())
+
+    async def news(self) -> Iterable[Message]:
+        await self._read_on()
+        told, self._told = self._told, []
+        if self._is_news and self._facts is not None:
+            self._is_news = False
+            told.append(self._stated(self._facts))
+        if self._course is not None:
+            told += self._course.fresh()
+            if time.monotonic() >= self._figures_s:
+                self._figures_s = time.monotonic() + FIGURES_S
+                told.append(self._course.meter.message(self._now_ns()))
+        return told
+
+    async def picture(self, client: Client) -> bytes | None:
+        self._window.look()
+        if time.monotonic() < self._picture_s:
+            return None
+        seen = self._window.newest(client.had_frame)
+        if seen is None:
+            return None
+        self._picture_s = time.monotonic() + PICTURE_S
+        if seen.frame != self._jpeg[0]:
+            self._jpeg = seen.frame, await asyncio.to_thread(_jpeg, seen)
+        client.had_frame = seen.frame
+        age_ms = (time.monotonic_ns() - seen.sampled_ns) * MS
+        return shown(seen.frame, 1e3 * seen.media_s, age_ms, self._jpeg[1])
+
+    def control(self, asked: ControlSaid) -> str:
+        control = self._controls.get(asked.name)
+        if control is None:
+            return f"found {asked.name!r}, expected one of {', '.join(self._controls)}"
+        if why := control.refusal(asked.value):
+            return why
+        if asked.name in OF_THE_CAMERA:
+            self._steer(asked.name, asked.value)
+            return ACCEPTED
+        now_s = time.monotonic()
+        if len(self._asked_s) == ASKED_A_SECOND and now_s - self._asked_s[0] < 1.0:
+            return f"more than {ASKED_A_SECOND} things were asked for within a second"
+        self._asked_s.append(now_s)
+        value = asked.value if not isinstance(asked.value, list) else None
+        return ACCEPTED if self._ask(Asked(asked.name, value)) else "the run does not answer"
+
+    async def seek(self, client: Client, to: Seek) -> Iterable[Message]:  # noqa: ARG002 - a view's signature
+        return [{"type": "refused", "control": "seek", "why": GOES_ON}]
+
+    def metrics(self) -> str:
+        return "" if self._course is None else self._course.meter.metrics(self._now_ns())
+
+    @property
+    def trace(self) -> Path | None:
+        folder = self._followed.folder if self._followed is not None else self._folder
+        return None if folder is None else folder / "trace.pftrace"
+
+    async def _read_on(self) -> None:
+        """Everything that the run has written since the last call, a little at a time."""
+        if self._followed is None and self._folder is not None and (self._folder / NAME).is_file():
+            self._followed = FollowedRun(self._folder)
+        if self._followed is None:
+            return
+        records = iter(self._followed.new())
+        while some := list(islice(records, RECORDS_AT_ONCE)):
+            for record in some:
+                self._add(record)
+            await asyncio.sleep(0)
+
+    def _add(self, record: Record) -> None:
+        if isinstance(record, Begun):
+            self._course = Course(record)
+            if self._facts is not None:
+                self._told.append(self._hello(self._course, self._facts))
+                self._is_news = True
+        elif self._course is not None:
+            self._course.add(record)
+
+    def _hello(self, course: Course, facts: RunFacts) -> Message:
+        run = {**facts.hello(), **described(course.begun.graph)}
+        values = self._values(facts)
+        rows = [control.as_json(values.get(name)) for name, control in self._controls.items()]
+        span = [0.0, course.timeline.now_ms]
+        return {"type": "hello", "run": run, "controls": rows, "is_live": True, "span_ms": span}
+
+    def _stated(self, facts: RunFacts) -> Message:
+        return {**facts.state(self._state, self._why), "config": self._values(facts)}
+
+    def _values(self, facts: RunFacts) -> dict[str, Any]:
+        """The value in force of each control that has one."""
+        camera = self._steering
+        return {**facts.config, "orbit": [camera.azimuth_deg, camera.elevation_deg], "zoom": camera.zoom}
+
+    def _steer(self, name: str, value: Value) -> None:
+        """A drag to the right brings the camera to the left, so that what is seen follows; one downwards raises it."""
+        azimuth, elevation, zoom = self._steering
+        if isinstance(value, list):
+            azimuth = (azimuth - value[0] + 180.0) % 360.0 - 180.0
+            elevation = min(max(elevation + value[1], -MOST_RAISED_DEG), MOST_RAISED_DEG)
+        elif isinstance(value, float | int):
+            zoom = float(value)
+        self._steering = Steering() if name == "recentre" else Steering(azimuth, elevation, zoom)
+        self._window.steer(self._steering)
+        self._is_news = True
+
+    def _now_ns(self) -> int | None:
+        """The time of the figures: now while the run goes on, else that of its end."""
+        return None if self._state in ("ended", "failed") else time.monotonic_ns()
+
+
+def _jpeg(seen: Shown) -> bytes:
+    return jpeg_of(Image.fromarray(seen.pixels))

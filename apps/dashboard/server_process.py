@@ -1,0 +1,68 @@
+"""The process that shows a run, beside the pipeline's. Rule: it yields to whoever has work, and ends with the run's.
+
+It is started with three descriptors: the listening socket, its end of the channel and the window.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+import sys
+from typing import Any, Final
+
+from trilane.apps.dashboard.app import DashboardApp
+from trilane.apps.dashboard.channel import Channel, Opened
+from trilane.apps.dashboard.live_view import LiveView
+from trilane.apps.dashboard.serve import server
+from trilane.transport.live_window import LiveWindow
+from trilane.unexpected_value import UnexpectedValue
+
+NICE: Final = 19
+
+
+async def serve(listener: socket.socket, channel: Channel, window_fd: int) -> None:
+    """Show runs until the other end of `channel` is gone."""
+    opened = await _first(channel)
+    window = LiveWindow(window_fd, opened.height, opened.width)
+    os.close(window_fd)
+    view = LiveView(window, channel.send)
+    app = DashboardApp(view, listener.getsockname()[1], opened.token)
+    answers = server(app.asgi)
+    asyncio.get_running_loop().add_reader(channel.fd, _hear, channel, view, answers)
+    await answers.serve(sockets=[listener])
+
+
+async def _first(channel: Channel) -> Opened:
+    while (message := channel.receive()) is None:
+        await asyncio.sleep(0.01)
+    if not isinstance(message, Opened):
+        raise UnexpectedValue(type(message).__name__, Opened.__name__)
+    return message
+
+
+def _hear(channel: Channel, view: LiveView, answers: Any) -> None:
+    try:
+        message = channel.receive()
+    except EOFError:
+        asyncio.get_running_loop().remove_reader(channel.fd)
+        answers.should_exit = True
+        return
+    if message is not None:
+        view.hear(message)
+
+
+def main() -> None:
+    """Of `python -m trilane.apps.dashboard.server_process LISTENER CHANNEL WINDOW`."""
+    listener_fd, channel_fd, window_fd = map(int, sys.argv[1:])
+    os.setpriority(os.PRIO_PROCESS, 0, NICE)
+    channel = Channel(socket.socket(fileno=channel_fd))
+    with socket.socket(fileno=listener_fd) as listener:
+        try:
+            asyncio.run(serve(listener, channel, window_fd))
+        except EOFError:  # the run ended before it began
+            return
+
+
+if __name__ == "__main__":
+    main()
