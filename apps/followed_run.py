@@ -50,7 +50,7 @@ class FollowedRun:
             raise BadInputError(folder, f"no {NAME}" if folder.is_dir() else "no such folder", EXPECTED, remedy)
         self.folder = folder
         matched = PARTIAL.fullmatch(folder.name)
-        self.name = matched["name"] if matched else folder.name
+        self.name = run_name(folder)
         self._pid = int(matched["pid"]) if matched else 0
         self._reader = JournalReader(journal)
         self._heard_ns = time.monotonic_ns()
@@ -140,10 +140,11 @@ def _missing(given: Path | None) -> BadInputError:
             RUNS, "no run with a journal", EXPECTED, "start one with `trilane run`, or name its folder"
         )
     parent = given.parent if len(given.parts) > 1 else RUNS
-    names = [_name(each) for each in parent.iterdir() if each.is_dir()] if parent.is_dir() else []
+    names = [run_name(each) for each in parent.iterdir() if each.is_dir()] if parent.is_dir() else []
     return BadInputError(given, "no such run", EXPECTED, did_you_mean(given.name, names))
 
 
-def _name(folder: Path) -> str:
+def run_name(folder: Path) -> str:
+    """The name that the run in `folder` has, or will have."""
     matched = PARTIAL.fullmatch(folder.name)
     return matched["name"] if matched else folder.name

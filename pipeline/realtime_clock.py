@@ -86,6 +86,7 @@ class RealtimeClock:
         self._open: dict[int, tuple[Job, int]] = {}
         self._unbooked: list[tuple[Job, int, int | None, Done]] = []
         self._controls: RunControls | None = None
+        self._to_end: set[str] = set()
         self._begun = self._stopping = self._is_lost = False
         self._step_ns = self._ping_ns = 0
         self._progress_s = 0.0
@@ -191,6 +192,7 @@ class RealtimeClock:
         events, kills = controls.taken()
         for unit in kills:
             self._log.say(f"unit {unit} is killed, as was asked")
+            self._to_end.add(unit)
             self._processes.kill(unit)
         return events
 
@@ -214,7 +216,9 @@ class RealtimeClock:
         if isinstance(message, messages.Pong):
             return Pong(unit)
         if message is None:
-            self._log.say(f"unit {unit} ended unexpectedly and is started again{self._processes.why_ended(unit)}")
+            how = "has ended" if unit in self._to_end else "ended unexpectedly"
+            self._to_end.discard(unit)
+            self._log.say(f"unit {unit} {how} and is started again{self._processes.why_ended(unit)}")
             return UnitDied(unit)
         return None
 

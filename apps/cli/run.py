@@ -158,6 +158,8 @@ def run(
     """
     from trilane.apps.asked_run import AskedRun, run_asked
 
+    if port is not None and not dashboard:
+        raise BadInputError("options", "--port without --dashboard", "both or neither")
     cuts, cap = tuple(split or ()), performance_profile and str(performance_profile)
     _check_pace(profile, pace, slow_motion, cuts, cap)
     request: dict[str, Any] = {

@@ -13,6 +13,7 @@ from trilane.apps.dashboard.channel import Asked, Message, Refused, RunBegins, S
 from trilane.apps.dashboard.choices import choices_of, reasons_against
 from trilane.apps.dashboard.controls import NO_PROFILE, OF_A_NEW_RUN, controls_of_run
 from trilane.apps.dashboard.run_facts import facts_of_checked
+from trilane.apps.followed_run import run_name
 from trilane.errors import TrilaneError
 from trilane.pipeline.controls import ALL, RunControls
 from trilane.stages.configure import Checked
@@ -45,7 +46,7 @@ class Director:
     def show(self, machine: Mapping[str, Any], folder: Path, checked: Checked) -> None:
         """The run writes into `folder`; it runs `checked`."""
         assert self._now is not None
-        facts = facts_of_checked(folder.name, checked, self._now.plan, machine)
+        facts = facts_of_checked(run_name(folder), checked, self._now.plan, machine)
         choices = choices_of(facts.config)
         controls = controls_of_run(UNITS, choices, reasons_against(self._now.asked))
         self._send(RunBegins(str(folder), asdict(facts), [asdict(control) for control in controls]))
