@@ -112,7 +112,7 @@ class Figures:
     `fps`: frames presented in the window, a second. `run_fps`: between the first and last presented frame.
     `frame_time_ms`, `latency_ms`: mean, p50, p90, p95, p99, max and samples, exact, of the window.
     `units`, `stages`: in the order of the pipeline.
-    `temperature_c`, `duty`: by place and unit, as last looked at.
+    `temperature_c`, `duty`: by place and unit, as last looked at. `memory_bytes`: of the processes, by unit.
     `notes`: the last few messages.
     `frame_times`, `latencies`: of the run.
     `began_at`: UTC, ISO 8601; "" where the journal does not say.
@@ -134,6 +134,7 @@ class Figures:
     stages: Mapping[str, StageFigures]
     temperature_c: Mapping[str, float]
     duty: Mapping[str, float]
+    memory_bytes: Mapping[str, float]
     notes: tuple[Note, ...]
     frame_times: Histogram
     latencies: Histogram

@@ -15,7 +15,7 @@ from trilane.apps.time_histogram import TimeHistogram
 from trilane.apps.unit_time import UnitTime
 from trilane.figure_sources import COMPUTED, MEASURED
 from trilane.pipeline.journal import Accounted, Begun, Counted, Ended, Record, Said, Sampled, Stepped, Worked
-from trilane.scheduler.events import Event, Finish, Start, UnitDied, UnitReady
+from trilane.scheduler.events import NEVER, Event, Finish, Start, UnitDied, UnitReady
 from trilane.scheduler.ledger import STARVED
 from trilane.scheduler.stats import NS_PER_MS, summary_ms
 
@@ -24,9 +24,20 @@ NS_PER_S: Final = 1e9
 MOST_NOTES = 5
 BYTES, LEAST = "bytes_", "least"  # bytes that a stage moved, and those that would have done
 LEAST_KEY = f"stages.*.bytes.{LEAST}"
-TEMPERATURE, DUTY = "temperature_c.", "duty."
+TEMPERATURE, DUTY, MEMORY = "temperature_c.", "duty.", "memory_bytes."
 SENSOR = "sensor"  # this machine's own, beside those that are modelled
-OF_THE_RUN = ("fps", "run_fps", "frame_time_ms", "latency_ms", "frames", "units", "stages", "frame_times", "latencies")
+OF_THE_RUN = (
+    "fps",
+    "run_fps",
+    "frame_time_ms",
+    "latency_ms",
+    "frames",
+    "units",
+    "stages",
+    "frame_times",
+    "latencies",
+    "memory_bytes",
+)
 
 
 class _Work(NamedTuple):
@@ -69,6 +80,7 @@ class LiveFigures:
         self._first_ns: int | None = None
         self._start_ns: int | None = None
         self._last_ns = 0
+        self._finished_ns = NEVER
         self._is_over = False
         self._up: set[str] = set()
         self._accounts = dict.fromkeys(begun.graph.units, STARVED)
@@ -107,8 +119,11 @@ class LiveFigures:
         self._adders[type(record)](record)
 
     def now(self, now_ns: int | None = None) -> Figures:
-        """At `now_ns`, of the run's clock; where it is None or earlier, at the last record."""
-        now_ns = max(now_ns or 0, self._last_ns)
+        """At `now_ns`, of the run's clock; where it is None or earlier, at the last record.
+
+        After the step that finished the run it is the moment of that step: what follows are no frames.
+        """
+        now_ns = min(max(now_ns or 0, self._last_ns), self._finished_ns)
         start_ns = now_ns if self._start_ns is None else self._start_ns
         window_s = min(now_ns - start_ns, WINDOW_NS) / NS_PER_S
         recent = [each for each in self._recent if each.end_ns > now_ns - WINDOW_NS]
@@ -128,6 +143,7 @@ class LiveFigures:
             stages=self._stage_figures(now_ns),
             temperature_c=self._values(TEMPERATURE),
             duty=self._values(DUTY),
+            memory_bytes=self._values(MEMORY),
             notes=tuple(self._notes),
             frame_times=self._frame_times.now(),
             latencies=self._latencies.now(),
@@ -154,6 +170,7 @@ class LiveFigures:
             if type(action) is Start:
                 self._restarts[action.unit] += 1
             elif type(action) is Finish:
+                self._finished_ns = step.now_ns
                 self._flow.end()
 
     def _hear(self, now_ns: int, event: Event) -> None:

@@ -1,7 +1,8 @@
 """The metrics of a run as a table: name, unit, meaning, labels, and where in the figures the values stand.
 
-Rule: base units; no label names a frame, a job or a process, so the rows do not grow with the run. Gauges are of the
-last seconds (`WINDOW_NS` of live_figures.py), histograms and counters of the whole run. docs/metrics.md has the same.
+Rule: base units; no label names a frame, a job or a process's number, so the rows do not grow with the run. Gauges are
+of the last seconds (`WINDOW_NS` of live_figures.py), histograms and counters of the whole run. docs/metrics.md has the
+same table.
 """
 
 from __future__ import annotations
@@ -185,6 +186,14 @@ GAUGES = (
         ("place",),
         lambda f: [((place,), value) for place, value in f.temperature_c.items()],
         "temperature_c",
+    ),
+    Metric(
+        "trilane_memory_bytes",
+        "bytes",
+        "Memory in use of the process of each unit and of the scheduler.",
+        ("process",),
+        lambda f: [((name,), value) for name, value in f.memory_bytes.items()],
+        "memory_bytes",
     ),
     Metric(
         "trilane_avatar_psnr_decibels",

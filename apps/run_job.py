@@ -125,7 +125,12 @@ def run_to_folder(
         job = _Job(checked, plan, hooks, starter, watched)
         result = job.run(
             folder.work,
-            {"config": config_facts(checked.config, plan.policy, plan.edge), "machine": machine, "made": made},
+            {
+                "config": config_facts(checked.config, plan.policy, plan.edge),
+                "machine": machine,
+                "made": made,
+                "accuracy": dict(checked.accuracy),
+            },
         )
         with Interrupts() as late:  # from here on a signal waits until the folder is whole
             baseline, stopped = job.run_baseline(folder.work) if _is_complete(result) else (None, False)

@@ -36,7 +36,8 @@ EXPECTED = "the journal of a run"
 class Begun(NamedTuple):
     """The first record. `facts`: what else is known before the first frame, as JSON: `clock` ("host" or "virtual"),
 
-    `began_at` (UTC, ISO 8601), `config`, `machine`, `made`, `units`, as in report.json, where they are known.
+    `began_at` (UTC, ISO 8601), `config`, `machine`, `made`, `accuracy`, `units`, as in report.json, where they are
+    known.
     """
 
     schema: int

@@ -161,7 +161,7 @@ class JournaledRun:
         if ledger.left_out != self._left_out:
             self._left_out = ledger.left_out
             add(Counted(now_ns, ledger.lost_by_cause, ledger.dropped_by_cause))
-        if now_ns >= self._flush_ns:
+        if now_ns >= self._flush_ns or core.outcome is not None:
             self._sample(now_ns, core)
 
     def say(self, text: str) -> None:

@@ -169,6 +169,9 @@ def _frames(figures: Figures) -> str:
         lines.append(f"temperature, C: {heat}")
     if figures.duty:
         lines.append(f"duty: {_listed((unit, f'{share:.0%}') for unit, share in figures.duty.items())}")
+    if figures.memory_bytes:
+        memory = _listed((name, f"{value / MIB:.0f}") for name, value in figures.memory_bytes.items())
+        lines.append(f"memory, MiB: {memory}")
     return "\n".join(lines)
 
 

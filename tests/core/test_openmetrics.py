@@ -46,7 +46,7 @@ def run(frames: int, frame_ms: int = 20) -> LiveFigures:
         figures.add(Stepped(t + 15 * MS, (JobDone("v", 2 * frame + 1, t + 5 * MS, t + 15 * MS, 0),), ()))
         figures.add(Accounted(t + 15 * MS, "v", STARVED))
     figures.add(Counted(0, {"died:v": 2}, {"a->b:stale": 3, "source->a:late": 4}))
-    figures.add(Sampled(0, {"temperature_c.sensor": 61.5, "duty.v": 0.25}))
+    figures.add(Sampled(0, {"temperature_c.sensor": 61.5, "duty.v": 0.25, "memory_bytes.v": 5e6}))
     figures.add(Ended(frames * frame_ms * MS, {}))
     return figures
 
@@ -109,6 +109,7 @@ def test_counters_and_gauges_by_hand() -> None:
         ("trilane_unit_duty_ratio", {"unit": "v"}, 0.25),
         ("trilane_unit_up", {"unit": "v"}, 1),
         ("trilane_temperature_celsius", {"place": "sensor"}, 61.5),
+        ("trilane_memory_bytes", {"process": "v"}, 5e6),
         ("trilane_avatar_psnr_decibels", {"avatar": "default", "band": "face"}, 28.3),
         ("trilane_avatar_mask_iou_ratio", {"avatar": "default"}, 0.98),
         ("trilane_avatar_error_known", {"avatar": "default"}, 1),

@@ -46,7 +46,10 @@ def told_journal() -> tuple[Begun, list[Record]]:
         Stepped(t + 20 * MS, (done(0, "u", 0, 20, sampled=2),), (job(1, "a", 1), job(2, "b", 0))),
         Accounted(t + 20 * MS, "v", ASSIGNED),
         worked("a", 0, 0, 20, bytes_written=100.0, visible=1.0),
-        Sampled(t + 30 * MS, {"temperature_c.device": 31.5, "duty.u": 0.5, "temperature_c.sensor": 60.0, "load": 3.0}),
+        Sampled(
+            t + 30 * MS,
+            {"temperature_c.device": 31.5, "duty.u": 0.5, "temperature_c.sensor": 60.0, "memory_bytes.u": 2e6},
+        ),
         Stepped(t + 40 * MS, (done(2, "v", 20, 40),), ()),
         Accounted(t + 40 * MS, "v", STARVED),
         worked("b", 0, 20, 40, bytes_read=100.0, bytes_written=7.0),
