@@ -27,7 +27,7 @@ from trilane.scheduler.accounts import compared, second_accounts
 from trilane.scheduler.events import Graph, Settings, chain
 from trilane.scheduler.policy import POLICIES
 from trilane.scheduler.release import run_settings
-from trilane.scheduler.virtual import simulate
+from trilane.scheduler.virtual import Simulation, simulate
 from trilane.unexpected_value import UnexpectedValue
 from trilane.units import AFTER_INFER, BEFORE_INFER, INFER, LATENCY_TO, UNITS, UnitName
 
@@ -36,6 +36,8 @@ PACKED_BYTES_PER_PIXEL = 16
 #: Frames of a simulated run: for shares of time, for a frame time alone, and where dropped frames vary the intervals.
 FRAMES, QUICK_FRAMES, FRAMES_WITH_DROPS = 192, 12, 480
 NS_PER_MS = 1_000_000
+#: Stage, unit and nanoseconds of a job, in data-flow order.
+StageTimes = tuple[tuple[str, UnitName, int], ...]
 LEAST_FPS, MOST_FPS = 1e-3, 1000.0  # as of a scene
 
 
@@ -199,9 +201,7 @@ def application_graph(edge: str = "double", infer: Iterable[tuple[str, str]] = (
 
 
 @lru_cache(maxsize=4096)
-def _settled(
-    times: tuple[tuple[str, UnitName, int], ...], variant: Variant, display_ns: int, quick: bool, twice: bool
-) -> tuple[Any, bool]:
+def _settled(times: StageTimes, variant: Variant, display_ns: int, quick: bool, twice: bool) -> tuple[Any, bool]:
     """The report of a run, and whether the display limits its rate.
 
     `times`: stage, unit and nanoseconds of a job.
@@ -211,16 +211,18 @@ def _settled(
     the buffers fill first, and meanwhile frames come faster.
     `twice`: whether the report has `accounts`, its shares of time computed a second time.
     """
-    graph = chain(((name, unit) for name, unit, _ in times), variant.edge, LATENCY_TO)
-    service = {name: ns for name, _, ns in times}
-    paced = POLICIES[variant.policy].paced
-    regular = variant.edge in ("single", "double") and not paced
-    short = quick and variant.edge == "single"
-    frames = (QUICK_FRAMES if short else FRAMES) if regular else FRAMES_WITH_DROPS
-    report = _run(graph, settings_of(variant, frames, display_ns), service, twice)
-    if paced or report["frame_time_ms"]["mean"] * NS_PER_MS >= display_ns:
+    frames = _frames_of(variant, quick)
+    report = _report(times, variant, settings_of(variant, frames, display_ns), twice)
+    if POLICIES[variant.policy].paced or report["frame_time_ms"]["mean"] * NS_PER_MS >= display_ns:
         return report, False
-    return _run(graph, settings_of(variant, frames, display_ns, held=True), service, twice), True
+    return _report(times, variant, settings_of(variant, frames, display_ns, held=True), twice), True
+
+
+def _frames_of(variant: Variant, quick: bool) -> int:
+    """How many frames are simulated. `quick`: as of `_settled`."""
+    if variant.edge not in ("single", "double") or POLICIES[variant.policy].paced:
+        return FRAMES_WITH_DROPS
+    return QUICK_FRAMES if quick and variant.edge == "single" else FRAMES
 
 
 def settings_of(variant: Variant, frames: int, display_ns: int, *, held: bool = False) -> Settings:
@@ -233,15 +235,50 @@ def settings_of(variant: Variant, frames: int, display_ns: int, *, held: bool = 
     return run_settings(variant.policy, frames, scene_period_ns, display_ns if held else 0)
 
 
-def _run(graph: Graph, settings: Settings, service: Mapping[str, int], twice: bool) -> Any:
+def _report(times: StageTimes, variant: Variant, settings: Settings, twice: bool) -> Any:
+    done = _simulated(times, variant, settings, keep=twice)
+    if done.recording is not None:
+        done.report["accounts"] = compared(done.report["units"], second_accounts(done.recording, done.jobs))
+    return done.report
+
+
+def _simulated(times: StageTimes, variant: Variant, settings: Settings, *, keep: bool) -> Simulation:
+    """A run of jobs that take `times`. Raises BadInputError for an unknown edge."""
+    service = {name: ns for name, _, ns in times}
     try:
-        done = simulate(graph, settings, lambda stage, _unit, _frame, _begin: service[stage], keep=twice)
-        if done.recording is not None:
-            done.report["accounts"] = compared(done.report["units"], second_accounts(done.recording, done.jobs))
-        return done.report
+        graph = chain(((name, unit) for name, unit, _ in times), variant.edge, LATENCY_TO)
+        return simulate(graph, settings, lambda stage, _unit, _frame, _begin: service[stage], keep=keep)
     except ValueError as error:
         expected = error.expected if isinstance(error, UnexpectedValue) else str(error)
-        raise BadInputError("edge", repr(graph.edges[0]), expected) from None
+        raise BadInputError("edge", repr(variant.edge), expected) from None
+
+
+def simulated(profile: Profile, plan: Plan, corners: Corners) -> Simulation:
+    """The run in virtual time from which `steady` has its figures, with its recording and its jobs.
+
+    `profile`, `plan`, `corners`: as of `steady`.
+    """
+    times, display_ns = _rounded(profile, plan, corners), _display_ns(profile, plan)
+    _, held = _settled(times, plan.variant, display_ns, quick=False, twice=True)
+    settings = settings_of(plan.variant, _frames_of(plan.variant, quick=False), display_ns, held=held)
+    return _simulated(times, plan.variant, settings, keep=True)
+
+
+def _rounded(profile: Profile, plan: Plan, corners: Corners) -> StageTimes:
+    """What a job of each stage takes, of units as the scheduler sees them."""
+    worker = workers_of(profile)
+    times = stage_times_ms(profile, plan, corners)
+    return tuple((name, worker[unit], round(ms * NS_PER_MS)) for (name, unit), ms in times.items())
+
+
+def _display_ms(profile: Profile, plan: Plan) -> float:
+    """The shortest time between two shown frames."""
+    return max(profile.application.display_ms.or_else(0), 1e3 / (plan.most_fps or math.inf))
+
+
+def _display_ns(profile: Profile, plan: Plan) -> int:
+    """The shortest time between two jobs that are shown."""
+    return round(plan.variant.batch * _display_ms(profile, plan) * NS_PER_MS)
 
 
 def steady(profile: Profile, plan: Plan, corners: Corners, *, quick: bool = False, twice: bool = False) -> Steady:
@@ -254,14 +291,10 @@ def steady(profile: Profile, plan: Plan, corners: Corners, *, quick: bool = Fals
     include filling and draining.
     `twice`: whether to compute the shares of time a second time.
     """
-    times = stage_times_ms(profile, plan, corners)
-    worker = workers_of(profile)
-    rounded = tuple((name, worker[unit], round(ms * NS_PER_MS)) for (name, unit), ms in times.items())
-    batch, display = (
-        plan.variant.batch,
-        max(profile.application.display_ms.or_else(0), 1e3 / (plan.most_fps or math.inf)),
-    )
-    report, capped = _settled(rounded, plan.variant, round(batch * display * NS_PER_MS), quick, twice)
+    times, worker = stage_times_ms(profile, plan, corners), workers_of(profile)
+    batch, display = plan.variant.batch, _display_ms(profile, plan)
+    rounded = _rounded(profile, plan, corners)
+    report, capped = _settled(rounded, plan.variant, _display_ns(profile, plan), quick, twice)
     shares = {unit: _shares(unit, worker, times, report["units"]) for unit in UNITS}
     frame = max(report["frame_time_ms"]["mean"], *times.values()) / batch
     return Steady(

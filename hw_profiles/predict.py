@@ -18,6 +18,7 @@ from trilane.hw_profiles.application import (
     Variant,
     isolated_job_time,
     relative_error,
+    simulated,
     steady,
 )
 from trilane.hw_profiles.application_rates import (
@@ -48,6 +49,7 @@ from trilane.hw_profiles.timeline import caps_of, ends_of, settled_corners, temp
 from trilane.scheduler.placement import Ranked
 from trilane.scheduler.policy import POLICIES
 from trilane.scheduler.stats import energy_score
+from trilane.scheduler.virtual import Simulation
 from trilane.units import SUSTAINED, UNITS, UnitName
 
 #: Rows of `what_if`: name, how the stages are joined, share of the network on the GPU. All have frames as often as the
@@ -82,11 +84,7 @@ def predict(
     `wanted`: a rate, to which the application is held, and a limit of power.
     Raises BadInputError for an unknown name or a time out of range.
     """
-    corners = corners_of(profile, performance_profile)
-    placed = place_units(profile, plan, corners, host_cores(usable_cores())) if profile.name == HOST else None
-    if placed is not None:
-        profile = on_cores(profile, placed.best.placement)
-    plan = held_to(plan, wanted.fps)
+    profile, plan, corners, placed = _settled_on(profile, plan, performance_profile, wanted)
     now = steady(profile, plan, corners, twice=True)
     moments = over_time(profile, plan, performance_profile, minutes, governor) if minutes else []
     frame = _mean([m.frame_ms for m in moments]) if moments else now.frame_ms
@@ -122,6 +120,28 @@ def predict(
         **({} if placed is None else {"placement": placed.facts}),
         "notes": _notes(profile, plan.variant, placed),
     }
+
+
+def predicted_run(
+    profile: Profile, plan: Plan, performance_profile: str = SUSTAINED, wanted: Wanted = NOTHING
+) -> Simulation:
+    """The run in virtual time, at constant temperature, from which `predict` has its shares of time; as that raises.
+
+    `profile`, `plan`, `performance_profile`, `wanted`: as of `predict`.
+    """
+    profile, plan, corners, _ = _settled_on(profile, plan, performance_profile, wanted)
+    return simulated(profile, plan, corners)
+
+
+def _settled_on(
+    profile: Profile, plan: Plan, performance_profile: str, wanted: Wanted
+) -> tuple[Profile, Plan, Corners, Placed | None]:
+    """The chip, of this machine with its units on cores; the plan at its rate; the corners; how units were placed."""
+    corners = corners_of(profile, performance_profile)
+    placed = place_units(profile, plan, corners, host_cores(usable_cores())) if profile.name == HOST else None
+    if placed is not None:
+        profile = on_cores(profile, placed.best.placement)
+    return profile, held_to(plan, wanted.fps), corners, placed
 
 
 def _notes(profile: Profile, variant: Variant, placed: Placed | None) -> list[str]:

@@ -7,6 +7,7 @@ Rule: nothing is computed here; what the pipelines are is read by `trilane.apps.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence, Set
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from trilane.hw_profiles.application import Variant
+    from trilane.hw_profiles.beside import Tenant
+    from trilane.hw_profiles.schema import Profile
 
 SceneToPredict = Annotated[
     str | None,
@@ -33,7 +36,19 @@ TurnsOption = Annotated[
     str, typer.Option(help="Whose job a unit takes that several pipelines wait for: round-robin or deadline.")
 ]
 #: Options that mean something beside a scene.
-USED = {"scene", "beside", "turns", "profile", "minutes", "policy", "edge", "performance_profile", "governor", "json"}
+USED = {
+    "scene",
+    "beside",
+    "turns",
+    "profile",
+    "minutes",
+    "policy",
+    "edge",
+    "performance_profile",
+    "governor",
+    "trace",
+    "json",
+}
 
 
 class OnChip(NamedTuple):
@@ -54,10 +69,17 @@ class Joined(NamedTuple):
 
 
 def predict_pipelines(
-    scene: str | None, beside: Sequence[str], typed: Set[str], on: OnChip, joined: Joined, as_json: bool
+    scene: str | None,
+    beside: Sequence[str],
+    typed: Set[str],
+    on: OnChip,
+    joined: Joined,
+    trace: Path | None,
+    as_json: bool,
 ) -> None:
     """Print how `scene` and the pipelines `beside` it do on one chip. `typed`: the options that the command line has.
 
+    `trace`: where to write the simulated runs.
     Raises BadInputError for options that do not go with a scene and for what is wrong in one of them.
     """
     from trilane.apps.beside import tenants
@@ -76,10 +98,30 @@ def predict_pipelines(
     with spinner("predicting"):
         found = tenants([scene, *beside], variant)
         answer = predict_beside(chip, found, on.performance_profile, on.minutes, on.governor, joined.turns)
+        if trace is not None:
+            _write_trace(chip, found, on.performance_profile, joined.turns, answer, trace)
     if as_json:
         print_json(answer)
         return
     _show(answer)
+
+
+def _write_trace(
+    chip: Profile,
+    found: Sequence[Tenant],
+    performance_profile: str,
+    turns: str,
+    answer: Mapping[str, Any],
+    target: Path,
+) -> None:
+    """The simulated runs of the pipelines as one trace."""
+    from trilane.apps.tracing.files import write_predicted
+    from trilane.hw_profiles.beside import together
+    from trilane.hw_profiles.performance_profiles import corners_of
+
+    runs = together(chip, found, corners_of(chip, performance_profile), turns, twice=True).runs
+    named = {tenant.name: run for tenant, run in zip(found, runs, strict=True)}
+    write_predicted(named, {key: answer[key] for key in ("machine", "config")}, target)
 
 
 def _variant(policy: str, edge: str | None) -> Variant:

@@ -43,6 +43,7 @@ Examples:
   trilane predict --policy latest --fps 24
   trilane predict --performance-profile burst --minutes 30 --plot temperature.svg
   trilane predict --avatar default --runtime gpu
+  trilane predict --policy latest --fps 24 --trace predicted.pftrace
   trilane predict --network midas.onnx --network unet.onnx --profile snapdragon-8-gen-3
   trilane predict --network net.onnx --input-shape image=1x3x224x224 --precision w8a8
   trilane predict --network net.onnx --engine-runtime qnn_dlc --performance-profile sustained_high_performance
@@ -55,14 +56,14 @@ Examples:
 PLOT_MINUTES = 30.0
 HOST = "host"
 OF_A_FILE = {"encoder", "norm", "size", "channels"}
-OF_THE_APPLICATION = {"layout", "policy", "edge", "batch", "gpu_share", "what_if", "plot"}
+OF_THE_APPLICATION = {"layout", "policy", "edge", "batch", "gpu_share", "what_if", "plot", "trace"}
 #: Option: those that have no effect beside it.
 IGNORED = {
     "avatar": OF_A_FILE | {"input_shape"},
     "network": OF_A_FILE | {"avatar"},
     "table": OF_A_FILE
     | {"layout", "avatar", "network", "application", "runtime", "minutes", "gpu_share", "governor", "what_if", "plot"}
-    | {"fps", "power_limit_w", "precision", "input_shape"},
+    | {"fps", "power_limit_w", "precision", "input_shape", "trace"},
 }
 WHY_IGNORED = {
     "avatar": "the avatar's network says so itself",
@@ -119,6 +120,9 @@ WhatIfOption = Annotated[
     bool, typer.Option("--what-if", help="Compare policies and edges for the same network, at --fps all.")
 ]
 PlotOption = Annotated[Path | None, typer.Option(help="Draw frame rate and temperature here (.png, .svg, .pdf).")]
+TraceOption = Annotated[
+    Path | None, typer.Option("--trace", help="Write the simulated run here, for ui.perfetto.dev (docs/trace.md).")
+]
 TableOption = Annotated[Path | None, typer.Option(help="CSV of configurations: one answer per row.")]
 
 
@@ -152,6 +156,7 @@ def predict(
     governor: GovernorOption = None,
     what_if: WhatIfOption = False,
     plot: PlotOption = None,
+    trace: TraceOption = None,
     table: TableOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -174,7 +179,7 @@ def predict(
     _check_governor(governor)
     if scene is not None or beside:
         chip_at = OnChip(profile, performance_profile, minutes, governor)
-        predict_pipelines(scene, beside or [], given(ctx), chip_at, Joined(policy, edge, turns), json)
+        predict_pipelines(scene, beside or [], given(ctx), chip_at, Joined(policy, edge, turns), trace, json)
         return
     wanted, shapes = _wanted(fps, power_limit_w), _shapes(input_shape or [], len(networks))
     chip, variant = load_runnable(profile), _variant(policy, edge, batch, fps)
@@ -192,6 +197,8 @@ def predict(
     answer = _answer(chip, plan, performance_profile, minutes, governor, what_if, wanted)
     if plot is not None:
         draw(chip, plan, performance_profile, minutes or PLOT_MINUTES, governor, plot)
+    if trace is not None:
+        _write_trace(chip, plan, performance_profile, wanted, answer, trace)
     show_answer(answer, json)
 
 
@@ -363,6 +370,17 @@ def _answer(
     if what_if:
         answer["alternatives"] = predictions.what_if(chip, plan.network, plan.runtime, performance_profile, wanted.fps)
     return answer
+
+
+def _write_trace(
+    chip: Profile, plan: Plan, performance_profile: str, wanted: Wanted, answer: dict[str, Any], target: Path
+) -> None:
+    """The simulated run that the prediction has its shares of time from, as a trace."""
+    from trilane.apps.tracing.files import write_predicted
+    from trilane.hw_profiles.predict import predicted_run
+
+    done = predicted_run(chip, plan, performance_profile, wanted)
+    write_predicted({chip.name: done}, {key: answer[key] for key in ("machine", "config")}, target)
 
 
 def _predict_table(chip: Profile, path: Path, performance_profile: str, variant: Variant) -> list[dict[str, Any]]:
