@@ -24,6 +24,7 @@ COUNTED: Final = {
     "bytes_written": ("bytes written", "B"),
     "bytes_uploaded": ("bytes uploaded", "B"),
     "bytes_read_back": ("bytes read back", "B"),
+    "bytes_least": ("bytes needed", "B"),
     "instructions": ("instructions", ""),
     "cache_misses": ("cache misses", ""),
 }

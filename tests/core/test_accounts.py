@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+import io
 import random
 from collections import defaultdict
-from pathlib import Path
 from typing import Any
 
 import pytest
-from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace, TrackEvent
 
-from trilane.apps.trace import write_trace
+from trilane.apps.tracing.writer import write_trace
 from trilane.bench.accounts import measure, virtual_run
 from trilane.errors import BadInputError
-from trilane.scheduler.accounts import LARGEST_DIFFERENCE, compared, idle_slices, second_accounts
+from trilane.pipeline.journal import journal_of
+from trilane.scheduler.accounts import LARGEST_DIFFERENCE, compared, second_accounts
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import (
     Dispatch,
@@ -31,6 +31,7 @@ from trilane.scheduler.events import (
 from trilane.scheduler.ledger import STARVED, JobRecord
 from trilane.scheduler.recording import Recording
 from trilane.scheduler.virtual import Simulation, simulate
+from trilane.testing.trace_reading import ReadTrace, read_trace
 
 MS = 1_000_000
 SERVICE = {"a": 2, "b": 5}
@@ -246,16 +247,18 @@ def test_both_computations_agree_in_random_runs(seed: int) -> None:
         assert sum(report["accounts"]["units"][unit].values()) == pytest.approx(1, abs=1e-12)
 
 
-def test_the_slices_of_the_trace_file_add_up_to_the_report(tmp_path: Path) -> None:
+def test_the_slices_of_the_trace_file_add_up_to_the_report() -> None:
     """The file is read as any program would: the length of each slice, under its name, on its unit's track."""
     done = run("double", faults=[(9 * MS, "v")], restart_ns=20 * MS, message_delay_ns=MS // 2)
     assert done.recording is not None
     lost = (MS // 8, MS // 16, MS // 4)  # a unit in virtual time loses nothing: put in by hand
     jobs = [job._replace(preempted_ns=lost[0], asleep_ns=lost[1], preempted_before_ns=lost[2]) for job in done.jobs]
-    path = tmp_path / "trace.pftrace"
-    write_trace(jobs, ("u", "v"), path, idle_slices(done.recording, jobs))
+    file = io.BytesIO()
+    write_trace(journal_of(done.recording, jobs, {"clock": "virtual"}, {}), file)
+    trace = read_trace(file.getvalue())
     expected = second_accounts(done.recording, jobs)
-    for unit, row in added_up(path).items():
+    for unit in ("u", "v"):
+        row = added_up(trace, unit)
         total = sum(row.values())
         assert total == round(done.report["duration_s"] * 1e9)
         assert {cause: ns / total for cause, ns in row.items()} == pytest.approx(
@@ -263,28 +266,15 @@ def test_the_slices_of_the_trace_file_add_up_to_the_report(tmp_path: Path) -> No
         )
 
 
-def added_up(path: Path) -> dict[str, dict[str, int]]:
-    """ns by unit and name, from the slices of a trace file; they do not overlap on a track."""
-    trace = Trace()
-    trace.ParseFromString(path.read_bytes())
-    names = {p.track_descriptor.uuid: p.track_descriptor.name for p in trace.packet if p.HasField("track_descriptor")}
-    sums: dict[str, dict[str, int]] = defaultdict(lambda: defaultdict(int))
-    begun: dict[int, Any] = {}
-    for packet in trace.packet:
-        event = packet.track_event
-        if event.type == TrackEvent.TYPE_SLICE_BEGIN:
-            assert event.track_uuid not in begun
-            begun[event.track_uuid] = packet
-        elif event.type == TrackEvent.TYPE_SLICE_END:
-            begin = begun.pop(event.track_uuid)
-            notes = {note.name: note.int_value for note in begin.track_event.debug_annotations}
-            row, name = sums[names[event.track_uuid]], begin.track_event.name
-            lost_ns = notes.get("preempted_ns", 0) + notes.get("asleep_ns", 0)
-            row["busy" if name in SERVICE else name] += packet.timestamp - begin.timestamp - lost_ns
-            row["preempted"] += notes.get("preempted_ns", 0)
-            row["overhead"] += notes.get("asleep_ns", 0)
-    assert not begun
-    return {unit: {name: ns for name, ns in row.items() if ns} for unit, row in sums.items()}
+def added_up(trace: ReadTrace, unit: str) -> dict[str, int]:
+    """ns by name, from the slices of a unit's track."""
+    row: dict[str, int] = defaultdict(int)
+    for piece in trace.of(f"clock/{unit}"):
+        preempted_ns, asleep_ns = piece.notes.get("preempted_ns", 0), piece.notes.get("asleep_ns", 0)
+        row["preempted"] += preempted_ns
+        row["overhead"] += asleep_ns
+        row["busy" if piece.name in SERVICE else piece.name] += piece.end_ns - piece.begin_ns - preempted_ns - asleep_ns
+    return {name: ns for name, ns in row.items() if ns}
 
 
 # One of the two computations is wrong: the comparison shows it.

@@ -1,4 +1,4 @@
-"""The run folder, the trace and the report of a run, made from a run written by hand."""
+"""The run folder and the report of a run, made from a run written by hand."""
 
 from __future__ import annotations
 
@@ -10,26 +10,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace, TrackDescriptor, TrackEvent
 
 from trilane.apps import report as report_module
 from trilane.apps import run_folder
 from trilane.apps.report import Report, read_report, write_report
 from trilane.apps.report_sources import NO_FIGURES_UNDER, sources_of
 from trilane.apps.run_folder import RunFolder, default_place
-from trilane.apps.trace import write_trace
 from trilane.errors import BadInputError
 from trilane.figure_sources import COMPARED, COMPUTED, MEASURED
-from trilane.scheduler.accounts import IdleSlice
-from trilane.scheduler.ledger import JobRecord
 from trilane.testing.run_report import SHARE, SHOWN, make_report
 from trilane.writing import WRITABLE
-
-JOBS = (
-    JobRecord("pose", "cpu", 0, 1_000, 1_500, 2_000, 3_000),
-    JobRecord("raster", "gpu", 0, 3_000, 3_500, 4_000, 9_000),
-    JobRecord("pose", "cpu", 1, 3_000, 3_000, 4_000, 5_000),
-)
 
 
 def test_a_folder_has_its_name_once_it_is_complete(tmp_path: Path) -> None:
@@ -126,76 +116,6 @@ def test_a_parent_that_others_use_by_then_stays(tmp_path: Path) -> None:
         (tmp_path / "a" / "other").touch()
         raise KeyError
     assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")] == ["a", "a/other"]
-
-
-def test_the_trace_has_a_track_per_unit_and_a_flow_per_frame(tmp_path: Path) -> None:
-    write_trace(JOBS, ("cpu", "gpu", "dsp"), tmp_path / "trace.pftrace")
-    trace = Trace()
-    trace.ParseFromString((tmp_path / "trace.pftrace").read_bytes())
-    tracks = {p.track_descriptor.uuid: p.track_descriptor.name for p in trace.packet if p.HasField("track_descriptor")}
-    assert sorted(tracks.values()) == ["cpu", "gpu", "trilane"]
-    begins = [p for p in trace.packet if p.track_event.type == TrackEvent.TYPE_SLICE_BEGIN]
-    ends = [p for p in trace.packet if p.track_event.type == TrackEvent.TYPE_SLICE_END]
-    found = {
-        (p.track_event.name, tracks[p.track_event.track_uuid], p.timestamp, tuple(p.track_event.flow_ids))
-        for p in begins
-    }
-    assert found == {("pose", "cpu", 2_000, (1,)), ("raster", "gpu", 4_000, (1,)), ("pose", "cpu", 4_000, (2,))}
-    assert sorted(p.timestamp for p in ends) == [3_000, 5_000, 9_000]
-
-
-def test_tracks_are_in_the_order_of_the_units_of_the_graph(tmp_path: Path) -> None:
-    jobs = [JOBS[0]._replace(unit="npu"), JOBS[1]]
-    write_trace(jobs, ("npu", "isp", "gpu"), tmp_path / "trace.pftrace")
-    trace = Trace()
-    trace.ParseFromString((tmp_path / "trace.pftrace").read_bytes())
-    tracks = [p.track_descriptor for p in trace.packet if p.HasField("track_descriptor")]
-    assert [(track.name, track.sibling_order_rank) for track in tracks[1:]] == [("npu", 0), ("gpu", 2)]
-
-
-def test_every_packet_of_a_trace(tmp_path: Path) -> None:
-    """The process is track 1, units follow in their order; a wait is in us, and flows begin at 1."""
-    jobs = [
-        JobRecord("raster", "gpu", 4, 10_000, 15_000, 22_999, 30_000, 700, 80),
-        JobRecord("pose", "cpu", 5, 40_000, 40_000, 40_000, 41_000),
-    ]
-    idle = [
-        IdleSlice("gpu", "blocked", 30_000, 36_000, 500),
-        IdleSlice("cpu", "starved", 0, 40_000),
-        IdleSlice("dsp", "starved", 0, 9),
-    ]
-    write_trace(jobs, ("dsp", "gpu", "npu", "cpu"), tmp_path / "trace", idle)
-    trace = Trace()
-    trace.ParseFromString((tmp_path / "trace").read_bytes())
-    tracks = [p.track_descriptor for p in trace.packet if p.HasField("track_descriptor")]
-    assert [(t.uuid, t.parent_uuid, t.name, t.sibling_order_rank) for t in tracks] == [
-        (1, 0, "trilane", 0),
-        (3, 1, "gpu", 1),
-        (5, 1, "cpu", 3),
-    ]
-    assert tracks[0].child_ordering == TrackDescriptor.EXPLICIT
-    packets = [p for p in trace.packet if p.HasField("track_event")]
-    assert len(packets) + len(tracks) == len(trace.packet)
-    assert {p.trusted_packet_sequence_id for p in packets} == {1}  # 0 is none
-    begin, end = TrackEvent.TYPE_SLICE_BEGIN, TrackEvent.TYPE_SLICE_END
-    found = [
-        (
-            *(p.timestamp, p.track_event.type, p.track_event.track_uuid, p.track_event.name),
-            {note.name: note.int_value for note in p.track_event.debug_annotations},
-            list(p.track_event.flow_ids),
-        )
-        for p in packets
-    ]
-    assert found == [
-        (0, begin, 5, "starved", {}, []),
-        (40_000, end, 5, "", {}, []),
-        (22_999, begin, 3, "raster", {"frame": 4, "wait_us": 12, "preempted_ns": 700, "asleep_ns": 80}, [5]),
-        (30_000, end, 3, "", {}, []),
-        (30_000, begin, 3, "blocked", {"preempted_ns": 500}, []),
-        (36_000, end, 3, "", {}, []),
-        (40_000, begin, 5, "pose", {"frame": 5, "wait_us": 0}, [6]),
-        (41_000, end, 5, "", {}, []),
-    ]
 
 
 def test_a_report_is_read_back_from_its_folder(tmp_path: Path) -> None:

@@ -112,7 +112,7 @@ RUNS: dict[str, dict[str, Any]] = {
         "period_ns": 7 * MS,
         "deadline_ns": 21 * MS,
     },
-    "queue": {"period_ns": 5 * MS, "deadline_ns": 50 * MS, "in_queue": 3, "queue_timeout_ns": 31 * MS},
+    "queue": {"period_ns": 5 * MS, "deadline_ns": 40 * MS, "in_queue": 3, "queue_timeout_ns": 31 * MS},
     "asked": {"asked": True, "inputs": [(at * MS, FrameRequest(3)) for at in range(0, 200, 10)]},
     "stopped": {"inputs": [(130 * MS, Stop())]},
     "aborted": {"inputs": [(130 * MS, Abort())]},
@@ -296,6 +296,14 @@ def test_without_deadlines_a_frame_is_late_by_the_rate_of_its_scene() -> None:
     assert [(one.begin_ns, one.end_ns) for one in expected] == [(end, end + period_ns) for end in ends[:-1]]
     assert [one.name.startswith("late") for one in actual[1:]] == [b - a > period_ns for a, b in pairwise(ends)]
     assert sum(one.name.startswith("late") for one in actual) == 39
+
+
+@pytest.mark.parametrize("name", ["latest", "deadline", "bypass and drops", "queue"])
+def test_late_frames_are_those_that_the_report_counts(name: str) -> None:
+    done = run_named(name)
+    frames = trace_of(records_of(done)).of("Actual frames")
+    assert len(frames) == done.report["frames"]["presented"]
+    assert sum(one.name.startswith("late") for one in frames) == done.report["deadline_misses"]
 
 
 def test_a_killed_run_ends_where_its_journal_does() -> None:
