@@ -7,7 +7,7 @@ is overhead.
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -17,14 +17,16 @@ from trilane.scheduler.events import JobDone
 from trilane.scheduler.ledger import STARVED
 
 ASSIGNED = "assigned"
+PARTS = (ASSIGNED, *NAMES.values(), BUSY, PREEMPTED)
 
 
 class Span(NamedTuple):
-    """A piece of time, and how many ns of it count as what."""
+    """A piece of time of which `ns` count as `name`; where in it they lie is not known."""
 
     begin_ns: int
     end_ns: int
-    parts: tuple[tuple[str, int], ...]
+    name: str
+    ns: int
 
 
 class UnitTime:
@@ -35,66 +37,58 @@ class UnitTime:
         self._state, self._since_ns = _name(account), begin_ns
         self._last_end_ns = 0
         self._spans: deque[Span] = deque()
-        self._totals: Counter[str] = Counter()
+        self._totals = dict.fromkeys(PARTS, 0)
 
     def enter(self, now_ns: int, account: int) -> None:
         """From `now_ns` on its time goes to `account`."""
-        self._keep(self._open(now_ns))
+        self._keep(self._since_ns, now_ns, self._state, now_ns - self._since_ns)
         self._state, self._since_ns = _name(account), now_ns
 
     def add_job(self, job: JobDone) -> None:
         """A job has ended; what was lost of the time before it was lost while the unit had it and did no other."""
         begin_ns, end_ns = job.t_begin_ns, job.t_end_ns
         held_from_ns = max(self._last_end_ns, self._since_ns)
-        if begin_ns > held_from_ns and job.preempted_before_ns:
-            lost_ns = min(job.preempted_before_ns, begin_ns - held_from_ns)
-            self._keep(Span(held_from_ns, begin_ns, ((PREEMPTED, lost_ns),)))
+        if begin_ns > held_from_ns:
+            self._keep(held_from_ns, begin_ns, PREEMPTED, min(job.preempted_before_ns, begin_ns - held_from_ns))
         if end_ns > self._last_end_ns:
             begin_ns = max(begin_ns, self._last_end_ns)
             ran_ns = end_ns - begin_ns
             self._last_end_ns = end_ns
-            busy_ns = ran_ns - min(job.preempted_ns + job.asleep_ns, ran_ns)
-            self._keep(Span(begin_ns, end_ns, ((BUSY, busy_ns), (PREEMPTED, min(job.preempted_ns, ran_ns)))))
+            self._keep(begin_ns, end_ns, BUSY, ran_ns - min(job.preempted_ns + job.asleep_ns, ran_ns))
+            self._keep(begin_ns, end_ns, PREEMPTED, min(job.preempted_ns, ran_ns))
 
     def shares(self, now_ns: int, running_since_ns: int | None) -> tuple[Shares, Shares]:
         """Of the window, and of the run. `running_since_ns`: when the job that it holds was handed to it, if any."""
-        opened = [self._open(now_ns)]
+        opened = [Span(self._since_ns, now_ns, self._state, now_ns - self._since_ns)]
         if running_since_ns is not None:
             begin_ns = min(max(running_since_ns, self._last_end_ns, self._since_ns), now_ns)
-            opened.append(Span(begin_ns, now_ns, ((BUSY, now_ns - begin_ns),)))
+            opened.append(Span(begin_ns, now_ns, BUSY, now_ns - begin_ns))
         from_ns = max(now_ns - self._window_ns, self._begin_ns)
-        window: Counter[str] = Counter()
-        run = self._totals.copy()
+        run, window = dict(self._totals), dict.fromkeys(PARTS, 0)
         for span in opened:
-            run.update(dict(span.parts))
-        for span in (*self._spans, *opened):
-            _add_clipped(window, span, from_ns, now_ns)
+            run[span.name] += span.ns
+        for begin_ns, end_ns, name, ns in (*self._spans, *opened):
+            if begin_ns >= from_ns:
+                window[name] += ns
+            elif end_ns > from_ns:
+                window[name] += ns * (end_ns - from_ns) // (end_ns - begin_ns)
         return _shares(window, now_ns - from_ns), _shares(run, now_ns - self._begin_ns)
 
-    def _open(self, now_ns: int) -> Span:
-        return Span(self._since_ns, now_ns, ((self._state, now_ns - self._since_ns),))
-
-    def _keep(self, span: Span) -> None:
-        self._totals.update(dict(span.parts))
-        self._spans.append(span)
-        while self._spans[0].end_ns < span.end_ns - self._window_ns:
-            self._spans.popleft()
+    def _keep(self, begin_ns: int, end_ns: int, name: str, ns: int) -> None:
+        if ns:
+            self._totals[name] += ns
+            self._spans.append(Span(begin_ns, end_ns, name, ns))
+            while self._spans[0].end_ns < end_ns - self._window_ns:
+                self._spans.popleft()
 
 
 def _name(account: int) -> str:
     return NAMES.get(account, ASSIGNED)
 
 
-def _add_clipped(sums: Counter[str], span: Span, from_ns: int, to_ns: int) -> None:
-    inside_ns = min(span.end_ns, to_ns) - max(span.begin_ns, from_ns)
-    if inside_ns > 0:
-        for name, ns in span.parts:
-            sums[name] += ns * inside_ns // (span.end_ns - span.begin_ns)
-
-
 def _shares(sums: Mapping[str, int], total_ns: int) -> Shares:
     if total_ns <= 0:
         return Shares(0.0, dict.fromkeys(CAUSES, 0.0))
     overhead_ns = max(sums[ASSIGNED] - sums[BUSY] - sums[PREEMPTED], 0)  # parts that were cut are rounded down
-    idle = {cause: sums[cause] / total_ns for cause in CAUSES} | {OVERHEAD: overhead_ns / total_ns}
-    return Shares(sums[BUSY] / total_ns, idle)
+    idle_ns = {**sums, OVERHEAD: overhead_ns}
+    return Shares(sums[BUSY] / total_ns, {cause: idle_ns[cause] / total_ns for cause in CAUSES})
