@@ -52,8 +52,9 @@ def asked(text: str) -> Asked:
             raise BadInputError(_where(text), "a network without a rate", FORM, remedy)
     if not what:
         raise BadInputError(_where(text), "no scene and no file", FORM)
-    number, _, unit = rate.partition(":")
-    return Asked(text, what, _rate(text, number) if at and what != text else None, _unit(text, unit))
+    number, colon, unit = rate.partition(":")
+    chosen = _unit(text, unit) if colon else INFER[1]
+    return Asked(text, what, _rate(text, number) if at and what != text else None, chosen)
 
 
 def _where(text: str) -> str:
@@ -69,9 +70,9 @@ def _rate(text: str, number: str) -> float:
 
 def _unit(text: str, asked_for: str) -> UnitName:
     for unit in RUNTIMES:
-        if unit == (asked_for or INFER[1]):
+        if unit == asked_for:
             return unit
-    raise BadInputError(_where(text), f"unit {asked_for!r}", " or ".join(RUNTIMES))
+    raise BadInputError(_where(text), f"unit {asked_for!r}", " or ".join(RUNTIMES), "without the colon it is the dsp")
 
 
 def tenants(texts: Sequence[str], variant: Variant = NEWEST) -> list[Tenant]:
@@ -105,14 +106,15 @@ def _avatar(each: Asked, name: str, variant: Variant) -> Tenant:
     scene, file = checked.config.scene, network_of(checked.assets)
     plan = ScenePlan(checked.config, checked.assets)
     plans = [plan.decide(frame).plan for frame in range(min(scene.frames, MOST_FRAMES))]
-    shapes = [one.shape if one.work is Work.FULL else None for one in plans]
-    distinct = list(dict.fromkeys(shape for shape in shapes if shape is not None)) or [_own(file.shape)]
-    networks = tuple(
-        Network({"scene": each.what}, *shape, file.shape[3], "packed", count_work(reshaped(file, *shape).model))
-        for shape in distinct
-    )
-    frames = tuple(SKIPS if shape is None else distinct.index(shape) for shape in shapes)
-    return Tenant(name, each.text, networks, frames, each.fps or scene.fps, each.unit, variant)
+    seen = [(one.shape, len(one.seen)) if one.shape and one.work is Work.FULL else None for one in plans]
+    distinct = list(dict.fromkeys(one for one in seen if one is not None)) or [(_own(file.shape), 1)]
+    by_shape = {
+        shape: Network({"scene": each.what}, *shape, file.shape[3], "packed", count_work(reshaped(file, *shape).model))
+        for shape in dict.fromkeys(shape for shape, _ in distinct)
+    }
+    networks, avatars = tuple(by_shape[shape] for shape, _ in distinct), tuple(count for _, count in distinct)
+    frames = tuple(SKIPS if one is None else distinct.index(one) for one in seen)
+    return Tenant(name, each.text, networks, frames, each.fps or scene.fps, each.unit, variant, avatars=avatars)
 
 
 def _own(shape: Sequence[int]) -> Shape:

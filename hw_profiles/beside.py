@@ -58,10 +58,11 @@ SKIPS = -1
 class Tenant:
     """A pipeline that shares the chip with others.
 
-    `name`: in reports; `source`: what was asked for. `networks`: one for each shape of its tensor. `frames`: of each
-    frame, the place of its network in `networks`, or `SKIPS`; they begin anew after the last one. `unit`: of the
-    network. `fps`: frames released a second. `variant`: how the stages are joined. `is_bare`: nothing but the network,
-    whose result is due when the next frame comes. Raises BadInputError for a unit or a rate out of range.
+    `name`: in reports; `source`: what was asked for. `networks`: one for each shape of its tensor and number of avatars
+    in view. `frames`: of each frame, the place of its network in `networks`, or `SKIPS`; they begin anew after the last
+    one. `unit`: of the network. `fps`: frames released a second. `variant`: how the stages are joined. `is_bare`:
+    nothing but the network, whose result is due when the next frame comes. `avatars`: in view where each of `networks`
+    runs; one in each if it is empty. Raises BadInputError for a unit or a rate out of range.
     """
 
     name: str
@@ -72,6 +73,7 @@ class Tenant:
     unit: UnitName = "dsp"
     variant: Variant = NEWEST
     is_bare: bool = False
+    avatars: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         if self.unit not in RUNTIMES:
@@ -96,6 +98,10 @@ class Tenant:
             return Settings(ENDLESS, policy, period_ns=period_ns, deadline_ns=period_ns, **limits)
         shown_ns = max(period_ns, display_ns)
         return run_settings(policy, ENDLESS, shown_ns, shown_ns, **limits)
+
+    def plan(self, kind: int) -> Plan:
+        """What runs in a frame whose network is the one at place `kind`."""
+        return Plan(self.networks[kind], self.unit, self.variant, avatars=self.avatars[kind] if self.avatars else 1)
 
     def kind(self, frame: int) -> int:
         """The place of the frame's network, or SKIPS."""
@@ -232,8 +238,8 @@ class _Costs:
 
     def _stages_ms(self, job: _Job, use: float) -> dict[str, float]:
         tenant = self._tenants[job.tenant]
-        plan = Plan(tenant.networks[job.kind], tenant.unit, tenant.variant)
-        times = {stage: ms for (stage, _), ms in stage_times_ms(_used(self._profile, use), plan, self._corners).items()}
+        used, plan = _used(self._profile, use), tenant.plan(job.kind)
+        times = {stage: ms for (stage, _), ms in stage_times_ms(used, plan, self._corners).items()}
         if not tenant.is_bare:
             return times
         return {INFER[0]: times[INFER[0]] - self._profile.application.handover_ms.or_else(0.0)}

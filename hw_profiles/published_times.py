@@ -10,6 +10,7 @@ Source: Qualcomm AI Hub Models, `unet_segmentation` and `resnet18`, w8a8, TFLite
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -17,34 +18,50 @@ from trilane.hw_profiles.graph_builder import GraphBuilder, TensorRef
 from trilane.hw_profiles.network_work import Work, count_work
 from trilane.hw_profiles.performance_profiles import corners_of
 from trilane.hw_profiles.reference_encoders import resnet18
-from trilane.hw_profiles.schema import Profile
+from trilane.hw_profiles.schema import EngineRuntime, Profile
 from trilane.hw_profiles.unit_times import time_on
 from trilane.units import UNITS
+
+Times = Mapping[str, Mapping[EngineRuntime, float]]
 
 UNET_SIZE = (640, 1280)
 UNET_WIDTHS = (64, 128, 256, 512, 1024)
 
-#: (network, profile): published milliseconds. Those of ResNet18 are the mean of both runtimes. The times of the 8 Gen 1
-#: were published for the QCS8450, which Qualcomm also takes for the XR2 Gen 2; those of the 8 Gen 2 for the QCS8550.
-PUBLISHED_MS = {
-    ("unet", "snapdragon-8-gen-1"): 54.1,
-    ("unet", "snapdragon-xr2-gen-2"): 55.6,
-    ("unet", "snapdragon-8-gen-2"): 34.5,
-    ("unet", "snapdragon-8-gen-3"): 26.4,
-    ("unet", "snapdragon-8-elite"): 21.6,
-    ("resnet18", "snapdragon-8-gen-1"): 0.68,
-    ("resnet18", "snapdragon-xr2-gen-2"): 0.68,
-    ("resnet18", "snapdragon-8-gen-2"): 0.47,
-    ("resnet18", "snapdragon-8-gen-3"): 0.35,
-    ("resnet18", "snapdragon-8-elite"): 0.27,
+#: Of a profile, the time of each network in ms by the engine's runtime.
+_QCS8450: Times = {"unet": {"tflite": 54.07, "qnn_dlc": 57.895}, "resnet18": {"tflite": 0.609, "qnn_dlc": 0.743}}
+#: The times of the 8 Gen 1 were published for the QCS8450, which Qualcomm also takes for the XR2 Gen 2; those of the
+#: 8 Gen 2 for the QCS8550.
+PUBLISHED_MS: dict[str, Times] = {
+    "qcs6490": {"unet": {"tflite": 267.749, "qnn_dlc": 267.845}, "resnet18": {"tflite": 1.481, "qnn_dlc": 1.811}},
+    "sa8295p": {"unet": {"tflite": 63.621, "qnn_dlc": 63.575}, "resnet18": {"tflite": 0.774, "qnn_dlc": 0.957}},
+    "snapdragon-8-gen-1": _QCS8450,
+    "snapdragon-xr2-gen-2": _QCS8450,
+    "snapdragon-8-gen-2": {
+        "unet": {"tflite": 34.543, "qnn_dlc": 34.657},
+        "resnet18": {"tflite": 0.391, "qnn_dlc": 0.548},
+    },
+    "snapdragon-x-elite": {"unet": {"qnn_dlc": 35.669}, "resnet18": {"qnn_dlc": 0.622}},
+    "snapdragon-8-gen-3": {
+        "unet": {"tflite": 26.398, "qnn_dlc": 26.4},
+        "resnet18": {"tflite": 0.293, "qnn_dlc": 0.405},
+    },
+    "snapdragon-8-elite": {
+        "unet": {"tflite": 21.567, "qnn_dlc": 21.896},
+        "resnet18": {"tflite": 0.246, "qnn_dlc": 0.299},
+    },
+    "snapdragon-8-elite-gen-5": {"unet": {"tflite": 15.895}, "resnet18": {"tflite": 0.233}},
 }
 
 
 class Check(NamedTuple):
-    """A published time beside the predicted one. `independent`: no number of the profile comes from this time."""
+    """A published time beside the predicted one, both of the same runtime.
+
+    `independent`: no number of the profile comes from this time.
+    """
 
     profile: str
     network: str
+    runtime: EngineRuntime
     independent: bool
     published_ms: float
     predicted_ms: float
@@ -90,9 +107,17 @@ WORK = {"unet": unet_work, "resnet18": resnet18_work}
 
 
 def check_published(name: str, profile: Profile) -> list[Check]:
-    """Published times of the chip `name` beside those that `profile` predicts under `burst`; none if none is known."""
+    """Published times of the chip `name` beside those that `profile` predicts under `burst`; none if none is known.
+
+    A runtime for which the profile has no numbers of the tensor engine is left out.
+    """
     unit = profile.units["dsp"]
     clock = unit.clock(corners_of(profile, "burst")[UNITS.index("dsp")])
-    known = {network: ms for (network, chip), ms in PUBLISHED_MS.items() if chip == name}
-    times = {network: time_on(unit, profile.memory, WORK[network](), clock).total_ms for network in known}
-    return [Check(name, network, False, ms, times[network]) for network, ms in known.items()]
+    checks = []
+    for network, by_runtime in PUBLISHED_MS.get(name, {}).items():
+        for runtime, ms in by_runtime.items():
+            running = unit.model_copy(update={"engine_runtime": runtime})
+            if running.engine is not None:
+                predicted = time_on(running, profile.memory, WORK[network](), clock).total_ms
+                checks.append(Check(name, network, runtime, False, ms, predicted))
+    return checks

@@ -105,11 +105,11 @@ def check(
     console.print(f"{len(profiles)} valid: {', '.join(profiles)}")
     if not latencies:
         return
-    table = Table("profile", "network", "published, ms", "predicted, ms", "error", "")
+    table = Table("profile", "network", "runtime", "published, ms", "predicted, ms", "error", "")
     for row in latencies:
         note = "" if row.independent else "among the rows of the fit"
         figures = (f"{row.published_ms:g}", f"{row.predicted_ms:.2f}", f"{100 * row.error:+.0f} %")
-        table.add_row(row.profile, row.network, *figures, note)
+        table.add_row(row.profile, row.network, row.runtime, *figures, note)
     console.print(table)
 
 

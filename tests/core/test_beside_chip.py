@@ -145,6 +145,21 @@ def test_an_avatar_alone_is_what_predict_says_of_its_network() -> None:
     assert found.frame_ms == pytest.approx(single.frame_ms, rel=1e-5)
 
 
+def test_every_avatar_in_view_is_posed_and_drawn() -> None:
+    """Three in view: three poses, the vertices of three; one tensor, one picture. Of one and three in turns, two."""
+    one, app = avatar(), CHIP.application
+    three = replace(one, name="three", avatars=(3,))
+    turns = replace(one, name="turns", networks=one.networks * 2, avatars=(1, 3), frames=(0, 1))
+    single, many, mean = (together(CHIP, [each], CORNERS).stages_ms[0] for each in (one, three, turns))
+    gpu = CHIP.units["gpu"].clock(CORNERS[1])
+    vertices_ms = app.vertices.or_else(0) * app.raster_ns_per_vertex.or_else(0) / gpu / 1e6
+    assert vertices_ms > 0.01
+    for found, more in ((many, 2), (mean, 1)):
+        assert found["pose"] == pytest.approx((1 + more) * single["pose"], abs=1e-5)
+        assert found["raster"] == pytest.approx(single["raster"] + more * vertices_ms, abs=1e-5)
+        assert all(found[stage] == single[stage] for stage in ("infer", "composite", "present"))
+
+
 def test_frames_that_show_nobody_new_skip_the_network() -> None:
     found = together(CHIP, [avatar(frames=(0, SKIPS, SKIPS))], CORNERS)
     row = found.runs[0].report
@@ -221,10 +236,13 @@ def test_pipelines_of_one_name_are_numbered() -> None:
 
 
 def test_a_scene_is_planned_frame_by_frame(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Frames of 64x96 and 32x32 with some that skip; a network for each shape, in the order in which they come."""
+    """Frames of 64x96 and 32x32 with some that skip; a network for each shape and number of avatars, as they come."""
     from trilane.scene.work import Work
 
-    works = [(Work.FULL, (64, 96)), (Work.REUSE, (64, 96)), (Work.FULL, (32, 32)), (Work.FULL, (64, 96))]
+    works = [
+        (Work.FULL, (64, 96), "a"), (Work.REUSE, (64, 96), "a"), (Work.FULL, (32, 32), "abc"),
+        (Work.FULL, (64, 96), "ab"), (Work.FULL, (64, 96), "b"),
+    ]  # fmt: skip
     scene = SimpleNamespace(frames=700, fps=24.0)
     checked: Any = SimpleNamespace(config=SimpleNamespace(scene=scene), assets="assets")
 
@@ -233,8 +251,8 @@ def test_a_scene_is_planned_frame_by_frame(monkeypatch: pytest.MonkeyPatch) -> N
             assert (config, assets) == (checked.config, "assets")
 
         def decide(self, frame: int) -> Any:
-            work, shape = works[frame % len(works)]
-            return SimpleNamespace(plan=SimpleNamespace(work=work, shape=shape))
+            work, shape, seen = works[frame % len(works)]
+            return SimpleNamespace(plan=SimpleNamespace(work=work, shape=shape, seen=seen))
 
     asked: list[Any] = []
     monkeypatch.setattr(sources, "configure", lambda request, _folder: asked.append(request) or checked)
@@ -247,10 +265,11 @@ def test_a_scene_is_planned_frame_by_frame(monkeypatch: pytest.MonkeyPatch) -> N
     assert (found.name, found.source, found.fps, found.unit) == ("home", "home.toml@12:gpu", 12.0, "gpu")
     assert (found.variant, found.is_bare) == (Variant("deadline", "single"), False)
     assert [tuple(each) for each in found.networks] == [
-        ({"scene": "home.toml"}, *shape, 12, "packed", shape) for shape in ((64, 96), (32, 32))
+        ({"scene": "home.toml"}, *shape, 12, "packed", shape) for shape in ((64, 96), (32, 32), (64, 96))
     ]
-    assert found.frames == (0, SKIPS, 1, 0) * 150
-    works[:] = [(Work.NONE, (1, 1))]
+    assert found.networks[0] is found.networks[2] and found.avatars == (1, 3, 2)
+    assert found.frames == (0, SKIPS, 1, 2, 0) * 120
+    works[:] = [(Work.NONE, None, "")]
     (nobody,) = sources.tenants(["home.toml"])
     assert (nobody.fps, nobody.frames[:2], nobody.networks[0].height) == (24.0, (SKIPS, SKIPS), 80)
 
@@ -288,6 +307,7 @@ BAD = {
     "above the most": ("network.onnx@1000.5", "0.001 to 1000"),
     "an empty rate": ("network.onnx@", "rate ''"),
     "no file": ("@30", "no scene and no file"),
+    "an empty unit": ("network.onnx@30:", "pipeline 'network.onnx@30:': found unit '', expected gpu or dsp"),
     "an unknown unit": ("network.onnx@30:npu", "unit 'npu', expected gpu or dsp"),
     "a network without a rate": ("net@work.onnx", "such as net@work.onnx@30; by itself: --network net@work.onnx"),
     "a missing network": ("missing.onnx@30", "missing.onnx"),

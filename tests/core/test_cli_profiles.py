@@ -48,7 +48,10 @@ def known(monkeypatch: pytest.MonkeyPatch) -> None:
         assert profile.title == f"The {name}"
         if name != "one":
             return []
-        return [Check("one", "unet", False, 54.1, 55.678), Check("one", "resnet18", True, 0.5, 0.4)]
+        return [
+            Check("one", "unet", "tflite", False, 54.1, 55.678),
+            Check("one", "resnet18", "qnn_dlc", True, 0.5, 0.4),
+        ]
 
     monkeypatch.setattr(load, "load_profile", load_profile)
     monkeypatch.setattr(load, "profile_names", lambda: ["one", "form", "two"])
@@ -74,10 +77,9 @@ def test_a_profile_is_shown(command: Command, check_printed: Callable[..., None]
 
 @pytest.mark.usefixtures("known")
 def test_profiles_are_checked(command: Command, check_printed: Callable[..., None]) -> None:
-    published = [
-        {"profile": "one", "network": "unet", "independent": False, "published_ms": 54.1, "predicted_ms": 55.678},
-        {"profile": "one", "network": "resnet18", "independent": True, "published_ms": 0.5, "predicted_ms": 0.4},
-    ]
+    keys = ("profile", "network", "runtime", "independent", "published_ms", "predicted_ms")
+    values = (("one", "unet", "tflite", False, 54.1, 55.678), ("one", "resnet18", "qnn_dlc", True, 0.5, 0.4))
+    published = [dict(zip(keys, row, strict=True)) for row in values]
     errors = (55.678 / 54.1 - 1, 0.4 / 0.5 - 1)
     rows = [{**row, "error": error} for row, error in zip(published, errors, strict=True)]
     assert json.loads(command("profiles", "check", "--json")[0]) == {"valid": ["one", "form", "two"], "published": rows}
