@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import random
 from collections.abc import Iterator
 from typing import Any
@@ -245,6 +246,20 @@ def test_at_every_step_frames_are_where_the_scheduler_has_them(case: str) -> Non
     assert now.latency_ms == report["latency_ms"]
     assert now.frame_times.count == report["frame_time_ms"]["samples"] == max(frames["presented"] - 1, 0)
     assert now.latencies.sum_s == pytest.approx(sum(core.ledger.latency_ns) / S)
+
+
+def test_a_longer_run_takes_no_more_memory() -> None:
+    def size(frames: int) -> int:
+        settings, graph = Settings(frames), chain((("a", "u"), ("b", "v")), "double", "b")
+        driver = VirtualDriver(graph, settings, lambda *_: 20 * MS, keep=True)
+        figures = LiveFigures(Begun(SCHEMA, graph, settings, {}))
+        for records in followed(driver.core, driver):
+            for record in records:
+                figures.add(record)
+        return len(pickle.dumps(figures))
+
+    seven_seconds, twenty = size(350), size(1000)
+    assert twenty < 1.02 * seven_seconds  # larger numbers take a few more bytes
 
 
 def assert_frames(now: Figures, core: Core) -> None:
