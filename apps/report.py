@@ -74,6 +74,7 @@ class Machine(Record):
     `python`, `trilane`: versions; null for a Trilane that was never installed.
     `scheduler_core`: compiled, interpreted or stale.
     `cpu`: the processor.
+    `hardware_counters`: what was counted of each job, or `absent` and why; null in reports of before it was said.
     `memory_bytes`: physical memory.
     `gl`: the OpenGL driver, null when there is none.
     `packages`: version of each that is installed and that Trilane uses.
@@ -84,6 +85,7 @@ class Machine(Record):
     trilane: str | None
     scheduler_core: str
     cpu: Cpu
+    hardware_counters: str | None = None
     memory_bytes: int
     gl: GlDriver | None
     packages: dict[str, str]

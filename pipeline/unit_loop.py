@@ -19,6 +19,7 @@ from typing import Any
 from trilane.errors import TrilaneError, UnitLostError
 from trilane.pipeline.bound_stage import BoundStage
 from trilane.pipeline.core_meter import TASKS, CoreMeter
+from trilane.pipeline.hardware_counters import HardwareCounters, NoCounters, counters_here
 from trilane.pipeline.job_times import JobClock
 from trilane.pipeline.shared_assets import map_assets
 from trilane.pipeline.stage import Skip, StageFactory, UnitContext
@@ -64,6 +65,11 @@ def serve(raw_spec: dict[str, Any], number_of: Mapping[int, int]) -> int:
 
 
 def _serve(spec: UnitSpec, link: Link) -> int:
+    with contextlib.closing(counters_here()) as counters:  # of the threads that the stages begin, too
+        return _answer(spec, link, counters)
+
+
+def _answer(spec: UnitSpec, link: Link, counters: HardwareCounters | NoCounters) -> int:
     others = _threads() - {os.getpid()}
     try:
         with building_cores(spec):
@@ -77,7 +83,7 @@ def _serve(spec: UnitSpec, link: Link) -> int:
     while True:
         message = link.job_pipe.receive()
         if isinstance(message, RunJob):
-            _run_job(link, stages[message.stage], message, clock)
+            _run_job(link, stages[message.stage], message, clock, counters)
         elif isinstance(message, Ping):
             link.send_heartbeat(Pong())
         elif isinstance(message, RunIsolated):
@@ -140,12 +146,16 @@ def factory_named(name: str) -> StageFactory:
     return factory
 
 
-def _run_job(link: Link, stage: BoundStage, job: RunJob, clock: JobClock) -> None:
+def _run_job(
+    link: Link, stage: BoundStage, job: RunJob, clock: JobClock, counters: HardwareCounters | NoCounters
+) -> None:
+    counters.begin()
     clock.begin(job.stage, job.t_dispatch_ns)
     try:
         metrics = stage.run(job.frame, job.slot_in, job.slot_out, job.epoch, job.fresh > 0, job.rung)
         clock.end(stage.works_asleep)
-        values = {str(name): float(value) for name, value in metrics.items()}
+        values = counters.figures()
+        values.update((str(name), float(value)) for name, value in metrics.items())
         sampled_ns = stage.sampled_ns(job.slot_in, job.slot_out)
         link.job_pipe.send(clock.done(job.id, sampled_ns, values, isinstance(metrics, Skip)))
     except UnitLostError:

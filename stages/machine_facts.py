@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from trilane.compiled import form
+from trilane.pipeline.hardware_counters import availability
 
 #: Instructions that decide how fast INT8 and FP32 networks run; a network's speed means nothing without them.
 CPU_FLAGS = (
@@ -129,6 +130,7 @@ def machine_facts(gl: dict[str, Any] | None = None) -> dict[str, Any]:
         "trilane": package_version("trilane"),
         "scheduler_core": form(),
         "cpu": cpu_facts(),
+        "hardware_counters": availability(),
         "memory_bytes": memory_bytes(),
         "gl": gl,
         "packages": {name: version for name, version in packages.items() if version is not None},

@@ -140,9 +140,19 @@ def _core() -> Check:
     return Check("scheduler core", state, works=state == "compiled", needed=False, install=install)
 
 
+def _counters() -> Check:
+    """Not needed: without them a trace has no instructions and cache misses."""
+    from trilane.pipeline.hardware_counters import absence, availability, remedy
+
+    why = absence()
+    install = "" if why is None else remedy(why)
+    return Check("hardware counters", why or availability(), works=why is None, needed=False, install=install)
+
+
 def checks(gl: dict[str, Any] | None) -> list[Check]:
     """Every check, in the order in which they are shown; `gl` is what `gl_facts` said."""
-    return [_python(), _cpu(), _int8(), _memfd(), _dev_shm(), _wakeup(), _core(), _gl(gl), _runtimes(), *_packages()]
+    machine = [_python(), _cpu(), _int8(), _counters(), _memfd(), _dev_shm(), _wakeup(), _core(), _gl(gl)]
+    return [*machine, _runtimes(), *_packages()]
 
 
 def _state(check: Check) -> str:

@@ -157,6 +157,8 @@ def _fill(note: Any, value: Any) -> None:
         note.int_value = value
     elif isinstance(value, float):
         note.double_value = value
+    elif value is None or (isinstance(value, Mapping | Sequence) and not value):
+        note.string_value = "none"
     elif isinstance(value, Mapping):
         for key, below in value.items():
             _fill(note.dict_entries.add(name=str(key)), below)
@@ -164,4 +166,4 @@ def _fill(note: Any, value: Any) -> None:
         for below in value:
             _fill(note.array_values.add(), below)
     else:
-        note.string_value = "none" if value is None else str(value)
+        note.string_value = str(value)

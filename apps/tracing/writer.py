@@ -25,7 +25,7 @@ RUN_RANK, MESSAGE_RANK, FRAME_RANK, UNIT_RANK, SAMPLE_RANK = 0, 1, 2, 10, 1000
 #: Arrows of several pipelines in one trace: so many frames each.
 FLOWS_PER_PIPELINE: Final = 1 << 40
 #: First part of a sampled value's name -> what people call it, unit.
-SAMPLED: Final = {"temperature_c": ("temperature", "°C"), "duty": ("duty", ""), "power_w": ("power", "W")}
+SAMPLED: Final = {"temperature_c": ("temperature", "°C"), "duty": ("duty", ""), "memory_bytes": ("memory", "B")}
 
 
 class RunTracks:

@@ -18,6 +18,7 @@ import pytest
 from trilane import compiled
 from trilane.apps.cli import doctor
 from trilane.apps.cli.doctor import Check
+from trilane.pipeline import hardware_counters
 from trilane.stages import machine_facts
 from trilane.transport import wakeup
 
@@ -46,6 +47,7 @@ def machine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> pytest.MonkeyPat
     monkeypatch.setattr(machine_facts, "machine_facts", lambda gl: {"gl": gl})
     monkeypatch.setattr(wakeup, "awake", awake)
     monkeypatch.setattr(compiled, "form", lambda: "compiled")
+    monkeypatch.setattr(hardware_counters, "absence", lambda: None)
     monkeypatch.setattr(doctor, "SHM", tmp_path)
     monkeypatch.setattr(doctor, "package_line", lambda name: f"pip install {name}")
     monkeypatch.setattr(doctor, "install_line", lambda extra: f"pip install trilane[{extra}]")
@@ -56,6 +58,7 @@ def machine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> pytest.MonkeyPat
 
 PYTHON = "apt-get install python3.11 python3.11-venv"
 ACL = f'apt-get install acl; setfacl -m "u:$USER:w" {wakeup.LATENCY_FILE}'
+PARANOID = "sysctl kernel.perf_event_paranoid=2"
 MEMFD = "needs Linux 3.17 or newer with memfd_create allowed"
 COMPILE = "make compile  # it takes gcc and python3-dev"
 
@@ -66,6 +69,7 @@ def test_a_machine_that_has_everything(tmp_path: Path) -> None:
         Check("Python", "3.11.9", True, True, PYTHON),
         Check("CPU", "a processor, 3 of 8 cores allowed, avx2 avx512_vnni amx_int8", True, True, ""),
         Check("INT8 dot product", "amx_int8 avx512_vnni", True, False, "needs another CPU"),
+        Check("hardware counters", "instructions, cache_misses", True, False, ""),
         Check("memfd", "anonymous shared memory works", True, True, ""),
         Check(str(tmp_path), "3 MiB free; Trilane leaves nothing there", True, False, ""),
         Check("idle cores", wakeup.AWAKE, True, False, ACL),
@@ -97,6 +101,7 @@ def test_a_machine_that_has_nothing(machine: pytest.MonkeyPatch, tmp_path: Path)
     machine.setattr(wakeup, "awake", asleep)
     machine.setattr(compiled, "form", lambda: "interpreted")
     machine.setattr(doctor, "clone", lambda: None)
+    machine.setattr(hardware_counters, "absence", lambda: "kernel.perf_event_paranoid is 3")
     machine.setattr(doctor, "SHM", tmp_path / "none")
     machine.setattr(os, "memfd_create", refused)
     no_mesa = "apt-get install libegl1 libgl1-mesa-dri"
@@ -105,6 +110,7 @@ def test_a_machine_that_has_nothing(machine: pytest.MonkeyPatch, tmp_path: Path)
         Check("Python", "3.11.9", False, True, PYTHON),
         Check("CPU", "a processor, 3 of 8 cores allowed, none of those that matter", True, True, ""),
         Check("INT8 dot product", "no; INT8 networks run on AVX2 or NEON alone", False, False, "needs another CPU"),
+        Check("hardware counters", "kernel.perf_event_paranoid is 3", False, False, PARANOID),
         Check("memfd", "operation not permitted", False, True, MEMFD),
         Check(str(tmp_path / "none"), "absent", False, False, "mount -t tmpfs tmpfs /dev/shm"),
         Check("idle cores", "may sleep", False, False, ACL),

@@ -59,7 +59,10 @@ from trilane.testing.trace_reading import ReadTrace, read_trace
 MS = 1_000_000
 STAGES = (("pose", "cpu"), ("raster", "gpu"), ("infer", "dsp"), ("composite", "gpu"), ("present", "cpu"))
 MEAN_MS = {"pose": 1.2, "raster": 3.0, "infer": 13.0, "composite": 2.0, "present": 3.0}
-FACTS = {"clock": "virtual", "config": {"scene": {"name": "default", "fps": 60, "avatars": ["a", "b"]}, "latch": None}}
+FACTS = {
+    "clock": "virtual",
+    "config": {"scene": {"name": "default", "fps": 60, "avatars": ["a", "b"], "planes": []}, "latch": None},
+}
 
 
 def a_run(frames: int = 40, graph: Graph | None = None, **options: Any) -> Simulation:
@@ -275,7 +278,10 @@ def test_a_run_written_by_hand_track_by_track() -> None:
     }
     ((_, run),) = [each for each in trace.slices if each[1].name == "run"]
     assert (run.track, run.begin_ns, run.end_ns) == (f"{root}/run", 5, 21 * MS)
-    assert run.notes["config"] == {"scene": {"name": "default", "fps": 60, "avatars": ["a", "b"]}, "latch": "none"}
+    assert run.notes["config"] == {
+        "scene": {"name": "default", "fps": 60, "avatars": ["a", "b"], "planes": "none"},
+        "latch": "none",
+    }
     assert run.notes["times"] == "ns of simulated time from 0 on"
     assert run.notes["scheduler"]["policy"] == "latest"
     assert run.notes["edges"] == ["double"]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+from collections import defaultdict
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,7 @@ from trilane.stages.config import RunConfig
 from trilane.stages.configure import Checked
 from trilane.stages.machine_facts import machine_facts
 from trilane.testing.doubles import pipeline_of_doubles
+from trilane.testing.trace_reading import Slice, read_trace
 
 FRAMES = 24
 pytestmark = pytest.mark.usefixtures("no_new_process", "behaviour")
@@ -93,6 +96,37 @@ def test_the_report_has_the_keys_of_the_schema_and_the_baseline(tmp_path: Path) 
 def test_the_events_of_a_run_replay_to_the_same_answers(tmp_path: Path) -> None:
     outcome = run_mocks(tmp_path / "run", Listener(), Plan(baseline_frames=0))
     assert list(replay(read(outcome.folder / "events.jsonl"))) == []
+
+
+def test_the_trace_of_a_run_adds_up_to_its_report(tmp_path: Path) -> None:
+    """Read as any program would; `read_trace` refuses slices of one track that lie over each other."""
+    outcome = run_mocks(tmp_path / "run", Listener(), Plan(baseline_frames=0))
+    trace = read_trace((outcome.folder / "trace.pftrace").read_bytes())
+    in_order = list(outcome.report.stages)
+    through: dict[int, list[str]] = defaultdict(list)
+    for unit, row in outcome.report.units.items():
+        slices = trace.of(f"trilane, host clock/{unit}")
+        busy_ns = sum(one.end_ns - one.begin_ns - lost_ns(one) for one in slices if one.flows)
+        span_ns = slices[-1].end_ns - slices[0].begin_ns
+        assert span_ns / 1e9 == pytest.approx(outcome.report.duration_s, rel=1e-6)
+        assert busy_ns / span_ns == pytest.approx(row.busy, abs=0.005)
+        assert all(before.end_ns == after.begin_ns for before, after in pairwise(slices))
+        for one in slices:
+            for flow in one.flows:
+                through[flow].append(one.name)
+    assert len(through) == FRAMES
+    assert all(sorted(stages) == sorted(in_order) for stages in through.values())
+    assert len(trace.of("Actual frames")) == FRAMES
+    (run,) = trace.of("host clock/run")
+    assert run.notes["config"]["policy"] == "pipelined"
+    assert run.notes["machine"]["hardware_counters"] == machine_facts()["hardware_counters"]
+    assert run.notes["times"] == "ns of CLOCK_MONOTONIC"
+
+
+def lost_ns(one: Slice) -> int:
+    """Of a job: the time in which its unit had no core or slept, which is not busy."""
+    lost: int = one.notes.get("preempted_ns", 0) + one.notes.get("asleep_ns", 0)
+    return lost
 
 
 def test_a_run_has_the_edge_that_was_asked_for(tmp_path: Path) -> None:
