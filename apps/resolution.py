@@ -5,9 +5,7 @@ Rule: frames are counted by the run; the error is the avatars' own, from their v
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
-from itertools import pairwise
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from trilane.apps.report import Resolution, TensorSize
@@ -16,24 +14,26 @@ from trilane.scene.planner import ALL_WORK
 from trilane.stages.config import RunConfig
 
 
-def resolution_of(rungs: Sequence[int], config: RunConfig, losses: Sequence[SizeLoss]) -> dict[str, Any]:
+def resolution_of(
+    rungs: Mapping[int, int], switches: int, config: RunConfig, losses: Sequence[SizeLoss]
+) -> dict[str, Any]:
     """The report's `resolution`.
 
-    `rungs`: of each presented frame. `losses`: of the scene's avatars.
+    `rungs`: how many presented frames had each. `switches`: how often one had another than the frame before.
+    `losses`: of the scene's avatars.
     """
-    counts = Counter(rungs)
     sizes = [
         {
             "work": work / ALL_WORK,
             "most_pixels": budget.own,
-            "frames": counts[rung],
+            "frames": rungs.get(rung, 0),
             "psnr_loss_db": worst_loss(work, losses),
         }
         for rung, (work, budget) in enumerate(zip(config.works, config.tensor_budgets, strict=True))
     ]
     return {
         "sizes": sizes,
-        "switches": sum(before != after for before, after in pairwise(rungs)),
+        "switches": switches,
         "loss_source": "; ".join(dict.fromkeys(loss.source for loss in losses)),
     }
 

@@ -138,7 +138,7 @@ def run_to_folder(
             if checked.placement is not None:
                 facts["placement"] = checked.placement
             if result.rungs:
-                facts["resolution"] = resolution_of(result.rungs, checked.config, checked.losses)
+                facts["resolution"] = resolution_of(result.rungs, result.rung_switches, checked.config, checked.losses)
             if plan.pace is not None:
                 from trilane.apps.pace import compare
 

@@ -15,7 +15,6 @@ from trilane.pipeline.description import Pipeline
 from trilane.pipeline.run_log import RunLog
 from trilane.scheduler.accounts import compared
 from trilane.scheduler.places import Place, busiest_core_ns
-from trilane.scheduler.stats import summary_ms
 
 NO_RUN_DELAY = (
     "this kernel does not count how long threads wait for a core (CONFIG_SCHED_INFO): the time in which a unit had a "
@@ -40,7 +39,7 @@ def add_accounts(
     for unit, row in report["units"].items():
         row.update(cpu_s=cpu.of_unit_s(unit), cpu_in_jobs_s=cpu.in_jobs_ns[unit] / 1e9)
     for stage, row in report["stages"].items():
-        row["cpu_ms"] = summary_ms(cpu.stage_ns[stage])
+        row["cpu_ms"] = cpu.stage_ns[stage].summary_ms()
     report["accounts"] = compared(report["units"], second)
     if not report["accounts"]["agree"]:
         found = report["accounts"]["largest_difference"]

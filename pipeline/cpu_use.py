@@ -8,9 +8,10 @@ figures say otherwise, a thread has run elsewhere or a clock is wrong.
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
+from trilane.scheduler.samples import Samples, Sketch
 from trilane.transport.messages import Done
 
 CLOCKS_DIFFER = 0.001  # CLOCK_MONOTONIC is slewed by up to 500 ppm, the clock of CPU times is not
@@ -31,13 +32,16 @@ class CoreUse(NamedTuple):
 
 
 class CpuTimes:
-    """CPU time of each unit, and of each stage's jobs, in ns. `cores`: how many each unit has."""
+    """CPU time of each unit, and of each stage's jobs, in ns. `cores`: how many each unit has.
 
-    def __init__(self, cores: Mapping[str, int]) -> None:
+    `sketch`: as of `trilane.scheduler.samples.Samples`.
+    """
+
+    def __init__(self, cores: Mapping[str, int], sketch: Callable[[], Sketch] | None = None) -> None:
         self._cores = cores
         self.in_jobs_ns: Counter[str] = Counter()
         self.between_ns: Counter[str] = Counter()
-        self.stage_ns: defaultdict[str, list[int]] = defaultdict(list)
+        self.stage_ns: defaultdict[str, Samples] = defaultdict(lambda: Samples(sketch))
         self._begun: set[str] = set()
 
     def add(self, unit: str, stage: str, done: Done, run_begin_ns: int) -> None:
@@ -46,7 +50,7 @@ class CpuTimes:
         What is between two jobs counts as it was read: a figure that cannot be must stay visible (`is_possible`).
         """
         self.in_jobs_ns[unit] += done.cpu_ns
-        self.stage_ns[stage].append(done.cpu_ns)
+        self.stage_ns[stage].add(done.cpu_ns)
         before_ns = done.cpu_before_ns
         if unit not in self._begun:
             self._begun.add(unit)

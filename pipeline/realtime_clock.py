@@ -39,6 +39,7 @@ from trilane.scheduler.events import (
     UnitReady,
 )
 from trilane.scheduler.ledger import JobRecord
+from trilane.scheduler.samples import Sketch
 from trilane.transport import messages
 from trilane.transport.messages import Done, Failed, Ping, Ready, RunJob
 
@@ -75,10 +76,11 @@ class RealtimeClock:
         requests: FrameRequestQueue | None,
         governor: Governor | None,
         on_progress: Callable[[int, int], None] | None,
+        sketch: Callable[[], Sketch] | None = None,
     ) -> None:
         self.metrics: dict[str, dict[str, float]] = defaultdict(dict)
         self.reported: dict[str, Counter[str]] = defaultdict(Counter)
-        self.cpu = CpuTimes(processes.core_counts)
+        self.cpu = CpuTimes(processes.core_counts, sketch)
         self.first: list[Event] = []
         self._core, self._processes, self._interrupts, self._log = core, processes, interrupts, log
         self._requests, self._governor, self._on_progress = requests, governor, on_progress
@@ -216,6 +218,7 @@ class RealtimeClock:
         if isinstance(message, messages.Pong):
             return Pong(unit)
         if message is None:
+            self._open = {number: held for number, held in self._open.items() if held[0].unit != unit}
             how = "has ended" if unit in self._to_end else "ended unexpectedly"
             self._to_end.discard(unit)
             self._log.say(f"unit {unit} {how} and is started again{self._processes.why_ended(unit)}")
@@ -255,4 +258,4 @@ class RealtimeClock:
         now_s = time.monotonic()
         if self._on_progress is not None and (final or now_s - self._progress_s >= PROGRESS_S):
             self._progress_s = now_s
-            self._on_progress(len(self._core.ledger.presented_ns), self._core.settings.frames)
+            self._on_progress(self._core.ledger.presented_count, self._core.settings.frames)

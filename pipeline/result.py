@@ -26,7 +26,8 @@ class RunResult:
     `report`: what the run measured; who calls it adds the machine and the configuration.
     `lost`, `dropped`: frames by cause. `startup_ms`: of each unit. `metrics`: of each stage, the means
     over the jobs that gave them.
-    `rungs`: of a run with a ladder of work, that of each presented frame, in order.
+    `rungs`: of a run with a ladder of work, how many presented frames had each, and `rung_switches`, how often one had
+    another than the frame before.
     `messages`: what went wrong on the way, such as a unit that died and was restarted.
     `failure`: set when a stage failed or a unit could not be kept alive; what was done until then is still here.
     """
@@ -41,7 +42,8 @@ class RunResult:
     jobs: tuple[JobRecord, ...]
     recording: Recording
     metrics: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    rungs: tuple[int, ...] = ()
+    rungs: Mapping[int, int] = field(default_factory=dict)
+    rung_switches: int = 0
     messages: tuple[str, ...] = ()
     interrupted: bool = False
     failure: Failure | None = None

@@ -24,12 +24,14 @@ from trilane.pipeline.run_metrics import RunMetrics, metrics_of
 from trilane.pipeline.run_record import JournalFile, RunRecord, recorded
 from trilane.pipeline.shared_assets import Assets
 from trilane.pipeline.signals import Interrupts
+from trilane.pipeline.sketch import EXACT, SKETCHED, DdSketch
 from trilane.pipeline.surroundings import on_cores, prompt_answers, unit_processes
 from trilane.pipeline.unit_processes import UnitProcesses
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.causes import Outcome, OutcomeKind
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import Settings
+from trilane.scheduler.ledger import Books
 from trilane.scheduler.loop import run_loop
 from trilane.scheduler.release import run_settings
 from trilane.scheduler.stats import energy_score
@@ -127,8 +129,9 @@ def run_pipeline(
             awake(governor is None or governor.is_prompt) as idle_cores,
             unit_processes(pipeline, assets or {}, starter, UnitProcesses) as processes,
         ):
-            core = Core(pipeline.graph(), settings)
-            clock = RealtimeClock(core, processes, interrupts, log, requests, governor, on_progress)
+            target_ns, sketch = 0 if settings.deadline_ns else round(1e9 / fps), None if journal is None else DdSketch
+            core = Core(pipeline.graph(), settings, Books(target_ns, sketch))
+            clock = RealtimeClock(core, processes, interrupts, log, requests, governor, on_progress, sketch)
             cores = sorted({core for unit in pipeline.units.values() for core in unit.cores})
             if controls is not None:
                 clock.heed(controls)
@@ -137,9 +140,9 @@ def run_pipeline(
         report = core.ledger.report(
             clock="host",
             requested=settings.frames if requests is None and controls is None else core.source.released,
-            target_period_ns=0 if settings.deadline_ns else round(1e9 / fps),
             isolated_ns=run.isolated.mean_ns if isolated else None,
         )
+        report["percentiles"] = EXACT if core.ledger.is_exact else SKETCHED
         report.update(policy=policy, edge=pipeline.rule, idle_cores=idle_cores, other_programs=run.other_programs)
         _add_caps(report, governor)
         for unit, row in report["units"].items():
@@ -212,7 +215,7 @@ class _Run:
         return RunResult(
             report=report,
             requested=report.frames.requested,
-            presented=len(ledger.presented_ns),
+            presented=ledger.presented_count,
             lost=dict(ledger.lost),
             dropped=dict(ledger.dropped),
             pids=self.pids,
@@ -220,7 +223,8 @@ class _Run:
             jobs=tuple(self._record.jobs),
             recording=self._record.recording,
             metrics=self._mean_metrics(),
-            rungs=tuple(ledger.rungs) if self._core.ladder is not None else (),
+            rungs=dict(ledger.rungs) if self._core.ladder is not None else {},
+            rung_switches=ledger.rung_switches,
             messages=tuple(self._log.messages),
             interrupted=stopped and self._interrupts.count > 0,
             failure=self._log.failure,

@@ -42,7 +42,7 @@ class FrameCounts(Record):
 
 
 class TimeSummary(Record):
-    """Statistics of times in ms: `mean`, exact percentiles `p50` to `p99`, and `max`; all 0 when there were none.
+    """Statistics of times in ms: `mean`, percentiles `p50` to `p99`, and `max`; all 0 when there were none.
 
     `samples`: how many times they are of; null in reports of before it was counted. p90 needs 29 of them, p95 59, p99
     299 (`trilane.scheduler.stats.samples_needed`).
@@ -259,6 +259,7 @@ class RunMetrics(Record):
     `clock`: `host`, measured on this machine, or `virtual`, computed from a hardware profile.
     `frames`: counted by what became of them.
     `duration_s`: from the first job to the end of the run.
+    `percentiles`: whether they are exact, or which are of a sketch and within what error; on the host clock.
     `frame_time_ms`: between presented frames.
     `latency_ms`: from the sampled pose to the end of the stage that the pipeline names (the composited frame).
     `fps`: presented frames a second; 0 for fewer than two.
@@ -282,6 +283,7 @@ class RunMetrics(Record):
     clock: Literal["host", "virtual"]
     frames: FrameCounts
     duration_s: float
+    percentiles: str = ""
     frame_time_ms: FrameTimes
     latency_ms: TimeSummary
     fps: float

@@ -127,7 +127,7 @@ class _Live:
         run_loop(core, turns)
         if self._interrupts.count:
             raise KeyboardInterrupt
-        if len(core.ledger.presented_ns) < SLICE * count:
+        if core.ledger.presented_count < SLICE * count:
             failure = log.failure or Failure("; ".join(log.messages) or "frames were lost")
             raise UnitError(failure.message, failure.exit_code)
         by_place = dict(zip(order, turns.frame_ns(), strict=True))
@@ -143,7 +143,7 @@ class _Turns:
         self._begun: list[int] = []  # how many frames were presented when each place had its turn
 
     def wait(self, deadline_ns: int) -> tuple[int, tuple[Event, ...]]:
-        presented = len(self._core.ledger.presented_ns)
+        presented = self._core.ledger.presented_count
         if len(self._begun) < len(self._places) and presented >= SLICE * len(self._begun):
             place = self._places[len(self._begun)]
             self._begun.append(presented)

@@ -58,7 +58,7 @@ from trilane.scheduler.events import (
 )
 from trilane.scheduler.flow import Flow
 from trilane.scheduler.frame_source import Source
-from trilane.scheduler.ledger import Ledger
+from trilane.scheduler.ledger import Books, Ledger
 from trilane.scheduler.policy import policy_named
 from trilane.scheduler.state import FULL_DUTY, FrameState, StageState, UnitState
 from trilane.scheduler.unit_life import READY, STOPPING, DeadlinePassed
@@ -68,12 +68,12 @@ from trilane.scheduler.work_ladder import WorkLadder
 class Core:
     """The state machine of one run. Raises ValueError for an unknown policy or edge."""
 
-    def __init__(self, graph: Graph, settings: Settings) -> None:
+    def __init__(self, graph: Graph, settings: Settings, books: Books | None = None) -> None:
         self.graph, self.settings = graph, settings
         self.policy = policy = policy_named(settings.policy)
         if policy.paced and not (settings.period_ns or settings.arrivals_ns or settings.asked):
             raise ValueError(f"policy {settings.policy!r} needs a period, arrivals or frame requests")
-        self.ledger = Ledger(graph)
+        self.ledger = Ledger(graph, books)
         self.source = Source(settings, self._count_drop_at_source)
         self.flow = Flow(graph, self.ledger, policy.newest or policy.drop_late)
         self.stages, self.units, self.frames = self.flow.stages, self.flow.units, self.flow.frames

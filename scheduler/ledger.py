@@ -9,14 +9,16 @@ core are one unit to the scheduler, whose share trilane.hw_profiles.application 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
-from itertools import pairwise
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any, Final, NamedTuple
 
 from trilane.scheduler.causes import Drop, Loss
 from trilane.scheduler.events import NEVER, Graph, Job
-from trilane.scheduler.stats import NS_PER_MS, ema_range_ms, jitter_ms, real_time_score, summary_ms
-from trilane.scheduler.uncertainty import fps_interval, frame_interval_ms
+from trilane.scheduler.frame_times import FrameTimes, Lateness
+from trilane.scheduler.samples import Samples, Sketch
+from trilane.scheduler.stats import NS_PER_MS
 
 ASSIGNED: Final = 0
 STARVED: Final = 1
@@ -82,30 +84,49 @@ class _UnitBook:
         }
 
 
+@dataclass(frozen=True)
+class Books:
+    """How a run is accounted for.
+
+    `target_period_ns`: frame times above it count as missed deadlines, and those of frames do not; 0: those of frames.
+    `sketch`: as of `trilane.scheduler.samples.Samples`.
+    """
+
+    target_period_ns: int = 0
+    sketch: Callable[[], Sketch] | None = None
+
+
 class _StageBook:
-    def __init__(self) -> None:
-        self.service_ns: list[int] = []
-        self.wait_ns: list[int] = []
-        self.on_core_ns: list[int] = []  # the service times without the time in which another thread had the core
-        self.skipping_ns: list[int] = []  # the same of jobs whose frame took the bypass
+    def __init__(self, sketch: Callable[[], Sketch] | None) -> None:
+        self.service = Samples(sketch)
+        self.wait = Samples(sketch)
+        self.on_core_ns = 0  # of the service times, without the time in which another thread had the core
+        self.skips = self.skipping_ns = 0  # jobs whose frame took the bypass, and the same of these
 
 
 class Ledger:
-    """Fed by the core alone. Times in ns of the run's clock."""
+    """Fed by the core alone. Times in ns of the run's clock.
 
-    def __init__(self, graph: Graph) -> None:
-        self._graph = graph
+    `presented_count`, `skipped`: frames; `rungs`: those of each rung of work; `rung_switches`: how often one had
+    another than the frame before. Of a run that keeps all values, `presented_frames` and `lateness_ns`, in order.
+    """
+
+    def __init__(self, graph: Graph, books: Books | None = None) -> None:
+        self._graph, self._books = graph, books or Books()
+        sketch = self._books.sketch
         self._units = {unit: _UnitBook() for unit in graph.units}
-        self._stages = {stage.name: _StageBook() for stage in graph.stages}
+        self._stages = {stage.name: _StageBook(sketch) for stage in graph.stages}
         self.start_ns = self.end_ns = 0
         self.lost: Counter[Loss] = Counter()
         self.dropped: Counter[Drop] = Counter()
-        self.skipped = 0
-        self.presented_frames: list[int] = []
-        self.rungs: list[int] = []
-        self.presented_ns: list[int] = []
-        self.latency_ns: list[int] = []
+        self.skipped = self.presented_count = 0
+        self.rungs: Counter[int] = Counter()
+        self.rung_switches = 0
         self.lateness_ns: list[int] = []
+        self.presented_frames: list[int] = []
+        self._rung = -1
+        self._first_ns = self._last_ns = 0
+        self._frame_times, self._latency, self._lateness = FrameTimes(sketch), Samples(sketch), Lateness()
 
     def start(self, now_ns: int) -> None:
         self.start_ns = now_ns
@@ -138,11 +159,12 @@ class Ledger:
         `skips`: its frame takes the bypass.
         """
         stage = self._stages[job.stage]
-        stage.on_core_ns.append(end_ns - begin_ns - preempted_ns)
+        stage.on_core_ns += end_ns - begin_ns - preempted_ns
         if skips:
-            stage.skipping_ns.append(end_ns - begin_ns - preempted_ns)
-        stage.service_ns.append(end_ns - begin_ns)
-        stage.wait_ns.append(begin_ns - ready_ns)
+            stage.skips += 1
+            stage.skipping_ns += end_ns - begin_ns - preempted_ns
+        stage.service.add(end_ns - begin_ns)
+        stage.wait.add(begin_ns - ready_ns)
         self._units[job.unit].add_job(begin_ns, end_ns, preempted_ns, asleep_ns, preempted_before_ns)
 
     @property
@@ -158,10 +180,26 @@ class Ledger:
     ) -> None:
         """`deadline_ns`: NEVER when the frame has none. `skipped`: it took the bypass. `rung`: of its work."""
         self.skipped += skipped
-        self.rungs.append(rung)
+        self.rungs[rung] += 1
+        self.rung_switches += rung != self._rung and self.presented_count > 0
+        self._rung = rung
+        target_ns = self._books.target_period_ns
+        if self.presented_count:
+            self._frame_times.add(end_ns - self._last_ns)
+            if target_ns:
+                self._lateness.add(end_ns - self._last_ns - target_ns)
+        else:
+            self._first_ns = end_ns
+        self._last_ns = end_ns
+        self.presented_count += 1
+        self._latency.add(latency_ns)
+        if deadline_ns != NEVER and not target_ns:
+            self._lateness.add(end_ns - deadline_ns)
+        if self._books.sketch is None:
+            self._keep(frame, end_ns, deadline_ns)
+
+    def _keep(self, frame: int, end_ns: int, deadline_ns: int) -> None:
         self.presented_frames.append(frame)
-        self.presented_ns.append(end_ns)
-        self.latency_ns.append(latency_ns)
         if deadline_ns != NEVER:
             self.lateness_ns.append(end_ns - deadline_ns)
 
@@ -181,57 +219,62 @@ class Ledger:
         return dict(sorted((str(drop), count) for drop, count in self.dropped.items()))
 
     @property
-    def frame_times_ns(self) -> list[int]:
-        return [after - before for before, after in pairwise(self.presented_ns)]
+    def presented_ns(self) -> list[int]:
+        """When each frame was presented, in order; of a run that keeps all values."""
+        return [*accumulate(self._frame_times.samples.kept, initial=self._first_ns)] if self.presented_count else []
+
+    @property
+    def latency_ns(self) -> list[int]:
+        """The latency of each presented frame, in order; of a run that keeps all values."""
+        return [*self._latency.kept]
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether all percentiles are."""
+        books = self._stages.values()
+        samples = [*[book.service for book in books], *[book.wait for book in books], self._latency]
+        return self._frame_times.samples.is_exact and all([each.is_exact for each in samples])
 
     def report(
         self,
         *,
         clock: str,
         requested: int,
-        target_period_ns: int = 0,
         isolated_ns: Mapping[str, float] | None = None,
     ) -> dict[str, Any]:
         """The keys of report.json. `isolated_ns`: mean service time of each stage measured isolated; efficiency is null
-        without it. `target_period_ns`: frame times above it count as deadline misses when frames have no deadline."""
-        intervals = self.frame_times_ns
-        span = self.presented_ns[-1] - self.presented_ns[0] if intervals else 0
-        late_ns = [interval - target_period_ns for interval in intervals] if target_period_ns else self.lateness_ns
+        without it."""
+        intervals, span_ns = max(self.presented_count - 1, 0), self._last_ns - self._first_ns
         return {
             "clock": clock,
             "frames": {
                 "requested": requested,
-                "presented": len(self.presented_ns),
+                "presented": self.presented_count,
                 "lost": sum(self.lost.values()),
                 "lost_by_cause": self.lost_by_cause,
                 "dropped": self.dropped_by_cause,
                 **({"skipped": self.skipped} if self._graph.bypass else {}),
             },
             "duration_s": (self.end_ns - self.start_ns) / 1e9,
-            "frame_time_ms": {
-                **summary_ms(intervals),
-                **ema_range_ms(intervals),
-                "jitter": jitter_ms(intervals),
-                **frame_interval_ms(intervals),
-            },
-            "latency_ms": summary_ms(self.latency_ns),
-            "fps": len(intervals) * 1e9 / span if span else 0.0,
-            **fps_interval(intervals),
-            "deadline_misses": sum(late > 0 for late in late_ns),
+            "frame_time_ms": self._frame_times.row(),
+            "latency_ms": self._latency.summary_ms(),
+            "fps": intervals * 1e9 / span_ns if span_ns else 0.0,
+            **self._frame_times.fps_interval(),
+            "deadline_misses": self._lateness.missed,
             "xrbench": {
-                "real_time": real_time_score(late_ns),
-                "qoe": len(self.presented_ns) / requested if requested else 0.0,
+                "real_time": self._lateness.real_time_score,
+                "qoe": self.presented_count / requested if requested else 0.0,
                 "energy": None,  # filled in by a caller that knows the power
             },
             "stages": {stage.name: self._stage_row(stage.name, stage.unit) for stage in self._graph.stages},
             "units": {unit: book.shares() for unit, book in self._units.items()},
-            **self._efficiency(isolated_ns, span / len(intervals) if intervals else 0.0),
+            **self._efficiency(isolated_ns, span_ns / intervals if intervals else 0.0),
         }
 
     def _stage_row(self, name: str, unit: str) -> dict[str, Any]:
         book = self._stages[name]
-        times = {"service_ms": summary_ms(book.service_ns), "wait_ms": summary_ms(book.wait_ns)}
-        return {"unit": unit, "jobs": len(book.service_ns), **times}
+        times = {"service_ms": book.service.summary_ms(), "wait_ms": book.wait.summary_ms()}
+        return {"unit": unit, "jobs": book.service.count, **times}
 
     def _efficiency(self, isolated_ns: Mapping[str, float] | None, interval_ns: float) -> dict[str, Any]:
         """Isolated service time of the slowest unit over the mean interval between presented frames.
@@ -243,20 +286,16 @@ class Ledger:
         if not isolated_ns or not interval_ns:
             return {"efficiency": None, "isolated_ms": {}}
         per_unit: dict[str, float] = dict.fromkeys(self._units, 0.0)
-        share = self.skipped / len(self.presented_ns)
+        share = self.skipped / self.presented_count
         for stage in self._graph.stages:
             book = self._stages[stage.name]
             isolated = isolated_ns.get(stage.name)
             if isolated is None:
-                per_unit[stage.unit] += _mean(book.on_core_ns)
+                per_unit[stage.unit] += book.on_core_ns / max(book.service.count, 1)
             else:
-                per_unit[stage.unit] += (1 - share) * isolated + share * _mean(book.skipping_ns)
+                per_unit[stage.unit] += (1 - share) * isolated + share * book.skipping_ns / max(book.skips, 1)
         return {
             "efficiency": max(per_unit.values()) / interval_ns,
             "bottleneck": max(per_unit, key=per_unit.__getitem__),
             "isolated_ms": {name: ns / NS_PER_MS for name, ns in isolated_ns.items()},
         }
-
-
-def _mean(times_ns: list[int]) -> float:
-    return sum(times_ns) / max(len(times_ns), 1)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from itertools import pairwise
-from math import ceil, comb, exp, log
+from collections.abc import Callable, Iterable, Sequence
+from math import ceil, comb, log
 
 NS_PER_MS = 1e6
 CONFIDENCE = 0.95
@@ -26,11 +25,18 @@ def percentile(ordered: Sequence[int], share: float) -> float:
 def summary_ms(values_ns: Iterable[int]) -> dict[str, float]:
     """mean, p50, p90, p95, p99, max in milliseconds, all 0 when there are no values; `samples`: how many there are."""
     ordered = sorted(values_ns)
-    if not ordered:
+    return summary_row(
+        len(ordered), sum(ordered), ordered[-1] if ordered else 0, lambda share: percentile(ordered, share)
+    )
+
+
+def summary_row(count: int, total: int, largest: int, percentile_of: Callable[[float], float]) -> dict[str, float]:
+    """`summary_ms` of `count` values in ns, whose percentiles `percentile_of` gives in ns."""
+    if not count:
         return dict.fromkeys(("mean", "p50", "p90", "p95", "p99", "max", "samples"), 0)
-    ranks = {f"p{rank}": percentile(ordered, rank / 100) for rank in (50, 90, 95, 99)}
-    row = {"mean": sum(ordered) / len(ordered), **ranks, "max": ordered[-1]}
-    return {**{key: round(value / NS_PER_MS, 6) for key, value in row.items()}, "samples": len(ordered)}
+    ranks = {f"p{rank}": percentile_of(rank / 100) for rank in (50, 90, 95, 99)}
+    row = {"mean": total / count, **ranks, "max": largest}
+    return {**{key: round(value / NS_PER_MS, 6) for key, value in row.items()}, "samples": count}
 
 
 def samples_needed(share: float) -> int:
@@ -40,19 +46,6 @@ def samples_needed(share: float) -> int:
     show that they reach up to it. Wilks, Annals of Mathematical Statistics 12 (1941), 91-96.
     """
     return ceil(log(1 - CONFIDENCE) / log(share))
-
-
-def ema_range_ms(values_ns: Sequence[int], span: int = 20) -> dict[str, float]:
-    """Smallest and largest exponential average (weight 2 / (span + 1)), from value `span` on when there are as many."""
-    if not values_ns:
-        return {f"ema{span}_min": 0.0, f"ema{span}_max": 0.0}
-    weight = 2 / (span + 1)
-    average, averages = float(values_ns[0]), []
-    for value in values_ns:
-        average += weight * (value - average)
-        averages.append(average)
-    settled = averages[span - 1 :] or averages[-1:]
-    return {f"ema{span}_min": round(min(settled) / NS_PER_MS, 6), f"ema{span}_max": round(max(settled) / NS_PER_MS, 6)}
 
 
 def median_interval(values: Sequence[float], confidence: float = 0.95) -> tuple[float, float]:
@@ -70,26 +63,9 @@ def median_interval(values: Sequence[float], confidence: float = 0.95) -> tuple[
     return ordered[rank - 1], ordered[-rank]
 
 
-def jitter_ms(values_ns: Sequence[int]) -> float:
-    """Mean absolute difference of successive frame times."""
-    steps = [abs(after - before) for before, after in pairwise(values_ns)]
-    return round(sum(steps) / len(steps) / NS_PER_MS, 6) if steps else 0.0
-
-
 def energy_score(frame_mj: float) -> float:
     """(E - e) / E, e the millijoules of a frame, E = `LARGEST_ENERGY_MJ`: 1 for nothing, 0 for E and more.
 
     Kwon et al., XRBench, MLSys 2023, section 3, with their E.
     """
     return max(0.0, 1 - frame_mj / LARGEST_ENERGY_MJ)
-
-
-def real_time_score(lateness_ns: Sequence[int]) -> float | None:
-    """Mean of 1 / (1 + e^(15 l)), l the lateness of a frame in ms: 1 in time, 0 late, None for no frame.
-
-    Kwon et al., XRBench, MLSys 2023, section 3.
-    """
-    if not lateness_ns:
-        return None
-    steep = [min(SCORE_PER_MS * late / NS_PER_MS, LARGEST_EXPONENT) for late in lateness_ns]
-    return sum(1 / (1 + exp(value)) for value in steep) / len(steep)

@@ -22,12 +22,12 @@ LEAST_FRAMES = 10
 T_975 = {4: 2.776445, 5: 2.570582, 6: 2.446912, 7: 2.364624, 8: 2.306004, 9: 2.262157}
 
 
-def mean_interval(values: Sequence[float]) -> tuple[float, float] | None:
+def mean_interval(values: Sequence[float], mean: float | None = None) -> tuple[float, float] | None:
     """Where the mean lies that a run like this one would have if it went on: the 95 % interval, in units of `values`.
 
     `values`: in the order in which they were measured, each above 0; of the first ones, those that do not fill a batch
     count for the mean alone. None when they are too few to tell: fewer than `LEAST_BATCHES` batches of `LEAST_FRAMES`,
-    or so scattered that the interval reaches 0.
+    or so scattered that the interval reaches 0. `mean`: of all, where `values` are means of blocks of them.
     """
     batches = min(len(values) // LEAST_FRAMES, MOST_BATCHES)
     if batches < LEAST_BATCHES:
@@ -35,17 +35,18 @@ def mean_interval(values: Sequence[float]) -> tuple[float, float] | None:
     length = len(values) // batches
     first = len(values) - batches * length
     means = [fmean(values[first + batch * length : first + (batch + 1) * length]) for batch in range(batches)]
-    mean, half = fmean(values), T_975[batches - 1] * stdev(means) / sqrt(batches)
+    mean = fmean(values) if mean is None else mean
+    half = T_975[batches - 1] * stdev(means) / sqrt(batches)
     return (mean - half, mean + half) if half < mean else None
 
 
-def frame_interval_ms(frame_times_ns: Sequence[int]) -> dict[str, float | None]:
+def frame_interval_ms(interval_ns: tuple[float, float] | None) -> dict[str, float | None]:
     """`mean_low` and `mean_high` of the frame time in ms, both None when it cannot be told."""
-    low, high = mean_interval(frame_times_ns) or (None, None)
+    low, high = interval_ns or (None, None)
     return {"mean_low": low and low / NS_PER_MS, "mean_high": high and high / NS_PER_MS}
 
 
-def fps_interval(frame_times_ns: Sequence[int]) -> dict[str, float | None]:
+def fps_interval(interval_ns: tuple[float, float] | None) -> dict[str, float | None]:
     """`fps_low` and `fps_high`: the same interval as frames a second."""
-    low, high = mean_interval(frame_times_ns) or (None, None)
+    low, high = interval_ns or (None, None)
     return {"fps_low": high and NS_PER_S / high, "fps_high": low and NS_PER_S / low}

@@ -27,7 +27,7 @@ from trilane.scheduler.events import (
     UnitDied,
     UnitReady,
 )
-from trilane.scheduler.ledger import JobRecord
+from trilane.scheduler.ledger import Books, JobRecord
 from trilane.scheduler.loop import run_loop
 from trilane.scheduler.recording import Recording
 
@@ -80,6 +80,7 @@ class VirtualDriver:
         inputs: Iterable[tuple[int, Event]] = (),
         skips: Skips = none_skips,
         keep: bool = False,
+        books: Books | None = None,
     ) -> None:
         """All times are `int`, those of `service` too (no NumPy integers).
 
@@ -91,9 +92,10 @@ class VirtualDriver:
         `inputs`: (t_ns, event), events from outside, such as SetDuty or Stop.
         `skips`: which frames take the bypass of `graph`, if it has one.
         `keep`: record steps, and the jobs that end.
+        `books`: of the core.
         Raises ValueError for an unknown policy or edge.
         """
-        self.core = Core(graph, settings)
+        self.core = Core(graph, settings, books)
         self.recording = Recording(graph, settings) if keep else None
         self.jobs: list[JobRecord] = []
         self._service, self._message_delay_ns, self._restart_ns = service, message_delay_ns, restart_ns
@@ -193,12 +195,10 @@ def simulate(
     """Run to the end.
 
     `graph`, `settings`, `service`, `keep`, `driver`: see VirtualDriver.
-    `target_period_ns`, `isolated_ns`: see Ledger.report.
+    `target_period_ns`: see `trilane.scheduler.ledger.Books`. `isolated_ns`: see Ledger.report.
     Raises ValueError for an unknown policy or edge, RuntimeError when nothing can ever happen again.
     """
-    virtual = VirtualDriver(graph, settings, service, keep=keep, **driver)
+    virtual = VirtualDriver(graph, settings, service, keep=keep, books=Books(target_period_ns), **driver)
     outcome = virtual.run()
-    report = virtual.core.ledger.report(
-        clock="virtual", requested=settings.frames, target_period_ns=target_period_ns, isolated_ns=isolated_ns
-    )
+    report = virtual.core.ledger.report(clock="virtual", requested=settings.frames, isolated_ns=isolated_ns)
     return Simulation(report, virtual.recording, tuple(virtual.jobs), outcome)

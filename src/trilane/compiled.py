@@ -25,6 +25,8 @@ MODULES = (
     "scheduler/completion.py",
     "scheduler/flow.py",
     "scheduler/late_frames.py",
+    "scheduler/frame_times.py",
+    "scheduler/samples.py",
     "scheduler/ledger.py",
     "scheduler/loop.py",
     "scheduler/policy.py",

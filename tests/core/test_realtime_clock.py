@@ -305,11 +305,28 @@ def test_every_job_that_ended_is_booked_with_its_times_and_figures(monkeypatch: 
     assert clock.ended() == []
     assert clock.metrics == {"draw": {"area": 7.0, "new": 1.0}}
     assert clock.reported == {"draw": Counter(area=2, new=1)}
-    assert (clock.cpu.stage_ns, clock.cpu.in_jobs_ns, clock.cpu.between_ns) == (
+    of_stages = {stage: [*each.kept] for stage, each in clock.cpu.stage_ns.items()}
+    assert (
+        of_stages,
+        clock.cpu.in_jobs_ns,
+        clock.cpu.between_ns,
+    ) == (
         {"draw": [4, 16]},
         {"gpu": 20},
         {"gpu": 7},
     )
+
+
+def test_of_jobs_that_end_with_their_process_nothing_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The GPU holds draw 0 and 1 and ends; what the CPU holds is still answered."""
+    world = World(monkeypatch)
+    clock = world.begun()
+    clock.perform(START, (Dispatch(Job(7, "cpu", "show", 5, 0, -1, 0)),))
+    world.inbox = [[("gpu", None)], [("cpu", Done(7, START, START + 1, 0, 0, 0, 0, 0, 1, 0, {}))]]
+    assert clock.wait(NEVER)[1][0] == UnitDied("gpu")
+    assert [held[0].id for held in clock._open.values()] == [7]
+    clock.wait(NEVER)
+    assert clock._open == {}
 
 
 def test_progress_is_shown_ten_times_a_second_and_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:

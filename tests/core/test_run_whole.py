@@ -34,6 +34,7 @@ from trilane.pipeline.result import RunResult
 from trilane.pipeline.run_log import UnitError
 from trilane.pipeline.run_metrics import metrics_of
 from trilane.pipeline.run_record import JournalFile, memory_bytes
+from trilane.pipeline.sketch import DdSketch
 from trilane.scheduler.causes import Outcome, OutcomeKind
 from trilane.scheduler.events import Settings, StageAlone
 from trilane.scheduler.stats import energy_score
@@ -192,13 +193,13 @@ def test_the_steps_of_a_run_and_its_report(world: World) -> None:
     assert (report.caps, report.xrbench.energy) == (None, None)
 
 
-@pytest.mark.usefixtures("world")
-def test_a_run_with_a_journal_keeps_nothing_and_writes_the_same(tmp_path: Path) -> None:
+def test_a_run_with_a_journal_keeps_nothing_and_writes_the_same(world: World, tmp_path: Path) -> None:
     """Steps, jobs and accounts are those of the same run in memory; each job follows the step that heard its end."""
     kept = go()
     file = JournalFile(tmp_path / "j", {"made": "today", "clock": "host"}, lambda: {"temperature_c.sensor": 41.5})
     result = go(journal=file)
     assert (result.jobs, result.recording.steps, result.recording.accounts) == ((), [], [])
+    assert world.others[-1] is DdSketch and result.report.percentiles == kept.report.percentiles == "exact"
     begun, *records, ended = read_journal(tmp_path / "j")
     assert isinstance(begun, Begun)
     assert (begun.graph, begun.settings, begun.facts["made"]) == (PIPELINE.graph(), kept.recording.settings, "today")
@@ -290,17 +291,17 @@ def test_a_ladder_of_work_is_measured_before_a_run_at_a_rate(world: World) -> No
     assert world.steps.index(("rungs", [0, 3, 6], 2, ("mid",))) < world.steps.index("loop")
     assert world.first == [StageAlone("mid", 0, 3 * MS), StageAlone("mid", 1, 2 * MS)]
     assert (world.core.settings.works, world.core.settings.follow) == ((1000, 250), ("mid",))
-    assert result.rungs == (0,) * 9
+    assert (result.rungs, result.rung_switches) == ({0: 9}, 0)
     world.first.clear()
     without = go(9, isolated_frames=1, works=(1000, 250), follow=("mid",))
-    assert (world.first, world.core.ladder, without.rungs) == ([], None, ())
+    assert (world.first, world.core.ladder, without.rungs) == ([], None, {})
 
 
 def test_what_a_clock_is_given(world: World) -> None:
     governor: Any = SimpleNamespace(is_prompt=True, power_w=None, report=dict)
     progress: Any = "progress"
     go(governor=governor, on_progress=progress)
-    assert world.others == (None, governor, "progress")
+    assert world.others == (None, governor, "progress", None)
 
 
 def test_a_run_that_was_interrupted_says_so(world: World) -> None:

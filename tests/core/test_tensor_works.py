@@ -124,7 +124,7 @@ def config(works: tuple[int, ...]) -> RunConfig:
 
 
 def test_frames_are_counted_by_size_with_what_it_costs() -> None:
-    found = resolution_of([0, 0, 1, 1, 2, 1, 0], config(ALL), [LOSS, LOSS])
+    found = resolution_of({0: 3, 1: 3, 2: 1}, 4, config(ALL), [LOSS, LOSS])
     assert [(size["work"], size["most_pixels"], size["frames"], size["psnr_loss_db"]) for size in found["sizes"]] == [
         (1.0, 65536, 3, 0.0),
         (0.563, 36896, 3, 1.0),
@@ -136,10 +136,10 @@ def test_frames_are_counted_by_size_with_what_it_costs() -> None:
         "resolution: to be in time 4 of 7 presented frames had smaller tensors: 3 of at most 36896 pixels an avatar, "
         "1.0 dB worse, 1 of at most 16384 pixels an avatar, 3.0 dB worse; 4 switches (error: from somewhere)"
     )
-    unknown = resolution_of([1], config(ALL), [LOSS, UNKNOWN])
+    unknown = resolution_of({1: 1}, 0, config(ALL), [LOSS, UNKNOWN])
     assert [size["psnr_loss_db"] for size in unknown["sizes"]] == [None] * 3
     assert "pixels an avatar; 0 switches" in resolution_note(Resolution.model_validate(unknown))
-    assert resolution_note(Resolution.model_validate(resolution_of([0, 0], config(ALL), [LOSS]))) == ""
+    assert resolution_note(Resolution.model_validate(resolution_of({0: 2}, 0, config(ALL), [LOSS]))) == ""
     assert json.dumps(found) and math.isfinite(found["sizes"][2]["psnr_loss_db"])
 
 

@@ -94,7 +94,7 @@ def test_a_frame_takes_what_the_unit_takes_where_it_is(live: Any, turn: int, ord
 def test_the_frames_that_were_under_way_do_not_count() -> None:
     """Frames come every 10 ms in the first slice and 20 ms in the second; the six after the move take 100 ms each."""
     steps = [10.0] * SLICE + [100.0] * SKIPPED + [20.0] * (SLICE - SKIPPED) + [500.0] * DRAIN
-    ledger = SimpleNamespace(presented_ns=[])
+    ledger = SimpleNamespace(presented_ns=[], presented_count=0)
     core: Any = SimpleNamespace(ledger=ledger, graph=GRAPH)
     processes = Processes()
 
@@ -102,7 +102,8 @@ def test_the_frames_that_were_under_way_do_not_count() -> None:
         def wait(self, deadline_ns: int) -> str:
             assert deadline_ns == 99
             last = ledger.presented_ns[-1] if ledger.presented_ns else 0.0
-            ledger.presented_ns.append(last + steps[len(ledger.presented_ns)])
+            ledger.presented_ns.append(last + steps[ledger.presented_count])
+            ledger.presented_count += 1
             return "events"
 
         def perform(self, now_ns: int, actions: Any) -> None:

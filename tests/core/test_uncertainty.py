@@ -29,20 +29,22 @@ def test_the_order_counts_because_frames_depend_on_each_other() -> None:
 def test_the_first_frames_that_fill_no_batch_count_for_the_mean_alone() -> None:
     """Four frames before five batches of ten: the mean is (4 x 39 + 50 x 12) / 54 = 14, the half width is the same."""
     assert mean_interval([39] * 4 + BY_HAND) == pytest.approx((14 - HALF, 14 + HALF), abs=1e-6)
+    assert mean_interval(BY_HAND, 14) == pytest.approx((14 - HALF, 14 + HALF), abs=1e-6)  # of more than are given
 
 
 @pytest.mark.parametrize("values", [[], [1.0], BY_HAND[:49], [1.0] * 40 + [1000.0] * 10])
 def test_too_short_or_too_scattered_to_tell(values: list[float]) -> None:
     assert mean_interval(values) is None
-    assert set(frame_interval_ms([round(v) for v in values]).values()) == {None}
-    assert set(fps_interval([round(v) for v in values]).values()) == {None}
+    assert set(frame_interval_ms(None).values()) == {None}
+    assert set(fps_interval(None).values()) == {None}
 
 
 def test_milliseconds_and_rate_are_of_the_same_interval() -> None:
     times_ns = [value * 1_000_000 for value in BY_HAND]
-    assert frame_interval_ms(times_ns) == pytest.approx({"mean_low": 12 - HALF, "mean_high": 12 + HALF}, abs=1e-6)
+    interval = mean_interval(times_ns)
+    assert frame_interval_ms(interval) == pytest.approx({"mean_low": 12 - HALF, "mean_high": 12 + HALF}, abs=1e-6)
     rates = {"fps_low": 1000 / (12 + HALF), "fps_high": 1000 / (12 - HALF)}
-    assert fps_interval(times_ns) == pytest.approx(rates, abs=1e-5)
+    assert fps_interval(interval) == pytest.approx(rates, abs=1e-5)
 
 
 @pytest.mark.parametrize("freedom", T_975)
