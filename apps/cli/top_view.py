@@ -81,7 +81,7 @@ def _title(look: Look) -> str:
     over = "over" if figures.is_over else f"for {figures.run_s:.1f} s"
     return (
         f"run {look.name}: {look.state}, {over}; {figures.fps:.1f} fps in the last {figures.window_s:.1f} s, "
-        f"{figures.run_fps:.1f} in all"
+        f"{figures.run_fps:.1f} in all\navatars: {_short_error(figures)}"  # a small terminal cuts off what stands below
     )
 
 
@@ -148,7 +148,7 @@ def _stages(figures: Figures) -> Table:
 
 def _moved(kinds: Mapping[str, Moved]) -> tuple[str, str]:
     """MiB of a job in all and by kind, and the least that would do; dashes where the stage counts none."""
-    shown = {kind: moved.per_job / MIB for kind, moved in kinds.items() if kind != LEAST}
+    shown = {kind: moved.per_job / MIB for kind, moved in kinds.items() if kind != LEAST and moved.total}
     least = f"{kinds[LEAST].per_job / MIB:.2f}" if LEAST in kinds else "–"
     if not shown:
         return "–", least
