@@ -31,6 +31,7 @@ class AskedRun:
     `latch_ms`: how long before it is needed a pose is sampled.
     `out`: the run folder; None: `runs/TIME-SCENE`.
     `command`: the words by which it was asked for.
+    `held_ns`: how long jobs of a stage are held, at least, by its name; in place of a chip's pace.
     """
 
     request: Mapping[str, Any] = field(default_factory=dict)
@@ -41,6 +42,7 @@ class AskedRun:
     latch_ms: float = 0.0
     out: Path | None = None
     command: tuple[str, ...] = ()
+    held_ns: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,8 @@ def prepare(asked: AskedRun, gl: GlFacts) -> Prepared:
 
         pace = pace_of(checked.config, *asked.paced_by)
         plan, checked = replace(plan, pace=pace), checked.changed(pace_ns=dict(pace.stage_ns))
+    if asked.held_ns:
+        checked = checked.changed(pace_ns={**checked.config.pace_ns, **asked.held_ns})
     return Prepared(asked, checked, plan)
 
 

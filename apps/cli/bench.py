@@ -42,6 +42,10 @@ BENCHES = {
     "handoff": ("trilane.bench.handoff", "A slot from process to process, beside pickling, copying and iceoryx2."),
     "scheduler": ("trilane.bench.scheduler", "The scheduler in virtual time beside SimPy, and its determinism."),
     "planner": ("trilane.bench.planner", "Planned work against a fixed square: speed and image error."),
+    "compare": (
+        "trilane.apps.experiments.comparing",
+        "What `trilane compare` says of runs of one kind, and of others.",
+    ),
     "joints": ("trilane.bench.joints", "What the joint transforms of a frame cost."),
 }
 

@@ -17,6 +17,7 @@ LIMITS: dict[str, tuple[float, float]] = {
     "repeats": (1, 100_000),
     "threads": (0, 4 * (os.cpu_count() or 1)),
     "rounds": (1, 10_000),
+    "pairs": (1, 1000),
     "views": (1, 1_000_000),
     "finalists": (1, 1000),
     "frames": (1, 10_000_000),

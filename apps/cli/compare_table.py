@@ -1,0 +1,61 @@
+"""What `trilane compare` prints for people. Rule: the verdict first, then what it rests on, then what is unsure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from rich.markup import escape
+
+from trilane.apps.comparison.compared import METHOD
+from trilane.apps.comparison.words import change_of, interval_of, name_of, setting, value_of
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from trilane.apps.comparison.compared import Comparison
+    from trilane.apps.comparison.rows import Figure
+
+#: Measures of which one statistic is shown even where nothing differs.
+ALWAYS = ("frame time", "latency", "work", "busy")
+ALWAYS_STATISTICS = ("mean", "typical", "share")
+
+
+def comparison_lines(comparison: Comparison, show_all: bool) -> Iterator[str | Table]:
+    """Texts and tables of one comparison. `show_all`: figures too that do not differ and are seldom asked for."""
+    yield f"{comparison.other.name} beside {comparison.base.name}"
+    yield f"verdict: {comparison.verdict}"
+    if comparison.changes:
+        yield _change_table(comparison)
+    shown = [figure for figure in comparison.rows if show_all or _is_shown(figure, comparison)]
+    yield _figure_table(comparison, shown)
+    left = len(comparison.rows) - len(shown)
+    if left:
+        yield f"{left} more figures do not differ: --all shows them"
+    yield from comparison.notes
+    yield METHOD
+
+
+def _is_shown(figure: Figure, comparison: Comparison) -> bool:
+    return figure in comparison.differing or (figure.measure in ALWAYS and figure.statistic in ALWAYS_STATISTICS)
+
+
+def _change_table(comparison: Comparison) -> Table:
+    from rich.table import Table
+
+    table = Table("changed", "base", "other")
+    for change in comparison.changes:
+        table.add_row(*(escape(text) for text in (change.key, setting(change.base), setting(change.other))))
+    return table
+
+
+def _figure_table(comparison: Comparison, figures: list[Figure]) -> Table:
+    from rich.table import Table
+
+    table = Table("figure", "statistic", "base", "other", "change", "95 % interval", "differs")
+    for figure in figures:
+        row, unit = comparison.rows[figure], figure.unit
+        values = (value_of(row.base, unit), value_of(row.other, unit), change_of(row, unit), interval_of(row, unit))
+        differs = "yes" if figure in comparison.differing else "?" if row.probability is None else "no"
+        table.add_row(*(escape(text) for text in (name_of(figure), figure.statistic, *values, differs)))
+    return table

@@ -1,0 +1,188 @@
+"""The frames of a run as series, from its journal. Rule: every figure here is a frame's, in the order of presentation.
+
+A frame's own time is from the frame presented before it to it; what units did in that time is the frame's share of
+them.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from trilane.apps.comparison.difference import Series
+from trilane.arrays import F64, I64
+from trilane.errors import BadInputError
+from trilane.pipeline.journal import Accounted, Begun, Ended, Record, Stepped, Worked, read_journal
+from trilane.scheduler.accounts import BUSY, CAUSES, IdleCutter, IdleSlice
+from trilane.scheduler.events import Dispatch, Graph, JobDone
+from trilane.scheduler.ledger import JobRecord
+
+NS_PER_MS = 1e6
+STATES = (BUSY, *CAUSES)
+OVERHEAD, PREEMPTED = "overhead", "preempted"
+
+
+class Key(NamedTuple):
+    """What a series is of: `measure`, and the stage, the unit, or nothing. `cause`: of idle time; else empty."""
+
+    measure: str
+    of: str = ""
+    cause: str = ""
+
+
+@dataclass(frozen=True)
+class RunFrames:
+    """`series` of a run's frames by what they are of, times in ms; its `graph`; whether it `is_whole`."""
+
+    graph: Graph
+    series: Mapping[Key, Series]
+    is_whole: bool
+
+
+def read_frames(path: Path) -> RunFrames:
+    """The frames that the journal at `path` tells of. Raises BadInputError for one that is none or ends too early."""
+    frames = frames_of(read_journal(path))
+    if frames is None:
+        raise BadInputError(path, "no presented frame", "the journal of a run", "it was cut off: run again")
+    return frames
+
+
+def frames_of(records: Iterable[Record]) -> RunFrames | None:
+    """None where fewer than two frames were presented."""
+    story = _Story()
+    for record in records:
+        story.add(record)
+    graph, jobs, idle = story.graph, story.jobs, story.idle()
+    last = graph.stages[-1].name
+    ends = sorted((job.end_ns, job.frame) for job in jobs if job.stage == last)
+    if len(ends) < 2:
+        return None
+    end_ns, numbers = (np.array(column, np.int64) for column in zip(*ends, strict=True))
+    series = {Key("frame time"): _plain(numbers[1:], np.diff(end_ns))}
+    series |= _latencies(graph.latency_to, jobs, story.sampled_ns)
+    for stage in graph.stages:
+        series |= _stage(stage.name, [job for job in jobs if job.stage == stage.name])
+    for unit in graph.units:
+        series |= _unit(unit, [job for job in jobs if job.unit == unit], idle, numbers, end_ns)
+    series |= _figures(story.figures)
+    return RunFrames(graph, series, story.is_whole)
+
+
+class _Story:
+    """What the records of a journal tell, gathered."""
+
+    def __init__(self) -> None:
+        self.jobs: list[JobRecord] = []
+        self.sampled_ns: dict[int, int] = {}
+        self.figures: dict[Key, list[tuple[int, float]]] = defaultdict(list)
+        self.is_whole = False
+        self._first_jobs: dict[int, int] = {}
+        self._idle: list[IdleSlice] = []
+
+    def idle(self) -> list[IdleSlice]:
+        """Every idle slice of the run; to be asked once, after the last record."""
+        return [*self._idle, *self._cutter.end()]
+
+    def add(self, record: Record) -> None:
+        if isinstance(record, Begun):
+            self.graph = record.graph
+            self._cutter = IdleCutter(record.graph)
+        elif isinstance(record, Stepped):
+            self._step(record)
+        elif isinstance(record, Accounted):
+            self._cutter.account(record.unit, record.account)
+        elif isinstance(record, Worked):
+            self._work(record)
+        self.is_whole = isinstance(record, Ended)
+
+    def _step(self, step: Stepped) -> None:
+        self._idle += self._cutter.step(step.now_ns, step.events, step.actions)
+        first = self.graph.stages[0].name
+        for action in step.actions:
+            if type(action) is Dispatch and action.job.stage == first:
+                self._first_jobs[action.job.id] = action.job.frame
+        for event in step.events:
+            if type(event) is JobDone and event.job in self._first_jobs:
+                self.sampled_ns[self._first_jobs.pop(event.job)] = event.t_sampled_ns
+
+    def _work(self, record: Worked) -> None:
+        self.jobs.append(record.job)
+        self._cutter.job(record.job)
+        for name, value in record.figures.items():
+            if name.endswith("_bytes"):
+                self.figures[Key(name.removesuffix("_bytes") + " bytes", record.job.stage)].append(
+                    (record.job.frame, value)
+                )
+
+
+def _plain(frames: I64, ns: I64) -> Series:
+    return Series(frames, ns / NS_PER_MS, np.ones(len(frames)))
+
+
+def _latencies(stage: str, jobs: Sequence[JobRecord], sampled_ns: Mapping[int, int]) -> dict[Key, Series]:
+    ends = sorted((job.end_ns, job.frame) for job in jobs if job.stage == stage and job.frame in sampled_ns)
+    frames = np.array([frame for _, frame in ends], np.int64)
+    return {Key("latency"): _plain(frames, np.array([end - sampled_ns[frame] for end, frame in ends], np.int64))}
+
+
+def _stage(name: str, jobs: Sequence[JobRecord]) -> dict[Key, Series]:
+    """`work`: on the core; `service`: with the time without one; `wait`: for the unit."""
+    frames = np.array([job.frame for job in jobs], np.int64)
+    service = np.array([job.end_ns - job.begin_ns for job in jobs], np.int64)
+    preempted = np.array([job.preempted_ns for job in jobs], np.int64)
+    wait = np.array([job.begin_ns - job.ready_ns for job in jobs], np.int64)
+    return {
+        Key("work", name): _plain(frames, service - preempted),
+        Key("service", name): _plain(frames, service),
+        Key("wait", name): _plain(frames, wait),
+    }
+
+
+def _unit(
+    unit: str, jobs: Sequence[JobRecord], idle: Sequence[IdleSlice], frames: I64, end_ns: I64
+) -> dict[Key, Series]:
+    """Busy and idle time of a unit in the time of each frame, by cause, as shares of that time."""
+    pieces: list[tuple[int, int, dict[str, int]]] = []
+    for job in jobs:
+        busy = job.end_ns - job.begin_ns - job.preempted_ns - job.asleep_ns
+        pieces.append((job.begin_ns, job.end_ns, {BUSY: busy, PREEMPTED: job.preempted_ns, OVERHEAD: job.asleep_ns}))
+    for piece in idle:
+        if piece.unit == unit:
+            rest = piece.end_ns - piece.begin_ns - piece.preempted_ns
+            states = {piece.cause: rest}
+            states[PREEMPTED] = states.get(PREEMPTED, 0) + piece.preempted_ns
+            pieces.append((piece.begin_ns, piece.end_ns, states))
+    pieces.sort(key=lambda piece: piece[:2])
+    weights = np.diff(end_ns) / NS_PER_MS
+    return {
+        Key("busy" if state == BUSY else "idle", unit, "" if state == BUSY else state): Series(
+            frames[1:], _within(pieces, state, end_ns), weights
+        )
+        for state in STATES
+    }
+
+
+def _within(pieces: Sequence[tuple[int, int, Mapping[str, int]]], state: str, edges_ns: I64) -> F64:
+    """(edges - 1,) ms of `state` between neighbouring edges, spread evenly over each piece of time that has it."""
+    places, totals, total = [0.0], [0.0], 0
+    for begin_ns, end_ns, states in pieces:
+        places += [begin_ns, end_ns]
+        totals.append(total)
+        total += states.get(state, 0)
+        totals.append(total)
+    return np.asarray(np.diff(np.interp(edges_ns, places, totals)) / NS_PER_MS)
+
+
+def _figures(figures: Mapping[Key, Sequence[tuple[int, float]]]) -> dict[Key, Series]:
+    """Figures that stages gave of their jobs."""
+    return {
+        key: Series(
+            np.array([frame for frame, _ in rows], np.int64), np.array([v for _, v in rows]), np.ones(len(rows))
+        )
+        for key, rows in figures.items()
+    }

@@ -1,0 +1,157 @@
+"""The sentence that says what differs and the likely cause. Rule: it names what holds for all comparisons together.
+
+First the frame time, then what explains it, the most telling first: stages whose work takes longer or shorter, units
+that wait more or less, then what a setting that changed is known to do. What a rule below does not explain is named all
+the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Final
+
+from trilane.apps.comparison.configuration import Change
+from trilane.apps.comparison.difference import Difference
+from trilane.apps.comparison.rows import (
+    BUSY,
+    BYTES,
+    DROPPED,
+    ERROR,
+    FRAME_TIME,
+    IDLE,
+    LATENCY,
+    LOST,
+    SERVICE,
+    SHARE,
+    WORK,
+    Figure,
+    Rows,
+)
+
+NO_DIFFERENCE: Final = "no difference"
+TOO_FEW: Final = "too short to tell"
+#: A cause of idle time is named where its share has changed by so much.
+TELLING_SHARE: Final = 0.05
+MOST_NAMED: Final = 4
+#: What is said of the values of a setting.
+REASONS: Final = {
+    ("policy", "sequential"): "one frame at a time under sequential",
+    ("policy", "pipelined"): "several frames at a time under pipelined",
+    ("policy", "latest"): "the newest pose wins under latest",
+    ("policy", "deadline"): "late frames are dropped under deadline",
+}
+WAITS: Final = {
+    "starved": "is starved",
+    "blocked": "is blocked",
+    "throttled": "is held by its cap",
+    "preempted": "has no core",
+    "overhead": "waits for messages or its process",
+}
+
+
+def verdict(
+    rows: Rows, differing: Sequence[Figure], changes: Sequence[Change], stages: Mapping[str, Sequence[str]]
+) -> str:
+    """`no difference`, or a sentence.
+
+    `differing`: figures of `rows` that differ, all comparisons together. `changes`: of the configuration. `stages`:
+    names of each unit's.
+    """
+    if not differing:
+        unknown = all(row.probability is None for figure, row in rows.items() if figure.measure in (FRAME_TIME, WORK))
+        return TOO_FEW if unknown else NO_DIFFERENCE
+    found = {figure: rows[figure] for figure in differing}
+    heads = list(_heads(found))
+    causes = [*_works(found, changes), *_waits(found, rows, stages), *_others(found)]
+    reasons = [REASONS[change.key, change.other] for change in changes if (change.key, change.other) in REASONS]
+    if not heads and not causes:
+        causes = [_plain(figure, row) for figure, row in [*found.items()][:MOST_NAMED]]
+    parts = ["; ".join(heads), "; ".join(causes), "; ".join(reasons) if heads or causes else ""]
+    return ": ".join(part for part in parts if part)
+
+
+def _heads(found: Rows) -> Iterator[str]:
+    """The frame time; where it is as it was, its percentiles and the latency."""
+    for measure in (FRAME_TIME, LATENCY):
+        mine = {figure: row for figure, row in found.items() if figure.measure == measure}
+        of_mean = [figure for figure in mine if figure.statistic == "mean"] or [*mine][:1]
+        for figure in of_mean:
+            name = measure if figure.statistic == "mean" else f"{figure.statistic} of the {measure}"
+            yield f"{name} {signed(mine[figure], figure.unit)}"
+        if of_mean:
+            return
+
+
+def _works(found: Rows, changes: Sequence[Change]) -> Iterator[str]:
+    """Stages by how many milliseconds their work has changed."""
+    by_stage: dict[str, tuple[Figure, Difference]] = {}
+    for figure, row in found.items():
+        if figure.measure in (WORK, SERVICE):
+            by_stage.setdefault(figure.of, (figure, row))
+    held = {
+        change.key.removeprefix("config.pace_ns.") for change in changes if change.key.startswith("config.pace_ns.")
+    }
+    ordered = sorted(by_stage.values(), key=lambda each: -abs(each[1].other - each[1].base))
+    for figure, row in ordered[:MOST_NAMED]:
+        at = "" if figure.statistic in ("typical", "mean") else f" at {figure.statistic}"
+        why = ", as it is told to (pace_ns)" if figure.of in held else ""
+        yield f"{figure.of} takes {longer(row, figure.unit)}{at}{why}"
+
+
+def _waits(found: Rows, rows: Rows, stages: Mapping[str, Sequence[str]]) -> Iterator[str]:
+    """Units that wait more where frames take longer, or less where shorter, those that were the busiest first."""
+    frame_time = next((row.change for figure, row in found.items() if figure.measure == FRAME_TIME), 0.0)
+    telling = [
+        (figure, row)
+        for figure, row in found.items()
+        if figure.measure == IDLE and abs(row.change) >= TELLING_SHARE and row.change * frame_time >= 0
+    ]
+    busy = {figure.of: row.base for figure, row in rows.items() if figure.measure == BUSY}
+    for figure, row in sorted(telling, key=lambda each: (each[1].change < 0, -busy.get(each[0].of, 0.0)))[:MOST_NAMED]:
+        what = WAITS.get(figure.cause, f"is {figure.cause}")
+        names = ", ".join(stages.get(figure.of, ()))
+        yield f"unit {figure.of} ({names}) {what} {100 * row.other:.0f} % of the time, was {100 * row.base:.0f} %"
+
+
+def _others(found: Rows) -> Iterator[str]:
+    for figure, row in found.items():
+        if figure.measure in (LOST, DROPPED):
+            yield f"{figure.measure} ({figure.of}) {100 * row.other:.1f} % of the frames, was {100 * row.base:.1f} %"
+        elif figure.measure == ERROR:
+            yield f"error of {figure.of} {row.other:.4g} {figure.unit}".rstrip() + f", was {row.base:.4g}"
+        elif figure.unit == BYTES:
+            yield f"{figure.of} {figure.measure} {signed(row, figure.unit)}"
+
+
+def _plain(figure: Figure, row: Difference) -> str:
+    name = " ".join(part for part in (figure.measure, figure.cause, "of" if figure.of else "", figure.of) if part)
+    return f"{name} ({figure.statistic}) {signed(row, figure.unit)}"
+
+
+def longer(row: Difference, unit: str) -> str:
+    """Such as `5 % longer (4.2 to 5.8)`."""
+    word = "longer" if row.change > 0 else "shorter"
+    sign = 1 if row.change > 0 else -1
+    return f"{_amount(sign * row.change, row, unit)} {word}{_between(row, sign)}"
+
+
+def signed(row: Difference, unit: str) -> str:
+    """Such as `+48 % (44 to 52)`."""
+    return f"{_amount(row.change, row, unit, '+')}{_between(row, 1)}"
+
+
+def _between(row: Difference, sign: int) -> str:
+    if row.low is None or row.high is None:
+        return ""
+    scale = 100 if row.is_ratio else 1
+    low, high = sorted((sign * row.low * scale, sign * row.high * scale))
+    return f" ({low:.3g} to {high:.3g})"
+
+
+def _amount(value: float, row: Difference, unit: str, sign: str = "") -> str:
+    """A change in its unit; of a share in points of percent."""
+    if row.is_ratio:
+        return f"{100 * value:{sign}.3g} %"
+    if unit == SHARE:
+        return f"{100 * value:{sign}.3g} points"
+    return f"{value:{sign}.3g} {unit}".rstrip()

@@ -1,0 +1,51 @@
+"""What the bench of `trilane compare` asks for and counts, with runs in virtual time in place of real ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from trilane.apps import asked_run
+from trilane.apps.asked_run import AskedRun
+from trilane.apps.experiments import comparing
+from trilane.errors import BadInputError
+from trilane.testing.compared_runs import simulated, write_run
+from trilane.testing.run_report import SHARE
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[AskedRun]:
+    """Every run that is asked for; it is simulated, and a held stage takes as long as it is held."""
+    seen: list[AskedRun] = []
+
+    def run(wanted: AskedRun, _hooks: Any) -> None:
+        seen.append(wanted)
+        assert wanted.out is not None
+        factors = {stage: ns / 9e6 for stage, ns in wanted.held_ns.items()}
+        done = simulated(len(seen), policy=wanted.request["policy"], frames=wanted.request["frames"], factors=factors)
+        cores = {"cpu": [0], "gpu": [1], "dsp": [0, 1]}
+        units = {unit: {**SHARE, **row, "cores": cores[unit]} for unit, row in done.report["units"].items()}
+        write_run(wanted.out, done, units=units, other_programs=0.25)
+
+    monkeypatch.setattr(asked_run, "run_asked", run)
+    return seen
+
+
+def test_pairs_a_policy_and_a_held_stage(asked: list[AskedRun]) -> None:
+    said = comparing.measure(pairs=2, frames=80)
+    assert (said["pairs"], said["no_difference"], said["starvation_named"], said["stage_named"]) == (2, 2, True, True)
+    assert [row["question"] for row in said["rows"]] == ["same", "same", "sequential", "held"]
+    assert {row["others"] for row in said["rows"]} == {0.25}
+    assert [wanted.request["policy"] for wanted in asked].count("sequential") == 1
+    assert asked[0].request["cores"] == ()
+    assert {wanted.request["cores"] for wanted in asked[1:]} == {("cpu=0", "gpu=1", "dsp=0,1")}
+    base, longer = (wanted.held_ns["infer"] for wanted in asked[-2:])
+    assert (longer, said["config"]["held_ms"]) == (round(1.05 * base), base / 1e6)
+    assert not any(Path(str(wanted.out)).exists() for wanted in asked)
+
+
+def test_runs_that_are_too_short_to_tell_are_refused() -> None:
+    with pytest.raises(BadInputError, match="--frames: found 50, expected at least 51"):
+        comparing.measure(frames=50)

@@ -1,0 +1,291 @@
+"""What `trilane compare` says of runs whose difference is known, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from trilane.apps.cli import main as cli
+from trilane.apps.comparison.compared import Comparison, compare, document
+from trilane.apps.comparison.configuration import Change, changes
+from trilane.apps.comparison.noise import Noise, noise_between, remarks
+from trilane.apps.comparison.page import page
+from trilane.apps.comparison.rows import Figure
+from trilane.apps.comparison.run_frames import Key, frames_of
+from trilane.apps.comparison.sides import Kind, Side, Told, read_side, read_told
+from trilane.apps.comparison.verdict import NO_DIFFERENCE, TOO_FEW
+from trilane.errors import BadInputError
+from trilane.pipeline.journal import NAME, journal_of
+from trilane.scheduler.virtual import Simulation
+from trilane.testing.compared_runs import simulated, write_run
+from trilane.testing.run_report import make_report
+
+Make = Callable[..., Path]
+
+
+def told(run: Simulation, name: str = "run", **changes: Any) -> Told:
+    assert run.recording is not None
+    frames = frames_of(journal_of(run.recording, run.jobs, {}, run.report))
+    report = make_report(**{**run.report, "policy": run.recording.settings.policy, **changes})
+    return Told(name, Kind.RUN, report, frames)
+
+
+def pair(base: Told, other: Told) -> Comparison:
+    return compare(Side(base.name, (base,)), [Side(other.name, (other,))])[0]
+
+
+@pytest.fixture
+def make(tmp_path: Path) -> Make:
+    def write(name: str, seed: int = 1, *, policy: str = "pipelined", factors: Any = None, **changes: Any) -> Path:
+        return write_run(tmp_path / name, simulated(seed, policy=policy, frames=80, factors=factors), **changes)
+
+    return write
+
+
+def test_series_of_frames_are_those_of_the_report() -> None:
+    """Means of the series, computed from the journal, beside the ledger's own."""
+    run = simulated(7, frames=60)
+    mine = told(run)
+    assert mine.frames is not None
+    series, report = mine.frames.series, run.report
+    assert series[Key("frame time")].values.mean() == pytest.approx(report["frame_time_ms"]["mean"], rel=1e-6)
+    assert series[Key("latency")].values.mean() == pytest.approx(report["latency_ms"]["mean"], rel=1e-6)
+    for stage, row in report["stages"].items():
+        assert series[Key("service", stage)].values.mean() == pytest.approx(row["service_ms"]["mean"], rel=1e-6)
+        assert series[Key("wait", stage)].values.mean() == pytest.approx(row["wait_ms"]["mean"], abs=1e-6)
+    for unit, row in report["units"].items():
+        found = {key.cause or "busy": each for key, each in series.items() if key.of == unit}
+        ms = {state: float(each.values.sum()) for state, each in found.items()}
+        assert sum(ms.values()) == pytest.approx(series[Key("frame time")].values.sum(), rel=1e-9)
+        assert ms["busy"] / sum(ms.values()) == pytest.approx(row["busy"], abs=0.02)
+        assert ms["starved"] / sum(ms.values()) == pytest.approx(row["idle"]["starved"], abs=0.02)
+
+
+def test_runs_of_one_kind_do_not_differ() -> None:
+    runs = [told(simulated(seed, frames=120), f"run {seed}") for seed in range(20)]
+    said = [pair(*both).verdict for both in zip(runs[::2], runs[1::2], strict=True)]
+    assert said.count(NO_DIFFERENCE) >= 9
+
+
+@pytest.mark.parametrize("stage", ["infer", "pose"])
+@pytest.mark.parametrize("clock", ["virtual", "host"])
+def test_a_stage_that_takes_5_percent_longer_is_named_and_no_other(stage: str, clock: str) -> None:
+    """`infer` is the slowest, so frames take longer too; for `pose` they do not."""
+    base = told(simulated(1), clock=clock)
+    found = pair(base, told(simulated(2, factors={stage: 1.05}), clock=clock))
+    named = {figure.of for figure in found.differing if figure.measure == "work"}
+    assert named == {stage}
+    assert f"{stage} takes " in found.verdict and " longer (" in found.verdict
+    row = found.rows[Figure("work", stage, "", "typical", "ms")]
+    assert row.low is not None and row.high is not None and row.low < 0.05 < row.high
+    assert found.verdict.startswith("frame time +") == (stage == "infer" and clock == "virtual")
+
+
+def test_sequential_beside_pipelined_names_the_starved_dsp() -> None:
+    found = pair(told(simulated(1)), told(simulated(2, policy="sequential")))
+    assert found.verdict.startswith("frame time +1")
+    assert "unit dsp (infer) is starved 5" in found.verdict
+    assert found.verdict.endswith(": one frame at a time under sequential")
+    assert "takes" not in found.verdict
+    back = pair(found.other.runs[0], found.base.runs[0])
+    assert back.verdict.startswith("frame time -5") and "several frames at a time" in back.verdict
+
+
+def test_a_short_run_is_too_short_to_tell() -> None:
+    found = pair(told(simulated(1, frames=20)), told(simulated(2, frames=20)))
+    assert found.verdict == TOO_FEW
+    assert any("20 frames; to tell what differs, more than 50 are needed" in note for note in found.notes)
+
+
+def test_several_runs_a_side_stand_for_it() -> None:
+    sides = [
+        Side(
+            name,
+            tuple(
+                told(simulated(seed, factors={"infer": factor}), f"{name}{seed}") for seed in range(start, start + 3)
+            ),
+        )
+        for name, start, factor in (("a", 1, 1.0), ("b", 4, 1.0), ("c", 7, 1.05))
+    ]
+    alike, longer = compare(sides[0], sides[1:])
+    assert alike.verdict == NO_DIFFERENCE
+    assert "infer takes " in longer.verdict
+    one = pair(sides[0].runs[0], sides[2].runs[0])
+    figure = Figure("work", "infer", "", "typical", "ms")
+    of_one, of_three = one.rows[figure].deviation, longer.rows[figure].deviation
+    assert of_one is not None and of_three is not None and of_three < of_one
+    said = document([alike, longer])
+    assert said["verdict"].startswith("b: no difference; c: frame time +")
+    assert [entry["run"] for entry in said["comparisons"]] == ["b", "c"]
+
+
+def test_other_programs_and_held_stages_decide_how_sure_a_time_on_the_host_is() -> None:
+    """By the table: work 0.007 and 1 for each share of others, in quadrature; in virtual time there is no noise."""
+    base = make_report(clock="host", other_programs=0.1)
+    other = make_report(clock="host", other_programs=0.024, config={**base["config"], "pace_ns": {"infer": 5}})
+    noise = noise_between(base, other, {"infer": 0.1})
+    assert noise.work["infer"] == pytest.approx((0.007**2 + 0.1**2) ** 0.5)
+    assert noise.held == frozenset()
+    assert noise_between(other, other, {"infer": 0.1}).held == {"infer"}
+    assert noise.wall == pytest.approx((0.02**2 + 0.1**2) ** 0.5)
+    assert noise.share == pytest.approx((0.01**2 + 0.05**2) ** 0.5)
+    virtual = make_report(clock="virtual")
+    assert noise_between(virtual, virtual, {"infer": 0.1}) == Noise({"infer": 0.0}, 0.0, 0.0)
+    said = remarks({"a": base, "b": other, "c": make_report(), "d": virtual})
+    assert [text[:2] for text in said] == ["a:", "c:"]
+    assert "had 10 % of its cores, so runs of one kind may differ by 20 %" in said[0]
+
+
+def test_a_core_on_which_every_stage_is_slower_is_slower_itself() -> None:
+    """One stage of two by 20 % says nothing of the core; both by 20 % and 30 % say 20 %, on one machine alone."""
+    stages = {
+        name: {**make_report()["stages"]["infer"], "unit": unit}
+        for name, unit in (("pose", "cpu"), ("present", "cpu"), ("infer", "dsp"))
+    }
+    share = make_report()["units"]["dsp"]
+    report = make_report(
+        stages=stages, units={"cpu": {**share, "cores": [0]}, "dsp": {**share, "cores": [1]}}, other_programs=0.0
+    )
+    both = noise_between(report, report, {"pose": 0.2, "present": 0.3, "infer": 0.5})
+    assert both.work == pytest.approx({"pose": 0.2, "present": 0.2, "infer": 0.0}, abs=0.008)
+    against = noise_between(report, report, {"pose": 0.2, "present": -0.3, "infer": 0.5})
+    assert max(against.work.values()) == pytest.approx(0.007)
+    elsewhere = {**report, "machine": {**report["machine"], "system": "another"}}
+    assert max(noise_between(report, elsewhere, {"pose": 0.2, "present": 0.3}).work.values()) == pytest.approx(0.007)
+
+
+def test_only_the_keys_that_differ_are_named() -> None:
+    base = make_report(made={"at": "1", "command": ["a"], "trilane": None, "revision": "x", "modified": False})
+    other = make_report(made={"at": "2", "command": ["b"], "trilane": None, "revision": "y", "modified": False})
+    other["config"] = {**base["config"], "policy": "latest", "pace_ns": {"infer": 5}}
+    other["policy"] = "latest"
+    assert changes(base, other) == [
+        Change("policy", "pipelined", "latest"),
+        Change("config.pace_ns.infer", None, 5),
+        Change("made.revision", "x", "y"),
+    ]
+    assert changes(base, base) == []
+
+
+def test_drops_and_errors_are_named() -> None:
+    run = simulated(1)
+    counts = {
+        "requested": 200,
+        "presented": 150,
+        "lost": 0,
+        "lost_by_cause": {},
+        "dropped": {"raster->infer:stale": 50},
+    }
+    error = {"someone": {"source": "x", "psnr_db_by_band": {"face": 29.5}, "iou": 0.9}}
+    better = {"someone": {"source": "x", "psnr_db_by_band": {"face": 31.25}, "iou": 0.9}}
+    found = pair(told(run, accuracy=better), told(run, frames=counts, accuracy=error))
+    assert found.verdict == (
+        "dropped (raster->infer:stale) 25.0 % of the frames, was 0.0 %; "
+        "error of someone psnr_db_by_band face 29.5 dB, was 31.25"
+    )
+
+
+def test_a_report_without_a_journal_has_summaries(make: Make) -> None:
+    base, other = make("a"), make("b", policy="sequential", seed=2)
+    (base / NAME).unlink()
+    found = compare(read_side(str(base)), [read_side(str(other / "report.json"))])[0]
+    assert "frame time +" in found.verdict and "is starved" in found.verdict
+    assert sum("only summaries are compared" in note for note in found.notes) == 2
+    assert found.rows[Figure("frame time", "", "", "p99", "ms")].probability is None
+
+
+def test_predictions_of_one_chip_share_the_models_error(tmp_path: Path) -> None:
+    def prediction(name: str, mean: float, chip: str) -> Told:
+        times = {"mean": mean, "p50": mean, "p90": mean, "p99": mean, "low": mean * 0.9, "high": mean * 1.1}
+        idle = {"starved": 0.5, "blocked": 0.0, "throttled": 0.0, "preempted": 0.0, "overhead": 0.0}
+        answer = {
+            "clock": "virtual", "machine": {"profile": chip}, "config": {"policy": "x"}, "network": {},
+            "expected_error": 0.1, "frame_time_ms": times, "latency_ms": {"mean": 30.0},
+            "stages": {"infer": {"unit": "dsp", "service_ms": {"mean": 10.0}}},
+            "units": {"dsp": {"busy": 0.5, "idle": idle}},
+        }  # fmt: skip
+        path = tmp_path / name
+        path.write_text(json.dumps(answer), encoding="utf-8")
+        return read_told(str(path))
+
+    base = prediction("a", 20.0, "one")
+    assert pair(base, prediction("b", 20.5, "one")).verdict == "frame time +2.5 % (2.5 to 2.5)"
+    assert pair(base, prediction("c", 20.5, "two")).verdict == NO_DIFFERENCE
+    assert "computed by a model" in pair(base, base).notes[0]
+
+
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [
+        (None, "no such file"),
+        ("[1]", "a JSON list"),
+        ("{", "EOF"),
+        ('{"schema": 99}', "schema: found 99"),
+        ('{"networks": []}', "bare networks"),
+        ("{}", "field required"),
+    ],
+)
+def test_what_is_no_run_is_refused_by_name(tmp_path: Path, content: str | None, found: str) -> None:
+    path = tmp_path / "thing.json"
+    if content is not None:
+        path.write_text(content, encoding="utf-8")
+    with pytest.raises(BadInputError, match=found) as error:
+        read_side(str(path))
+    assert "thing.json" in str(error.value)
+
+
+def test_a_journal_that_is_cut_off_is_compared_until_there_or_refused(make: Make) -> None:
+    base, other = make("a"), make("b", seed=2)
+    whole = (other / NAME).read_bytes()
+    (other / NAME).write_bytes(whole[: len(whole) * 3 // 4])
+    found = compare(read_side(str(base)), [read_side(str(other))])[0]
+    assert any("its journal ends before the run did" in note for note in found.notes)
+    (other / NAME).write_bytes(whole[:2000])
+    with pytest.raises(BadInputError, match=r"b/journal\.msgpack: found no presented frame"):
+        read_side(str(other))
+
+
+def test_the_page_asks_for_nothing_and_escapes_what_it_is_given() -> None:
+    name = "<script>alert(1)</script>&'"
+    base = told(simulated(1), name)
+    other = told(simulated(2, policy="sequential"), 'x" onload="y', idle_cores="<b>")
+    found = pair(base, other)
+    text = page([found])
+    assert "<script" not in text and "<b>" not in text and 'x" onload' not in text
+    assert "&lt;script&gt;" in text and "default-src &#x27;none&#x27;" in text
+    assert not any(word in text for word in ("http:", "https:", "src=", "url(", "@import"))
+    assert text.count("<svg") == len(found.rows)
+    assert "prefers-color-scheme: dark" in text
+
+
+def run_cli(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["trilane", "compare", *words])
+    with pytest.raises(SystemExit) as left:
+        cli.main()
+    return int(left.value.code or 0)
+
+
+def test_the_command(
+    make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    base, other = str(make("a")), str(make("b", seed=2, policy="sequential"))
+    assert run_cli(monkeypatch, base, other, "--html", str(tmp_path / "page.html")) == 0
+    text = capsys.readouterr().out
+    assert "verdict: frame time +" in text and "sequential" in text and "more figures do not differ" in text
+    assert (tmp_path / "page.html").read_text(encoding="utf-8").startswith("<!doctype html>")
+    assert run_cli(monkeypatch, base, other, "--json", "--fail-if-slower", "5%") == 1
+    said = json.loads(capsys.readouterr().out)
+    assert said["changes"] == [{"run": other, "key": "policy", "base": "pipelined", "other": "sequential"}]
+    assert run_cli(monkeypatch, f"{base},{base}", other, "--fail-if-slower", "500 %") == 0
+    capsys.readouterr()
+    assert run_cli(monkeypatch, base, other, "--fail-if-slower", "much") == 2
+    assert "found 'much', expected a percentage such as 5%" in capsys.readouterr().err
+    assert run_cli(monkeypatch, base, base, "--all") == 0
+    assert "verdict: no difference" in capsys.readouterr().out
+    assert run_cli(monkeypatch, base, str(tmp_path / "nothing")) == 2
+    assert "nothing" in capsys.readouterr().err
