@@ -11,6 +11,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from trilane.apps.asked_prediction import (
+    answer_of,
+    check_governor,
+    engine_runtime_of,
+    network_of,
+    precision_of,
+    predict_networks,
+    reference_of,
+    unit_of,
+    usual_cap,
+    variant_of,
+    wanted_of,
+)
 from trilane.apps.cli.beside import BesideOption, Joined, OnChip, SceneToPredict, TurnsOption, predict_pipelines
 from trilane.apps.cli.commands import Commands, given
 from trilane.apps.cli.console import stderr_console
@@ -25,13 +38,12 @@ from trilane.apps.cli.options import (
 )
 from trilane.apps.cli.predict_output import draw, show_answer, show_networks, show_table
 from trilane.errors import BadInputError
-from trilane.units import PerformanceProfile, UnitName
+from trilane.units import PerformanceProfile
 
 if TYPE_CHECKING:
     from trilane.hw_profiles.application import Plan, Variant
-    from trilane.hw_profiles.network_work import Network
     from trilane.hw_profiles.rates import Wanted
-    from trilane.hw_profiles.schema import EngineRuntime, Profile
+    from trilane.hw_profiles.schema import Profile
 
 app = Commands()
 
@@ -54,7 +66,6 @@ Examples:
   trilane predict portrait --beside default --beside network.onnx@30
 """
 PLOT_MINUTES = 30.0
-HOST = "host"
 OF_A_FILE = {"encoder", "norm", "size", "channels"}
 OF_THE_APPLICATION = {"layout", "policy", "edge", "batch", "gpu_share", "what_if", "plot", "trace"}
 #: Option: those that have no effect beside it.
@@ -70,8 +81,6 @@ WHY_IGNORED = {
     "network": "the file says so itself",
     "table": "each row says so itself",
 }
-#: How people call precisions -> as a hardware profile does.
-PRECISIONS = {"w8a8": "int8", "int8": "int8", "float": "fp16", "fp16": "fp16", "fp32": "fp32"}
 
 AvatarOption = Annotated[
     str | None, typer.Option(help="An avatar's network instead: `default`, or the folder of an avatar.")
@@ -174,27 +183,27 @@ def predict(
     bare = bool(networks) and not application
     _refuse_ignored(ctx, bare=bare)
     _check_application(application, len(networks))
-    if (profile == HOST or bare) and "performance_profile" not in given(ctx):
-        performance_profile = PerformanceProfile.BURST
-    _check_governor(governor)
+    if "performance_profile" not in given(ctx):
+        performance_profile = PerformanceProfile(usual_cap(profile, bare=bare))
+    check_governor(governor)
     if scene is not None or beside:
         chip_at = OnChip(profile, performance_profile, minutes, governor)
         predict_pipelines(scene, beside or [], given(ctx), chip_at, Joined(policy, edge, turns), trace, json)
         return
-    wanted, shapes = _wanted(fps, power_limit_w), _shapes(input_shape or [], len(networks))
-    chip, variant = load_runnable(profile), _variant(policy, edge, batch, fps)
+    wanted, shapes = wanted_of(fps, power_limit_w), _shapes(input_shape or [], len(networks))
+    chip, variant = load_runnable(profile), variant_of(policy, edge, batch, fps)
     if table is not None:
         answers = _predict_table(chip, table, performance_profile, variant)
         show_table(chip.name, performance_profile, answers, json)
         return
     if bare:
-        on = (_unit(runtime, "cpu"), _precision(precision), _engine_runtime(engine_runtime))
+        on = (unit_of(runtime, "cpu"), precision_of(precision), engine_runtime_of(engine_runtime))
         over = (performance_profile, minutes, governor, wanted)
-        show_networks(chip, over, _predict_networks(chip, networks, shapes, on, over), json)
+        show_networks(chip, over, predict_networks(chip, networks, shapes, on, over), json)
         return
-    chip, described = _network_of(chip, networks, shapes, avatar, layout, _unit(runtime), _precision(precision))
-    plan = Plan(described or _reference(encoder, norm, size, channels, layout), _unit(runtime), variant, gpu_share)
-    answer = _answer(chip, plan, performance_profile, minutes, governor, what_if, wanted)
+    chip, described = network_of(chip, networks, shapes, avatar, layout, unit_of(runtime), precision_of(precision))
+    plan = Plan(described or reference_of(encoder, norm, size, channels, layout), unit_of(runtime), variant, gpu_share)
+    answer = answer_of(chip, plan, performance_profile, minutes, governor, what_if, wanted)
     if plot is not None:
         draw(chip, plan, performance_profile, minutes or PLOT_MINUTES, governor, plot)
     if trace is not None:
@@ -224,17 +233,6 @@ def _check_application(application: bool, networks: int) -> None:
         raise BadInputError("options", f"--application with {networks} networks", "one --network", remedy)
 
 
-def _wanted(fps: float | None, power_limit_w: float | None) -> Wanted:
-    from trilane.hw_profiles.application import LEAST_FPS, MOST_FPS
-    from trilane.hw_profiles.rates import Wanted
-
-    if fps is not None and not LEAST_FPS <= fps <= MOST_FPS:
-        raise BadInputError("--fps", f"{fps:g}", f"{LEAST_FPS:g} to {MOST_FPS:g}")
-    if power_limit_w is not None and not 0 < power_limit_w < float("inf"):
-        raise BadInputError("--power-limit-w", f"{power_limit_w:g}", "watts above 0")
-    return Wanted(fps, power_limit_w)
-
-
 def _shapes(texts: list[str], networks: int) -> dict[str, tuple[int, ...]]:
     """Shapes of inputs by name."""
     if texts and not networks:
@@ -248,128 +246,6 @@ def _shapes(texts: list[str], networks: int) -> dict[str, tuple[int, ...]]:
             raise BadInputError("--input-shape", f"{found[1]!r} twice", "each input once")
         shapes[found[1]] = sizes
     return shapes
-
-
-def _precision(text: str | None) -> str | None:
-    if text is not None and text not in PRECISIONS:
-        raise BadInputError("--precision", repr(text), "w8a8 (int8), float (fp16) or fp32")
-    return None if text is None else PRECISIONS[text]
-
-
-def _engine_runtime(text: str | None) -> EngineRuntime | None:
-    from trilane.hw_profiles.schema import ENGINE_RUNTIMES
-
-    found = next((runtime for runtime in ENGINE_RUNTIMES if runtime == text), None)
-    if text is not None and found is None:
-        raise BadInputError("--engine-runtime", repr(text), " or ".join(ENGINE_RUNTIMES))
-    return found
-
-
-def _check_governor(governor: str | None) -> None:
-    from trilane.hw_profiles.throttling import GOVERNORS
-
-    if governor is not None and governor not in GOVERNORS:
-        raise BadInputError("--governor", repr(governor), " or ".join(GOVERNORS))
-
-
-def _variant(policy: str, edge: str | None, batch: int, fps: float | None) -> Variant:
-    from trilane.hw_profiles.application import REFERENCE, Variant
-
-    if policy != "reference":
-        return Variant(policy, edge or "double", batch, **({} if fps is None else {"fps": fps}))
-    if edge not in (None, REFERENCE.edge):
-        remedy = "choose a --policy of your own, such as pipelined"
-        raise BadInputError("--edge", repr(edge), f"{REFERENCE.edge}, which the reference application has", remedy)
-    return REFERENCE._replace(batch=batch)
-
-
-def _unit(runtime: str, *more: str) -> Any:
-    units = (*more, "gpu", "dsp")
-    if runtime not in units:
-        raise BadInputError("--runtime", repr(runtime), " or ".join(", ".join(units).rsplit(", ", 1)))
-    return runtime
-
-
-def _reference(encoder: str, norm: str, size: str, channels: int, layout: str) -> Network:
-    from trilane.hw_profiles.configuration_table import spec_of
-    from trilane.hw_profiles.reference_networks import reference_network
-
-    cells = {"encoder": encoder, "norm": norm, "size": size, "channels": str(channels), "layout": layout}
-    return reference_network(spec_of(cells, "options"))
-
-
-def _predict_networks(
-    chip: Profile,
-    paths: list[Path],
-    shapes: dict[str, tuple[int, ...]],
-    on: tuple[UnitName, str | None, EngineRuntime | None],
-    over: tuple[str, float, str | None, Wanted],
-) -> list[dict[str, Any]]:
-    """What is predicted of each network.
-
-    `on`: unit, its precision and the runtime of its tensor engine. `over`: performance profile, minutes, governor, and
-    what is wanted.
-    """
-    from trilane.hw_profiles.bare_network import in_precision, predict_network, under_runtime
-    from trilane.hw_profiles.graph_file import read_graph
-    from trilane.hw_profiles.network_work import constant_tensors
-
-    graphs = [read_graph(path, shapes) for path in paths]
-    inputs = {value.name for graph in graphs for value in graph.model.graph.input}
-    if missing := [name for name in shapes if name not in inputs]:
-        given = inputs.difference(*(constant_tensors(graph.model.graph) for graph in graphs))
-        raise BadInputError("--input-shape", f"no input {missing[0]!r}", f"one of {', '.join(sorted(given))}")
-    unit, precision, engine_runtime = on
-    chips = [in_precision(chip, unit, graph.numbers, precision) for graph in graphs]
-    chips = [under_runtime(each, unit, engine_runtime) for each in chips]
-    return [predict_network(each, graph, unit, *over) for each, graph in zip(chips, graphs, strict=True)]
-
-
-def _network_of(
-    chip: Profile,
-    networks: list[Path],
-    shapes: dict[str, tuple[int, ...]],
-    avatar: str | None,
-    layout: str,
-    unit: UnitName,
-    precision: str | None,
-) -> tuple[Profile, Network | None]:
-    """The network of a file, or of an avatar, None when neither was named; and the chip in its precision."""
-    from trilane.avatars.bundle import load_bundle
-    from trilane.hw_profiles.bare_network import in_precision
-    from trilane.hw_profiles.graph_file import read_graph
-    from trilane.hw_profiles.image_network import image_network
-    from trilane.hw_profiles.network_work import Network, count_work
-
-    if layout not in ("packed", "split"):
-        raise BadInputError("--layout", repr(layout), "packed or split")
-    if networks:
-        graph = read_graph(networks[0], shapes)
-        return in_precision(chip, unit, graph.numbers, precision), image_network(graph, layout)
-    chip = in_precision(chip, unit, "not said", precision)
-    if avatar is None:
-        return chip, None
-    file = load_bundle(avatar or "default").read_network()
-    _, height, width, channels = file.shape
-    return chip, Network({"avatar": str(avatar)}, height, width, channels, layout, count_work(file.model))
-
-
-def _answer(
-    chip: Profile,
-    plan: Plan,
-    performance_profile: str,
-    minutes: float,
-    governor: str | None,
-    what_if: bool,
-    wanted: Wanted,
-) -> dict[str, Any]:
-    """The prediction, with the alternatives to it when they were asked for."""
-    from trilane.hw_profiles import predict as predictions
-
-    answer = predictions.predict(chip, plan, performance_profile, minutes, governor, wanted)
-    if what_if:
-        answer["alternatives"] = predictions.what_if(chip, plan.network, plan.runtime, performance_profile, wanted.fps)
-    return answer
 
 
 def _write_trace(

@@ -53,8 +53,9 @@ def _try(row: Mapping[str, Any], taken: Mapping[str, Mapping[str, Any]]) -> str:
     if row["what"] == WORK:
         return SHORTER.get(stage, f"shorter work of {stage}, or a unit of its own for it")
     if row["what"] == PREEMPTED:
-        others = [other for other, ms in taken.get(stage, {}).get("taken_ms", {}).items() if ms]
-        if others:
-            return f"{unit} and {', '.join(others)} share a core: `--cores` gives them cores of their own"
-        return "no job of this run had the core: other programs, or threads that spin between jobs"
+        shared = taken.get(stage, {"taken_ms": {}, "others_ms": 0.0})
+        units = [other for other, ms in shared["taken_ms"].items() if ms]
+        if units and sum(shared["taken_ms"].values()) >= shared["others_ms"]:
+            return f"{unit} and {', '.join(units)} share a core: `--cores` gives them cores of their own"
+        return "mostly no job of this run had the core: end other programs; threads that spin between jobs take it too"
     return OF_CAUSES.get(row["what"], "nothing: it is before what is known").format(stage=stage, unit=unit)

@@ -271,4 +271,6 @@ def _whose_core(shown: Shown, part: Part) -> str:
     taken = {unit: ns for unit, ns in shown.taken_ns.get(part, {}).items() if ns}
     if not taken:
         return ": no job of this run had it"
-    return ": " + ", ".join(f"jobs of {unit} had it for {ns / NS_PER_MS:.1f} ms" for unit, ns in taken.items())
+    of_ms = max(shown.longest[part].preempted_ns, sum(taken.values())) / NS_PER_MS
+    said = ", ".join(f"jobs of {unit} had it for {ns / NS_PER_MS:.1f}" for unit, ns in taken.items())
+    return f": {said} of {of_ms:.1f} ms"

@@ -1,15 +1,33 @@
-"""Trilane: run, measure and predict a neural-avatar pipeline on CPU, GPU and DSP units."""
+"""Trilane: run, measure and predict a neural-avatar pipeline on CPU, GPU and DSP units.
 
-from typing import Any
+`run`, `predict` and `load_run` are its interface for programs and notebooks (docs/python.md). Rule: importing this
+module imports nothing else; what is asked of it is looked up then.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from trilane.apps.interface import Prediction, Run, RunFailedError, load_run, predict, run
+
+__all__ = ["Prediction", "Run", "RunFailedError", "load_run", "predict", "run"]
 
 
 def __getattr__(name: str) -> Any:
-    """`__version__`, looked up when it is asked for: reading it takes longer than a unit's start."""
+    """A name of the interface; `__version__`, whose reading takes longer than a unit's start."""
+    if name in __all__:
+        from importlib import import_module
+
+        return getattr(import_module("trilane.apps.interface"), name)
     if name != "__version__":
-        raise AttributeError(name)
+        raise AttributeError(f"module 'trilane' has no attribute {name!r}")
     from importlib.metadata import PackageNotFoundError, version
 
     try:
         return version("trilane")
     except PackageNotFoundError:  # a source tree that was never installed
         return "0.0.0"
+
+
+def __dir__() -> list[str]:
+    """So that the interface is completed and listed."""
+    return [*globals(), *__all__]

@@ -12,6 +12,7 @@ from typing import Any
 import onnx
 import pytest
 
+from trilane.apps import asked_prediction
 from trilane.apps.cli import predict as cli
 from trilane.apps.cli import predict_output
 from trilane.avatars.bundle import load_bundle
@@ -146,7 +147,7 @@ def test_a_rate_a_limit_and_a_precision(asked: dict[str, Any], command: Command)
 
 @pytest.mark.parametrize(("edge", "batch"), [(None, 1), (REFERENCE.edge, 4)])
 def test_the_reference_keeps_its_edge(edge: str | None, batch: int) -> None:
-    assert cli._variant("reference", edge, batch, None) == REFERENCE._replace(batch=batch)
+    assert asked_prediction.variant_of("reference", edge, batch, None) == REFERENCE._replace(batch=batch)
 
 
 ONE = "expected one or the other"
@@ -403,7 +404,7 @@ def test_inputs_that_may_have_another_shape_are_told_without_the_weights(tmp_pat
     onnx.save(onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)]), tmp_path / "net.onnx")
     with pytest.raises(BadInputError, match=r"found no input 'picture', expected one of image$"):
         over: Any = None
-        cli._predict_networks(CHIP, [tmp_path / "net.onnx"], {"picture": (1,)}, ("dsp", None, None), over)
+        asked_prediction.predict_networks(CHIP, [tmp_path / "net.onnx"], {"picture": (1,)}, ("dsp", None, None), over)
 
 
 def test_a_limit_below_what_an_idle_device_takes(capsys: pytest.CaptureFixture[str]) -> None:

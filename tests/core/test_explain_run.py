@@ -107,6 +107,27 @@ def test_dropped_frames_and_late_input_are_named(tmp_path: Path) -> None:
     assert usual["advice"][0].endswith("there is time to spare")
 
 
+def test_a_frame_that_lacked_its_core_says_who_had_it(tmp_path: Path) -> None:
+    """infer of frame 10 takes 100 ms, for 90 of which the DSP has no core; jobs of the CPU ran on it meanwhile."""
+
+    def service(stage: str, _unit: str, frame: int, _begin_ns: int) -> int:
+        return (100 if (stage, frame) == ("infer", 10) else STAGE_MS[stage]) * MS
+
+    run = simulate(application_graph(), Settings(20), service, keep=True)
+    slow = next(job for job in run.jobs if (job.stage, job.frame) == ("infer", 10))
+    jobs = [job._replace(preempted_ns=90 * MS) if job == slow else job for job in run.jobs]
+    (row,) = explain_run(write_run(tmp_path / "run", run, jobs, cores=CORES), 1)["slowest"]
+    beside_ms = (
+        sum(
+            max(min(job.end_ns, slow.end_ns) - max(job.begin_ns, slow.begin_ns), 0) for job in jobs if job.unit == "cpu"
+        )
+        / MS
+    )
+    expected = f"infer: dsp had no core: jobs of cpu had it for {beside_ms:.1f} of 90.0 ms"
+    assert beside_ms >= 2
+    assert row["why"][0]["text"].replace(" of frame 10", "") == expected
+
+
 def test_what_is_printed(folder: Path, command: Command, check_printed: Callable[[str, str], None]) -> None:
     out, err = command("explain", folder, "--slowest", 3)
     check_printed("explain-run", out.replace(str(folder), "RUN"))
@@ -207,12 +228,13 @@ def test_advice_is_about_what_bounds_a_tenth_at_least() -> None:
         {"stage": "infer", "unit": "dsp", "what": "throttled", "share": 0.11, "ms": 1.1},
         {"stage": "present", "unit": "cpu", "what": "work", "share": 0.09, "ms": 0.9},
     ]
-    shared = [{"stage": "pose", "taken_ms": {"dsp": 4.0, "gpu": 0.0}}]
+    shared = [{"stage": "pose", "taken_ms": {"dsp": 4.0, "gpu": 0.0}, "others_ms": 3.5}]
     assert advice(rows, shared, "pipelined") == [
         "5.0 ms a frame, pose (preempted): cpu and dsp share a core: `--cores` gives them cores of their own",
         "3.0 ms a frame, own (work): shorter work of own, or a unit of its own for it",
         "1.1 ms a frame, infer (throttled): a performance profile with more power, such as `--performance-profile "
         "burst`, caps dsp less",
     ]
-    assert advice(rows[:1], [], "pipelined")[0].endswith("or threads that spin between jobs")
+    for rest in ([], [{**shared[0], "others_ms": 4.5}]):
+        assert "mostly no job of this run had the core" in advice(rows[:1], rest, "pipelined")[0]
     assert "`--policy pipelined`" in advice(rows, [], "sequential")[0]

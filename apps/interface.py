@@ -1,0 +1,317 @@
+"""Trilane for programs and notebooks: `run`, `predict`, `load_run`, and what they hand back (docs/python.md).
+
+Rule: the same functions work here and below the command line. Nothing is printed and nothing ends the program: what
+goes wrong is a TrilaneError, what a person might want to read is in the report or comes through a callback.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.apps.asked_run import AskedRun, run_asked
+from trilane.apps.explained.job_table import COLUMNS, figure_names, job_rows
+from trilane.apps.explained.run import explain_run, explained_jobs, open_journal
+from trilane.apps.report import Report, read_report
+from trilane.apps.run_html import prediction_html, run_html
+from trilane.errors import BadInputError, MissingPartError, TrilaneError
+from trilane.near_miss import did_you_mean
+from trilane.pipeline.journal import Record, Stepped
+from trilane.pipeline.journal_slices import JournalSlices
+from trilane.scheduler.accounts import IdleSlice
+from trilane.scheduler.events import Event
+from trilane.scheduler.policy import POLICIES
+from trilane.units import PERFORMANCE_PROFILES
+
+if TYPE_CHECKING:
+    import pandas
+
+INTERRUPTED = 130
+FRAME_TYPE = np.dtype(
+    [("frame", np.int64), ("presented_ns", np.int64), ("frame_ns", np.int64), ("latency_ns", np.int64)]
+)
+
+
+class Run:
+    """A run that has ended. What it reads of its journal it keeps; `records` reads without keeping.
+
+    `folder`: the run folder. `report`: report.json (docs/report.md), with the machine and the avatars' error.
+    """
+
+    def __init__(self, folder: Path, report: Report) -> None:
+        self.folder, self.report = folder, report
+
+    def __repr__(self) -> str:
+        return f"<Run {self.folder}: {self.report.frames.presented} frames, {self.report.frame_time_ms.mean:.2f} ms>"
+
+    def _repr_html_(self) -> str:
+        return run_html(self.report, str(self.folder))
+
+    def records(self) -> Iterator[Record]:
+        """The records of the journal after the first, one by one. Raises BadInputError."""
+        return open_journal(self.folder)[1]
+
+    @cached_property
+    def jobs(self) -> NDArray[Any]:
+        """Every job, in the order of their ends: a structured array of shape (jobs,), its fields docs/explain.md's.
+
+        Times are int64, ns; words `str_`; figures of the stages float64, NaN where a stage has none. Raises
+        BadInputError.
+        """
+        figures = figure_names(self.folder)
+        begun, _ = open_journal(self.folder)
+        words = max(len(word) for stage in begun.graph.stages for word in (stage.name, stage.unit, "preempted"))
+        kinds: dict[type, Any] = {int: np.int64, bool: np.bool_, str: f"U{words}"}
+        fields = [(name, kinds[kind]) for name, (kind, _) in COLUMNS.items()]
+        dtype = np.dtype([*fields, *((name, np.float64) for name in figures)])
+        rows = (tuple(np.nan if value is None else value for value in row) for row in job_rows(self.folder, figures))
+        return np.fromiter(rows, dtype)
+
+    @cached_property
+    def events(self) -> list[tuple[int, Event]]:
+        """What the scheduler was told: (ns, event) in order, named tuples of `trilane.scheduler.events`."""
+        return [(step.now_ns, event) for step in self.records() if isinstance(step, Stepped) for event in step.events]
+
+    @cached_property
+    def idle(self) -> list[IdleSlice]:
+        """The time in which units did no job, in the order of the ends; how long of it they had no core."""
+        begun, records = open_journal(self.folder)
+        slices = JournalSlices(begun.graph)
+        found = [piece for record in records for piece in slices.add(record)]
+        return found + slices.end()
+
+    def frames(self) -> NDArray[Any]:
+        """The presented frames, in order: a structured array of shape (frames,), all int64.
+
+        `frame`; `presented_ns`; `frame_ns` since the frame before, -1 for the first; `latency_ns` from its sampled pose
+        to the end of the stage that the pipeline names. Raises BadInputError.
+        """
+        begun, records = open_journal(self.folder)
+        first, last = begun.graph.stages[0].name, begun.graph.stages[-1].name
+        sampled: dict[int, int] = {}
+        latency: dict[int, int] = {}
+        rows: list[tuple[int, int, int, int]] = []
+        for one in explained_jobs(begun, records):
+            stage, frame, end_ns = one.job.stage, one.job.frame, one.job.end_ns
+            if stage == first:
+                sampled[frame] = one.sampled_ns
+            if stage == begun.graph.latency_to:
+                latency[frame] = end_ns - sampled.pop(frame, end_ns)
+            if stage == last:
+                rows.append((frame, end_ns, end_ns - rows[-1][1] if rows else -1, latency.pop(frame, -1)))
+        return np.array(rows, FRAME_TYPE)
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """`jobs` as a data frame. Raises MissingPartError without pandas, which the extra `table` brings."""
+        try:
+            import pandas
+        except ImportError:
+            raise MissingPartError("a data frame needs pandas", extra="table") from None
+        return pandas.DataFrame({name: self.jobs[name] for name in self.jobs.dtype.names or ()})
+
+    def explain(self, slowest: int = 10) -> dict[str, Any]:
+        """Where the time went, as `trilane explain RUN --json` says it (docs/explain.md). Raises BadInputError."""
+        return explain_run(self.folder, slowest)
+
+
+class RunFailedError(TrilaneError):
+    """A run that ended before it was done. `run`: what was done until then."""
+
+    def __init__(self, message: str, run: Run, exit_code: int) -> None:
+        super().__init__(message)
+        self.run, self.exit_code = run, exit_code
+
+
+def load_run(folder: str | Path) -> Run:
+    """The run whose folder is `folder`. Raises BadInputError for a folder that is none, or that is not whole yet."""
+    place = Path(folder)
+    if not place.is_dir():
+        raise BadInputError(place, "no folder", "the folder of a run")
+    return Run(place, read_report(place))
+
+
+def run(
+    scene: str | Path = "default",
+    *,
+    frames: int | None = None,
+    size: int | str | None = None,
+    policy: str = "pipelined",
+    edge: str = "double",
+    avatar: str | Path | None = None,
+    motion: str | Path | None = None,
+    camera: str | Path | None = None,
+    background: str | Path | None = None,
+    fps: float | None = None,
+    output: str | None = None,
+    runtime: str = "auto",
+    cores: Mapping[str, Sequence[int]] | None = None,
+    performance_profile: str | None = None,
+    latch_ms: float = 0.0,
+    baseline_frames: int = 0,
+    out: str | Path | None = None,
+    on_progress: Callable[[str, int, int], None] | None = None,
+    on_message: Callable[[str], None] | None = None,
+) -> Run:
+    """Run a scene on the three units, each a process of its own, and load what it wrote.
+
+    `scene`: a scene file, or the name of one that comes with Trilane. The other arguments are the options of
+    `trilane run` of that name; None leaves what the scene says.
+    `cores`: numbers of the cores of a unit, such as {"dsp": [0, 1]}; else they follow from measured times.
+    `baseline_frames`: of a `sequential` run that follows, to compare with.
+    `out`: the run folder to write, runs/TIME-SCENE below the working directory where it is None.
+    `on_progress(policy, presented, requested)`, `on_message(text)`: called from this thread.
+    Raises BadInputError and MissingPartError for what cannot be run, RunFailedError for a run that ended early and
+    keeps its folder, TrilaneError for one that presented no frame, KeyboardInterrupt after an interrupted one was
+    written.
+    """
+    given = _given(locals())
+    _check_name("policy", policy, POLICIES)
+    if performance_profile is not None:
+        _check_name("performance_profile", performance_profile, PERFORMANCE_PROFILES)
+    from trilane.apps.run_job import Hooks
+
+    paths = {"scene": scene, "avatar": avatar, "motion": motion, "camera": camera, "background": background}
+    request = {
+        **{name: None if value is None else str(value) for name, value in paths.items()},
+        "frames": frames,
+        "size": None if size is None else str(size),
+        "policy": policy,
+        "fps": fps,
+        "output": output,
+        "runtime": runtime,
+        "cores": tuple(f"{unit}={','.join(map(str, own))}" for unit, own in (cores or {}).items()),
+    }
+    command = ("trilane.run", *(f"{name}={value!r}" for name, value in given.items()))
+    place = None if out is None else Path(out)
+    asked = AskedRun(request, edge, baseline_frames, None, performance_profile, latch_ms, place, command)
+    hooks = Hooks(on_progress or (lambda *_: None), on_message or (lambda _: None))
+    outcome = run_asked(asked, lambda: nullcontext(hooks))
+    done = Run(outcome.folder, outcome.report)
+    if outcome.exit_code == INTERRUPTED:
+        raise KeyboardInterrupt(f"what was done is in {outcome.folder}")
+    if outcome.exit_code:
+        message = outcome.report.failure or "the run ended early"
+        raise RunFailedError(f"{message}; what was done is in {outcome.folder}", done, outcome.exit_code)
+    return done
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a hardware profile says of an application or a network; every figure is computed.
+
+    `document`: the keys of `trilane predict --json`.
+    `frame_ms`: time of a frame; `low_ms`, `high_ms`: where it is with a probability of 80 %.
+    `latency_ms`: None of a network by itself.
+    `power_w`: of the whole device.
+    """
+
+    document: Mapping[str, Any]
+    profile: str
+    what: str
+    frame_ms: float
+    low_ms: float
+    high_ms: float
+    latency_ms: float | None
+    power_w: float
+
+    @property
+    def fps(self) -> float:
+        """Frames a second."""
+        return 1e3 / self.frame_ms
+
+    @property
+    def is_display_capped(self) -> bool:
+        """Whether frames would come faster if the display showed them."""
+        return bool(self.document.get("display_capped", False))
+
+    @property
+    def units(self) -> Mapping[str, Any]:
+        """Of each unit the busy share and the idle shares by cause; empty of a network by itself."""
+        found: Mapping[str, Any] = self.document.get("units", {})
+        return found
+
+    def _repr_html_(self) -> str:
+        busy = ", ".join(f"{unit} {row['busy']:.0%}" for unit, row in self.units.items())
+        rows = {
+            "frame time": f"{self.frame_ms:.2f} ms (80 %: {self.low_ms:.2f} to {self.high_ms:.2f})",
+            "rate": f"{self.fps:.1f} frames a second{', as the display shows them' if self.is_display_capped else ''}",
+            "latency": "" if self.latency_ms is None else f"{self.latency_ms:.1f} ms",
+            "power": f"{self.power_w:.1f} W",
+            "busy": busy,
+        }
+        title = f"{self.what} on {self.profile}"
+        return prediction_html(title, {name: text for name, text in rows.items() if text})
+
+
+def predict(
+    profile: str | Path = "snapdragon-888",
+    *,
+    avatar: str | Path | None = None,
+    network: str | Path | None = None,
+    application: bool = False,
+    encoder: str = "resnet18",
+    norm: str = "batch",
+    size: int | str = 512,
+    channels: int = 16,
+    runtime: str = "dsp",
+    policy: str = "reference",
+    edge: str | None = None,
+    fps: float | None = None,
+    power_limit_w: float | None = None,
+    minutes: float = 0.0,
+    performance_profile: str | None = None,
+) -> Prediction:
+    """Predict frame time, idleness, heat and energy on a chip.
+
+    `profile`: a hardware profile, by name or file. The other arguments are the options of `trilane predict` of that
+    name.
+    `avatar`: the application with this avatar's network. `network`: an ONNX file by itself, or with `application` in
+    the avatar's application. Without either, the application with a network of `encoder`, `norm`, `size`, `channels`.
+    Raises BadInputError.
+    """
+    from trilane.apps import asked_prediction as asked
+    from trilane.hw_profiles.application import Plan
+    from trilane.hw_profiles.load import load_runnable
+
+    if network is not None and avatar is not None:
+        raise BadInputError("predict", "an avatar and a network", "one of them")
+    if application and network is None:
+        raise BadInputError("predict", "application without a network", "a network, which the application then has")
+    bare = network is not None and not application
+    cap = performance_profile or asked.usual_cap(str(profile), bare=bare)
+    _check_name("performance_profile", cap, PERFORMANCE_PROFILES)
+    chip, wanted = load_runnable(str(profile)), asked.wanted_of(fps, power_limit_w)
+    files = [] if network is None else [Path(network)]
+    if bare:
+        on = (asked.unit_of(runtime, "cpu"), None, None)
+        (answer,) = asked.predict_networks(chip, files, {}, on, (cap, minutes, None, wanted))
+        times = (answer["network_ms"], answer["low_ms"], answer["high_ms"])
+        return Prediction(answer, chip.name, str(network), *times, None, answer["power"]["w"])
+    unit, named = asked.unit_of(runtime), None if avatar is None else str(avatar)
+    chip, described = asked.network_of(chip, files, {}, named, "packed", unit, None)
+    counted = described or asked.reference_of(encoder, norm, str(size), channels, "packed")
+    plan = Plan(counted, unit, asked.variant_of(policy, edge, 1, fps))
+    answer = asked.answer_of(chip, plan, cap, minutes, None, False, wanted)
+    frame, what = answer["frame_time_ms"], str(avatar or network or f"{encoder}, {size}")
+    times = (frame["mean"], frame["low"], frame["high"])
+    return Prediction(answer, chip.name, what, *times, answer["latency_ms"]["mean"], answer["power_w"])
+
+
+def _given(arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """The arguments of `run` that are not what they are by default, and tell of the run."""
+    defaults = {name: parameter.default for name, parameter in inspect.signature(run).parameters.items()}
+    told = {name: value for name, value in arguments.items() if not name.startswith("on_")}
+    return {name: value for name, value in told.items() if value != defaults[name]}
+
+
+def _check_name(where: str, name: str, names: Sequence[str] | Mapping[str, Any]) -> None:
+    if name not in names:
+        raise BadInputError(where, repr(name), f"one of {', '.join(names)}", did_you_mean(str(name), list(names)))
