@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from trilane.pipeline.sketch import RELATIVE_ERROR, DdSketch
-from trilane.scheduler import frame_times, samples
 from trilane.scheduler.events import NEVER, chain
-from trilane.scheduler.frame_times import FrameTimes
+from trilane.scheduler.frame_times import MOST_BLOCKS, FrameTimes
 from trilane.scheduler.ledger import Books, Ledger
 from trilane.scheduler.samples import MOST_EXACT, MOVED_AT_ONCE, Samples
 from trilane.scheduler.stats import summary_ms
@@ -84,16 +83,14 @@ def test_a_run_that_keeps_all_has_no_limit() -> None:
     assert found.is_exact and len(found.kept) == MOST_EXACT + 5
 
 
-def test_the_interval_of_a_long_run_is_that_of_all_its_frames(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Blocks of at most an eighth of a hundredth of the run: the ten batches differ by that at their ends."""
-    monkeypatch.setattr(samples, "MOST_EXACT", 100)
-    monkeypatch.setattr(frame_times, "MOST_BLOCKS", 256)
-    values = times(3000)
+def test_the_interval_of_a_long_run_is_that_of_all_its_frames() -> None:
+    """30,000 frames are 1,875 blocks of 16: each of the ten batches begins at most five of them later or earlier."""
+    values = times(30_000)
     bounded, whole = FrameTimes(DdSketch), FrameTimes()
     for value in values:
         bounded.add(value)
         whole.add(value)
-    assert len(bounded._blocks) < 256 and bounded._block_frames == 16
+    assert (len(bounded._blocks), bounded._block_frames) == (1875, 16)
     found, expected = bounded.row(), whole.row()
     width = expected["mean_high"] - expected["mean_low"]  # type: ignore[operator]
     for key in ("mean_low", "mean_high"):
@@ -106,32 +103,28 @@ def test_the_interval_of_a_long_run_is_that_of_all_its_frames(monkeypatch: pytes
     }
 
 
-def test_blocks_are_joined_in_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With at most four: 1 2 3 4 becomes 1.5 3.5; then two frames a block."""
-    monkeypatch.setattr(frame_times, "MOST_BLOCKS", 4)
+def test_blocks_are_joined_in_pairs() -> None:
+    """When there are 2,048 of one frame, 1 2 3 4 ... becomes 1.5 3.5 ...; then a block has two frames."""
     row = FrameTimes()
-    for value in (1, 2, 3, 4, 5):
+    for value in range(1, MOST_BLOCKS + 4):
         row.add(value)
-    assert (row._blocks, row._open_frames) == ([1.5, 3.5], 1)
-    for value in (7, 8, 10):
-        row.add(value)
-    assert (row._blocks, row._block_frames) == ([2.5, 7.5], 4)
+    assert (row._blocks[:2], len(row._blocks), row._open_frames) == ([1.5, 3.5], MOST_BLOCKS // 2 + 1, 1)
+    assert (row._blocks[-1], row._block_frames) == (MOST_BLOCKS + 1.5, 2)
 
 
-def test_a_ledger_with_a_sketch_holds_no_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ledger_with_a_sketch_holds_no_frame() -> None:
     """Deadlines of the frames, or of their times; rungs counted with the changes between them."""
-    monkeypatch.setattr(samples, "MOST_EXACT", 10)
-    graph = chain((("a", "u"),), "single", "a")
+    graph, frames = chain((("a", "u"),), "single", "a"), MOST_EXACT + 20
     bounded, whole = Ledger(graph, Books(sketch=DdSketch)), Ledger(graph)
-    for number in range(40):
+    for number in range(frames):
         for ledger in (bounded, whole):
-            ledger.presented(number, 10 * number, 5, 10 * number - number % 2 + 1, rung=number // 10 % 2)
+            ledger.presented(number, 10 * number, 5, 10 * number - number % 2 + 1, rung=number // 10_000 % 2)
     assert (bounded.presented_frames, bounded.lateness_ns) == ([], [])
-    assert (whole.presented_frames, whole.presented_ns[:3]) == ([*range(40)], [0, 10, 20])
-    assert (whole.latency_ns, whole.lateness_ns[:3]) == ([5] * 40, [-1, 0, -1])
+    assert (whole.presented_frames, whole.presented_ns[:3]) == ([*range(frames)], [0, 10, 20])
+    assert (whole.latency_ns, whole.lateness_ns[:3]) == ([5] * frames, [-1, 0, -1])
     assert (bounded.is_exact, whole.is_exact) == (False, True)
-    assert (dict(bounded.rungs), bounded.rung_switches) == ({0: 20, 1: 20}, 3)
-    found, expected = (each.report(clock="virtual", requested=40) for each in (bounded, whole))
+    assert (dict(bounded.rungs), bounded.rung_switches) == ({0: 10_020, 1: 10_000}, 2)
+    found, expected = (each.report(clock="virtual", requested=frames) for each in (bounded, whole))
     for key in ("fps", "frames", "deadline_misses", "xrbench"):
         assert found[key] == expected[key]
 
