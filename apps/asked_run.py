@@ -31,6 +31,7 @@ class AskedRun:
     `latch_ms`: how long before it is needed a pose is sampled.
     `out`: the run folder; None: `runs/TIME-SCENE`.
     `command`: the words by which it was asked for.
+    `has_video`: whether the presented pictures are digested and encoded; not for runs that last.
     `held_ns`: how long jobs of a stage are held, at least, by its name; in place of a chip's pace.
     """
 
@@ -42,6 +43,7 @@ class AskedRun:
     latch_ms: float = 0.0
     out: Path | None = None
     command: tuple[str, ...] = ()
+    has_video: bool = True
     held_ns: Mapping[str, int] = field(default_factory=dict)
 
 
@@ -79,6 +81,8 @@ def prepare(asked: AskedRun, gl: GlFacts) -> Prepared:
         plan, checked = replace(plan, pace=pace), checked.changed(pace_ns=dict(pace.stage_ns))
     if asked.held_ns:
         checked = checked.changed(pace_ns={**checked.config.pace_ns, **asked.held_ns})
+    if not asked.has_video:
+        checked = checked.changed(record=False)
     return Prepared(asked, checked, plan)
 
 

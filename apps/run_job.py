@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 BASELINE_POLICY = "sequential"
 HOST = "host"
 INTERRUPTED = 130
+NO_VIDEO = "no video, no contact sheet and no checksum: the frames were presented without, as was asked for"
 
 
 @dataclass(frozen=True)
@@ -134,7 +135,7 @@ def run_to_folder(
         )
         with Interrupts() as late:  # from here on a signal waits until the folder is whole
             baseline, stopped = job.run_baseline(folder.work) if _is_complete(result) else (None, False)
-            facts = {"made": made, "accuracy": dict(checked.accuracy), "notes": list(checked.notes)}
+            facts = {"made": made, "accuracy": dict(checked.accuracy), "notes": _notes(checked)}
             if checked.placement is not None:
                 facts["placement"] = checked.placement
             if result.rungs:
@@ -231,6 +232,10 @@ class _Job:
         from trilane.apps.pace import release_fps
 
         return release_fps(self._plan.pace, self._checked.config.scene.fps)
+
+
+def _notes(checked: Checked) -> list[str]:
+    return [*checked.notes, *([] if checked.config.record else [NO_VIDEO])]
 
 
 def _sensors() -> dict[str, float]:

@@ -49,6 +49,7 @@ Examples:
   trilane run --frames 60 --size 192 --out /tmp/run
   trilane run --motion walk.bvh --camera arkit.txt --frames 200 --json
   trilane run --latch 3
+  trilane run --no-video --baseline 0 --frames 1000000
   trilane run walk-past --policy latest --edge triple --fps 24 --output 1280x720
   trilane run --cores cpu=1 --cores gpu=0 --cores dsp=0,1
   trilane run --split /Concat_4_output_0_QuantizeLinear_Output=cpu
@@ -90,6 +91,7 @@ LatchOption = Annotated[
     float, typer.Option(min=0, max=1000, help="Sample poses late: ready so many ms before the raster; 0: at once.")
 ]
 CapOption = Annotated[PerformanceProfile | None, PerformanceProfileOption]
+VideoOption = Annotated[bool, typer.Option("--video/--no-video", help="Encode the frames; not for runs that last.")]
 DashboardOption = Annotated[
     bool, typer.Option("--dashboard", help="Show the run in a browser; without --frames it runs until Ctrl-C.")
 ]
@@ -147,13 +149,15 @@ def run(
     performance_profile: CapOption = None,
     baseline: BaselineOption = 60,
     out: FolderOption = None,
+    video: VideoOption = True,
     dashboard: DashboardOption = False,
     port: PortOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Run a scene on the three units and write a run folder.
 
-    The folder holds report.json, video.mp4, contact.png, trace.pftrace (open it at ui.perfetto.dev) and events.jsonl.
+    The folder holds report.json, video.mp4, contact.png, trace.pftrace (open it at ui.perfetto.dev), events.jsonl and
+    journal.msgpack, which is written while the run goes on.
     docs/report.md explains every key, the policies and the edges.
     """
     from trilane.apps.asked_run import AskedRun, run_asked
@@ -181,7 +185,7 @@ def run(
     }
     paced_by = None if profile is None else (profile, slow_motion)
     command = ("trilane", *sys.argv[1:])
-    asked = AskedRun(request, edge, baseline, paced_by, cap, latch, out, command)
+    asked = AskedRun(request, edge, baseline, paced_by, cap, latch, out, command, has_video=video)
     outcome = _run_live(asked, port) if dashboard else run_asked(asked, _hooks)
     _print_outcome(outcome, as_json)
     raise typer.Exit(outcome.exit_code)

@@ -148,6 +148,11 @@ def test_the_hud_is_asked_for_or_refused(hud: bool, asked: Asked, command: Comma
     assert asked.request == Request(hud=hud)
 
 
+def test_a_run_that_lasts_needs_no_video(asked: Asked, command: Command) -> None:
+    command("run", "--no-video")
+    assert asked.changes == [{"record": False}]
+
+
 def test_a_pace_holds_the_jobs(asked: Asked, command: Command) -> None:
     command("run", "--profile", "chip", "--pace", "--slow-motion", 24)
     assert asked.plan is not None and asked.plan.pace is not None

@@ -355,6 +355,14 @@ def test_the_video_is_joined_and_what_it_lacks_is_told(runs: Callable[..., Runs]
     assert SEGMENTS not in files
 
 
+def test_a_run_without_a_video_says_why(runs: Callable[..., Runs], tmp_path: Path) -> None:
+    double, unrecorded = runs(a_result()), checked().changed(record=False)
+    report = run_to_folder(unrecorded, tmp_path / "run", Plan(baseline_frames=0), double.hooks, machine=MACHINE).report
+    assert (report.video, report.checksum) == (None, None)
+    assert report.notes == (*checked().notes, run_job.NO_VIDEO)
+    assert not double.calls[0]["config"].record
+
+
 def test_a_whole_video_is_worth_no_word(runs: Callable[..., Runs], tmp_path: Path) -> None:
     def recorded(out_dir: Path) -> RunResult:
         record(out_dir, range(FRAMES))
