@@ -23,6 +23,10 @@ import { byId, clock, isNumber, setText, words } from "./text.js";
 import { followThemeSwitch, onThemeChange } from "./theme.js";
 import { Timeline } from "./timeline.js";
 
+// The page shares the cores with the run: where there are few it draws what moves half as often as the screen could.
+const FEW_CORES = 4;
+const DRAW_EVERY_MS = navigator.hardwareConcurrency > FEW_CORES ? 0 : 30;
+const NOTE_EVERY_MS = 250;
 const PERCENTILES = ["p50", "p90", "p95", "p99"];
 const STATES = {
   running: "running",
@@ -39,7 +43,8 @@ let isLive = true;
 let isOver = false;
 let state = "";
 let span = [0, 0];
-let turned = [0, 0];
+let drawnAt = 0;
+let notedAt = 0;
 
 const notes = new Notes(byId("notes"));
 const connection = new Connection({ message: received, picture: pictured, link: linked });
@@ -48,15 +53,9 @@ const controls = new Controls(
   (name, value) => connection.control(name, value),
 );
 const camera = {
-  orbit(dx, dy) {
-    turned = [turned[0] + dx, turned[1] + dy];
-    controls.use("orbit", [dx, dy]);
-  },
+  orbit: (dx, dy) => controls.use("orbit", [dx, dy]),
   zoom: (factor) => controls.scale("zoom", factor),
-  reset() {
-    if (turned[0] || turned[1]) this.orbit(-turned[0], -turned[1]);
-    if (controls.has("zoom")) controls.use("zoom", controls.first("zoom"));
-  },
+  reset: () => controls.use("recentre"),
 };
 const picture = new Picture(byId("picture"), camera);
 const timeline = new Timeline(byId("timeline"), {
@@ -173,7 +172,8 @@ function refusals(message) {
 }
 
 async function pictured(shown) {
-  if (!(await picture.show(shown))) return;
+  if (!(await picture.show(shown)) || (isLive && performance.now() - notedAt < NOTE_EVERY_MS)) return;
+  notedAt = performance.now();
   const age = shown.ageMs > 0 ? `, ${shown.ageMs.toFixed(0)} ms old when it was sent` : "";
   setText(byId("picture-note"), `frame ${shown.frame}, ${clock(shown.mediaMs)} in the scene${age}`);
 }
@@ -190,12 +190,14 @@ function playOrPause() {
 }
 
 function draw(now) {
+  requestAnimationFrame(draw);
+  if (now - drawnAt < DRAW_EVERY_MS) return;
+  drawnAt = now;
   if (picture.isWanted && !seek.isSurveying && (isLive || seek.isOn)) connection.pullPicture();
   picture.tick(now);
   seek.tick(now, timeline.span);
   timeline.tick(now);
   for (const chart of charts) chart.tick();
-  requestAnimationFrame(draw);
 }
 
 function drawLegend() {

@@ -5,6 +5,7 @@ import { element, isNumber, setText, words } from "./text.js";
 
 const KILLS = "kill";
 const SLIDER_STEPS = 200;
+const AHEAD_MS = 700;
 
 export class Controls {
   // send(name, value) sends; homes: {live, restart, actions}, the elements that they go into.
@@ -15,7 +16,7 @@ export class Controls {
   }
 
   build(table) {
-    this.table = new Map(table.map((control) => [control.name, { ...control, first: control.value }]));
+    this.table = new Map(table.map((control) => [control.name, { ...control, usedAt: -Infinity }]));
     for (const home of Object.values(this.homes)) home.replaceChildren();
     for (const control of this.table.values()) {
       const made = this.#make(control);
@@ -29,24 +30,14 @@ export class Controls {
     return control.live ? this.homes.live : this.homes.restart;
   }
 
-  has(name) {
-    return this.table.has(name) && !this.table.get(name).why_not;
-  }
-
-  value(name) {
-    return this.table.get(name)?.value;
-  }
-
-  first(name) {
-    return this.table.get(name)?.first;
-  }
-
   use(name, value = null) {
     const control = this.table.get(name);
     if (!control || control.why_not) return;
     this.refused(name, "");
-    if (control.kind === "number") this.config({ [name]: value });
     this.send(name, value);
+    if (control.kind !== "number") return;
+    control.usedAt = performance.now();
+    this.#inForce(control, value);
   }
 
   // The value within the control's range that is `factor` times the one in force.
@@ -57,14 +48,17 @@ export class Controls {
     this.use(name, Math.min(Math.max(value, control.min ?? -Infinity), control.max ?? Infinity));
   }
 
-  // What is in force, by name.
+  // What is in force, by name. A number that the person moves now is ahead of what the server says of it.
   config(values) {
     for (const [name, value] of Object.entries(values ?? {})) {
       const control = this.table.get(name);
-      if (!control) continue;
-      control.value = value;
-      control.show?.(value);
+      if (control && !(performance.now() - control.usedAt < AHEAD_MS)) this.#inForce(control, value);
     }
+  }
+
+  #inForce(control, value) {
+    control.value = value;
+    control.show?.(value);
   }
 
   refused(name, why) {
@@ -73,6 +67,7 @@ export class Controls {
     setText(control.problem, why ? `refused: ${why}` : "");
     control.problem.hidden = !why;
     control.field?.setAttribute("aria-invalid", why ? "true" : "false");
+    if (why) control.usedAt = -Infinity;
     if (why) control.show?.(control.value);
     return true;
   }

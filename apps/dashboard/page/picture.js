@@ -10,7 +10,7 @@ export class Picture {
   // camera: {orbit(dx, dy), zoom(factor), reset()}, which this calls with degrees and a factor.
   constructor(canvas, camera) {
     this.canvas = canvas;
-    this.pen = canvas.getContext("2d");
+    this.pen = canvas.getContext("bitmaprenderer");
     this.camera = camera;
     this.isSeen = true;
     this.shown = null;
@@ -35,15 +35,9 @@ export class Picture {
     } catch {
       return false;
     }
-    const { canvas } = this;
-    if (canvas.width !== bitmap.width || canvas.height !== bitmap.height) {
-      canvas.width = bitmap.width;
-      canvas.height = bitmap.height;
-    }
-    this.pen.drawImage(bitmap, 0, 0);
-    bitmap.close();
+    this.pen.transferFromImageBitmap(bitmap);
     this.shown = picture;
-    canvas.dataset.frame = picture.frame;
+    this.canvas.dataset.frame = picture.frame;
     return true;
   }
 

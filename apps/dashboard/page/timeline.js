@@ -13,7 +13,8 @@ const SHORTEST_SPAN_MS = 2;
 const LONGEST_SPAN_MS = 60_000;
 // Three views' slices of a finished run come in one answer, which is bounded.
 const LONGEST_FINISHED_SPAN_MS = 5000;
-const FIRST_SPAN_MS = 400;
+const FIRST_SPAN_MS = 400; // of a canvas of WIDE pixels or more
+const WIDE = 1200;
 // Live slices come a few times a second; so much later than the newest one the view runs evenly.
 const LAG_MS = 300;
 const CALM_STEP_MS = 1000;
@@ -58,6 +59,7 @@ export class Timeline {
     this.isLive = isLive;
     this.reset();
     this.#resize();
+    this.span = FIRST_SPAN_MS * Math.min(1, this.width / WIDE);
   }
 
   // Slices have come: the newest one tells how the run's clock lies to this page's.

@@ -40,6 +40,7 @@ CONTROLS: tuple[dict[str, Any], ...] = (
     {"name": "step", "kind": "action", "live": True},
     {"name": "orbit", "kind": "drag", "live": True},
     {"name": "zoom", "kind": "number", "live": True, "min": 0.25, "max": 4.0, "value": 1.0},
+    {"name": "recentre", "kind": "action", "live": True},
     {"name": "kill", "kind": "choice", "live": True, "choices": UNITS},
     {"name": "policy", "kind": "choice", "choices": POLICIES, "value": "pipelined"},
     {"name": "edge", "kind": "choice", "choices": EDGES, "value": "double"},
@@ -212,6 +213,8 @@ class DoubleView:
             self.turn_deg += asked.value[0]
         elif asked.name == "zoom" and isinstance(asked.value, float | int):
             self.zoom = self.config["zoom"] = asked.value
+        elif asked.name == "recentre":
+            self.turn_deg, self.zoom, self.config["zoom"] = 0.0, 1.0, 1.0
         elif asked.name == "kill":
             self.restarts += 1
             self._notes.append(
