@@ -193,7 +193,7 @@ function draw(now) {
   requestAnimationFrame(draw);
   if (now - drawnAt < DRAW_EVERY_MS) return;
   drawnAt = now;
-  if (picture.isWanted && !seek.isSurveying && (isLive || seek.isOn)) connection.pullPicture();
+  if (slices && picture.isWanted && !seek.isSurveying && (isLive || seek.isOn)) connection.pullPicture();
   picture.tick(now);
   seek.tick(now, timeline.span);
   timeline.tick(now);

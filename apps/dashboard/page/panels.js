@@ -1,15 +1,16 @@
 // Figures as text and tables. Rule: no speed is written without the avatar's error beside it.
 
 import { CAUSES, CAUSE_MEANINGS } from "./slices.js";
-import { byId, bytes, DASH, element, isNumber, ms, number, percent, setRows, setText, words } from "./text.js";
+import { byId, bytes, clock, DASH, element, isNumber, ms, number, percent, setRows, setText, words } from "./text.js";
 
 const MOST_NOTES = 200;
+const BYTES = ["read", "written", "uploaded", "read_back", "least"];
 const LONG_TEXT = 24;
 
 // "PSNR 30.6 dB, worst frame 19.5 dB (source)" for each avatar, or why there is no figure.
 export function errorText(accuracy) {
   const avatars = Object.entries(accuracy ?? {});
-  if (avatars.length === 0) return "error not known: the run does not say how exact its avatar is";
+  if (avatars.length === 0) return "not known: the run does not say how exact its avatar is";
   return avatars.map(([name, facts]) => `${avatars.length > 1 ? `${name}: ` : ""}${oneError(facts)}`).join("; ");
 }
 
@@ -23,13 +24,13 @@ function oneError(facts) {
     const range = `${number(Math.min(...bands))} to ${number(Math.max(...bands))}`;
     return `PSNR ${range} dB by distance (${facts.source ?? "source not said"})`;
   }
-  return `error not known: ${facts?.why ?? facts?.source ?? "no figures"}`;
+  return `not known: ${facts?.why ?? facts?.source ?? "no figures"}`;
 }
 
 export function showSpeed(figures, accuracy) {
-  const clock = figures.clock === "virtual" ? "computed, virtual clock" : "measured, host clock";
+  const how = figures.clock === "virtual" ? "computed, virtual clock" : "measured, host clock";
   setText(byId("fps"), number(figures.fps));
-  setText(byId("speed-note"), `frames a second, last ${number(figures.window_s, 0)} s (${clock})`);
+  setText(byId("speed-note"), `frames a second, last ${number(figures.window_s, 0)} s (${how})`);
   setText(byId("error"), errorText(accuracy));
   for (const [key, id] of [
     ["frame_time_ms", "frame-time"],
@@ -40,6 +41,8 @@ export function showSpeed(figures, accuracy) {
     const rest = ["p90", "p95", "p99"].map((name) => `${name} ${number(times[name])}`).join(" · ");
     setText(byId(`${id}-rest`), `p50; ${rest} ms, of ${number(times.samples, 0)}`);
   }
+  setText(byId("run-time"), isNumber(figures.run_s) ? `in ${clock(1000 * figures.run_s)} of the run` : "");
+  byId("run-time").dataset.seconds = figures.run_s;
   const frames = figures.frames ?? {};
   setText(byId("presented"), number(frames.presented, 0));
   const lost = total(frames.lost);
@@ -57,7 +60,7 @@ export function showUnits(figures) {
   const rows = Object.entries(figures.units ?? {}).map(([name, unit]) => [
     name,
     unit.is_up ? "up" : "down",
-    unit.stage ? `${unit.stage} of frame ${unit.frame}` : "idle",
+    unit.stage ? `${unit.stage} ${unit.frame}` : "idle",
     percent(unit.window?.busy),
     ...causes.map((cause) => percent(unit.window?.idle?.[cause])),
     percent(unit.run?.busy),
@@ -74,9 +77,9 @@ export function showUnits(figures) {
 // `edges`: {name, rule} of each edge; the first stage has none before it.
 export function showStages(figures, edges) {
   const stages = Object.entries(figures.stages ?? {});
-  const kinds = [...new Set(stages.flatMap(([, stage]) => Object.keys(stage.bytes ?? {})))];
+  const kinds = [...new Set(stages.flatMap(([, stage]) => Object.keys(stage.bytes ?? {})))].sort(byPlace);
   const head = byId("stages").tHead.rows[0];
-  const titles = ["stage", "unit", "edge before it", "frames waiting", "service", ...kinds.map((kind) => `${words(kind)} a job`)];
+  const titles = ["stage", "unit", "edge before it", "frames waiting", "service", ...kinds.map((kind) => words(kind))];
   while (head.cells.length > titles.length) head.deleteCell(-1);
   while (head.cells.length < titles.length) head.append(element("th", { scope: "col" }));
   titles.forEach((title, place) => setText(head.cells[place], title));
@@ -134,6 +137,12 @@ function factNode(facts) {
   return plain(facts);
 }
 
+// Kinds of bytes that are not in the list come before the last.
+function byPlace(a, b) {
+  const place = (kind) => (BYTES.includes(kind) ? BYTES.indexOf(kind) : BYTES.length - 1.5);
+  return place(a) - place(b);
+}
+
 function isLong(fact) {
   return typeof fact === "string" && fact.length > LONG_TEXT;
 }
@@ -182,10 +191,12 @@ export class Notes {
     this.last = key;
     this.home.prepend(element("li", {}, element("time", { text: timeText }), ` ${text}`));
     while (this.home.children.length > MOST_NOTES) this.home.lastElementChild.remove();
+    byId("no-notes").hidden = true;
   }
 
   clear() {
     this.last = null;
     this.home.replaceChildren();
+    byId("no-notes").hidden = false;
   }
 }
