@@ -94,14 +94,12 @@ class UnitTracks:
                 self._sink.slice(track, begin_ns, end_ns, piece.stage, _notes_of(piece), flow)
 
     def _count_figures(self, job: JobRecord, figures: Mapping[str, float]) -> None:
-        """Those of the table that have changed since the stage's last job, from the job's begin on."""
-        for name in COUNTED.keys() & figures.keys():
-            key, value = (job.stage, name), figures[name]
-            if self._figures.get(key) == value:
+        """Those of the table that have changed since the stage's last job, from the job's begin on; none that is 0."""
+        for rank, (name, (title, unit)) in enumerate(COUNTED.items(), start=1):
+            key, value = (job.stage, name), figures.get(name)
+            if value is None or self._figures.get(key, 0) == value:
                 continue
             if key not in self._counters:
-                title, unit = COUNTED[name]
-                rank = 1 + list(COUNTED).index(name)
                 self._counters[key] = self._sink.counter_track(title, self._stages[job.stage], rank, unit)
             self._figures[key] = value
             self._sink.count(self._counters[key], job.begin_ns, value)
