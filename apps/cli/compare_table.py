@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from rich.markup import escape
@@ -14,19 +14,24 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from trilane.apps.comparison.compared import Comparison
+    from trilane.apps.comparison.configuration import Change
     from trilane.apps.comparison.rows import Figure
 
 #: Measures of which one statistic is shown even where nothing differs.
 ALWAYS = ("frame time", "latency", "work", "busy")
 ALWAYS_STATISTICS = ("mean", "typical", "share")
+MOST_CHANGES = 12
 
 
 def comparison_lines(comparison: Comparison, show_all: bool) -> Iterator[str | Table]:
     """Texts and tables of one comparison. `show_all`: figures too that do not differ and are seldom asked for."""
     yield f"{comparison.other.name} beside {comparison.base.name}"
     yield f"verdict: {comparison.verdict}"
+    most = len(comparison.changes) if show_all else MOST_CHANGES
     if comparison.changes:
-        yield _change_table(comparison)
+        yield _change_table(comparison.changes[:most])
+    if len(comparison.changes) > most:
+        yield f"{len(comparison.changes) - most} more settings changed: --all shows them"
     shown = [figure for figure in comparison.rows if show_all or _is_shown(figure, comparison)]
     yield _figure_table(comparison, shown)
     left = len(comparison.rows) - len(shown)
@@ -40,11 +45,11 @@ def _is_shown(figure: Figure, comparison: Comparison) -> bool:
     return figure in comparison.differing or (figure.measure in ALWAYS and figure.statistic in ALWAYS_STATISTICS)
 
 
-def _change_table(comparison: Comparison) -> Table:
+def _change_table(changes: Sequence[Change]) -> Table:
     from rich.table import Table
 
     table = Table("changed", "base", "other")
-    for change in comparison.changes:
+    for change in changes:
         table.add_row(*(escape(text) for text in (change.key, setting(change.base), setting(change.other))))
     return table
 

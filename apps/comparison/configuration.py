@@ -6,7 +6,19 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Final, NamedTuple
 
 #: Parts of a report that say how it was made.
-PARTS: Final = ("clock", "policy", "edge", "config", "caps.performance_profile", "machine", "made", "idle_cores")
+PARTS: Final = (
+    "clock",
+    "policy",
+    "edge",
+    "config",
+    "stages",
+    "caps.performance_profile",
+    "machine",
+    "made",
+    "idle_cores",
+)
+#: Keys of a report that its `config` has too, and of a prediction its `config` alone.
+TWICE: Final = ("policy", "edge")
 #: Keys that differ between any two runs.
 ALWAYS_DIFFERENT: Final = ("made.at", "made.command")
 
@@ -28,15 +40,18 @@ def changes(base: Mapping[str, Any], other: Mapping[str, Any]) -> list[Change]:
 
 
 def _settings(document: Mapping[str, Any]) -> dict[str, Any]:
+    units = {name: {"unit": stage["unit"]} for name, stage in document["stages"].items()}
     found: dict[str, Any] = {}
     for part in PARTS:
-        value: Any = document
+        value: Any = {**document, "stages": units}
         for key in part.split("."):
             value = value.get(key) if isinstance(value, Mapping) else None
         if value is not None:
             found.update(_flat(part, value))
-    twice = {f"config.{key}" for key in ("policy", "edge") if key in found}
-    return {key: value for key, value in found.items() if key not in twice and key not in ALWAYS_DIFFERENT}
+    for key in TWICE:
+        if f"config.{key}" in found:
+            found.setdefault(key, found.pop(f"config.{key}"))
+    return {key: value for key, value in found.items() if key not in ALWAYS_DIFFERENT}
 
 
 def _flat(name: str, value: Any) -> Iterator[tuple[str, Any]]:

@@ -77,7 +77,16 @@ def _typical(values: F64, _: F64) -> F64:
 
 
 def _quantile(share: float) -> Reduce:
-    return lambda values, _: np.asarray(np.quantile(values, share, axis=-1))
+    """Linear between ranks, as in the report."""
+
+    def reduce(values: F64, _: F64) -> F64:
+        ordered = np.sort(values, axis=-1)
+        place = share * (ordered.shape[-1] - 1)
+        low = int(place)
+        above = ordered[..., min(low + 1, ordered.shape[-1] - 1)]
+        return np.asarray(ordered[..., low] + (above - ordered[..., low]) * (place - low))
+
+    return reduce
 
 
 #: Statistic: how it is computed over the last axis. `typical` is the mean of the middle half of the values.

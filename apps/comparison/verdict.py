@@ -33,6 +33,7 @@ TOO_FEW: Final = "too short to tell"
 #: A cause of idle time is named where its share has changed by so much.
 TELLING_SHARE: Final = 0.05
 MOST_NAMED: Final = 4
+MANY: Final = 999.5
 #: What is said of the values of a setting.
 REASONS: Final = {
     ("policy", "sequential"): "one frame at a time under sequential",
@@ -63,7 +64,8 @@ def verdict(
     found = {figure: rows[figure] for figure in differing}
     heads = list(_heads(found))
     causes = [*_works(found, changes), *_waits(found, rows, stages), *_others(found)]
-    reasons = [REASONS[change.key, change.other] for change in changes if (change.key, change.other) in REASONS]
+    settings = ((change.key.rpartition(".")[2], str(change.other)) for change in changes)
+    reasons = [REASONS[setting] for setting in settings if setting in REASONS]
     if not heads and not causes:
         causes = [_plain(figure, row) for figure, row in [*found.items()][:MOST_NAMED]]
     parts = ["; ".join(heads), "; ".join(causes), "; ".join(reasons) if heads or causes else ""]
@@ -141,17 +143,21 @@ def signed(row: Difference, unit: str) -> str:
 
 
 def _between(row: Difference, sign: int) -> str:
-    if row.low is None or row.high is None:
+    """The interval; nothing where it is no wider than what is computed."""
+    if row.low is None or row.high is None or row.low == row.high:
         return ""
     scale = 100 if row.is_ratio else 1
     low, high = sorted((sign * row.low * scale, sign * row.high * scale))
-    return f" ({low:.3g} to {high:.3g})"
+    return f" ({_number(low)} to {_number(high)})"
 
 
 def _amount(value: float, row: Difference, unit: str, sign: str = "") -> str:
     """A change in its unit; of a share in points of percent."""
-    if row.is_ratio:
-        return f"{100 * value:{sign}.3g} %"
-    if unit == SHARE:
-        return f"{100 * value:{sign}.3g} points"
-    return f"{value:{sign}.3g} {unit}".rstrip()
+    if row.is_ratio or unit == SHARE:
+        return f"{_number(100 * value, sign)} {'%' if row.is_ratio else 'points'}"
+    return f"{_number(value, sign)} {unit}".rstrip()
+
+
+def _number(value: float, sign: str = "") -> str:
+    """Three digits, and no powers of ten."""
+    return f"{value:{sign}.3g}" if abs(value) < MANY else f"{value:{sign}.0f}"

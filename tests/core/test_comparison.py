@@ -67,7 +67,7 @@ def test_series_of_frames_are_those_of_the_report() -> None:
 
 
 def test_runs_of_one_kind_do_not_differ() -> None:
-    runs = [told(simulated(seed, frames=120), f"run {seed}") for seed in range(20)]
+    runs = [told(simulated(seed, frames=80), f"run {seed}") for seed in range(20)]
     said = [pair(*both).verdict for both in zip(runs[::2], runs[1::2], strict=True)]
     assert said.count(NO_DIFFERENCE) >= 9
 
@@ -87,7 +87,8 @@ def test_a_stage_that_takes_5_percent_longer_is_named_and_no_other(stage: str, c
 
 
 def test_sequential_beside_pipelined_names_the_starved_dsp() -> None:
-    found = pair(told(simulated(1)), told(simulated(2, policy="sequential")))
+    config = {**make_report()["config"], "policy": "sequential", "shapes": [[1, 2]]}
+    found = pair(told(simulated(1)), told(simulated(2, policy="sequential"), config=config))
     assert found.verdict.startswith("frame time +1")
     assert "unit dsp (infer) is starved 5" in found.verdict
     assert found.verdict.endswith(": one frame at a time under sequential")
@@ -107,7 +108,8 @@ def test_several_runs_a_side_stand_for_it() -> None:
         Side(
             name,
             tuple(
-                told(simulated(seed, factors={"infer": factor}), f"{name}{seed}") for seed in range(start, start + 3)
+                told(simulated(seed, frames=100, factors={"infer": factor}), f"{name}{seed}")
+                for seed in range(start, start + 3)
             ),
         )
         for name, start, factor in (("a", 1, 1.0), ("b", 4, 1.0), ("c", 7, 1.05))
@@ -162,14 +164,20 @@ def test_a_core_on_which_every_stage_is_slower_is_slower_itself() -> None:
 def test_only_the_keys_that_differ_are_named() -> None:
     base = make_report(made={"at": "1", "command": ["a"], "trilane": None, "revision": "x", "modified": False})
     other = make_report(made={"at": "2", "command": ["b"], "trilane": None, "revision": "y", "modified": False})
-    other["config"] = {**base["config"], "policy": "latest", "pace_ns": {"infer": 5}}
+    other["config"] = {**base["config"], "policy": "latest", "pace_ns": {"infer": 5}, "shapes": [[1, 2]]}
     other["policy"] = "latest"
+    other["stages"] = {"infer": {**base["stages"]["infer"], "unit": "gpu"}}
     assert changes(base, other) == [
         Change("policy", "pipelined", "latest"),
         Change("config.pace_ns.infer", None, 5),
+        Change("config.shapes", None, [[1, 2]]),
+        Change("stages.infer.unit", "dsp", "gpu"),
         Change("made.revision", "x", "y"),
     ]
     assert changes(base, base) == []
+    prediction = {**base, "config": {**base["config"], "edge": "double"}}
+    del prediction["policy"], prediction["edge"]
+    assert changes(base, prediction) == []
 
 
 def test_drops_and_errors_are_named() -> None:
@@ -214,7 +222,8 @@ def test_predictions_of_one_chip_share_the_models_error(tmp_path: Path) -> None:
         return read_told(str(path))
 
     base = prediction("a", 20.0, "one")
-    assert pair(base, prediction("b", 20.5, "one")).verdict == "frame time +2.5 % (2.5 to 2.5)"
+    assert pair(base, prediction("b", 20.5, "one")).verdict == "frame time +2.5 %"
+    assert pair(base, prediction("d", 400.0, "one")).verdict == "frame time +1900 %"
     assert pair(base, prediction("c", 20.5, "two")).verdict == NO_DIFFERENCE
     assert "computed by a model" in pair(base, base).notes[0]
 
@@ -285,7 +294,9 @@ def test_the_command(
     capsys.readouterr()
     assert run_cli(monkeypatch, base, other, "--fail-if-slower", "much") == 2
     assert "found 'much', expected a percentage such as 5%" in capsys.readouterr().err
-    assert run_cli(monkeypatch, base, base, "--all") == 0
-    assert "verdict: no difference" in capsys.readouterr().out
+    many = str(make("c", config={**make_report()["config"], **dict.fromkeys("abcdefghijklmnop", 1)}))
+    assert run_cli(monkeypatch, base, many) == 0
+    text = capsys.readouterr().out
+    assert "verdict: no difference" in text and "4 more settings changed: --all shows them" in text
     assert run_cli(monkeypatch, base, str(tmp_path / "nothing")) == 2
     assert "nothing" in capsys.readouterr().err

@@ -69,7 +69,7 @@ def test_intervals_hold_what_they_promise(carried: float) -> None:
     generator = np.random.default_rng(11)
     held = 0
     for _ in range(RUNS):
-        pair = [series(autoregressive(generator, 300, carried), first) for first in (0, 1000)]
+        pair = [series(autoregressive(generator, 200, carried), first) for first in (0, 1000)]
         found = difference(*pair, "mean", is_ratio=False)
         assert found.low is not None and found.high is not None
         held += found.low < 0 < found.high
@@ -140,6 +140,13 @@ def test_frames_of_one_scene_are_compared_frame_with_frame() -> None:
     assert 0.04 < paired.low < 0.05 < paired.high < 0.06
     apart = difference(series(asked * noise[0]), series(1.05 * asked * noise[1], 500), "typical", is_ratio=True)
     assert apart.low is not None and apart.low < 0
+
+
+@pytest.mark.parametrize("statistic", ["p50", "p90", "p99"])
+def test_percentiles_are_linear_between_ranks(statistic: str) -> None:
+    values = np.random.default_rng(4).exponential(size=73)
+    found = difference(series(values), series(values), statistic, is_ratio=True)
+    assert found.base == pytest.approx(np.quantile(values, int(statistic[1:]) / 100))
 
 
 def test_the_typical_time_leaves_the_ends_out() -> None:
