@@ -25,6 +25,8 @@ EXPECTED = "a body file in the SMPL-X layout (.npz)"
 MAX_VERTICES = 1 << 18
 MAX_FACES = 1 << 19
 SUM_TOLERANCE = 1e-3
+#: Unit roundoff of the weights' float32: one that a file has rounded is off by so much of itself.
+ROUNDING = 2.0**-24
 
 #: Array of the file to its shape ("V" vertices, "F" faces, "T" texture coordinates, "*" any) and whether it is indices.
 _LAYOUT: dict[str, tuple[tuple[int | str, ...], bool]] = {
@@ -125,6 +127,7 @@ def load_body(path: Path) -> Body:
     _check_indices(path, arrays["ft"], len(arrays["vt"]), "ft", "texture coordinates")
     weights = _floats(path, arrays, "weights")
     _check_weights(path, weights)
+    weights = weights_of_one(weights)
     shape_dirs, expression_dirs = _split_shape(path, _floats(path, arrays, "shapedirs"))
     return Body(
         source=str(path),
@@ -194,6 +197,17 @@ def _check_weights(path: Path, weights: F32) -> None:
         raise BadInputError(where, f"a weight of {weights.min():.3g}", "weights of at least 0")
     if abs(sums[worst] - 1.0) > SUM_TOLERANCE:
         raise BadInputError(where, f"a sum of {sums[worst]:.4g} at vertex {worst}", "rows that sum to 1")
+
+
+def weights_of_one(weights: F32) -> F32:
+    """Skin weights (V,J) of which none is below 0 and each row sums to 1; a row that does to within rounding is kept.
+
+    A body that stands p metres from the origin would be off by p times what is missing of 1.
+    """
+    bounded = np.maximum(weights, 0)
+    sums = bounded.sum(axis=1, dtype=np.float64, keepdims=True)
+    kept = (np.abs(sums - 1.0) <= weights.shape[1] * ROUNDING) & (weights >= 0).all(axis=1, keepdims=True)
+    return _frozen(np.where(kept, weights, (bounded / sums).astype(np.float32)))
 
 
 def _split_shape(path: Path, dirs: F32) -> tuple[F32, F32]:

@@ -1,4 +1,4 @@
-"""`trilane accuracy`: how far runtimes are from each other on a scene, and from float on hard cases.
+"""`trilane accuracy`: how far runtimes are from each other on a scene; what is left of numbers on hard cases.
 
 Rule: this module reads options and shows results; every figure comes from `trilane.apps.experiments`.
 """
@@ -26,6 +26,7 @@ Examples:
 """
 OUT_OF_BOUNDS = 1
 SCENE, FRAMES = "default", 8
+NUMBER_COLUMNS = ("name", "error", "bound", "unit", "verdict")
 HARD_COLUMNS = ("name", "error", "bound", "constant_error", "shifted_error", "swapped_error", "source", "verdict")
 
 
@@ -45,13 +46,18 @@ def accuracy(
         ),
     ] = None,
     hard_cases: Annotated[
-        bool, typer.Option("--hard-cases", help="Compare with float on hard inputs and networks instead.")
+        bool,
+        typer.Option(
+            "--hard-cases",
+            help="Instead: hard rotations, bodies, cameras, tensors and times against bounds that follow from "
+            "analysis, and hard networks against float.",
+        ),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare the runtimes with each other on a scene's frames, or with float on hard cases.
+    """Compare the runtimes with each other on a scene's frames, or hard cases with their bounds.
 
-    Exit code 1 when a figure is out of its bound, or when a wrong picture would keep a hard case's bound: one of a
+    Exit code 1 when a figure is out of its bound, or when a wrong picture would keep a hard network's bound: one of a
     single colour, one shifted by 8 pixels, or one with red and blue exchanged.
     """
     from trilane.stages.dsp.runtime import installed
@@ -75,19 +81,25 @@ def _refuse_a_scene(scene: str, options: dict[str, object]) -> None:
 
 
 def _hard_cases(names: list[str], as_json: bool) -> bool:
-    from rich.progress import track
+    from rich.progress import Progress
 
     from trilane.apps.experiments.hard_cases import SOURCE, UNIT, hard_cases
     from trilane.apps.experiments.hard_networks import INPUTS, NETWORKS
+    from trilane.apps.experiments.hard_numbers.all_rows import COUNT, hard_numbers
 
     console = stderr_console()
-    count = len(NETWORKS) * len(INPUTS) * len(names)
-    with stdout_kept():
-        rows = list(track(hard_cases(names), "hard cases", count, console=console, disable=not console.is_terminal))
+    with stdout_kept(), Progress(console=console, disable=not console.is_terminal) as progress:
+        numbers = list(progress.track(hard_numbers(), COUNT, description="hard numbers"))
+        total = len(NETWORKS) * len(INPUTS) * len(names)
+        networks = list(progress.track(hard_cases(names), total, description="hard networks"))
+    rows = numbers + networks
     if as_json:
         print_json({"schema": 1, "hard_cases": rows})
     else:
-        _print(rows, HARD_COLUMNS)
+        _print(numbers, NUMBER_COLUMNS)
+        for source in dict.fromkeys(row["source"] for row in numbers):
+            stdout_console().print(f"bound: {source}", soft_wrap=True, markup=False)
+        _print(networks, HARD_COLUMNS)
         stdout_console().print(f"{UNIT}; bound: {SOURCE}", soft_wrap=True, markup=False)
     failed = [row for row in rows if not row["passed"]]
     for row in failed:

@@ -12,21 +12,16 @@ from typing import Any
 
 import numpy as np
 
+from trilane.apps.experiments.drawn_tensors import DrawnTensors
 from trilane.arrays import U8
 from trilane.avatars.integer_network import NetworkFile
 from trilane.avatars.network_reshape import reshaped
 from trilane.errors import BadInputError
 from trilane.figure_sources import MEASURED
-from trilane.pipeline.stage import UnitContext
 from trilane.shapes import Shape
 from trilane.stages.avatar_assets import network_of
-from trilane.stages.avatar_pipeline import edge_bytes
 from trilane.stages.configure import Checked
-from trilane.stages.cpu.pose import build as build_pose
 from trilane.stages.dsp.runtime import Binding, RuntimeOptions, load_runtime
-from trilane.stages.gpu.raster import build as build_raster
-from trilane.stages.packets import pose_dtype
-from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 #: Of 255: bounds on the difference of any two runtimes.
 MEAN_BOUND, LARGEST_BOUND = 0.5, 4
@@ -101,24 +96,7 @@ class _Sessions:
 
 def _tensors(checked: Checked, frames: int) -> Iterator[tuple[int, U8]]:
     """(number, tensor (h,w,C)) of frames that are evenly spread over the scene."""
-    config, assets = checked.config, checked.assets
-    total, avatars = config.scene.frames, len(config.avatar_dirs)
+    total, painter = checked.config.scene.frames, DrawnTensors(checked)
     count = min(frames, total)
-    sizes = edge_bytes(config, assets)
-    posed, drawn = _packet(avatars, sizes["pose->raster"]), _packet(avatars, sizes["raster->infer"])
-    settings = {"config": config.model_dump(mode="json")}
-    pose = build_pose(settings, UnitContext("cpu", config.units["cpu"], assets))
-    raster = build_raster(settings, UnitContext("gpu", config.units["gpu"], assets))
-    pose.bind([], [posed])
-    raster.bind([posed], [drawn])
-    channels = network_of(assets).channels
     for frame in (index * total // count for index in range(count)):
-        pose.run(frame, None, 0)
-        raster.run(frame, 0, 0)
-        height, width = posed.header["tensor_shape"].tolist()
-        yield frame, drawn.payload[: height * width * channels].reshape(height, width, channels)
-
-
-def _packet(avatars: int, payload: int) -> Packet:
-    layout = SlotLayout(pose_dtype(avatars), payload)
-    return view_packet(memoryview(bytearray(layout.slot_bytes)), layout)
+        yield frame, painter.tensor(frame)

@@ -14,6 +14,7 @@ import pytest
 from trilane.apps.cli import accuracy as cli
 from trilane.apps.experiments import accuracy, hard_cases
 from trilane.apps.experiments.accuracy import runtime_differences
+from trilane.apps.experiments.hard_numbers import all_rows
 from trilane.errors import BadInputError
 from trilane.stages import configure
 from trilane.stages.configure import Request
@@ -51,6 +52,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     monkeypatch.setattr(configure, "required_machine", lambda: {"cpu": "a processor"})
     monkeypatch.setattr(accuracy, "runtime_differences", differences)
     monkeypatch.setattr(hard_cases, "hard_cases", cases)
+    monkeypatch.setattr(all_rows, "hard_numbers", lambda: iter([]))
     monkeypatch.setattr(runtime, "installed", lambda: ("ort", "qnn"))
     return found
 
@@ -104,10 +106,12 @@ def test_a_hard_case_that_fails_is_named(passed: bool, monkeypatch: pytest.Monke
     figures = dict.fromkeys(cli.HARD_COLUMNS, 1.0)
     row = {**figures, "name": "batch, [odd], ort", "verdict": "above", "passed": passed}
     good = {**row, "name": "good", "passed": True}
+    number = {"name": "a [number]", "error": 2.0, "bound": 1.0, "verdict": "over", "passed": passed}
+    monkeypatch.setattr(all_rows, "hard_numbers", lambda: iter([number]))
     monkeypatch.setattr(hard_cases, "hard_cases", lambda _: iter([good, row]))
     out, err = command("accuracy", "--hard-cases", "--json", code=0 if passed else 1)
-    assert json.loads(out) == {"schema": 1, "hard_cases": [good, row]}
-    assert err.splitlines() == ([] if passed else ["batch, [odd], ort: above"])
+    assert json.loads(out) == {"schema": 1, "hard_cases": [number, good, row]}
+    assert err.splitlines() == ([] if passed else ["a [number]: over", "batch, [odd], ort: above"])
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ import pytest
 
 from trilane.apps.cli import bench
 from trilane.apps.experiments import accuracy, hard_cases
+from trilane.apps.experiments.hard_numbers import all_rows
 from trilane.stages import configure, machine_facts
 
 MACHINE = {"cpu": {"model": "a processor", "cores": 2}}
@@ -72,6 +73,9 @@ def test_hard_cases(printed: Printed, check_printed: Check, monkeypatch: pytest.
     row: dict[str, Any] = {name: 1.25 * (n + 1) for n, name in enumerate(figures)}
     row |= {"name": "batch, usual, ort", "verdict": "holds", "passed": True, "unit": "u", "source": "s"}
     bad = row | {"name": "batch, odd, ort", "verdict": "above its bound", "passed": False}
+    number = {key: row[key] for key in ("error", "bound", "unit", "source", "verdict", "passed")}
+    numbers = [number | {"name": "rotation by 0"}, number | {"name": "rotation by pi", "source": "another"}]
+    monkeypatch.setattr(all_rows, "hard_numbers", lambda: iter(numbers))
     monkeypatch.setattr(hard_cases, "hard_cases", lambda _: iter([row, bad]))
     check_printed("hard-cases", printed("accuracy", "--hard-cases", "--runtime", "ort", code=1))
 

@@ -1,0 +1,108 @@
+"""Tensors: values that quantising, packing and FP16 texels find hard, drawn by the GPU unit's own packed pass.
+
+Rule: a texture whose channels are constant makes every covered pixel of a tensor a known byte: q = clamp(round(x /
+scale) + zero point, 0, 255), rounded to even. Values are FP16 numbers and, where halves are asked for, the scale is a
+power of two, so that x / scale is exact however a driver divides; else x / scale is at least a tenth of a step from a
+half, which no driver's division crosses (2.5 units in the last place, Vulkan 1.3 and OpenCL 3.0 for float32).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from trilane.apps.experiments.hard_numbers.hard_number import EXACT, HardNumber, worst
+from trilane.arrays import F64, U8
+from trilane.body.body import ShapedBody
+from trilane.body.joints import JOINTS
+from trilane.body.kinematics import Skeleton
+from trilane.errors import BadInputError
+from trilane.scene.camera.path import look_at, projection_matrix
+from trilane.stages.gpu.mesh_arrays import mesh_arrays
+from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement, Quantisation
+from trilane.stages.gpu.skinned_mesh import SkinnedMesh
+from trilane.stages.gpu.texture_array import check_texture, texture_array
+
+SHAPE = (64, 64)
+CHANNELS = 16
+POWER = 2.0**-5
+#: What is drawn -> scale, zero point, the channels' values in steps (halves: exact), or as they are (numbers).
+STEPS: dict[str, tuple[float, int, Sequence[float]]] = {
+    "halves above 0": (POWER, 117, [k + 0.5 for k in range(16)]),
+    "halves below 0": (POWER, 117, [-k - 0.5 for k in range(16)]),
+    "seven tenths of a step": (6 / 255, 117, [k + 0.7 for k in range(16)]),
+    "seven tenths below 0": (6 / 255, 117, [-k - 0.7 for k in range(16)]),
+    "just over the highest byte": (POWER, 117, [138 + k / 2 for k in range(16)]),
+    "just under the lowest byte": (POWER, 117, [-117 - k / 2 for k in range(16)]),
+    "a zero point of 0": (POWER, 0, [k - 7.5 for k in range(16)]),
+    "a zero point of 255": (POWER, 255, [k - 7.5 for k in range(16)]),
+}
+LARGEST, LEAST_NORMAL, LEAST = 65504.0, 2.0**-14, 2.0**-24
+NUMBERS: dict[str, tuple[float, int, Sequence[float]]] = {
+    "the largest FP16 numbers": (6 / 255, 117, [LARGEST, -LARGEST] * 8),
+    "FP16 subnormals at a scale of their own": (LEAST, 3, [k * LEAST for k in range(16)]),
+    "no contrast: all values 0 or -0": (1e-30, 117, [0.0, -0.0] * 8),
+    "a scale so small that all is clamped": (1e-30, 117, [LEAST, -LEAST] * 8),
+    "a scale so large that all is 0": (1e30, 117, [LARGEST, -LARGEST] * 8),
+}
+HALF_ULP = "FP16 rounds to the nearest: 2^-11 of a number, 2^-25 at least"
+
+
+def tensor_cases(shaped: ShapedBody, ctx: Any) -> Iterator[HardNumber]:
+    """Rows of packing and of texels, drawn in the OpenGL context `ctx`."""
+    mesh, view, placement = _scene(shaped, ctx)
+    rows = {name: (s, z, [step * s for step in steps]) for name, (s, z, steps) in STEPS.items()} | NUMBERS
+    for name, (scale, zero_point, numbers) in rows.items():
+        values = np.asarray(numbers, np.float16).astype(np.float64)
+        packed = PackedPass(ctx, CHANNELS, Quantisation(scale, zero_point), deferred=True)
+        avatar = PackedAvatar(packed, mesh, np.tile(values.astype(np.float32), (8, 8, 1)))
+        avatar.draw(packed.begin(SHAPE), view, placement)
+        tensor = np.zeros(SHAPE[0] * SHAPE[1] * CHANNELS, np.uint8)
+        packed.read_into(SHAPE, tensor)
+        error = _steps_off(tensor.reshape(-1, CHANNELS), values, scale, zero_point)
+        yield HardNumber(f"packing {name}", error, 0.0, "steps", EXACT)
+    yield from _texels(ctx)
+
+
+def _scene(shaped: ShapedBody, ctx: Any) -> tuple[SkinnedMesh, F64, Placement]:
+    """The body at rest before a camera, in the middle of the tensor."""
+    body = shaped.body
+    joint = np.zeros((len(shaped.vertices), 4), np.int64)
+    weight = np.tile([1.0, 0.0, 0.0, 0.0], (len(joint), 1))
+    mesh = SkinnedMesh(ctx, mesh_arrays(shaped.vertices, body.faces, body.uv, body.uv_faces, joint, weight))
+    posed = Skeleton(shaped.joints, body.parents).pose(np.zeros((JOINTS, 3)))
+    middle = shaped.vertices.astype(np.float64).mean(axis=0)
+    view = look_at(middle + np.array([0.0, 0.0, 1.0]), middle)
+    return mesh, view, Placement(posed.matrices.copy(), projection_matrix(40.0, 1.0, 0.05, 10.0), (0, 0, *SHAPE))
+
+
+def _steps_off(pixels: U8, values: F64, scale: float, zero_point: int) -> float:
+    """The largest difference of a covered pixel (N, C) from the formula; NaN when no pixel is covered."""
+    wanted = np.clip(np.rint(values / np.float64(np.float32(scale))) + zero_point, 0, 255)
+    middle = pixels.reshape(*SHAPE, -1)[SHAPE[0] // 2, SHAPE[1] // 2]
+    background = (pixels == zero_point).all(axis=1)
+    covered = pixels[~background] if (~background).any() else middle[None]
+    return float(np.abs(covered - wanted).max())
+
+
+def _texels(ctx: Any) -> Iterator[HardNumber]:
+    """What the texture on the GPU holds, and what it refuses to hold."""
+    rng = np.random.default_rng(11)
+    for name, exponents in {"usual numbers": (-6, 6), "subnormals": (-24, -14), "large numbers": (10, 15)}.items():
+        sizes = 2.0 ** rng.uniform(*exponents, (8, 8, 4)) * rng.choice([-1.0, 1.0], (8, 8, 4))
+        texture = sizes.astype(np.float32)
+        stored = np.frombuffer(texture_array(ctx, texture).read(), np.float16).reshape(texture.shape)
+        bounds = np.maximum(2.0**-11 * np.abs(texture), 2.0**-25)
+        yield HardNumber(f"FP16 texels, {name}", *worst(np.abs(stored - texture), bounds), "as the texture", HALF_ULP)
+    taken = sum(_is_taken(value) for value in (65520.0, np.inf, -np.inf, np.nan))
+    yield HardNumber("textures that FP16 cannot hold and that are taken", float(taken), 0.0, "textures", EXACT)
+
+
+def _is_taken(value: float) -> bool:
+    try:
+        check_texture(np.full((2, 2, 4), value, np.float32), 4)
+    except BadInputError:
+        return False
+    return True

@@ -1,0 +1,155 @@
+"""Hard numbers keep their bounds, which are worked out by hand here, and a fault in the code breaks a row."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from decimal import Decimal
+from typing import Any
+
+import numpy as np
+import pytest
+
+from trilane.apps.experiments.hard_numbers import chains, rotations
+from trilane.apps.experiments.hard_numbers.all_rows import COUNT
+from trilane.apps.experiments.hard_numbers.exact_turn import PI, exact_turn, turn_error
+from trilane.apps.experiments.hard_numbers.hard_number import U32, HardNumber, U, gamma, worst
+from trilane.apps.experiments.hard_numbers.times import time_cases
+from trilane.avatars.bundle import bundle_folder
+from trilane.body.body import ShapedBody, load_body, weights_of_one
+from trilane.body.kinematics import Posed, Skeleton
+
+
+@pytest.fixture(scope="module")
+def shaped() -> ShapedBody:
+    return load_body(bundle_folder("default") / "body.npz").shape()
+
+
+@pytest.fixture
+def few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fewer random rotations than the command draws."""
+    monkeypatch.setattr(rotations, "RANDOM", 2000)
+    monkeypatch.setattr(rotations, "CHUNK", 1000)
+
+
+def failing(cases: Iterable[HardNumber]) -> list[str]:
+    return [case.name for case in cases if not case.holds]
+
+
+def test_a_row_holds_up_to_its_bound() -> None:
+    held = [HardNumber("", error, 2.0, "", "").holds for error in (0.0, 2.0, 2.1, math.nan, math.inf)]
+    assert held == [True, True, False, False, False]
+
+
+def test_roundoffs_are_those_of_the_formats() -> None:
+    assert np.spacing(1.0) / 2 == U
+    assert np.spacing(np.float32(1)) / 2 == U32
+    assert gamma(10) == pytest.approx(1.1102e-15, rel=1e-4)
+    assert gamma(2**23, U32) == 1.0  # n u / (1 - n u), n u a half
+
+
+@pytest.mark.parametrize(
+    ("errors", "bounds", "found"),
+    [
+        ([1.0, 3.0], [2.0, 9.0], (1.0, 2.0)),
+        ([0.0, 0.0], [1.0, 5.0], (0.0, 5.0)),
+        ([0.0, 1e-9], [0.0, 0.0], (1e-9, 0.0)),
+        ([[1.0, 2.0]], 4.0, (2.0, 4.0)),
+    ],
+)
+def test_the_error_nearest_to_its_bound_stands_for_all(errors: Any, bounds: Any, found: tuple[float, float]) -> None:
+    assert worst(errors, bounds) == found
+
+
+def test_an_error_that_is_no_number_stands_for_all() -> None:
+    error, bound = worst([1.0, math.nan], [2.0, 7.0])
+    assert (math.isnan(error), bound) == (True, 7.0)
+
+
+def test_exact_turns_are_those_of_paper() -> None:
+    """A quarter turn about z takes x to y; half a turn about x mirrors y and z; pi as a float misses pi by 1.22e-16."""
+    quarter = exact_turn([0.0, 0.0, math.pi / 2])
+    assert [[round(float(entry), 12) for entry in row] for row in quarter] == [[-1, -1, 0], [1, -1, 0], [0, 0, 0]]
+    half = exact_turn([math.pi, 0.0, 0.0])
+    assert float(half[2][1]) == pytest.approx(float(PI - Decimal(math.pi)), rel=1e-12)
+    assert float(half[1][1] + 2) == pytest.approx((1.2246467991473532e-16) ** 2 / 2, rel=1e-9)
+
+
+def test_tiny_exact_turns_are_their_cross_product() -> None:
+    found = exact_turn([1e-40, 2e-40, 3e-40])
+    assert [float(found[0][1]), float(found[0][2]), float(found[1][2])] == [-3e-40, 2e-40, -1e-40]
+    assert float(found[0][0]) == pytest.approx(-(4 + 9) / 2 * 1e-80)
+
+
+def test_a_turn_that_is_no_number_is_an_error() -> None:
+    assert math.isnan(turn_error(np.full((3, 3), np.nan), exact_turn([0.0, 0.0, 0.0])))
+    assert turn_error(np.full((3, 3), 0.25), exact_turn([0.0, 0.0, 0.0])) == 0.25
+
+
+def test_the_bound_of_a_turn_at_three_angles() -> None:
+    """At 2: s = h = 1, e = 10 U, f = 4.5 U: 60 + 9 + 6 = 75 U. Near 0: 2 e = 10 U t, s f and s U add 2 and 3 U t."""
+    bounds = rotations.turn_bound(np.array([0.0, 1e-8, 2.0]))
+    assert bounds[0] == 0.0
+    assert bounds[1] == pytest.approx(1.01 * 15e-8 * U, rel=1e-6)
+    assert bounds[2] == pytest.approx(1.01 * 75 * U, rel=1e-12)
+
+
+@pytest.mark.usefixtures("few")
+def test_rotations_keep_their_bounds() -> None:
+    cases = list(rotations.rotation_cases())
+    assert failing(cases) == []
+    assert len(cases) == len(rotations.ANGLES) + 2 + len(rotations.RETURNED)
+
+
+def _without_a_series(rotvec: Any) -> Any:
+    """Rodrigues' formula as it is often written: no care at 0, 1e-8 in the norm."""
+    v = np.asarray(rotvec, np.float64)
+    angle = np.sqrt((v * v).sum(axis=-1))[..., None, None] + 1e-8
+    x, y, z = np.moveaxis(v, -1, 0)
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*v.shape[:-1], 3, 3) / angle
+    return np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
+
+
+@pytest.mark.usefixtures("few")
+def test_a_formula_without_care_at_zero_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rotations, "turn", _without_a_series)
+    failed = failing(rotations.rotation_cases())
+    assert {f"rotation by {name}, 26 axes" for name in ("1e-12", "1e-3", "pi")} <= set(failed)
+
+
+def test_chains_keep_their_bounds(shaped: ShapedBody) -> None:
+    cases = list(chains.chain_cases(shaped))
+    assert failing(cases) == []
+    assert len(cases) == len(chains.TURNS) + 1 + len(chains.PLACES)
+
+
+def test_places_in_half_precision_fail(shaped: ShapedBody, monkeypatch: pytest.MonkeyPatch) -> None:
+    pose = Skeleton.pose
+
+    def rounded(*arguments: Any) -> Posed:
+        posed = pose(*arguments)
+        posed.matrices[:, :, 3] = posed.matrices[:, :, 3].astype(np.float16)
+        return posed
+
+    monkeypatch.setattr(Skeleton, "pose", rounded)
+    failed = failing(chains.chain_cases(shaped))
+    assert failed == [f"places of the skinning matrices, {place}" for place in chains.PLACES]
+
+
+def test_a_day_of_media_time_keeps_its_bounds() -> None:
+    cases = list(time_cases())
+    assert failing(cases) == []
+    assert len(cases) == 9
+
+
+def test_weights_are_made_to_sum_to_one() -> None:
+    given = np.array([[0.5, 0.5, 0.0], [0.5, 0.4995, 0.0], [1.0005, -0.0005, 0.0]], np.float32)
+    found = weights_of_one(given)
+    assert found[0].tolist() == [0.5, 0.5, 0.0]
+    assert found[1] == pytest.approx([0.5 / 0.9995, 0.4995 / 0.9995, 0.0], rel=1e-7)
+    assert found[2].tolist() == [1.0, 0.0, 0.0]
+
+
+def test_there_are_enough_rows() -> None:
+    assert COUNT >= 70
