@@ -60,14 +60,25 @@ def require_metrics() -> None:
 
 def error_maps(picture: U8, reference: U8) -> tuple[F64, F64, F64]:
     """For each pixel (h,w): the mean square of the differences, in 0..1; SSIM; FLIP."""
-    import flip_evaluator
+    shown, wanted = picture / 255, reference / 255
+    return ((shown - wanted) ** 2).mean(axis=2), ssim_map(shown, wanted), flip_map(shown, wanted)
+
+
+def ssim_map(picture: F64, reference: F64) -> F64:
+    """(h,w): SSIM of each pixel of two pictures (h,w,3) in 0..1, mean over the colours, by windows of 7 x 7 pixels."""
     from skimage.metrics import structural_similarity
 
-    square = (((picture.astype(np.float64) - reference) / 255) ** 2).mean(axis=2)
-    _, similar = structural_similarity(picture, reference, channel_axis=2, data_range=255, full=True)
-    real = [np.ascontiguousarray(image, np.float32) / np.float32(255) for image in (reference, picture)]
+    _, similar = structural_similarity(picture, reference, channel_axis=2, data_range=1.0, full=True)
+    return np.asarray(similar.mean(axis=2))
+
+
+def flip_map(picture: F64, reference: F64) -> F64:
+    """(h,w): FLIP of each pixel of two pictures (h,w,3), sRGB in 0..1."""
+    import flip_evaluator
+
+    real = [np.ascontiguousarray(image, np.float32) for image in (reference, picture)]
     flip, _, _ = flip_evaluator.evaluate(*real, "LDR", inputsRGB=True, applyMagma=False, computeMeanError=False)
-    return square, similar.mean(axis=2), np.asarray(flip, np.float64).reshape(square.shape)
+    return np.asarray(flip, np.float64).reshape(picture.shape[:2])
 
 
 def inside(boxes: Sequence[Box], picture: U8) -> Mask:
