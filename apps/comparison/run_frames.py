@@ -24,6 +24,8 @@ from trilane.scheduler.ledger import JobRecord
 
 NS_PER_MS = 1e6
 STATES = (BUSY, *CAUSES)
+#: Figures that stages report of their jobs, and the measures that they are here.
+MOVED = {f"bytes_{name}": f"bytes {name.replace('_', ' ')}" for name in ("read", "written", "uploaded", "read_back")}
 OVERHEAD, PREEMPTED = "overhead", "preempted"
 
 
@@ -114,10 +116,8 @@ class _Story:
         self.jobs.append(record.job)
         self._cutter.job(record.job)
         for name, value in record.figures.items():
-            if name.endswith("_bytes"):
-                self.figures[Key(name.removesuffix("_bytes") + " bytes", record.job.stage)].append(
-                    (record.job.frame, value)
-                )
+            if name in MOVED:
+                self.figures[Key(MOVED[name], record.job.stage)].append((record.job.frame, value))
 
 
 def _plain(frames: I64, ns: I64) -> Series:

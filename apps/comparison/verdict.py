@@ -143,12 +143,12 @@ def signed(row: Difference, unit: str) -> str:
 
 
 def _between(row: Difference, sign: int) -> str:
-    """The interval; nothing where it is no wider than what is computed."""
-    if row.low is None or row.high is None or row.low == row.high:
+    """The interval; nothing where both ends are the same to the last digit that is written."""
+    if row.low is None or row.high is None:
         return ""
     scale = 100 if row.is_ratio else 1
-    low, high = sorted((sign * row.low * scale, sign * row.high * scale))
-    return f" ({_number(low)} to {_number(high)})"
+    low, high = map(_number, sorted((sign * row.low * scale, sign * row.high * scale)))
+    return f" ({low} to {high})" if low != high else ""
 
 
 def _amount(value: float, row: Difference, unit: str, sign: str = "") -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, Final
 
 from trilane.apps.comparison.difference import Difference
-from trilane.apps.comparison.rows import SHARE, Figure
+from trilane.apps.comparison.rows import BYTES, SHARE, Figure
 
 DASH: Final = "–"
 
@@ -19,6 +19,8 @@ def name_of(figure: Figure) -> str:
 
 def value_of(value: float, unit: str) -> str:
     """A value in its unit; of a share in percent."""
+    if unit == BYTES:
+        return f"{value:,.0f} {unit}"
     return f"{100 * value:.1f} %" if unit == SHARE else f"{value:.4g} {unit}".rstrip()
 
 

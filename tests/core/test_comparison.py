@@ -20,7 +20,7 @@ from trilane.apps.comparison.run_frames import Key, frames_of
 from trilane.apps.comparison.sides import Kind, Side, Told, read_side, read_told
 from trilane.apps.comparison.verdict import NO_DIFFERENCE, TOO_FEW
 from trilane.errors import BadInputError
-from trilane.pipeline.journal import NAME, journal_of
+from trilane.pipeline.journal import NAME, Worked, journal_of
 from trilane.scheduler.virtual import Simulation
 from trilane.testing.compared_runs import simulated, write_run
 from trilane.testing.run_report import make_report
@@ -143,6 +143,25 @@ def test_other_programs_and_held_stages_decide_how_sure_a_time_on_the_host_is() 
     assert "had 10 % of its cores, so runs of one kind may differ by 20 %" in said[0]
 
 
+def test_tails_waits_and_shares_are_less_sure_than_means() -> None:
+    """Others had 10 %: 0.1 of the mean, 1.5 and 4 times as much of p90 and p99, half of shares, 0.002 if held."""
+    config = {**make_report()["config"], "pace_ns": {"infer": 9_000_000}}
+    base, other = (told(simulated(seed, frames=80), clock="host", other_programs=0.1, config=config) for seed in (1, 2))
+    rows = pair(base, other).rows
+    for (measure, of, statistic, unit), least in {
+        ("frame time", "", "mean", "ms"): 0.1,
+        ("frame time", "", "p90", "ms"): 0.15,
+        ("frame time", "", "p99", "ms"): 0.4,
+        ("work", "pose", "typical", "ms"): 0.1,
+        ("busy", "dsp", "share", "share"): 0.05,
+        ("work", "infer", "typical", "ms"): 0.002,
+    }.items():
+        deviation = rows[Figure(measure, of, "", statistic, unit)].deviation
+        assert deviation is not None and least < deviation < 1.5 * least + 0.02
+    wait = rows[Figure("wait", "raster", "", "mean", "ms")]
+    assert wait.deviation is not None and wait.deviation > 0.1 * max(wait.base, wait.other) > 0.05
+
+
 def test_a_core_on_which_every_stage_is_slower_is_slower_itself() -> None:
     """One stage of two by 20 % says nothing of the core; both by 20 % and 30 % say 20 %, on one machine alone."""
     stages = {
@@ -178,6 +197,22 @@ def test_only_the_keys_that_differ_are_named() -> None:
     prediction = {**base, "config": {**base["config"], "edge": "double"}}
     del prediction["policy"], prediction["edge"]
     assert changes(base, prediction) == []
+
+
+def test_bytes_that_a_stage_moves_are_named() -> None:
+    def moved(run: Simulation, ratio: float) -> Told:
+        assert run.recording is not None
+        records = [
+            record._replace(figures={"bytes_read": 1000.0 * ratio, "visible": record.job.frame * ratio})
+            if isinstance(record, Worked) and record.job.stage == "raster"
+            else record
+            for record in journal_of(run.recording, run.jobs, {}, run.report)
+        ]
+        return Told("run", Kind.RUN, make_report(**run.report), frames_of(records))
+
+    run = simulated(1, frames=60)
+    assert pair(moved(run, 1.0), moved(run, 1.5)).verdict == "raster bytes read +50 %"
+    assert pair(moved(run, 1.0), moved(run, 1.0)).verdict == NO_DIFFERENCE
 
 
 def test_drops_and_errors_are_named() -> None:
