@@ -299,6 +299,35 @@ def test_memory_of_the_timeline_is_bounded_and_its_slices_stay_in_order(opened: 
         assert seen.is_well()
 
 
+PERFETTO = """<script>
+  addEventListener("message", event => {
+    if (event.data === "PING") event.source.postMessage("PONG", event.origin);
+    else if (event.data.perfetto) window.got = event.data.perfetto;
+  });
+</script>"""
+
+
+def test_perfetto_is_handed_the_trace_on_a_click_alone(opened: Callable[..., Watched], tmp_path: Path) -> None:
+    trace = tmp_path / "trace.pftrace"
+    with Served(DoubleView(trace=trace)) as served:
+        seen = opened(served.url)
+        seen.context.route(
+            "https://ui.perfetto.dev/**", lambda route: route.fulfill(body=PERFETTO, content_type="text/html")
+        )
+        seen.page.click("#perfetto")
+        seen.wait_until(lambda: "no trace yet" in seen.text("#perfetto-note"))
+        assert len(seen.context.pages) == 1
+        seen.errors.clear()  # the browser says that there is no file
+
+        trace.write_bytes(bytes(range(256)) * 1000)
+        with seen.context.expect_page() as opening:
+            seen.page.click("#perfetto")
+        seen.wait_until(lambda: seen.text("#perfetto-note") == "handed to ui.perfetto.dev")
+        got = "() => [got.title, got.fileName, got.buffer.byteLength, new Uint8Array(got.buffer)[256001 - 1000]]"
+        assert opening.value.evaluate(got) == ["Trilane: 20261122-default", "trace.pftrace", 256000, 25]
+        assert seen.foreign == []
+
+
 class Started:
     """Context manager: `trilane run --dashboard` in a process of its own; `url` is the page's address."""
 

@@ -70,7 +70,10 @@ const seek = new Seek(
   (time) => timeline.showMoment(time),
 );
 
-const of = (key) => (figures) => Object.fromEntries(PERCENTILES.map((name) => [name, figures[key]?.[name]]));
+const of = (key) => (figures) => {
+  const times = figures[key]?.samples ? figures[key] : {};
+  return Object.fromEntries(PERCENTILES.map((name) => [name, times[name]]));
+};
 const shares = (table, share) =>
   Object.fromEntries(Object.entries(table ?? {}).map(([name, row]) => [words(name), 100 * share(row)]));
 const charts = [

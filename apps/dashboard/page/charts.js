@@ -76,7 +76,10 @@ export class Chart {
     if (this.names.length === 0) return;
     const columns = this.names.map((name) => this.rows.map((row) => (isNumber(row[name]) ? row[name] : null)));
     if (this.plot) this.plot.setData([this.times, ...columns]);
-    else this.plot = new uPlot(this.#options(), [this.times, ...columns], this.home);
+    else {
+      this.plot = new uPlot(this.#options(), [this.times, ...columns], this.home);
+      this.isDirty = true; // it has its scales, which the cursor needs, once it was drawn
+    }
     this.#point();
   }
 

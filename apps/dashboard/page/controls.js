@@ -15,7 +15,9 @@ export class Controls {
     this.table = new Map();
   }
 
+  // Who has the focus in a control keeps it in the one of that name.
   build(table) {
+    const focused = document.activeElement?.closest("[data-control]")?.dataset.control;
     this.table = new Map(table.map((control) => [control.name, { ...control, usedAt: -Infinity }]));
     for (const home of Object.values(this.homes)) home.replaceChildren();
     for (const control of this.table.values()) {
@@ -23,6 +25,7 @@ export class Controls {
       if (made) this.#home(control).append(made);
     }
     this.homes.restart.closest("section").hidden = this.homes.restart.children.length === 0;
+    if (focused) document.querySelector(`[data-control=${CSS.escape(focused)}] :is(select, input, button)`)?.focus();
   }
 
   #home(control) {

@@ -36,7 +36,7 @@ export function showSpeed(figures, accuracy) {
     ["frame_time_ms", "frame-time"],
     ["latency_ms", "latency"],
   ]) {
-    const times = figures[key] ?? {};
+    const times = figures[key]?.samples ? figures[key] : {};
     setText(byId(id), ms(times.p50));
     const rest = ["p90", "p95", "p99"].map((name) => `${name} ${number(times[name])}`).join(" · ");
     setText(byId(`${id}-rest`), `p50; ${rest} ms, of ${number(times.samples, 0)}`);
@@ -166,7 +166,7 @@ export function showSources(figures) {
 
 export function buildLegend(home) {
   home.replaceChildren(
-    element("li", {}, element("span", { class: "swatch job", "aria-hidden": "true" }), "busy: a colour for each frame"),
+    element("li", {}, element("span", { class: "swatch job", "aria-hidden": "true" }), "a job: a colour for each frame; with the time in which another thread had its core"),
     ...CAUSES.map((cause) =>
       element(
         "li",

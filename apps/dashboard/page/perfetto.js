@@ -6,24 +6,21 @@ const PERFETTO = "https://ui.perfetto.dev";
 const PING_EVERY_MS = 100;
 const GIVE_UP_MS = 60_000;
 
-// Fetches the trace at `url` and hands it over. `say` hears how far it is. Call it in the click's own turn.
+// Fetches the trace at `url` and hands it over. `say` hears how far it is. Call it when the person has clicked.
 export async function openInPerfetto(url, title, say) {
+  if (!(await fetch(url, { method: "HEAD" })).ok) {
+    say("the run has no trace yet: it is written at its end");
+    return;
+  }
   const target = window.open(PERFETTO);
   if (!target) {
     say("the browser did not open a window for ui.perfetto.dev: allow pop-ups of this page");
     return;
   }
   say("fetching the trace");
-  const answer = await fetch(url);
-  if (!answer.ok) {
-    target.close();
-    say(`no trace: ${(await answer.text()).slice(0, 200) || answer.status}`);
-    return;
-  }
-  const buffer = await answer.arrayBuffer();
+  const buffer = await (await fetch(url)).arrayBuffer();
   say("waiting for ui.perfetto.dev");
-  const isThere = await ponged(target);
-  if (!isThere) {
+  if (!(await ponged(target))) {
     say("ui.perfetto.dev did not answer: is there a network? The file is trace.pftrace in the run folder");
     return;
   }

@@ -135,10 +135,15 @@ def jpeg(frame: int, turn_deg: float, zoom: float) -> bytes:
 
 
 class DoubleView:
-    """A live run, or one that is over. `said`: what the page asked for, in order; `refuses`: names of controls."""
+    """A live run, or one that is over. `said`: what the page asked for, in order.
 
-    def __init__(self, is_live: bool = True, refuses: Mapping[str, str] | None = None) -> None:
-        self.is_live, self.refuses = is_live, dict(refuses or {})
+    `refuses`: names of controls, and why. `trace`: file that it says is its trace.
+    """
+
+    def __init__(
+        self, is_live: bool = True, refuses: Mapping[str, str] | None = None, trace: Path | None = None
+    ) -> None:
+        self.is_live, self.refuses, self.trace = is_live, dict(refuses or {}), trace
         self.said: list[ControlSaid | Seek] = []
         self.state = "running" if is_live else "ended"
         self.turn_deg, self.zoom, self.restarts = 0.0, 1.0, 0
@@ -237,11 +242,6 @@ class DoubleView:
     def metrics(self) -> str:
         """None."""
         return ""
-
-    @property
-    def trace(self) -> Path | None:
-        """None."""
-        return None
 
 
 class Served:
