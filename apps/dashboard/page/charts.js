@@ -5,7 +5,7 @@ import { colour, onThemeChange } from "./theme.js";
 import { isNumber, number } from "./text.js";
 
 const POINTS = 480; // two minutes, at four a second
-const HEIGHT = 150;
+const HEIGHT = 130;
 const DASHES = [[], [6, 3], [2, 3], [8, 3, 2, 3], [4, 4], [1, 2]];
 
 // One chart in the element `home`. `read(figures)` gives {name: number or null}; series come and go with its names.
@@ -97,7 +97,7 @@ export class Chart {
 
   #options() {
     const axis = { stroke: colour("muted"), grid: { stroke: colour("grid"), width: 1 }, ticks: { show: false } };
-    const value = (_, raw) => `${number(raw, this.digits)} ${this.unit}`;
+    const value = (_, raw) => `${number(raw, raw < 100 ? this.digits : 0)} ${this.unit}`;
     return {
       ...this.#size(),
       scales: { x: { time: false }, y: { range: (_, low, high) => [Math.min(0, low), high > 0 ? high * 1.08 : 1] } },

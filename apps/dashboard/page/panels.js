@@ -1,7 +1,7 @@
 // Figures as text and tables. Rule: no speed is written without the avatar's error beside it.
 
 import { CAUSES, CAUSE_MEANINGS } from "./slices.js";
-import { byId, bytes, clock, DASH, element, isNumber, ms, number, percent, setRows, setText, words } from "./text.js";
+import { byId, bytes, clock, DASH, element, isNumber, ms, number, percent, setRows, setText, short, words } from "./text.js";
 
 const MOST_NOTES = 200;
 const BYTES = ["read", "written", "uploaded", "read_back", "least"];
@@ -38,7 +38,7 @@ export function showSpeed(figures, accuracy) {
   ]) {
     const times = figures[key]?.samples ? figures[key] : {};
     setText(byId(id), ms(times.p50));
-    const rest = ["p90", "p95", "p99"].map((name) => `${name} ${number(times[name])}`).join(" · ");
+    const rest = ["p90", "p95", "p99"].map((name) => `${name} ${short(times[name])}`).join(" · ");
     setText(byId(`${id}-rest`), `p50; ${rest} ms, of ${number(times.samples, 0)}`);
   }
   setText(byId("run-time"), isNumber(figures.run_s) ? `in ${clock(1000 * figures.run_s)} of the run` : "");

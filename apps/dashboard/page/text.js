@@ -10,8 +10,13 @@ export function number(value, digits = 1) {
   return isNumber(value) ? value.toFixed(digits) : DASH;
 }
 
+// Three digits or so.
+export function short(value) {
+  return number(value, value < 100 ? 1 : 0);
+}
+
 export function ms(value) {
-  return isNumber(value) ? `${value.toFixed(value < 100 ? 1 : 0)} ms` : DASH;
+  return isNumber(value) ? `${short(value)} ms` : DASH;
 }
 
 export function percent(share) {
