@@ -13,7 +13,7 @@ import typer
 
 from trilane.apps.cli.commands import Commands, given
 from trilane.apps.cli.console import print_json, spinner, stderr_console, stdout_console
-from trilane.apps.cli.explain_run import MOST_SLOWEST, SLOWEST, explain_folder, is_run, refuse_options
+from trilane.apps.cli.explain_run import MOST_SLOWEST, SLOWEST, explain_folder, refuse_options, run_folder
 from trilane.apps.cli.options import (
     PROFILE_HELP,
     CameraOption,
@@ -88,10 +88,10 @@ def explain(
     With a run folder instead: which stage or wait bounded the frame time, why jobs waited, and why the slowest frames
     were slow (docs/explain.md).
     """
-    of_a_run = is_run(scene)
-    refuse_options(given(ctx), of_a_run=of_a_run)
-    if of_a_run:
-        explain_folder(Path(scene), slowest, jobs, json)
+    folder = run_folder(scene)
+    refuse_options(given(ctx), of_a_run=folder is not None)
+    if folder is not None:
+        explain_folder(folder, slowest, jobs, json)
         return
     from trilane.apps.explanation import explain as explained
     from trilane.apps.plan_picture import draw_plan

@@ -28,12 +28,20 @@ READ_SO = (
 )
 
 
-def is_run(name: str) -> bool:
-    """Whether `trilane explain NAME` means a run folder, and no scene."""
+def run_folder(name: str) -> Path | None:
+    """The run folder that `trilane explain NAME` means, also of a run that still goes on; None: a scene is meant."""
+    from trilane.apps.followed_run import follow
     from trilane.pipeline.journal import NAME
 
     folder = Path(name)
-    return any((folder / file).is_file() for file in ("report.json", NAME))
+    if any((folder / file).is_file() for file in ("report.json", NAME)):
+        return folder
+    if folder.exists() or len(folder.parts) == 1:
+        return None
+    try:
+        return follow(folder).folder
+    except BadInputError:  # the scene's own message names what was expected
+        return None
 
 
 def refuse_options(typed: set[str], *, of_a_run: bool) -> None:

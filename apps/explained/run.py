@@ -1,7 +1,7 @@
 """`trilane explain RUN`: where the time of a run went, as a document; the figures come from its journal and its report.
 
-Rule: everything is computed from the journal in one reading, in memory that does not grow with the run; the report adds
-what a journal does not know: the units' cores and the avatars' error.
+Rule: everything is computed from the journal in one reading, in memory that does not grow with the run, whether or not
+the run still goes on; the report of one that has ended says how it ended.
 """
 
 from __future__ import annotations
@@ -52,12 +52,12 @@ def open_journal(folder: Path) -> tuple[Begun, Iterator[Record]]:
 class Explanation:
     """Takes the records of a journal after the first; `document` is what follows from them.
 
-    `begun`: the journal's first record. `report`: of the run, None where there is none. `slowest`: frames to name.
+    `begun`: the journal's first record. `report`: of the run, None while it goes on. `slowest`: frames to name.
     """
 
     def __init__(self, begun: Begun, report: Report | None, slowest: int) -> None:
-        units = report.units if report is not None else {}
-        cores = {unit: shares.cores for unit, shares in units.items() if shares.cores}
+        config = _config(begun)
+        cores = {unit: own["cores"] for unit, own in config.get("units", {}).items() if own.get("cores")}
         self._begun, self._report, self._cores = begun, report, cores
         self._explainer = Waits(begun.graph)
         self._paths = Paths(begun.graph, begun.settings, self._explainer.downs)
@@ -99,7 +99,7 @@ class Explanation:
         return {
             "schema": SCHEMA,
             "clock": clock,
-            **self._of_report(),
+            **self._of_run(),
             "frames": self._frames,
             "frame_ms": (self._last_ns - self._first_ns) / intervals / NS_PER_MS if self._frames > 1 else None,
             "budget": rows,
@@ -119,15 +119,16 @@ class Explanation:
             },
         }
 
-    def _of_report(self) -> dict[str, Any]:
-        report = self._report
+    def _of_run(self) -> dict[str, Any]:
+        """What the run said of itself before its first frame, and of its end."""
+        facts, report = self._begun.facts, self._report
         return {
-            "scene": report.config["scene"]["name"] if report is not None else None,
+            "scene": _config(self._begun).get("scene", {}).get("name"),
             "policy": self._begun.settings.policy,
             "edges": list(self._begun.graph.edges),
-            "accuracy": report.accuracy if report is not None else {},
-            "interrupted": report.interrupted if report is not None else None,
-            "failure": report.failure if report is not None else None,
+            "accuracy": facts.get("accuracy", {}),
+            "interrupted": None if report is None else report.interrupted,
+            "failure": None if report is None else report.failure,
         }
 
     def _shared(self, stage: str, taken: Taken) -> dict[str, Any]:
@@ -156,6 +157,16 @@ def explain_run(folder: Path, slowest: int = 10) -> dict[str, Any]:
     for record in records:
         explanation.add(record)
     return {"run": str(folder), **explanation.document()}
+
+
+def _config(begun: Begun) -> Mapping[str, Any]:
+    """The configuration that a journal begins with; empty for one that does not know it."""
+    config = begun.facts.get("config", {})
+    if not isinstance(config, Mapping) or not all(
+        isinstance(config.get(key, {}), Mapping) for key in ("units", "scene")
+    ):
+        raise BadInputError("the journal: facts", "a configuration of another form", "that of a run")
+    return config
 
 
 def _budget_rows(budget: Mapping[Part, int], unit_of: Mapping[str, str], intervals: int) -> list[dict[str, Any]]:

@@ -11,9 +11,10 @@ unit is `unknown` there.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any, Final, NamedTuple
 
+from trilane.errors import BadInputError
 from trilane.pipeline.journal import Accounted, Record, Stepped, Worked
 from trilane.scheduler.accounts import NAMES
 from trilane.scheduler.events import Dispatch, Graph, Job, JobDone, JobFailed, Kill, UnitDied, UnitReady
@@ -131,12 +132,15 @@ class _Unit:
 class Waits:
     """Takes the records of a journal in order; `add` gives back the job that a record ends, with its wait explained.
 
+    `add` raises BadInputError for a unit or a stage that the graph lacks.
+
     `graph`: of the run. `kept`: jobs and changes of each unit that are remembered.
     `downs`: the last times in which a unit was down after its start, in the order of their ends.
     """
 
     def __init__(self, graph: Graph, kept: int = KEPT) -> None:
         self._kept = kept
+        self._stages = tuple(stage.name for stage in graph.stages)
         self.downs: deque[Down] = deque(maxlen=kept)
         self._units = {unit: _Unit(kept) for unit in graph.units}
         self._handed: dict[int, _Handed] = {}
@@ -147,12 +151,16 @@ class Waits:
         if isinstance(record, Stepped):
             self._step(record)
         elif isinstance(record, Accounted):
-            unit = self._units[record.unit]
+            unit = self._unit(record.unit)
             unit.account = record.account
             unit.note(record.now_ns)
         elif isinstance(record, Worked):
             return self._explain(record)
         return None
+
+    def _unit(self, name: str) -> _Unit:
+        _check(name, self._units, "unit")
+        return self._units[name]
 
     def _step(self, step: Stepped) -> None:
         now_ns, events, actions = step
@@ -185,7 +193,7 @@ class Waits:
         return [key]
 
     def _rise(self, name: str, now_ns: int) -> None:
-        unit = self._units[name]
+        unit = self._unit(name)
         if unit.down_ns is not None:
             self.downs.append(Down(name, unit.down_ns, now_ns))
         unit.is_up, unit.down_ns = True, None
@@ -193,13 +201,14 @@ class Waits:
 
     def _fall(self, name: str, now_ns: int) -> None:
         own = [handed for handed in self._handed.values() if handed.job.unit == name]
-        self._units[name].fall(now_ns, min((handed.dispatch_ns for handed in own), default=None))
+        self._unit(name).fall(now_ns, min((handed.dispatch_ns for handed in own), default=None))
         for handed in own:
             del self._handed[handed.job.id]
 
     def _explain(self, worked: Worked) -> ExplainedJob:
         job = worked.job
-        unit = self._units[job.unit]
+        unit = self._unit(job.unit)
+        _check(job.stage, self._stages, "stage")
         handed, done = self._ended.pop((job.stage, job.frame), (None, None))
         heard_ns = handed.heard_ns if handed is not None else 0
         others = list(unit.during(job.ready_ns, job.begin_ns))
@@ -209,6 +218,11 @@ class Waits:
         after, rung = (handed.after, handed.job.rung) if handed is not None else ((), 0)
         sampled_ns, skips = (done.t_sampled_ns, done.skips) if done is not None else (0, False)
         return ExplainedJob(job, worked.figures, waits_ns, behind, after, sampled_ns, rung, skips)
+
+
+def _check(name: str, names: Collection[str], kind: str) -> None:
+    if name not in names:
+        raise BadInputError("the journal", f"{kind} {name!r}", f"one of its header: {', '.join(names)}")
 
 
 def _limit(kept: dict[Any, Any], most: int) -> None:

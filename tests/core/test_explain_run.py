@@ -18,8 +18,9 @@ from trilane.apps.explained.run import explain_run
 from trilane.apps.explained.slow_frames import MOST_SAMPLES, Sample
 from trilane.errors import BadInputError, MissingPartError
 from trilane.hw_profiles.application import application_graph
-from trilane.pipeline.journal import NAME
-from trilane.scheduler.events import Settings
+from trilane.pipeline.journal import NAME, Accounted, Begun, JournalWriter, Record, Stepped, Worked
+from trilane.scheduler.events import Settings, UnitDied
+from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.virtual import Simulation, simulate
 from trilane.testing.run_folders import write_run
 
@@ -196,11 +197,42 @@ def test_what_is_refused_of_a_scene(command: Command) -> None:
     assert "--slowest with a scene" in command("explain", "default", "--slowest", 3, code=2)[1]
 
 
-def test_a_run_without_a_journal_or_a_report(folder: Path, tmp_path: Path) -> None:
+def test_a_run_that_goes_on_is_explained_so_far(folder: Path, tmp_path: Path, command: Command) -> None:
+    """It is asked for by the name that it will have; its journal ends within a record."""
     (folder / "report.json").unlink()
-    found = explain_run(folder)
-    assert (found["scene"], found["shared_cores"][0]["taken_ms"], found["accuracy"]) == (None, {}, {})
+    journal = folder / NAME
+    journal.write_bytes(journal.read_bytes()[: journal.stat().st_size // 2])
+    found = explain_run(folder.rename(tmp_path / "run.77.partial"))
+    assert (found["scene"], found["interrupted"]) == ("test", None)
+    assert 10 < found["frames"] < 39
+    out, _ = command("explain", tmp_path / "run", "--json")
+    assert json.loads(out) == json.loads(json.dumps(found))
+
+
+@pytest.mark.parametrize(
+    ("record", "found"),
+    [
+        (Accounted(9, "npu", 1), "unit 'npu'"),
+        (Worked(JobRecord("own", "cpu", 0, 0, 0, 0, 1), {}), "stage 'own'"),
+        (Stepped(9, (UnitDied("npu"),), ()), "unit 'npu'"),
+        (None, "facts"),
+    ],
+)
+def test_a_journal_that_contradicts_itself_is_refused(
+    tmp_path: Path, record: Record | None, found: str, command: Command
+) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    with JournalWriter(folder / NAME) as journal:
+        journal.add(Begun(1, application_graph(), Settings(3), {} if record is not None else {"config": [1]}))
+        if record is not None:
+            journal.add(record)
+    assert found in command("explain", folder, code=2)[1]
+
+
+def test_a_folder_without_a_journal_is_refused(folder: Path, tmp_path: Path, command: Command) -> None:
     (folder / NAME).unlink()
+    assert f"no {NAME}" in command("explain", folder, code=2)[1]
     with pytest.raises(BadInputError, match=f"no {NAME}"):
         explain_run(folder)
     with pytest.raises(BadInputError, match="none"):

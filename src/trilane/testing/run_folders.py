@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
 
 from trilane.pipeline.journal import NAME, JournalWriter, Worked, journal_of
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.virtual import Simulation
-from trilane.testing.run_report import SHARE, make_report
+from trilane.testing.run_report import make_report
 
 
 def write_run(
@@ -29,10 +28,12 @@ def write_run(
     """
     assert run.recording is not None
     folder.mkdir()
+    report = make_report()
+    units = {unit: {"cores": list(own)} for unit, own in (cores or {}).items()}
+    facts = {"clock": clock, "accuracy": report["accuracy"], "config": {**report["config"], "units": units}}
     with JournalWriter(folder / NAME) as journal:
-        for record in journal_of(run.recording, run.jobs if jobs is None else jobs, {"clock": clock}, run.report):
+        for record in journal_of(run.recording, run.jobs if jobs is None else jobs, facts, run.report):
             of_stage = (figures or {}).get(record.job.stage, {}) if isinstance(record, Worked) else {}
             journal.add(record._replace(figures=of_stage) if isinstance(record, Worked) else record)
-    units: dict[str, Any] = {unit: {**SHARE, "cores": list(own)} for unit, own in (cores or {}).items()}
-    (folder / "report.json").write_text(json.dumps(make_report(units=units)), encoding="utf-8")
+    (folder / "report.json").write_text(json.dumps(report), encoding="utf-8")
     return folder
