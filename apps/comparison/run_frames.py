@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trilane.apps.comparison.difference import Series
+from trilane.apps.comparison.difference import MOST_FRAMES, Series
 from trilane.arrays import F64, I64
 from trilane.errors import BadInputError
 from trilane.pipeline.journal import Accounted, Begun, Ended, Record, Stepped, Worked, read_journal
@@ -26,6 +26,8 @@ NS_PER_MS = 1e6
 STATES = (BUSY, *CAUSES)
 #: Figures that stages report of their jobs, and the measures that they are here.
 MOVED = {f"bytes_{name}": f"bytes {name.replace('_', ' ')}" for name in ("read", "written", "uploaded", "read_back")}
+#: Frames that may have been begun before the first of which all is kept.
+IN_FLIGHT = 100
 OVERHEAD, PREEMPTED = "overhead", "preempted"
 
 
@@ -115,9 +117,21 @@ class _Story:
     def _work(self, record: Worked) -> None:
         self.jobs.append(record.job)
         self._cutter.job(record.job)
+        most = (MOST_FRAMES + IN_FLIGHT) * len(self.graph.stages)
+        if len(self.jobs) >= 2 * most:
+            self._forget(self.jobs[-most])
         for name, value in record.figures.items():
             if name in MOVED:
                 self.figures[Key(MOVED[name], record.job.stage)].append((record.job.frame, value))
+
+    def _forget(self, first: JobRecord) -> None:
+        """What was before the job `first`, so that of a run of days no more is kept than of its last frames."""
+        self.jobs = self.jobs[self.jobs.index(first) :]
+        oldest = min(job.frame for job in self.jobs)
+        self._idle = [piece for piece in self._idle if piece.end_ns >= first.begin_ns]
+        self.sampled_ns = {frame: ns for frame, ns in self.sampled_ns.items() if frame >= oldest}
+        for key, rows in self.figures.items():
+            self.figures[key] = [row for row in rows if row[0] >= oldest]
 
 
 def _plain(frames: I64, ns: I64) -> Series:

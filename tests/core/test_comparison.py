@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from trilane.apps.cli import main as cli
+from trilane.apps.comparison import run_frames
 from trilane.apps.comparison.compared import Comparison, compare, document
 from trilane.apps.comparison.configuration import Change, changes
 from trilane.apps.comparison.noise import Noise, noise_between, remarks
@@ -64,6 +65,19 @@ def test_series_of_frames_are_those_of_the_report() -> None:
         assert sum(ms.values()) == pytest.approx(series[Key("frame time")].values.sum(), rel=1e-9)
         assert ms["busy"] / sum(ms.values()) == pytest.approx(row["busy"], abs=0.02)
         assert ms["starved"] / sum(ms.values()) == pytest.approx(row["idle"]["starved"], abs=0.02)
+
+
+def test_of_a_long_run_the_last_frames_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    run = simulated(3, frames=120)
+    whole = told(run).frames
+    monkeypatch.setattr(run_frames, "MOST_FRAMES", 20)
+    monkeypatch.setattr(run_frames, "IN_FLIGHT", 10)
+    last = told(run).frames
+    assert whole is not None and last is not None and whole.series.keys() == last.series.keys()
+    for key, series in last.series.items():
+        assert 20 <= len(series.values) < 70
+        assert series.frames[-20:].tolist() == whole.series[key].frames[-20:].tolist()
+        assert series.values[-20:] == pytest.approx(whole.series[key].values[-20:], abs=1e-9)
 
 
 def test_runs_of_one_kind_do_not_differ() -> None:
