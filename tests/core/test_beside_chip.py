@@ -25,6 +25,7 @@ from trilane.hw_profiles.load import load_profile
 from trilane.hw_profiles.network_work import Network, count_work
 from trilane.hw_profiles.performance_profiles import corners_of
 from trilane.hw_profiles.reference_networks import NetworkSpec, reference_network
+from trilane.testing.trace_reading import read_trace
 from trilane.units import SUSTAINED
 
 CHIP = load_profile("snapdragon-888")
@@ -394,3 +395,24 @@ def test_two_networks_as_a_table_and_as_json(
         ("add (2)", "network", "gpu"),
     ]
     assert np.isclose(answer["units"]["dsp"]["by_pipeline"]["add (1)"], answer["units"]["dsp"]["busy"])
+
+
+def test_the_trace_of_pipelines_beside_each_other_has_the_shares_of_the_answer(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, command: Callable[..., tuple[str, str]]
+) -> None:
+    """Each is a group of tracks; the time in which its units work is what the answer says of it."""
+    two = [avatar(), bare("gpu", fps=30.0, side=64)]
+    monkeypatch.setattr(sources, "tenants", lambda *_: two)
+    file = tmp_path / "both.pftrace"
+    out, _ = command("predict", "any", "--beside", "other@2", "--trace", file, "--json")
+    answer, trace = json.loads(out), read_trace(file.read_bytes())
+    for row in answer["pipelines"]:
+        (run,) = trace.of(f"{row['name']}, virtual clock/run")
+        assert run.notes["config"]["turns"] == "round-robin"
+        for unit, share in row["units"].items():
+            busy_ns = sum(
+                one.end_ns - one.begin_ns - one.notes.get("preempted_ns", 0)
+                for one in trace.of(f"{row['name']}, virtual clock/{unit}")
+                if one.flows
+            )
+            assert busy_ns / (run.end_ns - run.begin_ns) == pytest.approx(share["busy"], abs=1e-9)
