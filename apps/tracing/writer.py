@@ -61,7 +61,6 @@ class RunTracks:
             case Said():
                 self._sink.instant(self._messages, record.now_ns, record.text)
             case Ended():
-                self._count()
                 self._end_ns = record.now_ns
 
     def close(self) -> None:

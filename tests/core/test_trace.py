@@ -107,6 +107,10 @@ RUNS: dict[str, dict[str, Any]] = {
     "triple": {"graph": application_graph("triple")},
     "orphan": {"graph": application_graph("orphan:4")},
     "deaths": {"faults": [(150 * MS, "dsp"), (310 * MS, "gpu"), (311 * MS, "cpu")]},
+    "deaths of the first": {
+        "faults": [(MS // 2, "cpu"), *((at * MS, "cpu") for at in range(60, 900, 37))],
+        "max_failures": 99,
+    },
     "gives up": {"faults": [(at * MS, "dsp") for at in range(100, 90_000, 10)], "max_failures": 2},
     "bypass and drops": {
         "graph": with_bypass("triple"),
@@ -226,7 +230,7 @@ BY_HAND: tuple[Record, ...] = (
         JobRecord("a", "u", 1, 10 * MS + 5, 10 * MS + 5, 10 * MS + 9, 11 * MS), {"bytes_read": 64, "instructions": 8.5}
     ),
     Stepped(16 * MS, (JobDone("v", 1, 3 * MS, 15 * MS, 0, 0, 0, 600),), ()),
-    Worked(JobRecord("b", "v", 0, 2 * MS - 3, 2 * MS, 3 * MS, 15 * MS, 0, 0, 600), {}),
+    Worked(JobRecord("b", "v", 0, MS, 2 * MS, 3 * MS, 15 * MS, 0, 0, 600), {}),
     Accounted(16 * MS, "v", BLOCKED),
     Stepped(20 * MS, (UnitDied("v"),), (Finish(Outcome(OutcomeKind.GAVE_UP, "v")),)),
     Counted(20 * MS, {"gave_up:v": 1}, {}),
@@ -255,7 +259,7 @@ def test_a_run_written_by_hand_track_by_track() -> None:
     assert seen("v") == [
         ("starved", 5, 2 * MS, {}, ()),
         ("overhead", 2 * MS, 3 * MS, {"preempted_ns": 600}, ()),
-        ("b", 3 * MS, 15 * MS, {"frame": 0, "wait_us": 1000}, (1,)),
+        ("b", 3 * MS, 15 * MS, {"frame": 0, "wait_us": 2000}, (1,)),
         ("overhead", 15 * MS, 16 * MS, {}, ()),
         ("blocked", 16 * MS, 20 * MS, {}, ()),
     ]
@@ -358,9 +362,9 @@ def test_several_pipelines_are_groups_of_their_own() -> None:
     assert {flow >> 40 for flow in flows} == {0, 1}
 
 
-def endless(frames: int) -> Iterator[Record]:
+def endless(frames: int, **settings: int) -> Iterator[Record]:
     """A journal of two stages that take 5 ms each in turns, record by record."""
-    yield Begun(SCHEMA, chain((("a", "u"), ("b", "v")), "double", "b"), Settings(frames), FACTS)
+    yield Begun(SCHEMA, chain((("a", "u"), ("b", "v")), "double", "b"), Settings(frames, **settings), FACTS)
     yield Stepped(0, (UnitReady("u"), UnitReady("v")), ())
     for frame in range(frames):
         at_ns, number = frame * 10 * MS, 2 * frame
@@ -423,6 +427,12 @@ def test_ten_minutes_are_less_than_50_mb() -> None:
         assert PLAIN_BYTES + (ten_minutes - PLAIN_BYTES / plain) * packed < 50e6
 
 
+@pytest.mark.parametrize(("deadline_ns", "late"), [(10 * MS, 0), (10 * MS - 1, 20)])
+def test_a_frame_that_is_done_at_its_deadline_is_in_time(deadline_ns: int, late: int) -> None:
+    trace = trace_of(endless(20, period_ns=10 * MS, deadline_ns=deadline_ns))
+    assert sum(one.name.startswith("late") for one in trace.of("Actual frames")) == late
+
+
 def test_a_block_that_is_packed_reads_like_a_plain_one() -> None:
     plain, packed = io.BytesIO(), io.BytesIO()
     write_tracks(PacketSink(plain), {"x": records_of(run_named("latest"))})
@@ -458,5 +468,7 @@ def test_lanes_are_used_again_and_few() -> None:
         (1, 16),
     ]
     assert lanes.place(17, 30) == (1, 18)
+    three = Lanes(3)
+    assert [three.place(0, 10), three.place(5, 15), three.place(10, 20)] == [(0, 0), (1, 5), (0, 10)]
     assert lanes.place(17, 19) == (0, 19)
     assert lanes.place(30, 31) == (0, 30)
