@@ -123,11 +123,18 @@ class RealtimeClock:
             elif isinstance(action, Start):
                 self._start(action.unit)
 
-    def ended(self) -> list[Worked]:
-        """Book the jobs that have ended since the last call; those whose frame was still there, with their times."""
-        found = []
+    @property
+    def waiting(self) -> int:
+        """How many jobs `ended` would tell of."""
+        return len(self._unbooked)
+
+    def ended(self) -> list[Worked | None]:
+        """Book the jobs that have ended since the last call; None for one whose frame was lost by then."""
+        found: list[Worked | None] = []
         for job, dispatch_ns, ready_ns, done in self._unbooked:
-            if ready_ns is not None:
+            if ready_ns is None:
+                found.append(None)
+            else:
                 lost = (done.preempted_ns, done.asleep_ns, done.preempted_before_ns)
                 times = (ready_ns, dispatch_ns, done.t_begin_ns, done.t_end_ns, *lost)
                 found.append(Worked(JobRecord(job.stage, job.unit, job.frame, *times), done.metrics))

@@ -76,11 +76,16 @@ class World:
         reported = {"mid": Counter({"visible": 40}), "none": Counter({"x": 1})}
         said = {"metrics": metrics, "reported": reported, "first": self.first}
 
-        def ended() -> list[Worked]:
-            found, driver.jobs[:] = [Worked(job, {"n": 1.0}) for job in driver.jobs], []
-            return found
+        class Clock(SimpleNamespace):
+            @property
+            def waiting(self) -> int:
+                return len(driver.jobs)
 
-        return SimpleNamespace(cpu=cpu, ended=ended, finish=lambda: self.steps.append("finish"), driver=driver, **said)
+            def ended(self) -> list[Worked]:
+                found, driver.jobs[:] = [Worked(job, {"n": 1.0}) for job in driver.jobs], []
+                return found
+
+        return Clock(cpu=cpu, finish=lambda: self.steps.append("finish"), driver=driver, **said)
 
     def run_loop(self, core: Any, clock: Any, recording: Any) -> Outcome:
         self.steps.append("loop")
