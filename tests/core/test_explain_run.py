@@ -15,7 +15,7 @@ import pytest
 from trilane.apps.explained.advice import advice
 from trilane.apps.explained.job_table import COLUMNS, write_jobs
 from trilane.apps.explained.run import explain_run
-from trilane.apps.explained.slow_frames import MOST_SAMPLES, Sample
+from trilane.apps.explained.slow_frames import MOST_SAMPLES, Sample, Shown, notes
 from trilane.errors import BadInputError, MissingPartError
 from trilane.hw_profiles.application import application_graph
 from trilane.pipeline.journal import NAME, Accounted, Begun, JournalWriter, Record, Stepped, Worked
@@ -96,6 +96,16 @@ def test_a_frame_that_skips_or_has_another_rung_says_so(tmp_path: Path) -> None:
     assert rows[1]["frame_ms"] == 4.0
 
 
+def test_what_was_unlike_the_frame_before_is_noted() -> None:
+    shown = Shown(7, 100, 3, 50, None, {}, {}, {}, rung=2, rung_before=0, skips=True, skipped_before=False)
+    assert notes(shown) == [
+        "frames 4 to 6 before it were dropped or lost",
+        "its work changed from rung 0 to 2",
+        "it took the bypass",
+    ]
+    assert notes(shown._replace(before=5, rung=0, skips=False)) == ["frame 6 before it was dropped or lost"]
+
+
 def test_dropped_frames_and_late_input_are_named(tmp_path: Path) -> None:
     """A frame every 10 ms; infer of frame 5 takes 200 ms, so that frames are dropped behind it."""
     settings = Settings(40, "latest", period_ns=10 * MS, deadline_ns=30 * MS)
@@ -154,6 +164,7 @@ def test_jobs_as_csv_are_those_of_the_run(folder: Path, command: Command) -> Non
         ("composite", "", ""),
         ("present", "", ""),
     }
+    assert {row["skips"] for row in rows} == {"0"}
     for row in rows:
         assert int(row["wait_ns"]) == int(row["begin_ns"]) - int(row["ready_ns"]) >= int(row["wait_cause_ns"])
         assert (row["wait_cause"] == "") == (row["wait_ns"] == "0")

@@ -104,6 +104,28 @@ def test_a_restart_is_part_of_the_path() -> None:
     assert found["down", "infer"] == pytest.approx(7000, abs=100)
 
 
+def test_a_unit_that_is_down_is_told_from_a_late_release() -> None:
+    """Frames that were released while the dsp was down were dropped; the frame after them was released in time."""
+    settings = Settings(60, "deadline", period_ns=200, deadline_ns=600)
+    _, budget, shown = walked(simulated(settings, faults=[(1000, "dsp")], restart_ns=4000))
+    found = budget.close()
+    assert found["down", "infer"] == pytest.approx(4000, abs=400)
+    assert sum(found.values()) == shown[-1].job.end_ns - shown[0].job.end_ns
+
+
+def test_late_latching_is_held_and_no_overhead() -> None:
+    """draw waits so that its frames are new; every fifth takes 100 ns more than is expected, and is waited for."""
+
+    def service(stage: str, _unit: str, frame: int, _begin_ns: int) -> int:
+        return TIMES[stage] + (100 if stage == "draw" and frame % 5 == 4 else 0)
+
+    run = simulate(GRAPH, Settings(60, latch_ns=5), service, keep=True)
+    _, budget, _ = walked(run)
+    found = budget.close()
+    assert found["held", "draw"] > 0
+    assert ("overhead", "draw") not in found
+
+
 def test_a_frame_is_bounded_by_its_own_way_since_the_frame_before() -> None:
     """infer of frame 7 takes 500 instead of 50: so do the ends of frames 6 and 7, but for show."""
 

@@ -126,6 +126,53 @@ def test_a_job_that_is_lost_with_its_process_and_the_restart_are_told_apart() ->
     assert list(waits.downs) == [Down("dsp", 400, 900)]
 
 
+def test_time_without_a_core_is_counted_once() -> None:
+    """Handed over at 110; 10 ns until another job from 120 to 200, 30 ns after it; 25 ns without a core in all."""
+    found = explained(
+        *before_infer((110, ASSIGNED)),
+        Stepped(110, (), (job(9, "infer", "dsp", 9),)),
+        Stepped(201, (JobDone("dsp", 9, 120, 200, 0),), ()),
+        Worked(JobRecord("infer", "dsp", 9, 110, 110, 120, 200), {}),
+        *infer(100, 110, 230, preempted_before_ns=25),
+    )[-1]
+    assert found.waits_ns == {"overhead": 10 + 40 - 25, "preempted": 25, "busy": 80}
+
+
+def test_input_that_comes_while_the_unit_is_down_waits_for_the_unit() -> None:
+    """The dsp is down from 50 to 900; draw of frame 0 ends at 100, of which the scheduler hears at 110."""
+    found = explained(
+        Stepped(50, (UnitDied("dsp"),), ()),
+        *before_infer(),
+        Stepped(900, (UnitReady("dsp"),), ()),
+        *infer(100, 900, 905),
+    )[-1]
+    assert found.waits_ns == {"down": 800, "overhead": 5}
+
+
+def test_what_was_lost_began_after_the_last_job() -> None:
+    """Two jobs are handed over at 110; the first ends at 300, the second is lost with the process at 400."""
+    found = explained(
+        *before_infer((110, ASSIGNED)),
+        Stepped(110, (), (job(8, "infer", "dsp", 8), job(9, "infer", "dsp", 9))),
+        Stepped(301, (JobDone("dsp", 8, 110, 300, 0),), ()),
+        Worked(JobRecord("infer", "dsp", 8, 110, 110, 110, 300), {}),
+        Stepped(400, (UnitDied("dsp"),), ()),
+        Stepped(600, (UnitReady("dsp"),), ()),
+        *infer(100, 600, 600),
+    )[-1]
+    assert found.waits_ns == {"overhead": 10, "busy": 190, "lost": 100, "down": 200}
+
+
+def test_frames_that_never_come_to_an_end_are_forgotten() -> None:
+    """Their jobs are heard of, and lost before they are booked."""
+    waits = Waits(GRAPH, kept=10)
+    waits.add(UP)
+    for number in range(100):
+        waits.add(Stepped(number, (), (job(number, "draw", "gpu", number),)))
+        waits.add(Stepped(number, (JobDone("gpu", number, number, number, 0),), ()))
+    assert (len(waits._ended), len(waits._heard_ns), len(waits._handed)) == (10, 10, 0)
+
+
 def test_the_ends_that_were_heard_of_in_the_step_of_the_hand_over_are_kept() -> None:
     records = before_infer()
     records[1] = Stepped(110, (JobDone("gpu", 0, 20, 100, 20),), (job(1, "infer", "dsp", 0),))
