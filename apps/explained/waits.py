@@ -94,12 +94,11 @@ class _Unit:
             self.changes.append((now_ns, cause))
 
     def fall(self, now_ns: int, handed_ns: int | None) -> None:
-        """Its process is gone, and with it what it did since its last job, if it was handed one, at `handed_ns`."""
+        """Its process is gone, and with it what it did between jobs since `handed_ns`, when it was handed the first."""
         if handed_ns is not None and self.is_up:
-            since_ns = max(handed_ns, self.jobs[-1].end_ns if self.jobs else 0)
-            while self.changes and self.changes[-1][0] >= since_ns:
+            while self.changes and self.changes[-1][0] >= handed_ns:
                 self.changes.pop()
-            self.changes.append((since_ns, LOST))
+            self.changes.append((handed_ns, LOST))
         if self.is_up:
             self.down_ns = now_ns
         self.is_up = False
