@@ -24,6 +24,7 @@ COMMANDS = {
     "dashboard": ("trilane.apps.cli.dashboard", "Show a finished run in a browser."),
     "top": ("trilane.apps.cli.top", "Show the live figures of a run in a terminal."),
     "trace": ("trilane.apps.cli.trace", "Write the timeline of a run for Perfetto or Chrome."),
+    "report": ("trilane.apps.cli.report", "One page of many runs: what each speed costs in image error."),
     "compare": ("trilane.apps.cli.compare", "Say what differs between runs, by how much and why."),
     "explain": ("trilane.apps.cli.explain", "Explain the plan of a scene, or where the time of a run went."),
     "body": ("trilane.apps.cli.body", "Look into body files, pose them, build one."),

@@ -1,0 +1,101 @@
+"""Entries from folders: runs, sweeps, and folders of either.
+
+Rule: every file is opened with its size checked; what cannot be read is refused by name before anything is written.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from trilane.apps.overview.entry import Entry, entry_of
+from trilane.apps.report import MAX_REPORT_BYTES
+from trilane.errors import BadInputError
+from trilane.files import require_file
+
+REPORT, TRIALS, VIDEO = "report.json", "trials.jsonl", "video.mp4"
+EXPECTED = "a run folder, a sweep's folder, a prediction that was saved with --json, or a folder of these"
+MOST = 10_000
+
+
+def read_entries(places: Sequence[Path]) -> list[Entry]:
+    """The entries of all `places`, in their order. Raises BadInputError; so it does where there are none."""
+    entries: list[Entry] = []
+    for place in places:
+        before = len(entries)
+        for entry in _entries(place):
+            entries.append(entry)
+            if len(entries) > MOST:
+                raise BadInputError(place, f"more than {MOST} runs and trials", f"at most {MOST} for a page")
+        if len(entries) == before:
+            raise BadInputError(place, "no run and no trial", EXPECTED)
+    return entries
+
+
+def _entries(place: Path) -> Iterator[Entry]:
+    if place.is_file():
+        yield entry_of(place.stem, _document(place))
+    elif not place.is_dir():
+        raise BadInputError(place, "no such file or folder", EXPECTED)
+    elif (place / REPORT).is_file():
+        yield entry_of(place.name, _document(place / REPORT), place / VIDEO)
+    elif (place / TRIALS).is_file():
+        yield from _trials(place)
+    else:
+        for folder in sorted(path for path in place.iterdir() if path.is_dir() and path.suffix != ".partial"):
+            if (folder / REPORT).is_file() or (folder / TRIALS).is_file():
+                yield from _entries(folder)
+
+
+def _document(path: Path) -> Mapping[str, Any]:
+    size = require_file(path, EXPECTED)
+    if size > MAX_REPORT_BYTES:
+        raise BadInputError(path, f"{size} bytes", f"at most {MAX_REPORT_BYTES}")
+    return _parsed(path, path.read_text(encoding="utf-8", errors="replace"))
+
+
+def _parsed(where: Path | str, text: str) -> Mapping[str, Any]:
+    try:
+        document = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise BadInputError(where, str(error), EXPECTED) from None
+    if not isinstance(document, dict):
+        raise BadInputError(where, f"a {type(document).__name__}", EXPECTED)
+    return document
+
+
+def _trials(folder: Path) -> Iterator[Entry]:
+    """A trial a line; the last line of a sweep that was killed may be cut off, and is left out."""
+    path = folder / TRIALS
+    with path.open(encoding="utf-8", errors="replace") as lines:
+        for number, line in enumerate(lines, start=1):
+            if not line.endswith("\n"):
+                return
+            yield _trial(folder, _parsed(f"{path}, line {number}", line))
+
+
+def _trial(folder: Path, trial: Mapping[str, Any]) -> Entry:
+    result = trial.get("result")
+    document = dict(result) if isinstance(result, dict) else {}
+    options = trial.get("options")
+    document["config"] = {**_mapping(document.get("config")), **_mapping(options)}
+    document["made"] = {**_mapping(document.get("made")), "command": trial.get("command") or ()}
+    document.setdefault("clock", trial.get("clock", "host"))
+    document.setdefault("machine", trial.get("host"))
+    if trial.get("status") != "done":
+        document["failure"] = f"{trial.get('status')}, exit code {trial.get('exit_code')}"
+    return entry_of(str(trial.get("id")), document, _video(folder, trial.get("folder")))
+
+
+def _mapping(value: Any) -> dict[str, Any]:
+    return dict(value) if isinstance(value, dict) else {}
+
+
+def _video(folder: Path, name: Any) -> Path | None:
+    """The video of a trial's run folder, which has to lie inside the sweep's."""
+    if not isinstance(name, str):
+        return None
+    place = (folder / name).resolve()
+    return place / VIDEO if place.is_relative_to(folder.resolve()) else None

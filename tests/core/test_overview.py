@@ -1,0 +1,163 @@
+"""The overview of many runs: its frontier is the non-dominated set, its rows are what the documents say."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from trilane.apps.overview.entry import Entry, entry_of, varied
+from trilane.apps.overview.frontier import frontier
+from trilane.apps.overview.page import page
+from trilane.apps.overview.scatter import Dot, scatter
+from trilane.apps.overview.sources import read_entries
+from trilane.apps.overview.table_rows import columns, table_rows, write_csv, write_parquet
+from trilane.errors import BadInputError
+
+CPU = {"cpu": {"model": "<Chip>", "cores_allowed": [0, 1]}, "gl": {"renderer": "soft"}}
+REPORT: dict[str, Any] = {
+    "clock": "host",
+    "machine": CPU,
+    "made": {"command": ["trilane", "run"]},
+    "config": {"policy": "pipelined", "scene": {"size": "256", "fps": 30.0}, "units": {"cpu": {}}, "cuts": []},
+    "frame_time_ms": {"mean": 20.0, "mean_low": 19.0, "mean_high": 21.5},
+    "latency_ms": {"mean": 60.0},
+    "fps": 50.0,
+    "accuracy": {"a": {"psnr_db": 31.0, "source": "from A"}, "b": {"psnr_db": 30.0, "source": "from B"}},
+}
+
+scores = st.lists(
+    st.tuples(
+        st.one_of(st.none(), st.integers(1, 6)), st.one_of(st.none(), st.integers(20, 25)), st.sampled_from("ab")
+    ),
+    max_size=12,
+)
+
+
+@given(scores)
+def test_the_frontier_is_what_nobody_beats(rows: list[tuple[int | None, int | None, str]]) -> None:
+    """By comparing every pair."""
+
+    def beats(a: Any, b: Any) -> bool:
+        return a[2] == b[2] and a[0] <= b[0] and a[1] >= b[1] and a[:2] != b[:2]
+
+    known = [row for row in rows if None not in row]
+    expected = [None not in row and not any(beats(other, row) for other in known) for row in rows]
+    entries = [SimpleNamespace(frame_ms=ms, psnr_db=db, group=group) for ms, db, group in rows]
+    assert frontier(entries) == expected
+
+
+def test_a_report_becomes_a_row() -> None:
+    entry = entry_of("r", REPORT)
+    assert (entry.frame_ms, entry.low_ms, entry.high_ms, entry.frames_per_s, entry.latency_ms) == (20, 19, 21.5, 50, 60)
+    assert (entry.psnr_db, entry.error_source) == (30.0, "from B")
+    assert entry.settings == {"policy": "pipelined", "scene.size": "256", "scene.fps": "30"}
+    assert entry.machine == "<Chip>, 2 cores, soft"
+    assert (entry.command, entry.speed_source) == (("trilane", "run"), "measured in this run")
+
+
+@pytest.mark.parametrize(
+    ("change", "psnr_db", "source"),
+    [
+        ({"check": {"psnr_db": 28.5, "frames": 4}}, 28.5, "measured in this run, 4 frames"),
+        ({"accuracy": {}}, None, "no figures"),
+        ({"accuracy": {"a": {"psnr_db": 31.0}, "b": {"why": "changed"}}}, None, "no figures: changed"),
+    ],
+)
+def test_an_error_says_where_it_comes_from(change: dict[str, Any], psnr_db: float | None, source: str) -> None:
+    entry = entry_of("r", REPORT | change)
+    assert (entry.psnr_db, entry.error_source) == (psnr_db, source)
+
+
+def test_a_prediction_is_computed() -> None:
+    document = {
+        "clock": "virtual",
+        "machine": {"title": "A phone"},
+        "frame_time_ms": {"mean": 9.0, "low": 8, "high": 11},
+    }
+    entry = entry_of("p", document)
+    assert (entry.machine, entry.low_ms, entry.high_ms, entry.speed_source) == ("A phone", 8.0, 11.0, "computed")
+
+
+def test_only_what_differs_is_a_column() -> None:
+    one, two = entry_of("1", REPORT), entry_of("2", REPORT | {"config": {"policy": "latest", "encoder": "resnet18"}})
+    assert varied([one, two]) == ["policy"]
+    assert columns([one, two])[:2] == ["name", "policy"]
+    assert [row["policy"] for row in table_rows([one, two])] == ["pipelined", "latest"]
+
+
+def _sweep(folder: Path) -> Path:
+    folder.mkdir()
+    trial = {"id": "ab", "command": ["trilane", "run"], "options": {"size": "128"}, "status": "done", "result": REPORT}
+    lost = {"id": "cd", "status": "failed", "exit_code": 3, "options": {"size": "64"}, "folder": "../../etc"}
+    lines = [json.dumps(trial), json.dumps(lost), '{"id": "torn']
+    (folder / "trials.jsonl").write_text("\n".join(lines))
+    return folder
+
+
+def test_folders_of_runs_and_sweeps_are_read(tmp_path: Path) -> None:
+    run = tmp_path / "runs" / "one"
+    run.mkdir(parents=True)
+    (run / "report.json").write_text(json.dumps(REPORT))
+    (tmp_path / "runs" / "two.7.partial").mkdir()
+    entries = read_entries([tmp_path / "runs", _sweep(tmp_path / "sweep"), run / "report.json"])
+    assert [entry.name for entry in entries] == ["one", "ab", "cd", "report"]
+    assert (entries[1].settings["size"], entries[1].frame_ms) == ("128", 20.0)
+    assert (entries[2].failure, entries[2].frame_ms, entries[2].video) == ("failed, exit code 3", None, None)
+
+
+@pytest.mark.parametrize(
+    ("content", "found"), [("{", "column"), ("[1]", "a list"), ("[" * 100_000, "recursion"), ("", "empty")]
+)
+def test_what_is_no_document_is_named(tmp_path: Path, content: str, found: str) -> None:
+    (tmp_path / "report.json").write_text(content)
+    with pytest.raises(BadInputError, match=rf"report\.json.*{found}"):
+        read_entries([tmp_path])
+
+
+def test_a_folder_without_runs_is_refused(tmp_path: Path) -> None:
+    for place in (tmp_path, tmp_path / "none"):
+        with pytest.raises(BadInputError, match="a run folder"):
+            read_entries([place])
+
+
+def test_the_page_escapes_and_asks_nobody() -> None:
+    document = REPORT | {"made": {"command": ["trilane", "<script>alert(1)</script>"]}}
+    text = page("<b>title</b>", [entry_of("<i>", document), entry_of("two", REPORT | {"accuracy": {}})])
+    assert text.count("<script>") == 1
+    assert "<b>title" not in text
+    assert "<i>" not in text
+    assert "http:" not in text.replace("http://www.w3.org", "")
+    assert "https:" not in text
+    assert "1 of 2 have no speed or no known error" in text
+
+
+def test_a_dot_stands_where_its_numbers_say() -> None:
+    """Two dots: the axes reach a twentieth beyond them, so they stand at 1/22 and 21/22 of 640 by 336 pixels."""
+    drawn = scatter([Dot("a", 10.0, None, None, 30.0, True, 0), Dot("b", 20.0, 18.0, 20.0, 31.0, True, 0)], "x", "y")
+    assert '<circle class="g0" cx="93.1" cy="336.7" r="5"/>' in drawn
+    assert '<circle class="g0" cx="674.9" cy="31.3" r="5"/>' in drawn
+    assert '<line class="interval" x1="558.5" x2="674.9"' in drawn
+    assert '<path class="frontier g0" d="M93.1 336.7 H674.9 V31.3"/>' in drawn
+    assert scatter([], "x", "y") == ""
+
+
+def test_tables_have_the_same_rows(tmp_path: Path) -> None:
+    entries: list[Entry] = read_entries([_sweep(tmp_path / "sweep")])
+    write_csv(tmp_path / "t.csv", entries)
+    with (tmp_path / "t.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == columns(entries)
+    assert [(row["name"], row["frame_ms"], row["on_frontier"]) for row in rows] == [
+        ("ab", "20.0", "True"),
+        ("cd", "", "False"),
+    ]
+    parquet = pytest.importorskip("pyarrow.parquet")
+    write_parquet(tmp_path / "t.parquet", entries)
+    assert parquet.read_table(tmp_path / "t.parquet").to_pylist() == table_rows(entries)
