@@ -25,6 +25,7 @@ NEEDS_MORE = ("stages.dsp.openvino", "stages.dsp.quiet_openvino", "stages.dsp.qn
 CHANGING = {
     "hw_profiles.thermal_state.ThermalState",
     "hw_profiles.throttling.Throttle",
+    "pipeline.moved_bytes.ByteCounter",
     "scene.motion.bvh.BvhJoint",
     "scene.motion.bvh._Hierarchy",
     "scene.motion.bvh._Words",
