@@ -135,7 +135,7 @@ class DashboardApp:
         counts = self._refusals.as_json()
         while True:
             await asyncio.sleep(NEWS_S)
-            for message in await self._view.news():
+            for message in await self._view.news(is_watched=len(self._clients) > 0):
                 self._clients.tell(said(message))
             if counts != self._refusals.as_json():
                 counts = self._refusals.as_json()

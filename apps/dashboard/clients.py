@@ -63,7 +63,8 @@ class Client:
         while True:
             data = await self._queue.get()
             try:
-                await asyncio.wait_for(self._socket.send_bytes(data), SEND_S)
+                async with asyncio.timeout(SEND_S):  # wait_for of Python 3.11 may lose a cancellation
+                    await self._socket.send_bytes(data)
             except TimeoutError:
                 self._drop()
                 return

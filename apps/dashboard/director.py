@@ -12,7 +12,7 @@ from trilane.apps.asked_run import AskedRun, Prepared
 from trilane.apps.dashboard.channel import Asked, Message, Refused, RunBegins, StateIs
 from trilane.apps.dashboard.choices import choices_of, reasons_against
 from trilane.apps.dashboard.controls import NO_PROFILE, OF_A_NEW_RUN, controls_of_run
-from trilane.apps.dashboard.run_facts import facts_of_checked
+from trilane.apps.dashboard.known_runs import facts_of_checked
 from trilane.apps.followed_run import run_name
 from trilane.errors import TrilaneError
 from trilane.pipeline.controls import ALL, RunControls

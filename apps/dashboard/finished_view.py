@@ -17,8 +17,9 @@ import av
 import numpy as np
 
 from trilane.apps.dashboard.clients import Client
+from trilane.apps.dashboard.known_runs import facts_of_folder
 from trilane.apps.dashboard.meter import Meter
-from trilane.apps.dashboard.run_facts import RunFacts, facts_of_folder
+from trilane.apps.dashboard.run_facts import RunFacts
 from trilane.apps.dashboard.text_store import TextStore
 from trilane.apps.dashboard.time_table import TimeTable
 from trilane.apps.dashboard.timeline import Timeline, described, note, slices
@@ -157,7 +158,7 @@ class FinishedView:
         yield from (note(t_ms, text) for t_ms, text in run.notes)
         yield from self._moment(run.end_ms, FIRST_SPAN_MS)
 
-    async def news(self) -> Iterable[Message]:
+    async def news(self, *, is_watched: bool) -> Iterable[Message]:  # noqa: ARG002 - a view's signature
         return ()
 
     async def picture(self, client: Client) -> bytes | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final
@@ -31,12 +31,13 @@ from trilane.pipeline.journal import NAME, Begun, Record
 from trilane.transport.live_window import LiveWindow, Shown, Steering
 
 FIGURES_S: Final = 0.25
-PICTURE_S: Final = 1 / 30  # between two that are encoded
+PICTURE_S: Final = 1 / 20  # between two that are encoded
 MOST_RAISED_DEG: Final = 90.0
 MOST_JOBS: Final = 4000
 MOST_IDLE: Final = 4000
 MOST_NOTES: Final = 100
-RECORDS_AT_ONCE: Final = 500
+RECORDS_AT_ONCE: Final = 200
+READ_S: Final = 0.05  # of each look at the journal
 ASKED_A_SECOND: Final = 10
 ACCEPTED: Final = ""
 GOES_ON: Final = "a run that goes on has no other time than now"
@@ -83,7 +84,8 @@ class LiveView:
         self._course: Course | None = None
         self._state, self._why = "restarting", ""
         self._told: list[Message] = []
-        self._is_news = False
+        self._unread: Iterator[Record] = iter(())
+        self._is_news = self._is_behind = False
         self._figures_s = self._picture_s = 0.0
         self._jpeg: tuple[int, bytes] = (-1, b"")
         self._asked_s: deque[float] = deque(maxlen=ASKED_A_SECOND)
@@ -94,6 +96,7 @@ class LiveView:
             self._facts = RunFacts.of_row(message.facts)
             self._controls = {control.name: control for control in map(control_of, message.controls)}
             self._folder, self._followed, self._course = Path(message.folder), None, None
+            self._unread = iter(())
         elif isinstance(message, StateIs):
             self._state, self._why, self._is_news = message.state, message.why, True
         elif isinstance(message, Refused):
@@ -110,9 +113,13 @@ class LiveView:
             yield from course.notes
             yield course.meter.message(self._now_ns())
 
-    async def news(self) -> Iterable[Message]:
+    async def news(self, *, is_watched: bool) -> Iterable[Message]:
         await self._read_on()
         told, self._told = self._told, []
+        if not is_watched:
+            if self._course is not None:
+                self._course.fresh()
+            return ()
         if self._is_news and self._facts is not None:
             self._is_news = False
             told.append(self._stated(self._facts))
@@ -165,16 +172,20 @@ class LiveView:
         return None if folder is None else folder / "trace.pftrace"
 
     async def _read_on(self) -> None:
-        """Everything that the run has written since the last call, a little at a time."""
+        """What the run has written since the last call, as far as there is time for it."""
         if self._followed is None and self._folder is not None and (self._folder / NAME).is_file():
             self._followed = FollowedRun(self._folder)
         if self._followed is None:
             return
-        records = iter(self._followed.new())
-        while some := list(islice(records, RECORDS_AT_ONCE)):
-            for record in some:
+        until_s = time.monotonic() + READ_S
+        while records := list(islice(self._unread, RECORDS_AT_ONCE)):
+            for record in records:
                 self._add(record)
+            self._is_behind = time.monotonic() > until_s
+            if self._is_behind:
+                return
             await asyncio.sleep(0)
+        self._unread = self._followed.new()
 
     def _add(self, record: Record) -> None:
         if isinstance(record, Begun):
@@ -213,8 +224,8 @@ class LiveView:
         self._is_news = True
 
     def _now_ns(self) -> int | None:
-        """The time of the figures: now while the run goes on, else that of its end."""
-        return None if self._state in ("ended", "failed") else time.monotonic_ns()
+        """The time of the figures: now; None, which is the last record's, when the run is over or not read so far."""
+        return None if self._is_behind or self._state in ("ended", "failed") else time.monotonic_ns()
 
 
 def _jpeg(seen: Shown) -> bytes:

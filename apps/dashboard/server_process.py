@@ -18,7 +18,7 @@ from trilane.apps.dashboard.serve import server
 from trilane.transport.live_window import LiveWindow
 from trilane.unexpected_value import UnexpectedValue
 
-NICE: Final = 19
+NICE: Final = 10
 
 
 async def serve(listener: socket.socket, channel: Channel, window_fd: int) -> None:
@@ -30,6 +30,8 @@ async def serve(listener: socket.socket, channel: Channel, window_fd: int) -> No
     app = DashboardApp(view, listener.getsockname()[1], opened.token)
     answers = server(app.asgi)
     asyncio.get_running_loop().add_reader(channel.fd, _hear, channel, view, answers)
+    os.setpriority(os.PRIO_PROCESS, 0, NICE)  # what was imported until now had to be there at once
+    os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))  # it takes no core from a unit by waking up
     await answers.serve(sockets=[listener])
 
 
@@ -55,7 +57,6 @@ def _hear(channel: Channel, view: LiveView, answers: Any) -> None:
 def main() -> None:
     """Of `python -m trilane.apps.dashboard.server_process LISTENER CHANNEL WINDOW`."""
     listener_fd, channel_fd, window_fd = map(int, sys.argv[1:])
-    os.setpriority(os.PRIO_PROCESS, 0, NICE)
     channel = Channel(socket.socket(fileno=channel_fd))
     with socket.socket(fileno=listener_fd) as listener:
         try:

@@ -21,8 +21,8 @@ class View(Protocol):
     def greeting(self) -> Iterable[Message]:
         """What a client is told first: the hello, the state, and what happened lately."""
 
-    async def news(self) -> Iterable[Message]:
-        """What all clients are told: what happened since the last call."""
+    async def news(self, *, is_watched: bool) -> Iterable[Message]:
+        """What all clients are told: what happened since the last call; nothing when there are none to watch it."""
 
     async def picture(self, client: Client) -> bytes | None:
         """The newest picture, as `wire.shown` writes it, when `client` has not had it; notes that it has now."""

@@ -187,7 +187,7 @@ class DoubleView:
         else:
             yield figures(SPAN_MS)
 
-    async def news(self) -> list[dict[str, Any]]:
+    async def news(self, *, is_watched: bool) -> list[dict[str, Any]]:  # noqa: ARG002 - a view's signature
         """Slices since the last call, four figures a second."""
         if not self.is_live or self.state != "running":
             notes, self._notes = self._notes, []

@@ -1,0 +1,97 @@
+"""The facts of a run that begins, and of one that is over. Rule: what is not known is left out, nothing is guessed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from trilane.apps.dashboard.run_facts import RunFacts
+from trilane.apps.report import Report, config_facts, read_report
+from trilane.apps.run_job import Plan
+from trilane.pipeline.journal import Begun
+from trilane.stages.configure import Checked
+
+
+def config_in_force(config: Mapping[str, Any], performance_profile: str | None) -> dict[str, Any]:
+    """The value of each control that is set before a run. `config`: as in report.json."""
+    scene = config["scene"]
+    return {
+        "policy": config["policy"],
+        "edge": config["edge"],
+        "performance_profile": performance_profile or "none",
+        "size": scene["size"],
+        "runtime": config["runtime"],
+        "avatar": scene["avatars"][0]["bundle"],
+    }
+
+
+def machine_line(machine: Mapping[str, Any]) -> str:
+    """Processor and OpenGL driver in one line."""
+    cpu, driver = machine["cpu"], machine.get("gl")
+    cores = f"{len(cpu['cores_allowed'])} of {cpu['cores']} cores"
+    drawn = f", {driver['renderer']}" if driver else ""
+    return f"{cpu['model']}, {cores}{drawn}"
+
+
+def facts_of_checked(name: str, checked: Checked, plan: Plan, machine: Mapping[str, Any]) -> RunFacts:
+    """Of a run that begins."""
+    config = checked.config
+    scene = config.scene
+    said = config_facts(config, plan.policy, plan.edge)
+    return RunFacts(
+        name,
+        scene.name,
+        "host",
+        machine_line(machine),
+        scene.fps,
+        (scene.output.width, scene.output.height),
+        config_in_force(said, plan.performance_profile),
+        {"tensor_shapes": [list(shape) for shape in config.buckets], "notes": list(checked.notes)},
+        checked.placement,
+        checked.accuracy,
+    )
+
+
+def facts_of_report(name: str, report: Report) -> RunFacts:
+    """What the report of a finished run says."""
+    document = report.as_json()
+    scene = document["config"]["scene"]
+    caps = document["caps"]
+    return RunFacts(
+        name,
+        scene["name"],
+        report.clock,
+        machine_line(document["machine"]),
+        scene["fps"],
+        (scene["output"]["width"], scene["output"]["height"]),
+        config_in_force(document["config"], caps.get("performance_profile")),
+        {**document["plan"], "notes": document["notes"]},
+        document.get("placement"),
+        document["accuracy"],
+    )
+
+
+def facts_of_folder(folder: Path, begun: Begun) -> RunFacts:
+    """Of the run in `folder`: from its report, or, where it left none, what its journal begins with.
+
+    Raises BadInputError for a report that cannot be read.
+    """
+    if (folder / "report.json").is_file():
+        return facts_of_report(folder.name, read_report(folder))
+    facts = begun.facts
+    scene = (facts.get("config") or {}).get("scene") or {}
+    output = scene.get("output") or {}
+    machine = facts.get("machine")
+    return RunFacts(
+        folder.name,
+        scene.get("name", folder.name),
+        str(facts.get("clock", "host")),
+        machine_line(machine) if machine else "",
+        scene.get("fps", 30.0),
+        (output.get("width", 640), output.get("height", 480)),
+        {"policy": begun.settings.policy},
+        {},
+        None,
+        facts.get("accuracy") or {},
+    )
