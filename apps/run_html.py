@@ -43,14 +43,14 @@ def _run_rows(report: Report) -> Iterable[Row]:
     if frames.presented > 1:
         yield "frame time", f"{times.mean:.2f} ms ({_between(times.mean_low, times.mean_high)})", measured
         yield "rate", f"{report.fps:.1f} frames a second ({_between(report.fps_low, report.fps_high)})", measured
+    for name, facts in report.accuracy.items():
+        yield (f"error of {name}", *_error(facts))
     yield "latency", f"p50 {latency.p50:.1f} ms, p95 {latency.p95:.1f} ms", measured
     dropped = sum(frames.dropped.values())
     yield "frames", f"{frames.presented} presented, {frames.lost} lost, {dropped} dropped", measured
     for unit, shares in report.units.items():
         idle = ", ".join(f"{cause} {share:.0%}" for cause, share in shares.idle if share)
         yield unit, f"busy {shares.busy:.0%}; {idle}", measured
-    for name, facts in report.accuracy.items():
-        yield (f"error of {name}", *_error(facts))
     scene = report.config["scene"]
     yield "scene", f"{scene['name']}, tensor size {scene['size']}, {report.policy}, {report.edge}", ""
     yield "machine", report.machine.cpu.model, ""
