@@ -251,7 +251,7 @@ class _UnitState:
         self.is_up = False
         self.jobs: set[int] = set()
         self._cause = ""
-        self._begin_ns = self._cut_ns = 0
+        self._cut_ns = 0
 
     @property
     def cause(self) -> str:
@@ -272,11 +272,11 @@ class _UnitState:
         if cause != self._cause:
             if self._cause and now_ns > self._cut_ns:
                 yield IdleSlice(self.name, self._cause, self._cut_ns, now_ns)
-            self._cause, self._begin_ns, self._cut_ns = cause, now_ns, now_ns
+            self._cause, self._cut_ns = cause, now_ns
 
     def cut(self, job: JobRecord) -> Iterator[IdleSlice]:
         """The piece between the job before and this one; only of a slice of overhead, for in others it has no job."""
-        if self._cause == OVERHEAD and job.begin_ns >= self._begin_ns:
+        if self._cause == OVERHEAD:
             if job.begin_ns > self._cut_ns:
                 lost_ns = min(job.preempted_before_ns, job.begin_ns - self._cut_ns)
                 yield IdleSlice(self.name, OVERHEAD, self._cut_ns, job.begin_ns, lost_ns)
