@@ -7,6 +7,7 @@ order, the `Begun` when the writer is made.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
 from typing import IO, Any, Final
 
 from trilane.apps.tracing.chrome import ChromeSink
@@ -143,5 +144,5 @@ def _facts_of(begun: Begun) -> dict[str, Any]:
     """What is known of a run before its first frame, and the times of the clock are."""
     clocks = {"host": "CLOCK_MONOTONIC", "virtual": "simulated time from 0 on"}
     times = f"ns of {clocks.get(str(begun.facts.get('clock')), 'an unknown clock')}"
-    settings = {key: value for key, value in vars(begun.settings).items() if not isinstance(value, Sequence) or value}
+    settings = {key: value for key, value in asdict(begun.settings).items() if not isinstance(value, Sequence) or value}
     return {"times": times, **begun.facts, "scheduler": settings, "edges": list(begun.graph.edges)}
