@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -107,7 +108,11 @@ def test_sequential_beside_pipelined_names_the_starved_dsp() -> None:
     assert "unit dsp (infer) is starved 5" in found.verdict
     assert found.verdict.endswith(": one frame at a time under sequential")
     assert "takes" not in found.verdict
+    named = re.findall(r"(\d+) % of the time, was (\d+) %", found.verdict)
+    assert len(named) >= 2 and all(int(now) > int(before) for now, before in named)
     back = pair(found.other.runs[0], found.base.runs[0])
+    fewer = re.findall(r"(\d+) % of the time, was (\d+) %", back.verdict)
+    assert fewer and all(int(now) < int(before) for now, before in fewer)
     assert back.verdict.startswith("frame time -5") and "several frames at a time" in back.verdict
 
 
@@ -227,6 +232,20 @@ def test_bytes_that_a_stage_moves_are_named() -> None:
     run = simulated(1, frames=60)
     assert pair(moved(run, 1.0), moved(run, 1.5)).verdict == "raster bytes read +50 %"
     assert pair(moved(run, 1.0), moved(run, 1.0)).verdict == NO_DIFFERENCE
+
+
+def test_work_is_without_the_time_in_which_another_thread_had_the_core() -> None:
+    run = simulated(1, frames=60)
+    assert run.recording is not None
+    records = [
+        record._replace(job=record.job._replace(preempted_ns=1_500_000)) if isinstance(record, Worked) else record
+        for record in journal_of(run.recording, run.jobs, {}, run.report)
+    ]
+    frames = frames_of(records)
+    assert frames is not None
+    for stage in ("infer", "pose"):
+        service, work = (frames.series[Key(measure, stage)].values for measure in ("service", "work"))
+        assert service - work == pytest.approx(1.5)
 
 
 def test_drops_and_errors_are_named() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import erfc, log, sqrt
+from math import erfc, log, log10, sqrt
 
 import numpy as np
 import pytest
@@ -61,6 +61,21 @@ def test_blocks_are_as_long_as_the_series_remembers() -> None:
     assert lengths[0.0] < 4 < lengths[0.5] < lengths[0.9]
     assert lengths[0.5] == pytest.approx(13.9, rel=0.35)
     assert block_length(autoregressive(generator, 100, 0.99)) <= 30
+
+
+@pytest.mark.parametrize(("carried", "count"), [(0.3, 400), (0.7, 400), (0.5, 150)])
+def test_blocks_by_a_second_computation(carried: float, count: int) -> None:
+    """Politis and White (2004), section 3.2, value by value: the flat-top window is 1 up to half its width."""
+    values = autoregressive(np.random.default_rng(9), count, carried)
+    mean = sum(values) / count
+    lags = [sum((values[t] - mean) * (values[t + k] - mean) for t in range(count - k)) / count for k in range(60)]
+    limit, run = 2 * sqrt(log10(count) / count), 5
+    last = next(m for m in range(50) if all(abs(lags[m + k] / lags[0]) < limit for k in range(1, run + 1)))
+    width = 2 * last
+    window = [1.0 if k <= width / 2 else 2 * (1 - k / width) for k in range(width + 1)]
+    g = 2 * sum(window[k] * k * lags[k] for k in range(1, width + 1))
+    density = lags[0] + 2 * sum(window[k] * lags[k] for k in range(1, width + 1))
+    assert block_length(values) == round((2 * g**2 / (4 / 3 * density**2)) ** (1 / 3) * count ** (1 / 3))
 
 
 @pytest.mark.parametrize("carried", [0.0, 0.6])
