@@ -32,6 +32,7 @@ BENCHES = {
     "peers": ("trilane.bench.peers", "Trilane's runtimes beside the libraries' own examples and benchmark_app."),
     "roofline": ("trilane.bench.roofline", "The machine's INT8 and FP32 peaks and its memory bandwidth."),
     "pipeline": ("trilane.bench.pipeline", "Efficiency, idleness and gain of policies, edges and cores."),
+    "dashboard": ("trilane.bench.dashboard", "What the dashboard costs the run that it shows."),
     "placement": (
         "trilane.bench.placement",
         "Every placement of the units on the cores, beside the one that is chosen.",

@@ -61,6 +61,7 @@ MEANINGS = {
     "seconds": "How long each run lasts.",
     "infer seconds": "How long each network runs on each runtime.",
     "peers seconds": "How long each variant runs in a round.",
+    "dashboard seconds": "How long each variant runs in a round, at least 1.",
     "seed": "Seed of the random moments.",
     "accounts seed": "Seed of the runs.",
     "seeds": "How many seeds are compared.",

@@ -1,0 +1,138 @@
+"""A finished run, at any of its moments: a run in virtual time whose every slice is known, with a video beside it."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import json
+import struct
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from trilane.apps.dashboard.time_table import PIECE_ROWS, TimeTable
+from trilane.errors import BadInputError
+from trilane.pipeline.journal import NAME, JournalWriter, journal_of
+from trilane.scheduler.events import Settings, chain
+from trilane.scheduler.virtual import simulate
+from trilane.stages.cpu.present import Segment
+
+pytest.importorskip("prometheus_client", reason="the extra dashboard is not installed")
+
+from trilane.apps.dashboard.clients import Client
+from trilane.apps.dashboard.finished_view import MOST_JOBS, FinishedView
+from trilane.apps.dashboard.wire import ControlSaid, Seek
+
+MS = 1_000_000
+FRAMES, FPS = 40, 30.0
+#: With these times infer bounds: frame n is inferred from 10 + 20 n to 30 + 20 n and presented from there for 5 ms.
+TIMES = {"pose": 4 * MS, "raster": 6 * MS, "infer": 20 * MS, "present": 5 * MS}
+GRAPH = chain([("pose", "cpu"), ("raster", "gpu"), ("infer", "dsp"), ("present", "out")], "double", "infer")
+
+
+def grey(frame: int) -> int:
+    return 40 + 4 * frame
+
+
+@pytest.fixture(scope="module")
+def view(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FinishedView]:
+    folder = tmp_path_factory.mktemp("runs") / "walk"
+    folder.mkdir()
+    run = simulate(GRAPH, Settings(FRAMES), lambda stage, *_: TIMES[stage], keep=True)
+    assert run.recording is not None
+    with JournalWriter(folder / NAME) as writer:
+        for record in journal_of(run.recording, run.jobs, {"clock": "virtual"}, run.report):
+            writer.add(record)
+    segment = Segment(folder / "video.mp4", FPS, 64, 64)
+    for frame in range(FRAMES):
+        segment.add(frame, np.full((64, 64, 3), grey(frame), np.uint8))
+    segment.close()
+    view = FinishedView(folder)
+    yield view
+    view.close()
+
+
+def seek(view: FinishedView, client: Client, t_ms: float, span_ms: float) -> dict[str, Any]:
+    messages = asyncio.run(view.seek(client, Seek(type="seek", t_ms=t_ms, span_ms=span_ms)))
+    return {message["type"]: message for message in messages}
+
+
+def picture(view: FinishedView, client: Client) -> tuple[int, float, int] | None:
+    """Frame, time in the scene and grey of the picture."""
+    data = asyncio.run(view.picture(client))
+    if data is None:
+        return None
+    kind, frame, media_ms, _ = struct.unpack("<BIdd", data[:21])
+    assert kind == 2
+    return frame, media_ms, round(float(np.asarray(Image.open(io.BytesIO(data[21:]))).mean()))
+
+
+def test_it_says_what_it_is(view: FinishedView) -> None:
+    hello, state, *_ = view.greeting()
+    assert (hello["is_live"], hello["controls"], hello["run"]["name"]) == (False, [], "walk")
+    assert hello["run"]["stages"][2] == {"name": "infer", "unit": "dsp"}
+    assert hello["run"]["units"] == ["cpu", "gpu", "dsp", "out"]
+    assert hello["span_ms"] == [0.0, 10.0 + 20 * FRAMES + 5.0]
+    assert state["is"] == "ended"
+    assert json.dumps(list(view.greeting()))
+
+
+def test_a_moment_has_the_slices_that_are_known(view: FinishedView) -> None:
+    told = seek(view, Client(None, lambda: None), 400.0, 30.0)  # type: ignore[arg-type]
+    infers = [(job[2], job[3], job[4]) for job in told["slices"]["jobs"] if job[:2] == (2, 2)]
+    assert infers == [(n, 10.0 + 20 * n, 30.0 + 20 * n) for n in range(17, 22)]  # those that touch 370 to 430 ms
+    presents = [(job[2], job[3], job[4]) for job in told["slices"]["jobs"] if job[1] == 3]
+    assert presents[0] == (17, 370.0, 375.0)
+    rows = [job[3:5] for job in told["slices"]["jobs"] if job[0] == 1]
+    rows += [piece[2:4] for piece in told["slices"]["idle"] if piece[0] == 1]
+    gpu = sorted(tuple(row) for row in rows)
+    assert gpu[0][0] <= 370.0 and gpu[-1][1] >= 430.0
+    assert all(before[1] == after[0] for before, after in pairwise(gpu))  # jobs and idle time without a gap
+    assert told["figures"]["t_ms"] <= 400.0
+
+
+def test_the_picture_is_of_the_frame_that_was_presented_last(view: FinishedView) -> None:
+    client = Client(None, lambda: None)  # type: ignore[arg-type]
+    last = picture(view, client)
+    assert last is not None and last[0] == FRAMES - 1
+    assert picture(view, client) is None  # it has it
+    for t_ms, frame in ((375.0, 17), (374.9, 16), (400.0, 18), (35.0, 0), (1e9, FRAMES - 1)):
+        seek(view, client, t_ms, 1.0)
+        client.had_frame = -1
+        shown = picture(view, client)
+        assert shown is not None
+        assert shown[:2] == (frame, pytest.approx(1000 * frame / FPS))
+        assert abs(shown[2] - grey(frame)) <= 1  # the codec's and JPEG's rounding; frames are 4 apart
+    seek(view, client, 34.0, 1.0)
+    assert picture(view, client) is None  # none was presented yet
+
+
+def test_nothing_of_it_can_be_changed(view: FinishedView) -> None:
+    assert view.control(ControlSaid(type="control", name="pause")) == "the run is over"
+    assert "trilane_" in view.metrics()
+
+
+def test_a_folder_without_a_journal_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match=NAME):
+        FinishedView(tmp_path)
+
+
+def test_rows_of_a_time_are_found_among_many() -> None:
+    table = TimeTable(np.dtype([("number", "<u4"), ("begin", "<f8"), ("end", "<f8")]))
+    count = 3 * PIECE_ROWS + 17
+    for number in range(count):
+        table.add((number, float(number), number + 0.5))
+    table.complete()
+    assert table.near(5000.0, 2.0, 100)["number"].tolist() == [4998, 4999, 5000, 5001, 5002]
+    assert table.near(5000.2, 1e9, 3)["number"].tolist() == [4999, 5000, 5001]
+    assert len(table.near(0.0, 1e9, 10 * count)) == count
+    assert len(table.near(-10.0, 2.0, 5)) == 0
+    last, early = table.last_before(8191.5), table.last_before(0.4)
+    assert last is not None and int(last["number"]) == 8191 and early is None
+    table.close()
+    assert MOST_JOBS > PIECE_ROWS
