@@ -20,7 +20,7 @@ pytest.importorskip("uvicorn", reason="the extra dashboard is not installed")
 pytest.importorskip("websockets", reason="the extra dashboard is not installed")
 playwright = pytest.importorskip("playwright.sync_api", reason="the extra browser is not installed")
 
-from trilane.apps.dashboard.wire import ControlSaid, Seek  # noqa: E402
+from trilane.apps.dashboard.wire import PICTURE_KIND, ControlSaid, Seek  # noqa: E402
 from trilane.testing.dashboard_double import DoubleView, Served  # noqa: E402
 
 pytestmark = pytest.mark.slow
@@ -69,8 +69,23 @@ class Watched:
         self.page.on("console", self._said)
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
         self.page.on("request", self._asked)
-        self.page.on("websocket", lambda socket: self._check(socket.url))
+        self.pulled = self.outstanding = self.most_outstanding = 0
+        self.page.on("websocket", self._connected)
         self.page.goto(url)
+
+    def _connected(self, socket: Any) -> None:
+        self._check(socket.url)
+        socket.on("framesent", self._sent)
+        socket.on("framereceived", self._received)
+
+    def _sent(self, frame: bytes) -> None:
+        if b'"picture"' in frame:
+            self.pulled += 1
+            self.outstanding += 1
+            self.most_outstanding = max(self.most_outstanding, self.outstanding)
+
+    def _received(self, frame: bytes) -> None:
+        self.outstanding -= frame[0] == PICTURE_KIND
 
     def _said(self, message: Any) -> None:
         if message.type in ("error", "warning"):
@@ -158,6 +173,21 @@ def test_pictures_timeline_and_figures_of_a_live_run(opened: Callable[..., Watch
         assert seen.is_well()
 
 
+def test_pictures_are_pulled_one_at_a_time_and_only_while_they_are_seen(opened: Callable[..., Watched]) -> None:
+    with Served(DoubleView()) as served:
+        seen = opened(served.url)
+        seen.wait_until(lambda: seen.pulled > 20)
+        assert seen.most_outstanding == 1
+        seen.page.locator("#notes-title").scroll_into_view_if_needed()
+        seen.wait_for("() => document.getElementById('picture').getBoundingClientRect().bottom < 0")
+        seen.page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+        pulled, moment = seen.pulled, "() => Number(document.getElementById('run-time').dataset.seconds)"
+        later = seen.page.evaluate(moment) + 1
+        seen.wait_for(f"later => ({moment})() > later", later)
+        assert seen.pulled <= pulled + 1
+        assert seen.is_well()
+
+
 def test_the_camera_follows_mouse_wheel_and_keys(opened: Callable[..., Watched]) -> None:
     view = DoubleView()
     with Served(view) as served:
@@ -190,7 +220,7 @@ def test_controls_act_restart_or_say_why_not(opened: Callable[..., Watched]) -> 
         assert policy.get_by_role("button").is_disabled()
         policy.locator("select").select_option("sequential")
         assert controls(view, "policy") == []
-        policy.get_by_role("button", name="Restart the run with this policy").click()
+        policy.get_by_role("button", name="Restart with it: policy").click()
         seen.wait_until(lambda: controls(view, "policy") == ["sequential"])
         seen.wait_for("() => document.querySelector('[data-control=policy] button').disabled")
         runtime = seen.page.locator("[data-control=runtime]")

@@ -121,7 +121,7 @@ export class Controls {
       return this.#shell(control, label, select);
     }
     const apply = element("button", { type: "button", text: "Restart with it", disabled: true });
-    apply.setAttribute("aria-label", `Restart the run with this ${words(control.name)}`);
+    apply.setAttribute("aria-label", `Restart with it: ${words(control.name)}`);
     apply.addEventListener("click", () => this.use(control.name, chosen()));
     const update = () => {
       apply.disabled = select.disabled || select.value === String(control.value);

@@ -55,11 +55,13 @@ export class Timeline {
   }
 
   show(slices, isLive) {
+    const isFirst = this.slices === null;
+    const { span } = this;
     this.slices = slices;
     this.isLive = isLive;
     this.reset();
     this.#resize();
-    this.span = FIRST_SPAN_MS * Math.min(1, this.width / WIDE);
+    this.span = isFirst ? FIRST_SPAN_MS * Math.min(1, this.width / WIDE) : span;
   }
 
   // Slices have come: the newest one tells how the run's clock lies to this page's.
