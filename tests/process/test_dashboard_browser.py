@@ -277,6 +277,8 @@ def test_a_finished_run_is_sought_and_played(opened: Callable[..., Watched]) -> 
         seen.wait_for("() => document.getElementById('picture').dataset.frame === '300'")
         seen.wait_for("() => document.getElementById('presented').textContent === '300'")
         assert "0:05.0 of 0:20.0" in seen.text("#seek-time")
+        seen.page.locator("#seek").fill("5110")  # of which the slices are there already
+        seen.wait_for("() => document.getElementById('picture').dataset.frame === '306'")
         still = seen.pixels("timeline")
         seen.page.click("#seek-play")
         seen.wait_for("() => Number(document.getElementById('picture').dataset.frame) > 310")
@@ -318,13 +320,13 @@ def test_memory_of_the_timeline_is_bounded_and_its_slices_stay_in_order(opened: 
     fill = """async () => {
       const { SliceRing } = await import("./ring.js");
       const ring = new SliceRing(8);
-      for (const end of [3, 1, 2, 10, 11, 12, 13, 14, 9, 4]) ring.add(end - 0.5, end, end, 0, 0);
+      for (const end of [3, 1, 2, 10, 11, 12, 13, 14, 9, 4, 2]) ring.add(end - 0.5, end, end, 0, 0);
       const kept = Array.from({ length: ring.count }, (_, index) => ring.slice(index).frame);
       return [kept, ring.firstAfter(3), ring.firstAfter(10), ring.firstAfter(14), ring.ends.length];
     }"""
     with Served(DoubleView()) as served:
         seen = opened(served.url)
-        # Of ten slices into eight places: 1 goes for the ninth, 2 for the tenth.
+        # Of eleven slices into eight places: 1 goes for the ninth, 2 for the tenth; the last is too old.
         assert seen.page.evaluate(fill) == [[3, 4, 9, 10, 11, 12, 13, 14], 1, 4, 8, 8]
         assert seen.is_well()
 
