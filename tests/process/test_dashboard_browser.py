@@ -36,10 +36,10 @@ CORNER = """() => {
   copy.drawImage(document.getElementById("picture"), 0, 0);
   return [...copy.getImageData(0, 0, 24, 24).data];
 }"""
-#: At the pace of a chip, in slow motion, so that other programs on the machine change nothing of who waits for whom:
-#: the DSP has over half of a frame's time alone, and all of it where the units work at once (docs/pace.md).
-PACE = ("--profile", "snapdragon-888", "--pace", "--slow-motion", "16")
-SMALL = ("--size", "256", "--output", "320x240", "--camera", "builtin:static")
+#: At the pace of a chip, in slow motion, so that other programs of the machine hardly change who waits for whom. On the
+#: chip raster and composite take as long as the network: sequential, the DSP works about half as much (docs/pace.md).
+PACE = ("--profile", "snapdragon-888", "--pace", "--slow-motion", "64")
+SMALL = ("--size", "128", "--output", "320x240", "--camera", "builtin:static")
 VISIBLY = 0.8
 #: Columns of the table of the units.
 PROCESS, BUSY_OF_RUN, RESTARTS = 1, 9, 10
