@@ -16,6 +16,7 @@ CHANGING = {
     "scene": {"BvhJoint", "_Words", "_Hierarchy"},
     "hw_profiles": {"ThermalState", "Throttle"},
     "stages": {"_Extent"},
+    "pipeline": {"ByteCounter"},
     "bench": {"Signals", "_Player", "LoadGenVerdict", "LoadGenPlayer", "Queries"},
 }
 FOLDERS = (
@@ -33,6 +34,13 @@ EXTRAS = {
     "iceoryx2",
     "onnxruntime_qnn",
     "openvino",
+    "starlette",
+    "uvicorn",
+    "websockets",
+    "prometheus_client",
+    "pyarrow",
+    "pandas",
+    "ray",
 }
 
 
