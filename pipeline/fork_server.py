@@ -112,10 +112,10 @@ def _leave_server(server_pid: int) -> None:
     die_with_parent(server_pid)
 
 
-def die_with_parent(parent_pid: int) -> None:
-    """SIGKILL this process when the one that made it ends, also when it has ended already."""
+def die_with_parent(parent_pid: int, number: int = signal.SIGKILL) -> None:
+    """Send this process the signal `number` when the one that made it ends; end it if that has ended already."""
     libc = ctypes.CDLL(None, use_errno=True)
-    if libc.prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0) != 0:
+    if libc.prctl(PR_SET_PDEATHSIG, number, 0, 0, 0) != 0:
         raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG)")
     if os.getppid() != parent_pid:
         os._exit(1)

@@ -1,0 +1,227 @@
+"""`trilane sweep`: many configurations of one command, each tried once, in a folder that remembers what is done.
+
+Rule: this file talks to the person; what a sweep is, and how it is run, is in `trilane.apps.sweeps`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import signal
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from enum import StrEnum
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from trilane.apps.cli.commands import Commands
+from trilane.apps.cli.console import print_json, stderr_console
+from trilane.apps.cli.options import JsonOption
+from trilane.errors import BadInputError
+
+if TYPE_CHECKING:
+    from trilane.apps.cli.sweep_options import SweptCommand
+    from trilane.apps.sweeps.definition import Definition
+    from trilane.apps.sweeps.store import Store
+    from trilane.apps.sweeps.sweep import Engine
+    from trilane.apps.sweeps.trial import Trial
+
+app = Commands()
+
+EPILOG = """\b
+Examples:
+  trilane sweep run --size 128 --size 256 --runtime ort --runtime openvino
+  trilane sweep predict --channels 8 --channels 16 --edge double --edge triple --dry-run
+  trilane sweep predict --channels 8 --channels 16 --size 256 --size 512 --random 3 --seed 1
+  trilane sweep docs/examples/sweep.toml --out sweeps/chips
+  trilane sweep docs/examples/sweep.toml --out sweeps/chips --resume
+  trilane sweep docs/examples/sweep.toml --engine ray
+"""
+ENDING = ".toml"
+SOME_FAILED, INTERRUPTED = 1, 130
+
+
+class EngineName(StrEnum):
+    """Where the trials are done: on this machine, or on those of a Ray cluster."""
+
+    LOCAL = "local"
+    RAY = "ray"
+
+
+WordsArgument = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="FILE|COMMAND ...",
+        help="A sweep file (TOML), or run, predict, accuracy or bench NAME with its own arguments and options, "
+        "of which one that is given several times is an axis.",
+    ),
+]
+EngineOption = Annotated[EngineName, typer.Option(help="local: this machine; ray: those of the Ray cluster.")]
+ResumeOption = Annotated[bool, typer.Option("--resume", help="Go on with a sweep that was interrupted or killed.")]
+FolderOption = Annotated[Path | None, typer.Option("--out", help="Folder of the sweep; sweeps/NAME-HASH if none.")]
+ListOption = Annotated[bool, typer.Option("--list", help="Take the axes side by side, first with first.")]
+RandomOption = Annotated[int | None, typer.Option("--random", min=1, help="Draw so many of the combinations.")]
+SeedOption = Annotated[int | None, typer.Option(help="Of --random; 0 if none.")]
+DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Print the trials and run none.")]
+
+
+@app.command(epilog=EPILOG, context_settings={"ignore_unknown_options": True})
+def sweep(
+    words: WordsArgument,
+    engine: EngineOption = EngineName.LOCAL,
+    resume: ResumeOption = False,
+    out: FolderOption = None,
+    as_list: ListOption = False,
+    random: RandomOption = None,
+    seed: SeedOption = None,
+    dry_run: DryRunOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Try many configurations of run, predict, accuracy or a bench, and keep every result.
+
+    Every combination of the axes is a trial, a process of its own; its line in trials.jsonl has the command's whole
+    --json document. Trials on the host clock run one at a time, predictions on all cores. What is done is not done
+    again. docs/sweeps.md says more.
+    """
+    if words[0].endswith(ENDING):
+        name, definition, command = _of_file(words, as_list, random, seed)
+    else:
+        name, definition, command = _of_words(words, as_list, random, seed)
+    from trilane.apps.sweeps.definition import trials_of
+
+    trials = trials_of(definition, command.words_of)
+    if dry_run:
+        _print_planned(trials, as_json)
+        return
+    if engine is EngineName.RAY:
+        from trilane.apps.sweeps.ray_engine import required_ray
+
+        required_ray()
+    folder = out or _default_folder(name, trials)
+    failed = _run(trials, folder, definition, engine, resume, as_json)
+    raise typer.Exit(SOME_FAILED if failed else 0)
+
+
+def _of_file(
+    words: Sequence[str], as_list: bool, random: int | None, seed: int | None
+) -> tuple[str, Definition, SweptCommand]:
+    from trilane.apps.cli.sweep_options import SweptCommand
+    from trilane.apps.sweeps.definition import Definition
+    from trilane.apps.sweeps.toml_file import read_sweep
+
+    path = Path(words[0])
+    if len(words) > 1:
+        raise BadInputError("options", f"{' '.join(words[1:])} beside {path}", "it in the file", "it has all options")
+    if as_list or random is not None or seed is not None:
+        raise BadInputError("options", f"--list, --random or --seed beside {path}", "kind, count and seed in the file")
+    file = read_sweep(path)
+    command = SweptCommand(file.command)
+    options = {name: command.converted(name, value, f"{path}: options") for name, value in file.options.items()}
+    axes = {
+        name: [command.converted(name, value, f"{path}: axes") for value in values]
+        for name, values in file.axes.items()
+    }
+    return path.stem, Definition(command.words, options, axes, file.kind, file.count, file.seed, file.repeats), command
+
+
+def _of_words(
+    words: Sequence[str], as_list: bool, random: int | None, seed: int | None
+) -> tuple[str, Definition, SweptCommand]:
+    from trilane.apps.cli.sweep_options import SweptCommand
+    from trilane.apps.sweeps.definition import Definition, Kind
+
+    if as_list and random is not None:
+        raise BadInputError("options", "--list and --random", "one of them")
+    if seed is not None and random is None:
+        remedy = "the seed of a bench is given in a file (docs/sweeps.md)"
+        raise BadInputError("options", "--seed without --random", "both or neither", remedy)
+    count = 2 if words[0] == "bench" else 1
+    command = SweptCommand(words[:count])
+    values = command.values_of(words[count:])
+    options = {name: several[0] for name, several in values.items() if len(several) == 1}
+    axes = {name: several for name, several in values.items() if len(several) > 1}
+    kind = Kind.LIST if as_list else Kind.RANDOM if random is not None else Kind.GRID
+    return "-".join(command.words), Definition(command.words, options, axes, kind, random, seed or 0), command
+
+
+def _default_folder(name: str, trials: Sequence[Trial]) -> Path:
+    """The same for the same trials, so that a rerun finds what is done."""
+    digest = hashlib.sha256("".join(sorted(trial.id for trial in trials)).encode()).hexdigest()
+    return Path("sweeps") / f"{name}-{digest[:8]}"
+
+
+def _run(
+    trials: Sequence[Trial], folder: Path, definition: Definition, engine: EngineName, resume: bool, as_json: bool
+) -> bool:
+    """Run what is left and print how it ended. Returns: is there a trial that is not done?"""
+    from trilane.apps.cli.sweep_output import print_summary, progress
+    from trilane.apps.made import made_facts
+    from trilane.apps.sweeps.store import Store, is_ended
+    from trilane.apps.sweeps.sweep import run_sweep, summary
+
+    about = {"made": made_facts(("trilane", *sys.argv[1:])), "definition": _described(definition)}
+    with Store(folder, trials, about, resume=resume) as store:
+        before = {name for name, record in store.done.items() if is_ended(record)}
+        left = len(trials) - len(before)
+        try:
+            with progress(left, len(trials)) as told, _engine(engine, store) as engine_of:
+                run_sweep(trials, store, engine_of, told)
+        except KeyboardInterrupt:
+            _say_interrupted(trials, store)
+            raise typer.Exit(INTERRUPTED) from None
+        ended, records = summary(trials, store, before), store.done
+    document = {"schema": 1, "clock": str(trials[0].kind.clock), "engine": str(engine), **ended}
+    if as_json:
+        print_json(document)
+    else:
+        print_summary(document, definition, records)
+    stderr_console().print(f"sweep folder: {folder}", soft_wrap=True, markup=False)
+    return bool(ended["counts"]["failed"] or ended["counts"]["lost"])
+
+
+@contextmanager
+def _engine(name: EngineName, store: Store) -> Iterator[Engine]:
+    if name is EngineName.RAY:
+        from trilane.apps.sweeps.ray_engine import cluster
+
+        with cluster(store.folder) as engine:
+            yield engine
+        return
+    from trilane.apps.sweeps.local_engine import run_here
+    from trilane.apps.sweeps.perform import Place
+
+    yield partial(run_here, place=Place(store.folder), inherited=(store.lock,))
+
+
+def _described(definition: Definition) -> dict[str, Any]:
+    return {
+        "command": list(definition.command),
+        "options": dict(definition.options),
+        "axes": {name: list(values) for name, values in definition.axes.items()},
+        "kind": str(definition.kind),
+        "count": definition.count,
+        "seed": definition.seed,
+        "repeats": definition.repeats,
+    }
+
+
+def _say_interrupted(trials: Sequence[Trial], store: Store) -> None:
+    from trilane.apps.sweeps.store import is_ended
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # what is left to do is to say so
+    ended = sum(is_ended(store.done.get(trial.id)) for trial in trials)
+    text = f"interrupted: {ended} of {len(trials)} trials are done; --resume goes on ({store.folder})"
+    stderr_console().print(text, soft_wrap=True, markup=False)
+
+
+def _print_planned(trials: Sequence[Trial], as_json: bool) -> None:
+    from trilane.apps.sweeps.sweep import row_of
+
+    if as_json:
+        print_json({"schema": 1, "trials": [row_of(trial, None) for trial in trials]})
+        return
+    for trial in trials:
+        sys.stdout.write(f"{trial.id}  {trial.line}\n")

@@ -1,0 +1,148 @@
+"""The options of the commands that a sweep can try, found in the commands themselves.
+
+Rule: no second list of options. What a name, a spelling or a value is, the command's own parser says.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterable, Iterator, Sequence
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from trilane.apps.cli.bench import BENCHES, bench_command
+from trilane.apps.cli.main import COMMANDS as ALL_COMMANDS
+from trilane.apps.sweeps.trial import COMMANDS, Options, Value
+from trilane.errors import BadInputError
+from trilane.near_miss import did_you_mean
+
+#: Options of a trial that are not its configuration: why a sweep does not take them.
+NOT_SWEPT = {
+    "json": "every trial has it",
+    "out": "the sweep's own --out is the folder of all its trials",
+    "plot": "every trial would write the same file",
+    "trace": "every trial would write the same file",
+    "dashboard": "it waits for a person",
+    "port": "it is of --dashboard",
+}
+
+
+class SweptCommand:
+    """A command by its words. Raises BadInputError for words that are none of those that a sweep can try."""
+
+    def __init__(self, words: Sequence[str]) -> None:
+        self.words = tuple(words)
+        self._command = _command(self.words)
+        self._parameters = {_name(each): each for each in self._command.params if _name(each) not in NOT_SWEPT}
+
+    def values_of(self, tokens: Sequence[str]) -> dict[str, list[Value]]:
+        """Name: the values given to it, one after the other. `tokens`: what a person typed after the command.
+
+        Raises BadInputError.
+        """
+        found: dict[str, list[Value]] = {}
+        arguments = [name for name, each in self._parameters.items() if each.param_type_name == "argument"]
+        left = iter(tokens)
+        for token in left:
+            name, value = self._option(token, left) if token.startswith("-") else ("".join(arguments[:1]), token)
+            if not name:
+                raise BadInputError("options", repr(token), f"options of {' '.join(self.words)}")
+            found.setdefault(name, []).append(self.converted(name, value))
+        return found
+
+    def converted(self, name: str, value: Any, where: str = "") -> Value:
+        """`value` as the command converts it, as plain data. Raises BadInputError for one that it refuses."""
+        parameter = self._named(name, where)
+        words = self.words_of({name: value})
+        place = f"{where or 'options'}: {name}"
+        if _is_flag(parameter) != isinstance(value, bool):
+            expected = "true or false" if _is_flag(parameter) else "text or a number"
+            raise BadInputError(place, repr(value), expected)
+        try:
+            with self._command.make_context(self.words[-1], list(words)) as context:
+                return _plain(context.params[parameter.name])
+        except BadInputError as error:
+            if not where:
+                raise
+            raise BadInputError(place, error.found, error.expected, error.remedy) from None
+        except typer.BadParameter as error:
+            raise BadInputError(place, repr(value), f"a value that {' '.join(self.words)} takes", str(error)) from None
+
+    def words_of(self, options: Options) -> tuple[str, ...]:
+        """`options`, by name, as they are typed."""
+        words: list[str] = []
+        for name, value in options.items():
+            words += self._typed(self._named(name), value)
+        return tuple(words)
+
+    def _named(self, name: str, where: str = "") -> Any:
+        if name in NOT_SWEPT:
+            raise BadInputError(where or "options", f"--{name}", "options of the trials", NOT_SWEPT[name])
+        if name not in self._parameters:
+            expected = f"an option of {' '.join(self.words)}"
+            raise BadInputError(where or "options", f"unknown {name!r}", expected, did_you_mean(name, self._parameters))
+        return self._parameters[name]
+
+    def _option(self, token: str, left: Iterator[str]) -> tuple[str, Value]:
+        """Name and value of the option that begins with `token`; its value may be the next one of `left`."""
+        spelling, has_value, value = token.partition("=")
+        for name, parameter in self._parameters.items():
+            if spelling in (*parameter.opts, *parameter.secondary_opts) and parameter.param_type_name == "option":
+                if _is_flag(parameter):
+                    return name, spelling in parameter.opts
+                return name, value if has_value else _next(spelling, left)
+        self._named(spelling.lstrip("-"))  # raises, unless it is an argument's name
+        raise BadInputError("options", spelling, f"an option of {' '.join(self.words)}", "it is given without a name")
+
+    @staticmethod
+    def _typed(parameter: Any, value: Value) -> Iterator[str]:
+        if _is_flag(parameter):
+            spellings = parameter.opts if value else parameter.secondary_opts
+            yield from spellings[:1]  # no word says that a flag without an opposite is off
+            return
+        for each in value if isinstance(value, list) else [value]:
+            if parameter.param_type_name == "argument":
+                yield str(each)
+            elif str(each).startswith("-"):
+                yield f"{parameter.opts[0]}={each}"
+            else:
+                yield from (parameter.opts[0], str(each))
+
+
+def _command(words: tuple[str, ...]) -> Any:
+    known = [*(name for name in COMMANDS if name != "bench"), *(f"bench {name}" for name in BENCHES)]
+    text = " ".join(words)
+    if text not in known:
+        benches = ", ".join(BENCHES)
+        expected = f"one of {', '.join(COMMANDS)} NAME, NAME being one of {benches}" if words[:1] == ("bench",) else ""
+        expected = expected or f"one of {', '.join(COMMANDS)} NAME, or a file (.toml)"
+        raise BadInputError("command", repr(text), expected, did_you_mean(text, known))
+    if words[0] == "bench":
+        return bench_command(words[1])
+    return typer.main.get_command(importlib.import_module(ALL_COMMANDS[words[0]][0]).app)
+
+
+def _next(spelling: str, left: Iterator[str]) -> str:
+    value = next(left, None)
+    if value is None:
+        raise BadInputError("options", f"{spelling} without a value", "a value after it")
+    return value
+
+
+def _name(parameter: Any) -> str:
+    return str(parameter.opts[0]).lstrip("-")
+
+
+def _is_flag(parameter: Any) -> bool:
+    return bool(getattr(parameter, "is_flag", False))
+
+
+def _plain(value: Any) -> Value:
+    if isinstance(value, Enum):
+        return _plain(value.value)
+    if isinstance(value, str | bool | int | float):
+        return value
+    return [_plain(each) for each in value] if isinstance(value, Iterable) else str(Path(value))

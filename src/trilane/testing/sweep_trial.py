@@ -1,0 +1,47 @@
+"""A program that a sweep can try in place of Trilane: it says what it was asked, and does as its words say.
+
+`SWEEP_TRIAL_LOG` names a file that gets a line when it begins and one when it ends, `SWEEP_TRIAL_WAIT` says how many
+seconds it takes. `--code N` ends it with N; `--die-once FILE` makes it make FILE and kill itself, unless FILE is there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser()
+    for name in ("--die-once", "--out"):
+        parser.add_argument(name, type=Path)
+    parser.add_argument("--code", type=int, default=0)
+    asked, other = parser.parse_known_args()
+    note("begin", other)
+    if asked.out is not None:
+        asked.out.mkdir()
+        (asked.out / "report.json").touch()
+    if asked.die_once is not None and not asked.die_once.exists():
+        asked.die_once.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    time.sleep(float(os.environ.get("SWEEP_TRIAL_WAIT", "0")))
+    note("end", other)
+    print(json.dumps({"schema": 1, "words": other}))
+    if asked.code:
+        print("before the last line\nerror: as it was asked", file=sys.stderr)
+    return int(asked.code)
+
+
+def note(what: str, words: list[str]) -> None:
+    """Add a line to the log, in one write, so that lines of several processes do not mix."""
+    line = {"what": what, "at": time.monotonic(), "pid": os.getpid(), "words": words}
+    with Path(os.environ["SWEEP_TRIAL_LOG"]).open("ab", buffering=0) as file:
+        file.write(json.dumps(line).encode() + b"\n")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,172 @@
+"""Sweeps of real processes: alone or packed, interrupted, killed and taken up again, with none left behind.
+
+`trilane.testing.sweep_trial`, which says when it began and ended, is tried in place of Trilane.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from trilane.apps.sweeps.local_engine import at_once, run_here
+from trilane.apps.sweeps.perform import Place
+from trilane.apps.sweeps.store import TRIALS, Store, read_trials
+from trilane.apps.sweeps.sweep import run_sweep
+from trilane.apps.sweeps.trial import Clock, Trial
+
+FAKE = "trilane.testing.sweep_trial"
+#: `trilane` that tries the module in place of Trilane.
+PROGRAM = (
+    f"import trilane.apps.sweeps.perform as p; p.PROGRAM = {FAKE!r}; from trilane.apps.cli.main import entry; entry()"
+)
+LIMIT_S = 60.0
+COUNT = 5
+SWEEP = ["sweep", "run", *(word for n in range(1, COUNT + 1) for word in ("--frames", str(n)))]
+
+pytestmark = pytest.mark.usefixtures("no_new_process")
+
+
+@pytest.fixture(autouse=True)
+def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where the trials say when they began and ended."""
+    file = tmp_path / "log"
+    monkeypatch.setenv("SWEEP_TRIAL_LOG", str(file))
+    return file
+
+
+def swept(folder: Path, trials: list[Trial]) -> dict[str, dict[str, Any]]:
+    """The records after a sweep of `trials`."""
+    with Store(folder, trials, {}, resume=False) as store:
+        place = Place(store.folder, program=FAKE)
+        run_sweep(trials, store, lambda left: run_here(left, place), lambda _record: None)
+    return read_trials(folder)
+
+
+def numbered(command: str, count: int) -> list[Trial]:
+    return [Trial((command,), {"n": n}, ("--n", str(n))) for n in range(count)]
+
+
+def notes(log: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
+
+
+def spans(log: Path) -> list[tuple[float, float]]:
+    """Begin and end of each trial that ended, by begin."""
+    begins = {note["pid"]: note["at"] for note in notes(log) if note["what"] == "begin"}
+    return sorted((begins[note["pid"]], note["at"]) for note in notes(log) if note["what"] == "end")
+
+
+def test_trials_of_the_host_clock_one_after_the_other_with_their_folders(tmp_path: Path, log: Path) -> None:
+    trials = numbered("run", 2)
+    (tmp_path / "s" / f"{trials[1].id}.17.partial").mkdir(parents=True)  # of a trial that was killed
+    records = swept(tmp_path / "s", trials)
+    (_, first_end), (second_begin, _) = spans(log)
+    assert first_end <= second_begin
+    assert at_once(Clock.HOST) == 1
+    for trial in trials:
+        record = records[trial.id]
+        assert record["result"] == {"schema": 1, "words": ["run", *trial.words, "--json"]}
+        assert record["command"] == ["trilane", "run", *trial.words, "--json"]
+        assert (record["status"], record["clock"], record["folder"]) == ("done", "host", trial.id)
+        assert record["host"]["cpu"]["cores_allowed"] == sorted(os.sched_getaffinity(0))
+        assert (tmp_path / "s" / trial.id / "report.json").is_file()
+    assert not list((tmp_path / "s").glob("*.partial"))
+
+
+def test_virtual_trials_are_packed(tmp_path: Path, log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _pid: {0, 1})
+    monkeypatch.setenv("SWEEP_TRIAL_WAIT", "4")  # the second begins meanwhile, on a busy machine too
+    records = swept(tmp_path / "s", numbered("predict", 2))
+    assert {(record["clock"], record["folder"]) for record in records.values()} == {("virtual", None)}
+    (_, first_end), (second_begin, _) = spans(log)
+    assert second_begin < first_end
+
+
+def test_failed_trials_are_kept_and_not_repeated_and_lost_ones_are(tmp_path: Path, log: Path) -> None:
+    failing = Trial(("run",), {"n": 1}, ("--code", "3"))
+    killed = Trial(("run",), {"n": 2}, ("--die-once", str(tmp_path / "mark")))
+    records = swept(tmp_path / "s", [failing, killed])
+    assert {key: records[failing.id][key] for key in ("status", "exit_code", "error", "tries")} == {
+        "status": "failed",
+        "exit_code": 3,
+        "error": "error: as it was asked",
+        "tries": 1,
+    }
+    assert (records[killed.id]["status"], records[killed.id]["tries"]) == ("done", 2)
+    assert Counter(note["what"] for note in notes(log)) == {"begin": 3, "end": 2}
+
+
+@pytest.fixture
+def sweep(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    """Starts the command line, with words besides those of SWEEP; ends it after the test."""
+    started = []
+
+    def start(*words: str) -> subprocess.Popen[str]:
+        command = [sys.executable, "-c", PROGRAM, *SWEEP, "--out", str(tmp_path / "s"), *words]
+        pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        started.append(subprocess.Popen(command, **pipes))
+        return started[-1]
+
+    yield start
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
+def until_some_are_done(folder: Path, process: subprocess.Popen[str], count: int) -> list[psutil.Process]:
+    """Wait for `count` lines and a trial that goes on. Returns: its processes."""
+    end = time.monotonic() + LIMIT_S
+    while time.monotonic() < end:
+        lines = (folder / TRIALS).read_bytes().count(b"\n") if (folder / TRIALS).exists() else 0
+        going = psutil.Process(process.pid).children(recursive=True)
+        if lines >= count and going:
+            return going
+        time.sleep(0.02)
+    raise AssertionError(process.communicate())
+
+
+def each_done_once(folder: Path, log: Path) -> None:
+    """No trial of the sweep is lost, and none has two lines or went to its end twice."""
+    lines = [json.loads(line) for line in (folder / TRIALS).read_text().splitlines()]
+    assert sorted(line["options"]["frames"] for line in lines) == list(range(1, COUNT + 1))
+    assert {line["status"] for line in lines} == {"done"}
+    ends = Counter(tuple(note["words"]) for note in notes(log) if note["what"] == "end")
+    assert sorted(ends.values()) == [1] * COUNT
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+def test_a_sweep_that_is_ended_half_way_goes_on(
+    sweep: Any, tmp_path: Path, log: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    monkeypatch.setenv("SWEEP_TRIAL_WAIT", "0.5")
+    first = sweep()
+    going = until_some_are_done(tmp_path / "s", first, 2)
+    first.send_signal(number)
+    _, said = first.communicate(timeout=LIMIT_S)
+    if number == signal.SIGINT:
+        assert first.returncode == 130
+        assert "trials are done; --resume goes on" in said
+        assert not any(process.is_running() for process in going)
+    assert not psutil.wait_procs(going, timeout=LIMIT_S)[1]
+    monkeypatch.setenv("SWEEP_TRIAL_WAIT", "0")
+    refused = sweep()
+    assert "--resume goes on with it" in refused.communicate(timeout=LIMIT_S)[1]
+    assert refused.returncode == 2
+    second = sweep("--resume", "--json")
+    out, said = second.communicate(timeout=LIMIT_S)
+    assert second.returncode == 0, said
+    counts = json.loads(out)["counts"]
+    assert (counts["trials"], counts["done"]) == (COUNT, COUNT)
+    assert 2 <= counts["skipped"] < COUNT
+    each_done_once(tmp_path / "s", log)
