@@ -36,9 +36,9 @@ Examples:
   trilane sweep run --size 128 --size 256 --runtime ort --runtime openvino
   trilane sweep predict --channels 8 --channels 16 --edge double --edge triple --dry-run
   trilane sweep predict --channels 8 --channels 16 --size 256 --size 512 --random 3 --seed 1
-  trilane sweep docs/examples/sweep.toml --out sweeps/chips
-  trilane sweep docs/examples/sweep.toml --out sweeps/chips --resume
-  trilane sweep docs/examples/sweep.toml --engine ray
+  trilane sweep docs/examples/chip-sweep.toml --out sweeps/chips
+  trilane sweep docs/examples/chip-sweep.toml --out sweeps/chips --resume
+  trilane sweep docs/examples/chip-sweep.toml --engine ray
 """
 ENDING = ".toml"
 SOME_FAILED, INTERRUPTED = 1, 130
@@ -54,7 +54,7 @@ class EngineName(StrEnum):
 WordsArgument = Annotated[
     list[str],
     typer.Argument(
-        metavar="FILE|COMMAND ...",
+        metavar="FILE|COMMAND",
         help="A sweep file (TOML), or run, predict, accuracy or bench NAME with its own arguments and options, "
         "of which one that is given several times is an axis.",
     ),

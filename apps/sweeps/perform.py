@@ -95,7 +95,10 @@ class Place:
 
 
 def perform(trial: Trial, place: Place, children: Children) -> Record:
-    """Its process is one of `children`. Returns: the line of `trials.jsonl` (docs/sweeps.md has its keys). What a lost trial left in the folder is removed."""
+    """The line of `trials.jsonl` (docs/sweeps.md has its keys). What a lost trial left in the folder is removed.
+
+    `children`: its process is one of them.
+    """
     began_at, start = datetime.now(UTC).isoformat(timespec="milliseconds"), time.monotonic()
     with tempfile.TemporaryDirectory(prefix="trilane-trial-") as scratch:
         own = (place.folder or Path(scratch)) / trial.id

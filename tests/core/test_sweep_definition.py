@@ -19,6 +19,7 @@ from trilane.apps.sweeps.toml_file import read_sweep
 from trilane.apps.sweeps.trial import Options, Trial, canonical
 from trilane.errors import BadInputError
 
+EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "chip-sweep.toml"
 RUN = ("run",)
 AXES = {"size": ["128", "256"], "runtime": ["ort", "openvino", "qnn"]}
 
@@ -161,6 +162,15 @@ def test_a_file_by_hand(tmp_path: Path) -> None:
     found = read_sweep(file)
     assert (found.command, found.kind, found.repeats) == (("bench", "raster"), Kind.GRID, 3)
     assert (found.options, found.axes) == ({"size": 64}, {"channels": [4, 8]})
+
+
+def test_the_example_is_a_sweep_of_sixty_trials() -> None:
+    file = read_sweep(EXAMPLE)
+    command = SweptCommand(file.command)
+    axes = {name: [command.converted(name, value) for value in values] for name, values in file.axes.items()}
+    trials = trials_of(Definition(command.words, file.options, axes), command.words_of)
+    words = "--profile snapdragon-888 --policy pipelined --size 512 --channels 16 --runtime gpu --edge triple"
+    assert (len(trials), trials[-1].line) == (60, f"trilane predict {words} --json")
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,7 @@ def ran(name: str, folder: Path, *, frames: int = 1, as_input: bool = False, tim
 
 
 def test_every_example_is_run_here() -> None:
-    assert {script.name for script in EXAMPLES.iterdir()} == {"first_run.py", "chips.py", "own_experiment.py"}
+    assert {script.name for script in EXAMPLES.glob("*.py")} == {"first_run.py", "chips.py", "own_experiment.py"}
 
 
 def test_a_first_run(tmp_path: Path, nothing_left: Path) -> None:  # noqa: ARG001 - looks after the test

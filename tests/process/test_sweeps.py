@@ -31,7 +31,7 @@ PROGRAM = (
     f"import trilane.apps.sweeps.perform as p; p.PROGRAM = {FAKE!r}; from trilane.apps.cli.main import entry; entry()"
 )
 LIMIT_S = 60.0
-COUNT = 5
+COUNT = 4
 SWEEP = ["sweep", "run", *(word for n in range(1, COUNT + 1) for word in ("--frames", str(n)))]
 
 pytestmark = pytest.mark.usefixtures("no_new_process")
@@ -86,7 +86,7 @@ def test_trials_of_the_host_clock_one_after_the_other_with_their_folders(tmp_pat
 
 def test_virtual_trials_are_packed(tmp_path: Path, log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _pid: {0, 1})
-    monkeypatch.setenv("SWEEP_TRIAL_WAIT", "4")  # the second begins meanwhile, on a busy machine too
+    monkeypatch.setenv("SWEEP_TRIAL_TOGETHER", "2")
     records = swept(tmp_path / "s", numbered("predict", 2))
     assert {(record["clock"], record["folder"]) for record in records.values()} == {("virtual", None)}
     (_, first_end), (second_begin, _) = spans(log)
@@ -149,9 +149,9 @@ def each_done_once(folder: Path, log: Path) -> None:
 def test_a_sweep_that_is_ended_half_way_goes_on(
     sweep: Any, tmp_path: Path, log: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
-    monkeypatch.setenv("SWEEP_TRIAL_WAIT", "0.5")
+    monkeypatch.setenv("SWEEP_TRIAL_WAIT", "0.3")
     first = sweep()
-    going = until_some_are_done(tmp_path / "s", first, 2)
+    going = until_some_are_done(tmp_path / "s", first, 1)
     first.send_signal(number)
     _, said = first.communicate(timeout=LIMIT_S)
     if number == signal.SIGINT:
@@ -168,5 +168,5 @@ def test_a_sweep_that_is_ended_half_way_goes_on(
     assert second.returncode == 0, said
     counts = json.loads(out)["counts"]
     assert (counts["trials"], counts["done"]) == (COUNT, COUNT)
-    assert 2 <= counts["skipped"] < COUNT
+    assert 1 <= counts["skipped"] < COUNT
     each_done_once(tmp_path / "s", log)

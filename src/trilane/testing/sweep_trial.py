@@ -1,7 +1,8 @@
 """A program that a sweep can try in place of Trilane: it says what it was asked, and does as its words say.
 
-`SWEEP_TRIAL_LOG` names a file that gets a line when it begins and one when it ends, `SWEEP_TRIAL_WAIT` says how many
-seconds it takes. `--code N` ends it with N; `--die-once FILE` makes it make FILE and kill itself, unless FILE is there.
+`SWEEP_TRIAL_LOG` names a file that gets a line when it begins and one when it ends. It takes `SWEEP_TRIAL_WAIT`
+seconds, and ends once `SWEEP_TRIAL_TOGETHER` trials have begun or half a minute has passed. `--code N` ends it with N;
+`--die-once FILE` makes it make FILE and kill itself, unless FILE is there.
 """
 
 from __future__ import annotations
@@ -29,11 +30,20 @@ def main() -> int:
         asked.die_once.touch()
         os.kill(os.getpid(), signal.SIGKILL)
     time.sleep(float(os.environ.get("SWEEP_TRIAL_WAIT", "0")))
+    wait_for_others(int(os.environ.get("SWEEP_TRIAL_TOGETHER", "1")))
     note("end", other)
     print(json.dumps({"schema": 1, "words": other}))
     if asked.code:
         print("before the last line\nerror: as it was asked", file=sys.stderr)
     return int(asked.code)
+
+
+def wait_for_others(count: int) -> None:
+    """Until the log has so many trials that began."""
+    give_up_at = time.monotonic() + 30.0
+    log = Path(os.environ["SWEEP_TRIAL_LOG"])
+    while log.read_text().count('"begin"') < count and time.monotonic() < give_up_at:
+        time.sleep(0.02)
 
 
 def note(what: str, words: list[str]) -> None:
