@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
+from trilane.apps.cli.accuracy_by_cause import show_by_cause
 from trilane.apps.cli.commands import Commands
 from trilane.apps.cli.console import print_json, stderr_console, stdout_console, stdout_kept
 from trilane.apps.cli.options import JsonOption, SceneArgument, SceneAvatarOption, SceneSizeOption
@@ -22,10 +23,11 @@ EPILOG = """\b
 Examples:
   trilane accuracy
   trilane accuracy closeup --frames 20 --runtime ort --runtime openvino
+  trilane accuracy closeup --by-cause --frames 2 --out errors
   trilane accuracy --hard-cases --json
 """
 OUT_OF_BOUNDS = 1
-SCENE, FRAMES = "default", 8
+SCENE, FRAMES, BY_CAUSE_FRAMES = "default", 8, 2
 NUMBER_COLUMNS = ("name", "error", "bound", "unit", "verdict")
 HARD_COLUMNS = ("name", "error", "bound", "constant_error", "shifted_error", "swapped_error", "source", "verdict")
 
@@ -36,7 +38,7 @@ def accuracy(
     avatar: SceneAvatarOption = None,
     size: SceneSizeOption = None,
     frames: Annotated[
-        int | None, typer.Option(help="How many frames, evenly spread over the scene.  [default: 8]")
+        int | None, typer.Option(help="How many frames, evenly spread over the scene.  [default: 8; by cause: 2]")
     ] = None,
     runtime: Annotated[
         list[str] | None,
@@ -53,6 +55,16 @@ def accuracy(
             "analysis, and hard networks against float.",
         ),
     ] = False,
+    by_cause: Annotated[
+        bool,
+        typer.Option(
+            "--by-cause",
+            help="Instead: the run's frames against the reference (float64, FP32 network), split by cause.",
+        ),
+    ] = False,
+    out: Annotated[
+        Path | None, typer.Option(help="With --by-cause: a folder for error heat maps, PNG.", show_default=False)
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Compare the runtimes with each other on a scene's frames, or hard cases with their bounds.
@@ -63,6 +75,13 @@ def accuracy(
     from trilane.stages.dsp.runtime import installed
 
     names = list(runtime or installed())
+    if out is not None and not by_cause:
+        raise BadInputError("--out", str(out), "it beside --by-cause", "heat maps are of causes")
+    if by_cause:
+        _refuse_other_comparisons(hard_cases, runtime or [])
+        asked = {"avatar": avatar, "size": size, "runtime": runtime[0] if runtime else "auto"}
+        show_by_cause(scene, asked, BY_CAUSE_FRAMES if frames is None else frames, out, as_json)
+        return
     if hard_cases:
         _refuse_a_scene(scene, {"--avatar": avatar, "--size": size, "--frames": frames})
         passed = _hard_cases([name for name in names if runtime or name != "qnn"], as_json)
@@ -70,6 +89,15 @@ def accuracy(
         passed = _scene(scene, avatar, size, FRAMES if frames is None else frames, names, as_json)
     if not passed:
         raise typer.Exit(OUT_OF_BOUNDS)
+
+
+def _refuse_other_comparisons(hard_cases: bool, runtimes: list[str]) -> None:
+    """Raises BadInputError for what cannot stand beside --by-cause: it looks at one run."""
+    if hard_cases:
+        raise BadInputError("--by-cause", "--hard-cases beside it", "one of them")
+    if len(runtimes) > 1:
+        found = ", ".join(runtimes)
+        raise BadInputError("--runtime", found, "one runtime with --by-cause, that of the run", "leave the others out")
 
 
 def _refuse_a_scene(scene: str, options: dict[str, object]) -> None:

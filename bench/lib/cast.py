@@ -24,13 +24,14 @@ from trilane.stages.cpu.mesh_bounds import MeshBounds
 
 @dataclass(frozen=True)
 class Seen:
-    """One avatar in one frame.
+    """One avatar in one frame. `index`: its number in the scene.
 
     `folder`: of its bundle. `pose` (55,3), `translation` (3,), `world` (4,4): as `Mover.sample` and `Mover` have them.
     `joints` (55,3,4): its skinning matrices, of the house. `box`: the pixels of the picture that hold it, clothes
     included. `depth`: camera z of the pelvis. `view` (4,4); `projection` (4,4): of the box.
     """
 
+    index: int
     folder: Path
     pose: F64
     translation: F64
@@ -44,6 +45,7 @@ class Seen:
 
 @dataclass(frozen=True)
 class _Actor:
+    index: int
     folder: Path
     mover: Mover
     data: AvatarData
@@ -61,14 +63,15 @@ class Cast:
         self._output: Shape = (scene.output.height, scene.output.width)
         staged = staged_of(checked.assets)
         self._camera = staged.camera
-        self._projection = staged.camera.projection(scene.output.width / scene.output.height)
+        #: (4,4) of the whole picture.
+        self.projection = staged.camera.projection(scene.output.width / scene.output.height)
         self.avatars = {folder: load_avatar(load_bundle(folder)) for folder in dict.fromkeys(folders)}
         bounds = {
             folder: MeshBounds(data.shaped, standoff_m=CLOTHES_STANDOFF_M) for folder, data in self.avatars.items()
         }
         self._actors = [
-            _Actor(folder, mover, data := self.avatars[folder], _skeleton(data), bounds[folder])
-            for folder, mover in zip(folders, staged.movers, strict=True)
+            _Actor(index, folder, mover, data := self.avatars[folder], _skeleton(data), bounds[folder])
+            for index, (folder, mover) in enumerate(zip(folders, staged.movers, strict=True))
         ]
 
     def seen(self, frame: int) -> list[Seen]:
@@ -86,14 +89,15 @@ class Cast:
         pose, translation = actor.mover.sample(t_s)
         world = actor.mover.world
         posed = actor.skeleton.pose(pose, translation, world)
-        rect = actor.bounds.rect(posed, self._projection @ view)
+        rect = actor.bounds.rect(posed, self.projection @ view)
         if rect is None:
             return None
         box = box_around(rect, self._output)
         pelvis = world @ np.append(actor.data.shaped.joints[0] + translation, 1.0)
-        projection = crop_projection(self._projection, box.rect(self._output))
+        projection = crop_projection(self.projection, box.rect(self._output))
         depth = float(view[2] @ pelvis)
-        return Seen(actor.folder, pose, translation, world, posed.matrices.copy(), box, depth, view, projection)
+        joints = posed.matrices.copy()
+        return Seen(actor.index, actor.folder, pose, translation, world, joints, box, depth, view, projection)
 
 
 def _skeleton(data: AvatarData) -> Skeleton:

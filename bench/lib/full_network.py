@@ -92,6 +92,43 @@ def dequantised(network: NetworkFile) -> Paint:
     return paint
 
 
+def as_written(network: NetworkFile) -> Paint:
+    """The integer network as its file says it, every rounding to bytes and nothing else: what runtimes are to compute.
+
+    ONNX Runtime runs node by node, in FP32, with no optimisation. Its input is real numbers, which need not be of
+    bytes.
+    """
+    settings = onnxruntime.SessionOptions()
+    settings.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
+    settings.intra_op_num_threads = 1
+    sessions: dict[Shape, onnxruntime.InferenceSession] = {}
+
+    def paint(tensor: F64) -> F32:
+        shape = (tensor.shape[0], tensor.shape[1])
+        if shape not in sessions:
+            model = from_real(reshaped(network, *shape)).SerializeToString()
+            sessions[shape] = onnxruntime.InferenceSession(model, settings, providers=["CPUExecutionProvider"])
+        (picture,) = sessions[shape].run(None, {IN: tensor.astype(np.float32)[None]})
+        return np.asarray(picture[0] / np.float32(255))
+
+    return paint
+
+
+def from_real(network: NetworkFile) -> onnx.ModelProto:
+    """`network` with an input `IN` of real numbers, (N,H,W,C) float32, in place of its bytes. Else it is unchanged."""
+    model = onnx.ModelProto()
+    model.CopyFrom(network.model)
+    graph = model.graph
+    (entry,) = graph.input
+    for node in graph.node:
+        if entry.name in node.input:
+            node.CopyFrom(helper.make_node("Identity", [IN], node.output, name=node.name))
+    entry.name = IN
+    entry.type.tensor_type.elem_type = onnx.TensorProto.FLOAT
+    _keep_what_is_read(graph)
+    return model
+
+
 def unrounded(network: NetworkFile) -> onnx.ModelProto:
     """`network` between real numbers: input `IN` (N,H,W,C), output `OUT` (N,H,W,4), both float32.
 
@@ -117,15 +154,21 @@ def unrounded(network: NetworkFile) -> onnx.ModelProto:
     for node in nodes:
         node.input[:] = [ends.get(name, name) for name in node.input]
         node.output[:] = [ends.get(name, name) for name in node.output]
-    read = {name for node in nodes for name in node.input}
-    kept = [tensor for tensor in graph.initializer if tensor.name in read]
-    del graph.node[:], graph.value_info[:], graph.initializer[:]
+    del graph.node[:], graph.value_info[:]
     graph.node.extend(nodes)
-    graph.initializer.extend(kept)
+    _keep_what_is_read(graph)
     for value in (graph.input[0], graph.output[0]):
         value.name = ends[value.name]
         value.type.tensor_type.elem_type = onnx.TensorProto.FLOAT
     return model
+
+
+def _keep_what_is_read(graph: onnx.GraphProto) -> None:
+    """Leave out the constants that no node of `graph` reads."""
+    read = {name for node in graph.node for name in node.input}
+    kept = [tensor for tensor in graph.initializer if tensor.name in read]
+    del graph.initializer[:]
+    graph.initializer.extend(kept)
 
 
 def _range(node: onnx.NodeProto, constants: Mapping[str, onnx.TensorProto]) -> tuple[float, float]:

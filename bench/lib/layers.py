@@ -1,6 +1,7 @@
 """Layers of a picture, blended in linear light in float64: what the composite does, written a second time.
 
-Rule: a layer lies on the pixel grid of the picture, so it is never resampled; it may hang over the picture.
+Rule: a layer lies on the pixel grid of the picture and may hang over it. What lies on no grid of the picture is read
+for each of its pixels by `placed`.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy as np
 from trilane.arrays import F64, U8, Floats
 from trilane.scene.crop import Rect
 from trilane.shapes import BUCKET_STEP, Shape
+from trilane.stages.gpu.composite_painters import taps_of
 
 
 class Box(NamedTuple):
@@ -101,16 +103,56 @@ def _enlarged_down(light: F64, factor: int) -> F64:
     return np.asarray((1 - share) * light[above] + share * light[below])
 
 
+def placed(light: F64, rect: Rect, output: Shape, depth: float) -> Layer:
+    """`light` (h,w,C), which fills `rect` of a picture of `output` (height, width), read at the picture's pixels.
+
+    Each pixel whose middle lies in `rect` is the mean of as many bilinear reads as the composite takes, evenly over the
+    pixel; beyond the middles of the outermost pixels of `light` their values go on.
+    """
+    top, bottom = (1 - rect.y1) / 2 * output[0], (1 - rect.y0) / 2 * output[0]
+    left, right = (1 + rect.x0) / 2 * output[1], (1 + rect.x1) / 2 * output[1]
+    height, width = light.shape[:2]
+    taps = taps_of((height, width), (bottom - top, right - left))
+    first_row, rows = _reads(top, bottom, height, output[0], taps)
+    first_column, columns = _reads(left, right, width, output[1], taps)
+    box = Box(first_row, first_column, first_row + len(rows), first_column + len(columns))
+    across = np.einsum("xw,hwc->hxc", columns, light, optimize=True)
+    return Layer(box, depth, np.asarray(np.einsum("yh,hxc->yxc", rows, across, optimize=True)))
+
+
+def _reads(begin: float, end: float, count: int, side: int, taps: int) -> tuple[int, F64]:
+    """Along one axis: the first pixel of a picture of `side` whose middle lies in [begin, end), in its pixels, and for
+    it and the others (n, count) how much each of the `count` pixels between `begin` and `end` counts.
+    """
+    first, last = (min(max(int(np.ceil(place - 0.5)), 0), side) for place in (begin, end))
+    middles = np.arange(first, last)[:, None] + 0.5
+    offsets = (np.arange(taps) + 0.5) / taps - 0.5
+    places = np.clip((middles + offsets - begin) / (end - begin) * count - 0.5, 0, count - 1)
+    lower = np.floor(places).astype(int)
+    upper, share = np.minimum(lower + 1, count - 1), places - lower
+    weights = np.zeros((last - first, count))
+    pixel = np.broadcast_to(np.arange(last - first)[:, None], places.shape)
+    np.add.at(weights, (pixel, lower), (1 - share) / taps)
+    np.add.at(weights, (pixel, upper), share / taps)
+    return first, weights
+
+
 def blended(background: U8, layers: Iterable[Layer]) -> U8:
     """`layers` over `background`, both sRGB, (h,w,3) uint8; the farthest layer first."""
+    return np.asarray(np.rint(laid_over(background, layers)[0] * 255), np.uint8)
+
+
+def laid_over(background: U8, layers: Iterable[Layer]) -> tuple[F64, F64]:
+    """The same (h,w,3) in 0..1, not rounded, and how much of each pixel (h,w) the layers cover."""
     output = (background.shape[0], background.shape[1])
-    light = to_light(background / 255.0)
+    light, seen_through = to_light(background / 255.0), np.ones(output)
     for layer in sorted(layers, key=lambda layer: layer.depth):
         box = layer.box.on(output)
         own = layer.light[box.top - layer.box.top :, box.left - layer.box.left :][: box.shape[0], : box.shape[1]]
         part = np.s_[box.top : box.bottom, box.left : box.right]
         light[part] = own[..., :3] + (1 - own[..., 3:]) * light[part]
-    return np.asarray(np.rint(to_code(light) * 255), np.uint8)
+        seen_through[part] *= 1 - own[..., 3]
+    return to_code(light), 1 - seen_through
 
 
 def to_light(code: F64) -> F64:

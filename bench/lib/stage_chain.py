@@ -8,7 +8,7 @@ view takes the pipeline's bypass, as in a run.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +20,15 @@ from trilane.pipeline.shared_assets import Assets
 from trilane.pipeline.stage import Skip, UnitContext
 from trilane.pipeline.unit_loop import factory_named
 from trilane.scene.work import Work
+from trilane.stages.avatar_assets import network_of
 from trilane.stages.avatar_pipeline import avatar_pipeline
 from trilane.stages.configure import Checked
+from trilane.stages.cpu.pose import PoseStage
 from trilane.stages.gpu.opengl_context import CONTEXT, open_context
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 Units = Mapping[str, UnitContext]
+RASTER = 1
 
 
 def units_of(pipeline: Pipeline, assets: Assets) -> Units:
@@ -34,7 +37,7 @@ def units_of(pipeline: Pipeline, assets: Assets) -> Units:
 
 
 class StageChain:
-    """All stages of a pipeline but the last, on one slot an edge."""
+    """All stages of a pipeline but the last, on one slot an edge. `made`: the stages themselves."""
 
     def __init__(self, pipeline: Pipeline, units: Units) -> None:
         """Build and bind the stages. Raises what their factories raise."""
@@ -43,10 +46,12 @@ class StageChain:
         begin, end = pipeline.bypass or (None, None)
         self._end = [stage.name for stage in pipeline.stages].index(end) if end is not None else 0
         self._stages = []
+        self.made = []
         for stage, output in zip(pipeline.stages, self.packets, strict=False):  # the last stage has no output
             unit = units[stage.unit]
             inputs = [named[edge] for edge in pipeline.edges_into(stage.name)]
             made = factory_named(stage.factory)(stage.settings, unit)
+            self.made.append(made)
             self._stages.append(BoundStage(stage.name, made, inputs, [output], 0, unit, stage.name == begin))
 
     def run(self, frame: int, last: int | None = None) -> Packet:
@@ -75,6 +80,7 @@ class AvatarFrames:
         self.units = units_of(pipeline, checked.assets) if units is None else units
         self._chain = StageChain(pipeline, self.units)
         self._composite = len(pipeline.stages) - 2
+        self._channels = network_of(checked.assets).channels
         self._shape = (checked.config.scene.output.height, checked.config.scene.output.width, 3)
 
     def frame(self, number: int) -> U8:
@@ -90,6 +96,24 @@ class AvatarFrames:
         """(h,w,3) uint8: the same with everything that is under the avatars, their shadows too, but without them."""
         self._chain.run(number, self._composite - 1).payload[:] = 0
         return self._picture(self._chain.go_on(number))
+
+    def tensor_of(self, number: int) -> U8:
+        """(h,w,C) of frame `number`, as its raster stage drew it. Somebody must be seen in it."""
+        payload = self._chain.run(number, RASTER).payload
+        height, width = self.posed["tensor_shape"].tolist()
+        tensor: U8 = payload[: height * width * self._channels].reshape(height, width, self._channels).copy()
+        return tensor
+
+    def composited(self, number: int, painted: U8) -> U8:
+        """(h,w,3) uint8: frame `number` with `painted` (h,w,4) in place of the network's picture, of its shape."""
+        self._chain.run(number, self._composite - 1).payload[: painted.size] = painted.reshape(-1)
+        return self._picture(self._chain.go_on(number))
+
+    @property
+    def levels(self) -> Mapping[int, int]:
+        """Of the avatars that are in view in the frame that was made last, by number: the level of `DETAILS`."""
+        pose = cast(PoseStage, self._chain.made[0])
+        return {index: seen.level for index, seen in pose.plan.seen.items()}
 
     @property
     def posed(self) -> NDArray[np.void]:

@@ -163,8 +163,7 @@ class AvatarPainter:
         """
         top, left, height, width = tensor_rect
         rows, columns = (rect[3] - rect[1]) / 2 * target.height, (rect[2] - rect[0]) / 2 * target.width
-        density = max(height / max(rows, 1e-6), width / max(columns, 1e-6))
-        taps = int(np.clip(np.ceil(density - 0.25), 1, MAX_TAPS))
+        density, taps = _density((height, width), (rows, columns)), taps_of((height, width), (rows, columns))
         parts = WHOLE
         if rows * columns >= WORTH_CUTTING_PX:
             parts = spans(self._shown[top : top + height, left : left + width], math.ceil(density / 2) + 1)
@@ -190,6 +189,18 @@ class AvatarPainter:
         premultiplied.filter = (moderngl.LINEAR, moderngl.LINEAR)
         premultiplied.repeat_x = premultiplied.repeat_y = False
         return straight, self._ctx.framebuffer([premultiplied]), premultiplied
+
+
+def taps_of(cell: tuple[int, int], pixels: tuple[float, float]) -> int:
+    """How many reads, along a side, a pixel of the screen is the mean of, when `cell` of a picture fills `pixels`.
+
+    Both (height, width).
+    """
+    return int(np.clip(np.ceil(_density(cell, pixels) - 0.25), 1, MAX_TAPS))
+
+
+def _density(cell: tuple[int, int], pixels: tuple[float, float]) -> float:
+    return max(side / max(length, 1e-6) for side, length in zip(cell, pixels, strict=True))
 
 
 def _sides(cell: tuple[int, int, int, int]) -> tuple[int, int, int, int]:

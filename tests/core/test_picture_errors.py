@@ -160,6 +160,10 @@ def test_all_figures_of_a_picture() -> None:
     for module in ("skimage", "flip_evaluator"):
         pytest.importorskip(module)
     mask = np.eye(32, dtype=bool)
+    nearly = np.full((32, 32, 3), 0.5)
+    nearly[0, 0, 0] += 1e-12
+    computed, known = (figures(grey(0.5), one, mask, ~mask).as_json() for one in (nearly, grey(0.5)))
+    assert computed == pytest.approx(known, abs=1e-6)
     found = figures(grey(0.5), grey(0.5), mask, ~mask).as_json()
     assert found == {
         "mae": 0.0,

@@ -7,12 +7,13 @@ depends on the machine is not here.
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from trilane.apps.cli import bench
-from trilane.apps.experiments import accuracy, hard_cases
+from trilane.apps.experiments import accuracy, error_by_cause, hard_cases
 from trilane.apps.experiments.hard_numbers import all_rows
 from trilane.stages import configure, machine_facts
 
@@ -66,6 +67,56 @@ def test_differences_between_runtimes(
     monkeypatch.setattr(accuracy, "runtime_differences", lambda *_: result)
     asked = ("accuracy", "--runtime", "ort", "--runtime", "openvino")
     check_printed(f"accuracy-{code}", printed(*asked, code=code))
+
+
+@pytest.mark.usefixtures("known_machine")
+def test_errors_by_cause(
+    tmp_path: Path, printed: Printed, check_printed: Check, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A cause that moves vertices and one that does not; a figure that a small picture has not; the sums."""
+    figures = {
+        "mae": 1.5,
+        "square": 9.0,
+        "psnr_db": 38.6,
+        "ssim": 0.99,
+        "ms_ssim": None,
+        "flip": 0.02,
+        "dice": 1,
+        "iou": 1,
+    }
+    adds = {"mae": 0.75, "square": 4.5, "product": 3.0}
+    row = {"cause": "FP16 texture", "alone": figures, "step": figures, "so_far": figures, "adds": adds, "moved": None}
+    moved = row | {"cause": "skin weights", "moved": {"largest_mm": 1.25, "mean_mm": 0.5, "largest_px": 0.125}}
+    left = {"mae": 0.0, "square": 1e-12, "product": 0.0}
+    result = {
+        "causes": [moved, row],
+        "whole": figures,
+        "sums": {"in_order": adds, "left_in_order": left, "alone": adds, "left_alone": adds},
+        "remainder": figures | {"mae": 0.0},
+        "truth": {
+            name: {key: figures[key] for key in figures if key not in ("dice", "iou")} for name in ("reference", "run")
+        },
+        "frames": [0, 9],
+        "empty_frames": [9],
+        "network": "a network",
+        "config": {"scene": "default", "plan": "planned", "size": "256", "runtime": "ort"},
+    }
+    asked = []
+
+    def measured(*arguments: Any) -> Any:
+        asked.append(arguments[:3])
+        return result
+
+    monkeypatch.setattr(configure, "configure", lambda request, _: request)
+    monkeypatch.setattr(error_by_cause, "error_by_cause", measured)
+    out = tmp_path / "maps"
+    check_printed("accuracy-by-cause", printed("accuracy", "--by-cause", "--runtime", "ort", "--out", out))
+    assert out.is_dir()
+    printed("accuracy", "far", "--by-cause", "--size", "64", "--frames", 3)
+    assert asked == [
+        (configure.Request("default", runtime="ort"), 2, out),
+        (configure.Request("far", size="64"), 3, None),
+    ]
 
 
 def test_hard_cases(printed: Printed, check_printed: Check, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -37,6 +37,9 @@ def test_runtimes_are_compared_on_the_frames_of_a_scene(drawable_bundle: Path) -
         (("--runtime", "ort", "--runtime", "ort"), "two or more"),
         (("--runtime", "ort", "--runtime", "abacus"), "'abacus'"),
         (("beach",), "default"),
+        (("--by-cause", "--hard-cases"), "--hard-cases"),
+        (("--by-cause", "--runtime", "ort", "--runtime", "openvino"), "one runtime"),
+        (("--out", "maps"), "--by-cause"),
     ],
 )
 def test_wrong_usage_is_one_sentence(arguments: tuple[str, ...], said: str) -> None:

@@ -1,0 +1,282 @@
+"""The reference path of a frame, and the same with causes of error switched on, up to the run's own picture.
+
+Rule: with no cause it is the plan `full` (`bench/lib/full_picture.py`): float64 body with everything on, supersampled
+float64 raster, float texture, unrounded tensor of the network's own area, FP32 network, blend in linear light in
+float64, not rounded. Each cause replaces one of these by what the run has; with all of them the picture is the run's.
+Motion, camera, background and contact shadows are the run's own throughout.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.apps.experiments.causes import NOTHING, Cause, Causes, require_complete
+from trilane.apps.experiments.run_body import RunBody
+from trilane.arrays import F32, F64, U8, Mask
+from trilane.avatars.integer_network import Affine, NetworkFile
+from trilane.avatars.network_reshape import reshaped
+from trilane.bench.lib.cast import Cast, Seen
+from trilane.bench.lib.float_raster import quantise
+from trilane.bench.lib.full_network import Paint, as_written, float_network
+from trilane.bench.lib.full_picture import SAMPLES, fineness, supersampled
+from trilane.bench.lib.layers import Box, Layer, enlarged, grown, laid_over, placed, premultiplied, shrunk
+from trilane.bench.lib.stage_chain import AvatarFrames
+from trilane.scene.crop import Rect, crop_projection
+from trilane.scene.tensor_layout import Cell
+from trilane.scene.work import Work
+from trilane.shapes import BUCKET_STEP, Shape
+from trilane.stages.avatar_assets import AvatarData
+from trilane.stages.configure import Checked
+from trilane.stages.dsp.runtime import Binding, RuntimeOptions, load_runtime
+from trilane.stages.gpu.avatar_mesh import avatar_mesh
+from trilane.stages.gpu.mesh_arrays import MeshArrays
+
+#: From so much cover on a pixel belongs to a mask.
+HALF = 0.5
+
+
+@dataclass(frozen=True)
+class ReferenceFrame:
+    """Frame `number`. `picture` (h,w,3): sRGB in 0..1. `mask` (h,w): where avatars cover at least half of a pixel.
+
+    `boxes`: the parts of the picture that hold avatars.
+    """
+
+    number: int
+    picture: F64
+    mask: Mask
+    boxes: tuple[Box, ...]
+
+
+class ReferencePath:
+    """The frames of the scene in `checked`. `networks`: what paints the reference, for people. `gl`: the context."""
+
+    def __init__(self, checked: Checked) -> None:
+        """Raises BadInputError, MissingPartError."""
+        config = checked.config
+        self.cast, self.frames = Cast(checked), AvatarFrames(checked)
+        self.output: Shape = (config.scene.output.height, config.scene.output.width)
+        on_cpu = bool(config.posed_vertices)
+        self.avatars = {folder: _avatar(data, config.runtime, on_cpu) for folder, data in self.cast.avatars.items()}
+
+    @property
+    def networks(self) -> list[str]:
+        return sorted({avatar.network for avatar in self.avatars.values()})
+
+    @property
+    def gl(self) -> Any:
+        return self.frames.gl
+
+    def frame(self, number: int) -> ReferenceFrame:
+        """Frame `number` by the reference."""
+        return self.moment(number).frame(NOTHING)
+
+    def moment(self, number: int) -> Moment:
+        """Frame `number`, to be made with any causes."""
+        return Moment(self, number)
+
+
+class Moment:
+    """One frame, whose parts are made once. `own` (h,w,3): the run's picture. `seen`: who is, by number."""
+
+    def __init__(self, path: ReferencePath, number: int) -> None:
+        self._path, self.number = path, number
+        self.seen = {seen.index: seen for seen in path.cast.seen(number)}
+        self.boxes = tuple(path.cast.boxes(number))
+        self.background = path.frames.background(number)
+        self.own: F64 = path.frames.frame(number) / 255.0
+        self._header, self._levels = path.frames.posed.copy(), dict(path.frames.levels)
+        self._made: dict[Hashable, Any] = {}
+
+    def frame(self, causes: Causes) -> ReferenceFrame:
+        """The frame with `causes` switched on. Raises ValueError when one lacks what it needs."""
+        made: ReferenceFrame = self._once(("frame", require_complete(causes)), lambda: self._frame(causes))
+        return made
+
+    def _frame(self, causes: Causes) -> ReferenceFrame:
+        picture, cover = laid_over(self.background, self._layers(causes))
+        if Cause.COMPOSITE in causes:
+            picture = self._composited(causes)
+        return ReferenceFrame(self.number, picture, cover >= HALF, self.boxes)
+
+    def vertices(self, index: int, causes: Causes) -> F64:
+        """(V,3) metres of avatar `index`, which is seen."""
+        seen = self.seen[index]
+        body = self._path.avatars[seen.folder].body
+        level = self._levels.get(index)
+        wanted = causes & {Cause.WEIGHTS, Cause.BLEND, Cause.FLOAT32}
+        vertices: F64 = self._once((index, wanted), lambda: body.vertices(seen, level, wanted))
+        return vertices
+
+    def clip(self, index: int) -> F64:
+        """(4,4) of the whole picture: projection @ view."""
+        return self._path.cast.projection @ self.seen[index].view
+
+    def _layers(self, causes: Causes) -> list[Layer]:
+        if Cause.CROP not in causes:
+            return [self._own_layer(seen, causes) for seen in self.seen.values()]
+        cells = self._cells()
+        if not cells:
+            return []
+        light = premultiplied(self._painted(causes))
+        return [
+            placed(light[top : top + height, left : left + width], rect, self._path.output, seen.depth)
+            for seen, rect, (top, left, height, width) in cells
+        ]
+
+    def _own_layer(self, seen: Seen, causes: Causes) -> Layer:
+        """Of an avatar with a tensor of its own, on the picture's grid, as in the plan `full`."""
+        avatar = self._path.avatars[seen.folder]
+        times = fineness(seen.box.shape, avatar.area)
+        box = grown(seen.box, BUCKET_STEP * times.denominator)
+        height, width = (int(side * times) for side in box.shape)
+        projection, view = _rounded(causes, seen.projection, seen.view)
+        (clip,) = _rounded(causes, crop_projection(projection, box.within(seen.box)) @ view)
+        tensor = self._drawn(seen, clip, (height, width), causes)
+        painted = premultiplied(self._paint(avatar, avatar.packed(tensor, causes), causes))
+        return Layer(box, seen.depth, enlarged(shrunk(painted, times.numerator), times.denominator))
+
+    def _cells(self) -> list[tuple[Seen, Rect, Cell]]:
+        """Who is in the run's tensor, the crop rectangle, and its part of the tensor."""
+        if int(self._header["work"]) != Work.FULL:
+            return []
+        visible = [row for row in self._header["avatars"] if row["visible"] and int(row["avatar"]) in self.seen]
+        return [(self.seen[int(row["avatar"])], Rect(*map(float, row["rect"])), _cell(row)) for row in visible]
+
+    def _painted(self, causes: Causes) -> F32:
+        """(h,w,4): the picture of the run's tensor, which all avatars share."""
+        avatar = next(iter(self._path.avatars.values()))
+        return self._paint(avatar, self._tensor(avatar, causes), causes)
+
+    def _tensor(self, avatar: _Avatar, causes: Causes) -> F64:
+        """(h,w,C) real numbers: of the run's shape and crops."""
+        if Cause.RASTER in causes:
+            drawn = self._once("drawn", lambda: self._path.frames.tensor_of(self.number))
+            return avatar.real(drawn)
+        height, width = self._header["tensor_shape"].tolist()
+        tensor = np.zeros((height, width, avatar.texture.shape[2]))
+        for seen, rect, (top, left, high, wide) in self._cells():
+            projection, view = _rounded(causes, self._path.cast.projection, seen.view)
+            (clip,) = _rounded(causes, crop_projection(projection, rect) @ view)
+            tensor[top : top + high, left : left + wide] = self._drawn(seen, clip, (high, wide), causes)
+        return avatar.packed(tensor, causes)
+
+    def _drawn(self, seen: Seen, clip: F64, shape: Shape, causes: Causes) -> F64:
+        """(h,w,C): one avatar by the float64 rasteriser."""
+        avatar = self._path.avatars[seen.folder]
+        vertices, texture = self.vertices(seen.index, causes), avatar.texture
+        if Cause.FLOAT16 in causes:
+            texture = texture.astype(np.float16).astype(np.float32)
+        samples = 1 if Cause.READS in causes else SAMPLES
+        key = _digest(vertices, clip, texture), shape, samples
+        drawn: F64 = self._once(key, lambda: supersampled(vertices, avatar.mesh, clip, shape, texture, samples))
+        return drawn
+
+    def _paint(self, avatar: _Avatar, tensor: F64, causes: Causes) -> F32:
+        paint = avatar.paint
+        if Cause.RUNTIME in causes:
+            paint = avatar.by_runtime
+        elif Cause.QUANTISATION in causes:
+            paint = avatar.as_written
+        painted: F32 = self._once((paint, _digest(tensor)), lambda: paint(tensor))
+        return painted
+
+    def _composited(self, causes: Causes) -> F64:
+        """(h,w,3): by the composite stage, of the network's picture in bytes."""
+        if not self._cells():
+            return self.own
+        painted = np.asarray(np.rint(self._painted(causes) * 255), np.uint8)
+        made: F64 = self._once(_digest(painted), lambda: self._path.frames.composited(self.number, painted) / 255.0)
+        return made
+
+    def _once(self, key: Hashable, make: Callable[[], Any]) -> Any:
+        """What `make` gives, made once for each `key`: a cause that changes nothing costs nothing."""
+        if key not in self._made:
+            self._made[key] = make()
+        return self._made[key]
+
+
+@dataclass(frozen=True)
+class _Avatar:
+    """One distinct avatar. `area`: of the tensor that its network is for, in pixels. `network`: `paint`, for people.
+
+    `encoding`: of the tensor's bytes. `paint`, `as_written`, `by_runtime`: networks in FP32, in integers as the file
+    says, and on the run's runtime, which take real numbers.
+    """
+
+    body: RunBody
+    mesh: MeshArrays
+    texture: F32
+    encoding: Affine
+    area: int
+    paint: Paint
+    network: str
+    as_written: Paint
+    by_runtime: Paint
+
+    def packed(self, tensor: F64, causes: Causes) -> F64:
+        """`tensor` as its bytes say it when the causes have packing; else itself."""
+        if Cause.PACKING not in causes:
+            return tensor
+        return self.real(quantise(tensor, self.encoding.scale, self.encoding.zero_point))
+
+    def real(self, tensor: U8) -> F64:
+        """What the bytes of a tensor stand for."""
+        return (tensor.astype(np.float64) - self.encoding.zero_point) * self.encoding.scale
+
+
+def _avatar(data: AvatarData, runtime: str, on_cpu: bool) -> _Avatar:
+    paint, network = float_network(data.bundle)
+    entry = data.bundle.manifest.network.input
+    _, height, width, _ = data.network.shape
+    return _Avatar(
+        body=RunBody(data, on_cpu=on_cpu),
+        mesh=avatar_mesh(data.shaped),
+        texture=data.texture,
+        encoding=Affine(entry.scale, entry.zero_point),
+        area=height * width,
+        paint=paint,
+        network=network,
+        as_written=as_written(data.network),
+        by_runtime=_by_runtime(data.network, runtime),
+    )
+
+
+def _by_runtime(network: NetworkFile, name: str) -> Paint:
+    """`network` on runtime `name`, of tensors whose real numbers are those of bytes."""
+    bound: dict[Shape, tuple[U8, U8, Binding]] = {}
+
+    def paint(tensor: F64) -> F32:
+        shape = (tensor.shape[0], tensor.shape[1])
+        if shape not in bound:
+            slots = np.empty((1, *tensor.shape), np.uint8), np.empty((1, *shape, 4), np.uint8)
+            session = load_runtime(name).load(reshaped(network, *shape), RuntimeOptions(threads=1))
+            bound[shape] = (*slots, session.bind(slots[:1], slots[1:]))
+        slot_in, slot_out, binding = bound[shape]
+        slot_in[0] = quantise(tensor, network.input.scale, network.input.zero_point)
+        binding.run()
+        return np.asarray(slot_out[0] / np.float32(255))
+
+    return paint
+
+
+def _rounded(causes: Causes, *matrices: F64) -> list[F64]:
+    """`matrices` in float32 when the causes say so."""
+    if Cause.FLOAT32 not in causes:
+        return list(matrices)
+    return [matrix.astype(np.float32).astype(np.float64) for matrix in matrices]
+
+
+def _cell(avatar: NDArray[np.void]) -> Cell:
+    top, left, height, width = (int(side) for side in avatar["tensor_rect"])
+    return top, left, height, width
+
+
+def _digest(*arrays: NDArray[Any]) -> bytes:
+    return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).digest()
