@@ -266,6 +266,17 @@ def test_a_lost_connection_comes_back_and_says_so(opened: Callable[..., Watched]
     assert seen.foreign == []
 
 
+def test_where_the_run_is_over_nobody_asks_again(opened: Callable[..., Watched]) -> None:
+    view = DoubleView()
+    with Served(view) as served:
+        seen = opened(served.url)
+        seen.wait_for("() => document.getElementById('picture').dataset.frame > 0")
+        view.end()
+        seen.wait_for("() => document.getElementById('state').textContent === 'run: ended'")
+    seen.wait_for("() => document.getElementById('link').textContent.startsWith('the run is over')")
+    assert seen.is_well()
+
+
 def test_a_finished_run_is_sought_and_played(opened: Callable[..., Watched]) -> None:
     view = DoubleView(is_live=False)
     with Served(view) as served:

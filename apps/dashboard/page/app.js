@@ -47,7 +47,12 @@ let drawnAt = 0;
 let notedAt = 0;
 
 const notes = new Notes(byId("notes"));
-const connection = new Connection({ message: received, picture: pictured, link: linked });
+const connection = new Connection({
+  message: received,
+  picture: pictured,
+  link: linked,
+  isOver: () => isLive && isOver,
+});
 const controls = new Controls(
   { live: byId("live-controls"), restart: byId("restart-controls"), actions: byId("transport") },
   (name, value) => connection.control(name, value),
@@ -183,8 +188,7 @@ async function pictured(shown) {
 
 function linked(link, text) {
   byId("link").dataset.is = link;
-  const isServerGone = link === "lost" && isOver && isLive;
-  setText(byId("link"), isServerGone ? "the run is over and its server gone; `trilane dashboard` shows it again" : text);
+  setText(byId("link"), text);
 }
 
 function playOrPause() {

@@ -1,4 +1,4 @@
-// The one WebSocket. Rule: it says of itself what it is (connecting, open, lost) and comes back by itself; of pictures
+// The one WebSocket. Rule: it says of itself what it is, and comes back by itself while there is a run; of pictures
 // there is never more than one request on its way, so a slow page gets fewer of them and makes nobody wait.
 
 const FIRST_RETRY_MS = 500;
@@ -35,7 +35,7 @@ export function parse(buffer) {
 }
 
 export class Connection {
-  // on: {message(json), picture(picture), link(state, text)}; state: "connecting", "open" or "lost".
+  // on: {message(json), picture(picture), link(state, text), isOver()}; state: "connecting", "open", "lost" or "over".
   constructor(on) {
     this.on = on;
     this.retryMs = FIRST_RETRY_MS;
@@ -76,6 +76,10 @@ export class Connection {
     this.isPictureAsked = false;
     if (this.openedAt !== null && performance.now() - this.openedAt > STEADY_MS) this.retryMs = FIRST_RETRY_MS;
     this.openedAt = null;
+    if (this.on.isOver()) {
+      this.on.link("over", "the run is over and its server gone; `trilane dashboard` shows it again");
+      return;
+    }
     const why = event.reason ? ` (${event.reason})` : "";
     this.on.link("lost", `connection lost${why}; trying again in ${(this.retryMs / 1000).toFixed(1)} s`);
     this.timer = setTimeout(() => this.open(), this.retryMs);

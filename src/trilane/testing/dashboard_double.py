@@ -209,6 +209,11 @@ class DoubleView:
         client.had_frame = frame
         return shown(frame, frame * PERIOD_MS, 14.0, jpeg(frame, self.turn_deg, self.zoom))
 
+    def end(self) -> None:
+        """The run is over."""
+        self.state = "ended"
+        self._notes.append(self._state())
+
     def control(self, asked: ControlSaid) -> str:
         """Note it; do what changes pictures and state."""
         self.said.append(asked)
