@@ -40,7 +40,7 @@ from trilane.writing import WRITABLE
 
 FLUSH_NS = 250_000_000
 SAMPLE_NS = 5_000_000_000
-STEPS_AT_ONCE = 16  # two or three frames
+STEPS_AT_ONCE = 64  # some twelve frames
 PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 
 
