@@ -15,6 +15,7 @@ import typer
 from trilane.apps.cli.commands import Commands
 from trilane.apps.cli.console import stderr_console
 from trilane.apps.cli.options import PortOption
+from trilane.errors import BadInputError
 
 app = Commands()
 
@@ -24,7 +25,7 @@ Examples:
   trilane dashboard runs/walk --port 8080
 """
 
-FolderArgument = Annotated[Path, typer.Argument(help="Run folder that `trilane run` has written.")]
+FolderArgument = Annotated[Path, typer.Argument(help="Folder of a run, or its name below runs/.")]
 
 
 @app.command(epilog=EPILOG)
@@ -40,8 +41,13 @@ def dashboard(run: FolderArgument, port: PortOption = None) -> None:
     from trilane.apps.dashboard.app import DashboardApp
     from trilane.apps.dashboard.finished_view import FinishedView
     from trilane.apps.dashboard.serve import server
+    from trilane.apps.followed_run import RunState, follow
 
-    with contextlib.closing(FinishedView(run)) as view, contextlib.closing(listen(port)) as place:
+    followed = follow(run)
+    if followed.state is RunState.GOES_ON:
+        remedy = "`trilane top` shows it; start it with `trilane run --dashboard` to see it in a browser"
+        raise BadInputError(run, "a run that goes on", "one that is over", remedy)
+    with contextlib.closing(FinishedView(followed.folder)) as view, contextlib.closing(listen(port)) as place:
         answers = DashboardApp(view, place.port, place.token)
         stderr_console().print(f"dashboard: {place.url}", soft_wrap=True, markup=False)
         asyncio.run(server(answers.asgi).serve(sockets=[place.listener]))

@@ -28,6 +28,7 @@ from trilane.apps.dashboard.wire import ControlSaid, MalformedError, PictureAske
 PAGE: Final = Path(__file__).with_name("page")
 NEWS_S: Final = 0.1
 PICTURE_S: Final = 0.01
+LAST_S: Final = 0.3
 MOST_FAULTS: Final = 16
 OPENMETRICS: Final = "application/openmetrics-text; version=1.0.0; charset=utf-8"
 #: Codes with which a WebSocket ends that said what it may not.
@@ -55,6 +56,11 @@ class DashboardApp:
         ]
         app = Starlette(routes=routes, lifespan=self._lifespan)
         self.asgi: Asgi = Guard(app, port, token, self._refusals)
+
+    async def finish(self) -> None:
+        """Tell all clients what is still to be told; they have a moment to take it."""
+        await self._tell_newest()
+        await asyncio.sleep(LAST_S)
 
     @contextlib.asynccontextmanager
     async def _lifespan(self, _app: Starlette) -> AsyncIterator[None]:
@@ -135,11 +141,14 @@ class DashboardApp:
         counts = self._refusals.as_json()
         while True:
             await asyncio.sleep(NEWS_S)
-            for message in await self._view.news(is_watched=len(self._clients) > 0):
-                self._clients.tell(said(message))
+            await self._tell_newest()
             if counts != self._refusals.as_json():
                 counts = self._refusals.as_json()
                 self._clients.tell(said(self._refused()))
+
+    async def _tell_newest(self) -> None:
+        for message in await self._view.news(is_watched=len(self._clients) > 0):
+            self._clients.tell(said(message))
 
     async def _hand_out_pictures(self) -> None:
         while True:

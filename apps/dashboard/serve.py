@@ -9,6 +9,7 @@ import errno
 import secrets
 import socket
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Any, Final
 
 from trilane.apps.dashboard.guard import ADDRESS
@@ -20,6 +21,7 @@ PATIENCE_MS: Final = 10_000
 PING_S: Final = 10.0
 BACKLOG: Final = 256
 TOKEN_BYTES: Final = 24
+PACKAGES: Final = ("starlette", "uvicorn", "websockets", "prometheus_client")
 
 
 @dataclass(frozen=True)
@@ -43,12 +45,9 @@ class Place:
 
 def require_server() -> None:
     """Raises MissingPartError when the packages of the extra are missing."""
-    try:
-        import starlette  # noqa: F401
-        import uvicorn  # noqa: F401
-        import websockets  # noqa: F401
-    except ImportError as error:
-        raise MissingPartError(f"the dashboard needs the package {error.name}", install_line("dashboard")) from None
+    for package in PACKAGES:
+        if find_spec(package) is None:
+            raise MissingPartError(f"the dashboard needs the package {package}", install_line("dashboard"))
 
 
 def listen(port: int | None) -> Place:

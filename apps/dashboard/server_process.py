@@ -29,10 +29,13 @@ async def serve(listener: socket.socket, channel: Channel, window_fd: int) -> No
     view = LiveView(window, channel.send)
     app = DashboardApp(view, listener.getsockname()[1], opened.token)
     answers = server(app.asgi)
-    asyncio.get_running_loop().add_reader(channel.fd, _hear, channel, view, answers)
+    run_is_over = asyncio.Event()
+    asyncio.get_running_loop().add_reader(channel.fd, _hear, channel, view, run_is_over)
+    leaving = asyncio.create_task(_leave(run_is_over, app, answers))
     os.setpriority(os.PRIO_PROCESS, 0, NICE)  # what was imported until now had to be there at once
     os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))  # it takes no core from a unit by waking up
     await answers.serve(sockets=[listener])
+    leaving.cancel()
 
 
 async def _first(channel: Channel) -> Opened:
@@ -43,12 +46,18 @@ async def _first(channel: Channel) -> Opened:
     return message
 
 
-def _hear(channel: Channel, view: LiveView, answers: Any) -> None:
+async def _leave(run_is_over: asyncio.Event, app: DashboardApp, answers: Any) -> None:
+    await run_is_over.wait()
+    await app.finish()
+    answers.should_exit = True
+
+
+def _hear(channel: Channel, view: LiveView, run_is_over: asyncio.Event) -> None:
     try:
         message = channel.receive()
     except EOFError:
         asyncio.get_running_loop().remove_reader(channel.fd)
-        answers.should_exit = True
+        run_is_over.set()
         return
     if message is not None:
         view.hear(message)
