@@ -309,6 +309,11 @@ def test_a_phone_shows_all_of_it_without_scrolling_sideways(opened: Callable[...
         assert light == (theme == "light")
         seen.page.select_option("#theme", "light" if theme == "dark" else "dark")
         assert light != (seen.page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(244, 246, 248)")
+        seen.page.locator("#timeline").scroll_into_view_if_needed()
+        seen.page.locator("#timeline").tap(
+            position={"x": 200, "y": 135}
+        )  # in the lane of the dsp, which rests for 0.9 ms
+        seen.wait_for("() => /^frame \\d+: infer on dsp|^dsp idle/.test(slice.textContent)")
         assert seen.is_well()
 
 

@@ -266,7 +266,8 @@ export class Timeline {
   #point(slice) {
     this.hovered = slice;
     this.isDirty = true;
-    this.say(slice ? this.slices.describe(slice) : "");
+    const told = slice ?? this.selected; // a finger that lets go leaves the canvas too
+    this.say(told ? this.slices.describe(told) : "");
   }
 
   follow() {
