@@ -34,7 +34,11 @@ def made(folder: Path, at_s: int = 0) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("given", ["runs/walk", "walk", f"runs/walk/{NAME}", f"runs/walk.{os.getpid()}.partial"])
+@pytest.mark.parametrize(
+    "given",
+    ["runs/walk", "walk", f"runs/walk/{NAME}", f"runs/walk.{os.getpid()}.partial"],
+    ids=["place", "name", "journal", "partial folder"],
+)
 def test_a_name_a_folder_and_a_journal_mean_the_run_that_goes_on(given: str) -> None:
     folder = made(Path(f"runs/walk.{os.getpid()}.partial"))
     run = follow(Path(given) if NAME not in given else folder / NAME)
