@@ -27,7 +27,7 @@ from trilane.apps.dashboard.wire import ControlSaid, MalformedError, PictureAske
 
 PAGE: Final = Path(__file__).with_name("page")
 NEWS_S: Final = 0.1
-PICTURE_S: Final = 0.01
+PICTURE_S: Final = 0.02
 LAST_S: Final = 0.3
 MOST_FAULTS: Final = 16
 OPENMETRICS: Final = "application/openmetrics-text; version=1.0.0; charset=utf-8"
