@@ -15,6 +15,7 @@ from trilane.bench.lib.layers import (
     box_around,
     enlarged,
     grown,
+    placed,
     premultiplied,
     shrunk,
     to_code,
@@ -138,3 +139,32 @@ def test_a_ramp_stays_a_ramp_and_a_constant_a_constant_when_enlarged(factor: int
     assert own[0, 0, 0] == light[0, 0, 0] and own[-1, -1, 0] == light[-1, -1, 0]
     # What was enlarged and is shrunk again is a ramp away from the border: a square has its pixel's value as mean.
     assert shrunk(own, factor)[1:-1, 1:-1] == pytest.approx(light[1:-1, 1:-1])
+
+
+@pytest.mark.parametrize("times", [1, 2, 3])
+def test_what_lies_on_the_grid_is_placed_as_it_is_enlarged_and_shrunk(times: int) -> None:
+    """So the reference's two ways and the run's one are one filter: bilinear, or means of whole pixels."""
+    light = np.random.default_rng(times).uniform(0, 1, (12, 24, 4))
+    output = (40, 80)
+    box = Box(3, 5, 3 + 12 * times, 5 + 24 * times).on(output)
+    found = placed(light, Box(3, 5, 3 + 12 * times, 5 + 24 * times).rect(output), output, -1.0)
+    assert found.box == box
+    assert found.light == pytest.approx(enlarged(light, times)[: box.shape[0], : box.shape[1]])
+    small = placed(light, Box(3, 5, 3 + 12 // times, 5 + 24 // times).rect(output), output, -1.0)
+    assert small.light == pytest.approx(shrunk(light, times))
+
+
+def test_a_ramp_is_placed_where_it_is() -> None:
+    """In a rectangle on no grid: at the middle of each pixel the ramp's own value, but where it goes on as it ends."""
+    output, rect = (30, 50), Rect(-0.513, -0.407, 0.618, 0.711)
+    count = 16
+    ramp = np.broadcast_to(((np.arange(count) + 0.5) / count)[None, :, None], (count, count, 1))
+    found = placed(ramp.copy(), rect, output, 0.0)
+    middles = (np.arange(found.box.left, found.box.right) + 0.5) / 50 * 2 - 1
+    assert middles[0] >= rect.x0 > middles[0] - 2 / 50 and middles[-1] < rect.x1 <= middles[-1] + 2 / 50
+    inside = (middles - rect.x0) / rect.width
+    clear = np.abs(inside - 0.5) < 0.5 - 0.5 / count
+    assert clear.sum() > 20
+    assert found.light[:, clear, 0] == pytest.approx(np.broadcast_to(inside[clear], found.light[:, clear, 0].shape))
+    rows = (1 - (np.arange(found.box.top, found.box.bottom) + 0.5) / 30 * 2, rect)
+    assert rows[0][0] < rect.y1 and rows[0][-1] >= rect.y0
