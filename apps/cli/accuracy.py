@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from trilane.apps.cli.accuracy_by_cause import show_by_cause
+from trilane.apps.cli.accuracy_by_cause import Files, show_by_cause
 from trilane.apps.cli.commands import Commands
 from trilane.apps.cli.console import print_json, stderr_console, stdout_console, stdout_kept
 from trilane.apps.cli.options import JsonOption, SceneArgument, SceneAvatarOption, SceneSizeOption
@@ -65,6 +65,10 @@ def accuracy(
     out: Annotated[
         Path | None, typer.Option(help="With --by-cause: a folder for error heat maps, PNG.", show_default=False)
     ] = None,
+    lpips_weights: Annotated[
+        Path | None,
+        typer.Option(help="With --by-cause: a file of LPIPS' weights, which is said then.", show_default=False),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Compare the runtimes with each other on a scene's frames, or hard cases with their bounds.
@@ -75,12 +79,12 @@ def accuracy(
     from trilane.stages.dsp.runtime import installed
 
     names = list(runtime or installed())
-    if out is not None and not by_cause:
-        raise BadInputError("--out", str(out), "it beside --by-cause", "heat maps are of causes")
+    if not by_cause:
+        _refuse_without_by_cause({"--out": out, "--lpips-weights": lpips_weights})
     if by_cause:
         _refuse_other_comparisons(hard_cases, runtime or [])
         asked = {"avatar": avatar, "size": size, "runtime": runtime[0] if runtime else "auto"}
-        show_by_cause(scene, asked, BY_CAUSE_FRAMES if frames is None else frames, out, as_json)
+        show_by_cause(scene, asked, BY_CAUSE_FRAMES if frames is None else frames, Files(out, lpips_weights), as_json)
         return
     if hard_cases:
         _refuse_a_scene(scene, {"--avatar": avatar, "--size": size, "--frames": frames})
@@ -89,6 +93,13 @@ def accuracy(
         passed = _scene(scene, avatar, size, FRAMES if frames is None else frames, names, as_json)
     if not passed:
         raise typer.Exit(OUT_OF_BOUNDS)
+
+
+def _refuse_without_by_cause(options: dict[str, Path | None]) -> None:
+    """Raises BadInputError for options that only --by-cause knows."""
+    for name, value in options.items():
+        if value is not None:
+            raise BadInputError(name, str(value), "it beside --by-cause", "the other comparisons do not use it")
 
 
 def _refuse_other_comparisons(hard_cases: bool, runtimes: list[str]) -> None:

@@ -3,28 +3,46 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from trilane.apps.cli.console import print_json, stderr_console, stdout_console, stdout_kept
 
-FIGURES = ("mae", "psnr_db", "ssim", "ms_ssim", "flip", "iou")
-HEADS = ("MAE", "PSNR dB", "SSIM", "MS-SSIM", "FLIP", "mask IoU")
+HEADS = {
+    "mae": "MAE",
+    "psnr_db": "PSNR dB",
+    "ssim": "SSIM",
+    "ms_ssim": "MS-SSIM",
+    "flip": "FLIP",
+    "iou": "mask IoU",
+    "lpips": "LPIPS",
+}
 
 
-def show_by_cause(scene: str, request: dict[str, Any], frames: int, out: Path | None, as_json: bool) -> None:
-    """Measure and print. Raises BadInputError, MissingPartError."""
+@dataclass(frozen=True)
+class Files:
+    """`out`: folder for heat maps. `lpips_weights`: file of LPIPS' weights. None: without them."""
+
+    out: Path | None = None
+    lpips_weights: Path | None = None
+
+
+def show_by_cause(scene: str, request: dict[str, Any], frames: int, files: Files, as_json: bool) -> None:
+    """Measure and print. `request`: options of the run. Raises BadInputError, MissingPartError."""
     from trilane.apps.experiments.error_by_cause import error_by_cause
+    from trilane.apps.experiments.lpips_error import Lpips
     from trilane.stages.configure import Request, configure, required_machine
     from trilane.writing import write_folder
 
+    out, lpips = files.out, None if files.lpips_weights is None else Lpips(files.lpips_weights)
     checked = configure(Request(scene, **request), Path.cwd())
     machine = required_machine()
     if out is not None:
         with write_folder(out):
             pass  # that it can be written is found out before the work
     with stdout_kept():
-        result = error_by_cause(checked, frames, out, _tracked)
+        result = error_by_cause(checked, frames, out, _tracked, lpips)
     if as_json:
         print_json({"schema": 1, **result, "machine": machine})
     else:
@@ -50,14 +68,16 @@ def _print(result: dict[str, Any]) -> None:
         f"frames {', '.join(map(str, result['frames']))}; measured in this run",
         soft_wrap=True,
     )
-    alone = Table("each cause alone", *HEADS, "moved mm (px)", title="against the reference")
+    shown = [name for name in HEADS if name != "lpips" or whole["lpips"] is not None]
+    heads = (HEADS[name] for name in shown)
+    alone = Table("each cause alone", *heads, "moved mm (px)", title="against the reference")
     for row in result["causes"]:
         moved = row["moved"]
         said = "" if moved is None else f"{moved['largest_mm']:.3g} ({moved['largest_px']:.3g})"
-        alone.add_row(row["cause"], *_cells(row["alone"]), said)
-    alone.add_row("the run", *_cells(whole), "", style="bold")
+        alone.add_row(row["cause"], *_cells(row["alone"], shown), said)
+    alone.add_row("the run", *_cells(whole, shown), "", style="bold")
     for name, figures in (result["truth"] or {}).items():
-        alone.add_row(f"{name} against truth", *_cells(figures), "")
+        alone.add_row(f"{name} against truth", *_cells(figures, shown), "")
     console.print(alone)
     if result["empty_frames"]:
         console.print(f"nobody is in view in frames {', '.join(map(str, result['empty_frames']))}", soft_wrap=True)
@@ -86,8 +106,8 @@ def _sums(sums: dict[str, Any], whole: dict[str, Any], result: dict[str, Any]) -
     ]
 
 
-def _cells(figures: dict[str, float | None]) -> list[str]:
-    return [_number(figures.get(name)) for name in FIGURES]
+def _cells(figures: dict[str, float | None], shown: Sequence[str]) -> list[str]:
+    return [_number(figures.get(name)) for name in shown]
 
 
 def _number(value: float | None) -> str:

@@ -17,7 +17,7 @@ import numpy as np
 
 from trilane.apps.experiments.causes import BODY, NOTHING, WHAT, Cause, needs, up_to
 from trilane.apps.experiments.heat_maps import write_heat_map
-from trilane.apps.experiments.picture_errors import LEAST_MS_SSIM_PX, ErrorFigures, figures, require_metrics
+from trilane.apps.experiments.picture_errors import LEAST_MS_SSIM_PX, ErrorFigures, Perceived, figures, require_metrics
 from trilane.apps.experiments.reference_path import Moment, ReferenceFrame, ReferencePath
 from trilane.arrays import F64, U8
 from trilane.bench.lib.layers import Box
@@ -35,11 +35,16 @@ Frames = Callable[[Sequence[int]], Iterable[int]]
 
 
 def error_by_cause(
-    checked: Checked, frames: int, out: Path | None = None, shown: Frames = lambda numbers: numbers
+    checked: Checked,
+    frames: int,
+    out: Path | None = None,
+    shown: Frames = lambda numbers: numbers,
+    lpips: Perceived | None = None,
 ) -> dict[str, Any]:
     """The error of `frames` frames, evenly spread over the scene in `checked`, split by cause.
 
     `out`: a folder for heat maps; None for none. `shown`: what the frames' numbers go through, such as a progress bar.
+    `lpips`: says LPIPS; None: it is not said.
     Keys: `causes`, a row of each: `cause`, `what`, `needs`, `alone` and `step` (figures against the picture without
     the cause: in the reference, and in the sequence), `so_far` (against the reference), `adds` (`mae`, `square`,
     `product`), `moved` of causes of the body; `whole`; `sums`; `remainder` of the run's own frames against the
@@ -51,7 +56,7 @@ def error_by_cause(
     require_metrics()
     path = ReferencePath(checked)
     truth = _truth(path)
-    split, empty, numbers = _Split(path.output, out), [], _spread(checked.config.scene.frames, frames)
+    split, empty, numbers = _Split(path.output, out, lpips), [], _spread(checked.config.scene.frames, frames)
     for number in shown(numbers):
         moment = path.moment(number)
         if not moment.boxes:
@@ -101,6 +106,7 @@ def _truth(path: ReferencePath) -> Any:
 class _Pooled:
     """Figures of pairs of pictures: MAE and mean square over all pixels, of the others the mean over the frames."""
 
+    lpips: Perceived | None = None
     values: int = 0
     absolute: float = 0.0
     square: float = 0.0
@@ -111,7 +117,7 @@ class _Pooled:
         self.values += difference.size
         self.absolute += float(np.abs(difference).sum())
         self.square += float((difference**2).sum())
-        self.each.append(figures(picture.picture, reference.picture, picture.mask, reference.mask))
+        self.each.append(figures(picture.picture, reference.picture, picture.mask, reference.mask, self.lpips))
 
     @property
     def mae(self) -> float:
@@ -162,13 +168,13 @@ def _pixels(vertices: F64, clip: F64, output: Shape) -> tuple[F64, Any]:
 class _Split:
     """What was counted of the frames that were added."""
 
-    def __init__(self, output: Shape, out: Path | None) -> None:
+    def __init__(self, output: Shape, out: Path | None, lpips: Perceived | None = None) -> None:
         self._output, self._out = output, out
-        self._alone, self._step, self._so_far = ({cause: _Pooled() for cause in Cause} for _ in range(3))
+        self._alone, self._step, self._so_far = ({cause: _Pooled(lpips) for cause in Cause} for _ in range(3))
         self._products = dict.fromkeys(Cause, 0.0)
         self._moved = {cause: _Moved() for cause in Cause if cause in BODY}
-        self._remainder = _Pooled()
-        self._truth = {"reference": _Pooled(), "run": _Pooled()}
+        self._remainder = _Pooled(lpips)
+        self._truth = {"reference": _Pooled(lpips), "run": _Pooled(lpips)}
 
     def add(self, moment: Moment) -> None:
         """Count a frame in which somebody is seen."""

@@ -9,6 +9,7 @@ Sources: SSIM: Wang et al., "Image Quality Assessment", IEEE TIP 13 (2004); MS-S
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -29,6 +30,8 @@ LEAST_MS_SSIM_PX = WINDOW_PX * 2 ** (len(SCALES) - 1)
 LEAST_SSIM_PX = 7
 #: Constants that keep SSIM's quotients from 0 / 0, of values in 0..1.
 C1, C2 = 0.01**2, 0.03**2
+#: LPIPS of a picture and its reference, real numbers in 0..1: `trilane.apps.experiments.lpips_error.Lpips`.
+Perceived = Callable[[F64, F64], float | None]
 
 
 @dataclass(frozen=True)
@@ -37,7 +40,8 @@ class ErrorFigures:
 
     `mae`: mean difference, in steps of 1/255. `psnr_db`: at most 100, which is a picture without an error. `ssim`,
     `ms_ssim`: 1 without an error; None where the picture is too small for them. `flip`: mean, 0 without an error.
-    `dice`, `iou`: of the masks, 1 where they are the same; None without masks.
+    `dice`, `iou`: of the masks, 1 where they are the same; None without masks. `lpips`: 0 without an
+    error; None without its weights and where the picture is too small.
     """
 
     mae: float
@@ -47,6 +51,7 @@ class ErrorFigures:
     flip: float
     dice: float | None = None
     iou: float | None = None
+    lpips: float | None = None
 
     def as_json(self) -> dict[str, float | None]:
         """The figures by their names."""
@@ -54,15 +59,19 @@ class ErrorFigures:
 
 
 def figures(
-    picture: Floats, reference: Floats, mask: Mask | None = None, reference_mask: Mask | None = None
+    picture: Floats,
+    reference: Floats,
+    mask: Mask | None = None,
+    reference_mask: Mask | None = None,
+    lpips: Perceived | None = None,
 ) -> ErrorFigures:
-    """All errors of `picture` against `reference`, and with both masks those of the masks.
+    """All errors of `picture` against `reference`, with both masks those of the masks, with `lpips` what it says.
 
     Raises ValueError when shapes or numbers are not those of two pictures, ImportError without the extra `metrics`.
     """
     masks = None if mask is None or reference_mask is None else (mask, reference_mask)
     if np.array_equal(*_pair(picture, reference)):
-        return _no_error(min(picture.shape[:2]), masks)
+        return _no_error(min(picture.shape[:2]), masks, lpips)
     return ErrorFigures(
         mae=mae(picture, reference),
         psnr_db=psnr_db(picture, reference),
@@ -71,10 +80,11 @@ def figures(
         flip=flip(picture, reference),
         dice=None if masks is None else dice(*masks),
         iou=None if masks is None else iou(*masks),
+        lpips=None if lpips is None else lpips(*_pair(picture, reference)),
     )
 
 
-def _no_error(side: int, masks: tuple[Mask, Mask] | None) -> ErrorFigures:
+def _no_error(side: int, masks: tuple[Mask, Mask] | None, lpips: Perceived | None) -> ErrorFigures:
     """Figures of two pictures that are the same, whose shorter side is `side`: nothing has to be computed."""
     return ErrorFigures(
         mae=0.0,
@@ -84,6 +94,7 @@ def _no_error(side: int, masks: tuple[Mask, Mask] | None) -> ErrorFigures:
         flip=0.0,
         dice=None if masks is None else dice(*masks),
         iou=None if masks is None else iou(*masks),
+        lpips=None if lpips is None else 0.0,
     )
 
 

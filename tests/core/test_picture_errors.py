@@ -173,7 +173,10 @@ def test_all_figures_of_a_picture() -> None:
         "flip": pytest.approx(0.0, abs=1e-6),
         "dice": 0.0,
         "iou": 0.0,
+        "lpips": None,
     }
+    assert figures(grey(0.5), grey(0.5), lpips=lambda *_: 7.0).lpips == 0
+    assert figures(grey(0.5), nearly, lpips=lambda a, b: float(b[0, 0, 0] - a[0, 0, 0])).lpips == pytest.approx(1e-12)
     plain = figures(grey(0.5), grey(0.5))
     assert plain.dice is None and plain.iou is None
     assert set(picture_errors.__all__) >= {"ErrorFigures", "require_metrics"}

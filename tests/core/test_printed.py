@@ -82,6 +82,7 @@ def test_errors_by_cause(
         "ms_ssim": None,
         "flip": 0.02,
         "dice": 1,
+        "lpips": None,
         "iou": 1,
     }
     adds = {"mae": 0.75, "square": 4.5, "product": 3.0}
@@ -104,7 +105,7 @@ def test_errors_by_cause(
     asked = []
 
     def measured(*arguments: Any) -> Any:
-        asked.append(arguments[:3])
+        asked.append((*arguments[:3], *arguments[4:]))
         return result
 
     monkeypatch.setattr(configure, "configure", lambda request, _: request)
@@ -114,8 +115,8 @@ def test_errors_by_cause(
     assert out.is_dir()
     printed("accuracy", "far", "--by-cause", "--size", "64", "--frames", 3)
     assert asked == [
-        (configure.Request("default", runtime="ort"), 2, out),
-        (configure.Request("far", size="64"), 3, None),
+        (configure.Request("default", runtime="ort"), 2, out, None),
+        (configure.Request("far", size="64"), 3, None, None),
     ]
 
 

@@ -40,6 +40,7 @@ def test_runtimes_are_compared_on_the_frames_of_a_scene(drawable_bundle: Path) -
         (("--by-cause", "--hard-cases"), "--hard-cases"),
         (("--by-cause", "--runtime", "ort", "--runtime", "openvino"), "one runtime"),
         (("--out", "maps"), "--by-cause"),
+        (("--lpips-weights", "w.pth"), "--by-cause"),
     ],
 )
 def test_wrong_usage_is_one_sentence(arguments: tuple[str, ...], said: str) -> None:
