@@ -41,7 +41,7 @@ def dashboard(run: FolderArgument, port: PortOption = None) -> None:
     from trilane.apps.dashboard.app import DashboardApp
     from trilane.apps.dashboard.finished_view import FinishedView
     from trilane.apps.dashboard.serve import server
-    from trilane.apps.followed_run import RunState, follow
+    from trilane.apps.live.followed_run import RunState, follow
 
     followed = follow(run)
     if followed.state is RunState.GOES_ON:

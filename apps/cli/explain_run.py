@@ -30,7 +30,7 @@ READ_SO = (
 
 def run_folder(name: str) -> Path | None:
     """The run folder that `trilane explain NAME` means, also of a run that still goes on; None: a scene is meant."""
-    from trilane.apps.followed_run import follow
+    from trilane.apps.live.followed_run import follow
     from trilane.pipeline.journal import NAME
 
     folder = Path(name)

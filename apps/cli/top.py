@@ -1,6 +1,6 @@
 """`trilane top`: the figures of a run while it goes on, or as it ended.
 
-Rule: this module reads options and shows looks; they come from `trilane.apps.run_looks`.
+Rule: this module reads options and shows looks; they come from `trilane.apps.live.run_looks`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from trilane.apps.cli.console import print_json, spinner, stdout_console
 from trilane.errors import BadInputError, MissingPartError
 
 if TYPE_CHECKING:
-    from trilane.apps.run_looks import Look
+    from trilane.apps.live.run_looks import Look
 
 app = Commands()
 
@@ -64,8 +64,8 @@ def top(
     It ends with the run; Ctrl-C ends it before. A finished run is shown as it ended. Where stdout is no terminal, each
     look is a line.
     """
-    from trilane.apps.followed_run import follow
-    from trilane.apps.run_looks import looks
+    from trilane.apps.live.followed_run import follow
+    from trilane.apps.live.run_looks import looks
 
     if json and openmetrics:
         raise BadInputError("options", "--json and --openmetrics", "one of them")
@@ -85,7 +85,7 @@ def top(
 
 def _print_openmetrics(look: Look) -> None:
     try:
-        from trilane.apps.openmetrics import openmetrics
+        from trilane.apps.live.openmetrics import openmetrics
     except ModuleNotFoundError as error:
         raise MissingPartError(f"--openmetrics needs {error.name}", extra="dashboard") from None
     sys.stdout.write(openmetrics(look.figures).decode())

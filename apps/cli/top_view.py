@@ -10,9 +10,9 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from trilane.apps.cli.run_table import DASH, NEEDED, TOO_FEW, accuracy_line
-from trilane.apps.figures import Figures, Moved, UnitFigures
-from trilane.apps.live_figures import LEAST
-from trilane.apps.run_looks import Look
+from trilane.apps.live.figures import Figures, Moved, UnitFigures
+from trilane.apps.live.live_figures import LEAST
+from trilane.apps.live.run_looks import Look
 
 if TYPE_CHECKING:
     from rich.console import Group

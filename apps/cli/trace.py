@@ -33,7 +33,7 @@ def trace(run: RunArgument, chrome_json: ChromeOption = False, out: OutOption = 
 
     docs/trace.md says what every track is.
     """
-    from trilane.apps.followed_run import RunState, follow
+    from trilane.apps.live.followed_run import RunState, follow
     from trilane.apps.tracing.files import write_run
     from trilane.apps.tracing.writer import CHROME_NAME, NAME
 

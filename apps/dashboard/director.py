@@ -13,7 +13,7 @@ from trilane.apps.dashboard.channel import Asked, Message, Refused, RunBegins, S
 from trilane.apps.dashboard.choices import choices_of, reasons_against
 from trilane.apps.dashboard.controls import NO_PROFILE, OF_A_NEW_RUN, controls_of_run
 from trilane.apps.dashboard.known_runs import facts_of_checked
-from trilane.apps.followed_run import run_name
+from trilane.apps.live.followed_run import run_name
 from trilane.errors import TrilaneError
 from trilane.pipeline.controls import ALL, RunControls
 from trilane.stages.configure import Checked

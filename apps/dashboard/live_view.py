@@ -26,7 +26,7 @@ from trilane.apps.dashboard.timeline import IdleRow, JobRow, Timeline, described
 from trilane.apps.dashboard.video_frames import jpeg_of
 from trilane.apps.dashboard.view import Message
 from trilane.apps.dashboard.wire import ControlSaid, Seek, shown
-from trilane.apps.followed_run import FollowedRun
+from trilane.apps.live.followed_run import FollowedRun
 from trilane.pipeline.journal import NAME, Begun, Record
 from trilane.transport.live_window import LiveWindow, Shown, Steering
 

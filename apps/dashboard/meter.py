@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from trilane.apps.live_figures import LiveFigures
-from trilane.apps.openmetrics import openmetrics
+from trilane.apps.live.live_figures import LiveFigures
+from trilane.apps.live.openmetrics import openmetrics
 from trilane.pipeline.journal import Begun, Record
 
 #: What a text in OpenMetrics ends with; the server's own counts come before it.

@@ -15,9 +15,9 @@ from rich.console import Console
 
 from trilane.apps.cli import top as cli_top
 from trilane.apps.cli.top_view import screen
-from trilane.apps.followed_run import RunState
-from trilane.apps.live_figures import LiveFigures
-from trilane.apps.run_looks import Look
+from trilane.apps.live.followed_run import RunState
+from trilane.apps.live.live_figures import LiveFigures
+from trilane.apps.live.run_looks import Look
 from trilane.pipeline.journal import NAME, Counted, Ended, JournalWriter, Record, Stepped
 from trilane.scheduler.events import Start, UnitDied
 from trilane.testing.told_journal import told_journal
@@ -119,7 +119,7 @@ def test_openmetrics(command: Command) -> None:
 
 def test_openmetrics_without_its_library(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     written("runs/walk", BEGUN)
-    monkeypatch.setitem(__import__("sys").modules, "trilane.apps.openmetrics", None)
+    monkeypatch.setitem(__import__("sys").modules, "trilane.apps.live.openmetrics", None)
     _, err = command("top", "walk", "--openmetrics", code=3)
     assert "[dashboard]" in err
 

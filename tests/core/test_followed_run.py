@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from trilane.apps import followed_run
-from trilane.apps.followed_run import RunState, follow
+from trilane.apps.live import followed_run
+from trilane.apps.live.followed_run import RunState, follow
 from trilane.apps.run_folder import RunFolder
 from trilane.errors import BadInputError
 from trilane.pipeline.journal import NAME, SCHEMA, Begun, JournalWriter, Said

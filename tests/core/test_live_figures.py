@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from trilane.apps.figures import DropCount, Figures, Moved, Shares
-from trilane.apps.live_figures import LiveFigures
+from trilane.apps.live.figures import DropCount, Figures, Moved, Shares
+from trilane.apps.live.live_figures import LiveFigures
 from trilane.pipeline.journal import SCHEMA, Accounted, Begun, Counted, Ended, Record, Stepped, Worked
 from trilane.scheduler.causes import Outcome, OutcomeKind
 from trilane.scheduler.core import Core

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from trilane.apps.live_figures import LiveFigures
-from trilane.apps.metrics_table import COUNTERS, GAUGES, HISTOGRAMS, SOURCE
+from trilane.apps.live.live_figures import LiveFigures
+from trilane.apps.live.metrics_table import COUNTERS, GAUGES, HISTOGRAMS, SOURCE
 from trilane.pipeline.journal import SCHEMA, Accounted, Begun, Counted, Ended, Sampled, Stepped, Worked
 from trilane.scheduler.events import Dispatch, Job, JobDone, Settings, UnitReady, chain
 from trilane.scheduler.ledger import ASSIGNED, STARVED, JobRecord
@@ -54,7 +54,7 @@ def run(frames: int, frame_ms: int = 20) -> LiveFigures:
 def parsed(figures: LiveFigures) -> dict[str, Any]:
     from prometheus_client.openmetrics.parser import text_string_to_metric_families
 
-    from trilane.apps.openmetrics import openmetrics
+    from trilane.apps.live.openmetrics import openmetrics
 
     return {family.name: family for family in text_string_to_metric_families(openmetrics(figures.now()).decode())}
 
@@ -149,7 +149,7 @@ def test_without_a_beginning_there_are_no_creation_times() -> None:
 
 
 def test_the_document_ends_as_the_format_asks() -> None:
-    from trilane.apps.openmetrics import CONTENT_TYPE, openmetrics
+    from trilane.apps.live.openmetrics import CONTENT_TYPE, openmetrics
 
     assert openmetrics(run(1).now()).endswith(b"\n# EOF\n")
     assert CONTENT_TYPE.startswith("application/openmetrics-text; version=1.0.0")

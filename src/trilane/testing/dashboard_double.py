@@ -79,7 +79,7 @@ def slices(begin_ms: float, end_ms: float) -> dict[str, Any]:
 
 
 def figures(t_ms: float, restarts: int = 0) -> dict[str, Any]:
-    """`trilane.apps.figures.Figures` at a moment, as JSON."""
+    """`trilane.apps.live.figures.Figures` at a moment, as JSON."""
     wave = (t_ms / 1000 % 10) / 10
     times = {"mean": 16.7, "p50": 16.6 + wave, "p90": 17.9 + wave, "p95": 18.8 + wave, "p99": 21.4, "max": 25.0}
     idle = dict.fromkeys(CAUSES, 0.01)

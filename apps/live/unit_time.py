@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from trilane.apps.figures import Shares
+from trilane.apps.live.figures import Shares
 from trilane.scheduler.accounts import BUSY, CAUSES, NAMES, OVERHEAD, PREEMPTED
 from trilane.scheduler.events import JobDone
 from trilane.scheduler.ledger import STARVED

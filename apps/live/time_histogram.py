@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 
-from trilane.apps.figures import Histogram
+from trilane.apps.live.figures import Histogram
 
 NS_PER_S = 1e9
 #: Upper bounds in seconds: a few to each halving of the rate between 200 and 10 frames a second, fewer on both sides.

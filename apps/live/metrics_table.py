@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
-from trilane.apps.figures import Figures, Histogram
-from trilane.apps.live_figures import LEAST, LEAST_KEY
+from trilane.apps.live.figures import Figures, Histogram
+from trilane.apps.live.live_figures import LEAST, LEAST_KEY
 
 #: Values of the labels of a row, and its value.
 Row = tuple[tuple[str, ...], float]

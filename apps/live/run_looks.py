@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable, Generator
 from typing import Any, NamedTuple
 
-from trilane.apps.figures import Figures
-from trilane.apps.followed_run import EXPECTED, FollowedRun, RunState
-from trilane.apps.live_figures import LiveFigures
+from trilane.apps.live.figures import Figures
+from trilane.apps.live.followed_run import EXPECTED, FollowedRun, RunState
+from trilane.apps.live.live_figures import LiveFigures
 from trilane.errors import BadInputError
 from trilane.pipeline.journal import Begun
 

@@ -9,10 +9,10 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from typing import Any, Final, NamedTuple
 
-from trilane.apps.figures import DropCount, Figures, FrameFigures, Moved, Note, StageFigures, UnitFigures
-from trilane.apps.frame_flow import Done, FrameFlow, Presented
-from trilane.apps.time_histogram import TimeHistogram
-from trilane.apps.unit_time import UnitTime
+from trilane.apps.live.figures import DropCount, Figures, FrameFigures, Moved, Note, StageFigures, UnitFigures
+from trilane.apps.live.frame_flow import Done, FrameFlow, Presented
+from trilane.apps.live.time_histogram import TimeHistogram
+from trilane.apps.live.unit_time import UnitTime
 from trilane.figure_sources import COMPUTED, MEASURED
 from trilane.pipeline.journal import Accounted, Begun, Counted, Ended, Record, Said, Sampled, Stepped, Worked
 from trilane.scheduler.events import NEVER, Event, Finish, Start, UnitDied, UnitReady

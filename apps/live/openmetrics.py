@@ -14,8 +14,8 @@ from typing import Final
 from prometheus_client import metrics_core as families
 from prometheus_client.openmetrics.exposition import CONTENT_TYPE_LATEST, generate_latest
 
-from trilane.apps.figures import Figures
-from trilane.apps.metrics_table import COUNTERS, GAUGES, HISTOGRAMS, SOURCE, Metric, Times
+from trilane.apps.live.figures import Figures
+from trilane.apps.live.metrics_table import COUNTERS, GAUGES, HISTOGRAMS, SOURCE, Metric, Times
 
 CONTENT_TYPE: Final[str] = CONTENT_TYPE_LATEST
 
