@@ -1,0 +1,129 @@
+"""What does a speed cost in image error: every size of tensor on every runtime, error and time in one row.
+
+Rule: all rows are of the same moments and of the same part of the picture, that which holds the avatars; the times are
+of the very jobs that made the pictures, in turns, one job at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+from pathlib import Path
+from statistics import fmean, median
+from typing import Any
+
+from trilane.apps.experiments.picture_errors import ErrorFigures, figures, require_metrics
+from trilane.apps.experiments.scene_pictures import ScenePictures, around, spread, wanted_pictures
+from trilane.arrays import U8
+from trilane.bench.lib.cast import Cast
+from trilane.errors import BadInputError
+from trilane.figure_sources import MEASURED
+from trilane.scheduler.stats import median_interval
+from trilane.stages.configure import Checked, Request, configure
+
+SIZES = ("128", "256", "512")
+#: Times that each frame is made; its error is that of the first.
+ROUNDS = 3
+Shown = Callable[[Sequence[int]], Iterable[int]]
+
+
+@dataclass
+class Row:
+    """What was found for one size on one runtime. Times in milliseconds, `errors` one for each frame."""
+
+    size: str
+    runtime: str
+    pictures: ScenePictures
+    threads: int
+    infer_ms: list[float] = field(default_factory=list)
+    frame_ms: list[float] = field(default_factory=list)
+    errors: list[ErrorFigures] = field(default_factory=list)
+
+    def make(self, number: int) -> U8:
+        """The picture of frame `number`; its times are counted."""
+        picture, times = self.pictures.frame(number)
+        self.infer_ms.append(sum(ms for stage, ms in times.items() if stage.startswith("infer")))
+        self.frame_ms.append(sum(times.values()))
+        return picture
+
+    def as_json(self) -> dict[str, Any]:
+        """The row of `errors_by_size`."""
+        low, high = median_interval(self.infer_ms)
+        ssim = [error.ssim for error in self.errors if error.ssim is not None]
+        return {
+            "size": self.size,
+            "runtime": self.runtime,
+            "threads": self.threads,
+            "infer_ms": median(self.infer_ms),
+            "infer_low_ms": low,
+            "infer_high_ms": high,
+            "frame_ms": median(self.frame_ms),
+            "psnr_db": fmean(error.psnr_db for error in self.errors),
+            "worst_psnr_db": min(error.psnr_db for error in self.errors),
+            "mae": fmean(error.mae for error in self.errors),
+            "ssim": fmean(ssim) if ssim else None,
+            "flip": fmean(error.flip for error in self.errors),
+        }
+
+
+def errors_by_size(
+    request: Request,
+    sizes: Sequence[str] = SIZES,
+    runtimes: Sequence[str] = ("ort",),
+    frames: int = 8,
+    shown: Shown = lambda numbers: numbers,
+) -> dict[str, Any]:
+    """Error and time of `frames` frames, evenly spread over the scene of `request`, by size of tensor and runtime.
+
+    `shown`: what the frames' numbers go through, such as a progress bar.
+    Keys: `rows`: `size`, `runtime`, `threads`, `infer_ms` (median of all jobs) with its 95 % interval `infer_low_ms`,
+    `infer_high_ms`, `frame_ms` (median sum of all stages but present), and the error: `psnr_db`, `mae`, `ssim`, `flip`
+    (means over frames), `worst_psnr_db`; `against`; `frames`; `empty_frames` (nobody in view, not counted); `rounds`;
+    `sources`; `config`. Raises BadInputError, MissingPartError.
+    """
+    require_metrics()
+    refuse_twice("--size", sizes)
+    refuse_twice("--runtime", runtimes)
+    asked = [replace(request, size=size, runtime=runtime) for size, runtime in product(sizes, runtimes)]
+    checked = [configure(one, Path.cwd()) for one in asked]
+    first, scene = checked[0], checked[0].config.scene
+    numbers, cast, rows = spread(scene.frames, frames), Cast(first), _rows(asked, checked)
+    wanted, against = wanted_pictures(cast, rows[0].pictures.gl)
+    empty = []
+    for number in shown(numbers):
+        boxes = cast.boxes(number)
+        if not boxes:
+            empty.append(number)
+            continue
+        part = around(boxes)
+        true = wanted(number, rows[0].pictures.background(number))[part]
+        for turn, row in product(range(ROUNDS), rows):
+            picture = row.make(number)
+            if turn == 0:
+                row.errors.append(figures(picture[part], true))
+    if len(empty) == len(numbers):
+        raise BadInputError(f"scene {scene.name}", "nobody in view in any of the frames", "an avatar in the picture")
+    return {
+        "rows": [row.as_json() for row in rows],
+        "against": against,
+        "frames": numbers,
+        "empty_frames": empty,
+        "rounds": ROUNDS,
+        "sources": {"rows": MEASURED},
+        "config": {"scene": scene.name, "plan": scene.plan, "texture_filter": scene.texture_filter},
+    }
+
+
+def refuse_twice(option: str, values: Sequence[str]) -> None:
+    """Raises BadInputError unless there are `values`, each once."""
+    if not values or len(set(values)) < len(values):
+        raise BadInputError(option, ", ".join(values) or "none", "one or more, each once")
+
+
+def _rows(asked: Sequence[Request], checked: Sequence[Checked]) -> list[Row]:
+    rows: list[Row] = []
+    for request, one in zip(asked, checked, strict=True):
+        pictures = ScenePictures(one, rows[0].pictures.gpu if rows else None)
+        rows.append(Row(str(request.size), one.config.runtime, pictures, one.config.units["dsp"].threads))
+    return rows

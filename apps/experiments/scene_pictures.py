@@ -1,0 +1,89 @@
+"""The pictures of a scene's frames by one configuration, what each stage took, and what they are compared with.
+
+Rule: pictures are made by the run's own stages in this process, one after the other. They are compared with ground
+truth, the clothed body itself, where a scene has it, else with the plan `full`; whoever compares says which.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from trilane.arrays import U8
+from trilane.bench.lib.cast import Cast
+from trilane.bench.lib.full_picture import FullPictures
+from trilane.bench.lib.layers import Box
+from trilane.bench.lib.stage_chain import StageChain, units_of
+from trilane.errors import BadInputError
+from trilane.pipeline.stage import UnitContext
+from trilane.stages.avatar_pipeline import avatar_pipeline
+from trilane.stages.configure import Checked
+from trilane.stages.gpu.opengl_context import CONTEXT, open_context
+from trilane.transport.packets import Packet
+
+MAX_FRAMES = 10_000
+TRUTH = "ground truth: the clothed body that the default avatar was trained on"
+FULL = "the plan full: float64 body, supersampled raster, FP32 network"
+MS = 1e-6  # of a nanosecond
+#: (h,w,3) uint8: frame `number` over its background.
+Wanted = Callable[[int, U8], U8]
+
+
+class ScenePictures:
+    """The frames of the scene in `checked`. `gpu`: of other pictures in this process; all share one OpenGL context."""
+
+    def __init__(self, checked: Checked, gpu: UnitContext | None = None) -> None:
+        """Raises BadInputError, MissingPartError."""
+        pipeline, output = avatar_pipeline(checked.config, checked.assets), checked.config.scene.output
+        units = units_of(pipeline, checked.assets)
+        self.gpu = units["gpu"] if gpu is None else gpu
+        self._chain = StageChain(pipeline, {**units, "gpu": self.gpu})
+        self._names = [stage.name for stage in pipeline.stages[:-1]]
+        self._shape = (output.height, output.width, 3)
+
+    @property
+    def gl(self) -> Any:
+        """The OpenGL context that the stages draw with."""
+        return self.gpu.shared(CONTEXT, open_context)
+
+    def frame(self, number: int) -> tuple[U8, Mapping[str, float]]:
+        """(h,w,3) uint8, sRGB: frame `number`, and milliseconds by stage; those that it skips take none."""
+        times, begun = {}, time.perf_counter_ns()
+        packet = self._chain.run(number, 0)
+        for place, name in enumerate(self._names):
+            packet = self._chain.go_on(number, place)
+            ended = time.perf_counter_ns()
+            times[name], begun = (ended - begun) * MS, ended
+        return self._picture(packet), times
+
+    def background(self, number: int) -> U8:
+        """(h,w,3) uint8: what is under the avatars of the frame, their shadows too."""
+        self._chain.run(number, len(self._names) - 2).payload[:] = 0
+        return self._picture(self._chain.go_on(number))
+
+    def _picture(self, packet: Packet) -> U8:
+        height, width, colours = self._shape
+        picture: U8 = packet.payload[: height * width * colours].reshape(self._shape).copy()
+        return picture
+
+
+def wanted_pictures(cast: Cast, ctx: Any) -> tuple[Wanted, str]:
+    """What pictures of `cast` are compared with, and which of both it is. `ctx`: the OpenGL context in use."""
+    from trilane.bench.lib.true_picture import TruePictures, has_truth
+
+    return (TruePictures(cast, ctx).frame, TRUTH) if has_truth(cast) else (FullPictures(cast).frame, FULL)
+
+
+def spread(total: int, frames: int) -> list[int]:
+    """The numbers of at most `frames` of `total` frames, evenly spread. Raises BadInputError."""
+    if not 1 <= frames <= MAX_FRAMES:
+        raise BadInputError("--frames", str(frames), f"1 to {MAX_FRAMES}")
+    count = min(frames, total)
+    return [index * total // count for index in range(count)]
+
+
+def around(boxes: Sequence[Box]) -> tuple[slice, slice]:
+    """Rows and columns of the smallest rectangle that holds all `boxes`, of which there is one at least."""
+    rows = slice(min(box.top for box in boxes), max(box.bottom for box in boxes))
+    return rows, slice(min(box.left for box in boxes), max(box.right for box in boxes))
