@@ -81,6 +81,13 @@ def pack_assets(avatars: Sequence[AvatarData], staged: Staged) -> dict[str, NDAr
     return arrays | {SCENE + name: array for name, array in staged_to_arrays(staged).items()}
 
 
+def with_network(assets: Assets, network: NetworkFile) -> dict[str, NDArray[Any]]:
+    """`assets` with another `network` of all avatars, and with the scale and zero point of its input."""
+    encoding = np.array([network.input.scale, network.input.zero_point])
+    inputs = {name: encoding for name in assets if name.startswith("avatar") and name.endswith("/input")}
+    return {**assets, **inputs, NETWORK: np.frombuffer(network.model.SerializeToString(), np.uint8)}
+
+
 def distinct(config: RunConfig) -> list[Path]:
     """The folders of the distinct bundles of `config`, in the order in which assets number them."""
     return list(dict.fromkeys(config.avatar_dirs))

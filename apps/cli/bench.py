@@ -47,6 +47,11 @@ BENCHES = {
         "trilane.apps.experiments.comparing",
         "What `trilane compare` says of runs of one kind, and of others.",
     ),
+    "sizes": ("trilane.apps.experiments.error_by_size", "What a speed costs in image error, by size and runtime."),
+    "flicker": (
+        "trilane.apps.experiments.flicker",
+        "How restless the error is, by runtime, calibration and texture filter.",
+    ),
     "joints": ("trilane.bench.joints", "What the joint transforms of a frame cost."),
 }
 

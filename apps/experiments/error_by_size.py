@@ -6,8 +6,8 @@ of the very jobs that made the pictures, in turns, one job at a time.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
 from statistics import fmean, median
@@ -21,11 +21,6 @@ from trilane.errors import BadInputError
 from trilane.figure_sources import MEASURED
 from trilane.scheduler.stats import median_interval
 from trilane.stages.configure import Checked, Request, configure
-
-SIZES = ("128", "256", "512")
-#: Times that each frame is made; its error is that of the first.
-ROUNDS = 3
-Shown = Callable[[Sequence[int]], Iterable[int]]
 
 
 @dataclass
@@ -48,7 +43,7 @@ class Row:
         return picture
 
     def as_json(self) -> dict[str, Any]:
-        """The row of `errors_by_size`."""
+        """The row of `measure`."""
         low, high = median_interval(self.infer_ms)
         ssim = [error.ssim for error in self.errors if error.ssim is not None]
         return {
@@ -67,51 +62,55 @@ class Row:
         }
 
 
-def errors_by_size(
-    request: Request,
-    sizes: Sequence[str] = SIZES,
-    runtimes: Sequence[str] = ("ort",),
+def measure(
+    scene: str = "default",
+    size: tuple[str, ...] = ("128", "256", "512"),
+    runtime: tuple[str, ...] = ("ort", "openvino"),
     frames: int = 8,
-    shown: Shown = lambda numbers: numbers,
+    rounds: int = 3,
 ) -> dict[str, Any]:
-    """Error and time of `frames` frames, evenly spread over the scene of `request`, by size of tensor and runtime.
+    """Image error and time of `frames` frames, evenly spread over the scene, by size of tensor and runtime.
 
-    `shown`: what the frames' numbers go through, such as a progress bar.
+    Each frame is made `rounds` times; its error is that of the first.
+
     Keys: `rows`: `size`, `runtime`, `threads`, `infer_ms` (median of all jobs) with its 95 % interval `infer_low_ms`,
-    `infer_high_ms`, `frame_ms` (median sum of all stages but present), and the error: `psnr_db`, `mae`, `ssim`, `flip`
-    (means over frames), `worst_psnr_db`; `against`; `frames`; `empty_frames` (nobody in view, not counted); `rounds`;
-    `sources`; `config`. Raises BadInputError, MissingPartError.
+    `infer_high_ms`, `frame_ms` (median sum of all stages but present), and the error where the avatars are: `psnr_db`,
+    `mae` (steps of 1/255), `ssim`, `flip`, means over the frames, and `worst_psnr_db`; `against`: what they are
+    compared with; `frames`; `empty_frames`: with nobody in view, not counted; `sources`; `config`.
+
+    Raises BadInputError, MissingPartError.
     """
     require_metrics()
-    refuse_twice("--size", sizes)
-    refuse_twice("--runtime", runtimes)
-    asked = [replace(request, size=size, runtime=runtime) for size, runtime in product(sizes, runtimes)]
+    refuse_twice("--size", size)
+    refuse_twice("--runtime", runtime)
+    if rounds < 1:
+        raise BadInputError("--rounds", str(rounds), "at least 1")
+    asked = [Request(scene=scene, size=one, runtime=name, hud=False) for one, name in product(size, runtime)]
     checked = [configure(one, Path.cwd()) for one in asked]
-    first, scene = checked[0], checked[0].config.scene
-    numbers, cast, rows = spread(scene.frames, frames), Cast(first), _rows(asked, checked)
+    first, shown = checked[0], checked[0].config.scene
+    numbers, cast, rows = spread(shown.frames, frames), Cast(first), _rows(asked, checked)
     wanted, against = wanted_pictures(cast, rows[0].pictures.gl)
     empty = []
-    for number in shown(numbers):
+    for number in numbers:
         boxes = cast.boxes(number)
         if not boxes:
             empty.append(number)
             continue
         part = around(boxes)
-        true = wanted(number, rows[0].pictures.background(number))[part]
-        for turn, row in product(range(ROUNDS), rows):
+        true = wanted(number, rows[0].pictures.background(number))[part] / 255.0
+        for turn, row in product(range(rounds), rows):
             picture = row.make(number)
             if turn == 0:
-                row.errors.append(figures(picture[part], true))
+                row.errors.append(figures(picture[part] / 255.0, true))
     if len(empty) == len(numbers):
-        raise BadInputError(f"scene {scene.name}", "nobody in view in any of the frames", "an avatar in the picture")
+        raise BadInputError(f"scene {shown.name}", "nobody in view in any of the frames", "an avatar in the picture")
     return {
         "rows": [row.as_json() for row in rows],
         "against": against,
         "frames": numbers,
         "empty_frames": empty,
-        "rounds": ROUNDS,
         "sources": {"rows": MEASURED},
-        "config": {"scene": scene.name, "plan": scene.plan, "texture_filter": scene.texture_filter},
+        "config": {"scene": shown.name, "plan": shown.plan, "texture_filter": shown.texture_filter, "rounds": rounds},
     }
 
 

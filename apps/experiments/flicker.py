@@ -18,7 +18,7 @@ import numpy as np
 
 from trilane.apps.experiments.calibrated_network import AS_IT_IS, Calibrations
 from trilane.apps.experiments.error_by_size import refuse_twice
-from trilane.apps.experiments.scene_pictures import MAX_FRAMES, ScenePictures, around, wanted_pictures
+from trilane.apps.experiments.scene_pictures import ScenePictures, around, wanted_pictures
 from trilane.arrays import F64, U8
 from trilane.bench.lib.cast import Cast
 from trilane.errors import BadInputError
@@ -26,9 +26,9 @@ from trilane.figure_sources import MEASURED
 from trilane.near_miss import did_you_mean
 from trilane.stages.configure import Checked, Request, configure
 from trilane.stages.gpu.texture_array import FILTERS
+from trilane.training.quantising.calibration import METHODS
 
 STEPS = 255
-Shown = Callable[[Sequence[int]], Iterable[int]]
 
 
 def flicker(before: F64, now: F64) -> float:
@@ -59,7 +59,7 @@ class Row:
         self.before = error
 
     def as_json(self) -> dict[str, Any]:
-        """The row of `flicker_by_way`."""
+        """The row of `measure`."""
         return {
             "runtime": self.runtime,
             "calibration": self.calibration,
@@ -71,50 +71,58 @@ class Row:
         }
 
 
-def flicker_by_way(
-    request: Request,
+def measure(
+    scene: str = "default",
+    size: str = "256",
     frames: int = 12,
-    runtimes: Sequence[str] = ("ort",),
-    filters: Sequence[str] = ("linear",),
-    calibrations: Sequence[str] = (AS_IT_IS,),
-    shown: Shown = lambda numbers: numbers,
+    runtime: tuple[str, ...] = ("ort", "openvino"),
+    calibration: tuple[str, ...] = (AS_IT_IS,),
+    texture_filter: tuple[str, ...] = ("linear",),
 ) -> dict[str, Any]:
-    """The flicker of the first `frames` frames of the scene of `request`, by runtime, calibration and texture filter.
+    """The flicker of the first `frames` frames of a scene, by runtime, calibration and filter of the neural texture.
 
-    `filters`: names of FILTERS. `calibrations`: `AS_IT_IS` or names of METHODS. `shown`: as of `errors_by_size`.
     Keys: `rows`: `runtime`, `calibration`, `texture_filter`, `flicker` (mean over the pairs of frames), `worst` with
     the later frame of its pair, `worst_frame`, and `mae` of the frames, all in steps of 1/255 where the avatars are;
-    `scene_change`: mean change of what the frames should be, there; `against`; `frames`; `sources`; `config`.
+    `scene_change`: by how much what the frames should be changes there; `against`: what that is; `frames`; `sources`;
+    `config`.
+
     Raises BadInputError, MissingPartError.
     """
-    refuse_twice("--runtime", runtimes)
-    refuse_twice("--texture-filter", filters)
-    refuse_twice("--calibration", calibrations)
-    if unknown := next((name for name in filters if name not in FILTERS), None):
-        expected = f"one of {', '.join(FILTERS)}"
-        raise BadInputError("--texture-filter", repr(unknown), expected, did_you_mean(unknown, FILTERS))
-    checked = {runtime: configure(replace(request, runtime=runtime), Path.cwd()) for runtime in runtimes}
+    refuse_twice("--runtime", runtime)
+    refuse_twice("--texture-filter", texture_filter)
+    refuse_twice("--calibration", calibration)
+    _refuse_unknown("--texture-filter", texture_filter, FILTERS)
+    _refuse_unknown("--calibration", calibration, (AS_IT_IS, *METHODS))
+    checked = {
+        name: configure(Request(scene=scene, size=size, runtime=name, hud=False), Path.cwd()) for name in runtime
+    }
     first = next(iter(checked.values()))
-    scene = first.config.scene
-    if not 2 <= frames <= min(MAX_FRAMES, scene.frames):
-        raise BadInputError("--frames", str(frames), f"2 to {min(MAX_FRAMES, scene.frames)}, the scene's frames")
+    shown = first.config.scene
+    if not 2 <= frames <= shown.frames:
+        raise BadInputError("--frames", str(frames), f"2 to {shown.frames}, the scene's frames")
     cast, made = Cast(first), Calibrations(first)
     rows: list[Row] = []
-    for (runtime, one), calibration, name in product(checked.items(), calibrations, filters):
+    for (engine, one), method, name in product(checked.items(), calibration, texture_filter):
         gpu = rows[0].pictures.gpu if rows else None
-        pictures = ScenePictures(_filtered(made.changed(one, calibration), name), gpu)
-        rows.append(Row(runtime, calibration, name, pictures))
+        pictures = ScenePictures(_filtered(made.changed(one, method), name), gpu)
+        rows.append(Row(engine, method, name, pictures))
     wanted, against = wanted_pictures(cast, rows[0].pictures.gl)
     numbers = list(range(frames))
-    scene_change = _follow(cast, rows, wanted, shown(numbers))
+    scene_change = _follow(cast, rows, wanted, numbers)
     return {
         "rows": [row.as_json() for row in rows],
         "scene_change": scene_change,
         "against": against,
         "frames": numbers,
         "sources": dict.fromkeys(("rows", "scene_change"), MEASURED),
-        "config": {"scene": scene.name, "plan": scene.plan, "size": scene.size, "fps": scene.fps},
+        "config": {"scene": shown.name, "plan": shown.plan, "size": shown.size, "fps": shown.fps},
     }
+
+
+def _refuse_unknown(option: str, names: Sequence[str], known: Iterable[str]) -> None:
+    possible = list(known)
+    if unknown := next((name for name in names if name not in possible), None):
+        raise BadInputError(option, repr(unknown), f"one of {', '.join(possible)}", did_you_mean(unknown, possible))
 
 
 def _filtered(checked: Checked, name: str) -> Checked:

@@ -19,8 +19,8 @@ from trilane.errors import BadInputError
 from trilane.training.quantising.calibration import METHODS
 from trilane.training.quantising.quantise import quantise
 
-COUNTS = (5, 10, 20, 50, 100)
-#: Frames that pictures are evaluated on: the last ones.
+COUNTS = (5, 10, 50, 100)
+#: Frames that pictures are evaluated on, unless more are held out: the last ones.
 EVALUATED = 5
 PROVIDERS = ["CPUExecutionProvider"]
 ERRORS_ONLY = 3
@@ -31,8 +31,9 @@ def calibration_table(
     frames: Sequence[F32],
     methods: Sequence[str] = tuple(METHODS),
     counts: Sequence[int] = COUNTS,
+    held_out: int = EVALUATED,
 ) -> Iterator[dict[str, Any]]:
-    """Rows `method`, `count`, `psnr_db` (mean over the last `EVALUATED` frames), `mean` and `largest` error (of 255).
+    """Rows `method`, `count`, `psnr_db` (mean over the last `held_out` frames), `mean` and `largest` error (of 255).
 
     `model`: the float network (1, C, H, W).
     `frames`: (H, W, C) each.
@@ -40,10 +41,10 @@ def calibration_table(
     `counts`: of calibration frames; a count that would include evaluated frames is left out.
     Raises BadInputError when there are too few frames for the smallest count, or for an unknown method.
     """
-    spare = len(frames) - EVALUATED
+    spare = len(frames) - held_out
     possible = [count for count in counts if count <= spare]
     if not possible:
-        raise BadInputError("frames", f"{len(frames)} of them", f"at least {min(counts) + EVALUATED}")
+        raise BadInputError("frames", f"{len(frames)} of them", f"at least {min(counts) + held_out}")
     for method in methods:
         if method not in METHODS:
             raise BadInputError("--method", repr(method), f"one of {', '.join(METHODS)}")
