@@ -32,6 +32,7 @@ class AskedRun:
     `out`: the run folder; None: `runs/TIME-SCENE`.
     `command`: the words by which it was asked for.
     `has_video`: whether the presented pictures are digested and encoded; not for runs that last.
+    `check`: how many of its frames are compared with the reference path when it is over; 0: none.
     `held_ns`: how long jobs of a stage are held, at least, by its name; in place of a chip's pace.
     """
 
@@ -44,6 +45,7 @@ class AskedRun:
     out: Path | None = None
     command: tuple[str, ...] = ()
     has_video: bool = True
+    check: int = 0
     held_ns: Mapping[str, int] = field(default_factory=dict)
 
 
@@ -74,6 +76,9 @@ def prepare(asked: AskedRun, gl: GlFacts) -> Prepared:
     rule, request = requested_edge(asked.edge), Request(**asked.request)
     checked = configure(request, Path.cwd(), gl)
     plan = Plan(request.policy, asked.baseline_frames, None, asked.performance_profile, asked.latch_ms, rule)
+    if asked.check:
+        _require_check(checked)
+        plan = replace(plan, check=asked.check)
     if asked.paced_by is not None:
         from trilane.apps.pace import pace_of
 
@@ -84,6 +89,16 @@ def prepare(asked: AskedRun, gl: GlFacts) -> Prepared:
     if not asked.has_video:
         checked = checked.changed(record=False)
     return Prepared(asked, checked, plan)
+
+
+def _require_check(checked: Checked) -> None:
+    """Raises BadInputError, MissingPartError for what the reference path cannot be compared with."""
+    from trilane.apps.experiments.picture_errors import require_metrics
+    from trilane.errors import BadInputError
+
+    require_metrics()
+    if checked.config.scene.hud:
+        raise BadInputError("--check", "a scene with a HUD", "pictures without", "--no-hud leaves it out")
 
 
 @contextmanager

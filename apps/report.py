@@ -150,6 +150,27 @@ class Video(Record):
     seconds: float
 
 
+class Check(Record):
+    """Frames of the run itself against the reference path, where the avatars are.
+
+    `frames`: how many were compared; `numbers`: which.
+    `psnr_db`, `mae` (steps of 1/255), `ssim`, `flip`: means over them; `ssim` null where the picture is too small.
+    `worst_psnr_db`: of one frame.
+    `iou`: mean, of where picture and reference differ from the background.
+    `against`: what they were compared with.
+    """
+
+    frames: int
+    psnr_db: float
+    worst_psnr_db: float
+    mae: float
+    ssim: float | None
+    flip: float
+    iou: float
+    against: str
+    numbers: tuple[int, ...]
+
+
 class Made(Record):
     """How a report came about.
 
@@ -289,6 +310,7 @@ class Report(RunMetrics, Preamble):
     `resolution`: of a run whose frames had to be in time and whose tensor was planned; absent for others.
     `pace`: of a run at a chip's pace.
     `accuracy`: of each avatar, what `trilane.avatars.validation.accuracy_of` says: its figures, or why there are none.
+    `check`: frames of the run itself against the reference path; absent where none was asked for.
     `sources`: key, dotted where it is inside another, to where the figures below it come from; the longest key decides.
     `notes`: the format that each opened file was read as, and what was chosen for the run.
     `video`: null when no frame was recorded.
@@ -309,6 +331,7 @@ class Report(RunMetrics, Preamble):
     resolution: Resolution | None = None
     pace: PaceComparison | None = None
     accuracy: dict[str, dict[str, Any]] = Field(default={})
+    check: Check | None = None
     sources: dict[str, str] = Field(default={})
     notes: tuple[str, ...] = ()
     video: Video | None
@@ -330,7 +353,7 @@ def build_report(
     `machine`: what `machine_facts` said.
     `baseline`: of the same scene under another policy, None without one.
     `facts`: what others know of the run: `video`, `checksum`, and any of `made`, `placement`, `resolution`, `pace`,
-    `accuracy`, `notes`.
+    `accuracy`, `check`, `notes`.
     """
     metrics = result.report
     sensor = {"sensor": sensor_c()}
@@ -356,7 +379,7 @@ def build_report(
 
 def config_facts(config: RunConfig, policy: str, edge: str) -> dict[str, Any]:
     """`config` of the report."""
-    return {**config.model_dump(mode="json", exclude={"out_dir", "window"}), "policy": policy, "edge": edge}
+    return {**config.model_dump(mode="json", exclude={"out_dir", "window", "kept"}), "policy": policy, "edge": edge}
 
 
 def _compared(metrics: RunMetrics) -> Baseline:

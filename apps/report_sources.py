@@ -45,6 +45,7 @@ SOURCES = {
     "pace.compared_share": MEASURED,
     "pace.ratio": COMPARED,
     "video": MEASURED,
+    "check": MEASURED,
 }
 #: Keys whose numbers are settings, names of things or facts of the machine.
 NO_FIGURES_UNDER = ("schema", "machine", "config", "plan", "pids")

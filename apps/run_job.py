@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from trilane.apps.report import Report, build_report, config_facts, write_report
 from trilane.apps.resolution import resolution_note, resolution_of
+from trilane.apps.run_check import asked_frames, check_run
 from trilane.apps.run_folder import RunFolder
 from trilane.errors import TrilaneError
 from trilane.hw_profiles.governor import Governor
@@ -30,6 +31,7 @@ from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.policy import policy_named
 from trilane.stages.avatar_pipeline import run_avatar
 from trilane.stages.configure import Checked
+from trilane.stages.cpu.kept_frames import FOLDER
 from trilane.stages.placing import placed
 
 if TYPE_CHECKING:
@@ -51,6 +53,7 @@ class Plan:
     `performance_profile`: whose caps hold; None: no cap.
     `latch_ms`: how long before it is needed a pose is sampled; not in the run that is compared with.
     `edge`: rule of every edge.
+    `check`: how many of its frames are compared with the reference path when it is over.
     """
 
     policy: str = "pipelined"
@@ -59,6 +62,7 @@ class Plan:
     performance_profile: str | None = None
     latch_ms: float = 0.0
     edge: str = "double"
+    check: int = 0
 
 
 @dataclass(frozen=True)
@@ -146,6 +150,7 @@ def run_to_folder(
                 scene = checked.config.scene
                 jobs = list(jobs_of(folder.work / journal.NAME))
                 facts["pace"] = compare(plan.pace, plan.policy, scene.frames, jobs, edge=plan.edge, fps=scene.fps)
+            facts |= _checked_frames(checked, folder.work, hooks) if plan.check else {}
             facts |= _write_files(folder.work, checked.config.scene.fps)
             report = build_report(result, checked.config, machine=machine, baseline=baseline, facts=facts)
             _tell(report, hooks)
@@ -170,7 +175,9 @@ class _Job:
         """
         file, watched = JournalFile(folder / journal.NAME, facts, _sensors), self._watched
         frames, controls = (None, None) if watched is None else (watched.frames, watched.controls)
-        return self._run(folder, self._plan.policy, frames, self._plan.latch_ms, file, controls)
+        total = frames or self._checked.config.scene.frames
+        kept = asked_frames(total, self._plan.check) if self._plan.check else ()
+        return self._run(folder, self._plan.policy, frames, self._plan.latch_ms, file, controls, kept)
 
     def run_baseline(self, folder: Path) -> tuple[RunResult | None, bool]:
         """The first frames of the same scene again, one frame at a time; its pictures are not kept.
@@ -202,10 +209,11 @@ class _Job:
         latch_ms: float,
         file: JournalFile | None = None,
         controls: RunControls | None = None,
+        kept: tuple[int, ...] = (),
     ) -> RunResult:
         profile = self._plan.performance_profile
         result = run_avatar(
-            self._checked.config.model_copy(update={"out_dir": folder}),
+            self._checked.config.model_copy(update={"out_dir": folder, "kept": kept}),
             self._checked.assets,
             policy=policy,
             edge=self._plan.edge,
@@ -232,6 +240,17 @@ class _Job:
         from trilane.apps.pace import release_fps
 
         return release_fps(self._plan.pace, self._checked.config.scene.fps)
+
+
+def _checked_frames(checked: Checked, work: Path, hooks: Hooks) -> dict[str, Any]:
+    """`check` of the report; that there is none is said."""
+    try:
+        return {"check": check_run(checked, work, lambda done, of: hooks.progress("check", done, of))}
+    except TrilaneError as error:
+        hooks.message(f"the run was not compared with the reference path: {error}")
+        return {}
+    finally:
+        shutil.rmtree(work / FOLDER, ignore_errors=True)
 
 
 def _notes(checked: Checked) -> list[str]:

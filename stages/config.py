@@ -39,6 +39,7 @@ class RunConfig(Model):
     `posed_vertices`: how many of each avatar, when the CPU unit skins; empty when the GPU unit does.
     `pace_ns`: how long a job of a stage is held, at least.
     `cuts`: of the network; its first part is the DSP's.
+    `kept`: numbers of frames whose presented pictures are kept, to be compared when the run is over.
     `window`: where somebody looks at the pictures and steers the camera while the run goes on; None: nowhere.
     """
 
@@ -54,6 +55,7 @@ class RunConfig(Model):
     posed_vertices: tuple[int, ...] = ()
     pace_ns: dict[str, int] = Field(default={})
     cuts: tuple[NetworkCut, ...] = ()
+    kept: tuple[int, ...] = ()
     window: Path | None = None
 
     @field_validator("units")

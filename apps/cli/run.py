@@ -54,6 +54,7 @@ Examples:
   trilane run --cores cpu=1 --cores gpu=0 --cores dsp=0,1
   trilane run --split /Concat_4_output_0_QuantizeLinear_Output=cpu
   trilane run --performance-profile sustained_high_performance
+  trilane run --check 4
   trilane run --dashboard
   trilane run --profile snapdragon-888 --pace --slow-motion 24 --frames 60
   trilane run myscene.toml --background street.mp4 --policy sequential
@@ -97,6 +98,9 @@ DashboardOption = Annotated[
 ]
 BaselineOption = Annotated[
     int, typer.Option(min=0, help="Frames of the `sequential` run of the same scene that follows; 0: none.")
+]
+CheckOption = Annotated[
+    int, typer.Option(min=0, max=1000, help="Frames to compare with the reference when the run is over; 0: none.")
 ]
 FolderOption = Annotated[Path | None, typer.Option("--out", help="Run folder to write; runs/TIME-SCENE if none.")]
 
@@ -148,6 +152,7 @@ def run(
     latch: LatchOption = 0.0,
     performance_profile: CapOption = None,
     baseline: BaselineOption = 60,
+    check: CheckOption = 0,
     out: FolderOption = None,
     video: VideoOption = True,
     dashboard: DashboardOption = False,
@@ -164,6 +169,10 @@ def run(
 
     if port is not None and not dashboard:
         raise BadInputError("options", "--port without --dashboard", "both or neither")
+    if check and dashboard:
+        raise BadInputError(
+            "options", "--check with --dashboard", "one of them", "a run that is steered has no reference"
+        )
     cuts, cap = tuple(split or ()), performance_profile and str(performance_profile)
     _check_pace(profile, pace, slow_motion, cuts, cap)
     request: dict[str, Any] = {
@@ -185,7 +194,7 @@ def run(
     }
     paced_by = None if profile is None else (profile, slow_motion)
     command = ("trilane", *sys.argv[1:])
-    asked = AskedRun(request, edge, baseline, paced_by, cap, latch, out, command, has_video=video)
+    asked = AskedRun(request, edge, baseline, paced_by, cap, latch, out, command, has_video=video, check=check)
     outcome = _run_live(asked, port) if dashboard else run_asked(asked, _hooks)
     _print_outcome(outcome, as_json)
     raise typer.Exit(outcome.exit_code)

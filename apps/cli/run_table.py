@@ -17,7 +17,7 @@ from trilane.scheduler.stats import samples_needed
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from trilane.apps.report import Baseline, Made, PaceComparison, Report
+    from trilane.apps.report import Baseline, Check, Made, PaceComparison, Report
     from trilane.pipeline.run_metrics import Caps, MovedBytes, StageTimes, Temperature, TimeSummary, UnitShares
 
     #: Name of a row, what it measures, and a cell for each run.
@@ -75,6 +75,8 @@ def _caption(report: Report) -> str:
         lines.append(_pace(report.pace))
     if report.caps.performance_profile:
         lines.append(_caps(report.caps, report.temperature_c))
+    if report.check:
+        lines.append(_check(report.check))
     lines += [accuracy_line(name, facts) for name, facts in report.accuracy.items()]
     return escape("\n".join(lines))
 
@@ -90,6 +92,14 @@ def _pace(pace: PaceComparison) -> str:
     return (
         f"held to {pace.profile}{slow_motion}: {_number(pace.measured_ms, 2)} ms a frame ({MEASURED}), in virtual time "
         f"{_number(pace.virtual_ms, 2)} ms ({COMPUTED}), ratio {_number(pace.ratio, 3)}; jobs too slow here: {slower}"
+    )
+
+
+def _check(check: Check) -> str:
+    return (
+        f"of this run, {check.frames} frames against {check.against}: PSNR {check.psnr_db:.1f} dB, worst "
+        f"{check.worst_psnr_db:.1f}; MAE {check.mae:.2f} of 255; FLIP {check.flip:.3f}; IoU {check.iou:.3f} "
+        f"({MEASURED})"
     )
 
 

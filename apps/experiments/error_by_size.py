@@ -96,7 +96,7 @@ def measure(
         if not boxes:
             empty.append(number)
             continue
-        part = around(boxes)
+        part = around(boxes, rows[0].pictures.output)
         true = wanted(number, rows[0].pictures.background(number))[part] / 255.0
         for turn, row in product(range(rounds), rows):
             picture = row.make(number)

@@ -8,7 +8,7 @@ An error that moves with the surface counts where it passes over a pixel: surfac
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
 from statistics import fmean
@@ -137,7 +137,7 @@ def _follow(cast: Cast, rows: Sequence[Row], wanted: Callable[[int, U8], U8], nu
         boxes = cast.boxes(number)
         if not boxes:
             raise BadInputError("--frames", f"nobody in view in frame {number}", "frames that show an avatar")
-        part = around([*boxes_before, *boxes])
+        part = around([*boxes_before, *boxes], rows[0].pictures.output)
         true = wanted(number, rows[0].pictures.background(number)) / 255.0
         if last is not None:
             changes.append(flicker(last[part], true[part]))

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from trilane.apps.experiments.error_by_cause import region
 from trilane.arrays import U8
 from trilane.bench.lib.cast import Cast
 from trilane.bench.lib.full_picture import FullPictures
@@ -17,6 +18,7 @@ from trilane.bench.lib.layers import Box
 from trilane.bench.lib.stage_chain import StageChain, units_of
 from trilane.errors import BadInputError
 from trilane.pipeline.stage import UnitContext
+from trilane.shapes import Shape
 from trilane.stages.avatar_pipeline import avatar_pipeline
 from trilane.stages.configure import Checked
 from trilane.stages.gpu.opengl_context import CONTEXT, open_context
@@ -40,7 +42,7 @@ class ScenePictures:
         self.gpu = units["gpu"] if gpu is None else gpu
         self._chain = StageChain(pipeline, {**units, "gpu": self.gpu})
         self._names = [stage.name for stage in pipeline.stages[:-1]]
-        self._shape = (output.height, output.width, 3)
+        self.output: Shape = (output.height, output.width)
 
     @property
     def gl(self) -> Any:
@@ -63,8 +65,8 @@ class ScenePictures:
         return self._picture(self._chain.go_on(number))
 
     def _picture(self, packet: Packet) -> U8:
-        height, width, colours = self._shape
-        picture: U8 = packet.payload[: height * width * colours].reshape(self._shape).copy()
+        height, width = self.output
+        picture: U8 = packet.payload[: height * width * 3].reshape(height, width, 3).copy()
         return picture
 
 
@@ -83,7 +85,7 @@ def spread(total: int, frames: int) -> list[int]:
     return [index * total // count for index in range(count)]
 
 
-def around(boxes: Sequence[Box]) -> tuple[slice, slice]:
-    """Rows and columns of the smallest rectangle that holds all `boxes`, of which there is one at least."""
-    rows = slice(min(box.top for box in boxes), max(box.bottom for box in boxes))
-    return rows, slice(min(box.left for box in boxes), max(box.right for box in boxes))
+def around(boxes: Sequence[Box], output: Shape) -> tuple[slice, slice]:
+    """Rows and columns of the `region` of a picture of `output` that holds all `boxes`, of which there is one."""
+    box = region(boxes, output)
+    return slice(box.top, box.bottom), slice(box.left, box.right)

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from trilane.pipeline.moved_bytes import ByteCounter
 from trilane.pipeline.stage import UnitContext
 from trilane.stages.config import RunConfig
+from trilane.stages.cpu.kept_frames import KeptFrames
 from trilane.transport.packets import Packet
 
 SEGMENTS = "segments"
@@ -110,6 +111,7 @@ class PresentStage:
         self._drawn = -1
         self._segment: Segment | None = None
         self._window = config.opened_window()
+        self._kept = KeptFrames(config.out_dir, config.kept)
 
     def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
         """Views of the slots as frames, and the encoder, made ready. Raises ValueError when the stage has outputs."""
@@ -131,6 +133,7 @@ class PresentStage:
             header = self._headers[slot_in]
             times = float(header["media_time_s"]), int(header["t_sampled_ns"])
             self._window.show(frame, *times, self._frames[slot_in])
+        self._kept.see(frame, self._frames[slot_in])
         if self._segment is None:
             return NOTHING
         pixels, drawn = self._frames[slot_in], int(self._headers[slot_in]["repeats"]) - 1
