@@ -23,7 +23,7 @@ from trilane.scheduler.stats import median_interval
 from trilane.stages.configure import Checked, Request, configure
 
 
-@dataclass
+@dataclass(frozen=True)
 class Row:
     """What was found for one size on one runtime. Times in milliseconds, `errors` one for each frame."""
 

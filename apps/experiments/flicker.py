@@ -8,7 +8,6 @@ An error that moves with the surface counts where it passes over a pixel: surfac
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
 from statistics import fmean
@@ -39,35 +38,31 @@ def flicker(before: F64, now: F64) -> float:
     return float(np.abs(now - before).mean() * STEPS)
 
 
-@dataclass
 class Row:
     """What was found for one way to make pictures. `changes`: the flicker of each pair of frames."""
 
-    runtime: str
-    calibration: str
-    texture_filter: str
-    pictures: ScenePictures
-    before: F64 | None = None
-    changes: list[float] = field(default_factory=list)
-    errors: list[float] = field(default_factory=list)
+    def __init__(self, runtime: str, calibration: str, texture_filter: str, pictures: ScenePictures) -> None:
+        self.pictures = pictures
+        self.changes: list[float] = []
+        self._way = {"runtime": runtime, "calibration": calibration, "texture_filter": texture_filter}
+        self._before: F64 | None = None
+        self._errors: list[float] = []
 
     def add(self, error: F64, part: tuple[slice, slice]) -> None:
         """Count a frame whose error (h,w,3) is looked at in `part`, where the avatars of it and the last one are."""
-        if self.before is not None:
-            self.changes.append(flicker(self.before[part], error[part]))
-        self.errors.append(float(np.abs(error[part]).mean() * STEPS))
-        self.before = error
+        if self._before is not None:
+            self.changes.append(flicker(self._before[part], error[part]))
+        self._errors.append(float(np.abs(error[part]).mean() * STEPS))
+        self._before = error
 
     def as_json(self) -> dict[str, Any]:
         """The row of `measure`."""
         return {
-            "runtime": self.runtime,
-            "calibration": self.calibration,
-            "texture_filter": self.texture_filter,
+            **self._way,
             "flicker": fmean(self.changes),
             "worst": max(self.changes),
             "worst_frame": 1 + self.changes.index(max(self.changes)),
-            "mae": fmean(self.errors),
+            "mae": fmean(self._errors),
         }
 
 

@@ -23,7 +23,7 @@ from trilane.transport.slots import RULES
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "report.md").read_text(encoding="utf-8")
 PARTS = tomllib.loads((ROOT / "tests" / "process" / "json_keys.toml").read_text(encoding="utf-8"))["parts"]
-REPORTS = ("report_with_caps", "report_with_pace")
+REPORTS = ("report_with_caps", "report_with_pace", "report_with_check")
 
 
 def expanded(text: str) -> Iterator[str]:

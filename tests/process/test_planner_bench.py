@@ -16,6 +16,7 @@ from trilane.bench.lib.stage_chain import AvatarFrames
 from trilane.errors import BadInputError
 from trilane.stages.avatar_pipeline import run_avatar
 from trilane.stages.configure import Checked, Request, configure
+from trilane.stages.cpu.kept_frames import kept_frames
 from trilane.stages.cpu.present import SEGMENTS
 
 #: Three seconds from frame to frame.
@@ -43,12 +44,15 @@ def small(bundle: Path, folder: Path) -> Checked:
 
 def test_frames_made_here_are_those_that_a_run_presents(drawable_bundle: Path, tmp_path: Path) -> None:
     """To the byte, by the digests that the run's present stage noted; with nobody in view, too."""
-    checked = small(drawable_bundle, tmp_path)
+    checked = small(drawable_bundle, tmp_path).changed(kept=(1, 4))
     result = run_avatar(checked.config, checked.assets, isolated_frames=0)
     assert result.failure is None and result.presented == len(SEEN)
     assert result.report.stages["infer"].jobs == sum(SEEN)
     lines = [line.split() for path in (tmp_path / SEGMENTS).glob("*.sha256") for line in path.read_text().splitlines()]
     frames = AvatarFrames(checked)
+    for number, file in kept_frames(tmp_path).items():
+        assert np.array_equal(np.load(file), frames.frame(number))
+    assert list(kept_frames(tmp_path)) == [1, 4]
     own, drew, tensors = [], [], []
     for number in range(len(SEEN)):
         background = frames.background(number)
