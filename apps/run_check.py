@@ -52,7 +52,9 @@ def check_run(checked: Checked, folder: Path, told: Callable[[int, int], None] =
             picture, reference = np.load(file, allow_pickle=False), moment.frame(frozenset())
             masks = [differs(image, moment.background) for image in (picture, _bytes(reference.picture))]
             part = around(moment.boxes, path.output)
-            found[number] = figures(picture[part] / STEPS, reference.picture[part], *masks)
+            found[number] = figures(
+                picture[part] / STEPS, reference.picture[part], mask=masks[0], reference_mask=masks[1]
+            )
         told(done + 1, len(files))
     if not found:
         raise TrilaneError("none of the frames that were kept shows an avatar")

@@ -96,11 +96,14 @@ def measure(
     if not 2 <= frames <= shown.frames:
         raise BadInputError("--frames", str(frames), f"2 to {shown.frames}, the scene's frames")
     cast, made = Cast(first), Calibrations(first)
+    # Views to calibrate on are drawn in an OpenGL context of their own, before the stages have theirs.
+    ways = [
+        (engine, method, name, _filtered(made.changed(one, method), name))
+        for (engine, one), method, name in product(checked.items(), calibration, texture_filter)
+    ]
     rows: list[Row] = []
-    for (engine, one), method, name in product(checked.items(), calibration, texture_filter):
-        gpu = rows[0].pictures.gpu if rows else None
-        pictures = ScenePictures(_filtered(made.changed(one, method), name), gpu)
-        rows.append(Row(engine, method, name, pictures))
+    for engine, method, name, one in ways:
+        rows.append(Row(engine, method, name, ScenePictures(one, rows[0].pictures.gpu if rows else None)))
     wanted, against = wanted_pictures(cast, rows[0].pictures.gl)
     numbers = list(range(frames))
     scene_change = _follow(cast, rows, wanted, numbers)

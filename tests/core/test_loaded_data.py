@@ -18,6 +18,7 @@ CHANGING = {
     "stages": {"_Extent"},
     "pipeline": {"ByteCounter"},
     "bench": {"Signals", "_Player", "LoadGenVerdict", "LoadGenPlayer", "Queries"},
+    "apps": {"_Moved", "_Pooled"},
 }
 FOLDERS = (
     *("transport", "scheduler", "body", "pipeline", "scene", "avatars", "hw_profiles", "stages", "training", "bench"),

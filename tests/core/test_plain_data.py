@@ -23,6 +23,8 @@ FOLDERS = ("apps", "avatars", "body", "hw_profiles", "pipeline", "scene", "sched
 #: Imported with an extra, a driver or a fork alone.
 NEEDS_MORE = ("stages.dsp.openvino", "stages.dsp.quiet_openvino", "stages.dsp.qnn", "stages.dsp.cuda")
 CHANGING = {
+    "apps.experiments.error_by_cause._Moved",
+    "apps.experiments.error_by_cause._Pooled",
     "hw_profiles.thermal_state.ThermalState",
     "hw_profiles.throttling.Throttle",
     "pipeline.moved_bytes.ByteCounter",
