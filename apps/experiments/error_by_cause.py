@@ -18,9 +18,9 @@ import numpy as np
 from trilane.apps.experiments.causes import BODY, NOTHING, WHAT, Cause, needs, up_to
 from trilane.apps.experiments.heat_maps import write_heat_map
 from trilane.apps.experiments.picture_errors import LEAST_MS_SSIM_PX, ErrorFigures, Perceived, figures, require_metrics
-from trilane.apps.experiments.reference_path import Moment, ReferenceFrame, ReferencePath
-from trilane.arrays import F64, U8
-from trilane.bench.lib.layers import Box
+from trilane.apps.experiments.reference_path import HALF, Moment, ReferenceFrame, ReferencePath
+from trilane.arrays import F64
+from trilane.bench.lib.layers import Box, Layer, laid_over
 from trilane.bench.lib.picture_error import psnr_db
 from trilane.errors import BadInputError
 from trilane.figure_sources import MEASURED
@@ -64,7 +64,7 @@ def error_by_cause(
             continue
         split.add(moment)
         if truth is not None:
-            split.add_truth(moment, truth.frame(number, moment.background))
+            split.add_truth(moment, truth.layers(number))
     scene = checked.config.scene
     return {
         **split.document(),
@@ -196,19 +196,17 @@ class _Split:
             for index in moment.seen:
                 with_cause, reference_body = (moment.vertices(index, one) for one in (frozenset({cause}), NOTHING))
                 moved.add(with_cause, reference_body, moment.clip(index), self._output)
-        own = _cut(ReferenceFrame(moment.number, moment.own, moment.frame(frozenset(Cause)).mask, moment.boxes), box)
+        own = _cut(_run(moment), box)
         self._remainder.add(own, end)
         self._show(moment.number, WHOLE, own, reference)
 
-    def add_truth(self, moment: Moment, true: U8) -> None:
-        """Count a frame against its ground truth, (h,w,3)."""
+    def add_truth(self, moment: Moment, true: Sequence[Layer]) -> None:
+        """Count a frame against its ground truth, which is laid over the frame's background."""
         box = region(moment.boxes, self._output)
-        for name, picture in (("reference", moment.frame(NOTHING).picture), ("run", moment.own)):
-            nobody = np.zeros(picture.shape[:2], bool)
-            shown, wanted = (
-                _cut(ReferenceFrame(moment.number, image, nobody, moment.boxes), box)
-                for image in (picture, true / 255.0)
-            )
+        picture, cover = laid_over(moment.background, true)
+        wanted = _cut(ReferenceFrame(moment.number, picture, cover >= HALF, moment.boxes), box)
+        for name, frame in (("reference", moment.frame(NOTHING)), ("run", _run(moment))):
+            shown = _cut(frame, box)
             self._truth[name].add(shown, wanted)
             self._show(moment.number, f"{name} against truth", shown, wanted)
 
@@ -233,9 +231,7 @@ class _Split:
                 "left_alone": {"mae": whole.mae - alone["mae"], "square": whole.mean_square - alone["square"]},
             },
             "remainder": self._remainder.as_json(),
-            "truth": {name: _without_masks(one) for name, one in self._truth.items()}
-            if self._truth["run"].values
-            else None,
+            "truth": {name: one.as_json() for name, one in self._truth.items()} if self._truth["run"].values else None,
         }
 
     def _row(self, cause: Cause, before: Cause | None) -> dict[str, Any]:
@@ -259,6 +255,11 @@ class _Split:
             write_heat_map(self._out / name, f"frame {number}, {what}", picture.picture, reference.picture)
 
 
+def _run(moment: Moment) -> ReferenceFrame:
+    """The run's own frame; its mask is that of the sequence's end."""
+    return ReferenceFrame(moment.number, moment.own, moment.frame(frozenset(Cause)).mask, moment.boxes)
+
+
 def _cut(frame: ReferenceFrame, box: Box) -> ReferenceFrame:
     part = np.s_[box.top : box.bottom, box.left : box.right]
     return ReferenceFrame(frame.number, frame.picture[part], frame.mask[part], frame.boxes)
@@ -266,10 +267,6 @@ def _cut(frame: ReferenceFrame, box: Box) -> ReferenceFrame:
 
 def _sum(pooled: Mapping[Cause, _Pooled], name: str) -> float:
     return sum(float(getattr(one, name)) for one in pooled.values())
-
-
-def _without_masks(pooled: _Pooled) -> dict[str, float | None]:
-    return {name: value for name, value in pooled.as_json().items() if name not in ("dice", "iou")}
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

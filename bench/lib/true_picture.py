@@ -34,11 +34,15 @@ class TruePictures:
 
     def frame(self, number: int, background: U8) -> U8:
         """(h,w,3) uint8, sRGB: frame `number` over its `background` (h,w,3)."""
+        return blended(background, self.layers(number))
+
+    def layers(self, number: int) -> list[Layer]:
+        """Those who are seen in frame `number`, on the picture's grid."""
         layers = []
         for seen in self._cast.seen(number):
             rgba = self._clothed.render(seen.joints, seen.view, seen.projection, seen.box.shape) / 255.0
             layers.append(Layer(seen.box, seen.depth, premultiplied(rgba)))
-        return blended(background, layers)
+        return layers
 
 
 def has_truth(cast: Cast) -> bool:

@@ -23,7 +23,7 @@ from trilane.avatars.bundle import bundle_folder, load_bundle
 from trilane.avatars.network_checks import check_network
 from trilane.avatars.network_reshape import reshaped
 from trilane.bench.lib.full_network import as_written
-from trilane.bench.lib.layers import Box
+from trilane.bench.lib.layers import Box, Layer
 from trilane.body.body import load_body
 from trilane.body.detail import DETAILS
 from trilane.body.kinematics import Skeleton
@@ -37,6 +37,7 @@ EYE = np.eye(4)
 class MadeUp:
     """A moment whose causes each add a picture of their own; as (12,16,3) around grey."""
 
+    background: Any = None
     number, boxes, seen = 3, (Box(2, 3, 8, 9),), {0: None}
 
     def __init__(self, seed: int, still: Causes = NOTHING) -> None:
@@ -114,6 +115,21 @@ def test_what_the_run_s_own_frames_have_besides_is_the_remainder() -> None:
     moment = MadeUp(0)
     moment.own = moment.own + 3 / 255
     assert document(moment)["remainder"]["mae"] == pytest.approx(3)
+
+
+def test_the_truth_is_laid_over_the_frame_s_background() -> None:
+    """White of half the cover over black, in the box alone: what both pictures, grey, are from it."""
+    moment = MadeUp(0, frozenset(Cause))
+    moment.background = np.zeros((*OUTPUT, 3), np.uint8)
+    light = np.full((6, 6, 4), 0.5)
+    split = error_by_cause._Split(OUTPUT, None)
+    split.add_truth(moment, [Layer(Box(2, 3, 8, 9), -1.0, light)])
+    split.add(moment)
+    found = split.document()["truth"]
+    half_light = 1.055 * 0.5 ** (1 / 2.4) - 0.055
+    inside = 36 / (OUTPUT[0] * OUTPUT[1])
+    for figures in (found["reference"], found["run"]):
+        assert figures["mae"] == pytest.approx(255 * (inside * (half_light - 0.5) + (1 - inside) * 0.5))
 
 
 def test_how_far_the_vertices_move() -> None:
