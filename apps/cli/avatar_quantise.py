@@ -21,8 +21,15 @@ Examples:
   trilane avatar quantise float.onnx --frames frames.npy --out network.onnx
   trilane avatar quantise float.onnx --frames frames.npy --method entropy --count 20 --report report.json --out q.onnx
 """
-EPILOG_CALIBRATIONS = "\b\nExamples:\n  trilane avatar calibrations float.onnx --frames frames.npy --method minmax"
+EPILOG_CALIBRATIONS = """\b
+Examples:
+  trilane avatar calibrations float.onnx --frames frames.npy --method minmax
+  trilane avatar calibrations --avatar default --plot calibrations.png
+"""
 MAX_FRAMES = 1000
+#: Views of an avatar that a calibration is looked at on.
+HELD_OUT = 24
+EITHER = "a float network and its --frames, or --avatar alone"
 
 
 def quantise(
@@ -62,34 +69,70 @@ def quantise(
 
 
 def calibrations(
-    source: FloatNetworkArgument,
+    source: Annotated[
+        Path | None, typer.Argument(help="Float network (.onnx) with the input N x C x H x W; with --frames.")
+    ] = None,
     frames: Annotated[
-        Path, typer.Option(help="Real inputs: .npy (N, H, W, C) of floats; pictures of the last 5 are compared.")
-    ],
+        Path | None, typer.Option(help="Real inputs: .npy (N, H, W, C) of floats; pictures of the last 5 are compared.")
+    ] = None,
+    avatar: Annotated[
+        str | None,
+        typer.Option(
+            help="Instead: the avatar's float network, on views drawn as the training's; 24 others are compared."
+        ),
+    ] = None,
     method: Annotated[list[str] | None, typer.Option(help=f"{METHOD_HELP} Repeat it; all if none.")] = None,
+    plot: Annotated[
+        Path | None, typer.Option(help="Draw the table into a file: .png, .svg or .pdf. Needs the extra `plot`.")
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Compare numbers of calibration frames and methods by the error of the picture."""
     from rich.progress import track
     from rich.table import Table
 
-    from trilane.avatars.network_file import parse_network
     from trilane.training.quantising.calibration import METHODS
-    from trilane.training.quantising.calibration_table import COUNTS, calibration_table
+    from trilane.training.quantising.calibration_table import COUNTS, calibration_table, recommendation
 
     methods = method or list(METHODS)
     console = stderr_console()
-    table_rows = calibration_table(parse_network(source), _frames(frames), methods)
+    if plot is not None:
+        from trilane.hw_profiles.plot import figure_for
+
+        figure_for(plot, (1, 1))  # that it can be drawn is found out before the work
+    model, inputs, held_out = _material(source, frames, avatar)
+    table_rows = calibration_table(model, inputs, methods, held_out=held_out)
     steps = len(methods) * len(COUNTS)
     rows = list(track(table_rows, "quantising", steps, console=console, disable=not console.is_terminal))
+    line = recommendation(rows)
+    if plot is not None:
+        from trilane.training.quantising.calibration_plot import plot_calibrations
+
+        plot_calibrations(rows, line, plot)
     if json:
-        print_json({"rows": rows, "sources": {"rows": MEASURED}})
+        print_json({"rows": rows, "recommendation": line, "sources": {"rows": MEASURED}})
         return
     table = Table("method", "frames", "PSNR to float, dB", "mean, of 255", "largest", caption=MEASURED)
     for row in rows:
         figures = (f"{row['psnr_db']:.2f}", f"{row['mean']:.2f}", f"{row['largest']:.0f}")
         table.add_row(row["method"], str(row["count"]), *figures)
     stdout_console().print(table)
+    stdout_console().print(f"recommended: {line}", soft_wrap=True)
+
+
+def _material(source: Path | None, frames: Path | None, avatar: str | None) -> tuple[Any, list[Any], int]:
+    """A float network, its inputs, and how many of them are held out. Raises BadInputError, MissingPartError."""
+    from trilane.avatars.network_file import parse_network
+    from trilane.training.quantising.calibration_table import COUNTS, EVALUATED
+
+    if avatar is not None and source is None and frames is None:
+        from trilane.apps.experiments.calibrated_network import drawn_material
+
+        with spinner(f"drawing {max(COUNTS)} views of the training's kind"):
+            return *drawn_material(avatar, max(COUNTS), HELD_OUT), HELD_OUT
+    if avatar is not None or source is None or frames is None:
+        raise BadInputError("avatar calibrations", "some of a network, --frames and --avatar", EITHER)
+    return parse_network(source), _frames(frames), EVALUATED
 
 
 def _write_layers(path: Path, model: Any, result: Any, frame: Any) -> Any:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from trilane.apps.experiments.error_by_cause import region
@@ -33,13 +34,13 @@ Wanted = Callable[[int, U8], U8]
 
 
 class ScenePictures:
-    """The frames of the scene in `checked`. `gpu`: of other pictures in this process; all share one OpenGL context."""
+    """The frames of the scene in `checked`. `gpu`: of other pictures in this process; all share its context."""
 
     def __init__(self, checked: Checked, gpu: UnitContext | None = None) -> None:
         """Raises BadInputError, MissingPartError."""
         pipeline, output = avatar_pipeline(checked.config, checked.assets), checked.config.scene.output
         units = units_of(pipeline, checked.assets)
-        self.gpu = units["gpu"] if gpu is None else gpu
+        self.gpu = units["gpu"] if gpu is None else replace(gpu, assets=checked.assets)
         self._chain = StageChain(pipeline, {**units, "gpu": self.gpu})
         self._names = [stage.name for stage in pipeline.stages[:-1]]
         self.output: Shape = (output.height, output.width)

@@ -18,11 +18,18 @@ from PIL import Image
 import trilane.training
 from trilane.apps import made
 from trilane.apps.cli import avatar_quantise, avatar_validate
+from trilane.apps.experiments import calibrated_network
 from trilane.avatars.bundle import load_bundle, write_manifest
 from trilane.avatars.digests import sha256_of
 from trilane.stages.dsp import runtime
 from trilane.testing.validated import validated
-from trilane.training.quantising import calibration_table, cross_layer_equalisation, layer_noise, quantise
+from trilane.training.quantising import (
+    calibration_plot,
+    calibration_table,
+    cross_layer_equalisation,
+    layer_noise,
+    quantise,
+)
 
 Command = Callable[..., tuple[str, str]]
 
@@ -116,16 +123,39 @@ def test_calibrations_are_a_table(
 ) -> None:
     asked = []
 
-    def table(model: Any, frames: list[Any], methods: list[str]) -> Any:
-        asked.append((type(model).__name__, len(frames), methods))
+    def table(model: Any, frames: list[Any], methods: list[str], *, held_out: int) -> Any:
+        asked.append((type(model).__name__, len(frames), methods, held_out))
         return iter(CALIBRATED)
 
     monkeypatch.setattr(calibration_table, "calibration_table", table)
     words = ("avatar", "calibrations", files / "float.onnx", "--frames", files / "frames.npy")
     check_printed("avatar-calibrations", command(*words)[0])
     document = json.loads(command(*words, "--method", "minmax", "--json")[0])
-    assert document == {"rows": CALIBRATED, "sources": {"rows": "measured in this run"}}
-    assert asked == [("ModelProto", 6, ["minmax", "percentile", "entropy"]), ("ModelProto", 6, ["minmax"])]
+    line = "minmax on 5 frames: 31.42 dB, 0.00 dB below the best; within 0.1 dB the fewest frames win"
+    assert document == {"rows": CALIBRATED, "recommendation": line, "sources": {"rows": "measured in this run"}}
+    assert asked == [("ModelProto", 6, ["minmax", "percentile", "entropy"], 5), ("ModelProto", 6, ["minmax"], 5)]
+
+
+def test_an_avatar_brings_its_network_and_views(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, command: Command
+) -> None:
+    asked: list[Any] = []
+    drawn = lambda *words: asked.append(words) or ("model", ["frames"])  # noqa: E731
+    monkeypatch.setattr(calibrated_network, "drawn_material", drawn)
+    table = lambda *words, **named: asked.append((words, named)) or iter(CALIBRATED)  # noqa: E731
+    monkeypatch.setattr(calibration_table, "calibration_table", table)
+    plots: list[Any] = []
+    monkeypatch.setattr(calibration_plot, "plot_calibrations", lambda *words: plots.append(words))
+    words = ("avatar", "calibrations", "--avatar", "default", "--method", "minmax", "--json")
+    pytest.importorskip("matplotlib")
+    document = json.loads(command(*words, "--plot", tmp_path / "c.png")[0])
+    assert asked == [("default", 100, 24), (("model", ["frames"], ["minmax"]), {"held_out": 24})]
+    assert plots == [(CALIBRATED, document["recommendation"], tmp_path / "c.png")]
+    for bad in (("float.onnx",), ("--avatar", "default", "--frames", "f.npy"), ()):
+        assert (
+            "a float network and its --frames, or --avatar alone" in command("avatar", "calibrations", *bad, code=2)[1]
+        )
+    assert "one of .png, .svg, .pdf" in command(*words, "--plot", tmp_path / "c.bmp", code=2)[1]
 
 
 class Work:

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from trilane.apps.experiments import error_by_size
+from trilane.apps.experiments import error_by_size, scene_pictures
 from trilane.apps.experiments import flicker as bench
 from trilane.apps.experiments.error_by_size import refuse_twice
 from trilane.apps.experiments.flicker import flicker
 from trilane.apps.experiments.picture_errors import ErrorFigures
 from trilane.apps.experiments.scene_pictures import spread
 from trilane.errors import BadInputError
+from trilane.pipeline.stage import UnitContext
 
 WHOLE = (slice(None), slice(None))
 PICTURES: Any = None
+SETTINGS: Any = None
 
 
 def test_an_error_that_stays_does_not_flicker() -> None:
@@ -78,6 +81,22 @@ def test_a_size_has_its_median_time_and_its_mean_error() -> None:
 def test_bad_questions_are_refused_before_any_work(asked: dict[str, Any], said: str) -> None:
     with pytest.raises(BadInputError, match=said):
         bench.measure(**{"runtime": ("ort",), **asked})
+
+
+def test_pictures_share_the_context_and_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another network has another encoding of its input, which the raster stage reads from its unit's assets."""
+    seen: list[Any] = []
+    stages = [SimpleNamespace(name=name) for name in ("raster", "composite", "present")]
+    monkeypatch.setattr(scene_pictures, "avatar_pipeline", lambda *_: SimpleNamespace(stages=stages))
+    monkeypatch.setattr(scene_pictures, "units_of", lambda _, assets: {"gpu": UnitContext("gpu", SETTINGS, assets)})
+    monkeypatch.setattr(scene_pictures, "StageChain", lambda _, units: seen.append(units["gpu"]))
+    config = SimpleNamespace(scene=SimpleNamespace(output=SimpleNamespace(height=2, width=3)))
+    first, second = ({"one": np.zeros(1)}, {"two": np.zeros(1)})
+    made: Any = scene_pictures.ScenePictures(SimpleNamespace(config=config, assets=first))  # type: ignore[arg-type]
+    made.gpu.shared("context", lambda: "the context")
+    scene_pictures.ScenePictures(SimpleNamespace(config=config, assets=second), made.gpu)  # type: ignore[arg-type]
+    assert [unit.assets for unit in seen] == [first, second]
+    assert seen[1].shared("context", lambda: "another one") == "the context"
 
 
 def test_each_value_once_and_frames_within_the_scene() -> None:

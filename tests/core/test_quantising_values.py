@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,6 +16,7 @@ from onnx import TensorProto, helper, numpy_helper
 from trilane.errors import BadInputError
 from trilane.training.quantising import calibration_table as table
 from trilane.training.quantising.calibration import share_ranges, widen
+from trilane.training.quantising.calibration_plot import plot_calibrations
 from trilane.training.quantising.cross_layer_equalisation import equalised
 from trilane.training.quantising.layer_noise import _sqnr_db, layer_report
 from trilane.training.quantising.quantise import quantise
@@ -175,6 +177,31 @@ def test_calibrations_are_judged_on_the_last_five_frames(tiny_float: Any, tiny_f
 
 def test_what_a_table_is_made_of_when_nothing_is_asked_for() -> None:
     assert (table.COUNTS, table.EVALUATED) == ((5, 10, 50, 100), 5)
+
+
+@pytest.mark.parametrize(
+    ("rows", "chosen"),
+    [
+        ([("a", 5, 30.0), ("a", 50, 30.05), ("b", 100, 30.09)], ("a", 5)),
+        ([("a", 5, 30.0), ("a", 50, 30.2), ("b", 100, 30.25)], ("a", 50)),
+        ([("a", 10, 30.0), ("b", 10, 30.05)], ("b", 10)),
+        ([("a", 5, 20.0), ("b", 100, 30.0)], ("b", 100)),
+    ],
+)
+def test_the_fewest_frames_within_a_tenth_of_a_decibel_are_recommended(
+    rows: list[tuple[str, int, float]], chosen: tuple[str, int]
+) -> None:
+    told = [{"method": method, "count": count, "psnr_db": psnr} for method, count, psnr in rows]
+    row = table.recommended(told)
+    assert (row["method"], row["count"]) == chosen
+    assert table.recommendation(told).startswith(f"{chosen[0]} on {chosen[1]} frames: {row['psnr_db']:.2f} dB, ")
+
+
+def test_a_plot_of_calibrations_is_a_picture(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    rows = [{"method": "minmax", "count": count, "psnr_db": 30.0 + count} for count in (5, 10)]
+    plot_calibrations(rows, "a line", tmp_path / "c.svg")
+    assert "<svg" in (tmp_path / "c.svg").read_text(encoding="utf-8")
 
 
 def test_equal_pictures_have_a_finite_psnr() -> None:

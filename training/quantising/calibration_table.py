@@ -6,7 +6,7 @@ Rule: pictures are evaluated on frames that no row was calibrated on, against th
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,8 @@ from trilane.errors import BadInputError
 from trilane.training.quantising.calibration import METHODS
 from trilane.training.quantising.quantise import quantise
 
+#: Errors that are this near to each other are a tie.
+TIE_DB = 0.1
 COUNTS = (5, 10, 50, 100)
 #: Frames that pictures are evaluated on, unless more are held out: the last ones.
 EVALUATED = 5
@@ -58,6 +60,25 @@ def calibration_table(
             integer, scale, zero = _session(network.model), network.input.scale, network.input.zero_point
             tensors = [np.clip(np.round(f / scale) + zero, 0, 255).astype(np.uint8)[None] for f in evaluated]
             yield {"method": method, "count": count, **_errors(float_pictures, [integer(t) for t in tensors])}
+
+
+def recommended(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
+    """The row of the table to follow: of those within `TIE_DB` of the best one, that with the fewest frames.
+
+    Of several with as few, the one with the least error. Raises ValueError without rows.
+    """
+    best = max(float(row["psnr_db"]) for row in rows)
+    ties = [row for row in rows if best - float(row["psnr_db"]) <= TIE_DB]
+    return min(ties, key=lambda row: (row["count"], -row["psnr_db"]))
+
+
+def recommendation(rows: Sequence[Mapping[str, Any]]) -> str:
+    """One line for people: which row of the table to follow, and how near to the best one it is."""
+    row, best = recommended(rows), max(float(row["psnr_db"]) for row in rows)
+    return (
+        f"{row['method']} on {row['count']} frames: {row['psnr_db']:.2f} dB, {best - row['psnr_db']:.2f} dB below the "
+        f"best; within {TIE_DB} dB the fewest frames win"
+    )
 
 
 def _session(model: onnx.ModelProto) -> Any:
