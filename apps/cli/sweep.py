@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from trilane.apps.cli.commands import Commands
-from trilane.apps.cli.console import print_json, stderr_console
+from trilane.apps.cli.console import print_json, stderr_console, stdout_kept
 from trilane.apps.cli.options import JsonOption
 from trilane.errors import BadInputError
 
@@ -187,7 +187,7 @@ def _engine(name: EngineName, store: Store) -> Iterator[Engine]:
     if name is EngineName.RAY:
         from trilane.apps.sweeps.ray_engine import cluster
 
-        with cluster(store.folder) as engine:
+        with stdout_kept(), cluster(store.folder) as engine:  # Ray tells of dead machines on stdout
             yield engine
         return
     from trilane.apps.sweeps.local_engine import run_here

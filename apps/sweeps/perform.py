@@ -33,6 +33,19 @@ ENDED_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM, -signal.SIGINT, -signal.
 host_facts = cache(machine_facts)
 
 
+@dataclass(frozen=True)
+class Place:
+    """Where trials are done. `folder`: the sweep's, for their run folders.
+
+    `working_folder`, `environment`: of the trials; this process's if None. `program`: the module that is tried.
+    """
+
+    folder: Path | None
+    working_folder: Path | None = None
+    environment: dict[str, str] | None = None
+    program: str = field(default_factory=lambda: PROGRAM)
+
+
 class Children:
     """The processes of trials that go on, which several threads start and one may end."""
 
@@ -43,8 +56,8 @@ class Children:
         self._going: set[subprocess.Popen[bytes]] = set()
         self._over = False
 
-    def run(self, command: list[str], stdout: Any, stderr: Any, folder: Path | None) -> int:
-        """The exit code of `command`, run in `folder`; that of SIGTERM, without a process, after `end`."""
+    def run(self, command: list[str], stdout: Any, stderr: Any, place: Place) -> int:
+        """The exit code of `command`; that of SIGTERM, without a process, after `end`."""
         with self._lock:
             if self._over:
                 return -signal.SIGTERM
@@ -53,7 +66,8 @@ class Children:
                 stdin=subprocess.DEVNULL,
                 stdout=stdout,
                 stderr=stderr,
-                cwd=folder,
+                cwd=place.working_folder,
+                env=place.environment,
                 process_group=0,  # Ctrl-C is for the sweep, which ends its trials itself
                 pass_fds=self._inherited,
             )
@@ -85,15 +99,6 @@ def _end(processes: list[subprocess.Popen[bytes]]) -> None:
             process.wait()
 
 
-@dataclass(frozen=True)
-class Place:
-    """Where trials are done. `folder`: the sweep's, for their run folders. `working_folder`: this process's if None."""
-
-    folder: Path | None
-    working_folder: Path | None = None
-    program: str = field(default_factory=lambda: PROGRAM)
-
-
 def perform(trial: Trial, place: Place, children: Children) -> Record:
     """The line of `trials.jsonl` (docs/sweeps.md has its keys). What a lost trial left in the folder is removed.
 
@@ -104,7 +109,7 @@ def perform(trial: Trial, place: Place, children: Children) -> Record:
         own = (place.folder or Path(scratch)) / trial.id
         _remove(own)
         with tempfile.TemporaryFile() as stdout, tempfile.TemporaryFile() as stderr:
-            code = children.run(_command(trial, own, place.program), stdout, stderr, place.working_folder)
+            code = children.run(_command(trial, own, place.program), stdout, stderr, place)
             out, messages = (_text(file) for file in (stdout, stderr))
         ended = ended_as(code, out, messages)
         if ended["status"] == "lost":

@@ -1,16 +1,21 @@
 """Trials on the machines of a Ray cluster: one of the host clock at a time on each, virtual ones on all their cores.
 
 Rule: a task does one trial as this machine would, and its driver, this process, alone writes the sweep's folder. Ray
-tries nothing again by itself: what a lost worker or machine was doing is lost, and the sweep does it once more.
+tries nothing again by itself: what a lost worker or machine was doing is lost, and the sweep does it once more. A
+driver that leaves takes its workers with it, and they their trials.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator, Sequence
+import os
+import platform
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import psutil
 
 from trilane.apps.sweeps.perform import Children, Place, lost, perform
 from trilane.apps.sweeps.store import SWEEP, Record
@@ -21,8 +26,11 @@ from trilane.errors import BadInputError, MissingPartError
 #: What a machine has one of, and a trial of the host clock takes.
 RESOURCE = "trilane_host_clock"
 START_LINE = (
-    f"""ray start --resources='{{"{RESOURCE}": 1}}' --head, and without --head but with --address on the others"""
+    f"""RAY_worker_niceness=0 ray start --head --resources='{{"{RESOURCE}": 1}}', """
+    "on the others with --address=HEAD:6379 in place of --head"
 )
+#: Variables that Ray sets in its workers. A trial has them as its machine has.
+SET_BY_RAY = ("OMP_NUM_THREADS", "CUDA_VISIBLE_DEVICES", "PYTHONBREAKPOINT")
 
 
 @contextmanager
@@ -56,14 +64,9 @@ def _run_on(ray: Any, place: Place, trials: Sequence[Trial]) -> Generator[Record
     resources = _resources(ray, trials[0].kind.clock)
     task = ray.remote(num_cpus=1, resources=resources, max_retries=0)(perform_there)
     going = {task.remote(trial, str(place.folder), str(place.working_folder), place.program): trial for trial in trials}
-    try:
-        while going:
-            (ended,), _ = ray.wait(list(going), num_returns=1)
-            yield _record(ray, ended, going.pop(ended))
-    finally:
-        for reference in going:
-            ray.cancel(reference)  # interrupts the task, which ends its process
-        ray.wait(list(going), num_returns=len(going)) if going else None
+    while going:
+        (ended,), _ = ray.wait(list(going), num_returns=1)
+        yield _record(ray, ended, going.pop(ended))
 
 
 def _resources(ray: Any, clock: Clock) -> dict[str, int]:
@@ -79,8 +82,8 @@ def _resources(ray: Any, clock: Clock) -> dict[str, int]:
 def _record(ray: Any, reference: Any, trial: Trial) -> Record:
     try:
         found: Record = ray.get(reference)
-    except ray.exceptions.RayTaskError:
-        raise  # a defect of `perform`
+    except ray.exceptions.RayTaskError as error:
+        raise error.cause from None
     except ray.exceptions.RayError as error:
         return lost(trial, str(error).partition("\n")[0])
     return found
@@ -91,7 +94,20 @@ def perform_there(trial: Trial, folder: str, working_folder: str, program: str) 
 
     `folder`: the sweep's on the driver's machine, used if this one sees it.
     `working_folder`: the driver's, used if it is here.
+    Raises BadInputError when the trial measures, but would have less of the machine than other programs.
     """
+    worker = psutil.Process()
+    machine = worker.parent() or worker
+    if trial.kind.clock is Clock.HOST and worker.nice() > machine.nice():
+        found = f"workers on {platform.node()} that give way to other programs (niceness {worker.nice()})"
+        raise BadInputError("--engine ray", found, f"niceness {machine.nice()}", f"start Ray so: {START_LINE}")
     shared = Path(folder) if (Path(folder) / SWEEP).is_file() else None
     here = Path(working_folder) if Path(working_folder).is_dir() else None
-    return perform(trial, Place(shared, here, program), Children())
+    environment = restored(os.environ, machine.environ())
+    return perform(trial, Place(shared, here, environment, program), Children())
+
+
+def restored(worker: Mapping[str, str], machine: Mapping[str, str]) -> dict[str, str]:
+    """The environment of a Ray worker with those variables as on its machine that would change what is measured."""
+    kept = {name: value for name, value in worker.items() if name not in SET_BY_RAY}
+    return kept | {name: machine[name] for name in SET_BY_RAY if name in machine}

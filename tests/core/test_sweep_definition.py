@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 from trilane.apps.cli.sweep_options import SweptCommand
 from trilane.apps.cli.sweep_output import seconds_left
 from trilane.apps.sweeps import definition as module
+from trilane.apps.sweeps import ray_engine
 from trilane.apps.sweeps.definition import Definition, Kind, trials_of
 from trilane.apps.sweeps.toml_file import read_sweep
-from trilane.apps.sweeps.trial import Options, Trial, canonical
+from trilane.apps.sweeps.trial import Clock, Options, Trial, canonical
 from trilane.errors import BadInputError
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "chip-sweep.toml"
@@ -197,6 +198,26 @@ def test_files_that_are_no_sweep(tmp_path: Path, text: str, message: str) -> Non
     file.write_text(text)
     with pytest.raises(BadInputError, match=message):
         read_sweep(file)
+
+
+class TwoMachines:
+    """What a cluster of Ray says that it has."""
+
+    def __init__(self, **resources: float) -> None:
+        self.cluster_resources = lambda: {"CPU": 4.0, **resources}
+
+
+def test_machines_that_are_to_measure_have_the_resource_for_it() -> None:
+    assert ray_engine._resources(TwoMachines(), Clock.VIRTUAL) == {}
+    assert ray_engine._resources(TwoMachines(trilane_host_clock=2.0), Clock.HOST) == {"trilane_host_clock": 1}
+    with pytest.raises(BadInputError, match="no machine with the resource trilane_host_clock"):
+        ray_engine._resources(TwoMachines(), Clock.HOST)
+
+
+def test_a_worker_of_ray_measures_as_its_machine_would() -> None:
+    machine = {"PATH": "/bin", "CUDA_VISIBLE_DEVICES": "1", "LD_PRELOAD": "x"}
+    worker = {"PATH": "/bin", "CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1", "RAY_JOB_ID": "f"}
+    assert ray_engine.restored(worker, machine) == {"PATH": "/bin", "CUDA_VISIBLE_DEVICES": "1", "RAY_JOB_ID": "f"}
 
 
 def test_time_left() -> None:

@@ -42,6 +42,7 @@ def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Where the trials say when they began and ended."""
     file = tmp_path / "log"
     monkeypatch.setenv("SWEEP_TRIAL_LOG", str(file))
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
     return file
 
 
@@ -76,7 +77,7 @@ def test_trials_of_the_host_clock_one_after_the_other_with_their_folders(tmp_pat
     assert at_once(Clock.HOST) == 1
     for trial in trials:
         record = records[trial.id]
-        assert record["result"] == {"schema": 1, "words": ["run", *trial.words, "--json"]}
+        assert record["result"] == {"schema": 1, "words": ["run", *trial.words, "--json"], "threads": "7"}
         assert record["command"] == ["trilane", "run", *trial.words, "--json"]
         assert (record["status"], record["clock"], record["folder"]) == ("done", "host", trial.id)
         assert record["host"]["cpu"]["cores_allowed"] == sorted(os.sched_getaffinity(0))

@@ -32,7 +32,7 @@ def main() -> int:
     time.sleep(float(os.environ.get("SWEEP_TRIAL_WAIT", "0")))
     wait_for_others(int(os.environ.get("SWEEP_TRIAL_TOGETHER", "1")))
     note("end", other)
-    print(json.dumps({"schema": 1, "words": other}))
+    print(json.dumps({"schema": 1, "words": other, "threads": os.environ.get("OMP_NUM_THREADS")}))
     if asked.code:
         print("before the last line\nerror: as it was asked", file=sys.stderr)
     return int(asked.code)
@@ -48,7 +48,13 @@ def wait_for_others(count: int) -> None:
 
 def note(what: str, words: list[str]) -> None:
     """Add a line to the log, in one write, so that lines of several processes do not mix."""
-    line = {"what": what, "at": time.monotonic(), "pid": os.getpid(), "words": words}
+    line = {
+        "what": what,
+        "at": time.monotonic(),
+        "pid": os.getpid(),
+        "words": words,
+        "node": os.environ.get("RAY_RAYLET_PID"),
+    }
     with Path(os.environ["SWEEP_TRIAL_LOG"]).open("ab", buffering=0) as file:
         file.write(json.dumps(line).encode() + b"\n")
 
