@@ -13,10 +13,12 @@ from typing import Any
 
 import pytest
 
-from trilane.apps import made, pace, run_job
+from trilane.apps import asked_run, made, pace, run_job
 from trilane.apps.cli import run as cli_run
+from trilane.apps.experiments import picture_errors
 from trilane.apps.report import Report
 from trilane.apps.run_job import Outcome, Plan
+from trilane.errors import BadInputError
 from trilane.pipeline import unit_starter
 from trilane.stages import configure
 from trilane.stages.configure import Request
@@ -125,6 +127,22 @@ def test_what_a_run_without_options_asks_for(asked: Asked, command: Command) -> 
     assert asked.target.name.endswith("Z-beach")
     assert "Scene test: 640x480, tensor size 256" in out
     assert err.splitlines() == ["the motion is short", "[red] is no markup", f"run folder: {asked.target}"]
+
+
+def test_a_run_that_is_steered_is_not_compared(asked: Asked, command: Command) -> None:
+    assert "--check with --dashboard" in command("run", "--check", "2", "--dashboard", code=2)[1]
+    assert asked.request is None
+
+
+def test_a_picture_with_a_hud_is_not_compared(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(picture_errors, "require_metrics", lambda: None)
+
+    def checked(hud: bool) -> Any:
+        return SimpleNamespace(config=SimpleNamespace(scene=SimpleNamespace(hud=hud)))
+
+    asked_run._require_check(checked(False))
+    with pytest.raises(BadInputError, match="--no-hud"):
+        asked_run._require_check(checked(True))
 
 
 def test_every_option_arrives_where_it_belongs(asked: Asked, command: Command) -> None:

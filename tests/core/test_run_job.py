@@ -15,6 +15,7 @@ import pytest
 from trilane.apps import run_job
 from trilane.apps.pace import Pace
 from trilane.apps.report import read_report
+from trilane.apps.run_check import asked_frames
 from trilane.apps.run_job import Hooks, Outcome, Plan, run_to_folder
 from trilane.errors import BadInputError, TrilaneError
 from trilane.figure_sources import COMPARED, COMPUTED, MEASURED
@@ -31,6 +32,7 @@ from trilane.scheduler.recording import Recording
 from trilane.scheduler.virtual import simulate
 from trilane.stages.config import RunConfig
 from trilane.stages.configure import Checked
+from trilane.stages.cpu.kept_frames import FOLDER
 from trilane.stages.cpu.present import SEGMENTS, PresentStage
 from trilane.stages.packets import pose_dtype
 from trilane.transport.packets import SlotLayout, view_packet
@@ -208,6 +210,38 @@ def test_what_the_report_says_of_a_run(runs: Callable[..., Runs], tmp_path: Path
     text = (tmp_path / "run" / "report.json").read_text()
     assert text.startswith('{\n "schema": 1,\n') and text.endswith("}\n")
     assert outcome.report.made is not None and outcome.report.made.at == MADE["at"]
+
+
+CHECK = {
+    **{"frames": 1, "psnr_db": 30.0, "worst_psnr_db": 30.0, "mae": 1.0, "ssim": None, "flip": 0.1, "iou": 0.9},
+    **{"against": "the reference", "numbers": (1,)},
+}
+
+
+def test_frames_of_the_run_alone_are_kept_and_compared(
+    runs: Callable[..., Runs], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The baseline keeps none; what was kept is gone when the folder is whole."""
+
+    def check(_: Any, folder: Path, told: Any) -> dict[str, Any]:
+        assert (folder / FOLDER).is_dir()
+        told(1, 2)
+        return CHECK
+
+    def run(folder: Path) -> RunResult:
+        (folder / FOLDER).mkdir()
+        return a_result()
+
+    monkeypatch.setattr(run_job, "check_run", check)
+    double = runs(run, a_result(4, "sequential"))
+    outcome = go(double, tmp_path / "run", Plan(baseline_frames=4, check=2))
+    assert [call["config"].kept for call in double.calls] == [asked_frames(FRAMES, 2), ()]
+    assert ("check", 1, 2) in double.said
+    assert not (outcome.folder / FOLDER).exists()
+    document = json.loads((outcome.folder / "report.json").read_text())
+    assert document["check"] == {**CHECK, "numbers": [1]}
+    assert document["sources"]["check"] == MEASURED
+    assert "kept" not in document["config"]
 
 
 @pytest.mark.parametrize("plan", [Plan(baseline_frames=0), Plan("sequential")])

@@ -88,6 +88,15 @@ def test_a_cap_is_said_once_and_apart_from_what_heat_did() -> None:
     assert text.count("throttled") == 1  # the column
 
 
+def test_the_error_of_the_run_itself_stands_beside_its_speed() -> None:
+    check = {"frames": 3, "psnr_db": 31.26, "worst_psnr_db": 28.0, "mae": 1.756, "ssim": None, "flip": 0.04, "iou": 0.9}
+    text = table_text(make_report(check={**check, "against": "the reference", "numbers": (1, 2, 3)}))
+    said = (
+        "of this run, 3 frames against the reference: PSNR 31.3 dB, worst 28.0; MAE 1.76 of 255; FLIP 0.040; IoU 0.900"
+    )
+    assert f"{said} (measured in this run)" in text.replace("\n", " ")
+
+
 def test_the_table_says_when_and_by_what_it_was_made() -> None:
     made = {**MADE, "revision": "0123456789abcdef", "modified": True}
     assert "2026-11-22T01:00:00+00:00: trilane 0.1.0 at 0123456789, modified" in table_text(make_report(made=made))
