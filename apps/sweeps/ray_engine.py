@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import platform
+import socket
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -25,6 +26,8 @@ from trilane.errors import BadInputError, MissingPartError
 
 #: What a machine has one of, and a trial of the host clock takes.
 RESOURCE = "trilane_host_clock"
+#: For the head of a cluster to answer.
+ANSWER_S = 5.0
 START_LINE = (
     f"""RAY_worker_niceness=0 ray start --head --resources='{{"{RESOURCE}": 1}}', """
     "on the others with --address=HEAD:6379 in place of --head"
@@ -42,13 +45,21 @@ def cluster(folder: Path) -> Iterator[Engine]:
     """
     ray = required_ray()
     try:
+        _try_address(os.environ.get("RAY_ADDRESS", ""))
         ray.init(address="auto", log_to_driver=False, logging_level="ERROR")
-    except ConnectionError as error:
+    except OSError as error:
         raise BadInputError("--engine ray", "no cluster", "one that runs", f"start it: {START_LINE}") from error
     try:
         yield partial(_run_on, ray, Place(folder, Path.cwd()))
     finally:
         ray.shutdown()
+
+
+def _try_address(address: str) -> None:
+    """Raises OSError for HOST:PORT where nobody listens, which Ray would try for many minutes."""
+    host, _, port = address.rpartition(":")
+    if host and port.isdecimal() and "/" not in host:
+        socket.create_connection((host, int(port)), ANSWER_S).close()
 
 
 def required_ray() -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import socket
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -218,6 +219,16 @@ def test_a_worker_of_ray_measures_as_its_machine_would() -> None:
     machine = {"PATH": "/bin", "CUDA_VISIBLE_DEVICES": "1", "LD_PRELOAD": "x"}
     worker = {"PATH": "/bin", "CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1", "RAY_JOB_ID": "f"}
     assert ray_engine.restored(worker, machine) == {"PATH": "/bin", "CUDA_VISIBLE_DEVICES": "1", "RAY_JOB_ID": "f"}
+
+
+def test_an_address_where_nobody_listens_is_found_at_once() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"127.0.0.1:{server.getsockname()[1]}"
+        ray_engine._try_address(address)
+    with pytest.raises(ConnectionRefusedError):
+        ray_engine._try_address(address)
+    for known_to_ray_alone in ("", "auto", "local", "ray://127.0.0.1:1"):
+        ray_engine._try_address(known_to_ray_alone)
 
 
 def test_time_left() -> None:
