@@ -150,7 +150,7 @@ def run_to_folder(
                 scene = checked.config.scene
                 jobs = list(jobs_of(folder.work / journal.NAME))
                 facts["pace"] = compare(plan.pace, plan.policy, scene.frames, jobs, edge=plan.edge, fps=scene.fps)
-            facts |= _checked_frames(checked, folder.work, hooks) if plan.check else {}
+            facts |= _checked_frames(checked, folder.work, hooks, result) if plan.check else {}
             facts |= _write_files(folder.work, checked.config.scene.fps)
             report = build_report(result, checked.config, machine=machine, baseline=baseline, facts=facts)
             _tell(report, hooks)
@@ -242,9 +242,11 @@ class _Job:
         return release_fps(self._plan.pace, self._checked.config.scene.fps)
 
 
-def _checked_frames(checked: Checked, work: Path, hooks: Hooks) -> dict[str, Any]:
-    """`check` of the report; that there is none is said."""
+def _checked_frames(checked: Checked, work: Path, hooks: Hooks, result: RunResult) -> dict[str, Any]:
+    """`check` of the report; that there is none is said. Whoever interrupted a run does not wait for it."""
     try:
+        if result.interrupted:
+            raise TrilaneError("it was interrupted")
         return {"check": check_run(checked, work, lambda done, of: hooks.progress("check", done, of))}
     except TrilaneError as error:
         hooks.message(f"the run was not compared with the reference path: {error}")
