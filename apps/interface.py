@@ -132,7 +132,7 @@ class RunFailedError(TrilaneError):
 
 def load_run(folder: str | Path) -> Run:
     """The run whose folder is `folder`. Raises BadInputError for a folder that is none, or that is not whole yet."""
-    place = Path(folder)
+    place = _place("load_run", folder)
     if not place.is_dir():
         raise BadInputError(place, "no folder", "the folder of a run")
     return Run(place, read_report(place))
@@ -190,7 +190,7 @@ def run(
         "cores": tuple(f"{unit}={','.join(map(str, own))}" for unit, own in (cores or {}).items()),
     }
     command = ("trilane.run", *(f"{name}={value!r}" for name, value in given.items()))
-    place = None if out is None else Path(out)
+    place = None if out is None else _place("out", out)
     asked = AskedRun(request, edge, baseline_frames, None, performance_profile, latch_ms, place, command)
     hooks = Hooks(on_progress or (lambda *_: None), on_message or (lambda _: None))
     outcome = run_asked(asked, lambda: nullcontext(hooks))
@@ -303,6 +303,13 @@ def predict(
     frame, what = answer["frame_time_ms"], str(avatar or network or f"{encoder}, {size}")
     times = (frame["mean"], frame["low"], frame["high"])
     return Prediction(answer, chip.name, what, *times, answer["latency_ms"]["mean"], answer["power_w"])
+
+
+def _place(where: str, given: str | Path) -> Path:
+    """`given`; of an empty name Path would make the working directory."""
+    if isinstance(given, str) and not given.strip():
+        raise BadInputError(where, repr(given), "the name of a folder")
+    return Path(given)
 
 
 def _given(arguments: Mapping[str, Any]) -> dict[str, Any]:

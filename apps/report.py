@@ -16,6 +16,7 @@ from pydantic_core import from_json
 
 from trilane.apps.report_sources import sources_of
 from trilane.errors import BadInputError
+from trilane.files import require_file
 from trilane.hw_profiles.host import sensor_c
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run_metrics import (
@@ -400,8 +401,8 @@ def read_report(path: Path) -> Report:
     """
     file = path / "report.json" if path.is_dir() else path
     try:
-        if file.stat().st_size > MAX_REPORT_BYTES:
-            raise BadInputError(file, f"{file.stat().st_size} bytes", f"a report of at most {MAX_REPORT_BYTES}")
+        if (size := require_file(file, EXPECTED)) > MAX_REPORT_BYTES:
+            raise BadInputError(file, f"{size} bytes", f"a report of at most {MAX_REPORT_BYTES}")
         document = from_json(file.read_bytes())
         _refuse_newer(file, document)
         return Report.model_validate(document)

@@ -19,6 +19,7 @@ from typing import IO, Any, Final, NamedTuple, Self
 import msgpack
 
 from trilane.errors import BadInputError
+from trilane.files import require_file
 from trilane.scheduler.accounts import in_order
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import Action, Event, Graph, Settings
@@ -175,7 +176,8 @@ class JournalReader:
 
 
 def read_journal(path: Path) -> Iterator[Record]:
-    """Every whole record of the journal at `path`. Raises BadInputError; an empty file is none."""
+    """Every whole record of the journal at `path`. Raises BadInputError; an empty file is none, nor is a pipe."""
+    require_file(path, EXPECTED)
     reader = JournalReader(path)
     is_empty = True
     for record in reader.new():

@@ -34,11 +34,19 @@ def comparison_lines(comparison: Comparison, show_all: bool) -> Iterator[str | T
         yield f"{len(comparison.changes) - most} more settings changed: --all shows them"
     shown = [figure for figure in comparison.rows if show_all or _is_shown(figure, comparison)]
     yield _figure_table(comparison, shown)
-    left = len(comparison.rows) - len(shown)
-    if left:
-        yield f"{left} more figures do not differ: --all shows them"
+    yield from _left_out(comparison, shown)
     yield from comparison.notes
     yield METHOD
+
+
+def _left_out(comparison: Comparison, shown: Sequence[Figure]) -> Iterator[str]:
+    """How many figures are not in the table; those of which nobody knows whether they differ apart."""
+    left = [row for figure, row in comparison.rows.items() if figure not in shown]
+    unknown = sum(row.probability is None for row in left)
+    if alike := len(left) - unknown:
+        yield f"{alike} more {'figure does' if alike == 1 else 'figures do'} not differ: --all shows them"
+    if unknown:
+        yield f"of {unknown} more {'figure' if unknown == 1 else 'figures'} it cannot be told: --all shows them"
 
 
 def _is_shown(figure: Figure, comparison: Comparison) -> bool:

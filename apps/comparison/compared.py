@@ -13,11 +13,16 @@ from trilane.apps.comparison.noise import remarks
 from trilane.apps.comparison.rows import FRAME_TIME, Figure, Rows, rows_of
 from trilane.apps.comparison.sides import Kind, Side, Told
 from trilane.apps.comparison.verdict import verdict
+from trilane.errors import BadInputError
 
 SCHEMA: Final = 1
 METHOD: Final = (
     "intervals hold 95 %; that any of the figures that are said to differ does so by chance has a probability of at "
     f"most {100 * ALPHA:.0f} % (Holm)"
+)
+SEVERAL: Final = (
+    "of several runs a side: base and other are the arithmetic means of the runs' values; the change is the mean over "
+    "the pairs, of ratios the geometric one, so it need not be the ratio of these means"
 )
 
 
@@ -52,7 +57,13 @@ class Comparison:
 
 
 def compare(base: Side, others: Sequence[Side]) -> list[Comparison]:
-    """Each of `others` beside `base`."""
+    """Each of `others` beside `base`. Raises BadInputError for a side that has not as many runs as the base."""
+    for other in others:
+        if len(other.runs) != len(base.runs):
+            remedy = "runs stand in pairs, each in one: give as many on each side, or one on each"
+            raise BadInputError(
+                other.name, _runs(len(other.runs)), f"{_runs(len(base.runs))}, as {base.name} has", remedy
+            )
     return [_compared(base, other) for other in others]
 
 
@@ -67,6 +78,10 @@ def document(comparisons: Sequence[Comparison]) -> dict[str, Any]:
         "comparisons": [each.as_json() for each in comparisons],
         "method": METHOD,
     }
+
+
+def _runs(count: int) -> str:
+    return "1 run" if count == 1 else f"{count} runs"
 
 
 def _compared(base: Side, other: Side) -> Comparison:
@@ -90,6 +105,8 @@ def _stages(report: Mapping[str, Any]) -> dict[str, list[str]]:
 def _notes(base: Side, other: Side) -> list[str]:
     runs = {told.name: told for told in (*base.runs, *other.runs)}
     notes = remarks({name: told.document for name, told in runs.items()})
+    if len(base.runs) > 1:
+        notes.append(SEVERAL)
     return notes + [f"{name}: {text}" for name, told in runs.items() for text in _about(told)]
 
 
@@ -102,7 +119,9 @@ def _about(told: Told) -> Iterator[str]:
     if told.frames is None:
         return
     presented = told.document["frames"]["presented"]
-    if not told.frames.is_whole:
+    if told.remark:
+        yield told.remark
+    elif not told.frames.is_whole:
         yield "its journal ends before the run did: compared by the frames until then"
     if presented > MOST_FRAMES:
         yield f"compared by its last {MOST_FRAMES} frames"

@@ -19,6 +19,8 @@ PARTS: Final = (
 )
 #: Keys of a report that its `config` has too, and of a prediction its `config` alone.
 TWICE: Final = ("policy", "edge")
+#: Key of a document: the parts of which nobody knows what they were, so nobody knows whether they have changed.
+NOT_KNOWN: Final = "not_known"
 #: Keys that differ between any two runs.
 ALWAYS_DIFFERENT: Final = ("made.at", "made.command")
 
@@ -35,7 +37,8 @@ def changes(base: Mapping[str, Any], other: Mapping[str, Any]) -> list[Change]:
     """The keys of two reports, as JSON, in which the runs were not made alike."""
     first, second = _settings(base), _settings(other)
     found = dict.fromkeys([*first, *second])
-    keys = [key for part in PARTS for key in found if key == part or key.startswith(f"{part}.")]
+    known = [part for part in PARTS if part not in (*base.get(NOT_KNOWN, ()), *other.get(NOT_KNOWN, ()))]
+    keys = [key for part in known for key in found if key == part or key.startswith(f"{part}.")]
     return [Change(key, first.get(key), second.get(key)) for key in keys if first.get(key) != second.get(key)]
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from math import erfc, exp, hypot, inf, log, sqrt
+from math import erfc, expm1, hypot, inf, log, log1p, sqrt
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -50,9 +50,11 @@ class Series:
 class Difference(NamedTuple):
     """How far a statistic has changed.
 
-    `base`, `other`: its values. `change`, and its 95 % interval from `low` to `high`: of the other from the base, as a
-    share of the base where `is_ratio`, else in the statistic's unit. `probability`: of a change as large as this
-    between runs of one kind. `low`, `high` and `probability` are None where it cannot be told. `deviation`: the
+    `base`, `other`: its values, each of all frames of its own run, whatever it is beside; of several runs a side their
+    arithmetic mean. `change`, and its 95 % interval from `low` to `high`: of the other from the base, as a share of the
+    base where `is_ratio`, else in the statistic's unit; of the frames that both runs have, and of several pairs of runs
+    the geometric mean of their ratios, so it need not be the ratio of the values. `probability`: of a change as large
+    as this between runs of one kind. `low`, `high` and `probability` are None where it cannot be told. `deviation`: the
     standard deviation of the change, or of its logarithm where `is_ratio`.
     """
 
@@ -64,6 +66,11 @@ class Difference(NamedTuple):
     probability: float | None
     is_ratio: bool
     deviation: float | None = None
+
+    @property
+    def effect(self) -> float:
+        """What deviations are of: the logarithm of the ratio where `is_ratio`, else the change."""
+        return log1p(self.change) if self.is_ratio else self.change
 
 
 def _mean(values: F64, weights: F64) -> F64:
@@ -111,49 +118,65 @@ def difference(
     asks of each does not count as scatter.
     """
     base, other = base.at(slice(-MOST_FRAMES, None)), other.at(slice(-MOST_FRAMES, None))
+    reduce = STATISTICS[statistic]
+    values = _value(base, reduce), _value(other, reduce)
     pair = _Pair.of(base, other, statistic, is_ratio)
-    first, second = pair.values()
     if min(len(pair.base.values), len(pair.other.values)) < LEAST_FRAMES:
-        return unsure(first, second, is_ratio=pair.is_ratio)
+        return unsure(*values, is_ratio=pair.is_ratio)
+    first, second = pair.values()
     variance = max(pair.scatter_variance(), pair.drift_variance())
     between = relative if pair.is_ratio else hypot(relative * max(abs(first), abs(second)), absolute)
-    return judged(first, second, sqrt(variance + between**2), is_ratio=pair.is_ratio)
+    effect = log(second / first) if pair.is_ratio else second - first
+    return _told(values, effect, sqrt(variance + between**2), is_ratio=pair.is_ratio)
 
 
 def combined(pairs: Sequence[Difference]) -> Difference:
     """One difference of several pairs of runs, which differ from pair to pair by more than each one's interval says.
 
-    The mean, with the deviation of the mean of independent pairs; where the pairs scatter more than that (Birge's ratio
-    above 1), as much as they do. `pairs` are not empty, and all ratios or none.
+    `base` and `other` are the arithmetic means of the runs' values, the change is the mean of the effects, of ratios
+    so the geometric mean: with the deviation of the mean of independent pairs; where the pairs scatter more than that
+    (Birge's ratio above 1), as much as they do. Where some pairs are ratios and others are none, nobody knows how sure
+    the change of the means is. `pairs`: of runs that stand in one pair each; not empty.
     """
     base, other = (sum(getattr(pair, side) for pair in pairs) / len(pairs) for side in ("base", "other"))
     is_ratio = all(pair.is_ratio for pair in pairs)
+    if any(pair.is_ratio != is_ratio for pair in pairs):
+        return unsure(base, other, is_ratio=False)
+    effects = np.array([pair.effect for pair in pairs])
+    mean = float(effects.mean())
     deviations = [pair.deviation for pair in pairs if pair.deviation is not None]
-    if len(deviations) < len(pairs) or any(pair.is_ratio != is_ratio for pair in pairs):
-        return unsure(base, other, is_ratio=is_ratio)
-    effects = np.array([log(pair.other / pair.base) if is_ratio else pair.other - pair.base for pair in pairs])
-    mean, within = float(effects.mean()), sqrt(sum(value**2 for value in deviations)) / len(pairs)
+    if len(deviations) < len(pairs):
+        return _told((base, other), mean, None, is_ratio=is_ratio)
+    within = sqrt(sum(value**2 for value in deviations)) / len(pairs)
     between = float(effects.std(ddof=1)) / sqrt(len(pairs)) if len(pairs) > 1 else 0.0
-    if is_ratio:
-        other = base * exp(mean)
-    return judged(base, other, max(within, between), is_ratio=is_ratio)
+    return _told((base, other), mean, max(within, between), is_ratio=is_ratio)
 
 
 def unsure(base: float, other: float, *, is_ratio: bool) -> Difference:
     """A difference of which nobody knows how sure it is."""
     is_ratio = is_ratio and min(base, other) > 0
-    change = other / base - 1 if is_ratio else other - base
-    return Difference(base, other, change, None, None, None, is_ratio)
+    return _told((base, other), log(other / base) if is_ratio else other - base, None, is_ratio=is_ratio)
 
 
 def judged(base: float, other: float, deviation: float, *, is_ratio: bool) -> Difference:
     """A difference whose standard deviation is known; where `is_ratio`, of the logarithm, and values are above 0."""
-    effect = log(other / base) if is_ratio else other - base
-    change, low, high = (
-        exp(value) - 1 if is_ratio else value
-        for value in (effect, effect - Z_95 * deviation, effect + Z_95 * deviation)
-    )
-    return Difference(base, other, change, low, high, _probability(effect, deviation), is_ratio, deviation)
+    return _told((base, other), log(other / base) if is_ratio else other - base, deviation, is_ratio=is_ratio)
+
+
+def _told(values: tuple[float, float], effect: float, deviation: float | None, *, is_ratio: bool) -> Difference:
+    """The difference of which the `effect` and its deviation are known; None: the deviation is not."""
+    if deviation is None:
+        return Difference(*values, _change(effect, is_ratio), None, None, None, is_ratio)
+    change, low, high = (_change(effect + sign * Z_95 * deviation, is_ratio) for sign in (0, -1, 1))
+    return Difference(*values, change, low, high, _probability(effect, deviation), is_ratio, deviation)
+
+
+def _change(effect: float, is_ratio: bool) -> float:
+    return expm1(effect) if is_ratio else effect
+
+
+def _value(series: Series, reduce: Reduce) -> float:
+    return float(reduce(series.values, series.weights)) if len(series.values) else 0.0
 
 
 def _probability(effect: float, deviation: float) -> float:
@@ -182,7 +205,7 @@ class _Pair:
         return cls(base, other, STATISTICS[statistic], is_ratio and positive, is_paired)
 
     def values(self) -> tuple[float, float]:
-        return self._of(self.base), self._of(self.other)
+        return _value(self.base, self.reduce), _value(self.other, self.reduce)
 
     def scatter_variance(self) -> float:
         """Of the effect, by the frames' scatter alone."""
@@ -207,9 +230,6 @@ class _Pair:
 
     def _drawn(self, series: Series, length: int) -> F64:
         return self._scaled(self._at(series, _places(len(series.values), length)))
-
-    def _of(self, series: Series) -> float:
-        return float(self.reduce(series.values, series.weights)) if len(series.values) else 0.0
 
     def _at(self, series: Series, places: Ints | slice) -> F64:
         return self.reduce(series.values[places], series.weights[places])

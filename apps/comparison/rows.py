@@ -7,7 +7,7 @@ they hold: its uncertainty is that of the mean frame time, for nothing else is k
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from math import hypot, log, sqrt
+from math import hypot, sqrt
 from typing import Any, Final, NamedTuple
 
 from trilane.apps.comparison.difference import Z_95, Difference, combined, difference, judged, unsure
@@ -50,13 +50,15 @@ Rows = dict[Figure, Difference]
 
 
 def rows_of(base: Side, other: Side) -> Rows:
-    """Every figure that both sides have; of several runs a side, pair by pair, in order, and these combined."""
-    count = max(len(base.runs), len(other.runs))
-    pairs = [
-        rows_between(base.runs[place % len(base.runs)], other.runs[place % len(other.runs)]) for place in range(count)
-    ]
+    """Every figure that both sides have; of several runs a side, pair by pair, in order, and these combined.
+
+    Raises ValueError for sides of unequal count: a run that stood in two pairs would make them depend on each other.
+    """
+    pairs = [rows_between(*pair) for pair in zip(base.runs, other.runs, strict=True)]
+    if len(pairs) == 1:
+        return pairs[0]
     shared = [figure for figure in pairs[0] if all(figure in rows for rows in pairs)]
-    return {figure: combined([rows[figure] for rows in pairs]) if count > 1 else pairs[0][figure] for figure in shared}
+    return {figure: combined([rows[figure] for rows in pairs]) for figure in shared}
 
 
 def rows_between(base: Told, other: Told) -> Rows:
@@ -80,7 +82,7 @@ def _noise(base: Told, other: Told) -> Noise:
         if key.measure == WORK and key in second:
             change = difference(series, second[key], "typical", is_ratio=True)
             if change.is_ratio:
-                effects[key.of] = log(change.other / change.base)
+                effects[key.of] = change.effect
     return noise_between(base.document, other.document, effects)
 
 

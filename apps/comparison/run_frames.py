@@ -17,9 +17,9 @@ import numpy as np
 from trilane.apps.comparison.difference import MOST_FRAMES, Series
 from trilane.arrays import F64, I64
 from trilane.errors import BadInputError
-from trilane.pipeline.journal import Accounted, Begun, Ended, Record, Stepped, Worked, read_journal
+from trilane.pipeline.journal import Accounted, Begun, Counted, Ended, Record, Stepped, Worked, read_journal
 from trilane.scheduler.accounts import BUSY, CAUSES, IdleCutter, IdleSlice
-from trilane.scheduler.events import Dispatch, Graph, JobDone
+from trilane.scheduler.events import Dispatch, JobDone
 from trilane.scheduler.ledger import JobRecord
 
 NS_PER_MS = 1e6
@@ -41,11 +41,22 @@ class Key(NamedTuple):
 
 @dataclass(frozen=True)
 class RunFrames:
-    """`series` of a run's frames by what they are of, times in ms; its `graph`; whether it `is_whole`."""
+    """`series` of a run's frames by what they are of, times in ms.
 
-    graph: Graph
+    `begun`: the journal's first record, `ended` its last; None where the run did not end by itself.
+    `presented`: frames of the whole run. `counted`: those left out; None where there are none.
+    """
+
+    begun: Begun
     series: Mapping[Key, Series]
-    is_whole: bool
+    ended: Ended | None
+    presented: int
+    counted: Counted | None
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the journal has the whole run."""
+        return self.ended is not None
 
 
 def read_frames(path: Path) -> RunFrames:
@@ -74,7 +85,7 @@ def frames_of(records: Iterable[Record]) -> RunFrames | None:
     for unit in graph.units:
         series |= _unit(unit, [job for job in jobs if job.unit == unit], idle, numbers, end_ns)
     series |= _figures(story.figures)
-    return RunFrames(graph, series, story.is_whole)
+    return RunFrames(story.begun, series, story.ended, story.presented, story.counted)
 
 
 class _Story:
@@ -84,7 +95,9 @@ class _Story:
         self.jobs: list[JobRecord] = []
         self.sampled_ns: dict[int, int] = {}
         self.figures: dict[Key, list[tuple[int, float]]] = defaultdict(list)
-        self.is_whole = False
+        self.ended: Ended | None = None
+        self.counted: Counted | None = None
+        self.presented = 0
         self._first_jobs: dict[int, int] = {}
         self._idle: list[IdleSlice] = []
 
@@ -94,7 +107,7 @@ class _Story:
 
     def add(self, record: Record) -> None:
         if isinstance(record, Begun):
-            self.graph = record.graph
+            self.begun, self.graph = record, record.graph
             self._cutter = IdleCutter(record.graph)
         elif isinstance(record, Stepped):
             self._step(record)
@@ -102,7 +115,10 @@ class _Story:
             self._cutter.account(record.unit, record.account)
         elif isinstance(record, Worked):
             self._work(record)
-        self.is_whole = isinstance(record, Ended)
+        elif isinstance(record, Counted):
+            self.counted = record
+        elif isinstance(record, Ended):
+            self.ended = record
 
     def _step(self, step: Stepped) -> None:
         self._idle += self._cutter.step(step.now_ns, step.events, step.actions)
@@ -116,6 +132,7 @@ class _Story:
 
     def _work(self, record: Worked) -> None:
         self.jobs.append(record.job)
+        self.presented += record.job.stage == self.graph.stages[-1].name
         self._cutter.job(record.job)
         most = (MOST_FRAMES + IN_FLIGHT) * len(self.graph.stages)
         if len(self.jobs) >= 2 * most:

@@ -1,10 +1,12 @@
 """What is compared: run folders, reports and predictions, from disk. Rule: what cannot be compared is refused by name.
 
-A run folder with a journal has every frame; a report alone, or a prediction, has summaries.
+A run folder with a journal has every frame; a report alone, or a prediction, has summaries. What a run that was killed
+would have said of itself in its report follows from its journal (`journal_document.py`).
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
@@ -13,9 +15,12 @@ from typing import Any, Final
 
 from pydantic_core import from_json
 
+from trilane.apps.comparison.journal_document import document_of
 from trilane.apps.comparison.run_frames import RunFrames, read_frames
+from trilane.apps.live.followed_run import FollowedRun, RunState, folder_of
 from trilane.apps.report import MAX_REPORT_BYTES, read_report
 from trilane.errors import BadInputError
+from trilane.files import require_file
 from trilane.pipeline.journal import NAME as JOURNAL
 
 EXPECTED: Final = "a run folder, its report.json, or what `trilane predict --json` printed"
@@ -33,12 +38,16 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True)
 class Told:
-    """One run: `name` as given, `document` as JSON with the keys of a report, `frames` of a run with a journal."""
+    """One run: `name` as given, `document` as JSON with the keys of a report, `frames` of a run with a journal.
+
+    `remark`: what a person should know of one that has no report.
+    """
 
     name: str
     kind: Kind
     document: Mapping[str, Any]
     frames: RunFrames | None = None
+    remark: str = ""
 
 
 @dataclass(frozen=True)
@@ -50,20 +59,28 @@ class Side:
 
 
 def read_side(text: str) -> Side:
-    """`text`: a path, or several joined by commas. Raises BadInputError."""
-    names = [text] if Path(text).exists() else text.split(",")
+    """`text`: a path, or several joined by commas. Raises BadInputError, also for a run that is named twice."""
+    names = [text] if text.strip() and _is_there(text) else text.split(",")
+    for name in names:
+        if not name.strip():
+            raise BadInputError(repr(text), "an empty name", EXPECTED, "leave no comma over")
+    again = next((name for place, name in enumerate(names) if _same(name) in map(_same, names[:place])), None)
+    if again is not None:
+        raise BadInputError(repr(text), f"{again} twice", "each run once", "twice the same run is no surer than once")
     return Side(text, tuple(read_told(name) for name in names))
 
 
 def read_told(name: str) -> Told:
-    """The run at the path `name`. Raises BadInputError naming what is missing, cut off or of another schema."""
-    path = Path(name)
-    if path.is_dir():
-        document = read_report(path).as_json()
-        journal = path / JOURNAL
-        if not journal.exists():
-            return Told(name, Kind.REPORT, document)
-        return Told(name, Kind.RUN, document, read_frames(journal))
+    """The run at the path `name`, or of this name, as `trilane top` finds it.
+
+    Raises BadInputError naming what is missing, cut off or of another schema.
+    """
+    try:
+        path = folder_of(Path(name)) or Path(name)
+        if path.is_dir():
+            return _of_folder(name, path)
+    except OSError as error:
+        raise BadInputError.of_os_error(name, error, EXPECTED) from None
     found = _document(path)
     if all(key in found for key in OF_A_PREDICTION):
         return Told(name, Kind.PREDICTION, found)
@@ -73,10 +90,40 @@ def read_told(name: str) -> Told:
     return Told(name, Kind.REPORT, read_report(path).as_json())
 
 
+def _is_there(text: str) -> bool:
+    try:
+        return Path(text).exists()
+    except OSError:  # many names are longer together than one may be
+        return False
+
+
+def _same(name: str) -> str:
+    """Alike for two names of one thing."""
+    return os.path.realpath(name)
+
+
+def _of_folder(name: str, path: Path) -> Told:
+    journal = path / JOURNAL
+    if not os.path.lexists(journal):
+        return Told(name, Kind.REPORT, read_report(path).as_json())
+    if os.path.lexists(path / "report.json"):
+        return Told(name, Kind.RUN, read_report(path).as_json(), read_frames(journal))
+    frames = read_frames(journal)
+    return Told(name, Kind.RUN, document_of(frames, journal), frames, _without_report(path, frames))
+
+
+def _without_report(path: Path, frames: RunFrames) -> str:
+    if frames.is_whole:
+        return "it has no report: compared by its journal"
+    if FollowedRun(path).state is RunState.GOES_ON:
+        return "it still goes on and has no report: compared by the frames until now"
+    return "it did not end by itself and has no report: compared by the frames of its journal until then"
+
+
 def _document(path: Path) -> Mapping[str, Any]:
     try:
-        if path.stat().st_size > MAX_REPORT_BYTES:
-            raise BadInputError(path, f"{path.stat().st_size} bytes", f"at most {MAX_REPORT_BYTES}")
+        if (size := require_file(path, EXPECTED)) > MAX_REPORT_BYTES:
+            raise BadInputError(path, f"{size} bytes", f"at most {MAX_REPORT_BYTES}")
         document = from_json(path.read_bytes())
     except OSError as error:
         raise BadInputError.of_os_error(path, error, EXPECTED) from None

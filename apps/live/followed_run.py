@@ -100,7 +100,7 @@ def follow(given: Path | None, *, wait: bool = False, sleep: Callable[[float], N
     Raises BadInputError.
     """
     while True:
-        found = _newest(RUNS.glob(f"*/{NAME}")) if given is None else _folder_of(given)
+        found = _newest(RUNS.glob(f"*/{NAME}")) if given is None else folder_of(given)
         if found is not None:
             return FollowedRun(found)
         if not wait:
@@ -108,8 +108,8 @@ def follow(given: Path | None, *, wait: bool = False, sleep: Callable[[float], N
         sleep(LOOK_S)
 
 
-def _folder_of(given: Path) -> Path | None:
-    """The folder of a run that has begun, or what is there in its place."""
+def folder_of(given: Path) -> Path | None:
+    """The folder of the run that `given` means (`follow`) and that has begun, or what is there in its place."""
     if given.name == NAME:
         return given.parent
     places = [given] if given.is_absolute() or len(given.parts) > 1 else [given, RUNS / given]

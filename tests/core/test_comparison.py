@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import sys
 from collections.abc import Callable
@@ -12,6 +13,7 @@ from typing import Any
 import pytest
 
 from trilane.apps.cli import main as cli
+from trilane.apps.cli.compare_table import comparison_lines
 from trilane.apps.comparison import run_frames
 from trilane.apps.comparison.compared import Comparison, compare, document
 from trilane.apps.comparison.configuration import Change, changes
@@ -22,7 +24,7 @@ from trilane.apps.comparison.run_frames import Key, frames_of
 from trilane.apps.comparison.sides import Kind, Side, Told, read_side, read_told
 from trilane.apps.comparison.verdict import NO_DIFFERENCE, TOO_FEW
 from trilane.errors import BadInputError
-from trilane.pipeline.journal import NAME, Worked, journal_of
+from trilane.pipeline.journal import NAME, JournalWriter, Worked, journal_of
 from trilane.scheduler.virtual import Simulation
 from trilane.testing.compared_runs import simulated, write_run
 from trilane.testing.run_report import make_report
@@ -358,7 +360,17 @@ def test_the_command(
     assert run_cli(monkeypatch, base, other, "--json", "--fail-if-slower", "5%") == 1
     said = json.loads(capsys.readouterr().out)
     assert said["changes"] == [{"run": other, "key": "policy", "base": "pipelined", "other": "sequential"}]
-    assert run_cli(monkeypatch, f"{base},{base}", other, "--fail-if-slower", "500 %") == 0
+    more = [str(make(name, seed)) for seed, name in enumerate(("a2", "b2"), 3)]
+    assert run_cli(monkeypatch, f"{base},{more[0]}", f"{other},{more[1]}", "--fail-if-slower", "500 %") == 0
+    assert "of several runs a side: base and other are the arithmetic means" in " ".join(
+        capsys.readouterr().out.split()
+    )
+    assert run_cli(monkeypatch, f"{base},{more[0]}", other) == 2
+    assert "found 1 run, expected 2 runs" in " ".join(capsys.readouterr().err.split())
+    assert run_cli(monkeypatch, f"{base},{base}", f"{other},{more[1]}") == 2
+    assert "twice" in capsys.readouterr().err
+    assert run_cli(monkeypatch, f"{base},", other) == 2
+    assert "found an empty name" in " ".join(capsys.readouterr().err.split())
     capsys.readouterr()
     assert run_cli(monkeypatch, base, other, "--fail-if-slower", "much") == 2
     assert "found 'much', expected a percentage such as 5%" in capsys.readouterr().err
@@ -368,3 +380,118 @@ def test_the_command(
     assert "verdict: no difference" in text and "4 more settings changed: --all shows them" in text
     assert run_cli(monkeypatch, base, str(tmp_path / "nothing")) == 2
     assert "nothing" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("text", ["", " ", ",", "a,,b", "a, ,b", ",a"])
+def test_an_empty_name_is_refused_and_not_the_working_directory(
+    make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str
+) -> None:
+    monkeypatch.chdir(make("a"))
+    (tmp_path / "a" / "a").symlink_to(tmp_path / "a")
+    with pytest.raises(BadInputError, match="an empty name"):
+        read_side(text)
+    with pytest.raises(BadInputError, match="no such file"):
+        read_side(",".join(f"none{place}" for place in range(1000)))
+
+
+def test_a_side_of_several_runs_shows_what_its_reports_say() -> None:
+    runs = [told(simulated(seed, frames=60, factors={"infer": seed / 2.0}), f"r{seed}") for seed in range(1, 5)]
+    ab, cd = Side("a,b", tuple(runs[:2])), Side("c,d", tuple(runs[2:]))
+    there, back = compare(ab, [cd])[0].rows, compare(cd, [ab])[0].rows
+    figure = Figure("frame time", "", "", "mean", "ms")
+    means = [run.document["frame_time_ms"]["mean"] for run in runs]
+    assert there[figure].base == pytest.approx((means[0] + means[1]) / 2, rel=1e-6)
+    assert there[figure].other == pytest.approx((means[2] + means[3]) / 2, rel=1e-6)
+    assert all((row.base, row.other) == pytest.approx((back[key].other, back[key].base)) for key, row in there.items())
+    assert there[figure].change == pytest.approx((means[2] / means[0] * means[3] / means[1]) ** 0.5 - 1, rel=1e-6)
+
+
+def killed(folder: Path, run: Simulation, facts: dict[str, Any], *, keep: float = 1.0) -> Path:
+    """A folder with a journal alone, without its last record where `keep`, a share of it, is less than 1."""
+    folder.mkdir(parents=True)
+    assert run.recording is not None
+    with JournalWriter(folder / NAME) as journal:
+        for record in journal_of(run.recording, run.jobs, facts, run.report):
+            journal.add(record)
+    whole = (folder / NAME).read_bytes()
+    (folder / NAME).write_bytes(whole[: int(len(whole) * keep)])
+    return folder
+
+
+NOBODY = 999_999_999  # no process has this number
+
+
+def test_a_run_that_was_killed_is_compared_by_its_journal(
+    make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    report = make_report()
+    facts = {name: report[name] for name in ("config", "machine")} | {"clock": "virtual"}
+    config = {**report["config"], "pace_ns": {"pose": 7}}
+    base = make("base", clock="virtual", machine=report["machine"], config=report["config"], idle_cores="wait awake")
+    slow = simulated(2, frames=120, factors={"infer": 1.05})
+    folder = killed(tmp_path / "runs" / f"gone.{NOBODY}.partial", slow, {**facts, "config": config}, keep=0.8)
+    for name in (str(folder), "gone", "runs/gone", str(folder / NAME)):
+        other = read_side(name)
+        found = compare(read_side(str(base)), [other])[0]
+        assert [change.key for change in found.changes] == ["config.pace_ns.pose"]
+        assert "infer takes " in found.verdict
+        assert any("it did not end by itself and has no report" in note for note in found.notes)
+    document = other.runs[0].document
+    assert 60 < document["frames"]["presented"] == document["frames"]["requested"] < 120
+    live = killed(tmp_path / "runs" / f"live.{os.getpid()}.partial", slow, facts, keep=0.8)
+    assert "it still goes on" in read_side(str(live)).runs[0].remark
+    done = read_side(str(killed(tmp_path / "done", slow, facts))).runs[0]
+    assert done.remark == "it has no report: compared by its journal"
+    assert done.document["frame_time_ms"]["mean"] == pytest.approx(slow.report["frame_time_ms"]["mean"])
+    (base / NAME).unlink()
+    assert "only summaries" in compare(read_side(str(base)), [read_side("gone")])[0].notes[0]
+
+
+def test_what_a_journal_says_of_a_run_is_what_its_report_says(tmp_path: Path) -> None:
+    """All but the last record, beside the figures that the last one holds; shares up to what is before frame 1."""
+    run = simulated(5, frames=80, policy="latest", period_ms=5)
+    read = read_side(str(killed(tmp_path / "a", run, {"clock": "virtual"}, keep=0.999))).runs[0]
+    assert read.frames is not None and not read.frames.is_whole
+    mine, report = read.document, run.report
+    assert mine["policy"] == "latest"
+    for key in ("frame_time_ms", "latency_ms"):
+        assert mine[key]["mean"] == pytest.approx(report[key]["mean"], rel=0.02)
+    for stage, row in report["stages"].items():
+        assert mine["stages"][stage]["unit"] == row["unit"]
+        assert mine["stages"][stage]["service_ms"]["mean"] == pytest.approx(row["service_ms"]["mean"], rel=0.02)
+    for unit, row in report["units"].items():
+        assert mine["units"][unit]["busy"] == pytest.approx(row["busy"], abs=0.03)
+    assert sum(mine["frames"]["dropped"].values()) == pytest.approx(sum(report["frames"]["dropped"].values()), abs=3)
+    broken = killed(tmp_path / "b", run, {"config": [1]})
+    with pytest.raises(BadInputError, match=r"config: found \[1\], expected names and their values"):
+        read_side(str(broken))
+
+
+def test_what_is_too_short_is_not_called_alike(make: Make, tmp_path: Path) -> None:
+    short = str(write_run(tmp_path / "short", simulated(2, frames=20)))
+    found = compare(read_side(str(make("a"))), [read_side(short)])[0]
+    unknown = sum(row.probability is None for row in found.rows.values())
+    alike = len(found.rows) - unknown
+    lines = [*comparison_lines(found, False)]
+    said = " ".join(line for line in lines if isinstance(line, str))
+    (differs,) = (line.columns[-1] for line in lines if not isinstance(line, str) and len(line.columns) == 7)
+    shown = [*differs.cells].count("?")
+    assert shown > 5 and unknown - shown > 20
+    assert f"of {unknown - shown} more figures it cannot be told: --all shows them" in said
+    assert ("not differ" in said) == (alike > 0)
+    assert not any("cannot be told" in line for line in comparison_lines(found, True) if isinstance(line, str))
+
+
+@pytest.mark.parametrize("name", ["report.json", NAME])
+@pytest.mark.parametrize("kind", ["pipe", "device"])
+def test_no_pipe_and_no_device_is_read(make: Make, name: str, kind: str) -> None:
+    folder = make("a")
+    (folder / name).unlink()
+    if kind == "pipe":
+        os.mkfifo(folder / name)
+    else:
+        (folder / name).symlink_to("/dev/zero")
+    for given in (folder, folder / name) if name == "report.json" else (folder,):
+        with pytest.raises(BadInputError, match="a device, a pipe or a socket"):
+            read_side(str(given))

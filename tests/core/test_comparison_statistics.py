@@ -181,3 +181,23 @@ def test_several_pairs_are_as_sure_as_they_scatter() -> None:
     ratio = combined([judged(1.0, 2.0, 0.1, is_ratio=True), judged(4.0, 2.0, 0.1, is_ratio=True)])
     assert ratio.change == pytest.approx(0.0)
     assert combined([pairs[0], unsure(0.0, 1.0, is_ratio=False)]).probability is None
+
+
+def test_values_of_several_runs_are_their_means_whichever_side_they_are_on() -> None:
+    """Runs of 1 and 4, and of 8 and 2: means 2.5 and 5; ratios 8 and 1/2, so 2 in the geometric mean, or 1/2 back."""
+    there = combined([judged(1.0, 8.0, 0.1, is_ratio=True), judged(4.0, 2.0, 0.1, is_ratio=True)])
+    back = combined([judged(8.0, 1.0, 0.1, is_ratio=True), judged(2.0, 4.0, 0.1, is_ratio=True)])
+    assert (there.base, there.other) == (back.other, back.base) == (2.5, 5.0)
+    assert (there.change, back.change) == (pytest.approx(1.0), pytest.approx(-0.5))
+    uneven = combined([unsure(1.0, 16.0, is_ratio=True), unsure(4.0, 4.0, is_ratio=True)])
+    assert (uneven.base, uneven.other, uneven.change) == (2.5, 10.0, pytest.approx(3.0))
+    mixed = combined([judged(1.0, 2.0, 0.1, is_ratio=True), judged(0.0, 3.0, 0.1, is_ratio=False)])
+    assert mixed == unsure(0.5, 2.5, is_ratio=False)
+
+
+def test_a_run_has_its_own_value_whatever_it_is_beside() -> None:
+    """The base has 20 frames more than the other, of 5 ms; on the 100 that both have, the other takes twice as long."""
+    base = series(np.concatenate([np.full(100, 2.0), np.full(20, 5.0)]))
+    found = difference(base, series(np.full(100, 4.0)), "mean", is_ratio=True)
+    assert (found.base, found.other) == (pytest.approx(2.5), 4.0)
+    assert found.change == pytest.approx(1.0)

@@ -252,3 +252,11 @@ def test_a_network_by_itself_is_predicted_like_on_the_command_line(tiny_bundle: 
 def test_what_cannot_be_predicted_is_refused(arguments: dict[str, Any], found: str) -> None:
     with pytest.raises(BadInputError, match=found):
         trilane.predict(**arguments)
+
+
+@pytest.mark.parametrize("name", ["", " "])
+def test_an_empty_name_is_not_the_working_directory(name: str) -> None:
+    with pytest.raises(BadInputError, match=f"load_run: found '{name}', expected the name of a folder"):
+        trilane.load_run(name)
+    with pytest.raises(BadInputError, match=f"out: found '{name}', expected the name of a folder"):
+        trilane.run(out=name)

@@ -82,7 +82,8 @@ def test_a_record_cut_off_at_the_end_is_left_out(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "found"),
     [
-        (b"", "no record"),
+        (b"", "an empty file"),
+        (msgpack.packb([0, 99])[:1], "no record"),
         (b"\xc1", "byte 1"),
         (msgpack.packb([1, 5, [], []]), "a record before the header"),
         (msgpack.packb([0, 99, {}, {}, {}]), "schema 99"),

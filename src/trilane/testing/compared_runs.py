@@ -25,9 +25,14 @@ STAGES: Final = {
 
 
 def simulated(
-    seed: int, *, policy: str = "pipelined", frames: int = 200, factors: Mapping[str, float] | None = None
+    seed: int,
+    *,
+    policy: str = "pipelined",
+    frames: int = 200,
+    factors: Mapping[str, float] | None = None,
+    period_ms: float = 0,
 ) -> Simulation:
-    """A run whose service times scatter by 5 %. `factors`: of a stage's time, by its name."""
+    """A run whose service times scatter by 5 %. `factors`: of a stage's time, by its name. `period_ms`: of frames."""
     draw = random.Random(seed)
     scale = {stage: (factors or {}).get(stage, 1.0) * ms * MS for stage, (_, ms) in STAGES.items()}
 
@@ -35,7 +40,7 @@ def simulated(
         return round(scale[stage] * draw.lognormvariate(0, 0.05))
 
     graph = chain([(stage, unit) for stage, (unit, _) in STAGES.items()], "double", "composite")
-    return simulate(graph, Settings(frames, policy), service, keep=True)
+    return simulate(graph, Settings(frames, policy, round(period_ms * MS)), service, keep=True)
 
 
 def write_run(folder: Path, run: Simulation, **changes: Any) -> Path:
