@@ -1,10 +1,12 @@
 """The folder that a run writes: made under a temporary name beside its place and renamed when it is whole.
 
-Rule: a folder with the run's name is complete; a folder whose name ends in `.partial` is not.
+Rule: a folder with the run's name is complete; a folder whose name ends in `.partial` is not. Where something in it
+could not be written, such as on a full disk, what was written stays, and the error says where.
 """
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 from datetime import UTC, datetime
@@ -12,8 +14,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from trilane.errors import BadInputError
+from trilane.errors import BadInputError, TrilaneError, UnwrittenError, reason
 from trilane.writing import WRITABLE
+
+#: What the system says of a place that takes no more.
+FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS})
 
 
 def default_place(scene: str) -> Path:
@@ -30,7 +35,8 @@ def default_place(scene: str) -> Path:
 class RunFolder:
     """Context manager: `work` is the temporary folder. Leaving without `complete()` removes it and the parents it made.
 
-    Raises BadInputError on entry when `target` exists already or nothing can be written there.
+    Raises BadInputError on entry when `target` exists already or nothing can be written there, and TrilaneError on
+    leaving by an error about a file that could not be written: a folder in which anything was written stays then.
     """
 
     def __init__(self, target: Path) -> None:
@@ -72,8 +78,25 @@ class RunFolder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if not self._keep:
+        if self._keep:
+            return
+        failed = self._unwritten(error)
+        is_kept = failed and any(file.is_file() and file.stat().st_size for file in self.work.rglob("*"))
+        if not is_kept:
             self._remove()
+        if failed:
+            left = f"what was written stays in {self.work}" if is_kept else "nothing was written"
+            raise TrilaneError(f"{failed}; free space there or choose another --out; {left}") from error
+
+    def _unwritten(self, error: BaseException | None) -> str:
+        """What could not be written, and why; "" of an error about anything else."""
+        if isinstance(error, UnwrittenError):
+            return str(error)
+        if isinstance(error, BadInputError) and isinstance(error.__cause__, OSError):
+            return f"{error.where}: {error.found}"
+        if isinstance(error, OSError) and error.errno in FULL:
+            return f"{error.filename or self.work}: {reason(error)}"
+        return ""
 
     def _remove(self) -> None:
         shutil.rmtree(self.work, ignore_errors=True)

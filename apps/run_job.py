@@ -1,7 +1,8 @@
 """One run from a checked configuration to a complete run folder.
 
 Rule: whatever the units did, what is in the folder is whole: a run that was interrupted or failed says so in its
-report and keeps the frames that were presented; a run that presented none leaves no folder.
+report and keeps the frames that were presented; a run that presented none leaves no folder. A run that could not
+write on leaves what it wrote in a folder that is not whole (run_folder.py).
 """
 
 from __future__ import annotations
@@ -117,7 +118,8 @@ def run_to_folder(
     `made`: what `trilane.apps.made.made_facts` said of the command line; None where there is none.
     `starter`: a fork server that was started earlier; without one, the units stay where `checked` has them.
     `watched`: by whom; None: by nobody.
-    Raises BadInputError when `target` cannot be written, and TrilaneError when no frame was presented.
+    Raises BadInputError when `target` cannot be written, and TrilaneError when no frame was presented or the folder,
+    which stays then, could not be written on.
     """
     with RunFolder(target) as folder:
         if starter is not None:

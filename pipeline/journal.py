@@ -18,7 +18,7 @@ from typing import IO, Any, Final, NamedTuple, Self
 
 import msgpack
 
-from trilane.errors import BadInputError
+from trilane.errors import BadInputError, UnwrittenError
 from trilane.files import require_file
 from trilane.scheduler.accounts import in_order
 from trilane.scheduler.core import Core
@@ -107,21 +107,29 @@ _PLACES = {kind: place for place, kind in enumerate(RECORDS)}
 class JournalWriter:
     """Context manager: `add` writes a record. What is written reaches the file after `flush`, and at the end.
 
-    `path`: a file that does not exist yet. Raises OSError.
+    `path`: a file that does not exist yet; OSError where it cannot be made. All else, the end included, raises
+    UnwrittenError where the file cannot be written on, such as on a full disk.
     """
 
     def __init__(self, path: Path) -> None:
+        self._path = path
         self._file: IO[bytes] = path.open("xb", buffering=CHUNK_BYTES)
         self._packer = msgpack.Packer()
 
     def add(self, record: Record) -> None:
         kind = type(record)
         fields = _FIELDS[kind](record) if kind in _FIELDS else record
-        self._file.write(self._packer.pack([_PLACES[kind], *fields]))
+        try:
+            self._file.write(self._packer.pack([_PLACES[kind], *fields]))
+        except OSError as error:
+            raise UnwrittenError(self._path, error) from None
 
     def flush(self) -> None:
         """Whoever follows the journal sees all that was added."""
-        self._file.flush()
+        try:
+            self._file.flush()
+        except OSError as error:
+            raise UnwrittenError(self._path, error) from None
 
     def __enter__(self) -> Self:
         return self
@@ -129,7 +137,10 @@ class JournalWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._file.close()
+        try:
+            self._file.close()
+        except OSError as failed:
+            raise UnwrittenError(self._path, failed) from None
 
 
 class JournalReader:

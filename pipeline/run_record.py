@@ -16,7 +16,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Protocol
 
-from trilane.errors import BadInputError, TrilaneError
+from trilane.errors import BadInputError, UnwrittenError
 from trilane.pipeline.journal import (
     SCHEMA,
     Accounted,
@@ -171,18 +171,15 @@ class JournaledRun:
             self._sample(now_ns, core)
 
     def _write(self) -> None:
-        """What was noted since the last call; raises TrilaneError when it cannot be."""
+        """What was noted since the last call; raises UnwrittenError when it cannot be."""
         add, told = self._writer.add, 0
         jobs = self._source.ended() if self._source is not None else []
-        try:
-            for step, follows, ended in self._steps:
-                add(step)
-                for record in (*follows, *jobs[told:ended]):
-                    if record is not None:
-                        add(record)
-                told = ended
-        except OSError as error:
-            raise TrilaneError(f"{self._file.path}: the journal cannot be written: {error.strerror}") from None
+        for step, follows, ended in self._steps:
+            add(step)
+            for record in (*follows, *jobs[told:ended]):
+                if record is not None:
+                    add(record)
+            told = ended
         self._steps.clear()
 
     def say(self, text: str) -> None:
@@ -197,7 +194,7 @@ class JournaledRun:
         self._writer.add(Ended(time.monotonic_ns(), report))
 
     def flush(self) -> None:
-        """Everything that was noted is in the file. Raises TrilaneError when it cannot be written."""
+        """Everything that was noted is in the file. Raises UnwrittenError when it cannot be written."""
         self._write()
         self._writer.flush()
 
@@ -236,7 +233,7 @@ def recorded(file: JournalFile | None, graph: Graph, settings: Settings, caps: C
         try:
             yield run
         finally:
-            with suppress(TrilaneError, OSError):  # what cannot be written was told when the run tried
+            with suppress(UnwrittenError):  # what cannot be written was told when the run tried
                 run.flush()
 
 

@@ -57,6 +57,20 @@ class BadInputError(TrilaneError):
         return cls(where, reason(error), expected, remedy)
 
 
+class UnwrittenError(TrilaneError):
+    """A file that was being written could not be written on, such as on a full disk. Exit code 1.
+
+    `path`: of the file. `error`: what the system said.
+    """
+
+    def __init__(self, path: str | Path, error: OSError) -> None:
+        super().__init__(str(path), error)
+        self.path, self.error = str(path), error
+
+    def __str__(self) -> str:
+        return f"{self.path}: {reason(self.error)}"
+
+
 class UnitLostError(TrilaneError):
     """A unit cannot go on, but a new process in its place can: it ends, and the scheduler restarts it."""
 

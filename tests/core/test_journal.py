@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from pathlib import Path
 
 import msgpack
 import pytest
 
-from trilane.errors import BadInputError
+from trilane.errors import BadInputError, UnwrittenError
 from trilane.hw_profiles.application import application_graph
 from trilane.pipeline.journal import (
     SCHEMA,
@@ -114,3 +115,28 @@ def test_no_journal_is_written_over(tmp_path: Path) -> None:
     (tmp_path / "j").touch()
     with pytest.raises(FileExistsError):
         JournalWriter(tmp_path / "j")
+
+
+def test_a_disk_that_is_full_is_said_with_the_file(tmp_path: Path) -> None:
+    """/dev/full takes nothing: what is written, flushed and left over at the end is refused alike."""
+    (tmp_path / "j").touch()
+
+    class Full(JournalWriter):
+        def __init__(self) -> None:
+            super().__init__(tmp_path / "none")
+            self._file.close()
+            self._file = Path("/dev/full").open("wb", buffering=64)  # noqa: SIM115 - the writer closes it
+
+    said = f"^{tmp_path}/none: no space left on device$"
+    writer = Full()
+    with pytest.raises(UnwrittenError, match=said), writer:
+        writer.add(Said(1, "short"))
+    (tmp_path / "none").unlink()
+    writer = Full()
+    with pytest.raises(UnwrittenError, match=said):
+        writer.add(Said(1, "long" * 100))
+    with pytest.raises(UnwrittenError, match=said):
+        writer.add(Said(1, "short"))
+        writer.flush()
+    with contextlib.suppress(UnwrittenError):
+        writer.__exit__(None, None, None)

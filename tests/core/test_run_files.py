@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 from collections.abc import Iterator
@@ -16,10 +17,10 @@ from trilane.apps import run_folder
 from trilane.apps.report import Report, read_report, write_report
 from trilane.apps.report_sources import NO_FIGURES_UNDER, sources_of
 from trilane.apps.run_folder import RunFolder, default_place
-from trilane.errors import BadInputError
+from trilane.errors import BadInputError, TrilaneError, UnwrittenError
 from trilane.figure_sources import COMPARED, COMPUTED, MEASURED
 from trilane.testing.run_report import SHARE, SHOWN, make_report
-from trilane.writing import WRITABLE
+from trilane.writing import WRITABLE, write_atomically
 
 
 def test_a_folder_has_its_name_once_it_is_complete(tmp_path: Path) -> None:
@@ -109,6 +110,45 @@ def test_refusals_word_by_word(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         folder.complete()
     said = f"found directory not empty, expected a name that is free; the run is in {folder.work}"
     assert str(refused.value) == f"{tmp_path}/run: {said}"
+
+
+FULL = OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.mark.parametrize(
+    ("failure", "named"),
+    [
+        (UnwrittenError("/a/journal", FULL), "/a/journal"),
+        (OSError(errno.ENOSPC, "No space left on device", "/a/file"), "/a/file"),
+        (FULL, "WORK"),
+        ("report", "WORK/report.json"),
+    ],
+)
+def test_a_full_disk_leaves_what_was_written_and_says_where(failure: Any, named: str, tmp_path: Path) -> None:
+    with pytest.raises(TrilaneError) as refused, RunFolder(tmp_path / "run") as folder:
+        (folder.work / "half").write_text("half")
+        if failure == "report":
+            with write_atomically(folder.work / "report.json"):
+                raise FULL
+        raise failure
+    work = folder.work
+    said = f"no space left on device; free space there or choose another --out; what was written stays in {work}"
+    assert str(refused.value) == f"{named.replace('WORK', str(work))}: {said}"
+    assert (refused.value.exit_code, (work / "half").read_text()) == (1, "half")
+
+
+def test_a_full_disk_that_took_nothing_leaves_no_folder(tmp_path: Path) -> None:
+    with pytest.raises(TrilaneError, match=r"; nothing was written$"), RunFolder(tmp_path / "a" / "run") as folder:
+        (folder.work / "journal").touch()
+        raise FULL
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_error_about_something_else_stays_itself(tmp_path: Path) -> None:
+    with pytest.raises(BrokenPipeError), RunFolder(tmp_path / "run") as folder:
+        (folder.work / "half").write_text("half")
+        raise BrokenPipeError(errno.EPIPE, "Broken pipe")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_parent_that_others_use_by_then_stays(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from trilane.errors import BadInputError, TrilaneError
+from trilane.errors import BadInputError, UnwrittenError
 from trilane.pipeline import accounts, run, surroundings
 from trilane.pipeline.cpu_use import CpuTimes
 from trilane.pipeline.journal import (
@@ -244,10 +244,10 @@ def test_a_journal_that_cannot_be_begun_or_written(tmp_path: Path, monkeypatch: 
 
     def full(_self: Any, record: Any) -> None:
         if isinstance(record, Stepped):
-            raise OSError(28, "No space left on device")
+            raise UnwrittenError(tmp_path / "j", OSError(28, "No space left on device"))
 
     monkeypatch.setattr(JournalWriter, "add", full)
-    with pytest.raises(TrilaneError, match="the journal cannot be written: No space left on device"):
+    with pytest.raises(UnwrittenError, match=f"{tmp_path}/j: no space left on device"):
         go(journal=JournalFile(tmp_path / "j", {}))
 
 
