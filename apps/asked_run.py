@@ -11,12 +11,16 @@ from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
+
+from trilane.errors import BadInputError
 
 if TYPE_CHECKING:
     from trilane.apps.run_job import Hooks, Outcome, Plan, Watched
     from trilane.pipeline.unit_starter import UnitStarter
     from trilane.stages.configure import Checked, GlFacts
+
+MOST_LATCH_MS: Final = 1000
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,20 @@ class AskedRun:
     held_ns: Mapping[str, int] = field(default_factory=dict)
 
 
+def check_numbers(asked: AskedRun) -> None:
+    """Raises BadInputError for `latch_ms` and `baseline_frames` that are no numbers, or outside of what holds."""
+    latch_ms, frames = asked.latch_ms, asked.baseline_frames
+    if not _is_number(latch_ms, (int, float)) or not 0 <= latch_ms <= MOST_LATCH_MS:  # NaN is not either
+        raise BadInputError("latch_ms", repr(latch_ms), f"milliseconds, from 0 to {MOST_LATCH_MS}")
+    if not _is_number(frames, (int,)) or frames < 0:
+        raise BadInputError("baseline_frames", repr(frames), "a whole number of frames, 0 or more")
+
+
+def _is_number(value: object, kinds: tuple[type, ...]) -> bool:
+    """A program hands over anything; a truth value is no number."""
+    return isinstance(value, kinds) and not isinstance(value, bool)
+
+
 @dataclass(frozen=True)
 class Prepared:
     """What was `asked` for, `checked`, and how it is to be run."""
@@ -64,12 +82,14 @@ def run_asked(asked: AskedRun, hooks: Callable[[], AbstractContextManager[Hooks]
     `hooks`: opened when the input is checked and the units start.
     Raises BadInputError and MissingPartError for what cannot be run, TrilaneError when no frame was presented.
     """
+    check_numbers(asked)
     with early_processes() as (starter, gl):
         return run_prepared(prepare(asked, gl), hooks=hooks, starter=starter, gl=gl)
 
 
 def prepare(asked: AskedRun, gl: GlFacts) -> Prepared:
     """Check what was asked for. Raises BadInputError and MissingPartError for what cannot be run."""
+    check_numbers(asked)
     from trilane.apps.run_job import Plan
     from trilane.stages.configure import Request, configure, requested_edge
 

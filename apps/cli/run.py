@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from trilane.apps.asked_run import MOST_LATCH_MS
 from trilane.apps.cli.commands import Commands
 from trilane.apps.cli.console import print_json, stderr_console, stdout_console
 from trilane.apps.cli.options import (
@@ -89,7 +90,8 @@ PacedProfileOption = Annotated[str | None, typer.Option("--profile", help=f"{PRO
 PaceOption = Annotated[bool, typer.Option("--pace", help="Hold each job until its modelled time has passed.")]
 SlowMotionOption = Annotated[float, typer.Option(help="With --pace: times slower than the chip.")]
 LatchOption = Annotated[
-    float, typer.Option(min=0, max=1000, help="Sample poses late: ready so many ms before the raster; 0: at once.")
+    float,
+    typer.Option(min=0, max=MOST_LATCH_MS, help="Sample poses late: ready so many ms before the raster; 0: at once."),
 ]
 CapOption = Annotated[PerformanceProfile | None, PerformanceProfileOption]
 VideoOption = Annotated[bool, typer.Option("--video/--no-video", help="Encode the frames; not for runs that last.")]

@@ -14,7 +14,7 @@ import pytest
 
 import trilane
 from trilane.apps import interface
-from trilane.apps.asked_run import AskedRun
+from trilane.apps.asked_run import AskedRun, check_numbers, prepare
 from trilane.apps.explained.job_table import COLUMNS
 from trilane.apps.report import Report, read_report
 from trilane.apps.run_html import run_html
@@ -260,3 +260,31 @@ def test_an_empty_name_is_not_the_working_directory(name: str) -> None:
         trilane.load_run(name)
     with pytest.raises(BadInputError, match=f"out: found '{name}', expected the name of a folder"):
         trilane.run(out=name)
+
+
+@pytest.mark.parametrize(
+    ("argument", "value", "said"),
+    [
+        ("latch_ms", float("nan"), "latch_ms: found nan, expected milliseconds, from 0 to 1000"),
+        ("latch_ms", float("inf"), "latch_ms: found inf, expected milliseconds, from 0 to 1000"),
+        ("latch_ms", -5, "latch_ms: found -5, expected"),
+        ("latch_ms", 1000.5, "latch_ms: found 1000.5, expected"),
+        ("latch_ms", "3", "latch_ms: found '3', expected"),
+        ("baseline_frames", -1, "baseline_frames: found -1, expected a whole number of frames, 0 or more"),
+        ("baseline_frames", 2.0, "baseline_frames: found 2.0, expected"),
+        ("baseline_frames", True, "baseline_frames: found True, expected"),
+    ],
+)
+def test_numbers_outside_of_what_holds_are_refused_before_a_process_starts(
+    argument: str, value: Any, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("trilane.apps.asked_run.early_processes", pytest.fail)
+    with pytest.raises(BadInputError, match=f"^{said}"):
+        trilane.run(**{argument: value})
+    with pytest.raises(BadInputError, match=f"^{said}"):
+        prepare(AskedRun(**{argument: value}), pytest.fail)
+
+
+def test_the_limits_themselves_hold() -> None:
+    for latch_ms in (0, 1000):
+        check_numbers(AskedRun(latch_ms=latch_ms, baseline_frames=0))
