@@ -24,19 +24,30 @@ OF_A_RUN = frozenset({"scene", "slowest", "jobs", "json"})
 NOT_OF_A_SCENE = frozenset({"slowest", "jobs"})
 READ_SO = (
     "a job begins when the last thing that it needs is there; the path goes on with the job that brought it, so that "
-    "the rows sum to the frame time"
+    "the rows sum to the frame time; it is one path through the whole run, to its last frame: what held the rate back"
+)
+SLOWEST_SO = (
+    "each frame's own path, from the frame presented before it to its end, beside the medians of all frames: it may "
+    "blame what the path through the whole run above does not, where other jobs hid that time"
 )
 
 
 def run_folder(name: str) -> Path | None:
-    """The run folder that `trilane explain NAME` means, also of a run that still goes on; None: a scene is meant."""
-    from trilane.apps.live.followed_run import follow
+    """The run folder that `trilane explain NAME` means, found as `trilane top` finds it; None: a scene is meant.
+
+    A name that a scene of Trilane's has means that scene. Raises BadInputError for a folder whose journal is a link to
+    nothing.
+    """
+    from trilane.apps.live.followed_run import EXPECTED, follow, without_journal
     from trilane.pipeline.journal import NAME
+    from trilane.scene.load import scene_names
 
     folder = Path(name)
     if any((folder / file).is_file() for file in ("report.json", NAME)):
         return folder
-    if folder.exists() or len(folder.parts) == 1:
+    if (folder / NAME).is_symlink():
+        raise BadInputError(folder, without_journal(folder), EXPECTED)
+    if folder.is_file() or name in scene_names():
         return None
     try:
         return follow(folder).folder
@@ -158,7 +169,16 @@ def _slowest(document: Mapping[str, Any]) -> Table:
 
     usual = document["usual"]["frame_ms"]
     title = f"The slowest frames (the median takes {usual:.2f} ms)"
-    table = Table("frame", "ms", "latency, ms", "why", title=title, title_justify="left")
+    table = Table(
+        "frame",
+        "ms",
+        "latency, ms",
+        "why",
+        title=title,
+        title_justify="left",
+        caption=SLOWEST_SO,
+        caption_justify="left",
+    )
     for row in document["slowest"]:
         latency = "-" if row["latency_ms"] is None else f"{row['latency_ms']:.1f}"
         reasons = [f"{reason['longer_ms']:.1f} ms: {reason['text']}" for reason in row["why"]]

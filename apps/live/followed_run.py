@@ -37,6 +37,13 @@ class RunState(StrEnum):
     REMOVED = "removed"
 
 
+def without_journal(folder: Path) -> str:
+    """What `folder`, in which no journal is, has in its place."""
+    if (folder / NAME).is_symlink():
+        return f"{NAME}, a link to a file that is not there"
+    return f"no {NAME}" if folder.is_dir() else "no such folder"
+
+
 class FollowedRun:
     """The run whose journal is in `folder`. `name`: that it has, or will have.
 
@@ -47,7 +54,7 @@ class FollowedRun:
         journal = folder / NAME
         if not journal.is_file():
             remedy = "an older Trilane wrote it; run the scene again" if (folder / "report.json").is_file() else ""
-            raise BadInputError(folder, f"no {NAME}" if folder.is_dir() else "no such folder", EXPECTED, remedy)
+            raise BadInputError(folder, without_journal(folder), EXPECTED, remedy)
         self.folder = folder
         matched = PARTIAL.fullmatch(folder.name)
         self.name = run_name(folder)
@@ -63,7 +70,7 @@ class FollowedRun:
             return RunState.REMOVED
         if PARTIAL.fullmatch(self.folder.name) is None:
             return RunState.FINISHED
-        return RunState.GOES_ON if psutil.pid_exists(self._pid) else RunState.KILLED
+        return RunState.GOES_ON if _is_alive(self._pid) else RunState.KILLED
 
     @property
     def silent_ns(self) -> int:
@@ -106,6 +113,14 @@ def follow(given: Path | None, *, wait: bool = False, sleep: Callable[[float], N
         if not wait:
             raise _missing(given)
         sleep(LOOK_S)
+
+
+def _is_alive(pid: int) -> bool:
+    """A process that has ended is there until its parent has asked for its exit code; it writes nothing more."""
+    try:
+        return bool(psutil.Process(pid).status() != psutil.STATUS_ZOMBIE)
+    except psutil.NoSuchProcess:
+        return False
 
 
 def folder_of(given: Path) -> Path | None:

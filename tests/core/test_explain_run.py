@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from trilane.apps.cli import explain_run as explain_command
 from trilane.apps.explained.advice import advice
 from trilane.apps.explained.job_table import COLUMNS, write_jobs
 from trilane.apps.explained.run import explain_run
@@ -218,6 +219,27 @@ def test_a_run_that_goes_on_is_explained_so_far(folder: Path, tmp_path: Path, co
     assert 10 < found["frames"] < 39
     out, _ = command("explain", tmp_path / "run", "--json")
     assert json.loads(out) == json.loads(json.dumps(found))
+
+
+def test_a_run_is_found_by_its_name_below_runs(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command
+) -> None:
+    """Of a run that was killed too; a scene's own name means the scene, and what is neither has the scene's message."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs").mkdir()
+    folder.rename("runs/k9.999999999.partial")
+    assert command("explain", "k9")[0].startswith("Run runs/k9.999999999.partial: scene test")
+    assert explain_command.run_folder("k9") == Path("runs/k9.999999999.partial")
+    Path("runs/k9.999999999.partial").rename("runs/far")
+    assert explain_command.run_folder("far") is None
+    assert "scene: found 'k9'" in command("explain", "k9", code=2)[1]
+
+
+def test_a_journal_that_is_a_link_to_nothing_is_said_to_be(folder: Path, command: Command) -> None:
+    (folder / "report.json").unlink()
+    (folder / NAME).unlink()
+    (folder / NAME).symlink_to("nothing")
+    assert f"{folder}: found {NAME}, a link to a file that is not there" in command("explain", folder, code=2)[1]
 
 
 @pytest.mark.parametrize(

@@ -137,6 +137,7 @@ def test_one_that_has_not_begun_is_waited_for() -> None:
         ("elsewhere/walk", "elsewhere/walk: found no such run"),
         ("runs/old", r"runs/old: found no journal\.msgpack, .*; an older Trilane wrote it; run the scene again"),
         ("file", "file: found no such folder"),
+        ("dangling", r"dangling: found journal\.msgpack, a link to a file that is not there, expected a run folder"),
     ],
 )
 def test_what_is_no_run_is_refused(given: str | None, said: str) -> None:
@@ -144,5 +145,7 @@ def test_what_is_no_run_is_refused(given: str | None, said: str) -> None:
     Path("runs/old").mkdir()
     Path("runs/old/report.json").touch()
     Path("file").touch()
+    Path("dangling").mkdir()
+    (Path("dangling") / NAME).symlink_to("nothing")
     with pytest.raises(BadInputError, match=said):
         follow(None if given is None else Path(given))
