@@ -7,6 +7,7 @@ an error that a person can cause ends here as one sentence on stderr and an exit
 from __future__ import annotations
 
 import contextlib
+import errno
 import importlib
 import os
 import sys
@@ -117,9 +118,32 @@ def _describe(error: Exception) -> tuple[str, int]:
         return str(error), error.exit_code
     if isinstance(error, ModuleNotFoundError):
         return f"the Python package {error.name} is missing; install it with: {install_line()}", MISSING_PART
+    if isinstance(error, OSError) and not error.filename and _is_of_stdout(error):
+        return f"stdout: {reason(error)}; free space there, or write the output elsewhere", FAILED
     if isinstance(error, OSError):
         return f"{error.filename or 'the system'}: {reason(error)}", FAILED
     return f"{type(error).__name__}: {error}; this is a defect of Trilane, --debug shows where", FAILED
+
+
+def _is_of_stdout(error: OSError) -> bool:
+    """Where stdout takes no more, one byte more fails the same way; of another error nothing is tried."""
+    if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EIO):
+        return False
+    try:
+        os.write(sys.stdout.fileno(), b"\n")
+    except (OSError, ValueError) as again:  # without a file descriptor it is no file
+        return getattr(again, "errno", None) == error.errno
+    return False
+
+
+def _call(arguments: list[str]) -> None:
+    """Of a command that is done, the output is out: who reads none of it any more is no error, a full disk is."""
+    try:
+        app(args=arguments, prog_name="trilane")
+    except SystemExit:
+        with contextlib.suppress(BrokenPipeError, ValueError):
+            sys.stdout.flush()
+        raise
 
 
 def main() -> None:
@@ -127,7 +151,7 @@ def main() -> None:
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     debug = len(arguments) < len(sys.argv) - 1
     try:
-        app(args=arguments, prog_name="trilane")
+        _call(arguments)
     except Exception as error:
         if debug:
             raise

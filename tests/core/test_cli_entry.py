@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import io
 import os
+import subprocess
+import sys
 from collections.abc import Callable
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -145,3 +148,15 @@ def test_the_process_ends_at_once_with_its_code(
     monkeypatch.setattr(os, "_exit", ends.append)
     cli.entry()
     assert (ends, out.flushed, err.flushed) == ([code], 1, 1)
+
+
+@pytest.mark.parametrize("writes", ["print('x', flush=True)", "print('x')"], ids=["at once", "at the end"])
+def test_a_stdout_that_takes_no_more_is_named(writes: str) -> None:
+    script = (
+        "import sys; from trilane.apps.cli import main as cli; "
+        f"cli.app = lambda **_: ({writes}, sys.exit(0)); cli.entry()"
+    )
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run([sys.executable, "-c", script], stdout=full, stderr=subprocess.PIPE, text=True)
+    said = "error: stdout: no space left on device; free space there, or write the output elsewhere\n"
+    assert (done.returncode, done.stderr) == (1, said)
