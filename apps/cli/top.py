@@ -101,14 +101,19 @@ def _show(first: Look, rest: Iterator[Look]) -> None:
     """On a screen that is drawn anew; line by line where stdout is no terminal."""
     from rich.live import Live
 
-    from trilane.apps.cli.top_view import heading, line, screen
+    from trilane.apps.cli.top_view import ending, heading, line, screen
 
     console = stdout_console()
     if not console.is_terminal:
         sys.stdout.write(heading(first) + "\n")
+        written = ""
         for look in chain([first], rest):
-            sys.stdout.write(line(look) + "\n")
+            if (said := line(look)) != written:
+                sys.stdout.write(said + "\n")
+            if look.state is not first.state:
+                sys.stdout.write(ending(look) + "\n")
             sys.stdout.flush()
+            written = said
         return
     with Live(screen(first), console=console, auto_refresh=False) as live:
         for look in rest:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from trilane.apps.cli.run_table import DASH, NEEDED, TOO_FEW, accuracy_line
 from trilane.apps.live.figures import Figures, Moved, UnitFigures
+from trilane.apps.live.followed_run import RunState
 from trilane.apps.live.live_figures import LEAST
 from trilane.apps.live.run_looks import Look
 
@@ -22,6 +23,12 @@ BAR = 20
 FULL, EMPTY = "█", "░"
 NO_ERROR = "the run says nothing of its avatars' error"
 FEW = f"{TOO_FEW} of too few frames: " + ", ".join(f"{name} needs {count}" for name, count in NEEDED.items())
+#: What became of a run that went on when it was looked at first.
+ENDINGS = {
+    RunState.FINISHED: "finished",
+    RunState.KILLED: "killed: its process is gone, and the last line is as far as its journal goes",
+    RunState.REMOVED: "removed: it ended before any frame, and its folder is gone",
+}
 PERCENTILES = ("p50", "p90", "p95", "p99")
 MIB = 1 << 20
 
@@ -48,7 +55,7 @@ def line(look: Look) -> str:
     frames = figures.frames
     parts = (
         f"{figures.t_ms / 1000:.1f} s",
-        f"{figures.fps:.1f} fps",
+        _rate(look),
         f"frame {_three(figures.frame_time_ms)}",
         f"latency {_three(figures.latency_ms)}",
         f"busy {busy}",
@@ -62,8 +69,14 @@ def line(look: Look) -> str:
 
 def heading(look: Look) -> str:
     """What stands above the lines."""
-    how = f"p50 / p95 / p99 of the last 5 s;{FEW}"
+    of_fps = "between the first frame and the last" if look.state is RunState.FINISHED else "of the last 5 s"
+    how = f"fps {of_fps}, p50 / p95 / p99 of the last 5 s;{FEW}"
     return "\n".join([f"run {look.name}: {look.state}; {how}", *errors(look.figures), _sources(look.figures)])
+
+
+def ending(look: Look) -> str:
+    """What is said when a run that went on has another state."""
+    return f"run {look.name}: {ENDINGS[look.state]}"
 
 
 def errors(figures: Figures) -> list[str]:
@@ -79,10 +92,19 @@ def dropped(figures: Figures) -> int:
 def _title(look: Look) -> str:
     figures = look.figures
     over = "over" if figures.is_over else f"for {figures.run_s:.1f} s"
-    return (
-        f"run {look.name}: {look.state}, {over}; {figures.fps:.1f} fps in the last {figures.window_s:.1f} s, "
-        f"{figures.run_fps:.1f} in all\navatars: {_short_error(figures)}"  # a small terminal cuts off what stands below
-    )
+    rate = f"{_rate(look)} between the first frame and the last"
+    if look.state is not RunState.FINISHED:
+        rate = (
+            f"{_rate(look)} in the last {figures.window_s:.1f} s, {figures.run_fps:.1f} between the first and the last"
+        )
+    # a small terminal cuts off what stands below
+    return f"run {look.name}: {look.state}, {over}; {rate}\navatars: {_short_error(figures)}"
+
+
+def _rate(look: Look) -> str:
+    """Of a finished run as its report has it, of any other in the window."""
+    figures = look.figures
+    return f"{figures.run_fps if look.state is RunState.FINISHED else figures.fps:.1f} fps"
 
 
 def _units(figures: Figures) -> Table:
@@ -90,7 +112,8 @@ def _units(figures: Figures) -> Table:
     for name, unit in figures.units.items():
         filled = round(BAR * unit.window.busy)
         bar = FULL * filled + EMPTY * (BAR - filled)
-        _add_row(table, name, bar, _percent(unit.window.busy), _percent(unit.run.busy), _idle(unit), _doing(unit))
+        does = _doing(unit, figures.state)
+        _add_row(table, name, bar, _percent(unit.window.busy), _percent(unit.run.busy), _idle(unit), does)
     return table
 
 
@@ -112,8 +135,10 @@ def _idle(unit: UnitFigures) -> str:
     return ", ".join(f"{cause} {_percent(share)}" for cause, share in causes if round(100 * share)) or "none"
 
 
-def _doing(unit: UnitFigures) -> str:
+def _doing(unit: UnitFigures, state: str) -> str:
     restarts = f", restarts: {unit.restarts}" if unit.restarts else ""
+    if state != RunState.GOES_ON:
+        return f"{state}{restarts}"
     if not unit.is_up:
         return f"down{restarts}"
     return (f"{unit.stage} of frame {unit.frame}" if unit.stage else "nothing") + restarts

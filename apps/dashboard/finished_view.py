@@ -26,6 +26,7 @@ from trilane.apps.dashboard.timeline import Timeline, described, note, slices
 from trilane.apps.dashboard.video_frames import VideoFrames
 from trilane.apps.dashboard.view import Message
 from trilane.apps.dashboard.wire import ControlSaid, Seek, shown
+from trilane.apps.live.followed_run import FollowedRun, RunState
 from trilane.errors import BadInputError
 from trilane.pipeline.journal import NAME, Begun, Record, Stepped, read_journal
 from trilane.scheduler.accounts import CAUSES, UNEXPLAINED
@@ -71,12 +72,12 @@ class FinishedRun:
             if self._timeline.now_ms >= self._due_ms:
                 self._keep_figures()
 
-    def end(self) -> None:
-        """After the last record."""
+    def end(self, state: RunState) -> None:
+        """After the last record. `state`: of the run."""
         self._timeline.end()
         self._keep()
         self._keep_figures()
-        self.end_ms, self.metrics = self._timeline.now_ms, self._meter.metrics()
+        self.end_ms, self.metrics = self._timeline.now_ms, self._meter.metrics(state=state)
         for table in (self.jobs, self.idle, self.presented, self.figures):
             table.complete()
 
@@ -136,7 +137,7 @@ def read_run(folder: Path) -> FinishedRun:
         elif run is not None:
             run.add(record)
     assert run is not None, "a journal begins with its header"
-    run.end()
+    run.end(FollowedRun(folder).state)
     return run
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Final
 
+from trilane.apps.live.followed_run import RunState
 from trilane.apps.live.live_figures import LiveFigures
 from trilane.apps.live.openmetrics import openmetrics
 from trilane.pipeline.journal import Begun, Record
@@ -26,6 +27,6 @@ class Meter:
         """The figures at `now_ns`; where it is None, at the last record."""
         return {"type": "figures", **self._figures.now(now_ns).as_json()}
 
-    def metrics(self, now_ns: int | None = None) -> str:
-        """In OpenMetrics, without the end mark."""
-        return openmetrics(self._figures.now(now_ns)).decode().removesuffix(END)
+    def metrics(self, now_ns: int | None = None, state: RunState | None = None) -> str:
+        """In OpenMetrics, without the end mark. `state`: as of `LiveFigures.now`."""
+        return openmetrics(self._figures.now(now_ns, state)).decode().removesuffix(END)

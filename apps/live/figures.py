@@ -26,7 +26,7 @@ class UnitFigures:
     `window`, `run`: where its time went; a job that still runs counts as busy.
     `jobs`: that it ended, in the run.
     `restarts`: of its process, in the run.
-    `is_up`: whether its process is there and ready.
+    `is_up`: whether its process is there and ready; never of a run that is over.
     `stage`, `frame`: of the job that it does, "" and -1 without one.
     """
 
@@ -108,7 +108,8 @@ class Figures:
     """Figures at one moment.
 
     `t_ms`: since the first step. `window_s`, `run_s`: how long the window and the run have been.
-    `clock`: "host" or "virtual". `is_over`: whether the run has ended.
+    `clock`: "host" or "virtual". `is_over`: whether the journal has the run's end.
+    `state`: of the run, "goes on", "finished", "killed" or "removed".
     `fps`: frames presented in the window, a second. `run_fps`: between the first and last presented frame.
     `frame_time_ms`, `latency_ms`: mean, p50, p90, p95, p99, max and samples, exact, of the window.
     `units`, `stages`: in the order of the pipeline.
@@ -125,6 +126,7 @@ class Figures:
     run_s: float
     clock: str
     is_over: bool
+    state: str
     fps: float
     run_fps: float
     frame_time_ms: Mapping[str, float]

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final, NamedTuple
 
 from trilane.apps.live.figures import DropCount, Figures, FrameFigures, Moved, Note, StageFigures, UnitFigures
+from trilane.apps.live.followed_run import RunState
 from trilane.apps.live.frame_flow import Done, FrameFlow, Presented
 from trilane.apps.live.time_histogram import TimeHistogram
 from trilane.apps.live.unit_time import UnitTime
@@ -118,9 +119,10 @@ class LiveFigures:
         """A record of the journal, but for the first."""
         self._adders[type(record)](record)
 
-    def now(self, now_ns: int | None = None) -> Figures:
+    def now(self, now_ns: int | None = None, state: RunState | None = None) -> Figures:
         """At `now_ns`, of the run's clock; where it is None or earlier, at the last record.
 
+        `state`: what has become of the run, which the journal of one that was killed does not say; None: as it says.
         After the step that finished the run it is the moment of that step: what follows are no frames.
         """
         now_ns = min(max(now_ns or 0, self._last_ns), self._finished_ns)
@@ -128,18 +130,21 @@ class LiveFigures:
         window_s = min(now_ns - start_ns, WINDOW_NS) / NS_PER_S
         recent = [each for each in self._recent if each.end_ns > now_ns - WINDOW_NS]
         clock = str(self._facts.get("clock", ""))
+        state = state or (RunState.FINISHED if self._is_over else RunState.GOES_ON)
+        up = self._up if state is RunState.GOES_ON and not self._is_over else set()
         return Figures(
             t_ms=self._since_first_ms(now_ns),
             window_s=window_s,
             run_s=(now_ns - start_ns) / NS_PER_S,
             clock=clock,
             is_over=self._is_over,
+            state=state.value,
             fps=len(recent) / window_s if window_s else 0.0,
             run_fps=self._run_fps(),
             frame_time_ms=summary_ms(each.interval_ns for each in recent if each.interval_ns is not None),
             latency_ms=summary_ms(each.latency_ns for each in recent),
             frames=self._frame_figures(),
-            units={unit: self._unit_figures(unit, now_ns) for unit in self._graph.units},
+            units={unit: self._unit_figures(unit, now_ns, unit in up) for unit in self._graph.units},
             stages=self._stage_figures(now_ns),
             temperature_c=self._values(TEMPERATURE),
             duty=self._values(DUTY),
@@ -231,12 +236,12 @@ class LiveFigures:
         requested = self._settings.frames
         return FrameFigures(requested, flow.presented, flow.skipped, flow.in_flight, dict(self._lost), dropped)
 
-    def _unit_figures(self, unit: str, now_ns: int) -> UnitFigures:
+    def _unit_figures(self, unit: str, now_ns: int, is_up: bool) -> UnitFigures:
         held = next(iter(self._flow.held[unit]), None)
         times = self._times.get(unit) or UnitTime(now_ns, WINDOW_NS)
         window, run = times.shares(now_ns, held and held.since_ns)
         stage, frame = (held.job.stage, held.job.frame) if held else ("", -1)
-        return UnitFigures(window, run, self._jobs[unit], self._restarts[unit], unit in self._up, stage, frame)
+        return UnitFigures(window, run, self._jobs[unit], self._restarts[unit], is_up, stage, frame)
 
     def _stage_figures(self, now_ns: int) -> dict[str, StageFigures]:
         running_ns = None if self._start_ns is None else self._last_ns - self._start_ns

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
 from trilane.apps.live.figures import Figures, Histogram
+from trilane.apps.live.followed_run import RunState
 from trilane.apps.live.live_figures import LEAST, LEAST_KEY
 
 #: Values of the labels of a row, and its value.
@@ -150,7 +151,7 @@ GAUGES = (
     Metric(
         "trilane_unit_up",
         "",
-        "1 while the unit's process is there and ready.",
+        "1 while the unit's process is there and ready; 0 once the run is over.",
         ("unit",),
         lambda f: [((name,), float(unit.is_up)) for name, unit in f.units.items()],
         "units",
@@ -221,8 +222,15 @@ GAUGES = (
     Metric(
         "trilane_run_ended",
         "",
-        "1 once the run is over.",
+        "1 once the run is over, also of one that was killed.",
         (),
-        lambda f: [((), float(f.is_over))],
+        lambda f: [((), float(f.is_over or f.state != RunState.GOES_ON))],
+    ),
+    Metric(
+        "trilane_run_state",
+        "",
+        "1 of what has become of the run: it goes on, is finished, was killed, or removed its folder.",
+        ("state",),
+        lambda f: [((state.value,), float(f.state == state)) for state in RunState],
     ),
 )

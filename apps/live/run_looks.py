@@ -23,8 +23,8 @@ class Look(NamedTuple):
     figures: Figures
 
     def as_json(self) -> dict[str, Any]:
-        """`run`, `state`, and the names of `Figures`."""
-        return {"run": self.name, "state": self.state.value, **self.figures.as_json()}
+        """`run`, and the names of `Figures`."""
+        return {"run": self.name, **self.figures.as_json()}
 
 
 def looks(run: FollowedRun, pause: Callable[[], None]) -> Generator[Look]:
@@ -38,7 +38,7 @@ def looks(run: FollowedRun, pause: Callable[[], None]) -> Generator[Look]:
             elif figures is not None:
                 figures.add(record)
         if figures is not None:
-            yield Look(run.name, state, figures.now(figures.last_ns + run.silent_ns))
+            yield Look(run.name, state, figures.now(figures.last_ns + run.silent_ns, state))
         elif state is not RunState.GOES_ON:
             raise BadInputError(run.folder, "a journal without a record", EXPECTED)
         if state is not RunState.GOES_ON or (figures is not None and figures.is_over):

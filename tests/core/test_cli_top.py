@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -19,7 +20,7 @@ from trilane.apps.live.followed_run import RunState
 from trilane.apps.live.live_figures import LiveFigures
 from trilane.apps.live.run_looks import Look
 from trilane.pipeline.journal import NAME, Counted, Ended, JournalWriter, Record, Stepped
-from trilane.scheduler.events import Start, UnitDied
+from trilane.scheduler.events import JobDone, Start, UnitDied
 from trilane.testing.told_journal import told_journal
 
 Command = Callable[..., tuple[str, str]]
@@ -74,7 +75,7 @@ def test_a_terminal_is_drawn_anew(command: Command, monkeypatch: pytest.MonkeyPa
 def test_once_as_json_is_one_document(command: Command) -> None:
     written("runs/walk", BEGUN, *RECORDS, *END)
     document = json.loads(command("top", "runs/walk", "--once", "--json")[0])
-    assert (document.pop("run"), document.pop("state")) == ("walk", "finished")
+    assert (document.pop("run"), document["state"]) == ("walk", "finished")
     assert document == json.loads(json.dumps(FIGURES.now().as_json()))
 
 
@@ -106,7 +107,40 @@ def test_a_run_that_goes_on_is_looked_at_until_it_ends(command: Command, monkeyp
 
 def test_a_run_that_was_killed_is_shown_as_it_was(command: Command) -> None:
     written("runs/walk.999999999.partial", BEGUN, *RECORDS)
-    assert command("top", "walk")[0].startswith("run walk: killed")
+    assert command("top", "walk")[0].startswith("run walk: killed; fps of the last 5 s, ")
+
+
+def test_a_run_that_is_killed_while_it_is_looked_at_says_so_and_ends(
+    command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its process has ended, but its parent has not asked for its exit code yet."""
+    process = os.fork()
+    if not process:
+        signal.pause()
+    written(f"runs/walk.{process}.partial", BEGUN, *RECORDS)
+
+    def sleep(_: float) -> None:
+        os.kill(process, signal.SIGKILL)
+        os.waitid(os.P_PID, process, os.WEXITED | os.WNOWAIT)
+
+    monkeypatch.setattr(time, "sleep", sleep)
+    try:
+        lines = command("top", "walk")[0].splitlines()
+    finally:
+        os.waitpid(process, 0)
+    assert lines[0].startswith("run walk: goes on; ")
+    killed = "run walk: killed: its process is gone, and the last line is as far as its journal goes"
+    assert lines[-1] == killed
+    assert len(lines) == 5  # the heading's three, one look, the end
+
+
+def test_a_finished_run_has_the_rate_of_its_report(command: Command) -> None:
+    """Two frames, 20 ms apart, in a run of 90 ms: 50 a second, and not the 22 of its whole length."""
+    second = Stepped(1080 * MS, (JobDone("v", 3, 1050 * MS, 1060 * MS, 0),), ())
+    written("runs/walk", BEGUN, *RECORDS, second, Ended(1090 * MS, {}))
+    out = command("top", "walk")[0]
+    assert "finished; fps between the first frame and the last, p50" in out
+    assert "; 50.0 fps; " in out
 
 
 def test_openmetrics(command: Command) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from trilane.apps.live.followed_run import RunState
 from trilane.apps.live.live_figures import LiveFigures
 from trilane.apps.live.metrics_table import COUNTERS, GAUGES, HISTOGRAMS, SOURCE
 from trilane.pipeline.journal import SCHEMA, Accounted, Begun, Counted, Ended, Sampled, Stepped, Worked
@@ -51,12 +52,13 @@ def run(frames: int, frame_ms: int = 20) -> LiveFigures:
     return figures
 
 
-def parsed(figures: LiveFigures) -> dict[str, Any]:
+def parsed(figures: LiveFigures, state: RunState | None = None) -> dict[str, Any]:
     from prometheus_client.openmetrics.parser import text_string_to_metric_families
 
     from trilane.apps.live.openmetrics import openmetrics
 
-    return {family.name: family for family in text_string_to_metric_families(openmetrics(figures.now()).decode())}
+    text = openmetrics(figures.now(state=state)).decode()
+    return {family.name: family for family in text_string_to_metric_families(text)}
 
 
 def value(families: dict[str, Any], family: str, sample: str, **labels: str) -> float:
@@ -107,7 +109,7 @@ def test_counters_and_gauges_by_hand() -> None:
         ("trilane_unit_busy_ratio", {"unit": "v"}, 0.5),
         ("trilane_unit_idle_ratio", {"unit": "u", "cause": "starved"}, 0.75),
         ("trilane_unit_duty_ratio", {"unit": "v"}, 0.25),
-        ("trilane_unit_up", {"unit": "v"}, 1),
+        ("trilane_unit_up", {"unit": "v"}, 0),
         ("trilane_temperature_celsius", {"place": "sensor"}, 61.5),
         ("trilane_memory_bytes", {"process": "v"}, 5e6),
         ("trilane_avatar_psnr_decibels", {"avatar": "default", "band": "face"}, 28.3),
@@ -115,6 +117,8 @@ def test_counters_and_gauges_by_hand() -> None:
         ("trilane_avatar_error_known", {"avatar": "default"}, 1),
         ("trilane_avatar_error_known", {"avatar": 'own "one"\n'}, 0),
         ("trilane_run_ended", {}, 1),
+        ("trilane_run_state", {"state": "finished"}, 1),
+        ("trilane_run_state", {"state": "killed"}, 0),
     ):
         family = sample.removesuffix("_total").removesuffix("_created")
         assert value(families, family, sample, **labels) == pytest.approx(wanted), (sample, labels)
@@ -133,7 +137,20 @@ def test_each_metric_says_where_it_comes_from() -> None:
     assert sources["trilane_temperature_celsius", ""] == sources["trilane_bytes_needed", ""] == "computed"
     assert sources["trilane_avatar_psnr_decibels", "default"] == "from the avatar's validation of today"
     unsaid = {each.name for each in (*HISTOGRAMS, *COUNTERS, *GAUGES)} - {metric for metric, _ in sources}
-    assert unsaid == {"trilane_avatar_error_known", "trilane_run_ended"}
+    assert unsaid == {"trilane_avatar_error_known", "trilane_run_ended", "trilane_run_state"}
+
+
+@pytest.mark.parametrize("state", RunState)
+def test_units_are_up_in_a_run_that_goes_on_alone(state: RunState) -> None:
+    """A journal without an end says nothing of what became of its run."""
+    figures = LiveFigures(Begun(SCHEMA, GRAPH, Settings(1), FACTS))
+    figures.add(Stepped(0, (UnitReady("u"), UnitReady("v")), ()))
+    families = parsed(figures, state)
+    goes_on = state is RunState.GOES_ON
+    assert [value(families, "trilane_unit_up", "trilane_unit_up", unit=unit) for unit in "uv"] == [goes_on] * 2
+    assert value(families, "trilane_run_ended", "trilane_run_ended") == (not goes_on)
+    for each in RunState:
+        assert value(families, "trilane_run_state", "trilane_run_state", state=each.value) == (each is state)
 
 
 def test_a_longer_run_has_no_more_rows() -> None:
