@@ -1,4 +1,4 @@
-"""What does a speed cost in image error: every size of tensor on every runtime, error and time in one row.
+"""What does a speed cost in image error, for each size of tensor on each runtime?
 
 Rule: all rows are of the same moments and of the same part of the picture, that which holds the avatars; the times are
 of the very jobs that made the pictures, in turns, one job at a time.

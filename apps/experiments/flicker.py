@@ -1,4 +1,4 @@
-"""How restless is the error of successive frames: what a person sees as flicker.
+"""How restless is the error of successive frames, which a person sees as flicker?
 
 Rule: flicker of a pair of frames is the mean change of the error, |(P_t - G_t) - (P_t-1 - G_t-1)|, with P the picture
 and G what it should be; so what moves because the scene moves is none, and an error that stays where it is is none.
