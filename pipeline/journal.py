@@ -20,16 +20,22 @@ import msgpack
 
 from trilane.errors import BadInputError, UnwrittenError
 from trilane.files import require_file
+from trilane.pipeline import journal_values as values
+from trilane.pipeline.journal_values import RunValues
 from trilane.scheduler.accounts import in_order
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import Action, Event, Graph, Settings
 from trilane.scheduler.ledger import JobRecord
-from trilane.scheduler.recording import Recording, actions_of, events_of, graph_of, row_of, settings_of
+from trilane.scheduler.recording import Recording, row_of
 from trilane.unexpected_value import UnexpectedValue
 
 NAME = "journal.msgpack"
 SCHEMA: Final = 1
-MAX_RECORD_BYTES: Final = 64 << 20
+#: The longest that a run writes have a few kB, a map 25 entries. An empty map takes 72 times its byte in memory, and a
+#: list takes 8 bytes for each entry that it announces, in each of at most 1024 that may lie in one another.
+MAX_RECORD_BYTES: Final = 1 << 20
+MAX_ENTRIES: Final = 1 << 14
+MAX_TEXT_BYTES: Final = 1 << 16
 CHUNK_BYTES: Final = 1 << 20
 EXPECTED = "the journal of a run"
 
@@ -146,15 +152,23 @@ class JournalWriter:
 class JournalReader:
     """The records of the journal at `path`, again and again as it grows; where it was moved, set `path` anew.
 
-    `new()`: those that came whole since the last call. Raises BadInputError for a file that is none, or whose bytes are
-    no records.
+    `new()`: those that came whole since the last call. Raises BadInputError for a file that is none, and for a record
+    that is none, by its number, from 1 on.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._unpacker = msgpack.Unpacker(max_buffer_size=MAX_RECORD_BYTES, use_list=False)
-        self._read_bytes = 0
-        self._has_begun = False
+        self._unpacker = msgpack.Unpacker(
+            max_buffer_size=MAX_RECORD_BYTES + CHUNK_BYTES,
+            max_array_len=MAX_ENTRIES,
+            max_map_len=MAX_ENTRIES,
+            max_str_len=MAX_TEXT_BYTES,
+            max_bin_len=0,
+            max_ext_len=0,
+            use_list=False,
+        )
+        self._read_bytes = self._open_bytes = self._count = 0
+        self._run: _Checks | None = None
 
     def new(self) -> Iterator[Record]:
         """Each record once, in order."""
@@ -163,27 +177,53 @@ class JournalReader:
                 file.seek(self._read_bytes)
                 while chunk := file.read(CHUNK_BYTES):
                     self._read_bytes += len(chunk)
-                    self._unpacker.feed(chunk)
-                    yield from map(self._parsed, self._unpacker)
+                    yield from self._parsed(chunk)
         except OSError as error:
             raise BadInputError.of_os_error(self.path, error, EXPECTED) from None
-        except (ValueError, msgpack.UnpackException, RecursionError) as error:
-            self._refuse(str(error) or type(error).__name__)
 
-    def _parsed(self, row: Any) -> Record:
+    def _parsed(self, chunk: bytes) -> Iterator[Record]:
+        """The records that end in `chunk`, which comes next."""
+        count = self._count
         try:
-            record = _parse(row)
+            self._unpacker.feed(chunk)
+            for row in self._unpacker:
+                self._count += 1
+                yield self._record(row)
         except UnexpectedValue as error:
-            raise BadInputError.at(f"{self.path}, before byte {self._read_bytes}", error) from None
-        except (ValueError, TypeError, KeyError, IndexError) as error:
-            self._refuse(str(error) or type(error).__name__)
-        if isinstance(record, Begun) == self._has_begun:
-            self._refuse("a second header" if self._has_begun else "a record before the header")
-        self._has_begun = True
+            raise BadInputError.at(f"{self.path}, record {self._count}", error) from None
+        except (ValueError, msgpack.UnpackException) as error:
+            raise self._refused(next(found for kind, found in _UNREADABLE if isinstance(error, kind))) from None
+        self._open_bytes = self._open_bytes + len(chunk) if self._count == count else 0
+        if self._open_bytes > MAX_RECORD_BYTES:
+            raise self._refused(f"more than {MAX_RECORD_BYTES} bytes")
+
+    def _refused(self, found: str) -> BadInputError:
+        """Of the record that comes next, which cannot be read."""
+        return BadInputError(f"{self.path}, record {self._count + 1}", found, EXPECTED)
+
+    def _record(self, row: Any) -> Record:
+        place = row[0] if type(row) is tuple and row else None
+        if type(place) is not int or not 0 <= place < len(RECORDS):
+            raise UnexpectedValue(values.shown(row), f"one of {', '.join(each.__name__ for each in RECORDS)}")
+        if (place == 0) == (self._run is not None):
+            raise UnexpectedValue("a second header" if place == 0 else "a record before the header", EXPECTED)
+        kind = RECORDS[place]
+        if len(row) != len(kind._fields) + 1:
+            raise UnexpectedValue(values.shown(row), f"{kind.__name__} with {', '.join(kind._fields)}")
+        if self._run is None:
+            begun = _begun(*row[1:])
+            self._run = _checks(RunValues(begun.graph))
+            return begun
+        record: Record = kind(*[check(value) for check, value in zip(self._run[place], row[1:], strict=True)])
         return record
 
-    def _refuse(self, found: str) -> Any:
-        raise BadInputError(f"{self.path}, before byte {self._read_bytes}", found, EXPECTED) from None
+
+def journal_in(folder: Path) -> Path | None:
+    """The journal of a run folder; None: it has none. Raises BadInputError for anything but a file."""
+    path = folder / NAME
+    if path.exists() and not path.is_file():
+        require_file(path, EXPECTED)
+    return path if path.is_file() else None
 
 
 def read_journal(path: Path) -> Iterator[Record]:
@@ -227,21 +267,35 @@ _FIELDS: dict[type[Any], Callable[[Any], list[Any]]] = {
 }
 
 
-def _parse(row: Any) -> Record:
-    place, *fields = row
-    kind = RECORDS[place] if type(place) is int and 0 <= place < len(RECORDS) else None
-    if kind is Begun:
-        schema, graph, settings, facts = fields
-        if schema != SCHEMA:
-            raise UnexpectedValue(f"schema {schema!r}", str(SCHEMA))
-        return Begun(schema, graph_of(graph), settings_of(settings), facts)
-    if kind is Stepped:
-        now_ns, events, actions = fields
-        return Stepped(now_ns, events_of(events), actions_of(actions))
-    if kind is Worked:
-        job, figures = fields
-        return Worked(JobRecord(*job), figures)
-    if kind is None or len(fields) != len(kind._fields):
-        raise UnexpectedValue(str(row)[:80], f"one of {', '.join(each.__name__ for each in RECORDS)}")
-    record: Record = kind(*fields)
-    return record
+#: What is wrong with bytes, by what the reader of MessagePack raises.
+_UNREADABLE: tuple[tuple[type[Exception], str], ...] = (
+    (msgpack.FormatError, "bytes that are no MessagePack"),
+    (msgpack.StackError, "lists inside lists, too deep"),
+    (msgpack.BufferFull, f"more than {MAX_RECORD_BYTES} bytes"),
+    (UnicodeDecodeError, "a text that is not UTF-8"),
+    (Exception, f"a list of more than {MAX_ENTRIES} entries, a text of more than {MAX_TEXT_BYTES} bytes, or raw bytes"),
+)
+
+_Checks = tuple[tuple[Callable[[Any], Any], ...], ...]
+
+
+def _checks(run: RunValues) -> _Checks:
+    """By the place of a record in RECORDS: what its fields are checked with."""
+    of: dict[type[Any], tuple[Callable[[Any], Any], ...]] = {
+        Begun: (),
+        Stepped: (run.step_ns, run.events, run.actions),
+        Accounted: (values.time_ns, run.unit, run.account),
+        Worked: (run.job, values.numbers),
+        Counted: (values.time_ns, values.counts, values.counts),
+        Sampled: (values.time_ns, values.numbers),
+        Said: (values.time_ns, values.text),
+        Ended: (values.time_ns, values.facts),
+    }
+    return tuple(of[kind] for kind in RECORDS)
+
+
+def _begun(schema: Any, graph: Any, settings: Any, facts: Any) -> Begun:
+    if schema != SCHEMA:
+        raise UnexpectedValue(f"schema {values.shown(schema)}", str(SCHEMA))
+    found = values.graph(graph)
+    return Begun(SCHEMA, found, values.settings(settings, found), values.facts(facts))

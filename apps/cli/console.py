@@ -15,6 +15,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rich.console import Console
 
+#: C0, DEL and C1, as Python writes them.
+_WRITTEN_OUT = {code: repr(chr(code))[1:-1] for code in (*range(0x20), *range(0x7F, 0xA0))}
+
 
 def stderr_console() -> Console:
     """Console for messages and progress. Rich obeys NO_COLOR and plain pipes by itself."""
@@ -53,6 +56,18 @@ def spinner(text: str) -> Iterator[None]:
         return
     with console.status(text):
         yield
+
+
+def without_controls(value: Any) -> Any:
+    """A text, or every text in a document, with control characters written out: a terminal would obey those of a file.
+
+    `value`: mappings and lists of texts and numbers; all but texts stays as it is.
+    """
+    if isinstance(value, str):
+        return value.translate(_WRITTEN_OUT)
+    if isinstance(value, Mapping):
+        return {without_controls(key): without_controls(each) for key, each in value.items()}
+    return [without_controls(each) for each in value] if isinstance(value, list | tuple) else value
 
 
 def print_json(document: Mapping[str, Any]) -> None:

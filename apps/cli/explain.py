@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from trilane.apps.cli.commands import Commands, given
-from trilane.apps.cli.console import print_json, spinner, stderr_console, stdout_console
+from trilane.apps.cli.console import print_json, spinner, stderr_console, stdout_console, without_controls
 from trilane.apps.cli.explain_run import MOST_SLOWEST, SLOWEST, explain_folder, refuse_options, run_folder
 from trilane.apps.cli.options import (
     PROFILE_HELP,
@@ -115,7 +115,7 @@ def explain(
     if json:
         print_json(explanation.document)
         return
-    _show(explanation.document)
+    _show(without_controls(explanation.document))
 
 
 def _show(document: dict[str, Any]) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from trilane.apps.cli.console import print_json, spinner, stderr_console, stdout_console
+from trilane.apps.cli.console import print_json, spinner, stderr_console, stdout_console, without_controls
 from trilane.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def run_folder(name: str) -> Path | None:
     from trilane.scene.load import scene_names
 
     folder = Path(name)
-    if any((folder / file).is_file() for file in ("report.json", NAME)):
+    if any((folder / file).exists() for file in ("report.json", NAME)):
         return folder
     if (folder / NAME).is_symlink():
         raise BadInputError(folder, without_journal(folder), EXPECTED)
@@ -81,7 +81,7 @@ def explain_folder(folder: Path, slowest: int, jobs: Path | None, as_json: bool)
     if as_json:
         print_json(document)
         return
-    _show(document)
+    _show(without_controls(document))
 
 
 def _show(document: Mapping[str, Any]) -> None:

@@ -42,5 +42,5 @@ def trace(run: RunArgument, chrome_json: ChromeOption = False, out: OutOption = 
         raise BadInputError(run, "a run that goes on", "--out FILE for its trace so far", "its folder is its own")
     target = out or followed.folder / (CHROME_NAME if chrome_json else NAME)
     with spinner("writing the trace"):
-        write_run(followed.new(), target, chrome=chrome_json)
+        write_run(followed.whole(), target, chrome=chrome_json)
     stderr_console().print(f"trace: {target}", soft_wrap=True, markup=False)

@@ -28,7 +28,7 @@ from trilane.apps.dashboard.view import Message
 from trilane.apps.dashboard.wire import ControlSaid, Seek, shown
 from trilane.apps.live.followed_run import FollowedRun, RunState
 from trilane.errors import BadInputError
-from trilane.pipeline.journal import NAME, Begun, Record, Stepped, read_journal
+from trilane.pipeline.journal import NAME, Begun, Record, Stepped, journal_in, read_journal
 from trilane.scheduler.accounts import CAUSES, UNEXPLAINED
 
 FIRST_SPAN_MS: Final = 5000.0
@@ -128,10 +128,11 @@ class FinishedRun:
 
 def read_run(folder: Path) -> FinishedRun:
     """The run in `folder`. Raises BadInputError for a folder that has none, or whose journal cannot be read."""
-    if not (folder / NAME).is_file():
+    journal = journal_in(folder)
+    if journal is None:
         raise BadInputError(folder, f"no {NAME}", "the folder of a run", "`trilane run` writes one into runs/")
     run: FinishedRun | None = None
-    for record in read_journal(folder / NAME):
+    for record in read_journal(journal):
         if isinstance(record, Begun):
             run = FinishedRun(record, facts_of_folder(folder, record))
         elif run is not None:

@@ -18,7 +18,7 @@ from trilane.apps.explained.waits import ExplainedJob, Waits
 from trilane.apps.report import Report, read_report
 from trilane.errors import BadInputError
 from trilane.figure_sources import COMPUTED, MEASURED
-from trilane.pipeline.journal import NAME, Begun, Record, read_journal
+from trilane.pipeline.journal import NAME, Begun, Record, journal_in, read_journal
 from trilane.scheduler.stats import NS_PER_MS
 
 SCHEMA = 1
@@ -38,8 +38,8 @@ def open_journal(folder: Path) -> tuple[Begun, Iterator[Record]]:
 
     Raises BadInputError for a folder without one, and, also while it is read, for a file that is none.
     """
-    path = folder / NAME
-    if not path.is_file():
+    path = journal_in(folder)
+    if path is None:
         raise BadInputError(
             folder, f"no {NAME}", "the folder of a run", "a run of an older Trilane has none: run again"
         )

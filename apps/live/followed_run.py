@@ -16,12 +16,13 @@ import psutil
 
 from trilane.errors import BadInputError
 from trilane.near_miss import did_you_mean
-from trilane.pipeline.journal import NAME, JournalReader, Record
+from trilane.pipeline.journal import NAME, JournalReader, Record, journal_in
 
 RUNS = Path("runs")
 LOOK_S = 0.2
 SILENCE_NS = 1_000_000_000
 EXPECTED = "a run folder with a journal"
+NO_RECORD = "a journal without a record"
 PARTIAL = re.compile(r"(?P<name>.+)\.(?P<pid>[0-9]{1,9})\.partial")
 
 
@@ -51,8 +52,8 @@ class FollowedRun:
     """
 
     def __init__(self, folder: Path) -> None:
-        journal = folder / NAME
-        if not journal.is_file():
+        journal = journal_in(folder)
+        if journal is None:
             remedy = "an older Trilane wrote it; run the scene again" if (folder / "report.json").is_file() else ""
             raise BadInputError(folder, without_journal(folder), EXPECTED, remedy)
         self.folder = folder
@@ -90,6 +91,15 @@ class FollowedRun:
         except BadInputError:
             if self._reader.path.exists():
                 raise  # else it was moved this very moment, and the next call finds it
+
+    def whole(self) -> Iterator[Record]:
+        """As `new`, of a run not looked at yet. Raises BadInputError where the journal has no record so far."""
+        is_empty = True
+        for record in self.new():
+            is_empty = False
+            yield record
+        if is_empty:
+            raise BadInputError(self.folder, NO_RECORD, EXPECTED)
 
     def _find_again(self) -> None:
         """A run that has become complete has its own name."""

@@ -9,7 +9,7 @@ from collections.abc import Callable, Generator
 from typing import Any, NamedTuple
 
 from trilane.apps.live.figures import Figures
-from trilane.apps.live.followed_run import EXPECTED, FollowedRun, RunState
+from trilane.apps.live.followed_run import EXPECTED, NO_RECORD, FollowedRun, RunState
 from trilane.apps.live.live_figures import LiveFigures
 from trilane.errors import BadInputError
 from trilane.pipeline.journal import Begun
@@ -40,7 +40,7 @@ def looks(run: FollowedRun, pause: Callable[[], None]) -> Generator[Look]:
         if figures is not None:
             yield Look(run.name, state, figures.now(figures.last_ns + run.silent_ns, state))
         elif state is not RunState.GOES_ON:
-            raise BadInputError(run.folder, "a journal without a record", EXPECTED)
+            raise BadInputError(run.folder, NO_RECORD, EXPECTED)
         if state is not RunState.GOES_ON or (figures is not None and figures.is_over):
             return
         pause()

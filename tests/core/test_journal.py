@@ -12,6 +12,7 @@ import pytest
 from trilane.errors import BadInputError, UnwrittenError
 from trilane.hw_profiles.application import application_graph
 from trilane.pipeline.journal import (
+    MAX_ENTRIES,
     SCHEMA,
     Accounted,
     Begun,
@@ -30,7 +31,8 @@ from trilane.scheduler.causes import Outcome, OutcomeKind
 from trilane.scheduler.events import Dispatch, Finish, Job, JobDone, Settings, UnitReady
 from trilane.scheduler.ledger import JobRecord
 
-BEGUN = Begun(SCHEMA, application_graph(), Settings(3, works=(1000, 500), follow=("infer",)), {"clock": "host"})
+SETTINGS = Settings(3, period_ns=9, works=(1000, 500), follow=("infer",))
+BEGUN = Begun(SCHEMA, application_graph(), SETTINGS, {"clock": "host"})
 REST: tuple[Record, ...] = (
     Stepped(5, (UnitReady("cpu"),), (Dispatch(Job(0, "cpu", "pose", 0, -1, 0, 0, fresh=True, rung=1)),)),
     Accounted(5, "gpu", 1),
@@ -83,21 +85,60 @@ def test_a_record_cut_off_at_the_end_is_left_out(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "found"),
     [
+<<<<<<< HEAD
         (b"", "an empty file"),
         (msgpack.packb([0, 99])[:1], "no record"),
         (b"\xc1", "byte 1"),
+=======
+        (b"", "no record"),
+        (b"\xc1", "record 1: found bytes that are no MessagePack"),
+>>>>>>> a49cd65 (A journal's records are checked as they are read and refused by number, within stated limits; no record makes no trace)
         (msgpack.packb([1, 5, [], []]), "a record before the header"),
         (msgpack.packb([0, 99, {}, {}, {}]), "schema 99"),
-        (msgpack.packb([7, 5]), r"\(7, 5\)"),
+        (msgpack.packb([7, 5]), "before the header"),
         (msgpack.packb([-1, 5, {}]), r"\(-1, 5"),
-        (msgpack.packb(3), "unpack|iterable"),
-        (msgpack.packb([1, 5, [["Burn"]], []]), "'Burn'"),
+        (msgpack.packb(3), "record 1: found 3, expected one of Begun"),
+        (msgpack.packb([{}] * (MAX_ENTRIES + 1)), "a list of more than 16384"),
+        (msgpack.packb([[{}] * MAX_ENTRIES] * 200), "more than 1048576 bytes"),
     ],
 )
 def test_what_is_no_journal_is_refused(tmp_path: Path, content: bytes, found: str) -> None:
     path = tmp_path / "j"
     path.write_bytes(content)
     with pytest.raises(BadInputError, match=found):
+        list(read_journal(path))
+
+
+JOB = ("pose", "cpu", 0, 5, 5, 6, 8, 0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("row", "found"),
+    [
+        ([1, 5, [["Burn"]], []], "'Burn'"),
+        ([1, 3, [], []], "time 3 of a step"),
+        ([1, 9, [["UnitReady", "npu"]], []], "unit 'npu'"),
+        ([2, 9, "npu", 1], "unit 'npu'"),
+        ([2, 9, "gpu", 7], "account 7"),
+        ([3, ["own", *JOB[1:]], {}], "stage 'own'"),
+        ([3, [["pose"], *JOB[1:]], {}], "job"),
+        ([3, [*JOB[:5], float("nan"), *JOB[6:]], {}], "job"),
+        ([3, [*JOB[:6], -5, *JOB[7:]], {}], "times from 0 to its end"),
+        ([3, JOB, {}], "no job comes twice"),
+        ([3, JOB[:9], {}], "job"),
+        ([3, [*JOB[:2], 1, *JOB[3:]], {"visible": "x"}], "numbers by name"),
+        ([4, 9, {"died:gpu": -1}, {}], "whole numbers"),
+        ([5, 9, {"duty.gpu": float("inf")}], "finite"),
+        ([6, -1, "text"], "time -1"),
+        ([6, 9, 3], "text 3"),
+        ([7, 5], "Ended with now_ns, report"),
+    ],
+)
+def test_a_record_with_a_strange_value_is_refused_by_its_number(tmp_path: Path, row: list[object], found: str) -> None:
+    path = _write(tmp_path / "j", (BEGUN, *REST[:1], Worked(JobRecord(*JOB), {})))
+    with path.open("ab") as file:
+        file.write(msgpack.packb(row))
+    with pytest.raises(BadInputError, match=f"j, record 4: found .*{found}"):
         list(read_journal(path))
 
 

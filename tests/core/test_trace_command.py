@@ -79,6 +79,21 @@ def test_what_cannot_be_traced_or_written(runs: Path, command: Command) -> None:
     assert [path.name for path in runs.iterdir()] == [NAME]
 
 
+def test_a_journal_without_a_record_leaves_the_old_trace(runs: Path, command: Command) -> None:
+    (runs / "trace.pftrace").write_bytes(b"old")
+    (runs / NAME).write_bytes((runs / NAME).read_bytes()[:10])
+    _, err = command("trace", runs, code=2)
+    assert "a journal without a record" in err
+    assert (runs / "trace.pftrace").read_bytes() == b"old"
+
+
+@pytest.mark.parametrize("name", ["trace", "top", "explain"])
+def test_a_pipe_in_the_place_of_a_journal_is_called_so(runs: Path, name: str, command: Command) -> None:
+    (runs / NAME).unlink()
+    os.mkfifo(runs / NAME)
+    assert "found a device, a pipe or a socket" in command(name, runs, code=2)[1]
+
+
 def test_the_trace_of_a_prediction(tmp_path: Path, command: Command) -> None:
     """The simulated run of which the answer's shares of time are: those of the slices are the same."""
     file = tmp_path / "p.pftrace"

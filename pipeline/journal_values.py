@@ -1,0 +1,231 @@
+"""What a value of a journal's record may be.
+
+Rule: a check takes a value as it was read, from whomever it is, and hands back what it stands for, or raises
+UnexpectedValue in plain words; what a check remembers of a run does not grow with the run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from math import isfinite
+from typing import Any, Final, get_type_hints
+
+from trilane.scheduler.core import Core
+from trilane.scheduler.events import ACTIONS, EVENTS, NEVER, Action, Event, Finish, Graph, Settings
+from trilane.scheduler.ledger import ASSIGNED, BLOCKED, STARVED, THROTTLED, JobRecord
+from trilane.scheduler.recording import CARRIED, actions_of, events_of, graph_of, settings_of
+from trilane.unexpected_value import UnexpectedValue
+
+LONGEST_FOUND: Final = 80
+MOST_NESTED: Final = 32  # of the facts: a configuration has five
+ACCOUNTS: Final = {ASSIGNED: "assigned", STARVED: "starved", BLOCKED: "blocked", THROTTLED: "throttled"}
+A_TIME: Final = f"nanoseconds, a whole number from 0 to {NEVER}"
+NUMBERS: Final = {int, float}
+PLAIN: Final = {int, float, str, bool, type(None)}
+JOB_TYPES: Final = tuple(get_type_hints(JobRecord).values())
+SETTINGS_TYPES: Final = {
+    name: tuple if "tuple" in str(kind) else kind for name, kind in get_type_hints(Settings).items()
+}
+#: Name of an event or action -> where its row has a unit and a stage; 0: nowhere.
+_NAMED: Final = {
+    kind.__name__: tuple(fields.index(name) + 1 if name in fields else 0 for name in ("unit", "stage"))
+    for kind in (*EVENTS, *ACTIONS)
+    if kind is not Finish
+    for fields in [CARRIED.get(kind, kind)._fields]
+}
+
+
+def shown(value: Any) -> str:
+    """A value as part of a message."""
+    text = repr(value)
+    return text if len(text) <= LONGEST_FOUND else f"{text[:LONGEST_FOUND]}…"
+
+
+def time_ns(value: Any) -> int:
+    """A time of the run's clock."""
+    if type(value) is not int or not 0 <= value <= NEVER:
+        raise UnexpectedValue(f"time {shown(value)}", A_TIME)
+    return value
+
+
+def text(value: Any) -> str:
+    """A text."""
+    if type(value) is not str:
+        raise UnexpectedValue(f"text {shown(value)}", "a text")
+    return value
+
+
+def numbers(value: Any) -> Mapping[str, float]:
+    """Finite numbers by name."""
+    if type(value) is not dict:
+        raise UnexpectedValue(shown(value), "numbers by name")
+    if not (set(map(type, value)) <= {str} and set(map(type, value.values())) <= NUMBERS):
+        raise UnexpectedValue(shown(value), "numbers by name")
+    if not all(map(isfinite, value.values())):
+        raise UnexpectedValue(shown(value), "finite numbers by name")
+    return value
+
+
+def counts(value: Any) -> Mapping[str, int]:
+    """Whole numbers from 0 on, by name."""
+    found: Any = numbers(value)
+    if any(type(each) is not int or each < 0 for each in found.values()):
+        raise UnexpectedValue(shown(value), "whole numbers from 0 on, by name")
+    return found  # type: ignore[no-any-return]
+
+
+def facts(value: Any) -> Mapping[str, Any]:
+    """What JSON can hold, by name."""
+    if type(value) is not dict:
+        raise UnexpectedValue(shown(value), "facts by name")
+    waiting: list[tuple[Any, int]] = [(value, 1)]
+    while waiting:
+        one, depth = waiting.pop()
+        if depth > MOST_NESTED:
+            raise UnexpectedValue("facts inside facts, too deep", f"at most {MOST_NESTED} of them")
+        if type(one) is dict and set(map(type, one)) <= {str}:
+            waiting += [(each, depth + 1) for each in one.values()]
+        elif type(one) is tuple:
+            waiting += [(each, depth + 1) for each in one]
+        elif type(one) not in PLAIN or (type(one) is float and not isfinite(one)):
+            raise UnexpectedValue(shown(one), "what JSON can hold: texts, finite numbers, lists, names with values")
+    return value
+
+
+def graph(value: Any) -> Graph:
+    """The graph of a run, with names that a terminal can show."""
+    try:
+        found = graph_of(value)
+        names = [name for stage in found.stages for name in (stage.name, stage.unit)]
+        names += [*found.edges, found.latency_to, *(found.bypass or ())]
+    except UnexpectedValue:
+        raise
+    except (KeyError, TypeError, IndexError, ValueError):
+        raise UnexpectedValue(f"graph {shown(value)}", "stages, edges, latency_to and bypass") from None
+    for name in names:
+        if type(name) is not str or not name.isprintable():
+            raise UnexpectedValue(f"name {shown(name)} in the graph", "a text without control characters")
+    return found
+
+
+def settings(value: Any, of_graph: Graph) -> Settings:
+    """The settings of a run with that graph, with which its scheduler can be made."""
+    try:
+        found = settings_of(value)
+        for name, kind in SETTINGS_TYPES.items():
+            _check_setting(name, kind, getattr(found, name))
+        Core(of_graph, found)  # says what is wrong with them
+    except UnexpectedValue:
+        raise
+    except (TypeError, AttributeError):
+        raise UnexpectedValue(f"settings {shown(value)}", ", ".join(SETTINGS_TYPES)) from None
+    except ValueError as error:
+        raise UnexpectedValue(str(error), "settings and a graph of a run") from None
+    return found
+
+
+def _check_setting(name: str, kind: type[Any], value: Any) -> None:
+    if type(value) is not kind:
+        raise UnexpectedValue(f"setting {name} {shown(value)}", f"a value like {kind()!r}")
+    entries: tuple[Any, ...] = value if kind is tuple else (value,)
+    for each in entries:
+        wanted = (str if name == "follow" else int) if kind is tuple else kind
+        if type(each) is not wanted or (wanted is int and not 0 <= each <= NEVER):
+            raise UnexpectedValue(f"setting {name} {shown(value)}", f"whole numbers from 0 to {NEVER}, and texts")
+
+
+class RunValues:
+    """Checks of what must fit the graph of a run, or what was read before: times of steps, names, jobs."""
+
+    def __init__(self, of_graph: Graph) -> None:
+        self._unit_of = {stage.name: stage.unit for stage in of_graph.stages}
+        self._units = frozenset(of_graph.units)
+        self._last_frame = dict.fromkeys(self._unit_of, -1)
+        self._step_ns = 0
+
+    def step_ns(self, value: Any) -> int:
+        """The time of a step: not before the last one's."""
+        if type(value) is not int or not self._step_ns <= value <= NEVER:
+            raise UnexpectedValue(
+                f"time {shown(value)} of a step", f"{A_TIME}, not before the last step's {self._step_ns}"
+            )
+        self._step_ns = value
+        return value
+
+    def unit(self, value: Any) -> str:
+        """The name of a unit."""
+        if type(value) is not str or value not in self._units:
+            raise _unknown("unit", value, self._units)
+        return value
+
+    def account(self, value: Any) -> int:
+        """An account of the ledger."""
+        if type(value) is not int or value not in ACCOUNTS:
+            known = ", ".join(f"{number} ({name})" for number, name in ACCOUNTS.items())
+            raise UnexpectedValue(f"account {shown(value)}", f"one of {known}")
+        return value
+
+    def events(self, rows: Any) -> tuple[Event, ...]:
+        """What a step was told."""
+        found = events_of(_rows(rows))
+        for row in rows:
+            self._check_row(row)
+            if row[0] == "JobDone" and not 0 <= row[3] <= row[4]:
+                raise UnexpectedValue(f"a job from {row[3]} to {row[4]} ns", "one that does not end before it begins")
+        return found
+
+    def actions(self, rows: Any) -> tuple[Action, ...]:
+        """What a step answered."""
+        found = actions_of(_rows(rows))
+        for row in rows:
+            self._check_row(row)
+        return found
+
+    def _check_row(self, row: tuple[Any, ...]) -> None:
+        """Of an event or action, whose fields have their types: names that the graph has, numbers in their range."""
+        unit, stage = _NAMED.get(row[0], (0, 0))
+        if unit and row[unit] not in self._units:
+            raise _unknown("unit", row[unit], self._units)
+        if stage and row[stage] not in self._unit_of:
+            raise _unknown("stage", row[stage], self._unit_of)
+        for value in row:
+            if type(value) is int and not -1 <= value <= NEVER:
+                raise UnexpectedValue(f"{value} in {row[0]}", f"a whole number from -1 to {NEVER}")
+
+    def job(self, row: Any) -> JobRecord:
+        """A job that has ended; each stage does the frames in their order, and none twice."""
+        if type(row) is not tuple or tuple(map(type, row)) != JOB_TYPES:
+            raise UnexpectedValue(f"job {shown(row)}", f"texts and whole numbers: {', '.join(JobRecord._fields)}")
+        job = JobRecord(*row)
+        fields: tuple[Any, ...] = row
+        stage, unit, frame, ready_ns, dispatch_ns, begin_ns, end_ns, *lost = fields
+        if self._unit_of.get(stage) != unit:
+            self._refuse_place(stage, unit)
+        if (
+            min(ready_ns, dispatch_ns, begin_ns, *lost) < 0
+            or not max(ready_ns, dispatch_ns, begin_ns) <= end_ns <= NEVER
+        ):
+            raise UnexpectedValue(f"job {shown(row)}", f"times from 0 to its end, and that at most {NEVER} ns")
+        if max(lost) > NEVER or not self._last_frame[stage] < frame <= NEVER:
+            last = self._last_frame[stage]
+            raise UnexpectedValue(
+                f"frame {frame} of stage {stage!r}", f"one after its last, {last}: no job comes twice"
+            )
+        self._last_frame[stage] = frame
+        return job
+
+    def _refuse_place(self, stage: str, unit: str) -> None:
+        if stage not in self._unit_of:
+            raise _unknown("stage", stage, self._unit_of)
+        self.unit(unit)
+        raise UnexpectedValue(f"stage {stage!r} on unit {unit!r}", f"unit {self._unit_of[stage]!r}")
+
+
+def _rows(rows: Any) -> tuple[Any, ...]:
+    if type(rows) is not tuple or not all(type(row) is tuple and row for row in rows):
+        raise UnexpectedValue(shown(rows), "a list of events or actions, each a name and its fields")
+    return rows
+
+
+def _unknown(kind: str, name: Any, names: Collection[str]) -> UnexpectedValue:
+    return UnexpectedValue(f"{kind} {shown(name)}", f"one of the graph's: {', '.join(sorted(names))}")
