@@ -129,7 +129,7 @@ def _check_setting(name: str, kind: type[Any], value: Any) -> None:
         raise UnexpectedValue(f"setting {name} {shown(value)}", f"a value like {kind()!r}")
     entries: tuple[Any, ...] = value if kind is tuple else (value,)
     for each in entries:
-        wanted = (str if name == "follow" else int) if kind is tuple else kind
+        wanted: Any = (str if name == "follow" else int) if kind is tuple else kind
         if type(each) is not wanted or (wanted is int and not 0 <= each <= NEVER):
             raise UnexpectedValue(f"setting {name} {shown(value)}", f"whole numbers from 0 to {NEVER}, and texts")
 
