@@ -12,10 +12,11 @@ from typing import Any
 
 from trilane.apps.overview.entry import Entry, entry_of
 from trilane.apps.report import MAX_REPORT_BYTES
+from trilane.apps.sweeps.store import TRIALS, read_trials
 from trilane.errors import BadInputError
 from trilane.files import require_file
 
-REPORT, TRIALS, VIDEO = "report.json", "trials.jsonl", "video.mp4"
+REPORT, VIDEO = "report.json", "video.mp4"
 EXPECTED = "a run folder, a sweep's folder, a prediction that was saved with --json, or a folder of these"
 MOST = 10_000
 
@@ -42,7 +43,7 @@ def _entries(place: Path) -> Iterator[Entry]:
     elif (place / REPORT).is_file():
         yield entry_of(place.name, _document(place / REPORT), place / VIDEO)
     elif (place / TRIALS).is_file():
-        yield from _trials(place)
+        yield from (_trial(place, trial) for trial in read_trials(place).values())
     else:
         for folder in sorted(path for path in place.iterdir() if path.is_dir() and path.suffix != ".partial"):
             if (folder / REPORT).is_file() or (folder / TRIALS).is_file():
@@ -53,27 +54,13 @@ def _document(path: Path) -> Mapping[str, Any]:
     size = require_file(path, EXPECTED)
     if size > MAX_REPORT_BYTES:
         raise BadInputError(path, f"{size} bytes", f"at most {MAX_REPORT_BYTES}")
-    return _parsed(path, path.read_text(encoding="utf-8", errors="replace"))
-
-
-def _parsed(where: Path | str, text: str) -> Mapping[str, Any]:
     try:
-        document = json.loads(text)
+        document = json.loads(path.read_text(encoding="utf-8", errors="replace"))
     except (ValueError, RecursionError) as error:
-        raise BadInputError(where, str(error), EXPECTED) from None
+        raise BadInputError(path, str(error), EXPECTED) from None
     if not isinstance(document, dict):
-        raise BadInputError(where, f"a {type(document).__name__}", EXPECTED)
+        raise BadInputError(path, f"a {type(document).__name__}", EXPECTED)
     return document
-
-
-def _trials(folder: Path) -> Iterator[Entry]:
-    """A trial a line; the last line of a sweep that was killed may be cut off, and is left out."""
-    path = folder / TRIALS
-    with path.open(encoding="utf-8", errors="replace") as lines:
-        for number, line in enumerate(lines, start=1):
-            if not line.endswith("\n"):
-                return
-            yield _trial(folder, _parsed(f"{path}, line {number}", line))
 
 
 def _trial(folder: Path, trial: Mapping[str, Any]) -> Entry:
