@@ -24,7 +24,12 @@ def test_every_row_of_the_table_is_read() -> None:
 def test_the_code_has_what_the_table_says(name: str) -> None:
     number, unit = ROWS[name]
     module, _, constant = name.rpartition(".")
-    value = getattr(import_module(f"trilane.{module}"), constant)
+    try:
+        value = getattr(import_module(f"trilane.{module}"), constant)
+    except ModuleNotFoundError as error:
+        if str(error.name).startswith("trilane"):
+            raise
+        pytest.skip(f"{module} needs {error.name}, of an extra")
     if unit:
         assert value * ENDINGS[re.search(r"_[A-Z]+$", constant)[0]] == pytest.approx(number * UNITS[unit], rel=1e-12)
     else:
