@@ -13,6 +13,7 @@ from typing import Protocol
 from trilane.errors import TrilaneError
 from trilane.pipeline.controls import RunControls
 from trilane.pipeline.cpu_use import CpuTimes
+from trilane.pipeline.held_time import HeldTime
 from trilane.pipeline.journal import Worked
 from trilane.pipeline.requests import FrameRequestQueue
 from trilane.pipeline.run_log import RunLog
@@ -88,6 +89,7 @@ class RealtimeClock:
         self._open: dict[int, tuple[Job, int]] = {}
         self._unbooked: list[tuple[Job, int, int | None, Done]] = []
         self._controls: RunControls | None = None
+        self._held = HeldTime()
         self._to_end: set[str] = set()
         self._begun = self._stopping = self._is_lost = False
         self._step_ns = self._ping_ns = 0
@@ -147,7 +149,9 @@ class RealtimeClock:
         return found
 
     def finish(self) -> None:
-        """Show the final progress."""
+        """Show the final progress, and say how long the run was held."""
+        if held := self._held.sentence(time.monotonic_ns()):
+            self._log.say(held)
         self._show_progress(final=True)
 
     def _start(self, unit: str) -> None:
@@ -199,6 +203,7 @@ class RealtimeClock:
 
     def _asked(self, controls: RunControls) -> list[Event]:
         events, kills = controls.taken()
+        self._held.hear(time.monotonic_ns(), events)
         for unit in kills:
             self._log.say(f"unit {unit} is killed, as was asked")
             self._to_end.add(unit)
