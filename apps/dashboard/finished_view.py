@@ -28,7 +28,7 @@ from trilane.apps.dashboard.view import Message
 from trilane.apps.dashboard.wire import ControlSaid, Seek, shown
 from trilane.apps.live.followed_run import FollowedRun, RunState
 from trilane.errors import BadInputError
-from trilane.pipeline.journal import NAME, Begun, Record, Stepped, journal_in, read_journal
+from trilane.pipeline.journal import NAME, Begun, Ended, Record, Stepped, journal_in, read_journal
 from trilane.scheduler.accounts import CAUSES, UNEXPLAINED
 
 FIRST_SPAN_MS: Final = 5000.0
@@ -37,6 +37,8 @@ MOST_JOBS: Final = 6000
 MOST_IDLE: Final = 6000
 MOST_NOTES: Final = 100
 OVER: Final = "the run is over"
+CUT_OFF: Final = "the journal stops here: the run was killed, or the file is cut off; what came after is not known"
+NO_VIDEO: Final = "there are no pictures: video.mp4 is missing or cannot be read"
 
 CAUSE_NAMES: Final = (*CAUSES, UNEXPLAINED)
 TIMES: Final = [("begin", "<f8"), ("end", "<f8")]
@@ -61,12 +63,14 @@ class FinishedRun:
         self._last_stage = len(begun.graph.stages) - 1
         self._due_ms = 0.0
         self.metrics = ""
+        self._is_whole = False
         self.notes: list[tuple[float, str]] = []
 
     def add(self, record: Record) -> None:
         """The next record."""
         self._timeline.add(record)
         self._meter.add(record)
+        self._is_whole = isinstance(record, Ended)
         if isinstance(record, Stepped):
             self._keep()
             if self._timeline.now_ms >= self._due_ms:
@@ -78,6 +82,8 @@ class FinishedRun:
         self._keep()
         self._keep_figures()
         self.end_ms, self.metrics = self._timeline.now_ms, self._meter.metrics(state=state)
+        if not self._is_whole:
+            self.notes.append((self.end_ms, CUT_OFF))
         for table in (self.jobs, self.idle, self.presented, self.figures):
             table.complete()
 
@@ -158,6 +164,8 @@ class FinishedView:
         yield {"type": "hello", "run": told, "controls": [], "is_live": False, "span_ms": span}
         yield run.facts.state("ended")
         yield from (note(t_ms, text) for t_ms, text in run.notes)
+        if self._video.is_missing:
+            yield note(0.0, NO_VIDEO)
         yield from self._moment(run.end_ms, FIRST_SPAN_MS)
 
     async def news(self, *, is_watched: bool) -> Iterable[Message]:  # noqa: ARG002 - a view's signature
@@ -201,6 +209,10 @@ class Pictures:
             self._frames: VideoFrames | None = VideoFrames(path, fps)
         except (OSError, av.error.FFmpegError):
             self._frames = None  # the run was not recorded
+
+    @property
+    def is_missing(self) -> bool:
+        return self._frames is None
 
     def jpeg(self, frame: int) -> bytes | None:
         """What was shown with frame `frame`; None where there is no picture."""

@@ -17,7 +17,7 @@ from PIL import Image
 
 from trilane.apps.dashboard.time_table import PIECE_ROWS, TimeTable
 from trilane.errors import BadInputError
-from trilane.pipeline.journal import NAME, JournalWriter, journal_of
+from trilane.pipeline.journal import NAME, Ended, JournalWriter, journal_of
 from trilane.scheduler.events import Settings, chain
 from trilane.scheduler.virtual import simulate
 from trilane.stages.cpu.present import Segment
@@ -25,7 +25,7 @@ from trilane.stages.cpu.present import Segment
 pytest.importorskip("prometheus_client", reason="the extra dashboard is not installed")
 
 from trilane.apps.dashboard.clients import Client
-from trilane.apps.dashboard.finished_view import MOST_JOBS, FinishedView
+from trilane.apps.dashboard.finished_view import CUT_OFF, MOST_JOBS, NO_VIDEO, FinishedView
 from trilane.apps.dashboard.wire import ControlSaid, Seek
 
 MS = 1_000_000
@@ -115,6 +115,23 @@ def test_the_picture_is_of_the_frame_that_was_presented_last(view: FinishedView)
 def test_nothing_of_it_can_be_changed(view: FinishedView) -> None:
     assert view.control(ControlSaid(type="control", name="pause")) == "the run is over"
     assert "trilane_" in view.metrics()
+
+
+@pytest.mark.parametrize("video", [None, b"no video"], ids=["missing", "damaged"])
+def test_a_run_that_is_not_whole_says_so(tmp_path: Path, view: FinishedView, video: bytes | None) -> None:
+    run = simulate(GRAPH, Settings(3), lambda stage, *_: TIMES[stage], keep=True)
+    assert run.recording is not None
+    with JournalWriter(tmp_path / NAME) as writer:
+        for record in journal_of(run.recording, run.jobs, {"clock": "virtual"}, run.report):
+            if not isinstance(record, Ended):
+                writer.add(record)
+    if video is not None:
+        (tmp_path / "video.mp4").write_bytes(video)
+    cut = FinishedView(tmp_path)
+    said = [(message["t_ms"], message["text"]) for message in cut.greeting() if message["type"] == "note"]
+    cut.close()
+    assert said == [(75.0, CUT_OFF), (0.0, NO_VIDEO)]
+    assert not [message for message in view.greeting() if message["type"] == "note"]
 
 
 def test_a_folder_without_a_journal_is_refused(tmp_path: Path) -> None:
