@@ -25,7 +25,9 @@ from trilane.errors import BadInputError
 
 FAKE = "trilane.testing.sweep_trial"
 #: `trilane` that tries the module in place of Trilane.
+#: SIGINT is heard even where the tests run in a background in which it is ignored.
 PROGRAM = (
+    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
     f"import trilane.apps.sweeps.perform as p; p.PROGRAM = {FAKE!r}; from trilane.apps.cli.main import entry; entry()"
 )
 LIMIT_S = 100.0
