@@ -31,7 +31,7 @@ from trilane.pipeline.journal import NAME, Begun, Record
 from trilane.transport.live_window import LiveWindow, Shown, Steering
 
 FIGURES_S: Final = 0.25
-PICTURE_S: Final = 1 / 20  # between two that are encoded
+PICTURE_S: Final = 0.05  # between two that are encoded
 MOST_RAISED_DEG: Final = 90.0
 MOST_JOBS: Final = 4000
 MOST_IDLE: Final = 4000
