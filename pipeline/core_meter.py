@@ -85,8 +85,12 @@ class CoreMeter:
     def _open(self, thread: int) -> None:
         try:
             file = os.open(f"{self._tasks}/{thread}/schedstat", os.O_RDONLY | os.O_CLOEXEC)
-            delay_ns = int(os.pread(file, LINE_BYTES, 0).split()[1])
         except (FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
+            return
+        try:
+            delay_ns = int(os.pread(file, LINE_BYTES, 0).split()[1])
+        except ProcessLookupError:  # it has ended since its file was opened
+            os.close(file)
             return
         self._files[thread], self._seen_ns[file] = file, delay_ns
         self._born_ns += delay_ns

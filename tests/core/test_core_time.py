@@ -171,6 +171,33 @@ def test_cpu_time_is_that_of_all_threads_and_files_are_closed() -> None:
     assert len(list(FILES.iterdir())) == before
 
 
+def test_the_file_of_a_thread_that_ends_between_opening_and_reading_is_closed(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "schedstat").write_text("1 0 1")
+    task = tmp_path / "task" / "7"
+    task.mkdir(parents=True)
+    (task / "schedstat").write_text("1 0 1")
+    closed: list[int] = []
+    opened: list[int] = []
+    real_close = os.close
+
+    def ended(file: int, *_: int) -> bytes:
+        opened.append(file)
+        raise ProcessLookupError
+
+    def close(file: int) -> None:
+        closed.append(file)
+        real_close(file)
+
+    monkeypatch.setattr(os, "pread", ended)
+    monkeypatch.setattr(os, "close", close)
+    meter = CoreMeter(process=str(tmp_path))
+    assert meter.threads == 0
+    assert len(opened) == 1 and closed == opened
+    meter.close()
+
+
 def done(begin: int, end: int, cpu: int, cpu_before: int) -> Done:
     return Done(0, begin, end, 0, 0, 0, 0, 0, cpu, cpu_before, {})
 
