@@ -10,6 +10,7 @@ from pathlib import Path
 
 from trilane.scene.camera.recorded import RawCamera
 from trilane.scene.camera.text_table import elapsed, read_table
+from trilane.scene.detected import Detected
 
 COLUMNS = 13
 EXPECTED = "an ARKit log: time and the 12 numbers of a 3x4 matrix a line"
@@ -38,4 +39,5 @@ def load_arkit(path: Path) -> RawCamera:
         "usual for a phone",
         notes,
         read.place_of,
+        Detected("ARKit log", f"{COLUMNS} columns of numbers", unit="m", rate=f"by the times of the file, in {unit}"),
     )

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from trilane.errors import BadInputError
 from trilane.files import read_text
 from trilane.scene.camera.recorded import RawCamera
+from trilane.scene.detected import Detected
 
 EXPECTED = "a NeRF transforms.json: `frames`, each with a 4x4 `transform_matrix`"
 FILM_RATE_HZ = 30.0
@@ -44,9 +45,9 @@ def load_nerf(path: Path) -> RawCamera:
     rate, how = _rate(matrices[:, :3, :3])
     tall, wide, lens = _lens(path, content)
     notes = (f"NeRF transforms, {len(frames)} views, no times: {how}, camera to world",)
-    return RawCamera(
-        np.arange(len(frames)) / rate, matrices[:, :3, :3], matrices[:, :3, 3], "z", tall, wide, lens, notes, _place_of
-    )
+    detected = Detected("NeRF transforms.json", "JSON with `frames`", rate=f"no times in the format: {how}")
+    times, turns, places = np.arange(len(frames)) / rate, matrices[:, :3, :3], matrices[:, :3, 3]
+    return RawCamera(times, turns, places, "z", tall, wide, lens, notes, _place_of, detected)
 
 
 def _place_of(index: int) -> str:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from trilane.arrays import F64
+from trilane.scene.detected import NOTHING, Detected
 from trilane.scene.motion.motion import Wrap, bracket, wrapped_time
 from trilane.scene.rotations import matrix_from_quat, slerp
 
@@ -74,7 +75,7 @@ class CameraPath:
 
     `times_s` (N,): from 0, strictly increasing. `quats` (N, 4) and `places` (N, 3), metres: camera to world. `notes`:
     how the source was read, for people. `wrap`: what follows the last sample. `recorded`: whether the path
-    comes from a recording, which has to be placed in the scene.
+    comes from a recording, which has to be placed in the scene. `detected`: what its file is.
     """
 
     times_s: F64
@@ -84,6 +85,7 @@ class CameraPath:
     notes: tuple[str, ...]
     wrap: Wrap = Wrap.BOUNCE
     recorded: bool = True
+    detected: Detected = NOTHING
 
     @property
     def duration_s(self) -> float:

@@ -6,13 +6,14 @@ and one of the picture by a multiple of 90 degrees, as a phone turns its display
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import F64
 from trilane.scene.camera.path import CameraPath, Lens
+from trilane.scene.detected import NOTHING, Detected
 from trilane.scene.motion.usable_samples import PlaceOf, by_number, usable_samples
 from trilane.scene.rotations import about, quat_from_matrix, shortest_turn
 from trilane.scene.schema import CameraSpec
@@ -33,7 +34,7 @@ class RawCamera:
     `times_s` (N,): seconds. `turns` (N, 3, 3) and `places` (N, 3), metres: camera to world, OpenGL axes. `usual_up`:
     the axis of the world that is usually up in the format. `fov_y_deg`: field of view of the picture's height with the
     device held level; `portrait_fov_y_deg`: held upright; `lens`: where these two come from. `notes`: on the file, for
-    people. `place_of`: where a sample stands in the file.
+    people. `place_of`: where a sample stands in the file. `detected`: what the file is, but for its axes and lens.
     """
 
     times_s: F64
@@ -45,6 +46,7 @@ class RawCamera:
     lens: str
     notes: tuple[str, ...]
     place_of: PlaceOf = by_number
+    detected: Detected = NOTHING
 
 
 def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraPath:
@@ -61,15 +63,17 @@ def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraP
     usual = raw.portrait_fov_y_deg if quarter % 2 else raw.fov_y_deg
     fov = usual if spec.fov_y_deg is None else spec.fov_y_deg
     source = raw.lens if spec.fov_y_deg is None else "as given"
+    seen = f"field of view {fov:.4g} degrees high, {source}"
     notes = (
         *raw.notes,
         note,
-        f"field of view {fov:.4g} degrees high, {source}",
+        seen,
         *repairs,
         f"{times[-1] - times[0]:.2f} s, then plays back and forth" if len(times) > 1 else "one pose: held",
     )
     lens = Lens(fov, spec.near_m, spec.far_m)
-    return CameraPath(times - times[0], quats, places @ world.T, lens, notes)
+    detected = replace(raw.detected, axes=note, lens=seen)
+    return CameraPath(times - times[0], quats, places @ world.T, lens, notes, detected=detected)
 
 
 def _readable(turns: F64, places: F64) -> NDArray[np.bool_]:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from trilane.scene.camera.recorded import OPENGL_FROM_OPTICAL, RawCamera
 from trilane.scene.camera.text_table import elapsed, read_table
+from trilane.scene.detected import Detected
 from trilane.scene.rotations import matrix_from_quat, normalised
 
 COLUMNS = 8
@@ -27,4 +28,5 @@ def load_tum(path: Path) -> RawCamera:
     rate = f", {1 / step:.4g}/s" if step > 0 else ""
     notes = (f"TUM trajectory, {len(table)} poses{rate}, optical axes, camera to world",)
     lens = (KINECT_DEG, KINECT_UPRIGHT_DEG, "usual for a Kinect")
-    return RawCamera(times, turns, table[:, 1:4], "z", *lens, notes, read.place_of)
+    detected = Detected("TUM trajectory", f"{COLUMNS} columns of numbers", unit="m", rate="by the times of the file")
+    return RawCamera(times, turns, table[:, 1:4], "z", *lens, notes, read.place_of, detected)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
 from trilane.files import as_numbers, read_npz
+from trilane.scene.detected import Detected
 from trilane.scene.motion.motion import JOINTS, REST_PELVIS
 from trilane.scene.motion.recorded import RawMotion
 from trilane.scene.motion.smplx_npy import hands_note
@@ -44,7 +45,8 @@ def load_amass(path: Path) -> RawMotion:
         f"betas: {'none' if betas is None else len(betas)}",
         *(("no `trans`: stays in place",) if translation is None else ()),
     )
-    return RawMotion(np.arange(len(poses)) / rate, poses, translation, betas, "z", notes)
+    detected = Detected(f"AMASS .npz ({NAMES[width]})", f"`poses` has {width} columns", unit="m", rate=f"by `{key}`")
+    return RawMotion(np.arange(len(poses)) / rate, poses, translation, betas, "z", notes, detected=detected)
 
 
 def _poses(path: Path, array: NDArray[Any]) -> tuple[NDArray[np.float64], int]:

@@ -14,6 +14,7 @@ import numpy as np
 from trilane.arrays import F64
 from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS
 from trilane.errors import BadInputError
+from trilane.scene.detected import Detected
 from trilane.scene.motion.bvh import BvhJoint, load_bvh
 from trilane.scene.motion.bvh_joint_names import DIALECTS, plain
 from trilane.scene.motion.bvh_units import leg_length, unit_of
@@ -65,8 +66,12 @@ def load_retargeted(path: Path, units: str) -> RawMotion:
         f"{len(index_of)} joints have a partner, {hands} of them in the hands",
         "betas: none in the format",
     )
+    joints = {name: bvh.joints[index].name for name, index in index_of.items()}
+    others = tuple(joint.name for joint in bvh.joints if joint.name not in joints.values())
+    reason = f"HIERARCHY, with joint names of {dialect}"
+    detected = Detected("BVH", reason, unit=unit, rate="by `Frame Time`", joints=joints, unmapped=others)
     times = np.arange(len(bvh.frames), dtype=np.float64) * bvh.frame_time_s
-    return RawMotion(times, poses, translation, None, "y", notes, leg * unit_m)
+    return RawMotion(times, poses, translation, None, "y", notes, leg * unit_m, detected)
 
 
 def match_names(path: Path, names: list[str]) -> tuple[str, dict[str, int]]:

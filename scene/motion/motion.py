@@ -12,6 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from trilane.arrays import F64
+from trilane.scene.detected import NOTHING, Detected
 from trilane.scene.rotations import quat_from_rotvec, rotvec_from_quat, slerp
 
 JOINTS = 55
@@ -53,7 +54,8 @@ class Motion:
     `times_s` (T,): from 0, strictly increasing. `poses` (T, 55, 3): axis-angle, radians, SMPL-X joint order.
     `translation` (T, 3): place of the pelvis, metres, Y up. `betas` (n,) or None. `notes`: how the source was read, for
     people. `wrap`: what follows the last frame. `leg_m`: hip to ankle of the recorded person, by which the translation
-    is scaled to another body; None when unknown. `travels`: whether the translation was recorded.
+    is scaled to another body; None when unknown. `travels`: whether the translation was recorded. `detected`: what its
+    file is.
     """
 
     times_s: F64
@@ -64,6 +66,7 @@ class Motion:
     wrap: Wrap
     leg_m: float | None = None
     travels: bool = True
+    detected: Detected = NOTHING
 
     @property
     def duration_s(self) -> float:

@@ -6,13 +6,14 @@ one of the format.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import F64
 from trilane.errors import BadInputError
+from trilane.scene.detected import NOTHING, Detected
 from trilane.scene.motion.motion import Motion, Wrap
 from trilane.scene.motion.usable_samples import usable_samples
 from trilane.scene.rotations import Y_UP_FROM_Z_UP, about, matrix_from_rotvec, rotvec_from_matrix
@@ -31,7 +32,7 @@ class RawMotion:
     `times_s` (T,): seconds; NaNs and repeated times are still in. `poses` (T, 55, 3): axis-angle, radians, SMPL-X joint
     order. `translation` (T, 3): of the pelvis, metres; None when the format has none. `betas` (n,) or None. `up`: the
     axis that is usually up in the format. `notes`: on the file, for people. `leg_m`: hip to ankle of the recorded
-    person; None when unknown.
+    person; None when unknown. `detected`: what the file is, but for its axes.
     """
 
     times_s: F64
@@ -41,6 +42,7 @@ class RawMotion:
     up: str
     notes: tuple[str, ...]
     leg_m: float | None = None
+    detected: Detected = NOTHING
 
 
 def motion_from_recording(raw: RawMotion, where: str, up_axis: str) -> Motion:
@@ -63,9 +65,17 @@ def motion_from_recording(raw: RawMotion, where: str, up_axis: str) -> Motion:
     poses[:, 0] = rotvec_from_matrix(turn @ roots)
     translation = shift @ turn.T
     wrap = Wrap.BOUNCE
-    notes = (*raw.notes, f"{up.upper()} up, {how}", *repairs, _end_note(times, wrap))
+    axes = f"{up.upper()} up, {how}"
     return Motion(
-        times - times[0], poses, centred(translation), raw.betas, notes, wrap, raw.leg_m, raw.translation is not None
+        times - times[0],
+        poses,
+        centred(translation),
+        raw.betas,
+        (*raw.notes, axes, *repairs, _end_note(times, wrap)),
+        wrap,
+        raw.leg_m,
+        raw.translation is not None,
+        replace(raw.detected, axes=axes),
     )
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
 from trilane.files import as_numbers, read_npy
+from trilane.scene.detected import Detected
 from trilane.scene.motion.motion import JOINTS
 from trilane.scene.motion.recorded import RawMotion
 from trilane.scene.rotations import matrix_from_rotvec, rotvec_from_matrix
@@ -36,7 +37,8 @@ def load_smplx_npy(path: Path) -> RawMotion:
         else f"no rate in the format, {ASSUMED_RATE_HZ:g} frames/s assumed"
     )
     notes = (f"SMPL-X .npy, {len(poses)} frames", rate_note, f"hands: {hands_note(poses)}", "betas: none in the format")
-    return RawMotion(np.arange(len(poses)) / rate, poses, None, None, "y", notes)
+    detected = Detected("SMPL-X poses (.npy)", f"an array of shape {array.shape}", rate=rate_note)
+    return RawMotion(np.arange(len(poses)) / rate, poses, None, None, "y", notes, detected=detected)
 
 
 def median_step_rad(poses: NDArray[np.float64]) -> float:
