@@ -1,0 +1,170 @@
+"""A pinhole lens as pixels of the picture that it makes, and what scaling, cutting and turning that picture does to it.
+
+Rule: whatever is done to a picture is done to its lens by the method of the same name, so that a point of the world
+stays on its pixel. Pixels are counted from the picture's top left corner, x to the right and y down: the centre of the
+first pixel is at (0.5, 0.5), as COLMAP has it (https://colmap.github.io/cameras.html). Where a format counts from the
+centre of the first pixel, as OpenCV does, 0.5 is to be added to its principal point.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import NamedTuple
+
+import numpy as np
+
+from trilane.arrays import F64
+from trilane.shapes import Shape
+
+#: Picture of a lens of which nothing but an angle is known.
+ASSUMED_WIDTH_PX, ASSUMED_HEIGHT_PX = 640.0, 480.0
+
+
+class Known(Enum):
+    """What is known of a lens: all of it, or the angle over one side of a picture whose shape is not known."""
+
+    ALL = "all"
+    WIDTH = "width"
+    HEIGHT = "height"
+
+
+#: What is known of a lens whose picture was turned by a quarter.
+TURNED = {Known.ALL: Known.ALL, Known.WIDTH: Known.HEIGHT, Known.HEIGHT: Known.WIDTH}
+
+
+class Cut(NamedTuple):
+    """A picture is scaled to `height` x `width` pixels, of which `top` rows and `left` columns are cut off first."""
+
+    height: int
+    width: int
+    top: int
+    left: int
+
+
+def cover(picture: Shape, output: Shape) -> Cut:
+    """How `picture` covers `output`, both (height, width): scaled until no border is left, the overhang cut equally."""
+    scale = max(output[0] / picture[0], output[1] / picture[1])
+    height, width = (max(side, round(full * scale)) for side, full in zip(output, picture, strict=True))
+    return Cut(height, width, (height - output[0]) // 2, (width - output[1]) // 2)
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A lens without distortion: x = `cx` + `fx` X / Z, y = `cy` + `fy` Y / Z, with Y down and Z ahead.
+
+    All numbers in pixels of a picture of `width_px` x `height_px`. `known`: whether the shape of the picture is.
+    """
+
+    width_px: float
+    height_px: float
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    known: Known = Known.ALL
+
+    @property
+    def fov_y_deg(self) -> float:
+        """Field of view from the top to the bottom of the picture."""
+        return math.degrees(math.atan(self.cy / self.fy) + math.atan((self.height_px - self.cy) / self.fy))
+
+    @property
+    def fov_x_deg(self) -> float:
+        """Field of view from the left to the right of the picture."""
+        return math.degrees(math.atan(self.cx / self.fx) + math.atan((self.width_px - self.cx) / self.fx))
+
+    def scaled(self, width_px: float, height_px: float) -> Lens:
+        """Of the picture scaled to `width_px` x `height_px`."""
+        x, y = width_px / self.width_px, height_px / self.height_px
+        return replace(
+            self,
+            width_px=width_px,
+            height_px=height_px,
+            fx=self.fx * x,
+            fy=self.fy * y,
+            cx=self.cx * x,
+            cy=self.cy * y,
+        )
+
+    def cropped(self, x: float, y: float, width_px: float, height_px: float) -> Lens:
+        """Of the part of `width_px` x `height_px` whose top left corner is at (`x`, `y`), which may be outside."""
+        return replace(self, width_px=width_px, height_px=height_px, cx=self.cx - x, cy=self.cy - y)
+
+    def turned(self, quarters: int) -> Lens:
+        """Of the picture turned clockwise by `quarters` of 90 degrees."""
+        lens = self
+        for _ in range(quarters % 4):
+            lens = Lens(
+                lens.height_px, lens.width_px, lens.fy, lens.fx, lens.height_px - lens.cy, lens.cx, TURNED[lens.known]
+            )
+        return lens
+
+    def onto(self, picture: Shape) -> Lens:
+        """Of `picture` (height, width), which the lens made.
+
+        A picture of another shape than the lens's is taken as cut equally at both sides, by its sensor or later. A lens
+        whose shape is not known takes the picture's, with square pixels and the angle that is known.
+        """
+        height, width = float(picture[0]), float(picture[1])
+        if self.known is not Known.ALL:
+            by_width = self.known is Known.WIDTH
+            focal = self.fx * width / self.width_px if by_width else self.fy * height / self.height_px
+            return Lens(width, height, focal, focal, width / 2, height / 2)
+        scale = max(width / self.width_px, height / self.height_px)
+        whole = self.scaled(self.width_px * scale, self.height_px * scale)
+        return whole.cropped((whole.width_px - width) / 2, (whole.height_px - height) / 2, width, height)
+
+    def covering(self, output: Shape) -> Lens:
+        """Of the picture cut by `cover` to `output` (height, width); the picture has whole pixels."""
+        cut = cover((round(self.height_px), round(self.width_px)), output)
+        return self.scaled(cut.width, cut.height).cropped(cut.left, cut.top, output[1], output[0])
+
+    def filling_height(self, output: Shape) -> Lens:
+        """Of a drawing of `output` (height, width) as high as the picture; at its sides it shows more, or less."""
+        height, width = output
+        scale = height / self.height_px
+        whole = self.scaled(self.width_px * scale, height)
+        return whole.cropped((whole.width_px - width) / 2, 0.0, width, height)
+
+    def between(self, other: Lens, fraction: float) -> Lens:
+        """From this lens at a `fraction` of 0 to `other`, of a picture of the same size, at 1."""
+
+        def mix(a: float, b: float) -> float:
+            return a + (b - a) * fraction
+
+        fx, fy = mix(self.fx, other.fx), mix(self.fy, other.fy)
+        return replace(self, fx=fx, fy=fy, cx=mix(self.cx, other.cx), cy=mix(self.cy, other.cy))
+
+    def projection(self, near_m: float, far_m: float) -> F64:
+        """OpenGL clip matrix (4, 4), its camera with y up, looking along -Z. `near_m`, `far_m`: of the clip planes.
+
+        x / w = 2 (cx + fx X / -Z) / width - 1, and y / w = 1 - 2 (cy - fy Y / -Z) / height.
+        """
+        depth = near_m - far_m
+        return np.array(
+            [
+                [2 * self.fx / self.width_px, 0.0, 1 - 2 * self.cx / self.width_px, 0.0],
+                [0.0, 2 * self.fy / self.height_px, 2 * self.cy / self.height_px - 1, 0.0],
+                [0.0, 0.0, (far_m + near_m) / depth, 2 * far_m * near_m / depth],
+                [0.0, 0.0, -1.0, 0.0],
+            ]
+        )
+
+
+def centred(width_px: float, height_px: float, focal_px: float, known: Known = Known.ALL) -> Lens:
+    """A lens with square pixels whose principal point is the middle of its picture."""
+    return Lens(width_px, height_px, focal_px, focal_px, width_px / 2, height_px / 2, known)
+
+
+def of_fov_y(fov_y_deg: float) -> Lens:
+    """A lens of which the field of view over the picture's height is known."""
+    focal = ASSUMED_HEIGHT_PX / 2 / math.tan(math.radians(fov_y_deg) / 2)
+    return centred(ASSUMED_WIDTH_PX, ASSUMED_HEIGHT_PX, focal, Known.HEIGHT)
+
+
+def of_fov_x(fov_x_deg: float) -> Lens:
+    """A lens of which the field of view over the picture's width is known."""
+    focal = ASSUMED_WIDTH_PX / 2 / math.tan(math.radians(fov_x_deg) / 2)
+    return centred(ASSUMED_WIDTH_PX, ASSUMED_HEIGHT_PX, focal, Known.WIDTH)

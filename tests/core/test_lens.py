@@ -1,0 +1,138 @@
+"""A lens and its picture stay together: points by hand, and any chain of changes against a picture that is changed."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from trilane.scene.lens import Cut, Known, Lens, centred, cover, of_fov_x, of_fov_y
+
+LENS = Lens(400.0, 300.0, 500.0, 480.0, 210.0, 140.0)
+
+
+def pixel(lens: Lens, point: tuple[float, float, float]) -> np.ndarray:
+    """Column and row of `point`, x right, y up, -z ahead, through the clip matrix."""
+    x, y, _, w = lens.projection(0.1, 10.0) @ [*point, 1.0]
+    return np.array([(x / w + 1) / 2 * lens.width_px, (1 - y / w) / 2 * lens.height_px])
+
+
+def test_a_point_falls_on_its_pixel() -> None:
+    """4 m ahead, 0.4 m right, 0.2 m up: 500 * 0.1 right of 210, 480 * 0.05 above 140."""
+    assert pixel(LENS, (0.4, 0.2, -4.0)) == pytest.approx([260, 116])
+    assert pixel(LENS, (0, 0, -1)) == pytest.approx([210, 140])
+
+
+def test_a_projection_by_hand() -> None:
+    """90 degrees high, twice as wide as high, from 2 m to 6 m: depth = (-2 z - 6) / -z, written out."""
+    assert centred(200, 100, 50).projection(2.0, 6.0) == pytest.approx(
+        np.array([[0.5, 0, 0, 0], [0, 1, 0, 0], [0, 0, -2, -6], [0, 0, -1, 0]])
+    )
+
+
+def test_each_change_by_hand() -> None:
+    assert LENS.scaled(200, 600) == Lens(200, 600, 250, 960, 105, 280)
+    assert LENS.cropped(10, -20, 50, 60) == Lens(50, 60, 500, 480, 200, 160)
+    assert LENS.turned(1) == Lens(300, 400, 480, 500, 160, 210)
+    assert LENS.turned(2) == Lens(400, 300, 500, 480, 190, 160)
+    assert LENS.turned(-1) == LENS.turned(3) == Lens(300, 400, 480, 500, 140, 190)
+    assert LENS.turned(4) == LENS == LENS.turned(0)
+    other = Lens(400.0, 300.0, 600.0, 500.0, 200.0, 150.0)
+    assert LENS.between(other, 0.25) == Lens(400, 300, 525, 485, 207.5, 142.5)
+
+
+def test_a_photo_of_1080x1920_cut_to_810_rows() -> None:
+    """The focal length stays in pixels, so the angle of the 810 rows is that of 810 pixels: not that of the 1920."""
+    phone = centred(1080, 1920, 1662.77)
+    shown = phone.onto((1920, 1080)).covering((810, 1080))
+    assert shown == Lens(1080, 810, 1662.77, 1662.77, 540, 405)
+    assert shown.fov_y_deg == pytest.approx(2 * math.degrees(math.atan(405 / 1662.77)))
+    half = phone.onto((960, 540)).covering((406, 540))
+    assert (half.fx, half.cy) == pytest.approx((1662.77 / 2, 203.0))
+
+
+@pytest.mark.parametrize(
+    ("picture", "output", "cut"),
+    [
+        ((1080, 1920), (480, 640), Cut(480, 853, 0, 106)),  # 853.3 columns
+        ((1920, 1080), (480, 640), Cut(1138, 640, 329, 0)),  # 1137.8 rows
+        ((480, 640), (480, 640), Cut(480, 640, 0, 0)),
+        ((10, 10), (100, 30), Cut(100, 100, 0, 35)),
+        ((3, 1000), (3, 3), Cut(3, 1000, 0, 498)),
+    ],
+)
+def test_a_picture_covers_the_output(
+    picture: tuple[int, int], output: tuple[int, int], cut: tuple[int, int, int, int]
+) -> None:
+    assert cover(picture, output) == cut
+
+
+def test_a_picture_of_another_shape_is_a_cut_of_the_lens_s() -> None:
+    """A sensor of 4:3 that films in 16:9 loses rows: 640x480 at f = 517 is 1280x720 at 1034."""
+    kinect = Lens(640.0, 480.0, 517.0, 517.0, 320.0, 250.0)
+    assert kinect.onto((720, 1280)) == Lens(1280, 720, 1034, 1034, 640, 380)
+
+
+def test_an_angle_alone_takes_the_shape_of_the_picture() -> None:
+    """NeRF's `camera_angle_x` of 90 degrees: f is half of the width, whatever the height; turned, of the height."""
+    lens = of_fov_x(90.0)
+    upright = centred(600, 800, 400)
+    for found, wanted in (
+        (lens.onto((800, 800)), centred(800, 800, 400)),
+        (lens.onto((1000, 200)), centred(200, 1000, 100)),
+        (lens.turned(1).onto((800, 600)), upright),
+        (of_fov_y(90.0).onto((800, 600)), upright),
+    ):
+        assert (found.width_px, found.height_px, found.known) == (wanted.width_px, wanted.height_px, Known.ALL)
+        assert (found.fx, found.fy, found.cx, found.cy) == pytest.approx((wanted.fx, wanted.fy, wanted.cx, wanted.cy))
+    assert (lens.fov_x_deg, of_fov_y(33.0).fov_y_deg) == pytest.approx((90.0, 33.0))
+
+
+def test_a_drawing_is_as_high_as_the_picture() -> None:
+    """The principal point stays as far from the middle of the columns as it was, in the picture's own scale."""
+    shown = LENS.filling_height((600, 1000))
+    assert shown == Lens(1000, 600, 1000, 960, 520, 280)
+    assert shown.fov_y_deg == pytest.approx(LENS.fov_y_deg)
+
+
+SIDES = st.integers(8, 400)
+CHANGES = st.lists(
+    st.one_of(
+        st.tuples(st.just("turn"), st.integers(-3, 5)),
+        st.tuples(st.just("scale"), st.tuples(SIDES, SIDES)),
+        st.tuples(st.just("crop"), st.tuples(SIDES, SIDES, SIDES, SIDES)),
+        st.tuples(st.just("cover"), st.tuples(SIDES, SIDES)),
+    ),
+    max_size=6,
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(CHANGES, st.tuples(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3)))
+def test_any_chain_of_changes_moves_a_point_as_it_moves_the_pixels(
+    changes: list[tuple[str, object]], at: tuple[float, float]
+) -> None:
+    """A mark at the point's pixel, moved as an array's pixels move, stays where the changed lens has the point."""
+    lens, point = LENS, (2 * at[0], 2 * at[1], -2.0)
+    x, y = pixel(lens, point)
+    for kind, how in changes:
+        width, height = lens.width_px, lens.height_px
+        if kind == "turn":
+            for _ in range(how % 4):  # np.rot90(picture, -1): row y becomes column height - y
+                x, y, width, height = height - y, x, height, width
+                point = (point[1], -point[0], point[2])  # the camera's axes turn with its picture
+            lens = lens.turned(how)
+        elif kind == "scale":
+            x, y = x * how[0] / width, y * how[1] / height
+            lens = lens.scaled(*how)
+        elif kind == "crop":
+            x, y = x - how[0], y - how[1]
+            lens = lens.cropped(*how)
+        else:
+            cut = cover((round(height), round(width)), how)
+            x, y = x * cut.width / width - cut.left, y * cut.height / height - cut.top
+            lens = lens.covering(how)
+    assert pixel(lens, point) == pytest.approx([x, y], abs=1e-6)
