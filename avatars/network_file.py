@@ -15,8 +15,11 @@ from onnx import TensorProto, external_data_helper
 from trilane.avatars.integer_network import NetworkFile
 from trilane.avatars.network_checks import check_network
 from trilane.errors import BadInputError, reason
+from trilane.file_signatures import signature_of
+from trilane.files import require_file
 
 MAX_BYTES = 512 << 20
+EXPECTED = "an ONNX network"
 
 
 def read_network(path: Path) -> NetworkFile:
@@ -39,9 +42,11 @@ def network_files(path: Path) -> list[Path]:
 
 def _parse(path: Path) -> onnx.ModelProto:
     try:
-        size = path.stat().st_size
-        if not 0 < size <= MAX_BYTES:
+        size = require_file(path, EXPECTED)
+        if size > MAX_BYTES:
             raise BadInputError(path, f"a file of {size} bytes", f"an ONNX network of 1 to {MAX_BYTES} bytes")
+        if (other := signature_of(path)) is not None:
+            raise BadInputError(path, other.name, EXPECTED)
         model = onnx.load_model_from_string(path.read_bytes())
     except OSError as error:
         raise BadInputError.of_os_error(path, error, "a readable ONNX file") from error

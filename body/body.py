@@ -8,6 +8,7 @@ The layout is that of https://smpl-x.is.tue.mpg.de, read as the `smplx` package 
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,12 +20,15 @@ from trilane.arrays import F32, F64, I32
 from trilane.body.joints import JOINTS, LEFT_HAND, POSE_FEATURES, POSE_SIZE, RIGHT_HAND
 from trilane.body.pose_blend_shapes import read_pose_blend
 from trilane.errors import BadInputError
-from trilane.files import read_npz
+from trilane.files import npz_names, read_npz
 
 EXPECTED = "a body file in the SMPL-X layout (.npz)"
 MAX_VERTICES = 1 << 18
 MAX_FACES = 1 << 19
 SUM_TOLERANCE = 1e-3
+#: Names of arrays that are a motion's, in AMASS files and those like them.
+MOTION_KEYS = frozenset({"poses", "smpl_poses", "body_pose", "pose_body", "mocap_framerate", "mocap_frame_rate"})
+MOST_NAMED = 16
 #: Unit roundoff of the weights' float32: one that a file has rounded is off by so much of itself.
 ROUNDING = 2.0**-24
 
@@ -155,7 +159,7 @@ def _check_layout(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
     sizes: dict[str, int] = {}
     for key, (sides, is_index) in _LAYOUT.items():
         if key not in arrays:
-            raise BadInputError(path, f"no array {key!r}", EXPECTED, f"arrays that were found: {sorted(arrays)}")
+            raise BadInputError(path, f"no array {key!r}", EXPECTED, _instead_of_body(npz_names(path, EXPECTED)))
         array = arrays[key]
         if array.dtype.kind not in ("iu" if is_index else "fiu"):
             raise BadInputError(f"{path}[{key}]", f"dtype {array.dtype}", "integers" if is_index else "numbers")
@@ -169,6 +173,14 @@ def _check_layout(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
     for side, limit in _LIMITS.items():
         if not 0 < sizes[side] <= limit:
             raise BadInputError(path, f"{sizes[side]} {side}", f"1 to {limit} (V vertices, F faces, T vt)")
+
+
+def _instead_of_body(names: Collection[str]) -> str:
+    """What a file with the arrays `names` has instead of those of a body."""
+    listed = f"arrays that were found: {', '.join(sorted(names)[:MOST_NAMED]) or 'none'}"
+    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+    motion = ": a motion, which `trilane run --motion` takes" if MOTION_KEYS & set(names) else ""
+    return f"{listed}{more}{motion}"
 
 
 def _matches(shape: tuple[int, ...], wanted: tuple[int | str, ...]) -> bool:

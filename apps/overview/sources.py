@@ -14,7 +14,7 @@ from trilane.apps.overview.entry import Entry, entry_of
 from trilane.apps.report import MAX_REPORT_BYTES
 from trilane.apps.sweeps.store import TRIALS, read_trials
 from trilane.errors import BadInputError
-from trilane.files import require_file
+from trilane.files import instead_of_file, require_file
 
 REPORT, VIDEO = "report.json", "video.mp4"
 EXPECTED = "a run folder, a sweep's folder, a prediction that was saved with --json, or a folder of these"
@@ -39,7 +39,7 @@ def _entries(place: Path) -> Iterator[Entry]:
     if place.is_file():
         yield entry_of(place.stem, _document(place))
     elif not place.is_dir():
-        raise BadInputError(place, "no such file or folder", EXPECTED)
+        raise BadInputError(place, instead_of_file(place), EXPECTED)
     elif (place / REPORT).is_file():
         yield entry_of(place.name, _document(place / REPORT), place / VIDEO)
     elif (place / TRIALS).is_file():

@@ -5,6 +5,7 @@ Rule: whatever is wrong with a file becomes one BadInputError that names it.
 
 from __future__ import annotations
 
+import errno
 import math
 import tokenize
 import warnings
@@ -18,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.errors import BadInputError, reason
+from trilane.file_signatures import ARCHIVE, ARRAY, signature_of
 
 MAX_ARRAY_BYTES = 1 << 30
 MAX_TEXT_BYTES = 256 << 20
@@ -43,7 +45,7 @@ def require_file(path: Path, expected: str) -> int:
     """Size of a regular, non-empty file in bytes. Raises BadInputError."""
     try:
         if not path.is_file():
-            raise BadInputError(path, _instead_of_file(path), expected)
+            raise BadInputError(path, instead_of_file(path), expected)
         size = path.stat().st_size
     except (OSError, ValueError) as error:
         raise BadInputError(path, f"a file that cannot be read ({reason(error)})", expected) from error
@@ -52,27 +54,50 @@ def require_file(path: Path, expected: str) -> int:
     return size
 
 
-def _instead_of_file(path: Path) -> str:
+def instead_of_file(path: Path) -> str:
+    """What `path` is, which is no regular file."""
     if path.is_dir():
         return "a folder"
-    return "a device, a pipe or a socket" if path.exists() else "no such file"
+    try:
+        path.stat()
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            return "a link that leads back to itself"
+        return f"a link to {path.readlink()}, which is not there" if path.is_symlink() else "no such file"
+    return "a device, a pipe or a socket"
 
 
 def read_text(path: Path, expected: str) -> str:
-    """The file as text. Raises BadInputError when it is missing, empty, over 256 MiB or not UTF-8."""
+    """The file as text. Raises BadInputError when it is missing, empty, over 256 MiB, not UTF-8 or not text."""
     size = require_file(path, expected)
     if size > MAX_TEXT_BYTES:
         raise BadInputError(path, f"{size} bytes", f"at most {MAX_TEXT_BYTES}")
     try:
-        return path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise BadInputError(path, f"a file that cannot be read as text ({reason(error)})", expected) from error
+        _refuse_other(path, expected)
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        found = f"a file that cannot be read as text ({reason(error)})"
+        raise BadInputError(path, found, expected, "if it is text, save it as UTF-8") from error
+    except OSError as error:
+        raise BadInputError(path, f"a file that cannot be read ({reason(error)})", expected) from error
+    if "\0" in text:
+        line = text.count("\n", 0, text.index("\0")) + 1
+        raise BadInputError(f"{path}, line {line}", "a NUL byte, as no text has", expected)
+    return text
+
+
+def _refuse_other(path: Path, expected: str, *groups: str) -> None:
+    """Raises BadInputError for a file whose head is that of a known format, unless it is of one of `groups`."""
+    signature = signature_of(path)
+    if signature is not None and signature.group not in groups:
+        raise BadInputError(path, signature.name, expected, signature.remedy)
 
 
 def read_npy(path: Path, expected: str) -> NDArray[Any]:
     """The array of a `.npy` file. Raises BadInputError; pickled, truncated and huge files are refused unread."""
     size = require_file(path, expected)
     try:
+        _refuse_other(path, expected, ARRAY)
         with path.open("rb") as file:
             wanted = _checked_bytes(path, file, expected)
             if size - file.tell() < wanted:
@@ -87,9 +112,20 @@ def read_npz(path: Path, keys: Collection[str], expected: str) -> dict[str, NDAr
     """Those of `keys` that the `.npz` file has; other members are not opened. Raises BadInputError."""
     require_file(path, expected)
     try:
+        _refuse_other(path, expected, ARRAY, ARCHIVE)
         with zipfile.ZipFile(path) as archive:
             names = {info.filename: info for info in archive.infolist()}
             return {key: _member(path, archive, names[f"{key}.npy"]) for key in keys if f"{key}.npy" in names}
+    except DAMAGED as error:
+        raise BadInputError(path, f"no readable .npz archive ({reason(error)})", expected) from error
+
+
+def npz_names(path: Path, expected: str) -> list[str]:
+    """The names of the arrays of an `.npz` file, in its order; none is opened. Raises BadInputError."""
+    require_file(path, expected)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
     except DAMAGED as error:
         raise BadInputError(path, f"no readable .npz archive ({reason(error)})", expected) from error
 

@@ -124,7 +124,7 @@ SENTENCES: dict[str, tuple[str, Any, str]] = {
     "no array": (
         "f",
         None,
-        "no array 'f', expected a body file in the SMPL-X layout (.npz); arrays that were found: [",
+        "no array 'f', expected a body file in the SMPL-X layout (.npz); arrays that were found: J_regressor, ft",
     ),
     "dtype": ("vt", np.full((9, 2), "a"), "[vt]: found dtype <U1, expected numbers"),
     "index dtype": ("f", np.zeros((5, 3)), "[f]: found dtype float64, expected integers"),
@@ -453,3 +453,17 @@ def test_the_bound_is_reached_where_one_joint_turns_half_round(shaped: ShapedBod
     neck_only = dataclasses.replace(body, weights=np.eye(55, dtype=np.float32)[[JOINT_INDEX["neck"]]])
     fewer = CpuSkinner(ShapedBody(vertex, shaped.joints, neck_only)).vertices(posed)[0]
     assert np.linalg.norm(whole - fewer) == pytest.approx(0.05 * 2 * 0.3, rel=1e-5)
+
+
+def test_a_motion_is_said_to_be_one(tmp_path: Path) -> None:
+    arrays = {"poses": np.zeros((2, 156)), "trans": np.zeros((2, 3)), "mocap_framerate": np.array(60.0)}
+    np.savez(tmp_path / "m.npz", **arrays)
+    with pytest.raises(BadInputError) as raised:
+        load_body(tmp_path / "m.npz")
+    assert raised.value.remedy == (
+        "arrays that were found: mocap_framerate, poses, trans: a motion, which `trilane run --motion` takes"
+    )
+    np.savez(tmp_path / "m.npz", **{f"a{k:02}": np.zeros(1) for k in range(18)})
+    with pytest.raises(BadInputError) as raised:
+        load_body(tmp_path / "m.npz")
+    assert raised.value.remedy.endswith("a14, a15 and 2 more")

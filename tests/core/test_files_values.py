@@ -16,7 +16,7 @@ import pytest
 
 from trilane import files
 from trilane.errors import BadInputError
-from trilane.files import as_numbers, read_npy, read_npz, read_text, require_file
+from trilane.files import as_numbers, npz_names, read_npy, read_npz, read_text, require_file
 
 WANTED = "numbers of mine"
 
@@ -68,7 +68,57 @@ def test_text(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file.write_bytes(b"a\xff")
     found = said(lambda: read_text(file, WANTED))
     assert found.startswith(f"{file}: found a file that cannot be read as text ('utf-8")
-    assert found.endswith(f"), expected {WANTED}")
+    assert found.endswith(f"), expected {WANTED}; if it is text, save it as UTF-8")
+    monkeypatch.undo()
+    file.write_text("1 2\n3 \0 4\n")
+    assert (
+        said(lambda: read_text(file, WANTED)) == f"{file}, line 2: found a NUL byte, as no text has, expected {WANTED}"
+    )
+
+
+#: Heads of files as their specifications have them: content, what it is, the beginning of the remedy.
+OTHERS = {
+    "FBX": (b"Kaydara FBX Binary  \0\x1a\0\xe8\x1c\0\0", "an FBX file", "export the motion as BVH"),
+    "ASCII FBX": (b"; FBX 7.5.0 project file\n", "an FBX file", "export the motion as BVH"),
+    "GLB": (b"glTF\x02\0\0\0", "a binary glTF file (GLB, VRM)", "export the motion as BVH"),
+    "USD": (b"#usda 1.0\n", "a USD file", "export the motion as BVH"),
+    "USD crate": (b"PXR-USDC\0\x08\0\0", "a USD file", "export the motion as BVH"),
+    "pickle": (b"\x80\x04\x95\x10\0\0\0\0\0\0\0", "a Python pickle", "save its arrays with NumPy"),
+    "UTF-16": ("HIERARCHY\n".encode("utf-16"), "text in UTF-16", "save it as UTF-8"),
+    "LFS": (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "a Git LFS pointer", "fetch it"),
+    "web page": (b"\n<!DOCTYPE HTML><html>", "a web page", "download the file itself"),
+    "MP4": (b"\0\0\0\x20ftypisom", "an MP4 or QuickTime video", ""),
+}
+
+
+@pytest.mark.parametrize("case", OTHERS)
+def test_another_format_is_named_by_every_reader(case: str, tmp_path: Path) -> None:
+    content, name, remedy = OTHERS[case]
+    file = tmp_path / "walk.bvh"
+    file.write_bytes(content)
+    for read in (read_text, read_npy, lambda path, wanted: read_npz(path, ["a"], wanted)):
+        with pytest.raises(BadInputError) as refused:
+            read(file, WANTED)
+        assert refused.value.found.startswith(name)
+        assert refused.value.remedy.startswith(remedy)
+        assert refused.value.expected == WANTED
+
+
+def test_links_that_lead_nowhere(tmp_path: Path) -> None:
+    (tmp_path / "a").symlink_to(tmp_path / "b")
+    assert said(lambda: require_file(tmp_path / "a", WANTED)).endswith(
+        f"found a link to {tmp_path / 'b'}, which is not there, expected {WANTED}"
+    )
+    (tmp_path / "b").symlink_to(tmp_path / "a")
+    for place in (tmp_path / "a", tmp_path / "a" / "below"):
+        assert "found a link that leads back to itself" in said(lambda place=place: require_file(place, WANTED))
+
+
+def test_names_of_arrays(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", poses=np.zeros(3), trans=np.zeros(3))
+    assert npz_names(tmp_path / "a.npz", WANTED) == ["poses", "trans"]
+    (tmp_path / "b.npz").write_bytes(b"PK\x03\x04 and nothing")
+    assert "no readable .npz archive" in said(lambda: npz_names(tmp_path / "b.npz", WANTED))
 
 
 DAMAGED = {

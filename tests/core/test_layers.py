@@ -18,6 +18,7 @@ ROWS = (
         "compiled",
         "errors",
         "figure_sources",
+        "file_signatures",
         "files",
         "install",
         "near_miss",

@@ -29,7 +29,8 @@ def test_a_network_file_is_read_or_refused(tmp_path: Path, monkeypatch: pytest.M
     cut_short = "; copy it again: it may be cut short"
     for content, sentence in (
         (data, f"found a file of {len(data)} bytes, expected an ONNX network of 1 to {len(data) - 1} bytes"),
-        (b"", f"found a file of 0 bytes, expected an ONNX network of 1 to {len(data) - 1} bytes"),
+        (b"", "found an empty file, expected an ONNX network"),
+        (b"glTF" + bytes(60), "found a binary glTF file (GLB, VRM), expected an ONNX network"),
         (b"not a network", f"found bytes that do not parse, expected an ONNX file{cut_short}"),
         (b"\x08\x08", f"found no nodes or no operator set, expected an ONNX network{cut_short}"),
     ):
@@ -40,7 +41,7 @@ def test_a_network_file_is_read_or_refused(tmp_path: Path, monkeypatch: pytest.M
     path.unlink()
     with pytest.raises(BadInputError) as raised:
         parse_network(path)
-    assert str(raised.value) == f"{path}: found no such file or directory, expected a readable ONNX file"
+    assert str(raised.value) == f"{path}: found no such file, expected an ONNX network"
 
 
 @pytest.mark.parametrize(("domain", "fine"), [("", True), ("ai.onnx", True), ("com.acme", False)])
