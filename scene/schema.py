@@ -10,12 +10,15 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict, field_validator, model_validator
 
+from trilane.body.joints import JOINT_INDEX
+from trilane.near_miss import did_you_mean
 from trilane.shapes import BUCKET_STEP, MAX_SIDE, checked_size
 from trilane.unexpected_value import UnexpectedValue
 
 MAX_DEPTH_RATIO = 1e6  # of far to near clip plane; beyond it a depth buffer of 24 bits is too coarse
 AUTO = "auto"  # size of a tensor that is planned
 LEAST_FPS = 1e-3  # far below that a period in nanoseconds is no number any more
+LONGEST_S = 1e6  # of a motion
 FARTHEST_M = 1e4  # of an avatar from the scene's origin; there float32 still resolves millimetres
 
 NAME = r"^[\w .-]+$"
@@ -52,7 +55,9 @@ class AvatarSpec(Table):
 
     `name`: no other avatar of the scene has it; `avatar1`, `avatar2`, ... by its place when it is not given.
     `bundle`: `default` or a folder. `motion`: `builtin:NAME` or a file. `position`: metres. `up_axis`, `units`: of the
-    motion file. `ground`: how the motion is put on the floor (`floor.py`).
+    motion file. `joint_map`: joint of the body -> name of the file's, or an empty text for none. `start_s`, `end_s`:
+    of the motion's own time, what is played of it; `speed`: how many times as fast; `loop`: what follows, by default
+    what is usual for the motion. `ground`: how the motion is put on the floor (`floor.py`).
     """
 
     name: str | None = Field(default=None, min_length=1, max_length=80, pattern=NAME)
@@ -62,7 +67,27 @@ class AvatarSpec(Table):
     heading_deg: float = Field(default=0.0, ge=-3600, le=3600, allow_inf_nan=False)
     up_axis: Literal["auto", "y", "z"] = "auto"
     units: Literal["auto", "m", "cm", "in", "cmu"] = "auto"
+    joint_map: dict[str, str] = Field(default={})
+    start_s: float = Field(default=0.0, ge=0, le=LONGEST_S, allow_inf_nan=False)
+    end_s: float | None = Field(default=None, gt=0, le=LONGEST_S, allow_inf_nan=False)
+    speed: float = Field(default=1.0, ge=0.01, le=100, allow_inf_nan=False)
+    loop: Literal["auto", "repeat", "back-and-forth", "hold"] = "auto"
     ground: Literal["auto", "sequence", "frame", "none"] = "auto"
+
+    @field_validator("joint_map")
+    @classmethod
+    def _joints_exist(cls, joint_map: dict[str, str]) -> dict[str, str]:
+        for name in joint_map:
+            if name not in JOINT_INDEX:
+                expected = "a joint of the body, such as pelvis, left_hip or right_wrist"
+                raise UnexpectedValue(f"the joint {name!r}", expected, did_you_mean(name, JOINT_INDEX))
+        return joint_map
+
+    @model_validator(mode="after")
+    def _starts_before_it_ends(self) -> Self:
+        if self.end_s is not None and not self.start_s < self.end_s:
+            raise UnexpectedValue(f"start_s {self.start_s:g} and end_s {self.end_s:g}", "start_s below end_s")
+        return self
 
 
 class CameraSpec(Table):

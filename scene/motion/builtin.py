@@ -105,7 +105,7 @@ def idle() -> Motion:
 def t_pose() -> Motion:
     """The rest pose, one frame."""
     poses, places = np.zeros((1, JOINTS, 3)), np.array([[0.0, 0.94, 0.0]])
-    return Motion(np.zeros(1), poses, places, None, ("built in: the T pose, one frame: held",), Wrap.LOOP, None, False)
+    return Motion(np.zeros(1), poses, places, None, ("built in: the T pose",), Wrap.LOOP, None, False)
 
 
 BUILTIN: dict[str, Callable[[], Motion]] = {
@@ -120,7 +120,7 @@ def _closed(times: F64, poses: F64, places: F64, what: str) -> Motion:
     """A loop whose last frame is its first."""
     times = np.append(times, len(times) / RATE_HZ)
     poses, places = np.concatenate([poses, poses[:1]]), np.concatenate([places, places[:1]])
-    notes = (f"built in: {what}, {times[-1]:g} s at {RATE_HZ}/s, {Wrap.LOOP.value}",)
+    notes = (f"built in: {what}, {RATE_HZ} frames/s",)
     return Motion(times, poses, places, None, notes, Wrap.LOOP, BUILD.leg_m, False)
 
 

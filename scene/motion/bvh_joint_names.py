@@ -1,6 +1,14 @@
-"""Names that BVH skeletons of several programs have for the SMPL-X joints.
+"""Names that skeletons of several programs have for the SMPL-X joints.
 
-Rule: one table per family of skeletons; names are compared without prefix, case and separators.
+Rule: one table per family of skeletons; names are compared without prefix, case and separators. Where two families
+share most names, the one whose table has more of a file's names is its family; of equals, the one that stands first.
+
+Sources of the names, besides files of those programs: Unity's `HumanBodyBones`
+(https://docs.unity3d.com/ScriptReference/HumanBodyBones.html); VRM's humanoid bones, 0.x and 1.0
+(https://github.com/vrm-c/vrm-specification); Unreal's mannequins (UE4 with 3 spine bones, UE5 with 5); Blender's Rigify
+human meta-rig; LaFAN1 (https://github.com/ubisoft/ubisoft-laforge-animation-dataset); Bandai Namco's motion dataset
+(https://github.com/BandaiNamcoResearchInc/Bandai-Namco-Research-Motiondataset); Xsens MVN's BVH and segment names;
+Rokoko's Newton skeleton; Reallusion's Character Creator; Poser's and Daz's figures.
 """
 
 from __future__ import annotations
@@ -9,46 +17,83 @@ import re
 
 from trilane.body.joints import JOINT_NAMES
 
+#: What stands before all names: a namespace, or what Mixamo, 3ds Max, Rigify, VRoid and Character Creator write.
+_PREFIX = re.compile(r"^(?:.*:)?(?:mixamorig\d*_?(?=[a-z])|bip0*1|def-|org-|j_bip_|cc_base_)?")
+
 
 def plain(name: str) -> str:
     """`name` without prefix, case and separators: `mixamorig:Left_Hand` -> `lefthand`."""
-    return re.sub(r"[^a-z0-9]", "", name.rsplit(":", 1)[-1].lower().removeprefix("bip01"))
+    return re.sub(r"[^a-z0-9]", "", _PREFIX.sub("", name.lower()))
 
 
-def _sided(pattern: dict[str, str], left: str, right: str) -> dict[str, str]:
+def _sided(pattern: dict[str, str], left: str, right: str, *, behind: bool = False) -> dict[str, str]:
+    """`pattern` for both sides, whose marks stand before the names, or `behind` them."""
     sides = ((left, "left"), (right, "right"))
-    return {plain(side + source): f"{name}_{target}" for side, name in sides for source, target in pattern.items()}
+    return {
+        plain(source + side if behind else side + source): f"{name}_{target}"
+        for side, name in sides
+        for source, target in pattern.items()
+    }
 
 
-_FINGERS_BY_NUMBER = {
-    f"hand{finger}{k}": f"{finger}{k}" for finger in ("index", "middle", "pinky", "ring", "thumb") for k in (1, 2, 3)
+_FINGERS = ("index", "middle", "pinky", "ring", "thumb")
+_FINGERS_BY_NUMBER = {f"hand{finger}{k}": f"{finger}{k}" for finger in _FINGERS for k in (1, 2, 3)}
+_LITTLE_FINGERS = {"little": "pinky", **{finger: finger for finger in _FINGERS if finger != "pinky"}}
+_LITTLE_BY_NUMBER = {f"{theirs}{k}": f"{ours}{k}" for theirs, ours in _LITTLE_FINGERS.items() for k in (1, 2, 3)}
+_FINGERS_BY_TWO_DIGITS = {f"{finger}0{k}": f"{finger}{k}" for finger in _FINGERS for k in (1, 2, 3)}
+_RIGIFY_FINGERS = {
+    f"{'' if finger == 'thumb' else 'f'}{finger}0{k}": f"{finger}{k}" for finger in _FINGERS for k in (1, 2, 3)
 }
+
+
+def _phalanges(thumb: tuple[str, str, str]) -> dict[str, str]:
+    """Unity's names of the fingers' bones; `thumb`: those of its three."""
+    usual = ("proximal", "intermediate", "distal")
+    return {
+        f"{theirs}{bone}": f"{ours}{k}"
+        for theirs, ours in _LITTLE_FINGERS.items()
+        for k, bone in enumerate(thumb if ours == "thumb" else usual, 1)
+    }
+
+
+_MIXAMO_LIMBS = {
+    "upleg": "hip", "leg": "knee", "foot": "ankle", "toebase": "foot", "shoulder": "collar",
+    "arm": "shoulder", "forearm": "elbow", "hand": "wrist",
+}  # fmt: skip
+_UNITY_LIMBS = {
+    "upperleg": "hip", "lowerleg": "knee", "foot": "ankle", "toes": "foot", "shoulder": "collar",
+    "upperarm": "shoulder", "lowerarm": "elbow", "hand": "wrist",
+}  # fmt: skip
+_ANATOMICAL_LIMBS = {
+    "hip": "hip", "knee": "knee", "ankle": "ankle", "toe": "foot", "collar": "collar",
+    "shoulder": "shoulder", "elbow": "elbow", "wrist": "wrist",
+}  # fmt: skip
+_UNREAL_LIMBS = {
+    "thigh": "hip", "calf": "knee", "foot": "ankle", "ball": "foot", "clavicle": "collar",
+    "upperarm": "shoulder", "lowerarm": "elbow", "hand": "wrist",
+}  # fmt: skip
+_RIGIFY_LIMBS = {
+    "thigh": "hip", "shin": "knee", "foot": "ankle", "toe": "foot", "shoulder": "collar",
+    "upperarm": "shoulder", "forearm": "elbow", "hand": "wrist",
+}  # fmt: skip
+_UNITY_TRUNK = {
+    "hips": "pelvis", "spine": "spine1", "chest": "spine2", "upperchest": "spine3", "neck": "neck", "head": "head",
+    "jaw": "jaw",
+}  # fmt: skip
 
 #: Skeleton family -> {plain name: SMPL-X name}.
 DIALECTS: dict[str, dict[str, str]] = {
     "Mixamo": {
         "hips": "pelvis", "spine": "spine1", "spine1": "spine2", "spine2": "spine3", "neck": "neck", "head": "head",
-        **_sided(
-            {"upleg": "hip", "leg": "knee", "foot": "ankle", "toebase": "foot", "shoulder": "collar",
-             "arm": "shoulder", "forearm": "elbow", "hand": "wrist", **_FINGERS_BY_NUMBER},
-            "left", "right",
-        ),
+        **_sided({**_MIXAMO_LIMBS, **_FINGERS_BY_NUMBER}, "left", "right"),
     },
     "CMU": {
         "hips": "pelvis", "lowerback": "spine1", "spine": "spine2", "spine1": "spine3", "neck": "neck", "head": "head",
-        **_sided(
-            {"upleg": "hip", "leg": "knee", "foot": "ankle", "toebase": "foot", "shoulder": "collar",
-             "arm": "shoulder", "forearm": "elbow", "hand": "wrist", "handindex1": "index1", "thumb": "thumb1"},
-            "left", "right",
-        ),
+        **_sided({**_MIXAMO_LIMBS, "handindex1": "index1", "thumb": "thumb1"}, "left", "right"),
     },
     "MotionBuilder": {
         "hips": "pelvis", "lowerback": "spine1", "chest": "spine2", "chest2": "spine3", "neck": "neck", "head": "head",
-        **_sided(
-            {"hip": "hip", "knee": "knee", "ankle": "ankle", "toe": "foot", "collar": "collar",
-             "shoulder": "shoulder", "elbow": "elbow", "wrist": "wrist"},
-            "left", "right",
-        ),
+        **_sided(_ANATOMICAL_LIMBS, "left", "right"),
     },
     "3ds Max Biped": {
         "pelvis": "pelvis", "spine": "spine1", "spine1": "spine2", "spine2": "spine3", "neck": "neck", "head": "head",
@@ -66,4 +111,81 @@ DIALECTS: dict[str, dict[str, str]] = {
         ),
     },
     "SMPL-X": {plain(name): name for name in JOINT_NAMES},
+    "LaFAN1": {
+        "hips": "pelvis", "spine": "spine1", "spine1": "spine2", "spine2": "spine3", "neck": "neck", "head": "head",
+        **_sided({**_MIXAMO_LIMBS, "toe": "foot"}, "left", "right"),
+    },
+    "Unity and VRM 0": {
+        **_UNITY_TRUNK, "lefteye": "left_eye", "righteye": "right_eye",
+        **_sided({**_UNITY_LIMBS, **_phalanges(("proximal", "intermediate", "distal"))}, "left", "right"),
+    },
+    "VRM 1": {
+        **_UNITY_TRUNK, "lefteye": "left_eye", "righteye": "right_eye",
+        **_sided({**_UNITY_LIMBS, **_phalanges(("metacarpal", "proximal", "distal"))}, "left", "right"),
+    },
+    "VRoid": {
+        **{f"c{theirs}": ours for theirs, ours in _UNITY_TRUNK.items() if ours != "jaw"},
+        **_sided({**_UNITY_LIMBS, "toebase": "foot", **_LITTLE_BY_NUMBER}, "l", "r"),
+    },
+    "Bandai Namco": {
+        **_UNITY_TRUNK,
+        **_sided(_UNITY_LIMBS, "l", "r", behind=True),
+    },
+    "Unreal 5": {
+        "pelvis": "pelvis", "spine01": "spine1", "spine03": "spine2", "spine05": "spine3", "neck01": "neck",
+        "head": "head",
+        **_sided({**_UNREAL_LIMBS, **_FINGERS_BY_TWO_DIGITS}, "l", "r", behind=True),
+    },
+    "Unreal 4": {
+        "pelvis": "pelvis", "spine01": "spine1", "spine02": "spine2", "spine03": "spine3", "neck01": "neck",
+        "head": "head",
+        **_sided({**_UNREAL_LIMBS, **_FINGERS_BY_TWO_DIGITS}, "l", "r", behind=True),
+    },
+    "Rigify": {
+        "spine": "pelvis", "spine001": "spine1", "spine002": "spine2", "spine003": "spine3", "spine004": "neck",
+        "spine006": "head", "jaw": "jaw",
+        **_sided({**_RIGIFY_LIMBS, "eye": "eye", **_RIGIFY_FINGERS}, "l", "r", behind=True),
+    },
+    "Rigify, basic": {
+        "spine": "pelvis", "spine001": "spine1", "spine002": "spine2", "spine003": "spine3", "spine004": "neck",
+        "spine005": "head",
+        **_sided(_RIGIFY_LIMBS, "l", "r", behind=True),
+    },
+    "Xsens": {
+        "hips": "pelvis", "chest": "spine1", "chest2": "spine2", "chest4": "spine3", "neck": "neck", "head": "head",
+        **_sided(_ANATOMICAL_LIMBS, "left", "right"),
+    },
+    "Xsens segments": {
+        "pelvis": "pelvis", "l5": "spine1", "t12": "spine2", "t8": "spine3", "neck": "neck", "head": "head",
+        **_sided(
+            {"upperleg": "hip", "lowerleg": "knee", "foot": "ankle", "toe": "foot", "shoulder": "collar",
+             "upperarm": "shoulder", "forearm": "elbow", "hand": "wrist"},
+            "left", "right",
+        ),
+    },
+    "Rokoko": {
+        "hips": "pelvis", "spine1": "spine1", "spine2": "spine2", "spine4": "spine3", "neck": "neck", "head": "head",
+        **_sided(
+            {"thigh": "hip", "shin": "knee", "foot": "ankle", "toe": "foot", "shoulder": "collar",
+             "arm": "shoulder", "forearm": "elbow", "hand": "wrist"},
+            "left", "right",
+        ),
+    },
+    "Character Creator": {
+        "hip": "pelvis", "waist": "spine1", "spine01": "spine2", "spine02": "spine3", "necktwist01": "neck",
+        "head": "head",
+        **_sided(
+            {"thigh": "hip", "calf": "knee", "foot": "ankle", "toebase": "foot", "clavicle": "collar",
+             "upperarm": "shoulder", "forearm": "elbow", "hand": "wrist"},
+            "l", "r",
+        ),
+    },
+    "Poser and Daz": {
+        "hip": "pelvis", "abdomen": "spine1", "chest": "spine3", "neck": "neck", "head": "head",
+        **_sided(
+            {"thigh": "hip", "shin": "knee", "foot": "ankle", "toe": "foot", "collar": "collar",
+             "shldr": "shoulder", "forearm": "elbow", "hand": "wrist"},
+            "l", "r",
+        ),
+    },
 }  # fmt: skip

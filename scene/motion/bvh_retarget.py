@@ -7,6 +7,7 @@ the file's turns unchanged. A joint that the file does not have follows its pare
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -16,14 +17,13 @@ from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS
 from trilane.errors import BadInputError
 from trilane.scene.detected import Detected
 from trilane.scene.motion.bvh import BvhJoint, load_bvh
-from trilane.scene.motion.bvh_joint_names import DIALECTS, plain
 from trilane.scene.motion.bvh_units import leg_length, unit_of
+from trilane.scene.motion.joint_match import NO_MAP, match_names
 from trilane.scene.motion.motion import JOINTS
 from trilane.scene.motion.recorded import RawMotion
 from trilane.scene.rotations import rotvec_from_matrix, shortest_turn
 
 LEAST_LENGTH = 1e-6
-REQUIRED = ("pelvis", "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle")
 #: Joint whose bone is laid on that of the file -> the joint at the other end of the bone, its direction in the T pose.
 LIMBS: dict[str, tuple[str, tuple[float, float, float]]] = {
     "left_hip": ("left_knee", (0.0, -1.0, 0.0)),
@@ -41,13 +41,13 @@ LIMBS: dict[str, tuple[str, tuple[float, float, float]]] = {
 }
 
 
-def load_retargeted(path: Path, units: str) -> RawMotion:
-    """Read a BVH file onto the 55 joints; `units` is a key of UNITS_M or `auto`.
+def load_retargeted(path: Path, units: str, joint_map: Mapping[str, str] = NO_MAP) -> RawMotion:
+    """Read a BVH file onto the 55 joints; `units` is a key of UNITS_M or `auto`, `joint_map` as of `match_names`.
 
     Raises BadInputError when the file is no BVH or its names are of no known skeleton.
     """
     bvh = load_bvh(path)
-    dialect, index_of = match_names(path, [joint.name for joint in bvh.joints])
+    dialect, index_of = match_names(path, [joint.name for joint in bvh.joints], joint_map)
     offsets = _rest_positions(bvh.joints)
     leg = leg_length(offsets, index_of)
     hips = offsets[index_of["left_hip"]] - offsets[index_of["right_hip"]]
@@ -72,30 +72,6 @@ def load_retargeted(path: Path, units: str) -> RawMotion:
     detected = Detected("BVH", reason, unit=unit, rate="by `Frame Time`", joints=joints, unmapped=others)
     times = np.arange(len(bvh.frames), dtype=np.float64) * bvh.frame_time_s
     return RawMotion(times, poses, translation, None, "y", notes, leg * unit_m, detected)
-
-
-def match_names(path: Path, names: list[str]) -> tuple[str, dict[str, int]]:
-    """The dialect that has the most of `names`, and {SMPL-X name: index in `names`}.
-
-    Raises BadInputError when none has all of REQUIRED; `path` is named in it.
-    """
-    index_of: dict[str, int] = {}
-    for index, name in enumerate(names):
-        index_of.setdefault(plain(name), index)
-    matches = {
-        dialect: {target: index_of[source] for source, target in table.items() if source in index_of}
-        for dialect, table in DIALECTS.items()
-    }
-    best = max(matches, key=lambda dialect: len(matches[dialect]))
-    missing = [name for name in REQUIRED if name not in matches[best]]
-    if missing:
-        raise BadInputError(
-            path,
-            f"joints {', '.join(names[:6])} …, of which none is {missing[0]}",
-            f"the joint names of {', '.join(DIALECTS)}",
-            "rename the joints",
-        )
-    return best, matches[best]
 
 
 def _rest_positions(joints: list[BvhJoint]) -> F64:

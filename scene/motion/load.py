@@ -1,6 +1,7 @@
 """Loads the motion of a scene's avatar: a built-in one by name, or a file.
 
-Rule: the ending of the file decides which reader is used; the reader's errors name the file.
+Rule: the ending of the file decides which reader is used; the reader's errors name the file. A key that a format has
+no use for is refused, not ignored.
 """
 
 from __future__ import annotations
@@ -17,21 +18,24 @@ from trilane.scene.motion.amass import load_amass
 from trilane.scene.motion.builtin import BUILTIN
 from trilane.scene.motion.bvh_retarget import load_retargeted
 from trilane.scene.motion.motion import Motion
+from trilane.scene.motion.playing import as_played
 from trilane.scene.motion.recorded import RawMotion, motion_from_recording
 from trilane.scene.motion.smplx_npy import load_smplx_npy
 from trilane.scene.schema import AvatarSpec
 
 PREFIX = "builtin:"
 
-_READERS: dict[str, Callable[[Path, str], RawMotion]] = {
-    ".npy": lambda path, _units: load_smplx_npy(path),
-    ".npz": lambda path, _units: load_amass(path),
-    ".bvh": load_retargeted,
+_READERS: dict[str, Callable[[Path, AvatarSpec], RawMotion]] = {
+    ".npy": lambda path, _spec: load_smplx_npy(path),
+    ".npz": lambda path, _spec: load_amass(path),
+    ".bvh": lambda path, spec: load_retargeted(path, spec.units, spec.joint_map),
 }
+#: Endings of files whose joints have names.
+NAMED = (".bvh",)
 
 
 def load_motion(spec: AvatarSpec, base: Path) -> Motion:
-    """The motion that `spec.motion` names; a relative path starts at `base`.
+    """The motion that `spec.motion` names, as `spec` plays it; a relative path starts at `base`.
 
     Raises BadInputError when there is no such motion or the file is unusable.
     """
@@ -40,11 +44,20 @@ def load_motion(spec: AvatarSpec, base: Path) -> Motion:
         if make is None:
             near = did_you_mean(spec.motion.removeprefix(PREFIX), BUILTIN, PREFIX)
             raise BadInputError("motion", repr(spec.motion), f"{PREFIX}{{{', '.join(BUILTIN)}}} or a file", near)
-        return make()
+        _check_named(spec, spec.motion)
+        return as_played(make(), spec, spec.motion)
     path = base / spec.motion
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         raise BadInputError(path, f"the ending {path.suffix!r}", f"a motion file: {', '.join(_READERS)}")
+    _check_named(spec, path)
     require_file(path, "a motion file")
     with np.errstate(over="ignore", invalid="ignore"):  # `usable_samples` leaves out what is not finite
-        return motion_from_recording(reader(path, spec.units), str(path), spec.up_axis)
+        motion = motion_from_recording(reader(path, spec), str(path), spec.up_axis)
+    return as_played(motion, spec, str(path))
+
+
+def _check_named(spec: AvatarSpec, motion: str | Path) -> None:
+    """Raises BadInputError when `spec` maps joints of a `motion` that has no names."""
+    if spec.joint_map and Path(motion).suffix.lower() not in NAMED:
+        raise BadInputError(motion, "joint_map", f"none: only joints of {', '.join(NAMED)} files have names")

@@ -25,12 +25,15 @@ class Wrap(enum.Enum):
 
     LOOP = "loops"
     BOUNCE = "plays back and forth"
+    HOLD = "holds its last frame"
 
 
 def wrapped_time(t_s: float, length_s: float, wrap: Wrap) -> float:
     """The time in [0, length_s] whose frame is shown at `t_s`; 0 for a length of 0."""
     if length_s <= 0:
         return 0.0
+    if wrap is Wrap.HOLD:
+        return min(max(t_s, 0.0), length_s)
     if wrap is Wrap.LOOP:
         return t_s % length_s
     phase = t_s % (2 * length_s)

@@ -60,19 +60,18 @@ def motion_from_recording(raw: RawMotion, where: str, up_axis: str) -> Motion:
     roots = matrix_from_rotvec(poses[:, 0])
     up, how = _up_axis(roots, raw.up, up_axis)
     turn = Y_UP_FROM_Z_UP if up == "z" else np.eye(3)
-    turn = _facing(turn @ roots[0]) @ turn
+    turn = facing(turn @ roots[0]) @ turn
     poses = poses.copy()
     poses[:, 0] = rotvec_from_matrix(turn @ roots)
     translation = shift @ turn.T
-    wrap = Wrap.BOUNCE
     axes = f"{up.upper()} up, {how}"
     return Motion(
         times - times[0],
         poses,
         centred(translation),
         raw.betas,
-        (*raw.notes, axes, *repairs, _end_note(times, wrap)),
-        wrap,
+        (*raw.notes, axes, *repairs),
+        Wrap.BOUNCE,
         raw.leg_m,
         raw.translation is not None,
         replace(raw.detected, axes=axes),
@@ -103,7 +102,7 @@ def _up_axis(roots: F64, usual: str, stated: str) -> tuple[str, str]:
     return usual, "as usual for the format"
 
 
-def _facing(root: F64) -> F64:
+def facing(root: F64) -> F64:
     """Turn about Y (3, 3) after which a body with root turn `root` (3, 3) faces +Z; the identity for one that lies."""
     x, _, z = root[:, 2]
     if np.hypot(x, z) < 0.3:
@@ -116,9 +115,3 @@ def centred(translation: F64) -> F64:
     low, high = translation.min(axis=0), translation.max(axis=0)
     middle = (low + high) / 2
     return np.asarray(translation - np.array([middle[0], 0.0, middle[2]]))
-
-
-def _end_note(times_s: F64, wrap: Wrap) -> str:
-    if len(times_s) == 1:
-        return "one frame: held"
-    return f"{times_s[-1] - times_s[0]:.2f} s, then {wrap.value}"

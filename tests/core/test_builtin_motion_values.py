@@ -402,9 +402,9 @@ def test_velocities_are_central_differences() -> None:
 
 def test_the_motions_say_what_they_are() -> None:
     walk, idle, rest = (BUILTIN[name]() for name in ("walk-wave-turn", "idle", "t-pose"))
-    assert walk.notes == ("built in: walks, waves and turns, 10 s at 60/s, loops",)
-    assert idle.notes == ("built in: stands, 8 s at 60/s, loops",)
-    assert rest.notes == ("built in: the T pose, one frame: held",)
+    assert walk.notes == ("built in: walks, waves and turns, 60 frames/s",)
+    assert idle.notes == ("built in: stands, 60 frames/s",)
+    assert rest.notes == ("built in: the T pose",)
     for motion, count, leg in ((walk, 601, BUILD.leg_m), (idle, 481, BUILD.leg_m), (rest, 1, None)):
         assert (len(motion.times_s), motion.leg_m, motion.travels, motion.wrap) == (count, leg, False, Wrap.LOOP)
         assert motion.times_s == pytest.approx(np.arange(count) / 60)
@@ -427,7 +427,7 @@ def test_one_who_walks_there_and_back_takes_ten_steps_either_way_and_three_to_tu
     assert z == pytest.approx([-2.5, 0, 2.5, 2.5, 2.5, 0, -2.5, -2.5, -2.5], abs=1e-9)
     assert heading == pytest.approx(np.pi * np.array([0, 0, 0, 0.5, 1, 1, 1, 1.5, 2]))
     motion = BUILTIN["there-and-back"]()
-    assert motion.notes == ("built in: walks five metres, turns and walks back, 15 s at 60/s, loops",)
+    assert motion.notes == ("built in: walks five metres, turns and walks back, 60 frames/s",)
     assert (len(motion.times_s), motion.leg_m, motion.travels) == (901, BUILD.leg_m, False)
     assert np.abs(motion.translation[:, 0]).max() < 0.1  # sways, and leans to the loaded foot
     assert motion.translation[:, 2].min() == pytest.approx(-2.5, abs=0.1)

@@ -13,8 +13,9 @@ from trilane.errors import BadInputError
 from trilane.scene.motion import bvh as bvh_module
 from trilane.scene.motion.bvh import load_bvh
 from trilane.scene.motion.bvh_joint_names import DIALECTS, plain
-from trilane.scene.motion.bvh_retarget import LIMBS, load_retargeted, match_names
+from trilane.scene.motion.bvh_retarget import LIMBS, load_retargeted
 from trilane.scene.motion.bvh_units import unit_of
+from trilane.scene.motion.joint_match import match_names
 from trilane.scene.motion.recorded import RawMotion
 
 #: A turn by +90 degrees takes an axis to: about X y->z, z->-y; about Y z->x, x->-z; about Z x->y, y->-x.
@@ -237,7 +238,7 @@ def test_a_name_twice_is_the_first_and_a_joint_that_must_be_there_is_named() -> 
             match_names(Path("a.bvh"), rest)
         assert str(raised.value) == (
             f"a.bvh: found joints {', '.join(rest[:6])} …, of which none is {ours}, expected the joint names of "
-            "Mixamo, CMU, MotionBuilder, 3ds Max Biped, SMPL, SMPL-X; rename the joints"
+            f'{", ".join(DIALECTS)}; say which is which in the scene: joint_map = {{{ours} = "...", ...}} for {ours}'
         )
 
 

@@ -28,7 +28,8 @@ def test_what_a_scene_leaves_out() -> None:
         "avatars": ({
             "name": "avatar1", "bundle": "default", "motion": "builtin:walk-wave-turn",
             "position": (0.0, 0.0, 0.0), "heading_deg": 0.0,
-            "up_axis": "auto", "units": "auto", "ground": "auto",
+            "up_axis": "auto", "units": "auto", "joint_map": {}, "start_s": 0.0, "end_s": None, "speed": 1.0,
+            "loop": "auto", "ground": "auto",
         },),
     }  # fmt: skip
     assert PlaneSpec().model_dump() == {
@@ -50,6 +51,11 @@ LIMITS: list[tuple[type, str, list[Any], list[Any]]] = [
     (AvatarSpec, "heading_deg", [-3600, 3600], [-3601, 3601, math.nan]),
     (AvatarSpec, "up_axis", ["auto", "y", "z"], ["x"]),
     (AvatarSpec, "units", ["auto", "m", "cm", "in", "cmu"], ["mm"]),
+    (AvatarSpec, "joint_map", [{}, {"left_hip": "Thigh L", "jaw": ""}], [{"left hip": "a"}, {"jaw": 1}]),
+    (AvatarSpec, "start_s", [0, 1e6], [-0.1, 1.1e6, math.nan]),
+    (AvatarSpec, "end_s", [0.1, 1e6, None], [0, 1.1e6, math.nan]),
+    (AvatarSpec, "speed", [0.01, 100], [0, 101, math.nan]),
+    (AvatarSpec, "loop", ["auto", "repeat", "back-and-forth", "hold"], ["bounce"]),
     (AvatarSpec, "ground", ["auto", "sequence", "frame", "none"], ["floor"]),
     (CameraSpec, "format", ["auto", "arkit", "tum", "nerf"], ["colmap"]),
     (CameraSpec, "fov_y_deg", [1.1, 169.9, None], [1, 170, math.nan]),

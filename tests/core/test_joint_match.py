@@ -1,0 +1,191 @@
+"""Joint names of programs, written here as those programs write them, and what a scene states of joints."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from trilane.body.joints import JOINT_NAMES
+from trilane.errors import BadInputError
+from trilane.scene.motion.bvh_joint_names import DIALECTS, plain
+from trilane.scene.motion.joint_match import REQUIRED, match_names
+
+HERE = Path("a.bvh")
+BODY = tuple(
+    """pelvis left_hip right_hip spine1 left_knee right_knee spine2 left_ankle right_ankle spine3 left_foot
+right_foot neck left_collar right_collar head left_shoulder right_shoulder left_elbow right_elbow
+left_wrist right_wrist""".split()  # noqa: SIM905
+)
+
+#: Family -> names of BODY's joints in their order (`-`: none), then names of no joint of the body.
+AS_WRITTEN = {
+    "LaFAN1": (
+        """Hips LeftUpLeg RightUpLeg Spine LeftLeg RightLeg Spine1 LeftFoot RightFoot Spine2 LeftToe RightToe Neck
+        LeftShoulder RightShoulder Head LeftArm RightArm LeftForeArm RightForeArm LeftHand RightHand""",
+        "",
+    ),
+    "Unity and VRM 0": (
+        """Hips LeftUpperLeg RightUpperLeg Spine LeftLowerLeg RightLowerLeg Chest LeftFoot RightFoot UpperChest LeftToes
+        RightToes Neck LeftShoulder RightShoulder Head LeftUpperArm RightUpperArm LeftLowerArm RightLowerArm LeftHand
+        RightHand""",
+        "",
+    ),
+    "VRoid": (
+        """J_Bip_C_Hips J_Bip_L_UpperLeg J_Bip_R_UpperLeg J_Bip_C_Spine J_Bip_L_LowerLeg J_Bip_R_LowerLeg J_Bip_C_Chest
+        J_Bip_L_Foot J_Bip_R_Foot J_Bip_C_UpperChest J_Bip_L_ToeBase J_Bip_R_ToeBase J_Bip_C_Neck J_Bip_L_Shoulder
+        J_Bip_R_Shoulder J_Bip_C_Head J_Bip_L_UpperArm J_Bip_R_UpperArm J_Bip_L_LowerArm J_Bip_R_LowerArm J_Bip_L_Hand
+        J_Bip_R_Hand""",
+        "Root J_Sec_Hair1_01 J_Adj_L_FaceEye",
+    ),
+    "Bandai Namco": (
+        """Hips UpperLeg_L UpperLeg_R Spine LowerLeg_L LowerLeg_R Chest Foot_L Foot_R - Toes_L Toes_R Neck Shoulder_L
+        Shoulder_R Head UpperArm_L UpperArm_R LowerArm_L LowerArm_R Hand_L Hand_R""",
+        "joint_Root",
+    ),
+    "Unreal 5": (
+        """pelvis thigh_l thigh_r spine_01 calf_l calf_r spine_03 foot_l foot_r spine_05 ball_l ball_r neck_01
+        clavicle_l clavicle_r head upperarm_l upperarm_r lowerarm_l lowerarm_r hand_l hand_r""",
+        "root spine_02 spine_04 neck_02 thigh_twist_01_l ik_hand_l index_metacarpal_l",
+    ),
+    "Unreal 4": (
+        """pelvis thigh_l thigh_r spine_01 calf_l calf_r spine_02 foot_l foot_r spine_03 ball_l ball_r neck_01
+        clavicle_l clavicle_r head upperarm_l upperarm_r lowerarm_l lowerarm_r hand_l hand_r""",
+        "root thigh_twist_01_l ik_foot_root",
+    ),
+    "Rigify": (
+        """DEF-spine DEF-thigh.L DEF-thigh.R DEF-spine.001 DEF-shin.L DEF-shin.R DEF-spine.002 DEF-foot.L DEF-foot.R
+        DEF-spine.003 DEF-toe.L DEF-toe.R DEF-spine.004 DEF-shoulder.L DEF-shoulder.R DEF-spine.006 DEF-upper_arm.L
+        DEF-upper_arm.R DEF-forearm.L DEF-forearm.R DEF-hand.L DEF-hand.R""",
+        "DEF-spine.005 DEF-thigh.L.001 DEF-upper_arm.R.001",
+    ),
+    "Rigify, basic": (
+        """spine thigh.L thigh.R spine.001 shin.L shin.R spine.002 foot.L foot.R spine.003 toe.L toe.R spine.004
+        shoulder.L shoulder.R spine.005 upper_arm.L upper_arm.R forearm.L forearm.R hand.L hand.R""",
+        "heel.02.L breast.L pelvis.L",
+    ),
+    "Xsens": (
+        """Hips LeftHip RightHip Chest LeftKnee RightKnee Chest2 LeftAnkle RightAnkle Chest4 LeftToe RightToe Neck
+        LeftCollar RightCollar Head LeftShoulder RightShoulder LeftElbow RightElbow LeftWrist RightWrist""",
+        "Chest3",
+    ),
+    "Xsens segments": (
+        """Pelvis LeftUpperLeg RightUpperLeg L5 LeftLowerLeg RightLowerLeg T12 LeftFoot RightFoot T8 LeftToe RightToe
+        Neck LeftShoulder RightShoulder Head LeftUpperArm RightUpperArm LeftForeArm RightForeArm LeftHand RightHand""",
+        "L3",
+    ),
+    "Rokoko": (
+        """Hips LeftThigh RightThigh Spine1 LeftShin RightShin Spine2 LeftFoot RightFoot Spine4 LeftToe RightToe Neck
+        LeftShoulder RightShoulder Head LeftArm RightArm LeftForeArm RightForeArm LeftHand RightHand""",
+        "Root Spine3",
+    ),
+    "Character Creator": (
+        """CC_Base_Hip CC_Base_L_Thigh CC_Base_R_Thigh CC_Base_Waist CC_Base_L_Calf CC_Base_R_Calf CC_Base_Spine01
+        CC_Base_L_Foot CC_Base_R_Foot CC_Base_Spine02 CC_Base_L_ToeBase CC_Base_R_ToeBase CC_Base_NeckTwist01
+        CC_Base_L_Clavicle CC_Base_R_Clavicle CC_Base_Head CC_Base_L_Upperarm CC_Base_R_Upperarm CC_Base_L_Forearm
+        CC_Base_R_Forearm CC_Base_L_Hand CC_Base_R_Hand""",
+        "RL_BoneRoot CC_Base_Pelvis CC_Base_L_CalfTwist01",
+    ),
+    "Poser and Daz": (
+        """hip lThigh rThigh abdomen lShin rShin - lFoot rFoot chest lToe rToe neck lCollar rCollar head lShldr rShldr
+        lForeArm rForeArm lHand rHand""",
+        "lButtock lEye",
+    ),
+}
+MIXAMO = list(
+    """Hips LeftUpLeg RightUpLeg Spine LeftLeg RightLeg Spine1 LeftFoot RightFoot Spine2 LeftToeBase RightToeBase
+Neck LeftShoulder RightShoulder Head LeftArm RightArm LeftForeArm RightForeArm LeftHand RightHand""".split()  # noqa: SIM905
+)
+
+
+@pytest.mark.parametrize("family", AS_WRITTEN)
+def test_every_name_of_a_family_is_that_joint(family: str) -> None:
+    written, others = AS_WRITTEN[family]
+    expected = {ours: name for ours, name in zip(BODY, written.split(), strict=True) if name != "-"}
+    names = [*others.split(), *expected.values()]
+    found, index_of = match_names(HERE, names)
+    assert found == family
+    assert {ours: names[index] for ours, index in index_of.items()} == expected
+
+
+def test_every_family_is_held_here_or_beside_the_bvh_reader() -> None:
+    first = {"Mixamo", "CMU", "MotionBuilder", "3ds Max Biped", "SMPL", "SMPL-X"}  # in test_bvh_values.py
+    assert set(DIALECTS) == first | set(AS_WRITTEN) | {"VRM 1"}
+    for table in DIALECTS.values():
+        assert set(table.values()) <= set(JOINT_NAMES) and set(REQUIRED) <= set(table.values())
+
+
+#: Family -> names of the left hand: thumb from its root, then index, middle, ring and little finger.
+HANDS = {
+    "Unity and VRM 0": [f"left{f}{b}" for f in ("Thumb", "Index", "Middle", "Ring", "Little")
+                        for b in ("Proximal", "Intermediate", "Distal")],
+    "VRM 1": ["leftThumbMetacarpal", "leftThumbProximal", "leftThumbDistal",
+              *(f"left{f}{b}" for f in ("Index", "Middle", "Ring", "Little")
+                for b in ("Proximal", "Intermediate", "Distal"))],
+    "VRoid": [f"J_Bip_L_{f}{k}" for f in ("Thumb", "Index", "Middle", "Ring", "Little") for k in (1, 2, 3)],
+    "Unreal 4": [f"{f}_0{k}_l" for f in ("thumb", "index", "middle", "ring", "pinky") for k in (1, 2, 3)],
+    "Rigify": [f"DEF-{f}.0{k}.L" for f in ("thumb", "f_index", "f_middle", "f_ring", "f_pinky") for k in (1, 2, 3)],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("family", HANDS)
+def test_fingers_from_their_roots(family: str) -> None:
+    written, _ = AS_WRITTEN["Unity and VRM 0" if family == "VRM 1" else family]
+    names = [*written.split(), *HANDS[family]]
+    found, index_of = match_names(HERE, names)
+    assert found == family
+    ours = [f"left_{finger}{k}" for finger in ("thumb", "index", "middle", "ring", "pinky") for k in (1, 2, 3)]
+    assert [names[index_of[name]] for name in ours] == HANDS[family]
+
+
+def test_what_stands_before_all_names_is_no_part_of_them() -> None:
+    for written, name in (
+        ("mixamorig:LeftUpLeg", "leftupleg"),
+        ("mixamorig1:LeftUpLeg", "leftupleg"),
+        ("mixamorig_LeftUpLeg", "leftupleg"),
+        ("mixamorigLeftUpLeg", "leftupleg"),
+        ("Bip001 L Thigh", "lthigh"),
+        ("Bip01_L_Thigh", "lthigh"),
+        ("ORG-thigh.L", "thighl"),
+        ("J_Bip_C_Hips", "chips"),
+        ("CC_Base_Hip", "hip"),
+        ("Character1:Ctrl:Hips", "hips"),
+        ("Definition", "definition"),
+    ):
+        assert plain(written) == name
+
+
+def test_what_the_scene_states_comes_first_and_tables_fill_the_rest() -> None:
+    names = [*MIXAMO, "Tail", "OldHead"]
+    found, index_of = match_names(HERE, names, {"head": "OldHead", "neck": "", "jaw": "tail"})
+    assert found == "Mixamo and joint_map"
+    assert (names[index_of["head"]], names[index_of["jaw"]]) == ("OldHead", "Tail")
+    assert "neck" not in index_of and index_of["left_hip"] == 1
+
+
+def test_a_joint_of_the_file_is_one_joint_of_the_body() -> None:
+    """Spine2 is stated to be spine1; the table's spine1 has gone, and spine3 has no partner any more."""
+    _, index_of = match_names(HERE, MIXAMO, {"spine1": "Spine2"})
+    assert MIXAMO[index_of["spine1"]] == "Spine2" and "spine3" not in index_of
+    assert len(set(index_of.values())) == len(index_of)
+
+
+def test_joints_of_no_table_can_all_be_stated() -> None:
+    names = [f"bone{k}" for k in range(9)]
+    stated = {ours: names[k + 1] for k, ours in enumerate(REQUIRED)}
+    found, index_of = match_names(HERE, names, stated)
+    assert found == "joint_map"
+    assert {ours: names[index] for ours, index in index_of.items()} == stated
+    with pytest.raises(BadInputError, match=r"none is left_hip.*joint_map = {left_hip = .*for left_hip, right_hip"):
+        match_names(HERE, names, {"pelvis": "bone0"})
+
+
+def test_a_joint_that_is_stated_but_not_there_is_named_with_the_near_one() -> None:
+    with pytest.raises(BadInputError) as raised:
+        match_names(HERE, MIXAMO, {"left_hip": "LeftUpLegg"})
+    assert str(raised.value) == (
+        "a.bvh: found no joint 'LeftUpLegg', which joint_map names for left_hip, expected a joint of the file; "
+        "did you mean 'LeftUpLeg'?"
+    )
+    with pytest.raises(BadInputError, match="the file has Hips, LeftUpLeg"):
+        match_names(HERE, MIXAMO, {"left_hip": "qqq"})
