@@ -10,7 +10,15 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from trilane.apps.experiments.hard_cases import EXCEEDED, IDEAL_STEPS, SHIFT, error_of, make_case, make_pair  # noqa: E402
+from trilane.apps.experiments.hard_cases import (  # noqa: E402
+    EXCEEDED,
+    HOLDS,
+    IDEAL_STEPS,
+    SHIFT,
+    error_of,
+    make_case,
+    make_pair,
+)
 from trilane.apps.experiments.hard_networks import INPUTS, NETWORKS  # noqa: E402
 from trilane.training.quantising import power_of_two_scales  # noqa: E402
 from trilane.training.quantising import quantise as quantise_module  # noqa: E402
@@ -24,17 +32,6 @@ WRONG = {
     "right": lambda picture: np.roll(picture, SHIFT, axis=1),
     "left, edge repeated": lambda picture: np.pad(picture, ((0, 0), (0, SHIFT), (0, 0)), "edge")[:, SHIFT:],
     "red and blue exchanged": lambda picture: picture[..., [2, 1, 0, 3]],
-}
-
-
-#: Rows that fail: more than an ideal quantiser's error, by docs/networks.md. On one runtime or the other some hold.
-ABOVE_IDEAL = {
-    ("batch", "constant patches"),
-    ("batch", "saturating"),
-    ("instance", "constant patches"),
-    ("instance", "saturating"),
-    ("group", "constant patches"),
-    ("outlier channel", "saturating"),
 }
 
 pair_of = functools.cache(make_pair)
@@ -58,11 +55,11 @@ def test_a_wrong_picture_is_above_the_bound(case, wrong):
     assert case.tells
 
 
-def test_the_picture_is_near_the_float_networks(quick_runtime, row, case):
-    """Every picture keeps the bound of its own network's steps; only named rows do not keep that of ideal steps."""
+def test_the_picture_is_near_the_float_networks(quick_runtime, case):
+    """Every picture keeps the bound of its own network's steps and that of ideal ones."""
     error = error_of(case, quick_runtime)
-    assert error <= case.own_bound
-    assert error <= case.bound or row in ABOVE_IDEAL
+    assert error <= case.bound <= case.own_bound
+    assert case.verdict(error) == HOLDS
 
 
 def test_ranges_four_times_as_wide_fail(monkeypatch):

@@ -228,12 +228,13 @@ def test_ideal_noise_does_not_depend_on_the_quantisers_steps(factor):
 
 
 @pytest.mark.parametrize(("alike", "widened"), [(False, 1), (True, 2)])
-def test_ideal_weights_have_127_steps_to_either_side_and_powers_of_two_at_most_twice_as_wide_ones(alike, widened):
+def test_ideal_weights_have_64_steps_to_either_side_and_powers_of_two_at_most_twice_as_wide_ones(alike, widened):
+    """64 is the greatest w with 2 * 255 * w < 2**15, by which two products fit 16 bits: 32640; 33150 does not."""
     quantised = layers((W1, W2), (STEP1, STEP2), (STEP_BETWEEN, STEP_OUT))
     quantised.facts["rounds_alike"] = alike
     model = ideal_noise_model(plain_network(), quantised, np.full((1, 1, 1, 1), 6, np.uint8))
     halves = [half.item() for _, half in model.constants.values()]
-    assert halves == pytest.approx([widened * 0.7 / 127 / 2, widened * 0.9 / 127 / 2])
+    assert halves == pytest.approx([widened * 0.7 / 64 / 2, widened * 0.9 / 64 / 2])
     limits = {
         t.name: numpy_helper.to_array(t).item() for t in model.model.graph.initializer if t.name.endswith(".step")
     }

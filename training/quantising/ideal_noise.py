@@ -2,8 +2,9 @@
 
 Rule: of the integer network only the places are used where it rounds, and whether its steps are powers of two. A stored
 tensor has 255 steps from the least to the greatest value that the float network gives it on this very input; a weight
-has 127 to either side of 0, by output channel; biases are exact. Where steps are powers of two, each is `POWER_OF_TWO`
-times as wide, the most that rounding up to a power of two costs. The picture has its own steps, of 1/255.
+has `LARGEST_WEIGHT` to either side of 0, by output channel; biases are exact. Where steps are powers of two, each is
+`POWER_OF_TWO` times as wide: the most that rounding up to a power of two costs a stored tensor; for a weight the even
+multiples, which rounding alike leaves, cost as much already. The picture has its own steps, of 1/255.
 """
 
 from __future__ import annotations
@@ -19,7 +20,10 @@ from trilane.training.quantising.quantise import Quantised
 
 #: Greatest ratio of the least power of two that is large enough to the step that is large enough.
 POWER_OF_TWO = 2
-LARGEST_WEIGHT = 127
+BYTE_TOP, INT16_TOP = 255, 2**15 - 1
+#: AVX2 without VNNI adds two products of a byte and a weight in 16 bits and cuts off what is beyond (Intel's manual,
+#: VPMADDUBSW). A bundle gives the same picture on every CPU, so no quantiser may use weights that are larger.
+LARGEST_WEIGHT = INT16_TOP // (2 * BYTE_TOP)
 #: Operators whose output consists of values of their input.
 MOVES_VALUES = (*MOVES, "Relu", "Identity")
 Range = tuple[float, float]
