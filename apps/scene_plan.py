@@ -74,7 +74,8 @@ class ScenePlan:
     def _places(self, vertices: F64, frame: int) -> F64:
         height, width = self.output
         camera = self._staged.camera
-        clip = camera.projection(width / height) @ camera.sample(frame / self.config.scene.fps)
+        t_s = frame / self.config.scene.fps
+        clip = camera.projection(t_s, self.output) @ camera.sample(t_s)
         points = vertices @ clip[:, :3].T + clip[:, 3]
         seen = (points[:, 3] > 0) & (np.abs(points[:, :3]) <= points[:, 3:]).all(axis=1)
         places = points[:, :2] / np.where(seen, points[:, 3], np.nan)[:, None]

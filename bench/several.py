@@ -153,7 +153,7 @@ def _views(fixture: _CrowdFixture, avatars: int, views: int, size: str, margin: 
     staged = stage_scene(scene, [fixture.shaped] * avatars, Path.cwd())
     skeleton = Skeleton(fixture.shaped.joints, fixture.shaped.body.parents)
     bounds = MeshBounds(fixture.shaped, standoff_m=CLOTHES_STANDOFF_M)
-    projection = staged.camera.projection(OUTPUT[1] / OUTPUT[0])
+    projection = staged.camera.projection(0.0, OUTPUT)
     for t_s in np.linspace(0.0, SECONDS, views, endpoint=False):
         view, rects, joints = staged.camera.sample(t_s), [], []
         for k, mover in enumerate(staged.movers):

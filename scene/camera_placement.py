@@ -51,13 +51,14 @@ class _Footage:
     """The recording and the bodies at the F frames at which places are scored.
 
     `views` (F, 3, 4): path world to camera. `eyes` (F, 3): the camera's places, path world. `boxes` (F, 8, 3):
-    corners of a box round the bodies, scene world. `scale` (2,): factors of x and y to NDC.
+    corners of a box round the bodies, scene world. `lenses` (F, 2, 2): of x and of y, factor and addend to NDC, where
+    ndc = factor * x / depth + addend.
     """
 
     views: F32
     eyes: F64
     boxes: F64
-    scale: F64
+    lenses: F64
 
 
 def place_camera(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]) -> PlacedCamera:
@@ -104,10 +105,9 @@ def _footage(
     lows, highs = _bounds(times, movers, bodies)
     pick = np.array([[(k >> axis) & 1 for axis in range(3)] for k in range(8)], dtype=bool)
     boxes = np.where(pick[None], highs[:, None], lows[:, None])
-    projection = path.projection(scene.output.width / scene.output.height)
-    return _Footage(
-        views, np.stack([place for _, place in poses]), boxes, np.array([projection[0, 0], projection[1, 1]])
-    )
+    clips = np.stack([path.projection(float(t), (scene.output.height, scene.output.width)) for t in times])
+    lenses = np.stack([[clips[:, k, k], -clips[:, k, 2]] for k in range(2)]).transpose(2, 0, 1)
+    return _Footage(views, np.stack([place for _, place in poses]), boxes, lenses)
 
 
 def _bounds(times: F64, movers: Sequence[Mover], bodies: Sequence[ShapedBody]) -> tuple[F64, F64]:
@@ -159,7 +159,8 @@ def _visibility(footage: _Footage, places: F64) -> tuple[F64, F64]:
     right, up, back = (_row(footage.views[:, k], x, y, z) for k in range(3))
     depth = np.maximum(-back, NEAREST_M)
     in_front = (-back > NEAREST_M).all(axis=0)
-    x_ndc, y_ndc = right * np.float32(footage.scale[0]) / depth, up * np.float32(footage.scale[1]) / depth
+    (x_scale, x_add), (y_scale, y_add) = footage.lenses.astype(np.float32).transpose(1, 2, 0)
+    x_ndc, y_ndc = right * x_scale / depth + x_add, up * y_scale / depth + y_add
     inside = (np.abs(x_ndc) < MARGIN).all(axis=0) & (np.abs(y_ndc) < MARGIN).all(axis=0)
     tall = (np.clip(y_ndc.max(axis=0), -1, 1) - np.clip(y_ndc.min(axis=0), -1, 1)) / 2
     return (in_front & inside).mean(axis=1), np.where(in_front, tall, 0.0).mean(axis=1)

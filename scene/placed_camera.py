@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from trilane.arrays import F64
 from trilane.scene.camera.path import CameraPath, view_from_pose
+from trilane.shapes import Shape
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,6 @@ class PlacedCamera:
         turn, place = self.path.pose(t_s)
         return view_from_pose(self.turn @ turn @ self.mount, self.turn @ place + self.shift)
 
-    def projection(self, aspect: float) -> F64:
-        """OpenGL clip matrix (4, 4) for a picture of `aspect` width over height."""
-        return self.path.projection(aspect)
+    def projection(self, t_s: float, output: Shape) -> F64:
+        """OpenGL clip matrix (4, 4) at `t_s` for a picture of `output` (height, width)."""
+        return self.path.projection(t_s, output)

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.scene.camera.path import CameraPath, Lens
+from trilane.scene.camera.path import CameraPath, Optics
+from trilane.scene.lens import Known, Lens
 from trilane.scene.motion.motion import Motion, Wrap
 from trilane.scene.mover import Mover
 from trilane.scene.placed_camera import PlacedCamera
@@ -20,7 +21,8 @@ from trilane.scene.staging import Staged
 
 Arrays = dict[str, NDArray[Any]]
 
-WRAPS = tuple(Wrap)
+WRAPS, KNOWN = tuple(Wrap), tuple(Known)
+LENS = ("width_px", "height_px", "fx", "fy", "cx", "cy")
 
 
 def staged_to_arrays(staged: Staged) -> Arrays:
@@ -88,7 +90,11 @@ def _camera_arrays(camera: PlacedCamera) -> Arrays:
         "times_s": path.times_s,
         "quats": path.quats,
         "places": path.places,
-        "lens": np.array([path.lens.fov_y_deg, path.lens.near_m, path.lens.far_m]),
+        "lenses": np.array([[getattr(lens, key) for key in LENS] for lens in path.optics.lenses]),
+        "known": np.array([KNOWN.index(lens.known) for lens in path.optics.lenses]),
+        "clip_m": np.array([path.optics.near_m, path.optics.far_m]),
+        "filmed": np.array(path.optics.filmed, np.int64).reshape(-1, 2),
+        "pictures": np.array(path.pictures, np.str_),
         "wrap": np.array(WRAPS.index(path.wrap)),
         "recorded": np.array(path.recorded),
         "turn": camera.turn,
@@ -102,9 +108,20 @@ def _camera(arrays: Arrays) -> PlacedCamera:
         arrays["times_s"],
         arrays["quats"],
         arrays["places"],
-        Lens(*(float(value) for value in arrays["lens"])),
+        _optics(arrays),
         (),
         WRAPS[int(arrays["wrap"])],
         bool(arrays["recorded"]),
+        pictures=tuple(arrays["pictures"].tolist()),
     )
     return PlacedCamera(path, arrays["turn"], arrays["shift"], arrays["mount"], ())
+
+
+def _optics(arrays: Arrays) -> Optics:
+    near_m, far_m = (float(value) for value in arrays["clip_m"])
+    rows = zip(arrays["lenses"], arrays["known"], strict=True)
+    lenses = tuple(
+        Lens(**dict(zip(LENS, map(float, row), strict=True)), known=KNOWN[int(known)]) for row, known in rows
+    )
+    filmed = tuple((int(height), int(width)) for height, width in arrays["filmed"])
+    return Optics(lenses, near_m, far_m, filmed)

@@ -102,10 +102,9 @@ def foreseen_rects(
     """For each of `frames` the rectangles of the avatars that are visible, in the order of the scene."""
     distinct = {id(body): MeshBounds(body, standoff_m=CLOTHES_STANDOFF_M) for body in bodies}
     skeletons = [Skeleton(body.joints, body.body.parents) for body in bodies]
-    projection = staged.camera.projection(scene.output.width / scene.output.height)
     for frame in frames:
         t_s = frame / scene.fps
-        clip = projection @ staged.camera.sample(t_s)
+        clip = staged.camera.projection(t_s, (scene.output.height, scene.output.width)) @ staged.camera.sample(t_s)
         rects = []
         for body, skeleton, mover in zip(bodies, skeletons, staged.movers, strict=True):
             pose, translation = mover.sample(t_s)

@@ -116,7 +116,7 @@ class Moment:
 
     def clip(self, index: int) -> F64:
         """(4,4) of the whole picture: projection @ view."""
-        return self._path.cast.projection @ self.seen[index].view
+        return self._path.cast.projection(self.number) @ self.seen[index].view
 
     def _layers(self, causes: Causes) -> list[Layer]:
         if Cause.CROP not in causes:
@@ -162,7 +162,7 @@ class Moment:
         height, width = self._header["tensor_shape"].tolist()
         tensor = np.zeros((height, width, avatar.texture.shape[2]))
         for seen, rect, (top, left, high, wide) in self._cells():
-            projection, view = _rounded(causes, self._path.cast.projection, seen.view)
+            projection, view = _rounded(causes, self._path.cast.projection(self.number), seen.view)
             (clip,) = _rounded(causes, crop_projection(projection, rect) @ view)
             tensor[top : top + high, left : left + wide] = self._drawn(seen, clip, (high, wide), causes)
         return avatar.packed(tensor, causes)

@@ -63,8 +63,6 @@ class Cast:
         self._output: Shape = (scene.output.height, scene.output.width)
         staged = staged_of(checked.assets)
         self._camera = staged.camera
-        #: (4,4) of the whole picture.
-        self.projection = staged.camera.projection(scene.output.width / scene.output.height)
         self.avatars = {folder: load_avatar(load_bundle(folder)) for folder in dict.fromkeys(folders)}
         bounds = {
             folder: MeshBounds(data.shaped, standoff_m=CLOTHES_STANDOFF_M) for folder, data in self.avatars.items()
@@ -77,24 +75,28 @@ class Cast:
     def seen(self, frame: int) -> list[Seen]:
         """The avatars that are on the screen in frame number `frame`."""
         t_s = frame / self._fps
-        view = self._camera.sample(t_s)
-        found = (self._seen(actor, t_s, view) for actor in self._actors)
+        view, whole = self._camera.sample(t_s), self.projection(frame)
+        found = (self._seen(actor, t_s, view, whole) for actor in self._actors)
         return [seen for seen in found if seen is not None]
 
     def boxes(self, frame: int) -> list[Box]:
         """The parts of the picture that hold avatars in frame number `frame`."""
         return [seen.box.on(self._output) for seen in self.seen(frame)]
 
-    def _seen(self, actor: _Actor, t_s: float, view: F64) -> Seen | None:
+    def projection(self, frame: int) -> F64:
+        """(4,4) of the whole picture in frame number `frame`."""
+        return self._camera.projection(frame / self._fps, self._output)
+
+    def _seen(self, actor: _Actor, t_s: float, view: F64, whole: F64) -> Seen | None:
         pose, translation = actor.mover.sample(t_s)
         world = actor.mover.world
         posed = actor.skeleton.pose(pose, translation, world)
-        rect = actor.bounds.rect(posed, self.projection @ view)
+        rect = actor.bounds.rect(posed, whole @ view)
         if rect is None:
             return None
         box = box_around(rect, self._output)
         pelvis = world @ np.append(actor.data.shaped.joints[0] + translation, 1.0)
-        projection = crop_projection(self.projection, box.rect(self._output))
+        projection = crop_projection(whole, box.rect(self._output))
         depth = float(view[2] @ pelvis)
         joints = posed.matrices.copy()
         return Seen(actor.index, actor.folder, pose, translation, world, joints, box, depth, view, projection)

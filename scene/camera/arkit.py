@@ -6,18 +6,20 @@ seconds is recognised by the size of their steps.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 from trilane.scene.camera.recorded import RawCamera
 from trilane.scene.camera.text_table import elapsed, read_table
 from trilane.scene.detected import Detected
+from trilane.scene.lens import Known, centred
 
 COLUMNS = 13
 EXPECTED = "an ARKit log: time and the 12 numbers of a 3x4 matrix a line"
 #: With a median step above this, times are in nanoseconds, else in seconds.
 LEAST_STEP_NS = 1e3
-#: Field of view of an iPhone's main camera, 26 mm equivalent, on a 16:9 picture: long side, short side.
-LONG_SIDE_DEG, SHORT_SIDE_DEG = 60.0, 36.0
+#: An iPhone's main camera, 26 mm equivalent, on a 16:9 picture: 36 degrees high, 60 wide.
+PHONE = centred(1920, 1080, 540 / math.tan(math.radians(18.0)), Known.WIDTH)
 
 
 def load_arkit(path: Path) -> RawCamera:
@@ -34,8 +36,7 @@ def load_arkit(path: Path) -> RawCamera:
         matrices[:, :, :3],
         matrices[:, :, 3],
         "y",
-        SHORT_SIDE_DEG,
-        LONG_SIDE_DEG,
+        (PHONE,),
         "usual for a phone",
         notes,
         read.place_of,

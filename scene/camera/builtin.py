@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from trilane.arrays import F64
-from trilane.scene.camera.path import CameraPath, Lens, axes_towards
+from trilane.scene.camera.path import CameraPath, axes_towards, one_lens
 from trilane.scene.motion.motion import Wrap
 from trilane.scene.rotations import quat_from_matrix
 from trilane.scene.schema import CameraSpec
@@ -102,4 +102,4 @@ def load_builtin(name: str, spec: CameraSpec) -> CameraPath | None:
     fov = FOV_Y_DEG if spec.fov_y_deg is None else spec.fov_y_deg
     notes = (f"built in: {camera.what}, {_pace(camera)}, field of view {fov:g} degrees high",)
     quats = quat_from_matrix(axes_towards(places, np.array(camera.target)))
-    return CameraPath(times, quats, places, Lens(fov, spec.near_m, spec.far_m), notes, Wrap.LOOP, recorded=False)
+    return CameraPath(times, quats, places, one_lens(fov, spec.near_m, spec.far_m), notes, Wrap.LOOP, recorded=False)

@@ -1,14 +1,14 @@
 """NeRF `transforms.json`: `frames[].transform_matrix`, 4x4 camera to world, OpenGL axes, Z up.
 
-Rule: the lens is that of the file (`fl_y` and `h`, `fl_x` and `w`, or `camera_angle_x`). The format has no times: views
-less than FILM_STEP_DEG apart are a film at 30 a second, others are stills, one a second.
+Rule: the lens is that of the file (`fl_x`, `fl_y`, `cx`, `cy` in pixels of `w` x `h`, or `camera_angle_x`). The format
+has no times: views less than FILM_STEP_DEG apart are a film at 30 a second, others are stills, one a second.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from trilane.errors import BadInputError
 from trilane.files import read_text
 from trilane.scene.camera.recorded import RawCamera
 from trilane.scene.detected import Detected
+from trilane.scene.lens import Known, Lens, centred, of_fov_x
 
 EXPECTED = "a NeRF transforms.json: `frames`, each with a 4x4 `transform_matrix`"
 FILM_RATE_HZ = 30.0
@@ -43,11 +44,17 @@ def load_nerf(path: Path) -> RawCamera:
         raise BadInputError(f"{path}: frames", f"{len(frames)} frames", f"1 to {MAX_FRAMES}")
     matrices = np.stack([_matrix(path, k, frame) for k, frame in enumerate(frames)])
     rate, how = _rate(matrices[:, :3, :3])
-    tall, wide, lens = _lens(path, content)
+    lens, source = _lens(path, content)
     notes = (f"NeRF transforms, {len(frames)} views, no times: {how}, camera to world",)
     detected = Detected("NeRF transforms.json", "JSON with `frames`", rate=f"no times in the format: {how}")
     times, turns, places = np.arange(len(frames)) / rate, matrices[:, :3, :3], matrices[:, :3, 3]
-    return RawCamera(times, turns, places, "z", tall, wide, lens, notes, _place_of, detected)
+    return RawCamera(times, turns, places, "z", (lens,), source, notes, _place_of, detected, pictures=_pictures(frames))
+
+
+def _pictures(frames: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
+    """The photo of each view as the file names it; nothing when a view has none."""
+    names = tuple(frame.get("file_path") for frame in frames)
+    return tuple(str(name) for name in names) if all(isinstance(name, str) and name for name in names) else ()
 
 
 def _place_of(index: int) -> str:
@@ -88,24 +95,31 @@ def _rate(turns: NDArray[np.float64]) -> tuple[float, str]:
     return FILM_RATE_HZ, f"{FILM_RATE_HZ:g} a second assumed"
 
 
-def _lens(path: Path, content: Mapping[str, Any]) -> tuple[float, float, str]:
-    """Field of view in degrees of the picture's height and of its width, and where it comes from."""
-    width, height = (_number(path, content, key) for key in ("w", "h"))
-    aspect = width / height if width and height else DEFAULT_ASPECT
-    focal_y, focal_x = (_number(path, content, key) for key in ("fl_y", "fl_x"))
-    angle_x, lens = _number(path, content, "camera_angle_x"), "by `camera_angle_x`"
-    if focal_y and height:
-        tan_y, lens = height / focal_y / 2, "by `fl_y`"
-    elif focal_x and width:
-        tan_y, lens = width / focal_x / 2 / aspect, "by `fl_x`"
-    else:
-        lens = lens if angle_x else "usual, as the file has none"
-        tan_y = math.tan((angle_x or DEFAULT_ANGLE_X) / 2) / aspect
-    angles = [math.degrees(2 * math.atan(tangent)) for tangent in (tan_y, tan_y * aspect)]
-    for side, angle in zip(("height", "width"), angles, strict=True):
+def _lens(path: Path, content: Mapping[str, Any]) -> tuple[Lens, str]:
+    """The lens, and where it comes from."""
+    lens, source = _measured(path, content)
+    for side, angle in (("height", lens.fov_y_deg), ("width", lens.fov_x_deg)):
         if not 1 < angle < 170:
             raise BadInputError(path, f"a field of view of {angle:.4g} degrees over the {side}", "1 to 170")
-    return angles[0], angles[1], lens
+    return lens, source
+
+
+def _measured(path: Path, content: Mapping[str, Any]) -> tuple[Lens, str]:
+    keys = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x")
+    width, height, focal_x, focal_y, cx, cy, angle_x = (_number(path, content, key) for key in keys)
+    usable = {"fl_x": focal_x if width else None, "fl_y": focal_y if height else None}
+    known = [key for key, value in usable.items() if value]
+    if not known:
+        angle = angle_x or DEFAULT_ANGLE_X
+        source = "by `camera_angle_x`" if angle_x else "usual, as the file has none"
+        if not (width and height):
+            return of_fov_x(math.degrees(angle)), source
+        return centred(width, height, width / 2 / math.tan(angle / 2)), source
+    wide, high = width or (height or 0.0) * DEFAULT_ASPECT, height or (width or 0.0) / DEFAULT_ASPECT
+    fx, fy = usable["fl_x"] or usable["fl_y"] or 0.0, usable["fl_y"] or usable["fl_x"] or 0.0
+    shape = Known.ALL if width and height else Known.WIDTH if width else Known.HEIGHT
+    source = f"by {' and '.join(f'`{key}`' for key in known)}"
+    return Lens(wide, high, fx, fy, cx or wide / 2, cy or high / 2, shape), source
 
 
 def _number(path: Path, content: Mapping[str, Any], key: str) -> float | None:

@@ -1,7 +1,7 @@
-"""A camera over time, whatever its source: poses at increasing times, sampled at any time, and a lens.
+"""A camera over time, whatever its source: poses at increasing times, sampled at any time, and its lenses.
 
-Rule: a pose is camera to world, OpenGL axes (x right, y up, looks along -Z), world Y up. Between samples the place is
-interpolated linearly and the turn by slerp; after the last sample the path loops or is run backwards (`wrap`).
+Rule: a pose is camera to world, OpenGL axes (x right, y up, looks along -Z), world Y up. Between samples place and lens
+are interpolated linearly and the turn by slerp; after the last sample the path loops or is run backwards (`wrap`).
 """
 
 from __future__ import annotations
@@ -12,8 +12,10 @@ import numpy as np
 
 from trilane.arrays import F64
 from trilane.scene.detected import NOTHING, Detected
+from trilane.scene.lens import Lens, of_fov_y
 from trilane.scene.motion.motion import Wrap, bracket, wrapped_time
 from trilane.scene.rotations import matrix_from_quat, slerp
+from trilane.shapes import Shape
 
 
 def view_from_pose(turn: F64, place: F64) -> F64:
@@ -61,12 +63,38 @@ def projection_matrix(fov_y_deg: float, aspect: float, near_m: float, far_m: flo
 
 
 @dataclass(frozen=True)
-class Lens:
-    """Field of view of the picture's height, and the clip planes."""
+class Optics:
+    """How the camera's picture comes about.
 
-    fov_y_deg: float
+    `lenses`: one for all samples of the path, or one for each. `near_m`, `far_m`: distances of the clip planes.
+    `filmed`: (height, width) of the background that the camera filmed, one for all samples or one for each; empty where
+    the background is not the camera's.
+    """
+
+    lenses: tuple[Lens, ...]
     near_m: float
     far_m: float
+    filmed: tuple[Shape, ...] = ()
+
+    def lens(self, i: int, j: int, fraction: float, output: Shape) -> Lens:
+        """Of a picture of `output` (height, width), at `fraction` of the way from sample `i` to sample `j`.
+
+        Over what the camera filmed it is cut as that is; else the picture's height is the camera's.
+        """
+        first = self._shown(i, output)
+        is_one = len(self.lenses) == 1 and len(self.filmed) <= 1
+        return first if is_one else first.between(self._shown(j, output), fraction)
+
+    def _shown(self, sample: int, output: Shape) -> Lens:
+        lens = self.lenses[sample % len(self.lenses)]
+        if not self.filmed:
+            return lens.filling_height(output)
+        return lens.onto(self.filmed[sample % len(self.filmed)]).covering(output)
+
+
+def one_lens(fov_y_deg: float, near_m: float, far_m: float) -> Optics:
+    """Of a camera of which the field of view over the picture's height is known."""
+    return Optics((of_fov_y(fov_y_deg),), near_m, far_m)
 
 
 @dataclass(frozen=True)
@@ -75,17 +103,19 @@ class CameraPath:
 
     `times_s` (N,): from 0, strictly increasing. `quats` (N, 4) and `places` (N, 3), metres: camera to world. `notes`:
     how the source was read, for people. `wrap`: what follows the last sample. `recorded`: whether the path
-    comes from a recording, which has to be placed in the scene. `detected`: what its file is.
+    comes from a recording, which has to be placed in the scene. `detected`: what its file is. `pictures`: names of the
+    photos that the samples are of, one for each; empty where the file names none.
     """
 
     times_s: F64
     quats: F64
     places: F64
-    lens: Lens
+    optics: Optics
     notes: tuple[str, ...]
     wrap: Wrap = Wrap.BOUNCE
     recorded: bool = True
     detected: Detected = NOTHING
+    pictures: tuple[str, ...] = ()
 
     @property
     def duration_s(self) -> float:
@@ -102,6 +132,10 @@ class CameraPath:
         """World to camera (4, 4) at `t_s`."""
         return view_from_pose(*self.pose(t_s))
 
-    def projection(self, aspect: float) -> F64:
-        """OpenGL clip matrix (4, 4) for a picture of `aspect` width over height."""
-        return projection_matrix(self.lens.fov_y_deg, aspect, self.lens.near_m, self.lens.far_m)
+    def lens(self, t_s: float, output: Shape) -> Lens:
+        """At `t_s`, of a picture of `output` (height, width)."""
+        return self.optics.lens(*bracket(self.times_s, wrapped_time(t_s, self.duration_s, self.wrap)), output)
+
+    def projection(self, t_s: float, output: Shape) -> F64:
+        """OpenGL clip matrix (4, 4) at `t_s` for a picture of `output` (height, width)."""
+        return self.lens(t_s, output).projection(self.optics.near_m, self.optics.far_m)

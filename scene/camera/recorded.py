@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import F64
-from trilane.scene.camera.path import CameraPath, Lens
+from trilane.scene.camera.path import CameraPath, Optics, one_lens
 from trilane.scene.detected import NOTHING, Detected
+from trilane.scene.lens import Lens
 from trilane.scene.motion.usable_samples import PlaceOf, by_number, usable_samples
 from trilane.scene.rotations import about, quat_from_matrix, shortest_turn
 from trilane.scene.schema import CameraSpec
@@ -32,21 +33,22 @@ class RawCamera:
     """The content of a camera file, before anything is left out or turned.
 
     `times_s` (N,): seconds. `turns` (N, 3, 3) and `places` (N, 3), metres: camera to world, OpenGL axes. `usual_up`:
-    the axis of the world that is usually up in the format. `fov_y_deg`: field of view of the picture's height with the
-    device held level; `portrait_fov_y_deg`: held upright; `lens`: where these two come from. `notes`: on the file, for
-    people. `place_of`: where a sample stands in the file. `detected`: what the file is, but for its axes and lens.
+    the axis of the world that is usually up in the format. `lenses`: of the picture as the axes of a pose have it,
+    one for all poses or one for each; `lens`: where they come from. `notes`: on the file, for people. `place_of`: where
+    a sample stands in the file. `detected`: what the file is, but for its axes and lens. `pictures`: names of the
+    photos that the poses are of, one for each, or none.
     """
 
     times_s: F64
     turns: F64
     places: F64
     usual_up: str
-    fov_y_deg: float
-    portrait_fov_y_deg: float
+    lenses: tuple[Lens, ...]
     lens: str
     notes: tuple[str, ...]
     place_of: PlaceOf = by_number
     detected: Detected = NOTHING
+    pictures: tuple[str, ...] = ()
 
 
 def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraPath:
@@ -60,10 +62,7 @@ def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraP
     up, quarter, note = _upright(turns, raw.usual_up)
     world = shortest_turn(np.array(up), np.array(UP["y"]))
     quats = quat_from_matrix(world @ turns @ about(2, np.array(quarter * np.pi / 2)))
-    usual = raw.portrait_fov_y_deg if quarter % 2 else raw.fov_y_deg
-    fov = usual if spec.fov_y_deg is None else spec.fov_y_deg
-    source = raw.lens if spec.fov_y_deg is None else "as given"
-    seen = f"field of view {fov:.4g} degrees high, {source}"
+    optics, seen = _optics(raw, usable, quarter, spec)
     notes = (
         *raw.notes,
         note,
@@ -71,9 +70,22 @@ def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraP
         *repairs,
         f"{times[-1] - times[0]:.2f} s, then plays back and forth" if len(times) > 1 else "one pose: held",
     )
-    lens = Lens(fov, spec.near_m, spec.far_m)
     detected = replace(raw.detected, axes=note, lens=seen)
-    return CameraPath(times - times[0], quats, places @ world.T, lens, notes, detected=detected)
+    pictures = tuple(raw.pictures[k] for k in usable) if raw.pictures else ()
+    return CameraPath(times - times[0], quats, places @ world.T, optics, notes, detected=detected, pictures=pictures)
+
+
+def _optics(raw: RawCamera, usable: NDArray[np.intp], quarter: int, spec: CameraSpec) -> tuple[Optics, str]:
+    """The lenses of the `usable` poses, of a picture turned by `quarter`, and a note."""
+    if spec.fov_y_deg is not None:
+        optics = one_lens(spec.fov_y_deg, spec.near_m, spec.far_m)
+        return optics, f"field of view {spec.fov_y_deg:.4g} degrees high, as given"
+    own = raw.lenses if len(raw.lenses) == 1 else tuple(raw.lenses[k] for k in usable)
+    lenses = tuple(lens.turned(quarter) for lens in (own[:1] if len(set(own)) == 1 else own))
+    angles = sorted({f"{lens.fov_y_deg:.4g}" for lens in lenses}, key=float)
+    return Optics(lenses, spec.near_m, spec.far_m), (
+        f"field of view {' to '.join(dict.fromkeys((angles[0], angles[-1])))} degrees high, {raw.lens}"
+    )
 
 
 def _readable(turns: F64, places: F64) -> NDArray[np.bool_]:

@@ -11,12 +11,13 @@ from pathlib import Path
 from trilane.scene.camera.recorded import OPENGL_FROM_OPTICAL, RawCamera
 from trilane.scene.camera.text_table import elapsed, read_table
 from trilane.scene.detected import Detected
+from trilane.scene.lens import centred
 from trilane.scene.rotations import matrix_from_quat, normalised
 
 COLUMNS = 8
 EXPECTED = "a TUM trajectory: time, tx ty tz, qx qy qz qw a line"
-#: Field of view of the Kinect's colour camera, 640x480 at a focal length of 517 pixels: height, width.
-KINECT_DEG, KINECT_UPRIGHT_DEG = 49.8, 63.5
+#: The Kinect's colour camera, as calibrated for the first of these recordings: 49.8 degrees high, 63.5 wide.
+KINECT = centred(640, 480, 517.0)
 
 
 def load_tum(path: Path) -> RawCamera:
@@ -27,6 +28,6 @@ def load_tum(path: Path) -> RawCamera:
     turns = matrix_from_quat(normalised(table[:, [7, 4, 5, 6]])) @ OPENGL_FROM_OPTICAL
     rate = f", {1 / step:.4g}/s" if step > 0 else ""
     notes = (f"TUM trajectory, {len(table)} poses{rate}, optical axes, camera to world",)
-    lens = (KINECT_DEG, KINECT_UPRIGHT_DEG, "usual for a Kinect")
+    lens = ((KINECT,), "usual for a Kinect")
     detected = Detected("TUM trajectory", f"{COLUMNS} columns of numbers", unit="m", rate="by the times of the file")
     return RawCamera(times, turns, table[:, 1:4], "z", *lens, notes, read.place_of, detected)

@@ -101,7 +101,6 @@ class PoseStage:
             for index, (folder, mover) in enumerate(zip(config.avatar_dirs, staged.movers, strict=True))
         ]
         self._camera = staged.camera
-        self._projection = staged.camera.projection(scene.output.width / scene.output.height)
         self._counts = config.posed_vertices
         self._window = config.opened_window()
         self._made: dict[Work, _Made] = {}
@@ -135,11 +134,11 @@ class PoseStage:
         packet["t_sampled_ns"] = time.monotonic_ns()
         packet["media_time_s"] = t_s
         moved = [actor.mover.sample(t_s) for actor in self._actors]
-        view = self._view(t_s, moved)
+        view, projection = self._view(t_s, moved), self._camera.projection(t_s, self._output)
         _require_all_finite(view, moved, frame)
         self._count(packet, view, moved)
-        shown = shown_by([view, *(array for pair in moved for array in pair)])
-        work = self._work_of(shown, lambda: self._make(slot_out, frame, view, moved))
+        shown = shown_by([view, projection, *(array for pair in moved for array in pair)])
+        work = self._work_of(shown, lambda: self._make(slot_out, frame, view, projection, moved))
         packet["work"] = work
         known = self._made.get(Work.FULL if work is Work.REUSE else work)
         if self._skips and known is not None and known.shown == shown:
@@ -182,15 +181,15 @@ class PoseStage:
     def _shown_by(self, work: Work) -> bytes | None:
         return self._made[work].shown if work in self._made else None
 
-    def _make(self, slot_out: int, frame: int, view: F64, moved: Sequence[tuple[F64, F64]]) -> bool:
+    def _make(self, slot_out: int, frame: int, view: F64, projection: F64, moved: Sequence[tuple[F64, F64]]) -> bool:
         """Fill what the header of slot `slot_out` says of camera and avatars; whether an avatar is visible.
 
-        `view` (4,4), and `moved`, each avatar's pose and place, are those of `frame`.
+        `view` and `projection` (4,4), and `moved`, each avatar's pose and place, are those of `frame`.
         """
         packet = self._slots[slot_out]
         packet["avatar_count"] = len(self._actors)
-        packet["view"], packet["projection"] = view, self._projection
-        clip = self._projection @ view
+        packet["view"], packet["projection"] = view, projection
+        clip = projection @ view
         vertices: Sequence[NDArray[np.float32] | None] = self._vertices[slot_out] or [None] * len(self._actors)
         seen = [
             (avatar, one)

@@ -96,7 +96,7 @@ def nerf_file(path: Path, **extra: Any) -> Path:
 def test_nerf_is_opengl_and_z_up_with_its_own_lens(tmp_path: Path) -> None:
     camera = load(nerf_file(tmp_path / "transforms.json", fl_y=400.0, h=480, w=640))
     check_path(camera, 1 / 30)
-    assert camera.lens.fov_y_deg == pytest.approx(np.degrees(2 * np.arctan(240 / 400)))
+    assert camera.lens(0.0, (480, 640)).fov_y_deg == pytest.approx(np.degrees(2 * np.arctan(240 / 400)))
     assert "by `fl_y`" in " ".join(camera.notes)
 
 
@@ -107,8 +107,8 @@ def test_nerf_is_opengl_and_z_up_with_its_own_lens(tmp_path: Path) -> None:
 ])  # fmt: skip
 def test_the_lens_of_a_nerf_file(tmp_path: Path, extra: dict[str, float], fov_y: float) -> None:
     camera = load(nerf_file(tmp_path / "transforms.json", **extra))
-    assert camera.lens.fov_y_deg == pytest.approx(np.degrees(fov_y))
-    assert load(tmp_path / "transforms.json", fov_y_deg=33.0).lens.fov_y_deg == 33.0
+    assert camera.lens(0.0, (480, 640)).fov_y_deg == pytest.approx(np.degrees(fov_y))
+    assert load(tmp_path / "transforms.json", fov_y_deg=33.0).lens(0.0, (480, 640)).fov_y_deg == pytest.approx(33.0)
 
 
 def test_holes_in_a_log_are_mended_and_said(tmp_path: Path) -> None:

@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from trilane.scene.camera.path import CameraPath, Lens, look_at, projection_matrix, view_from_pose
+from trilane.scene.camera.path import CameraPath, look_at, one_lens, projection_matrix, view_from_pose
+from trilane.scene.lens import of_fov_y
 from trilane.scene.motion.motion import Wrap
 from trilane.testing.camera_files import load
 
@@ -26,7 +27,7 @@ def test_a_built_in_camera_is_where_its_formula_says(
     """Farthest at 0, nearest at half the period; the swing is a sine that is 0.6 rad late."""
     camera = load(f"builtin:{name}", near_m=0.1, far_m=50.0)
     assert (camera.duration_s, camera.wrap, camera.recorded) == (period, Wrap.LOOP, False)
-    assert (len(camera.times_s), camera.lens) == (round(period * 30) + 1, Lens(40.0, 0.1, 50.0))
+    assert (len(camera.times_s), camera.optics) == (round(period * 30) + 1, one_lens(40.0, 0.1, 50.0))
     assert camera.notes == (f"built in: {what}, {period:g} s a cycle, field of view 40 degrees high",)
     for share, distance in ((0.0, far), (0.25, (far + near) / 2), (0.5, near), (0.75, (far + near) / 2)):
         angle = math.radians(swing) * math.sin(2 * math.pi * share - 0.6)
@@ -37,7 +38,7 @@ def test_a_built_in_camera_is_where_its_formula_says(
         right = np.array([back[2], 0, -back[0]]) / math.hypot(back[0], back[2])
         assert turn == pytest.approx(np.column_stack([right, np.cross(back, right), back]), abs=1e-9)
         assert turn[1, 1] > 0
-    assert load(f"builtin:{name}", fov_y_deg=33.5).lens.fov_y_deg == 33.5
+    assert load(f"builtin:{name}", fov_y_deg=33.5).optics.lenses == (of_fov_y(33.5),)
 
 
 def test_a_camera_goes_from_above_down_to_the_floor() -> None:
@@ -69,8 +70,8 @@ def test_a_path_between_and_after_its_samples() -> None:
     """A quarter turn about +Y in 2 s while the camera moves 4 m along x."""
     h = math.sqrt(0.5)
     quats, places = np.array([[1.0, 0, 0, 0], [h, 0, h, 0]]), np.array([[0.0, 1, 0], [4.0, 1, 0]])
-    bounce = CameraPath(np.array([0.0, 2.0]), quats, places, Lens(90.0, 0.1, 10.0), ())
-    loop = CameraPath(np.array([0.0, 2.0]), quats, places, Lens(90.0, 0.1, 10.0), (), Wrap.LOOP)
+    bounce = CameraPath(np.array([0.0, 2.0]), quats, places, one_lens(90.0, 0.1, 10.0), ())
+    loop = CameraPath(np.array([0.0, 2.0]), quats, places, one_lens(90.0, 0.1, 10.0), (), Wrap.LOOP)
     assert bounce.wrap is Wrap.BOUNCE and bounce.recorded and bounce.duration_s == 2.0
     for path, t_s, share in ((bounce, 0.5, 0.25), (bounce, 3.5, 0.25), (bounce, 4.5, 0.25), (loop, 3.5, 0.75)):
         turn, place = path.pose(t_s)
@@ -80,7 +81,7 @@ def test_a_path_between_and_after_its_samples() -> None:
             np.array([[math.cos(a), 0, math.sin(a)], [0, 1, 0], [-math.sin(a), 0, math.cos(a)]])
         )
         assert path.sample(t_s) @ [*place, 1.0] == pytest.approx([0, 0, 0, 1])
-    assert bounce.projection(2.0) == pytest.approx(projection_matrix(90.0, 2.0, 0.1, 10.0))
+    assert bounce.projection(0.7, (100, 200)) == pytest.approx(projection_matrix(90.0, 2.0, 0.1, 10.0))
 
 
 def test_a_projection_by_hand() -> None:

@@ -10,18 +10,23 @@ import pytest
 from trilane.body.body import ShapedBody
 from trilane.scene import camera_placement as placement
 from trilane.scene import rotations as rot
-from trilane.scene.camera.path import CameraPath, Lens
+from trilane.scene.camera.path import CameraPath, one_lens
 from trilane.scene.motion.builtin import BUILTIN
 from trilane.scene.motion.motion import Wrap
 from trilane.scene.mover import make_mover
 from trilane.scene.placed_camera import PlacedCamera
 from trilane.scene.schema import AvatarSpec, CameraSpec, OutputSpec, Scene
 
+#: Of x and of y: factor and addend to normalised device coordinates.
+LENS = ((1.3, 0.05), (1.73, -0.1))
+
 
 def path(turns: list[np.ndarray], places: list[list[float]], recorded: bool = True) -> CameraPath:
     quats = rot.quat_from_matrix(np.stack(turns))
     times = np.arange(len(turns)) / 30
-    return CameraPath(times, quats, np.array(places, float), Lens(60.0, 0.1, 50.0), ("path",), Wrap.BOUNCE, recorded)
+    return CameraPath(
+        times, quats, np.array(places, float), one_lens(60.0, 0.1, 50.0), ("path",), Wrap.BOUNCE, recorded
+    )
 
 
 def footage(seed: int = 0) -> placement._Footage:
@@ -36,7 +41,7 @@ def footage(seed: int = 0) -> placement._Footage:
         [[(low, high)[(k >> axis) & 1][axis] for axis in range(3)] for k in range(8)]
         for low, high in zip(lows, highs, strict=True)
     ])  # fmt: skip
-    return placement._Footage(views.astype(np.float32), eyes, boxes, np.array([1.3, 1.73]))
+    return placement._Footage(views.astype(np.float32), eyes, boxes, np.array([LENS] * 3))
 
 
 def plain_visibility(f: placement._Footage, place: np.ndarray) -> tuple[float, float]:
@@ -49,7 +54,7 @@ def plain_visibility(f: placement._Footage, place: np.ndarray) -> tuple[float, f
         for x, y, z in box:
             right, up, back = view @ [c * x + s * z + place[0], y + place[1], c * z - s * x + place[2], 1.0]
             depth = max(-back, 0.3)
-            u, v = right * f.scale[0] / depth, up * f.scale[1] / depth
+            u, v = right * LENS[0][0] / depth + LENS[0][1], up * LENS[1][0] / depth + LENS[1][1]
             front &= bool(-back > 0.3)
             inside &= bool(abs(u) < 0.97 and abs(v) < 0.97)
             rows.append(min(max(v, -1.0), 1.0))
@@ -139,7 +144,7 @@ def test_what_is_filmed_is_boxed_in(body: ShapedBody) -> None:
     scene = Scene(output=OutputSpec(width=800, height=400))
     made = placement._footage(camera, mount, camera.times_s, scene, movers, [body, body])
     assert made.eyes.tolist() == [[0, 1, 5], [1, 1, 5]]
-    assert made.scale == pytest.approx([math.sqrt(3) / 2, math.sqrt(3)])
+    assert made.lenses == pytest.approx(np.array([[[math.sqrt(3) / 2, 0], [math.sqrt(3), 0]]] * 2))
     for k, turn in enumerate((np.eye(3), rot.about(1, 0.3))):
         axes = turn @ mount
         assert made.views[k] == pytest.approx(np.column_stack([axes.T, -axes.T @ made.eyes[k]]), abs=1e-6)
@@ -157,7 +162,7 @@ def test_a_built_in_camera_stays_and_a_placed_one_is_moved_with_its_path() -> No
     eye, axes = turn @ [1.0, 2.0, 3.0] + shift, turn @ look @ mount
     view = placed.sample(0.0)
     assert view[:3, :3] == pytest.approx(axes.T) and view[:3, 3] == pytest.approx(-axes.T @ eye)
-    assert placed.projection(2.0) == pytest.approx(camera.projection(2.0))
+    assert placed.projection(0.0, (240, 480)) == pytest.approx(camera.projection(0.0, (240, 480)))
     for kept, spec in (
         (path([np.eye(3)], [[9, 9, 9]], recorded=False), CameraSpec()),
         (camera, CameraSpec(place="none")),

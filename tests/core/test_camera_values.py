@@ -9,17 +9,23 @@ import numpy as np
 import pytest
 
 from trilane.errors import BadInputError
-from trilane.scene.camera.path import Lens
+from trilane.scene.camera.path import CameraPath, one_lens
 from trilane.scene.camera.recorded import OPENGL_FROM_OPTICAL, RawCamera, path_from_recording
+from trilane.scene.lens import Lens, of_fov_y
 from trilane.scene.motion.motion import Wrap
 from trilane.scene.schema import CameraSpec
 from trilane.testing.camera_files import HEIGHT, load, pixel, rows_of
 
 SPEC = CameraSpec()
+LENSES = (of_fov_y(36.0),)
 
 
 def focal(fov_y_deg: float) -> float:
     return HEIGHT / 2 / math.tan(math.radians(fov_y_deg) / 2)
+
+
+def fov_y(camera: CameraPath) -> float:
+    return camera.lens(0.0, (480, 640)).fov_y_deg
 
 
 def arkit_rows(*rows: str) -> str:
@@ -36,7 +42,8 @@ def test_an_arkit_pose_puts_points_at_their_pixels(tmp_path: Path) -> None:
     camera = load(tmp_path / "a.txt")
     f = focal(36.0)
     assert pixel(camera, [5.0, 3.0, 3.5]) == pytest.approx((320 + f / 8, 240 - f / 4))
-    assert camera.lens == Lens(36.0, 0.05, 100.0)
+    assert fov_y(camera) == pytest.approx(36.0)
+    assert (camera.optics.near_m, camera.optics.far_m, camera.optics.filmed) == (0.05, 100.0, ())
     assert camera.notes == (
         "ARKit log, 1 poses, time in s, camera to world",
         "Y up",
@@ -46,11 +53,13 @@ def test_an_arkit_pose_puts_points_at_their_pixels(tmp_path: Path) -> None:
 
 
 #: A level picture's right (r) and up (u) after the device was turned by quarters: the columns of the matrix x, y.
+#: The long side of a picture of 16:9 that is 36 degrees high: 60.02.
+LONG_DEG = 2 * math.degrees(math.atan(math.tan(math.radians(18)) * 16 / 9))
 HELD = {
     0: ("r", "u", 36.0),
-    1: ("-u", "r", 60.0),
+    1: ("-u", "r", LONG_DEG),
     2: ("-r", "-u", 36.0),
-    3: ("u", "-r", 60.0),
+    3: ("u", "-r", LONG_DEG),
 }
 
 
@@ -67,7 +76,7 @@ def test_a_phone_held_upright_has_the_long_side_high(tmp_path: Path, quarter: in
     axes = np.column_stack([vectors[x], vectors[y], [0, 0, 1], [0, 0, 0]])
     (tmp_path / "a.txt").write_text("0 " + " ".join(map(str, axes.ravel())))
     camera = load(tmp_path / "a.txt")
-    assert camera.lens.fov_y_deg == fov
+    assert fov_y(camera) == pytest.approx(fov)
     f = focal(fov)
     assert pixel(camera, [0.3, 0.2, -2.0]) == pytest.approx((320 + 0.15 * f, 240 - 0.1 * f))
     turned = f", device held so that the picture is turned by {quarter * 90} degrees" if quarter else ""
@@ -90,7 +99,7 @@ def test_a_tum_pose_puts_points_at_their_pixels(tmp_path: Path) -> None:
     h = math.sqrt(0.5)
     (tmp_path / "a.txt").write_text(f"10 1 2 3 {-h} 0 0 {h}\n10.5 1 2 4 {-2 * h} 0 0 {2 * h}\n")
     camera = load(tmp_path / "a.txt")
-    f = focal(49.8)
+    f = 517.0
     # 4 m ahead (+Y), 0.5 m right (+X), 1 m up (+Z): (1.5, 6, 4) of the recording; Y up world: (x, z, -y).
     assert pixel(camera, [1.5, 4.0, -6.0]) == pytest.approx((320 + f / 8, 240 - f / 4))
     assert pixel(camera, [1.5, 4.0, -6.0], 0.5) == pytest.approx((320 + f / 8, 240))
@@ -121,7 +130,7 @@ def test_a_kinect_held_upright_has_its_width_high(tmp_path: Path) -> None:
     """As above, then rolled by 90 degrees about the line of sight: the quaternions' product by hand."""
     (tmp_path / "a.txt").write_text("10 1 2 3 -0.5 0.5 0.5 0.5\n")  # (w, x, y, z) = ½ (1, -1, 1, 1)
     camera = load(tmp_path / "a.txt")
-    assert camera.lens.fov_y_deg == 63.5
+    assert fov_y(camera) == pytest.approx(2 * math.degrees(math.atan(320 / 517)))
     assert camera.notes[1] == "Z up, device held so that the picture is turned by 90 degrees"
     assert camera.notes[0] == "TUM trajectory, 1 poses, optical axes, camera to world"
 
@@ -129,11 +138,11 @@ def test_a_kinect_held_upright_has_its_width_high(tmp_path: Path) -> None:
 def test_a_camera_that_looks_straight_down_keeps_its_picture() -> None:
     """No turn of the picture has its up near the usual one: up is the axis nearest to the picture's own up."""
     down = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # x right, up = -Z, looks along -Y
-    raw = RawCamera(np.zeros(1), down[None], np.zeros((1, 3)), "y", 36.0, 60.0, "usual", ())
+    raw = RawCamera(np.zeros(1), down[None], np.zeros((1, 3)), "y", LENSES, "usual", ())
     camera = path_from_recording(raw, "here", SPEC)
     assert camera.notes[0] == "-Z up, as the camera is held (not Y, usual for the format)"
     assert camera.pose(0.0)[0][:, 1] == pytest.approx([0, 1, 0], abs=1e-12)
-    assert camera.lens.fov_y_deg == 36.0
+    assert fov_y(camera) == pytest.approx(36.0)
 
 
 @pytest.mark.parametrize(
@@ -143,7 +152,7 @@ def test_up_is_the_axis_that_the_picture_shows_up(axis: int, sign: int, usual: s
     """Cameras that look along the usual up: every axis of the picture is level, so its own up decides."""
     up, look = np.eye(3)[axis] * sign, np.eye(3)["xyz".index(usual)]
     turns = np.column_stack([np.cross(look, up), up, -look])
-    raw = RawCamera(np.zeros(1), turns[None], np.ones((1, 3)), usual, 36.0, 60.0, "usual", ())
+    raw = RawCamera(np.zeros(1), turns[None], np.ones((1, 3)), usual, LENSES, "usual", ())
     camera = path_from_recording(raw, "here", SPEC)
     assert camera.notes[0].startswith(f"{'-' if sign < 0 else ''}{'XYZ'[axis]} up, as the camera is held")
     world = camera.pose(0.0)[0] @ turns.T
@@ -155,7 +164,7 @@ def test_up_is_the_axis_that_the_picture_shows_up(axis: int, sign: int, usual: s
 def test_the_usual_up_holds_above_a_cosine_of_0_3(cosine: float, turned: bool) -> None:
     sine = math.sqrt(1 - cosine**2)
     pitched = np.array([[1.0, 0, 0], [0, cosine, sine], [0, -sine, cosine]])  # up (0, cos, -sin): looks down steeply
-    raw = RawCamera(np.zeros(1), pitched[None], np.zeros((1, 3)), "y", 36.0, 60.0, "usual", ())
+    raw = RawCamera(np.zeros(1), pitched[None], np.zeros((1, 3)), "y", LENSES, "usual", ())
     note = path_from_recording(raw, "here", SPEC).notes[0]
     assert note == ("Y up" if turned else "-Z up, as the camera is held (not Y, usual for the format)")
 
@@ -192,14 +201,14 @@ def test_places_farther_than_100_km_are_left_out() -> None:
     for far, used in ((99_999.0, 3), (1e5, 2), (-1e5, 2), (np.nan, 2)):
         places = np.zeros((3, 3))
         places[1, 2] = far
-        raw = RawCamera(np.arange(3.0), turns, places, "y", 36.0, 60.0, "usual", ())
+        raw = RawCamera(np.arange(3.0), turns, places, "y", LENSES, "usual", ())
         assert len(path_from_recording(raw, "here", SPEC).times_s) == used
 
 
 def test_what_the_scene_says_of_the_lens_wins() -> None:
-    raw = RawCamera(np.arange(2.0), np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)), "y", 36.0, 60.0, "usual", ("x",))
+    raw = RawCamera(np.arange(2.0), np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)), "y", LENSES, "usual", ("x",))
     camera = path_from_recording(raw, "here", CameraSpec(fov_y_deg=50.5, near_m=0.2, far_m=30.0))
-    assert camera.lens == Lens(50.5, 0.2, 30.0)
+    assert camera.optics == one_lens(50.5, 0.2, 30.0)
     assert camera.notes == (
         "x",
         "Y up",
@@ -207,7 +216,7 @@ def test_what_the_scene_says_of_the_lens_wins() -> None:
         "1.00 s, then plays back and forth",
     )
     assert camera.recorded and camera.wrap is Wrap.BOUNCE
-    holed = RawCamera(np.arange(5.0), np.tile(np.eye(3), (5, 1, 1)), np.zeros((5, 3)), "y", 36.0, 60.0, "usual", ())
+    holed = RawCamera(np.arange(5.0), np.tile(np.eye(3), (5, 1, 1)), np.zeros((5, 3)), "y", LENSES, "usual", ())
     holed.places[2] = np.nan
     assert path_from_recording(holed, "here", SPEC).notes == (
         "Y up",
@@ -222,3 +231,28 @@ def test_times_too_far_apart_for_a_number_are_left_out(tmp_path: Path) -> None:
     row = LOOKS_ALONG_X.format(x=0, y=0, z=0)
     (tmp_path / "a.txt").write_text(arkit_rows(f"-1.7e308 {row}", f"1.7e308 {row}"))
     assert load(tmp_path / "a.txt").times_s.tolist() == [0.0]
+
+
+def test_each_pose_may_have_a_lens_of_its_own() -> None:
+    """Half way from f = 400 to 600 of 480 rows it is 500; a pose that is left out takes its lens and photo along."""
+    lenses = tuple(Lens(640.0, 480.0, f, f, c, 240.0) for f, c in ((400.0, 320.0), (9.0, 0.0), (600.0, 330.0)))
+    raw = RawCamera(
+        np.arange(3.0), np.tile(np.eye(3), (3, 1, 1)), np.zeros((3, 3)), "y", lenses, "by the file", (),
+        pictures=("a", "b", "c"),
+    )  # fmt: skip
+    raw.places[1] = np.nan
+    camera = path_from_recording(raw, "here", SPEC)
+    assert camera.pictures == ("a", "c")
+    assert camera.lens(1.0, (480, 640)) == Lens(640, 480, 500, 500, 325, 240)
+    x, y = pixel(camera, [0.2, 0.1, -1.0], 1.0)
+    assert (x, y) == pytest.approx((325 + 100, 240 - 50))
+    assert camera.notes[1] == "field of view 43.6 to 61.93 degrees high, by the file"
+
+
+def test_a_principal_point_turns_with_the_device() -> None:
+    """The camera's x axis points down: its picture is turned clockwise, and column cx becomes row cx."""
+    held = np.column_stack([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    lens = Lens(640.0, 480.0, 500.0, 480.0, 300.0, 200.0)
+    raw = RawCamera(np.zeros(1), held[None].astype(float), np.zeros((1, 3)), "y", (lens,), "by the file", ())
+    camera = path_from_recording(raw, "here", SPEC)
+    assert camera.optics.lenses == (Lens(480.0, 640.0, 480.0, 500.0, 280.0, 300.0),)

@@ -208,7 +208,7 @@ def test_a_packet_holds_what_motion_camera_and_layout_give(
     assert not slots[0].header["avatar_count"]
     pose = slots[1].header
     assert (int(pose["frame"]), int(pose["avatar_count"]), float(pose["media_time_s"])) == (40, 2, 1.6)
-    view, projection = staged.camera.sample(1.6), staged.camera.projection(1.6)
+    view, projection = staged.camera.sample(1.6), staged.camera.projection(1.6, (200, 320))
     np.testing.assert_allclose(pose["view"], view, rtol=1e-6)
     np.testing.assert_allclose(pose["projection"], projection, rtol=1e-6)
     rects, vertices = [], np.zeros((total, 3), np.float32)
@@ -243,7 +243,7 @@ def test_a_planned_packet_is_what_the_planner_says_of_the_avatars_on_the_screen(
     stage, slot, held = PoseStage(config, assets), packet(1), None
     stage.bind([], [slot])
     bounds, skeleton = MeshBounds(body, standoff_m=CLOTHES_STANDOFF_M), Skeleton(body.joints, body.body.parents)
-    projection = staged.camera.projection(640 / 480)
+    projection = staged.camera.projection(0.0, (480, 640))
     for frame in range(0, 300, 20):
         metrics, t_s = stage.run(frame, None, 0), frame / 30
         posed = skeleton.pose(*staged.movers[0].sample(t_s), staged.movers[0].world)

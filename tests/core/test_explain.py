@@ -344,7 +344,7 @@ def test_measured_errors_are_those_of_the_drawn_vertices(checked: Checked) -> No
     body, staged = shaped_body(checked.assets, 0), staged_of(checked.assets)
     t_s = 7 / checked.config.scene.fps
     posed = Skeleton(body.joints, body.body.parents).pose(*staged.movers[0].sample(t_s), staged.movers[0].world)
-    clip = staged.camera.projection(320 / 240) @ staged.camera.sample(t_s)
+    clip = staged.camera.projection(t_s, (240, 320)) @ staged.camera.sample(t_s)
 
     def places(vertices: Any) -> Any:
         points = np.concatenate([vertices, np.ones((len(vertices), 1))], axis=1) @ clip.T
@@ -365,7 +365,9 @@ def test_a_vertex_is_on_the_picture_from_the_near_plane_to_the_far_one(checked: 
     plan = ScenePlan(checked.config, checked.assets)
     projection = np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, -2, -3], [0, 0, -1, 0]])
     plan._staged = SimpleNamespace(  # type: ignore[assignment]
-        camera=SimpleNamespace(projection=lambda aspect: projection * aspect / (4 / 3), sample=lambda _t_s: np.eye(4))
+        camera=SimpleNamespace(
+            projection=lambda _t_s, output: projection * output[1] / output[0] / (4 / 3), sample=lambda _t_s: np.eye(4)
+        )
     )
     points = np.array(
         [(0.5, 0.5, -1.0), (0.6, -0.3, -1.2), (0, 0, -3), (0, 0, -0.99), (0, 0, -3.01), (0, 0, 2), (2, 0, -1.5)]

@@ -16,9 +16,12 @@ from trilane.testing.camera_files import angle, load, nerf_text, pixel, pose_z_u
 
 
 def test_a_nerf_view_puts_points_at_their_pixels(tmp_path: Path) -> None:
-    """fl_y = 600 of 480 rows: at (1, 2, 3), 4 m along +Y, 0.5 m right (+X), 1 m up (+Z) is at 75 right, 150 above."""
+    """fl_y = 600 of 480 rows: at (1, 2, 3), 4 m along +Y, 0.5 m right (+X), 1 m up (+Z) is 150 above the middle."""
     (tmp_path / "a.json").write_text(nerf_text(pose_z_up(0, (1, 2, 3)), fl_y=600, h=480, fl_x=300, w=640))
-    assert pixel(load(tmp_path / "a.json"), [1.5, 4.0, -6.0]) == pytest.approx((395, 90))
+    assert pixel(load(tmp_path / "a.json"), [1.5, 4.0, -6.0]) == pytest.approx((320 + 300 / 8, 90))
+    lens = {"fl_y": 600, "h": 480, "fl_x": 300, "w": 640, "cx": 310, "cy": 260}
+    (tmp_path / "a.json").write_text(nerf_text(pose_z_up(0, (1, 2, 3)), **lens))
+    assert pixel(load(tmp_path / "a.json"), [1.5, 4.0, -6.0]) == pytest.approx((310 + 300 / 8, 110))
     (tmp_path / "a.json").write_text(nerf_text(pose_z_up(0, (1, 2, 3))[:3]))  # 3x4 is enough
     load(tmp_path / "a.json")
 
@@ -27,10 +30,10 @@ def test_a_nerf_view_puts_points_at_their_pixels(tmp_path: Path) -> None:
 LENSES: list[tuple[dict[str, float], float, float, str]] = [
     ({"fl_y": 400, "h": 480, "w": 640}, 0.6, 0.8, "by `fl_y`"),
     ({"fl_y": 400, "h": 480}, 0.6, 0.8, "by `fl_y`"),  # the usual aspect, 4:3
-    ({"fl_y": 400, "h": 480, "w": 640, "fl_x": 800, "camera_angle_x": 1.0}, 0.6, 0.8, "by `fl_y`"),
+    ({"fl_y": 400, "h": 480, "w": 640, "fl_x": 800, "camera_angle_x": 1.0}, 0.6, 0.4, "by `fl_x` and `fl_y`"),
     ({"fl_x": 500, "w": 800, "h": 400}, 0.4, 0.8, "by `fl_x`"),
     ({"fl_x": 500, "w": 800}, 0.6, 0.8, "by `fl_x`"),
-    ({"fl_x": 500, "w": 800, "h": 400, "fl_y": 100}, 2.0, 4.0, "by `fl_y`"),
+    ({"fl_x": 500, "w": 800, "h": 400, "fl_y": 100}, 2.0, 0.8, "by `fl_x` and `fl_y`"),
     ({"fl_y": 500, "w": 800, "camera_angle_x": math.pi / 2}, 0.75, 1.0, "by `camera_angle_x`"),  # no `h`
     ({"fl_x": 500, "h": 800, "camera_angle_x": math.pi / 2}, 0.75, 1.0, "by `camera_angle_x`"),  # no `w`
     ({"camera_angle_x": math.pi / 2, "w": 1000, "h": 500}, 0.5, 1.0, "by `camera_angle_x`"),
@@ -48,7 +51,7 @@ def test_the_lens_of_height_and_of_width(
     for matrix, tangent in ((pose_z_up(0), tan_y), (pose_z_up(0) @ roll, tan_x)):
         (tmp_path / "a.json").write_text(nerf_text(matrix, **keys))
         camera = load(tmp_path / "a.json")
-        assert camera.lens.fov_y_deg == pytest.approx(angle(tangent))
+        assert camera.lens(0.0, (480, 640)).fov_y_deg == pytest.approx(angle(tangent))
         assert camera.notes[2] == f"field of view {angle(tangent):.4g} degrees high, {note}"
 
 
@@ -144,7 +147,7 @@ def test_fields_of_view_just_inside_the_range_are_read(tmp_path: Path) -> None:
     for degrees in (1.1, 169.0):
         tangent = math.tan(math.radians(degrees / 2))
         (tmp_path / "a.json").write_text(nerf_text(pose_z_up(0), fl_y=1.0, h=2 * tangent, w=2 * tangent))
-        assert load(tmp_path / "a.json").lens.fov_y_deg == pytest.approx(degrees)
+        assert load(tmp_path / "a.json").lens(0.0, (480, 640)).fov_y_deg == pytest.approx(degrees)
 
 
 def test_a_nerf_file_may_have_so_many_views(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

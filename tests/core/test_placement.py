@@ -19,7 +19,7 @@ from trilane.scene.rotations import about, normalised
 from trilane.scene.schema import AvatarSpec, CameraSpec, Scene
 from trilane.scene.staging import Staged, stage_scene
 
-ASPECT = 640 / 480
+OUTPUT = (480, 640)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def staged(body: ShapedBody, camera: Path | str, motion: Path | str = "builtin:w
 def whole_share(scene: Staged, body: ShapedBody, frames: int) -> float:
     """Share of frames with every outline vertex of the first avatar in the picture."""
     skeleton, shape = Skeleton(body.joints, body.body.parents), outline(body)
-    projection, mover = scene.camera.projection(ASPECT), scene.movers[0]
+    projection, mover = scene.camera.projection(0.0, OUTPUT), scene.movers[0]
     whole = 0
     for frame in range(0, frames, 4):
         pose, place = mover.sample(frame / 30)

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from trilane.body.body import ShapedBody
-from trilane.scene.camera.path import CameraPath, Lens
+from trilane.scene.camera.path import CameraPath, Optics
+from trilane.scene.lens import Known, Lens, of_fov_y
 from trilane.scene.motion.motion import Motion, Wrap
 from trilane.scene.mover import Mover
 from trilane.scene.placed_camera import PlacedCamera
@@ -44,9 +45,9 @@ def test_every_field_survives_as_an_array(wrap: Wrap, leg_m: float | None) -> No
         np.array([2.0, 3.0]),
         ("n",),
     )
-    lens = Lens(33.0, 0.2, 44.0)
+    lens = Optics((Lens(9.0, 8.0, 7.0, 6.0, 5.0, 4.0, Known.WIDTH), of_fov_y(33.0)), 0.2, 44.0, ((3, 4),))
     quats, places = random.normal(size=(2, 4)), random.normal(size=(2, 3))
-    camera = CameraPath(np.array([0.0, 2.0]), quats, places, lens, ("c",), wrap, leg_m is None)
+    camera = CameraPath(np.array([0.0, 2.0]), quats, places, lens, ("c",), wrap, leg_m is None, pictures=("a", "b"))
     placed = PlacedCamera(camera, random.normal(size=(3, 3)), random.normal(size=3), random.normal(size=(3, 3)), ("p",))
     arrays = staged_to_arrays(Staged((mover, mover), placed, ("all",)))
     again = staged_from_arrays(arrays)

@@ -129,7 +129,7 @@ def test_the_cast_has_room_for_its_clothes(checked: Checked) -> None:
     cast = Cast(checked)
     (actor,) = cast._actors
     posed = actor.skeleton.pose(*actor.mover.sample(0.5), actor.mover.world)
-    clip = cast.projection @ cast._camera.sample(0.5)
+    clip = cast.projection(15) @ cast._camera.sample(0.5)
     clothed, bare = (
         MeshBounds(actor.data.shaped, standoff_m=off).rect(posed, clip) for off in (CLOTHES_STANDOFF_M, 0.0)
     )

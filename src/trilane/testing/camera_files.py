@@ -23,7 +23,7 @@ def load(source: Path | str, **spec: Any) -> CameraPath:
 
 def pixel(camera: CameraPath, point: list[float], t_s: float = 0.0) -> tuple[float, float]:
     """Column and row of a world point in a picture of 640x480, origin top left."""
-    x, y, _, w = camera.projection(WIDTH / HEIGHT) @ camera.sample(t_s) @ [*point, 1.0]
+    x, y, _, w = camera.projection(t_s, (HEIGHT, WIDTH)) @ camera.sample(t_s) @ [*point, 1.0]
     return (x / w + 1) / 2 * WIDTH, (1 - y / w) / 2 * HEIGHT
 
 
