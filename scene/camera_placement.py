@@ -10,7 +10,7 @@ constant angle, so that it does not look down on people.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from trilane.scene.body_outline import outline
 from trilane.scene.camera.path import CameraPath, view_from_pose
 from trilane.scene.mover import Mover
 from trilane.scene.placed_camera import PlacedCamera
-from trilane.scene.rotations import about
+from trilane.scene.rotations import about, quat_from_matrix, quat_multiply
 from trilane.scene.schema import Scene
 
 #: Frames at which a place is scored.
@@ -35,6 +35,8 @@ FINER_M = (0.25, 0.12, 0.06)
 LOWEST_EYE_M = 0.3
 #: A body counts as whole in the picture when it is within this part of the picture's half width and half height.
 MARGIN = 0.97
+#: With whole bodies in a smaller part of the frames the run warns.
+ENOUGH_WHOLE = 0.5
 #: Range of the camera's median line of sight, degrees above the horizon; outside of it the camera is tilted to its end.
 SIGHT_DEG = (-24.0, 0.0)
 LARGEST_TILT_DEG = 40.0
@@ -69,12 +71,17 @@ def place_camera(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies
     `movers`: its avatars.
     `bodies`: of these avatars, in the same order.
     """
-    if not path.recorded or scene.camera.place == "none":
-        return PlacedCamera(path, np.eye(3), np.zeros(3), np.eye(3), ())
     times = np.linspace(0.0, (scene.frames - 1) / scene.fps, min(scene.frames, SCORED_FRAMES))
+    if not path.recorded:
+        return PlacedCamera(path, np.eye(3), np.zeros(3), np.eye(3), ())
+    if scene.camera.place == "none":
+        footage = _footage(path, np.eye(3), times, scene, movers, bodies)
+        whole, size = _filmed(footage, footage.boxes.astype(np.float32).transpose(2, 1, 0)[:, :, None])
+        return PlacedCamera(path, np.eye(3), np.zeros(3), np.eye(3), _seen_notes(whole[0], size[0]))
+    levelled, level, middle = _from_the_middle(path)
     tilt = _tilt_deg(path, times) if scene.background in SYNTHETIC_BACKGROUNDS else 0.0
     mount = about(0, np.radians(tilt))
-    footage = _footage(path, mount, times, scene, movers, bodies)
+    footage = _footage(levelled, mount, times, scene, movers, bodies)
     places = _coarse_grid(footage)
     best = _best(footage, places)
     for step in FINER_M:
@@ -86,9 +93,32 @@ def place_camera(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies
     notes = (
         *tilted,
         f"camera set down {_distance(footage, best):.1f} m from the avatar, {eye:.1f} m over the floor on average",
-        f"whole body in the picture in {whole[0]:.0%} of the frames, {size[0]:.0%} of its height on average",
+        *_seen_notes(whole[0], size[0]),
     )
-    return PlacedCamera(path, turn, shift, mount, notes)
+    return PlacedCamera(path, turn @ level, shift - turn @ level @ middle, mount, notes)
+
+
+def _seen_notes(whole: float, size: float) -> tuple[str, ...]:
+    """How much of the bodies is filmed, and a warning where it is little."""
+    seen = f"whole body in the picture in {whole:.0%} of the frames, {size:.0%} of its height on average"
+    if whole >= ENOUGH_WHOLE:
+        return (seen,)
+    return seen, (
+        f"warning: the body is whole in less than {ENOUGH_WHOLE:.0%} of the frames; if the picture lies on its side or "
+        "looks past the body, state camera.up_axis or another camera.place"
+    )
+
+
+def _from_the_middle(path: CameraPath) -> tuple[CameraPath, F64, F64]:
+    """`path` about its middle, first looking along -Z; and the turn (3, 3) and middle (3,) that were taken off.
+
+    So the grid of places is the same however the file's world is turned, and wherever it has its origin.
+    """
+    ahead = path.pose(0.0)[0][:, 2]
+    level = about(1, -np.arctan2(ahead[0], ahead[2]))
+    middle = path.places.mean(axis=0)
+    turned = quat_multiply(quat_from_matrix(level), path.quats)
+    return replace(path, quats=turned, places=(path.places - middle) @ level.T), level, middle
 
 
 def _tilt_deg(path: CameraPath, times: F64) -> float:
@@ -156,6 +186,12 @@ def _visibility(footage: _Footage, places: F64) -> tuple[F64, F64]:
     x = cos * corners[0] + sin * corners[2] + places32[:, 0]
     y = corners[1] + places32[:, 1]
     z = cos * corners[2] - sin * corners[0] + places32[:, 2]
+    return _filmed(footage, (x, y, z))
+
+
+def _filmed(footage: _Footage, corners: Sequence[F32] | F32) -> tuple[F64, F64]:
+    """As `_visibility`, of boxes with `corners` x, y, z, each (8, S, F), in the path's world."""
+    x, y, z = corners
     right, up, back = (_row(footage.views[:, k], x, y, z) for k in range(3))
     depth = np.maximum(-back, NEAREST_M)
     in_front = (-back > NEAREST_M).all(axis=0)

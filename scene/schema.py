@@ -94,13 +94,14 @@ class CameraSpec(Table):
     """The camera.
 
     `source`: `builtin:NAME` or a file. `fov_y_deg`: of the picture's height; None for that of the file, or the usual
-    one of its format. `near_m`, `far_m`: clip planes. `place`: whether a recorded camera is placed in the scene
-    (`auto`) or stays where it was recorded (`none`).
+    one of its format. `up_axis`: of the file's world. `near_m`, `far_m`: clip planes. `place`: whether a recorded
+    camera is placed in the scene (`auto`) or stays where it was recorded (`none`).
     """
 
     source: str = "builtin:orbit"
     format: Literal["auto", "arkit", "tum", "nerf"] = "auto"
     fov_y_deg: float | None = Field(default=None, gt=1, lt=170)
+    up_axis: Literal["auto", "x", "-x", "y", "-y", "z", "-z"] = "auto"
     near_m: float = Field(default=0.05, gt=0, allow_inf_nan=False)
     far_m: float = Field(default=100.0, gt=0, allow_inf_nan=False)
     place: Literal["auto", "none"] = "auto"

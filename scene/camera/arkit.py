@@ -41,4 +41,5 @@ def load_arkit(path: Path) -> RawCamera:
         notes,
         read.place_of,
         Detected("ARKit log", f"{COLUMNS} columns of numbers", unit="m", rate=f"by the times of the file, in {unit}"),
+        is_levelled=True,
     )

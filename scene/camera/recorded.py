@@ -13,17 +13,20 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F64
 from trilane.scene.camera.path import CameraPath, Optics, one_lens
+from trilane.scene.camera.upright import UP
+from trilane.scene.camera.upright import upright as find_upright
 from trilane.scene.detected import NOTHING, Detected
 from trilane.scene.lens import Lens
 from trilane.scene.motion.usable_samples import PlaceOf, by_number, usable_samples
 from trilane.scene.rotations import about, quat_from_matrix, shortest_turn
 from trilane.scene.schema import CameraSpec
 
-UP = {"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-#: The usual up of the format holds when its cosine with the picture's mean up is above this.
-LEAST_UP_COSINE = 0.3
 #: A matrix is taken for a rotation when |R^T R - 1| is below this.
 SKEW = 0.05
+#: Places are left out that are farther than this from the others; and the origin of a map from which they all are
+#: farther than MAP_M, where float32 no longer resolves tenths of a millimetre, is moved to their middle.
+FARTHEST_M, MAP_M = 1e5, 1e3
+NOT_FINITE, FAR_OFF = "not finite", f"farther than {FARTHEST_M / 1000:.0f} km from the others"
 #: Optical axes (x right, y down, z ahead) to OpenGL axes.
 OPENGL_FROM_OPTICAL: F64 = np.diag([1.0, -1.0, -1.0])
 
@@ -36,7 +39,8 @@ class RawCamera:
     the axis of the world that is usually up in the format. `lenses`: of the picture as the axes of a pose have it,
     one for all poses or one for each; `lens`: where they come from. `notes`: on the file, for people. `place_of`: where
     a sample stands in the file. `detected`: what the file is, but for its axes and lens. `pictures`: names of the
-    photos that the poses are of, one for each, or none.
+    photos that the poses are of, one for each, or none. `is_levelled`: whether the world of the format is aligned with
+    gravity, by its definition.
     """
 
     times_s: F64
@@ -49,6 +53,7 @@ class RawCamera:
     place_of: PlaceOf = by_number
     detected: Detected = NOTHING
     pictures: tuple[str, ...] = ()
+    is_levelled: bool = False
 
 
 def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraPath:
@@ -57,20 +62,25 @@ def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraP
     `raw`: its content. `where`: its path, for messages. `spec`: of the scene, with the lens. Raises BadInputError when
     more than half of the poses are unusable.
     """
-    usable, repairs = usable_samples(where, raw.times_s, _readable(raw.turns, raw.places), raw.place_of)
-    times, turns, places = raw.times_s[usable], raw.turns[usable], raw.places[usable]
-    up, quarter, note = _upright(turns, raw.usual_up)
-    world = shortest_turn(np.array(up), np.array(UP["y"]))
-    quats = quat_from_matrix(world @ turns @ about(2, np.array(quarter * np.pi / 2)))
-    optics, seen = _optics(raw, usable, quarter, spec)
+    near, offset_notes = near_origin(raw.places)
+    faults = _faults(raw.times_s, raw.turns, near)
+    readable = ~np.logical_or.reduce(list(faults.values()))
+    broken = " or ".join(fault for fault, of in faults.items() if of.any())
+    usable, repairs = usable_samples(where, raw.times_s, readable, raw.place_of, broken or NOT_FINITE)
+    times, turns, places = raw.times_s[usable], raw.turns[usable], near[usable]
+    upright = find_upright(turns, raw.usual_up, raw.is_levelled, spec.up_axis)
+    world = shortest_turn(upright.up, np.array(UP["y"]))
+    quats = quat_from_matrix(world @ turns @ about(2, np.array(upright.quarter * np.pi / 2)))
+    optics, seen = _optics(raw, usable, upright.quarter, spec)
     notes = (
         *raw.notes,
-        note,
+        *offset_notes,
+        upright.note,
         seen,
         *repairs,
         f"{times[-1] - times[0]:.2f} s, then plays back and forth" if len(times) > 1 else "one pose: held",
     )
-    detected = replace(raw.detected, axes=note, lens=seen)
+    detected = replace(raw.detected, axes=upright.note, lens=seen)
     pictures = tuple(raw.pictures[k] for k in usable) if raw.pictures else ()
     return CameraPath(times - times[0], quats, places @ world.T, optics, notes, detected=detected, pictures=pictures)
 
@@ -88,31 +98,23 @@ def _optics(raw: RawCamera, usable: NDArray[np.intp], quarter: int, spec: Camera
     )
 
 
-def _readable(turns: F64, places: F64) -> NDArray[np.bool_]:
-    """Whether each pose (N,) is finite, its matrix a rotation and its place not absurdly far off."""
-    finite = np.asarray(np.isfinite(turns).all(axis=(1, 2)) & np.isfinite(places).all(axis=1))
-    safe = np.where(finite[:, None, None], turns, 0.0)
+def near_origin(places: F64) -> tuple[F64, tuple[str, ...]]:
+    """`places` (N, 3) without the offset of a map, such as that of UTM coordinates, and a note on it."""
+    finite = np.isfinite(places).all(axis=1)
+    middle = np.median(places[finite], axis=0) if finite.any() else np.zeros(3)
+    if np.abs(middle).max() <= MAP_M:
+        return places, ()
+    offset = np.round(middle)
+    text = ", ".join(f"{value:.0f}" for value in offset)
+    return places - offset, (f"origin of the map moved: ({text}) m subtracted from all places",)
+
+
+def _faults(times_s: F64, turns: F64, places: F64) -> dict[str, NDArray[np.bool_]]:
+    """What can be wrong with a pose, in words, and which poses (N,) have it; a pose has one fault at most."""
+    finite = np.isfinite(times_s) & np.isfinite(turns).all(axis=(1, 2)) & np.isfinite(places).all(axis=1)
+    safe, near = np.where(finite[:, None, None], turns, 0.0), np.where(finite[:, None], places, 0.0)
     with np.errstate(over="ignore", invalid="ignore"):
         skew = np.abs(np.swapaxes(safe, -1, -2) @ safe - np.eye(3)).max(axis=(1, 2))
         rotation = (skew < SKEW) & (np.linalg.det(safe) > 0)
-        return np.asarray(finite & rotation & (np.abs(np.where(finite[:, None], places, 0.0)) < 1e5).all(axis=1))
-
-
-def _upright(turns: F64, usual: str) -> tuple[tuple[float, float, float], int, str]:
-    """Up axis of the world, quarter turns of the picture, and a note.
-
-    The picture is turned so that its up is nearest to the usual one. Where the two disagree even then, the picture is
-    not turned, and up is the axis nearest to the picture's own up.
-    """
-    x, y = turns[:, :, 0].mean(axis=0), turns[:, :, 1].mean(axis=0)
-    ups = np.array([y, -x, -y, x])
-    cosines = ups @ np.array(UP[usual])
-    quarter = int(np.argmax(cosines))
-    if cosines[quarter] > LEAST_UP_COSINE:
-        turned = f", device held so that the picture is turned by {quarter * 90} degrees" if quarter else ""
-        return UP[usual], quarter, f"{usual.upper()} up{turned}"
-    axis = int(np.argmax(np.abs(y)))
-    sign = 1.0 if y[axis] >= 0 else -1.0
-    vector = (sign * (axis == 0), sign * (axis == 1), sign * (axis == 2))
-    name = f"{'-' if sign < 0 else ''}{'XYZ'[axis]}"
-    return vector, 0, f"{name} up, as the camera is held (not {usual.upper()}, usual for the format)"
+    is_far = (np.abs(near) >= FARTHEST_M).any(axis=1)
+    return {NOT_FINITE: ~finite, "no rotation": finite & ~rotation, FAR_OFF: finite & rotation & is_far}

@@ -27,12 +27,17 @@ def by_number(index: int) -> str:
 
 
 def usable_samples(
-    where: str, times_s: F64, readable: NDArray[np.bool_], place_of: PlaceOf = by_number
+    where: str,
+    times_s: F64,
+    readable: NDArray[np.bool_],
+    place_of: PlaceOf = by_number,
+    broken_as: str = "not finite or no rotation",
 ) -> tuple[NDArray[np.intp], tuple[str, ...]]:
     """Indices of the usable samples, and notes on the others and on gaps in time.
 
     `where`: the file, for messages. `times_s` (T,): of the samples. `readable` (T,): whether their values are readable.
-    `place_of`: where each stands in the file. Raises BadInputError when less than half of the samples are usable.
+    `place_of`: where each stands in the file. `broken_as`: what those that are not readable are. Raises BadInputError
+    when less than half of the samples are usable.
     """
     timed = readable & np.isfinite(times_s)
     broken = int(len(times_s) - timed.sum())
@@ -43,13 +48,12 @@ def usable_samples(
     if not len(increasing) or 2 * len(increasing) < len(times_s):
         raise BadInputError(
             where,
-            f"{broken} samples that are not finite numbers or no rotation{first} and {late} times that do not "
-            f"increase, of {len(times_s)}",
+            f"{broken} samples that are {broken_as}{first} and {late} times that do not increase, of {len(times_s)}",
             "at least half of the samples sound",
         )
     notes = []
     if broken:
-        notes.append(f"{broken} samples not finite or no rotation{first}, interpolated across")
+        notes.append(f"{broken} samples {broken_as}{first}, interpolated across")
     if late:
         notes.append(f"{late} samples with repeated or decreasing times left out")
     return increasing, (*notes, *_gap_notes(times_s[increasing]))

@@ -131,7 +131,7 @@ WRONG = {
     "ragged": (arkit_line(0, np.eye(3), np.zeros(3)) + "\n1 2\n", "line 2"),
     "words": (" ".join(["x"] * 13), "could not convert"),
     "comments only": ("# nothing\n", "0 columns"),
-    "no rotations": (arkit_line(0, np.zeros((3, 3)), np.zeros(3)), "1 samples that are not finite"),
+    "no rotations": (arkit_line(0, np.zeros((3, 3)), np.zeros(3)), "1 samples that are no rotation"),
     "empty": ("", "an empty file"),
     "not json": ("{", "no valid JSON"),
     "no frames": ("{}", "no list `frames`"),

@@ -154,7 +154,7 @@ def test_what_is_filmed_is_boxed_in(body: ShapedBody) -> None:
     }
 
 
-def test_a_built_in_camera_stays_and_a_placed_one_is_moved_with_its_path() -> None:
+def test_a_built_in_camera_stays_and_a_placed_one_is_moved_with_its_path(body: ShapedBody) -> None:
     look = rot.about(0, 0.3) @ rot.about(1, 0.4)
     camera = path([look], [[1.0, 2.0, 3.0]])
     turn, mount, shift = rot.about(1, 0.7), rot.about(0, 0.1), np.array([0.5, 0.0, -1.0])
@@ -163,12 +163,24 @@ def test_a_built_in_camera_stays_and_a_placed_one_is_moved_with_its_path() -> No
     view = placed.sample(0.0)
     assert view[:3, :3] == pytest.approx(axes.T) and view[:3, 3] == pytest.approx(-axes.T @ eye)
     assert placed.projection(0.0, (240, 480)) == pytest.approx(camera.projection(0.0, (240, 480)))
-    for kept, spec in (
-        (path([np.eye(3)], [[9, 9, 9]], recorded=False), CameraSpec()),
-        (camera, CameraSpec(place="none")),
-    ):
-        same = placement.place_camera(kept, Scene(camera=spec), [], [])
-        assert same.sample(0.0) == pytest.approx(kept.sample(0.0)) and same.notes == ()
+    built_in = path([np.eye(3)], [[9, 9, 9]], recorded=False)
+    same = placement.place_camera(built_in, Scene(), [], [])
+    assert same.sample(0.0) == pytest.approx(built_in.sample(0.0)) and same.notes == ()
+    mover = make_mover(AvatarSpec(), BUILTIN["t-pose"](), body)
+    same = placement.place_camera(camera, Scene(frames=2, camera=CameraSpec(place="none")), [mover], [body])
+    assert same.sample(0.0) == pytest.approx(camera.sample(0.0))
+    assert same.notes == (
+        "whole body in the picture in 0% of the frames, 21% of its height on average",
+        "warning: the body is whole in less than 50% of the frames; if the picture lies on its side or looks past the "
+        "body, state camera.up_axis or another camera.place",
+    )
+
+
+def test_the_warning_of_a_body_that_is_not_filmed() -> None:
+    assert len(placement._seen_notes(0.5, 0.6)) == 1
+    seen, warning = placement._seen_notes(0.49, 0.6)
+    assert seen == "whole body in the picture in 49% of the frames, 60% of its height on average"
+    assert warning.startswith("warning: the body is whole in less than 50% of the frames")
 
 
 def test_notes_of_a_placed_camera(body: ShapedBody) -> None:

@@ -366,7 +366,7 @@ def test_half_of_the_samples_is_enough() -> None:
             usable(times, bad)
         first = f" (first: number {bad[0]})" if bad else ""
         assert str(raised.value) == (
-            f"here: found {broken} samples that are not finite numbers or no rotation{first} and {late} times that do "
+            f"here: found {broken} samples that are not finite or no rotation{first} and {late} times that do "
             f"not increase, of {len(times)}, expected at least half of the samples sound"
         )
 

@@ -50,7 +50,7 @@ def test_the_lens_of_height_and_of_width(
     roll[:2, :2] = [[0, -1], [1, 0]]
     for matrix, tangent in ((pose_z_up(0), tan_y), (pose_z_up(0) @ roll, tan_x)):
         (tmp_path / "a.json").write_text(nerf_text(matrix, **keys))
-        camera = load(tmp_path / "a.json")
+        camera = load(tmp_path / "a.json", up_axis="z")
         assert camera.lens(0.0, (480, 640)).fov_y_deg == pytest.approx(angle(tangent))
         assert camera.notes[2] == f"field of view {angle(tangent):.4g} degrees high, {note}"
 
@@ -102,7 +102,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
     ),
     "no rotation": (
         {"frames": [{"transform_matrix": [[2, 0, 0, 5], [0, 1, 0, 5], [0, 0, 1, 5], [0, 0, 0, 1]]}]},
-        ": found 1 samples that are not finite numbers or no rotation (first: frames[0].transform_matrix) and 0 times",
+        ": found 1 samples that are no rotation (first: frames[0].transform_matrix) and 0 times",
     ),
     "true": ({"frames": [{"transform_matrix": ONE}], "w": True}, ": w: found True, expected a positive number"),
     "zero": ({"frames": [{"transform_matrix": ONE}], "h": 0}, ": h: found 0, expected a positive number"),
