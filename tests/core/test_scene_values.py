@@ -22,8 +22,8 @@ def test_what_a_scene_leaves_out() -> None:
         "most_side": 512, "memory_mb": 512,
         "output": {"width": 640, "height": 480},
         "camera": {
-            "source": "builtin:orbit", "format": "auto", "fov_y_deg": None, "near_m": 0.05, "far_m": 100.0,
-            "place": "auto",
+            "source": "builtin:orbit", "format": "auto", "fov_y_deg": None, "up_axis": "auto",
+            "near_m": 0.05, "far_m": 100.0, "place": "auto",
         },
         "avatars": ({
             "name": "avatar1", "bundle": "default", "motion": "builtin:walk-wave-turn",
