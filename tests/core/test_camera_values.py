@@ -253,6 +253,8 @@ def test_a_principal_point_turns_with_the_device() -> None:
     """The camera's x axis points down: its picture is turned clockwise, and column cx becomes row cx."""
     held = np.column_stack([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
     lens = Lens(640.0, 480.0, 500.0, 480.0, 300.0, 200.0)
-    raw = RawCamera(np.zeros(1), held[None].astype(float), np.zeros((1, 3)), "y", (lens,), "by the file", ())
+    raw = RawCamera(
+        np.zeros(1), held[None].astype(float), np.zeros((1, 3)), "y", (lens,), "by the file", (), is_levelled=True
+    )
     camera = path_from_recording(raw, "here", SPEC)
     assert camera.optics.lenses == (Lens(480.0, 640.0, 480.0, 500.0, 280.0, 300.0),)
