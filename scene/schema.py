@@ -65,7 +65,7 @@ class AvatarSpec(Table):
     motion: str = "builtin:walk-wave-turn"
     position: Annotated[tuple[Metres, Metres, Metres], LISTED] = (0.0, 0.0, 0.0)
     heading_deg: float = Field(default=0.0, ge=-3600, le=3600, allow_inf_nan=False)
-    up_axis: Literal["auto", "y", "z"] = "auto"
+    up_axis: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
     units: Literal["auto", "m", "cm", "in", "cmu"] = "auto"
     joint_map: dict[str, str] = Field(default={})
     start_s: float = Field(default=0.0, ge=0, le=LONGEST_S, allow_inf_nan=False)

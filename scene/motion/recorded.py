@@ -1,7 +1,7 @@
 """A recorded motion to a Motion: bad frames left out, Y up, facing +Z at first, centred on the ground it covers.
 
 Rule: up is the axis that the scene states, else the one that the body's own up points along on average, else the usual
-one of the format.
+one of the format. Where a format has a world of its own, one that stands on its hands does not turn it over.
 """
 
 from __future__ import annotations
@@ -21,6 +21,17 @@ from trilane.scene.rotations import Y_UP_FROM_Z_UP, about, matrix_from_rotvec, r
 MAX_FRAMES = 200_000
 MAX_ANGLE_RAD = 64.0
 MAX_PLACE_M = 10_000.0
+#: Axis that is up -> the turn (3, 3) that makes it +Y.
+UPRIGHT: dict[str, F64] = {
+    "y": np.eye(3),
+    "z": Y_UP_FROM_Z_UP,
+    "x": about(2, np.pi / 2),
+    "-y": about(0, np.pi),
+    "-z": about(0, np.pi / 2),
+    "-x": about(2, -np.pi / 2),
+}
+#: Axes that may be up in a world, and in the coordinates of anything, such as a camera.
+WORLD, ANY = ("y", "z"), tuple(UPRIGHT)
 #: The body's own up decides when the cosine between it, on average, and an axis is above this.
 LEAST_UP_COSINE = 0.7
 
@@ -31,8 +42,8 @@ class RawMotion:
 
     `times_s` (T,): seconds; NaNs and repeated times are still in. `poses` (T, 55, 3): axis-angle, radians, SMPL-X joint
     order. `translation` (T, 3): of the pelvis, metres; None when the format has none. `betas` (n,) or None. `up`: the
-    axis that is usually up in the format. `notes`: on the file, for people. `leg_m`: hip to ankle of the recorded
-    person; None when unknown. `detected`: what the file is, but for its axes.
+    axis that is usually up in the format; `ups`: the axes that may be up in it. `notes`: on the file, for people.
+    `leg_m`: hip to ankle of the recorded person; None when unknown. `detected`: what the file is, but for its axes.
     """
 
     times_s: F64
@@ -43,13 +54,14 @@ class RawMotion:
     notes: tuple[str, ...]
     leg_m: float | None = None
     detected: Detected = NOTHING
+    ups: tuple[str, ...] = WORLD
 
 
 def motion_from_recording(raw: RawMotion, where: str, up_axis: str) -> Motion:
     """The motion of a file.
 
-    `raw`: its content. `where`: its path, for messages. `up_axis`: `y`, `z` or `auto`. Raises BadInputError when it has
-    more than MAX_FRAMES frames, is in degrees, or is unreadable in more than half of its frames.
+    `raw`: its content. `where`: its path, for messages. `up_axis`: a key of UPRIGHT, or `auto`. Raises BadInputError
+    when it has more than MAX_FRAMES frames, is in degrees, or is unreadable in more than half of its frames.
     """
     if len(raw.times_s) > MAX_FRAMES:
         raise BadInputError(where, f"{len(raw.times_s)} frames", f"at most {MAX_FRAMES}")
@@ -58,8 +70,8 @@ def motion_from_recording(raw: RawMotion, where: str, up_axis: str) -> Motion:
     times, poses, shift = raw.times_s[usable], raw.poses[usable], shift[usable]
     _check_angles(poses, where)
     roots = matrix_from_rotvec(poses[:, 0])
-    up, how = _up_axis(roots, raw.up, up_axis)
-    turn = Y_UP_FROM_Z_UP if up == "z" else np.eye(3)
+    up, how = _up_axis(roots, raw, up_axis)
+    turn = UPRIGHT[up]
     turn = facing(turn @ roots[0]) @ turn
     poses = poses.copy()
     poses[:, 0] = rotvec_from_matrix(turn @ roots)
@@ -91,15 +103,15 @@ def _check_angles(poses: F64, where: str) -> None:
         raise BadInputError(where, f"an angle of {largest:.3g}", "axis-angle in radians", "convert degrees to radians")
 
 
-def _up_axis(roots: F64, usual: str, stated: str) -> tuple[str, str]:
+def _up_axis(roots: F64, raw: RawMotion, stated: str) -> tuple[str, str]:
     """The axis that is up, and a note on how it was decided."""
     if stated != "auto":
         return stated, "as given"
     mean = roots[:, :, 1].mean(axis=0)
-    for index, name in ((1, "y"), (2, "z")):
-        if mean[index] > LEAST_UP_COSINE:
+    for name in raw.ups:
+        if (UPRIGHT[name] @ mean)[1] > LEAST_UP_COSINE:
             return name, "as the body stands"
-    return usual, "as usual for the format"
+    return raw.up, "as usual for the format"
 
 
 def facing(root: F64) -> F64:

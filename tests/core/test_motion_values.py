@@ -18,6 +18,7 @@ from trilane.scene.motion.motion import REST_PELVIS, Motion, Wrap, bracket, wrap
 from trilane.scene.motion.recorded import RawMotion, motion_from_recording
 from trilane.scene.motion.smplx_npy import hands_note, load_smplx_npy, median_step_rad
 from trilane.scene.motion.usable_samples import usable_samples
+from trilane.scene.rotations import matrix_from_rotvec
 from trilane.scene.schema import AvatarSpec
 
 
@@ -277,6 +278,28 @@ def rolled(cosine: float, axis: str) -> list[float]:
 )
 def test_which_axis_is_up(root: list[float], usual: str, stated: str, note: str) -> None:
     assert note in motion_from_recording(raw_motion([root] * 2, up=usual), "here", stated).notes
+
+
+@pytest.mark.parametrize(("axis", "root"), [
+    ("y", [0, 0, 0]),
+    ("z", [math.pi / 2, 0, 0]),
+    ("x", [0, 0, -math.pi / 2]),
+    ("-y", [math.pi, 0, 0]),
+    ("-z", [-math.pi / 2, 0, 0]),
+    ("-x", [0, 0, math.pi / 2]),
+])  # fmt: skip
+def test_a_body_in_coordinates_of_any_axes_stands_up(axis: str, root: list[float]) -> None:
+    """It climbs by 2 along its own up, which is one of the six axes; afterwards it climbs along +Y."""
+    up = np.zeros(3)
+    up["xyz".index(axis[-1])] = -1.0 if axis[0] == "-" else 1.0
+    raw = raw_motion([root] * 2, translation=np.array([up, 3 * up]), ups=recorded_module.ANY)
+    motion = motion_from_recording(raw, "here", "auto")
+    assert f"{axis.upper()} up, as the body stands" in motion.notes
+    assert motion.translation == pytest.approx(np.array([[0, 1, 0], [0, 3, 0]]), abs=1e-12)
+    turn = matrix_from_rotvec(motion.poses[:, 0])
+    assert turn[:, :, 1] == pytest.approx(np.array([[0, 1, 0]] * 2), abs=1e-12)
+    stated = motion_from_recording(raw, "here", axis)
+    assert stated.translation == pytest.approx(motion.translation) and f"{axis.upper()} up, as given" in stated.notes
 
 
 @pytest.mark.parametrize(("level", "turned"), [(0.31, True), (0.29, False)])

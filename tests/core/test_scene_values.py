@@ -49,7 +49,7 @@ LIMITS: list[tuple[type, str, list[Any], list[Any]]] = [
     ),
     (AvatarSpec, "name", ["x" * 80, "a b.c-d_e"], ["", "x" * 81, "a/b", "a\n"]),
     (AvatarSpec, "heading_deg", [-3600, 3600], [-3601, 3601, math.nan]),
-    (AvatarSpec, "up_axis", ["auto", "y", "z"], ["x"]),
+    (AvatarSpec, "up_axis", ["auto", "x", "y", "z", "-x", "-y", "-z"], ["+x", "Y"]),
     (AvatarSpec, "units", ["auto", "m", "cm", "in", "cmu"], ["mm"]),
     (AvatarSpec, "joint_map", [{}, {"left_hip": "Thigh L", "jaw": ""}], [{"left hip": "a"}, {"jaw": 1}]),
     (AvatarSpec, "start_s", [0, 1e6], [-0.1, 1.1e6, math.nan]),
