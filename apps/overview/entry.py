@@ -5,6 +5,7 @@ Rule: a figure is taken over from a document as it stands there; nothing is meas
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +14,9 @@ from typing import Any
 from trilane.figure_sources import COMPUTED, MEASURED, NO_FIGURES
 
 HOST = "host"
+#: What an error is of, and what an interval of the frame time holds.
+OF_RUN, OF_AVATAR = "errors of the runs themselves", "errors of the avatars' validations"
+BY_SCATTER, BY_MODEL = "95 %, scatter of the run's frames", "80 %, of the model"
 #: Keys of a document's `config` that are no settings, or that the row has by other names.
 NOT_SETTINGS = ("avatar_dirs", "shapes", "own_pixels", "works", "posed_vertices", "pace_ns", "units", "cuts", "record")
 
@@ -21,8 +25,9 @@ NOT_SETTINGS = ("avatar_dirs", "shapes", "own_pixels", "works", "posed_vertices"
 class Entry:
     """`name`: of its folder or trial. `clock`: host or virtual. `machine`: in a line. `settings`: by dotted key.
 
-    `command`: word by word; empty where none is known. `frame_ms`, `low_ms`, `high_ms`: mean frame time and its 95 %
-    interval, None where there is none. `psnr_db`: the error; `error_source`: where it comes from, or why there is none.
+    `command`: word by word; empty where none is known. `frame_ms`, `low_ms`, `high_ms`: mean frame time and its
+    interval, None where there is none; `interval`: what that holds. `psnr_db`: the error; `error_source`: where it
+    comes from, or why there is none; `error_of`: `OF_RUN`, `OF_AVATAR`, or empty. `shows`: what the pictures are of.
     `video`: of a run. `failure`: why there are no figures.
     """
 
@@ -41,54 +46,84 @@ class Entry:
     facts: Mapping[str, Any] = field(default_factory=dict)
     video: Path | None = None
     failure: str = ""
+    interval: str = ""
+    error_of: str = ""
+    shows: str = ""
 
     @property
     def speed_source(self) -> str:
-        return MEASURED if self.clock == HOST else COMPUTED
+        """Empty without a speed."""
+        return "" if self.frame_ms is None else MEASURED if self.clock == HOST else COMPUTED
 
     @property
-    def group(self) -> tuple[str, str]:
-        """Entries of one group are compared with each other: those of one clock and machine."""
-        return self.clock, self.machine
+    def group(self) -> tuple[str, str, str, str]:
+        """Entries of one group are compared with each other: their times and their errors mean the same."""
+        return self.clock, self.machine, self.shows, self.error_of
 
 
-def entry_of(name: str, document: Mapping[str, Any], video: Path | None = None) -> Entry:
-    """The row of a report.json, of a prediction, or of a failed trial, which has a `failure` alone."""
+def entry_of(
+    name: str, document: Mapping[str, Any], video: Path | None = None, options: Mapping[str, Any] | None = None
+) -> Entry:
+    """The row of a report.json, of a prediction, or of a failed trial, which has a `failure` alone.
+
+    `options`: of a trial, settings beside those of its document.
+    """
     times, made = _mapping(document, "frame_time_ms"), _mapping(document, "made")
-    machine = _mapping(document, "machine")
-    psnr_db, source = _error(document)
+    machine, config = _mapping(document, "machine"), _mapping(document, "config")
+    psnr_db, source, error_of = _error(document)
+    low, high = _interval(times)
     return Entry(
-        name,
+        _text(name),
         str(document.get("clock", HOST)),
         _machine_line(machine),
-        dict(_settings(_mapping(document, "config"))),
-        tuple(map(str, made.get("command") or ())),
-        _number(times.get("mean")),
-        _number(times.get("mean_low", times.get("low"))),
-        _number(times.get("mean_high", times.get("high"))),
-        _number(document.get("fps")),
-        _number(_mapping(document, "latency_ms").get("mean")),
+        dict(_settings(config)) | dict(_settings(options or {})),
+        tuple(map(_text, _sequence(made.get("command")))),
+        _time(times.get("mean")),
+        low,
+        high,
+        _time(document.get("fps")),
+        _time(_mapping(document, "latency_ms").get("mean")),
         psnr_db,
-        source,
+        _text(source),
         machine,
         video if video is not None and video.is_file() else None,
-        str(document.get("failure") or ""),
+        _text(document.get("failure") or ""),
+        interval="" if low is None else BY_SCATTER if "mean_low" in times else BY_MODEL,
+        error_of=error_of,
+        shows=_shows(_mapping(config, "scene")),
     )
 
 
-def _error(document: Mapping[str, Any]) -> tuple[float | None, str]:
-    """The least PSNR of the avatars; that of the run itself where it was compared with the reference."""
+def _interval(times: Mapping[str, Any]) -> tuple[float | None, float | None]:
+    """That of the mean by a run's own frames, else that of a model."""
+    names = ("mean_low", "mean_high") if "mean_low" in times else ("low", "high")
+    low, high = (_time(times.get(name)) for name in names)
+    return (None, None) if low is None or high is None else (low, high)
+
+
+def _shows(scene: Mapping[str, Any]) -> str:
+    """What the frames of `scene` are of, in words; a smaller tensor or another network shows the same."""
+    output, camera = _mapping(scene, "output"), _mapping(scene, "camera")
+    bodies = [body for body in _sequence(scene.get("avatars")) if isinstance(body, Mapping)]
+    picture = f"{output.get('width')}x{output.get('height')}" if output else None
+    parts = [scene.get("name"), picture, camera.get("source"), *(body.get("motion") for body in bodies)]
+    return _text(", ".join(str(part) for part in [*parts, scene.get("background")] if part))
+
+
+def _error(document: Mapping[str, Any]) -> tuple[float | None, str, str]:
+    """PSNR, where it comes from and what it is of: of the run itself where it was compared, else its avatars' least."""
     check = _mapping(document, "check")
     if (own := _number(check.get("psnr_db"))) is not None:
-        return own, f"{MEASURED}, {check.get('frames')} frames"
+        return own, f"{MEASURED}, {check.get('frames')} frames", OF_RUN
     avatars = [facts for facts in _mapping(document, "accuracy").values() if isinstance(facts, Mapping)]
     if not avatars:
-        return None, NO_FIGURES
+        return None, NO_FIGURES, ""
     known = [(_number(facts.get("psnr_db")), str(facts.get("source", ""))) for facts in avatars]
     if any(value is None for value, _ in known):
         why = next((str(facts["why"]) for facts in avatars if facts.get("why")), "")
-        return None, f"{NO_FIGURES}: {why}" if why else NO_FIGURES
-    return min((value, source) for value, source in known if value is not None)
+        return None, f"{NO_FIGURES}: {why}" if why else NO_FIGURES, ""
+    least, source = min((value, source) for value, source in known if value is not None)
+    return least, source, OF_AVATAR
 
 
 def _settings(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
@@ -102,14 +137,15 @@ def _settings(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str
             for number, each in enumerate(value):
                 yield from _settings(each, f"{prefix}{key}[{number}].")
         elif value is not None:
-            yield f"{prefix}{key}", f"{value:g}" if isinstance(value, float) else str(value)
+            yield _text(f"{prefix}{key}"), f"{value:g}" if isinstance(value, float) else _text(value)
 
 
 def _machine_line(machine: Mapping[str, Any]) -> str:
     cpu, gl = _mapping(machine, "cpu"), _mapping(machine, "gl")
     if cpu:
-        return f"{cpu.get('model')}, {len(cpu.get('cores_allowed') or ())} cores, {gl.get('renderer', 'no OpenGL')}"
-    return str(machine.get("title") or machine.get("profile") or "a machine that is not named")
+        cores = len(_sequence(cpu.get("cores_allowed")))
+        return _text(f"{cpu.get('model')}, {cores} cores, {gl.get('renderer', 'no OpenGL')}")
+    return _text(machine.get("title") or machine.get("profile") or "a machine that is not named")
 
 
 def _mapping(document: Mapping[str, Any], key: str) -> Mapping[str, Any]:
@@ -117,8 +153,30 @@ def _mapping(document: Mapping[str, Any], key: str) -> Mapping[str, Any]:
     return found if isinstance(found, Mapping) else {}
 
 
+def _sequence(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else []
+
+
+def _text(value: Any) -> str:
+    """`value` as text that any file can hold: half a surrogate pair, as of a file's name that is no UTF-8, is a `?`."""
+    return str(value).encode("utf-8", "replace").decode("utf-8")
+
+
 def _number(value: Any) -> float | None:
-    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
+    """None for what is no number, and for NaN, infinities and integers beyond a float, which JSON may hold."""
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _time(value: Any) -> float | None:
+    """A number above 0."""
+    number = _number(value)
+    return number if number is not None and number > 0 else None
 
 
 def varied(entries: list[Entry]) -> list[str]:

@@ -15,16 +15,17 @@ from typing import Any
 from trilane.apps.overview.entry import Entry
 from trilane.apps.overview.frontier import frontier
 from trilane.apps.overview.pictures import MOST, still
-from trilane.apps.overview.scatter import Dot, scatter
+from trilane.apps.overview.scatter import Dot, marker_name, scatter
 from trilane.apps.overview.table_rows import columns, table_rows
 
 UNITS = {"frame_ms": "frame, ms", "low_ms": "from, ms", "high_ms": "to, ms", "latency_ms": "latency, ms"}
 UNITS |= {"psnr_db": "PSNR, dB", "frames_per_s": "frames/s", "on_frontier": "frontier"}
 LONG = 40  # letters of a cell that is given room
 MEANING = (
-    "Frame time is the mean between presented frames, from and to its 95 % interval; PSNR is the error of the picture, "
-    "larger is better. The frontier holds what nobody on the same clock and machine beats in both. An entry without a "
-    "known error is in the table and on no frontier."
+    "Frame time is the mean between presented frames, from and to its interval: of a run 95 %, by the scatter of its "
+    "own frames; of a prediction 80 %, by the model. PSNR is the error of the picture, larger is better. The frontier "
+    "holds what nobody beats in both on the same clock and machine, with the same scene and the same kind of error. An "
+    "entry without a known error is in the table and on no frontier."
 )
 
 
@@ -53,7 +54,8 @@ def _sections(title: str, entries: Sequence[Entry]) -> Iterator[str]:
 
 
 def _drawing(entries: Sequence[Entry]) -> str:
-    groups = list(dict.fromkeys(entry.group for entry in entries))
+    drawable = [entry for entry in entries if entry.frame_ms is not None and entry.psnr_db is not None]
+    groups = list(dict.fromkeys(entry.group for entry in drawable))
     dots = [
         Dot(entry.name, entry.frame_ms, entry.low_ms, entry.high_ms, entry.psnr_db, on, groups.index(entry.group))
         for entry, on in zip(entries, frontier(entries), strict=True)
@@ -61,11 +63,17 @@ def _drawing(entries: Sequence[Entry]) -> str:
     ]
     left_out = len(entries) - len(dots)
     note = f"{left_out} of {len(entries)} have no speed or no known error and are not drawn. " if left_out else ""
-    words = "Filled: on the frontier. A marker's shape is its clock and machine: "
-    shapes = ("circle", "square", "triangle", "diamond")
-    legend = "; ".join(f"{shapes[n % len(shapes)]}: {clock} clock, {name}" for n, (clock, name) in enumerate(groups))
-    drawn = scatter(dots, "frame time, ms", "PSNR, dB") or "<p>No entry has both a speed and a known error.</p>"
+    words = "Filled: on the frontier. A marker's shape is what it is compared with: "
+    legend = "; ".join(f"{marker_name(number)}: {_told(group)}" for number, group in enumerate(groups))
+    drawn = scatter(dots, "frame time, ms", "PSNR, dB")
+    if not drawn:
+        return "<p>No entry has both a speed and a known error.</p>"
     return f'<div class="wide">{drawn}</div><p class="note">{escape(note + words + legend)}.</p>'
+
+
+def _told(group: tuple[str, ...]) -> str:
+    clock, *rest = group
+    return ", ".join(filter(None, [f"{clock} clock", *rest]))
 
 
 def _table(title: str, entries: Sequence[Entry]) -> str:

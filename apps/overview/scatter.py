@@ -27,12 +27,21 @@ class Dot(NamedTuple):
     group: int
 
 
-MARKERS = (
-    '<circle class="g0" cx="{x}" cy="{y}" r="5"/>',
-    '<rect class="g1" x="{x0}" y="{y0}" width="9" height="9"/>',
-    '<path class="g2" d="M{x} {y0} l6 10 h-12 z"/>',
-    '<path class="g3" d="M{x} {y0} l5 5 l-5 5 l-5 -5 z"/>',
-)
+#: Name -> marker. A group beyond the last one begins again.
+MARKERS = {
+    "circle": '<circle class="g0" cx="{x}" cy="{y}" r="5"/>',
+    "square": '<rect class="g1" x="{x0}" y="{y0}" width="9" height="9"/>',
+    "triangle": '<path class="g2" d="M{x} {y0} l6 10 h-12 z"/>',
+    "diamond": '<path class="g3" d="M{x} {y0} l5 5 l-5 5 l-5 -5 z"/>',
+    "triangle on its tip": '<path class="g4" d="M{x} {y0} m-6 0 h12 l-6 10 z"/>',
+    "hexagon": '<path class="g5" d="M{x} {y0} m-3 0 h6 l3 5 l-3 5 h-6 l-3 -5 z"/>',
+    "plus": '<path class="g6" d="M{x} {y0} m-2 0 h4 v3 h3 v4 h-3 v3 h-4 v-3 h-3 v-4 h3 z"/>',
+    "bar": '<path class="g7" d="M{x} {y0} m-2 0 h4 v10 h-4 z"/>',
+}
+
+
+def marker_name(group: int) -> str:
+    return list(MARKERS)[group % len(MARKERS)]
 
 
 def scatter(dots: Sequence[Dot], x_title: str, y_title: str) -> str:
@@ -104,6 +113,6 @@ def _dot(dot: Dot, across: _Axis, up: _Axis) -> str:
         if dot.low is not None and dot.high is not None
         else ""
     )
-    marker = MARKERS[dot.group % len(MARKERS)].format(x=x, y=y, x0=x - 4.5, y0=y - 5)
+    marker = MARKERS[marker_name(dot.group)].format(x=x, y=y, x0=x - 4.5, y0=y - 5)
     title = f"<title>{escape(dot.label)}: {dot.x:.2f} ms, {dot.y:.2f} dB</title>"
     return f'<g class="{"on" if dot.on else "off"}" tabindex="0">{title}{interval}{marker}</g>'

@@ -66,14 +66,15 @@ def _document(path: Path) -> Mapping[str, Any]:
 def _trial(folder: Path, trial: Mapping[str, Any]) -> Entry:
     result = trial.get("result")
     document = dict(result) if isinstance(result, dict) else {}
-    options = trial.get("options")
-    document["config"] = {**_mapping(document.get("config")), **_mapping(options)}
-    document["made"] = {**_mapping(document.get("made")), "command": trial.get("command") or ()}
+    document["made"] = {**_mapping(document.get("made")), "command": trial.get("command")}
     document.setdefault("clock", trial.get("clock", "host"))
     document.setdefault("machine", trial.get("host"))
     if trial.get("status") != "done":
-        document["failure"] = f"{trial.get('status')}, exit code {trial.get('exit_code')}"
-    return entry_of(str(trial.get("id")), document, _video(folder, trial.get("folder")))
+        error = trial.get("error")
+        ended = f"{trial.get('status')}, exit code {trial.get('exit_code')}"
+        document["failure"] = f"{ended}: {error}" if error else ended
+    video = _video(folder, trial.get("folder"))
+    return entry_of(str(trial.get("id")), document, video, _mapping(trial.get("options")))
 
 
 def _mapping(value: Any) -> dict[str, Any]:

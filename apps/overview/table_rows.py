@@ -6,6 +6,7 @@ Rule: the page, the CSV and the Parquet file have the same columns and the same 
 from __future__ import annotations
 
 import csv
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from trilane.errors import MissingPartError
 from trilane.writing import write_atomically
 
 FIGURES = ("frame_ms", "low_ms", "high_ms", "frames_per_s", "latency_ms", "psnr_db", "on_frontier")
-SOURCES = ("speed_source", "error_source", "clock", "machine", "failure", "command")
+SOURCES = ("speed_source", "interval", "error_source", "shows", "clock", "machine", "failure", "command")
 
 
 def columns(entries: Sequence[Entry]) -> list[str]:
@@ -34,7 +35,7 @@ def table_rows(entries: Sequence[Entry]) -> list[dict[str, Any]]:
             **{key: getattr(entry, key) for key in FIGURES[:-1]},
             "on_frontier": on,
             **{key: getattr(entry, key) for key in SOURCES[:-1]},
-            "command": " ".join(entry.command),
+            "command": shlex.join(entry.command),
         }
         for entry, on in zip(entries, frontier(entries), strict=True)
     ]

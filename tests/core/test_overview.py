@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,7 +16,7 @@ from hypothesis import strategies as st
 from trilane.apps.overview.entry import Entry, entry_of, varied
 from trilane.apps.overview.frontier import frontier
 from trilane.apps.overview.page import page
-from trilane.apps.overview.scatter import Dot, scatter
+from trilane.apps.overview.scatter import MARKERS, Dot, marker_name, scatter
 from trilane.apps.overview.sources import read_entries
 from trilane.apps.overview.table_rows import columns, table_rows, write_csv, write_parquet
 from trilane.errors import BadInputError
@@ -60,6 +61,10 @@ def test_a_report_becomes_a_row() -> None:
     assert entry.settings == {"policy": "pipelined", "scene.size": "256", "scene.fps": "30"}
     assert entry.machine == "<Chip>, 2 cores, soft"
     assert (entry.command, entry.speed_source) == (("trilane", "run"), "measured in this run")
+    assert (entry.interval, entry.error_of) == (
+        "95 %, scatter of the run's frames",
+        "errors of the avatars' validations",
+    )
 
 
 @pytest.mark.parametrize(
@@ -83,6 +88,78 @@ def test_a_prediction_is_computed() -> None:
     }
     entry = entry_of("p", document)
     assert (entry.machine, entry.low_ms, entry.high_ms, entry.speed_source) == ("A phone", 8.0, 11.0, "computed")
+    assert entry.interval == "80 %, of the model"
+
+
+SCENE = {
+    "name": "far",
+    "output": {"width": 640, "height": 480},
+    "camera": {"source": "builtin:orbit"},
+    "avatars": [{"motion": "walk.bvh", "bundle": "a"}],
+    "background": "room",
+    "size": "256",
+}
+
+
+def test_what_is_shown_says_nothing_of_what_it_costs() -> None:
+    first = entry_of("1", REPORT | {"config": {"scene": SCENE}})
+    assert first.shows == "far, 640x480, builtin:orbit, walk.bvh, room"
+    cheaper = SCENE | {"size": "128", "avatars": [{"motion": "walk.bvh", "bundle": "b"}]}
+    assert entry_of("2", REPORT | {"config": {"scene": cheaper}}).group == first.group
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"config": {"scene": SCENE | {"name": "near"}}},
+        {"config": {"scene": SCENE | {"camera": {"source": "phone.txt"}}}},
+        {"config": {"scene": SCENE | {"output": {"width": 1280, "height": 720}}}},
+        {"check": {"psnr_db": 39.0, "frames": 4}},
+        {"machine": {"title": "Another"}},
+        {"clock": "virtual"},
+    ],
+    ids=["scene", "camera", "picture", "kind of error", "machine", "clock"],
+)
+def test_errors_and_times_of_different_kinds_are_not_compared(change: dict[str, Any]) -> None:
+    """The other entry is quicker and has fewer errors, but of something else: both stay on their frontiers."""
+    slow = entry_of("slow", REPORT | {"config": {"scene": SCENE}})
+    other = REPORT | {"config": {"scene": SCENE}, "frame_time_ms": {"mean": 2.0}}
+    quick = other | {"accuracy": {"a": {"psnr_db": 50.0, "source": "from A"}}}
+    assert frontier([slow, entry_of("quick", quick)]) == [False, True]
+    assert frontier([slow, entry_of("else", quick | change)]) == [True, True]
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf, 10**400, True, "12", None])
+def test_what_is_no_number_is_no_figure(number: Any) -> None:
+    document = REPORT | {"frame_time_ms": {"mean": number, "mean_low": number, "mean_high": 1.0}, "fps": number}
+    entry = entry_of("r", document | {"check": {"psnr_db": number, "frames": 2}})
+    assert (entry.frame_ms, entry.low_ms, entry.high_ms, entry.frames_per_s, entry.psnr_db) == (None,) * 4 + (30.0,)
+    assert (entry.speed_source, entry.interval) == ("", "")
+    page("t", [entry])
+
+
+def test_a_time_below_zero_is_no_time() -> None:
+    assert entry_of("r", REPORT | {"frame_time_ms": {"mean": -5.0}}).frame_ms is None
+
+
+def test_half_a_surrogate_pair_is_written_as_a_question_mark(tmp_path: Path) -> None:
+    """As of a file's name that is no UTF-8."""
+    entry = entry_of("r", REPORT | {"made": {"command": ["trilane", "\udcff.toml"]}, "failure": "\ud800"})
+    assert (entry.command, entry.failure) == (("trilane", "?.toml"), "?")
+    page("t", [entry]).encode()
+    write_csv(tmp_path / "t.csv", [entry])
+
+
+def test_a_command_can_be_typed_again() -> None:
+    document = REPORT | {"made": {"command": ["trilane", "run", "my scene's.toml"]}}
+    assert table_rows([entry_of("r", document)])[0]["command"] == """trilane run 'my scene'"'"'s.toml'"""
+
+
+def test_more_groups_than_four_have_markers_of_their_own() -> None:
+    dots = [Dot(str(number), 1.0 + number, None, None, 30.0, False, number) for number in range(len(MARKERS))]
+    drawn = scatter(dots, "x", "y")
+    assert [drawn.count(f'class="g{number}"') for number in range(8)] == [1] * 8
+    assert marker_name(len(MARKERS)) == "circle"
 
 
 def test_only_what_differs_is_a_column() -> None:
@@ -92,10 +169,14 @@ def test_only_what_differs_is_a_column() -> None:
     assert [row["policy"] for row in table_rows([one, two])] == ["pipelined", "latest"]
 
 
+OPTIONS = {"size": "128", "scene": "far.toml"}
+
+
 def _sweep(folder: Path) -> Path:
     folder.mkdir()
-    trial = {"id": "ab", "command": ["trilane", "run"], "options": {"size": "128"}, "status": "done", "result": REPORT}
+    trial = {"id": "ab", "command": ["trilane", "run"], "options": OPTIONS, "status": "done", "result": REPORT}
     lost = {"id": "cd", "status": "failed", "exit_code": 3, "options": {"size": "64"}, "folder": "../../etc"}
+    lost["error"] = "error: no such scene"
     lines = [json.dumps(trial), json.dumps(lost), '{"id": "torn']
     (folder / "trials.jsonl").write_text("\n".join(lines))
     return folder
@@ -109,7 +190,12 @@ def test_folders_of_runs_and_sweeps_are_read(tmp_path: Path) -> None:
     entries = read_entries([tmp_path / "runs", _sweep(tmp_path / "sweep"), run / "report.json"])
     assert [entry.name for entry in entries] == ["one", "ab", "cd", "report"]
     assert (entries[1].settings["size"], entries[1].frame_ms) == ("128", 20.0)
-    assert (entries[2].failure, entries[2].frame_ms, entries[2].video) == ("failed, exit code 3", None, None)
+    assert (entries[1].settings["scene"], entries[1].settings["scene.size"]) == ("far.toml", "256")
+    assert (entries[2].failure, entries[2].frame_ms, entries[2].video) == (
+        "failed, exit code 3: error: no such scene",
+        None,
+        None,
+    )
 
 
 @pytest.mark.parametrize(
