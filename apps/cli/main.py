@@ -28,6 +28,7 @@ COMMANDS = {
     "report": ("trilane.apps.cli.report", "One page of many runs: what each speed costs in image error."),
     "compare": ("trilane.apps.cli.compare", "Say what differs between runs, by how much and why."),
     "explain": ("trilane.apps.cli.explain", "Explain the plan of a scene, or where the time of a run went."),
+    "inspect": ("trilane.apps.cli.inspect", "Say what any file is, what was detected, and what to do about it."),
     "body": ("trilane.apps.cli.body", "Look into body files, pose them, build one."),
     "avatar": ("trilane.apps.cli.avatar", "Look into avatars, export and quantise their networks."),
     "bench": ("trilane.apps.cli.bench", "Measure this machine: raster, readback, crop and more."),

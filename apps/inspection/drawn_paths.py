@@ -1,0 +1,167 @@
+"""Contact sheets of motions and cameras: skeletons and paths, from the front, from the right and from above.
+
+Rule: one scale for a whole row of skeletons, and one for a path, so that lengths compare; Y is up, and a person who
+faces +Z faces the reader. What is left of the person is blue, what is right is orange.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from trilane.arrays import F64
+from trilane.body.joints import JOINT_NAMES, JOINT_PARENTS
+
+GROUND, LINE, TEXT = (24, 26, 30), (70, 76, 86), (235, 235, 235)
+LEFT, RIGHT, MIDDLE, BEGIN, END = (92, 176, 255), (255, 172, 64), (200, 205, 212), (96, 220, 130), (255, 96, 96)
+#: Name of a view -> its axes to the right and upwards of the picture, as rows.
+VIEWS: Final = {
+    "from the front": np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
+    "from the right": np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]]),
+    "from above": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
+}
+TILE, PATH_TILE = 190, 380  # pixels
+MARGIN = 0.86  # of a tile that is drawn on
+LEAST_EXTENT_M = 0.2
+SHARP = 2  # drawn larger by this, then made smaller
+#: Bones of the face are left out.
+DRAWN: Final = tuple(k for k in range(1, len(JOINT_NAMES)) if JOINT_NAMES[k] not in ("jaw", "left_eye", "right_eye"))
+CAMERAS = 14
+FRUSTUM = np.array([[-0.8, -0.6, -1.0], [0.8, -0.6, -1.0], [0.8, 0.6, -1.0], [-0.8, 0.6, -1.0]])
+
+
+@dataclass(frozen=True)
+class _Tile:
+    """A square of `side` pixels, of which the middle is `middle` (2,), metres; `scale`: pixels per metre."""
+
+    draw: ImageDraw.ImageDraw
+    side: int
+    middle: F64
+    scale: float
+
+    def at(self, points: F64) -> list[tuple[float, float]]:
+        """Points (N, 2), metres, in pixels."""
+        pixels = (points - self.middle) * (self.scale, -self.scale) + self.side / 2
+        return [(float(x), float(y)) for x, y in pixels]
+
+    def line(self, points: F64, colour: tuple[int, int, int], width: int = 2) -> None:
+        self.draw.line(self.at(points), fill=colour, width=width * SHARP, joint="curve")
+
+    def dot(self, point: F64, colour: tuple[int, int, int], radius: int = 4) -> None:
+        (x, y), r = self.at(point[None])[0], radius * SHARP
+        self.draw.ellipse((x - r, y - r, x + r, y + r), fill=colour)
+
+    def text(self, words: str, row: int = 0) -> None:
+        self.draw.text((6 * SHARP, (4 + 15 * row) * SHARP), words, fill=TEXT, font_size=12 * SHARP)
+
+
+def skeletons(joints: F64, times_s: F64, path: F64) -> Image.Image:
+    """A row of tiles for each view: the skeleton at each moment, and the path of the pelvis.
+
+    `joints` (M, 55, 3), metres, Y up, at the moments `times_s` (M,). `path` (T, 3): of the pelvis.
+    """
+    rows: list[list[Image.Image]] = []
+    for name, view in VIEWS.items():
+        flat = joints @ view.T
+        centred = flat - (flat.min(axis=1, keepdims=True) + flat.max(axis=1, keepdims=True)) / 2
+        scale = _scale(TILE, 2 * np.abs(centred).max())
+        tiles = []
+        for moment, places in enumerate(centred):
+            picture, tile = _blank(TILE, np.zeros(2), scale)
+            _bones(tile, places)
+            if not rows:
+                tile.text(f"{times_s[moment]:.2f} s", row=0 if moment else 1)
+            if not moment:
+                tile.text(name)
+            tiles.append(picture)
+        rows.append([*tiles, _path_tile(path @ view.T, f"pelvis, {name}", TILE)])
+    return _sheet(rows)
+
+
+def cameras(turns: F64, places: F64) -> Image.Image:
+    """One row of three views on the path, with the camera at some of its moments.
+
+    `turns` (N, 3, 3), `places` (N, 3), metres: camera to world, Y up, looks along its -Z.
+    """
+    chosen = np.unique(np.linspace(0, len(places) - 1, min(CAMERAS, len(places))).round().astype(int))
+    size = max(float(np.ptp(places, axis=0).max()), LEAST_EXTENT_M) * 0.09
+    corners = places[chosen, None] + size * np.einsum("nij,kj->nki", turns[chosen], FRUSTUM)
+    every = np.concatenate([places, corners.reshape(-1, 3)])
+    tiles = []
+    for name, view in VIEWS.items():
+        tiles.append(_path_tile(places @ view.T, name, PATH_TILE, every @ view.T, (places[chosen], corners, view)))
+    return _sheet([tiles])
+
+
+def points(vertices: F64) -> Image.Image:
+    """One row of three views on points (V, 3), metres, Y up."""
+    tiles = []
+    for name, view in VIEWS.items():
+        flat = vertices @ view.T
+        low, high = flat.min(axis=0), flat.max(axis=0)
+        picture, tile = _blank(PATH_TILE, (low + high) / 2, _scale(PATH_TILE, float((high - low).max())))
+        tile.draw.point([pixel for pixel in tile.at(flat)], fill=MIDDLE)
+        tile.text(f"{name}, {high[1] - low[1]:.2f} m")
+        tiles.append(picture)
+    return _sheet([tiles])
+
+
+def _bones(tile: _Tile, places: F64) -> None:
+    for joint in DRAWN:
+        name = JOINT_NAMES[joint]
+        colour = LEFT if name.startswith("left") else RIGHT if name.startswith("right") else MIDDLE
+        tile.line(places[[JOINT_PARENTS[joint], joint]], colour, 3 if joint < 22 else 1)
+    tile.dot(places[JOINT_NAMES.index("head")], MIDDLE, 5)
+
+
+def _path_tile(
+    path: F64, name: str, side: int, every: F64 | None = None, cameras_: tuple[F64, F64, F64] | None = None
+) -> Image.Image:
+    """A path (T, 2) in a tile that has room for `every` point, with a bar for the length of it."""
+    room = path if every is None else every
+    low, high = room.min(axis=0), room.max(axis=0)
+    extent = max(float((high - low).max()), LEAST_EXTENT_M)
+    picture, tile = _blank(side, (low + high) / 2, _scale(side, extent))
+    if cameras_ is not None:
+        _frustums(tile, *cameras_)
+    if len(path) > 1:
+        tile.line(path, MIDDLE)
+    tile.dot(path[-1], END)
+    tile.dot(path[0], BEGIN)
+    bar = 10.0 ** np.floor(np.log10(extent))
+    corner = (low + high) / 2 + np.array([-0.46, -0.46]) * side * SHARP / tile.scale
+    tile.line(np.array([corner, corner + np.array([bar, 0.0])]), TEXT)
+    tile.text(name)
+    tile.text(f"bar: {bar:g} m", row=1)
+    return picture
+
+
+def _frustums(tile: _Tile, eyes: F64, corners: F64, view: F64) -> None:
+    for eye, four in zip(eyes @ view.T, corners @ view.T, strict=True):
+        tile.line(np.concatenate([four, four[:1]]), LEFT, 1)
+        for corner in four:
+            tile.line(np.stack([eye, corner]), LEFT, 1)
+
+
+def _scale(side: int, extent: float) -> float:
+    return side * SHARP * MARGIN / max(extent, 1e-9)
+
+
+def _blank(side: int, middle: F64, scale: float) -> tuple[Image.Image, _Tile]:
+    picture = Image.new("RGB", (side * SHARP, side * SHARP), GROUND)
+    draw = ImageDraw.Draw(picture)
+    draw.rectangle((0, 0, side * SHARP - 1, side * SHARP - 1), outline=LINE)
+    return picture, _Tile(draw, side * SHARP, middle, scale)
+
+
+def _sheet(rows: Sequence[Sequence[Image.Image]]) -> Image.Image:
+    side = rows[0][0].width
+    sheet = Image.new("RGB", (side * len(rows[0]), side * len(rows)))
+    for y, row in enumerate(rows):
+        for x, tile in enumerate(row):
+            sheet.paste(tile, (x * side, y * side))
+    return sheet.resize((sheet.width // SHARP, sheet.height // SHARP), Image.Resampling.LANCZOS)

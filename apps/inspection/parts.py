@@ -1,0 +1,219 @@
+"""What bodies, avatars, networks, scenes, traces and runs are: each by the reader that a command would use.
+
+Rule: a fact is one that the reader found; what this file adds is words.
+"""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from trilane.apps.avatar_facts import bundle_facts, network_facts
+from trilane.apps.inspection.drawn_paths import points
+from trilane.apps.inspection.inspection import Inspection, Length
+from trilane.apps.overview.sources import read_entries
+from trilane.apps.report import read_report
+from trilane.apps.tracing.writer import NAME as TRACE_NAME
+from trilane.arrays import F32
+from trilane.avatars.bundle import MANIFEST, load_bundle
+from trilane.avatars.network_checks import check_network
+from trilane.avatars.network_file import parse_network
+from trilane.body.body import load_body
+from trilane.errors import BadInputError
+from trilane.files import MAX_TEXT_BYTES, read_npz, read_text
+from trilane.hw_profiles.load import load_profile
+from trilane.hw_profiles.network_work import graph_facts
+from trilane.pipeline.journal import NAME as JOURNAL
+from trilane.pipeline.journal import read_journal
+from trilane.scene.detected import Detected
+from trilane.scene.load import load_scene
+
+SHEET = "contact.png"
+
+
+def inspect_body(path: Path) -> Inspection:
+    """Raises BadInputError when it is no usable body."""
+    shaped = load_body(path).shape()
+    height = float(np.ptp(shaped.vertices[:, 1]))
+    facts = {
+        "vertices": len(shaped.vertices),
+        "triangles": len(shaped.body.faces),
+        "joints": len(shaped.joints),
+        "height_m": round(height, 4),
+        "pose_blend_shapes": shaped.body.has_pose_blend_shapes,
+    }
+    return Inspection(
+        "body",
+        f"a body of {len(shaped.vertices)} vertices, {height:.2f} m tall",
+        "",
+        f"trilane body inspect {path}",
+        Detected("body in the SMPL-X layout", "an array `v_template`", "Y up, as the layout has it", "m"),
+        facts=facts,
+        draw=partial(_drawn_body, shaped.vertices),
+    )
+
+
+def _drawn_body(vertices: F32) -> Image.Image:
+    return points(vertices.astype(np.float64))
+
+
+def inspect_avatar(path: Path) -> Inspection:
+    """Raises BadInputError when it is no usable bundle. `path`: its folder or manifest."""
+    folder = path if path.is_dir() else path.parent
+    bundle = load_bundle(folder)
+    found = bundle_facts(bundle)
+    manifest = bundle.manifest
+    vertices = load_body(bundle.body_path).shape(manifest.betas, manifest.expression).vertices
+    facts = {
+        "name": found["name"],
+        "vertices": found["body"]["vertices"],
+        "texture": found["texture"]["shape"],
+        "network": {key: found["network"][key] for key in ("file", "encoder", "width", "shape", "parameters", "gmac")},
+        "validated": found["validation"] is not None,
+    }
+    return Inspection(
+        "avatar",
+        f"the avatar {manifest.name!r}",
+        "",
+        f"trilane run --avatar {folder}",
+        Detected("avatar bundle", f"a file {MANIFEST}"),
+        facts=facts,
+        draw=partial(_drawn_body, vertices),
+    )
+
+
+def inspect_texture(path: Path) -> Inspection:
+    """Raises BadInputError when it cannot be read."""
+    shape = list(read_npz(path, ("texture",), "a neural texture")["texture"].shape)
+    what = f"a neural texture of shape {tuple(shape)}, a part of an avatar"
+    found = Detected("neural texture", "an array `texture`")
+    return Inspection("texture", what, "", f"trilane inspect {path.parent}", found, facts={"shape": shape})
+
+
+def inspect_network(path: Path) -> Inspection:
+    """Raises BadInputError when it is no ONNX network. One that is no avatar's is usable for predictions."""
+    model = parse_network(path)
+    try:
+        network = check_network(model, str(path))
+    except BadInputError as error:
+        work = graph_facts(model)
+        what = f"an ONNX network of {work['parameters']} parameters, which is no avatar's"
+        note = f"no avatar's network: found {error.found}, expected {error.expected}"
+        facts, notes = {"avatars": False, **work}, [note]
+    else:
+        found = network_facts(network)
+        facts = {"avatars": True, "shape": found["shape"], "parameters": found["parameters"], "gmac": found["gmac"]}
+        what, notes = "an avatar's integer network", []
+    detected = Detected("ONNX network", "a protobuf message with nodes and operator sets")
+    advice = f"trilane predict --network {path}"
+    return Inspection("network", what, "", advice, detected, facts=facts, notes=tuple(notes))
+
+
+def inspect_scene(path: Path) -> Inspection:
+    """Raises BadInputError when the scene is refused. The files that it names are not opened."""
+    values = load_scene(path)
+    avatars = values["avatars"]
+    named = [values["background"], values["camera"]["source"], *(raw[key] for raw in avatars for key in ("motion",))]
+    facts = {"name": values["name"], "avatars": len(avatars), "sources": [str(source) for source in named]}
+    missing = [source for source in facts["sources"] if "/" in source and not Path(source).exists()]
+    notes = tuple(f"{source}: no such file, which the scene names" for source in missing)
+    what = f"the scene {values['name']!r} with {len(avatars)} avatar{'s' if len(avatars) != 1 else ''}"
+    advice = "give the files that it names" if missing else f"trilane run {path}"
+    found = Detected("scene", "TOML with keys of the scene schema")
+    return Inspection("scene", what, notes[0] if missing else "", advice, found, facts=facts, notes=notes)
+
+
+def inspect_profile(path: Path) -> Inspection:
+    """Raises BadInputError when the profile is refused."""
+    profile = load_profile(path)
+    found = Detected("hardware profile", "TOML with a title and units")
+    return Inspection(
+        "hardware profile",
+        f"the hardware profile of {profile.title}",
+        "",
+        f"trilane predict --profile {path}",
+        found,
+        facts={"name": profile.name},
+    )
+
+
+def inspect_run(path: Path) -> Inspection:
+    """A run folder, or the journal of one. Raises BadInputError when neither report nor journal is readable."""
+    folder = path if path.is_dir() else path.parent
+    sheet = folder / SHEET
+    detected = Detected("run folder", "a report or a journal in it")
+    draw = partial(_copied, sheet) if sheet.is_file() else None
+    if (folder / "report.json").is_file():
+        found = inspect_report(folder)
+        return Inspection("run", f"a run folder with {found.what}", "", found.advice, detected, found.length,
+                          found.facts, draw=draw)  # fmt: skip
+    records = sum(1 for _ in read_journal(folder / JOURNAL))
+    what = f"a run folder without a report: a journal of {records} records of a run that goes on or was killed"
+    return Inspection("run", what, "", f"trilane explain {folder}", detected, facts={"records": records}, draw=draw)
+
+
+def _copied(sheet: Path) -> Image.Image:
+    try:
+        with Image.open(sheet) as image:
+            return image.convert("RGB")
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise BadInputError(sheet, f"no readable picture ({error})", "the contact sheet of a run") from error
+
+
+def inspect_report(path: Path) -> Inspection:
+    """The report of a run. Raises BadInputError when it is none."""
+    report = read_report(path)
+    presented = report.frames.presented
+    seconds = report.duration_s
+    facts = {"clock": report.clock, "fps": report.fps, "presented": presented, "failure": report.failure}
+    what = f"the report of {presented} frames at {report.fps:.4g}/s on the {report.clock} clock"
+    advice = f"trilane explain {path if path.is_dir() else path.parent}"
+    length = Length(presented, float(seconds), float(report.fps))
+    return Inspection("report", what, "", advice, Detected("report of a run", "its key `clock`"), length, facts)
+
+
+def inspect_sweep(path: Path) -> Inspection:
+    """Raises BadInputError when the trials are not readable."""
+    entries = read_entries([path])
+    what = f"a folder of {len(entries)} trials of a sweep"
+    found = Detected("sweep", "a file trials.jsonl")
+    return Inspection("sweep", what, "", f"trilane report {path}", found, facts={"trials": len(entries)})
+
+
+def inspect_trace(path: Path) -> Inspection:
+    """Raises BadInputError when it is no trace."""
+    events = _trace_events(path)
+    found, advice = Detected("trace", "its events"), "open it at https://ui.perfetto.dev"
+    return Inspection("trace", f"a trace of {events} events", "", advice, found, facts={"events": events})
+
+
+def _trace_events(path: Path) -> int:
+    if path.suffix == Path(TRACE_NAME).suffix:
+        return _packets(path)
+    document: Any = json.loads(read_text(path, "a trace in Chrome's format"))
+    events = document.get("traceEvents") if isinstance(document, dict) else None
+    if not isinstance(events, list):
+        raise BadInputError(f"{path}: traceEvents", type(events).__name__, "a list of events")
+    return len(events)
+
+
+def _packets(path: Path) -> int:
+    from google.protobuf.message import DecodeError
+    from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace
+
+    size = path.stat().st_size
+    if size > MAX_TEXT_BYTES:
+        raise BadInputError(path, f"{size} bytes", f"a trace of at most {MAX_TEXT_BYTES}")
+    trace = Trace()
+    try:
+        trace.ParseFromString(path.read_bytes())
+    except DecodeError as error:
+        raise BadInputError(path, "bytes that do not parse", "a trace of Perfetto") from error
+    if not trace.packet:
+        raise BadInputError(path, "no packets", "a trace of Perfetto")
+    return len(trace.packet)
