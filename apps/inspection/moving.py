@@ -55,8 +55,11 @@ def inspect_camera(path: Path) -> Inspection:
     camera = load_camera(CameraSpec(source=str(path.absolute())), Path())
     low, high = camera.places.min(axis=0), camera.places.max(axis=0)
     steps = np.linalg.norm(np.diff(camera.places, axis=0), axis=1)
+    angles = [lens.fov_y_deg for lens in camera.optics.lenses]
     facts = {
-        "fov_y_deg": round(camera.lens.fov_y_deg, 3),
+        "fov_y_deg": [round(min(angles), 3), round(max(angles), 3)],
+        "lenses": len(angles),
+        "pictures": len(camera.pictures),
         "extent_m": [round(float(side), 3) for side in high - low],
         "path_m": round(float(steps.sum()), 3),
     }

@@ -105,7 +105,7 @@ def inspect_video(path: Path) -> Inspection:
     turned = f", turned by {turn} degrees" if turn else ""
     return Inspection(
         "video",
-        f"a {facts['codec']} video of {facts['width']}x{facts['height']} pixels{turned}",
+        f"a video ({facts['codec']}) of {facts['width']}x{facts['height']} pixels{turned}",
         "",
         f"trilane run --background {path}",
         Detected(f"{facts['codec']} video", "streams that FFmpeg finds", rate="the mean of the file's header"),

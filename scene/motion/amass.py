@@ -45,7 +45,7 @@ def load_amass(path: Path) -> RawMotion:
         f"betas: {'none' if betas is None else len(betas)}",
         *(("no `trans`: stays in place",) if translation is None else ()),
     )
-    detected = Detected(f"AMASS .npz ({NAMES[width]})", f"`poses` has {width} columns", unit="m", rate=f"by `{key}`")
+    detected = Detected(f"AMASS .npz ({NAMES[width]})", f"`poses` of {width} columns", unit="m", rate=f"by `{key}`")
     return RawMotion(np.arange(len(poses)) / rate, poses, translation, betas, "z", notes, detected=detected)
 
 

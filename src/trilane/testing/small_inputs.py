@@ -160,7 +160,7 @@ def write_film(path: Path, frames: int = 6) -> None:
 def write_avatar(folder: Path) -> None:
     """A bundle of the small body and a network of two convolutions."""
     body = folder.with_name("body-of-avatar.npz")
-    np.savez_compressed(body, **body_arrays())
+    _packed(body, **body_arrays())
     network = check_network(net(), "network.onnx")
     texture = np.random.default_rng(2).normal(0, 1, (8, 8, network.channels)).astype(np.float16)
     manifest = Manifest(name="small", network=network_entry(network, "resnet18", "batch", 8))
@@ -187,8 +187,18 @@ position = [0.0, 0.0, 0.5]
 """
 
 
+def write_pictures(folder: Path) -> None:
+    folder.mkdir()
+    for k in range(3):
+        picture(k).save(folder / f"{k:03}.png")
+
+
 def _arrays(path: Path, **arrays: Any) -> None:
     np.savez(path, **arrays)
+
+
+def _packed(path: Path, **arrays: Any) -> None:
+    np.savez_compressed(path, **arrays)
 
 
 #: Name of a file or folder -> what writes it.
@@ -204,10 +214,10 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "photo.png": lambda path: picture().save(path),
     "photo.jpg": lambda path: picture().save(path),
     "film.mkv": write_film,
-    "body.npz": lambda path: np.savez_compressed(path, **body_arrays()),
+    "body.npz": lambda path: _packed(path, **body_arrays()),
     "network.onnx": lambda path: onnx.save(net(), path),
     "scene.toml": lambda path: path.write_text(SCENE),
-    "pictures": lambda path: [path.mkdir(), *(picture(k).save(path / f"{k:03}.png") for k in range(3))],
+    "pictures": write_pictures,
     "avatar": write_avatar,
 }
 
