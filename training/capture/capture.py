@@ -1,0 +1,221 @@
+"""A capture: frames of one person, each with its mask and the fit of the body, and the camera that took them.
+
+Rule: a `Capture` is whole; everything that is wrong with a folder is found before anything starts and is listed
+together. Layout on disk: docs/captures.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.arrays import F64, U8
+from trilane.avatars.bundle import bundle_folder
+from trilane.body.body import Body, ShapedBody, load_body
+from trilane.errors import BadInputError
+from trilane.files import read_npz
+from trilane.shapes import Shape
+from trilane.training.capture.capture_file import NAME, CaptureFile, read_capture_file
+from trilane.training.capture.faults import Fault, FaultyCaptureError
+from trilane.training.capture.fits import NAMES, SHAPE, Fit, read_fit
+from trilane.training.capture.pictures import FRAME, MASK, PictureFolder, Pictures, open_pictures
+from trilane.training.capture.view_coverage import camera_direction, frames_by_side
+from trilane.unexpected_value import UnexpectedValue
+
+#: One for each side of a person.
+LEAST_FRAMES = 4
+#: From this value on a pixel of a mask counts as the person's.
+HALF = 128
+EXPECTED_FITS = "a folder of .npz files named like the frames, or one .npz"
+BODY = "body.npz"
+Read = TypeVar("Read")
+Track = Callable[[Sequence[int]], Iterable[int]]
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A capture without faults. `fits`, `views` (4,4): of each frame; `mask_of`: the number of its mask.
+
+    `shaped`: the body, whose shape is the mean of that of the fits. `body_file`: where it was read.
+    """
+
+    folder: Path
+    file: CaptureFile
+    body_file: Path
+    shaped: ShapedBody
+    betas: F64
+    expression: F64
+    fits: tuple[Fit, ...]
+    views: tuple[F64, ...]
+    frames: Pictures
+    masks: Pictures
+    mask_of: tuple[int, ...]
+
+    def __len__(self) -> int:
+        return len(self.fits)
+
+    @property
+    def shape(self) -> Shape:
+        """(height, width) of the frames."""
+        return self.file.camera.shape
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the frames."""
+        return self.frames.names
+
+    def picture(self, number: int) -> U8:
+        """Frame `number` with its mask as alpha (h,w,4), straight. Raises UnexpectedValue when it was changed since."""
+        return np.dstack([self.frames.read(number), self.masks.read(self.mask_of[number])])
+
+    def directions(self) -> list[tuple[float, float]]:
+        """Of each frame: yaw and height of the camera, degrees, as `camera_direction`."""
+        root = self.shaped.joints[0]
+        pairs = zip(self.fits, self.views, strict=True)
+        return [camera_direction(fit.pose, root + fit.place, view) for fit, view in pairs]
+
+
+def open_capture(folder: Path, track: Track = iter) -> Capture:
+    """The capture in `folder`, after every picture and fit has been looked at.
+
+    `track`: wraps the numbers of the frames to show progress.
+    Raises BadInputError for a capture.toml that cannot be read, FaultyCaptureError with all faults of what it names.
+    """
+    return _Opening(folder, read_capture_file(folder)).opened(track)
+
+
+class _Opening:
+    """Reads a capture and gathers its faults."""
+
+    def __init__(self, folder: Path, file: CaptureFile) -> None:
+        self.folder, self.file = folder, file
+        self.faults: list[Fault] = []
+
+    def opened(self, track: Track) -> Capture:
+        place = self.folder / self.file.body
+        body_file = bundle_folder("default") / BODY if self.file.body == "default" else place
+        body = self._try(lambda: load_body(body_file))
+        frames = self._try(lambda: open_pictures(self.folder / self.file.frames, FRAME))
+        masks = self._try(lambda: open_pictures(self.folder / self.file.masks, MASK))
+        mask_of: list[int] = []
+        if frames is not None:
+            self._count(frames)
+            mask_of = self._matched(frames, masks) if masks is not None else []
+            self._look(frames, masks, mask_of, track)
+        fits = self._fits(frames.names, body) if frames is not None and body is not None else []
+        if body is None or frames is None or masks is None or len(fits) < LEAST_FRAMES:
+            raise FaultyCaptureError(str(self.folder), self.faults)
+        betas, expression = (_mean([getattr(fit, name) for fit in fits]) for name in SHAPE)
+        views = tuple(self.file.camera.view(fit.rotation, fit.translation) for fit in fits)
+        shaped = body.shape(betas, expression)
+        capture = Capture(
+            *(self.folder, self.file, body_file, shaped, betas, expression),
+            *(tuple(fits), views, frames, masks, tuple(mask_of)),
+        )
+        self._require_sides(capture)
+        if self.faults:
+            raise FaultyCaptureError(str(self.folder), self.faults)
+        return capture
+
+    def _try(self, read: Callable[[], Read]) -> Read | None:
+        try:
+            return read()
+        except BadInputError as error:
+            self.faults.append(Fault.of(error))
+            return None
+
+    def _count(self, frames: Pictures) -> None:
+        if len(frames.names) < LEAST_FRAMES:
+            count = f"{len(frames.names)} frame" + "s" * (len(frames.names) > 1)
+            expected = f"at least {LEAST_FRAMES}, one for each side of the person"
+            self.faults.append(Fault(self.file.frames, count, expected))
+
+    def _matched(self, frames: Pictures, masks: Pictures) -> list[int]:
+        """The number of each frame's mask: by name in folders, else by place; -1 where there is none."""
+        if isinstance(frames, PictureFolder) and isinstance(masks, PictureFolder):
+            by_stem = {Path(name).stem: number for number, name in enumerate(masks.names)}
+            found = [by_stem.get(Path(name).stem, -1) for name in frames.names]
+            wanted = [f"{self.file.masks}/{Path(name).stem}.png" for name in frames.names]
+        else:
+            found = [number if number < len(masks.names) else -1 for number in range(len(frames.names))]
+            wanted = [f"{self.file.masks}#{number}" for number in range(len(frames.names))]
+        missing = [name for name, number in zip(wanted, found, strict=True) if number < 0]
+        self.faults += [Fault(name, "no mask", "a mask for every frame") for name in missing]
+        return found
+
+    def _look(self, frames: Pictures, masks: Pictures | None, mask_of: Sequence[int], track: Track) -> None:
+        """Read every picture once."""
+        shape = self.file.camera.shape
+        for number in track(range(len(frames.names))):
+            frame = self._read(frames, number, f"{self.file.frames}/{frames.names[number]}", shape)
+            if masks is None or mask_of[number] < 0:
+                continue
+            where = f"{self.file.masks}/{masks.names[mask_of[number]]}"
+            mask = self._read(masks, mask_of[number], where, shape if frame is None else frame.shape[:2])
+            if mask is not None and not (mask >= HALF).any():
+                self.faults.append(Fault(where, "an all-black mask", "a mask that is 255 on the person"))
+
+    def _read(self, pictures: Pictures, number: int, where: str, shape: Shape) -> U8 | None:
+        try:
+            picture = pictures.read(number)
+        except UnexpectedValue as error:
+            self.faults.append(Fault(where, error.found, error.expected, error.remedy))
+            return None
+        if picture.shape[:2] != shape:
+            size, wanted = (f"{side[1]}x{side[0]} pixels" for side in (picture.shape, shape))
+            self.faults.append(Fault(where, size, f"{wanted}, as the camera and the other pictures have"))
+        return picture
+
+    def _fits(self, names: Sequence[str], body: Body) -> list[Fit]:
+        """Those fits that could be read."""
+        path, fits = self.folder / self.file.fits, []
+        one = self._try(lambda: _fits_of_file(path, len(names))) if path.is_file() else None
+        if not path.is_dir() and one is None:
+            if not path.exists():
+                self.faults.append(Fault(self.file.fits, "no such file or folder", EXPECTED_FITS))
+            return []
+        for number, name in enumerate(names):
+            where = f"{self.file.fits}#{number}" if one is not None else f"{self.file.fits}/{Path(name).stem}.npz"
+            arrays = one[number] if one is not None else self._fit_arrays(where)
+            if arrays is None:
+                continue
+            fit, faults = read_fit(where, arrays, body, self.file.flat_hand_mean)
+            self.faults += faults
+            fits += [] if fit is None else [fit]
+        return fits
+
+    def _fit_arrays(self, where: str) -> dict[str, NDArray[Any]] | None:
+        try:
+            return read_npz(self.folder / where, NAMES, "the fit of a frame (.npz)")
+        except BadInputError as error:
+            self.faults.append(Fault(where, error.found, error.expected, error.remedy))
+            return None
+
+    def _require_sides(self, capture: Capture) -> None:
+        shown = frames_by_side([yaw for yaw, _ in capture.directions()])
+        for side, count in shown.items():
+            if not count and side not in self.file.missing_views:
+                found, expected = f"no frame that shows the {side}", "frames of all four sides"
+                remedy = f"film it too; or, if it will never be seen, write missing_views = [{side!r}] in {NAME}"
+                self.faults.append(Fault(self.file.fits, found, expected, remedy))
+
+
+def _mean(rows: Sequence[F64]) -> F64:
+    """The mean of rows of coefficients; one that a row does not have is 0."""
+    longest = max(len(row) for row in rows)
+    return np.asarray(np.mean([np.pad(row, (0, longest - len(row))) for row in rows], axis=0))
+
+
+def _fits_of_file(path: Path, count: int) -> list[Mapping[str, NDArray[Any]]]:
+    """The arrays of each frame out of one file; those of the shape may hold for all. Raises BadInputError."""
+    arrays = read_npz(path, NAMES, EXPECTED_FITS)
+    shared = {name: arrays.pop(name) for name in SHAPE if name in arrays and arrays[name].ndim < 2}
+    for name, array in arrays.items():
+        if array.ndim < 2 or len(array) != count:
+            raise BadInputError(f"{path}[{name}]", f"shape {array.shape}", f"({count}, ...), a row for each frame")
+    return [shared | {name: array[number] for name, array in arrays.items()} for number in range(count)]
