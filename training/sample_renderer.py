@@ -68,7 +68,7 @@ class SampleRenderer:
         self.mesh = SkinnedMesh(self.ctx, mesh)
         self._uv = UvRaster(self.ctx, self.mesh)
         layers = clothing_layers(arrays, landmarks)
-        self._surface = ClothedSurface(layers)
+        self.surface = ClothedSurface(layers)
         self.clothed_body = ClothedBody(self.ctx, layers, landmarks, samples)
 
     def plan(self, seed: Sequence[int], source: PoseSource, band: str, size: str) -> Sample:
@@ -82,10 +82,10 @@ class SampleRenderer:
         rng = np.random.default_rng(seed)
         pose = source(rng)
         posed = self.skeleton.pose(pose)
-        points = self._surface.posed(posed)
+        points = self.surface.posed(posed)
         while True:
             view = random_view(rng, band, posed.joints)
-            if not self._surface.is_clear_of(view, points):
+            if not self.surface.is_clear_of(view, points):
                 continue
             crop = self.cropper.crop(posed, view, shape_buckets(size))
             if crop is not None and crop.pixels >= LEAST_PIXELS:

@@ -89,7 +89,7 @@ def test_a_view_is_taken_when_it_is_clear_and_shows_enough(
     vars(renderer).update(
         skeleton=SimpleNamespace(pose=lambda found: body if found is pose else None),
         cropper=SimpleNamespace(crop=crop),
-        _surface=SimpleNamespace(
+        surface=SimpleNamespace(
             posed=lambda posed: "points" if posed is body else None,
             is_clear_of=lambda view, points: points == "points" and view != 1,
         ),

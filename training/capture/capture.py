@@ -117,7 +117,8 @@ class _Opening:
             *(self.folder, self.file, body_file, shaped, betas, expression),
             *(tuple(fits), views, frames, masks, tuple(mask_of)),
         )
-        self._require_sides(capture)
+        if not self.faults:
+            self._require_sides(capture)
         if self.faults:
             raise FaultyCaptureError(str(self.folder), self.faults)
         return capture

@@ -17,6 +17,7 @@ from trilane.arrays import F64
 from trilane.errors import BadInputError
 from trilane.files import read_text
 from trilane.near_miss import did_you_mean
+from trilane.scene.lens import Lens
 from trilane.scene.schema import LISTED, Finite, Table
 from trilane.shapes import MAX_SIDE, Shape
 from trilane.training.capture.faults import Fault, FaultyCaptureError
@@ -31,10 +32,10 @@ OPENGL_FROM_OPENCV: F64 = np.diag([1.0, -1.0, -1.0])
 
 
 class CameraTable(Table):
-    """The camera, in pixels: `fx`, `fy` focal lengths; `cx`, `cy` from the picture's top left corner.
+    """The camera; its lens is that of `scene/lens.py`: pixels are counted from the picture's top left corner.
 
-    The middle of the first pixel is (0.5, 0.5). `axes`: of the camera that fits are in, or that `rotation` (rows) and
-    `translation`, metres, lead to from the world of the fits.
+    `axes`: of the camera that fits are in, or that `rotation` (rows) and `translation`, metres, lead to from the world
+    of the fits.
     """
 
     width: int = Field(ge=64, le=2 * MAX_SIDE)
@@ -52,14 +53,14 @@ class CameraTable(Table):
         """(height, width) of a frame."""
         return self.height, self.width
 
+    @property
+    def lens(self) -> Lens:
+        """That made the frames."""
+        return Lens(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
+
     def projection(self) -> F64:
-        """OpenGL clip matrix (4,4): x to column 0..width, y up to row 0..height, as `fx`, `fy`, `cx`, `cy` say."""
-        matrix = np.zeros((4, 4))
-        matrix[0, 0], matrix[0, 2] = 2 * self.fx / self.width, 1 - 2 * self.cx / self.width
-        matrix[1, 1], matrix[1, 2] = 2 * self.fy / self.height, 2 * self.cy / self.height - 1
-        matrix[2, 2], matrix[2, 3] = (FAR_M + NEAR_M) / (NEAR_M - FAR_M), 2 * FAR_M * NEAR_M / (NEAR_M - FAR_M)
-        matrix[3, 2] = -1.0
-        return matrix
+        """OpenGL clip matrix (4,4) of a frame."""
+        return self.lens.projection(NEAR_M, FAR_M)
 
     def view(self, rotation: Any = None, translation: Any = None) -> F64:
         """(4,4) from the world of the fits to the OpenGL camera; a frame's own `rotation`, `translation` go before."""

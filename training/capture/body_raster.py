@@ -1,0 +1,42 @@
+"""The body of a capture as the pipeline rasterises it: UV images of its fits.
+
+Rule: the pipeline's mesh, skinning and raster; a body that has pose blend shapes is drawn with them.
+"""
+
+from __future__ import annotations
+
+from trilane.arrays import F32, F64
+from trilane.body.body import ShapedBody
+from trilane.body.kinematics import Posed, Skeleton
+from trilane.shapes import Shape
+from trilane.stages.gpu.avatar_mesh import avatar_mesh
+from trilane.stages.gpu.opengl_context import open_context
+from trilane.stages.gpu.skinned_mesh import SkinnedMesh
+from trilane.training.capture.capture import Capture
+from trilane.training.capture.fits import Fit
+from trilane.training.uv_image import UvRaster
+
+
+class BodyRaster:
+    """Draws one shaped body, with an OpenGL context of its own."""
+
+    def __init__(self, shaped: ShapedBody, threads: int | None = None) -> None:
+        """Open the context. `threads`: of a software OpenGL driver. Raises MissingPartError without OpenGL."""
+        context = open_context(threads)
+        self._blended = shaped.body.posedirs is not None
+        self._raster = UvRaster(context, SkinnedMesh(context, avatar_mesh(shaped), shaped.body.posedirs))
+        self.skeleton = Skeleton(shaped.joints, shaped.body.parents)
+
+    def posed(self, fit: Fit) -> Posed:
+        """The body of `fit`; valid until the next call."""
+        return self.skeleton.pose(fit.pose, fit.place)
+
+    def uv(self, fit: Fit, view: F64, projection: F64, shape: Shape) -> F32:
+        """The UV image (h,w,3) of `fit`: u, v, coverage. `view`, `projection` (4,4); `shape` (height, width)."""
+        posed = self.posed(fit)
+        feature = posed.feature if self._blended else None
+        return self._raster.render(posed.matrices, view, projection, shape, feature)
+
+    def uv_of(self, capture: Capture, number: int) -> F32:
+        """The UV image of frame `number` of `capture`, as large as the frame."""
+        return self.uv(capture.fits[number], capture.views[number], capture.file.camera.projection(), capture.shape)

@@ -1,0 +1,249 @@
+"""A capture of the default body, clothed: as many frames as wanted, in random poses, from all sides.
+
+Rule: a frame depends on the seed and its number alone; what noise is put on fits and masks is stated, and the truth is
+kept beside them as a capture of its own.
+"""
+
+from __future__ import annotations
+
+import io
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageFilter
+
+from trilane.arrays import F64, U8, Floats
+from trilane.body.body import ShapedBody
+from trilane.body.joints import JOINTS, LEFT_HAND, RIGHT_HAND
+from trilane.body.kinematics import rodrigues
+from trilane.scene.lens import Lens, centred
+from trilane.scene.rotations import rotvec_from_matrix
+from trilane.shapes import Shape
+from trilane.training.capture.capture_file import FAR_M, NAME, NEAR_M, OPENGL_FROM_OPENCV
+from trilane.training.random_poses import random_pose
+from trilane.training.random_views import look_at
+from trilane.training.sample_renderer import SampleRenderer
+
+TRUTH = "truth"
+FOV_Y_DEG = 40.0
+PITCH_DEG = (-12.0, 4.0, 30.0)
+ROLL_DEG = 1.0
+#: Of the turn between two frames, by which each is off its even place: so little that four frames show all sides.
+JITTER = 0.3
+#: The person reaches over this share of the frame's half sides at most, and at least that over `MOST_FARTHER`.
+FILLED = 0.94
+MOST_FARTHER = 1.3
+FAST_PNG = 1
+#: Size of the patches in which the outline of an imperfect mask is moved alike, and of the background's, pixels.
+MASK_PATCH_PX, BACKGROUND_PATCH_PX = 24, 160
+#: A blurred straight outline has a tenth of its height this many standard deviations from it.
+TENTH_AT = 1.2816
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """`frames` pictures of `shape` (height, width), drawn from `seed`.
+
+    `fit_deg`: each joint of a fit is turned about a random axis by up to so many degrees. `fit_mm`: the body is moved
+    by up to so many millimetres along each axis. `mask_px`: the outline of a mask is moved by up to so many pixels.
+    """
+
+    frames: int
+    shape: Shape
+    seed: int = 1
+    fit_deg: float = 0.0
+    fit_mm: float = 0.0
+    mask_px: float = 0.0
+
+    @property
+    def is_noisy(self) -> bool:
+        return max(self.fit_deg, self.fit_mm, self.mask_px) > 0
+
+    @property
+    def lens(self) -> Lens:
+        """Of the camera, which has square pixels."""
+        height, width = self.shape
+        return centred(width, height, height / 2 / np.tan(np.radians(FOV_Y_DEG) / 2))
+
+
+@dataclass(frozen=True)
+class SyntheticFrame:
+    """`frame` (h,w,3), `mask` (h,w). `pose` (55,3) and `place` (3,), as a fit has them, in the camera's OpenCV axes."""
+
+    frame: U8
+    mask: U8
+    pose: F64
+    place: F64
+
+
+class SyntheticCapture:
+    """Draws the frames of a recipe, with an OpenGL context of its own."""
+
+    def __init__(self, shaped: ShapedBody, recipe: Recipe) -> None:
+        """Put clothes on `shaped` and open the context. Raises MissingPartError without OpenGL."""
+        self._recipe, self._root = recipe, shaped.joints[0]
+        self._renderer = SampleRenderer(shaped)
+        self._projection = recipe.lens.projection(NEAR_M, FAR_M)
+        self._background = _patches(np.random.default_rng((recipe.seed, 4)), recipe.shape, BACKGROUND_PATCH_PX, 3)
+
+    def frame(self, number: int) -> SyntheticFrame:
+        """Frame `number`, without noise."""
+        recipe, renderer = self._recipe, self._renderer
+        rng = np.random.default_rng((recipe.seed, 3, number))
+        pose = random_pose(rng)
+        posed = renderer.skeleton.pose(pose)
+        yaw = 2 * np.pi * (number + JITTER * rng.uniform(-1, 1)) / recipe.frames
+        view = framing_view(rng, yaw, renderer.surface.posed(posed), self._projection)
+        rgba = renderer.clothed_body.render(posed.matrices, view, self._projection, recipe.shape)
+        share = rgba[..., 3:] / 255
+        ground = 96 + 64 * self._background
+        frame = np.round(rgba[..., :3] * share + ground * (1 - share)).astype(np.uint8)
+        return SyntheticFrame(frame, rgba[..., 3].copy(), *in_camera(pose, self._root, view))
+
+    def noisy(self, number: int, exact: SyntheticFrame) -> SyntheticFrame:
+        """`exact`, which is frame `number`, with the recipe's noise on its fit and its mask."""
+        recipe = self._recipe
+        rng = np.random.default_rng((recipe.seed, 5, number))
+        pose = turned_at_random(rng, exact.pose, recipe.fit_deg)
+        place = exact.place + rng.uniform(-1, 1, 3) * recipe.fit_mm / 1000
+        mask = moved_outline(rng, exact.mask, recipe.mask_px) if recipe.mask_px else exact.mask
+        return SyntheticFrame(exact.frame, mask, pose, place)
+
+
+def framing_view(rng: np.random.Generator, yaw: float, points: F64, projection: F64) -> F64:
+    """(4,4) of a camera at `yaw` about `points` (N,3) that has all of them in its picture, which they nearly fill.
+
+    A point at (x, y, z) from the aim, in camera axes, is in a picture whose half sides have the tangents t from the
+    distance |x| / t + z on.
+    """
+    aim = (points.min(axis=0) + points.max(axis=0)) / 2
+    pitch = np.radians(rng.triangular(*PITCH_DEG))
+    back = np.array([np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)])
+    roll = np.radians(ROLL_DEG) * rng.standard_normal()
+    near = look_at(aim + back, aim, roll)
+    x, y, z = near[:3, :3] @ (points - aim).T
+    tangents = FILLED / np.array([projection[0, 0], projection[1, 1]])
+    distance = max((np.abs(x) / tangents[0] + z).max(), (np.abs(y) / tangents[1] + z).max())
+    return look_at(aim + back * distance * rng.uniform(1.0, MOST_FARTHER), aim, roll)
+
+
+def in_camera(pose: F64, root: F64, view: F64) -> tuple[F64, F64]:
+    """The pose (55,3) and the place (3,) in OpenCV camera axes of a body that stands in the world as `pose` has it.
+
+    `root` (3,): the root joint at rest, about which the body turns and to which the place is added. `view` (4,4).
+    """
+    to_camera = OPENGL_FROM_OPENCV @ view[:3]  # its own inverse
+    turned = pose.copy()
+    turned[0] = rotvec_from_matrix(to_camera[:, :3] @ rodrigues(pose[0]))
+    return turned, to_camera[:, :3] @ root + to_camera[:, 3] - root
+
+
+def turned_at_random(rng: np.random.Generator, pose: F64, most_deg: float) -> F64:
+    """`pose` (55,3) with each joint turned about a random axis by up to `most_deg`."""
+    axes = rng.standard_normal((JOINTS, 3))
+    turns = axes / np.linalg.norm(axes, axis=1, keepdims=True) * np.radians(rng.uniform(0, most_deg, (JOINTS, 1)))
+    return np.asarray(rotvec_from_matrix(rodrigues(turns) @ rodrigues(pose)))
+
+
+def moved_outline(rng: np.random.Generator, mask: U8, most_px: float) -> U8:
+    """`mask` (h,w), 255 or 0, with its outline moved inwards and outwards by up to `most_px`, patch by patch.
+
+    The mask is blurred and cut at a level that differs from place to place, from a tenth to nine tenths.
+    """
+    blurred = np.asarray(Image.fromarray(mask).filter(ImageFilter.GaussianBlur(most_px / TENTH_AT)), np.float64) / 255
+    level = 0.5 + 0.4 * _patches(rng, (mask.shape[0], mask.shape[1]), MASK_PATCH_PX, 1)[..., 0]
+    return np.where(blurred > level, 255, 0).astype(np.uint8)
+
+
+def _patches(rng: np.random.Generator, shape: Shape, side: int, channels: int) -> F64:
+    """(h,w,channels) in -1..1: random values `side` pixels apart, smooth between."""
+    coarse = rng.uniform(-1, 1, (channels, shape[0] // side + 2, shape[1] // side + 2)).astype(np.float32)
+    planes = [np.asarray(Image.fromarray(plane).resize(shape[::-1], Image.Resampling.BILINEAR)) for plane in coarse]
+    return np.stack(planes, axis=-1).astype(np.float64)
+
+
+def write_capture(folder: Path, capture: SyntheticCapture, recipe: Recipe) -> Iterator[int]:
+    """Write the frames of `recipe` to `folder`, which is empty; yields the number of each that is written."""
+    for part in ("frames", "masks", "fits", *((f"{TRUTH}/masks", f"{TRUTH}/fits") if recipe.is_noisy else ())):
+        (folder / part).mkdir(parents=True)
+    (folder / NAME).write_text(capture_text(recipe, "frames"), encoding="utf-8")
+    if recipe.is_noisy:
+        (folder / TRUTH / NAME).write_text(capture_text(recipe, "../frames"), encoding="utf-8")
+    for number in range(recipe.frames):
+        exact = capture.frame(number)
+        Image.fromarray(exact.frame).save(folder / "frames" / f"{number:06}.png", compress_level=FAST_PNG)
+        _write_shot(folder, number, capture.noisy(number, exact))
+        if recipe.is_noisy:
+            _write_shot(folder / TRUTH, number, exact)
+        yield number
+
+
+def _write_shot(folder: Path, number: int, shot: SyntheticFrame) -> None:
+    Image.fromarray(shot.mask).save(folder / "masks" / f"{number:06}.png", compress_level=FAST_PNG)
+    np.savez(folder / "fits" / f"{number:06}.npz", **fit_arrays(shot.pose, shot.place))
+
+
+def fit_arrays(pose: F64, place: F64) -> dict[str, Any]:
+    """A fit by the names of SMPL-X, float32: `pose` (55,3), `place` (3,)."""
+    row = pose.reshape(-1)
+    parts: dict[str, Floats] = {
+        "global_orient": row[:3],
+        "body_pose": row[3:66],
+        "jaw_pose": row[66:69],
+        "leye_pose": row[69:72],
+        "reye_pose": row[72:75],
+        "left_hand_pose": row[LEFT_HAND],
+        "right_hand_pose": row[RIGHT_HAND],
+        "transl": place,
+        "betas": np.zeros(10),
+    }
+    return {name: part.astype(np.float32) for name, part in parts.items()}
+
+
+def capture_text(recipe: Recipe, frames: str) -> str:
+    """`capture.toml` of a synthetic capture whose frames lie at `frames`."""
+    lens = recipe.lens
+    noise = f"fits up to {recipe.fit_deg:g} degrees and {recipe.fit_mm:g} mm, masks up to {recipe.mask_px:g} pixels off"
+    return f"""\
+# The default body, clothed, drawn by `trilane avatar create-data`: {recipe.frames} frames, seed {recipe.seed}.
+# Noise: {noise if recipe.is_noisy and frames == "frames" else "none"}.
+schema = 1
+body = "default"
+frames = "{frames}"
+masks = "masks"
+fits = "fits"
+
+[camera]
+width = {recipe.shape[1]}
+height = {recipe.shape[0]}
+fx = {float(lens.fx)!r}
+fy = {float(lens.fy)!r}
+cx = {float(lens.cx)!r}
+cy = {float(lens.cy)!r}
+"""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """`seconds` and `disk_bytes` of a frame, measured."""
+
+    seconds: float
+    disk_bytes: int
+
+
+def measured_cost(capture: SyntheticCapture, recipe: Recipe) -> Cost:
+    """What a frame of `recipe` takes: of one that is drawn and written to memory, after another that warms up."""
+    capture.frame(0)
+    start = time.monotonic()
+    exact = capture.frame(recipe.frames // 2)
+    shots = [capture.noisy(recipe.frames // 2, exact), *([exact] if recipe.is_noisy else [])]
+    file = io.BytesIO()
+    for picture in (exact.frame, *(shot.mask for shot in shots)):
+        Image.fromarray(picture).save(file, "png", compress_level=FAST_PNG)
+    for shot in shots:
+        np.savez(file, **fit_arrays(shot.pose, shot.place))
+    return Cost(time.monotonic() - start, file.tell())
