@@ -68,7 +68,7 @@ def test_every_fault_is_listed_with_its_file(folder: Path, command: Command) -> 
     (folder / "masks" / "000.png").unlink()
     Image.fromarray(np.zeros((HEIGHT, WIDTH, 4), np.uint8)).save(folder / "frames" / "001.png")
     np.savez(folder / "fits" / "002.npz", **fit(2) | {"body_pose": np.zeros(69)})
-    Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint8)).save(folder / "masks" / "003.png")
+    Image.fromarray(np.full((HEIGHT, WIDTH), 127, np.uint8)).save(folder / "masks" / "003.png")
     Image.fromarray(np.zeros((HEIGHT + 2, WIDTH, 3), np.uint8)).save(folder / "frames" / "004.png")
     np.savez(folder / "fits" / "005.npz", **fit(5) | {"transl": np.array([0.0, np.nan, 0.0])})
     whole = (folder / "frames" / "006.png").read_bytes()
@@ -81,7 +81,7 @@ def test_every_fault_is_listed_with_its_file(folder: Path, command: Command) -> 
         ("masks/000.png", "no mask"),
         ("frames/001.png", "four channels (RGBA)"),
         ("fits/002.npz[body_pose]", "69 numbers (23 joints: the SMPL layout)"),
-        ("masks/003.png", "an all-black mask"),
+        ("masks/003.png", "an all-black mask (its greatest value is 127)"),
         ("frames/004.png", f"{WIDTH}x{HEIGHT + 2} pixels"),
         ("masks/004.png", f"{WIDTH}x{HEIGHT} pixels"),
         ("fits/005.npz[transl]", "NaN, infinity or a huge number"),

@@ -159,7 +159,8 @@ class _Opening:
             where = f"{self.file.masks}/{masks.names[mask_of[number]]}"
             mask = self._read(masks, mask_of[number], where, shape if frame is None else frame.shape[:2])
             if mask is not None and not (mask >= HALF).any():
-                self.faults.append(Fault(where, "an all-black mask", "a mask that is 255 on the person"))
+                found = f"an all-black mask (its greatest value is {mask.max()})"
+                self.faults.append(Fault(where, found, "a mask that is 255 on the person"))
 
     def _read(self, pictures: Pictures, number: int, where: str, shape: Shape) -> U8 | None:
         try:
