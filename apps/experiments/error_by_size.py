@@ -22,6 +22,9 @@ from trilane.figure_sources import MEASURED
 from trilane.scheduler.stats import median_interval
 from trilane.stages.configure import Checked, Request, configure
 
+#: Jobs that an interval of 95 % needs: the median lies between the least and the largest of n with 1 - 2 / 2^n.
+LEAST_JOBS = 6
+
 
 @dataclass(frozen=True)
 class Row:
@@ -44,7 +47,7 @@ class Row:
 
     def as_json(self) -> dict[str, Any]:
         """The row of `measure`."""
-        low, high = median_interval(self.infer_ms)
+        low, high = median_interval(self.infer_ms) if len(self.infer_ms) >= LEAST_JOBS else (None, None)
         ssim = [error.ssim for error in self.errors if error.ssim is not None]
         return {
             "size": self.size,
@@ -74,9 +77,10 @@ def measure(
     Each frame is made `rounds` times; its error is that of the first.
 
     Keys: `rows`: `size`, `runtime`, `threads`, `infer_ms` (median of all jobs) with its 95 % interval `infer_low_ms`,
-    `infer_high_ms`, `frame_ms` (median sum of all stages but present), and the error where the avatars are: `psnr_db`,
-    `mae` (steps of 1/255), `ssim`, `flip`, means over the frames, and `worst_psnr_db`; `against`: what they are
-    compared with; `frames`; `empty_frames`: with nobody in view, not counted; `sources`; `config`.
+    `infer_high_ms` (null of fewer than 6 jobs), `frame_ms` (median sum of all stages but present), and the error where
+    the avatars are: `psnr_db`, `mae` (steps of 1/255), `ssim`, `flip`, means over the frames, and `worst_psnr_db`;
+    `against`: what they are compared with; `frames`; `empty_frames`: with nobody in view, not counted; `sources`;
+    `config`.
 
     Raises BadInputError, MissingPartError.
     """
