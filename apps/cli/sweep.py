@@ -34,7 +34,7 @@ app = Commands()
 EPILOG = """\b
 Examples:
   trilane sweep run --size 128 --size 256 --runtime ort --runtime openvino
-  trilane sweep predict --channels 8 --channels 16 --edge double --edge triple --dry-run
+  trilane sweep predict --policy pipelined --edge double --edge triple --dry-run
   trilane sweep predict --channels 8 --channels 16 --size 256 --size 512 --random 3 --seed 1
   trilane sweep docs/examples/chip-sweep.toml --out sweeps/chips
   trilane sweep docs/examples/chip-sweep.toml --out sweeps/chips --resume
@@ -90,9 +90,7 @@ def sweep(
         name, definition, command = _of_file(words, as_list, random, seed)
     else:
         name, definition, command = _of_words(words, as_list, random, seed)
-    from trilane.apps.sweeps.definition import trials_of
-
-    trials = trials_of(definition, command.words_of)
+    trials = _trials(words[0], definition, command)
     if dry_run:
         _print_planned(trials, as_json)
         return
@@ -145,6 +143,18 @@ def _of_words(
     axes = {name: several for name, several in values.items() if len(several) > 1}
     kind = Kind.LIST if as_list else Kind.RANDOM if random is not None else Kind.GRID
     return "-".join(command.words), Definition(command.words, options, axes, kind, random, seed or 0), command
+
+
+def _trials(first: str, definition: Definition, command: SweptCommand) -> list[Trial]:
+    """Errors of a definition that came from a file, the `first` word, name it."""
+    from trilane.apps.sweeps.definition import trials_of
+
+    try:
+        return trials_of(definition, command.words_of)
+    except BadInputError as error:
+        if not first.endswith(ENDING):
+            raise
+        raise BadInputError(f"{first}: {error.where}", error.found, error.expected, error.remedy) from None
 
 
 def _default_folder(name: str, trials: Sequence[Trial]) -> Path:

@@ -6,6 +6,7 @@ Rule: on a terminal one bar with the time left, elsewhere a line for each trial 
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import timedelta
@@ -78,7 +79,7 @@ def _time(seconds: float) -> str:
 
 
 def print_summary(document: Mapping[str, Any], definition: Definition, records: Mapping[str, Any]) -> None:
-    """A row for each trial and a line of counts.
+    """A row for each trial, a line of counts, and a line for each error that trials ended with.
 
     `document`: as `--json` prints it.
     `records`: by name, as in `trials.jsonl`.
@@ -97,6 +98,9 @@ def print_summary(document: Mapping[str, Any], definition: Definition, records: 
     counts = document["counts"]
     text = ", ".join(f"{counts[key]} {key}" for key in ("trials", "done", "failed", "lost", "skipped"))
     stdout_console().print(f"{text}; {document['clock']} clock", markup=False)
+    errors = Counter((row["status"], row["error"]) for row in document["trials"] if row["error"])
+    for (status, error), count in errors.items():
+        stdout_console().print(f"{count} {status}: {error}", soft_wrap=True, markup=False)
 
 
 def _figure(result: Mapping[str, Any], path: tuple[str, ...]) -> Any:

@@ -99,7 +99,8 @@ def _count(definition: Definition) -> int:
     if definition.kind is Kind.GRID:
         return whole
     if definition.count is None or not 1 <= definition.count <= whole:
-        raise BadInputError("count", str(definition.count), f"1 to {whole}", "so many combinations the axes have")
+        found = "none" if definition.count is None else str(definition.count)
+        raise BadInputError("count", found, f"1 to {whole}", "so many combinations the axes have")
     return definition.count
 
 

@@ -35,7 +35,10 @@ def whole_lines(text: bytes, where: str | Path) -> tuple[list[Record], int]:
     for number, line in enumerate(lines, start=1):
         record = _record(line)
         if record is None and number < len(lines):
-            raise BadInputError(f"{where}, line {number}", "no trial", "a JSON object with id and status")
+            expected = "a JSON object with id and status"
+            raise BadInputError(
+                f"{where}, line {number}", "no trial", expected, "without this line its trial is done again"
+            )
         if record is not None:
             records.append(record)
             size += len(line) + 1

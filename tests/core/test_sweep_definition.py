@@ -12,8 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from trilane.apps.cli.sweep import sweep as sweep_command
 from trilane.apps.cli.sweep_options import SweptCommand
-from trilane.apps.cli.sweep_output import seconds_left
+from trilane.apps.cli.sweep_output import print_summary, seconds_left
 from trilane.apps.sweeps import definition as module
 from trilane.apps.sweeps import ray_engine
 from trilane.apps.sweeps.definition import Definition, Kind, trials_of
@@ -234,3 +235,29 @@ def test_an_address_where_nobody_listens_is_found_at_once() -> None:
 def test_time_left() -> None:
     assert seconds_left(12.0, 4, 6) == 18.0
     assert seconds_left(12.0, 4, 0) == 0.0
+
+
+def test_a_summary_says_why_trials_failed(capsys: pytest.CaptureFixture[str]) -> None:
+    rows = [
+        {"id": str(place), "options": {"size": place}, "status": status, "seconds": 1.0, "error": error}
+        for place, (status, error) in enumerate(
+            [("failed", "no [room]"), ("done", None), ("failed", "no [room]"), ("lost", "killed")]
+        )
+    ]
+    counts = dict.fromkeys(("trials", "done", "failed", "lost", "skipped"), 1)
+    print_summary({"trials": rows, "counts": counts, "clock": "host"}, Definition(RUN, {}, {"size": [0]}), {})
+    assert capsys.readouterr().out.splitlines()[-2:] == ["2 failed: no [room]", "1 lost: killed"]
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("kind = 'random'", "sweep.toml: count: found none"),
+        ("[axes]\nsize = []", "sweep.toml: axes.size: found no value"),
+    ],
+)
+def test_defects_that_are_found_late_name_the_file(tmp_path: Path, text: str, found: str) -> None:
+    file = tmp_path / "sweep.toml"
+    file.write_text(f"command = 'predict'\n{text}\n")
+    with pytest.raises(BadInputError, match=found):
+        sweep_command([str(file)], dry_run=True)

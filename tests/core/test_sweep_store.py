@@ -45,7 +45,7 @@ def test_a_wrong_last_line_is_torn_and_a_wrong_one_before_it_is_named() -> None:
     good = json.dumps(record(FIRST)).encode() + b"\n"
     assert whole_lines(good + b"\0\0\0\n", "x") == ([record(FIRST)], len(good))
     for wrong in (b"\0\n", b"[1]\n", b'{"id": "a"}\n', b"\n"):
-        with pytest.raises(BadInputError, match=r"trials.jsonl, line 2: found no trial"):
+        with pytest.raises(BadInputError, match=r"trials.jsonl, line 2: found no trial.*done again"):
             whole_lines(good + wrong + good, "trials.jsonl")
 
 
