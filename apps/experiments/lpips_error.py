@@ -46,8 +46,10 @@ class Lpips:
             raise MissingPartError(f"LPIPS needs {error.name}", extra="train") from None
         try:
             state = torch.load(weights, map_location="cpu", weights_only=True)
-        except Exception as error:  # of whatever kind: PyTorch raises many for what is no such file
-            raise BadInputError(str(weights), str(error).partition("\n")[0], EXPECTED, REMEDY) from None
+        except OSError as error:
+            raise BadInputError.of_os_error(weights, error, EXPECTED) from None
+        except Exception:  # of whatever kind: PyTorch raises many, some with the advice to read the file less carefully
+            raise BadInputError(str(weights), "a file that is not of tensors alone", EXPECTED, REMEDY) from None
         self._state = {name: _tensor(state, name, shape, weights) for name, shape in _shapes()}
 
     def __call__(self, picture: F64, reference: F64) -> float | None:

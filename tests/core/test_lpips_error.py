@@ -71,7 +71,8 @@ def test_what_is_no_file_of_weights_is_refused(state: dict[str, Any], tmp_path: 
     text.write_text("no weights", encoding="utf-8")
     torch.save({name: state[name] for name in list(state)[:3]}, part)
     torch.save({**state, "lin4.model.1.weight": torch.zeros(1, 7, 1, 1)}, odd)
-    for file, said in ((text, "text.pth"), (part, "slice2.3.weight: found no tensor"), (odd, "(1, 7, 1, 1)")):
+    no_tensors = "text.pth: found a file that is not of tensors alone"
+    for file, said in ((text, no_tensors), (part, "slice2.3.weight: found no tensor"), (odd, "(1, 7, 1, 1)")):
         with pytest.raises(BadInputError, match=r"weights of lpips") as caught:
             Lpips(file)
         assert said in str(caught.value)
