@@ -28,7 +28,7 @@ Examples:
 """
 OUT_OF_BOUNDS = 1
 SCENE, FRAMES, BY_CAUSE_FRAMES = "default", 8, 2
-NUMBER_COLUMNS = ("name", "error", "bound", "unit", "verdict")
+NUMBER_COLUMNS = ("name", "error", "bound", "unit", "from", "verdict")
 HARD_COLUMNS = ("name", "error", "bound", "constant_error", "shifted_error", "swapped_error", "source", "verdict")
 
 
@@ -135,15 +135,20 @@ def _hard_cases(names: list[str], as_json: bool) -> bool:
     if as_json:
         print_json({"schema": 1, "hard_cases": rows})
     else:
-        _print(numbers, NUMBER_COLUMNS)
-        for source in dict.fromkeys(row["source"] for row in numbers):
-            stdout_console().print(f"bound: {source}", soft_wrap=True, markup=False)
+        marks = {source: f"[{number}]" for number, source in enumerate(dict.fromkeys(_sources(numbers)), start=1)}
+        _print([{**row, "from": marks[row["source"]]} for row in numbers], NUMBER_COLUMNS)
+        for source, mark in marks.items():
+            stdout_console().print(f"{mark} bound: {source}", soft_wrap=True, markup=False)
         _print(networks, HARD_COLUMNS)
         stdout_console().print(f"{UNIT}; bound: {SOURCE}", soft_wrap=True, markup=False)
     failed = [row for row in rows if not row["passed"]]
     for row in failed:
         stderr_console().print(f"{row['name']}: {row['verdict']}", soft_wrap=True, markup=False)
     return not failed
+
+
+def _sources(rows: list[dict[str, Any]]) -> Iterator[str]:
+    return (row["source"] for row in rows)
 
 
 def _scene(scene: str, avatar: str | None, size: str | None, frames: int, names: list[str], as_json: bool) -> bool:
@@ -177,8 +182,15 @@ def _out_of_bounds(row: dict[str, Any], bounds: dict[str, float]) -> Iterator[st
 
 def _print(rows: list[dict[str, Any]], columns: tuple[str, ...]) -> None:
     from rich.table import Table
+    from rich.text import Text
 
     table = Table(*columns)
     for row in rows:
-        table.add_row(*(f"{row[key]:.3g}" if isinstance(row[key], float) else str(row[key]) for key in columns))
+        table.add_row(*(Text(_shown(row[key])) for key in columns))
     stdout_console().print(table)
+
+
+def _shown(value: Any) -> str:
+    if value is None:
+        return "no number"
+    return f"{value:.3g}" if isinstance(value, float) else str(value)

@@ -7,6 +7,7 @@ Neither follows from a runtime's picture. A row whose bound a wrong picture woul
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -123,7 +124,7 @@ def hard_cases(runtimes: Sequence[str]) -> Iterator[dict[str, Any]]:
     """Rows of every network, input and runtime. Raises MissingPartError.
 
     Keys: `name`, `error`, `bound`, `unit`, `source` (of the bound), `predicted_error`, those of `wrong_answers`,
-    `verdict`, `passed`.
+    `verdict`, `passed`. `error` is None where it is no number, which is above every bound.
     """
     for network in NETWORKS:
         pair = make_pair(network)
@@ -134,7 +135,7 @@ def hard_cases(runtimes: Sequence[str]) -> Iterator[dict[str, Any]]:
                 verdict = case.verdict(error)
                 yield {
                     "name": f"{network}, {name}, {runtime}",
-                    "error": error,
+                    "error": error if math.isfinite(error) else None,
                     "bound": case.bound,
                     "unit": UNIT,
                     "source": case.source,

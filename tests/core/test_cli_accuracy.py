@@ -114,6 +114,23 @@ def test_a_hard_case_that_fails_is_named(passed: bool, monkeypatch: pytest.Monke
     assert err.splitlines() == ([] if passed else ["a [number]: over", "batch, [odd], ort: above"])
 
 
+@pytest.mark.usefixtures("asked")
+def test_each_hard_number_says_where_its_bound_comes_from(monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
+    row = {"bound": 1.0, "unit": "m", "verdict": "holds", "passed": True}
+    found = [("first", 0.5, "[proof]"), ("second", None, "analysis"), ("third", 0.25, "[proof]")]
+    numbers = [{**row, "name": name, "error": error, "source": source} for name, error, source in found]
+    monkeypatch.setattr(all_rows, "hard_numbers", lambda: iter(numbers))
+    monkeypatch.setattr(hard_cases, "hard_cases", lambda _: iter([]))
+    lines = command("accuracy", "--hard-cases")[0].splitlines()
+    cells = [[cell.strip() for cell in line.split("│")[1:-1]] for line in lines if line.startswith("│")]
+    assert [row[:2] + row[4:5] for row in cells] == [
+        ["first", "0.5", "[1]"],
+        ["second", "no number", "[2]"],
+        ["third", "0.25", "[1]"],
+    ]
+    assert [line for line in lines if "bound: " in line][:2] == ["[1] bound: [proof]", "[2] bound: analysis"]
+
+
 @pytest.mark.parametrize(
     ("words", "found"),
     [

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from decimal import Decimal
 from typing import Any
 
 import numpy as np
 import pytest
 
-from trilane.apps.experiments.hard_numbers import chains, rotations
+from trilane.apps.experiments.hard_numbers import all_rows, bodies, chains, rotations
 from trilane.apps.experiments.hard_numbers.all_rows import COUNT
 from trilane.apps.experiments.hard_numbers.exact_turn import PI, exact_turn, turn_error
 from trilane.apps.experiments.hard_numbers.hard_number import U32, HardNumber, U, gamma, worst
 from trilane.apps.experiments.hard_numbers.times import time_cases
 from trilane.avatars.bundle import bundle_folder
+from trilane.body import kinematics, skin_weights, skinning
 from trilane.body.body import ShapedBody, load_body, weights_of_one
 from trilane.body.kinematics import Posed, Skeleton
+from trilane.body.skin_weights import TopWeights
+from trilane.errors import BadInputError
 
 
 @pytest.fixture(scope="module")
@@ -149,6 +153,53 @@ def test_weights_are_made_to_sum_to_one() -> None:
     assert found[0].tolist() == [0.5, 0.5, 0.0]
     assert found[1] == pytest.approx([0.5 / 0.9995, 0.4995 / 0.9995, 0.0], rel=1e-7)
     assert found[2].tolist() == [1.0, 0.0, 0.0]
+
+
+def test_fewer_weights_keep_the_bound_that_is_proved(shaped: ShapedBody) -> None:
+    cases = list(bodies._left_out(shaped))
+    assert failing(cases) == []
+    assert [case.name.split(" skin")[0] for case in cases] == [
+        "the 4 largest",
+        "the 4 largest of 16 drawn",
+        "the 8 largest of 16 drawn",
+        "the 12 largest of 16 drawn",
+    ]
+    assert all(case.error > 0 for case in cases)
+
+
+def test_weights_that_are_not_scaled_fail(shaped: ShapedBody, monkeypatch: pytest.MonkeyPatch) -> None:
+    def unscaled(weights: Any, k: int) -> TopWeights:
+        order = np.argsort(-weights, axis=1, kind="stable")[:, :k]
+        return TopWeights(order.astype(np.int32), np.take_along_axis(weights, order, axis=1))
+
+    monkeypatch.setattr(skin_weights, "largest_weights", unscaled)
+    monkeypatch.setattr(skinning, "largest_weights", unscaled)
+    assert len(failing(bodies._left_out(shaped))) == 4
+
+
+def test_a_kind_of_case_that_an_error_ends_is_a_row_that_fails() -> None:
+    def cases() -> Iterator[HardNumber]:
+        yield HardNumber("first", 0.0, 1.0, "m", "")
+        raise BadInputError("place", "NaN", "a number")
+
+    kept = list(all_rows.kept_going("bodies", cases()))
+    assert [(case.name, case.holds) for case in kept] == [
+        ("first", True),
+        ("bodies, ended by an error: place: found NaN, expected a number", False),
+    ]
+
+
+def test_a_fault_that_gives_no_number_is_told_row_by_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As JSON has it, which knows no NaN."""
+    monkeypatch.setattr(kinematics, "_TINY", 0.0)
+    monkeypatch.setattr(rotations, "ANGLES", {"0": 0.0, "1e-3": 1e-3})
+    monkeypatch.setattr(all_rows, "_cases", lambda: all_rows.kept_going("rotations", rotations.rotation_cases()))
+    monkeypatch.setattr(rotations, "_random_cases", lambda: iter(()))
+    monkeypatch.setattr(rotations, "RETURNED", ())
+    with np.errstate(invalid="ignore"):
+        rows = list(all_rows.hard_numbers())
+    assert [(row["error"] is None, row["passed"]) for row in rows] == [(True, False), (False, True)]
+    json.dumps(rows, allow_nan=False)
 
 
 def test_there_are_enough_rows() -> None:
