@@ -12,6 +12,7 @@ from trilane.avatars.bundle import Bundle
 from trilane.avatars.integer_network import NetworkFile
 from trilane.avatars.validation import validation_facts
 from trilane.body.body import load_body
+from trilane.errors import BadInputError
 from trilane.hw_profiles.network_work import graph_facts
 
 
@@ -39,5 +40,9 @@ def bundle_facts(bundle: Bundle) -> dict[str, Any]:
 
 
 def network_facts(network: NetworkFile) -> dict[str, Any]:
-    """`shape` (N, H, W, C), `sha256`, and the work of one pass, see `graph_facts`."""
-    return {"shape": list(network.shape), "sha256": network.digest, **graph_facts(network.model)}
+    """`shape` (N, H, W, C), `sha256`, and the work of one pass, see `graph_facts`. Raises BadInputError."""
+    try:
+        work = graph_facts(network.model)
+    except BadInputError as error:
+        raise BadInputError(f"{network.where}, {error.where}", error.found, error.expected, error.remedy) from None
+    return {"shape": list(network.shape), "sha256": network.digest, **work}

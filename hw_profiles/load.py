@@ -122,7 +122,7 @@ def _read(path: Path) -> dict[str, Any]:
         if path.stat().st_size > MAX_BYTES:
             raise BadInputError(path, f"{path.stat().st_size} bytes", f"at most {MAX_BYTES}")
         return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # of bytes that are no text, of numbers and lists that are too long
         raise BadInputError(path, str(error), "TOML in UTF-8") from None
     except OSError as error:
         raise BadInputError.of_os_error(path, error, "a file that can be read") from None

@@ -40,6 +40,8 @@ from trilane.hw_profiles.product_counts import product_of
 WEIGHT_INPUT = re.compile(r"w\d+")
 #: Inputs of a batch normalisation up to those that are learned; mean and variance become part of them.
 SCALE_AND_SHIFT = 3
+#: Least dimensions of a tensor that is convolved: pictures, channels, one side.
+CONVOLVED = 3
 
 
 class Operator(NamedTuple):
@@ -183,7 +185,7 @@ def _shapes(model: Any) -> dict[str, tuple[int, ...]]:
     shapes = {i.name: tuple(i.dims) for i in model.graph.initializer}
     known = {v.name for v in model.graph.value_info}
     if any(name not in known for node in model.graph.node[:-1] for name in node.output[:1]):
-        model = onnx.shape_inference.infer_shapes(model)
+        model = _inferred(model)
     for info in (*model.graph.input, *model.graph.value_info, *model.graph.output):
         shapes[info.name] = tuple(d.dim_value for d in info.type.tensor_type.shape.dim)
     return shapes
@@ -195,6 +197,14 @@ def _weight_inputs(graph: Any) -> set[str]:
     after_first = {name for node in graph.node if node.op_type in kinds for name in node.input[1:] if name in names}
     numbered = {name for name in names if WEIGHT_INPUT.fullmatch(name)}
     return after_first | (numbered if numbered != names else set())
+
+
+def _inferred(model: Any) -> Any:
+    try:
+        return onnx.shape_inference.infer_shapes(model)
+    except onnx.shape_inference.InferenceError as error:
+        wrong = str(error).splitlines()[0]
+        raise BadInputError("its shapes", wrong, "shapes that follow from each other", "export it again") from None
 
 
 def _size(shapes: Shapes, name: str) -> int:
@@ -266,6 +276,9 @@ def _convolution(node: Any, shapes: Shapes, plain: Operator) -> Operator:
     weight, source, result = (
         shapes[name] for name in (node.input[CONVOLUTIONS[node.op_type]], node.input[0], node.output[0])
     )
+    if min(len(weight), len(source), len(result)) < CONVOLVED or not 0 < groups <= min(source[1], result[1]):
+        found = f"tensors of {len(source)}, {len(weight)} and {len(result)} dimensions in {groups} groups"
+        raise BadInputError(f"operator {plain.name}", found, "a convolution of pictures", "export it again")
     c_in, c_out = source[1] // groups, result[1] // groups
     kernel = prod(weight[2:])
     positions = prod(source) // source[1] if node.op_type == "ConvTranspose" else prod(result) // (c_out * groups)

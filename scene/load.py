@@ -137,7 +137,7 @@ def load_scene(path: Path) -> dict[str, Any]:
     """
     try:
         values = tomllib.loads(read_text(path, "a scene file (TOML)"))
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # also of numbers and lists that are too long
         raise BadInputError(path, f"no valid TOML ({error})", "a scene file (TOML)") from None
     values.setdefault("name", path.stem)
     scene = scene_from(path, values)

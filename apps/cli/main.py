@@ -107,9 +107,9 @@ def _root(
 def _fail(message: str, code: int) -> NoReturn:
     from rich.text import Text
 
-    from trilane.apps.cli.console import stderr_console
+    from trilane.apps.cli.console import stderr_console, without_controls
 
-    stderr_console().print(Text.assemble(("error: ", "bold red"), message), soft_wrap=True)
+    stderr_console().print(Text.assemble(("error: ", "bold red"), without_controls(message)), soft_wrap=True)
     raise SystemExit(code)
 
 

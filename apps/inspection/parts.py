@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from trilane.apps.avatar_facts import bundle_facts, network_facts
+from trilane.apps.avatar_facts import bundle_facts
 from trilane.apps.inspection.drawn_paths import points
 from trilane.apps.inspection.inspection import Inspection, Length
 from trilane.apps.overview.sources import read_entries
@@ -21,13 +21,12 @@ from trilane.apps.report import read_report
 from trilane.apps.tracing.writer import NAME as TRACE_NAME
 from trilane.arrays import F32
 from trilane.avatars.bundle import MANIFEST, load_bundle
-from trilane.avatars.network_checks import check_network
-from trilane.avatars.network_file import parse_network
+from trilane.avatars.network_file import read_network
 from trilane.body.body import load_body
 from trilane.errors import BadInputError
 from trilane.files import MAX_TEXT_BYTES, read_npz, read_text
+from trilane.hw_profiles.graph_file import read_graph
 from trilane.hw_profiles.load import load_profile
-from trilane.hw_profiles.network_work import graph_facts
 from trilane.pipeline.journal import NAME as JOURNAL
 from trilane.pipeline.journal import read_journal
 from trilane.scene.detected import Detected
@@ -97,21 +96,18 @@ def inspect_texture(path: Path) -> Inspection:
 
 def inspect_network(path: Path) -> Inspection:
     """Raises BadInputError when it is no ONNX network. One that is no avatar's is usable for predictions."""
-    model = parse_network(path)
+    graph = read_graph(path)
+    facts: dict[str, Any] = {"parameters": graph.work.weights, "gmac": graph.work.macs / 1e9, "numbers": graph.numbers}
+    notes: tuple[str, ...] = ()
     try:
-        network = check_network(model, str(path))
+        shape = read_network(path).shape
+        facts, what = {"avatars": True, "shape": list(shape), **facts}, "an avatar's integer network"
     except BadInputError as error:
-        work = graph_facts(model)
-        what = f"an ONNX network of {work['parameters']} parameters, which is no avatar's"
-        note = f"no avatar's network: found {error.found}, expected {error.expected}"
-        facts, notes = {"avatars": False, **work}, [note]
-    else:
-        found = network_facts(network)
-        facts = {"avatars": True, "shape": found["shape"], "parameters": found["parameters"], "gmac": found["gmac"]}
-        what, notes = "an avatar's integer network", []
+        facts, what = {"avatars": False, **facts}, "an ONNX network, which is no avatar's"
+        notes = (f"no avatar's network: found {error.found}, expected {error.expected}",)
     detected = Detected("ONNX network", "a protobuf message with nodes and operator sets")
     advice = f"trilane predict --network {path}"
-    return Inspection("network", what, "", advice, detected, facts=facts, notes=tuple(notes))
+    return Inspection("network", what, "", advice, detected, facts=facts, notes=notes)
 
 
 def inspect_scene(path: Path) -> Inspection:

@@ -45,7 +45,7 @@ def read_sweep(path: Path) -> SweepFile:
     """Raises BadInputError when the file cannot be read or is no sweep."""
     try:
         data = tomllib.loads(read_text(path, EXPECTED))
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # also of numbers and lists that are too long
         raise BadInputError(path, f"no TOML ({error})", EXPECTED) from error
     for key, value in data.items():
         _check(path, key, value)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
-from trilane.files import read_text
+from trilane.files import read_text, whole_number
 from trilane.scene.camera.recorded import RawCamera
 from trilane.scene.detected import Detected
 from trilane.scene.lens import Known, Lens, centred, of_fov_x
@@ -34,7 +34,7 @@ LEAST_DETERMINANT = 1e-9
 def load_nerf(path: Path) -> RawCamera:
     """Read `path`. Raises BadInputError naming the key."""
     try:
-        content = json.loads(read_text(path, EXPECTED))
+        content = json.loads(read_text(path, EXPECTED), parse_int=whole_number)
     except (ValueError, RecursionError) as error:
         raise BadInputError(path, f"no valid JSON ({error})", EXPECTED) from None
     if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
@@ -89,7 +89,8 @@ def _is_singular(matrix: NDArray[np.float64]) -> bool:
 def _rate(turns: NDArray[np.float64]) -> tuple[float, str]:
     ahead = turns[:, :, 2]
     cosine = np.clip((ahead[1:] * ahead[:-1]).sum(axis=1), -1, 1)
-    step = float(np.degrees(np.nanmedian(np.arccos(cosine)))) if len(cosine) else 0.0
+    finite = cosine[np.isfinite(cosine)]
+    step = float(np.degrees(np.median(np.arccos(finite)))) if len(finite) else 0.0
     if step > FILM_STEP_DEG:
         return 1.0, f"stills {step:.0f} degrees apart, 1 a second"
     return FILM_RATE_HZ, f"{FILM_RATE_HZ:g} a second assumed"

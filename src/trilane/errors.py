@@ -11,6 +11,9 @@ from pathlib import Path
 from trilane.install import install_line
 from trilane.unexpected_value import UnexpectedValue
 
+#: Letters of what was found that are shown.
+LONGEST_FOUND = 500
+
 
 def reason(error: Exception) -> str:
     """Why it failed, as part of a sentence: an OSError without its number and path, any other error's own text."""
@@ -29,14 +32,16 @@ class TrilaneError(Exception):
 class BadInputError(TrilaneError):
     """Wrong usage or bad input. Exit code 2.
 
-    `where` is the file, with key or line when known; `found`, `expected` and `remedy` are sentence parts.
+    `where` is the file, with key or line when known; `found`, `expected` and `remedy` are sentence parts. A long
+    `found`, such as a whole line of a file, is shown without its middle.
     """
 
     exit_code = 2
 
     def __init__(self, where: str | Path, found: str, expected: str, remedy: str = "") -> None:
-        super().__init__(str(where), found, expected, remedy)
-        self.where, self.found, self.expected, self.remedy = str(where), found, expected, remedy
+        shown = found if len(found) <= LONGEST_FOUND else f"{found[: LONGEST_FOUND - 100]} … {found[-100:]}"
+        super().__init__(str(where), shown, expected, remedy)
+        self.where, self.found, self.expected, self.remedy = str(where), shown, expected, remedy
 
     def __str__(self) -> str:
         return f"{self.where}: {UnexpectedValue(self.found, self.expected, self.remedy)}"

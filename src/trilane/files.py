@@ -23,6 +23,7 @@ from trilane.file_signatures import ARCHIVE, ARRAY, signature_of
 
 MAX_ARRAY_BYTES = 1 << 30
 MAX_TEXT_BYTES = 256 << 20
+LONGEST_WHOLE = 300  # digits; floats have up to 309
 
 #: What NumPy and zipfile raise on damaged files.
 DAMAGED = (
@@ -171,6 +172,11 @@ def _checked_bytes(where: Path | str, file: IO[bytes], expected: str) -> int:
     if wanted > MAX_ARRAY_BYTES:
         raise BadInputError(where, f"shape {shape}, {wanted} bytes", f"at most {MAX_ARRAY_BYTES} bytes")
     return wanted
+
+
+def whole_number(digits: str) -> int | float:
+    """A whole number of a JSON document; infinity for one that no float can hold."""
+    return int(digits) if len(digits) < LONGEST_WHOLE else math.copysign(math.inf, -1 if digits.startswith("-") else 1)
 
 
 def as_numbers(where: Path | str, array: NDArray[Any], expected: str) -> NDArray[np.float64]:

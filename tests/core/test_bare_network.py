@@ -296,3 +296,16 @@ def test_a_picture_in_either_order(shape: tuple[int, ...], tmp_path: Path) -> No
 def test_what_is_no_picture_cannot_be_the_applications(shape: tuple[int, ...], tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match=f"inputs {'x'.join(map(str, shape))}, expected one picture"):
         image_network(graph_of(tmp_path, shape), "packed")
+
+
+@pytest.mark.parametrize(
+    ("operator", "ends_as", "said"), [("Conv", 1, "convolution of pictures"), ("Add", 7, "follow")]
+)
+def test_shapes_that_contradict_each_other_are_refused(operator: str, ends_as: int, said: str) -> None:
+    """A convolution of vectors; a result of floats (1) that is declared to be whole numbers (7)."""
+    nodes = [helper.make_node(operator, ["a", "b"], ["c"]), helper.make_node("Relu", ["c"], ["d"])]
+    a, b, c = (helper.make_tensor_value_info(name, TensorProto.FLOAT, [4]) for name in "abc")
+    d = helper.make_tensor_value_info("d", ends_as, [4])
+    graph = helper.make_graph(nodes, "g", [a, b], [d], value_info=[c] if operator == "Conv" else [])
+    with pytest.raises(BadInputError, match=said):
+        count_work(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)]))

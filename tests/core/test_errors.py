@@ -34,6 +34,11 @@ def test_the_sentence_is_built_from_the_fields() -> None:
     assert str(UnexpectedValue("3", "4", "add one")) == "found 3, expected 4; add one"
 
 
+def test_a_long_find_is_shown_without_its_middle() -> None:
+    assert BadInputError("a", "x" * 500, "4").found == "x" * 500
+    assert BadInputError("a", "b" * 400 + "m" * 5000 + "e" * 100, "4").found == "b" * 400 + " … " + "e" * 100
+
+
 def test_a_place_is_added_and_the_parts_stay() -> None:
     error = BadInputError.at("--size", UnexpectedValue("a, expected b", "c, found d", "mend it"))
     assert (error.where, error.found, error.expected) == ("--size", "a, expected b", "c, found d")

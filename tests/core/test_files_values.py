@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import os
 import struct
 import warnings
@@ -16,7 +17,7 @@ import pytest
 
 from trilane import files
 from trilane.errors import BadInputError
-from trilane.files import as_numbers, npz_names, read_npy, read_npz, read_text, require_file
+from trilane.files import as_numbers, npz_names, read_npy, read_npz, read_text, require_file, whole_number
 
 WANTED = "numbers of mine"
 
@@ -112,6 +113,12 @@ def test_links_that_lead_nowhere(tmp_path: Path) -> None:
     (tmp_path / "b").symlink_to(tmp_path / "a")
     for place in (tmp_path / "a", tmp_path / "a" / "below"):
         assert "found a link that leads back to itself" in said(lambda place=place: require_file(place, WANTED))
+
+
+def test_whole_numbers_of_any_length() -> None:
+    assert whole_number("12") == 12
+    assert whole_number("9" * 299) == 10**299 - 1
+    assert (whole_number("9" * 300), whole_number("-" + "9" * 5000)) == (math.inf, -math.inf)
 
 
 def test_names_of_arrays(tmp_path: Path) -> None:

@@ -257,3 +257,12 @@ def test_nothing_is_said_of_joints_where_none_are_named() -> None:
     document = Inspection("motion", "a motion").document(Path("a"), None)
     assert document["joints"] == {"mapped": {}, "unmapped": [], "missing": []}
     assert document["length"] == {"samples": None, "seconds": None, "rate_hz": None}
+
+
+def test_control_characters_of_a_file_do_not_reach_the_terminal(command: Command, tmp_path: Path) -> None:
+    """A joint's name may hold the sequence that clears a screen."""
+    text = bvh_text().replace("LeftUpLeg", "\x1b[2JLeg")
+    (tmp_path / "a.bvh").write_text(text)
+    out, err = command("inspect", tmp_path / "a.bvh", code=2)
+    assert "\x1b" not in out + err
+    assert "\x1b" not in command("body", "inspect", tmp_path / "\x1b[2J.npz", code=2)[1]

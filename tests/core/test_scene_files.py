@@ -23,7 +23,7 @@ WRONG = {
     "avatars = []": ("avatars", "found []", "at least 1 of them"),
     "camera = 3": ("camera", "found 3", "a table"),
     "[output]\nwidth = 641": ("output.width", "found 641", "a multiple of 2"),
-    "[[avatars]]\nup_axis = 'x'": ("avatars.0.up_axis", "found 'x'", "'auto', 'y' or 'z'"),
+    "[[avatars]]\nup_axis = 'w'": ("avatars.0.up_axis", "found 'w'", "'-y' or '-z'"),
     "[camera]\nnear_m = 5\nfar_m = 1": ("camera", "near_m 5 and far_m 1", "expected near_m below far_m"),
     "[camera]\nnear_m = 1e-9": ("camera", "far_m 100", "at most 1e+06 times near_m"),
     "name = '../x'": ("name", "found '../x'"),
@@ -73,6 +73,12 @@ def test_why_there_is_no_budget_of_nothing_is_said_of_nothing_else(tmp_path: Pat
         load_scene(write(tmp_path, f"error_budget_px = {budget}"))
     assert said in str(raised.value)
     assert ("rounded" in str(raised.value)) is (budget == "0")
+
+
+@pytest.mark.parametrize("value", ["9" * 5000, "[" * 5000])
+def test_what_is_too_long_for_toml_is_refused(tmp_path: Path, value: str) -> None:
+    with pytest.raises(BadInputError, match="no valid TOML"):
+        load_scene(write(tmp_path, f"frames = {value}"))
 
 
 @pytest.mark.parametrize(("content", "part"), [(b"", "an empty file"), (b"a\xff", "cannot be read as text")])
