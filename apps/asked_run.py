@@ -13,14 +13,16 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from trilane.apps.remake import Remake, check_remake
 from trilane.errors import BadInputError
 
 if TYPE_CHECKING:
     from trilane.apps.run_job import Hooks, Outcome, Plan, Watched
     from trilane.pipeline.unit_starter import UnitStarter
-    from trilane.stages.configure import Checked, GlFacts
+    from trilane.stages.configure import Checked, GlFacts, Request
 
 MOST_LATCH_MS: Final = 1000
+MOST_CHECKED: Final = 1000
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,7 @@ class AskedRun:
     `command`: the words by which it was asked for.
     `has_video`: whether the presented pictures are digested and encoded; not for runs that last.
     `check`: how many of its frames are compared with the reference path when it is over; 0: none.
+    `remake`: what of the avatar is made anew for the run.
     `held_ns`: how long jobs of a stage are held, at least, by its name; in place of a chip's pace.
     """
 
@@ -50,16 +53,20 @@ class AskedRun:
     command: tuple[str, ...] = ()
     has_video: bool = True
     check: int = 0
+    remake: Remake = field(default_factory=Remake)
     held_ns: Mapping[str, int] = field(default_factory=dict)
 
 
 def check_numbers(asked: AskedRun) -> None:
-    """Raises BadInputError for `latch_ms` and `baseline_frames` that are no numbers, or outside of what holds."""
-    latch_ms, frames = asked.latch_ms, asked.baseline_frames
+    """Raises BadInputError for numbers of what was asked for that are none, or outside of what holds."""
+    latch_ms, frames, check = asked.latch_ms, asked.baseline_frames, asked.check
     if not _is_number(latch_ms, (int, float)) or not 0 <= latch_ms <= MOST_LATCH_MS:  # NaN is not either
         raise BadInputError("latch_ms", repr(latch_ms), f"milliseconds, from 0 to {MOST_LATCH_MS}")
     if not _is_number(frames, (int,)) or frames < 0:
         raise BadInputError("baseline_frames", repr(frames), "a whole number of frames, 0 or more")
+    if not _is_number(check, (int,)) or not 0 <= check <= MOST_CHECKED:
+        raise BadInputError("check", repr(check), f"a whole number of frames, from 0 to {MOST_CHECKED}")
+    check_remake(asked.remake)
 
 
 def _is_number(value: object, kinds: tuple[type, ...]) -> bool:
@@ -94,7 +101,13 @@ def prepare(asked: AskedRun, gl: GlFacts) -> Prepared:
     from trilane.stages.configure import Request, configure, requested_edge
 
     rule, request = requested_edge(asked.edge), Request(**asked.request)
+    said: tuple[str, ...] = ()
+    if asked.remake.is_asked:
+        request, remade = _with_remade_avatar(request, asked.remake, is_checked=asked.check > 0)
+        said = (remade,)
     checked = configure(request, Path.cwd(), gl)
+    if said:
+        checked = replace(checked, notes=(*said, *checked.notes))
     plan = Plan(request.policy, asked.baseline_frames, None, asked.performance_profile, asked.latch_ms, rule)
     if asked.check:
         _require_check(checked)
@@ -109,6 +122,22 @@ def prepare(asked: AskedRun, gl: GlFacts) -> Prepared:
     if not asked.has_video:
         checked = checked.changed(record=False)
     return Prepared(asked, checked, plan)
+
+
+def _with_remade_avatar(request: Request, remake: Remake, *, is_checked: bool) -> tuple[Request, str]:
+    """`request` with the avatar made anew, and a sentence on it. Raises BadInputError, MissingPartError."""
+    from trilane.apps.remade_avatar import is_untrained, remade_avatar
+    from trilane.avatars.bundle import load_bundle
+    from trilane.stages.configure import requested_scene
+
+    avatars = requested_scene(request).avatars
+    if len(avatars) > 1:
+        expected = "one avatar, whose network is made anew"
+        raise BadInputError("--width, --channels, --calibration", f"a scene of {len(avatars)} avatars", expected)
+    folder, said = remade_avatar(str(avatars[0].bundle), remake)
+    if is_checked and is_untrained(load_bundle(folder)):
+        raise BadInputError("--check", "a network that is made untrained", "pictures that mean something")
+    return replace(request, avatar=str(folder)), f"avatar: {said}"
 
 
 def _require_check(checked: Checked) -> None:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from trilane.apps.asked_run import AskedRun, run_asked
 from trilane.apps.explained.job_table import COLUMNS, figure_names, job_rows
 from trilane.apps.explained.run import explain_run, explained_jobs, open_journal
+from trilane.apps.remake import Remake
 from trilane.apps.report import Report, read_report
 from trilane.apps.run_html import prediction_html, run_html
 from trilane.errors import BadInputError, MissingPartError, TrilaneError
@@ -156,6 +157,10 @@ def run(
     performance_profile: str | None = None,
     latch_ms: float = 0.0,
     baseline_frames: int = 0,
+    check: int = 0,
+    width: int | None = None,
+    channels: int | None = None,
+    calibration: str | None = None,
     out: str | Path | None = None,
     on_progress: Callable[[str, int, int], None] | None = None,
     on_message: Callable[[str], None] | None = None,
@@ -166,6 +171,9 @@ def run(
     `trilane run` of that name; None leaves what the scene says.
     `cores`: numbers of the cores of a unit, such as {"dsp": [0, 1]}; else they follow from measured times.
     `baseline_frames`: of a `sequential` run that follows, to compare with.
+    `check`: how many of its frames are compared with the reference path when it is over; the report's `check` is the
+    error of this run then (extra `metrics`).
+    `width`, `channels`, `calibration`: of an avatar made anew, as `trilane run` takes them (docs/sweeps.md).
     `out`: the run folder to write, runs/TIME-SCENE below the working directory where it is None.
     `on_progress(policy, presented, requested)`, `on_message(text)`: called from this thread.
     Raises BadInputError and MissingPartError for what cannot be run, RunFailedError for a run that ended early and
@@ -191,7 +199,12 @@ def run(
     }
     command = ("trilane.run", *(f"{name}={value!r}" for name, value in given.items()))
     place = None if out is None else _place("out", out)
-    asked = AskedRun(request, edge, baseline_frames, None, performance_profile, latch_ms, place, command)
+    remake = Remake(width, channels, calibration)
+    asked = AskedRun(
+        *(request, edge, baseline_frames, None, performance_profile, latch_ms, place, command),
+        check=check,
+        remake=remake,
+    )
     hooks = Hooks(on_progress or (lambda *_: None), on_message or (lambda _: None))
     outcome = run_asked(asked, lambda: nullcontext(hooks))
     done = Run(outcome.folder, outcome.report)

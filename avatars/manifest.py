@@ -23,6 +23,8 @@ from pydantic import (
 from trilane.avatars.integer_network import MAX_CHANNELS, NetworkFile
 from trilane.errors import BadInputError
 
+#: Of `provenance`: what `weights` says of a network that nobody trained.
+UNTRAINED = "untrained: for speed alone"
 BANDS = ("far", "full_body", "upper_body", "face")
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 #: A shape or expression coefficient in standard deviations; values outside describe no human body.

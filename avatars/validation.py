@@ -14,7 +14,7 @@ from typing import Any
 
 from trilane.avatars.bundle import DEFAULT, Bundle, bundle_folder
 from trilane.avatars.digests import digests_of, figures_digest
-from trilane.avatars.manifest import Validation
+from trilane.avatars.manifest import UNTRAINED, Validation
 from trilane.figure_sources import NO_FIGURES, from_validation
 
 #: Part of an avatar to its name in a sentence.
@@ -88,6 +88,9 @@ def refused(bundle: Bundle) -> dict[str, Any]:
     Raises BadInputError for a file that cannot be read.
     """
     validation = bundle.manifest.validation
+    if bundle.manifest.provenance.get("weights") == UNTRAINED:
+        why = "its network is untrained: its times count, its pictures do not"
+        return {"source": NO_FIGURES, "changed": [], "why": why}
     if validation is None:
         return _no_figures(bundle, [], "it was never validated")
     if validation.digests is None:

@@ -149,10 +149,10 @@ def _float_network(bundle: Bundle, weights: Path) -> FloatNetwork:
         from trilane.training.float_painter import float_painter_of
     except ImportError as error:
         raise MissingPartError(f"the float network needs {error.name}", extra="train") from None
-    from trilane.avatars.digests import sha256_of
+    from trilane.bench.lib.full_network import weights_name
     from trilane.training.validate import FloatNetwork
 
-    return FloatNetwork(f"{weights.name}, sha256 {sha256_of([weights])}", float_painter_of(bundle, weights))
+    return FloatNetwork(weights_name(weights), float_painter_of(bundle, weights))
 
 
 def _write_sheet(path: Path, samples: list[Evaluated], runtime: str) -> None:

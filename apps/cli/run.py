@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from trilane.apps.asked_run import MOST_LATCH_MS
+from trilane.apps.asked_run import MOST_CHECKED, MOST_LATCH_MS
 from trilane.apps.cli.commands import Commands
 from trilane.apps.cli.console import print_json, stderr_console, stdout_console
 from trilane.apps.cli.options import (
     PROFILE_HELP,
     RUNTIME_HELP,
+    WIDTH_HELP,
     CameraOption,
     CoresOption,
     FpsOption,
@@ -33,6 +34,7 @@ from trilane.apps.cli.options import (
     SceneSizeOption,
     SkinningOption,
 )
+from trilane.apps.remake import MOST_WIDTH, Remake, check_remake
 from trilane.errors import BadInputError
 from trilane.units import PerformanceProfile
 
@@ -56,6 +58,8 @@ Examples:
   trilane run --split /Concat_4_output_0_QuantizeLinear_Output=cpu
   trilane run --performance-profile sustained_high_performance
   trilane run --check 4
+  trilane run --calibration entropy:10 --check 4
+  trilane run --width 8 --channels 8
   trilane run --dashboard
   trilane run --profile snapdragon-888 --pace --slow-motion 24 --frames 60
   trilane run myscene.toml --background street.mp4 --policy sequential
@@ -102,7 +106,39 @@ BaselineOption = Annotated[
     int, typer.Option(min=0, help="Frames of the `sequential` run of the same scene that follows; 0: none.")
 ]
 CheckOption = Annotated[
-    int, typer.Option(min=0, max=1000, help="Frames to compare with the reference when the run is over; 0: none.")
+    int,
+    typer.Option(min=0, max=MOST_CHECKED, help="Frames to compare with the reference when the run is over; 0: none."),
+]
+
+
+def _checked_channels(channels: int | None) -> int | None:
+    """Looked at with the options, so that a sweep refuses a wrong one before its first trial."""
+    check_remake(Remake(channels=channels))
+    return channels
+
+
+def _checked_calibration(text: str | None) -> str | None:
+    """As `_checked_channels`."""
+    check_remake(Remake(calibration=text))
+    return text
+
+
+RemadeWidthOption = Annotated[
+    int | None,
+    typer.Option(min=1, max=MOST_WIDTH, help=f"{WIDTH_HELP} Of another width than the avatar's it is untrained."),
+]
+RemadeChannelsOption = Annotated[
+    int | None,
+    typer.Option(
+        callback=_checked_channels, help="Of the neural texture: 4, 8, 12, 16; of others than the avatar's: untrained."
+    ),
+]
+CalibrationOption = Annotated[
+    str | None,
+    typer.Option(
+        callback=_checked_calibration,
+        help="Quantise the avatar's network anew: minmax, percentile or entropy, or METHOD:VIEWS; 5 views if none.",
+    ),
 ]
 FolderOption = Annotated[Path | None, typer.Option("--out", help="Run folder to write; runs/TIME-SCENE if none.")]
 
@@ -137,6 +173,9 @@ def run(
     camera: CameraOption = None,
     background: BackgroundOption = None,
     avatar: SceneAvatarOption = None,
+    width: RemadeWidthOption = None,
+    channels: RemadeChannelsOption = None,
+    calibration: CalibrationOption = None,
     frames: FramesOption = None,
     fps: FpsOption = None,
     output: OutputOption = None,
@@ -196,7 +235,19 @@ def run(
     }
     paced_by = None if profile is None else (profile, slow_motion)
     command = ("trilane", *sys.argv[1:])
-    asked = AskedRun(request, edge, baseline, paced_by, cap, latch, out, command, has_video=video, check=check)
+    asked = AskedRun(
+        request,
+        edge,
+        baseline,
+        paced_by,
+        cap,
+        latch,
+        out,
+        command,
+        has_video=video,
+        check=check,
+        remake=Remake(width, channels, calibration),
+    )
     outcome = _run_live(asked, port) if dashboard else run_asked(asked, _hooks)
     _print_outcome(outcome, as_json)
     raise typer.Exit(outcome.exit_code)

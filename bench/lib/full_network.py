@@ -46,13 +46,20 @@ def float_network(bundle: Bundle) -> tuple[Paint, str]:
 def float_weights(bundle: Bundle) -> Path | None:
     """The file of the network that `bundle` was quantised from; None when its manifest names none that is here.
 
-    A manifest names it by file and digest, as `avatar validate --float-network` writes it.
+    A manifest names it by file and digest, as `avatar validate --float-network` writes it, or with how the network was
+    quantised.
     """
     validation = bundle.manifest.validation
-    said = ((validation.model_extra or {}) if validation is not None else {}).get("float", {}).get("network", "")
+    validated = ((validation.model_extra or {}) if validation is not None else {}).get("float", {}).get("network", "")
+    said = validated or bundle.manifest.quantisation.get("float_network", "")
     name, _, digest = str(said).partition(", sha256 ")
     path = WEIGHTS / Path(name).name
     return path if path.is_file() and sha256_of([path]) == digest else None
+
+
+def weights_name(weights: Path) -> str:
+    """The file of a float network as a manifest names it."""
+    return f"{weights.name}, sha256 {sha256_of([weights])}"
 
 
 def trained(bundle: Bundle, weights: Path) -> Paint:

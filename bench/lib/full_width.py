@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from trilane.avatars.bundle import MANIFEST, bundle_folder, load_bundle, write_bundle
-from trilane.avatars.manifest import Manifest, network_entry
+from trilane.avatars.manifest import UNTRAINED, Manifest, network_entry
 from trilane.bench.lib.networks import untrained
 from trilane.cache import cache_dir
 from trilane.errors import TrilaneError
@@ -36,6 +36,6 @@ def full_width_bundle() -> Path:
     if not (folder / MANIFEST).exists():
         network = untrained(ENCODER, NORM, WIDTH, (SIDE, SIDE), texture.shape[2]).integer
         entry = network_entry(network, ENCODER, NORM, WIDTH)
-        manifest = Manifest(name=NAME, network=entry, provenance={"weights": "untrained: for speed alone"})
+        manifest = Manifest(name=NAME, network=entry, provenance={"weights": UNTRAINED})
         write_bundle(folder, manifest, default.body_path, texture, network)
     return folder

@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import trilane
 from trilane.apps import interface
 from trilane.apps.asked_run import AskedRun, check_numbers, prepare
 from trilane.apps.explained.job_table import COLUMNS
+from trilane.apps.remake import Remake
 from trilane.apps.report import Report, read_report
 from trilane.apps.run_html import run_html
 from trilane.apps.run_job import Outcome
@@ -93,6 +95,10 @@ def test_arguments_are_handed_on(asked: list[Any], tmp_path: Path) -> None:
         performance_profile="burst",
         latch_ms=2.0,
         baseline_frames=4,
+        check=2,
+        width=8,
+        channels=4,
+        calibration="entropy:9",
         out="there",
         on_progress=lambda *given: said.append(given),
         on_message=said.append,
@@ -112,7 +118,8 @@ def test_arguments_are_handed_on(asked: list[Any], tmp_path: Path) -> None:
     assert Request(**given.request) == request
     assert given.command[:2] == ("trilane.run", f"scene={tmp_path / 's.toml'!r}")
     assert "size=96" in given.command
-    assert given == AskedRun(given.request, "triple", 4, None, "burst", 2.0, Path("there"), given.command)
+    expected = AskedRun(given.request, "triple", 4, None, "burst", 2.0, Path("there"), given.command)
+    assert given == replace(expected, check=2, remake=Remake(8, 4, "entropy:9"))
     assert said == [("pipelined", 1, 2), "a note"]
 
 
@@ -273,6 +280,9 @@ def test_an_empty_name_is_not_the_working_directory(name: str) -> None:
         ("baseline_frames", -1, "baseline_frames: found -1, expected a whole number of frames, 0 or more"),
         ("baseline_frames", 2.0, "baseline_frames: found 2.0, expected"),
         ("baseline_frames", True, "baseline_frames: found True, expected"),
+        ("check", -1, "check: found -1, expected a whole number of frames, from 0 to 1000"),
+        ("check", 1001, "check: found 1001, expected"),
+        ("check", True, "check: found True, expected"),
     ],
 )
 def test_numbers_outside_of_what_holds_are_refused_before_a_process_starts(
@@ -287,4 +297,4 @@ def test_numbers_outside_of_what_holds_are_refused_before_a_process_starts(
 
 def test_the_limits_themselves_hold() -> None:
     for latch_ms in (0, 1000):
-        check_numbers(AskedRun(latch_ms=latch_ms, baseline_frames=0))
+        check_numbers(AskedRun(latch_ms=latch_ms, baseline_frames=0, check=latch_ms))

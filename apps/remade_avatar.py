@@ -1,0 +1,179 @@
+"""A scene's avatar made anew for a run: its network calibrated otherwise, or of another width or number of channels.
+
+Rule: calibrating quantises the avatar's own float network, so its pictures count; a network of another width or number
+of channels is untrained, so its times count and its pictures do not, and its manifest says so. What was made is kept
+below the cache, named by a digest of all that it follows from.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.apps.remake import METHOD, VIEWS, Remake, calibration_of
+from trilane.arrays import F32
+from trilane.avatars.bundle import MANIFEST, TEXTURE_KEYS, Bundle, load_bundle, write_bundle
+from trilane.avatars.digests import digests_of, sha256_of
+from trilane.avatars.manifest import UNTRAINED, Manifest, network_entry
+from trilane.bench.lib.full_network import float_weights, weights_name
+from trilane.cache import cache_dir
+from trilane.errors import BadInputError, MissingPartError, TrilaneError
+from trilane.files import read_npz
+
+if TYPE_CHECKING:
+    import onnx
+
+    from trilane.training.quantising.quantise import Quantised
+
+#: Of an untrained network's weights.
+SEED = 0
+#: Grows when this file makes another avatar of the same.
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class _Recipe:
+    """A `Remake` of one avatar, complete. `trained`: whether width and channels are the avatar's own."""
+
+    width: int
+    channels: int
+    trained: bool
+    method: str | None
+    views: int
+
+    def __str__(self) -> str:
+        calibrated = "" if self.method is None else f"{self.method} on {self.views} view{'s' * (self.views > 1)}"
+        return calibrated if self.trained else f"width {self.width}, {self.channels} channels, untrained; {calibrated}"
+
+
+def remade_avatar(name: str, remake: Remake) -> tuple[Path, str]:
+    """The folder of avatar `name` made anew by `remake`, made now where it is not kept, and a sentence on what it is.
+
+    Raises BadInputError for an avatar whose float network is needed and not here, MissingPartError without PyTorch,
+    TrilaneError where nothing can be kept.
+    """
+    bundle = load_bundle(name)
+    recipe = _recipe(bundle, remake)
+    if recipe.trained and recipe.method is None:
+        return bundle.folder, "as its files are: it has this width and these channels"
+    home = cache_dir("avatars")
+    if home is None:
+        raise TrilaneError("the cache folder cannot be written: set XDG_CACHE_HOME to one that can")
+    folder = home / _digest(bundle, recipe)
+    with _alone(home / f"{folder.name}.lock"):
+        if not (folder / MANIFEST).exists():
+            _make(bundle, recipe, folder)
+    what = "" if recipe.trained else "; its times count, its pictures do not"
+    return folder, f"made anew: {recipe}{what}"
+
+
+def is_untrained(bundle: Bundle) -> bool:
+    return bundle.manifest.provenance.get("weights") == UNTRAINED
+
+
+def _recipe(bundle: Bundle, remake: Remake) -> _Recipe:
+    own = bundle.manifest.network
+    width, channels = remake.width or own.width, remake.channels or own.channels
+    trained = (width, channels) == (own.width, own.channels)
+    asked = None if remake.calibration is None else calibration_of(remake.calibration)
+    method, views = asked or ((None, 0) if trained else (METHOD, VIEWS))
+    return _Recipe(width, channels, trained, method, views)
+
+
+def _digest(bundle: Bundle, recipe: _Recipe) -> str:
+    import onnxruntime
+
+    weights = float_weights(bundle)
+    of = {
+        "version": VERSION,
+        "onnxruntime": onnxruntime.__version__,
+        "avatar": digests_of(bundle.folder, bundle.manifest).model_dump(),
+        "network": bundle.manifest.network.model_dump(),
+        "weights": weights and sha256_of([weights]),
+        "recipe": asdict(recipe),
+    }
+    return hashlib.sha256(json.dumps(of, sort_keys=True).encode()).hexdigest()[:16]
+
+
+@contextmanager
+def _alone(lock: Path) -> Iterator[None]:
+    """While no other process makes the same."""
+    try:
+        file = lock.open("w")
+    except OSError as error:
+        raise BadInputError.of_os_error(lock, error, "a cache that can be written") from error
+    with file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def _make(bundle: Bundle, recipe: _Recipe, folder: Path) -> None:
+    from trilane.avatars.network_reshape import reshaped
+
+    chosen = np.arange(recipe.channels) % bundle.manifest.network.channels
+    quantised = _quantised(bundle, recipe, chosen)
+    network = reshaped(quantised.network, *bundle.read_network().shape[1:3])
+    arrays = read_npz(bundle.texture_path, TEXTURE_KEYS, "a neural texture")
+    texture, scale = arrays["texture"][..., chosen], arrays.get("scale")
+    if scale is not None and scale.ndim:
+        scale = scale[chosen]
+    write_bundle(folder, _manifest(bundle, recipe, network, quantised), bundle.body_path, texture, network, scale)
+
+
+def _manifest(bundle: Bundle, recipe: _Recipe, network: Any, quantised: Quantised) -> Manifest:
+    own, weights = bundle.manifest, float_weights(bundle)
+    facts, provenance = dict(quantised.facts), {**own.provenance, "made_from": own.name}
+    if recipe.trained and weights is not None:
+        facts["float_network"] = weights_name(weights)
+    if not recipe.trained:
+        provenance = {"weights": UNTRAINED, "made_from": own.name}
+    changed = {
+        "name": f"{own.name}, {recipe}"[:100],
+        "network": network_entry(network, own.network.encoder, own.network.norm, recipe.width),
+        "provenance": provenance,
+        "quantisation": facts,
+        "validation": None,
+    }
+    return own.model_copy(update=changed)
+
+
+def _quantised(bundle: Bundle, recipe: _Recipe, chosen: NDArray[np.intp]) -> Quantised:
+    try:
+        from trilane.training.calibration_views import training_views
+        from trilane.training.quantising.quantise import quantise
+        from trilane.training.validate import open_renderer
+    except ImportError as error:
+        raise MissingPartError(f"an avatar made anew needs {error.name}", extra="train") from None
+    model = _float_model(bundle, recipe)
+    frames: list[F32] = training_views(open_renderer(bundle, 1), bundle, recipe.views)
+    return quantise(model, [np.ascontiguousarray(frame[..., chosen]) for frame in frames], recipe.method or METHOD)
+
+
+def _float_model(bundle: Bundle, recipe: _Recipe) -> onnx.ModelProto:
+    """The network that is quantised: the avatar's own, or an untrained one."""
+    import torch
+
+    from trilane.training.calibration_views import float_model
+    from trilane.training.make_bundle import CALIBRATION_SHAPE
+    from trilane.training.network import UNet
+    from trilane.training.onnx_export import export_onnx
+
+    own = bundle.manifest.network
+    if not recipe.trained:
+        torch.manual_seed(SEED)
+        untrained = UNet(own.encoder, own.norm, recipe.width, recipe.channels, input_skip=True)
+        return export_onnx(untrained, *CALIBRATION_SHAPE)
+    weights = float_weights(bundle)
+    if weights is None:
+        remedy = "`trilane avatar validate --float-network` notes which it is"
+        raise BadInputError(bundle.folder, "no float network that its manifest names", "one to quantise", remedy)
+    return float_model(bundle, weights)
