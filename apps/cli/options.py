@@ -32,7 +32,7 @@ SceneAvatarOption = Annotated[str | None, typer.Option("--avatar", help="`defaul
 SceneSizeOption = Annotated[
     str | None, typer.Option("--size", help=f"{SIZE_HELP} auto: planned, as the network paints best.")
 ]
-MotionOption = Annotated[str | None, typer.Option(help="SMPL-X .npy, AMASS .npz, .bvh, or builtin:NAME.")]
+MotionOption = Annotated[str | None, typer.Option(help="Motion: .bvh, .npz, .npy, .pkl, or builtin:NAME.")]
 CameraOption = Annotated[str | None, typer.Option(help="ARKit log, TUM, transforms.json, or builtin:NAME.")]
 FpsOption = Annotated[float | None, typer.Option(help="Frames a second of the scene's time, and of the video.")]
 OutputOption = Annotated[str | None, typer.Option(help="Size of the picture in pixels: WIDTHxHEIGHT.")]

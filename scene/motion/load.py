@@ -14,20 +14,21 @@ import numpy as np
 from trilane.errors import BadInputError
 from trilane.files import require_file
 from trilane.near_miss import did_you_mean
-from trilane.scene.motion.amass import load_amass
+from trilane.scene.motion.array_files import load_npy, load_npz, load_pickle
 from trilane.scene.motion.builtin import BUILTIN
 from trilane.scene.motion.bvh_retarget import load_retargeted
 from trilane.scene.motion.motion import Motion
 from trilane.scene.motion.playing import as_played
 from trilane.scene.motion.recorded import RawMotion, motion_from_recording
-from trilane.scene.motion.smplx_npy import load_smplx_npy
 from trilane.scene.schema import AvatarSpec
 
 PREFIX = "builtin:"
 
 _READERS: dict[str, Callable[[Path, AvatarSpec], RawMotion]] = {
-    ".npy": lambda path, _spec: load_smplx_npy(path),
-    ".npz": lambda path, _spec: load_amass(path),
+    ".npy": lambda path, _spec: load_npy(path),
+    ".npz": lambda path, _spec: load_npz(path),
+    ".pkl": lambda path, _spec: load_pickle(path),
+    ".pickle": lambda path, _spec: load_pickle(path),
     ".bvh": lambda path, spec: load_retargeted(path, spec.units, spec.joint_map),
 }
 #: Endings of files whose joints have names.

@@ -18,6 +18,8 @@ from trilane.scene.rotations import quat_from_rotvec, rotvec_from_quat, slerp
 JOINTS = 55
 #: Rest place of the pelvis of the published neutral SMPL-X body, metres; translations in AMASS files start from it.
 REST_PELVIS: F64 = np.array([0.003, -0.351, 0.012])
+#: The same of SMPL's neutral body, to some 2 cm: its betas and sex move it by as much.
+SMPL_REST_PELVIS: F64 = np.array([-0.002, -0.23, 0.028])
 
 
 class Wrap(enum.Enum):

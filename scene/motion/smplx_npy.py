@@ -1,44 +1,48 @@
-"""Reads SMPL-X poses from a `.npy` file: (T, 165) or (T, 55, 3), axis-angle.
+"""Poses in one array, such as that of a `.npy` file: axis-angle turns of SMPL-X, SMPL-H or SMPL, in radians.
 
-Rule: the format has no frame rate. When neighbouring frames are similar, 30 frames per second are assumed; when they
-differ by more than POSE_SET_STEP_RAD, they are separate poses, one per second.
+Rule: an array has no frame rate. When neighbouring frames are similar, 30 frames per second are assumed; when they
+differ by more than POSE_SET_STEP_RAD, they are separate poses, one per second. Its axes may be those of a camera.
 """
 
 from __future__ import annotations
 
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.errors import BadInputError
-from trilane.files import as_numbers, read_npy
 from trilane.scene.detected import Detected
-from trilane.scene.motion.motion import JOINTS
-from trilane.scene.motion.recorded import RawMotion
+from trilane.scene.motion.recorded import ANY, RawMotion
+from trilane.scene.motion.smpl_turns import WHOLE, turns_in
 from trilane.scene.rotations import matrix_from_rotvec, rotvec_from_matrix
 
-EXPECTED = "SMPL-X poses, an array of shape (T, 165) in radians"
 ASSUMED_RATE_HZ = 30.0
 POSE_SET_STEP_RAD = 0.7
 
 
-def load_smplx_npy(path: Path) -> RawMotion:
-    """Read `path`. Raises BadInputError for anything but numbers of shape (T, 165) or (T, 55, 3) with T >= 1."""
-    array = read_npy(path, EXPECTED)
-    if array.shape[1:] not in ((JOINTS * 3,), (JOINTS, 3)) or not len(array):
-        raise BadInputError(path, f"shape {array.shape}", EXPECTED)
-    poses = as_numbers(path, array, EXPECTED).reshape(-1, JOINTS, 3)
-    separate = median_step_rad(poses) > POSE_SET_STEP_RAD
+def motion_of_array(where: str, source: str, array: NDArray[Any]) -> RawMotion:
+    """The motion of an `array` (T, W) or (T, W / 3, 3), whose W is a key of WHOLE.
+
+    `where`: the file. `source`: its ending, for people. Raises BadInputError for anything else.
+    """
+    read = turns_in(where, array, WHOLE)
+    separate = median_step_rad(read.turns) > POSE_SET_STEP_RAD
     rate = 1.0 if separate else ASSUMED_RATE_HZ
     rate_note = (
         "neighbours unlike, so taken for separate poses, 1 a second"
         if separate
         else f"no rate in the format, {ASSUMED_RATE_HZ:g} frames/s assumed"
     )
-    notes = (f"SMPL-X .npy, {len(poses)} frames", rate_note, f"hands: {hands_note(poses)}", "betas: none in the format")
-    detected = Detected("SMPL-X poses (.npy)", f"an array of shape {array.shape}", rate=rate_note)
-    return RawMotion(np.arange(len(poses)) / rate, poses, None, None, "y", notes, detected=detected)
+    notes = (
+        f"{read.whose} {source}, {len(array)} frames",
+        rate_note,
+        f"hands: {hands_note(read.turns)}",
+        "betas: none in the format",
+        *read.notes,
+    )
+    detected = Detected(f"{read.whose} poses ({source})", f"an array of shape {array.shape}", rate=rate_note)
+    times = np.arange(len(array)) / rate
+    return RawMotion(times, read.turns, None, None, "y", notes, detected=detected, ups=ANY)
 
 
 def median_step_rad(poses: NDArray[np.float64]) -> float:

@@ -36,6 +36,7 @@ DAMAGED = (
     NotImplementedError,
     RuntimeError,
 )
+NPY = b"\x93NUMPY"
 _HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
@@ -129,6 +130,75 @@ def npz_names(path: Path, expected: str) -> list[str]:
             return [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
     except DAMAGED as error:
         raise BadInputError(path, f"no readable .npz archive ({reason(error)})", expected) from error
+
+
+def npz_pickles(path: Path, keys: Collection[str], most: int, expected: str) -> dict[str, bytes]:
+    """Of those `keys` of an `.npz` file that hold Python objects: the pickles, unread. Raises BadInputError.
+
+    `most`: bytes that one may have.
+    """
+    require_file(path, expected)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = ((key, archive.getinfo(f"{key}.npy")) for key in keys)
+            return {
+                key: pickle
+                for key, info in members
+                if (pickle := _pickle_in(f"{path}[{key}]", archive, info, most)) is not None
+            }
+    except DAMAGED as error:
+        raise BadInputError(path, f"no readable .npz archive ({reason(error)})", expected) from error
+
+
+def _pickle_in(where: str, archive: zipfile.ZipFile, info: zipfile.ZipInfo, most: int) -> bytes | None:
+    """The pickle of a member that holds objects; None for any other, which is not read."""
+    with archive.open(info) as file:
+        if not _holds_objects(file):
+            return None
+        if info.file_size > most:
+            raise BadInputError(where, f"{info.file_size} bytes of Python objects", f"at most {most}")
+        return file.read()
+
+
+def npy_pickle(path: Path, most: int, expected: str) -> bytes | None:
+    """The pickle of a `.npy` file that holds Python objects, unread; None for any other. Raises BadInputError.
+
+    `most`: bytes that it may have.
+    """
+    size = require_file(path, expected)
+    try:
+        with path.open("rb") as file:
+            if file.read(len(NPY)) != NPY:
+                return None
+            file.seek(0)
+            if not _holds_objects(file):
+                return None
+            if size > most:
+                raise BadInputError(path, f"{size} bytes of Python objects", f"at most {most}")
+            return file.read()
+    except DAMAGED as error:
+        raise BadInputError(path, f"no readable NumPy array ({reason(error)})", expected) from error
+
+
+def _holds_objects(file: IO[bytes]) -> bool:
+    """Whether the array that comes next in `file` is one of Python objects; leaves `file` after its header.
+
+    Raises one of DAMAGED on a broken header.
+    """
+    version = np.lib.format.read_magic(file)
+    return version in _HEADERS and _HEADERS[version](file)[2].hasobject
+
+
+def read_bytes(path: Path, most: int, expected: str) -> bytes:
+    """The whole file. Raises BadInputError when it is missing, empty or has more than `most` bytes."""
+    size = require_file(path, expected)
+    if size > most:
+        raise BadInputError(path, f"{size} bytes", f"at most {most}")
+    try:
+        with path.open("rb") as file:
+            return file.read(most)
+    except OSError as error:
+        raise BadInputError.of_os_error(path, error, expected) from error
 
 
 def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:

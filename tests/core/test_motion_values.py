@@ -12,11 +12,11 @@ import pytest
 from trilane.body.joints import JOINT_INDEX
 from trilane.errors import BadInputError
 from trilane.scene.motion import recorded as recorded_module
-from trilane.scene.motion.amass import load_amass
+from trilane.scene.motion.array_files import load_npy, load_npz
 from trilane.scene.motion.load import load_motion
 from trilane.scene.motion.motion import REST_PELVIS, Motion, Wrap, bracket, wrapped_time
 from trilane.scene.motion.recorded import RawMotion, motion_from_recording
-from trilane.scene.motion.smplx_npy import hands_note, load_smplx_npy, median_step_rad
+from trilane.scene.motion.smplx_npy import hands_note, median_step_rad
 from trilane.scene.motion.usable_samples import usable_samples
 from trilane.scene.rotations import matrix_from_rotvec
 from trilane.scene.schema import AvatarSpec
@@ -49,7 +49,7 @@ def amass(path: Path, **changes: Any) -> Path:
 
 def test_smplh_has_no_jaw_and_eyes(tmp_path: Path) -> None:
     """Columns 0-65 are the body, 66-110 the left hand, 111-155 the right one."""
-    raw = load_amass(amass(tmp_path / "a.npz"))
+    raw = load_npz(amass(tmp_path / "a.npz"))
     row = np.arange(156, 312).reshape(52, 3) / 100
     assert raw.poses[1, :22] == pytest.approx(row[:22])
     assert not raw.poses[:, 22:25].any()
@@ -70,7 +70,7 @@ def test_smplh_has_no_jaw_and_eyes(tmp_path: Path) -> None:
 
 def test_smplx_has_all_joints_in_their_order(tmp_path: Path) -> None:
     poses = np.arange(165.0)[None] / 10
-    raw = load_amass(amass(tmp_path / "a.npz", poses=poses, trans=None, betas=None))
+    raw = load_npz(amass(tmp_path / "a.npz", poses=poses, trans=None, betas=None))
     assert raw.poses[0].ravel() == pytest.approx(poses[0])
     assert raw.translation is None and raw.betas is None
     assert raw.notes[0] == "AMASS .npz (SMPL-X, 165 columns), 1 frames at 120/s (mocap_framerate)"
@@ -80,17 +80,26 @@ def test_smplx_has_all_joints_in_their_order(tmp_path: Path) -> None:
 WRONG_AMASS: list[tuple[dict[str, Any], str]] = [
     (
         {"poses": None},
-        ": found no key `poses`, expected AMASS motion: `poses` (T, 156) or (T, 165), `trans` (T, 3), a fr",
+        ": found arrays trans, betas, mocap_framerate, expected a motion: `poses` (AMASS); or `smpl_poses` (AIST++); ",
     ),
-    ({"poses": np.zeros((3, 157))}, "[poses]: found shape (3, 157), expected (T, 156) or (T, 165), T at least 1"),
-    ({"poses": np.zeros((0, 156))}, "[poses]: found shape (0, 156), expected (T, 156) or (T, 165), T at least 1"),
-    ({"poses": np.zeros(156)}, "[poses]: found shape (156,), expected (T, 156) or (T, 165), T at least 1"),
+    (
+        {"poses": np.zeros((3, 157))},
+        "[poses]: found shape (3, 157), expected (T, 66), (T, 72), (T, 156) or (T, 165), T at least 1, axis-angle",
+    ),
+    (
+        {"poses": np.zeros((0, 156))},
+        "[poses]: found shape (0, 156), expected (T, 66), (T, 72), (T, 156) or (T, 165), T at least 1, axis-angle",
+    ),
+    (
+        {"poses": np.zeros(156)},
+        "[poses]: found shape (156,), expected (T, 66), (T, 72), (T, 156) or (T, 165), T at least 1, axis-angle",
+    ),
     ({"poses": np.full((3, 156), "a")}, "[poses]: found dtype <U1, expected numbers"),
     ({"mocap_framerate": None}, ": found no frame rate, expected a key `mocap_framerate` or `mocap_frame_rate`"),
     ({"mocap_framerate": np.array(0.99)}, "[mocap_framerate]: found 0.99, expected one rate from 1 to 1000 frames/s"),
     ({"mocap_framerate": np.array(1001)}, "[mocap_framerate]: found 1001.0, expected one rate from 1 to 1000 frames/s"),
     ({"mocap_framerate": np.ones(2)}, "[mocap_framerate]: found [1.0, 1.0], expected one rate from 1 to 1000 frames/s"),
-    ({"mocap_framerate": np.array("x")}, "[mocap_framerate]: found dtype <U1, expected one number"),
+    ({"mocap_framerate": np.array("x")}, "[mocap_framerate]: found dtype <U1, expected numbers"),
     ({"trans": np.zeros((3, 2))}, "[trans]: found shape (3, 2), expected (3, 3), a row for each of `poses`"),
     ({"trans": np.full((3, 3), "a")}, "[trans]: found dtype <U1, expected numbers"),
     ({"betas": np.zeros(401)}, "[betas]: found 401 values, some not finite or too many, expected finite numbers"),
@@ -104,13 +113,13 @@ def test_a_wrong_amass_file_is_refused_in_one_sentence(tmp_path: Path, case: int
     changes, sentence = WRONG_AMASS[case]
     path = amass(tmp_path / "a.npz", **changes)
     with pytest.raises(BadInputError) as raised:
-        load_amass(path)
+        load_npz(path)
     assert str(raised.value).startswith(f"{path}{sentence}")
 
 
 @pytest.mark.parametrize("rate", [1.0, 1000.0])
 def test_rates_and_betas_at_the_ends_of_their_ranges(tmp_path: Path, rate: float) -> None:
-    raw = load_amass(amass(tmp_path / "a.npz", mocap_framerate=np.array([rate]), betas=np.zeros((1, 400))))
+    raw = load_npz(amass(tmp_path / "a.npz", mocap_framerate=np.array([rate]), betas=np.zeros((1, 400))))
     assert raw.times_s[1] == 1 / rate
     assert raw.betas is not None and raw.betas.shape == (400,)
 
@@ -128,7 +137,7 @@ def test_an_array_of_either_shape_is_read(tmp_path: Path) -> None:
     values = np.arange(2 * 165).reshape(2, 165) / 1000
     for shape in ((2, 165), (2, 55, 3)):
         np.save(tmp_path / "a.npy", values.reshape(shape))
-        raw = load_smplx_npy(tmp_path / "a.npy")
+        raw = load_npy(tmp_path / "a.npy")
         assert raw.poses.reshape(2, 165) == pytest.approx(values)
     assert raw.times_s == pytest.approx([0, 1 / 30])
     assert (raw.translation, raw.betas, raw.up) == (None, None, "y")
@@ -146,7 +155,7 @@ def test_steps_above_0_7_are_separate_poses(tmp_path: Path) -> None:
         (0.71, 4.0, "neighbours unlike, so taken for separate poses, 1 a second"),
     ):
         np.save(tmp_path / "a.npy", stepping(step))
-        raw = load_smplx_npy(tmp_path / "a.npy")
+        raw = load_npy(tmp_path / "a.npy")
         assert raw.times_s[-1] == pytest.approx(last)
         assert raw.notes[1:3] == (note, "hands: all zero, flat")
 
@@ -183,10 +192,13 @@ def test_what_is_said_of_hands() -> None:
 
 
 WRONG_NPY: list[tuple[np.ndarray, str]] = [
-    (np.zeros((2, 164)), "found shape (2, 164), expected SMPL-X poses, an array of shape (T, 165) in radians"),
+    (
+        np.zeros((2, 164)),
+        "found shape (2, 164), expected (T, 66), (T, 72), (T, 156) or (T, 165), T at least 1, axis-angle",
+    ),
     (np.zeros((2, 54, 3)), "found shape (2, 54, 3), expected"),
     (np.zeros((0, 165)), "found shape (0, 165), expected"),
-    (np.full((1, 165), "a"), "found dtype <U1, expected SMPL-X poses, an array of shape (T, 165) in radians"),
+    (np.full((1, 165), "a"), "found dtype <U1, expected numbers"),
 ]
 
 
@@ -194,7 +206,7 @@ WRONG_NPY: list[tuple[np.ndarray, str]] = [
 def test_a_wrong_array_is_refused(tmp_path: Path, case: int) -> None:
     np.save(tmp_path / "a.npy", WRONG_NPY[case][0])
     with pytest.raises(BadInputError) as raised:
-        load_smplx_npy(tmp_path / "a.npy")
+        load_npy(tmp_path / "a.npy")
     assert f"{tmp_path}/a.npy: {WRONG_NPY[case][1]}" in str(raised.value)
 
 
@@ -211,7 +223,10 @@ def test_the_ending_says_which_reader(tmp_path: Path) -> None:
     for motion, sentence in (
         ("builtin:dance", f"motion: found 'builtin:dance', expected {names} or a file"),
         ("builtin:tpose", f"motion: found 'builtin:tpose', expected {names} or a file; did you mean 'builtin:t-pose'?"),
-        ("a.fbx", f"{tmp_path}/a.fbx: found the ending '.fbx', expected a motion file: .npy, .npz, .bvh"),
+        (
+            "a.fbx",
+            f"{tmp_path}/a.fbx: found the ending '.fbx', expected a motion file: .npy, .npz, .pkl, .pickle, .bvh",
+        ),
         ("b.bvh", f"{tmp_path}/b.bvh: found no such file, expected a motion file"),
     ):
         with pytest.raises(BadInputError) as raised:

@@ -16,7 +16,7 @@ from trilane.arrays import F64
 from trilane.body.body import Body
 from trilane.body.joints import JOINTS, LEFT_HAND, POSE_SIZE, RIGHT_HAND
 from trilane.body.kinematics import MAX_VALUE
-from trilane.scene.motion.amass import COLUMNS
+from trilane.scene.motion.smpl_turns import WHOLE as WIDTHS
 from trilane.training.capture.faults import Fault
 
 #: The place of a part of the pose among its 165 numbers -> the names that files have for it.
@@ -38,6 +38,8 @@ SHAPE = ("betas", "expression")
 NAMES = (*WHOLE, *(name for names in PARTS.values() for name in names), *PLACE, *SHAPE, *CAMERA)
 #: Sizes of arrays of other bodies -> what they are, for people.
 OTHER_BODIES = {69: "23 joints: the SMPL layout", 72: "24 joints: the SMPL layout", 66: "22 joints", 63: "21 joints"}
+#: Number of columns of a whole pose, of SMPL-H and SMPL-X -> its joints.
+COLUMNS = {width: WIDTHS[width][0] for width in (156, 165)}
 REMEDY = "convert the fits to SMPL-X"
 
 Arrays = Mapping[str, NDArray[Any]]

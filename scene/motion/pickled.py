@@ -1,0 +1,395 @@
+"""Reads the plain values and arrays of a Python pickle without running anything that it says.
+
+Rule: nothing is imported, called or built but None, numbers, text, bytes, lists, tuples, dicts and NumPy arrays of
+numbers. `pickletools` splits the file into operations; the tables below do those that make such values. What the
+file wants built beside them becomes a `Foreign` that holds its name alone. An operation that is not in a table ends
+the reading.
+
+What a file can make this use is bounded by its own size: text and bytes are pieces of the file, an array is a view of
+such bytes and must have exactly as many as its shape says, the number of operations is limited, and keys of dicts are
+text (whose hash a file cannot foresee) or are left out. Values may contain themselves, so whoever looks for something
+in them must limit how deep.
+
+The format: https://docs.python.org/3/library/pickle.html, `pickletools`, PEP 3154 and PEP 574; what NumPy writes:
+`numpy.ndarray.__reduce__`, `__setstate__` and `numpy.dtype.__setstate__`.
+"""
+
+from __future__ import annotations
+
+import math
+import pickletools
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.unexpected_value import UnexpectedValue
+
+MAX_BYTES = 256 << 20
+MAX_OPERATIONS = 2_000_000
+MAX_INDEX = 1 << 32
+MAX_NAME = 200
+MAX_SIDES = 32
+ARRAYS = "save its arrays with NumPy where it was made: numpy.savez(FILE, poses=..., trans=..., mocap_frame_rate=...)"
+#: Types of numbers that NumPy writes: kind and bytes of one.
+_NUMBERS = re.compile(r"[<>|=]?(b1|[iu][1248]|f[248])")
+_OBJECT = "O"
+_ORDERS = ("<", ">", "|", "=")
+
+
+@dataclass(frozen=True)
+class Foreign:
+    """Something that is not built. `name`: of its class or function, module first."""
+
+    name: str
+
+
+@dataclass
+class StoredArray:
+    """An array of the file. `values`: its numbers; a list of what an array of objects holds; None until they come."""
+
+    values: NDArray[Any] | list[Any] | None = None
+
+
+@dataclass
+class _Kind:
+    """A `numpy.dtype`; `code` is empty for one that is no plain number."""
+
+    code: str
+    order: str = "|"
+
+    def dtype(self) -> np.dtype[Any]:
+        name = self.code if self.order == "|" else self.order + self.code.lstrip("".join(_ORDERS))
+        if not _NUMBERS.fullmatch(name):
+            raise UnexpectedValue(f"an array of {printable(self.code) or 'a structured type'}", "numbers", ARRAYS)
+        return np.dtype(name)
+
+
+class _Mark:
+    """Where a run of values begins on the stack."""
+
+
+_MARK = _Mark()
+
+
+@dataclass
+class _Reader:
+    """`stack` and `memo`: as the format has them. `encoded`: bytes of text that holds bytes, by the text's identity.
+    `paired`: how many items were given to dicts in lists.
+    """
+
+    stack: list[Any] = field(default_factory=list)
+    memo: dict[int, Any] = field(default_factory=dict)
+    encoded: dict[int, tuple[str, bytes]] = field(default_factory=dict)
+    paired: int = 0
+
+    def since_mark(self) -> list[Any]:
+        """The values above the last mark; both leave the stack."""
+        values: list[Any] = []
+        while True:
+            value = self.stack.pop()
+            if value is _MARK:
+                return values[::-1]
+            values.append(value)
+
+    def bytes_of(self, raw: Any) -> bytes:
+        """`raw` itself, or the text as which Python 2 and older protocols wrote it; the same text gives the same."""
+        if isinstance(raw, str):
+            known = self.encoded.get(id(raw))
+            if known is None:
+                known = self.encoded[id(raw)] = (raw, raw.encode("latin-1"))
+            return known[1]
+        return bytes(wanted(raw, bytes, "bytes"))
+
+
+def values_of(data: bytes) -> Any:
+    """What the pickle `data` holds, its arrays as StoredArray.
+
+    Raises UnexpectedValue when it is damaged, too large, or does what no file of plain values and arrays does.
+    """
+    if len(data) > MAX_BYTES:
+        raise UnexpectedValue(f"{len(data)} bytes", f"at most {MAX_BYTES}", ARRAYS)
+    reader = _Reader()
+    try:
+        for count, (operation, value, _) in enumerate(pickletools.genops(data)):
+            if operation.name == "STOP":
+                return reader.stack.pop()
+            if count >= MAX_OPERATIONS:
+                raise UnexpectedValue(f"more than {MAX_OPERATIONS} values", "arrays of numbers", ARRAYS)
+            _OPERATIONS.get(operation.name, _refuse(operation.name))(reader, value)
+    except (ValueError, OverflowError, IndexError, KeyError, TypeError, RecursionError) as error:
+        if isinstance(error, UnexpectedValue):
+            raise
+        found = f"no readable pickle ({printable(str(error))})"
+        raise UnexpectedValue(found, "the arrays of a motion", ARRAYS) from error
+    raise UnexpectedValue("no readable pickle (it has no end)", "the arrays of a motion", ARRAYS)
+
+
+def printable(text: str) -> str:
+    """`text` in a form and of a length that every console can show."""
+    return ascii(text[:MAX_NAME])[1:-1]
+
+
+def wanted(value: Any, kind: type, what: str) -> Any:
+    """`value`, which must be of the type `kind`; raises TypeError that says `what` was expected."""
+    if type(value) is not kind:
+        raise TypeError(f"{type(value).__name__} in place of {what}")
+    return value
+
+
+def _refuse(name: str) -> Callable[[_Reader, Any], None]:
+    def refuse(_reader: _Reader, _value: Any) -> None:
+        raise UnexpectedValue(f"the operation {name}", "a pickle of numbers, text, lists, dicts and arrays", ARRAYS)
+
+    return refuse
+
+
+# --- operations ---
+
+
+def _ignore(reader: _Reader, value: Any) -> None:
+    """Says nothing about values."""
+
+
+def _push(reader: _Reader, value: Any) -> None:
+    reader.stack.append(value)
+
+
+def _push_bytes(reader: _Reader, value: Any) -> None:
+    reader.stack.append(bytes(value))
+
+
+def _make(make: Callable[[], Any]) -> Callable[[_Reader, Any], None]:
+    return lambda reader, _value: reader.stack.append(make())
+
+
+def _tuple_of(count: int) -> Callable[[_Reader, Any], None]:
+    def tuple_of(reader: _Reader, _value: Any) -> None:
+        reader.stack[-count:] = [tuple(reader.stack[-count:])]
+
+    return tuple_of
+
+
+def _gather(make: Callable[[list[Any]], Any]) -> Callable[[_Reader, Any], None]:
+    return lambda reader, _value: reader.stack.append(make(reader.since_mark()))
+
+
+def _append(reader: _Reader, _value: Any) -> None:
+    item = reader.stack.pop()
+    _extend(reader.stack[-1], [item])
+
+
+def _append_all(reader: _Reader, _value: Any) -> None:
+    items = reader.since_mark()
+    _extend(reader.stack[-1], items)
+
+
+def _extend(target: Any, items: list[Any]) -> None:
+    if not isinstance(target, Foreign):
+        wanted(target, list, "a list").extend(items)
+
+
+def _set_item(reader: _Reader, _value: Any) -> None:
+    value, key = reader.stack.pop(), reader.stack.pop()
+    _update(reader.stack[-1], [key, value])
+
+
+def _set_items(reader: _Reader, _value: Any) -> None:
+    items = reader.since_mark()
+    _update(reader.stack[-1], items)
+
+
+def _update(target: Any, items: list[Any]) -> None:
+    if not isinstance(target, Foreign):
+        wanted(target, dict, "a dict").update(_dict_of(items))
+
+
+def _dict_of(items: list[Any]) -> dict[str, Any]:
+    """Keys and values that stand in turns; numbers become text, and what is neither is left out."""
+    keys = ((str(key) if type(key) is int and abs(key) < 1 << 64 else key) for key in items[::2])
+    return {key: value for key, value in zip(keys, items[1::2], strict=True) if type(key) is str}
+
+
+def _pop(reader: _Reader, _value: Any) -> None:
+    reader.stack.pop()
+
+
+def _pop_mark(reader: _Reader, _value: Any) -> None:
+    reader.since_mark()
+
+
+def _memoise(reader: _Reader, _value: Any) -> None:
+    reader.memo[len(reader.memo)] = reader.stack[-1]
+
+
+def _put(reader: _Reader, value: Any) -> None:
+    if not 0 <= value < MAX_INDEX:
+        raise ValueError("an index of a value that no file needs")
+    reader.memo[value] = reader.stack[-1]
+
+
+def _get(reader: _Reader, value: Any) -> None:
+    reader.stack.append(reader.memo[value])
+
+
+def _global(reader: _Reader, value: Any) -> None:
+    module, _, name = value.partition(" ")
+    reader.stack.append(_named(module, name))
+
+
+def _stack_global(reader: _Reader, _value: Any) -> None:
+    name, module = reader.stack.pop(), reader.stack.pop()
+    reader.stack.append(_named(wanted(module, str, "a module's name"), wanted(name, str, "a name")))
+
+
+def _named(module: str, name: str) -> Foreign:
+    if len(module) + len(name) > MAX_NAME:
+        raise ValueError("a name that no class has")
+    if module.partition(".")[0] == "joblib":
+        raise UnexpectedValue("a file of joblib, which mixes arrays into the pickle", "a plain pickle", ARRAYS)
+    return Foreign(f"{module.replace('numpy.core.', 'numpy._core.', 1)}.{name}")
+
+
+def _reduce(reader: _Reader, _value: Any) -> None:
+    arguments = wanted(reader.stack.pop(), tuple, "arguments")
+    called = reader.stack.pop()
+    name = called.name if isinstance(called, Foreign) else ""
+    build = _BUILDERS.get(name)
+    reader.stack.append(Foreign(name) if build is None else build(reader, arguments))
+
+
+def _new_object(reader: _Reader, _value: Any) -> None:
+    reader.stack.pop()
+    kind = reader.stack.pop()
+    reader.stack.append(Foreign(wanted(kind, Foreign, "a class").name))
+
+
+def _build(reader: _Reader, _value: Any) -> None:
+    state = reader.stack.pop()
+    target = reader.stack[-1]
+    if isinstance(target, StoredArray):
+        target.values = _array(reader, *wanted(state, tuple, "an array's state")[-4:])
+    elif isinstance(target, _Kind):
+        _, order, *structured = wanted(state, tuple, "a type's state")[:5]
+        target.order = order if order in _ORDERS else ""
+        target.code = target.code if structured == [None, None, None] else ""
+    elif not isinstance(target, Foreign):
+        raise TypeError("a state for a plain value")
+
+
+# --- what NumPy and the standard library have built ---
+
+
+def _array(reader: _Reader, shape: Any, kind: Any, fortran: Any, raw: Any) -> NDArray[Any] | list[Any]:
+    """The array of a state: as many bytes as its shape and type say, or the list of an array of objects."""
+    sides = wanted(shape, tuple, "a shape")
+    if len(sides) > MAX_SIDES or any(type(side) is not int or side < 0 for side in sides):
+        raise ValueError("a shape that none can have")
+    kind = wanted(kind, _Kind, "a type")
+    if kind.code.startswith(_OBJECT):
+        return wanted(raw, list, "objects")  # type: ignore[no-any-return]
+    dtype, data = kind.dtype(), reader.bytes_of(raw)
+    if math.prod(sides) * dtype.itemsize != len(data):
+        raise ValueError(f"{len(data)} bytes for an array of shape {sides}")
+    return np.frombuffer(data, dtype).reshape(sides, order="F" if fortran else "C")
+
+
+def _blank_array(_reader: _Reader, arguments: tuple[Any, ...]) -> Any:
+    kind = arguments[0]
+    return StoredArray() if kind == Foreign("numpy.ndarray") else Foreign(wanted(kind, Foreign, "a class").name)
+
+
+def _kind(_reader: _Reader, arguments: tuple[Any, ...]) -> _Kind:
+    code = wanted(arguments[0], str, "the name of a type")
+    if len(code) > MAX_NAME:
+        raise ValueError("a type that no array has")
+    return _Kind(code)
+
+
+def _scalar(reader: _Reader, arguments: tuple[Any, ...]) -> StoredArray:
+    kind, raw = arguments
+    return StoredArray(_array(reader, (), kind, False, raw))
+
+
+def _from_buffer(reader: _Reader, arguments: tuple[Any, ...]) -> StoredArray:
+    raw, kind, shape, order = arguments
+    return StoredArray(_array(reader, shape, kind, order == "F", raw))
+
+
+def _encoded(reader: _Reader, arguments: tuple[Any, ...]) -> bytes:
+    text, encoding = arguments
+    if encoding not in ("latin1", "latin-1"):
+        raise ValueError("bytes in an unknown encoding")
+    return reader.bytes_of(wanted(text, str, "text"))
+
+
+def _no_bytes(_reader: _Reader, arguments: tuple[Any, ...]) -> bytes:
+    """Empty bytes, as older protocols write them."""
+    if arguments:
+        raise ValueError("bytes of something")
+    return b""
+
+
+def _dict(reader: _Reader, arguments: tuple[Any, ...]) -> dict[str, Any]:
+    pairs = arguments[0] if arguments and type(arguments[0]) is list else []
+    reader.paired += len(pairs)
+    if reader.paired > MAX_OPERATIONS:
+        raise ValueError("the same items in many dicts")
+    return _dict_of([item for pair in pairs for item in pair[:2]])
+
+
+def _of_class(_reader: _Reader, arguments: tuple[Any, ...]) -> Foreign:
+    return Foreign(wanted(arguments[0], Foreign, "a class").name)
+
+
+_BUILDERS: dict[str, Callable[[_Reader, tuple[Any, ...]], Any]] = {
+    "numpy._core.multiarray._reconstruct": _blank_array,
+    "numpy._core.multiarray.scalar": _scalar,
+    "numpy._core.numeric._frombuffer": _from_buffer,
+    "numpy.dtype": _kind,
+    "_codecs.encode": _encoded,
+    "builtins.bytes": _no_bytes,
+    "__builtin__.bytes": _no_bytes,
+    "collections.OrderedDict": _dict,
+    "collections.defaultdict": _dict,
+    "copyreg._reconstructor": _of_class,
+    "copy_reg._reconstructor": _of_class,
+}
+
+_OPERATIONS: dict[str, Callable[[_Reader, Any], None]] = {
+    **dict.fromkeys(("PROTO", "FRAME"), _ignore),
+    **dict.fromkeys(("INT", "LONG", "BININT", "BININT1", "BININT2", "LONG1", "LONG4", "FLOAT", "BINFLOAT"), _push),
+    **dict.fromkeys(("STRING", "BINSTRING", "SHORT_BINSTRING"), _push),
+    **dict.fromkeys(("UNICODE", "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8"), _push),
+    **dict.fromkeys(("BINBYTES", "SHORT_BINBYTES", "BINBYTES8", "BYTEARRAY8"), _push_bytes),
+    **dict.fromkeys(("PUT", "BINPUT", "LONG_BINPUT"), _put),
+    **dict.fromkeys(("GET", "BINGET", "LONG_BINGET"), _get),
+    "MEMOIZE": _memoise,
+    "NONE": _make(lambda: None),
+    "NEWTRUE": _make(lambda: True),
+    "NEWFALSE": _make(lambda: False),
+    "MARK": _make(lambda: _MARK),
+    "EMPTY_LIST": _make(list),
+    "EMPTY_DICT": _make(dict),
+    "EMPTY_TUPLE": _make(tuple),
+    "LIST": _gather(list),
+    "TUPLE": _gather(tuple),
+    "DICT": _gather(_dict_of),
+    "TUPLE1": _tuple_of(1),
+    "TUPLE2": _tuple_of(2),
+    "TUPLE3": _tuple_of(3),
+    "APPEND": _append,
+    "APPENDS": _append_all,
+    "SETITEM": _set_item,
+    "SETITEMS": _set_items,
+    "POP": _pop,
+    "POP_MARK": _pop_mark,
+    "GLOBAL": _global,
+    "STACK_GLOBAL": _stack_global,
+    "REDUCE": _reduce,
+    "NEWOBJ": _new_object,
+    "BUILD": _build,
+}

@@ -1,0 +1,139 @@
+"""The content of a `.npy`, `.npz` or `.pkl` file as plain values: dicts, lists, numbers, text and arrays.
+
+Rule: sizes are known before memory is taken, nothing in a file is executed (`pickled.py`), and of an archive only
+arrays are read that somebody asked for by name. What holds what can be without end, so a search goes a few levels deep.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.arrays import F64
+from trilane.errors import BadInputError
+from trilane.files import as_numbers, npy_pickle, npz_names, npz_pickles, read_bytes, read_npy, read_npz
+from trilane.scene.motion.pickled import ARRAYS, MAX_BYTES, Foreign, StoredArray, printable, values_of
+from trilane.unexpected_value import UnexpectedValue
+
+DEEPEST = 4
+MOST_TABLES = 200_000
+MOST_NAMED = 12
+
+
+def npy_values(path: Path, expected: str) -> Any:
+    """The array of a `.npy` file, or what it holds when that is an object. Raises BadInputError."""
+    pickled = npy_pickle(path, MAX_BYTES, expected)
+    return read_npy(path, expected) if pickled is None else _values(path, pickled)
+
+
+def npz_values(path: Path, keys: Collection[str], expected: str) -> dict[str, Any]:
+    """Those arrays of an `.npz` file that `keys` names, and everything in it that is an object.
+
+    Raises BadInputError.
+    """
+    names = npz_names(path, expected)
+    pickles = npz_pickles(path, names, MAX_BYTES, expected)
+    arrays = read_npz(path, [key for key in keys if key in names and key not in pickles], expected)
+    return {**arrays, **{key: _values(f"{path}[{key}]", data) for key, data in pickles.items()}}
+
+
+def pickle_values(path: Path, expected: str) -> Any:
+    """What a pickle holds. Raises BadInputError."""
+    return _values(path, read_bytes(path, MAX_BYTES, expected))
+
+
+def _values(where: Path | str, data: bytes) -> Any:
+    try:
+        return plain(values_of(data))
+    except UnexpectedValue as error:
+        raise BadInputError.at(where, error) from None
+
+
+def plain(value: Any) -> Any:
+    """`value`, or the one object in an array of one, as NumPy stores an object."""
+    if isinstance(value, StoredArray) and isinstance(value.values, list) and len(value.values) == 1:
+        return value.values[0]
+    return value.values if isinstance(value, StoredArray) else value
+
+
+def tables_in(value: Any) -> Iterator[tuple[str, dict[str, Any]]]:
+    """The dicts in `value` with the names on the way to them, `.` between, from the outermost inwards; each once."""
+    seen: set[int] = set()
+    level = [("", plain(value))]
+    for _ in range(DEEPEST + 1):
+        inner: list[tuple[str, Any]] = []
+        for name, each in level:
+            if id(each) in seen or len(seen) >= MOST_TABLES or not isinstance(each, dict | list):
+                continue
+            seen.add(id(each))
+            if isinstance(each, dict):
+                yield name, each
+            inner += [(f"{name}.{key}".removeprefix("."), plain(below)) for key, below in _items(each)]
+        level = inner
+
+
+def _items(value: dict[str, Any] | list[Any]) -> list[tuple[Any, Any]]:
+    """Keys, or places in the list, and values of what may hold a dict."""
+    pairs = value.items() if isinstance(value, dict) else enumerate(value)
+    return [(key, below) for key, below in pairs if isinstance(below, dict | list | StoredArray)]
+
+
+def array_of(value: Any) -> NDArray[Any] | None:
+    """`value` as an array, if it is one, a number, or a list of numbers; else None."""
+    value = plain(value)
+    if isinstance(value, np.ndarray):
+        return value
+    numbers = value if isinstance(value, list) else [value]
+    if not all(type(each) in (int, float) and abs(each) < 1e300 for each in numbers):
+        return None
+    return np.array(value, dtype=np.float64)
+
+
+def contents(value: Any) -> str:
+    """What is in `value`, for messages: names of its outermost dict that has arrays, with their shapes."""
+    value = plain(value)
+    for name, table in tables_in(value):
+        arrays = {key: array_of(each) for key, each in table.items()}
+        if any(array is not None for array in arrays.values()) or not table:
+            listed = [
+                f"{printable(key)} {array.shape if array is not None else ''}".strip() for key, array in arrays.items()
+            ]
+            more = f" and {len(listed) - MOST_NAMED} more" if len(listed) > MOST_NAMED else ""
+            within = f" in {printable(name)}" if name else ""
+            return f"{', '.join(listed[:MOST_NAMED]) or 'nothing'}{more}{within}"
+    if isinstance(value, Foreign):
+        return f"{printable(value.name)}, which is not built"
+    array = array_of(value)
+    return f"an array of shape {array.shape}" if array is not None else f"a {type(value).__name__}"
+
+
+@dataclass(frozen=True)
+class Found:
+    """A dict of a file. `where`: of it, for messages; `name`: its own in the file, empty for the outermost."""
+
+    where: str
+    name: str
+    table: Mapping[str, Any]
+
+    def has(self, key: str) -> bool:
+        """Whether there is a value, not None, of that name."""
+        return bool(key) and self.table.get(key) is not None
+
+    def array(self, key: str) -> NDArray[Any]:
+        """The array `key`. Raises BadInputError when it is none."""
+        value = self.table[key]
+        array = array_of(value)
+        if array is None:
+            kind = printable(value.name) if isinstance(value, Foreign) else type(value).__name__
+            kind = "an array of objects" if isinstance(value, StoredArray) else kind
+            raise BadInputError(f"{self.where}[{key}]", kind, "an array of numbers", ARRAYS)
+        return array
+
+    def numbers(self, key: str) -> F64:
+        """The array `key` as numbers. Raises BadInputError."""
+        return as_numbers(f"{self.where}[{key}]", self.array(key), "numbers")
