@@ -245,14 +245,15 @@ class _Job:
 
 
 def _checked_frames(checked: Checked, work: Path, hooks: Hooks, result: RunResult) -> dict[str, Any]:
-    """`check` of the report; that there is none is said. Whoever interrupted a run does not wait for it."""
+    """`check` of the report, or `notes` that say why there is none. Whoever interrupted a run does not wait for it."""
     try:
         if result.interrupted:
             raise TrilaneError("it was interrupted")
         return {"check": check_run(checked, work, lambda done, of: hooks.progress("check", done, of))}
     except TrilaneError as error:
-        hooks.message(f"the run was not compared with the reference path: {error}")
-        return {}
+        said = f"the run was not compared with the reference path: {error}"
+        hooks.message(said)
+        return {"notes": [*_notes(checked), said]}
     finally:
         shutil.rmtree(work / FOLDER, ignore_errors=True)
 

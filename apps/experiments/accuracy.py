@@ -35,8 +35,8 @@ def runtime_differences(checked: Checked, runtimes: Sequence[str], frames: int) 
     `runtimes`: two or more, by name.
     `frames`: how many, evenly spread over the scene.
     Keys: `rows`, one per pair: `first`, `second`, `mean`, `largest` (of 255, over all channels and frames),
-    `worst_frame`; `sources`; `bounds`; `frames` (their numbers); `runtimes` (name to version). Raises BadInputError and
-    MissingPartError.
+    `worst_frame`; `sources`; `bounds`; `frames` (numbers of those that show an avatar); `runtimes` (name to version).
+    Raises BadInputError and MissingPartError.
     """
     if not 1 <= frames <= MAX_FRAMES:
         raise BadInputError("--frames", str(frames), f"1 to {MAX_FRAMES}")
@@ -52,6 +52,9 @@ def runtime_differences(checked: Checked, runtimes: Sequence[str], frames: int) 
         for pair in pairs:
             steps = np.abs(pictures[pair[0]] - pictures[pair[1]])
             steps_of[pair].append((float(steps.mean()), int(steps.max()), frame))
+    if not numbers:
+        found = "nobody in view in any of the frames"
+        raise BadInputError(f"scene {checked.config.scene.name}", found, "an avatar in the picture")
     return {
         "rows": [_row(pair, steps) for pair, steps in steps_of.items()],
         "sources": {"rows": MEASURED},
@@ -95,8 +98,10 @@ class _Sessions:
 
 
 def _tensors(checked: Checked, frames: int) -> Iterator[tuple[int, U8]]:
-    """(number, tensor (h,w,C)) of frames that are evenly spread over the scene."""
+    """(number, tensor (h,w,C)) of frames that are evenly spread over the scene, where an avatar is seen."""
     total, painter = checked.config.scene.frames, DrawnTensors(checked)
     count = min(frames, total)
     for frame in (index * total // count for index in range(count)):
-        yield frame, painter.tensor(frame)
+        tensor = painter.tensor(frame)
+        if painter.anybody:
+            yield frame, tensor

@@ -40,6 +40,11 @@ class DrawnTensors:
         tensor: U8 = self._drawn.payload[: height * width * self._channels].reshape(height, width, self._channels)
         return tensor
 
+    @property
+    def anybody(self) -> bool:
+        """Whether an avatar is seen in the last frame that was asked for."""
+        return bool(self._posed.header["avatars"]["visible"].any())
+
 
 def _packet(avatars: int, payload: int) -> Packet:
     layout = SlotLayout(pose_dtype(avatars), payload)

@@ -66,6 +66,8 @@ def error_by_cause(
         if truth is not None:
             split.add_truth(moment, truth.layers(number))
     scene = checked.config.scene
+    if len(empty) == len(numbers):
+        raise BadInputError(f"scene {scene.name}", "nobody in view in any of the frames", "an avatar in the picture")
     return {
         **split.document(),
         "frames": numbers,

@@ -245,6 +245,14 @@ def test_what_cannot_be_compared(names: tuple[str, ...], frames: int, said: str,
 
 
 @pytest.mark.usefixtures("loaded")
+def test_frames_that_show_nobody_are_no_agreement(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(accuracy, "_tensors", lambda *_: iter(()))
+    checked: Any = SimpleNamespace(assets=None, config=SimpleNamespace(scene=SimpleNamespace(name="away")))
+    with pytest.raises(BadInputError, match="scene away: found nobody in view"):
+        runtime_differences(checked, ("ort", "qnn"), 3)
+
+
+@pytest.mark.usefixtures("loaded")
 @pytest.mark.parametrize("frames", [1, 10000])
 def test_the_ends_of_the_range_are_in_it(frames: int) -> None:
     checked: Any = SimpleNamespace(assets=None)

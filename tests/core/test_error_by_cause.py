@@ -27,6 +27,7 @@ from trilane.bench.lib.layers import Box, Layer
 from trilane.body.body import load_body
 from trilane.body.detail import DETAILS
 from trilane.body.kinematics import Skeleton
+from trilane.errors import BadInputError
 from trilane.stages.avatar_assets import AvatarData
 from trilane.testing.byte_network import net
 
@@ -254,3 +255,13 @@ def test_the_bar_runs_from_its_first_to_its_last_colour(tmp_path: Path) -> None:
     heat_maps.write_heat_map(file, "t", np.zeros((8, 8, 3)), np.ones((8, 8, 3)))
     with Image.open(file) as image:
         assert image.size[0] > 3 * 320
+
+
+def test_frames_with_nobody_in_view_have_no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else the run would be said to be without an error, 100 dB."""
+    empty = SimpleNamespace(output=OUTPUT, moment=lambda _: SimpleNamespace(boxes=()))
+    monkeypatch.setattr(error_by_cause, "ReferencePath", lambda _: empty)
+    monkeypatch.setattr(error_by_cause, "_truth", lambda _: None)
+    checked: Any = SimpleNamespace(config=SimpleNamespace(scene=SimpleNamespace(frames=9, name="away")))
+    with pytest.raises(BadInputError, match="scene away: found nobody in view in any of the frames"):
+        error_by_cause.error_by_cause(checked, 2)

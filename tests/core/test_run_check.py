@@ -112,9 +112,11 @@ def test_without_any_frame_there_is_no_check_and_that_is_said(tmp_path: Path) ->
         check_run("checked", tmp_path)  # type: ignore[arg-type]
     said: list[str] = []
     hooks = run_job.Hooks(lambda *_: None, said.append)
+    checked: Any = SimpleNamespace(notes=("planned",), config=SimpleNamespace(record=True))
     for interrupted in (False, True):
         result: Any = SimpleNamespace(interrupted=interrupted)
-        assert run_job._checked_frames("checked", tmp_path, hooks, result) == {}  # type: ignore[arg-type]
+        facts = run_job._checked_frames(checked, tmp_path, hooks, result)
+        assert facts == {"notes": ["planned", said[-1]]}
     assert said == [
         "the run was not compared with the reference path: none of the frames that were kept shows an avatar",
         "the run was not compared with the reference path: it was interrupted",
