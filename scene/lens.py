@@ -23,15 +23,19 @@ ASSUMED_WIDTH_PX, ASSUMED_HEIGHT_PX = 640.0, 480.0
 
 
 class Known(Enum):
-    """What is known of a lens: all of it, or the angle over one side of a picture whose shape is not known."""
+    """What is known of a lens: all of it, or the angle over one side of a picture whose shape is not known.
+
+    LONG: the angle over the longer side, and whether that lies or stands.
+    """
 
     ALL = "all"
     WIDTH = "width"
     HEIGHT = "height"
+    LONG = "long"
 
 
 #: What is known of a lens whose picture was turned by a quarter.
-TURNED = {Known.ALL: Known.ALL, Known.WIDTH: Known.HEIGHT, Known.HEIGHT: Known.WIDTH}
+TURNED = {**{known: known for known in Known}, Known.WIDTH: Known.HEIGHT, Known.HEIGHT: Known.WIDTH}
 
 
 class Cut(NamedTuple):
@@ -64,6 +68,11 @@ class Lens:
     cx: float
     cy: float
     known: Known = Known.ALL
+
+    def lies_across(self, picture: Shape) -> bool:
+        """Whether the lens's picture stands upright and `picture` (height, width) lies, or the other way round."""
+        is_known = self.known in (Known.ALL, Known.LONG)
+        return is_known and (self.height_px - self.width_px) * (picture[0] - picture[1]) < 0
 
     @property
     def fov_y_deg(self) -> float:
@@ -109,8 +118,11 @@ class Lens:
         """
         height, width = float(picture[0]), float(picture[1])
         if self.known is not Known.ALL:
-            by_width = self.known is Known.WIDTH
-            focal = self.fx * width / self.width_px if by_width else self.fy * height / self.height_px
+            focal = {
+                Known.WIDTH: self.fx / self.width_px * width,
+                Known.HEIGHT: self.fy / self.height_px * height,
+                Known.LONG: self.fx / max(self.width_px, self.height_px) * max(width, height),
+            }[self.known]
             return Lens(width, height, focal, focal, width / 2, height / 2)
         scale = max(width / self.width_px, height / self.height_px)
         whole = self.scaled(self.width_px * scale, self.height_px * scale)

@@ -94,7 +94,11 @@ def _camera_arrays(camera: PlacedCamera) -> Arrays:
         "known": np.array([KNOWN.index(lens.known) for lens in path.optics.lenses]),
         "clip_m": np.array([path.optics.near_m, path.optics.far_m]),
         "filmed": np.array(path.optics.filmed, np.int64).reshape(-1, 2),
+        "turned": np.array(path.optics.turned, np.int64),
         "pictures": np.array(path.pictures, np.str_),
+        "quarter": np.array(path.quarter),
+        "is_held": np.array(path.is_held),
+        "repeat_s": np.array(path.repeat_s),
         "wrap": np.array(WRAPS.index(path.wrap)),
         "recorded": np.array(path.recorded),
         "turn": camera.turn,
@@ -113,6 +117,9 @@ def _camera(arrays: Arrays) -> PlacedCamera:
         WRAPS[int(arrays["wrap"])],
         bool(arrays["recorded"]),
         pictures=tuple(arrays["pictures"].tolist()),
+        quarter=int(arrays["quarter"]),
+        is_held=bool(arrays["is_held"]),
+        repeat_s=float(arrays["repeat_s"]),
     )
     return PlacedCamera(path, arrays["turn"], arrays["shift"], arrays["mount"], ())
 
@@ -124,4 +131,4 @@ def _optics(arrays: Arrays) -> Optics:
         Lens(**dict(zip(LENS, map(float, row), strict=True)), known=KNOWN[int(known)]) for row, known in rows
     )
     filmed = tuple((int(height), int(width)) for height, width in arrays["filmed"])
-    return Optics(lenses, near_m, far_m, filmed)
+    return Optics(lenses, near_m, far_m, filmed, tuple(int(quarters) for quarters in arrays["turned"]))

@@ -13,6 +13,7 @@ from pathlib import Path
 from trilane.body.body import ShapedBody
 from trilane.scene.camera.load import load_camera
 from trilane.scene.camera_placement import place_camera
+from trilane.scene.footage import Footage, filmed
 from trilane.scene.motion.load import load_motion
 from trilane.scene.mover import Mover, make_mover
 from trilane.scene.placed_camera import PlacedCamera
@@ -28,17 +29,19 @@ class Staged:
     notes: tuple[str, ...]
 
 
-def stage_scene(scene: Scene, bodies: Sequence[ShapedBody], base: Path) -> Staged:
+def stage_scene(scene: Scene, bodies: Sequence[ShapedBody], base: Path, footage: Footage | None = None) -> Staged:
     """Load the motions and the camera of `scene`, whose avatars have `bodies`; relative paths start at `base`.
 
-    Raises BadInputError when a file is unusable.
+    `footage`: what its background is; None for a drawn one. Raises BadInputError when a file is unusable.
     """
     motions = [load_motion(spec, base) for spec in scene.avatars]
     movers = tuple(
         make_mover(spec, motion, body) for spec, motion, body in zip(scene.avatars, motions, bodies, strict=True)
     )
-    path = load_camera(scene.camera, base)
+    output = scene.output.height, scene.output.width
+    path, seen = filmed(load_camera(scene.camera, base), footage, output)
     camera = place_camera(path, scene, movers, bodies)
     notes = [f"motion: {note}" for mover in movers for note in (*mover.motion.notes, *mover.notes)]
     notes += [f"camera: {note}" for note in (*path.notes, *camera.notes)]
+    notes += [f"background: {note}" for note in seen]
     return Staged(movers, camera, tuple(notes))

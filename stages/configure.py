@@ -27,10 +27,11 @@ from trilane.hw_profiles.runtime_choice import fastest_runtime
 from trilane.install import EGL_LINE
 from trilane.near_miss import did_you_mean
 from trilane.pipeline.shared_assets import Assets
+from trilane.scene.footage import Footage
 from trilane.scene.load import find_scene, load_scene, located, scene_from
 from trilane.scene.planner import TensorBudget
 from trilane.scene.schema import Scene
-from trilane.scene.staging import stage_scene
+from trilane.scene.staging import Staged, stage_scene
 from trilane.stages.avatar_assets import AvatarData, load_avatar, pack_assets, require_one_tensor
 from trilane.stages.config import NetworkCut, RunConfig
 from trilane.stages.dsp.runtime import RUNTIMES, installed, resolve
@@ -145,13 +146,14 @@ def configure(request: Request, out_dir: Path, gl: GlFacts = gl_facts) -> Checke
         )
     asked = asked_cores(request.cores)
     runtime, reason = requested_runtime(request.runtime)
-    _check_background(scene)
+    footage = _footage(scene)
     bundles = {spec.bundle: load_bundle(spec.bundle) for spec in scene.avatars}
     avatars = {bundle.folder.absolute(): load_avatar(bundle) for bundle in bundles.values()}
     folders = tuple(bundles[spec.bundle].folder.absolute() for spec in scene.avatars)
     require_one_tensor(list(avatars.values()))
     bodies = [avatars[folder].shaped for folder in folders]
-    staged = stage_scene(scene, bodies, Path.cwd())
+    staged = stage_scene(scene, bodies, Path.cwd(), footage)
+    _check_pictures(scene, staged)
     network = avatars[folders[0]].network
     cuts = requested_cuts(request.split, network)
     unit, why = skinning_unit(request.skinning, gl)
@@ -204,11 +206,21 @@ def requested_cuts(texts: Sequence[str], network: NetworkFile) -> tuple[NetworkC
     return tuple(cuts)
 
 
-def _check_background(scene: Scene) -> None:
-    if scene.background != ROOM:
-        from trilane.stages.gpu.background import open_background  # slow to import, and seldom needed here
+def _footage(scene: Scene) -> Footage | None:
+    """What the background of `scene` is; None for the room. Raises BadInputError."""
+    if scene.background == ROOM:
+        return None
+    from trilane.stages.gpu.survey import survey  # slow to import, and seldom needed here
 
-        open_background(Path(scene.background), (scene.output.height, scene.output.width), scene.fps).close()
+    return survey(Path(scene.background), scene.fps)
+
+
+def _check_pictures(scene: Scene, staged: Staged) -> None:
+    """Raises BadInputError when a picture that the run shows cannot be decoded."""
+    if scene.background != ROOM:
+        from trilane.stages.gpu.survey import check_pictures
+
+        check_pictures(Path(scene.background), scene.fps, scene.frames, staged.camera.path)
 
 
 def _accuracy(avatars: Sequence[AvatarData], drawn: DrawnAs) -> dict[str, Any]:

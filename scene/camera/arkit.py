@@ -19,7 +19,7 @@ EXPECTED = "an ARKit log: time and the 12 numbers of a 3x4 matrix a line"
 #: With a median step above this, times are in nanoseconds, else in seconds.
 LEAST_STEP_NS = 1e3
 #: An iPhone's main camera, 26 mm equivalent, on a 16:9 picture: 36 degrees high, 60 wide.
-PHONE = centred(1920, 1080, 540 / math.tan(math.radians(18.0)), Known.WIDTH)
+PHONE = centred(1920, 1080, 540 / math.tan(math.radians(18.0)), Known.LONG)
 
 
 def load_arkit(path: Path) -> RawCamera:

@@ -17,6 +17,9 @@ from trilane.scene.motion.motion import Wrap, bracket, wrapped_time
 from trilane.scene.rotations import matrix_from_quat, slerp
 from trilane.shapes import Shape
 
+ROUNDING_S = 1e-6
+HALFWAY = 0.5
+
 
 def view_from_pose(turn: F64, place: F64) -> F64:
     """World to camera (4, 4) of a camera whose axes are the columns of `turn` (3, 3), standing at `place` (3,)."""
@@ -67,14 +70,16 @@ class Optics:
     """How the camera's picture comes about.
 
     `lenses`: one for all samples of the path, or one for each. `near_m`, `far_m`: distances of the clip planes.
-    `filmed`: (height, width) of the background that the camera filmed, one for all samples or one for each; empty where
-    the background is not the camera's.
+    `filmed`: (height, width) of the background that the camera filmed, as it is shown, one for all samples or one for
+    each; empty where the background is not the camera's. `turned`: by how many quarters its pixels are turned clockwise
+    to be shown, likewise; empty for what its file says.
     """
 
     lenses: tuple[Lens, ...]
     near_m: float
     far_m: float
     filmed: tuple[Shape, ...] = ()
+    turned: tuple[int, ...] = ()
 
     def lens(self, i: int, j: int, fraction: float, output: Shape) -> Lens:
         """Of a picture of `output` (height, width), at `fraction` of the way from sample `i` to sample `j`.
@@ -104,7 +109,9 @@ class CameraPath:
     `times_s` (N,): from 0, strictly increasing. `quats` (N, 4) and `places` (N, 3), metres: camera to world. `notes`:
     how the source was read, for people. `wrap`: what follows the last sample. `recorded`: whether the path
     comes from a recording, which has to be placed in the scene. `detected`: what its file is. `pictures`: names of the
-    photos that the samples are of, one for each; empty where the file names none.
+    photos that the samples are of, one for each; empty where the file names none. `quarter`: quarters by which the
+    camera's picture was turned clockwise. `is_held`: whether each sample holds, halfway to its neighbours, because its
+    photo does. `repeat_s`: after which time the path starts again, as what it filmed does; 0 for `wrap` alone.
     """
 
     times_s: F64
@@ -116,6 +123,9 @@ class CameraPath:
     recorded: bool = True
     detected: Detected = NOTHING
     pictures: tuple[str, ...] = ()
+    quarter: int = 0
+    is_held: bool = False
+    repeat_s: float = 0.0
 
     @property
     def duration_s(self) -> float:
@@ -124,9 +134,26 @@ class CameraPath:
 
     def pose(self, t_s: float) -> tuple[F64, F64]:
         """Turn (3, 3) and place (3,) of the camera at `t_s`."""
-        i, j, fraction = bracket(self.times_s, wrapped_time(t_s, self.duration_s, self.wrap))
+        i, j, fraction = self._between(t_s)
         turn = matrix_from_quat(slerp(self.quats[i], self.quats[j], fraction))
         return turn, self.places[i] + (self.places[j] - self.places[i]) * fraction
+
+    def nearest(self, t_s: float) -> int:
+        """The sample that is nearest to `t_s`."""
+        i, j, fraction = self._bracket(t_s)
+        return i if fraction < HALFWAY else j
+
+    def _between(self, t_s: float) -> tuple[int, int, float]:
+        """Two samples, and how far `t_s` is from the first to the second, 0 to 1."""
+        if not self.is_held:
+            return self._bracket(t_s)
+        held = self.nearest(t_s)
+        return held, held, 0.0
+
+    def _bracket(self, t_s: float) -> tuple[int, int, float]:
+        if self.repeat_s:
+            t_s = max((t_s + ROUNDING_S) % self.repeat_s - ROUNDING_S, 0.0)
+        return bracket(self.times_s, wrapped_time(t_s, self.duration_s, self.wrap))
 
     def sample(self, t_s: float) -> F64:
         """World to camera (4, 4) at `t_s`."""
@@ -134,7 +161,7 @@ class CameraPath:
 
     def lens(self, t_s: float, output: Shape) -> Lens:
         """At `t_s`, of a picture of `output` (height, width)."""
-        return self.optics.lens(*bracket(self.times_s, wrapped_time(t_s, self.duration_s, self.wrap)), output)
+        return self.optics.lens(*self._between(t_s), output)
 
     def projection(self, t_s: float, output: Shape) -> F64:
         """OpenGL clip matrix (4, 4) at `t_s` for a picture of `output` (height, width)."""

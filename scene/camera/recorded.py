@@ -82,7 +82,9 @@ def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraP
     )
     detected = replace(raw.detected, axes=upright.note, lens=seen)
     pictures = tuple(raw.pictures[k] for k in usable) if raw.pictures else ()
-    return CameraPath(times - times[0], quats, places @ world.T, optics, notes, detected=detected, pictures=pictures)
+    return CameraPath(
+        times - times[0], quats, places @ world.T, optics, notes, detected=detected, pictures=pictures, quarter=quarter
+    )
 
 
 def _optics(raw: RawCamera, usable: NDArray[np.intp], quarter: int, spec: CameraSpec) -> tuple[Optics, str]:

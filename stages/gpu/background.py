@@ -1,27 +1,26 @@
 """Backgrounds from the user's files: a picture, a folder of pictures, a video.
 
 Rule: every frame covers the output: it is scaled until no border is left, and what overhangs is cut off equally on both
-sides. Videos and folders start again when they end.
+sides. Videos and folders start again when they end; photos that belong to the camera's views are shown with them.
 """
 
 from __future__ import annotations
 
-import warnings
+from bisect import bisect_right
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Protocol
 
-import numpy as np
-from PIL import Image, ImageOps, UnidentifiedImageError
-
 from trilane.arrays import U8
-from trilane.errors import BadInputError, reason
+from trilane.errors import BadInputError
 from trilane.files import require_file
+from trilane.scene.camera.path import CameraPath
+from trilane.scene.picture_order import film_of, in_order
+from trilane.shapes import Shape
+from trilane.stages.gpu.picture_file import PHONE_PHOTOS, PICTURES, read_picture
 from trilane.stages.gpu.video_reader import VideoReader
 
-Shape = tuple[int, int]
-
-PICTURES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff"})
-MAX_PIXELS = 64_000_000
+ROUNDING = 1e-6
 
 
 class Background(Protocol):
@@ -34,60 +33,73 @@ class Background(Protocol):
         """Release files and threads."""
 
 
-def open_background(path: Path, shape: Shape, fps: float) -> Background:
-    """The background in `path`; a folder's pictures follow each other at `fps`. Raises BadInputError."""
+def open_background(path: Path, shape: Shape, fps: float, camera: CameraPath | None = None) -> Background:
+    """The background in `path`; a folder's pictures follow each other at `fps`. Raises BadInputError.
+
+    `camera`: the one that may have filmed it.
+    """
+    turned = () if camera is None else camera.optics.turned
+    if camera is not None and camera.is_held:
+        return Pictures([Path(name) for name in camera.pictures], camera.nearest, shape, turned)
     if path.is_dir():
-        return PictureFolder(path, shape, fps)
+        pictures, number_at, _ = folder_film(path, fps)
+        return Pictures(pictures, number_at, shape, turned)
     require_file(path, "a video, a picture, or a folder of pictures")
-    return Still(path, shape) if path.suffix.lower() in PICTURES else VideoReader(path, shape)
+    if is_picture(path):
+        return Pictures([path], lambda _time_s: 0, shape, turned)
+    return VideoReader(path, shape, turned[0] if turned else None)
 
 
-class Still:
-    """One picture."""
-
-    def __init__(self, path: Path, shape: Shape) -> None:
-        self._picture: U8 | None = read_picture(path, shape)
-
-    def at(self, time_s: float) -> U8 | None:  # noqa: ARG002 - a still shows the same at all times
-        """The picture at the first call, None later."""
-        picture, self._picture = self._picture, None
-        return picture
-
-    def close(self) -> None:
-        """Nothing is held."""
+def is_picture(path: Path) -> bool:
+    """Whether the name of `path` says that it is a picture."""
+    return path.suffix.lower() in PICTURES | PHONE_PHOTOS
 
 
-class PictureFolder:
-    """The pictures of a folder in the order of their names."""
+def pictures_in(folder: Path) -> list[Path]:
+    """Its pictures, in order. Raises BadInputError without any."""
+    try:
+        names = [path.name for path in folder.iterdir() if path.suffix.lower() in PICTURES]
+    except OSError as error:
+        raise BadInputError(folder, f"no readable folder ({error.strerror})", "a folder of pictures") from None
+    if not names:
+        raise BadInputError(folder, "no pictures", f"files that end in {', '.join(sorted(PICTURES))}")
+    return [folder / name for name in in_order(names)]
 
-    def __init__(self, folder: Path, shape: Shape, fps: float) -> None:
-        self._paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
-        if not self._paths:
-            raise BadInputError(folder, "no pictures", f"files that end in {', '.join(sorted(PICTURES))}")
-        self._shape, self._fps, self._shown = shape, fps, -1
-        read_picture(self._paths[0], shape)
+
+def folder_film(folder: Path, fps: float) -> tuple[list[Path], Callable[[float], int], float]:
+    """The pictures of `folder`, the number of the one that is shown at a time, and after how long it starts again."""
+    pictures = pictures_in(folder)
+    film = film_of([path.name for path in pictures])
+
+    def number_at(time_s: float) -> int:
+        return bisect_right(film.frames, int(time_s * fps + ROUNDING) % film.count) - 1
+
+    return pictures, number_at, film.count / fps
+
+
+class Pictures:
+    """Pictures in files, one after the other. `number_at`: the number of the one that is shown at a time."""
+
+    def __init__(
+        self, paths: Sequence[Path], number_at: Callable[[float], int], shape: Shape, turned: Sequence[int] = ()
+    ) -> None:
+        """`turned`: by how many quarters each is turned, or all are; empty for what the files say."""
+        self._paths, self._number_at, self._shape, self._turned = paths, number_at, shape, turned
+        self._shown = -1
+        self._first: U8 | None = self._read(0)
 
     def at(self, time_s: float) -> U8 | None:
         """The picture whose turn it is."""
-        index = int(time_s * self._fps + 1e-6) % len(self._paths)
-        if index == self._shown:
+        number = self._number_at(time_s)
+        if number == self._shown:
             return None
-        self._shown = index
-        return read_picture(self._paths[index], self._shape)
+        self._shown = number
+        first, self._first = self._first, None
+        return first if first is not None and number == 0 else self._read(number)
 
     def close(self) -> None:
         """Nothing is held."""
 
-
-def read_picture(path: Path, shape: Shape) -> U8:
-    """The picture in `path`, turned as its EXIF says, covering `shape`: (h,w,3) uint8. Raises BadInputError."""
-    try:
-        with warnings.catch_warnings(action="ignore"), Image.open(path) as image:
-            if image.width * image.height > MAX_PIXELS:
-                raise BadInputError(path, f"{image.width}x{image.height} pixels", f"at most {MAX_PIXELS} pixels")
-            upright = ImageOps.exif_transpose(image).convert("RGB")
-        return np.asarray(ImageOps.fit(upright, (shape[1], shape[0]), Image.Resampling.LANCZOS))
-    except (OSError, ValueError, SyntaxError, UnidentifiedImageError, Image.DecompressionBombError) as error:
-        raise BadInputError(
-            path, f"no readable picture ({reason(error)})", "a PNG, JPEG, BMP, WebP or TIFF file"
-        ) from error
+    def _read(self, number: int) -> U8:
+        turned = self._turned[number % len(self._turned)] if self._turned else None
+        return read_picture(self._paths[number], self._shape, turned)

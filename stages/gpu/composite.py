@@ -212,10 +212,11 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> CompositeStage:
     scene = config.scene
     shape, folders = (scene.output.height, scene.output.width), distinct(config)
     joints = [shaped_body(unit.assets, folders.index(folder)).joints for folder in config.avatar_dirs]
+    camera = staged_of(unit.assets).camera
     if scene.background == ROOM:
-        background, eyes = None, room_eyes(staged_of(unit.assets).camera, scene)
+        background, eyes = None, room_eyes(camera, scene)
     else:
-        background, eyes = open_background(Path(scene.background), shape, scene.fps), []
+        background, eyes = open_background(Path(scene.background), shape, scene.fps, camera.path), []
     ctx = unit.shared(CONTEXT, lambda: open_context(unit.settings.threads))
     driver = describe(ctx)
     if driver.hardware:

@@ -1,6 +1,7 @@
 """A video as a background: decoded ahead on a thread, in step with media time.
 
-Rule: the thread decodes at most AHEAD frames in advance, and `at` waits for at most one frame to be decoded.
+Rule: each frame is shown at the time that the file gives it, whatever the rate. The thread decodes at most AHEAD frames
+in advance, and `at` waits for at most one frame to be decoded.
 """
 
 from __future__ import annotations
@@ -10,26 +11,35 @@ import threading
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import av
 import numpy as np
 
 from trilane.arrays import U8
 from trilane.errors import BadInputError, TrilaneError
+from trilane.scene.lens import cover
+from trilane.shapes import Shape
+from trilane.stages.gpu.high_range import HLG, PQ, to_srgb
 
 AHEAD = 4
 MAX_PIXELS = 64_000_000
 DEFAULT_STEP_S = 1 / 30
 ROUNDING_S = 1e-6
+#: By their numbers in ITU-T H.273, which are FFmpeg's.
+TRANSFERS, BT2020_PRIMARIES = {16: PQ, 18: HLG}, 9
+MIN_ASPECT = 0.1  # of a pixel; what is beyond is a mistake of the file
 MICROSECONDS = 1e6  # of a second: the unit of a container's duration and of its seeks
 
 
 class VideoReader:
-    """The first video stream of a file, scaled and cropped to `shape`, played in a loop. Raises BadInputError."""
+    """The first video stream of a file, scaled and cropped to `shape`, played in a loop. Raises BadInputError.
 
-    def __init__(self, path: Path, shape: tuple[int, int]) -> None:
-        self._path, self._shape = path, shape
+    `turned`: by how many quarters it is turned clockwise; None for what the file says.
+    """
+
+    def __init__(self, path: Path, shape: Shape, turned: int | None = None) -> None:
+        self._path, self._shape, self._turned = path, shape, turned
         self._start_s: float | None = None  # of the file's first frame, in its own time
         self._period_s = 0.0  # of the loop; 0 until the video has ended once
         self._shown_s = -1.0
@@ -110,25 +120,67 @@ class VideoReader:
         """The frames from the last key frame before `seek_s` to the end, with their times from the file's first one."""
         try:
             with av.open(str(self._path)) as container:
-                if not container.streams.video:
-                    raise BadInputError(self._path, "no video stream", "a video")
-                stream = container.streams.video[0]
+                stream = video_stream(container, self._path)
                 if self._start_s is not None and 0 < seek_s < (container.duration or 0) / MICROSECONDS:
                     container.seek(round((self._start_s + seek_s) * MICROSECONDS))
                 for index, frame in enumerate(container.decode(stream)):
                     time_s = frame.time if frame.time is not None else index * DEFAULT_STEP_S
                     self._start_s = time_s if self._start_s is None else self._start_s
-                    yield max(time_s - self._start_s, 0.0), self._fit(frame)
+                    yield max(time_s - self._start_s, 0.0), self._fit(frame, pixels_of(stream))
         except (av.FFmpegError, ValueError) as error:
             raise BadInputError(self._path, f"no readable video ({error})", "a video that FFmpeg can decode") from error
 
-    def _fit(self, frame: Any) -> U8:
-        if frame.width * frame.height > MAX_PIXELS:
-            raise BadInputError(self._path, f"{frame.width}x{frame.height} pixels", f"at most {MAX_PIXELS} pixels")
-        turns = round(frame.rotation / 90) % 4
-        height, width = self._shape if turns % 2 == 0 else self._shape[::-1]
-        scale = max(width / frame.width, height / frame.height)
-        size = max(width, round(frame.width * scale)), max(height, round(frame.height * scale))
-        pixels = frame.reformat(width=size[0], height=size[1], format="rgb24").to_ndarray()
-        top, left = (size[1] - height) // 2, (size[0] - width) // 2
-        return np.ascontiguousarray(np.rot90(pixels[top : top + height, left : left + width], turns))
+    def _fit(self, frame: Any, pixels: Pixels) -> U8:
+        check_size(self._path, frame)
+        return fitted(frame, pixels, self._shape, self._turned)
+
+
+def fitted(frame: Any, pixels: Pixels, shape: Shape, turned: int | None = None) -> U8:
+    """`frame`, of `pixels`, covering `shape` (h,w), turned clockwise by `turned` quarters, or as its file says."""
+    quarters = quarters_of(frame) if turned is None else turned % 4
+    stored = (frame.height, round(frame.width * pixels.aspect))
+    cut = cover(stored[::-1] if quarters % 2 else stored, shape)
+    height, width = (cut.width, cut.height) if quarters % 2 else (cut.height, cut.width)
+    scaled = frame.reformat(width=width, height=height, format="rgb48le" if pixels.transfer else "rgb24").to_ndarray()
+    upright = np.rot90(scaled, -quarters)[cut.top : cut.top + shape[0], cut.left : cut.left + shape[1]]
+    return to_srgb(upright, pixels.transfer, pixels.is_wide) if pixels.transfer else np.ascontiguousarray(upright)
+
+
+def quarters_of(frame: Any) -> int:
+    """By how many quarters `frame` is turned clockwise to be shown, as its file says."""
+    return int(-round(frame.rotation / 90) % 4)
+
+
+def check_size(path: Path, frame: Any) -> None:
+    """Raises BadInputError when `frame` of `path` is too large."""
+    if frame.width * frame.height > MAX_PIXELS:
+        raise BadInputError(path, f"{frame.width}x{frame.height} pixels", f"at most {MAX_PIXELS} pixels")
+
+
+def video_stream(container: Any, path: Path) -> Any:
+    """The first video stream. Raises BadInputError when there is none."""
+    if not container.streams.video:
+        raise BadInputError(path, "no video stream", "a video")
+    return container.streams.video[0]
+
+
+class Pixels(NamedTuple):
+    """Those of a video. `aspect`: width over height of one. `transfer`: PQ or HLG, empty for the usual range.
+
+    `is_wide`: whether their primaries are those of BT.2020.
+    """
+
+    aspect: float = 1.0
+    transfer: str = ""
+    is_wide: bool = False
+
+
+def pixels_of(stream: Any) -> Pixels:
+    """Those of a video `stream`."""
+    codec = stream.codec_context
+    aspect = float(codec.sample_aspect_ratio or 0)
+    return Pixels(
+        aspect if MIN_ASPECT < aspect < 1 / MIN_ASPECT else 1.0,
+        TRANSFERS.get(int(codec.color_trc), ""),
+        int(codec.color_primaries) == BT2020_PRIMARIES,
+    )

@@ -14,7 +14,7 @@ from PIL import Image
 
 from trilane.errors import BadInputError
 from trilane.stages.gpu.background import open_background
-from trilane.stages.gpu.video_reader import VideoReader
+from trilane.stages.gpu.video_reader import Pixels, fitted
 
 
 def write_video(path: Path, levels: list[int], fps: int = 10) -> None:
@@ -171,15 +171,11 @@ def test_a_frame_is_turned_as_its_file_says(rotation: float, picture: list[list[
     """At its own size, and at twice the size."""
     wanted = np.array(picture, np.uint8)
     for scale in (1, 2):
-        reader = object.__new__(VideoReader)
-        reader._shape = (wanted.shape[0] * scale, wanted.shape[1] * scale)
-        found = reader._fit(Turned(rotation))
+        found = fitted(Turned(rotation), Pixels(), (wanted.shape[0] * scale, wanted.shape[1] * scale))
         assert np.array_equal(found[..., 1], wanted.repeat(scale, 0).repeat(scale, 1))
 
 
 def test_a_frame_that_is_too_wide_or_too_high_loses_both_sides_equally() -> None:
-    reader = object.__new__(VideoReader)
-    reader._shape = (2, 2)
-    assert reader._fit(Turned(0))[..., 0].tolist() == [[1, 2], [5, 6]]
-    reader._shape = (2, 8)  # twice the size, 4 x 8, of which the middle rows stay
-    assert reader._fit(Turned(0))[..., 0].tolist() == [[0, 0, 1, 1, 2, 2, 3, 3], [4, 4, 5, 5, 6, 6, 7, 7]]
+    assert fitted(Turned(0), Pixels(), (2, 2))[..., 0].tolist() == [[1, 2], [5, 6]]
+    # Twice the size, 4 x 8, of which the middle rows stay.
+    assert fitted(Turned(0), Pixels(), (2, 8))[..., 0].tolist() == [[0, 0, 1, 1, 2, 2, 3, 3], [4, 4, 5, 5, 6, 6, 7, 7]]

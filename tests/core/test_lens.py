@@ -91,6 +91,15 @@ def test_an_angle_alone_takes_the_shape_of_the_picture() -> None:
     assert (lens.fov_x_deg, of_fov_y(33.0).fov_y_deg) == pytest.approx((90.0, 33.0))
 
 
+def test_the_angle_of_a_longer_side_takes_the_shape_of_the_picture() -> None:
+    """A phone's 1920 of 1920x1080 at f = 960: half of the longer side, of a picture of 4:3 and of an upright one."""
+    phone = centred(1920, 1080, 960, Known.LONG)
+    assert phone.onto((300, 400)) == centred(400, 300, 200)
+    assert phone.turned(1).onto((400, 300)) == centred(300, 400, 200)
+    assert (phone.lies_across((300, 400)), phone.turned(1).lies_across((300, 400))) == (False, True)
+    assert not of_fov_x(90).lies_across((400, 300)) and not centred(10, 10, 5).lies_across((400, 300))
+
+
 def test_a_drawing_is_as_high_as_the_picture() -> None:
     """The principal point stays as far from the middle of the columns as it was, in the picture's own scale."""
     shown = LENS.filling_height((600, 1000))

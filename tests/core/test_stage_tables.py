@@ -363,16 +363,19 @@ def test_the_accuracy_of_a_run_is_of_each_avatar_as_the_run_draws_it(
     }
 
 
-def test_a_background_is_opened_in_its_size_before_the_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    from trilane.stages.gpu import background
+def test_a_background_is_looked_at_before_the_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    from trilane.stages.gpu import survey
 
     asked: list[Any] = []
-    closing = SimpleNamespace(close=lambda: asked.append("closed"))
-    monkeypatch.setattr(background, "open_background", lambda *given: asked.append(given) or closing)
-    scene = Scene(background=str(tmp_path / "a.png"), output=OutputSpec(width=100, height=64), fps=12.0)
-    configure._check_background(scene)
-    assert asked == [(tmp_path / "a.png", (64, 100), 12.0), "closed"]
-    configure._check_background(Scene())
+    monkeypatch.setattr(survey, "survey", lambda *given: asked.append(given))
+    monkeypatch.setattr(survey, "check_pictures", lambda *given: asked.append(given))
+    scene = Scene(background=str(tmp_path / "a.png"), output=OutputSpec(width=100, height=64), fps=12.0, frames=7)
+    staged: Any = SimpleNamespace(camera=SimpleNamespace(path="the camera"))
+    configure._footage(scene)
+    configure._check_pictures(scene, staged)
+    assert asked == [(tmp_path / "a.png", 12.0), (tmp_path / "a.png", 12.0, 7, "the camera")]
+    assert configure._footage(Scene()) is None
+    configure._check_pictures(Scene(), staged)
     assert len(asked) == 2
 
 

@@ -45,9 +45,21 @@ def test_every_field_survives_as_an_array(wrap: Wrap, leg_m: float | None) -> No
         np.array([2.0, 3.0]),
         ("n",),
     )
-    lens = Optics((Lens(9.0, 8.0, 7.0, 6.0, 5.0, 4.0, Known.WIDTH), of_fov_y(33.0)), 0.2, 44.0, ((3, 4),))
+    lens = Optics((Lens(9.0, 8.0, 7.0, 6.0, 5.0, 4.0, Known.WIDTH), of_fov_y(33.0)), 0.2, 44.0, ((3, 4),), (1, 2))
     quats, places = random.normal(size=(2, 4)), random.normal(size=(2, 3))
-    camera = CameraPath(np.array([0.0, 2.0]), quats, places, lens, ("c",), wrap, leg_m is None, pictures=("a", "b"))
+    camera = CameraPath(
+        np.array([0.0, 2.0]),
+        quats,
+        places,
+        lens,
+        ("c",),
+        wrap,
+        leg_m is None,
+        pictures=("a", "b"),
+        quarter=3,
+        is_held=True,
+        repeat_s=7.0,
+    )
     placed = PlacedCamera(camera, random.normal(size=(3, 3)), random.normal(size=3), random.normal(size=(3, 3)), ("p",))
     arrays = staged_to_arrays(Staged((mover, mover), placed, ("all",)))
     again = staged_from_arrays(arrays)

@@ -1,0 +1,223 @@
+"""What a background of the user's is, and the camera that filmed it.
+
+Rule: a recorded camera is taken for the one that filmed the background: they begin together, they start again together,
+and the camera's picture is cut as the background is. Photos that the camera's file names belong to their views.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import PurePosixPath
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.scene.camera.path import CameraPath, Optics
+from trilane.scene.lens import Known, Lens, cover
+from trilane.shapes import Shape
+
+#: Lengths of camera and background that differ by more than this share are said.
+LIKE_LENGTH = 0.05
+#: Shapes whose aspects differ by more than this are different.
+LIKE_ASPECT = 0.01
+#: A camera that moves farther than this does not fit a picture that stands still.
+STILL_M = 0.05
+NAMED = 3
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Stored:
+    """A picture, or the frames of a video. `shape`: (height, width) of its pixels as stored, when they are square.
+
+    `turned`: by how many quarters they are to be turned clockwise, as the file says.
+    """
+
+    shape: Shape
+    turned: int = 0
+
+    def shown(self, turned: int | None = None) -> Shape:
+        """(height, width), turned by `turned` quarters, or as the file says."""
+        return self.shape[::-1] if (self.turned if turned is None else turned) % 2 else self.shape
+
+
+@dataclass(frozen=True)
+class Footage:
+    """A background. `what`: it is, for people. `stored`: the video or the picture; of a folder, each of its pictures.
+
+    `files`: names of pictures, in the order of `stored`; none of a video. `folder`: where they are. `period_s`:
+    after which time it starts again; 0 for a single picture.
+    """
+
+    what: tuple[str, ...]
+    stored: tuple[Stored, ...]
+    files: tuple[str, ...] = ()
+    folder: str = ""
+    period_s: float = 0.0
+
+
+def filmed(path: CameraPath, footage: Footage | None, output: Shape) -> tuple[CameraPath, tuple[str, ...]]:
+    """`path` as the camera that filmed `footage`, and notes on the background; None is one that is drawn.
+
+    `output`: (height, width) of the picture that is shown.
+    """
+    if footage is None:
+        return path, ()
+    if not path.recorded:
+        return path, (*footage.what, _loop(footage), cut_note([one.shown() for one in footage.stored], output))
+    matched, notes = _with_photos(path, footage)
+    if matched is None:
+        return _over_all(path, footage, output, notes)
+    camera, stored = matched
+    camera, turn_notes = _turned(camera, stored)
+    shapes = camera.optics.filmed
+    return camera, (*footage.what, *notes, *turn_notes, cut_note(shapes, output), *_shape_notes(camera))
+
+
+def _over_all(
+    path: CameraPath, footage: Footage, output: Shape, notes: tuple[str, ...]
+) -> tuple[CameraPath, tuple[str, ...]]:
+    """A video, a picture, or pictures that have nothing to do with single poses; their first one stands for all."""
+    camera, turn_notes = _turned(path, footage.stored[:1])
+    camera = replace(camera, repeat_s=footage.period_s)
+    return camera, (
+        *footage.what,
+        _loop(footage),
+        *notes,
+        *turn_notes,
+        cut_note(camera.optics.filmed, output),
+        *_shape_notes(camera),
+        *_length_notes(path, footage),
+    )
+
+
+def _turned(path: CameraPath, stored: tuple[Stored, ...]) -> tuple[CameraPath, tuple[str, ...]]:
+    """`path` over `stored`, one for all of its samples or one for each, turned so that camera and picture agree."""
+    lenses = path.optics.lenses
+    turns = tuple(
+        _turn(lenses[k % len(lenses)], path.quarter, one, is_own=path.is_held) for k, one in enumerate(stored)
+    )
+    shapes = tuple(one.shown(turned) for one, turned in zip(stored, turns, strict=True))
+    optics = replace(path.optics, filmed=_once(shapes), turned=_once(turns))
+    differ = sum((one.turned - turned) % 4 != 0 for one, turned in zip(stored, turns, strict=True))
+    said = f" ({differ} of {len(stored)})" if len(stored) > 1 else ""
+    note = (f"turned with the camera's picture, and not as the file says{said}",) if differ else ()
+    return replace(path, optics=optics), note
+
+
+def _turn(lens: Lens, quarter: int, stored: Stored, is_own: bool) -> int:
+    """By how many quarters `stored` is turned clockwise to be seen through `lens`, which was turned by `quarter`.
+
+    A photo that the camera's file measured (`is_own`) was measured as it is stored, or as its file says, whichever has
+    the shape of the lens. Else the file is believed, unless it lies across the camera's picture.
+    """
+    if is_own and lens.known is Known.ALL:
+        measured = lens.turned(-quarter)
+        is_as_stored = not measured.lies_across(stored.shape) or measured.lies_across(stored.shown())
+        return (quarter if is_as_stored else quarter + stored.turned) % 4
+    is_aside = lens.lies_across(stored.shown()) and not lens.lies_across(stored.shown(quarter))
+    return quarter % 4 if is_aside else stored.turned % 4
+
+
+def _once(values: tuple[T, ...]) -> tuple[T, ...]:
+    return values[:1] if len(set(values)) == 1 else values
+
+
+def _with_photos(
+    path: CameraPath, footage: Footage
+) -> tuple[tuple[CameraPath, tuple[Stored, ...]] | None, tuple[str, ...]]:
+    """`path` without the poses whose photo is missing, and the photos of the others; None when all are missing."""
+    if not path.pictures or not footage.files:
+        return None, ()
+    places = _matches(path.pictures, footage)
+    if not places:
+        first = PurePosixPath(path.pictures[0]).name
+        return None, (f"it has none of the {len(path.pictures)} photos that the camera's file names, such as {first}",)
+    kept = np.array(sorted(places))
+    camera = replace(
+        path,
+        times_s=path.times_s[kept] - path.times_s[kept[0]],
+        quats=path.quats[kept],
+        places=path.places[kept],
+        optics=_of_samples(path.optics, kept),
+        pictures=tuple(f"{footage.folder}/{footage.files[places[int(k)]]}" for k in kept),
+        is_held=True,
+    )
+    missing = [PurePosixPath(name).name for k, name in enumerate(path.pictures) if k not in places]
+    notes = [
+        f"{len(kept)} of the camera's {len(path.pictures)} views have their photo here, by name; each is held with it"
+    ]
+    if missing:
+        named = ", ".join(missing[:NAMED]) + (" and others" if len(missing) > NAMED else "")
+        notes.append(f"photos of {len(missing)} views are missing ({named}): these views are skipped")
+    return (camera, tuple(footage.stored[places[int(k)]] for k in kept)), tuple(notes)
+
+
+def _of_samples(optics: Optics, kept: NDArray[np.intp]) -> Optics:
+    return optics if len(optics.lenses) == 1 else replace(optics, lenses=tuple(optics.lenses[k] for k in kept))
+
+
+def _matches(names: tuple[str, ...], footage: Footage) -> Mapping[int, int]:
+    """Of each of the `names` that a file of the folder has, the number of that file.
+
+    Names are compared without their folders, and without their endings where one has none or another one. Where files
+    of several folders have the same name, only those are meant whose folder is called like this one.
+    """
+    paths = [PurePosixPath(name.replace("\\", "/")) for name in names]
+    if len({one.name for one in paths}) < len(paths):
+        here = PurePosixPath(footage.folder).name
+        meant = {k: one for k, one in enumerate(paths) if one.parent.name == here}
+    else:
+        meant = dict(enumerate(paths))
+    whole = {name: number for number, name in enumerate(footage.files)}
+    stems = {PurePosixPath(name).stem: number for name, number in reversed(whole.items())}
+    found = {k: whole.get(one.name, stems.get(one.name, stems.get(one.stem))) for k, one in meant.items()}
+    return {k: number for k, number in found.items() if number is not None}
+
+
+def _loop(footage: Footage) -> str:
+    return f"{footage.period_s:.2f} s, then starts again" if footage.period_s else "stands still"
+
+
+def cut_note(shapes: tuple[Shape, ...] | list[Shape], output: Shape) -> str:
+    """What of pictures of `shapes` is not shown when they cover `output`."""
+    height, width = output
+    cuts = {_cut(shape, output) for shape in shapes}
+    how = cuts.pop() if len(cuts) == 1 else "cut according to their shapes"
+    return f"shown at {width}x{height}: {how}"
+
+
+def _cut(shape: Shape, output: Shape) -> str:
+    cut = cover(shape, output)
+    lost_rows, lost_columns = 1 - output[0] / cut.height, 1 - output[1] / cut.width
+    if max(lost_rows, lost_columns) < 1e-9:
+        return "all of it"
+    side, lost = ("height", lost_rows) if lost_rows > lost_columns else ("width", lost_columns)
+    return f"{lost:.0%} of its {side} cut off, equally at both ends"
+
+
+def _shape_notes(path: CameraPath) -> tuple[str, ...]:
+    """What does not fit between the camera's lens and what it is said to have filmed."""
+    lens, shape = path.optics.lenses[0], path.optics.filmed[0]
+    if lens.lies_across(shape):
+        return ("the camera's picture and the background do not lie the same way: they may not belong together",)
+    like = abs(lens.width_px * shape[0] / (lens.height_px * shape[1]) - 1) < LIKE_ASPECT
+    if like or lens.known is not Known.ALL:
+        return ()
+    size = f"{lens.width_px:.0f}x{lens.height_px:.0f}"
+    return (f"taken for the middle of the camera's picture of {size}, which has another shape",)
+
+
+def _length_notes(path: CameraPath, footage: Footage) -> tuple[str, ...]:
+    if len(path.times_s) == 1:
+        return ()
+    if not footage.period_s:
+        farthest = float(np.linalg.norm(path.places - path.places[0], axis=1).max())
+        is_moving = farthest > STILL_M
+        return (f"it does not follow the camera, which moves by up to {farthest:.1f} m",) if is_moving else ()
+    if abs(footage.period_s - path.duration_s) <= LIKE_LENGTH * footage.period_s:
+        return ()
+    return (f"the camera's recording lasts {path.duration_s:.2f} s: they may not belong together",)

@@ -1,0 +1,154 @@
+"""What the background of a scene is, looked at before a run.
+
+Rule: whatever the run will show is opened here: each picture is decoded, and a video's frames are counted, so that a
+broken file is named before a process is started. A note says size, rate and range.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+from pathlib import Path
+from statistics import median
+from typing import Any, NamedTuple
+
+import av
+
+from trilane.errors import BadInputError
+from trilane.files import require_file
+from trilane.scene.camera.path import CameraPath
+from trilane.scene.footage import Footage, Stored
+from trilane.scene.picture_order import film_of
+from trilane.stages.gpu.background import folder_film, is_picture
+from trilane.stages.gpu.picture_file import check_picture, look_at_picture
+from trilane.stages.gpu.video_reader import DEFAULT_STEP_S, Pixels, check_size, pixels_of, quarters_of, video_stream
+
+#: Steps between a video's frames that differ by more than this share of the usual one are of a variable rate.
+STEADY = 0.25
+MOST_PACKETS = 500_000
+QUARTER_WORDS = {1: ", turned by 90 degrees", 2: ", turned by 180 degrees", 3: ", turned by 270 degrees"}
+EIGHT_BITS = 8
+
+
+def survey(path: Path, fps: float) -> Footage:
+    """What `path` is; a folder's pictures follow each other at `fps`. Raises BadInputError."""
+    if path.is_dir():
+        return _folder(path, fps)
+    require_file(path, "a video, a picture, or a folder of pictures")
+    if is_picture(path):
+        stored = look_at_picture(path)
+        return Footage((f"picture of {_size(stored)}",), (stored,), (path.name,), str(path.absolute().parent))
+    return _video(path)
+
+
+def check_pictures(path: Path, fps: float, frames: int, camera: CameraPath) -> None:
+    """Decode each picture of `path` that a run of so many `frames` shows. Raises BadInputError naming a bad one.
+
+    `camera`: the scene's, whose views the pictures may belong to.
+    """
+    if path.is_dir():
+        for _ in _checked(_shown(path, fps, frames, camera)):
+            pass
+    elif is_picture(path):
+        check_picture(path)
+
+
+def _shown(path: Path, fps: float, frames: int, camera: CameraPath) -> list[Path]:
+    if camera.is_held:
+        return [Path(name) for name in camera.pictures]
+    pictures, number_at, period_s = folder_film(path, fps)
+    count = min(frames, round(period_s * fps))
+    return pictures[: number_at((count - 1) / fps) + 1]
+
+
+def _checked(paths: Sequence[Path]) -> Iterable[None]:
+    with ThreadPoolExecutor(os.process_cpu_count() if hasattr(os, "process_cpu_count") else os.cpu_count()) as pool:
+        yield from pool.map(check_picture, paths)
+
+
+def _folder(path: Path, fps: float) -> Footage:
+    pictures, _, period_s = folder_film(path, fps)
+    stored = tuple(look_at_picture(picture) for picture in pictures)
+    names = tuple(picture.name for picture in pictures)
+    sizes = {_size(one) for one in stored}
+    size = sizes.pop() if len(sizes) == 1 else f"{len(sizes)} sizes, the first {_size(stored[0])}"
+    what = [f"folder of {len(pictures)} pictures of {size}, {fps:g}/s"]
+    missing = film_of(names).note
+    return Footage((*what, *((missing,) if missing else ())), stored, names, str(path.absolute()), period_s)
+
+
+def _size(stored: Stored) -> str:
+    height, width = stored.shown()
+    return f"{width}x{height}{QUARTER_WORDS.get(stored.turned, '')}"
+
+
+class _Head(NamedTuple):
+    """Of a video: its first frame, and what its stream says. `bits`: of a colour."""
+
+    stored: Stored
+    pixels: Pixels
+    codec: str
+    bits: int
+
+
+def _video(path: Path) -> Footage:
+    try:
+        with av.open(str(path)) as container:
+            head = _head(container, path)
+        with av.open(str(path)) as container:
+            times = _times(container, path)
+    except (av.FFmpegError, ValueError) as error:
+        raise BadInputError(path, f"no readable video ({error})", "a video that FFmpeg can decode") from error
+    steps = sorted(later - earlier for earlier, later in pairwise(times))
+    period_s = times[-1] - times[0] + (times[-1] - times[-2] if steps else DEFAULT_STEP_S)
+    what = [f"video of {_size(head.stored)}, {head.codec}, {_rate(steps, period_s)}"]
+    if head.pixels.transfer:
+        what.append(
+            f"high range ({head.pixels.transfer}, {head.bits} bits): tone mapped by ITU-R BT.2390, white at 203 cd/m2, "
+            "peaks at 1000"
+        )
+    elif head.bits > EIGHT_BITS:
+        what.append(f"{head.bits} bits a colour: shown with 8")
+    return Footage(tuple(what), (head.stored,), period_s=period_s)
+
+
+def _head(container: Any, path: Path) -> _Head:
+    stream = video_stream(container, path)
+    frame = next(iter(container.decode(stream)), None)
+    if frame is None:
+        raise BadInputError(path, "no video frame", "a video with at least one frame")
+    check_size(path, frame)
+    pixels = pixels_of(stream)
+    stored = Stored((frame.height, round(frame.width * pixels.aspect)), quarters_of(frame))
+    bits = max(component.bits for component in frame.format.components)
+    return _Head(stored, pixels, stream.codec_context.name, bits)
+
+
+def _times(container: Any, path: Path) -> list[float]:
+    """Of the frames, seconds, increasing; without decoding them. Raises BadInputError when the file was cut off."""
+    stream = video_stream(container, path)
+    times, count = set(), 0
+    for packet in container.demux(stream):
+        count += packet.size > 0
+        if packet.pts is not None and not packet.is_discard:
+            times.add(packet.pts * packet.time_base)
+        if count >= MOST_PACKETS:
+            break
+    if count < min(stream.frames, MOST_PACKETS):
+        raise BadInputError(path, f"{count} of the {stream.frames} frames that it names", "a file that was not cut off")
+    return sorted(float(time) for time in times) or [0.0]
+
+
+def _rate(steps: Sequence[float], period_s: float) -> str:
+    """In words, from the `steps` between frames, sorted."""
+    if not steps:
+        return "one frame"
+    usual = median(steps)
+    if steps[-1] - steps[0] <= STEADY * usual:
+        return f"{1 / usual:.4g}/s"
+    mean = (len(steps) + 1) / period_s
+    return (
+        f"variable rate, {1 / steps[-1]:.3g} to {1 / steps[0]:.3g}/s, {mean:.3g}/s on average: its own times are kept"
+    )

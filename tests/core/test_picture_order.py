@@ -1,0 +1,56 @@
+"""The order of a folder's pictures, and what its numbers say of time."""
+
+from __future__ import annotations
+
+import pytest
+
+from trilane.scene.picture_order import film_of, in_order
+
+FILMS: dict[str, tuple[list[str], list[int], int, str]] = {
+    "whole": (["f_1.png", "f_2.png", "f_3.jpg"], [0, 1, 2], 3, ""),
+    "one": (["a.png"], [0], 1, ""),
+    "two": (["a7.png", "a9.png"], [0, 1], 2, ""),  # in steps of 2
+    "a hole": (
+        [f"f{k:04}.png" for k in (3, 4, 5, 8, 9)],
+        [0, 1, 2, 5, 6],
+        7,
+        "2 numbers missing (6 to 7): the picture before is held",
+    ),
+    "holes": (
+        [f"f{k}.png" for k in (0, 1, 2, 4, 5, 7, 8, 9, 11, 12, 13, 14, 17, 18)],
+        [0, 1, 2, 4, 5, 7, 8, 9, 11, 12, 13, 14, 17, 18],
+        19,
+        "5 numbers missing (3, 6, 10 and others): the picture before is held",
+    ),
+    "every tenth": (
+        [f"f{k}.png" for k in (10, 20, 40, 50)],
+        [0, 1, 3, 4],
+        5,
+        "1 numbers missing (30): the picture before is held",
+    ),
+    "photos of a day": (["IMG_2031.jpg", "IMG_2077.jpg", "IMG_2101.jpg", "IMG_2102.jpg"], [0, 1, 2, 3], 4, ""),
+    "far apart": (["f1.png", "f2.png", "f3.png", "f900.png"], [0, 1, 2, 3], 4, ""),
+    "no numbers": (["a.png", "b.png", "d.png"], [0, 1, 2], 3, ""),
+    "two series": (["a1.png", "a2.png", "b1.png", "b4.png"], [0, 1, 2, 3], 4, ""),
+    "twice": (["f1.jpg", "f1.png", "f2.png", "f3.png"], [0, 1, 2, 3], 4, ""),
+    "off the step": (["f0.png", "f10.png", "f20.png", "f30.png", "f35.png"], [0, 1, 2, 3, 4], 5, ""),
+    "a rate in the name": (
+        ["run30_1.png", "run30_2.png", "run30_4.png"],
+        [0, 1, 3],
+        4,
+        "1 numbers missing (3): the picture before is held",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FILMS)
+def test_what_numbers_say_of_time(name: str) -> None:
+    names, frames, count, note = FILMS[name]
+    film = film_of(names)
+    assert (list(film.frames), film.count, film.note) == (frames, count, note)
+
+
+def test_numbers_are_compared_as_numbers() -> None:
+    assert in_order(["f10.png", "f2.png", "f1.png"]) == ["f1.png", "f2.png", "f10.png"]
+    assert in_order(["b.png", "a.jpg", "007.png", "08.png"]) == ["007.png", "08.png", "a.jpg", "b.png"]
+    assert in_order(["f01.png", "f1.png", "f²3.png"]) == ["f01.png", "f1.png", "f²3.png"]
