@@ -83,7 +83,14 @@ def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraP
     detected = replace(raw.detected, axes=upright.note, lens=seen)
     pictures = tuple(raw.pictures[k] for k in usable) if raw.pictures else ()
     return CameraPath(
-        times - times[0], quats, places @ world.T, optics, notes, detected=detected, pictures=pictures, quarter=quarter
+        times - times[0],
+        quats,
+        places @ world.T,
+        optics,
+        notes,
+        detected=detected,
+        pictures=pictures,
+        quarter=upright.quarter,
     )
 
 

@@ -1,0 +1,161 @@
+"""What a camera and a background have to do with each other: photos by name, turns, cuts, loops, and what is said."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from trilane.scene.camera.path import CameraPath, Optics
+from trilane.scene.footage import Footage, Stored, cut_note, filmed
+from trilane.scene.lens import Known, Lens, centred
+from trilane.scene.motion.motion import Wrap
+
+LENS = centred(640, 480, 500)
+OUTPUT = (480, 640)
+
+
+def camera(count: int, pictures: tuple[str, ...] = (), lenses: tuple[Lens, ...] = (LENS,), **more: Any) -> CameraPath:
+    """Poses one second apart, pose K at x = K."""
+    quats, places = np.tile([1.0, 0, 0, 0], (count, 1)), np.zeros((count, 3))
+    places[:, 0] = np.arange(count)
+    optics = Optics(lenses, 0.1, 10.0)
+    return CameraPath(np.arange(float(count)), quats, places, optics, (), pictures=pictures, **more)
+
+
+def folder(*names: str, shape: tuple[int, int] = OUTPUT) -> Footage:
+    return Footage(("folder",), (Stored(shape),) * len(names), names, "/photos", 2.0)
+
+
+def test_a_drawn_background_is_filmed_by_nobody() -> None:
+    path = camera(3)
+    assert filmed(path, None, OUTPUT) == (path, ())
+
+
+def test_a_built_in_camera_has_its_own_lens_before_any_background() -> None:
+    path = replace(camera(3), recorded=False)
+    video = Footage(("video",), (Stored((1920, 1080)),), period_s=2.5)
+    assert filmed(path, video, OUTPUT) == (
+        path,
+        ("video", "2.50 s, then starts again", "shown at 640x480: 58% of its height cut off, equally at both ends"),
+    )
+
+
+def test_photos_belong_to_their_views_and_missing_ones_are_skipped() -> None:
+    """Of views a to e, b and d have no photo: the times of the others stay, from the first one that is there."""
+    names = ("./images/b", "images/a.png", "images\\c.jpg", "d.png", "x/e.png")
+    path, notes = filmed(camera(5, names), folder("a.png", "c.png", "e.png", "z.png"), OUTPUT)
+    assert path.pictures == ("/photos/a.png", "/photos/c.png", "/photos/e.png")
+    assert path.times_s.tolist() == [0, 1, 3]
+    assert notes == (
+        "folder",
+        "3 of the camera's 5 views have their photo here, by name; each is held with it",
+        "photos of 2 views are missing (b, d.png): these views are skipped",
+        "shown at 640x480: all of it",
+    )
+    for t_s, x in ((0.0, 1), (0.4, 1), (0.6, 2), (1.9, 2), (2.1, 4), (3.0, 4), (3.9, 4), (4.1, 2), (5.9, 1), (6.2, 1)):
+        assert path.pose(t_s)[1][0] == x == [1, 2, 4][path.nearest(t_s)], t_s
+    assert path.wrap is Wrap.BOUNCE and path.repeat_s == 0
+
+
+def test_each_photo_keeps_its_lens() -> None:
+    lenses = tuple(centred(640, 480, focal) for focal in (100.0, 200.0, 300.0))
+    path, _ = filmed(camera(3, ("a", "b", "c"), lenses), folder("a.png", "c.png"), OUTPUT)
+    assert [path.lens(t_s, OUTPUT).fx for t_s in (0.0, 0.9, 1.1, 2.0)] == [100, 100, 300, 300]
+    one, _ = filmed(camera(3, ("a", "b", "c")), folder("c.png"), OUTPUT)
+    assert one.optics.lenses == (LENS,) and one.pose(0.0)[1][0] == 2
+
+
+def test_photos_of_the_same_name_in_several_folders() -> None:
+    """Only those are meant whose folder is called like the background's."""
+    names = ("left/1.png", "photos/1.png", "left/2.png", "photos/2.png")
+    path, _ = filmed(camera(4, names), folder("1.png", "2.png"), OUTPUT)
+    assert path.places[:, 0].tolist() == [1, 3]
+    path, notes = filmed(camera(2, ("left/1.png", "right/1.png")), folder("1.png"), OUTPUT)
+    assert not path.is_held
+    assert "it has none of the 2 photos that the camera's file names, such as 1.png" in notes
+
+
+def test_pictures_that_the_camera_does_not_name_follow_each_other() -> None:
+    path, notes = filmed(camera(3, ("a", "b", "c")), folder("1.png", "2.png"), OUTPUT)
+    assert (path.is_held, path.repeat_s) == (False, 2.0)
+    assert notes[:3] == (
+        "folder",
+        "2.00 s, then starts again",
+        "it has none of the 3 photos that the camera's file names, such as a",
+    )
+
+
+def test_camera_and_video_start_again_together() -> None:
+    """The video lasts 1.5 s, the path 2 s: at 1.75 s both are where they were at 0.25 s."""
+    path, notes = filmed(camera(3), Footage(("video",), (Stored(OUTPUT),), period_s=1.5), OUTPUT)
+    for t_s, x in ((0.25, 0.25), (1.49, 1.49), (1.5, 0.0), (1.75, 0.25), (4.6, 0.1)):
+        assert path.pose(t_s)[1][0] == pytest.approx(x)
+    assert notes[-1] == "the camera's recording lasts 2.00 s: they may not belong together"
+    _, notes = filmed(camera(3), Footage(("video",), (Stored(OUTPUT),), period_s=2.03), OUTPUT)
+    assert notes == ("video", "2.03 s, then starts again", "shown at 640x480: all of it")
+
+
+def test_a_still_behind_a_moving_camera_is_said() -> None:
+    picture = Footage(("picture",), (Stored(OUTPUT),), ("a.png",), "/photos")
+    assert filmed(camera(3), picture, OUTPUT)[1][-1] == "it does not follow the camera, which moves by up to 2.0 m"
+    assert filmed(camera(1), picture, OUTPUT)[1] == ("picture", "stands still", "shown at 640x480: all of it")
+    path, _ = filmed(camera(3, ("b", "a", "c")), picture, OUTPUT)
+    assert path.pose(0.0)[1][0] == 1 == path.pose(9.9)[1][0]
+
+
+UPRIGHT = replace(LENS.turned(1), known=Known.LONG)
+
+
+@pytest.mark.parametrize(
+    ("stored", "lens", "quarter", "turned", "shown"),
+    [
+        (Stored((480, 640)), LENS, 0, 0, (480, 640)),
+        (Stored((480, 640), 1), UPRIGHT, 1, 1, (640, 480)),  # the phone was held upright, and its video says so
+        (Stored((480, 640)), UPRIGHT, 1, 1, (640, 480)),  # the video does not say it
+        (Stored((640, 480)), UPRIGHT, 1, 0, (640, 480)),  # it was turned already
+        (Stored((480, 640), 2), LENS, 0, 2, (480, 640)),
+        (Stored((640, 480)), LENS, 0, 0, (640, 480)),  # nothing fits
+        (Stored((480, 640), 3), UPRIGHT, 1, 3, (640, 480)),
+    ],
+)
+def test_a_background_is_turned_as_the_camera_was_held(
+    stored: Stored, lens: Lens, quarter: int, turned: int, shown: tuple[int, int]
+) -> None:
+    video = Footage(("video",), (stored,), period_s=2.0)
+    path, notes = filmed(camera(3, lenses=(lens,), quarter=quarter), video, OUTPUT)
+    assert (path.optics.turned, path.optics.filmed) == ((turned,), (shown,))
+    assert ("turned with the camera's picture, and not as the file says" in notes) == (turned != stored.turned)
+    across = "the camera's picture and the background do not lie the same way: they may not belong together"
+    assert (across in notes) == lens.lies_across(shown)
+
+
+@pytest.mark.parametrize(
+    ("stored", "lens", "quarter", "turned"),
+    [
+        (Stored((480, 640), 1), LENS, 0, 0),  # measured as stored, whatever its tag says
+        (Stored((480, 640), 1), LENS.turned(1), 1, 1),  # likewise, and the whole scene was held upright
+        (Stored((480, 640), 1), LENS.turned(1), 0, 1),  # measured as its tag says
+        (Stored((480, 640), 1), LENS.turned(2), 1, 2),  # likewise, in a scene that was held aside
+        (Stored((480, 480), 1), centred(480, 480, 500), 0, 0),
+    ],
+)
+def test_a_photo_is_turned_as_its_lens_was_measured(stored: Stored, lens: Lens, quarter: int, turned: int) -> None:
+    photos = Footage(("folder",), (stored,), ("a.png",), "/photos", 1.0)
+    path, _ = filmed(camera(1, ("a",), (lens,), quarter=quarter), photos, OUTPUT)
+    assert path.optics.turned == (turned,)
+
+
+def test_what_is_cut_off() -> None:
+    assert cut_note([(1080, 1920)], (480, 640)) == "shown at 640x480: 25% of its width cut off, equally at both ends"
+    assert cut_note([(480, 640), (960, 1280)], (480, 640)) == "shown at 640x480: all of it"
+    assert cut_note([(480, 640), (64, 640)], (480, 640)) == "shown at 640x480: cut according to their shapes"
+
+
+def test_a_background_of_another_shape_than_the_sensor_is_said() -> None:
+    video = Footage(("video",), (Stored((720, 1280)),), period_s=2.0)
+    path, notes = filmed(camera(3), video, OUTPUT)
+    assert "taken for the middle of the camera's picture of 640x480, which has another shape" in notes
+    assert path.lens(0.0, (720, 1280)).fx == 1000

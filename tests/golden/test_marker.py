@@ -1,0 +1,168 @@
+"""A marker at a known place, photographed by each camera format, is where the drawn one is, whatever the cut.
+
+Rule: the photo is painted by K [R | t] written out, as the format defines it; what is drawn there is a detected plane.
+The centre of the one and that of the other lie within a pixel of the composed picture.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from trilane.arrays import F64, U8
+from trilane.scene.camera.load import load_camera
+from trilane.scene.footage import filmed
+from trilane.scene.schema import CameraSpec, PlaneSpec
+from trilane.shapes import Shape
+from trilane.stages.gpu.background import open_background
+from trilane.stages.gpu.composite import CompositeStage
+from trilane.stages.gpu.survey import survey
+from trilane.stages.packets import pose_dtype
+
+#: Of the camera in a world with Y up: x right, y down, z ahead (optical), and where it stands.
+YAW, PITCH = 0.3, 0.12
+PLACE = np.array([0.4, 1.5, 2.0])
+MARK_M, DISC_PX = 0.12, 14.0
+#: As the photos, which are half as large as those of the devices.
+OUTPUTS = {"of 4:3": (240, 320), "upright": (320, 240), "810 of 1920 rows": (405, 540), "a strip": (64, 320)}
+
+
+def optical_axes(roll: int = 0) -> F64:
+    """Columns right, down, ahead of the camera, which is then turned clockwise about its line of sight by quarters."""
+    c, s, cp, sp = math.cos(YAW), math.sin(YAW), math.cos(PITCH), math.sin(PITCH)
+    ahead = np.array([-s * cp, -sp, -c * cp])
+    right = np.array([c, 0.0, -s])
+    down = np.cross(ahead, right)
+    for _ in range(roll):
+        right, down = down, -right
+    return np.column_stack([right, down, ahead])
+
+
+class Camera(NamedTuple):
+    """One of a format: its lens in pixels of a photo `shape` as stored, counted from its corner; `roll` in quarters."""
+
+    shape: Shape
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    roll: int = 0
+
+
+def mark_of(shown: F64) -> F64:
+    """A place (3,) 3 m ahead, off the middle of the upright picture by `shown`, tangents right and down."""
+    axes = optical_axes()
+    return PLACE + axes @ np.array([3 * shown[0], 3 * shown[1], 3.0])
+
+
+def paint(path: Path, camera: Camera, mark: F64) -> None:
+    """The photo: black, with a red disc where the pinhole has `mark`."""
+    x, y, z = optical_axes(camera.roll).T @ (mark - PLACE)
+    column, row = camera.cx + camera.fx * x / z, camera.cy + camera.fy * y / z
+    rows, columns = np.indices(camera.shape) + 0.5
+    radius = DISC_PX * camera.shape[1] / 640
+    cover = np.clip(radius + 0.5 - np.hypot(rows - row, columns - column), 0, 1)
+    Image.fromarray(np.stack([255 * cover, 0 * cover, 0 * cover], -1).round().astype(np.uint8)).save(path)
+
+
+def z_up(vectors: F64) -> F64:
+    """Of a world with Z up: x, -z, y of one with Y up, by rows."""
+    return np.stack([vectors[0], -vectors[2], vectors[1]])
+
+
+def write_arkit(folder: Path, camera: Camera) -> Path:
+    pose = np.column_stack([optical_axes(camera.roll) * (1, -1, -1), PLACE])
+    (folder / "log.txt").write_text(f"0 {' '.join(map(str, pose.ravel()))}\n")
+    return folder / "log.txt"
+
+
+def write_tum(folder: Path, camera: Camera) -> Path:
+    r = z_up(optical_axes(camera.roll))
+    w = math.sqrt(1 + np.trace(r)) / 2
+    x, y, z = (r[2, 1] - r[1, 2]) / (4 * w), (r[0, 2] - r[2, 0]) / (4 * w), (r[1, 0] - r[0, 1]) / (4 * w)
+    tx, ty, tz = z_up(PLACE)
+    (folder / "tum.txt").write_text(f"1 {tx} {ty} {tz} {x} {y} {z} {w}\n")
+    return folder / "tum.txt"
+
+
+def nerf_writer(keys: Callable[[Camera], dict[str, Any]], of_frame: bool = False) -> Callable[[Path, Camera], Path]:
+    def write(folder: Path, camera: Camera) -> Path:
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = z_up(optical_axes(camera.roll) * (1, -1, -1)), z_up(PLACE)
+        frame = {"file_path": "./images/photo", "transform_matrix": matrix.tolist()}
+        other = {"file_path": "./images/none", "transform_matrix": (matrix + 0.1 * np.eye(4, k=3)).tolist()}
+        lens = keys(camera)
+        frames = [{**other, **(lens if of_frame else {})}, {**frame, **(lens if of_frame else {})}]
+        (folder / "transforms.json").write_text(json.dumps({"frames": frames, **({} if of_frame else lens)}))
+        return folder / "transforms.json"
+
+    return write
+
+
+def whole_lens(camera: Camera) -> dict[str, Any]:
+    height, width = camera.shape
+    return {"w": width, "h": height, "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
+
+
+PHONE_F = 270 / math.tan(math.radians(18))
+PHONE, KINECT = Camera((540, 960), PHONE_F, PHONE_F, 480, 270), Camera((480, 640), 517, 517, 320, 240)
+#: Name: camera, and what writes its file.
+FORMATS: dict[str, tuple[Camera, Callable[[Path, Camera], Path]]] = {
+    "arkit": (PHONE, write_arkit),
+    "arkit upright": (Camera((540, 960), PHONE_F, PHONE_F, 480, 270, roll=1), write_arkit),
+    "arkit of 4:3": (Camera((720, 960), PHONE_F, PHONE_F, 480, 360), write_arkit),
+    "tum": (KINECT, write_tum),
+    "tum of half the pixels": (Camera((240, 320), 258.5, 258.5, 160, 120), write_tum),
+    "nerf": (Camera((540, 960), 750, 700, 500, 250), nerf_writer(whole_lens)),
+    "nerf upright": (Camera((540, 960), 750, 700, 500, 250, roll=1), nerf_writer(whole_lens)),
+    "nerf by its angle": (
+        Camera((400, 500), 450, 450, 250, 200),
+        nerf_writer(lambda _camera: {"camera_angle_x": 2 * math.atan(250 / 450)}),
+    ),
+}
+
+
+def composed(gl: Any, output: Shape, background: Any, pose: Any, planes: list[PlaneSpec]) -> U8:
+    stage = CompositeStage(gl, output, [(8, 8)], [np.zeros((55, 3))], background, planes=planes)
+    stage.draw(pose, np.zeros(8 * 8 * 4, np.uint8))
+    read = np.frombuffer(stage._target.read(components=3, alignment=1), np.uint8)
+    return read.reshape(*output, 3)
+
+
+def centre(weights: F64) -> F64:
+    """Column and row of the middle of what is there; the centre of the first pixel is at (0.5, 0.5)."""
+    assert weights.sum() > 0
+    rows, columns = np.indices(weights.shape) + 0.5
+    return np.array([(columns * weights).sum(), (rows * weights).sum()]) / weights.sum()
+
+
+@pytest.mark.parametrize("output", OUTPUTS.values(), ids=OUTPUTS)
+@pytest.mark.parametrize("name", FORMATS)
+def test_the_drawn_marker_lies_on_the_photographed_one(gl: Any, tmp_path: Path, name: str, output: Shape) -> None:
+    camera, write = FORMATS[name]
+    (tmp_path / "images").mkdir()
+    mark = mark_of(np.array([0.06, 0.012]))
+    paint(tmp_path / "images" / "photo.png", camera, mark)
+    spec = CameraSpec(source=str(write(tmp_path, camera)), place="none", up_axis="z" if "nerf" in name else "auto")
+    footage = survey(tmp_path / "images", 30.0)
+    path, notes = filmed(load_camera(spec, Path()), footage, output)
+    background = open_background(tmp_path / "images", output, 30.0, path)
+    pose = np.zeros(1, pose_dtype(1))[0]
+    pose["view"], pose["projection"] = path.sample(0.0), path.projection(0.0, output)
+    ahead = optical_axes()[:, 2]
+    plane = PlaneSpec(centre=tuple(mark), normal=tuple(-ahead), width_m=MARK_M, depth_m=MARK_M)
+    photo = composed(gl, output, background, pose, []).astype(np.float64)
+    background = open_background(tmp_path / "images", output, 30.0, path)
+    both = composed(gl, output, background, pose, [plane]).astype(np.float64)
+    photographed, drawn = centre(photo[..., 0]), centre((both - photo)[..., 2])
+    assert np.abs(photographed - drawn).max() < 1.0, (photographed, drawn, notes)
+    x, y, _, w = pose["projection"] @ pose["view"] @ [*mark, 1.0]
+    computed = np.array([(x / w + 1) / 2 * output[1], (1 - y / w) / 2 * output[0]])
+    assert np.abs(photographed - computed).max() < 0.1  # what is drawn has edges on whole pixels, a number has none
