@@ -18,7 +18,8 @@ from PIL import ExifTags, Image, ImageDraw
 from trilane.apps.inspection.inspection import Inspection, Length
 from trilane.errors import BadInputError, reason
 from trilane.scene.detected import Detected
-from trilane.stages.gpu.background import PICTURES, open_background, read_picture
+from trilane.stages.gpu.background import open_background
+from trilane.stages.gpu.picture_file import PICTURES, read_picture
 
 THUMB = (160, 213)  # height, width
 COLUMNS, MOST_THUMBS = 4, 8
