@@ -7,7 +7,6 @@ nothing here needs.
 
 from __future__ import annotations
 
-import stat
 from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -18,6 +17,8 @@ from google.protobuf.message import DecodeError
 from onnx import AttributeProto, TensorProto
 
 from trilane.errors import BadInputError
+from trilane.file_signatures import HEAD_BYTES, signature_of_head
+from trilane.files import require_file
 from trilane.hw_profiles.graph_shapes import Shape, with_shapes
 from trilane.hw_profiles.graph_structure import check_structure, in_order
 from trilane.hw_profiles.graph_tensors import forget_data
@@ -33,7 +34,6 @@ REMEMBERED, REMEMBERED_BYTES = 16, 1 << 20
 OLDEST_OPSET = 7
 #: Operators that have a tensor among their attributes.
 WITH_VALUES = frozenset(["Constant", "ConstantOfShape"])
-NOT_A_FILE = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
 EXPORT_AGAIN = "copy or export it again: it may be cut short"
 
 #: What a file says of its numbers: 8-bit weights and activations, floats, or nothing, as it has no weights.
@@ -84,19 +84,17 @@ _checked_before = lru_cache(maxsize=REMEMBERED)(_checked)
 
 def _bytes(path: Path) -> bytes:
     try:
-        facts = path.stat()
-        if not stat.S_ISREG(facts.st_mode):
-            raise BadInputError(path, NOT_A_FILE.get(stat.S_IFMT(facts.st_mode), "a device"), _expected())
-        if facts.st_size == 0:
-            raise BadInputError(path, "an empty file", _expected(), EXPORT_AGAIN)
-        if facts.st_size > MAX_BYTES:
+        size = require_file(path, _expected(), EXPORT_AGAIN)
+        if size > MAX_BYTES:
             remedy = "keep its weights beside it: onnx.save(model, path, save_as_external_data=True)"
-            raise BadInputError(path, f"{facts.st_size >> 20} MiB", _expected(), remedy)
-        return path.read_bytes()
+            raise BadInputError(path, f"{size >> 20} MiB", _expected(), remedy)
+        data = path.read_bytes()
     except OSError as error:
         raise BadInputError.of_os_error(path, error, _expected()) from None
-    except ValueError as error:
-        raise BadInputError(path, str(error), _expected()) from None
+    other = signature_of_head(data[:HEAD_BYTES])
+    if other is not None:
+        raise BadInputError(path, other.name, _expected(), "export the network as ONNX")
+    return data
 
 
 def _expected() -> str:

@@ -43,8 +43,8 @@ _HEADERS = {
 }
 
 
-def require_file(path: Path, expected: str) -> int:
-    """Size of a regular, non-empty file in bytes. Raises BadInputError."""
+def require_file(path: Path, expected: str, if_empty: str = "") -> int:
+    """Size of a regular, non-empty file in bytes. Raises BadInputError, of an empty one with the remedy `if_empty`."""
     try:
         if not path.is_file():
             raise BadInputError(path, instead_of_file(path), expected)
@@ -52,7 +52,7 @@ def require_file(path: Path, expected: str) -> int:
     except (OSError, ValueError) as error:
         raise BadInputError(path, f"a file that cannot be read ({reason(error)})", expected) from error
     if size == 0:
-        raise BadInputError(path, "an empty file", expected)
+        raise BadInputError(path, "an empty file", expected, if_empty)
     return size
 
 

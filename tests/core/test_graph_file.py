@@ -268,8 +268,8 @@ def test_what_is_no_onnx_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         (tmp_path, "a folder"),
         (tmp_path / "pipe.onnx", "a pipe"),
         (tmp_path / "device.onnx", "a device"),
-        (tmp_path / "astray.onnx", "no such file"),
-        (tmp_path / "round.onnx", "symbolic links"),
+        (tmp_path / "astray.onnx", "nowhere.onnx, which is not there"),
+        (tmp_path / "round.onnx", "leads back to itself"),
         (tmp_path / "no\0name", "null"),
     ):
         with pytest.raises(BadInputError, match=words):
