@@ -27,7 +27,9 @@ MAX_VERTICES = 1 << 18
 MAX_FACES = 1 << 19
 SUM_TOLERANCE = 1e-3
 #: Names of arrays that are a motion's, in AMASS files and those like them.
-MOTION_KEYS = frozenset({"poses", "smpl_poses", "body_pose", "pose_body", "mocap_framerate", "mocap_frame_rate"})
+MOTION_KEYS = frozenset(
+    {"poses", "smpl_poses", "smpl_pose", "smpl_thetas", "body_pose", "pose_body", "mocap_framerate", "mocap_frame_rate"}
+)
 MOST_NAMED = 16
 #: Unit roundoff of the weights' float32: one that a file has rounded is off by so much of itself.
 ROUNDING = 2.0**-24

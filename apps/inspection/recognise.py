@@ -12,7 +12,7 @@ from pathlib import Path
 
 from trilane.avatars.bundle import MANIFEST
 from trilane.errors import BadInputError
-from trilane.file_signatures import ARCHIVE, ARRAY, FOREIGN, PICTURE, VIDEO, Signature, signature_of
+from trilane.file_signatures import ARCHIVE, ARRAY, FOREIGN, PICKLE, PICTURE, VIDEO, Signature, signature_of
 from trilane.files import npz_names, read_text, require_file
 from trilane.pipeline.journal import NAME as JOURNAL
 from trilane.stages.gpu.picture_file import PICTURES
@@ -24,6 +24,8 @@ EXPECTED = "a motion, camera, picture, video, body, avatar, network, scene, trac
 #: Endings that say what their files are, where the head of the file does not.
 ENDINGS = {
     ".bvh": MOTION,
+    ".pkl": MOTION,
+    ".pickle": MOTION,
     ".onnx": NETWORK,
     ".toml": SCENE,
     ".pftrace": TRACE,
@@ -68,8 +70,8 @@ def kind_of(path: Path) -> tuple[str, Signature | None]:
         raise BadInputError.of_os_error(path, error, EXPECTED) from None
     if signature is None:
         return _by_text(path), None
-    if signature.group == ARRAY:
-        return _arrays(path), None
+    if signature.group in (ARRAY, PICKLE):
+        return (MOTION if signature.group == PICKLE else _arrays(path)), None
     return signature.group, signature if signature.group in (FOREIGN, ARCHIVE) or signature.remedy else None
 
 

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F64
 from trilane.errors import BadInputError
-from trilane.files import as_numbers, npy_pickle, npz_names, npz_pickles, read_bytes, read_npy, read_npz
+from trilane.file_signatures import PICKLE
+from trilane.files import as_numbers, npy_pickle, npz_names, npz_pickles, read_bytes, read_npy, read_npz, refuse_other
 from trilane.scene.motion.pickled import ARRAYS, MAX_BYTES, Foreign, StoredArray, printable, values_of
 from trilane.unexpected_value import UnexpectedValue
 
@@ -44,7 +45,9 @@ def npz_values(path: Path, keys: Collection[str], expected: str) -> dict[str, An
 
 def pickle_values(path: Path, expected: str) -> Any:
     """What a pickle holds. Raises BadInputError."""
-    return _values(path, read_bytes(path, MAX_BYTES, expected))
+    data = read_bytes(path, MAX_BYTES, expected)
+    refuse_other(path, expected, PICKLE)
+    return _values(path, data)
 
 
 def _values(where: Path | str, data: bytes) -> Any:

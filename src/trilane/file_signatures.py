@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 HEAD_BYTES = 512
-PICTURE, VIDEO, ARRAY, ARCHIVE, FOREIGN = "picture", "video", "array", "archive", "foreign"
+PICTURE, VIDEO, ARRAY, PICKLE, ARCHIVE, FOREIGN = "picture", "video", "array", "pickle", "archive", "foreign"
 
 _AS_BVH = "in Blender: File > Import, choose the armature, then File > Export > Motion Capture (.bvh)"
 _OTHER_3D = f"export the motion as BVH, such as {_AS_BVH}"
@@ -38,7 +38,7 @@ SIGNATURES: tuple[tuple[bytes, Signature], ...] = (
     (rb"//Maya ASCII|FOR[48]....Maya", Signature("a Maya scene", remedy=_OTHER_3D)),
     (rb"\s*<\?xml.{0,300}<COLLADA", Signature("a COLLADA file", remedy=_OTHER_3D)),
     (rb"[\x02-\x08]\x50", Signature("a C3D file", remedy="solve it to a skeleton and save that as BVH")),
-    (rb"\x80[\x02-\x05]", Signature("a Python pickle", remedy=_ARRAYS)),
+    (rb"\x80[\x02-\x05]", Signature("a Python pickle", PICKLE, _ARRAYS)),
     (rb"\x89HDF\r\n\x1a\n", Signature("an HDF5 file", remedy=_ARRAYS)),
     (rb"MATLAB 5\.0 MAT-file", Signature("a MATLAB file", remedy=_ARRAYS)),
     (rb"version https://git-lfs", Signature("a Git LFS pointer, not the file itself", remedy="fetch it: git lfs pull")),

@@ -75,7 +75,7 @@ def read_text(path: Path, expected: str) -> str:
     if size > MAX_TEXT_BYTES:
         raise BadInputError(path, f"{size} bytes", f"at most {MAX_TEXT_BYTES}")
     try:
-        _refuse_other(path, expected)
+        refuse_other(path, expected)
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         found = f"a file that cannot be read as text ({reason(error)})"
@@ -88,8 +88,11 @@ def read_text(path: Path, expected: str) -> str:
     return text
 
 
-def _refuse_other(path: Path, expected: str, *groups: str) -> None:
-    """Raises BadInputError for a file whose head is that of a known format, unless it is of one of `groups`."""
+def refuse_other(path: Path, expected: str, *groups: str) -> None:
+    """Raises BadInputError for a file whose head is that of a known format, unless it is of one of `groups`.
+
+    OSError of one that cannot be read.
+    """
     signature = signature_of(path)
     if signature is not None and signature.group not in groups:
         raise BadInputError(path, signature.name, expected, signature.remedy)
@@ -99,7 +102,7 @@ def read_npy(path: Path, expected: str) -> NDArray[Any]:
     """The array of a `.npy` file. Raises BadInputError; pickled, truncated and huge files are refused unread."""
     size = require_file(path, expected)
     try:
-        _refuse_other(path, expected, ARRAY)
+        refuse_other(path, expected, ARRAY)
         with path.open("rb") as file:
             wanted = _checked_bytes(path, file, expected)
             if size - file.tell() < wanted:
@@ -114,7 +117,7 @@ def read_npz(path: Path, keys: Collection[str], expected: str) -> dict[str, NDAr
     """Those of `keys` that the `.npz` file has; other members are not opened. Raises BadInputError."""
     require_file(path, expected)
     try:
-        _refuse_other(path, expected, ARRAY, ARCHIVE)
+        refuse_other(path, expected, ARRAY, ARCHIVE)
         with zipfile.ZipFile(path) as archive:
             names = {info.filename: info for info in archive.infolist()}
             return {key: _member(path, archive, names[f"{key}.npy"]) for key in keys if f"{key}.npy" in names}
@@ -126,6 +129,7 @@ def npz_names(path: Path, expected: str) -> list[str]:
     """The names of the arrays of an `.npz` file, in its order; none is opened. Raises BadInputError."""
     require_file(path, expected)
     try:
+        refuse_other(path, expected, ARRAY, ARCHIVE)
         with zipfile.ZipFile(path) as archive:
             return [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
     except DAMAGED as error:

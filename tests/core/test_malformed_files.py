@@ -235,7 +235,7 @@ ARRAY_FILES: dict[str, tuple[Content, str]] = {
     "FBX": (FBX, "an FBX file"),
     "cut header": (array(poses(), cut=40), "no readable NumPy array"),
     "cut data": (array(poses(), cut=-9), "truncated"),
-    "objects": (npy_header("(3,)", "'|O'") + b"x" * 24, "pickled objects"),
+    "objects": (npy_header("(3,)", "'|O'") + b"x" * 24, "no readable pickle"),
     "164 columns": (array(np.zeros((4, 164))), "shape (4, 164)"),
     "no rows": (array(np.zeros((0, 165))), "shape (0, 165)"),
     "one axis": (array(np.zeros(165)), "shape (165,)"),

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import io
 import json
+import os
+import pickle
 import re
 import warnings
 from collections.abc import Callable
@@ -188,6 +190,15 @@ def change_arrays(content: bytes, random: Random) -> bytes:
     return file.getvalue()
 
 
+def change_pickle(_content: bytes, random: Random) -> bytes:
+    """The pickle of a dict of which an array is another one, by any protocol; it may hold what no motion has."""
+    arrays: dict[str, Any] = {"smpl_poses": np.zeros((4, 72)), "smpl_trans": np.ones((4, 3)), "smpl_scaling": [90.0]}
+    name = random.choice(sorted(arrays))
+    other = _other_array(np.asarray(arrays[name]), random)
+    arrays[name] = random.choice((other, other, *NODES, {"poses": other}, [other], {1, 2}, print, os.getcwd))
+    return pickle.dumps(arrays, protocol=random.randrange(pickle.HIGHEST_PROTOCOL + 1))
+
+
 def _saved(array: NDArray[Any]) -> bytes:
     file = io.BytesIO()
     np.save(file, array, allow_pickle=True)
@@ -271,4 +282,5 @@ CHANGES: dict[str, tuple[Callable[[bytes, Random], bytes], ...]] = {
     ".npy": (change_bytes, change_array, change_array),
     ".npz": (change_bytes, change_arrays, change_arrays, change_arrays),
     ".onnx": (change_bytes, change_bytes, change_network),
+    ".pkl": (change_bytes, change_pickle),
 }

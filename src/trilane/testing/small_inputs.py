@@ -6,6 +6,7 @@ Rule: everything is made here, from the published layout of its format; nothing 
 from __future__ import annotations
 
 import json
+import pickle
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -76,6 +77,28 @@ def poses(frames: int = FRAMES, joints: int = JOINTS) -> NDArray[np.float64]:
     array = np.zeros((frames, joints * 3))
     array[:, 48] = np.linspace(0, 0.3, frames)
     return array
+
+
+def parts_of_poses() -> dict[str, NDArray[Any]]:
+    """The poses as `smplx` names them: the pelvis, 21 joints, places."""
+    array = poses()
+    return {"global_orient": array[:, :3], "body_pose": array[:, 3:66], "transl": np.zeros((FRAMES, 3))}
+
+
+def aist_arrays() -> dict[str, NDArray[Any]]:
+    """The dict of an AIST++ file: 24 joints, places in its own unit and the scale of it."""
+    return {"smpl_poses": poses(joints=24), "smpl_trans": np.ones((FRAMES, 3)), "smpl_scaling": np.array([90.0])}
+
+
+def write_romp(path: Path) -> None:
+    """A dict for each frame, in an array of one object, as ROMP saves a video."""
+    frames = {
+        f"{k:08}.png": {"smpl_thetas": poses(1, 24), "cam_trans": np.array([[0.0, 0.5, 3.0]]), "track_ids": [7]}
+        for k in range(FRAMES)
+    }
+    with path.open("wb") as file:
+        save: Any = np.savez
+        save(file, results=np.array(frames, dtype=object))
 
 
 def camera_poses(count: int = 5) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
@@ -208,6 +231,9 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "amass.npz": lambda path: _arrays(
         path, poses=poses(joints=52), trans=np.zeros((FRAMES, 3)), mocap_framerate=np.array(60.0), betas=np.zeros(10)
     ),
+    "parts.npz": lambda path: _arrays(path, **parts_of_poses()),
+    "aist.pkl": lambda path: path.write_bytes(pickle.dumps(aist_arrays(), protocol=4)),
+    "romp.npz": write_romp,
     "arkit.txt": lambda path: path.write_text(arkit_text()),
     "tum.txt": lambda path: path.write_text(tum_text()),
     "transforms.json": lambda path: path.write_text(nerf_text()),
