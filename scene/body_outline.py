@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F32, F64
 from trilane.body.body import ShapedBody
+from trilane.body.joints import JOINT_INDEX
 
 #: How many of a vertex's skin weights are used: the largest ones.
 WEIGHTS = 4
 #: Frames whose heights are computed together: so few that the arrays stay in the processor's cache.
 FRAMES_AT_ONCE = 16
+FEET = ("left_ankle", "right_ankle", "left_foot", "right_foot")
 #: Directions in which the outermost vertices of each joint are taken: the axes and the diagonals of a cube.
 _SIGNS = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if abs(x) + abs(y) + abs(z) in (1, 3)]
 DIRECTIONS: F64 = np.array(_SIGNS, dtype=np.float64) / np.linalg.norm(_SIGNS, axis=1, keepdims=True)
@@ -59,7 +61,18 @@ def outline(body: ShapedBody) -> Outline:
         own = np.flatnonzero(owner == joint)
         picked.update(own[(rest[own] @ DIRECTIONS.T).argmax(axis=0)].tolist())
     index = np.array(sorted(picked))
-    points = np.concatenate([rest[index], np.ones((len(index), 1))], axis=1)
-    top = np.argsort(-weights[index], axis=1)[:, :WEIGHTS]
-    largest = np.take_along_axis(weights[index], top, axis=1).astype(np.float64)
+    return _of(body, index)
+
+
+def feet(body: ShapedBody) -> Outline:
+    """All vertices that ankles and toes move most: those that stand on the floor to the millimetre."""
+    return _of(body, np.flatnonzero(np.isin(body.body.weights.argmax(axis=1), [JOINT_INDEX[name] for name in FEET])))
+
+
+def _of(body: ShapedBody, index: NDArray[np.intp]) -> Outline:
+    """The Outline of the vertices `index`."""
+    weights, rest = body.body.weights[index], body.vertices[index].astype(np.float64)
+    points = np.concatenate([rest, np.ones((len(index), 1))], axis=1)
+    top = np.argsort(-weights, axis=1)[:, :WEIGHTS]
+    largest = np.take_along_axis(weights, top, axis=1).astype(np.float64)
     return Outline(points, top, largest / largest.sum(axis=1, keepdims=True))

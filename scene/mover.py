@@ -12,7 +12,7 @@ import numpy as np
 from trilane.arrays import F64
 from trilane.body.body import ShapedBody
 from trilane.body.kinematics import Skeleton
-from trilane.scene.body_outline import outline
+from trilane.scene.body_outline import feet, outline
 from trilane.scene.floor import floor_lift, ground_rule, leg_length
 from trilane.scene.motion.motion import Motion, bracket, wrapped_time
 from trilane.scene.rotations import about
@@ -53,7 +53,7 @@ def make_mover(spec: AvatarSpec, motion: Motion, body: ShapedBody) -> Mover:
     shift = -body.joints[0]
     rule = ground_rule(motion, spec.ground)
     skeleton = Skeleton(body.joints, body.body.parents)
-    lift_times_s, lift_m = floor_lift(motion, skeleton, outline(body), shift, scale, rule)
+    lift_times_s, lift_m = floor_lift(motion, skeleton, outline(body), shift, scale, rule, feet(body))
     world = np.eye(4)
     world[:3, :3] = about(1, np.radians(spec.heading_deg))
     world[:3, 3] = spec.position
@@ -66,5 +66,6 @@ def make_mover(spec: AvatarSpec, motion: Motion, body: ShapedBody) -> Mover:
 _GROUND_NOTES = {
     "frame": "the lowest point of the body touches it in every frame",
     "sequence": "the lowest point over the motion touches it",
+    "stance": "feet that stand in the recording stand on it",
     "none": "heights as recorded",
 }

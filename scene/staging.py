@@ -34,7 +34,7 @@ def stage_scene(scene: Scene, bodies: Sequence[ShapedBody], base: Path, footage:
 
     `footage`: what its background is; None for a drawn one. Raises BadInputError when a file is unusable.
     """
-    motions = [load_motion(spec, base) for spec in scene.avatars]
+    motions = [load_motion(spec, base, body.joints) for spec, body in zip(scene.avatars, bodies, strict=True)]
     movers = tuple(
         make_mover(spec, motion, body) for spec, motion, body in zip(scene.avatars, motions, bodies, strict=True)
     )

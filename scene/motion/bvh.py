@@ -6,7 +6,7 @@ Rule: syntax only; `bvh_retarget.py` interprets the joints' names. Every error n
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -21,14 +21,16 @@ EXPECTED = "a BVH file: HIERARCHY, MOTION, Frames, Frame Time, one line of chann
 MAX_JOINTS = 1000
 MAX_FRAMES = 200_000
 CHANNELS = {f"{axis}{kind}": (kind, k) for kind in ("position", "rotation") for k, axis in enumerate("XYZ")}
+_CHANNEL_OF = {name.lower(): name for name in CHANNELS}
 
 
 @dataclass
 class BvhJoint:
     """One joint of the file.
 
-    `parent`: index of its parent, -1 at the root. `offset` (3,): from its parent, file units. `channels`: such as
-    `Zrotation`, in file order. `first`: column of the first of them. `tip` (3,): offset of its end site, None without.
+    `parent`: index of its parent, -1 at a root, of which a file may have several. `offset` (3,): from its parent, file
+    units. `channels`: such as `Zrotation`, in file order. `first`: column of the first of them. `tip` (3,): offset of
+    its end site, None without.
     """
 
     name: str
@@ -79,14 +81,18 @@ class _Words:
     """The words of the hierarchy, one after the other, each with its line."""
 
     path: Path
-    words: Iterator[tuple[int, str]]
+    words: Sequence[tuple[int, str]]
     line: int = 1
+    read: int = 0
+
+    def more(self) -> bool:
+        return self.read < len(self.words)
 
     def next(self) -> str:
-        try:
-            self.line, word = next(self.words)
-        except StopIteration:
-            raise self.error("the end of the file", EXPECTED) from None
+        if not self.more():
+            raise self.error("the end of the file", EXPECTED)
+        self.line, word = self.words[self.read]
+        self.read += 1
         return word
 
     def want(self, *words: str) -> str:
@@ -120,9 +126,17 @@ class _Hierarchy:
     columns: int = 0
 
     def read(self) -> None:
-        """Everything from HIERARCHY to the root's closing brace."""
+        """Everything from HIERARCHY to the closing brace of the last root."""
         self.words.want("HIERARCHY")
         self.words.want("ROOT")
+        self._tree()
+        while self.words.more():
+            word = self.words.next()
+            if word.upper() != "ROOT":
+                raise self.words.error(repr(word), "another ROOT or a line MOTION")
+            self._tree()
+
+    def _tree(self) -> None:
         open_joints = [self._joint(parent=-1)]
         while open_joints:
             word = self.words.want("JOINT", "END", "CHANNELS", "}")
@@ -155,9 +169,9 @@ class _Hierarchy:
             raise self.words.error(f"{count:g} channels", "0 to 6")
         names = [self.words.next() for _ in range(int(count))]
         for name in names:
-            if name not in CHANNELS:
+            if name.lower() not in _CHANNEL_OF:
                 raise self.words.error(repr(name), "a channel such as Zrotation or Xposition")
-        joint.channels, joint.first = tuple(names), self.columns
+        joint.channels, joint.first = tuple(_CHANNEL_OF[name.lower()] for name in names), self.columns
         self.columns += len(names)
 
 
@@ -165,7 +179,7 @@ def load_bvh(path: Path) -> Bvh:
     """Read `path`. Raises BadInputError with the line on syntax, on a short or long frame, on a file cut off."""
     lines = read_text(path, EXPECTED).splitlines()
     start = next((k for k, line in enumerate(lines) if line.strip().upper() == "MOTION"), len(lines))
-    words = _Words(path, ((k + 1, word) for k, line in enumerate(lines[:start]) for word in line.split()))
+    words = _Words(path, [(k + 1, word) for k, line in enumerate(lines[:start]) for word in line.split()])
     hierarchy = _Hierarchy(words)
     hierarchy.read()
     if start == len(lines):

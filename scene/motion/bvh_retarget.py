@@ -1,62 +1,56 @@
-"""Puts the motion of a BVH skeleton on the SMPL-X joints, which are matched by name.
+"""Reads the motion of a BVH skeleton: joints matched by name, and laid on the avatar's.
 
-Rule: a joint's global turn is that of the file times a fixed turn, which lays the SMPL-X rest bone on the file's rest
-bone. So every limb points in the direction of the recorded one, whatever the file's zero pose is. Trunk and head take
-the file's turns unchanged. A joint that the file does not have follows its parent.
+Rule: what the file says about places, names and units is told apart here; turning it into poses is `retarget.py`'s.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from trilane.arrays import F64
-from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS
+from trilane.body.joints import JOINT_INDEX
 from trilane.errors import BadInputError
 from trilane.scene.detected import Detected
-from trilane.scene.motion.bvh import BvhJoint, load_bvh
-from trilane.scene.motion.bvh_units import leg_length, unit_of
+from trilane.scene.motion.bvh import Bvh, BvhJoint, load_bvh
+from trilane.scene.motion.bvh_joint_names import plain
+from trilane.scene.motion.bvh_units import unit_of
 from trilane.scene.motion.joint_match import NO_MAP, match_names
-from trilane.scene.motion.motion import JOINTS
 from trilane.scene.motion.recorded import RawMotion
-from trilane.scene.rotations import rotvec_from_matrix, shortest_turn
+from trilane.scene.motion.retarget import retarget
+from trilane.scene.motion.standing import leg_length
+from trilane.scene.motion.t_pose import T_POSE
+from trilane.scene.motion.t_pose_frames import leading_t_pose
+from trilane.scene.motion.tracks import SIDES, Tracks
+from trilane.scene.motion.trunk_turns import trunk_line
 
 LEAST_LENGTH = 1e-6
-#: Joint whose bone is laid on that of the file -> the joint at the other end of the bone, its direction in the T pose.
-LIMBS: dict[str, tuple[str, tuple[float, float, float]]] = {
-    "left_hip": ("left_knee", (0.0, -1.0, 0.0)),
-    "right_hip": ("right_knee", (0.0, -1.0, 0.0)),
-    "left_knee": ("left_ankle", (0.0, -1.0, 0.0)),
-    "right_knee": ("right_ankle", (0.0, -1.0, 0.0)),
-    "left_ankle": ("left_foot", (0.0, -0.42, 0.91)),
-    "right_ankle": ("right_foot", (0.0, -0.42, 0.91)),
-    "left_shoulder": ("left_elbow", (1.0, 0.0, 0.0)),
-    "right_shoulder": ("right_elbow", (-1.0, 0.0, 0.0)),
-    "left_elbow": ("left_wrist", (1.0, 0.0, 0.0)),
-    "right_elbow": ("right_wrist", (-1.0, 0.0, 0.0)),
-    "left_wrist": ("left_middle1", (1.0, 0.0, 0.0)),
-    "right_wrist": ("right_middle1", (-1.0, 0.0, 0.0)),
-}
+#: Axes that are tried as up; along X a body is taken to lie.
+UPS = ("y", "z", "-y", "-z")
+#: A coordinate beyond this, in the file's units, is a damaged one.
+FARTHEST = 1e9
 
 
-def load_retargeted(path: Path, units: str, joint_map: Mapping[str, str] = NO_MAP) -> RawMotion:
-    """Read a BVH file onto the 55 joints; `units` is a key of UNITS_M or `auto`, `joint_map` as of `match_names`.
+def load_retargeted(path: Path, units: str, joint_map: Mapping[str, str] = NO_MAP, rest: F64 = T_POSE) -> RawMotion:
+    """Read a BVH file onto the 55 joints.
 
-    Raises BadInputError when the file is no BVH or its names are of no known skeleton.
+    `units`: a key of UNITS_M or `auto`. `joint_map`: as of `match_names`. `rest` (55, 3): rest joints of the avatar,
+    metres. Raises BadInputError when the file is no BVH or its names are of no known skeleton.
     """
     bvh = load_bvh(path)
-    dialect, index_of = match_names(path, [joint.name for joint in bvh.joints], joint_map)
-    offsets = _rest_positions(bvh.joints)
-    leg = leg_length(offsets, index_of)
-    hips = offsets[index_of["left_hip"]] - offsets[index_of["right_hip"]]
-    if leg < LEAST_LENGTH or np.linalg.norm(hips) < LEAST_LENGTH:
+    dialect, index_of, of_roots = _person(path, bvh.joints, joint_map)
+    tracks, readable = tracks_of(bvh, index_of)
+    leg = leg_length(tracks) if readable.any() else 0.0
+    if leg < LEAST_LENGTH or np.linalg.norm(tracks.across("hip"), axis=-1).min() < LEAST_LENGTH:
         raise BadInputError(path, "legs of no length or hips in one place", "a skeleton with OFFSETs")
     unit, unit_m = unit_of(leg, units)
-    turns, places = bvh.forward()
-    poses = _local_turns(turns, _rest_turns(bvh.joints, offsets, index_of), index_of)
-    translation = places[:, index_of["pelvis"]] * unit_m
+    poses, places, how = retarget(tracks, rest)
+    start = int(np.flatnonzero(readable)[leading_t_pose(tracks, trunk_line(tracks).along(tracks))])
+    dropped = (f"the first {start} frames are a T pose that the motion jumps away from: left out",) if start else ()
     partners = sorted(JOINT_INDEX[name] for name in index_of)
     hands = sum(index >= 25 for index in partners)
     rate = 1 / bvh.frame_time_s
@@ -64,6 +58,9 @@ def load_retargeted(path: Path, units: str, joint_map: Mapping[str, str] = NO_MA
         f"BVH, {len(bvh.joints)} joints named as in {dialect}, {len(bvh.frames)} frames at {rate:.4g}/s",
         f"units: {unit} (leg of {leg * unit_m:.2f} m)",
         f"{len(index_of)} joints have a partner, {hands} of them in the hands",
+        *of_roots,
+        *how,
+        *dropped,
         "betas: none in the format",
     )
     joints = {name: bvh.joints[index].name for name, index in index_of.items()}
@@ -71,75 +68,83 @@ def load_retargeted(path: Path, units: str, joint_map: Mapping[str, str] = NO_MA
     reason = f"HIERARCHY, with joint names of {dialect}"
     detected = Detected("BVH", reason, unit=unit, rate="by `Frame Time`", joints=joints, unmapped=others)
     times = np.arange(len(bvh.frames), dtype=np.float64) * bvh.frame_time_s
-    return RawMotion(times, poses, translation, None, "y", notes, leg * unit_m, detected)
+    poses, places, feet = (
+        _spread(values, readable)[start:] for values in (poses, places * unit_m, feet_of(tracks) * unit_m)
+    )
+    return RawMotion(times[start:], poses, places, None, "y", notes, leg * unit_m, detected, UPS, feet)
 
 
-def _rest_positions(joints: list[BvhJoint]) -> F64:
-    """Positions (J, 3) in the file's zero pose."""
-    places = np.zeros((len(joints), 3))
-    for index, joint in enumerate(joints):
-        places[index] = joint.offset + (places[joint.parent] if joint.parent >= 0 else 0.0)
-    return places
+def _person(
+    path: Path, joints: Sequence[BvhJoint], joint_map: Mapping[str, str]
+) -> tuple[str, dict[str, int], tuple[str, ...]]:
+    """The family of names, {SMPL-X name: index} of the person, and a note when there are several roots.
+
+    Of several persons it is the one with the most joints, or the first of equals; a person may also be spread over all
+    roots. Raises BadInputError as `match_names` does.
+    """
+    names = [joint.name for joint in joints]
+    roots = [index for index, joint in enumerate(joints) if joint.parent < 0]
+    if len(roots) == 1:
+        return *match_names(path, names, joint_map), ()
+    found: list[tuple[str, dict[str, int], int]] = []
+    for root, end in itertools.pairwise([*roots, len(joints)]):
+        try:
+            family, index_of = match_names(path, names[root:end], joint_map)
+        except BadInputError:
+            continue
+        found.append((family, {name: root + index for name, index in index_of.items()}, root))
+    if not found:
+        note = f"{len(roots)} ROOTs ({', '.join(names[root] for root in roots)}), taken for one person"
+        return *match_names(path, names, joint_map), (note,)
+    family, index_of, shown = max(found, key=lambda person: len(person[1]))
+    others = ", ".join(names[root] for root in roots if root != shown)
+    return family, index_of, (f"{len(roots)} ROOTs: the person of {names[shown]} is shown, not {others}",)
 
 
-def _rest_turns(joints: list[BvhJoint], offsets: F64, index_of: dict[str, int]) -> dict[str, F64]:
-    """{SMPL-X name: matrix (3, 3) from the SMPL-X rest frame to the file's zero-pose frame}."""
-    frame = _body_frame(offsets, index_of)
-    turns: dict[str, F64] = {}
-    for index, name in enumerate(JOINT_NAMES):
-        above = turns.get(JOINT_NAMES[JOINT_PARENTS[index]], frame) if index else frame
-        turns[name] = above if name in LIMBS or index >= 25 else frame
-        bone = _file_bone(name, joints, offsets, index_of) if name in LIMBS else None
-        if bone is not None:
-            ours = above @ np.array(LIMBS[name][1])
-            turns[name] = shortest_turn(ours, bone, fallback=frame[:, 0]) @ above
-    return turns
+def feet_of(tracks: Tracks) -> F64:
+    """Places (T, 2, n, 3) of the ankles, and of the toes or what else is at the end of both feet."""
+    feet = [[tracks.places[f"{side}_ankle"]] for side in SIDES]
+    ends = [tracks.places.get(f"{side}_foot", tracks.tips.get(f"{side}_ankle")) for side in SIDES]
+    if all(end is not None for end in ends):
+        feet = [[*foot, end] for foot, end in zip(feet, ends, strict=True) if end is not None]
+    return np.moveaxis(np.array(feet), 2, 0)
 
 
-def _file_bone(name: str, joints: list[BvhJoint], offsets: F64, index_of: dict[str, int]) -> F64 | None:
-    """Direction (3,) of the bone that begins at joint `name`, in the file's zero pose; None when it has none."""
-    if name not in index_of:
-        return None
-    end = LIMBS[name][0]
-    index = index_of[name]
-    bone = offsets[index_of[end]] - offsets[index] if end in index_of else _to_furthest_tip(index, joints, offsets)
-    return bone if np.linalg.norm(bone) > 1e-6 else None
+def tracks_of(bvh: Bvh, index_of: dict[str, int]) -> tuple[Tracks, NDArray[np.bool_]]:
+    """The named joints over the frames whose numbers are usable, and which frames (T,) these are."""
+    turns, places = bvh.forward()
+    with np.errstate(invalid="ignore"):
+        readable = np.asarray((np.abs(places) < FARTHEST).all(axis=(1, 2)) & np.isfinite(turns).all(axis=(1, 2, 3)))
+    turns, places = turns[readable], places[readable]
+    tips = {name: _tip(bvh, index, turns, places) for name, index in index_of.items()}
+    return Tracks(
+        {name: places[:, index] for name, index in index_of.items()},
+        {name: turns[:, index] for name, index in index_of.items()},
+        {name: tip for name, tip in tips.items() if tip is not None},
+    ), readable
 
 
-def _to_furthest_tip(index: int, joints: list[BvhJoint], offsets: F64) -> F64:
-    """Vector (3,) from a joint to the furthest end site below it; zero when there is none."""
-    below = {index}
-    best = np.zeros(3)
-    for k, joint in enumerate(joints):
-        if joint.parent in below:
-            below.add(k)
-        if k in below and joint.tip is not None:
-            reach = offsets[k] + joint.tip - offsets[index]
-            best = max(best, reach, key=np.linalg.norm)
-    return best
+def _tip(bvh: Bvh, index: int, turns: F64, places: F64) -> F64 | None:
+    """Place (T, 3) of what a joint's own bone ends at: its end site or the next joint below, the furthest of several.
+
+    A joint at the same place counts as the joint itself; thumbs do not count. None when there is nothing below.
+    """
+    here, found, reach = {index}, None, LEAST_LENGTH
+    for k, joint in enumerate(bvh.joints):
+        ends = [places[:, k] + turns[:, k] @ joint.tip] if k in here and joint.tip is not None else []
+        if joint.parent in here:
+            if np.abs(joint.offset).max() < LEAST_LENGTH:
+                here.add(k)
+            ends.append(places[:, k])
+        for end in [] if "thumb" in plain(joint.name) or not len(places) else ends:
+            distance = float(np.linalg.norm(end - places[:, index], axis=-1).mean())
+            if distance > reach:
+                found, reach = end, distance
+    return found
 
 
-def _body_frame(offsets: F64, index_of: dict[str, int]) -> F64:
-    """The body's left, up and forward as columns (3, 3), in the file's zero pose; snapped to axes within 20 degrees."""
-    hips = (offsets[index_of["left_hip"]] + offsets[index_of["right_hip"]]) / 2
-    left = offsets[index_of["left_hip"]] - offsets[index_of["right_hip"]]
-    top = next((index_of[name] for name in ("head", "neck", "spine3", "spine2", "spine1") if name in index_of), None)
-    up = offsets[top] - hips if top is not None else hips - offsets[index_of["left_ankle"]]
-    forward = np.cross(left, up)
-    columns = np.stack([np.cross(up, forward), up, forward], axis=1)
-    frame = columns / np.linalg.norm(columns, axis=0)
-    snapped = np.round(frame)
-    close = np.abs(np.linalg.det(snapped) - 1) < 1e-9 and np.trace(snapped.T @ frame) > 1 + 2 * np.cos(np.radians(20))
-    return np.asarray(snapped if close else frame)
-
-
-def _local_turns(turns: F64, rest: dict[str, F64], index_of: dict[str, int]) -> F64:
-    """Axis-angle (T, 55, 3) of the SMPL-X joints from the file's global turns (T, J, 3, 3)."""
-    globals_: list[F64] = []
-    poses = np.zeros((len(turns), JOINTS, 3))
-    for index, name in enumerate(JOINT_NAMES):
-        above = globals_[JOINT_PARENTS[index]] if index else np.broadcast_to(np.eye(3), (len(turns), 3, 3))
-        turn = turns[:, index_of[name]] @ rest[name] if name in index_of else above
-        globals_.append(turn)
-        poses[:, index] = rotvec_from_matrix(np.swapaxes(above, -1, -2) @ turn)
-    return poses
+def _spread(values: F64, readable: NDArray[np.bool_]) -> F64:
+    """`values` of the readable frames among all frames; the others are NaN."""
+    spread = np.full((len(readable), *values.shape[1:]), np.nan)
+    spread[readable] = values
+    return spread

@@ -6,30 +6,13 @@ human legs, the file is scaled so that they have USUAL_LEG_M.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
-
-from trilane.arrays import F64
 
 #: Metres in one unit; `cmu` is the unit of the CMU recordings, 1/0.45 inches.
 UNITS_M = {"m": 1.0, "cm": 0.01, "in": 0.0254, "cmu": 0.0254 / 0.45}
 USUAL_LEG_M = 0.85
 #: Length over USUAL_LEG_M, from and to, of legs that are taken for human ones.
 HUMAN_LEG = (0.6, 1.6)
-
-
-def leg_length(offsets: F64, index_of: Mapping[str, int]) -> float:
-    """Mean length of both legs, hip to knee to ankle, in the file's units.
-
-    `offsets` (J, 3): positions of the file's joints. `index_of`: SMPL-X name -> index in `offsets`.
-    """
-    return float(np.mean([_leg(offsets, index_of, side) for side in ("left", "right")]))
-
-
-def _leg(offsets: F64, index_of: Mapping[str, int], side: str) -> float:
-    hip, knee, ankle = (offsets[index_of[f"{side}_{part}"]] for part in ("hip", "knee", "ankle"))
-    return float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
 
 
 def unit_of(leg: float, units: str) -> tuple[str, float]:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from trilane.arrays import F64
 from trilane.errors import BadInputError
 from trilane.files import require_file
 from trilane.near_miss import did_you_mean
@@ -20,25 +21,27 @@ from trilane.scene.motion.bvh_retarget import load_retargeted
 from trilane.scene.motion.motion import Motion
 from trilane.scene.motion.playing import as_played
 from trilane.scene.motion.recorded import RawMotion, motion_from_recording
+from trilane.scene.motion.t_pose import T_POSE
 from trilane.scene.schema import AvatarSpec
 
 PREFIX = "builtin:"
 
-_READERS: dict[str, Callable[[Path, AvatarSpec], RawMotion]] = {
-    ".npy": lambda path, _spec: load_npy(path),
-    ".npz": lambda path, _spec: load_npz(path),
-    ".pkl": lambda path, _spec: load_pickle(path),
-    ".pickle": lambda path, _spec: load_pickle(path),
-    ".bvh": lambda path, spec: load_retargeted(path, spec.units, spec.joint_map),
+_READERS: dict[str, Callable[[Path, AvatarSpec, F64], RawMotion]] = {
+    ".npy": lambda path, _spec, _rest: load_npy(path),
+    ".npz": lambda path, _spec, _rest: load_npz(path),
+    ".pkl": lambda path, _spec, _rest: load_pickle(path),
+    ".pickle": lambda path, _spec, _rest: load_pickle(path),
+    ".bvh": lambda path, spec, rest: load_retargeted(path, spec.units, spec.joint_map, rest),
 }
 #: Endings of files whose joints have names.
 NAMED = (".bvh",)
 
 
-def load_motion(spec: AvatarSpec, base: Path) -> Motion:
+def load_motion(spec: AvatarSpec, base: Path, rest: F64 = T_POSE) -> Motion:
     """The motion that `spec.motion` names, as `spec` plays it; a relative path starts at `base`.
 
-    Raises BadInputError when there is no such motion or the file is unusable.
+    `rest` (55, 3): rest joints of the avatar that does it, metres; those of a plain body when there is none. Raises
+    BadInputError when there is no such motion or the file is unusable.
     """
     if spec.motion.startswith(PREFIX):
         make = BUILTIN.get(spec.motion.removeprefix(PREFIX))
@@ -54,7 +57,7 @@ def load_motion(spec: AvatarSpec, base: Path) -> Motion:
     _check_named(spec, path)
     require_file(path, "a motion file")
     with np.errstate(over="ignore", invalid="ignore"):  # `usable_samples` leaves out what is not finite
-        motion = motion_from_recording(reader(path, spec), str(path), spec.up_axis)
+        motion = motion_from_recording(reader(path, spec, rest), str(path), spec.up_axis)
     return as_played(motion, spec, str(path))
 
 

@@ -60,7 +60,7 @@ class Motion:
     `translation` (T, 3): place of the pelvis, metres, Y up. `betas` (n,) or None. `notes`: how the source was read, for
     people. `wrap`: what follows the last frame. `leg_m`: hip to ankle of the recorded person, by which the translation
     is scaled to another body; None when unknown. `travels`: whether the translation was recorded. `detected`: what its
-    file is.
+    file is. `stance` (T,): how much the recorded feet stand on the floor, 0 to 1; None when unknown.
     """
 
     times_s: F64
@@ -72,6 +72,7 @@ class Motion:
     leg_m: float | None = None
     travels: bool = True
     detected: Detected = NOTHING
+    stance: F64 | None = None
 
     @property
     def duration_s(self) -> float:

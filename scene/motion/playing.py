@@ -53,9 +53,11 @@ def _part(motion: Motion, start_s: float, end_s: float) -> Motion:
     inside = (motion.times_s > start_s) & (motion.times_s < end_s)
     ends = replace(motion, wrap=Wrap.HOLD)
     (first, here), (last, there) = ends.sample(start_s), ends.sample(end_s)
+    times_s = np.concatenate([[start_s], motion.times_s[inside], [end_s]])
     return replace(
         motion,
-        times_s=np.concatenate([[start_s], motion.times_s[inside], [end_s]]) - start_s,
+        times_s=times_s - start_s,
+        stance=None if motion.stance is None else np.interp(times_s, motion.times_s, motion.stance),
         poses=np.concatenate([first[None], motion.poses[inside], last[None]]),
         translation=np.concatenate([here[None], motion.translation[inside], there[None]]),
     )

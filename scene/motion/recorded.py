@@ -15,6 +15,7 @@ from trilane.arrays import F64
 from trilane.errors import BadInputError
 from trilane.scene.detected import NOTHING, Detected
 from trilane.scene.motion.motion import Motion, Wrap
+from trilane.scene.motion.stance import stance
 from trilane.scene.motion.usable_samples import usable_samples
 from trilane.scene.rotations import Y_UP_FROM_Z_UP, about, matrix_from_rotvec, rotvec_from_matrix
 
@@ -44,6 +45,7 @@ class RawMotion:
     order. `translation` (T, 3): of the pelvis, metres; None when the format has none. `betas` (n,) or None. `up`: the
     axis that is usually up in the format; `ups`: the axes that may be up in it. `notes`: on the file, for people.
     `leg_m`: hip to ankle of the recorded person; None when unknown. `detected`: what the file is, but for its axes.
+    `feet` (T, 2, n, 3): places of n joints of the left and the right foot, metres; None when the format has no places.
     """
 
     times_s: F64
@@ -55,6 +57,7 @@ class RawMotion:
     leg_m: float | None = None
     detected: Detected = NOTHING
     ups: tuple[str, ...] = WORLD
+    feet: F64 | None = None
 
 
 def motion_from_recording(raw: RawMotion, where: str, up_axis: str) -> Motion:
@@ -87,6 +90,7 @@ def motion_from_recording(raw: RawMotion, where: str, up_axis: str) -> Motion:
         raw.leg_m,
         raw.translation is not None,
         replace(raw.detected, axes=axes),
+        None if raw.feet is None else stance((raw.feet[usable] @ turn.T)[..., 1]),
     )
 
 

@@ -13,7 +13,7 @@ from trilane.body.body import ShapedBody
 from trilane.body.joints import JOINT_INDEX
 from trilane.body.kinematics import Skeleton
 from trilane.body.skinning import CpuSkinner
-from trilane.scene.body_outline import DIRECTIONS, outline
+from trilane.scene.body_outline import DIRECTIONS, feet, outline
 from trilane.scene.floor import floor_lift, ground_rule, leg_length
 from trilane.scene.motion.motion import Motion, Wrap
 from trilane.scene.mover import make_mover
@@ -77,7 +77,7 @@ def test_which_rule_puts_a_motion_on_the_floor() -> None:
 
 def lift(body: ShapedBody, motion: Motion, rule: Any, scale: float = 1.0) -> tuple[list[float], np.ndarray]:
     skeleton = Skeleton(body.joints, body.body.parents)
-    times, metres = floor_lift(motion, skeleton, outline(body), -body.joints[0], scale, rule)
+    times, metres = floor_lift(motion, skeleton, outline(body), -body.joints[0], scale, rule, feet(body))
     return times.tolist(), metres
 
 

@@ -13,7 +13,7 @@ import pytest
 #: Those that are filled bit by bit, or count; each by its folder.
 CHANGING = {
     "scheduler": {"Recording", "_VirtualUnit"},
-    "scene": {"BvhJoint", "_Words", "_Hierarchy", "_Reader", "_Kind", "StoredArray"},
+    "scene": {"BvhJoint", "_Words", "_Hierarchy", "_Reader", "_Kind", "StoredArray", "Retarget"},
     "hw_profiles": {"ThermalState", "Throttle"},
     "stages": {"_Extent"},
     "pipeline": {"ByteCounter"},

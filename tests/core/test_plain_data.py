@@ -34,6 +34,7 @@ CHANGING = {
     "scene.motion.pickled.StoredArray",
     "scene.motion.pickled._Kind",
     "scene.motion.pickled._Reader",
+    "scene.motion.retarget.Retarget",
     "scheduler.recording.Recording",
     "scheduler.virtual._VirtualUnit",
     "stages.cpu.mesh_bounds._Extent",

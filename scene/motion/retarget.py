@@ -1,0 +1,257 @@
+"""Puts recorded joints on the 55 SMPL-X joints of an avatar.
+
+Rule: turns come from places: limbs point where the recorded ones point, pelvis and trunk turn as hip line, trunk and
+shoulder line do (`trunk_turns.py`), and the file's own turns only tell how limbs twist (`limb_turns.py`) and how head
+and toes turn. So neither a file's zero pose nor its axes matter. A joint that the file does not have follows its
+parent.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.arrays import F64
+from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS
+from trilane.scene.motion.frame_turns import level_with, transposed, turned
+from trilane.scene.motion.limb_turns import Evidence, hinge, limb_turns, swung
+from trilane.scene.motion.motion import JOINTS
+from trilane.scene.motion.standing import built_alike, leg_length, planted_frames, standing_frames, upward
+from trilane.scene.motion.tracks import SIDES, Tracks, angle_between, at_rest, unit
+from trilane.scene.motion.trunk_turns import (
+    trunk_line,
+    trunk_of,
+    turns_of_collars,
+    turns_of_neck,
+    turns_of_trunk,
+    with_neck_on,
+)
+from trilane.scene.rotations import about, rotvec_from_matrix
+
+UP, LEFT, FORWARD = (np.eye(3)[k] for k in (1, 0, 2))
+FINGERS = ("index", "middle", "pinky", "ring", "thumb")
+#: What a hand points to: the first of these that the file has, else what its bone ends at.
+HAND_ENDS = ("middle1", "index1", "ring1", "pinky1")
+#: Weights of what tells a twist beside the bend of a limb: toes, and the least twist from the part above.
+OF_TOES, OF_LEAST_TWIST = 0.5, 0.1
+#: A foot whose bone is steeper or flatter than the avatar's by more than this stands on its sole, not along its bone.
+SAME_SLOPE = np.radians(8.0)
+
+
+@dataclass
+class Retarget:
+    """The turns of one recording on one avatar, filled in from the pelvis outwards.
+
+    `tracks`: the recording. `rest`: the avatar's joints. `stands` (T,): the frames in which the person stands. `own`:
+    whether the skeleton is built like the avatar's. `turns`: global, (T, 3, 3) of each joint that is done. `notes`: for
+    people.
+    """
+
+    tracks: Tracks
+    rest: Tracks
+    stands: NDArray[np.bool_]
+    own: bool
+    turns: dict[str, F64] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    def bone(self, start: str, end: str) -> F64:
+        """Of the avatar at rest, (3,)."""
+        return unit(self.rest.bone(start, end)[0])
+
+    def above(self, name: str) -> F64:
+        """The turn of a joint's parent."""
+        return self.turns[JOINT_NAMES[JOINT_PARENTS[JOINT_INDEX[name]]]]
+
+    def lay(self, name: str, bone: F64, recorded: F64, evidence: list[Evidence]) -> None:
+        """Turn `name` so that its `bone` (3,) points as `recorded` (T, 3)."""
+        swing = swung(self.above(name), bone, recorded)
+        side = UP if abs(bone[1]) < 0.7 else FORWARD
+        weight = OF_LEAST_TWIST * (1 + (unit(recorded) * turned(self.above(name), bone)).sum(axis=-1))
+        least = (side, turned(swing, side) * weight[:, None])
+        carrier = self.tracks.turns.get(name, swing)
+        self.turns[name] = limb_turns(bone, recorded, carrier, [*evidence, least])
+
+
+def retarget(tracks: Tracks, joints: F64) -> tuple[F64, F64, tuple[str, ...]]:
+    """Poses (T, 55, 3), axis-angle; places (T, 3) of the avatar's pelvis in the unit of `tracks`; notes for people.
+
+    `tracks`: the recording; hips, knees and ankles must be in it, and the hips apart. `joints` (55, 3): the avatar's
+    rest joints in metres.
+    """
+    rest = at_rest(joints)
+    line = trunk_line(tracks)
+    trunk = line.along(tracks)
+    stands = standing_frames(tracks, trunk)
+    work = Retarget(tracks, rest, stands, built_alike(tracks, rest))
+    shares = line.shares(rest)
+    spine = turns_of_trunk(trunk_of(tracks, line, shares), trunk_of(rest, line, shares), stands, work.own)
+    work.turns.update(with_neck_on(trunk, spine, rest) if line.top == "neck" else spine)
+    work.turns.update(turns_of_collars(tracks, rest, work.turns["spine3"], stands, work.own))
+    work.turns["neck"] = turns_of_neck(tracks, rest, work.turns["spine3"])
+    for side in SIDES:
+        _leg(work, side, trunk)
+        _arm(work, side)
+    _head(work)
+    return _local(work.turns, tracks.frames), _pelvis_places(work, joints), (*_notes(work), *work.notes)
+
+
+def _leg(work: Retarget, side: str, trunk: F64) -> None:
+    hip, knee, ankle, toes = (f"{side}_{part}" for part in ("hip", "knee", "ankle", "foot"))
+    tracks = work.tracks
+    thigh, shin = tracks.bone(hip, knee), tracks.bone(knee, ankle)
+    foot = _foot(tracks, side)
+    bend = (LEFT, hinge(thigh, shin))
+    of_thigh, of_shin = [bend], [bend]
+    if foot is not None:
+        straight = np.cos(np.minimum(angle_between(thigh, shin), np.pi / 2))[:, None]
+        of_thigh.append((FORWARD, unit(foot) * straight * OF_TOES))
+        of_shin.append((FORWARD, unit(foot) * OF_TOES))
+    work.lay(hip, work.bone(hip, knee), thigh, of_thigh)
+    work.lay(knee, work.bone(knee, ankle), shin, of_shin)
+    if foot is None:
+        work.turns[ankle] = work.turns[toes] = work.turns[knee]
+        return
+    level = [(work.bone(ankle, knee), -unit(shin) * OF_LEAST_TWIST)]
+    bone = work.bone(ankle, toes)
+    if work.stands.any():
+        up = upward(tracks, trunk, work.stands)
+        planted = planted_frames(tracks, side, foot, up)
+        level.append((UP, planted[:, None] * up))
+        bone = _sole(work, side, bone, angle_between(foot, up)[planted])
+    work.lay(ankle, bone, foot, level)
+    work.turns[toes] = _levelled(work, toes, work.turns[ankle])
+
+
+def _foot(tracks: Tracks, side: str) -> F64 | None:
+    """From the ankle to the toes, or to what its bone ends at (T, 3); None when the foot has no length."""
+    ankle, toes = f"{side}_ankle", f"{side}_foot"
+    end = tracks.places.get(toes, tracks.tips.get(ankle))
+    if end is None:
+        return None
+    foot = end - tracks.places[ankle]
+    return foot if np.linalg.norm(foot, axis=-1).min() > 0 else None
+
+
+def _sole(work: Retarget, side: str, bone: F64, slopes: F64) -> F64:
+    """The avatar's direction (3,) that corresponds to a recorded foot: `bone`, or as steep as the recorded one.
+
+    `slopes`: angles between the recorded foot and up while it is planted, radians.
+    """
+    steeper = float(np.median(slopes) - angle_between(bone, UP)) if len(slopes) else 0.0
+    if work.own or abs(steeper) < SAME_SLOPE:
+        return bone
+    word = "steeper" if steeper > 0 else "flatter"
+    work.notes.append(
+        f"{side} foot: {abs(np.degrees(steeper)):.0f}° {word} than the avatar's where it is planted, so its sole is "
+        "laid on the recorded sole, not its bone on the bone"
+    )
+    return about(0, steeper) @ bone
+
+
+def _levelled(work: Retarget, name: str, base: F64) -> F64:
+    """The file's turns of a joint, equal to `base` on average over the frames that stand, or over all if none does."""
+    turns = work.tracks.turns.get(name)
+    if turns is None:
+        return base
+    where = work.stands if work.stands.any() else np.ones(len(base), dtype=bool)
+    return level_with(turns, base, where)
+
+
+def _arm(work: Retarget, side: str) -> None:
+    shoulder, elbow, wrist = (f"{side}_{part}" for part in ("shoulder", "elbow", "wrist"))
+    tracks = work.tracks
+    bend: list[Evidence] = []
+    if tracks.has(shoulder, elbow, wrist):
+        bend = [(-UP if side == "left" else UP, hinge(tracks.bone(shoulder, elbow), tracks.bone(elbow, wrist)))]
+    for start, end in ((shoulder, elbow), (elbow, wrist)):
+        if tracks.has(start, end):
+            work.lay(start, work.bone(start, end), tracks.bone(start, end), bend)
+        else:
+            work.turns[start] = work.above(start)
+    _hand(work, side)
+
+
+def _hand(work: Retarget, side: str) -> None:
+    wrist = f"{side}_wrist"
+    tracks = work.tracks
+    ends = [f"{side}_{end}" for end in HAND_ENDS if tracks.has(wrist, f"{side}_{end}")]
+    if ends:
+        work.lay(wrist, work.bone(wrist, ends[0]), tracks.bone(wrist, ends[0]), _palm(work, side))
+    elif tracks.has(wrist) and wrist in tracks.tips:
+        recorded = tracks.tips[wrist] - tracks.places[wrist]
+        work.lay(wrist, work.bone(wrist, f"{side}_middle1"), recorded, _palm(work, side))
+    else:
+        work.turns[wrist] = work.above(wrist)
+    for finger in FINGERS:
+        for part in (1, 2, 3):
+            _finger(work, f"{side}_{finger}", part)
+
+
+def _palm(work: Retarget, side: str) -> list[Evidence]:
+    """What tells how a hand is turned about its length: from the little finger to the index finger, or the thumb."""
+    for start, end in (("pinky1", "index1"), ("wrist", "thumb1")):
+        names = f"{side}_{start}", f"{side}_{end}"
+        if work.tracks.has(*names):
+            return [(work.bone(*names), unit(work.tracks.bone(*names)))]
+    return []
+
+
+def _finger(work: Retarget, finger: str, part: int) -> None:
+    name, end = f"{finger}{part}", f"{finger}{part + 1}"
+    if part < 3 and work.tracks.has(name, end):
+        work.turns[name] = swung(work.above(name), work.bone(name, end), work.tracks.bone(name, end))
+    else:
+        work.turns[name] = work.above(name)
+
+
+def _head(work: Retarget) -> None:
+    work.turns["head"] = _levelled(work, "head", work.turns["spine3"])
+    for name in ("jaw", "left_eye", "right_eye"):
+        work.turns[name] = work.turns["head"]
+
+
+def _local(turns: dict[str, F64], frames: int) -> F64:
+    """Axis-angle (T, 55, 3), of each joint relative to its parent."""
+    poses = np.zeros((frames, JOINTS, 3))
+    for index, name in enumerate(JOINT_NAMES):
+        above = turns[JOINT_NAMES[JOINT_PARENTS[index]]] if index else np.eye(3)
+        poses[:, index] = rotvec_from_matrix(transposed(above) @ turns[name])
+    return poses
+
+
+def _pelvis_places(work: Retarget, joints: F64) -> F64:
+    """Where the avatar's pelvis is when the middle of its hips is where that of the recorded ones is, (T, 3)."""
+    scale = leg_length(work.tracks) / leg_length(work.rest)
+    from_hips = joints[0] - work.rest.between("hip")[0]
+    return np.asarray(work.tracks.between("hip") + turned(work.turns["pelvis"], from_hips * scale))
+
+
+def _notes(work: Retarget) -> list[str]:
+    count = int(work.stands.sum())
+    if work.own:
+        trunk = "skeleton: built like the avatar's"
+    elif count:
+        trunk = (
+            f"skeleton: not built like the avatar's; {count} frames with straight legs tell how trunk and shoulders "
+            "stand at rest"
+        )
+    else:
+        trunk = (
+            "skeleton: not built like the avatar's, and no frame has straight legs; the pitch of pelvis, trunk and "
+            "head may be some 15° off"
+        )
+    head = (
+        "head: as the file turns it, straight ahead on average" if "head" in work.tracks.turns else "head: as the neck"
+    )
+    return [trunk, head, *_backwards(work)]
+
+
+def _backwards(work: Retarget) -> list[str]:
+    """A note when the feet point to where left and right say is the back."""
+    feet = [foot for foot in (_foot(work.tracks, side) for side in SIDES) if foot is not None]
+    ahead = [np.median(turned(transposed(work.turns["pelvis"]), unit(foot))[:, 2]) for foot in feet]
+    if not ahead or max(ahead) > -0.3:
+        return []
+    return ["feet point backwards: the file's left and right are exchanged, or it is a mirror image"]
