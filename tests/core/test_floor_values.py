@@ -16,6 +16,7 @@ from trilane.body.skinning import CpuSkinner
 from trilane.scene.body_outline import DIRECTIONS, feet, outline
 from trilane.scene.floor import floor_lift, ground_rule, leg_length
 from trilane.scene.motion.motion import Motion, Wrap
+from trilane.scene.motion.stance import stance
 from trilane.scene.mover import make_mover
 from trilane.scene.schema import AvatarSpec
 
@@ -98,6 +99,37 @@ def test_a_sequence_is_lifted_by_its_fifth_percentile(body: ShapedBody) -> None:
     times, metres = lift(body, still((np.arange(101) / 100).tolist(), heights.tolist()), "sequence")
     assert times == [0.0]
     assert metres == pytest.approx([sole(body) - 1.05], abs=1e-5)
+
+
+def test_feet_that_stand_are_on_the_floor_and_others_as_high_as_those_on_average(body: ShapedBody) -> None:
+    motion = dataclasses.replace(still([0, 0.02, 0.04], [1.0, 1.1, 1.5]), stance=np.array([1.0, 1.0, 0.0]))
+    assert ground_rule(motion, "auto") == "stance"
+    assert ground_rule(dataclasses.replace(motion, travels=False), "auto") == "frame"
+    times, metres = lift(body, motion, "stance")
+    assert times == pytest.approx([0, 0.02, 0.04])
+    assert metres == pytest.approx(sole(body) - np.array([1.0, 1.1, 1.05]), abs=1e-5)
+    half = dataclasses.replace(motion, stance=np.array([1.0, 0.0, 0.5]))
+    usual = (1.0 + 0.5 * 1.5) / 1.5  # 1.17: at 1.1 the body would be deeper than 3 cm
+    expected = np.array([1.0, 1.13, (usual + 1.5) / 2])
+    assert lift(body, half, "stance")[1] == pytest.approx(sole(body) - expected, abs=1e-5)
+    deep = dataclasses.replace(still([0, 0.02], [1.0, 0.5]), stance=np.array([1.0, 0.0]))
+    assert lift(body, deep, "stance")[1] == pytest.approx(sole(body) - np.array([1.0, 0.5 + 0.03]), abs=1e-5)
+    mover = make_mover(AvatarSpec(), motion, body)
+    assert mover.notes[0] == "floor: feet that stand in the recording stand on it"
+
+
+def test_feet_stand_where_they_are_low() -> None:
+    """Ankles stand at 0.1, toes at 0.02; one foot on the floor is enough, and from 3 cm on there is less and less."""
+    heights = np.tile([[0.1, 0.02], [0.1, 0.02]], (100, 1, 1))
+    heights[50] += 0.03
+    heights[51] += 0.045
+    heights[52] += 0.06
+    heights[53] += 0.5
+    heights[53, 1] -= 0.5
+    heights[54, :, 0] += 0.2  # on the toes
+    expected = np.ones(100)
+    expected[[50, 51, 52]] = 1, 0.5, 0
+    assert stance(heights) == pytest.approx(expected)
 
 
 def test_a_mover_by_hand(body: ShapedBody) -> None:

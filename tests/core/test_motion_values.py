@@ -286,7 +286,7 @@ def rolled(cosine: float, axis: str) -> list[float]:
         (rolled(0.69, "y"), "z", "auto", "Z up, as usual for the format"),
         (rolled(0.72, "z"), "y", "auto", "Z up, as the body stands"),
         (rolled(0.69, "z"), "y", "auto", "Y up, as the body stands"),  # the cosine with +Y is 0.72
-        (rolled(-0.9, "y"), "y", "auto", "-Y up, as the body stands"),
+        (rolled(-0.9, "y"), "y", "auto", "Y up, as usual for the format"),
         ([0, 0, 0], "y", "z", "Z up, as given"),
         ([math.pi / 2, 0, 0], "z", "y", "Y up, as given"),
     ],
