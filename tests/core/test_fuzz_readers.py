@@ -51,7 +51,7 @@ def leaving(path: Path) -> None:
 
 
 def holding(path: Path) -> None:
-    HELD.append(path.open("rb"))
+    HELD.append(next(file for file in (path, *path.glob("*")) if file.is_file()).open("rb"))
 
 
 def hiding(path: Path) -> None:
