@@ -17,10 +17,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from trilane.arrays import F32, F64, I32
+from trilane.body.height import check_height
 from trilane.body.joints import JOINTS, LEFT_HAND, POSE_FEATURES, POSE_SIZE, RIGHT_HAND
 from trilane.body.pose_blend_shapes import read_pose_blend
 from trilane.errors import BadInputError
 from trilane.files import npz_names, read_npz
+from trilane.unexpected_value import UnexpectedValue
 
 EXPECTED = "a body file in the SMPL-X layout (.npz)"
 MAX_VERTICES = 1 << 18
@@ -135,9 +137,14 @@ def load_body(path: Path) -> Body:
     _check_weights(path, weights)
     weights = weights_of_one(weights)
     shape_dirs, expression_dirs = _split_shape(path, _floats(path, arrays, "shapedirs"))
+    template = _floats(path, arrays, "v_template")
+    try:
+        check_height(float(np.ptp(template[:, 1])))
+    except UnexpectedValue as error:
+        raise BadInputError.at(f"{path}[v_template]", error) from None
     return Body(
         source=str(path),
-        v_template=_floats(path, arrays, "v_template"),
+        v_template=template,
         shape_dirs=shape_dirs,
         expression_dirs=expression_dirs,
         posedirs=read_pose_blend(path, (vertices, 3, POSE_FEATURES)),

@@ -467,3 +467,33 @@ def test_a_motion_is_said_to_be_one(tmp_path: Path) -> None:
     with pytest.raises(BadInputError) as raised:
         load_body(tmp_path / "m.npz")
     assert raised.value.remedy.endswith("a14, a15 and 2 more")
+
+
+def tall(arrays: Arrays, height: float) -> Arrays:
+    """The arrays of a body whose lowest and highest vertices are `height` apart."""
+    places = arrays["v_template"].astype(np.float64)
+    low, high = places[:, 1].min(), places[:, 1].max()
+    return {**arrays, "v_template": places * (height / (high - low))}
+
+
+@pytest.mark.parametrize(("height", "unit"), [
+    (176.0, "1.76 m if they are centimetres, so multiply v_template and shapedirs by 0.01"),
+    (1760.0, "1.76 m if they are millimetres, so multiply v_template and shapedirs by 0.001"),
+    (69.0, "1.75 m if they are inches, so multiply v_template and shapedirs by 0.0254"),
+    (5.6, "1.71 m if they are feet, so multiply v_template and shapedirs by 0.3048"),
+    (0.29, "give its places in metres, Y up"),
+    (1e6, "give its places in metres, Y up"),
+])  # fmt: skip
+def test_a_body_of_no_persons_height_is_refused_with_the_unit_that_fits(
+    tmp_path: Path, body_arrays: Arrays, height: float, unit: str
+) -> None:
+    with pytest.raises(BadInputError) as raised:
+        loaded(tmp_path, tall(body_arrays, height))
+    sentence = str(raised.value)
+    assert f"[v_template]: found a body {height:.4g} m high, along Y at rest, expected 0.3 to 3 m; " in sentence
+    assert sentence.endswith(unit)
+
+
+def test_bodies_from_a_child_to_a_giant_are_read(tmp_path: Path, body_arrays: Arrays) -> None:
+    for height in (0.31, 2.99):
+        assert np.ptp(loaded(tmp_path, tall(body_arrays, height)).v_template[:, 1]) == pytest.approx(height)
