@@ -93,15 +93,18 @@ class AvatarSpec(Table):
 class CameraSpec(Table):
     """The camera.
 
-    `source`: `builtin:NAME` or a file. `fov_y_deg`: of the picture's height; None for that of the file, or the usual
-    one of its format. `up_axis`: of the file's world. `near_m`, `far_m`: clip planes. `place`: whether a recorded
+    `source`: `builtin:NAME`, a file or a folder. `fov_y_deg`: of the picture's height; None for that of the file, or
+    the usual one of its format. `up_axis`: of the file's world. `metres_per_unit`: of its lengths; None for what it
+    says or is likely. `rate_hz`: of a file without times. `near_m`, `far_m`: clip planes. `place`: whether a recorded
     camera is placed in the scene (`auto`) or stays where it was recorded (`none`).
     """
 
     source: str = "builtin:orbit"
-    format: Literal["auto", "arkit", "tum", "nerf"] = "auto"
+    format: Literal["auto", "arkit", "colmap", "euroc", "kitti", "nerf", "stray", "tum"] = "auto"
     fov_y_deg: float | None = Field(default=None, gt=1, lt=170)
     up_axis: Literal["auto", "x", "-x", "y", "-y", "z", "-z"] = "auto"
+    metres_per_unit: float | None = Field(default=None, gt=0, le=1e6, allow_inf_nan=False)
+    rate_hz: float | None = Field(default=None, ge=1e-3, le=1000, allow_inf_nan=False)
     near_m: float = Field(default=0.05, gt=0, allow_inf_nan=False)
     far_m: float = Field(default=100.0, gt=0, allow_inf_nan=False)
     place: Literal["auto", "none"] = "auto"

@@ -10,14 +10,12 @@ import math
 from pathlib import Path
 
 from trilane.scene.camera.recorded import RawCamera
-from trilane.scene.camera.text_table import elapsed, read_table
+from trilane.scene.camera.text_table import in_seconds, read_table
 from trilane.scene.detected import Detected
 from trilane.scene.lens import Known, centred
 
 COLUMNS = 13
 EXPECTED = "an ARKit log: time and the 12 numbers of a 3x4 matrix a line"
-#: With a median step above this, times are in nanoseconds, else in seconds.
-LEAST_STEP_NS = 1e3
 #: An iPhone's main camera, 26 mm equivalent, on a 16:9 picture: 36 degrees high, 60 wide.
 PHONE = centred(1920, 1080, 540 / math.tan(math.radians(18.0)), Known.LONG)
 
@@ -26,13 +24,12 @@ def load_arkit(path: Path) -> RawCamera:
     """Read `path`. Raises BadInputError with the line."""
     read = read_table(path, COLUMNS, EXPECTED)
     table = read.numbers
-    times, step = elapsed(table[:, 0])
-    unit, scale = ("ns", 1e-9) if step > LEAST_STEP_NS else ("s", 1.0)
+    times, step, unit = in_seconds(table[:, 0])
     matrices = table[:, 1:].reshape(-1, 3, 4)
-    rate = f", {1 / (step * scale):.4g}/s" if step > 0 else ""
+    rate = f", {1 / step:.4g}/s" if step > 0 else ""
     notes = (f"ARKit log, {len(table)} poses{rate}, time in {unit}, camera to world",)
     return RawCamera(
-        times * scale,
+        times,
         matrices[:, :, :3],
         matrices[:, :, 3],
         "y",

@@ -1,11 +1,12 @@
 """Loads the camera of a scene: a built-in one by name, or a file.
 
-Rule: a JSON file is NeRF's; the format of a text table is recognised by its number of columns.
+Rule: the scene says the format, else the file's content does (`detect.py`), and a note says which and why.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,21 +14,35 @@ import numpy as np
 from trilane.errors import BadInputError
 from trilane.files import require_file
 from trilane.near_miss import did_you_mean
-from trilane.scene.camera import arkit, tum
 from trilane.scene.camera.arkit import load_arkit
 from trilane.scene.camera.builtin import BUILTIN, load_builtin
+from trilane.scene.camera.colmap import load_colmap
+from trilane.scene.camera.detect import EXPECTED, Guess, detect
+from trilane.scene.camera.euroc import load_euroc
+from trilane.scene.camera.kitti import load_kitti
 from trilane.scene.camera.nerf import load_nerf
 from trilane.scene.camera.path import CameraPath
 from trilane.scene.camera.recorded import RawCamera, path_from_recording
-from trilane.scene.camera.text_table import column_count
+from trilane.scene.camera.stray import load_stray
 from trilane.scene.camera.tum import load_tum
 from trilane.scene.schema import CameraSpec
 
 PREFIX = "builtin:"
-EXPECTED = "a camera file: an ARKit log, a TUM trajectory or a NeRF transforms.json"
 
-_READERS: dict[str, Callable[[Path], RawCamera]] = {"arkit": load_arkit, "tum": load_tum, "nerf": load_nerf}
-_COLUMNS = {arkit.COLUMNS: "arkit", tum.COLUMNS: "tum"}
+_READERS: dict[str, Callable[[Path], RawCamera]] = {
+    "arkit": load_arkit,
+    "euroc": load_euroc,
+    "stray": load_stray,
+    "tum": load_tum,
+}
+#: Of formats without times, which take the scene's rate.
+_UNTIMED: dict[str, Callable[[Path, float | None], RawCamera]] = {
+    "colmap": load_colmap,
+    "kitti": load_kitti,
+    "nerf": load_nerf,
+}
+#: Formats that may be folders.
+FOLDERS = ("colmap", "nerf", "stray")
 
 
 def load_camera(spec: CameraSpec, base: Path) -> CameraPath:
@@ -42,16 +57,12 @@ def load_camera(spec: CameraSpec, base: Path) -> CameraPath:
             raise BadInputError("camera", repr(spec.source), f"{PREFIX}{{{', '.join(BUILTIN)}}} or a file", near)
         return built_in
     path = base / spec.source
-    require_file(path, EXPECTED)
-    kind = _kind(path) if spec.format == "auto" else spec.format
+    guess = detect(path) if spec.format == "auto" else Guess(spec.format, "")
+    if not (path.is_dir() and guess.kind in FOLDERS):
+        require_file(path, EXPECTED)
     with np.errstate(over="ignore", invalid="ignore"):  # `usable_samples` leaves out what is not finite
-        return path_from_recording(_READERS[kind](path), str(path), spec)
-
-
-def _kind(path: Path) -> str:
-    if path.suffix.lower() == ".json":
-        return "nerf"
-    columns = column_count(path, EXPECTED)
-    if columns not in _COLUMNS:
-        raise BadInputError(path, f"{columns} columns", f"{arkit.COLUMNS} (ARKit) or {tum.COLUMNS} (TUM)")
-    return _COLUMNS[columns]
+        raw = _UNTIMED[guess.kind](path, spec.rate_hz) if guess.kind in _UNTIMED else _READERS[guess.kind](path)
+        camera = path_from_recording(raw, str(path), spec)
+    reason = guess.reason or "as given"
+    taken = f"taken for {camera.detected.format}: {reason}"
+    return replace(camera, notes=(*camera.notes, taken), detected=replace(camera.detected, reason=reason))

@@ -1,7 +1,9 @@
-"""NeRF `transforms.json`: `frames[].transform_matrix`, 4x4 camera to world, OpenGL axes, Z up.
+"""NeRF `transforms.json`: `frames[].transform_matrix`, 4x4 camera to world, OpenGL axes, usually Z up.
 
-Rule: the lens is that of the file (`fl_x`, `fl_y`, `cx`, `cy` in pixels of `w` x `h`, or `camera_angle_x`). The format
-has no times: views less than FILM_STEP_DEG apart are a film at 30 a second, others are stills, one a second.
+Rule: the lens is that of the frame, else that of the file (`fl_x`, `fl_y`, `cx`, `cy` in pixels of `w` x `h`, or
+`camera_angle_x`); distortion is left out and said. The format has no times (`untimed.py`). Polycam's and Record3D's
+exports are such files, as nerfstudio makes them.
+Format: https://docs.nerf.studio/quickstart/data_conventions.html.
 """
 
 from __future__ import annotations
@@ -17,22 +19,28 @@ from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
 from trilane.files import read_text, whole_number
+from trilane.scene.camera.distortion import distortion_note, largest_px
+from trilane.scene.camera.map_frame import Unit
 from trilane.scene.camera.recorded import RawCamera
+from trilane.scene.camera.untimed import times_without
 from trilane.scene.detected import Detected
 from trilane.scene.lens import Known, Lens, centred, of_fov_x
 
+FILE = "transforms.json"
 EXPECTED = "a NeRF transforms.json: `frames`, each with a 4x4 `transform_matrix`"
-FILM_RATE_HZ = 30.0
-FILM_STEP_DEG = 6.0
 DEFAULT_ANGLE_X = math.radians(50.0)
 DEFAULT_ASPECT = 4 / 3
 MAX_FRAMES = 100_000
 #: Of a matrix whose columns have unit length; that of a rotation is 1. A place far off makes it less: 1e-5 at 100 km.
 LEAST_DETERMINANT = 1e-9
+LENS_KEYS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x")
+DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
+FISHEYE = "FISHEYE"  # in the name of a camera model
 
 
-def load_nerf(path: Path) -> RawCamera:
-    """Read `path`. Raises BadInputError naming the key."""
+def load_nerf(path: Path, rate_hz: float | None = None) -> RawCamera:
+    """Read `path`, the file or its folder. `rate_hz`: of the scene. Raises BadInputError naming the key."""
+    path = path / FILE if path.is_dir() else path
     try:
         content = json.loads(read_text(path, EXPECTED), parse_int=whole_number)
     except (ValueError, RecursionError) as error:
@@ -43,12 +51,49 @@ def load_nerf(path: Path) -> RawCamera:
     if not 1 <= len(frames) <= MAX_FRAMES:
         raise BadInputError(f"{path}: frames", f"{len(frames)} frames", f"1 to {MAX_FRAMES}")
     matrices = np.stack([_matrix(path, k, frame) for k, frame in enumerate(frames)])
-    rate, how = _rate(matrices[:, :3, :3])
-    lens, source = _lens(path, content)
-    notes = (f"NeRF transforms, {len(frames)} views, no times: {how}, camera to world",)
+    turns, places = matrices[:, :3, :3], matrices[:, :3, 3]
+    times, how = times_without(turns, rate_hz)
+    lenses, source = _lenses(path, content, frames)
+    notes = (
+        f"NeRF transforms, {len(frames)} views, no times: {how}, camera to world",
+        *_distortion(path, content, frames, lenses),
+    )
     detected = Detected("NeRF transforms.json", "JSON with `frames`", rate=f"no times in the format: {how}")
-    times, turns, places = np.arange(len(frames)) / rate, matrices[:, :3, :3], matrices[:, :3, 3]
-    return RawCamera(times, turns, places, "z", (lens,), source, notes, _place_of, detected, pictures=_pictures(frames))
+    return RawCamera(
+        times, turns, places, "z", lenses, source, notes, _place_of, detected, _pictures(frames), unit=Unit.USUALLY_M
+    )
+
+
+def _lenses(path: Path, content: Mapping[str, Any], frames: Sequence[Any]) -> tuple[tuple[Lens, ...], str]:
+    """One lens for all views, or one for each where a view has a key of its own; and where they come from."""
+    if not any(key in frame for frame in frames if isinstance(frame, dict) for key in LENS_KEYS):
+        lens, source = _lens(path, content, "")
+        return (lens,), source
+    own = [_lens(path, {**content, **frame}, f"frames[{k}].") for k, frame in enumerate(frames)]
+    sources = dict.fromkeys(source for _, source in own)
+    return tuple(lens for lens, _ in own), f"{' or '.join(sources)}, frame by frame"
+
+
+def _distortion(
+    path: Path, content: Mapping[str, Any], frames: Sequence[Any], lenses: Sequence[Lens]
+) -> tuple[str, ...]:
+    """What is left out of the lens that is distorted the most."""
+    worst: tuple[float, tuple[str, ...]] = (0.0, ())
+    for k in range(len(lenses)):
+        keys = {**content, **frames[k]}
+        bent = {key: _real(path, keys, key) for key in DISTORTION_KEYS}
+        is_fisheye = FISHEYE in str(keys.get("camera_model", ""))
+        if is_fisheye or any(bent.values()):
+            worst = max(worst, (largest_px(lenses[k], bent, is_fisheye), distortion_note(lenses[k], bent, is_fisheye)))
+    return worst[1]
+
+
+def _real(path: Path, content: Mapping[str, Any], key: str) -> float:
+    """A finite number of the file, 0 when the key is not there. Raises BadInputError."""
+    value = content.get(key, 0.0)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise BadInputError(f"{path}: {key}", repr(value)[:40], "a number")
+    return float(value)
 
 
 def _pictures(frames: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
@@ -86,28 +131,19 @@ def _is_singular(matrix: NDArray[np.float64]) -> bool:
     return bool(not lengths.all() or abs(np.linalg.det(square / lengths)) < LEAST_DETERMINANT)
 
 
-def _rate(turns: NDArray[np.float64]) -> tuple[float, str]:
-    ahead = turns[:, :, 2]
-    cosine = np.clip((ahead[1:] * ahead[:-1]).sum(axis=1), -1, 1)
-    finite = cosine[np.isfinite(cosine)]
-    step = float(np.degrees(np.median(np.arccos(finite)))) if len(finite) else 0.0
-    if step > FILM_STEP_DEG:
-        return 1.0, f"stills {step:.0f} degrees apart, 1 a second"
-    return FILM_RATE_HZ, f"{FILM_RATE_HZ:g} a second assumed"
-
-
-def _lens(path: Path, content: Mapping[str, Any]) -> tuple[Lens, str]:
-    """The lens, and where it comes from."""
-    lens, source = _measured(path, content)
+def _lens(path: Path, content: Mapping[str, Any], of: str) -> tuple[Lens, str]:
+    """The lens, and where it comes from. `of`: the beginning of its keys, for messages."""
+    lens, source = _measured(path, content, of)
     for side, angle in (("height", lens.fov_y_deg), ("width", lens.fov_x_deg)):
         if not 1 < angle < 170:
-            raise BadInputError(path, f"a field of view of {angle:.4g} degrees over the {side}", "1 to 170")
+            where = f"{path}: {of.rstrip('.')}" if of else path
+            raise BadInputError(where, f"a field of view of {angle:.4g} degrees over the {side}", "1 to 170")
     return lens, source
 
 
-def _measured(path: Path, content: Mapping[str, Any]) -> tuple[Lens, str]:
-    keys = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x")
-    width, height, focal_x, focal_y, cx, cy, angle_x = (_number(path, content, key) for key in keys)
+def _measured(path: Path, content: Mapping[str, Any], of: str) -> tuple[Lens, str]:
+    numbers = (_number(f"{path}: {of}{key}", content.get(key), key) for key in LENS_KEYS)
+    width, height, focal_x, focal_y, cx, cy, angle_x = numbers
     usable = {"fl_x": focal_x if width else None, "fl_y": focal_y if height else None}
     known = [key for key, value in usable.items() if value]
     if not known:
@@ -123,13 +159,12 @@ def _measured(path: Path, content: Mapping[str, Any]) -> tuple[Lens, str]:
     return Lens(wide, high, fx, fy, cx or wide / 2, cy or high / 2, shape), source
 
 
-def _number(path: Path, content: Mapping[str, Any], key: str) -> float | None:
+def _number(where: str, value: Any, key: str) -> float | None:
     """A positive number of the file, or None when the key is not there. Raises BadInputError."""
-    value = content.get(key)
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | float) or not (math.isfinite(value) and value > 0):
-        raise BadInputError(f"{path}: {key}", repr(value)[:40], "a positive number")
+        raise BadInputError(where, repr(value)[:40], "a positive number")
     if key == "camera_angle_x" and value >= math.pi:
-        raise BadInputError(f"{path}: {key}", f"{value:g}", "an angle in radians below pi")
+        raise BadInputError(where, f"{value:g}", "an angle in radians below pi")
     return float(value)

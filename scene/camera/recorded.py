@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import F64
+from trilane.scene.camera.map_frame import Unit, metres_per_unit, near_origin
 from trilane.scene.camera.path import CameraPath, Optics, one_lens
 from trilane.scene.camera.upright import UP
 from trilane.scene.camera.upright import upright as find_upright
@@ -23,9 +24,8 @@ from trilane.scene.schema import CameraSpec
 
 #: A matrix is taken for a rotation when |R^T R - 1| is below this.
 SKEW = 0.05
-#: Places are left out that are farther than this from the others; and the origin of a map from which they all are
-#: farther than MAP_M, where float32 no longer resolves tenths of a millimetre, is moved to their middle.
-FARTHEST_M, MAP_M = 1e5, 1e3
+#: Places are left out that are farther than this from the others.
+FARTHEST_M = 1e5
 NOT_FINITE, FAR_OFF = "not finite", f"farther than {FARTHEST_M / 1000:.0f} km from the others"
 #: Optical axes (x right, y down, z ahead) to OpenGL axes.
 OPENGL_FROM_OPTICAL: F64 = np.diag([1.0, -1.0, -1.0])
@@ -40,7 +40,7 @@ class RawCamera:
     one for all poses or one for each; `lens`: where they come from. `notes`: on the file, for people. `place_of`: where
     a sample stands in the file. `detected`: what the file is, but for its axes and lens. `pictures`: names of the
     photos that the poses are of, one for each, or none. `is_levelled`: whether the world of the format is aligned with
-    gravity, by its definition.
+    gravity, by its definition. `unit`: of the lengths.
     """
 
     times_s: F64
@@ -54,6 +54,7 @@ class RawCamera:
     detected: Detected = NOTHING
     pictures: tuple[str, ...] = ()
     is_levelled: bool = False
+    unit: Unit = Unit.METRES
 
 
 def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraPath:
@@ -72,20 +73,24 @@ def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraP
     world = shortest_turn(upright.up, np.array(UP["y"]))
     quats = quat_from_matrix(world @ turns @ about(2, np.array(upright.quarter * np.pi / 2)))
     optics, seen = _optics(raw, usable, upright.quarter, spec)
+    fov_y_deg = float(np.median([lens.fov_y_deg for lens in optics.lenses]))
+    scale, scale_notes = metres_per_unit(turns, places, times, fov_y_deg, raw.unit, spec)
     notes = (
         *raw.notes,
         *offset_notes,
         upright.note,
+        *scale_notes,
         seen,
         *repairs,
         f"{times[-1] - times[0]:.2f} s, then plays back and forth" if len(times) > 1 else "one pose: held",
     )
-    detected = replace(raw.detected, axes=upright.note, lens=seen)
+    unit = " ".join(scale_notes) or raw.detected.unit
+    detected = replace(raw.detected, axes=upright.note, unit=unit, lens=seen)
     pictures = tuple(raw.pictures[k] for k in usable) if raw.pictures else ()
     return CameraPath(
         times - times[0],
         quats,
-        places @ world.T,
+        scale * places @ world.T,
         optics,
         notes,
         detected=detected,
@@ -105,17 +110,6 @@ def _optics(raw: RawCamera, usable: NDArray[np.intp], quarter: int, spec: Camera
     return Optics(lenses, spec.near_m, spec.far_m), (
         f"field of view {' to '.join(dict.fromkeys((angles[0], angles[-1])))} degrees high, {raw.lens}"
     )
-
-
-def near_origin(places: F64) -> tuple[F64, tuple[str, ...]]:
-    """`places` (N, 3) without the offset of a map, such as that of UTM coordinates, and a note on it."""
-    finite = np.isfinite(places).all(axis=1)
-    middle = np.median(places[finite], axis=0) if finite.any() else np.zeros(3)
-    if np.abs(middle).max() <= MAP_M:
-        return places, ()
-    offset = np.round(middle)
-    text = ", ".join(f"{value:.0f}" for value in offset)
-    return places - offset, (f"origin of the map moved: ({text}) m subtracted from all places",)
 
 
 def _faults(times_s: F64, turns: F64, places: F64) -> dict[str, NDArray[np.bool_]]:

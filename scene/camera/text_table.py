@@ -1,10 +1,12 @@
 """Reads text tables of camera poses: one pose per line, numbers separated by blanks or commas, `#` for comments.
 
-Rule: every line has the same count of numbers; the error names the first line that has not.
+Rule: every line has the same count of numbers; the error names the first line that has not. An empty field between two
+commas is no number (NaN), at the end of a line it is nothing. Column names in a comment or in the first line are read.
 """
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,6 +17,22 @@ from trilane.errors import BadInputError
 from trilane.files import read_text
 
 MAX_ROWS = 1_000_000
+#: With a median step above this, times are in nanoseconds, else in seconds.
+LEAST_STEP_NS = 1e3
+#: A time above this is in nanoseconds whatever the steps are: in seconds it would be 30 million years.
+LEAST_TIME_NS = 1e15
+#: Lines of numbers by which a table's format is told.
+LOOKED_AT = 20
+#: What is left out of a column's name: its unit, the frames of EuRoC's symbols, and all but letters and digits.
+UNIT, FRAMES, OTHER = re.compile(r"\[.*?\]"), re.compile(r"_rs(_r)?_"), re.compile(r"[^a-z0-9]")
+#: A column's name -> what it holds.
+KNOWN = {
+    **{name: "time" for name in ("timestamp", "time", "t", "timestamps", "timestampns")},
+    **{name: axis for axis in "xyz" for name in (axis, f"t{axis}", f"p{axis}", f"pos{axis}")},
+    **{name: f"q{part}" for part in "wxyz" for name in (f"q{part}", f"rot{part}")},
+    **{name: name for name in ("frame", "fx", "fy", "cx", "cy")},
+}
+POSE = ("time", "x", "y", "z", "qw", "qx", "qy", "qz")
 
 
 class Table(NamedTuple):
@@ -28,10 +46,28 @@ class Table(NamedTuple):
         return f"line {self.lines[index]}"
 
 
+class Layout(NamedTuple):
+    """How the first line of a table with numbers looks.
+
+    `columns`: how many there are. `names`: what each holds, by KNOWN, "" for others; none without column names.
+    `has_commas`: whether they part the numbers. `is_ns`: whether the first column has times in nanoseconds.
+    """
+
+    columns: int
+    names: tuple[str, ...]
+    has_commas: bool
+    is_ns: bool
+
+    @property
+    def has_pose(self) -> bool:
+        """Whether the names say where time, place and quaternion are."""
+        return all(name in self.names for name in POSE)
+
+
 def read_table(path: Path, columns: int, expected: str) -> Table:
     """The poses of `path`, at least one; `nan` and `inf` stay. Raises BadInputError with the line."""
     rows, lines = [], []
-    for number, words in _lines(path, expected):
+    for number, words in _rows(path, expected):
         if len(words) != columns:
             raise BadInputError(f"{path}, line {number}", f"{len(words)} columns", expected)
         try:
@@ -44,9 +80,41 @@ def read_table(path: Path, columns: int, expected: str) -> Table:
     return Table(np.array(rows), np.array(lines))
 
 
-def column_count(path: Path, expected: str) -> int:
-    """How many numbers the first line that is no comment has; 0 when there is no such line. Raises BadInputError."""
-    return next((len(words) for _, words in _lines(path, expected)), 0)
+def layout_of(path: Path, expected: str) -> Layout:
+    """Of the first line that is neither comment nor column names; no columns without one. Raises BadInputError."""
+    names: tuple[str, ...] = ()
+    first: list[str] = []
+    times: list[float] = []
+    has_commas = False
+    for line in read_text(path, expected).splitlines():
+        words = words_of(line)
+        if found := names_in(line):
+            names = names if times else found
+        elif words:
+            first, has_commas = first or words, has_commas or "," in line
+            times += _number(words[0])
+        if len(times) == LOOKED_AT:
+            break
+    with np.errstate(over="ignore"):
+        is_ns = bool(times) and (elapsed(np.array(times))[1] > LEAST_STEP_NS or abs(times[0]) > LEAST_TIME_NS)
+    return Layout(len(first), names, has_commas, is_ns)
+
+
+def _number(word: str) -> list[float]:
+    """`word` as a number, if it is a finite one."""
+    try:
+        return [float(word)] if np.isfinite(float(word)) else []
+    except ValueError:
+        return []
+
+
+def names_in(line: str) -> tuple[str, ...]:
+    """What the columns hold, if `line`, which may be a comment, names four or more that are known; else nothing."""
+    text = UNIT.sub("", line.strip().lstrip("#"))
+    words = text.split(",") if "," in text else text.split()
+    plain = (OTHER.sub("", FRAMES.sub("", word.strip().lower())) for word in words)
+    names = tuple(KNOWN.get(word, "") for word in plain)
+    return names if len({*names} - {""}) >= 4 else ()
 
 
 def elapsed(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
@@ -57,7 +125,27 @@ def elapsed(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     return times - finite[0], float(np.median(np.diff(finite)))
 
 
-def _lines(path: Path, expected: str) -> list[tuple[int, list[str]]]:
+def in_seconds(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], float, str]:
+    """As `elapsed`, in seconds, and the unit of `times` (N,): `ns` or `s`, by the size of their steps."""
+    since, step = elapsed(times)
+    unit, scale = ("ns", 1e-9) if step > LEAST_STEP_NS else ("s", 1.0)
+    return since * scale, step * scale, unit
+
+
+def words_of(line: str) -> list[str]:
+    """The fields of a line without its comment."""
+    text = line.split("#", 1)[0]
+    if "," not in text:
+        return text.split()
+    fields = [word for field in text.split(",") for word in field.split() or ["nan"]]
+    while fields and text.rstrip().endswith(",") and fields[-1] == "nan":
+        fields.pop()
+        text = text.rstrip()[:-1]
+    return fields
+
+
+def _rows(path: Path, expected: str) -> list[tuple[int, list[str]]]:
     lines = enumerate(read_text(path, expected).splitlines(), 1)
-    cut = ((number, line.split("#", 1)[0].replace(",", " ").split()) for number, line in lines)
-    return [(number, words) for number, words in cut if words]
+    cut = ((number, words_of(line)) for number, line in lines)
+    rows = [(number, words) for number, words in cut if words]
+    return rows[1:] if rows and names_in(" ".join(rows[0][1])) else rows

@@ -1,6 +1,7 @@
 """TUM RGB-D trajectory: `time tx ty tz qx qy qz qw` a line, camera to world, metres, seconds.
 
-Rule: axes are optical (x right, y down, looks along +Z); the quaternion's scalar comes last.
+Rule: axes are optical (x right, y down, looks along +Z); the quaternion's scalar comes last, unless the file's own
+column names say otherwise. Programs of SLAM write their maps so too, some with times in nanoseconds.
 Format: https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats.
 """
 
@@ -8,13 +9,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from trilane.scene.camera.map_frame import Unit
+from trilane.scene.camera.pose_table import USUAL, read_pose_table
 from trilane.scene.camera.recorded import OPENGL_FROM_OPTICAL, RawCamera
-from trilane.scene.camera.text_table import elapsed, read_table
 from trilane.scene.detected import Detected
 from trilane.scene.lens import centred
-from trilane.scene.rotations import matrix_from_quat, normalised
 
-COLUMNS = 8
+NAMES = ("time", "x", "y", "z", "qx", "qy", "qz", "qw")
+COLUMNS = len(NAMES)
 EXPECTED = "a TUM trajectory: time, tx ty tz, qx qy qz qw a line"
 #: The Kinect's colour camera, as calibrated for the first of these recordings: 49.8 degrees high, 63.5 wide.
 KINECT = centred(640, 480, 517.0)
@@ -22,12 +24,12 @@ KINECT = centred(640, 480, 517.0)
 
 def load_tum(path: Path) -> RawCamera:
     """Read `path`. Raises BadInputError with the line."""
-    read = read_table(path, COLUMNS, EXPECTED)
-    table = read.numbers
-    times, step = elapsed(table[:, 0])
-    turns = matrix_from_quat(normalised(table[:, [7, 4, 5, 6]])) @ OPENGL_FROM_OPTICAL
-    rate = f", {1 / step:.4g}/s" if step > 0 else ""
-    notes = (f"TUM trajectory, {len(table)} poses{rate}, optical axes, camera to world",)
+    poses = read_pose_table(path, NAMES, EXPECTED)
+    order = "" if poses.order == USUAL else f", columns {poses.order}"
+    time = "" if poses.time == "s" else f", time in {poses.time}"
+    notes = (f"TUM trajectory, {len(poses.times_s)} poses{poses.rate}{time}{order}, optical axes, camera to world",)
     lens = ((KINECT,), "usual for a Kinect")
     detected = Detected("TUM trajectory", f"{COLUMNS} columns of numbers", unit="m", rate="by the times of the file")
-    return RawCamera(times, turns, table[:, 1:4], "z", *lens, notes, read.place_of, detected)
+    turns = poses.turns @ OPENGL_FROM_OPTICAL
+    place_of = poses.table.place_of
+    return RawCamera(poses.times_s, turns, poses.places, "z", *lens, notes, place_of, detected, unit=Unit.USUALLY_M)

@@ -10,7 +10,7 @@ import pytest
 from trilane.errors import BadInputError
 from trilane.scene.camera import text_table
 from trilane.scene.camera.load import load_camera
-from trilane.scene.camera.text_table import column_count, elapsed, read_table
+from trilane.scene.camera.text_table import Layout, elapsed, layout_of, read_table
 from trilane.scene.schema import CameraSpec
 from trilane.testing.camera_files import load, nerf_text, pose_z_up, rows_of
 
@@ -21,9 +21,9 @@ def test_a_table_has_comments_commas_and_blank_lines(tmp_path: Path) -> None:
     table = read_table(path, 3, "three")
     assert table.numbers == pytest.approx(np.array([[1, 2, 3], [4, 5, np.nan]]), nan_ok=True)
     assert [table.place_of(index) for index in (0, 1)] == ["line 3", "line 4"]
-    assert column_count(path, "three") == 3
+    assert layout_of(path, "three") == Layout(3, (), has_commas=True, is_ns=False)
     path.write_text("# only this\n")
-    assert column_count(path, "three") == 0
+    assert layout_of(path, "three").columns == 0
     path.write_text("1 2 3\n# x\n1 2\n")
     with pytest.raises(BadInputError) as raised:
         read_table(path, 3, "three numbers")
@@ -66,7 +66,7 @@ def test_the_format_is_told_by_columns_or_given(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text(nerf_text(pose_z_up(0)))
     assert load(tmp_path / "a.txt", format="nerf").notes[0].startswith("NeRF")
     for text, kind, sentence in (
-        (other, "auto", "found 4 columns, expected 13 (ARKit) or 8 (TUM)"),
+        (other, "auto", "found 4 columns, expected 8 (TUM, EuRoC), 12 (KITTI) or 13 (ARKit), or column names"),
         (
             tum,
             "arkit",
@@ -89,8 +89,8 @@ def test_the_format_is_told_by_columns_or_given(tmp_path: Path) -> None:
     with pytest.raises(BadInputError) as raised:
         load(tmp_path / "nowhere.txt")
     assert str(raised.value) == (
-        f"{tmp_path}/nowhere.txt: found no such file, expected a camera file: an ARKit log, a TUM trajectory or a NeRF "
-        "transforms.json"
+        f"{tmp_path}/nowhere.txt: found no such file, expected a camera: an ARKit log, a TUM, KITTI or EuRoC "
+        "trajectory, a transforms.json, odometry.csv of Stray Scanner or a folder of COLMAP"
     )
 
 

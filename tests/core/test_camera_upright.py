@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from trilane.scene.camera.recorded import MAP_M, near_origin
+from trilane.scene.camera.map_frame import MAP_M, near_origin
 from trilane.scene.camera.upright import UP, upright
 from trilane.scene.rotations import about, matrix_from_rotvec
 
@@ -79,6 +79,6 @@ def test_the_offset_of_a_map_is_taken_off_and_said() -> None:
     places = np.array([[500_010.0, 5_400_020.0, 300.0], [500_012.4, 5_400_020.0, 300.0], [np.nan, 0, 0]])
     near, notes = near_origin(places)
     assert near[1] - near[0] == pytest.approx([2.4, 0, 0]) and np.abs(near[:2]).max() < 2.0
-    assert notes == ("origin of the map moved: (500011, 5400020, 300) m subtracted from all places",)
+    assert notes == ("origin of the map moved: (500011, 5400020, 300) subtracted from all places",)
     for kept in (np.full((3, 3), MAP_M), np.full((2, 3), np.nan)):
         assert near_origin(kept)[1] == () and near_origin(kept)[0] is kept

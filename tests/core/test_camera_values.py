@@ -49,6 +49,7 @@ def test_an_arkit_pose_puts_points_at_their_pixels(tmp_path: Path) -> None:
         "Y up",
         "field of view 36 degrees high, usual for a phone",
         "one pose: held",
+        "taken for ARKit log: 13 columns: a time and a 3x4 matrix",
     )
 
 
@@ -108,6 +109,7 @@ def test_a_tum_pose_puts_points_at_their_pixels(tmp_path: Path) -> None:
         "Z up",
         "field of view 49.8 degrees high, usual for a Kinect",
         "0.50 s, then plays back and forth",
+        "taken for TUM trajectory: 8 columns: the quaternion's scalar is taken to be last",
     )
     assert OPENGL_FROM_OPTICAL.tolist() == [[1, 0, 0], [0, -1, 0], [0, 0, -1]]
 

@@ -33,7 +33,7 @@ def test_of_real_poses_without_a_rate(shared_data: Path) -> None:
 def test_of_real_cameras(shared_data: Path) -> None:
     formats = {
         "arkit_camera_pose.txt": ("ARKit log", "13 columns"),
-        "tum_freiburg1_xyz.txt": ("TUM trajectory", "8 col"),
+        "tum_freiburg1_xyz.txt": ("TUM trajectory", "column names"),
     }
     for name, (format_, reason) in formats.items():
         found = load_camera(CameraSpec(source=str(shared_data / "camera" / name)), Path()).detected

@@ -23,7 +23,7 @@ def test_what_a_scene_leaves_out() -> None:
         "output": {"width": 640, "height": 480},
         "camera": {
             "source": "builtin:orbit", "format": "auto", "fov_y_deg": None, "up_axis": "auto",
-            "near_m": 0.05, "far_m": 100.0, "place": "auto",
+            "metres_per_unit": None, "rate_hz": None, "near_m": 0.05, "far_m": 100.0, "place": "auto",
         },
         "avatars": ({
             "name": "avatar1", "bundle": "default", "motion": "builtin:walk-wave-turn",
@@ -57,7 +57,10 @@ LIMITS: list[tuple[type, str, list[Any], list[Any]]] = [
     (AvatarSpec, "speed", [0.01, 100], [0, 101, math.nan]),
     (AvatarSpec, "loop", ["auto", "repeat", "back-and-forth", "hold"], ["bounce"]),
     (AvatarSpec, "ground", ["auto", "sequence", "frame", "none"], ["floor"]),
-    (CameraSpec, "format", ["auto", "arkit", "tum", "nerf"], ["colmap"]),
+    (CameraSpec, "format", ["auto", "arkit", "colmap", "euroc", "kitti", "nerf", "stray", "tum"], ["fbx"]),
+    (CameraSpec, "up_axis", ["auto", "x", "y", "z", "-x", "-y", "-z"], ["+x", "Y"]),
+    (CameraSpec, "metres_per_unit", [1e-9, 1e6, None], [0, -1, 1.1e6, math.nan]),
+    (CameraSpec, "rate_hz", [1e-3, 1000, None], [0, 0.9e-3, 1001, math.nan]),
     (CameraSpec, "fov_y_deg", [1.1, 169.9, None], [1, 170, math.nan]),
     (CameraSpec, "near_m", [1e-4, 99.9], [0, 100, 0.99e-4, math.nan]),
     (CameraSpec, "far_m", [0.051, 5e4], [0, 0.05, 5.01e4, math.inf]),

@@ -1,0 +1,64 @@
+"""Tables with a time, a place and a quaternion in each line, whatever the order of their columns.
+
+Rule: column names decide the order where a file has them, else its format does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from trilane.arrays import F64
+from trilane.scene.camera.text_table import POSE, Table, in_seconds, layout_of, read_table
+from trilane.scene.rotations import matrix_from_quat, normalised
+
+USUAL = "as usual"
+
+
+@dataclass(frozen=True)
+class PoseTable:
+    """`times_s` (N,): from 0. `turns` (N, 3, 3) and `places` (N, 3): as the file has them.
+
+    `time`: unit of the file's times. `step_s`: their median step. `order`: where the order of columns comes from.
+    `names`: what the columns of `table` hold.
+    """
+
+    times_s: F64
+    turns: F64
+    places: F64
+    time: str
+    step_s: float
+    order: str
+    names: Sequence[str]
+    table: Table
+
+    @property
+    def rate(self) -> str:
+        """For notes: `, 30/s`; empty where it is unknown."""
+        return f", {1 / self.step_s:.4g}/s" if self.step_s > 0 else ""
+
+    def column(self, name: str) -> F64:
+        """The numbers (N,) of the column that holds `name`."""
+        return self.table.numbers[:, self.names.index(name)]
+
+
+def read_pose_table(path: Path, usual: Sequence[str], expected: str, may_have_more: bool = False) -> PoseTable:
+    """The poses of `path`.
+
+    `usual`: what columns hold in the format. `may_have_more`: whether others may follow. Raises BadInputError with the
+    line.
+    """
+    layout = layout_of(path, expected)
+    names = layout.names if layout.has_pose else tuple(usual)
+    order = USUAL if names[: len(usual)] == tuple(usual) else "by the file's column names"
+    if may_have_more or layout.has_pose:
+        fitting = (*names, *[""] * (layout.columns - len(names)))[: layout.columns]
+        names = fitting if set(POSE) <= set(fitting) else names
+    table = read_table(path, len(names), expected)
+    time, x, y, z, qw, qx, qy, qz = (table.numbers[:, names.index(name)] for name in POSE)
+    times, step, unit = in_seconds(time)
+    turns = matrix_from_quat(normalised(np.column_stack([qw, qx, qy, qz])))
+    return PoseTable(times, turns, np.column_stack([x, y, z]), unit, step, order, names, table)
