@@ -98,8 +98,10 @@ def calibrations(
     console = stderr_console()
     if plot is not None:
         from trilane.hw_profiles.plot import figure_for
+        from trilane.writing import require_writable
 
-        figure_for(plot, (1, 1))  # that it can be drawn is found out before the work
+        figure_for(plot, (1, 1))  # that it can be drawn and written is found out before the work
+        require_writable(plot)
     model, inputs, held_out = _material(source, frames, avatar)
     table_rows = calibration_table(model, inputs, methods, held_out=held_out)
     steps = len(methods) * len(COUNTS)

@@ -155,7 +155,10 @@ def test_an_avatar_brings_its_network_and_views(
         assert (
             "a float network and its --frames, or --avatar alone" in command("avatar", "calibrations", *bad, code=2)[1]
         )
+    done = len(asked)
     assert "one of .png, .svg, .pdf" in command(*words, "--plot", tmp_path / "c.bmp", code=2)[1]
+    assert "a place that can be written" in command(*words, "--plot", tmp_path / "none" / "c.png", code=2)[1]
+    assert len(asked) == done
 
 
 class Work:
