@@ -28,7 +28,7 @@ class Entry:
     `command`: word by word; empty where none is known. `frame_ms`, `low_ms`, `high_ms`: mean frame time and its
     interval, None where there is none; `interval`: what that holds. `psnr_db`: the error; `error_source`: where it
     comes from, or why there is none; `error_of`: `OF_RUN`, `OF_AVATAR`, or empty. `shows`: what the pictures are of.
-    `video`: of a run. `failure`: why there are no figures.
+    `video`: of a run. `failure`: why there are no figures. `within`: name of the folder of its run, or of its sweep.
     """
 
     name: str
@@ -49,6 +49,7 @@ class Entry:
     interval: str = ""
     error_of: str = ""
     shows: str = ""
+    within: str = ""
 
     @property
     def speed_source(self) -> str:

@@ -6,7 +6,9 @@ Rule: every file is opened with its size checked; what cannot be read is refused
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +24,11 @@ MOST = 10_000
 
 
 def read_entries(places: Sequence[Path]) -> list[Entry]:
-    """The entries of all `places`, in their order. Raises BadInputError; so it does where there are none."""
+    """The entries of all `places`, in their order; of two with one name each is called after its folder, too.
+
+    A run or a sweep in a folder of these that cannot be read is an entry with a `failure`.
+    Raises BadInputError for a place that cannot be read, and where there are no entries.
+    """
     entries: list[Entry] = []
     for place in places:
         before = len(entries)
@@ -32,22 +38,33 @@ def read_entries(places: Sequence[Path]) -> list[Entry]:
                 raise BadInputError(place, f"more than {MOST} runs and trials", f"at most {MOST} for a page")
         if len(entries) == before:
             raise BadInputError(place, "no run and no trial", EXPECTED)
-    return entries
+    names = Counter(entry.name for entry in entries)
+    return [replace(each, name=f"{each.within}/{each.name}") if names[each.name] > 1 else each for each in entries]
 
 
 def _entries(place: Path) -> Iterator[Entry]:
+    within = place.absolute().parent.name
     if place.is_file():
-        yield entry_of(place.stem, _document(place))
+        yield replace(entry_of(place.stem, _document(place)), within=within)
     elif not place.is_dir():
         raise BadInputError(place, instead_of_file(place), EXPECTED)
     elif (place / REPORT).is_file():
-        yield entry_of(place.name, _document(place / REPORT), place / VIDEO)
+        yield replace(entry_of(place.name, _document(place / REPORT), place / VIDEO), within=within)
     elif (place / TRIALS).is_file():
-        yield from (_trial(place, trial) for trial in read_trials(place).values())
+        trials = [_trial(place, trial) for trial in read_trials(place).values()]
+        yield from (replace(trial, within=place.absolute().name) for trial in trials)
     else:
         for folder in sorted(path for path in place.iterdir() if path.is_dir() and path.suffix != ".partial"):
             if (folder / REPORT).is_file() or (folder / TRIALS).is_file():
-                yield from _entries(folder)
+                yield from _one_of_many(folder)
+
+
+def _one_of_many(folder: Path) -> list[Entry]:
+    try:
+        return list(_entries(folder))
+    except BadInputError as error:
+        damaged = entry_of(folder.name, {"failure": f"cannot be read: {error}"})
+        return [replace(damaged, within=folder.absolute().parent.name)]
 
 
 def _document(path: Path) -> Mapping[str, Any]:

@@ -207,6 +207,28 @@ def test_what_is_no_document_is_named(tmp_path: Path, content: str, found: str) 
         read_entries([tmp_path])
 
 
+def test_one_damaged_run_of_many_is_a_row(tmp_path: Path) -> None:
+    for name, text in {"bad": "{", "good": json.dumps(REPORT)}.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "report.json").write_text(text)
+    (_sweep(tmp_path / "torn") / "trials.jsonl").write_text("x\n{}\n")
+    bad, good, torn = read_entries([tmp_path])
+    assert (good.name, good.frame_ms, good.failure) == ("good", 20.0, "")
+    assert (bad.frame_ms, torn.frame_ms) == (None, None)
+    assert bad.failure.startswith(f"cannot be read: {tmp_path / 'bad' / 'report.json'}: ")
+    assert "line 1: found no trial" in torn.failure
+    with pytest.raises(BadInputError, match="bad"):
+        read_entries([tmp_path / "bad", tmp_path / "good"])
+
+
+def test_entries_of_one_name_are_told_apart(tmp_path: Path) -> None:
+    for name in ("left", "right"):
+        _sweep(tmp_path / name)
+    other = _sweep(tmp_path / "other")
+    (other / "trials.jsonl").write_text('{"id": "ef", "status": "done"}\n')
+    assert [entry.name for entry in read_entries([tmp_path])] == ["left/ab", "left/cd", "ef", "right/ab", "right/cd"]
+
+
 def test_a_folder_without_runs_is_refused(tmp_path: Path) -> None:
     for place in (tmp_path, tmp_path / "none"):
         with pytest.raises(BadInputError, match="a run folder"):
