@@ -127,9 +127,9 @@ def slerp(start: ArrayLike, end: ArrayLike, fraction: ArrayLike) -> F64:
 
 
 def normalised(vectors: ArrayLike) -> F64:
-    """Vectors (..., n) at unit length; a zero vector gives NaN."""
+    """Vectors (..., n) at unit length; one whose square is zero gives no finite numbers."""
     v = np.asarray(vectors, dtype=np.float64)
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(v / np.sqrt((v * v).sum(axis=-1, keepdims=True)))
 
 

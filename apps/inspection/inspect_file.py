@@ -46,7 +46,7 @@ def inspect_file(path: Path) -> Inspection:
     if signature is not None:
         return _foreign(signature)
     if kind == recognise.GLTF:
-        return _foreign(Signature("a glTF file (VRM)", remedy=AS_BVH))
+        return _foreign(Signature("a glTF file", remedy=AS_BVH))
     if kind not in READERS:
         return UNKNOWN
     read, what = READERS[kind]

@@ -5,7 +5,7 @@ Rule: nothing is placed in a scene here, so that what is said is of the file alo
 
 from __future__ import annotations
 
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from PIL import Image
 from trilane.apps.inspection.drawn_paths import cameras, skeletons
 from trilane.apps.inspection.inspection import Inspection, Length
 from trilane.avatars.bundle import DEFAULT, bundle_folder
-from trilane.body.body import load_body
+from trilane.body.body import ShapedBody, load_body
 from trilane.body.kinematics import Skeleton
 from trilane.scene.camera.load import load_camera
 from trilane.scene.camera.path import CameraPath
@@ -29,7 +29,7 @@ MOST_PATH_POINTS = 2000
 
 def inspect_motion(path: Path) -> Inspection:
     """Raises BadInputError when the motion is not usable."""
-    motion = load_motion(AvatarSpec(motion=str(path.absolute())), Path())
+    motion = load_motion(AvatarSpec(motion=str(path.absolute())), Path(), _body().joints)
     places = motion.translation
     facts = {
         "travels": motion.travels,
@@ -76,8 +76,14 @@ def inspect_camera(path: Path) -> Inspection:
     )
 
 
+@cache
+def _body() -> ShapedBody:
+    """On which motions are shown: the default avatar's."""
+    return load_body(bundle_folder(DEFAULT) / "body.npz").shape()
+
+
 def _drawn_motion(motion: Motion) -> Image.Image:
-    body = load_body(bundle_folder(DEFAULT) / "body.npz").shape()
+    body = _body()
     skeleton = Skeleton(body.joints, body.body.parents)
     times = np.linspace(0.0, motion.duration_s, MOMENTS if motion.duration_s else 1)
     joints = []

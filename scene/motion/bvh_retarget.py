@@ -44,7 +44,10 @@ def load_retargeted(path: Path, units: str, joint_map: Mapping[str, str] = NO_MA
     bvh = load_bvh(path)
     dialect, index_of, of_roots = _person(path, bvh.joints, joint_map)
     tracks, readable = tracks_of(bvh, index_of)
-    leg = leg_length(tracks) if readable.any() else 0.0
+    if not readable.any():
+        found = f"numbers that are not finite, or absurdly large, in all of {len(readable)} frames"
+        raise BadInputError(path, found, "at least half of the frames sound")
+    leg = leg_length(tracks)
     if leg < LEAST_LENGTH or np.linalg.norm(tracks.across("hip"), axis=-1).min() < LEAST_LENGTH:
         raise BadInputError(path, "legs of no length or hips in one place", "a skeleton with OFFSETs")
     unit, unit_m = unit_of(leg, units)

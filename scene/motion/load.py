@@ -13,7 +13,7 @@ import numpy as np
 
 from trilane.arrays import F64
 from trilane.errors import BadInputError
-from trilane.files import require_file
+from trilane.files import refuse_other, require_file
 from trilane.near_miss import did_you_mean
 from trilane.scene.motion.array_files import load_npy, load_npz, load_pickle
 from trilane.scene.motion.builtin import BUILTIN
@@ -53,12 +53,23 @@ def load_motion(spec: AvatarSpec, base: Path, rest: F64 = T_POSE) -> Motion:
     path = base / spec.motion
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
-        raise BadInputError(path, f"the ending {path.suffix!r}", f"a motion file: {', '.join(_READERS)}")
+        raise _of_no_reader(path)
     _check_named(spec, path)
     require_file(path, "a motion file")
     with np.errstate(over="ignore", invalid="ignore"):  # `usable_samples` leaves out what is not finite
         motion = motion_from_recording(reader(path, spec, rest), str(path), spec.up_axis)
     return as_played(motion, spec, str(path))
+
+
+def _of_no_reader(path: Path) -> BadInputError:
+    """What is wrong with a file that has the ending of no motion."""
+    expected = f"a motion file: {', '.join(_READERS)}"
+    try:
+        require_file(path, expected)
+        refuse_other(path, expected)
+    except BadInputError as error:
+        return error
+    return BadInputError(path, f"the ending {path.suffix!r}", expected)
 
 
 def _check_named(spec: AvatarSpec, motion: str | Path) -> None:

@@ -89,11 +89,11 @@ def read_text(path: Path, expected: str) -> str:
 
 
 def refuse_other(path: Path, expected: str, *groups: str) -> None:
-    """Raises BadInputError for a file whose head is that of a known format, unless it is of one of `groups`.
-
-    OSError of one that cannot be read.
-    """
-    signature = signature_of(path)
+    """Raises BadInputError for a file whose head is that of a known format, unless it is of one of `groups`."""
+    try:
+        signature = signature_of(path)
+    except OSError as error:
+        raise BadInputError.of_os_error(path, error, expected) from None
     if signature is not None and signature.group not in groups:
         raise BadInputError(path, signature.name, expected, signature.remedy)
 

@@ -120,7 +120,7 @@ REFUSED: dict[str, tuple[bytes, str, str, str]] = {
     "an FBX by its own name": (b"Kaydara FBX Binary  \0", "man.fbx", "an FBX file", "Motion Capture (.bvh)"),
     "an FBX named BVH": (b"Kaydara FBX Binary  \0", "man.bvh", "an FBX file", "Motion Capture (.bvh)"),
     "a GLB": (b"glTF\x02\0\0\0", "man.glb", "a binary glTF file (GLB, VRM)", "Motion Capture (.bvh)"),
-    "a glTF": (b'{"asset": {"version": "2.0"}}', "man.gltf", "a glTF file (VRM)", "Motion Capture (.bvh)"),
+    "a glTF": (b'{"asset": {"version": "2.0"}}', "man.gltf", "a glTF file", "Motion Capture (.bvh)"),
     "a USD": (b"PXR-USDC\0", "man.usdc", "a USD file", "Motion Capture (.bvh)"),
     "a ZIP": (b"PK\x05\x06" + bytes(18), "all.zip", "a ZIP archive", "unpack it"),
     "a letter": (b"Dear reader,\n", "a.txt", "nothing that Trilane knows", "motions: .bvh"),

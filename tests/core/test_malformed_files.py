@@ -202,6 +202,11 @@ ANY_TEXT: dict[str, tuple[Content, str]] = {
     "web page": (b"<!DOCTYPE html>\n<html><title>404</title>", "a web page"),
     "packed": (b"\x1f\x8b\x08\0" + bytes(20), "a packed file"),
 }
+OF_NO_READER: dict[str, tuple[Content, str]] = {
+    "FBX": (FBX, "an FBX file"),
+    "text": (BVH, "the ending '.fbx'"),
+    "missing": (lambda _: None, "no such file"),
+}
 BVH_FILES: dict[str, tuple[Content, str]] = {
     "ASCII FBX": ("; FBX 7.5.0 project file\n", "an FBX file"),
     "GLB": (b"glTF\x02\0\0\0" + bytes(40), "a binary glTF file"),
@@ -227,7 +232,10 @@ BVH_FILES: dict[str, tuple[Content, str]] = {
     "too many joints": ("HIERARCHY\nROOT a {\nOFFSET 0 0 0\n" + "JOINT b {\nOFFSET 0 0 0\n" * 2000, "more than 1000"),
     "a chair": (BVH.replace("Leg", "Chair").replace("Hips", "Seat"), "joints"),
     "legs of no length": (BVH.replace("0 -42 0", "0 0 0"), "legs of no length"),
-    "all frames nan": (bvh(lambda lines: lines.__setitem__(slice(FIRST, None), ["nan " * 51] * 4)), "of 4"),
+    "all frames nan": (
+        bvh(lambda lines: lines.__setitem__(slice(FIRST, None), ["nan " * 51] * 4)),
+        "in all of 4 frames",
+    ),
 }
 ARRAY_FILES: dict[str, tuple[Content, str]] = {
     "text": (BVH, "no readable NumPy array"),
@@ -359,6 +367,7 @@ def table() -> dict[str, tuple[Callable[[Path], None], str, Content, str]]:
             found[f"{NAMES[read]}: {what}"] = (read, NAMES[read], content, words)
     for read, name, rows in (
         (MOTION, "a.bvh", BVH_FILES),
+        (MOTION, "a.fbx", OF_NO_READER),
         (MOTION, "a.npy", ARRAY_FILES),
         (MOTION, "a.npz", AMASS_FILES),
         (CAMERA, "a.txt", TABLES),
@@ -374,7 +383,7 @@ def table() -> dict[str, tuple[Callable[[Path], None], str, Content, str]]:
 
 ROWS_OF_ALL = table()
 #: What is told by content is usable, for something else than what it was given as.
-OF_ANOTHER_KIND = {(MOTION, "picture"), (CAMERA, "picture"), (BODY, "motion")}
+OF_ANOTHER_KIND = {(MOTION, "motion"), (MOTION, "picture"), (CAMERA, "picture"), (BODY, "motion")}
 
 
 def test_there_are_more_than_a_hundred() -> None:
