@@ -46,13 +46,15 @@ class Stored:
 
 @dataclass(frozen=True)
 class Footage:
-    """A background. `what`: it is, for people. `stored`: the video or the picture; of a folder, each of its pictures.
+    """A background. `what` it is, and the `rate` at which its frames follow each other, for people.
 
-    `files`: names of pictures, in the order of `stored`; none of a video. `folder`: where they are. `period_s`:
-    after which time it starts again; 0 for a single picture.
+    `stored`: the video or the picture; of a folder, each of its pictures. `files`: names of pictures, in the order of
+    `stored`; none of a video. `folder`: where they are. `period_s`: after which time it starts again; 0 for a single
+    picture.
     """
 
     what: tuple[str, ...]
+    rate: tuple[str, ...]
     stored: tuple[Stored, ...]
     files: tuple[str, ...] = ()
     folder: str = ""
@@ -67,7 +69,12 @@ def filmed(path: CameraPath, footage: Footage | None, output: Shape) -> tuple[Ca
     if footage is None:
         return path, ()
     if not path.recorded:
-        return path, (*footage.what, _loop(footage), cut_note([one.shown() for one in footage.stored], output))
+        return path, (
+            *footage.what,
+            *footage.rate,
+            _loop(footage),
+            cut_note([one.shown() for one in footage.stored], output),
+        )
     matched, notes = _with_photos(path, footage)
     if matched is None:
         return _over_all(path, footage, output, notes)
@@ -85,6 +92,7 @@ def _over_all(
     camera = replace(camera, repeat_s=footage.period_s)
     return camera, (
         *footage.what,
+        *footage.rate,
         _loop(footage),
         *notes,
         *turn_notes,

@@ -42,6 +42,6 @@ def stage_scene(scene: Scene, bodies: Sequence[ShapedBody], base: Path, footage:
     path, seen = filmed(load_camera(scene.camera, base), footage, output)
     camera = place_camera(path, scene, movers, bodies)
     notes = [f"motion: {note}" for mover in movers for note in (*mover.motion.notes, *mover.notes)]
-    notes += [f"camera: {note}" for note in (*path.notes, *camera.notes)]
+    notes += [f"camera: {note}" for note in (*path.notes, *((path.course,) if path.recorded else ()), *camera.notes)]
     notes += [f"background: {note}" for note in seen]
     return Staged(movers, camera, tuple(notes))

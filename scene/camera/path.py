@@ -132,6 +132,14 @@ class CameraPath:
         """Time of the last sample."""
         return float(self.times_s[-1])
 
+    @property
+    def course(self) -> str:
+        """How long it lasts and what follows, for people."""
+        if len(self.times_s) == 1:
+            return "one pose: held"
+        then = "starts again with the background" if self.repeat_s else self.wrap.value
+        return f"{self.duration_s:.2f} s, then {then}"
+
     def pose(self, t_s: float) -> tuple[F64, F64]:
         """Turn (3, 3) and place (3,) of the camera at `t_s`."""
         i, j, fraction = self._between(t_s)

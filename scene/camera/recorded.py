@@ -82,7 +82,6 @@ def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraP
         *scale_notes,
         seen,
         *repairs,
-        f"{times[-1] - times[0]:.2f} s, then plays back and forth" if len(times) > 1 else "one pose: held",
     )
     unit = " ".join(scale_notes) or raw.detected.unit
     detected = replace(raw.detected, axes=upright.note, unit=unit, lens=seen)

@@ -39,7 +39,7 @@ def survey(path: Path, fps: float) -> Footage:
     require_file(path, "a video, a picture, or a folder of pictures")
     if is_picture(path):
         stored = look_at_picture(path)
-        return Footage((f"picture of {_size(stored)}",), (stored,), (path.name,), str(path.absolute().parent))
+        return Footage((f"picture of {_size(stored)}",), (), (stored,), (path.name,), str(path.absolute().parent))
     return _video(path)
 
 
@@ -74,9 +74,11 @@ def _folder(path: Path, fps: float) -> Footage:
     names = tuple(picture.name for picture in pictures)
     sizes = {_size(one) for one in stored}
     size = sizes.pop() if len(sizes) == 1 else f"{len(sizes)} sizes, the first {_size(stored[0])}"
-    what = [f"folder of {len(pictures)} pictures of {size}, {fps:g}/s"]
     missing = film_of(names).note
-    return Footage((*what, *((missing,) if missing else ())), stored, names, str(path.absolute()), period_s)
+    rate = (f"{fps:g}/s", *((missing,) if missing else ()))
+    return Footage(
+        (f"folder of {len(pictures)} pictures of {size}",), rate, stored, names, str(path.absolute()), period_s
+    )
 
 
 def _size(stored: Stored) -> str:
@@ -103,7 +105,7 @@ def _video(path: Path) -> Footage:
         raise BadInputError(path, f"no readable video ({error})", "a video that FFmpeg can decode") from error
     steps = sorted(later - earlier for earlier, later in pairwise(times))
     period_s = times[-1] - times[0] + (times[-1] - times[-2] if steps else DEFAULT_STEP_S)
-    what = [f"video of {_size(head.stored)}, {head.codec}, {_rate(steps, period_s)}"]
+    what = [f"video of {_size(head.stored)}, {head.codec}"]
     if head.pixels.transfer:
         what.append(
             f"high range ({head.pixels.transfer}, {head.bits} bits): tone mapped by ITU-R BT.2390, white at 203 cd/m2, "
@@ -111,7 +113,7 @@ def _video(path: Path) -> Footage:
         )
     elif head.bits > EIGHT_BITS:
         what.append(f"{head.bits} bits a colour: shown with 8")
-    return Footage(tuple(what), (head.stored,), period_s=period_s)
+    return Footage(tuple(what), (_rate(steps, period_s),), (head.stored,), period_s=period_s)
 
 
 def _head(container: Any, path: Path) -> _Head:

@@ -174,7 +174,7 @@ def test_any_text_is_read_or_refused(tmp_path_factory: pytest.TempPathFactory, t
 
 def test_one_pose_is_held_and_a_path_runs_back(tmp_path: Path) -> None:
     still = load(write_arkit(tmp_path / "one.txt", [arkit_line(5.0, *path_of_poses(1)[0])]))
-    assert "one pose: held" in still.notes
+    assert still.course == "one pose: held"
     assert still.sample(123.0) == pytest.approx(still.sample(0.0))
     camera = load(arkit(tmp_path))
     assert camera.sample(0.08 + 0.03) == pytest.approx(camera.sample(0.08 - 0.03))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -43,12 +44,12 @@ def test_an_arkit_pose_puts_points_at_their_pixels(tmp_path: Path) -> None:
     f = focal(36.0)
     assert pixel(camera, [5.0, 3.0, 3.5]) == pytest.approx((320 + f / 8, 240 - f / 4))
     assert fov_y(camera) == pytest.approx(36.0)
+    assert camera.course == "one pose: held"
     assert (camera.optics.near_m, camera.optics.far_m, camera.optics.filmed) == (0.05, 100.0, ())
     assert camera.notes == (
         "ARKit log, 1 poses, time in s, camera to world",
         "Y up",
         "field of view 36 degrees high, usual for a phone",
-        "one pose: held",
         "taken for ARKit log: 13 columns: a time and a 3x4 matrix",
     )
 
@@ -100,6 +101,8 @@ def test_a_tum_pose_puts_points_at_their_pixels(tmp_path: Path) -> None:
     h = math.sqrt(0.5)
     (tmp_path / "a.txt").write_text(f"10 1 2 3 {-h} 0 0 {h}\n10.5 1 2 4 {-2 * h} 0 0 {2 * h}\n")
     camera = load(tmp_path / "a.txt")
+    assert camera.course == "0.50 s, then plays back and forth"
+    assert replace(camera, repeat_s=2.0).course == "0.50 s, then starts again with the background"
     f = 517.0
     # 4 m ahead (+Y), 0.5 m right (+X), 1 m up (+Z): (1.5, 6, 4) of the recording; Y up world: (x, z, -y).
     assert pixel(camera, [1.5, 4.0, -6.0]) == pytest.approx((320 + f / 8, 240 - f / 4))
@@ -108,7 +111,6 @@ def test_a_tum_pose_puts_points_at_their_pixels(tmp_path: Path) -> None:
         "TUM trajectory, 2 poses, 2/s, optical axes, camera to world",
         "Z up",
         "field of view 49.8 degrees high, usual for a Kinect",
-        "0.50 s, then plays back and forth",
         "taken for TUM trajectory: 8 columns: the quaternion's scalar is taken to be last",
     )
     assert OPENGL_FROM_OPTICAL.tolist() == [[1, 0, 0], [0, -1, 0], [0, 0, -1]]
@@ -215,7 +217,6 @@ def test_what_the_scene_says_of_the_lens_wins() -> None:
         "x",
         "Y up",
         "field of view 50.5 degrees high, as given",
-        "1.00 s, then plays back and forth",
     )
     assert camera.recorded and camera.wrap is Wrap.BOUNCE
     holed = RawCamera(np.arange(5.0), np.tile(np.eye(3), (5, 1, 1)), np.zeros((5, 3)), "y", LENSES, "usual", ())
@@ -225,7 +226,6 @@ def test_what_the_scene_says_of_the_lens_wins() -> None:
         "field of view 36 degrees high, usual",
         "1 samples not finite (first: number 2), interpolated across",
         "1 gaps, the longest 2000 ms, interpolated across",
-        "4.00 s, then plays back and forth",
     )
 
 

@@ -26,7 +26,7 @@ def camera(count: int, pictures: tuple[str, ...] = (), lenses: tuple[Lens, ...] 
 
 
 def folder(*names: str, shape: tuple[int, int] = OUTPUT) -> Footage:
-    return Footage(("folder",), (Stored(shape),) * len(names), names, "/photos", 2.0)
+    return Footage(("folder",), ("30/s",), (Stored(shape),) * len(names), names, "/photos", 2.0)
 
 
 def test_a_drawn_background_is_filmed_by_nobody() -> None:
@@ -36,10 +36,15 @@ def test_a_drawn_background_is_filmed_by_nobody() -> None:
 
 def test_a_built_in_camera_has_its_own_lens_before_any_background() -> None:
     path = replace(camera(3), recorded=False)
-    video = Footage(("video",), (Stored((1920, 1080)),), period_s=2.5)
+    video = Footage(("video",), ("30/s",), (Stored((1920, 1080)),), period_s=2.5)
     assert filmed(path, video, OUTPUT) == (
         path,
-        ("video", "2.50 s, then starts again", "shown at 640x480: 58% of its height cut off, equally at both ends"),
+        (
+            "video",
+            "30/s",
+            "2.50 s, then starts again",
+            "shown at 640x480: 58% of its height cut off, equally at both ends",
+        ),
     )
 
 
@@ -81,8 +86,9 @@ def test_photos_of_the_same_name_in_several_folders() -> None:
 def test_pictures_that_the_camera_does_not_name_follow_each_other() -> None:
     path, notes = filmed(camera(3, ("a", "b", "c")), folder("1.png", "2.png"), OUTPUT)
     assert (path.is_held, path.repeat_s) == (False, 2.0)
-    assert notes[:3] == (
+    assert notes[:4] == (
         "folder",
+        "30/s",
         "2.00 s, then starts again",
         "it has none of the 3 photos that the camera's file names, such as a",
     )
@@ -90,16 +96,16 @@ def test_pictures_that_the_camera_does_not_name_follow_each_other() -> None:
 
 def test_camera_and_video_start_again_together() -> None:
     """The video lasts 1.5 s, the path 2 s: at 1.75 s both are where they were at 0.25 s."""
-    path, notes = filmed(camera(3), Footage(("video",), (Stored(OUTPUT),), period_s=1.5), OUTPUT)
+    path, notes = filmed(camera(3), Footage(("video",), ("30/s",), (Stored(OUTPUT),), period_s=1.5), OUTPUT)
     for t_s, x in ((0.25, 0.25), (1.49, 1.49), (1.5, 0.0), (1.75, 0.25), (4.6, 0.1)):
         assert path.pose(t_s)[1][0] == pytest.approx(x)
     assert notes[-1] == "the camera's recording lasts 2.00 s: they may not belong together"
-    _, notes = filmed(camera(3), Footage(("video",), (Stored(OUTPUT),), period_s=2.03), OUTPUT)
-    assert notes == ("video", "2.03 s, then starts again", "shown at 640x480: all of it")
+    _, notes = filmed(camera(3), Footage(("video",), ("30/s",), (Stored(OUTPUT),), period_s=2.03), OUTPUT)
+    assert notes == ("video", "30/s", "2.03 s, then starts again", "shown at 640x480: all of it")
 
 
 def test_a_still_behind_a_moving_camera_is_said() -> None:
-    picture = Footage(("picture",), (Stored(OUTPUT),), ("a.png",), "/photos")
+    picture = Footage(("picture",), (), (Stored(OUTPUT),), ("a.png",), "/photos")
     assert filmed(camera(3), picture, OUTPUT)[1][-1] == "it does not follow the camera, which moves by up to 2.0 m"
     assert filmed(camera(1), picture, OUTPUT)[1] == ("picture", "stands still", "shown at 640x480: all of it")
     path, _ = filmed(camera(3, ("b", "a", "c")), picture, OUTPUT)
@@ -124,7 +130,7 @@ UPRIGHT = replace(LENS.turned(1), known=Known.LONG)
 def test_a_background_is_turned_as_the_camera_was_held(
     stored: Stored, lens: Lens, quarter: int, turned: int, shown: tuple[int, int]
 ) -> None:
-    video = Footage(("video",), (stored,), period_s=2.0)
+    video = Footage(("video",), ("30/s",), (stored,), period_s=2.0)
     path, notes = filmed(camera(3, lenses=(lens,), quarter=quarter), video, OUTPUT)
     assert (path.optics.turned, path.optics.filmed) == ((turned,), (shown,))
     assert ("turned with the camera's picture, and not as the file says" in notes) == (turned != stored.turned)
@@ -143,7 +149,7 @@ def test_a_background_is_turned_as_the_camera_was_held(
     ],
 )
 def test_a_photo_is_turned_as_its_lens_was_measured(stored: Stored, lens: Lens, quarter: int, turned: int) -> None:
-    photos = Footage(("folder",), (stored,), ("a.png",), "/photos", 1.0)
+    photos = Footage(("folder",), ("30/s",), (stored,), ("a.png",), "/photos", 1.0)
     path, _ = filmed(camera(1, ("a",), (lens,), quarter=quarter), photos, OUTPUT)
     assert path.optics.turned == (turned,)
 
@@ -155,7 +161,7 @@ def test_what_is_cut_off() -> None:
 
 
 def test_a_background_of_another_shape_than_the_sensor_is_said() -> None:
-    video = Footage(("video",), (Stored((720, 1280)),), period_s=2.0)
+    video = Footage(("video",), ("30/s",), (Stored((720, 1280)),), period_s=2.0)
     path, notes = filmed(camera(3), video, OUTPUT)
     assert "taken for the middle of the camera's picture of 640x480, which has another shape" in notes
     assert path.lens(0.0, (720, 1280)).fx == 1000
