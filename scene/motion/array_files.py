@@ -1,6 +1,7 @@
 """Reads motions out of `.npy`, `.npz` and `.pkl` files: one array of poses, or arrays with names.
 
-Rule: what is in a file decides how it is read, not its ending: an array is poses, a dict has a layout.
+Rule: what is in a file decides how it is read, not its ending: an array is poses or places of joints, a dict has a
+layout.
 """
 
 from __future__ import annotations
@@ -10,14 +11,17 @@ from typing import Any
 
 import numpy as np
 
+from trilane.arrays import F64
 from trilane.files import npz_names
 from trilane.scene.motion import romp_file
+from trilane.scene.motion.joint_places import motion_of_places, places_in
 from trilane.scene.motion.pickled import printable
 from trilane.scene.motion.recorded import RawMotion
 from trilane.scene.motion.smpl_file import motion_of
 from trilane.scene.motion.smpl_layouts import KEYS
 from trilane.scene.motion.smplx_npy import motion_of_array
 from trilane.scene.motion.stored import npy_values, npz_values, pickle_values, plain
+from trilane.scene.motion.t_pose import T_POSE
 
 EXPECTED = "a motion: arrays of axis-angle poses of SMPL, SMPL-H or SMPL-X"
 #: The name that NumPy gives to an array that is saved without one.
@@ -26,9 +30,16 @@ NPZ_KEYS = (*KEYS, romp_file.POSES, romp_file.PLACES, romp_file.PERSONS, NAMELES
 MOST_NAMED = 12
 
 
-def load_npy(path: Path) -> RawMotion:
-    """Read a `.npy` file. Raises BadInputError."""
-    return _motion(path, npy_values(path, EXPECTED))
+def load_npy(path: Path, units: str = "auto", rest: F64 = T_POSE) -> RawMotion:
+    """Read a `.npy` file. Raises BadInputError.
+
+    `units`: of places of joints, a key of UNITS_M or `auto`. `rest` (55, 3): rest joints of the avatar, metres.
+    """
+    values = plain(npy_values(path, EXPECTED))
+    places = places_in(values) if isinstance(values, np.ndarray) else None
+    if places is not None:
+        return motion_of_places(path.suffix.lower(), places, units, rest)
+    return _motion(path, values)
 
 
 def load_npz(path: Path) -> RawMotion:

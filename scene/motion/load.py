@@ -27,7 +27,7 @@ from trilane.scene.schema import AvatarSpec
 PREFIX = "builtin:"
 
 _READERS: dict[str, Callable[[Path, AvatarSpec, F64], RawMotion]] = {
-    ".npy": lambda path, _spec, _rest: load_npy(path),
+    ".npy": lambda path, spec, rest: load_npy(path, spec.units, rest),
     ".npz": lambda path, _spec, _rest: load_npz(path),
     ".pkl": lambda path, _spec, _rest: load_pickle(path),
     ".pickle": lambda path, _spec, _rest: load_pickle(path),

@@ -11,13 +11,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from trilane.errors import BadInputError
 from trilane.scene.detected import Detected
 from trilane.scene.motion.recorded import ANY, RawMotion
-from trilane.scene.motion.smpl_turns import WHOLE, turns_in
+from trilane.scene.motion.smpl_turns import WHOLE, shapes, turns_in
 from trilane.scene.rotations import matrix_from_rotvec, rotvec_from_matrix
 
 ASSUMED_RATE_HZ = 30.0
 POSE_SET_STEP_RAD = 0.7
+_AS_VECTORS = "turn them into axis-angle vectors, such as with scipy.spatial.transform.Rotation.as_rotvec"
+#: Shape of a row of what others save -> how it becomes usable.
+OTHERS: dict[tuple[int, ...], str] = {
+    (263,): "these are HumanML3D's features: make places of joints of them with its recover_from_ric and save those",
+    (251,): "these are the features of KIT-ML: use HumanML3D's places of 22 joints",
+    (135,): f"these look like turns of six numbers: {_AS_VECTORS}",
+    **{(count, 6): f"these are turns of six numbers: {_AS_VECTORS}" for count in (22, 24, 52, 55)},
+    **{(count, 4): f"these are quaternions: {_AS_VECTORS}" for count in (22, 24, 52, 55)},
+    **{(count, 3, 3): f"these are matrices: {_AS_VECTORS}" for count in (22, 24, 52, 55)},
+}
 
 
 def motion_of_array(where: str, source: str, array: NDArray[Any]) -> RawMotion:
@@ -25,6 +36,8 @@ def motion_of_array(where: str, source: str, array: NDArray[Any]) -> RawMotion:
 
     `where`: the file. `source`: its ending, for people. Raises BadInputError for anything else.
     """
+    if array.shape[1:] in OTHERS:
+        raise BadInputError(where, f"shape {array.shape}", f"{shapes(WHOLE)}, axis-angle", OTHERS[array.shape[1:]])
     read = turns_in(where, array, WHOLE)
     separate = median_step_rad(read.turns) > POSE_SET_STEP_RAD
     rate = 1.0 if separate else ASSUMED_RATE_HZ

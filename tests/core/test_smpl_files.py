@@ -77,7 +77,7 @@ def test_an_array_in_an_npz_or_a_pickle_is_poses_too(tmp_path: Path) -> None:
         assert raw.notes[0] == f"SMPL {path.suffix}, 4 frames"
 
 
-@pytest.mark.parametrize("shape", [(3, 71), (3, 24, 6), (3, 24, 3, 3), (3, 22, 4), (3, 69), (72,), (0, 72)])
+@pytest.mark.parametrize("shape", [(3, 71), (3, 23, 3), (3, 69), (72,), (0, 72)])
 def test_arrays_that_are_no_axis_angle_are_refused_with_the_widths(tmp_path: Path, shape: tuple[int, ...]) -> None:
     path = save(tmp_path / "a.npy", np.zeros(shape))
     with pytest.raises(BadInputError) as raised:
