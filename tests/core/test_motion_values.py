@@ -225,7 +225,7 @@ def test_the_ending_says_which_reader(tmp_path: Path) -> None:
         ("builtin:tpose", f"motion: found 'builtin:tpose', expected {names} or a file; did you mean 'builtin:t-pose'?"),
         (
             "a.fbx",
-            f"{tmp_path}/a.fbx: found the ending '.fbx', expected a motion file: .npy, .npz, .pkl, .pickle, .bvh",
+            f"{tmp_path}/a.fbx: found no such file, expected a motion file: .npy, .npz, .pkl, .pickle, .bvh",
         ),
         ("b.bvh", f"{tmp_path}/b.bvh: found no such file, expected a motion file"),
     ):
