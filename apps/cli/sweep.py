@@ -33,7 +33,7 @@ app = Commands()
 
 EPILOG = """\b
 Examples:
-  trilane sweep run --size 128 --size 256 --runtime ort --runtime openvino
+  trilane sweep run --size 128 --size 256 --runtime ort --runtime openvino --check 4
   trilane sweep predict --policy pipelined --edge double --edge triple --dry-run
   trilane sweep predict --channels 8 --channels 16 --size 256 --size 512 --random 3 --seed 1
   trilane sweep docs/examples/chip-sweep.toml --out sweeps/chips

@@ -20,6 +20,7 @@ from trilane.apps.overview.table_rows import columns, table_rows
 
 UNITS = {"frame_ms": "frame, ms", "low_ms": "from, ms", "high_ms": "to, ms", "latency_ms": "latency, ms"}
 UNITS |= {"psnr_db": "PSNR, dB", "frames_per_s": "frames/s", "on_frontier": "frontier"}
+NO_ERROR = "No entry has both a speed and a known error. `trilane run --check N` measures the error of a run."
 LONG = 40  # letters of a cell that is given room
 MEANING = (
     "Frame time is the mean between presented frames, from and to its interval: of a run 95 %, by the scatter of its "
@@ -67,7 +68,7 @@ def _drawing(entries: Sequence[Entry]) -> str:
     legend = "; ".join(f"{marker_name(number)}: {_told(group)}" for number, group in enumerate(groups))
     drawn = scatter(dots, "frame time, ms", "PSNR, dB")
     if not drawn:
-        return "<p>No entry has both a speed and a known error.</p>"
+        return f"<p>{escape(NO_ERROR)}</p>"
     return f'<div class="wide">{drawn}</div><p class="note">{escape(note + words + legend)}.</p>'
 
 

@@ -246,6 +246,12 @@ def test_the_page_escapes_and_asks_nobody() -> None:
     assert "1 of 2 have no speed or no known error" in text
 
 
+def test_a_page_without_errors_says_how_to_have_them() -> None:
+    text = page("t", [entry_of("one", REPORT | {"accuracy": {}})])
+    assert "No entry has both a speed and a known error. `trilane run --check N`" in text
+    assert "<svg" not in text
+
+
 def test_a_dot_stands_where_its_numbers_say() -> None:
     """Two dots: the axes reach a twentieth beyond them, so they stand at 1/22 and 21/22 of 640 by 336 pixels."""
     drawn = scatter([Dot("a", 10.0, None, None, 30.0, True, 0), Dot("b", 20.0, 18.0, 20.0, 31.0, True, 0)], "x", "y")
