@@ -2,8 +2,8 @@
 
 Rule: whatever is done to a picture is done to its lens by the method of the same name, so that a point of the world
 stays on its pixel. Pixels are counted from the picture's top left corner, x to the right and y down: the centre of the
-first pixel is at (0.5, 0.5), as COLMAP has it (https://colmap.github.io/cameras.html). Where a format counts from the
-centre of the first pixel, as OpenCV does, 0.5 is to be added to its principal point.
+first pixel is at (0.5, 0.5), as COLMAP has it (https://colmap.github.io/cameras.html). `of_opencv` is for formats that
+count from that centre.
 """
 
 from __future__ import annotations
@@ -168,6 +168,11 @@ class Lens:
 def centred(width_px: float, height_px: float, focal_px: float, known: Known = Known.ALL) -> Lens:
     """A lens with square pixels whose principal point is the middle of its picture."""
     return Lens(width_px, height_px, focal_px, focal_px, width_px / 2, height_px / 2, known)
+
+
+def of_opencv(width_px: float, height_px: float, fx: float, fy: float, cx: float, cy: float) -> Lens:
+    """A lens whose principal point is counted from the centre of the first pixel, as OpenCV and Kalibr do."""
+    return Lens(width_px, height_px, fx, fy, cx + 0.5, cy + 0.5)
 
 
 def of_fov_y(fov_y_deg: float) -> Lens:

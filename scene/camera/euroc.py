@@ -21,13 +21,13 @@ from trilane.scene.camera.distortion import distortion_note
 from trilane.scene.camera.pose_table import read_pose_table
 from trilane.scene.camera.recorded import OPENGL_FROM_OPTICAL, RawCamera
 from trilane.scene.detected import Detected
-from trilane.scene.lens import Lens
+from trilane.scene.lens import Lens, of_opencv
 
 NAMES = ("time", "x", "y", "z", "qw", "qx", "qy", "qz")
 EXPECTED = "EuRoC poses: time in ns, x, y, z, qw, qx, qy, qz a line"
 SENSOR = Path("cam0") / "sensor.yaml"
 #: The left camera of the data sets.
-CAM0 = Lens(752.0, 480.0, 458.654, 457.296, 367.215, 248.375)
+CAM0 = of_opencv(752.0, 480.0, 458.654, 457.296, 367.215, 248.375)
 #: Key of the sensor's file -> how many numbers follow it.
 KEYS = {"data": 16, "resolution": 2, "intrinsics": 4, "distortion_coefficients": 4}
 
@@ -53,7 +53,7 @@ def load_euroc(path: Path) -> RawCamera:
 def _lens(numbers: Mapping[str, F64]) -> Lens:
     width, height = (float(value) for value in numbers["resolution"])
     fx, fy, cx, cy = (float(value) for value in numbers["intrinsics"])
-    return Lens(width, height, fx, fy, cx, cy)
+    return of_opencv(width, height, fx, fy, cx, cy)
 
 
 def _distortion(lens: Lens, numbers: Mapping[str, F64]) -> tuple[str, ...]:

@@ -15,14 +15,14 @@ from trilane.arrays import F64
 from trilane.scene.camera.recorded import OPENGL_FROM_OPTICAL, RawCamera
 from trilane.scene.camera.text_table import elapsed, read_table
 from trilane.scene.detected import Detected
-from trilane.scene.lens import Lens
+from trilane.scene.lens import of_opencv
 
 COLUMNS = 12
 EXPECTED = "KITTI poses: the 12 numbers of a 3x4 matrix a line"
 RATE_HZ = 10.0
 TIMES = "times.txt"
 #: The left grey camera of the first sequences, rectified.
-GREY = Lens(1241.0, 376.0, 718.856, 718.856, 607.1928, 185.2157)
+GREY = of_opencv(1241.0, 376.0, 718.856, 718.856, 607.1928, 185.2157)
 
 
 def load_kitti(path: Path, rate_hz: float | None = None) -> RawCamera:
