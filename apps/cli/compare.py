@@ -29,10 +29,13 @@ Examples:
   trilane compare before.json after.json --json
   trilane compare runs/before runs/after --html difference.html
   trilane compare runs/main runs/branch --fail-if-slower 5%
+  trilane compare sweeps/main sweeps/branch
 """
 SLOWER = 1
 
-BaseArgument = Annotated[str, typer.Argument(metavar="BASE", help="A run folder, its report.json, or a prediction.")]
+BaseArgument = Annotated[
+    str, typer.Argument(metavar="BASE", help="A run folder, its report.json, a prediction, or a sweep's folder.")
+]
 OthersArgument = Annotated[
     list[str], typer.Argument(metavar="OTHER", help="What is compared with it. Runs of one kind: A1,A2,A3.")
 ]
@@ -56,9 +59,12 @@ def compare(
     """Say what differs between runs, by how much, how sure that is, and the likely cause.
 
     Every figure of OTHER stands beside that of BASE with a 95 % interval. Exit code 0 also when they differ.
-    docs/compare.md says how it is told.
+    Of two sweeps, trials of equal configuration stand beside each other. docs/compare.md says how it is told.
     """
     limit = _share(fail_if_slower)
+    if _are_sweeps([base, *others]):
+        _compare_sweeps(base, others, html, show_all, limit, json)
+        return
     from trilane.apps.cli.compare_table import comparison_lines
     from trilane.apps.comparison.compared import compare as compared
     from trilane.apps.comparison.compared import document
@@ -75,6 +81,38 @@ def compare(
             for part in comparison_lines(comparison, show_all):
                 console.print(part, soft_wrap=isinstance(part, str), markup=False)
     if limit is not None and any(comparison.slower > limit for comparison in comparisons):
+        raise typer.Exit(SLOWER)
+
+
+def _are_sweeps(names: list[str]) -> bool:
+    """Raises BadInputError for sweeps beside something else."""
+    from trilane.apps.comparison.sweeps import is_sweep
+
+    sweeps = [name for name in names if is_sweep(name)]
+    if sweeps and len(sweeps) < len(names):
+        other = next(name for name in names if name not in sweeps)
+        raise BadInputError(other, f"no sweep, beside {sweeps[0]}, which is one", "two sweeps, or runs alone")
+    return bool(sweeps)
+
+
+def _compare_sweeps(
+    base: str, others: list[str], html: Path | None, show_all: bool, limit: float | None, json: bool
+) -> None:
+    from trilane.apps.cli.compare_table import sweep_lines
+    from trilane.apps.comparison.sweeps import compare_sweeps
+
+    if len(others) > 1:
+        raise BadInputError("compare", f"{1 + len(others)} sweeps", "two")
+    if html is not None:
+        remedy = f"`trilane report {base} {others[0]}` draws both on one page"
+        raise BadInputError("options", "--html with sweeps", "runs", remedy)
+    comparison = compare_sweeps(base, others[0])
+    if json:
+        print_json(comparison.as_json())
+    else:
+        for part in sweep_lines(comparison, show_all):
+            stdout_console().print(part, soft_wrap=isinstance(part, str), markup=False)
+    if limit is not None and comparison.slower > limit:
         raise typer.Exit(SLOWER)
 
 

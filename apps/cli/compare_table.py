@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 from rich.markup import escape
 
 from trilane.apps.comparison.compared import METHOD
+from trilane.apps.comparison.rows import MS
+from trilane.apps.comparison.sweeps import METHOD as SWEEP_METHOD
 from trilane.apps.comparison.words import change_of, interval_of, name_of, setting, value_of
 
 if TYPE_CHECKING:
@@ -16,6 +18,7 @@ if TYPE_CHECKING:
     from trilane.apps.comparison.compared import Comparison
     from trilane.apps.comparison.configuration import Change
     from trilane.apps.comparison.rows import Figure
+    from trilane.apps.comparison.sweeps import SweepComparison, TrialPair
 
 #: Measures of which one statistic is shown even where nothing differs.
 ALWAYS = ("frame time", "latency", "work", "busy")
@@ -37,6 +40,52 @@ def comparison_lines(comparison: Comparison, show_all: bool) -> Iterator[str | T
     yield from _left_out(comparison, shown)
     yield from comparison.notes
     yield METHOD
+
+
+#: Why a configuration of a sweep has no partner.
+LEFT_OUT = {
+    "not_done": "not done in both",
+    "base_alone": "in the base alone",
+    "other_alone": "in the other alone",
+}
+
+
+def sweep_lines(comparison: SweepComparison, show_all: bool) -> Iterator[str | Table]:
+    """Texts and tables of two sweeps. `show_all`: trials too that do not differ."""
+    yield f"{comparison.other} beside {comparison.base}: {len(comparison.pairs)} trials of equal configuration"
+    yield f"verdict: {comparison.verdict}"
+    if comparison.changes:
+        yield _change_table(comparison.changes[:MOST_CHANGES])
+    shown = [pair for pair in comparison.pairs if show_all or pair.differs]
+    if shown:
+        yield _trial_table(shown)
+    if left := len(comparison.pairs) - len(shown):
+        more = "trial does" if left == 1 else "trials do"
+        yield f"{left} more {more} not differ, or it cannot be told: --all shows them"
+    for reason, names in comparison.left_out.items():
+        if names:
+            yield f"{LEFT_OUT[reason]}: {len(names)} ({', '.join(names[:4])}{', ...' * (len(names) > 4)})"
+    yield from comparison.notes
+    yield SWEEP_METHOD
+
+
+def _trial_table(pairs: Sequence[TrialPair]) -> Table:
+    """The options that vary, the mean frame time in both sweeps, the change and its interval."""
+    from rich.table import Table
+
+    names = [
+        name
+        for name in dict.fromkeys(name for pair in pairs for name in pair.options)
+        if len({str(pair.options.get(name)) for pair in pairs}) > 1
+    ] or ["trial"]
+    table = Table(*names, "base, ms", "other, ms", "change", "95 % interval", "differs")
+    for pair in pairs:
+        row = pair.frame_time
+        values = [setting(pair.options.get(name, pair.name)) for name in names]
+        differs = "yes" if pair.differs else "?" if row.probability is None else "no"
+        figures = (f"{row.base:.4g}", f"{row.other:.4g}", change_of(row, MS), interval_of(row, MS), differs)
+        table.add_row(*(escape(text) for text in (*values, *figures)))
+    return table
 
 
 def _left_out(comparison: Comparison, shown: Sequence[Figure]) -> Iterator[str]:
