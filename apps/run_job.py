@@ -152,7 +152,9 @@ def run_to_folder(
                 scene = checked.config.scene
                 jobs = list(jobs_of(folder.work / journal.NAME))
                 facts["pace"] = compare(plan.pace, plan.policy, scene.frames, jobs, edge=plan.edge, fps=scene.fps)
-            facts |= _checked_frames(checked, folder.work, hooks, result) if plan.check else {}
+            if plan.check:
+                ended = lambda: result.interrupted or stopped or late.count > 0  # noqa: E731
+                facts |= _checked_frames(checked, folder.work, hooks, ended)
             facts |= _write_files(folder.work, checked.config.scene.fps)
             report = build_report(result, checked.config, machine=machine, baseline=baseline, facts=facts)
             _tell(report, hooks)
@@ -244,18 +246,27 @@ class _Job:
         return release_fps(self._plan.pace, self._checked.config.scene.fps)
 
 
-def _checked_frames(checked: Checked, work: Path, hooks: Hooks, result: RunResult) -> dict[str, Any]:
-    """`check` of the report, or `notes` that say why there is none. Whoever interrupted a run does not wait for it."""
+def _checked_frames(checked: Checked, work: Path, hooks: Hooks, interrupted: Callable[[], bool]) -> dict[str, Any]:
+    """`check` of the report, or `notes` that say why there is none. Whoever interrupts does not wait for it."""
+
+    def told(done: int, of: int) -> None:
+        hooks.progress("check", done, of)
+        _require(not interrupted())
+
     try:
-        if result.interrupted:
-            raise TrilaneError("it was interrupted")
-        return {"check": check_run(checked, work, lambda done, of: hooks.progress("check", done, of))}
+        _require(not interrupted())
+        return {"check": check_run(checked, work, told)}
     except TrilaneError as error:
         said = f"the run was not compared with the reference path: {error}"
         hooks.message(said)
         return {"notes": [*_notes(checked), said]}
     finally:
         shutil.rmtree(work / FOLDER, ignore_errors=True)
+
+
+def _require(wanted: bool) -> None:
+    if not wanted:
+        raise TrilaneError("it was interrupted")
 
 
 def _notes(checked: Checked) -> list[str]:

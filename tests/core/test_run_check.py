@@ -114,10 +114,28 @@ def test_without_any_frame_there_is_no_check_and_that_is_said(tmp_path: Path) ->
     hooks = run_job.Hooks(lambda *_: None, said.append)
     checked: Any = SimpleNamespace(notes=("planned",), config=SimpleNamespace(record=True))
     for interrupted in (False, True):
-        result: Any = SimpleNamespace(interrupted=interrupted)
-        facts = run_job._checked_frames(checked, tmp_path, hooks, result)
+        facts = run_job._checked_frames(checked, tmp_path, hooks, lambda: interrupted)  # noqa: B023
         assert facts == {"notes": ["planned", said[-1]]}
     assert said == [
         "the run was not compared with the reference path: none of the frames that were kept shows an avatar",
         "the run was not compared with the reference path: it was interrupted",
     ]
+
+
+def test_an_interrupt_is_heard_between_two_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A frame takes seconds, so that whoever asks for many and changes their mind would wait for minutes."""
+    made: list[int] = []
+
+    def check(_checked: Any, _folder: Path, told: Any) -> Any:
+        for number in range(5):
+            made.append(number)
+            told(number + 1, 5)
+
+    monkeypatch.setattr(run_job, "check_run", check)
+    said: list[str] = []
+    shown: list[tuple[str, int, int]] = []
+    hooks = run_job.Hooks(lambda *words: shown.append(words), said.append)
+    checked: Any = SimpleNamespace(notes=(), config=SimpleNamespace(record=True))
+    run_job._checked_frames(checked, tmp_path, hooks, lambda: len(made) == 2)
+    assert (made, shown) == ([0, 1], [("check", 1, 5), ("check", 2, 5)])
+    assert said == ["the run was not compared with the reference path: it was interrupted"]
