@@ -180,6 +180,11 @@ def test_colmap_text_and_binary_say_the_same(tmp_path: Path) -> None:
     assert text.places == pytest.approx(binary.places, abs=1e-9)
     assert text.pictures == binary.pictures == tuple(f"view {k}.jpg" for k in range(5))
     assert text.optics == binary.optics
+    project = tmp_path / "project"
+    (project / "sparse").mkdir(parents=True)
+    (tmp_path / "a").rename(project / "sparse" / "0")
+    assert load(project).pictures == text.pictures
+    (project / "sparse" / "0").rename(tmp_path / "a")
     for file in ("cameras.txt", "images.txt"):
         assert load(tmp_path / "a" / file).detected.reason == "a file of a COLMAP model"
 

@@ -98,9 +98,13 @@ def write_euroc(folder: Path, turns: F64, places: F64) -> Path:
     return folder / "data.csv"
 
 
+def kitti_text(turns: F64, places: F64) -> str:
+    return lines_of(np.dstack([turns @ OPTICAL, places]).reshape(-1, 12))
+
+
 def write_kitti(folder: Path, turns: F64, places: F64) -> Path:
     """As the readme of KITTI's odometry development kit has it, with its times."""
-    (folder / "00.txt").write_text(lines_of(np.dstack([turns @ OPTICAL, places]).reshape(-1, 12)))
+    (folder / "00.txt").write_text(kitti_text(turns, places))
     (folder / "times.txt").write_text(lines_of(seconds(len(turns))[:, None]))
     return folder / "00.txt"
 
@@ -150,16 +154,14 @@ def write_colmap_text(folder: Path, turns: F64, places: F64) -> Path:
 
 
 def write_colmap_binary(folder: Path, turns: F64, places: F64) -> Path:
-    """As https://colmap.github.io/format.html#binary-file-format has it, below `sparse/0`."""
-    model = folder / "sparse" / "0"
-    model.mkdir(parents=True, exist_ok=True)
+    """As https://colmap.github.io/format.html#binary-file-format has it."""
     camera = struct.pack("<iiQQ4d", 7, 1, 640, 480, LENS.fx, LENS.fy, LENS.cx, LENS.cy)
-    (model / "cameras.bin").write_bytes(struct.pack("<Q", 1) + camera)
+    (folder / "cameras.bin").write_bytes(struct.pack("<Q", 1) + camera)
     images = b"".join(
         struct.pack("<i7di", k + 1, *row, 7) + name.encode() + b"\0" + struct.pack("<Q", k % 3) + bytes(24 * (k % 3))
         for k, (name, row) in enumerate(colmap_rows(turns, places))
     )
-    (model / "images.bin").write_bytes(struct.pack("<Q", len(turns)) + images)
+    (folder / "images.bin").write_bytes(struct.pack("<Q", len(turns)) + images)
     return folder
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import pickle
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,14 @@ from trilane.avatars.manifest import Manifest, network_entry
 from trilane.avatars.network_checks import check_network
 from trilane.body.joints import JOINT_PARENTS, JOINTS
 from trilane.testing.byte_network import net
+from trilane.testing.camera_files import (
+    Writer,
+    kitti_text,
+    write_colmap_binary,
+    write_colmap_text,
+    write_euroc,
+    write_stray,
+)
 
 VERTICES, FACES, CORNERS = 60, 80, 90
 #: Name, depth below the root, offset from its parent in centimetres.
@@ -108,6 +117,12 @@ def camera_poses(count: int = 5) -> list[tuple[NDArray[np.float64], NDArray[np.f
         c, s = np.cos(np.radians(2 * k)), np.sin(np.radians(2 * k))
         found.append((np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]), np.array([0.1 * k, 1.5, 3.0])))
     return found
+
+
+def camera_arrays() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """`camera_poses` as two arrays."""
+    turns, places = zip(*camera_poses(), strict=True)
+    return np.stack(turns), np.stack(places)
 
 
 def arkit_text() -> str:
@@ -216,6 +231,11 @@ def write_pictures(folder: Path) -> None:
         picture(k).save(folder / f"{k:03}.png")
 
 
+def _in_folder(write: Writer, path: Path) -> None:
+    path.mkdir()
+    write(path, *camera_arrays())
+
+
 def _arrays(path: Path, **arrays: Any) -> None:
     np.savez(path, **arrays)
 
@@ -237,6 +257,11 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "arkit.txt": lambda path: path.write_text(arkit_text()),
     "tum.txt": lambda path: path.write_text(tum_text()),
     "transforms.json": lambda path: path.write_text(nerf_text()),
+    "euroc.csv": lambda path: write_euroc(path.parent, *camera_arrays()).rename(path),
+    "kitti.txt": lambda path: path.write_text(kitti_text(*camera_arrays())),
+    "odometry.csv": lambda path: write_stray(path.parent, *camera_arrays()),
+    "colmap": partial(_in_folder, write_colmap_text),
+    "colmap-binary": partial(_in_folder, write_colmap_binary),
     "photo.png": lambda path: picture().save(path),
     "photo.jpg": lambda path: picture().save(path),
     "film.mkv": write_film,
