@@ -1,5 +1,7 @@
 """The data set: which samples an avatar is trained and evaluated on, rendered to disk by several processes.
 
+Samples come from the synthetic person or from a capture; what follows is the same for both.
+
 Rule: validation poses come from motions that no training sample uses; a sample depends only on its seed.
 """
 
@@ -9,18 +11,19 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from trilane.arrays import F64
+from trilane.arrays import F32, F64, U8
 from trilane.body.body import load_body
 from trilane.scene.motion.motion import Motion
 from trilane.shapes import Shape
-from trilane.training.random_poses import random_pose
+from trilane.training.sample_crop import Crop
 from trilane.training.sample_files import U16, create_group, open_groups
 from trilane.training.sample_renderer import BAND_NAMES, PoseSource, Sample, SampleRenderer
 
+One = TypeVar("One")
 #: Share of each band among the training samples; `anywhere` is last.
 TRAINING_SHARE = {"far": 0.16, "full_body": 0.34, "upper_body": 0.22, "face": 0.16, "anywhere": 0.12}
 #: Share of each tensor size among the training samples: the default size, and half its side for avatars far away.
@@ -41,10 +44,41 @@ def motion_poses(motions: Sequence[Motion]) -> PoseSource:
     return draw
 
 
-def plan_training(renderer: SampleRenderer, count: int, seed: int, track: Callable[[Any], Any] = iter) -> list[Sample]:
-    """Samples of random poses, views and sizes.
+class Planned(Protocol):
+    """A sample that was planned: of the synthetic person, or of a capture.
 
-    `renderer`: plans each sample.
+    `crop`: whose shape is the tensor's. `band`: its index. `picture`: the number of the frame that it is cut from.
+    """
+
+    @property
+    def crop(self) -> Crop: ...
+
+    @property
+    def band(self) -> int: ...
+
+    @property
+    def picture(self) -> int: ...
+
+
+class SampleSource(Protocol[One]):
+    """What samples come from; each process that renders opens one."""
+
+    def training_sample(self, seed: Sequence[int], band: str, size: str) -> One:
+        """The sample of `seed`, in `band` and of tensor size `size`."""
+
+    def render(self, sample: One) -> tuple[F32, U8]:
+        """The UV image (h,w,3) and the ground truth (h,w,4) of `sample`."""
+
+
+def clothed_source(body: Path) -> SampleRenderer:
+    """The default source: the body in the file `body`, clothed, on one thread. Raises BadInputError."""
+    return SampleRenderer(load_body(body).shape(), threads=1)
+
+
+def plan_training(source: SampleSource[One], count: int, seed: int, track: Callable[[Any], Any] = iter) -> list[One]:
+    """Samples in random bands and sizes.
+
+    `source`: plans each sample.
     `count`: how many.
     `seed`: of all random numbers.
     `track`: wraps the list of samples to show progress.
@@ -53,7 +87,7 @@ def plan_training(renderer: SampleRenderer, count: int, seed: int, track: Callab
     bands = rng.choice(list(TRAINING_SHARE), count, p=list(TRAINING_SHARE.values()))
     sizes = rng.choice(list(SIZES), count, p=list(SIZES.values()))
     return [
-        renderer.plan((seed, 1, number), random_pose, str(band), str(size))
+        source.training_sample((seed, 1, number), str(band), str(size))
         for number, (band, size) in enumerate(track(list(zip(bands, sizes, strict=True))))
     ]
 
@@ -78,41 +112,45 @@ def plan_validation(
 
 
 def write_dataset(
-    body: Path, samples: list[Sample], folder: Path, processes: int, track: Callable[[Any], Any] = iter
+    source: Callable[[], SampleSource[Any]],
+    samples: Sequence[Planned],
+    folder: Path,
+    processes: int,
+    track: Callable[[Any], Any] = iter,
 ) -> None:
-    """Render samples to disk, grouped by tensor shape.
+    """Render samples to disk, grouped by tensor shape, those of a frame after each other.
 
-    `body`: the body file.
+    `source`: opens what renders them in each process; it is sent there.
     `samples`: what to render.
     `folder`: where the arrays are written, see `sample_files`.
     `processes`: how many processes render.
     `track`: wraps the list of parts to show progress.
     """
-    by_shape: dict[Shape, list[Sample]] = {}
-    for sample in samples:
+    by_shape: dict[Shape, list[Planned]] = {}
+    for sample in sorted(samples, key=lambda each: each.picture):
         by_shape.setdefault(sample.crop.shape, []).append(sample)
     for shape, group in by_shape.items():
         create_group(folder, shape, np.array([sample.band for sample in group], np.int8))
     places = [(shape, place, sample) for shape, group in by_shape.items() for place, sample in enumerate(group)]
     parts = [places[start : start + PART] for start in range(0, len(places), PART)]
-    with ProcessPoolExecutor(processes, get_context("spawn"), _open_renderer, (body,)) as pool:
+    with ProcessPoolExecutor(processes, get_context("spawn"), _open_source, (source,)) as pool:
         waiting = [pool.submit(_render_part, folder, part) for part in parts]
         for done in track(waiting):
             done.result()
 
 
-#: The renderer of a rendering process, made once by `_open_renderer`.
-_renderer: list[SampleRenderer] = []
+#: The source of a rendering process, opened once by `_open_source`.
+_source: list[SampleSource[Any]] = []
 
 
-def _open_renderer(body: Path) -> None:
-    _renderer.append(SampleRenderer(load_body(body).shape(), threads=1))
+def _open_source(source: Callable[[], SampleSource[Any]]) -> None:
+    _source.append(source())
 
 
-def _render_part(folder: Path, part: list[tuple[Shape, int, Sample]]) -> None:
+def _render_part(folder: Path, part: list[tuple[Shape, int, Planned]]) -> None:
     groups = {group.shape: group for group in open_groups(folder, writable=True)}
     for shape, place, sample in part:
-        uv, rgba = _renderer[0].render(sample)
+        uv, rgba = _source[0].render(sample)
         group = groups[shape]
         group.uv[place] = np.round(np.clip(uv[..., :2], 0, 1) * U16)
         group.covered[place] = uv[..., 2] > 0

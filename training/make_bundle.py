@@ -23,6 +23,7 @@ from trilane.training.neural_texture import read_texture
 from trilane.training.onnx_export import export_onnx
 from trilane.training.quantising.quantise import Quantised, quantise
 from trilane.training.sample_files import U16, ShapeGroup
+from trilane.training.subject import Person
 from trilane.training.trainable_avatar import TrainableAvatar
 
 INT8_MAX = 127
@@ -76,7 +77,7 @@ def quantise_avatar(
 
 def write_avatar(
     folder: Path,
-    body: Path,
+    person: Person,
     quantised: QuantisedAvatar,
     width: int,
     provenance: dict[str, Any],
@@ -85,7 +86,7 @@ def write_avatar(
     """Write the bundle.
 
     `folder`: of the bundle.
-    `body`: the body file.
+    `person`: whose it is.
     `quantised`: network and texture.
     `width`: of the network; 64 is full.
     `provenance`: how the avatar was trained.
@@ -97,8 +98,10 @@ def write_avatar(
         provenance=provenance,
         training_command=names["training_command"],
         quantisation=quantised.network.facts,
+        betas=person.betas,
+        expression=person.expression,
     )
-    write_bundle(folder, manifest, body, quantised.texture, quantised.network.network, quantised.scale)
+    write_bundle(folder, manifest, person.body, quantised.texture, quantised.network.network, quantised.scale)
 
 
 def _inputs(avatar: TrainableAvatar, group: ShapeGroup, index: NDArray[np.int64]) -> list[NDArray[np.float32]]:

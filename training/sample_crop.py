@@ -35,8 +35,9 @@ class Crop:
 class Cropper:
     """Crops of one shaped body."""
 
-    def __init__(self, shaped: ShapedBody) -> None:
-        self._bounds = MeshBounds(shaped, standoff_m=CLOTHES_STANDOFF_M, pose_blend=False)
+    def __init__(self, shaped: ShapedBody, pose_blend: bool = False) -> None:
+        """Of `shaped`; `pose_blend`: whether its pose blend shapes, if any, are drawn."""
+        self._bounds = MeshBounds(shaped, standoff_m=CLOTHES_STANDOFF_M, pose_blend=pose_blend)
 
     def crop(self, posed: Posed, view: View, buckets: Sequence[Shape]) -> Crop | None:
         """The crop of the body as seen from `view`, in one of the tensor shapes `buckets`; None when it is not seen."""

@@ -26,6 +26,7 @@ from trilane.training.clear_view import ClothedSurface
 from trilane.training.clothing.clothed_body import ClothedBody
 from trilane.training.clothing.landmarks import find_landmarks
 from trilane.training.clothing.layers import clothing_layers
+from trilane.training.random_poses import random_pose
 from trilane.training.random_views import BANDS, View, random_view
 from trilane.training.sample_crop import Crop, Cropper
 from trilane.training.uv_image import UvRaster
@@ -44,6 +45,7 @@ class Sample:
     view: View
     crop: Crop
     band: int
+    picture: int = 0  # there is none
 
 
 class SampleRenderer:
@@ -90,6 +92,10 @@ class SampleRenderer:
             crop = self.cropper.crop(posed, view, shape_buckets(size))
             if crop is not None and crop.pixels >= LEAST_PIXELS:
                 return Sample(pose, view, crop, BAND_NAMES.index(band) if band in BANDS else ANYWHERE)
+
+    def training_sample(self, seed: Sequence[int], band: str, size: str) -> Sample:
+        """As `plan`, in a random pose."""
+        return self.plan(seed, random_pose, band, size)
 
     def render(self, sample: Sample) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
         """The UV image (h,w,3) float32 of u, v, coverage, and the ground truth (h,w,4) uint8, straight alpha."""

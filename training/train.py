@@ -23,7 +23,7 @@ from PIL import Image
 
 from trilane.avatars.bundle import bundle_folder, load_bundle
 from trilane.avatars.manifest import Validation
-from trilane.body.body import ShapedBody, load_body
+from trilane.body.body import ShapedBody
 from trilane.errors import BadInputError, TrilaneError
 from trilane.training.body_arrays import body_arrays
 from trilane.training.comparison_sheet import comparison_sheet
@@ -36,6 +36,7 @@ from trilane.training.network import UNet
 from trilane.training.neural_texture import SIDES, NeuralTexture
 from trilane.training.sample_files import open_groups
 from trilane.training.sample_renderer import SampleRenderer
+from trilane.training.subject import Subject, captured_subject, clothed_subject
 from trilane.training.trainable_avatar import TrainableAvatar
 from trilane.training.training_loop import FitConfig, fit
 from trilane.training.validate import (
@@ -73,6 +74,7 @@ class TrainConfig:
     `sheet`: picture file that compares held-out samples; None for none.
     `minutes`: of training. `samples`: of the training set. `per_band`: validation samples of each band and seed.
     `held_out`: motions that validation poses come from. `width`: of the network; 64 is full.
+    `capture`: folder of the person to train on; None for the body in `body`, clothed.
     `weights`: do not train, use these. `resume`: continue from these weights at a lower rate. `network`: start from the
     network of these weights, with a new texture or with `texture`, that of a trained avatar (a name or a folder).
     """
@@ -95,6 +97,7 @@ class TrainConfig:
     resume: Path | None = None
     network: Path | None = None
     texture: str | None = None
+    capture: Path | None = None
 
 
 def train(config: TrainConfig, report: Callable[[str], None]) -> Path:
@@ -103,19 +106,29 @@ def train(config: TrainConfig, report: Callable[[str], None]) -> Path:
     Raises BadInputError for inputs that do not fit together, MissingPartError without OpenGL.
     """
     torch.manual_seed(config.seed)
-    shaped = load_body(config.body).shape()
-    renderer = SampleRenderer(shaped, threads=config.workers)
+    subject = _subject(config, report)
     held_out_motions(config.held_out)  # a motion that cannot be read ends the command here
-    _render_training_set(renderer, config, report)
+    _render_training_set(subject, config, report)
+    shaped = subject.shaped
     avatar, steps = _trained(shaped, config, report)
     report("quantising and evaluating")
     torch.set_num_threads(config.workers)
     quantised = quantise_avatar(avatar, shaped, open_groups(config.work / TRAINING), config.seed)
     names = {"name": config.name, "training_command": command_of(config)}
-    write_avatar(config.out, config.body, quantised, config.width, _provenance(config, steps), names)
-    validation = _validate(config, avatar, renderer)
-    report(validation.model_dump_json())
+    provenance = _provenance(config, steps) | subject.facts
+    write_avatar(config.out, subject.person, quantised, config.width, provenance, names)
+    if subject.truth is not None:
+        validation = _validate(config, avatar, subject.truth)
+        report(validation.model_dump_json())
+    else:
+        report("not validated: there is no measure of an avatar of a capture yet")
     return config.out
+
+
+def _subject(config: TrainConfig, report: Callable[[str], None]) -> Subject:
+    if config.capture is None:
+        return clothed_subject(config.body, config.workers)
+    return captured_subject(config.capture, config.workers, report)
 
 
 def _validate(config: TrainConfig, avatar: TrainableAvatar, renderer: SampleRenderer) -> Validation:
@@ -137,7 +150,6 @@ def _validate(config: TrainConfig, avatar: TrainableAvatar, renderer: SampleRend
 
 def _provenance(config: TrainConfig, steps: int) -> dict[str, Any]:
     return {
-        "body": "the default body, clothed by trilane.training.clothing",
         "samples": config.samples,
         "steps": steps,
         "batch": config.batch,
@@ -154,25 +166,27 @@ def command_of(config: TrainConfig) -> str:
         value = getattr(config, field.name)
         if isinstance(value, tuple):
             options += [part for motion in value for part in ("--held-out", Path(motion).name)]
-        elif field.name in ("weights", "resume", "network") and value is not None:
+        elif field.name in ("weights", "resume", "network", "capture") and value is not None:
             options += [f"--{field.name}", value.name]
         elif isinstance(value, int | float | str):
             options += [f"--{field.name.replace('_', '-')}", str(value)]
     return shlex.join(["python", "-m", "trilane.training.train", *options])
 
 
-def _render_training_set(renderer: SampleRenderer, config: TrainConfig, report: Callable[[str], None]) -> None:
+def _render_training_set(subject: Subject, config: TrainConfig, report: Callable[[str], None]) -> None:
     """Render the training set into the work folder, unless it is there. Raises BadInputError for another set's."""
     facts, folder = config.work / FACTS, config.work / TRAINING
-    wanted = {"samples": config.samples, "seed": config.seed}
+    wanted: dict[str, Any] = {"samples": config.samples, "seed": config.seed}
+    if config.capture is not None:
+        wanted |= {"capture": str(config.capture.resolve())}
     if facts.exists():
         present = json.loads(facts.read_text())
         if present != wanted:
             raise BadInputError(facts, str(present), str(wanted), "use another --work folder")
         return
     report(f"rendering {config.samples} samples into {folder}")
-    samples = plan_training(renderer, config.samples, config.seed)
-    write_dataset(config.body, samples, folder, config.workers)
+    samples = plan_training(subject.renderer, config.samples, config.seed)
+    write_dataset(subject.source, samples, folder, config.workers)
     facts.write_text(json.dumps(wanted))
 
 

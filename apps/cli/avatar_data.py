@@ -102,7 +102,7 @@ def _checked(capture: Capture, picture: Path) -> dict[str, Any]:
     raster, coverage = BodyRaster(capture.shaped), coverage_of(capture)
     with _tracked("drawing fits") as track:
         checks = check_frames(capture, raster, coverage)
-        frames = [frame for frame, _ in track(range(len(capture)), checks)]
+        frames = list(track(range(len(capture)), checks))
     bad = bad_frames(frames)
     cells = []
     for frame in sorted(chosen(frames, bad), key=lambda each: each.number):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,7 +19,9 @@ SHAPES = ((32, 64), (64, 32))
 
 
 def sample(number: int) -> Any:
-    return SimpleNamespace(number=number, band=number % 5, crop=SimpleNamespace(shape=SHAPES[number % 3 == 0]))
+    return SimpleNamespace(
+        number=number, picture=0, band=number % 5, crop=SimpleNamespace(shape=SHAPES[number % 3 == 0])
+    )
 
 
 class Renderer:
@@ -46,14 +49,13 @@ def test_samples_are_written_by_shape_in_their_order(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(dataset, "ProcessPoolExecutor", pool)
     monkeypatch.setattr(dataset, "SampleRenderer", Renderer)
-    monkeypatch.setattr(dataset, "_renderer", [])
+    monkeypatch.setattr(dataset, "_source", [])
     bodies = {tmp_path / "body.npz": SimpleNamespace(shape=lambda: "shape of a body")}
     monkeypatch.setattr(dataset, "load_body", bodies.__getitem__)
+    source = partial(dataset.clothed_source, tmp_path / "body.npz")
     parts = []
     samples = [sample(number) for number in range(120)]
-    dataset.write_dataset(
-        tmp_path / "body.npz", samples, tmp_path / "set", 2, lambda rows: parts.append(len(rows)) or rows
-    )
+    dataset.write_dataset(source, samples, tmp_path / "set", 2, lambda rows: parts.append(len(rows)) or rows)
     assert made == [(2, "spawn")] and parts == [3]
     groups = {group.shape: group for group in open_groups(tmp_path / "set")}
     assert list(groups) == list(SHAPES)
@@ -64,6 +66,28 @@ def test_samples_are_written_by_shape_in_their_order(monkeypatch: pytest.MonkeyP
         assert group.uv[:, 5, 5, 0].tolist() == [round(65535 * n / 256) for n in numbers]
         assert not group.uv[:, 0, 0].any() and (group.uv[:, -1, -1] == 65535).all()
         assert group.covered.sum() == 6 * len(numbers) and (group.covered[:, 1:3, 2:5] == 1).all()
+
+
+def test_samples_of_a_frame_follow_each_other(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
+    """So that a video is decoded once: samples of one shape, planned of frames 3, 1, 3, 2, 1."""
+    rendered: list[int] = []
+
+    class Source:
+        def render(self, asked: Any) -> tuple[Any, Any]:
+            rendered.append(asked.picture)
+            return Renderer("shape of a body", 1).render(asked)
+
+    def pool(*words: Any) -> ThreadPoolExecutor:
+        words[2](*words[3])
+        return ThreadPoolExecutor(1)
+
+    monkeypatch.setattr(dataset, "ProcessPoolExecutor", pool)
+    monkeypatch.setattr(dataset, "_source", [])
+    samples = [SimpleNamespace(**{**vars(sample(3 * n)), "picture": frame}) for n, frame in enumerate((3, 1, 3, 2, 1))]
+    dataset.write_dataset(Source, samples, tmp_path, 1)
+    assert rendered == [1, 1, 2, 3, 3]
+    (group,) = open_groups(tmp_path)
+    assert group.rgba[:, 3, 3, 1].tolist() == [3, 12, 9, 0, 6] and group.band.tolist() == [3, 2, 4, 0, 1]
 
 
 @pytest.mark.parametrize(("band", "index"), [("far", 0), ("face", 3), ("anywhere", 4)])

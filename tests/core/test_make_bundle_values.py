@@ -19,6 +19,7 @@ from trilane.training.network import UNet  # noqa: E402
 from trilane.training.neural_texture import NeuralTexture  # noqa: E402
 from trilane.training.quantising.quantise import Quantised  # noqa: E402
 from trilane.training.sample_files import U16, create_group  # noqa: E402
+from trilane.training.subject import Person  # noqa: E402
 from trilane.training.trainable_avatar import TrainableAvatar  # noqa: E402
 from trilane.training.weights_file import save_network  # noqa: E402
 
@@ -119,7 +120,8 @@ def test_the_manifest_says_how_the_avatar_was_made(tiny_quantised, tiny_bundle, 
     scale = np.arange(1, 6, dtype=np.float32)
     quantised = make_bundle.QuantisedAvatar(tiny_quantised, texture, scale)
     names = {"name": "somebody", "training_command": "python -m x"}
-    make_bundle.write_avatar(tmp_path / "out", tiny_bundle / "body.npz", quantised, 8, {"steps": 3}, names)
+    person = Person(tiny_bundle / "body.npz", (0.5, -1.0), (2.0,))
+    make_bundle.write_avatar(tmp_path / "out", person, quantised, 8, {"steps": 3}, names)
     bundle = load_bundle(tmp_path / "out")
     np.testing.assert_array_equal(bundle.read_texture(), texture * scale)
     assert (tmp_path / "out" / "body.npz").read_bytes() == (tiny_bundle / "body.npz").read_bytes()
@@ -134,8 +136,8 @@ def test_the_manifest_says_how_the_avatar_was_made(tiny_quantised, tiny_bundle, 
         "name": "somebody",
         "body": "body.npz",
         "texture": "texture.npz",
-        "betas": [],
-        "expression": [],
+        "betas": [0.5, -1.0],
+        "expression": [2.0],
         "network": {
             "file": "network.onnx", "encoder": "resnet18", "norm": "batch", "width": 8, "channels": 5,
             "input": ends[0], "output": ends[1],

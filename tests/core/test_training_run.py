@@ -21,6 +21,7 @@ from trilane.training import neural_texture  # noqa: E402
 from trilane.training import train as command  # noqa: E402
 from trilane.training.network import UNet  # noqa: E402
 from trilane.training.neural_texture import NeuralTexture  # noqa: E402
+from trilane.training.subject import Person, Subject  # noqa: E402
 from trilane.training.train import TrainConfig, command_of, main, train  # noqa: E402
 from trilane.training.trainable_avatar import TrainableAvatar  # noqa: E402
 from trilane.training.training_loop import FitConfig  # noqa: E402
@@ -29,6 +30,7 @@ from trilane.training.weights_file import load_avatar, load_network, save_avatar
 
 #: Of the textures here; a trained one has 512 texels along each side.
 SIDES, SIDE, CHANNELS = (64, 32), 64, 16
+CLOTHED = {"body": "the default body, clothed by somebody"}
 
 
 def avatar(seed: int) -> TrainableAvatar:
@@ -79,8 +81,7 @@ def calls(monkeypatch):
 
         monkeypatch.setattr(command, name, asked)
 
-    part("load_body", SimpleNamespace(shape=lambda: "shaped"))
-    part("SampleRenderer", "renderer")
+    part("clothed_subject", lambda body, _: Subject(Person(body), "shaped", "renderer", "source", CLOTHED, "renderer"))
     part("plan_training", "planned")
     part("write_dataset")
     part("open_groups", "groups")
@@ -117,8 +118,7 @@ def test_every_part_gets_what_is_its(config, calls, tmp_path):
     work, said = tmp_path / "work", {call[0]: call[1:] for call in calls}
     assert [call[0] for call in calls] == [
         *(
-            "load_body",
-            "SampleRenderer",
+            "clothed_subject",
             "plan_training",
             "write_dataset",
             "body_arrays",
@@ -128,10 +128,9 @@ def test_every_part_gets_what_is_its(config, calls, tmp_path):
         *("fit", "open_groups", "quantise_avatar", "write_avatar", "load_bundle", "float_painter", "validate"),
         *("revalidate", "comparison_sheet"),
     ]
-    assert said["load_body"] == (config.body,)
-    assert said["SampleRenderer"] == ("shaped", ("threads", 2))
+    assert said["clothed_subject"] == (config.body, 2)
     assert said["plan_training"] == ("renderer", 6, 11)
-    assert said["write_dataset"] == (config.body, "planned", work / "training", 2)
+    assert said["write_dataset"] == ("source", "planned", work / "training", 2)
     assert said["open_groups"] == (work / "training",)
     assert said["first_texture"] == ("arrays", "groups", SIDE, CHANNELS)
     assert said["fit"] == (work / "training", FitConfig(minutes=3.0, workers=2, threads=7, batch=9, seed=11))
@@ -139,11 +138,11 @@ def test_every_part_gets_what_is_its(config, calls, tmp_path):
     assert rest == ["shaped", "groups", 11]
     assert said["write_avatar"] == (
         config.out,
-        config.body,
+        Person(config.body),
         "quantised",
         4,
         {
-            "body": "the default body, clothed by trilane.training.clothing",
+            **CLOTHED,
             "samples": 6,
             "steps": 8,
             "batch": 9,
@@ -195,15 +194,41 @@ def seeded(config, seeds):
 
 
 def test_a_training_set_is_rendered_once_and_another_is_refused(config, calls):
-    command._render_training_set("renderer", config, lambda _: None)
-    command._render_training_set("renderer", config, lambda _: pytest.fail("rendered again"))
+    subject = Subject(Person(config.body), "shaped", "renderer", "source", CLOTHED)
+    command._render_training_set(subject, config, lambda _: None)
+    command._render_training_set(subject, config, lambda _: pytest.fail("rendered again"))
     assert [call[0] for call in calls] == ["plan_training", "write_dataset"]
     with pytest.raises(BadInputError) as caught:
-        command._render_training_set("renderer", replace(config, samples=7), lambda _: None)
+        command._render_training_set(subject, replace(config, samples=7), lambda _: None)
     assert str(caught.value) == (
         f"{config.work / 'dataset.json'}: found {{'samples': 6, 'seed': 11}}, "
         "expected {'samples': 7, 'seed': 11}; use another --work folder"
     )
+
+
+def test_a_capture_is_another_source_and_nothing_is_said_of_its_quality(config, calls, monkeypatch, tmp_path):
+    """What is known of the person goes into the bundle; figures of the synthetic person are not measured on it."""
+    person = Person(tmp_path / "b.npz", (0.5,), (1.0, 2.0))
+    asked = []
+
+    def captured(*words):
+        asked.append(words[:2])
+        words[2]("9 frames of 10")
+        return Subject(person, "their shape", "their renderer", "their source", {"body": "that of a capture"})
+
+    monkeypatch.setattr(command, "captured_subject", captured)
+    lines, folder = [], tmp_path / "mine"
+    one = replace(config, capture=folder)
+    train(one, lines.append)
+    said = {call[0]: call[1:] for call in calls}
+    assert asked == [(folder, 2)] and lines[0] == "9 frames of 10"
+    assert said["plan_training"][0] == "their renderer" and said["write_dataset"][0] == "their source"
+    assert said["write_avatar"][1] is person and said["write_avatar"][4]["body"] == "that of a capture"
+    assert not {"validate", "revalidate", "clothed_subject"} & set(said) and lines[-1].startswith("not validated")
+    assert command_of(one).endswith("--capture mine") and "--capture" not in command_of(config)
+    assert json.loads((config.work / "dataset.json").read_text())["capture"] == str(folder)
+    with pytest.raises(BadInputError, match="use another --work folder"):
+        train(config, lines.append)
 
 
 def test_no_sheet_is_drawn_when_none_is_asked_for(config, calls):

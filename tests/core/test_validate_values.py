@@ -19,6 +19,7 @@ from trilane.avatars.digests import digests_of
 from trilane.training import dataset, evaluate, validate
 from trilane.training.image_error import image_error
 from trilane.training.random_poses import random_pose
+from trilane.training.sample_renderer import SampleRenderer
 from trilane.training.validate import FloatNetwork, ValidationPlan
 
 BANDS = ("far", "full_body", "upper_body", "face")
@@ -36,6 +37,9 @@ class Renderer:
     def plan(self, seed, source, band, size):
         self.planned.append((seed, band, size))
         return SimpleNamespace(seed=seed, source=source, band=BANDS.index(band) if band in BANDS else 4)
+
+    def training_sample(self, seed, band, size):
+        return SampleRenderer.training_sample(self, seed, band, size)  # as the real one, of a random pose
 
     def render(self, sample):
         """A square of 8 x 8 pixels; the first sample of seed 2 shows nobody."""

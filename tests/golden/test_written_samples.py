@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 
 pytest.importorskip("torch")
 
 from trilane.avatars.bundle import bundle_folder
-from trilane.training.dataset import plan_training, write_dataset
+from trilane.training.dataset import clothed_source, plan_training, write_dataset
 from trilane.training.sample_files import U16, open_groups
 
 BODY = bundle_folder("default") / "body.npz"
@@ -20,7 +22,7 @@ def test_a_seed_gives_the_same_bytes_in_any_process(renderer, tmp_path):
     assert all(
         np.array_equal(a.pose, b.pose) and a.crop.shape == b.crop.shape for a, b in zip(samples, again, strict=True)
     )
-    write_dataset(BODY, samples, tmp_path, processes=1)
+    write_dataset(partial(clothed_source, BODY), samples, tmp_path, processes=1)
     groups = {group.shape: group for group in open_groups(tmp_path)}
     uv, rgba = renderer.render(samples[0])
     stored = groups[samples[0].crop.shape]

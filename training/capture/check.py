@@ -36,13 +36,19 @@ class CheckedFrame:
     outside: float
 
 
-def check_frames(capture: Capture, raster: BodyRaster, coverage: TexelCoverage) -> Iterator[tuple[CheckedFrame, F32]]:
-    """Each frame of `capture` as it was checked, and the UV image (h,w,3) of its body; `coverage` counts its texels."""
+def check_frames(capture: Capture, raster: BodyRaster, coverage: TexelCoverage) -> Iterator[CheckedFrame]:
+    """Each frame of `capture` as it was checked; `coverage` counts the texels that it shows."""
     for number in range(len(capture)):
-        uv = raster.uv_of(capture, number)
-        mask = capture.masks.read(capture.mask_of[number]) >= HALF
+        frame, uv, mask = checked_frame(capture, raster, number)
         coverage.add(uv, mask)
-        yield checked(number, uv[..., 2] > 0, mask), uv
+        yield frame
+
+
+def checked_frame(capture: Capture, raster: BodyRaster, number: int) -> tuple[CheckedFrame, F32, Mask]:
+    """Frame `number` as it was checked, the UV image (h,w,3) of its body, and the person (h,w)."""
+    uv = raster.uv_of(capture, number)
+    mask = np.asarray(capture.masks.read(capture.mask_of[number]) >= HALF)
+    return checked(number, uv[..., 2] > 0, mask), uv, mask
 
 
 def checked(number: int, drawn: Mask, mask: Mask) -> CheckedFrame:

@@ -6,7 +6,6 @@ Rule: every figure was measured by the check.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,8 +17,8 @@ from trilane.training.capture.texel_coverage import TexelCoverage
 from trilane.training.capture.view_coverage import STEP_DEG, frames_by_side, widest_gap_deg
 
 
-def require_fits(capture: Capture, frames: Sequence[CheckedFrame], sheet: Path) -> None:
-    """Raises FaultyCaptureError when the bodies of most frames are not where the masks are."""
+def require_fits(capture: Capture, frames: Sequence[CheckedFrame], sheet: object) -> None:
+    """Raises FaultyCaptureError, which points to `sheet`, when most bodies are not where the masks are."""
     median = float(np.median([frame.iou for frame in frames]))
     if median < LEAST_IOU:
         found = f"bodies that overlap the masks by a median IoU of {median:.2f}"

@@ -68,6 +68,14 @@ def augmented_projection(projection: ArrayLike, by: F64, frame: Shape, target: S
     return np.asarray(after @ np.asarray(projection, np.float64))
 
 
+def map_between(before: ArrayLike, after: ArrayLike, frame: Shape, target: Shape) -> F64:
+    """(3,3): the map of which `augmented_projection` makes `after` (4,4) from `before` (4,4): its inverse."""
+    clip = np.asarray(after, np.float64) @ _inverse(np.asarray(before, np.float64))
+    plane = np.eye(3)
+    plane[:2, :2], plane[:2, 2] = clip[:2, :2], clip[:2, 3]
+    return np.asarray(_inverse(_ndc_from_pixels(target)) @ plane @ _ndc_from_pixels(frame))
+
+
 def projected(points: ArrayLike, clip: F64, shape: Shape) -> F64:
     """(..., 2): pixels of a picture of `shape` at which `points` (..., 3) lie, by `clip` (4,4), projection @ view."""
     homogeneous = np.asarray(points, np.float64) @ clip[:, :3].T + clip[:, 3]

@@ -111,6 +111,10 @@ class PictureVideo:
             raise UnexpectedValue("four channels", expected, remedy)
         return np.asarray(frame.to_ndarray(format=form))
 
+    def __getstate__(self) -> dict[str, Any]:
+        """For another process, which opens the video anew."""
+        return self.__dict__ | {"_stream": iter(()), "_next": 0}
+
     def _frames(self) -> Iterator[Any]:
         try:
             with av.open(str(self._path)) as container:
