@@ -264,7 +264,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         folder = train(TrainConfig(**values), report)
     except TrilaneError as error:
-        print(error, file=sys.stderr)
+        print(error, *error.details, sep="\n", file=sys.stderr)
         return error.exit_code
     print(os.fspath(folder))
     return 0

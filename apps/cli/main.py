@@ -104,12 +104,13 @@ def _root(
     """Run, measure and predict a real-time neural-avatar pipeline on CPU, GPU and DSP units."""
 
 
-def _fail(message: str, code: int) -> NoReturn:
+def _fail(message: str, code: int, details: tuple[str, ...] = ()) -> NoReturn:
     from rich.text import Text
 
     from trilane.apps.cli.console import stderr_console, without_controls
 
-    stderr_console().print(Text.assemble(("error: ", "bold red"), without_controls(message)), soft_wrap=True)
+    lines = "\n".join(map(without_controls, (message, *details)))
+    stderr_console().print(Text.assemble(("error: ", "bold red"), lines), soft_wrap=True)
     raise SystemExit(code)
 
 
@@ -156,7 +157,7 @@ def main() -> None:
     except Exception as error:
         if debug:
             raise
-        _fail(*_describe(error))
+        _fail(*_describe(error), error.details if isinstance(error, TrilaneError) else ())
 
 
 def entry() -> NoReturn:

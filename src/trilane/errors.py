@@ -24,9 +24,13 @@ def reason(error: Exception) -> str:
 
 
 class TrilaneError(Exception):
-    """A failure with a message for people. Exit code 1: the run failed."""
+    """A failure with a message for people. Exit code 1: the run failed.
+
+    `details`: lines that follow the message, where it takes more than one to say.
+    """
 
     exit_code = 1
+    details: tuple[str, ...] = ()
 
 
 class BadInputError(TrilaneError):

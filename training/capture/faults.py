@@ -31,15 +31,16 @@ class Fault:
 
 
 class FaultyCaptureError(BadInputError):
-    """A capture with faults. Exit code 2; its text lists all `faults`."""
+    """A capture with faults. Exit code 2; its details list all `faults`."""
 
     def __init__(self, folder: str, faults: Sequence[Fault]) -> None:
         count = "1 fault" if len(faults) == 1 else f"{len(faults)} faults"
         super().__init__(folder, count, "a capture without any", "mend what is listed")
         self.faults = tuple(faults)
+        self.details = tuple(fault_lines(self.faults))
 
     def __str__(self) -> str:
-        return "\n".join([f"{self.where}: {self.found}; nothing was started", *fault_lines(self.faults)])
+        return f"{self.where}: {self.found}; nothing was started"
 
 
 def fault_lines(faults: Sequence[Fault]) -> list[str]:
