@@ -60,7 +60,7 @@ def load_camera(spec: CameraSpec, base: Path) -> CameraPath:
     guess = detect(path) if spec.format == "auto" else Guess(spec.format, "")
     if not (path.is_dir() and guess.kind in FOLDERS):
         require_file(path, EXPECTED)
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # `usable_samples` leaves out what is not finite
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is left out afterwards
         raw = _UNTIMED[guess.kind](path, spec.rate_hz) if guess.kind in _UNTIMED else _READERS[guess.kind](path)
         camera = path_from_recording(raw, str(path), spec)
     reason = guess.reason or "as given"
