@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Protocol
 
 from trilane.arrays import U8
-from trilane.errors import BadInputError
+from trilane.errors import BadInputError, reason
 from trilane.files import require_file
 from trilane.scene.camera.path import CameraPath
 from trilane.scene.picture_order import film_of, in_order
@@ -57,13 +57,23 @@ def is_picture(path: Path) -> bool:
 
 def pictures_in(folder: Path) -> list[Path]:
     """Its pictures, in order. Raises BadInputError without any."""
-    try:
-        names = [path.name for path in folder.iterdir() if path.suffix.lower() in PICTURES]
-    except OSError as error:
-        raise BadInputError(folder, f"no readable folder ({error.strerror})", "a folder of pictures") from None
+    names = _names_in(folder)
     if not names:
-        raise BadInputError(folder, "no pictures", f"files that end in {', '.join(sorted(PICTURES))}")
-    return [folder / name for name in in_order(names)]
+        near = next((sub for sub in sorted(folder.iterdir()) if sub.is_dir() and _names_in(sub)), None)
+        remedy = f"did you mean {near}?" if near else ""
+        raise BadInputError(folder, "no pictures", f"files that end in {', '.join(sorted(PICTURES))}", remedy)
+    pictures = [folder / name for name in in_order(names)]
+    for path in pictures:
+        require_file(path, "a picture")  # a pipe of such a name would be waited for
+    return pictures
+
+
+def _names_in(folder: Path) -> list[str]:
+    """Names of its pictures. Raises BadInputError when it cannot be read."""
+    try:
+        return [path.name for path in folder.iterdir() if path.suffix.lower() in PICTURES]
+    except OSError as error:
+        raise BadInputError(folder, f"no readable folder ({reason(error)})", "a folder of pictures") from None
 
 
 def folder_film(folder: Path, fps: float) -> tuple[list[Path], Callable[[float], int], float]:

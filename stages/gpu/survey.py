@@ -28,6 +28,8 @@ from trilane.stages.gpu.video_reader import DEFAULT_STEP_S, Pixels, check_size, 
 #: Steps between a video's frames that differ by more than this share of the usual one are of a variable rate.
 STEADY = 0.25
 MOST_PACKETS = 500_000
+#: Of the frames that a whole file names, so many are in it.
+LEAST_WHOLE = 0.99
 QUARTER_WORDS = {1: ", turned by 90 degrees", 2: ", turned by 180 degrees", 3: ", turned by 270 degrees"}
 EIGHT_BITS = 8
 
@@ -138,7 +140,7 @@ def _times(container: Any, path: Path) -> list[float]:
             times.add(packet.pts * packet.time_base)
         if count >= MOST_PACKETS:
             break
-    if count < min(stream.frames, MOST_PACKETS):
+    if count < LEAST_WHOLE * min(stream.frames, MOST_PACKETS):
         raise BadInputError(path, f"{count} of the {stream.frames} frames that it names", "a file that was not cut off")
     return sorted(float(time) for time in times) or [0.0]
 

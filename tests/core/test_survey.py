@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
@@ -218,6 +219,40 @@ def test_a_broken_picture_that_the_run_shows_is_found_before(tmp_path: Path) -> 
     (tmp_path / "a.jpg").write_bytes((tmp_path / "a.jpg").read_bytes()[:-500])
     with pytest.raises(BadInputError, match=r"a\.jpg: found no readable picture"):
         check_pictures(tmp_path / "a.jpg", 10.0, 1, LOOSE)
+
+
+def test_a_pipe_in_a_folder_is_not_waited_for(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path / "f", [1, 2])
+    os.mkfifo(folder / "f003.png")
+    with pytest.raises(BadInputError, match=r"f003\.png: found a device, a pipe or a socket"):
+        survey(folder, 30.0)
+
+
+def test_pictures_one_folder_below_are_pointed_at(tmp_path: Path) -> None:
+    folder_of(tmp_path / "images", [1])
+    with pytest.raises(BadInputError, match=r"found no pictures, .*; did you mean .*/images\?"):
+        survey(tmp_path, 30.0)
+
+
+@pytest.mark.parametrize(("name", "codec", "pixels"), [("a.mp4", "libx264", "yuv420p"), ("a.gif", "gif", "rgb8")])
+def test_what_is_foreseen_of_a_loop_is_what_is_played(tmp_path: Path, name: str, codec: str, pixels: str) -> None:
+    """Frames are stored in another order than shown; frame K, of grey 40 + 8 K, comes at K / 25 s, again and again."""
+    path = tmp_path / name
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=25, options={"bf": "3"} if codec == "libx264" else {})
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, pixels
+        for number in range(20):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(grey(40 + 8 * number), format="rgb24")))
+        container.mux(stream.encode(None))
+    found = survey(path, 30.0)
+    assert found.period_s == pytest.approx(0.8)
+    background, picture = open_background(path, (HEIGHT, WIDTH), 30.0), None
+    for number in range(70):
+        due = background.at(number / 25 + 1e-4)
+        picture = due if due is not None else picture
+        assert picture is not None and float(picture.mean()) == pytest.approx(40 + 8 * (number % 20), abs=4), number
+    assert background._period_s == pytest.approx(found.period_s)  # type: ignore[attr-defined]
+    background.close()
 
 
 def test_a_folder_of_several_sizes(tmp_path: Path) -> None:
