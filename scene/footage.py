@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from trilane.scene.camera.path import CameraPath, Optics
 from trilane.scene.lens import Known, Lens, cover
+from trilane.scene.rotations import quat_from_matrix
 from trilane.shapes import Shape
 
 #: Lengths of camera and background that differ by more than this share are said.
@@ -50,7 +51,7 @@ class Footage:
 
     `stored`: the video or the picture; of a folder, each of its pictures. `files`: names of pictures, in the order of
     `stored`; none of a video. `folder`: where they are. `period_s`: after which time it starts again; 0 for a single
-    picture.
+    picture. `clock_s`: of each picture, seconds since 1970, increasing; none where names do not say it.
     """
 
     what: tuple[str, ...]
@@ -59,6 +60,7 @@ class Footage:
     files: tuple[str, ...] = ()
     folder: str = ""
     period_s: float = 0.0
+    clock_s: tuple[float, ...] = ()
 
 
 def filmed(path: CameraPath, footage: Footage | None, output: Shape) -> tuple[CameraPath, tuple[str, ...]]:
@@ -75,7 +77,7 @@ def filmed(path: CameraPath, footage: Footage | None, output: Shape) -> tuple[Ca
             _loop(footage),
             cut_note([one.shown() for one in footage.stored], output),
         )
-    matched, notes = _with_photos(path, footage)
+    matched, notes = _by_clock(path, footage) or _with_photos(path, footage)
     if matched is None:
         return _over_all(path, footage, output, notes)
     camera, stored = matched
@@ -162,6 +164,34 @@ def _with_photos(
         named = ", ".join(missing[:NAMED]) + (" and others" if len(missing) > NAMED else "")
         notes.append(f"photos of {len(missing)} views are missing ({named}): these views are skipped")
     return (camera, tuple(footage.stored[places[int(k)]] for k in kept)), tuple(notes)
+
+
+def _by_clock(
+    path: CameraPath, footage: Footage
+) -> tuple[tuple[CameraPath, tuple[Stored, ...]], tuple[str, ...]] | None:
+    """`path` at the times of those pictures that were taken during it, and these; None where the clocks do not meet."""
+    if path.began_s is None:
+        return None
+    times = np.array(footage.clock_s) - path.began_s
+    within = np.flatnonzero((times >= 0) & (times <= path.duration_s))
+    if not len(within):
+        return None
+    poses = [path.pose(float(t_s)) for t_s in times[within]]
+    sampled = replace(
+        path,
+        times_s=times[within] - times[within[0]],
+        quats=quat_from_matrix(np.stack([turn for turn, _ in poses])),
+        places=np.stack([place for _, place in poses]),
+        optics=replace(path.optics, lenses=_once(tuple(path.own_lens(float(t_s)) for t_s in times[within]))),
+        pictures=tuple(f"{footage.folder}/{footage.files[k]}" for k in within),
+        is_held=True,
+        began_s=float(footage.clock_s[within[0]]),
+    )
+    notes = (
+        f"{len(within)} of its {len(times)} pictures were taken during the camera's recording, by the clock, the first "
+        f"{times[within[0]]:.2f} s after it began: each is held with the camera's place at its time",
+    )
+    return (sampled, tuple(footage.stored[k] for k in within)), notes
 
 
 def _of_samples(optics: Optics, kept: NDArray[np.intp]) -> Optics:

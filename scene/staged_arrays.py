@@ -99,6 +99,7 @@ def _camera_arrays(camera: PlacedCamera) -> Arrays:
         "quarter": np.array(path.quarter),
         "is_held": np.array(path.is_held),
         "repeat_s": np.array(path.repeat_s),
+        **({} if path.began_s is None else {"began_s": np.array(path.began_s)}),
         "wrap": np.array(WRAPS.index(path.wrap)),
         "recorded": np.array(path.recorded),
         "turn": camera.turn,
@@ -120,6 +121,7 @@ def _camera(arrays: Arrays) -> PlacedCamera:
         quarter=int(arrays["quarter"]),
         is_held=bool(arrays["is_held"]),
         repeat_s=float(arrays["repeat_s"]),
+        began_s=float(arrays["began_s"]) if "began_s" in arrays else None,
     )
     return PlacedCamera(path, arrays["turn"], arrays["shift"], arrays["mount"], ())
 

@@ -47,7 +47,9 @@ def load_euroc(path: Path) -> RawCamera:
     notes = (f"EuRoC poses, {len(poses.times_s)}{poses.rate}, time in {poses.time}, columns {poses.order}", *how)
     detected = Detected("EuRoC poses", "times in ns and commas", unit="m", rate="by the times of the file")
     turns = turns @ OPENGL_FROM_OPTICAL
-    return RawCamera(poses.times_s, turns, places, "z", (lens,), source, notes, poses.table.place_of, detected)
+    return RawCamera(
+        poses.times_s, turns, places, "z", (lens,), source, notes, poses.table.place_of, detected, began_s=poses.began_s
+    )
 
 
 def _lens(numbers: Mapping[str, F64]) -> Lens:

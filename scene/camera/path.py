@@ -112,6 +112,7 @@ class CameraPath:
     photos that the samples are of, one for each; empty where the file names none. `quarter`: quarters by which the
     camera's picture was turned clockwise. `is_held`: whether each sample holds, halfway to its neighbours, because its
     photo does. `repeat_s`: after which time the path starts again, as what it filmed does; 0 for `wrap` alone.
+    `began_s`: when it was recorded, seconds since 1970; None where the file does not say it.
     """
 
     times_s: F64
@@ -126,6 +127,7 @@ class CameraPath:
     quarter: int = 0
     is_held: bool = False
     repeat_s: float = 0.0
+    began_s: float | None = None
 
     @property
     def duration_s(self) -> float:
@@ -166,6 +168,12 @@ class CameraPath:
     def sample(self, t_s: float) -> F64:
         """World to camera (4, 4) at `t_s`."""
         return view_from_pose(*self.pose(t_s))
+
+    def own_lens(self, t_s: float) -> Lens:
+        """At `t_s`, of the picture that the camera took."""
+        i, j, fraction = self._between(t_s)
+        lenses = self.optics.lenses
+        return lenses[i % len(lenses)].between(lenses[j % len(lenses)], fraction) if len(lenses) > 1 else lenses[0]
 
     def lens(self, t_s: float, output: Shape) -> Lens:
         """At `t_s`, of a picture of `output` (height, width)."""

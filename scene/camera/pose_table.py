@@ -16,6 +16,8 @@ from trilane.scene.camera.text_table import POSE, Table, in_seconds, layout_of, 
 from trilane.scene.rotations import matrix_from_quat, normalised
 
 USUAL = "as usual"
+#: Times from 2001 to 2100 are those of a clock, others those of a device.
+EARLIEST_S, LATEST_S = 1e9, 4.1e9
 
 
 @dataclass(frozen=True)
@@ -23,7 +25,8 @@ class PoseTable:
     """`times_s` (N,): from 0. `turns` (N, 3, 3) and `places` (N, 3): as the file has them.
 
     `time`: unit of the file's times. `step_s`: their median step. `order`: where the order of columns comes from.
-    `names`: what the columns of `table` hold.
+    `names`: what the columns of `table` hold. `began_s`: at a time of 0, seconds since 1970; None where the file has
+    other times.
     """
 
     times_s: F64
@@ -34,6 +37,7 @@ class PoseTable:
     order: str
     names: Sequence[str]
     table: Table
+    began_s: float | None
 
     @property
     def rate(self) -> str:
@@ -61,4 +65,12 @@ def read_pose_table(path: Path, usual: Sequence[str], expected: str, may_have_mo
     time, x, y, z, qw, qx, qy, qz = (table.numbers[:, names.index(name)] for name in POSE)
     times, step, unit = in_seconds(time)
     turns = matrix_from_quat(normalised(np.column_stack([qw, qx, qy, qz])))
-    return PoseTable(times, turns, np.column_stack([x, y, z]), unit, step, order, names, table)
+    places = np.column_stack([x, y, z])
+    return PoseTable(times, turns, places, unit, step, order, names, table, _began(time, unit))
+
+
+def _began(times: F64, unit: str) -> float | None:
+    """The first of `times`, seconds since 1970; None when it is no such time."""
+    finite = times[np.isfinite(times)]
+    first = float(finite[0]) * (1e-9 if unit == "ns" else 1.0) if len(finite) else 0.0
+    return first if EARLIEST_S < first < LATEST_S else None

@@ -40,7 +40,8 @@ class RawCamera:
     one for all poses or one for each; `lens`: where they come from. `notes`: on the file, for people. `place_of`: where
     a sample stands in the file. `detected`: what the file is, but for its axes and lens. `pictures`: names of the
     photos that the poses are of, one for each, or none. `is_levelled`: whether the world of the format is aligned with
-    gravity, by its definition. `unit`: of the lengths.
+    gravity, by its definition. `unit`: of the lengths. `began_s`: at a time of 0, seconds since 1970; None where the
+    file does not say it.
     """
 
     times_s: F64
@@ -55,6 +56,7 @@ class RawCamera:
     pictures: tuple[str, ...] = ()
     is_levelled: bool = False
     unit: Unit = Unit.METRES
+    began_s: float | None = None
 
 
 def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraPath:
@@ -95,6 +97,7 @@ def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraP
         detected=detected,
         pictures=pictures,
         quarter=upright.quarter,
+        began_s=None if raw.began_s is None else raw.began_s + float(times[0]),
     )
 
 

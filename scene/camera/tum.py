@@ -32,4 +32,15 @@ def load_tum(path: Path) -> RawCamera:
     detected = Detected("TUM trajectory", f"{COLUMNS} columns of numbers", unit="m", rate="by the times of the file")
     turns = poses.turns @ OPENGL_FROM_OPTICAL
     place_of = poses.table.place_of
-    return RawCamera(poses.times_s, turns, poses.places, "z", *lens, notes, place_of, detected, unit=Unit.USUALLY_M)
+    return RawCamera(
+        poses.times_s,
+        turns,
+        poses.places,
+        "z",
+        *lens,
+        notes,
+        place_of,
+        detected,
+        unit=Unit.USUALLY_M,
+        began_s=poses.began_s,
+    )

@@ -6,7 +6,6 @@ sides. Videos and folders start again when they end; photos that belong to the c
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Protocol
@@ -19,8 +18,6 @@ from trilane.scene.picture_order import film_of, in_order
 from trilane.shapes import Shape
 from trilane.stages.gpu.picture_file import PHONE_PHOTOS, PICTURES, read_picture
 from trilane.stages.gpu.video_reader import VideoReader
-
-ROUNDING = 1e-6
 
 
 class Background(Protocol):
@@ -42,8 +39,8 @@ def open_background(path: Path, shape: Shape, fps: float, camera: CameraPath | N
     if camera is not None and camera.is_held:
         return Pictures([Path(name) for name in camera.pictures], camera.nearest, shape, turned)
     if path.is_dir():
-        pictures, number_at, _ = folder_film(path, fps)
-        return Pictures(pictures, number_at, shape, turned)
+        pictures = pictures_in(path)
+        return Pictures(pictures, film_of([one.name for one in pictures], fps).number_at, shape, turned)
     require_file(path, "a video, a picture, or a folder of pictures")
     if is_picture(path):
         return Pictures([path], lambda _time_s: 0, shape, turned)
@@ -74,17 +71,6 @@ def _names_in(folder: Path) -> list[str]:
         return [path.name for path in folder.iterdir() if path.suffix.lower() in PICTURES]
     except OSError as error:
         raise BadInputError(folder, f"no readable folder ({reason(error)})", "a folder of pictures") from None
-
-
-def folder_film(folder: Path, fps: float) -> tuple[list[Path], Callable[[float], int], float]:
-    """The pictures of `folder`, the number of the one that is shown at a time, and after how long it starts again."""
-    pictures = pictures_in(folder)
-    film = film_of([path.name for path in pictures])
-
-    def number_at(time_s: float) -> int:
-        return bisect_right(film.frames, int(time_s * fps + ROUNDING) % film.count) - 1
-
-    return pictures, number_at, film.count / fps
 
 
 class Pictures:

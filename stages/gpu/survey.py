@@ -21,7 +21,7 @@ from trilane.files import require_file
 from trilane.scene.camera.path import CameraPath
 from trilane.scene.footage import Footage, Stored
 from trilane.scene.picture_order import film_of
-from trilane.stages.gpu.background import folder_film, is_picture
+from trilane.stages.gpu.background import is_picture, pictures_in
 from trilane.stages.gpu.picture_file import check_picture, look_at_picture
 from trilane.stages.gpu.video_reader import DEFAULT_STEP_S, Pixels, check_size, pixels_of, quarters_of, video_stream
 
@@ -60,9 +60,10 @@ def check_pictures(path: Path, fps: float, frames: int, camera: CameraPath) -> N
 def _shown(path: Path, fps: float, frames: int, camera: CameraPath) -> list[Path]:
     if camera.is_held:
         return [Path(name) for name in camera.pictures]
-    pictures, number_at, period_s = folder_film(path, fps)
-    count = min(frames, round(period_s * fps))
-    return pictures[: number_at((count - 1) / fps) + 1]
+    pictures = pictures_in(path)
+    film = film_of([picture.name for picture in pictures], fps)
+    last_s = (frames - 1) / fps
+    return pictures if last_s >= film.period_s else pictures[: film.number_at(last_s) + 1]
 
 
 def _checked(paths: Sequence[Path]) -> Iterable[None]:
@@ -71,16 +72,15 @@ def _checked(paths: Sequence[Path]) -> Iterable[None]:
 
 
 def _folder(path: Path, fps: float) -> Footage:
-    pictures, _, period_s = folder_film(path, fps)
+    pictures = pictures_in(path)
     stored = tuple(look_at_picture(picture) for picture in pictures)
     names = tuple(picture.name for picture in pictures)
     sizes = {_size(one) for one in stored}
     size = sizes.pop() if len(sizes) == 1 else f"{len(sizes)} sizes, the first {_size(stored[0])}"
-    missing = film_of(names).note
-    rate = (f"{fps:g}/s", *((missing,) if missing else ()))
-    return Footage(
-        (f"folder of {len(pictures)} pictures of {size}",), rate, stored, names, str(path.absolute()), period_s
-    )
+    film = film_of(names, fps)
+    clock = () if film.began_s is None else tuple(film.began_s + time_s for time_s in film.times_s)
+    what = (f"folder of {len(pictures)} pictures of {size}",)
+    return Footage(what, film.rate, stored, names, str(path.absolute()), film.period_s, clock)
 
 
 def _size(stored: Stored) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from trilane.scene.camera.path import CameraPath, Optics
 from trilane.scene.footage import Footage, Stored, cut_note, filmed
 from trilane.scene.lens import Known, Lens, centred
 from trilane.scene.motion.motion import Wrap
+from trilane.testing.camera_files import WRITERS, load
 
 LENS = centred(640, 480, 500)
 OUTPUT = (480, 640)
@@ -92,6 +94,39 @@ def test_pictures_that_the_camera_does_not_name_follow_each_other() -> None:
         "2.00 s, then starts again",
         "it has none of the 3 photos that the camera's file names, such as a",
     )
+
+
+def test_pictures_with_times_are_put_to_the_clock_of_the_camera() -> None:
+    """The camera began at 1e9 + 10 and moves by 1 m/s; of pictures at 9.5, 10.5, 11.25 and 14 s two are of its 3 s."""
+    names = tuple(f"{1_000_000_000 + t:.6f}.png" for t in (9.5, 10.5, 11.25, 14.0))
+    clock = tuple(1e9 + t for t in (9.5, 10.5, 11.25, 14.0))
+    photos = Footage(("folder",), ("1/s",), (Stored(OUTPUT),) * 4, names, "/photos", 5.0, clock)
+    path, notes = filmed(camera(4, began_s=1e9 + 10), photos, OUTPUT)
+    assert path.pictures == tuple(f"/photos/{name}" for name in names[1:3])
+    assert path.times_s == pytest.approx([0, 0.75])
+    assert path.places[:, 0] == pytest.approx([0.5, 1.25])
+    assert (path.is_held, path.began_s) == (True, 1e9 + 10.5)
+    assert notes[1].startswith(
+        "2 of its 4 pictures were taken during the camera's recording, by the clock, the first 0.5"
+    )
+    other, _ = filmed(camera(4, began_s=1.2e9), photos, OUTPUT)
+    unknown, _ = filmed(camera(4), photos, OUTPUT)
+    assert (other.is_held, unknown.is_held, unknown.repeat_s) == (False, False, 5.0)
+    lenses = tuple(centred(640, 480, focal) for focal in (100.0, 200.0, 300.0, 400.0))
+    own, _ = filmed(camera(4, lenses=lenses, began_s=1e9 + 10), photos, OUTPUT)
+    assert [own.lens(t_s, OUTPUT).fx for t_s in (0.0, 0.75)] == pytest.approx([150, 225])
+
+
+def test_when_a_camera_was_recorded(tmp_path: Path) -> None:
+    """TUM and EuRoC: seconds and nanoseconds since 1970; the first pose, without a place, is left out. Others: no."""
+    turns, places = np.tile(np.eye(3), (3, 1, 1)), np.zeros((3, 3))
+    places[0] = np.nan
+    for kind, began in (("tum", 1305031098.5), ("euroc", 1403636580.838555648)):
+        path = load(WRITERS[kind](tmp_path, turns, places), up_axis="z")
+        assert path.began_s == pytest.approx(began + 1 / 30, abs=1e-6)
+    assert load(WRITERS["arkit"](tmp_path, turns, places)).began_s is None
+    (tmp_path / "since start.txt").write_text("7.5 0 0 0 0 0 0 1\n")
+    assert load(tmp_path / "since start.txt").began_s is None
 
 
 def test_camera_and_video_start_again_together() -> None:

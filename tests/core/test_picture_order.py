@@ -46,8 +46,35 @@ FILMS: dict[str, tuple[list[str], list[int], int, str]] = {
 @pytest.mark.parametrize("name", FILMS)
 def test_what_numbers_say_of_time(name: str) -> None:
     names, frames, count, note = FILMS[name]
-    film = film_of(names)
-    assert (list(film.frames), film.count, film.note) == (frames, count, note)
+    film = film_of(names, 10.0)
+    assert film.times_s == pytest.approx([frame / 10 for frame in frames])
+    assert film.period_s == pytest.approx(count / 10)
+    assert film.rate == (("10/s", note) if note else ("10/s",))
+    held = [max(number for number, frame in enumerate(frames) if frame <= t % count) for t in range(3 * count)]
+    assert [film.number_at(t / 10) for t in range(3 * count)] == held
+
+
+@pytest.mark.parametrize(
+    ("names", "began"),
+    [
+        (["1305031102.175304.png", "1305031102.211214.png", "1305031102.275326.png"], 1305031102.175304),
+        (["1403636579763555584.png", "1403636579799465584.png", "1403636579863577584.png"], 1403636579.7635556),
+    ],
+)
+def test_names_that_are_times(names: list[str], began: float) -> None:
+    """TUM's and EuRoC's: steps of 35.91 and 64.112 ms, of which the usual one is 50.011 in the middle."""
+    film = film_of(names, 10.0)
+    assert film.times_s == pytest.approx([0, 0.03591, 0.100022], abs=1e-6)
+    assert film.began_s == pytest.approx(began, abs=1e-6)
+    assert film.period_s == pytest.approx(0.100022 + 0.050011, abs=1e-6)
+    assert film.rate == ("20/s by the times that are their names",)
+    gap = film_of([*names, names[-1].replace("1102.2", "1102.9").replace("9863", "9999")], 10.0)
+    assert gap.rate[1].startswith("1 gaps, the longest ")
+
+
+def test_numbers_that_are_no_times_of_a_clock() -> None:
+    for names in (["0000000001.5.png", "0000000002.5.png"], ["1234567890123456789012.png"] * 2, ["1305031102.1.png"]):
+        assert film_of(names, 10.0).began_s is None
 
 
 def test_numbers_are_compared_as_numbers() -> None:

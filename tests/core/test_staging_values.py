@@ -59,6 +59,7 @@ def test_every_field_survives_as_an_array(wrap: Wrap, leg_m: float | None) -> No
         quarter=3,
         is_held=True,
         repeat_s=7.0,
+        began_s=None if leg_m is None else 3.0,
     )
     placed = PlacedCamera(camera, random.normal(size=(3, 3)), random.normal(size=3), random.normal(size=(3, 3)), ("p",))
     arrays = staged_to_arrays(Staged((mover, mover), placed, ("all",)))
