@@ -68,7 +68,7 @@ def _sensor(path: Path) -> dict[str, F64]:
     text = "\n".join(line.split("#", 1)[0] for line in read_text(path, "a EuRoC sensor.yaml").splitlines())
     numbers = {}
     for key, count in KEYS.items():
-        found = re.search(rf"\b{key}:\s*\[([^\]]*)\]", text)
+        found = re.search(rf"\b{key}:\s*\[([^\[\]]*)\]", text)
         try:
             values = np.array([float(word) for word in found.group(1).split(",")]) if found else np.zeros(0)
         except ValueError as error:

@@ -24,7 +24,7 @@ LEAST_TIME_NS = 1e15
 #: Lines of numbers by which a table's format is told.
 LOOKED_AT = 20
 #: What is left out of a column's name: its unit, the frames of EuRoC's symbols, and all but letters and digits.
-UNIT, FRAMES, OTHER = re.compile(r"\[.*?\]"), re.compile(r"_rs(_r)?_"), re.compile(r"[^a-z0-9]")
+UNIT, FRAMES, OTHER = re.compile(r"\[[^\[\]]*\]"), re.compile(r"_rs(_r)?_"), re.compile(r"[^a-z0-9]")
 #: A column's name -> what it holds.
 KNOWN = {
     **{name: "time" for name in ("timestamp", "time", "t", "timestamps", "timestampns")},

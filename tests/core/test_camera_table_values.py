@@ -34,6 +34,12 @@ def test_a_table_has_comments_commas_and_blank_lines(tmp_path: Path) -> None:
     assert str(raised.value) == f"{path}, line 2: found could not convert string to float: 'x', expected three numbers"
 
 
+def test_column_names_without_end_take_no_time(tmp_path: Path) -> None:
+    """Brackets that are never closed: a search that looks for the end of each would take minutes."""
+    (tmp_path / "a.txt").write_text("[" * 2_000_000 + "\n0 0 0 0 0 0 0 1\n")
+    assert layout_of(tmp_path / "a.txt", "a table").columns == 1
+
+
 def test_a_table_may_have_a_million_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert text_table.MAX_ROWS == 1_000_000
     monkeypatch.setattr(text_table, "MAX_ROWS", 2)
