@@ -122,13 +122,14 @@ def _turn(lens: Lens, quarter: int, stored: Stored, is_own: bool) -> int:
     """By how many quarters `stored` is turned clockwise to be seen through `lens`, which was turned by `quarter`.
 
     A photo that the camera's file measured (`is_own`) was measured as it is stored, or as its file says, whichever has
-    the shape of the lens. Else the file is believed, unless it lies across the camera's picture.
+    the shape of the lens. Else the file is believed, unless its pixels have the shape of a measured lens, and as it is
+    shown it lies across it.
     """
+    measured = lens.turned(-quarter)
     if is_own and lens.known is Known.ALL:
-        measured = lens.turned(-quarter)
         is_as_stored = not measured.lies_across(stored.shape) or measured.lies_across(stored.shown())
         return (quarter if is_as_stored else quarter + stored.turned) % 4
-    is_aside = lens.lies_across(stored.shown()) and not lens.lies_across(stored.shown(quarter))
+    is_aside = lens.lies_across(stored.shown()) and lens.known is Known.ALL and _is_like(measured, stored.shape)
     return quarter % 4 if is_aside else stored.turned % 4
 
 
@@ -241,12 +242,19 @@ def _shape_notes(path: CameraPath) -> tuple[str, ...]:
     """What does not fit between the camera's lens and what it is said to have filmed."""
     lens, shape = path.optics.lenses[0], path.optics.filmed[0]
     if lens.lies_across(shape):
-        return ("the camera's picture and the background do not lie the same way: they may not belong together",)
-    like = abs(lens.width_px * shape[0] / (lens.height_px * shape[1]) - 1) < LIKE_ASPECT
-    if like or lens.known is not Known.ALL:
+        held, lies = ("upright", "lies") if lens.height_px > lens.width_px else ("level", "stands")
+        return (
+            f"the camera was held {held} and the background {lies}: turn it if it is on its side; else they do not fit",
+        )
+    if lens.known is not Known.ALL or _is_like(lens, shape):
         return ()
     size = f"{lens.width_px:.0f}x{lens.height_px:.0f}"
     return (f"taken for the middle of the camera's picture of {size}, which has another shape",)
+
+
+def _is_like(lens: Lens, shape: Shape) -> bool:
+    """Whether a picture of `shape` (height, width) has the aspect of the lens's."""
+    return abs(lens.width_px * shape[0] / (lens.height_px * shape[1]) - 1) < LIKE_ASPECT
 
 
 def _length_notes(path: CameraPath, footage: Footage) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image
 
 from trilane.arrays import F64, U8
 from trilane.scene.camera.load import load_camera
@@ -47,7 +47,10 @@ def optical_axes(roll: int = 0) -> F64:
 
 
 class Camera(NamedTuple):
-    """One of a format: its lens in pixels of a photo `shape` as stored, counted from its corner; `roll` in quarters."""
+    """One of a format: its lens in pixels of a photo `shape` as stored, counted from its corner; `roll` in quarters.
+
+    `tag`: the photo's EXIF orientation.
+    """
 
     shape: Shape
     fx: float
@@ -55,6 +58,7 @@ class Camera(NamedTuple):
     cx: float
     cy: float
     roll: int = 0
+    tag: int = 1
 
 
 def mark_of(shown: F64) -> F64:
@@ -70,7 +74,9 @@ def paint(path: Path, camera: Camera, mark: F64) -> None:
     rows, columns = np.indices(camera.shape) + 0.5
     radius = DISC_PX * camera.shape[1] / 640
     cover = np.clip(radius + 0.5 - np.hypot(rows - row, columns - column), 0, 1)
-    Image.fromarray(np.stack([255 * cover, 0 * cover, 0 * cover], -1).round().astype(np.uint8)).save(path)
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = camera.tag
+    Image.fromarray(np.stack([255 * cover, 0 * cover, 0 * cover], -1).round().astype(np.uint8)).save(path, exif=exif)
 
 
 def z_up(vectors: F64) -> F64:
@@ -108,7 +114,7 @@ WRITTEN = Camera((480, 640), LENS.fx, LENS.fy, LENS.cx, LENS.cy)  # by the write
 #: Name: camera, what writes its file, and the name of its photo.
 FORMATS: dict[str, tuple[Camera, Writer, str]] = {
     "arkit": (Camera((540, 960), PHONE_F, PHONE_F, 480, 270), WRITERS["arkit"], "a"),
-    "arkit upright": (Camera((540, 960), PHONE_F, PHONE_F, 480, 270, roll=1), WRITERS["arkit"], "a"),
+    "arkit upright": (Camera((540, 960), PHONE_F, PHONE_F, 480, 270, roll=1, tag=6), WRITERS["arkit"], "a"),
     "arkit of 4:3": (Camera((720, 960), PHONE_F, PHONE_F, 480, 360), WRITERS["arkit"], "a"),
     "tum": (Camera((480, 640), 517, 517, 320, 240), WRITERS["tum"], "a"),
     "tum of half the pixels": (Camera((240, 320), 258.5, 258.5, 160, 120), WRITERS["tum"], "a"),
