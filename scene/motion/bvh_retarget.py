@@ -29,6 +29,8 @@ from trilane.scene.motion.tracks import SIDES, Tracks
 from trilane.scene.motion.trunk_turns import trunk_line
 
 LEAST_LENGTH = 1e-6
+#: An end site that is nearer to its joint than this share of the legs is a mark, not the end of a bone.
+LEAST_TIP = 0.02
 #: Axes that are tried as up; along X a body is taken to lie.
 UPS = ("y", "z", "-y", "-z")
 #: A coordinate beyond this, in the file's units, is a damaged one.
@@ -119,20 +121,23 @@ def tracks_of(bvh: Bvh, index_of: dict[str, int]) -> tuple[Tracks, NDArray[np.bo
     with np.errstate(invalid="ignore"):
         readable = np.asarray((np.abs(places) < FARTHEST).all(axis=(1, 2)) & np.isfinite(turns).all(axis=(1, 2, 3)))
     turns, places = turns[readable], places[readable]
-    tips = {name: _tip(bvh, index, turns, places) for name, index in index_of.items()}
+    named = {name: places[:, index] for name, index in index_of.items()}
+    least = LEAST_TIP * leg_length(Tracks(named)) if len(places) else 0.0
+    tips = {name: _tip(bvh, index, turns, places, least) for name, index in index_of.items()}
     return Tracks(
-        {name: places[:, index] for name, index in index_of.items()},
+        named,
         {name: turns[:, index] for name, index in index_of.items()},
         {name: tip for name, tip in tips.items() if tip is not None},
     ), readable
 
 
-def _tip(bvh: Bvh, index: int, turns: F64, places: F64) -> F64 | None:
+def _tip(bvh: Bvh, index: int, turns: F64, places: F64, least: float) -> F64 | None:
     """Place (T, 3) of what a joint's own bone ends at: its end site or the next joint below, the furthest of several.
 
-    A joint at the same place counts as the joint itself; thumbs do not count. None when there is nothing below.
+    A joint at the same place counts as the joint itself; thumbs do not count. None when there is nothing below, or
+    nothing further than `least`, in the file's units.
     """
-    here, found, reach = {index}, None, LEAST_LENGTH
+    here, found, reach = {index}, None, max(least, LEAST_LENGTH)
     for k, joint in enumerate(bvh.joints):
         ends = [places[:, k] + turns[:, k] @ joint.tip] if k in here and joint.tip is not None else []
         if joint.parent in here:

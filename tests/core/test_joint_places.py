@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trilane.body.joints import JOINT_NAMES, JOINT_PARENTS
+from trilane.body.joints import JOINT_NAMES
 from trilane.errors import BadInputError
 from trilane.scene.motion.array_files import load_npy
 from trilane.scene.motion.builtin import walk_wave_turn
@@ -18,25 +18,12 @@ from trilane.scene.motion.motion import Motion
 from trilane.scene.motion.recorded import RawMotion
 from trilane.scene.motion.t_pose import T_POSE
 from trilane.scene.rotations import matrix_from_rotvec
-
-LIMBS = [
-    (f"{side}_{start}", f"{side}_{end}")
-    for side in ("left", "right")
-    for start, end in (("hip", "knee"), ("knee", "ankle"), ("ankle", "foot"), ("shoulder", "elbow"), ("elbow", "wrist"))
-]
+from trilane.testing.joint_chain import chained_places, degrees_between, limb_directions
 
 
-def places_of(poses: np.ndarray, pelvis: np.ndarray, rest: np.ndarray = T_POSE) -> np.ndarray:
-    """Places (T, 22, 3) of the joints of a body at rest in `rest`: each turned by all turns above it, one by one."""
-    places = np.zeros((len(poses), 22, 3))
-    for frame, pose in enumerate(poses):
-        turns = [np.eye(3)] * 22
-        for joint in range(22):
-            above = JOINT_PARENTS[joint]
-            turn = turns[above] if joint else np.eye(3)
-            places[frame, joint] = places[frame, above] + turn @ (rest[joint] - rest[above]) if joint else pelvis[frame]
-            turns[joint] = turn @ matrix_from_rotvec(pose[joint])
-    return places
+def places_of(poses: np.ndarray, pelvis: np.ndarray) -> np.ndarray:
+    """Places (T, 22, 3) of the joints of the plain body."""
+    return chained_places(poses, pelvis, T_POSE)
 
 
 @pytest.fixture(scope="module")
@@ -49,16 +36,6 @@ def read(path: Path, array: np.ndarray) -> RawMotion:
     return load_npy(path)
 
 
-def directions(places: np.ndarray) -> dict[str, np.ndarray]:
-    at = {name: places[:, index] for index, name in enumerate(JOINT_NAMES[:22])}
-    bones = {end: at[end] - at[start] for start, end in LIMBS}
-    return {name: bone / np.linalg.norm(bone, axis=-1, keepdims=True) for name, bone in bones.items()}
-
-
-def degrees_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.degrees(np.arccos(np.clip((a * b).sum(axis=-1), -1, 1)))
-
-
 def test_limbs_point_where_the_places_say(tmp_path: Path, walk: Motion) -> None:
     """Places of a walk with waving and turning; the poses that are read put the limbs there again."""
     frames = slice(0, 600, 12)
@@ -66,7 +43,7 @@ def test_limbs_point_where_the_places_say(tmp_path: Path, walk: Motion) -> None:
     raw = read(tmp_path / "a.npy", truth.astype(np.float32))
     assert raw.translation is not None
     again = places_of(raw.poses, raw.translation)
-    wanted, found = directions(truth), directions(again)
+    wanted, found = limb_directions(truth), limb_directions(again)
     for name, bone in found.items():
         assert degrees_between(bone, wanted[name]).max() < 0.1, name
     assert np.abs(again - truth).max() < 0.03
