@@ -50,12 +50,14 @@ def load_retargeted(path: Path, units: str, joint_map: Mapping[str, str] = NO_MA
         found = f"numbers that are not finite, or absurdly large, in all of {len(readable)} frames"
         raise BadInputError(path, found, "at least half of the frames sound")
     leg = leg_length(tracks)
-    if leg < LEAST_LENGTH or np.linalg.norm(tracks.across("hip"), axis=-1).min() < LEAST_LENGTH:
+    if leg < LEAST_LENGTH or np.median(np.linalg.norm(tracks.across("hip"), axis=-1)) < LEAST_LENGTH:
         raise BadInputError(path, "legs of no length or hips in one place", "a skeleton with OFFSETs")
     unit, unit_m = unit_of(leg, units)
     poses, places, how = retarget(tracks, rest)
     start = int(np.flatnonzero(readable)[leading_t_pose(tracks, trunk_line(tracks).along(tracks))])
-    dropped = (f"the first {start} frames are a T pose that the motion jumps away from: left out",) if start else ()
+    dropped = (
+        (f"a T pose before the motion, which jumps away from it: left out, {start} of the frames",) if start else ()
+    )
     partners = sorted(JOINT_INDEX[name] for name in index_of)
     hands = sum(index >= 25 for index in partners)
     rate = 1 / bvh.frame_time_s

@@ -35,10 +35,12 @@ def frames_along(exact: F64, other: F64, first: str) -> F64:
     """Frames (T, 3, 3) with left, up and forward as columns.
 
     `first`: `left` when `exact` (T, 3) is the left and `other` (T, 3) is towards up; `up` when it is the other way
-    round.
+    round. Where both are along one line, any perpendicular direction takes the place of `other`.
     """
     a = unit(exact)
-    b = unit(beside(other, a))
+    b = beside(unit(other), a)
+    along = np.linalg.norm(b, axis=-1, keepdims=True) < TOO_SHORT
+    b = unit(np.where(along, np.cross(a, np.eye(3)[np.abs(a).argmin(axis=-1)]), b) if along.any() else b)
     left, up = (a, b) if first == "left" else (b, a)
     return np.stack([left, up, np.cross(left, up)], axis=-1)
 

@@ -90,14 +90,16 @@ def retarget(tracks: Tracks, joints: F64) -> tuple[F64, F64, tuple[str, ...]]:
     work.turns.update(with_neck_on(trunk, spine, rest) if line.top == "neck" else spine)
     work.turns.update(turns_of_collars(tracks, rest, work.turns["spine3"], stands, work.own))
     work.turns["neck"] = turns_of_neck(tracks, rest, work.turns["spine3"])
+    up = upward(tracks, trunk, stands)
+    steeper = _steeper(work, up)
     for side in SIDES:
-        _leg(work, side, trunk)
+        _leg(work, side, up, steeper)
         _arm(work, side)
     _head(work)
     return _local(work.turns, tracks.frames), _pelvis_places(work, joints), (*_notes(work), *work.notes)
 
 
-def _leg(work: Retarget, side: str, trunk: F64) -> None:
+def _leg(work: Retarget, side: str, up: F64, steeper: float) -> None:
     hip, knee, ankle, toes = (f"{side}_{part}" for part in ("hip", "knee", "ankle", "foot"))
     tracks = work.tracks
     thigh, shin = tracks.bone(hip, knee), tracks.bone(knee, ankle)
@@ -114,13 +116,8 @@ def _leg(work: Retarget, side: str, trunk: F64) -> None:
         work.turns[ankle] = work.turns[toes] = work.turns[knee]
         return
     level = [(work.bone(ankle, knee), -unit(shin) * OF_LEAST_TWIST)]
-    bone = work.bone(ankle, toes)
-    if work.stands.any():
-        up = upward(tracks, trunk, work.stands)
-        planted = planted_frames(tracks, side, foot, up)
-        level.append((UP, planted[:, None] * up))
-        bone = _sole(work, side, bone, angle_between(foot, up)[planted])
-    work.lay(ankle, bone, foot, level)
+    level.append((UP, planted_frames(tracks, side, foot, up)[:, None] * up))
+    work.lay(ankle, about(0, steeper) @ work.bone(ankle, toes), foot, level)
     work.turns[toes] = _levelled(work, toes, work.turns[ankle])
 
 
@@ -134,20 +131,27 @@ def _foot(tracks: Tracks, side: str) -> F64 | None:
     return foot if np.linalg.norm(foot, axis=-1).min() > 0 else None
 
 
-def _sole(work: Retarget, side: str, bone: F64, slopes: F64) -> F64:
-    """The avatar's direction (3,) that corresponds to a recorded foot: `bone`, or as steep as the recorded one.
+def _steeper(work: Retarget, up: F64) -> float:
+    """How much steeper a bone the recorded feet have than the avatar's while they are planted, radians.
 
-    `slopes`: angles between the recorded foot and up while it is planted, radians.
+    Of both feet the flatter one counts, as the other may stand on its toes. 0 where they are nearly as steep.
     """
-    steeper = float(np.median(slopes) - angle_between(bone, UP)) if len(slopes) else 0.0
+    found = []
+    for side in SIDES:
+        foot = _foot(work.tracks, side)
+        planted = planted_frames(work.tracks, side, foot, up) if foot is not None else np.zeros(1, dtype=bool)
+        if foot is not None and planted.any():
+            ours = angle_between(work.bone(f"{side}_ankle", f"{side}_foot"), UP)
+            found.append(float(np.median(angle_between(foot, up)[planted]) - ours))
+    steeper = min(found, default=0.0)
     if work.own or abs(steeper) < SAME_SLOPE:
-        return bone
+        return 0.0
     word = "steeper" if steeper > 0 else "flatter"
     work.notes.append(
-        f"{side} foot: {abs(np.degrees(steeper)):.0f}° {word} than the avatar's where it is planted, so its sole is "
-        "laid on the recorded sole, not its bone on the bone"
+        f"feet: {abs(np.degrees(steeper)):.0f}° {word} than the avatar's where they are planted, so soles are laid on "
+        "recorded soles, not bones on bones"
     )
-    return about(0, steeper) @ bone
+    return steeper
 
 
 def _levelled(work: Retarget, name: str, base: F64) -> F64:
@@ -234,8 +238,8 @@ def _notes(work: Retarget) -> list[str]:
         trunk = "skeleton: built like the avatar's"
     elif count:
         trunk = (
-            f"skeleton: not built like the avatar's; {count} frames with straight legs tell how trunk and shoulders "
-            "stand at rest"
+            "skeleton: not built like the avatar's; how trunk and shoulders stand at rest is told by the straightest "
+            f"legs, {count} of {work.tracks.frames} frames"
         )
     else:
         trunk = (

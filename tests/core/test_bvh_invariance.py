@@ -277,15 +277,14 @@ def test_a_skeleton_of_another_build_is_the_same_body_too(tmp_path: Path, body: 
     ours = np.array([said.lines[LINES.index(line)] for line in exact])
     cosines = (bones * ours).sum(axis=-1) / np.linalg.norm(bones, axis=-1)
     assert np.degrees(np.arccos(np.clip(cosines, -1, 1))).max() < MOST_DEG
-    steeper = [note for note in first.notes if "steeper than the avatar's where it is planted" in note]
-    assert len(steeper) == 2
+    assert any("steeper than the avatar's where they are planted" in note for note in first.notes)
 
 
 def test_frames_of_a_t_pose_before_the_motion_are_left_out(tmp_path: Path, body: ShapedBody, truth: Seen) -> None:
     poses, pelvis = the_motion()
     lead = np.concatenate([np.zeros((3, 55, 3)), poses]), np.concatenate([np.zeros((3, 3)), pelvis])
     motion = load(tmp_path / "a.bvh", written(Style(5), *lead, body.joints), body)
-    assert "the first 3 frames are a T pose that the motion jumps away from: left out" in motion.notes
+    assert "a T pose before the motion, which jumps away from it: left out, 3 of the frames" in motion.notes
     same_body(Style(5), motion, body, truth)
     slow = np.linspace(0, 1, 12)[:, None, None] * poses[0]  # a T pose that becomes the first pose is part of the motion
     whole = np.concatenate([slow, poses]), np.concatenate([np.repeat(pelvis[:1], 12, axis=0), pelvis])
