@@ -35,7 +35,7 @@ FINGERS = ("index", "middle", "pinky", "ring", "thumb")
 #: What a hand points to: the first of these that the file has, else what its bone ends at.
 HAND_ENDS = ("middle1", "index1", "ring1", "pinky1")
 #: Weights of what tells a twist beside the bend of a limb: toes, and the least twist from the part above.
-OF_TOES, OF_LEAST_TWIST = 0.5, 0.1
+OF_TOES, OF_LEAST_TWIST = 0.5, 0.02
 #: A foot whose bone is steeper or flatter than the avatar's by more than this stands on its sole, not along its bone.
 SAME_SLOPE = np.radians(8.0)
 
@@ -108,8 +108,8 @@ def _leg(work: Retarget, side: str, up: F64, steeper: float) -> None:
     of_thigh, of_shin = [bend], [bend]
     if foot is not None:
         straight = np.cos(np.minimum(angle_between(thigh, shin), np.pi / 2))[:, None]
-        of_thigh.append((FORWARD, unit(foot) * straight * OF_TOES))
-        of_shin.append((FORWARD, unit(foot) * OF_TOES))
+        of_thigh.append((work.bone(ankle, toes), unit(foot) * straight * OF_TOES))
+        of_shin.append((work.bone(ankle, toes), unit(foot) * OF_TOES))
     work.lay(hip, work.bone(hip, knee), thigh, of_thigh)
     work.lay(knee, work.bone(knee, ankle), shin, of_shin)
     if foot is None:
