@@ -20,8 +20,10 @@ from trilane.scene.motion.motion import Motion
 Ground = Literal["auto", "sequence", "frame", "none"]
 Rule = Literal["sequence", "frame", "stance", "none"]
 
-#: Times per second of a motion at which the lowest point is computed, and how many there are at most.
-SAMPLES_PER_S, MAX_SAMPLES = 30, 600
+#: Times per second of a motion at which the lowest point is computed.
+SAMPLES_PER_S = 30
+#: How many there are at most: with `stance` those of 200 s, beyond which feet are less exactly on the floor.
+MAX_SAMPLES: dict[Rule, int] = {"sequence": 600, "frame": 600, "stance": 6000}
 #: With `sequence` 5 % of the frames may dip below the floor, so that one bad frame does not lift all others.
 LOWEST_PERCENTILE = 5.0
 #: With `stance` no point of the body is further below the floor, metres: hands and knees may be of another length.
@@ -47,9 +49,9 @@ def ground_rule(motion: Motion, ground: Ground) -> Rule:
     return "sequence" if motion.stance is None else "stance"
 
 
-def _sample_count(motion: Motion) -> int:
+def _sample_count(motion: Motion, rule: Rule) -> int:
     dense = int(motion.duration_s * SAMPLES_PER_S) + 1
-    return min(max(len(motion.times_s), dense), MAX_SAMPLES)
+    return min(max(len(motion.times_s), dense), MAX_SAMPLES[rule])
 
 
 def floor_lift(
@@ -67,7 +69,7 @@ def floor_lift(
     """
     if rule == "none":
         return np.zeros(1), np.zeros(1)
-    times_s = np.linspace(0.0, motion.duration_s, _sample_count(motion))
+    times_s = np.linspace(0.0, motion.duration_s, _sample_count(motion, rule))
     poses, pelvises = motion.sample_all(times_s)
     rows = [
         skeleton.pose(pose, pelvis * scale + shift).matrices[:, 1].copy()

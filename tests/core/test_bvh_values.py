@@ -287,7 +287,7 @@ SKELETON: list[tuple[str, str, tuple[float, float, float], tuple[float, float, f
     ("right_shoulder", "right_collar", (-12, 3, 0), None),
     ("right_elbow", "right_shoulder", (-26, 3, 0), None),
     ("right_wrist", "right_elbow", (-24, 0, 4), None),
-    ("right_thumb", "right_wrist", (-2, 0, 3), (-1, 0, 2)),
+    ("right_thumb", "right_wrist", (-6, 0, 9), (-1, 0, 2)),
     ("right_nails", "right_wrist", (-8, 1, 2), (-7, 1, 0)),
 ]
 PARENT = {name: parent for name, parent, _, _ in SKELETON}

@@ -91,6 +91,8 @@ def test_each_frame_is_lifted_by_its_own_height(body: ShapedBody) -> None:
     assert times == pytest.approx([0, 0.01, 0.02])  # as many as the motion has
     assert metres == pytest.approx(sole(body) - np.array([1.0, 1.2, 1.1]), abs=1e-5)
     assert len(lift(body, still([0, 40.0], [2.0, 2.0]), "frame")[0]) == 600
+    standing = dataclasses.replace(still([0, 40.0], [2.0, 2.0]), stance=np.ones(2))
+    assert len(lift(body, standing, "stance")[0]) == 1201
     assert lift(body, still([0, 1], [3, 3]), "none") == ([0.0], [0.0])
 
 

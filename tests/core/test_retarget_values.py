@@ -113,6 +113,18 @@ def test_feet_of_another_slope_stand_on_their_soles(lower_m: float, degrees: flo
     assert angle_deg(turn_of(poses, "left_ankle"), 0) == pytest.approx(0 if degrees else 3, abs=1)
 
 
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_the_foot_that_stands_on_its_toes_tells_no_slope(side: str) -> None:
+    places = steep_feet(posed(), 0.08)
+    foot = places[f"{side}_foot"] - places[f"{side}_ankle"]
+    places[f"{side}_foot"] = places[f"{side}_ankle"] + foot @ about(0, np.radians(20)).T
+    poses, notes = without_turns(places)
+    assert any("feet: 23° steeper" in note for note in notes)
+    other = "right" if side == "left" else "left"
+    assert angle_deg(turn_of(poses, f"{other}_ankle"), 0) == pytest.approx(0, abs=1)
+    assert angle_deg(turn_of(poses, f"{side}_ankle"), 0) == pytest.approx(20, abs=1)
+
+
 def test_feet_of_one_who_crouches_throughout_stand_on_their_soles() -> None:
     """Nobody stands, so the axis that is next to the body's up is up."""
     crouch = [(f"{side}_{joint}", about(0, np.radians(by))) for side in ("left", "right")
