@@ -18,8 +18,11 @@ from PIL import ExifTags, Image, ImageDraw
 from trilane.apps.inspection.inspection import Inspection, Length
 from trilane.errors import BadInputError, reason
 from trilane.scene.detected import Detected
-from trilane.stages.gpu.background import open_background
-from trilane.stages.gpu.picture_file import PICTURES, read_picture
+from trilane.scene.footage import Footage
+from trilane.stages.gpu.background import open_background, pictures_in
+from trilane.stages.gpu.picture_file import read_picture
+from trilane.stages.gpu.survey import survey
+from trilane.stages.gpu.video_reader import quarters_of
 
 THUMB = (160, 213)  # height, width
 COLUMNS, MOST_THUMBS = 4, 8
@@ -63,7 +66,7 @@ def _turned(orientation: int) -> str:
 
 def inspect_folder(path: Path) -> Inspection:
     """Raises BadInputError when a picture of the folder is not usable."""
-    names = sorted(file for file in path.iterdir() if file.suffix.lower() in PICTURES)
+    names, footage = pictures_in(path), survey(path, FOLDER_FPS)
     for name in names:
         _require_whole(name)
     sizes = sorted({(facts["width"], facts["height"]) for _, facts in map(picture_facts, names)})
@@ -74,7 +77,7 @@ def inspect_folder(path: Path) -> Inspection:
         f"a folder of {len(names)} pictures of {first if len(sizes) == 1 else f'{len(sizes)} sizes'}",
         "",
         f"trilane run --background {path}",
-        Detected("folder of pictures", f"{len(names)} files end as pictures do", rate="the scene's, one a frame"),
+        Detected("folder of pictures", f"{len(names)} files end as pictures do", rate=_folder_rate(footage)),
         facts={
             "pictures": len(names),
             "first": names[0].name,
@@ -85,6 +88,12 @@ def inspect_folder(path: Path) -> Inspection:
     )
 
 
+def _folder_rate(footage: Footage) -> str:
+    """Of the pictures in a scene, and what is missing."""
+    own = footage.rate if footage.clock_s else ("the scene's, one a frame", *footage.rate[1:])
+    return "; ".join(own)
+
+
 def _require_whole(path: Path) -> None:
     """Raises BadInputError for a picture that cannot be decoded to its end."""
     read_picture(path, (8, 8))
@@ -92,8 +101,7 @@ def _require_whole(path: Path) -> None:
 
 def inspect_video(path: Path) -> Inspection:
     """Raises BadInputError when the video is not usable as a background."""
-    background = open_background(path, THUMB, FOLDER_FPS)
-    background.close()
+    footage = survey(path, FOLDER_FPS)
     try:
         with av.open(str(path)) as container:
             stream = container.streams.video[0]
@@ -109,7 +117,9 @@ def inspect_video(path: Path) -> Inspection:
         f"a video ({facts['codec']}) of {facts['width']}x{facts['height']} pixels{turned}",
         "",
         f"trilane run --background {path}",
-        Detected(f"{facts['codec']} video", "streams that FFmpeg finds", rate="the mean of the file's header"),
+        Detected(
+            f"{facts['codec']} video", "streams that FFmpeg finds", rate="; ".join((*footage.rate, *footage.what[1:]))
+        ),
         Length(frames, seconds, rate),
         facts,
         draw=partial(_film, path, seconds),
@@ -129,9 +139,9 @@ def _video_facts(stream: Any) -> dict[str, Any]:
 
 
 def _rotation(stream: Any) -> int:
-    """Degrees by which the first frame is to be turned, as its file says."""
+    """Degrees by which the first frame is to be turned clockwise, as its file says."""
     for frame in stream.container.decode(stream):
-        return int(round(frame.rotation / 90) % 4 * 90)
+        return 90 * quarters_of(frame)
     return 0
 
 
