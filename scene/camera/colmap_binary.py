@@ -15,10 +15,10 @@ from typing import IO, Any
 
 from trilane.errors import BadInputError
 from trilane.files import require_file
-from trilane.scene.camera.colmap_model import MODELS, ColmapCamera, ColmapImage, checked_camera
+from trilane.scene.camera.colmap_model import MAX_NAME, MODELS, ColmapCamera, ColmapImage, checked_camera
 
 COUNT, CAMERA, IMAGE = struct.Struct("<Q"), struct.Struct("<iiQQ"), struct.Struct("<i7di")
-POINT_BYTES, MAX_NAME_BYTES = 24, 4096
+POINT_BYTES, MAX_NAME_BYTES = 24, 4 * MAX_NAME
 MAX_ENTRIES = 1_000_000
 
 

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 from trilane.errors import BadInputError
 from trilane.scene.camera.distortion import distortion_note
+from trilane.scene.camera.field_of_view import checked
 from trilane.scene.lens import Lens
 
 
@@ -40,8 +41,8 @@ MODELS = {
     10: Model("THIN_PRISM_FISHEYE", (*_FXY, "k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"), is_fisheye=True),
 }
 BY_NAME = {model.name: model for model in MODELS.values()}
-#: Sides of pictures in pixels, and fields of view in degrees, that are believed.
-MAX_SIDE_PX, FOV_DEG = 1e6, (1.0, 170.0)
+#: Sides of pictures, in pixels, that are believed; letters of a photo's name.
+MAX_SIDE_PX, MAX_NAME = 1e6, 256
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,5 @@ def checked_camera(where: str | Path, model: Model, size: tuple[float, float], v
     if not all(math.isfinite(value) for value in values) or min(focal) <= 0:
         raise BadInputError(where, "parameters that are not finite or a focal length below 0", "those of a camera")
     camera = ColmapCamera(model.name, *size, named)
-    for angle in (camera.lens().fov_x_deg, camera.lens().fov_y_deg):
-        if not FOV_DEG[0] < angle < FOV_DEG[1]:
-            raise BadInputError(where, f"a field of view of {angle:.4g} degrees", f"{FOV_DEG[0]:g} to {FOV_DEG[1]:g}")
+    checked(where, camera.lens())
     return camera

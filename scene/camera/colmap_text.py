@@ -9,7 +9,7 @@ from pathlib import Path
 
 from trilane.errors import BadInputError
 from trilane.files import read_text
-from trilane.scene.camera.colmap_model import BY_NAME, ColmapCamera, ColmapImage, checked_camera
+from trilane.scene.camera.colmap_model import BY_NAME, MAX_NAME, ColmapCamera, ColmapImage, checked_camera
 
 CAMERAS = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS a line"
 IMAGES = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME a line, then its points"
@@ -66,6 +66,8 @@ def _is_image(line: str) -> bool:
 def _image(where: str, line: str) -> ColmapImage:
     words = line.split(maxsplit=WORDS - 1)
     try:
+        if len(words[9]) > MAX_NAME:
+            raise BadInputError(where, f"a name of {len(words[9])} letters", f"at most {MAX_NAME}")
         numbers = tuple(float(word) for word in words[1:8])
         return ColmapImage(words[9], numbers[:4], numbers[4:], int(words[8]))
     except ValueError as error:

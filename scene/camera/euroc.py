@@ -18,6 +18,7 @@ from trilane.arrays import F64
 from trilane.errors import BadInputError
 from trilane.files import read_text
 from trilane.scene.camera.distortion import distortion_note
+from trilane.scene.camera.field_of_view import checked
 from trilane.scene.camera.pose_table import read_pose_table
 from trilane.scene.camera.recorded import OPENGL_FROM_OPTICAL, RawCamera
 from trilane.scene.detected import Detected
@@ -42,7 +43,7 @@ def load_euroc(path: Path) -> RawCamera:
         numbers = _sensor(sensor)
         to_body = numbers["data"].reshape(4, 4)
         turns, places = turns @ to_body[:3, :3], places + turns @ to_body[:3, 3]
-        lens, source = _lens(numbers), f"by {SENSOR}"
+        lens, source = checked(sensor, _lens(numbers)), f"by {SENSOR}"
         how = (f"poses of the body, brought to the camera by {SENSOR}", *_distortion(lens, numbers))
     notes = (f"EuRoC poses, {len(poses.times_s)}{poses.rate}, time in {poses.time}, columns {poses.order}", *how)
     detected = Detected("EuRoC poses", "times in ns and commas", unit="m", rate="by the times of the file")

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from trilane.errors import BadInputError
 from trilane.files import read_text, whole_number
 from trilane.scene.camera.distortion import distortion_note, largest_px
+from trilane.scene.camera.field_of_view import checked
 from trilane.scene.camera.map_frame import Unit
 from trilane.scene.camera.recorded import RawCamera
 from trilane.scene.camera.untimed import times_without
@@ -134,11 +135,7 @@ def _is_singular(matrix: NDArray[np.float64]) -> bool:
 def _lens(path: Path, content: Mapping[str, Any], of: str) -> tuple[Lens, str]:
     """The lens, and where it comes from. `of`: the beginning of its keys, for messages."""
     lens, source = _measured(path, content, of)
-    for side, angle in (("height", lens.fov_y_deg), ("width", lens.fov_x_deg)):
-        if not 1 < angle < 170:
-            where = f"{path}: {of.rstrip('.')}" if of else path
-            raise BadInputError(where, f"a field of view of {angle:.4g} degrees over the {side}", "1 to 170")
-    return lens, source
+    return checked(f"{path}: {of.rstrip('.')}" if of else path, lens), source
 
 
 def _measured(path: Path, content: Mapping[str, Any], of: str) -> tuple[Lens, str]:

@@ -15,6 +15,7 @@ import numpy as np
 from trilane.arrays import F64
 from trilane.errors import BadInputError
 from trilane.scene.camera.arkit import PHONE
+from trilane.scene.camera.field_of_view import checked
 from trilane.scene.camera.pose_table import PoseTable, read_pose_table
 from trilane.scene.camera.recorded import OPENGL_FROM_OPTICAL, RawCamera
 from trilane.scene.camera.text_table import read_table
@@ -46,20 +47,27 @@ def _lenses(file: Path, poses: PoseTable) -> tuple[tuple[Lens, ...], str]:
     parts = ("fx", "fy", "cx", "cy")
     if all(name in poses.names for name in parts):
         table = np.column_stack([poses.column(name) for name in parts])
-        if np.isfinite(table).all() and (table > 0).all():
-            return tuple(_lens(row) for row in table), "by the file, frame by frame"
+        if np.isfinite(table).any():
+            places = (f"{file}, {poses.table.place_of(k)}" for k in range(len(table)))
+            lenses = tuple(_lens(where, row) for where, row in zip(places, table, strict=True))
+            return lenses, "by the file, frame by frame"
     matrix = file.with_name(MATRIX)
     if not matrix.is_file():
         return (PHONE,), f"usual for a phone, as there is no {MATRIX}"
     numbers = read_table(matrix, 3, "the 3 x 3 camera matrix").numbers
-    if numbers.shape != (3, 3) or not (np.isfinite(numbers).all() and (numbers[[0, 1, 0, 1], [0, 1, 2, 2]] > 0).all()):
-        raise BadInputError(matrix, "something else", "a 3 x 3 camera matrix with positive focal lengths")
-    return (_lens(numbers[[0, 1, 0, 1], [0, 1, 2, 2]]),), f"by {MATRIX}"
+    if numbers.shape != (3, 3):
+        raise BadInputError(matrix, f"{len(numbers)} rows", "a 3 x 3 camera matrix")
+    return (_lens(matrix, numbers[[0, 1, 0, 1], [0, 1, 2, 2]]),), f"by {MATRIX}"
 
 
-def _lens(numbers: F64) -> Lens:
-    """Of fx, fy, cx and cy, of a video of the usual size where the principal point is in its middle."""
+def _lens(where: str | Path, numbers: F64) -> Lens:
+    """Of fx, fy, cx and cy, of a video of the usual size where the principal point is in its middle.
+
+    Raises BadInputError about `where`.
+    """
+    if not (np.isfinite(numbers).all() and (numbers > 0).all()):
+        raise BadInputError(where, "a lens whose numbers are not all positive", "fx, fy, cx and cy in pixels")
     fx, fy, cx, cy = (float(value) for value in numbers)
     is_usual = abs(cx - VIDEO_PX[0] / 2) < NEAR_PX and abs(cy - VIDEO_PX[1] / 2) < NEAR_PX
     width, height = VIDEO_PX if is_usual else (2 * cx, 2 * cy)
-    return Lens(width, height, fx, fy, cx, cy)
+    return checked(where, Lens(width, height, fx, fy, cx, cy))

@@ -90,8 +90,22 @@ def test_stray_scanner_without_a_lens_of_each_frame(tmp_path: Path) -> None:
     (tmp_path / "camera_matrix.csv").write_text("1400.0, 0.0, 970.0\n0.0, 1410.0, 715.0\n0.0, 0.0, 1.0")
     assert load(tmp_path).optics.lenses == (Lens(1920, 1440, 1400, 1410, 970, 715),)
     (tmp_path / "camera_matrix.csv").write_text("-1400.0, 0.0, 970.0\n0.0, 1410.0, 715.0\n0.0, 0.0, 1.0")
-    with pytest.raises(BadInputError, match=r"camera_matrix\.csv: found something else"):
+    with pytest.raises(BadInputError, match=r"camera_matrix\.csv: found a lens whose numbers are not all positive"):
         load(tmp_path)
+
+
+def test_a_lens_of_stray_scanner_that_sees_nothing_is_refused(tmp_path: Path) -> None:
+    path = write_stray(tmp_path, TURNS, PLACES)
+    lines = path.read_text().splitlines()
+    for lens, sentence in (
+        ("1e-300, 1e-300", "a field of view of 180 degrees"),
+        ("nan, 1500", "a lens whose number"),
+    ):
+        words = lines[2].split(", ")
+        words[9:11] = lens.split(", ")
+        path.write_text("\n".join([*lines[:2], ", ".join(words), *lines[3:]]))
+        with pytest.raises(BadInputError, match=rf"odometry\.csv, line 3: found {sentence}"):
+            load(path)
 
 
 def test_the_order_of_columns_is_that_of_their_names(tmp_path: Path) -> None:
@@ -303,6 +317,11 @@ BROKEN_TEXT: dict[str, tuple[str, str, str]] = {
     ),
     "word": ("1 SIMPLE_PINHOLE 640 480 500 x 240\n", VIEW, "cameras.txt, line 1: found could not convert"),
     "wide": ("1 SIMPLE_PINHOLE 640 480 1 320 240\n", VIEW, "cameras.txt, line 1: found a field of view of"),
+    "name": (
+        PINHOLE,
+        VIEW.replace("a.jpg", "a" * 257),
+        "line 1: found a name of 257 letters, expected at most",
+    ),
     "quaternion": (PINHOLE, "1 1 0 y 0 0 0 0 1 a.jpg\n", "images.txt, line 1: found could not convert"),
     "camera": (PINHOLE, "1 1 0 0 0 0 0 0 x a.jpg\n", "images.txt, line 1: found invalid literal"),
     "prose": (PINHOLE, "hello\n" + VIEW, "images.txt, line 1: found 'hello'"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -33,6 +34,20 @@ def test_first_camera_coordinates(degrees: float, pitch: float) -> None:
     assert math.acos(min(1.0, float(found.up @ true))) < allowed, found.note
 
 
+@pytest.mark.parametrize(("degrees", "pitch"), [(0, 0), (0, -20), (5, -20), (15, -50), (45, -50), (120, -35), (170, 0)])
+def test_up_is_found_in_every_axis_system(degrees: float, pitch: float) -> None:
+    """Where the camera looks within 20 degrees of level, or pans by 15 either way; held by hand, 2 degrees off."""
+    rng = np.random.default_rng(18)
+    turns = pan(degrees, pitch) @ about(0, rng.normal(0, 0.035, 31)) @ about(2, rng.normal(0, 0.035, 31))
+    for order, signs in itertools.product(itertools.permutations(range(3)), itertools.product((1.0, -1.0), repeat=3)):
+        system = np.eye(3)[list(order)] * np.array(signs)[:, None]
+        if np.linalg.det(system) < 0:
+            continue
+        for usual in ("y", "z", "-y"):
+            found = upright(system @ turns, usual, is_levelled=False)
+            assert found.quarter == 0 and found.up @ system[:, 1] == pytest.approx(1.0), found.note
+
+
 @pytest.mark.parametrize("quarter", range(4))
 def test_a_turned_device_is_believed_where_its_horizon_says_so(quarter: int) -> None:
     """A pan of 40 degrees either way; a picture on its head is rather one of a world with another up."""
@@ -47,6 +62,13 @@ def test_a_turn_is_not_believed_before_every_axis() -> None:
     turns = pan(0.0, 0.0, roll_deg=-90.0, count=1)
     assert upright(turns, "y", is_levelled=False).note == ("X up, as the camera is held (not Y, usual for the format)")
     assert upright(turns, "y", is_levelled=True).note == "Y up, device held so that the picture is turned by 90 degrees"
+
+
+def test_horizons_decide_where_a_camera_looks_down() -> None:
+    """50 degrees down, panning by 20 either way: -Z, the usual axis, is nearer to the pictures' up, but not level."""
+    turns = pan(20.0, -50.0)
+    assert (turns[:, :, 1] @ UP["-z"]).mean() > (turns[:, :, 1] @ UP["y"]).mean() > 0.6
+    assert upright(turns, "-z", is_levelled=False).up.tolist() == list(UP["y"])
 
 
 def test_a_near_rival_is_named() -> None:
