@@ -25,7 +25,7 @@ import pytest
 
 from trilane.apps.inspection.inspect_file import inspect_file
 from trilane.errors import BadInputError
-from trilane.testing.fuzz_readers import READERS
+from trilane.testing.fuzz_readers import READERS, open_files
 from trilane.testing.small_inputs import (
     arkit_text,
     body_arrays,
@@ -400,7 +400,7 @@ def test_it_is_refused_with_the_right_reason(case: str, tmp_path: Path) -> None:
         path.write_bytes(content)
     else:
         content(path)
-    before = sorted(tmp_path.rglob("*")), len(os.listdir("/proc/self/fd")), threading.active_count()  # noqa: PTH208
+    before = sorted(tmp_path.rglob("*")), open_files(), threading.active_count()
     with pytest.raises(BadInputError) as refused:
         read(path)
     sentence = str(refused.value)
@@ -414,4 +414,4 @@ def test_it_is_refused_with_the_right_reason(case: str, tmp_path: Path) -> None:
     else:
         assert (read, found.kind) in OF_ANOTHER_KIND or not found.usable
         assert found.what
-    assert (sorted(tmp_path.rglob("*")), len(os.listdir("/proc/self/fd")), threading.active_count()) == before  # noqa: PTH208
+    assert (sorted(tmp_path.rglob("*")), open_files(), threading.active_count()) == before

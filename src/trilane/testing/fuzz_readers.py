@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
-import os
 import re
 import shutil
 import tempfile
@@ -179,7 +178,7 @@ class Fuzzer:
         random = Random(f"{self.seed} {number}")
         name = random.choice(sorted(READERS))
         path = self._changed(name, random)
-        before = _open_files(), threading.active_count(), _listing(self._tried)
+        before = open_files(), threading.active_count(), _listing(self._tried)
         said = []
         for read in (READERS[name], _draw if random.random() < DRAWN else _inspect):
             begun = time.monotonic()
@@ -192,11 +191,11 @@ class Fuzzer:
         self.outcomes.update(f"{name}: {what}" for what in said[:1] if what in ("read", "refused"))
         return [Finding(self.seed, number, name, what) for what in said if what not in ("read", "refused")]
 
-    def _after(self, threads: int) -> tuple[int, int, list[str]]:
+    def _after(self, threads: int) -> tuple[list[str], int, list[str]]:
         deadline = time.monotonic() + 2
         while threading.active_count() > threads and time.monotonic() < deadline:
             time.sleep(0.01)
-        return _open_files(), threading.active_count(), _listing(self._tried)
+        return open_files(), threading.active_count(), _listing(self._tried)
 
     def _changed(self, name: str, random: Random) -> Path:
         shutil.rmtree(self._tried, ignore_errors=True)
@@ -216,8 +215,13 @@ class Fuzzer:
         return path
 
 
-def _open_files() -> int:
-    return len(os.listdir("/proc/self/fd"))  # noqa: PTH208
+def open_files() -> list[str]:
+    """What this process holds open, by name: files, pipes, sockets."""
+    found = []
+    for link in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(OSError):  # of the listing itself, which is over
+            found.append(str(link.readlink()))
+    return sorted(found)
 
 
 def _listing(folder: Path) -> list[str]:
