@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from trilane.apps.inspection import parts, recognise
@@ -31,6 +33,8 @@ READERS: dict[str, tuple[Callable[[Path], Inspection], str]] = {
     recognise.SWEEP: (parts.inspect_sweep, "a sweep"),
     recognise.TRACE: (parts.inspect_trace, "a trace"),
 }
+#: Of a folder: files that are looked at, and those that are named.
+MOST_LOOKED_AT, MOST_NAMED = 50, 6
 UNKNOWN = Inspection(
     recognise.OTHER,
     "nothing that Trilane knows",
@@ -48,12 +52,30 @@ def inspect_file(path: Path) -> Inspection:
     if kind == recognise.GLTF:
         return _foreign(Signature("a glTF file", remedy=AS_BVH))
     if kind not in READERS:
-        return UNKNOWN
+        return _folder_of(path) if path.is_dir() else UNKNOWN
     read, what = READERS[kind]
     try:
         return read(path)
     except BadInputError as error:
         return refused(kind, what, error, path)
+
+
+def _folder_of(path: Path) -> Inspection:
+    """Of a folder that is nothing by itself: the files in it that may be meant."""
+    files = itertools.islice((file for file in sorted(path.iterdir()) if file.is_file()), MOST_LOOKED_AT)
+    known = [f"{file.name} ({kind})" for file in files if (kind := _kind_or_none(file)) in READERS]
+    if not known:
+        return replace(UNKNOWN, what="a folder of nothing that Trilane knows")
+    advice = f"name a file of it: {', '.join(known[:MOST_NAMED])}"
+    return replace(UNKNOWN, what="a folder that is nothing by itself", advice=advice)
+
+
+def _kind_or_none(file: Path) -> str | None:
+    try:
+        kind, signature = recognise.kind_of(file)
+    except BadInputError:
+        return None
+    return kind if signature is None else None
 
 
 def _foreign(signature: Signature) -> Inspection:

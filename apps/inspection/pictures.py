@@ -103,7 +103,7 @@ def inspect_video(path: Path) -> Inspection:
     """Raises BadInputError when the video is not usable as a background."""
     footage = survey(path, FOLDER_FPS)
     try:
-        with av.open(str(path)) as container:
+        with av.open(str(path), metadata_errors="replace") as container:
             stream = container.streams.video[0]
             facts = _video_facts(stream)
             seconds = _seconds(container, stream)

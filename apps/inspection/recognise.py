@@ -15,6 +15,7 @@ from trilane.errors import BadInputError
 from trilane.file_signatures import ARCHIVE, ARRAY, FOREIGN, PICKLE, PICTURE, VIDEO, Signature, signature_of
 from trilane.files import npz_names, read_text, require_file
 from trilane.pipeline.journal import NAME as JOURNAL
+from trilane.scene.camera.detect import COLMAP_FILES, detect
 from trilane.stages.gpu.picture_file import PICTURES
 
 MOTION, CAMERA, PICTURE_FOLDER, BODY, TEXTURE, AVATAR = "motion", "camera", "pictures", "body", "texture", "avatar"
@@ -43,14 +44,6 @@ MARKS: tuple[tuple[tuple[str, ...], str], ...] = (
     ((MANIFEST,), AVATAR),
     (("report.json", JOURNAL), RUN),
     (("trials.jsonl",), SWEEP),
-    (
-        (
-            *(f"{folder}{name}" for folder in ("", "sparse/0/", "sparse/") for name in ("images.txt", "images.bin")),
-            "transforms.json",
-            "odometry.csv",
-        ),
-        CAMERA,
-    ),
 )
 #: Key of a JSON document -> what a file with it is. The first that is there counts.
 JSON_KEYS = {"traceEvents": TRACE, "clock": REPORT, "network": AVATAR, "frames": CAMERA}
@@ -79,6 +72,8 @@ def _folder(path: Path) -> str:
     for names, kind in MARKS:
         if any((path / name).exists() for name in names):
             return kind
+    if _is_camera(path):
+        return CAMERA
     return PICTURE_FOLDER if any(file.suffix.lower() in PICTURES for file in path.iterdir()) else OTHER
 
 
@@ -96,6 +91,8 @@ def _by_text(path: Path) -> str:
     """The kind of a file without a signature: text, or a format that has none."""
     if path.name == JOURNAL:
         return RUN
+    if path.name in COLMAP_FILES:
+        return CAMERA
     try:
         text = read_text(path, EXPECTED)
     except BadInputError:
@@ -131,6 +128,14 @@ def _toml_kind(text: str) -> str:
     if {"units", "title"} <= set(keys):
         return PROFILE
     return SCENE if keys else ""
+
+
+def _is_camera(path: Path) -> bool:
+    try:
+        detect(path)
+    except BadInputError:
+        return False
+    return True
 
 
 def _is_table(text: str) -> bool:

@@ -99,9 +99,9 @@ class _Head(NamedTuple):
 
 def _video(path: Path) -> Footage:
     try:
-        with av.open(str(path)) as container:
+        with av.open(str(path), metadata_errors="replace") as container:
             head = _head(container, path)
-        with av.open(str(path)) as container:
+        with av.open(str(path), metadata_errors="replace") as container:
             times = _times(container, path)
     except (av.FFmpegError, ValueError) as error:
         raise BadInputError(path, f"no readable video ({error})", "a video that FFmpeg can decode") from error

@@ -119,7 +119,7 @@ class VideoReader:
     def _one_round(self, seek_s: float) -> Iterator[tuple[float, U8]]:
         """The frames from the last key frame before `seek_s` to the end, with their times from the file's first one."""
         try:
-            with av.open(str(self._path)) as container:
+            with av.open(str(self._path), metadata_errors="replace") as container:
                 stream = video_stream(container, self._path)
                 if self._start_s is not None and 0 < seek_s < (container.duration or 0) / MICROSECONDS:
                     container.seek(round((self._start_s + seek_s) * MICROSECONDS))

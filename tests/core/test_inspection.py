@@ -29,6 +29,7 @@ KINDS = {
     "parts.npz": "motion",
     "aist.pkl": "motion",
     "romp.npz": "motion",
+    "places.npy": "motion",
     "arkit.txt": "camera",
     "tum.txt": "camera",
     "transforms.json": "camera",
@@ -116,6 +117,14 @@ def test_a_picture_and_a_film(inputs: dict[str, Path], tmp_path: Path) -> None:
     assert film.length == Length(6, pytest.approx(0.24), 25.0)
 
 
+def test_a_film_whose_tags_are_no_text_is_read(inputs: dict[str, Path], tmp_path: Path) -> None:
+    """The name of the program that wrote it, in Latin-1."""
+    content = inputs["film.mkv"].read_bytes()
+    assert b"Lavf" in content
+    (tmp_path / "a.mkv").write_bytes(content.replace(b"Lavf", b"L\xe4vf"))
+    assert inspect_file(tmp_path / "a.mkv").usable
+
+
 def test_lengths() -> None:
     assert Length.of(np.array([0.0])) == Length(1, 0.0, None)
     assert Length.of(np.array([1.0, 1.5, 2.0, 4.0])) == Length(4, 3.0, 2.0)
@@ -158,7 +167,12 @@ def test_a_scene_whose_files_are_missing(inputs: dict[str, Path], tmp_path: Path
 
 
 def test_folders(tmp_path: Path, inputs: dict[str, Path]) -> None:
-    assert not inspect_file(tmp_path).usable
+    assert inspect_file(tmp_path).what == "a folder of nothing that Trilane knows"
+    (tmp_path / "sequence").mkdir()
+    shutil.copyfile(inputs["kitti.txt"], tmp_path / "sequence" / "00.txt")
+    found = inspect_file(tmp_path / "sequence")
+    assert not found.usable
+    assert found.advice == "name a file of it: 00.txt (camera)"
     shutil.copytree(inputs["pictures"], tmp_path / "pictures")
     whole = (tmp_path / "pictures" / "001.png").read_bytes()
     (tmp_path / "pictures" / "001.png").write_bytes(whole[: len(whole) // 2])

@@ -276,6 +276,7 @@ AMASS_FILES: dict[str, tuple[Content, str]] = {
 }
 TABLES: dict[str, tuple[Content, str]] = {
     "words": ("a letter\nof words\n", "columns"),
+    "brackets without end": ("1 2 " + "[" * 200_000 + "\n", "found 3 columns"),
     "comments alone": ("# time\n# and place\n", "columns"),
     "a row of seven": (columns(TUM, lambda row: row[:7], first=3), "line 4: found 7 columns"),
     "a word": (columns(TUM, lambda row: [*row[:7], "x"], first=3), "line 4: found"),

@@ -122,6 +122,7 @@ READERS: dict[str, Callable[[Path], None]] = {
     "parts.npz": _motion,
     "aist.pkl": _motion,
     "romp.npz": _motion,
+    "places.npy": _motion,
     "arkit.txt": _camera,
     "tum.txt": _camera,
     "transforms.json": _camera,
@@ -204,7 +205,7 @@ class Fuzzer:
         if source.is_dir():
             path = self._tried / name
             shutil.copytree(source, path)
-            file = random.choice(sorted(path.iterdir()))
+            file = random.choice(sorted(each for each in path.rglob("*") if each.is_file()))
         else:
             file = path = self._tried / name
             file.write_bytes(source.read_bytes())

@@ -22,6 +22,7 @@ from trilane.avatars.bundle import write_bundle
 from trilane.avatars.manifest import Manifest, network_entry
 from trilane.avatars.network_checks import check_network
 from trilane.body.joints import JOINT_PARENTS, JOINTS
+from trilane.scene.motion.t_pose import T_POSE
 from trilane.testing.byte_network import net
 from trilane.testing.camera_files import (
     Writer,
@@ -86,6 +87,12 @@ def poses(frames: int = FRAMES, joints: int = JOINTS) -> NDArray[np.float64]:
     array = np.zeros((frames, joints * 3))
     array[:, 48] = np.linspace(0, 0.3, frames)
     return array
+
+
+def places_of_joints() -> NDArray[np.float64]:
+    """(T, 22, 3): the first joints of a plain body in its T pose, which goes forward by a centimetre a frame."""
+    forward = np.arange(FRAMES)[:, None, None] * np.array([0.0, 0.0, 0.01])
+    return np.asarray(T_POSE[:22] + forward, np.float64)
 
 
 def parts_of_poses() -> dict[str, NDArray[Any]]:
@@ -254,6 +261,7 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "parts.npz": lambda path: _arrays(path, **parts_of_poses()),
     "aist.pkl": lambda path: path.write_bytes(pickle.dumps(aist_arrays(), protocol=4)),
     "romp.npz": write_romp,
+    "places.npy": lambda path: np.save(path, places_of_joints()),
     "arkit.txt": lambda path: path.write_text(arkit_text()),
     "tum.txt": lambda path: path.write_text(tum_text()),
     "transforms.json": lambda path: path.write_text(nerf_text()),
