@@ -98,8 +98,8 @@ def _pace(pace: PaceComparison) -> str:
 def _check(check: Check) -> str:
     return (
         f"of this run, {check.frames} frames against {check.against}: PSNR {check.psnr_db:.1f} dB, worst "
-        f"{check.worst_psnr_db:.1f}; MAE {check.mae:.2f} of 255; FLIP {check.flip:.3f}; IoU {check.iou:.3f} "
-        f"({MEASURED})"
+        f"{check.worst_psnr_db:.1f}; MAE {check.mae:.2f} of 255; FLIP {check.flip:.3f}; IoU of all but background "
+        f"{check.iou:.3f} ({MEASURED})"
     )
 
 

@@ -92,7 +92,8 @@ def test_the_error_of_the_run_itself_stands_beside_its_speed() -> None:
     check = {"frames": 3, "psnr_db": 31.26, "worst_psnr_db": 28.0, "mae": 1.756, "ssim": None, "flip": 0.04, "iou": 0.9}
     text = table_text(make_report(check={**check, "against": "the reference", "numbers": (1, 2, 3)}))
     said = (
-        "of this run, 3 frames against the reference: PSNR 31.3 dB, worst 28.0; MAE 1.76 of 255; FLIP 0.040; IoU 0.900"
+        "of this run, 3 frames against the reference: PSNR 31.3 dB, worst 28.0; MAE 1.76 of 255; FLIP 0.040; "
+        "IoU of all but background 0.900"
     )
     assert f"{said} (measured in this run)" in text.replace("\n", " ")
 
