@@ -114,13 +114,20 @@ def read_npy(path: Path, expected: str) -> NDArray[Any]:
 
 
 def read_npz(path: Path, keys: Collection[str], expected: str) -> dict[str, NDArray[Any]]:
-    """Those of `keys` that the `.npz` file has; other members are not opened. Raises BadInputError."""
+    """Those of `keys` that the `.npz` file has; other members are not opened. Raises BadInputError.
+
+    All together have at most MAX_ARRAY_BYTES and a header each.
+    """
     require_file(path, expected)
     try:
         refuse_other(path, expected, ARRAY, ARCHIVE)
         with zipfile.ZipFile(path) as archive:
             names = {info.filename: info for info in archive.infolist()}
-            return {key: _member(path, archive, names[f"{key}.npy"]) for key in keys if f"{key}.npy" in names}
+            wanted = {key: names[f"{key}.npy"] for key in keys if f"{key}.npy" in names}
+            total = sum(info.file_size for info in wanted.values())
+            if len(wanted) > 1 and total > MAX_ARRAY_BYTES:
+                raise BadInputError(path, f"{total} bytes of arrays", f"at most {MAX_ARRAY_BYTES}")
+            return {key: _member(path, archive, info) for key, info in wanted.items()}
     except DAMAGED as error:
         raise BadInputError(path, f"no readable .npz archive ({reason(error)})", expected) from error
 
@@ -139,17 +146,18 @@ def npz_names(path: Path, expected: str) -> list[str]:
 def npz_pickles(path: Path, keys: Collection[str], most: int, expected: str) -> dict[str, bytes]:
     """Of those `keys` of an `.npz` file that hold Python objects: the pickles, unread. Raises BadInputError.
 
-    `most`: bytes that one may have.
+    `most`: bytes that all together may have.
     """
     require_file(path, expected)
+    found: dict[str, bytes] = {}
     try:
         with zipfile.ZipFile(path) as archive:
-            members = ((key, archive.getinfo(f"{key}.npy")) for key in keys)
-            return {
-                key: pickle
-                for key, info in members
-                if (pickle := _pickle_in(f"{path}[{key}]", archive, info, most)) is not None
-            }
+            for key in keys:
+                left = most - sum(map(len, found.values()))
+                pickle = _pickle_in(f"{path}[{key}]", archive, archive.getinfo(f"{key}.npy"), left)
+                if pickle is not None:
+                    found[key] = pickle
+        return found
     except DAMAGED as error:
         raise BadInputError(path, f"no readable .npz archive ({reason(error)})", expected) from error
 

@@ -17,7 +17,7 @@ import pytest
 
 from trilane import files
 from trilane.errors import BadInputError
-from trilane.files import as_numbers, npz_names, read_npy, read_npz, read_text, require_file, whole_number
+from trilane.files import as_numbers, npz_names, npz_pickles, read_npy, read_npz, read_text, require_file, whole_number
 
 WANTED = "numbers of mine"
 
@@ -181,6 +181,25 @@ def test_an_old_header_is_read_without_a_warning(tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert read_npy(file, WANTED).tolist() == [1.0, 2.0]
+
+
+def test_arrays_and_objects_of_an_archive_are_bounded_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two members of 128 + 24 bytes each; two objects with pickles of the same length."""
+    file = tmp_path / "a.npz"
+    np.savez(file, a=np.arange(3), b=np.arange(3), o=np.array([None], object), p=np.array([None], object))
+    monkeypatch.setattr(files, "MAX_ARRAY_BYTES", 304)
+    assert len(read_npz(file, ("a", "b"), WANTED)) == 2
+    monkeypatch.setattr(files, "MAX_ARRAY_BYTES", 303)
+    assert said(lambda: read_npz(file, ("a", "b"), WANTED)) == (
+        f"{file}: found 304 bytes of arrays, expected at most 303"
+    )
+    size = len(zipfile.ZipFile(file).read("o.npy"))
+    assert npz_pickles(file, ("a", "p"), size, WANTED).keys() == {"p"}
+    pickle = len(npz_pickles(file, ("o",), size, WANTED)["o"])
+    assert len(npz_pickles(file, ("o", "p"), size + pickle, WANTED)) == 2
+    assert said(lambda: npz_pickles(file, ("o", "p"), size + pickle - 1, WANTED)) == (
+        f"{file}[p]: found {size} bytes of Python objects, expected at most {size - 1}"
+    )
 
 
 def test_archives(tmp_path: Path) -> None:
