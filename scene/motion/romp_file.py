@@ -83,7 +83,7 @@ def _rows(found: list[Found]) -> tuple[list[int], str]:
         if times:
             person, most = times.most_common(1)[0]
             rows = [each.index(person) if person in each else -1 for each in tracks]
-            return rows, f"{len(times)} persons in the file: track {person}, in {most} frames, is read"
+            return rows, f"track {person} is read, in {most} frames, of {len(times)} in the file"
     if not any(counts):
         raise BadInputError(found[0].where, "nobody in any frame", f"rows of `{POSES}`")
     several = (

@@ -24,6 +24,7 @@ from trilane.scene.motion.stored import Found, contents, tables_in
 
 MAX_BETAS = 400
 LARGEST_SCALE = 1e4
+NO_RATE = "save it again with mocap_frame_rate=..., or its poses alone as .npy, which is played at 30/s"
 
 
 def motion_of(where: str, source: str, values: Any, there: str = "") -> RawMotion:
@@ -113,7 +114,7 @@ def _rate(layout: Layout, found: Found) -> tuple[float, str]:
                 )
             return float(value.item()), key
     if layout.rate_hz is None:
-        raise BadInputError(found.where, "no frame rate", f"a key `{RATE_KEYS[0]}` or `{RATE_KEYS[1]}`")
+        raise BadInputError(found.where, "no frame rate", f"a key `{RATE_KEYS[0]}` or `{RATE_KEYS[1]}`", NO_RATE)
     return layout.rate_hz, layout.rate_why
 
 

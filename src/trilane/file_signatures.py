@@ -53,6 +53,8 @@ SIGNATURES: tuple[tuple[bytes, Signature], ...] = (
     (rb"ply\r?\n", Signature("a PLY model", remedy="it has no motion and no camera")),
     (rb"\xff\xfe|\xfe\xff", Signature("text in UTF-16", remedy="save it as UTF-8")),
     (rb"\x93NUMPY", Signature("a NumPy array (.npy)", ARRAY)),
+    (rb"PK\x03\x04.{26}[^\0/]{0,120}/data\.pkl|PK\x03\x04.{26}[^\0/]{0,120}/\.format_version",
+     Signature("a file of torch.save", remedy=_ARRAYS)),
     (rb"PK\x03\x04.{26}[^\0/]{0,120}\.npy", Signature("NumPy arrays (.npz)", ARRAY)),
     (rb"PK(\x03\x04|\x05\x06)", Signature("a ZIP archive", ARCHIVE, _UNPACK)),
     (rb"\x1f\x8b|BZh[1-9]1AY|\xfd7zXZ\0|7z\xbc\xaf|Rar!\x1a|\x28\xb5\x2f\xfd|.{257}ustar",

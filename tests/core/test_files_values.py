@@ -88,6 +88,7 @@ OTHERS = {
     "MVNX": (b'<?xml version="1.0"?>\n<mvnx version="4">', "an MVNX file", "in Xsens MVN"),
     "ASF": (b"# AST/ASF file\n:version 1.10\n:name walker\n", "an ASF or AMC file", "export the motion as BVH"),
     "AMC": (b"#!OML:ASF F:\\VICON\n:FULLY-SPECIFIED\n:DEGREES\n", "an ASF or AMC file", "export the motion as BVH"),
+    "torch": (b"PK\x03\x04" + bytes(26) + b"archive/data.pklFB", "a file of torch.save", "save its arrays with NumPy"),
     "USD": (b"#usda 1.0\n", "a USD file", "export the motion as BVH"),
     "USD crate": (b"PXR-USDC\0\x08\0\0", "a USD file", "export the motion as BVH"),
     "pickle": (b"\x80\x04\x95\x10\0\0\0\0\0\0\0", "a Python pickle", "save its arrays with NumPy"),

@@ -238,7 +238,7 @@ def test_romp_follows_who_is_there_most_by_the_numbers_of_frames(tmp_path: Path)
     raw = romp(tmp_path / "a.npz", frames)
     assert raw.times_s == pytest.approx(np.array([3, 4, 6]) / 30)
     assert raw.translation == pytest.approx(SMPL_REST_PELVIS + np.array([[0, 1, 11], [0.1, 1, 11], [0.3, 1, 11]]))
-    assert "2 persons in the file: track 7, in 3 frames, is read" in raw.notes
+    assert "track 7 is read, in 3 frames, of 2 in the file" in raw.notes
     motion = load_motion(AvatarSpec(motion=str(tmp_path / "a.npz")), tmp_path)
     assert "-Y up, as the body stands" in motion.notes
     assert matrix_from_rotvec(motion.poses[:, 0]) == pytest.approx(np.stack([np.eye(3)] * 3), abs=1e-9)
