@@ -69,7 +69,9 @@ def motion_from_recording(raw: RawMotion, where: str, up_axis: str) -> Motion:
     if len(raw.times_s) > MAX_FRAMES:
         raise BadInputError(where, f"{len(raw.times_s)} frames", f"at most {MAX_FRAMES}")
     shift = np.zeros((len(raw.poses), 3)) if raw.translation is None else raw.translation
-    usable, repairs = usable_samples(where, raw.times_s, _readable(raw.poses, shift))
+    usable, repairs = usable_samples(
+        where, raw.times_s, _readable(raw.poses, shift), broken_as=_broken_as(raw.poses, shift)
+    )
     times, poses, shift = raw.times_s[usable], raw.poses[usable], shift[usable]
     _check_angles(poses, where)
     roots = matrix_from_rotvec(poses[:, 0])
@@ -99,6 +101,16 @@ def _readable(poses: F64, shift: F64) -> NDArray[np.bool_]:
     finite = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(shift).all(axis=1)
     with np.errstate(invalid="ignore"):
         return np.asarray(finite & (np.abs(shift) < MAX_PLACE_M).all(axis=1))
+
+
+def _broken_as(poses: F64, shift: F64) -> str:
+    """What those frames are that are not readable."""
+    not_finite = not (np.isfinite(poses).all() and np.isfinite(shift).all())
+    with np.errstate(invalid="ignore"):
+        is_far = bool((np.abs(np.where(np.isfinite(shift), shift, 0.0)) >= MAX_PLACE_M).any())
+    far = f"{MAX_PLACE_M / 1000:g} km or more from the origin"
+    found = [words for words, holds in (("not finite", not_finite), (far, is_far)) if holds]
+    return " or ".join(found) or "without a time"
 
 
 def _check_angles(poses: F64, where: str) -> None:

@@ -251,7 +251,7 @@ ARRAY_FILES: dict[str, tuple[Content, str]] = {
     "complex": (array(np.zeros((4, 165), complex)), "dtype complex128"),
     "bomb": (npy_header("(99999999, 165)") + bytes(8), "at most 1073741824 bytes"),
     "degrees": (array(np.full((4, 165), 90.0)), "an angle of 90"),
-    "nan": (array(np.full((4, 165), np.nan)), "of 4"),
+    "nan": (array(np.full((4, 165), np.nan)), "4 samples that are not finite (first: number 0)"),
     "version 9": (b"\x93NUMPY\x09\0" + bytes(100), ".npy version (9, 0)"),
 }
 AMASS_FILES: dict[str, tuple[Content, str]] = {
@@ -271,8 +271,12 @@ AMASS_FILES: dict[str, tuple[Content, str]] = {
     "bomb": (archive(poses=npy_header("(999999999, 156)") + bytes(1 << 20)), "at most 1073741824 bytes"),
     "shorter than it says": (archive(poses=npy_header("(40, 156)") + bytes(80)), "truncated"),
     "degrees": (arrays(poses=np.full((4, 156), 90.0)), "an angle of 90"),
-    "nan": (arrays(poses=np.full((4, 156), np.nan)), "of 4"),
-    "places nan": (arrays(trans=np.full((4, 3), np.inf)), "of 4"),
+    "nan": (arrays(poses=np.full((4, 156), np.nan)), "4 samples that are not finite (first: number 0)"),
+    "places nan": (arrays(trans=np.full((4, 3), np.inf)), "4 samples that are not finite (first: number 0)"),
+    "places of another planet": (
+        arrays(trans=np.full((4, 3), 2e4)),
+        "that are 10 km or more from the origin",
+    ),
 }
 TABLES: dict[str, tuple[Content, str]] = {
     "words": ("a letter\nof words\n", "columns"),
@@ -280,7 +284,7 @@ TABLES: dict[str, tuple[Content, str]] = {
     "comments alone": ("# time\n# and place\n", "columns"),
     "a row of seven": (columns(TUM, lambda row: row[:7], first=3), "line 4: found 7 columns"),
     "a word": (columns(TUM, lambda row: [*row[:7], "x"], first=3), "line 4: found"),
-    "no rotation": (columns(TUM, lambda row: [*row[:4], "0", "0", "0", "0"]), "of 5"),
+    "no rotation": (columns(TUM, lambda row: [*row[:4], "0", "0", "0", "0"]), "5 samples that are "),
     "mirrored": (columns(ARKIT, lambda row: [*row[:1], row[3], row[2], row[1], *row[4:]]), "of 5"),
     "nan": (columns(ARKIT, lambda row: ["nan" for _ in row]), "of 5"),
     "one time": (columns(TUM, lambda row: ["7", *row[1:]]), "4 times that do not increase"),
@@ -300,6 +304,33 @@ NERF_FILES: dict[str, tuple[Content, str]] = {
     "an angle of a circle": (nerf(camera_angle_x=6.3), "camera_angle_x"),
     "negative width": (nerf(w=-640), "w: found -640"),
     "nested": ('{"frames": ' + "[" * 100_000, "no valid JSON"),
+}
+
+
+def colmap(name: str, file: str, change: Callable[[bytes], bytes]) -> Callable[[Path], None]:
+    """The model of `small_inputs` with one of its files changed."""
+
+    def write(path: Path) -> None:
+        write_small_inputs(path.parent, name)[name].rename(path)
+        place = next(path.rglob(file))
+        place.write_bytes(change(place.read_bytes()))
+
+    return write
+
+
+MODELS: dict[str, tuple[Content, str]] = {
+    "another camera": (
+        colmap("colmap", "images.txt", lambda text: text.replace(b" 7 view", b" 8 " + b"v" * 200)),
+        "camera 8, expected a camera of the model",
+    ),
+    "cut images": (colmap("colmap-binary", "images.bin", lambda data: data[:-20]), "images.bin"),
+    "more images than bytes": (
+        colmap("colmap-binary", "images.bin", lambda data: b"\xff" * 4 + data[4:]),
+        "images.bin",
+    ),
+    "no lens": (colmap("colmap", "cameras.txt", lambda text: text.replace(b"510.0", b"nan")), "cameras.txt"),
+    "FBX": (colmap("colmap", "images.txt", lambda _: FBX), "an FBX file"),
+    "empty folder": (Path.mkdir, "a folder without"),
 }
 BACKGROUNDS: dict[str, tuple[str, Content, str]] = {
     "cut picture": ("a.png", cut_file("photo.png", 0.5), "no readable picture"),
@@ -373,6 +404,7 @@ def table() -> dict[str, tuple[Callable[[Path], None], str, Content, str]]:
         (MOTION, "a.npz", AMASS_FILES),
         (CAMERA, "a.txt", TABLES),
         (CAMERA, "a.json", NERF_FILES),
+        (CAMERA, "model", MODELS),
         (BODY, "body.npz", BODIES),
         (SCENE, "a.toml", SCENES),
         (NETWORK, "a.onnx", NETWORKS),
