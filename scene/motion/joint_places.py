@@ -65,7 +65,7 @@ def _sound(places: F64) -> NDArray[np.bool_]:
     """Which frames (T,) have a person's bones, each as long as in the other frames."""
     with np.errstate(all="ignore"):
         bones = _bones(places)
-        usual = np.nanmedian(bones, axis=0) if np.isfinite(bones).any() else np.zeros(len(_ENDS))
+        usual = np.nanmedian(bones, axis=0) if np.isfinite(bones).any(axis=0).all() else np.zeros(len(_ENDS))
         person = _bones(T_POSE[None, : len(NAMES)])[0]
         likeness = (usual / usual[_LEGS].sum()) / (person / person[_LEGS].sum())
         alike = (

@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 import pickletools
 import re
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -112,19 +113,25 @@ def values_of(data: bytes) -> Any:
     """
     if len(data) > MAX_BYTES:
         raise UnexpectedValue(f"{len(data)} bytes", f"at most {MAX_BYTES}", ARRAYS)
-    reader = _Reader()
     try:
-        for count, (operation, value, _) in enumerate(pickletools.genops(data)):
-            if operation.name == "STOP":
-                return reader.stack.pop()
-            if count >= MAX_OPERATIONS:
-                raise UnexpectedValue(f"more than {MAX_OPERATIONS} values", "arrays of numbers", ARRAYS)
-            _OPERATIONS.get(operation.name, _refuse(operation.name))(reader, value)
+        with warnings.catch_warnings(action="ignore", category=DeprecationWarning):  # of escapes in text of protocol 0
+            return _run(data)
     except (ValueError, OverflowError, IndexError, KeyError, TypeError, RecursionError) as error:
         if isinstance(error, UnexpectedValue):
             raise
         found = f"no readable pickle ({printable(str(error))})"
         raise UnexpectedValue(found, "the arrays of a motion", ARRAYS) from error
+
+
+def _run(data: bytes) -> Any:
+    """What the operations of `data` make. Raises UnexpectedValue, and what Python raises of values that do not fit."""
+    reader = _Reader()
+    for count, (operation, value, _) in enumerate(pickletools.genops(data)):
+        if operation.name == "STOP":
+            return reader.stack.pop()
+        if count >= MAX_OPERATIONS:
+            raise UnexpectedValue(f"more than {MAX_OPERATIONS} values", "arrays of numbers", ARRAYS)
+        _OPERATIONS.get(operation.name, _refuse(operation.name))(reader, value)
     raise UnexpectedValue("no readable pickle (it has no end)", "the arrays of a motion", ARRAYS)
 
 

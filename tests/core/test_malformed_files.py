@@ -252,7 +252,16 @@ ARRAY_FILES: dict[str, tuple[Content, str]] = {
     "bomb": (npy_header("(99999999, 165)") + bytes(8), "at most 1073741824 bytes"),
     "degrees": (array(np.full((4, 165), 90.0)), "an angle of 90"),
     "nan": (array(np.full((4, 165), np.nan)), "4 samples that are not finite (first: number 0)"),
+    "places nan": (array(np.full((4, 22, 3), np.nan)), "that are not finite"),
+    "a joint nan": (array(np.where(np.arange(22)[:, None] == 21, np.nan, np.ones((4, 22, 3)))), "that are not finite"),
     "version 9": (b"\x93NUMPY\x09\0" + bytes(100), ".npy version (9, 0)"),
+}
+PICKLES: dict[str, tuple[Content, str]] = {
+    "text": ("a letter", "no readable pickle"),
+    "FBX": (FBX, "an FBX file"),
+    "escapes": (b"S'\\u0031 \\x'\n.", "no readable pickle"),
+    "cut": (pickle.dumps({"smpl_poses": np.zeros((4, 72))})[:-20], "no readable pickle"),
+    "a call": (pickle.dumps(print), "print"),
 }
 AMASS_FILES: dict[str, tuple[Content, str]] = {
     "text": ("poses", "no readable .npz archive"),
@@ -402,6 +411,7 @@ def table() -> dict[str, tuple[Callable[[Path], None], str, Content, str]]:
         (MOTION, "a.fbx", OF_NO_READER),
         (MOTION, "a.npy", ARRAY_FILES),
         (MOTION, "a.npz", AMASS_FILES),
+        (MOTION, "a.pkl", PICKLES),
         (CAMERA, "a.txt", TABLES),
         (CAMERA, "a.json", NERF_FILES),
         (CAMERA, "model", MODELS),
