@@ -54,10 +54,8 @@ def load_retargeted(path: Path, units: str, joint_map: Mapping[str, str] = NO_MA
         raise BadInputError(path, "legs of no length or hips in one place", "a skeleton with OFFSETs")
     unit, unit_m = unit_of(leg, units)
     poses, places, how = retarget(tracks, rest)
-    start = int(np.flatnonzero(readable)[leading_t_pose(tracks, trunk_line(tracks).along(tracks))])
-    dropped = (
-        (f"a T pose before the motion, which jumps away from it: left out, {start} of the frames",) if start else ()
-    )
+    in_t, of_t_pose = leading_t_pose(tracks, trunk_line(tracks).along(tracks))
+    start = int(np.flatnonzero(readable)[in_t])
     partners = sorted(JOINT_INDEX[name] for name in index_of)
     hands = sum(index >= 25 for index in partners)
     rate = 1 / bvh.frame_time_s
@@ -67,7 +65,7 @@ def load_retargeted(path: Path, units: str, joint_map: Mapping[str, str] = NO_MA
         f"{len(index_of)} joints have a partner, {hands} of them in the hands",
         *of_roots,
         *how,
-        *dropped,
+        *of_t_pose,
         "betas: none in the format",
     )
     joints = {name: bvh.joints[index].name for name, index in index_of.items()}

@@ -38,6 +38,8 @@ HAND_ENDS = ("middle1", "index1", "ring1", "pinky1")
 OF_TOES, OF_LEAST_TWIST = 0.5, 0.02
 #: A foot whose bone is steeper or flatter than the avatar's by more than this stands on its sole, not along its bone.
 SAME_SLOPE = np.radians(8.0)
+#: No program's feet are steeper than the avatar's by more: what is more is a heel that is raised throughout.
+MOST_STEEPER = np.radians(27.0)
 
 
 @dataclass
@@ -143,7 +145,7 @@ def _steeper(work: Retarget, up: F64) -> float:
         if foot is not None and planted.any():
             ours = angle_between(work.bone(f"{side}_ankle", f"{side}_foot"), UP)
             found.append(float(np.median(angle_between(foot, up)[planted]) - ours))
-    steeper = min(found, default=0.0)
+    steeper = float(np.clip(min(found, default=0.0), -MOST_STEEPER, MOST_STEEPER))
     if work.own or abs(steeper) < SAME_SLOPE:
         return 0.0
     word = "steeper" if steeper > 0 else "flatter"

@@ -17,8 +17,8 @@ STRAIGHT_HIP, STANDING_KNEE = np.radians(25.0), np.radians(50.0)
 STRAIGHT_KNEE, LITTLE_MORE = np.radians(10.0), np.radians(5.0)
 #: A leg is below its hip when it leans less, radians; of such frames this share has the foot flat on the floor.
 LEG_BELOW, PLANTED_SHARE = np.radians(35.0), 0.25
-#: Cosine of the angle within which a mean of people who do not stand is taken for the axis beside it.
-NEAR_AXIS = np.cos(np.radians(35.0))
+#: Cosine of the angle within which the direction that a body stands in is taken for the axis beside it.
+NEAR_AXIS = np.cos(np.radians(30.0))
 #: Distances of which some are the same in two skeletons that are built alike: pairs of joints of one bone or one part.
 RIGID = (
     ("left_hip", "right_hip"),
@@ -53,17 +53,15 @@ def standing_frames(tracks: Tracks, trunk: F64) -> NDArray[np.bool_]:
 
 
 def upward(tracks: Tracks, trunk: F64, stands: NDArray[np.bool_]) -> F64:
-    """The direction (3,) that is up in the recording: of trunk and legs on average, over the frames that stand.
+    """The direction (3,) that is up in the recording: the axis of the file beside that of trunk and legs on average.
 
-    When none does, over all, and the nearest axis of the file if that is near.
+    The average is over the frames that stand, or over all when none does; it is up itself where no axis is near.
     """
     legs = tracks.between("hip") - tracks.between("ankle")
     both = unit(trunk) + unit(legs)
-    if stands.any():
-        return unit(both[stands].mean(axis=0))
-    mean = unit(both.mean(axis=0))
-    axis = np.round(mean / np.abs(mean).max())
-    return np.asarray(axis if unit(axis) @ mean > NEAR_AXIS and np.abs(axis).sum() == 1 else mean)
+    mean = unit(both[stands].mean(axis=0) if stands.any() else both.mean(axis=0))
+    nearest = np.eye(3)[np.abs(mean).argmax()] * np.sign(mean[np.abs(mean).argmax()])
+    return np.asarray(nearest if nearest @ mean > NEAR_AXIS else mean)
 
 
 def planted_frames(tracks: Tracks, side: str, foot: F64, up: F64) -> NDArray[np.bool_]:

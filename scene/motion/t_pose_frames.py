@@ -19,18 +19,22 @@ JUMP = np.radians(20.0)
 CHAINS = (("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "ankle"))
 
 
-def leading_t_pose(tracks: Tracks, trunk: F64) -> int:
-    """How many frames at the beginning are a T pose from which the motion jumps away; `trunk`: its line (T, 3)."""
+def leading_t_pose(tracks: Tracks, trunk: F64) -> tuple[int, tuple[str, ...]]:
+    """How many frames at the beginning are a T pose from which the motion jumps away, and a note on a T pose there.
+
+    `trunk`: its line (T, 3).
+    """
     pairs = [(f"{side}_{start}", f"{side}_{end}") for start, end in CHAINS for side in SIDES]
     if tracks.frames < 2 or not all(tracks.has(*pair) for pair in pairs):
-        return 0
+        return 0, ()
     bones = np.array([tracks.bone(*pair) for pair in pairs])
-    away = angle_between(bones, bones[:, :1]).max(axis=0)
-    moved = np.flatnonzero(away > STILL)
+    moved = np.flatnonzero(angle_between(bones, bones[:, :1]).max(axis=0) > STILL)
     if not len(moved) or not _in_t(tracks, trunk, bones)[0]:
-        return 0
+        return 0, ()
     first = int(moved[0])
-    return first if angle_between(bones[:, first], bones[:, first - 1]).max() > JUMP else 0
+    if angle_between(bones[:, first], bones[:, first - 1]).max() < JUMP:
+        return 0, ("begins in a T pose and moves on from it; `start_s` leaves it out",)
+    return first, (f"a T pose before the motion, which jumps away from it: left out, {first} of the frames",)
 
 
 def _in_t(tracks: Tracks, trunk: F64, bones: F64) -> NDArray[np.bool_]:

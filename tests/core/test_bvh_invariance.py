@@ -288,7 +288,9 @@ def test_frames_of_a_t_pose_before_the_motion_are_left_out(tmp_path: Path, body:
     same_body(Style(5), motion, body, truth)
     slow = np.linspace(0, 1, 12)[:, None, None] * poses[0]  # a T pose that becomes the first pose is part of the motion
     whole = np.concatenate([slow, poses]), np.concatenate([np.repeat(pelvis[:1], 12, axis=0), pelvis])
-    assert len(load(tmp_path / "b.bvh", written(Style(5), *whole, body.joints), body).times_s) == 12 + len(poses)
+    motion = load(tmp_path / "b.bvh", written(Style(5), *whole, body.joints), body)
+    assert len(motion.times_s) == 12 + len(poses)
+    assert "begins in a T pose and moves on from it; `start_s` leaves it out" in motion.notes
 
 
 @pytest.mark.parametrize("first", [True, False])
