@@ -26,6 +26,8 @@ from trilane.writing import require_writable, write_bytes, write_folder
 
 MANIFEST = "manifest.json"
 DEFAULT = "default"
+CAPTURE = "capture.toml"
+HOW_TO_TRAIN = "docs/captures.md says how an avatar is trained from frames of a person"
 TEXTURE_KEYS = ("texture", "scale")
 #: Clothes and hair of an avatar reach this far from its body, metres. The pose stage and the training crop by it.
 CLOTHES_STANDOFF_M = 0.045
@@ -82,10 +84,23 @@ def load_bundle(name: str | Path) -> Bundle:
     meant = did_you_mean(folder.name, [DEFAULT])
     if meant and not folder.exists():
         raise BadInputError(folder, "no such folder", "an avatar's folder, or default", meant)
+    if folder.is_file():
+        raise BadInputError(folder, _what_it_is(folder), "the folder of an avatar, or default", HOW_TO_TRAIN)
+    if (folder / CAPTURE).is_file() and not path.exists():
+        raise BadInputError(folder, "a capture, which avatars are trained on", "an avatar's folder", HOW_TO_TRAIN)
     manifest = parse_manifest(read_text(path, "an avatar's manifest"), path)
     for key, file in (("body", manifest.body), ("texture", manifest.texture), ("network.file", manifest.network.file)):
         _check_inside(folder, file, f"{path}: {key}")
     return Bundle(folder, manifest)
+
+
+def _what_it_is(file: Path) -> str:
+    """Of a file that stands where an avatar's folder should."""
+    try:
+        is_body = bool(read_npz(file, ("v_template",), "a body"))
+    except BadInputError:
+        is_body = False
+    return "a body, which has no texture and no network" if is_body else "a file"
 
 
 def write_bundle(

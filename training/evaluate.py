@@ -7,21 +7,33 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.arrays import U8
+from trilane.arrays import F64, U8
 from trilane.avatars.bundle import Bundle
 from trilane.avatars.network_reshape import reshaped
 from trilane.shapes import Shape
 from trilane.stages.dsp.runtime import RuntimeOptions, Session, load_runtime
 from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement, Quantisation
+from trilane.stages.gpu.skinned_mesh import SkinnedMesh
 from trilane.training.image_error import ImageError, image_error
 from trilane.training.sample_renderer import BAND_NAMES, Sample, SampleRenderer
 
 #: Paints the picture (h,w,4) of a sample and its UV image (h,w,3).
-Painter = Callable[[Sample, NDArray[np.float32]], U8]
+Painter = Callable[[Any, NDArray[np.float32]], U8]
+
+
+class Drawn(Protocol):
+    """A renderer whose samples the packed pass can draw."""
+
+    ctx: Any
+    mesh: SkinnedMesh
+
+    def placed(self, sample: Any) -> tuple[F64, Placement]:
+        """The camera (4,4) of `sample`, and its body's pose, crop and place in the tensor."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +64,7 @@ def evaluate(
             yield Evaluated(number, BAND_NAMES[sample.band], truth, pictures, known)
 
 
-def integer_painter(renderer: SampleRenderer, bundle: Bundle, runtime: str, threads: int) -> Painter:
+def integer_painter(renderer: Drawn, bundle: Bundle, runtime: str, threads: int) -> Painter:
     """A painter that runs the GPU unit's packed pass, then the integer network of `bundle` on `runtime`.
 
     `renderer`: the body and its OpenGL context.
@@ -67,12 +79,10 @@ def integer_painter(renderer: SampleRenderer, bundle: Bundle, runtime: str, thre
     drawn = PackedAvatar(packed, renderer.mesh, texture)
     sessions: dict[Shape, Session] = {}
 
-    def paint(sample: Sample, _: NDArray[np.float32]) -> U8:
+    def paint(sample: Any, _: NDArray[np.float32]) -> U8:
         shape = sample.crop.shape
         tensor = np.empty((1, *shape, packed.channels), np.uint8)
-        joints = renderer.skeleton.pose(sample.pose).matrices
-        target = packed.begin(shape)
-        drawn.draw(target, sample.view.view, Placement(joints, sample.crop.projection, (0, 0, *shape)))
+        drawn.draw(packed.begin(shape), *renderer.placed(sample))
         packed.read_into(shape, tensor.reshape(-1))
         if shape not in sessions:
             sessions[shape] = runs.load(reshaped(network, *shape), RuntimeOptions(threads=threads))

@@ -20,6 +20,7 @@ from trilane.shapes import shape_buckets
 from trilane.stages.gpu.avatar_mesh import enough_weights
 from trilane.stages.gpu.mesh_arrays import mesh_arrays
 from trilane.stages.gpu.opengl_context import open_context
+from trilane.stages.gpu.packed_pass import Placement
 from trilane.stages.gpu.skinned_mesh import SkinnedMesh
 from trilane.training.body_arrays import body_arrays
 from trilane.training.clear_view import ClothedSurface
@@ -96,6 +97,11 @@ class SampleRenderer:
     def training_sample(self, seed: Sequence[int], band: str, size: str) -> Sample:
         """As `plan`, in a random pose."""
         return self.plan(seed, random_pose, band, size)
+
+    def placed(self, sample: Sample) -> tuple[F64, Placement]:
+        """The camera (4,4) of `sample`, and its body as the packed pass draws it; valid until the next pose."""
+        joints, crop = self.skeleton.pose(sample.pose).matrices, sample.crop
+        return sample.view.view, Placement(joints, crop.projection, (0, 0, *crop.shape))
 
     def render(self, sample: Sample) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
         """The UV image (h,w,3) float32 of u, v, coverage, and the ground truth (h,w,4) uint8, straight alpha."""

@@ -36,7 +36,8 @@ class Subject:
     """Who is trained.
 
     `person`, `shaped`: the body. `renderer`: plans and renders samples. `source`: opens another one like it, in another
-    process. `facts`: for the manifest. `truth`: renders the person in any pose and view; None where only frames exist.
+    process. `facts`: for the manifest. `truth`: renders the person in any pose and view; None where only frames are
+    known: then `frames` has them, of which those `held_out` are for measuring.
     """
 
     person: Person
@@ -45,6 +46,8 @@ class Subject:
     source: Callable[[], SampleSource[Any]]
     facts: dict[str, Any]
     truth: SampleRenderer | None = None
+    frames: CaptureRenderer | None = None
+    held_out: tuple[int, ...] = ()
 
 
 def clothed_subject(body: Path, threads: int) -> Subject:
@@ -76,4 +79,5 @@ def captured_subject(folder: Path, threads: int, report: Callable[[str], None]) 
     }
     person = Person(capture.body_file, tuple(map(float, capture.betas)), tuple(map(float, capture.expression)))
     source = partial(CaptureRenderer, capture, tuple(kept), ViewRule(), threads=1)
-    return Subject(person, capture.shaped, source(), source, facts)
+    renderer = source()
+    return Subject(person, capture.shaped, renderer, source, facts, None, renderer, tuple(held_out))

@@ -26,6 +26,8 @@ from trilane.avatars.manifest import Validation
 from trilane.body.body import ShapedBody
 from trilane.errors import BadInputError, TrilaneError
 from trilane.training.body_arrays import body_arrays
+from trilane.training.capture.capture_samples import CaptureRenderer
+from trilane.training.capture_error import error_facts, frame_errors, write_held_out_error
 from trilane.training.comparison_sheet import comparison_sheet
 from trilane.training.dataset import plan_training, write_dataset
 from trilane.training.evaluate import Evaluated
@@ -120,8 +122,8 @@ def train(config: TrainConfig, report: Callable[[str], None]) -> Path:
     if subject.truth is not None:
         validation = _validate(config, avatar, subject.truth)
         report(validation.model_dump_json())
-    else:
-        report("not validated: there is no measure of an avatar of a capture yet")
+    if subject.frames is not None:
+        report(json.dumps({"held_out_error": _measure_held_out(config, subject.frames, subject.held_out)}))
     return config.out
 
 
@@ -129,6 +131,14 @@ def _subject(config: TrainConfig, report: Callable[[str], None]) -> Subject:
     if config.capture is None:
         return clothed_subject(config.body, config.workers)
     return captured_subject(config.capture, config.workers, report)
+
+
+def _measure_held_out(config: TrainConfig, renderer: CaptureRenderer, numbers: Sequence[int]) -> dict[str, Any]:
+    """The error on frames of the capture that training never read, which is written into the bundle."""
+    bundle = load_bundle(config.out)
+    facts = error_facts(frame_errors(bundle, renderer, numbers, config.workers))
+    write_held_out_error(bundle, facts)
+    return facts
 
 
 def _validate(config: TrainConfig, avatar: TrainableAvatar, renderer: SampleRenderer) -> Validation:

@@ -206,7 +206,7 @@ def test_a_training_set_is_rendered_once_and_another_is_refused(config, calls):
     )
 
 
-def test_a_capture_is_another_source_and_nothing_is_said_of_its_quality(config, calls, monkeypatch, tmp_path):
+def test_a_capture_is_another_source_and_is_measured_on_its_own_frames(config, calls, monkeypatch, tmp_path):
     """What is known of the person goes into the bundle; figures of the synthetic person are not measured on it."""
     person = Person(tmp_path / "b.npz", (0.5,), (1.0, 2.0))
     asked = []
@@ -214,17 +214,23 @@ def test_a_capture_is_another_source_and_nothing_is_said_of_its_quality(config, 
     def captured(*words):
         asked.append(words[:2])
         words[2]("9 frames of 10")
-        return Subject(person, "their shape", "their renderer", "their source", {"body": "that of a capture"})
+        facts = {"body": "that of a capture"}
+        return Subject(person, "their shape", "their renderer", "their source", facts, None, "their frames", (3, 13))
 
+    monkeypatch.setattr(command, "frame_errors", lambda *words: asked.append(words) or "errors")
+    monkeypatch.setattr(command, "error_facts", lambda errors: {"psnr_db": 20.0} if errors == "errors" else None)
+    monkeypatch.setattr(command, "write_held_out_error", lambda *words: asked.append(words))
     monkeypatch.setattr(command, "captured_subject", captured)
     lines, folder = [], tmp_path / "mine"
     one = replace(config, capture=folder)
     train(one, lines.append)
     said = {call[0]: call[1:] for call in calls}
-    assert asked == [(folder, 2)] and lines[0] == "9 frames of 10"
+    bundle, figures = f"bundle in {config.out}", {"psnr_db": 20.0}
+    assert asked == [(folder, 2), (bundle, "their frames", (3, 13), 2), (bundle, figures)]
+    assert (lines[0], json.loads(lines[-1])) == ("9 frames of 10", {"held_out_error": figures})
     assert said["plan_training"][0] == "their renderer" and said["write_dataset"][0] == "their source"
     assert said["write_avatar"][1] is person and said["write_avatar"][4]["body"] == "that of a capture"
-    assert not {"validate", "revalidate", "clothed_subject"} & set(said) and lines[-1].startswith("not validated")
+    assert not {"validate", "revalidate", "clothed_subject"} & set(said)
     assert command_of(one).endswith("--capture mine") and "--capture" not in command_of(config)
     assert json.loads((config.work / "dataset.json").read_text())["capture"] == str(folder)
     with pytest.raises(BadInputError, match="use another --work folder"):

@@ -274,6 +274,7 @@ def test_the_integer_network_is_run_as_in_the_pipeline(monkeypatch):
     bundle = SimpleNamespace(read_network=lambda: network, read_texture=lambda: np.zeros((8, 8, 5)))
     skeleton = SimpleNamespace(pose=lambda pose: SimpleNamespace(matrices=f"joints of {pose}"))
     renderer = SimpleNamespace(ctx="context", mesh="mesh", skeleton=skeleton)
+    renderer.placed = lambda sample: SampleRenderer.placed(renderer, sample)
     paint = evaluate.integer_painter(renderer, bundle, "ort", 3)
     assert made[0].made == ("context", 5, evaluate.Quantisation(0.5, 7), True)
     for number, shape in enumerate(((2, 3), (4, 2), (2, 3))):

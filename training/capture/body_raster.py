@@ -11,7 +11,7 @@ from trilane.body.kinematics import Posed, Skeleton
 from trilane.shapes import Shape
 from trilane.stages.gpu.avatar_mesh import avatar_mesh
 from trilane.stages.gpu.opengl_context import open_context
-from trilane.stages.gpu.skinned_mesh import SkinnedMesh
+from trilane.stages.gpu.skinned_mesh import BodyPose, SkinnedMesh
 from trilane.training.capture.capture import Capture
 from trilane.training.capture.fits import Fit
 from trilane.training.uv_image import UvRaster
@@ -22,20 +22,25 @@ class BodyRaster:
 
     def __init__(self, shaped: ShapedBody, threads: int | None = None) -> None:
         """Open the context. `threads`: of a software OpenGL driver. Raises MissingPartError without OpenGL."""
-        context = open_context(threads)
+        self.ctx = open_context(threads)
         self._blended = shaped.body.posedirs is not None
-        self._raster = UvRaster(context, SkinnedMesh(context, avatar_mesh(shaped), shaped.body.posedirs))
+        self.mesh = SkinnedMesh(self.ctx, avatar_mesh(shaped), shaped.body.posedirs)
+        self._raster = UvRaster(self.ctx, self.mesh)
         self.skeleton = Skeleton(shaped.joints, shaped.body.parents)
 
     def posed(self, fit: Fit) -> Posed:
         """The body of `fit`; valid until the next call."""
         return self.skeleton.pose(fit.pose, fit.place)
 
+    def body_pose(self, fit: Fit) -> BodyPose:
+        """The same as the mesh takes it; valid until the next call."""
+        posed = self.posed(fit)
+        return BodyPose(posed.matrices, posed.feature if self._blended else None)
+
     def uv(self, fit: Fit, view: F64, projection: F64, shape: Shape) -> F32:
         """The UV image (h,w,3) of `fit`: u, v, coverage. `view`, `projection` (4,4); `shape` (height, width)."""
-        posed = self.posed(fit)
-        feature = posed.feature if self._blended else None
-        return self._raster.render(posed.matrices, view, projection, shape, feature)
+        pose = self.body_pose(fit)
+        return self._raster.render(pose.joints, view, projection, shape, pose.feature)
 
     def uv_of(self, capture: Capture, number: int) -> F32:
         """The UV image of frame `number` of `capture`, as large as the frame."""

@@ -15,6 +15,7 @@ import numpy as np
 from trilane.arrays import F32, F64, U8
 from trilane.errors import BadInputError
 from trilane.shapes import shape_buckets
+from trilane.stages.gpu.packed_pass import Placement
 from trilane.training.capture.body_raster import BodyRaster
 from trilane.training.capture.capture import Capture
 from trilane.training.capture.centres import Centres, VertexCentres
@@ -69,6 +70,7 @@ class CaptureRenderer:
         self.capture, self._numbers, self._rule = capture, list(numbers), rule
         self._centres = centres or VertexCentres(capture.shaped)
         self._raster = BodyRaster(capture.shaped, threads)
+        self.ctx, self.mesh = self._raster.ctx, self._raster.mesh
         self._cropper = Cropper(capture.shaped, pose_blend=True)
         self._projection, self._lens = capture.file.camera.projection(), capture.file.camera.lens
         self._kept: OrderedDict[int, U8] = OrderedDict()
@@ -86,6 +88,25 @@ class CaptureRenderer:
                 return sample
         found = f"no view of band {band} in {TRIES} draws"
         raise BadInputError(self.capture.folder, found, "frames that show the whole person")
+
+    def whole_sample(self, number: int, size: str) -> CaptureSample | None:
+        """Frame `number` as it is, cropped to the person; None where nothing of the body is in it."""
+        posed, view, frame = (
+            self._raster.posed(self.capture.fits[number]),
+            self.capture.views[number],
+            self.capture.shape,
+        )
+        crop = self._cropper.crop(posed, View(view, self._projection, frame[1] / frame[0]), shape_buckets(size))
+        if crop is None:
+            return None
+        by = map_between(self._projection, crop.projection, frame, crop.shape)
+        return CaptureSample(number, crop, by, False, ANYWHERE)
+
+    def placed(self, sample: CaptureSample) -> tuple[F64, Placement]:
+        """The camera (4,4) of a sample that is not mirrored, and its body as the packed pass draws it."""
+        pose, crop = self._raster.body_pose(self.capture.fits[sample.picture]), sample.crop
+        placement = Placement(pose.joints, crop.projection, (0, 0, *crop.shape), pose.feature)
+        return self.capture.views[sample.picture], placement
 
     def _drawn(self, rng: np.random.Generator, band: str, size: str) -> CaptureSample | None:
         number = self._numbers[int(rng.integers(len(self._numbers)))]
