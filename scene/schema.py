@@ -100,7 +100,7 @@ class CameraSpec(Table):
     """
 
     source: str = "builtin:orbit"
-    format: Literal["auto", "arkit", "colmap", "euroc", "kitti", "nerf", "stray", "tum"] = "auto"
+    format: Literal["auto", "arkit", "colmap", "euroc", "kitti", "nerf", "record3d", "stray", "tum"] = "auto"
     fov_y_deg: float | None = Field(default=None, gt=1, lt=170)
     up_axis: Literal["auto", "x", "-x", "y", "-y", "z", "-z"] = "auto"
     metres_per_unit: float | None = Field(default=None, gt=0, le=1e6, allow_inf_nan=False)

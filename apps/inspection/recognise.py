@@ -46,7 +46,7 @@ MARKS: tuple[tuple[tuple[str, ...], str], ...] = (
     (("trials.jsonl",), SWEEP),
 )
 #: Key of a JSON document -> what a file with it is. The first that is there counts.
-JSON_KEYS = {"traceEvents": TRACE, "clock": REPORT, "network": AVATAR, "frames": CAMERA}
+JSON_KEYS = {"traceEvents": TRACE, "clock": REPORT, "network": AVATAR, "frames": CAMERA, "poses": CAMERA}
 
 
 def kind_of(path: Path) -> tuple[str, Signature | None]:

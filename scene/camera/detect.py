@@ -11,12 +11,12 @@ from typing import NamedTuple
 
 from trilane.errors import BadInputError
 from trilane.files import read_text, require_file
-from trilane.scene.camera import arkit, colmap, kitti, nerf, stray, tum
+from trilane.scene.camera import arkit, colmap, kitti, nerf, record3d, stray, tum
 from trilane.scene.camera.text_table import Layout, layout_of
 
 EXPECTED = (
-    "a camera: an ARKit log, a TUM, KITTI or EuRoC trajectory, a transforms.json, odometry.csv of Stray Scanner or a "
-    "folder of COLMAP"
+    "a camera: an ARKit log, a TUM, KITTI or EuRoC trajectory, a transforms.json, odometry.csv of Stray Scanner, "
+    "metadata.json of Record3D or a folder of COLMAP"
 )
 COLMAP_FILES = tuple(f"{name}{ending}" for name in ("cameras", "images") for ending in colmap.ENDINGS)
 
@@ -36,19 +36,28 @@ def detect(path: Path) -> Guess:
     if path.name in COLMAP_FILES and colmap.model_in(path.parent) is not None:
         return Guess("colmap", "a file of a COLMAP model")
     if path.suffix.lower() == ".json" or read_text(path, EXPECTED).lstrip()[:1] == "{":
-        return Guess("nerf", "it is JSON")
+        return _of_json(path)
     return _of_table(path, layout_of(path, EXPECTED))
+
+
+def _of_json(path: Path) -> Guess:
+    text = read_text(path, EXPECTED)
+    if '"frames"' not in text and '"poses"' in text:
+        return Guess("record3d", "JSON with `poses` and no `frames`")
+    return Guess("nerf", "it is JSON")
 
 
 def _of_folder(path: Path) -> Guess:
     found = colmap.model_in(path)
     if found is not None:
         return Guess("colmap", f"cameras{found[1]} and images{found[1]} in the folder")
-    for kind, name in (("nerf", nerf.FILE), ("stray", stray.FILE)):
+    for kind, name in (("nerf", nerf.FILE), ("stray", stray.FILE), ("record3d", record3d.FILE)):
         if (path / name).is_file():
             return Guess(kind, f"{name} in the folder")
     remedy = "name the file of poses in it"
-    raise BadInputError(path, f"a folder without {nerf.FILE}, {stray.FILE} and COLMAP's files", EXPECTED, remedy)
+    raise BadInputError(
+        path, f"a folder without {nerf.FILE}, {stray.FILE}, {record3d.FILE} and COLMAP's files", EXPECTED, remedy
+    )
 
 
 def _of_table(path: Path, layout: Layout) -> Guess:

@@ -22,6 +22,7 @@ from trilane.scene.camera.euroc import load_euroc
 from trilane.scene.camera.kitti import load_kitti
 from trilane.scene.camera.nerf import load_nerf
 from trilane.scene.camera.path import CameraPath
+from trilane.scene.camera.record3d import load_record3d
 from trilane.scene.camera.recorded import RawCamera, path_from_recording
 from trilane.scene.camera.stray import load_stray
 from trilane.scene.camera.tum import load_tum
@@ -40,9 +41,10 @@ _UNTIMED: dict[str, Callable[[Path, float | None], RawCamera]] = {
     "colmap": load_colmap,
     "kitti": load_kitti,
     "nerf": load_nerf,
+    "record3d": load_record3d,
 }
 #: Formats that may be folders.
-FOLDERS = ("colmap", "nerf", "stray")
+FOLDERS = ("colmap", "nerf", "record3d", "stray")
 
 
 def load_camera(spec: CameraSpec, base: Path) -> CameraPath:

@@ -32,6 +32,7 @@ from trilane.testing.camera_files import (
     write_colmap_binary,
     write_colmap_text,
     write_kitti,
+    write_record3d,
     write_stray,
 )
 
@@ -46,7 +47,7 @@ def where_it_is(lens: Lens) -> tuple[float, float]:
     return lens.cx + lens.fx * x / -z, lens.cy - lens.fy * y / -z
 
 
-@pytest.mark.parametrize("kind", ["nerf", "stray", "colmap text", "colmap binary"])
+@pytest.mark.parametrize("kind", ["nerf", "record3d", "stray", "colmap text", "colmap binary"])
 def test_a_point_is_at_its_pixel(tmp_path: Path, kind: str) -> None:
     """Principal point and both focal lengths are the file's; the world keeps its origin with `place = "none"`."""
     path = WRITERS[kind](tmp_path, TURNS, PLACES)
@@ -167,6 +168,30 @@ def test_euroc_poses_of_the_body_are_brought_to_the_camera(tmp_path: Path) -> No
     sensor.write_text("\n".join(lines[:-3]))
     with pytest.raises(BadInputError, match=r"sensor\.yaml: resolution: found 0 numbers, expected 2 finite numbers"):
         load(folder / "data.csv")
+
+
+def test_record3d_without_times_and_lenses_of_frames(tmp_path: Path) -> None:
+    path = write_record3d(tmp_path, TURNS, PLACES)
+    content = json.loads(path.read_text())
+    assert load(tmp_path).detected.reason == "metadata.json in the folder"
+    del content["perFrameIntrinsicCoeffs"], content["frameTimestamps"]
+    path.write_text(json.dumps({**content, "fps": 60}))
+    camera = load(path)
+    assert camera.times_s == pytest.approx(np.arange(5) / 60) and camera.optics.lenses == (LENS,)
+    assert "Record3D, 5 poses, 60 a second by `fps`, camera to world" in camera.notes
+    for key, value, sentence in (
+        ("K", [1] * 8, "K: found shape (1, 8), expected rows of 9 numbers"),
+        ("w", -1, "w: found -1, expected a side of the picture in pixels"),
+        ("poses", [[1, 2]], "poses: found shape (1, 2), expected rows of 7 numbers"),
+        ("poses", [], "poses: found shape (0,), expected rows of 7 numbers"),
+        ("perFrameIntrinsicCoeffs", [[1, 2, 3, 4]], "perFrameIntrinsicCoeffs: found 1 rows, expected 5, one for each"),
+        ("frameTimestamps", 3, "frameTimestamps: found shape (), expected rows of 1 numbers"),
+        ("frameTimestamps", ["x"], "frameTimestamps: found something else than numbers"),
+    ):
+        path.write_text(json.dumps({**content, key: value}))
+        with pytest.raises(BadInputError) as raised:
+            load(path)
+        assert f"{path}: {sentence}" in str(raised.value)
 
 
 def test_kitti_times(tmp_path: Path) -> None:
@@ -360,9 +385,9 @@ def test_files_that_are_none_of_these_are_refused(tmp_path: Path, name: str) -> 
 
 
 def test_a_folder_without_a_camera(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match=r"a folder without transforms\.json, odometry\.csv and COLMAP's files"):
+    with pytest.raises(BadInputError, match=r"a folder without transforms\.json, .*metadata\.json and COLMAP's files"):
         load(tmp_path)
-    for kind in ("colmap", "nerf", "stray", "tum"):
+    for kind in ("colmap", "nerf", "record3d", "stray", "tum"):
         with pytest.raises(BadInputError):
             load(tmp_path, format=kind)
 

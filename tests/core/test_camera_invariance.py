@@ -50,7 +50,7 @@ def known_path() -> tuple[F64, F64]:
 
 
 #: ARKit's world is levelled by its definition, so only its heading may differ.
-LEVELLED = ("arkit", "stray")
+LEVELLED = ("arkit", "record3d", "stray")
 
 
 def systems_of(name: str) -> list[F64]:
@@ -94,7 +94,7 @@ def test_all_axis_systems_origins_and_scales_give_the_same_path(tmp_path: Path, 
         assert matrix_from_quat(path.quats) == pytest.approx(turns, abs=1e-6), path.notes
         assert path.places == pytest.approx(size * (places - places.mean(axis=0)), abs=1e-3), path.notes
         assert path.times_s == pytest.approx(np.arange(POSES) / RATE_HZ, abs=1e-6)
-        if name in ("nerf", "stray") or name.startswith("colmap"):
+        if name in ("nerf", "record3d", "stray") or name.startswith("colmap"):
             assert set(path.optics.lenses) == {VIDEO_LENS if name == "stray" else LENS}
 
 

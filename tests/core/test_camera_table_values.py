@@ -96,7 +96,8 @@ def test_the_format_is_told_by_columns_or_given(tmp_path: Path) -> None:
         load(tmp_path / "nowhere.txt")
     assert str(raised.value) == (
         f"{tmp_path}/nowhere.txt: found no such file, expected a camera: an ARKit log, a TUM, KITTI or EuRoC "
-        "trajectory, a transforms.json, odometry.csv of Stray Scanner or a folder of COLMAP"
+        "trajectory, a transforms.json, odometry.csv of Stray Scanner, metadata.json of Record3D or a "
+        "folder of COLMAP"
     )
 
 

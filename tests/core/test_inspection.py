@@ -35,6 +35,7 @@ KINDS = {
     "transforms.json": "camera",
     "euroc.csv": "camera",
     "kitti.txt": "camera",
+    "metadata.json": "camera",
     "odometry.csv": "camera",
     "colmap": "camera",
     "colmap-binary": "camera",

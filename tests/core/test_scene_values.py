@@ -57,7 +57,7 @@ LIMITS: list[tuple[type, str, list[Any], list[Any]]] = [
     (AvatarSpec, "speed", [0.01, 100], [0, 101, math.nan]),
     (AvatarSpec, "loop", ["auto", "repeat", "back-and-forth", "hold"], ["bounce"]),
     (AvatarSpec, "ground", ["auto", "sequence", "frame", "none"], ["floor"]),
-    (CameraSpec, "format", ["auto", "arkit", "colmap", "euroc", "kitti", "nerf", "stray", "tum"], ["fbx"]),
+    (CameraSpec, "format", ["auto", "arkit", "colmap", "euroc", "kitti", "nerf", "record3d", "stray", "tum"], ["fbx"]),
     (CameraSpec, "up_axis", ["auto", "x", "y", "z", "-x", "-y", "-z"], ["+x", "Y"]),
     (CameraSpec, "metres_per_unit", [1e-9, 1e6, None], [0, -1, 1.1e6, math.nan]),
     (CameraSpec, "rate_hz", [1e-3, 1000, None], [0, 0.9e-3, 1001, math.nan]),

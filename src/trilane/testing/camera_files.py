@@ -165,6 +165,17 @@ def write_colmap_binary(folder: Path, turns: F64, places: F64) -> Path:
     return folder
 
 
+def write_record3d(folder: Path, turns: F64, places: F64) -> Path:
+    """As the app exports it: keys of https://docs.nerf.studio's converter, with the lens of each frame."""
+    poses = np.column_stack([quat_from_matrix(turns)[:, [1, 2, 3, 0]], places]).tolist()
+    content = {"w": 640, "h": 480, "fps": 30, "K": [LENS.fx, 0, 0, 0, LENS.fy, 0, LENS.cx, LENS.cy, 1], "poses": poses}
+    lens = [[LENS.fx, LENS.fy, LENS.cx, LENS.cy]] * len(poses)
+    times = (7.5 + seconds(len(poses))).tolist()
+    text = json.dumps({**content, "perFrameIntrinsicCoeffs": lens, "frameTimestamps": times})
+    (folder / "metadata.json").write_text(text)
+    return folder / "metadata.json"
+
+
 Writer = Callable[[Path, F64, F64], Path]
 #: Kind -> writes the poses (N, 3, 3) and (N, 3) of a camera, OpenGL axes, camera to world, and says where.
 WRITERS: dict[str, Writer] = {
@@ -174,6 +185,7 @@ WRITERS: dict[str, Writer] = {
     "kitti": write_kitti,
     "stray": write_stray,
     "nerf": write_nerf,
+    "record3d": write_record3d,
     "colmap text": write_colmap_text,
     "colmap binary": write_colmap_binary,
 }

@@ -128,6 +128,7 @@ READERS: dict[str, Callable[[Path], None]] = {
     "transforms.json": _camera,
     "euroc.csv": _camera,
     "kitti.txt": _camera,
+    "metadata.json": _camera,
     "odometry.csv": _camera,
     "colmap": _camera,
     "colmap-binary": _camera,

@@ -30,6 +30,7 @@ from trilane.testing.camera_files import (
     write_colmap_binary,
     write_colmap_text,
     write_euroc,
+    write_record3d,
     write_stray,
 )
 
@@ -267,6 +268,7 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "transforms.json": lambda path: path.write_text(nerf_text()),
     "euroc.csv": lambda path: write_euroc(path.parent, *camera_arrays()).rename(path),
     "kitti.txt": lambda path: path.write_text(kitti_text(*camera_arrays())),
+    "metadata.json": lambda path: write_record3d(path.parent, *camera_arrays()),
     "odometry.csv": lambda path: write_stray(path.parent, *camera_arrays()),
     "colmap": partial(_in_folder, write_colmap_text),
     "colmap-binary": partial(_in_folder, write_colmap_binary),
