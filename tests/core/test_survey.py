@@ -11,7 +11,7 @@ from typing import Any
 import av
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageOps
 
 from trilane.errors import BadInputError
 from trilane.scene.footage import Stored
@@ -19,7 +19,7 @@ from trilane.stages.gpu.background import open_background
 from trilane.stages.gpu.high_range import PQ, pq_code
 from trilane.stages.gpu.survey import check_pictures, survey
 
-WIDTH, HEIGHT = 64, 48
+WIDTH, HEIGHT, WHITE_PX = 64, 48, 16
 LOOSE: Any = SimpleNamespace(is_held=False)
 
 
@@ -27,8 +27,8 @@ def grey(level: int, shape: tuple[int, int] = (HEIGHT, WIDTH)) -> np.ndarray:
     return np.full((*shape, 3), level, np.uint8)
 
 
-def write_video(path: Path, times_ms: list[int], **stream: Any) -> Path:
-    """One frame at each time, frame K of grey 10 K."""
+def write_video(path: Path, times_ms: list[int], white: bool = False, **stream: Any) -> Path:
+    """One frame at each time, frame K of grey 10 K; `white`: but for its first columns."""
     with av.open(str(path), "w") as container:
         made = container.add_stream("mpeg4", rate=30)
         made.width, made.height, made.pix_fmt, made.time_base = WIDTH, HEIGHT, "yuv420p", Fraction(1, 1000)
@@ -36,7 +36,9 @@ def write_video(path: Path, times_ms: list[int], **stream: Any) -> Path:
         for key, value in stream.items():
             setattr(made.codec_context, key, value)
         for number, time_ms in enumerate(times_ms):
-            frame = av.VideoFrame.from_ndarray(grey(10 * number), format="rgb24")
+            pixels = grey(10 * number)
+            pixels[:, : WHITE_PX * white] = 255
+            frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
             frame.pts, frame.time_base = time_ms, Fraction(1, 1000)
             container.mux(made.encode(frame))
         container.mux(made.encode())
@@ -66,9 +68,13 @@ def test_a_video_of_a_variable_rate_keeps_its_times(tmp_path: Path) -> None:
 
 
 def test_pixels_that_are_not_square(tmp_path: Path) -> None:
-    """64 columns twice as wide as high are shown as 128: of a square, the middle half."""
-    path = write_video(tmp_path / "a.mkv", [0, 100], sample_aspect_ratio=Fraction(2, 1))
+    """64 columns twice as wide as high are shown as 128, of which 16 are cut off at each end: 16 white ones stay."""
+    path = write_video(tmp_path / "a.mkv", [0, 100], white=True, sample_aspect_ratio=Fraction(2, 1))
     assert survey(path, 30.0).stored == (Stored((48, 128)),)
+    background = open_background(path, (48, 96), 30.0)
+    shown = background.at(0.0)
+    background.close()
+    assert shown is not None and (shown[:, :14] > 220).all() and (shown[:, 18:] < 40).all()
 
 
 def test_a_video_that_lies_in_its_file(tmp_path: Path) -> None:
@@ -162,6 +168,20 @@ def test_a_picture_that_lies_in_its_file(tmp_path: Path) -> None:
     camera: Any = SimpleNamespace(is_held=False, optics=SimpleNamespace(turned=(3,)))
     shown = open_background(tmp_path / "a.png", (8, 6), 30.0, camera).at(0.0)
     assert shown is not None and (shown[7] == 200).all() and not shown[:7].any()
+
+
+@pytest.mark.parametrize("tag", range(1, 9))
+def test_every_tag_turns_and_mirrors_as_pillow_does(tmp_path: Path, tag: int) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = tag
+    pixels = np.random.default_rng(0).integers(0, 255, (6, 8, 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "a.png", exif=exif)
+    with Image.open(tmp_path / "a.png") as image:
+        upright = np.asarray(ImageOps.exif_transpose(image))
+    (stored,) = survey(tmp_path / "a.png", 30.0).stored
+    assert stored.shown() == upright.shape[:2]
+    shown = open_background(tmp_path / "a.png", stored.shown(), 30.0).at(0.0)
+    assert shown is not None and np.array_equal(shown, upright)
 
 
 def test_sixteen_bits_of_grey_are_brought_to_eight(tmp_path: Path) -> None:
