@@ -25,6 +25,8 @@ from trilane.errors import BadInputError
 
 #: Of `provenance`: what `weights` says of a network that nobody trained.
 UNTRAINED = "untrained: for speed alone"
+#: Entry `body` of the provenance where the person is known by frames alone: nobody can draw another pose or view.
+CAPTURED = "that of a capture"
 BANDS = ("far", "full_body", "upper_body", "face")
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 #: A shape or expression coefficient in standard deviations; values outside describe no human body.

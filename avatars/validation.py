@@ -14,7 +14,7 @@ from typing import Any
 
 from trilane.avatars.bundle import DEFAULT, Bundle, bundle_folder
 from trilane.avatars.digests import digests_of, figures_digest
-from trilane.avatars.manifest import UNTRAINED, Validation
+from trilane.avatars.manifest import CAPTURED, UNTRAINED, Validation
 from trilane.figure_sources import NO_FIGURES, from_validation
 
 #: Part of an avatar to its name in a sentence.
@@ -25,6 +25,7 @@ PARTS = {
     "constants": "the manifest's constants (shape, expression, scales and zero points)",
 }
 VALIDATE = "trilane avatar validate"
+NO_TRUTH = "only frames of its person are known; its error on those held out is in the provenance of its manifest"
 
 
 #: What a validation at another size or on another runtime costs.
@@ -91,6 +92,8 @@ def refused(bundle: Bundle) -> dict[str, Any]:
     if bundle.manifest.provenance.get("weights") == UNTRAINED:
         why = "its network is untrained: its times count, its pictures do not"
         return {"source": NO_FIGURES, "changed": [], "why": why}
+    if bundle.manifest.provenance.get("body") == CAPTURED:
+        return {"source": NO_FIGURES, "changed": [], "why": NO_TRUTH}
     if validation is None:
         return _no_figures(bundle, [], "it was never validated")
     if validation.digests is None:

@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from trilane.avatars.manifest import CAPTURED
 from trilane.body.body import ShapedBody, load_body
 from trilane.training.capture.body_raster import BodyRaster
 from trilane.training.capture.capture import open_capture
@@ -73,7 +74,7 @@ def captured_subject(folder: Path, threads: int, report: Callable[[str], None]) 
     report(f"{len(kept)} frames of {len(capture)}; {len(held_out)} are held out, {len(bad)} have bad fits")
     names = {"held_out": held_out, "bad": bad}
     facts = {
-        "body": "that of a capture",
+        "body": CAPTURED,
         "frames": len(capture),
         **{f"{key}_frames": [capture.names[number] for number in numbers] for key, numbers in names.items()},
     }

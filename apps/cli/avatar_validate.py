@@ -12,7 +12,7 @@ import typer
 
 from trilane.apps.cli.console import print_facts, stderr_console, stdout_kept
 from trilane.apps.cli.options import SIZE_HELP, AvatarArgument, JsonOption
-from trilane.avatars.manifest import BANDS
+from trilane.avatars.manifest import BANDS, CAPTURED
 from trilane.errors import BadInputError, MissingPartError
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def validate(
     """
     from trilane.apps.made import made_facts
     from trilane.avatars.bundle import load_bundle, require_writable_manifest
-    from trilane.avatars.validation import validation_facts
+    from trilane.avatars.validation import NO_TRUTH, validation_facts
     from trilane.shapes import shape_buckets
     from trilane.stages.dsp.runtime import installed, resolve
     from trilane.unexpected_value import UnexpectedValue
@@ -74,6 +74,8 @@ def validate(
     except UnexpectedValue as error:
         raise BadInputError.at("--size", error) from error
     bundle = load_bundle(name)
+    if bundle.manifest.provenance.get("body") == CAPTURED:
+        raise BadInputError(bundle.folder, "an avatar of a capture", "one of the default body, clothed", NO_TRUTH)
     try:
         from trilane.training import validate as work
     except ImportError as error:

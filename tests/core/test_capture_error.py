@@ -14,6 +14,8 @@ import pytest
 pytest.importorskip("skimage")
 
 from trilane.avatars.bundle import load_bundle
+from trilane.avatars.manifest import CAPTURED
+from trilane.avatars.validation import refused
 from trilane.errors import BadInputError
 from trilane.testing.capture_folder import write_capture_folder
 from trilane.training import capture_error
@@ -87,6 +89,19 @@ def test_the_figures_stand_in_the_provenance(tiny_bundle: Path, tmp_path: Path) 
     written = json.loads((folder / "manifest.json").read_text())
     before = json.loads((tiny_bundle / "manifest.json").read_text())
     assert written == before | {"provenance": before["provenance"] | {"held_out_error": {"psnr_db": 28.5}}}
+
+
+def test_nothing_is_validated_against_clothes_that_the_person_does_not_wear(
+    tiny_bundle: Path, tmp_path: Path, command: Any
+) -> None:
+    folder = tmp_path / "mine"
+    shutil.copytree(tiny_bundle, folder)
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["provenance"]["body"] = CAPTURED
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    assert "found an avatar of a capture" in command("avatar", "validate", folder, code=2)[1]
+    assert refused(load_bundle(folder))["why"].startswith("only frames of its person are known")
+    assert refused(load_bundle(tiny_bundle))["why"].startswith("it was never validated")
 
 
 def test_what_is_no_avatar_is_answered_with_the_way_to_one(tiny_bundle: Path, tmp_path: Path) -> None:
