@@ -311,6 +311,7 @@ NERF_FILES: dict[str, tuple[Content, str]] = {
     "no rotation": (nerf_matrix((3 * np.eye(4)).tolist(), slice(None)), "of 5"),
     "nan": (nerf_matrix(np.full((4, 4), np.nan).tolist(), slice(None)), "of 5"),
     "an angle of a circle": (nerf(camera_angle_x=6.3), "camera_angle_x"),
+    "no pixel": (nerf(w=1e-320, h=1e-320), "sides of 1 to 1e+06 pixels"),
     "negative width": (nerf(w=-640), "w: found -640"),
     "nested": ('{"frames": ' + "[" * 100_000, "no valid JSON"),
 }

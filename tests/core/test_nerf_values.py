@@ -146,7 +146,7 @@ def test_a_wrong_nerf_file_is_refused_in_one_sentence(tmp_path: Path, case: str)
 def test_fields_of_view_just_inside_the_range_are_read(tmp_path: Path) -> None:
     for degrees in (1.1, 169.0):
         tangent = math.tan(math.radians(degrees / 2))
-        (tmp_path / "a.json").write_text(nerf_text(pose_z_up(0), fl_y=1.0, h=2 * tangent, w=2 * tangent))
+        (tmp_path / "a.json").write_text(nerf_text(pose_z_up(0), fl_y=100.0, h=200 * tangent, w=200 * tangent))
         assert load(tmp_path / "a.json").lens(0.0, (480, 640)).fov_y_deg == pytest.approx(degrees)
 
 
