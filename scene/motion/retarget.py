@@ -87,8 +87,9 @@ def retarget(tracks: Tracks, joints: F64) -> tuple[F64, F64, tuple[str, ...]]:
     trunk = line.along(tracks)
     stands = standing_frames(tracks, trunk)
     work = Retarget(tracks, rest, stands, built_alike(tracks, rest))
-    shares = line.shares(rest)
-    spine = turns_of_trunk(trunk_of(tracks, line, shares), trunk_of(rest, line, shares), stands, work.own)
+    shares, by_collars = line.shares(rest), work.own or bool(stands.any())  # else the collars are as at rest
+    recorded, ours = (trunk_of(joints_of, line, shares, by_collars) for joints_of in (tracks, rest))
+    spine = turns_of_trunk(recorded, ours, stands, work.own)
     work.turns.update(with_neck_on(trunk, spine, rest) if line.top == "neck" else spine)
     work.turns.update(turns_of_collars(tracks, rest, work.turns["spine3"], stands, work.own))
     work.turns["neck"] = turns_of_neck(tracks, rest, work.turns["spine3"])

@@ -100,11 +100,14 @@ class Trunk:
     line: F64
 
 
-def trunk_of(tracks: Tracks, line: TrunkLine, shares: F64) -> Trunk:
-    """The frames of pelvis and spine, with the joints of the spine at `shares` (3,) of the line."""
+def trunk_of(tracks: Tracks, line: TrunkLine, shares: F64, by_collars: bool) -> Trunk:
+    """The frames of pelvis and spine, with the joints of the spine at `shares` (3,) of the line.
+
+    `by_collars`: whether the chest turns with its collar joints, where they are apart, or with the shoulders.
+    """
     low, *inner, top = points_at(line.points(tracks), np.array([0.0, *shares, 1.0]))
     hips = unit(tracks.across("hip"))
-    chest = _across_chest(tracks, hips)
+    chest = _across_chest(tracks, hips, by_collars)
     frames = {"pelvis": frames_along(hips, inner[0] - low, "left")}
     for name, start, end in zip(SPINE, inner, [*inner[1:], top], strict=True):
         left = (1 - TWIST[name]) * hips + TWIST[name] * chest
@@ -113,12 +116,12 @@ def trunk_of(tracks: Tracks, line: TrunkLine, shares: F64) -> Trunk:
     return Trunk(frames, line.along(tracks))
 
 
-def _across_chest(tracks: Tracks, hips: F64) -> F64:
+def _across_chest(tracks: Tracks, hips: F64, by_collars: bool) -> F64:
     """The left (T, 3) of the chest: along the collar joints if they are apart, else along the shoulders."""
     if not tracks.has("left_shoulder", "right_shoulder"):
         return hips
     shoulders = tracks.across("shoulder")
-    if collars_apart(tracks):
+    if by_collars and collars_apart(tracks):
         return unit(tracks.across("collar"))
     return unit(shoulders)
 

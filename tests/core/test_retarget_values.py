@@ -135,8 +135,11 @@ def test_feet_of_one_who_crouches_throughout_stand_on_their_soles() -> None:
     places = posed(*crouch)
     for name in below("spine1"):
         places[name] = places[name] @ about(0, np.radians(35)).T
+    places["left_shoulder"] = places["left_shoulder"] + [-0.03, 0.06, 0.02]  # the collars are as at rest, then
     poses, notes = without_turns(steep_feet(places, 0.08))
     assert any("no frame has straight legs" in note for note in notes)
+    shoulders = (places["left_shoulder"] - places["right_shoulder"])[0]
+    assert turn_of(poses, "spine3")[:, 0] == pytest.approx(shoulders / np.linalg.norm(shoulders), abs=1e-6)
     assert angle_deg(turn_of(poses, "left_ankle"), 0) == pytest.approx(0, abs=1)
 
 
