@@ -27,6 +27,7 @@ from trilane.scene.motion.trunk_turns import (
     turns_of_neck,
     turns_of_trunk,
     with_neck_on,
+    with_shoulders_on,
 )
 from trilane.scene.rotations import about, rotvec_from_matrix
 
@@ -90,8 +91,10 @@ def retarget(tracks: Tracks, joints: F64) -> tuple[F64, F64, tuple[str, ...]]:
     shares, by_collars = line.shares(rest), work.own or bool(stands.any())  # else the collars are as at rest
     recorded, ours = (trunk_of(joints_of, line, shares, by_collars) for joints_of in (tracks, rest))
     spine = turns_of_trunk(recorded, ours, stands, work.own)
-    work.turns.update(with_neck_on(trunk, spine, rest) if line.top == "neck" else spine)
-    work.turns.update(turns_of_collars(tracks, rest, work.turns["spine3"], stands, work.own))
+    upper = spine | turns_of_collars(tracks, rest, spine["spine3"], stands, work.own)
+    if tracks.has("left_shoulder", "right_shoulder"):
+        upper = with_shoulders_on(tracks.across("shoulder"), upper, rest)
+    work.turns.update(with_neck_on(trunk, upper, rest) if line.top == "neck" else upper)
     work.turns["neck"] = turns_of_neck(tracks, rest, work.turns["spine3"])
     up = upward(tracks, trunk, stands)
     steeper = _steeper(work, up)

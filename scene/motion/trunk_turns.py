@@ -197,6 +197,16 @@ def turns_of_collars(tracks: Tracks, rest: Tracks, chest: F64, stands: NDArray[n
     return {f"{side}_collar": chest @ least_turns(bones[side], local[side]) for side in SIDES}
 
 
+def with_shoulders_on(across: F64, turns: dict[str, F64], rest: Tracks) -> dict[str, F64]:
+    """Turns of chest and collars, turned once more by the least turn that lays the shoulders along `across` (T, 3)."""
+    ends = []
+    for side in SIDES:
+        chest, collar, shoulder = (rest.places[name][0] for name in ("spine3", f"{side}_collar", f"{side}_shoulder"))
+        ends.append(turned(turns["spine3"], collar - chest) + turned(turns[f"{side}_collar"], shoulder - collar))
+    once_more = least_turns(ends[0] - ends[1], across)
+    return turns | {name: once_more @ turns[name] for name in ("spine3", "left_collar", "right_collar")}
+
+
 def turns_of_neck(tracks: Tracks, rest: Tracks, chest: F64) -> F64:
     """Global turns (T, 3, 3) of the neck: it points to the head as recorded; its left is the chest's."""
     if not tracks.has("neck", "head"):
