@@ -35,9 +35,15 @@ test-device: .venv/ready-device
 mutants: .venv/ready-all
 	$(BIN)/python -m trilane.testing.mutants $(ARGS)
 
-# Tables and pictures of the documents that are computed from data beside this repository: docs/predict.md.
+# The project's own figures. docs/results: a sweep of this machine, 5 minutes in which it should do nothing else. Tables and pictures of
+# docs/predict.md: computed from data beside this repository, where they are.
 results: .venv/ready-all
-	$(BIN)/trilane profiles fit-chips ../shared/data/chips --table docs/predict.md --plot docs/images/chip-errors.png
+	rm -rf sweeps/results
+	$(BIN)/trilane sweep docs/results/runs.toml --out sweeps/results
+	$(BIN)/trilane report sweeps/results --title "What a speed costs in image error" --out docs/results/report.html \
+	  --csv docs/results/report.csv
+	if [ -d ../shared/data/chips ]; then \
+	  $(BIN)/trilane profiles fit-chips ../shared/data/chips --table docs/predict.md --plot docs/images/chip-errors.png; fi
 
 setup: .venv/ready-run
 
