@@ -35,7 +35,7 @@ test-device: .venv/ready-device
 mutants: .venv/ready-all
 	$(BIN)/python -m trilane.testing.mutants $(ARGS)
 
-# The project's own figures. docs/results: a sweep of this machine, 5 minutes in which it should do nothing else. Tables and pictures of
+# The project's own figures. docs/results: a sweep of this machine, some minutes in which it should do nothing else. Tables and pictures of
 # docs/predict.md: computed from data beside this repository, where they are.
 results: .venv/ready-all
 	rm -rf sweeps/results
