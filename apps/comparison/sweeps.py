@@ -77,6 +77,8 @@ class SweepComparison:
         whole = f"over all {change_of(self.over_all, MS)} ({interval_of(self.over_all, MS)})"
         if not differing:
             unsure = sum(pair.frame_time.probability is None for pair in self.pairs)
+            if unsure == len(self.pairs):
+                return f"it cannot be told whether any of {of} differs; {whole}"
             told = f"; of {unsure} it cannot be told" if unsure else ""
             return f"no difference in any of {of}{told}; {whole}"
         slower = sum(pair.frame_time.effect > 0 for pair in differing)

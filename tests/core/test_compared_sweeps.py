@@ -76,6 +76,15 @@ def test_repeats_of_a_configuration_stand_for_it_together(sweep: SweepOf) -> Non
     assert again.runs == 3 and again.frame_time.high is not None and again.frame_time.high < 0
 
 
+def test_of_runs_that_are_too_short_it_cannot_be_told(tmp_path: Path) -> None:
+    report = json.loads((write_run(tmp_path / "run", simulated(1, frames=20)) / "report.json").read_text())
+    record = {"id": "run", "status": "done", "command": ["trilane", "run"], "options": {}, "folder": "run"}
+    (tmp_path / "trials.jsonl").write_text(json.dumps({**record, "result": report}) + "\n")
+    found = compared(tmp_path, tmp_path)
+    assert found.verdict.startswith("it cannot be told whether any of 1 trial differs; over all +0.0 % (")
+    assert found.notes[-1].startswith("20 frames at the least")
+
+
 def test_without_run_folders_the_results_are_compared(sweep: SweepOf) -> None:
     base, other = sweep("base", {64: SAME}), sweep("other", {64: {"infer": 1.5}}, folders=False)
     (pair,) = compared(base, other).pairs
