@@ -148,6 +148,23 @@ def test_the_picture_lies_on_the_uv_image_in_every_view(capture: Capture) -> Non
     assert min(mirrored[True], mirrored[False]) > 2
 
 
+def test_where_the_frame_ends_the_body_ends_as_well(capture: Capture) -> None:
+    """The body stands across the right edge: what is drawn of it beyond is taken away, and only that."""
+    aside = tuple(replace(fit, place=fit.place + np.array([1.6, 0.0, 0.0])) for fit in capture.fits)
+    renderer = CaptureRenderer(replace(capture, fits=aside), range(8), replace(WIDE, flip_share=0.0))
+    beyond = 0
+    for number in range(6):
+        sample = renderer.training_sample((2, number), "full_body", "128")
+        uv, _ = renderer.render(sample)
+        raster = renderer._raster.uv(
+            aside[sample.picture], capture.views[sample.picture], sample.crop.projection, sample.crop.shape
+        )
+        inside = seen_of_frame(sample.by, capture.shape, sample.crop.shape)
+        assert not uv[~inside].any() and np.array_equal(uv[inside], raster[inside])
+        beyond += int((raster[~inside][:, 2] > 0).sum())
+    assert beyond > 500
+
+
 def test_a_sample_depends_on_its_seed_alone(capture: Capture) -> None:
     first, second = CaptureRenderer(capture, range(8), WIDE), CaptureRenderer(capture, range(8), WIDE)
     one, other = first.training_sample((1, 2), "far", "128"), first.training_sample((1, 3), "far", "128")
