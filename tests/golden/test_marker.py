@@ -130,6 +130,7 @@ FORMATS: dict[str, tuple[Camera, Writer, str]] = {
         "frame_00000",
     ),
     "nerf view by view": (WRITTEN, WRITERS["nerf"], "frame_00000"),
+    "record3d, upright": (WRITTEN._replace(roll=1), WRITERS["record3d"], "a"),
     "colmap text": (WRITTEN, WRITERS["colmap text"], "view 0"),
     "colmap binary, upright": (WRITTEN._replace(roll=1), WRITERS["colmap binary"], "view 0"),
 }
