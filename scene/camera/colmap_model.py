@@ -79,7 +79,7 @@ def checked_camera(where: str | Path, model: Model, size: tuple[float, float], v
     """A camera whose numbers make sense. Raises BadInputError."""
     if len(values) != len(model.parameters):
         raise BadInputError(where, f"{len(values)} parameters", f"{len(model.parameters)} of {model.name}")
-    if not all(0 < side <= MAX_SIDE_PX for side in size):
+    if not all(1 <= side <= MAX_SIDE_PX for side in size):
         raise BadInputError(where, f"a picture of {size[0]:g}x{size[1]:g}", f"sides of 1 to {MAX_SIDE_PX:g} pixels")
     named = dict(zip(model.parameters, values, strict=True))
     focal = [named[key] for key in ("f", "fx", "fy") if key in named]

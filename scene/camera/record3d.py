@@ -94,7 +94,7 @@ def _lenses(path: Path, content: Mapping[str, Any], count: int) -> tuple[tuple[L
 
 def _side(path: Path, content: Mapping[str, Any], key: str) -> float:
     value = content.get(key)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 1e6:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 1 <= value <= 1e6:
         raise BadInputError(f"{path}: {key}", repr(value)[:40], "a side of the picture in pixels")
     return float(value)
 

@@ -106,7 +106,7 @@ def test_another_axis_system_films_the_same_views(tmp_path: Path, body: ShapedBo
 @pytest.mark.slow
 @pytest.mark.parametrize("name", WRITERS)
 def test_all_axis_systems_film_the_same_views(tmp_path: Path, body: ShapedBody, name: str) -> None:
-    check_views(tmp_path, name, body, systems_of(name) * 3)
+    check_views(tmp_path, name, body, systems_of(name) * 2)
 
 
 def check_views(folder: Path, name: str, body: ShapedBody, systems: list[F64]) -> None:
