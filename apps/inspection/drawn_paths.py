@@ -31,6 +31,7 @@ SHARP = 2  # drawn larger by this, then made smaller
 #: Bones of the face are left out.
 DRAWN: Final = tuple(k for k in range(1, len(JOINT_NAMES)) if JOINT_NAMES[k] not in ("jaw", "left_eye", "right_eye"))
 CAMERAS = 14
+SPARSE = 2000  # vertices; fewer are drawn larger
 FRUSTUM = np.array([[-0.8, -0.6, -1.0], [0.8, -0.6, -1.0], [0.8, 0.6, -1.0], [-0.8, 0.6, -1.0]])
 
 
@@ -51,9 +52,13 @@ class _Tile:
     def line(self, points: F64, colour: tuple[int, int, int], width: int = 2) -> None:
         self.draw.line(self.at(points), fill=colour, width=width * SHARP, joint="curve")
 
-    def dot(self, point: F64, colour: tuple[int, int, int], radius: int = 4) -> None:
-        (x, y), r = self.at(point[None])[0], radius * SHARP
-        self.draw.ellipse((x - r, y - r, x + r, y + r), fill=colour)
+    def dot(self, point: F64, colour: tuple[int, int, int], radius: float = 4) -> None:
+        self.dots(point[None], colour, radius)
+
+    def dots(self, points_: F64, colour: tuple[int, int, int], radius: float) -> None:
+        r = radius * SHARP
+        for x, y in self.at(points_):
+            self.draw.ellipse((x - r, y - r, x + r, y + r), fill=colour)
 
     def text(self, words: str, row: int = 0) -> None:
         self.draw.text((6 * SHARP, (4 + 15 * row) * SHARP), words, fill=TEXT, font_size=12 * SHARP)
@@ -65,6 +70,7 @@ def skeletons(joints: F64, times_s: F64, path: F64) -> Image.Image:
     `joints` (M, 55, 3), metres, Y up, at the moments `times_s` (M,). `path` (T, 3): of the pelvis.
     """
     rows: list[list[Image.Image]] = []
+    extent = _extent(path)
     for name, view in VIEWS.items():
         flat = joints @ view.T
         centred = flat - (flat.min(axis=1, keepdims=True) + flat.max(axis=1, keepdims=True)) / 2
@@ -78,7 +84,7 @@ def skeletons(joints: F64, times_s: F64, path: F64) -> Image.Image:
             if not moment:
                 tile.text(name)
             tiles.append(picture)
-        rows.append([*tiles, _path_tile(path @ view.T, f"pelvis, {name}", TILE)])
+        rows.append([*tiles, _path_tile(path @ view.T, f"pelvis, {name}", TILE, extent)])
     return _sheet(rows)
 
 
@@ -93,18 +99,20 @@ def cameras(turns: F64, places: F64) -> Image.Image:
     every = np.concatenate([places, corners.reshape(-1, 3)])
     tiles = []
     for name, view in VIEWS.items():
-        tiles.append(_path_tile(places @ view.T, name, PATH_TILE, every @ view.T, (places[chosen], corners, view)))
+        seen = places[chosen], corners, view
+        tiles.append(_path_tile(places @ view.T, name, PATH_TILE, _extent(every), every @ view.T, seen))
     return _sheet([tiles])
 
 
 def points(vertices: F64) -> Image.Image:
     """One row of three views on points (V, 3), metres, Y up."""
-    tiles = []
+    tiles, extent = [], _extent(vertices)
+    radius = 0.5 if len(vertices) > SPARSE else 3
     for name, view in VIEWS.items():
         flat = vertices @ view.T
         low, high = flat.min(axis=0), flat.max(axis=0)
-        picture, tile = _blank(PATH_TILE, (low + high) / 2, _scale(PATH_TILE, float((high - low).max())))
-        tile.draw.point([pixel for pixel in tile.at(flat)], fill=MIDDLE)
+        picture, tile = _blank(PATH_TILE, (low + high) / 2, _scale(PATH_TILE, extent))
+        tile.dots(flat, MIDDLE, radius)
         tile.text(f"{name}, {high[1] - low[1]:.2f} m")
         tiles.append(picture)
     return _sheet([tiles])
@@ -119,15 +127,19 @@ def _bones(tile: _Tile, places: F64) -> None:
 
 
 def _path_tile(
-    path: F64, name: str, side: int, every: F64 | None = None, cameras_: tuple[F64, F64, F64] | None = None
+    path: F64,
+    name: str,
+    side: int,
+    extent: float,
+    every: F64 | None = None,
+    seen: tuple[F64, F64, F64] | None = None,
 ) -> Image.Image:
-    """A path (T, 2) in a tile that has room for `every` point, with a bar for the length of it."""
+    """A path (T, 2) in a tile of `extent` metres whose middle is that of `every` point, with a bar for a length."""
     room = path if every is None else every
     low, high = room.min(axis=0), room.max(axis=0)
-    extent = max(float((high - low).max()), LEAST_EXTENT_M)
     picture, tile = _blank(side, (low + high) / 2, _scale(side, extent))
-    if cameras_ is not None:
-        _frustums(tile, *cameras_)
+    if seen is not None:
+        _frustums(tile, *seen)
     if len(path) > 1:
         tile.line(path, MIDDLE)
     tile.dot(path[-1], END)
@@ -138,6 +150,11 @@ def _path_tile(
     tile.text(name)
     tile.text(f"bar: {bar:g} m", row=1)
     return picture
+
+
+def _extent(points_: F64) -> float:
+    """The longest side of a box round points (N, 3)."""
+    return max(float(np.ptp(points_, axis=0).max()), LEAST_EXTENT_M)
 
 
 def _frustums(tile: _Tile, eyes: F64, corners: F64, view: F64) -> None:
