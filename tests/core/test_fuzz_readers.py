@@ -29,7 +29,7 @@ def test_a_few_changed_files(tmp_path: Path) -> None:
 @pytest.mark.timeout(400)
 @pytest.mark.parametrize("seed", [11, 12])
 def test_many_changed_files(tmp_path: Path, seed: int) -> None:
-    assert tried(tmp_path, seed, seconds=120) == ""
+    assert tried(tmp_path, seed, seconds=60) == ""
 
 
 def test_a_number_finds_a_case_again(tmp_path: Path) -> None:
