@@ -97,7 +97,8 @@ def _check_output(model: onnx.ModelProto, where: str, shape: tuple[int, int, int
 def _static_shape(value: onnx.ValueInfoProto, where: str) -> tuple[int, int, int, int]:
     kind = value.type.tensor_type
     if kind.elem_type != TensorProto.UINT8:
-        name = TensorProto.DataType.Name(kind.elem_type)
+        known = kind.elem_type in TensorProto.DataType.values()
+        name = TensorProto.DataType.Name(kind.elem_type) if known else str(kind.elem_type)
         raise BadInputError(where, f"{value.name!r} of type {name}", "uint8", "quantise it: trilane avatar quantize")
     dims = [dim.dim_value if dim.HasField("dim_value") else -1 for dim in kind.shape.dim]
     if len(dims) != 4 or min(dims) < 1:
@@ -133,10 +134,15 @@ def _check_zero_point(node: onnx.NodeProto, tensor: TensorProto | None, where: s
 def _array(tensor: TensorProto, where: str) -> NDArray[np.generic]:
     try:
         array: NDArray[np.generic] = numpy_helper.to_array(tensor)
+    except KeyError:
+        found = f"tensor {tensor.name!r} of type {tensor.data_type}"
+        raise BadInputError(where, found, "a type that ONNX has") from None
     except (ValueError, TypeError, OverflowError) as error:
         raise BadInputError(
             where, f"tensor {tensor.name!r} that does not decode ({error})", "as much data as its shape"
         ) from error
+    if array.dtype.kind not in "fiub":
+        raise BadInputError(where, f"tensor {tensor.name!r} of {array.dtype}", "numbers")
     return array
 
 

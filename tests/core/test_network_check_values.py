@@ -144,6 +144,14 @@ def cut_scale(model: onnx.ModelProto) -> None:
     tensor.raw_data = tensor.raw_data[:2]
 
 
+def scale_of_no_type(model: onnx.ModelProto) -> None:
+    next(tensor for tensor in model.graph.initializer if tensor.name == "mid_scale").data_type = 50
+
+
+def input_of_no_type(model: onnx.ModelProto) -> None:
+    model.graph.input[0].type.tensor_type.elem_type = 50
+
+
 def read_twice(model: onnx.ModelProto) -> None:
     model.graph.node.append(helper.make_node("Relu", ["bytes"], ["spare"], "second"))
 
@@ -184,6 +192,12 @@ REFUSED: dict[str, tuple[Change, str]] = {
         "zero point of node 'mid_out' no integer, expected a constant integer",
     ),
     "cut": (cut_scale, "tensor 'mid_scale' that does not decode"),
+    "no type": (scale_of_no_type, "tensor 'mid_scale' of type 50, expected a type that ONNX has"),
+    "no type of the input": (input_of_no_type, "'bytes' of type 50, expected uint8"),
+    "a scale in words": (
+        constant("mid_scale", np.array(["a"], object)),
+        "tensor 'mid_scale' of object, expected numbers",
+    ),
     "two scales at the end": (
         constant("in_scale", np.float32([1, 2])),
         "node 'bytes_in' of type uint8, expected one scale and one uint8 zero point",
