@@ -143,7 +143,8 @@ def printable(text: str) -> str:
 def wanted(value: Any, kind: type, what: str) -> Any:
     """`value`, which must be of the type `kind`; raises TypeError that says `what` was expected."""
     if type(value) is not kind:
-        raise TypeError(f"{type(value).__name__} in place of {what}")
+        found = "nothing" if value is None else type(value).__name__
+        raise TypeError(f"{found} in place of {what}")
     return value
 
 

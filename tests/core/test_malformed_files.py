@@ -444,7 +444,7 @@ def test_it_is_refused_with_the_right_reason(case: str, tmp_path: Path) -> None:
         path.write_bytes(content)
     else:
         content(path)
-    before = sorted(tmp_path.rglob("*")), open_files(), threading.active_count()
+    before = sorted(tmp_path.rglob("*")), open_files(tmp_path), threading.active_count()
     with pytest.raises(BadInputError) as refused:
         read(path)
     sentence = str(refused.value)
@@ -458,4 +458,4 @@ def test_it_is_refused_with_the_right_reason(case: str, tmp_path: Path) -> None:
     else:
         assert (read, found.kind) in OF_ANOTHER_KIND or not found.usable
         assert found.what
-    assert (sorted(tmp_path.rglob("*")), open_files(), threading.active_count()) == before
+    assert (sorted(tmp_path.rglob("*")), open_files(tmp_path), threading.active_count()) == before

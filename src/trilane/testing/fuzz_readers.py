@@ -180,7 +180,7 @@ class Fuzzer:
         random = Random(f"{self.seed} {number}")
         name = random.choice(sorted(READERS))
         path = self._changed(name, random)
-        before = open_files(), threading.active_count(), _listing(self._tried)
+        before = open_files(self._tried), threading.active_count(), _listing(self._tried)
         said = []
         for read in (READERS[name], _draw if random.random() < DRAWN else _inspect):
             begun = time.monotonic()
@@ -197,7 +197,7 @@ class Fuzzer:
         deadline = time.monotonic() + 2
         while threading.active_count() > threads and time.monotonic() < deadline:
             time.sleep(0.01)
-        return open_files(), threading.active_count(), _listing(self._tried)
+        return open_files(self._tried), threading.active_count(), _listing(self._tried)
 
     def _changed(self, name: str, random: Random) -> Path:
         shutil.rmtree(self._tried, ignore_errors=True)
@@ -217,13 +217,13 @@ class Fuzzer:
         return path
 
 
-def open_files() -> list[str]:
-    """What this process holds open, by name: files, pipes, sockets."""
+def open_files(below: Path) -> list[str]:
+    """Files below a folder that this process holds open; libraries may open their own at any time."""
     found = []
     for link in Path("/proc/self/fd").iterdir():
         with contextlib.suppress(OSError):  # of the listing itself, which is over
             found.append(str(link.readlink()))
-    return sorted(found)
+    return sorted(name for name in found if name.startswith(f"{below}/"))
 
 
 def _listing(folder: Path) -> list[str]:
