@@ -31,6 +31,7 @@ READERS: dict[str, tuple[Callable[[Path], Inspection], str]] = {
     recognise.RUN: (parts.inspect_run, "a run folder"),
     recognise.REPORT: (parts.inspect_report, "the report of a run"),
     recognise.SWEEP: (parts.inspect_sweep, "a sweep"),
+    recognise.PLANNED_SWEEP: (parts.inspect_sweep_file, "a sweep that is to be done"),
     recognise.TRACE: (parts.inspect_trace, "a trace"),
 }
 #: Of a folder: files that are looked at, and those that are named.

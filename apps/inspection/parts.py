@@ -18,6 +18,7 @@ from trilane.apps.inspection.drawn_paths import points
 from trilane.apps.inspection.inspection import Inspection, Length
 from trilane.apps.overview.sources import read_entries
 from trilane.apps.report import read_report
+from trilane.apps.sweeps.toml_file import read_sweep
 from trilane.apps.tracing.writer import NAME as TRACE_NAME
 from trilane.arrays import F32
 from trilane.avatars.bundle import MANIFEST, load_bundle
@@ -179,6 +180,15 @@ def inspect_sweep(path: Path) -> Inspection:
     what = f"a folder of {len(entries)} trials of a sweep"
     found = Detected("sweep", "a file trials.jsonl")
     return Inspection("sweep", what, "", f"trilane report {path}", found, facts={"trials": len(entries)})
+
+
+def inspect_sweep_file(path: Path) -> Inspection:
+    """Raises BadInputError when it is no sweep."""
+    sweep = read_sweep(path)
+    command = " ".join(sweep.command)
+    facts = {"command": command, "axes": list(sweep.axes)}
+    found = Detected("sweep file", "TOML with a `command`")
+    return Inspection("sweep file", f"a sweep of `trilane {command}`", "", f"trilane sweep {path}", found, facts=facts)
 
 
 def inspect_trace(path: Path) -> Inspection:

@@ -20,7 +20,7 @@ from trilane.stages.gpu.picture_file import PICTURES
 
 MOTION, CAMERA, PICTURE_FOLDER, BODY, TEXTURE, AVATAR = "motion", "camera", "pictures", "body", "texture", "avatar"
 NETWORK, SCENE, TRACE, RUN, REPORT, SWEEP = "network", "scene", "trace", "run", "report", "sweep"
-PROFILE, GLTF, OTHER = "hardware profile", "glTF", "other"
+PROFILE, PLANNED_SWEEP, GLTF, OTHER = "hardware profile", "sweep file", "glTF", "other"
 EXPECTED = "a motion, camera, picture, video, body, avatar, network, scene, trace or run"
 #: Endings that say what their files are, where the head of the file does not.
 ENDINGS = {
@@ -127,6 +127,8 @@ def _toml_kind(text: str) -> str:
         return ""
     if {"units", "title"} <= set(keys):
         return PROFILE
+    if "command" in keys:
+        return PLANNED_SWEEP
     return SCENE if keys else ""
 
 

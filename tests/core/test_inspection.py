@@ -289,3 +289,10 @@ def test_control_characters_of_a_file_do_not_reach_the_terminal(command: Command
     out, err = command("inspect", tmp_path / "a.bvh", code=2)
     assert "\x1b" not in out + err
     assert "\x1b" not in command("body", "inspect", tmp_path / "\x1b[2J.npz", code=2)[1]
+
+
+def test_a_sweep_is_no_scene(tmp_path: Path) -> None:
+    (tmp_path / "s.toml").write_text('command = "run"\n[axes]\nsize = ["64", "128"]\n')
+    found = inspect_file(tmp_path / "s.toml")
+    assert found.usable, found.problem
+    assert (found.kind, found.facts["axes"]) == ("sweep file", ["size"])
