@@ -1,7 +1,8 @@
 """A recorded motion to a Motion: bad frames left out, Y up, facing +Z at first, centred on the ground it covers.
 
 Rule: up is the axis that the scene states, else the one that the body's own up points along on average, else the usual
-one of the format. Where a format has a world of its own, one that stands on its hands does not turn it over.
+one of the format. Where a format has a world of its own, one that lies or stands on its hands throughout does not turn
+it over: the floor of the file tells (`on_floor.py`), and where it does not, a note says what else may be up.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from trilane.arrays import F64
 from trilane.errors import BadInputError
 from trilane.scene.detected import NOTHING, Detected
 from trilane.scene.motion.motion import Motion, Wrap
+from trilane.scene.motion.on_floor import lies, lowest, stands
 from trilane.scene.motion.stance import stance
 from trilane.scene.motion.usable_samples import usable_samples
 from trilane.scene.rotations import Y_UP_FROM_Z_UP, about, matrix_from_rotvec, rotvec_from_matrix
@@ -75,7 +77,7 @@ def motion_from_recording(raw: RawMotion, where: str, up_axis: str) -> Motion:
     times, poses, shift = raw.times_s[usable], raw.poses[usable], shift[usable]
     _check_angles(poses, where)
     roots = matrix_from_rotvec(poses[:, 0])
-    up, how = _up_axis(roots, raw, up_axis)
+    up, how, doubt = _up_axis(poses, None if raw.translation is None else shift, raw, up_axis)
     turn = UPRIGHT[up]
     turn = facing(turn @ roots[0]) @ turn
     poses = poses.copy()
@@ -87,7 +89,7 @@ def motion_from_recording(raw: RawMotion, where: str, up_axis: str) -> Motion:
         poses,
         centred(translation),
         raw.betas,
-        (*raw.notes, axes, *repairs),
+        (*raw.notes, axes, *doubt, *repairs),
         Wrap.BOUNCE,
         raw.leg_m,
         raw.translation is not None,
@@ -119,15 +121,27 @@ def _check_angles(poses: F64, where: str) -> None:
         raise BadInputError(where, f"an angle of {largest:.3g}", "axis-angle in radians", "convert degrees to radians")
 
 
-def _up_axis(roots: F64, raw: RawMotion, stated: str) -> tuple[str, str]:
-    """The axis that is up, and a note on how it was decided."""
+def _up_axis(poses: F64, places: F64 | None, raw: RawMotion, stated: str) -> tuple[str, str, tuple[str, ...]]:
+    """The axis that is up, how it was decided, and a note where another one may be it.
+
+    `poses` (T, 55, 3) and `places` (T, 3) of the pelvis, if recorded: of the usable frames.
+    """
     if stated != "auto":
-        return stated, "as given"
-    mean = roots[:, :, 1].mean(axis=0)
-    for name in raw.ups:
-        if (UPRIGHT[name] @ mean)[1] > LEAST_UP_COSINE:
-            return name, "as the body stands"
-    return raw.up, "as usual for the format"
+        return stated, "as given", ()
+    mean = matrix_from_rotvec(poses[:, 0])[:, :, 1].mean(axis=0)
+    name = next((name for name in raw.ups if (UPRIGHT[name] @ mean)[1] > LEAST_UP_COSINE), None)
+    if name is None:
+        return raw.up, "as usual for the format", ()
+    if name == raw.up or places is None or raw.ups == ANY:
+        return name, "as the body stands", ()
+    heights, usual = (lowest(poses, places, raw.leg_m, UPRIGHT[axis][1]) for axis in (name, raw.up))
+    if stands(heights):
+        return name, "as the body stands", ()
+    if lies(usual):
+        what = f"`up_axis` {name.upper()} if it stands there"
+        return raw.up, f"as the body lies, or is upside down, on the file's floor: {what}", ()
+    doubt = f"up: one who lies, or is upside down, throughout needs `up_axis` {raw.up.upper()}"
+    return name, "as the body stands", (doubt,)
 
 
 def facing(root: F64) -> F64:
