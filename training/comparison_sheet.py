@@ -5,7 +5,7 @@ Rule: all pictures are over mid-grey, and none is enlarged.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +40,12 @@ def worst_sheet(samples: Sequence[Evaluated], painters: Sequence[str]) -> NDArra
 
 def _cells(sample: Evaluated, painters: Sequence[str]) -> NDArray[np.uint8]:
     """The ground truth and the pictures of `painters` side by side."""
-    return np.hstack([_cell(picture) for picture in (sample.truth, *(sample.pictures[name] for name in painters))])
+    return side_by_side((sample.truth, *(sample.pictures[name] for name in painters)))
+
+
+def side_by_side(pictures: Iterable[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    """`pictures` (h,w,4), each in a cell: (height, width, 3) uint8."""
+    return np.hstack([_cell(picture) for picture in pictures])
 
 
 def _cell(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -1,4 +1,4 @@
-"""What training minimises: errors of the picture over grey, of its decibels, its colours, its edges and its mask.
+"""What training minimises: errors of the picture over grey, of its decibels, colours, edges, structure and its mask.
 
 Rule: every term is a mean over the pixels it is about, so that the weights in the table mean the same for every view.
 
@@ -8,12 +8,15 @@ from runtime to runtime.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from scipy.ndimage import maximum_filter
 from torch import Tensor
 from torch.nn import functional
 
 from trilane.training.image_error import GREY
+from trilane.training.structural_similarity import ms_ssim
 
 #: Pixels round the person that count as its outline.
 MARGIN_PX = 5
@@ -27,17 +30,24 @@ WEIGHTS = {
     "overlap": 0.1,
     "background": 0.05,
 }
+#: One minus MS-SSIM, a term that is computed only where it has a weight: it takes several blurs.
+STRUCTURE = "structure"
 LEAST_SQUARE = 1e-5
 
 
-def loss_terms(output: Tensor, target: Tensor) -> dict[str, Tensor]:
-    """The terms by name, before weighting. `output` and `target` (N, 4, H, W): straight colour and mask, 0..1."""
+def loss_terms(output: Tensor, target: Tensor, weights: Mapping[str, float] = WEIGHTS) -> dict[str, Tensor]:
+    """The terms by name, before weighting. `output` and `target` (N, 4, H, W): straight colour and mask, 0..1.
+
+    `weights`: by name; of `STRUCTURE` it decides whether that is among the terms. `overlap` is the Dice loss, with one
+    pixel more in numerator and denominator, so that it is 0 without a person.
+    """
     mask, true_mask = output[:, 3:], target[:, 3:]
     near = _grown(true_mask)
     pixels = near.sum() * 3 + 1
-    difference = composite(output) - composite(target)
+    shown, wanted = composite(output), composite(target)
+    difference = shown - wanted
     size = difference.abs()
-    return {
+    terms = {
         "composite": (size * (near + 0.05)).sum() / pixels,
         "decibels": missing_db(difference, near).mean(),
         "colour": ((output[:, :3] - target[:, :3]).abs() * true_mask).sum() / pixels,
@@ -51,6 +61,9 @@ def loss_terms(output: Tensor, target: Tensor) -> dict[str, Tensor]:
         "background": -(torch.log1p(-output[:, :3].clamp(max=1 - 1e-4)) * (true_mask == 0)).mean(),
         "overlap": 1 - (2 * (mask * true_mask).sum() + 1) / (mask.sum() + true_mask.sum() + 1),
     }
+    if weights.get(STRUCTURE):
+        terms[STRUCTURE] = 1 - ms_ssim(shown, wanted).mean()
+    return terms
 
 
 def missing_db(difference: Tensor, near: Tensor) -> Tensor:
@@ -70,9 +83,9 @@ def _grown(mask: Tensor) -> Tensor:
     return torch.from_numpy(grown).gt(0).float()
 
 
-def total_loss(terms: dict[str, Tensor]) -> Tensor:
-    """The sum of the terms, weighted by `WEIGHTS`."""
-    return torch.stack([WEIGHTS[name] * term for name, term in terms.items()]).sum()
+def total_loss(terms: Mapping[str, Tensor], weights: Mapping[str, float] = WEIGHTS) -> Tensor:
+    """The sum of the terms, weighted by `weights`; a term without a weight counts nothing."""
+    return torch.stack([weights.get(name, 0.0) * term for name, term in terms.items()]).sum()
 
 
 def composite(image: Tensor) -> Tensor:

@@ -53,11 +53,11 @@ def byte_texture(avatar: TrainableAvatar, shaped: ShapedBody) -> tuple[NDArray[n
 
 
 def integer_network(avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int) -> Quantised:
-    """The network in integers, calibrated on training samples of one shape."""
-    group = next(group for group in groups if group.shape == CALIBRATION_SHAPE)
+    """The network in integers, calibrated on training samples of one shape: that with most, where none is usual."""
+    group = max(groups, key=lambda group: (group.shape == CALIBRATION_SHAPE, len(group)))
     chosen = np.random.default_rng(seed).permutation(len(group))[:CALIBRATION_FRAMES]
     frames = _inputs(avatar, group, np.sort(chosen))
-    quantised = quantise(export_onnx(avatar.network, *CALIBRATION_SHAPE), frames, METHOD)
+    quantised = quantise(export_onnx(avatar.network, *group.shape), frames, METHOD)
     return replace(quantised, network=reshaped(quantised.network, *STORED_SHAPE))
 
 

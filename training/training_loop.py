@@ -13,10 +13,10 @@ import copy
 import math
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from torch import multiprocessing as tmp
 
 from trilane.training.activation_noise import add_activation_noise
-from trilane.training.losses import loss_terms, total_loss
+from trilane.training.losses import WEIGHTS, loss_terms, total_loss
 from trilane.training.sample_files import U16, ShapeGroup, batches, open_groups
 from trilane.training.trainable_avatar import TrainableAvatar
 
@@ -38,6 +38,19 @@ EXCHANGE_STEPS = 4
 TOTAL_SHARE = 1.5
 #: Seconds between two looks of the main process at its workers.
 WATCH_S = 4.0
+
+
+class Rates(Protocol):
+    """Learning rates of network and texture, and the decay of weights."""
+
+    @property
+    def network_rate(self) -> float: ...
+
+    @property
+    def texture_rate(self) -> float: ...
+
+    @property
+    def weight_decay(self) -> float: ...
 
 
 @dataclass(frozen=True)
@@ -105,7 +118,7 @@ def fit(
         now = time.time()
         if steps.value:
             age = min(config.average_s, 0.2 * (now - start))
-            _follow(average, shared, math.exp(-WATCH_S / max(age, WATCH_S)))
+            follow(average, shared, math.exp(-WATCH_S / max(age, WATCH_S)))
         if now - last_report >= config.report_s:
             report(f"{spent(config, start):6.1%} step {steps.value} " + _terms_text(terms))
             last_report = now
@@ -135,7 +148,7 @@ def _worker(
     avatar = copy.deepcopy(shared)
     add_activation_noise(avatar.network, config.noise_steps)
     avatar.network.to(memory_format=torch.channels_last)
-    optimiser = _optimiser(avatar, config)
+    optimiser = optimiser_of(avatar, config)
     peaks = [group["lr"] for group in optimiser.param_groups]
     groups = open_groups(data)
     small = [group for group in groups if math.prod(group.shape) < SMALL_PIXELS]
@@ -148,9 +161,9 @@ def _worker(
         share = spent(config, start)
         if share >= 1 or os.getppid() != parent:
             break
-        _set_mode(avatar, frozen=share > config.freeze_norms_at)
+        set_mode(avatar, frozen=share > config.freeze_norms_at)
         for parameters, peak in zip(optimiser.param_groups, peaks, strict=True):
-            parameters["lr"] = peak * _schedule(share)
+            parameters["lr"] = peak * rate_share(share)
         values = train_step(avatar, optimiser, *load_batch(*next(streams[share >= config.small_until])))
         with lock:
             steps.value += 1
@@ -161,22 +174,29 @@ def _worker(
 
 
 def train_step(
-    avatar: TrainableAvatar, optimiser: torch.optim.Optimizer, uv: Tensor, covered: Tensor, target: Tensor
+    avatar: TrainableAvatar,
+    optimiser: torch.optim.Optimizer,
+    uv: Tensor,
+    covered: Tensor,
+    target: Tensor,
+    weights: Mapping[str, float] = WEIGHTS,
 ) -> dict[str, float]:
     """One step on one batch; the loss terms by name.
 
     `avatar`, `optimiser`: what is trained.
     `uv`, `covered`, `target`: the batch, as `load_batch` returns it.
+    `weights`: of the terms.
     """
-    terms = loss_terms(avatar(uv, covered), target)
+    terms = loss_terms(avatar(uv, covered), target, weights)
     optimiser.zero_grad(set_to_none=True)
-    total_loss(terms).backward()
+    total_loss(terms, weights).backward()
     nn.utils.clip_grad_norm_(avatar.parameters(), 1.0)
     optimiser.step()
     return {name: float(term.detach()) for name, term in terms.items()}
 
 
-def _optimiser(avatar: TrainableAvatar, config: FitConfig) -> torch.optim.Optimizer:
+def optimiser_of(avatar: TrainableAvatar, config: Rates) -> torch.optim.Optimizer:
+    """AdamW for `avatar`; weights that are no kernels do not decay."""
     kernels = [p for p in avatar.network.parameters() if p.ndim > 1]
     others = [p for p in avatar.network.parameters() if p.ndim <= 1]
     groups = [
@@ -187,13 +207,15 @@ def _optimiser(avatar: TrainableAvatar, config: FitConfig) -> torch.optim.Optimi
     return torch.optim.AdamW(groups, betas=(0.9, 0.99))
 
 
-def _schedule(share: float) -> float:
+def rate_share(share: float) -> float:
+    """What learning rates are multiplied by when `share` of the training is done: up at first, then half a cosine."""
     if share < WARM_UP:
         return max(share / WARM_UP, 0.02)
     return 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * (share - WARM_UP) / (1 - WARM_UP)))
 
 
-def _set_mode(avatar: TrainableAvatar, frozen: bool) -> None:
+def set_mode(avatar: TrainableAvatar, frozen: bool) -> None:
+    """Put `avatar` into training mode; `frozen`: its batch statistics no longer change."""
     avatar.train()
     if frozen:
         for module in avatar.modules():
@@ -221,7 +243,7 @@ def _exchange(avatar: TrainableAvatar, before: dict[str, Tensor], shared: Traina
             value.copy_(common[name])
 
 
-def _follow(average: TrainableAvatar, avatar: TrainableAvatar, keep: float) -> None:
+def follow(average: TrainableAvatar, avatar: TrainableAvatar, keep: float) -> None:
     """Move `average` towards `avatar`; it keeps the share `keep` of itself."""
     current = avatar.state_dict()
     for name, value in average.state_dict().items():

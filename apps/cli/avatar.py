@@ -1,19 +1,19 @@
-"""`trilane avatar`: look into avatars and what they are trained on, validate them, export and quantise their networks.
+"""`trilane avatar`: look into avatars and what they are trained on, train and validate them, quantise their networks.
 
-Rule: this file lists the commands of the group; `avatar_data.py`, `avatar_validate.py`, `avatar_network.py` and
-`avatar_quantise.py` hold the larger ones.
+Rule: this file lists the commands of the group; `avatar_data.py`, `avatar_train.py`, `avatar_validate.py`,
+`avatar_network.py` and `avatar_quantise.py` hold the larger ones.
 """
 
 from __future__ import annotations
 
-from trilane.apps.cli import avatar_data, avatar_network, avatar_quantise, avatar_validate
+from trilane.apps.cli import avatar_data, avatar_network, avatar_quantise, avatar_train, avatar_validate
 from trilane.apps.cli.commands import Commands
 from trilane.apps.cli.console import print_facts
 from trilane.apps.cli.options import AvatarArgument, JsonOption
 
 app = Commands(
     no_args_is_help=True,
-    help="Look into avatars and what they are trained on, validate them, export and quantise their networks.",
+    help="Look into avatars and captures, train and validate avatars, export and quantise their networks.",
 )
 
 EPILOG_INSPECT = "\b\nExamples:\n  trilane avatar inspect default\n  trilane avatar inspect my-avatar --json"
@@ -30,6 +30,7 @@ def inspect(name: AvatarArgument, json: JsonOption = False) -> None:
 
 app.command("create-data", epilog=avatar_data.EPILOG_CREATE)(avatar_data.create_data)
 app.command("check-data", epilog=avatar_data.EPILOG_CHECK)(avatar_data.check_data)
+app.command(epilog=avatar_train.EPILOG_TRAIN)(avatar_train.train)
 app.command(epilog=avatar_validate.EPILOG_VALIDATE)(avatar_validate.validate)
 app.command(epilog=avatar_network.EPILOG_NETWORK)(avatar_network.network)
 app.command(epilog=avatar_quantise.EPILOG_QUANTISE)(avatar_quantise.quantise)

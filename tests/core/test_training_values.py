@@ -105,13 +105,13 @@ def test_masks_at_their_ends_cost_a_finite_amount():
     ],
 )
 def test_the_learning_rate_rises_and_falls_as_a_cosine(share, rate):
-    assert training_loop._schedule(share) == pytest.approx(rate)
+    assert training_loop.rate_share(share) == pytest.approx(rate)
 
 
 def test_kernels_decay_and_the_texture_has_a_rate_of_its_own():
     made = avatar()
     config = FitConfig(1.0, network_rate=3.0, texture_rate=5.0, weight_decay=7.0)
-    kernels, others, texture = training_loop._optimiser(made, config).param_groups
+    kernels, others, texture = training_loop.optimiser_of(made, config).param_groups
     assert [(group["lr"], group["weight_decay"]) for group in (kernels, others, texture)] == [(3, 7), (3, 0), (5, 7)]
     assert {p.ndim for p in kernels["params"]} == {4}
     assert {p.ndim for p in others["params"]} == {1}
@@ -143,14 +143,14 @@ def test_the_average_keeps_its_share():
     old = average.state_dict()[name].clone()
     with torch.no_grad():
         now.state_dict()[name] += 8.0
-    training_loop._follow(average, now, keep=0.75)
+    training_loop.follow(average, now, keep=0.75)
     assert torch.allclose(average.state_dict()[name], old + 2.0)
 
 
 @pytest.mark.parametrize("frozen", [False, True])
 def test_frozen_norms_keep_their_statistics(frozen):
     made = avatar().eval()
-    training_loop._set_mode(made, frozen)
+    training_loop.set_mode(made, frozen)
     norms = [module for module in made.modules() if isinstance(module, torch.nn.BatchNorm2d)]
     assert norms and made.network.colour[0].training
     assert all(norm.training is not frozen for norm in norms)

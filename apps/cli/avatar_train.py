@@ -1,0 +1,129 @@
+"""`trilane avatar train`: an avatar of a person, from a capture.
+
+Rule: this file talks to the person; the work is done in `trilane.training.captured_avatar`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from trilane.apps.cli.commands import given
+from trilane.apps.cli.console import print_facts, stderr_console, stdout_kept
+from trilane.apps.cli.options import JsonOption
+from trilane.errors import BadInputError, MissingPartError
+from trilane.install import install_line, package_line
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import Progress
+
+EPILOG_TRAIN = """\b
+Examples:
+  trilane avatar train my-capture --out mine --minutes 600
+  trilane avatar train my-capture --out smoke --minutes 1 --samples 200
+  trilane avatar train my-capture --out again --config mine/training.toml
+"""
+#: Where wheels of PyTorch lie that need no GPU; the plain package index has those for NVIDIA's.
+CPU_INDEX = "https://download.pytorch.org/whl/cpu"
+#: Share of the newest loss in the one that is shown; seconds between two lines where no bar is drawn.
+NEWEST, LINE_S = 0.05, 30.0
+#: Width of the default avatar's network.
+DEFAULT_WIDTH = 16
+
+
+def train(
+    ctx: typer.Context,
+    capture: Annotated[Path, typer.Argument(help="Folder of a capture; docs/captures.md says what is in it.")],
+    out: Annotated[Path, typer.Option(help="Folder of the avatar to write.")],
+    work: Annotated[
+        Path | None, typer.Option(help="Folder of samples, state and sheets; OUT-work if none. Training goes on there.")
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="Settings (training.toml), such as an avatar's own; options go before them.")
+    ] = None,
+    minutes: Annotated[float, typer.Option(help="Time of training; the samples before it take some more.")] = 60.0,
+    steps: Annotated[int | None, typer.Option(help="Steps of training, in place of a time.")] = None,
+    samples: Annotated[int, typer.Option(help="Views of the frames to train on.")] = 4000,
+    seed: Annotated[int, typer.Option(help="Of all random numbers.")] = 1,
+    threads: Annotated[int, typer.Option(help="Of PyTorch, and processes that draw; only 1 repeats to the bit.")] = 1,
+    start: Annotated[str, typer.Option(help="default: the default avatar's network; new: random weights.")] = "default",
+    width: Annotated[int, typer.Option(help="Of a new network; 64 is full.")] = 16,
+    json: JsonOption = False,
+) -> None:
+    """Train an avatar on a capture and write it as a folder for `trilane run --avatar`.
+
+    A command that was ended goes on where it was when it is given again.
+    """
+    from trilane.training.training_settings import parsed_settings, read_settings
+
+    usual = {"minutes": minutes, "steps": steps, "samples": samples, "seed": seed, "threads": threads, "start": start}
+    options = {name: value for name, value in (usual | {"width": width}).items() if name in given(ctx)}
+    values = read_settings(config).model_dump(by_alias=True, exclude_none=True) if config is not None else {}
+    asked = parsed_settings(values | options, "options" if config is None else config)
+    if asked.start == "default" and asked.width != DEFAULT_WIDTH:
+        raise BadInputError("--width", str(asked.width), f"{DEFAULT_WIDTH} of the default network", "or --start new")
+    _require_torch()
+    from trilane.training.captured_avatar import Places, train_on_capture
+
+    places = Places(capture, out, out.parent / f"{out.name}-work" if work is None else work, out.name)
+    with stdout_kept(), _shown() as listener:
+        facts = train_on_capture(places, asked, listener)
+    print_facts(facts, json)
+
+
+def _require_torch() -> None:
+    """Raises MissingPartError with the lines that install it."""
+    missing = [name for name in ("torch", "scipy", "skimage") if find_spec(name) is None]
+    if "torch" in missing:
+        lines = f"{package_line('torch')} --index-url {CPU_INDEX} (CPU) or {package_line('torch')} (NVIDIA GPU)"
+        raise MissingPartError("training needs torch", f"{lines}, then {install_line('train')}")
+    if missing:
+        raise MissingPartError(f"training needs {missing[0]}", extra="train")
+
+
+@contextmanager
+def _shown() -> Iterator[_Shown]:
+    """Someone who shows a training on stderr: as bars on a terminal, else as lines."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = stderr_console()
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
+    with Progress(*columns, TimeRemainingColumn(), console=console, disable=not console.is_terminal) as progress:
+        yield _Shown(console, progress)
+
+
+class _Shown:
+    """Shows what a training says; a `captured_avatar.Listener`."""
+
+    def __init__(self, console: Console, progress: Progress) -> None:
+        self._console, self._progress = console, progress
+        self._task: Any = None
+        self._loss, self._first_step, self._start, self._line = 0.0, 0, 0.0, 0.0
+
+    def say(self, line: str) -> None:
+        self._console.print(line, soft_wrap=True)
+
+    def track(self, text: str, numbers: Iterable[Any], total: int) -> Iterable[Any]:
+        yield from self._progress.track(numbers, total=total, description=text)
+
+    def trained(self, step: int, total: int, terms: dict[str, float], loss: float) -> None:
+        if self._task is None:
+            self._task = self._progress.add_task("training", total=total)
+            self._loss, self._first_step, self._start = loss, step, time.monotonic()
+            self._line = self._start - LINE_S
+        self._loss += NEWEST * (loss - self._loss)
+        shown = f"loss {self._loss:.3f}, composite {terms['composite']:.3f}, overlap {terms['overlap']:.3f}"
+        self._progress.update(self._task, completed=step, description=shown)
+        now = time.monotonic()
+        if self._console.is_terminal or (now - self._line < LINE_S and step < total):
+            return
+        self._line = now
+        left_s = (now - self._start) / max(1, step - self._first_step) * (total - step)
+        self.say(f"step {step} of {total}: {shown}" + (f", {left_s:.0f} s left" if step > self._first_step else ""))

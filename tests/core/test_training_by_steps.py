@@ -1,0 +1,200 @@
+"""Training by steps: repeats to the bit, goes on to the bit after it was ended anywhere, and says what it is given."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("scipy")
+pytest.importorskip("skimage")
+
+from trilane.errors import BadInputError  # noqa: E402
+from trilane.training import step_loop  # noqa: E402
+from trilane.training.captured_avatar import resumed_settings  # noqa: E402
+from trilane.training.network import UNet  # noqa: E402
+from trilane.training.neural_texture import NeuralTexture  # noqa: E402
+from trilane.training.sample_files import U16, ShapeGroup, create_group, open_groups  # noqa: E402
+from trilane.training.step_loop import first_state, step_seconds, steps  # noqa: E402
+from trilane.training.trainable_avatar import TrainableAvatar  # noqa: E402
+from trilane.training.training_settings import (  # noqa: E402
+    TrainingSettings,
+    parsed_settings,
+    read_settings,
+    settings_text,
+)
+from trilane.training.training_state import TrainingState, load_state, save_state  # noqa: E402
+
+SMALL, LARGE = (32, 32), (64, 32)
+COUNT = 7
+#: Steps 0 to 2 are of small samples alone, and from step 5 on batch statistics stay.
+VALUES: dict[str, Any] = {"samples": 9, "batch": 2, "seed": 5, "small_until": 0.4, "freeze_norms_at": 0.6}
+
+
+def settings(**others: Any) -> TrainingSettings:
+    return parsed_settings(VALUES | others, "a test")
+
+
+def avatar(width: int = 4) -> TrainableAvatar:
+    torch.manual_seed(0)
+    start = np.random.default_rng(1).uniform(-0.5, 0.5, (64, 64, 4)).astype(np.float32)
+    return TrainableAvatar(NeuralTexture(start, sides=(64, 32)), UNet(width=width, channels=4))
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Any:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
+def groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[ShapeGroup]:
+    """Five samples of a small shape and four of a large one."""
+    monkeypatch.setattr(step_loop, "SMALL_PIXELS", math.prod(LARGE))
+    rng = np.random.default_rng(0)
+    for shape, count in ((SMALL, 5), (LARGE, 4)):
+        group = create_group(tmp_path / "data", shape, (np.arange(count) % 2).astype(np.int8))
+        group.uv[:] = rng.integers(0, U16, group.uv.shape)
+        group.covered[:, 4:24, 6:28] = 1
+        group.rgba[:, 4:26, 5:28] = (200, 100, 50, 255)
+    return open_groups(tmp_path / "data")
+
+
+def trained(groups: list[ShapeGroup], until: int, **others: Any) -> TrainingState:
+    """The state after `until` of seven steps."""
+    asked = settings(**others)
+    state = first_state(avatar(), asked)
+    go(state, groups, asked, until)
+    return state
+
+
+def go(state: TrainingState, groups: list[ShapeGroup], asked: TrainingSettings, until: int) -> None:
+    going = steps(state, groups, asked, COUNT)
+    while state.step < until:
+        next(going)
+
+
+def bits(state: TrainingState) -> dict[str, bytes]:
+    return {name: value.detach().contiguous().numpy().tobytes() for name, value in state.tensors().items()}
+
+
+def test_the_same_seed_gives_the_same_bits(groups: list[ShapeGroup]) -> None:
+    first = bits(trained(groups, COUNT))
+    torch.manual_seed(99)
+    torch.rand(5)
+    assert bits(trained(groups, COUNT)) == first
+    assert bits(trained(groups, COUNT, seed=6)) != first
+
+
+@pytest.mark.parametrize("ended", [0, 2, 3, 5, 6])
+def test_a_training_that_was_ended_goes_on_to_the_bit(groups: list[ShapeGroup], tmp_path: Path, ended: int) -> None:
+    """In each part: before and after other samples are used and statistics stay."""
+    whole = bits(trained(groups, COUNT))
+    before = trained(groups, ended)
+    if ended:
+        save_state(before, tmp_path / "state.npz")
+    after = first_state(avatar(), settings())
+    if ended:
+        load_state(after, tmp_path / "state.npz")
+        assert bits(after) == bits(before) and after.step == ended
+    go(after, groups, settings(), COUNT)
+    assert bits(after) == whole
+
+
+def test_small_samples_come_first_and_statistics_stay_at_last(
+    groups: list[ShapeGroup], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[tuple[int, bool]] = []
+    load = step_loop.load_batch
+
+    def loaded(group: ShapeGroup, index: Any) -> Any:
+        seen.append((group.shape[0], state.avatar.network.colour[1].training))
+        return load(group, index)
+
+    monkeypatch.setattr(step_loop, "load_batch", loaded)
+    state = first_state(avatar(), settings())
+    go(state, groups, settings(), COUNT)
+    assert [shape for shape, _ in seen[:3]] == [32] * 3 and 64 in [shape for shape, _ in seen[3:]]
+    assert [training for _, training in seen] == [True] * 5 + [False] * 2
+
+
+def test_the_average_is_the_last_weights_where_few_steps_were_done(groups: list[ShapeGroup]) -> None:
+    """A tenth of seven steps is less than one; of a time constant of all steps it is their plain mean."""
+    state = trained(groups, 3)
+    for one, other in zip(state.average.parameters(), state.avatar.parameters(), strict=True):
+        assert torch.equal(one, other)
+    asked, weights = settings(average_share=1.0), list[np.ndarray]()
+    state = first_state(avatar(), asked)
+    for _ in steps(state, groups, asked, 4):
+        weights.append(next(state.avatar.parameters()).detach().numpy().copy())
+    np.testing.assert_allclose(next(state.average.parameters()).detach(), np.mean(weights, axis=0), atol=1e-6)
+
+
+def test_a_step_is_measured_on_a_copy(groups: list[ShapeGroup]) -> None:
+    made = avatar()
+    before = {name: value.clone() for name, value in made.state_dict().items()}
+    assert step_seconds(made, groups, settings()) > 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(step_loop, "_measured", lambda *words: {1.0: 2.0, 0.0: 10.0}[words[-1]])
+        assert [step_seconds(made, groups, settings(small_until=share)) for share in (0.0, 0.25, 1.0)] == [10, 8, 2]
+    assert all(torch.equal(value, before[name]) for name, value in made.state_dict().items())
+
+
+def test_a_state_of_another_training_is_refused(groups: list[ShapeGroup], tmp_path: Path) -> None:
+    save_state(trained(groups, 1), tmp_path / "state.npz")
+    other = first_state(avatar(width=8), settings())
+    with pytest.raises(BadInputError, match=r"state\.npz: found .*expected the state of this training; remove it"):
+        load_state(other, tmp_path / "state.npz")
+    (tmp_path / "state.npz").write_bytes((tmp_path / "state.npz").read_bytes()[:1000])
+    with pytest.raises(BadInputError, match="expected the state of this training"):
+        load_state(first_state(avatar(), settings()), tmp_path / "state.npz")
+
+
+def test_settings_are_written_whole_and_read_again(tmp_path: Path) -> None:
+    asked = settings(start="new", steps=40, loss={"structure": 20.0, "overlap": 25.0})
+    (tmp_path / "training.toml").write_text(settings_text(asked))
+    assert read_settings(tmp_path / "training.toml") == asked
+    assert asked.loss.by_name()["composite"] == 0.4 and asked.loss.by_name()["structure"] == 20.0
+
+
+def test_a_new_network_is_trained_on_small_samples_first() -> None:
+    known, new = parsed_settings({}, "a test"), parsed_settings({"start": "new"}, "a test")
+    assert (known.small_until, known.freeze_norms_at) == (0.0, 0.3)
+    assert (new.small_until, new.freeze_norms_at) == (0.12, 0.6)
+    assert parsed_settings({"start": "new", "small_until": 0.5}, "a test").small_until == 0.5
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        (
+            {"sample": 3},
+            "options: sample: found an unknown key, expected one of schema, samples, .*did you mean 'samples'",
+        ),
+        ({"loss": {"dice": 1.0}}, "options: loss.dice: found an unknown key, expected one of composite, "),
+        ({"samples": 3}, "options: samples: found 3, expected greater than or equal to 8"),
+        ({"start": "old"}, "options: start: found 'old', expected 'default' or 'new'"),
+    ],
+)
+def test_wrong_settings_are_refused(values: dict[str, Any], words: str) -> None:
+    with pytest.raises(BadInputError, match=words):
+        parsed_settings(values, "options")
+
+
+def test_a_training_goes_on_only_as_it_was_begun(tmp_path: Path) -> None:
+    path = tmp_path / "training.toml"
+    assert resumed_settings(path, settings()) == settings()
+    path.write_text(settings_text(settings(steps=50)))
+    assert resumed_settings(path, settings()).steps == 50, "steps that were counted by time stay"
+    with pytest.raises(
+        BadInputError, match=r"training\.toml: batch: found a training with 2, expected 3, as asked; use"
+    ):
+        resumed_settings(path, settings(batch=3))
+    with pytest.raises(BadInputError, match="steps: found a training with 50, expected 51"):
+        resumed_settings(path, settings(steps=51))

@@ -1,0 +1,221 @@
+"""Trains an avatar on a capture: draws samples, trains by steps, quantises, writes the bundle and measures it.
+
+Rule: what was finished is kept in the work folder and not done again; each part of the work says what it will cost
+before it starts.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import psutil
+import torch
+
+from trilane.avatars.bundle import load_bundle
+from trilane.errors import BadInputError
+from trilane.training.body_arrays import body_arrays
+from trilane.training.capture_error import error_facts, frame_errors, write_held_out_error
+from trilane.training.dataset import Planned, plan_training, write_dataset
+from trilane.training.first_texture import first_texture
+from trilane.training.make_bundle import quantise_avatar, write_avatar
+from trilane.training.network import UNet
+from trilane.training.neural_texture import SIDES, NeuralTexture
+from trilane.training.progress_sheet import write_sheet
+from trilane.training.sample_files import FIELDS, open_groups
+from trilane.training.step_loop import first_state, step_seconds, steps
+from trilane.training.subject import Subject, captured_subject
+from trilane.training.trainable_avatar import TrainableAvatar
+from trilane.training.training_settings import NAME, TrainingSettings, read_settings, settings_text
+from trilane.training.training_state import TrainingState, load_state, save_state
+from trilane.training.weights_file import load_network, save_network
+from trilane.writing import write_bytes
+
+CHANNELS = 16
+DEFAULT_NETWORK = Path(__file__).with_name("default-network.npz")
+SAMPLES, SAMPLE_FACTS, STATE, NETWORK, SHEETS = "samples", "samples.json", "state.npz", "network.npz", "sheets"
+LEAST_STEPS = 10
+#: Sheets of a training, evenly over its steps; seconds between two states on the disk.
+SHEET_COUNT, SAVE_S = 10, 60.0
+ANOTHER_WORK = "use another --work folder, or remove this one"
+
+
+@dataclass(frozen=True)
+class Places:
+    """`capture`: folder. `out`: of the bundle. `work`: of samples, state and sheets. `name`: of the avatar."""
+
+    capture: Path
+    out: Path
+    work: Path
+    name: str
+
+
+class Listener(Protocol):
+    """Who is told how the work goes."""
+
+    def say(self, line: str) -> None:
+        """`line`: what was found, or what the next part of the work will take."""
+
+    def track(self, text: str, numbers: Iterable[Any], total: int) -> Iterable[Any]:
+        """`numbers`, of which there are `total`, while they are gone through; `text` says what is done."""
+
+    def trained(self, step: int, total: int, terms: dict[str, float], loss: float) -> None:
+        """Step `step` of `total` was done; `terms` of the loss before weighting, and their weighted sum."""
+
+
+def train_on_capture(places: Places, asked: TrainingSettings, listener: Listener) -> dict[str, Any]:
+    """Train what `asked` says and write the bundle; facts of the training and of the held-out frames.
+
+    A training that was ended before goes on from its last state.
+    Raises BadInputError; FaultyCaptureError with all faults; MissingPartError without OpenGL.
+    """
+    started = time.monotonic()
+    places.work.mkdir(parents=True, exist_ok=True)
+    settings = resumed_settings(places.work / NAME, asked)
+    torch.set_num_threads(settings.threads)
+    subject = captured_subject(places.capture, settings.threads, listener.say)
+    _draw_samples(subject, places, settings, listener)
+    groups = open_groups(places.work / SAMPLES)
+    torch.manual_seed(settings.seed)
+    avatar = _first_avatar(subject, places, settings)
+    settings = _with_steps(avatar, places, settings, listener)
+    write_bytes(places.work / NAME, settings_text(settings).encode())
+    state = first_state(avatar, settings)
+    losses = _train(state, subject, places, settings, listener)
+    save_network(state.average, places.work / NETWORK)
+    quantised = quantise_avatar(state.average, subject.shaped, groups, settings.seed)
+    made = {"samples": settings.samples, "steps": state.step, "batch": settings.batch, "seed": settings.seed}
+    provenance = made | {"texture_sides": list(SIDES)} | subject.facts
+    names = {"name": places.name, "training_command": f"trilane avatar train {places.capture.name} --config {NAME}"}
+    write_avatar(places.out, subject.person, quantised, settings.width, provenance, names)
+    write_bytes(places.out / NAME, settings_text(settings).encode())
+    facts = {"avatar": str(places.out), "steps": state.step, "loss": losses}
+    facts |= {"held_out_error": _measure(places, subject, settings)} if subject.held_out else {}
+    sheets = str(places.work / SHEETS)
+    return facts | {"sheets": sheets, "seconds": round(time.monotonic() - started, 1)}
+
+
+def resumed_settings(path: Path, asked: TrainingSettings) -> TrainingSettings:
+    """Those of the training that the file `path` is of, where they are what is `asked` for; else `asked`.
+
+    Steps that were counted before stay. Raises BadInputError when the file has others.
+    """
+    if not path.exists():
+        return asked
+    begun = read_settings(path)
+    if asked.steps is None:
+        asked = asked.model_copy(update={"steps": begun.steps})
+    one, other = begun.model_dump(), asked.model_dump()
+    for key, value in one.items():
+        if other[key] != value:
+            raise BadInputError(f"{path}: {key}", f"a training with {value}", f"{other[key]}, as asked", ANOTHER_WORK)
+    return begun
+
+
+def _draw_samples(subject: Subject, places: Places, settings: TrainingSettings, listener: Listener) -> None:
+    """Draw the samples into the work folder, unless they are there. Raises BadInputError where others are."""
+    facts = places.work / SAMPLE_FACTS
+    wanted = {"capture": str(places.capture.resolve()), "samples": settings.samples, "seed": settings.seed}
+    if facts.exists():
+        present = json.loads(facts.read_text(encoding="utf-8"))
+        if present != wanted:
+            raise BadInputError(facts, str(present), str(wanted), ANOTHER_WORK)
+        return
+    samples = plan_training(
+        subject.renderer,
+        settings.samples,
+        settings.seed,
+        lambda all_: listener.track("choosing views", all_, len(all_)),
+    )
+    listener.say(_sample_cost(subject, samples, settings))
+    folder, processes = places.work / SAMPLES, settings.threads
+    write_dataset(
+        subject.source, samples, folder, processes, lambda parts: listener.track("drawing views", parts, len(parts))
+    )
+    write_bytes(facts, json.dumps(wanted).encode())
+
+
+def _sample_cost(subject: Subject, samples: list[Planned], settings: TrainingSettings) -> str:
+    """What drawing `samples` will take, by some that are drawn."""
+    start, tried = time.monotonic(), samples[:: max(1, len(samples) // 4)][:4]
+    for sample in tried:
+        subject.renderer.render(sample)
+    seconds = (time.monotonic() - start) / len(tried) * len(samples) / settings.threads
+    pixel = sum(int(np.prod(tail, dtype=int)) * np.dtype(kind).itemsize for tail, kind in FIELDS.values())
+    megabytes = sum(sample.crop.shape[0] * sample.crop.shape[1] for sample in samples) * pixel / 1e6
+    return (
+        f"{len(samples)} views: about {seconds:.0f} s, {megabytes:.0f} MB on the disk (by {len(tried)} that were drawn)"
+    )
+
+
+def _first_avatar(subject: Subject, places: Places, settings: TrainingSettings) -> TrainableAvatar:
+    """What training starts from; of a training that was begun, only its shapes matter."""
+    network = UNet(width=settings.width, channels=CHANNELS, input_skip=True)
+    if settings.start == "default":
+        network = load_network(network, DEFAULT_NETWORK)
+    if (places.work / STATE).exists():
+        texture = np.zeros((SIDES[0], SIDES[0], CHANNELS), np.float32)
+    else:
+        groups = open_groups(places.work / SAMPLES)
+        texture = first_texture(body_arrays(subject.shaped), groups, SIDES[0], CHANNELS)
+    return TrainableAvatar(NeuralTexture(texture), network)
+
+
+def _with_steps(
+    avatar: TrainableAvatar, places: Places, settings: TrainingSettings, listener: Listener
+) -> TrainingSettings:
+    """`settings` with a number of steps, by default as many as fit into the minutes; says what they take."""
+    seconds = step_seconds(avatar, open_groups(places.work / SAMPLES), settings)
+    count = settings.steps or max(LEAST_STEPS, int(60 * settings.minutes / seconds))
+    memory_mb = psutil.Process().memory_info().rss / 1e6
+    per_step = f"{seconds:.2f} s a step as measured on {settings.threads} threads"
+    listener.say(f"{count} steps: about {count * seconds / 60:.1f} min ({per_step}), {memory_mb:.0f} MB of memory")
+    return settings.model_copy(update={"steps": count})
+
+
+def _train(
+    state: TrainingState, subject: Subject, places: Places, settings: TrainingSettings, listener: Listener
+) -> dict[str, float]:
+    """Do all steps that are left; the loss at the first and last of them: `first`, `last`."""
+    path, count = places.work / STATE, settings.steps or LEAST_STEPS
+    if path.exists():
+        load_state(state, path)
+        listener.say(f"goes on after step {state.step} of {count}")
+    weights, saved = settings.loss.by_name(), time.monotonic()
+    every, losses = max(1, count // SHEET_COUNT), list[float]()
+    for terms in steps(state, open_groups(places.work / SAMPLES), settings, count):
+        losses.append(sum(weights[name] * value for name, value in terms.items()))
+        listener.trained(state.step, count, terms, losses[-1])
+        if state.step % every == 0 or state.step == count:
+            write_sheet(places.work / SHEETS / f"step-{state.step:07}.png", state.average, subject)
+        if time.monotonic() - saved > SAVE_S:
+            save_state(state, path)
+            saved = time.monotonic()
+    save_state(state, path)
+    return _ends(losses)
+
+
+def _ends(losses: list[float]) -> dict[str, float]:
+    """Means over the first and the last tenth of the steps that were done now."""
+    part = max(1, len(losses) // 10)
+    if not losses:
+        return {}
+    return {
+        "first": losses[0],
+        "first_tenth": float(np.mean(losses[:part])),
+        "last_tenth": float(np.mean(losses[-part:])),
+    }
+
+
+def _measure(places: Places, subject: Subject, settings: TrainingSettings) -> dict[str, Any]:
+    """The error of the bundle on frames that training never read, which is written into it."""
+    assert subject.frames is not None
+    bundle = load_bundle(places.out)
+    facts = error_facts(frame_errors(bundle, subject.frames, subject.held_out, settings.threads))
+    write_held_out_error(bundle, facts)
+    return facts

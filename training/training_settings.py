@@ -1,0 +1,94 @@
+"""`training.toml`: everything that decides what a training on a capture makes, in one file that the bundle keeps.
+
+Rule: no folders are in it; the same file, capture and machine give the same avatar on one thread of a CPU.
+"""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, ValidationError
+
+from trilane.errors import BadInputError
+from trilane.files import read_text
+from trilane.near_miss import did_you_mean
+from trilane.scene.schema import Table
+from trilane.training.loss_weights import LossWeights
+
+NAME = "training.toml"
+#: What is usual for a network that is trained already, and for a new one, where the settings do not say it.
+STARTS: dict[str, dict[str, float]] = {
+    "default": {"small_until": 0.0, "freeze_norms_at": 0.3},
+    "new": {"small_until": 0.12, "freeze_norms_at": 0.6},
+}
+EXPECTED = "settings of a training (TOML): docs/captures.md"
+HEAD = "# How this avatar was trained; `trilane avatar train CAPTURE --config training.toml` trains one so again.\n"
+
+
+class TrainingSettings(Table):
+    """One training.
+
+    `samples`: views of the capture's frames, drawn before training. `minutes`: of training, which `steps` are counted
+    for by measured time where they are not given. `batch`: samples of a step. `seed`: of all random numbers. `threads`:
+    of PyTorch. `start`: the network of the default avatar, or one of random weights. `width`: of a new one.
+    `network_rate`, `texture_rate`: peaks of the learning rates. `small_until`, `freeze_norms_at`: shares of the steps,
+    up to which only half-size samples are used, and after which batch statistics stay. `average_share`: of the steps
+    so far, time constant of the average that becomes the avatar. `noise_steps`: on activations, steps of a byte.
+    """
+
+    schema_: Literal[1] = Field(default=1, alias="schema")
+    samples: int = Field(default=4000, ge=8, le=200_000)
+    minutes: float = Field(default=60.0, gt=0, le=100_000)
+    steps: int | None = Field(default=None, ge=10, le=10_000_000)
+    batch: int = Field(default=4, ge=1, le=64)
+    seed: int = Field(default=1, ge=0, lt=2**31)
+    threads: int = Field(default=1, ge=1, le=256)
+    start: Literal["default", "new"] = "default"
+    width: int = Field(default=16, ge=4, le=64)
+    network_rate: float = Field(default=1.5e-3, gt=0, le=1)
+    texture_rate: float = Field(default=4e-4, gt=0, le=1)
+    weight_decay: float = Field(default=1e-3, ge=0, le=1)
+    small_until: float = Field(ge=0, le=1)
+    freeze_norms_at: float = Field(ge=0, le=1)
+    average_share: float = Field(default=0.1, gt=0, le=1)
+    noise_steps: float = Field(default=1.0, ge=0, le=16)
+    loss: LossWeights = LossWeights()
+
+
+def read_settings(path: Path) -> TrainingSettings:
+    """The settings in the file `path`. Raises BadInputError."""
+    try:
+        values = tomllib.loads(read_text(path, EXPECTED))
+    except tomllib.TOMLDecodeError as error:
+        raise BadInputError(path, f"no valid TOML ({error})", EXPECTED) from None
+    return parsed_settings(values, path)
+
+
+def parsed_settings(values: dict[str, Any], where: str | Path) -> TrainingSettings:
+    """The settings of `values`, which stand at `where`. Raises BadInputError."""
+    usual = STARTS.get(str(values.get("start", "default")), {})
+    try:
+        return TrainingSettings.model_validate(usual | values)
+    except ValidationError as error:
+        raise _refused(dict(error.errors()[0]), where) from None
+
+
+def settings_text(settings: TrainingSettings) -> str:
+    """The text of a file of `settings`: every value, also where it is the default."""
+    values = settings.model_dump(by_alias=True, exclude_none=True)
+    weights = values.pop("loss")
+    lines = [f"{key} = {json.dumps(value)}" for key, value in values.items()]
+    return "\n".join([HEAD, *lines, "", "[loss]", *(f"{key} = {value!r}" for key, value in weights.items())]) + "\n"
+
+
+def _refused(details: dict[str, Any], where: str | Path) -> BadInputError:
+    """One of the `errors()` of a ValidationError."""
+    place, keys = f"{where}: {'.'.join(map(str, details['loc']))}", details["loc"]
+    if details["type"] != "extra_forbidden":
+        return BadInputError(place, repr(details["input"])[:80], details["msg"].removeprefix("Input should be "))
+    table = LossWeights if len(keys) > 1 else TrainingSettings
+    known = [field.alias or name for name, field in table.model_fields.items()]
+    return BadInputError(place, "an unknown key", f"one of {', '.join(known)}", did_you_mean(str(keys[-1]), known))
