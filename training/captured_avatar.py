@@ -96,7 +96,7 @@ def train_on_capture(places: Places, asked: TrainingSettings, listener: Listener
     write_bytes(places.out / NAME, settings_text(settings).encode())
     facts = {"avatar": str(places.out), "steps": state.step, "loss": losses}
     facts |= {"held_out_error": _measure(places, subject, settings)} if subject.held_out else {}
-    sheets = str(places.work / SHEETS)
+    sheets = str(places.work / SHEETS) if subject.held_out else None
     return facts | {"sheets": sheets, "seconds": round(time.monotonic() - started, 1)}
 
 
