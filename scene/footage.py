@@ -111,8 +111,9 @@ def _turned(path: CameraPath, stored: tuple[Stored, ...]) -> tuple[CameraPath, t
         _turn(lenses[k % len(lenses)], path.quarter, one, is_own=path.is_held) for k, one in enumerate(stored)
     )
     shapes = tuple(one.shown(turned) for one, turned in zip(stored, turns, strict=True))
-    optics = replace(path.optics, filmed=_once(shapes), turned=_once(turns))
     differ = sum((one.turned - turned) % 4 != 0 for one, turned in zip(stored, turns, strict=True))
+    as_files_say = not differ and not path.is_held  # mirrored, too, and each picture of a folder by its own tag
+    optics = replace(path.optics, filmed=_once(shapes), turned=() if as_files_say else _once(turns))
     said = f" ({differ} of {len(stored)})" if len(stored) > 1 else ""
     note = (f"turned with the camera's picture, and not as the file says{said}",) if differ else ()
     return replace(path, optics=optics), note

@@ -14,7 +14,8 @@ import pytest
 from PIL import Image, ImageOps
 
 from trilane.errors import BadInputError
-from trilane.scene.footage import Stored
+from trilane.scene.camera.path import CameraPath, one_lens
+from trilane.scene.footage import Stored, filmed
 from trilane.stages.gpu.background import open_background
 from trilane.stages.gpu.high_range import PQ, pq_code
 from trilane.stages.gpu.survey import check_pictures, survey
@@ -170,18 +171,35 @@ def test_a_picture_that_lies_in_its_file(tmp_path: Path) -> None:
     assert shown is not None and (shown[7] == 200).all() and not shown[:7].any()
 
 
-@pytest.mark.parametrize("tag", range(1, 9))
-def test_every_tag_turns_and_mirrors_as_pillow_does(tmp_path: Path, tag: int) -> None:
+def tagged(path: Path, pixels: np.ndarray, tag: int) -> np.ndarray:
+    """Written to `path`; what Pillow shows of it."""
     exif = Image.Exif()
     exif[0x0112] = tag
+    Image.fromarray(pixels).save(path, exif=exif)
+    with Image.open(path) as image:
+        return np.asarray(ImageOps.exif_transpose(image))
+
+
+@pytest.mark.parametrize("tag", range(1, 9))
+def test_every_tag_turns_and_mirrors_as_pillow_does(tmp_path: Path, tag: int) -> None:
     pixels = np.random.default_rng(0).integers(0, 255, (6, 8, 3), dtype=np.uint8)
-    Image.fromarray(pixels).save(tmp_path / "a.png", exif=exif)
-    with Image.open(tmp_path / "a.png") as image:
-        upright = np.asarray(ImageOps.exif_transpose(image))
+    upright = tagged(tmp_path / "a.png", pixels, tag)
     (stored,) = survey(tmp_path / "a.png", 30.0).stored
     assert stored.shown() == upright.shape[:2]
     shown = open_background(tmp_path / "a.png", stored.shown(), 30.0).at(0.0)
     assert shown is not None and np.array_equal(shown, upright)
+
+
+@pytest.mark.parametrize("tag", range(1, 9))
+def test_every_tag_is_obeyed_before_a_recorded_camera_too(tmp_path: Path, tag: int) -> None:
+    """Of each picture of a folder, which the camera's file does not name, whatever the first one's is."""
+    pixels = np.random.default_rng(0).integers(0, 255, (8, 8, 3), dtype=np.uint8)
+    shown = [tagged(tmp_path / f"{number}.png", pixels, one) for number, one in enumerate((tag, 1, 5))]
+    path = CameraPath(np.zeros(1), np.array([[1.0, 0, 0, 0]]), np.zeros((1, 3)), one_lens(50.0, 0.1, 10.0), ())
+    camera, _ = filmed(path, survey(tmp_path, 1.0), (8, 8))
+    background = open_background(tmp_path, (8, 8), 1.0, camera)
+    for number, upright in enumerate(shown):
+        assert np.array_equal(background.at(float(number)), upright)  # type: ignore[arg-type]
 
 
 def test_sixteen_bits_of_grey_are_brought_to_eight(tmp_path: Path) -> None:
