@@ -1,8 +1,8 @@
 """NeRF `transforms.json`: `frames[].transform_matrix`, 4x4 camera to world, OpenGL axes, usually Z up.
 
 Rule: the lens is that of the frame, else that of the file (`fl_x`, `fl_y`, `cx`, `cy` in pixels of `w` x `h`, or
-`camera_angle_x`); distortion is left out and said. The format has no times (`untimed.py`). Polycam's and Record3D's
-exports are such files, as nerfstudio makes them.
+`camera_angle_x` or `camera_angle_y`); distortion is left out and said. The
+format has no times (`untimed.py`). Polycam's and Record3D's exports are such files, as nerfstudio makes them.
 Format: https://docs.nerf.studio/quickstart/data_conventions.html.
 """
 
@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from trilane.scene.camera.map_frame import Unit
 from trilane.scene.camera.recorded import RawCamera
 from trilane.scene.camera.untimed import times_without
 from trilane.scene.detected import Detected
-from trilane.scene.lens import Known, Lens, centred, of_fov_x
+from trilane.scene.lens import Known, Lens, centred, of_fov_x, of_fov_y
 
 FILE = "transforms.json"
 EXPECTED = "a NeRF transforms.json: `frames`, each with a 4x4 `transform_matrix`"
@@ -34,9 +35,12 @@ DEFAULT_ASPECT = 4 / 3
 MAX_FRAMES = 100_000
 #: Of a matrix whose columns have unit length; that of a rotation is 1. A place far off makes it less: 1e-5 at 100 km.
 LEAST_DETERMINANT = 1e-9
-LENS_KEYS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x")
+LENS_KEYS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y")
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
 FISHEYE = "FISHEYE"  # in the name of a camera model
+#: In the names of nerfstudio's models whose pictures no pinhole makes.
+NO_LENS = ("EQUIRECTANGULAR", "OMNIDIRECTIONAL", "VR180", "ORTHOPHOTO")
+NO_LENS_REMEDY = "cut the pictures into perspective ones first (ns-process-data --camera-type equirectangular)"
 
 
 def load_nerf(path: Path, rate_hz: float | None = None) -> RawCamera:
@@ -67,12 +71,21 @@ def load_nerf(path: Path, rate_hz: float | None = None) -> RawCamera:
 
 def _lenses(path: Path, content: Mapping[str, Any], frames: Sequence[Any]) -> tuple[tuple[Lens, ...], str]:
     """One lens for all views, or one for each where a view has a key of its own; and where they come from."""
+    _check_models(path, (content, *frames))
     if not any(key in frame for frame in frames if isinstance(frame, dict) for key in LENS_KEYS):
         lens, source = _lens(path, content, "")
         return (lens,), source
     own = [_lens(path, {**content, **frame}, f"frames[{k}].") for k, frame in enumerate(frames)]
     sources = dict.fromkeys(source for _, source in own)
     return tuple(lens for lens, _ in own), f"{' or '.join(sources)}, frame by frame"
+
+
+def _check_models(path: Path, tables: Sequence[Mapping[str, Any]]) -> None:
+    """Raises BadInputError where a camera of the file makes pictures that no pinhole makes."""
+    for keys in tables:
+        model = str(keys.get("camera_model", ""))
+        if any(word in model.upper() for word in NO_LENS):
+            raise BadInputError(f"{path}: camera_model", model[:40], "a pinhole or fisheye camera", NO_LENS_REMEDY)
 
 
 def _distortion(
@@ -140,20 +153,37 @@ def _lens(path: Path, content: Mapping[str, Any], of: str) -> tuple[Lens, str]:
 
 def _measured(path: Path, content: Mapping[str, Any], of: str) -> tuple[Lens, str]:
     numbers = (_number(f"{path}: {of}{key}", content.get(key), key) for key in LENS_KEYS)
-    width, height, focal_x, focal_y, cx, cy, angle_x = numbers
+    width, height, focal_x, focal_y, cx, cy, angle_x, angle_y = numbers
     usable = {"fl_x": focal_x if width else None, "fl_y": focal_y if height else None}
     known = [key for key, value in usable.items() if value]
     if not known:
-        angle = angle_x or DEFAULT_ANGLE_X
-        source = "by `camera_angle_x`" if angle_x else "usual, as the file has none"
-        if not (width and height):
-            return of_fov_x(math.degrees(angle)), source
-        return centred(width, height, width / 2 / math.tan(angle / 2)), source
+        lens, source = _by_angle(width, height, angle_x, angle_y)
+        if (focal_x or focal_y) and not (angle_x or angle_y):
+            source = "usual, as focal lengths in pixels need `w` and `h`"
+        return replace(lens, cx=cx or lens.cx, cy=cy or lens.cy) if width and height else lens, source
     wide, high = width or (height or 0.0) * DEFAULT_ASPECT, height or (width or 0.0) / DEFAULT_ASPECT
     fx, fy = usable["fl_x"] or usable["fl_y"] or 0.0, usable["fl_y"] or usable["fl_x"] or 0.0
     shape = Known.ALL if width and height else Known.WIDTH if width else Known.HEIGHT
     source = f"by {' and '.join(f'`{key}`' for key in known)}"
     return Lens(wide, high, fx, fy, cx or wide / 2, cy or high / 2, shape), source
+
+
+def _by_angle(
+    width: float | None, height: float | None, angle_x: float | None, angle_y: float | None
+) -> tuple[Lens, str]:
+    """The lens of which at most the angles over a picture's sides are known, and where they come from."""
+    angles = {"camera_angle_x": angle_x, "camera_angle_y": angle_y}
+    source = f"by {' and '.join(f'`{key}`' for key, value in angles.items() if value)}"
+    if not (angle_x or angle_y):
+        angle_x, source = DEFAULT_ANGLE_X, "usual, as the file has none"
+    if not (width and height):
+        if angle_x:
+            return of_fov_x(math.degrees(angle_x)), source.removesuffix(" and `camera_angle_y`")
+        return of_fov_y(math.degrees(angle_y or 0.0)), source
+    focal_x = width / 2 / math.tan(angle_x / 2) if angle_x else None
+    focal_y = height / 2 / math.tan(angle_y / 2) if angle_y else None
+    lens = centred(width, height, focal_x or focal_y or 0.0)
+    return replace(lens, fy=focal_y or lens.fx), source
 
 
 def _number(where: str, value: Any, key: str) -> float | None:
@@ -162,6 +192,6 @@ def _number(where: str, value: Any, key: str) -> float | None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | float) or not (math.isfinite(value) and value > 0):
         raise BadInputError(where, repr(value)[:40], "a positive number")
-    if key == "camera_angle_x" and value >= math.pi:
+    if key.startswith("camera_angle") and value >= math.pi:
         raise BadInputError(where, f"{value:g}", "an angle in radians below pi")
     return float(value)

@@ -37,6 +37,21 @@ LENSES: list[tuple[dict[str, float], float, float, str]] = [
     ({"fl_y": 500, "w": 800, "camera_angle_x": math.pi / 2}, 0.75, 1.0, "by `camera_angle_x`"),  # no `h`
     ({"fl_x": 500, "h": 800, "camera_angle_x": math.pi / 2}, 0.75, 1.0, "by `camera_angle_x`"),  # no `w`
     ({"camera_angle_x": math.pi / 2, "w": 1000, "h": 500}, 0.5, 1.0, "by `camera_angle_x`"),
+    ({"camera_angle_y": math.pi / 2}, 1.0, 4 / 3, "by `camera_angle_y`"),  # the usual aspect
+    ({"camera_angle_y": math.pi / 2, "w": 1000, "h": 500}, 1.0, 2.0, "by `camera_angle_y`"),
+    (
+        {"camera_angle_x": math.pi / 2, "camera_angle_y": 2 * math.atan(0.4), "w": 1000, "h": 500},
+        0.4,
+        1.0,
+        "by `camera_angle_x` and `camera_angle_y`",
+    ),
+    ({"camera_angle_x": math.pi / 2, "camera_angle_y": 1.0}, 0.75, 1.0, "by `camera_angle_x`"),  # square pixels
+    (
+        {"fl_x": 500, "cx": 400, "cy": 300},
+        math.tan(math.radians(25)) * 0.75,
+        math.tan(math.radians(25)),
+        "usual, as focal lengths in pixels need `w` and `h`",
+    ),
     ({"w": 1000, "h": 500}, math.tan(math.radians(25)) / 2, math.tan(math.radians(25)), "usual, as the file has none"),
 ]
 
@@ -53,6 +68,24 @@ def test_the_lens_of_height_and_of_width(
         camera = load(tmp_path / "a.json", up_axis="z")
         assert camera.lens(0.0, (480, 640)).fov_y_deg == pytest.approx(angle(tangent))
         assert camera.notes[2] == f"field of view {angle(tangent):.4g} degrees high, {note}"
+
+
+def test_the_principal_point_counts_where_only_an_angle_is_known(tmp_path: Path) -> None:
+    """f is 320 px of 640x480 at 90 degrees; at (1, 2, 3), 4 m along +Y, 0.5 m right is 40 px, 1 m up 80."""
+    lens = {"camera_angle_x": math.pi / 2, "w": 640, "h": 480, "cx": 192, "cy": 336}
+    (tmp_path / "a.json").write_text(nerf_text(pose_z_up(0, (1, 2, 3)), **lens))
+    assert pixel(load(tmp_path / "a.json"), [1.5, 4.0, -6.0]) == pytest.approx((192 + 40, 336 - 80))
+
+
+@pytest.mark.parametrize("model", ["EQUIRECTANGULAR", "OMNIDIRECTIONALSTEREO_L", "VR180_R", "ORTHOPHOTO"])
+def test_pictures_that_no_lens_makes_are_refused(tmp_path: Path, model: str) -> None:
+    text = json.loads(nerf_text(pose_z_up(0), fl_x=500, w=800, h=400))
+    for table in (text, text["frames"][0]):
+        table["camera_model"] = model
+        (tmp_path / "a.json").write_text(json.dumps(text))
+        del table["camera_model"]
+        with pytest.raises(BadInputError, match=f"camera_model: found {model}, .*; cut the pictures into perspective"):
+            load(tmp_path / "a.json")
 
 
 def test_views_a_step_apart_are_a_film_or_stills(tmp_path: Path) -> None:
