@@ -42,7 +42,7 @@ def first_state(avatar: TrainableAvatar, settings: TrainingSettings) -> Training
     average = copy.deepcopy(avatar).eval()
     add_activation_noise(avatar.network, settings.noise_steps)
     avatar.network.to(memory_format=torch.channels_last)
-    return TrainingState(avatar, average, optimiser_of(avatar, settings))
+    return TrainingState(avatar, average, optimiser_of(avatar, settings, settings.masked_texture))
 
 
 def steps(

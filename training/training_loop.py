@@ -26,6 +26,7 @@ from torch import multiprocessing as tmp
 
 from trilane.training.activation_noise import add_activation_noise
 from trilane.training.losses import WEIGHTS, loss_terms, total_loss
+from trilane.training.masked_adam import MASKED, MaskedAdamW
 from trilane.training.sample_files import U16, ShapeGroup, batches, open_groups
 from trilane.training.trainable_avatar import TrainableAvatar
 
@@ -195,16 +196,18 @@ def train_step(
     return {name: float(term.detach()) for name, term in terms.items()}
 
 
-def optimiser_of(avatar: TrainableAvatar, config: Rates) -> torch.optim.Optimizer:
-    """AdamW for `avatar`; weights that are no kernels do not decay."""
+def optimiser_of(avatar: TrainableAvatar, config: Rates, masked: bool = False) -> torch.optim.Optimizer:
+    """AdamW for `avatar`; weights that are no kernels do not decay. `masked`: texels without a gradient stay."""
     kernels = [p for p in avatar.network.parameters() if p.ndim > 1]
     others = [p for p in avatar.network.parameters() if p.ndim <= 1]
-    groups = [
+    groups: list[dict[str, Any]] = [
         {"params": kernels, "lr": config.network_rate, "weight_decay": config.weight_decay},
         {"params": others, "lr": config.network_rate, "weight_decay": 0.0},
         {"params": list(avatar.texture.parameters()), "lr": config.texture_rate, "weight_decay": config.weight_decay},
     ]
-    return torch.optim.AdamW(groups, betas=(0.9, 0.99))
+    if masked:
+        groups[2][MASKED] = True
+    return (MaskedAdamW if masked else torch.optim.AdamW)(groups, betas=(0.9, 0.99))
 
 
 def rate_share(share: float) -> float:

@@ -37,6 +37,7 @@ class TrainingSettings(Table):
     `network_rate`, `texture_rate`: peaks of the learning rates. `small_until`, `freeze_norms_at`: shares of the steps,
     up to which only half-size samples are used, and after which batch statistics stay. `average_share`: of the steps
     so far, time constant of the average that becomes the avatar. `noise_steps`: on activations, steps of a byte.
+    `masked_texture`: texels that a batch does not show keep their values and their momentum.
     """
 
     schema_: Literal[1] = Field(default=1, alias="schema")
@@ -55,6 +56,7 @@ class TrainingSettings(Table):
     freeze_norms_at: float = Field(ge=0, le=1)
     average_share: float = Field(default=0.1, gt=0, le=1)
     noise_steps: float = Field(default=1.0, ge=0, le=16)
+    masked_texture: bool = False
     loss: LossWeights = LossWeights()
 
 
