@@ -27,7 +27,7 @@ from trilane.writing import require_writable, write_bytes, write_folder
 MANIFEST = "manifest.json"
 DEFAULT = "default"
 CAPTURE = "capture.toml"
-HOW_TO_TRAIN = "docs/captures.md says how an avatar is trained from frames of a person"
+HOW_TO_TRAIN = "docs/captures.md says how `trilane avatar train` makes one from frames of a person"
 TEXTURE_KEYS = ("texture", "scale")
 #: Clothes and hair of an avatar reach this far from its body, metres. The pose stage and the training crop by it.
 CLOTHES_STANDOFF_M = 0.045

@@ -1,0 +1,182 @@
+"""A training on a capture as a whole, on samples of plain colour: what is drawn, kept, refused, written and told."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("scipy")
+pytest.importorskip("skimage")
+
+from trilane.errors import BadInputError  # noqa: E402
+from trilane.training import captured_avatar  # noqa: E402
+from trilane.training.captured_avatar import Places, train_on_capture  # noqa: E402
+from trilane.training.neural_texture import NeuralTexture  # noqa: E402
+from trilane.training.sample_files import create_group  # noqa: E402
+from trilane.training.subject import Person, Subject  # noqa: E402
+from trilane.training.training_settings import TrainingSettings, parsed_settings, read_settings  # noqa: E402
+
+SHAPE, SIDES = (32, 32), (64, 32)
+FACTS = {"body": "that of a capture", "frames": 9}
+
+
+class Told:
+    """Notes what a training says."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self.steps: list[tuple[int, int, float]] = []
+
+    def say(self, line: str) -> None:
+        self.lines.append(line)
+
+    def track(self, text: str, numbers: Any, total: int) -> Any:
+        self.lines.append(f"{text} {total}")
+        return numbers
+
+    def trained(self, step: int, total: int, terms: dict[str, float], loss: float) -> None:
+        assert loss == pytest.approx(0.1 * terms["colour"] + sum_without_colour(terms))
+        self.steps.append((step, total, loss))
+
+
+def sum_without_colour(terms: dict[str, float]) -> float:
+    """By the weights of the default avatar's loss."""
+    weights = {"composite": 0.4, "decibels": 0.03, "edges": 0.2, "coarse": 0.2, "mask": 0.1}
+    return sum(
+        (weights | {"background": 0.05, "overlap": 0.1})[name] * terms[name] for name in terms if name != "colour"
+    )
+
+
+@pytest.fixture
+def log(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """What the training asks of the parts that draw, quantise and measure, which are doubles."""
+    asked: list[Any] = []
+    crop = SimpleNamespace(shape=SHAPE)
+
+    def render(_: Any) -> Any:
+        asked.append("render")
+
+    def sample(seed: Any, band: str, size: str) -> Any:
+        return SimpleNamespace(crop=crop, seed=seed, band=band, size=size)
+
+    renderer = SimpleNamespace(training_sample=sample, render=render)
+    person = Person(Path("body.npz"))
+
+    def subject(folder: Path, _: int, report: Callable[[str], None]) -> Subject:
+        report(f"9 frames of {folder.name}")
+        return Subject(person, "shaped", renderer, "source", FACTS, None, "frames", (3,))  # type: ignore[arg-type]
+
+    def draw(source: Any, samples: Any, folder: Path, processes: int, track: Any) -> None:
+        asked.append(("draw", source, len(samples), processes))
+        list(track([1, 2, 3]))
+        group = create_group(folder, SHAPE, np.zeros(len(samples), np.int8))
+        group.covered[:, 4:24, 6:28] = 1
+        group.rgba[:, 4:26, 5:28] = (200, 100, 50, 255)
+
+    part = monkeypatch.setattr
+    before = torch.get_num_threads()
+    part(captured_avatar, "captured_subject", subject)
+    part(captured_avatar, "write_dataset", draw)
+    part(captured_avatar, "SIDES", SIDES)
+    part(captured_avatar, "NeuralTexture", lambda start: NeuralTexture(start, SIDES))
+    part(captured_avatar, "body_arrays", lambda shaped: f"arrays of {shaped}")
+    part(captured_avatar, "first_texture", lambda *_: np.full((64, 64, 16), 0.25, np.float32))
+    part(captured_avatar, "write_sheet", lambda path, *_: asked.append(path.name))
+    part(captured_avatar, "quantise_avatar", lambda avatar, *words: (weights_of(avatar), words[0], words[2]))
+    part(captured_avatar, "write_avatar", lambda *words: (words[0].mkdir(exist_ok=True), asked.append(words)))
+    part(captured_avatar, "load_bundle", lambda folder: f"bundle of {folder.name}")
+    part(captured_avatar, "frame_errors", lambda *words: asked.append(words) or "errors")
+    part(captured_avatar, "error_facts", lambda errors: {"psnr_db": 21.0, "of": errors})
+    part(captured_avatar, "write_held_out_error", lambda *words: asked.append(words))
+    yield asked
+    torch.set_num_threads(before)
+
+
+def weights_of(avatar: Any) -> bytes:
+    return b"".join(value.detach().numpy().tobytes() for value in avatar.state_dict().values())
+
+
+def places(folder: Path, work: str = "work") -> Places:
+    return Places(folder / "capture", folder / "mine", folder / work, "mine")
+
+
+def settings(**others: Any) -> TrainingSettings:
+    return parsed_settings({"start": "new", "width": 4, "samples": 8, "batch": 2, "steps": 20, **others}, "a test")
+
+
+def test_every_part_gets_what_is_its(log: list[Any], tmp_path: Path) -> None:
+    told = Told()
+    facts = train_on_capture(places(tmp_path), settings(), told)
+    assert log[:4] == ["render"] * 4 and log[4] == ("draw", "source", 8, 1)
+    assert log[5:15] == [f"step-{step:07}.png" for step in range(2, 21, 2)]
+    folder, person, (_, shaped, seed), width, provenance, names = log[15]
+    assert (folder, person, shaped, seed, width) == (tmp_path / "mine", Person(Path("body.npz")), "shaped", 1, 4)
+    assert provenance == {"samples": 8, "steps": 20, "batch": 2, "seed": 1, "texture_sides": list(SIDES), **FACTS}
+    command = "trilane avatar train capture --config training.toml"
+    assert names == {"name": "mine", "training_command": command}
+    assert log[16:] == [("bundle of mine", "frames", (3,), 1), ("bundle of mine", {"psnr_db": 21.0, "of": "errors"})]
+    assert read_settings(tmp_path / "mine" / "training.toml") == settings()
+    assert told.lines[:2] == ["9 frames of capture", "choosing views 8"]
+    assert "0 MB on the disk (by 4 that were drawn)" in told.lines[2] and told.lines[3] == "drawing views 3"
+    assert told.lines[4].startswith("20 steps: about 0.") and told.lines[4].endswith(" MB of memory")
+    losses = [loss for _, _, loss in told.steps]
+    assert [step[:2] for step in told.steps] == [(step, 20) for step in range(1, 21)] and losses[-1] < losses[0]
+    assert facts["loss"] == {
+        "first": losses[0],
+        "first_tenth": pytest.approx(np.mean(losses[:2])),
+        "last_tenth": pytest.approx(np.mean(losses[-2:])),
+    }
+    assert (facts["steps"], facts["sheets"]) == (20, str(tmp_path / "work" / "sheets"))
+
+
+def test_an_ended_training_goes_on_and_makes_the_same_avatar(
+    log: list[Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Ended(Told):
+        def trained(self, step: int, total: int, terms: dict[str, float], loss: float) -> None:
+            super().trained(step, total, terms, loss)
+            if step == 7:
+                raise KeyboardInterrupt
+
+    def avatars() -> list[bytes]:
+        return [words[2][0] for words in log if isinstance(words, tuple) and words[0] == tmp_path / "mine"]
+
+    train_on_capture(places(tmp_path, "whole"), settings(), Told())
+    monkeypatch.setattr(captured_avatar, "SAVE_S", -1.0)
+    with pytest.raises(KeyboardInterrupt):
+        train_on_capture(places(tmp_path), settings(), Ended())
+    told = Told()
+    log_before = len(log)
+    train_on_capture(places(tmp_path), settings(), told)
+    assert "draw" not in [words[0] for words in log[log_before:]], "samples that are there are not drawn again"
+    assert "goes on after step 6 of 20" in told.lines and told.steps[0][0] == 7
+    assert len(avatars()) == 2 and avatars()[0] == avatars()[1]
+    with pytest.raises(BadInputError, match="seed: found a training with 1, expected 2, as asked"):
+        train_on_capture(places(tmp_path), settings(seed=2), Told())
+
+
+@pytest.mark.usefixtures("log")
+def test_samples_of_another_capture_are_refused(tmp_path: Path) -> None:
+    work = places(tmp_path).work
+    work.mkdir()
+    (work / "samples.json").write_text(json.dumps({"capture": "/there", "samples": 8, "seed": 1}))
+    with pytest.raises(BadInputError, match=r"samples\.json: found .*/there.*use another --work folder"):
+        train_on_capture(places(tmp_path), settings(), Told())
+
+
+def test_steps_are_counted_for_the_minutes(log: list[Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A step of a hundredth of a minute: twelve in a ninth of one, and no less than ten."""
+    monkeypatch.setattr(captured_avatar, "step_seconds", lambda *_: 0.6)
+    told = Told()
+    assert train_on_capture(places(tmp_path), settings(steps=None, minutes=0.125), told)["steps"] == 12
+    assert "12 steps: about 0.1 min (0.60 s a step as measured on 1 threads)" in told.lines[4]
+    assert read_settings(tmp_path / "mine" / "training.toml").steps == 12
+    assert train_on_capture(places(tmp_path, "other"), settings(steps=None, minutes=0.001), Told())["steps"] == 10
+    assert log
