@@ -28,6 +28,15 @@ class Guess(NamedTuple):
     reason: str
 
 
+#: Columns of what others save -> how it becomes usable.
+OTHERS = {
+    1: "part the numbers by blanks or commas",
+    7: "if these are rotation vectors, as in ARKitScenes, or a place and a quaternion: write time, place and "
+    "quaternion of each pose, camera to world, as TUM has them",
+    16: "if these are 4x4 matrices, as of Replica: leave the last four columns out, which are 0 0 0 1, for KITTI's 12",
+}
+
+
 def detect(path: Path) -> Guess:
     """The format of `path`. Raises BadInputError when it is none."""
     if path.is_dir():
@@ -79,4 +88,4 @@ def _of_table(path: Path, layout: Layout) -> Guess:
     if columns == tum.COLUMNS:
         return Guess("tum", f"{columns} columns: the quaternion's scalar is taken to be last")
     counts = f"{tum.COLUMNS} (TUM, EuRoC), {kitti.COLUMNS} (KITTI) or {arkit.COLUMNS} (ARKit), or column names"
-    raise BadInputError(path, f"{columns} columns", counts)
+    raise BadInputError(path, f"{columns} columns", counts, OTHERS.get(columns, ""))

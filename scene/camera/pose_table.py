@@ -1,6 +1,7 @@
 """Tables with a time, a place and a quaternion in each line, whatever the order of their columns.
 
-Rule: column names decide the order where a file has them, else its format does.
+Rule: column names decide the order where a file has them, else its format does. Columns that most often hold no
+quaternion are refused: taken for one, another order of columns would give a camera that looks anywhere.
 """
 
 from __future__ import annotations
@@ -10,14 +11,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from trilane.arrays import F64
+from trilane.errors import BadInputError
 from trilane.scene.camera.text_table import POSE, Table, in_seconds, layout_of, read_table
 from trilane.scene.rotations import matrix_from_quat, normalised
 
 USUAL = "as usual"
 #: Times from 2001 to 2100 are those of a clock, others those of a device.
 EARLIEST_S, LATEST_S = 1e9, 4.1e9
+#: A quaternion has length 1; two digits after the point change it by 0.01 at most.
+MOST_OFF = 0.02
 
 
 @dataclass(frozen=True)
@@ -64,7 +69,9 @@ def read_pose_table(path: Path, usual: Sequence[str], expected: str, may_have_mo
     table = read_table(path, len(names), expected)
     time, x, y, z, qw, qx, qy, qz = (table.numbers[:, names.index(name)] for name in POSE)
     times, step, unit = in_seconds(time)
-    turns = matrix_from_quat(normalised(np.column_stack([qw, qx, qy, qz])))
+    quats = np.column_stack([qw, qx, qy, qz])
+    _require_quats(path, quats, table)
+    turns = matrix_from_quat(normalised(quats))
     places = np.column_stack([x, y, z])
     return PoseTable(times, turns, places, unit, step, order, names, table, _began(time, unit))
 
@@ -74,3 +81,24 @@ def _began(times: F64, unit: str) -> float | None:
     finite = times[np.isfinite(times)]
     first = float(finite[0]) * (1e-9 if unit == "ns" else 1.0) if len(finite) else 0.0
     return first if EARLIEST_S < first < LATEST_S else None
+
+
+def _require_quats(path: Path, quats: F64, table: Table) -> None:
+    """Raises BadInputError when most of `quats` (N, 4), which are of `table`, have not length 1."""
+    off = _is_off(quats)
+    if 2 * np.count_nonzero(off) <= len(off):
+        return
+    first = int(np.flatnonzero(off)[0])
+    others = [k for k in range(table.numbers.shape[1] - 3) if not _is_off(table.numbers[:, k : k + 4]).any()]
+    remedy = "say the order in a first line, such as `timestamp qx qy qz qw tx ty tz`"
+    if others:
+        remedy = f"columns {others[0] + 1} to {others[0] + 4} have length 1: {remedy}"
+    found = f"a quaternion of length {np.linalg.norm(quats[first]):.3g}"
+    raise BadInputError(f"{path}, {table.place_of(first)}", found, "length 1", remedy)
+
+
+def _is_off(quats: F64) -> NDArray[np.bool_]:
+    """Of which rows (N, 4) the length is another than 1; not of those that are no rotation at all."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        length = np.linalg.norm(quats, axis=1)
+        return np.asarray(np.isfinite(length) & (length > 0) & (np.abs(length - 1) > MOST_OFF))

@@ -427,3 +427,34 @@ def test_damaged_files_are_read_or_refused(tmp_path_factory: pytest.TempPathFact
 @settings(max_examples=2000, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_many_damaged_files(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
     check_damaged(tmp_path_factory.mktemp("any"), data)
+
+
+def test_columns_that_hold_no_quaternion_are_refused_with_those_that_may(tmp_path: Path) -> None:
+    """A TUM table whose quaternion comes before its place; with names in the first line it is right."""
+    rows = "".join(f"{k} 0.5 -0.5 0.1 0.7 {k + 1} 2 3\n" for k in range(3))
+    (tmp_path / "a.txt").write_text(rows)
+    with pytest.raises(BadInputError) as refused:
+        load(tmp_path / "a.txt")
+    # of line 1: 0.7 1 2 3, whose squares add up to 14.49
+    assert (refused.value.where, refused.value.found) == (
+        f"{tmp_path / 'a.txt'}, line 1",
+        "a quaternion of length 3.81",
+    )
+    assert refused.value.remedy.startswith("columns 2 to 5 have length 1: ")
+    (tmp_path / "a.txt").write_text(f"timestamp qx qy qz qw tx ty tz\n{rows}")
+    assert load(tmp_path / "a.txt", up_axis="y").places[2] - load(tmp_path / "a.txt", up_axis="y").places[
+        0
+    ] == pytest.approx([2, 0, 0])
+
+
+def test_quaternions_of_two_digits_are_some(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("".join(f"{k} {k} 2 3 0.58 0.58 0.58 0\n" for k in range(3)))  # length 1.0046
+    assert len(load(tmp_path / "a.txt").times_s) == 3
+
+
+@pytest.mark.parametrize(("columns", "way"), [(1, "commas"), (7, "as TUM has them"), (16, "KITTI's 12")])
+def test_tables_of_others_are_refused_with_a_way(tmp_path: Path, columns: int, way: str) -> None:
+    (tmp_path / "a.txt").write_text("1 " * columns + "\n" + "2 " * columns + "\n")
+    with pytest.raises(BadInputError) as refused:
+        load(tmp_path / "a.txt")
+    assert way in refused.value.remedy
