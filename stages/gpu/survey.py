@@ -7,6 +7,7 @@ broken file is named before a process is started. A note says size, rate and ran
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
@@ -17,6 +18,7 @@ from typing import Any, NamedTuple
 import av
 
 from trilane.errors import BadInputError
+from trilane.file_signatures import HEAD_BYTES, PICTURE, VIDEO, signature_of_head
 from trilane.files import require_file
 from trilane.scene.camera.path import CameraPath
 from trilane.scene.footage import Footage, Stored
@@ -30,6 +32,9 @@ STEADY = 0.25
 MOST_PACKETS = 500_000
 #: Of the frames that a whole file names, so many are in it.
 LEAST_WHOLE = 0.99
+A_VIDEO = "a video, a picture, or a folder of pictures"
+#: Control characters but those that lay out a text.
+NO_TEXT = re.compile(rb"[\x00-\x08\x0e-\x1a\x1c-\x1f]")
 QUARTER_WORDS = {1: ", turned by 90 degrees", 2: ", turned by 180 degrees", 3: ", turned by 270 degrees"}
 EIGHT_BITS = 8
 
@@ -38,7 +43,7 @@ def survey(path: Path, fps: float) -> Footage:
     """What `path` is; a folder's pictures follow each other at `fps`. Raises BadInputError."""
     if path.is_dir():
         return _folder(path, fps)
-    require_file(path, "a video, a picture, or a folder of pictures")
+    require_file(path, A_VIDEO)
     if is_picture(path):
         stored = look_at_picture(path)
         return Footage((f"picture of {_size(stored)}",), (), (stored,), (path.name,), str(path.absolute().parent))
@@ -97,7 +102,27 @@ class _Head(NamedTuple):
     bits: int
 
 
+def require_video(path: Path) -> None:
+    """Raises BadInputError for what is no video, though FFmpeg may show it, or files that it names: text, archives."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(HEAD_BYTES)
+    except OSError as error:
+        raise BadInputError.of_os_error(path, error, A_VIDEO) from None
+    signature = signature_of_head(head)
+    if signature is not None and signature.group not in (PICTURE, VIDEO):
+        raise BadInputError(path, signature.name, A_VIDEO, signature.remedy)
+    if is_text(head):
+        raise BadInputError(path, "text", A_VIDEO)
+
+
+def is_text(head: bytes) -> bool:
+    """Whether a file that begins with `head` has none of the bytes that no text has, and every video."""
+    return not NO_TEXT.search(head)
+
+
 def _video(path: Path) -> Footage:
+    require_video(path)
     try:
         with av.open(str(path), metadata_errors="replace") as container:
             head = _head(container, path)

@@ -14,6 +14,7 @@ from PIL import Image
 
 from trilane.errors import BadInputError
 from trilane.stages.gpu.background import open_background
+from trilane.stages.gpu.survey import survey
 from trilane.stages.gpu.video_reader import Pixels, fitted
 
 
@@ -179,3 +180,21 @@ def test_a_frame_that_is_too_wide_or_too_high_loses_both_sides_equally() -> None
     assert fitted(Turned(0), Pixels(), (2, 2))[..., 0].tolist() == [[1, 2], [5, 6]]
     # Twice the size, 4 x 8, of which the middle rows stay.
     assert fitted(Turned(0), Pixels(), (2, 8))[..., 0].tolist() == [[0, 0, 1, 1, 2, 2, 3, 3], [4, 4, 5, 5, 6, 6, 7, 7]]
+
+
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [
+        (b"0 1 2 3 0 0 0 1\n" * 50, "text"),
+        ("Grüße\n".encode() * 50, "text"),
+        (b"#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:9,\n/etc/passwd\n", "text"),
+        ("frame\n".encode("utf-16") * 50, "text in UTF-16"),
+        (b"PK\x03\x04" + bytes(99), "a ZIP archive"),
+    ],
+)
+def test_what_ffmpeg_would_show_though_it_is_no_video_is_refused(tmp_path: Path, content: bytes, found: str) -> None:
+    """FFmpeg draws text as a terminal does, and opens what a playlist names."""
+    (tmp_path / "a.txt").write_bytes(content)
+    with pytest.raises(BadInputError) as refused:
+        survey(tmp_path / "a.txt", 30.0)
+    assert refused.value.found == found
