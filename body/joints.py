@@ -52,6 +52,9 @@ JOINT_PARENTS: tuple[int, ...] = (
 )
 
 #: Index of each joint by name.
+#: Those without face and hands.
+BODY_JOINTS: tuple[str, ...] = JOINT_NAMES[:22]
+
 JOINT_INDEX: dict[str, int] = {name: i for i, name in enumerate(JOINT_NAMES)}
 
 #: Poses are axis-angle, three numbers a joint.

@@ -86,7 +86,7 @@ def lines(document: Mapping[str, Any]) -> Iterator[str]:
         **{key: document["detected"][key] for key in ("axes", "unit", "rate", "lens")},
         "length": _length(document["length"]),
         **_joints(document["joints"]),
-        **{key.replace("_", " "): str(value) for key, value in document["facts"].items()},
+        **{key.replace("_", " "): "" if value is None else str(value) for key, value in document["facts"].items()},
     }
     for key, value in rows.items():
         if value:

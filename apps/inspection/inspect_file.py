@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from trilane.apps.inspection.moving import inspect_camera, inspect_motion
 from trilane.apps.inspection.pictures import inspect_folder, inspect_picture, inspect_video
 from trilane.errors import BadInputError
 from trilane.file_signatures import PICTURE, VIDEO, Signature
+from trilane.files import read_text
 from trilane.scene.detected import Detected
 
 #: Kind -> how it is read, and what one of it is called before it was read.
@@ -53,12 +55,25 @@ def inspect_file(path: Path) -> Inspection:
     if kind == recognise.GLTF:
         return _foreign(Signature("a glTF file", remedy=AS_BVH))
     if kind not in READERS:
-        return _folder_of(path) if path.is_dir() else UNKNOWN
+        return _folder_of(path) if path.is_dir() else _other(path)
     read, what = READERS[kind]
     try:
         return read(path)
     except BadInputError as error:
         return refused(kind, what, error, path)
+
+
+def _other(path: Path) -> Inspection:
+    """Of a file that is nothing that Trilane knows; JSON that is broken may have been something."""
+    if path.suffix.lower() != ".json":
+        return UNKNOWN
+    try:
+        json.loads(read_text(path, recognise.EXPECTED))
+    except (BadInputError, ValueError, RecursionError) as error:
+        found = error.found if isinstance(error, BadInputError) else f"no valid JSON ({error})"
+        problem = f"found {found}, expected {recognise.EXPECTED}"
+        return replace(UNKNOWN, what="a broken JSON file", problem=problem, advice="write or download it again")
+    return UNKNOWN
 
 
 def _folder_of(path: Path) -> Inspection:

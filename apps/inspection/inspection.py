@@ -5,6 +5,7 @@ Rule: a file is usable when the reader that a run would use takes it; a problem 
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -14,11 +15,9 @@ import numpy as np
 from PIL import Image
 
 from trilane.arrays import F64
-from trilane.body.joints import JOINT_NAMES
+from trilane.body.joints import BODY_JOINTS
 from trilane.errors import BadInputError
 from trilane.scene.detected import NOTHING, Detected
-
-BODY_JOINTS = JOINT_NAMES[:22]
 
 
 @dataclass(frozen=True)
@@ -79,8 +78,16 @@ class Inspection:
         }
 
 
+def used(option: str, file: Path) -> str:
+    """The command that takes `file`, behind `option` or by itself, as a shell reads it."""
+    return shlex.join(["trilane", "run", *([option] if option else []), str(file)])
+
+
 def refused(kind: str, what: str, error: BadInputError, file: Path) -> Inspection:
     """Of a file that its reader refuses."""
-    where = error.where.removeprefix(str(file)).lstrip(", :")
+    where = error.where
+    for itself in (str(file), str(file.absolute())):
+        if where.startswith(itself):
+            where = where.removeprefix(itself).lstrip(", :/")
     place = f"{where}: " if where else ""
     return Inspection(kind, what, f"{place}found {error.found}, expected {error.expected}", error.remedy)

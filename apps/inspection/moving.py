@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from trilane.apps.inspection.drawn_paths import cameras, skeletons
-from trilane.apps.inspection.inspection import Inspection, Length
+from trilane.apps.inspection.inspection import Inspection, Length, used
 from trilane.avatars.bundle import DEFAULT, bundle_folder
 from trilane.body.body import ShapedBody, load_body
 from trilane.body.kinematics import Skeleton
@@ -41,7 +41,7 @@ def inspect_motion(path: Path) -> Inspection:
         "motion",
         f"a motion: {motion.detected.format or 'a recording'}",
         "",
-        f"trilane run --motion {path}",
+        used("--motion", path),
         motion.detected,
         Length.of(motion.times_s),
         facts,
@@ -67,7 +67,7 @@ def inspect_camera(path: Path) -> Inspection:
         "camera",
         f"a camera path: {camera.detected.format or 'a recording'}",
         "",
-        f"trilane run --camera {path}",
+        used("--camera", path),
         camera.detected,
         Length.of(camera.times_s),
         facts,

@@ -15,7 +15,7 @@ from PIL import Image
 
 from trilane.apps.avatar_facts import bundle_facts
 from trilane.apps.inspection.drawn_paths import points
-from trilane.apps.inspection.inspection import Inspection, Length
+from trilane.apps.inspection.inspection import Inspection, Length, used
 from trilane.apps.overview.sources import read_entries
 from trilane.apps.report import read_report
 from trilane.apps.sweeps.toml_file import read_sweep
@@ -80,7 +80,7 @@ def inspect_avatar(path: Path) -> Inspection:
         "avatar",
         f"the avatar {manifest.name!r}",
         "",
-        f"trilane run --avatar {folder}",
+        used("--avatar", folder),
         Detected("avatar bundle", f"a file {MANIFEST}"),
         facts=facts,
         draw=partial(_drawn_body, vertices),
@@ -120,7 +120,7 @@ def inspect_scene(path: Path) -> Inspection:
     missing = [source for source in facts["sources"] if "/" in source and not Path(source).exists()]
     notes = tuple(f"{source}: no such file, which the scene names" for source in missing)
     what = f"the scene {values['name']!r} with {len(avatars)} avatar{'s' if len(avatars) != 1 else ''}"
-    advice = "give the files that it names" if missing else f"trilane run {path}"
+    advice = "give the files that it names" if missing else used("", path)
     found = Detected("scene", "TOML with keys of the scene schema")
     return Inspection("scene", what, notes[0] if missing else "", advice, found, facts=facts, notes=notes)
 

@@ -15,11 +15,11 @@ import av
 import numpy as np
 from PIL import ExifTags, Image, ImageDraw
 
-from trilane.apps.inspection.inspection import Inspection, Length
+from trilane.apps.inspection.inspection import Inspection, Length, used
 from trilane.errors import BadInputError, reason
 from trilane.scene.detected import Detected
 from trilane.scene.footage import Footage
-from trilane.stages.gpu.background import open_background, pictures_in
+from trilane.stages.gpu.background import is_picture, open_background, pictures_in
 from trilane.stages.gpu.picture_file import read_picture
 from trilane.stages.gpu.survey import survey
 from trilane.stages.gpu.video_reader import quarters_of
@@ -31,18 +31,29 @@ DAMAGED = (OSError, ValueError, SyntaxError, Image.DecompressionBombError)
 
 
 def inspect_picture(path: Path) -> Inspection:
-    """Raises BadInputError when the picture is not usable as a background."""
+    """Raises BadInputError when the picture is not usable as a background; what moves is shown as a video is."""
+    if not is_picture(path) and _moves(path):
+        return inspect_video(path)
     thumb = read_picture(path, THUMB)
     encoding, facts = picture_facts(path)
     return Inspection(
         "picture",
         f"a {encoding} picture of {facts['width']}x{facts['height']} pixels",
         "",
-        f"trilane run --background {path}",
+        used("--background", path),
         Detected(f"{encoding} picture", "the head of the file", axes=_turned(facts["exif_orientation"])),
         facts=facts,
         draw=partial(_sheet, [thumb], [path.name]),
     )
+
+
+def _moves(path: Path) -> bool:
+    """Whether the picture has several frames."""
+    try:
+        with Image.open(path) as image:
+            return bool(getattr(image, "is_animated", False))
+    except DAMAGED:
+        return False
 
 
 def picture_facts(path: Path) -> tuple[str, dict[str, Any]]:
@@ -76,7 +87,7 @@ def inspect_folder(path: Path) -> Inspection:
         "pictures",
         f"a folder of {len(names)} pictures of {first if len(sizes) == 1 else f'{len(sizes)} sizes'}",
         "",
-        f"trilane run --background {path}",
+        used("--background", path),
         Detected("folder of pictures", f"{len(names)} files end as pictures do", rate=_folder_rate(footage)),
         facts={
             "pictures": len(names),
@@ -116,7 +127,7 @@ def inspect_video(path: Path) -> Inspection:
         "video",
         f"a video ({facts['codec']}) of {facts['width']}x{facts['height']} pixels{turned}",
         "",
-        f"trilane run --background {path}",
+        used("--background", path),
         Detected(
             f"{facts['codec']} video", "streams that FFmpeg finds", rate="; ".join((*footage.rate, *footage.what[1:]))
         ),

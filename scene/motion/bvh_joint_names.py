@@ -8,7 +8,8 @@ Sources of the names, besides files of those programs: Unity's `HumanBodyBones`
 (https://github.com/vrm-c/vrm-specification); Unreal's mannequins (UE4 with 3 spine bones, UE5 with 5); Blender's Rigify
 human meta-rig; LaFAN1 (https://github.com/ubisoft/ubisoft-laforge-animation-dataset); Bandai Namco's motion dataset
 (https://github.com/BandaiNamcoResearchInc/Bandai-Namco-Research-Motiondataset); Xsens MVN's BVH and segment names;
-Rokoko's Newton skeleton; Reallusion's Character Creator; Poser's and Daz's figures.
+Rokoko's Newton skeleton; Reallusion's Character Creator; Poser's and Daz's figures; OptiTrack Motive's own bones;
+Sony's mocopi; the bones of CMU's Acclaim files (.asf), which converters keep.
 """
 
 from __future__ import annotations
@@ -185,6 +186,31 @@ DIALECTS: dict[str, dict[str, str]] = {
         **_sided(
             {"thigh": "hip", "shin": "knee", "foot": "ankle", "toe": "foot", "collar": "collar",
              "shldr": "shoulder", "forearm": "elbow", "hand": "wrist"},
+            "l", "r",
+        ),
+    },
+    "OptiTrack": {
+        "hip": "pelvis", "ab": "spine1", "chest": "spine3", "neck": "neck", "head": "head",
+        **_sided(
+            {"thigh": "hip", "shin": "knee", "foot": "ankle", "toe": "foot", "shoulder": "collar",
+             "uarm": "shoulder", "farm": "elbow", "hand": "wrist"},
+            "l", "r",
+        ),
+    },
+    "mocopi": {
+        "root": "pelvis", "torso2": "spine1", "torso4": "spine2", "torso6": "spine3", "neck1": "neck", "head": "head",
+        **_sided(
+            {"upleg": "hip", "lowleg": "knee", "foot": "ankle", "toes": "foot", "shoulder": "collar",
+             "uparm": "shoulder", "lowarm": "elbow", "hand": "wrist"},
+            "l", "r",
+        ),
+    },
+    "Acclaim": {
+        "root": "pelvis", "lowerback": "spine1", "upperback": "spine2", "thorax": "spine3", "lowerneck": "neck",
+        "head": "head",
+        **_sided(
+            {"femur": "hip", "tibia": "knee", "foot": "ankle", "toes": "foot", "clavicle": "collar",
+             "humerus": "shoulder", "radius": "elbow", "wrist": "wrist", "hand": "wrist"},
             "l", "r",
         ),
     },

@@ -6,20 +6,20 @@ Rule: what the file says about places, names and units is told apart here; turni
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import F64
-from trilane.body.joints import JOINT_INDEX
+from trilane.body.joints import BODY_JOINTS, JOINT_INDEX
 from trilane.errors import BadInputError
 from trilane.scene.detected import Detected
 from trilane.scene.motion.bvh import Bvh, BvhJoint, load_bvh
 from trilane.scene.motion.bvh_joint_names import plain
 from trilane.scene.motion.bvh_units import unit_of
-from trilane.scene.motion.joint_match import NO_MAP, match_names
+from trilane.scene.motion.joint_match import NO_MAP, STATED, match_names
 from trilane.scene.motion.recorded import RawMotion
 from trilane.scene.motion.retarget import retarget
 from trilane.scene.motion.standing import leg_length
@@ -63,6 +63,7 @@ def load_retargeted(path: Path, units: str, joint_map: Mapping[str, str] = NO_MA
         f"BVH, {len(bvh.joints)} joints named as in {dialect}, {len(bvh.frames)} frames at {rate:.4g}/s",
         f"units: {unit} (leg of {leg * unit_m:.2f} m)",
         f"{len(index_of)} joints have a partner, {hands} of them in the hands",
+        *_without_partner(index_of),
         *of_roots,
         *how,
         *of_t_pose,
@@ -77,6 +78,14 @@ def load_retargeted(path: Path, units: str, joint_map: Mapping[str, str] = NO_MA
         _spread(values, readable)[start:] for values in (poses, places * unit_m, feet_of(tracks) * unit_m)
     )
     return RawMotion(times[start:], poses, places, None, "y", notes, leg * unit_m, detected, UPS, feet)
+
+
+def _without_partner(index_of: Collection[str]) -> tuple[str, ...]:
+    """A note on those joints of the body, without the hands, that are not in `index_of`."""
+    missing = [name for name in BODY_JOINTS if name not in index_of]
+    if not missing:
+        return ()
+    return (f"{', '.join(missing)}: no partner, so they follow their parents; `{STATED}` of the avatar names partners",)
 
 
 def _person(

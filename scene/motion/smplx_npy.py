@@ -23,6 +23,8 @@ _AS_VECTORS = "turn them into axis-angle vectors, such as with scipy.spatial.tra
 #: Shape of a row of what others save -> how it becomes usable.
 OTHERS: dict[tuple[int, ...], str] = {
     (263,): "these are HumanML3D's features: make places of joints of them with its recover_from_ric and save those",
+    (322,): "these are rows of Motion-X: its columns 0 to 155 are `poses`, 309 to 311 `trans` of an .npz",
+    (17,): "these are LLFF's poses_bounds of a camera: export transforms.json or COLMAP's model",
     (251,): "these are the features of KIT-ML: use HumanML3D's places of 22 joints",
     (135,): f"these look like turns of six numbers: {_AS_VECTORS}",
     **{(count, 6): f"these are turns of six numbers: {_AS_VECTORS}" for count in (22, 24, 52, 55)},

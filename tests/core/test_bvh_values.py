@@ -493,3 +493,10 @@ def test_a_skeleton_without_lengths_is_refused(tmp_path: Path, bones: str) -> No
     assert str(raised.value) == (
         f"{tmp_path}/a.bvh: found legs of no length or hips in one place, expected a skeleton with OFFSETs"
     )
+
+
+def test_joints_of_the_body_without_a_partner_are_named(tmp_path: Path) -> None:
+    text = text_of([{}]).replace("JOINT left_elbow", "JOINT bone_7").replace("JOINT spine2", "JOINT bone_8")
+    assert recorded(tmp_path / "a.bvh", text).notes[3] == (
+        "spine2, left_elbow: no partner, so they follow their parents; `joint_map` of the avatar names partners"
+    )

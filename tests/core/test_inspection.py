@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from trilane.apps.cli.inspect import lines
 from trilane.apps.inspection import drawn_paths
 from trilane.apps.inspection.inspect_file import READERS, inspect_file
 from trilane.apps.inspection.inspection import Inspection, Length
@@ -141,7 +143,7 @@ REFUSED: dict[str, tuple[bytes, str, str, str]] = {
     "a letter": (b"Dear reader,\n", "a.txt", "nothing that Trilane knows", "motions: .bvh"),
     "bytes": (bytes(range(1, 200)), "a.bin", "nothing that Trilane knows", "motions: .bvh"),
     "a cut BVH": (bvh_text().encode()[:300], "a.bvh", "a motion", ""),
-    "a cut NeRF": (nerf_text().encode()[:300], "a.json", "nothing that Trilane knows", "motions: .bvh"),
+    "a cut NeRF": (nerf_text().encode()[:300], "a.json", "a broken JSON file", "again"),
     "a table of four columns": (b"1 2 3 4\n2 3 4 5\n", "a.txt", "a camera, by its content", ""),
     "a picture that ends early": (b"\x89PNG\r\n\x1a\n", "a.png", "a picture", ""),
 }
@@ -296,3 +298,38 @@ def test_a_sweep_is_no_scene(tmp_path: Path) -> None:
     found = inspect_file(tmp_path / "s.toml")
     assert found.usable, found.problem
     assert (found.kind, found.facts["axes"]) == ("sweep file", ["size"])
+
+
+def test_the_line_that_uses_a_file_is_one_for_a_shell(inputs: dict[str, Path], tmp_path: Path) -> None:
+    path = tmp_path / "a walk & $HOME;'x'.bvh"
+    shutil.copyfile(inputs["walk.bvh"], path)
+    assert shlex.split(inspect_file(path).advice) == ["trilane", "run", "--motion", str(path)]
+
+
+def test_a_broken_picture_is_named_as_in_its_folder(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n")
+    assert inspect_file(tmp_path).problem.startswith("a.png: found no readable picture")
+
+
+def test_of_a_file_only_the_line_is_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.bvh").write_text(bvh_text().replace("CHANNELS 6 ", "CHANNELS six ", 1))
+    monkeypatch.chdir(tmp_path)
+    assert inspect_file(Path("a.bvh")).problem.startswith("line ")
+    np.save(tmp_path / "a.npy", np.zeros((4, 322)))
+    found = inspect_file(Path("a.npy"))
+    assert found.problem.startswith("found shape (4, 322)") and "Motion-X" in found.advice
+
+
+def test_a_picture_that_moves_is_said_to_be_the_video_as_which_it_is_shown(tmp_path: Path) -> None:
+    first, *others = (Image.new("RGB", (32, 24), colour) for colour in ("red", "green", "blue"))
+    first.save(tmp_path / "a.gif", save_all=True, append_images=others, duration=100)
+    found = inspect_file(tmp_path / "a.gif")
+    assert (found.kind, found.length and found.length.samples) == ("video", 3)
+    first.save(tmp_path / "still.gif")
+    assert inspect_file(tmp_path / "still.gif").kind == "picture"
+
+
+def test_what_is_not_known_is_not_printed(inputs: dict[str, Path]) -> None:
+    found = inspect_file(inputs["amass.npz"])
+    assert found.facts["leg_m"] is None
+    assert not any("None" in line for line in lines(found.document(inputs["amass.npz"], None)))

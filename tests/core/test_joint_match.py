@@ -91,6 +91,21 @@ AS_WRITTEN = {
         lForeArm rForeArm lHand rHand""",
         "lButtock lEye",
     ),
+    "OptiTrack": (
+        """Hip LThigh RThigh Ab LShin RShin - LFoot RFoot Chest LToe RToe Neck LShoulder RShoulder Head LUArm RUArm
+        LFArm RFArm LHand RHand""",
+        "LThumb1",
+    ),
+    "mocopi": (
+        """root l_up_leg r_up_leg torso_2 l_low_leg r_low_leg torso_4 l_foot r_foot torso_6 l_toes r_toes neck_1
+        l_shoulder r_shoulder head l_up_arm r_up_arm l_low_arm r_low_arm l_hand r_hand""",
+        "torso_1 torso_3 torso_5 torso_7 neck_2",
+    ),
+    "Acclaim": (
+        """root lfemur rfemur lowerback ltibia rtibia upperback lfoot rfoot thorax ltoes rtoes lowerneck lclavicle
+        rclavicle head lhumerus rhumerus lradius rradius lwrist rwrist""",
+        "lhipjoint rhipjoint upperneck lhand lfingers lthumb",
+    ),
 }
 MIXAMO = list(
     """Hips LeftUpLeg RightUpLeg Spine LeftLeg RightLeg Spine1 LeftFoot RightFoot Spine2 LeftToeBase RightToeBase
