@@ -16,6 +16,7 @@ CHANGING = {
     "scene": {"BvhJoint", "_Words", "_Hierarchy", "_Reader", "_Kind", "StoredArray", "Retarget"},
     "hw_profiles": {"ThermalState", "Throttle"},
     "stages": {"_Extent"},
+    "training": {"TrainingState"},
     "pipeline": {"ByteCounter"},
     "bench": {"Signals", "_Player", "LoadGenVerdict", "LoadGenPlayer", "Queries"},
     "apps": {"_Moved", "_Pooled"},
