@@ -46,6 +46,10 @@ ANY_WORLD, LEVELLED = _Prices(0.2, 0.4, 0.25), _Prices(0.4, 0.1, None)
 #: A direction between the axes is believed when the cameras pan by this, in radians (root mean square), and it is
 #: farther than this cosine from every axis.
 LEAST_PAN, MOST_AXIS_COSINE = 0.15, 0.995
+#: Cosine above which the first picture's axes, OpenGL's or optical ones, are the world's; and what is said then, as
+#: nothing else tells it.
+AS_FIRST = 1 - 1e-8
+OF_FIRST = "; the axes are those of the first picture: if that looked down or up, the floor is tilted by as much"
 #: A rival this much dearer than the best is named.
 NEAR = 0.1
 
@@ -87,7 +91,15 @@ def upright(turns: F64, usual: str, is_levelled: bool, stated: str = AUTO) -> Up
     if not guesses:
         return Upright(np.array(UP[expected]), 0, f"{expected.upper()} up, {_why_without(stated)}")
     best = min(guesses, key=lambda guess: guess.price)
-    return Upright(best.up, best.quarter, _note(best, usual, stated) + _rival(best, guesses, stated))
+    of_first = OF_FIRST if best.name and not is_levelled and _is_of_first(turns, best) else ""
+    return Upright(best.up, best.quarter, _note(best, usual, stated) + _rival(best, guesses, stated) + of_first)
+
+
+def _is_of_first(turns: F64, best: _Guess) -> bool:
+    """Whether the world's axes are those of the first of several pictures, as in a SLAM map, and up is its own up."""
+    first = turns[0]
+    is_unturned = abs(first[0, 0]) > AS_FIRST and abs(first[1, 1]) > AS_FIRST
+    return len(turns) > 1 and bool(is_unturned and first[0, 0] > 0 and first[:, 1] @ best.up > AS_FIRST)
 
 
 def _why_without(stated: str) -> str:

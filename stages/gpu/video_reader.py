@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import av
 import numpy as np
+from av.sidedata.sidedata import Type
 
 from trilane.arrays import U8
 from trilane.errors import BadInputError, TrilaneError
@@ -136,12 +137,17 @@ class VideoReader:
 
 
 def fitted(frame: Any, pixels: Pixels, shape: Shape, turned: int | None = None) -> U8:
-    """`frame`, of `pixels`, covering `shape` (h,w), turned clockwise by `turned` quarters, or as its file says."""
+    """`frame`, of `pixels`, covering `shape` (h,w), turned clockwise by `turned` quarters, or as its file says.
+
+    What the file mirrors is mirrored only in the latter case.
+    """
     quarters = quarters_of(frame) if turned is None else turned % 4
     stored = (frame.height, round(frame.width * pixels.aspect))
     cut = cover(stored[::-1] if quarters % 2 else stored, shape)
     height, width = (cut.width, cut.height) if quarters % 2 else (cut.height, cut.width)
     scaled = frame.reformat(width=width, height=height, format="rgb48le" if pixels.transfer else "rgb24").to_ndarray()
+    if turned is None and is_mirrored(frame):
+        scaled = scaled[::-1]
     upright = np.rot90(scaled, -quarters)[cut.top : cut.top + shape[0], cut.left : cut.left + shape[1]]
     return to_srgb(upright, pixels.transfer, pixels.is_wide) if pixels.transfer else np.ascontiguousarray(upright)
 
@@ -149,6 +155,19 @@ def fitted(frame: Any, pixels: Pixels, shape: Shape, turned: int | None = None) 
 def quarters_of(frame: Any) -> int:
     """By how many quarters `frame` is turned clockwise to be shown, as its file says."""
     return int(-round(frame.rotation / 90) % 4)
+
+
+def is_mirrored(frame: Any) -> bool:
+    """Whether `frame` is to be mirrored top to bottom before it is turned, as its file says: a selfie's display matrix.
+
+    FFmpeg takes its angle from where x goes (`av_display_rotation_get`), so what is left of a mirror image is that y is
+    reversed.
+    """
+    for side in frame.side_data:
+        if side.type == Type.DISPLAYMATRIX:
+            (a, b, _), (c, d, _), _ = np.frombuffer(bytes(side), np.int32).reshape(3, 3).astype(float)
+            return bool(a * d - b * c < 0)
+    return False
 
 
 def check_size(path: Path, frame: Any) -> None:

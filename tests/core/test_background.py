@@ -143,7 +143,7 @@ class Turned:
     width, height = 4, 2
 
     def __init__(self, rotation: float) -> None:
-        self.rotation = rotation
+        self.rotation, self.side_data = rotation, ()
         self.pixels = np.arange(8, dtype=np.uint8).reshape(2, 4)
 
     def reformat(self, width: int, height: int, format: str) -> Any:

@@ -34,6 +34,23 @@ def test_first_camera_coordinates(degrees: float, pitch: float) -> None:
     assert math.acos(min(1.0, float(found.up @ true))) < allowed, found.note
 
 
+def test_a_map_of_the_first_picture_that_does_not_tell_its_pitch_says_so() -> None:
+    """It pans by 5 degrees, looking down by 20: the axes are taken for level, and nothing else is known."""
+    turns = pan(5.0, -20.0)
+    said = "; the axes are those of the first picture: if that looked down or up, the floor is tilted by as much"
+    for axes, up in ((OPTICAL, "-Y"), (np.eye(3), "Y")):
+        own = (turns[0] @ axes).T @ turns
+        assert upright(own, "-y" if up == "-Y" else "y", is_levelled=False).note.removesuffix(said) == f"{up} up"
+        assert upright(own, "-y", is_levelled=False).note.endswith(said)
+        assert not upright(own, "y", is_levelled=True).note.endswith(said)  # gravity is known
+        assert not upright(own[:1], "-y", is_levelled=False).note.endswith(said)  # one picture makes no map
+    wide = pan(170.0, -20.0)
+    assert not upright((wide[0] @ OPTICAL).T @ wide, "-y", is_levelled=False).note.endswith(
+        said
+    )  # the horizons tell it
+    assert not upright(about(1, 0.01) @ wide[:2], "y", is_levelled=False).note.endswith(said)
+
+
 @pytest.mark.parametrize(("degrees", "pitch"), [(0, 0), (0, -20), (5, -20), (15, -50), (45, -50), (120, -35), (170, 0)])
 def test_up_is_found_in_every_axis_system(degrees: float, pitch: float) -> None:
     """Where the camera looks within 20 degrees of level, or pans by 15 either way; held by hand, 2 degrees off."""

@@ -12,6 +12,7 @@ import pytest
 from trilane.errors import BadInputError
 from trilane.scene.camera.path import CameraPath, one_lens
 from trilane.scene.camera.recorded import OPENGL_FROM_OPTICAL, RawCamera, path_from_recording
+from trilane.scene.camera.upright import OF_FIRST
 from trilane.scene.lens import Lens, of_fov_y
 from trilane.scene.motion.motion import Wrap
 from trilane.scene.schema import CameraSpec
@@ -215,14 +216,14 @@ def test_what_the_scene_says_of_the_lens_wins() -> None:
     assert camera.optics == one_lens(50.5, 0.2, 30.0)
     assert camera.notes == (
         "x",
-        "Y up",
+        f"Y up{OF_FIRST}",
         "field of view 50.5 degrees high, as given",
     )
     assert camera.recorded and camera.wrap is Wrap.BOUNCE
     holed = RawCamera(np.arange(5.0), np.tile(np.eye(3), (5, 1, 1)), np.zeros((5, 3)), "y", LENSES, "usual", ())
     holed.places[2] = np.nan
     assert path_from_recording(holed, "here", SPEC).notes == (
-        "Y up",
+        f"Y up{OF_FIRST}",
         "field of view 36 degrees high, usual",
         "1 samples not finite (first: number 2), interpolated across",
         "1 gaps, the longest 2000 ms, interpolated across",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import struct
 from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,6 +20,7 @@ from trilane.scene.footage import Stored, filmed
 from trilane.stages.gpu.background import open_background
 from trilane.stages.gpu.high_range import PQ, pq_code
 from trilane.stages.gpu.survey import check_pictures, survey
+from trilane.stages.gpu.video_reader import Pixels, fitted
 
 WIDTH, HEIGHT, WHITE_PX = 64, 48, 16
 LOOSE: Any = SimpleNamespace(is_held=False)
@@ -200,6 +202,36 @@ def test_every_tag_is_obeyed_before_a_recorded_camera_too(tmp_path: Path, tag: i
     background = open_background(tmp_path, (8, 8), 1.0, camera)
     for number, upright in enumerate(shown):
         assert np.array_equal(background.at(float(number)), upright)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("x", [(1, 0), (0, 1), (-1, 0), (0, -1)])
+@pytest.mark.parametrize("is_mirrored", [False, True])
+def test_a_video_is_turned_and_mirrored_as_its_matrix_says(
+    tmp_path: Path, x: tuple[int, int], is_mirrored: bool
+) -> None:
+    """(x, y) is shown at (a x + c y, b x + d y), y down: where its white columns, at the left, and black rows, at the
+    top, are seen tells all of it. The matrix is written into the header of the track."""
+    y = (x[1], -x[0]) if is_mirrored else (-x[1], x[0])
+    path = write_video(tmp_path / "a.mp4", [0, 33])
+    content = bytearray(path.read_bytes())
+    at = content.index(b"tkhd") + 44
+    content[at : at + 36] = struct.pack(">9i", x[0] << 16, x[1] << 16, 0, y[0] << 16, y[1] << 16, 0, 0, 0, 1 << 30)
+    path.write_bytes(content)
+    with av.open(str(path)) as container:
+        frame = next(container.decode(video=0))
+    pixels = grey(100)
+    pixels[:, :WHITE_PX], pixels[:WHITE_PX] = 255, 0
+    marked = av.VideoFrame.from_ndarray(pixels, format="rgb24")
+    turned = SimpleNamespace(
+        width=WIDTH, height=HEIGHT, rotation=frame.rotation, side_data=frame.side_data, reformat=marked.reformat
+    )
+    shape = (HEIGHT, WIDTH) if x[0] else (WIDTH, HEIGHT)
+    shown = fitted(turned, Pixels(), shape)[..., 1]
+    left, top = ((-side[0], -side[1]) for side in (x, y))  # the ways to both sides, as they are shown
+    middle = np.array([shape[1], shape[0]]) / 2
+    for way, level in ((left, 255), (top, 0)):
+        column, row = (middle + np.array(way) * (middle - 4)).astype(int)
+        assert abs(int(shown[row, column]) - level) < 12
 
 
 def test_sixteen_bits_of_grey_are_brought_to_eight(tmp_path: Path) -> None:
