@@ -5,6 +5,7 @@ Rule: whether it is usable says the reader of backgrounds; sizes and rates are t
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from collections.abc import Sequence
 from functools import partial
@@ -21,7 +22,7 @@ from trilane.scene.detected import Detected
 from trilane.scene.footage import Footage
 from trilane.stages.gpu.background import is_picture, open_background, pictures_in
 from trilane.stages.gpu.picture_file import read_picture
-from trilane.stages.gpu.survey import survey
+from trilane.stages.gpu.survey import MOST_PACKETS, survey
 from trilane.stages.gpu.video_reader import quarters_of
 
 THUMB = (160, 213)  # height, width
@@ -121,7 +122,7 @@ def inspect_video(path: Path) -> Inspection:
     except (av.FFmpegError, ValueError, OSError) as error:
         raise BadInputError(path, f"no readable video ({error})", "a video that FFmpeg can decode") from error
     rate, turn = facts["rate_hz"], facts["turned_deg"]
-    frames = stream.frames or (round(seconds * rate) if rate and seconds else 0)
+    frames = stream.frames or _counted(path)
     turned = f", turned by {turn} degrees" if turn else ""
     return Inspection(
         "video",
@@ -131,10 +132,17 @@ def inspect_video(path: Path) -> Inspection:
         Detected(
             f"{facts['codec']} video", "streams that FFmpeg finds", rate="; ".join((*footage.rate, *footage.what[1:]))
         ),
-        Length(frames, seconds, rate),
+        Length(frames, seconds, rate if stream.frames or not seconds else frames / seconds),
         facts,
         draw=partial(_film, path, seconds),
     )
+
+
+def _counted(path: Path) -> int:
+    """Frames of a video whose file does not say how many there are."""
+    with av.open(str(path), metadata_errors="replace") as container:
+        packets = container.demux(container.streams.video[0])
+        return sum(packet.size > 0 for packet in itertools.islice(packets, MOST_PACKETS))
 
 
 def _video_facts(stream: Any) -> dict[str, Any]:

@@ -14,6 +14,8 @@ from trilane.near_miss import did_you_mean
 from trilane.scene.motion.bvh_joint_names import DIALECTS, plain
 
 REQUIRED = ("pelvis", "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle")
+#: What the pelvis is called in most families: found beside any other table, since it is one joint and no limb.
+PELVIS = ("hips", "pelvis", "hip")
 #: What names the joints that are in no table.
 STATED = "joint_map"
 NO_MAP: Mapping[str, str] = {}
@@ -62,11 +64,14 @@ def _stated(path: Path, names: list[str], target: str, source: str) -> int | Non
 
 
 def _by_table(table: Mapping[str, str], index_of: Mapping[str, int]) -> dict[str, int]:
-    """{SMPL-X name: index} of what `table` finds; of several names for a joint, the first in the table."""
+    """{SMPL-X name: index} of what `table` finds, and the pelvis; of several names the first in the table."""
     found: dict[str, int] = {}
     for source, target in table.items():
         if source in index_of:
             found.setdefault(target, index_of[source])
+    named = next((index_of[name] for name in PELVIS if name in index_of), None)
+    if named is not None and named not in found.values():
+        found.setdefault("pelvis", named)
     return found
 
 

@@ -9,6 +9,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 from PIL import Image
@@ -333,3 +334,18 @@ def test_what_is_not_known_is_not_printed(inputs: dict[str, Path]) -> None:
     found = inspect_file(inputs["amass.npz"])
     assert found.facts["leg_m"] is None
     assert not any("None" in line for line in lines(found.document(inputs["amass.npz"], None)))
+
+
+def test_frames_of_a_video_of_variable_rate_are_counted(tmp_path: Path) -> None:
+    """Matroska has no number of frames: 4 of 1/10 s, then 3 of 1 s."""
+    with av.open(str(tmp_path / "a.mkv"), "w") as container:
+        stream = container.add_stream("mpeg4", rate=10)
+        stream.width, stream.height = 32, 24
+        for time in (0, 1, 2, 3, 4, 14, 24):
+            frame = av.VideoFrame.from_image(Image.new("RGB", (32, 24)))
+            frame.pts = time
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    found = inspect_file(tmp_path / "a.mkv")
+    assert found.length is not None and found.length.samples == 7
+    assert found.length.rate_hz == pytest.approx(7 / found.length.seconds)

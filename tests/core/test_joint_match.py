@@ -204,3 +204,12 @@ def test_a_joint_that_is_stated_but_not_there_is_named_with_the_near_one() -> No
     )
     with pytest.raises(BadInputError, match="the file has Hips, LeftUpLeg"):
         match_names(HERE, MIXAMO, {"left_hip": "qqq"})
+
+
+def test_the_pelvis_may_have_the_name_of_another_family() -> None:
+    """As in files of Vicon Shogun: Pelvis, and limbs as Mixamo writes them."""
+    names = ["Pelvis", *MIXAMO[1:]]
+    assert match_names(HERE, names) == match_names(HERE, MIXAMO)
+    # the floor under a person is no pelvis
+    with pytest.raises(BadInputError, match="none is pelvis"):
+        match_names(HERE, ["Root", *MIXAMO[1:]])
