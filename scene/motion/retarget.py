@@ -172,15 +172,25 @@ def _levelled(work: Retarget, name: str, base: F64) -> F64:
 def _arm(work: Retarget, side: str) -> None:
     shoulder, elbow, wrist = (f"{side}_{part}" for part in ("shoulder", "elbow", "wrist"))
     tracks = work.tracks
+    bones = {start: _arm_bone(tracks, start, end) for start, end in ((shoulder, elbow), (elbow, wrist))}
+    upper, lower = bones.values()
     bend: list[Evidence] = []
-    if tracks.has(shoulder, elbow, wrist):
-        bend = [(-UP if side == "left" else UP, hinge(tracks.bone(shoulder, elbow), tracks.bone(elbow, wrist)))]
-    for start, end in ((shoulder, elbow), (elbow, wrist)):
-        if tracks.has(start, end):
-            work.lay(start, work.bone(start, end), tracks.bone(start, end), bend)
+    if upper is not None and lower is not None:
+        bend = [(-UP if side == "left" else UP, hinge(upper, lower))]
+    for (start, bone), end in zip(bones.items(), (elbow, wrist), strict=True):
+        if bone is not None:
+            work.lay(start, work.bone(start, end), bone, bend)
         else:
             work.turns[start] = work.above(start)
     _hand(work, side)
+
+
+def _arm_bone(tracks: Tracks, start: str, end: str) -> F64 | None:
+    """From one joint of an arm to the next (T, 3), or to what its bone ends at where the file has no next one."""
+    if not tracks.has(start):
+        return None
+    far = tracks.places.get(end, tracks.tips.get(start))
+    return None if far is None else far - tracks.places[start]
 
 
 def _hand(work: Retarget, side: str) -> None:

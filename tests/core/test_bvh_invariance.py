@@ -310,6 +310,18 @@ def test_of_two_roots_the_person_with_more_joints_is_shown(
     same_body(Style(1), motion, body, truth)
 
 
+def test_a_forearm_without_a_hand_points_to_its_end(tmp_path: Path, body: ShapedBody, truth: Seen) -> None:
+    """The wrists have no partner; the bone of the forearm ends where the file's next joint is, of whatever name."""
+    path = tmp_path / "a.bvh"
+    path.write_text(written(Style(7, extra=False), *the_motion(), body.joints))
+    spec = AvatarSpec(motion=str(path), joint_map={"left_wrist": "", "right_wrist": ""})
+    motion = load_motion(spec, Path("/"), body.joints)
+    found = seen(motion.poses, motion.translation, body).lines
+    arms = [k for k, line in enumerate(LINES) if line[0].endswith(("shoulder", "elbow"))]
+    cosines = (found[arms] * truth.lines[arms]).sum(axis=-1)
+    assert np.degrees(np.arccos(np.clip(cosines, -1, 1))).max() < MOST_DEG
+
+
 @pytest.mark.parametrize("axis", ["x", "-x", "y", "-y", "z", "-z"])
 def test_an_axis_that_the_scene_states_is_up(tmp_path: Path, body: ShapedBody, truth: Seen, axis: str) -> None:
     """Along X a body is taken to lie, unless the scene says that it stands."""
