@@ -118,11 +118,11 @@ def inspect_video(path: Path) -> Inspection:
         with av.open(str(path), metadata_errors="replace") as container:
             stream = container.streams.video[0]
             facts = _video_facts(stream)
-            seconds = _seconds(container, stream)
+            seconds, stated = _seconds(container, stream), stream.frames
     except (av.FFmpegError, ValueError, OSError) as error:
         raise BadInputError(path, f"no readable video ({error})", "a video that FFmpeg can decode") from error
     rate, turn = facts["rate_hz"], facts["turned_deg"]
-    frames = stream.frames or _counted(path)
+    frames = stated or _counted(path)
     turned = f", turned by {turn} degrees" if turn else ""
     return Inspection(
         "video",
@@ -132,7 +132,7 @@ def inspect_video(path: Path) -> Inspection:
         Detected(
             f"{facts['codec']} video", "streams that FFmpeg finds", rate="; ".join((*footage.rate, *footage.what[1:]))
         ),
-        Length(frames, seconds, rate if stream.frames or not seconds else frames / seconds),
+        Length(frames, seconds, rate if stated or not seconds else frames / seconds),
         facts,
         draw=partial(_film, path, seconds),
     )
