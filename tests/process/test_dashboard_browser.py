@@ -166,7 +166,7 @@ def test_pictures_timeline_and_figures_of_a_live_run(opened: Callable[..., Watch
         for canvas in ("picture", "timeline"):
             seen.wait_for_other_pixels(canvas, seen.pixels(canvas))
         assert seen.text("#fps") == "60.0"
-        assert "30.3 dB, worst frame 20.2 dB" in seen.text("#error")
+        assert "30.6 dB, worst frame 19.5 dB" in seen.text("#error")
         assert [row.split("\t")[3] for row in seen.text("#units tbody").splitlines()] == ["39 %", "66 %", "95 %"]
         assert "pose->raster" in seen.text("#drops") and "64.0 KiB" in seen.text("#stages")
         assert "running" in seen.text("#state") and seen.text("#link") == "connected"
