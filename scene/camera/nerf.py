@@ -8,7 +8,6 @@ Format: https://docs.nerf.studio/quickstart/data_conventions.html.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -19,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
-from trilane.files import read_text, whole_number
 from trilane.scene.camera.distortion import distortion_note, largest_px
 from trilane.scene.camera.field_of_view import checked
+from trilane.scene.camera.json_object import read_object
 from trilane.scene.camera.map_frame import Unit
 from trilane.scene.camera.recorded import RawCamera
 from trilane.scene.camera.untimed import times_without
@@ -46,11 +45,8 @@ NO_LENS_REMEDY = "cut the pictures into perspective ones first (ns-process-data 
 def load_nerf(path: Path, rate_hz: float | None = None) -> RawCamera:
     """Read `path`, the file or its folder. `rate_hz`: of the scene. Raises BadInputError naming the key."""
     path = path / FILE if path.is_dir() else path
-    try:
-        content = json.loads(read_text(path, EXPECTED), parse_int=whole_number)
-    except (ValueError, RecursionError) as error:
-        raise BadInputError(path, f"no valid JSON ({error})", EXPECTED) from None
-    if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
+    content = read_object(path, EXPECTED)
+    if not isinstance(content.get("frames"), list):
         raise BadInputError(path, "no list `frames`", EXPECTED)
     frames = content["frames"]
     if not 1 <= len(frames) <= MAX_FRAMES:

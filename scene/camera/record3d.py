@@ -8,7 +8,6 @@ Format: keys of the exports of https://record3d.app, as nerfstudio's `process_da
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,8 @@ import numpy as np
 
 from trilane.arrays import F64
 from trilane.errors import BadInputError
-from trilane.files import read_text, whole_number
 from trilane.scene.camera.field_of_view import checked
+from trilane.scene.camera.json_object import read_object
 from trilane.scene.camera.recorded import RawCamera
 from trilane.scene.camera.untimed import FILM_RATE_HZ
 from trilane.scene.detected import Detected
@@ -33,11 +32,8 @@ MAX_FRAMES = 100_000
 def load_record3d(path: Path, rate_hz: float | None = None) -> RawCamera:
     """Read `path`, the file or its folder. `rate_hz`: of the scene. Raises BadInputError naming the key."""
     path = path / FILE if path.is_dir() else path
-    try:
-        content = json.loads(read_text(path, EXPECTED), parse_int=whole_number)
-    except (ValueError, RecursionError) as error:
-        raise BadInputError(path, f"no valid JSON ({error})", EXPECTED) from None
-    if not isinstance(content, dict) or "poses" not in content:
+    content = read_object(path, EXPECTED)
+    if "poses" not in content:
         raise BadInputError(path, "no `poses`", EXPECTED)
     poses = _array(path, content, "poses", 7)
     if not 1 <= len(poses) <= MAX_FRAMES:

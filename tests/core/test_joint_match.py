@@ -124,7 +124,7 @@ def test_every_name_of_a_family_is_that_joint(family: str) -> None:
 
 
 def test_every_family_is_held_here_or_beside_the_bvh_reader() -> None:
-    first = {"Mixamo", "CMU", "MotionBuilder", "3ds Max Biped", "SMPL", "SMPL-X"}  # in test_bvh_values.py
+    first = {"Mixamo", "CMU", "MotionBuilder", "3ds Max Biped", "SMPL", "SMPL-X"}  # in test_bvh_names.py
     assert set(DIALECTS) == first | set(AS_WRITTEN) | {"VRM 1"}
     for table in DIALECTS.values():
         assert set(table.values()) <= set(JOINT_NAMES) and set(REQUIRED) <= set(table.values())
