@@ -18,6 +18,7 @@ import psutil
 import torch
 
 from trilane.avatars.bundle import load_bundle
+from trilane.avatars.digests import sha256_of
 from trilane.errors import BadInputError
 from trilane.training.body_arrays import body_arrays
 from trilane.training.capture_error import error_facts, frame_errors, write_held_out_error
@@ -26,6 +27,7 @@ from trilane.training.first_texture import first_texture
 from trilane.training.make_bundle import quantise_avatar, write_avatar
 from trilane.training.network import UNet
 from trilane.training.neural_texture import SIDES, NeuralTexture
+from trilane.training.perceptual import Vgg16, read_vgg16
 from trilane.training.progress_sheet import write_sheet
 from trilane.training.sample_files import FIELDS, open_groups
 from trilane.training.step_loop import first_state, step_seconds, steps
@@ -47,12 +49,16 @@ ANOTHER_WORK = "use another --work folder, or remove this one"
 
 @dataclass(frozen=True)
 class Places:
-    """`capture`: folder. `out`: of the bundle. `work`: of samples, state and sheets. `name`: of the avatar."""
+    """`capture`: folder. `out`: of the bundle. `work`: of samples, state and sheets. `name`: of the avatar.
+
+    `vgg`: the file of VGG-16's weights, for a perceptual loss by its features.
+    """
 
     capture: Path
     out: Path
     work: Path
     name: str
+    vgg: Path | None = None
 
 
 class Listener(Protocol):
@@ -76,16 +82,19 @@ def train_on_capture(places: Places, asked: TrainingSettings, listener: Listener
     """
     started = time.monotonic()
     places.work.mkdir(parents=True, exist_ok=True)
-    settings = resumed_settings(places.work / NAME, asked)
+    settings = resumed_settings(places.work / NAME, with_vgg(asked, places.vgg))
+    vgg = read_vgg16(places.vgg) if places.vgg is not None else None
     torch.set_num_threads(settings.threads)
+    if settings.loss.perceptual:
+        listener.say(f"perceptual loss: {'MS-SSIM' if vgg is None else f'features of VGG-16 in {places.vgg}'}")
     subject = captured_subject(places.capture, settings.threads, listener.say)
     _draw_samples(subject, places, settings, listener)
     groups = open_groups(places.work / SAMPLES)
     torch.manual_seed(settings.seed)
     avatar = _first_avatar(subject, places, settings)
-    settings = _with_steps(avatar, places, settings, listener)
+    settings = _with_steps(avatar, places, settings, vgg, listener)
     write_bytes(places.work / NAME, settings_text(settings).encode())
-    state = first_state(avatar, settings)
+    state = first_state(avatar, settings, vgg)
     losses = _train(state, subject, places, settings, listener)
     save_network(state.average, places.work / NETWORK)
     quantised = quantise_avatar(state.average, subject.shaped, groups, settings.seed)
@@ -98,6 +107,20 @@ def train_on_capture(places: Places, asked: TrainingSettings, listener: Listener
     facts |= {"held_out_error": _measure(places, subject, settings)} if subject.held_out else {}
     sheets = str(places.work / SHEETS) if subject.held_out else None
     return facts | {"sheets": sheets, "seconds": round(time.monotonic() - started, 1)}
+
+
+def with_vgg(asked: TrainingSettings, file: Path | None) -> TrainingSettings:
+    """`asked`, with the digest of the weights in `file`. Raises BadInputError where one is given without the other."""
+    if file is None:
+        if asked.vgg is not None:
+            raise BadInputError("vgg", "no file of weights", f"that with SHA-256 {asked.vgg}", "give it with --vgg")
+        return asked
+    if not asked.loss.perceptual:
+        raise BadInputError("--vgg", "a loss without `perceptual`", "a weight for it", "such as that of --loss thesis")
+    digest = sha256_of([file])
+    if asked.vgg not in (None, digest):
+        raise BadInputError(file, f"SHA-256 {digest}", f"that of the settings, {asked.vgg}")
+    return asked.model_copy(update={"vgg": digest})
 
 
 def resumed_settings(path: Path, asked: TrainingSettings) -> TrainingSettings:
@@ -167,10 +190,10 @@ def _first_avatar(subject: Subject, places: Places, settings: TrainingSettings) 
 
 
 def _with_steps(
-    avatar: TrainableAvatar, places: Places, settings: TrainingSettings, listener: Listener
+    avatar: TrainableAvatar, places: Places, settings: TrainingSettings, vgg: Vgg16 | None, listener: Listener
 ) -> TrainingSettings:
     """`settings` with a number of steps, by default as many as fit into the minutes; says what they take."""
-    seconds = step_seconds(avatar, open_groups(places.work / SAMPLES), settings)
+    seconds = step_seconds(avatar, open_groups(places.work / SAMPLES), settings, vgg)
     count = settings.steps or max(LEAST_STEPS, int(60 * settings.minutes / seconds))
     memory_mb = psutil.Process().memory_info().rss / 1e6
     per_step = f"{seconds:.2f} s a step as measured on {settings.threads} threads"
@@ -189,7 +212,7 @@ def _train(
     weights, saved = settings.loss.by_name(), time.monotonic()
     every, losses = max(1, count // SHEET_COUNT), list[float]()
     for terms in steps(state, open_groups(places.work / SAMPLES), settings, count):
-        losses.append(sum(weights[name] * value for name, value in terms.items()))
+        losses.append(sum(weights.get(name, 0.0) * value for name, value in terms.items()))
         listener.trained(state.step, count, terms, losses[-1])
         if state.step % every == 0 or state.step == count:
             write_sheet(places.work / SHEETS / f"step-{state.step:07}.png", state.average, subject)

@@ -5,6 +5,8 @@ Rule: it needs no PyTorch, so that settings are read, and refused, where none is
 
 from __future__ import annotations
 
+from typing import Any
+
 from pydantic import Field
 
 from trilane.scene.schema import Table
@@ -13,7 +15,8 @@ from trilane.scene.schema import Table
 class LossWeights(Table):
     """Of each term of `losses.loss_terms`; 0 leaves it out. The defaults are the default avatar's.
 
-    The thesis has L1 25, Dice 25 and a perceptual loss 20, which here are `composite`, `overlap` and `structure`.
+    `perceptual` is by features of VGG-16 where their weights are given, else one minus MS-SSIM, as `structure` always
+    is. `adversarial` and `features` (feature matching) bring discriminators.
     """
 
     composite: float = Field(default=0.4, ge=0, le=1000)
@@ -25,7 +28,29 @@ class LossWeights(Table):
     background: float = Field(default=0.05, ge=0, le=1000)
     overlap: float = Field(default=0.1, ge=0, le=1000)
     structure: float = Field(default=0.0, ge=0, le=1000)
+    perceptual: float = Field(default=0.0, ge=0, le=1000)
+    adversarial: float = Field(default=0.0, ge=0, le=1000)
+    features: float = Field(default=0.0, ge=0, le=1000)
+
+    @property
+    def judged(self) -> bool:
+        """Whether a term is about what discriminators find."""
+        return self.adversarial > 0 or self.features > 0
 
     def by_name(self) -> dict[str, float]:
         """The weights as `losses.total_loss` takes them."""
         return {str(name): float(value) for name, value in self.model_dump().items()}
+
+
+#: Losses by name: the weights, and the settings that belong to them where a training does not say others.
+LOSSES: dict[str, dict[str, Any]] = {
+    "default": {"loss": {}},
+    "thesis": {
+        "loss": dict.fromkeys(LossWeights.model_fields, 0.0)
+        | {"composite": 25.0, "overlap": 25.0, "perceptual": 20.0, "adversarial": 1.0, "features": 1.0},
+        "network_rate": 1e-3,
+        "texture_rate": 1e-3,
+        "discriminator_rate": 1e-5,
+        "weight_decay": 0.0,
+    },
+}

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import torch
-from scipy.ndimage import maximum_filter
 from torch import Tensor
 from torch.nn import functional
 
@@ -78,9 +77,8 @@ def missing_db(difference: Tensor, near: Tensor) -> Tensor:
 
 def _grown(mask: Tensor) -> Tensor:
     """(N, 1, H, W): 1 on the person of `mask` and up to `MARGIN_PX` round it, else 0."""
-    side = 2 * MARGIN_PX + 1
-    grown = maximum_filter(mask.detach().numpy(), (1, 1, side, side), mode="constant")
-    return torch.from_numpy(grown).gt(0).float()
+    grown = functional.max_pool2d(mask.detach(), 2 * MARGIN_PX + 1, stride=1, padding=MARGIN_PX)
+    return grown.gt(0).float()
 
 
 def total_loss(terms: Mapping[str, Tensor], weights: Mapping[str, float] = WEIGHTS) -> Tensor:

@@ -17,6 +17,9 @@ import torch
 from numpy.typing import NDArray
 
 from trilane.training.activation_noise import add_activation_noise
+from trilane.training.adversary import Adversary
+from trilane.training.objective import Objective
+from trilane.training.perceptual import Vgg16
 from trilane.training.sample_files import ShapeGroup, batches
 from trilane.training.trainable_avatar import TrainableAvatar
 from trilane.training.training_loop import (
@@ -37,18 +40,21 @@ MEASURED = 4
 SEED_BITS = 31
 
 
-def first_state(avatar: TrainableAvatar, settings: TrainingSettings) -> TrainingState:
-    """The state of a training of `avatar` before its first step."""
+def first_state(avatar: TrainableAvatar, settings: TrainingSettings, vgg: Vgg16 | None = None) -> TrainingState:
+    """The state of a training of `avatar` before its first step. `vgg`: for a perceptual loss by its features."""
     average = copy.deepcopy(avatar).eval()
     add_activation_noise(avatar.network, settings.noise_steps)
     avatar.network.to(memory_format=torch.channels_last)
-    return TrainingState(avatar, average, optimiser_of(avatar, settings, settings.masked_texture))
+    loss, rate = settings.loss, settings.discriminator_rate
+    adversary = Adversary(settings.width, rate, settings.seed) if loss.judged else None
+    objective = Objective(loss.by_name(), vgg, adversary)
+    return TrainingState(avatar, average, optimiser_of(avatar, settings, settings.masked_texture), objective)
 
 
 def steps(
     state: TrainingState, groups: list[ShapeGroup], settings: TrainingSettings, count: int
 ) -> Iterator[dict[str, float]]:
-    """Do the steps of `state` up to number `count`; yields the terms of the loss after each.
+    """Do the steps of `state` up to number `count`; yields after each what `train_step` tells.
 
     `state`: changes in place.
     `groups`: the samples.
@@ -58,7 +64,7 @@ def steps(
     streams = (_stream(small, settings, 0), _stream(groups, settings, 1))
     done = (min(state.step, switch), max(state.step - switch, 0))
     first, then = (islice(stream, skipped, None) for stream, skipped in zip(streams, done, strict=True))
-    weights, peaks = settings.loss.by_name(), (settings.network_rate, settings.network_rate, settings.texture_rate)
+    peaks = (settings.network_rate, settings.network_rate, settings.texture_rate)
     while state.step < count:
         share = state.step / count
         torch.manual_seed(state.step << SEED_BITS | settings.seed)
@@ -66,26 +72,32 @@ def steps(
         for group, peak in zip(state.optimiser.param_groups, peaks, strict=True):
             group["lr"] = peak * rate_share(share)  # kernels, the network's other weights, texture
         batch = load_batch(*next(first if state.step < switch else then))
-        terms = train_step(state.avatar, state.optimiser, *batch, weights)
+        terms = train_step(state.avatar, state.optimiser, *batch, state.objective)
         state.step += 1
         follow(state.average, state.avatar, 1 - 1 / max(1.0, settings.average_share * state.step))
         yield terms
 
 
-def step_seconds(avatar: TrainableAvatar, groups: list[ShapeGroup], settings: TrainingSettings) -> float:
+def step_seconds(
+    avatar: TrainableAvatar, groups: list[ShapeGroup], settings: TrainingSettings, vgg: Vgg16 | None = None
+) -> float:
     """Mean seconds of a step of a copy of `avatar`, measured; small samples count by their share of the steps."""
     share = settings.small_until
-    of_small = _measured(avatar, groups, settings, 1.0) if share > 0 else 0.0
-    of_all = _measured(avatar, groups, settings, 0.0) if share < 1 else 0.0
+    of_small = _measured(avatar, groups, settings, vgg, 1.0) if share > 0 else 0.0
+    of_all = _measured(avatar, groups, settings, vgg, 0.0) if share < 1 else 0.0
     return share * of_small + (1 - share) * of_all
 
 
 def _measured(
-    avatar: TrainableAvatar, groups: list[ShapeGroup], settings: TrainingSettings, small_until: float
+    avatar: TrainableAvatar,
+    groups: list[ShapeGroup],
+    settings: TrainingSettings,
+    vgg: Vgg16 | None,
+    small_until: float,
 ) -> float:
     """Mean seconds of a step, after one that warms up."""
     going = steps(
-        first_state(copy.deepcopy(avatar), settings),
+        first_state(copy.deepcopy(avatar), settings, vgg),
         groups,
         settings.model_copy(update={"small_until": small_until}),
         1 + MEASURED,

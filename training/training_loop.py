@@ -13,7 +13,7 @@ import copy
 import math
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -25,8 +25,9 @@ from torch import Tensor, nn
 from torch import multiprocessing as tmp
 
 from trilane.training.activation_noise import add_activation_noise
-from trilane.training.losses import WEIGHTS, loss_terms, total_loss
+from trilane.training.losses import loss_terms
 from trilane.training.masked_adam import MASKED, MaskedAdamW
+from trilane.training.objective import Objective
 from trilane.training.sample_files import U16, ShapeGroup, batches, open_groups
 from trilane.training.trainable_avatar import TrainableAvatar
 
@@ -180,20 +181,22 @@ def train_step(
     uv: Tensor,
     covered: Tensor,
     target: Tensor,
-    weights: Mapping[str, float] = WEIGHTS,
+    objective: Objective | None = None,
 ) -> dict[str, float]:
-    """One step on one batch; the loss terms by name.
+    """One step on one batch; the loss terms by name, and what the objective tells of itself.
 
     `avatar`, `optimiser`: what is trained.
     `uv`, `covered`, `target`: the batch, as `load_batch` returns it.
-    `weights`: of the terms.
+    `objective`: what is minimised; the default avatar's where there is none.
     """
-    terms = loss_terms(avatar(uv, covered), target, weights)
+    objective = objective or Objective()
+    output = avatar(uv, covered)
+    terms = objective.terms(output, target)
     optimiser.zero_grad(set_to_none=True)
-    total_loss(terms, weights).backward()
+    objective.total(terms).backward()
     nn.utils.clip_grad_norm_(avatar.parameters(), 1.0)
     optimiser.step()
-    return {name: float(term.detach()) for name, term in terms.items()}
+    return {name: float(term.detach()) for name, term in terms.items()} | objective.learn(output.detach(), target)
 
 
 def optimiser_of(avatar: TrainableAvatar, config: Rates, masked: bool = False) -> torch.optim.Optimizer:

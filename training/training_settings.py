@@ -16,7 +16,7 @@ from trilane.errors import BadInputError
 from trilane.files import read_text
 from trilane.near_miss import did_you_mean
 from trilane.scene.schema import Table
-from trilane.training.loss_weights import LossWeights
+from trilane.training.loss_weights import LOSSES, LossWeights
 
 NAME = "training.toml"
 #: What is usual for a network that is trained already, and for a new one, where the settings do not say it.
@@ -36,8 +36,9 @@ class TrainingSettings(Table):
     of PyTorch. `start`: the network of the default avatar, or one of random weights. `width`: of a new one.
     `network_rate`, `texture_rate`: peaks of the learning rates. `small_until`, `freeze_norms_at`: shares of the steps,
     up to which only half-size samples are used, and after which batch statistics stay. `average_share`: of the steps
-    so far, time constant of the average that becomes the avatar. `noise_steps`: on activations, steps of a byte.
-    `masked_texture`: texels that a batch does not show keep their values and their momentum.
+    so far, time constant of the average that becomes the avatar. `discriminator_rate`: of learning, for discriminators;
+    it stays as it is. `noise_steps`: on activations, steps of a byte. `masked_texture`: texels that a batch does not
+    show keep their values and their momentum. `vgg`: SHA-256 of VGG-16's weights that the perceptual loss is by.
     """
 
     schema_: Literal[1] = Field(default=1, alias="schema")
@@ -51,12 +52,14 @@ class TrainingSettings(Table):
     width: int = Field(default=16, ge=4, le=64)
     network_rate: float = Field(default=1.5e-3, gt=0, le=1)
     texture_rate: float = Field(default=4e-4, gt=0, le=1)
+    discriminator_rate: float = Field(default=1e-5, gt=0, le=1)
     weight_decay: float = Field(default=1e-3, ge=0, le=1)
     small_until: float = Field(ge=0, le=1)
     freeze_norms_at: float = Field(ge=0, le=1)
     average_share: float = Field(default=0.1, gt=0, le=1)
     noise_steps: float = Field(default=1.0, ge=0, le=16)
     masked_texture: bool = False
+    vgg: str | None = Field(default=None, pattern="^[0-9a-f]{64}$")
     loss: LossWeights = LossWeights()
 
 
@@ -70,12 +73,22 @@ def read_settings(path: Path) -> TrainingSettings:
 
 
 def parsed_settings(values: dict[str, Any], where: str | Path) -> TrainingSettings:
-    """The settings of `values`, which stand at `where`. Raises BadInputError."""
+    """The settings of `values`, which stand at `where`; `loss` may be one of `LOSSES` by name. Raises BadInputError."""
     usual = STARTS.get(str(values.get("start", "default")), {})
     try:
-        return TrainingSettings.model_validate(usual | values)
+        return TrainingSettings.model_validate(usual | _with_loss(values, where))
     except ValidationError as error:
         raise _refused(dict(error.errors()[0]), where) from None
+
+
+def _with_loss(values: dict[str, Any], where: str | Path) -> dict[str, Any]:
+    """`values` with the weights of a loss that has a name, and what is usual with it."""
+    name = values.get("loss")
+    if not isinstance(name, str):
+        return values
+    if name not in LOSSES:
+        raise BadInputError(f"{where}: loss", repr(name), f"one of {', '.join(LOSSES)}", did_you_mean(name, LOSSES))
+    return LOSSES[name] | values | {"loss": LOSSES[name]["loss"]}
 
 
 def settings_text(settings: TrainingSettings) -> str:

@@ -1,4 +1,5 @@
-"""Everything that a training by steps goes on from, as one .npz file: weights, their average and Adam's moments.
+"""Everything that a training by steps goes on from, as one .npz file: weights, their average and Adam's moments, and
+the same of discriminators.
 
 Rule: what was read computes the same bits as what was written, so tensors keep their layout in memory.
 """
@@ -12,9 +13,10 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from trilane.errors import BadInputError, reason
+from trilane.training.objective import Objective
 from trilane.training.trainable_avatar import TrainableAvatar
 from trilane.writing import write_atomically
 
@@ -24,25 +26,36 @@ REMEDY = "remove it, and the training begins anew"
 
 @dataclass
 class TrainingState:
-    """`avatar`, which is trained by `optimiser`; the `average` of its weights; `step`: how many were done."""
+    """`avatar`, trained by `optimiser` for the `objective`; the `average` of its weights; `step`s were done."""
 
     avatar: TrainableAvatar
     average: TrainableAvatar
     optimiser: torch.optim.Optimizer
+    objective: Objective
     step: int = 0
 
     def tensors(self) -> dict[str, Tensor]:
         """All tensors by name; they are the state's own."""
-        named = {f"avatar.{name}": value for name, value in self.avatar.state_dict().items()}
-        named |= {f"average.{name}": value for name, value in self.average.state_dict().items()}
-        for number, moments in self.optimiser.state_dict()["state"].items():
-            named |= {f"optimiser.{number}.{name}": value for name, value in moments.items()}
+        modules: dict[str, nn.Module] = {"avatar": self.avatar, "average": self.average}
+        if self.objective.adversary is not None:
+            modules["discriminators"] = self.objective.adversary.discriminators
+        named = {
+            f"{kind}.{name}": value for kind, module in modules.items() for name, value in module.state_dict().items()
+        }
+        for kind, optimiser in self.optimisers().items():
+            for number, moments in optimiser.state_dict()["state"].items():
+                named |= {f"{kind}.{number}.{name}": value for name, value in moments.items()}
         return named
+
+    def optimisers(self) -> dict[str, torch.optim.Optimizer]:
+        """All optimisers by name, each of Adam's kind."""
+        adversary = self.objective.adversary
+        return {"optimiser": self.optimiser} | ({} if adversary is None else {"judges": adversary.optimiser})
 
 
 def save_state(state: TrainingState, path: Path) -> None:
     """Write `state` as the file `path`, whole or not at all. Raises BadInputError."""
-    arrays = {name: value.detach().numpy() for name, value in state.tensors().items()}
+    arrays = {name: value.detach().cpu().numpy() for name, value in state.tensors().items()}
     with write_atomically(path) as draft, draft.open("wb") as file:
         np.savez(file, step=np.int64(state.step), **arrays)
 
@@ -54,7 +67,8 @@ def load_state(state: TrainingState, path: Path) -> None:
             arrays = {name: file[name] for name in file.files}
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
         raise BadInputError(path, reason(error).splitlines()[0], EXPECTED, REMEDY) from error
-    _add_moments(state.optimiser)
+    for optimiser in state.optimisers().values():
+        _add_moments(optimiser)
     wanted = {name: tuple(value.shape) for name, value in state.tensors().items()} | {"step": ()}
     found = {name: array.shape for name, array in arrays.items()}
     if wanted != found:

@@ -55,6 +55,12 @@ def train(
     threads: Annotated[int, typer.Option(help="Of PyTorch, and processes that draw; only 1 repeats to the bit.")] = 1,
     start: Annotated[str, typer.Option(help="default: the default avatar's network; new: random weights.")] = "default",
     width: Annotated[int, typer.Option(help="Of a new network; 64 is full.")] = 16,
+    loss: Annotated[
+        str, typer.Option(help="default: the default avatar's; thesis: L1, Dice, perceptual, GAN.")
+    ] = "default",
+    vgg: Annotated[
+        Path | None, typer.Option(help="VGG-16 weights (.pth, .safetensors) for the perceptual loss; else MS-SSIM.")
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Train an avatar on a capture and write it as a folder for `trilane run --avatar`.
@@ -64,7 +70,7 @@ def train(
     from trilane.training.training_settings import parsed_settings, read_settings
 
     usual = {"minutes": minutes, "steps": steps, "samples": samples, "seed": seed, "threads": threads, "start": start}
-    options = {name: value for name, value in (usual | {"width": width}).items() if name in given(ctx)}
+    options = {name: value for name, value in (usual | {"width": width, "loss": loss}).items() if name in given(ctx)}
     values = read_settings(config).model_dump(by_alias=True, exclude_none=True) if config is not None else {}
     asked = parsed_settings(values | options, "options" if config is None else config)
     if asked.start == "default" and asked.width != DEFAULT_WIDTH:
@@ -72,7 +78,7 @@ def train(
     _require_torch()
     from trilane.training.captured_avatar import Places, train_on_capture
 
-    places = Places(capture, out, out.parent / f"{out.name}-work" if work is None else work, out.name)
+    places = Places(capture, out, out.parent / f"{out.name}-work" if work is None else work, out.name, vgg)
     with stdout_kept(), _shown() as listener:
         facts = train_on_capture(places, asked, listener)
     print_facts(facts, json)

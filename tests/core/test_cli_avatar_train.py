@@ -55,12 +55,15 @@ def test_options_are_settings_and_go_before_those_of_a_file(
     assert json.loads(out) == {"avatar": str(tmp_path / "mine"), "steps": 3}
     command(*words, "--config", tmp_path / "training.toml", "--seed", 8, "--work", "there")
     command(*words, "--start", "new", "--width", 8, "--minutes", 2, "--samples", 50, "--threads", 2, "--steps", 30)
-    folder = (Path("their"), tmp_path / "mine", tmp_path / "mine-work", "mine")
+    command(*words, "--config", tmp_path / "training.toml", "--loss", "thesis", "--vgg", "vgg.pth")
+    folder = (Path("their"), tmp_path / "mine", tmp_path / "mine-work", "mine", None)
+    begun = {"seed": 7, "batch": 3, "steps": 40, "network_rate": 1.5e-3, "texture_rate": 4e-4, "weight_decay": 1e-3}
     wanted = {"start": "new", "width": 8, "minutes": 2.0, "samples": 50, "threads": 2, "steps": 30}
     assert training.asked == [
         (folder, parsed_settings({}, "")),
-        ((*folder[:2], Path("there"), "mine"), parsed_settings({"seed": 8, "batch": 3, "steps": 40}, "")),
+        ((*folder[:2], Path("there"), "mine", None), parsed_settings({"seed": 8, "batch": 3, "steps": 40}, "")),
         (folder, parsed_settings(wanted, "")),
+        ((*folder[:4], Path("vgg.pth")), parsed_settings(begun | {"loss": "thesis"}, "")),
     ]
 
 
@@ -98,6 +101,7 @@ def test_without_pytorch_the_lines_that_install_it_are_said(
     [
         (("--samples", 2), "options: samples: found 2, expected greater than or equal to 8"),
         (("--start", "old"), "options: start: found 'old', expected 'default' or 'new'"),
+        (("--loss", "tesis"), "options: loss: found 'tesis', expected one of default, thesis; did you mean 'thesis'"),
         (("--width", 8), "--width: found 8, expected 16 of the default network; or --start new"),
         (("--config", "nothing.toml"), "nothing.toml: found no such file"),
     ],

@@ -92,19 +92,24 @@ def test_the_same_seed_gives_the_same_bits(groups: list[ShapeGroup]) -> None:
     assert bits(trained(groups, COUNT, seed=6)) != first
 
 
-@pytest.mark.parametrize(("ended", "masked"), [(2, False), (3, True), (5, False), (6, False)])
+@pytest.mark.parametrize(
+    ("ended", "others"),
+    [(2, {}), (3, {"masked_texture": True}), (5, {}), (6, {}), (3, {"loss": "thesis", "width": 4})],
+    ids=str,
+)
 def test_a_training_that_was_ended_goes_on_to_the_bit(
-    groups: list[ShapeGroup], tmp_path: Path, ended: int, masked: bool
+    groups: list[ShapeGroup], tmp_path: Path, ended: int, others: dict[str, Any]
 ) -> None:
-    """In each part: before and after other samples are used and statistics stay."""
-    whole = bits(trained(groups, COUNT, masked_texture=masked))
-    before = trained(groups, ended, masked_texture=masked)
+    """In each part: before and after other samples are used and statistics stay. With discriminators too."""
+    whole = bits(trained(groups, COUNT, **others))
+    before = trained(groups, ended, **others)
     save_state(before, tmp_path / "state.npz")
-    after = first_state(avatar(), settings(masked_texture=masked))
+    after = first_state(avatar(), settings(**others))
     load_state(after, tmp_path / "state.npz")
     assert bits(after) == bits(before) and after.step == ended
-    go(after, groups, settings(masked_texture=masked), COUNT)
+    go(after, groups, settings(**others), COUNT)
     assert bits(after) == whole
+    assert any(name.startswith("judges.") for name in whole) == ("loss" in others)
 
 
 def test_a_masked_texture_is_kept_where_no_sample_shows_it(groups: list[ShapeGroup]) -> None:
@@ -170,6 +175,22 @@ def test_settings_are_written_whole_and_read_again(tmp_path: Path) -> None:
     assert asked.loss.by_name()["composite"] == 0.4 and asked.loss.by_name()["structure"] == 20.0
 
 
+def test_the_thesis_loss_has_its_rates_where_a_training_says_no_others(tmp_path: Path) -> None:
+    asked = settings(loss="thesis")
+    weights = {"composite": 25, "overlap": 25, "perceptual": 20, "adversarial": 1, "features": 1}
+    assert {name: weight for name, weight in asked.loss.by_name().items() if weight} == weights
+    assert (asked.network_rate, asked.texture_rate, asked.discriminator_rate, asked.weight_decay) == (
+        1e-3,
+        1e-3,
+        1e-5,
+        0,
+    )
+    assert settings(loss="thesis", texture_rate=0.25).texture_rate == 0.25
+    assert settings(loss="default") == settings()
+    (tmp_path / "training.toml").write_text(settings_text(asked))
+    assert read_settings(tmp_path / "training.toml") == asked
+
+
 def test_a_new_network_is_trained_on_small_samples_first() -> None:
     known, new = parsed_settings({}, "a test"), parsed_settings({"start": "new"}, "a test")
     assert (known.small_until, known.freeze_norms_at) == (0.0, 0.3)
@@ -185,6 +206,8 @@ def test_a_new_network_is_trained_on_small_samples_first() -> None:
             "options: sample: found an unknown key, expected one of schema, samples, .*did you mean 'samples'",
         ),
         ({"loss": {"dice": 1.0}}, "options: loss.dice: found an unknown key, expected one of composite, "),
+        ({"loss": "thesi"}, "options: loss: found 'thesi', expected one of default, thesis; did you mean 'thesis'"),
+        ({"vgg": "mine.pth"}, "options: vgg: found 'mine.pth', expected String should match pattern"),
         ({"samples": 3}, "options: samples: found 3, expected greater than or equal to 8"),
         ({"start": "old"}, "options: start: found 'old', expected 'default' or 'new'"),
     ],
