@@ -97,7 +97,7 @@ def train_on_capture(places: Places, asked: TrainingSettings, listener: Listener
     state = first_state(avatar, settings, vgg)
     losses = _train(state, subject, places, settings, listener)
     save_network(state.average, places.work / NETWORK)
-    quantised = quantise_avatar(state.average, subject.shaped, groups, settings.seed)
+    quantised = quantise_avatar(state.average, subject.shaped, groups, settings.seed, subject.unseen)
     made = {"samples": settings.samples, "steps": state.step, "batch": settings.batch, "seed": settings.seed}
     provenance = made | {"texture_sides": list(SIDES)} | subject.facts
     names = {"name": places.name, "training_command": f"trilane avatar train {places.capture.name} --config {NAME}"}

@@ -12,7 +12,8 @@ from trilane.arrays import F32
 from trilane.training.body_arrays import BodyArrays
 from trilane.training.sample_files import U16, ShapeGroup
 from trilane.training.surface_fields import eigenfunctions
-from trilane.training.texture_layout import fill_gaps, lay_out
+from trilane.training.surface_fill import fill_along_surface
+from trilane.training.texture_layout import fill_beside, fill_gaps, lay_out
 
 COLOURS = 3
 OPAQUE = 250
@@ -35,12 +36,15 @@ def first_texture(body: BodyArrays, groups: list[ShapeGroup], side: int, channel
     fields = eigenfunctions(body.vertices, body.faces, channels - COLOURS)
     image, known = lay_out(fields, body.faces, body.uv, body.uv_faces, side)
     smooth = fill_gaps(image, known)
-    colours = mean_colours(groups, side)
+    colours = mean_colours(groups, side, body)
     return np.asarray(np.clip(np.concatenate([2 * colours - 1, smooth], axis=2), -1, 1), np.float32)
 
 
-def mean_colours(groups: list[ShapeGroup], side: int) -> NDArray[np.float64]:
-    """(side, side, 3) in 0..1: the mean colour of the pixels at which each texel is drawn; unseen texels are filled.
+def mean_colours(groups: list[ShapeGroup], side: int, body: BodyArrays) -> NDArray[np.float64]:
+    """(side, side, 3) in 0..1: the mean colour of the pixels at which each texel is drawn.
+
+    Texels beside seen ones, which lie between the pixels of a view, have their mean; all others are filled along the
+    surface of `body`.
 
     Clothes stand off the body, so in every view a texel shows another point of them. The mean is still sharp, because
     near views and views along the surface's normal have the largest weights.
@@ -61,7 +65,8 @@ def mean_colours(groups: list[ShapeGroup], side: int) -> NDArray[np.float64]:
                 coloured = weight[seen] * rgba[seen][:, k] / 255
                 total[:, k] += np.bincount(number, weights=coloured, minlength=side * side)
     mean = total / np.maximum(count, 1e-12)[:, None]
-    return fill_gaps(mean.reshape(side, side, COLOURS), (count > LEAST_WEIGHT).reshape(side, side))
+    colours, near = fill_beside(mean.reshape(side, side, COLOURS), (count > LEAST_WEIGHT).reshape(side, side))
+    return fill_along_surface(colours, ~near, body)
 
 
 def head_on(uv: NDArray[np.float64], covered: NDArray[np.bool_], side: int) -> NDArray[np.float64]:

@@ -13,17 +13,20 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from trilane.arrays import F64, Mask
 from trilane.avatars.bundle import write_bundle
 from trilane.avatars.manifest import Manifest, network_entry
 from trilane.avatars.network_reshape import reshaped
 from trilane.body.body import ShapedBody
-from trilane.training.body_arrays import body_arrays
+from trilane.training.body_arrays import BodyArrays, body_arrays
 from trilane.training.first_texture import used_texels
 from trilane.training.neural_texture import read_texture
 from trilane.training.onnx_export import export_onnx
 from trilane.training.quantising.quantise import Quantised, quantise
 from trilane.training.sample_files import U16, ShapeGroup
 from trilane.training.subject import Person
+from trilane.training.surface_fill import fill_along_surface
+from trilane.training.texture_layout import grown
 from trilane.training.trainable_avatar import TrainableAvatar
 
 INT8_MAX = 127
@@ -44,12 +47,30 @@ class QuantisedAvatar:
     scale: NDArray[np.float32]
 
 
-def byte_texture(avatar: TrainableAvatar, shaped: ShapedBody) -> tuple[NDArray[np.int8], NDArray[np.float32]]:
-    """The texture as int8 (S,S,C) and the scale (C,) of each channel; texels that the body does not use are 0."""
-    image = avatar.texture.image().detach()[0].permute(1, 2, 0).numpy()
-    image = image * used_texels(body_arrays(shaped), image.shape[0], TEXEL_MARGIN)[..., None]
+def byte_texture(
+    avatar: TrainableAvatar, shaped: ShapedBody, unseen: Mask | None = None
+) -> tuple[NDArray[np.int8], NDArray[np.float32]]:
+    """The texture as int8 (S,S,C) and the scale (C,) of each channel; texels that the body does not use are 0.
+
+    Those of the body that are `unseen`, an image of any side, were never trained: they are filled from those that were.
+    """
+    image: NDArray[Any] = avatar.texture.image().detach()[0].permute(1, 2, 0).numpy()
+    body = body_arrays(shaped)
+    if unseen is not None and unseen.any():
+        image = _without_holes(image, unseen, body)
+    image = image * used_texels(body, image.shape[0], TEXEL_MARGIN)[..., None]
     scale = np.maximum(np.abs(image).max(axis=(0, 1)), 1e-6) / INT8_MAX
     return np.round(image / scale).astype(np.int8), scale.astype(np.float32)
+
+
+def _without_holes(image: NDArray[Any], unseen: Mask, body: BodyArrays) -> F64:
+    """`image` (S,S,C) with its `unseen` texels filled, and those beside the body's faces that lie next to them."""
+    side = image.shape[0]
+    nearest = np.arange(side) * len(unseen) // side
+    hole = margin = unseen[np.ix_(nearest, nearest)]
+    for _ in range(TEXEL_MARGIN):
+        margin = grown(margin)
+    return fill_along_surface(image, hole | (margin & ~used_texels(body, side, 0)), body)
 
 
 def integer_network(avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int) -> Quantised:
@@ -62,7 +83,7 @@ def integer_network(avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int
 
 
 def quantise_avatar(
-    avatar: TrainableAvatar, shaped: ShapedBody, groups: list[ShapeGroup], seed: int
+    avatar: TrainableAvatar, shaped: ShapedBody, groups: list[ShapeGroup], seed: int, unseen: Mask | None = None
 ) -> QuantisedAvatar:
     """Network and texture in integers.
 
@@ -70,8 +91,9 @@ def quantise_avatar(
     `shaped`: the body, whose texels are stored.
     `groups`: training samples, from which calibration frames are chosen.
     `seed`: of that choice.
+    `unseen`: texels of the body that no sample can show, see `byte_texture`.
     """
-    texture, scale = byte_texture(avatar, shaped)
+    texture, scale = byte_texture(avatar, shaped, unseen)
     return QuantisedAvatar(integer_network(avatar, groups, seed), texture, scale)
 
 

@@ -11,13 +11,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from trilane.arrays import U8, Mask
 from trilane.avatars.manifest import CAPTURED
 from trilane.body.body import ShapedBody, load_body
 from trilane.training.capture.body_raster import BodyRaster
-from trilane.training.capture.capture import open_capture
+from trilane.training.capture.capture import Capture, open_capture
 from trilane.training.capture.capture_samples import CaptureRenderer, held_out_frames
-from trilane.training.capture.check import bad_frames, checked_frame
-from trilane.training.capture.check_facts import require_fits
+from trilane.training.capture.check import CheckedFrame, bad_frames, checked_frame, coverage_of
+from trilane.training.capture.check_facts import require_fits, texel_facts
+from trilane.training.capture.texel_coverage import TexelCoverage
 from trilane.training.capture.zoomed_view import ViewRule
 from trilane.training.dataset import SampleSource, clothed_source
 from trilane.training.sample_renderer import SampleRenderer
@@ -38,7 +42,8 @@ class Subject:
 
     `person`, `shaped`: the body. `renderer`: plans and renders samples. `source`: opens another one like it, in another
     process. `facts`: for the manifest. `truth`: renders the person in any pose and view; None where only frames are
-    known: then `frames` has them, of which those `held_out` are for measuring.
+    known: then `frames` has them, of which those `held_out` are for measuring. `unseen` (S,S): texels of the body that
+    no frame of the training shows; None where all can be drawn.
     """
 
     person: Person
@@ -49,6 +54,7 @@ class Subject:
     truth: SampleRenderer | None = None
     frames: CaptureRenderer | None = None
     held_out: tuple[int, ...] = ()
+    unseen: Mask | None = None
 
 
 def clothed_subject(body: Path, threads: int) -> Subject:
@@ -66,19 +72,42 @@ def captured_subject(folder: Path, threads: int, report: Callable[[str], None]) 
     Raises BadInputError; FaultyCaptureError with all faults.
     """
     capture = open_capture(folder)
-    raster = BodyRaster(capture.shaped, threads)
-    frames = [checked_frame(capture, raster, number)[0] for number in range(len(capture))]
+    frames, coverage, drawn = _checked(capture, threads)
     require_fits(capture, frames, "what `trilane avatar check-data` draws")
     bad = [frame.number for frame in bad_frames(frames)]
     kept, held_out = held_out_frames(len(capture), bad)
     report(f"{len(kept)} frames of {len(capture)}; {len(held_out)} are held out, {len(bad)} have bad fits")
+    for number in kept:
+        coverage.add(np.unpackbits(drawn[number]).astype(bool).reshape(coverage.used.shape))
+    report(_unseen_line(coverage))
     names = {"held_out": held_out, "bad": bad}
     facts = {
         "body": CAPTURED,
         "frames": len(capture),
         **{f"{key}_frames": [capture.names[number] for number in numbers] for key, numbers in names.items()},
+        "texels": texel_facts(coverage),
     }
     person = Person(capture.body_file, tuple(map(float, capture.betas)), tuple(map(float, capture.expression)))
     source = partial(CaptureRenderer, capture, tuple(kept), ViewRule(), threads=1)
     renderer = source()
-    return Subject(person, capture.shaped, renderer, source, facts, None, renderer, tuple(held_out))
+    shown = (None, renderer, tuple(held_out), coverage.unseen)
+    return Subject(person, capture.shaped, renderer, source, facts, *shown)
+
+
+def _checked(capture: Capture, threads: int) -> tuple[list[CheckedFrame], TexelCoverage, list[U8]]:
+    """The frames of `capture` as they were checked, a coverage that counted none, and the packed texels of each."""
+    raster, coverage = BodyRaster(capture.shaped, threads), coverage_of(capture)
+    frames, drawn = [], []
+    for number in range(len(capture)):
+        frame, uv, mask = checked_frame(capture, raster, number)
+        frames.append(frame)
+        drawn.append(np.packbits(coverage.drawn(uv, mask)))
+    return frames, coverage, drawn
+
+
+def _unseen_line(coverage: TexelCoverage) -> str:
+    """What a person should know of texels that no frame shows."""
+    regions = coverage.never_seen()
+    names = f", among them all of {', '.join(regions)}" if regions else ""
+    share = f"{1 - coverage.share():.1%} of the body's texels are seen by no frame{names}"
+    return f"{share}: filled from seen ones, along the surface"

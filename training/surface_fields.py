@@ -25,7 +25,7 @@ def eigenfunctions(vertices: F64, faces: Ints, count: int) -> F64:
     1993. Vertices that are not connected to the largest part of the mesh (eyeballs) take the values of its nearest
     vertex.
     """
-    laplacian, mass = _cotangent(vertices, faces)
+    laplacian, mass = cotangent_laplacian(vertices, faces)
     part = _largest_part(laplacian)
     inner = laplacian[part][:, part]
     values, vectors = eigsh(inner, k=count + 1, M=sparse.diags(mass[part]), sigma=-1e-3, v0=np.ones(len(part)))
@@ -40,7 +40,7 @@ def eigenfunctions(vertices: F64, faces: Ints, count: int) -> F64:
     return fields
 
 
-def _cotangent(vertices: F64, faces: Ints) -> tuple[Any, F64]:
+def cotangent_laplacian(vertices: F64, faces: Ints) -> tuple[Any, F64]:
     """The cotangent Laplacian (V,V), sparse, and each vertex's share of the area (V,)."""
     count = len(vertices)
     rows, columns, values = [], [], []

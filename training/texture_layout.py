@@ -46,6 +46,26 @@ def fill_gaps(image: NDArray[Any], known: NDArray[np.bool_]) -> NDArray[np.float
     return _pulled(image * weight, weight)
 
 
+def fill_beside(image: NDArray[Any], known: NDArray[np.bool_]) -> tuple[F64, NDArray[np.bool_]]:
+    """`image` (S,S,C) where texels beside those that are `known` (S,S) have their mean; and which are known now."""
+    total = np.sum(_round_each(image * known[..., None]), axis=0)
+    count = np.sum(_round_each(known.astype(np.float64)[..., None]), axis=0)
+    near = np.asarray(count[..., 0] > 0)
+    return np.where((near & ~known)[..., None], total / np.maximum(count, 1), image), near
+
+
+def grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """`mask` (S,S) and the eight texels round each of its own."""
+    return np.asarray(np.any(_round_each(mask[..., None]), axis=0)[..., 0])
+
+
+def _round_each(image: NDArray[Any]) -> list[NDArray[Any]]:
+    """Of `image` (S,S,C): nine images, in which each texel has its own value or that of one beside it; 0 beyond."""
+    side = image.shape[0]
+    padded = np.pad(image, ((1, 1), (1, 1), (0, 0)))
+    return [padded[y : y + side, x : x + side] for y in range(3) for x in range(3)]
+
+
 def _pulled(total: F64, weight: F64) -> F64:
     mean = total / np.maximum(weight, 1e-9)
     if total.shape[0] == 1 or total.shape[0] % 2 or bool((weight > 0).all()):

@@ -115,7 +115,8 @@ def train(config: TrainConfig, report: Callable[[str], None]) -> Path:
     avatar, steps = _trained(shaped, config, report)
     report("quantising and evaluating")
     torch.set_num_threads(config.workers)
-    quantised = quantise_avatar(avatar, shaped, open_groups(config.work / TRAINING), config.seed)
+    groups = open_groups(config.work / TRAINING)
+    quantised = quantise_avatar(avatar, shaped, groups, config.seed, subject.unseen)
     names = {"name": config.name, "training_command": command_of(config)}
     provenance = _provenance(config, steps) | subject.facts
     write_avatar(config.out, subject.person, quantised, config.width, provenance, names)

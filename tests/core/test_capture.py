@@ -254,7 +254,7 @@ def test_bodies_that_are_not_where_the_masks_are_are_a_fault(
     folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The masks are rectangles, no person's. The sheet shows it; texels are not counted, which takes seconds."""
-    monkeypatch.setattr(check, "coverage_of", lambda _: SimpleNamespace(add=lambda *_: None))
+    monkeypatch.setattr(check, "coverage_of", lambda _: SimpleNamespace(add=lambda *_: None, drawn=lambda *_: None))
     _, err = command("avatar", "check-data", folder, "--sheet", folder / "sheet.png", code=2)
     assert re.search(r"fits: found bodies that overlap the masks by a median IoU of 0\.[0-3]\d", err) and "axes" in err
     with Image.open(folder / "sheet.png") as sheet:

@@ -79,21 +79,21 @@ def test_texels_on_the_mask_are_seen(square: TexelCoverage) -> None:
     mask = np.zeros((64, 64), bool)
     assert square.share() == 0 and square.never_seen() == ["face and head", "left hand"]
     mask[:, :16] = True
-    square.add(uv, mask)
+    square.add(square.drawn(uv, mask))
     seen = square.seen
     assert seen[1:-1, 1:9].all() and not seen[:, 10:].any()
     assert square.share() == pytest.approx(9 / 32, abs=0.01)
     by_region = square.share_by_region()
     assert by_region["face and head"] > 0.5 and by_region["left hand"] == 0 and square.never_seen() == ["left hand"]
-    square.add(uv[:, ::-1], np.ones((64, 64), bool))
-    assert square.share() > 0.95
+    square.add(square.drawn(uv[:, ::-1], np.ones((64, 64), bool)))
+    assert square.share() > 0.95 and np.array_equal(square.unseen, square.used & ~square.seen)
 
 
 def test_a_surface_seen_at_its_outline_is_not_seen(square: TexelCoverage) -> None:
     """u hardly changes over the picture: the surface is nearly parallel to the rays."""
     y, x = np.mgrid[:64, :64] + 0.5
     uv = np.dstack([0.5 + 1e-4 * x / 64, y / 64, np.ones((64, 64))]).astype(np.float32)
-    square.add(uv, np.ones((64, 64), bool))
+    square.add(square.drawn(uv, np.ones((64, 64), bool)))
     assert square.share() == 0
 
 

@@ -25,6 +25,7 @@ from trilane.training.capture.body_raster import BodyRaster
 from trilane.training.capture.capture import Capture, open_capture
 from trilane.training.capture.capture_samples import CaptureRenderer, held_out_frames
 from trilane.training.capture.centres import JointCentres, VertexCentres
+from trilane.training.capture.check import checked_frame, coverage_of
 from trilane.training.capture.image_map import moved, projected, seen_of_frame
 from trilane.training.capture.zoomed_view import Camera, ViewRule, zoomed_view
 from trilane.training.random_views import BANDS
@@ -202,12 +203,21 @@ def test_the_person_of_a_capture(capture: Capture, monkeypatch: pytest.MonkeyPat
     lines: list[str] = []
     found = captured_subject(capture.folder, 1, lines.append)
     path.write_bytes(before)
-    assert lines == ["2 frames of 8; 2 are held out, 1 have bad fits"]
+    raster, coverage = BodyRaster(capture.shaped, 1), coverage_of(capture)
+    for number in (0, 1):
+        coverage.add(coverage.drawn(*checked_frame(capture, raster, number)[1:]))
+    seen = coverage.share()
+    assert lines[0] == "2 frames of 8; 2 are held out, 1 have bad fits" and 0.2 < seen < 0.8
+    assert lines[1:] == [
+        f"{1 - seen:.1%} of the body's texels are seen by no frame: filled from seen ones, along the surface"
+    ]
+    assert found.unseen is not None and np.array_equal(found.unseen, coverage.unseen)
     assert found.facts == {
         "body": "that of a capture",
         "frames": 8,
         "held_out_frames": ["007.png", "003.png"],
         "bad_frames": ["003.png"],
+        "texels": {"seen": seen, "regions": coverage.share_by_region(), "never_seen": coverage.never_seen()},
     }
     assert found.person.betas == pytest.approx([0.35] * 10) and found.person.body == capture.body_file
     assert np.array_equal(found.shaped.vertices, capture.shaped.vertices) and found.truth is None

@@ -58,6 +58,29 @@ def test_a_texture_has_bytes_by_channel_and_nothing_where_no_face_is(monkeypatch
     assert np.abs(texture[..., :2]).max() == 127
 
 
+def test_texels_that_no_frame_shows_are_filled_from_their_neighbours_on_the_body(monkeypatch):
+    """A sheet of 8 x 8 squares over the left half, u + v at the seen texels: the plane goes on through the hole, and
+    over the margin that bilinear reads at the body's border use."""
+    x, y = np.meshgrid(np.arange(9.0), np.arange(9.0))
+    points = np.column_stack([x.ravel(), y.ravel(), np.zeros(81)])
+    first = [9 * j + k for j in range(8) for k in range(8)]
+    faces = np.array([[a, a + 1, a + 9] for a in first] + [[a + 1, a + 10, a + 9] for a in first])
+    uv = points[:, :2] * [0.5 / 8, 1 / 8]
+    body = BodyArrays(points, faces, uv, faces, np.zeros((81, 55)), np.zeros((55, 3)))
+    monkeypatch.setattr(make_bundle, "body_arrays", {"shaped": body}.__getitem__)
+    u, v = np.meshgrid((np.arange(64) + 0.5) / 64, (np.arange(64) + 0.5) / 64)
+    plane = np.repeat((0.6 * u + 0.3 * v)[..., None], CHANNELS, axis=2).astype(np.float32)
+    unseen = np.zeros((32, 32), bool)
+    unseen[10:16, 12:16] = True
+    made = avatar(np.where(np.kron(unseen, np.ones((2, 2)))[..., None] > 0, -0.9, plane).astype(np.float32))
+    texture, scale = make_bundle.byte_texture(made, "shaped", unseen)
+    steps = float(scale.max()) / 2
+    np.testing.assert_allclose((texture * scale)[20:32, 24:30], plane[20:32, 24:30], atol=steps + 0.02)
+    assert (texture[20:32, 32:34] > 0).all(), "the margin"
+    left, _ = make_bundle.byte_texture(made, "shaped")
+    assert (left[22:30, 26:30] < 0).all() and np.array_equal(left[40:, :30] > 0, texture[40:, :30] > 0)
+
+
 @pytest.fixture
 def groups(tmp_path):
     """Two shapes; the samples of the second are what the network is calibrated on."""
@@ -96,9 +119,9 @@ def test_the_network_is_calibrated_on_chosen_samples_of_one_shape(monkeypatch, g
     monkeypatch.setattr(make_bundle, "reshaped", lambda network, *shape: (network.name, shape))
     monkeypatch.setattr(make_bundle, "byte_texture", lambda *words: (words, "scale"))
     made = avatar(noise(1))
-    found = make_bundle.quantise_avatar(made, "shaped", groups, 9)
+    found = make_bundle.quantise_avatar(made, "shaped", groups, 9, "unseen")
     assert found.network == Quantised(("made", (256, 256)), {"a": 1}, {})
-    assert (found.texture, found.scale) == ((made, "shaped"), "scale")
+    assert (found.texture, found.scale) == ((made, "shaped", "unseen"), "scale")
     ((model, frames, method),) = asked
     assert model == (made.network, (64, 32)) and method == "minmax"
     chosen = sorted(np.random.default_rng(9).permutation(7)[:4])

@@ -135,7 +135,7 @@ def test_every_part_gets_what_is_its(config, calls, tmp_path):
     assert said["first_texture"] == ("arrays", "groups", SIDE, CHANNELS)
     assert said["fit"] == (work / "training", FitConfig(minutes=3.0, workers=2, threads=7, batch=9, seed=11))
     made, *rest = said["quantise_avatar"]
-    assert rest == ["shaped", "groups", 11]
+    assert rest == ["shaped", "groups", 11, None]
     assert said["write_avatar"] == (
         config.out,
         Person(config.body),

@@ -282,11 +282,11 @@ def test_a_texels_colour_is_the_weighted_mean_of_its_pixels():
     group = ShapeGroup(
         (h, w), np.round(uv * U16).astype(np.uint16)[None], np.ones((1, h, w), np.uint8), rgba, np.zeros(1)
     )
-    colours = mean_colours([group], 8)
+    colours = mean_colours([group], 8, sheet())
     np.testing.assert_allclose(colours[:, :4], np.broadcast_to([200 / 255, 0, 0], (8, 4, 3)), atol=1e-6)
     np.testing.assert_allclose(colours[:, 4:], np.broadcast_to([0, 100 / 255, 0], (8, 4, 3)), atol=1e-6)
     small = ShapeGroup((64, 64), group.uv[:, :64, :64], group.covered[:, :64, :64], rgba[:, :64, :64], np.zeros(1))
-    assert not mean_colours([small], 8).any()
+    assert not mean_colours([small], 8, sheet()).any()
 
 
 def sheet() -> BodyArrays:

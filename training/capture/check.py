@@ -40,7 +40,7 @@ def check_frames(capture: Capture, raster: BodyRaster, coverage: TexelCoverage) 
     """Each frame of `capture` as it was checked; `coverage` counts the texels that it shows."""
     for number in range(len(capture)):
         frame, uv, mask = checked_frame(capture, raster, number)
-        coverage.add(uv, mask)
+        coverage.add(coverage.drawn(uv, mask))
         yield frame
 
 

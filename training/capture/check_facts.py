@@ -44,12 +44,14 @@ def capture_facts(
         },
         "bad": [{"name": capture.names[each.number], "iou": each.iou, "outside": each.outside} for each in bad],
         "views": view_facts(capture.directions()),
-        "texels": {
-            "seen": coverage.share(),
-            "regions": coverage.share_by_region(),
-            "never_seen": coverage.never_seen(),
-        },
+        "texels": texel_facts(coverage),
     }
+
+
+def texel_facts(coverage: TexelCoverage) -> dict[str, Any]:
+    """`seen`: share of the body's texels. `regions`: of each region's. `never_seen`: regions hardly seen."""
+    names = coverage.never_seen()
+    return {"seen": coverage.share(), "regions": coverage.share_by_region(), "never_seen": names}
 
 
 def view_facts(directions: Sequence[tuple[float, float]]) -> dict[str, Any]:

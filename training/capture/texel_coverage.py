@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from trilane.arrays import F32, F64, Mask
+from trilane.arrays import F32, Mask
 from trilane.training.body_arrays import BodyArrays
 from trilane.training.capture.body_regions import REGIONS, vertex_regions
 from trilane.training.first_texture import LEAST_WEIGHT, head_on
-from trilane.training.texture_layout import lay_out
+from trilane.training.texture_layout import grown, lay_out
 
 #: Of a region that counts as never seen, at most this share of texels was seen.
 HARDLY = 0.05
@@ -21,27 +21,36 @@ SIDE = 256
 
 
 class TexelCoverage:
-    """Counts how well each texel of one body was seen."""
+    """Which texels of one body were seen, frame by frame."""
 
     def __init__(self, body: BodyArrays, side: int = SIDE) -> None:
         regions = np.eye(len(REGIONS))[vertex_regions(body)]
         image, self.used = lay_out(regions, body.faces, body.uv, body.uv_faces, side)
         self.region = image.argmax(axis=2)
-        self.weight: F64 = np.zeros((side, side))
+        self._drawn: Mask = np.zeros((side, side), bool)
         self._side = side
 
-    def add(self, uv: F32, mask: Mask) -> None:
-        """Count the UV image (h,w,3) of a frame whose person is `mask` (h,w)."""
-        weight = head_on(uv[..., :2].astype(np.float64), uv[..., 2] > 0, self._side) * mask
-        seen = weight > 0
-        texel = np.minimum((uv[..., :2][seen] * self._side).astype(np.int64), self._side - 1)
-        np.maximum.at(self.weight, (texel[:, 1], texel[:, 0]), weight[seen])
+    def add(self, drawn: Mask) -> None:
+        """Count a frame that shows the texels `drawn` (S,S)."""
+        self._drawn |= drawn
+
+    def drawn(self, uv: F32, mask: Mask) -> Mask:
+        """(S,S): texels at which pixels of a frame lie. `uv` (h,w,3): its UV image. `mask` (h,w): its person."""
+        shown = (head_on(uv[..., :2].astype(np.float64), uv[..., 2] > 0, self._side) > LEAST_WEIGHT) & mask
+        texel = np.minimum((uv[..., :2][shown] * self._side).astype(np.int64), self._side - 1)
+        found = np.zeros_like(self._drawn)
+        found[texel[:, 1], texel[:, 0]] = True
+        return found
 
     @property
     def seen(self) -> Mask:
         """(S,S): texels of the body that were seen, or lie beside one that was: a pixel spans a texel or two."""
-        near = _grown(self.weight > LEAST_WEIGHT)
-        return np.asarray(near & self.used)
+        return np.asarray(grown(self._drawn) & self.used)
+
+    @property
+    def unseen(self) -> Mask:
+        """(S,S): texels of the body that were not."""
+        return np.asarray(self.used & ~self.seen)
 
     def share(self) -> float:
         """Share of the body's texels that were seen."""
@@ -58,9 +67,3 @@ class TexelCoverage:
     def never_seen(self) -> list[str]:
         """Regions of which hardly any texel was seen."""
         return [name for name, share in self.share_by_region().items() if share <= HARDLY]
-
-
-def _grown(mask: Mask) -> Mask:
-    padded = np.pad(mask, 1)
-    rows = padded[:-2] | padded[1:-1] | padded[2:]
-    return np.asarray(rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:])
