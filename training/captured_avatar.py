@@ -178,7 +178,7 @@ def _sample_cost(subject: Subject, samples: list[Planned], settings: TrainingSet
 
 def _first_avatar(subject: Subject, places: Places, settings: TrainingSettings) -> TrainableAvatar:
     """What training starts from; of a training that was begun, only its shapes matter."""
-    network = UNet(width=settings.width, channels=CHANNELS, input_skip=True)
+    network = UNet(norm=settings.norm, width=settings.width, channels=CHANNELS, input_skip=True)
     if settings.start == "default":
         network = load_network(network, DEFAULT_NETWORK)
     if (places.work / STATE).exists():

@@ -40,11 +40,12 @@ TEXEL_MARGIN = 3
 
 @dataclass(frozen=True)
 class QuantisedAvatar:
-    """`network`: in integers. `texture` (S,S,C) int8 with `scale` (C,) float32."""
+    """`network`: in integers, with its `norm`. `texture` (S,S,C) int8 with `scale` (C,) float32."""
 
     network: Quantised
     texture: NDArray[np.int8]
     scale: NDArray[np.float32]
+    norm: str = "batch"
 
 
 def byte_texture(
@@ -94,7 +95,7 @@ def quantise_avatar(
     `unseen`: texels of the body that no sample can show, see `byte_texture`.
     """
     texture, scale = byte_texture(avatar, shaped, unseen)
-    return QuantisedAvatar(integer_network(avatar, groups, seed), texture, scale)
+    return QuantisedAvatar(integer_network(avatar, groups, seed), texture, scale, avatar.network.norm)
 
 
 def write_avatar(
@@ -116,7 +117,7 @@ def write_avatar(
     """
     manifest = Manifest(
         name=names["name"],
-        network=network_entry(quantised.network.network, "resnet18", "batch", width),
+        network=network_entry(quantised.network.network, "resnet18", quantised.norm, width),
         provenance=provenance,
         training_command=names["training_command"],
         quantisation=quantised.network.facts,

@@ -1,4 +1,4 @@
-"""AdamW that leaves numbers without a gradient as they are, with their moments.
+"""Adam and AdamW that leave numbers without a gradient as they are, with their moments.
 
 Rule: a texel that a batch does not show is no texel whose gradient is 0: plain Adam would go on moving it by its old
 momentum, let that fade, and let its weight decay.
@@ -17,14 +17,15 @@ MASKED = "masked"
 MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
-class MaskedAdamW(torch.optim.AdamW):
-    """AdamW; in groups of parameters with `masked`, numbers whose gradient is exactly 0 do not take part in a step.
+class _Masked(torch.optim.Optimizer):
+    """What is put before a class of Adam.
 
-    The count of steps, which corrects the moments' bias, goes on for all, as in `torch.optim.SparseAdam`.
+    In groups of parameters with `masked`, numbers whose gradient is exactly 0 do not take part in a step. The count of
+    steps, which corrects the moments' bias, goes on for all, as in `torch.optim.SparseAdam`.
     """
 
     def step(self, closure: Callable[[], float] | None = None) -> Any:
-        """As `AdamW.step`."""
+        """As the class behind this one."""
         groups = [group for group in self.param_groups if group.get(MASKED)]
         kept = [
             self._kept(parameter) for group in groups for parameter in group["params"] if parameter.grad is not None
@@ -45,3 +46,11 @@ class MaskedAdamW(torch.optim.AdamW):
 
     def _tensors(self, parameter: Tensor) -> list[Tensor]:
         return [parameter, *(self.state[parameter][name] for name in MOMENTS)]
+
+
+class MaskedAdam(_Masked, torch.optim.Adam):
+    """Adam, whose weight decay is part of the gradient and so is left out where there is none."""
+
+
+class MaskedAdamW(_Masked, torch.optim.AdamW):
+    """AdamW."""

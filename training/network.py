@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Self
 
 import torch
 from torch import Tensor, nn
@@ -30,10 +31,24 @@ class GroupNorm(nn.GroupNorm):
         return functional.conv2d(x, self.weight.view(c, 1, 1, 1), self.bias, groups=c)
 
 
+class NoNorm(nn.BatchNorm2d):
+    """A learnt scale and shift of each channel, and no statistics: a batch norm that never measures.
+
+    It is exported, and folded into the convolution before it, as a batch norm is.
+    """
+
+    def train(self, mode: bool = True) -> Self:
+        """Stays in evaluation mode, in which the mean is 0 and the variance 1; `mode` changes nothing."""
+        del mode
+        super().train(False)
+        return self
+
+
 NORMS: dict[str, Callable[[int], nn.Module]] = {
     "batch": nn.BatchNorm2d,
     "instance": lambda channels: nn.InstanceNorm2d(channels, affine=True),
     "group": lambda channels: GroupNorm(math.gcd(channels, NORM_GROUPS), channels),
+    "none": lambda channels: NoNorm(channels).eval(),
 }
 
 
@@ -64,7 +79,7 @@ class UNet(nn.Module):
             return max(CHANNEL_STEP, round(count * width / FULL_WIDTH / CHANNEL_STEP) * CHANNEL_STEP)
 
         make_norm = NORMS[norm]
-        self.input_skip = input_skip
+        self.norm, self.input_skip = norm, input_skip
         self.encoder = ENCODERS[encoder](channels, scale, make_norm)
         *skips, deepest = self.encoder.channels
         self.levels = nn.ModuleList()

@@ -62,7 +62,11 @@ def open_groups(folder: Path, writable: bool = False) -> list[ShapeGroup]:
 
 
 def batches(
-    groups: list[ShapeGroup], size: int, rng: np.random.Generator, repeats: Sequence[int] = (1,) * 5
+    groups: list[ShapeGroup],
+    size: int,
+    rng: np.random.Generator,
+    repeats: Sequence[int] = (1,) * 5,
+    labels: Sequence[NDArray[np.int64]] | None = None,
 ) -> Iterator[tuple[ShapeGroup, NDArray[np.int64]]]:
     """Batches without end, each of one tensor shape: a group and the indices of the samples in it.
 
@@ -70,12 +74,16 @@ def batches(
     `size`: samples of a batch, roughly.
     `rng`: shuffles the samples of each epoch.
     `repeats`: how often an epoch has a sample, by its band.
+    `labels`: of each group (N,); the samples of a batch have one label, and those below 0 are left out.
     """
+    kinds = labels if labels is not None else [np.zeros(len(group), np.int64) for group in groups]
     while True:
         epoch: list[tuple[ShapeGroup, NDArray[np.int64]]] = []
-        for group in groups:
-            order = rng.permutation(np.repeat(np.arange(len(group)), np.asarray(repeats)[group.band]))
-            parts = np.array_split(order, max(1, len(order) // size))
-            epoch += [(group, np.sort(part)) for part in parts if len(part)]
+        for group, kind in zip(groups, kinds, strict=True):
+            for label in np.unique(kind[kind >= 0]):
+                alike = np.flatnonzero(kind == label)
+                order = rng.permutation(np.repeat(alike, np.asarray(repeats)[group.band[alike]]))
+                parts = np.array_split(order, max(1, len(order) // size))
+                epoch += [(group, np.sort(part)) for part in parts if len(part)]
         for index in rng.permutation(len(epoch)):
             yield epoch[index]

@@ -7,30 +7,22 @@ goes on as if it had not been. `training_loop.py` is the other loop, of processe
 from __future__ import annotations
 
 import copy
-import math
 import time
 from collections.abc import Iterator
 from itertools import islice
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from trilane.training.activation_noise import add_activation_noise
 from trilane.training.adversary import Adversary
+from trilane.training.batch_choice import Batch, batch_stream, is_whole
+from trilane.training.dropout import add_dropout
 from trilane.training.objective import Objective
+from trilane.training.optimisers import clip_gradients, optimiser_of
 from trilane.training.perceptual import Vgg16
-from trilane.training.sample_files import ShapeGroup, batches
+from trilane.training.sample_files import ShapeGroup
 from trilane.training.trainable_avatar import TrainableAvatar
-from trilane.training.training_loop import (
-    SMALL_PIXELS,
-    follow,
-    load_batch,
-    optimiser_of,
-    rate_share,
-    set_mode,
-    train_step,
-)
+from trilane.training.training_loop import add_gradients, follow, load_batch, rate_share, set_mode
 from trilane.training.training_settings import TrainingSettings
 from trilane.training.training_state import TrainingState
 
@@ -43,12 +35,16 @@ SEED_BITS = 31
 def first_state(avatar: TrainableAvatar, settings: TrainingSettings, vgg: Vgg16 | None = None) -> TrainingState:
     """The state of a training of `avatar` before its first step. `vgg`: for a perceptual loss by its features."""
     average = copy.deepcopy(avatar).eval()
+    harder = settings.regularisation
+    avatar.texture_noise, avatar.input_noise = harder.texture_noise, harder.input_noise
+    add_dropout(avatar.network, harder.dropout)
     add_activation_noise(avatar.network, settings.noise_steps)
     avatar.network.to(memory_format=torch.channels_last)
     loss, rate = settings.loss, settings.discriminator_rate
     adversary = Adversary(settings.width, rate, settings.seed) if loss.judged else None
     objective = Objective(loss.by_name(), vgg, adversary)
-    return TrainingState(avatar, average, optimiser_of(avatar, settings, settings.masked_texture), objective)
+    optimiser = optimiser_of(avatar, settings, settings.optimiser, settings.masked_texture)
+    return TrainingState(avatar, average, optimiser, objective)
 
 
 def steps(
@@ -59,23 +55,34 @@ def steps(
     `state`: changes in place.
     `groups`: the samples.
     """
-    small = [group for group in groups if math.prod(group.shape) < SMALL_PIXELS] or groups
-    switch = math.ceil(settings.small_until * count)
-    streams = (_stream(small, settings, 0), _stream(groups, settings, 1))
-    done = (min(state.step, switch), max(state.step - switch, 0))
-    first, then = (islice(stream, skipped, None) for stream, skipped in zip(streams, done, strict=True))
+    stream = batch_stream(groups, settings, count, state.step)
     peaks = (settings.network_rate, settings.network_rate, settings.texture_rate)
     while state.step < count:
         share = state.step / count
         torch.manual_seed(state.step << SEED_BITS | settings.seed)
-        set_mode(state.avatar, frozen=share > settings.freeze_norms_at)
         for group, peak in zip(state.optimiser.param_groups, peaks, strict=True):
             group["lr"] = peak * rate_share(share)  # kernels, the network's other weights, texture
-        batch = load_batch(*next(first if state.step < switch else then))
-        terms = train_step(state.avatar, state.optimiser, *batch, state.objective)
+        terms = _step(state, stream, settings, frozen=share > settings.freeze_norms_at)
         state.step += 1
         follow(state.average, state.avatar, 1 - 1 / max(1.0, settings.average_share * state.step))
         yield terms
+
+
+def _step(state: TrainingState, stream: Iterator[Batch], settings: TrainingSettings, frozen: bool) -> dict[str, float]:
+    """One step by the mean gradient of the next batches of `stream`; the mean terms of their losses.
+
+    `frozen`: batch statistics no longer change.
+    """
+    options, avatar = settings.optimiser, state.avatar
+    state.optimiser.zero_grad(set_to_none=True)
+    sums: dict[str, float] = {}
+    for batch in islice(stream, options.batches_per_step):
+        set_mode(avatar, frozen or (settings.batches.full_body_statistics and not is_whole(batch)))
+        terms = add_gradients(avatar, load_batch(*batch), state.objective, 1 / options.batches_per_step)
+        sums = {name: sums.get(name, 0.0) + value / options.batches_per_step for name, value in terms.items()}
+    clip_gradients(avatar, options)
+    state.optimiser.step()
+    return sums
 
 
 def step_seconds(
@@ -107,9 +114,3 @@ def _measured(
     for _ in going:
         pass
     return (time.monotonic() - start) / MEASURED
-
-
-def _stream(
-    groups: list[ShapeGroup], settings: TrainingSettings, phase: int
-) -> Iterator[tuple[ShapeGroup, NDArray[np.int64]]]:
-    return batches(groups, settings.batch, np.random.default_rng((settings.seed, 2, phase)))

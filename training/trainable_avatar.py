@@ -1,6 +1,7 @@
 """What is trained: a neural texture and a network, which turn a UV image into a picture.
 
-Rule: while training, the network's input is rounded to as many steps as its bytes have in the pipeline.
+Rule: while training, the network's input is rounded to as many steps as its bytes have in the pipeline. Noise, where
+there is any, is in training mode alone.
 """
 
 from __future__ import annotations
@@ -16,15 +17,23 @@ INPUT_STEPS = 127
 
 
 class TrainableAvatar(nn.Module):
-    """A neural texture and the network that reads it."""
+    """A neural texture and the network that reads it.
+
+    `texture_noise`, `input_noise`: standard deviation of Gaussian noise on texels, and on the network's input.
+    """
 
     def __init__(self, texture: NeuralTexture, network: UNet) -> None:
         super().__init__()
         self.texture, self.network = texture, network
+        self.texture_noise = self.input_noise = 0.0
 
     def forward(self, uv: Tensor, covered: Tensor) -> Tensor:
         """`uv` (N,H,W,2) in 0..1 and `covered` (N,H,W) bool to pictures (N,4,H,W) in 0..1."""
-        x = read_texture(self.texture.image(), uv, covered)
+        x = read_texture(self._noisy(self.texture.image(), self.texture_noise), uv, covered)
+        x = self._noisy(x, self.input_noise)
         rounded = torch.round(x * INPUT_STEPS) / INPUT_STEPS
         output: Tensor = self.network(x + (rounded - x).detach())
         return output
+
+    def _noisy(self, x: Tensor, deviation: float) -> Tensor:
+        return x + deviation * torch.randn_like(x) if self.training and deviation else x

@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,8 +26,8 @@ from torch import multiprocessing as tmp
 
 from trilane.training.activation_noise import add_activation_noise
 from trilane.training.losses import loss_terms
-from trilane.training.masked_adam import MASKED, MaskedAdamW
 from trilane.training.objective import Objective
+from trilane.training.optimisers import clip_gradients, optimiser_of
 from trilane.training.sample_files import U16, ShapeGroup, batches, open_groups
 from trilane.training.trainable_avatar import TrainableAvatar
 
@@ -40,19 +40,6 @@ EXCHANGE_STEPS = 4
 TOTAL_SHARE = 1.5
 #: Seconds between two looks of the main process at its workers.
 WATCH_S = 4.0
-
-
-class Rates(Protocol):
-    """Learning rates of network and texture, and the decay of weights."""
-
-    @property
-    def network_rate(self) -> float: ...
-
-    @property
-    def texture_rate(self) -> float: ...
-
-    @property
-    def weight_decay(self) -> float: ...
 
 
 @dataclass(frozen=True)
@@ -189,28 +176,25 @@ def train_step(
     `uv`, `covered`, `target`: the batch, as `load_batch` returns it.
     `objective`: what is minimised; the default avatar's where there is none.
     """
-    objective = objective or Objective()
+    optimiser.zero_grad(set_to_none=True)
+    terms = add_gradients(avatar, (uv, covered, target), objective or Objective())
+    clip_gradients(avatar)
+    optimiser.step()
+    return terms
+
+
+def add_gradients(
+    avatar: TrainableAvatar, batch: tuple[Tensor, Tensor, Tensor], objective: Objective, share: float = 1.0
+) -> dict[str, float]:
+    """Add `share` of the gradients of `batch`, as `load_batch` returns it, to those of `avatar`; the terms by name.
+
+    `objective`: what is minimised; its discriminators learn from every batch.
+    """
+    uv, covered, target = batch
     output = avatar(uv, covered)
     terms = objective.terms(output, target)
-    optimiser.zero_grad(set_to_none=True)
-    objective.total(terms).backward()
-    nn.utils.clip_grad_norm_(avatar.parameters(), 1.0)
-    optimiser.step()
+    (share * objective.total(terms)).backward()
     return {name: float(term.detach()) for name, term in terms.items()} | objective.learn(output.detach(), target)
-
-
-def optimiser_of(avatar: TrainableAvatar, config: Rates, masked: bool = False) -> torch.optim.Optimizer:
-    """AdamW for `avatar`; weights that are no kernels do not decay. `masked`: texels without a gradient stay."""
-    kernels = [p for p in avatar.network.parameters() if p.ndim > 1]
-    others = [p for p in avatar.network.parameters() if p.ndim <= 1]
-    groups: list[dict[str, Any]] = [
-        {"params": kernels, "lr": config.network_rate, "weight_decay": config.weight_decay},
-        {"params": others, "lr": config.network_rate, "weight_decay": 0.0},
-        {"params": list(avatar.texture.parameters()), "lr": config.texture_rate, "weight_decay": config.weight_decay},
-    ]
-    if masked:
-        groups[2][MASKED] = True
-    return (MaskedAdamW if masked else torch.optim.AdamW)(groups, betas=(0.9, 0.99))
 
 
 def rate_share(share: float) -> float:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,6 +18,7 @@ from trilane.files import read_text
 from trilane.near_miss import did_you_mean
 from trilane.scene.schema import Table
 from trilane.training.loss_weights import LOSSES, LossWeights
+from trilane.training.training_options import BatchOptions, OptimiserOptions, RegularisationOptions
 
 NAME = "training.toml"
 #: What is usual for a network that is trained already, and for a new one, where the settings do not say it.
@@ -38,7 +40,8 @@ class TrainingSettings(Table):
     up to which only half-size samples are used, and after which batch statistics stay. `average_share`: of the steps
     so far, time constant of the average that becomes the avatar. `discriminator_rate`: of learning, for discriminators;
     it stays as it is. `noise_steps`: on activations, steps of a byte. `masked_texture`: texels that a batch does not
-    show keep their values and their momentum. `vgg`: SHA-256 of VGG-16's weights that the perceptual loss is by.
+    show keep their values and their momentum. `norm`: of a new network. `vgg`: SHA-256 of VGG-16's weights that the
+    perceptual loss is by.
     """
 
     schema_: Literal[1] = Field(default=1, alias="schema")
@@ -59,8 +62,12 @@ class TrainingSettings(Table):
     average_share: float = Field(default=0.1, gt=0, le=1)
     noise_steps: float = Field(default=1.0, ge=0, le=16)
     masked_texture: bool = False
+    norm: Literal["batch", "instance", "group", "none"] = "batch"
     vgg: str | None = Field(default=None, pattern="^[0-9a-f]{64}$")
     loss: LossWeights = LossWeights()
+    optimiser: OptimiserOptions = OptimiserOptions()
+    batches: BatchOptions = BatchOptions()
+    regularisation: RegularisationOptions = RegularisationOptions()
 
 
 def read_settings(path: Path) -> TrainingSettings:
@@ -76,9 +83,19 @@ def parsed_settings(values: dict[str, Any], where: str | Path) -> TrainingSettin
     """The settings of `values`, which stand at `where`; `loss` may be one of `LOSSES` by name. Raises BadInputError."""
     usual = STARTS.get(str(values.get("start", "default")), {})
     try:
-        return TrainingSettings.model_validate(usual | _with_loss(values, where))
+        settings = TrainingSettings.model_validate(usual | _with_loss(values, where))
     except ValidationError as error:
         raise _refused(dict(error.errors()[0]), where) from None
+    for key, clashes, expected, remedy in CLASHES:
+        if clashes(settings):
+            raise BadInputError(f"{where}: {key}", str(getattr(settings, key)), expected, remedy)
+    return settings
+
+
+#: What does not go together: key, test, what is expected of the key, and another way.
+CLASHES: tuple[tuple[str, Callable[[TrainingSettings], bool], str, str], ...] = (
+    ("norm", lambda s: s.start == "default" and s.norm != "batch", "batch of the default network", 'or start = "new"'),
+)
 
 
 def _with_loss(values: dict[str, Any], where: str | Path) -> dict[str, Any]:
@@ -94,9 +111,15 @@ def _with_loss(values: dict[str, Any], where: str | Path) -> dict[str, Any]:
 def settings_text(settings: TrainingSettings) -> str:
     """The text of a file of `settings`: every value, also where it is the default."""
     values = settings.model_dump(by_alias=True, exclude_none=True)
-    weights = values.pop("loss")
-    lines = [f"{key} = {json.dumps(value)}" for key, value in values.items()]
-    return "\n".join([HEAD, *lines, "", "[loss]", *(f"{key} = {value!r}" for key, value in weights.items())]) + "\n"
+    tables = {key: value for key, value in values.items() if isinstance(value, dict)}
+    lines = [HEAD, *_lines({key: value for key, value in values.items() if key not in tables})]
+    for name, table in tables.items():
+        lines += ["", f"[{name}]", *_lines(table)]
+    return "\n".join(lines) + "\n"
+
+
+def _lines(values: dict[str, Any]) -> list[str]:
+    return [f"{key} = {json.dumps(value)}" for key, value in values.items()]
 
 
 def _refused(details: dict[str, Any], where: str | Path) -> BadInputError:
@@ -104,6 +127,6 @@ def _refused(details: dict[str, Any], where: str | Path) -> BadInputError:
     place, keys = f"{where}: {'.'.join(map(str, details['loc']))}", details["loc"]
     if details["type"] != "extra_forbidden":
         return BadInputError(place, repr(details["input"])[:80], details["msg"].removeprefix("Input should be "))
-    table = LossWeights if len(keys) > 1 else TrainingSettings
-    known = [field.alias or name for name, field in table.model_fields.items()]
+    table = TrainingSettings.model_fields[keys[0]].annotation if len(keys) > 1 else TrainingSettings
+    known = [field.alias or name for name, field in getattr(table, "model_fields", {}).items()]
     return BadInputError(place, "an unknown key", f"one of {', '.join(known)}", did_you_mean(str(keys[-1]), known))

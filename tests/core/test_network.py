@@ -40,7 +40,8 @@ def test_full_width_has_the_published_size():
 
 torch.set_num_threads(1)
 
-PAIRS = [*((encoder, "batch") for encoder in ENCODERS), ("resnet18", "instance"), ("mobilenetv3", "group")]
+RESNETS = [("resnet18", norm) for norm in ("instance", "none")]
+PAIRS = [*((encoder, "batch") for encoder in ENCODERS), *RESNETS, ("mobilenetv3", "group")]
 #: Published, in millions. Ours within 5 %.
 PARAMETERS = {"resnet18": 14.5, "mobilenetv2": 6.6, "mobilenetv3": 6.7, "efficientnet-lite0": 6.1}
 

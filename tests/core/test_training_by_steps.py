@@ -14,7 +14,7 @@ pytest.importorskip("scipy")
 pytest.importorskip("skimage")
 
 from trilane.errors import BadInputError  # noqa: E402
-from trilane.training import step_loop  # noqa: E402
+from trilane.training import batch_choice, step_loop  # noqa: E402
 from trilane.training.captured_avatar import resumed_settings  # noqa: E402
 from trilane.training.network import UNet  # noqa: E402
 from trilane.training.neural_texture import NeuralTexture  # noqa: E402
@@ -56,7 +56,7 @@ def one_thread() -> Any:
 @pytest.fixture
 def groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[ShapeGroup]:
     """Five samples of a small shape and four of a large one."""
-    monkeypatch.setattr(step_loop, "SMALL_PIXELS", math.prod(LARGE))
+    monkeypatch.setattr(batch_choice, "SMALL_PIXELS", math.prod(LARGE))
     rng = np.random.default_rng(0)
     for shape, count in ((SMALL, 5), (LARGE, 4)):
         group = create_group(tmp_path / "data", shape, (np.arange(count) % 2).astype(np.int8))
