@@ -27,6 +27,7 @@ from trilane.training.clear_view import ClothedSurface
 from trilane.training.clothing.clothed_body import ClothedBody
 from trilane.training.clothing.landmarks import find_landmarks
 from trilane.training.clothing.layers import clothing_layers
+from trilane.training.clothing.looks import DEFAULT, Look
 from trilane.training.random_poses import random_pose
 from trilane.training.random_views import BANDS, View, random_view
 from trilane.training.sample_crop import Crop, Cropper
@@ -52,12 +53,13 @@ class Sample:
 class SampleRenderer:
     """Plans and renders samples of one body, with an OpenGL context of its own."""
 
-    def __init__(self, shaped: ShapedBody, threads: int | None = None, samples: int = 2) -> None:
+    def __init__(self, shaped: ShapedBody, threads: int | None = None, samples: int = 2, look: Look = DEFAULT) -> None:
         """Put clothes on the body and open the context.
 
         `shaped`: the body.
         `threads`: of a software OpenGL driver; None for its default.
         `samples`: of the ground truth along each side of a pixel, an even number.
+        `look`: what the body wears; its build is that of `shaped`.
         Raises MissingPartError without OpenGL.
         """
         body = shaped.body
@@ -70,9 +72,9 @@ class SampleRenderer:
         self.ctx = open_context(threads)
         self.mesh = SkinnedMesh(self.ctx, mesh)
         self._uv = UvRaster(self.ctx, self.mesh)
-        layers = clothing_layers(arrays, landmarks)
+        layers = clothing_layers(arrays, landmarks, look)
         self.surface = ClothedSurface(layers)
-        self.clothed_body = ClothedBody(self.ctx, layers, landmarks, samples)
+        self.clothed_body = ClothedBody(self.ctx, layers, landmarks, samples, look)
 
     def plan(self, seed: Sequence[int], source: PoseSource, band: str, size: str) -> Sample:
         """The sample of `seed`: draws views until enough of the body is on the screen and none of it is cut.

@@ -23,6 +23,7 @@ from trilane.training.capture.check import CheckedFrame, bad_frames, checked_fra
 from trilane.training.capture.check_facts import require_fits, texel_facts
 from trilane.training.capture.texel_coverage import TexelCoverage
 from trilane.training.capture.zoomed_view import ViewRule
+from trilane.training.clothing.looks import DEFAULT_NAME, KEY, look_named
 from trilane.training.dataset import SampleSource, clothed_source
 from trilane.training.sample_renderer import SampleRenderer
 
@@ -57,12 +58,14 @@ class Subject:
     unseen: Mask | None = None
 
 
-def clothed_subject(body: Path, threads: int) -> Subject:
-    """The body in the file `body`, clothed. `threads`: of a software OpenGL driver. Raises BadInputError."""
-    shaped = load_body(body).shape()
-    facts = {"body": "the default body, clothed by trilane.training.clothing"}
-    renderer = SampleRenderer(shaped, threads=threads)
-    return Subject(Person(body), shaped, renderer, partial(clothed_source, body), facts, renderer)
+def clothed_subject(body: Path, threads: int, name: str = DEFAULT_NAME) -> Subject:
+    """The body in the file `body`, in the look `name`. `threads`: of a software OpenGL driver. Raises BadInputError."""
+    look = look_named(name)
+    shaped = load_body(body).shape(look.betas)
+    facts = {"body": "the default body, clothed by trilane.training.clothing", KEY: name}
+    renderer = SampleRenderer(shaped, threads=threads, look=look)
+    person = Person(body, look.betas)
+    return Subject(person, shaped, renderer, partial(clothed_source, body, name), facts, renderer)
 
 
 def captured_subject(folder: Path, threads: int, report: Callable[[str], None]) -> Subject:

@@ -28,6 +28,7 @@ from trilane.errors import BadInputError, TrilaneError
 from trilane.training.body_arrays import body_arrays
 from trilane.training.capture.capture_samples import CaptureRenderer
 from trilane.training.capture_error import error_facts, frame_errors, write_held_out_error
+from trilane.training.clothing.looks import DEFAULT_NAME
 from trilane.training.comparison_sheet import comparison_sheet
 from trilane.training.dataset import plan_training, write_dataset
 from trilane.training.evaluate import Evaluated
@@ -76,7 +77,8 @@ class TrainConfig:
     `sheet`: picture file that compares held-out samples; None for none.
     `minutes`: of training. `samples`: of the training set. `per_band`: validation samples of each band and seed.
     `held_out`: motions that validation poses come from. `width`: of the network; 64 is full.
-    `capture`: folder of the person to train on; None for the body in `body`, clothed.
+    `capture`: folder of the person to train on; None for the body in `body`, clothed. `look`: of that body, a name of
+    `LOOKS`.
     `weights`: do not train, use these. `resume`: continue from these weights at a lower rate. `network`: start from the
     network of these weights, with a new texture or with `texture`, that of a trained avatar (a name or a folder).
     """
@@ -100,6 +102,7 @@ class TrainConfig:
     network: Path | None = None
     texture: str | None = None
     capture: Path | None = None
+    look: str | None = None
 
 
 def train(config: TrainConfig, report: Callable[[str], None]) -> Path:
@@ -130,7 +133,9 @@ def train(config: TrainConfig, report: Callable[[str], None]) -> Path:
 
 def _subject(config: TrainConfig, report: Callable[[str], None]) -> Subject:
     if config.capture is None:
-        return clothed_subject(config.body, config.workers)
+        return clothed_subject(config.body, config.workers, config.look or DEFAULT_NAME)
+    if config.look is not None:
+        raise BadInputError("--look", repr(config.look), "none beside --capture, which has a person of its own")
     return captured_subject(config.capture, config.workers, report)
 
 
@@ -190,6 +195,8 @@ def _render_training_set(subject: Subject, config: TrainConfig, report: Callable
     wanted: dict[str, Any] = {"samples": config.samples, "seed": config.seed}
     if config.capture is not None:
         wanted |= {"capture": str(config.capture.resolve())}
+    elif config.look is not None:
+        wanted |= {"look": config.look}
     if facts.exists():
         present = json.loads(facts.read_text())
         if present != wanted:

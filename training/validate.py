@@ -20,6 +20,7 @@ from trilane.scene.motion.motion import Motion
 from trilane.scene.schema import AvatarSpec
 from trilane.stages.dsp.runtime import load_runtime
 from trilane.stages.machine_facts import package_version
+from trilane.training.clothing.looks import look_of
 from trilane.training.dataset import VALIDATION_SIZE, plan_validation
 from trilane.training.error_summary import SampleError, summary
 from trilane.training.evaluate import Evaluated, Painter, evaluate, integer_painter
@@ -71,7 +72,8 @@ def held_out_motions(names: Iterable[str]) -> list[Motion]:
 def open_renderer(bundle: Bundle, threads: int) -> SampleRenderer:
     """The renderer of the samples of `bundle`'s body. Raises BadInputError, MissingPartError."""
     manifest = bundle.manifest
-    return SampleRenderer(load_body(bundle.body_path).shape(manifest.betas, manifest.expression), threads)
+    shaped = load_body(bundle.body_path).shape(manifest.betas, manifest.expression)
+    return SampleRenderer(shaped, threads, look=look_of(manifest.provenance))
 
 
 def validate(

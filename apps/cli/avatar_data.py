@@ -47,6 +47,9 @@ def create_data(
     fit_deg: Annotated[float, typer.Option(min=0, max=45, help="Turn joints of the fits by up to so much.")] = 0.0,
     fit_mm: Annotated[float, typer.Option(min=0, max=1000, help="Move the fits by up to so much.")] = 0.0,
     mask_px: Annotated[float, typer.Option(min=0, max=50, help="Move the outline of masks by up to so much.")] = 0.0,
+    look: Annotated[
+        str, typer.Option(help="Who is drawn: default, or hiker, of another build in other clothes.")
+    ] = "default",
     json: JsonOption = False,
 ) -> None:
     """Draw frames of the default body, clothed, with masks, fits and the camera: a capture to try the training on.
@@ -57,20 +60,24 @@ def create_data(
     from trilane.body.body import load_body
     from trilane.training.capture.capture import BODY
     from trilane.training.capture.synthetic import Recipe, SyntheticCapture, write_capture
+    from trilane.training.clothing.looks import look_named
     from trilane.writing import write_folder
 
-    recipe = Recipe(frames, _shape(output), seed, fit_deg, fit_mm, mask_px)
+    recipe = Recipe(frames, _shape(output), seed, fit_deg, fit_mm, mask_px, look)
+    betas = look_named(look).betas
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
         raise BadInputError(folder, "files" if folder.is_dir() else "a file", "a folder that is not there yet")
     with spinner("putting clothes on the body"):
-        capture = SyntheticCapture(load_body(bundle_folder("default") / BODY).shape(), recipe)
+        capture = SyntheticCapture(load_body(bundle_folder("default") / BODY).shape(betas), recipe)
     _state_cost(capture, recipe)
     with write_folder(folder) as draft, _tracked("drawing frames") as track:
         for _ in track(range(frames), write_capture(draft, capture, recipe)):
             pass
     noise = {"fit_deg": fit_deg, "fit_mm": fit_mm, "mask_px": mask_px}
-    facts = {"capture": str(folder), "frames": frames, "size": [*recipe.shape[::-1]], "seed": seed, "noise": noise}
-    print_facts({**facts, "truth": str(folder / "truth") if recipe.is_noisy else None}, json)
+    facts = {"capture": str(folder), "frames": frames, "size": [*recipe.shape[::-1]], "seed": seed}
+    print_facts(
+        {**facts, "look": look, "noise": noise, "truth": str(folder / "truth") if recipe.is_noisy else None}, json
+    )
 
 
 def check_data(

@@ -15,11 +15,12 @@ from trilane.errors import MissingPartError
 def ground_truth(bundle: Bundle) -> tuple[Any, Any]:
     """The renderer of the bundle's body, clothed, and the `image_error` of two pictures. Raises MissingPartError."""
     try:
+        from trilane.training.clothing.looks import look_of
         from trilane.training.image_error import image_error
         from trilane.training.sample_renderer import SampleRenderer
     except ImportError as error:
         raise MissingPartError(f"ground truth needs {error.name}", extra="train") from None
-    return SampleRenderer(shaped_body(bundle)), image_error
+    return SampleRenderer(shaped_body(bundle), look=look_of(bundle.manifest.provenance)), image_error
 
 
 def shaped_body(bundle: Bundle) -> ShapedBody:

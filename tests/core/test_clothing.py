@@ -8,8 +8,10 @@ import pytest
 from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import load_body
 from trilane.training.body_arrays import BodyArrays
+from trilane.training.clothing.garments import GARMENTS
 from trilane.training.clothing.landmarks import find_landmarks
 from trilane.training.clothing.layers import MATERIALS, clothing_layers
+from trilane.training.clothing.looks import DEFAULT
 from trilane.training.clothing.surface_geometry import obscurance, shell, vertex_normals
 
 #: Percentile of a layer's vertices, metres that it stands off the body at least, and the farthest at most. Hair is cut
@@ -43,7 +45,8 @@ def layers(body):
 
 
 def test_every_material_has_a_layer(layers):
-    assert set(layers) == set(MATERIALS)
+    assert set(layers) == {*DEFAULT.garments, "shoe", "sole", "skin"}
+    assert set(MATERIALS) == set(GARMENTS) | {"shoe", "sole", "skin"}
 
 
 @pytest.mark.parametrize("material", STANDOFF)

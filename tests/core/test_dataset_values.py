@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from trilane.training import dataset, sample_renderer
+from trilane.training.clothing.looks import HIKER
 from trilane.training.sample_crop import Crop
 from trilane.training.sample_files import open_groups
 from trilane.training.sample_renderer import Sample, SampleRenderer
@@ -27,8 +28,8 @@ def sample(number: int) -> Any:
 class Renderer:
     """A sample's pictures: its number as colour, and u and v beyond 0..1 at two corners."""
 
-    def __init__(self, shaped: Any, threads: int) -> None:
-        assert (shaped, threads) == ("shape of a body", 1)
+    def __init__(self, shaped: Any, threads: int, look: Any) -> None:
+        assert (shaped, threads, look) == (HIKER.betas, 1, HIKER)
 
     def render(self, asked: Any) -> tuple[Any, Any]:
         uv = np.zeros((*asked.crop.shape, 3), np.float32)
@@ -50,9 +51,9 @@ def test_samples_are_written_by_shape_in_their_order(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(dataset, "ProcessPoolExecutor", pool)
     monkeypatch.setattr(dataset, "SampleRenderer", Renderer)
     monkeypatch.setattr(dataset, "_source", [])
-    bodies = {tmp_path / "body.npz": SimpleNamespace(shape=lambda: "shape of a body")}
+    bodies = {tmp_path / "body.npz": SimpleNamespace(shape=lambda betas: betas)}
     monkeypatch.setattr(dataset, "load_body", bodies.__getitem__)
-    source = partial(dataset.clothed_source, tmp_path / "body.npz")
+    source = partial(dataset.clothed_source, tmp_path / "body.npz", "hiker")
     parts = []
     samples = [sample(number) for number in range(120)]
     dataset.write_dataset(source, samples, tmp_path / "set", 2, lambda rows: parts.append(len(rows)) or rows)
@@ -75,7 +76,7 @@ def test_samples_of_a_frame_follow_each_other(monkeypatch: pytest.MonkeyPatch, t
     class Source:
         def render(self, asked: Any) -> tuple[Any, Any]:
             rendered.append(asked.picture)
-            return Renderer("shape of a body", 1).render(asked)
+            return Renderer(HIKER.betas, 1, HIKER).render(asked)
 
     def pool(*words: Any) -> ThreadPoolExecutor:
         words[2](*words[3])

@@ -266,14 +266,16 @@ def test_ground_truth_is_drawn_as_training_draws_it(monkeypatch: pytest.MonkeyPa
     """Of the body in the shape that the manifest says; needs what the error of a picture needs."""
     pytest.importorskip("skimage")
     from trilane.training import sample_renderer
+    from trilane.training.clothing.looks import LOOKS
     from trilane.training.image_error import image_error
 
     asked: list[Any] = []
     body = SimpleNamespace(shape=lambda *shape: asked.append(shape) or "shaped")
     monkeypatch.setattr(ground_truth, "load_body", lambda path: asked.append(path) or body)
-    monkeypatch.setattr(sample_renderer, "SampleRenderer", lambda shaped: ("studio", shaped))
-    bundle: Any = SimpleNamespace(body_path="path", manifest=SimpleNamespace(betas="betas", expression="expression"))
-    assert ground_truth.ground_truth(bundle) == (("studio", "shaped"), image_error)
+    monkeypatch.setattr(sample_renderer, "SampleRenderer", lambda shaped, look: ("studio", shaped, look))
+    manifest = SimpleNamespace(betas="betas", expression="expression", provenance={"look": "hiker"})
+    bundle: Any = SimpleNamespace(body_path="path", manifest=manifest)
+    assert ground_truth.ground_truth(bundle) == (("studio", "shaped", LOOKS["hiker"]), image_error)
     assert asked == ["path", ("betas", "expression")]
 
 

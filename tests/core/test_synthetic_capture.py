@@ -29,6 +29,7 @@ from trilane.training.capture.synthetic import (
     write_capture,
 )
 from trilane.training.capture.view_coverage import camera_direction, frames_by_side
+from trilane.training.clothing.looks import LOOKS
 from trilane.training.random_views import look_at, perspective
 
 NOISY = Recipe(6, (64, 96), seed=3, fit_deg=1.0, fit_mm=5.0, mask_px=2.0)
@@ -157,6 +158,24 @@ def test_the_cost_is_that_of_what_is_written(body: ShapedBody, tmp_path: Path) -
     assert cost.disk_bytes * 6 == pytest.approx(written, rel=0.1) and cost.seconds > 0
 
 
+def test_fits_have_the_shape_of_the_look(body: ShapedBody, tmp_path: Path) -> None:
+    """Of the hiker, whose body the capture then has, which is another one than the default's."""
+    recipe = Recipe(4, (64, 96), look="hiker")
+    list(write_capture(tmp_path, Drawn(body, recipe), recipe))
+    capture = open_capture(tmp_path)
+    assert capture.betas[:6] == pytest.approx(LOOKS["hiker"].betas) and not capture.betas[6:].any()
+    wanted = body.body.shape(LOOKS["hiker"].betas).vertices
+    assert np.abs(capture.shaped.vertices - wanted).max() < 1e-6
+    assert np.abs(wanted - body.vertices).max() > 0.05
+    assert "# Look: hiker." in (tmp_path / "capture.toml").read_text()
+
+
+def test_the_person_wears_what_the_recipe_says(body: ShapedBody, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(synthetic, "SampleRenderer", lambda shaped, look: SimpleNamespace(shaped=shaped, look=look))
+    for name, look in LOOKS.items():
+        assert SyntheticCapture(body, Recipe(4, (64, 96), look=name))._renderer.look is look
+
+
 def test_the_command_writes_all_or_nothing(tmp_path: Path, command: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(synthetic, "SyntheticCapture", Drawn)
     words = ("avatar", "create-data", tmp_path / "new", "--frames", 5, "--output", "96x64", "--fit-mm", 2)
@@ -166,6 +185,8 @@ def test_the_command_writes_all_or_nothing(tmp_path: Path, command: Any, monkeyp
     assert "expected a folder that is not there yet" in command(*words, code=2)[1]
     for wrong in ("96", "96x63", "5000x600", "96x64x3"):
         assert "--output: found" in command(*words[:2], tmp_path / "w", "--output", wrong, code=2)[1]
+
+    assert "expected one of default, hiker" in command(*words[:2], tmp_path / "w", "--look", "nobody", code=2)[1]
 
     def break_off(*_: Any) -> Any:
         raise BadInputError("fits", "a defect", "none")

@@ -81,7 +81,7 @@ def calls(monkeypatch):
 
         monkeypatch.setattr(command, name, asked)
 
-    part("clothed_subject", lambda body, _: Subject(Person(body), "shaped", "renderer", "source", CLOTHED, "renderer"))
+    part("clothed_subject", lambda body, *_: Subject(Person(body), "shaped", "renderer", "source", CLOTHED, "renderer"))
     part("plan_training", "planned")
     part("write_dataset")
     part("open_groups", "groups")
@@ -128,7 +128,7 @@ def test_every_part_gets_what_is_its(config, calls, tmp_path):
         *("fit", "open_groups", "quantise_avatar", "write_avatar", "load_bundle", "float_painter", "validate"),
         *("revalidate", "comparison_sheet"),
     ]
-    assert said["clothed_subject"] == (config.body, 2)
+    assert said["clothed_subject"] == (config.body, 2, "default")
     assert said["plan_training"] == ("renderer", 6, 11)
     assert said["write_dataset"] == ("source", "planned", work / "training", 2)
     assert said["open_groups"] == (work / "training",)
@@ -235,6 +235,17 @@ def test_a_capture_is_another_source_and_is_measured_on_its_own_frames(config, c
     assert json.loads((config.work / "dataset.json").read_text())["capture"] == str(folder)
     with pytest.raises(BadInputError, match="use another --work folder"):
         train(config, lines.append)
+    with pytest.raises(BadInputError, match="none beside --capture"):
+        train(replace(one, look="hiker"), lines.append)
+
+
+def test_the_look_is_that_of_the_person_and_of_the_samples(config, calls):
+    """A work folder has the samples of one look."""
+    train(replace(config, look="hiker"), lambda _: None)
+    assert next(call for call in calls if call[0] == "clothed_subject") == ("clothed_subject", config.body, 2, "hiker")
+    assert json.loads((config.work / "dataset.json").read_text())["look"] == "hiker"
+    with pytest.raises(BadInputError, match="use another --work folder"):
+        train(config, lambda _: None)
 
 
 def test_no_sheet_is_drawn_when_none_is_asked_for(config, calls):
@@ -302,15 +313,15 @@ EVERY = [
     *("--body", "d/b.npz", "--out", "d/o", "--name", "a b", "--work", "d/w", "--sheet", "d/s.png", "--minutes", "2.5"),
     *("--samples", "7", "--per-band", "6", "--held-out", "d/jump.bvh", "--held-out", "builtin:idle", "--width", "8"),
     *("--workers", "2", "--threads", "4", "--batch", "3", "--seed", "5", "--weights", "d/f.npz"),
-    *("--resume", "d/r.npz", "--network", "d/n.npz", "--texture", "somebody"),
+    *("--resume", "d/r.npz", "--network", "d/n.npz", "--texture", "somebody", "--look", "hiker"),
 ]
 ALL = TrainConfig(
     Path("d/b.npz"), Path("d/o"), "a b", Path("d/w"), Path("d/s.png"), 2.5, 7, 6, ("d/jump.bvh", "builtin:idle"), 8, 2,
-    4, 3, 5, Path("d/f.npz"), Path("d/r.npz"), Path("d/n.npz"), "somebody",
+    4, 3, 5, Path("d/f.npz"), Path("d/r.npz"), Path("d/n.npz"), "somebody", None, "hiker",
 )  # fmt: skip
 USUAL = TrainConfig(
     bundle_folder("default") / "body.npz", Path("avatar"), "default", Path("avatar-work"), None, 60.0, 4000, 24,
-    ("builtin:walk-wave-turn",), 16, 3, 1, 4, 1, None, None, None, None,
+    ("builtin:walk-wave-turn",), 16, 3, 1, 4, 1, None, None, None, None, None, None,
 )  # fmt: skip
 
 
@@ -340,7 +351,7 @@ def test_the_command_is_written_without_folders():
     assert command_of(ALL) == (
         "python -m trilane.training.train --name 'a b' --minutes 2.5 --samples 7 --per-band 6 --held-out jump.bvh "
         "--held-out builtin:idle --width 8 --workers 2 --threads 4 --batch 3 --seed 5 --weights f.npz --resume r.npz "
-        "--network n.npz --texture somebody"
+        "--network n.npz --texture somebody --look hiker"
     )
 
 

@@ -17,6 +17,7 @@ pytest.importorskip("skimage")
 from trilane.avatars.bundle import Bundle, load_bundle
 from trilane.avatars.digests import digests_of
 from trilane.training import dataset, evaluate, validate
+from trilane.training.clothing.looks import LOOKS
 from trilane.training.image_error import image_error
 from trilane.training.random_poses import random_pose
 from trilane.training.sample_renderer import SampleRenderer
@@ -199,8 +200,11 @@ def test_samples_are_of_the_avatars_own_shape(monkeypatch, tiny_bundle):
     bundle = load_bundle(tiny_bundle)
     bundle = Bundle(bundle.folder, bundle.manifest.model_copy(update={"betas": (1.0,), "expression": (2.0,)}))
     monkeypatch.setattr(validate, "load_body", lambda path: SimpleNamespace(shape=lambda *shape: (path, shape)))
-    monkeypatch.setattr(validate, "SampleRenderer", lambda *words: words)
-    assert validate.open_renderer(bundle, 4) == ((tiny_bundle / "body.npz", ((1.0,), (2.0,))), 4)
+    monkeypatch.setattr(validate, "SampleRenderer", lambda *words, look: (*words, look))
+    shaped = (tiny_bundle / "body.npz", ((1.0,), (2.0,)))
+    assert validate.open_renderer(bundle, 4) == (shaped, 4, LOOKS["default"])
+    manifest = bundle.manifest.model_copy(update={"provenance": {"look": "hiker"}})
+    assert validate.open_renderer(Bundle(bundle.folder, manifest), 4) == (shaped, 4, LOOKS["hiker"])
 
 
 # --- what samples are made of -------------------------------------------------------------------------------------

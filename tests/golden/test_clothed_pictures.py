@@ -7,8 +7,13 @@ import pytest
 
 pytest.importorskip("torch")
 
+from trilane.avatars.bundle import bundle_folder
+from trilane.body.body import load_body
+from trilane.training.clothing import layers
+from trilane.training.clothing.looks import HIKER
 from trilane.training.random_poses import random_pose
 from trilane.training.random_views import BANDS
+from trilane.training.sample_renderer import SampleRenderer
 
 
 @pytest.mark.parametrize("band", BANDS)
@@ -30,6 +35,24 @@ def test_the_paint_is_as_it_was(renderer, golden, view, seed):
     _, rgba = renderer.render(renderer.plan((7, seed), lambda _: np.zeros((55, 3)), view, "256"))
     over_black = (rgba[..., :3] * (rgba[..., 3:] / 255)).round().astype(np.uint8)
     golden(f"clothes-{view}-{seed}", over_black, 1.0, 0.02)
+
+
+@pytest.fixture(scope="module")
+def opened_hiker(gl):  # noqa: ARG001 - where no context can be made, `gl` skips the test
+    """Its obscurance is coarse, which takes a third of the time."""
+    body = load_body(bundle_folder("default") / "body.npz").shape(HIKER.betas)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(layers, "EMITTERS", 600)
+        return SampleRenderer(body, threads=2, look=HIKER)
+
+
+@pytest.mark.parametrize(("view", "seed"), [("full_body", 2), ("face", 3)])
+def test_the_other_look_is_as_it_was(opened_hiker, golden, view, seed):
+    """Shorter, in jacket and shorts, with hair to the jaw; the bounds are the default look's."""
+    opened_hiker.ctx.__enter__()
+    _, rgba = opened_hiker.render(opened_hiker.plan((7, seed), lambda _: np.zeros((55, 3)), view, "256"))
+    over_black = (rgba[..., :3] * (rgba[..., 3:] / 255)).round().astype(np.uint8)
+    golden(f"hiker-{view}-{seed}", over_black, 1.0, 0.02)
 
 
 def test_clothes_skin_and_hair_have_their_own_colours(renderer):

@@ -17,6 +17,7 @@ from trilane.training.clothing.clothed_body import PAINT, _places
 from trilane.training.clothing.garments import GARMENTS
 from trilane.training.clothing.landmarks import Landmarks, find_landmarks
 from trilane.training.clothing.layers import MATERIALS
+from trilane.training.clothing.looks import DEFAULT, HIKER, Look
 from trilane.training.clothing.surface_geometry import vertex_normals
 
 #: Points of each material, and the rows and columns of their picture.
@@ -45,6 +46,11 @@ def landmarks(arrays: BodyArrays) -> Landmarks:
     return find_landmarks(arrays.vertices, arrays.joints, arrays.weights)
 
 
+def look_of(material: str) -> Look:
+    """The look that has the garment; skin, shoes and soles are the default's."""
+    return HIKER if material in HIKER.garments else DEFAULT
+
+
 def points_of(material: str, body: BodyArrays, landmarks: Landmarks, random: np.random.Generator) -> tuple[F64, F64]:
     """Points 3 mm off the faces that the material may cover, half of them by area, and 1 for those on an eyeball."""
     eyes = landmarks.eyeball[body.faces].all(axis=1)
@@ -67,7 +73,7 @@ def points_of(material: str, body: BodyArrays, landmarks: Landmarks, random: np.
 
 def painted(gl: Any, landmarks: Landmarks, material: str, content: F64, turn: F64, shape: tuple[int, int]) -> Any:
     """(h,w,4) of the points of `content`, whose columns are `POINTS`'s inputs, seen by a camera that is turned so."""
-    program = gl.program(POINTS, shader_source(PAINT))
+    program = gl.program(POINTS, shader_source(PAINT, **look_of(material).definitions(landmarks)))
     view = np.eye(4)
     view[:3, :3] = turn
     places = {"material": MATERIALS.index(material), "view": tuple(view.T.ravel()), "eye": (0.3, 0.4, 3.0)}

@@ -24,6 +24,7 @@ from trilane.scene.lens import Lens, centred
 from trilane.scene.rotations import rotvec_from_matrix
 from trilane.shapes import Shape
 from trilane.training.capture.capture_file import FAR_M, NAME, NEAR_M, OPENGL_FROM_OPENCV
+from trilane.training.clothing.looks import DEFAULT_NAME, look_named
 from trilane.training.random_poses import random_pose
 from trilane.training.random_views import look_at
 from trilane.training.sample_renderer import SampleRenderer
@@ -50,6 +51,7 @@ class Recipe:
 
     `fit_deg`: each joint of a fit is turned about a random axis by up to so many degrees. `fit_mm`: the body is moved
     by up to so many millimetres along each axis. `mask_px`: the outline of a mask is moved by up to so many pixels.
+    `look`: of the person, a name of `LOOKS`.
     """
 
     frames: int
@@ -58,10 +60,16 @@ class Recipe:
     fit_deg: float = 0.0
     fit_mm: float = 0.0
     mask_px: float = 0.0
+    look: str = DEFAULT_NAME
 
     @property
     def is_noisy(self) -> bool:
         return max(self.fit_deg, self.fit_mm, self.mask_px) > 0
+
+    @property
+    def betas(self) -> F64:
+        """(10,) of the look's body."""
+        return np.array([*look_named(self.look).betas, *[0.0] * 10][:10])
 
     @property
     def lens(self) -> Lens:
@@ -84,9 +92,9 @@ class SyntheticCapture:
     """Draws the frames of a recipe, with an OpenGL context of its own."""
 
     def __init__(self, shaped: ShapedBody, recipe: Recipe) -> None:
-        """Put clothes on `shaped` and open the context. Raises MissingPartError without OpenGL."""
+        """Put clothes on `shaped`, whose shape is the look's, and open the context. Raises MissingPartError."""
         self._recipe, self._root = recipe, shaped.joints[0]
-        self._renderer = SampleRenderer(shaped)
+        self._renderer = SampleRenderer(shaped, look=look_named(recipe.look))
         self._projection = recipe.lens.projection(NEAR_M, FAR_M)
         self._background = _patches(np.random.default_rng((recipe.seed, 4)), recipe.shape, BACKGROUND_PATCH_PX, 3)
 
@@ -176,19 +184,19 @@ def write_capture(folder: Path, capture: SyntheticCapture, recipe: Recipe) -> It
     for number in range(recipe.frames):
         exact = capture.frame(number)
         Image.fromarray(exact.frame).save(folder / "frames" / f"{number:06}.png", compress_level=FAST_PNG)
-        _write_shot(folder, number, capture.noisy(number, exact))
+        _write_shot(folder, number, capture.noisy(number, exact), recipe)
         if recipe.is_noisy:
-            _write_shot(folder / TRUTH, number, exact)
+            _write_shot(folder / TRUTH, number, exact, recipe)
         yield number
 
 
-def _write_shot(folder: Path, number: int, shot: SyntheticFrame) -> None:
+def _write_shot(folder: Path, number: int, shot: SyntheticFrame, recipe: Recipe) -> None:
     Image.fromarray(shot.mask).save(folder / "masks" / f"{number:06}.png", compress_level=FAST_PNG)
-    np.savez(folder / "fits" / f"{number:06}.npz", **fit_arrays(shot.pose, shot.place))
+    np.savez(folder / "fits" / f"{number:06}.npz", **fit_arrays(shot.pose, shot.place, recipe.betas))
 
 
-def fit_arrays(pose: F64, place: F64) -> dict[str, Any]:
-    """A fit by the names of SMPL-X, float32: `pose` (55,3), `place` (3,)."""
+def fit_arrays(pose: F64, place: F64, betas: F64) -> dict[str, Any]:
+    """A fit by the names of SMPL-X, float32: `pose` (55,3), `place` (3,), `betas` (10,)."""
     row = pose.reshape(-1)
     parts: dict[str, Floats] = {
         "global_orient": row[:3],
@@ -199,7 +207,7 @@ def fit_arrays(pose: F64, place: F64) -> dict[str, Any]:
         "left_hand_pose": row[LEFT_HAND],
         "right_hand_pose": row[RIGHT_HAND],
         "transl": place,
-        "betas": np.zeros(10),
+        "betas": betas,
     }
     return {name: part.astype(np.float32) for name, part in parts.items()}
 
@@ -210,6 +218,7 @@ def capture_text(recipe: Recipe, frames: str) -> str:
     noise = f"fits up to {recipe.fit_deg:g} degrees and {recipe.fit_mm:g} mm, masks up to {recipe.mask_px:g} pixels off"
     return f"""\
 # The default body, clothed, drawn by `trilane avatar create-data`: {recipe.frames} frames, seed {recipe.seed}.
+# Look: {recipe.look}.
 # Noise: {noise if recipe.is_noisy and frames == "frames" else "none"}.
 schema = 1
 body = "default"
@@ -245,5 +254,5 @@ def measured_cost(capture: SyntheticCapture, recipe: Recipe) -> Cost:
     for picture in (exact.frame, *(shot.mask for shot in shots)):
         Image.fromarray(picture).save(file, "png", compress_level=FAST_PNG)
     for shot in shots:
-        np.savez(file, **fit_arrays(shot.pose, shot.place))
+        np.savez(file, **fit_arrays(shot.pose, shot.place, recipe.betas))
     return Cost(time.monotonic() - start, file.tell())

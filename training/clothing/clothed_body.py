@@ -17,6 +17,7 @@ from trilane.stages.gpu.skinned_mesh import SkinnedMesh
 from trilane.training.clothing import landmarks as joint
 from trilane.training.clothing.landmarks import Landmarks
 from trilane.training.clothing.layers import MATERIALS, Layer
+from trilane.training.clothing.looks import DEFAULT, Look
 from trilane.training.clothing.shaded_raster import ShadedMesh, ShadedRaster
 
 WEIGHTS_PER_VERTEX = 8
@@ -26,17 +27,20 @@ PAINT = Path(str(files("trilane.training.clothing") / "paint.frag"))
 class ClothedBody:
     """Draws the layers of a clothed body."""
 
-    def __init__(self, ctx: Any, layers: list[Layer], landmarks: Landmarks, samples: int) -> None:
+    def __init__(self, ctx: Any, layers: list[Layer], landmarks: Landmarks, samples: int, look: Look = DEFAULT) -> None:
         """Put the layers on the GPU.
 
         `ctx`: the OpenGL context.
         `layers`: of `clothing_layers`.
         `landmarks`: of the body at rest.
         `samples`: along each side of a pixel, an even number.
+        `look`: of the layers.
         """
-        placed = _places(landmarks)
+        placed, definitions = _places(landmarks), look.definitions(landmarks)
         self._meshes = [
-            ShadedMesh(ctx, _mesh(ctx, layer), PAINT, uniforms=placed | {"material": MATERIALS.index(layer.material)})
+            ShadedMesh(
+                ctx, _mesh(ctx, layer), PAINT, placed | {"material": MATERIALS.index(layer.material)}, definitions
+            )
             for layer in layers
         ]
         self._raster = ShadedRaster(ctx, samples)

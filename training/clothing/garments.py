@@ -69,9 +69,54 @@ def _hair_thickness(at: F64, landmarks: Landmarks) -> tuple[F64, F64, int]:
     return offset, 0.75 * offset, 8
 
 
+def _shorts_covers(at: F64, landmarks: Landmarks) -> NDArray[np.bool_]:
+    return np.asarray(_trousers_covers(at, landmarks) & (at[:, 1] > landmarks.joints[joint.KNEE, 1] - 0.02))
+
+
+def _shorts_thickness(at: F64, landmarks: Landmarks) -> tuple[F64, F64, int]:
+    joints = landmarks.joints
+    thigh = smoothstep(joints[joint.HIP, 1] - 0.08, joints[joint.KNEE, 1] + 0.06, at[:, 1])
+    waist = smoothstep(joints[joint.HIP, 1] - 0.02, joints[joint.PELVIS, 1] + 0.08, at[:, 1])
+    folds = 0.003 * np.sin(27.0 * at[:, 0] + 12.0 * at[:, 2] + 2.0 * np.sin(13.0 * at[:, 1]))
+    offset = (0.018 + 0.020 * thigh + folds * thigh) * (1 - waist) + 0.009 * waist
+    return offset, 0.8 * offset, 20
+
+
+def _jacket_covers(at: F64, landmarks: Landmarks) -> NDArray[np.bool_]:
+    joints = landmarks.joints
+    sleeve = np.abs(at[:, 0]) < joints[joint.WRIST, 0]
+    above, below = at[:, 1] > joints[joint.HIP, 1] - 0.12, at[:, 1] < joints[joint.HEAD, 1] - 0.02
+    return np.asarray(sleeve & above & below)
+
+
+def _jacket_thickness(at: F64, landmarks: Landmarks) -> tuple[F64, F64, int]:
+    joints = landmarks.joints
+    along = (np.abs(at[:, 0]) - joints[joint.SHOULDER, 0]) / (joints[joint.WRIST, 0] - joints[joint.SHOULDER, 0])
+    cuff = smoothstep(0.75, 0.97, along)
+    hem = smoothstep(joints[joint.PELVIS, 1] + 0.14, joints[joint.HIP, 1] + 0.02, at[:, 1]) * (along < 0)
+    neck = smoothstep(joints[joint.NECK, 1] - 0.09, joints[joint.NECK, 1] - 0.02, at[:, 1])
+    folds = 0.004 * np.sin(29.0 * at[:, 1] + 34.0 * np.abs(at[:, 0]) + 2.0 * np.sin(9.0 * at[:, 2]))
+    offset = (0.027 + 0.014 * hem + folds * (1 - neck)) * (1 - 0.45 * cuff) * (1 - 0.25 * neck)
+    return offset, 0.8 * offset, 14
+
+
+def _bob_thickness(at: F64, landmarks: Landmarks) -> tuple[F64, F64, int]:
+    """Hair that falls straight to the jaw, over the ears."""
+    up = smoothstep(landmarks.eye[1] + 0.01, landmarks.crown - 0.02, at[:, 1])
+    front = smoothstep(landmarks.eye[2] - 0.07, landmarks.eye[2] - 0.01, at[:, 2])
+    end = smoothstep(landmarks.eye[1] - 0.03, landmarks.eye[1] - 0.09, at[:, 1])
+    ear = smoothstep(0.05, 0.0, np.linalg.norm(np.abs(at) * (1, 0, 0) + at * (0, 1, 1) - landmarks.ear, axis=1))
+    lock = np.sin(75.0 * at[:, 0] + 60.0 * at[:, 2])
+    offset = (0.020 + 0.006 * up + 0.0012 * lock) * (1 - 0.35 * front) * (1 - 0.3 * end) * (1 - 0.7 * ear)
+    return offset, 0.75 * offset, 16
+
+
 #: Garment to the vertices it may cover, and its offset, least offset (metres) and rounds of relaxation.
 GARMENTS: dict[str, tuple[Covers, Thickness]] = {
     "trousers": (_trousers_covers, _trousers_thickness),
     "shirt": (_shirt_covers, _shirt_thickness),
     "hair": (_hair_covers, _hair_thickness),
+    "shorts": (_shorts_covers, _shorts_thickness),
+    "jacket": (_jacket_covers, _jacket_thickness),
+    "bob": (_hair_covers, _bob_thickness),
 }

@@ -17,7 +17,7 @@ from trilane.body.joints import JOINT_INDEX
 PELVIS, NECK, HEAD = JOINT_INDEX["pelvis"], JOINT_INDEX["neck"], JOINT_INDEX["head"]
 #: Of joints that both sides have, the left one.
 HIP, KNEE, ANKLE, FOOT = (JOINT_INDEX[f"left_{name}"] for name in ("hip", "knee", "ankle", "foot"))
-SHOULDER, ELBOW = JOINT_INDEX["left_shoulder"], JOINT_INDEX["left_elbow"]
+SHOULDER, ELBOW, WRIST = (JOINT_INDEX[f"left_{name}"] for name in ("shoulder", "elbow", "wrist"))
 LEFT_EYE, RIGHT_EYE = JOINT_INDEX["left_eye"], JOINT_INDEX["right_eye"]
 #: Ankle of each foot by its side: 1 is the left one (+X), -1 the right one.
 ANKLES = {1: JOINT_INDEX["left_ankle"], -1: JOINT_INDEX["right_ankle"]}

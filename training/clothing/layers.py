@@ -1,4 +1,4 @@
-"""The layers of a clothed body: skin, trousers, shirt, hair, shoes and their soles.
+"""The layers of a clothed body: its garments and hair, shoes and their soles, skin.
 
 Rule: a layer is a mesh that is skinned by the body's own weights; `paint.frag` decides where it ends and how it looks.
 """
@@ -15,11 +15,12 @@ from trilane.arrays import F64
 from trilane.training.body_arrays import BodyArrays
 from trilane.training.clothing.garments import GARMENTS
 from trilane.training.clothing.landmarks import ANKLES, Landmarks
+from trilane.training.clothing.looks import DEFAULT, Look
 from trilane.training.clothing.shoes import shoe
 from trilane.training.clothing.surface_geometry import Smoother, obscurance, shell, vertex_areas, vertex_normals
 
 #: Their order is that of `material` in `paint.frag`.
-MATERIALS = ("skin", "trousers", "shirt", "hair", "shoe", "sole")
+MATERIALS = ("skin", "trousers", "shirt", "hair", "shoe", "sole", "shorts", "jacket", "bob")
 OBSCURANCE_REACH_M = 0.25
 #: Number of vertices, of all layers together, that obscure others.
 EMITTERS = 6000
@@ -54,10 +55,10 @@ class _Sheet(NamedTuple):
     weights: F64
 
 
-def clothing_layers(body: BodyArrays, landmarks: Landmarks) -> list[Layer]:
-    """All layers of the clothed body, outer ones first. The uppers of both shoes are one layer, their soles another."""
+def clothing_layers(body: BodyArrays, landmarks: Landmarks, look: Look = DEFAULT) -> list[Layer]:
+    """All layers of the body in `look`, outer ones first. Both shoes are one layer, their soles another."""
     sheets = [
-        *(_garment(body, landmarks, name) for name in GARMENTS),
+        *(_garment(body, landmarks, name) for name in look.garments),
         *_shoes(body, landmarks),
         _Sheet("skin", body.vertices, body.faces, body.vertices, body.weights),
     ]

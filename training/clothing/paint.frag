@@ -1,6 +1,8 @@
 #version 330
 // Paints the clothed body: where each layer ends, its colours, and the light of a soft lamp on the camera.
 // Everything is placed by the point at rest, `v_rest` (metres), relative to landmarks of the body.
+// Definitions are of the look, in `looks.py`: colours in sRGB; HAIRLINE, FRINGE and WHORL of the hair, EAR_RING round
+// the ears; where sleeves (SLEEVE_END), what covers the legs (LEGS_END) and socks (SOCK_END) end.
 // v_colour: r is the obscurance, 1 in the open; g is 1 on the eyeballs.
 
 in vec3 v_position;
@@ -10,7 +12,7 @@ in vec4 v_colour;
 
 uniform mat4 view;
 uniform vec3 eye;
-uniform int material;      // 0 skin, 1 trousers, 2 shirt, 3 hair, 4 shoe, 5 sole
+uniform int material;      // 0 skin, 1 trousers, 2 shirt, 3 hair, 4 shoe, 5 sole, 6 shorts, 7 jacket, 8 bob
 uniform vec3 eyeball;      // centre of the left one
 uniform float eyeball_radius;
 uniform vec3 ear;          // tip of the left one
@@ -23,20 +25,6 @@ uniform vec3 ankle;        // left
 uniform vec3 toes;         // left, root of the toes
 
 out vec4 pixel;
-
-const vec3 SKIN = vec3(0.88, 0.67, 0.54);
-const vec3 BLUSH = vec3(0.84, 0.47, 0.40);
-const vec3 LIP = vec3(0.75, 0.42, 0.38);
-const vec3 BROW = vec3(0.24, 0.15, 0.10);
-const vec3 IRIS = vec3(0.24, 0.42, 0.46);
-const vec3 SHIRT = vec3(0.07, 0.47, 0.52);
-const vec3 CREAM = vec3(0.66, 0.80, 0.75);
-const vec3 DENIM = vec3(0.20, 0.23, 0.36);
-const vec3 STITCH = vec3(0.36, 0.34, 0.38);
-const vec3 HAIR = vec3(0.29, 0.17, 0.10);
-const vec3 HAIR_LIGHT = vec3(0.50, 0.32, 0.19);
-const vec3 SHOE = vec3(0.78, 0.24, 0.17);
-const vec3 RUBBER = vec3(0.88, 0.85, 0.80);
 
 float band(float x, float half_width, float soft) {  // 1 where |x| < half_width
     return 1.0 - smoothstep(half_width - soft, half_width + soft, abs(x));
@@ -57,12 +45,11 @@ float rough(vec3 p) {  // smooth, about -1..1
 float hairline(vec3 p) {  // > 0 in the hair
     vec3 q = p - vec3(0.0, eyeball.yz);
     float side = abs(q.x);
-    float fringe = 0.046 + 0.007 * sin(70.0 * q.x + 1.0) + 0.004 * sin(170.0 * q.x) + 0.012 * smoothstep(0.03, 0.0, abs(q.x - 0.022));
-    float temple = -0.012;
-    float nape = -0.088 + 0.006 * sin(90.0 * q.x);
-    float line = mix(temple, fringe, smoothstep(-0.052, -0.030, q.z));
+    float forehead = HAIRLINE.x + FRINGE * 0.007 * sin(70.0 * q.x + 1.0) + FRINGE * 0.004 * sin(170.0 * q.x) + FRINGE * 0.012 * smoothstep(0.03, 0.0, abs(q.x - 0.022));
+    float nape = HAIRLINE.z + 0.006 * sin(90.0 * q.x);
+    float line = mix(HAIRLINE.y, forehead, smoothstep(-0.052, -0.030, q.z));
     line = mix(line, nape, smoothstep(ear.z - eyeball.z - 0.012, ear.z - eyeball.z - 0.024, q.z));
-    float ring = length((p.zy - ear.zy - vec2(0.000, -0.016)) / vec2(0.023, 0.032)) - 1.0;
+    float ring = length((p.zy - ear.zy - vec2(0.000, -0.016)) / (EAR_RING * vec2(0.023, 0.032))) - 1.0;
     float around = side > 0.045 ? ring * 0.025 : 1.0;
     return min(q.y - line, around);
 }
@@ -105,6 +92,7 @@ vec3 paint_skin(vec3 p) {
     vec2 lid = vec2(s - 0.0320, q.y + 0.0018) / vec2(0.0115, 0.0040);
     float lash = band(length(lid) - 1.05, mix(0.10, 0.26, over(lid.y, 0.3)), 0.12) * mix(0.30, 0.92, over(lid.y, 0.3));
     c = mix(c, vec3(0.12, 0.07, 0.06), face * lash);
+    c = mix(c, SOCK * (0.92 + 0.08 * sin(700.0 * p.y)), over(ankle.y + SOCK_END - p.y, 0.0015));
     // the scalp under the hair
     return mix(c, HAIR * 0.8, 0.9 * smoothstep(0.0, 0.006, hairline(p)) * over(p.y - neck.y - 0.03, 0.01));
 }
@@ -112,19 +100,19 @@ vec3 paint_skin(vec3 p) {
 vec3 paint_shirt(vec3 p) {
     vec3 c = SHIRT * (1.0 + 0.06 * rough(p * vec3(25.0, 18.0, 25.0)));
     float chest = shoulder.y - 0.135;
-    c = mix(c, CREAM, band(p.y - chest, 0.040, 0.0015) * over(shoulder.x - 0.012 - abs(p.x), 0.003));
-    float sleeve_end = mix(shoulder.x, elbow.x, 0.60);
-    c = mix(c, CREAM, over(abs(p.x) - sleeve_end + 0.026, 0.0015));
+    c = mix(c, TRIM, band(p.y - chest, 0.040, 0.0015) * over(shoulder.x - 0.012 - abs(p.x), 0.003));
+    float cuff = mix(shoulder.x, elbow.x, SLEEVE_END);
+    c = mix(c, TRIM, over(abs(p.x) - cuff + 0.026, 0.0015));
     c = mix(c, c * 0.80, band(abs(p.x) - shoulder.x + 0.012, 0.0030, 0.0020) * over(p.y - shoulder.y + 0.10, 0.01));        // shoulder seam
     c = mix(c, c * 0.82, band(p.y - hip.y + 0.042, 0.0030, 0.0020));                    // hem stitch
     float tilt = p.y - neck.y + 0.45 * (p.z - neck.z);
-    c = mix(c, CREAM, over(tilt + 0.012, 0.0015) * over(0.115 - length(p.xz - neck.xz), 0.0015));                                      // collar
+    c = mix(c, TRIM, over(tilt + 0.012, 0.0015) * over(0.115 - length(p.xz - neck.xz), 0.0015));                                      // collar
     float front = over(p.z - neck.z - 0.03, 0.005);
     float placket = front * over(p.y - chest - 0.053, 0.001) * over(-0.012 - tilt, 0.0015);
     c = mix(c, SHIRT * 0.72, placket * band(p.x, 0.017, 0.0012));
     for (int i = 0; i < 2; ++i) {
         float y = mix(chest + 0.053, neck.y - 0.06, 0.25 + 0.45 * float(i));
-        c = mix(c, CREAM, placket * blob(vec2(p.x, p.y - y), vec2(0.0055), 0.15));
+        c = mix(c, TRIM, placket * blob(vec2(p.x, p.y - y), vec2(0.0055), 0.15));
     }
     return c;
 }
@@ -132,30 +120,64 @@ vec3 paint_shirt(vec3 p) {
 vec3 paint_trousers(vec3 p) {
     float front = step(hip.z, p.z);
     vec2 leg = vec2(abs(p.x) - mix(hip.x, ankle.x, clamp((hip.y - p.y) / (hip.y - ankle.y), 0.0, 1.0)), p.z - hip.z);
-    vec3 c = DENIM * (1.0 + 0.07 * rough(p * vec3(22.0, 15.0, 22.0)));
+    vec3 c = TROUSERS * (1.0 + 0.07 * rough(p * vec3(22.0, 15.0, 22.0)));
     float worn = blob(vec2(leg.x, (p.y - mix(hip.y, ankle.y, 0.35)) * 0.35), vec2(0.06, 0.08), 0.8) * front;
-    c = mix(c, DENIM * 1.45, 0.45 * worn);
+    c = mix(c, TROUSERS * 1.45, 0.45 * worn);
     c = mix(c, STITCH, 0.8 * band(p.z - mix(hip.z + 0.005, ankle.z, clamp((hip.y - p.y) / (hip.y - ankle.y), 0.0, 1.0)), 0.0022, 0.0012) * step(0.0, leg.x));
     c = mix(c, STITCH, 0.8 * band(p.y - ankle.y - 0.030, 0.0020, 0.0012));
     float pocket = (p.y - hip.y + 0.045) - 1.1 * (abs(p.x) - 0.115);
     c = mix(c, STITCH, 0.85 * front * band(pocket, 0.0026, 0.0014) * over(abs(p.x) - 0.075, 0.004));
-    c = mix(c, DENIM * 0.6, front * band(p.x, 0.0022, 0.0012) * over(p.y - hip.y + 0.075, 0.004));
+    c = mix(c, TROUSERS * 0.6, front * band(p.x, 0.0022, 0.0012) * over(p.y - hip.y + 0.075, 0.004));
     float back = 1.0 - front;
     vec2 b = vec2(abs(p.x) - 0.085, p.y - hip.y + 0.055);
     float edge = max(abs(b.x) / 0.048, abs(b.y + 0.010 * (1.0 - abs(b.x) / 0.048)) / 0.055);
     return mix(c, STITCH, 0.85 * back * band(edge - 1.0, 0.05, 0.02));
 }
 
+vec3 paint_jacket(vec3 p) {
+    float sleeve = abs(p.x) - shoulder.x, front = step(neck.z, p.z), side = sign(p.x);
+    vec3 c = SHIRT * (1.0 + 0.05 * rough(p * vec3(21.0, 27.0, 21.0)));
+    float chest = shoulder.y - 0.10;
+    c = mix(c, TRIM, over(p.y - chest - 0.35 * max(sleeve + 0.06, 0.0), 0.0015));             // yoke
+    c = mix(c, SHIRT * 0.62, band(p.y - chest - 0.35 * max(sleeve + 0.06, 0.0), 0.0026, 0.0015));
+    c = mix(c, TRIM, band(p.z - shoulder.z, 0.012, 0.0015) * over(sleeve - 0.05, 0.003));       // down the sleeve
+    float cuff = mix(shoulder.x, elbow.x, SLEEVE_END) - 0.040, hem = hip.y + 0.025;
+    float rib = 0.86 + 0.14 * sin((abs(p.x) < shoulder.x ? p.x + p.z : p.y + p.z) * 900.0);
+    c = mix(c, TRIM * 0.55 * rib, max(over(abs(p.x) - cuff, 0.0015), over(hem - p.y, 0.0015)));
+    // zip, pockets on the front, a badge on its left
+    float middle = front * over(0.06 - abs(p.x), 0.001);
+    c = mix(c, SHIRT * 0.45, middle * band(p.x, 0.011, 0.0012));
+    c = mix(c, RUBBER, middle * band(p.x, 0.0032, 0.0010) * over(fract(p.y * 130.0) - 0.35, 0.12));
+    float pocket = p.y - hip.y - 0.13 - 0.9 * (abs(p.x) - 0.10);
+    c = mix(c, SHIRT * 0.42, front * band(pocket, 0.0040, 0.0015) * band(abs(p.x) - 0.095, 0.034, 0.002));
+    c = mix(c, RUBBER, front * over(side, 0.1) * blob(vec2(p.x - 0.085, p.y - chest + 0.050), vec2(0.021), 0.06));
+    c = mix(c, STITCH, front * over(side, 0.1) * blob(vec2(p.x - 0.085, p.y - chest + 0.050), vec2(0.015), 0.08));
+    return mix(c, c * 0.75, band(sleeve + 0.012, 0.0030, 0.0020) * over(p.y - shoulder.y + 0.10, 0.01));  // shoulder seam
+}
+
+vec3 paint_shorts(vec3 p) {
+    float front = step(hip.z, p.z), end = ankle.y + LEGS_END;
+    vec3 c = TROUSERS * (1.0 + 0.06 * rough(p * vec3(24.0, 17.0, 24.0)));
+    vec2 b = vec2(p.z - hip.z, p.y - end - 0.155);                                                      // pocket on the thigh
+    float outer = over(abs(p.x) - hip.x - 0.03, 0.004), edge = max(abs(b.x) / 0.055, abs(b.y) / 0.065);
+    c = mix(c, TROUSERS * 1.14, outer * over(1.0 - edge, 0.02));
+    c = mix(c, STITCH, 0.85 * outer * band(edge - 1.0, 0.035, 0.02));
+    c = mix(c, TROUSERS * 0.70, outer * over(1.0 - edge, 0.02) * band(b.y - 0.030, 0.0030, 0.0015));  // its flap
+    c = mix(c, STITCH, 0.8 * band(p.y - end - 0.022, 0.0022, 0.0012));
+    c = mix(c, TROUSERS * 0.6, front * band(p.x, 0.0024, 0.0012) * over(p.y - hip.y + 0.075, 0.004));
+    return mix(c, STITCH, 0.8 * (1.0 - front) * band(p.x, 0.0022, 0.0012) * over(p.y - hip.y + 0.10, 0.004));
+}
+
 vec3 paint_hair(vec3 p) {
     vec3 q = p - vec3(0.0, eyeball.y + 0.03, eyeball.z - 0.09);
     vec3 d = normalize(q);
-    vec3 whorl = normalize(vec3(0.15, 0.80, -0.58)), across = normalize(cross(whorl, vec3(1.0, 0.0, 0.0)));
+    vec3 whorl = normalize(WHORL), across = normalize(cross(whorl, vec3(1.0, 0.0, 0.0)));
     float along = atan(dot(d, cross(across, whorl)), dot(d, across)) * 10.0 + 3.0 * dot(d, whorl);
     float calm = smoothstep(0.98, 0.80, dot(d, whorl));
     float strands = 0.5 + 0.5 * calm * sin(along * 2.0 + 1.5 * sin(along));
-    vec3 c = mix(HAIR, HAIR_LIGHT, 0.10 + 0.20 * strands);
+    vec3 c = mix(HAIR, STRANDS, 0.10 + 0.20 * strands);
     float shine = band(q.y - 0.062 - 0.012 * sin(along), 0.016, 0.016);
-    c = mix(c, HAIR_LIGHT * 1.2, 0.35 * shine);
+    c = mix(c, STRANDS * 1.2, 0.35 * shine);
     return mix(c * 0.6, c, smoothstep(0.0, 0.012, hairline(p)));
 }
 
@@ -185,16 +207,17 @@ vec3 paint_sole(vec3 p) {
 bool cut(vec3 p) {
     float tilt = p.y - neck.y + 0.45 * (p.z - neck.z);
     if (material == 0) {  // skin well inside a garment
-        bool in_shirt = abs(p.x) < mix(shoulder.x, elbow.x, 0.25) && tilt < -0.13 && p.y > hip.y;
-        bool in_trousers = p.y < hip.y + 0.05 && p.y > ankle.y + 0.11 && abs(p.x) < shoulder.x + 0.1;
+        bool in_shirt = abs(p.x) < mix(shoulder.x, elbow.x, SLEEVE_END - 0.35) && tilt < -0.13 && p.y > hip.y;
+        bool in_trousers = p.y < hip.y + 0.05 && p.y > ankle.y + LEGS_END + 0.09 && abs(p.x) < shoulder.x + 0.1;
         return in_shirt || in_trousers || p.y < ankle.y - 0.01;
     }
-    if (material == 1) return p.y < ankle.y + 0.020 || p.y > hip.y + 0.06;
+    if (material == 1 || material == 6) return p.y < ankle.y + LEGS_END || p.y > hip.y + 0.06;
     if (material == 2) {
         bool open = p.z > neck.z && tilt > -0.085 + abs(p.x) * 2.6;
-        return abs(p.x) > mix(shoulder.x, elbow.x, 0.60) || p.y < hip.y - 0.055 || tilt > 0.024 || open;
+        return abs(p.x) > mix(shoulder.x, elbow.x, SLEEVE_END) || p.y < hip.y - 0.055 || tilt > 0.024 || open;
     }
-    if (material == 3) return hairline(p) < 0.0;
+    if (material == 3 || material == 8) return hairline(p) < 0.0;
+    if (material == 7) return abs(p.x) > mix(shoulder.x, elbow.x, SLEEVE_END) || p.y < hip.y - 0.020 || tilt > 0.034;
     return false;
 }
 
@@ -202,9 +225,11 @@ vec3 paint(vec3 p) {
     if (material == 0) return paint_skin(p);
     if (material == 1) return paint_trousers(p);
     if (material == 2) return paint_shirt(p);
-    if (material == 3) return paint_hair(p);
+    if (material == 3 || material == 8) return paint_hair(p);
     if (material == 4) return paint_shoe(p);
-    return paint_sole(p);
+    if (material == 5) return paint_sole(p);
+    if (material == 6) return paint_shorts(p);
+    return paint_jacket(p);
 }
 
 void main() {

@@ -5,6 +5,7 @@ Rule: shaders write linear light; samples are averaged in linear light, then wri
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,16 +27,19 @@ class ShadedMesh:
     linear light and alpha, which is 1; `discard` makes holes.
     """
 
-    def __init__(self, ctx: Any, mesh: SkinnedMesh, fragment: Path, uniforms: dict[str, Any]) -> None:
+    def __init__(
+        self, ctx: Any, mesh: SkinnedMesh, fragment: Path, uniforms: dict[str, Any], definitions: Mapping[str, str]
+    ) -> None:
         """Compile the shader.
 
         `ctx`: the OpenGL context.
         `mesh`: what to draw.
         `fragment`: the shader's file.
         `uniforms`: its own, which never change.
+        `definitions`: what it is compiled with.
         Raises TrilaneError when the shader does not compile.
         """
-        self._draw = MeshDraw(ctx, mesh, fragment)
+        self._draw = MeshDraw(ctx, mesh, fragment, **definitions)
         self._draw.set(uniforms)
 
     def draw(self, joints: F32, view: Floats, projection: Floats) -> None:
