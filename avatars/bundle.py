@@ -28,6 +28,7 @@ MANIFEST = "manifest.json"
 DEFAULT = "default"
 CAPTURE = "capture.toml"
 HOW_TO_TRAIN = "docs/captures.md says how `trilane avatar train` makes one from frames of a person"
+HOW_TO_CREATE = "`trilane avatar create --body` puts a body of the same UV layout into an avatar"
 TEXTURE_KEYS = ("texture", "scale")
 #: Clothes and hair of an avatar reach this far from its body, metres. The pose stage and the training crop by it.
 CLOTHES_STANDOFF_M = 0.045
@@ -54,12 +55,7 @@ class Bundle:
 
     def read_texture(self) -> NDArray[np.float32]:
         """The neural texture, (H, W, C) float32, row 0 at v = 0. Raises BadInputError."""
-        arrays = read_npz(self.texture_path, TEXTURE_KEYS, "a neural texture")
-        if "texture" not in arrays:
-            raise BadInputError(self.texture_path, "no array 'texture'", "a neural texture")
-        return _decode_texture(
-            arrays["texture"], arrays.get("scale"), self.texture_path, self.manifest.network.channels
-        )
+        return read_texture(self.texture_path, self.manifest.network.channels)
 
     def read_network(self) -> NetworkFile:
         """The checked network. Raises BadInputError, also when it contradicts the manifest."""
@@ -70,6 +66,14 @@ class Bundle:
         for side in ("input", "output"):
             _check_same(getattr(network, side), getattr(entry, side), f"{self.network_path} ({side})")
         return network
+
+
+def read_texture(path: Path, channels: int) -> NDArray[np.float32]:
+    """The neural texture (H, W, `channels`) of a file of a bundle, row 0 at v = 0. Raises BadInputError."""
+    arrays = read_npz(path, TEXTURE_KEYS, "a neural texture")
+    if "texture" not in arrays:
+        raise BadInputError(path, "no array 'texture'", "a neural texture")
+    return _decode_texture(arrays["texture"], arrays.get("scale"), path, channels)
 
 
 def bundle_folder(name: str | Path) -> Path:
@@ -85,7 +89,7 @@ def load_bundle(name: str | Path) -> Bundle:
     if meant and not folder.exists():
         raise BadInputError(folder, "no such folder", "an avatar's folder, or default", meant)
     if folder.is_file():
-        raise BadInputError(folder, _what_it_is(folder), "the folder of an avatar, or default", HOW_TO_TRAIN)
+        raise BadInputError(folder, *_what_it_is(folder))
     if (folder / CAPTURE).is_file() and not path.exists():
         raise BadInputError(folder, "a capture, which avatars are trained on", "an avatar's folder", HOW_TO_TRAIN)
     manifest = parse_manifest(read_text(path, "an avatar's manifest"), path)
@@ -94,13 +98,15 @@ def load_bundle(name: str | Path) -> Bundle:
     return Bundle(folder, manifest)
 
 
-def _what_it_is(file: Path) -> str:
-    """Of a file that stands where an avatar's folder should."""
+def _what_it_is(file: Path) -> tuple[str, str, str]:
+    """Of a file that stands where an avatar's folder should: what it is, what is expected, and what to do."""
     try:
         is_body = bool(read_npz(file, ("v_template",), "a body"))
     except BadInputError:
         is_body = False
-    return "a body, which has no texture and no network" if is_body else "a file"
+    found = "a body, which has no texture and no network" if is_body else "a file"
+    remedy = f"{HOW_TO_TRAIN}; {HOW_TO_CREATE}" if is_body else HOW_TO_TRAIN
+    return found, "the folder of an avatar, or default", remedy
 
 
 def write_bundle(

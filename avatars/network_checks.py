@@ -25,6 +25,8 @@ from trilane.avatars.integer_network import (
 from trilane.errors import BadInputError
 
 RGBA = 4
+#: What to do with a network of floats.
+TO_INTEGERS = "make it one of integers: trilane avatar quantise FLOAT.onnx --frames FRAMES.npy --out NETWORK.onnx"
 #: Smallest and largest plausible scale; others come from an empty calibration or a damaged file.
 SCALE_RANGE = (1e-30, 1e30)
 #: The operators a network may have: layers that quantise, activations, norms, and operators that move data.
@@ -99,7 +101,7 @@ def _static_shape(value: onnx.ValueInfoProto, where: str) -> tuple[int, int, int
     if kind.elem_type != TensorProto.UINT8:
         known = kind.elem_type in TensorProto.DataType.values()
         name = TensorProto.DataType.Name(kind.elem_type) if known else str(kind.elem_type)
-        raise BadInputError(where, f"{value.name!r} of type {name}", "uint8", "quantise it: trilane avatar quantize")
+        raise BadInputError(where, f"{value.name!r} of type {name}", "uint8", TO_INTEGERS)
     dims = [dim.dim_value if dim.HasField("dim_value") else -1 for dim in kind.shape.dim]
     if len(dims) != 4 or min(dims) < 1:
         text = "x".join("?" if d < 1 else str(d) for d in dims)

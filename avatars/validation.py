@@ -25,7 +25,9 @@ PARTS = {
     "constants": "the manifest's constants (shape, expression, scales and zero points)",
 }
 VALIDATE = "trilane avatar validate"
-NO_TRUTH = "only frames of its person are known; its error on those held out is in the provenance of its manifest"
+NO_TRUTH = "only frames of its person are known"
+HELD_OUT = "held_out_error"
+ON_HELD_OUT = "its error on those held out is in the provenance of its manifest"
 
 
 #: What a validation at another size or on another runtime costs.
@@ -93,7 +95,7 @@ def refused(bundle: Bundle) -> dict[str, Any]:
         why = "its network is untrained: its times count, its pictures do not"
         return {"source": NO_FIGURES, "changed": [], "why": why}
     if bundle.manifest.provenance.get("body") == CAPTURED:
-        return {"source": NO_FIGURES, "changed": [], "why": NO_TRUTH}
+        return {"source": NO_FIGURES, "changed": [], "why": no_truth(bundle)}
     if validation is None:
         return _no_figures(bundle, [], "it was never validated")
     if validation.digests is None:
@@ -109,6 +111,11 @@ def refused(bundle: Bundle) -> dict[str, Any]:
         return {}
     names = " and ".join(PARTS[part] for part in changed)
     return _no_figures(bundle, changed, f"changed since the validation of {validation.date}: {names}")
+
+
+def no_truth(bundle: Bundle) -> str:
+    """Why an avatar of a capture cannot be validated, and where its error on frames is if somebody measured it."""
+    return f"{NO_TRUTH}; {ON_HELD_OUT}" if HELD_OUT in bundle.manifest.provenance else NO_TRUTH
 
 
 def _drawn_otherwise(validation: Validation, drawn: DrawnAs) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -105,6 +106,12 @@ def tiny_float_network(channels: int = 5, side: int = 64, seed: int = 0) -> onnx
 def tiny_float() -> onnx.ModelProto:
     """A float network with random weights, 5 channels, 64 x 64. For tests of machinery only."""
     return tiny_float_network()
+
+
+@pytest.fixture(scope="session")
+def tiny_float_network_of() -> Callable[..., onnx.ModelProto]:
+    """Makes one of other channels, side or seed: `tiny_float_network`."""
+    return tiny_float_network
 
 
 @pytest.fixture(scope="session")

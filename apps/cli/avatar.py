@@ -1,12 +1,12 @@
 """`trilane avatar`: look into avatars and what they are trained on, train and validate them, quantise their networks.
 
-Rule: this file lists the commands of the group; `avatar_data.py`, `avatar_train.py`, `avatar_validate.py`,
-`avatar_network.py` and `avatar_quantise.py` hold the larger ones.
+Rule: this file lists the commands of the group; `avatar_create.py`, `avatar_data.py`, `avatar_train.py`,
+`avatar_validate.py`, `avatar_network.py` and `avatar_quantise.py` hold the larger ones.
 """
 
 from __future__ import annotations
 
-from trilane.apps.cli import avatar_data, avatar_network, avatar_quantise, avatar_train, avatar_validate
+from trilane.apps.cli import avatar_create, avatar_data, avatar_network, avatar_quantise, avatar_train, avatar_validate
 from trilane.apps.cli.commands import Commands
 from trilane.apps.cli.console import print_facts
 from trilane.apps.cli.options import AvatarArgument, JsonOption
@@ -28,6 +28,7 @@ def inspect(name: AvatarArgument, json: JsonOption = False) -> None:
     print_facts(bundle_facts(load_bundle(name)), json)
 
 
+app.command(epilog=avatar_create.EPILOG_CREATE)(avatar_create.create)
 app.command("create-data", epilog=avatar_data.EPILOG_CREATE)(avatar_data.create_data)
 app.command("check-data", epilog=avatar_data.EPILOG_CHECK)(avatar_data.check_data)
 app.command(epilog=avatar_train.EPILOG_TRAIN)(avatar_train.train)

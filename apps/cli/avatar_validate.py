@@ -63,7 +63,7 @@ def validate(
     """
     from trilane.apps.made import made_facts
     from trilane.avatars.bundle import load_bundle, require_writable_manifest
-    from trilane.avatars.validation import NO_TRUTH, validation_facts
+    from trilane.avatars.validation import no_truth, validation_facts
     from trilane.shapes import shape_buckets
     from trilane.stages.dsp.runtime import installed, resolve
     from trilane.unexpected_value import UnexpectedValue
@@ -75,7 +75,9 @@ def validate(
         raise BadInputError.at("--size", error) from error
     bundle = load_bundle(name)
     if bundle.manifest.provenance.get("body") == CAPTURED:
-        raise BadInputError(bundle.folder, "an avatar of a capture", "one of the default body, clothed", NO_TRUTH)
+        raise BadInputError(
+            bundle.folder, "an avatar of a capture", "one of the default body, clothed", no_truth(bundle)
+        )
     try:
         from trilane.training import validate as work
     except ImportError as error:

@@ -20,7 +20,7 @@ from trilane.avatars.integer_network import (
     constants_of,
     node_name,
 )
-from trilane.avatars.network_checks import check_network
+from trilane.avatars.network_checks import TO_INTEGERS, check_network
 from trilane.errors import BadInputError
 from trilane.testing.byte_network import net, node_of
 
@@ -169,8 +169,8 @@ REFUSED: dict[str, tuple[Change, str]] = {
     "no name": (nameless("conv1", "If"), "operator If in node 'If that makes conv1', expected operators a DSP has"),
     "two inputs": (more("input"), "2 inputs, expected one input, N x H x W x C uint8"),
     "two outputs": (more("output"), "2 outputs, expected one output, N x H x W x 4 uint8"),
-    "float in": (float_end("input"), "'bytes' of type FLOAT, expected uint8; quantise it: trilane avatar quantize"),
-    "float out": (float_end("output"), "'rgba' of type FLOAT, expected uint8; quantise it: trilane avatar quantize"),
+    "float in": (float_end("input"), f"'bytes' of type FLOAT, expected uint8; {TO_INTEGERS}"),
+    "float out": (float_end("output"), f"'rgba' of type FLOAT, expected uint8; {TO_INTEGERS}"),
     "dynamic": (input_dims([1, "h", 64, 3]), "'bytes' of shape 1x?x64x3, expected four fixed sizes, N x H x W x C"),
     "zero side": (input_dims([1, 32, 0, 3]), "'bytes' of shape 1x32x?x3, expected four fixed sizes, N x H x W x C"),
     "three": (input_dims([32, 64, 3]), "'bytes' of shape 32x64x3, expected four fixed sizes, N x H x W x C"),
