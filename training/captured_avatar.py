@@ -14,22 +14,24 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-import psutil
 import torch
 
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.digests import sha256_of
 from trilane.errors import BadInputError
+from trilane.files import read_text
 from trilane.training.body_arrays import body_arrays
 from trilane.training.capture_error import error_facts, frame_errors, write_held_out_error
 from trilane.training.dataset import Planned, plan_training, write_dataset
+from trilane.training.device import chosen_device, device_words, memory_words
 from trilane.training.first_texture import first_texture
 from trilane.training.make_bundle import quantise_avatar, write_avatar
 from trilane.training.network import UNet
 from trilane.training.neural_texture import SIDES, NeuralTexture
 from trilane.training.perceptual import Vgg16, read_vgg16
+from trilane.training.probe_loss import probe_loss
 from trilane.training.progress_sheet import write_sheet
-from trilane.training.sample_files import FIELDS, open_groups
+from trilane.training.sample_files import FIELDS, ShapeGroup, open_groups
 from trilane.training.step_loop import first_state, step_seconds, steps
 from trilane.training.subject import Subject, captured_subject
 from trilane.training.trainable_avatar import TrainableAvatar
@@ -41,6 +43,7 @@ from trilane.writing import write_bytes
 CHANNELS = 16
 DEFAULT_NETWORK = Path(__file__).with_name("default-network.npz")
 SAMPLES, SAMPLE_FACTS, STATE, NETWORK, SHEETS = "samples", "samples.json", "state.npz", "network.npz", "sheets"
+LOSS_BEFORE = "loss-before.json"
 LEAST_STEPS = 10
 #: Sheets of a training, evenly over its steps; seconds between two states on the disk.
 SHEET_COUNT, SAVE_S = 10, 60.0
@@ -85,6 +88,7 @@ def train_on_capture(places: Places, asked: TrainingSettings, listener: Listener
     settings = resumed_settings(places.work / NAME, with_vgg(asked, places.vgg))
     vgg = read_vgg16(places.vgg) if places.vgg is not None else None
     torch.set_num_threads(settings.threads)
+    listener.say(f"trains on {device_words(chosen_device(settings.device), settings.threads)}")
     if settings.loss.perceptual:
         listener.say(f"perceptual loss: {'MS-SSIM' if vgg is None else f'features of VGG-16 in {places.vgg}'}")
     subject = captured_subject(places.capture, settings.threads, listener.say)
@@ -95,7 +99,10 @@ def train_on_capture(places: Places, asked: TrainingSettings, listener: Listener
     settings = _with_steps(avatar, places, settings, vgg, listener)
     write_bytes(places.work / NAME, settings_text(settings).encode())
     state = first_state(avatar, settings, vgg)
-    losses = _train(state, subject, places, settings, listener)
+    losses = {"before": _loss_before(state, places, groups)}
+    _train(state, subject, places, settings, listener)
+    losses["after"] = probe_loss(state, groups)
+    state.average.cpu()
     save_network(state.average, places.work / NETWORK)
     quantised = quantise_avatar(state.average, subject.shaped, groups, settings.seed, subject.unseen)
     made = {"samples": settings.samples, "steps": state.step, "batch": settings.batch, "seed": settings.seed}
@@ -195,44 +202,39 @@ def _with_steps(
     """`settings` with a number of steps, by default as many as fit into the minutes; says what they take."""
     seconds = step_seconds(avatar, open_groups(places.work / SAMPLES), settings, vgg)
     count = settings.steps or max(LEAST_STEPS, int(60 * settings.minutes / seconds))
-    memory_mb = psutil.Process().memory_info().rss / 1e6
-    per_step = f"{seconds:.2f} s a step as measured on {settings.threads} threads"
-    listener.say(f"{count} steps: about {count * seconds / 60:.1f} min ({per_step}), {memory_mb:.0f} MB of memory")
+    memory = memory_words(chosen_device(settings.device))
+    per_step = f"{seconds:.2f} s a step as just measured"
+    listener.say(f"{count} steps: about {count * seconds / 60:.1f} min ({per_step}), {memory}")
     return settings.model_copy(update={"steps": count})
 
 
 def _train(
     state: TrainingState, subject: Subject, places: Places, settings: TrainingSettings, listener: Listener
-) -> dict[str, float]:
-    """Do all steps that are left; the loss at the first and last of them: `first`, `last`."""
+) -> None:
+    """Do all steps that are left."""
     path, count = places.work / STATE, settings.steps or LEAST_STEPS
     if path.exists():
         load_state(state, path)
         listener.say(f"goes on after step {state.step} of {count}")
     weights, saved = settings.loss.by_name(), time.monotonic()
-    every, losses = max(1, count // SHEET_COUNT), list[float]()
+    every = max(1, count // SHEET_COUNT)
     for terms in steps(state, open_groups(places.work / SAMPLES), settings, count):
-        losses.append(sum(weights.get(name, 0.0) * value for name, value in terms.items()))
-        listener.trained(state.step, count, terms, losses[-1])
+        loss = sum(weights.get(name, 0.0) * value for name, value in terms.items())
+        listener.trained(state.step, count, terms, loss)
         if state.step % every == 0 or state.step == count:
             write_sheet(places.work / SHEETS / f"step-{state.step:07}.png", state.average, subject)
         if time.monotonic() - saved > SAVE_S:
             save_state(state, path)
             saved = time.monotonic()
     save_state(state, path)
-    return _ends(losses)
 
 
-def _ends(losses: list[float]) -> dict[str, float]:
-    """Means over the first and the last tenth of the steps that were done now."""
-    part = max(1, len(losses) // 10)
-    if not losses:
-        return {}
-    return {
-        "first": losses[0],
-        "first_tenth": float(np.mean(losses[:part])),
-        "last_tenth": float(np.mean(losses[-part:])),
-    }
+def _loss_before(state: TrainingState, places: Places, groups: list[ShapeGroup]) -> float:
+    """The loss before the first step, as it was when the training was begun."""
+    path = places.work / LOSS_BEFORE
+    if not (places.work / STATE).exists():
+        write_bytes(path, json.dumps(probe_loss(state, groups)).encode())
+    return float(json.loads(read_text(path, "the loss before this training")))
 
 
 def _measure(places: Places, subject: Subject, settings: TrainingSettings) -> dict[str, Any]:

@@ -21,14 +21,14 @@ from trilane.training.weights_file import load_network
 
 
 def float_painter(network: UNet, texture: torch.Tensor) -> Painter:
-    """A painter that runs `network` on `texture` (1,C,S,S)."""
+    """A painter that runs `network` on `texture` (1,C,S,S), where both are."""
     network.eval()
 
     def paint(_: Sample, uv: NDArray[np.float32]) -> U8:
-        image = torch.from_numpy(np.ascontiguousarray(uv))[None]
+        image = torch.from_numpy(np.ascontiguousarray(uv))[None].to(texture.device)
         with torch.no_grad():
             output = network(read_texture(texture, image[..., :2], image[..., 2] > 0))
-        pixels: U8 = (output[0].permute(1, 2, 0) * 255).round().to(torch.uint8).numpy()
+        pixels: U8 = (output[0].permute(1, 2, 0) * 255).round().to(torch.uint8).cpu().numpy()
         return pixels
 
     return paint

@@ -52,5 +52,6 @@ LOSSES: dict[str, dict[str, Any]] = {
         "texture_rate": 1e-3,
         "discriminator_rate": 1e-5,
         "weight_decay": 0.0,
+        "optimiser": {"kind": "adam", "second_momentum": 0.999, "clip_norm": 0.0},
     },
 }

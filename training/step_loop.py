@@ -16,6 +16,7 @@ import torch
 from trilane.training.activation_noise import add_activation_noise
 from trilane.training.adversary import Adversary
 from trilane.training.batch_choice import Batch, batch_stream, is_whole
+from trilane.training.device import chosen_device
 from trilane.training.dropout import add_dropout
 from trilane.training.objective import Objective
 from trilane.training.optimisers import clip_gradients, optimiser_of
@@ -34,15 +35,16 @@ SEED_BITS = 31
 
 def first_state(avatar: TrainableAvatar, settings: TrainingSettings, vgg: Vgg16 | None = None) -> TrainingState:
     """The state of a training of `avatar` before its first step. `vgg`: for a perceptual loss by its features."""
-    average = copy.deepcopy(avatar).eval()
+    device = chosen_device(settings.device)
+    average = copy.deepcopy(avatar.to(device)).eval()
     harder = settings.regularisation
     avatar.texture_noise, avatar.input_noise = harder.texture_noise, harder.input_noise
     add_dropout(avatar.network, harder.dropout)
     add_activation_noise(avatar.network, settings.noise_steps)
     avatar.network.to(memory_format=torch.channels_last)
     loss, rate = settings.loss, settings.discriminator_rate
-    adversary = Adversary(settings.width, rate, settings.seed) if loss.judged else None
-    objective = Objective(loss.by_name(), vgg, adversary)
+    adversary = Adversary(settings.width, rate, settings.seed, device) if loss.judged else None
+    objective = Objective(loss.by_name(), None if vgg is None else vgg.to(device), adversary)
     optimiser = optimiser_of(avatar, settings, settings.optimiser, settings.masked_texture)
     return TrainingState(avatar, average, optimiser, objective)
 
@@ -78,7 +80,7 @@ def _step(state: TrainingState, stream: Iterator[Batch], settings: TrainingSetti
     sums: dict[str, float] = {}
     for batch in islice(stream, options.batches_per_step):
         set_mode(avatar, frozen or (settings.batches.full_body_statistics and not is_whole(batch)))
-        terms = add_gradients(avatar, load_batch(*batch), state.objective, 1 / options.batches_per_step)
+        terms = add_gradients(avatar, load_batch(*batch, state.device), state.objective, 1 / options.batches_per_step)
         sums = {name: sums.get(name, 0.0) + value / options.batches_per_step for name, value in terms.items()}
     clip_gradients(avatar, options)
     state.optimiser.step()

@@ -73,12 +73,14 @@ class FitConfig:
     max_steps: int = 10_000_000
 
 
-def load_batch(group: ShapeGroup, index: NDArray[np.int64]) -> tuple[Tensor, Tensor, Tensor]:
+def load_batch(
+    group: ShapeGroup, index: NDArray[np.int64], device: torch.device | str = "cpu"
+) -> tuple[Tensor, Tensor, Tensor]:
     """`uv` (N,H,W,2) in 0..1, `covered` (N,H,W) bool and the target (N,4,H,W) in 0..1 of the samples `index` (N,)."""
     uv = torch.from_numpy(group.uv[index].astype(np.float32) / U16)
     covered = torch.from_numpy(group.covered[index] > 0)
     target = torch.from_numpy(group.rgba[index].astype(np.float32) / 255).permute(0, 3, 1, 2)
-    return uv, covered, target
+    return uv.to(device), covered.to(device), target.to(device)
 
 
 def fit(

@@ -47,6 +47,11 @@ class TrainingState:
                 named |= {f"{kind}.{number}.{name}": value for name, value in moments.items()}
         return named
 
+    @property
+    def device(self) -> torch.device:
+        """Where it is trained."""
+        return next(self.avatar.parameters()).device
+
     def optimisers(self) -> dict[str, torch.optim.Optimizer]:
         """All optimisers by name, each of Adam's kind."""
         adversary = self.objective.adversary

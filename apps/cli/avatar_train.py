@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress
 
+    from trilane.training.event_log import EventLog
+
 EPILOG_TRAIN = """\b
 Examples:
   trilane avatar train my-capture --out mine --minutes 600
@@ -34,6 +36,8 @@ Examples:
 CPU_INDEX = "https://download.pytorch.org/whl/cpu"
 #: Share of the newest loss in the one that is shown; seconds between two lines where no bar is drawn.
 NEWEST, LINE_S = 0.05, 30.0
+#: Folder of the log for TensorBoard, in the work folder.
+LOG = "tensorboard"
 #: Width of the default avatar's network.
 DEFAULT_WIDTH = 16
 
@@ -53,6 +57,7 @@ def train(
     samples: Annotated[int, typer.Option(help="Views of the frames to train on.")] = 4000,
     seed: Annotated[int, typer.Option(help="Of all random numbers.")] = 1,
     threads: Annotated[int, typer.Option(help="Of PyTorch, and processes that draw; only 1 repeats to the bit.")] = 1,
+    device: Annotated[str, typer.Option(help="auto, cpu or cuda; auto takes an NVIDIA GPU that is there.")] = "auto",
     start: Annotated[str, typer.Option(help="default: the default avatar's network; new: random weights.")] = "default",
     width: Annotated[int, typer.Option(help="Of a new network; 64 is full.")] = 16,
     loss: Annotated[
@@ -61,6 +66,7 @@ def train(
     vgg: Annotated[
         Path | None, typer.Option(help="VGG-16 weights (.pth, .safetensors) for the perceptual loss; else MS-SSIM.")
     ] = None,
+    tensorboard: Annotated[bool, typer.Option("--tensorboard", help="Log the losses to WORK/tensorboard too.")] = False,
     json: JsonOption = False,
 ) -> None:
     """Train an avatar on a capture and write it as a folder for `trilane run --avatar`.
@@ -70,16 +76,25 @@ def train(
     from trilane.training.training_settings import parsed_settings, read_settings
 
     usual = {"minutes": minutes, "steps": steps, "samples": samples, "seed": seed, "threads": threads, "start": start}
-    options = {name: value for name, value in (usual | {"width": width, "loss": loss}).items() if name in given(ctx)}
+    options = {
+        name: value
+        for name, value in (usual | {"width": width, "loss": loss, "device": device}).items()
+        if name in given(ctx)
+    }
     values = read_settings(config).model_dump(by_alias=True, exclude_none=True) if config is not None else {}
     asked = parsed_settings(values | options, "options" if config is None else config)
     if asked.start == "default" and asked.width != DEFAULT_WIDTH:
         raise BadInputError("--width", str(asked.width), f"{DEFAULT_WIDTH} of the default network", "or --start new")
     _require_torch()
     from trilane.training.captured_avatar import Places, train_on_capture
+    from trilane.training.event_log import EventLog, require_tensorboard
 
-    places = Places(capture, out, out.parent / f"{out.name}-work" if work is None else work, out.name, vgg)
-    with stdout_kept(), _shown() as listener:
+    if tensorboard:
+        require_tensorboard()
+    work = out.parent / f"{out.name}-work" if work is None else work
+    places = Places(capture, out, work, out.name, vgg)
+    log = EventLog(work / LOG) if tensorboard else None
+    with stdout_kept(), _shown(log) as listener:
         facts = train_on_capture(places, asked, listener)
     print_facts(facts, json)
 
@@ -95,21 +110,25 @@ def _require_torch() -> None:
 
 
 @contextmanager
-def _shown() -> Iterator[_Shown]:
-    """Someone who shows a training on stderr: as bars on a terminal, else as lines."""
+def _shown(log: EventLog | None) -> Iterator[_Shown]:
+    """Someone who shows a training on stderr: as bars on a terminal, else as lines; and in a `log`, if any."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     console = stderr_console()
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
     with Progress(*columns, TimeRemainingColumn(), console=console, disable=not console.is_terminal) as progress:
-        yield _Shown(console, progress)
+        try:
+            yield _Shown(console, progress, log)
+        finally:
+            if log is not None:
+                log.close()
 
 
 class _Shown:
     """Shows what a training says; a `captured_avatar.Listener`."""
 
-    def __init__(self, console: Console, progress: Progress) -> None:
-        self._console, self._progress = console, progress
+    def __init__(self, console: Console, progress: Progress, log: EventLog | None) -> None:
+        self._console, self._progress, self._log = console, progress, log
         self._task: Any = None
         self._loss, self._first_step, self._start, self._line = 0.0, 0, 0.0, 0.0
 
@@ -124,6 +143,8 @@ class _Shown:
             self._task = self._progress.add_task("training", total=total)
             self._loss, self._first_step, self._start = loss, step, time.monotonic()
             self._line = self._start - LINE_S
+        if self._log is not None:
+            self._log.write(step, terms, loss)
         self._loss += NEWEST * (loss - self._loss)
         shown = f"loss {self._loss:.3f}, composite {terms['composite']:.3f}, overlap {terms['overlap']:.3f}"
         self._progress.update(self._task, completed=step, description=shown)

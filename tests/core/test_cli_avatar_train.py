@@ -13,6 +13,9 @@ import pytest
 
 import trilane.training
 from trilane.apps.cli import avatar_train
+from trilane.errors import BadInputError
+from trilane.training import event_log
+from trilane.training.training_options import OptimiserOptions
 from trilane.training.training_settings import TrainingSettings, parsed_settings, settings_text
 
 Command = Callable[..., tuple[str, str]]
@@ -54,11 +57,35 @@ def test_options_are_settings_and_go_before_those_of_a_file(
     out, _ = command(*words, "--json")
     assert json.loads(out) == {"avatar": str(tmp_path / "mine"), "steps": 3}
     command(*words, "--config", tmp_path / "training.toml", "--seed", 8, "--work", "there")
-    command(*words, "--start", "new", "--width", 8, "--minutes", 2, "--samples", 50, "--threads", 2, "--steps", 30)
+    command(
+        *words,
+        "--start",
+        "new",
+        "--width",
+        8,
+        "--minutes",
+        2,
+        "--samples",
+        50,
+        "--threads",
+        2,
+        "--steps",
+        30,
+        "--device",
+        "cpu",
+    )
     command(*words, "--config", tmp_path / "training.toml", "--loss", "thesis", "--vgg", "vgg.pth")
     folder = (Path("their"), tmp_path / "mine", tmp_path / "mine-work", "mine", None)
-    begun = {"seed": 7, "batch": 3, "steps": 40, "network_rate": 1.5e-3, "texture_rate": 4e-4, "weight_decay": 1e-3}
-    wanted = {"start": "new", "width": 8, "minutes": 2.0, "samples": 50, "threads": 2, "steps": 30}
+    begun: dict[str, Any] = {
+        "seed": 7,
+        "batch": 3,
+        "steps": 40,
+        "network_rate": 1.5e-3,
+        "texture_rate": 4e-4,
+        "weight_decay": 1e-3,
+    }
+    begun["optimiser"] = OptimiserOptions().model_dump()
+    wanted = {"start": "new", "width": 8, "minutes": 2.0, "samples": 50, "threads": 2, "steps": 30, "device": "cpu"}
     assert training.asked == [
         (folder, parsed_settings({}, "")),
         ((*folder[:2], Path("there"), "mine", None), parsed_settings({"seed": 8, "batch": 3, "steps": 40}, "")),
@@ -81,6 +108,42 @@ def test_losses_and_the_time_that_is_left_are_shown(
         "step 2 of 3: loss 1.950, composite 0.250, overlap 0.125, 31 s left",
         "step 3 of 3: loss 1.877, composite 0.250, overlap 0.125, 0 s left",
     ]
+
+
+def test_a_log_is_written_beside_what_is_shown(
+    training: Training, command: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """It is closed also where a training ends early."""
+    made: list[Any] = []
+
+    class Log:
+        def __init__(self, folder: Path) -> None:
+            made.append(folder)
+
+        def write(self, *words: Any) -> None:
+            made.append(words)
+
+        def close(self) -> None:
+            made.append("closed")
+
+    monkeypatch.setattr(event_log, "EventLog", Log)
+    monkeypatch.setattr(event_log, "find_spec", lambda _: True)
+    words = ("avatar", "train", "their", "--out", tmp_path / "mine", "--work", tmp_path / "work")
+    command(*words)
+    assert made == []
+    command(*words, "--tensorboard")
+    terms = {"composite": 0.25, "overlap": 0.125}
+    assert made == [tmp_path / "work" / "tensorboard", (1, terms, 2.0), (2, terms, 1.0), (3, terms, 0.5), "closed"]
+
+    def refused(*_: Any) -> None:
+        raise BadInputError("capture", "nothing", "frames")
+
+    monkeypatch.setattr(training, "train_on_capture", refused)
+    command(*words, "--tensorboard", code=2)
+    assert made[5:] == [tmp_path / "work" / "tensorboard", "closed"]
+    monkeypatch.setattr(event_log, "find_spec", lambda _: None)
+    _, err = command(*words, "--tensorboard", code=3)
+    assert "a log for TensorBoard needs the package tensorboard" in err and "[tensorboard]" in err
 
 
 def test_without_pytorch_the_lines_that_install_it_are_said(

@@ -32,7 +32,14 @@ from trilane.training.training_state import TrainingState, load_state, save_stat
 SMALL, LARGE = (32, 32), (64, 32)
 COUNT = 7
 #: Steps 0 to 2 are of small samples alone, and from step 5 on batch statistics stay.
-VALUES: dict[str, Any] = {"samples": 9, "batch": 2, "seed": 5, "small_until": 0.4, "freeze_norms_at": 0.6}
+VALUES: dict[str, Any] = {
+    "device": "cpu",
+    "samples": 9,
+    "batch": 2,
+    "seed": 5,
+    "small_until": 0.4,
+    "freeze_norms_at": 0.6,
+}
 
 
 def settings(**others: Any) -> TrainingSettings:
@@ -125,9 +132,9 @@ def test_small_samples_come_first_and_statistics_stay_at_last(
     seen: list[tuple[int, bool]] = []
     load = step_loop.load_batch
 
-    def loaded(group: ShapeGroup, index: Any) -> Any:
+    def loaded(group: ShapeGroup, *words: Any) -> Any:
         seen.append((group.shape[0], state.avatar.network.colour[1].training))
-        return load(group, index)
+        return load(group, *words)
 
     monkeypatch.setattr(step_loop, "load_batch", loaded)
     state = first_state(avatar(), settings())
@@ -185,7 +192,10 @@ def test_the_thesis_loss_has_its_rates_where_a_training_says_no_others(tmp_path:
         1e-5,
         0,
     )
+    assert (asked.optimiser.kind, asked.optimiser.second_momentum, asked.optimiser.clip_norm) == ("adam", 0.999, 0)
     assert settings(loss="thesis", texture_rate=0.25).texture_rate == 0.25
+    clipped = settings(loss="thesis", optimiser={"clip_norm": 2.0}).optimiser
+    assert (clipped.kind, clipped.clip_norm) == ("adam", 2.0)
     assert settings(loss="default") == settings()
     (tmp_path / "training.toml").write_text(settings_text(asked))
     assert read_settings(tmp_path / "training.toml") == asked

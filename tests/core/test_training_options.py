@@ -64,7 +64,7 @@ MANY: list[dict[str, Any]] = [
 
 def settings(**others: Any) -> TrainingSettings:
     usual = {"start": "new", "samples": 8, "batch": 2, "seed": 5, "small_until": 0.0, "freeze_norms_at": 1.0}
-    return parsed_settings(usual | others, "a test")
+    return parsed_settings({"device": "cpu"} | usual | others, "a test")
 
 
 def avatar(norm: str = "batch") -> TrainableAvatar:

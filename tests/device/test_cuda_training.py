@@ -10,22 +10,27 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from trilane.training.adversary import Adversary  # noqa: E402
 from trilane.training.network import UNet  # noqa: E402
 from trilane.training.neural_texture import NeuralTexture  # noqa: E402
+from trilane.training.objective import Objective  # noqa: E402
 from trilane.training.trainable_avatar import TrainableAvatar  # noqa: E402
 from trilane.training.training_loop import train_step  # noqa: E402
+from trilane.training.training_settings import parsed_settings  # noqa: E402
 
 #: Gradients are sums of up to N*H*W = 8192 products; the rounding of such a sum differs by about sqrt(8192) * 2**-24 of
 #: it, and one step of plain descent at this rate moves a weight by its gradient times 0.01.
 TOLERANCE = 1e-4
 
 
-def test_one_step_is_the_cpus(cuda: Any) -> None:
+@pytest.mark.parametrize("loss", ["default", "thesis"])
+def test_one_step_is_the_cpus(cuda: Any, loss: str) -> None:
+    weights = parsed_settings({"loss": loss}, "a test").loss
     torch.manual_seed(0)
     torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = False
     random = np.random.default_rng(0)
     start = random.uniform(-0.5, 0.5, (64, 64, 4)).astype(np.float32)
-    avatar = TrainableAvatar(NeuralTexture(start, sides=(64, 32)), UNet(width=8, channels=4))
+    avatar = TrainableAvatar(NeuralTexture(start, sides=(64, 32)), UNet(width=4, channels=4))
     batch = (
         torch.from_numpy(random.uniform(0, 1, (2, 64, 64, 2)).astype(np.float32)),
         torch.from_numpy(random.uniform(0, 1, (2, 64, 64)) > 0.5),
@@ -33,7 +38,12 @@ def test_one_step_is_the_cpus(cuda: Any) -> None:
     )
     on_gpu = copy.deepcopy(avatar).to(cuda)
     losses = [
-        train_step(each, torch.optim.SGD(each.parameters(), 0.01), *(part.to(device) for part in batch))
+        train_step(
+            each,
+            torch.optim.SGD(each.parameters(), 0.01),
+            *(part.to(device) for part in batch),
+            Objective(weights.by_name(), None, Adversary(4, 1e-3, 1, device) if weights.judged else None),
+        )
         for each, device in ((avatar, torch.device("cpu")), (on_gpu, cuda))
     ]
     assert losses[1] == pytest.approx(losses[0], rel=TOLERANCE)
