@@ -84,7 +84,6 @@ def train_on_capture(places: Places, asked: TrainingSettings, listener: Listener
     Raises BadInputError; FaultyCaptureError with all faults; MissingPartError without OpenGL.
     """
     started = time.monotonic()
-    places.work.mkdir(parents=True, exist_ok=True)
     settings = resumed_settings(places.work / NAME, with_vgg(asked, places.vgg))
     vgg = read_vgg16(places.vgg) if places.vgg is not None else None
     torch.set_num_threads(settings.threads)
@@ -92,6 +91,7 @@ def train_on_capture(places: Places, asked: TrainingSettings, listener: Listener
     if settings.loss.perceptual:
         listener.say(f"perceptual loss: {'MS-SSIM' if vgg is None else f'features of VGG-16 in {places.vgg}'}")
     subject = captured_subject(places.capture, settings.threads, listener.say)
+    places.work.mkdir(parents=True, exist_ok=True)
     _draw_samples(subject, places, settings, listener)
     groups = open_groups(places.work / SAMPLES)
     torch.manual_seed(settings.seed)

@@ -91,6 +91,7 @@ def test_every_fault_is_listed_with_its_file(folder: Path, command: Command) -> 
         ("fits/006.npz[betas]", "400 coefficients"),
         ("fits/007.npz", "no such file"),
         ("masks/007.png", "three channels (RGB)"),
+        ("fits", "no frame that shows the right among the 4 with fits that could be read"),
     }
     _, err = command("avatar", "check-data", folder, code=2)
     assert err.startswith(f"error: {folder}: {len(found)} faults; nothing was started\n")
@@ -100,8 +101,22 @@ def test_every_fault_is_listed_with_its_file(folder: Path, command: Command) -> 
 
 
 def test_one_frame_is_too_few(tmp_path: Path) -> None:
-    (fault,) = faults_of(write_capture_folder(tmp_path / "one", 1))
-    assert (fault.found, fault.expected) == ("1 frame", "at least 4, one for each side of the person")
+    few, sides = faults_of(write_capture_folder(tmp_path / "one", 1))
+    assert (few.found, few.expected) == ("1 frame", "at least 4, one for each side of the person")
+    assert len(re.findall("front|left|back|right", sides.found)) == 3
+
+
+def test_a_missing_side_is_listed_with_everything_else(folder: Path) -> None:
+    """Frame 3 alone shows nothing of use, so its side counts for nothing; what is said of the back says so."""
+    for number in range(8):
+        turned = {"global_orient": np.array([0.0, np.radians(180 if number == 3 else 110 * np.sin(number)), 0.0])}
+        np.savez(folder / "fits" / f"{number:03}.npz", **fit(number) | turned)
+    assert len(open_capture(folder)) == 8
+    np.savez(folder / "fits" / "003.npz", **fit(3) | {"body_pose": np.zeros(69)})
+    (folder / "masks" / "000.png").unlink()
+    found = [fault.found for fault in faults_of(folder)]
+    joints = "69 numbers (23 joints: the SMPL layout)"
+    assert found == ["no mask", joints, "no frame that shows the back among the 7 with fits that could be read"]
 
 
 def test_a_side_that_no_frame_shows_is_a_fault_unless_it_may_be_missing(folder: Path) -> None:

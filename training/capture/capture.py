@@ -75,9 +75,13 @@ class Capture:
 
     def directions(self) -> list[tuple[float, float]]:
         """Of each frame: yaw and height of the camera, degrees, as `camera_direction`."""
-        root = self.shaped.joints[0]
-        pairs = zip(self.fits, self.views, strict=True)
-        return [camera_direction(fit.pose, root + fit.place, view) for fit, view in pairs]
+        return directions(self.shaped, self.fits, self.views)
+
+
+def directions(shaped: ShapedBody, fits: Sequence[Fit], views: Sequence[F64]) -> list[tuple[float, float]]:
+    """Of each of `fits` of a body, seen by the camera (4,4) of `views`: its yaw and height, see `camera_direction`."""
+    root = shaped.joints[0]
+    return [camera_direction(fit.pose, root + fit.place, view) for fit, view in zip(fits, views, strict=True)]
 
 
 def open_capture(folder: Path, track: Track = iter) -> Capture:
@@ -108,20 +112,18 @@ class _Opening:
             mask_of = self._matched(frames, masks) if masks is not None else []
             self._look(frames, masks, mask_of, track)
         fits = self._fits(frames.names, body) if frames is not None and body is not None else []
-        if body is None or frames is None or masks is None or len(fits) < LEAST_FRAMES:
+        if body is None or frames is None or not fits:
             raise FaultyCaptureError(str(self.folder), self.faults)
         betas, expression = (_mean([getattr(fit, name) for fit in fits]) for name in SHAPE)
         views = tuple(self.file.camera.view(fit.rotation, fit.translation) for fit in fits)
         shaped = body.shape(betas, expression)
-        capture = Capture(
+        self._require_sides(directions(shaped, fits, views), len(frames.names))
+        if masks is None or self.faults:
+            raise FaultyCaptureError(str(self.folder), self.faults)
+        return Capture(
             *(self.folder, self.file, body_file, shaped, betas, expression),
             *(tuple(fits), views, frames, masks, tuple(mask_of)),
         )
-        if not self.faults:
-            self._require_sides(capture)
-        if self.faults:
-            raise FaultyCaptureError(str(self.folder), self.faults)
-        return capture
 
     def _try(self, read: Callable[[], Read]) -> Read | None:
         try:
@@ -198,13 +200,15 @@ class _Opening:
             self.faults.append(Fault(where, error.found, error.expected, error.remedy))
             return None
 
-    def _require_sides(self, capture: Capture) -> None:
-        shown = frames_by_side([yaw for yaw, _ in capture.directions()])
-        for side, count in shown.items():
-            if not count and side not in self.file.missing_views:
-                found, expected = f"no frame that shows the {side}", "frames of all four sides"
-                remedy = f"film it too; or, if it will never be seen, write missing_views = [{side!r}] in {NAME}"
-                self.faults.append(Fault(self.file.fits, found, expected, remedy))
+    def _require_sides(self, seen: Sequence[tuple[float, float]], frames: int) -> None:
+        """`seen`: yaw and height of each camera whose fit could be read, of so many `frames`."""
+        shown = frames_by_side([yaw for yaw, _ in seen])
+        missing = [side for side, count in shown.items() if not count and side not in self.file.missing_views]
+        if missing:
+            among = f" among the {len(seen)} with fits that could be read" if len(seen) < frames else ""
+            found = f"no frame that shows the {', the '.join(missing)}{among}"
+            remedy = f"film it too; or, if it will never be seen, write missing_views = {missing} in {NAME}"
+            self.faults.append(Fault(self.file.fits, found, "frames of all four sides", remedy))
 
 
 def _mean(rows: Sequence[F64]) -> F64:
