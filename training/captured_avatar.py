@@ -25,7 +25,7 @@ from trilane.training.capture_error import error_facts, frame_errors, write_held
 from trilane.training.dataset import Planned, plan_training, write_dataset
 from trilane.training.device import chosen_device, device_words, memory_words
 from trilane.training.first_texture import first_texture
-from trilane.training.make_bundle import quantise_avatar, write_avatar
+from trilane.training.make_bundle import quantise_avatar, write_avatar, write_float_network
 from trilane.training.network import UNet
 from trilane.training.neural_texture import SIDES, NeuralTexture
 from trilane.training.perceptual import Vgg16, read_vgg16
@@ -104,6 +104,7 @@ def train_on_capture(places: Places, asked: TrainingSettings, listener: Listener
     losses["after"] = probe_loss(state, groups)
     state.average.cpu()
     save_network(state.average, places.work / NETWORK)
+    files = write_float_network(places.work, state.average, groups, settings.seed)
     quantised = quantise_avatar(state.average, subject.shaped, groups, settings.seed, subject.unseen)
     made = {"samples": settings.samples, "steps": state.step, "batch": settings.batch, "seed": settings.seed}
     provenance = made | {"texture_sides": list(SIDES)} | subject.facts
@@ -113,7 +114,7 @@ def train_on_capture(places: Places, asked: TrainingSettings, listener: Listener
     facts = {"avatar": str(places.out), "steps": state.step, "loss": losses}
     facts |= {"held_out_error": _measure(places, subject, settings)} if subject.held_out else {}
     sheets = str(places.work / SHEETS) if subject.held_out else None
-    return facts | {"sheets": sheets, "seconds": round(time.monotonic() - started, 1)}
+    return facts | files | {"sheets": sheets, "seconds": round(time.monotonic() - started, 1)}
 
 
 def with_vgg(asked: TrainingSettings, file: Path | None) -> TrainingSettings:

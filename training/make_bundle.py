@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import torch
 from numpy.typing import NDArray
 
@@ -28,6 +29,7 @@ from trilane.training.subject import Person
 from trilane.training.surface_fill import fill_along_surface
 from trilane.training.texture_layout import grown
 from trilane.training.trainable_avatar import TrainableAvatar
+from trilane.writing import write_atomically, write_bytes
 
 INT8_MAX = 127
 #: The network is calibrated at the tensor shape that standing bodies get most often, and stored for the square one.
@@ -35,6 +37,8 @@ CALIBRATION_SHAPE = (320, 192)
 STORED_SHAPE = (256, 256)
 CALIBRATION_FRAMES = 96
 METHOD = "minmax"
+#: What a person can quantise anew; 20 inputs of the calibration's shape are 40 MB.
+FLOAT_NETWORK, FRAMES, WRITTEN_FRAMES = "network.onnx", "frames.npy", 20
 TEXEL_MARGIN = 3
 
 
@@ -76,11 +80,31 @@ def _without_holes(image: NDArray[Any], unseen: Mask, body: BodyArrays) -> F64:
 
 def integer_network(avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int) -> Quantised:
     """The network in integers, calibrated on training samples of one shape: that with most, where none is usual."""
-    group = max(groups, key=lambda group: (group.shape == CALIBRATION_SHAPE, len(group)))
-    chosen = np.random.default_rng(seed).permutation(len(group))[:CALIBRATION_FRAMES]
-    frames = _inputs(avatar, group, np.sort(chosen))
-    quantised = quantise(export_onnx(avatar.network, *group.shape), frames, METHOD)
+    model, frames = _calibration(avatar, groups, seed, CALIBRATION_FRAMES)
+    quantised = quantise(model, frames, METHOD)
     return replace(quantised, network=reshaped(quantised.network, *STORED_SHAPE))
+
+
+def write_float_network(folder: Path, avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int) -> dict[str, str]:
+    """Write what `trilane avatar quantise` takes to `folder`: the float network, and inputs from training samples.
+
+    The names of both files, by `float_network` and `frames`. Inputs are as those of `integer_network`, but fewer.
+    """
+    model, frames = _calibration(avatar, groups, seed, WRITTEN_FRAMES)
+    files = {"float_network": folder / FLOAT_NETWORK, "frames": folder / FRAMES}
+    write_bytes(files["float_network"], model.SerializeToString())
+    with write_atomically(files["frames"]) as draft:
+        np.save(draft, np.stack(frames).astype(np.float16))
+    return {key: str(file) for key, file in files.items()}
+
+
+def _calibration(
+    avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int, count: int
+) -> tuple[onnx.ModelProto, list[NDArray[np.float32]]]:
+    """The float network of `avatar`, and at most `count` inputs of its shape."""
+    group = max(groups, key=lambda group: (group.shape == CALIBRATION_SHAPE, len(group)))
+    chosen = np.random.default_rng(seed).permutation(len(group))[:count]
+    return export_onnx(avatar.network, *group.shape), _inputs(avatar, group, np.sort(chosen))
 
 
 def quantise_avatar(

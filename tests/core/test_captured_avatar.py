@@ -88,6 +88,9 @@ def log(monkeypatch: pytest.MonkeyPatch) -> Any:
     part(captured_avatar, "first_texture", lambda *_: np.full((64, 64, 16), 0.25, np.float32))
     part(captured_avatar, "write_sheet", lambda path, *_: asked.append(path.name))
     part(captured_avatar, "quantise_avatar", lambda avatar, *words: (weights_of(avatar), words[0], words[2]))
+    part(
+        captured_avatar, "write_float_network", lambda folder, _, groups, seed: {"frames": (folder, len(groups), seed)}
+    )
     part(captured_avatar, "write_avatar", lambda *words: (words[0].mkdir(exist_ok=True), asked.append(words)))
     part(captured_avatar, "load_bundle", lambda folder: f"bundle of {folder.name}")
     part(captured_avatar, "frame_errors", lambda *words: asked.append(words) or "errors")
@@ -136,6 +139,7 @@ def test_every_part_gets_what_is_its(log: list[Any], tmp_path: Path) -> None:
     assert facts["loss"] == {"before": told_before(tmp_path), "after": pytest.approx(losses[-1], rel=0.5)}
     assert facts["loss"]["after"] < facts["loss"]["before"]
     assert (facts["steps"], facts["sheets"]) == (20, str(tmp_path / "work" / "sheets"))
+    assert facts["frames"] == (tmp_path / "work", 1, 1)
 
 
 def test_an_ended_training_goes_on_and_makes_the_same_avatar(

@@ -6,6 +6,7 @@ import json
 from types import SimpleNamespace
 
 import numpy as np
+import onnxruntime
 import pytest
 
 torch = pytest.importorskip("torch")
@@ -103,6 +104,27 @@ def read_by_hand(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
     sx, sy = sx[..., None], sy[..., None]
     upper = image[y0, x0] * (1 - sx) + image[y0, x1] * sx
     return upper * (1 - sy) + (image[y1, x0] * (1 - sx) + image[y1, x1] * sx) * sy
+
+
+def test_the_float_network_and_its_inputs_are_written(monkeypatch, groups, tmp_path):
+    """The file computes what the network does; the inputs are those that it was calibrated on, to half floats."""
+    monkeypatch.setattr(make_bundle, "CALIBRATION_SHAPE", (64, 32))
+    monkeypatch.setattr(make_bundle, "WRITTEN_FRAMES", 3)
+    made = avatar(noise(1))
+    made.network.eval()
+    names = make_bundle.write_float_network(tmp_path, made, groups, 9)
+    assert names == {"float_network": str(tmp_path / "network.onnx"), "frames": str(tmp_path / "frames.npy")}
+    frames, image = np.load(tmp_path / "frames.npy"), made.texture.image().detach()[0].permute(1, 2, 0).numpy()
+    assert (frames.shape, frames.dtype) == ((3, 64, 32, CHANNELS), np.float16)
+    chosen, group = sorted(np.random.default_rng(9).permutation(7)[:3]), groups[1]
+    for frame, number in zip(frames, chosen, strict=True):
+        wanted = read_by_hand(image, group.uv[number] / 65535) * (group.covered[number] == 1)[..., None]
+        np.testing.assert_allclose(frame, wanted, atol=1e-3)
+    planes = np.ascontiguousarray(frames[:1].astype(np.float32).transpose(0, 3, 1, 2))
+    session = onnxruntime.InferenceSession(tmp_path / "network.onnx", providers=["CPUExecutionProvider"])
+    with torch.no_grad():
+        wanted = made.network(torch.from_numpy(planes)).numpy()
+    np.testing.assert_allclose(session.run(None, {"tensor": planes})[0], wanted, atol=1e-4)
 
 
 def test_the_network_is_calibrated_on_chosen_samples_of_one_shape(monkeypatch, groups):
