@@ -109,6 +109,7 @@ class Figures(_Model):
     iou: Share
     ssim: float = Field(ge=-1, le=1)
     body_psnr_db_by_band: dict[Band, Finite] | None = None
+    iou_by_band: dict[Band, Share] | None = None
     psnr_db: Finite | None = None
     body_psnr_db: Finite | None = None
     background: Share | None = None

@@ -33,10 +33,10 @@ class SampleError:
 def summary(errors: Sequence[SampleError]) -> dict[str, Any]:
     """What `errors`, at least one, come to; decibels are means over pictures.
 
-    Keys: `psnr_db_by_band`, `body_psnr_db_by_band`; `psnr_db`, `body_psnr_db`, `background`, `iou`, `ssim`: means of
-    the fields of `ImageError`; `least_psnr_db`, `least_body_psnr_db`; `worst`, the sample of the least PSNR: `seed`,
-    `number`, `band`, `psnr_db`, `body_psnr_db`; `by_seed`: `psnr_db`, `body_psnr_db`, `least_psnr_db` of each seed's
-    samples; `samples`, how many.
+    Keys: `psnr_db_by_band`, `body_psnr_db_by_band`, `iou_by_band`; `psnr_db`, `body_psnr_db`, `background`, `iou`,
+    `ssim`: means of the fields of `ImageError`; `least_psnr_db`, `least_body_psnr_db`; `worst`, the sample of the least
+    PSNR: `seed`, `number`, `band`, `psnr_db`, `body_psnr_db`; `by_seed`: `psnr_db`, `body_psnr_db`, `least_psnr_db` of
+    each seed's samples; `samples`, how many.
     """
     bands = [band for band in BANDS if any(sample.band == band for sample in errors)]
     worst = min(errors, key=lambda sample: sample.error.psnr_db)
@@ -45,7 +45,7 @@ def summary(errors: Sequence[SampleError]) -> dict[str, Any]:
     return {
         **{
             f"{key}_by_band": {band: _mean([s for s in errors if s.band == band], key) for band in bands}
-            for key in ("psnr_db", "body_psnr_db")
+            for key in ("psnr_db", "body_psnr_db", "iou")
         },
         **{key: _mean(errors, key) for key in means},
         "least_psnr_db": _least(errors, "psnr_db"),

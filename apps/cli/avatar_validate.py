@@ -10,13 +10,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from trilane.apps.cli.console import print_facts, stderr_console, stdout_kept
+from trilane.apps.cli.console import print_facts, stderr_console, stdout_console, stdout_kept
 from trilane.apps.cli.options import SIZE_HELP, AvatarArgument, JsonOption
 from trilane.avatars.manifest import BANDS, CAPTURED
 from trilane.errors import BadInputError, MissingPartError
+from trilane.figure_sources import from_validation
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from trilane.avatars.bundle import Bundle
+    from trilane.avatars.manifest import Validation
     from trilane.training.evaluate import Evaluated
     from trilane.training.validate import FloatNetwork, ValidationPlan
 
@@ -95,7 +99,28 @@ def validate(
         modified=made["modified"],
     )
     validated = _add_sizes(bundle, plan) if sizes else _validate(bundle, plan, float_network, sheet)
+    if not json and validated.manifest.validation is not None:
+        stdout_console().print(band_table(validated.manifest.validation))
     print_facts({"name": bundle.manifest.name, "validation": validation_facts(validated)}, json)
+
+
+def band_table(validation: Validation) -> Table:
+    """A row for each band of zoom: what the first runtime's pictures are worth, and what quantising cost."""
+    from rich.table import Table
+
+    own = validation.on(validation.runtime) or validation
+    cost = (validation.model_extra or {}).get("psnr_loss_db", {})
+    columns = {
+        "PSNR, dB": (own.psnr_db_by_band, 2),
+        "of the person alone": (own.body_psnr_db_by_band or {}, 2),
+        "mask IoU": (own.iou_by_band or {}, 4),
+        "lost by quantising, dB": (cost, 2),
+    }
+    table = Table("band", *columns, caption=from_validation(validation.date))
+    for band in own.psnr_db_by_band:
+        cells = (f"{by[band]:.{digits}f}" if band in by else "-" for by, digits in columns.values())
+        table.add_row(band.replace("_", " "), *cells)
+    return table
 
 
 def _validate(bundle: Bundle, plan: ValidationPlan, float_network: Path | None, sheet: Path | None) -> Bundle:

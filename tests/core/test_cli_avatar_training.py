@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import sys
 from collections.abc import Callable
+from dataclasses import replace
+from datetime import date
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -21,6 +24,7 @@ from trilane.apps.cli import avatar_quantise, avatar_validate
 from trilane.apps.experiments import calibrated_network
 from trilane.avatars.bundle import load_bundle, write_manifest
 from trilane.avatars.digests import sha256_of
+from trilane.avatars.manifest import Validation
 from trilane.stages.dsp import runtime
 from trilane.testing.validated import validated
 from trilane.training.quantising import (
@@ -232,6 +236,27 @@ def test_validate_without_options(work: Work, tiny_bundle: Path, command: Comman
     }
     assert work.asked == [("renderer", "tiny", 7), ("tiny", True, "a renderer", None)]
     assert "name tiny" in " ".join(command("avatar", "validate", tiny_bundle)[0].split())
+
+
+@pytest.mark.usefixtures("work")
+def test_bands_are_a_table(tiny_bundle: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the integer network, each figure at its place; what nobody measured is a dash."""
+    by_band = {"full_body": 31.456, "face": 28.1}
+    figures = {"psnr_db_by_band": by_band, "iou": 0.9, "ssim": 0.9, "iou_by_band": {"full_body": 0.98765}}
+    own = figures | {"body_psnr_db_by_band": {"full_body": 27.5, "face": 26.0}}
+    told = {**figures, "date": date(2026, 1, 2), "runtime": "ort", "integer": own, "psnr_loss_db": {"face": 0.07}}
+    bundle = load_bundle(tiny_bundle)
+    manifest = bundle.manifest.model_copy(update={"validation": Validation.model_validate(told)})
+    work_module = sys.modules["trilane.training.validate"]
+    monkeypatch.setattr(work_module, "revalidate", lambda *_: replace(bundle, manifest=manifest))
+    lines = command("avatar", "validate", tiny_bundle)[0].splitlines()
+    rows = [[cell.strip() for cell in re.split("[│┃]", line)[1:-1]] for line in lines if re.match("[│┃]", line)]
+    assert rows == [
+        ["band", "PSNR, dB", "of the person alone", "mask IoU", "lost by quantising, dB"],
+        ["full body", "31.46", "27.50", "0.9877", "-"],
+        ["face", "28.10", "26.00", "-", "0.07"],
+    ]
+    assert any("validation of 2026-01-02" in line for line in lines)
 
 
 def test_validate_with_every_option(work: Work, tiny_bundle: Path, tmp_path: Path, command: Command) -> None:

@@ -165,11 +165,13 @@ def test_a_summary_has_means_and_the_worst_sample_of_all_seeds():
     ]
     facts = summary(errors)
     assert list(facts) == [
-        *("psnr_db_by_band", "body_psnr_db_by_band", "psnr_db", "body_psnr_db", "background", "iou", "ssim"),
+        *("psnr_db_by_band", "body_psnr_db_by_band", "iou_by_band"),
+        *("psnr_db", "body_psnr_db", "background", "iou", "ssim"),
         *("least_psnr_db", "least_body_psnr_db", "worst", "by_seed", "samples"),
     ]
     assert facts["psnr_db_by_band"] == {"far": 32.0, "face": 21.0}
     assert facts["body_psnr_db_by_band"] == {"far": 29.0, "face": 17.0}
+    assert facts["iou_by_band"] == {"far": 1.0, "face": 0.75}
     assert (facts["psnr_db"], facts["body_psnr_db"], facts["samples"]) == (26.5, 23.0, 4)
     assert (facts["background"], facts["ssim"], facts["iou"]) == (0.5, 0.75, 0.875)
     assert (facts["least_psnr_db"], facts["least_body_psnr_db"]) == (20.0, 15.0)
