@@ -53,6 +53,10 @@ BENCHES = {
         "How restless the error is, by runtime, calibration and texture filter.",
     ),
     "joints": ("trilane.bench.joints", "What the joint transforms of a frame cost."),
+    "augmentation": (
+        "trilane.bench.augmentation",
+        "A close-up of an avatar trained on camera-space views, beside image-space ones.",
+    ),
 }
 
 METAVARS: dict[type, str] = {int: "N", float: "X", str: "TEXT"}

@@ -92,6 +92,12 @@ MEANINGS = {
     "peers size": FIXED_SIZE,
     "raster size": SQUARE_SIZE,
     "raster-oracle size": SQUARE_SIZE,
+    "steps": "Steps of each training, of four views each; at least 10.",
+    "look": "Synthetic person: default, or hiker, whom the network that training starts from never saw.",
+    "augmentation frames": "Frames of the capture, at least 4.",
+    "augmentation samples": "Views of them that are drawn for each training, at least 8.",
+    "augmentation views": "Held-out views of each band of zoom.",
+    "augmentation seed": "Seed of the capture, of its views and of the held-out ones.",
     "crop width": "Width of the picture in pixels.",
 }
 

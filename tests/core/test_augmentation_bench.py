@@ -1,0 +1,75 @@
+"""`bench augmentation`: its rows and gains on figures that are told, what both trainings share, and what it refuses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+pytest.importorskip("skimage")
+
+from trilane.bench import augmentation
+from trilane.errors import BadInputError, MissingPartError
+from trilane.training import sample_renderer
+from trilane.training.clothing.looks import HIKER
+
+FIGURES = {
+    "camera space": {"psnr_db_far": 25.0, "psnr_db_face": 24.5, "iou": 0.96},
+    "image space": {"psnr_db_far": 25.5, "psnr_db_face": 22.0, "iou": 0.95},
+}
+
+
+def test_rows_and_gains(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both are trained by the same steps on as many samples of the same seed, and measured by the same renderer."""
+    asked: list[Any] = []
+
+    def trained(work: Any, source: Any, folder: Path) -> Any:
+        asked.append((work.capture, work.steps, work.count, work.seed, source, folder.name))
+        return source, 0.5
+
+    def errors(studio: Any, paint: str, views: int, seed: int) -> Any:
+        asked.append((studio, views, seed))
+        return FIGURES[paint]
+
+    def capture(folder: Path, shaped: Any, *said: Any) -> Any:
+        asked.append((folder.name, *said))
+        assert np.array_equal(shaped.vertices, shaped.body.shape(HIKER.betas).vertices)
+        return "capture"
+
+    monkeypatch.setattr(sample_renderer, "SampleRenderer", lambda _, threads, look: ("studio", threads, look))
+    monkeypatch.setattr(augmentation, "_capture", capture)
+    monkeypatch.setattr(augmentation, "_sources", lambda capture: {name: name for name in FIGURES if capture})
+    monkeypatch.setattr(augmentation, "_trained", trained)
+    monkeypatch.setattr(augmentation, "_errors", errors)
+    found = augmentation.measure(steps=11, frames=5, samples=9, views=3, seed=7)
+    studio = (("studio", 1, HIKER), 3, 7)
+    assert asked == [
+        ("capture", 5, "hiker", 7),
+        *(("capture", 11, 9, 7, "camera space", "camera-space"), studio),
+        *(("capture", 11, 9, 7, "image space", "image-space"), studio),
+    ]
+    assert found["rows"] == [{"augmentation": name, **figures, "loss": 0.5} for name, figures in FIGURES.items()]
+    assert found["gain_db"] == {"far": -0.5, "face": 2.5}
+    assert found["config"] == {"steps": 11, "frames": 5, "samples": 9, "views": 3, "look": "hiker", "seed": 7}
+
+
+@pytest.mark.parametrize("asked", [{"steps": 9}, {"frames": 3}, {"samples": 7}, {"look": "nobody"}])
+def test_settings_out_of_range_are_refused(asked: Any) -> None:
+    with pytest.raises(BadInputError):
+        augmentation.measure(**asked)
+
+
+def test_without_pytorch_it_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(augmentation, "find_spec", lambda part: None if part == "torch" else part)
+    with pytest.raises(MissingPartError, match=r"training needs torch; .*train"):
+        augmentation.measure()
+
+
+@pytest.mark.slow
+def test_camera_space_wins_close_up() -> None:
+    """After few steps already, because the texture of a new person is then mostly what the samples' colours say."""
+    found = augmentation.measure(steps=60, frames=16, samples=96, views=4)
+    assert found["gain_db"]["face"] > 0 and found["gain_db"]["upper_body"] > 0
