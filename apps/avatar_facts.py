@@ -11,7 +11,6 @@ from typing import Any
 from trilane.avatars.bundle import Bundle
 from trilane.avatars.integer_network import NetworkFile
 from trilane.avatars.validation import validation_facts
-from trilane.body.body import load_body
 from trilane.errors import BadInputError
 from trilane.hw_profiles.network_work import graph_facts
 
@@ -23,7 +22,7 @@ def bundle_facts(bundle: Bundle) -> dict[str, Any]:
     `validation`.
     """
     manifest = bundle.manifest
-    shaped = load_body(bundle.body_path).shape(manifest.betas, manifest.expression)
+    shaped = bundle.shaped_body()
     files = {"body": bundle.body_path, "texture": bundle.texture_path, "network": bundle.network_path}
     return {
         "name": manifest.name,

@@ -126,7 +126,8 @@ def _make(bundle: Bundle, recipe: _Recipe, folder: Path) -> None:
     texture, scale = arrays["texture"][..., chosen], arrays.get("scale")
     if scale is not None and scale.ndim:
         scale = scale[chosen]
-    write_bundle(folder, _manifest(bundle, recipe, network, quantised), bundle.body_path, texture, network, scale)
+    manifest, offsets = _manifest(bundle, recipe, network, quantised), bundle.read_body().offsets
+    write_bundle(folder, manifest, bundle.body_path, texture, network, scale, offsets)
 
 
 def _manifest(bundle: Bundle, recipe: _Recipe, network: Any, quantised: Quantised) -> Manifest:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +15,19 @@ import numpy as np
 import onnx
 from numpy.typing import NDArray
 
+from trilane.arrays import F32
 from trilane.avatars.digests import digests_of
 from trilane.avatars.integer_network import MAX_SIDE, Affine, NetworkFile
 from trilane.avatars.manifest import ByteRange, Manifest, parse_manifest
 from trilane.avatars.network_file import read_network
+from trilane.avatars.offsets import read_offsets, save_offsets
+from trilane.body.body import Body, ShapedBody, load_body
 from trilane.errors import BadInputError
 from trilane.files import read_npz, read_text, require_file
 from trilane.near_miss import did_you_mean
 from trilane.writing import require_writable, write_bytes, write_folder
 
-MANIFEST = "manifest.json"
+MANIFEST, OFFSETS = "manifest.json", "offsets.npz"
 DEFAULT = "default"
 CAPTURE = "capture.toml"
 HOW_TO_TRAIN = "docs/captures.md says how `trilane avatar train` makes one from frames of a person"
@@ -46,12 +49,27 @@ class Bundle:
         return self.folder / self.manifest.body
 
     @property
+    def offsets_path(self) -> Path | None:
+        return None if self.manifest.offsets is None else self.folder / self.manifest.offsets
+
+    @property
     def texture_path(self) -> Path:
         return self.folder / self.manifest.texture
 
     @property
     def network_path(self) -> Path:
         return self.folder / self.manifest.network.file
+
+    def read_body(self) -> Body:
+        """The body with the offsets of the bundle, if any. Raises BadInputError."""
+        body = load_body(self.body_path)
+        if self.offsets_path is None:
+            return body
+        return replace(body, offsets=read_offsets(self.offsets_path, len(body.v_template)))
+
+    def shaped_body(self) -> ShapedBody:
+        """The avatar at rest. Raises BadInputError."""
+        return self.read_body().shape(self.manifest.betas, self.manifest.expression)
 
     def read_texture(self) -> NDArray[np.float32]:
         """The neural texture, (H, W, C) float32, row 0 at v = 0. Raises BadInputError."""
@@ -93,7 +111,9 @@ def load_bundle(name: str | Path) -> Bundle:
     if (folder / CAPTURE).is_file() and not path.exists():
         raise BadInputError(folder, "a capture, which avatars are trained on", "an avatar's folder", HOW_TO_TRAIN)
     manifest = parse_manifest(read_text(path, "an avatar's manifest"), path)
-    for key, file in (("body", manifest.body), ("texture", manifest.texture), ("network.file", manifest.network.file)):
+    files = {"body": manifest.body, "texture": manifest.texture, "network.file": manifest.network.file}
+    files |= {"offsets": manifest.offsets} if manifest.offsets is not None else {}
+    for key, file in files.items():
         _check_inside(folder, file, f"{path}: {key}")
     return Bundle(folder, manifest)
 
@@ -110,22 +130,32 @@ def _what_it_is(file: Path) -> tuple[str, str, str]:
 
 
 def write_bundle(
-    folder: Path, manifest: Manifest, body: Path, texture: NDArray[Any], network: NetworkFile, scale: Any = None
+    folder: Path,
+    manifest: Manifest,
+    body: Path,
+    texture: NDArray[Any],
+    network: NetworkFile,
+    scale: Any = None,
+    offsets: F32 | None = None,
 ) -> None:
     """Write a bundle beside `folder`, read it back, then put its files in `folder`.
 
     A validation of other parts than these is left out of the manifest.
 
     `folder`: of the bundle; made when it does not exist.
-    `manifest`: its content.
+    `manifest`: its content, but for the name of the file of `offsets`.
     `body`: an .npz file to copy.
     `texture`: (H, W, C) float16, or int8 with `scale`.
     `network`: the network to write.
     `scale`: (C,) float32, of an int8 texture.
+    `offsets`: (V,3) metres, of the body's vertices at rest; None for a body that is drawn bare.
     Raises BadInputError when the parts do not fit together; then nothing is written.
     """
     with write_folder(folder) as draft:
         shutil.copyfile(body, draft / manifest.body)
+        if offsets is not None:
+            save_offsets(draft / OFFSETS, offsets)
+        manifest = manifest.model_copy(update={"offsets": None if offsets is None else OFFSETS})
         arrays: dict[str, Any] = (
             {"texture": texture} if scale is None else {"texture": texture, "scale": np.asarray(scale, np.float32)}
         )
@@ -133,6 +163,7 @@ def write_bundle(
         onnx.save(network.model, draft / manifest.network.file)
         (draft / MANIFEST).write_bytes(_content(_with_own_validation(manifest, draft)))
         bundle = load_bundle(draft)
+        bundle.read_body()
         bundle.read_texture()
         bundle.read_network()
 

@@ -21,7 +21,7 @@ BLOCK = 1 << 20
 def digests_of(folder: Path, manifest: Manifest) -> Digests:
     """The digests of the files in `folder` that `manifest` names. Raises BadInputError for one that cannot be read."""
     return Digests(
-        body=sha256_of([folder / manifest.body]),
+        body=sha256_of([folder / file for file in (manifest.body, manifest.offsets) if file is not None]),
         texture=sha256_of([folder / manifest.texture]),
         network=sha256_of(network_files(folder / manifest.network.file)),
         constants=hashlib.sha256(_constants(manifest).encode()).hexdigest(),

@@ -68,7 +68,8 @@ class NetworkEntry(_Model):
 class Digests(_Model):
     """SHA-256, hexadecimal, of all that an avatar's pictures depend on.
 
-    `body`, `texture`, `network`: of the bytes of those files. `constants`: of the manifest's numbers, which are shape,
+    `body`, `texture`, `network`: of the bytes of those files; offsets count as the body's. `constants`: of the
+    manifest's numbers, which are shape,
     expression, and the scales and zero points of the network's bytes.
     """
 
@@ -194,11 +195,12 @@ class Validation(Figures):
 
 
 class Manifest(_Model):
-    """`manifest.json`. File names are relative to the bundle's folder."""
+    """`manifest.json`. File names are relative to the bundle's folder; a body without `offsets` is drawn bare."""
 
     schema_version: Literal[1] = 1
     name: str = Field(min_length=1, max_length=100)
     body: FileName = "body.npz"
+    offsets: FileName | None = None
     texture: FileName = "texture.npz"
     network: NetworkEntry
     betas: tuple[Coefficient, ...] = Field(default=(), max_length=400)

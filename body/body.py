@@ -9,7 +9,7 @@ The layout is that of https://smpl-x.is.tue.mpg.de, read as the `smplx` package 
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +65,7 @@ class Body:
     `posedirs` (V,3,486), or None when the file's are all zero; `j_regressor` (55,V); `weights` (V,55);
     `parents` (55,), -1 at the root; `faces` (F,3); `uv` (T,2), u right, v up; `uv_faces` (F,3), per corner;
     `hand_components` (left (C,45), right (C,45)); `hand_mean` (90,), axis-angle, left then right.
+    `offsets` (V,3): from the rest shape to what is drawn, such as clothes and hair; None for none.
     """
 
     source: str
@@ -80,6 +81,7 @@ class Body:
     uv_faces: I32
     hand_components: tuple[F32, F32]
     hand_mean: F32
+    offsets: F32 | None = None
 
     @property
     def has_pose_blend_shapes(self) -> bool:
@@ -102,6 +104,8 @@ class Body:
             if len(values):
                 rest += dirs[:, :, : len(values)] @ values
         joints = self.j_regressor.astype(np.float64) @ rest
+        if self.offsets is not None:
+            rest += self.offsets
         return ShapedBody(_frozen(rest.astype(np.float32)), _frozen(joints), self)
 
     def full_pose(self, poses: ArrayLike, flat_hand_mean: bool) -> F64:
@@ -121,6 +125,18 @@ class ShapedBody:
     vertices: F32
     joints: F64
     body: Body
+
+    def bare(self) -> ShapedBody:
+        """The person without offsets: the skin that clothes are put on."""
+        if self.body.offsets is None:
+            return self
+        return ShapedBody(_frozen(self.vertices - self.body.offsets), self.joints, replace(self.body, offsets=None))
+
+    def with_offsets(self, offsets: F32) -> ShapedBody:
+        """The person drawn `offsets` (V,3) metres from the skin at rest, in place of those there were."""
+        bare = self.bare()
+        moved = (bare.vertices.astype(np.float64) + offsets).astype(np.float32)
+        return ShapedBody(_frozen(moved), self.joints, replace(self.body, offsets=_frozen(offsets.copy())))
 
 
 def load_body(path: Path) -> Body:

@@ -18,7 +18,7 @@ from trilane.arrays import F32
 from trilane.avatars.bundle import Bundle
 from trilane.avatars.integer_network import NetworkFile
 from trilane.avatars.network_checks import check_network
-from trilane.body.body import Body, ShapedBody, load_body
+from trilane.body.body import Body, ShapedBody
 from trilane.errors import BadInputError
 from trilane.pipeline.shared_assets import Assets
 from trilane.scene.staged_arrays import staged_from_arrays, staged_to_arrays
@@ -43,8 +43,7 @@ class AvatarData:
 
 def load_avatar(bundle: Bundle) -> AvatarData:
     """Everything that a run needs of `bundle`. Raises BadInputError."""
-    manifest = bundle.manifest
-    shaped = load_body(bundle.body_path).shape(manifest.betas, manifest.expression)
+    shaped = bundle.shaped_body()
     return AvatarData(bundle, shaped, bundle.read_texture(), bundle.read_network())
 
 
@@ -96,7 +95,7 @@ def distinct(config: RunConfig) -> list[Path]:
 def shaped_body(assets: Assets, number: int) -> ShapedBody:
     """The body of distinct avatar `number`."""
     own = _with_prefix(assets, f"body{number}/")
-    arrays: dict[str, Any] = {name: own.get(name) for name in BODY_ARRAYS}  # `posedirs` alone may be None
+    arrays: dict[str, Any] = {name: own.get(name) for name in BODY_ARRAYS}  # `posedirs` and `offsets` may be None
     hands = (own[HANDS[0]], own[HANDS[1]])
     body = Body(source=f"avatar {number} of the run", hand_components=hands, **arrays)
     return ShapedBody(own["vertices"], own["joints"], body)

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
-from trilane.avatars.bundle import load_bundle
+from trilane.avatars.bundle import OFFSETS, load_bundle
 from trilane.avatars.digests import sha256_of
 from trilane.errors import BadInputError
 from trilane.files import read_text
@@ -28,6 +28,7 @@ from trilane.training.first_texture import first_texture
 from trilane.training.make_bundle import quantise_avatar, write_avatar, write_float_network
 from trilane.training.network import UNet
 from trilane.training.neural_texture import SIDES, NeuralTexture
+from trilane.training.outlines import subject_with_offsets
 from trilane.training.perceptual import Vgg16, read_vgg16
 from trilane.training.probe_loss import probe_loss
 from trilane.training.progress_sheet import write_sheet
@@ -92,6 +93,7 @@ def train_on_capture(places: Places, asked: TrainingSettings, listener: Listener
         listener.say(f"perceptual loss: {'MS-SSIM' if vgg is None else f'features of VGG-16 in {places.vgg}'}")
     subject = captured_subject(places.capture, settings.threads, listener.say)
     places.work.mkdir(parents=True, exist_ok=True)
+    subject = _raised(subject, places, settings, listener)
     _draw_samples(subject, places, settings, listener)
     groups = open_groups(places.work / SAMPLES)
     torch.manual_seed(settings.seed)
@@ -129,6 +131,17 @@ def with_vgg(asked: TrainingSettings, file: Path | None) -> TrainingSettings:
     if asked.vgg not in (None, digest):
         raise BadInputError(file, f"SHA-256 {digest}", f"that of the settings, {asked.vgg}")
     return asked.model_copy(update={"vgg": digest})
+
+
+def _raised(subject: Subject, places: Places, settings: TrainingSettings, listener: Listener) -> Subject:
+    """`subject`, drawn with the offsets of its clothes and hair where the settings ask for them."""
+    if not settings.stand_off:
+        return subject
+
+    def track(views: list[Any]) -> Iterable[Any]:
+        return listener.track("measuring outlines", views, len(views))
+
+    return subject_with_offsets(subject, places.work / OFFSETS, settings.seed, track)
 
 
 def resumed_settings(path: Path, asked: TrainingSettings) -> TrainingSettings:

@@ -19,7 +19,7 @@ from trilane.arrays import F32, F64, U8
 from trilane.body.body import load_body
 from trilane.scene.motion.motion import Motion
 from trilane.shapes import Shape
-from trilane.training.clothing.looks import DEFAULT_NAME, look_named
+from trilane.training.clothing.looks import look_named
 from trilane.training.sample_crop import Crop
 from trilane.training.sample_files import U16, create_group, open_groups
 from trilane.training.sample_renderer import BAND_NAMES, PoseSource, Sample, SampleRenderer
@@ -71,10 +71,14 @@ class SampleSource(Protocol[One]):
         """The UV image (h,w,3) and the ground truth (h,w,4) of `sample`."""
 
 
-def clothed_source(body: Path, name: str = DEFAULT_NAME) -> SampleRenderer:
-    """The default source: the body in the file `body`, in the look `name`, on one thread. Raises BadInputError."""
+def clothed_source(body: Path, name: str, offsets: F32 | None) -> SampleRenderer:
+    """The default source: the body in the file `body`, in the look `name`, drawn with `offsets` (V,3), on one thread.
+
+    Raises BadInputError.
+    """
     look = look_named(name)
-    return SampleRenderer(load_body(body).shape(look.betas), threads=1, look=look)
+    shaped = load_body(body).shape(look.betas)
+    return SampleRenderer(shaped if offsets is None else shaped.with_offsets(offsets), threads=1, look=look)
 
 
 def plan_training(source: SampleSource[One], count: int, seed: int, track: Callable[[Any], Any] = iter) -> list[One]:

@@ -148,7 +148,8 @@ def write_avatar(
         betas=person.betas,
         expression=person.expression,
     )
-    write_bundle(folder, manifest, person.body, quantised.texture, quantised.network.network, quantised.scale)
+    network, scale = quantised.network.network, quantised.scale
+    write_bundle(folder, manifest, person.body, quantised.texture, network, scale, person.offsets)
 
 
 def _inputs(avatar: TrainableAvatar, group: ShapeGroup, index: NDArray[np.int64]) -> list[NDArray[np.float32]]:

@@ -56,14 +56,14 @@ class SampleRenderer:
     def __init__(self, shaped: ShapedBody, threads: int | None = None, samples: int = 2, look: Look = DEFAULT) -> None:
         """Put clothes on the body and open the context.
 
-        `shaped`: the body.
+        `shaped`: the body; its offsets, if any, are what the UV image is drawn with, clothes are put on the skin.
         `threads`: of a software OpenGL driver; None for its default.
         `samples`: of the ground truth along each side of a pixel, an even number.
         `look`: what the body wears; its build is that of `shaped`.
         Raises MissingPartError without OpenGL.
         """
         body = shaped.body
-        arrays = body_arrays(shaped)
+        arrays = body_arrays(shaped.bare())
         top = largest_weights(body.weights, enough_weights(body))
         mesh = mesh_arrays(shaped.vertices, body.faces, body.uv, body.uv_faces, top.joints, top.weights)
         landmarks = find_landmarks(arrays.vertices, arrays.joints, arrays.weights)

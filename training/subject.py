@@ -5,15 +5,15 @@ Rule: this alone differs between the two; samples, training and bundle are the s
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from trilane.arrays import U8, Mask
+from trilane.arrays import F32, U8, Mask
 from trilane.avatars.manifest import CAPTURED
 from trilane.body.body import ShapedBody, load_body
 from trilane.training.capture.body_raster import BodyRaster
@@ -30,32 +30,54 @@ from trilane.training.sample_renderer import SampleRenderer
 
 @dataclass(frozen=True)
 class Person:
-    """Whose avatar it is. `body`: the file. `betas`, `expression`: coefficients of its shape."""
+    """Whose avatar it is. `body`: the file. `betas`, `expression`: coefficients of its shape.
+
+    `offsets` (V,3): from the skin to what is drawn, metres at rest; None for nothing.
+    """
 
     body: Path
     betas: tuple[float, ...] = ()
     expression: tuple[float, ...] = ()
+    offsets: F32 | None = None
 
 
 @dataclass(frozen=True)
 class Subject:
     """Who is trained.
 
-    `person`, `shaped`: the body. `renderer`: plans and renders samples. `source`: opens another one like it, in another
-    process. `facts`: for the manifest. `truth`: renders the person in any pose and view; None where only frames are
-    known: then `frames` has them, of which those `held_out` are for measuring. `unseen` (S,S): texels of the body that
-    no frame of the training shows; None where all can be drawn.
+    `person`, `shaped`: the body. `renderer`: plans and renders samples. `opener`: opens another one like it, also in
+    another process, whose body is drawn with the offsets that it is given. `facts`: for the manifest. `truth`: renders
+    the person in any pose and view; None where only frames are known: then `frames` has them, of which those `held_out`
+    are for measuring. `unseen` (S,S): texels of the body that no frame of the training shows; None where all can be
+    drawn.
     """
 
     person: Person
     shaped: ShapedBody
     renderer: SampleSource[Any]
-    source: Callable[[], SampleSource[Any]]
+    opener: Callable[[F32 | None], SampleSource[Any]]
     facts: dict[str, Any]
     truth: SampleRenderer | None = None
     frames: CaptureRenderer | None = None
     held_out: tuple[int, ...] = ()
     unseen: Mask | None = None
+
+    @property
+    def source(self) -> Callable[[], SampleSource[Any]]:
+        """Opens another renderer like this subject's."""
+        return partial(self.opener, self.person.offsets)
+
+    def with_offsets(self, offsets: F32) -> Subject:
+        """The same, drawn with `offsets` (V,3)."""
+        renderer: Any = self.opener(offsets)
+        return replace(
+            self,
+            person=replace(self.person, offsets=offsets),
+            shaped=self.shaped.with_offsets(offsets),
+            renderer=renderer,
+            truth=None if self.truth is None else renderer,
+            frames=None if self.frames is None else renderer,
+        )
 
 
 def clothed_subject(body: Path, threads: int, name: str = DEFAULT_NAME) -> Subject:
@@ -91,10 +113,16 @@ def captured_subject(folder: Path, threads: int, report: Callable[[str], None]) 
         "texels": texel_facts(coverage),
     }
     person = Person(capture.body_file, tuple(map(float, capture.betas)), tuple(map(float, capture.expression)))
-    source = partial(CaptureRenderer, capture, tuple(kept), ViewRule(), threads=1)
-    renderer = source()
+    opener = partial(capture_source, capture, tuple(kept))
+    renderer = opener(None)
     shown = (None, renderer, tuple(held_out), coverage.unseen)
-    return Subject(person, capture.shaped, renderer, source, facts, *shown)
+    return Subject(person, capture.shaped, renderer, opener, facts, *shown)
+
+
+def capture_source(capture: Capture, numbers: Sequence[int], offsets: F32 | None) -> CaptureRenderer:
+    """What renders the frames `numbers` of `capture`, on one thread; the body is drawn with `offsets` (V,3)."""
+    drawn = capture if offsets is None else replace(capture, shaped=capture.shaped.with_offsets(offsets))
+    return CaptureRenderer(drawn, numbers, ViewRule(), threads=1)
 
 
 def _checked(capture: Capture, threads: int) -> tuple[list[CheckedFrame], TexelCoverage, list[U8]]:

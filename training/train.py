@@ -21,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from trilane.avatars.bundle import bundle_folder, load_bundle
+from trilane.avatars.bundle import OFFSETS, bundle_folder, load_bundle
 from trilane.avatars.manifest import Validation
 from trilane.body.body import ShapedBody
 from trilane.errors import BadInputError, TrilaneError
@@ -37,10 +37,11 @@ from trilane.training.float_painter import float_painter
 from trilane.training.make_bundle import quantise_avatar, write_avatar
 from trilane.training.network import UNet
 from trilane.training.neural_texture import SIDES, NeuralTexture
+from trilane.training.outlines import subject_with_offsets
 from trilane.training.sample_files import open_groups
 from trilane.training.sample_renderer import SampleRenderer
 from trilane.training.subject import Subject, captured_subject, clothed_subject
-from trilane.training.trainable_avatar import TrainableAvatar
+from trilane.training.trainable_avatar import Precision, TrainableAvatar
 from trilane.training.training_loop import FitConfig, fit
 from trilane.training.validate import (
     BUILTIN_HELD_OUT,
@@ -59,13 +60,14 @@ CHANNELS = 16
 CHECKPOINT, FINAL, NETWORK = "checkpoint.npz", "final.npz", "network.npz"
 FACTS, TRAINING = "dataset.json", "training"
 #: Settings of `FitConfig` for a training that starts from a network, and for one that also has a trained texture.
-KNOWN_NETWORK: dict[str, Any] = {"small_until": 0.0, "freeze_norms_at": 0.3}
+REPEATS = (2, 1, 2, 3, 1)
+KNOWN_NETWORK: dict[str, Any] = {"small_until": 0.0, "freeze_norms_at": 0.3, "repeats": REPEATS}
 RESUMED: dict[str, Any] = {
     "network_rate": 6e-4,
     "texture_rate": 2e-4,
     "small_until": 0.0,
     "freeze_norms_at": 0.1,
-    "repeats": (2, 1, 2, 3, 1),
+    "repeats": REPEATS,
 }
 
 
@@ -79,6 +81,7 @@ class TrainConfig:
     `held_out`: motions that validation poses come from. `width`: of the network; 64 is full.
     `capture`: folder of the person to train on; None for the body in `body`, clothed. `look`: of that body, a name of
     `LOOKS`.
+    `precision`: of the network while it is trained; "bfloat16" is three times as fast on processors with AMX.
     `weights`: do not train, use these. `resume`: continue from these weights at a lower rate. `network`: start from the
     network of these weights, with a new texture or with `texture`, that of a trained avatar (a name or a folder).
     """
@@ -103,6 +106,7 @@ class TrainConfig:
     texture: str | None = None
     capture: Path | None = None
     look: str | None = None
+    precision: Precision = "float32"
 
 
 def train(config: TrainConfig, report: Callable[[str], None]) -> Path:
@@ -111,7 +115,8 @@ def train(config: TrainConfig, report: Callable[[str], None]) -> Path:
     Raises BadInputError for inputs that do not fit together, MissingPartError without OpenGL.
     """
     torch.manual_seed(config.seed)
-    subject = _subject(config, report)
+    config.work.mkdir(parents=True, exist_ok=True)
+    subject = subject_with_offsets(_subject(config, report), config.work / OFFSETS, config.seed)
     held_out_motions(config.held_out)  # a motion that cannot be read ends the command here
     _render_training_set(subject, config, report)
     shaped = subject.shaped
@@ -225,7 +230,7 @@ def _trained(shaped: ShapedBody, config: TrainConfig, report: Callable[[str], No
 
 def _starting_point(shaped: ShapedBody, config: TrainConfig) -> tuple[TrainableAvatar, int, FitConfig]:
     """The avatar that training starts from, the steps it has been trained, and the settings of the training."""
-    shared = {name: getattr(config, name) for name in ("minutes", "workers", "threads", "batch", "seed")}
+    shared = {name: getattr(config, name) for name in ("minutes", "workers", "threads", "batch", "seed", "precision")}
     settings = FitConfig(**shared)
     if config.resume is not None:
         avatar, steps = load_avatar(_blank_avatar(config), config.resume)

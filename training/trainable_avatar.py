@@ -6,12 +6,15 @@ there is any, is in training mode alone.
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch
 from torch import Tensor, nn
 
 from trilane.training.network import UNet
 from trilane.training.neural_texture import NeuralTexture, read_texture
 
+Precision = Literal["float32", "bfloat16"]
 #: Steps of the network's input bytes on each side of zero.
 INPUT_STEPS = 127
 
@@ -21,6 +24,9 @@ class TrainableAvatar(nn.Module):
 
     `texture_noise`, `input_noise`: standard deviation of Gaussian noise on texels, and on the network's input.
     """
+
+    #: "bfloat16": the network is computed in it where that is safe; weights, texture and loss stay float32.
+    precision: Precision = "float32"
 
     def __init__(self, texture: NeuralTexture, network: UNet) -> None:
         super().__init__()
@@ -32,8 +38,9 @@ class TrainableAvatar(nn.Module):
         x = read_texture(self._noisy(self.texture.image(), self.texture_noise), uv, covered)
         x = self._noisy(x, self.input_noise)
         rounded = torch.round(x * INPUT_STEPS) / INPUT_STEPS
-        output: Tensor = self.network(x + (rounded - x).detach())
-        return output
+        with torch.autocast(x.device.type, torch.bfloat16, enabled=self.precision == "bfloat16"):
+            output: Tensor = self.network(x + (rounded - x).detach())
+        return output.float()
 
     def _noisy(self, x: Tensor, deviation: float) -> Tensor:
         return x + deviation * torch.randn_like(x) if self.training and deviation else x

@@ -29,7 +29,7 @@ from trilane.training.losses import loss_terms
 from trilane.training.objective import Objective
 from trilane.training.optimisers import clip_gradients, optimiser_of
 from trilane.training.sample_files import U16, ShapeGroup, batches, open_groups
-from trilane.training.trainable_avatar import TrainableAvatar
+from trilane.training.trainable_avatar import Precision, TrainableAvatar
 
 #: Share of the budget in which the learning rate rises.
 WARM_UP = 0.02
@@ -53,6 +53,7 @@ class FitConfig:
     `average_s`: time constant of the average of the weights.
     `repeats`: how often an epoch has a sample, by its band: far, full body, upper body, face, anywhere.
     `noise_steps`: size of the noise on activations, in steps of a byte.
+    `precision`: of the network while it is trained.
     """
 
     minutes: float
@@ -71,6 +72,7 @@ class FitConfig:
     report_s: float = 30.0
     checkpoint_s: float = 180.0
     max_steps: int = 10_000_000
+    precision: Precision = "float32"
 
 
 def load_batch(
@@ -137,6 +139,7 @@ def _worker(
     torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed + number)
     avatar = copy.deepcopy(shared)
+    avatar.precision = config.precision
     add_activation_noise(avatar.network, config.noise_steps)
     avatar.network.to(memory_format=torch.channels_last)
     optimiser = optimiser_of(avatar, config)

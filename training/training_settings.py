@@ -40,8 +40,9 @@ class TrainingSettings(Table):
     rates. `small_until`, `freeze_norms_at`: shares of the steps, up to which only half-size samples are used, and after
     which batch statistics stay. `average_share`: of the steps so far, time constant of the average that becomes the
     avatar. `discriminator_rate`: of learning, for discriminators; it stays as it is. `noise_steps`: on activations,
-    steps of a byte. `masked_texture`: texels that a batch does not show keep their values and their momentum. `norm`:
-    of a new network. `vgg`: SHA-256 of VGG-16's weights that the perceptual loss is by.
+    steps of a byte. `masked_texture`: texels that a batch does not show keep their values and their momentum.
+    `stand_off`: the body is drawn with clothes and hair raised by what masks show. `norm`: of a new network. `vgg`:
+    SHA-256 of VGG-16's weights that the perceptual loss is by.
     """
 
     schema_: Literal[1] = Field(default=1, alias="schema")
@@ -63,6 +64,7 @@ class TrainingSettings(Table):
     average_share: float = Field(default=0.1, gt=0, le=1)
     noise_steps: float = Field(default=1.0, ge=0, le=16)
     masked_texture: bool = False
+    stand_off: bool = True
     norm: Literal["batch", "instance", "group", "none"] = "batch"
     vgg: str | None = Field(default=None, pattern="^[0-9a-f]{64}$")
     loss: LossWeights = LossWeights()

@@ -14,7 +14,6 @@ from typing import Any
 from trilane.avatars.bundle import Bundle, write_manifest
 from trilane.avatars.digests import digests_of, sha256_of, with_figures_digest
 from trilane.avatars.manifest import MadeWith, Validation
-from trilane.body.body import load_body
 from trilane.scene.motion.load import load_motion
 from trilane.scene.motion.motion import Motion
 from trilane.scene.schema import AvatarSpec
@@ -71,9 +70,7 @@ def held_out_motions(names: Iterable[str]) -> list[Motion]:
 
 def open_renderer(bundle: Bundle, threads: int) -> SampleRenderer:
     """The renderer of the samples of `bundle`'s body. Raises BadInputError, MissingPartError."""
-    manifest = bundle.manifest
-    shaped = load_body(bundle.body_path).shape(manifest.betas, manifest.expression)
-    return SampleRenderer(shaped, threads, look=look_of(manifest.provenance))
+    return SampleRenderer(bundle.shaped_body(), threads, look=look_of(bundle.manifest.provenance))
 
 
 def validate(

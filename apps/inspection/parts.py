@@ -68,7 +68,7 @@ def inspect_avatar(path: Path) -> Inspection:
     bundle = load_bundle(folder)
     found = bundle_facts(bundle)
     manifest = bundle.manifest
-    vertices = load_body(bundle.body_path).shape(manifest.betas, manifest.expression).vertices
+    vertices = bundle.shaped_body().vertices
     facts = {
         "name": found["name"],
         "vertices": found["body"]["vertices"],

@@ -26,6 +26,8 @@ class FullBody:
         for directions, values in ((body.shape_dirs, betas), (body.expression_dirs, expression)):
             self.rest = self.rest + directions[:, :, : len(values)].astype(np.float64) @ np.array(values, np.float64)
         self.joints = body.j_regressor.astype(np.float64) @ self.rest
+        if body.offsets is not None:
+            self.rest = self.rest + body.offsets
 
     def vertices(self, pose: F64, translation: F64, world: F64) -> F64:
         """(V,3) metres, in the world.

@@ -31,11 +31,13 @@ def full_width_bundle() -> Path:
         raise TrilaneError("the cache folder cannot be written: set XDG_CACHE_HOME to one that can")
     default = load_bundle(bundle_folder("default"))
     texture = default.read_texture().astype(np.float16)
-    content = hashlib.sha256(texture.tobytes() + default.body_path.read_bytes()).hexdigest()[:12]
+    offsets = default.read_body().offsets
+    worn = b"" if offsets is None else offsets.tobytes()
+    content = hashlib.sha256(texture.tobytes() + default.body_path.read_bytes() + worn).hexdigest()[:12]
     folder = home / f"{ENCODER}-{NORM}-{WIDTH}-{content}"
     if not (folder / MANIFEST).exists():
         network = untrained(ENCODER, NORM, WIDTH, (SIDE, SIDE), texture.shape[2]).integer
         entry = network_entry(network, ENCODER, NORM, WIDTH)
         manifest = Manifest(name=NAME, network=entry, provenance={"weights": UNTRAINED})
-        write_bundle(folder, manifest, default.body_path, texture, network)
+        write_bundle(folder, manifest, default.body_path, texture, network, offsets=offsets)
     return folder

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 from trilane.avatars.bundle import Bundle
-from trilane.body.body import ShapedBody, load_body
+from trilane.body.body import ShapedBody
 from trilane.errors import MissingPartError
 
 
@@ -25,4 +25,4 @@ def ground_truth(bundle: Bundle) -> tuple[Any, Any]:
 
 def shaped_body(bundle: Bundle) -> ShapedBody:
     """The body of `bundle` in the shape that its manifest says."""
-    return load_body(bundle.body_path).shape(bundle.manifest.betas, bundle.manifest.expression)
+    return bundle.shaped_body()

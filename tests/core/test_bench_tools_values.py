@@ -226,8 +226,8 @@ def test_the_full_width_bundle_is_made_once(
 
     written: list[Any] = []
 
-    def write(folder: Path, *what: Any) -> None:
-        written.append((folder, *what))
+    def write(folder: Path, *what: Any, offsets: Any) -> None:
+        written.append((folder, *what, offsets))
         folder.mkdir(parents=True)
         (folder / full_width.MANIFEST).touch()
 
@@ -237,9 +237,12 @@ def test_the_full_width_bundle_is_made_once(
     folder = full_width.full_width_bundle()
     assert folder.parent == tmp_path / "bench"
     default = load_bundle("default")
+    worn = default.read_body().offsets
     content = default.read_texture().astype(np.float16).tobytes() + default.body_path.read_bytes()
+    content += b"" if worn is None else worn.tobytes()
     assert folder.name == f"resnet18-batch-64-{hashlib.sha256(content).hexdigest()[:12]}"
-    ((place, manifest, body, texture, network),) = written
+    ((place, manifest, body, texture, network, offsets),) = written
+    assert np.array_equal(offsets, worn) if worn is not None else offsets is None
     assert (place, body, network) == (folder, default.body_path, tiny_quantised.network)
     assert texture.dtype == np.float16 and np.array_equal(texture, default.read_texture().astype(np.float16))
     assert made == [("resnet18", "batch", 64, (64, 64), texture.shape[2])]

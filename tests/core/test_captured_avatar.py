@@ -69,10 +69,17 @@ def log(monkeypatch: pytest.MonkeyPatch) -> Any:
 
     def subject(folder: Path, _: int, report: Callable[[str], None]) -> Subject:
         report(f"9 frames of {folder.name}")
-        return Subject(person, "shaped", renderer, "source", FACTS, None, "frames", (3,))  # type: ignore[arg-type]
+        return Subject(person, "shaped", renderer, opener, FACTS, None, "frames", (3,))  # type: ignore[arg-type]
+
+    def raised(found: Subject, path: Path, seed: int, track: Any) -> Subject:
+        asked.append(("raise", path.name, seed, len(list(track([1, 2])))))
+        return found
+
+    def opener(offsets: Any) -> Any:
+        """Stands for what opens renderers."""
 
     def draw(source: Any, samples: Any, folder: Path, processes: int, track: Any) -> None:
-        asked.append(("draw", source, len(samples), processes))
+        asked.append(("draw", source.func.__name__, source.args, len(samples), processes))
         list(track([1, 2, 3]))
         group = create_group(folder, SHAPE, np.zeros(len(samples), np.int8))
         group.covered[:, 4:24, 6:28] = 1
@@ -81,6 +88,7 @@ def log(monkeypatch: pytest.MonkeyPatch) -> Any:
     part = monkeypatch.setattr
     before = torch.get_num_threads()
     part(captured_avatar, "captured_subject", subject)
+    part(captured_avatar, "subject_with_offsets", raised)
     part(captured_avatar, "write_dataset", draw)
     part(captured_avatar, "SIDES", SIDES)
     part(captured_avatar, "NeuralTexture", lambda start: NeuralTexture(start, SIDES))
@@ -121,7 +129,8 @@ def told_before(folder: Path) -> float:
 def test_every_part_gets_what_is_its(log: list[Any], tmp_path: Path) -> None:
     told = Told()
     facts = train_on_capture(places(tmp_path), settings(), told)
-    assert log[:4] == ["render"] * 4 and log[4] == ("draw", "source", 8, 1)
+    assert log.pop(0) == ("raise", "offsets.npz", 1, 2)
+    assert log[:4] == ["render"] * 4 and log[4] == ("draw", "opener", (None,), 8, 1)
     assert log[5:15] == [f"step-{step:07}.png" for step in range(2, 21, 2)]
     folder, person, (_, shaped, seed), width, provenance, names = log[15]
     assert (folder, person, shaped, seed, width) == (tmp_path / "mine", Person(Path("body.npz")), "shaped", 1, 4)
@@ -130,9 +139,10 @@ def test_every_part_gets_what_is_its(log: list[Any], tmp_path: Path) -> None:
     assert names == {"name": "mine", "training_command": command}
     assert log[16:] == [("bundle of mine", "frames", (3,), 1), ("bundle of mine", {"psnr_db": 21.0, "of": "errors"})]
     assert read_settings(tmp_path / "mine" / "training.toml") == settings()
-    assert told.lines[:3] == ["trains on 1 thread of the CPU", "9 frames of capture", "choosing views 8"]
-    assert "0 MB on the disk (by 4 that were drawn)" in told.lines[3] and told.lines[4] == "drawing views 3"
-    assert told.lines[5].startswith("20 steps: about 0.") and told.lines[5].endswith(" MB of memory")
+    said = ["trains on 1 thread of the CPU", "9 frames of capture", "measuring outlines 2", "choosing views 8"]
+    assert told.lines[:4] == said
+    assert "0 MB on the disk (by 4 that were drawn)" in told.lines[4] and told.lines[5] == "drawing views 3"
+    assert told.lines[6].startswith("20 steps: about 0.") and told.lines[6].endswith(" MB of memory")
     losses = [loss for _, _, loss in told.steps]
     assert [step[:2] for step in told.steps] == [(step, 20) for step in range(1, 21)] and losses[-1] < losses[0]
     assert losses == [pytest.approx(sum(WEIGHTS[name] * terms[name] for name in terms)) for terms in told.terms]
@@ -182,7 +192,7 @@ def test_steps_are_counted_for_the_minutes(log: list[Any], tmp_path: Path, monke
     monkeypatch.setattr(captured_avatar, "step_seconds", lambda *_: 0.6)
     told = Told()
     assert train_on_capture(places(tmp_path), settings(steps=None, minutes=0.125), told)["steps"] == 12
-    assert "12 steps: about 0.1 min (0.60 s a step as just measured)" in told.lines[5]
+    assert "12 steps: about 0.1 min (0.60 s a step as just measured)" in told.lines[6]
     assert read_settings(tmp_path / "mine" / "training.toml").steps == 12
     assert train_on_capture(places(tmp_path, "other"), settings(steps=None, minutes=0.001), Told())["steps"] == 10
     assert log

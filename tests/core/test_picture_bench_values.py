@@ -269,14 +269,10 @@ def test_ground_truth_is_drawn_as_training_draws_it(monkeypatch: pytest.MonkeyPa
     from trilane.training.clothing.looks import LOOKS
     from trilane.training.image_error import image_error
 
-    asked: list[Any] = []
-    body = SimpleNamespace(shape=lambda *shape: asked.append(shape) or "shaped")
-    monkeypatch.setattr(ground_truth, "load_body", lambda path: asked.append(path) or body)
     monkeypatch.setattr(sample_renderer, "SampleRenderer", lambda shaped, look: ("studio", shaped, look))
-    manifest = SimpleNamespace(betas="betas", expression="expression", provenance={"look": "hiker"})
-    bundle: Any = SimpleNamespace(body_path="path", manifest=manifest)
+    manifest = SimpleNamespace(provenance={"look": "hiker"})
+    bundle: Any = SimpleNamespace(shaped_body=lambda: "shaped", manifest=manifest)
     assert ground_truth.ground_truth(bundle) == (("studio", "shaped", LOOKS["hiker"]), image_error)
-    assert asked == ["path", ("betas", "expression")]
 
 
 def test_ground_truth_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:

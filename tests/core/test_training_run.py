@@ -44,6 +44,10 @@ def same(one: torch.nn.Module, other: torch.nn.Module) -> bool:
     return all(torch.equal(a, b) for a, b in pairs)
 
 
+def opener(offsets):
+    """Stands for what opens renderers of a subject."""
+
+
 def grey(made: TrainableAvatar) -> float:
     """The mean of its texture."""
     return float(made.texture.image().detach().mean())
@@ -81,7 +85,8 @@ def calls(monkeypatch):
 
         monkeypatch.setattr(command, name, asked)
 
-    part("clothed_subject", lambda body, *_: Subject(Person(body), "shaped", "renderer", "source", CLOTHED, "renderer"))
+    part("clothed_subject", lambda body, *_: Subject(Person(body), "shaped", "renderer", opener, CLOTHED, "renderer"))
+    part("subject_with_offsets", lambda subject, *_: subject)
     part("plan_training", "planned")
     part("write_dataset")
     part("open_groups", "groups")
@@ -119,6 +124,7 @@ def test_every_part_gets_what_is_its(config, calls, tmp_path):
     assert [call[0] for call in calls] == [
         *(
             "clothed_subject",
+            "subject_with_offsets",
             "plan_training",
             "write_dataset",
             "body_arrays",
@@ -130,7 +136,10 @@ def test_every_part_gets_what_is_its(config, calls, tmp_path):
     ]
     assert said["clothed_subject"] == (config.body, 2, "default")
     assert said["plan_training"] == ("renderer", 6, 11)
-    assert said["write_dataset"] == ("source", "planned", work / "training", 2)
+    assert said["subject_with_offsets"][1:] == (work / "offsets.npz", 11)
+    source, *others = said["write_dataset"]
+    assert (source.func, source.args) == (opener, (None,))
+    assert tuple(others) == ("planned", work / "training", 2)
     assert said["open_groups"] == (work / "training",)
     assert said["first_texture"] == ("arrays", "groups", SIDE, CHANNELS)
     assert said["fit"] == (work / "training", FitConfig(minutes=3.0, workers=2, threads=7, batch=9, seed=11))
@@ -194,7 +203,7 @@ def seeded(config, seeds):
 
 
 def test_a_training_set_is_rendered_once_and_another_is_refused(config, calls):
-    subject = Subject(Person(config.body), "shaped", "renderer", "source", CLOTHED)
+    subject = Subject(Person(config.body), "shaped", "renderer", opener, CLOTHED)
     command._render_training_set(subject, config, lambda _: None)
     command._render_training_set(subject, config, lambda _: pytest.fail("rendered again"))
     assert [call[0] for call in calls] == ["plan_training", "write_dataset"]
@@ -215,7 +224,7 @@ def test_a_capture_is_another_source_and_is_measured_on_its_own_frames(config, c
         asked.append(words[:2])
         words[2]("9 frames of 10")
         facts = {"body": "that of a capture"}
-        return Subject(person, "their shape", "their renderer", "their source", facts, None, "their frames", (3, 13))
+        return Subject(person, "their shape", "their renderer", opener, facts, None, "their frames", (3, 13))
 
     monkeypatch.setattr(command, "frame_errors", lambda *words: asked.append(words) or "errors")
     monkeypatch.setattr(command, "error_facts", lambda errors: {"psnr_db": 20.0} if errors == "errors" else None)
@@ -228,10 +237,10 @@ def test_a_capture_is_another_source_and_is_measured_on_its_own_frames(config, c
     bundle, figures = f"bundle in {config.out}", {"psnr_db": 20.0}
     assert asked == [(folder, 2), (bundle, "their frames", (3, 13), 2), (bundle, figures)]
     assert (lines[0], json.loads(lines[-1])) == ("9 frames of 10", {"held_out_error": figures})
-    assert said["plan_training"][0] == "their renderer" and said["write_dataset"][0] == "their source"
+    assert said["plan_training"][0] == "their renderer" and said["write_dataset"][0].func is opener
     assert said["write_avatar"][1] is person and said["write_avatar"][4]["body"] == "that of a capture"
     assert not {"validate", "revalidate", "clothed_subject"} & set(said)
-    assert command_of(one).endswith("--capture mine") and "--capture" not in command_of(config)
+    assert command_of(one).endswith("--capture mine --precision float32") and "--capture" not in command_of(config)
     assert json.loads((config.work / "dataset.json").read_text())["capture"] == str(folder)
     with pytest.raises(BadInputError, match="use another --work folder"):
         train(config, lines.append)
@@ -274,7 +283,9 @@ def test_a_known_network_learns_a_new_texture_or_one_that_is_trained(config, mon
     save_network(avatar(1), tmp_path / "network.npz")
     known = replace(config, network=tmp_path / "network.npz")
     start, steps, settings = command._starting_point("shaped", known)
-    assert steps == 0 and settings == FitConfig(**SHARED, small_until=0.0, freeze_norms_at=0.3, seed=11)
+    assert steps == 0 and settings == FitConfig(
+        **SHARED, small_until=0.0, freeze_norms_at=0.3, repeats=(2, 1, 2, 3, 1), seed=11
+    )
     wanted = load_network(UNet(width=4, channels=CHANNELS, input_skip=True), tmp_path / "network.npz")
     assert same(start.network, wanted)
     assert grey(start) == pytest.approx(0.5)
@@ -351,7 +362,7 @@ def test_the_command_is_written_without_folders():
     assert command_of(ALL) == (
         "python -m trilane.training.train --name 'a b' --minutes 2.5 --samples 7 --per-band 6 --held-out jump.bvh "
         "--held-out builtin:idle --width 8 --workers 2 --threads 4 --batch 3 --seed 5 --weights f.npz --resume r.npz "
-        "--network n.npz --texture somebody --look hiker"
+        "--network n.npz --texture somebody --look hiker --precision float32"
     )
 
 

@@ -16,6 +16,7 @@ pytest.importorskip("skimage")
 
 from trilane.avatars.bundle import Bundle, load_bundle
 from trilane.avatars.digests import digests_of
+from trilane.body.body import load_body
 from trilane.training import dataset, evaluate, validate
 from trilane.training.clothing.looks import LOOKS
 from trilane.training.image_error import image_error
@@ -200,12 +201,12 @@ def test_motions_are_found_from_where_one_is(parts):
 def test_samples_are_of_the_avatars_own_shape(monkeypatch, tiny_bundle):
     bundle = load_bundle(tiny_bundle)
     bundle = Bundle(bundle.folder, bundle.manifest.model_copy(update={"betas": (1.0,), "expression": (2.0,)}))
-    monkeypatch.setattr(validate, "load_body", lambda path: SimpleNamespace(shape=lambda *shape: (path, shape)))
-    monkeypatch.setattr(validate, "SampleRenderer", lambda *words, look: (*words, look))
-    shaped = (tiny_bundle / "body.npz", ((1.0,), (2.0,)))
-    assert validate.open_renderer(bundle, 4) == (shaped, 4, LOOKS["default"])
+    monkeypatch.setattr(validate, "SampleRenderer", lambda shaped, *words, look: (shaped.vertices, *words, look))
+    shaped = load_body(tiny_bundle / "body.npz").shape((1.0,), (2.0,)).vertices
+    vertices, *others = validate.open_renderer(bundle, 4)
+    assert (vertices == shaped).all() and others == [4, LOOKS["default"]]
     manifest = bundle.manifest.model_copy(update={"provenance": {"look": "hiker"}})
-    assert validate.open_renderer(Bundle(bundle.folder, manifest), 4) == (shaped, 4, LOOKS["hiker"])
+    assert validate.open_renderer(Bundle(bundle.folder, manifest), 4)[1:] == (4, LOOKS["hiker"])
 
 
 # --- what samples are made of -------------------------------------------------------------------------------------
