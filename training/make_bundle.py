@@ -23,7 +23,7 @@ from trilane.training.body_arrays import BodyArrays, body_arrays
 from trilane.training.first_texture import used_texels
 from trilane.training.neural_texture import read_texture
 from trilane.training.onnx_export import export_onnx
-from trilane.training.quantising.quantise import Quantised, quantise
+from trilane.training.quantising.quantise import ByteRanges, Quantised, byte_ranges, quantise
 from trilane.training.sample_files import U16, ShapeGroup
 from trilane.training.subject import Person
 from trilane.training.surface_fill import fill_along_surface
@@ -80,9 +80,13 @@ def _without_holes(image: NDArray[Any], unseen: Mask, body: BodyArrays) -> F64:
 
 def integer_network(avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int) -> Quantised:
     """The network in integers, calibrated on training samples of one shape: that with most, where none is usual."""
-    model, frames = _calibration(avatar, groups, seed, CALIBRATION_FRAMES)
-    quantised = quantise(model, frames, METHOD)
+    quantised = quantise(*_calibration(avatar, groups, seed, CALIBRATION_FRAMES), METHOD)
     return replace(quantised, network=reshaped(quantised.network, *STORED_SHAPE))
+
+
+def ranges_of(avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int) -> ByteRanges:
+    """The ranges that the tensors of `integer_network` would have."""
+    return byte_ranges(*_calibration(avatar, groups, seed, CALIBRATION_FRAMES), METHOD)
 
 
 def write_float_network(folder: Path, avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int) -> dict[str, str]:

@@ -16,8 +16,10 @@ import torch
 from trilane.training.activation_noise import add_activation_noise
 from trilane.training.adversary import Adversary
 from trilane.training.batch_choice import Batch, batch_stream, is_whole
+from trilane.training.byte_grid import ByteGrid
 from trilane.training.device import chosen_device
 from trilane.training.dropout import add_dropout
+from trilane.training.make_bundle import ranges_of
 from trilane.training.objective import Objective
 from trilane.training.optimisers import clip_gradients, optimiser_of
 from trilane.training.perceptual import Vgg16
@@ -39,6 +41,8 @@ def first_state(avatar: TrainableAvatar, settings: TrainingSettings, vgg: Vgg16 
     average = copy.deepcopy(avatar.to(device)).eval()
     harder = settings.regularisation
     avatar.texture_noise, avatar.input_noise = harder.texture_noise, harder.input_noise
+    if settings.bytes_from < 1:
+        avatar.grid = ByteGrid(avatar.network)
     add_dropout(avatar.network, harder.dropout)
     add_activation_noise(avatar.network, settings.noise_steps)
     avatar.network.to(memory_format=torch.channels_last)
@@ -64,10 +68,20 @@ def steps(
         torch.manual_seed(state.step << SEED_BITS | settings.seed)
         for group, peak in zip(state.optimiser.param_groups, peaks, strict=True):
             group["lr"] = peak * rate_share(share)  # kernels, the network's other weights, texture
+        _round(state.avatar, groups, settings, share)
         terms = _step(state, stream, settings, frozen=share > settings.freeze_norms_at)
         state.step += 1
         follow(state.average, state.avatar, 1 - 1 / max(1.0, settings.average_share * state.step))
         yield terms
+
+
+def _round(avatar: TrainableAvatar, groups: list[ShapeGroup], settings: TrainingSettings, share: float) -> None:
+    """Round `avatar` to bytes where the `share` of the steps that is done says so; the grid is measured at first."""
+    if avatar.grid is None or share <= settings.bytes_from:
+        return
+    if not avatar.grid.measured:
+        avatar.grid.measure(ranges_of(copy.deepcopy(avatar).cpu(), groups, settings.seed))
+    avatar.grid.active = True
 
 
 def _step(state: TrainingState, stream: Iterator[Batch], settings: TrainingSettings, frozen: bool) -> dict[str, float]:
@@ -108,7 +122,7 @@ def _measured(
     going = steps(
         first_state(copy.deepcopy(avatar), settings, vgg),
         groups,
-        settings.model_copy(update={"small_until": small_until}),
+        settings.model_copy(update={"small_until": small_until, "bytes_from": 1.0}),
         1 + MEASURED,
     )
     next(going)

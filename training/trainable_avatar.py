@@ -11,6 +11,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from trilane.training.byte_grid import ByteGrid
 from trilane.training.network import UNet
 from trilane.training.neural_texture import NeuralTexture, read_texture
 
@@ -22,7 +23,8 @@ INPUT_STEPS = 127
 class TrainableAvatar(nn.Module):
     """A neural texture and the network that reads it.
 
-    `texture_noise`, `input_noise`: standard deviation of Gaussian noise on texels, and on the network's input.
+    `texture_noise`, `input_noise`: standard deviation of Gaussian noise on texels, and on the network's input. `grid`:
+    rounds weights and activations, where it is active.
     """
 
     #: "bfloat16": the network is computed in it where that is safe; weights, texture and loss stay float32.
@@ -32,14 +34,18 @@ class TrainableAvatar(nn.Module):
         super().__init__()
         self.texture, self.network = texture, network
         self.texture_noise = self.input_noise = 0.0
+        self.grid: ByteGrid | None = None
 
     def forward(self, uv: Tensor, covered: Tensor) -> Tensor:
         """`uv` (N,H,W,2) in 0..1 and `covered` (N,H,W) bool to pictures (N,4,H,W) in 0..1."""
         x = read_texture(self._noisy(self.texture.image(), self.texture_noise), uv, covered)
         x = self._noisy(x, self.input_noise)
         rounded = torch.round(x * INPUT_STEPS) / INPUT_STEPS
+        x = x + (rounded - x).detach()
+        if self.grid is not None and self.grid.active:
+            return self.grid.painted(self.network, x)
         with torch.autocast(x.device.type, torch.bfloat16, enabled=self.precision == "bfloat16"):
-            output: Tensor = self.network(x + (rounded - x).detach())
+            output: Tensor = self.network(x)
         return output.float()
 
     def _noisy(self, x: Tensor, deviation: float) -> Tensor:

@@ -41,8 +41,9 @@ class TrainingSettings(Table):
     which batch statistics stay. `average_share`: of the steps so far, time constant of the average that becomes the
     avatar. `discriminator_rate`: of learning, for discriminators; it stays as it is. `noise_steps`: on activations,
     steps of a byte. `masked_texture`: texels that a batch does not show keep their values and their momentum.
-    `stand_off`: the body is drawn with clothes and hair raised by what masks show. `norm`: of a new network. `vgg`:
-    SHA-256 of VGG-16's weights that the perceptual loss is by.
+    `stand_off`: the body is drawn with clothes and hair raised by what masks show. `norm`: of a new network.
+    `bytes_from`: share of the steps after which weights and activations are rounded as the bundle's are, in float32.
+    `vgg`: SHA-256 of VGG-16's weights that the perceptual loss is by.
     """
 
     schema_: Literal[1] = Field(default=1, alias="schema")
@@ -66,6 +67,7 @@ class TrainingSettings(Table):
     masked_texture: bool = False
     stand_off: bool = True
     norm: Literal["batch", "instance", "group", "none"] = "batch"
+    bytes_from: float = Field(default=1.0, ge=0, le=1)
     vgg: str | None = Field(default=None, pattern="^[0-9a-f]{64}$")
     loss: LossWeights = LossWeights()
     optimiser: OptimiserOptions = OptimiserOptions()
@@ -98,6 +100,18 @@ def parsed_settings(values: dict[str, Any], where: str | Path) -> TrainingSettin
 #: What does not go together: key, test, what is expected of the key, and another way.
 CLASHES: tuple[tuple[str, Callable[[TrainingSettings], bool], str, str], ...] = (
     ("norm", lambda s: s.start == "default" and s.norm != "batch", "batch of the default network", 'or start = "new"'),
+    (
+        "bytes_from",
+        lambda s: s.bytes_from < 1 and s.norm in ("instance", "group"),
+        "1 with a norm that is not folded into the weights",
+        'or norm = "batch" or "none"',
+    ),
+    (
+        "bytes_from",
+        lambda s: s.norm == "batch" and s.bytes_from < s.freeze_norms_at,
+        "no less than freeze_norms_at: the weights are rounded with the batch statistics in them",
+        "or a lower freeze_norms_at",
+    ),
 )
 
 

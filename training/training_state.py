@@ -42,6 +42,8 @@ class TrainingState:
         named = {
             f"{kind}.{name}": value for kind, module in modules.items() for name, value in module.state_dict().items()
         }
+        if self.avatar.grid is not None:
+            named |= {"grid.ends": self.avatar.grid.ends, "grid.alike": self.avatar.grid.alike}
         for kind, optimiser in self.optimisers().items():
             for number, moments in optimiser.state_dict()["state"].items():
                 named |= {f"{kind}.{number}.{name}": value for name, value in moments.items()}

@@ -53,6 +53,7 @@ MANY: list[dict[str, Any]] = [
         "batches": {"full_body_statistics": True, "same_zoom": True, "sample_share": 0.9},
         "regularisation": {"texture_noise": 0.1, "dropout": 0.1},
     },
+    {"freeze_norms_at": 0.2, "bytes_from": 0.4, "noise_steps": 0.0},
     {
         "norm": "instance",
         "optimiser": {"batches_per_step": 2, "momentum": 0.5},
@@ -125,11 +126,24 @@ def test_a_training_with_options_is_resumed_to_the_bit(
 ) -> None:
     asked = settings(**change)
     whole = bits(trained(groups, COUNT, asked))
-    save_state(trained(groups, 2, asked), tmp_path / "state.npz")
+    save_state(trained(groups, 3, asked), tmp_path / "state.npz")
     after = first_state(avatar(asked.norm), asked)
     load_state(after, tmp_path / "state.npz")
     go(after, groups, asked, COUNT)
     assert bits(after) == whole
+
+
+def test_bytes_begin_after_their_share_of_the_steps(groups: list[ShapeGroup]) -> None:
+    """Of four steps those after more than 40 %; the grid is measured once, and an average is not rounded."""
+    asked = settings(freeze_norms_at=0.2, bytes_from=0.4)
+    state, painted = first_state(avatar(), asked), list[int]()
+    grid = state.avatar.grid
+    assert grid is not None and state.average.grid is None and first_state(avatar(), settings()).avatar.grid is None
+    paint = grid.painted
+    grid.painted = lambda *words: painted.append(state.step) or paint(*words)  # type: ignore[func-returns-value]
+    grids = [grid.ends.clone() for _ in steps(state, groups, asked, COUNT)]
+    assert painted == [2, 3]
+    assert not grids[1].any() and grids[2].any() and torch.equal(grids[2], grids[3])
 
 
 def test_the_training_has_the_optimiser_that_is_asked_for() -> None:
@@ -157,6 +171,14 @@ def test_options_are_written_and_read_again() -> None:
         (
             {"norm": "group", "start": "default"},
             'norm: found group, expected batch of the default network; or start = "new"',
+        ),
+        (
+            {"norm": "group", "bytes_from": 0.9},
+            "bytes_from: found 0.9, expected 1 with a norm that is not folded into the weights; or norm = ",
+        ),
+        (
+            {"freeze_norms_at": 0.6, "bytes_from": 0.5},
+            "bytes_from: found 0.5, expected no less than freeze_norms_at: .*; or a lower freeze_norms_at",
         ),
     ],
 )

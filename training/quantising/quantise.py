@@ -53,6 +53,17 @@ class Quantised:
 
 
 @dataclass(frozen=True)
+class ByteRanges:
+    """`ends`: of each tensor of a float network by name, the real values of bytes 0 and 255.
+
+    `alike`: whether weights are even multiples of powers of two, so that all runtimes round alike.
+    """
+
+    ends: dict[str, tuple[float, float]]
+    alike: bool
+
+
+@dataclass(frozen=True)
 class _Calibrated:
     """A float network with the ranges of its tensors. `overrides`: scales of weights, empty when they are measured."""
 
@@ -102,6 +113,21 @@ def quantise(
         "onnxruntime": onnxruntime.__version__,
     }
     return Quantised(check_network(quantised, "quantised network"), facts, constants)
+
+
+def byte_ranges(model: onnx.ModelProto, frames: Sequence[F32], method: str = "minmax") -> ByteRanges:
+    """What `quantise` would give the tensors of `model`, by the same arguments. Raises BadInputError as it does."""
+    _check_frames(model, frames)
+    _check_weights(model)
+    plain, ranges = _measured(model, frames, method)
+    limit_logits(plain, ranges)
+    calibrated = _calibrated(plain, ranges, reduce_range=True, keep_float=())
+    names = list(calibrated.ranges.keys())
+    ends = {name: (calibrated.ranges[name].lowest, calibrated.ranges[name].highest) for name in names}
+    reals = {
+        name: (float(np.asarray(low).item()), float(np.asarray(high).item())) for name, (low, high) in ends.items()
+    }
+    return ByteRanges(reals, calibrated.rounds_alike)
 
 
 def _float_constants(plain: onnx.ModelProto, rounded: onnx.ModelProto) -> dict[str, NDArray[Any]]:
