@@ -5,8 +5,6 @@ Rule: it needs no PyTorch, so that settings are read, and refused, where none is
 
 from __future__ import annotations
 
-from typing import Any
-
 from pydantic import Field
 
 from trilane.scene.schema import Table
@@ -40,18 +38,3 @@ class LossWeights(Table):
     def by_name(self) -> dict[str, float]:
         """The weights as `losses.total_loss` takes them."""
         return {str(name): float(value) for name, value in self.model_dump().items()}
-
-
-#: Losses by name: the weights, and the settings that belong to them where a training does not say others.
-LOSSES: dict[str, dict[str, Any]] = {
-    "default": {"loss": {}},
-    "thesis": {
-        "loss": dict.fromkeys(LossWeights.model_fields, 0.0)
-        | {"composite": 25.0, "overlap": 25.0, "perceptual": 20.0, "adversarial": 1.0, "features": 1.0},
-        "network_rate": 1e-3,
-        "texture_rate": 1e-3,
-        "discriminator_rate": 1e-5,
-        "weight_decay": 0.0,
-        "optimiser": {"kind": "adam", "second_momentum": 0.999, "clip_norm": 0.0},
-    },
-}

@@ -17,15 +17,11 @@ from trilane.errors import BadInputError
 from trilane.files import read_text
 from trilane.near_miss import did_you_mean
 from trilane.scene.schema import Table
-from trilane.training.loss_weights import LOSSES, LossWeights
+from trilane.training.loss_weights import LossWeights
 from trilane.training.training_options import BatchOptions, OptimiserOptions, RegularisationOptions
+from trilane.training.usual_settings import with_usual
 
 NAME = "training.toml"
-#: What is usual for a network that is trained already, and for a new one, where the settings do not say it.
-STARTS: dict[str, dict[str, float]] = {
-    "default": {"small_until": 0.0, "freeze_norms_at": 0.3},
-    "new": {"small_until": 0.12, "freeze_norms_at": 0.6},
-}
 EXPECTED = "settings of a training (TOML): docs/captures.md"
 HEAD = "# How this avatar was trained; `trilane avatar train CAPTURE --config training.toml` trains one so again.\n"
 
@@ -85,10 +81,9 @@ def read_settings(path: Path) -> TrainingSettings:
 
 
 def parsed_settings(values: dict[str, Any], where: str | Path) -> TrainingSettings:
-    """The settings of `values`, which stand at `where`; `loss` may be one of `LOSSES` by name. Raises BadInputError."""
-    usual = STARTS.get(str(values.get("start", "default")), {})
+    """The settings of `values`, which stand at `where`; `loss` may be the name of one. Raises BadInputError."""
     try:
-        settings = TrainingSettings.model_validate(usual | _with_loss(values, where))
+        settings = TrainingSettings.model_validate(with_usual(values, where))
     except ValidationError as error:
         raise _refused(dict(error.errors()[0]), where) from None
     for key, clashes, expected, remedy in CLASHES:
@@ -113,18 +108,6 @@ CLASHES: tuple[tuple[str, Callable[[TrainingSettings], bool], str, str], ...] = 
         "or a lower freeze_norms_at",
     ),
 )
-
-
-def _with_loss(values: dict[str, Any], where: str | Path) -> dict[str, Any]:
-    """`values` with the weights of a loss that has a name, and what is usual with it."""
-    name = values.get("loss")
-    if not isinstance(name, str):
-        return values
-    if name not in LOSSES:
-        raise BadInputError(f"{where}: loss", repr(name), f"one of {', '.join(LOSSES)}", did_you_mean(name, LOSSES))
-    usual = LOSSES[name]
-    optimiser = usual.get("optimiser", {}) | values.get("optimiser", {})
-    return usual | values | {"loss": usual["loss"], "optimiser": optimiser}
 
 
 def settings_text(settings: TrainingSettings) -> str:

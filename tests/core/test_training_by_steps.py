@@ -208,6 +208,25 @@ def test_a_new_network_is_trained_on_small_samples_first() -> None:
     assert parsed_settings({"start": "new", "small_until": 0.5}, "a test").small_until == 0.5
 
 
+def test_a_new_network_with_little_time_takes_many_cheap_steps(tmp_path: Path) -> None:
+    def rates(**values: Any) -> tuple[float, ...]:
+        asked = parsed_settings(values, "a test")
+        return asked.batch, asked.small_until, asked.network_rate, asked.texture_rate
+
+    short = (2, 0.8, 5e-3, 1e-3)
+    assert rates(start="new", minutes=4.9) == rates(start="new", minutes=1, loss="thesis") == short
+    assert rates(start="new", minutes=1, batch=4, network_rate=0.25) == (4, 0.8, 0.25, 1e-3)
+    assert rates(start="new", minutes=5) == rates(start="new") == rates(start="new", minutes=1, steps=900)
+    assert rates(start="new") == (4, 0.12, 1.5e-3, 4e-4) and rates(minutes=1) == (4, 0.0, 1.5e-3, 4e-4)
+    asked = parsed_settings({"start": "new", "minutes": 1}, "a test").model_copy(update={"steps": 40})
+    (tmp_path / "training.toml").write_text(settings_text(asked))
+    assert read_settings(tmp_path / "training.toml") == asked
+    with pytest.raises(BadInputError, match="minutes: found '1', expected"):
+        parsed_settings({"start": "new", "minutes": "1"}, "a test")
+    with pytest.raises(BadInputError, match="optimiser: found 3, expected"):
+        parsed_settings({"loss": "thesis", "optimiser": 3}, "a test")
+
+
 @pytest.mark.parametrize(
     ("values", "words"),
     [
