@@ -7,6 +7,7 @@ before it starts.
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -46,8 +47,10 @@ DEFAULT_NETWORK = Path(__file__).with_name("default-network.npz")
 SAMPLES, SAMPLE_FACTS, STATE, NETWORK, SHEETS = "samples", "samples.json", "state.npz", "network.npz", "sheets"
 LOSS_BEFORE = "loss-before.json"
 LEAST_STEPS = 10
-#: Sheets of a training, evenly over its steps; seconds between two states on the disk.
-SHEET_COUNT, SAVE_S = 10, 60.0
+#: Most sheets of a training, evenly over its steps, and least steps between two: a sheet takes about as long as a step.
+SHEET_COUNT, SHEET_STEPS = 10, 10
+#: Seconds between two states on the disk.
+SAVE_S = 60.0
 ANOTHER_WORK = "use another --work folder, or remove this one"
 
 
@@ -231,7 +234,7 @@ def _train(
         load_state(state, path)
         listener.say(f"goes on after step {state.step} of {count}")
     weights, saved = settings.loss.by_name(), time.monotonic()
-    every = max(1, count // SHEET_COUNT)
+    every = max(SHEET_STEPS, math.ceil(count / SHEET_COUNT))
     for terms in steps(state, open_groups(places.work / SAMPLES), settings, count):
         loss = sum(weights.get(name, 0.0) * value for name, value in terms.items())
         listener.trained(state.step, count, terms, loss)
