@@ -30,7 +30,7 @@ from trilane.writing import require_writable, write_bytes, write_folder
 MANIFEST, OFFSETS = "manifest.json", "offsets.npz"
 DEFAULT = "default"
 CAPTURE = "capture.toml"
-HOW_TO_TRAIN = "docs/captures.md says how `trilane avatar train` makes one from frames of a person"
+HOW_TO_TRAIN = "docs/own-avatar.md says how `trilane avatar train` makes one from frames of a person"
 HOW_TO_CREATE = "`trilane avatar create --body` puts a body of the same UV layout into an avatar"
 TEXTURE_KEYS = ("texture", "scale")
 #: Clothes and hair of an avatar reach this far from its body, metres. The pose stage and the training crop by it.
