@@ -62,8 +62,10 @@ def assemble(base: Bundle, parts: Parts, out: Path) -> dict[str, Any]:
     body = parts.body or base.body_path
     if parts.body is not None:
         _check_body(base, load_body(parts.body), parts)
+    offsets = base.read_body().offsets if parts.body is None else None
     arrays = read_npz(source, TEXTURE_KEYS, "a neural texture")
-    write_bundle(out, _manifest(base, parts, network, out.name), body, arrays["texture"], network, arrays.get("scale"))
+    manifest = _manifest(base, parts, network, out.name)
+    write_bundle(out, manifest, body, arrays["texture"], network, arrays.get("scale"), offsets)
     made = load_bundle(out)
     return {
         "avatar": str(out),

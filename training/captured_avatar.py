@@ -167,7 +167,8 @@ def resumed_settings(path: Path, asked: TrainingSettings) -> TrainingSettings:
 def _draw_samples(subject: Subject, places: Places, settings: TrainingSettings, listener: Listener) -> None:
     """Draw the samples into the work folder, unless they are there. Raises BadInputError where others are."""
     facts = places.work / SAMPLE_FACTS
-    wanted = {"capture": str(places.capture.resolve()), "samples": settings.samples, "seed": settings.seed}
+    decides = ("samples", "seed", "stand_off")
+    wanted = {"capture": str(places.capture.resolve())} | {key: getattr(settings, key) for key in decides}
     if facts.exists():
         present = json.loads(facts.read_text(encoding="utf-8"))
         if present != wanted:

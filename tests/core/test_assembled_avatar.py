@@ -15,9 +15,10 @@ import pytest
 from onnx import numpy_helper
 
 from trilane.apps.assembled_avatar import Parts, assemble
-from trilane.avatars.bundle import bundle_folder, load_bundle
+from trilane.avatars.bundle import OFFSETS, bundle_folder, load_bundle
 from trilane.avatars.digests import digests_of, with_figures_digest
 from trilane.avatars.manifest import CAPTURED, UNTRAINED, Validation
+from trilane.avatars.offsets import save_offsets
 from trilane.errors import BadInputError
 from trilane.training.quantising.quantise import quantise
 
@@ -131,6 +132,18 @@ def test_another_body_has_its_own_shape(base: Path, tmp_path: Path) -> None:
         assemble(load_bundle(base), Parts(body=tmp_path / "other.npz"), tmp_path / "none")
     parts = Parts(body=tmp_path / "other.npz", texture=base / "texture.npz")
     assert assemble(load_bundle(base), parts, tmp_path / "two")["replaced"].keys() == {"body", "texture"}
+
+
+def test_clothes_stay_with_their_body(base: Path, network: Path, tmp_path: Path) -> None:
+    """Offsets of the vertices: kept to the byte with the body, left out with another one."""
+    offsets = np.random.default_rng(4).normal(0, 0.01, (len(np.load(BODY)["v_template"]), 3)).astype(np.float32)
+    save_offsets(base / OFFSETS, offsets)
+    change(base, offsets=OFFSETS)
+    assemble(load_bundle(base), Parts(network=network), tmp_path / "new")
+    assert (tmp_path / "new" / OFFSETS).read_bytes() == (base / OFFSETS).read_bytes()
+    assert np.abs(load_bundle(tmp_path / "new").read_body().offsets - offsets).max() < 1e-4
+    assemble(load_bundle(base), Parts(body=BODY), tmp_path / "bare")
+    assert load_bundle(tmp_path / "bare").manifest.offsets is None and not (tmp_path / "bare" / OFFSETS).exists()
 
 
 @pytest.mark.parametrize(

@@ -179,12 +179,16 @@ def test_an_ended_training_goes_on_and_makes_the_same_avatar(
 
 
 @pytest.mark.usefixtures("log")
-def test_samples_of_another_capture_are_refused(tmp_path: Path) -> None:
-    work = places(tmp_path).work
-    work.mkdir()
-    (work / "samples.json").write_text(json.dumps({"capture": "/there", "samples": 8, "seed": 1}))
-    with pytest.raises(BadInputError, match=r"samples\.json: found .*/there.*use another --work folder"):
-        train_on_capture(places(tmp_path), settings(), Told())
+@pytest.mark.parametrize(
+    ("changed", "said"), [({"capture": "/there"}, "/there"), ({"stand_off": False}, "'stand_off': False")]
+)
+def test_samples_of_another_capture_or_body_are_refused(changed: dict[str, Any], said: str, tmp_path: Path) -> None:
+    there = places(tmp_path)
+    there.work.mkdir()
+    own = {"capture": str(there.capture.resolve()), "samples": 8, "seed": 1, "stand_off": True}
+    (there.work / "samples.json").write_text(json.dumps(own | changed))
+    with pytest.raises(BadInputError, match=rf"samples\.json: found .*{said}.*use another --work folder"):
+        train_on_capture(there, settings(), Told())
 
 
 def test_steps_are_counted_for_the_minutes(log: list[Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
