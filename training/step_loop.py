@@ -41,6 +41,7 @@ def first_state(avatar: TrainableAvatar, settings: TrainingSettings, vgg: Vgg16 
     average = copy.deepcopy(avatar.to(device)).eval()
     harder = settings.regularisation
     avatar.texture_noise, avatar.input_noise = harder.texture_noise, harder.input_noise
+    avatar.precision = settings.precision
     if settings.bytes_from < 1:
         avatar.grid = ByteGrid(avatar.network)
     add_dropout(avatar.network, harder.dropout)

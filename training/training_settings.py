@@ -31,15 +31,15 @@ class TrainingSettings(Table):
 
     `samples`: views of the capture's frames, drawn before training. `minutes`: of training, which `steps` are counted
     for by measured time where they are not given. `batch`: samples of a step. `seed`: of all random numbers. `threads`:
-    of PyTorch. `device`: auto is a GPU that PyTorch can use, where there is one. `start`: the network of the default
-    avatar, or one of random weights. `width`: of a new one. `network_rate`, `texture_rate`: peaks of the learning
-    rates. `small_until`, `freeze_norms_at`: shares of the steps, up to which only half-size samples are used, and after
-    which batch statistics stay. `average_share`: of the steps so far, time constant of the average that becomes the
-    avatar. `discriminator_rate`: of learning, for discriminators; it stays as it is. `noise_steps`: on activations,
-    steps of a byte. `masked_texture`: texels that a batch does not show keep their values and their momentum.
-    `stand_off`: the body is drawn with clothes and hair raised by what masks show. `norm`: of a new network.
-    `bytes_from`: share of the steps after which weights and activations are rounded as the bundle's are, in float32.
-    `vgg`: SHA-256 of VGG-16's weights that the perceptual loss is by.
+    of PyTorch. `device`: auto is a GPU that PyTorch can use, where there is one. `precision`: of the network while it
+    is trained. `start`: the network of the default avatar, or one of random weights. `width`: of a new one.
+    `network_rate`, `texture_rate`: peaks of the learning rates. `small_until`, `freeze_norms_at`: shares of the steps,
+    up to which only half-size samples are used, and after which batch statistics stay. `average_share`: of the steps so
+    far, time constant of the average that becomes the avatar. `discriminator_rate`: of learning, for discriminators; it
+    stays as it is. `noise_steps`: on activations, steps of a byte. `masked_texture`: texels that a batch does not show
+    keep their values and their momentum. `stand_off`: the body is drawn with clothes and hair raised by what masks
+    show. `norm`: of a new network. `bytes_from`: share of the steps after which weights and activations are rounded as
+    the bundle's are, in float32. `vgg`: SHA-256 of VGG-16's weights that the perceptual loss is by.
     """
 
     schema_: Literal[1] = Field(default=1, alias="schema")
@@ -50,6 +50,7 @@ class TrainingSettings(Table):
     seed: int = Field(default=1, ge=0, lt=2**31)
     threads: int = Field(default=1, ge=1, le=256)
     device: Literal["auto", "cpu", "cuda"] = "auto"
+    precision: Literal["float32", "bfloat16"] = "float32"
     start: Literal["default", "new"] = "default"
     width: int = Field(default=16, ge=4, le=64)
     network_rate: float = Field(default=1.5e-3, gt=0, le=1)
