@@ -64,8 +64,8 @@ def assemble(base: Bundle, parts: Parts, out: Path) -> dict[str, Any]:
         _check_body(base, load_body(parts.body), parts)
     offsets = base.read_body().offsets if parts.body is None else None
     arrays = read_npz(source, TEXTURE_KEYS, "a neural texture")
-    manifest = _manifest(base, parts, network, out.name)
-    write_bundle(out, manifest, body, arrays["texture"], network, arrays.get("scale"), offsets)
+    manifest, scale = _manifest(base, parts, network, out.name), arrays.get("scale")
+    write_bundle(out, manifest, body, arrays["texture"], network, scale, offsets, arrays.get("levels"))
     made = load_bundle(out)
     return {
         "avatar": str(out),

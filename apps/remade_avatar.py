@@ -127,7 +127,8 @@ def _make(bundle: Bundle, recipe: _Recipe, folder: Path) -> None:
     if scale is not None and scale.ndim:
         scale = scale[chosen]
     manifest, offsets = _manifest(bundle, recipe, network, quantised), bundle.read_body().offsets
-    write_bundle(folder, manifest, bundle.body_path, texture, network, scale, offsets)
+    levels = arrays["levels"][..., chosen] if "levels" in arrays else None
+    write_bundle(folder, manifest, bundle.body_path, texture, network, scale, offsets, levels)
 
 
 def _manifest(bundle: Bundle, recipe: _Recipe, network: Any, quantised: Quantised) -> Manifest:

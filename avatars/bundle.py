@@ -21,6 +21,7 @@ from trilane.avatars.integer_network import MAX_SIDE, Affine, NetworkFile
 from trilane.avatars.manifest import ByteRange, Manifest, parse_manifest
 from trilane.avatars.network_file import read_network
 from trilane.avatars.offsets import read_offsets, save_offsets
+from trilane.avatars.texture_levels import check_levels
 from trilane.body.body import Body, ShapedBody, load_body
 from trilane.errors import BadInputError
 from trilane.files import read_npz, read_text, require_file
@@ -32,7 +33,7 @@ DEFAULT = "default"
 CAPTURE = "capture.toml"
 HOW_TO_TRAIN = "docs/own-avatar.md says how `trilane avatar train` makes one from frames of a person"
 HOW_TO_CREATE = "`trilane avatar create --body` puts a body of the same UV layout into an avatar"
-TEXTURE_KEYS = ("texture", "scale")
+TEXTURE_KEYS = ("texture", "scale", "levels")
 #: Clothes and hair of an avatar reach this far from its body, metres. The pose stage and the training crop by it.
 CLOTHES_STANDOFF_M = 0.045
 
@@ -74,6 +75,14 @@ class Bundle:
     def read_texture(self) -> NDArray[np.float32]:
         """The neural texture, (H, W, C) float32, row 0 at v = 0. Raises BadInputError."""
         return read_texture(self.texture_path, self.manifest.network.channels)
+
+    def read_levels(self) -> NDArray[np.float32] | None:
+        """Smaller levels of the neural texture, see `texture_levels`; None where it has none. Raises BadInputError."""
+        arrays = read_npz(self.texture_path, TEXTURE_KEYS, "a neural texture")
+        if "levels" not in arrays:
+            return None
+        check_levels(arrays["levels"], arrays["texture"], self.texture_path)
+        return _decoded(arrays["levels"], arrays.get("scale"), self.texture_path)
 
     def read_network(self) -> NetworkFile:
         """The checked network. Raises BadInputError, also when it contradicts the manifest."""
@@ -137,6 +146,7 @@ def write_bundle(
     network: NetworkFile,
     scale: Any = None,
     offsets: F32 | None = None,
+    levels: NDArray[Any] | None = None,
 ) -> None:
     """Write a bundle beside `folder`, read it back, then put its files in `folder`.
 
@@ -149,6 +159,7 @@ def write_bundle(
     `network`: the network to write.
     `scale`: (C,) float32, of an int8 texture.
     `offsets`: (V,3) metres, of the body's vertices at rest; None for a body that is drawn bare.
+    `levels`: smaller ones of the texture, of its type, see `texture_levels`.
     Raises BadInputError when the parts do not fit together; then nothing is written.
     """
     with write_folder(folder) as draft:
@@ -159,12 +170,14 @@ def write_bundle(
         arrays: dict[str, Any] = (
             {"texture": texture} if scale is None else {"texture": texture, "scale": np.asarray(scale, np.float32)}
         )
+        arrays |= {} if levels is None else {"levels": levels}
         np.savez_compressed(draft / manifest.texture, **arrays)
         onnx.save(network.model, draft / manifest.network.file)
         (draft / MANIFEST).write_bytes(_content(_with_own_validation(manifest, draft)))
         bundle = load_bundle(draft)
         bundle.read_body()
         bundle.read_texture()
+        bundle.read_levels()
         bundle.read_network()
 
 
@@ -217,8 +230,12 @@ def _decode_texture(texture: NDArray[Any], scale: Any, path: Path, channels: int
     shape = texture.shape
     if len(shape) != 3 or min(shape[:2]) < 2 or max(shape[:2]) > MAX_SIDE or shape[2] != channels:
         raise BadInputError(path, f"a texture of shape {shape}", f"(H, W, {channels}) with sides of 2 to {MAX_SIDE}")
+    return _decoded(texture, scale, path)
+
+
+def _decoded(texture: NDArray[Any], scale: Any, path: Path) -> NDArray[np.float32]:
     if texture.dtype == np.int8:
-        factor = _check_scale(scale, path, channels)
+        factor = _check_scale(scale, path, texture.shape[2])
     elif texture.dtype in (np.float16, np.float32):
         factor = np.ones((), np.float32)
     else:

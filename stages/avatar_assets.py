@@ -33,18 +33,19 @@ BODY_ARRAYS = tuple(field.name for field in fields(Body) if field.name not in ("
 
 @dataclass(frozen=True)
 class AvatarData:
-    """One distinct bundle, loaded. `texture` (H,W,C) float32."""
+    """One distinct bundle, loaded. `texture` (H,W,C) float32. `levels`: smaller ones of it, see `texture_levels`."""
 
     bundle: Bundle
     shaped: ShapedBody
     texture: F32
     network: NetworkFile
+    levels: F32 | None = None
 
 
 def load_avatar(bundle: Bundle) -> AvatarData:
     """Everything that a run needs of `bundle`. Raises BadInputError."""
     shaped = bundle.shaped_body()
-    return AvatarData(bundle, shaped, bundle.read_texture(), bundle.read_network())
+    return AvatarData(bundle, shaped, bundle.read_texture(), bundle.read_network(), bundle.read_levels())
 
 
 def require_one_tensor(avatars: Sequence[AvatarData]) -> None:
@@ -73,6 +74,8 @@ def pack_assets(avatars: Sequence[AvatarData], staged: Staged) -> dict[str, NDAr
         arrays |= {f"body{number}/{name}": array for name in BODY_ARRAYS if (array := getattr(body, name)) is not None}
         arrays |= {f"body{number}/{name}": array for name, array in zip(HANDS, body.hand_components, strict=True)}
         arrays[f"avatar{number}/texture"] = avatar.texture
+        if avatar.levels is not None:
+            arrays[f"avatar{number}/levels"] = avatar.levels
         arrays[f"avatar{number}/input"] = np.array([scale.scale, scale.zero_point])
     network = avatars[0].network
     arrays[NETWORK] = np.frombuffer(network.model.SerializeToString(), np.uint8)
@@ -104,6 +107,11 @@ def shaped_body(assets: Assets, number: int) -> ShapedBody:
 def texture_of(assets: Assets, number: int) -> F32:
     """The neural texture (H,W,C) of distinct avatar `number`."""
     return assets[f"avatar{number}/texture"]
+
+
+def levels_of(assets: Assets, number: int) -> F32 | None:
+    """Smaller levels of the neural texture of distinct avatar `number`, if it has any."""
+    return assets.get(f"avatar{number}/levels")
 
 
 def quantisation_of(assets: Assets, number: int) -> Quantisation:

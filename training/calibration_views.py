@@ -18,8 +18,8 @@ from trilane.arrays import F32
 from trilane.avatars.bundle import Bundle
 from trilane.training.dataset import SIZES, TRAINING_SHARE, VALIDATION_SIZE, motion_poses
 from trilane.training.make_bundle import CALIBRATION_SHAPE
+from trilane.training.mip_levels import levels_of, read_levels
 from trilane.training.network import UNet
-from trilane.training.neural_texture import read_texture
 from trilane.training.onnx_export import export_onnx
 from trilane.training.random_poses import random_pose
 from trilane.training.sample_renderer import BAND_NAMES, Sample, SampleRenderer
@@ -63,8 +63,8 @@ def held_out_views(renderer: SampleRenderer, bundle: Bundle, views: int) -> list
 
 def _inputs(renderer: SampleRenderer, bundle: Bundle, sample: Callable[[int], Sample], wanted: int) -> Iterator[F32]:
     """Of samples 0, 1, 2, ... the first `wanted` that have the calibration's shape, as the network is given them."""
-    texture = torch.from_numpy(bundle.read_texture().transpose(2, 0, 1).copy())[None]
+    levels = levels_of(bundle)
     found = (one for one in map(sample, count()) if one.crop.shape == CALIBRATION_SHAPE)
     for _, one in zip(range(wanted), found, strict=False):
         uv = torch.from_numpy(np.ascontiguousarray(renderer.render(one)[0]))[None]
-        yield read_texture(texture, uv[..., :2], uv[..., 2] > 0)[0].permute(1, 2, 0).contiguous().numpy()
+        yield read_levels(levels, uv[..., :2], uv[..., 2] > 0)[0].permute(1, 2, 0).contiguous().numpy()

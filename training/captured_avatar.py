@@ -211,7 +211,7 @@ def _first_avatar(subject: Subject, places: Places, settings: TrainingSettings) 
     else:
         groups = open_groups(places.work / SAMPLES)
         texture = first_texture(body_arrays(subject.shaped), groups, SIDES[0], CHANNELS)
-    return TrainableAvatar(NeuralTexture(texture), network)
+    return TrainableAvatar(NeuralTexture(texture, mip_levels=settings.mip_levels), network)
 
 
 def _with_steps(

@@ -75,8 +75,9 @@ def integer_painter(renderer: Drawn, bundle: Bundle, runtime: str, threads: int)
     """
     network, texture, runs = bundle.read_network(), bundle.read_texture(), load_runtime(runtime)
     quantisation = Quantisation(network.input.scale, network.input.zero_point)
-    packed = PackedPass(renderer.ctx, texture.shape[2], quantisation, deferred=True)
-    drawn = PackedAvatar(packed, renderer.mesh, texture)
+    levels = bundle.read_levels()
+    packed = PackedPass(renderer.ctx, texture.shape[2], quantisation, deferred=levels is None)
+    drawn = PackedAvatar(packed, renderer.mesh, texture, levels)
     sessions: dict[Shape, Session] = {}
 
     def paint(sample: Any, _: NDArray[np.float32]) -> U8:

@@ -18,10 +18,11 @@ from trilane.arrays import F64, Mask
 from trilane.avatars.bundle import write_bundle
 from trilane.avatars.manifest import Manifest, network_entry
 from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.texture_levels import pack_levels
 from trilane.body.body import ShapedBody
 from trilane.training.body_arrays import BodyArrays, body_arrays
 from trilane.training.first_texture import used_texels
-from trilane.training.neural_texture import read_texture
+from trilane.training.mip_levels import read_levels
 from trilane.training.onnx_export import export_onnx
 from trilane.training.quantising.quantise import ByteRanges, Quantised, byte_ranges, quantise
 from trilane.training.sample_files import U16, ShapeGroup
@@ -44,28 +45,40 @@ TEXEL_MARGIN = 3
 
 @dataclass(frozen=True)
 class QuantisedAvatar:
-    """`network`: in integers, with its `norm`. `texture` (S,S,C) int8 with `scale` (C,) float32."""
+    """`network`: in integers, with its `norm`. `texture` (S,S,C) int8 with `scale` (C,) float32.
+
+    `levels`: smaller ones of the texture, as `texture_levels` packs them, or None.
+    """
 
     network: Quantised
     texture: NDArray[np.int8]
     scale: NDArray[np.float32]
     norm: str = "batch"
+    levels: NDArray[np.int8] | None = None
 
 
 def byte_texture(
     avatar: TrainableAvatar, shaped: ShapedBody, unseen: Mask | None = None
-) -> tuple[NDArray[np.int8], NDArray[np.float32]]:
-    """The texture as int8 (S,S,C) and the scale (C,) of each channel; texels that the body does not use are 0.
+) -> tuple[NDArray[np.int8], NDArray[np.float32], NDArray[np.int8] | None]:
+    """The texture as int8 (S,S,C), the scale (C,) of each channel, and the packed smaller levels, if any.
 
-    Those of the body that are `unseen`, an image of any side, were never trained: they are filled from those that were.
+    Texels that the body does not use are 0. Those of the body that are `unseen`, an image of any side, were never
+    trained: they are filled from those that were.
     """
-    image: NDArray[Any] = avatar.texture.image().detach()[0].permute(1, 2, 0).numpy()
     body = body_arrays(shaped)
+    images = [_finished(level.detach()[0].permute(1, 2, 0).numpy(), unseen, body) for level in avatar.texture.levels()]
+    largest = np.max([np.abs(image).max(axis=(0, 1)) for image in images], axis=0)
+    scale = np.maximum(largest, 1e-6) / INT8_MAX
+    texture, *smaller = (np.round(image / scale).astype(np.int8) for image in images)
+    return texture, scale.astype(np.float32), pack_levels(smaller) if smaller else None
+
+
+def _finished(image: NDArray[Any], unseen: Mask | None, body: BodyArrays) -> NDArray[Any]:
+    """`image` (S,S,C) without holes where texels are `unseen`, and 0 where the body uses none."""
     if unseen is not None and unseen.any():
         image = _without_holes(image, unseen, body)
-    image = image * used_texels(body, image.shape[0], TEXEL_MARGIN)[..., None]
-    scale = np.maximum(np.abs(image).max(axis=(0, 1)), 1e-6) / INT8_MAX
-    return np.round(image / scale).astype(np.int8), scale.astype(np.float32)
+    finished: NDArray[Any] = image * used_texels(body, image.shape[0], TEXEL_MARGIN)[..., None]
+    return finished
 
 
 def _without_holes(image: NDArray[Any], unseen: Mask, body: BodyArrays) -> F64:
@@ -122,8 +135,9 @@ def quantise_avatar(
     `seed`: of that choice.
     `unseen`: texels of the body that no sample can show, see `byte_texture`.
     """
-    texture, scale = byte_texture(avatar, shaped, unseen)
-    return QuantisedAvatar(integer_network(avatar, groups, seed), texture, scale, avatar.network.norm)
+    texture, scale, levels = byte_texture(avatar, shaped, unseen)
+    network = integer_network(avatar, groups, seed)
+    return QuantisedAvatar(network, texture, scale, avatar.network.norm, levels)
 
 
 def write_avatar(
@@ -153,15 +167,15 @@ def write_avatar(
         expression=person.expression,
     )
     network, scale = quantised.network.network, quantised.scale
-    write_bundle(folder, manifest, person.body, quantised.texture, network, scale, person.offsets)
+    write_bundle(folder, manifest, person.body, quantised.texture, network, scale, person.offsets, quantised.levels)
 
 
 def _inputs(avatar: TrainableAvatar, group: ShapeGroup, index: NDArray[np.int64]) -> list[NDArray[np.float32]]:
     """The network's inputs (H, W, C) for samples `index` of `group`."""
-    image = avatar.texture.image().detach()
+    levels = [level.detach() for level in avatar.texture.levels()]
     frames = []
     for number in index:
         uv = torch.from_numpy(group.uv[number].astype(np.float32) / U16)[None]
         covered = torch.from_numpy(group.covered[number] > 0)[None]
-        frames.append(read_texture(image, uv, covered)[0].permute(1, 2, 0).numpy())
+        frames.append(read_levels(levels, uv, covered)[0].permute(1, 2, 0).numpy())
     return frames

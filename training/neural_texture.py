@@ -21,9 +21,11 @@ class NeuralTexture(nn.Module):
 
     Each scale holds the difference of `start`, shrunk to its side, and the next coarser scale's image, enlarged. The
     sum is clipped to -1..1, because the network's input has one byte range for all channels.
+
+    `mip_levels`: smaller images, each of half the side, that are learnt on their own from `start`, shrunk.
     """
 
-    def __init__(self, start: F32, sides: tuple[int, ...] = SIDES) -> None:
+    def __init__(self, start: F32, sides: tuple[int, ...] = SIDES, mip_levels: int = 0) -> None:
         super().__init__()
         target = torch.from_numpy(np.ascontiguousarray(start.transpose(2, 0, 1)))[None]
         scales: list[Tensor] = []
@@ -33,6 +35,10 @@ class NeuralTexture(nn.Module):
             scales.append(shrunk - _enlarged(coarser, side))
             coarser = shrunk
         self.scales = nn.ParameterList([nn.Parameter(scale) for scale in reversed(scales)])
+        smaller = [max(sides) >> (number + 1) for number in range(mip_levels)]
+        self.mips = nn.ParameterList(
+            [nn.Parameter(functional.interpolate(target, size=(side, side), mode="area")) for side in smaller]
+        )
 
     def image(self) -> Tensor:
         """The texture (1, C, S, S)."""
@@ -40,6 +46,10 @@ class NeuralTexture(nn.Module):
         for scale in reversed(finer):
             total = scale + _enlarged(total, scale.shape[-1])
         return total.clamp(-LIMIT, LIMIT)
+
+    def levels(self) -> list[Tensor]:
+        """The texture and its smaller levels, (1, C, S, S), (1, C, S/2, S/2), ..."""
+        return [self.image(), *(level.clamp(-LIMIT, LIMIT) for level in self.mips)]
 
 
 def _enlarged(scale: Tensor, side: int) -> Tensor:

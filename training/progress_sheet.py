@@ -26,7 +26,7 @@ def write_sheet(path: Path, avatar: TrainableAvatar, subject: Subject) -> None:
 
     Raises BadInputError when it cannot be written.
     """
-    paint, rows = float_painter(avatar.network, avatar.texture.image().detach()), []
+    paint, rows = float_painter(avatar.network, *(level.detach() for level in avatar.texture.levels())), []
     for number in subject.held_out[:: max(1, len(subject.held_out) // MOST_FRAMES)][:MOST_FRAMES]:
         sample = subject.frames.whole_sample(number, VALIDATION_SIZE) if subject.frames is not None else None
         if sample is not None and subject.frames is not None:

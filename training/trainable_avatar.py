@@ -12,8 +12,9 @@ import torch
 from torch import Tensor, nn
 
 from trilane.training.byte_grid import ByteGrid
+from trilane.training.mip_levels import read_levels
 from trilane.training.network import UNet
-from trilane.training.neural_texture import NeuralTexture, read_texture
+from trilane.training.neural_texture import NeuralTexture
 
 Precision = Literal["float32", "bfloat16"]
 #: Steps of the network's input bytes on each side of zero.
@@ -38,7 +39,8 @@ class TrainableAvatar(nn.Module):
 
     def forward(self, uv: Tensor, covered: Tensor) -> Tensor:
         """`uv` (N,H,W,2) in 0..1 and `covered` (N,H,W) bool to pictures (N,4,H,W) in 0..1."""
-        x = read_texture(self._noisy(self.texture.image(), self.texture_noise), uv, covered)
+        levels = [self._noisy(level, self.texture_noise) for level in self.texture.levels()]
+        x = read_levels(levels, uv, covered)
         x = self._noisy(x, self.input_noise)
         rounded = torch.round(x * INPUT_STEPS) / INPUT_STEPS
         x = x + (rounded - x).detach()

@@ -38,8 +38,9 @@ class TrainingSettings(Table):
     far, time constant of the average that becomes the avatar. `discriminator_rate`: of learning, for discriminators; it
     stays as it is. `noise_steps`: on activations, steps of a byte. `masked_texture`: texels that a batch does not show
     keep their values and their momentum. `stand_off`: the body is drawn with clothes and hair raised by what masks
-    show. `norm`: of a new network. `bytes_from`: share of the steps after which weights and activations are rounded as
-    the bundle's are, in float32. `vgg`: SHA-256 of VGG-16's weights that the perceptual loss is by.
+    show. `norm`: of a new network. `mip_levels`: smaller levels of the texture that are learnt with it. `bytes_from`:
+    share of the steps after which weights and activations are rounded as the bundle's are, in float32. `vgg`: SHA-256
+    of VGG-16's weights that the perceptual loss is by.
     """
 
     schema_: Literal[1] = Field(default=1, alias="schema")
@@ -65,6 +66,7 @@ class TrainingSettings(Table):
     stand_off: bool = True
     norm: Literal["batch", "instance", "group", "none"] = "batch"
     bytes_from: float = Field(default=1.0, ge=0, le=1)
+    mip_levels: int = Field(default=0, ge=0, le=5)
     vgg: str | None = Field(default=None, pattern="^[0-9a-f]{64}$")
     loss: LossWeights = LossWeights()
     optimiser: OptimiserOptions = OptimiserOptions()

@@ -19,6 +19,7 @@ COLOR, DEPTH = 0x1800, 0x1801
 SYNC_GPU_COMMANDS_COMPLETE, SYNC_FLUSH_COMMANDS = 0x9117, 1
 TIMEOUT_EXPIRED, WAIT_FAILED = 0x911B, 0x911D
 FRAMEBUFFER_SRGB = 0x8DB9
+TEXTURE_2D_ARRAY, RGBA, HALF_FLOAT, UNPACK_ALIGNMENT = 0x8C1A, 0x1908, 0x140B, 0x0CF5
 SRGB8_ALPHA8 = 0x8C43
 
 _INT, _UINT, _PTR = ctypes.c_int, ctypes.c_uint, ctypes.c_void_p
@@ -30,6 +31,9 @@ _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "glDeleteSync": (None, (_PTR,)),
     "glEnable": (None, (_UINT,)),
     "glDisable": (None, (_UINT,)),
+    "glBindTexture": (None, (_UINT, _UINT)),
+    "glPixelStorei": (None, (_UINT, _INT)),
+    "glTexSubImage3D": (None, (_UINT, *(_INT,) * 7, _UINT, _UINT, _PTR)),
 }
 
 
@@ -54,6 +58,14 @@ def clear_unsigned(value: tuple[int, int, int, int]) -> None:
 def clear_depth() -> None:
     """Fill the bound framebuffer's depth with 1, the greatest depth."""
     function("glClearBufferfv")(DEPTH, 0, (ctypes.c_float * 1)(1.0))
+
+
+def write_level(texture: int, level: int, size: tuple[int, int, int], pixels: bytes) -> None:
+    """Put half-float RGBA `pixels` into a `level` of array texture `texture`; `size`: width, height, layers of it."""
+    function("glBindTexture")(TEXTURE_2D_ARRAY, texture)
+    function("glPixelStorei")(UNPACK_ALIGNMENT, 1)
+    function("glTexSubImage3D")(TEXTURE_2D_ARRAY, level, 0, 0, 0, *size, RGBA, HALF_FLOAT, pixels)
+    function("glBindTexture")(TEXTURE_2D_ARRAY, 0)
 
 
 def fence() -> int:

@@ -12,6 +12,7 @@ import moderngl
 import numpy as np
 
 from trilane.arrays import F32, U8, Floats
+from trilane.avatars.texture_levels import split_levels
 from trilane.errors import BadInputError
 from trilane.shapes import Shape
 from trilane.stages.gpu import opengl_calls
@@ -157,11 +158,19 @@ class PackedPass:
 class PackedAvatar:
     """One avatar's mesh and texture, which a `PackedPass` draws."""
 
-    def __init__(self, packed: PackedPass, mesh: Mesh, texture: Floats) -> None:
-        """`texture` (H,W,C) is uploaded here. Raises BadInputError when FP16 cannot hold it or C is not the pass's."""
+    def __init__(self, packed: PackedPass, mesh: Mesh, texture: Floats, levels: Floats | None = None) -> None:
+        """`texture` (H,W,C) is uploaded here, with its smaller `levels`, which a deferred pass cannot read.
+
+        Raises BadInputError when FP16 cannot hold a texture or C is not the pass's.
+        """
         check_texture(texture, packed.channels)
+        smaller = split_levels(levels, texture.shape[1])
+        for level in smaller:
+            check_texture(level, packed.channels)
+        if smaller and packed.deferred:
+            raise BadInputError("neural texture", "learnt levels", "one level", "draw mesh and texture in one pass")
         self.mesh, self._ctx = mesh, packed.ctx
-        self._texture = texture_array(packed.ctx, texture, packed.filtering)
+        self._texture = texture_array(packed.ctx, texture, packed.filtering, smaller)
         defines: dict[str, int | str] = {"LAYERS": packed.layers, "WORDS": WORD_TYPES[packed.layers]}
         if packed.deferred:
             self._geometry = MeshDraw(packed.ctx, mesh, "uv_only.frag")

@@ -17,7 +17,7 @@ from trilane.errors import TrilaneError
 from trilane.pipeline.stage import UnitContext
 from trilane.scene.crop import Rect, crop_projection
 from trilane.shapes import Shape
-from trilane.stages.avatar_assets import distinct, quantisation_of, shaped_body, texture_of
+from trilane.stages.avatar_assets import distinct, levels_of, quantisation_of, shaped_body, texture_of
 from trilane.stages.config import RunConfig
 from trilane.stages.gpu.avatar_mesh import avatar_mesh
 from trilane.stages.gpu.opengl_context import CONTEXT, checked, describe, open_context
@@ -119,10 +119,11 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> RasterStage:
     driver = describe(ctx)
     if driver.hardware:
         unit.use_device(driver.renderer)
-    deferred = filtering == "linear" and not driver.hardware
+    levels = [levels_of(unit.assets, number) for number in range(len(folders))]
+    deferred = filtering == "linear" and not driver.hardware and all(each is None for each in levels)
     packed = PackedPass(ctx, textures[0].shape[2], quantisation_of(unit.assets, 0), deferred, filtering)
     drawn = {
-        folder: PackedAvatar(packed, _mesh(ctx, shaped_body(unit.assets, number), config), texture)
+        folder: PackedAvatar(packed, _mesh(ctx, shaped_body(unit.assets, number), config), texture, levels[number])
         for number, (folder, texture) in enumerate(zip(folders, textures, strict=True))
     }
     avatars = [drawn[folder] for folder in config.avatar_dirs]

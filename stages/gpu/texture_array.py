@@ -5,6 +5,7 @@ Rule: texels are FP16; what FP16 cannot hold is refused before anything is uploa
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import moderngl
@@ -12,6 +13,7 @@ import numpy as np
 
 from trilane.arrays import Floats
 from trilane.errors import BadInputError
+from trilane.stages.gpu import opengl_calls
 
 #: How the neural texture is read: the filter when it is shrunk, and the greatest anisotropy (a driver may allow less).
 FILTERS = {
@@ -22,19 +24,35 @@ FILTERS = {
 FP16_MAX = float(np.finfo(np.float16).max)
 
 
-def texture_array(ctx: Any, texture: Floats, filtering: str = "linear") -> Any:
-    """An FP16 array texture of C/4 RGBA layers from `texture` (H,W,C), clamped at its edge. `filtering`: of FILTERS."""
+def texture_array(ctx: Any, texture: Floats, filtering: str = "linear", levels: Sequence[Floats] = ()) -> Any:
+    """An FP16 array texture of C/4 RGBA layers from `texture` (H,W,C), clamped at its edge.
+
+    `filtering`: of FILTERS. `levels`: smaller ones that were learnt; they are read in place of the driver's means, and
+    none below them, so `linear` becomes `mipmap`.
+    """
     height, width, channels = texture.shape
-    layers = texture.reshape(height, width, channels // 4, 4).transpose(2, 0, 1, 3)
-    pixels = np.ascontiguousarray(layers, np.float16).tobytes()
-    array = ctx.texture_array((width, height, channels // 4), 4, pixels, dtype="f2")
-    shrunk, anisotropy = FILTERS[filtering]
+    array = ctx.texture_array((width, height, channels // 4), 4, _pixels(texture), dtype="f2")
+    shrunk, anisotropy = FILTERS[filter_of(filtering, bool(levels))]
     if shrunk != moderngl.LINEAR:
-        array.build_mipmaps()
+        array.build_mipmaps(**({"max_level": len(levels)} if levels else {}))
+    for number, level in enumerate(levels, 1):
+        size = (level.shape[1], level.shape[0], channels // 4)
+        opengl_calls.write_level(array.glo, number, size, _pixels(level))
     array.filter = (shrunk, moderngl.LINEAR)
     array.anisotropy = anisotropy
     array.repeat_x = array.repeat_y = False
     return array
+
+
+def filter_of(asked: str, learnt: bool) -> str:
+    """The filter of a texture for which the scene has `asked`; one with `learnt` levels is never read without them."""
+    return "mipmap" if learnt and asked == "linear" else asked
+
+
+def _pixels(texture: Floats) -> bytes:
+    height, width, channels = texture.shape
+    layers = texture.reshape(height, width, channels // 4, 4).transpose(2, 0, 1, 3)
+    return np.ascontiguousarray(layers, np.float16).tobytes()
 
 
 def check_texture(texture: Floats, channels: int) -> None:

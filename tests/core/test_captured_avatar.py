@@ -91,7 +91,7 @@ def log(monkeypatch: pytest.MonkeyPatch) -> Any:
     part(captured_avatar, "subject_with_offsets", raised)
     part(captured_avatar, "write_dataset", draw)
     part(captured_avatar, "SIDES", SIDES)
-    part(captured_avatar, "NeuralTexture", lambda start: NeuralTexture(start, SIDES))
+    part(captured_avatar, "NeuralTexture", lambda start, mip_levels: NeuralTexture(start, SIDES, mip_levels))
     part(captured_avatar, "body_arrays", lambda shaped: f"arrays of {shaped}")
     part(captured_avatar, "first_texture", lambda *_: np.full((64, 64, 16), 0.25, np.float32))
     part(captured_avatar, "write_sheet", lambda path, *_: asked.append(path.name))

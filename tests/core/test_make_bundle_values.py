@@ -46,7 +46,7 @@ def test_a_texture_has_bytes_by_channel_and_nothing_where_no_face_is(monkeypatch
     made = noise(3)
     made[:, 50:] = 0.95
     made[..., 2] = 0
-    texture, scale = make_bundle.byte_texture(avatar(made), "shaped")
+    texture, scale, _ = make_bundle.byte_texture(avatar(made), "shaped")
     assert texture.dtype == np.int8 and scale.dtype == np.float32
     grown = np.zeros((64, 64), bool)
     grown[:, : 32 + 3] = True
@@ -74,11 +74,11 @@ def test_texels_that_no_frame_shows_are_filled_from_their_neighbours_on_the_body
     unseen = np.zeros((32, 32), bool)
     unseen[10:16, 12:16] = True
     made = avatar(np.where(np.kron(unseen, np.ones((2, 2)))[..., None] > 0, -0.9, plane).astype(np.float32))
-    texture, scale = make_bundle.byte_texture(made, "shaped", unseen)
+    texture, scale, _ = make_bundle.byte_texture(made, "shaped", unseen)
     steps = float(scale.max()) / 2
     np.testing.assert_allclose((texture * scale)[20:32, 24:30], plane[20:32, 24:30], atol=steps + 0.02)
     assert (texture[20:32, 32:34] > 0).all(), "the margin"
-    left, _ = make_bundle.byte_texture(made, "shaped")
+    left, _, _ = make_bundle.byte_texture(made, "shaped")
     assert (left[22:30, 26:30] < 0).all() and np.array_equal(left[40:, :30] > 0, texture[40:, :30] > 0)
 
 
@@ -139,7 +139,7 @@ def test_the_network_is_calibrated_on_chosen_samples_of_one_shape(monkeypatch, g
     monkeypatch.setattr(make_bundle, "quantise", quantise)
     monkeypatch.setattr(make_bundle, "export_onnx", lambda network, *shape: (network, shape))
     monkeypatch.setattr(make_bundle, "reshaped", lambda network, *shape: (network.name, shape))
-    monkeypatch.setattr(make_bundle, "byte_texture", lambda *words: (words, "scale"))
+    monkeypatch.setattr(make_bundle, "byte_texture", lambda *words: (words, "scale", None))
     made = avatar(noise(1))
     found = make_bundle.quantise_avatar(made, "shaped", groups, 9, "unseen")
     assert found.network == Quantised(("made", (256, 256)), {"a": 1}, {})
@@ -210,8 +210,9 @@ def test_a_painter_in_floats_reads_the_texture_and_rounds_the_picture(tmp_path):
     assert np.abs(found - wanted).max() <= 1 and (found != wanted).mean() < 0.01
 
     save_network(made, tmp_path / "n.npz")
-    entry = SimpleNamespace(width=4, channels=CHANNELS)
+    entry = SimpleNamespace(norm="batch", width=4, channels=CHANNELS)
     texture = image[0].permute(1, 2, 0).numpy()
-    bundle = SimpleNamespace(manifest=SimpleNamespace(network=entry), read_texture=lambda: texture)
+    parts = {"read_texture": lambda: texture, "read_levels": lambda: None}
+    bundle = SimpleNamespace(manifest=SimpleNamespace(network=entry), **parts)
     again = float_painter.float_painter_of(bundle, tmp_path / "n.npz")(None, uv)
     assert np.abs(again.astype(int) - found).max() <= 2, "weights in half precision"

@@ -56,6 +56,7 @@ MANY: list[dict[str, Any]] = [
     {"freeze_norms_at": 0.2, "bytes_from": 0.4, "noise_steps": 0.0},
     {
         "norm": "instance",
+        "mip_levels": 2,
         "optimiser": {"batches_per_step": 2, "momentum": 0.5},
         "batches": {"full_body_from": 0.7},
         "regularisation": {"input_noise": 0.1},
@@ -68,10 +69,10 @@ def settings(**others: Any) -> TrainingSettings:
     return parsed_settings({"device": "cpu"} | usual | others, "a test")
 
 
-def avatar(norm: str = "batch") -> TrainableAvatar:
+def avatar(norm: str = "batch", mip_levels: int = 0) -> TrainableAvatar:
     torch.manual_seed(0)
     start = np.random.default_rng(1).uniform(-0.5, 0.5, (64, 64, 4)).astype(np.float32)
-    return TrainableAvatar(NeuralTexture(start, sides=(64, 32)), UNet(norm=norm, width=4, channels=4))
+    return TrainableAvatar(NeuralTexture(start, (64, 32), mip_levels), UNet(norm=norm, width=4, channels=4))
 
 
 @pytest.fixture(autouse=True)
@@ -98,7 +99,7 @@ def groups(tmp_path: Path) -> list[ShapeGroup]:
 
 
 def trained(groups: list[ShapeGroup], until: int, asked: TrainingSettings) -> TrainingState:
-    state = first_state(avatar(asked.norm), asked)
+    state = first_state(avatar(asked.norm, asked.mip_levels), asked)
     go(state, groups, asked, until)
     return state
 
@@ -127,7 +128,7 @@ def test_a_training_with_options_is_resumed_to_the_bit(
     asked = settings(**change)
     whole = bits(trained(groups, COUNT, asked))
     save_state(trained(groups, 3, asked), tmp_path / "state.npz")
-    after = first_state(avatar(asked.norm), asked)
+    after = first_state(avatar(asked.norm, asked.mip_levels), asked)
     load_state(after, tmp_path / "state.npz")
     go(after, groups, asked, COUNT)
     assert bits(after) == whole

@@ -268,8 +268,8 @@ def test_the_integer_network_is_run_as_in_the_pipeline(monkeypatch):
         made.append(Packed(*words, **options))
         return made[-1]
 
-    def packed_avatar(packed, mesh, texture):
-        assert (mesh, texture.shape) == ("mesh", (8, 8, 5))
+    def packed_avatar(packed, mesh, texture, levels):
+        assert (mesh, texture.shape, levels) == ("mesh", (8, 8, 5), kept[-1])
         return SimpleNamespace(draw=lambda *words: packed.drawn.append(words))
 
     monkeypatch.setattr(evaluate, "PackedPass", packed_pass)
@@ -277,7 +277,13 @@ def test_the_integer_network_is_run_as_in_the_pipeline(monkeypatch):
     monkeypatch.setattr(evaluate, "reshaped", lambda network, *shape: (network, shape))
     monkeypatch.setattr(evaluate, "load_runtime", lambda name: SimpleNamespace(load=Session, name=name))
     network = SimpleNamespace(input=SimpleNamespace(scale=0.5, zero_point=7))
-    bundle = SimpleNamespace(read_network=lambda: network, read_texture=lambda: np.zeros((8, 8, 5)))
+    kept = [None]
+    parts = {
+        "read_network": lambda: network,
+        "read_texture": lambda: np.zeros((8, 8, 5)),
+        "read_levels": lambda: kept[-1],
+    }
+    bundle = SimpleNamespace(**parts)
     skeleton = SimpleNamespace(pose=lambda pose: SimpleNamespace(matrices=f"joints of {pose}"))
     renderer = SimpleNamespace(ctx="context", mesh="mesh", skeleton=skeleton)
     renderer.placed = lambda sample: SampleRenderer.placed(renderer, sample)
@@ -292,6 +298,9 @@ def test_the_integer_network_is_run_as_in_the_pipeline(monkeypatch):
     placement = evaluate.Placement("joints of 1", "projection 1", (0, 0, 4, 2))
     assert made[0].drawn[1] == (("target", (4, 2)), "view 1", placement)
     assert loaded == [((network, (2, 3)), 3), ((network, (4, 2)), 3)]
+    kept.append("levels")
+    evaluate.integer_painter(renderer, bundle, "ort", 3)
+    assert made[1].made[3] is False, "a deferred pass cannot read smaller levels"
 
 
 @pytest.mark.parametrize(("side", "window"), [(12, 7), (8, 7), (6, 5), (3, 3)])
