@@ -19,10 +19,10 @@ from trilane.training.batch_choice import Batch, batch_stream, is_whole
 from trilane.training.byte_grid import ByteGrid
 from trilane.training.device import chosen_device
 from trilane.training.dropout import add_dropout
-from trilane.training.make_bundle import ranges_of
 from trilane.training.objective import Objective
 from trilane.training.optimisers import clip_gradients, optimiser_of
 from trilane.training.perceptual import Vgg16
+from trilane.training.rounding import round_to_bytes
 from trilane.training.sample_files import ShapeGroup
 from trilane.training.trainable_avatar import TrainableAvatar
 from trilane.training.training_loop import add_gradients, follow, load_batch, rate_share, set_mode
@@ -80,9 +80,7 @@ def _round(avatar: TrainableAvatar, groups: list[ShapeGroup], settings: Training
     """Round `avatar` to bytes where the `share` of the steps that is done says so; the grid is measured at first."""
     if avatar.grid is None or share <= settings.bytes_from:
         return
-    if not avatar.grid.measured:
-        avatar.grid.measure(ranges_of(copy.deepcopy(avatar).cpu(), groups, settings.seed))
-    avatar.grid.active = True
+    round_to_bytes(avatar, avatar.grid, groups, settings.seed)
 
 
 def _step(state: TrainingState, stream: Iterator[Batch], settings: TrainingSettings, frozen: bool) -> dict[str, float]:

@@ -60,6 +60,8 @@ CHANNELS = 16
 CHECKPOINT, FINAL, NETWORK = "checkpoint.npz", "final.npz", "network.npz"
 FACTS, TRAINING = "dataset.json", "training"
 #: Settings of `FitConfig` for a training that starts from a network, and for one that also has a trained texture.
+#: What the loop is told as the command is.
+SHARED = ("minutes", "workers", "threads", "batch", "seed", "precision", "bytes_from")
 REPEATS = (2, 1, 2, 3, 1)
 KNOWN_NETWORK: dict[str, Any] = {"small_until": 0.0, "freeze_norms_at": 0.3, "repeats": REPEATS}
 RESUMED: dict[str, Any] = {
@@ -82,6 +84,7 @@ class TrainConfig:
     `capture`: folder of the person to train on; None for the body in `body`, clothed. `look`: of that body, a name of
     `LOOKS`.
     `precision`: of the network while it is trained; "bfloat16" is three times as fast on processors with AMX.
+    `bytes_from`: share of the minutes after which weights and activations are rounded as the bundle's are.
     `weights`: do not train, use these. `resume`: continue from these weights at a lower rate. `network`: start from the
     network of these weights, with a new texture or with `texture`, that of a trained avatar (a name or a folder).
     """
@@ -107,6 +110,7 @@ class TrainConfig:
     capture: Path | None = None
     look: str | None = None
     precision: Precision = "float32"
+    bytes_from: float = 1.0
 
 
 def train(config: TrainConfig, report: Callable[[str], None]) -> Path:
@@ -230,7 +234,7 @@ def _trained(shaped: ShapedBody, config: TrainConfig, report: Callable[[str], No
 
 def _starting_point(shaped: ShapedBody, config: TrainConfig) -> tuple[TrainableAvatar, int, FitConfig]:
     """The avatar that training starts from, the steps it has been trained, and the settings of the training."""
-    shared = {name: getattr(config, name) for name in ("minutes", "workers", "threads", "batch", "seed", "precision")}
+    shared = {name: getattr(config, name) for name in SHARED}
     settings = FitConfig(**shared)
     if config.resume is not None:
         avatar, steps = load_avatar(_blank_avatar(config), config.resume)

@@ -44,10 +44,9 @@ class TrainableAvatar(nn.Module):
         x = self._noisy(x, self.input_noise)
         rounded = torch.round(x * INPUT_STEPS) / INPUT_STEPS
         x = x + (rounded - x).detach()
-        if self.grid is not None and self.grid.active:
-            return self.grid.painted(self.network, x)
+        rounds = self.grid is not None and self.grid.active
         with torch.autocast(x.device.type, torch.bfloat16, enabled=self.precision == "bfloat16"):
-            output: Tensor = self.network(x)
+            output: Tensor = self.grid.painted(self.network, x) if self.grid and rounds else self.network(x)
         return output.float()
 
     def _noisy(self, x: Tensor, deviation: float) -> Tensor:

@@ -25,9 +25,11 @@ from torch import Tensor, nn
 from torch import multiprocessing as tmp
 
 from trilane.training.activation_noise import add_activation_noise
+from trilane.training.byte_grid import ByteGrid
 from trilane.training.losses import loss_terms
 from trilane.training.objective import Objective
 from trilane.training.optimisers import clip_gradients, optimiser_of
+from trilane.training.rounding import round_to_bytes
 from trilane.training.sample_files import U16, ShapeGroup, batches, open_groups
 from trilane.training.trainable_avatar import Precision, TrainableAvatar
 
@@ -54,6 +56,7 @@ class FitConfig:
     `repeats`: how often an epoch has a sample, by its band: far, full body, upper body, face, anywhere.
     `noise_steps`: size of the noise on activations, in steps of a byte.
     `precision`: of the network while it is trained.
+    `bytes_from`: share of the budget after which weights and activations are rounded as the bundle's are.
     """
 
     minutes: float
@@ -73,6 +76,7 @@ class FitConfig:
     checkpoint_s: float = 180.0
     max_steps: int = 10_000_000
     precision: Precision = "float32"
+    bytes_from: float = 1.0
 
 
 def load_batch(
@@ -141,6 +145,7 @@ def _worker(
     avatar = copy.deepcopy(shared)
     avatar.precision = config.precision
     add_activation_noise(avatar.network, config.noise_steps)
+    grid = avatar.grid = ByteGrid(avatar.network) if config.bytes_from < 1 else None
     avatar.network.to(memory_format=torch.channels_last)
     optimiser = optimiser_of(avatar, config)
     peaks = [group["lr"] for group in optimiser.param_groups]
@@ -156,6 +161,8 @@ def _worker(
         if share >= 1 or os.getppid() != parent:
             break
         set_mode(avatar, frozen=share > config.freeze_norms_at)
+        if grid is not None and share > config.bytes_from:
+            round_to_bytes(avatar, grid, groups, config.seed)
         for parameters, peak in zip(optimiser.param_groups, peaks, strict=True):
             parameters["lr"] = peak * rate_share(share)
         values = train_step(avatar, optimiser, *load_batch(*next(streams[share >= config.small_until])))
