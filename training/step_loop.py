@@ -42,10 +42,10 @@ def first_state(avatar: TrainableAvatar, settings: TrainingSettings, vgg: Vgg16 
     harder = settings.regularisation
     avatar.texture_noise, avatar.input_noise = harder.texture_noise, harder.input_noise
     avatar.precision = settings.precision
-    if settings.bytes_from < 1:
-        avatar.grid = ByteGrid(avatar.network)
     add_dropout(avatar.network, harder.dropout)
     add_activation_noise(avatar.network, settings.noise_steps)
+    if settings.bytes_from < 1:
+        avatar.grid = ByteGrid(avatar.network)  # after the noise, so that what is rounded has it
     avatar.network.to(memory_format=torch.channels_last)
     loss, rate = settings.loss, settings.discriminator_rate
     adversary = Adversary(settings.width, rate, settings.seed, device) if loss.judged else None

@@ -240,7 +240,9 @@ def test_a_capture_is_another_source_and_is_measured_on_its_own_frames(config, c
     assert said["plan_training"][0] == "their renderer" and said["write_dataset"][0].func is opener
     assert said["write_avatar"][1] is person and said["write_avatar"][4]["body"] == "that of a capture"
     assert not {"validate", "revalidate", "clothed_subject"} & set(said)
-    assert command_of(one).endswith("--capture mine --precision float32") and "--capture" not in command_of(config)
+    assert command_of(one).endswith(
+        "--capture mine --precision float32 --bytes-from 1.0"
+    ) and "--capture" not in command_of(config)
     assert json.loads((config.work / "dataset.json").read_text())["capture"] == str(folder)
     with pytest.raises(BadInputError, match="use another --work folder"):
         train(config, lines.append)
@@ -362,7 +364,7 @@ def test_the_command_is_written_without_folders():
     assert command_of(ALL) == (
         "python -m trilane.training.train --name 'a b' --minutes 2.5 --samples 7 --per-band 6 --held-out jump.bvh "
         "--held-out builtin:idle --width 8 --workers 2 --threads 4 --batch 3 --seed 5 --weights f.npz --resume r.npz "
-        "--network n.npz --texture somebody --look hiker --precision float32"
+        "--network n.npz --texture somebody --look hiker --precision float32 --bytes-from 1.0"
     )
 
 
