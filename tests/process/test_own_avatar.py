@@ -15,7 +15,11 @@ from trilane.avatars.bundle import load_bundle
 
 PAGE = Path(__file__).parents[2] / "docs" / "own-avatar.md"
 #: What is put in the place of a long option's value; and what is added to a command.
-SHORTER = {"--frames 120": "--frames 6", "1920x1080": "320x240", "--minutes 600": "--steps 10 --samples 8"}
+SHORTER = {
+    "--frames 120": "--frames 6",
+    "1920x1080": "320x240",
+    "--minutes 600": "--steps 10 --samples 8",
+}
 ADDED = {"run": "--frames 2 --size 64", "quantise": "--count 2"}
 
 
