@@ -66,10 +66,3 @@ def test_without_pytorch_it_says_what_is_missing(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(augmentation, "find_spec", lambda part: None if part == "torch" else part)
     with pytest.raises(MissingPartError, match=r"training needs torch; .*train"):
         augmentation.measure()
-
-
-@pytest.mark.slow
-def test_camera_space_wins_close_up() -> None:
-    """After few steps already, because the texture of a new person is then mostly what the samples' colours say."""
-    found = augmentation.measure(steps=60, frames=16, samples=96, views=4)
-    assert found["gain_db"]["face"] > 0 and found["gain_db"]["upper_body"] > 0
