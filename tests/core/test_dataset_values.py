@@ -53,7 +53,7 @@ def test_samples_are_written_by_shape_in_their_order(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(dataset, "_source", [])
     bodies = {tmp_path / "body.npz": SimpleNamespace(shape=lambda betas: betas)}
     monkeypatch.setattr(dataset, "load_body", bodies.__getitem__)
-    source = partial(dataset.clothed_source, tmp_path / "body.npz", "hiker")
+    source = partial(dataset.clothed_source, tmp_path / "body.npz", "hiker", None)
     parts = []
     samples = [sample(number) for number in range(120)]
     dataset.write_dataset(source, samples, tmp_path / "set", 2, lambda rows: parts.append(len(rows)) or rows)
