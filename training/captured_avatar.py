@@ -33,6 +33,7 @@ from trilane.training.outlines import subject_with_offsets
 from trilane.training.perceptual import Vgg16, read_vgg16
 from trilane.training.probe_loss import probe_loss
 from trilane.training.progress_sheet import write_sheet
+from trilane.training.rounding import keep_rounded_weights
 from trilane.training.sample_files import FIELDS, ShapeGroup, open_groups
 from trilane.training.step_loop import first_state, step_seconds, steps
 from trilane.training.subject import Subject, captured_subject
@@ -108,6 +109,8 @@ def train_on_capture(places: Places, asked: TrainingSettings, listener: Listener
     _train(state, subject, places, settings, listener)
     losses["after"] = probe_loss(state, groups)
     state.average.cpu()
+    if settings.bytes_from < 1:
+        keep_rounded_weights(state.average, groups, settings.seed)
     save_network(state.average, places.work / NETWORK)
     files = write_float_network(places.work, state.average, groups, settings.seed)
     quantised = quantise_avatar(state.average, subject.shaped, groups, settings.seed, subject.unseen)

@@ -38,6 +38,7 @@ from trilane.training.make_bundle import quantise_avatar, write_avatar
 from trilane.training.network import UNet
 from trilane.training.neural_texture import SIDES, NeuralTexture
 from trilane.training.outlines import subject_with_offsets
+from trilane.training.rounding import keep_rounded_weights
 from trilane.training.sample_files import open_groups
 from trilane.training.sample_renderer import SampleRenderer
 from trilane.training.subject import Subject, captured_subject, clothed_subject
@@ -127,6 +128,9 @@ def train(config: TrainConfig, report: Callable[[str], None]) -> Path:
     avatar, steps = _trained(shaped, config, report)
     report("quantising and evaluating")
     torch.set_num_threads(config.workers)
+    if config.bytes_from < 1:
+        keep_rounded_weights(avatar, open_groups(config.work / TRAINING), config.seed)
+        save_network(avatar, config.work / NETWORK)
     groups = open_groups(config.work / TRAINING)
     quantised = quantise_avatar(avatar, shaped, groups, config.seed, subject.unseen)
     names = {"name": config.name, "training_command": command_of(config)}

@@ -13,11 +13,14 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("scipy")
 pytest.importorskip("skimage")
 
+from trilane.training import rounding  # noqa: E402
 from trilane.training.byte_grid import ByteGrid, rounded_weights  # noqa: E402
 from trilane.training.network import UNet  # noqa: E402
+from trilane.training.neural_texture import NeuralTexture  # noqa: E402
 from trilane.training.onnx_export import export_onnx  # noqa: E402
 from trilane.training.quantising.power_of_two_scales import _round_weights  # noqa: E402
 from trilane.training.quantising.quantise import ByteRanges, byte_ranges, quantise  # noqa: E402
+from trilane.training.trainable_avatar import TrainableAvatar  # noqa: E402
 
 SHAPE, CHANNELS = (64, 32), 5
 
@@ -139,3 +142,21 @@ def test_ranges_are_given_for_each_place() -> None:
     other = ByteGrid(network())
     with pytest.raises(KeyError):
         other.measure(ByteRanges({"tensor": (0.0, 1.0)}, True))
+
+
+def test_what_was_trained_rounded_keeps_its_rounded_weights(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rounding again changes no weight, so the integer network stays but for ranges that are measured anew, which are
+    worth a step; the float network comes nearer to it."""
+    monkeypatch.setattr(rounding, "ranges_of", lambda one, *_: byte_ranges(export_onnx(one.network, *SHAPE), frames()))
+    made, texture = network(), NeuralTexture(np.zeros((32, 32, CHANNELS), np.float32), (32,))
+    rounding.keep_rounded_weights(TrainableAvatar(texture, made), [], 1)
+    before, after = (quantise(export_onnx(one, *SHAPE), frames()).network for one in (network(), made))
+    grid = grid_of(made)
+    for name, weight in grid.weights(made).items():
+        np.testing.assert_allclose(weight.detach(), made.get_parameter(name).detach(), rtol=1e-5, atol=1e-7)
+    assert any((network().get_parameter(name) != weight).any() for name, weight in grid.weights(made).items())
+    for frame in frames():
+        integers = painted_in_integers(before, frame)
+        assert np.abs(painted_in_integers(after, frame).astype(int) - integers).max() <= 1
+        off = [np.square(np.round(picture(one, None, frame)) - integers).mean() for one in (network(), made)]
+        assert off[1] < off[0]
