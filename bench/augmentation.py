@@ -1,13 +1,14 @@
 """What is a close-up worth when views are drawn by the camera, and what when whole frames are resampled?
 
 Rule: one capture, the same views, first network, first texture's method, steps and batches; only how a view is made of
-its frame differs. Both avatars are measured on motions, cameras and seeds that no training sample has.
+its frame differs. The body wears what the package's avatar of that look wears, so that outlines are not what is
+compared. Both avatars are measured on motions, cameras and seeds that no training sample has.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from trilane.avatars.bundle import bundle_folder
+from trilane.avatars.bundle import bundle_folder, load_bundle
 from trilane.body.body import load_body
 from trilane.errors import BadInputError, MissingPartError
 from trilane.figure_sources import MEASURED
@@ -68,13 +69,15 @@ def measure(
             raise MissingPartError(f"training needs {part}", extra="train")
     from trilane.training.sample_renderer import SampleRenderer
 
-    shaped = load_body(bundle_folder("default") / "body.npz").shape(chosen.betas)
+    offsets = load_bundle(look).read_body().offsets
+    bare = load_body(bundle_folder("default") / "body.npz").shape(chosen.betas)
+    shaped = bare if offsets is None else bare.with_offsets(offsets)
     rows = list[dict[str, Any]]()
     with TemporaryDirectory() as folder:
         capture = _capture(Path(folder) / "capture", shaped, frames, look, seed)
-        work = _Work(capture, steps, samples, seed)
+        work = _Work(replace(capture, shaped=shaped), steps, samples, seed)
         studio = SampleRenderer(shaped, threads=1, look=chosen)
-        for name, source in _sources(capture).items():
+        for name, source in _sources(work.capture).items():
             paint, loss = _trained(work, source, Path(folder) / name.replace(" ", "-"))
             rows.append({"augmentation": name, **_errors(studio, paint, views, seed), "loss": loss})
     gains = {key.removeprefix("psnr_db_"): rows[0][key] - rows[1][key] for key in rows[0] if key.startswith("psnr_db")}

@@ -22,7 +22,7 @@ def test_a_seed_gives_the_same_bytes_in_any_process(renderer, tmp_path):
     assert all(
         np.array_equal(a.pose, b.pose) and a.crop.shape == b.crop.shape for a, b in zip(samples, again, strict=True)
     )
-    write_dataset(partial(clothed_source, BODY), samples, tmp_path, processes=1)
+    write_dataset(partial(clothed_source, BODY, "default", None), samples, tmp_path, processes=1)
     groups = {group.shape: group for group in open_groups(tmp_path)}
     uv, rgba = renderer.render(samples[0])
     stored = groups[samples[0].crop.shape]
