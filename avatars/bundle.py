@@ -30,6 +30,8 @@ from trilane.writing import require_writable, write_bytes, write_folder
 
 MANIFEST, OFFSETS = "manifest.json", "offsets.npz"
 DEFAULT = "default"
+#: Avatars that are part of the package, by name.
+BUILT_IN = (DEFAULT, "hiker")
 CAPTURE = "capture.toml"
 HOW_TO_TRAIN = "docs/own-avatar.md says how `trilane avatar train` makes one from frames of a person"
 HOW_TO_CREATE = "`trilane avatar create --body` puts a body of the same UV layout into an avatar"
@@ -104,15 +106,15 @@ def read_texture(path: Path, channels: int) -> NDArray[np.float32]:
 
 
 def bundle_folder(name: str | Path) -> Path:
-    """The folder of a bundle: `default` is the embedded avatar, anything else a path."""
-    return Path(__file__).parent / DEFAULT if str(name) == DEFAULT else Path(name)
+    """The folder of a bundle: names of `BUILT_IN` are embedded, anything else is a path."""
+    return Path(__file__).parent / name if str(name) in BUILT_IN else Path(name)
 
 
 def load_bundle(name: str | Path) -> Bundle:
     """Read a bundle's manifest. Raises BadInputError naming file and key."""
     folder = bundle_folder(name)
     path = folder / MANIFEST
-    meant = did_you_mean(folder.name, [DEFAULT])
+    meant = did_you_mean(folder.name, BUILT_IN)
     if meant and not folder.exists():
         raise BadInputError(folder, "no such folder", "an avatar's folder, or default", meant)
     if folder.is_file():

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from trilane.avatars.bundle import DEFAULT, Bundle, bundle_folder
+from trilane.avatars.bundle import BUILT_IN, Bundle, bundle_folder
 from trilane.avatars.digests import digests_of, figures_digest
 from trilane.avatars.manifest import CAPTURED, UNTRAINED, Validation
 from trilane.figure_sources import NO_FIGURES, from_validation
@@ -140,5 +140,6 @@ def _no_figures(bundle: Bundle, changed: Sequence[str], why: str, how: str = "",
 
 
 def name_of(folder: Path) -> str:
-    """What a person types for `folder`: `default`, or the folder."""
-    return DEFAULT if folder.absolute() == bundle_folder(DEFAULT).absolute() else str(folder)
+    """What a person types for `folder`: the name of an avatar of the package, or the folder."""
+    known = (name for name in BUILT_IN if folder.absolute() == bundle_folder(name).absolute())
+    return next(known, str(folder))

@@ -54,10 +54,10 @@ class AvatarSpec(Table):
     """One avatar.
 
     `name`: no other avatar of the scene has it; `avatar1`, `avatar2`, ... by its place when it is not given.
-    `bundle`: `default` or a folder. `motion`: `builtin:NAME` or a file. `position`: metres. `up_axis`, `units`: of the
-    motion file. `joint_map`: joint of the body -> name of the file's, or an empty text for none. `start_s`, `end_s`:
-    of the motion's own time, what is played of it; `speed`: how many times as fast; `loop`: what follows, by default
-    what is usual for the motion. `ground`: how the motion is put on the floor (`floor.py`).
+    `bundle`: `default`, `hiker` or a folder. `motion`: `builtin:NAME` or a file. `position`: metres. `up_axis`,
+    `units`: of the motion file. `joint_map`: joint of the body -> name of the file's, or an empty text for none.
+    `start_s`, `end_s`: of the motion's own time, what is played of it; `speed`: how many times as fast; `loop`: what
+    follows, by default what is usual for the motion. `ground`: how the motion is put on the floor (`floor.py`).
     """
 
     name: str | None = Field(default=None, min_length=1, max_length=80, pattern=NAME)

@@ -23,7 +23,7 @@ Examples:
 
 def create(
     out: Annotated[Path, typer.Option("--out", help="Folder of the avatar to write.")],
-    name: Annotated[str, typer.Argument(help="The avatar whose other parts stay: `default`, or a folder.")] = "default",
+    name: Annotated[str, typer.Argument(help="The avatar whose other parts stay: its name or folder.")] = "default",
     network: Annotated[
         Path | None, typer.Option(help="Integer network (.onnx), as `trilane avatar quantise` writes it.")
     ] = None,

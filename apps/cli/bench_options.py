@@ -15,7 +15,7 @@ DRIVER_THREADS = "Threads of the software OpenGL driver."
 
 #: Option, or bench and option: its line in `--help`.
 MEANINGS = {
-    "avatar": "`default`, the folder of an avatar, or `resnet18`: the full-width network, untrained.",
+    "avatar": "`default`, `hiker`, the folder of an avatar, or `resnet18`: the full-width network, untrained.",
     "avatars": "How many avatars share the tensor.",
     "beside": "A second avatar, run at the same time and set beside the virtual clock.",
     "beside_size": "Tensor size of the second avatar in pixels: HEIGHTxWIDTH, or a side.",

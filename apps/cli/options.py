@@ -28,7 +28,8 @@ PortOption = Annotated[
 
 # A scene and what it is run with.
 SceneArgument = Annotated[str, typer.Argument(help="A scene file (TOML), or the name of one that comes with Trilane.")]
-SceneAvatarOption = Annotated[str | None, typer.Option("--avatar", help="`default`, or the folder of an avatar.")]
+AVATARS = "`default`, `hiker`, or the folder of an avatar."
+SceneAvatarOption = Annotated[str | None, typer.Option("--avatar", help=AVATARS)]
 SceneSizeOption = Annotated[
     str | None, typer.Option("--size", help=f"{SIZE_HELP} auto: planned, as the network paints best.")
 ]
@@ -49,7 +50,7 @@ PerformanceProfileOption = typer.Option(help="Which power and speed the units as
 PerformanceProfileChoice = Annotated[PerformanceProfile, PerformanceProfileOption]
 
 # An avatar and its network.
-AvatarArgument = Annotated[str, typer.Argument(help="`default`, or the folder of an avatar.")]
+AvatarArgument = Annotated[str, typer.Argument(help=AVATARS)]
 EncoderOption = Annotated[str, typer.Option(help=ENCODER_HELP)]
 NormOption = Annotated[str, typer.Option(help=NORM_HELP)]
 WidthOption = Annotated[int, typer.Option(help=WIDTH_HELP)]

@@ -83,7 +83,7 @@ WHY_IGNORED = {
 }
 
 AvatarOption = Annotated[
-    str | None, typer.Option(help="An avatar's network instead: `default`, or the folder of an avatar.")
+    str | None, typer.Option(help="An avatar's network instead: `default`, `hiker`, or the folder of an avatar.")
 ]
 NetworkOption = Annotated[
     list[Path] | None,

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trilane.avatars.bundle import load_bundle, write_bundle, write_manifest
+from trilane.avatars.bundle import BUILT_IN, bundle_folder, load_bundle, write_bundle, write_manifest
 from trilane.avatars.digests import digests_of
 from trilane.avatars.offsets import as_kept, read_offsets, save_offsets
 from trilane.errors import BadInputError
@@ -82,3 +82,22 @@ def test_a_manifest_s_offsets_lie_in_its_folder(raised: Path, tmp_path: Path) ->
         write_manifest(raised, manifest.model_copy(update={"offsets": name}))
         with pytest.raises(BadInputError, match=r"offsets|missing"):
             load_bundle(raised)
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_avatars_of_the_package_wear_clothes_and_their_figures_are_of_their_files(name: str) -> None:
+    """Clothes stand off by a centimetre or two in the mean, hair and shoes by some more."""
+    bundle = load_bundle(name)
+    length = np.linalg.norm(bundle.read_body().offsets, axis=1)  # type: ignore[arg-type]
+    assert 0.005 < length.mean() < 0.03 and 0.03 < length.max() < 0.1
+    assert bundle.manifest.name == name and bundle.folder == bundle_folder(name)
+    assert bundle.manifest.validation is not None
+    assert bundle.manifest.validation.digests == digests_of(bundle.folder, bundle.manifest)
+
+
+def test_avatars_of_the_package_are_two_people() -> None:
+    """Another height, and other colours: the first three channels of a texture begin as those that are seen."""
+    one, other = (load_bundle(name) for name in BUILT_IN)
+    heights = [float(np.ptp(bundle.shaped_body().vertices[:, 1])) for bundle in (one, other)]
+    assert abs(heights[0] - heights[1]) > 0.02
+    assert np.abs(one.read_texture() - other.read_texture()).mean() > 0.05

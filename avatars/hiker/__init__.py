@@ -1,0 +1,1 @@
+"""The embedded avatar of another look (data)."""
