@@ -45,10 +45,14 @@ def body_cases(shaped: ShapedBody) -> Iterator[HardNumber]:
 
 
 def _shapes(body: Body) -> Iterator[HardNumber]:
-    """The rest vertices are a sum of S + 1 numbers in float64, rounded to float32. The shape directions are drawn."""
+    """The rest vertices are a sum in float64 of S + 1 numbers and an offset, rounded to float32.
+
+    The shape directions are drawn.
+    """
     rng = np.random.default_rng(9)
     drawn = rng.normal(0, DRAWN_M, (2, *body.v_template.shape, DRAWN)).astype(np.float32)
     body = replace(body, shape_dirs=drawn[0], expression_dirs=drawn[1])
+    offsets = np.zeros_like(body.v_template) if body.offsets is None else body.offsets
     for name, dirs in (("betas", body.shape_dirs), ("expression", body.expression_dirs)):
         count = dirs.shape[2]
         signs = {"+5 sigma": np.ones(count), "-5 sigma": -np.ones(count), "+-5 sigma": (-1.0) ** np.arange(count)}
@@ -56,9 +60,9 @@ def _shapes(body: Body) -> Iterator[HardNumber]:
             values = SIGMAS * sign
             found = body.shape(**{name: values}).vertices
             terms = dirs.astype(np.longdouble) * values
-            wanted = body.v_template + terms.sum(axis=2)
-            size = np.abs(body.v_template) + np.abs(terms).sum(axis=2)
-            bounds = U32 * np.abs(wanted) + 2 * gamma(count + 2) * size
+            wanted = body.v_template + terms.sum(axis=2) + offsets
+            size = np.abs(body.v_template) + np.abs(terms).sum(axis=2) + np.abs(offsets)
+            bounds = U32 * np.abs(wanted) + 2 * gamma(count + 3) * size
             errors = np.abs(found - wanted)
             yield HardNumber(f"all {count} {name} at {word}", *_in_mm(worst(errors, bounds)), "mm", HIGHAM)
 
