@@ -25,6 +25,7 @@ from trilane.body.body import Body, load_body
 from trilane.errors import BadInputError
 from trilane.files import read_npz
 from trilane.stages.gpu.packed_pass import CHANNELS
+from trilane.training.clothing.looks import KEY as LOOK
 
 #: Of a network that is not the replaced one's: what the manifest says of its encoder and norm, which nobody stated.
 OTHER = "other"
@@ -136,6 +137,7 @@ def _provenance(own: Manifest, parts: Parts) -> dict[str, Any]:
     """Where the parts come from; what is said of the person or the weights stays where these stay."""
     stays = {"body": (parts.body, CAPTURED), "weights": (parts.network, UNTRAINED)}
     kept = {key: word for key, (part, word) in stays.items() if part is None and own.provenance.get(key) == word}
+    kept |= {LOOK: own.provenance[LOOK]} if parts.body is None and LOOK in own.provenance else {}
     files = {key: file.name for key, file in parts.files().items()}
     return kept | {"made_from": own.name, "replaced": files, "base": own.provenance}
 

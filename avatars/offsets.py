@@ -38,9 +38,13 @@ def read_offsets(path: Path, vertices: int) -> F32:
         raise BadInputError(path, f"no array {KEY!r}", EXPECTED)
     where = f"{path}[{KEY}]"
     if array.shape != (vertices, 3) or array.dtype.kind != "f":
-        raise BadInputError(where, f"{array.dtype} of shape {array.shape}", f"numbers of shape ({vertices}, 3)")
-    offsets: F32 = array.astype(np.float32)
-    if not np.isfinite(offsets).all() or np.abs(offsets).max(initial=0.0) > LONGEST_M:
+        raise BadInputError(
+            where, f"{array.dtype} of shape {array.shape}", f"floating-point numbers of shape ({vertices}, 3)"
+        )
+    with np.errstate(over="ignore"):
+        offsets: F32 = array.astype(np.float32)
+        lengths = np.linalg.norm(offsets, axis=1)
+    if not (lengths <= LONGEST_M).all():  # NaN and infinity are not
         raise BadInputError(where, "offsets that are not finite or too long", f"at most {LONGEST_M} m")
     offsets.flags.writeable = False
     return offsets

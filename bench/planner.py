@@ -60,8 +60,8 @@ def measure(
     `fixed_ms`, `planned_ms`; `placements`: by plan, on which cores its units were and why; `psnr_fixed_db`,
     `psnr_planned_db`, `ssim_*`, `flip_*` of the frames against those of
     `full`, the same with `box_` in the avatars' rectangles, None with nobody in view; PSNR is that of the mean square
-    over all frames; `truth`: the same against the clothed body that the default
-    avatar was trained on, `full` too; `network`: what paints `full`; `tensors`: the planned ones; `shape_changes`: what
+    over all frames; `truth`: the same against the clothed body that an avatar of the package was trained on, `full`
+    too; `network`: what paints `full`; `tensors`: the planned ones; `shape_changes`: what
     `trilane.bench.lib.shape_changes.summed_up` says of the planned frames, all of the scene's. `median_speedup`,
     `least_speedup`, `largest_loss_db` (fixed minus planned); `sources`; `driver`; `config`.
 

@@ -41,7 +41,7 @@ IN_STEPS = ("multiple_of", "greater_than_equal", "less_than_equal")
 #: Key of the scene -> why it cannot be what it was, where the range alone does not tell.
 REASONS = {"error_budget_px": "numbers are rounded, so nothing is drawn without an error"}
 BUILT_IN_PREFIX = "builtin:"
-BUILT_IN = ("room", "default")  # a background, an avatar
+BUILT_IN = ("room", "default", "hiker")  # a background, avatars
 
 
 def bad_input(where: str | Path, error: ValidationError) -> BadInputError:

@@ -9,12 +9,15 @@ from collections.abc import Callable
 from typing import Protocol
 
 from torch import Tensor, nn
+from torch.nn import functional
 
 from trilane.unet_tables import MOBILE_ENCODERS, RESNET18_STAGES, RESNET18_STEM, MobileEncoder, Row, squeeze_channels
 
 Norm = Callable[[int], nn.Module]
 Scale = Callable[[int], int]
 
+#: A strided 1x1 convolution of as many channels is trained as it is: a whole vector of floats.
+SAFE_CHANNELS = 16
 ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {"relu": nn.ReLU, "relu6": nn.ReLU6, "hardswish": nn.Hardswish}
 
 
@@ -25,6 +28,24 @@ class Encoder(Protocol):
 
     def __call__(self, x: Tensor) -> list[Tensor]:
         """(N, C, H, W), sides multiples of 32 -> five features, finest first."""
+
+
+class Shortcut(nn.Conv2d):
+    """A strided 1x1 convolution without bias.
+
+    In float32, oneDNN's backward pass of one with 8 channels or fewer, channels last, writes beyond its memory (seen
+    with PyTorch 2.13 under AVX-512, from 4 and 8 channels). While training, pixels are therefore left out before it.
+    """
+
+    def __init__(self, c_in: int, c_out: int, stride: int) -> None:
+        """From `c_in` to `c_out` channels, at every `stride`-th pixel of each axis."""
+        super().__init__(c_in, c_out, 1, stride, bias=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        if not self.training or self.in_channels >= SAFE_CHANNELS:
+            return super().forward(x)
+        down, along = self.stride
+        return functional.conv2d(x[:, :, ::down, ::along], self.weight)
 
 
 class ResidualBlock(nn.Module):
@@ -46,9 +67,7 @@ class ResidualBlock(nn.Module):
             norm(c_out),
         )
         same = stride == 1 and c_in == c_out
-        self.shortcut = (
-            nn.Identity() if same else nn.Sequential(nn.Conv2d(c_in, c_out, 1, stride, bias=False), norm(c_out))
-        )
+        self.shortcut = nn.Identity() if same else nn.Sequential(Shortcut(c_in, c_out, stride), norm(c_out))
         self.relu = nn.ReLU(inplace=True)
 
     def forward(self, x: Tensor) -> Tensor:

@@ -6,7 +6,6 @@ Rule: what was read computes the same bits as what was written, so tensors keep 
 
 from __future__ import annotations
 
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from trilane.errors import BadInputError, reason
+from trilane.files import DAMAGED
 from trilane.training.objective import Objective
 from trilane.training.trainable_avatar import TrainableAvatar
 from trilane.writing import write_atomically
@@ -72,7 +72,7 @@ def load_state(state: TrainingState, path: Path) -> None:
     try:
         with path.open("rb") as source, np.load(source, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+    except (*DAMAGED, TypeError) as error:  # TypeError: of a lone array
         raise BadInputError(path, reason(error).splitlines()[0], EXPECTED, REMEDY) from error
     for optimiser in state.optimisers().values():
         _add_moments(optimiser)

@@ -26,7 +26,7 @@ from trilane.stages.gpu.opengl_context import CONTEXT, open_context
 from trilane.transport.packets import Packet
 
 MAX_FRAMES = 10_000
-TRUTH = "ground truth: the clothed body that the default avatar was trained on"
+TRUTH = "ground truth: the clothed body that the avatar was trained on"
 FULL = "the plan full: float64 body, supersampled raster, FP32 network"
 MS = 1e-6  # of a nanosecond
 #: (h,w,3) uint8: frame `number` over its background.

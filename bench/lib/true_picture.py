@@ -1,7 +1,8 @@
 """The picture of a scene with the clothed body itself, drawn by what training draws its samples with.
 
 Rule: it is what an avatar's network was trained to paint, so it tells of every plan, `full` included, how good its
-picture is. There is one of the default avatar alone.
+picture is. There is one of the package's own avatars alone. Clothes are put on the skin, not on an avatar's offsets,
+which are these clothes already.
 """
 
 from __future__ import annotations
@@ -9,28 +10,29 @@ from __future__ import annotations
 from typing import Any
 
 from trilane.arrays import U8
-from trilane.avatars.bundle import DEFAULT, bundle_folder
+from trilane.avatars.bundle import BUILT_IN, bundle_folder
 from trilane.bench.lib.cast import Cast
 from trilane.bench.lib.layers import Layer, blended, premultiplied
 from trilane.training.body_arrays import body_arrays
 from trilane.training.clothing.clothed_body import ClothedBody
 from trilane.training.clothing.landmarks import find_landmarks
 from trilane.training.clothing.layers import clothing_layers
+from trilane.training.clothing.looks import look_of
 
 #: Of the clothed body, along each side of a pixel.
 SAMPLES = 4
 
 
 class TruePictures:
-    """Pictures of a cast of default avatars as the clothed bodies that they were trained on."""
+    """Pictures of a cast of one avatar of the package as the clothed bodies that it was trained on."""
 
     def __init__(self, cast: Cast, ctx: Any) -> None:
         """`ctx`: the OpenGL context in use. The cast must be one that `has_truth`."""
         (data,) = cast.avatars.values()
-        arrays = body_arrays(data.shaped)
+        arrays, look = body_arrays(data.shaped.bare()), look_of(data.bundle.manifest.provenance)
         landmarks = find_landmarks(arrays.vertices, arrays.joints, arrays.weights)
         self._cast = cast
-        self._clothed = ClothedBody(ctx, clothing_layers(arrays, landmarks), landmarks, SAMPLES)
+        self._clothed = ClothedBody(ctx, clothing_layers(arrays, landmarks, look), landmarks, SAMPLES, look)
 
     def frame(self, number: int, background: U8) -> U8:
         """(h,w,3) uint8, sRGB: frame `number` over its `background` (h,w,3)."""
@@ -46,5 +48,5 @@ class TruePictures:
 
 
 def has_truth(cast: Cast) -> bool:
-    """Whether every avatar of `cast` is the default one."""
-    return list(cast.avatars) == [bundle_folder(DEFAULT).absolute()]
+    """Whether everybody of `cast` is the same avatar of the package."""
+    return len(cast.avatars) == 1 and set(cast.avatars) <= {bundle_folder(name).absolute() for name in BUILT_IN}

@@ -20,6 +20,7 @@ from trilane.avatars.digests import digests_of, with_figures_digest
 from trilane.avatars.manifest import CAPTURED, UNTRAINED, Validation
 from trilane.avatars.offsets import save_offsets
 from trilane.errors import BadInputError
+from trilane.training.clothing.looks import LOOKS, look_of
 from trilane.training.quantising.quantise import quantise
 
 Command = Callable[..., tuple[str, str]]
@@ -85,6 +86,15 @@ def test_another_network_brings_its_scales_and_loses_the_validation(
     assert facts["accuracy"].startswith("it was never validated; `trilane avatar validate")
     assert facts["network"]["shapes"] == "any with sides in multiples of 32"
     assert facts["replaced"] == {"network": str(network)} and facts["made_from"] == "anna"
+
+
+def test_who_is_shown_stays_known_while_the_body_stays(base: Path, tmp_path: Path) -> None:
+    """`avatar validate` draws the truth in this look."""
+    change(base, provenance={"look": "hiker"})
+    assemble(load_bundle(base), Parts(texture=base / "texture.npz"), tmp_path / "same")
+    assemble(load_bundle(base), Parts(body=base / "body.npz"), tmp_path / "other")
+    looks = [look_of(load_bundle(tmp_path / name).manifest.provenance) for name in ("same", "other")]
+    assert looks == [LOOKS["hiker"], LOOKS["default"]]
 
 
 def test_the_same_network_keeps_validation_and_words(base: Path, tmp_path: Path) -> None:

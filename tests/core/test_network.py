@@ -10,7 +10,7 @@ torch = pytest.importorskip("torch")
 
 from trilane.avatars.network_reshape import reshaped  # noqa: E402
 from trilane.errors import BadInputError  # noqa: E402
-from trilane.training.encoders import ENCODERS  # noqa: E402
+from trilane.training.encoders import ENCODERS, Shortcut  # noqa: E402
 from trilane.training.network import NORMS, UNet  # noqa: E402
 from trilane.training.onnx_export import export_onnx  # noqa: E402
 from trilane.training.quantising.quantise import quantise  # noqa: E402
@@ -85,3 +85,28 @@ def test_output_is_rgba_of_the_input_size():
 def test_wrong_settings_are_named(bad):
     with pytest.raises(BadInputError, match=str(next(iter(bad)))):
         UNet(**bad)
+
+
+@pytest.mark.parametrize("channels", [4, 8, 15, 16])
+def test_a_narrow_shortcut_is_trained_without_a_strided_convolution(channels, monkeypatch):
+    """Values and gradients are those of the strided one in float64, which no runtime of float32 computes."""
+    strides, convolve = [], torch.nn.functional.conv2d
+
+    def seen(x, weight, bias=None, stride=1, *rest):
+        strides.append(stride)
+        return convolve(x, weight, bias, stride, *rest)
+
+    monkeypatch.setattr(torch.nn.functional, "conv2d", seen)
+    shortcut = Shortcut(channels, 2 * channels, 2)
+    x = torch.rand(2, channels, 10, 6).to(memory_format=torch.channels_last).requires_grad_()
+    exact = x.detach().double().requires_grad_()
+    weight = shortcut.weight.detach().double().requires_grad_()
+    convolve(exact, weight, stride=2).square().sum().backward()
+    found = shortcut(x)
+    assert strides == ([(2, 2)] if channels == 16 else [1])
+    if channels < 16:
+        found.square().sum().backward()
+        torch.testing.assert_close(x.grad.double(), exact.grad, rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(shortcut.weight.grad.double(), weight.grad, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(shortcut.eval()(x), found)
+    assert strides[-1] == (2, 2)

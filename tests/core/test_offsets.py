@@ -63,10 +63,11 @@ def test_offsets_are_part_of_the_body_s_digest(raised: Path, tiny_bundle: Path) 
     ("arrays", "said"),
     [
         ({"other": np.zeros((4, 3))}, "no array 'offsets'"),
-        ({"offsets": np.zeros((5, 3))}, r"shape \(5, 3\), expected numbers of shape \(4, 3\)"),
+        ({"offsets": np.zeros((5, 3))}, r"shape \(5, 3\), expected floating-point numbers of shape \(4, 3\)"),
         ({"offsets": np.zeros((4, 3), np.int32)}, "int32 of shape"),
         ({"offsets": np.full((4, 3), np.nan)}, "not finite or too long, expected at most 0.5 m"),
-        ({"offsets": np.full((4, 3), 0.6)}, "not finite or too long"),
+        ({"offsets": np.full((4, 3), 1e300)}, "not finite or too long"),
+        ({"offsets": np.full((4, 3), 0.3)}, "not finite or too long"),
     ],
 )
 def test_a_file_that_is_none_of_this_body_is_refused(arrays: dict[str, np.ndarray], said: str, tmp_path: Path) -> None:

@@ -192,6 +192,11 @@ def test_a_state_of_another_training_is_refused(groups: list[ShapeGroup], tmp_pa
     (tmp_path / "state.npz").write_bytes((tmp_path / "state.npz").read_bytes()[:1000])
     with pytest.raises(BadInputError, match="expected the state of this training"):
         load_state(first_state(avatar(), settings()), tmp_path / "state.npz")
+    (tmp_path / "state.npz").write_bytes(b"")
+    np.save(tmp_path / "lone.npy", np.zeros(3))
+    for name in ("state.npz", "lone.npy"):
+        with pytest.raises(BadInputError, match="expected the state of this training"):
+            load_state(first_state(avatar(), settings()), tmp_path / name)
 
 
 def test_settings_are_written_whole_and_read_again(tmp_path: Path) -> None:

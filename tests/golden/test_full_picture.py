@@ -11,18 +11,24 @@ import numpy as np
 import pytest
 
 from trilane.arrays import F32, F64
-from trilane.avatars.bundle import CLOTHES_STANDOFF_M
+from trilane.avatars.bundle import BUILT_IN, CLOTHES_STANDOFF_M
 from trilane.bench.lib import full_picture
 from trilane.bench.lib.cast import Cast
 from trilane.bench.lib.full_picture import FullPictures
 from trilane.bench.lib.layers import Box, Layer, blended, premultiplied, to_light
 from trilane.bench.lib.plans import FIXED, fixed, in_frames, planned
 from trilane.bench.lib.stage_chain import AvatarFrames
-from trilane.bench.lib.true_picture import has_truth
+from trilane.bench.lib.true_picture import SAMPLES, TruePictures, has_truth
+from trilane.body.body import load_body
 from trilane.stages.configure import Checked, Request, configure
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 from trilane.stages.gpu import opengl_calls
 from trilane.stages.gpu.composite_painters import AvatarPainter, PicturePainter
+from trilane.training.body_arrays import body_arrays
+from trilane.training.clothing.clothed_body import ClothedBody
+from trilane.training.clothing.landmarks import find_landmarks
+from trilane.training.clothing.layers import clothing_layers
+from trilane.training.clothing.looks import LOOKS
 
 SCENE = """
 frames = 12
@@ -106,8 +112,26 @@ def test_the_body_is_in_one_place_at_every_density(checked: Checked, monkeypatch
         assert np.abs(np.subtract(other, found[0])).max() < 0.25
 
 
-def test_only_the_default_avatar_has_a_truth(checked: Checked) -> None:
+def test_an_avatar_of_ones_own_has_no_truth(checked: Checked) -> None:
     assert not has_truth(Cast(checked))
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_the_truth_is_what_the_training_draws(name: str, tmp_path: Path, gl: Any) -> None:
+    """The clothes of the avatar's look on the skin; on the offsets, which are these clothes, they would stand off."""
+    file = tmp_path / "own.toml"
+    file.write_text(SCENE.format(bundle=name), encoding="utf-8")
+    cast = Cast(configure(Request(scene=str(file), runtime="ort", skinning="cpu"), tmp_path))
+    (data,), (seen,), look = cast.avatars.values(), cast.seen(5), LOOKS[name]
+    assert has_truth(cast) and data.shaped.body.offsets is not None
+    skin = body_arrays(load_body(data.bundle.body_path).shape(data.bundle.manifest.betas))
+    landmarks = find_landmarks(skin.vertices, skin.joints, skin.weights)
+    clothed = ClothedBody(gl, clothing_layers(skin, landmarks, look), landmarks, SAMPLES, look)
+    wanted = clothed.render(seen.joints, seen.view, seen.projection, seen.box.shape)
+    (layer,) = TruePictures(cast, gl).layers(5)
+    assert (wanted[..., 3] == 255).any()
+    differs = np.abs(layer.light - premultiplied(wanted / 255.0)).max(axis=-1) > 0.02
+    assert differs.sum() <= 0.02 * (wanted[..., 3] > 0).sum()  # a skin that was moved out and back is rounded otherwise
 
 
 def test_the_fixed_plan_is_the_square_and_fewer_frames_show_the_whole_scene(checked: Checked) -> None:
