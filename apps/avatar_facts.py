@@ -24,6 +24,7 @@ def bundle_facts(bundle: Bundle) -> dict[str, Any]:
     manifest = bundle.manifest
     shaped = bundle.shaped_body()
     files = {"body": bundle.body_path, "texture": bundle.texture_path, "network": bundle.network_path}
+    files |= {"offsets": bundle.offsets_path} if bundle.offsets_path is not None else {}
     return {
         "name": manifest.name,
         "folder": str(bundle.folder),

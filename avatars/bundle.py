@@ -32,6 +32,7 @@ MANIFEST, OFFSETS = "manifest.json", "offsets.npz"
 DEFAULT = "default"
 #: Avatars that are part of the package, by name.
 BUILT_IN = (DEFAULT, "hiker")
+EXPECTED = f"the folder of an avatar, or one of {', '.join(BUILT_IN)}"
 CAPTURE = "capture.toml"
 HOW_TO_TRAIN = "docs/own-avatar.md says how `trilane avatar train` makes one from frames of a person"
 HOW_TO_CREATE = "`trilane avatar create --body` puts a body of the same UV layout into an avatar"
@@ -114,9 +115,8 @@ def load_bundle(name: str | Path) -> Bundle:
     """Read a bundle's manifest. Raises BadInputError naming file and key."""
     folder = bundle_folder(name)
     path = folder / MANIFEST
-    meant = did_you_mean(folder.name, BUILT_IN)
-    if meant and not folder.exists():
-        raise BadInputError(folder, "no such folder", "an avatar's folder, or default", meant)
+    if not folder.exists():
+        raise BadInputError(folder, "no such folder", EXPECTED, did_you_mean(folder.name, BUILT_IN) or HOW_TO_TRAIN)
     if folder.is_file():
         raise BadInputError(folder, *_what_it_is(folder))
     if (folder / CAPTURE).is_file() and not path.exists():
@@ -137,7 +137,7 @@ def _what_it_is(file: Path) -> tuple[str, str, str]:
         is_body = False
     found = "a body, which has no texture and no network" if is_body else "a file"
     remedy = f"{HOW_TO_TRAIN}; {HOW_TO_CREATE}" if is_body else HOW_TO_TRAIN
-    return found, "the folder of an avatar, or default", remedy
+    return found, EXPECTED, remedy
 
 
 def write_bundle(

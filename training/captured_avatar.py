@@ -147,7 +147,7 @@ def _raised(subject: Subject, places: Places, settings: TrainingSettings, listen
     def track(views: list[Any]) -> Iterable[Any]:
         return listener.track("measuring outlines", views, len(views))
 
-    return subject_with_offsets(subject, places.work / OFFSETS, settings.seed, track)
+    return subject_with_offsets(subject, places.work / OFFSETS, settings.seed, listener.say, track)
 
 
 def resumed_settings(path: Path, asked: TrainingSettings) -> TrainingSettings:

@@ -101,7 +101,7 @@ def captured_subject(folder: Path, threads: int, report: Callable[[str], None]) 
     require_fits(capture, frames, "what `trilane avatar check-data` draws")
     bad = [frame.number for frame in bad_frames(frames)]
     kept, held_out = held_out_frames(len(capture), bad)
-    report(f"{len(kept)} frames of {len(capture)}; {len(held_out)} are held out, {len(bad)} have bad fits")
+    report(f"{len(kept)} frames of {len(capture)} to train on; held out: {len(held_out)}, with bad fits: {len(bad)}")
     for number in kept:
         coverage.add(np.unpackbits(drawn[number]).astype(bool).reshape(coverage.used.shape))
     report(_unseen_line(coverage))

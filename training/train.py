@@ -121,7 +121,7 @@ def train(config: TrainConfig, report: Callable[[str], None]) -> Path:
     """
     torch.manual_seed(config.seed)
     config.work.mkdir(parents=True, exist_ok=True)
-    subject = subject_with_offsets(_subject(config, report), config.work / OFFSETS, config.seed)
+    subject = subject_with_offsets(_subject(config, report), config.work / OFFSETS, config.seed, report)
     held_out_motions(config.held_out)  # a motion that cannot be read ends the command here
     _render_training_set(subject, config, report)
     shaped = subject.shaped

@@ -35,7 +35,7 @@ def create(
 ) -> None:
     """Put another network, texture or body into an avatar, as a new one.
 
-    To train an avatar of a person: docs/captures.md.
+    To train an avatar of a person: docs/own-avatar.md.
     """
     from trilane.apps.assembled_avatar import Parts, assemble
     from trilane.avatars.bundle import load_bundle

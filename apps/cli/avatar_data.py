@@ -44,15 +44,19 @@ def create_data(
     frames: Annotated[int, typer.Option(min=4, max=MOST_FRAMES, help="Number of frames, from all sides.")] = 120,
     output: Annotated[str, typer.Option(help="Size of a frame in pixels: WIDTHxHEIGHT.")] = "1280x720",
     seed: Annotated[int, typer.Option(min=0, help="Seed of poses, views and noise.")] = 1,
-    fit_deg: Annotated[float, typer.Option(min=0, max=45, help="Turn joints of the fits by up to so much.")] = 0.0,
-    fit_mm: Annotated[float, typer.Option(min=0, max=1000, help="Move the fits by up to so much.")] = 0.0,
-    mask_px: Annotated[float, typer.Option(min=0, max=50, help="Move the outline of masks by up to so much.")] = 0.0,
+    fit_deg: Annotated[
+        float, typer.Option(min=0, max=45, help="Turn joints of the fits by up to so many degrees.")
+    ] = 0.0,
+    fit_mm: Annotated[float, typer.Option(min=0, max=1000, help="Move the fits by up to so many millimetres.")] = 0.0,
+    mask_px: Annotated[
+        float, typer.Option(min=0, max=50, help="Move the outline of masks by up to so many pixels.")
+    ] = 0.0,
     look: Annotated[
         str, typer.Option(help="Who is drawn: default, or hiker, of another build in other clothes.")
     ] = "default",
     json: JsonOption = False,
 ) -> None:
-    """Draw frames of the default body, clothed, with masks, fits and the camera: a capture to try the training on.
+    """Draw frames of a synthetic person with masks, fits and the camera: a capture to try the training on.
 
     With noise the exact masks and fits are kept as a capture of their own, in `truth`.
     """

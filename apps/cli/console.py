@@ -85,8 +85,17 @@ def print_facts(facts: Mapping[str, Any], as_json: bool) -> None:
 
     table = Table(show_header=False, box=None)
     for key, value in _flat(facts):
-        table.add_row(key, f"{value:.4g}" if isinstance(value, float) else str(value))
+        table.add_row(key, _written(value))
     stdout_console().print(table)
+
+
+def _written(value: Any) -> str:
+    """`value` as it stands in a table: floats with four digits, also in a list of numbers."""
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, list) and all(isinstance(each, int | float) for each in value):
+        return f"[{', '.join(map(_written, value))}]"
+    return str(value)
 
 
 def _flat(facts: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

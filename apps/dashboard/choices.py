@@ -8,14 +8,13 @@ from typing import Any, Final
 
 from trilane.apps.asked_run import AskedRun
 from trilane.apps.dashboard.controls import NO_PROFILE
-from trilane.avatars.bundle import MANIFEST
+from trilane.avatars.bundle import BUILT_IN, MANIFEST
 from trilane.scheduler.policy import POLICIES
 from trilane.stages.dsp.runtime import installed
 from trilane.units import PERFORMANCE_PROFILES
 
 EDGES: Final = ("single", "double", "triple", "fifo:4", "orphan")
 SIZES: Final = ("auto", "96", "128", "192", "256", "384", "512")
-DEFAULT_AVATAR: Final = "default"
 MOST_AVATARS: Final = 20
 
 
@@ -27,7 +26,7 @@ def choices_of(config: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
         "performance_profile": (NO_PROFILE, *PERFORMANCE_PROFILES),
         "size": SIZES,
         "runtime": tuple(installed()),
-        "avatar": (DEFAULT_AVATAR, *_neighbours(str(config["avatar"]))),
+        "avatar": (*BUILT_IN, *_neighbours(str(config["avatar"]))),
     }
     return {name: tuple(dict.fromkeys([*words, str(config[name])])) for name, words in choices.items()}
 
@@ -42,5 +41,5 @@ def reasons_against(asked: AskedRun) -> dict[str, str]:
 def _neighbours(avatar: str) -> Iterator[str]:
     """The folders of avatars beside that of `avatar`, where it is a folder."""
     folder = Path(avatar)
-    if avatar != DEFAULT_AVATAR and folder.is_dir():
+    if avatar not in BUILT_IN and folder.is_dir():
         yield from [str(manifest.parent) for manifest in sorted(folder.parent.glob(f"*/{MANIFEST}"))[:MOST_AVATARS]]

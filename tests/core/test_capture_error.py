@@ -107,7 +107,9 @@ def test_nothing_is_validated_against_clothes_that_the_person_does_not_wear(
 def test_what_is_no_avatar_is_answered_with_the_way_to_one(tiny_bundle: Path, tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match=r"found a body, which has no texture and no network.*docs/own-avatar\.md"):
         load_bundle(tiny_bundle / "body.npz")
-    with pytest.raises(BadInputError, match=r"found a file, expected the folder of an avatar, or default; docs"):
+    with pytest.raises(
+        BadInputError, match=r"found a file, expected the folder of an avatar, or one of default, hiker; docs"
+    ):
         load_bundle(tiny_bundle / "network.onnx")
     with pytest.raises(BadInputError, match=r"found a capture, which avatars are trained on.*docs/own-avatar\.md"):
         load_bundle(write_capture_folder(tmp_path / "capture"))

@@ -207,7 +207,7 @@ def test_the_person_of_a_capture(capture: Capture, monkeypatch: pytest.MonkeyPat
     for number in (0, 1):
         coverage.add(coverage.drawn(*checked_frame(capture, raster, number)[1:]))
     seen = coverage.share()
-    assert lines[0] == "2 frames of 8; 2 are held out, 1 have bad fits" and 0.2 < seen < 0.8
+    assert lines[0] == "2 frames of 8 to train on; held out: 2, with bad fits: 1" and 0.2 < seen < 0.8
     assert lines[1:] == [
         f"{1 - seen:.1%} of the body's texels are seen by no frame: filled from seen ones, along the surface"
     ]

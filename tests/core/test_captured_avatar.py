@@ -71,7 +71,8 @@ def log(monkeypatch: pytest.MonkeyPatch) -> Any:
         report(f"9 frames of {folder.name}")
         return Subject(person, "shaped", renderer, opener, FACTS, None, "frames", (3,))  # type: ignore[arg-type]
 
-    def raised(found: Subject, path: Path, seed: int, track: Any) -> Subject:
+    def raised(found: Subject, path: Path, seed: int, report: Any, track: Any) -> Subject:
+        report("measures outlines")
         asked.append(("raise", path.name, seed, len(list(track([1, 2])))))
         return found
 
@@ -139,10 +140,10 @@ def test_every_part_gets_what_is_its(log: list[Any], tmp_path: Path) -> None:
     assert names == {"name": "mine", "training_command": command}
     assert log[8:] == [("bundle of mine", "frames", (3,), 1), ("bundle of mine", {"psnr_db": 21.0, "of": "errors"})]
     assert read_settings(tmp_path / "mine" / "training.toml") == settings()
-    said = ["trains on 1 thread of the CPU", "9 frames of capture", "measuring outlines 2", "choosing views 8"]
-    assert told.lines[:4] == said
-    assert "0 MB on the disk (by 4 that were drawn)" in told.lines[4] and told.lines[5] == "drawing views 3"
-    assert told.lines[6].startswith("20 steps: about 0.") and told.lines[6].endswith(" MB of memory")
+    said = ["trains on 1 thread of the CPU", "9 frames of capture", "measures outlines", "measuring outlines 2"]
+    assert told.lines[:5] == [*said, "choosing views 8"]
+    assert "0 MB on the disk (by 4 that were drawn)" in told.lines[5] and told.lines[6] == "drawing views 3"
+    assert told.lines[7].startswith("20 steps: about 0.") and told.lines[7].endswith(" MB of memory")
     losses = [loss for _, _, loss in told.steps]
     assert [step[:2] for step in told.steps] == [(step, 20) for step in range(1, 21)] and losses[-1] < losses[0]
     assert losses == [pytest.approx(sum(WEIGHTS[name] * terms[name] for name in terms)) for terms in told.terms]
@@ -196,7 +197,7 @@ def test_steps_are_counted_for_the_minutes(log: list[Any], tmp_path: Path, monke
     monkeypatch.setattr(captured_avatar, "step_seconds", lambda *_: 0.6)
     told = Told()
     assert train_on_capture(places(tmp_path), settings(steps=None, minutes=0.125), told)["steps"] == 12
-    assert "12 steps: about 0.1 min (0.60 s a step as just measured)" in told.lines[6]
+    assert "12 steps: about 0.1 min (0.60 s a step as just measured)" in told.lines[7]
     assert read_settings(tmp_path / "mine" / "training.toml").steps == 12
     assert train_on_capture(places(tmp_path, "other"), settings(steps=None, minutes=0.001), Told())["steps"] == 10
     assert log

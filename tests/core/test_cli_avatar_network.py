@@ -31,6 +31,13 @@ def module(name: str, **names: Any) -> ModuleType:
     return made
 
 
+def test_inspect_names_the_offsets_of_an_avatar_that_has_some() -> None:
+    bundle = load_bundle("hiker")
+    assert bundle.offsets_path is not None
+    size = bundle.offsets_path.stat().st_size
+    assert bundle_facts(bundle)["files"]["offsets"] == {"name": "offsets.npz", "bytes": size}
+
+
 def test_inspect_says_what_the_files_hold(tiny_bundle: Path, command: Command) -> None:
     bundle = load_bundle(tiny_bundle)
     network = bundle.read_network()

@@ -105,7 +105,7 @@ def test_what_is_in_force_can_be_chosen_and_a_pace_is_capped_already(tmp_path: A
     }  # fmt: skip
     choices = choices_of(config)
     assert all(config[name] in words and len(set(words)) == len(words) for name, words in choices.items())
-    assert choices["avatar"] == ("default", str(tmp_path / "one"), str(tmp_path / "two"))
+    assert choices["avatar"] == ("default", "hiker", str(tmp_path / "one"), str(tmp_path / "two"))
     assert reasons_against(ASKED) == {}
     assert set(reasons_against(AskedRun(paced_by=("snapdragon-888", 1.0)))) == {"performance_profile"}
 

@@ -136,7 +136,7 @@ def test_every_part_gets_what_is_its(config, calls, tmp_path):
     ]
     assert said["clothed_subject"] == (config.body, 2, "default")
     assert said["plan_training"] == ("renderer", 6, 11)
-    assert said["subject_with_offsets"][1:] == (work / "offsets.npz", 11)
+    assert said["subject_with_offsets"][1:] == (work / "offsets.npz", 11, lines.append)
     source, *others = said["write_dataset"]
     assert (source.func, source.args) == (opener, (None,))
     assert tuple(others) == ("planned", work / "training", 2)

@@ -142,7 +142,7 @@ OPTIONS = {
     "unknown motion": (["--motion", "builtin:fly"], "motion", "builtin:fly"),
     "unknown camera": (["--camera", "builtin:fly"], "camera", "builtin:fly"),
     "missing background": (["--background", "b.mp4"], "b.mp4", "no such file"),
-    "missing avatar": (["--avatar", "nobody"], "manifest.json", "no such file"),
+    "missing avatar": (["--avatar", "nobody"], "nobody", "no such folder"),
 }
 
 
