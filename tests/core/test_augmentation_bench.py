@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 pytest.importorskip("torch")
 pytest.importorskip("skimage")
 
+from trilane.avatars.bundle import load_bundle
 from trilane.bench import augmentation
 from trilane.errors import BadInputError, MissingPartError
 from trilane.training import sample_renderer
@@ -22,12 +24,23 @@ FIGURES = {
 }
 
 
+@dataclass(frozen=True)
+class Captured:
+    """Stands for a capture."""
+
+    shaped: Any
+
+
 def test_rows_and_gains(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Both are trained by the same steps on as many samples of the same seed, and measured by the same renderer."""
+    """Both are trained by the same steps on as many samples of the same seed, and measured by the same renderer.
+
+    The body wears what the package's avatar of that look wears, also where it is trained on.
+    """
     asked: list[Any] = []
 
     def trained(work: Any, source: Any, folder: Path) -> Any:
-        asked.append((work.capture, work.steps, work.count, work.seed, source, folder.name))
+        worn = work.capture.shaped.body.offsets is not None
+        asked.append((type(work.capture) is Captured and worn, work.steps, work.count, work.seed, source, folder.name))
         return source, 0.5
 
     def errors(studio: Any, paint: str, views: int, seed: int) -> Any:
@@ -36,8 +49,10 @@ def test_rows_and_gains(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def capture(folder: Path, shaped: Any, *said: Any) -> Any:
         asked.append((folder.name, *said))
-        assert np.array_equal(shaped.vertices, shaped.body.shape(HIKER.betas).vertices)
-        return "capture"
+        worn = load_bundle("hiker").read_body()
+        assert worn.offsets is not None and np.array_equal(shaped.body.offsets, worn.offsets)
+        np.testing.assert_allclose(shaped.vertices, worn.shape(HIKER.betas).vertices, atol=2e-7)
+        return Captured(shaped)
 
     monkeypatch.setattr(sample_renderer, "SampleRenderer", lambda _, threads, look: ("studio", threads, look))
     monkeypatch.setattr(augmentation, "_capture", capture)
@@ -48,8 +63,8 @@ def test_rows_and_gains(monkeypatch: pytest.MonkeyPatch) -> None:
     studio = (("studio", 1, HIKER), 3, 7)
     assert asked == [
         ("capture", 5, "hiker", 7),
-        *(("capture", 11, 9, 7, "camera space", "camera-space"), studio),
-        *(("capture", 11, 9, 7, "image space", "image-space"), studio),
+        *((True, 11, 9, 7, "camera space", "camera-space"), studio),
+        *((True, 11, 9, 7, "image space", "image-space"), studio),
     ]
     assert found["rows"] == [{"augmentation": name, **figures, "loss": 0.5} for name, figures in FIGURES.items()]
     assert found["gain_db"] == {"far": -0.5, "face": 2.5}
