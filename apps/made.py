@@ -5,13 +5,12 @@ Rule: what is not known is null; nothing here can make a command fail.
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 from collections.abc import Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from trilane import machine
 from trilane.stages.machine_facts import package_version
 
 CHECKOUT = Path(__file__).resolve().parents[1]
@@ -26,7 +25,7 @@ def made_facts(command: Sequence[str], checkout: Path = CHECKOUT) -> dict[str, A
     """
     revision, modified = _revision(checkout)
     return {
-        "at": datetime.now(UTC).isoformat(timespec="seconds"),
+        "at": machine.here.now().isoformat(timespec="seconds"),
         "command": list(command),
         "trilane": package_version("trilane"),
         "revision": revision,
@@ -36,7 +35,7 @@ def made_facts(command: Sequence[str], checkout: Path = CHECKOUT) -> dict[str, A
 
 def _revision(checkout: Path) -> tuple[str | None, bool | None]:
     """Git's revision and whether files that git follows were changed; None for what is no checkout of its own."""
-    git = shutil.which("git")
+    git = machine.here.program("git")
     if git is None or not (checkout / ".git").exists():
         return None, None
     revision = _git(git, checkout, "rev-parse", "HEAD")

@@ -17,7 +17,7 @@ from pydantic_core import from_json
 from trilane.apps.report_sources import sources_of
 from trilane.errors import BadInputError
 from trilane.files import require_file
-from trilane.hw_profiles.host import sensor_c
+from trilane.machine import here
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run_metrics import (
     Caps,
@@ -357,7 +357,7 @@ def build_report(
     `accuracy`, `check`, `notes`.
     """
     metrics = result.report
-    sensor = {"sensor": sensor_c()}
+    sensor = {"sensor": here.sensor_c()}
     document = {
         **metrics.as_json(),
         "schema": SCHEMA,

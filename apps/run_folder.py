@@ -9,11 +9,11 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from trilane import machine
 from trilane.errors import BadInputError, TrilaneError, UnwrittenError, reason
 from trilane.writing import WRITABLE
 
@@ -23,7 +23,7 @@ FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROF
 
 def default_place(scene: str) -> Path:
     """`runs/<UTC time>-<scene>` in the working directory, a name that nothing has at this moment."""
-    stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
+    stamp = machine.here.now().strftime("%Y%m%dT%H%M%SZ")
     safe = "".join(letter if letter.isalnum() or letter in "-_" else "-" for letter in scene)
     place, tries = Path("runs") / f"{stamp}-{safe}", 1
     while place.exists():

@@ -14,13 +14,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from trilane import machine
 from trilane.apps.report import Report, build_report, config_facts, write_report
 from trilane.apps.resolution import resolution_note, resolution_of
 from trilane.apps.run_check import asked_frames, check_run
 from trilane.apps.run_folder import RunFolder
 from trilane.errors import TrilaneError
 from trilane.hw_profiles.governor import Governor
-from trilane.hw_profiles.host import sensor_c
 from trilane.hw_profiles.load import load_runnable
 from trilane.pipeline import journal
 from trilane.pipeline.controls import RunControls
@@ -275,7 +275,7 @@ def _notes(checked: Checked) -> list[str]:
 
 def _sensors() -> dict[str, float]:
     """What is looked at in passing."""
-    celsius = sensor_c()
+    celsius = machine.here.sensor_c()
     return {} if celsius is None else {"temperature_c.sensor": celsius}
 
 

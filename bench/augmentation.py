@@ -10,13 +10,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from trilane import machine
 from trilane.avatars.bundle import bundle_folder, load_bundle
 from trilane.body.body import load_body
 from trilane.errors import BadInputError, MissingPartError
@@ -65,7 +65,7 @@ def measure(
         raise BadInputError("--frames", str(frames), "at least 4")
     chosen = look_named(look)
     for part in ("torch", "skimage"):
-        if find_spec(part) is None:
+        if not machine.here.has_package(part):
             raise MissingPartError(f"training needs {part}", extra="train")
     from trilane.training.sample_renderer import SampleRenderer
 

@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 import onnx
 
+from trilane import machine
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import read_network
 from trilane.bench import roofline
 from trilane.bench.lib.interleaved_processes import Variant, runners
 from trilane.bench.lib.networks import NetworkFixture, fixture_of_file, untrained, untrained_float
 from trilane.errors import BadInputError
-from trilane.hw_profiles.host import sensor_c
 from trilane.shapes import parse_shape
 from trilane.stages.dsp.runtime import resolve
 from trilane.unexpected_value import UnexpectedValue
@@ -57,7 +57,7 @@ def measure(
 
     Raises BadInputError, MissingPartError.
     """
-    threads = threads or len(os.sched_getaffinity(0))
+    threads = threads or len(machine.here.cores())
     if not 0 < period <= seconds:
         raise BadInputError("--period", f"{period:g}", f"more than 0, at most --seconds {seconds:g}")
     names = [resolve(name) for name in runtime]
@@ -159,7 +159,7 @@ def _rows(fixture: NetworkFixture, measured: dict[str, dict[str, Any]], peak: di
             "periods": [
                 {"min_ms": float(p.min()), "mean_ms": float(p.mean()), "max_ms": float(p.max())} for p in periods[name]
             ],
-            "temperature_c": sensor_c(),
+            "temperature_c": machine.here.sensor_c(),
         }
         if name != FP32:
             rate, allowed = fixture.gmac / (medians[name] / 1e3), peak["int8_instruction_gmac_s"]

@@ -6,8 +6,6 @@ Rule: the libraries run as their first examples run them, ours on as many thread
 from __future__ import annotations
 
 import json
-import os
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -19,6 +17,7 @@ from typing import Any
 import numpy as np
 import onnx
 
+from trilane import machine
 from trilane.bench import roofline
 from trilane.bench.lib.interleaved_processes import Variant, runners
 from trilane.bench.lib.networks import untrained, untrained_float
@@ -57,7 +56,7 @@ def measure(
     """
     for name in ("openvino", "ort"):
         resolve(name)
-    threads = threads or len(os.sched_getaffinity(0))
+    threads = threads or len(machine.here.cores())
     try:
         shape = parse_shape(size)
     except UnexpectedValue as error:
@@ -133,7 +132,7 @@ def _measure_rounds(
 
 def _benchmark_app(network: Path, threads: int, seconds: int) -> float:
     """Median latency in milliseconds by OpenVINO's tool: one request at a time."""
-    tool = shutil.which(APP, path=f"{Path(sys.executable).parent}:{os.environ.get('PATH', '')}")
+    tool = machine.here.program(APP, first=Path(sys.executable).parent)
     if tool is None:
         raise MissingPartError(f"{APP} is not there", extra="openvino")
     options = ["-hint", "none", "-api", "sync", "-nthreads", str(threads), "-nstreams", "1", "-t", str(seconds)]

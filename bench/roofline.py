@@ -7,7 +7,6 @@ multiply-accumulates of a cycle, by the clock measured under that load, by the c
 
 from __future__ import annotations
 
-import os
 import tempfile
 import time
 from collections.abc import Sequence
@@ -18,6 +17,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
+from trilane import machine
 from trilane.bench.lib.instruction_kernels import measure_issued
 from trilane.bench.lib.instruction_sets import instruction_set_of, peak_gmac_s
 from trilane.bench.lib.interleaved_processes import Variant, runners
@@ -41,7 +41,7 @@ def measure(threads: int = 0) -> dict[str, Any]:
     first over the last; `memory_gb_s` (bytes read and written by one thread); `instructions`: how the peak of the
     instruction set follows, or why it is not known; `rows`: the rate of each INT8 layer that was tried.
     """
-    threads = threads or len(os.sched_getaffinity(0))
+    threads = threads or len(machine.here.cores())
     rows = _int8_rows(threads)
     best = max(row["gmac_s"] for row in rows)
     instructions = instruction_peak(cpu_facts()["flags"], threads)
@@ -68,7 +68,7 @@ def instruction_peak(flags: Sequence[str], threads: int) -> dict[str, Any]:
     widest = instruction_set_of(flags)
     if widest is None:
         return {"absent": "the table of instruction sets has none of this CPU's"}
-    cores = sorted(os.sched_getaffinity(0))[:threads]
+    cores = list(machine.here.cores()[:threads])
     try:
         issued = measure_issued(widest.name, cores)
     except OSError as error:

@@ -7,34 +7,30 @@ spin between jobs only when no other unit shares its cores. `trilane.scheduler.p
 from __future__ import annotations
 
 import math
-import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
-import psutil
-
+from trilane import machine
 from trilane.errors import BadInputError
 from trilane.near_miss import did_you_mean
 from trilane.pipeline.description import UnitSettings
 from trilane.scheduler.places import FULL, Core, Place, Placement, has_own_cores
 from trilane.units import UNITS
 
-CGROUP = Path("/sys/fs/cgroup")
-CPUS = Path("/sys/devices/system/cpu")
 CORES = "UNIT=LIST, such as dsp=0,1 or dsp=2-5"
 
 
 def usable_cores() -> tuple[int, ...]:
     """Numbers of the cores in the affinity mask, ascending, at most as many as the control group's quota allows."""
-    cores = sorted(os.sched_getaffinity(0))
+    cores = machine.here.cores()
     quota = cgroup_quota()
-    return tuple(cores if quota is None else cores[: max(1, math.ceil(quota))])
+    return cores if quota is None else cores[: max(1, math.ceil(quota))]
 
 
-def cgroup_quota(root: Path = CGROUP) -> float | None:
-    """How many CPUs' time the control group allows; None when it sets no limit. `root`: where its files are."""
+def cgroup_quota() -> float | None:
+    """How many CPUs' time the control group allows; None when it sets no limit."""
+    root = machine.here.sys / "fs/cgroup"
     try:
         limit, period = (root / "cpu.max").read_text().split()
     except (OSError, ValueError):
@@ -85,7 +81,7 @@ def settings_of(placement: Placement) -> dict[str, UnitSettings]:
 def asked_cores(texts: Sequence[str]) -> dict[str, tuple[int, ...]]:
     """`UNIT=LIST` texts as the cores of each unit, ascending. Raises BadInputError naming what is wrong."""
     asked: dict[str, tuple[int, ...]] = {}
-    usable = sorted(os.sched_getaffinity(0))
+    usable = machine.here.cores()
     for text in texts:
         unit, equals, listed = text.partition("=")
         if not equals:
@@ -115,11 +111,12 @@ def _listed(text: str, listed: str) -> tuple[int, ...]:
     return tuple(sorted(cores))
 
 
-def host_cores(numbers: Sequence[int], root: Path = CPUS) -> tuple[Core, ...]:
+def host_cores(numbers: Sequence[int]) -> tuple[Core, ...]:
     """What the kernel says of the cores with these numbers: which are siblings, and how fast each type is.
 
-    `root`: where its files are. Where it says nothing, a core is a physical one, and as fast as the others.
+    Where it says nothing, a core is a physical one, and as fast as the others.
     """
+    root = machine.here.sys / "devices/system/cpu"
     siblings = {number: _number(root / f"cpu{number}/topology/thread_siblings_list", number) for number in numbers}
     # cpu_capacity is 1024 for the fastest type of core; kernels without it have the highest clock
     for file in ("cpu_capacity", "cpufreq/cpuinfo_max_freq"):
@@ -140,10 +137,3 @@ def _number(file: Path, otherwise: int) -> int:
     except OSError:
         return otherwise
     return int(found[0]) if found else otherwise
-
-
-def sensor_c() -> float | None:
-    """Temperature of the hottest sensor in degrees Celsius; None on a system that shows none."""
-    by_chip: dict[str, list[Any]] = getattr(psutil, "sensors_temperatures", dict)()
-    values = [sensor.current for sensors in by_chip.values() for sensor in sensors]
-    return max(values) if values else None

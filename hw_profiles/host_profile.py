@@ -6,14 +6,11 @@ it was measured. The units have as many cores as in a run.
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
-import psutil
-
+from trilane import machine
 from trilane.hw_profiles.host import split_cores, usable_cores
 
-CPU_INFO = Path("/proc/cpuinfo")
 #: CPU flag -> INT8 and FP32 multiply-accumulates per cycle and core. The first flag that the machine has is used.
 RATES = {
     "avx512_vnni": (128, 32),
@@ -38,10 +35,9 @@ RUNTIMES: dict[str, tuple[dict[str, float], str, str]] = {
 def host_tables() -> dict[str, Any]:
     """Tables that are laid over those of `host.toml`: title, peak rates of the units, speeds of the runtimes."""
     cores = len(usable_cores())
-    frequency = psutil.cpu_freq()
-    ghz = (frequency.max or frequency.current) / 1e3 if frequency else 0.0
+    ghz = machine.here.clock_ghz()
     known_ghz = ghz if ghz > 0 else FALLBACK_GHZ
-    flags = set(CPU_INFO.read_text(encoding="utf-8", errors="replace").split()) if CPU_INFO.is_file() else set()
+    flags = machine.here.cpu_flags()
     flag = next(name for name in RATES if name in flags or not name)
     clock = f"{known_ghz:.1f} GHz" + ("" if ghz > 0 else " (not told, assumed)")
     split = split_cores(usable_cores())

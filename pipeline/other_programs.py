@@ -6,18 +6,18 @@ import contextlib
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 
 import psutil
 
-STAT = Path("/proc/stat")
+from trilane import machine
 
 
 class OtherPrograms:
     """Counts from its making on. `cores`: of which; `pids`: of processes that are ours beside this one."""
 
-    def __init__(self, cores: Sequence[int], pids: Sequence[int] = (), stat: Path = STAT) -> None:
-        self._cores, self._processes, self._stat = cores, [psutil.Process(pid) for pid in (os.getpid(), *pids)], stat
+    def __init__(self, cores: Sequence[int], pids: Sequence[int] = ()) -> None:
+        self._cores, self._processes = cores, [psutil.Process(pid) for pid in (os.getpid(), *pids)]
+        self._stat = machine.here.proc / "stat"
         self._begin_s, self._before_s = time.monotonic(), self._others_s()
 
     def share(self) -> float:

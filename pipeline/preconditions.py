@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-import os
 import resource
 import sys
 
+from trilane import machine
 from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline import fork_server
 from trilane.pipeline.description import Pipeline
@@ -32,9 +32,9 @@ def check_open_files() -> None:
 
 def check_cores(pipeline: Pipeline) -> None:
     """Raises BadInputError for cores that the units could not get."""
-    here = os.sched_getaffinity(0)
+    here = machine.here.cores()
     for unit, settings in pipeline.units.items():
-        if absent := set(settings.cores) - here:
+        if absent := set(settings.cores).difference(here):
             found, expected = ", ".join(map(str, sorted(absent))), ", ".join(map(str, sorted(here)))
             raise BadInputError(f"cores of unit {unit}", found, f"some of this process's: {expected}")
 

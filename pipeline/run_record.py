@@ -12,10 +12,10 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Protocol
 
+from trilane import machine
 from trilane.errors import BadInputError, UnwrittenError
 from trilane.pipeline.journal import (
     SCHEMA,
@@ -145,7 +145,7 @@ class JournaledRun:
         self._accounts = dict.fromkeys(graph.units, -1)
         self._steps: list[_Step] = []
         self._left_out = self._flush_ns = self._sample_ns = 0
-        facts = {"clock": "host", "began_at": datetime.now(UTC).isoformat(timespec="seconds"), **file.facts}
+        facts = {"clock": "host", "began_at": machine.here.now().isoformat(timespec="seconds"), **file.facts}
         self._writer.add(Begun(SCHEMA, graph, settings, facts))
         self._writer.flush()
 
@@ -240,6 +240,6 @@ def recorded(file: JournalFile | None, graph: Graph, settings: Settings, caps: C
 def memory_bytes(pid: int) -> int:
     """Memory of a process that is in use (RSS), the part included that it shares; 0 for one that has ended."""
     try:
-        return int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]) * PAGE_BYTES
+        return int((machine.here.proc / f"{pid}/statm").read_text(encoding="ascii").split()[1]) * PAGE_BYTES
     except (OSError, IndexError):
         return 0

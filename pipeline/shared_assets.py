@@ -14,9 +14,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import psutil
 from numpy.typing import NDArray
 
+from trilane import machine
 from trilane.errors import TrilaneError, reason
 from trilane.transport.memory import F_ADD_SEALS, F_SEAL_GROW, F_SEAL_SHRINK
 from trilane.transport.packets import PAGE
@@ -34,7 +34,7 @@ def share_assets(assets: Assets) -> int:
     Raises TrilaneError when there is too little memory, or for arrays of another kind than numbers, times and text.
     """
     index, end = _index(assets)
-    free = psutil.virtual_memory().available
+    free = machine.here.free_bytes()
     if end > free:
         raise TrilaneError(f"assets: found {end >> 20} MiB, expected at most {free >> 20} MiB, which are free")
     head = json.dumps(index).encode()

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Iterator
 from typing import TypeVar
 
+from trilane import machine
 from trilane.pipeline.description import Pipeline
 from trilane.pipeline.regions import edge_regions
 from trilane.pipeline.shared_assets import Assets, share_assets
@@ -23,7 +24,7 @@ SWITCH_S = 0.0002  # the longest that another thread of this process keeps the i
 @contextlib.contextmanager
 def on_cores(cores: tuple[int, ...]) -> Iterator[None]:
     """The scheduler runs on `cores`, off those of the other units."""
-    before = os.sched_getaffinity(0)
+    before = machine.here.cores()
     os.sched_setaffinity(0, cores)
     try:
         yield

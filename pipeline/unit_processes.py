@@ -14,11 +14,11 @@ import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import chain
-from pathlib import Path
 from typing import NamedTuple
 
 import zmq
 
+from trilane import machine
 from trilane.errors import TrilaneError
 from trilane.pipeline.description import Pipeline
 from trilane.pipeline.regions import EdgeRegion
@@ -152,7 +152,7 @@ class UnitProcesses:
     def move(self, unit: str, cores: tuple[int, ...]) -> None:
         """Every thread of the unit may run on `cores` alone, from now until its process ends."""
         with contextlib.suppress(ProcessLookupError, FileNotFoundError):  # its end is heard of by `listen`
-            for thread in Path(f"/proc/{self._live[unit].pid}/task").iterdir():
+            for thread in (machine.here.proc / f"{self._live[unit].pid}/task").iterdir():
                 with contextlib.suppress(ProcessLookupError):  # the thread has ended meanwhile
                     os.sched_setaffinity(int(thread.name), cores)
 

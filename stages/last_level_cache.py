@@ -7,22 +7,23 @@ nothing is taken to fit.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable
 from pathlib import Path
 
-CORES = Path("/sys/devices/system/cpu")
+from trilane import machine
+
 UNITS = {"K": 1 << 10, "M": 1 << 20, "G": 1 << 30}
 
 
 def last_level_bytes(cores: Iterable[int]) -> int:
     """Size of the largest last-level cache of `cores`; 0 where the kernel tells none."""
-    return max((_of_core(CORES / f"cpu{core}" / "cache") for core in cores), default=0)
+    folder = machine.here.sys / "devices/system/cpu"
+    return max((_of_core(folder / f"cpu{core}" / "cache") for core in cores), default=0)
 
 
 def moved_of_kept(kept_bytes: int) -> int:
     """Of `kept_bytes` that each frame needs again on this process's cores, those that come from memory: all or none."""
-    return 0 if kept_bytes <= last_level_bytes(os.sched_getaffinity(0)) else kept_bytes
+    return 0 if kept_bytes <= last_level_bytes(machine.here.cores()) else kept_bytes
 
 
 def _of_core(caches: Path) -> int:

@@ -7,14 +7,12 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
-import os
-import platform
 import subprocess
 import sys
 from functools import cache
-from pathlib import Path
 from typing import Any
 
+from trilane import machine
 from trilane.compiled import form
 from trilane.pipeline.hardware_counters import availability
 
@@ -55,30 +53,14 @@ def package_version(name: str) -> str | None:
 
 def cpu_facts() -> dict[str, Any]:
     """Model, instruction flags and cores; `cores_allowed` are those that this process may run on."""
-    fields = _cpuinfo()
-    flags = set((fields.get("flags") or fields.get("Features") or "").split())
+    flags = machine.here.cpu_flags()
     return {
-        "model": fields.get("model name") or platform.processor() or platform.machine(),
-        "architecture": platform.machine(),
+        "model": machine.here.cpu_model(),
+        "architecture": machine.here.architecture(),
         "flags": [flag for flag in CPU_FLAGS + ARM_FLAGS if flag in flags],
-        "cores": os.cpu_count() or 1,
-        "cores_allowed": sorted(os.sched_getaffinity(0)),
+        "cores": machine.here.core_count(),
+        "cores_allowed": list(machine.here.cores()),
     }
-
-
-def _cpuinfo() -> dict[str, str]:
-    """Fields of the first core in /proc/cpuinfo."""
-    try:
-        text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return {}
-    pairs = (line.partition(":") for line in text.split("\n\n")[0].splitlines())
-    return {key.strip(): value.strip() for key, _, value in pairs}
-
-
-def memory_bytes() -> int:
-    """Physical memory in bytes."""
-    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
 def open_gl() -> dict[str, Any]:
@@ -125,13 +107,13 @@ def machine_facts(gl: dict[str, Any] | None = None) -> dict[str, Any]:
     """All facts that stand beside a measurement; `gl` is what `gl_facts` said, when it was asked."""
     packages = {name: package_version(name) for name in (*PACKAGES, *OPTIONAL_PACKAGES)}
     return {
-        "system": platform.platform(),
-        "python": platform.python_version(),
+        "system": machine.here.system(),
+        "python": machine.here.python(),
         "trilane": package_version("trilane"),
         "scheduler_core": form(),
         "cpu": cpu_facts(),
         "hardware_counters": availability(),
-        "memory_bytes": memory_bytes(),
+        "memory_bytes": machine.here.memory_bytes(),
         "gl": gl,
         "packages": {name: version for name, version in packages.items() if version is not None},
     }

@@ -6,10 +6,10 @@ Rule: writing it changes nothing of the training; a training that goes on takes 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from trilane import machine
 from trilane.errors import MissingPartError
 
 #: Seconds after which what was logged is on the disk.
@@ -18,7 +18,7 @@ FLUSH_S = 10
 
 def require_tensorboard() -> None:
     """Raises MissingPartError where the package is not installed."""
-    if find_spec("tensorboard") is None:
+    if not machine.here.has_package("tensorboard"):
         raise MissingPartError("a log for TensorBoard needs the package tensorboard", extra="tensorboard")
 
 

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from trilane import machine
 from trilane.arrays import U8
 from trilane.avatars.bundle import Bundle
 from trilane.avatars.digests import with_figures_digest
@@ -64,7 +64,7 @@ def measure_sizes(
         look()
     psnr_db = {f"{h}x{w}": round(float(np.mean(errors)), DIGITS) for (h, w), errors in found.items()}
     return BySize(
-        date=datetime.now(UTC).date(),
+        date=machine.here.now().date(),
         runtime=runtime,
         seed=seed,
         per_band=plan.per_band,

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from trilane import machine
 from trilane.avatars.bundle import Bundle, write_manifest
 from trilane.avatars.digests import digests_of, sha256_of, with_figures_digest
 from trilane.avatars.manifest import MadeWith, Validation
@@ -104,7 +104,7 @@ def validate(
     figures = {name: summary(found) for name, found in errors.items()}
     validation = Validation.model_validate(
         {
-            "date": datetime.now(UTC).date(),
+            "date": machine.here.now().date(),
             "digests": digests,
             "made_with": _made_with(plan, renderer),
             "size": plan.size,

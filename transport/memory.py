@@ -11,8 +11,7 @@ import mmap
 import os
 from dataclasses import dataclass
 
-import psutil
-
+from trilane import machine
 from trilane.errors import TrilaneError, reason
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 
@@ -39,7 +38,7 @@ def create_region(name: str, layout: RegionLayout) -> int:
     Every page is reserved here: on a machine with too little memory this function fails, and not a later write, which
     would end the process by a signal. Raises TrilaneError when there is too little memory.
     """
-    free = psutil.virtual_memory().available
+    free = machine.here.free_bytes()
     if layout.total_bytes > free:
         raise TrilaneError(_too_little(name, layout, f"{free // MIB} MiB are free"))
     fd = os.memfd_create(f"trilane:{name}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)

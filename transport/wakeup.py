@@ -13,11 +13,11 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import os
-import platform
 import struct
 from collections.abc import Iterator
 from pathlib import Path
 
+from trilane import machine
 from trilane.errors import reason
 
 SHORTEST_NS = 100_000
@@ -39,7 +39,7 @@ def use_slice(slice_ns: int) -> bool:
 
     Returns whether the kernel accepted it.
     """
-    number = SCHED_SETATTR.get(platform.machine())
+    number = SCHED_SETATTR.get(machine.here.architecture())
     if number is None or os.sched_getscheduler(0) != os.SCHED_OTHER:
         return False
     nice = os.getpriority(os.PRIO_PROCESS, 0)

@@ -8,12 +8,12 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from trilane import machine
 from trilane.apps.cli.commands import given
 from trilane.apps.cli.console import print_facts, stderr_console, stdout_kept
 from trilane.apps.cli.options import JsonOption
@@ -101,7 +101,7 @@ def train(
 
 def _require_torch() -> None:
     """Raises MissingPartError with the lines that install it."""
-    missing = [name for name in ("torch", "scipy", "skimage") if find_spec(name) is None]
+    missing = [name for name in ("torch", "scipy", "skimage") if not machine.here.has_package(name)]
     if "torch" in missing:
         lines = f"{package_line('torch')} --index-url {CPU_INDEX} (CPU) or {package_line('torch')} (NVIDIA GPU)"
         raise MissingPartError("training needs torch", f"{lines}, then {install_line('train')}")

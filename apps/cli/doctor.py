@@ -6,7 +6,6 @@ Rule: a part is said to work only after it was tried here.
 from __future__ import annotations
 
 import os
-import platform
 import shutil
 import sys
 from dataclasses import asdict, dataclass
@@ -15,6 +14,7 @@ from typing import Any
 
 import typer
 
+from trilane import machine
 from trilane.apps.cli.commands import Commands
 from trilane.apps.cli.console import print_json, stdout_console
 from trilane.apps.cli.options import JsonOption
@@ -49,7 +49,7 @@ class Check:
 
 def _python() -> Check:
     works = sys.version_info >= (3, 11)
-    return Check("Python", platform.python_version(), works, install="apt-get install python3.11 python3.11-venv")
+    return Check("Python", machine.here.python(), works, install="apt-get install python3.11 python3.11-venv")
 
 
 def _packages() -> list[Check]:

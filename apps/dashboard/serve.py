@@ -9,9 +9,9 @@ import errno
 import secrets
 import socket
 from dataclasses import dataclass
-from importlib.util import find_spec
 from typing import Any, Final
 
+from trilane import machine
 from trilane.apps.dashboard.guard import ADDRESS
 from trilane.errors import BadInputError, MissingPartError, reason
 from trilane.install import install_line
@@ -46,7 +46,7 @@ class Place:
 def require_server() -> None:
     """Raises MissingPartError when the packages of the extra are missing."""
     for package in PACKAGES:
-        if find_spec(package) is None:
+        if not machine.here.has_package(package):
             raise MissingPartError(f"the dashboard needs the package {package}", install_line("dashboard"))
 
 

@@ -5,10 +5,10 @@ Rule: no process is left, whatever ends the loop over the records.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 
+from trilane import machine
 from trilane.apps.sweeps.perform import Children, Place, perform
 from trilane.apps.sweeps.store import Record
 from trilane.apps.sweeps.trial import Clock, Trial
@@ -16,7 +16,7 @@ from trilane.apps.sweeps.trial import Clock, Trial
 
 def at_once(clock: Clock) -> int:
     """How many trials go on together: one that measures has the machine for itself."""
-    return 1 if clock is Clock.HOST else len(os.sched_getaffinity(0))
+    return 1 if clock is Clock.HOST else len(machine.here.cores())
 
 
 def run_here(trials: Sequence[Trial], place: Place, inherited: tuple[int, ...] = ()) -> Generator[Record]:

@@ -15,11 +15,11 @@ import tempfile
 import threading
 import time
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+from trilane import machine
 from trilane.apps.sweeps.store import Record
 from trilane.apps.sweeps.trial import Trial
 from trilane.stages.machine_facts import machine_facts
@@ -104,7 +104,7 @@ def perform(trial: Trial, place: Place, children: Children) -> Record:
 
     `children`: its process is one of them.
     """
-    began_at, start = datetime.now(UTC).isoformat(timespec="milliseconds"), time.monotonic()
+    began_at, start = machine.here.now().isoformat(timespec="milliseconds"), time.monotonic()
     with tempfile.TemporaryDirectory(prefix="trilane-trial-") as scratch:
         own = (place.folder or Path(scratch)) / trial.id
         _remove(own)

@@ -8,7 +8,6 @@ driver that leaves takes its workers with it, and they their trials.
 from __future__ import annotations
 
 import os
-import platform
 import socket
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -18,6 +17,7 @@ from typing import Any
 
 import psutil
 
+from trilane import machine
 from trilane.apps.sweeps.perform import Children, Place, lost, perform
 from trilane.apps.sweeps.store import SWEEP, Record
 from trilane.apps.sweeps.sweep import Engine
@@ -108,17 +108,17 @@ def perform_there(trial: Trial, folder: str, working_folder: str, program: str) 
     Raises BadInputError when the trial measures, but would have less of the machine than other programs.
     """
     worker = psutil.Process()
-    machine = worker.parent() or worker
-    if trial.kind.clock is Clock.HOST and worker.nice() > machine.nice():
-        found = f"workers on {platform.node()} that give way to other programs (niceness {worker.nice()})"
-        raise BadInputError("--engine ray", found, f"niceness {machine.nice()}", f"start Ray so: {START_LINE}")
+    parent = worker.parent() or worker
+    if trial.kind.clock is Clock.HOST and worker.nice() > parent.nice():
+        found = f"workers on {machine.here.host_name()} that give way to other programs (niceness {worker.nice()})"
+        raise BadInputError("--engine ray", found, f"niceness {parent.nice()}", f"start Ray so: {START_LINE}")
     shared = Path(folder) if (Path(folder) / SWEEP).is_file() else None
     here = Path(working_folder) if Path(working_folder).is_dir() else None
-    environment = restored(os.environ, machine.environ())
+    environment = restored(os.environ, parent.environ())
     return perform(trial, Place(shared, here, environment, program), Children())
 
 
-def restored(worker: Mapping[str, str], machine: Mapping[str, str]) -> dict[str, str]:
+def restored(worker: Mapping[str, str], parent: Mapping[str, str]) -> dict[str, str]:
     """The environment of a Ray worker with those variables as on its machine that would change what is measured."""
     kept = {name: value for name, value in worker.items() if name not in SET_BY_RAY}
-    return kept | {name: machine[name] for name in SET_BY_RAY if name in machine}
+    return kept | {name: parent[name] for name in SET_BY_RAY if name in parent}

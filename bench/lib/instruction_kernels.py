@@ -14,7 +14,6 @@ from __future__ import annotations
 import ctypes
 import mmap
 import os
-import platform
 import threading
 import time
 from collections.abc import Sequence
@@ -22,6 +21,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from statistics import median
 
+from trilane import machine
 from trilane.scheduler.stats import median_interval
 
 IMUL, IMUL_CYCLES = bytes.fromhex("480fafc0"), 3  # imul %rax,%rax
@@ -121,7 +121,7 @@ def measure_issued(name: str, cores: Sequence[int]) -> Issued:
 
     Raises OSError when the kernel refuses machine code in memory or the tiles of AMX.
     """
-    if platform.machine() != "x86_64":
+    if machine.here.architecture() != "x86_64":
         raise OSError("there are no loops for this architecture")
     kernel = KERNELS[name]
     if kernel.before:

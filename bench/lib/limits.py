@@ -6,16 +6,16 @@ it itself.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from typing import Any
 
+from trilane import machine
 from trilane.errors import BadInputError
 
 #: Option: least and greatest value.
 LIMITS: dict[str, tuple[float, float]] = {
     "repeats": (1, 100_000),
-    "threads": (0, 4 * (os.cpu_count() or 1)),
+    "threads": (0, 4 * machine.here.core_count()),
     "rounds": (1, 10_000),
     "pairs": (1, 1000),
     "views": (1, 1_000_000),

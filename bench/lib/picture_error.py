@@ -10,10 +10,10 @@ Difference Evaluator for Alternating Images", HPG 2020, by its authors' flip-eva
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib.util import find_spec
 
 import numpy as np
 
+from trilane import machine
 from trilane.arrays import F64, U8, Mask
 from trilane.bench.lib.layers import Box
 from trilane.errors import MissingPartError
@@ -54,7 +54,7 @@ class PictureErrors:
 def require_metrics() -> None:
     """Raises MissingPartError when a library that computes an error is missing: found out before long work."""
     for module in MODULES:
-        if find_spec(module) is None:
+        if not machine.here.has_package(module):
             raise MissingPartError(f"image errors need {module}", extra="metrics")
 
 

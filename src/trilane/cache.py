@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from trilane import machine
 from trilane.errors import BadInputError
 from trilane.writing import write_atomically
 
@@ -28,8 +29,7 @@ Arrays = Mapping[str, NDArray[Any]]
 def cache_dir(name: str) -> Path | None:
     """The folder of the cache `name`; None when it cannot be written."""
     try:
-        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        folder = Path(home) / "trilane" / name
+        folder = machine.here.cache_home() / "trilane" / name
         folder.mkdir(parents=True, exist_ok=True)
     except (OSError, RuntimeError):  # RuntimeError: this user has no home
         return None

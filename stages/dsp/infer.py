@@ -5,7 +5,6 @@ Rule: sessions and bindings are all made in `bind`, a frame allocates nothing, a
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from trilane import machine
 from trilane.arrays import U8
 from trilane.avatars.integer_network import NetworkFile
 from trilane.avatars.network_split import NetworkPart
@@ -88,7 +88,7 @@ class InferStage:
     def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
         """Compile every shape, bind every pair of slots, run each shape once: as many at a time as there are cores."""
         self._inputs, self._outputs = inputs, outputs
-        at_once = len(os.sched_getaffinity(0)) if self.runtime in LOAD_AT_ONCE else 1
+        at_once = len(machine.here.cores()) if self.runtime in LOAD_AT_ONCE else 1
         with ThreadPoolExecutor(at_once) as pool:
             for shape, bindings in zip(self._shapes, pool.map(self._prepare, self._shapes), strict=True):
                 self._bindings |= {(shape, *pair): binding for pair, binding in bindings.items()}

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import platform
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Any
 import onnxruntime
 import onnxruntime_qnn
 
+from trilane import machine
 from trilane.avatars.integer_network import IntegerNetwork, NetworkFile, check_integer_layers
 from trilane.cache import cache_dir
 from trilane.errors import BadInputError, MissingPartError
@@ -65,7 +65,12 @@ def version() -> str:
 
 def _key(network: IntegerNetwork, device: Mapping[str, str]) -> str:
     """A file name from everything that a compiled network depends on."""
-    parts = (network.digest, version(), platform.machine(), *(f"{key}={device[key]}" for key in sorted(device)))
+    parts = (
+        network.digest,
+        version(),
+        machine.here.architecture(),
+        *(f"{key}={device[key]}" for key in sorted(device)),
+    )
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 

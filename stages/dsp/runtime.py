@@ -5,15 +5,13 @@ Rule: a runtime is chosen by name; it runs the network or the run stops with an 
 
 from __future__ import annotations
 
-import importlib.util
-import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
-from pathlib import Path
 from typing import Protocol
 
+from trilane import machine
 from trilane.arrays import U8
 from trilane.avatars.integer_network import IntegerNetwork
 from trilane.errors import BadInputError, MissingPartError
@@ -78,8 +76,8 @@ class RuntimeEntry:
     @property
     def is_installed(self) -> bool:
         """Whether the package, and its `file`, are there."""
-        spec = importlib.util.find_spec(self.package)
-        return spec is not None and (not self.file or (Path(spec.origin or "").parent / self.file).is_file())
+        begins = machine.here.package_file(self.package)
+        return begins is not None and (not self.file or (begins.parent / self.file).is_file())
 
 
 def cuda_line() -> str:
@@ -120,7 +118,7 @@ def resolve(name: str) -> str:
 
 def has_device(name: str) -> bool:
     """Whether runtime `name` computes on hardware of its own; on x86, `qnn` is an emulator that runs on the cores."""
-    return name == "cuda" or (name == "qnn" and platform.machine() not in X86)
+    return name == "cuda" or (name == "qnn" and machine.here.architecture() not in X86)
 
 
 def copies_slots(name: str) -> bool:

@@ -6,7 +6,6 @@ broken file is named before a process is started. A note says size, rate and ran
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,6 +16,7 @@ from typing import Any, NamedTuple
 
 import av
 
+from trilane import machine
 from trilane.errors import BadInputError
 from trilane.file_signatures import HEAD_BYTES, PICTURE, VIDEO, signature_of_head
 from trilane.files import require_file
@@ -72,7 +72,7 @@ def _shown(path: Path, fps: float, frames: int, camera: CameraPath) -> list[Path
 
 
 def _checked(paths: Sequence[Path]) -> Iterable[None]:
-    with ThreadPoolExecutor(os.process_cpu_count() if hasattr(os, "process_cpu_count") else os.cpu_count()) as pool:
+    with ThreadPoolExecutor(len(machine.here.cores())) as pool:
         yield from pool.map(check_picture, paths)
 
 

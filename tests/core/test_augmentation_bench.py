@@ -12,6 +12,7 @@ import pytest
 pytest.importorskip("torch")
 pytest.importorskip("skimage")
 
+from trilane import machine
 from trilane.avatars.bundle import load_bundle
 from trilane.bench import augmentation
 from trilane.errors import BadInputError, MissingPartError
@@ -78,6 +79,6 @@ def test_settings_out_of_range_are_refused(asked: Any) -> None:
 
 
 def test_without_pytorch_it_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(augmentation, "find_spec", lambda part: None if part == "torch" else part)
+    monkeypatch.setattr(machine.here, "has_package", lambda part: part != "torch")
     with pytest.raises(MissingPartError, match=r"training needs torch; .*train"):
         augmentation.measure()

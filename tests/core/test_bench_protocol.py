@@ -18,6 +18,7 @@ from types import ModuleType
 from typing import Any
 
 import trilane.bench
+from trilane import machine
 from trilane.bench.lib.limits import LIMITS
 
 FILE = Path(__file__).with_name("printed") / "bench-protocol.txt"
@@ -88,4 +89,4 @@ def test_what_the_benches_measure_with_is_held() -> None:
 
 
 def test_threads_may_be_four_to_a_core() -> None:
-    assert LIMITS["threads"] == (0, 4 * (os.cpu_count() or 1))
+    assert LIMITS["threads"] == (0, 4 * machine.here.core_count())

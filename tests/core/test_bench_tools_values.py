@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from trilane import machine
 from trilane.avatars.bundle import load_bundle
 from trilane.bench.lib import full_width, instruction_kernels, networks
 from trilane.bench.lib.instruction_kernels import KERNELS, Issued, measure_issued
@@ -298,7 +299,7 @@ def test_what_cores_do_is_the_median_of_bursts_and_the_mean_of_cores(monkeypatch
     barrier = SimpleNamespace(wait=lambda: None)
     monkeypatch.setattr(instruction_kernels, "threading", SimpleNamespace(Barrier=lambda n: asked.append(n) or barrier))
     monkeypatch.setattr(instruction_kernels.os, "sched_setaffinity", lambda pid, cores: asked.extend((pid, *cores)))
-    monkeypatch.setattr(instruction_kernels.platform, "machine", lambda: "x86_64")
+    monkeypatch.setattr(machine.here, "architecture", lambda: "x86_64")
     found = measure_issued("AVX-VNNI", [2, 5])
     assert found == Issued(*(pytest.approx(value) for value in (1.5, 3.0, 3.0, 3.0)))
     assert asked == [2, 0, 2, "freed", "freed", 0, 5, "freed", "freed"]
@@ -314,7 +315,7 @@ def test_tiles_are_asked_for_where_a_set_has_them(monkeypatch: pytest.MonkeyPatc
         instruction_kernels.ctypes, "CDLL", lambda name, use_errno: libc if (name, use_errno) == (None, True) else None
     )
     monkeypatch.setattr(instruction_kernels, "_on_core", lambda *_: (1.0, [2.0, 4.0, 3.0]))
-    monkeypatch.setattr(instruction_kernels.platform, "machine", lambda: "x86_64")
+    monkeypatch.setattr(machine.here, "architecture", lambda: "x86_64")
     if refused:
         with pytest.raises(OSError, match=words):
             measure_issued("AMX-INT8", [0])
@@ -325,7 +326,7 @@ def test_tiles_are_asked_for_where_a_set_has_them(monkeypatch: pytest.MonkeyPatc
     assert len(calls) == 1
 
 
-@pytest.mark.skipif("instruction_kernels.platform.machine() != 'x86_64'")
+@pytest.mark.skipif(machine.here.architecture() != "x86_64", reason="the loops are machine code of x86")
 def test_a_loop_runs_as_often_as_it_is_told() -> None:
     """Machine code by hand: `imul` alone is on every x86-64 core. Three cycles of at most 10 GHz each."""
     kernel = instruction_kernels.Kernel("480fafc0", sequences=1, imuls=1, cycles=3, after="")

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 import trilane.training
+from trilane import machine
 from trilane.apps.cli import avatar_train
 from trilane.errors import BadInputError
 from trilane.training import event_log
@@ -45,7 +46,7 @@ def training(monkeypatch: pytest.MonkeyPatch) -> Training:
     double = Training()
     monkeypatch.setitem(sys.modules, double.__name__, double)
     monkeypatch.setattr(trilane.training, "captured_avatar", double, raising=False)
-    monkeypatch.setattr(avatar_train, "find_spec", lambda _: True)
+    monkeypatch.setattr(machine.here, "has_package", lambda _: True)
     return double
 
 
@@ -127,7 +128,7 @@ def test_a_log_is_written_beside_what_is_shown(
             made.append("closed")
 
     monkeypatch.setattr(event_log, "EventLog", Log)
-    monkeypatch.setattr(event_log, "find_spec", lambda _: True)
+    monkeypatch.setattr(machine.here, "has_package", lambda _: True)
     words = ("avatar", "train", "their", "--out", tmp_path / "mine", "--work", tmp_path / "work")
     command(*words)
     assert made == []
@@ -141,7 +142,7 @@ def test_a_log_is_written_beside_what_is_shown(
     monkeypatch.setattr(training, "train_on_capture", refused)
     command(*words, "--tensorboard", code=2)
     assert made[5:] == [tmp_path / "work" / "tensorboard", "closed"]
-    monkeypatch.setattr(event_log, "find_spec", lambda _: None)
+    monkeypatch.setattr(machine.here, "has_package", lambda name: name != "tensorboard")
     _, err = command(*words, "--tensorboard", code=3)
     assert "a log for TensorBoard needs the package tensorboard" in err and "[tensorboard]" in err
 
@@ -153,7 +154,7 @@ def test_without_pytorch_the_lines_that_install_it_are_said(
         ("torch", ("training needs torch", "--index-url https://download.pytorch.org/whl/cpu (CPU) or ", "NVIDIA GPU")),
         ("skimage", ("training needs skimage", "[train]")),
     ):
-        monkeypatch.setattr(avatar_train, "find_spec", lambda name, missing=missing: None if name == missing else True)
+        monkeypatch.setattr(machine.here, "has_package", lambda name, missing=missing: name != missing)
         _, err = command("avatar", "train", "their", "--out", tmp_path / "mine", code=3)
         assert all(word in err for word in words), err
     assert not list(tmp_path.iterdir())

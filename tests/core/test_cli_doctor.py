@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 import shutil
 from collections import namedtuple
 from collections.abc import Callable, Iterator
@@ -15,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from trilane import compiled
+from trilane import compiled, machine
 from trilane.apps.cli import doctor
 from trilane.apps.cli.doctor import Check
 from trilane.pipeline import hardware_counters
@@ -29,7 +28,7 @@ Version = namedtuple("Version", "major minor")
 
 
 @pytest.fixture
-def machine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> pytest.MonkeyPatch:
+def well_equipped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> pytest.MonkeyPatch:
     """A machine that has everything."""
 
     @contextmanager
@@ -37,7 +36,7 @@ def machine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> pytest.MonkeyPat
         yield wakeup.AWAKE
 
     monkeypatch.setattr(doctor.sys, "version_info", Version(3, 11))
-    monkeypatch.setattr(platform, "python_version", lambda: "3.11.9")
+    monkeypatch.setattr(machine.here, "python", lambda: "3.11.9")
     monkeypatch.setattr(machine_facts, "PACKAGES", ("numpy", "av"))
     monkeypatch.setattr(machine_facts, "OPTIONAL_PACKAGES", {"openvino": "openvino", "torch": "train"})
     monkeypatch.setattr(machine_facts, "package_version", lambda name: f"{name}-1.2")
@@ -48,6 +47,7 @@ def machine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> pytest.MonkeyPat
     monkeypatch.setattr(wakeup, "awake", awake)
     monkeypatch.setattr(compiled, "form", lambda: "compiled")
     monkeypatch.setattr(hardware_counters, "absence", lambda: None)
+    monkeypatch.setattr(hardware_counters, "availability", lambda: "instructions, cache_misses")
     monkeypatch.setattr(doctor, "SHM", tmp_path)
     monkeypatch.setattr(doctor, "package_line", lambda name: f"pip install {name}")
     monkeypatch.setattr(doctor, "install_line", lambda extra: f"pip install trilane[{extra}]")
@@ -63,7 +63,7 @@ MEMFD = "needs Linux 3.17 or newer with memfd_create allowed"
 COMPILE = "make compile  # it takes gcc and python3-dev"
 
 
-@pytest.mark.usefixtures("machine")
+@pytest.mark.usefixtures("well_equipped")
 def test_a_machine_that_has_everything(tmp_path: Path) -> None:
     assert doctor.checks(GL) == [
         Check("Python", "3.11.9", True, True, PYTHON),
@@ -83,7 +83,7 @@ def test_a_machine_that_has_everything(tmp_path: Path) -> None:
     ]
 
 
-def test_a_machine_that_has_nothing(machine: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_machine_that_has_nothing(well_equipped: pytest.MonkeyPatch, tmp_path: Path) -> None:
     @contextmanager
     def asleep() -> Iterator[str]:
         yield "may sleep"
@@ -94,16 +94,16 @@ def test_a_machine_that_has_nothing(machine: pytest.MonkeyPatch, tmp_path: Path)
     def broken() -> dict[str, Any]:
         raise ImportError("no libonnxruntime.so")
 
-    machine.setattr(doctor.sys, "version_info", Version(3, 10))
-    machine.setattr(machine_facts, "package_version", lambda _: None)
-    machine.setattr(machine_facts, "cpu_facts", lambda: {**CPU, "flags": []})
-    machine.setattr(machine_facts, "runtime_facts", broken)
-    machine.setattr(wakeup, "awake", asleep)
-    machine.setattr(compiled, "form", lambda: "interpreted")
-    machine.setattr(doctor, "clone", lambda: None)
-    machine.setattr(hardware_counters, "absence", lambda: "kernel.perf_event_paranoid is 3")
-    machine.setattr(doctor, "SHM", tmp_path / "none")
-    machine.setattr(os, "memfd_create", refused)
+    well_equipped.setattr(doctor.sys, "version_info", Version(3, 10))
+    well_equipped.setattr(machine_facts, "package_version", lambda _: None)
+    well_equipped.setattr(machine_facts, "cpu_facts", lambda: {**CPU, "flags": []})
+    well_equipped.setattr(machine_facts, "runtime_facts", broken)
+    well_equipped.setattr(wakeup, "awake", asleep)
+    well_equipped.setattr(compiled, "form", lambda: "interpreted")
+    well_equipped.setattr(doctor, "clone", lambda: None)
+    well_equipped.setattr(hardware_counters, "absence", lambda: "kernel.perf_event_paranoid is 3")
+    well_equipped.setattr(doctor, "SHM", tmp_path / "none")
+    well_equipped.setattr(os, "memfd_create", refused)
     no_mesa = "apt-get install libegl1 libgl1-mesa-dri"
     again = "install Trilane again from its sources, where there are gcc and python3-dev"
     assert doctor.checks(None) == [
@@ -125,22 +125,22 @@ def test_a_machine_that_has_nothing(machine: pytest.MonkeyPatch, tmp_path: Path)
 
 
 @pytest.mark.parametrize("flag", ["avx512_vnni", "avx_vnni", "amx_int8", "asimddp", "i8mm"])
-def test_any_instruction_for_dot_products_is_enough(flag: str, machine: pytest.MonkeyPatch) -> None:
-    machine.setattr(machine_facts, "cpu_facts", lambda: {**CPU, "flags": ["avx2", flag]})
+def test_any_instruction_for_dot_products_is_enough(flag: str, well_equipped: pytest.MonkeyPatch) -> None:
+    well_equipped.setattr(machine_facts, "cpu_facts", lambda: {**CPU, "flags": ["avx2", flag]})
     assert doctor._int8() == Check("INT8 dot product", flag, True, False, "needs another CPU")
 
 
-def test_a_runtime_without_a_place_to_run_does_not_work(machine: pytest.MonkeyPatch) -> None:
-    machine.setattr(machine_facts, "runtime_facts", lambda: {"onnxruntime": []})
+def test_a_runtime_without_a_place_to_run_does_not_work(well_equipped: pytest.MonkeyPatch) -> None:
+    well_equipped.setattr(machine_facts, "runtime_facts", lambda: {"onnxruntime": []})
     assert not doctor._runtimes().works
 
 
-def test_a_stale_core_stops_a_run(machine: pytest.MonkeyPatch) -> None:
-    machine.setattr(compiled, "form", lambda: "stale")
+def test_a_stale_core_stops_a_run(well_equipped: pytest.MonkeyPatch) -> None:
+    well_equipped.setattr(compiled, "form", lambda: "stale")
     assert doctor._core() == Check("scheduler core", compiled.STALE, False, True, compiled.MEND)
 
 
-@pytest.mark.usefixtures("machine")
+@pytest.mark.usefixtures("well_equipped")
 def test_a_driver_on_the_cpu_is_named() -> None:
     assert doctor._gl({**GL, "hardware": False}).found == "a [driver], 4.5 (software, on the CPU)"
 
@@ -171,9 +171,13 @@ ROWS = [
 
 @pytest.mark.parametrize(("rows", "code"), [(ROWS, 3), ([ROWS[0], ROWS[2]], 0)])
 def test_the_table_and_the_exit_code(
-    rows: list[Check], code: int, machine: pytest.MonkeyPatch, command: Command, check_printed: Callable[..., None]
+    rows: list[Check],
+    code: int,
+    well_equipped: pytest.MonkeyPatch,
+    command: Command,
+    check_printed: Callable[..., None],
 ) -> None:
-    machine.setattr(doctor, "checks", lambda gl: rows if gl is GL else [])
+    well_equipped.setattr(doctor, "checks", lambda gl: rows if gl is GL else [])
     out, err = command("doctor", code=code)
     assert err == ""
     check_printed(f"doctor-{code}", out)

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from trilane import machine
 from trilane.apps.asked_run import AskedRun, Prepared
 from trilane.apps.dashboard import live_run, serve
 from trilane.apps.dashboard.channel import Asked, Message, Refused, StateIs
@@ -105,7 +106,7 @@ def test_a_first_run_that_cannot_begin_is_an_error_and_one_that_fails_says_so(mo
 
 
 def test_what_is_not_installed_is_named_with_its_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(serve, "find_spec", lambda name: None if name == "uvicorn" else name)
+    monkeypatch.setattr(machine.here, "has_package", lambda name: name != "uvicorn")
     with pytest.raises(MissingPartError, match=r"needs the package uvicorn.*\[dashboard\]") as missing:
         serve.require_server()
     assert missing.value.exit_code == 3

@@ -19,6 +19,7 @@ import onnxruntime
 import pytest
 from onnx import helper
 
+from trilane import machine
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_reshape import reshaped
 from trilane.avatars.network_split import cuts, split
@@ -240,7 +241,7 @@ def test_qnn_compiles_once_for_all_nodes(
     assert made[-1][1].devices[1]["htp_arch"] == "73"
     assert len(list(stored.parent.iterdir())) == 2
     assert qnn.version() == "onnxruntime-qnn 9.9"
-    parts_of_key = (network.digest, qnn.version(), qnn.platform.machine(), "a=1", "b=2")
+    parts_of_key = (network.digest, qnn.version(), machine.here.architecture(), "a=1", "b=2")
     assert qnn._key(network, {"b": "2", "a": "1"}) == hashlib.sha256("\n".join(parts_of_key).encode()).hexdigest()
 
 
@@ -472,7 +473,7 @@ def test_networks_are_compiled_at_once_where_the_runtime_may(
     monkeypatch.setattr(infer, "ThreadPoolExecutor", lambda count: asked.append(count) or pool(count))
     monkeypatch.setattr(infer, "resolve", lambda given: given)
     monkeypatch.setattr(infer, "load_runtime", lambda _name: module)
-    monkeypatch.setattr(infer.os, "sched_getaffinity", lambda _pid: {0, 1, 2})
+    monkeypatch.setattr(machine.here, "cores", lambda: (0, 1, 2))
     config = configured(tiny_bundle, size="64").model_copy(update={"runtime": name})
     config.units["dsp"] = UnitSettings(cores=(0,), threads=2, spin=True)
     stage = InferStage(config, load_bundle(tiny_bundle).read_network())

@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from trilane import machine
 from trilane.hw_profiles.host import cgroup_quota, host_units, split_cores, usable_cores
+from trilane.machine import Machine
 
 
 @pytest.mark.parametrize("count", range(1, 33))
@@ -31,19 +33,33 @@ def test_threads_spin_only_on_cores_of_their_own() -> None:
     assert host_units((0, 1, 2, 3))["dsp"].threads == 2
 
 
+@pytest.fixture
+def groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of the control groups of a machine that has nothing else."""
+    monkeypatch.setattr(machine, "here", Machine(tmp_path))
+    folder = tmp_path / "sys/fs/cgroup"
+    folder.mkdir(parents=True)
+    return folder
+
+
 @pytest.mark.parametrize(("text", "quota"), [("max 100000", None), ("150000 100000", 1.5), ("x", None), ("", None)])
-def test_the_quota_of_a_control_group(tmp_path: Path, text: str, quota: float | None) -> None:
-    (tmp_path / "cpu.max").write_text(text)
-    assert cgroup_quota(tmp_path) == quota
+def test_the_quota_of_a_control_group(groups: Path, text: str, quota: float | None) -> None:
+    (groups / "cpu.max").write_text(text)
+    assert cgroup_quota() == quota
 
 
 @pytest.mark.parametrize(("limit", "quota"), [("-1", None), ("200000", 2.0)])
-def test_the_quota_of_the_older_control_groups(tmp_path: Path, limit: str, quota: float | None) -> None:
-    (tmp_path / "cpu").mkdir()
-    (tmp_path / "cpu" / "cpu.cfs_quota_us").write_text(limit)
-    (tmp_path / "cpu" / "cpu.cfs_period_us").write_text("100000\n")
-    assert cgroup_quota(tmp_path) == quota
+def test_the_quota_of_the_older_control_groups(groups: Path, limit: str, quota: float | None) -> None:
+    (groups / "cpu").mkdir()
+    (groups / "cpu" / "cpu.cfs_quota_us").write_text(limit)
+    (groups / "cpu" / "cpu.cfs_period_us").write_text("100000\n")
+    assert cgroup_quota() == quota
 
 
-def test_this_machine_has_cores() -> None:
-    assert usable_cores()
+def test_a_quota_takes_the_last_cores_away(groups: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A CPU and a half of time is worth two cores; one core is left whatever the quota."""
+    monkeypatch.setattr(machine.here, "cores", lambda: (2, 3, 5))
+    assert usable_cores() == (2, 3, 5)
+    for quota, cores in (("150000", (2, 3)), ("1", (2,)), ("900000", (2, 3, 5))):
+        (groups / "cpu.max").write_text(f"{quota} 100000")
+        assert usable_cores() == cores

@@ -5,12 +5,12 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
-from importlib.util import find_spec
 
 import numpy as np
 import onnx
 import pytest
 
+from trilane import machine
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.integer_network import constants_of
 from trilane.errors import BadInputError
@@ -167,7 +167,7 @@ def test_the_factory_builds_a_part_of_the_network(tiny_bundle):
 
 def test_openvino_is_loaded_without_its_telemetry() -> None:
     """Imported by itself it tells its maker's server; this is its own stand-in, which does nothing."""
-    if find_spec("openvino") is None:
+    if not machine.here.has_package("openvino"):
         pytest.skip(f"OpenVINO is not installed: {install_line('openvino')}")
     program = (
         "import trilane.stages.dsp.openvino, sys\n"

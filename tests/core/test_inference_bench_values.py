@@ -17,6 +17,7 @@ import onnxruntime
 import pytest
 from onnx import shape_inference
 
+from trilane import machine
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import read_network
 from trilane.bench import infer, peers, roofline
@@ -49,7 +50,7 @@ def test_a_file_in_batches_of_two(monkeypatch: pytest.MonkeyPatch, network: Path
     caches: list[str] = []
     told = ToldRunners(lambda _, turn: caches.append(os.environ["XDG_CACHE_HOME"]) or [8.0 + 10 * turn, 12 + 10 * turn])
     monkeypatch.setattr(infer, "runners", told)
-    monkeypatch.setattr(infer, "sensor_c", lambda: 41.5)
+    monkeypatch.setattr(machine.here, "sensor_c", lambda: 41.5)
     monkeypatch.setenv("XDG_CACHE_HOME", "/before")
     result = infer.measure(str(network), batch=(2,), runtime=("ort",), threads=3, spin=True, seconds=2.0, period=0.75)
     file = read_network(network)
@@ -117,7 +118,7 @@ def test_each_network_is_set_against_itself_in_float(
     told = ToldRunners(look)
     monkeypatch.setattr(infer, "runners", told)
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
-    monkeypatch.setattr("os.sched_getaffinity", lambda _: {0, 1, 2, 5})
+    monkeypatch.setattr(machine.here, "cores", lambda: (0, 1, 2, 5))
     result = infer.measure(
         encoder=("a", "b"), norm=("n",), width=9, size=("64x96",), batch=(2,), runtime=("ort",), seconds=1, period=1
     )
@@ -164,7 +165,7 @@ def told_app(monkeypatch: pytest.MonkeyPatch, stats: str, code: int = 0) -> list
         (folder / "benchmark_report.json").write_text(stats, encoding="utf-8")
 
     monkeypatch.setattr(peers.subprocess, "run", run)
-    monkeypatch.setattr(peers.shutil, "which", lambda name, path: f"{path.partition(':')[0]}/{name}")
+    monkeypatch.setattr(machine.here, "program", lambda name, first: f"{first}/{name}")
     return commands
 
 
@@ -192,7 +193,7 @@ def test_peers_run_interleaved_on_the_same_files(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(
         peers.onnx, "save", lambda model, path: saved.append((path.name, model == file.model)) or path.touch()
     )
-    monkeypatch.setattr("os.sched_getaffinity", lambda _: {0, 3, 4})
+    monkeypatch.setattr(machine.here, "cores", lambda: (0, 3, 4))
     result = peers.measure(width=5, size="64x64", rounds=2, seconds=1)
     assert resolved == ["openvino", "ort"]
     assert made == [("resnet18", "batch", 5, (64, 64))] * 2
@@ -246,7 +247,7 @@ def test_openvinos_tool_may_fail(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     told_app(monkeypatch, stats, code)
     with pytest.raises(TrilaneError, match="benchmark_app failed: "):
         peers._benchmark_app(tmp_path / "n.onnx", 1, 1)
-    monkeypatch.setattr(peers.shutil, "which", lambda *_, **__: None)
+    monkeypatch.setattr(machine.here, "program", lambda *_, **__: None)
     with pytest.raises(MissingPartError, match="benchmark_app is not there") as raised:
         peers._benchmark_app(tmp_path / "n.onnx", 1, 1)
     assert "openvino" in str(raised.value)
@@ -262,7 +263,7 @@ def test_rates_are_work_over_the_best_time(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(roofline, "_memory_gb_s", lambda: 12.5)
     issued: list[Any] = []
     monkeypatch.setattr(roofline, "measure_issued", lambda *asked: issued.append(asked) or Issued(0.9, 2.0, 1.9, 2.1))
-    monkeypatch.setattr("os.sched_getaffinity", lambda _: {7, 2, 5})
+    monkeypatch.setattr(machine.here, "cores", lambda: (2, 5, 7))
     saved: dict[str, onnx.ModelProto] = {}
     monkeypatch.setattr(roofline.onnx, "save", lambda model, path: saved.update({Path(path).name: model}))
     result = roofline.measure()

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from trilane import machine
 from trilane.bench import peers, roofline
-from trilane.bench.lib import instruction_kernels
 from trilane.bench.lib.instruction_kernels import KERNELS, Issued, Kernel, clock_loop, rate_loop
 from trilane.bench.lib.instruction_sets import INSTRUCTION_SETS, instruction_set_of, peak_gmac_s
 
@@ -55,7 +55,7 @@ def test_a_core_of_no_known_set_has_no_peak() -> None:
 def test_the_peak_is_macs_a_cycle_by_clock_by_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     """2 instructions of 64 at 2.5 GHz on 2 cores are 640 G/s; the 1.9 that were issued mean the documented 2."""
     monkeypatch.setattr(roofline, "measure_issued", lambda _name, _cores: Issued(1.9, 2.5, 2.4, 2.6))
-    monkeypatch.setattr("os.sched_getaffinity", lambda _pid: {4, 5, 6})
+    monkeypatch.setattr(machine.here, "cores", lambda: (4, 5, 6))
     peak = roofline.instruction_peak(["avx512f", "avx512_vnni"], threads=2)
     assert peak["gmac_s"] == 640 and peak["cores"] == 2 and peak["macs_a_cycle"] == 128
     assert peak["issued_macs_a_cycle"] == pytest.approx(121.6)
@@ -69,7 +69,7 @@ def test_one_512_bit_unit_is_told_from_two() -> None:
 
 
 def test_what_cannot_be_measured_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(instruction_kernels.platform, "machine", lambda: "aarch64")
+    monkeypatch.setattr(machine.here, "architecture", lambda: "aarch64")
     assert "no loops for this architecture" in roofline.instruction_peak(["asimddp"], 1)["absent"]
 
 

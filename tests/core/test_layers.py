@@ -17,6 +17,7 @@ ROWS = (
         "cache",
         "compiled",
         "errors",
+        "machine",
         "figure_sources",
         "file_signatures",
         "files",

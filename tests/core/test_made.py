@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import subprocess
-from datetime import UTC, datetime, timedelta, tzinfo
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from trilane import machine
 from trilane.apps import made
 from trilane.apps.made import made_facts
 
@@ -41,17 +42,11 @@ def test_what_is_no_checkout_has_no_revision_though_a_folder_above_is_one(checko
     facts = made_facts(["trilane", "run", "--out", "a b"], installed)
     assert (facts["revision"], facts["modified"]) == (None, None)
     assert facts["command"] == ["trilane", "run", "--out", "a b"]
-    assert timedelta(0) <= datetime.now(UTC) - datetime.fromisoformat(facts["at"]) < timedelta(minutes=5)
+    assert timedelta(0) <= machine.here.now() - datetime.fromisoformat(facts["at"]) < timedelta(minutes=5)
 
 
 def test_every_key_of_what_was_made(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    class Clock:
-        @staticmethod
-        def now(zone: tzinfo) -> datetime:
-            assert zone is UTC
-            return datetime(2026, 11, 22, 3, 4, 5, 678, tzinfo=UTC)
-
-    monkeypatch.setattr(made, "datetime", Clock)
+    monkeypatch.setattr(machine.here, "now", lambda: datetime(2026, 11, 22, 3, 4, 5, 678, tzinfo=UTC))
     monkeypatch.setattr(made, "package_version", lambda name: f"{name} 9.9")
     assert made_facts(("trilane", "run"), checkout) == {
         "at": "2026-11-22T03:04:05+00:00",
@@ -77,7 +72,7 @@ def test_git_is_asked_without_locks_and_may_hang(checkout: Path, monkeypatch: py
             raise subprocess.TimeoutExpired(words, 5.0)
         return subprocess.CompletedProcess(words, 0, " abc \n", "")
 
-    monkeypatch.setattr("shutil.which", lambda name: f"/bin/{name}")
+    monkeypatch.setattr(machine.here, "program", lambda name: f"/bin/{name}")
     monkeypatch.setattr(subprocess, "run", run)
     facts = made_facts([], checkout)
     assert (facts["revision"], facts["modified"]) == ("abc", None)
@@ -92,5 +87,5 @@ def test_git_is_asked_without_locks_and_may_hang(checkout: Path, monkeypatch: py
 def test_without_git_or_with_a_broken_checkout_nothing_fails(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (checkout / ".git" / "HEAD").write_text("nonsense")
     assert made_facts([], checkout)["revision"] is None
-    monkeypatch.setattr("shutil.which", lambda _name: None)
+    monkeypatch.setattr(machine.here, "program", lambda _name: None)
     assert made_facts([], checkout)["revision"] is None

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from trilane import machine
 from trilane.body.body import load_body
 from trilane.body.skinning import FrameSkinner
+from trilane.machine import Machine
 from trilane.pipeline.moved_bytes import BYTES, ByteCounter, add_bytes
 from trilane.pipeline.run_metrics import MovedInAll
-from trilane.stages import last_level_cache
 from trilane.stages.cpu.present import Segment
 from trilane.stages.dsp.infer import BoundPart
 from trilane.stages.last_level_cache import last_level_bytes, moved_of_kept
@@ -73,11 +74,12 @@ def caches(folder: Path, *sizes: tuple[int, int, str]) -> None:
 
 
 def test_the_last_level_decides_what_comes_from_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    caches(tmp_path, (0, 1, "48K"), (0, 3, "2M"), (0, 2, "512K"), (1, 2, "4096K"), (2, 2, "junk"), (3, 1, "100"))
-    monkeypatch.setattr(last_level_cache, "CORES", tmp_path)
+    monkeypatch.setattr(machine, "here", Machine(tmp_path))
+    cores = tmp_path / "sys/devices/system/cpu"
+    caches(cores, (0, 1, "48K"), (0, 3, "2M"), (0, 2, "512K"), (1, 2, "4096K"), (2, 2, "junk"), (3, 1, "100"))
     assert [last_level_bytes([core]) for core in (0, 1, 2, 3, 9)] == [2 << 20, 4 << 20, 0, 100, 0]
     assert (last_level_bytes([0, 1]), last_level_bytes([])) == (4 << 20, 0)
-    monkeypatch.setattr(last_level_cache.os, "sched_getaffinity", lambda _: {0})
+    monkeypatch.setattr(machine.here, "cores", lambda: (0,))
     assert (moved_of_kept(2 << 20), moved_of_kept((2 << 20) + 1)) == (0, (2 << 20) + 1)
 
 

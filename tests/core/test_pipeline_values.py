@@ -6,12 +6,12 @@ import json
 import os
 import time
 from collections.abc import Mapping, Sequence
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from trilane import machine
 from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline import (
     bound_stage,
@@ -281,7 +281,7 @@ def test_assets_lie_on_pages_of_their_own_behind_the_index() -> None:
 
 def test_assets_that_fit_to_the_byte_are_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     for free, is_refused in ((4096, False), (4095, True)):
-        monkeypatch.setattr("psutil.virtual_memory", lambda free=free: SimpleNamespace(available=free))
+        monkeypatch.setattr(machine.here, "free_bytes", lambda free=free: free)
         if is_refused:
             with pytest.raises(TrilaneError, match=r"^assets: found 0 MiB, expected at most 0 MiB, which are free$"):
                 shared_assets.share_assets({})

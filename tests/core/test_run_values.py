@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 
+from trilane import machine
 from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline import (
     isolated,
@@ -63,11 +64,11 @@ def test_ninety_six_open_files_are_enough(monkeypatch: pytest.MonkeyPatch, limit
 
 
 def test_cores_that_are_not_there_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+    monkeypatch.setattr(machine.here, "cores", lambda: (0, 1))
     said = r"^cores of unit right: found 3, expected some of this process's: 0, 1$"
     with pytest.raises(BadInputError, match=said):
         preconditions.check_cores(pipeline())
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1, 3})
+    monkeypatch.setattr(machine.here, "cores", lambda: (0, 1, 3))
     preconditions.check_cores(pipeline())
 
 
@@ -359,11 +360,11 @@ def test_settings_follow_from_policy_and_rate() -> None:
 
 
 def test_the_scheduler_is_on_its_cores_and_back_afterwards() -> None:
-    before = os.sched_getaffinity(0)
+    before = set(machine.here.cores())
     with contextlib.suppress(ValueError), surroundings.on_cores((min(before),)):
-        assert os.sched_getaffinity(0) == {min(before)}
+        assert set(machine.here.cores()) == {min(before)}
         raise ValueError
-    assert os.sched_getaffinity(0) == before
+    assert set(machine.here.cores()) == before
 
 
 @pytest.mark.parametrize("collects", [True, False])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from trilane import machine
 from trilane.errors import MissingPartError
 from trilane.hw_profiles import host_profile
 from trilane.hw_profiles.load import load_profile
@@ -13,9 +14,8 @@ from trilane.stages.dsp.runtime import RUNTIMES
 
 
 @pytest.mark.parametrize(("flag", "fastest"), [("avx2", "openvino"), ("avx512_vnni", "openvino"), ("asimddp", "ort")])
-def test_the_instructions_of_the_machine_decide(monkeypatch, tmp_path, flag, fastest):
-    (tmp_path / "cpuinfo").write_text(f"flags : fpu {flag}")
-    monkeypatch.setattr(host_profile, "CPU_INFO", tmp_path / "cpuinfo")
+def test_the_instructions_of_the_machine_decide(monkeypatch, flag, fastest):
+    monkeypatch.setattr(machine.here, "cpu_flags", lambda: frozenset({"fpu", flag}))
     name, why = fastest_runtime(load_profile("host"), ["ort", "openvino", "qnn"])
     assert name == fastest and "host profile" in why and "qnn" not in why
 
@@ -35,7 +35,7 @@ def test_the_table_knows_only_runtimes_that_there_are():
 
 
 @pytest.mark.parametrize(
-    ("name", "machine", "device"),
+    ("name", "architecture", "device"),
     [
         ("cuda", "x86_64", True),
         ("cuda", "aarch64", True),
@@ -45,6 +45,6 @@ def test_the_table_knows_only_runtimes_that_there_are():
         ("openvino", "x86_64", False),
     ],
 )
-def test_which_runtimes_have_hardware_of_their_own(monkeypatch, name, machine, device):
-    monkeypatch.setattr(runtime.platform, "machine", lambda: machine)
+def test_which_runtimes_have_hardware_of_their_own(monkeypatch, name, architecture, device):
+    monkeypatch.setattr(machine.here, "architecture", lambda: architecture)
     assert runtime.has_device(name) is device

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("skimage")
+from trilane import machine
 from trilane.arrays import U8
 from trilane.training import size_figures
 from trilane.training.validate import ValidationPlan
@@ -69,9 +69,9 @@ def test_every_view_is_painted_at_every_size(monkeypatch: pytest.MonkeyPatch) ->
     plan = ValidationPlan(
         held_out=("/far/a.bvh", "builtin:b"), seeds=(5, 6), per_band=3, runtimes=("x", "y"), threads=2
     )
-    before, looks = datetime.now(UTC).date(), list[int]()
+    before, looks = machine.here.now().date(), list[int]()
     found = size_figures.measure_sizes(bundle, plan, renderer, lambda: looks.append(1))
-    assert before <= found.date <= datetime.now(UTC).date()
+    assert before <= found.date <= machine.here.now().date()
     assert asked == [(renderer, bundle, "x", 2), (renderer, 3, 5, ("motions", plan.held_out), "64x64")]
     assert (found.runtime, found.seed, found.per_band, found.held_out) == ("x", 5, 3, ("a.bvh", "builtin:b"))
     assert len(looks) == 3

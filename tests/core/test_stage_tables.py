@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from trilane import machine
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_split import cuts
 from trilane.avatars.validation import DrawnAs
@@ -381,43 +382,19 @@ def test_a_background_is_looked_at_before_the_run(monkeypatch: pytest.MonkeyPatc
 
 # --- facts -----------------------------------------------------------------------------------------------------------
 
-CPUINFO = """processor\t: 0
-model name\t: Some: CPU 3000
-flags\t\t: fpu avx2 fma amx_int8 f16c avx
 
-processor\t: 1
-model name\t: Other
-"""
-
-
-def test_the_first_cores_facts_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(machine_facts.Path, "read_text", lambda _self, **_: CPUINFO)
-    monkeypatch.setattr(machine_facts.os, "cpu_count", lambda: 6)
-    monkeypatch.setattr(machine_facts.os, "sched_getaffinity", lambda pid: {4, 1} if pid == 0 else set())
-    monkeypatch.setattr(machine_facts.platform, "machine", lambda: "x86_64")
+def test_facts_of_the_processor_are_the_flags_that_decide_in_their_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    flags = frozenset({"fpu", "amx_int8", "fma", "avx2", "f16c", "i8mm", "avx"})
+    told = {"cores": (1, 4), "core_count": 6, "architecture": "x86_64", "cpu_model": "CPU 3000", "cpu_flags": flags}
+    for name, value in told.items():
+        monkeypatch.setattr(machine.here, name, lambda value=value: value)
     assert machine_facts.cpu_facts() == {
-        "model": "Some: CPU 3000",
+        "model": "CPU 3000",
         "architecture": "x86_64",
-        "flags": ["avx2", "fma", "f16c", "amx_int8"],
+        "flags": ["avx2", "fma", "f16c", "amx_int8", "i8mm"],
         "cores": 6,
         "cores_allowed": [1, 4],
     }
-    monkeypatch.setattr(machine_facts.Path, "read_text", lambda _self, **_: "Features\t: asimd i8mm sve\n")
-    monkeypatch.setattr(machine_facts.platform, "processor", lambda: "")
-    monkeypatch.setattr(machine_facts.os, "cpu_count", lambda: None)
-    found = machine_facts.cpu_facts()
-    assert (found["model"], found["flags"], found["cores"]) == ("x86_64", ["asimd", "i8mm", "sve"], 1)
-
-    def absent(_self: Any, **_: Any) -> str:
-        raise FileNotFoundError
-
-    monkeypatch.setattr(machine_facts.Path, "read_text", absent)
-    assert machine_facts.cpu_facts()["flags"] == []
-
-
-def test_memory_is_pages_times_their_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(machine_facts.os, "sysconf", {"SC_PHYS_PAGES": 1000, "SC_PAGE_SIZE": 4096}.__getitem__)
-    assert machine_facts.memory_bytes() == 4_096_000
 
 
 @pytest.mark.parametrize(
@@ -462,7 +439,7 @@ def test_facts_name_what_is_installed_and_nothing_else(monkeypatch: pytest.Monke
     assert facts["packages"] == {"numpy": "1", "torch": "2"}
     assert (facts["trilane"], facts["gl"]) == ("3", {"vendor": "v"})
     assert facts["scheduler_core"] == machine_facts.form()
-    assert facts["memory_bytes"] == machine_facts.memory_bytes() and facts["cpu"] == machine_facts.cpu_facts()
+    assert facts["memory_bytes"] == machine.here.memory_bytes() and facts["cpu"] == machine_facts.cpu_facts()
     assert list(machine_facts.runtime_facts()) == ["onnxruntime"]
     assert machine_facts.machine_facts()["gl"] is None
     monkeypatch.undo()

@@ -16,6 +16,7 @@ import psutil
 import pytest
 import zmq
 
+from trilane import machine
 from trilane.errors import TrilaneError
 from trilane.transport import heartbeats, job_pipe, memory, messages, packets, slots, socket_folder, wakeup
 from trilane.transport.heartbeats import HeartbeatSocket, context_on_cores
@@ -177,7 +178,7 @@ def test_memory_that_is_just_there_is_taken_and_a_byte_more_is_refused(monkeypat
         "lower the tensor or output size, or the number of slots$"
     )
     for free, is_refused in ((2 * MIB, False), (2 * MIB - 1, True)):
-        monkeypatch.setattr(psutil, "virtual_memory", lambda free=free: type("Memory", (), {"available": free}))
+        monkeypatch.setattr(machine.here, "free_bytes", lambda free=free: free)
         if is_refused:
             with pytest.raises(TrilaneError, match=said):
                 create_region("pose->raster", layout)
@@ -352,7 +353,7 @@ def test_the_thread_of_heartbeats_stays_on_the_schedulers_cores(monkeypatch: pyt
     """Its time slice is asked for before it is made, for it inherits it."""
     slices: list[int] = []
     monkeypatch.setattr(heartbeats, "use_slice", slices.append)
-    core = max(os.sched_getaffinity(0))
+    core = max(machine.here.cores())
     tasks = Path("/proc/self/task")
     before = set(tasks.iterdir())
     context = context_on_cores((core,))
@@ -362,7 +363,7 @@ def test_the_thread_of_heartbeats_stays_on_the_schedulers_cores(monkeypatch: pyt
     end = time.monotonic() + 2
     while not io_threads and time.monotonic() < end:  # a thread names itself once it runs, after it chose its cores
         io_threads = [t for t in set(tasks.iterdir()) - before if (t / "comm").read_text().startswith("ZMQbg/IO")]
-    assert [os.sched_getaffinity(int(task.name)) for task in io_threads] == [{core}]
+    assert [os.sched_getaffinity(int(task.name)) for task in io_threads] == [{core}]  # noqa: TID251 - of a thread
     socket.close()
     context.term()
 
@@ -434,7 +435,7 @@ def test_a_slice_is_asked_for_by_sched_setattr(monkeypatch: pytest.MonkeyPatch, 
     libc = FakeLibc(answer)
     monkeypatch.setattr("ctypes.CDLL", lambda _: libc)
     monkeypatch.setattr("os.getpriority", lambda which, who: {(os.PRIO_PROCESS, 0): 3}[which, who])
-    monkeypatch.setattr("platform.machine", lambda: "aarch64")
+    monkeypatch.setattr(machine.here, "architecture", lambda: "aarch64")
     assert wakeup.use_slice(wakeup.UNIT_NS) is accepted
     assert libc.calls == [(274, 0, struct.pack("=IIQiIQQQ", 48, 0, 0, 3, 0, 1_000_000, 0, 0), 0)]
     assert (wakeup.SCHED_SETATTR["x86_64"], wakeup.SHORTEST_NS, wakeup.DEFAULT) == (314, 100_000, 0)
@@ -444,7 +445,7 @@ def test_where_slices_are_unknown_or_not_ours_nothing_is_asked(monkeypatch: pyte
     libc = FakeLibc(0)
     monkeypatch.setattr("ctypes.CDLL", lambda _: libc)
     with monkeypatch.context() as patched:
-        patched.setattr("platform.machine", lambda: "riscv64")
+        patched.setattr(machine.here, "architecture", lambda: "riscv64")
         assert wakeup.use_slice(1) is False
     monkeypatch.setattr("os.sched_getscheduler", lambda _: os.SCHED_FIFO)
     assert wakeup.use_slice(1) is False

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from trilane import machine
 from trilane.pipeline import trial
 from trilane.pipeline.result import Failure
 from trilane.pipeline.run_log import UnitError
@@ -111,7 +112,7 @@ def test_the_frames_that_were_under_way_do_not_count() -> None:
 
     told: list[Any] = []
     clock: Any = Clock()
-    own = {"a": tuple(sorted(trial.os.sched_getaffinity(0)))}
+    own = {"a": machine.here.cores()}
     places: Any = [{**own, "b": (5,)}, {**own, "b": (6,)}]
     turns = trial._Turns(core, clock, processes, places)  # type: ignore[arg-type]
     where = []

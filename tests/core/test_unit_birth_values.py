@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 import zmq
 
+from trilane import machine
 from trilane.pipeline import (
     fork_server,
     unit_loop,
@@ -55,6 +56,7 @@ def test_a_process_dies_with_its_parent_or_at_once_when_that_is_gone(monkeypatch
 UNIT_LIFE = """
 import ctypes, json, os, signal, sys
 from types import SimpleNamespace
+from trilane import machine
 from trilane.pipeline import fork_server
 
 def serve(spec, number_of):
@@ -62,7 +64,7 @@ def serve(spec, number_of):
     ctypes.CDLL(None).prctl(2, ctypes.byref(death), 0, 0, 0)
     print(json.dumps({
         "death": death.value, "name": open("/proc/self/comm").read().strip(), "own_group": os.getpgid(0) == os.getpid(),
-        "cores": sorted(os.sched_getaffinity(0)), "threads": [os.environ[name] for name in fork_server.THREAD_LIMITS],
+        "cores": list(machine.here.cores()), "threads": [os.environ[name] for name in fork_server.THREAD_LIMITS],
         "spec": spec, "fds": sorted(number_of), "sigchld": signal.getsignal(signal.SIGCHLD) == signal.SIG_DFL,
         "blocked": sorted(signal.pthread_sigmask(signal.SIG_BLOCK, [])),
         "shut": not os.path.exists(f"/proc/self/fd/{spec_fd}"),
@@ -80,7 +82,7 @@ for spec in ("whole", "broken"):
     said, theirs = os.pipe()
     signal.signal(signal.SIGCHLD, lambda *_: None)
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGCHLD})
-    request = {"unit": "left-handed-unit", "cores": [min(os.sched_getaffinity(0))], "threads": 3, "fds": [41]}
+    request = {"unit": "left-handed-unit", "cores": [min(machine.here.cores())], "threads": 3, "fds": [41]}
     server = os.getpid()
     if (pid := os.fork()) == 0:
         os._exit(fork_server._run_unit(request, [spec_fd, theirs, os.dup(1)], server))
@@ -98,7 +100,7 @@ def test_a_unit_is_forked_into_a_life_of_its_own() -> None:
         "death": signal.SIGKILL,
         "name": "trilane-left-ha",
         "own_group": True,
-        "cores": [min(os.sched_getaffinity(0))],
+        "cores": [min(machine.here.cores())],
         "threads": ["3"] * 4,
         "spec": "whole",
         "fds": [41],
@@ -170,7 +172,7 @@ def test_a_whole_unit_connects_is_ready_and_ends_when_it_is_told(
     monkeypatch.setattr(unit_loop, "context_on_cores", lambda cores: slices.append(cores) or zmq.Context())
     monkeypatch.setattr(unit_loop, "gc", SimpleNamespace(collect=lambda: 0, freeze=lambda: None))
     monkeypatch.setattr(unit_loop, "build_stages", lambda _: [])
-    here = os.sched_getaffinity(0)
+    here = set(machine.here.cores())
     context = zmq.Context()
     beats, pipe = HeartbeatSocket(context), JobPipe(ours)
     beats.socket.bind(f"ipc://{tmp_path}/h")
@@ -193,6 +195,7 @@ def test_a_whole_unit_connects_is_ready_and_ends_when_it_is_told(
 SERVER_LIFE = """
 import ctypes, json, os, select, signal, socket, sys, time
 from types import SimpleNamespace
+from trilane import machine
 from trilane.pipeline import fork_server
 
 def death_signal():
@@ -228,7 +231,7 @@ def call(name):
 def unit(seconds):
     spec = os.memfd_create("spec")
     os.write(spec, json.dumps(seconds).encode())
-    request = {"unit": "u", "cores": [min(os.sched_getaffinity(0))], "threads": 1, "fds": []}
+    request = {"unit": "u", "cores": [min(machine.here.cores())], "threads": 1, "fds": []}
     socket.send_fds(ours, [json.dumps(request).encode()], [spec, os.dup(2)])
     answer, fds, *_ = socket.recv_fds(ours, 99, 9)
     return int(answer), fds

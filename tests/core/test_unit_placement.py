@@ -11,8 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from trilane import machine
 from trilane.errors import BadInputError
 from trilane.hw_profiles.host import asked_cores, host_cores, rule_placement, settings_of
+from trilane.machine import Machine
 from trilane.scheduler import placement_model, places
 from trilane.scheduler.placement import Ranked, chosen, fastest, ranked, typical, worth_trying
 from trilane.scheduler.placement_list import placements
@@ -364,7 +366,7 @@ def test_the_rule_for_any_run_gives_way_to_what_was_asked() -> None:
 
 @pytest.fixture
 def three_usable(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("os.sched_getaffinity", lambda _: {0, 1, 3})
+    monkeypatch.setattr(machine.here, "cores", lambda: (0, 1, 3))
 
 
 @pytest.mark.usefixtures("three_usable")
@@ -394,15 +396,17 @@ def test_cores_that_cannot_be_are_refused(texts: list[str], said: str) -> None:
         asked_cores(texts)
 
 
-def test_what_the_kernel_says_of_cores(tmp_path: Path) -> None:
+def test_what_the_kernel_says_of_cores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(machine, "here", Machine(tmp_path))
+    tmp_path /= "sys/devices/system/cpu"
     for number, (siblings, capacity) in enumerate([("0,2", 512), ("1,3", 1024), ("0,2", 512), ("1,3", 1024)]):
         (tmp_path / f"cpu{number}" / "topology").mkdir(parents=True)
         (tmp_path / f"cpu{number}" / "topology" / "thread_siblings_list").write_text(f"{siblings}\n")
         (tmp_path / f"cpu{number}" / "cpu_capacity").write_text(f"{capacity}\n")
-    assert host_cores((0, 1, 2), tmp_path) == (Core(0, 0, 500), Core(1, 1, 1000), Core(2, 0, 500))
-    assert host_cores((7, 8), tmp_path) == (Core(7, 7, 1000), Core(8, 8, 1000))
+    assert host_cores((0, 1, 2)) == (Core(0, 0, 500), Core(1, 1, 1000), Core(2, 0, 500))
+    assert host_cores((7, 8)) == (Core(7, 7, 1000), Core(8, 8, 1000))
     for number, clock in enumerate((3_000_000, 4_000_000)):
         (tmp_path / f"cpu{number}" / "cpu_capacity").write_text("1024\n")
         (tmp_path / f"cpu{number}" / "cpufreq").mkdir()
         (tmp_path / f"cpu{number}" / "cpufreq" / "cpuinfo_max_freq").write_text(f"{clock}\n")
-    assert [core.permille for core in host_cores((0, 1), tmp_path)] == [750, 1000]
+    assert [core.permille for core in host_cores((0, 1))] == [750, 1000]

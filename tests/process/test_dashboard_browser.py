@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import signal
 import subprocess
 import sys
@@ -20,12 +19,13 @@ pytest.importorskip("uvicorn", reason="the extra dashboard is not installed")
 pytest.importorskip("websockets", reason="the extra dashboard is not installed")
 playwright = pytest.importorskip("playwright.sync_api", reason="the extra browser is not installed")
 
+from trilane import machine  # noqa: E402
 from trilane.apps.dashboard.wire import PICTURE_KIND, ControlSaid, Seek  # noqa: E402
 from trilane.testing.dashboard_double import DoubleView, Served  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+CHROMIUM = next(filter(None, map(machine.here.program, ("chromium", "chromium-browser", "google-chrome"))), None)
 PHONE = {"width": 360, "height": 740}
 DESKTOP = {"width": 1440, "height": 900}
 PATIENCE_MS = 60_000

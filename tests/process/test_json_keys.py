@@ -14,7 +14,6 @@ import sys
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ import onnx
 import pytest
 from numpy.typing import NDArray
 
+from trilane import machine
 from trilane.apps.cli import main as cli
 from trilane.avatars.bundle import load_bundle, write_manifest
 from trilane.pipeline.journal import NAME as JOURNAL
@@ -195,7 +195,7 @@ def check(document: Any, lines: list[str], what: str, where: str) -> None:
 def test_the_keys_are_those_of_the_file(name: str, place: Place) -> None:
     case = CASES[name]
     for package in case.needs:
-        if find_spec(package) is None:
+        if not machine.here.has_package(package):
             pytest.skip(f"{case.line}: needs the package {package}, which is absent")
     document = one_document(place.run(case), case.line)
     heading = f'[{case.table}."{name}"]'

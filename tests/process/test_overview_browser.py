@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from trilane import machine
 from trilane.apps.overview import page as page_module
 from trilane.apps.overview.entry import Entry
 from trilane.apps.overview.frontier import frontier
 
 playwright = pytest.importorskip("playwright.sync_api")
 pytestmark = pytest.mark.slow
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+CHROMIUM = next(filter(None, map(machine.here.program, ("chromium", "chromium-browser", "google-chrome"))), None)
 
 
 def entries(video: Path) -> list[Entry]:

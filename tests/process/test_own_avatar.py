@@ -6,11 +6,11 @@ import re
 import shlex
 import subprocess
 import sys
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
+from trilane import machine
 from trilane.avatars.bundle import load_bundle
 
 PAGE = Path(__file__).parents[2] / "docs" / "own-avatar.md"
@@ -43,10 +43,12 @@ def test_the_page_names_the_whole_way() -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-@pytest.mark.skipif(find_spec("torch") is None or find_spec("skimage") is None, reason="training needs PyTorch")
+@pytest.mark.skipif(
+    not machine.here.has_package("torch") or not machine.here.has_package("skimage"), reason="training needs PyTorch"
+)
 def test_every_command_of_the_walk_does_what_the_page_says(tmp_path: Path) -> None:
     for words in commands():
-        if "--qnn" in words and find_spec("onnxruntime_qnn") is None:
+        if "--qnn" in words and not machine.here.has_package("onnxruntime_qnn"):
             continue
         line = [sys.executable, "-m", "trilane.apps.cli.main", *words[1:]]
         done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=600)

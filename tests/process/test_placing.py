@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from trilane import machine
 from trilane.hw_profiles.host import rule_placement, usable_cores
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.places import Times
@@ -85,7 +85,7 @@ def test_a_short_run_and_one_at_a_chips_pace_are_not_rehearsed(
 
 
 def test_units_have_the_cores_that_were_asked_for(drawable_bundle: Path, tmp_path: Path) -> None:
-    cores = sorted(os.sched_getaffinity(0))
+    cores = list(machine.here.cores())
     wanted = {"cpu": [cores[-1]], "gpu": [cores[0]], "dsp": sorted({cores[0], cores[-1]})}
     options = [part for unit, own in wanted.items() for part in ("--cores", f"{unit}={','.join(map(str, own))}")]
     command = [sys.executable, "-m", "trilane.apps.cli.main", "run", "--avatar", str(drawable_bundle), *options]

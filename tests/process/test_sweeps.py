@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -19,6 +18,7 @@ from typing import Any
 import psutil
 import pytest
 
+from trilane import machine
 from trilane.apps.sweeps.local_engine import at_once, run_here
 from trilane.apps.sweeps.perform import Place
 from trilane.apps.sweeps.store import TRIALS, Store, read_trials
@@ -82,13 +82,13 @@ def test_trials_of_the_host_clock_one_after_the_other_with_their_folders(tmp_pat
         assert record["result"] == {"schema": 1, "words": ["run", *trial.words, "--json"], "threads": "7"}
         assert record["command"] == ["trilane", "run", *trial.words, "--json"]
         assert (record["status"], record["clock"], record["folder"]) == ("done", "host", trial.id)
-        assert record["host"]["cpu"]["cores_allowed"] == sorted(os.sched_getaffinity(0))
+        assert record["host"]["cpu"]["cores_allowed"] == list(machine.here.cores())
         assert (tmp_path / "s" / trial.id / "report.json").is_file()
     assert not list((tmp_path / "s").glob("*.partial"))
 
 
 def test_virtual_trials_are_packed(tmp_path: Path, log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _pid: {0, 1})
+    monkeypatch.setattr(machine.here, "cores", lambda: (0, 1))
     monkeypatch.setenv("SWEEP_TRIAL_TOGETHER", "2")
     records = swept(tmp_path / "s", numbered("predict", 2))
     assert {(record["clock"], record["folder"]) for record in records.values()} == {("virtual", None)}

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import pytest
 
+from trilane import machine
 from trilane.hw_profiles.host import usable_cores
 from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, UnitSettings
 from trilane.pipeline.trial import SLICE, Group, try_in_turns
@@ -25,7 +25,7 @@ class Stage:
     def run(self, frame, slot_in, slot_out):
         if frame == self.fails:
             raise RuntimeError("no more")
-        cores = ",".join(map(str, sorted(os.sched_getaffinity(0))))
+        cores = ",".join(map(str, list(machine.here.cores())))
         self.file.write(f"{frame} {cores}\\n")
         return {}
     def close(self):
@@ -58,7 +58,7 @@ def noted(file: Path) -> list[tuple[int, str]]:
 @pytest.mark.skipif(len(usable_cores()) < 2, reason="there is one core")
 def test_units_are_moved_between_slices_and_every_slice_has_the_same_frames(tmp_path: Path) -> None:
     one, two = usable_cores()[:2]
-    before = os.sched_getaffinity(0)
+    before = set(machine.here.cores())
     apart, crossed, floating = (
         {"a": (one,), "b": (two,)},
         {"a": (two,), "b": (one,)},
@@ -68,7 +68,7 @@ def test_units_are_moved_between_slices_and_every_slice_has_the_same_frames(tmp_
     with UnitStarter() as starter:
         rounds = try_in_turns(groups, [0, 40], {}, starter)
         enough = try_in_turns(groups[1:], [0, 40], {}, starter, lambda done: len(done) == 1)
-    assert os.sched_getaffinity(0) == before
+    assert set(machine.here.cores()) == before
     assert [len(each.frame_ns) for each in rounds] == [4, 4]
     assert len(enough) == 1
     assert all(ns > 0 for each in rounds for ns in each.frame_ns)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -12,6 +11,7 @@ from contextlib import ExitStack
 from itertools import islice
 from pathlib import Path
 
+from trilane import machine
 from trilane.testing.mutants.control import Controls
 from trilane.testing.mutants.draw import code_files, draw
 from trilane.testing.mutants.fault import Fault
@@ -44,7 +44,7 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--count", type=int, default=400, help="how many faults [400]")
     parser.add_argument("--minutes", type=float, default=120.0, help="begin no trial later than this [120]")
     parser.add_argument("--seconds", type=float, default=60.0, help="tests run for one fault, quickest first [60]")
-    parser.add_argument("--workers", type=int, default=os.cpu_count(), help="trials at a time [the cores]")
+    parser.add_argument("--workers", type=int, default=machine.here.core_count(), help="trials at a time [the cores]")
     parser.add_argument("--only", action="append", default=[], metavar="PREFIX", help="only files that begin so; often")
     parser.add_argument("--tests", action="append", metavar="PREFIX", help="only tests that begin so; often [all]")
     parser.add_argument(

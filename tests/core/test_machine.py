@@ -1,0 +1,106 @@
+"""What is read of the machine, from files that a test writes in place of the kernel's."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import psutil
+import pytest
+
+from trilane.cache import cache_dir
+from trilane.machine import Machine
+
+X86 = """processor\t: 0
+model name\t: Some: CPU 3000
+flags\t\t: fpu avx2 fma
+
+processor\t: 1
+model name\t: Other
+flags\t\t: fpu
+"""
+
+
+def with_cpuinfo(folder: Path, text: str) -> Machine:
+    (folder / "proc").mkdir(exist_ok=True)
+    (folder / "proc/cpuinfo").write_text(text, encoding="utf-8")
+    return Machine(folder)
+
+
+def test_the_first_core_tells_model_and_flags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    x86 = with_cpuinfo(tmp_path, X86)
+    assert (x86.cpu_model(), x86.cpu_flags()) == ("Some: CPU 3000", {"fpu", "avx2", "fma"})
+    monkeypatch.setattr("platform.processor", lambda: "")
+    monkeypatch.setattr("platform.machine", lambda: "aarch64")
+    arm = with_cpuinfo(tmp_path, "Features\t: asimd i8mm sve\n")
+    assert (arm.cpu_model(), arm.cpu_flags()) == ("aarch64", {"asimd", "i8mm", "sve"})
+    nothing = Machine(tmp_path / "none")
+    assert (nothing.cpu_model(), nothing.cpu_flags(), nothing.cpu_fields()) == ("aarch64", frozenset(), {})
+
+
+def test_cores_are_ascending_and_one_at_least(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.sched_getaffinity", lambda pid: {4, 1, 12} if pid == 0 else set())
+    monkeypatch.setattr("os.cpu_count", lambda: None)
+    assert (Machine().cores(), Machine().core_count()) == ((1, 4, 12), 1)
+
+
+def test_memory_is_pages_times_their_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.sysconf", {"SC_PHYS_PAGES": 1000, "SC_PAGE_SIZE": 4096}.__getitem__)
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=7))
+    assert (Machine().memory_bytes(), Machine().free_bytes()) == (4_096_000, 7)
+
+
+@pytest.mark.parametrize(
+    ("told", "ghz"),
+    [(None, 0.0), (SimpleNamespace(max=0.0, current=2600.0), 2.6), (SimpleNamespace(max=3000.0, current=1000.0), 3.0)],
+)
+def test_the_highest_clock_comes_first(monkeypatch: pytest.MonkeyPatch, told: Any, ghz: float) -> None:
+    monkeypatch.setattr(psutil, "cpu_freq", lambda: told)
+    assert Machine().clock_ghz() == ghz
+
+
+def test_the_hottest_sensor_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    chips = {"a": [SimpleNamespace(current=40.0), SimpleNamespace(current=55.5)], "b": [SimpleNamespace(current=50.0)]}
+    for found, hottest in ((chips, 55.5), ({}, None)):
+        monkeypatch.setattr(psutil, "sensors_temperatures", lambda found=found: found, raising=False)
+        assert Machine().sensor_c() == hottest
+    monkeypatch.delattr(psutil, "sensors_temperatures")
+    assert Machine().sensor_c() is None
+
+
+def test_packages_and_programs_are_found_and_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "explosive.py").write_text("raise SystemExit(1)")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert Machine().package_file("explosive") == tmp_path / "explosive.py"
+    assert Machine().has_package("explosive") and not Machine().has_package("antigravity_none")
+    program = tmp_path / "some-tool"
+    program.write_text("#!/bin/sh\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", "/nowhere")
+    assert Machine().program("some-tool") is None
+    assert Machine().program("some-tool", first=tmp_path) == str(program)
+    monkeypatch.setenv("PATH", f"/nowhere:{tmp_path}")
+    assert Machine().program("some-tool") == str(program)
+
+
+def test_a_user_without_a_home_has_no_cache(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", "/somewhere")
+    assert Machine().cache_home() == Path("/somewhere")
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setenv("HOME", "/home/me")
+    assert Machine().cache_home() == Path("/home/me/.cache")
+
+    def homeless() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "home", homeless)
+    assert cache_dir("any") is None
+
+
+def test_the_date_is_in_utc_wherever_the_machine_stands(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TZ", "Pacific/Auckland")
+    now = Machine().now()
+    assert now.utcoffset() is not None and not now.utcoffset()
+    assert os.environ["TZ"] == "Pacific/Auckland"
