@@ -1,30 +1,31 @@
 """Instructions and cache misses of a unit's jobs, by perf_event_open. Rule: counted by the processor, or said absent.
 
-Counts are of user mode, of the thread that opens them and of all threads that it and its threads begin later, by
-`man 2 perf_event_open`: the kernel adds up those of the threads (`inherit`), and one read gives the group. Where the
-processor has fewer counters than events it counts for a part of the time; the counts are scaled to the whole.
+Counts are of user mode, of the thread that opens them and of all threads that it and its threads begin later: the
+kernel adds up those of the threads (`inherit`). Where the processor has fewer counters than events it counts for a part
+of the time; the counts are scaled to the whole.
+
+Each event is opened and read by itself, because `inherit` and a group do not go together (`man 2 perf_event_open`):
+some kernels refuse to read such a group (ECHILD). A figure that cannot be read is missing from its job, which goes on.
 """
 
 from __future__ import annotations
 
-import ctypes
 import errno
 import os
-import platform
 import struct
 from collections.abc import Sequence
 from contextlib import closing
-from pathlib import Path
 from typing import Final, NamedTuple
 
-SYSCALLS: Final = {"x86_64": 298, "aarch64": 241, "riscv64": 241}
-PARANOID: Final = Path("/proc/sys/kernel/perf_event_paranoid")
+from trilane import machine
+
 MOST_PARANOID: Final = 2  # at which a process may still count its own user mode
 
 # linux/perf_event.h
 ATTR: Final = struct.Struct("=IIQQQQQIIQ")  # type, size, config, period, sample_type, read_format, flags, 0, 0, 0
+ROW: Final = struct.Struct("=QQQ")  # the count, time enabled, time running
 INHERIT, EXCLUDE_KERNEL, EXCLUDE_HYPERVISOR = 1 << 1, 1 << 5, 1 << 6
-ENABLED_TIME, RUNNING_TIME, GROUP = 1, 2, 8
+ENABLED_TIME, RUNNING_TIME = 1, 2
 CLOSE_ON_EXEC: Final = 8
 HARDWARE: Final = 0
 
@@ -37,45 +38,70 @@ class Counted(NamedTuple):
     config: int
 
 
+class Reading(NamedTuple):
+    """One reading of a counter: its count, for how long it was asked for, for how long the processor had it."""
+
+    value: int
+    enabled_ns: int
+    running_ns: int
+
+
 KINDS: Final = (Counted("instructions", HARDWARE, 1), Counted("cache_misses", HARDWARE, 3))
 
 
 class HardwareCounters:
-    """Counts from its making on, of this thread and those that come from it. Raises OSError where it cannot."""
+    """Counts from its making on, of this thread and those that come from it, every kind that the kernel lets it.
+
+    Raises OSError where it can count none of `kinds`.
+    """
 
     def __init__(self, kinds: Sequence[Counted] = KINDS) -> None:
-        self._names = [kind.name for kind in kinds]
-        self._row = struct.Struct(f"={3 + len(kinds)}Q")  # how many, time enabled, time running, the counts
-        self._files: list[int] = []
-        self._before = b""
-        try:
-            for kind in kinds:
-                self._files.append(_open(kind, self._files[0] if self._files else -1))
-            self.begin()
-        except OSError:
-            self.close()
-            raise
+        self._files: dict[str, int] = {}
+        self._before: dict[str, Reading] = {}
+        refused: OSError | None = None
+        for kind in kinds:
+            try:
+                self._files[kind.name] = _open(kind)
+            except OSError as error:
+                refused = refused or error
+        if not self._files and refused is not None:
+            raise refused
+        self.begin()
+
+    @property
+    def names(self) -> list[str]:
+        """Of the figures that are counted."""
+        return list(self._files)
 
     def begin(self) -> None:
         """A job begins."""
         self._before = self._read()
 
     def figures(self) -> dict[str, float]:
-        """Of the job that has begun, by name; nothing where the processor had no counter for it."""
-        after = self._row.unpack(self._read())
-        (_, enabled_ns, running_ns, *counts) = map(int.__sub__, after, self._row.unpack(self._before))
-        if not running_ns:
-            return {}
-        scale = enabled_ns / running_ns
-        return {name: count * scale for name, count in zip(self._names, counts, strict=True)}
+        """Of the job that has begun, by name, without those that the processor did not count or nobody could read."""
+        figures = {}
+        for name, now in self._read().items():
+            before = self._before.get(name)
+            if before is not None and now.running_ns > before.running_ns:
+                share = (now.running_ns - before.running_ns) / (now.enabled_ns - before.enabled_ns)
+                figures[name] = (now.value - before.value) / share
+        return figures
 
     def close(self) -> None:
         """Count no longer."""
         while self._files:
-            os.close(self._files.pop())
+            os.close(self._files.popitem()[1])
 
-    def _read(self) -> bytes:
-        return os.read(self._files[0], self._row.size)
+    def _read(self) -> dict[str, Reading]:
+        readings = {}
+        for name, file in self._files.items():
+            try:
+                row = machine.here.read_counter(file, ROW.size)
+            except OSError:
+                continue
+            if len(row) == ROW.size:  # the kernel ends the file of an event that it had to give up
+                readings[name] = Reading._make(ROW.unpack(row))
+        return readings
 
 
 class NoCounters:
@@ -99,7 +125,7 @@ def counters_here() -> HardwareCounters | NoCounters:
 
 
 def absence() -> str | None:
-    """Why nothing can be counted here, as part of a sentence; None where it can."""
+    """Why nothing can be counted here, as part of a sentence; None where something can."""
     try:
         with closing(HardwareCounters()):
             return None
@@ -109,28 +135,18 @@ def absence() -> str | None:
 
 def availability() -> str:
     """What is counted, or that nothing is and why: a fact of the machine."""
-    why = absence()
-    return ", ".join(kind.name for kind in KINDS) if why is None else f"absent: {why}"
+    try:
+        with closing(HardwareCounters()) as counters:
+            return ", ".join(counters.names)
+    except OSError as error:
+        return f"absent: {_reason(error)}"
 
 
-def _open(kind: Counted, leader: int) -> int:
-    """The file of a counter in the group of `leader`, -1 for a group of its own. Raises OSError."""
-    number = SYSCALLS.get(platform.machine())
-    if number is None:
-        raise OSError(errno.ENOSYS, f"no number of perf_event_open is known for {platform.machine()}")
+def _open(kind: Counted) -> int:
+    """The file of a counter. Raises OSError."""
     flags = INHERIT | EXCLUDE_KERNEL | EXCLUDE_HYPERVISOR
-    read_format = ENABLED_TIME | RUNNING_TIME | GROUP
-    attributes = ATTR.pack(kind.kind, ATTR.size, kind.config, 0, 0, read_format, flags, 0, 0, 0)
-    words = (ctypes.c_long(number), ctypes.c_char_p(attributes), ctypes.c_int(0), ctypes.c_int(-1))
-    file: int = _LIBC.syscall(*words, ctypes.c_int(leader), ctypes.c_ulong(CLOSE_ON_EXEC))
-    if file < 0:
-        code = ctypes.get_errno()
-        raise OSError(code, os.strerror(code))
-    return file
-
-
-_LIBC: Final = ctypes.CDLL(None, use_errno=True)
-_LIBC.syscall.restype = ctypes.c_long
+    attributes = ATTR.pack(kind.kind, ATTR.size, kind.config, 0, 0, ENABLED_TIME | RUNNING_TIME, flags, 0, 0, 0)
+    return machine.here.open_counter(attributes, CLOSE_ON_EXEC)
 
 
 def _reason(error: OSError) -> str:
@@ -147,7 +163,7 @@ def _reason(error: OSError) -> str:
 def paranoid_level() -> int | None:
     """What the kernel's setting is, None where it has none."""
     try:
-        return int(PARANOID.read_text())
+        return int((machine.here.proc / "sys/kernel/perf_event_paranoid").read_text())
     except (OSError, ValueError):
         return None
 
