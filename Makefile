@@ -2,28 +2,27 @@
 # Arguments of `trilane run` go in ARGS: make run ARGS="--frames 60 --size 192"
 SHELL := /bin/bash
 .DELETE_ON_ERROR:
-.PHONY: run test test-all test-device mutants results setup format compile interpreted clean
+.PHONY: run test test-all test-rest test-device mutants results setup format compile interpreted clean
 
 BIN := .venv/bin
 COMPILED := $(shell sed -n 's/^    "\(.*\.py\)",$$/\1/p' src/trilane/compiled.py)
 
-# Tests that stand for themselves share the cores; after them those that run units, which have the cores to themselves.
-# With ARGS the tests that it names, as pytest takes them.
-tests = $(if $(ARGS),$(BIN)/pytest $(1) $(ARGS),\
-  $(BIN)/pytest $(1) --numprocesses auto --dist loadfile tests/core tests/golden && $(BIN)/pytest $(1) tests/conformance tests/process)
+# Every check, whatever fails; with ARGS only the tests that it names, as pytest takes them.
+checks = $(if $(ARGS),$(BIN)/pytest $(filter --slow,$(1)) $(ARGS),$(BIN)/python -m trilane.testing.checks $(1))
 
 run: .venv/ready-run
 	$(BIN)/trilane run $(ARGS)
 
 test: .venv/ready-test .venv/ready-core
-	$(BIN)/ruff check .
-	$(BIN)/ruff format --check .
-	$(BIN)/mypy
-	$(call tests)
+	@$(call checks)
 
 # All that a machine without a GPU can run: every extra is installed, and a skip that is not on the list fails.
 test-all: .venv/ready-all .venv/ready-core
-	$(call tests,--slow -p trilane.testing.skips)
+	@$(call checks,--slow)
+
+# What the last `make test` left out: slow tests, and those that it skipped for want of an extra.
+test-rest: .venv/ready-all .venv/ready-core
+	@$(call checks,--rest)
 
 # What needs a GPU: hardware OpenGL, training on CUDA, the runtime cuda. Exit code 3 where there is none.
 test-device: .venv/ready-device

@@ -1,0 +1,131 @@
+"""Style, types and tests in one piece. Rule: every check runs, whatever failed; the last line names each failure.
+
+Use: `python -m trilane.testing.checks [--slow | --rest]`, as `make test`, `make test-all` and `make test-rest` call it.
+The file is also the pytest plugin that tells the runner what failed and what was skipped (`-p trilane.testing.checks`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+BIN = Path(sys.executable).parent
+STYLE = (["ruff", "check", "."], ["ruff", "format", "--check", "."], ["mypy"])
+#: Tests share the cores, a file of them on one worker.
+GROUPS = (
+    ["--numprocesses", "auto", "--dist", "loadfile", "tests/core", "tests/golden"],
+    ["tests/conformance", "tests/process"],
+)
+#: Beside the packages that decide what is skipped: the tests that `make test` skipped here, for `make test-rest`.
+SKIPPED = Path(sys.prefix) / "skipped-tests.txt"
+
+
+class Outcome(NamedTuple):
+    """What one check found."""
+
+    failures: list[str]
+    passed: int = 0
+    skipped: tuple[str, ...] = ()
+
+
+def said(outcomes: Sequence[Outcome], seconds: float) -> str:
+    """The last line: the failures by name, or that there are none."""
+    failures = [failure for outcome in outcomes for failure in outcome.failures]
+    passed, skipped = sum(outcome.passed for outcome in outcomes), sum(len(outcome.skipped) for outcome in outcomes)
+    counts = f"{passed} tests passed, {skipped} skipped, in {int(seconds // 60)} min {int(seconds % 60)} s"
+    if not failures:
+        return f"no failures: {len(outcomes)} checks, {counts}"
+    return f"{len(failures)} failure{'s' * (len(failures) > 1)} ({counts}): {'; '.join(failures)}"
+
+
+def check_style(command: Sequence[str]) -> Outcome:
+    """Runs a tool; what it says goes to this process's output."""
+    done = subprocess.run([BIN / command[0], *command[1:]], check=False)
+    return Outcome([" ".join(command)] if done.returncode else [])
+
+
+def check_tests(arguments: Sequence[str], told: Path) -> Outcome:
+    """Runs pytest with `arguments`. `told`: a file for what the plugin tells."""
+    told.unlink(missing_ok=True)
+    command = [
+        str(BIN / "pytest"),
+        "-p",
+        "trilane.testing.checks",
+        f"--tell={told}",
+        "--continue-on-collection-errors",
+        *arguments,
+    ]
+    code = subprocess.run(command, check=False).returncode
+    if not told.is_file():
+        return Outcome([f"pytest {' '.join(arguments)} (exit code {code}, nothing told)"])
+    found = json.loads(told.read_text(encoding="utf-8"))
+    told.unlink()
+    failures = [*found["failed"]]
+    if code and not failures:
+        failures = [f"pytest {' '.join(arguments)} (exit code {code})"]
+    return Outcome(failures, found["passed"], tuple(found["skipped"]))
+
+
+def main(words: Sequence[str]) -> int:
+    """The exit code: 0 where every check passed, else 1."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--slow", action="store_true", help="run slow tests too, and refuse skips that are not listed")
+    parser.add_argument("--rest", action="store_true", help="run only slow tests and those that the last run skipped")
+    asked = parser.parse_args(words)
+    begin_s = time.monotonic()
+    told = SKIPPED.with_suffix(".json")
+    extra = ["--slow", "-p", "trilane.testing.skips"] if asked.slow or asked.rest else []
+    if asked.rest:
+        extra.append(f"--only-rest={SKIPPED}")
+    outcomes = [] if asked.rest else [check_style(command) for command in STYLE]
+    outcomes += [check_tests([*extra, *group], told) for group in GROUPS]
+    if not (asked.slow or asked.rest):
+        lines = (f"{test}\n" for outcome in outcomes for test in outcome.skipped)
+        SKIPPED.write_text("".join(lines), encoding="utf-8")
+    print(said(outcomes, time.monotonic() - begin_s), flush=True)
+    return int(any(outcome.failures for outcome in outcomes))
+
+
+def pytest_addoption(parser: Any) -> None:
+    parser.addoption("--tell", type=Path, help="a JSON file for what failed, how many passed, and what was skipped")
+    parser.addoption("--only-rest", type=Path, help="only slow tests and those that this file names, one in a line")
+
+
+def pytest_collection_modifyitems(config: Any, items: list[Any]) -> None:
+    """With `--only-rest`, leave out what `make test` has run. A file that was skipped whole is named without a test."""
+    file = config.getoption("--only-rest")
+    if file is None:
+        return
+    named = set(file.read_text(encoding="utf-8").splitlines())
+    done = [
+        item
+        for item in items
+        if item.get_closest_marker("slow") is None
+        and item.nodeid not in named
+        and item.nodeid.partition("::")[0] not in named
+    ]
+    config.hook.pytest_deselected(items=done)
+    items[:] = [item for item in items if item not in set(done)]
+
+
+def pytest_terminal_summary(terminalreporter: Any, config: Any) -> None:
+    file = config.getoption("--tell")
+    if file is None:
+        return
+    stats = terminalreporter.stats
+
+    def names(*kinds: str) -> list[str]:
+        return list(dict.fromkeys(report.nodeid for kind in kinds for report in stats.get(kind, ())))
+
+    told = {"failed": names("failed", "error"), "skipped": names("skipped"), "passed": len(stats.get("passed", ()))}
+    file.write_text(json.dumps(told), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,113 @@
+"""`make test` in one piece: what its last line says, and what the plugin tells of real runs of pytest."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from trilane.testing import checks
+from trilane.testing.checks import Outcome, check_tests, main, said
+
+COUNTED = "tests passed, 1 skipped, in"
+TESTS = {
+    "test_well.py": """
+import pytest
+
+def test_passes(): pass
+
+@pytest.mark.slow
+def test_is_slow(): pass
+
+def test_wants_a_part(): pytest.skip("a part")
+
+def test_fails(): assert False
+
+@pytest.fixture
+def broken(): raise OSError("no")
+
+def test_cannot_begin(broken): pass
+""",
+    "test_whole.py": "import pytest\npytest.importorskip('antigravity_none')\n\ndef test_never_seen(): pass\n",
+    "test_damaged.py": "import antigravity_none\n",
+}
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    for name, text in TESTS.items():
+        (tmp_path / name).write_text(text)
+    monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")
+    (tmp_path / "pytest.ini").write_text("[pytest]\nmarkers = slow: takes long\n")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_what_pytest_found_is_told_by_name(folder: Path) -> None:
+    """Also where a file cannot be imported, and where a fixture fails."""
+    found = check_tests(["-q", "."], folder / "told.json")
+    names = {"test_well.py::test_fails", "test_well.py::test_cannot_begin", "test_damaged.py"}
+    assert (set(found.failures), found.passed) == (names, 2)
+    assert found.skipped == ("test_whole.py", "test_well.py::test_wants_a_part")
+    assert not (folder / "told.json").exists()
+
+
+def test_the_rest_is_what_was_skipped_and_what_is_slow(folder: Path) -> None:
+    (folder / "test_damaged.py").unlink()
+    (folder / "skipped.txt").write_text("test_whole.py\ntest_well.py::test_wants_a_part\n")
+    (folder / "antigravity_none.py").touch()  # the part is there now
+    words = ["-p", "trilane.testing.checks", "--only-rest=skipped.txt", "--tell=told.json", "-q", "-rA"]
+    done = subprocess.run([sys.executable, "-m", "pytest", *words], capture_output=True, text=True, check=True)
+    assert json.loads((folder / "told.json").read_text()) == {
+        "failed": [],
+        "skipped": ["test_well.py::test_wants_a_part"],
+        "passed": 2,
+    }
+    assert "PASSED test_whole.py::test_never_seen" in done.stdout and "PASSED test_well.py::test_is_slow" in done.stdout
+
+
+def test_a_run_of_pytest_that_tells_nothing_has_failed(folder: Path) -> None:
+    assert check_tests(["--no-such-option"], folder / "told.json").failures == [
+        "pytest --no-such-option (exit code 4, nothing told)"
+    ]
+    found = check_tests(["-q", "-k", "nothing_of_that_name", "test_well.py"], folder / "told.json")
+    assert found.failures == ["pytest -q -k nothing_of_that_name test_well.py (exit code 5)"]
+
+
+def test_every_check_runs_and_the_last_line_names_every_failure(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "test_damaged.py").unlink()
+    style = [["python", "-c", "raise SystemExit(3)"], ["python", "-c", "print('well')"]]
+    monkeypatch.setattr(checks, "STYLE", style)
+    monkeypatch.setattr(checks, "GROUPS", (["-q", "-k", "fails"], ["-q", "-k", "passes or wants"]))
+    monkeypatch.setattr(checks, "SKIPPED", folder / "skipped.txt")
+    assert main([]) == 1
+    lines = capfd.readouterr().out.splitlines()
+    assert "well" in lines
+    assert lines[-1].startswith("2 failures (1 tests passed, ")
+    assert lines[-1].endswith(": python -c raise SystemExit(3); test_well.py::test_fails")
+    assert "test_well.py::test_wants_a_part" in (folder / "skipped.txt").read_text().splitlines()
+    monkeypatch.setattr(checks, "STYLE", style[1:])
+    monkeypatch.setattr(checks, "GROUPS", (["-q", "-k", "passes"],))
+    assert main([]) == 0
+    assert capfd.readouterr().out.splitlines()[-1].startswith("no failures: 2 checks, 1 tests passed, ")
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "seconds", "line"),
+    [
+        (
+            [Outcome([], 7, ("a",)), Outcome([], 3)],
+            125.9,
+            "no failures: 2 checks, 10 tests passed, 1 skipped, in 2 min 5 s",
+        ),
+        ([Outcome(["mypy"]), Outcome([], 3)], 1.0, "1 failure (3 tests passed, 0 skipped, in 0 min 1 s): mypy"),
+    ],
+)
+def test_the_last_line(outcomes: Any, seconds: float, line: str) -> None:
+    assert said(outcomes, seconds) == line
