@@ -64,9 +64,13 @@ def read_side(text: str) -> Side:
     for name in names:
         if not name.strip():
             raise BadInputError(repr(text), "an empty name", EXPECTED, "leave no comma over")
-    again = next((name for place, name in enumerate(names) if _same(name) in map(_same, names[:place])), None)
-    if again is not None:
-        raise BadInputError(repr(text), f"{again} twice", "each run once", "twice the same run is no surer than once")
+    seen: set[str] = set()
+    for name in names:
+        place = os.path.realpath(name)
+        if place in seen:
+            remedy = "twice the same run is no surer than once"
+            raise BadInputError(repr(text), f"{name} twice", "each run once", remedy)
+        seen.add(place)
     return Side(text, tuple(read_told(name) for name in names))
 
 
@@ -95,11 +99,6 @@ def _is_there(text: str) -> bool:
         return Path(text).exists()
     except OSError:  # many names are longer together than one may be
         return False
-
-
-def _same(name: str) -> str:
-    """Alike for two names of one thing."""
-    return os.path.realpath(name)
 
 
 def _of_folder(name: str, path: Path) -> Told:

@@ -390,6 +390,9 @@ def test_an_empty_name_is_refused_and_not_the_working_directory(
     (tmp_path / "a" / "a").symlink_to(tmp_path / "a")
     with pytest.raises(BadInputError, match="an empty name"):
         read_side(text)
+
+
+def test_of_a_thousand_files_that_are_not_there_one_is_named() -> None:
     with pytest.raises(BadInputError, match="no such file"):
         read_side(",".join(f"none{place}" for place in range(1000)))
 

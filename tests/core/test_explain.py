@@ -67,9 +67,17 @@ def explained(tmp_path: Path, *options: str) -> Any:
     return result
 
 
+@pytest.fixture(scope="module")
+def printed(tiny_bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The document as the command prints it, which takes a second."""
+    folder = tmp_path_factory.mktemp("explained")
+    (folder / "small.toml").write_text(SCENE.format(bundle=tiny_bundle))
+    return str(explained(folder, "--json").stdout)
+
+
 @pytest.fixture
-def document(checked: Checked, tmp_path: Path) -> Any:  # noqa: ARG001 - it writes the scene
-    return json.loads(explained(tmp_path, "--json").stdout)
+def document(printed: str) -> Any:
+    return json.loads(printed)
 
 
 def planned(frame: int, shape: tuple[int, int] | None, *levels: int) -> PlannedFrame:
@@ -156,6 +164,7 @@ def test_a_fixed_size_is_explained_as_such(checked: Checked, tmp_path: Path) -> 
     assert all(row["density"] is None for row in rows)
 
 
+@pytest.mark.usefixtures("checked")
 def test_the_table_names_frames_tensors_and_totals(document: Any, tmp_path: Path) -> None:
     text = explained(tmp_path).stdout
     first = document["phases"][0]
