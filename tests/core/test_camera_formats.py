@@ -417,14 +417,14 @@ def check_damaged(folder: Path, draw: Any) -> None:
 
 
 @given(st.data())
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_damaged_files_are_read_or_refused(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
     check_damaged(tmp_path_factory.mktemp("any"), data)
 
 
 @pytest.mark.slow
 @given(st.data())
-@settings(max_examples=2000, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=2000, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_many_damaged_files(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
     check_damaged(tmp_path_factory.mktemp("any"), data)
 

@@ -448,7 +448,7 @@ def test_a_batch_pays_weights_and_fixed_costs_once() -> None:
     assert four.layers[:, 3:] == pytest.approx(one.layers[:, 3:])
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(side=st.integers(1, 12), channels=st.integers(1, 15), room=st.integers(1, 2**22))
 def test_more_to_do_and_less_room_never_take_less_time(side: int, channels: int, room: int) -> None:
     def seconds(side: int, channels: int, room: int) -> float:

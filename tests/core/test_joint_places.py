@@ -96,7 +96,7 @@ def test_turns_are_no_places(walk: Motion) -> None:
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.02, 3), st.booleans())
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_a_pose_at_random_is_never_taken_for_places(seed: int, size: float, mirrored: bool) -> None:
     """One pose alone, so that no bone can change its length; mirrored, so that both sides are alike."""
     pose = np.random.default_rng(seed).normal(0, size, (1, 22, 3))

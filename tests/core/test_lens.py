@@ -119,7 +119,7 @@ CHANGES = st.lists(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(CHANGES, st.tuples(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3)))
 def test_any_chain_of_changes_moves_a_point_as_it_moves_the_pixels(
     changes: list[tuple[str, object]], at: tuple[float, float]

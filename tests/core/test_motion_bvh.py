@@ -125,7 +125,7 @@ def test_channels_turn_in_the_files_order(tmp_path: Path, order: str) -> None:
 
 
 @given(st.tuples(*[st.floats(-180, 180)] * 3), st.tuples(*[st.floats(-180, 180)] * 3))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_limbs_point_where_the_recorded_limbs_point(
     tmp_path_factory: pytest.TempPathFactory, shoulder: tuple[float, ...], elbow: tuple[float, ...]
 ) -> None:
@@ -198,7 +198,7 @@ def test_a_frame_of_wild_numbers_is_left_out(tmp_path: Path, value: str) -> None
 
 
 @given(st.integers(0, 2600))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_a_file_cut_anywhere_is_refused_or_read(tmp_path_factory: pytest.TempPathFactory, length: int) -> None:
     text = bvh_text([{}])[:length]
     path = tmp_path_factory.mktemp("cut") / "a.bvh"

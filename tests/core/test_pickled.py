@@ -235,7 +235,7 @@ def test_depth_is_no_recursion() -> None:
 
 
 @given(st.binary(max_size=80), st.lists(st.tuples(st.integers(0, 400), st.integers(0, 255)), max_size=8))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_damaged_pickles_are_read_or_refused(tail: bytes, changes: list[tuple[int, int]]) -> None:
     file = io.BytesIO()
     pickle.dump({"poses": np.zeros((1, 2)), "k": [1, ("a", None)], "o": collections.OrderedDict(a=1)}, file, 2)

@@ -173,7 +173,7 @@ def test_time_is_the_sum_of_its_parts_and_falls_with_the_clock() -> None:
     assert fast.total_ms < slow.total_ms < 2 * fast.total_ms + 1e-9
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(
     encoder=st.sampled_from(ENCODERS),
     norm=st.sampled_from(NORMS),

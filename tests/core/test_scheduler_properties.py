@@ -83,7 +83,7 @@ def check(core: Core) -> None:
     assert sorted(held) == sorted(core.frames)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(
     graph=graphs(),
     policy=st.sampled_from(POLICIES),
@@ -162,7 +162,7 @@ def check_bypass(graph: Graph, steps: Any, faults: list[tuple[int, str]]) -> Non
         assert order == sorted(set(order)) or faults
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(
     graph=graphs(KEEPING),
     seed=st.integers(0, 2**32),

@@ -237,7 +237,7 @@ def unit(seconds):
     return int(answer), fds
 
 def until(found):
-    end = time.monotonic() + 5
+    end = time.monotonic() + 60
     while not found() and time.monotonic() < end:
         time.sleep(0.005)
     return found()
@@ -250,7 +250,7 @@ files = os.listdir(f"/proc/{server}/fd")
 pid, (pidfd,) = unit(0.5)
 named = until(lambda: open(f"/proc/{pid}/comm").read() == "trilane-u\\n")
 alive = not select.select([pidfd], [], [], 0)[0]
-ended = bool(select.select([pidfd], [], [], 5)[0])
+ended = bool(select.select([pidfd], [], [], 60)[0])
 none = call("no:such")
 print(json.dumps([death, default, blocked, parent == server, named, alive, ended, none,
                   until(lambda: not children()), until(lambda: os.listdir(f"/proc/{server}/fd") == files)]))

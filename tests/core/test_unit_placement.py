@@ -291,7 +291,7 @@ def machines(draw: st.DrawFn) -> tuple[list[Core], Times]:
     return cores, times(draw(POSITIVE), draw(POSITIVE), network)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(machines(), st.booleans())
 def test_what_is_chosen_is_never_predicted_worse_than_the_rule(machine: tuple[list[Core], Times], one: bool) -> None:
     cores, of = machine
@@ -302,7 +302,7 @@ def test_what_is_chosen_is_never_predicted_worse_than_the_rule(machine: tuple[li
     assert found[0].frame_ns * (1 + 0.04) >= chosen(found, rule).frame_ns
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(machines(), st.randoms(use_true_random=False), st.booleans())
 def test_which_number_a_core_has_changes_no_prediction(
     machine: tuple[list[Core], Times], random: Random, one: bool
@@ -315,7 +315,7 @@ def test_which_number_a_core_has_changes_no_prediction(
     assert [each.frame_ns for each in before] == [each.frame_ns for each in after]
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(machines(), st.sampled_from(["cpu", "gpu", "dsp"]), st.integers(1, 50), st.booleans())
 def test_more_work_never_makes_a_frame_shorter(
     machine: tuple[list[Core], Times], unit: str, more: int, one: bool

@@ -85,7 +85,7 @@ def started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[U
         processes.start(unit)
     yield processes, starter
     processes.close()
-    assert [sleeper.wait(5) for sleeper in starter.sleepers.values()] == [-signal.SIGKILL] * 2
+    assert [sleeper.wait(60) for sleeper in starter.sleepers.values()] == [-signal.SIGKILL] * 2
     for unit in list(starter.pipes):
         starter.leave(unit)
     assert processes.pids == {}
@@ -163,7 +163,7 @@ def test_what_a_unit_said_comes_before_its_end_and_its_last_line_is_kept(started
         starter.pipes["right"].send(done(number))
     processes.kill("nobody")
     processes.kill("right")
-    starter.sleepers["right"].wait(5)
+    starter.sleepers["right"].wait(60)
     starter.leave("right")
     assert heard(processes, 3) == [UnitMessage("right", m) for m in (done(0), done(1), None)]
     assert processes.stderr_tails["right"] == "x" * (8192 - 12) + "\nlast words"
@@ -413,9 +413,9 @@ def test_a_unit_that_ends_by_itself_is_waited_for_and_what_it_started_is_ended()
     process.pid, process.pidfd = shell.pid, os.pidfd_open(shell.pid)
     process.wait()
     os.close(process.pidfd)
-    assert shell.wait(5) == 3
+    assert shell.wait(60) == 3
     left = [each for each in psutil.process_iter(["name"]) if each.pid != shell.pid and _group(each.pid) == shell.pid]
-    assert psutil.wait_procs(left, timeout=2)[1] == []
+    assert psutil.wait_procs(left, timeout=60)[1] == []
 
 
 def _group(pid: int) -> int | None:

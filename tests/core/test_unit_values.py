@@ -247,7 +247,7 @@ def test_threads_that_were_started_while_building_go_back_to_the_units_cores() -
 
     def work() -> None:
         ids.append(threading.get_native_id())
-        end.wait(10)
+        end.wait(60)
 
     early, late = threading.Thread(target=work), threading.Thread(target=work)
     early.start()
