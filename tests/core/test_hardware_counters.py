@@ -175,6 +175,7 @@ def test_why_there_are_none(
 
 
 def test_an_unknown_processor_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(machine, "here", Machine())
     monkeypatch.setattr(machine.here, "architecture", lambda: "vax")
     assert absence() == "perf_event_open: no number of perf_event_open is known for vax"
 

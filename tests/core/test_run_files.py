@@ -6,14 +6,14 @@ import errno
 import json
 import os
 from collections.abc import Iterator
-from datetime import UTC, datetime, tzinfo
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from trilane import machine
 from trilane.apps import report as report_module
-from trilane.apps import run_folder
 from trilane.apps.report import Report, read_report, write_report
 from trilane.apps.report_sources import NO_FIGURES_UNDER, sources_of
 from trilane.apps.run_folder import RunFolder, default_place
@@ -74,14 +74,8 @@ def test_the_default_place_is_free_and_named_after_the_scene(tmp_path: Path, mon
 
 
 def test_a_second_run_of_the_same_second_has_a_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    class Clock:
-        @staticmethod
-        def now(zone: tzinfo) -> datetime:
-            assert zone is UTC
-            return datetime(2026, 11, 22, 3, 4, 5, tzinfo=UTC)
-
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(run_folder, "datetime", Clock)
+    monkeypatch.setattr(machine.here, "now", lambda: datetime(2026, 11, 22, 3, 4, 5, tzinfo=UTC))
     for name in ("20261122T030405Z-a_b-1", "20261122T030405Z-a_b-1-2", "20261122T030405Z-a_b-1-3"):
         assert default_place("a_b-1") == Path("runs") / name
         (Path("runs") / name).mkdir(parents=True)

@@ -14,6 +14,7 @@ import pytest
 
 pytest.importorskip("skimage")
 
+from trilane import machine
 from trilane.avatars.bundle import Bundle, load_bundle
 from trilane.avatars.digests import digests_of
 from trilane.body.body import load_body
@@ -126,8 +127,7 @@ def parts(monkeypatch):
     monkeypatch.setattr(validate, "load_motion", lambda spec, folder: (spec.motion, folder))
     monkeypatch.setattr(validate, "load_runtime", lambda name: SimpleNamespace(version=lambda: f"{name} 3.2"))
     monkeypatch.setattr(validate, "package_version", {"trilane": "9.8"}.__getitem__)
-    now = {UTC: datetime(2026, 1, 2, 23, 30, tzinfo=UTC)}
-    monkeypatch.setattr(validate, "datetime", SimpleNamespace(now=now.__getitem__))
+    monkeypatch.setattr(machine.here, "now", lambda: datetime(2026, 1, 2, 23, 30, tzinfo=UTC))
     return asked
 
 
