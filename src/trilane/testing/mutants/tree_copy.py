@@ -57,10 +57,10 @@ class TreeCopy:
 
 
 @contextmanager
-def copied_tree(root: Path, paths: Sequence[str]) -> Iterator[TreeCopy]:
-    """A copy of the files `paths` of `root`, a checkout of its own for git, with the real inputs beside it."""
-    with TemporaryDirectory(prefix="faults-") as folder:
-        copy = Path(folder) / "tree"
+def copied_tree(root: Path, paths: Sequence[str], name: str = "tree") -> Iterator[TreeCopy]:
+    """A copy of the files `paths` of `root` in a folder `name`, no checkout for git, with the real inputs beside it."""
+    with TemporaryDirectory(prefix="trilane-copy-") as folder:
+        copy = Path(folder) / name
         for path in paths:
             (copy / path).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(root / path, copy / path, follow_symlinks=False)
