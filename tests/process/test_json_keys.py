@@ -1,7 +1,8 @@
 """The keys of `--json` and of report.json stay what programs read: as json_keys.toml has them, none lost, none new.
 
-Rule: every command that takes `--json` is in json_keys.toml, and is run as a person runs it, with its cheapest
-arguments; its stdout is one JSON document. What the lines of the file mean stands at its head.
+Rule: every command that takes `--json` is in json_keys.toml, and is run with its cheapest arguments in a process of its
+own; its stdout is one JSON document. These processes are forked from one that has imported what they need, which takes
+longer than most of the commands. What the lines of the file mean stands at its head.
 """
 
 from __future__ import annotations
@@ -33,7 +34,25 @@ from trilane.testing.validated import validated
 
 FILE = Path(__file__).with_name("json_keys.toml")
 DATA = tomllib.loads(FILE.read_text(encoding="utf-8"))
-TIMEOUT_S = 110
+#: Calls the command of each line of stdin, in a process of its own, and prints its exit code.
+COMMANDS = """
+import importlib, json, os, sys
+from trilane.apps.cli import main
+from trilane.stages.factories import PRELOAD
+
+for module in ("onnx", "onnxruntime", "rich.table", *PRELOAD, *(module for module, _ in main.COMMANDS.values())):
+    importlib.import_module(module)
+for line in sys.stdin:
+    folder, arguments = json.loads(line)
+    child = os.fork()
+    if child == 0:
+        os.chdir(folder)
+        for number, name in enumerate(("/dev/null", "stdout", "stderr")):
+            os.dup2(os.open(name, os.O_RDWR | (os.O_CREAT | os.O_TRUNC) * (number > 0)), number)
+        sys.argv[1:] = arguments
+        main.entry()
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+"""
 
 #: Names from the document's root to a key; those of lists end in `[]` where an entry of theirs is meant.
 Names = tuple[str, ...]
@@ -63,9 +82,10 @@ CASES = {name: Case(name, table, **fields) for table in ("commands", "slow") for
 
 @dataclass
 class Place:
-    """A folder with everything that the commands read. Each command is run in it once."""
+    """A folder with everything that the commands read, and the process that calls them. Each is run in it once."""
 
     folder: Path
+    commands: subprocess.Popen[str]
     printed: dict[str, str] = field(default_factory=dict)
 
     def run(self, case: Case) -> str:
@@ -73,16 +93,12 @@ class Place:
         if case.after:
             self.run(CASES[case.after])
         if case.name not in self.printed:
-            done = subprocess.run(
-                [sys.executable, "-m", "trilane.apps.cli.main", *case.arguments, "--json"],
-                cwd=self.folder,
-                capture_output=True,
-                text=True,
-                check=False,
-                timeout=TIMEOUT_S,
-            )
-            assert done.returncode in case.exits, f"{case.line}\nended with {done.returncode}: {done.stderr}"
-            self.printed[case.name] = done.stdout
+            assert self.commands.stdin is not None and self.commands.stdout is not None
+            print(json.dumps([str(self.folder), [*case.arguments, "--json"]]), file=self.commands.stdin, flush=True)
+            code = int(self.commands.stdout.readline())
+            said = (self.folder / "stderr").read_text(encoding="utf-8")
+            assert code in case.exits, f"{case.line}\nended with {code}: {said}"
+            self.printed[case.name] = (self.folder / "stdout").read_text(encoding="utf-8")
         return self.printed[case.name]
 
 
@@ -92,7 +108,7 @@ def place(
     tiny_float: onnx.ModelProto,
     tiny_frames: list[NDArray[Any]],
     tmp_path_factory: pytest.TempPathFactory,
-) -> Place:
+) -> Iterator[Place]:
     folder = tmp_path_factory.mktemp("keys")
     shutil.copytree(drawable_bundle, folder / "bundle")
     shutil.copytree(drawable_bundle, folder / "unvalidated")
@@ -107,7 +123,9 @@ def place(
     np.save(folder / "poses.npy", np.zeros((1, 165)))
     for name, text in DATA["inputs"].items():
         (folder / name).write_text(text.lstrip(), encoding="utf-8")
-    return Place(folder)
+    pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", COMMANDS], **pipes) as commands:
+        yield Place(folder, commands)
 
 
 def one_document(text: str, where: str) -> Any:

@@ -8,9 +8,9 @@ import resource
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,14 +28,25 @@ from trilane.pipeline.description import Pipeline, UnitSettings
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run import run_pipeline
 from trilane.pipeline.unit_starter import CLOSE_S, UnitStarter
-from trilane.scheduler.events import Pong
+from trilane.scheduler.events import Dispatch, JobDone, Pong, UnitDied
 from trilane.scheduler.recording import Recording, replay
 from trilane.stages.avatar_pipeline import avatar_pipeline
 from trilane.stages.configure import Request, configure
 from trilane.testing import lost_context
+from trilane.testing.doubles import HANG
 from trilane.testing.doubles import pipeline_of_doubles as doubles
 
 pytestmark = pytest.mark.usefixtures("nothing_left")
+#: A unit that is silent for so long has stopped; a busy machine keeps one from its core for some hundredths of it.
+HANG_NS = 1_500_000_000
+PATIENCE_S = 60.0
+Run = Callable[..., RunResult]
+
+
+@pytest.fixture
+def run(starter: UnitStarter) -> Run:
+    """`run_pipeline` with a fork server that is up."""
+    return partial(run_pipeline, starter=starter)
 
 
 class When:
@@ -60,6 +71,19 @@ def with_factory(pipeline: Pipeline, name: str, factory: str) -> Pipeline:
     return pipeline.model_copy(update={"stages": tuple(stages)})
 
 
+def in_hand(result: RunResult, unit: str) -> set[int]:
+    """The frames whose jobs the unit had been handed, and had not done, when it died."""
+    held: dict[int, int] = {}
+    for _, events, actions in result.recording.steps:
+        if any(isinstance(event, UnitDied) and event.unit == unit for event in events):
+            break
+        for event in events:
+            if isinstance(event, JobDone):
+                held.pop(event.job, None)
+        held |= {act.job.id: act.job.frame for act in actions if isinstance(act, Dispatch) and act.job.unit == unit}
+    return set(held.values())
+
+
 def check_accounts(result: RunResult) -> None:
     counted = result.presented + sum(result.lost.values()) + sum(result.dropped.values())
     assert counted == result.requested
@@ -70,31 +94,35 @@ def check_accounts(result: RunResult) -> None:
 
 @pytest.mark.parametrize("policy", ["sequential", "pipelined"])
 @pytest.mark.parametrize("edge", ["single", "double"])
-def test_every_frame_is_presented_in_order(tmp_path: Path, policy: str, edge: str) -> None:
+def test_every_frame_is_presented_in_order(run: Run, tmp_path: Path, policy: str, edge: str) -> None:
     log = tmp_path / "presented.txt"
-    result = run_pipeline(doubles(log).with_rule(edge), 40, policy=policy, isolated_frames=2)
+    result = run(doubles(log).with_rule(edge), 40, policy=policy, isolated_frames=2)
     assert result.failure is None
     assert (result.presented, dict(result.lost), dict(result.dropped)) == (40, {}, {})
     assert log.read_text().split() == [str(frame) for frame in range(40)]
     assert len(set(result.pids.values())) == 3
     assert result.report.clock == "host"
-    assert 0 < (result.report.efficiency or 0) < 3
+    isolated = result.report.isolated_ms
+    own = isolated | {"present": result.report.stages["present"].service_ms.mean}
+    slowest = max(own["pose"] + own["present"], own["raster"] + own["composite"], own["infer"])
+    assert result.report.efficiency == pytest.approx(slowest * result.report.fps / 1000, rel=0.05)
     check_accounts(result)
 
 
 @pytest.mark.parametrize(("policy", "edge"), [("latest", "triple"), ("deadline", "double"), ("latest", "orphan")])
-def test_a_paced_run_drops_what_it_cannot_do_and_counts_it(policy: str, edge: str) -> None:
-    result = run_pipeline(doubles(infer=16).with_rule(edge), 100, policy=policy, pace_fps=100, isolated_frames=0)
-    assert sum(result.dropped.values()) > 20
-    assert result.presented > 20
+def test_a_paced_run_drops_what_it_cannot_do_and_counts_it(run: Run, policy: str, edge: str) -> None:
+    """The DSP can do 25 of the 40 frames in the second in which they come, and two in hand."""
+    result = run(doubles(infer=40).with_rule(edge), 40, policy=policy, pace_fps=40, isolated_frames=0)
+    assert sum(result.dropped.values()) >= 13
+    assert result.presented > 8
     assert result.report.efficiency is None
     check_accounts(result)
 
 
 @pytest.mark.parametrize("policy", ["latest", "deadline"])
-def test_a_prediction_has_the_rules_of_a_run(policy: str) -> None:
+def test_a_prediction_has_the_rules_of_a_run(run: Run, policy: str) -> None:
     """The events of a run, told to a core as predictions set it up, get the same answers; at another rate others."""
-    result = run_pipeline(doubles(infer=40), 25, policy=policy, fps=50, isolated_frames=0)
+    result = run(doubles(infer=40), 25, policy=policy, fps=50, isolated_frames=0)
     assert sum(result.dropped.values()) > 5
 
     def differences(fps: float) -> list[str]:
@@ -105,15 +133,15 @@ def test_a_prediction_has_the_rules_of_a_run(policy: str) -> None:
     assert differences(60.0)
 
 
-def test_a_run_at_a_pace_has_the_frame_time_of_virtual_time() -> None:
-    """Jobs of a millisecond, held for 20 to 40; the median interval, for another program may hold one frame up."""
-    stage_ns = {"pose": 2, "raster": 10, "infer": 40, "composite": 20, "present": 2}
+def test_a_run_at_a_pace_has_the_frame_time_of_virtual_time(run: Run) -> None:
+    """Jobs of a millisecond, held for 50 to 100; the median interval, for another program may hold one frame up."""
+    stage_ns = {"pose": 5, "raster": 25, "infer": 100, "composite": 50, "present": 5}
     stage_ns = {stage: ms * 1_000_000 for stage, ms in stage_ns.items()}
-    result = run_pipeline(doubles(pace_ns=stage_ns), 20)
-    found = compare(Pace("chip", "any", 1.0, stage_ns), "pipelined", 20, result.jobs)
-    assert result.presented == 20
-    assert found["virtual_ms"] == 40
-    assert result.report.frame_time_ms.p50 == pytest.approx(40, rel=0.05)
+    result = run(doubles(pace_ns=stage_ns), 10, isolated_frames=0)
+    found = compare(Pace("chip", "any", 1.0, stage_ns), "pipelined", 10, result.jobs)
+    assert result.presented == 10
+    assert found["virtual_ms"] == 100
+    assert result.report.frame_time_ms.p50 == pytest.approx(100, rel=0.05)
     assert min(job.end_ns - job.begin_ns for job in result.jobs if job.stage == "infer") >= stage_ns["infer"]
 
 
@@ -129,10 +157,10 @@ class Capped:
         return {"temperature_c": {"sensor": None}}
 
 
-def test_a_report_says_what_was_run_and_where() -> None:
+def test_a_report_says_what_was_run_and_where(run: Run) -> None:
     """Frames of 5 ms and more: each of the 11 frame times misses a target of 1 ms, and none one of 100 s."""
     pipeline, cores = doubles(infer=5), set(machine.here.cores())
-    result = run_pipeline(pipeline, 12, fps=1000.0, governor=Capped())
+    result = run(pipeline, 12, fps=1000.0, governor=Capped())
     report = result.report
     assert set(machine.here.cores()) == cores
     assert (report.policy, report.edge, report.clock, report.deadline_misses) == ("pipelined", "double", "host", 11)
@@ -152,31 +180,34 @@ def test_a_report_says_what_was_run_and_where() -> None:
     assert all(
         job.ready_ns <= job.dispatch_ns <= job.begin_ns < job.end_ns for job in result.jobs if job.stage != "pose"
     )
-    slow = run_pipeline(doubles(), 5, fps=0.01, isolated_frames=0)
+    slow = run(doubles(), 5, fps=0.01, isolated_frames=0)
     assert (slow.report.deadline_misses, slow.report.isolated_ms, slow.report.xrbench.energy) == (0, {}, None)
 
 
-def test_pipelined_hides_all_but_the_slowest() -> None:
-    pipeline = doubles(raster=4, infer=12, composite=3, present=4)
-    reports = [run_pipeline(pipeline, 60, policy=policy).report for policy in ("sequential", "pipelined")]
-    assert reports[1].fps > 1.4 * reports[0].fps
-    assert reports[1].bottleneck == "dsp"
-    assert (reports[1].efficiency or 0) > 0.8
+def test_pipelined_hides_all_but_the_slowest(run: Run) -> None:
+    """One after the other, jobs take 86 ms of a frame; the slowest unit takes 40. Each hand-over may take 5 ms more."""
+    pipeline = doubles(pose=2, raster=14, infer=40, composite=12, present=18)
+    sequential, pipelined = (
+        run(pipeline, 12, policy=policy, isolated_frames=2).report for policy in ("sequential", "pipelined")
+    )
+    assert pipelined.frame_time_ms.p50 * 1.4 < sequential.frame_time_ms.p50
+    assert pipelined.bottleneck == "dsp"
+    assert (pipelined.efficiency or 0) > 0.8
 
 
 @pytest.mark.parametrize(("unit", "slowest"), [("cpu", "pose"), ("gpu", "raster"), ("dsp", "infer")])
-def test_a_killed_unit_is_restarted_and_the_run_goes_on(unit: str, slowest: str) -> None:
-    """The unit that is killed is the one that always has a job in hand; an idle one would lose nothing."""
+def test_a_killed_unit_is_restarted_and_the_run_goes_on(run: Run, unit: str, slowest: str) -> None:
+    """The unit that is killed is the slowest: its jobs wait for it. It loses what it has in hand."""
     victims = []
 
     def kill() -> None:
         victims.append(unit_process(unit).pid)
         os.kill(victims[0], signal.SIGKILL)
 
-    result = run_pipeline(doubles(**{slowest: 10}), 60, isolated_frames=0, on_progress=When(10, kill))
+    result = run(doubles(**{slowest: 30}), 30, isolated_frames=0, on_progress=When(5, kill))
     assert result.failure is None
     assert set(map(str, result.lost)) == {f"died:{unit}"}
-    assert sum(result.lost.values()) <= 2
+    assert 1 <= sum(result.lost.values()) <= len(in_hand(result, unit)) <= 2
     assert result.report.units[unit].restarts == 1
     assert result.pids[unit] != victims[0]
     assert any(unit in message for message in result.messages)
@@ -184,9 +215,9 @@ def test_a_killed_unit_is_restarted_and_the_run_goes_on(unit: str, slowest: str)
 
 
 def fork_server() -> psutil.Process:
-    return next(
-        process for process in psutil.Process().children() if "trilane.pipeline.fork_server" in process.cmdline()
-    )
+    """The one that began last."""
+    servers = [p for p in psutil.Process().children() if "trilane.pipeline.fork_server" in p.cmdline()]
+    return max(servers, key=psutil.Process.create_time)
 
 
 def test_a_killed_fork_server_ends_the_run_with_what_was_done() -> None:
@@ -249,59 +280,58 @@ def test_cores_that_this_machine_lacks_are_refused() -> None:
         run_pipeline(pipeline.model_copy(update={"units": units}), 5)
 
 
-def test_a_stopped_unit_is_found_by_its_deadline() -> None:
+def test_a_stopped_unit_is_found_by_its_deadline(run: Run) -> None:
     stop = When(10, lambda: unit_process("dsp").suspend())
-    result = run_pipeline(doubles(infer=10), 60, isolated_frames=0, hang_ns=700_000_000, on_progress=stop)
+    result = run(doubles(infer=10), 40, isolated_frames=0, hang_ns=HANG_NS, on_progress=stop)
     assert set(map(str, result.lost)) == {"hung:dsp"}
     assert any("did not answer in time" in message for message in result.messages)
     check_accounts(result)
 
 
-def test_idle_units_are_asked_whether_they_live() -> None:
+def test_idle_units_are_asked_whether_they_live(run: Run) -> None:
     """The CPU waits longer for its next job than a unit may be silent."""
-    pipeline = doubles(raster=400, infer=400, composite=400)
-    result = run_pipeline(pipeline, 2, policy="sequential", isolated_frames=0, hang_ns=700_000_000)
+    pipeline = doubles(raster="600@1", infer="600@1", composite="600@1")
+    result = run(pipeline, 2, policy="sequential", isolated_frames=0, hang_ns=HANG_NS)
     beats = [event for _, events, _ in result.recording.steps for event in events if isinstance(event, Pong)]
     assert result.presented == 2
     assert not any(unit.restarts for unit in result.report.units.values())
     assert any(beat.unit == "cpu" for beat in beats)
 
 
-def test_a_job_that_never_ends_ends_the_run_after_some_restarts() -> None:
-    result = run_pipeline(doubles(raster="hang"), 8, isolated_frames=0, hang_ns=300_000_000)
+def test_a_job_that_never_ends_ends_the_run_after_some_restarts(run: Run) -> None:
+    result = run(doubles(raster=HANG), 8, isolated_frames=0, hang_ns=HANG_NS)
     assert by_cause(result.lost) == {"hung:gpu": 1}
     assert result.presented == 7
     check_accounts(result)
 
 
-def test_a_cap_holds_every_unit_and_says_so() -> None:
+def test_a_cap_holds_every_unit_and_says_so(run: Run) -> None:
     """Half of the time at most, whatever the jobs ask for; the recording with the cap's events replays."""
-    free = run_pipeline(doubles(infer=10), 60, isolated_frames=0)
-    capped = run_pipeline(
-        doubles(infer=10), 60, isolated_frames=0, governor=Governor(load_runnable("host"), "power_saver")
-    )
+    pipeline = doubles(infer=20)
+    free = run(pipeline, 20, isolated_frames=0)
+    capped = run(pipeline, 40, isolated_frames=0, governor=Governor(load_runnable("host"), "power_saver"))
     check_accounts(capped)
-    assert capped.report.fps < 0.7 * free.report.fps
+    assert free.report.units["dsp"].idle.throttled == 0
+    assert capped.report.fps < 0.7 * 1000 / 20
     assert capped.report.units["dsp"].idle.throttled > 0.2
     assert capped.report.caps is not None
     assert capped.report.caps.performance_profile == "power_saver"
     assert capped.report.caps.units["dsp"].duty < 0.5
 
 
-def test_late_poses_arrive_and_are_newer() -> None:
+def test_late_poses_arrive_and_are_newer(run: Run) -> None:
     early, late = (
-        run_pipeline(doubles(pose=2, raster=5, infer=10), 80, isolated_frames=0, latch_ms=latch_ms)
-        for latch_ms in (0, 4)
+        run(doubles(pose=8, raster=20, infer=40), 24, isolated_frames=0, latch_ms=latch_ms) for latch_ms in (0, 16)
     )
     check_accounts(late)
-    assert late.presented == 80
+    assert late.presented == 24
     assert late.report.latency_ms.p50 < early.report.latency_ms.p50
 
 
-def test_a_lost_context_costs_a_restart_and_a_frame(tmp_path: Path) -> None:
-    checked = configure(Request(frames=40, size="128"), tmp_path)
+def test_a_lost_context_costs_a_restart_and_a_frame(run: Run, tmp_path: Path, drawable_bundle: Path) -> None:
+    checked = configure(Request(avatar=str(drawable_bundle), frames=12, size="64", runtime="ort"), tmp_path)
     losing = with_factory(avatar_pipeline(checked.config, checked.assets), "raster", lost_context.FACTORY)
-    result = run_pipeline(losing, 40, assets=checked.assets, isolated_frames=0)
+    result = run(losing, 12, assets=checked.assets, isolated_frames=0)
     assert result.failure is None
     assert by_cause(result.lost) == {"died:gpu": 1}
     assert result.report.units["gpu"].restarts == 1
@@ -310,8 +340,8 @@ def test_a_lost_context_costs_a_restart_and_a_frame(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("stage", ["raster", "infer", "present"])
-def test_a_stage_that_raises_ends_the_run_with_its_sentence(stage: str) -> None:
-    result = run_pipeline(doubles(**{stage: "raise"}), 200, isolated_frames=0)
+def test_a_stage_that_raises_ends_the_run_with_its_sentence(run: Run, stage: str) -> None:
+    result = run(doubles(**{stage: "raise"}), 200, isolated_frames=0)
     assert result.failure is not None
     assert result.failure.exit_code == 2
     assert result.failure.message == "mock.npz: found nothing, expected something"
@@ -320,16 +350,16 @@ def test_a_stage_that_raises_ends_the_run_with_its_sentence(stage: str) -> None:
 
 
 @pytest.mark.parametrize("stage", ["pose", "raster", "infer"])
-def test_a_stage_that_cannot_be_built_is_the_callers_error(stage: str) -> None:
+def test_a_stage_that_cannot_be_built_is_the_callers_error(run: Run, stage: str) -> None:
     with pytest.raises(TrilaneError, match="expected a network; train one") as caught:
-        run_pipeline(doubles(**{stage: "badbuild"}), 5)
+        run(doubles(**{stage: "badbuild"}), 5)
     assert caught.value.exit_code == 2
 
 
-def test_a_unit_that_dies_while_it_starts_is_an_error_with_its_last_words() -> None:
+def test_a_unit_that_dies_while_it_starts_is_an_error_with_its_last_words(run: Run) -> None:
     pipeline = with_factory(doubles(), "infer", "antigravity_none:build")
     with pytest.raises(TrilaneError, match="antigravity_none"):
-        run_pipeline(pipeline, 5)
+        run(pipeline, 5)
 
 
 @pytest.mark.parametrize(("policy", "edge"), [("fast", "double"), ("pipelined", "quad"), ("pipelined", "fifo:0")])
@@ -338,26 +368,27 @@ def test_unknown_settings_are_bad_input(policy: str, edge: str) -> None:
         run_pipeline(doubles().with_rule(edge), 5, policy=policy)
 
 
-def test_an_interrupt_finishes_what_is_in_flight() -> None:
+def test_an_interrupt_finishes_what_is_in_flight(run: Run) -> None:
     interrupt = When(10, lambda: os.kill(os.getpid(), signal.SIGINT))
-    result = run_pipeline(doubles(infer=5), 2000, isolated_frames=0, on_progress=interrupt)
+    result = run(doubles(infer=5), 2000, isolated_frames=0, on_progress=interrupt)
     assert result.interrupted
     assert result.failure is None
     assert 10 <= result.presented < 100
     assert not result.lost
 
 
-def test_a_second_interrupt_ends_at_once() -> None:
-    def interrupt() -> None:
-        for _ in range(2):
-            time.sleep(0.5)
-            os.kill(os.getpid(), signal.SIGINT)
+def test_a_second_interrupt_ends_at_once(run: Run) -> None:
+    """The second comes once the first was heard; the job in hand would never end, nor its unit be given up."""
 
-    thread = threading.Thread(target=interrupt)
-    begin = time.monotonic()
-    result = run_pipeline(doubles(raster="hang"), 20, isolated_frames=0, on_progress=When(2, thread.start))
-    thread.join()
-    assert time.monotonic() - begin < 8
+    def interrupt() -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+
+    def again(text: str) -> None:
+        if text.startswith("interrupted"):
+            interrupt()
+
+    options: dict[str, Any] = {"isolated_frames": 0, "hang_ns": 3_600_000_000_000}
+    result = run(doubles(raster=HANG), 20, on_progress=When(2, interrupt), on_message=again, **options)
     assert result.interrupted
     assert by_cause(result.lost)["aborted"] >= 1
     assert not list(replay(result.recording))
@@ -366,10 +397,13 @@ def test_a_second_interrupt_ends_at_once() -> None:
 SCRIPT = """
 import sys
 from trilane.pipeline.run import run_pipeline
+from trilane.scheduler.events import SchedulerStalled
 from trilane.testing.doubles import pipeline_of_doubles
 
 result = run_pipeline(pipeline_of_doubles(infer=int(sys.argv[3])), int(sys.argv[1]), isolated_frames=0,
                       hang_ns=int(float(sys.argv[2]) * 1e9), on_progress=lambda done, _: print(done, flush=True))
+happened = [event for _, events, _ in result.recording.steps for event in events]
+print("stalled", max((event.ns for event in happened if isinstance(event, SchedulerStalled)), default=0))
 print(f"over: {result.presented} presented, lost {dict(result.lost)}, {result.messages}", flush=True)
 """
 
@@ -390,23 +424,29 @@ def test_nothing_outlives_the_parent(nothing_left: Path, number: signal.Signals)
     os.kill(parent.pid, number)
     parent.stdout.read()
     parent.stdout.close()
-    parent.wait(10)
-    _, alive = psutil.wait_procs(children, timeout=3)
+    parent.wait(PATIENCE_S)
+    _, alive = psutil.wait_procs(children, timeout=PATIENCE_S)
     assert not [process for process in alive if process.status() != psutil.STATUS_ZOMBIE]
+
+
+STOPPED_S = 1.8
 
 
 def test_a_scheduler_that_was_stopped_blames_nobody() -> None:
     """Not the units that waited for it longer than they may be silent, with a job done or with nothing to do."""
-    parent = subprocess.Popen(script(60, 1.0, infer_ms=10), stdout=subprocess.PIPE, text=True, process_group=0)
+    parent = subprocess.Popen(
+        script(60, STOPPED_S - 0.5, infer_ms=10), stdout=subprocess.PIPE, text=True, process_group=0
+    )
     assert parent.stdout is not None
     while int(parent.stdout.readline()) < 10:
         pass
     os.kill(parent.pid, signal.SIGSTOP)
-    time.sleep(2.0)
+    time.sleep(STOPPED_S)  # the time itself is what is tried
     os.kill(parent.pid, signal.SIGCONT)
     said = parent.stdout.read().splitlines()
     parent.stdout.close()
-    assert parent.wait(10) == 0
+    assert parent.wait(PATIENCE_S) == 0
+    assert int(said[-2].removeprefix("stalled")) >= STOPPED_S * 1e9
     assert said[-1] == "over: 60 presented, lost {}, ()"
 
 
@@ -429,12 +469,12 @@ def test_a_run_that_may_open_too_few_files_says_so(monkeypatch: pytest.MonkeyPat
         run_pipeline(doubles(), 3, isolated_frames=0)
 
 
-def test_an_idle_unit_that_does_not_answer_is_restarted(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The DSP has no job while pose and raster work, and so loses none."""
+def test_an_idle_unit_that_does_not_answer_is_restarted(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The DSP has no job while pose and raster work, for twice 1.2 s, and so loses none."""
     monkeypatch.setattr("trilane.pipeline.realtime_clock.PING_NS", 50_000_000)
     stop = When(1, lambda: unit_process("dsp").suspend())
-    pipeline = doubles(pose=500, raster=500)
-    result = run_pipeline(pipeline, 3, policy="sequential", isolated_frames=0, hang_ns=850_000_000, on_progress=stop)
+    pipeline = doubles(pose="1200@1", raster="1200@1")
+    result = run(pipeline, 3, policy="sequential", isolated_frames=0, hang_ns=HANG_NS, on_progress=stop)
     assert result.report.units["dsp"].restarts == 1
     assert any("dsp did not answer in time" in message for message in result.messages)
     assert result.presented == 3 and not result.lost
@@ -447,7 +487,7 @@ def test_a_parent_killed_while_it_starts_leaves_what_the_next_run_removes(nothin
     children = psutil.Process(parent.pid).children(recursive=True)
     parent.kill()
     parent.wait()
-    _, alive = psutil.wait_procs(children, timeout=3)
+    _, alive = psutil.wait_procs(children, timeout=PATIENCE_S)
     assert not [process for process in alive if process.status() != psutil.STATUS_ZOMBIE]
     run_pipeline(doubles(), 3, isolated_frames=0)
     assert not list(nothing_left.glob("trilane-*"))

@@ -20,8 +20,11 @@ from trilane.transport.packets import Packet
 from trilane.units import AFTER_INFER, BEFORE_INFER, INFER, LATENCY_TO
 
 STAGES = (*BEFORE_INFER, INFER, *AFTER_INFER)
-FACTORY = "trilane.testing.doubles:build"
+MODULE = "trilane.testing.doubles"
+FACTORY = f"{MODULE}:build"
+USUAL_S = 0.001
 BAD_FRAME = 3
+HANG = f"3600000@{BAD_FRAME}"
 PAYLOAD_BYTES = 4096
 CHECKED_BYTES = 64
 FULL_EVERY = 7
@@ -32,12 +35,15 @@ SLOW_FRAMES = range(10, 30)
 class StageDouble:
     """Sleeps through each job, passes the frame's number on in the payload, and writes it to the file `log`, if any.
 
-    `behaviour`: milliseconds of a job as text, or `raise`: fails at frame 3, or `hang`: never ends frame 3.
+    `behaviour`: milliseconds of a job as text, or `MS@FRAME`: those of one frame alone, or `raise`: fails at frame 3;
+    another job takes 1 ms.
     """
 
     def __init__(self, behaviour: str, log: str | None) -> None:
         self._behaviour = behaviour
-        self._spend_s = 0.001 if behaviour in ("raise", "hang") else float(behaviour) / 1000
+        ms, _, frame = behaviour.partition("@")
+        self._spend_s = USUAL_S if behaviour == "raise" else float(ms) / 1000
+        self._only = int(frame) if frame else None
         self._log = open(log, "a", encoding="ascii") if log else None  # noqa: SIM115, PTH123 - closed in close()
 
     def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
@@ -46,7 +52,7 @@ class StageDouble:
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
         if self._behaviour == "raise" and frame == BAD_FRAME:
             raise BadInputError("mock.npz", "nothing", "something")
-        time.sleep(3600 if self._behaviour == "hang" and frame == BAD_FRAME else self._spend_s)
+        time.sleep(self._spend_s if self._only in (None, frame) else USUAL_S)
         if slot_in is not None:
             _check(self._inputs[slot_in], frame)
         if slot_out is not None:
@@ -137,7 +143,7 @@ def stepped_pipeline(ms: float) -> Pipeline:
             PipelineStage(
                 name=name,
                 unit=unit,
-                factory="trilane.testing.doubles:build_stepped",
+                factory=f"{MODULE}:build_stepped",
                 settings={"stage": name, "behaviour": behaviour},
             )
             for name, unit, behaviour in (("pose", "cpu", "0"), ("infer", "dsp", str(ms)), ("present", "cpu", "0"))
@@ -145,6 +151,7 @@ def stepped_pipeline(ms: float) -> Pipeline:
         edges=(PipelineEdge(payload_bytes=PAYLOAD_BYTES),) * 2,
         units=host_units(),
         latency_to="infer",
+        preload=(MODULE,),
     )
 
 
@@ -170,4 +177,5 @@ def pipeline_of_doubles(
         edges=(PipelineEdge(payload_bytes=PAYLOAD_BYTES),) * (len(STAGES) - 1),
         units=host_units(),
         latency_to=LATENCY_TO,
+        preload=(MODULE,),
     )
