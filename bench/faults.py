@@ -57,7 +57,7 @@ def measure(
     `uncounted` (none of these three); `lost_per_death`; `restarts`; `ready_ms`: from a unit's death until it is ready
     again, model load and context included, median; `back_ms`, `back_max_ms`: from a signal until the run is back to its
     pace, median and longest; `not_back`: signals after which the next signal came before the run was back to its pace;
-    `left`: processes and names in /dev/shm afterwards.
+    `left`: processes and names of Trilane's in /dev/shm afterwards.
 
     Raises BadInputError, MissingPartError.
     """
@@ -235,7 +235,8 @@ def _moments(fault: str, times: int, seconds: float, stop_s: float, seed: int) -
 
 
 def _names() -> set[str]:
-    return {path.name for path in SHM.iterdir()} if SHM.is_dir() else set()
+    """What Trilane has in /dev/shm; other programs come and go there."""
+    return {path.name for path in SHM.glob("*trilane*")}
 
 
 def _check(

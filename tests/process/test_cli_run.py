@@ -6,6 +6,7 @@ The tiny network's pictures mean nothing; what is tested is what the command lea
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -26,6 +27,7 @@ from trilane.avatars.network_split import cuts
 from trilane.figure_sources import COMPUTED, NO_FIGURES
 from trilane.pipeline.fork_server import process_name
 from trilane.scheduler.recording import read, replay
+from trilane.units import UNITS
 
 FRAMES = 20
 PATIENCE_S = 60.0
@@ -55,7 +57,8 @@ def presented_something(folder: Path) -> bool:
 @contextmanager
 def running(bundle: Path, folder: Path) -> Iterator[tuple[subprocess.Popen[str], list[psutil.Process]]]:
     """A long run that has presented frames, and the processes of its units."""
-    arguments = command(bundle, "--frames", "100000", "--out", "run")
+    cores = [word for unit in UNITS for word in ("--cores", f"{unit}={min(os.sched_getaffinity(0))}")]
+    arguments = command(bundle, "--frames", "100000", "--out", "run", *cores)  # asked for, so that none are tried
     with subprocess.Popen(arguments, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as parent:
         try:
             wait_until(lambda: presented_something(folder) or parent.poll() is not None, "frames")
@@ -173,14 +176,14 @@ def test_an_interrupted_run_keeps_its_frames_and_ends_its_units(drawable_bundle:
     assert json.loads(out)["interrupted"]
     assert {path.name for path in (tmp_path / "run").iterdir()} == WHOLE
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
-    assert psutil.wait_procs(units, timeout=5)[1] == []
+    assert psutil.wait_procs(units, timeout=PATIENCE_S)[1] == []
 
 
 def test_a_killed_run_leaves_nothing_that_looks_whole(drawable_bundle: Path, tmp_path: Path) -> None:
     with running(drawable_bundle, tmp_path) as (parent, units):
         assert len(units) >= 3
         parent.kill()
-    assert psutil.wait_procs(units, timeout=10)[1] == [], "the units end with their parent"
+    assert psutil.wait_procs(units, timeout=PATIENCE_S)[1] == [], "the units end with their parent"
     assert [path.suffix for path in tmp_path.iterdir()] == [".partial"]
 
 

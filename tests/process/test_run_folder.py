@@ -18,6 +18,7 @@ from trilane.hw_profiles.host import host_units
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run import run_pipeline
 from trilane.pipeline.shared_assets import Assets
+from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scene.schema import OutputSpec, Scene
 from trilane.scheduler.recording import read, replay
 from trilane.stages.config import RunConfig
@@ -45,13 +46,14 @@ class Listener:
 
 
 @pytest.fixture
-def behaviour(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
+def behaviour(starter: UnitStarter, monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
     """Runs are of doubles; what is put in here is how they behave, by stage."""
     asked: dict[str, object] = {}
 
     def run_doubles(config: RunConfig, assets: Assets, frames: int | None, edge: str, **options: Any) -> RunResult:
         pipeline = pipeline_of_doubles(**asked).with_rule(edge)
-        return run_pipeline(pipeline, frames or config.scene.frames, fps=config.scene.fps, assets=assets, **options)
+        count, fps = frames or config.scene.frames, config.scene.fps
+        return run_pipeline(pipeline, count, fps=fps, assets=assets, **{**options, "starter": starter})
 
     monkeypatch.setattr("trilane.apps.run_job.run_avatar", run_doubles)
     return asked
@@ -77,7 +79,9 @@ def test_a_run_leaves_one_whole_folder_and_no_process(tmp_path: Path) -> None:
     assert {"report.json", "trace.pftrace", "events.jsonl"} <= {path.name for path in outcome.folder.iterdir()}
 
 
-def test_the_report_has_the_keys_of_the_schema_and_the_baseline(tmp_path: Path) -> None:
+def test_the_report_has_the_keys_of_the_schema_and_the_baseline(tmp_path: Path, behaviour: dict[str, object]) -> None:
+    """One after the other, jobs take 23 ms of a frame; the slowest unit takes 11."""
+    behaviour.update(raster=10, infer=10)
     report = read_report(run_mocks(tmp_path / "run", Listener()).folder)
     assert report.clock == "host"
     assert (report.frames.requested, report.frames.presented, report.frames.lost) == (FRAMES, FRAMES, 0)
@@ -148,11 +152,11 @@ def test_an_interrupted_run_keeps_what_was_presented(tmp_path: Path) -> None:
 
 
 def test_an_interrupted_baseline_loses_nothing_of_the_run(tmp_path: Path) -> None:
-    outcome = run_mocks(tmp_path / "run", Listener("sequential", 1), Plan(baseline_frames=2000), frames=500)
+    outcome = run_mocks(tmp_path / "run", Listener("sequential", 1), Plan(baseline_frames=2000), frames=60)
     assert outcome.exit_code == 130
     assert not outcome.report.interrupted
     assert outcome.report.baseline is None
-    assert read_report(outcome.folder).frames.presented == 500
+    assert read_report(outcome.folder).frames.presented == 60
     assert not (outcome.folder / "sequential").exists()
 
 

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("nothing_left")
 
 @pytest.mark.parametrize(("name", "queries"), [("single-stream", 64), ("server", 662), ("offline", 64)])
 def test_every_query_is_answered_and_judged(name: str, queries: int) -> None:
-    asked = Load(name, seconds=0.1, rate=300, limit_ms=5000)  # 64 frames take 0.128 s at least: two stages of 1 ms
+    asked = Load(name, seconds=0.1, rate=300, limit_ms=60_000)  # 64 frames take 0.128 s at least: two stages of 1 ms
     row, summary = scenario.run_scenario(doubles(), {}, asked, "trilane", "pipelined")
     assert (row["verdict"], row["because"], summary) == ("VALID", "", "")
     assert row["queries"] >= queries
@@ -31,7 +31,9 @@ def test_a_query_of_several_frames_takes_longer_than_one(monkeypatch: pytest.Mon
     pipeline = doubles(infer=5)
     one, _ = scenario.run_scenario(pipeline, {}, Load("single-stream", seconds=0.1), "trilane", "pipelined")
     four, _ = scenario.run_scenario(pipeline, {}, Load("multi-stream", seconds=0.1, samples=4), "trilane", "pipelined")
-    assert four["p50_ms"] > one["p50_ms"] + 10
+    assert one["p50_ms"] >= 5 + 4  # infer and four stages of 1 ms
+    assert four["p50_ms"] >= 4 * 5 + 4  # the DSP makes one frame at a time
+    assert four["p50_ms"] > one["p50_ms"]
 
 
 def test_a_server_that_is_too_slow_is_invalid_and_says_why() -> None:
@@ -44,7 +46,7 @@ def test_a_server_that_is_too_slow_is_invalid_and_says_why() -> None:
 @pytest.mark.parametrize("name", ["single-stream", "server"])
 def test_loadgen_finds_it_valid(name: str) -> None:
     pytest.importorskip("mlperf_loadgen")
-    asked = Load(name, seconds=0.2, rate=300, limit_ms=5000)
+    asked = Load(name, seconds=0.2, rate=300, limit_ms=60_000)
     row, summary = scenario.run_scenario(doubles(), {}, asked, "loadgen", "pipelined")
     assert row["verdict"] == "VALID"
     assert "Result is : VALID" in summary

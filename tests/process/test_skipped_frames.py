@@ -55,10 +55,10 @@ def test_a_unit_that_dies_between_skipping_frames_costs_no_more_than_its_jobs(
     unit: str, policy: str, edge: str, tmp_path: Path
 ) -> None:
     doubles = with_pose(
-        pipeline_of_doubles(tmp_path / "log", infer=5, composite=3), "trilane.testing.doubles:build_skipping", BYPASS
+        pipeline_of_doubles(tmp_path / "log", infer=10, composite=6), "trilane.testing.doubles:build_skipping", BYPASS
     )
     kill, victims = kills(unit)
-    result = run_pipeline(doubles.with_rule(edge), 60, policy=policy, pace_fps=200, isolated_frames=0, on_progress=kill)
+    result = run_pipeline(doubles.with_rule(edge), 60, policy=policy, pace_fps=100, isolated_frames=0, on_progress=kill)
     report, presented = result.report, [int(line) for line in (tmp_path / "log").read_text().split()]
     assert (result.failure, bool(victims), report.units[unit].restarts) == (None, True, 1)
     assert presented == sorted(set(presented)) and len(presented) == result.presented
