@@ -21,6 +21,7 @@ import psutil
 import pytest
 from PIL import Image
 
+from trilane import machine
 from trilane.apps.report import read_report
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_split import cuts
@@ -57,7 +58,7 @@ def presented_something(folder: Path) -> bool:
 @contextmanager
 def running(bundle: Path, folder: Path) -> Iterator[tuple[subprocess.Popen[str], list[psutil.Process]]]:
     """A long run that has presented frames, and the processes of its units."""
-    cores = [word for unit in UNITS for word in ("--cores", f"{unit}={min(os.sched_getaffinity(0))}")]
+    cores = [word for unit in UNITS for word in ("--cores", f"{unit}={min(machine.here.cores())}")]
     arguments = command(bundle, "--frames", "100000", "--out", "run", *cores)  # asked for, so that none are tried
     with subprocess.Popen(arguments, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as parent:
         try:
