@@ -6,7 +6,6 @@ The tiny network's pictures mean nothing; what is tested is what the command lea
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
