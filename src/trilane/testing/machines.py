@@ -69,7 +69,8 @@ class Outcome:
     """What a row did. `failures`: a line for each; `reason`: why it could not be tried."""
 
     name: str
-    counts: Mapping[str, int] = field(default_factory=dict)
+    passed: int = 0
+    skipped: int = 0
     failures: tuple[str, ...] = ()
     seconds: float = 0.0
     reason: str = ""
@@ -77,7 +78,7 @@ class Outcome:
     def __str__(self) -> str:
         if self.reason:
             return f"{self.name:20}  not run: {self.reason}"
-        said = ", ".join(f"{self.counts.get(word, 0)} {word}" for word in ("passed", "failed", "skipped"))
+        said = f"{self.passed} passed, {len(self.failures)} failed, {self.skipped} skipped"
         return f"{self.name:20}  {said}  {self.seconds:.0f} s"
 
 
@@ -87,15 +88,16 @@ def load_rows(file: Path = TABLE) -> tuple[list[Row], list[str]]:
     return [Row(**row) for row in table["row"]], table["everywhere"]
 
 
-def outcome_of(name: str, text: str, code: int, seconds: float) -> Outcome:
-    """From what pytest printed with `-ra` and its exit code. A row in which no test passed has shown nothing."""
-    summary = text.rstrip().rpartition("\n")[2]
-    counts = {word: int(count) for count, word in re.findall(r"(\d+) (passed|failed|skipped|error)", summary)}
-    counts["failed"] = counts.get("failed", 0) + counts.pop("error", 0)
-    failures = [match[1] for match in re.finditer(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", text, re.MULTILINE)]
-    if not failures and (code != 0 or not counts.get("passed")):
-        failures = [f"pytest ended with exit code {code}: {summary}"]
-    return Outcome(name, counts, tuple(failures), seconds)
+def outcome_of(row: Row, text: str, code: int, told: Path, seconds: float) -> Outcome:
+    """From what pytest told a file and printed. A row in which no test passed has shown nothing."""
+    found: dict[str, Any] = {"failed": [], "skipped": [], "passed": 0}
+    if told.is_file():
+        found = json.loads(told.read_text(encoding="utf-8"))
+        told.unlink()
+    failures = found["failed"]
+    if not failures and (code != 0 or not found["passed"]):
+        failures = [f"pytest ended with exit code {code}: {text.rstrip().rpartition(chr(10))[2]}"]
+    return Outcome(row.name, found["passed"], len(found["skipped"]), tuple(failures), seconds)
 
 
 def lowest_versions(project: Mapping[str, Any]) -> list[str]:
@@ -109,11 +111,13 @@ def find_python(version: str) -> Path:
     if version == "{}.{}".format(*sys.version_info):
         return Path(sys.executable)
     own = PYENV.expanduser().glob(f"{version}.*/bin/python")
-    newest_first = sorted(own, key=lambda path: int(path.parts[-3].split(".")[2]), reverse=True)
+    newest_first = sorted(map(str, own), key=lambda path: int(Path(path).parts[-3].split(".")[2]), reverse=True)
     # pyenv also puts a program of every version on PATH, which fails where that version is not chosen
-    for path in filter(None, (machine.here.program(f"python{version}"), *newest_first)):
-        done = subprocess.run([path, "-c", "import venv, ensurepip"], capture_output=True, check=False)
-        if done.returncode == 0:
+    for path in (machine.here.program(f"python{version}"), *newest_first):
+        if (
+            path
+            and subprocess.run([path, "-c", "import venv, ensurepip"], capture_output=True, check=False).returncode == 0
+        ):
             return Path(path)
     raise CannotRunError(f"no Python {version} on PATH or in {PYENV}")
 
@@ -131,7 +135,7 @@ def environment_python(row: Row, wanted: Sequence[str]) -> Path:
     if not (stamp.is_file() and stamp.read_text(encoding="utf-8") == text):
         shutil.rmtree(folder, ignore_errors=True)
         subprocess.run([python, "-m", "venv", folder], check=True, capture_output=True, text=True)
-        pip = [folder / "bin/python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *wanted]
+        pip = [str(folder / "bin/python"), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *wanted]
         done = subprocess.run(pip, capture_output=True, text=True, check=False)
         if any(words in done.stderr for words in NO_NETWORK):
             raise CannotRunError("pip reaches no package index")
@@ -187,7 +191,7 @@ def run_row(row: Row, everywhere: Sequence[str]) -> Outcome:
     except subprocess.CalledProcessError as error:
         lines = [line for line in (error.stderr or "").splitlines() if line.startswith("ERROR")] or ["no words"]
         failure = f"its environment could not be made: {lines[0]}"
-        return Outcome(row.name, {}, (failure,), time.monotonic() - began)
+        return Outcome(row.name, failures=(failure,), seconds=time.monotonic() - began)
 
 
 def _run(row: Row, everywhere: Sequence[str], began: float) -> Outcome:
@@ -205,7 +209,10 @@ def _run(row: Row, everywhere: Sequence[str], began: float) -> Outcome:
         }
         tests = [row.own_test, *row.tests, *everywhere]
         wrapper = [word.format(first_core=machine.here.cores()[0]) for word in row.wrapper]
-        words = [*wrapper, python, "-m", "pytest", "--quiet", "--color=no", "-p", "no:cacheprovider", *tests]
+        KEPT.mkdir(parents=True, exist_ok=True)
+        told = KEPT / f"{row.name}.json"
+        plugins = ["-p", "no:cacheprovider", "-p", "trilane.testing.checks", f"--tell={told}"]
+        words = [*wrapper, str(python), "-m", "pytest", "--quiet", "--color=no", *plugins, *tests]
         done = subprocess.run(
             words,
             cwd=root,
@@ -217,9 +224,8 @@ def _run(row: Row, everywhere: Sequence[str], began: float) -> Outcome:
             check=False,
         )
     text = done.stdout.decode(errors="replace")
-    KEPT.mkdir(parents=True, exist_ok=True)
     (KEPT / f"{row.name}.log").write_text(text, encoding="utf-8")
-    return outcome_of(row.name, text, done.returncode, time.monotonic() - began)
+    return outcome_of(row, text, done.returncode, told, time.monotonic() - began)
 
 
 def last_line(outcomes: Sequence[Outcome]) -> str:
