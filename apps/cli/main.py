@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import importlib
+import io
 import os
 import sys
 from typing import Annotated, Any, NoReturn
@@ -150,6 +151,8 @@ def _call(arguments: list[str]) -> None:
 
 def main() -> None:
     """Run the command line of `sys.argv`; leaves by SystemExit with one of the exit codes."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # what a locale's encoding lacks is printed as a question mark
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     debug = len(arguments) < len(sys.argv) - 1
     try:

@@ -16,7 +16,8 @@ from trilane.errors import TrilaneError
 
 def shader_source(name: str | Path, **defines: int | str) -> str:
     """Text of shader `name`, a file of `trilane.shaders` or a path, with the definitions inserted."""
-    text = name.read_text() if isinstance(name, Path) else (files("trilane.shaders") / name).read_text()
+    file = name if isinstance(name, Path) else files("trilane.shaders") / name
+    text = file.read_text(encoding="utf-8")
     version, _, body = text.partition("\n")
     lines = [version, *(f"#define {key} {value}" for key, value in defines.items()), "#line 2", body]
     return "\n".join(lines)

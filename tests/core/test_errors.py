@@ -213,4 +213,4 @@ def test_no_code_reads_the_parts_out_of_a_text() -> None:
         file for folder in (PACKAGE, *(p for p in PACKAGE.iterdir() if p.is_dir())) for file in folder.rglob("*.py")
     ]
     assert len(files) > 200
-    assert {str(file): found for file in files if (found := calls(ast.parse(file.read_text())))} == {}
+    assert {str(file): found for file in files if (found := calls(ast.parse(file.read_text(encoding="utf-8"))))} == {}

@@ -152,6 +152,14 @@ def test_doctor_prints_a_table_without_colour_when_asked() -> None:
     assert "\x1b[" not in done.stdout
 
 
+def test_what_the_encoding_of_stdout_lacks_is_a_question_mark() -> None:
+    """And so it is in a locale without one."""
+    words = ("profiles", "show", "snapdragon-888")
+    done, by_locale = run_trilane(*words, PYTHONIOENCODING="ascii"), run_trilane(*words)
+    assert (done.returncode, done.stderr, by_locale.returncode, by_locale.stderr) == (0, "", 0, "")
+    assert "| value    | ? % | kind" in done.stdout
+
+
 def test_completion_knows_the_commands_and_their_options() -> None:
     found = {}
     for words, place in (("trilane ru", "1"), ("trilane run --pol", "2")):
