@@ -2,7 +2,7 @@
 # Arguments of `trilane run` go in ARGS: make run ARGS="--frames 60 --size 192"
 SHELL := /bin/bash
 .DELETE_ON_ERROR:
-.PHONY: run test test-all test-rest test-device mutants results setup format compile interpreted clean
+.PHONY: run test test-all test-rest test-machines test-device mutants results setup format compile interpreted clean
 
 BIN := .venv/bin
 COMPILED := $(shell sed -n 's/^    "\(.*\.py\)",$$/\1/p' src/trilane/compiled.py)
@@ -23,6 +23,11 @@ test-all: .venv/ready-all .venv/ready-core
 # What the last `make test` left out: slow tests, and those that it skipped for want of an extra.
 test-rest: .venv/ready-all .venv/ready-core
 	@$(call checks,--rest)
+
+# Some tests once more on each machine of tests/machines.toml: one core, no compiler, another locale and more.
+# ARGS=--environments: those with packages or a Python of their own, which are installed once.
+test-machines: .venv/ready-test .venv/ready-core
+	@$(BIN)/python -m trilane.testing.machines $(ARGS)
 
 # What needs a GPU: hardware OpenGL, training on CUDA, the runtime cuda. Exit code 3 where there is none.
 test-device: .venv/ready-device
