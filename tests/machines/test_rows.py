@@ -21,6 +21,7 @@ import pytest
 
 import trilane
 from trilane import machine
+from trilane.apps.run_folder import RunFolder
 from trilane.cache import cache_dir
 from trilane.compiled import form
 from trilane.pipeline.hardware_counters import availability
@@ -28,6 +29,7 @@ from trilane.pipeline.unit_starter import UnitStarter
 from trilane.stages.dsp.runtime import installed
 from trilane.stages.machine_facts import cpu_facts, package_version
 from trilane.testing.machines import lowest_versions
+from trilane.writing import write_bytes, write_folder
 
 ROOT = Path(__file__).resolve().parents[2]
 DOT_PRODUCTS = {"avx512_vnni", "avx_vnni", "amx_int8", "asimddp", "i8mm"}
@@ -104,8 +106,18 @@ def test_time_zone() -> None:
 
 
 def test_umask(tmp_path: Path) -> None:
+    """And nothing that the product writes is open to others."""
     (tmp_path / "file").touch()
     assert stat.S_IMODE((tmp_path / "file").stat().st_mode) == 0o600
+    write_bytes(tmp_path / "written", b"1")
+    with write_folder(tmp_path / "folder") as draft:
+        (draft / "inside").touch()
+    with RunFolder(tmp_path / "run") as run:
+        (run.work / "report.json").touch()
+        run.complete()
+    modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in tmp_path.rglob("*")}
+    assert {name for name, mode in modes.items() if mode & 0o077} == set()
+    assert {"written", "folder", "inside", "run", "report.json"} <= set(modes)
 
 
 def test_lowest() -> None:
