@@ -33,8 +33,13 @@ ROOT = Path(__file__).resolve().parents[3]
 TABLE = ROOT / "tests" / "machines.toml"
 KEPT = ROOT / ".venv" / "machines"
 PYENV = Path("~/.pyenv/versions")
-#: What `make test` installs; the tools that check style and types are not run here.
 EXTRAS = ("openvino", "metrics", "dev")
+NOT_HERE = (
+    "ruff",
+    "mypy",
+    "setuptools",
+    "build",
+)  # of `dev`: style, types and wheels are not checked on these machines
 NO_NETWORK = ("Network is unreachable", "Temporary failure in name resolution", "Connection refused")
 
 
@@ -102,8 +107,8 @@ def outcome_of(row: Row, text: str, code: int, told: Path, seconds: float) -> Ou
 
 def lowest_versions(project: Mapping[str, Any]) -> list[str]:
     """What a run and its tests need, each `>=` as `==`. `project`: that of pyproject.toml."""
-    extras = project["optional-dependencies"]
-    return [line.replace(">=", "==") for line in (*project["dependencies"], *(e for x in EXTRAS for e in extras[x]))]
+    extras = [line for extra in EXTRAS for line in project["optional-dependencies"][extra]]
+    return [line.replace(">=", "==") for line in (*project["dependencies"], *extras) if not line.startswith(NOT_HERE)]
 
 
 def find_python(version: str) -> Path:
@@ -190,7 +195,7 @@ def run_row(row: Row, everywhere: Sequence[str]) -> Outcome:
         return Outcome(row.name, reason=str(why))
     except subprocess.CalledProcessError as error:
         lines = [line for line in (error.stderr or "").splitlines() if line.startswith("ERROR")] or ["no words"]
-        failure = f"its environment could not be made: {lines[0]}"
+        failure = f"its environment could not be made: {lines[-1]}"
         return Outcome(row.name, failures=(failure,), seconds=time.monotonic() - began)
 
 
