@@ -34,12 +34,8 @@ TABLE = ROOT / "tests" / "machines.toml"
 KEPT = ROOT / ".venv" / "machines"
 PYENV = Path("~/.pyenv/versions")
 EXTRAS = ("openvino", "metrics", "dev")
-NOT_HERE = (
-    "ruff",
-    "mypy",
-    "setuptools",
-    "build",
-)  # of `dev`: style, types and wheels are not checked on these machines
+#: Of `dev`: style, types and wheels are not checked on these machines.
+NOT_HERE = ("ruff", "mypy", "setuptools", "build")
 NO_NETWORK = ("Network is unreachable", "Temporary failure in name resolution", "Connection refused")
 
 
