@@ -27,7 +27,7 @@ from trilane.compiled import form
 from trilane.pipeline.hardware_counters import availability
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.stages.dsp.runtime import installed
-from trilane.stages.machine_facts import cpu_facts, package_version
+from trilane.stages.machine_facts import cpu_facts, package_version, runtime_facts
 from trilane.testing.machines import lowest_versions
 from trilane.writing import write_bytes, write_folder
 
@@ -78,6 +78,7 @@ def test_no_compiler() -> None:
 def test_no_openvino() -> None:
     assert package_version("openvino") is None
     assert [("openvino" in names, "ort" in names) for names in here_and_in_units(installed)] == [(False, True)] * 2
+    assert list(runtime_facts()) == ["onnxruntime"]
     with pytest.raises(ModuleNotFoundError):
         importlib.import_module("openvino")
 
