@@ -17,11 +17,9 @@ from typing import Any, NamedTuple
 
 BIN = Path(sys.executable).parent
 STYLE = (["ruff", "check", "."], ["ruff", "format", "--check", "."], ["mypy"])
-#: Tests share the cores, a file of them on one worker.
-GROUPS = (
-    ["--numprocesses", "auto", "--dist", "loadfile", "tests/core", "tests/golden"],
-    ["tests/conformance", "tests/process"],
-)
+#: Tests share the cores, a file of them on one worker. Files that wait the longest come first, small ones at the end.
+FOLDERS = ("process", "conformance", "golden", "core")
+GROUPS = (["--numprocesses", "auto", "--dist", "loadfile", *(f"tests/{folder}" for folder in FOLDERS)],)
 #: Beside the packages that decide what is skipped: the tests that `make test` skipped here, for `make test-rest`.
 SKIPPED = Path(sys.prefix) / "skipped-tests.txt"
 
