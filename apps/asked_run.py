@@ -38,7 +38,7 @@ class AskedRun:
     `out`: the run folder; None: `runs/TIME-SCENE`.
     `command`: the words by which it was asked for.
     `has_video`: whether the presented pictures are digested and encoded; not for runs that last.
-    `check`: how many of its frames are compared with the reference path when it is over; 0: none.
+    `check`: how many of its frames are compared with the truth or the float path when it is over; 0: none.
     `remake`: what of the avatar is made anew for the run.
     `held_ns`: how long jobs of a stage are held, at least, by its name; in place of a chip's pace.
     """
@@ -141,11 +141,11 @@ def _with_remade_avatar(request: Request, remake: Remake, *, is_checked: bool) -
 
 
 def _require_check(checked: Checked) -> None:
-    """Raises BadInputError, MissingPartError for what the reference path cannot be compared with."""
-    from trilane.apps.experiments.picture_errors import require_metrics
-    from trilane.errors import BadInputError
+    """Raises BadInputError, MissingPartError for what nothing can be compared with: found out before the run."""
+    from trilane.apps.run_check import require_parts
+    from trilane.avatars.bundle import load_bundle
 
-    require_metrics()
+    require_parts(load_bundle(folder) for folder in dict.fromkeys(checked.config.avatar_dirs))
     if checked.config.scene.hud:
         raise BadInputError("--check", "a scene with a HUD", "pictures without", "--no-hud leaves it out")
 

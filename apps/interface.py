@@ -171,8 +171,8 @@ def run(
     `trilane run` of that name; None leaves what the scene says.
     `cores`: numbers of the cores of a unit, such as {"dsp": [0, 1]}; else they follow from measured times.
     `baseline_frames`: of a `sequential` run that follows, to compare with.
-    `check`: how many of its frames are compared with the reference path when it is over; the report's `check` is the
-    error of this run then (extra `metrics`).
+    `check`: how many of its frames are compared with the truth or the float path when it is over; the report's
+    `check` is the error of this run then (extra `metrics`).
     `width`, `channels`, `calibration`: of an avatar made anew, as `trilane run` takes them (docs/sweeps.md).
     `out`: the run folder to write, runs/TIME-SCENE below the working directory where it is None.
     `on_progress(policy, presented, requested)`, `on_message(text)`: called from this thread.

@@ -151,25 +151,34 @@ class Video(Record):
     seconds: float
 
 
-class Check(Record):
-    """Frames of the run itself against the reference path, where the avatars are.
+class FrameErrors(Record):
+    """Frames of the run itself `against` something, where the avatars are.
 
-    `frames`: how many were compared; `numbers`: which.
     `psnr_db`, `mae` (steps of 1/255), `ssim`, `flip`: means over them; `ssim` null where the picture is too small.
-    `worst_psnr_db`: of one frame.
-    `iou`: mean, of where picture and reference differ from the background.
-    `against`: what they were compared with.
+    `worst_psnr_db`: of one frame; `p1_psnr_db`: 1st percentile, null in reports of an older Trilane.
+    `iou`: mean, of where both pictures differ from the background.
     """
 
-    frames: int
+    against: str
     psnr_db: float
     worst_psnr_db: float
+    p1_psnr_db: float | None = None
     mae: float
     ssim: float | None
     flip: float
     iou: float
-    against: str
+
+
+class Check(FrameErrors):
+    """Frames of the run itself against the truth where it is known, else against the float path.
+
+    `frames`: how many were compared; `numbers`: which. `float_path`: the same frames against the float path; null where
+    the first figures are that already.
+    """
+
+    frames: int
     numbers: tuple[int, ...]
+    float_path: FrameErrors | None = None
 
 
 class Made(Record):
@@ -311,7 +320,7 @@ class Report(RunMetrics, Preamble):
     `resolution`: of a run whose frames had to be in time and whose tensor was planned; absent for others.
     `pace`: of a run at a chip's pace.
     `accuracy`: of each avatar, what `trilane.avatars.validation.accuracy_of` says: its figures, or why there are none.
-    `check`: frames of the run itself against the reference path; absent where none was asked for.
+    `check`: frames of the run itself against the truth or the float path; absent where none was asked for.
     `sources`: key, dotted where it is inside another, to where the figures below it come from; the longest key decides.
     `notes`: the format that each opened file was read as, and what was chosen for the run.
     `video`: null when no frame was recorded.

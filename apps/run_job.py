@@ -54,7 +54,7 @@ class Plan:
     `performance_profile`: whose caps hold; None: no cap.
     `latch_ms`: how long before it is needed a pose is sampled; not in the run that is compared with.
     `edge`: rule of every edge.
-    `check`: how many of its frames are compared with the reference path when it is over.
+    `check`: how many of its frames are compared with the truth or the float path when it is over.
     """
 
     policy: str = "pipelined"
@@ -257,7 +257,7 @@ def _checked_frames(checked: Checked, work: Path, hooks: Hooks, interrupted: Cal
         _require(not interrupted())
         return {"check": check_run(checked, work, told)}
     except TrilaneError as error:
-        said = f"the run was not compared with the reference path: {error}"
+        said = f"the run's frames were not compared: {error}"
         hooks.message(said)
         return {"notes": [*_notes(checked), said]}
     finally:

@@ -24,7 +24,7 @@ from trilane.bench.lib.picture_error import PictureErrors, require_metrics
 from trilane.bench.lib.plans import fixed, in_frames, planned
 from trilane.bench.lib.shape_changes import shape_changes, summed_up
 from trilane.bench.lib.stage_chain import AvatarFrames
-from trilane.bench.lib.true_picture import TruePictures, has_truth
+from trilane.bench.lib.true_picture import true_pictures
 from trilane.errors import BadInputError, TrilaneError
 from trilane.figure_sources import MEASURED
 from trilane.pipeline.unit_starter import UnitStarter
@@ -143,7 +143,7 @@ class _Scene:
         first = AvatarFrames(self._checked)
         chains = {plan: AvatarFrames(checked, first.units) for plan, checked in self._plans.items()}
         self.driver = asdict(describe(first.gl))
-        true = TruePictures(cast, first.gl) if has_truth(cast) else None
+        true = true_pictures(cast, first.gl)
         against_full = {plan: PictureErrors() for plan in chains}
         against_true = {plan: PictureErrors() for plan in ("full", *chains)}
         sheets, tensors = [], []

@@ -107,7 +107,11 @@ BaselineOption = Annotated[
 ]
 CheckOption = Annotated[
     int,
-    typer.Option(min=0, max=MOST_CHECKED, help="Frames to compare with the reference when the run is over; 0: none."),
+    typer.Option(
+        min=0,
+        max=MOST_CHECKED,
+        help="Frames to compare with the truth or the float path when the run is over; 0: none.",
+    ),
 ]
 
 

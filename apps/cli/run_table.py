@@ -17,7 +17,7 @@ from trilane.scheduler.stats import samples_needed
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from trilane.apps.report import Baseline, Check, Made, PaceComparison, Report
+    from trilane.apps.report import Baseline, Check, FrameErrors, Made, PaceComparison, Report
     from trilane.pipeline.run_metrics import Caps, MovedBytes, StageTimes, Temperature, TimeSummary, UnitShares
 
     #: Name of a row, what it measures, and a cell for each run.
@@ -76,7 +76,7 @@ def _caption(report: Report) -> str:
     if report.caps.performance_profile:
         lines.append(_caps(report.caps, report.temperature_c))
     if report.check:
-        lines.append(_check(report.check))
+        lines += _check(report.check)
     lines += [accuracy_line(name, facts) for name, facts in report.accuracy.items()]
     return escape("\n".join(lines))
 
@@ -95,11 +95,17 @@ def _pace(pace: PaceComparison) -> str:
     )
 
 
-def _check(check: Check) -> str:
+def _check(check: Check) -> list[str]:
+    """A line for each thing that the frames were compared with."""
+    errors = [check, *([check.float_path] if check.float_path else [])]
+    return [f"of this run, {check.frames} frames against {_errors(each)} ({MEASURED})" for each in errors]
+
+
+def _errors(found: FrameErrors) -> str:
     return (
-        f"of this run, {check.frames} frames against {check.against}: PSNR {check.psnr_db:.1f} dB, worst "
-        f"{check.worst_psnr_db:.1f}; MAE {check.mae:.2f} of 255; FLIP {check.flip:.3f}; IoU of all but background "
-        f"{check.iou:.3f} ({MEASURED})"
+        f"{found.against}: PSNR mean {found.psnr_db:.1f} dB, 1st percentile {_number(found.p1_psnr_db, 1)}, worst "
+        f"{found.worst_psnr_db:.1f}; MAE {found.mae:.2f} of 255; FLIP {found.flip:.3f}; IoU of all but background "
+        f"{found.iou:.3f}"
     )
 
 

@@ -9,7 +9,7 @@ import hashlib
 import signal
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
@@ -98,6 +98,8 @@ def sweep(
         from trilane.apps.sweeps.ray_engine import required_ray
 
         required_ray()
+    else:
+        _require_checks(trials)
     folder = out or _default_folder(name, trials)
     failed = _run(trials, folder, definition, engine, resume, as_json)
     raise typer.Exit(SOME_FAILED if failed else 0)
@@ -155,6 +157,22 @@ def _trials(first: str, definition: Definition, command: SweptCommand) -> list[T
         if not first.endswith(ENDING):
             raise
         raise BadInputError(f"{first}: {error.where}", error.found, error.expected, error.remedy) from None
+
+
+def _require_checks(trials: Sequence[Trial]) -> None:
+    """Raises MissingPartError where runs are to be checked and cannot be: found out before the first trial.
+
+    What else is wrong with a trial, it says itself.
+    """
+    from trilane.apps.run_check import require_parts
+    from trilane.avatars.bundle import load_bundle
+    from trilane.stages.configure import Request, requested_scene
+
+    runs = [trial.options for trial in trials if trial.command == ("run",) and trial.options.get("check")]
+    for scene, avatar in {(options.get("scene", "default"), options.get("avatar")) for options in runs}:
+        with suppress(BadInputError):
+            asked = Request(scene=str(scene), avatar=None if avatar is None else str(avatar))
+            require_parts(load_bundle(each.bundle) for each in requested_scene(asked).avatars)
 
 
 def _default_folder(name: str, trials: Sequence[Trial]) -> Path:

@@ -99,9 +99,9 @@ def _spread(total: int, frames: int) -> list[int]:
 
 def _truth(path: ReferencePath) -> Any:
     """The clothed bodies of the scene, where they are known; else None."""
-    from trilane.bench.lib.true_picture import TruePictures, has_truth
+    from trilane.bench.lib.true_picture import true_pictures
 
-    return TruePictures(path.cast, path.gl) if has_truth(path.cast) else None
+    return true_pictures(path.cast, path.gl)
 
 
 @dataclass

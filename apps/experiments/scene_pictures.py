@@ -73,9 +73,10 @@ class ScenePictures:
 
 def wanted_pictures(cast: Cast, ctx: Any) -> tuple[Wanted, str]:
     """What pictures of `cast` are compared with, and which of both it is. `ctx`: the OpenGL context in use."""
-    from trilane.bench.lib.true_picture import TruePictures, has_truth
+    from trilane.bench.lib.true_picture import true_pictures
 
-    return (TruePictures(cast, ctx).frame, TRUTH) if has_truth(cast) else (FullPictures(cast).frame, FULL)
+    true = true_pictures(cast, ctx)
+    return (FullPictures(cast).frame, FULL) if true is None else (true.frame, TRUTH)
 
 
 def spread(total: int, frames: int) -> list[int]:

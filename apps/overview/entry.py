@@ -27,7 +27,8 @@ class Entry:
 
     `command`: word by word; empty where none is known. `frame_ms`, `low_ms`, `high_ms`: mean frame time and its
     interval, None where there is none; `interval`: what that holds. `psnr_db`: the error; `error_source`: where it
-    comes from, or why there is none; `error_of`: `OF_RUN`, `OF_AVATAR`, or empty. `shows`: what the pictures are of.
+    comes from, or why there is none; `error_of`: `OF_RUN` and against what, `OF_AVATAR`, or empty.
+    `shows`: what the pictures are of.
     `video`: of a run. `failure`: why there are no figures. `within`: name of the folder of its run, or of its sweep.
     """
 
@@ -115,7 +116,8 @@ def _error(document: Mapping[str, Any]) -> tuple[float | None, str, str]:
     """PSNR, where it comes from and what it is of: of the run itself where it was compared, else its avatars' least."""
     check = _mapping(document, "check")
     if (own := _number(check.get("psnr_db"))) is not None:
-        return own, f"{MEASURED}, {check.get('frames')} frames", OF_RUN
+        against = f"against {str(check.get('against')).partition(':')[0]}"
+        return own, f"{MEASURED}, {check.get('frames')} frames {against}", _text(f"{OF_RUN} {against}")
     avatars = [facts for facts in _mapping(document, "accuracy").values() if isinstance(facts, Mapping)]
     if not avatars:
         return None, NO_FIGURES, ""

@@ -8,6 +8,7 @@ rounding between its layers: what quantising the weights cost is then in `full` 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -32,15 +33,20 @@ Paint = Callable[[F64], F32]
 
 def float_network(bundle: Bundle) -> tuple[Paint, str]:
     """The FP32 network of `bundle`, and what it is, for people. Raises BadInputError, MissingPartError."""
-    weights = float_weights(bundle)
+    weights = require_float_network(bundle)
     if weights is None:
         return dequantised(
             bundle.read_network()
         ), "the integer network's weights in FP32, nothing rounded between layers"
-    try:
-        return trained(bundle, weights), f"the FP32 network it was quantised from, {weights.name}"
-    except ImportError as error:
-        raise MissingPartError(f"the FP32 network needs {error.name}", extra="train") from None
+    return trained(bundle, weights), f"the FP32 network it was quantised from, {weights.name}"
+
+
+def require_float_network(bundle: Bundle) -> Path | None:
+    """Its `float_weights`. Raises MissingPartError when they cannot be run here: found out before long work."""
+    weights = float_weights(bundle)
+    if weights is not None and find_spec("torch") is None:
+        raise MissingPartError("the FP32 network needs torch", extra="train")
+    return weights
 
 
 def float_weights(bundle: Bundle) -> Path | None:

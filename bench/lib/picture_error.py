@@ -51,6 +51,18 @@ class PictureErrors:
         return found
 
 
+def psnr_of_frames(psnr_db: Sequence[float]) -> dict[str, float]:
+    """Of the PSNR of single frames, at least one: mean, worst and 1st percentile, linear between ranks.
+
+    A mean hides single bad frames, which people see; the worst of many frames depends on how many there are.
+    """
+    return {
+        "psnr_db": float(np.mean(psnr_db)),
+        "worst_psnr_db": float(np.min(psnr_db)),
+        "p1_psnr_db": float(np.quantile(psnr_db, 0.01)),
+    }
+
+
 def require_metrics() -> None:
     """Raises MissingPartError when a library that computes an error is missing: found out before long work."""
     for module in MODULES:

@@ -13,9 +13,8 @@ from typing import Any
 
 import pytest
 
-from trilane.apps import asked_run, made, pace, run_job
+from trilane.apps import asked_run, made, pace, run_check, run_job
 from trilane.apps.cli import run as cli_run
-from trilane.apps.experiments import picture_errors
 from trilane.apps.report import Report
 from trilane.apps.run_job import Outcome, Plan
 from trilane.errors import BadInputError
@@ -135,10 +134,10 @@ def test_a_run_that_is_steered_is_not_compared(asked: Asked, command: Command) -
 
 
 def test_a_picture_with_a_hud_is_not_compared(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(picture_errors, "require_metrics", lambda: None)
+    monkeypatch.setattr(run_check, "require_parts", lambda _: None)
 
     def checked(hud: bool) -> Any:
-        return SimpleNamespace(config=SimpleNamespace(scene=SimpleNamespace(hud=hud)))
+        return SimpleNamespace(config=SimpleNamespace(scene=SimpleNamespace(hud=hud), avatar_dirs=()))
 
     asked_run._require_check(checked(False))
     with pytest.raises(BadInputError, match="--no-hud"):

@@ -67,10 +67,21 @@ def test_a_report_becomes_a_row() -> None:
     )
 
 
+CHECK = {"psnr_db": 28.5, "frames": 4, "against": "the truth: the clothed body"}
+
+
+def test_errors_against_the_truth_and_against_the_float_path_are_not_compared() -> None:
+    groups = [
+        entry_of("r", {**REPORT, "check": {**CHECK, "against": against}}).group
+        for against in ("the truth: x", "the truth: y", "the float path: z")
+    ]
+    assert groups[0] == groups[1] != groups[2]
+
+
 @pytest.mark.parametrize(
     ("change", "psnr_db", "source"),
     [
-        ({"check": {"psnr_db": 28.5, "frames": 4}}, 28.5, "measured in this run, 4 frames"),
+        ({"check": CHECK}, 28.5, "measured in this run, 4 frames against the truth"),
         ({"accuracy": {}}, None, "no figures"),
         ({"accuracy": {"a": {"psnr_db": 31.0}, "b": {"why": "changed"}}}, None, "no figures: changed"),
     ],

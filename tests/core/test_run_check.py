@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,12 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trilane.apps import run_check, run_job
+from trilane.apps import asked_run, run_job
+from trilane.apps.cli import main as cli
+from trilane.apps.cli import sweep as cli_sweep
 from trilane.apps.experiments.error_by_cause import region
 from trilane.apps.experiments.picture_errors import ErrorFigures
-from trilane.apps.run_check import asked_frames, check_run, differs, summed_up
+from trilane.apps.run_check import FLOAT_PATH, TRUTH, asked_frames, check_run, differs, require_parts, summed_up
+from trilane.arrays import U8
 from trilane.bench.lib.layers import Box
-from trilane.errors import TrilaneError
+from trilane.errors import MissingPartError, TrilaneError
 from trilane.stages.cpu.kept_frames import FOLDER, KeptFrames, kept_frames
 
 
@@ -42,21 +46,20 @@ def test_nothing_is_kept_unless_it_was_asked_for(tmp_path: Path) -> None:
 
 
 def test_the_check_is_of_all_frames_and_names_the_worst() -> None:
-    errors = {
-        3: ErrorFigures(1.0, 30.0, 0.9, None, 0.1, 1.0, 0.8),
-        7: ErrorFigures(2.0, 40.0, None, None, 0.3, 1.0, 0.6),
-    }
-    check = summed_up(errors)
-    assert check.pop("against") == run_check.AGAINST
-    assert check == {
-        "frames": 2,
+    """The 1st percentile of two values is a hundredth of the way from the lower one."""
+    errors = [
+        ErrorFigures(1.0, 30.0, 0.9, None, 0.1, 1.0, 0.8),
+        ErrorFigures(2.0, 40.0, None, None, 0.3, 1.0, 0.6),
+    ]
+    assert summed_up("something", errors) == {
+        "against": "something",
         "psnr_db": 35.0,
         "worst_psnr_db": 30.0,
+        "p1_psnr_db": pytest.approx(30.1),
         "mae": 1.5,
         "ssim": 0.9,
         "flip": pytest.approx(0.2),
         "iou": pytest.approx(0.7),
-        "numbers": (3, 7),
     }
 
 
@@ -68,9 +71,9 @@ def test_a_mask_is_where_the_background_was_changed() -> None:
 
 
 class Black:
-    """In place of the reference: black in its one box, over grey; nobody is seen in frame 4."""
+    """In place of the float path: black in its one box, over grey; nobody is seen in frame 4."""
 
-    output = (200, 200)
+    output, cast, gl = (200, 200), "cast", "gl"
 
     def __init__(self, checked: Any) -> None:
         assert checked == "checked"
@@ -89,9 +92,7 @@ class Black:
 def test_kept_frames_are_compared_where_the_avatars_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The upper half of the box is 102 off, the lower one 51 and not to be told from the background."""
     pytest.importorskip("flip_evaluator")
-    from trilane.apps.experiments import reference_path
-
-    monkeypatch.setattr(reference_path, "ReferencePath", Black)
+    black_float_path(monkeypatch, None)
     kept, picture = KeptFrames(tmp_path, (2, 4)), np.full((200, 200, 3), 51, np.uint8)
     picture[10:100, 10:190] = 102
     picture[100:190, 10:190] = 51
@@ -105,6 +106,118 @@ def test_kept_frames_are_compared_where_the_avatars_are(tmp_path: Path, monkeypa
     assert check["mae"] == pytest.approx((102 + 51) / 2)
     assert check["psnr_db"] == pytest.approx(-10 * np.log10((0.4**2 + 0.2**2) / 2))
     assert check["iou"] == pytest.approx(90 * 180 / (180 * 180 + 1))
+    assert (check["against"], check["float_path"]) == (FLOAT_PATH, None)
+
+
+def black_float_path(monkeypatch: pytest.MonkeyPatch, truth: U8 | None) -> None:
+    """`truth`: the true picture of every frame; None where nobody knows it."""
+    from trilane.apps.experiments import reference_path
+    from trilane.bench.lib import true_picture
+
+    true = None if truth is None else SimpleNamespace(frame=lambda _number, _background: truth)
+    monkeypatch.setattr(reference_path, "ReferencePath", Black)
+    monkeypatch.setattr(true_picture, "true_pictures", lambda cast, gl: true if (cast, gl) == ("cast", "gl") else 1 / 0)
+
+
+BOX = np.s_[10:190, 10:190]
+GREY = np.full((200, 200, 3), 51, np.uint8)
+
+
+def person() -> U8:
+    """Somebody of random colours, far from 0 and 255, in the box, over grey."""
+    picture = GREY.copy()
+    picture[BOX] = np.random.default_rng(8).integers(90, 160, (180, 180, 3))
+    return picture
+
+
+def tinted(picture: U8, levels: int, rows: int) -> U8:
+    changed = picture.copy()
+    changed[10 : 10 + rows, 10:190] += np.uint8(levels)
+    return changed
+
+
+def see_through(picture: U8, alpha: float) -> U8:
+    return np.asarray(np.rint(GREY + alpha * (picture.astype(float) - GREY)), np.uint8)
+
+
+def moved(picture: U8, pixels: int) -> U8:
+    changed = GREY.copy()
+    changed[10:190, 10 + pixels : 190] = picture[10:190, 10 : 190 - pixels]
+    return changed
+
+
+@pytest.mark.parametrize(
+    ("changed", "square"),
+    [
+        (person(), 0.0),
+        (tinted(person(), 12, 180), 12**2),
+        (tinted(person(), 12, 45), 12**2 / 4),
+        (tinted(person(), 40, 45), 40**2 / 4),
+        (see_through(person(), 0.7), 0.3**2 * ((124.5 - 51) ** 2 + (70**2 - 1) / 12)),
+        (moved(person(), 9), 0.95 * (70**2 - 1) / 6 + 0.05 * ((124.5 - 51) ** 2 + (70**2 - 1) / 12)),
+    ],
+    ids=["as it is", "tinted", "a quarter tinted", "a quarter tinted more", "see-through", "moved"],
+)
+def test_the_check_moves_as_the_picture_is_changed(
+    changed: U8, square: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The true picture is a person of evenly random colours from 90 to 159: mean 124.5, variance (70^2 - 1) / 12.
+
+    Mean squares of the changes by hand: d^2 times the share that is tinted; of alpha 0.7, 0.09 times the mean square
+    of colour less background; of a person moved by 9 of 180 columns, twice the variance where they still overlap, and
+    the colour less the background where they do not. Of random colours: within 3 %; a byte of rounding is below that.
+    """
+    pytest.importorskip("flip_evaluator")
+    black_float_path(monkeypatch, person())
+    kept = KeptFrames(tmp_path, (2,))
+    kept.see(2, changed)
+    check = check_run("checked", tmp_path)  # type: ignore[arg-type]
+    wanted_db = 100.0 if not square else -10 * np.log10(square / 255**2)
+    assert check["against"] == TRUTH and check["psnr_db"] == pytest.approx(wanted_db, abs=0.13)
+    assert check["float_path"]["against"] == FLOAT_PATH
+    black = -20 * np.log10(np.sqrt((changed[BOX].astype(float) ** 2).mean()) / 255)
+    assert check["float_path"]["psnr_db"] == pytest.approx(black)
+
+
+def test_a_check_without_its_libraries_is_refused_before_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where an avatar's float network is here PyTorch must be too; of an avatar without one it need not."""
+    from trilane.avatars.bundle import load_bundle
+    from trilane.bench.lib import full_network, picture_error
+
+    bundle = load_bundle("default")
+    monkeypatch.setattr(full_network, "float_weights", lambda each: Path("weights") if each == bundle else None)
+    there = {"skimage", "flip_evaluator", "torch"}
+    for module in (picture_error, full_network):
+        monkeypatch.setattr(module, "find_spec", lambda name: "found" if name in there else None)
+    require_parts([bundle])
+    there.remove("torch")
+    with pytest.raises(MissingPartError, match="torch") as refused:
+        require_parts([bundle])
+    assert "[train]" in str(refused.value)
+    require_parts([load_bundle("hiker")])
+    there.remove("skimage")
+    with pytest.raises(MissingPartError, match=r"skimage.*\[metrics\]"):
+        require_parts([])
+    checked: Any = SimpleNamespace(config=SimpleNamespace(avatar_dirs=(bundle.folder,)))
+    with pytest.raises(MissingPartError, match="skimage"):
+        asked_run._require_check(checked)
+
+
+def test_a_sweep_whose_runs_cannot_be_checked_is_refused_before_its_first_trial(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from trilane.bench.lib import picture_error
+
+    monkeypatch.setattr(picture_error, "find_spec", lambda _: None)
+    words = ("sweep", "run", "--size", "64", "--size", "128", "--check")
+    for check, code in (("2", 3), ("0", 0)):
+        monkeypatch.setattr(cli_sweep, "_run", lambda *_: False)
+        monkeypatch.setattr(sys, "argv", ["trilane", *words, check, "--out", str(tmp_path / "sweep")])
+        with pytest.raises(SystemExit) as left:
+            cli.main()
+        assert (left.value.code or 0) == code
+    assert "[metrics]" in capsys.readouterr().err
+    assert not (tmp_path / "sweep").exists()
 
 
 def test_without_any_frame_there_is_no_check_and_that_is_said(tmp_path: Path) -> None:
@@ -117,8 +230,8 @@ def test_without_any_frame_there_is_no_check_and_that_is_said(tmp_path: Path) ->
         facts = run_job._checked_frames(checked, tmp_path, hooks, lambda: interrupted)  # noqa: B023
         assert facts == {"notes": ["planned", said[-1]]}
     assert said == [
-        "the run was not compared with the reference path: none of the frames that were kept shows an avatar",
-        "the run was not compared with the reference path: it was interrupted",
+        "the run's frames were not compared: none of the frames that were kept shows an avatar",
+        "the run's frames were not compared: it was interrupted",
     ]
 
 
@@ -138,4 +251,4 @@ def test_an_interrupt_is_heard_between_two_frames(tmp_path: Path, monkeypatch: p
     checked: Any = SimpleNamespace(notes=(), config=SimpleNamespace(record=True))
     run_job._checked_frames(checked, tmp_path, hooks, lambda: len(made) == 2)
     assert (made, shown) == ([0, 1], [("check", 1, 5), ("check", 2, 5)])
-    assert said == ["the run was not compared with the reference path: it was interrupted"]
+    assert said == ["the run's frames were not compared: it was interrupted"]

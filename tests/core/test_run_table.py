@@ -89,13 +89,15 @@ def test_a_cap_is_said_once_and_apart_from_what_heat_did() -> None:
 
 
 def test_the_error_of_the_run_itself_stands_beside_its_speed() -> None:
-    check = {"frames": 3, "psnr_db": 31.26, "worst_psnr_db": 28.0, "mae": 1.756, "ssim": None, "flip": 0.04, "iou": 0.9}
-    text = table_text(make_report(check={**check, "against": "the reference", "numbers": (1, 2, 3)}))
-    said = (
-        "of this run, 3 frames against the reference: PSNR 31.3 dB, worst 28.0; MAE 1.76 of 255; FLIP 0.040; "
-        "IoU of all but background 0.900"
-    )
-    assert f"{said} (measured in this run)" in text.replace("\n", " ")
+    errors = {"psnr_db": 31.26, "worst_psnr_db": 28.0, "mae": 1.756, "ssim": None, "flip": 0.04, "iou": 0.9}
+    path = {**errors, "against": "the float path", "psnr_db": 40.5}
+    check = {**errors, "against": "the truth", "p1_psnr_db": 28.07, "frames": 3, "numbers": (1, 2, 3)}
+    text = table_text(make_report(check={**check, "float_path": path})).replace("\n", " ")
+    rest = "worst 28.0; MAE 1.76 of 255; FLIP 0.040; IoU of all but background 0.900 (measured in this run)"
+    first = f"of this run, 3 frames against the truth: PSNR mean 31.3 dB, 1st percentile 28.1, {rest}"
+    second = f"of this run, 3 frames against the float path: PSNR mean 40.5 dB, 1st percentile –, {rest}"
+    assert f"{first} {second}" in text
+    assert "against the float path" not in table_text(make_report(check=check))
 
 
 def test_the_table_says_when_and_by_what_it_was_made() -> None:

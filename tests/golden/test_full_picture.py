@@ -18,7 +18,7 @@ from trilane.bench.lib.full_picture import FullPictures
 from trilane.bench.lib.layers import Box, Layer, blended, premultiplied, to_light
 from trilane.bench.lib.plans import FIXED, fixed, in_frames, planned
 from trilane.bench.lib.stage_chain import AvatarFrames
-from trilane.bench.lib.true_picture import SAMPLES, TruePictures, has_truth
+from trilane.bench.lib.true_picture import SAMPLES, true_pictures
 from trilane.body.body import load_body
 from trilane.stages.configure import Checked, Request, configure
 from trilane.stages.cpu.mesh_bounds import MeshBounds
@@ -112,8 +112,8 @@ def test_the_body_is_in_one_place_at_every_density(checked: Checked, monkeypatch
         assert np.abs(np.subtract(other, found[0])).max() < 0.25
 
 
-def test_an_avatar_of_ones_own_has_no_truth(checked: Checked) -> None:
-    assert not has_truth(Cast(checked))
+def test_an_avatar_of_ones_own_has_no_truth(checked: Checked, gl: Any) -> None:
+    assert true_pictures(Cast(checked), gl) is None
 
 
 @pytest.mark.parametrize("name", BUILT_IN)
@@ -123,12 +123,13 @@ def test_the_truth_is_what_the_training_draws(name: str, tmp_path: Path, gl: Any
     file.write_text(SCENE.format(bundle=name), encoding="utf-8")
     cast = Cast(configure(Request(scene=str(file), runtime="ort", skinning="cpu"), tmp_path))
     (data,), (seen,), look = cast.avatars.values(), cast.seen(5), LOOKS[name]
-    assert has_truth(cast) and data.shaped.body.offsets is not None
+    true = true_pictures(cast, gl)
+    assert true is not None and data.shaped.body.offsets is not None
     skin = body_arrays(load_body(data.bundle.body_path).shape(data.bundle.manifest.betas))
     landmarks = find_landmarks(skin.vertices, skin.joints, skin.weights)
     clothed = ClothedBody(gl, clothing_layers(skin, landmarks, look), landmarks, SAMPLES, look)
     wanted = clothed.render(seen.joints, seen.view, seen.projection, seen.box.shape)
-    (layer,) = TruePictures(cast, gl).layers(5)
+    (layer,) = true.layers(5)
     assert (wanted[..., 3] == 255).any()
     differs = np.abs(layer.light - premultiplied(wanted / 255.0)).max(axis=-1) > 0.02
     assert differs.sum() <= 0.02 * (wanted[..., 3] > 0).sum()  # a skin that was moved out and back is rounded otherwise
