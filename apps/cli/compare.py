@@ -6,6 +6,7 @@ Rule: this module reads options and shows; every figure comes from `trilane.apps
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,6 +19,7 @@ from trilane.errors import BadInputError
 
 if TYPE_CHECKING:
     from trilane.apps.comparison.compared import Comparison
+    from trilane.apps.comparison.difference import Outcome
 
 app = Commands()
 
@@ -31,7 +33,8 @@ Examples:
   trilane compare runs/main runs/branch --fail-if-slower 5%
   trilane compare sweeps/main sweeps/branch
 """
-SLOWER = 1
+SLOWER, CANNOT_TELL = 1, 3
+MORE = "more runs of each kind (A1,A2,A3), longer ones, or a machine without other programs tell more"
 
 BaseArgument = Annotated[
     str, typer.Argument(metavar="BASE", help="A run folder, its report.json, a prediction, or a sweep's folder.")
@@ -43,7 +46,10 @@ HtmlOption = Annotated[Path | None, typer.Option("--html", help="Write a page th
 AllOption = Annotated[bool, typer.Option("--all", help="Show every figure, not only those that differ.")]
 SlowerOption = Annotated[
     str | None,
-    typer.Option("--fail-if-slower", help="Exit with 1 where frames surely take longer by more than so much, as 5%."),
+    typer.Option(
+        "--fail-if-slower",
+        help="Exit with 1 where frames surely take longer by more than so much, as 5%; with 3 where it cannot be told.",
+    ),
 ]
 
 
@@ -58,7 +64,8 @@ def compare(
 ) -> None:
     """Say what differs between runs, by how much, how sure that is, and the likely cause.
 
-    Every figure of OTHER stands beside that of BASE with a 95 % interval. Exit code 0 also when they differ.
+    Every figure of OTHER stands beside that of BASE with a 95 % interval. Exit code 0 also when they differ, and when
+    it cannot be told; with --fail-if-slower 1 where frames surely take longer by more, 3 where that cannot be told.
     Of two sweeps, trials of equal configuration stand beside each other. docs/compare.md says how it is told.
     """
     limit = _share(fail_if_slower)
@@ -80,8 +87,19 @@ def compare(
         for comparison in comparisons:
             for part in comparison_lines(comparison, show_all):
                 console.print(part, soft_wrap=isinstance(part, str), markup=False)
-    if limit is not None and any(comparison.slower > limit for comparison in comparisons):
+    _leave(limit, [comparison.slower_than(limit) for comparison in comparisons] if limit is not None else [])
+
+
+def _leave(limit: float | None, outcomes: Sequence[Outcome]) -> None:
+    """With the exit code that --fail-if-slower asks for."""
+    from trilane.apps.comparison.difference import Outcome
+
+    if Outcome.DIFFERS in outcomes:
         raise typer.Exit(SLOWER)
+    if limit is not None and Outcome.UNKNOWN in outcomes:
+        text = f"cannot tell whether frames take longer by more than {100 * limit:g} %; {MORE}"
+        stderr_console().print(text, soft_wrap=True, markup=False)
+        raise typer.Exit(CANNOT_TELL)
 
 
 def _are_sweeps(names: list[str]) -> bool:
@@ -112,8 +130,7 @@ def _compare_sweeps(
     else:
         for part in sweep_lines(comparison, show_all):
             stdout_console().print(part, soft_wrap=isinstance(part, str), markup=False)
-    if limit is not None and comparison.slower > limit:
-        raise typer.Exit(SLOWER)
+    _leave(limit, comparison.slower_than(limit) if limit is not None else [])
 
 
 def _share(text: str | None) -> float | None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from rich.markup import escape
 
 from trilane.apps.comparison.compared import METHOD
+from trilane.apps.comparison.difference import Outcome
 from trilane.apps.comparison.rows import MS
 from trilane.apps.comparison.sweeps import METHOD as SWEEP_METHOD
 from trilane.apps.comparison.words import change_of, interval_of, name_of, setting, value_of
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from trilane.apps.comparison.sweeps import SweepComparison, TrialPair
 
 #: Measures of which one statistic is shown even where nothing differs.
-ALWAYS = ("frame time", "latency", "work", "busy")
+ALWAYS = ("frame time", "latency", "instructions", "time of an instruction", "work", "busy")
 ALWAYS_STATISTICS = ("mean", "typical", "share")
 MOST_CHANGES = 12
 
@@ -78,11 +79,11 @@ def _trial_table(pairs: Sequence[TrialPair]) -> Table:
         for name in dict.fromkeys(name for pair in pairs for name in pair.options)
         if len({str(pair.options.get(name)) for pair in pairs}) > 1
     ] or ["trial"]
-    table = Table(*names, "base, ms", "other, ms", "change", "95 % interval", "differs")
+    table = Table(*names, "base, ms", "other, ms", "change", "95 % interval", "outcome")
     for pair in pairs:
         row = pair.frame_time
         values = [setting(pair.options.get(name, pair.name)) for name in names]
-        differs = "yes" if pair.differs else "?" if row.probability is None else "no"
+        differs = str(pair.outcome)
         figures = (f"{row.base:.4g}", f"{row.other:.4g}", change_of(row, MS), interval_of(row, MS), differs)
         table.add_row(*(escape(text) for text in (*values, *figures)))
     return table
@@ -90,8 +91,8 @@ def _trial_table(pairs: Sequence[TrialPair]) -> Table:
 
 def _left_out(comparison: Comparison, shown: Sequence[Figure]) -> Iterator[str]:
     """How many figures are not in the table; those of which nobody knows whether they differ apart."""
-    left = [row for figure, row in comparison.rows.items() if figure not in shown]
-    unknown = sum(row.probability is None for row in left)
+    left = [comparison.outcome(figure) for figure in comparison.rows if figure not in shown]
+    unknown = left.count(Outcome.UNKNOWN)
     if alike := len(left) - unknown:
         yield f"{alike} more {'figure does' if alike == 1 else 'figures do'} not differ: --all shows them"
     if unknown:
@@ -114,10 +115,10 @@ def _change_table(changes: Sequence[Change]) -> Table:
 def _figure_table(comparison: Comparison, figures: list[Figure]) -> Table:
     from rich.table import Table
 
-    table = Table("figure", "statistic", "base", "other", "change", "95 % interval", "differs")
+    table = Table("figure", "statistic", "base", "other", "change", "95 % interval", "outcome")
     for figure in figures:
         row, unit = comparison.rows[figure], figure.unit
         values = (value_of(row.base, unit), value_of(row.other, unit), change_of(row, unit), interval_of(row, unit))
-        differs = "yes" if figure in comparison.differing else "?" if row.probability is None else "no"
+        differs = str(comparison.outcome(figure))
         table.add_row(*(escape(text) for text in (name_of(figure), figure.statistic, *values, differs)))
     return table

@@ -7,22 +7,21 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from trilane.apps.comparison.configuration import Change, changes
-from trilane.apps.comparison.difference import LEAST_FRAMES, MOST_FRAMES
+from trilane.apps.comparison.difference import LEAST_FRAMES, MATTERS, MOST_FRAMES, Difference, Outcome
 from trilane.apps.comparison.family import ALPHA, rejected
 from trilane.apps.comparison.noise import remarks
-from trilane.apps.comparison.rows import FRAME_TIME, Figure, Rows, rows_of
+from trilane.apps.comparison.rows import FRAME_TIME, Figure, Rows, margin_of, named, rows_of
 from trilane.apps.comparison.sides import Kind, Side, Told
 from trilane.apps.comparison.verdict import verdict
-from trilane.errors import BadInputError
 
 SCHEMA: Final = 1
 METHOD: Final = (
-    "intervals hold 95 %; that any of the figures that are said to differ does so by chance has a probability of at "
-    f"most {100 * ALPHA:.0f} % (Holm)"
+    "intervals hold 95 %; that the verdict names a difference by chance has a probability of at most "
+    f"{100 * ALPHA:.0f} % (Holm); no difference: surely less than {100 * MATTERS:.0f} %; cannot tell: neither"
 )
 SEVERAL: Final = (
-    "of several runs a side: base and other are the arithmetic means of the runs' values; the change is the mean over "
-    "the pairs, of ratios the geometric one, so it need not be the ratio of these means"
+    "of several runs a side: base and other are the arithmetic means of the runs' values; the change of a ratio is "
+    "that of their geometric means, so it need not be the ratio of these means"
 )
 
 
@@ -48,22 +47,28 @@ class Comparison:
             "notes": list(self.notes),
         }
 
-    @property
-    def slower(self) -> float:
-        """By which share the mean frame time is longer at the least, of those that differ; 0 where it is not."""
-        figure = next((each for each in self.differing if each[:4] == (FRAME_TIME, "", "", "mean")), None)
-        low = self.rows[figure].low if figure is not None else None
-        return max(low or 0.0, 0.0)
+    def outcome(self, figure: Figure) -> Outcome:
+        """Of one of the `rows`."""
+        row = self.rows[figure]
+        return row.outcome(differs=figure in self.differing, margin=margin_of(figure, row))
+
+    def slower_than(self, limit: float) -> Outcome:
+        """Whether the mean frame time is longer by more than the share `limit`: DIFFERS where it surely is."""
+        figure = next(each for each in self.rows if each[:4] == (FRAME_TIME, "", "", "mean"))
+        return exceeds(self.rows[figure], limit, differs=figure in self.differing)
+
+
+def exceeds(row: Difference, limit: float, *, differs: bool) -> Outcome:
+    """Whether a change is surely above `limit`, surely not, or neither."""
+    if row.low is None or row.high is None:
+        return Outcome.UNKNOWN
+    if differs and row.low > limit:
+        return Outcome.DIFFERS
+    return Outcome.SAME if row.high <= limit else Outcome.UNKNOWN
 
 
 def compare(base: Side, others: Sequence[Side]) -> list[Comparison]:
-    """Each of `others` beside `base`. Raises BadInputError for a side that has not as many runs as the base."""
-    for other in others:
-        if len(other.runs) != len(base.runs):
-            remedy = "runs stand in pairs, each in one: give as many on each side, or one on each"
-            raise BadInputError(
-                other.name, _runs(len(other.runs)), f"{_runs(len(base.runs))}, as {base.name} has", remedy
-            )
+    """Each of `others` beside `base`."""
     return [_compared(base, other) for other in others]
 
 
@@ -80,18 +85,23 @@ def document(comparisons: Sequence[Comparison]) -> dict[str, Any]:
     }
 
 
-def _runs(count: int) -> str:
-    return "1 run" if count == 1 else f"{count} runs"
-
-
 def _compared(base: Side, other: Side) -> Comparison:
     rows = rows_of(base, other)
-    tested = [figure for figure, row in rows.items() if row.probability is not None and (row.base or row.other)]
-    fallen = rejected([rows[figure].probability or 0.0 for figure in tested])
-    differing = tuple(figure for figure, falls in zip(tested, fallen, strict=True) if falls)
+    first = named(rows)
+    differing = _differing(rows, first)
+    if differing:
+        differing += _differing(rows, [figure for figure in rows if figure not in first])
     changed = tuple(changes(base.runs[0].document, other.runs[0].document))
-    said = verdict(rows, differing, changed, _stages(base.runs[0].document))
+    said = verdict(rows, first, differing, changed, _stages(base.runs[0].document))
     return Comparison(base, other, rows, differing, changed, said, tuple(_notes(base, other)))
+
+
+def _differing(rows: Rows, figures: Sequence[Figure]) -> tuple[Figure, ...]:
+    """Those of `figures` that differ, all of them together; those that chance does not touch are not counted."""
+    tested = {figure: rows[figure].probability or 0.0 for figure in figures if rows[figure].probability is not None}
+    uncertain = [figure for figure in tested if rows[figure].deviation]
+    fallen = dict(zip(uncertain, rejected([tested[figure] for figure in uncertain]), strict=True))
+    return tuple(figure for figure, probability in tested.items() if fallen.get(figure, probability < ALPHA))
 
 
 def _stages(report: Mapping[str, Any]) -> dict[str, list[str]]:
@@ -141,4 +151,5 @@ def _row(figure: Figure, comparison: Comparison) -> dict[str, Any]:
         "is_ratio": row.is_ratio,
         "probability": row.probability,
         "differs": figure in comparison.differing,
+        "outcome": str(comparison.outcome(figure)),
     }

@@ -1,6 +1,6 @@
 """Many comparisons at a time. Rule: of all that is compared in a pair of runs, nothing is called different by chance
 
-with more than a probability of 5 %. Holm, "A simple sequentially rejective multiple test procedure", Scandinavian
+with more than a probability of 1 %. Holm, "A simple sequentially rejective multiple test procedure", Scandinavian
 Journal of Statistics 6 (1979): it needs no independence of the comparisons.
 """
 
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-ALPHA = 0.05
+ALPHA = 0.01
 
 
 def rejected(probabilities: Sequence[float], alpha: float = ALPHA) -> list[bool]:

@@ -24,8 +24,10 @@ from trilane.scheduler.ledger import JobRecord
 
 NS_PER_MS = 1e6
 STATES = (BUSY, *CAUSES)
-#: Figures that stages report of their jobs, and the measures that they are here.
-MOVED = {f"bytes_{name}": f"bytes {name.replace('_', ' ')}" for name in ("read", "written", "uploaded", "read_back")}
+INSTRUCTIONS, INSTRUCTION_TIME = "instructions", "time of an instruction"
+#: Figures of jobs that stages report or the processor counts, and the measures that they are here.
+REPORTED = {f"bytes_{name}": f"bytes {name.replace('_', ' ')}" for name in ("read", "written", "uploaded", "read_back")}
+REPORTED["instructions"] = INSTRUCTIONS
 #: Frames that may have been begun before the first of which all is kept.
 IN_FLIGHT = 100
 OVERHEAD, PREEMPTED = "overhead", "preempted"
@@ -85,6 +87,7 @@ def frames_of(records: Iterable[Record]) -> RunFrames | None:
     for unit in graph.units:
         series |= _unit(unit, [job for job in jobs if job.unit == unit], idle, numbers, end_ns)
     series |= _figures(story.figures)
+    series |= _instruction_times(series)
     return RunFrames(story.begun, series, story.ended, story.presented, story.counted)
 
 
@@ -138,8 +141,8 @@ class _Story:
         if len(self.jobs) >= 2 * most:
             self._forget(self.jobs[-most])
         for name, value in record.figures.items():
-            if name in MOVED:
-                self.figures[Key(MOVED[name], record.job.stage)].append((record.job.frame, value))
+            if name in REPORTED:
+                self.figures[Key(REPORTED[name], record.job.stage)].append((record.job.frame, value))
 
     def _forget(self, first: JobRecord) -> None:
         """What was before the job `first`, so that of a run of days no more is kept than of its last frames."""
@@ -217,3 +220,15 @@ def _figures(figures: Mapping[Key, Sequence[tuple[int, float]]]) -> dict[Key, Se
         )
         for key, rows in figures.items()
     }
+
+
+def _instruction_times(series: Mapping[Key, Series]) -> dict[Key, Series]:
+    """Of each stage whose instructions were counted, in ns: its time on the core over them."""
+    found = {}
+    for key, counted in series.items():
+        if key.measure == INSTRUCTIONS:
+            work = series[Key("work", key.of)]
+            frames, ours, theirs = np.intersect1d(work.frames, counted.frames, return_indices=True)
+            ns = work.values[ours] * NS_PER_MS / np.maximum(counted.values[theirs], 1.0)
+            found[Key(INSTRUCTION_TIME, key.of)] = Series(frames, ns, np.ones(len(frames)))
+    return found

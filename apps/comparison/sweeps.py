@@ -14,9 +14,9 @@ from typing import Any, Final
 
 from pydantic import ValidationError
 
-from trilane.apps.comparison.compared import SCHEMA
+from trilane.apps.comparison.compared import SCHEMA, exceeds
 from trilane.apps.comparison.configuration import Change, changes
-from trilane.apps.comparison.difference import LEAST_FRAMES, Difference, combined
+from trilane.apps.comparison.difference import LEAST_FRAMES, Difference, Outcome, combined
 from trilane.apps.comparison.family import ALPHA, rejected
 from trilane.apps.comparison.noise import BUSY_MACHINE
 from trilane.apps.comparison.rows import FRAME_TIME, MS, Figure, rows_of
@@ -52,6 +52,11 @@ class TrialPair:
     differs: bool
     changes: tuple[Change, ...]
 
+    @property
+    def outcome(self) -> Outcome:
+        """Of the frame time."""
+        return self.frame_time.outcome(differs=self.differs)
+
 
 @dataclass(frozen=True)
 class SweepComparison:
@@ -76,7 +81,7 @@ class SweepComparison:
         of = f"{len(self.pairs)} trial{'s' * (len(self.pairs) > 1)}"
         whole = f"over all {change_of(self.over_all, MS)} ({interval_of(self.over_all, MS)})"
         if not differing:
-            unsure = sum(pair.frame_time.probability is None for pair in self.pairs)
+            unsure = sum(pair.outcome is Outcome.UNKNOWN for pair in self.pairs)
             if unsure == len(self.pairs):
                 return f"it cannot be told whether any of {of} differs; {whole}"
             told = f"; of {unsure} it cannot be told" if unsure else ""
@@ -84,10 +89,9 @@ class SweepComparison:
         slower = sum(pair.frame_time.effect > 0 for pair in differing)
         return f"frame time differs in {len(differing)} of {of}, {slower} of them slower; {whole}"
 
-    @property
-    def slower(self) -> float:
-        """By which share the trial that surely is the most slower is so at the least; 0 where none is."""
-        return max((pair.frame_time.low or 0.0 for pair in self.pairs if pair.differs), default=0.0)
+    def slower_than(self, limit: float) -> list[Outcome]:
+        """Whether each pair's frame time is longer by more than the share `limit`: DIFFERS where it surely is."""
+        return [exceeds(pair.frame_time, limit, differs=pair.differs) for pair in self.pairs]
 
     def as_json(self) -> dict[str, Any]:
         """What `trilane compare --json` prints of two sweeps."""
@@ -100,7 +104,7 @@ class SweepComparison:
             "over_all": _told(self.over_all),
             "trials": [
                 {"id": pair.name, "options": dict(pair.options), "runs": pair.runs}
-                | {**_told(pair.frame_time), "differs": pair.differs}
+                | {**_told(pair.frame_time), "differs": pair.differs, "outcome": str(pair.outcome)}
                 for pair in self.pairs
             ],
             "left_out": {reason: list(names) for reason, names in self.left_out.items()},

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
 from trilane.apps.comparison.configuration import Change
-from trilane.apps.comparison.difference import Difference
+from trilane.apps.comparison.difference import Difference, Outcome
 from trilane.apps.comparison.rows import (
     BUSY,
     BYTES,
@@ -26,13 +26,16 @@ from trilane.apps.comparison.rows import (
     WORK,
     Figure,
     Rows,
+    margin_of,
 )
+from trilane.apps.comparison.run_frames import INSTRUCTION_TIME, INSTRUCTIONS
 
-NO_DIFFERENCE: Final = "no difference"
-TOO_FEW: Final = "too short to tell"
+NO_DIFFERENCE: Final = str(Outcome.SAME)
+TOO_FEW: Final = f"{Outcome.UNKNOWN}: too short"
 #: A cause of idle time is named where its share has changed by so much.
 TELLING_SHARE: Final = 0.05
 MOST_NAMED: Final = 4
+NOT_EXPLAINED: Final = "no stage, unit or setting alone explains it; the cores may have another speed"
 MANY: Final = 999.5
 #: What is said of the values of a setting.
 REASONS: Final = {
@@ -51,25 +54,68 @@ WAITS: Final = {
 
 
 def verdict(
-    rows: Rows, differing: Sequence[Figure], changes: Sequence[Change], stages: Mapping[str, Sequence[str]]
+    rows: Rows,
+    named: Sequence[Figure],
+    differing: Sequence[Figure],
+    changes: Sequence[Change],
+    stages: Mapping[str, Sequence[str]],
 ) -> str:
-    """`no difference`, or a sentence.
+    """`no difference`, or a sentence, which begins with `cannot tell` where it cannot be told.
 
-    `differing`: figures of `rows` that differ, all comparisons together. `changes`: of the configuration. `stages`:
-    names of each unit's.
+    `named`: figures of `rows` that it rests on; `differing`: those that differ, all together. `changes`: of the
+    configuration. `stages`: names of each unit's.
     """
     if not differing:
-        unknown = all(row.probability is None for figure, row in rows.items() if figure.measure in (FRAME_TIME, WORK))
-        return TOO_FEW if unknown else NO_DIFFERENCE
+        return _not_told(rows, named, changes, stages)
     found = {figure: rows[figure] for figure in differing}
     heads = list(_heads(found))
-    causes = [*_works(found, changes), *_waits(found, rows, stages), *_others(found)]
+    causes = [*_programs(found), *_works(found, changes), *_waits(found, rows, stages), *_others(found)]
     settings = ((change.key.rpartition(".")[2], str(change.other)) for change in changes)
     reasons = [REASONS[setting] for setting in settings if setting in REASONS]
-    if not heads and not causes:
-        causes = [_plain(figure, row) for figure, row in [*found.items()][:MOST_NAMED]]
+    if not causes:
+        causes = [NOT_EXPLAINED] if not reasons and any(figure.measure == WORK for figure in rows) else []
+        if not heads:
+            causes = [_plain(figure, row) for figure, row in [*found.items()][:MOST_NAMED]]
     parts = ["; ".join(heads), "; ".join(causes), "; ".join(reasons) if heads or causes else ""]
     return ": ".join(part for part in parts if part)
+
+
+def _not_told(
+    rows: Rows, named: Sequence[Figure], changes: Sequence[Change], stages: Mapping[str, Sequence[str]]
+) -> str:
+    """Where nothing surely differs: that nothing that matters does, or that this cannot be told, and of what.
+
+    Where nothing was set otherwise and every stage's instructions were counted, these alone are the program.
+    """
+    counted = [figure for figure in named if figure.measure == INSTRUCTIONS]
+    is_counted = len(counted) == sum(map(len, stages.values())) and not changes
+    rested_on = counted if is_counted else [figure for figure in named if figure.measure in (FRAME_TIME, WORK, SERVICE)]
+    if all(rows[figure].probability is None for figure in rested_on):
+        return TOO_FEW
+    unknown = {
+        figure: rows[figure]
+        for figure in rested_on
+        if rows[figure].outcome(differs=False, margin=margin_of(figure, rows[figure])) is Outcome.UNKNOWN
+    }
+    if not unknown:
+        return NO_DIFFERENCE
+    ordered = sorted(
+        unknown.items(), key=lambda each: (each[0].measure != FRAME_TIME, -abs(each[1].other - each[1].base))
+    )
+    said = (f"{figure.of or figure.measure} {signed(row, figure.unit)}" for figure, row in ordered[:MOST_NAMED])
+    return f"{Outcome.UNKNOWN}: {', '.join(said)}: runs of one kind may differ by as much"
+
+
+def _programs(found: Rows) -> Iterator[str]:
+    """Stages that execute more instructions or fewer, and those whose instructions take longer or shorter."""
+    for figure, row in found.items():
+        if figure.measure == INSTRUCTIONS:
+            sign = 1 if row.change > 0 else -1
+            more = f"{_amount(sign * row.change, row, figure.unit)} {'more' if sign > 0 else 'fewer'} instructions"
+            yield f"{figure.of} executes {more}{_between(row, sign)}"
+    for figure, row in found.items():
+        if figure.measure == INSTRUCTION_TIME:
+            yield f"an instruction of {figure.of} takes {longer(row, figure.unit)}, as the machine lets it"
 
 
 def _heads(found: Rows) -> Iterator[str]:
@@ -85,10 +131,11 @@ def _heads(found: Rows) -> Iterator[str]:
 
 
 def _works(found: Rows, changes: Sequence[Change]) -> Iterator[str]:
-    """Stages by how many milliseconds their work has changed."""
+    """Stages by how many milliseconds their work has changed, but for those that execute more or fewer instructions."""
     by_stage: dict[str, tuple[Figure, Difference]] = {}
+    counted = {figure.of for figure in found if figure.measure == INSTRUCTIONS}
     for figure, row in found.items():
-        if figure.measure in (WORK, SERVICE):
+        if figure.measure in (WORK, SERVICE) and figure.of not in counted:
             by_stage.setdefault(figure.of, (figure, row))
     held = {
         change.key.removeprefix("config.pace_ns.") for change in changes if change.key.startswith("config.pace_ns.")

@@ -8,6 +8,7 @@ from trilane.apps.comparison.difference import Difference
 from trilane.apps.comparison.rows import BYTES, SHARE, Figure
 
 DASH: Final = "–"
+MANY: Final = 10_000
 
 
 def name_of(figure: Figure) -> str:
@@ -21,6 +22,8 @@ def value_of(value: float, unit: str) -> str:
     """A value in its unit; of a share in percent."""
     if unit == BYTES:
         return f"{value:,.0f} {unit}"
+    if unit == "" and abs(value) >= MANY:
+        return f"{value:,.0f}"
     return f"{100 * value:.1f} %" if unit == SHARE else f"{value:.4g} {unit}".rstrip()
 
 

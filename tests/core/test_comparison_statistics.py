@@ -1,24 +1,28 @@
-"""Blocks, drift, Holm and differences, by hand and by simulations with a seed."""
+"""Student's t, Holm and differences, by hand and by simulations with a seed."""
 
 from __future__ import annotations
 
-from math import erfc, log, log10, sqrt
+from math import erfc, gamma, inf, log, pi, sqrt
 
 import numpy as np
 import pytest
 
-from trilane.apps.comparison.blocks import block_length, draws
 from trilane.apps.comparison.difference import (
     LEAST_FRAMES,
+    STRETCHES,
+    Chance,
     Difference,
+    Outcome,
     Series,
     combined,
     difference,
     judged,
+    settled,
+    student_quantile,
+    student_tails,
     unsure,
 )
 from trilane.apps.comparison.family import rejected
-from trilane.apps.comparison.slow_noise import STRETCHES, drift_variance
 from trilane.arrays import F64
 
 RUNS = 100
@@ -26,6 +30,10 @@ RUNS = 100
 
 def series(values: F64, first: int = 0) -> Series:
     return Series(np.arange(first, first + len(values)), values, np.ones(len(values)))
+
+
+def compared(base: Series, other: Series, statistic: str) -> Difference:
+    return difference([base], [other], statistic, is_ratio=True, chance=Chance())
 
 
 def autoregressive(generator: np.random.Generator, count: int, carried: float) -> F64:
@@ -36,48 +44,6 @@ def autoregressive(generator: np.random.Generator, count: int, carried: float) -
     return values[100:]
 
 
-def test_blocks_follow_each_other_and_go_on_at_the_beginning() -> None:
-    """Of 7 values in blocks of 3: two whole ones and the first value of a third."""
-    places = draws(7, 3, 50, np.random.default_rng(1))
-    assert places.shape == (50, 7)
-    steps = np.diff(places, axis=1) % 7
-    assert (steps[:, [0, 1, 3, 4]] == 1).all()
-    assert len(np.unique(places[:, 0])) == 7 and len(np.unique(places[:, 6])) == 7
-    assert (draws(4, 1, 3, np.random.default_rng(1)) < 4).all()
-
-
-@pytest.mark.parametrize("values", [np.ones(100), np.arange(5.0), np.full(60, 0.1)])
-def test_what_does_not_vary_or_is_short_is_drawn_singly(values: F64) -> None:
-    assert block_length(values) == 1
-
-
-def test_blocks_are_as_long_as_the_series_remembers() -> None:
-    """By the formula for what is half of its predecessor, with 1000 values: (6 (c / (1 - c^2))^2 n)^(1/3) = 13.9."""
-    generator = np.random.default_rng(5)
-    lengths = {
-        carried: np.mean([block_length(autoregressive(generator, 1000, carried)) for _ in range(20)])
-        for carried in (0.0, 0.5, 0.9)
-    }
-    assert lengths[0.0] < 4 < lengths[0.5] < lengths[0.9]
-    assert lengths[0.5] == pytest.approx(13.9, rel=0.35)
-    assert block_length(autoregressive(generator, 100, 0.99)) <= 30
-
-
-@pytest.mark.parametrize(("carried", "count"), [(0.3, 400), (0.7, 400), (0.5, 150)])
-def test_blocks_by_a_second_computation(carried: float, count: int) -> None:
-    """Politis and White (2004), section 3.2, value by value: the flat-top window is 1 up to half its width."""
-    values = autoregressive(np.random.default_rng(9), count, carried)
-    mean = sum(values) / count
-    lags = [sum((values[t] - mean) * (values[t + k] - mean) for t in range(count - k)) / count for k in range(60)]
-    limit, run = 2 * sqrt(log10(count) / count), 5
-    last = next(m for m in range(50) if all(abs(lags[m + k] / lags[0]) < limit for k in range(1, run + 1)))
-    width = 2 * last
-    window = [1.0 if k <= width / 2 else 2 * (1 - k / width) for k in range(width + 1)]
-    g = 2 * sum(window[k] * k * lags[k] for k in range(1, width + 1))
-    density = lags[0] + 2 * sum(window[k] * lags[k] for k in range(1, width + 1))
-    assert block_length(values) == round((2 * g**2 / (4 / 3 * density**2)) ** (1 / 3) * count ** (1 / 3))
-
-
 @pytest.mark.parametrize("carried", [0.0, 0.6])
 def test_intervals_hold_what_they_promise(carried: float) -> None:
     """Of two series of one mean, whose values depend on each other: 95 % of the intervals hold that it is the same."""
@@ -85,42 +51,85 @@ def test_intervals_hold_what_they_promise(carried: float) -> None:
     held = 0
     for _ in range(RUNS):
         pair = [series(autoregressive(generator, 200, carried), first) for first in (0, 1000)]
-        found = difference(*pair, "mean", is_ratio=False)
+        found = difference(pair[:1], pair[1:], "mean", is_ratio=False, chance=Chance())
         assert found.low is not None and found.high is not None
         held += found.low < 0 < found.high
     assert 0.92 <= held / RUNS <= 0.98
 
 
-def test_drift_goes_on_and_scatter_does_not() -> None:
-    """Independent values: from 1 / n, their mean's variance, to 8 / n, that of the stretches that are looked at.
+@pytest.mark.parametrize("freedom", [1, 2, 3, 4, 5, 9, 10, 30])
+def test_students_t_is_the_integral_of_its_density(freedom: int) -> None:
+    """By Simpson's rule over the density up to t, of which both tails are what is left."""
+    t, steps = 2.3, 2000
+    places = np.linspace(0, t, steps + 1)
+    constant = gamma((freedom + 1) / 2) / (sqrt(freedom * pi) * gamma(freedom / 2))
+    density = constant * (1 + places**2 / freedom) ** (-(freedom + 1) / 2)
+    weights = np.where(np.arange(steps + 1) % 2, 4, 2)
+    weights[[0, -1]] = 1
+    inside = 2 * float(weights @ density) * t / steps / 3
+    assert student_tails(t, freedom) == pytest.approx(1 - inside, abs=1e-9)
 
-    Four speeds, one after the other, of variance 1: of 7 pairs of neighbouring eighths 3 differ, by a square of 2 in
-    the mean, and half of that stays at any time scale.
+
+def test_students_quantiles_are_those_of_the_tables() -> None:
+    wanted = {1: 12.706, 2: 4.303, 5: 2.571, 10: 2.228, 30: 2.042, inf: 1.960}
+    assert {freedom: round(student_quantile(freedom), 3) for freedom in wanted} == wanted
+    assert student_tails(inf, 5) == 0.0 == student_tails(40.0, inf)
+
+
+def test_a_stretch_left_out_at_a_time_is_the_variance_of_the_mean() -> None:
+    """Of a mean of equal stretches the jackknife is the variance of the stretches' means over their count, exactly."""
+    values = np.random.default_rng(6).normal(10, 1, 64)
+    of_stretches = values.reshape(STRETCHES, 4).mean(axis=1)
+    found = difference([series(values)], [series(values[::-1], 900)], "mean", is_ratio=False, chance=Chance())
+    assert found.deviation == pytest.approx(sqrt(2 * of_stretches.var(ddof=1) / STRETCHES))
+    assert found.freedom == STRETCHES - 1
+
+
+def test_what_is_known_before_counts_as_so_many_runs() -> None:
+    """One run a side: the prior alone, 0.1 for each. Of 3 and 2 runs, squares about the means of 2 and 0.5, with a
+
+    share of 1/3 + 1/2: (5 x 0.01 + 2.5) / (5 + 3) of it.
     """
-    generator = np.random.default_rng(3)
-    count, tries = 800, 60
-    quiet = np.mean([_drift(generator.normal(size=count)) for _ in range(tries)])
-    assert 1 / count < quiet < 8 / count
-    levels = np.repeat(generator.normal(size=(tries, 4)), count // 4, axis=1)
-    assert np.mean([_drift(row) for row in levels]) == pytest.approx(3 / 7, rel=0.4)
-    assert _drift(np.ones(count)) == 0.0
+    chance = Chance(absolute=0.1, freedom=5)
+    alone = settled([[1.0], [2.0]], [np.array([1.0]), np.array([2.0])], 0.0, chance, is_ratio=False)
+    assert alone.deviation == pytest.approx(0.1 * sqrt(2)) and alone.freedom == 5
+    assert alone.probability == pytest.approx(student_tails(1 / (0.1 * sqrt(2)), 5))
+    sides = [np.array([1.0, 2.0, 3.0]), np.array([4.5, 5.5])]
+    several = settled([side.tolist() for side in sides], sides, 0.0, chance, is_ratio=False)
+    assert (several.base, several.other, several.change, several.freedom) == (2.0, 5.0, 3.0, 8)
+    assert several.deviation == pytest.approx(sqrt((1 / 3 + 1 / 2) * (5 * 0.01 + 2.5) / 8))
+    relative = settled([[8.0], [4.0]], [np.array([8.0]), np.array([4.0])], 0.02, Chance(0.1), is_ratio=False)
+    assert relative.deviation == pytest.approx(sqrt(2 * 0.8**2 + 0.02))
 
 
-def _drift(values: F64) -> float:
-    return drift_variance(len(values), lambda stretch: float(values[stretch].mean()))
+def test_what_is_explained_is_no_chance() -> None:
+    """A change of 0.7 of which 0.5 has another cause, with a deviation of 0.1 sqrt(2)."""
+    chance = Chance(absolute=0.1, freedom=5, explained=0.5)
+    effects = [np.array([0.0]), np.array([0.7])]
+    found = settled([[1.0], [1.7]], effects, 0.0, chance, is_ratio=False)
+    reach = student_quantile(5) * 0.1 * sqrt(2) + 0.5
+    assert (found.low, found.high) == (pytest.approx(0.7 - reach), pytest.approx(0.7 + reach))
+    assert found.probability == pytest.approx(student_tails(0.2 / (0.1 * sqrt(2)), 5))
+    less = settled([[1.0], [1.4]], [np.array([0.0]), np.array([-0.4])], 0.0, chance, is_ratio=False)
+    assert less.probability == 1.0
 
 
-def test_drift_by_hand() -> None:
-    """Stretches of one value that alternate: 2 at the shortest time, 0 at the next, so nothing is left."""
-    values = np.tile([1.0, -1.0], STRETCHES // 2)
-    assert drift_variance(STRETCHES, lambda stretch: float(values[stretch].mean())) == 0.0
+def test_a_figure_has_one_of_three_outcomes() -> None:
+    """Within 5 % at both ends; beyond at one; not known; and what differs does so whatever its interval."""
+    assert judged(1.0, 1.01, 0.01, is_ratio=True).outcome(differs=False) is Outcome.SAME
+    assert judged(1.0, 1.04, 0.01, is_ratio=True).outcome(differs=False) is Outcome.UNKNOWN
+    assert judged(1.0, 0.96, 0.01, is_ratio=True).outcome(differs=False) is Outcome.UNKNOWN
+    assert judged(1.0, 1.04, 0.01, is_ratio=True).outcome(differs=False, margin=0.1) is Outcome.SAME
+    assert unsure(1.0, 1.0, is_ratio=True).outcome(differs=False) is Outcome.UNKNOWN
+    assert judged(1.0, 1.01, 0.001, is_ratio=True).outcome(differs=True) is Outcome.DIFFERS
 
 
 def test_holms_steps() -> None:
     """0.05 / 4 = 0.0125, / 3 = 0.0167, / 2 = 0.025: 0.03 is above its limit, so 0.04 stays too, though below 0.05."""
-    assert rejected([0.04, 0.001, 0.03, 0.012]) == [False, True, False, True]
-    assert rejected([0.02, 0.02]) == [True, True]
-    assert rejected([0.03, 0.03]) == [False, False]
+    assert rejected([0.04, 0.001, 0.03, 0.012], 0.05) == [False, True, False, True]
+    assert rejected([0.02, 0.02], 0.05) == [True, True]
+    assert rejected([0.03, 0.03], 0.05) == [False, False]
+    assert rejected([0.009]) == [True] and rejected([0.011]) == [False]
     assert rejected([]) == []
 
 
@@ -142,7 +151,7 @@ def test_what_nobody_knows_has_no_interval() -> None:
     assert unsure(2.0, 3.0, is_ratio=True) == Difference(2.0, 3.0, 0.5, None, None, None, True)
     assert unsure(0.0, 3.0, is_ratio=True).is_ratio is False
     few = series(np.ones(LEAST_FRAMES - 1))
-    assert difference(few, few, "mean", is_ratio=True).low is None
+    assert difference([few], [few], "mean", is_ratio=True, chance=Chance()).low is None
 
 
 def test_frames_of_one_scene_are_compared_frame_with_frame() -> None:
@@ -150,24 +159,24 @@ def test_frames_of_one_scene_are_compared_frame_with_frame() -> None:
     generator = np.random.default_rng(2)
     asked = np.repeat(generator.uniform(1, 3, 30), 10)
     noise = [generator.lognormal(0, 0.01, 300) for _ in range(2)]
-    paired = difference(series(asked * noise[0]), series(1.05 * asked * noise[1]), "typical", is_ratio=True)
+    paired = compared(series(asked * noise[0]), series(1.05 * asked * noise[1]), "typical")
     assert paired.low is not None and paired.high is not None
     assert 0.04 < paired.low < 0.05 < paired.high < 0.06
-    apart = difference(series(asked * noise[0]), series(1.05 * asked * noise[1], 500), "typical", is_ratio=True)
+    apart = compared(series(asked * noise[0]), series(1.05 * asked * noise[1], 500), "typical")
     assert apart.low is not None and apart.low < 0
 
 
 @pytest.mark.parametrize("statistic", ["p50", "p90", "p99"])
 def test_percentiles_are_linear_between_ranks(statistic: str) -> None:
     values = np.random.default_rng(4).exponential(size=73)
-    found = difference(series(values), series(values), statistic, is_ratio=True)
+    found = compared(series(values), series(values), statistic)
     assert found.base == pytest.approx(np.quantile(values, int(statistic[1:]) / 100))
 
 
 def test_the_typical_time_leaves_the_ends_out() -> None:
     """Of 0 to 79, of which 20 are far off: the mean of 20 to 59 is 39.5."""
     values = np.concatenate([np.arange(60.0), np.full(20, 1e6)])
-    found = difference(series(values), series(values + 1), "typical", is_ratio=False)
+    found = difference([series(values)], [series(values + 1)], "typical", is_ratio=False, chance=Chance())
     assert (found.base, found.other) == (39.5, 40.5)
 
 
@@ -198,6 +207,6 @@ def test_values_of_several_runs_are_their_means_whichever_side_they_are_on() -> 
 def test_a_run_has_its_own_value_whatever_it_is_beside() -> None:
     """The base has 20 frames more than the other, of 5 ms; on the 100 that both have, the other takes twice as long."""
     base = series(np.concatenate([np.full(100, 2.0), np.full(20, 5.0)]))
-    found = difference(base, series(np.full(100, 4.0)), "mean", is_ratio=True)
+    found = compared(base, series(np.full(100, 4.0)), "mean")
     assert (found.base, found.other) == (pytest.approx(2.5), 4.0)
     assert found.change == pytest.approx(1.0)
