@@ -12,7 +12,7 @@ from trilane.apps.comparison.family import ALPHA, rejected
 from trilane.apps.comparison.noise import remarks
 from trilane.apps.comparison.rows import FRAME_TIME, Figure, Rows, margin_of, named, rows_of
 from trilane.apps.comparison.sides import Kind, Side, Told
-from trilane.apps.comparison.verdict import verdict
+from trilane.apps.comparison.verdict import NO_DIFFERENCE, verdict
 
 SCHEMA: Final = 1
 METHOD: Final = (
@@ -42,10 +42,18 @@ class Comparison:
         return {
             "run": self.other.name,
             "verdict": self.verdict,
+            "outcome": str(self.whole),
             "changes": [change._asdict() for change in self.changes],
             "rows": [_row(figure, self) for figure in self.rows],
             "notes": list(self.notes),
         }
+
+    @property
+    def whole(self) -> Outcome:
+        """That of the verdict."""
+        if self.differing:
+            return Outcome.DIFFERS
+        return Outcome.SAME if self.verdict == NO_DIFFERENCE else Outcome.UNKNOWN
 
     def outcome(self, figure: Figure) -> Outcome:
         """Of one of the `rows`."""

@@ -112,7 +112,7 @@ def _noise(base: Side, other: Side) -> Noise:
             change = _difference(base, other, key, "typical", Chance())
             if change.is_ratio:
                 effects[key.of] = change.effect
-    return noise_between(*([told.document for told in side.runs] for side in (base, other)), effects)
+    return noise_between([told.document for told in base.runs], [told.document for told in other.runs], effects)
 
 
 def _shared(base: Side, other: Side) -> list[Key]:
@@ -122,9 +122,9 @@ def _shared(base: Side, other: Side) -> list[Key]:
 
 
 def _difference(base: Side, other: Side, key: Key, statistic: str, chance: Chance) -> Difference:
-    sides = [[told.frames.series[key] for told in side.runs if told.frames] for side in (base, other)]
+    first, second = ([told.frames.series[key] for told in side.runs if told.frames] for side in (base, other))
     is_ratio = statistic != SHARE and key.measure != WAIT
-    return difference(*sides, statistic, is_ratio=is_ratio, chance=chance)
+    return difference(first, second, statistic, is_ratio=is_ratio, chance=chance)
 
 
 def _of_frames(base: Side, other: Side, noise: Noise) -> Iterator[tuple[Figure, Difference]]:
@@ -214,9 +214,9 @@ def _statistics(measure: str, of: str, times: Mapping[str, Any], names: Sequence
 
 def _of_counts(base: Side, other: Side, noise: Noise) -> Iterator[tuple[Figure, Difference]]:
     """Frames lost and dropped, as shares of those asked for."""
-    sides = [[told.document.get("frames") for told in side.runs] for side in (base, other)]
-    if any(frames is None for side in sides for frames in side):
+    if any("frames" not in told.document for told in (*base.runs, *other.runs)):
         return
+    sides = [[told.document["frames"] for told in side.runs] for side in (base, other)]
     for measure, causes in ((LOST, "lost_by_cause"), (DROPPED, DROPPED)):
         for cause in dict.fromkeys(cause for side in sides for frames in side for cause in frames.get(causes, {})):
             counts = [[frames.get(causes, {}).get(cause, 0) for frames in side] for side in sides]

@@ -69,7 +69,7 @@ def verdict(
         return _not_told(rows, named, changes, stages)
     found = {figure: rows[figure] for figure in differing}
     heads = list(_heads(found))
-    causes = [*_programs(found), *_works(found, changes), *_waits(found, rows, stages), *_others(found)]
+    causes = [*_programs(found), *_works(found, rows, changes), *_waits(found, rows, stages), *_others(found)]
     settings = ((change.key.rpartition(".")[2], str(change.other)) for change in changes)
     reasons = [REASONS[setting] for setting in settings if setting in REASONS]
     if not causes:
@@ -130,12 +130,13 @@ def _heads(found: Rows) -> Iterator[str]:
             return
 
 
-def _works(found: Rows, changes: Sequence[Change]) -> Iterator[str]:
-    """Stages by how many milliseconds their work has changed, but for those that execute more or fewer instructions."""
+def _works(found: Rows, rows: Rows, changes: Sequence[Change]) -> Iterator[str]:
+    """Stages by how many milliseconds their work has changed, but for those of which instructions say it."""
     by_stage: dict[str, tuple[Figure, Difference]] = {}
-    counted = {figure.of for figure in found if figure.measure == INSTRUCTIONS}
+    counted = {figure.of for figure in found if figure.measure in (INSTRUCTIONS, INSTRUCTION_TIME)}
+    measure = WORK if any(figure.measure == WORK for figure in rows) else SERVICE
     for figure, row in found.items():
-        if figure.measure in (WORK, SERVICE) and figure.of not in counted:
+        if figure.measure == measure and figure.of not in counted:
             by_stage.setdefault(figure.of, (figure, row))
     held = {
         change.key.removeprefix("config.pace_ns.") for change in changes if change.key.startswith("config.pace_ns.")

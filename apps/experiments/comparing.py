@@ -6,16 +6,18 @@ Rule: every run is a whole one, in processes of its own, as `trilane run` does i
 from __future__ import annotations
 
 import contextlib
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
+from math import log
 from pathlib import Path
-from statistics import median
+from statistics import median, stdev
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from trilane.apps.comparison.compared import compare
-from trilane.apps.comparison.difference import LEAST_FRAMES
+from trilane.apps.comparison.difference import LEAST_FRAMES, STATISTICS, Outcome
+from trilane.apps.comparison.rows import WORK
 from trilane.apps.comparison.sides import Side, read_side
-from trilane.apps.comparison.verdict import NO_DIFFERENCE
 from trilane.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -33,9 +35,11 @@ def measure(pairs: int = 10, frames: int = 300, size: str = "192") -> dict[str, 
     `frames`, `size`: of each run of the default scene. The placement is that of the first run.
 
     A row per pair: `question` (`same`; `sequential` beside pipelined; `held`: infer is held 5 % longer), the `verdict`,
-    and `others`: the share of the cores that other programs had, the larger of both runs. `no_difference`: of pairs of
-    one kind, how many were said to be of one kind. `starvation_named`: whether the verdict on sequential says that the
-    DSP is starved. `stage_named`: whether that on the held stage names it and no other. Raises BadInputError.
+    and `others`: the share of the cores that other programs had, the larger of both runs. `outcomes`: of pairs of one
+    kind, how many were said to differ, not to differ, and of how many it could not be told. `scatter`: of the runs of
+    one kind, the standard deviation of the logarithm of each stage's typical time on its core, which
+    `trilane.apps.comparison.noise` takes to be `WORK`. `starvation_named`: whether the verdict on sequential says that
+    the DSP is starved. `stage_named`: whether that on the held stage names it and no other. Raises BadInputError.
     """
     if frames <= LEAST_FRAMES:
         raise BadInputError("--frames", str(frames), f"at least {LEAST_FRAMES + 1}")
@@ -43,7 +47,8 @@ def measure(pairs: int = 10, frames: int = 300, size: str = "192") -> dict[str, 
         runs = _Runs(Path(folder), frames, size)
         first = runs.run()
         runs.pin(first)
-        rows = [_row("same", runs.run(), runs.run()) for _ in range(pairs)]
+        same = [(runs.run(), runs.run()) for _ in range(pairs)]
+        rows = [_row("same", *pair) for pair in same]
         rows.append(_row("sequential", runs.run(), runs.run(policy="sequential")))
         held_ns = round(ROOM * _longest_ns(first))
         rows.append(_row("held", runs.run(held_ns=held_ns), runs.run(held_ns=round(LONGER * held_ns))))
@@ -51,7 +56,8 @@ def measure(pairs: int = 10, frames: int = 300, size: str = "192") -> dict[str, 
     return {
         "rows": rows,
         "pairs": pairs,
-        "no_difference": sum(row["verdict"] == NO_DIFFERENCE for row in rows if row["question"] == "same"),
+        "outcomes": {str(each): sum(row["outcome"] == each for row in rows[:pairs]) for each in Outcome},
+        "scatter": _scatter([side for pair in same for side in pair]),
         "starvation_named": f"unit {UNIT} ({STAGE}) is starved" in verdicts["sequential"],
         "stage_named": _named(verdicts["held"], runs.stages) == [STAGE],
         "config": {"frames": frames, "size": size, "held_ms": held_ns / 1e6, "longer": LONGER, "cores": runs.cores},
@@ -66,8 +72,24 @@ def _named(verdict: str, stages: Sequence[str]) -> list[str]:
 def _row(question: str, base: Side, other: Side) -> dict[str, Any]:
     others = [told.document["other_programs"] for side in (base, other) for told in side.runs]
     known = [share for share in others if share is not None]
-    verdict = compare(base, [other])[0].verdict
-    return {"question": question, "verdict": verdict, "others": max(known, default=None)}
+    found = compare(base, [other])[0].as_json()
+    return {
+        "question": question,
+        "verdict": found["verdict"],
+        "outcome": found["outcome"],
+        "others": max(known, default=None),
+    }
+
+
+def _scatter(sides: Sequence[Side]) -> dict[str, float]:
+    """Of each stage, over the runs of all `sides`."""
+    times: dict[str, list[float]] = defaultdict(list)
+    for side in sides:
+        for told in side.runs:
+            for key, series in (told.frames.series if told.frames else {}).items():
+                if key.measure == WORK:
+                    times[key.of].append(log(STATISTICS["typical"](series.values, series.weights)))
+    return {stage: stdev(values) for stage, values in times.items()}
 
 
 def _longest_ns(side: Side) -> float:

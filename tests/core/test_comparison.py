@@ -282,6 +282,23 @@ def test_work_is_without_the_time_in_which_another_thread_had_the_core() -> None
         assert service - work == pytest.approx(1.5)
 
 
+def test_a_stage_that_only_waits_longer_for_its_core_takes_no_longer() -> None:
+    """Of infer's jobs, which last three times as long, two thirds are another thread's: frames are what differs."""
+    run = simulated(2, factors={"infer": 3.0})
+    assert run.recording is not None
+    records = [
+        record._replace(job=record.job._replace(preempted_ns=(record.job.end_ns - record.job.begin_ns) * 2 // 3))
+        if isinstance(record, Worked) and record.job.stage == "infer"
+        else record
+        for record in journal_of(run.recording, run.jobs, {}, run.report)
+    ]
+    waits = Told("waits", Kind.RUN, make_report(**run.report), frames_of(records))
+    found = pair(told(simulated(1)), waits)
+    assert found.verdict.startswith("frame time +2") and "unit dsp (infer) has no core" in found.verdict
+    assert "takes" not in found.verdict
+    assert Figure("service", "infer", "", "mean", "ms") in found.differing
+
+
 def test_drops_and_errors_are_named() -> None:
     run = simulated(1)
     counts = {
