@@ -28,7 +28,7 @@ from trilane.apps.comparison.verdict import NO_DIFFERENCE, TOO_FEW
 from trilane.errors import BadInputError
 from trilane.pipeline.journal import NAME, JournalWriter, Worked, journal_of
 from trilane.scheduler.virtual import Simulation
-from trilane.testing.compared_runs import simulated, write_run
+from trilane.testing.compared_runs import STAGES, simulated, write_run
 from trilane.testing.run_report import make_report
 
 Make = Callable[..., Path]
@@ -429,6 +429,22 @@ def test_the_command(
     assert "verdict: no difference" in text and "4 more settings changed: --all shows them" in text
     assert run_cli(monkeypatch, base, str(tmp_path / "nothing")) == 2
     assert "nothing" in capsys.readouterr().err
+
+
+def test_a_gate_that_cannot_tell_ends_with_3_and_says_what_would(
+    make: Make, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One run of each kind on the host: 5 % is less than it can tell; twice as long it can, and 10 times is not."""
+    base, same, slow = (
+        str(make(name, seed, factors=factors, clock="host", other_programs=0.0))
+        for name, seed, factors in (("a", 1, None), ("b", 2, None), ("c", 3, dict.fromkeys(STAGES, 2.0)))
+    )
+    wanted = {(same, "5%"): 3, (same, "100%"): 0, (slow, "5%"): 1, (slow, "100%"): 3, (slow, "1000%"): 0}
+    for (other, limit), code in wanted.items():
+        assert run_cli(monkeypatch, base, other, "--fail-if-slower", limit) == code
+        said = " ".join(capsys.readouterr().err.split())
+        assert ("cannot tell whether frames take longer by more than" in said) == (code == 3)
+        assert ("more runs of each kind" in said) == (code == 3)
 
 
 @pytest.mark.parametrize("text", ["", " ", ",", "a,,b", "a, ,b", ",a"])
