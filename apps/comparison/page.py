@@ -63,7 +63,7 @@ def _section(comparison: Comparison) -> Iterator[str]:
         )
         yield _table("What changed in configuration and machine", ("key", "base", "other"), rows)
     scales = _scales(comparison)
-    titles = ("figure", "statistic", "base", "other", "change", "95 % interval", "drawn")
+    titles = ("figure", "statistic", "base", "other", "change", "95 % interval", "outcome", "drawn")
     figures = sorted(comparison.rows, key=lambda figure: figure not in comparison.differing)
     rows = (_figure(figure, comparison, scales) for figure in figures)
     yield _table("Figures; those that differ stand first", titles, rows)
@@ -101,7 +101,8 @@ def _figure(figure: Figure, comparison: Comparison, scales: dict[tuple[bool, str
     cells = (value_of(row.base, unit), value_of(row.other, unit), change_of(row, unit), interval_of(row, unit))
     drawn = _drawing(row, scales[_scale_of(row, unit)])
     kind = "differs" if figure in comparison.differing else "same"
-    return _row(kind, _head(name_of(figure)), f"<td>{escape(figure.statistic)}</td>", *map(_number, cells), drawn)
+    texts = (f"<td>{escape(text)}</td>" for text in (figure.statistic, comparison.outcome(figure)))
+    return _row(kind, _head(name_of(figure)), next(texts), *map(_number, cells), *texts, drawn)
 
 
 def _scale_of(row: Difference, unit: str) -> tuple[bool, str]:

@@ -388,6 +388,8 @@ def test_the_page_asks_for_nothing_and_escapes_what_it_is_given() -> None:
     assert "&lt;script&gt;" in text and "default-src &#x27;none&#x27;" in text
     assert not any(word in text for word in ("http:", "https:", "src=", "url(", "@import"))
     assert text.count("<svg") == len(found.rows)
+    outcomes = [found.outcome(figure) for figure in found.rows]
+    assert all(text.count(f"<td>{each}</td>") == outcomes.count(each) for each in Outcome)
     assert "prefers-color-scheme: dark" in text
 
 
