@@ -8,7 +8,6 @@ rounding between its layers: what quantising the weights cost is then in `full` 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ import onnx
 import onnxruntime
 from onnx import helper, numpy_helper
 
+from trilane import machine
 from trilane.arrays import F32, F64
 from trilane.avatars.bundle import Bundle
 from trilane.avatars.digests import sha256_of
@@ -44,7 +44,7 @@ def float_network(bundle: Bundle) -> tuple[Paint, str]:
 def require_float_network(bundle: Bundle) -> Path | None:
     """Its `float_weights`. Raises MissingPartError when they cannot be run here: found out before long work."""
     weights = float_weights(bundle)
-    if weights is not None and find_spec("torch") is None:
+    if weights is not None and not machine.here.has_package("torch"):
         raise MissingPartError("the FP32 network needs torch", extra="train")
     return weights
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from trilane import machine
 from trilane.apps import asked_run, run_job
 from trilane.apps.cli import main as cli
 from trilane.apps.cli import sweep as cli_sweep
@@ -182,13 +183,12 @@ def test_the_check_moves_as_the_picture_is_changed(
 def test_a_check_without_its_libraries_is_refused_before_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where an avatar's float network is here PyTorch must be too; of an avatar without one it need not."""
     from trilane.avatars.bundle import load_bundle
-    from trilane.bench.lib import full_network, picture_error
+    from trilane.bench.lib import full_network
 
     bundle = load_bundle("default")
     monkeypatch.setattr(full_network, "float_weights", lambda each: Path("weights") if each == bundle else None)
     there = {"skimage", "flip_evaluator", "torch"}
-    for module in (picture_error, full_network):
-        monkeypatch.setattr(module, "find_spec", lambda name: "found" if name in there else None)
+    monkeypatch.setattr(machine.here, "has_package", there.__contains__)
     require_parts([bundle])
     there.remove("torch")
     with pytest.raises(MissingPartError, match="torch") as refused:
@@ -206,9 +206,7 @@ def test_a_check_without_its_libraries_is_refused_before_the_run(monkeypatch: py
 def test_a_sweep_whose_runs_cannot_be_checked_is_refused_before_its_first_trial(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from trilane.bench.lib import picture_error
-
-    monkeypatch.setattr(picture_error, "find_spec", lambda _: None)
+    monkeypatch.setattr(machine.here, "has_package", lambda _: False)
     words = ("sweep", "run", "--size", "64", "--size", "128", "--check")
     for check, code in (("2", 3), ("0", 0)):
         monkeypatch.setattr(cli_sweep, "_run", lambda *_: False)
