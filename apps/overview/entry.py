@@ -6,17 +6,26 @@ Rule: a figure is taken over from a document as it stands there; nothing is meas
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from trilane.figure_sources import COMPUTED, MEASURED, NO_FIGURES
+from trilane.scene.schema import Scene
 
 HOST = "host"
 #: What an error is of, and what an interval of the frame time holds.
 OF_RUN, OF_AVATAR = "errors of the runs themselves", "errors of the avatars' validations"
 BY_SCATTER, BY_MODEL = "95 %, scatter of the run's frames", "80 %, of the model"
+#: Keys of a scene that say how it is drawn, not what; another bundle may be another network of the same person.
+HOW_DRAWN = (
+    *("size", "plan", "texture_filter", "error_budget_px", "error_budget_db", "most_side", "memory_mb"),
+    *("avatars[0].bundle", "avatars[0].name"),
+)
+#: Keys of a scene whose values are told without them. The keys of every avatar are as those of the first.
+WITHOUT_KEY = ("name", "background", "output.width", "output.height", "camera.source", "avatars[0].motion")
 #: Keys of a document's `config` that are no settings, or that the row has by other names.
 NOT_SETTINGS = ("avatar_dirs", "shapes", "own_pixels", "works", "posed_vertices", "pace_ns", "units", "cuts", "record")
 
@@ -104,12 +113,24 @@ def _interval(times: Mapping[str, Any]) -> tuple[float | None, float | None]:
 
 
 def _shows(scene: Mapping[str, Any]) -> str:
-    """What the frames of `scene` are of, in words; a smaller tensor or another network shows the same."""
+    """What the frames of `scene` are of, in words; a smaller tensor or another network shows the same.
+
+    Whatever is not as usual is named by its key: two scenes of the same words show the same pictures.
+    """
     output, camera = _mapping(scene, "output"), _mapping(scene, "camera")
     bodies = [body for body in _sequence(scene.get("avatars")) if isinstance(body, Mapping)]
     picture = f"{output.get('width')}x{output.get('height')}" if output else None
     parts = [scene.get("name"), picture, camera.get("source"), *(body.get("motion") for body in bodies)]
-    return _text(", ".join(str(part) for part in [*parts, scene.get("background")] if part))
+    return _text(", ".join(str(part) for part in [*parts, scene.get("background"), *_unusual(scene)] if part))
+
+
+def _unusual(scene: Mapping[str, Any]) -> Iterator[str]:
+    """Keys of `scene` with their values, such as `frames 60`, where a scene has others unless it says so."""
+    usual = dict(_settings(Scene().model_dump(mode="json")))
+    for key, value in _settings(scene):
+        plain = re.sub(r"^avatars\[\d+\]", "avatars[0]", key)
+        if plain not in (*HOW_DRAWN, *WITHOUT_KEY) and usual.get(plain) != value:
+            yield f"{key} {value}"
 
 
 def _error(document: Mapping[str, Any]) -> tuple[float | None, str, str]:

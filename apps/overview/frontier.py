@@ -1,7 +1,8 @@
 """Which entries nobody beats in both: the frontier of frame time against error.
 
 Rule: one entry beats another when it is at least as quick and at least as near to the truth, and better in one of both.
-Entries are compared with those of their own clock and machine; one without a speed or an error is on no frontier.
+Entries are compared with those of their own clock, machine and scene, and of the same kind of error; one without a
+speed or an error is on no frontier.
 """
 
 from __future__ import annotations

@@ -125,11 +125,16 @@ def test_what_is_shown_says_nothing_of_what_it_costs() -> None:
         {"config": {"scene": SCENE | {"name": "near"}}},
         {"config": {"scene": SCENE | {"camera": {"source": "phone.txt"}}}},
         {"config": {"scene": SCENE | {"output": {"width": 1280, "height": 720}}}},
+        {"config": {"scene": SCENE | {"frames": 60}}},
+        {"config": {"scene": SCENE | {"fps": 15.0}}},
+        {"config": {"scene": SCENE | {"avatars": [{"motion": "walk.bvh", "start_s": 2.0}]}}},
+        {"config": {"scene": SCENE | {"avatars": [{"motion": "walk.bvh", "position": [1.0, 0.0, 0.0]}]}}},
+        {"config": {"scene": SCENE | {"camera": {"source": "builtin:orbit", "fov_y_deg": 20.0}}}},
         {"check": {"psnr_db": 39.0, "frames": 4}},
         {"machine": {"title": "Another"}},
         {"clock": "virtual"},
     ],
-    ids=["scene", "camera", "picture", "kind of error", "machine", "clock"],
+    ids=["scene", "camera", "picture", "frames", "rate", "part", "place", "lens", "kind of error", "machine", "clock"],
 )
 def test_errors_and_times_of_different_kinds_are_not_compared(change: dict[str, Any]) -> None:
     """The other entry is quicker and has fewer errors, but of something else: both stay on their frontiers."""
