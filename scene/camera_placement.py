@@ -2,9 +2,10 @@
 
 Rule: the recording is moved as one rigid, upright piece: it is turned about the vertical and shifted; its movement from
 frame to frame never changes. A fixed grid of places is searched, coarse and then finer. The best place shows the whole
-bodies in the most frames; among equals the one where they are larger wins. At the first frame the camera is in front of
+bodies at the most moments; among equals the one where they are larger wins. At first the camera is in front of
 the avatars, in the direction that a heading of 0 faces. Over a drawn background the camera is also tilted by one
-constant angle, so that it does not look down on people.
+constant angle, so that it does not look down on people. The moments are those of the scene's first seconds, however
+many frames a run shows and at whatever rate: a frame of a scene is the same picture in every run.
 """
 
 from __future__ import annotations
@@ -24,8 +25,9 @@ from trilane.scene.placed_camera import PlacedCamera
 from trilane.scene.rotations import about, quat_from_matrix, quat_multiply
 from trilane.scene.schema import Scene
 
-#: Frames at which a place is scored.
-SCORED_FRAMES = 48
+#: A place is scored at so many moments, evenly spread over the first SCORED_S seconds of the scene, in which a shorter
+#: motion or recording is repeated as in a run. What a longer one shows later does not count.
+SCORED_MOMENTS, SCORED_S = 48, 10.0
 #: Metres: the grid of places, level up to REACH_M each way from the camera and EYE_HEIGHTS_M below it; first in steps
 #: of COARSE_M, then in those of FINER_M round the best place so far.
 REACH_M, COARSE_M = 7.0, 0.5
@@ -35,13 +37,13 @@ FINER_M = (0.25, 0.12, 0.06)
 LOWEST_EYE_M = 0.3
 #: A body counts as whole in the picture when it is within this part of the picture's half width and half height.
 MARGIN = 0.97
-#: With whole bodies in a smaller part of the frames the run warns.
+#: With whole bodies at a smaller part of the moments the run warns.
 ENOUGH_WHOLE = 0.5
 #: Range of the camera's median line of sight, degrees above the horizon; outside of it the camera is tilted to its end.
 SIGHT_DEG = (-24.0, 0.0)
 LARGEST_TILT_DEG = 40.0
 SYNTHETIC_BACKGROUNDS = ("room",)
-#: Score of the bodies' share of the picture's height, up to ENOUGH_SIZE, against that of whole bodies in all frames, 1.
+#: Score of the bodies' share of the picture's height, up to ENOUGH_SIZE; whole bodies at all moments score 1.
 SIZE_WEIGHT, ENOUGH_SIZE = 0.12, 0.75
 NEAREST_M = 0.3
 #: Places that are scored together: so few that the arrays stay in the processor's cache.
@@ -50,7 +52,7 @@ PLACES_AT_ONCE = 256
 
 @dataclass(frozen=True)
 class _Footage:
-    """The recording and the bodies at the F frames at which places are scored.
+    """The recording and the bodies at the F moments at which places are scored.
 
     `views` (F, 3, 4): path world to camera. `eyes` (F, 3): the camera's places, path world. `boxes` (F, 8, 3):
     corners of a box round the bodies, scene world. `lenses` (F, 2, 2): of x and of y, factor and addend to NDC, where
@@ -67,11 +69,11 @@ def place_camera(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies
     """The camera of a scene. A built-in one, and one whose spec has `place = "none"`, stays where it is.
 
     `path`: of the camera.
-    `scene`: says which frames are filmed.
+    `scene`: says what lies behind, how large the picture is, and whether the camera is placed.
     `movers`: its avatars.
     `bodies`: of these avatars, in the same order.
     """
-    times = np.linspace(0.0, (scene.frames - 1) / scene.fps, min(scene.frames, SCORED_FRAMES))
+    times = np.linspace(0.0, SCORED_S, SCORED_MOMENTS)
     if not path.recorded:
         return PlacedCamera(path, np.eye(3), np.zeros(3), np.eye(3), ())
     if scene.camera.place == "none":
@@ -100,12 +102,12 @@ def place_camera(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies
 
 def _seen_notes(whole: float, size: float) -> tuple[str, ...]:
     """How much of the bodies is filmed, and a warning where it is little."""
-    seen = f"whole body in the picture in {whole:.0%} of the frames, {size:.0%} of its height on average"
+    seen = f"whole body in the picture in {whole:.0%} of the first {SCORED_S:g} s, {size:.0%} of its height on average"
     if whole >= ENOUGH_WHOLE:
         return (seen,)
     return seen, (
-        f"warning: the body is whole in less than {ENOUGH_WHOLE:.0%} of the frames; if the picture lies on its side or "
-        "looks past the body, state camera.up_axis or another camera.place"
+        f"warning: the body is whole in less than {ENOUGH_WHOLE:.0%} of them; if the picture lies on its side or looks "
+        "past the body, state camera.up_axis or another camera.place"
     )
 
 
@@ -174,7 +176,7 @@ def _best(footage: _Footage, places: F64) -> F64:
 
 
 def _visibility(footage: _Footage, places: F64) -> tuple[F64, F64]:
-    """For each place: share of the frames with whole bodies, and mean share of the picture's height that they take.
+    """For each place: share of the moments with whole bodies, and mean share of the picture's height that they take.
 
     Each (S,).
     """

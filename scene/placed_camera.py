@@ -31,6 +31,11 @@ class PlacedCamera:
         turn, place = self.path.pose(t_s)
         return view_from_pose(self.turn @ turn @ self.mount, self.turn @ place + self.shift)
 
+    def reach(self) -> tuple[F64, F64]:
+        """Lowest and highest coordinates (3,), in the scene, of the places that the camera is ever at."""
+        places = self.path.places @ self.turn.T + self.shift
+        return places.min(axis=0), places.max(axis=0)
+
     def projection(self, t_s: float, output: Shape) -> F64:
         """OpenGL clip matrix (4, 4) at `t_s` for a picture of `output` (height, width)."""
         return self.path.projection(t_s, output)

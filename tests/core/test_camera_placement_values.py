@@ -103,7 +103,8 @@ def test_the_grids_of_places() -> None:
     assert finer[0].tolist() == [1, 2, 3] and len(finer) == 28
     wanted = {(1 + a, 2 + b, 3 + c) for a in (-0.25, 0, 0.25) for b in (-0.25, 0, 0.25) for c in (-0.25, 0, 0.25)}
     assert {tuple(row) for row in finer[1:]} == wanted
-    assert (placement.SCORED_FRAMES, placement.FINER_M, placement.PLACES_AT_ONCE) == (48, (0.25, 0.12, 0.06), 256)
+    assert (placement.FINER_M, placement.PLACES_AT_ONCE) == ((0.25, 0.12, 0.06), 256)
+    assert (placement.SCORED_MOMENTS, placement.SCORED_S) == (48, 10.0)
 
 
 def test_turn_shift_and_distance_of_a_place() -> None:
@@ -167,11 +168,11 @@ def test_a_built_in_camera_stays_and_a_placed_one_is_moved_with_its_path(body: S
     same = placement.place_camera(built_in, Scene(), [], [])
     assert same.sample(0.0) == pytest.approx(built_in.sample(0.0)) and same.notes == ()
     mover = make_mover(AvatarSpec(), BUILTIN["t-pose"](), body)
-    same = placement.place_camera(camera, Scene(frames=2, camera=CameraSpec(place="none")), [mover], [body])
+    same = placement.place_camera(camera, Scene(camera=CameraSpec(place="none")), [mover], [body])
     assert same.sample(0.0) == pytest.approx(camera.sample(0.0))
     assert same.notes == (
-        "whole body in the picture in 0% of the frames, 21% of its height on average",
-        "warning: the body is whole in less than 50% of the frames; if the picture lies on its side or looks past the "
+        "whole body in the picture in 0% of the first 10 s, 21% of its height on average",
+        "warning: the body is whole in less than 50% of them; if the picture lies on its side or looks past the "
         "body, state camera.up_axis or another camera.place",
     )
 
@@ -179,15 +180,15 @@ def test_a_built_in_camera_stays_and_a_placed_one_is_moved_with_its_path(body: S
 def test_the_warning_of_a_body_that_is_not_filmed() -> None:
     assert len(placement._seen_notes(0.5, 0.6)) == 1
     seen, warning = placement._seen_notes(0.49, 0.6)
-    assert seen == "whole body in the picture in 49% of the frames, 60% of its height on average"
-    assert warning.startswith("warning: the body is whole in less than 50% of the frames")
+    assert seen == "whole body in the picture in 49% of the first 10 s, 60% of its height on average"
+    assert warning.startswith("warning: the body is whole in less than 50% of them")
 
 
 def test_notes_of_a_placed_camera(body: ShapedBody) -> None:
     """A camera that looks 30 degrees down in a drawn room; its notes say what can be computed again."""
     camera = path([rot.about(0, math.radians(-30))] * 5, [[30.0, -7.0, 12.0]] * 5)
     mover = make_mover(AvatarSpec(), BUILTIN["t-pose"](), body)
-    placed = placement.place_camera(camera, Scene(frames=60), [mover], [body])
+    placed = placement.place_camera(camera, Scene(), [mover], [body])
     assert placed.mount == pytest.approx(rot.about(0, math.radians(6)))
     eye = placed.turn @ [30.0, -7.0, 12.0] + placed.shift
     assert placed.notes == (
@@ -195,7 +196,33 @@ def test_notes_of_a_placed_camera(body: ShapedBody) -> None:
         f"camera set down {math.hypot(eye[0], eye[2]):.1f} m from the avatar, {eye[1]:.1f} m over the floor on average",
         placed.notes[2],
     )
-    assert placed.notes[2].startswith("whole body in the picture in 100% of the frames, ")
+    assert placed.notes[2].startswith("whole body in the picture in 100% of the first 10 s, ")
     share = float(placed.notes[2].split(", ")[1].split("%")[0]) / 100
     assert 0.6 < share < 0.97  # as large as the picture takes it, up to ENOUGH_SIZE and the finest step
     assert abs(eye[0]) < 1e-9 and 0.3 <= eye[1] <= 3.7
+
+
+@pytest.mark.parametrize("distance", [4.0, 6.0, 12.0])
+def test_a_camera_that_stands_farther_off_reports_a_smaller_body(body: ShapedBody, distance: float) -> None:
+    """Half as near, half as large: the nearest side of the box of the T pose, in the picture of a level lens of 60
+    degrees at 0.9 m, has its height over tan 30 degrees and its distance, a half of which is the share.
+    """
+    mover = make_mover(AvatarSpec(), BUILTIN["t-pose"](), body)
+    (low,), (high,) = placement._bounds(np.array([0.0]), [mover], [body])
+    camera = path([np.eye(3)], [[0.0, 0.9, distance]])
+    placed = placement.place_camera(camera, Scene(camera=CameraSpec(place="none")), [mover], [body])
+    share = (high[1] - low[1]) / math.tan(math.radians(30)) / (distance - high[2]) / 2
+    assert placed.notes == (
+        f"whole body in the picture in 100% of the first 10 s, {share:.0%} of its height on average",
+    )
+
+
+def test_the_reach_of_a_camera_is_where_it_ever_stands() -> None:
+    """Three places, turned by a quarter about +Y, x to -z and z to x, and shifted."""
+    camera = path([np.eye(3)] * 3, [[1, 2, 3], [-1, 5, 4], [0, 4, 9]])
+    placed = PlacedCamera(camera, rot.about(1, math.pi / 2), np.array([10.0, 0.0, -1.0]), np.eye(3), ())
+    low, high = placed.reach()
+    assert low == pytest.approx([13, 2, -2]) and high == pytest.approx([19, 5, 0])
+    for t_s in np.linspace(0, 0.3, 50):
+        eye = np.linalg.inv(placed.sample(float(t_s)))[:3, 3]
+        assert (eye >= low - 1e-9).all() and (eye <= high + 1e-9).all()

@@ -163,5 +163,25 @@ def test_real_cameras_see_whole_people_in_nearly_every_frame(
     body: ShapedBody, shared_data: Path, camera: str, motion: str | None
 ) -> None:
     source = "builtin:walk-wave-turn" if motion is None else shared_data / "motion" / motion
-    scene = staged(body, shared_data / "camera" / camera, source, frames=200)
-    assert whole_share(scene, body, 200) >= 0.95
+    scene = staged(body, shared_data / "camera" / camera, source)
+    assert whole_share(scene, body, 300) >= 0.9  # of the ten seconds that a place is chosen by
+
+
+@pytest.mark.parametrize("camera", ["arkit_camera_pose.txt", "tum_freiburg1_xyz.txt"])
+def test_a_frame_shows_the_same_however_many_a_run_has(body: ShapedBody, shared_data: Path, camera: str) -> None:
+    """Pose and lens of each frame that two runs share, to the bit, and the room that holds the camera."""
+    motion = shared_data / "motion" / "cmu_jumping_jacks.bvh"
+    runs = {count: staged(body, shared_data / "camera" / camera, motion, frames=count) for count in (1, 60, 150, 900)}
+    longest = runs.pop(900)
+    for count, run in runs.items():
+        for frame in range(0, count, 7):
+            assert np.array_equal(run.camera.sample(frame / 30), longest.camera.sample(frame / 30))
+            assert np.array_equal(*(one.camera.projection(frame / 30, OUTPUT) for one in (run, longest)))
+        assert np.array_equal(run.camera.reach(), longest.camera.reach())
+        assert run.notes == longest.notes
+
+
+def test_a_moment_shows_the_same_at_whatever_rate(body: ShapedBody, tmp_path: Path) -> None:
+    log = write_path(tmp_path / "log.txt", wandering())
+    slow, fast = (staged(body, log, "builtin:idle", fps=fps, frames=40) for fps in (5.0, 60.0))
+    assert np.array_equal(slow.camera.sample(0.6), fast.camera.sample(0.6))
