@@ -3,13 +3,14 @@
 Rule: both plans run interleaved, on the same moments of the same scenes, each on the cores that are best for it, as
 `trilane run` places it; the pictures that are compared are made by the
 runs' own stages from the very configurations that were timed. What they are compared with, the plan `full`, is written
-a second time (`bench/lib/full_picture.py`).
+a second time (`bench/lib/full_picture.py`). Single bad frames are seen and means hide them, so every frame of both runs
+is compared too, with the truth, which takes less long to draw.
 """
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import median
@@ -20,9 +21,8 @@ import numpy as np
 from trilane.arrays import U8
 from trilane.bench.lib.cast import Cast
 from trilane.bench.lib.full_picture import FullPictures
-from trilane.bench.lib.picture_error import PictureErrors, require_metrics
+from trilane.bench.lib.picture_error import PictureErrors, box_psnr_db, psnr_of_frames, require_metrics
 from trilane.bench.lib.plans import fixed, in_frames, planned
-from trilane.bench.lib.shape_changes import shape_changes, summed_up
 from trilane.bench.lib.stage_chain import AvatarFrames
 from trilane.bench.lib.true_picture import true_pictures
 from trilane.errors import BadInputError, TrilaneError
@@ -61,9 +61,9 @@ def measure(
     `psnr_planned_db`, `ssim_*`, `flip_*` of the frames against those of
     `full`, the same with `box_` in the avatars' rectangles, None with nobody in view; PSNR is that of the mean square
     over all frames; `truth`: the same against the clothed body that an avatar of the package was trained on, `full`
-    too; `network`: what paints `full`; `tensors`: the planned ones; `shape_changes`: what
-    `trilane.bench.lib.shape_changes.summed_up` says of the planned frames, all of the scene's. `median_speedup`,
-    `least_speedup`, `largest_loss_db` (fixed minus planned); `sources`; `driver`; `config`.
+    too; `network`: what paints `full`; `tensors`: the planned ones; `by_frame`: what `by_frame` says of all frames,
+    None where there is no truth. `median_speedup`, `least_speedup`, `largest_loss_db` (fixed minus planned) and
+    `worst_loss_db`, the same of the worst frames, None without any truth; `sources`; `driver`; `config`.
 
     Raises BadInputError, MissingPartError, TrilaneError when a run fails.
     """
@@ -85,6 +85,7 @@ def measure(
         "median_speedup": median(row["speedup"] for row in rows),
         "least_speedup": min(row["speedup"] for row in rows),
         "largest_loss_db": max(row["psnr_fixed_db"] - row["psnr_planned_db"] for row in rows),
+        "worst_loss_db": max((_worst_loss_db(row["by_frame"]) for row in rows if row["by_frame"]), default=None),
         "sources": {"scenes": MEASURED},
         "driver": found[-1].driver,
         "config": {"frames": frames, "rounds": rounds, "pictures": pictures, "runtime": runtime, "video": video},
@@ -146,6 +147,7 @@ class _Scene:
         true = true_pictures(cast, first.gl)
         against_full = {plan: PictureErrors() for plan in chains}
         against_true = {plan: PictureErrors() for plan in ("full", *chains)}
+        frame_by_frame = by_frame(range(total), chains, first, true, cast) if true is not None else None
         sheets, tensors = [], []
         for number in (index * total // pictures for index in range(pictures)):
             background, boxes = first.background(number), cast.boxes(number)
@@ -164,8 +166,43 @@ class _Scene:
             "truth": _figures(against_true) if true is not None else None,
             "network": "; ".join(full.networks),
             "tensors": sorted(set(tensors)),
-            "shape_changes": summed_up(shape_changes(chains["planned"], cast, total)),
+            "by_frame": frame_by_frame,
         }, sheets
+
+
+def by_frame(
+    frames: Iterable[int], chains: Mapping[str, AvatarFrames], behind: AvatarFrames, true: TruePictures, cast: Cast
+) -> dict[str, Any] | None:
+    """Of `frames`, one after the other, each plan's error in the avatars' boxes against the truth.
+
+    `behind`: whose background the truth has. By plan what `psnr_of_frames` says of the frames in which somebody is
+    seen, and `worst_frame`, its number; and of `planned` `changes`: how often the tensor's shape is not that of the
+    frame before, and `worst_change_db`, the least PSNR of these frames, None without any. None with nobody in view.
+    """
+    errors: dict[str, dict[int, float]] = {plan: {} for plan in chains}
+    tensors: dict[int, str] = {}
+    for number in frames:
+        made = {plan: chain.frame(number) for plan, chain in chains.items()}
+        boxes = cast.boxes(number)
+        if boxes:
+            wanted = true.frame(number, behind.background(number))
+            tensors[number] = chains["planned"].tensor
+            for plan, picture in made.items():
+                errors[plan][number] = box_psnr_db(picture, wanted, boxes)
+    if not tensors:
+        return None
+    found: dict[str, Any] = {
+        plan: {**psnr_of_frames([*each.values()]), "worst_frame": min(each, key=lambda number: each[number])}
+        for plan, each in errors.items()
+    }
+    changed = [number for number, tensor in tensors.items() if tensors.get(number - 1, tensor) != tensor]
+    worst = min((errors["planned"][number] for number in changed), default=None)
+    found["planned"] |= {"changes": len(changed), "worst_change_db": worst}
+    return found
+
+
+def _worst_loss_db(found: Mapping[str, Any]) -> float:
+    return float(found["fixed"]["worst_psnr_db"] - found["planned"]["worst_psnr_db"])
 
 
 def _figures(errors: Mapping[str, PictureErrors]) -> dict[str, float | None]:

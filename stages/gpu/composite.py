@@ -16,28 +16,24 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F64, Floats
 from trilane.pipeline.stage import UnitContext
-from trilane.scene.placed_camera import PlacedCamera
-from trilane.scene.schema import PlaneSpec, Scene
+from trilane.scene.schema import PlaneSpec
 from trilane.scene.work import Work
 from trilane.shapes import Shape
 from trilane.stages.avatar_assets import distinct, shaped_body, staged_of
 from trilane.stages.config import RunConfig
 from trilane.stages.gpu import opengl_calls
 from trilane.stages.gpu.background import Background, open_background
-from trilane.stages.gpu.camera_matrices import eye_of
 from trilane.stages.gpu.composite_painters import AvatarPainter, PicturePainter, RoomPainter, ShadowPainter
 from trilane.stages.gpu.contact_shadows import DISCS, floor_discs
 from trilane.stages.gpu.detected_planes import PlanePainter
 from trilane.stages.gpu.drawn_frames import Drawing, DrawnFrames
 from trilane.stages.gpu.head_up_display import Hud
 from trilane.stages.gpu.opengl_context import CONTEXT, checked, describe, open_context
-from trilane.stages.gpu.shape_change import ShapeChange
 from trilane.stages.gpu.still_background import StillBackground
 from trilane.stages.gpu.transfers import counter_of, read_into
 from trilane.transport.packets import Packet
 
 ROOM = "room"
-ROOM_FRAMES = 8
 
 
 class CompositeStage:
@@ -46,7 +42,7 @@ class CompositeStage:
     `shapes`: tensor shapes that may come.
     `rest`: rest joints (55,3) of each avatar of the scene, metres.
     `background`: None for the built-in room.
-    `eyes`: places (3,) of the camera that the room is made to hold.
+    `eyes`: places (3,) that the room holds from the first frame on, so that it does not grow, nor after a restart.
     `planes`: detected ones to show.
     `hud`: show frame, rate and age.
     """
@@ -72,7 +68,6 @@ class CompositeStage:
         self._hud = Hud(ctx) if hud else None
         self._shadow = ShadowPainter(ctx, len(DISCS) * len(rest))
         self._painter = AvatarPainter(ctx, list(shapes))
-        self._change = ShapeChange(rest)
         self._held: NDArray[np.void] | None = None  # header of the frame whose picture of the avatars was uploaded
         self._shows_background = 0  # grows with each picture of it
         self._drawn = DrawnFrames()
@@ -133,14 +128,11 @@ class CompositeStage:
                 self._picture.upload(picture)
                 counter_of(self._ctx).least += picture.nbytes
         if int(pose["work"]) == Work.FULL:
-            self._change.note(self._held, pose)
             self._held = pose.copy()
             if _visible(pose):
                 shape = _tensor_shape(pose)
                 self._painter.upload(shape, image[: math.prod(shape) * 4])
                 counter_of(self._ctx).least += _cells_bytes(pose)
-                for change in self._change.blends(pose):
-                    self._painter.blend(shape, change)
 
     def _holds(self, picture: int) -> bool:
         """Whether the picture of the avatars that was uploaded is that of frame `picture`."""
@@ -213,22 +205,11 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> CompositeStage:
     shape, folders = (scene.output.height, scene.output.width), distinct(config)
     joints = [shaped_body(unit.assets, folders.index(folder)).joints for folder in config.avatar_dirs]
     camera = staged_of(unit.assets).camera
-    if scene.background == ROOM:
-        background, eyes = None, room_eyes(camera, scene)
-    else:
-        background, eyes = open_background(Path(scene.background), shape, scene.fps, camera.path), []
+    background = None
+    if scene.background != ROOM:
+        background = open_background(Path(scene.background), shape, scene.fps, camera.path)
     ctx = unit.shared(CONTEXT, lambda: open_context(unit.settings.threads))
     driver = describe(ctx)
     if driver.hardware:
         unit.use_device(driver.renderer)
-    return CompositeStage(ctx, shape, config.buckets, joints, background, eyes, scene.planes, scene.hud)
-
-
-def room_eyes(camera: PlacedCamera, scene: Scene) -> list[Floats]:
-    """Where the camera stands at ROOM_FRAMES instants spread over the scene, float32 as in a packet.
-
-    The room holds them from the first frame on: it seldom grows, and it is the same in a unit that was restarted.
-    """
-    count = min(ROOM_FRAMES, scene.frames)
-    frames = [index * scene.frames // count for index in range(count)]
-    return [eye_of(camera.sample(frame / scene.fps).astype(np.float32)) for frame in frames]
+    return CompositeStage(ctx, shape, config.buckets, joints, background, camera.reach(), scene.planes, scene.hud)

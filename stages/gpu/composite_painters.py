@@ -19,7 +19,6 @@ from trilane.stages.gpu.builtin_room import Extent, room_mesh, room_textures
 from trilane.stages.gpu.camera_matrices import eye_of, target_clip
 from trilane.stages.gpu.picture_spans import BAND, WHOLE, spans
 from trilane.stages.gpu.shader_program import build_program
-from trilane.stages.gpu.shape_change import Blend
 from trilane.stages.gpu.transfers import counter_of, upload, uploaded_buffer
 
 MAX_TAPS = 8
@@ -119,8 +118,6 @@ class AvatarPainter:
         self._ctx = ctx
         self._premultiply = build_program(ctx, "whole_screen.vert", "premultiply.frag")
         self._screen = ctx.vertex_array(self._premultiply, [])
-        self._change = build_program(ctx, "whole_screen.vert", "shape_change.frag")
-        self._changing = ctx.vertex_array(self._change, [])
         programs = [build_program(ctx, "avatar.vert", "avatar.frag", TAPS=taps) for taps in range(1, MAX_TAPS + 1)]
         self._parts = ctx.buffer(reserve=max(-(-height // BAND) for height, _ in shapes) * WHOLE.nbytes, dynamic=True)
         self._quads = [(made, ctx.vertex_array(made, [(self._parts, "4f/i", "part")])) for made in programs]
@@ -137,19 +134,6 @@ class AvatarPainter:
         self._ctx.enable_only(moderngl.NOTHING)
         straight.use(0)
         self._screen.render(vertices=3)
-
-    def blend(self, shape: tuple[int, int], change: Blend) -> None:
-        """Blend a part of an older picture of another shape into the one of `shape` that was just uploaded."""
-        straight, target, _ = self._pictures[shape]
-        target.use()
-        self._ctx.enable_only(moderngl.NOTHING)
-        straight.use(0)
-        self._pictures[change.shape][2].use(1)
-        self._change["image"].value, self._change["before"].value = 0, 1
-        self._change["cell"].value, self._change["part"].value = _sides(change.cell), _sides(change.part)
-        self._change["old_from_new"].value = (*change.scale, *change.offset)
-        self._change["share"].value = change.share
-        self._changing.render(vertices=3)
 
     def draw(
         self, target: Any, shape: tuple[int, int], rect: tuple[float, ...], tensor_rect: tuple[int, int, int, int]
@@ -201,12 +185,6 @@ def taps_of(cell: tuple[int, int], pixels: tuple[float, float]) -> int:
 
 def _density(cell: tuple[int, int], pixels: tuple[float, float]) -> float:
     return max(side / max(length, 1e-6) for side, length in zip(cell, pixels, strict=True))
-
-
-def _sides(cell: tuple[int, int, int, int]) -> tuple[int, int, int, int]:
-    """Left, top, right, bottom of top, left, height, width."""
-    top, left, height, width = cell
-    return left, top, left + width, top + height
 
 
 def _detail(ctx: Any, image: U8, minify: int) -> Any:

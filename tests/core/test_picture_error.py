@@ -7,7 +7,14 @@ import pytest
 
 from trilane.bench.lib import picture_error
 from trilane.bench.lib.layers import Box
-from trilane.bench.lib.picture_error import PictureErrors, inside, psnr_db, require_metrics
+from trilane.bench.lib.picture_error import (
+    PictureErrors,
+    box_psnr_db,
+    inside,
+    psnr_db,
+    psnr_of_frames,
+    require_metrics,
+)
 from trilane.errors import MissingPartError
 
 SHAPE = (24, 32, 3)
@@ -32,6 +39,26 @@ def test_psnr_of_a_mean_square() -> None:
 def test_the_pixels_of_two_boxes_count_once() -> None:
     mask = inside([Box(0, 0, 4, 4), Box(2, 2, 6, 8)], grey(0))
     assert mask.sum() == 16 + 24 - 4 and mask[3, 3] and not mask[0, 5]
+
+
+def test_psnr_in_boxes_is_of_their_pixels_alone() -> None:
+    """Steps of 51, a fifth, in a quarter of the box's pixels: 0.04 / 4. Outside of it all is wrong."""
+    picture = grey(255)
+    picture[2:6, 2:10] = 100
+    picture[2:4, 2:6] = 151
+    assert box_psnr_db(picture, grey(100), [Box(2, 2, 6, 10)]) == pytest.approx(20)
+    assert box_psnr_db(grey(7), grey(7), [Box(0, 0, 1, 1)]) == 100
+
+
+def test_one_bad_frame_moves_the_worst_and_hardly_the_mean() -> None:
+    """100 frames of 40 dB, then one of them 20: the mean falls by a fifth of a dB, the worst by 20. The 1st percentile
+    lies at 0.99 of the way from the worst to the next one.
+    """
+    frames = [40.0] * 100
+    assert psnr_of_frames(frames) == {"psnr_db": 40, "worst_psnr_db": 40, "p1_psnr_db": 40}
+    frames[37] = 20.0
+    found = psnr_of_frames(frames)
+    assert found == pytest.approx({"psnr_db": 39.8, "worst_psnr_db": 20, "p1_psnr_db": 20 + 0.99 * 20})
 
 
 class TestErrors:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from trilane.bench import placement, planner
+from trilane.bench.lib.layers import Box
 from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline.trial import Round
 from trilane.scheduler.placement import Ranked
@@ -219,7 +220,9 @@ class Scene:
         self.driver = {"renderer": f"driver of {name}"}
 
     def compare(self, pictures: int) -> Any:
+        worst = {plan: {"worst_psnr_db": value - 5} for plan, value in (("fixed", self.fixed), ("planned", 30.0))}
         row = {"psnr_fixed_db": self.fixed, "psnr_planned_db": self.planned, "asked": (*self.asked, pictures)}
+        row["by_frame"] = None if self.name == "scene b" else worst
         return row, [(3, np.full((2, 2, 3), 9, np.uint8))]
 
     def time(self, rounds: int, starter: str) -> Any:
@@ -241,9 +244,11 @@ def test_plans_are_compared_by_scene_and_in_all(monkeypatch: pytest.MonkeyPatch,
         "psnr_fixed_db": 42.0,
         "psnr_planned_db": 41.75,
         "asked": (20, "ort", False, 2),
+        "by_frame": None,
     }
     assert [row["name"] for row in found["scenes"]] == ["scene a", "scene b", "scene c"]
     assert (found["median_speedup"], found["least_speedup"], found["largest_loss_db"]) == (1.5, 0.5, 0.25)
+    assert found["worst_loss_db"] == 0.0  # 30 - 30 of a; c gains ten; nothing is known of b
     assert found["driver"] == {"renderer": "driver of c"}
     assert found["config"] == {"frames": 20, "rounds": 4, "pictures": 2, "runtime": "ort", "video": False}
     assert sorted(path.name for path in (tmp_path / "pictures").iterdir()) == [f"scene {name}-3.png" for name in "abc"]
@@ -273,3 +278,46 @@ def test_both_plans_are_timed_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
         "placements": {"fixed": "f on its cores", "planned": "p on its cores"},
     }
     assert [(one.plan, *rest) for one, *rest in asked] == [("f", "s, fixed", starter), ("p", "s, planned", starter)] * 3
+
+
+class Told:
+    """Frames of one grey each, in tensors that are told."""
+
+    def __init__(self, values: list[int], tensors: str = "aaaaaa") -> None:
+        self.values, self.tensors, self.tensor = values, tensors, ""
+
+    def frame(self, number: int) -> Any:
+        self.tensor = self.tensors[number]
+        return np.full((4, 6, 3), self.values[number], np.uint8)
+
+    def background(self, number: int) -> Any:
+        return np.full((4, 6, 3), number, np.uint8)
+
+
+class Truth:
+    """Grey 100 in each frame, whose number its background tells; nobody is seen in frame 2."""
+
+    def frame(self, number: int, background: Any) -> Any:
+        assert background[0, 0, 0] == number != 2
+        return np.full((4, 6, 3), 100, np.uint8)
+
+    def boxes(self, number: int) -> list[Box]:
+        return [] if number == 2 else [Box(1, 1, 3, 4)]
+
+
+def test_every_frame_is_compared_and_the_worst_ones_are_named() -> None:
+    """A step of 51, a fifth, has 13.98 dB, one of 25.5 would have 6 more. The tensor changes in frames 1 and 5; that of
+    frame 3 is another than that of frame 1, but nobody was seen between.
+    """
+    chains = {"fixed": Told([100, 100, 0, 151, 100, 100]), "planned": Told([100, 151, 0, 100, 100, 202], "abcaac")}
+    truth: Any = Truth()
+    found = planner.by_frame(range(6), chains, Told([0] * 6), truth, truth)  # type: ignore[arg-type]
+    fifth, two = -20 * np.log10(0.2), -20 * np.log10(0.4)
+    assert found is not None
+    assert {plan: row["worst_frame"] for plan, row in found.items()} == {"fixed": 3, "planned": 5}
+    assert found["fixed"]["psnr_db"] == pytest.approx((4 * 100 + fifth) / 5)
+    assert found["fixed"]["worst_psnr_db"] == pytest.approx(fifth) and "changes" not in found["fixed"]
+    assert found["planned"]["psnr_db"] == pytest.approx((3 * 100 + fifth + two) / 5)
+    assert found["planned"]["worst_psnr_db"] == found["planned"]["worst_change_db"] == pytest.approx(two)
+    assert found["planned"]["changes"] == 2
+    assert planner.by_frame([2], chains, Told([0] * 6), truth, truth) is None  # type: ignore[arg-type]

@@ -18,13 +18,12 @@ from trilane.bench.lib import float_raster
 from trilane.scene.crop import Rect
 from trilane.scene.schema import PlaneSpec
 from trilane.scene.tensor_layout import lay_out_at
-from trilane.stages.gpu import composite, composite_painters, head_up_display, opengl_calls
+from trilane.stages.gpu import composite_painters, head_up_display, opengl_calls
 from trilane.stages.gpu.builtin_room import Extent, room_mesh
 from trilane.stages.gpu.composite import CompositeStage
 from trilane.stages.gpu.composite_painters import AvatarPainter, PicturePainter, RoomPainter, ShadowPainter
 from trilane.stages.gpu.contact_shadows import floor_discs
 from trilane.stages.gpu.detected_planes import PlanePainter, half_sides
-from trilane.stages.gpu.shape_change import Blend
 from trilane.stages.packets import pose_dtype
 from trilane.testing.told_bytes import without_bytes
 from trilane.transport.packets import Packet, SlotLayout, view_packet
@@ -441,45 +440,14 @@ def test_a_composite_needs_both_slots(gl: Any, slots: Any) -> None:
         stage(gl).run(0, *slots)
 
 
-@pytest.mark.parametrize(
-    ("frames", "expected"), [(3, [0, 1, 2]), (8, range(8)), (20, [0, 2, 5, 7, 10, 12, 15, 17])], ids=str
-)
-def test_the_room_holds_the_camera_at_eight_instants_of_the_scene(frames: int, expected: Any) -> None:
-    """Evenly spread from the first frame on; where the camera stands, not where it looks."""
-    asked = []
-
-    def sample(t_s: float) -> F64:
-        asked.append(t_s)
-        view = np.eye(4)
-        view[:3, :3], view[:3, 3] = [[0, 0, -1], [0, 1, 0], [1, 0, 0]], (t_s, 2.0, 3.0)
-        return view
-
-    eyes = composite.room_eyes(SimpleNamespace(sample=sample), SimpleNamespace(frames=frames, fps=25.0))  # type: ignore[arg-type]
-    assert asked == pytest.approx([frame / 25 for frame in expected])
-    np.testing.assert_allclose(eyes, [(-3.0, -2.0, frame / 25) for frame in expected], rtol=1e-6)
-
-
-def test_an_older_picture_of_another_shape_is_blended_in_light_times_alpha(gl: Any) -> None:
-    """A quarter of the new picture and three of the old one, where both have it; elsewhere the new one alone."""
-    shape, old_shape = (12, 16), (24, 20)
-    image, old = noise(shape, 4, seed=3), noise(old_shape, 4, seed=4)
-    painter = AvatarPainter(gl, [shape, old_shape])
-    painter.upload(old_shape, old.reshape(-1))
-    painter.upload(shape, image.reshape(-1))
-    cell, part = (2, 3, 8, 10), (3, 4, 14, 12)
-    change = Blend(old_shape, cell, part, (1.5, 2.0), (-2.0, -3.0), 0.75)
-    painter.blend(shape, change)
-
-    def light(picture: NDArray[np.uint8]) -> NDArray[np.float64]:
-        alpha = picture[..., 3:] / 255
-        return np.concatenate([linear(picture[..., :3]) * alpha, alpha], axis=-1)
-
-    rows, columns = np.mgrid[: shape[0], : shape[1]] + 0.5
-    x, y = columns * 1.5 - 2.0, rows * 2.0 - 3.0
-    inside = (columns > 3) & (columns < 13) & (rows > 2) & (rows < 10) & (x >= 4) & (x <= 16) & (y >= 3) & (y <= 17)
-    u, v = np.clip(x, 4.5, 15.5) / old_shape[1], np.clip(y, 3.5, 16.5) / old_shape[0]
-    mixed = 0.25 * light(image) + 0.75 * float_raster.sample(light(old), np.stack([u, v], axis=-1))
-    expected = np.where(inside[..., None], mixed, light(image))
-    found = np.frombuffer(painter._pictures[shape][2].read(), np.float16).reshape(*shape, 4)
-    assert inside.sum() == 7 * 8
-    assert np.abs(found - expected).max() < 4e-3  # FP16, and the driver's weights of eight bits
+def test_the_frame_after_a_change_of_size_shows_nothing_of_the_old_picture(gl: Any) -> None:
+    """From twice the pixels to fewer and back, frame by frame: each frame is that of a stage which knew no other."""
+    large, small = two_avatars(0), two_avatars(0)
+    large["tensor_shape"], large["avatars"]["tensor_rect"] = (16, 8), (0, 0, 16, 8)
+    sizes = [(large, noise((16, 8), 4, seed=3)), (small, noise((8, 16), 4, seed=4))]
+    made = stage(gl)
+    for number in range(6):
+        pose, image = (each.copy() for each in sizes[number % 2])
+        pose["picture"], pose["media_time_s"] = number, 0.9 + number / 30
+        frame = frame_of(made, pose, image.reshape(-1))
+        assert np.array_equal(frame, frame_of(stage(gl), pose, image.reshape(-1)))
