@@ -27,7 +27,10 @@ Examples:
   trilane report sweeps/sizes --csv sizes.csv --parquet sizes.parquet
   trilane report runs prediction.json --json
 """
-SHOWN = ("name", "frame_ms", "low_ms", "high_ms", "psnr_db", "on_frontier", "error_source")
+SHOWN = (
+    *("name", "frame_ms", "low_ms", "high_ms"),
+    *("psnr_db", "worst_psnr_db", "p1_psnr_db", "on_frontier", "error_source"),
+)
 
 PlacesArgument = Annotated[
     list[Path],
@@ -83,7 +86,8 @@ def _print(entries: list[Entry], rows: list[dict[str, Any]]) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    table = Table("entry", "frame, ms", "from, ms", "to, ms", "PSNR, dB", "frontier", "where the error comes from")
+    times, errors = ("frame, ms", "from, ms", "to, ms"), ("PSNR, dB", "worst", "1st pct.")
+    table = Table("entry", *times, *errors, "frontier", "where the error comes from")
     for row in rows:
         table.add_row(*(Text(_shown(row[key])) for key in SHOWN))
     stdout_console().print(table)

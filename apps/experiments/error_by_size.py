@@ -17,6 +17,7 @@ from trilane.apps.experiments.picture_errors import ErrorFigures, figures, requi
 from trilane.apps.experiments.scene_pictures import ScenePictures, around, spread, wanted_pictures
 from trilane.arrays import U8
 from trilane.bench.lib.cast import Cast
+from trilane.bench.lib.picture_error import psnr_of_frames
 from trilane.errors import BadInputError
 from trilane.figure_sources import MEASURED
 from trilane.scheduler.stats import median_interval
@@ -57,8 +58,7 @@ class Row:
             "infer_low_ms": low,
             "infer_high_ms": high,
             "frame_ms": median(self.frame_ms),
-            "psnr_db": fmean(error.psnr_db for error in self.errors),
-            "worst_psnr_db": min(error.psnr_db for error in self.errors),
+            **psnr_of_frames([error.psnr_db for error in self.errors]),
             "mae": fmean(error.mae for error in self.errors),
             "ssim": fmean(ssim) if ssim else None,
             "flip": fmean(error.flip for error in self.errors),
@@ -78,9 +78,9 @@ def measure(
 
     Keys: `rows`: `size`, `runtime`, `threads`, `infer_ms` (median of all jobs) with its 95 % interval `infer_low_ms`,
     `infer_high_ms` (null of fewer than 6 jobs), `frame_ms` (median sum of all stages but present), and the error where
-    the avatars are: `psnr_db`, `mae` (steps of 1/255), `ssim`, `flip`, means over the frames, and `worst_psnr_db`;
-    `against`: what they are compared with; `frames`; `empty_frames`: with nobody in view, not counted; `sources`;
-    `config`.
+    the avatars are: `psnr_db`, `mae` (steps of 1/255), `ssim`, `flip`, means over the frames, `worst_psnr_db` and
+    `p1_psnr_db`, the 1st percentile; `against`: what they are compared with; `frames`; `empty_frames`: with nobody in
+    view, not counted; `sources`; `config`.
 
     Raises BadInputError, MissingPartError.
     """

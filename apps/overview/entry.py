@@ -35,9 +35,9 @@ class Entry:
     """`name`: of its folder or trial. `clock`: host or virtual. `machine`: in a line. `settings`: by dotted key.
 
     `command`: word by word; empty where none is known. `frame_ms`, `low_ms`, `high_ms`: mean frame time and its
-    interval, None where there is none; `interval`: what that holds. `psnr_db`: the error; `error_source`: where it
-    comes from, or why there is none; `error_of`: `OF_RUN` and against what, `OF_AVATAR`, or empty.
-    `shows`: what the pictures are of.
+    interval, None where there is none; `interval`: what that holds. `psnr_db`: the error, a mean;
+    `worst_psnr_db`, `p1_psnr_db`: of a run's own frames, the worst and the 1st percentile; `error_source`: where it
+    comes from, or why there is none; `error_of`: `OF_RUN` and against what, `OF_AVATAR`, or empty. `shows`: what the pictures are of.
     `video`: of a run. `failure`: why there are no figures. `within`: name of the folder of its run, or of its sweep.
     """
 
@@ -52,6 +52,8 @@ class Entry:
     frames_per_s: float | None = None
     latency_ms: float | None = None
     psnr_db: float | None = None
+    worst_psnr_db: float | None = None
+    p1_psnr_db: float | None = None
     error_source: str = NO_FIGURES
     facts: Mapping[str, Any] = field(default_factory=dict)
     video: Path | None = None
@@ -82,6 +84,7 @@ def entry_of(
     times, made = _mapping(document, "frame_time_ms"), _mapping(document, "made")
     machine, config = _mapping(document, "machine"), _mapping(document, "config")
     psnr_db, source, error_of = _error(document)
+    check = _mapping(document, "check")
     low, high = _interval(times)
     return Entry(
         _text(name),
@@ -95,10 +98,11 @@ def entry_of(
         _time(document.get("fps")),
         _time(_mapping(document, "latency_ms").get("mean")),
         psnr_db,
-        _text(source),
-        machine,
-        video if video is not None and video.is_file() else None,
-        _text(document.get("failure") or ""),
+        *(_number(check.get(key)) for key in ("worst_psnr_db", "p1_psnr_db")),
+        error_source=_text(source),
+        facts=machine,
+        video=video if video is not None and video.is_file() else None,
+        failure=_text(document.get("failure") or ""),
         interval="" if low is None else BY_SCATTER if "mean_low" in times else BY_MODEL,
         error_of=error_of,
         shows=_shows(_mapping(config, "scene")),

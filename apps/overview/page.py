@@ -19,12 +19,14 @@ from trilane.apps.overview.scatter import Dot, marker_name, scatter
 from trilane.apps.overview.table_rows import columns, table_rows
 
 UNITS = {"frame_ms": "frame, ms", "low_ms": "from, ms", "high_ms": "to, ms", "latency_ms": "latency, ms"}
-UNITS |= {"psnr_db": "PSNR, dB", "frames_per_s": "frames/s", "on_frontier": "frontier"}
+UNITS |= {"psnr_db": "PSNR, dB", "worst_psnr_db": "worst frame, dB", "p1_psnr_db": "1st percentile, dB"}
+UNITS |= {"frames_per_s": "frames/s", "on_frontier": "frontier"}
 NO_ERROR = "No entry has both a speed and a known error. `trilane run --check N` measures the error of a run."
 LONG = 40  # letters of a cell that is given room
 MEANING = (
     "Frame time is the mean between presented frames, from and to its interval: of a run 95 %, by the scatter of its "
-    "own frames; of a prediction 80 %, by the model. PSNR is the error of the picture, larger is better. The frontier "
+    "own frames; of a prediction 80 %, by the model. PSNR is the error of the picture, larger is better, a mean "
+    "over frames, beside the worst one and the 1st percentile, which tell what the mean hides. The frontier "
     "holds what nobody beats in both on the same clock and machine, with the same scene and the same kind of error. An "
     "entry without a known error is in the table and on no frontier."
 )

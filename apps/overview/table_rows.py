@@ -16,7 +16,10 @@ from trilane.apps.overview.frontier import frontier
 from trilane.errors import MissingPartError
 from trilane.writing import write_atomically
 
-FIGURES = ("frame_ms", "low_ms", "high_ms", "frames_per_s", "latency_ms", "psnr_db", "on_frontier")
+FIGURES = (
+    *("frame_ms", "low_ms", "high_ms", "frames_per_s", "latency_ms"),
+    *("psnr_db", "worst_psnr_db", "p1_psnr_db", "on_frontier"),
+)
 SOURCES = ("speed_source", "interval", "error_source", "shows", "clock", "machine", "failure", "command")
 
 

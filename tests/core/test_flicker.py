@@ -66,7 +66,7 @@ def test_a_size_has_its_median_time_and_its_mean_error() -> None:
     assert (found["infer_ms"], found["frame_ms"]) == (2.0, 8.0)
     assert (found["infer_low_ms"], found["infer_high_ms"]) == (None, None)
     assert (found["psnr_db"], found["worst_psnr_db"], found["mae"], found["ssim"]) == (25.0, 20.0, 2.0, 0.9)
-    assert found["flip"] == pytest.approx(0.2)
+    assert found["flip"] == pytest.approx(0.2) and found["p1_psnr_db"] == pytest.approx(20.1)
 
 
 @pytest.mark.parametrize(("jobs", "interval"), [(5, (None, None)), (6, (1.0, 6.0)), (9, (2.0, 8.0))])

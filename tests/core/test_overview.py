@@ -102,6 +102,16 @@ def test_a_prediction_is_computed() -> None:
     assert entry.interval == "80 %, of the model"
 
 
+def test_the_worst_frame_stands_beside_the_mean_and_is_the_runs_own() -> None:
+    check = {"psnr_db": 38.5, "worst_psnr_db": 24.0, "p1_psnr_db": 26.5, "frames": 8}
+    entry = entry_of("r", REPORT | {"check": check})
+    assert (entry.psnr_db, entry.worst_psnr_db, entry.p1_psnr_db) == (38.5, 24.0, 26.5)
+    (row,) = table_rows([entry])
+    assert (row["worst_psnr_db"], row["p1_psnr_db"]) == (24.0, 26.5)
+    without = entry_of("r", REPORT)
+    assert without.psnr_db == 30.0 and (without.worst_psnr_db, without.p1_psnr_db) == (None, None)
+
+
 SCENE = {
     "name": "far",
     "output": {"width": 640, "height": 480},
