@@ -10,7 +10,7 @@ is compared too, with the truth, which takes less long to draw.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import median
@@ -147,7 +147,7 @@ class _Scene:
         true = true_pictures(cast, first.gl)
         against_full = {plan: PictureErrors() for plan in chains}
         against_true = {plan: PictureErrors() for plan in ("full", *chains)}
-        frame_by_frame = by_frame(range(total), chains, first, true, cast) if true is not None else None
+        frame_by_frame = by_frame(range(total), chains, first, true.frame, cast) if true is not None else None
         sheets, tensors = [], []
         for number in (index * total // pictures for index in range(pictures)):
             background, boxes = first.background(number), cast.boxes(number)
@@ -171,13 +171,18 @@ class _Scene:
 
 
 def by_frame(
-    frames: Iterable[int], chains: Mapping[str, AvatarFrames], behind: AvatarFrames, true: TruePictures, cast: Cast
+    frames: Iterable[int],
+    chains: Mapping[str, AvatarFrames],
+    behind: AvatarFrames,
+    true: Callable[[int, U8], U8],
+    cast: Cast,
 ) -> dict[str, Any] | None:
     """Of `frames`, one after the other, each plan's error in the avatars' boxes against the truth.
 
-    `behind`: whose background the truth has. By plan what `psnr_of_frames` says of the frames in which somebody is
-    seen, and `worst_frame`, its number; and of `planned` `changes`: how often the tensor's shape is not that of the
-    frame before, and `worst_change_db`, the least PSNR of these frames, None without any. None with nobody in view.
+    `true`: makes the true picture of a frame over its background, which is that of `behind`.
+    By plan what `psnr_of_frames` says of the frames in which somebody is seen, and `worst_frame`, its number; and of
+    `planned` `changes`: how often the tensor's shape is not that of the frame before, and `worst_change_db`, the least
+    PSNR of these frames, None without any. None with nobody in view.
     """
     errors: dict[str, dict[int, float]] = {plan: {} for plan in chains}
     tensors: dict[int, str] = {}
@@ -185,7 +190,7 @@ def by_frame(
         made = {plan: chain.frame(number) for plan, chain in chains.items()}
         boxes = cast.boxes(number)
         if boxes:
-            wanted = true.frame(number, behind.background(number))
+            wanted = true(number, behind.background(number))
             tensors[number] = chains["planned"].tensor
             for plan, picture in made.items():
                 errors[plan][number] = box_psnr_db(picture, wanted, boxes)

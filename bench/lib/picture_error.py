@@ -51,12 +51,6 @@ class PictureErrors:
         return found
 
 
-def box_psnr_db(picture: U8, reference: U8, boxes: Sequence[Box]) -> float:
-    """PSNR of `picture` against `reference`, both (h,w,3) sRGB, over the pixels in `boxes`, at least one."""
-    mask = inside(boxes, picture)
-    return psnr_db(float((((picture[mask] / 255) - reference[mask] / 255) ** 2).mean()))
-
-
 def psnr_of_frames(psnr_db: Sequence[float]) -> dict[str, float]:
     """Of the PSNR of single frames, at least one: mean, worst and 1st percentile, linear between ranks.
 
@@ -110,3 +104,9 @@ def inside(boxes: Sequence[Box], picture: U8) -> Mask:
 def psnr_db(square: float) -> float:
     """PSNR in dB of values in 0..1 whose differences have the mean square `square`; at most 100."""
     return float(-10 * np.log10(max(square, LEAST_SQUARE)))
+
+
+def box_psnr_db(picture: U8, reference: U8, boxes: Sequence[Box]) -> float:
+    """PSNR of `picture` against `reference`, both (h,w,3) sRGB, over the pixels in `boxes`, at least one."""
+    mask = inside(boxes, picture)
+    return psnr_db(float((((picture[mask] / 255) - reference[mask] / 255) ** 2).mean()))

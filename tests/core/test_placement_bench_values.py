@@ -311,7 +311,7 @@ def test_every_frame_is_compared_and_the_worst_ones_are_named() -> None:
     """
     chains = {"fixed": Told([100, 100, 0, 151, 100, 100]), "planned": Told([100, 151, 0, 100, 100, 202], "abcaac")}
     truth: Any = Truth()
-    found = planner.by_frame(range(6), chains, Told([0] * 6), truth, truth)  # type: ignore[arg-type]
+    found = planner.by_frame(range(6), chains, Told([0] * 6), truth.frame, truth)  # type: ignore[arg-type]
     fifth, two = -20 * np.log10(0.2), -20 * np.log10(0.4)
     assert found is not None
     assert {plan: row["worst_frame"] for plan, row in found.items()} == {"fixed": 3, "planned": 5}
@@ -320,4 +320,4 @@ def test_every_frame_is_compared_and_the_worst_ones_are_named() -> None:
     assert found["planned"]["psnr_db"] == pytest.approx((3 * 100 + fifth + two) / 5)
     assert found["planned"]["worst_psnr_db"] == found["planned"]["worst_change_db"] == pytest.approx(two)
     assert found["planned"]["changes"] == 2
-    assert planner.by_frame([2], chains, Told([0] * 6), truth, truth) is None  # type: ignore[arg-type]
+    assert planner.by_frame([2], chains, Told([0] * 6), truth.frame, truth) is None  # type: ignore[arg-type]
