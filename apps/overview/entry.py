@@ -38,7 +38,8 @@ class Entry:
     interval, None where there is none; `interval`: what that holds. `psnr_db`: the error, a mean;
     `worst_psnr_db`, `p1_psnr_db`: of a run's own frames, the worst and the 1st percentile; `error_source`: where it
     comes from, or why there is none; `error_of`: `OF_RUN` and against what, `OF_AVATAR`, or empty. `shows`: what the
-    pictures are of. `video`: of a run. `failure`: why there are no figures. `within`: name of the folder of its run, or of its sweep.
+    pictures are of. `video`: of a run. `failure`: why there are no figures. `within`: name of the folder of its run, or
+    of its sweep.
     """
 
     name: str
