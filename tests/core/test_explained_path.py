@@ -8,10 +8,10 @@ from itertools import pairwise
 
 import pytest
 
-from trilane.apps.explained.path import MARGIN, Budget, Paths, Piece, parts
-from trilane.apps.explained.sharing import Sharing
-from trilane.apps.explained.waits import ExplainedJob, Waits
+from trilane.pipeline.critical_path import MARGIN, Budget, Paths, Piece, parts
 from trilane.pipeline.journal import journal_of
+from trilane.pipeline.sharing import Sharing
+from trilane.pipeline.waits import ExplainedJob, Waits
 from trilane.scheduler.events import Graph, Settings, chain
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.virtual import Simulation, simulate

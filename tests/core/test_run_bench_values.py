@@ -92,8 +92,8 @@ def test_a_rounds_runs_are_set_against_the_sequential_ones(
     assert result["config"] == {"frames": 30, "rounds": 2, "runtime": "told", "video": False}
     assert configured == [Request(size="64x64", avatar="x", frames=30, runtime="auto")]
     values = {"out_dir": None, "record": False, "units": host_units(cores)}
-    one = {"policy": "sequential", "edge": "double", "pace_fps": None, "isolated_frames": 16}
-    other = {"policy": "latest", "edge": "orphan", "pace_fps": 1.25 * 1000 / 8, "isolated_frames": 16}
+    one = {"policy": "sequential", "edge": "double", "pace_fps": None}
+    other = {"policy": "latest", "edge": "orphan", "pace_fps": 1.25 * 1000 / 8}
     whole = {"assets": "assets of x", "values": values}
     assert asked == [each | whole for each in (one, other, one, other, one)]
 
@@ -241,7 +241,7 @@ def test_a_run_is_asked_on_a_thread_while_it_goes_on(
     row, summary = scenario.run_scenario("pipeline", "assets", load, judge, "latest")  # type: ignore[arg-type]
     assert (row["judge"], summary) == (judge, "its summary" if judge == "loadgen" else "")
     assert (row["p50_ms"], row["queries"], row["max_ms"]) == (1000.0, 1, 1000.0)
-    assert asked == [(("pipeline", 1_000_000), {"policy": "latest", "assets": "assets", "isolated_frames": 0})]
+    assert asked == [(("pipeline", 1_000_000), {"policy": "latest", "assets": "assets"})]
     (player,) = threads
     assert (player.name, player.daemon, player.is_alive()) == ("player", True, False) and hash(player) == id(player)
 

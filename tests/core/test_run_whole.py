@@ -93,17 +93,13 @@ class World:
         self.count = self.told.get("interrupts", 0)
         return self.told.get("outcome", outcome)
 
-    def isolated(self, *_: Any) -> Any:
-        def measure(frames: list[int]) -> None:
-            self.steps.append(("measure", frames))
-            if "loop" in self.steps and "broken" in self.told:
-                raise self.told["broken"]
+    def chain(self, _graph: Any, processes: Any, _interrupts: Any, *, whole: bool) -> Any:
+        assert set(processes) == {"left", "right"} and not whole
+        return SimpleNamespace(frame=lambda number: self.steps.append(("frame", number)))
 
-        def of_rungs(frames: list[int], rungs: int, follow: tuple[str, ...]) -> list[StageAlone]:
-            self.steps.append(("rungs", frames, rungs, follow))
-            return [StageAlone("mid", rung, (3 - rung) * MS) for rung in range(rungs)]
-
-        return SimpleNamespace(measure=measure, of_rungs=of_rungs, mean_ns={"in": MS, "mid": 3 * MS})
+    def rungs(self, _chain: Any, frames: list[int], rungs: int, follow: tuple[str, ...]) -> list[StageAlone]:
+        self.steps.append(("rungs", frames, rungs, follow))
+        return [StageAlone("mid", rung, (3 - rung) * MS) for rung in range(rungs)]
 
     def start(self, _processes: Any, units: Any, _interrupts: Any) -> dict[str, float]:
         self.steps.append(("start", tuple(units)))
@@ -144,7 +140,8 @@ def world(monkeypatch: pytest.MonkeyPatch) -> World:
         ("awake", awake),
         ("Interrupts", interrupts),
         ("RealtimeClock", world.clock),
-        ("IsolatedTimes", world.isolated),
+        ("Chain", world.chain),
+        ("on_rungs", world.rungs),
         ("run_loop", world.run_loop),
         ("start_units", world.start),
         ("close_units", world.close),
@@ -166,7 +163,7 @@ def test_the_steps_of_a_run_and_its_report(world: World) -> None:
         *("refuse", "check files", ("check cores", True), ("cores", PIPELINE.scheduler_cores), ("awake", True)),
         ("processes", True, {"a": 1}, "starter"),
         ("start", ("left", "right")),
-        *(("measure", [0, 30]), "loop", "finish", ("measure", [15, 45]), "close"),
+        *(("frame", 0), "loop", "finish", "close"),
     ]
     assert (result.requested, result.presented, result.lost, result.dropped) == (60, 60, {}, {})
     assert (result.pids, result.startup_ms) == ({"left": 11, "right": 12}, {"left": 1.5, "right": 2.5})
@@ -181,7 +178,7 @@ def test_the_steps_of_a_run_and_its_report(world: World) -> None:
         "kept awake",
     )
     assert (report.frame_time_ms.mean, report.other_programs) == (4.0, 0.25)
-    assert (report.deadline_misses, report.isolated_ms) == (0, {"in": 1.0, "mid": 3.0})
+    assert report.deadline_misses == 0
     assert (report.efficiency, report.bottleneck) == (0.75, "right")
     left, right = report.units["left"], report.units["right"]
     assert (left.pid, left.cores, left.threads, left.spin) == (11, (1, 0), 2, False)
@@ -262,17 +259,6 @@ def test_a_frame_time_above_the_rates_is_a_missed_deadline(world: World) -> None
     assert world.core.settings.deadline_ns == 0
 
 
-@pytest.mark.parametrize(
-    ("frames", "isolated", "measured"), [(3, 0, ([0], [])), (3, None, ([0, 2], [1])), (9, 1, ([0], []))]
-)
-def test_how_many_frames_are_measured_alone(world: World, frames: int, isolated: int | None, measured: Any) -> None:
-    result = go(frames, isolated_frames=isolated)
-    before, after = measured
-    found = [step[1] for step in world.steps if step[0] == "measure"]
-    assert found == ([before, after] if after else [before])
-    assert (result.report.efficiency is None) == (isolated == 0)
-
-
 def test_a_governor_is_reported_with_its_energy(world: World) -> None:
     """2 W at 250 frames a second are 8 mJ a frame."""
     temperature = {"kind": "modelled"}
@@ -291,14 +277,14 @@ def test_a_governor_is_reported_with_its_energy(world: World) -> None:
 
 
 def test_a_ladder_of_work_is_measured_before_a_run_at_a_rate(world: World) -> None:
-    """Three frames of nine, on both rungs, before the loop, which is told of it. Without a rate there is no ladder."""
-    result = go(9, policy="latest", fps=50.0, isolated_frames=1, works=(1000, 250), follow=("mid",))
-    assert world.steps.index(("rungs", [0, 3, 6], 2, ("mid",))) < world.steps.index("loop")
+    """Four frames of nine, on both rungs, before the loop, which is told of it. Without a rate there is no ladder."""
+    result = go(9, policy="latest", fps=50.0, works=(1000, 250), follow=("mid",))
+    assert world.steps.index(("rungs", [0, 2, 4, 6], 2, ("mid",))) < world.steps.index("loop")
     assert world.first == [StageAlone("mid", 0, 3 * MS), StageAlone("mid", 1, 2 * MS)]
     assert (world.core.settings.works, world.core.settings.follow) == ((1000, 250), ("mid",))
     assert (result.rungs, result.rung_switches) == ({0: 9}, 0)
     world.first.clear()
-    without = go(9, isolated_frames=1, works=(1000, 250), follow=("mid",))
+    without = go(9, works=(1000, 250), follow=("mid",))
     assert (world.first, world.core.ladder, without.rungs) == ([], None, {})
 
 

@@ -74,7 +74,6 @@ def make_report(**changes: Any) -> dict[str, Any]:
         **run,
         "duration_s": 1.0,
         "xrbench": {"real_time": None, "qoe": 1.0, "energy": None},
-        "isolated_ms": {},
         "policy": "pipelined",
         "edge": "double",
         "idle_cores": "wait awake",
