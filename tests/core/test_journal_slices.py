@@ -8,7 +8,17 @@ from pathlib import Path
 
 import pytest
 
-from trilane.pipeline.journal import Begun, Counted, Ended, JournalWriter, Record, Stepped, Worked, journal_of
+from trilane.pipeline.journal import (
+    Begun,
+    Counted,
+    Ended,
+    JournalWriter,
+    Record,
+    Stepped,
+    Worked,
+    journal_of,
+    read_journal,
+)
 from trilane.pipeline.journal_slices import JournalSlices
 from trilane.pipeline.reckoning import reckoned
 from trilane.scheduler.accounts import UNEXPLAINED, IdleCutter, IdleSlice, Span, compared, idle_slices
@@ -129,6 +139,6 @@ def test_time_that_nobody_explains_has_its_own_name() -> None:
     """A unit that is up and has no job, whose account says that it has one."""
     cutter = IdleCutter(chain((("a", "u"),), "single", "a"))
     assert cutter.step(5, (UnitReady("u"),), ()) == []
-    cutter.account("u", ASSIGNED)
+    cutter.account(5, "u", ASSIGNED)
     cutter.step(9, (), ())
     assert cutter.end() == [IdleSlice("u", UNEXPLAINED, 5, 9)]

@@ -238,7 +238,7 @@ def test_figures_stand_to_the_right_and_words_to_the_left() -> None:
 def test_rows_of_one_kind_stand_together() -> None:
     """A line is drawn below the stages, the units, the cores, the times and the rates."""
     table = run_table(Report.model_validate(make_report()))
-    assert [place for place, row in enumerate(table.rows) if row.end_section] == [0, 1, 2, 14, 19]
+    assert [place for place, row in enumerate(table.rows) if row.end_section] == [0, 1, 2, 14, 22]
 
 
 def test_no_line_of_marks_when_no_percentile_is_marked() -> None:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import ast
 import random
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -77,7 +79,7 @@ def run(policy: str = "pipelined", edge: str = "double", times: Service = servic
     return simulate(application_graph(edge), Settings(FRAMES, policy, **{**settings, **more}), times, **driver)
 
 
-def busy_slowest(report: dict[str, Any]) -> float:
+def busy_slowest(report: Mapping[str, Any]) -> float:
     """The work of the slowest unit, the DSP's, for a frame over the frame time."""
     return SERVICE_MS["infer"] / float(report["frame_time_ms"]["mean"])
 

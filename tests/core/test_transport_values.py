@@ -87,13 +87,13 @@ def test_what_is_wrong_with_bytes_is_said() -> None:
     with pytest.raises(MessageError, match=r"unknown message b'\\nabc'"):
         unpack(b"\x0aabc")
     with pytest.raises(MessageError, match="10 bytes for Ready, which takes 9"):
-        unpack(b"\4" + words(1) + b"\0")
+        unpack(b"\3" + words(1) + b"\0")
     with pytest.raises(MessageError, match="16 bytes for Failed, which takes 17"):
-        unpack(b"\7" + words(1, 2)[:15])
+        unpack(b"\5" + words(1, 2)[:15])
     with pytest.raises(MessageError, match="found '1', expected str"):
-        unpack(b"\7" + words(1, 2) + b"\1")
+        unpack(b"\5" + words(1, 2) + b"\1")
     with pytest.raises(MessageError, match="not msgpack: "):
-        unpack(b"\7" + words(1, 2) + b"\xc1")
+        unpack(b"\5" + words(1, 2) + b"\xc1")
     with pytest.raises(MessageError, match="Failed of 4096 bytes, expected less than 4096"):
         pack(messages.Failed(1, 2, "e" * 4093))
     assert len(pack(messages.Failed(1, 2, "e" * 4076))) == 4096
