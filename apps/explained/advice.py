@@ -21,7 +21,6 @@ SHORTER = {
     "present": "a smaller `--output`: the picture is encoded there",
 }
 OF_CAUSES = {
-    PREEMPTED: "no job of this run had the core of {unit}: end other programs; threads that spin take it too",
     THROTTLED: "a performance profile with more power, such as `--performance-profile burst`, caps {unit} less",
     DOWN: "{unit} was restarted: the run's messages say why",
     LOST: "{unit} was restarted: the run's messages say why",
@@ -41,10 +40,16 @@ def advice(budget: Sequence[Mapping[str, Any]], policy: str, spare_cores: int) -
     works = [row for row in budget if row["what"] == WORK]
     if policy == "sequential" and len(works) > 1:
         found.append("one frame is worked on at a time: `--policy pipelined` lets the units work at once")
-    rows = [row for row in budget if row["share"] >= LEAST_SHARE]
+    nobodys = [row for row in budget if row["what"] == PREEMPTED]
+    if sum(row["share"] for row in nobodys) >= LEAST_SHARE:
+        found.append(
+            f"{sum(row['ms'] for row in nobodys):.1f} ms a frame, {', '.join(row['stage'] for row in nobodys)} "
+            f"({PREEMPTED}): no job of this run had the core: end other programs; threads that spin take it too"
+        )
     found += [
         f"{row['ms']:.1f} ms a frame, {row['stage']} ({row['what']}): {_try(row, spare_cores)}"
-        for row in sorted(rows, key=lambda row: row["what"] != PREEMPTED)
+        for row in budget
+        if row["share"] >= LEAST_SHARE and row["what"] != PREEMPTED
     ]
     return found[:MOST]
 

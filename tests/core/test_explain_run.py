@@ -292,8 +292,8 @@ def test_advice_is_about_what_bounds_a_tenth_at_least() -> None:
         {"stage": "present", "unit": "cpu", "what": "work", "share": 0.09, "ms": 0.9},
     ]
     assert advice(rows, "pipelined", -1) == [
-        "5.0 ms a frame, pose (preempted): no job of this run had the core of cpu: end other programs; threads that "
-        "spin take it too",
+        "5.0 ms a frame, pose (preempted): no job of this run had the core: end other programs; threads that spin take "
+        "it too",
         "3.0 ms a frame, own (work): shorter work of own, or a unit of its own for it",
         "1.1 ms a frame, infer (throttled): a performance profile with more power, such as `--performance-profile "
         "burst`, caps dsp less",
@@ -319,9 +319,10 @@ def test_advice_is_what_this_machine_can_follow(what: str, spare: int, found: st
 def test_what_other_programs_took_is_said_first() -> None:
     rows = [
         {"stage": "infer", "unit": "dsp", "what": "work", "share": 0.6, "ms": 6.0},
-        {"stage": "pose", "unit": "cpu", "what": "preempted", "share": 0.4, "ms": 4.0},
+        {"stage": "pose", "unit": "cpu", "what": "preempted", "share": 0.06, "ms": 0.6},
+        {"stage": "raster", "unit": "gpu", "what": "preempted", "share": 0.05, "ms": 0.5},
     ]
-    assert [line.split(" a frame, ")[1].split(":")[0] for line in advice(rows, "pipelined", 0)] == [
-        "pose (preempted)",
-        "infer (work)",
+    assert [line.split(":")[0] for line in advice(rows, "pipelined", 0)] == [
+        "1.1 ms a frame, pose, raster (preempted)",
+        "6.0 ms a frame, infer (work)",
     ]
