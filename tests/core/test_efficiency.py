@@ -10,6 +10,7 @@ import pytest
 from trilane.pipeline.core_shares import lost_in_job
 from trilane.pipeline.cpu_use import Efficiencies
 from trilane.pipeline.reckoning import Reckoned, reckoned, records_of
+from trilane.scheduler.beside import Member, simulate_beside
 from trilane.scheduler.events import Settings, chain
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.places import Place
@@ -206,3 +207,28 @@ def test_what_other_programs_take_is_no_units_and_no_work() -> None:
     assert found.figures["bottleneck"] == "other programs"
     assert found.figures["bound"]["unit"]["share"] == pytest.approx(0.75, abs=0.01)
     assert found.figures["bound"]["stage"]["name"] == "composite"
+
+
+@pytest.mark.parametrize("slower", [0.0, 0.2, 0.5, 1.0])
+def test_a_stage_that_shares_a_core_costs_what_it_takes_though_nothing_waits_for_its_frames(slower: float) -> None:
+    """pose and infer have equal shares of core 0, which is full: a frame takes the sum of both, and each has of the
+    path what it has of the core, pose nearly all of it as what infer lacked."""
+    times = {"pose": round(4000 * (1 + slower)), "raster": 3000, "infer": 9000, "composite": 4000}
+    graph, settings = chain(STAGES, "double", "composite"), Settings(200)
+    seats = {"cpu": "core 0", "dsp": "core 0", "gpu": "core 1"}
+    member = Member(graph, settings, lambda stage, *_: times[stage], seats)
+    (run,) = simulate_beside([member], divided=["core 0"], keep=True)
+    assert run.recording is not None
+    both_ns = times["pose"] + times["infer"]
+    assert 1e6 * run.report["frame_time_ms"]["mean"] == pytest.approx(both_ns, rel=0.01)
+    places = {"cpu": ON_0, "gpu": ON_1, "dsp": ON_0}
+    _, found = reckoned(graph, settings, places, records_of(run.recording, run.jobs))
+    total = sum(found.budget.values())
+    of_pose = sum(ns for (_, stage), ns in found.budget.items() if stage == "pose") / total
+    of_infer = sum(ns for (_, stage), ns in found.budget.items() if stage == "infer") / total
+    assert (of_pose, of_infer) == pytest.approx((times["pose"] / both_ns, times["infer"] / both_ns), abs=0.03)
+    assert found.budget["taken", "pose"] / total > of_pose / 2
+    assert found.figures["core_efficiency"] == pytest.approx(1, abs=0.01)
+    assert found.figures["core_efficiency"] <= 1
+    assert found.figures["efficiency"] == pytest.approx(times["infer"] / both_ns, rel=0.02)
+    assert found.figures["bound"]["stage"]["name"] == "infer"
