@@ -170,7 +170,8 @@ def everything() -> dict[str, Any]:
 
 def least() -> dict[str, Any]:
     """One frame without a baseline, of which nothing more is known than of any."""
-    report = make_report(baseline=None, accuracy={}, core_shares=[], efficiency=None, deadline_misses=4)
+    unmeasured = dict.fromkeys(("efficiency", "core_efficiency", "machine_efficiency", "bottleneck", "bound"))
+    report = make_report(baseline=None, accuracy={}, core_shares=[], deadline_misses=4, **unmeasured)
     report["frames"] = {"requested": 5, "presented": 1, "lost": 2, "lost_by_cause": {"died:gpu": 2}, "dropped": {}}
     idle = {**SHARE["idle"], "preempted": None}
     report["units"] = {"dsp": {**SHARE, "idle": idle}, "cpu": {**SHARE, "cores": [0]}}
