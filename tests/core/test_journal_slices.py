@@ -20,11 +20,13 @@ from trilane.pipeline.journal import (
     read_journal,
 )
 from trilane.pipeline.journal_slices import JournalSlices
+from trilane.pipeline.journal_values import RunValues
 from trilane.pipeline.reckoning import reckoned
 from trilane.scheduler.accounts import UNEXPLAINED, IdleCutter, IdleSlice, Span, compared, idle_slices
 from trilane.scheduler.events import Settings, UnitReady, chain
-from trilane.scheduler.ledger import ASSIGNED
+from trilane.scheduler.ledger import ASSIGNED, JobRecord
 from trilane.scheduler.virtual import Simulation, simulate
+from trilane.unexpected_value import UnexpectedValue
 
 MS = 1_000_000
 TWO = chain((("a", "u"), ("b", "v")), "double", "b")
@@ -142,3 +144,11 @@ def test_time_that_nobody_explains_has_its_own_name() -> None:
     cutter.account(5, "u", ASSIGNED)
     cutter.step(9, (), ())
     assert cutter.end() == [IdleSlice("u", UNEXPLAINED, 5, 9)]
+
+
+def test_a_journal_of_before_jobs_had_their_cpu_time_is_read() -> None:
+    row = ("a", "u", 3, 1, 2, 3, 9, 0, 1, 0)
+    assert RunValues(TWO).job(row) == JobRecord(*row, cpu_ns=0)
+    assert RunValues(TWO).job((*row, 4)).cpu_ns == 4
+    with pytest.raises(UnexpectedValue, match="texts and whole numbers"):
+        RunValues(TWO).job(row[:-1])
