@@ -20,6 +20,7 @@ from trilane.files import require_file
 from trilane.machine import here
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run_metrics import (
+    Bound,
     Caps,
     CoreShare,
     FrameCounts,
@@ -112,8 +113,11 @@ class Baseline(Record):
     stages: dict[str, StageTimes]
     bytes: MovedInAll | None = None
     units: dict[str, UnitShares]
-    efficiency: float | None
+    efficiency: float | None = None
     core_efficiency: float | None = None
+    machine_efficiency: float | None = None
+    bottleneck: str | None = None
+    bound: Bound | None = None
     core_shares: tuple[CoreShare, ...] = ()
 
 
@@ -414,6 +418,8 @@ def read_report(path: Path) -> Report:
             raise BadInputError(file, f"{size} bytes", f"a report of at most {MAX_REPORT_BYTES}")
         document = from_json(file.read_bytes())
         _refuse_newer(file, document)
+        if isinstance(document, dict):
+            document.pop("isolated_ms", None)  # of an older Trilane, which measured stages by themselves
         return Report.model_validate(document)
     except OSError as error:
         raise BadInputError.of_os_error(file, error, EXPECTED) from None

@@ -13,6 +13,7 @@ from trilane.figure_sources import COMPUTED, MEASURED, NO_FIGURES
 
 if TYPE_CHECKING:
     from trilane.apps.report import Report
+    from trilane.pipeline.run_metrics import PathShare
 
 #: Name of a row, its value, and where that comes from.
 Row = tuple[str, str, str]
@@ -48,6 +49,8 @@ def _run_rows(report: Report) -> Iterable[Row]:
     yield "latency", f"p50 {latency.p50:.1f} ms, p95 {latency.p95:.1f} ms", measured
     dropped = sum(frames.dropped.values())
     yield "frames", f"{frames.presented} presented, {frames.lost} lost, {dropped} dropped", measured
+    if report.bound is not None:
+        yield "bound", ", ".join(_of_path(part) for part in (report.bound.unit, report.bound.stage) if part), measured
     for unit, shares in report.units.items():
         idle = ", ".join(f"{cause} {share:.0%}" for cause, share in shares.idle if share)
         yield unit, f"busy {shares.busy:.0%}; {idle}", measured
@@ -58,6 +61,10 @@ def _run_rows(report: Report) -> Iterable[Row]:
 
 def _between(low: float | None, high: float | None) -> str:
     return TOO_SHORT if low is None or high is None else f"95 %: {low:.2f} to {high:.2f}"
+
+
+def _of_path(part: PathShare) -> str:
+    return f"{part.name} {part.share:.0%} of the path"
 
 
 def _error(facts: Mapping[str, Any]) -> tuple[str, str]:

@@ -111,7 +111,6 @@ def host_run(draw: random.Random, frames: int, starter: UnitStarter) -> dict[str
         policy=policy,
         fps=draw.choice((60.0, 120.0, 240.0)),
         pace_fps=draw.choice((None, 100.0)),
-        isolated_frames=0,
         starter=starter,
         on_progress=_Killer(dies_at, lambda: unit_process(victim)),
     )

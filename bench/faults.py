@@ -149,7 +149,6 @@ def run_under(
             frames,
             pace_fps=fps,
             assets=assets,
-            isolated_frames=0,
             hang_ns=round(hang_s * 1e9),
             on_progress=lambda *_: signals.begun.set(),
         )

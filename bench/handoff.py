@@ -208,7 +208,7 @@ def _pairs(stack: ExitStack, sizes: tuple[int, ...]) -> tuple[dict[tuple[str, in
 
 def _through_pipeline(size: int, frames: int) -> Times:
     """A sequential run of units that only write and read: from raster's end to infer's begin, and to its end."""
-    result = run_pipeline(handoff_pipeline(size * 1024), frames, policy="sequential", isolated_frames=0)
+    result = run_pipeline(handoff_pipeline(size * 1024), frames, policy="sequential")
     if result.interrupted:
         raise KeyboardInterrupt
     if result.failure is not None or result.presented < frames:

@@ -1,8 +1,8 @@
 """Does the pipeline keep its slowest unit busy, and what does that gain over one frame at a time?
 
-Rule: every run is compared with its stages isolated, measured just before and after on the same cores, and with the
-`sequential` runs before and after it. Settings run interleaved in many short rounds, because a shared machine grows
-slower and faster within seconds; a row is the median over the rounds.
+Rule: every run is compared with the `sequential` runs before and after it on the same cores, in which every stage does
+the same frames in the same order while the other units are quiet. Settings run interleaved in many short rounds,
+because a shared machine grows slower and faster within seconds; a row is the median over the rounds.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from trilane.errors import BadInputError, TrilaneError
 from trilane.figure_sources import COMPARED, COMPUTED, MEASURED
 from trilane.hw_profiles.host import host_units, usable_cores
 from trilane.pipeline.result import RunResult
-from trilane.pipeline.run_metrics import RunMetrics
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.policy import policy_named
 from trilane.scheduler.stats import NS_PER_MS, median_interval, percentile, samples_needed
@@ -34,8 +33,8 @@ from trilane.units import BEFORE_INFER, LATENCY_TO
 
 SEQUENTIAL = "sequential"
 MIN_FRAMES = 20
-ALONE = 16  # frames of each run that are measured isolated
 LATENCIES = "latencies_ns"  # of a run; a row has their percentiles over all rounds
+UNITS_MS = "units_ms"  # of a run: what each unit takes for a frame
 PACE = 1.25  # of the slowest unit's rate: paced policies always get more frames than they can present
 
 
@@ -66,14 +65,15 @@ def measure(
     """A row for each avatar, size, number of cores, policy and edge; figures are medians over the `rounds`.
 
     Rows: `frame_ms`, `fps`; `latency_p50_ms`, `latency_p99_ms`: from the beginning of a frame's pose to its composited
-    picture, over the frames of all rounds (no p99 of fewer than 299); `efficiency`: the slowest unit's stages,
-    isolated, over the frame time; `slowest`: that unit, `alone_ms`: its stages isolated; `busiest`: the unit with the
-    most work, `idle`: its share without a job from its first job's begin to its last one's end, and the causes:
-    `starved` (no input), `undispatched` (input, but no free slot, or not dispatched yet), `overhead` (dispatched, but
-    not begun).
+    picture, over the frames of all rounds (no p99 of fewer than 299); `efficiency`: the slowest unit's work over the
+    frame time, by CPU time; `slowest`: the unit that takes longest for a frame in the `sequential` runs before and
+    after, without the time in which it had no core, and `alone_ms`: how long; `busiest`: the unit with the most work,
+    `idle`: its share without a job from its first job's begin to its last one's end, and the causes: `starved` (no
+    input), `undispatched` (input, but no free slot, or not dispatched yet), `overhead` (dispatched, but not begun).
 
-    `gain`: over the mean of the `sequential` runs before and after. `bound`: sum(t) / max(t), where sum(t) is all
-    stages isolated (`all_alone_ms`) and the hand-overs of those sequential runs, and max(t) the slowest unit's stages.
+    `gain`: over the mean of the `sequential` runs before and after. `bound`: sum(t) / max(t), where sum(t) is what all
+    units take in those runs (`all_alone_ms`) and their hand-overs, and max(t) what the slowest takes.
+    `in_run_over_alone`: what that unit takes in this run, without the time in which it had no core, over `alone_ms`.
     `gain_of_bound`: one over the other; `of_bound_low`, `of_bound_high`: the 95 % interval of its median (with fewer
     than six rounds the least and largest). `hops_ms`: what a sequential run takes for a frame beyond its stages.
     `dropped`, `lost`: frames of all rounds. `accuracy`: the error of the avatar's pictures and its
@@ -158,7 +158,8 @@ def _config(avatar: str, size: str, cores: int, frames: int, runtime: str, video
 def _run_round(checked: Checked, settings: list[Setting]) -> list[dict[str, Any]]:
     """One run of each; the `sequential` one sets the pace of the paced ones."""
     base = _run(checked, settings[0])
-    return [base, *(_run(checked, setting, base["alone_ms"]) for setting in settings[1:])]
+    slowest_ms = max(base[UNITS_MS].values())
+    return [base, *(_run(checked, setting, slowest_ms) for setting in settings[1:])]
 
 
 def _compare(runs: list[dict[str, Any]], after: dict[str, Any]) -> None:
@@ -168,18 +169,20 @@ def _compare(runs: list[dict[str, Any]], after: dict[str, Any]) -> None:
     """
     for place, row in enumerate(runs):
         beside = (runs[0], after if place else runs[0])
+        units_ms = {unit: fmean(base[UNITS_MS][unit] for base in beside) for unit in runs[0][UNITS_MS]}
+        slowest = max(units_ms, key=units_ms.__getitem__)
+        row |= {"slowest": slowest, "alone_ms": units_ms[slowest], "all_alone_ms": sum(units_ms.values())}
+        row["in_run_over_alone"] = row[UNITS_MS][slowest] / row["alone_ms"]
         row["gain"] = fmean(base["frame_ms"] for base in beside) / row["frame_ms"]
         row["bound"] = (row["all_alone_ms"] + fmean(base["hops_ms"] for base in beside)) / row["alone_ms"]
         row["gain_of_bound"] = row["gain"] / row["bound"]
 
 
-def _run(checked: Checked, plan: Setting, alone_ms: float = 0.0) -> dict[str, Any]:
-    pace = PACE * 1e3 / alone_ms if policy_named(plan.policy).paced else None
+def _run(checked: Checked, plan: Setting, slowest_ms: float = 0.0) -> dict[str, Any]:
+    pace = PACE * 1e3 / slowest_ms if policy_named(plan.policy).paced else None
     with tempfile.TemporaryDirectory(prefix="trilane-bench-") as folder:
         placed = checked.changed(out_dir=Path(folder))
-        result = run_avatar(
-            placed.config, placed.assets, policy=plan.policy, edge=plan.edge, pace_fps=pace, isolated_frames=ALONE
-        )
+        result = run_avatar(placed.config, placed.assets, policy=plan.policy, edge=plan.edge, pace_fps=pace)
     if result.interrupted:
         raise KeyboardInterrupt
     if result.failure is not None or result.presented < 2:
@@ -190,8 +193,6 @@ def _run(checked: Checked, plan: Setting, alone_ms: float = 0.0) -> dict[str, An
 def _figures(result: RunResult) -> dict[str, Any]:
     """The row of one run, before it is compared with others."""
     metrics = result.report
-    isolated = _isolated_ms(metrics)
-    slowest = max(isolated, key=isolated.__getitem__)
     stages_ms = sum(stage.service_ms.mean for stage in metrics.stages.values())
     busiest = max(metrics.units, key=lambda unit: metrics.units[unit].busy)
     return {
@@ -199,28 +200,22 @@ def _figures(result: RunResult) -> dict[str, Any]:
         "frame_ms": metrics.frame_time_ms.mean,
         LATENCIES: latencies_ns(result.jobs),
         "efficiency": metrics.efficiency,
-        "slowest": slowest,
-        "alone_ms": isolated[slowest],
-        "all_alone_ms": sum(isolated.values()),
+        UNITS_MS: _units_ms(result),
         "hops_ms": metrics.frame_time_ms.mean - stages_ms if metrics.policy == SEQUENTIAL else None,
         "busiest": busiest,
         **idle_between_jobs([job for job in result.jobs if job.unit == busiest]),
-        "in_run_over_alone": _in_run_ms(metrics, slowest) / isolated[slowest],
         "dropped": sum(result.dropped.values()),
         "lost": sum(result.lost.values()),
     }
 
 
-def _isolated_ms(metrics: RunMetrics) -> dict[str, float]:
-    """Milliseconds of each unit for a frame: its stages isolated; the last stage never is and counts as in the run."""
-    times = dict.fromkeys(metrics.units, 0.0)
-    for name, stage in metrics.stages.items():
-        times[stage.unit] += metrics.isolated_ms.get(name, stage.service_ms.mean)
+def _units_ms(result: RunResult) -> dict[str, float]:
+    """Milliseconds of each unit's jobs for a frame, without the time in which it had no core."""
+    times = dict.fromkeys(result.report.units, 0.0)
+    for name, stage in result.report.stages.items():
+        preempted = [job.preempted_ns for job in result.jobs if job.stage == name]
+        times[stage.unit] += stage.service_ms.mean - (fmean(preempted) / NS_PER_MS if preempted else 0.0)
     return times
-
-
-def _in_run_ms(metrics: RunMetrics, unit: str) -> float:
-    return sum(stage.service_ms.mean for stage in metrics.stages.values() if stage.unit == unit)
 
 
 def idle_between_jobs(jobs: Sequence[JobRecord]) -> dict[str, float]:
@@ -259,7 +254,7 @@ def _summary(setting: Setting, runs: list[dict[str, Any]]) -> dict[str, Any]:
     names = ("slowest", "busiest")
     sums = ("dropped", "lost")
     row: dict[str, Any] = {**vars(setting)}
-    for key in (key for key in runs[0] if key != LATENCIES):
+    for key in (key for key in runs[0] if key not in (LATENCIES, UNITS_MS)):
         values = [run[key] for run in runs]
         pick: Callable[[list[Any]], Any] = sum if key in sums else median
         row[key] = None if None in values else max(set(values), key=values.count) if key in names else pick(values)

@@ -42,7 +42,6 @@ from trilane.stages.rehearsing import measured_times, tried
 from trilane.units import BURST
 
 MIN_FRAMES = 20
-ISOLATED = 4  # frames of each whole run that are measured isolated
 VIRTUAL_CORES = (1, 2, 3, 4, 8)
 POLICY, EDGE = "pipelined", "double"
 
@@ -212,9 +211,7 @@ class _Trial:
     def _run(self, placement: Placement) -> RunMetrics:
         with tempfile.TemporaryDirectory(prefix="trilane-bench-") as folder:
             placed = self._checked.changed(out_dir=Path(folder), units=settings_of(placement))
-            result = run_avatar(
-                placed.config, placed.assets, policy=POLICY, edge=EDGE, isolated_frames=ISOLATED, starter=self._starter
-            )
+            result = run_avatar(placed.config, placed.assets, policy=POLICY, edge=EDGE, starter=self._starter)
         if result.interrupted:
             raise KeyboardInterrupt
         if result.failure is not None or result.presented < MIN_FRAMES:

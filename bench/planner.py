@@ -217,7 +217,7 @@ def _figures(errors: Mapping[str, PictureErrors]) -> dict[str, float | None]:
 def _frame_ms(checked: Checked, what: str, starter: UnitStarter) -> float:
     with tempfile.TemporaryDirectory(prefix="trilane-bench-") as folder:
         here = checked.changed(out_dir=Path(folder))
-        result = run_avatar(here.config, here.assets, policy=POLICY, isolated_frames=0, starter=starter)
+        result = run_avatar(here.config, here.assets, policy=POLICY, starter=starter)
     if result.interrupted:
         raise KeyboardInterrupt
     if result.failure is not None or result.presented < 2:

@@ -91,7 +91,7 @@ def run_scenario(
     player = _Player(requests, work)
     player.start()
     try:
-        result = run_pipeline(pipeline, MAX_FRAMES, policy=policy, assets=assets, isolated_frames=0, requests=requests)
+        result = run_pipeline(pipeline, MAX_FRAMES, policy=policy, assets=assets, requests=requests)
     finally:
         requests.close()
         player.join()

@@ -14,7 +14,6 @@ from trilane.pipeline.cpu_use import CpuTimes, use_of_cores
 from trilane.pipeline.description import Pipeline
 from trilane.pipeline.run_log import RunLog
 from trilane.scheduler.accounts import compared
-from trilane.scheduler.places import Place, busiest_core_ns
 
 NO_RUN_DELAY = (
     "this kernel does not count how long threads wait for a core (CONFIG_SCHED_INFO): the time in which a unit had a "
@@ -55,23 +54,3 @@ def add_accounts(
         for row in report["units"].values():
             row["idle"]["preempted"] = None
         log.say(NO_RUN_DELAY)
-
-
-def core_efficiency(report: Mapping[str, Any], pipeline: Pipeline) -> float | None:
-    """The work of the busiest core for a frame over the mean frame time; None without isolated times.
-
-    `report`: of a ledger, with its accounts; `pipeline`: that ran. A stage takes its isolated time of each core on
-    which its unit has a thread, but no more than its CPU time for each thread: a core that sleeps does no work. Of the
-    last stage, which is not measured isolated, its CPU time counts. A stage that frames have skipped counts with its
-    jobs for a frame.
-    """
-    frame_ms: float = report["frame_time_ms"]["mean"]
-    if not report["isolated_ms"] or not frame_ms:
-        return None
-    placement = {unit: Place(settings.cores, settings.threads) for unit, settings in pipeline.units.items()}
-    core_ms = dict.fromkeys(placement, 0.0)
-    for name, row in report["stages"].items():
-        cpu_ms = row["cpu_ms"]["mean"] / placement[row["unit"]].threads
-        jobs = row["jobs"] / report["frames"]["presented"]
-        core_ms[row["unit"]] += jobs * min(report["isolated_ms"].get(name, cpu_ms), cpu_ms)
-    return busiest_core_ns(placement, core_ms) / frame_ms

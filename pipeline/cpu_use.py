@@ -2,7 +2,7 @@
 
 A unit's CPU time is that of all threads of its process, those that a runtime lets spin between jobs included. Whatever
 the units do, those that may only run on a set of cores cannot have more CPU time than these cores had time: where the
-figures say otherwise, a thread has run elsewhere or a clock is wrong.
+figures say otherwise, a thread has run elsewhere or a clock is wrong. Efficiencies are of the CPU time of jobs alone.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
+from trilane.scheduler.ledger import JobRecord
+from trilane.scheduler.places import Place, Placement, busiest_core_ns
 from trilane.scheduler.samples import Samples, Sketch
 from trilane.transport.messages import Done
 
@@ -77,3 +79,63 @@ def use_of_cores(
         cpu = sum(cpu_s[unit] for unit in units) / had_s if had_s else 0.0
         rows.append(CoreUse(tuple(sorted(these)), units, cpu, sum(busy[unit] for unit in units) / len(these)))
     return rows
+
+
+class Efficiencies:
+    """How much of the time between the first and the last presented frame was work of jobs; none can pass 1.
+
+    `places`: of each unit. To be told the jobs in the order of their ends, and with those that present a frame, that.
+
+    Of a job that began before that time or ended after it, only the CPU time counts that must lie within, whatever the
+    rest of the job had: all of it but as much as its cores had time outside. So what a unit or a set of cores is
+    credited with fits into the time. Of a unit with more threads than one the slowest unit counts a job with its CPU
+    time for each of them. What runs on a device of its own while the threads sleep counts as long as the job was busy.
+    """
+
+    def __init__(self, places: Placement) -> None:
+        self._places = places
+        self._work_ns: dict[str, float] = dict.fromkeys(places, 0.0)
+        self._cpu_ns: dict[str, float] = dict.fromkeys(places, 0.0)
+        self._first_ns: int | None = None
+        self._last_ns = 0
+        self._unsettled: list[JobRecord] = []  # since the last presented frame
+
+    def add(self, job: JobRecord, *, presents: bool) -> None:
+        """The next job that has ended. `presents`: its end is that of a presented frame."""
+        self._unsettled.append(job)
+        if not presents:
+            return
+        self._first_ns = self._first_ns or job.end_ns
+        self._last_ns = job.end_ns
+        settled = [each for each in self._unsettled if each.end_ns <= job.end_ns]
+        self._unsettled = [each for each in self._unsettled if each.end_ns > job.end_ns]
+        self._book(settled, self._first_ns)
+
+    def close(self) -> dict[str, float | None]:
+        """After the last job: `efficiency`, `core_efficiency`, `machine_efficiency` of a report; None for one frame.
+
+        The work of the slowest unit; the CPU time of the fullest set of cores by the units that have no others, which
+        no division of the work avoids; that of all units on all cores. Each over the time that these had.
+        """
+        had_ns = self._last_ns - (self._first_ns or 0)
+        if self._first_ns is None or had_ns <= 0:
+            return dict.fromkeys(("efficiency", "core_efficiency", "machine_efficiency"))
+        self._book(self._unsettled, self._first_ns)
+        anywhere = {unit: Place(place.cores, 1) for unit, place in self._places.items()}
+        cores = {core for place in anywhere.values() for core in place.cores}
+        return {
+            "efficiency": max(self._work_ns.values()) / had_ns,
+            "core_efficiency": busiest_core_ns(anywhere, self._cpu_ns) / had_ns,
+            "machine_efficiency": sum(self._cpu_ns.values()) / len(cores) / had_ns,
+        }
+
+    def _book(self, jobs: Sequence[JobRecord], first_ns: int) -> None:
+        """What must lie between the first and the last presented frame."""
+        for job in jobs:
+            cores, threads = self._places[job.unit]
+            length_ns = job.end_ns - job.begin_ns
+            outside_ns = max(first_ns - job.begin_ns, 0) + max(job.end_ns - self._last_ns, 0)
+            busy_ns = length_ns - job.preempted_ns - job.asleep_ns
+            work_ns = busy_ns if busy_ns > job.cpu_ns else min(job.cpu_ns / threads, length_ns)
+            self._work_ns[job.unit] += max(work_ns - outside_ns, 0)
+            self._cpu_ns[job.unit] += max(job.cpu_ns - outside_ns * len(cores), 0)

@@ -24,6 +24,7 @@ from pydantic.functional_validators import ModelWrapValidatorHandler
 
 from trilane.errors import BadInputError
 from trilane.scheduler.events import Graph, StageSpec
+from trilane.scheduler.places import Place
 from trilane.transport.packets import FRAME_FIELDS, header_dtype
 from trilane.transport.slots import edge_rule
 from trilane.unexpected_value import UnexpectedValue, unexpected_in
@@ -207,6 +208,10 @@ class Pipeline(Described):
     def run_cores(self) -> tuple[int, ...]:
         """The cores of all units."""
         return tuple(sorted({core for settings in self.units.values() for core in settings.cores}))
+
+    def places(self) -> dict[str, Place]:
+        """Cores and threads of each unit."""
+        return {unit: Place(settings.cores, settings.threads) for unit, settings in self.units.items()}
 
     def stages_of(self, unit: str) -> tuple[PipelineStage, ...]:
         """The unit's stages, in the order of the chain."""

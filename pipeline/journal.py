@@ -249,8 +249,8 @@ def journal_of(
     yield Begun(SCHEMA, recording.graph, recording.settings, facts)
     for now_ns, events, actions, accounts, ended in in_order(recording, jobs):
         yield Stepped(now_ns, events, actions)
-        for unit, account in accounts:
-            yield Accounted(now_ns, unit, account)
+        for since_ns, unit, account in accounts:
+            yield Accounted(since_ns, unit, account)
         for job in ended:
             yield Worked(job, {})
         core.step(now_ns, events)

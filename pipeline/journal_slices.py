@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from trilane.pipeline.journal import Accounted, Begun, Record, Stepped, Worked, read_journal
-from trilane.scheduler.accounts import IdleCutter, IdleSlice, ShareSums, Span
+from trilane.pipeline.journal import Accounted, Record, Stepped, Worked, read_journal
+from trilane.scheduler.accounts import IdleCutter, IdleSlice, Span
 from trilane.scheduler.events import Graph
 from trilane.scheduler.ledger import JobRecord
 
@@ -31,7 +31,7 @@ class JournalSlices:
             case Stepped():
                 return self._cutter.step(*record)
             case Accounted():
-                self._cutter.account(record.unit, record.account)
+                self._cutter.account(*record)
             case Worked():
                 self._cutter.job(record.job)
         return []
@@ -44,22 +44,3 @@ class JournalSlices:
 def jobs_of(path: Path) -> Iterator[JobRecord]:
     """The jobs of the journal at `path`, in the order in which their ends were heard. Raises BadInputError."""
     return (record.job for record in read_journal(path) if isinstance(record, Worked))
-
-
-def shares_of_journal(path: Path) -> dict[str, dict[str, float]]:
-    """The second accounts of the run whose journal is at `path`. Raises BadInputError for a file that is none."""
-    sums = ShareSums()
-    slices: JournalSlices | None = None
-    for record in read_journal(path):
-        if isinstance(record, Begun):
-            slices = JournalSlices(record.graph)
-        elif slices is not None:
-            if isinstance(record, Worked):
-                sums.add_job(record.job)
-            for piece in slices.add(record):
-                sums.add_idle(piece)
-    if slices is None:
-        return {}
-    for piece in slices.end():
-        sums.add_idle(piece)
-    return sums.shares(slices.span)

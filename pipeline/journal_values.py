@@ -22,7 +22,7 @@ ACCOUNTS: Final = {ASSIGNED: "assigned", STARVED: "starved", BLOCKED: "blocked",
 A_TIME: Final = f"nanoseconds, a whole number from 0 to {NEVER}"
 NUMBERS: Final = {int, float}
 PLAIN: Final = {int, float, str, bool, type(None)}
-JOB_TYPES: Final = tuple(get_type_hints(JobRecord).values())
+JOB_TYPES: Final = tuple(get_type_hints(JobRecord).values())  # journals of an older Trilane lack the last
 SETTINGS_TYPES: Final = {
     name: tuple if "tuple" in str(kind) else kind for name, kind in get_type_hints(Settings).items()
 }
@@ -194,7 +194,7 @@ class RunValues:
 
     def job(self, row: Any) -> JobRecord:
         """A job that has ended; each stage does the frames in their order, and none twice."""
-        if type(row) is not tuple or tuple(map(type, row)) != JOB_TYPES:
+        if type(row) is not tuple or tuple(map(type, row)) not in (JOB_TYPES, JOB_TYPES[:-1]):
             raise UnexpectedValue(f"job {shown(row)}", f"texts and whole numbers: {', '.join(JobRecord._fields)}")
         job = JobRecord(*row)
         fields: tuple[Any, ...] = row

@@ -138,7 +138,7 @@ class RealtimeClock:
                 found.append(None)
             else:
                 lost = (done.preempted_ns, done.asleep_ns, done.preempted_before_ns)
-                times = (ready_ns, dispatch_ns, done.t_begin_ns, done.t_end_ns, *lost)
+                times = (ready_ns, dispatch_ns, done.t_begin_ns, done.t_end_ns, *lost, done.cpu_ns)
                 found.append(Worked(JobRecord(job.stage, job.unit, job.frame, *times), done.metrics))
             self.cpu.add(job.unit, job.stage, done, self._core.ledger.start_ns)
             sums, counts = self.metrics[job.stage], self.reported[job.stage]

@@ -1,7 +1,8 @@
-"""What each unit needs for a frame, measured before the run. Rule: one unit works at a time, and its files are lost.
+"""What is done before a run on the run's own stages: frames in the order of a run, one at a time. Rule: none twice.
 
-The caller gives a pipeline whose files go to a folder that is thrown away, so that the last stage is measured too. What
-counts is time in which the unit had its cores: others may use the machine meanwhile.
+Every frame goes through all stages before the next one, and through the slots of an edge in turn: what a stage takes
+depends on what it did last, on what its slot holds, and on how long it rested. What counts is time in which the unit
+had its cores: others may use the machine meanwhile.
 """
 
 from __future__ import annotations
@@ -9,8 +10,9 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Iterator, Sequence
-from statistics import fmean
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
+from statistics import median
 
 from trilane.pipeline.description import Pipeline
 from trilane.pipeline.lifecycle import START_S, listen_before_run, start_units
@@ -20,20 +22,80 @@ from trilane.pipeline.shared_assets import Assets, share_assets
 from trilane.pipeline.signals import Interrupts
 from trilane.pipeline.unit_processes import UnitProcesses
 from trilane.pipeline.unit_starter import UnitStarter
+from trilane.scheduler.events import Graph, StageAlone
 from trilane.scheduler.places import Work
 from trilane.transport.messages import Done, RunJob
+from trilane.transport.slots import edge_rule
 
-REPEATS = 3  # of a stage for each frame, after one that warms up; the shortest counts
-LIMIT_S = 0.5  # no further frame is begun after this
+WARM_UP = 2  # frames that do not count: as many as most edges have slots
+LIMIT_S = 0.5  # after those no further frame is begun after this
+
+
+class Chain:
+    """The stages of `graph`, but the last unless `whole`. `processes`: of each unit, ready and without a job."""
+
+    def __init__(
+        self, graph: Graph, processes: Mapping[str, UnitProcesses], interrupts: Interrupts, *, whole: bool
+    ) -> None:
+        self._stages = graph.stages if whole else graph.stages[:-1]
+        self._slots = [edge_rule(edge).slots for edge in graph.edges]
+        self._processes, self._interrupts = processes, interrupts
+        self._frames = self._jobs = 0
+
+    def frame(self, number: int, rung: int = 0) -> dict[str, Done]:
+        """Every stage does frame `number`, one after the other; their answers.
+
+        Raises UnitError when a stage fails or does not answer, KeyboardInterrupt when interrupted.
+        """
+        slots = [-1, *(self._frames % count for count in self._slots), -1]
+        self._frames += 1
+        found = {}
+        for place, stage in enumerate(self._stages):
+            self._jobs += 1
+            processes = self._processes[stage.unit]
+            position, since_ns = processes.places[stage.name], time.monotonic_ns()
+            slot_in, slot_out = slots[place : place + 2]
+            job = RunJob(self._jobs, position, number, slot_in, slot_out, 0, since_ns, fresh=1, rung=rung)
+            processes.send(stage.unit, job)
+            found[stage.name] = self._answer(stage.unit, processes)
+        return found
+
+    def _answer(self, unit: str, processes: UnitProcesses) -> Done:
+        end = time.monotonic() + START_S
+        while time.monotonic() < end:
+            for name, message in listen_before_run(processes, self._interrupts):
+                if name == unit and isinstance(message, Done):
+                    return message
+        raise UnitError(f"unit {unit} did not end a job within {START_S:.0f} s")
+
+
+def on_rungs(chain: Chain, frames: Sequence[int], rungs: int, follow: Sequence[str]) -> list[StageAlone]:
+    """What each stage of `follow` takes, alone, on each of so many `rungs` of a ladder: the most of `frames`.
+
+    Of several frames the first warms up. Nothing is said of a stage that does not take less on every further rung, such
+    as where nobody is on the screen in any of the frames. Raises as `Chain.frame`.
+    """
+    times = {name: [0] * rungs for name in follow}
+    for number, frame in enumerate(frames):
+        for rung in range(rungs):
+            done = chain.frame(frame, rung)
+            for name in follow if number or len(frames) == 1 else ():
+                times[name][rung] = max(times[name][rung], _took_ns(done[name]))
+    return [
+        StageAlone(name, rung, ns)
+        for name, of_rungs in times.items()
+        if all(more > less for more, less in pairwise(of_rungs))
+        for rung, ns in enumerate(of_rungs)
+    ]
 
 
 def rehearse(
     pipeline: Pipeline, variants: Sequence[Pipeline], frames: Sequence[int], assets: Assets, starter: UnitStarter
 ) -> dict[str, dict[int, Work]]:
-    """Unit, then threads, to its work for a frame.
+    """Unit, then threads, to its work for a frame; the files that the last stage writes are the caller's to remove.
 
-    `pipeline`: of whose units all are measured, with the mean over `frames`.
-    `variants`: the same with other settings of some units, which alone are measured again, with the last of the frames.
+    `pipeline`: of whose units all are measured, on `frames`.
+    `variants`: the same with other settings of some units, which alone are measured again, between the other stages.
     `assets`, `starter`: as for a run.
     Raises TrilaneError when a unit cannot start or a stage fails, KeyboardInterrupt when interrupted.
     """
@@ -44,79 +106,47 @@ def rehearse(
         regions = stack.enter_context(edge_regions(pipeline))
 
         @contextlib.contextmanager
-        def running(described: Pipeline, units: Sequence[str]) -> Iterator[_Rehearsal]:
+        def running(described: Pipeline, units: Sequence[str]) -> Iterator[dict[str, UnitProcesses]]:
             with contextlib.closing(UnitProcesses(described, regions, assets_fd, starter)) as processes:
                 start_units(processes, units, interrupts)
-                yield _Rehearsal(described, processes, interrupts)
+                yield dict.fromkeys(units, processes)
 
-        with running(pipeline, list(pipeline.units)) as first:
-            works, last = first.measure(frames)
+        first = stack.enter_context(running(pipeline, list(pipeline.units)))
+        works = works_of(pipeline, Chain(pipeline.graph(), first, interrupts, whole=True), frames)
         found = {unit: {pipeline.units[unit].threads: work} for unit, work in works.items()}
         for variant in variants:
             changed = [unit for unit, settings in variant.units.items() if settings != pipeline.units[unit]]
             with running(variant, changed) as again:
-                for unit in changed:
-                    other = again.work_of(unit, last)
-                    threads = variant.units[unit].threads
-                    found[unit][threads] = _in_proportion(works[unit], first.works[unit, last], other)
+                chain = Chain(pipeline.graph(), {**first, **again}, interrupts, whole=True)
+                works = works_of(variant, chain, frames)
+            for unit in changed:
+                found[unit][variant.units[unit].threads] = works[unit]
         return found
 
 
-def _in_proportion(mean: Work, before: Work, after: Work) -> Work:
-    """`mean` of some frames, where one of them took `before` and now takes `after`."""
-    serial_ns = mean.serial_ns * after.serial_ns // max(before.serial_ns, 1)
-    core_ns = mean.core_ns * after.core_ns // max(before.core_ns, 1)
-    return Work(serial_ns, core_ns, mean.jobs)
+def works_of(pipeline: Pipeline, chain: Chain, frames: Sequence[int]) -> dict[str, Work]:
+    """The work of each unit of `pipeline` for a frame: the sum over its stages of the medians over `frames`.
+
+    The first WARM_UP do not count, where there are more; LIMIT_S holds for the others.
+    """
+    warm_up = min(WARM_UP, len(frames) - 1)
+    for frame in frames[:warm_up]:
+        chain.frame(frame)
+    end, done = time.monotonic() + LIMIT_S, list[dict[str, Done]]()
+    for frame in frames[warm_up:]:
+        if done and time.monotonic() > end:
+            break
+        done.append(chain.frame(frame))
+    works = {}
+    for unit, settings in pipeline.units.items():
+        names = [stage.name for stage in pipeline.stages_of(unit)]
+        took_ns = [median(_took_ns(each[name]) for each in done) for name in names]
+        cpu_ns = [median(each[name].cpu_ns for each in done) / settings.threads for name in names]
+        core_ns = sum(map(min, cpu_ns, took_ns))
+        works[unit] = Work(round(sum(took_ns)), round(core_ns), len(names))
+    return works
 
 
-class _Rehearsal:
-    """Jobs of the units of `pipeline`, one at a time, through the first slot of every edge."""
-
-    def __init__(self, pipeline: Pipeline, processes: UnitProcesses, interrupts: Interrupts) -> None:
-        self._pipeline, self._processes, self._interrupts = pipeline, processes, interrupts
-        self._jobs = 0
-        self.works: dict[tuple[str, int], Work] = {}
-
-    def measure(self, frames: Sequence[int]) -> tuple[dict[str, Work], int]:
-        """The mean work of each unit, and the last of the frames that were done."""
-        end, done = time.monotonic() + LIMIT_S, list[int]()
-        while len(done) < len(frames) and (not done or time.monotonic() < end):
-            done.append(frames[len(done)])
-            for stage in self._pipeline.stages:
-                self._run(stage.name, done[-1])
-            for unit in self._pipeline.units:
-                self.works[unit, done[-1]] = self.work_of(unit, done[-1])
-        return {unit: self._mean(unit, done) for unit in self._pipeline.units}, done[-1]
-
-    def work_of(self, unit: str, frame: int) -> Work:
-        """The unit's stages on what their input slots hold."""
-        stages = self._pipeline.stages_of(unit)
-        rounds = [[self._run(stage.name, frame) for stage in stages] for _ in range(1 + REPEATS)]
-        shortest = [min(round_[place] for round_ in rounds[1:]) for place in range(len(stages))]
-        return Work(sum(ns for ns, _ in shortest), sum(ns for _, ns in shortest), len(stages))
-
-    def _mean(self, unit: str, frames: Sequence[int]) -> Work:
-        works = [self.works[unit, frame] for frame in frames]
-        serial_ns, core_ns = (round(fmean(work[field] for work in works)) for field in range(2))
-        return Work(serial_ns, core_ns, len(self._pipeline.stages_of(unit)))
-
-    def _run(self, name: str, frame: int) -> tuple[int, int]:
-        """How long a job took without the time in which it had no core, and its CPU time for each thread."""
-        position = next(place for place, stage in enumerate(self._pipeline.stages) if stage.name == name)
-        unit, is_last = self._pipeline.stages[position].unit, position == len(self._pipeline.stages) - 1
-        slots = (0 if position else -1, -1 if is_last else 0)
-        self._jobs += 1
-        now_ns = time.monotonic_ns()
-        job = RunJob(self._jobs, self._processes.places[name], frame, *slots, epoch=0, t_dispatch_ns=now_ns, fresh=1)
-        self._processes.send(unit, job)
-        done = self._answer(unit)
-        took_ns = done.t_end_ns - done.t_begin_ns - done.preempted_ns
-        return took_ns, min(done.cpu_ns // self._pipeline.units[unit].threads, took_ns)
-
-    def _answer(self, unit: str) -> Done:
-        end = time.monotonic() + START_S
-        while time.monotonic() < end:
-            for name, message in listen_before_run(self._processes, self._interrupts):
-                if name == unit and isinstance(message, Done):
-                    return message
-        raise UnitError(f"unit {unit} did not end a job within {START_S:.0f} s")
+def _took_ns(done: Done) -> int:
+    """How long a job took without the time in which it had no core."""
+    return done.t_end_ns - done.t_begin_ns - done.preempted_ns

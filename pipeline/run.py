@@ -8,18 +8,18 @@ from dataclasses import replace
 from typing import Any, Protocol
 
 from trilane.errors import BadInputError
-from trilane.pipeline.accounts import add_accounts, core_efficiency
+from trilane.pipeline.accounts import add_accounts
 from trilane.pipeline.controls import RunControls
 from trilane.pipeline.description import Pipeline
-from trilane.pipeline.isolated import IsolatedTimes
 from trilane.pipeline.lifecycle import close_units, start_units
 from trilane.pipeline.moved_bytes import BYTES, add_bytes
 from trilane.pipeline.other_programs import beside_units
 from trilane.pipeline.preconditions import check_cores, check_open_files, check_positive, refuse_in_a_unit
 from trilane.pipeline.realtime_clock import Governor, RealtimeClock
+from trilane.pipeline.rehearsal import Chain, on_rungs
 from trilane.pipeline.requests import FrameRequestQueue
 from trilane.pipeline.result import RunResult
-from trilane.pipeline.run_log import RunLog, UnitError
+from trilane.pipeline.run_log import RunLog
 from trilane.pipeline.run_metrics import RunMetrics, metrics_of
 from trilane.pipeline.run_record import JournalFile, RunRecord, recorded
 from trilane.pipeline.shared_assets import Assets
@@ -39,8 +39,7 @@ from trilane.transport.wakeup import awake
 from trilane.unexpected_value import UnexpectedValue
 
 HANG_NS = 10_000_000_000
-FRAMES_PER_ISOLATED, LEAST_ISOLATED, MOST_ISOLATED = 15, 4, 16
-FRAMES_ON_RUNGS = 3
+FRAMES_ON_RUNGS = 4  # the first of which warms up
 
 
 class ReportingGovernor(Governor, Protocol):
@@ -70,7 +69,6 @@ def run_pipeline(
     fps: float = 30.0,
     pace_fps: float | None = None,
     assets: Assets | None = None,
-    isolated_frames: int | None = None,
     hang_ns: int = HANG_NS,
     latch_ms: float = 0.0,
     works: tuple[int, ...] = (),
@@ -90,8 +88,6 @@ def run_pipeline(
     `pace_fps`: frames are released at this rate; None releases them as fast as they are taken, and under `latest` and
     `deadline`, which need a rate, at `fps`.
     `assets`: arrays that every stage may read.
-    `isolated_frames`: frames measured with the other units quiet, half of them before the run and half after it, which
-    efficiency needs; None: one for every 15 of the run, from 4 to 16; 0 does a single one, to warm up.
     `hang_ns`: a unit whose job takes longer is restarted.
     `latch_ms`: the first stage begins so late that it is expected to end this long before the second can take it; 0: at
     once.
@@ -116,7 +112,6 @@ def run_pipeline(
     refuse_in_a_unit()
     check_open_files()
     check_cores(pipeline)
-    isolated = _isolated_share(frames) if isolated_frames is None else isolated_frames
     settings = _stepped(_settings(policy, frames, fps, pace_fps, hang_ns, latch_ms, requests), works, follow)
     with recorded(journal, pipeline.graph(), settings, governor) as record:
         log = RunLog(record.say, *([on_message] if on_message is not None else []))
@@ -136,19 +131,19 @@ def run_pipeline(
             if controls is not None:
                 clock.heed(controls)
             run = _Run(core, clock, processes, interrupts, log, record, cores)
-            run.execute(isolated)
+            run.execute()
         report = core.ledger.report(
             clock="host",
             requested=settings.frames if requests is None and controls is None else core.source.released,
-            isolated_ns=run.isolated.mean_ns if isolated else None,
         )
         report["percentiles"] = EXACT if core.ledger.is_exact else SKETCHED
         report.update(policy=policy, edge=pipeline.rule, idle_cores=idle_cores, other_programs=run.other_programs)
         _add_caps(report, governor)
         for unit, row in report["units"].items():
             row.update(pid=run.pids[unit], **pipeline.units[unit].model_dump(mode="json"))
-        add_accounts(report, pipeline, clock.cpu, record.second_accounts(), log)
-        report["core_efficiency"] = core_efficiency(report, pipeline)
+        second, bounded = record.reckoned(pipeline.places())
+        report.update(bounded.figures)
+        add_accounts(report, pipeline, clock.cpu, second, log)
         add_bytes(report, clock.metrics)
         metrics = metrics_of(report)
         record.end(metrics.as_json())
@@ -165,7 +160,7 @@ def _add_caps(report: dict[str, Any], governor: ReportingGovernor | None) -> Non
 
 
 class _Run:
-    """The steps of one run: start, isolated times, the scheduler's loop, isolated times again, close."""
+    """The steps of one run: start, a frame that warms up, the scheduler's loop, close."""
 
     def __init__(
         self,
@@ -179,22 +174,21 @@ class _Run:
     ) -> None:
         self._core, self._clock, self._processes, self._cores = core, clock, processes, cores
         self._interrupts, self._log, self._record = interrupts, log, record
-        self.isolated = IsolatedTimes(core.graph, processes, interrupts)
         self.pids: dict[str, int] = {}
         self.other_programs: float | None = None
         self._startup_ms: dict[str, float] = {}
         self._outcome = Outcome(OutcomeKind.ABORTED)
 
-    def execute(self, isolated_frames: int) -> None:
+    def execute(self) -> None:
         """All of it. Raises as `run_pipeline`."""
         self._startup_ms = start_units(self._processes, self._core.graph.units, self._interrupts)
         self.pids = self._processes.pids
-        sample = _spread(self._core.settings.frames, max(isolated_frames, 1))
-        self.isolated.measure(sample[::2])
-        settings = self._core.settings
+        graph, settings = self._core.graph, self._core.settings
+        chain = Chain(graph, dict.fromkeys(graph.units, self._processes), self._interrupts, whole=False)
         if settings.works:
             few = _spread(settings.frames, FRAMES_ON_RUNGS)
-            self._clock.first += self.isolated.of_rungs(few, len(settings.works), settings.follow)
+            self._clock.first += on_rungs(chain, few, len(settings.works), settings.follow)
+        chain.frame(0)
         others = beside_units(self._cores, self.pids)
         self._record.begin(self._clock, lambda: self._processes.pids)
         self._outcome = run_loop(self._core, self._clock, self._record)
@@ -203,8 +197,6 @@ class _Run:
         if self._outcome.kind is OutcomeKind.GAVE_UP:
             unit = self._outcome.unit
             self._log.fail(f"unit {unit} could not be kept alive{self._processes.why_ended(unit)}")
-        if sample[1::2] and self._outcome.kind is OutcomeKind.DONE:
-            self._measure_again(sample[1::2])
         self.pids = {**self.pids, **self._processes.pids}
         if self._outcome.kind is not OutcomeKind.ABORTED:
             close_units(self._processes, self._log, self._interrupts)
@@ -229,18 +221,6 @@ class _Run:
             interrupted=stopped and self._interrupts.count > 0,
             failure=self._log.failure,
         )
-
-    def _measure_again(self, frames: list[int]) -> None:
-        """After the run, so that a machine which grew slower or faster weighs on both sides.
-
-        What goes wrong here leaves the run's result as it is.
-        """
-        if self._log.failure or not all(unit.is_ready for unit in self._core.units.values()):
-            return
-        try:
-            self.isolated.measure(frames)
-        except (UnitError, KeyboardInterrupt) as error:
-            self._log.say(f"the measurement after the run was left out: {str(error) or 'interrupted'}")
 
     def _mean_metrics(self) -> Mapping[str, Mapping[str, float]]:
         """Of each stage that reported any, the mean over the jobs that reported it; of bytes see `add_bytes`."""
@@ -278,11 +258,6 @@ def _settings(
 def _stepped(settings: Settings, works: tuple[int, ...], follow: tuple[str, ...]) -> Settings:
     """With the ladder, where frames are released at a rate, and so can be late."""
     return replace(settings, works=works, follow=follow) if works and settings.period_ns else settings
-
-
-def _isolated_share(frames: int) -> int:
-    """A short run is measured with fewer frames: its figures are as uncertain as theirs."""
-    return min(max(frames // FRAMES_PER_ISOLATED, LEAST_ISOLATED), MOST_ISOLATED)
 
 
 def _spread(frames: int, count: int) -> list[int]:

@@ -253,6 +253,26 @@ class Temperature(Record):
     sensor: float | None = None
 
 
+class PathShare(Record):
+    """What the critical path was for most of its time (`trilane.pipeline.critical_path`).
+
+    `name`: of the unit or the stage, or what it was instead. `share`: of the path. `share_low`, `share_high`: 95 %
+    interval by the scatter of this run's frames; null for fewer than 50.
+    """
+
+    name: str
+    share: float
+    share_low: float | None = None
+    share_high: float | None = None
+
+
+class Bound(Record):
+    """What bounded the frame time. `unit`: its name is the report's `bottleneck`. `stage`: null where no stage did."""
+
+    unit: PathShare
+    stage: PathShare | None = None
+
+
 class RunMetrics(Record):
     """What a run measured.
 
@@ -269,10 +289,11 @@ class RunMetrics(Record):
     `stages`: times of each, in the order of the pipeline.
     `bytes`: moved for a presented frame by all stages that count them; absent where none does.
     `units`: shares of each.
-    `efficiency`: the slowest unit's stages, measured isolated, over the mean frame time; null when not measured.
-    `bottleneck`: that slowest unit; absent when not measured.
-    `core_efficiency`: the work of the busiest core alone over the mean frame time; null when not measured.
-    `isolated_ms`: mean time of each stage that was measured while no other unit worked.
+    `efficiency`: work of the slowest unit's jobs, as a share of the time from the first presented frame to the last;
+    null for fewer than two. `core_efficiency`: of the fullest cores. `machine_efficiency`: of all cores of the run.
+    `bottleneck`: what most of the critical path is: a unit, `other programs`, `release`, `overhead`, or `held`; null
+    without a path.
+    `bound`: its share of the path, and the stage that has most of it.
     `core_shares`: what was done on each set of cores that a unit has, and on all; on the host clock.
     `accounts`: the shares of `units` computed a second time.
     `policy`, `edge`: of the scheduler; `idle_cores`: whether cores without work stayed awake; on the host clock.
@@ -294,10 +315,11 @@ class RunMetrics(Record):
     stages: dict[str, StageTimes]
     bytes: MovedInAll | None = None
     units: dict[str, UnitShares]
-    efficiency: float | None
-    bottleneck: str | None = None
+    efficiency: float | None = None
     core_efficiency: float | None = None
-    isolated_ms: dict[str, float]
+    machine_efficiency: float | None = None
+    bottleneck: str | None = None
+    bound: Bound | None = None
     core_shares: tuple[CoreShare, ...] = ()
     accounts: Accounts | None = None
     policy: str = ""

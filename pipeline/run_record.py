@@ -28,12 +28,13 @@ from trilane.pipeline.journal import (
     Sampled,
     Stepped,
     Worked,
+    read_journal,
 )
-from trilane.pipeline.journal_slices import shares_of_journal
-from trilane.scheduler.accounts import second_accounts
+from trilane.pipeline.reckoning import Reckoned, reckoned, records_of
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import Action, Event, Graph, Settings
 from trilane.scheduler.ledger import JobRecord
+from trilane.scheduler.places import Placement
 from trilane.scheduler.recording import Recording
 from trilane.scheduler.state import FULL_DUTY
 from trilane.writing import WRITABLE
@@ -90,8 +91,8 @@ class RunRecord(Protocol):
     def say(self, text: str) -> None:
         """Note a message to a person."""
 
-    def second_accounts(self) -> dict[str, dict[str, float]]:
-        """Of the whole run; the loop is over."""
+    def reckoned(self, places: Placement) -> tuple[dict[str, dict[str, float]], Reckoned]:
+        """The second accounts of the whole run, and what bounded it; the loop is over. `places`: of its units."""
 
     def end(self, report: Mapping[str, Any]) -> None:
         """The run is over, with this report."""
@@ -115,10 +116,11 @@ class KeptRun:
     def say(self, text: str) -> None:
         """Messages are kept by the log of the run."""
 
-    def second_accounts(self) -> dict[str, dict[str, float]]:
+    def reckoned(self, places: Placement) -> tuple[dict[str, dict[str, float]], Reckoned]:
         if self._source is not None:
             self.jobs += [worked.job for worked in self._source.ended() if worked is not None]
-        return second_accounts(self.recording, self.jobs)
+        recording = self.recording
+        return reckoned(recording.graph, recording.settings, places, records_of(recording, self.jobs))
 
     def end(self, report: Mapping[str, Any]) -> None:
         """Nothing is left to do."""
@@ -158,7 +160,7 @@ class JournaledRun:
         for unit in core.units.values():
             if accounts[unit.name] != unit.account:
                 accounts[unit.name] = unit.account
-                follows.append(Accounted(now_ns, unit.name, unit.account))
+                follows.append(Accounted(unit.account_ns, unit.name, unit.account))
         ledger = core.ledger
         if ledger.left_out != self._left_out:
             self._left_out = ledger.left_out
@@ -186,9 +188,11 @@ class JournaledRun:
         self._writer.add(Said(time.monotonic_ns(), text))
         self._writer.flush()
 
-    def second_accounts(self) -> dict[str, dict[str, float]]:
+    def reckoned(self, places: Placement) -> tuple[dict[str, dict[str, float]], Reckoned]:
         self.flush()
-        return shares_of_journal(self._file.path)
+        records = read_journal(self._file.path)
+        next(records)  # the header
+        return reckoned(self.recording.graph, self.recording.settings, places, records)
 
     def end(self, report: Mapping[str, Any]) -> None:
         self._writer.add(Ended(time.monotonic_ns(), report))

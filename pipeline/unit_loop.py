@@ -9,7 +9,6 @@ import contextlib
 import gc
 import os
 import sys
-import time
 import traceback
 from collections.abc import Iterable, Iterator, Mapping
 from importlib import import_module
@@ -32,16 +31,13 @@ from trilane.transport.messages import (
     BUILDING,
     CLOSING,
     MAX_TEXT,
-    MEASURING,
     Close,
     Closed,
-    Duration,
     Failed,
     MessageError,
     Ping,
     Pong,
     Ready,
-    RunIsolated,
     RunJob,
 )
 from trilane.transport.wakeup import UNIT_NS, use_slice
@@ -86,9 +82,6 @@ def _answer(spec: UnitSpec, link: Link, counters: HardwareCounters | NoCounters)
             _run_job(link, stages[message.stage], message, clock, counters)
         elif isinstance(message, Ping):
             link.send_heartbeat(Pong())
-        elif isinstance(message, RunIsolated):
-            _run_isolated(link, stages[message.stage], message)
-            clock.restart()
         elif isinstance(message, Close):
             return _close(spec.unit, link, stages)
         elif link.job_pipe.ended:
@@ -163,16 +156,6 @@ def _run_job(
     except Exception as error:
         _fail(link, job.id, f"stage {stage.name}, frame {job.frame}", error)
     clock.answered()
-
-
-def _run_isolated(link: Link, stage: BoundStage, job: RunIsolated) -> None:
-    begin_ns = time.monotonic_ns()
-    try:
-        stage.run(job.frame, job.slot_in, job.slot_out, 0, fresh=True, rung=job.rung)
-    except Exception as error:
-        _fail(link, MEASURING, f"stage {stage.name}, frame {job.frame}", error)
-        return
-    link.job_pipe.send(Duration(time.monotonic_ns() - begin_ns))
 
 
 def _close(unit: str, link: Link, stages: Iterable[BoundStage]) -> int:

@@ -25,7 +25,7 @@ from trilane.scheduler.events import (
     UnitDied,
     UnitReady,
 )
-from trilane.scheduler.ledger import BLOCKED, STARVED, THROTTLED, JobRecord
+from trilane.scheduler.ledger import ASSIGNED, BLOCKED, STARVED, THROTTLED, JobRecord
 from trilane.scheduler.recording import Recording
 
 BUSY = "busy"
@@ -55,12 +55,12 @@ class Span(NamedTuple):
 
 
 class Moment(NamedTuple):
-    """A step of the scheduler, the (unit, account) that were noted after it, and the jobs whose end it heard."""
+    """A step of the scheduler, the (since, unit, account) that were noted after it, and the jobs whose end it heard."""
 
     now_ns: int
     events: tuple[Event, ...]
     actions: tuple[Action, ...]
-    accounts: list[tuple[str, int]]
+    accounts: list[tuple[int, str, int]]
     jobs: list[JobRecord]
 
 
@@ -73,7 +73,7 @@ def in_order(recording: Recording, jobs: Iterable[JobRecord]) -> Iterator[Moment
     for now_ns, events, actions in recording.steps:
         moment = Moment(now_ns, events, actions, [], [])
         while accounts and accounts[0][0] <= now_ns:
-            moment.accounts.append(accounts.popleft()[1:])
+            moment.accounts.append(accounts.popleft())
         for event in events:
             while type(event) is JobDone and ended[event.unit] and ended[event.unit][0].end_ns <= event.t_end_ns:
                 moment.jobs.append(ended[event.unit].popleft())
@@ -114,9 +114,15 @@ class IdleCutter:
                 self.span = Span(self._begin_ns, now_ns)
         return slices
 
-    def account(self, unit: str, account: int) -> None:
-        """From the last step on the time of `unit` without a job goes to `account` (`trilane.scheduler.ledger`)."""
-        self._units[unit].account = account
+    def account(self, since_ns: int, unit: str, account: int) -> None:
+        """From `since_ns` on the time of `unit` without a job goes to `account` (`trilane.scheduler.ledger`).
+
+        That is the time of the last step, or of a release before it which that step did late.
+        """
+        state = self._units[unit]
+        if account == ASSIGNED and since_ns < self._now_ns and self._begin_ns is not None:
+            self._hold(state.note(since_ns, OVERHEAD))
+        state.account = account
 
     def job(self, job: JobRecord) -> None:
         """A job whose end the last step heard; those of a unit come in the order in which it did them."""
@@ -160,8 +166,8 @@ def slices_of(cutter: IdleCutter, recording: Recording, jobs: Iterable[JobRecord
     """Tell `cutter` a whole run that is in memory; what it hands back."""
     for moment in in_order(recording, jobs):
         yield from cutter.step(moment.now_ns, moment.events, moment.actions)
-        for unit, account in moment.accounts:
-            cutter.account(unit, account)
+        for since_ns, unit, account in moment.accounts:
+            cutter.account(since_ns, unit, account)
         for job in moment.jobs:
             cutter.job(job)
     yield from cutter.end()

@@ -8,7 +8,7 @@ from trilane.scheduler.events import Action, Dispatch
 from trilane.scheduler.flow import Flow
 from trilane.scheduler.frame_source import Source
 from trilane.scheduler.late_frames import LateFrames
-from trilane.scheduler.ledger import ASSIGNED, Ledger
+from trilane.scheduler.ledger import ASSIGNED, STARVED, Ledger
 from trilane.scheduler.policy import Policy
 from trilane.scheduler.state import StageState, UnitState
 
@@ -30,11 +30,16 @@ class Assignment:
         self._hang_ns = hang_ns
         self._flow, self._source, self._choice, self._ledger = flow, source, choice, ledger
         self._lead_ns = policy.lead_ns
+        self._first_unit = flow.stages[0].unit
         self._late = LateFrames(policy, flow, source, choice)
         self._drops = policy.newest or policy.drop_late
 
-    def assign(self, now_ns: int, actions: list[Action]) -> None:
-        """Hand jobs to the dirty units, as `Dispatch` in `actions`, until each is full or has nothing to run."""
+    def assign(self, now_ns: int, released_ns: int, actions: list[Action]) -> None:
+        """Hand jobs to the dirty units, as `Dispatch` in `actions`, until each is full or has nothing to run.
+
+        `released_ns`: when the first frame was due that this step releases, else now. A unit that had no input until
+        then waited for the scheduler since.
+        """
         dirty = self._flow.dirty
         for unit in dirty:  # a dispatch may append to the list, also a unit that was looked at before
             while len(unit.queue) < unit.queue_capacity:
@@ -45,8 +50,9 @@ class Assignment:
         for unit in dirty:
             account = ASSIGNED if unit.queue else self._choice.account_without_job(unit, now_ns)
             if account != unit.account:
-                unit.account = account
-                self._ledger.enter(unit.name, now_ns, account)
+                is_late = unit.account == STARVED and account == ASSIGNED and unit is self._first_unit
+                unit.account, unit.account_ns = account, released_ns if is_late else now_ns
+                self._ledger.enter(unit.name, unit.account_ns, account)
         dirty.clear()
 
     def _next_stage(self, unit: UnitState, now_ns: int) -> StageState | None:

@@ -231,7 +231,8 @@ class BesideDriver:
         preempted_ns = now_ns - begin_ns - running.had // ONE
         if line.recording is not None and job.frame in line.core.frames:
             ready_ns = line.core.frames[job.frame].ready_ns
-            times = (ready_ns, running.waited.dispatch_ns, begin_ns, now_ns, preempted_ns, 0, before_ns)
+            cpu_ns = now_ns - begin_ns - preempted_ns
+            times = (ready_ns, running.waited.dispatch_ns, begin_ns, now_ns, preempted_ns, 0, before_ns, cpu_ns)
             line.jobs.append(JobRecord(job.stage, job.unit, job.frame, *times))
         skips = job.stage == line.bypass_begin and line.member.skips(job.frame, job.fresh)
         done = JobDone(job.unit, job.id, begin_ns, now_ns, begin_ns, preempted_ns, 0, before_ns, skips)

@@ -130,16 +130,23 @@ class Core:
         if self.started and not self.finished:
             if self._latches:
                 self.flow.mark_dirty(self.stages[0].unit)
-            if now_ns >= self.source.due_ns and self.source.advance(now_ns):
-                self.flow.mark_dirty(self.stages[0].unit)
+            released_ns = self._release(now_ns) if now_ns >= self.source.due_ns else now_ns
             before = len(self.actions)
-            self.assignment.assign(now_ns, self.actions)
+            self.assignment.assign(now_ns, released_ns, self.actions)
             if len(self.actions) > before:
                 self._set_alarm(now_ns + self._hang_ns)  # a job that was handed out now may be late then
             if not self.frames and self.source.exhausted:
                 self._finish(Outcome(OutcomeKind.STOPPED if self.stopping else OutcomeKind.DONE))
         next_ns = NEVER if self.finished else self._next_deadline()
         return tuple.__new__(Decision, (tuple(self.actions), next_ns))  # Decision(...) takes twice as long
+
+    def _release(self, now_ns: int) -> int:
+        """Release what is due; since when the first of it was, now where there was nothing."""
+        due_ns = self.source.due_ns
+        if not self.source.advance(now_ns):
+            return now_ns
+        self.flow.mark_dirty(self.stages[0].unit)
+        return due_ns
 
     def _next_deadline(self) -> int:
         if self._lead_ns or self.alarm_ns <= self.now_ns:
@@ -188,9 +195,7 @@ class Core:
         service_ns = end_ns - begin_ns
         if skips:
             self._on_skip(stage, frame)
-        self.ledger.job(
-            job, frame.ready_ns, begin_ns, end_ns, preempted_ns, asleep_ns, preempted_before_ns, frame.skips
-        )
+        self.ledger.job(job, frame.ready_ns, begin_ns, end_ns, preempted_ns, asleep_ns, preempted_before_ns)
         if self._estimates:
             stage.learn(service_ns)
         if self.ladder is not None and not frame.skips:

@@ -9,7 +9,7 @@ core are one unit to the scheduler, whose share trilane.hw_profiles.application 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import Any, Final, NamedTuple
@@ -18,7 +18,6 @@ from trilane.scheduler.causes import Drop, Loss
 from trilane.scheduler.events import NEVER, Graph, Job
 from trilane.scheduler.frame_times import FrameTimes, Lateness
 from trilane.scheduler.samples import Samples, Sketch
-from trilane.scheduler.stats import NS_PER_MS
 
 ASSIGNED: Final = 0
 STARVED: Final = 1
@@ -29,7 +28,8 @@ THROTTLED: Final = 3
 class JobRecord(NamedTuple):
     """One finished job. Times in ns of the run's clock; `ready` is when its input was there.
 
-    `preempted_ns`, `asleep_ns`, `preempted_before_ns`: as in `JobDone`.
+    `preempted_ns`, `asleep_ns`, `preempted_before_ns`: as in `JobDone`. `cpu_ns`: CPU time of all its unit's threads in
+    the job; 0 in journals of before it was kept; on the virtual clock its service time.
     """
 
     stage: str
@@ -42,6 +42,7 @@ class JobRecord(NamedTuple):
     preempted_ns: int = 0
     asleep_ns: int = 0
     preempted_before_ns: int = 0
+    cpu_ns: int = 0
 
 
 class _UnitBook:
@@ -100,8 +101,6 @@ class _StageBook:
     def __init__(self, sketch: Callable[[], Sketch] | None) -> None:
         self.service = Samples(sketch)
         self.wait = Samples(sketch)
-        self.on_core_ns = 0  # of the service times, without the time in which another thread had the core
-        self.skips = self.skipping_ns = 0  # jobs whose frame took the bypass, and the same of these
 
 
 class Ledger:
@@ -152,17 +151,9 @@ class Ledger:
         preempted_ns: int = 0,
         asleep_ns: int = 0,
         preempted_before_ns: int = 0,
-        skips: bool = False,
     ) -> None:
-        """Book a job that has ended: `ready_ns` is when its input was there, the rest is as in `JobDone`.
-
-        `skips`: its frame takes the bypass.
-        """
+        """Book a job that has ended: `ready_ns` is when its input was there, the rest is as in `JobDone`."""
         stage = self._stages[job.stage]
-        stage.on_core_ns += end_ns - begin_ns - preempted_ns
-        if skips:
-            stage.skips += 1
-            stage.skipping_ns += end_ns - begin_ns - preempted_ns
         stage.service.add(end_ns - begin_ns)
         stage.wait.add(begin_ns - ready_ns)
         self._units[job.unit].add_job(begin_ns, end_ns, preempted_ns, asleep_ns, preempted_before_ns)
@@ -235,15 +226,8 @@ class Ledger:
         samples = [*[book.service for book in books], *[book.wait for book in books], self._latency]
         return self._frame_times.samples.is_exact and all([each.is_exact for each in samples])
 
-    def report(
-        self,
-        *,
-        clock: str,
-        requested: int,
-        isolated_ns: Mapping[str, float] | None = None,
-    ) -> dict[str, Any]:
-        """The keys of report.json. `isolated_ns`: mean service time of each stage measured isolated; efficiency is null
-        without it."""
+    def report(self, *, clock: str, requested: int) -> dict[str, Any]:
+        """The keys of report.json."""
         intervals, span_ns = max(self.presented_count - 1, 0), self._last_ns - self._first_ns
         return {
             "clock": clock,
@@ -268,34 +252,9 @@ class Ledger:
             },
             "stages": {stage.name: self._stage_row(stage.name, stage.unit) for stage in self._graph.stages},
             "units": {unit: book.shares() for unit, book in self._units.items()},
-            **self._efficiency(isolated_ns, span_ns / intervals if intervals else 0.0),
         }
 
     def _stage_row(self, name: str, unit: str) -> dict[str, Any]:
         book = self._stages[name]
         times = {"service_ms": book.service.summary_ms(), "wait_ms": book.wait.summary_ms()}
         return {"unit": unit, "jobs": book.service.count, **times}
-
-    def _efficiency(self, isolated_ns: Mapping[str, float] | None, interval_ns: float) -> dict[str, Any]:
-        """Isolated service time of the slowest unit over the mean interval between presented frames.
-
-        A stage that was not measured isolated (it writes files) counts with its mean in the run, without the time in
-        which another thread had its core; so do, of frames that took the bypass, their jobs, which are none of the
-        stages that it skips.
-        """
-        if not isolated_ns or not interval_ns:
-            return {"efficiency": None, "isolated_ms": {}}
-        per_unit: dict[str, float] = dict.fromkeys(self._units, 0.0)
-        share = self.skipped / self.presented_count
-        for stage in self._graph.stages:
-            book = self._stages[stage.name]
-            isolated = isolated_ns.get(stage.name)
-            if isolated is None:
-                per_unit[stage.unit] += book.on_core_ns / max(book.service.count, 1)
-            else:
-                per_unit[stage.unit] += (1 - share) * isolated + share * book.skipping_ns / max(book.skips, 1)
-        return {
-            "efficiency": max(per_unit.values()) / interval_ns,
-            "bottleneck": max(per_unit, key=per_unit.__getitem__),
-            "isolated_ms": {name: ns / NS_PER_MS for name, ns in isolated_ns.items()},
-        }

@@ -60,7 +60,7 @@ class Recording:
         for unit in core.units.values():
             if self._account_of.get(unit.name) != unit.account:
                 self._account_of[unit.name] = unit.account
-                self.accounts.append((now_ns, unit.name, unit.account))
+                self.accounts.append((unit.account_ns, unit.name, unit.account))
 
     def write(self, path: Path) -> None:
         """As JSON lines (`header_line`, `step_line`)."""

@@ -23,11 +23,12 @@ class UnitState:
     `queue`: the running job, then the one dispatched ahead. `queue_capacity`: how many jobs it may hold now, see
     `update_queue_capacity`. `head_since_ns`: since when the running job could run. `hold_until_ns`: the end of the
     pause that its duty asks for. `failures`: how often it died since it last ended a job. `account`: where the ledger
-    books its time now.
+    books its time now, and `account_ns`: since when.
     """
 
     __slots__ = (
         "account",
+        "account_ns",
         "deadline_ns",
         "duty",
         "failures",
@@ -52,6 +53,7 @@ class UnitState:
         self.failures = 0
         self.duty = FULL_DUTY
         self.account = STARVED
+        self.account_ns = 0
 
     @property
     def is_ready(self) -> bool:

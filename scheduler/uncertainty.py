@@ -32,12 +32,26 @@ def mean_interval(values: Sequence[float], mean: float | None = None) -> tuple[f
     batches = min(len(values) // LEAST_FRAMES, MOST_BATCHES)
     if batches < LEAST_BATCHES:
         return None
+    mean = fmean(values) if mean is None else mean
+    half = _half_width(values, batches)
+    return (mean - half, mean + half) if half < mean else None
+
+
+def batch_interval(values: Sequence[float]) -> float | None:
+    """Half the width of the 95 % interval of a mean, from its `values` over equal batches of LEAST_FRAMES and more.
+
+    None for fewer than LEAST_BATCHES; of more than MOST_BATCHES neighbours are put together.
+    """
+    batches = min(len(values), MOST_BATCHES)
+    return _half_width(values, batches) if batches >= LEAST_BATCHES else None
+
+
+def _half_width(values: Sequence[float], batches: int) -> float:
+    """Student's t over the means of so many batches; the first values, which fill none, do not count."""
     length = len(values) // batches
     first = len(values) - batches * length
     means = [fmean(values[first + batch * length : first + (batch + 1) * length]) for batch in range(batches)]
-    mean = fmean(values) if mean is None else mean
-    half = T_975[batches - 1] * stdev(means) / sqrt(batches)
-    return (mean - half, mean + half) if half < mean else None
+    return T_975[batches - 1] * stdev(means) / sqrt(batches)
 
 
 def frame_interval_ms(interval_ns: tuple[float, float] | None) -> dict[str, float | None]:

@@ -6,7 +6,7 @@ The units are queues of jobs whose service times a callable gives; everything el
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from heapq import heappop, heappush
 from typing import Any, Final
@@ -174,7 +174,8 @@ class VirtualDriver:
         heappush(self._heap, (end_ns + self._message_delay_ns, EVENT, self._sequence, done, unit.epoch))
         if self.recording is not None:
             ready_ns = self.core.frames[frame].ready_ns
-            self._begun[job_id] = JobRecord(stage, name, frame, ready_ns, now_ns, begin_ns, end_ns)
+            times = (ready_ns, now_ns, begin_ns, end_ns, 0, 0, 0, end_ns - begin_ns)
+            self._begun[job_id] = JobRecord(stage, name, frame, *times)
 
     def _start(self, now_ns: int, action: Start) -> None:
         unit = self._units[action.unit]
@@ -188,17 +189,16 @@ def simulate(
     service: Service,
     *,
     target_period_ns: int = 0,
-    isolated_ns: Mapping[str, float] | None = None,
     keep: bool = False,
     **driver: Any,
 ) -> Simulation:
     """Run to the end.
 
     `graph`, `settings`, `service`, `keep`, `driver`: see VirtualDriver.
-    `target_period_ns`: see `trilane.scheduler.ledger.Books`. `isolated_ns`: see Ledger.report.
+    `target_period_ns`: see `trilane.scheduler.ledger.Books`.
     Raises ValueError for an unknown policy or edge, RuntimeError when nothing can ever happen again.
     """
     virtual = VirtualDriver(graph, settings, service, keep=keep, books=Books(target_period_ns), **driver)
     outcome = virtual.run()
-    report = virtual.core.ledger.report(clock="virtual", requested=settings.frames, isolated_ns=isolated_ns)
+    report = virtual.core.ledger.report(clock="virtual", requested=settings.frames)
     return Simulation(report, virtual.recording, tuple(virtual.jobs), outcome)

@@ -34,7 +34,7 @@ from trilane.units import BEFORE_INFER, UNITS
 
 #: Shorter runs do not gain what a rehearsal takes.
 LEAST_FRAMES = 100
-CACHE, TRIAL_CACHE = "placement-1", "placement-trial-1"
+CACHE, TRIAL_CACHE = "placement-2", "placement-trial-2"
 MOST_LOGICAL, MOST_CORES = 8, 16
 FIRST = BEFORE_INFER[0][1]
 SEQUENTIAL = "sequential"

@@ -23,7 +23,7 @@ from trilane.stages.config import RunConfig
 from trilane.stages.configure import Checked
 from trilane.units import UNITS
 
-FRAMES = 5  # of the scene, evenly spread, that each unit does alone
+FRAMES = 12  # of the scene, evenly spread, the first two of which warm up
 
 
 def thread_counts(cores: int, rule: Placement) -> dict[str, list[int]]:

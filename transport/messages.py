@@ -42,16 +42,6 @@ class RunJob(NamedTuple):
     rung: int = 0
 
 
-class RunIsolated(NamedTuple):
-    """To a unit: run one of its stages by itself and answer with `Duration`. Fields as in `RunJob`."""
-
-    stage: int
-    frame: int
-    slot_in: int
-    slot_out: int
-    rung: int = 0
-
-
 class Ping(NamedTuple):
     """To a unit that has no job: answer with `Pong`."""
 
@@ -89,16 +79,10 @@ class Done(NamedTuple):
     metrics: dict[str, float]
 
 
-class Duration(NamedTuple):
-    """From a unit: the answer to `RunIsolated`: how long the stage took, in ns."""
-
-    value: int
-
-
 class Failed(NamedTuple):
     """From a unit: something raised an error.
 
-    `id`: of the job, or BUILDING, MEASURING or CLOSING when it was none. `exit_code`: that the error asks the program
+    `id`: of the job, or BUILDING or CLOSING when it was none. `exit_code`: that the error asks the program
     to end with. `message`: for people, at most MAX_TEXT bytes.
     """
 
@@ -116,12 +100,12 @@ class Closed(NamedTuple):
 
 
 Heartbeat = Ready | Pong
-Message = RunJob | RunIsolated | Ping | Close | Ready | Done | Duration | Failed | Pong | Closed
-#: `Failed.id` of an error outside a job: while stages were built, in `RunIsolated`, while stages were closed.
-BUILDING, MEASURING, CLOSING = -1, -2, -3
+Message = RunJob | Ping | Close | Ready | Done | Failed | Pong | Closed
+#: `Failed.id` of an error outside a job: while stages were built, while they were closed.
+BUILDING, CLOSING = -1, -2
 
 #: A message's place here is its first byte.
-_KINDS: tuple[Any, ...] = (RunJob, RunIsolated, Ping, Close, Ready, Done, Duration, Failed, Pong, Closed)
+_KINDS: tuple[Any, ...] = (RunJob, Ping, Close, Ready, Done, Failed, Pong, Closed)
 _PACKER = msgpack.Packer()  # one for the process: making one costs more than packing
 
 

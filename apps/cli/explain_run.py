@@ -105,6 +105,12 @@ def _head(document: Mapping[str, Any]) -> Iterator[str]:
     mean = "fewer than two frames: no frame time" if frame_ms is None else f"{frame_ms:.2f} ms a frame"
     scene = f"scene {document['scene']}, " if document["scene"] else ""
     yield f"Run {document['run']}: {scene}policy {document['policy']}, {document['frames']} frames, {mean}"
+    if frame_ms and document["nobodys_ms"] >= LEAST_SHARE * frame_ms:
+        yield (
+            f"other programs: {document['nobodys_ms']:.1f} of {frame_ms:.1f} ms a frame were nobody's of this run: a "
+            "stage on the path had no core, and no job of this run had it"
+        )
+    yield from _efficiency(document)
     if document["failure"]:
         yield f"the run failed: {document['failure']}"
     for name, facts in document["accuracy"].items():
@@ -113,6 +119,27 @@ def _head(document: Mapping[str, Any]) -> Iterator[str]:
             yield f"avatar {name}: PSNR on held-out views, dB: {bands} ({facts['source']})"
         else:
             yield f"avatar {name}: {facts.get('source', 'no figures')} of accuracy"
+
+
+def _efficiency(document: Mapping[str, Any]) -> Iterator[str]:
+    """What bounded the run, and what all cores did."""
+    if bound := document.get("bound"):
+        named = [f"{part['name']} {_share(part)}" for part in (bound["unit"], bound["stage"]) if part]
+        yield f"bound: {', and of stages most '.join(named)}" if len(named) > 1 else f"bound: {named[0]}"
+    if document["cores"]:
+        numbers, efficiency = ",".join(map(str, document["cores"]["numbers"])), document["machine_efficiency"]
+        cpu_ms, had_ms = document["cores"]["cpu_ms"], document["cores"]["had_ms"]
+        yield (
+            f"cores {numbers}: jobs had {cpu_ms:.2f} of {had_ms:.2f} ms of CPU time a frame, {efficiency:.0%}; the "
+            f"fullest {document['core_efficiency']:.0%}; the slowest unit {document['efficiency']:.0%}"
+        )
+
+
+def _share(part: Mapping[str, Any]) -> str:
+    """Of the path, with its interval."""
+    if part["share_low"] is None:
+        return f"{part['share']:.0%} of the path"
+    return f"{part['share']:.0%} of the path ({part['share_low']:.0%} to {part['share_high']:.0%})"
 
 
 def _budget(document: Mapping[str, Any]) -> Table:
@@ -146,9 +173,9 @@ def _shared(rows: list[dict[str, Any]]) -> Iterator[str]:
             continue
         lead = f"{row['stage']}: {row['preempted_ms']:.2f} of {row['service_ms']:.2f} ms a job without a core"
         found = [
-            f"{ms:.2f} ms of it jobs of {unit} had it: {row['unit']} and {unit} share core"
-            f"{'s' if len(row['shared'][unit]) > 1 else ''} {','.join(map(str, row['shared'][unit]))}"
-            for unit, ms in row["taken_ms"].items()
+            f"{ms:.2f} ms of it {other} had it, on core"
+            f"{'s' if len(row['shared'][other]) > 1 else ''} {','.join(map(str, row['shared'][other]))}"
+            for other, ms in row["taken_ms"].items()
         ]
         found.append(f"{row['others_ms']:.2f} ms nobody of this run")
         yield f"{lead}; {'; '.join(found)}"

@@ -18,7 +18,15 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from trilane.apps.report import Baseline, Check, FrameErrors, Made, PaceComparison, Report
-    from trilane.pipeline.run_metrics import Caps, MovedBytes, StageTimes, Temperature, TimeSummary, UnitShares
+    from trilane.pipeline.run_metrics import (
+        Caps,
+        MovedBytes,
+        PathShare,
+        StageTimes,
+        Temperature,
+        TimeSummary,
+        UnitShares,
+    )
 
     #: Name of a row, what it measures, and a cell for each run.
     Rows = Iterator[tuple[str, str, list[str]]]
@@ -240,10 +248,22 @@ def _of_several(run: Report | Baseline, value: float) -> float | None:
 def _rate_rows(runs: Sequence[Report | Baseline]) -> Rows:
     rates = [f"{_number(_of_several(run, run.fps))} ({_between(run.fps_low, run.fps_high)})" for run in runs]
     yield "rate", "frames per second", rates
-    yield "efficiency", "slowest unit isolated / frame time", [_number(run.efficiency, 2) for run in runs]
+    yield "efficiency", "slowest unit's work / frame time", [_number(run.efficiency, 2) for run in runs]
     yield "", "busiest core's work / frame time", [_number(run.core_efficiency, 2) for run in runs]
+    yield "", "all work / time of all cores", [_number(run.machine_efficiency, 2) for run in runs]
+    units, stages = ([getattr(run.bound, kind, None) for run in runs] for kind in ("unit", "stage"))
+    yield "bound", "unit, % of the path (95 % interval)", [_part_of_path(part) for part in units]
+    yield "", "stage, % of the path (95 % interval)", [_part_of_path(part) for part in stages]
     yield "frames", "lost + dropped", [f"{run.frames.lost} + {sum(run.frames.dropped.values())}" for run in runs]
     yield "", "deadline misses", [str(run.deadline_misses) for run in runs]
+
+
+def _part_of_path(part: PathShare | None) -> str:
+    if part is None:
+        return DASH
+    if part.share_low is None or part.share_high is None:
+        return f"{part.name} {_percent(part.share)}"
+    return f"{part.name} {_percent(part.share)} ({_percent(part.share_low)} to {_percent(part.share_high)})"
 
 
 def _number(value: float | None, digits: int = 1) -> str:

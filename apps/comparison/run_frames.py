@@ -115,7 +115,7 @@ class _Story:
         elif isinstance(record, Stepped):
             self._step(record)
         elif isinstance(record, Accounted):
-            self._cutter.account(record.unit, record.account)
+            self._cutter.account(*record)
         elif isinstance(record, Worked):
             self._work(record)
         elif isinstance(record, Counted):

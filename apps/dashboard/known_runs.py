@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from trilane.apps.dashboard.run_facts import RunFacts
 from trilane.apps.report import Report, config_facts, read_report
@@ -32,6 +32,10 @@ def machine_line(machine: Mapping[str, Any]) -> str:
     cores = f"{len(cpu['cores_allowed'])} of {cpu['cores']} cores"
     drawn = f", {driver['renderer']}" if driver else ""
     return f"{cpu['model']}, {cores}{drawn}"
+
+
+#: Of a report: how well a run used its cores, and what bounded it.
+BOUND: Final = ("bottleneck", "bound", "efficiency", "core_efficiency", "machine_efficiency")
 
 
 def facts_of_checked(name: str, checked: Checked, plan: Plan, machine: Mapping[str, Any]) -> RunFacts:
@@ -69,6 +73,7 @@ def facts_of_report(name: str, report: Report) -> RunFacts:
         {**document["plan"], "notes": document["notes"]},
         document.get("placement"),
         document["accuracy"],
+        {key: document.get(key) for key in BOUND} if report.bound is not None else None,
     )
 
 

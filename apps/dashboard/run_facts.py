@@ -15,7 +15,8 @@ class RunFacts:
     """`name` of the run folder; `scene`; `clock`: host or virtual; `machine`: a line for people.
 
     `fps`, `output` (width, height): of the scene. `config`: the value in force of each control.
-    `plan`, `placement`, `accuracy`: as in report.json, and `notes` beside the plan.
+    `plan`, `placement`, `accuracy`: as in report.json, and `notes` beside the plan. `bound`: of a run that is over, as
+    there, with its efficiencies.
     """
 
     name: str
@@ -28,6 +29,7 @@ class RunFacts:
     plan: Mapping[str, Any]
     placement: Mapping[str, Any] | None
     accuracy: Mapping[str, Any]
+    bound: Mapping[str, Any] | None = None
 
     @classmethod
     def of_row(cls, row: Mapping[str, Any]) -> RunFacts:
@@ -48,5 +50,5 @@ class RunFacts:
 
     def state(self, state: str, why: str = "") -> dict[str, Any]:
         """The message that says what the run does, and under what configuration."""
-        facts = {"plan": self.plan, "placement": self.placement, "accuracy": self.accuracy}
+        facts = {"plan": self.plan, "placement": self.placement, "accuracy": self.accuracy, "bound": self.bound}
         return {"type": "state", "is": state, "why": why, "config": self.config, **facts}

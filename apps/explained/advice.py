@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from trilane.apps.explained.path import ASLEEP, RELEASE, WORK
-from trilane.apps.explained.waits import DOWN, HELD, LOST, OVERHEAD, PREEMPTED, THROTTLED
+from trilane.pipeline.critical_path import ASLEEP, RELEASE, TAKEN, WORK
+from trilane.pipeline.waits import DOWN, HELD, LOST, OVERHEAD, PREEMPTED, THROTTLED
 
 #: Of the frame time; what bounds less of it is not worth an attempt.
 LEAST_SHARE: Final = 0.1
@@ -16,7 +16,7 @@ MOST: Final = 4
 SHORTER = {
     "pose": "`--skinning gpu` takes the vertices off the CPU; `trilane explain SCENE` says what a scene models",
     "raster": "a smaller `--size` draws fewer texels",
-    "infer": "a smaller `--size`, another `--runtime`, or more cores for it (`--cores dsp=0,1`)",
+    "infer": "a smaller `--size`, or another `--runtime`",
     "composite": "a smaller `--output`",
     "present": "a smaller `--output`: the picture is encoded there",
 }
@@ -31,31 +31,34 @@ OF_CAUSES = {
 }
 
 
-def advice(budget: Sequence[Mapping[str, Any]], shared: Sequence[Mapping[str, Any]], policy: str) -> list[str]:
-    """Sentences, the most promising first.
+def advice(budget: Sequence[Mapping[str, Any]], policy: str, spare_cores: int) -> list[str]:
+    """Sentences: first what other programs took, then the most promising.
 
-    `budget`: rows of the document. `shared`: its rows of shared cores. `policy`: of the run.
+    `budget`: rows of the document. `policy`: of the run. `spare_cores`: of this machine beyond one for each unit.
     """
     found = []
-    taken = {row["stage"]: row for row in shared}
     works = [row for row in budget if row["what"] == WORK]
     if policy == "sequential" and len(works) > 1:
         found.append("one frame is worked on at a time: `--policy pipelined` lets the units work at once")
-    for row in budget:
-        if row["share"] < LEAST_SHARE:
-            continue
-        found.append(f"{row['ms']:.1f} ms a frame, {row['stage']} ({row['what']}): {_try(row, taken)}")
+    nobodys = [row for row in budget if row["what"] == PREEMPTED]
+    if sum(row["share"] for row in nobodys) >= LEAST_SHARE:
+        found.append(
+            f"{sum(row['ms'] for row in nobodys):.1f} ms a frame, {', '.join(row['stage'] for row in nobodys)} "
+            f"({PREEMPTED}): no job of this run had the core: end other programs; threads that spin take it too"
+        )
+    found += [
+        f"{row['ms']:.1f} ms a frame, {row['stage']} ({row['what']}): {_try(row, spare_cores)}"
+        for row in budget
+        if row["share"] >= LEAST_SHARE and row["what"] != PREEMPTED
+    ]
     return found[:MOST]
 
 
-def _try(row: Mapping[str, Any], taken: Mapping[str, Mapping[str, Any]]) -> str:
+def _try(row: Mapping[str, Any], spare_cores: int) -> str:
     stage, unit = row["stage"], row["unit"]
-    if row["what"] == WORK:
-        return SHORTER.get(stage, f"shorter work of {stage}, or a unit of its own for it")
-    if row["what"] == PREEMPTED:
-        shared = taken.get(stage, {"taken_ms": {}, "others_ms": 0.0})
-        units = [other for other, ms in shared["taken_ms"].items() if ms]
-        if units and sum(shared["taken_ms"].values()) >= shared["others_ms"]:
-            return f"{unit} and {', '.join(units)} share a core: `--cores` gives them cores of their own"
-        return "mostly no job of this run had the core: end other programs; threads that spin between jobs take it too"
+    if row["what"] == TAKEN and spare_cores >= 0:
+        return f"this machine has a core for every unit: `--cores` gives {unit} one of its own"
+    if row["what"] in (WORK, TAKEN):
+        more_cores = ", or more cores for it (`--cores dsp=...`)" if stage == "infer" and spare_cores > 0 else ""
+        return SHORTER.get(stage, f"shorter work of {stage}, or a unit of its own for it") + more_cores
     return OF_CAUSES.get(row["what"], "nothing: it is before what is known").format(stage=stage, unit=unit)

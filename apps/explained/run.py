@@ -11,14 +11,16 @@ from pathlib import Path
 from typing import Any
 
 from trilane.apps.explained.advice import advice
-from trilane.apps.explained.path import WHATS, Budget, Part, Paths
-from trilane.apps.explained.sharing import Sharing, Taken
 from trilane.apps.explained.slow_frames import MOST_SAMPLES, Shown, SlowFrames, Usual, notes, reasons
-from trilane.apps.explained.waits import ExplainedJob, Waits
 from trilane.apps.report import Report, read_report
 from trilane.errors import BadInputError
 from trilane.figure_sources import COMPUTED, MEASURED
+from trilane.pipeline.critical_path import WHATS, Part
 from trilane.pipeline.journal import NAME, Begun, Record, journal_in, read_journal
+from trilane.pipeline.reckoning import Reckoning
+from trilane.pipeline.sharing import Taken
+from trilane.pipeline.waits import PREEMPTED, ExplainedJob, Waits
+from trilane.scheduler.places import Place
 from trilane.scheduler.stats import NS_PER_MS
 
 SCHEMA = 1
@@ -56,44 +58,37 @@ class Explanation:
     """
 
     def __init__(self, begun: Begun, report: Report | None, slowest: int) -> None:
-        config = _config(begun)
-        cores = {unit: own["cores"] for unit, own in config.get("units", {}).items() if own.get("cores")}
-        self._begun, self._report, self._cores = begun, report, cores
-        self._explainer = Waits(begun.graph)
-        self._paths = Paths(begun.graph, begun.settings, self._explainer.downs)
-        self._sharing = Sharing(cores)
-        self._slow = SlowFrames(begun.graph, self._paths, self._sharing, slowest)
-        self._budget = Budget(self._paths)
+        self._begun, self._report, self._places = begun, report, _places(begun)
+        self._reckoning = Reckoning(begun.graph, begun.settings, self._places)
+        self._slow = SlowFrames(begun.graph, self._reckoning.paths, self._reckoning.sharing, slowest)
         self._waits: dict[str, dict[str, int]] = {stage.name: {} for stage in begun.graph.stages}
         self._jobs = dict.fromkeys(self._waits, 0)
         self._frames, self._first_ns, self._last_ns = 0, 0, 0
 
     def add(self, record: Record) -> None:
         """The next record."""
-        if explained := self._explainer.add(record):
+        if explained := self._reckoning.add(record):
             self._count(explained)
 
     def _count(self, explained: ExplainedJob) -> None:
         job = explained.job
-        self._paths.add(explained)
-        self._sharing.add(job)
         self._slow.add(explained)
         self._jobs[job.stage] += 1
         sums = self._waits[job.stage]
         for cause, ns in explained.waits_ns.items():
             sums[cause] = sums.get(cause, 0) + ns
-        if self._paths.is_presented(explained):
-            self._budget.present(explained)
+        if self._reckoning.paths.is_presented(explained):
             self._frames += 1
             self._first_ns, self._last_ns = self._first_ns or job.end_ns, job.end_ns
 
     def document(self) -> dict[str, Any]:
         """After the last job: the keys of `trilane explain RUN --json`."""
-        budget, taken = self._budget.close(), self._sharing.close()
+        budget, taken, figures = self._reckoning.close()
         slowest, usual = self._slow.close()
         unit_of = {stage.name: stage.unit for stage in self._begun.graph.stages}
         intervals = max(self._frames - 1, 1)
         clock = str(self._begun.facts.get("clock", HOST))
+        frame_ms = (self._last_ns - self._first_ns) / intervals / NS_PER_MS if self._frames > 1 else None
         rows = _budget_rows(budget, unit_of, intervals)
         shared = [self._shared(stage, row) for stage, row in taken.items() if row.preempted_ns]
         return {
@@ -101,7 +96,10 @@ class Explanation:
             "clock": clock,
             **self._of_run(),
             "frames": self._frames,
-            "frame_ms": (self._last_ns - self._first_ns) / intervals / NS_PER_MS if self._frames > 1 else None,
+            "frame_ms": frame_ms,
+            **figures,
+            "cores": self._of_cores(frame_ms, figures["machine_efficiency"]),
+            "nobodys_ms": sum(row["ms"] for row in rows if row["what"] == PREEMPTED),
             "budget": rows,
             "shared_cores": shared,
             "waits": [_wait_row(name, unit_of[name], self._jobs[name], self._waits[name]) for name in self._waits],
@@ -110,10 +108,11 @@ class Explanation:
                 "service_ms": {name: ns / NS_PER_MS for name, ns in usual.service_ns.items()},
             },
             "slowest": [_slow_row(shown, usual) for shown in slowest],
-            "advice": advice(rows, shared, self._begun.settings.policy),
+            "advice": advice(rows, self._begun.settings.policy, self._spare_cores(unit_of)),
             "sources": {
                 "frames, waits_ms, service_ms, preempted_ms": MEASURED if clock == HOST else COMPUTED,
-                "budget": "the same times along the path that ends with the last frame",
+                "efficiency, core_efficiency, machine_efficiency, cores": "CPU time of the run's own jobs",
+                "budget, bound": "the same times along the path that ends with the last frame",
                 "taken_ms": "computed: whose jobs ran then on the same cores",
                 "usual": f"medians of all frames, of at most {MOST_SAMPLES} evenly spaced ones in a long run",
             },
@@ -133,17 +132,31 @@ class Explanation:
 
     def _shared(self, stage: str, taken: Taken) -> dict[str, Any]:
         per_job = taken.jobs * NS_PER_MS
-        cores = self._cores.get(taken.unit, ())
+        unit_of = {each.name: each.unit for each in self._begun.graph.stages}
+        cores = self._places[taken.unit].cores if taken.unit in self._places else ()
         return {
             "stage": stage,
             "unit": taken.unit,
             "cores": list(cores),
             "service_ms": taken.service_ns / per_job,
             "preempted_ms": taken.preempted_ns / per_job,
-            "taken_ms": {unit: ns / per_job for unit, ns in taken.of.items()},
-            "shared": {unit: sorted(set(cores) & set(self._cores[unit])) for unit in taken.of},
+            "taken_ms": {other: ns / per_job for other, ns in taken.of.items()},
+            "shared": {other: sorted(set(cores) & set(self._places[unit_of[other]].cores)) for other in taken.of},
             "others_ms": taken.other_ns / per_job,
         }
+
+    def _of_cores(self, frame_ms: float | None, efficiency: float | None) -> dict[str, Any] | None:
+        """CPU time of all jobs for a frame beside what the run's cores had; None where one of them is not known."""
+        cores = sorted({core for place in self._places.values() for core in place.cores})
+        if frame_ms is None or efficiency is None or not cores or len(self._places) < len(self._begun.graph.units):
+            return None
+        had_ms = len(cores) * frame_ms
+        return {"numbers": cores, "cpu_ms": efficiency * had_ms, "had_ms": had_ms}
+
+    def _spare_cores(self, unit_of: Mapping[str, str]) -> int:
+        """How many cores the run might have used beyond one for each unit; negative: units must share."""
+        cpu = self._begun.facts.get("machine", {}).get("cpu", {})
+        return len(cpu.get("cores_allowed", ())) - len(set(unit_of.values()))
 
 
 def explain_run(folder: Path, slowest: int = 10) -> dict[str, Any]:
@@ -157,6 +170,16 @@ def explain_run(folder: Path, slowest: int = 10) -> dict[str, Any]:
     for record in records:
         explanation.add(record)
     return {"run": str(folder), **explanation.document()}
+
+
+def _places(begun: Begun) -> dict[str, Place]:
+    """Cores and threads of each unit, as far as the journal's head knows them."""
+    units = _config(begun).get("units", {})
+    return {
+        unit: Place(tuple(own["cores"]), own.get("threads", 1))
+        for unit, own in units.items()
+        if unit in begun.graph.units and own.get("cores")
+    }
 
 
 def _config(begun: Begun) -> Mapping[str, Any]:

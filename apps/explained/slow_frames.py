@@ -12,16 +12,17 @@ from heapq import heappush, heappushpop
 from statistics import median
 from typing import Final, Generic, NamedTuple, TypeVar
 
-from trilane.apps.explained.path import (
+from trilane.pipeline.critical_path import (
     ASLEEP,
     RELEASE,
+    TAKEN,
     WORK,
     Part,
     Paths,
     parts,
 )
-from trilane.apps.explained.sharing import Sharing
-from trilane.apps.explained.waits import DOWN, HELD, LOST, OVERHEAD, PREEMPTED, THROTTLED, ExplainedJob
+from trilane.pipeline.sharing import Sharing
+from trilane.pipeline.waits import DOWN, HELD, LOST, OVERHEAD, PREEMPTED, THROTTLED, ExplainedJob
 from trilane.scheduler.events import Graph
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.stats import NS_PER_MS
@@ -42,7 +43,6 @@ class Shown(NamedTuple):
     `frame_ns`: since then. `latency_ns`: from its sampled pose to the end of the stage that the pipeline names, None
     where that is not kept.
     `parts_ns`: of its frame time. `longest`: of each part, the job that most of it belongs to.
-    `taken_ns`: of each of these jobs that had no core for a while, by unit whose jobs had it.
     `rung`, `skips`: of its work, and whether it took the bypass; `rung_before`, `skipped_before`: of the frame before.
     """
 
@@ -53,7 +53,6 @@ class Shown(NamedTuple):
     latency_ns: int | None
     parts_ns: Mapping[Part, int]
     longest: Mapping[Part, JobRecord]
-    taken_ns: Mapping[Part, Mapping[str, int]]
     rung: int
     rung_before: int
     skips: bool
@@ -150,7 +149,7 @@ class SlowFrames:
         sums: dict[Part, int] = {}
         longest: dict[Part, tuple[int, JobRecord]] = {}
         for piece in self._paths.walk(shown, begin_ns):
-            for part, ns in parts(piece, begin_ns, end_ns).items():
+            for part, ns in parts(piece, begin_ns, end_ns, self._sharing).items():
                 sums[part] = sums.get(part, 0) + ns
                 if ns > longest.get(part, (0, piece.job))[0]:
                     longest[part] = (ns, piece.job)
@@ -164,7 +163,6 @@ class SlowFrames:
         self, shown: ExplainedJob, begin_ns: int, sums: Mapping[Part, int], jobs: Mapping[Part, JobRecord]
     ) -> Shown:
         (before, rung_before, skipped_before), (frame, rung, skips) = self._facts
-        taken = {part: self._sharing.taken(job) for part, job in jobs.items() if part[0] == PREEMPTED}
         return Shown(
             frame,
             shown.job.end_ns,
@@ -173,7 +171,6 @@ class SlowFrames:
             self._latency_ns(frame),
             sums,
             jobs,
-            taken,
             rung,
             rung_before,
             skips,
@@ -241,7 +238,9 @@ def _text(shown: Shown, usual: Usual, part: Part, longer_ns: float) -> str:
     if what == WORK:
         return _work(shown, usual, job, longer_ns)
     if what == PREEMPTED:
-        return f"{stage}{whose}: {unit} had no core{_whose_core(shown, part)}"
+        return f"{stage}{whose}: {unit} had no core, and no job of this run had it"
+    if what == TAKEN:
+        return f"{job.stage}{whose}: {stage} had its core"
     words = {
         ASLEEP: f"{stage}{whose} slept in its job",
         OVERHEAD: f"{stage}{whose} was handed over late",
@@ -264,13 +263,3 @@ def _work(shown: Shown, usual: Usual, job: JobRecord, longer_ns: float) -> str:
     if whose:
         return f"it waited for {job.stage}{whose} ({times})"
     return f"less of its {job.stage} overlapped with the frame before ({times})"
-
-
-def _whose_core(shown: Shown, part: Part) -> str:
-    """Which units of the run had the core."""
-    taken = {unit: ns for unit, ns in shown.taken_ns.get(part, {}).items() if ns}
-    if not taken:
-        return ": no job of this run had it"
-    of_ms = max(shown.longest[part].preempted_ns, sum(taken.values())) / NS_PER_MS
-    said = ", ".join(f"jobs of {unit} had it for {ns / NS_PER_MS:.1f}" for unit, ns in taken.items())
-    return f": {said} of {of_ms:.1f} ms"

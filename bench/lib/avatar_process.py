@@ -88,7 +88,7 @@ def serve(pipe: Connection, asked: Asked) -> None:
             policy = pipe.recv()
             with tempfile.TemporaryDirectory(prefix="trilane-bench-") as folder:
                 placed = checked.changed(out_dir=Path(folder))
-                result = run_avatar(placed.config, placed.assets, policy=policy, edge=asked.edge, isolated_frames=0)
+                result = run_avatar(placed.config, placed.assets, policy=policy, edge=asked.edge)
             if result.failure is not None:
                 pipe.send(result.failure.message)
                 return

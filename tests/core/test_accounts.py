@@ -13,6 +13,8 @@ from trilane.apps.tracing.writer import write_trace
 from trilane.bench.accounts import measure, virtual_run
 from trilane.errors import BadInputError
 from trilane.pipeline.journal import journal_of
+from trilane.pipeline.reckoning import records_of
+from trilane.pipeline.waits import Waits
 from trilane.scheduler.accounts import LARGEST_DIFFERENCE, compared, second_accounts
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import (
@@ -215,6 +217,30 @@ def test_what_a_unit_waited_for_a_core_before_it_had_a_job_is_not_preempted() ->
         (15 * MS, (done[1],)),
     ]
     assert parts(fed(Settings(2, asked=True), steps, jobs), "u") == (4 + 3, 6, 0, 0, 2, 0)
+
+
+def test_a_frame_that_is_released_late_is_overhead_since_it_was_due() -> None:
+    """A frame every 10 ms. The second is due at 10 and the scheduler looks at 13; the third comes in time, at 20."""
+    spans = [(0, 2), (13, 15), (20, 21)]
+    done = [JobDone("u", n, begin * MS, end * MS, 0) for n, (begin, end) in enumerate(spans)]
+    due = [0, 10, 20]
+    jobs = [JobRecord("a", "u", n, due[n] * MS, b * MS, b * MS, e * MS) for n, (b, e) in enumerate(spans)]
+    steps: list[tuple[int, tuple[Event, ...]]] = [
+        (0, (UnitReady("u"),)),
+        (2 * MS, (done[0],)),
+        (13 * MS, ()),
+        (15 * MS, (done[1],)),
+        (20 * MS, ()),
+        (21 * MS, (done[2],)),
+    ]
+    settings = Settings(3, period_ns=10 * MS)
+    assert parts(fed(settings, steps, jobs), "u") == (2 + 2 + 1, 8 + 5, 0, 0, 0, 3)
+    graph = chain((("a", "u"),), "single", "a")
+    core, recording, waits = Core(graph, settings), Recording(graph, settings), Waits(graph)
+    for now_ns, events in steps:
+        recording.add(now_ns, events, core.step(now_ns, events).actions, core)
+    explained = [one for record in records_of(recording, jobs) if (one := waits.add(record))]
+    assert [dict(one.waits_ns) for one in explained] == [{}, {"overhead": 3 * MS}, {}]
 
 
 def test_what_a_unit_lost_is_booked_under_its_causes() -> None:

@@ -72,7 +72,7 @@ def test_a_run_on_the_host_is_asked_as_it_was_drawn(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(accounts, "run_pipeline", run_pipeline)
     reports = [accounts.host_run(random.Random(f"4 {run}"), 9, "starter") for run in range(12)]  # type: ignore[arg-type]
     for (drawn, frames), options in asked:
-        assert (frames, options["starter"], options["isolated_frames"]) == (9, "starter", 0)
+        assert (frames, options["starter"]) == (9, "starter")
         assert {s.unit for s in drawn.stages if s.settings["device"]} == reports.pop(0)["devices"]
     policies = list(accounts.POLICIES)
     held("asked", [[policies.index(o["policy"]), o["fps"], o["pace_fps"] or 0] for _, o in asked])

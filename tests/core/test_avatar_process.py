@@ -87,10 +87,7 @@ def test_the_process_runs_under_each_policy_until_its_pipe_closes(runs: list[Any
     request = configure.Request(avatar="default", size="64x64", frames=20, runtime="ort")
     assert runs == [
         (request, Path.cwd()),
-        *(
-            (True, True, "assets", {"policy": policy, "edge": "latest", "isolated_frames": 0})
-            for policy in ("sequential", "pipelined")
-        ),
+        *((True, True, "assets", {"policy": policy, "edge": "latest"}) for policy in ("sequential", "pipelined")),
     ]
 
 

@@ -6,7 +6,8 @@ import re
 import signal
 from collections.abc import Callable, Iterator
 from itertools import count
-from typing import Any, ClassVar
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -302,12 +303,15 @@ def test_idle_between_jobs_by_hand() -> None:
 
 
 def test_runs_are_compared_with_the_sequential_ones_before_and_after() -> None:
-    """Sequential frames of 30 and 34 ms, hops 2 and 4: gain 32 / 16 = 2, bound (20 + 3) / 10, of the bound 2 / 2.3."""
-    base = {"frame_ms": 30.0, "hops_ms": 2.0, "all_alone_ms": 21.0, "alone_ms": 10.0}
-    row = {"frame_ms": 16.0, "hops_ms": None, "all_alone_ms": 20.0, "alone_ms": 10.0}
-    pipeline_bench._compare([base, row], {"frame_ms": 34.0, "hops_ms": 4.0})
+    """Sequential frames of 30 and 34 ms, hops 2 and 4, in which b takes 9 and 11 and a 10: gain 32 / 16 = 2, bound
+    (20 + 3) / 10, of the bound 2 / 2.3. The sequential run beside itself alone: 19 and 2 over 10."""
+    base = {"frame_ms": 30.0, "hops_ms": 2.0, "units_ms": {"a": 10.0, "b": 9.0}}
+    row = {"frame_ms": 16.0, "hops_ms": None, "units_ms": {"a": 12.0, "b": 9.0}}
+    after = {"frame_ms": 34.0, "hops_ms": 4.0, "units_ms": {"a": 10.0, "b": 11.0}}
+    pipeline_bench._compare([base, row], after)
     assert (row["gain"], row["bound"], row["gain_of_bound"]) == pytest.approx((2.0, 2.3, 2 / 2.3))
-    assert (base["gain"], base["bound"]) == pytest.approx((1.0, 2.3))
+    assert (row["slowest"], row["alone_ms"], row["all_alone_ms"], row["in_run_over_alone"]) == ("a", 10, 20, 1.2)
+    assert (base["gain"], base["bound"]) == pytest.approx((1.0, 2.1))
 
 
 def test_a_row_is_medians_sums_and_the_commonest_name() -> None:
@@ -369,14 +373,17 @@ def stage(unit: str, mean: float) -> StageTimes:
     return StageTimes(unit=unit, service_ms=times, wait_ms=times)
 
 
-def test_a_units_isolated_time_has_its_last_stage_as_in_the_run() -> None:
-    class Metrics:
-        units: ClassVar = {"cpu": None, "gpu": None}
-        stages: ClassVar = {"pose": stage("cpu", 3.0), "raster": stage("gpu", 5.0), "present": stage("cpu", 2.0)}
-        isolated_ms: ClassVar = {"pose": 2.5, "raster": 4.0}
+def test_what_a_unit_takes_is_without_the_time_in_which_it_had_no_core() -> None:
+    """Two poses of 3 ms in the mean, of which one lacked its core for 2 ms."""
 
-    assert pipeline_bench._isolated_ms(Metrics) == {"cpu": 4.5, "gpu": 4.0}  # type: ignore[arg-type]
-    assert pipeline_bench._in_run_ms(Metrics, "cpu") == 5.0  # type: ignore[arg-type]
+    class Result:
+        report = SimpleNamespace(
+            units={"cpu": None, "gpu": None},
+            stages={"pose": stage("cpu", 3.0), "raster": stage("gpu", 5.0), "present": stage("cpu", 2.0)},
+        )
+        jobs = tuple(JobRecord("pose", "cpu", n, 0, 0, 0, 9, preempted_ns=n * 2_000_000) for n in range(2))
+
+    assert pipeline_bench._units_ms(Result) == {"cpu": 4.0, "gpu": 5.0}  # type: ignore[arg-type]
 
 
 def test_the_pace_is_back_with_five_frames_within_a_fifth_more() -> None:

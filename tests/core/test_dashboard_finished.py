@@ -16,6 +16,7 @@ import pytest
 from PIL import Image
 
 from trilane.apps.dashboard.time_table import PIECE_ROWS, TimeTable
+from trilane.apps.report import Report
 from trilane.errors import BadInputError
 from trilane.pipeline.journal import NAME, Ended, JournalWriter, journal_of
 from trilane.scheduler.events import Settings, chain
@@ -26,7 +27,9 @@ pytest.importorskip("prometheus_client", reason="the extra dashboard is not inst
 
 from trilane.apps.dashboard.clients import Client
 from trilane.apps.dashboard.finished_view import CUT_OFF, MOST_JOBS, NO_VIDEO, FinishedView
+from trilane.apps.dashboard.known_runs import facts_of_report
 from trilane.apps.dashboard.wire import ControlSaid, Seek
+from trilane.testing.run_report import make_report
 
 MS = 1_000_000
 FRAMES, FPS = 40, 30.0
@@ -80,6 +83,18 @@ def test_it_says_what_it_is(view: FinishedView) -> None:
     assert hello["span_ms"] == [0.0, 10.0 + 20 * FRAMES + 5.0]
     assert state["is"] == "ended"
     assert json.dumps(list(view.greeting()))
+
+
+def test_what_bounded_it_is_that_of_its_report(view: FinishedView) -> None:
+    """Without a report, as of a run that was killed, nothing is said of it."""
+    assert [*view.greeting()][1]["bound"] is None
+    document = make_report(notes=[])
+    document["config"]["edge"] = "double"
+    document["config"]["scene"] |= {"fps": 30.0, "avatars": [{"bundle": "someone"}]}
+    said = facts_of_report("n", Report.model_validate(document)).state("ended")["bound"]
+    assert said == {
+        key: document[key] for key in ("bottleneck", "bound", "efficiency", "core_efficiency", "machine_efficiency")
+    }
 
 
 def test_a_moment_has_the_slices_that_are_known(view: FinishedView) -> None:

@@ -8,10 +8,10 @@ from itertools import pairwise
 
 import pytest
 
-from trilane.apps.explained.path import MARGIN, Budget, Paths, Piece, parts
-from trilane.apps.explained.sharing import Sharing
-from trilane.apps.explained.waits import ExplainedJob, Waits
+from trilane.pipeline.critical_path import MARGIN, Budget, Paths, Piece, parts
 from trilane.pipeline.journal import journal_of
+from trilane.pipeline.sharing import Sharing
+from trilane.pipeline.waits import ExplainedJob, Waits
 from trilane.scheduler.events import Graph, Settings, chain
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.virtual import Simulation, simulate
@@ -190,9 +190,10 @@ def test_units_that_share_a_core_are_named_in_proportion_to_what_they_did() -> N
     sharing.add(JobRecord("infer", "dsp", 0, 0, 0, 80, 140))
     sharing.add(JobRecord("draw", "gpu", 0, 0, 0, 100, 200))  # on another core
     sharing.add(pose)
-    assert sharing.taken(pose) == {"dsp": 40}
+    assert sharing.taken("cpu", 100, 200, 60) == {"infer": 40}
+    assert sharing.taken("cpu", 120, 130, 10) == {"infer": 10}
     row = sharing.close()["pose"]
-    assert (row.jobs, row.service_ns, row.preempted_ns, row.of, row.other_ns) == (1, 100, 60, {"dsp": 40}, 20)
+    assert (row.jobs, row.service_ns, row.preempted_ns, row.of, row.other_ns) == (1, 100, 60, {"infer": 40}, 20)
 
 
 def test_no_more_is_taken_than_the_job_lacked() -> None:
@@ -203,7 +204,7 @@ def test_no_more_is_taken_than_the_job_lacked() -> None:
     sharing.add(infer)
     sharing.add(JobRecord("draw", "gpu", 0, 0, 0, 100, 200, preempted_ns=50))
     taken = sharing.close()["infer"]
-    assert (taken.of, taken.other_ns) == ({"cpu": 26, "gpu": 13}, 1)
+    assert (taken.of, taken.other_ns) == ({"pose": 26, "draw": 13}, 1)
 
 
 def test_without_known_cores_nobody_is_named() -> None:

@@ -6,8 +6,8 @@ import random
 
 import pytest
 
-from trilane.apps.explained.waits import Down, ExplainedJob, Waits
 from trilane.pipeline.journal import Accounted, Record, Stepped, Worked, journal_of
+from trilane.pipeline.waits import Down, ExplainedJob, Waits
 from trilane.scheduler.events import (
     Dispatch,
     Graph,

@@ -155,7 +155,7 @@ def test_what_a_run_leaves_behind_is_counted(monkeypatch: pytest.MonkeyPatch) ->
     row = faults.run_under(signals, "pipeline", 50, 12.5, 1.5, "assets")  # type: ignore[arg-type]
     assert row["left"] == 3 and row["requested"] == 50
     assert signals.over.is_set() and not signals.is_alive()
-    options = {"pace_fps": 12.5, "assets": "assets", "isolated_frames": 0, "hang_ns": 1_500_000_000}
+    options = {"pace_fps": 12.5, "assets": "assets", "hang_ns": 1_500_000_000}
     assert asked == [(("pipeline", 50), options)]
 
     def interrupted(*_: Any, **__: Any) -> Any:

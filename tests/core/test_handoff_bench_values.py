@@ -297,7 +297,7 @@ def test_a_run_is_read_from_the_readers_jobs(monkeypatch: pytest.MonkeyPatch) ->
     assert handoff._through_pipeline(256, 2) == ([2.0, 5.0], [7.0, 7.0])
     (((pipeline, frames), options),) = asked
     assert [edge.payload_bytes for edge in pipeline.edges] == [0, 256 * 1024, 0]
-    assert (frames, options) == (2, {"policy": "sequential", "isolated_frames": 0})
+    assert (frames, options) == (2, {"policy": "sequential"})
     with pytest.raises(TrilaneError, match="the run with 256 KiB failed: frames were lost"):
         handoff._through_pipeline(256, 3)
     result.failure = "it broke"

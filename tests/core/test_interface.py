@@ -197,10 +197,20 @@ def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
         trilane.load_run(tmp_path)
 
 
+BOUND = "dsp 82% of the path, infer 44% of the path"
+
+
 def test_a_notebook_shows_the_error_beside_the_speed_and_nothing_unescaped(folder: Path) -> None:
     report = read_report(folder)
     shown = trilane.load_run(folder)._repr_html_()
-    for part in ("20.00 ms", "50.0 frames a second", "PSNR face 31.2 dB", "validation of 2026-01-02", "a processor"):
+    for part in (
+        "20.00 ms",
+        "50.0 frames a second",
+        "PSNR face 31.2 dB",
+        "validation of 2026-01-02",
+        "a processor",
+        BOUND,
+    ):
         assert part in shown
     named = report.model_copy(update={"accuracy": {"<script>": {"why": "<b>&"}}, "failure": "<i>"})
     spoilt = run_html(named, "<u>")

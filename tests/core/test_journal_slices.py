@@ -8,12 +8,25 @@ from pathlib import Path
 
 import pytest
 
-from trilane.pipeline.journal import Begun, Counted, Ended, JournalWriter, Record, Stepped, Worked, journal_of
-from trilane.pipeline.journal_slices import JournalSlices, shares_of_journal
+from trilane.pipeline.journal import (
+    Begun,
+    Counted,
+    Ended,
+    JournalWriter,
+    Record,
+    Stepped,
+    Worked,
+    journal_of,
+    read_journal,
+)
+from trilane.pipeline.journal_slices import JournalSlices
+from trilane.pipeline.journal_values import RunValues
+from trilane.pipeline.reckoning import reckoned
 from trilane.scheduler.accounts import UNEXPLAINED, IdleCutter, IdleSlice, Span, compared, idle_slices
 from trilane.scheduler.events import Settings, UnitReady, chain
-from trilane.scheduler.ledger import ASSIGNED
+from trilane.scheduler.ledger import ASSIGNED, JobRecord
 from trilane.scheduler.virtual import Simulation, simulate
+from trilane.unexpected_value import UnexpectedValue
 
 MS = 1_000_000
 TWO = chain((("a", "u"), ("b", "v")), "double", "b")
@@ -88,10 +101,11 @@ def test_a_journal_has_the_second_accounts_of_the_run_in_memory(tmp_path: Path) 
     with JournalWriter(tmp_path / "j") as journal:
         for record in records(done):
             journal.add(record)
-    assert compared(done.report["units"], shares_of_journal(tmp_path / "j"))["largest_difference"] < 1e-12
-    with JournalWriter(tmp_path / "begun") as journal:
-        journal.add(next(records(done)))
-    assert shares_of_journal(tmp_path / "begun") == {}
+    begun, *rest = read_journal(tmp_path / "j")
+    assert isinstance(begun, Begun)
+    shares, _ = reckoned(begun.graph, begun.settings, {}, rest)
+    assert compared(done.report["units"], shares)["largest_difference"] < 1e-12
+    assert reckoned(begun.graph, begun.settings, {}, [])[0] == {}
 
 
 def test_a_run_in_memory_as_a_journal() -> None:
@@ -127,6 +141,14 @@ def test_time_that_nobody_explains_has_its_own_name() -> None:
     """A unit that is up and has no job, whose account says that it has one."""
     cutter = IdleCutter(chain((("a", "u"),), "single", "a"))
     assert cutter.step(5, (UnitReady("u"),), ()) == []
-    cutter.account("u", ASSIGNED)
+    cutter.account(5, "u", ASSIGNED)
     cutter.step(9, (), ())
     assert cutter.end() == [IdleSlice("u", UNEXPLAINED, 5, 9)]
+
+
+def test_a_journal_of_before_jobs_had_their_cpu_time_is_read() -> None:
+    row = ("a", "u", 3, 1, 2, 3, 9, 0, 1, 0)
+    assert RunValues(TWO).job(row) == JobRecord(*row, cpu_ns=0)
+    assert RunValues(TWO).job((*row, 4)).cpu_ns == 4
+    with pytest.raises(UnexpectedValue, match="texts and whole numbers"):
+        RunValues(TWO).job(row[:-1])

@@ -58,9 +58,7 @@ def test_a_literal_is_read_as_it_is_imported() -> None:
 
 def test_what_follows_from_one_another() -> None:
     """A unit that is asked at each ping is heard of before the scheduler takes itself for stopped."""
-    from trilane.pipeline import fork_server, isolated, realtime_clock
-    from trilane.transport import job_pipe
+    from trilane.pipeline import fork_server, realtime_clock
 
     assert realtime_clock.LONGEST_STEP_NS > realtime_clock.PING_NS
-    assert isolated.AT_ONCE == job_pipe.PACKETS - 4 == 12
     assert tuple(f"{name}_NUM_THREADS" for name in ("OMP", "OPENBLAS", "MKL", "NUMEXPR")) == fork_server.THREAD_LIMITS

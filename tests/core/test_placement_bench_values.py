@@ -143,7 +143,7 @@ def test_a_run_that_shows_too_few_frames_ends_the_bench(monkeypatch: pytest.Monk
     with pytest.raises(TrilaneError, match=r"^cpu 0, gpu 1, dsp 0: 19 frames were presented$"):
         trial._run(A)
     assert trial._run(A) == 7
-    options = {"policy": "pipelined", "edge": "double", "isolated_frames": 4, "starter": "starter"}
+    options = {"policy": "pipelined", "edge": "double", "starter": "starter"}
     assert asked == [({"of": A}, "assets", options)] * 4
 
 

@@ -92,11 +92,11 @@ def test_what_is_measured_is_kept_and_the_best_of_those_tried_is_taken(monkeypat
     found = placing.placed(asked(), "pipelined", "starter", "a driver", said.append)  # type: ignore[arg-type]
     names = [placing.described(where) for where in (B, RULE, A)]
     assert told.asked == [
-        ("placement-1", KEY),
+        ("placement-2", KEY),
         ("measured", CORES, RULE, "starter"),
         ("ranked", list(CORES), TIMES, Rules("cpu", False), {}),
         ("choice", [0, 1], [B, RULE, A], "starter"),
-        ("placement-trial-1", [*KEY, NOON, *names]),
+        ("placement-trial-2", [*KEY, NOON, *names]),
     ]
     assert said == [placing.MEASURING]
     facts: Any = found.placement

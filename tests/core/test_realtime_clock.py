@@ -296,7 +296,7 @@ def test_every_job_that_ended_is_booked_with_its_times_and_figures(monkeypatch: 
     released = world.core.frames[0].ready_ns
     world.inbox = [[("gpu", Done(0, START + 1, START + 9, START + 2, 3, 2, 1, 0, 4, 99, {"area": 3.0}))]]
     clock.wait(START)
-    job = JobRecord("draw", "gpu", 0, released, START, START + 1, START + 9, 3, 2, 1)
+    job = JobRecord("draw", "gpu", 0, released, START, START + 1, START + 9, 3, 2, 1, 4)
     assert clock.ended() == [Worked(job, {"area": 3.0})]
     del world.core.frames[1]
     world.inbox = [[("gpu", Done(1, START + 12, START + 20, 0, 0, 0, 0, 0, 16, 5, {"area": 4.0, "new": 1.0}))]]

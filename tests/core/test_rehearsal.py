@@ -9,30 +9,35 @@ import pytest
 
 from trilane.hw_profiles.placement_facts import described, placement_of, predictions, unit_rows
 from trilane.pipeline import rehearsal
-from trilane.pipeline.rehearsal import _in_proportion, _Rehearsal
+from trilane.pipeline.rehearsal import Chain, on_rungs, works_of
 from trilane.pipeline.run_log import UnitError
+from trilane.scheduler.events import StageAlone, chain
 from trilane.scheduler.placement import Ranked
 from trilane.scheduler.places import Core, Place, Work
 from trilane.stages.placing import MEASURED, _reason, considered, thread_counts, times_rows
 from trilane.transport.messages import Done, Pong, RunJob
 
 STAGES = (("pose", "cpu"), ("raster", "gpu"), ("infer", "dsp"), ("present", "cpu"))
+GRAPH = chain(STAGES, "double", "present")
 PIPELINE: Any = SimpleNamespace(
-    stages=[SimpleNamespace(name=name, unit=unit) for name, unit in STAGES],
     units={"cpu": SimpleNamespace(threads=1), "gpu": SimpleNamespace(threads=1), "dsp": SimpleNamespace(threads=2)},
     stages_of=lambda unit: [SimpleNamespace(name=name) for name, of in STAGES if of == unit],
 )
-#: Microseconds of a job: by stage, and one more with each job that the rehearsal asks for, the first of which is 1.
+#: Microseconds of a job: by stage, and what is told of its frame and rung beside.
 BASE_US = {"pose": 1000, "raster": 2000, "infer": 4000, "present": 3000}
 
 
 class Units:
-    """Answers each job: 100 us of its time were another's, and the threads' CPU time is `cpu` of the rest."""
+    """Answers each job: 100 us of its time were another's, and the threads' CPU time is `cpu` of the rest.
+
+    `more_us`: of a stage, frame and rung.
+    """
 
     def __init__(self, cpu: float = 0.5) -> None:
         self.places = {name: place for place, (name, _) in enumerate(STAGES)}
         self.jobs: list[tuple[str, RunJob]] = []
         self.cpu = cpu
+        self.more_us: dict[tuple[str, int, int], int] = {}
 
     def send(self, unit: str, job: RunJob) -> None:
         assert STAGES[job.stage][1] == unit and job.id == len(self.jobs) + 1
@@ -40,12 +45,17 @@ class Units:
 
     def answers(self, *_: object) -> list[Any]:
         name, job = self.jobs[-1]
-        own_ns = 1000 * (BASE_US[name] + job.id)
+        own_ns = 1000 * (BASE_US[name] + self.more_us.get((name, job.frame, job.rung), 0))
         unit, cpu_ns = STAGES[job.stage][1], int(self.cpu * own_ns)
         times = {"preempted_ns": 100_000, "asleep_ns": 0, "preempted_before_ns": 0, "skips": 0}
         own = {"t_begin_ns": 5, "t_end_ns": 5 + own_ns + 100_000, "t_sampled_ns": 5, "metrics": {}}
         done = Done(id=job.id, cpu_ns=cpu_ns, cpu_before_ns=0, **own, **times)
         return [("gpu" if unit != "gpu" else "cpu", done._replace(t_end_ns=5)), (unit, Pong()), (unit, done)]
+
+    def chain(self, *, whole: bool = True) -> Chain:
+        processes: Any = dict.fromkeys(("cpu", "gpu", "dsp"), self)
+        nobody: Any = SimpleNamespace(count=0)
+        return Chain(GRAPH, processes, nobody, whole=whole)
 
 
 @pytest.fixture
@@ -55,61 +65,87 @@ def units(monkeypatch: pytest.MonkeyPatch) -> Units:
     return units
 
 
-def test_a_frame_goes_through_every_stage_and_then_each_unit_works_alone(units: Units) -> None:
-    """Jobs 1 to 4 are the chain. The CPU unit's rounds are the jobs 5 6, 7 8, 9 10, 11 12, of which the first warms up:
-    the shortest pose is job 7, the shortest present job 8. The GPU unit's are 13 to 16, the DSP's 17 to 20."""
-    works, last = _Rehearsal(PIPELINE, units, SimpleNamespace()).measure([40])  # type: ignore[arg-type]
-    assert last == 40
-    assert [name for name, _ in units.jobs] == [
-        *("pose", "raster", "infer", "present"),
-        *(("pose", "present") * 4),
-        *(("raster",) * 4),
-        *(("infer",) * 4),
+def test_frames_go_through_every_stage_in_order_and_through_the_slots_in_turn(units: Units) -> None:
+    chain = units.chain()
+    for frame in (40, 50, 60):
+        chain.frame(frame)
+    assert [(name, job.frame) for name, job in units.jobs] == [
+        (name, frame) for frame in (40, 50, 60) for name, _ in STAGES
     ]
+    slots = [(job.slot_in, job.slot_out) for _, job in units.jobs]
+    assert slots == [
+        (-1, 0),
+        (0, 0),
+        (0, 0),
+        (0, -1),
+        (-1, 1),
+        (1, 1),
+        (1, 1),
+        (1, -1),
+        (-1, 0),
+        (0, 0),
+        (0, 0),
+        (0, -1),
+    ]
+    assert {(job.epoch, job.fresh, job.rung) for _, job in units.jobs} == {(0, 1, 0)}
+    units.jobs.clear()
+    units.chain(whole=False).frame(7)
+    assert [name for name, _ in units.jobs] == ["pose", "raster", "infer"]
+
+
+def test_works_are_medians_over_the_frames_that_do_not_warm_up(units: Units) -> None:
+    """Of five frames two warm up, however slow; of the others infer takes 10, 70 and 20 us more than its 4000."""
+    units.more_us = {("infer", 0, 0): 9999, ("infer", 1, 0): 9999}
+    units.more_us |= {("infer", 2, 0): 10, ("infer", 3, 0): 70, ("infer", 4, 0): 20}
+    works = works_of(PIPELINE, units.chain(), [0, 1, 2, 3, 4])
     assert works == {
-        "cpu": Work(1_007_000 + 3_008_000, (1_007_000 + 3_008_000) // 2, 2),
-        "gpu": Work(2_014_000, 1_007_000, 1),
-        "dsp": Work(4_018_000, 4_018_000 // 4, 1),  # half of it is CPU time, of two threads
+        "cpu": Work(4_000_000, 2_000_000, 2),
+        "gpu": Work(2_000_000, 1_000_000, 1),
+        "dsp": Work(4_020_000, 4_020_000 // 4, 1),  # half of it is CPU time, of two threads
     }
-    by_name = {name: job for name, job in units.jobs}
-    ends = {name: (job.slot_in, job.slot_out) for name, job in by_name.items()}
-    assert ends == {"pose": (-1, 0), "raster": (0, 0), "infer": (0, 0), "present": (0, -1)}
-    assert {(job.frame, job.epoch, job.fresh) for _, job in units.jobs} == {(40, 0, 1)}
 
 
-def test_works_are_means_over_frames_and_no_frame_is_begun_when_the_time_is_up(
+def test_no_frame_is_begun_when_the_time_is_up_and_warming_up_is_not_part_of_it(
     units: Units, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A second frame's jobs come 20 later, so its work is 20 us more for a stage, 10 in the mean."""
-    rehearsed = _Rehearsal(PIPELINE, units, SimpleNamespace())  # type: ignore[arg-type]
-    works, last = rehearsed.measure([4, 9])
-    assert last == 9
-    assert [works[unit].serial_ns for unit in ("cpu", "gpu", "dsp")] == [4_035_000, 2_024_000, 4_028_000]
-    assert rehearsed.works["gpu", 4].serial_ns == 2_014_000 and rehearsed.works["gpu", 9].serial_ns == 2_034_000
     monkeypatch.setattr(rehearsal, "LIMIT_S", -1.0)
+    works_of(PIPELINE, units.chain(), [0, 1, 2, 3])
+    assert {job.frame for _, job in units.jobs} == {0, 1, 2}
     units.jobs.clear()
-    assert _Rehearsal(PIPELINE, units, SimpleNamespace()).measure([4, 9])[1] == 4  # type: ignore[arg-type]
-    assert len(units.jobs) == 20
+    works_of(PIPELINE, units.chain(), [5])
+    assert {job.frame for _, job in units.jobs} == {5}
 
 
 def test_cpu_time_is_never_more_than_the_time_it_took(units: Units) -> None:
     units.cpu = 3.0
-    works, _ = _Rehearsal(PIPELINE, units, SimpleNamespace()).measure([0])  # type: ignore[arg-type]
-    assert works["gpu"] == Work(2_014_000, 2_014_000, 1)
-    assert works["dsp"] == Work(4_018_000, 4_018_000, 1)  # 3 / 2 of it for each thread
+    works = works_of(PIPELINE, units.chain(), [0])
+    assert works["gpu"] == Work(2_000_000, 2_000_000, 1)
+    assert works["dsp"] == Work(4_000_000, 4_000_000, 1)  # 3 / 2 of it for each thread
+
+
+def test_what_a_stage_takes_on_each_rung_is_its_most_of_the_frames_after_the_first(units: Units) -> None:
+    """infer is followed on two rungs: of frames 4 and 8, 4030 and 4020 us on rung 0, and 3000 and 3500 on rung 1."""
+    units.more_us = {("infer", 0, 0): 9999, ("infer", 4, 0): 30, ("infer", 8, 0): 20}
+    units.more_us |= {("infer", 4, 1): -1000, ("infer", 8, 1): -500}
+    found = on_rungs(units.chain(whole=False), [0, 4, 8], 2, ["infer"])
+    assert found == [StageAlone("infer", 0, 4_030_000), StageAlone("infer", 1, 3_500_000)]
+    assert [(job.frame, job.rung) for name, job in units.jobs if name == "pose"] == [
+        (frame, rung) for frame in (0, 4, 8) for rung in (0, 1)
+    ]
+
+
+def test_nothing_is_said_of_a_stage_that_takes_no_less_on_a_further_rung(units: Units) -> None:
+    """One frame, which counts: pose takes less on the second rung, infer does not."""
+    units.more_us = {("pose", 0, 1): -1}
+    found = on_rungs(units.chain(whole=False), [0], 2, ["infer", "pose"])
+    assert found == [StageAlone("pose", 0, 1_000_000), StageAlone("pose", 1, 999_000)]
 
 
 def test_a_unit_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rehearsal, "listen_before_run", lambda *_: [])
     monkeypatch.setattr(rehearsal, "START_S", 0.0)
     with pytest.raises(UnitError, match=r"^unit cpu did not end a job within 0 s$"):
-        _Rehearsal(PIPELINE, Units(), SimpleNamespace()).measure([0])  # type: ignore[arg-type]
-
-
-def test_other_settings_change_the_mean_as_they_change_one_frame() -> None:
-    """That frame takes 6 where it took 8, and 5 of a core where it took 2: three quarters of 100, and 50 by 5 / 2."""
-    assert _in_proportion(Work(100, 50, 3), Work(8, 2, 3), Work(6, 5, 3)) == Work(75, 125, 3)
-    assert _in_proportion(Work(100, 50, 3), Work(0, 0, 3), Work(6, 5, 3)) == Work(600, 250, 3)
+        Units().chain().frame(0)
 
 
 def test_the_network_is_measured_with_every_number_of_threads_that_it_may_have() -> None:

@@ -35,14 +35,14 @@ def configured(monkeypatch: pytest.MonkeyPatch) -> list[Request]:
 FIGURES = {
     "efficiency": 0.75,
     "slowest": "gpu",
-    "alone_ms": 8.0,
-    "all_alone_ms": 12.5,
+    "alone_ms": 10.0,
+    "all_alone_ms": 15.0,
     "busiest": "gpu",
     "idle": pytest.approx(10 / 50),
     "starved": pytest.approx(4 / 50),
     "undispatched": pytest.approx(3 / 50),
     "overhead": pytest.approx(3 / 50),
-    "in_run_over_alone": 1.25,
+    "in_run_over_alone": 1.0,
     "latency_p50_ms": None,
     "latency_p99_ms": None,
 }
@@ -52,7 +52,7 @@ def test_a_rounds_runs_are_set_against_the_sequential_ones(
     monkeypatch: pytest.MonkeyPatch, configured: list[Request]
 ) -> None:
     """Sequential frames of 20, 22 and 24 ms (hops 5, 7, 9), between them 10 ms pipelined. First round: gain 2.1, bound
-    (12.5 + 6) / 8; second: 2.3 and (12.5 + 8) / 8. No frame of theirs is composited: none has a latency."""
+    (15 + 6) / 10; second: 2.3 and (15 + 8) / 10. No frame of theirs is composited: none has a latency."""
     sequential = iter([20.0, 22.0, 24.0])
     asked: list[dict[str, Any]] = []
 
@@ -74,26 +74,26 @@ def test_a_rounds_runs_are_set_against_the_sequential_ones(
         **setting,
         **{"policy": "sequential", "edge": "double", "fps": (50 + 1000 / 22) / 2, "frame_ms": 21.0, "hops_ms": 6.0},
         **FIGURES,
-        **{"dropped": 10, "lost": 14, "gain": 1.0, "bound": pytest.approx((17.5 + 19.5) / 16)},
-        "gain_of_bound": pytest.approx((8 / 17.5 + 8 / 19.5) / 2),
-        "of_bound_low": pytest.approx(8 / 19.5),
-        "of_bound_high": pytest.approx(8 / 17.5),
+        **{"dropped": 10, "lost": 14, "gain": 1.0, "bound": pytest.approx((20 + 22) / 20)},
+        "gain_of_bound": pytest.approx((10 / 20 + 10 / 22) / 2),
+        "of_bound_low": pytest.approx(10 / 22),
+        "of_bound_high": pytest.approx(10 / 20),
     }
     assert second == {
         **setting,
         **{"policy": "latest", "edge": "orphan", "fps": 100.0, "frame_ms": 10.0, "hops_ms": None},
         **FIGURES,
-        **{"dropped": 10, "lost": 14, "gain": pytest.approx(2.2), "bound": pytest.approx((18.5 + 20.5) / 16)},
-        "gain_of_bound": pytest.approx((2.1 * 8 / 18.5 + 2.3 * 8 / 20.5) / 2),
-        "of_bound_low": pytest.approx(2.3 * 8 / 20.5),
-        "of_bound_high": pytest.approx(2.1 * 8 / 18.5),
+        **{"dropped": 10, "lost": 14, "gain": pytest.approx(2.2), "bound": pytest.approx((21 + 23) / 20)},
+        "gain_of_bound": pytest.approx((2.1 * 10 / 21 + 2.3 * 10 / 23) / 2),
+        "of_bound_low": pytest.approx(2.3 * 10 / 23),
+        "of_bound_high": pytest.approx(2.1 * 10 / 21),
     }
     assert result["accuracy"] == {"x": "accuracy of x"}
     assert result["config"] == {"frames": 30, "rounds": 2, "runtime": "told", "video": False}
     assert configured == [Request(size="64x64", avatar="x", frames=30, runtime="auto")]
     values = {"out_dir": None, "record": False, "units": host_units(cores)}
-    one = {"policy": "sequential", "edge": "double", "pace_fps": None, "isolated_frames": 16}
-    other = {"policy": "latest", "edge": "orphan", "pace_fps": 1.25 * 1000 / 8, "isolated_frames": 16}
+    one = {"policy": "sequential", "edge": "double", "pace_fps": None}
+    other = {"policy": "latest", "edge": "orphan", "pace_fps": 1.25 * 1000 / 10}
     whole = {"assets": "assets of x", "values": values}
     assert asked == [each | whole for each in (one, other, one, other, one)]
 
@@ -241,7 +241,7 @@ def test_a_run_is_asked_on_a_thread_while_it_goes_on(
     row, summary = scenario.run_scenario("pipeline", "assets", load, judge, "latest")  # type: ignore[arg-type]
     assert (row["judge"], summary) == (judge, "its summary" if judge == "loadgen" else "")
     assert (row["p50_ms"], row["queries"], row["max_ms"]) == (1000.0, 1, 1000.0)
-    assert asked == [(("pipeline", 1_000_000), {"policy": "latest", "assets": "assets", "isolated_frames": 0})]
+    assert asked == [(("pipeline", 1_000_000), {"policy": "latest", "assets": "assets"})]
     (player,) = threads
     assert (player.name, player.daemon, player.is_alive()) == ("player", True, False) and hash(player) == id(player)
 

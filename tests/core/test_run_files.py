@@ -271,3 +271,8 @@ def test_every_figure_of_a_report_has_a_source() -> None:
 
 def test_what_a_report_has_not_has_no_source() -> None:
     assert not {"pace", "pace.ratio", "video"} & set(sources_of(make_report()))
+
+
+def test_a_report_with_the_isolated_times_of_an_older_trilane_is_read(tmp_path: Path) -> None:
+    (tmp_path / "report.json").write_text(json.dumps(make_report(isolated_ms={"infer": 4.0})), encoding="utf-8")
+    assert read_report(tmp_path) == Report.model_validate(make_report())

@@ -67,7 +67,7 @@ def a_result(frames: int = FRAMES, policy: str = "pipelined", **changes: Any) ->
     """What a run of so many frames hands back."""
     run = simulate(application_graph(), Settings(frames, policy), lambda stage, *_: STAGE_NS[stage], keep=True)
     assert run.recording is not None
-    report = metrics_of({**run.report, "clock": "host", "policy": policy, "edge": "double", "isolated_ms": {}})
+    report = metrics_of({**run.report, "clock": "host", "policy": policy, "edge": "double"})
     result = RunResult(
         report=report,
         requested=frames,
@@ -202,7 +202,7 @@ def test_what_the_report_says_of_a_run(runs: Callable[..., Runs], tmp_path: Path
     assert document["baseline"]["fps"] == pytest.approx(100.0)
     assert document["sources"] == {
         **dict.fromkeys(("frames", "duration_s", "frame_time_ms", "latency_ms", "fps", "deadline_misses"), MEASURED),
-        **dict.fromkeys(("xrbench", "stages", "units", "isolated_ms", "startup_ms", "figures", "baseline"), MEASURED),
+        **dict.fromkeys(("xrbench", "stages", "units", "startup_ms", "figures", "baseline"), MEASURED),
         **dict.fromkeys(("caps", "temperature_c"), COMPUTED),
         **({"temperature_c.sensor": MEASURED} if document["temperature_c"]["sensor"] is not None else {}),
         "accuracy.someone": "no figures",

@@ -172,7 +172,8 @@ def everything() -> dict[str, Any]:
 
 def least() -> dict[str, Any]:
     """One frame without a baseline, of which nothing more is known than of any."""
-    report = make_report(baseline=None, accuracy={}, core_shares=[], efficiency=None, deadline_misses=4)
+    unmeasured = dict.fromkeys(("efficiency", "core_efficiency", "machine_efficiency", "bottleneck", "bound"))
+    report = make_report(baseline=None, accuracy={}, core_shares=[], deadline_misses=4, **unmeasured)
     report["frames"] = {"requested": 5, "presented": 1, "lost": 2, "lost_by_cause": {"died:gpu": 2}, "dropped": {}}
     idle = {**SHARE["idle"], "preempted": None}
     report["units"] = {"dsp": {**SHARE, "idle": idle}, "cpu": {**SHARE, "cores": [0]}}
@@ -240,7 +241,7 @@ def test_figures_stand_to_the_right_and_words_to_the_left() -> None:
 def test_rows_of_one_kind_stand_together() -> None:
     """A line is drawn below the stages, the units, the cores, the times and the rates."""
     table = run_table(Report.model_validate(make_report()))
-    assert [place for place, row in enumerate(table.rows) if row.end_section] == [0, 1, 2, 14, 19]
+    assert [place for place, row in enumerate(table.rows) if row.end_section] == [0, 1, 2, 14, 22]
 
 
 def test_no_line_of_marks_when_no_percentile_is_marked() -> None:

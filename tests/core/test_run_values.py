@@ -1,4 +1,4 @@
-"""Around a run's loop, beside doubles of its units: what must be so before, start, isolated times, close, settings."""
+"""Around a run's loop, beside doubles of its units: what must be so before, start, close, settings."""
 
 from __future__ import annotations
 
@@ -19,14 +19,12 @@ import pytest
 from trilane import machine
 from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline import (
-    isolated,
     lifecycle,
     preconditions,
     run,
     run_log,
     surroundings,
 )
-from trilane.pipeline.isolated import IsolatedTimes
 from trilane.pipeline.lifecycle import close_units, listen_before_run, start_units
 from trilane.pipeline.requests import FrameRequestQueue
 from trilane.pipeline.result import Failure
@@ -34,17 +32,15 @@ from trilane.pipeline.run_log import RunLog, UnitError, after_stderr
 from trilane.pipeline.signals import Interrupts
 from trilane.pipeline.unit_processes import UnitMessage
 from trilane.scheduler import release
-from trilane.scheduler.events import FrameRequest, Settings, StageAlone, Stop
+from trilane.scheduler.events import FrameRequest, Settings, Stop
 from trilane.testing.small_pipeline import pipeline
 from trilane.testing.told_time import ToldTime
 from trilane.transport.messages import (
     Close,
     Closed,
-    Duration,
     Failed,
     Pong,
     Ready,
-    RunIsolated,
 )
 
 MS = 1_000_000
@@ -241,7 +237,7 @@ def test_units_close_their_files_and_are_waited_for() -> None:
 
 
 def test_a_unit_that_fails_or_ends_while_it_closes_is_said() -> None:
-    _, log = closed([[("left", Failed(-3, 4, "disk full")), ("left", Closed()), ("right", Closed())]])
+    _, log = closed([[("left", Failed(-2, 4, "disk full")), ("left", Closed()), ("right", Closed())]])
     assert (log.failure, log.messages) == (Failure("disk full", 4), ["disk full"])
     _, log = closed([[("left", Closed()), ("right", None)]])
     assert log.failure == Failure("unit right ended before its files were closed; it was right", 1)
@@ -258,85 +254,6 @@ def test_units_that_do_not_close_are_named_unless_somebody_has_lost_patience(mon
     assert log.failure == Failure("unit left, right did not close its files", 1)
     processes, log = closed([], SimpleNamespace(count=2))
     assert (log.failure, processes.told[-1]) == (None, ("wait", ["left", "right"]))
-
-
-def answers(*durations: Sequence[int]) -> list[Any]:
-    return [[("right" if unit else "left", Duration(ns)) for unit, ns in enumerate(row) if ns] for row in durations]
-
-
-def test_each_stage_is_measured_on_its_own_unit_without_the_first_repetition() -> None:
-    """in (left) and mid (right); out is the last and not measured. Per frame: the chain once, then each unit thrice.
-
-    Of frame 4 the repetitions take 90, 10, 14: 90 does not count, the median is 12. Of frame 8: 20.
-    """
-    frame_4 = answers([50, 0], [0, 60], [90, 0], [10, 0], [14, 0], [0, 99], [0, 30], [0, 32])
-    frame_8 = answers([50, 0], [0, 60], [90, 0], [20, 0], [20, 0], [0, 99], [0, 41], [0, 41])
-    processes: Any = FakeProcesses([*frame_4, *frame_8])
-    times = IsolatedTimes(pipeline().graph(), processes, NOBODY)
-    assert times.mean_ns == {}
-    times.measure([4, 8])
-    assert times.mean_ns == {"in": 16, "mid": 36}
-    left, right = ("left", RunIsolated(0, 4, -1, 0)), ("right", RunIsolated(0, 4, 0, 0))
-    assert processes.told[:8] == [left, right, left, left, left, right, right, right]
-    assert len(processes.told) == 16
-
-
-def test_what_a_stage_takes_on_each_rung_is_its_most_of_the_frames() -> None:
-    """in is followed, mid is not. Each frame and rung: in three times, the first of which does not count, and mid once.
-
-    Frame 4: 20 and 9; frame 8: 18 and 10.
-    """
-    rows = [(99, 21, 20), (1, 9, 12), (99, 18, 50), (1, 99, 10)]
-    script = [row for told in rows for row in ([("left", Duration(ns)) for ns in told], [("right", Duration(7))])]
-    processes: Any = FakeProcesses(script)
-    times = IsolatedTimes(pipeline().graph(), processes, NOBODY)
-    assert times.of_rungs([4, 8], 2, ["in"]) == [StageAlone("in", 0, 20), StageAlone("in", 1, 10)]
-    assert processes.told[:8] == [
-        *[("left", RunIsolated(0, 4, -1, 0, 0))] * 3,
-        ("right", RunIsolated(0, 4, 0, 0, 0)),
-        *[("left", RunIsolated(0, 4, -1, 0, 1))] * 3,
-        ("right", RunIsolated(0, 4, 0, 0, 1)),
-    ]
-    assert times.mean_ns == {}
-
-
-def test_nothing_is_said_of_a_stage_that_takes_no_less_on_a_further_rung() -> None:
-    """Three rungs: in takes 20, 10 and 10 ns, mid 9, 8 and 7."""
-    script = []
-    for left, right in ((20, 9), (10, 8), (10, 7)):
-        script += [[("left", Duration(left))] * 3, [("right", Duration(right))] * 3]
-    processes: Any = FakeProcesses(script)
-    times = IsolatedTimes(pipeline().graph(), processes, NOBODY)
-    assert times.of_rungs([0], 3, ["in", "mid"]) == [StageAlone("mid", rung, 9 - rung) for rung in range(3)]
-
-
-def test_a_unit_is_handed_no_more_at_once_than_its_pipe_holds() -> None:
-    assert (isolated.AT_ONCE, isolated.REPEATS, isolated.LIMIT_S) == (12, 2, 10)
-    processes: Any = FakeProcesses([[("left", Duration(1))] * 12, [("right", Duration(5)), ("left", Duration(2))]])
-    times = IsolatedTimes(pipeline().graph(), processes, NOBODY)
-    assert times._durations_ns("left", [0] * 13, 3) == [1] * 12 + [2]
-
-
-def test_measuring_begins_no_frame_after_its_time_and_waits_no_longer_than_for_a_start(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    clock = ToldTime()
-    monkeypatch.setattr(isolated, "time", clock)
-    rows = answers([50, 0], [0, 60], [90, 0], [10, 0], [14, 0], [0, 99], [0, 30], [0, 32])
-    processes: Any = FakeProcesses([*rows, *rows])
-    take = processes.listen
-    processes.listen = lambda ms: clock.sleep(1.5) or take(ms)
-    times = IsolatedTimes(pipeline().graph(), processes, NOBODY)
-    times.measure([4, 8, 9])
-    assert len(processes.script) == 8  # 12 s have passed after the first frame
-    processes.listen = lambda _: clock.sleep(121) or []
-    with pytest.raises(UnitError, match=r"^unit left did not end its jobs within 120 s$"):
-        times.measure([4])
-
-
-@pytest.mark.parametrize(("frames", "count"), [(1, 4), (60, 4), (75, 5), (239, 15), (240, 16), (9000, 16)])
-def test_one_frame_in_fifteen_is_measured_alone(frames: int, count: int) -> None:
-    assert run._isolated_share(frames) == count
 
 
 def test_frames_to_measure_are_spread_over_the_run() -> None:

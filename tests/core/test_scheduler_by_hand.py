@@ -79,7 +79,7 @@ def test_every_job_of_five_frames_is_where_it_was_worked_out() -> None:
 
 def test_the_report_of_five_frames_is_the_one_worked_out() -> None:
     """Presented at 11, 16, 23, 28, 35: intervals of 5, 7, 5, 7. Poses at 1, 4, 13, 18, 25."""
-    report = five_frames(target_period_ns=6 * MS, isolated_ns={"draw": 2.0 * MS}).report
+    report = five_frames(target_period_ns=6 * MS).report
     times = {key: report["frame_time_ms"][key] for key in ("mean", "p50", "max", "jitter")}
     assert times == {"mean": 6, "p50": 6, "max": 7, "jitter": 2}
     assert (report["clock"], report["duration_s"]) == ("virtual", 0.036)
@@ -97,9 +97,6 @@ def test_the_report_of_five_frames_is_the_one_worked_out() -> None:
     assert [(report["units"][unit]["jobs"], report["units"][unit]["restarts"]) for unit in ("gpu", "cpu")] == [
         (5, 0)
     ] * 2
-    # show was not measured alone, so it counts with its 5 ms of the run
-    assert (report["efficiency"], report["bottleneck"]) == (pytest.approx(5 / 6), "cpu")
-    assert report["isolated_ms"] == {"draw": 2}
 
 
 @pytest.mark.parametrize(("target_ms", "misses"), [(4, 4), (5, 2), (6, 2), (7, 0), (0, 0)])
@@ -107,30 +104,9 @@ def test_a_frame_time_above_the_target_is_a_miss_and_one_that_meets_it_is_none(t
     assert five_frames(target_period_ns=target_ms * MS).report["deadline_misses"] == misses
 
 
-def test_efficiency_is_the_slowest_units_time_alone_over_the_frame_time() -> None:
-    report = five_frames(isolated_ns={"draw": 9.0 * MS, "show": 1.0 * MS}).report
-    assert (report["efficiency"], report["bottleneck"]) == (pytest.approx(1.5), "gpu")
-    assert report["isolated_ms"] == {"draw": 9, "show": 1}
-    unmeasured = five_frames().report
-    assert (unmeasured["efficiency"], unmeasured["isolated_ms"], "bottleneck" in unmeasured) == (None, {}, False)
-
-
-def test_waiting_for_a_core_is_no_work_of_a_stage_that_was_not_measured_alone() -> None:
-    """show takes 9 ms each time, but another thread has its core for 5 and 3 of them; a frame every 10 ms."""
-    ledger = Ledger(TWO)
-    for frame, lost_ms in enumerate((5, 3)):
-        end_ns = 10 * (frame + 1) * MS
-        job = Job(frame, "cpu", "show", frame, 0, -1, 0)
-        ledger.job(job, end_ns - 9 * MS, end_ns - 9 * MS, end_ns, preempted_ns=lost_ms * MS)
-        ledger.presented(frame, end_ns, 9 * MS, NEVER)
-    report = ledger.report(clock="host", requested=2, isolated_ns={"draw": 4.0 * MS})
-    assert (report["efficiency"], report["bottleneck"]) == (pytest.approx((4 + 6) / 2 / 10), "cpu")
-    assert report["stages"]["show"]["service_ms"]["mean"] == 9
-
-
 def test_a_run_without_frames_divides_by_nothing() -> None:
-    report = Ledger(TWO).report(clock="virtual", requested=0, isolated_ns={"draw": 1.0})
-    assert (report["fps"], report["xrbench"]["qoe"], report["efficiency"]) == (0, 0, None)
+    report = Ledger(TWO).report(clock="virtual", requested=0)
+    assert (report["fps"], report["xrbench"]["qoe"]) == (0, 0)
     assert report["xrbench"]["real_time"] is None
     assert shares_ms(report["units"]["gpu"], 1) == dict.fromkeys(GPU, 0)
 

@@ -382,9 +382,7 @@ def test_the_fork_server_is_started_alone_with_one_thread_a_library(monkeypatch:
 
 def test_the_report_of_a_run_is_complete_in_order_and_has_no_other_keys() -> None:
     times: Any = {"in": 3, "mid": 5, "out": 2}
-    report = simulate(
-        PIPELINE.graph(), Settings(4), lambda stage, *_: times[stage] * 1_000_000, isolated_ns={"in": 3e6}
-    ).report
+    report = simulate(PIPELINE.graph(), Settings(4), lambda stage, *_: times[stage] * 1_000_000).report
     metrics = metrics_of(report)
     assert metrics.as_json() == report
     assert list(metrics.as_json()) == [key for key in type(metrics).model_fields if key in report]

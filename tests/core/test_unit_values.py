@@ -33,13 +33,11 @@ from trilane.testing.small_pipeline import OWN, STAGES, UNITS, packets, pipeline
 from trilane.transport.messages import (
     Close,
     Closed,
-    Duration,
     Failed,
     MessageError,
     Ping,
     Pong,
     Ready,
-    RunIsolated,
     RunJob,
 )
 from trilane.transport.packets import Packet
@@ -144,27 +142,23 @@ def test_a_unit_answers_every_message_once(monkeypatch: pytest.MonkeyPatch) -> N
         BoundStage("b", second, packets(OWN, 2), [], 1, context()),
     ]
     outputs[0].header["epoch"] = 9
-    alone = RunIsolated(1, 7, 0, -1), RunIsolated(0, 8, -1, 0)
-    link = FakeLink(
-        RunJob(11, 0, 5, -1, 1, 2, LATER_NS, 0), Ping(), RunJob(12, 1, 6, 1, -1, 2, LATER_NS, 0), *alone, Close()
-    )
+    link = FakeLink(RunJob(11, 0, 5, -1, 1, 2, LATER_NS, 0), Ping(), RunJob(12, 1, 6, 1, -1, 2, LATER_NS, 0), Close())
     meters: list[ToldMeter] = []
     monkeypatch.setattr(unit_loop, "CoreMeter", lambda others: meters.append(ToldMeter(others)) or meters[0])
     others = unit_loop._threads() - {os.getpid()}
     before = time.monotonic_ns()
     assert served(monkeypatch, link, stages) == 0
-    one, two, three, four, end = link.sent
+    one, two, end = link.sent
     assert (one.id, two.id, one.metrics) == (11, 12, {"shade": 3.0})
     assert before <= one.t_begin_ns <= one.t_sampled_ns <= one.t_end_ns <= two.t_begin_ns <= two.t_end_ns
     assert (two.t_sampled_ns, end) == (0, Closed())
     wall_ns = one.t_end_ns - one.t_begin_ns  # on one core: 100 ns worked, 2 ns waited for it, the rest slept
     assert one[4:10] == (2, wall_ns - 102, 0, 0, 100, 100)
     assert two[4:10] == (2, 0, 2, 0, 100, 200)  # held to a pace: the chip worked
-    assert [(meter.others, meter.looks) for meter in meters] == [(others, 5)]  # at the start, after a job or the like
-    assert all(isinstance(took, Duration) and 0 <= took.value < time.monotonic_ns() - before for took in (three, four))
+    assert [(meter.others, meter.looks) for meter in meters] == [(others, 3)]  # at the start, after a job
     assert link.beats == [Ready(os.getpid()), Pong()]
-    assert (first.runs, second.runs) == ([(5, None, 1), (8, None, 0)], [(6, 1, None), (7, 0, None)])
-    assert [int(packet.header["epoch"]) for packet in outputs] == [0, 2]
+    assert (first.runs, second.runs) == ([(5, None, 1)], [(6, 1, None)])
+    assert [int(packet.header["epoch"]) for packet in outputs] == [9, 2]
     assert first.closed and second.closed
 
 
@@ -186,11 +180,11 @@ def test_a_stage_that_fails_is_an_answer_in_one_line(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], error: Exception, code: int, said: str
 ) -> None:
     stage = BoundStage("a", FakeStage(error), [], packets(OWN, 1), 0, context())
-    link = FakeLink(RunJob(11, 0, 5, -1, 0, 0, 0, 0), RunIsolated(0, 5, -1, 0), Close())
+    link = FakeLink(RunJob(11, 0, 5, -1, 0, 0, 0, 0), Close())
     assert served(monkeypatch, link, [stage]) == code
-    assert [(answer.id, answer.exit_code) for answer in link.sent[:3]] == [(11, code), (-2, code), (-3, code)]
-    assert all(answer.message.startswith(said) for answer in link.sent[:2])
-    assert link.sent[3:] == [Closed()]
+    assert [(answer.id, answer.exit_code) for answer in link.sent[:2]] == [(11, code), (-2, code)]
+    assert link.sent[0].message.startswith(said)
+    assert link.sent[2:] == [Closed()]
     assert type(error).__name__ in capfd.readouterr().err
 
 
@@ -202,7 +196,7 @@ def test_closing_names_its_stage_and_goes_on(monkeypatch: pytest.MonkeyPatch) ->
     ]
     link = FakeLink(Close())
     assert served(monkeypatch, link, stages) == 1
-    assert link.sent == [Failed(-3, 1, "unit right, closing a: ValueError: x"), Closed()]
+    assert link.sent == [Failed(-2, 1, "unit right, closing a: ValueError: x"), Closed()]
     assert last.closed
 
 

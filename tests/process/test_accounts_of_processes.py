@@ -25,7 +25,7 @@ def run(*, sleep_ms: float = 0.0, device: bool = False) -> RunResult:
         edges=(PipelineEdge(payload_bytes=64),),
         units={"a": unit, "b": unit},
     )
-    return run_pipeline(pipeline, FRAMES, isolated_frames=0)
+    return run_pipeline(pipeline, FRAMES)
 
 
 def test_two_units_that_compute_on_one_core_share_it() -> None:

@@ -27,7 +27,7 @@ BYTES_PER_FRAME = 24
 def test_memory_does_not_grow_with_the_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run_record, "SAMPLE_NS", 1_000_000_000)
     pipeline = doubles(pose=0, raster=0, infer=0, composite=0, present=0)
-    result = run_pipeline(pipeline, FRAMES, isolated_frames=0, journal=JournalFile(tmp_path / "j", {}))
+    result = run_pipeline(pipeline, FRAMES, journal=JournalFile(tmp_path / "j", {}))
     assert (result.presented, result.report.percentiles) == (FRAMES, SKETCHED)
     presented, memory = 0, list[tuple[int, dict[str, float]]]()
     for record in read_journal(tmp_path / "j"):

@@ -82,7 +82,8 @@ def run(arguments: list[str], folder: Path) -> str:
 
 def test_the_file_runs_as_it_stands(module: Path) -> None:
     fps, efficiency, *_ = run([str(module)], module.parent).split()
-    assert float(fps) > 0 and float(efficiency) > 0
+    assert float(fps) > 0
+    assert 0 < float(efficiency) <= 1
     rows = [line.split() for line in (module.parent / "brightness.txt").read_text().splitlines()]
     assert [(int(frame), float(value)) for frame, value in rows] == [(n, 2.0 * (n % 100)) for n in range(200)]
     assert (module.parent / "brightness.pftrace").stat().st_size > 1000

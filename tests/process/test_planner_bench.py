@@ -46,7 +46,7 @@ def small(bundle: Path, folder: Path, policy: str = "pipelined") -> Checked:
 def test_frames_made_here_are_those_that_a_run_presents(drawable_bundle: Path, tmp_path: Path) -> None:
     """To the byte, by the digests that the run's present stage noted; with nobody in view, too."""
     checked = small(drawable_bundle, tmp_path).changed(kept=(1, 4))
-    result = run_avatar(checked.config, checked.assets, isolated_frames=0)
+    result = run_avatar(checked.config, checked.assets)
     assert result.failure is None and result.presented == len(SEEN)
     assert result.report.stages["infer"].jobs == sum(SEEN)
     lines = [line.split() for path in (tmp_path / SEGMENTS).glob("*.sha256") for line in path.read_text().splitlines()]

@@ -58,7 +58,7 @@ def test_a_unit_that_dies_between_skipping_frames_costs_no_more_than_its_jobs(
         pipeline_of_doubles(tmp_path / "log", infer=10, composite=6), "trilane.testing.doubles:build_skipping", BYPASS
     )
     kill, victims = kills(unit)
-    result = run_pipeline(doubles.with_rule(edge), 60, policy=policy, pace_fps=100, isolated_frames=0, on_progress=kill)
+    result = run_pipeline(doubles.with_rule(edge), 60, policy=policy, pace_fps=100, on_progress=kill)
     report, presented = result.report, [int(line) for line in (tmp_path / "log").read_text().split()]
     assert (result.failure, bool(victims), report.units[unit].restarts) == (None, True, 1)
     assert presented == sorted(set(presented)) and len(presented) == result.presented
@@ -81,7 +81,7 @@ def avatar(bundle: Path, folder: Path, position: str, frames: int, *, skips: boo
     pipeline = avatar_pipeline(checked.config, checked.assets, "double")
     if not skips:
         pipeline = with_pose(pipeline, "trilane.testing.full_frames:build", None)
-    return run_pipeline(pipeline, frames, assets=checked.assets, isolated_frames=0, **options)  # type: ignore[arg-type]
+    return run_pipeline(pipeline, frames, assets=checked.assets, **options)  # type: ignore[arg-type]
 
 
 def digests(folder: Path) -> Mapping[int, str]:

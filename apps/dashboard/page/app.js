@@ -163,6 +163,8 @@ function stated(message) {
   if (message.accuracy) accuracy = message.accuracy;
   if ("plan" in message) showFacts(byId("plan"), message.plan);
   if ("placement" in message) showFacts(byId("placement"), message.placement);
+  byId("bound-part").hidden = !message.bound;
+  if (message.bound) showFacts(byId("bound"), message.bound);
 }
 
 function noted(message) {

@@ -57,6 +57,13 @@ def make_report(**changes: Any) -> dict[str, Any]:
         "units": {"dsp": SHARE},
         "core_shares": [{"cores": [2, 3], "units": ["cpu", "gpu"], "cpu": 0.8, "busy": 0.75}],
         "efficiency": 0.91,
+        "core_efficiency": 0.93,
+        "machine_efficiency": 0.84,
+        "bottleneck": "dsp",
+        "bound": {
+            "unit": {"name": "dsp", "share": 0.82, "share_low": 0.78, "share_high": 0.861},
+            "stage": {"name": "infer", "share": 0.44, "share_low": None, "share_high": None},
+        },
     }
     config = {
         "policy": "pipelined",
@@ -74,7 +81,6 @@ def make_report(**changes: Any) -> dict[str, Any]:
         **run,
         "duration_s": 1.0,
         "xrbench": {"real_time": None, "qoe": 1.0, "energy": None},
-        "isolated_ms": {},
         "policy": "pipelined",
         "edge": "double",
         "idle_cores": "wait awake",

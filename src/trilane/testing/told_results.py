@@ -29,7 +29,7 @@ def _times(mean: float) -> SimpleNamespace:
 
 
 def result_of(policy: str, frame_ms: float, **changes: Any) -> SimpleNamespace:
-    """A run of `pose` (2 ms, 1.5 isolated) and `present` (3 ms) on the unit `host`, and `raster` (10 ms, 8 isolated).
+    """A run of `pose` (2 ms) and `present` (3 ms) on the unit `host`, and `raster` (10 ms).
 
     The unit of `raster` is the slowest and the busiest, and is not the last by its name.
     """
@@ -39,7 +39,6 @@ def result_of(policy: str, frame_ms: float, **changes: Any) -> SimpleNamespace:
         fps=1000 / frame_ms,
         efficiency=0.75,
         frame_time_ms=_times(frame_ms),
-        isolated_ms={"pose": 1.5, "raster": 8.0},
         stages={name: SimpleNamespace(unit=unit, service_ms=_times(mean)) for name, (unit, mean) in stage.items()},
         units={"host": SimpleNamespace(busy=0.3, restarts=5), "gpu": SimpleNamespace(busy=0.6, restarts=2)},
     )

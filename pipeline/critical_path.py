@@ -6,15 +6,19 @@ cap, a restart. So the pieces of a path follow each other without gap, and their
 
 Which thing was last is known, not guessed: a job that was handed over while its unit did another waited for that one;
 any other waited for one of the ends that the scheduler heard of in the step in which it handed the job over.
+
+Units that share cores slow each other without bringing each other anything. So time in which a job on the path had no
+core is the time of the stage whose job had it (`Sharing`); what is left of it was no job's of this run.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict, deque
-from collections.abc import Iterator, Reversible
-from typing import Final, NamedTuple
+from collections.abc import Iterator, Mapping, Reversible, Sequence
+from typing import Any, Final, NamedTuple
 
-from trilane.apps.explained.waits import (
+from trilane.pipeline.sharing import Sharing
+from trilane.pipeline.waits import (
     DOWN,
     HELD,
     KEPT,
@@ -29,12 +33,14 @@ from trilane.apps.explained.waits import (
 )
 from trilane.scheduler.events import Graph, Settings
 from trilane.scheduler.ledger import JobRecord
+from trilane.scheduler.uncertainty import LEAST_FRAMES, batch_interval
 
-WORK, ASLEEP, RELEASE = "work", "asleep", "release"
+WORK, TAKEN, ASLEEP, RELEASE = "work", "taken", "asleep", "release"
 #: What a piece of a path can be, and what it means.
 WHATS = {
     WORK: "the stage worked",
-    PREEMPTED: "the stage's unit had the job, but another thread had its core",
+    TAKEN: "the stage worked, on the core that a stage on the path waited for",
+    PREEMPTED: "the stage's unit had the job, but no core: no job of this run had it",
     ASLEEP: "the stage slept in its job, and no device of its own worked for it",
     OVERHEAD: "messages and hand-over before the stage's job",
     THROTTLED: "the unit's cap held the stage's job",
@@ -47,6 +53,11 @@ WHATS = {
 #: Of a gap between two jobs, in the order in which it is divided; the rest is overhead.
 OF_GAPS = (LOST, DOWN, THROTTLED, HELD, PREEMPTED)
 MARGIN: Final = 32  # presented frames after which paths that end with different frames have met
+STEP: Final = 3 * LEAST_FRAMES
+MOST_BLOCKS: Final = 128
+#: Of a piece: its time is the stage's, and its unit's. All other time is called by what it was.
+OF_STAGES = frozenset({WORK, TAKEN, ASLEEP, THROTTLED, LOST, DOWN})
+OTHER_PROGRAMS = "other programs"
 
 
 class Piece(NamedTuple):
@@ -199,40 +210,55 @@ def _clipped(piece: Piece, until_ns: int) -> Iterator[Piece]:
 Part = tuple[str, str]
 
 
-def parts(piece: Piece, begin_ns: int, end_ns: int) -> dict[Part, int]:
+def parts(piece: Piece, begin_ns: int, end_ns: int, sharing: Sharing | None = None) -> dict[Part, int]:
     """The ns of a piece between two times, by what they are and of which stage.
 
     Where in a job it was preempted or asleep is not known: each part of the job has the same share of it.
+    `sharing`: knows who had a core that was lacked; without it nobody of the run had.
     """
     ns = min(piece.end_ns, end_ns) - max(piece.begin_ns, begin_ns)
     if ns <= 0:
         return {}
     job = piece.job
+    if piece.what == PREEMPTED:
+        lacked_ns = piece.end_ns - piece.begin_ns
+        taken = sharing.taken(job.unit, piece.begin_ns, piece.end_ns, lacked_ns) if sharing is not None else {}
+        return _divided_preempted(job.stage, ns, taken, lacked_ns)
     if piece.what != WORK:
         return {(piece.what, piece.stage): ns}
     length_ns = job.end_ns - job.begin_ns
-    preempted_ns = ns * min(job.preempted_ns, length_ns) // length_ns
-    asleep_ns = ns * min(job.asleep_ns, length_ns - min(job.preempted_ns, length_ns)) // length_ns
-    found = {
-        (WORK, job.stage): ns - preempted_ns - asleep_ns,
-        (PREEMPTED, job.stage): preempted_ns,
-        (ASLEEP, job.stage): asleep_ns,
-    }
+    lacked_ns = min(job.preempted_ns, length_ns)
+    preempted_ns = ns * lacked_ns // length_ns
+    asleep_ns = ns * min(job.asleep_ns, length_ns - lacked_ns) // length_ns
+    taken = sharing.taken(job.unit, job.begin_ns, job.end_ns, lacked_ns) if sharing is not None else {}
+    found = {(WORK, job.stage): ns - preempted_ns - asleep_ns, (ASLEEP, job.stage): asleep_ns}
+    found |= _divided_preempted(job.stage, preempted_ns, taken, lacked_ns)
     return {part: ns for part, ns in found.items() if ns}
+
+
+def _divided_preempted(stage: str, ns: int, taken: Mapping[str, int], lacked_ns: int) -> dict[Part, int]:
+    """Of `ns` without a core the part of each stage that had it, as `taken` of `lacked_ns` was, and the rest."""
+    found = {(TAKEN, other): ns * of_other // lacked_ns for other, of_other in taken.items()}
+    left_ns = ns - sum(found.values())
+    return {part: ns for part, ns in (found | {(PREEMPTED, stage): left_ns}).items() if ns}
 
 
 class Budget:
     """What bounded a whole run: the path that ends with its last frame, in time that does not grow with the run.
 
-    A path is walked back from every `step`-th presented frame, but for what lies in the last MARGIN frames before it:
+    A path is walked back from every STEP-th presented frame, but for what lies in the last MARGIN frames before it:
     paths that end with different frames meet. `total_ns` and `ns_of` are of the time from the first presented frame.
+    `sharing`: knows who had a core that was lacked.
     """
 
-    def __init__(self, paths: Paths, step: int = MARGIN) -> None:
-        self._paths, self._step = paths, step
+    def __init__(self, paths: Paths, sharing: Sharing | None = None) -> None:
+        self._paths, self._sharing = paths, sharing
         self._since: deque[int] = deque()
         self._from_ns: int | None = None
         self._newest: ExplainedJob | None = None
+        self._blocks: list[dict[Part, int]] = []  # of equally many frames each, as they follow each other
+        self._merged = 1  # how many were made one
+        self._open: list[dict[Part, int]] = []
         self.ns_of: dict[Part, int] = {}
 
     def present(self, shown: ExplainedJob) -> None:
@@ -240,23 +266,88 @@ class Budget:
         self._newest = shown
         if self._from_ns is None:
             self._from_ns = shown.job.end_ns
-        self._since.append(shown.job.end_ns)
-        if len(self._since) >= MARGIN + self._step:
-            self._cut(self._since[-MARGIN - 1])
-            while len(self._since) > MARGIN:
-                self._since.popleft()
+        else:
+            self._since.append(shown.job.end_ns)
+        if len(self._since) >= MARGIN + STEP:
+            self._cut([self._since.popleft() for _ in range(STEP)][LEAST_FRAMES - 1 :: LEAST_FRAMES])
 
     def close(self) -> dict[Part, int]:
         """After the last frame: ns by what they are and of which stage."""
-        if self._newest is not None:
-            self._cut(self._newest.job.end_ns)
+        if self._newest is not None and self._since:
+            ends_ns = [*self._since][LEAST_FRAMES - 1 :: LEAST_FRAMES]
+            is_whole = len(self._since) % LEAST_FRAMES == 0
+            self._cut(ends_ns if is_whole else [*ends_ns, self._since[-1]], is_whole=is_whole)
+            self._since.clear()
         return self.ns_of
 
-    def _cut(self, until_ns: int) -> None:
-        """Count the path between what is counted already and `until_ns`."""
-        if self._newest is None or self._from_ns is None or until_ns <= self._from_ns:
-            return
+    def bound(self, unit_of: Mapping[str, str]) -> dict[str, Any]:
+        """`bottleneck` and `bound` of a report, after `close`; nothing where there is no path.
+
+        `unit_of`: of each stage. What is no unit's is called by what it was: other programs, release, overhead, held.
+        """
+        stages = {part: part[1] for part in self.ns_of if part[0] in OF_STAGES}
+        if not self.ns_of:
+            return {}
+        names = {PREEMPTED: OTHER_PROGRAMS}
+        units = {part: unit_of[stages[part]] if part in stages else names.get(part[0], part[0]) for part in self.ns_of}
+        unit = self._largest(units)
+        assert unit is not None  # every part has one
+        return {"bottleneck": unit["name"], "bound": {"unit": unit, "stage": self._largest(stages)}}
+
+    def _largest(self, name_of: Mapping[Part, str]) -> dict[str, Any] | None:
+        """The name that most of the path has, its share, and the 95 % interval of that, by its scatter over frames."""
+        sums = _by_name(self.ns_of, name_of)
+        if not sums:
+            return None
+        name = max(sums, key=sums.__getitem__)
+        share = sums[name] / sum(self.ns_of.values())
+        shares = [_by_name(block, name_of).get(name, 0) / max(sum(block.values()), 1) for block in self._blocks]
+        half = batch_interval(shares)
+        low, high = (None, None) if half is None else (max(share - half, 0.0), min(share + half, 1.0))
+        return {"name": name, "share": share, "share_low": low, "share_high": high}
+
+    def _cut(self, ends_ns: Sequence[int], *, is_whole: bool = True) -> None:
+        """Count the path between what is counted already and the last of `ends_ns`, in blocks that end with each.
+
+        `is_whole`: whether the last block has as many frames as the others.
+        """
+        assert self._newest is not None
+        assert self._from_ns is not None
+        bounds = [*zip([self._from_ns, *ends_ns], ends_ns, strict=False)]
+        blocks: list[dict[Part, int]] = [{} for _ in bounds]
         for piece in self._paths.walk(self._newest, self._from_ns):
-            for part, ns in parts(piece, self._from_ns, until_ns).items():
-                self.ns_of[part] = self.ns_of.get(part, 0) + ns
-        self._from_ns = until_ns
+            for block, (begin_ns, end_ns) in zip(blocks, bounds, strict=True):
+                if piece.begin_ns < end_ns and piece.end_ns > begin_ns:
+                    _add(block, parts(piece, begin_ns, end_ns, self._sharing))
+        for block in blocks:
+            _add(self.ns_of, block)
+        self._from_ns = ends_ns[-1]
+        self._open += blocks if is_whole else blocks[:-1]
+        self._keep()
+
+    def _keep(self) -> None:
+        """Blocks that are whole; with too many of them two become one."""
+        while len(self._open) >= self._merged:
+            block: dict[Part, int] = {}
+            for each in self._open[: self._merged]:
+                _add(block, each)
+            del self._open[: self._merged]
+            self._blocks.append(block)
+            if len(self._blocks) == MOST_BLOCKS:
+                for even, odd in zip(self._blocks[::2], self._blocks[1::2], strict=True):
+                    _add(even, odd)
+                self._blocks = self._blocks[::2]
+                self._merged *= 2
+
+
+def _add(sums: dict[Part, int], more: Mapping[Part, int]) -> None:
+    for part, ns in more.items():
+        sums[part] = sums.get(part, 0) + ns
+
+
+def _by_name(ns_of: Mapping[Part, int], name_of: Mapping[Part, str]) -> dict[str, int]:
+    sums: dict[str, int] = {}
+    for part, ns in ns_of.items():
+        if part in name_of:
+            sums[name_of[part]] = sums.get(name_of[part], 0) + ns
+    return sums

@@ -1,0 +1,94 @@
+"""What bounded a run, and how well it used its cores: one reading of what happened, for everyone who says it.
+
+Rule: report.json, the table, `trilane explain`, the dashboard and Python say what this says; nobody computes it again.
+What is held of a run while it is read is bounded, however long it lasts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+from trilane.pipeline.cpu_use import Efficiencies
+from trilane.pipeline.critical_path import Budget, Part, Paths
+from trilane.pipeline.journal import Accounted, Record, Stepped, Worked
+from trilane.pipeline.journal_slices import JournalSlices
+from trilane.pipeline.sharing import Sharing, Taken
+from trilane.pipeline.waits import ExplainedJob, Waits
+from trilane.scheduler.accounts import ShareSums, in_order
+from trilane.scheduler.events import Graph, Settings
+from trilane.scheduler.ledger import JobRecord
+from trilane.scheduler.places import Place, Placement
+from trilane.scheduler.recording import Recording
+
+
+class Reckoned(NamedTuple):
+    """Of a whole run.
+
+    `budget`: the ns of the path by what they are and of which stage. `taken`: of each stage, who had its core.
+    `figures`: `bottleneck`, `bound`, `efficiency`, `core_efficiency` and `machine_efficiency` of a report.
+    """
+
+    budget: Mapping[Part, int]
+    taken: Mapping[str, Taken]
+    figures: Mapping[str, Any]
+
+
+class Reckoning:
+    """Takes the records of a run after the first, in order.
+
+    `graph`, `settings`: of the run. `places`: of its units, as far as they are known.
+    """
+
+    def __init__(self, graph: Graph, settings: Settings, places: Placement) -> None:
+        self._waits = Waits(graph)
+        self.paths = Paths(graph, settings, self._waits.downs)
+        self.sharing = Sharing({unit: place.cores for unit, place in places.items()})
+        self._budget = Budget(self.paths, self.sharing)
+        own = {unit: Place((-1 - number,), 1) for number, unit in enumerate(graph.units)}  # as if it had a core
+        self._efficiencies = Efficiencies({**own, **places})
+        self._unit_of = {stage.name: stage.unit for stage in graph.stages}
+
+    def add(self, record: Record) -> ExplainedJob | None:
+        """The next record; the job that it ends, if any, with its wait explained."""
+        explained = self._waits.add(record)
+        if explained is not None:
+            self.paths.add(explained)
+            self.sharing.add(explained.job)
+            presents = self.paths.is_presented(explained)
+            self._efficiencies.add(explained.job, presents=presents)
+            if presents:
+                self._budget.present(explained)
+        return explained
+
+    def close(self) -> Reckoned:
+        """After the last record."""
+        budget = self._budget.close()
+        figures = {**self._efficiencies.close(), **self._budget.bound(self._unit_of)}
+        return Reckoned(budget, self.sharing.close(), figures)
+
+
+def records_of(recording: Recording, jobs: Iterable[JobRecord]) -> Iterator[Record]:
+    """The records of a run that is in memory, as far as a reckoning needs them."""
+    for now_ns, events, actions, accounts, ended in in_order(recording, jobs):
+        yield Stepped(now_ns, events, actions)
+        for since_ns, unit, account in accounts:
+            yield Accounted(since_ns, unit, account)
+        for job in ended:
+            yield Worked(job, {})
+
+
+def reckoned(
+    graph: Graph, settings: Settings, places: Placement, records: Iterable[Record]
+) -> tuple[dict[str, dict[str, float]], Reckoned]:
+    """The second accounts of a run, and what bounded it. `records`: those of the run after the first."""
+    sums, slices, reckoning = ShareSums(), JournalSlices(graph), Reckoning(graph, settings, places)
+    for record in records:
+        if isinstance(record, Worked):
+            sums.add_job(record.job)
+        for piece in slices.add(record):
+            sums.add_idle(piece)
+        reckoning.add(record)
+    for piece in slices.end():
+        sums.add_idle(piece)
+    return sums.shares(slices.span), reckoning.close()
