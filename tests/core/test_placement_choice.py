@@ -13,6 +13,7 @@ import psutil
 import pytest
 
 from trilane.bench.lib.rank_correlation import rank_correlation
+from trilane.machine import Machine
 from trilane.pipeline import other_programs
 from trilane.pipeline.other_programs import OtherPrograms, busy_s
 from trilane.pipeline.trial import Round
@@ -112,7 +113,9 @@ def test_what_cores_did_since_the_system_began() -> None:
 
 def test_the_share_of_others_is_what_is_not_ours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In 2 s two cores were busy for 1.5 s, of which this process had 0.3 s and a unit 0.2 s: 1 s of 4 are others'."""
-    file, now = tmp_path / "stat", [10.0]
+    file, now = tmp_path / "proc/stat", [10.0]
+    file.parent.mkdir()
+    monkeypatch.setattr("trilane.machine.here", Machine(tmp_path))
     used = {os.getpid(): 1.0, 77: 5.0}
 
     class Process:
@@ -126,7 +129,7 @@ def test_the_share_of_others_is_what_is_not_ours(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(other_programs, "time", SimpleNamespace(monotonic=lambda: now[0]))
     idle = (0,) * 9
     file.write_text(stat((round(8 / STEP_S), *idle), (0, *idle)))
-    others = OtherPrograms((0, 1), [77], file)
+    others = OtherPrograms((0, 1), [77])
     file.write_text(stat((round(9 / STEP_S), *idle), (round(0.5 / STEP_S), *idle)))
     used.update({os.getpid(): 1.3, 77: 5.2})
     now[0] = 12.0

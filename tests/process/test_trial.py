@@ -17,6 +17,8 @@ MODULE = """
 import os
 from pathlib import Path
 
+from trilane import machine
+
 class Stage:
     def __init__(self, file, fails):
         self.file, self.fails = open(file, "a", buffering=1), fails
@@ -25,7 +27,7 @@ class Stage:
     def run(self, frame, slot_in, slot_out):
         if frame == self.fails:
             raise RuntimeError("no more")
-        cores = ",".join(map(str, list(machine.here.cores())))
+        cores = ",".join(map(str, machine.here.cores()))
         self.file.write(f"{frame} {cores}\\n")
         return {}
     def close(self):
