@@ -25,10 +25,10 @@ SAMPLES = 4
 
 
 class TruePictures:
-    """Pictures of a cast of avatars of the package as the clothed bodies that they were trained on."""
+    """Pictures of a cast of bundled avatars as the clothed bodies that they were trained on."""
 
     def __init__(self, cast: Cast, ctx: Any) -> None:
-        """`ctx`: the OpenGL context in use. The cast must be of avatars of the package alone."""
+        """`ctx`: the OpenGL context in use. Everybody in the cast must be a bundled avatar."""
         self._cast = cast
         self._clothed = {folder: _clothed(data, ctx) for folder, data in cast.avatars.items()}
 
@@ -46,7 +46,7 @@ class TruePictures:
 
 
 def true_pictures(cast: Cast, ctx: Any) -> TruePictures | None:
-    """Those of `cast`; None unless everybody in it is an avatar of the package. `ctx`: the OpenGL context in use."""
+    """Those of `cast`; None unless everybody in it is a bundled avatar. `ctx`: the OpenGL context in use."""
     is_known = set(cast.avatars) <= {bundle_folder(name).absolute() for name in BUILT_IN}
     return TruePictures(cast, ctx) if is_known else None
 

@@ -86,6 +86,9 @@ def test_every_check_runs_and_the_last_line_names_every_failure(
     monkeypatch.setattr(checks, "STYLE", style)
     monkeypatch.setattr(checks, "GROUPS", (["-q", "-k", "fails"], ["-q", "-k", "passes or wants"]))
     monkeypatch.setattr(checks, "SKIPPED", folder / "skipped.txt")
+    with pytest.raises(SystemExit, match="2"):
+        main(["--rest"])  # nothing was run yet
+    assert "run it first" in capfd.readouterr().err
     assert main([]) == 1
     lines = capfd.readouterr().out.splitlines()
     assert "well" in lines

@@ -80,6 +80,8 @@ def main(words: Sequence[str]) -> int:
     told = SKIPPED.with_suffix(".json")
     extra = ["--slow", "-p", "trilane.testing.skips"] if asked.slow or asked.rest else []
     if asked.rest:
+        if not SKIPPED.is_file():
+            parser.error("nothing says what `make test` skipped here: run it first")
         extra.append(f"--only-rest={SKIPPED}")
     outcomes = [] if asked.rest else [check_style(command) for command in STYLE]
     outcomes += [check_tests([*extra, *group], told) for group in GROUPS]
