@@ -4,8 +4,8 @@ Rule: the avatar's loss does not change them, and their own does not change the 
 that a picture's score does not depend on the others of its batch.
 
 The thesis has three networks of falling resolution and rising channels, each with one probability for a picture, and
-does not say what the three see. Here each sees colours before a background and the mask, at the whole, half and quarter size
-(Wang et al., High-resolution image synthesis with conditional GANs, 2018, section 3.2).
+does not say what the three see. Here each sees colours before a background and the mask, at the whole, half and quarter
+size (Wang et al., High-resolution image synthesis with conditional GANs, 2018, section 3.2).
 """
 
 from __future__ import annotations

@@ -39,9 +39,9 @@ def summary(errors: Sequence[SampleError]) -> dict[str, Any]:
     """What `errors`, at least one, come to; decibels are means over pictures.
 
     Keys: `psnr_db_by_band`, `body_psnr_db_by_band`, `see_through_by_band`, `iou_by_band`; `psnr_db_by_background`;
-    those of `MEANS`: means of the fields of `ImageError`; `least_psnr_db`, `least_body_psnr_db`; `worst`, the sample of the least
-    PSNR: `seed`, `number`, `band`, `psnr_db`, `body_psnr_db`; `by_seed`: `psnr_db`, `body_psnr_db`, `least_psnr_db` of
-    each seed's samples; `samples`, how many.
+    those of `MEANS`: means of the fields of `ImageError`; `least_psnr_db`, `least_body_psnr_db`; `worst`, the sample of
+    the least PSNR: `seed`, `number`, `band`, `psnr_db`, `body_psnr_db`; `by_seed`: `psnr_db`, `body_psnr_db`,
+    `least_psnr_db` of each seed's samples; `samples`, how many.
     """
     bands = [band for band in BANDS if any(sample.band == band for sample in errors)]
     worst = min(errors, key=lambda sample: sample.error.psnr_db)

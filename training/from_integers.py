@@ -38,7 +38,8 @@ def network_of(bundle: Bundle, groups: list[ShapeGroup], seed: int) -> UNet:
     Raises BadInputError.
     """
     entry = bundle.manifest.network
-    network = UNet(entry.encoder, "batch", entry.width, entry.channels, input_skip=True).eval()
+    network = UNet(entry.encoder, "batch", entry.width, entry.channels, input_skip=True)
+    network.eval()
     constants = dict(_constants(bundle.read_network().model))
     for name, conv, norm in convolutions(network):
         if name not in constants:
@@ -50,8 +51,9 @@ def network_of(bundle: Bundle, groups: list[ShapeGroup], seed: int) -> UNet:
                 assert conv.bias is not None
                 conv.bias.copy_(bias)
             else:
+                assert norm.running_var is not None
                 norm.bias.copy_(bias)
-                norm.running_var.fill_(1 - norm.eps)  # type: ignore[union-attr]
+                norm.running_var.fill_(1 - norm.eps)
     _measure_norms(network, _inputs(bundle, groups, seed))
     return network
 

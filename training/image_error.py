@@ -90,7 +90,9 @@ def regions(alpha: U8) -> tuple[Mask, Mask, Mask]:
     near = [np.pad(alpha, EDGE_PX, mode="edge")]
     for axis in (0, 1):
         size = alpha.shape[axis]
-        near = [np.take(part, np.arange(start, start + size), axis) for part in near for start in range(2 * EDGE_PX + 1)]
+        near = [
+            np.take(part, np.arange(start, start + size), axis) for part in near for start in range(2 * EDGE_PX + 1)
+        ]
     inside, outside = np.min(near, axis=0) == OPAQUE, np.max(near, axis=0) == 0
     return inside, ~(inside | outside), outside
 

@@ -83,7 +83,10 @@ def missing_db(difference: Tensor, near: Tensor) -> Tensor:
 
 def _grown(mask: Tensor) -> Tensor:
     """(N, 1, H, W): 1 on the person of `mask` and up to `MARGIN_PX` round it, else 0."""
-    grown = functional.max_pool2d(mask.detach(), 2 * MARGIN_PX + 1, stride=1, padding=MARGIN_PX)
+    grown = mask.detach().contiguous()
+    for along in ((1, 0), (0, 1)):
+        kernel, padding = tuple(2 * MARGIN_PX * side + 1 for side in along), tuple(MARGIN_PX * side for side in along)
+        grown = functional.max_pool2d(grown, kernel, stride=1, padding=padding)
     return grown.gt(0).float()
 
 

@@ -68,5 +68,5 @@ def test_its_norms_have_the_statistics_of_the_samples(groups: list[ShapeGroup]) 
 
 def test_an_avatar_of_another_network_is_refused(tiny_bundle: Path, groups: list[ShapeGroup]) -> None:
     bundle: Bundle = load_bundle(tiny_bundle)
-    with pytest.raises(BadInputError, match="no convolution encoder.stem.0"):
+    with pytest.raises(BadInputError, match=r"no convolution encoder\.stem\.0"):
         network_of(bundle, groups, 1)

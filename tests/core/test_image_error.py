@@ -67,7 +67,9 @@ def test_alpha_of_seven_tenths_is_not_passed_where_one_grey_would_pass_it() -> N
     ghost = truth.copy()
     ghost[..., 3] = np.round(ghost[..., 3] * 0.7)
     grey = 128 / 255
-    over = [image[..., :3] / 255 * (image[..., 3:] / 255) + grey * (1 - image[..., 3:] / 255) for image in (ghost, truth)]
+    over = [
+        image[..., :3] / 255 * (image[..., 3:] / 255) + grey * (1 - image[..., 3:] / 255) for image in (ghost, truth)
+    ]
     assert np.abs(over[0] - over[1]).max() < 1e-9
     found = error(ghost, truth)
     assert found.iou == 1.0
@@ -133,7 +135,7 @@ def test_each_sample_has_a_background_of_its_own() -> None:
     """Of 200 draws each of four kinds has 50 in the mean, with a deviation of 6.1."""
     drawn = backgrounds(200, (8, 12), np.random.default_rng(3))
     assert drawn.shape == (200, 8, 12, 3) and drawn.dtype == np.float32
-    assert 0 <= drawn.min() and drawn.max() <= 1
+    assert drawn.min() >= 0 and drawn.max() <= 1
     plain = drawn.reshape(200, -1)
     black, white = ((plain == level).all(axis=1).sum() for level in (0, 1))
     assert all(abs(count - 50) < 4 * 6.1 for count in (black, white))

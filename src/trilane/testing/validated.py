@@ -21,7 +21,10 @@ def validated(bundle: Bundle, size: str = "256") -> Manifest:
         "iou": 0.9753,
         "ssim": 0.8642,
     }
-    others = {"openvino": figures | {"psnr_db_by_band": {"full_body": OTHER_PSNR_DB}, "psnr_db_by_background": {}}}
+    others = {
+        "openvino": figures
+        | {"psnr_db_by_band": {"full_body": OTHER_PSNR_DB}, "psnr_db_by_background": {"black": OTHER_PSNR_DB}}
+    }
     digests = digests_of(bundle.folder, bundle.manifest)
     about = {"date": date(2026, 1, 2), "digests": digests, "runtime": "ort", "size": size, "other_runtimes": others}
     validation = with_figures_digest(Validation.model_validate(figures | about))
