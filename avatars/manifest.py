@@ -100,13 +100,21 @@ class SeedFigures(_Model):
 class Figures(_Model):
     """Image error of one network on one runtime, on poses and views that were not trained on.
 
-    `psnr_db_by_band`: in dB, inside the box of the true mask. `iou`, `ssim`: means. The other keys, see `summary` of
-    `training/error_summary.py`, are None where nobody measured them, and then not written.
+    `psnr_db_by_band`: in dB, before random backgrounds, inside the box of the true mask. `see_through`: share of the
+    inside of the person whose alpha is less than 0.9. `iou`, `ssim`: means. The other keys, see `summary` of
+    `training/error_summary.py`, are None where nobody measured them, and then not written; without
+    `psnr_db_by_background` the figures are before one grey, as an older Trilane measured them.
     """
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
     psnr_db_by_band: dict[Band, Finite]
+    psnr_db_by_background: dict[str, Finite] | None = None
+    see_through: Share | None = None
+    see_through_by_band: dict[Band, Share] | None = None
+    alpha_inside: Share | None = None
+    alpha_edge: Share | None = None
+    alpha_outside: Share | None = None
     iou: Share
     ssim: float = Field(ge=-1, le=1)
     body_psnr_db_by_band: dict[Band, Finite] | None = None
@@ -160,6 +168,10 @@ class BySize(_Model):
     psnr_db: dict[Annotated[str, Field(pattern=r"^[0-9]{1,4}x[0-9]{1,4}$")], Finite] = Field(min_length=1)
 
 
+#: Figures of the runtime that a validation is by, which stand at its top too.
+AT_THE_TOP = ("psnr_db_by_band", "psnr_db_by_background", "see_through", "iou", "ssim")
+
+
 class Validation(Figures):
     """The figures of an avatar, and what they are of.
 
@@ -191,7 +203,7 @@ class Validation(Figures):
         """The figures of `runtime`; None when nothing was painted on it."""
         if runtime != self.runtime:
             return self.other_runtimes.get(runtime)
-        return self.integer or Figures(psnr_db_by_band=self.psnr_db_by_band, iou=self.iou, ssim=self.ssim)
+        return self.integer or Figures(**{key: getattr(self, key) for key in AT_THE_TOP})
 
 
 class Manifest(_Model):

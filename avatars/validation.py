@@ -105,6 +105,10 @@ def refused(bundle: Bundle) -> dict[str, Any]:
         return _no_figures(bundle, [], f"the validation in its manifest is not whole: {why}")
     if validation.figures_digest != figures_digest(validation):
         return _no_figures(bundle, [], f"the figures were changed since the validation of {validation.date}")
+    if validation.psnr_db_by_background is None:
+        return _no_figures(
+            bundle, [], "its figures are before one grey, before which a transparent person has no error"
+        )
     now = digests_of(bundle.folder, bundle.manifest)
     changed = [part for part in PARTS if getattr(now, part) != getattr(validation.digests, part)]
     if not changed:

@@ -4,8 +4,8 @@ Rule: the avatar's loss does not change them, and their own does not change the 
 that a picture's score does not depend on the others of its batch.
 
 The thesis has three networks of falling resolution and rising channels, each with one probability for a picture, and
-does not say what the three see. Here each sees colours over grey and the mask, at the whole, half and quarter size
-(Wang et al., High-resolution image synthesis with conditional GANs, 2018, section 3.2).
+does not say what the three see. Here each sees colours before a background and the mask, at the whole, half and quarter
+size (Wang et al., High-resolution image synthesis with conditional GANs, 2018, section 3.2).
 """
 
 from __future__ import annotations
@@ -66,14 +66,14 @@ class Adversary:
             self.discriminators = nn.ModuleList(Discriminator(width) for _ in SHRUNK).to(device)
         self.optimiser = torch.optim.Adam(self.discriminators.parameters(), lr=rate, betas=BETAS)
 
-    def terms(self, output: Tensor, target: Tensor) -> dict[str, Tensor]:
+    def terms(self, output: Tensor, target: Tensor, behind: Tensor) -> dict[str, Tensor]:
         """What the avatar minimises: `adversarial`, that its pictures are told from true ones, and `features`.
 
-        `output`, `target` (N, 4, H, W): straight colour and mask in 0..1. `features`: the mean difference of the
-        discriminators' features (feature matching).
+        `output`, `target` (N, 4, H, W): straight colour and mask in 0..1; both are judged over `behind` (N, 3, H, W).
+        `features`: the mean difference of the discriminators' features (feature matching).
         """
         self.discriminators.requires_grad_(False)
-        painted, true = self._judged(output), self._judged(target)
+        painted, true = self._judged(output, behind), self._judged(target, behind)
         self.discriminators.requires_grad_(True)
         differences = [
             functional.l1_loss(one, other)
@@ -83,11 +83,11 @@ class Adversary:
         fooled = torch.stack([bits(judged.score, true=True) for judged in painted])
         return {"adversarial": fooled.mean(), "features": torch.stack(differences).mean()}
 
-    def learn(self, output: Tensor, target: Tensor) -> float:
+    def learn(self, output: Tensor, target: Tensor, behind: Tensor) -> float:
         """One step of the discriminators on these pictures; their mean error before it: 1 bit where they guess."""
         wrong = [
             (bits(mine.score, true=False) + bits(theirs.score, true=True)) / 2
-            for mine, theirs in zip(self._judged(output.detach()), self._judged(target), strict=True)
+            for mine, theirs in zip(self._judged(output.detach(), behind), self._judged(target, behind), strict=True)
         ]
         loss = torch.stack(wrong).mean()
         self.optimiser.zero_grad(set_to_none=True)
@@ -95,8 +95,8 @@ class Adversary:
         self.optimiser.step()
         return float(loss.detach())
 
-    def _judged(self, picture: Tensor) -> list[Judged]:
-        seen = torch.cat((composite(picture), picture[:, 3:]), dim=1)
+    def _judged(self, picture: Tensor, behind: Tensor) -> list[Judged]:
+        seen = torch.cat((composite(picture, behind), picture[:, 3:]), dim=1)
         return [
             judge(functional.avg_pool2d(seen, shrunk, ceil_mode=True))
             for judge, shrunk in zip(self.discriminators, SHRUNK, strict=True)

@@ -69,7 +69,7 @@ class ByteGrid:
         """The rounded weights of all convolutions, by name."""
         return {
             f"{name}.weight": _rounded_weight(conv.weight, _folded_scale(conv, norm), bool(self.alike))
-            for name, conv, norm in _convolutions(network)
+            for name, conv, norm in convolutions(network)
         }
 
     def _stored(self, x: Tensor, place: int) -> Tensor:
@@ -106,7 +106,7 @@ def _folded_scale(conv: nn.Conv2d, norm: nn.BatchNorm2d | None) -> Tensor:
     return norm.weight.detach() / torch.sqrt(norm.running_var + norm.eps)
 
 
-def _convolutions(network: UNet) -> Iterator[tuple[str, nn.Conv2d, nn.BatchNorm2d | None]]:
+def convolutions(network: UNet) -> Iterator[tuple[str, nn.Conv2d, nn.BatchNorm2d | None]]:
     """Each convolution with its name and the norm behind it, which always is the next module."""
     named = list(network.named_modules())
     for (name, module), (_, after) in zip(named, [*named[1:], ("", None)], strict=True):
@@ -131,14 +131,18 @@ def _modules_of(tensor: str) -> tuple[str, ...]:
     """The places that the exported `tensor` is stored at, by the exporter's names: `/a/b.0/b.0.1/Conv_output_0`."""
     if tensor in NAMED:
         return NAMED[tensor]
-    *scopes, operator = tensor.strip("/").split("/")
-    path: list[str] = []
-    for scope in scopes:
-        if path and scope.startswith(f"{path[-1]}."):
-            path.pop()
-        path.append(scope)
-    name = ".".join(path)
+    name, operator = module_of(tensor), tensor.rpartition("/")[2]
     if operator.startswith("Conv") and name:
         before, _, number = name.rpartition(".")
         return (f"{before}.{int(number) + 1}",) if number.isdecimal() else ()
     return (name,)
+
+
+def module_of(exported: str) -> str:
+    """The module of the `exported` operator or tensor: `a.b.0.1` of `/a/b.0/b.0.1/Conv`."""
+    path: list[str] = []
+    for scope in exported.strip("/").split("/")[:-1]:
+        if path and scope.startswith(f"{path[-1]}."):
+            path.pop()
+        path.append(scope)
+    return ".".join(path)

@@ -13,6 +13,7 @@ import numpy as np
 from trilane.avatars.bundle import Bundle, write_manifest
 from trilane.training.capture.capture_samples import CaptureRenderer
 from trilane.training.dataset import VALIDATION_SIZE
+from trilane.training.error_summary import MEANS
 from trilane.training.evaluate import integer_painter
 from trilane.training.image_error import ImageError, image_error
 
@@ -37,7 +38,7 @@ def frame_errors(bundle: Bundle, renderer: CaptureRenderer, numbers: Sequence[in
 
 def error_facts(errors: Sequence[ImageError]) -> dict[str, Any]:
     """Means of `errors`, and how they were measured: keys `runtime`, `size`, `frames`, and those of an error."""
-    names = ("psnr_db", "body_psnr_db", "ssim", "iou")
+    names = [name for name in MEANS if name != "background"]
     means = (
         {name: round(float(np.mean([getattr(error, name) for error in errors])), 4) for name in names} if errors else {}
     )

@@ -1,6 +1,6 @@
 """Sheets that compare pictures: the ground truth and what each painter made of it, side by side.
 
-Rule: all pictures are over mid-grey, and none is enlarged.
+Rule: all pictures are before the same scenery, in which a transparent person shows, and none is enlarged.
 """
 
 from __future__ import annotations
@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from trilane.training.backgrounds import SIDE, scenes
 from trilane.training.evaluate import Evaluated
-from trilane.training.image_error import over_grey
+from trilane.training.image_error import over
 from trilane.training.sample_renderer import BAND_NAMES
 
 SHEET_CELL = (256, 192)
@@ -49,7 +50,8 @@ def side_by_side(pictures: Iterable[NDArray[np.uint8]]) -> NDArray[np.uint8]:
 
 
 def _cell(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    image = Image.fromarray((over_grey(picture) * 255).round().astype(np.uint8))
+    behind = scenes()[0][np.arange(picture.shape[0])[:, None] % SIDE, np.arange(picture.shape[1]) % SIDE]
+    image = Image.fromarray((over(picture, behind) * 255).round().astype(np.uint8))
     image.thumbnail(SHEET_CELL[::-1], Image.Resampling.LANCZOS)
     cell = np.full((*SHEET_CELL, 3), 128, np.uint8)
     top, left = (SHEET_CELL[0] - image.height) // 2, (SHEET_CELL[1] - image.width) // 2

@@ -15,6 +15,11 @@ from trilane.avatars.manifest import BANDS
 from trilane.training.image_error import ImageError
 
 DB_DIGITS, SHARE_DIGITS = 2, 4
+#: Fields of `ImageError` whose mean says how good an avatar is.
+MEANS = (
+    *("psnr_db", "body_psnr_db", "see_through", "alpha_inside", "alpha_edge", "alpha_outside"),
+    *("background", "iou", "ssim"),
+)
 
 
 @dataclass(frozen=True)
@@ -33,21 +38,24 @@ class SampleError:
 def summary(errors: Sequence[SampleError]) -> dict[str, Any]:
     """What `errors`, at least one, come to; decibels are means over pictures.
 
-    Keys: `psnr_db_by_band`, `body_psnr_db_by_band`, `iou_by_band`; `psnr_db`, `body_psnr_db`, `background`, `iou`,
-    `ssim`: means of the fields of `ImageError`; `least_psnr_db`, `least_body_psnr_db`; `worst`, the sample of the least
-    PSNR: `seed`, `number`, `band`, `psnr_db`, `body_psnr_db`; `by_seed`: `psnr_db`, `body_psnr_db`, `least_psnr_db` of
-    each seed's samples; `samples`, how many.
+    Keys: `psnr_db_by_band`, `body_psnr_db_by_band`, `see_through_by_band`, `iou_by_band`; `psnr_db_by_background`;
+    those of `MEANS`: means of the fields of `ImageError`; `least_psnr_db`, `least_body_psnr_db`; `worst`, the sample of
+    the least PSNR: `seed`, `number`, `band`, `psnr_db`, `body_psnr_db`; `by_seed`: `psnr_db`, `body_psnr_db`,
+    `least_psnr_db` of each seed's samples; `samples`, how many.
     """
     bands = [band for band in BANDS if any(sample.band == band for sample in errors)]
     worst = min(errors, key=lambda sample: sample.error.psnr_db)
     seeds = sorted({sample.seed for sample in errors})
-    means = ("psnr_db", "body_psnr_db", "background", "iou", "ssim")
     return {
         **{
             f"{key}_by_band": {band: _mean([s for s in errors if s.band == band], key) for band in bands}
-            for key in ("psnr_db", "body_psnr_db", "iou")
+            for key in ("psnr_db", "body_psnr_db", "see_through", "iou")
         },
-        **{key: _mean(errors, key) for key in means},
+        "psnr_db_by_background": {
+            kind: _rounded("psnr_db", float(np.mean([sample.error.by_background[kind] for sample in errors])))
+            for kind in errors[0].error.by_background
+        },
+        **{key: _mean(errors, key) for key in MEANS},
         "least_psnr_db": _least(errors, "psnr_db"),
         "least_body_psnr_db": _least(errors, "body_psnr_db"),
         "worst": {

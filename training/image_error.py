@@ -1,22 +1,32 @@
-"""Error of an avatar's picture against the ground truth: PSNR, SSIM and IoU.
+"""Error of an avatar's picture against the ground truth: PSNR, SSIM and IoU of it, and the error of its alpha.
 
-Rule: pictures are compared over mid-grey, inside the box of the true mask; beside that PSNR, which counts the
-background in the box too, stands that of the true mask's pixels alone.
+Rule: pictures are compared before each kind of background in turn, inside the box of the true mask, because before one
+colour a person who lets that colour through has no error; beside that PSNR, which counts the background in the box too,
+stands that of the true mask's pixels alone. Decibels and SSIM are means over the backgrounds.
+
+Alpha is counted in three regions. The edge is whatever lies within `EDGE_PX` of a change of the true alpha: there an
+outline that is wrong by a pixel decides, which IoU says too. Inside and outside are the rest, where alpha should be 1
+and 0.
 """
 
 from __future__ import annotations
 
+import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from skimage.metrics import structural_similarity
 
-from trilane.arrays import U8
+from trilane.arrays import F64, U8, Mask
+from trilane.training.backgrounds import KINDS, background
 
-GREY = 0.5
-HALF = 128
+HALF, OPAQUE = 128, 255
 SSIM_WINDOW = 7
+EDGE_PX = 2
+#: A pixel inside whose alpha is less lets more than a tenth of the background through.
+SOLID = 0.9
 #: The least mean square that a PSNR is computed of, which makes 100 dB the most.
 LEAST_SQUARE = 1e-10
 
@@ -26,14 +36,21 @@ class ImageError:
     """How far a picture is from the truth.
 
     `psnr_db`, `ssim`: inside the box of the true mask. `body_psnr_db`: in dB, over the true mask's pixels alone.
-    `background`: share of the box that the mask does not cover. `iou`: of the masks, over the whole tensor.
+    `by_background`: `psnr_db` before each kind. `background`: share of the box that the mask does not cover. `iou`: of
+    the masks, over the whole tensor. `alpha_inside`, `alpha_edge`, `alpha_outside`: mean size of alpha's error there.
+    `see_through`: share of the inside whose alpha is less than `SOLID`. Both of the inside are 0 where there is none.
     """
 
     psnr_db: float
     body_psnr_db: float
+    by_background: dict[str, float]
     background: float
     ssim: float
     iou: float
+    alpha_inside: float
+    alpha_edge: float
+    alpha_outside: float
+    see_through: float
 
 
 def image_error(picture: U8, truth: U8) -> ImageError | None:
@@ -43,25 +60,61 @@ def image_error(picture: U8, truth: U8) -> ImageError | None:
         return None
     rows, columns = (np.flatnonzero(true_mask.any(axis=axis)) for axis in (1, 0))
     box = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    shown, wanted = over_grey(picture)[box], over_grey(truth)[box]
-    square = (shown - wanted) ** 2
-    window = min(SSIM_WINDOW, *(side - 1 + side % 2 for side in shown.shape[:2]))
-    ssim = structural_similarity(shown, wanted, data_range=1.0, channel_axis=2, win_size=window) if window >= 3 else 1.0
+    before = {kind: (over(picture, behind)[box], over(truth, behind)[box]) for kind, behind in _behind(truth)}
+    squares = {kind: (shown - wanted) ** 2 for kind, (shown, wanted) in before.items()}
+    by_background = {kind: _psnr_db(square) for kind, square in squares.items()}
+    inside, edge, outside = regions(truth[..., 3])
+    wrong = np.abs(picture[..., 3].astype(np.float64) - truth[..., 3]) / OPAQUE
     return ImageError(
-        psnr_db=_psnr_db(square),
-        body_psnr_db=_psnr_db(square[true_mask[box]]),
+        psnr_db=float(np.mean(list(by_background.values()))),
+        body_psnr_db=float(np.mean([_psnr_db(square[true_mask[box]]) for square in squares.values()])),
+        by_background=by_background,
         background=1.0 - float(true_mask[box].mean()),
-        ssim=float(ssim),
+        ssim=float(np.mean([_ssim(shown, wanted) for shown, wanted in before.values()])),
         iou=float((mask & true_mask).sum() / (mask | true_mask).sum()),
+        alpha_inside=_mean(wrong[inside]),
+        alpha_edge=_mean(wrong[edge]),
+        alpha_outside=_mean(wrong[outside]),
+        see_through=_mean(picture[..., 3][inside] < SOLID * OPAQUE),
     )
 
 
-def over_grey(image: U8) -> NDArray[np.float64]:
-    """`image` (h,w,4) uint8 over mid-grey: (h,w,3) in 0..1."""
-    alpha = image[..., 3:] / 255
-    return np.asarray(image[..., :3] / 255 * alpha + GREY * (1 - alpha))
+def over(image: U8, behind: NDArray[np.floating]) -> F64:
+    """`image` (h,w,4) uint8 over `behind` (h,w,3) in 0..1: (h,w,3) in 0..1."""
+    alpha = image[..., 3:] / OPAQUE
+    return np.asarray(image[..., :3] / OPAQUE * alpha + behind * (1 - alpha))
 
 
-def _psnr_db(square: NDArray[np.float64]) -> float:
+def regions(alpha: U8) -> tuple[Mask, Mask, Mask]:
+    """Inside, edge and outside (h,w) of a true `alpha` (h,w); what lies beyond the picture is as its last pixels."""
+    near = [np.pad(alpha, EDGE_PX, mode="edge")]
+    for axis in (0, 1):
+        size = alpha.shape[axis]
+        near = [
+            np.take(part, np.arange(start, start + size), axis) for part in near for start in range(2 * EDGE_PX + 1)
+        ]
+    inside, outside = np.min(near, axis=0) == OPAQUE, np.max(near, axis=0) == 0
+    return inside, ~(inside | outside), outside
+
+
+def _behind(truth: U8) -> Iterator[tuple[str, NDArray[np.floating]]]:
+    """A background of each kind, which `truth` alone decides: all painters stand before the same ones."""
+    rng = np.random.default_rng(zlib.crc32(truth.tobytes()))
+    for kind in KINDS:
+        yield kind, background(kind, (truth.shape[0], truth.shape[1]), rng)
+
+
+def _ssim(shown: F64, wanted: F64) -> float:
+    window = min(SSIM_WINDOW, *(side - 1 + side % 2 for side in shown.shape[:2]))
+    if window < 3:
+        return 1.0
+    return float(structural_similarity(shown, wanted, data_range=1.0, channel_axis=2, win_size=window))
+
+
+def _mean(values: NDArray[np.generic]) -> float:
+    return float(values.mean()) if values.size else 0.0
+
+
+def _psnr_db(square: F64) -> float:
     """PSNR in dB of values in 0..1 whose differences have the squares `square`."""
     return -10 * float(np.log10(max(float(square.mean()), LEAST_SQUARE)))

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from torch import Tensor
 
 from trilane.training.adversary import Adversary
-from trilane.training.losses import WEIGHTS, composite, loss_terms, total_loss
+from trilane.training.losses import WEIGHTS, composite, drawn_behind, loss_terms, total_loss
 from trilane.training.perceptual import Vgg16
 from trilane.training.structural_similarity import ms_ssim
 
@@ -29,13 +29,17 @@ class Objective:
     adversary: Adversary | None = None
 
     def terms(self, output: Tensor, target: Tensor) -> dict[str, Tensor]:
-        """The terms by name, before weighting. `output`, `target` (N, 4, H, W): straight colour and mask, 0..1."""
-        terms = loss_terms(output, target, self.weights)
+        """The terms by name, before weighting, over backgrounds that are drawn here.
+
+        `output`, `target` (N, 4, H, W): straight colour and mask, 0..1.
+        """
+        behind = drawn_behind(target)
+        terms = loss_terms(output, target, behind, self.weights)
         if self.weights.get(PERCEPTUAL):
-            shown, wanted = composite(output), composite(target)
+            shown, wanted = composite(output, behind), composite(target, behind)
             distance = 1 - ms_ssim(shown, wanted) if self.vgg is None else self.vgg.distance(shown, wanted)
             terms[PERCEPTUAL] = distance.mean()
-        return terms if self.adversary is None else terms | self.adversary.terms(output, target)
+        return terms if self.adversary is None else terms | self.adversary.terms(output, target, behind)
 
     def total(self, terms: Mapping[str, Tensor]) -> Tensor:
         """The weighted sum of `terms`, which is minimised."""
@@ -43,4 +47,4 @@ class Objective:
 
     def learn(self, output: Tensor, target: Tensor) -> dict[str, float]:
         """What of this objective is trained itself takes a step on these pictures; what that tells, by name."""
-        return {} if self.adversary is None else {JUDGES: self.adversary.learn(output, target)}
+        return {} if self.adversary is None else {JUDGES: self.adversary.learn(output, target, drawn_behind(target))}

@@ -34,6 +34,7 @@ from trilane.training.dataset import plan_training, write_dataset
 from trilane.training.evaluate import Evaluated
 from trilane.training.first_texture import first_texture
 from trilane.training.float_painter import float_painter
+from trilane.training.from_integers import network_of
 from trilane.training.make_bundle import quantise_avatar, write_avatar
 from trilane.training.network import UNet
 from trilane.training.neural_texture import SIDES, NeuralTexture
@@ -66,8 +67,8 @@ SHARED = ("minutes", "workers", "threads", "batch", "seed", "precision", "bytes_
 REPEATS = (2, 1, 2, 3, 1)
 KNOWN_NETWORK: dict[str, Any] = {"small_until": 0.0, "freeze_norms_at": 0.3, "repeats": REPEATS}
 RESUMED: dict[str, Any] = {
-    "network_rate": 6e-4,
-    "texture_rate": 2e-4,
+    "network_rate": 1e-3,
+    "texture_rate": 3e-4,
     "small_until": 0.0,
     "freeze_norms_at": 0.1,
     "repeats": REPEATS,
@@ -87,7 +88,8 @@ class TrainConfig:
     `precision`: of the network while it is trained; "bfloat16" is three times as fast on processors with AMX.
     `bytes_from`: share of the minutes after which weights and activations are rounded as the bundle's are.
     `weights`: do not train, use these. `resume`: continue from these weights at a lower rate. `network`: start from the
-    network of these weights, with a new texture or with `texture`, that of a trained avatar (a name or a folder).
+    network of these weights or, with the name or folder of an avatar, from that of its integers; with a new texture or
+    with `texture`, that of a trained avatar (a name or a folder).
     """
 
     body: Path = bundle_folder("default") / "body.npz"
@@ -247,12 +249,20 @@ def _starting_point(shaped: ShapedBody, config: TrainConfig) -> tuple[TrainableA
     texture = _first_texture(shaped, config)
     if config.network is not None:
         settings = replace(settings, **(RESUMED if config.texture else KNOWN_NETWORK))
-        network = load_network(network, config.network)
+        network = _known_network(network, config)
     return TrainableAvatar(NeuralTexture(texture), network), 0, settings
 
 
 def _new_network(config: TrainConfig) -> UNet:
     return UNet(width=config.width, channels=CHANNELS, input_skip=True)
+
+
+def _known_network(blank: UNet, config: TrainConfig) -> UNet:
+    """The network of `config.network`: weights for `blank`, or an avatar."""
+    assert config.network is not None
+    if config.network.suffix == ".npz":
+        return load_network(blank, config.network)
+    return network_of(load_bundle(config.network), open_groups(config.work / TRAINING), config.seed)
 
 
 def _blank_avatar(config: TrainConfig) -> TrainableAvatar:

@@ -26,7 +26,7 @@ from torch import multiprocessing as tmp
 
 from trilane.training.activation_noise import add_activation_noise
 from trilane.training.byte_grid import ByteGrid
-from trilane.training.losses import loss_terms
+from trilane.training.losses import WEIGHTS
 from trilane.training.objective import Objective
 from trilane.training.optimisers import clip_gradients, optimiser_of
 from trilane.training.rounding import round_to_bytes
@@ -254,5 +254,4 @@ def follow(average: TrainableAvatar, avatar: TrainableAvatar, keep: float) -> No
 
 
 def _terms_text(terms: Tensor) -> str:
-    names = list(loss_terms(torch.full((1, 4, 32, 32), 0.5), torch.full((1, 4, 32, 32), 0.5)))
-    return " ".join(f"{name} {float(value):.4f}" for name, value in zip(names, terms, strict=False))
+    return " ".join(f"{name} {float(value):.4f}" for name, value in zip(WEIGHTS, terms, strict=False))

@@ -13,7 +13,7 @@ from typing import Any
 from trilane import machine
 from trilane.avatars.bundle import Bundle, write_manifest
 from trilane.avatars.digests import digests_of, sha256_of, with_figures_digest
-from trilane.avatars.manifest import MadeWith, Validation
+from trilane.avatars.manifest import AT_THE_TOP, MadeWith, Validation
 from trilane.scene.motion.load import load_motion
 from trilane.scene.motion.motion import Motion
 from trilane.scene.schema import AvatarSpec
@@ -138,7 +138,7 @@ def _arranged(figures: Mapping[str, dict[str, Any]], runtimes: tuple[str, ...], 
     first, *others = runtimes
     own = figures[first]
     arranged: dict[str, Any] = {
-        **{key: own[key] for key in ("psnr_db_by_band", "iou", "ssim")},
+        **{key: own[key] for key in AT_THE_TOP},
         "runtime": first,
         "integer": own,
         "other_runtimes": {name: figures[name] for name in others},

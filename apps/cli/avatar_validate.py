@@ -113,6 +113,7 @@ def band_table(validation: Validation) -> Table:
     columns = {
         "PSNR, dB": (own.psnr_db_by_band, 2),
         "of the person alone": (own.body_psnr_db_by_band or {}, 2),
+        "alpha < 0.9 inside, %": ({band: 100 * share for band, share in (own.see_through_by_band or {}).items()}, 2),
         "mask IoU": (own.iou_by_band or {}, 4),
         "lost by quantising, dB": (cost, 2),
     }

@@ -137,7 +137,8 @@ def accuracy_line(name: str, facts: Mapping[str, Any]) -> str:
     bands = ", ".join(f"{band} {value:.1f}" for band, value in facts["psnr_db_by_band"].items())
     body = f"; of the body alone {facts['body_psnr_db']:.1f}" if "body_psnr_db" in facts else ""
     return (
-        f"avatar {name}: PSNR on held-out views, dB: {bands}{body}{_worst(facts)}; mask IoU {facts['iou']:.3f} "
+        f"avatar {name}: PSNR on held-out views before random backgrounds, dB: {bands}{body}{_worst(facts)}; "
+        f"{facts['see_through']:.1%} of the inside lets more than a tenth through; mask IoU {facts['iou']:.3f} "
         f"({source}, on {facts['runtime']} at tensor size {facts['size']})"
     )
 

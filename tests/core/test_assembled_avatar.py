@@ -49,6 +49,7 @@ def base(drawable_bundle: Path, tmp_path: Path) -> Path:
     digests = digests_of(folder, load_bundle(folder).manifest)
     figures = {
         "psnr_db_by_band": {"face": 30.0},
+        "psnr_db_by_background": {"black": 30.0},
         "iou": 0.9,
         "ssim": 0.8,
         "date": datetime.date(2026, 1, 2),

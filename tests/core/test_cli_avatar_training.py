@@ -243,7 +243,7 @@ def test_bands_are_a_table(tiny_bundle: Path, command: Command, monkeypatch: pyt
     """Of the integer network, each figure at its place; what nobody measured is a dash."""
     by_band = {"full_body": 31.456, "face": 28.1}
     figures = {"psnr_db_by_band": by_band, "iou": 0.9, "ssim": 0.9, "iou_by_band": {"full_body": 0.98765}}
-    own = figures | {"body_psnr_db_by_band": {"full_body": 27.5, "face": 26.0}}
+    own = figures | {"body_psnr_db_by_band": {"full_body": 27.5, "face": 26.0}, "see_through_by_band": {"face": 0.0234}}
     told = {**figures, "date": date(2026, 1, 2), "runtime": "ort", "integer": own, "psnr_loss_db": {"face": 0.07}}
     bundle = load_bundle(tiny_bundle)
     manifest = bundle.manifest.model_copy(update={"validation": Validation.model_validate(told)})
@@ -252,9 +252,9 @@ def test_bands_are_a_table(tiny_bundle: Path, command: Command, monkeypatch: pyt
     lines = command("avatar", "validate", tiny_bundle)[0].splitlines()
     rows = [[cell.strip() for cell in re.split("[│┃]", line)[1:-1]] for line in lines if re.match("[│┃]", line)]
     assert rows == [
-        ["band", "PSNR, dB", "of the person alone", "mask IoU", "lost by quantising, dB"],
-        ["full body", "31.46", "27.50", "0.9877", "-"],
-        ["face", "28.10", "26.00", "-", "0.07"],
+        ["band", "PSNR, dB", "of the person alone", "alpha < 0.9 inside, %", "mask IoU", "lost by quantising, dB"],
+        ["full body", "31.46", "27.50", "-", "0.9877", "-"],
+        ["face", "28.10", "26.00", "2.34", "-", "0.07"],
     ]
     assert any("validation of 2026-01-02" in line for line in lines)
 

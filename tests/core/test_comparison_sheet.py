@@ -1,4 +1,4 @@
-"""Sheets of pictures side by side: which samples, in which order, how large, on which grey."""
+"""Sheets of pictures side by side: which samples, in which order, how large, before what."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import pytest
 
 pytest.importorskip("skimage")
 
+from trilane.training.backgrounds import scenes
 from trilane.training.comparison_sheet import comparison_sheet, worst_sheet
 from trilane.training.evaluate import Evaluated
 from trilane.training.image_error import ImageError
@@ -15,6 +16,7 @@ BANDS = ("far", "full_body", "upper_body", "face")
 #: Height and width of a cell.
 CELL = (256, 192)
 PAINTERS = ("float", "ort")
+ALPHA = ("alpha_inside", "alpha_edge", "alpha_outside", "see_through")
 
 
 def evaluated(band: str, number: int, psnr_db: float, shape: tuple[int, int] = (64, 32)) -> Evaluated:
@@ -24,7 +26,7 @@ def evaluated(band: str, number: int, psnr_db: float, shape: tuple[int, int] = (
         return np.full((*shape, 4), (grey, grey, grey, 255), np.uint8)
 
     def error(value: float) -> ImageError:
-        return ImageError(psnr_db=value, body_psnr_db=0.0, background=0.0, ssim=1.0, iou=1.0)
+        return ImageError(value, 0.0, {}, 0.0, ssim=1.0, iou=1.0, **dict.fromkeys(ALPHA, 0.0))
 
     pictures = {name: flat(10 * number + k) for k, name in enumerate(PAINTERS, start=1)}
     return Evaluated(number, band, flat(10 * number), pictures, {"float": error(-psnr_db), "ort": error(psnr_db)})
@@ -71,9 +73,10 @@ def test_a_large_picture_is_shrunk_into_its_cell() -> None:
         assert (cell != 128).any(axis=2).sum() == (256 * 48 if shape[0] == 512 else 16 * 192)
 
 
-def test_what_is_transparent_is_grey() -> None:
-    """Half transparent black over mid-grey is 64: round(127.5 / 2)."""
+def test_what_is_transparent_shows_the_scenery() -> None:
+    """The middle of a cell is pixel (32, 16) of a picture; black of alpha 127 lets 128 of 255 parts through."""
     sample = evaluated("far", 0, 1.0)
     sample.truth[..., 3] = 0
     sample.pictures["ort"][...] = (0, 0, 0, 127)
-    assert cells(worst_sheet([sample], ("ort",))) == [[128, 64]]
+    behind = scenes()[0][32, 16, 0]
+    assert cells(worst_sheet([sample], ("ort",))) == [[round(255 * behind), round(128 * behind)]]

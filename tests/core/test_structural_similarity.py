@@ -77,11 +77,12 @@ def test_plain_pictures_differ_by_luminance_alone() -> None:
 def test_it_is_a_term_of_the_loss_only_where_it_has_a_weight() -> None:
     rng = np.random.default_rng(2)
     output, target = (torch.from_numpy(rng.uniform(0.1, 0.9, (2, 4, 32, 32))) for _ in range(2))
-    plain, weights = loss_terms(output, target), dict.fromkeys(WEIGHTS, 0.0) | {"structure": 20.0}
-    terms = loss_terms(output.requires_grad_(), target, weights)
+    behind = torch.from_numpy(rng.uniform(0, 1, (2, 3, 32, 32)))
+    plain, weights = loss_terms(output, target, behind), dict.fromkeys(WEIGHTS, 0.0) | {"structure": 20.0}
+    terms = loss_terms(output.requires_grad_(), target, behind, weights)
     assert set(plain) == set(WEIGHTS) and set(terms) == set(WEIGHTS) | {"structure"}
     total = total_loss(terms, weights)
-    over = [each[:, :3] * each[:, 3:] + 0.5 * (1 - each[:, 3:]) for each in (output.detach(), target)]
+    over = [each[:, :3] * each[:, 3:] + behind * (1 - each[:, 3:]) for each in (output.detach(), target)]
     value = np.mean([by_numpy(*(each[k].permute(1, 2, 0).numpy() for each in over)) for k in range(2)])
     assert float(total.detach()) == pytest.approx(20 * (1 - value), rel=1e-6)
     total.backward()

@@ -104,10 +104,10 @@ def test_texture_starts_as_it_is_told_and_reads_bilinearly():
 
 
 def test_a_perfect_picture_costs_nothing():
-    target = torch.zeros(1, 4, 32, 32)
+    target, behind = torch.zeros(1, 4, 32, 32), torch.rand(1, 3, 32, 32)
     target[:, :, 8:24, 8:24] = 1.0
-    perfect = total_loss(loss_terms(target, target))
-    worse = total_loss(loss_terms(target * 0.8, target))
+    perfect = total_loss(loss_terms(target, target, behind))
+    worse = total_loss(loss_terms(target * 0.8, target, behind))
     assert float(perfect) < 0.01 < float(worse)
 
 
@@ -140,20 +140,25 @@ def test_psnr_in_the_box_and_of_the_body_alone_worked_out_by_hand():
 
 
 def test_what_is_painted_beside_the_body_counts_in_the_box_alone():
-    """One background pixel of eight is painted over grey (0.5) with 255, alpha too: a square of about 0.25 / 8."""
+    """One background pixel of eight is painted white, alpha too: before black a square of 1 / 8, before white none."""
     truth = np.zeros((5, 6, 4), np.uint8)
     truth[1:3, 1:5] = (100, 100, 100, 255)
     truth[1, 2:4, 3] = 0
     picture = truth.copy()
     picture[1, 2] = 255
     error = image_error(picture, truth)
-    assert error.psnr_db == pytest.approx(-10 * np.log10(0.25 / 8), abs=1e-6)
+    assert error.by_background["black"] == pytest.approx(-10 * np.log10(1 / 8), abs=1e-6)
+    assert error.by_background["white"] == 100.0
+    assert error.psnr_db == pytest.approx(np.mean(list(error.by_background.values())), abs=1e-9)
     assert error.body_psnr_db == 100.0, "the body itself is exact"
     assert error.iou == pytest.approx(6 / 7)
 
 
 def an_error(psnr_db, body_psnr_db, iou=1.0):
-    return ImageError(psnr_db=psnr_db, body_psnr_db=body_psnr_db, background=0.5, ssim=0.75, iou=iou)
+    before, shares = {"black": psnr_db - 2, "white": psnr_db + 2}, {"alpha_edge": 0.25, "alpha_outside": 0.125}
+    return ImageError(
+        psnr_db, body_psnr_db, before, 0.5, ssim=0.75, iou=iou, alpha_inside=iou / 8, **shares, see_through=iou / 4
+    )
 
 
 def test_a_summary_has_means_and_the_worst_sample_of_all_seeds():
@@ -165,13 +170,18 @@ def test_a_summary_has_means_and_the_worst_sample_of_all_seeds():
     ]
     facts = summary(errors)
     assert list(facts) == [
-        *("psnr_db_by_band", "body_psnr_db_by_band", "iou_by_band"),
-        *("psnr_db", "body_psnr_db", "background", "iou", "ssim"),
+        *("psnr_db_by_band", "body_psnr_db_by_band", "see_through_by_band", "iou_by_band", "psnr_db_by_background"),
+        *("psnr_db", "body_psnr_db", "see_through", "alpha_inside", "alpha_edge", "alpha_outside"),
+        *("background", "iou", "ssim"),
         *("least_psnr_db", "least_body_psnr_db", "worst", "by_seed", "samples"),
     ]
     assert facts["psnr_db_by_band"] == {"far": 32.0, "face": 21.0}
     assert facts["body_psnr_db_by_band"] == {"far": 29.0, "face": 17.0}
     assert facts["iou_by_band"] == {"far": 1.0, "face": 0.75}
+    assert facts["see_through_by_band"] == {"far": 0.25, "face": 0.1875}
+    assert facts["psnr_db_by_background"] == {"black": 24.5, "white": 28.5}
+    assert (facts["see_through"], facts["alpha_inside"]) == (0.2188, 0.1094)
+    assert (facts["alpha_edge"], facts["alpha_outside"]) == (0.25, 0.125)
     assert (facts["psnr_db"], facts["body_psnr_db"], facts["samples"]) == (26.5, 23.0, 4)
     assert (facts["background"], facts["ssim"], facts["iou"]) == (0.5, 0.75, 0.875)
     assert (facts["least_psnr_db"], facts["least_body_psnr_db"]) == (20.0, 15.0)

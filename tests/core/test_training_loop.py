@@ -17,7 +17,7 @@ pytest.importorskip("skimage")
 from trilane.errors import BadInputError  # noqa: E402
 from trilane.training import training_loop  # noqa: E402
 from trilane.training.activation_noise import add_activation_noise  # noqa: E402
-from trilane.training.losses import loss_terms, total_loss  # noqa: E402
+from trilane.training.losses import drawn_behind, loss_terms, total_loss  # noqa: E402
 from trilane.training.network import UNet  # noqa: E402
 from trilane.training.neural_texture import NeuralTexture  # noqa: E402
 from trilane.training.sample_files import U16, batches, create_group, open_groups  # noqa: E402
@@ -107,7 +107,7 @@ def trained_again(made, data, number, jitter=0.0):
                     module.train(False)
         group, index = next(streams[0 if share < 0.05 else 1])
         uv, covered, target = load_batch(group, index)
-        terms = loss_terms(mine(uv, covered), target)
+        terms = loss_terms(mine(uv, covered), target, drawn_behind(target))
         mine.zero_grad()
         total_loss(terms).backward()
         length = math.sqrt(sum(float(p.grad.double().square().sum()) for p in mine.parameters()))

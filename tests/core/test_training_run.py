@@ -265,7 +265,7 @@ def test_no_sheet_is_drawn_when_none_is_asked_for(config, calls):
 
 
 SHARED = {"minutes": 3.0, "workers": 2, "threads": 7, "batch": 9}
-LOWER = {"network_rate": 6e-4, "texture_rate": 2e-4, "small_until": 0.0, "freeze_norms_at": 0.1}
+LOWER = {"network_rate": 1e-3, "texture_rate": 3e-4, "small_until": 0.0, "freeze_norms_at": 0.1}
 
 
 @pytest.mark.usefixtures("calls")

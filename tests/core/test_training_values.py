@@ -43,13 +43,16 @@ def pictures():
     return output, target
 
 
+BEHIND = np.random.default_rng(6).uniform(0, 1, (2, 3, 24, 20))
+
+
 def terms_by_loops(output, target):
     """`loss_terms` again, pixel by pixel."""
     n, _, h, w = output.shape
     near = np.zeros((n, h, w))
     for k, y, x in np.ndindex(n, h, w):
         near[k, y, x] = target[k, 3, max(0, y - 5) : y + 6, max(0, x - 5) : x + 6].any()
-    over = [image[:, :3] * image[:, 3:] + 0.5 * (1 - image[:, 3:]) for image in (output, target)]
+    over = [image[:, :3] * image[:, 3:] + BEHIND * (1 - image[:, 3:]) for image in (output, target)]
     off = over[0] - over[1]
     pixels = 3 * near.sum() + 1
     decibels = [10 * math.log10(1 + (off[k] ** 2 * near[k]).sum() / (3 * near[k].sum() + 1) / 1e-5) for k in range(n)]
@@ -75,7 +78,7 @@ def terms_by_loops(output, target):
 
 def test_losses_are_their_formulas(pictures):
     output, target = pictures
-    terms = losses.loss_terms(torch.from_numpy(output), torch.from_numpy(target))
+    terms = losses.loss_terms(*map(torch.from_numpy, (output, target, BEHIND)))
     wanted = terms_by_loops(output, target)
     assert set(terms) == set(wanted) == set(losses.WEIGHTS)
     for name, value in wanted.items():
@@ -89,7 +92,7 @@ def test_losses_are_their_formulas(pictures):
 def test_masks_at_their_ends_cost_a_finite_amount():
     """A mask of 1 where none is wanted is taken as 1 - 1e-4, a colour of 1 likewise."""
     output, target = torch.ones(1, 4, 8, 8), torch.zeros(1, 4, 8, 8)
-    terms = losses.loss_terms(output, target)
+    terms = losses.loss_terms(output, target, torch.zeros(1, 3, 8, 8))
     assert float(terms["mask"]) == pytest.approx(-math.log(1e-4), rel=1e-3)
     assert float(terms["background"]) == pytest.approx(-math.log(1e-4), rel=1e-3)
 
@@ -348,3 +351,30 @@ def test_a_first_texture_is_colours_then_fields():
     fields = eigenfunctions(body.vertices, body.faces, 2)
     image, known = lay_out(fields, body.faces, body.uv, body.uv_faces, 16)
     np.testing.assert_allclose(texture[..., 3:][known], np.clip(image[known], -1, 1), atol=1e-6)
+
+
+def test_each_picture_of_a_batch_stands_before_a_background_of_its_own():
+    """The seed of PyTorch alone decides them, so that a training that goes on draws what it would have drawn."""
+    target = torch.zeros(32, 4, 8, 8)
+    torch.manual_seed(2)
+    first, second = losses.drawn_behind(target), losses.drawn_behind(target)
+    torch.manual_seed(2)
+    assert torch.equal(losses.drawn_behind(target), first) and not torch.equal(first, second)
+    assert first.shape == (32, 3, 8, 8)
+    drawn = {each.numpy().tobytes() for each in first}
+    plain = [each for each in first if float(each.min()) == float(each.max())]
+    assert len(drawn) == 32 - max(0, len(plain) - 2), "black and white are each one picture, all others differ"
+
+
+def test_training_sees_a_person_as_grey_as_the_one_background_that_was():
+    """Alpha of 0.7 before black and white: 0.15 in each colour of a person who fills the picture, 33.5 dB from none."""
+    target = torch.cat((torch.full((2, 3, 16, 16), 0.5), torch.ones(2, 1, 16, 16)), dim=1)
+    ghost = target.clone()
+    ghost[:, 3] = 0.7
+    behind = torch.stack((torch.zeros(3, 16, 16), torch.ones(3, 16, 16)))
+    pixels = 2 * 3 * 16 * 16
+    terms = losses.loss_terms(ghost, target, behind)
+    assert float(terms["composite"]) == pytest.approx(0.15 * 1.05 * pixels / (pixels + 1), rel=1e-5)
+    assert float(terms["decibels"]) == pytest.approx(10 * math.log10(1 + 0.15**2 / 1e-5 * 768 / 769), rel=1e-5)
+    hidden = losses.loss_terms(ghost, target, torch.full((2, 3, 16, 16), 0.5))
+    assert float(hidden["composite"]) == float(hidden["decibels"]) == 0

@@ -100,6 +100,9 @@ def figures(times):
     return {
         "psnr_db_by_band": means,
         "body_psnr_db_by_band": means,
+        "psnr_db_by_background": dict.fromkeys(("black", "white", "noise", "scenery"), mean),
+        "see_through_by_band": dict.fromkeys(means, 0.0),
+        **dict.fromkeys(("see_through", "alpha_inside", "alpha_edge", "alpha_outside"), 0.0),
         "iou_by_band": dict.fromkeys(means, 1.0),
         "psnr_db": mean,
         "body_psnr_db": mean,
@@ -160,6 +163,7 @@ def test_a_validation_by_hand(parts, tiny_bundle, tmp_path, with_float):
             "jump.bvh": f"sha256 {hashlib.sha256(b'a motion').hexdigest()}",
         },
         "psnr_db_by_band": integer["psnr_db_by_band"],
+        "psnr_db_by_background": integer["psnr_db_by_background"],
         "iou": 1.0,
         "ssim": integer["ssim"],
         "runtime": "ort",

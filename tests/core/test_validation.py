@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from trilane.apps.cli.avatar import app
 from trilane.avatars.bundle import load_bundle, write_bundle, write_manifest
-from trilane.avatars.digests import digests_of, sha256_of
+from trilane.avatars.digests import digests_of, sha256_of, with_figures_digest
 from trilane.avatars.validation import DrawnAs, accuracy_of, validation_facts
 from trilane.errors import BadInputError
 from trilane.figure_sources import NO_FIGURES
@@ -37,7 +37,8 @@ def own(tiny_bundle, tmp_path):
 
 def test_an_avatars_own_figures_are_shown_with_their_source(own):
     facts = accuracy_of(load_bundle(own), DRAWN)
-    assert list(facts) == ["source", "runtime", "size", "psnr_db_by_band", "iou", "ssim"]
+    figures = ["psnr_db_by_band", "psnr_db_by_background", "see_through", "iou", "ssim"]
+    assert list(facts) == ["source", "runtime", "size", *figures]
     assert facts["source"] == SOURCE
     assert (facts["runtime"], facts["size"]) == ("ort", "256")
     assert facts["psnr_db_by_band"] == {"full_body": PSNR_DB}
@@ -109,6 +110,16 @@ def test_a_validation_without_digests_is_of_unknown_parts(own):
     assert facts["source"] == NO_FIGURES
     assert "no digests" in facts["why"] and "trilane avatar validate" in facts["why"]
     assert "28.26" not in json.dumps([facts, validation_facts(load_bundle(own))])
+
+
+def test_figures_before_one_grey_are_not_shown(own):
+    """So measured Trilane before it had backgrounds: a person who lets the grey through had no error."""
+    bundle = load_bundle(own)
+    validation = bundle.manifest.validation.model_copy(update={"psnr_db_by_background": None})
+    write_manifest(own, bundle.manifest.model_copy(update={"validation": with_figures_digest(validation)}))
+    facts = accuracy_of(load_bundle(own), DRAWN)
+    assert facts["source"] == NO_FIGURES
+    assert "before one grey" in facts["why"] and f"trilane avatar validate {own}" in facts["why"]
 
 
 def test_an_avatar_that_was_never_validated_says_so(tiny_bundle):
@@ -240,7 +251,7 @@ def test_the_digest_of_figures_is_of_their_values_in_one_way_of_writing(own):
 
 
 def test_the_default_avatars_figures_are_those_of_its_validation():
-    assert validation_facts(load_bundle("default"))["source"] == "from the avatar's validation of 2026-11-22"
+    assert validation_facts(load_bundle("default"))["source"] == "from the avatar's validation of 2026-11-23"
 
 
 WORST = {"seed": 1, "number": 2, "band": "face", "psnr_db": 20.0, "body_psnr_db": 19.0}

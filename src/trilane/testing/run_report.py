@@ -10,6 +10,7 @@ SHOWN = {
     "size": "256",
     "psnr_db_by_band": {"face": 31.25},
     "body_psnr_db": 28.75,
+    "see_through": 0.0125,
     "iou": 0.9812,
     "samples": 96,
     "by_seed": {"1": {}, "2": {}},
