@@ -257,7 +257,7 @@ class PathShare(Record):
     """What the critical path was for most of its time (`trilane.pipeline.critical_path`).
 
     `name`: of the unit or the stage, or what it was instead. `share`: of the path. `share_low`, `share_high`: 95 %
-    interval by the scatter of this run's frames; null for fewer than 50.
+    interval by the scatter of this run's frames; null for fewer than 51.
     """
 
     name: str

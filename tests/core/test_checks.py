@@ -70,6 +70,29 @@ def test_the_rest_is_what_was_skipped_and_what_is_slow(folder: Path) -> None:
     assert "PASSED test_whole.py::test_never_seen" in done.stdout and "PASSED test_well.py::test_is_slow" in done.stdout
 
 
+ONE_WORKER = ("-p", "xdist", *checks.WORKERS, "--numprocesses", "1")
+
+
+@pytest.mark.parametrize(
+    ("workers", "end"),
+    [((), "raise KeyboardInterrupt"), (ONE_WORKER, "raise KeyboardInterrupt"), (ONE_WORKER, "os._exit(3)")],
+)
+def test_tests_that_a_run_never_came_to_are_counted(tmp_path: Path, workers: tuple[str, ...], end: str) -> None:
+    """The first fails, the second ends the run, two are left."""
+    test = tmp_path / "test_ends.py"
+    lines = ["def test_0(): assert False", f"def test_1(): {end}", "def test_2(): pass", "def test_3(): pass"]
+    test.write_text("import os\n" + "\n".join(lines))
+    found = check_tests([*workers, "-q", f"--rootdir={tmp_path}", str(test)], tmp_path / "told.json")
+    names, left = found.failures[:-1], found.failures[-1]
+    # the worker that died is its test's failure
+    assert [*map(_function, names)] == ["test_0", "test_1"][: 2 if workers else 1]
+    assert left == f"{2 if workers else 3} tests not run"
+
+
+def _function(name: str) -> str:
+    return name.rpartition("::")[2]
+
+
 def test_a_run_of_pytest_that_tells_nothing_has_failed(folder: Path) -> None:
     assert check_tests(["--no-such-option"], folder / "told.json").failures == [
         "pytest --no-such-option (exit code 4, nothing told)"

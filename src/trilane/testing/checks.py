@@ -13,15 +13,23 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
+
+import pytest
 
 BIN = Path(sys.executable).parent
 STYLE = (["ruff", "check", "."], ["ruff", "format", "--check", "."], ["mypy"])
 #: Tests share the cores, a file of them on one worker. Files that wait the longest come first, small ones at the end.
 FOLDERS = ("process", "conformance", "golden", "core")
-GROUPS = (["--numprocesses", "auto", "--dist", "loadfile", *(f"tests/{folder}" for folder in FOLDERS)],)
+#: No worker takes the place of one that died: with `loadfile` it meets the same test again, and pytest never ends.
+WORKERS = ("--numprocesses", "auto", "--dist", "loadfile", "--max-worker-restart", "0")
+GROUPS = ([*WORKERS, *(f"tests/{folder}" for folder in FOLDERS)],)
 #: Beside the packages that decide what is skipped: the tests that `make test` skipped here, for `make test-rest`.
 SKIPPED = Path(sys.prefix) / "skipped-tests.txt"
+
+
+#: Tests that this process's pytest was to run.
+COLLECTED: Final = pytest.StashKey[set[str]]()
 
 
 class Outcome(NamedTuple):
@@ -114,6 +122,15 @@ def pytest_collection_modifyitems(config: Any, items: list[Any]) -> None:
     items[:] = [item for item in items if item not in set(done)]
 
 
+def pytest_collection_finish(session: Any) -> None:
+    session.config.stash[COLLECTED] = {item.nodeid for item in session.items}
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_node_collection_finished(node: Any, ids: Sequence[str]) -> None:
+    node.config.stash[COLLECTED] = set(ids)
+
+
 def pytest_terminal_summary(terminalreporter: Any, config: Any) -> None:
     file = config.getoption("--tell")
     if file is None:
@@ -123,7 +140,11 @@ def pytest_terminal_summary(terminalreporter: Any, config: Any) -> None:
     def names(*kinds: str) -> list[str]:
         return list(dict.fromkeys(report.nodeid for kind in kinds for report in stats.get(kind, ())))
 
-    told = {"failed": names("failed", "error"), "skipped": names("skipped"), "passed": len(stats.get("passed", ()))}
+    done = names("passed", "failed", "error", "skipped", "xfailed", "xpassed")
+    missing = len(config.stash.get(COLLECTED, set()).difference(done))
+    not_run = [f"{missing} test{'s' * (missing > 1)} not run"] if missing else []
+    failed = names("failed", "error") + not_run
+    told = {"failed": failed, "skipped": names("skipped"), "passed": len(stats.get("passed", ()))}
     file.write_text(json.dumps(told), encoding="utf-8")
 
 

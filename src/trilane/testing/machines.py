@@ -212,6 +212,7 @@ def _run(row: Row, everywhere: Sequence[str], began: float) -> Outcome:
         wrapper = [word.format(first_core=machine.here.cores()[0]) for word in row.wrapper]
         KEPT.mkdir(parents=True, exist_ok=True)
         told = KEPT / f"{row.name}.json"
+        told.unlink(missing_ok=True)
         plugins = ["-p", "no:cacheprovider", "-p", "trilane.testing.checks", f"--tell={told}"]
         if row.lowest:  # an old package may use what a newer one of its own has deprecated
             plugins += ["-W", "ignore::DeprecationWarning"]
