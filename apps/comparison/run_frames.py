@@ -65,7 +65,7 @@ def read_frames(path: Path) -> RunFrames:
     """The frames that the journal at `path` tells of. Raises BadInputError for one that is none or ends too early."""
     frames = frames_of(read_journal(path))
     if frames is None:
-        raise BadInputError(path, "no presented frame", "the journal of a run", "it was cut off: run again")
+        raise BadInputError(path, "fewer than two presented frames", "two or more", "run more frames")
     return frames
 
 

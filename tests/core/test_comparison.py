@@ -374,7 +374,7 @@ def test_a_journal_that_is_cut_off_is_compared_until_there_or_refused(make: Make
     found = compare(read_side(str(base)), [read_side(str(other))])[0]
     assert any("its journal ends before the run did" in note for note in found.notes)
     (other / NAME).write_bytes(whole[:2000])
-    with pytest.raises(BadInputError, match=r"b/journal\.msgpack: found no presented frame"):
+    with pytest.raises(BadInputError, match=r"b/journal\.msgpack: found fewer than two presented frames"):
         read_side(str(other))
 
 
