@@ -83,8 +83,8 @@ class HardwareCounters:
         for name, now in self._read().items():
             before = self._before.get(name)
             if before is not None and now.running_ns > before.running_ns:
-                share = (now.running_ns - before.running_ns) / (now.enabled_ns - before.enabled_ns)
-                figures[name] = (now.value - before.value) / share
+                scale = (now.enabled_ns - before.enabled_ns) / (now.running_ns - before.running_ns)
+                figures[name] = (now.value - before.value) * scale
         return figures
 
     def close(self) -> None:

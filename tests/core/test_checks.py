@@ -66,6 +66,7 @@ def test_the_rest_is_what_was_skipped_and_what_is_slow(folder: Path) -> None:
         "failed": [],
         "skipped": ["test_well.py::test_wants_a_part"],
         "passed": 2,
+        "missing": 0,
     }
     assert "PASSED test_whole.py::test_never_seen" in done.stdout and "PASSED test_well.py::test_is_slow" in done.stdout
 

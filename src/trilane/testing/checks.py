@@ -33,11 +33,12 @@ COLLECTED: Final = pytest.StashKey[set[str]]()
 
 
 class Outcome(NamedTuple):
-    """What one check found."""
+    """What one check found. `complete`: no test was left without an answer."""
 
     failures: list[str]
     passed: int = 0
     skipped: tuple[str, ...] = ()
+    complete: bool = True
 
 
 def said(outcomes: Sequence[Outcome], seconds: float) -> str:
@@ -69,13 +70,13 @@ def check_tests(arguments: Sequence[str], told: Path) -> Outcome:
     ]
     code = subprocess.run(command, check=False).returncode
     if not told.is_file():
-        return Outcome([f"pytest {' '.join(arguments)} (exit code {code}, nothing told)"])
+        return Outcome([f"pytest {' '.join(arguments)} (exit code {code}, nothing told)"], complete=False)
     found = json.loads(told.read_text(encoding="utf-8"))
     told.unlink()
     failures = [*found["failed"]]
     if code and not failures:
         failures = [f"pytest {' '.join(arguments)} (exit code {code})"]
-    return Outcome(failures, found["passed"], tuple(found["skipped"]))
+    return Outcome(failures, found["passed"], tuple(found["skipped"]), not found["missing"])
 
 
 def main(words: Sequence[str]) -> int:
@@ -93,7 +94,7 @@ def main(words: Sequence[str]) -> int:
         extra.append(f"--only-rest={SKIPPED}")
     outcomes = [] if asked.rest else [check_style(command) for command in STYLE]
     outcomes += [check_tests([*extra, *group], told) for group in GROUPS]
-    if not (asked.slow or asked.rest):
+    if not (asked.slow or asked.rest) and all(outcome.complete for outcome in outcomes):
         lines = (f"{test}\n" for outcome in outcomes for test in outcome.skipped)
         SKIPPED.write_text("".join(lines), encoding="utf-8")
     print(said(outcomes, time.monotonic() - begin_s), flush=True)
@@ -144,7 +145,7 @@ def pytest_terminal_summary(terminalreporter: Any, config: Any) -> None:
     missing = len(config.stash.get(COLLECTED, set()).difference(done))
     not_run = [f"{missing} test{'s' * (missing > 1)} not run"] if missing else []
     failed = names("failed", "error") + not_run
-    told = {"failed": failed, "skipped": names("skipped"), "passed": len(stats.get("passed", ()))}
+    told = {"failed": failed, "skipped": names("skipped"), "passed": len(stats.get("passed", ())), "missing": missing}
     file.write_text(json.dumps(told), encoding="utf-8")
 
 

@@ -266,7 +266,8 @@ def main(words: Sequence[str] | None = None) -> int:
         outcomes.append(run_row(row, everywhere))
         print(outcomes[-1], *(f"  {failure}" for failure in outcomes[-1].failures), sep="\n", flush=True)
     print(last_line(outcomes))
-    return 1 if any(outcome.failures for outcome in outcomes) else 0
+    tried = any(not outcome.reason for outcome in outcomes)
+    return int(not tried or any(outcome.failures for outcome in outcomes))
 
 
 if __name__ == "__main__":
