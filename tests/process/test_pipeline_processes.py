@@ -191,7 +191,8 @@ def test_pipelined_hides_all_but_the_slowest(run: Run) -> None:
     sequential, pipelined = (run(pipeline, 12, policy=policy).report for policy in ("sequential", "pipelined"))
     assert pipelined.frame_time_ms.p50 * 1.4 < sequential.frame_time_ms.p50
     assert pipelined.bottleneck == "dsp"
-    assert (pipelined.efficiency or 0) > 0.8
+    work_ms = (pipelined.efficiency or 0) * pipelined.frame_time_ms.mean
+    assert work_ms > 40 * 9 / 11  # in the 11 frame times lie at least 9 whole jobs
 
 
 @pytest.mark.parametrize(("unit", "slowest"), [("cpu", "pose"), ("gpu", "raster"), ("dsp", "infer")])
