@@ -68,4 +68,4 @@ def test_arrays_whose_bytes_do_not_say_what_they_are_are_refused(array: NDArray[
     before = psutil.Process().num_fds()
     with pytest.raises(TrilaneError, match="expected numbers, times or text"):
         share_assets({"odd": array})
-    assert psutil.Process().num_fds() == before
+    assert psutil.Process().num_fds() <= before
