@@ -179,7 +179,7 @@ def by_frame(
 ) -> dict[str, Any] | None:
     """Of `frames`, one after the other, each plan's error in the avatars' boxes against the truth.
 
-    `true`: makes the true picture of a frame over its background, which is that of `behind`.
+    `true`: makes the true picture of a frame over the background that `behind` makes.
     By plan what `psnr_of_frames` says of the frames in which somebody is seen, and `worst_frame`, its number; and of
     `planned` `changes`: how often the tensor's shape is not that of the frame before, and `worst_change_db`, the least
     PSNR of these frames, None without any. None with nobody in view.

@@ -131,7 +131,7 @@ def _heads(found: Rows) -> Iterator[str]:
 
 
 def _works(found: Rows, rows: Rows, changes: Sequence[Change]) -> Iterator[str]:
-    """Stages by how many milliseconds their work has changed, but for those of which instructions say it."""
+    """Stages without counted instructions, by how many milliseconds their work has changed."""
     by_stage: dict[str, tuple[Figure, Difference]] = {}
     counted = {figure.of for figure in found if figure.measure in (INSTRUCTIONS, INSTRUCTION_TIME)}
     measure = WORK if any(figure.measure == WORK for figure in rows) else SERVICE

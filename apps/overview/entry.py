@@ -24,7 +24,7 @@ HOW_DRAWN = (
     *("size", "plan", "texture_filter", "error_budget_px", "error_budget_db", "most_side", "memory_mb"),
     *("avatars[0].bundle", "avatars[0].name"),
 )
-#: Keys of a scene whose values are told without them. The keys of every avatar are as those of the first.
+#: The overview shows the values of these keys of a scene without the key. Every avatar has the keys of the first.
 WITHOUT_KEY = ("name", "background", "output.width", "output.height", "camera.source", "avatars[0].motion")
 #: Keys of a document's `config` that are no settings, or that the row has by other names.
 NOT_SETTINGS = ("avatar_dirs", "shapes", "own_pixels", "works", "posed_vertices", "pace_ns", "units", "cuts", "record")
