@@ -249,7 +249,7 @@ class IceoryxChannel:
         import iceoryx2  # noqa: F401 - says here, in the parent, that it is not installed
 
         self._size = size
-        self._folder = tempfile.mkdtemp(prefix="iox-", dir="/tmp")
+        self._folder = tempfile.mkdtemp(prefix=f"iox-{os.getpid()}-", dir="/tmp")
         self._prefix = f"{Path(self._folder).name}_"
 
     def producer(self) -> Producer:

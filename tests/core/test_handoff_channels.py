@@ -154,7 +154,8 @@ def test_a_sample_of_iceoryx_is_written_in_place(request: pytest.FixtureRequest)
     channel = IceoryxChannel(64, None)  # type: ignore[arg-type]
     request.addfinalizer(channel.close)
     folder = Path(channel._folder)
-    assert folder.parent == Path("/tmp") and folder.name.startswith("iox-") and channel._prefix == f"{folder.name}_"  # noqa: S108
+    assert folder.parent == Path("/tmp") and folder.name.startswith(f"iox-{os.getpid()}-")  # noqa: S108
+    assert channel._prefix == f"{folder.name}_"
     consumer, producer = channel.consumer(), channel.producer()
     for value in (7, 9):
         payload = producer.buffer()
