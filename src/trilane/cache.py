@@ -21,7 +21,6 @@ from trilane.errors import BadInputError
 from trilane.writing import write_atomically
 
 ARRAYS = "arrays"
-ENTRY_FORMAT = b"2 "  # part of an entry's name: an entry of another format is never read
 MAX_ENTRIES = 64  # of arrays, some MB each; the oldest go first
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -51,9 +50,8 @@ def cached_arrays(name: str, sources: Iterable[NDArray[Any] | str], make: Callab
         return stored
     made = make()
     with contextlib.suppress(OSError, BadInputError):
-        save: Any = np.savez  # older than 2.2 it takes the option `allow_pickle` for an array and stores it
         with write_atomically(entry) as draft, draft.open("wb") as file:
-            save(file, **made)
+            np.savez(file, allow_pickle=False, **made)
         _forget_oldest(folder)
     return made
 
@@ -68,7 +66,7 @@ def _read(entry: Path) -> Arrays | None:
 
 
 def _digest(name: str, sources: Iterable[NDArray[Any] | str]) -> str:
-    digest = hashlib.blake2b(ENTRY_FORMAT + name.encode() + b"\0", digest_size=20)
+    digest = hashlib.blake2b(name.encode() + b"\0", digest_size=20)
     for source in sources:
         if isinstance(source, str):
             digest.update(source.encode() + b"\0")

@@ -53,7 +53,7 @@ def blended(tmp_path_factory: pytest.TempPathFactory) -> Path:
     random = np.random.default_rng(5)
     arrays["posedirs"] = random.normal(0, 1e-3, arrays["posedirs"].shape).astype(np.float32)
     path = tmp_path_factory.mktemp("body") / "SMPLX_NEUTRAL.npz"
-    np.savez(path, **arrays)
+    np.savez(path, allow_pickle=False, **arrays)
     return path
 
 

@@ -146,7 +146,7 @@ def test_files_that_are_no_archive(tmp_path: Path, body_arrays: Arrays) -> None:
 def test_damaged_data_is_refused(tmp_path: Path, body_arrays: Arrays) -> None:
     """A flipped byte inside an array is found by the archive's checksum."""
     path = tmp_path / "body.npz"
-    np.savez(path, **body_arrays)
+    np.savez(path, allow_pickle=False, **body_arrays)
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 0xFF
     path.write_bytes(data)

@@ -55,7 +55,7 @@ spine3 right_collar right_shoulder right_elbow right_wrist
 
 
 def loaded(tmp_path: Path, arrays: Arrays) -> Body:
-    np.savez(tmp_path / "body.npz", **arrays)
+    np.savez(tmp_path / "body.npz", allow_pickle=False, **arrays)
     return load_body(tmp_path / "body.npz")
 
 

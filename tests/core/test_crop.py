@@ -267,7 +267,7 @@ def test_standoff_widens_the_rectangle() -> None:
 
 def test_pose_blend_shapes_and_fewer_weights(tmp_path: Path, body_arrays: dict[str, NDArray[Any]]) -> None:
     """A body with pose blend shapes, drawn with 4 weights: the rectangle is that of what is drawn."""
-    np.savez(tmp_path / "body.npz", **body_arrays)
+    np.savez(tmp_path / "body.npz", allow_pickle=False, **body_arrays)
     shaped = load_body(tmp_path / "body.npz").shape()
     random = np.random.default_rng(6)
     bounds, skinner = MeshBounds(shaped, weight_count=4), CpuSkinner(shaped, 4)

@@ -34,7 +34,7 @@ def blended(tmp_path: Path, body_arrays: dict[str, NDArray[Any]]) -> ShapedBody:
     weights = random.random(body_arrays["weights"].shape) ** 8
     arrays = {**body_arrays, "weights": (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)}
     arrays["posedirs"] = random.normal(0.0, 0.002, arrays["posedirs"].shape).astype(np.float32)
-    np.savez(tmp_path / "blended.npz", **arrays)
+    np.savez(tmp_path / "blended.npz", allow_pickle=False, **arrays)
     return load_body(tmp_path / "blended.npz").shape()
 
 
@@ -160,7 +160,7 @@ def _blend_by_hand(shaped: ShapedBody, joint: int) -> F64:
 
 @pytest.fixture
 def tiny_shaped(tmp_path: Path, body_arrays: dict[str, NDArray[Any]]) -> ShapedBody:
-    np.savez(tmp_path / "tiny.npz", **body_arrays)
+    np.savez(tmp_path / "tiny.npz", allow_pickle=False, **body_arrays)
     return load_body(tmp_path / "tiny.npz").shape()
 
 

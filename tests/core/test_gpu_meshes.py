@@ -36,7 +36,7 @@ def test_the_avatars_mesh_is_the_bodys_and_is_the_same_from_the_cache(body_array
     from trilane.body.body import load_body
     from trilane.body.skin_weights import largest_weights
 
-    np.savez(tmp_path / "body.npz", **body_arrays)
+    np.savez(tmp_path / "body.npz", allow_pickle=False, **body_arrays)
     shaped = load_body(tmp_path / "body.npz").shape()
     body = shaped.body
     top = largest_weights(body.weights, 8)
@@ -54,7 +54,7 @@ def test_a_closed_body_is_closed_from_the_cache_too(
 ) -> None:
     from trilane.body.body import load_body
 
-    np.savez(tmp_path / "body.npz", **body_arrays)
+    np.savez(tmp_path / "body.npz", allow_pickle=False, **body_arrays)
     shaped = load_body(tmp_path / "body.npz").shape()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr("trilane.stages.gpu.mesh_arrays.is_closed", lambda *_: True)

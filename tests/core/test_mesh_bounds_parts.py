@@ -24,7 +24,7 @@ LENS = np.array([(1.5, 0, 0.2, 0), (0, 2.0, -0.1, 0), (0, 0, -1.02, -0.202), (0,
 @pytest.fixture
 def shaped(tmp_path: Path, body_arrays: dict[str, NDArray[Any]]) -> ShapedBody:
     """A small body with pose blend shapes."""
-    np.savez(tmp_path / "body.npz", **body_arrays)
+    np.savez(tmp_path / "body.npz", allow_pickle=False, **body_arrays)
     return load_body(tmp_path / "body.npz").shape()
 
 

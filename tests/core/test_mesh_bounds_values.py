@@ -22,7 +22,7 @@ SQUARE = np.array([[-0.01, -0.01, 0], [0.01, -0.01, 0], [0.01, 0.01, 0], [-0.01,
 @pytest.fixture
 def square(tmp_path: Path, body_arrays: dict[str, NDArray[Any]]) -> ShapedBody:
     """A square of 2 cm at the origin on the root, without pose blend shapes; joints at the origin, left_hip 1 m up."""
-    np.savez(tmp_path / "body.npz", **body_arrays)
+    np.savez(tmp_path / "body.npz", allow_pickle=False, **body_arrays)
     weights = np.zeros((4, 55), np.float32)
     weights[:, 0] = 1.0
     body = dataclasses.replace(

@@ -107,7 +107,7 @@ def test_a_new_frame_is_read_by_digest_and_encoder_and_a_repeated_one_by_neither
 
 def test_what_skinning_keeps_is_all_that_it_reads_again(body_arrays: Any, tmp_path: Path) -> None:
     """Rest positions of a block of 256 vertices, the weights and numbers of its joints, 90 vertices' blend shapes."""
-    np.savez(tmp_path / "body.npz", **body_arrays)
+    np.savez(tmp_path / "body.npz", allow_pickle=False, **body_arrays)
     shaped = load_body(tmp_path / "body.npz").shape()
     used = int((shaped.body.weights > 0).any(axis=0).sum())
     assert shaped.body.posedirs is not None and shaped.body.posedirs.dtype == np.float32

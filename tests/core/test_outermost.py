@@ -22,7 +22,7 @@ LENS = np.array([(1.5, 0, 0.2, 0), (0, 2.0, -0.1, 0), (0, 0, -1.02, -0.202), (0,
 @pytest.fixture
 def shaped(tmp_path: Path, body_arrays: dict[str, NDArray[Any]]) -> ShapedBody:
     """A small body with pose blend shapes."""
-    np.savez(tmp_path / "body.npz", **body_arrays)
+    np.savez(tmp_path / "body.npz", allow_pickle=False, **body_arrays)
     return load_body(tmp_path / "body.npz").shape()
 
 
@@ -107,7 +107,7 @@ def test_no_pose_brings_a_vertex_further_from_the_root_than_the_reach(shaped: Sh
 
 def test_the_reach_follows_the_bones_to_the_joints(tmp_path: Path, body_arrays: dict[str, NDArray[Any]]) -> None:
     """Without blend shapes, bone by bone."""
-    np.savez(tmp_path / "body.npz", **body_arrays | {"posedirs": 0 * body_arrays["posedirs"]})
+    np.savez(tmp_path / "body.npz", allow_pickle=False, **body_arrays | {"posedirs": 0 * body_arrays["posedirs"]})
     shaped = load_body(tmp_path / "body.npz").shape()
     parents, joints = shaped.body.parents, shaped.joints
     longest = 0.0

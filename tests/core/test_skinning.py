@@ -22,7 +22,7 @@ Arrays = dict[str, NDArray[Any]]
 
 @pytest.fixture
 def shaped(tmp_path: Path, body_arrays: Arrays) -> ShapedBody:
-    np.savez(tmp_path / "body.npz", **body_arrays)
+    np.savez(tmp_path / "body.npz", allow_pickle=False, **body_arrays)
     return load_body(tmp_path / "body.npz").shape()
 
 
