@@ -24,6 +24,7 @@ from trilane import machine
 from trilane.apps.run_folder import RunFolder
 from trilane.cache import cache_dir
 from trilane.compiled import form
+from trilane.hw_profiles.load import load_profile
 from trilane.pipeline.hardware_counters import availability
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.stages.dsp.runtime import installed
@@ -97,9 +98,13 @@ def test_path() -> None:
 
 
 def test_c_locale(tmp_path: Path) -> None:
+    """And a user's file is UTF-8 all the same."""
     assert locale.getlocale(locale.LC_CTYPE) == (None, None)
     with (tmp_path / "text").open("w") as file, pytest.raises(UnicodeEncodeError):
         file.write("ü")
+    mine = tmp_path / "mine.toml"
+    mine.write_text('extends = "snapdragon-888"\nname = "mine"\ntitle = "Prüfstand"\n', encoding="utf-8")
+    assert load_profile(mine).title == "Prüfstand"
 
 
 def test_time_zone() -> None:
