@@ -1,0 +1,85 @@
+"""Which stage's slowing costs a run the most frame time: that must be the one that the run names as its bound.
+
+Each stage in turn takes SHARE more CPU time in every job: its unit's thread goes on computing when the job is done.
+The runs take turns, in another order each round. By hand, on a quiet machine:
+
+    python tests/process/slowed_stages.py OUT ROUNDS -- trilane run --frames 200 --baseline 0 --no-video
+
+prints for each stage the median of frame time over that of the run beside it in which nothing is slowed, and the bound
+that those runs name. OUT: a folder for the runs, which is removed at the end.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import statistics
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+SHARE = 0.2
+#: Python imports a module of this name when it starts, in the units' processes too.
+HOOK = """
+import os, time
+from trilane.pipeline.bound_stage import BoundStage
+
+run = BoundStage.run
+
+def slowed(self, *arguments, **named):
+    if self.name != os.environ["SLOWED_STAGE"]:
+        return run(self, *arguments, **named)
+    begin_ns = time.process_time_ns()
+    metrics = run(self, *arguments, **named)
+    end_ns = time.process_time_ns()
+    while time.process_time_ns() < end_ns + {share} * (end_ns - begin_ns):
+        pass
+    return metrics
+
+BoundStage.run = slowed
+"""
+
+
+def run(folder: Path, command: list[str], stage: str) -> dict[str, Any]:
+    """The report of one run in which `stage` is slowed; "": none is."""
+    out = folder / "run"
+    path = os.pathsep.join(filter(None, (str(folder), os.environ.get("PYTHONPATH"))))
+    environment = {**os.environ, "PYTHONPATH": path, "SLOWED_STAGE": stage}
+    subprocess.run([*command, "--out", str(out)], env=environment, check=True, capture_output=True)
+    report: dict[str, Any] = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    shutil.rmtree(out)
+    return report
+
+
+def main(folder: Path, rounds: int, command: list[str]) -> None:
+    folder.mkdir()
+    (folder / "sitecustomize.py").write_text(HOOK.format(share=SHARE), encoding="utf-8")
+    stages = [*run(folder, command, "")["stages"]]
+    cost: dict[str, list[float]] = {stage: [] for stage in stages}
+    grown: dict[str, list[float]] = {stage: [] for stage in stages}
+    plains = []
+    for number in range(rounds):
+        order = random.Random(number).sample(stages, len(stages))
+        for stage in order:
+            plain, slow = run(folder, command, ""), run(folder, command, stage)
+            plains.append(plain)
+            cost[stage].append(slow["frame_time_ms"]["mean"] / plain["frame_time_ms"]["mean"] - 1)
+            cpu = [report["stages"][stage]["cpu_ms"]["mean"] for report in (slow, plain)]
+            grown[stage].append(cpu[0] / cpu[1] - 1)
+    for stage in stages:
+        each = " ".join(f"{value:+.3f}" for value in cost[stage])
+        more = statistics.median(grown[stage])
+        print(f"{stage:10} CPU time {more:+.1%}  frame time {statistics.median(cost[stage]):+.1%}  ({each})")
+    print("costs most:", max(stages, key=lambda stage: statistics.median(cost[stage])))
+    named = [report["bound"]["stage"]["name"] for report in plains]
+    print("named:", {name: named.count(name) for name in sorted(set(named))})
+    print(f"other programs: {statistics.median(report['other_programs'] for report in plains):.1%} of the cores")
+    shutil.rmtree(folder)
+
+
+if __name__ == "__main__":
+    place, turns, _, *words = sys.argv[1:]
+    main(Path(place), int(turns), words)
