@@ -70,8 +70,8 @@ def measure(
     `rule_low`, `rule_high`: its interval. `rank_correlation`: Spearman's, of predicted and tried times of all.
     `predicted_over_tried`, `predicted_least`, `predicted_largest`: median, least and largest ratio of all. `others`:
     share of the cores that other programs had in the further rounds: with more than a tenth the row says little.
-    `run_ms`, `rule_run_ms`, `core_efficiency`, `efficiency`, `rule_core_efficiency`: medians of `runs` whole runs of
-    `frames` frames each, in turns. `took_s`: a run's rehearsal and trial. `times`: what was measured first.
+    `run_ms`, `rule_run_ms`, `machine_efficiency`, `efficiency`, `rule_machine_efficiency`: medians of `runs` whole
+    runs of `frames` frames each, in turns. `took_s`: a run's rehearsal and trial. `times`: what was measured first.
 
     `virtual`: other numbers of cores, by the profile `host` in virtual time: `frame_ms` is computed by the scheduler,
     for every placement that virtual time knows.
@@ -187,9 +187,9 @@ class _Trial:
             "others": self._others,
             "run_ms": median(run.frame_time_ms.mean for run in self._runs["chosen"]),
             "rule_run_ms": median(run.frame_time_ms.mean for run in self._runs["rule"]),
-            "core_efficiency": median(run.core_efficiency or 0.0 for run in self._runs["chosen"]),
+            "machine_efficiency": median(run.machine_efficiency or 0.0 for run in self._runs["chosen"]),
             "efficiency": median(run.efficiency or 0.0 for run in self._runs["chosen"]),
-            "rule_core_efficiency": median(run.core_efficiency or 0.0 for run in self._runs["rule"]),
+            "rule_machine_efficiency": median(run.machine_efficiency or 0.0 for run in self._runs["rule"]),
             "took_s": self._took_s,
         }
 

@@ -51,9 +51,9 @@ def trial(monkeypatch: pytest.MonkeyPatch) -> Any:
 
     def run(_self: Any, where: Any) -> Any:
         asked.append(name_of(where))
-        frame_ms, core_efficiency, efficiency = RUNS[name_of(where)][asked.count(name_of(where)) - 1]
+        frame_ms, machine_efficiency, efficiency = RUNS[name_of(where)][asked.count(name_of(where)) - 1]
         mean = SimpleNamespace(mean=frame_ms)
-        return SimpleNamespace(frame_time_ms=mean, core_efficiency=core_efficiency, efficiency=efficiency)
+        return SimpleNamespace(frame_time_ms=mean, machine_efficiency=machine_efficiency, efficiency=efficiency)
 
     found = [Ranked(each, ms * 1_000_000) for each, ms in ((A, 9), (B, 10), (C, 11))]
     monkeypatch.setattr(placement, "rule_placement", lambda cores: RULE if cores == (0, 1) else {})
@@ -101,9 +101,9 @@ def test_the_chosen_placement_is_set_against_the_best_other_and_the_rules(trial:
         "others": pytest.approx(0.2),
         "run_ms": 12.0,
         "rule_run_ms": 26.0,
-        "core_efficiency": pytest.approx(0.05),  # nothing, and 0.1
+        "machine_efficiency": pytest.approx(0.05),  # nothing, and 0.1
         "efficiency": pytest.approx(0.5),
-        "rule_core_efficiency": pytest.approx(0.3),
+        "rule_machine_efficiency": pytest.approx(0.3),
         "took_s": 2.5,
     }
     assert trial.made.times() == [{"unit": "cpu", "threads": 1, "ms": 2.0, "core_ms": 1.5}]
