@@ -68,12 +68,17 @@ def measured(folder: Path) -> tuple[RunMetrics, dict[str, float], dict[str, floa
 
 
 def test_the_efficiencies_are_those_that_are_seen_from_outside(tmp_path: Path) -> None:
-    """However busy the machine is. A process has a little CPU time between its jobs, which is no work."""
+    """However busy the machine is. The kernel counts what a process has between its jobs as well, which is no work.
+
+    With many programs beside it that is several percent: each time that a unit gets its core again costs it a little.
+    """
     report, of_kernel, of_jobs = measured(tmp_path)
+    more = [row.cpu_s / row.cpu_in_jobs_s for row in report.units.values() if row.cpu_s and row.cpu_in_jobs_s]
+    assert len(more) == 3
     for key in KEYS:
         found = getattr(report, key)
         assert found == pytest.approx(of_jobs[key], rel=0.03)
-        assert found == pytest.approx(of_kernel[key], rel=0.03)
+        assert 0.97 * min(more) * found <= of_kernel[key] <= 1.03 * max(more) * found
         assert found <= 1
     # a and c are on one core: 20 ms of the 31 that a frame takes two cores
     if len(CORES) > 1:
