@@ -221,7 +221,8 @@ class Prediction:
     """What a hardware profile says of an application or a network; every figure is computed.
 
     `document`: the keys of `trilane predict --json`.
-    `frame_ms`: time of a frame; `low_ms`, `high_ms`: where it is with a probability of 80 %.
+    `frame_ms`: time of a frame; `low_ms`, `high_ms`: where it is with a probability of 80 %, None where
+    nothing was measured of this machine.
     `latency_ms`: None of a network by itself.
     `power_w`: of the whole device.
     """
@@ -230,8 +231,8 @@ class Prediction:
     profile: str
     what: str
     frame_ms: float
-    low_ms: float
-    high_ms: float
+    low_ms: float | None
+    high_ms: float | None
     latency_ms: float | None
     power_w: float
 
@@ -253,8 +254,9 @@ class Prediction:
 
     def _repr_html_(self) -> str:
         busy = ", ".join(f"{unit} {row['busy']:.0%}" for unit, row in self.units.items())
+        around = "" if self.low_ms is None else f" (80 %: {self.low_ms:.2f} to {self.high_ms:.2f})"
         rows = {
-            "frame time": f"{self.frame_ms:.2f} ms (80 %: {self.low_ms:.2f} to {self.high_ms:.2f})",
+            "frame time": f"{self.frame_ms:.2f} ms{around}",
             "rate": f"{self.fps:.1f} frames a second{', as the display shows them' if self.is_display_capped else ''}",
             "latency": "" if self.latency_ms is None else f"{self.latency_ms:.1f} ms",
             "power": f"{self.power_w:.1f} W",
@@ -275,7 +277,7 @@ def predict(
     size: int | str = 512,
     channels: int = 16,
     runtime: str = "dsp",
-    policy: str = "reference",
+    policy: str | None = None,
     edge: str | None = None,
     fps: float | None = None,
     power_limit_w: float | None = None,
@@ -311,7 +313,7 @@ def predict(
     unit, named = asked.unit_of(runtime), None if avatar is None else str(avatar)
     chip, described = asked.network_of(chip, files, {}, named, "packed", unit, None)
     counted = described or asked.reference_of(encoder, norm, str(size), channels, "packed")
-    plan = Plan(counted, unit, asked.variant_of(policy, edge, 1, fps))
+    plan = Plan(counted, unit, asked.variant_of(policy or asked.usual_policy(str(profile)), edge, 1, fps))
     answer = asked.answer_of(chip, plan, cap, minutes, None, False, wanted)
     frame, what = answer["frame_time_ms"], str(avatar or network or f"{encoder}, {size}")
     times = (frame["mean"], frame["low"], frame["high"])

@@ -94,7 +94,7 @@ def predict_pipelines(
         raise BadInputError("options", f"{names} beside a scene", "none of them", "the scene says so itself")
     if joined.turns not in TURNS:
         raise BadInputError("--turns", repr(joined.turns), " or ".join(TURNS))
-    chip, variant = load_runnable(on.profile), _variant(joined.policy if "policy" in typed else "", joined.edge)
+    chip, variant = load_runnable(on.profile), _variant(joined.policy, joined.edge)
     with spinner("predicting"):
         found = tenants([scene, *beside], variant)
         answer = predict_beside(chip, found, on.performance_profile, on.minutes, on.governor, joined.turns)
