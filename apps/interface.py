@@ -283,6 +283,7 @@ def predict(
     power_limit_w: float | None = None,
     minutes: float = 0.0,
     performance_profile: str | None = None,
+    on_message: Callable[[str], None] | None = None,
 ) -> Prediction:
     """Predict frame time, idleness, heat and energy on a chip.
 
@@ -290,6 +291,7 @@ def predict(
     name.
     `avatar`: the application with this avatar's network. `network`: an ONNX file by itself, or with `application` in
     the avatar's application. Without either, the application with a network of `encoder`, `norm`, `size`, `channels`.
+    `on_message(text)`: is told before the profile `host`, this machine, is measured, which may take half a minute.
     Raises BadInputError.
     """
     from trilane.apps import asked_prediction as asked
@@ -304,14 +306,14 @@ def predict(
     cap = performance_profile or asked.usual_cap(str(profile), bare=bare)
     _check_name("performance_profile", cap, PERFORMANCE_PROFILES)
     chip, wanted = load_runnable(str(profile)), asked.wanted_of(fps, power_limit_w)
-    files = [] if network is None else [Path(network)]
+    files, say = [] if network is None else [Path(network)], on_message or (lambda _: None)
     if bare:
         on = (asked.unit_of(runtime, "cpu"), None, None)
-        (answer,) = asked.predict_networks(chip, files, {}, on, (cap, minutes, None, wanted))
+        (answer,) = asked.predict_networks(chip, files, {}, on, (cap, minutes, None, wanted), say)
         times = (answer["network_ms"], answer["low_ms"], answer["high_ms"])
         return Prediction(answer, chip.name, str(network), *times, None, answer["power"]["w"])
     unit, named = asked.unit_of(runtime), None if avatar is None else str(avatar)
-    chip, described = asked.network_of(chip, files, {}, named, "packed", unit, None)
+    chip, described = asked.network_of(chip, files, {}, named, "packed", unit, None, say)
     counted = described or asked.reference_of(encoder, norm, str(size), channels, "packed")
     plan = Plan(counted, unit, asked.variant_of(policy or asked.usual_policy(str(profile)), edge, 1, fps))
     answer = asked.answer_of(chip, plan, cap, minutes, None, False, wanted)

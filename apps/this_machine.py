@@ -10,10 +10,10 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from statistics import median
 
-from trilane.avatars.bundle import load_bundle
+from trilane.apps.beside import NETWORK_ENDING, asked
 from trilane.avatars.network_reshape import reshaped
 from trilane.errors import TrilaneError
-from trilane.hw_profiles.graph_file import GraphFile
+from trilane.hw_profiles.graph_file import GraphFile, read_graph
 from trilane.hw_profiles.host import usable_cores
 from trilane.hw_profiles.measured_host import error_of, with_network, with_stages
 from trilane.hw_profiles.network_time import price
@@ -23,6 +23,7 @@ from trilane.hw_profiles.placed_host import NETWORK
 from trilane.hw_profiles.placement_facts import NS_PER_MS
 from trilane.hw_profiles.schema import Profile
 from trilane.pipeline.unit_starter import UnitStarter
+from trilane.stages.avatar_assets import network_of
 from trilane.stages.configure import Request, configure, requested_runtime
 from trilane.stages.dsp.bare_calls import calls_of
 from trilane.stages.factories import PRELOAD
@@ -43,10 +44,20 @@ def with_avatar(chip: Profile, avatar: str, say: Say) -> tuple[Profile, Network]
 
     `say`: is told what takes time, and what cannot be measured. Raises BadInputError for what is no avatar.
     """
-    checked = configure(Request(avatar=avatar), Path.cwd())
-    file, (height, width) = load_bundle(avatar).read_network(), one_shape(checked.config)
+    measured, network = with_run(chip, Request(avatar=avatar), say)
+    return measured, network._replace(facts={"avatar": avatar})
+
+
+def with_run(chip: Profile, request: Request, say: Say) -> tuple[Profile, Network]:
+    """`chip`, this machine, with what a run that was asked for is placed by, and the network of its usual tensor.
+
+    Its avatars share the tensor; each has an equal part of the time of their poses. `say`: as of `with_avatar`. Raises
+    BadInputError for what cannot be run.
+    """
+    checked = configure(request, Path.cwd())
+    file, (height, width) = network_of(checked.assets), one_shape(checked.config)
     work = count_work(reshaped(file, height, width).model)
-    network = Network({"avatar": avatar}, height, width, file.channels, "packed", work)
+    network = Network({"scene": request.scene}, height, width, file.channels, "packed", work)
     try:
         with UnitStarter(PRELOAD) as starter:
             found, at = rehearsed(checked, starter, str(gl_facts()), lambda _: say(MEASURING.format("the stages")))
@@ -56,7 +67,15 @@ def with_avatar(chip: Profile, avatar: str, say: Say) -> tuple[Profile, Network]
     ms = {threads: work.serial_ns / NS_PER_MS for threads, work in found.times[NETWORK].items()}
     frames = [sum(frame) for frame in zip(*found.took_ns.values(), strict=True)]
     measured = with_network(chip, network.work, ms, error_of(frames), said)
-    return with_stages(measured, network, found.took_ns, said), network
+    return with_stages(measured, network, found.took_ns, said, len(checked.config.avatar_dirs)), network
+
+
+def with_first(chip: Profile, text: str, say: Say) -> Profile:
+    """`chip`, this machine, with what was measured of the first of several pipelines, as it was typed."""
+    what = asked(text).what
+    if what.endswith(NETWORK_ENDING):
+        return with_file(chip, read_graph(Path(what)), {}, say)
+    return with_run(chip, Request(what), say)[0]
 
 
 def with_file_in_application(chip: Profile, graph: GraphFile, shapes: Mapping[str, Sequence[int]], say: Say) -> Profile:

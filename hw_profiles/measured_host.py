@@ -53,21 +53,24 @@ def with_network(profile: Profile, work: Work, ms: Mapping[int, float], error: f
         threads: took / time_on(with_threads(unit, threads), memory, work).total_ms for threads, took in ms.items()
     }
     measured = unit.model_copy(update={"measured": Measured(slower=slower, error=error, said=said)})
-    units = {**profile.units, NETWORK: with_threads(measured, min(slower))}
+    threads = unit.threads if unit.threads in slower else min(slower)
+    units = {**profile.units, NETWORK: with_threads(measured, threads)}
     return profile.model_copy(update={"units": units, "memory": memory})
 
 
-def with_stages(profile: Profile, network: Network, took_ns: Mapping[str, Sequence[int]], said: str) -> Profile:
+def with_stages(
+    profile: Profile, network: Network, took_ns: Mapping[str, Sequence[int]], said: str, avatars: int = 1
+) -> Profile:
     """`profile` with the times of the stages beside the network; the medians over the frames count.
 
-    `network`: whose tensor they had. `took_ns`: of each stage, frame by frame. The scheduler works on the cores of the
-    first and the last stage; what it takes for a frame is added to these, half each.
+    `network`: whose tensor they had. `took_ns`: of each stage, frame by frame. `avatars`: that were posed. The
+    scheduler works on the cores of the first and the last stage; half of what it takes for a frame is added to each.
     """
     ms = {name: median(each) / NS_PER_MS for name, each in took_ns.items()}
     scheduler_ms = len(ms) * SCHEDULER_NS / NS_PER_MS / 2
     drawn = network.pixels * -(-network.channels // CHANNELS_PER_PASS)
     costs = {
-        "pose_ms": ms["pose"] + scheduler_ms,
+        "pose_ms": (ms["pose"] + scheduler_ms) / avatars,
         "raster_ns_per_vertex": 0.0,
         "raster_ns_per_pixel": ms["raster"] * NS_PER_MS / drawn,
         "readback_ns_per_byte": 0.0,

@@ -27,7 +27,7 @@ from trilane.apps.asked_prediction import (
 )
 from trilane.apps.cli.beside import BesideOption, Joined, OnChip, SceneToPredict, TurnsOption, predict_pipelines
 from trilane.apps.cli.commands import Commands, given
-from trilane.apps.cli.console import stderr_console
+from trilane.apps.cli.console import say, stderr_console
 from trilane.apps.cli.options import (
     ChannelsOption,
     EncoderOption,
@@ -204,11 +204,9 @@ def predict(
     if bare:
         on = (unit_of(runtime, "cpu"), precision_of(precision), engine_runtime_of(engine_runtime))
         over = (performance_profile, minutes, governor, wanted)
-        show_networks(chip, over, predict_networks(chip, networks, shapes, on, over, _say), json)
+        show_networks(chip, over, predict_networks(chip, networks, shapes, on, over, say), json)
         return
-    chip, described = network_of(
-        chip, networks, shapes, avatar, layout, unit_of(runtime), precision_of(precision), _say
-    )
+    chip, described = network_of(chip, networks, shapes, avatar, layout, unit_of(runtime), precision_of(precision), say)
     plan = Plan(described or reference_of(encoder, norm, size, channels, layout), unit_of(runtime), variant, gpu_share)
     answer = answer_of(chip, plan, performance_profile, minutes, governor, what_if, wanted)
     if plot is not None:
@@ -216,10 +214,6 @@ def predict(
     if trace is not None:
         _write_trace(chip, plan, performance_profile, wanted, answer, trace)
     show_answer(answer, json)
-
-
-def _say(text: str) -> None:
-    stderr_console().print(text, soft_wrap=True)
 
 
 def _refuse_ignored(ctx: typer.Context, *, bare: bool) -> None:

@@ -242,7 +242,7 @@ def test_what_cannot_be_measured_stays_as_it_is_and_is_said(
 
 
 @pytest.fixture
-def rehearsed(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+def rehearsed(tiny_bundle: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """A rehearsal of three frames whose network is of 96x64; what it was asked is under `asked`."""
     asked: dict[str, Any] = {}
     one = [1_000_000] * 3
@@ -251,7 +251,8 @@ def rehearsed(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
     def configure(request: Any, _: Path) -> Any:
         asked["request"] = request
-        return SimpleNamespace(config=SimpleNamespace(runtime="ort"))
+        assets = load_bundle(tiny_bundle).read_network()
+        return SimpleNamespace(config=SimpleNamespace(runtime="ort", avatar_dirs=(1,)), assets=assets)
 
     def rehearse(_checked: Any, _starter: Any, driver: str, say: Any) -> Any:
         asked["driver"] = driver
@@ -261,6 +262,7 @@ def rehearsed(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         return Rehearsed(times, took_ns), "noon"
 
     monkeypatch.setattr(this_machine, "configure", configure)
+    monkeypatch.setattr(this_machine, "network_of", lambda assets: assets)
     monkeypatch.setattr(this_machine, "rehearsed", rehearse)
     monkeypatch.setattr(this_machine, "one_shape", lambda _: (96, 64))
     monkeypatch.setattr(this_machine, "gl_facts", lambda: {"vendor": "Mesa"})
@@ -296,6 +298,15 @@ def test_a_file_in_the_application_has_its_own_calls_and_the_stages_of_the_defau
     rehearsed["fails"] = True
     host = load_profile("host")
     assert this_machine.with_file_in_application(host, graph, {}, lambda _: None) == host
+
+
+@pytest.mark.usefixtures("told")
+def test_of_several_pipelines_the_first_is_measured(rehearsed: Any, measured: list[Any], network: Path) -> None:
+    host = load_profile("host")
+    assert this_machine.with_first(host, f"{network}@12", lambda _: None).units["dsp"].measured is not None
+    assert len(measured) == 1 and "request" not in rehearsed
+    assert this_machine.with_first(host, "crowd@12", lambda _: None).units["dsp"].measured is not None
+    assert rehearsed["request"].scene == "crowd" and len(measured) == 1
 
 
 @pytest.mark.parametrize(
