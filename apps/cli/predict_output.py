@@ -150,8 +150,8 @@ def _print_wanted(console: Console, answer: dict[str, Any]) -> None:
 
 def _reserve(rate: dict[str, Any]) -> str:
     if rate["holds"]:
-        ends = (None if rate[key] is None else 100 * rate[key] for key in ("reserve_low", "reserve_high"))
-        return f"reserve {100 * rate['reserve']:.0f} % of a frame's time{_span(*ends, '.0f', ' %')}"
+        low, high = (None if rate[key] is None else 100 * rate[key] for key in ("reserve_low", "reserve_high"))
+        return f"reserve {100 * rate['reserve']:.0f} % of a frame's time{_span(low, high, '.0f', ' %')}"
     most, least = (None if rate[key] is None else 1 - rate[key] for key in ("reserve_low", "reserve_high"))
     return f"needs {1 - rate['reserve']:.2f} times a frame's time{_span(least, most, '.2f')}"
 
