@@ -289,7 +289,8 @@ def _row_predictions(profile: Profile, network: Network, corners: Corners, varia
         predictions |= {f"bench_{runtime}_ms": alone.total_ms, f"app_{runtime}_ms": frame}
         predictions |= {f"app_{runtime}_ms_min": low, f"app_{runtime}_ms_max": high}
         predictions[f"expected_error_{runtime}"] = errors[-1]
-    return {**predictions, "confidence": max(0.0, 1 - _mean(errors))}
+    answer = {**predictions, "confidence": max(0.0, 1 - _mean(errors))}
+    return with_known_intervals(profile, RUNTIMES[-1], answer) if profile.name == HOST else answer
 
 
 def _cells(row: Row) -> dict[str, Any]:

@@ -44,7 +44,8 @@ def show_table(profile: str, performance_profile: str, answers: list[dict[str, A
         return
     table = Table("encoder", "norm", "size", "ch", "layout", *SHOWN)
     for row in answers:
-        figures = (*(f"{row[key]:.1f}" for key in SHOWN[:-1]), f"{row['confidence']:.2f}")
+        confidence = "-" if row["confidence"] is None else f"{row['confidence']:.2f}"
+        figures = (*(f"{row[key]:.1f}" for key in SHOWN[:-1]), confidence)
         table.add_row(*(str(row[key]) for key in KEYS), *figures)
     stdout_console().print(table)
 

@@ -9,13 +9,14 @@ import pytest
 
 from trilane.hw_profiles.application import Plan, Variant, stage_times_ms
 from trilane.hw_profiles.bare_network import predict_network
+from trilane.hw_profiles.configuration_table import Row
 from trilane.hw_profiles.graph_file import GraphFile
 from trilane.hw_profiles.load import load_profile
 from trilane.hw_profiles.measured_host import MODEL_ERROR, UNMEASURED, error_of, with_network, with_stages
 from trilane.hw_profiles.network_time import price
 from trilane.hw_profiles.performance_profiles import corners_of
 from trilane.hw_profiles.placed_host import place_units, with_threads
-from trilane.hw_profiles.predict import predict, what_if
+from trilane.hw_profiles.predict import predict, predict_table, what_if
 from trilane.hw_profiles.rates import Wanted
 from trilane.hw_profiles.reference_networks import NetworkSpec, reference_network
 from trilane.hw_profiles.schema import Profile
@@ -172,3 +173,14 @@ def test_alternatives_and_longer_times_are_of_the_measured_profile() -> None:
     rows = what_if(measured(), NETWORK, "dsp", BURST)
     (row,) = [each for each in rows if each["name"] == "one frame at a time"]
     assert row["frame_ms"] == pytest.approx(13.5, rel=0.01)
+
+
+def test_a_table_says_nothing_of_how_sure_it_is_of_this_machine() -> None:
+    spec = NetworkSpec("resnet18", "batch", 64, 96, 10)
+    of_host, of_chip = (
+        next(iter(predict_table(load_profile(name), [Row("rows.csv: line 2", {}, spec)])))
+        for name in ("host", "snapdragon-888")
+    )
+    unsure = {"confidence", "expected_error_gpu", "expected_error_dsp"}
+    assert {key for key, value in of_host.items() if value is None} == unsure
+    assert all(of_chip[key] > 0 for key in unsure) and of_host.keys() == of_chip.keys()
