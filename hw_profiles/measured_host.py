@@ -26,8 +26,18 @@ from trilane.units import UnitName
 MODEL_ERROR = 0.08
 #: Keys of intervals, and of what stands for one.
 OF_TIMES = frozenset(
-    """low high low_ms high_ms reserve_low reserve_high
-    confidence expected_error expected_error_gpu expected_error_dsp""".split()
+    [
+        "low",
+        "high",
+        "low_ms",
+        "high_ms",
+        "reserve_low",
+        "reserve_high",
+        "confidence",
+        "expected_error",
+        "expected_error_gpu",
+        "expected_error_dsp",
+    ]
 )
 OF_POWER = frozenset(["low_w", "high_w", "low_fps", "high_fps"])
 UNMEASURED = "of this machine are cores, clock and instructions; its speeds are assumed, so there is no interval"

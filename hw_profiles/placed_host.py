@@ -89,7 +89,7 @@ def _times(profile: Profile, plan: Plan, corners: Corners, cores: int, given: Pl
         counts[unit] |= {place.threads for name, place in given.items() if name == unit}
     times: dict[str, dict[int, Work]] = {unit: {} for unit in UNITS}
     for unit, threads in ((unit, each) for unit, of in counts.items() for each in sorted(of)):
-        network = with_threads(profile.units[NETWORK], threads if unit == NETWORK else 1)
+        network = with_threads(profile.units[NETWORK], threads) if unit == NETWORK else profile.units[NETWORK]
         threaded = profile.model_copy(update={"units": {**profile.units, NETWORK: network}})
         stages = stage_times_ms(threaded, plan, corners)
         own = [ms / plan.variant.batch for (_, other), ms in stages.items() if other == unit]

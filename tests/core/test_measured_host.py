@@ -130,15 +130,14 @@ def test_a_display_bounds_the_interval() -> None:
 def test_what_was_not_measured_has_no_interval(runtime: Any) -> None:
     """Neither of times nor of powers, and no confidence; the words of a rate say whether it holds and no more."""
     host = load_profile("host") if runtime == "dsp" else measured()
-    answer = predict(host, Plan(NETWORK, runtime, PIPELINED), BURST, wanted=Wanted(1.0, 900.0))
+    answer = predict(host, Plan(NETWORK, runtime, PIPELINED), BURST, wanted=Wanted(1.0))
     assert [answer["frame_time_ms"][key] for key in ("low", "high")] == [None, None]
     assert [answer["network"][key] for key in ("low_ms", "high_ms")] == [None, None]
     assert answer["expected_error"] is answer["confidence"] is None
-    rate, limit = answer["rate"], answer["power_limit"]
+    rate = answer["rate"]
     assert (rate["words"], rate["reserve_low"], rate["reserve_high"]) == ("holds", None, None)
-    assert (limit["low_fps"], limit["high_fps"]) == (None, None) and limit["fps"] > 0
     assert UNMEASURED in answer["notes"]
-    chip = predict(load_profile("snapdragon-888"), Plan(NETWORK, runtime, PIPELINED), BURST, wanted=Wanted(1.0, 900.0))
+    chip = predict(load_profile("snapdragon-888"), Plan(NETWORK, runtime, PIPELINED), BURST, wanted=Wanted(1.0))
     assert "slow end" in chip["rate"]["words"] and chip["power"]["low_w"] > 0 and chip["confidence"] > 0
 
 
@@ -148,7 +147,9 @@ def test_a_network_by_itself_has_its_measured_time_or_no_interval() -> None:
     assert answer["network_ms"] == pytest.approx(6.5) and answer["why"] == [SAID]
     assert answer["low_ms"] == pytest.approx(6.5 / math.exp(0.12816))
     assert sum(row["share"] for row in answer["operators"]) == pytest.approx(1 - answer["job_ms"] / 6.5)
-    plain = predict_network(load_profile("host"), graph, "dsp")
+    plain = predict_network(load_profile("host"), graph, "dsp", wanted=Wanted(1.0, 900.0))
+    limit = plain["power_limit"]
+    assert limit["low_fps"] is limit["high_fps"] is None and limit["fps"] > 0 and plain["rate"]["words"] == "holds"
     assert plain["low_ms"] is plain["high_ms"] is None and plain["why"] == [UNMEASURED]
     on_gpu = predict_network(measured(), graph, "gpu")
     assert on_gpu["low_ms"] is None and on_gpu["why"] == [UNMEASURED], "only the unit for networks is measured"
@@ -161,11 +162,12 @@ def test_units_are_placed_by_the_measured_times() -> None:
     def threads(**ms: float) -> set[int]:
         profile = measured(**ms)
         found = place_units(profile, plan, corners_of(profile, BURST), cores).found
-        assert {each.placement["dsp"].threads for each in found} == {int(name[1:]) for name in ms}
+        assert {each.placement["dsp"].threads for each in found} <= {int(name[1:]) for name in ms}
         return {found[0].placement["dsp"].threads}
 
     assert threads(t1=20.0, t2=11.0) == {2}
     assert threads(t1=20.0, t2=21.0) == {1}
+    assert threads(t2=20.0, t4=21.0) == {2}
 
 
 def test_alternatives_and_longer_times_are_of_the_measured_profile() -> None:
