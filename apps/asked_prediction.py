@@ -33,7 +33,7 @@ def usual_cap(profile: str, *, bare: bool) -> str:
 
 
 def usual_policy(profile: str) -> str:
-    """The policy where none is asked for: that of the published application, and on this machine that of a run."""
+    """The policy where none is asked for: a run's on this machine, else the published application's."""
     return "pipelined" if profile == HOST else "reference"
 
 

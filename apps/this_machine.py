@@ -81,7 +81,7 @@ def with_first(chip: Profile, text: str, say: Say) -> Profile:
 def with_file_in_application(chip: Profile, graph: GraphFile, shapes: Mapping[str, Sequence[int]], say: Say) -> Profile:
     """`chip`, this machine, with the times of a run in which a file's network is the default avatar's.
 
-    The words are those of `with_file`.
+    The words mean what they mean in `with_file`.
     """
     usual, _ = with_avatar(chip, DEFAULT, say)
     placed = usual.units[NETWORK].measured
@@ -99,7 +99,7 @@ def with_file(
     """`chip`, this machine, with the time of the network of a file.
 
     `shapes`: of inputs by name, in place of what the file says. `say`: as of `with_avatar`. `counts`: numbers of
-    threads; those of the unit for networks if not given.
+    threads; as many as the unit for networks has, if not given.
     """
     why = _why_not(chip, graph)
     if why:

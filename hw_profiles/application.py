@@ -354,7 +354,7 @@ def reference_frame_ms(profile: Profile, plan: Plan, corners: Corners) -> float:
 def relative_error(job: JobTime, unit: Unit) -> float:
     """Expected relative error of the time of `job` on `unit`: as measured, where it was.
 
-    Else it joins the error of the number that each part of the time is computed from, and that of the model itself.
+    Else it joins the errors of the numbers that the parts of the time are computed from, and the model's own error.
     """
     if unit.measured is not None:
         return unit.measured.error

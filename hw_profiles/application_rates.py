@@ -45,8 +45,8 @@ def unheld_times(profile: Profile, plan: Plan, corners: Corners, around: Interva
     `profile`: of the chip.
     `plan`: what runs on it.
     `corners`: of all units.
-    `around`, `network_ms`: the network's time with its interval; those of a frame follow from it, alike where the other
-    stages were measured with it.
+    `around`, `network_ms`: the network's time with its interval. A frame's follow from it; where the other stages were
+    measured with it, they have its relative error.
     """
     display = profile.application.display_ms.model_copy(update={"value": 1e3 / MOST_FPS})
     free = profile.model_copy(update={"application": profile.application.model_copy(update={"display_ms": display})})

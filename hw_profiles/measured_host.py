@@ -22,7 +22,7 @@ from trilane.scheduler.placement_model import SCHEDULER_NS
 from trilane.units import UnitName
 
 #: Relative error of a prediction from measured times, besides their scatter: frame times that followed from CPU times
-#: were 0.90 to 1.15 of 11 measured runs (docs/decisions/placement.md), whose range is that of a deviation of 0.08.
+#: were 0.90 to 1.15 of 11 measured runs (docs/decisions/placement.md), a range that fits a deviation of 0.08.
 MODEL_ERROR = 0.08
 #: Keys of intervals, and of what stands for one.
 OF_TIMES = frozenset(

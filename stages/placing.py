@@ -148,7 +148,7 @@ def rehearsed(
 ) -> tuple[Rehearsed, str]:
     """What a run of `checked` is placed by, and when that was measured, UTC: now, or for an earlier one.
 
-    The words, and what is raised, are those of `placed`.
+    The words, and what is raised: as of `placed`.
     """
     cores, rule = host_cores(usable_cores()), rule_placement(usable_cores(), {})
     return _kept(checked, cores, rule, starter, [*_made_from(checked, cores, rule), driver], say)

@@ -26,7 +26,7 @@ from trilane.units import BURST
 
 NETWORK = reference_network(NetworkSpec("resnet18", "batch", 64, 96, 10))
 LARGER = reference_network(NetworkSpec("resnet18", "batch", 128, 96, 10))
-#: ns of each stage in three frames, of which the middle one counts.
+#: ns of each stage in three frames; the median counts.
 TOOK_NS = {
     "pose": [900_000, 1_000_000, 5_000_000],
     "raster": [3_000_000, 2_000_000, 1_000_000],
