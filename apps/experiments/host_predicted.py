@@ -42,7 +42,7 @@ class Predicted(NamedTuple):
 
 
 def measure(
-    avatar: str = "default", width: tuple[int, ...] = (8, 24, 32, 48, 64), frames: int = 200, seconds: float = 3.0
+    avatar: str = "default", width: tuple[int, ...] = (8, 24, 32, 40, 48), frames: int = 200, seconds: float = 3.0
 ) -> dict[str, Any]:
     """Predicted beside measured: the avatar with its own network, then with an untrained one of each `width`.
 
