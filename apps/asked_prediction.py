@@ -1,15 +1,17 @@
 """A prediction as somebody asked for it, from words to an answer: the same for a command line and for a program.
 
-Rule: nothing is printed here, and nothing computed: what was asked for is checked, `trilane.hw_profiles` answers.
+Rule: nothing is printed here, and nothing computed: what was asked for is checked, `trilane.hw_profiles` answers, of
+this machine with what `this_machine.py` measured.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from trilane.errors import BadInputError
-from trilane.units import BURST, SUSTAINED, UnitName
+from trilane.units import BURST, INFER, SUSTAINED, UnitName
 
 if TYPE_CHECKING:
     from trilane.hw_profiles.application import Plan, Variant
@@ -28,6 +30,11 @@ def usual_cap(profile: str, *, bare: bool) -> str:
     That of published latencies for a network by itself (`bare`), and no cap on this machine, where a run has none.
     """
     return BURST if bare or profile == HOST else SUSTAINED
+
+
+def usual_policy(profile: str) -> str:
+    """The policy where none is asked for: a run's on this machine, else the published application's."""
+    return "pipelined" if profile == HOST else "reference"
 
 
 def wanted_of(fps: float | None, power_limit_w: float | None) -> Wanted:
@@ -95,11 +102,12 @@ def predict_networks(
     shapes: dict[str, tuple[int, ...]],
     on: tuple[UnitName, str | None, EngineRuntime | None],
     over: tuple[str, float, str | None, Wanted],
+    say: Callable[[str], None] = lambda _: None,
 ) -> list[dict[str, Any]]:
-    """What is predicted of each network.
+    """What is predicted of each network; of this machine it is measured first.
 
     `on`: unit, its precision and the runtime of its tensor engine. `over`: performance profile, minutes, governor, and
-    what is wanted.
+    what is wanted. `say`: is told before it takes seconds.
     """
     from trilane.hw_profiles.bare_network import in_precision, predict_network, under_runtime
     from trilane.hw_profiles.graph_file import read_graph
@@ -113,6 +121,10 @@ def predict_networks(
     unit, precision, engine_runtime = on
     chips = [in_precision(chip, unit, graph.numbers, precision) for graph in graphs]
     chips = [under_runtime(each, unit, engine_runtime) for each in chips]
+    if _is_measured(chip, unit, precision):
+        from trilane.apps.this_machine import with_file
+
+        chips = [with_file(each, graph, shapes, say) for each, graph in zip(chips, graphs, strict=True)]
     return [predict_network(each, graph, unit, *over) for each, graph in zip(chips, graphs, strict=True)]
 
 
@@ -124,8 +136,12 @@ def network_of(
     layout: str,
     unit: UnitName,
     precision: str | None,
+    say: Callable[[str], None] = lambda _: None,
 ) -> tuple[Profile, Network | None]:
-    """The network of a file, or of an avatar, None when neither was named; and the chip in its precision."""
+    """The network of a file, or of an avatar, None when neither was named; and the chip in its precision.
+
+    This machine is measured with it. `say`: as of `predict_networks`.
+    """
     from trilane.avatars.bundle import load_bundle
     from trilane.hw_profiles.bare_network import in_precision
     from trilane.hw_profiles.graph_file import read_graph
@@ -136,13 +152,27 @@ def network_of(
         raise BadInputError("--layout", repr(layout), "packed or split")
     if networks:
         graph = read_graph(networks[0], shapes)
-        return in_precision(chip, unit, graph.numbers, precision), image_network(graph, layout)
+        named, network = in_precision(chip, unit, graph.numbers, precision), image_network(graph, layout)
+        if _is_measured(chip, unit, precision):
+            from trilane.apps.this_machine import with_file_in_application
+
+            named = with_file_in_application(named, graph, shapes, say)
+        return named, network
     chip = in_precision(chip, unit, "not said", precision)
     if avatar is None:
         return chip, None
+    if _is_measured(chip, unit, precision):
+        from trilane.apps.this_machine import with_avatar
+
+        return with_avatar(chip, avatar, say)
     file = load_bundle(avatar or "default").read_network()
     _, height, width, channels = file.shape
     return chip, Network({"avatar": str(avatar)}, height, width, channels, layout, count_work(file.model))
+
+
+def _is_measured(chip: Profile, unit: UnitName, precision: str | None) -> bool:
+    """Whether the chip is this machine, and what is asked of it what it would run."""
+    return chip.name == HOST and unit == INFER[1] and precision is None
 
 
 def answer_of(

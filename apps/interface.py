@@ -221,7 +221,8 @@ class Prediction:
     """What a hardware profile says of an application or a network; every figure is computed.
 
     `document`: the keys of `trilane predict --json`.
-    `frame_ms`: time of a frame; `low_ms`, `high_ms`: where it is with a probability of 80 %.
+    `frame_ms`: time of a frame; `low_ms`, `high_ms`: where it is with a probability of 80 %, None where
+    nothing was measured of this machine.
     `latency_ms`: None of a network by itself.
     `power_w`: of the whole device.
     """
@@ -230,8 +231,8 @@ class Prediction:
     profile: str
     what: str
     frame_ms: float
-    low_ms: float
-    high_ms: float
+    low_ms: float | None
+    high_ms: float | None
     latency_ms: float | None
     power_w: float
 
@@ -253,8 +254,9 @@ class Prediction:
 
     def _repr_html_(self) -> str:
         busy = ", ".join(f"{unit} {row['busy']:.0%}" for unit, row in self.units.items())
+        around = "" if self.low_ms is None else f" (80 %: {self.low_ms:.2f} to {self.high_ms:.2f})"
         rows = {
-            "frame time": f"{self.frame_ms:.2f} ms (80 %: {self.low_ms:.2f} to {self.high_ms:.2f})",
+            "frame time": f"{self.frame_ms:.2f} ms{around}",
             "rate": f"{self.fps:.1f} frames a second{', as the display shows them' if self.is_display_capped else ''}",
             "latency": "" if self.latency_ms is None else f"{self.latency_ms:.1f} ms",
             "power": f"{self.power_w:.1f} W",
@@ -275,12 +277,13 @@ def predict(
     size: int | str = 512,
     channels: int = 16,
     runtime: str = "dsp",
-    policy: str = "reference",
+    policy: str | None = None,
     edge: str | None = None,
     fps: float | None = None,
     power_limit_w: float | None = None,
     minutes: float = 0.0,
     performance_profile: str | None = None,
+    on_message: Callable[[str], None] | None = None,
 ) -> Prediction:
     """Predict frame time, idleness, heat and energy on a chip.
 
@@ -288,6 +291,7 @@ def predict(
     name.
     `avatar`: the application with this avatar's network. `network`: an ONNX file by itself, or with `application` in
     the avatar's application. Without either, the application with a network of `encoder`, `norm`, `size`, `channels`.
+    `on_message(text)`: is told before the profile `host`, this machine, is measured, which may take half a minute.
     Raises BadInputError.
     """
     from trilane.apps import asked_prediction as asked
@@ -302,16 +306,16 @@ def predict(
     cap = performance_profile or asked.usual_cap(str(profile), bare=bare)
     _check_name("performance_profile", cap, PERFORMANCE_PROFILES)
     chip, wanted = load_runnable(str(profile)), asked.wanted_of(fps, power_limit_w)
-    files = [] if network is None else [Path(network)]
+    files, say = [] if network is None else [Path(network)], on_message or (lambda _: None)
     if bare:
         on = (asked.unit_of(runtime, "cpu"), None, None)
-        (answer,) = asked.predict_networks(chip, files, {}, on, (cap, minutes, None, wanted))
+        (answer,) = asked.predict_networks(chip, files, {}, on, (cap, minutes, None, wanted), say)
         times = (answer["network_ms"], answer["low_ms"], answer["high_ms"])
         return Prediction(answer, chip.name, str(network), *times, None, answer["power"]["w"])
     unit, named = asked.unit_of(runtime), None if avatar is None else str(avatar)
-    chip, described = asked.network_of(chip, files, {}, named, "packed", unit, None)
+    chip, described = asked.network_of(chip, files, {}, named, "packed", unit, None, say)
     counted = described or asked.reference_of(encoder, norm, str(size), channels, "packed")
-    plan = Plan(counted, unit, asked.variant_of(policy, edge, 1, fps))
+    plan = Plan(counted, unit, asked.variant_of(policy or asked.usual_policy(str(profile)), edge, 1, fps))
     answer = asked.answer_of(chip, plan, cap, minutes, None, False, wanted)
     frame, what = answer["frame_time_ms"], str(avatar or network or f"{encoder}, {size}")
     times = (frame["mean"], frame["low"], frame["high"])

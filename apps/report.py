@@ -246,7 +246,7 @@ class PlacementFacts(Record):
     `predicted_ms`: time of a frame of the policy of the run.
     `rule_ms`, `rule`: of the placement for any run.
     `alternatives`: the next best, the shortest frame time first.
-    `times`: what was measured, a row for each unit and number of threads.
+    `times`: medians of distinct frames, one job at a time; a row for each unit and number of threads.
     `tried`: what real frames went through before the run, or before an earlier one; absent when none was.
     """
 

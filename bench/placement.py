@@ -117,7 +117,7 @@ class _Trial:
         self._checked, self._starter = checked, starter
         begin_s = time.monotonic()
         where = rule_placement(tuple(core.number for core in cores))
-        self._times = measured_times(checked, cores, where, starter)
+        self._times = measured_times(checked, cores, where, starter).times
         self._found = ranked(considered(cores, {}), self._times, Rules(FIRST))
         self._rule = Ranked(where, frame_ns(where, cores, self._times, Rules(FIRST)))
         candidates = worth_trying(self._found, self._rule)

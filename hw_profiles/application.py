@@ -352,10 +352,12 @@ def reference_frame_ms(profile: Profile, plan: Plan, corners: Corners) -> float:
 
 
 def relative_error(job: JobTime, unit: Unit) -> float:
-    """Expected relative error of the time of `job` on `unit`.
+    """Expected relative error of the time of `job` on `unit`: as measured, where it was.
 
-    It joins the error of the number that each part of the time is computed from, and that of the model itself.
+    Else it joins the errors of the numbers that the parts of the time are computed from, and the model's own error.
     """
+    if unit.measured is not None:
+        return unit.measured.error
     if job.unsure is not None and unit.engine is not None:
         return math.hypot(job.unsure, unit.engine.error_fraction.or_else(0.5) * job.unlike)
     computed_from = {

@@ -45,11 +45,15 @@ def unheld_times(profile: Profile, plan: Plan, corners: Corners, around: Interva
     `profile`: of the chip.
     `plan`: what runs on it.
     `corners`: of all units.
-    `around`, `network_ms`: the network's time with its interval; those of a frame follow from it.
+    `around`, `network_ms`: the network's time with its interval. A frame's follow from it; where the other stages were
+    measured with it, they have its relative error.
     """
     display = profile.application.display_ms.model_copy(update={"value": 1e3 / MOST_FPS})
     free = profile.model_copy(update={"application": profile.application.model_copy(update={"display_ms": display})})
     stretches = (1.0, around.low_ms / network_ms, around.high_ms / network_ms)
+    if profile.units[plan.runtime].measured is not None:
+        frame_ms = steady(free, _unheld(plan), corners, quick=True).frame_ms
+        return FrameTimes(*(stretch * frame_ms for stretch in stretches))
     plans = (replace(_unheld(plan), stretch=stretch) for stretch in stretches)
     return FrameTimes(*(steady(free, each, corners, quick=True).frame_ms for each in plans))
 

@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 from trilane.errors import BadInputError
 from trilane.hw_profiles.device_power import device_power
 from trilane.hw_profiles.graph_file import GraphFile, Numbers
+from trilane.hw_profiles.load import HOST
+from trilane.hw_profiles.measured_host import UNMEASURED, with_known_intervals
 from trilane.hw_profiles.network_time import Interval, NetworkTime, interval, price, spread_of
 from trilane.hw_profiles.network_work import Work
 from trilane.hw_profiles.operator_kinds import COMPILED
@@ -101,7 +103,7 @@ def predict_network(
 
     moments = warm_up(profile, running, performance_profile, minutes, governor) if minutes else []
     at_last = settled_corners(moments) if moments else corners
-    return {
+    answer = {
         "file": str(graph.path),
         "unit": unit,
         "numbers": graph.numbers,
@@ -118,6 +120,10 @@ def predict_network(
         ),
         **(_over_minutes(moments) if moments else {}),
     }
+    if profile.name != HOST:
+        return answer
+    why = answer["why"] if profile.units[unit].measured is not None else [UNMEASURED, *answer["why"][1:]]
+    return with_known_intervals(profile, unit, {**answer, "why": why})
 
 
 def _times(time: NetworkTime, around: Interval) -> dict[str, Any]:

@@ -11,11 +11,12 @@ from typing import Any
 
 from trilane.hw_profiles.beside import Tenant, Together, together
 from trilane.hw_profiles.load import HOST
+from trilane.hw_profiles.measured_host import UNMEASURED
 from trilane.hw_profiles.over_time import Moment, unit_power_w, warm_up
 from trilane.hw_profiles.performance_profiles import Corners, corners_of
 from trilane.hw_profiles.schema import Profile
 from trilane.scheduler.turns import ROUND_ROBIN
-from trilane.units import SUSTAINED, UNITS
+from trilane.units import INFER, SUSTAINED, UNITS
 
 LAST = 5  # of the time: the last fifth is what it settles to
 
@@ -139,11 +140,13 @@ def _notes(profile: Profile, tenants: Sequence[Tenant], turns: str) -> list[str]
         "a network's result is due when its next frame comes, an avatar's frame three of its periods after its release"
     ]
     if profile.name == HOST:
-        notes.append(
-            "units on one core of this machine divide it in equal shares; cores are given by the rule for any run; of "
-            "this machine are cores, clock and instructions, its speeds are assumed: `trilane bench pipeline --beside` "
-            "measures"
-        )
+        measured = profile.units[INFER[1]].measured
+        notes += [
+            "units on one core of this machine divide it in equal shares; cores are given by the rule for any run",
+            f"{UNMEASURED}: `trilane bench pipeline --beside` measures"
+            if measured is None
+            else f"the first pipeline was {measured.said}; others have the same ratios of measured to modelled times",
+        ]
     elif len(tenants) > 1:
         notes.append(f"a unit that several pipelines have handed a job takes them by {turns}, each job to its end")
     return notes

@@ -1,7 +1,7 @@
 """The numbers of the profile `host` that depend on this machine: peak rates of each unit and speeds of the runtimes.
 
 Rule: nothing is measured here. Every number says in its `source` what it was computed from, or on which other machine
-it was measured. The units have as many cores as in a run.
+it was measured; `measured_host.py` lays over it what was measured of this one. The units have as many cores as a run's.
 """
 
 from __future__ import annotations
@@ -50,6 +50,7 @@ def host_tables() -> dict[str, Any]:
             "dsp": {
                 **_unit(network_threads(), known_ghz, flag, clock),
                 "core": core["dsp"],
+                "threads": network_threads(),
                 "runtimes": _runtimes(flag),
             },
         },

@@ -122,7 +122,9 @@ def interval(profile: Profile, work: Work, time: NetworkTime) -> Interval:
     unit = profile.units[time.unit]
     job = time_on(unit, profile.memory, work)
     error = relative_error(job, unit)
-    if unit.engine is None:
+    if unit.measured is not None:
+        why = [unit.measured.said]
+    elif unit.engine is None:
         why = [f"the profile states a relative error of {error:.0%} for networks on its {time.unit}"]
         peak = unit.peak
         if peak.value is None:

@@ -71,7 +71,7 @@ class JobTime:
 
 
 def machine_of(unit: Unit, memory: Memory, clock_fraction: float = 1.0, contended: bool = False) -> Machine:
-    """The numbers of a unit.
+    """The numbers of a unit, all of them slower where it was measured to be.
 
     `unit`: from a profile.
     `memory`: of the same profile.
@@ -82,20 +82,20 @@ def machine_of(unit: Unit, memory: Memory, clock_fraction: float = 1.0, contende
     bandwidth = memory.bandwidth_gb_s.or_else(10.0) * 1e9 * (1 - use)
     efficiency = unit.efficiency
     arithmetic = [getattr(efficiency, kind).or_else(0.1) * unit.peak_mac_s * clock_fraction for kind in ARITHMETIC]
-    traffic = np.array([getattr(efficiency, key).or_else(0.1) for key in TRAFFIC_KEYS]) * bandwidth
+    traffic = np.array([getattr(efficiency, key).or_else(0.1) for key in TRAFFIC_KEYS]) * bandwidth / unit.slower
     return Machine(
-        arithmetic=np.array(arithmetic + [np.inf] * len(TRAFFIC)),
+        arithmetic=np.array(arithmetic + [np.inf] * len(TRAFFIC)) / unit.slower,
         traffic=traffic,
         stream=float(traffic[CLASSES.index("convolution")]),
         element_bytes=unit.element_bytes,
         block=unit.channel_block.or_else(1.0),
-        job=unit.job_fixed_ms.or_else(0.0) / 1e3,
-        operator=unit.operator_fixed_us.or_else(0.0) / 1e6,
-        input=unit.input_ns_per_element.or_else(0.0) / 1e9,
-        permute=unit.permute_fixed_ms.or_else(0.0) / 1e3,
+        job=unit.slower * unit.job_fixed_ms.or_else(0.0) / 1e3,
+        operator=unit.slower * unit.operator_fixed_us.or_else(0.0) / 1e6,
+        input=unit.slower * unit.input_ns_per_element.or_else(0.0) / 1e9,
+        permute=unit.slower * unit.permute_fixed_ms.or_else(0.0) / 1e3,
         fallback=frozenset(unit.fallback),
-        fallback_job=unit.fallback_fixed_ms.or_else(0.0) / 1e3,
-        fallback_element=unit.fallback_ns_per_element.or_else(0.0) / 1e9,
+        fallback_job=unit.slower * unit.fallback_fixed_ms.or_else(0.0) / 1e3,
+        fallback_element=unit.slower * unit.fallback_ns_per_element.or_else(0.0) / 1e9,
     )
 
 

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 from trilane.hw_profiles.application import Plan, stage_times_ms
 from trilane.hw_profiles.host import rule_placement
-from trilane.hw_profiles.host_profile import network_threads
 from trilane.hw_profiles.performance_profiles import Corners
 from trilane.hw_profiles.placement_facts import NS_PER_MS, predictions, unit_rows
 from trilane.hw_profiles.schema import Profile, Quantity, Unit
@@ -65,7 +64,7 @@ def on_cores(profile: Profile, placement: Placement) -> Profile:
     for name, unit in profile.units.items():
         place = placement[name]
         core = f"core {place.cores[0]}" if len(place.cores) == 1 else ""
-        placed = _with_threads(unit, place.threads) if name == NETWORK else unit
+        placed = with_threads(unit, place.threads) if name == NETWORK else unit
         units[name] = placed.model_copy(update={"core": core})
     return profile.model_copy(update={"units": units})
 
@@ -84,23 +83,27 @@ def _times(profile: Profile, plan: Plan, corners: Corners, cores: int, given: Pl
     """
     rule = rule_placement(tuple(range(cores)))
     counts = {unit: {1, rule[unit].threads} for unit in UNITS}
-    counts[NETWORK] |= set(range(1, cores + 1))
+    measured = profile.units[NETWORK].measured
+    counts[NETWORK] = counts[NETWORK] | set(range(1, cores + 1)) if measured is None else set(measured.slower)
     for unit in UNITS:
         counts[unit] |= {place.threads for name, place in given.items() if name == unit}
     times: dict[str, dict[int, Work]] = {unit: {} for unit in UNITS}
     for unit, threads in ((unit, each) for unit, of in counts.items() for each in sorted(of)):
-        network = _with_threads(profile.units[NETWORK], threads if unit == NETWORK else 1)
-        with_threads = profile.model_copy(update={"units": {**profile.units, NETWORK: network}})
-        stages = stage_times_ms(with_threads, plan, corners)
+        network = with_threads(profile.units[NETWORK], threads) if unit == NETWORK else profile.units[NETWORK]
+        threaded = profile.model_copy(update={"units": {**profile.units, NETWORK: network}})
+        stages = stage_times_ms(threaded, plan, corners)
         own = [ms / plan.variant.batch for (_, other), ms in stages.items() if other == unit]
         ns = round(sum(own) * NS_PER_MS)
         times[unit][threads] = Work(ns, ns, len(own))
     return times
 
 
-def _with_threads(unit: Unit, threads: int) -> Unit:
-    """The network's unit of the profile with the peak rates of so many threads, each of which has a core's."""
-    scale = threads / network_threads()
+def with_threads(unit: Unit, threads: int) -> Unit:
+    """The network's unit of the profile with so many threads, each of which has the peak rates of a core.
+
+    One that was measured is as much slower as it was with these.
+    """
+    scale = threads / unit.threads
     rates: dict[str, Quantity] = {name: getattr(unit, name) for name in PEAKS}
     scaled = {name: rate.model_copy(update={"value": rate.or_else(0.0) * scale}) for name, rate in rates.items()}
-    return unit.model_copy(update=scaled)
+    return unit.model_copy(update={**scaled, "threads": threads})

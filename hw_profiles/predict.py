@@ -35,6 +35,7 @@ from trilane.hw_profiles.application_rates import (
 from trilane.hw_profiles.configuration_table import Row
 from trilane.hw_profiles.host import host_cores, usable_cores
 from trilane.hw_profiles.load import HOST
+from trilane.hw_profiles.measured_host import UNMEASURED, with_known_intervals
 from trilane.hw_profiles.network_time import interval, price
 from trilane.hw_profiles.network_work import Network
 from trilane.hw_profiles.operator_times import JobTime
@@ -92,7 +93,7 @@ def predict(
     job = isolated_job_time(profile, plan.network, plan.runtime, corners)
     around = interval(profile, plan.network.work, price(profile, plan.network.work, plan.runtime, corners))
     times = unheld_times(profile, plan, corners, around, job.total_ms)
-    return {
+    answer = {
         "schema": 1,
         "clock": "virtual",
         "machine": {"profile": profile.name, "title": profile.title},
@@ -118,8 +119,9 @@ def predict(
         **answers(profile, load_of(profile, plan), corners, wanted, times),
         **_expected_error(profile, plan, job),
         **({} if placed is None else {"placement": placed.facts}),
-        "notes": _notes(profile, plan.variant, placed),
+        "notes": _notes(profile, plan, placed),
     }
+    return with_known_intervals(profile, plan.runtime, answer) if profile.name == HOST else answer
 
 
 def predicted_run(
@@ -144,17 +146,15 @@ def _settled_on(
     return profile, held_to(plan, wanted.fps), corners, placed
 
 
-def _notes(profile: Profile, variant: Variant, placed: Placed | None) -> list[str]:
+def _notes(profile: Profile, plan: Plan, placed: Placed | None) -> list[str]:
     """What a reader of the figures has to know of the profile, of the policy and of the placement."""
-    notes = []
+    notes, variant, measured = [], plan.variant, profile.units[plan.runtime].measured
     if POLICIES[variant.policy].paced:
         notes.append(
             f"under {variant.policy}, {variant.fps:g} frames are released a second, whether there is room or not"
         )
     if profile.name == HOST:
-        notes.append(
-            "of this machine are cores, clock and instructions; its speeds are assumed: `trilane run` measures"
-        )
+        notes.append(UNMEASURED if measured is None else f"{measured.said}; of powers nothing is measured")
     if placed is not None:
         beside = f"; {_predicted(placed.rule)}" if placed.rule.placement != placed.best.placement else ""
         notes.append(f"placement: {_predicted(placed.best)} ms, the least by the placement's model{beside}")
@@ -289,7 +289,8 @@ def _row_predictions(profile: Profile, network: Network, corners: Corners, varia
         predictions |= {f"bench_{runtime}_ms": alone.total_ms, f"app_{runtime}_ms": frame}
         predictions |= {f"app_{runtime}_ms_min": low, f"app_{runtime}_ms_max": high}
         predictions[f"expected_error_{runtime}"] = errors[-1]
-    return {**predictions, "confidence": max(0.0, 1 - _mean(errors))}
+    answer = {**predictions, "confidence": max(0.0, 1 - _mean(errors))}
+    return with_known_intervals(profile, RUNTIMES[-1], answer) if profile.name == HOST else answer
 
 
 def _cells(row: Row) -> dict[str, Any]:

@@ -175,6 +175,18 @@ class Engine(Model):
         return (1 if rate == "arithmetic" else self.element_bytes) / (value * unit)
 
 
+class Measured(Model):
+    """What was measured of a network on a unit of this machine.
+
+    `slower`: by threads, how many times longer it took than by the unit's numbers. `error`: relative, of a time that
+    follows. `said`: how it was measured.
+    """
+
+    slower: dict[int, float] = Field(min_length=1)
+    error: float = Field(ge=0)
+    said: str
+
+
 class Unit(Model):
     """One unit. `fallback`: ONNX operators that it cannot run and hands to the CPU.
 
@@ -186,11 +198,13 @@ class Unit(Model):
     times faster than ONNX Runtime in FP32 each runtime runs an INT8 network; only the host's DSP unit has them. `core`:
     units with the same one, unless it is empty, work in turns: on a host with too few cores. `engines`: a tensor
     engine's numbers by precision and runtime, of which `engine_runtime` is taken; a unit without is priced by
-    `efficiency`.
+    `efficiency`. Of this machine alone: `threads` have the peak rates together; `measured`: where it was.
     """
 
     title: str
     core: str = ""
+    threads: int = Field(default=1, ge=1)
+    measured: Measured | None = None
     precision: Literal["int8", "fp16", "fp32"]
     peak_int8_tmac_s: Rate
     peak_fp16_tmac_s: Rate
@@ -230,6 +244,11 @@ class Unit(Model):
         """Mean power in watts at `corner` when the unit works for a share `busy` of the time."""
         active: float = self.power_max_w.or_else(1.0) * self.clock(corner) ** self.power_exponent.or_else(3.0)
         return busy * active + (1 - busy) * self.idle_w.or_else(0.0)
+
+    @property
+    def slower(self) -> float:
+        """How many times longer it takes than by its numbers."""
+        return 1.0 if self.measured is None else self.measured.slower[self.threads]
 
     @property
     def peak(self) -> Quantity:

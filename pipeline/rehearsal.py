@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from statistics import median
+from typing import NamedTuple
 
 from trilane.pipeline.description import Pipeline
 from trilane.pipeline.lifecycle import START_S, listen_before_run, start_units
@@ -23,7 +24,7 @@ from trilane.pipeline.signals import Interrupts
 from trilane.pipeline.unit_processes import UnitProcesses
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.events import Graph, StageAlone
-from trilane.scheduler.places import Work
+from trilane.scheduler.places import Times, Work
 from trilane.transport.messages import Done, RunJob
 from trilane.transport.slots import edge_rule
 
@@ -70,29 +71,36 @@ class Chain:
 
 
 def on_rungs(chain: Chain, frames: Sequence[int], rungs: int, follow: Sequence[str]) -> list[StageAlone]:
-    """What each stage of `follow` takes, alone, on each of so many `rungs` of a ladder: the most of `frames`.
+    """What each stage of `follow` takes, alone, on each of so many `rungs` of a ladder: the median over `frames`.
 
-    Of several frames the first warms up. Nothing is said of a stage that does not take less on every further rung, such
-    as where nobody is on the screen in any of the frames. Raises as `Chain.frame`.
+    All of them go through one rung before the next, so no frame follows itself. Of several frames the first of each
+    rung warms up. Nothing is said of a stage that does not take less on every further rung, such as where nobody is on
+    the screen in any of the frames. Raises as `Chain.frame`.
     """
-    times = {name: [0] * rungs for name in follow}
-    for number, frame in enumerate(frames):
-        for rung in range(rungs):
-            done = chain.frame(frame, rung)
-            for name in follow if number or len(frames) == 1 else ():
-                times[name][rung] = max(times[name][rung], _took_ns(done[name]))
+    medians: dict[str, list[float]] = {name: [] for name in follow}
+    for rung in range(rungs):
+        done = [chain.frame(frame, rung) for frame in frames]
+        for name, of_rungs in medians.items():
+            of_rungs.append(median(_took_ns(each[name]) for each in (done[1:] or done)))
     return [
-        StageAlone(name, rung, ns)
-        for name, of_rungs in times.items()
+        StageAlone(name, rung, round(ns))
+        for name, of_rungs in medians.items()
         if all(more > less for more, less in pairwise(of_rungs))
         for rung, ns in enumerate(of_rungs)
     ]
 
 
+class Rehearsed(NamedTuple):
+    """What was measured. `times`: of each unit, by threads. `took_ns`: by stage of the first pipeline, each frame's."""
+
+    times: Times
+    took_ns: Mapping[str, Sequence[int]]
+
+
 def rehearse(
     pipeline: Pipeline, variants: Sequence[Pipeline], frames: Sequence[int], assets: Assets, starter: UnitStarter
-) -> dict[str, dict[int, Work]]:
-    """Unit, then threads, to its work for a frame; the files that the last stage writes are the caller's to remove.
+) -> Rehearsed:
+    """What each unit needs for a frame; the files that the last stage writes are the caller's to remove.
 
     `pipeline`: of whose units all are measured, on `frames`.
     `variants`: the same with other settings of some units, which alone are measured again, between the other stages.
@@ -112,22 +120,24 @@ def rehearse(
                 yield dict.fromkeys(units, processes)
 
         first = stack.enter_context(running(pipeline, list(pipeline.units)))
-        works = works_of(pipeline, Chain(pipeline.graph(), first, interrupts, whole=True), frames)
+        done = timed(Chain(pipeline.graph(), first, interrupts, whole=True), frames)
+        took_ns = {stage.name: [_took_ns(each[stage.name]) for each in done] for stage in pipeline.stages}
+        works = works_of(pipeline, done)
         found = {unit: {pipeline.units[unit].threads: work} for unit, work in works.items()}
         for variant in variants:
             changed = [unit for unit, settings in variant.units.items() if settings != pipeline.units[unit]]
             with running(variant, changed) as again:
                 chain = Chain(pipeline.graph(), {**first, **again}, interrupts, whole=True)
-                works = works_of(variant, chain, frames)
+                works = works_of(variant, timed(chain, frames))
             for unit in changed:
                 found[unit][variant.units[unit].threads] = works[unit]
-        return found
+        return Rehearsed(found, took_ns)
 
 
-def works_of(pipeline: Pipeline, chain: Chain, frames: Sequence[int]) -> dict[str, Work]:
-    """The work of each unit of `pipeline` for a frame: the sum over its stages of the medians over `frames`.
+def timed(chain: Chain, frames: Sequence[int]) -> list[dict[str, Done]]:
+    """The answers of all stages to each of `frames`, but to the first WARM_UP; LIMIT_S holds for the others.
 
-    The first WARM_UP do not count, where there are more; LIMIT_S holds for the others.
+    Of fewer frames the last one counts.
     """
     warm_up = min(WARM_UP, len(frames) - 1)
     for frame in frames[:warm_up]:
@@ -137,6 +147,11 @@ def works_of(pipeline: Pipeline, chain: Chain, frames: Sequence[int]) -> dict[st
         if done and time.monotonic() > end:
             break
         done.append(chain.frame(frame))
+    return done
+
+
+def works_of(pipeline: Pipeline, done: Sequence[Mapping[str, Done]]) -> dict[str, Work]:
+    """The work of each unit of `pipeline` for a frame: the sum over its stages of the medians of what was `done`."""
     works = {}
     for unit, settings in pipeline.units.items():
         names = [stage.name for stage in pipeline.stages_of(unit)]

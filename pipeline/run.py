@@ -39,7 +39,7 @@ from trilane.transport.wakeup import awake
 from trilane.unexpected_value import UnexpectedValue
 
 HANG_NS = 10_000_000_000
-FRAMES_ON_RUNGS = 4  # the first of which warms up
+FRAMES_ON_RUNGS = 4  # on each rung; the first one warms up
 
 
 class ReportingGovernor(Governor, Protocol):

@@ -51,6 +51,11 @@ def package_version(name: str) -> str | None:
         return None
 
 
+def versions_with(package: str) -> list[str]:
+    """Of every package that times depend on, a runtime's `package` among them."""
+    return [f"{name} {package_version(name)}" for name in dict.fromkeys(("trilane", *PACKAGES, package))]
+
+
 def cpu_facts() -> dict[str, Any]:
     """Model, instruction flags and cores; `cores_allowed` are those that this process may run on."""
     flags = machine.here.cpu_flags()

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from trilane.cache import cached_arrays
 from trilane.hw_profiles.host import host_cores, rule_placement, settings_of, usable_cores
 from trilane.hw_profiles.placement_facts import NS_PER_MS, described, placement_of, predictions, unit_rows
+from trilane.pipeline.rehearsal import Rehearsed
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.placement import Ranked, chosen, ranked, worth_trying
 from trilane.scheduler.placement_model import Rules, frame_ns
@@ -28,13 +29,13 @@ from trilane.stages.avatar_assets import network_of
 from trilane.stages.choosing import choice
 from trilane.stages.configure import Checked
 from trilane.stages.dsp.runtime import RUNTIMES
-from trilane.stages.machine_facts import cpu_facts, package_version
+from trilane.stages.machine_facts import cpu_facts, versions_with
 from trilane.stages.rehearsing import measured_times, thread_counts
 from trilane.units import BEFORE_INFER, UNITS
 
 #: Shorter runs do not gain what a rehearsal takes.
 LEAST_FRAMES = 100
-CACHE, TRIAL_CACHE = "placement-2", "placement-trial-2"
+CACHE, TRIAL_CACHE = "placement-3", "placement-trial-2"
 MOST_LOGICAL, MOST_CORES = 8, 16
 FIRST = BEFORE_INFER[0][1]
 SEQUENTIAL = "sequential"
@@ -60,7 +61,7 @@ def placed(
         how = ASKED if len(asked) == len(UNITS) else RULE
         return _with(checked, rule, {"how": how, "why": why, "units": unit_rows(rule)})
     made_from = [*_made_from(checked, cores, rule), driver]
-    times, at = _kept_times(checked, cores, rule, starter, made_from, say)
+    (times, _), at = _kept(checked, cores, rule, starter, made_from, say)
     rules = Rules(FIRST, policy == SEQUENTIAL)
     found = ranked(considered(cores, asked), times, rules, asked)
     by_rule = Ranked(rule, frame_ns(rule, cores, times, rules))
@@ -142,30 +143,45 @@ def _reason(facts: Mapping[str, Any]) -> str:
     return "; ".join([text, *rest])
 
 
-def _kept_times(
+def rehearsed(
+    checked: Checked, starter: UnitStarter, driver: str = "", say: Callable[[str], None] = lambda _: None
+) -> tuple[Rehearsed, str]:
+    """What a run of `checked` is placed by, and when that was measured, UTC: now, or for an earlier one.
+
+    The words, and what is raised: as of `placed`.
+    """
+    cores, rule = host_cores(usable_cores()), rule_placement(usable_cores(), {})
+    return _kept(checked, cores, rule, starter, [*_made_from(checked, cores, rule), driver], say)
+
+
+def _kept(
     checked: Checked,
     cores: Sequence[Core],
     rule: Placement,
     starter: UnitStarter,
     made_from: Sequence[str],
     say: Callable[[str], None],
-) -> tuple[Times, str]:
+) -> tuple[Rehearsed, str]:
     """What each unit needs for a frame, and when that was measured, UTC."""
 
     def measured() -> dict[str, NDArray[Any]]:
         say(MEASURING)
+        found = measured_times(checked, cores, rule, starter)
         rows = [
             (UNITS.index(unit), threads, *work)
-            for unit, works in measured_times(checked, cores, rule, starter).items()
+            for unit, works in found.times.items()
             for threads, work in works.items()
         ]
-        return {"works": np.array(rows, np.int64), "at_s": np.array(time.time(), np.int64)}
+        took_ns = {f"stage {name}": np.array(ns, np.int64) for name, ns in found.took_ns.items()}
+        return {"works": np.array(rows, np.int64), "at_s": np.array(time.time(), np.int64), **took_ns}
 
     made = cached_arrays(CACHE, made_from, measured)
     times: dict[str, dict[int, Work]] = {unit: {} for unit in UNITS}
     for unit, threads, *work in made["works"].tolist():
         times[UNITS[unit]][threads] = Work(*work)
-    return times, time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(int(made["at_s"])))
+    took_ns = {key.partition(" ")[2]: ns.tolist() for key, ns in made.items() if key.startswith("stage ")}
+    at = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(int(made["at_s"])))
+    return Rehearsed(times, took_ns), at
 
 
 def _made_from(checked: Checked, cores: Sequence[Core], rule: Placement) -> list[str]:
@@ -175,5 +191,4 @@ def _made_from(checked: Checked, cores: Sequence[Core], rule: Placement) -> list
     scene = config.scene.model_dump_json(exclude={"name", "frames", "fps"})
     machine = [str(cpu_facts()), str([tuple(core) for core in cores]), str(thread_counts(len(cores), rule))]
     network = network_of(checked.assets).digest
-    versions = [str(package_version(name)) for name in (RUNTIMES[config.runtime].package, "trilane")]
-    return [said, scene, *machine, network, *versions]
+    return [said, scene, *machine, network, *versions_with(RUNTIMES[config.runtime].package)]

@@ -14,10 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from trilane.hw_profiles.host import settings_of
-from trilane.pipeline.rehearsal import rehearse
+from trilane.pipeline.rehearsal import Rehearsed, rehearse
 from trilane.pipeline.trial import SLICE, Group, Round, try_in_turns
 from trilane.pipeline.unit_starter import UnitStarter
-from trilane.scheduler.places import Core, Place, Placement, Times
+from trilane.scheduler.places import Core, Place, Placement
+from trilane.shapes import Shape
 from trilane.stages.avatar_pipeline import avatar_pipeline
 from trilane.stages.config import RunConfig
 from trilane.stages.configure import Checked
@@ -37,7 +38,7 @@ def thread_counts(cores: int, rule: Placement) -> dict[str, list[int]]:
     return {unit: sorted(count for count in of if count > 1) for unit, of in counts.items()}
 
 
-def measured_times(checked: Checked, cores: Sequence[Core], rule: Placement, starter: UnitStarter) -> Times:
+def measured_times(checked: Checked, cores: Sequence[Core], rule: Placement, starter: UnitStarter) -> Rehearsed:
     """What each unit needs for a frame, measured now.
 
     `checked`: what is to be run. `cores`: there are. `rule`: whose numbers of threads are measured too. `starter`: a
@@ -103,7 +104,8 @@ def _thrown_away(checked: Checked) -> Iterator[RunConfig]:
     All shapes have about the same area.
     """
     with tempfile.TemporaryDirectory(prefix="trilane-rehearsal-") as folder:
-        scene = checked.config.scene.model_copy(update={"size": _one_shape(checked.config)})
+        height, width = one_shape(checked.config)
+        scene = checked.config.scene.model_copy(update={"size": f"{height}x{width}"})
         yield checked.config.model_copy(update={"out_dir": Path(folder), "scene": scene, "shapes": ()})
 
 
@@ -115,8 +117,7 @@ def _spinning(placement: Placement, cores: int) -> dict[str, Any]:
     }
 
 
-def _one_shape(config: RunConfig) -> str:
+def one_shape(config: RunConfig) -> Shape:
     """The tensor shape nearest to a square, of those that are not stepped down to when frames would be late."""
     large = [shape for shape in config.buckets if 2 * shape[0] * shape[1] > config.max_tensor_pixels]
-    height, width = min(large, key=lambda shape: (abs(shape[0] - shape[1]), shape))
-    return f"{height}x{width}"
+    return min(large, key=lambda shape: (abs(shape[0] - shape[1]), shape))

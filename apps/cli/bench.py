@@ -47,6 +47,10 @@ BENCHES = {
         "trilane.apps.experiments.comparing",
         "What `trilane compare` says of runs of one kind, and of others.",
     ),
+    "predict": (
+        "trilane.apps.experiments.host_predicted",
+        "What is predicted of this machine, beside real runs and calls.",
+    ),
     "sizes": ("trilane.apps.experiments.error_by_size", "What a speed costs in image error, by size and runtime."),
     "flicker": (
         "trilane.apps.experiments.flicker",

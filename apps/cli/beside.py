@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from trilane.apps.cli.console import print_json, spinner, stdout_console
+from trilane.apps.cli.console import print_json, say, spinner, stdout_console
 from trilane.apps.cli.predict_output import IDLE
 from trilane.errors import BadInputError
 
@@ -84,7 +84,7 @@ def predict_pipelines(
     """
     from trilane.apps.beside import tenants
     from trilane.hw_profiles.beside_answer import predict_beside
-    from trilane.hw_profiles.load import load_runnable
+    from trilane.hw_profiles.load import HOST, load_runnable
     from trilane.scheduler.turns import TURNS
 
     if scene is None:
@@ -94,7 +94,11 @@ def predict_pipelines(
         raise BadInputError("options", f"{names} beside a scene", "none of them", "the scene says so itself")
     if joined.turns not in TURNS:
         raise BadInputError("--turns", repr(joined.turns), " or ".join(TURNS))
-    chip, variant = load_runnable(on.profile), _variant(joined.policy if "policy" in typed else "", joined.edge)
+    chip, variant = load_runnable(on.profile), _variant(joined.policy, joined.edge)
+    if chip.name == HOST:
+        from trilane.apps.this_machine import with_first
+
+        chip = with_first(chip, scene, say)
     with spinner("predicting"):
         found = tenants([scene, *beside], variant)
         answer = predict_beside(chip, found, on.performance_profile, on.minutes, on.governor, joined.turns)

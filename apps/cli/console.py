@@ -33,6 +33,11 @@ def stdout_console() -> Console:
     return Console(highlight=False, width=None if sys.stdout.isatty() else 120)
 
 
+def say(text: str) -> None:
+    """Print a message, on one line however long it is."""
+    stderr_console().print(text, soft_wrap=True)
+
+
 @contextmanager
 def stdout_kept() -> Iterator[None]:
     """Inside the block, what libraries write to file descriptor 1 goes to stderr: it is not a result."""

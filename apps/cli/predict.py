@@ -21,12 +21,13 @@ from trilane.apps.asked_prediction import (
     reference_of,
     unit_of,
     usual_cap,
+    usual_policy,
     variant_of,
     wanted_of,
 )
 from trilane.apps.cli.beside import BesideOption, Joined, OnChip, SceneToPredict, TurnsOption, predict_pipelines
 from trilane.apps.cli.commands import Commands, given
-from trilane.apps.cli.console import stderr_console
+from trilane.apps.cli.console import say, stderr_console
 from trilane.apps.cli.options import (
     ChannelsOption,
     EncoderOption,
@@ -112,8 +113,12 @@ UnitOption = Annotated[
 ]
 MinutesOption = Annotated[float, typer.Option(help="Virtual minutes with heat; 0: settled, without heat.")]
 PolicyOption = Annotated[
-    str,
-    typer.Option("--policy", "--pipelining", help="reference, or a policy: sequential, pipelined, latest, deadline."),
+    str | None,
+    typer.Option(
+        "--policy",
+        "--pipelining",
+        help="reference (if not given), or sequential, pipelined (if not given, on host), latest, deadline.",
+    ),
 ]
 EdgeOption = Annotated[
     str | None, typer.Option(help="Buffers between stages: single, double (if not given), triple, fifo:N, orphan.")
@@ -155,7 +160,7 @@ def predict(
     engine_runtime: EngineRuntimeOption = None,
     runtime: UnitOption = "dsp",
     minutes: MinutesOption = 0.0,
-    policy: PolicyOption = "reference",
+    policy: PolicyOption = None,
     edge: EdgeOption = None,
     batch: BatchOption = 1,
     fps: RateOption = None,
@@ -188,10 +193,10 @@ def predict(
     check_governor(governor)
     if scene is not None or beside:
         chip_at = OnChip(profile, performance_profile, minutes, governor)
-        predict_pipelines(scene, beside or [], given(ctx), chip_at, Joined(policy, edge, turns), trace, json)
+        predict_pipelines(scene, beside or [], given(ctx), chip_at, Joined(policy or "", edge, turns), trace, json)
         return
     wanted, shapes = wanted_of(fps, power_limit_w), _shapes(input_shape or [], len(networks))
-    chip, variant = load_runnable(profile), variant_of(policy, edge, batch, fps)
+    chip, variant = load_runnable(profile), variant_of(policy or usual_policy(profile), edge, batch, fps)
     if table is not None:
         answers = _predict_table(chip, table, performance_profile, variant)
         show_table(chip.name, performance_profile, answers, json)
@@ -199,9 +204,9 @@ def predict(
     if bare:
         on = (unit_of(runtime, "cpu"), precision_of(precision), engine_runtime_of(engine_runtime))
         over = (performance_profile, minutes, governor, wanted)
-        show_networks(chip, over, predict_networks(chip, networks, shapes, on, over), json)
+        show_networks(chip, over, predict_networks(chip, networks, shapes, on, over, say), json)
         return
-    chip, described = network_of(chip, networks, shapes, avatar, layout, unit_of(runtime), precision_of(precision))
+    chip, described = network_of(chip, networks, shapes, avatar, layout, unit_of(runtime), precision_of(precision), say)
     plan = Plan(described or reference_of(encoder, norm, size, channels, layout), unit_of(runtime), variant, gpu_share)
     answer = answer_of(chip, plan, performance_profile, minutes, governor, what_if, wanted)
     if plot is not None:

@@ -44,7 +44,8 @@ def show_table(profile: str, performance_profile: str, answers: list[dict[str, A
         return
     table = Table("encoder", "norm", "size", "ch", "layout", *SHOWN)
     for row in answers:
-        figures = (*(f"{row[key]:.1f}" for key in SHOWN[:-1]), f"{row['confidence']:.2f}")
+        confidence = "-" if row["confidence"] is None else f"{row['confidence']:.2f}"
+        figures = (*(f"{row[key]:.1f}" for key in SHOWN[:-1]), confidence)
         table.add_row(*(str(row[key]) for key in KEYS), *figures)
     stdout_console().print(table)
 
@@ -109,8 +110,8 @@ def _print_bare(console: Console, answer: dict[str, Any], minutes: float) -> Non
     )
     if minutes:
         _print_settled(console, answer, minutes)
-    span = f"{answer['low_ms']:.2f} to {answer['high_ms']:.2f} ms"
-    console.print(f"network alone   {answer['network_ms']:.2f} ms ({span}), {answer['fps']:.1f} a second")
+    span = _span(answer["low_ms"], answer["high_ms"], ".2f", " ms")
+    console.print(f"network alone   {answer['network_ms']:.2f} ms{span}, {answer['fps']:.1f} a second")
     for why in answer["why"]:
         console.print(f"                {why}")
     for kind in answer["without_rule"]:
@@ -143,17 +144,22 @@ def _print_wanted(console: Console, answer: dict[str, Any]) -> None:
             console.print(f"{name:<16}never: the device takes {limit['power_w']:.2f} W when no unit works")
             return
         corners = ", ".join(f"{unit} {corner}" for unit, corner in limit["corners"].items())
-        span = f"{limit['low_fps']:.1f} to {limit['high_fps']:.1f}"
+        span = _span(limit["low_fps"], limit["high_fps"], ".1f")
         reason = "its full speed" if limit["limited_by"] == "speed" else "by power"
-        console.print(f"{name:<16}{limit['fps']:.1f} fps ({span}), {reason}, at {limit['power_w']:.2f} W ({corners})")
+        console.print(f"{name:<16}{limit['fps']:.1f} fps{span}, {reason}, at {limit['power_w']:.2f} W ({corners})")
 
 
 def _reserve(rate: dict[str, Any]) -> str:
     if rate["holds"]:
-        span = f"{100 * rate['reserve_low']:.0f} to {100 * rate['reserve_high']:.0f} %"
-        return f"reserve {100 * rate['reserve']:.0f} % of a frame's time ({span})"
-    needed, most, least = (1 - rate[key] for key in ("reserve", "reserve_low", "reserve_high"))
-    return f"needs {needed:.2f} times a frame's time ({least:.2f} to {most:.2f})"
+        low, high = (None if rate[key] is None else 100 * rate[key] for key in ("reserve_low", "reserve_high"))
+        return f"reserve {100 * rate['reserve']:.0f} % of a frame's time{_span(low, high, '.0f', ' %')}"
+    most, least = (None if rate[key] is None else 1 - rate[key] for key in ("reserve_low", "reserve_high"))
+    return f"needs {1 - rate['reserve']:.2f} times a frame's time{_span(least, most, '.2f')}"
+
+
+def _span(low: float | None, high: float | None, form: str, unit: str = "") -> str:
+    """An interval in brackets; nothing where there is none."""
+    return "" if low is None or high is None else f" ({low:{form}} to {high:{form}}{unit})"
 
 
 def _print_power(console: Console, answer: dict[str, Any]) -> None:
@@ -164,7 +170,7 @@ def _print_power(console: Console, answer: dict[str, Any]) -> None:
 
 
 def _watts(watts: dict[str, Any]) -> str:
-    return f"{watts['w']:.2f} ({watts['low_w']:.2f} to {watts['high_w']:.2f})"
+    return f"{watts['w']:.2f}{_span(watts['low_w'], watts['high_w'], '.2f')}"
 
 
 def _print_heat(console: Console, answer: dict[str, Any]) -> None:
@@ -194,8 +200,9 @@ def show_answer(answer: dict[str, Any], as_json: bool) -> None:
     _print_times(console, answer)
     if answer["temperature_c"]:
         _print_heat(console, answer)
-    error = f"±{100 * answer['expected_error']:.0f} % of the network's time"
-    console.print(f"expected error  {error} (confidence {answer['confidence']:.2f})")
+    if answer["expected_error"] is not None:
+        error = f"±{100 * answer['expected_error']:.0f} % of the network's time"
+        console.print(f"expected error  {error} (confidence {answer['confidence']:.2f})")
     console.print(_unit_table(answer))
     if not answer["accounts"]["agree"]:
         found = answer["accounts"]["largest_difference"]
@@ -214,15 +221,16 @@ def _print_network(console: Console, answer: dict[str, Any]) -> None:
     )
     if minutes := config["minutes"]:
         _print_settled(console, answer, minutes)
-    span = f"{network['low_ms']:.1f} to {network['high_ms']:.1f}"
-    console.print(f"network alone   {network['alone_ms']:.1f} ms ({span})")
+    span = _span(network["low_ms"], network["high_ms"], ".1f")
+    console.print(f"network alone   {network['alone_ms']:.1f} ms{span}")
 
 
 def _print_times(console: Console, answer: dict[str, Any]) -> None:
     frame = answer["frame_time_ms"]
     capped = ", held by the display" if answer["display_capped"] else ""
     stray = f"averages over 20 frames {frame['ema20_min']:.1f} to {frame['ema20_max']:.1f} ms"
-    means = f"{frame['mean']:.1f} ms ({frame['low']:.1f} to {frame['high']:.1f}), {answer['fps']:.1f} fps{capped}"
+    span = _span(frame["low"], frame["high"], ".1f")
+    means = f"{frame['mean']:.1f} ms{span}, {answer['fps']:.1f} fps{capped}"
     console.print(f"{'over all' if answer['config']['minutes'] else 'application':<16}{means}; {stray}")
     console.print(f"latency         {answer['latency_ms']['mean']:.1f} ms")
     console.print(f"efficiency      {answer['efficiency']:.2f}")

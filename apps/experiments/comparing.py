@@ -112,7 +112,7 @@ class _Runs:
         out = self._folder / str(self._count)
         request = {"frames": self._frames, "size": self._size, "policy": policy, "cores": self.cores}
         held = {STAGE: held_ns} if held_ns else {}
-        run_asked(AskedRun(request, baseline_frames=0, held_ns=held, out=out, command=("trilane", "bench")), _quiet)
+        run_asked(AskedRun(request, baseline_frames=0, held_ns=held, out=out, command=("trilane", "bench")), quiet)
         return read_side(str(out))
 
     def pin(self, side: Side) -> None:
@@ -123,7 +123,7 @@ class _Runs:
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[Hooks]:
+def quiet() -> Iterator[Hooks]:
     from trilane.apps.run_job import Hooks
 
     yield Hooks(lambda *_: None, lambda _: None)

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import replace
 from typing import Any
 
+from trilane import machine
 from trilane.apps.experiments.error_by_cause import region
 from trilane.arrays import U8
 from trilane.bench.lib.cast import Cast
@@ -18,6 +20,8 @@ from trilane.bench.lib.full_picture import FullPictures
 from trilane.bench.lib.layers import Box
 from trilane.bench.lib.stage_chain import StageChain, units_of
 from trilane.errors import BadInputError
+from trilane.pipeline.core_meter import CoreMeter
+from trilane.pipeline.core_shares import preempted_ns
 from trilane.pipeline.stage import UnitContext
 from trilane.shapes import Shape
 from trilane.stages.avatar_pipeline import avatar_pipeline
@@ -51,13 +55,19 @@ class ScenePictures:
         return self.gpu.shared(CONTEXT, open_context)
 
     def frame(self, number: int) -> tuple[U8, Mapping[str, float]]:
-        """(h,w,3) uint8, sRGB: frame `number`, and milliseconds by stage; those that it skips take none."""
-        times, begun = {}, time.perf_counter_ns()
-        packet = self._chain.run(number, 0)
-        for place, name in enumerate(self._names):
-            packet = self._chain.go_on(number, place)
-            ended = time.perf_counter_ns()
-            times[name], begun = (ended - begun) * MS, ended
+        """(h,w,3) uint8, sRGB: frame `number`, and milliseconds by stage; those that it skips take none.
+
+        Time in which a thread that was ready had no core does not count.
+        """
+        cores, times = len(machine.here.cores()), {}
+        with closing(CoreMeter()) as meter:
+            begun = time.perf_counter_ns()
+            packet = self._chain.run(number, 0)
+            for place, name in enumerate(self._names):
+                packet = self._chain.go_on(number, place)
+                ended = time.perf_counter_ns()
+                wall_ns, begun = ended - begun, ended
+                times[name] = (wall_ns - preempted_ns(wall_ns, meter.cpu_ns(), meter.delay_ns(), cores)) * MS
         return self._picture(packet), times
 
     def background(self, number: int) -> U8:

@@ -63,7 +63,7 @@ def load(network: IntegerNetwork, options: RuntimeOptions) -> OrtSession:
     """Compile `network`. Raises BadInputError when ONNX Runtime cannot load it or would run a layer in float."""
     with tempfile.TemporaryDirectory(prefix="trilane-ort-") as folder:
         optimised = Path(folder) / "optimised.onnx"
-        settings = _settings(options)
+        settings = settings_of(options)
         settings.optimized_model_filepath = str(optimised)
         try:
             session = onnxruntime.InferenceSession(network.model.SerializeToString(), settings, providers=[PROVIDER])
@@ -87,7 +87,7 @@ def check_integer(optimised: onnx.ModelProto, network: IntegerNetwork) -> None:
         )
 
 
-def _settings(options: RuntimeOptions) -> onnxruntime.SessionOptions:
+def settings_of(options: RuntimeOptions) -> onnxruntime.SessionOptions:
     settings = onnxruntime.SessionOptions()
     settings.intra_op_num_threads = options.threads
     settings.inter_op_num_threads = 1

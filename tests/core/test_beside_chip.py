@@ -22,6 +22,7 @@ from trilane.hw_profiles.application import REFERENCE, Plan, Variant, stage_time
 from trilane.hw_profiles.beside import SKIPS, Tenant, Together, moved_bytes, together
 from trilane.hw_profiles.beside_answer import predict_beside
 from trilane.hw_profiles.load import load_profile
+from trilane.hw_profiles.measured_host import UNMEASURED, with_network
 from trilane.hw_profiles.network_work import Network, count_work
 from trilane.hw_profiles.performance_profiles import corners_of
 from trilane.hw_profiles.reference_networks import NetworkSpec, reference_network
@@ -225,11 +226,15 @@ def test_temperatures_by_hand() -> None:
 
 
 def test_what_is_said_of_a_machine_and_of_turns() -> None:
-    host: Any = SimpleNamespace(name="host")
+    host = load_profile("host")
     one, two = [beside_answer._notes(CHIP, [avatar()] * count, "deadline") for count in (1, 2)]
     assert len(one) == 1 and one[0].startswith("frames are released from one instant on")
     assert two[1:] == ["a unit that several pipelines have handed a job takes them by deadline, each job to its end"]
-    assert "divide it in equal shares" in beside_answer._notes(host, [avatar()] * 2, "deadline")[1]
+    plain = beside_answer._notes(host, [avatar()] * 2, "deadline")
+    assert "divide it in equal shares" in plain[1] and plain[2].startswith(UNMEASURED)
+    measured = with_network(host, avatar().networks[0].work, {1: 5.0}, 0.1, "measured by a test")
+    told = beside_answer._notes(measured, [avatar()] * 2, "deadline")
+    assert told[:2] == plain[:2] and told[2].startswith("the first pipeline was measured by a test;")
 
 
 def test_pipelines_of_one_name_are_numbered() -> None:

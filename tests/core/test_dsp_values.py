@@ -94,7 +94,7 @@ def test_a_part_of_a_package_counts_as_its_file(tmp_path: Path, monkeypatch: pyt
 
 @pytest.mark.parametrize(("threads", "spin"), [(1, False), (3, True)])
 def test_ort_is_set_up_as_the_unit_says(threads: int, spin: bool) -> None:
-    settings = ort._settings(RuntimeOptions(threads, spin))
+    settings = ort.settings_of(RuntimeOptions(threads, spin))
     assert (settings.intra_op_num_threads, settings.inter_op_num_threads) == (threads, 1)
     assert settings.execution_mode == onnxruntime.ExecutionMode.ORT_SEQUENTIAL
     assert settings.log_severity_level == 3

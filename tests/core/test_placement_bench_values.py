@@ -13,6 +13,7 @@ import pytest
 from trilane.bench import placement, planner
 from trilane.bench.lib.layers import Box
 from trilane.errors import BadInputError, TrilaneError
+from trilane.pipeline.rehearsal import Rehearsed
 from trilane.pipeline.trial import Round
 from trilane.scheduler.placement import Ranked
 from trilane.scheduler.places import Core, Place, Work
@@ -57,7 +58,7 @@ def trial(monkeypatch: pytest.MonkeyPatch) -> Any:
 
     found = [Ranked(each, ms * 1_000_000) for each, ms in ((A, 9), (B, 10), (C, 11))]
     monkeypatch.setattr(placement, "rule_placement", lambda cores: RULE if cores == (0, 1) else {})
-    monkeypatch.setattr(placement, "measured_times", lambda *_: {"cpu": {1: Work(2_000_000, 1_500_000)}})
+    monkeypatch.setattr(placement, "measured_times", lambda *_: Rehearsed({"cpu": {1: Work(2_000_000, 1_500_000)}}, {}))
     monkeypatch.setattr(placement, "ranked", lambda *_: list(found))
     monkeypatch.setattr(placement, "frame_ns", lambda *_: 15_000_000)
     monkeypatch.setattr(placement, "worth_trying", lambda ranking, rule: [ranking[1], ranking[0], rule])

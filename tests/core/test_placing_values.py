@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from trilane.pipeline.rehearsal import Rehearsed
 from trilane.scheduler.placement import Ranked
 from trilane.scheduler.placement_model import Rules
 from trilane.scheduler.places import Core, Place, Work
@@ -24,6 +25,7 @@ TIMES = {
     "gpu": {1: Work(3_000_000, 3_000_000, 2)},
     "dsp": {1: Work(8_000_000, 7_000_000), 2: Work(4_000_000, 3_500_000)},
 }
+TOOK_NS = {"pose": [1_000_000, 1_200_000], "infer": [8_000_000, 8_400_000]}
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,7 @@ class Told:
 
     def measured(self, *what: Any) -> Any:
         self.asked.append(("measured", *what[1:]))
-        return TIMES
+        return Rehearsed(TIMES, TOOK_NS)
 
     def cached(self, name: str, key: Any, make: Any) -> Any:
         self.asked.append((name, list(key)))
@@ -92,7 +94,7 @@ def test_what_is_measured_is_kept_and_the_best_of_those_tried_is_taken(monkeypat
     found = placing.placed(asked(), "pipelined", "starter", "a driver", said.append)  # type: ignore[arg-type]
     names = [placing.described(where) for where in (B, RULE, A)]
     assert told.asked == [
-        ("placement-2", KEY),
+        ("placement-3", KEY),
         ("measured", CORES, RULE, "starter"),
         ("ranked", list(CORES), TIMES, Rules("cpu", False), {}),
         ("choice", [0, 1], [B, RULE, A], "starter"),
@@ -151,3 +153,13 @@ def test_what_is_not_measured_is_placed_by_the_rule(run: Any, how: str, why: str
 def test_one_core_leaves_nothing_to_choose() -> None:
     assert placing._why_not(asked(), CORES[:1]) == "there is one core"
     assert placing._why_not(asked(), CORES) == ""
+
+
+def test_a_prediction_has_the_times_that_a_run_is_placed_by(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Under the run's own key, so whoever comes second measures nothing; each stage has its times frame by frame."""
+    told = Told(monkeypatch, Choice(0, ""))
+    placing.placed(asked(), "sequential", ANY, "a driver")
+    found, at = placing.rehearsed(asked(), ANY, "a driver")
+    assert (found, at) == (Rehearsed(TIMES, TOOK_NS), NOON)
+    assert [each for each in told.asked if each[0] == "placement-3"] == [("placement-3", KEY)] * 2
+    assert [each[0] for each in told.asked].count("measured") == 1

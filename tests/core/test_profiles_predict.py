@@ -322,7 +322,7 @@ def test_a_placed_network_has_the_rates_of_its_threads_and_no_other_unit_changes
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The profile's rates are those of as many threads as the rule gives, here 4."""
-    monkeypatch.setattr(placed_host, "network_threads", lambda: 4)
+    monkeypatch.setattr("trilane.hw_profiles.host_profile.network_threads", lambda: 4)
     profile = load_profile("host")
     placement = {"cpu": Place((2,), 1), "gpu": Place((0, 1), 1), "dsp": Place((0, 1, 3), 3)}
     units = on_cores(profile, placement).units
@@ -332,8 +332,9 @@ def test_a_placed_network_has_the_rates_of_its_threads_and_no_other_unit_changes
     for peak in ("peak_int8_tmac_s", "peak_fp16_tmac_s", "peak_fp32_tmac_s"):
         before, after = getattr(profile.units["dsp"], peak), getattr(units["dsp"], peak)
         assert after.value == pytest.approx(0.75 * before.or_else(0.0)) and after.kind == before.kind
-    others = units["dsp"].model_dump(exclude={"core", *placed_host.PEAKS})
-    assert others == profile.units["dsp"].model_dump(exclude={"core", *placed_host.PEAKS})
+    assert units["dsp"].threads == 3
+    others = units["dsp"].model_dump(exclude={"core", "threads", *placed_host.PEAKS})
+    assert others == profile.units["dsp"].model_dump(exclude={"core", "threads", *placed_host.PEAKS})
 
 
 def test_units_with_cores_of_their_own_are_predicted_as_without() -> None:

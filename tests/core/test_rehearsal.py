@@ -9,7 +9,7 @@ import pytest
 
 from trilane.hw_profiles.placement_facts import described, placement_of, predictions, unit_rows
 from trilane.pipeline import rehearsal
-from trilane.pipeline.rehearsal import Chain, on_rungs, works_of
+from trilane.pipeline.rehearsal import Chain, on_rungs, timed, works_of
 from trilane.pipeline.run_log import UnitError
 from trilane.scheduler.events import StageAlone, chain
 from trilane.scheduler.placement import Ranked
@@ -97,7 +97,7 @@ def test_works_are_medians_over_the_frames_that_do_not_warm_up(units: Units) -> 
     """Of five frames two warm up, however slow; of the others infer takes 10, 70 and 20 us more than its 4000."""
     units.more_us = {("infer", 0, 0): 9999, ("infer", 1, 0): 9999}
     units.more_us |= {("infer", 2, 0): 10, ("infer", 3, 0): 70, ("infer", 4, 0): 20}
-    works = works_of(PIPELINE, units.chain(), [0, 1, 2, 3, 4])
+    works = works_of(PIPELINE, timed(units.chain(), [0, 1, 2, 3, 4]))
     assert works == {
         "cpu": Work(4_000_000, 2_000_000, 2),
         "gpu": Work(2_000_000, 1_000_000, 1),
@@ -109,29 +109,28 @@ def test_no_frame_is_begun_when_the_time_is_up_and_warming_up_is_not_part_of_it(
     units: Units, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(rehearsal, "LIMIT_S", -1.0)
-    works_of(PIPELINE, units.chain(), [0, 1, 2, 3])
+    assert len(timed(units.chain(), [0, 1, 2, 3])) == 1
     assert {job.frame for _, job in units.jobs} == {0, 1, 2}
     units.jobs.clear()
-    works_of(PIPELINE, units.chain(), [5])
+    assert len(timed(units.chain(), [5])) == 1
     assert {job.frame for _, job in units.jobs} == {5}
 
 
 def test_cpu_time_is_never_more_than_the_time_it_took(units: Units) -> None:
     units.cpu = 3.0
-    works = works_of(PIPELINE, units.chain(), [0])
+    works = works_of(PIPELINE, timed(units.chain(), [0]))
     assert works["gpu"] == Work(2_000_000, 2_000_000, 1)
     assert works["dsp"] == Work(4_000_000, 4_000_000, 1)  # 3 / 2 of it for each thread
 
 
-def test_what_a_stage_takes_on_each_rung_is_its_most_of_the_frames_after_the_first(units: Units) -> None:
-    """infer is followed on two rungs: of frames 4 and 8, 4030 and 4020 us on rung 0, and 3000 and 3500 on rung 1."""
-    units.more_us = {("infer", 0, 0): 9999, ("infer", 4, 0): 30, ("infer", 8, 0): 20}
-    units.more_us |= {("infer", 4, 1): -1000, ("infer", 8, 1): -500}
-    found = on_rungs(units.chain(whole=False), [0, 4, 8], 2, ["infer"])
-    assert found == [StageAlone("infer", 0, 4_030_000), StageAlone("infer", 1, 3_500_000)]
-    assert [(job.frame, job.rung) for name, job in units.jobs if name == "pose"] == [
-        (frame, rung) for frame in (0, 4, 8) for rung in (0, 1)
-    ]
+def test_what_a_stage_takes_on_each_rung_is_its_median_over_the_frames_after_the_first(units: Units) -> None:
+    """infer is followed on two rungs: of frames 4, 8, 9 it takes 4030, 4020, 4900 us on 0; 3000, 3500, 3100 on 1."""
+    units.more_us = {("infer", 0, 0): 9999, ("infer", 4, 0): 30, ("infer", 8, 0): 20, ("infer", 9, 0): 900}
+    units.more_us |= {("infer", 0, 1): -3999, ("infer", 4, 1): -1000, ("infer", 8, 1): -500, ("infer", 9, 1): -900}
+    found = on_rungs(units.chain(whole=False), [0, 4, 8, 9], 2, ["infer"])
+    assert found == [StageAlone("infer", 0, 4_030_000), StageAlone("infer", 1, 3_100_000)]
+    followed = [(job.frame, job.rung) for name, job in units.jobs if name == "pose"]
+    assert followed == [(frame, rung) for rung in (0, 1) for frame in (0, 4, 8, 9)], "no frame follows itself"
 
 
 def test_nothing_is_said_of_a_stage_that_takes_no_less_on_a_further_rung(units: Units) -> None:

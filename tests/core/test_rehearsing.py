@@ -149,8 +149,8 @@ def test_every_number_of_threads_is_measured_on_the_fastest_cores(
 def test_the_shape_is_the_squarest_of_those_that_are_large() -> None:
     """Half of the most pixels is too small; of two as square the one with fewer rows."""
 
-    def shape(*buckets: tuple[int, int], most: int = 20_000) -> str:
-        return rehearsing._one_shape(checked_of(9, buckets, most).config)
+    def shape(*buckets: tuple[int, int], most: int = 20_000) -> tuple[int, int]:
+        return rehearsing.one_shape(checked_of(9, buckets, most).config)
 
-    assert shape((100, 100), (90, 140), (140, 90)) == "90x140"
-    assert shape((100, 100), (80, 240), (140, 90), most=19_999) == "100x100"
+    assert shape((100, 100), (90, 140), (140, 90)) == (90, 140)
+    assert shape((100, 100), (80, 240), (140, 90), most=19_999) == (100, 100)

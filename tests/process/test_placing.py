@@ -10,11 +10,13 @@ from pathlib import Path
 import pytest
 
 from trilane import machine
+from trilane.errors import TrilaneError
 from trilane.hw_profiles.host import rule_placement, usable_cores
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.places import Times
 from trilane.stages import choosing, placing
 from trilane.stages.configure import Checked, Request, configure
+from trilane.stages.dsp.bare_calls import calls_of
 from trilane.stages.factories import PRELOAD
 
 SEVERAL = pytest.mark.skipif(len(usable_cores()) < 2, reason="there is one core")
@@ -99,3 +101,20 @@ def test_units_have_the_cores_that_were_asked_for(drawable_bundle: Path, tmp_pat
     assert {unit: row["threads"] for unit, row in report["units"].items()} == {u: len(own) for u, own in wanted.items()}
     assert {unit: row["spin"] for unit, row in report["units"].items()} == dict.fromkeys(wanted, False)
     assert report["core_efficiency"] > 0
+
+
+@pytest.mark.usefixtures("nothing_left")
+def test_calls_of_a_network_are_measured_in_a_process_of_their_own(
+    drawable_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With one thread; a file that is cut short ends it with what is wrong, and nothing is kept of it."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    path, said = drawable_bundle / "network.onnx", list[int]()
+    first = calls_of(path, {}, "ort", (1,), usable_cores(), lambda: said.append(1))
+    assert first == calls_of(path, {}, "ort", (1,), usable_cores(), lambda: said.append(2))
+    assert said == [1] and list(first.took_ns) == [1] and min(first.took_ns[1]) > 0
+    short = tmp_path / "short.onnx"
+    short.write_bytes(path.read_bytes()[:-400])
+    with pytest.raises(TrilaneError, match=r"short\.onnx"):
+        calls_of(short, {}, "ort", (1,), usable_cores(), lambda: said.append(3))
+    assert said == [1, 3]

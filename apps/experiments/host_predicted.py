@@ -1,0 +1,132 @@
+"""Is what `trilane predict --profile host` says true: of runs of an avatar, and of networks by themselves?
+
+Rule: each prediction is made first, then what it is of runs as it always does: a whole `trilane run` in processes of
+its own; calls of the network in a process that the prediction did not start. Nothing of these comes into a prediction.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+from trilane.apps.asked_prediction import answer_of, network_of, predict_networks, usual_policy, variant_of
+from trilane.apps.asked_run import AskedRun, run_asked
+from trilane.apps.experiments.comparing import quiet
+from trilane.apps.remade_avatar import remade_avatar
+from trilane.apps.remake import Remake
+from trilane.avatars.bundle import load_bundle
+from trilane.bench.lib.interleaved_processes import Variant, runners
+from trilane.errors import BadInputError
+from trilane.hw_profiles.application import Plan
+from trilane.hw_profiles.load import HOST, load_runnable
+from trilane.hw_profiles.network_time import NORMAL_80
+from trilane.hw_profiles.placed_host import NETWORK
+from trilane.hw_profiles.rates import NOTHING
+from trilane.stages.configure import requested_runtime
+from trilane.units import BURST
+
+RUN, ALONE = "run", "network"
+MIN_FRAMES = 100  # of a run that is placed by its times
+
+
+class Predicted(NamedTuple):
+    """Milliseconds, and the 80 % interval; None where nothing could be measured."""
+
+    ms: float
+    low_ms: float | None
+    high_ms: float | None
+
+
+def measure(
+    avatar: str = "default", width: tuple[int, ...] = (8, 24, 32, 40, 48), frames: int = 200, seconds: float = 3.0
+) -> dict[str, Any]:
+    """Predicted beside measured: the avatar with its own network, then with an untrained one of each `width`.
+
+    Two rows for each network: `what` is `run` (time between frames of a run of `frames` frames) or `network` (median of
+    the calls of `seconds` seconds). `predicted_ms`, `low_ms`, `high_ms`; `measured_ms`; `error`: predicted over
+    measured, less 1; `inside`: whether the measured time is in the 80 % interval; `others`: share of the cores that
+    other programs had in the run, with more than 0.1 the row says little.
+
+    `run`, `network`: of the rows of that kind `inside`, `of`; `median_error`: of the errors without sign;
+    `leave_one_out_error`: root mean square of the errors as logarithms; `inside_left_out`: how many rows are in the
+    interval that follows from the errors of the others alone.
+
+    Raises BadInputError, MissingPartError without PyTorch, TrilaneError when a run fails.
+    """
+    if frames < MIN_FRAMES:
+        raise BadInputError("--frames", str(frames), f"at least {MIN_FRAMES}")
+    rows: list[dict[str, Any]] = []
+    with TemporaryDirectory(prefix="trilane-predict-") as folder:
+        for asked in (None, *width):
+            made = str(remade_avatar(avatar, Remake(width=asked))[0]) if asked else avatar
+            name = f"width {asked}" if asked else avatar
+            predicted = _of_run(made)
+            measured_ms, others = _run(made, frames, Path(folder) / str(len(rows)))
+            rows.append(_row(name, RUN, predicted, measured_ms, others))
+            file = load_bundle(made).network_path
+            predicted = _of_network(file)
+            rows.append(_row(name, ALONE, predicted, _calls(file, seconds), None))
+    summaries = {what: summary([row for row in rows if row["what"] == what]) for what in (RUN, ALONE)}
+    config = {"avatar": avatar, "width": list(width), "frames": frames, "seconds": seconds}
+    return {"rows": rows, **summaries, "config": config}
+
+
+def _of_run(avatar: str) -> Predicted:
+    chip, network = network_of(load_runnable(HOST), [], {}, avatar, "packed", NETWORK, None)
+    assert network is not None
+    plan = Plan(network, NETWORK, variant_of(usual_policy(HOST), None, 1, None))
+    frame = answer_of(chip, plan, BURST, 0.0, None, False, NOTHING)["frame_time_ms"]
+    return Predicted(frame["mean"], frame["low"], frame["high"])
+
+
+def _run(avatar: str, frames: int, out: Path) -> tuple[float, float | None]:
+    """Milliseconds between the frames of a run, and what other programs had of the cores."""
+    request = {"avatar": avatar, "frames": frames}
+    asked = AskedRun(request, baseline_frames=0, out=out, command=("trilane", "bench"))
+    report = run_asked(asked, quiet).report
+    return report.frame_time_ms.mean, report.other_programs
+
+
+def _of_network(file: Path) -> Predicted:
+    over = (BURST, 0.0, None, NOTHING)
+    (answer,) = predict_networks(load_runnable(HOST), [file], {}, (NETWORK, None, None), over)
+    return Predicted(answer["network_ms"], answer["low_ms"], answer["high_ms"])
+
+
+def _calls(file: Path, seconds: float) -> float:
+    runtime, _ = requested_runtime("auto")
+    variant = Variant("runtime", file, runtime, load_runnable(HOST).units[NETWORK].threads)
+    with runners({ALONE: variant}) as by_name:
+        return median(by_name[ALONE].run_for(seconds))
+
+
+def _row(name: str, what: str, predicted: Predicted, measured_ms: float, others: float | None) -> dict[str, Any]:
+    ms, low, high = predicted
+    return {
+        "name": name,
+        "what": what,
+        "predicted_ms": ms,
+        "low_ms": low,
+        "high_ms": high,
+        "measured_ms": measured_ms,
+        "error": ms / measured_ms - 1,
+        "inside": low is not None and high is not None and low <= measured_ms <= high,
+        "others": others,
+    }
+
+
+def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Of rows of one kind, at least two."""
+    squares = [math.log1p(row["error"]) ** 2 for row in rows]
+    left_out = [(sum(squares) - one) / (len(squares) - 1) for one in squares]
+    return {
+        "inside": sum(row["inside"] for row in rows),
+        "of": len(rows),
+        "median_error": median(abs(row["error"]) for row in rows),
+        "leave_one_out_error": math.sqrt(sum(squares) / len(squares)),
+        "inside_left_out": sum(one <= NORMAL_80**2 * other for one, other in zip(squares, left_out, strict=True)),
+    }

@@ -1,0 +1,340 @@
+"""When this machine is measured, what of it is kept, and what is said where it cannot be; what measures is told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper
+
+from trilane import machine
+from trilane.apps import asked_prediction, this_machine
+from trilane.avatars.bundle import load_bundle
+from trilane.errors import BadInputError, TrilaneError
+from trilane.hw_profiles.graph_file import read_graph
+from trilane.hw_profiles.load import load_profile
+from trilane.hw_profiles.network_work import Network, count_work
+from trilane.machine import Machine
+from trilane.pipeline.description import UnitSettings
+from trilane.pipeline.rehearsal import Rehearsed
+from trilane.pipeline.stage import UnitContext
+from trilane.scheduler.places import Work
+from trilane.stages import machine_facts
+from trilane.stages.dsp import bare_calls
+from trilane.units import BURST
+
+ANY: Any = None
+CORES = (0, 1, 2)
+TOOK_NS = {1: [4_000_000, 5_000_000, 9_000_000], 2: [3_000_000, 3_000_000, 3_000_000]}
+
+
+class Told(Machine):
+    """A machine with these facts; its cache is below `root`."""
+
+    def __init__(self, root: Path) -> None:
+        super().__init__(root)
+        self.root = root
+        self.fields, self.allowed = {"model name": "Zen", "flags": "avx2 fma"}, CORES
+
+    def cores(self) -> tuple[int, ...]:
+        return self.allowed
+
+    def cpu_fields(self) -> dict[str, str]:
+        return self.fields
+
+    def cache_home(self) -> Path:
+        return self.root / "cache"
+
+
+@pytest.fixture
+def told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Told:
+    found = Told(tmp_path)
+    monkeypatch.setattr(machine, "here", found)
+    return found
+
+
+@pytest.fixture
+def measured(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
+    """What was asked of what measures calls."""
+    asked: list[tuple[Any, ...]] = []
+
+    def calls(*what: Any) -> Any:
+        asked.append(what)
+        return {threads: TOOK_NS[threads] for threads in what[3]}
+
+    monkeypatch.setattr(bare_calls, "_measured", calls)
+    return asked
+
+
+@pytest.fixture
+def network(tiny_bundle: Path) -> Path:
+    return tiny_bundle / "network.onnx"
+
+
+def float_network(path: Path, shape: tuple[int, ...] = (1, 2, 4, 4), kind: int = TensorProto.FLOAT) -> Path:
+    """The sum of an input and a constant."""
+    given = [helper.make_tensor_value_info(name, kind, shape) for name in ("x", "y")]
+    dtype = helper.tensor_dtype_to_np_dtype(kind)
+    constant = onnx.numpy_helper.from_array(np.ones(shape, dtype), "one")
+    node = helper.make_node("Add", ["x", "one"], ["y"])
+    graph = helper.make_graph([node], "sum", given[:1], given[1:], [constant])
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=10), path)
+    return path
+
+
+def calls(path: Path, say: Callable[[], None] = lambda: None, runtime: str = "ort") -> bare_calls.Calls:
+    return bare_calls.calls_of(path, {}, runtime, (1, 2), CORES, say)
+
+
+@pytest.mark.usefixtures("told")
+def test_calls_are_measured_once_and_it_is_said_before(measured: list[Any], network: Path) -> None:
+    said: list[int] = []
+    first = calls(network, lambda: said.append(len(measured)))
+    assert (first.took_ns, first.runtime) == (TOOK_NS, "ort")
+    assert first == calls(network, lambda: said.append(len(measured)))
+    assert said == [0], "once, before anything was measured"
+    assert measured == [(network, {}, "ort", (1, 2), CORES)]
+
+
+@pytest.mark.parametrize("changed", ["model", "flags", "cores", "package", "runtime", "network"])
+def test_another_fact_is_measured_again(
+    changed: str, told: Told, measured: list[Any], network: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls(network)
+    path, runtime = network, "ort"
+    if changed == "model":
+        told.fields = {**told.fields, "model name": "Zen 2"}
+    elif changed == "flags":
+        told.fields = {**told.fields, "flags": "avx2"}
+    elif changed == "cores":
+        told.allowed = (0, 1)
+    elif changed == "package":
+        version = machine_facts.package_version
+        monkeypatch.setattr(machine_facts, "package_version", lambda name: "0.1" if name == "numpy" else version(name))
+    elif changed == "runtime":
+        runtime = "openvino"
+    else:
+        path = float_network(tmp_path / "other.onnx")
+    calls(path, runtime=runtime)
+    assert len(measured) == 2
+    calls(path, runtime=runtime)
+    assert len(measured) == 2
+
+
+@pytest.mark.usefixtures("told")
+def test_where_nothing_can_be_kept_it_is_measured_each_time(
+    measured: list[Any], network: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("trilane.cache.cache_dir", lambda _: None)
+    assert [calls(network).took_ns for _ in range(2)] == [TOOK_NS] * 2
+    assert len(measured) == 2
+
+
+@pytest.mark.usefixtures("told")
+def test_a_network_of_floats_runs_in_onnx_runtime(measured: list[Any], tmp_path: Path) -> None:
+    assert calls(float_network(tmp_path / "net.onnx"), runtime="openvino").runtime == "ort"
+    assert measured[0][2] == "ort"
+
+
+def built(path: Path, shapes: Any = None) -> Any:
+    unit = UnitContext("dsp", UnitSettings(cores=(0,), threads=1), {})
+    return bare_calls.build({"path": str(path), "shapes": shapes or {}, "runtime": "ort"}, unit)
+
+
+@pytest.mark.parametrize("kind", [TensorProto.FLOAT, TensorProto.INT64, TensorProto.FLOAT16])
+def test_frames_are_calls_with_distinct_inputs_in_turn(
+    kind: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import onnxruntime
+
+    seen: list[Any] = []
+    real = onnxruntime.InferenceSession
+
+    def session(*args: Any, **options: Any) -> Any:
+        own = real(*args, **options)
+        run = lambda names, feed: seen.append((feed["x"], own.run(names, feed)[0]))  # noqa: E731
+        return SimpleNamespace(get_inputs=own.get_inputs, run=run)
+
+    monkeypatch.setattr(onnxruntime, "InferenceSession", session)
+    stage = built(float_network(tmp_path / "net.onnx", kind=kind))
+    stage.bind([], [])
+    for frame in range(5):
+        assert stage.run(frame, None, None) == {}
+    stage.close()
+    assert all(np.array_equal(done, given + given.dtype.type(1)) for given, done in seen)
+    assert len({given.tobytes() for given, _ in seen[:4]}) == 4
+    assert np.array_equal(seen[0][0], seen[4][0])
+
+
+def test_a_network_of_integers_is_bound_to_distinct_bytes(network: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bound: list[Any] = []
+
+    class Session:
+        def bind(self, inputs: Any, outputs: Any) -> Any:
+            place = len(bound)
+            bound.append((inputs[0], outputs[0]))
+            return SimpleNamespace(run=lambda: ran.append(place))
+
+    ran: list[int] = []
+    monkeypatch.setattr(bare_calls, "load_runtime", lambda _: SimpleNamespace(load=lambda *_: Session()))
+    stage = built(network)
+    for frame in range(5):
+        stage.run(frame, None, None)
+    assert ran == [0, 1, 2, 3, 0]
+    assert {given.shape for given, _ in bound} == {(1, 64, 64, 5)} and bound[0][1].shape == (1, 64, 64, 4)
+    assert len({given.tobytes() for given, _ in bound}) == 4
+
+
+def test_what_is_no_number_or_has_no_shape_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="input x of tensor\\(uint16\\)"):
+        built(float_network(tmp_path / "net.onnx", kind=TensorProto.UINT16))
+    path = float_network(tmp_path / "open.onnx")
+    model = onnx.load(path)
+    model.graph.input[0].type.tensor_type.shape.dim[0].dim_param = "n"
+    onnx.save(model, path)
+    with pytest.raises(BadInputError, match="in a fixed shape"):
+        built(path)
+    built(path, {"x": [1, 2, 4, 4]}).run(0, None, None)
+
+
+@pytest.mark.usefixtures("told")
+def test_a_file_has_the_median_of_its_calls(measured: list[Any], network: Path) -> None:
+    """The unit for networks has one thread of three cores: 5 ms. With told numbers of threads it has those."""
+    graph, said = read_graph(network), list[str]()
+    chip = this_machine.with_file(load_profile("host"), graph, {}, said.append)
+    found: Any = chip.units["dsp"].measured
+    assert this_machine.price(chip, graph.work, "dsp", this_machine.corners_of(chip, BURST)).total_ms == pytest.approx(
+        5.0
+    )
+    assert found.said.startswith("measured on this machine at ") and "calls of the network by itself" in found.said
+    assert said == [this_machine.MEASURING.format("network.onnx")] and "at most half a minute" in said[0]
+    assert measured[0][3:] == ((1,), CORES)
+    both: Any = this_machine.with_file(load_profile("host"), graph, {}, said.append, (1, 2)).units["dsp"].measured
+    assert set(both.slower) == {1, 2} and found.error == both.error
+
+
+@pytest.mark.usefixtures("told")
+def test_what_cannot_be_measured_stays_as_it_is_and_is_said(
+    measured: list[Any], network: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    graph, said, host = read_graph(network), list[str](), load_profile("host")
+    assert this_machine.with_file(host, graph._replace(numbers="not said"), {}, said.append) == host
+    monkeypatch.setattr(this_machine, "LONGEST_CALL_MS", 0.0)
+    assert this_machine.with_file(host, graph, {}, said.append) == host
+    monkeypatch.setattr(this_machine, "LONGEST_CALL_MS", 1e9)
+
+    def fails(*_: object) -> None:
+        raise TrilaneError("the unit ended")
+
+    monkeypatch.setattr(this_machine, "calls_of", fails)
+    assert this_machine.with_file(host, graph, {}, said.append) == host
+    assert measured == []
+    assert [text.removeprefix("not measured on this machine: ") for text in said] == [
+        "the file has no weights",
+        "a call is expected to take 0 s, which is too long",
+        "the unit ended",
+    ]
+
+
+@pytest.fixture
+def rehearsed(tiny_bundle: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """A rehearsal of three frames whose network is of 96x64; what it was asked is under `asked`."""
+    asked: dict[str, Any] = {}
+    one = [1_000_000] * 3
+    took_ns = {"pose": one, "raster": one, "infer": [5_000_000] * 3, "composite": one, "present": one}
+    times = {"dsp": {1: Work(5_000_000, 5_000_000), 2: Work(3_000_000, 3_000_000)}}
+
+    def configure(request: Any, _: Path) -> Any:
+        asked["request"] = request
+        assets = load_bundle(tiny_bundle).read_network()
+        return SimpleNamespace(config=SimpleNamespace(runtime="ort", avatar_dirs=(1,)), assets=assets)
+
+    def rehearse(_checked: Any, _starter: Any, driver: str, say: Any) -> Any:
+        asked["driver"] = driver
+        say("anything")
+        if "fails" in asked:
+            raise TrilaneError("no driver")
+        return Rehearsed(times, took_ns), "noon"
+
+    monkeypatch.setattr(this_machine, "configure", configure)
+    monkeypatch.setattr(this_machine, "network_of", lambda assets: assets)
+    monkeypatch.setattr(this_machine, "rehearsed", rehearse)
+    monkeypatch.setattr(this_machine, "one_shape", lambda _: (96, 64))
+    monkeypatch.setattr(this_machine, "gl_facts", lambda: {"vendor": "Mesa"})
+    return asked
+
+
+def test_an_avatar_has_what_a_run_of_it_is_placed_by(rehearsed: Any, tiny_bundle: Path) -> None:
+    """The run's driver is part of the key under which it is kept; the network has the run's usual shape."""
+    said: list[str] = []
+    chip, network = this_machine.with_avatar(load_profile("host"), str(tiny_bundle), said.append)
+    assert rehearsed["request"].avatar == str(tiny_bundle) and rehearsed["driver"] == "{'vendor': 'Mesa'}"
+    assert (network.height, network.width, network.channels) == (96, 64, 5)
+    found: Any = chip.units["dsp"].measured
+    assert set(found.slower) == {1, 2} and found.error == pytest.approx(0.08)
+    assert found.said == "measured on this machine at noon: frames of a run, one at a time, with ort"
+    assert chip.application.composite_ms.or_else(0) == 1.0
+    assert said == [this_machine.MEASURING.format("the stages")]
+    rehearsed["fails"] = True
+    host = load_profile("host")
+    assert this_machine.with_avatar(host, str(tiny_bundle), said.append)[0] == host
+    assert said[-1] == "not measured on this machine: no driver"
+
+
+@pytest.mark.usefixtures("told")
+def test_a_file_in_the_application_has_its_own_calls_and_the_stages_of_the_default_avatar(
+    rehearsed: Any, measured: list[Any], network: Path
+) -> None:
+    graph = read_graph(network)
+    chip = this_machine.with_file_in_application(load_profile("host"), graph, {}, lambda _: None)
+    found: Any = chip.units["dsp"].measured
+    assert rehearsed["request"].avatar == "default" and measured[0][3] == (1, 2)
+    assert "calls of the network" in found.said and chip.application.composite_ms.or_else(0) == 1.0
+    rehearsed["fails"] = True
+    host = load_profile("host")
+    assert this_machine.with_file_in_application(host, graph, {}, lambda _: None) == host
+
+
+@pytest.mark.usefixtures("told")
+def test_of_several_pipelines_the_first_is_measured(rehearsed: Any, measured: list[Any], network: Path) -> None:
+    host = load_profile("host")
+    assert this_machine.with_first(host, f"{network}@12", lambda _: None).units["dsp"].measured is not None
+    assert len(measured) == 1 and "request" not in rehearsed
+    assert this_machine.with_first(host, "crowd@12", lambda _: None).units["dsp"].measured is not None
+    assert rehearsed["request"].scene == "crowd" and len(measured) == 1
+
+
+@pytest.mark.parametrize(
+    ("profile", "unit", "precision", "is_measured"),
+    [
+        ("host", "dsp", None, True),
+        ("host", "gpu", None, False),
+        ("host", "dsp", "fp16", False),
+        ("qcs6490", "dsp", None, False),
+    ],
+)
+def test_only_what_this_machine_would_run_is_measured(
+    profile: str, unit: Any, precision: Any, is_measured: bool, tiny_bundle: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+    work = count_work(load_bundle(tiny_bundle).read_network().model)
+    network = Network({}, 64, 64, 5, "packed", work)
+    monkeypatch.setattr(this_machine, "with_avatar", lambda chip, *_: asked.append("avatar") or (chip, network))
+    monkeypatch.setattr(this_machine, "with_file", lambda chip, *_: asked.append("file") or chip)
+    monkeypatch.setattr(this_machine, "with_file_in_application", lambda chip, *_: asked.append("both") or chip)
+    chip, files = load_profile(profile), [tiny_bundle / "network.onnx"]
+    asked_prediction.network_of(chip, [], {}, str(tiny_bundle), "packed", unit, precision)
+    asked_prediction.network_of(chip, files, {}, None, "packed", unit, precision)
+    over: Any = (BURST, 0.0, None, asked_prediction.wanted_of(None, None))
+    asked_prediction.predict_networks(chip, files, {}, (unit, precision, None), over)
+    assert asked == (["avatar", "both", "file"] if is_measured else [])
+
+
+def test_this_machine_has_the_policy_of_a_run() -> None:
+    assert asked_prediction.usual_policy("host") == "pipelined"
+    assert asked_prediction.usual_policy("qcs6490") == "reference"
