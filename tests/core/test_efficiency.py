@@ -9,7 +9,8 @@ import pytest
 
 from trilane.pipeline.core_shares import lost_in_job
 from trilane.pipeline.cpu_use import Efficiencies
-from trilane.pipeline.reckoning import Reckoned, reckoned, records_of
+from trilane.pipeline.journal import records_of
+from trilane.pipeline.reckoning import Reckoned, reckoned
 from trilane.scheduler.beside import Member, simulate_beside
 from trilane.scheduler.events import Settings, chain
 from trilane.scheduler.ledger import JobRecord

@@ -25,7 +25,8 @@ from trilane.hw_profiles.load import load_profile
 from trilane.hw_profiles.predict import predict
 from trilane.hw_profiles.reference_networks import NetworkSpec, reference_network
 from trilane.hw_profiles.schema import Profile
-from trilane.pipeline.reckoning import Reckoned, reckoned, records_of
+from trilane.pipeline.journal import records_of
+from trilane.pipeline.reckoning import Reckoned, reckoned
 from trilane.scene.crop import Rect
 from trilane.scene.work import Work
 from trilane.scheduler.beside import Member, simulate_beside
