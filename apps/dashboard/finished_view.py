@@ -59,7 +59,7 @@ class FinishedRun:
         self.end_ms = 0.0
         self.jobs, self.idle, self.presented, self.figures = map(TimeTable, (JOB, IDLE, PRESENTED, FIGURES))
         self._written = TextStore()
-        self._timeline, self._meter = Timeline(begun), Meter(begun)
+        self._timeline, self._meter = Timeline(begun), Meter(begun, finds_bound=facts.bound is None)
         self._last_stage = len(begun.graph.stages) - 1
         self._due_ms = 0.0
         self.metrics = ""
