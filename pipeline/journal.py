@@ -276,7 +276,7 @@ def config_of(begun: Begun) -> Mapping[str, Any]:
     """The configuration that a journal begins with; empty for one that does not know it."""
     config = begun.facts.get("config", {})
     if not isinstance(config, Mapping) or not all(
-        isinstance(config.get(key, {}), Mapping) for key in ("units", "scene")
+        isinstance(config.get(key, {}), Mapping) for key in ("units", "scene", "pace_ns")
     ):
         raise BadInputError("the journal: facts", "a configuration of another form", "that of a run")
     return config

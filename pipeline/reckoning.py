@@ -78,10 +78,15 @@ class Reckoning:
 
 
 def places_of(begun: Begun) -> dict[str, Place]:
-    """Cores and threads of each unit, as far as the journal's head knows them. Raises BadInputError."""
-    units = config_of(begun).get("units", {})
+    """Cores and threads of each unit as `Pipeline.places` has them, as far as the journal's head knows them.
+
+    Raises BadInputError for a configuration that is none of a run.
+    """
+    config = config_of(begun)
+    units, pace_ns = config.get("units", {}), config.get("pace_ns", {})
+    paced = {stage.unit for stage in begun.graph.stages if pace_ns.get(stage.name)}
     return {
-        unit: Place(tuple(own["cores"]), own.get("threads", 1))
+        unit: Place(tuple(own["cores"]), 1 if unit in paced else own.get("threads", 1))
         for unit, own in units.items()
         if unit in begun.graph.units and own.get("cores")
     }
