@@ -101,6 +101,8 @@ def _show(document: Mapping[str, Any]) -> None:
 
 
 def _head(document: Mapping[str, Any]) -> Iterator[str]:
+    if document["remark"]:
+        yield document["remark"]
     frame_ms = document["frame_ms"]
     mean = "fewer than two frames: no frame time" if frame_ms is None else f"{frame_ms:.2f} ms a frame"
     scene = f"scene {document['scene']}, " if document["scene"] else ""

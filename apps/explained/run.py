@@ -12,11 +12,12 @@ from typing import Any
 
 from trilane.apps.explained.advice import advice
 from trilane.apps.explained.slow_frames import MOST_SAMPLES, Shown, SlowFrames, Usual, notes, reasons
+from trilane.apps.live.followed_run import CUT_OFF, FollowedRun, RunState
 from trilane.apps.report import Report, read_report
 from trilane.errors import BadInputError
 from trilane.figure_sources import COMPUTED, MEASURED
 from trilane.pipeline.critical_path import WHATS, Part
-from trilane.pipeline.journal import NAME, Begun, Record, config_of, journal_in, read_journal
+from trilane.pipeline.journal import NAME, Begun, Ended, Record, config_of, journal_in, read_journal
 from trilane.pipeline.reckoning import Reckoning, places_of
 from trilane.pipeline.sharing import Taken
 from trilane.pipeline.waits import PREEMPTED, ExplainedJob, Waits
@@ -24,6 +25,7 @@ from trilane.scheduler.stats import NS_PER_MS
 
 SCHEMA = 1
 HOST = "host"
+GOES_ON = "the run still goes on: what follows is of its frames so far"
 
 
 def explained_jobs(begun: Begun, records: Iterable[Record]) -> Iterator[ExplainedJob]:
@@ -165,10 +167,13 @@ def explain_run(folder: Path, slowest: int = 10) -> dict[str, Any]:
     """
     report = read_report(folder) if (folder / "report.json").exists() else None  # there is none while a run goes on
     begun, records = open_journal(folder)
-    explanation = Explanation(begun, report, slowest)
+    explanation, is_whole = Explanation(begun, report, slowest), False
     for record in records:
         explanation.add(record)
-    return {"run": str(folder), **explanation.document()}
+        is_whole = isinstance(record, Ended)
+    goes_on = not is_whole and FollowedRun(folder).state is RunState.GOES_ON
+    remark = "" if is_whole else GOES_ON if goes_on else CUT_OFF
+    return {"run": str(folder), "remark": remark, **explanation.document()}
 
 
 def _budget_rows(budget: Mapping[Part, int], unit_of: Mapping[str, str], intervals: int) -> list[dict[str, Any]]:
