@@ -278,7 +278,7 @@ def config_of(begun: Begun) -> Mapping[str, Any]:
     if not isinstance(config, Mapping) or not all(
         isinstance(config.get(key, {}), Mapping) for key in ("units", "scene", "pace_ns")
     ):
-        raise BadInputError("the journal: facts", "a configuration of another form", "that of a run")
+        raise BadInputError("the journal: facts", "a configuration of another form", "one as a run writes it")
     return config
 
 

@@ -55,7 +55,7 @@ class Reckoning:
 
     @property
     def bound(self) -> Mapping[str, Any] | None:
-        """That of a report, by the path so far; None until some 60 frames were presented."""
+        """As in a report, by the path so far; None until 63 frames were presented."""
         return self._budget.bound(self._unit_of).get("bound")
 
     def add(self, record: Record) -> ExplainedJob | None:

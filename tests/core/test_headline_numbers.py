@@ -182,7 +182,7 @@ def test_other_programs_move_frame_time_bound_preempted_share_and_efficiency(pro
     assert 1e3 * document["nobodys_ms"] == pytest.approx(INFER_US * programs, abs=INFER_US * (programs + 1) * NEAR)
 
 
-# Power. All of it is halved: that of the units at work and at rest, and that of the rest of the device.
+# Power. All of it is halved: what units take at work and at rest, and what the rest of the device takes.
 
 OF_POWER = ("power_max_w", "idle_w")
 
