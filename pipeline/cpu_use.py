@@ -88,8 +88,8 @@ class Efficiencies:
 
     Of a job that began before that time or ended after it, only the CPU time counts that must lie within, whatever the
     rest of the job had: all of it but as much as its cores had time outside. So what a unit or a set of cores is
-    credited with fits into the time. Of a unit with more threads than one the slowest unit counts a job with its CPU
-    time for each of them. What runs on a device of its own while the threads sleep counts as long as the job was busy.
+    credited with fits into the time. The slowest unit counts a job with its CPU time for each of its threads, and with
+    what it was busy beyond its CPU time: then a device of its own worked while the threads slept.
     """
 
     def __init__(self, places: Placement) -> None:
@@ -136,6 +136,6 @@ class Efficiencies:
             length_ns = job.end_ns - job.begin_ns
             outside_ns = max(first_ns - job.begin_ns, 0) + max(job.end_ns - self._last_ns, 0)
             busy_ns = length_ns - job.preempted_ns - job.asleep_ns
-            work_ns = busy_ns if busy_ns > job.cpu_ns else min(job.cpu_ns / threads, length_ns)
+            work_ns = min(job.cpu_ns / threads, length_ns) + max(busy_ns - job.cpu_ns, 0)
             self._work_ns[job.unit] += max(work_ns - outside_ns, 0)
             self._cpu_ns[job.unit] += max(job.cpu_ns - outside_ns * len(cores), 0)

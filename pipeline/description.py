@@ -210,8 +210,12 @@ class Pipeline(Described):
         return tuple(sorted({core for settings in self.units.values() for core in settings.cores}))
 
     def places(self) -> dict[str, Place]:
-        """Cores and threads of each unit."""
-        return {unit: Place(settings.cores, settings.threads) for unit, settings in self.units.items()}
+        """Cores and threads of each unit; one that is held to a pace works all the while, as one thread would."""
+        paced = {stage.unit for stage in self.stages if stage.pace_ns}
+        return {
+            unit: Place(settings.cores, 1 if unit in paced else settings.threads)
+            for unit, settings in self.units.items()
+        }
 
     def stages_of(self, unit: str) -> tuple[PipelineStage, ...]:
         """The unit's stages, in the order of the chain."""

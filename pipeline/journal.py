@@ -238,6 +238,20 @@ def read_journal(path: Path) -> Iterator[Record]:
         raise BadInputError(path, "no record", EXPECTED)
 
 
+def records_of(recording: Recording, jobs: Iterable[JobRecord]) -> Iterator[Record]:
+    """The records of a run that is in memory, as far as what bounded it follows from them."""
+    for stepped, others in _steps_of(recording, jobs):
+        yield stepped
+        yield from others
+
+
+def _steps_of(recording: Recording, jobs: Iterable[JobRecord]) -> Iterator[tuple[Stepped, list[Record]]]:
+    """Of each step its record, and those of what it changed and of the jobs that it ended."""
+    for now_ns, events, actions, accounts, ended in in_order(recording, jobs):
+        changed = [Accounted(since_ns, unit, account) for since_ns, unit, account in accounts]
+        yield Stepped(now_ns, events, actions), [*changed, *(Worked(job, {}) for job in ended)]
+
+
 def journal_of(
     recording: Recording, jobs: Iterable[JobRecord], facts: Mapping[str, Any], report: Mapping[str, Any]
 ) -> Iterator[Record]:
@@ -247,17 +261,25 @@ def journal_of(
     """
     core, counted, now_ns = Core(recording.graph, recording.settings), 0, 0
     yield Begun(SCHEMA, recording.graph, recording.settings, facts)
-    for now_ns, events, actions, accounts, ended in in_order(recording, jobs):
-        yield Stepped(now_ns, events, actions)
-        for since_ns, unit, account in accounts:
-            yield Accounted(since_ns, unit, account)
-        for job in ended:
-            yield Worked(job, {})
-        core.step(now_ns, events)
+    for stepped, others in _steps_of(recording, jobs):
+        yield stepped
+        yield from others
+        now_ns = stepped.now_ns
+        core.step(now_ns, stepped.events)
         if (count := core.ledger.left_out) != counted:
             counted = count
             yield Counted(now_ns, core.ledger.lost_by_cause, core.ledger.dropped_by_cause)
     yield Ended(now_ns, report)
+
+
+def config_of(begun: Begun) -> Mapping[str, Any]:
+    """The configuration that a journal begins with; empty for one that does not know it."""
+    config = begun.facts.get("config", {})
+    if not isinstance(config, Mapping) or not all(
+        isinstance(config.get(key, {}), Mapping) for key in ("units", "scene", "pace_ns")
+    ):
+        raise BadInputError("the journal: facts", "a configuration of another form", "one as a run writes it")
+    return config
 
 
 #: The fields of a record as they are written, where they are not its own.

@@ -6,20 +6,18 @@ What is held of a run while it is read is bounded, however long it lasts.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 from trilane.pipeline.cpu_use import Efficiencies
 from trilane.pipeline.critical_path import Budget, Part, Paths
-from trilane.pipeline.journal import Accounted, Record, Stepped, Worked
+from trilane.pipeline.journal import Begun, Record, Worked, config_of
 from trilane.pipeline.journal_slices import JournalSlices
 from trilane.pipeline.sharing import Sharing, Taken
 from trilane.pipeline.waits import ExplainedJob, Waits
-from trilane.scheduler.accounts import ShareSums, in_order
+from trilane.scheduler.accounts import ShareSums
 from trilane.scheduler.events import Graph, Settings
-from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.places import Place, Placement
-from trilane.scheduler.recording import Recording
 
 
 class Reckoned(NamedTuple):
@@ -37,7 +35,8 @@ class Reckoned(NamedTuple):
 class Reckoning:
     """Takes the records of a run after the first, in order.
 
-    `graph`, `settings`: of the run. `places`: of its units, as far as they are known.
+    `graph`, `settings`: of the run. `places`: of its units, as far as they are known. `paths`, `sharing`: of the
+    records so far.
     """
 
     def __init__(self, graph: Graph, settings: Settings, places: Placement) -> None:
@@ -48,6 +47,16 @@ class Reckoning:
         own = {unit: Place((-1 - number,), 1) for number, unit in enumerate(graph.units)}  # as if it had a core
         self._efficiencies = Efficiencies({**own, **places})
         self._unit_of = {stage.name: stage.unit for stage in graph.stages}
+
+    @classmethod
+    def of(cls, begun: Begun) -> Reckoning:
+        """Of the run whose journal begins so. Raises BadInputError for a configuration that is none of a run."""
+        return cls(begun.graph, begun.settings, places_of(begun))
+
+    @property
+    def bound(self) -> Mapping[str, Any] | None:
+        """As in a report, by the path so far; None until 63 frames were presented."""
+        return self._budget.bound(self._unit_of).get("bound")
 
     def add(self, record: Record) -> ExplainedJob | None:
         """The next record; the job that it ends, if any, with its wait explained."""
@@ -68,14 +77,19 @@ class Reckoning:
         return Reckoned(budget, self.sharing.close(), figures)
 
 
-def records_of(recording: Recording, jobs: Iterable[JobRecord]) -> Iterator[Record]:
-    """The records of a run that is in memory, as far as a reckoning needs them."""
-    for now_ns, events, actions, accounts, ended in in_order(recording, jobs):
-        yield Stepped(now_ns, events, actions)
-        for since_ns, unit, account in accounts:
-            yield Accounted(since_ns, unit, account)
-        for job in ended:
-            yield Worked(job, {})
+def places_of(begun: Begun) -> dict[str, Place]:
+    """Cores and threads of each unit as `Pipeline.places` has them, as far as the journal's head knows them.
+
+    Raises BadInputError for a configuration that is none of a run.
+    """
+    config = config_of(begun)
+    units, pace_ns = config.get("units", {}), config.get("pace_ns", {})
+    paced = {stage.unit for stage in begun.graph.stages if pace_ns.get(stage.name)}
+    return {
+        unit: Place(tuple(own["cores"]), 1 if unit in paced else own.get("threads", 1))
+        for unit, own in units.items()
+        if unit in begun.graph.units and own.get("cores")
+    }
 
 
 def reckoned(

@@ -29,8 +29,9 @@ from trilane.pipeline.journal import (
     Stepped,
     Worked,
     read_journal,
+    records_of,
 )
-from trilane.pipeline.reckoning import Reckoned, reckoned, records_of
+from trilane.pipeline.reckoning import Reckoned, reckoned
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import Action, Event, Graph, Settings
 from trilane.scheduler.ledger import JobRecord

@@ -11,7 +11,7 @@ from trilane.apps.comparison.compared import METHOD
 from trilane.apps.comparison.difference import Outcome
 from trilane.apps.comparison.rows import MS
 from trilane.apps.comparison.sweeps import METHOD as SWEEP_METHOD
-from trilane.apps.comparison.words import change_of, interval_of, name_of, setting, value_of
+from trilane.apps.comparison.words import bounds_text, change_of, interval_of, name_of, setting, value_of
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -31,6 +31,8 @@ def comparison_lines(comparison: Comparison, show_all: bool) -> Iterator[str | T
     """Texts and tables of one comparison. `show_all`: figures too that do not differ and are seldom asked for."""
     yield f"{comparison.other.name} beside {comparison.base.name}"
     yield f"verdict: {comparison.verdict}"
+    if said := bounds_text(comparison.bounds):
+        yield said
     most = len(comparison.changes) if show_all else MOST_CHANGES
     if comparison.changes:
         yield _change_table(comparison.changes[:most])

@@ -101,6 +101,8 @@ def _show(document: Mapping[str, Any]) -> None:
 
 
 def _head(document: Mapping[str, Any]) -> Iterator[str]:
+    if document["remark"]:
+        yield document["remark"]
     frame_ms = document["frame_ms"]
     mean = "fewer than two frames: no frame time" if frame_ms is None else f"{frame_ms:.2f} ms a frame"
     scene = f"scene {document['scene']}, " if document["scene"] else ""
@@ -124,8 +126,9 @@ def _head(document: Mapping[str, Any]) -> Iterator[str]:
 def _efficiency(document: Mapping[str, Any]) -> Iterator[str]:
     """What bounded the run, and what all cores did."""
     if bound := document.get("bound"):
-        named = [f"{part['name']} {_share(part)}" for part in (bound["unit"], bound["stage"]) if part]
-        yield f"bound: {', and of stages most '.join(named)}" if len(named) > 1 else f"bound: {named[0]}"
+        from trilane.apps.explained.advice import bound_text
+
+        yield f"bound: {bound_text(bound)}"
     if document["cores"]:
         numbers, efficiency = ",".join(map(str, document["cores"]["numbers"])), document["machine_efficiency"]
         cpu_ms, had_ms = document["cores"]["cpu_ms"], document["cores"]["had_ms"]
@@ -133,13 +136,6 @@ def _efficiency(document: Mapping[str, Any]) -> Iterator[str]:
             f"cores {numbers}: jobs had {cpu_ms:.2f} of {had_ms:.2f} ms of CPU time a frame, {efficiency:.0%}; the "
             f"fullest {document['core_efficiency']:.0%}; the slowest unit {document['efficiency']:.0%}"
         )
-
-
-def _share(part: Mapping[str, Any]) -> str:
-    """Of the path, with its interval."""
-    if part["share_low"] is None:
-        return f"{part['share']:.0%} of the path"
-    return f"{part['share']:.0%} of the path ({part['share_low']:.0%} to {part['share_high']:.0%})"
 
 
 def _budget(document: Mapping[str, Any]) -> Table:

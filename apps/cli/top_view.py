@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from trilane.apps.cli.run_table import DASH, NEEDED, TOO_FEW, accuracy_line
+from trilane.apps.explained.advice import bound_text
 from trilane.apps.live.figures import Figures, Moved, UnitFigures
 from trilane.apps.live.followed_run import RunState
 from trilane.apps.live.live_figures import LEAST
@@ -59,6 +60,7 @@ def line(look: Look) -> str:
         f"frame {_three(figures.frame_time_ms)}",
         f"latency {_three(figures.latency_ms)}",
         f"busy {busy}",
+        _short_bound(figures),
         f"waiting {waiting or 'none'}",
         f"presented {frames.presented}, lost {sum(frames.lost.values())}, dropped {dropped(figures)}",
         heat,
@@ -98,7 +100,14 @@ def _title(look: Look) -> str:
             f"{_rate(look)} in the last {figures.window_s:.1f} s, {figures.run_fps:.1f} between the first and the last"
         )
     # a small terminal cuts off what stands below
-    return f"run {look.name}: {look.state}, {over}; {rate}\navatars: {_short_error(figures)}"
+    return f"run {look.name}: {look.state}, {over}; {rate}\navatars: {_short_error(figures)}\n{_bound(look)}"
+
+
+def _bound(look: Look) -> str:
+    """What bounds the run, or bounded it."""
+    so_far = " so far" if look.state is RunState.GOES_ON else ""
+    bound = look.figures.bound
+    return f"bound{so_far}: {'not known' if bound is None else bound_text(bound)}"
 
 
 def _rate(look: Look) -> str:
@@ -206,6 +215,12 @@ def _listed(pairs: Iterator[tuple[str, Any]]) -> str:
 
 def _percent(share: float) -> str:
     return f"{100 * share:.0f}"
+
+
+def _short_bound(figures: Figures) -> str:
+    """The unit, and its share of the path; empty where it is not known."""
+    unit = (figures.bound or {}).get("unit")
+    return f"bound {unit['name']} {unit['share']:.0%}" if unit else ""
 
 
 def _short_error(figures: Figures) -> str:

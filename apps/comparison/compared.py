@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from trilane.apps.comparison.configuration import Change, changes
 from trilane.apps.comparison.difference import LEAST_FRAMES, MATTERS, MOST_FRAMES, Difference, Outcome
@@ -25,6 +25,29 @@ SEVERAL: Final = (
 )
 
 
+class Bounds(NamedTuple):
+    """What bounded each run of either side, as in report.json; None where nobody knows. `outcome`: of the unit's name.
+
+    Its share of the path is all that is known of the path, so that another unit's can be as large unless it is surely
+    more than a half.
+    """
+
+    base: tuple[Mapping[str, Any] | None, ...]
+    other: tuple[Mapping[str, Any] | None, ...]
+
+    @property
+    def outcome(self) -> Outcome:
+        every = [bound["unit"] if bound else None for bound in (*self.base, *self.other)]
+        units = [unit for unit in every if unit is not None]
+        if len(units) < len(every):
+            return Outcome.UNKNOWN
+        base, other = ({unit["name"] for unit in side} for side in (units[: len(self.base)], units[len(self.base) :]))
+        if len(base | other) == 1:
+            return Outcome.SAME
+        is_sure = all((unit["share_low"] or 0.0) > 0.5 for unit in units)
+        return Outcome.DIFFERS if len(base) == len(other) == 1 and is_sure else Outcome.UNKNOWN
+
+
 @dataclass(frozen=True)
 class Comparison:
     """A side beside the base. `differing`: figures that differ, all of a comparison's together."""
@@ -35,6 +58,7 @@ class Comparison:
     differing: tuple[Figure, ...]
     changes: tuple[Change, ...]
     verdict: str
+    bounds: Bounds
     notes: tuple[str, ...]
 
     def as_json(self) -> dict[str, Any]:
@@ -43,6 +67,7 @@ class Comparison:
             "run": self.other.name,
             "verdict": self.verdict,
             "outcome": str(self.whole),
+            "bound": {**self.bounds._asdict(), "outcome": str(self.bounds.outcome)},
             "changes": [change._asdict() for change in self.changes],
             "rows": [_row(figure, self) for figure in self.rows],
             "notes": list(self.notes),
@@ -101,7 +126,8 @@ def _compared(base: Side, other: Side) -> Comparison:
         differing += _differing(rows, [figure for figure in rows if figure not in first])
     changed = tuple(changes(base.runs[0].document, other.runs[0].document))
     said = verdict(rows, first, differing, changed, _stages(base.runs[0].document))
-    return Comparison(base, other, rows, differing, changed, said, tuple(_notes(base, other)))
+    bounds = Bounds(*(tuple(told.document.get("bound") for told in side.runs) for side in (base, other)))
+    return Comparison(base, other, rows, differing, changed, said, bounds, tuple(_notes(base, other)))
 
 
 def _differing(rows: Rows, figures: Sequence[Figure]) -> tuple[Figure, ...]:

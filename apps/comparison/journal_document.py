@@ -1,7 +1,7 @@
 """What a journal alone tells of its run, with the keys of a report that a comparison reads.
 
 Rule: what the journal does not say is not there, and is named as not known. Settings come from its first record,
-figures from its frames; of a run that ended, from its last record.
+figures from its frames; of a run that ended, from its last record, of another what bounded it until then.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from trilane.apps.comparison.configuration import NOT_KNOWN, PARTS
 from trilane.apps.comparison.difference import STATISTICS
 from trilane.apps.comparison.run_frames import Key, RunFrames
 from trilane.errors import BadInputError
+from trilane.pipeline.journal import Begun, read_journal
+from trilane.pipeline.reckoning import Reckoning
 from trilane.pipeline.run_metrics import RunMetrics
 
 #: Facts of the first record that a report has too.
@@ -56,9 +58,15 @@ def document_of(frames: RunFrames, path: Path) -> dict[str, Any]:
 
 
 def _at_the_end(frames: RunFrames, path: Path) -> dict[str, Any]:
-    """What the last record says of the whole run; nothing where there is none."""
+    """What the last record says of the whole run; where there is none, what bounded it and how full its cores were."""
     if frames.ended is None:
-        return {}
+        records = read_journal(path)
+        begun = next(records)
+        assert isinstance(begun, Begun)  # the reader sees to it
+        reckoning = Reckoning.of(begun)
+        for record in records:
+            reckoning.add(record)
+        return dict(reckoning.close().figures)
     try:
         return RunMetrics.model_validate(from_json(to_json(dict(frames.ended.report)))).as_json()
     except ValidationError as error:

@@ -12,7 +12,7 @@ from typing import Final
 from trilane.apps.comparison.compared import METHOD, Comparison
 from trilane.apps.comparison.difference import Difference
 from trilane.apps.comparison.rows import Figure
-from trilane.apps.comparison.words import change_of, interval_of, name_of, setting, value_of
+from trilane.apps.comparison.words import bounds_text, change_of, interval_of, name_of, setting, value_of
 
 STYLE: Final = """
 :root { color-scheme: light dark;
@@ -56,6 +56,8 @@ def page(comparisons: Sequence[Comparison]) -> str:
 def _section(comparison: Comparison) -> Iterator[str]:
     yield f"<h2>{escape(comparison.other.name)}</h2>"
     yield f'<p class="verdict">{escape(comparison.verdict)}</p>'
+    if said := bounds_text(comparison.bounds):
+        yield f"<p>{escape(said)}</p>"
     if comparison.changes:
         rows = (
             _row("", _head(change.key), _long(setting(change.base)), _long(setting(change.other)))

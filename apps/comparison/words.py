@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from trilane.apps.comparison.difference import Difference
+from trilane.apps.comparison.compared import Bounds
+from trilane.apps.comparison.difference import Difference, Outcome
 from trilane.apps.comparison.rows import BYTES, SHARE, Figure
+from trilane.apps.explained.advice import bound_text
 
 DASH: Final = "–"
 MANY: Final = 10_000
@@ -44,6 +48,23 @@ def _scaled(value: float, row: Difference, unit: str, *, with_unit: bool = True)
         name = "%" if row.is_ratio else "points"
         return f"{100 * value:+.1f} {name}" if with_unit else f"{100 * value:+.1f}"
     return f"{value:+.4g} {unit}".rstrip() if with_unit else f"{value:+.4g}"
+
+
+def bounds_text(bounds: Bounds) -> str:
+    """What bounded the other side, and the base; empty where nobody knows either, such as of predictions."""
+    if not any((*bounds.base, *bounds.other)):
+        return ""
+    changed = " changed" if bounds.outcome is Outcome.DIFFERS else ""
+    unsure = ": whether it changed cannot be told" if bounds.outcome is Outcome.UNKNOWN else ""
+    return f"bound{changed}: {_side(bounds.other)}; was {_side(bounds.base)}{unsure}"
+
+
+def _side(bounds: Sequence[Mapping[str, Any] | None]) -> str:
+    """Of one run with its shares; of several how many each unit bounded."""
+    if len(bounds) == 1:
+        return bound_text(bounds[0]) if bounds[0] else "not known"
+    names = Counter(bound["unit"]["name"] if bound else "not known" for bound in bounds)
+    return ", ".join(f"{name} in {count} of {len(bounds)} runs" for name, count in names.most_common())
 
 
 def setting(value: Any) -> str:

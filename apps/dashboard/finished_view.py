@@ -26,7 +26,7 @@ from trilane.apps.dashboard.timeline import Timeline, described, note, slices
 from trilane.apps.dashboard.video_frames import VideoFrames
 from trilane.apps.dashboard.view import Message
 from trilane.apps.dashboard.wire import ControlSaid, Seek, shown
-from trilane.apps.live.followed_run import FollowedRun, RunState
+from trilane.apps.live.followed_run import CUT_OFF, FollowedRun, RunState
 from trilane.errors import BadInputError
 from trilane.pipeline.journal import NAME, Begun, Ended, Record, Stepped, journal_in, read_journal
 from trilane.scheduler.accounts import CAUSES, UNEXPLAINED
@@ -37,7 +37,6 @@ MOST_JOBS: Final = 6000
 MOST_IDLE: Final = 6000
 MOST_NOTES: Final = 100
 OVER: Final = "the run is over"
-CUT_OFF: Final = "the journal stops here: the run was killed, or the file is cut off; what came after is not known"
 NO_VIDEO: Final = "there are no pictures: video.mp4 is missing or cannot be read"
 
 CAUSE_NAMES: Final = (*CAUSES, UNEXPLAINED)
@@ -59,7 +58,7 @@ class FinishedRun:
         self.end_ms = 0.0
         self.jobs, self.idle, self.presented, self.figures = map(TimeTable, (JOB, IDLE, PRESENTED, FIGURES))
         self._written = TextStore()
-        self._timeline, self._meter = Timeline(begun), Meter(begun)
+        self._timeline, self._meter = Timeline(begun), Meter(begun, finds_bound=facts.bound is None)
         self._last_stage = len(begun.graph.stages) - 1
         self._due_ms = 0.0
         self.metrics = ""

@@ -14,10 +14,10 @@ END: Final = "# EOF\n"
 
 
 class Meter:
-    """Fed the records after `begun`, in order."""
+    """Fed the records after `begun`, in order. `finds_bound`: as of `LiveFigures`."""
 
-    def __init__(self, begun: Begun) -> None:
-        self._figures = LiveFigures(begun)
+    def __init__(self, begun: Begun, *, finds_bound: bool = True) -> None:
+        self._figures = LiveFigures(begun, finds_bound=finds_bound)
 
     def add(self, record: Record) -> None:
         """The next record."""

@@ -1,4 +1,4 @@
-"""What a person could try, from what bounded the frame time. Rule: a table of causes; each names what it rests on."""
+"""What bounded the frame time in words, and what a person could try. Rule: each cause names what it rests on."""
 
 from __future__ import annotations
 
@@ -11,6 +11,19 @@ from trilane.pipeline.waits import DOWN, HELD, LOST, OVERHEAD, PREEMPTED, THROTT
 #: Of the frame time; what bounds less of it is not worth an attempt.
 LEAST_SHARE: Final = 0.1
 MOST: Final = 4
+
+
+def bound_text(bound: Mapping[str, Any]) -> str:
+    """Of the `bound` of a report: the unit that most of the path is, and the stage, with their shares and intervals."""
+    named = [f"{part['name']} {_share(part)}" for part in (bound["unit"], bound["stage"]) if part]
+    return ", and of stages most ".join(named)
+
+
+def _share(part: Mapping[str, Any]) -> str:
+    if part["share_low"] is None:
+        return f"{part['share']:.0%} of the path"
+    return f"{part['share']:.0%} of the path ({part['share_low']:.0%} to {part['share_high']:.0%})"
+
 
 #: Of stages of the avatar's pipeline: what makes their work shorter.
 SHORTER = {

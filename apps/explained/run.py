@@ -12,19 +12,20 @@ from typing import Any
 
 from trilane.apps.explained.advice import advice
 from trilane.apps.explained.slow_frames import MOST_SAMPLES, Shown, SlowFrames, Usual, notes, reasons
+from trilane.apps.live.followed_run import CUT_OFF, FollowedRun, RunState
 from trilane.apps.report import Report, read_report
 from trilane.errors import BadInputError
 from trilane.figure_sources import COMPUTED, MEASURED
 from trilane.pipeline.critical_path import WHATS, Part
-from trilane.pipeline.journal import NAME, Begun, Record, journal_in, read_journal
-from trilane.pipeline.reckoning import Reckoning
+from trilane.pipeline.journal import NAME, Begun, Ended, Record, config_of, journal_in, read_journal
+from trilane.pipeline.reckoning import Reckoning, places_of
 from trilane.pipeline.sharing import Taken
 from trilane.pipeline.waits import PREEMPTED, ExplainedJob, Waits
-from trilane.scheduler.places import Place
 from trilane.scheduler.stats import NS_PER_MS
 
 SCHEMA = 1
 HOST = "host"
+GOES_ON = "the run still goes on: what follows is of its frames so far"
 
 
 def explained_jobs(begun: Begun, records: Iterable[Record]) -> Iterator[ExplainedJob]:
@@ -58,7 +59,7 @@ class Explanation:
     """
 
     def __init__(self, begun: Begun, report: Report | None, slowest: int) -> None:
-        self._begun, self._report, self._places = begun, report, _places(begun)
+        self._begun, self._report, self._places = begun, report, places_of(begun)
         self._reckoning = Reckoning(begun.graph, begun.settings, self._places)
         self._slow = SlowFrames(begun.graph, self._reckoning.paths, self._reckoning.sharing, slowest)
         self._waits: dict[str, dict[str, int]] = {stage.name: {} for stage in begun.graph.stages}
@@ -122,7 +123,7 @@ class Explanation:
         """What the run said of itself before its first frame, and of its end."""
         facts, report = self._begun.facts, self._report
         return {
-            "scene": _config(self._begun).get("scene", {}).get("name"),
+            "scene": config_of(self._begun).get("scene", {}).get("name"),
             "policy": self._begun.settings.policy,
             "edges": list(self._begun.graph.edges),
             "accuracy": facts.get("accuracy", {}),
@@ -166,30 +167,13 @@ def explain_run(folder: Path, slowest: int = 10) -> dict[str, Any]:
     """
     report = read_report(folder) if (folder / "report.json").exists() else None  # there is none while a run goes on
     begun, records = open_journal(folder)
-    explanation = Explanation(begun, report, slowest)
+    explanation, is_whole = Explanation(begun, report, slowest), False
     for record in records:
         explanation.add(record)
-    return {"run": str(folder), **explanation.document()}
-
-
-def _places(begun: Begun) -> dict[str, Place]:
-    """Cores and threads of each unit, as far as the journal's head knows them."""
-    units = _config(begun).get("units", {})
-    return {
-        unit: Place(tuple(own["cores"]), own.get("threads", 1))
-        for unit, own in units.items()
-        if unit in begun.graph.units and own.get("cores")
-    }
-
-
-def _config(begun: Begun) -> Mapping[str, Any]:
-    """The configuration that a journal begins with; empty for one that does not know it."""
-    config = begun.facts.get("config", {})
-    if not isinstance(config, Mapping) or not all(
-        isinstance(config.get(key, {}), Mapping) for key in ("units", "scene")
-    ):
-        raise BadInputError("the journal: facts", "a configuration of another form", "that of a run")
-    return config
+        is_whole = isinstance(record, Ended)
+    goes_on = not is_whole and FollowedRun(folder).state is RunState.GOES_ON
+    remark = "" if is_whole else GOES_ON if goes_on else CUT_OFF
+    return {"run": str(folder), "remark": remark, **explanation.document()}
 
 
 def _budget_rows(budget: Mapping[Part, int], unit_of: Mapping[str, str], intervals: int) -> list[dict[str, Any]]:

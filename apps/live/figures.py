@@ -115,6 +115,7 @@ class Figures:
     `units`, `stages`: in the order of the pipeline.
     `temperature_c`, `duty`: by place and unit, as last looked at. `memory_bytes`: of the processes, by unit.
     `notes`: the last few messages.
+    `bound`: of the run so far, as in report.json; null before 63 frames, and where it is not looked for.
     `frame_times`, `latencies`: of the run.
     `began_at`: UTC, ISO 8601; "" where the journal does not say.
     `accuracy`: by avatar, as in report.json; empty where the journal does not say.
@@ -138,6 +139,7 @@ class Figures:
     duty: Mapping[str, float]
     memory_bytes: Mapping[str, float]
     notes: tuple[Note, ...]
+    bound: Mapping[str, Any] | None
     frame_times: Histogram
     latencies: Histogram
     began_at: str

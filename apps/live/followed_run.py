@@ -23,6 +23,7 @@ LOOK_S = 0.2
 SILENCE_NS = 1_000_000_000
 EXPECTED = "a run folder with a journal"
 NO_RECORD = "a journal without a record"
+CUT_OFF = "the journal stops here: the run was killed, or the file is cut off; what came after is not known"
 PARTIAL = re.compile(r"(?P<name>.+)\.(?P<pid>[0-9]{1,9})\.partial")
 
 

@@ -16,6 +16,7 @@ from trilane.apps.live.time_histogram import TimeHistogram
 from trilane.apps.live.unit_time import UnitTime
 from trilane.figure_sources import COMPUTED, MEASURED
 from trilane.pipeline.journal import Accounted, Begun, Counted, Ended, Record, Said, Sampled, Stepped, Worked
+from trilane.pipeline.reckoning import Reckoning
 from trilane.scheduler.events import NEVER, Event, Finish, Start, UnitDied, UnitReady
 from trilane.scheduler.ledger import STARVED
 from trilane.scheduler.stats import NS_PER_MS, summary_ms
@@ -37,6 +38,7 @@ OF_THE_RUN = (
     "stages",
     "frame_times",
     "latencies",
+    "bound",
     "memory_bytes",
 )
 
@@ -73,9 +75,15 @@ class _StageBook:
 
 
 class LiveFigures:
-    """`add` the records that follow `begun`, in order; `now` gives the figures of a moment that is not before them."""
+    """`add` the records that follow `begun`, in order; `now` gives the figures of a moment that is not before them.
 
-    def __init__(self, begun: Begun) -> None:
+    `finds_bound`: also what bounds the run, which takes three times as long as all else. The end of a journal says it,
+    so it need not be found of a run that is over.
+    """
+
+    def __init__(self, begun: Begun, *, finds_bound: bool = True) -> None:
+        self._reckoning = Reckoning.of(begun) if finds_bound else None
+        self._bound: Mapping[str, Any] | None = None
         self._graph, self._facts, self._settings = begun.graph, begun.facts, begun.settings
         self._flow = FrameFlow(begun.graph, begun.settings)
         self._first_ns: int | None = None
@@ -118,6 +126,8 @@ class LiveFigures:
     def add(self, record: Record) -> None:
         """A record of the journal, but for the first."""
         self._adders[type(record)](record)
+        if self._reckoning is not None:
+            self._reckoning.add(record)
 
     def now(self, now_ns: int | None = None, state: RunState | None = None) -> Figures:
         """At `now_ns`, of the run's clock; where it is None or earlier, at the last record.
@@ -150,6 +160,7 @@ class LiveFigures:
             duty=self._values(DUTY),
             memory_bytes=self._values(MEMORY),
             notes=tuple(self._notes),
+            bound=self._bound or (self._reckoning.bound if self._reckoning is not None else None),
             frame_times=self._frame_times.now(),
             latencies=self._latencies.now(),
             began_at=str(self._facts.get("began_at", "")),
@@ -219,7 +230,7 @@ class LiveFigures:
 
     def _add_end(self, ended: Ended) -> None:
         self._last_ns = max(self._last_ns, ended.now_ns)
-        self._is_over = True
+        self._is_over, self._bound = True, ended.report.get("bound")
 
     # figures
 

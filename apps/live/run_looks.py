@@ -34,7 +34,7 @@ def looks(run: FollowedRun, pause: Callable[[], None]) -> Generator[Look]:
         state = run.state  # asked before the journal is read, which has everything then
         for record in run.new():
             if isinstance(record, Begun):
-                figures = LiveFigures(record)
+                figures = LiveFigures(record, finds_bound=state is not RunState.FINISHED)
             elif figures is not None:
                 figures.add(record)
         if figures is not None:

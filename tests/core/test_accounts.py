@@ -12,8 +12,7 @@ import pytest
 from trilane.apps.tracing.writer import write_trace
 from trilane.bench.accounts import measure, virtual_run
 from trilane.errors import BadInputError
-from trilane.pipeline.journal import journal_of
-from trilane.pipeline.reckoning import records_of
+from trilane.pipeline.journal import journal_of, records_of
 from trilane.pipeline.waits import Waits
 from trilane.scheduler.accounts import LARGEST_DIFFERENCE, compared, second_accounts
 from trilane.scheduler.core import Core

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
+import re
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -88,6 +92,51 @@ def test_tests_that_a_run_never_came_to_are_counted(tmp_path: Path, workers: tup
     # the worker that died is its test's failure
     assert [*map(_function, names)] == ["test_0", "test_1"][: 2 if workers else 1]
     assert left == f"{2 if workers else 3} tests not run"
+
+
+ASLEEP = """
+import pathlib, time
+def test_0(): pass
+def test_1():
+    pathlib.Path({begun!r}).touch()
+    while True: time.sleep(0.01)
+def test_2(): pass
+"""
+RUNNER = """
+import sys
+from pathlib import Path
+from trilane.testing import checks
+checks.STYLE, checks.SKIPPED = (), Path({skipped!r})
+checks.GROUPS = ({words!r}, ["--no-such-option"])
+sys.exit(checks.main([]))
+"""
+
+
+def test_ctrl_c_ends_quietly_with_what_was_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first test passes, which the worker may not have told yet; the second never ends; the third is left.
+
+    What follows is not begun, and nothing is kept of what was skipped.
+    """
+    monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")
+    begun, skipped = tmp_path / "begun", tmp_path / "skipped.txt"
+    (tmp_path / "test_asleep.py").write_text(ASLEEP.format(begun=str(begun)))
+    words = [*ONE_WORKER, "-q", f"--rootdir={tmp_path}", str(tmp_path / "test_asleep.py")]
+    code = RUNNER.format(skipped=str(skipped), words=words)
+    runner = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    while not begun.exists():
+        assert runner.poll() is None
+        time.sleep(0.01)
+    os.killpg(runner.pid, signal.SIGINT)
+    out, err = runner.communicate()
+    assert runner.returncode == 130
+    line = r"interrupted; 1 failure \((\d) tests passed, 0 skipped, in \d+ min \d+ s\): (\d) tests not run"
+    told = re.fullmatch(line, out.splitlines()[-1])
+    assert told is not None
+    assert tuple(map(int, told.groups())) in {(0, 3), (1, 2)}
+    assert "Traceback" not in err
+    assert not skipped.exists()
 
 
 def _function(name: str) -> str:

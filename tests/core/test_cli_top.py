@@ -8,6 +8,7 @@ import os
 import signal
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,13 @@ import pytest
 from rich.console import Console
 
 from trilane.apps.cli import top as cli_top
-from trilane.apps.cli.top_view import screen
+from trilane.apps.cli.top_view import line, screen
 from trilane.apps.live.followed_run import RunState
 from trilane.apps.live.live_figures import LiveFigures
 from trilane.apps.live.run_looks import Look
 from trilane.pipeline.journal import NAME, Counted, Ended, JournalWriter, Record, Stepped
 from trilane.scheduler.events import JobDone, Start, UnitDied
+from trilane.testing.run_report import make_report
 from trilane.testing.told_journal import told_journal
 
 Command = Callable[..., tuple[str, str]]
@@ -62,6 +64,17 @@ def test_the_screen(check_printed: Check) -> None:
     text = console.file.getvalue()  # type: ignore[attr-defined]
     assert text.count("█") == round(20 * 40 / 90) + round(20 * 20 / 90)  # of 20, by the busy shares of u and v
     check_printed("top-screen", text)
+
+
+def test_what_bounds_the_run_is_named() -> None:
+    figures = replace(FIGURES.now(), bound=make_report()["bound"])
+    named = "dsp 82% of the path (78% to 86%), and of stages most infer 44% of the path"
+    for state, said in ((RunState.GOES_ON, f"bound so far: {named}"), (RunState.KILLED, f"bound: {named}")):
+        console, look = Console(file=io.StringIO(), width=120), Look("walk", state, figures)
+        console.print(screen(look))
+        assert console.file.getvalue().splitlines()[2].rstrip() == said  # type: ignore[attr-defined]
+        assert "; bound dsp 82%; " in line(look)
+    assert "bound" not in line(Look("walk", RunState.KILLED, FIGURES.now()))
 
 
 def test_a_terminal_is_drawn_anew(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,17 +9,22 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Mapping
+from typing import Any
 
 import pytest
 
-from trilane.apps.comparison.compared import Comparison, compare
+from trilane.apps.cli.compare_table import comparison_lines
+from trilane.apps.comparison.compared import Bounds, Comparison, compare
 from trilane.apps.comparison.difference import Outcome
+from trilane.apps.comparison.page import page
 from trilane.apps.comparison.rows import Figure
 from trilane.apps.comparison.run_frames import frames_of
 from trilane.apps.comparison.sides import Kind, Side, Told
 from trilane.apps.comparison.verdict import NO_DIFFERENCE
-from trilane.pipeline.journal import Worked
-from trilane.testing.compared_runs import STAGES, on_a_machine
+from trilane.apps.comparison.words import bounds_text
+from trilane.pipeline.journal import Worked, journal_of
+from trilane.pipeline.reckoning import reckoned
+from trilane.testing.compared_runs import STAGES, on_a_machine, simulated
 from trilane.testing.run_report import make_report
 
 
@@ -117,3 +122,62 @@ def test_how_often_it_is_right(counted: bool, capsys: pytest.CaptureFixture[str]
     assert all(found[change]["right"] >= 8 for change in CHANGES if change >= (1.05 if counted else 2.0))
     if counted:
         assert found[1.0]["no difference"] >= 19
+
+
+def bounded(seed: int, **factors: float) -> Told:
+    """A run whose report names what bounded it. infer takes 9 ms of the dsp, raster 4 and composite 3 of the gpu."""
+    run = simulated(seed, factors=factors)
+    assert run.recording is not None
+    begun, *records = journal_of(run.recording, run.jobs, {}, run.report)
+    _, found = reckoned(run.recording.graph, run.recording.settings, {}, records)
+    return Told(f"run {seed}", Kind.RUN, make_report(**run.report, **found.figures), frames_of([begun, *records]))
+
+
+def test_what_bounded_either_run_is_named_and_that_it_changed() -> None:
+    """Raster three times as long makes 15 ms of the gpu; a fifth more of it makes 7.8, still less than the dsp's."""
+    base, alike, slow = bounded(1), bounded(2, raster=1.2), bounded(3, raster=3.0)
+    same = one(Side("base", (base,)), Side("other", (alike,)))
+    changed = one(Side("base", (base,)), Side("other", (slow,)))
+    assert (same.bounds.outcome, changed.bounds.outcome) == (Outcome.SAME, Outcome.DIFFERS)
+    line = re.compile(r"bound( changed)?: (\w+) (\d+)% .*, and of stages most (\w+) .*; was (\w+) .* most (\w+) ")
+    for found, said in (
+        (same, (None, "dsp", "infer", "dsp", "infer")),
+        (changed, (" changed", "gpu", "raster", "dsp", "infer")),
+    ):
+        matched = line.match(bounds_text(found.bounds))
+        assert matched is not None
+        word, unit, share, stage, *was = matched.groups()
+        assert (word, unit, stage, *was) == said and int(share) > 90
+        assert bounds_text(found.bounds) in [*comparison_lines(found, show_all=False)]
+        assert f"<p>{bounds_text(found.bounds)}</p>" in page([found])
+    several = one(Side("base", (base, alike)), Side("other", (slow, bounded(4))))
+    assert bounds_text(several.bounds) == (
+        "bound: gpu in 1 of 2 runs, dsp in 1 of 2 runs; was dsp in 2 of 2 runs: whether it changed cannot be told"
+    )
+    assert several.as_json()["bound"]["other"][0] == slow.document["bound"]
+
+
+def bound(name: str, low: float | None) -> dict[str, Any]:
+    return {"unit": {"name": name, "share": 0.6, "share_low": low, "share_high": 0.7}, "stage": None}
+
+
+@pytest.mark.parametrize(
+    ("base", "other", "outcome", "said"),
+    [
+        (bound("dsp", 0.2), bound("dsp", 0.2), "no difference", "bound: dsp "),
+        (bound("dsp", 0.51), bound("gpu", 0.51), "differs", "bound changed: gpu "),
+        (bound("dsp", 0.51), bound("gpu", 0.5), "cannot tell", "bound: gpu "),
+        (bound("dsp", None), bound("gpu", 0.6), "cannot tell", "bound: gpu "),
+        (None, bound("gpu", 0.6), "cannot tell", "bound: gpu "),
+        (None, None, "cannot tell", ""),
+    ],
+)
+def test_a_bound_changed_where_no_other_unit_can_have_as_much_of_the_path(
+    base: Any, other: Any, outcome: str, said: str
+) -> None:
+    """All units together have one path: who surely has more than half of it surely has most."""
+    bounds = Bounds((base,), (other,))
+    assert bounds.outcome == outcome
+    text = bounds_text(bounds)
+    assert text.startswith(said) and bool(text) == bool(said)
+    assert text.endswith("whether it changed cannot be told") == (outcome == "cannot tell" and bool(said))

@@ -509,6 +509,7 @@ def test_a_run_that_was_killed_is_compared_by_its_journal(
         assert any("it did not end by itself and has no report" in note for note in found.notes)
     document = other.runs[0].document
     assert 60 < document["frames"]["presented"] == document["frames"]["requested"] < 120
+    assert (document["bottleneck"], document["bound"]["stage"]["name"]) == ("dsp", "infer")
     live = killed(tmp_path / "runs" / f"live.{os.getpid()}.partial", slow, facts, keep=0.8)
     assert "it still goes on" in read_side(str(live)).runs[0].remark
     done = read_side(str(killed(tmp_path / "done", slow, facts))).runs[0]

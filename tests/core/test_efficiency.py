@@ -9,7 +9,9 @@ import pytest
 
 from trilane.pipeline.core_shares import lost_in_job
 from trilane.pipeline.cpu_use import Efficiencies
-from trilane.pipeline.reckoning import Reckoned, reckoned, records_of
+from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, UnitSettings
+from trilane.pipeline.journal import Begun, records_of
+from trilane.pipeline.reckoning import Reckoned, places_of, reckoned
 from trilane.scheduler.beside import Member, simulate_beside
 from trilane.scheduler.events import Settings, chain
 from trilane.scheduler.ledger import JobRecord
@@ -56,6 +58,34 @@ def test_a_device_works_while_its_units_threads_sleep() -> None:
     """The job slept for nothing: all of its 100 ns were busy, with 7 of CPU time."""
     jobs = [(job("a", 0, 100, 7, asleep_ns=0), True), (job("a", 100, 200, 7, asleep_ns=0), True)]
     assert figures({"a": ON_0}, jobs) == (1.0, 0.07, 0.07)
+
+
+@pytest.mark.parametrize(
+    ("cpu_ns", "work_ns"),
+    [(0, 100), (40, 20 + 60), (98, 49 + 2), (99, 49.5 + 1), (100, 50), (101, 50.5), (102, 51), (200, 100)],
+)
+def test_a_device_beside_two_threads_adds_what_both_slept_through(cpu_ns: int, work_ns: float) -> None:
+    """Of 100 ns in which the job was busy two threads had so much; the device worked alone in the rest at least.
+
+    A ns more of CPU time is at most half a ns of work more or less: nothing jumps where it passes the busy time.
+    """
+    jobs = [(job("a", 0, 100, 100, asleep_ns=0), True), (job("a", 100, 200, cpu_ns, asleep_ns=0), True)]
+    assert figures({"a": ON_BOTH}, jobs)[0] == pytest.approx(work_ns / 100)
+
+
+@pytest.mark.parametrize("cpu_ns", [30, 99, 101, 150])
+def test_a_unit_that_is_held_to_a_pace_works_all_the_while_whatever_its_threads_have(cpu_ns: int) -> None:
+    """Held for 100 ns: of two threads that had 30 or 150 of them the chip that it stands for knows nothing."""
+    units = {"a": UnitSettings(cores=(0, 1), threads=2), "b": UnitSettings(cores=(0, 1), threads=2)}
+    stages = [PipelineStage(name=f"{unit}-stage", unit=unit, factory="json:loads") for unit in units]
+    held = stages[0].model_copy(update={"pace_ns": 100})
+    pipeline = Pipeline(stages=(held, stages[1]), edges=(PipelineEdge(payload_bytes=1),), units=units)
+    config = {"units": {unit: {"cores": [0, 1], "threads": 2} for unit in units}, "pace_ns": {"a-stage": 100}}
+    graph = chain([("a-stage", "a"), ("b-stage", "b")], "double", "b-stage")
+    places = places_of(Begun(1, graph, Settings(1), {"config": config}))
+    assert places == pipeline.places() == {"a": FLOATS, "b": ON_BOTH}
+    jobs = [(job("a", 0, 100, 100), True), (job("a", 100, 200, cpu_ns, asleep_ns=0), True)]
+    assert figures(places, jobs)[0] == 1
 
 
 def test_of_a_job_across_the_edges_only_what_must_lie_within_counts() -> None:

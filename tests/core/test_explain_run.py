@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,6 +18,7 @@ from trilane.apps.explained.advice import advice
 from trilane.apps.explained.job_table import COLUMNS, write_jobs
 from trilane.apps.explained.run import explain_run
 from trilane.apps.explained.slow_frames import MOST_SAMPLES, Sample, Shown, notes
+from trilane.apps.live.followed_run import CUT_OFF
 from trilane.errors import BadInputError, MissingPartError
 from trilane.hw_profiles.application import application_graph
 from trilane.pipeline.journal import NAME, Accounted, Begun, JournalWriter, Record, Stepped, Worked
@@ -268,6 +270,25 @@ def test_a_folder_without_a_journal_is_refused(folder: Path, tmp_path: Path, com
         explain_run(folder)
     with pytest.raises(BadInputError, match="none"):
         explain_run(tmp_path / "none")
+
+
+def test_a_journal_that_was_cut_off_says_so_first(tmp_path: Path, command: Command) -> None:
+    """Where its process lives the run goes on; else nobody knows what came after."""
+    whole = write_run(tmp_path / "whole", simulated({}))
+    assert explain_run(whole)["remark"] == ""
+    assert command("explain", whole)[0].startswith(f"Run {whole}: ")
+    data = (whole / NAME).read_bytes()
+    for name, said in (
+        ("cut", CUT_OFF),
+        (f"gone.{10**9 - 1}.partial", CUT_OFF),
+        (f"live.{os.getpid()}.partial", "the run still goes on: what follows is of its frames so far"),
+    ):
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / NAME).write_bytes(data[: len(data) * 3 // 4])
+        assert explain_run(folder)["remark"] == said
+        first, second, *_ = command("explain", folder)[0].splitlines()
+        assert first == said and second.startswith(f"Run {folder}: ")
 
 
 def test_a_run_of_one_frame_has_no_frame_time(tmp_path: Path, command: Command) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from trilane.apps.live.figures import DropCount, Figures, Moved, Shares
 from trilane.apps.live.live_figures import LiveFigures
-from trilane.pipeline.journal import SCHEMA, Accounted, Begun, Counted, Ended, Record, Stepped, Worked
+from trilane.pipeline.journal import SCHEMA, Accounted, Begun, Counted, Ended, Record, Stepped, Worked, journal_of
 from trilane.scheduler.causes import Outcome, OutcomeKind
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import (
@@ -29,7 +29,7 @@ from trilane.scheduler.events import (
     UnitReady,
     chain,
 )
-from trilane.scheduler.virtual import VirtualDriver
+from trilane.scheduler.virtual import VirtualDriver, simulate
 from trilane.testing.told_journal import told_journal
 
 MS = 1_000_000
@@ -186,6 +186,32 @@ def test_the_end_is_told() -> None:
     assert (now.is_over, now.t_ms) == (True, 90)
 
 
+def test_what_bounds_the_run_is_known_after_some_frames_and_at_the_end_it_is_the_reports() -> None:
+    """b takes 15 ms of each frame, a 5 of them beside it: every path is b's but for the first frame. Paths are walked
+    back from each thirtieth frame as far as 32 before the newest, so that the first share is there after 62 intervals.
+    """
+    graph, times = chain((("a", "u"), ("b", "v")), "double", "b"), {"a": 5 * MS, "b": 15 * MS}
+    run = simulate(graph, Settings(100), lambda stage, *_: times[stage], keep=True)
+    assert run.recording is not None
+    told = {"bound": {"unit": {"name": "told"}, "stage": None}}
+    begun, *records = journal_of(run.recording, run.jobs, {}, told)
+    assert isinstance(begun, Begun)
+    live, finished, presented = LiveFigures(begun), LiveFigures(begun, finds_bound=False), 0
+    for record in records[:-1]:
+        for figures in (live, finished):
+            figures.add(record)
+        presented += isinstance(record, Worked) and record.job.stage == "b"
+        assert finished.now().bound is None
+        assert (live.now().bound is None) == (presented <= 62)
+    bound = live.now().bound
+    assert bound is not None
+    assert (bound["unit"]["name"], bound["stage"]["name"]) == ("v", "b")
+    assert bound["unit"]["share"] == bound["stage"]["share"] == 1
+    for figures in (live, finished):
+        figures.add(records[-1])
+        assert figures.now().bound == told["bound"]
+
+
 BYPASS = Graph(
     tuple(StageSpec(name, unit) for name, unit in zip("abcd", "uvwv", strict=True)),
     ("double",) * 3,
@@ -248,18 +274,19 @@ def test_at_every_step_frames_are_where_the_scheduler_has_them(case: str) -> Non
     assert now.latencies.sum_s == pytest.approx(sum(core.ledger.latency_ns) / S)
 
 
-def test_a_longer_run_takes_no_more_memory() -> None:
-    def size(frames: int) -> int:
-        settings, graph = Settings(frames), chain((("a", "u"), ("b", "v")), "double", "b")
-        driver = VirtualDriver(graph, settings, lambda *_: 20 * MS, keep=True)
-        figures = LiveFigures(Begun(SCHEMA, graph, settings, {}))
-        for records in followed(driver.core, driver):
-            for record in records:
-                figures.add(record)
-        return len(pickle.dumps(figures))
-
-    seven_seconds, twenty = size(350), size(1000)
-    assert twenty < 1.02 * seven_seconds  # larger numbers take a few more bytes
+@pytest.mark.parametrize(("sooner", "later", "finds_bound"), [(350, 1000, False), (4200, 5500, True)])
+def test_a_longer_run_takes_no_more_memory(sooner: int, later: int, finds_bound: bool) -> None:
+    """Beyond the window of 5 s; what bounds the run is found in the last 4096 jobs and changes of each unit."""
+    settings, graph = Settings(later), chain((("a", "u"), ("b", "v")), "double", "b")
+    driver = VirtualDriver(graph, settings, lambda *_: 20 * MS, keep=True)
+    figures = LiveFigures(Begun(SCHEMA, graph, settings, {}), finds_bound=finds_bound)
+    sizes: dict[int, int] = {}
+    for records in followed(driver.core, driver):
+        for record in records:
+            figures.add(record)
+        if (presented := driver.core.ledger.presented_count) in (sooner, later):
+            sizes[presented] = len(pickle.dumps(figures))
+    assert sizes[later] < 1.02 * sizes[sooner]  # larger numbers take a few more bytes
 
 
 def assert_frames(now: Figures, core: Core) -> None:

@@ -44,10 +44,27 @@ def test_every_row_of_the_table_has_a_test_of_its_own_and_tests_that_are_there()
     assert all(row.tests for row in rows)
 
 
-def test_a_key_that_no_row_has_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "rows.toml").write_text('everywhere = []\n[[row]]\nname = "a"\nstands_for = "b"\ncores = 1\n', "utf-8")
-    with pytest.raises(TypeError, match="cores"):
-        load_rows(tmp_path / "rows.toml")
+@pytest.mark.parametrize(
+    ("row", "said"),
+    [
+        (
+            'name = "a"\nstands_for = "b"\nwrappers = []',
+            "row 2 (a): wrappers: found a key that no row has, expected name, ",
+        ),
+        ('name = "a"\nstands_for = "b"\nwrappers = []', "lowest; did you mean 'wrapper'?"),
+        ('stands_for = "b"', "row 2: found no name, expected a name and what it stands for"),
+        ('name = "a"', "row 2 (a): found no stands_for, expected"),
+    ],
+)
+def test_a_row_of_other_keys_is_refused_by_name(
+    row: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "rows.toml"
+    file.write_text(f'everywhere = []\n[[row]]\nname = "x"\nstands_for = "y"\n[[row]]\n{row}\n', "utf-8")
+    monkeypatch.setattr(machines, "load_rows", lambda: load_rows(file))
+    assert machines.main([]) == 2
+    out, err = capsys.readouterr()
+    assert not out and err.startswith(f"{file}, row 2") and said in err
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,9 @@ from math import gamma, pi, sqrt
 import numpy as np
 import pytest
 
+from trilane.scheduler.events import Settings, chain
 from trilane.scheduler.uncertainty import T_975, fps_interval, frame_interval_ms, mean_interval
+from trilane.scheduler.virtual import simulate
 
 #: Five batches of ten frames with the means 10, 12, 11, 13, 14: mean 12, variance (4 + 0 + 1 + 1 + 4) / 4 = 2.5, so the
 #: interval is 12 -+ 2.776445 sqrt(2.5 / 5) = 12 -+ 1.963243.
@@ -37,6 +39,15 @@ def test_too_short_or_too_scattered_to_tell(values: list[float]) -> None:
     assert mean_interval(values) is None
     assert set(frame_interval_ms(None).values()) == {None}
     assert set(fps_interval(None).values()) == {None}
+
+
+@pytest.mark.parametrize(("frames", "is_known"), [(50, False), (51, True)])
+def test_of_51_frames_there_are_50_times_which_are_enough(frames: int, is_known: bool) -> None:
+    """Five batches of ten; all are equal, so the interval is a point."""
+    report = simulate(chain([("a", "u")], "double", "a"), Settings(frames), lambda *_: 2_000_000).report
+    found = [report["frame_time_ms"][key] for key in ("mean_low", "mean_high")]
+    assert found == ([2.0, 2.0] if is_known else [None, None])
+    assert (report["fps_low"], report["fps_high"]) == ((500, 500) if is_known else (None, None))
 
 
 def test_milliseconds_and_rate_are_of_the_same_interval() -> None:

@@ -3,7 +3,7 @@
 The presented picture p differs from the truth t by r (root mean square) where the avatar is. A change f that moves no
 two pictures apart makes f(p) differ from t by |f(t) - t|, at least less r and at most more r: a tint and a shift keep
 distances, an alpha of 0.7 shrinks them. f(t) is made of the truth alone. The same holds of another avatar in place of
-this one, by its own picture and its own truth.
+this one, and of another camera, by their own picture and their own truth.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ frames = 12
 fps = 6
 size = "128x64"
 output = {{width = 160, height = 128}}
-camera = {{source = "builtin:static"}}
+camera = {{source = "{camera}"}}
 [[avatars]]
 bundle = "{avatar}"
 """
 NUMBER, ALPHA, SHIFT, TINT = 5, 0.7, 3, 20
 
 
-def scene(folder: Path, avatar: str) -> Checked:
-    file = folder / f"{avatar}.toml"
-    file.write_text(SCENE.format(avatar=avatar), encoding="utf-8")
+def scene(folder: Path, avatar: str, camera: str = "builtin:static") -> Checked:
+    file = folder / "scene.toml"
+    file.write_text(SCENE.format(avatar=avatar, camera=camera), encoding="utf-8")
     return configure(Request(scene=str(file), runtime="ort"), folder)
 
 
@@ -86,8 +86,12 @@ class Pictures:
 
 @pytest.mark.slow
 def test_the_check_moves_as_the_picture_is_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    checked, other = scene(tmp_path, "default"), Pictures(scene(tmp_path, "hiker"))
-    pictures = Pictures(checked)  # after the other one, as its OpenGL context must be the one in use
+    others = {
+        "avatar": Pictures(scene(tmp_path, "hiker")),
+        "camera": Pictures(scene(tmp_path, "default", "builtin:orbit")),
+    }
+    checked = scene(tmp_path, "default")
+    pictures = Pictures(checked)  # after the others, as its OpenGL context must be the one in use
     moment = cache(pictures.path.moment)
     path = SimpleNamespace(**vars(pictures.path), gl=pictures.path.gl, moment=moment)
     monkeypatch.setattr(reference_path, "ReferencePath", lambda _: path)
@@ -107,9 +111,9 @@ def test_the_check_moves_as_the_picture_is_changed(tmp_path: Path, monkeypatch: 
     assert checked_db("own", pictures.own) == pytest.approx(db(own), abs=1e-6)
     assert pictures.distance(pictures.tinted()[1], pictures.truth) == pytest.approx(TINT / 255)
     changes = {"see-through": pictures.see_through(), "shifted": pictures.shifted(), "tinted": pictures.tinted()}
-    changes["other"] = other.own, other.truth
+    changes |= {name: (other.own, other.truth) for name, other in others.items()}
     for name, (presented, truth) in changes.items():
         made = pictures.distance(truth, pictures.truth)
-        apart = pictures.distance(other.own, other.truth) if name == "other" else own
+        apart = pictures.distance(presented, truth) if name in others else own
         assert made > 2 * apart, f"{name}: too small a change to be seen"
         assert db(made + apart) <= checked_db(name, presented) <= db(made - apart), name

@@ -170,6 +170,7 @@ def test_pictures_timeline_and_figures_of_a_live_run(opened: Callable[..., Watch
         assert [row.split("\t")[3] for row in seen.text("#units tbody").splitlines()] == ["39 %", "66 %", "95 %"]
         assert "pose->raster" in seen.text("#drops") and "64.0 KiB" in seen.text("#stages")
         assert "running" in seen.text("#state") and seen.text("#link") == "connected"
+        assert seen.text("#bound-title") == "What bounds the frame time, so far" and "infer" in seen.text("#bound")
         assert seen.is_well()
 
 
@@ -296,6 +297,8 @@ def test_a_finished_run_is_sought_and_played(opened: Callable[..., Watched]) -> 
         seen.wait_for_other_pixels("timeline", still)
         seen.page.click("#seek-play")
         assert seen.page.locator("#transport button").count() == 0
+        assert seen.text("#bound-title") == "What bounded the frame time"
+        assert "gpu" in seen.text("#bound") and "infer" not in seen.text("#bound")  # the report's, not a moment's
         assert seen.is_well()
 
 

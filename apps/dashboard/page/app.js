@@ -41,6 +41,7 @@ let accuracy = null;
 let run = { name: "" };
 let isLive = true;
 let isOver = false;
+let isReported = false; // what bounded it
 let state = "";
 let span = [0, 0];
 let drawnAt = 0;
@@ -150,6 +151,15 @@ function showFigures(figures) {
   showStages(figures, run.edges ?? []);
   showDrops(figures);
   showSources(figures);
+  if (!isReported) showBound(figures.bound);
+}
+
+// Of a run that goes on as far as it is known, of one that is over as its report has it.
+function showBound(bound) {
+  byId("bound-part").hidden = !bound;
+  if (!bound) return;
+  setText(byId("bound-title"), isOver ? "What bounded the frame time" : "What bounds the frame time, so far");
+  showFacts(byId("bound"), bound);
 }
 
 function stated(message) {
@@ -163,8 +173,8 @@ function stated(message) {
   if (message.accuracy) accuracy = message.accuracy;
   if ("plan" in message) showFacts(byId("plan"), message.plan);
   if ("placement" in message) showFacts(byId("placement"), message.placement);
-  byId("bound-part").hidden = !message.bound;
-  if (message.bound) showFacts(byId("bound"), message.bound);
+  isReported = Boolean(message.bound);
+  if (isReported) showBound(message.bound);
 }
 
 function noted(message) {

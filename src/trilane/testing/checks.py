@@ -8,11 +8,15 @@ from __future__ import annotations
 
 import argparse
 import json
+import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
+from threading import Event
 from typing import Any, Final, NamedTuple
 
 import pytest
@@ -26,6 +30,7 @@ WORKERS = ("--numprocesses", "auto", "--dist", "loadfile", "--max-worker-restart
 GROUPS = ([*WORKERS, *(f"tests/{folder}" for folder in FOLDERS)],)
 #: Beside the packages that decide what is skipped: the tests that `make test` skipped here, for `make test-rest`.
 SKIPPED = Path(sys.prefix) / "skipped-tests.txt"
+INTERRUPTED = 130
 
 
 #: Tests that this process's pytest was to run.
@@ -80,7 +85,7 @@ def check_tests(arguments: Sequence[str], told: Path) -> Outcome:
 
 
 def main(words: Sequence[str]) -> int:
-    """The exit code: 0 where every check passed, else 1."""
+    """The exit code: 0 where every check passed, 130 after Ctrl-C, else 1."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--slow", action="store_true", help="run slow tests too, and refuse skips that are not listed")
     parser.add_argument("--rest", action="store_true", help="run only slow tests and those that the last run skipped")
@@ -92,13 +97,47 @@ def main(words: Sequence[str]) -> int:
         if not SKIPPED.is_file():
             parser.error("nothing says what `make test` skipped here: run it first")
         extra.append(f"--only-rest={SKIPPED}")
-    outcomes = [] if asked.rest else [check_style(command) for command in STYLE]
-    outcomes += [check_tests([*extra, *group], told) for group in GROUPS]
-    if not (asked.slow or asked.rest) and all(outcome.complete for outcome in outcomes):
+    checks = [] if asked.rest else [partial(check_style, command) for command in STYLE]
+    checks += [partial(check_tests, [*extra, *group], told) for group in GROUPS]
+    with interrupts() as interrupt:
+        outcomes = list(outcomes_of(checks, interrupt))
+    if not (asked.slow or asked.rest or interrupt.is_set()) and all(outcome.complete for outcome in outcomes):
         lines = (f"{test}\n" for outcome in outcomes for test in outcome.skipped)
         SKIPPED.write_text("".join(lines), encoding="utf-8")
-    print(said(outcomes, time.monotonic() - begin_s), flush=True)
+    line = said(outcomes, time.monotonic() - begin_s)
+    if interrupt.is_set():
+        print(f"interrupted; {line}", flush=True)
+        return INTERRUPTED
+    print(line, flush=True)
     return int(any(outcome.failures for outcome in outcomes))
+
+
+def outcomes_of(checks: Sequence[Callable[[], Outcome]], interrupt: Event) -> Iterator[Outcome]:
+    """Those of the checks until the interrupt, and what one that it ended has told."""
+    with suppress(KeyboardInterrupt):
+        for check in checks:
+            outcome = check()
+            if not interrupt.is_set() or outcome.passed or not outcome.complete:
+                yield outcome
+            if interrupt.is_set():
+                return
+
+
+@contextmanager
+def interrupts() -> Iterator[Event]:
+    """Set by the first Ctrl-C, which ends the check that runs and lets it tell what it knows; the second kills it."""
+    interrupt = Event()
+
+    def interrupted(*_: object) -> None:
+        if interrupt.is_set():
+            raise KeyboardInterrupt
+        interrupt.set()
+
+    before = signal.signal(signal.SIGINT, interrupted)
+    try:
+        yield interrupt
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def pytest_addoption(parser: Any) -> None:

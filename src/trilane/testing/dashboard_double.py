@@ -78,6 +78,10 @@ def slices(begin_ms: float, end_ms: float) -> dict[str, Any]:
     }
 
 
+#: Of the path.
+SO_FAR = {"name": "gpu", "share": 0.82, "share_low": 0.78, "share_high": 0.86}
+
+
 def figures(t_ms: float, restarts: int = 0) -> dict[str, Any]:
     """`trilane.apps.live.figures.Figures` at a moment, as JSON."""
     wave = (t_ms / 1000 % 10) / 10
@@ -118,6 +122,7 @@ def figures(t_ms: float, restarts: int = 0) -> dict[str, Any]:
         "temperature_c": {"device": 38 + wave, "gpu": 51 + 3 * wave, "dsp": 55 + 4 * wave},
         "duty": {"gpu": 0.8, "dsp": 0.6},
         "accuracy": ACCURACY,
+        "bound": {"unit": {**SO_FAR, "name": "dsp"}, "stage": {**SO_FAR, "name": "infer"}},
         "sources": {"fps": "measured in this run", "temperature_c": "computed by a model"},
     }
 
@@ -163,7 +168,8 @@ class DoubleView:
         unit = {"cores": [0], "threads": 1}
         placement = {"how": "measured", "why": "the least predicted frame time", "units": dict.fromkeys(UNITS, unit)}
         return {"type": "state", "is": self.state, "config": self.config, "plan": plan, "placement": placement} | {
-            "accuracy": ACCURACY
+            "accuracy": ACCURACY,
+            "bound": None if self.is_live else {"bottleneck": "gpu", "bound": {"unit": SO_FAR, "stage": None}},
         }
 
     def greeting(self) -> Iterable[dict[str, Any]]:

@@ -20,13 +20,15 @@ import tomllib
 import venv
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from fnmatch import fnmatchcase
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from trilane import machine
+from trilane.errors import BadInputError
+from trilane.near_miss import did_you_mean
 from trilane.testing.mutants.tree_copy import copied_tree, tracked_files
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -84,9 +86,20 @@ class Outcome:
 
 
 def load_rows(file: Path = TABLE) -> tuple[list[Row], list[str]]:
-    """The rows, and the tests of every row. Raises TypeError for a key that no row has."""
+    """The rows, and the tests of every row. Raises BadInputError for a row with a key that none has, or without one."""
     table = tomllib.loads(file.read_text(encoding="utf-8"))
-    return [Row(**row) for row in table["row"]], table["everywhere"]
+    return [_row(f"{file}, row {number}", row) for number, row in enumerate(table["row"], 1)], table["everywhere"]
+
+
+def _row(where: str, row: Mapping[str, Any]) -> Row:
+    known = [each.name for each in fields(Row)]
+    where += f" ({row['name']})" if "name" in row else ""
+    for key in row.keys() - set(known):
+        raise BadInputError(f"{where}: {key}", "a key that no row has", ", ".join(known), did_you_mean(key, known))
+    for key in ("name", "stands_for"):
+        if key not in row:
+            raise BadInputError(where, f"no {key}", "a name and what it stands for")
+    return Row(**row)
 
 
 def outcome_of(row: Row, text: str, code: int, told: Path, seconds: float) -> Outcome:
@@ -253,7 +266,11 @@ def arguments(names: Sequence[str], words: Sequence[str] | None = None) -> argpa
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    rows, everywhere = load_rows()
+    try:
+        rows, everywhere = load_rows()
+    except BadInputError as error:
+        print(error, file=sys.stderr)
+        return error.exit_code
     options = arguments([row.name for row in rows], words)
     chosen = [
         row for row in rows if (row.name in options.only if options.only else bool(row.python) == options.environments)
