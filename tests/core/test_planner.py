@@ -403,6 +403,14 @@ def test_a_change_that_is_needed_is_made_early() -> None:
     assert foreseen([tall(), wide(), wide()], TALL, WIDE) == ((0, TALL), (1, WIDE))
 
 
+def test_a_change_is_made_where_the_density_changes_least() -> None:
+    """125 pixels high and 106, 103, 100, 97, 94 wide. 160x192 has a density of 1.28; 256x128 has 128 over the width,
+    which is 1.28 at 100. It is too little at 106, and so much at 94 that 160x192 is not good any more.
+    """
+    rects = [pixels(0, 0, width, 125) for width in (106, 103, 100, 97, 94)]
+    assert foreseen([*rects], TALL, (160, 192)) == ((0, (160, 192)), (6, TALL))
+
+
 def test_a_shape_that_is_good_for_all_spares_changes_where_they_cost_more_than_its_pixels() -> None:
     """130x100 pixels and 100x130 in turns. 160x128 and 128x160 are 1.23 times as dense each, and so is 160x160 for
     both. It has 5,120 pixels more, 15,360 in the three frames of a look. A change costs ten times 20,480, twice that
