@@ -25,7 +25,7 @@ def resolution_of(
     sizes = [
         {
             "work": work / ALL_WORK,
-            "most_pixels": budget.own,
+            "most_pixels": budget.most_of(1),
             "frames": rungs.get(rung, 0),
             "psnr_loss_db": worst_loss(work, losses),
         }

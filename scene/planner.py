@@ -1,19 +1,24 @@
 """The planner: which tensor a frame gets. Rule: each avatar in view gets the pixels that its network was trained to
-paint, no more than the picture can show, in a shape that is ready; pure functions of what is on the screen and held.
+paint, more where the picture shows more of it, in a shape that is ready; pure functions of what is on the screen, held
+and foreseen.
 
-A network paints a body best at the size that it has learnt, whatever the distance: smaller it loses the face, larger it
-paints ragged edges (docs/decisions/planner.md has the figures). So the pixels follow from how many avatars are seen,
-and the shape from where they are.
+A network paints a body best at about the size that it has learnt, whatever the distance: much smaller it loses the
+face, much larger it paints ragged edges. A body that has more pixels on the picture than in its tensor loses detail, so
+it gets up to `MOST_GROWTH` times the pixels (docs/decisions/planner.md has the figures).
 
-A shape is changed at once when another would be denser, and after `PATIENCE` frames in a row when a smaller one would
-have done, so that a body at the edge of two shapes does not go to and fro between them (hysteresis).
+A change of shape is seen, so it costs as much as the pixels of `PATIENCE` frames. The scene is known ahead: before the
+run `foreseen_changes` finds the changes that cost least, each in the window in which both shapes are good, where nobody
+is in view or what is seen moves fast. A frame whose shape is not good enough is not waited for: it gets a good one at
+once, whatever was foreseen. Where nothing is foreseen a smaller shape is taken after `PATIENCE` frames in a row in
+which it would have done.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 from trilane.errors import BadInputError
 from trilane.scene.crop import Rect
@@ -24,8 +29,14 @@ from trilane.shapes import Shape, shapes_within
 MOST_DENSITY = 4.0
 #: A density is as good as the best one when it is at least this share of it.
 AS_GOOD = 0.95
-#: Frames for which a smaller shape has to do before it is taken.
+#: A change in view costs as much as the pixels of so many frames; so long a smaller shape has to do before it is taken.
 PATIENCE = 10
+#: What is seen moves by this share of the picture's side in a frame: a change shows half as much as at rest.
+FAST = 0.01
+#: A change of the density by this factor shows twice as much as one of the shape alone.
+DENSITY_STEP = 1.25
+#: How many times its own pixels an avatar gets at most, where the picture shows as many: 5/4 of the sides.
+MOST_GROWTH = 25 / 16
 #: Sides of a tensor, in parts of those that its network was trained to paint: the sizes that it may be stepped down to
 #: when frames would be late, or that an error budget allows.
 SIDES = (1.0, 0.75, 0.5)
@@ -39,25 +50,41 @@ def work_of_side(side: float) -> int:
 
 @dataclass(frozen=True)
 class TensorBudget:
-    """Pixels of a tensor. `own`: of each avatar, those of its network's own shape. `most`: of all together."""
+    """Pixels of a tensor.
+
+    `own`: of its network's own shape, for each avatar. `most`: of all together. `work`: thousandths of what these two
+    allow.
+    """
 
     own: int
     most: int
+    work: int = ALL_WORK
 
     def scaled(self, work: int) -> TensorBudget:
         """With so many thousandths of the pixels."""
-        return TensorBudget(self.own * work // ALL_WORK, self.most * work // ALL_WORK)
+        return replace(self, work=work)
 
-    def of(self, avatars: int) -> int:
-        """For so many avatars in view."""
-        return min(avatars * self.own, self.most)
+    def most_of(self, avatars: int) -> int:
+        """For so many avatars in view, however large they are."""
+        return self._allowed(avatars * self.own * MOST_GROWTH)
+
+    def of(self, rects: Sequence[Rect], output: Shape) -> int:
+        """For the avatars at `rects` on a picture of `output`: their own pixels, or as many as the picture shows."""
+        own = len(rects) * self.own
+        return min(self._allowed(max(own, area(tight_shape(rects, output)))), self.most_of(len(rects)))
+
+    def _allowed(self, pixels: float) -> int:
+        return int(min(pixels, self.most)) * self.work // ALL_WORK
 
 
 @dataclass(frozen=True)
 class Held:
-    """The shape in use, and for how many frames in a row a smaller one would have done."""
+    """The shape in use. `foreseen`: what was foreseen when such a shape was last taken. `smaller_for`: how many frames
+    in a row a smaller shape would have done.
+    """
 
     shape: Shape
+    foreseen: Shape | None = None
     smaller_for: int = 0
 
 
@@ -70,35 +97,123 @@ class TensorPlan:
 
 
 def plan_tensor(
-    rects: Sequence[Rect], output: Shape, shapes: Sequence[Shape], budget: TensorBudget, before: Held | None
+    rects: Sequence[Rect],
+    output: Shape,
+    shapes: Sequence[Shape],
+    budget: TensorBudget,
+    before: Held | None,
+    foreseen: Shape | None = None,
 ) -> TensorPlan:
     """The tensor for the avatars at `rects`, at least one.
 
     `output`: (height, width) of the picture in pixels.
     `shapes`: that are ready. Where all of them are larger than the budget allows, any may be taken.
     `before`: of the frame before, None for the first.
+    `foreseen`: the shape of this frame by `foreseen_changes`; None where nothing was foreseen.
     Raises BadInputError when no shape has room for all avatars.
     """
-    allowed = [shape for shape in shapes if area(shape) <= budget.of(len(rects))] or shapes
-    fits = {shape: fit for shape in allowed if (fit := lay_out_at(rects, output, shape, MOST_DENSITY)) is not None}
-    if not fits:
+    fits, good = _fits(rects, output, shapes, budget)
+    if not good:
         raise BadInputError("tensor shapes", f"{list(shapes)}", f"room for {len(rects)} avatars", "use a larger --size")
-    enough = AS_GOOD * max(fit.density for fit in fits.values())
-    best = min((shape for shape, fit in fits.items() if fit.density >= enough), key=lambda one: (area(one), one))
-    held = _held(best, before, before is not None and before.shape in fits and fits[before.shape].density >= enough)
+    held = _held(good, before, foreseen)
     return TensorPlan(fits[held.shape], held)
 
 
-def _held(best: Shape, before: Held | None, still_good: bool) -> Held:
-    if before is None or not still_good or area(best) >= area(before.shape):
-        return Held(before.shape if before is not None and still_good else best)
+def _fits(
+    rects: Sequence[Rect], output: Shape, shapes: Sequence[Shape], budget: TensorBudget
+) -> tuple[dict[Shape, DenseLayout], list[Shape]]:
+    """The avatars' layout in each shape that may be taken and has room for them, and which of the shapes are good.
+
+    Good is what is nearly as dense as the densest within the frame's budget. A shape may be larger than that, but not
+    than the budget of any frame with as many avatars.
+    """
+    most, pixels = budget.most_of(len(rects)), budget.of(rects, output)
+    allowed = [shape for shape in shapes if area(shape) <= most] or shapes
+    fits = {shape: fit for shape in allowed if (fit := lay_out_at(rects, output, shape, MOST_DENSITY)) is not None}
+    within = [fit.density for shape, fit in fits.items() if area(shape) <= pixels]
+    enough = AS_GOOD * max(within or [fit.density for fit in fits.values()], default=0.0)
+    return fits, [shape for shape, fit in fits.items() if fit.density >= enough]
+
+
+def _held(good: Sequence[Shape], before: Held | None, foreseen: Shape | None) -> Held:
+    """What was foreseen, once and as soon as it is good; then what is held while it is good, else the smallest."""
+    last = before.foreseen if before is not None else None
+    is_kept = before is not None and before.shape in good
+    if foreseen is not None and foreseen in good and (foreseen != last or not is_kept):
+        return Held(foreseen, foreseen)
+    best = min(good, key=lambda shape: (area(shape), shape))
+    if before is None or not is_kept:
+        return Held(best, last)
+    if foreseen is not None or area(best) >= area(before.shape):
+        return Held(before.shape, last)
     waited = before.smaller_for + 1
-    return Held(best) if waited > PATIENCE else Held(before.shape, waited)
+    return Held(best, last) if waited > PATIENCE else Held(before.shape, last, waited)
+
+
+@dataclass(frozen=True)
+class Look:
+    """A frame that was looked at before the run. `rects`: of the avatars that are seen, by their numbers."""
+
+    frame: int
+    rects: Mapping[int, Rect]
+
+
+def foreseen_changes(
+    looks: Sequence[Look], output: Shape, shapes: Sequence[Shape], budget: TensorBudget
+) -> tuple[tuple[int, Shape], ...]:
+    """From which frame on there is which shape: that of the first of `looks`, at least one, and every change.
+
+    Of all ways through the shapes that are good it is the one that costs least, in pixels: those of all frames, and
+    what the changes cost. A change from a shape that is not good at a look is made in the first frame behind the look
+    before.
+    """
+    order = sorted(shapes, key=lambda shape: (area(shape), shape))
+    costs, origins, needed = dict.fromkeys(order, 0.0), [], []
+    for number, look in enumerate(looks):
+        fits, good = _fits(list(look.rects.values()), output, order, budget) if look.rects else ({}, order)
+        before, after = looks[max(number - 1, 0)], looks[min(number + 1, len(looks) - 1)]
+        price = PATIENCE * budget.own / (1.0 + _speed(before, look) / FAST) if before.rects and look.rects else 0.0
+        ways = {shape: _cheapest_way(shape, costs, fits, price) for shape in good or order}
+        frames = max(after.frame - look.frame, 1) if look.rects else 0
+        costs = {shape: cost + frames * area(shape) for shape, (cost, _) in ways.items()}
+        origins.append({shape: origin for shape, (_, origin) in ways.items()})
+        needed.append(set(order) if not before.rects else set(order) - set(good))
+    path = [min(costs, key=lambda shape: costs[shape])]
+    for ways_back in reversed(origins[1:]):
+        path.insert(0, ways_back[path[0]])
+    changes = [(looks[0].frame, path[0])]
+    for number, (old, new) in enumerate(pairwise(path), start=1):
+        if new != old:
+            changes.append((looks[number - 1].frame + 1 if old in needed[number] else looks[number].frame, new))
+    return tuple(changes)
+
+
+def _cheapest_way(
+    shape: Shape, costs: Mapping[Shape, float], fits: Mapping[Shape, DenseLayout], price: float
+) -> tuple[float, Shape]:
+    """To come to `shape`: its cost, and from which of the shapes in `costs`. `price`: of a change of shape alone."""
+
+    def change(origin: Shape) -> float:
+        if origin == shape:
+            return 0.0
+        if origin not in fits or shape not in fits:
+            return price
+        return price * (1.0 + abs(math.log(fits[shape].density / fits[origin].density)) / math.log(DENSITY_STEP))
+
+    return min(((cost + change(origin), origin) for origin, cost in costs.items()), key=lambda way: way[0])
+
+
+def _speed(before: Look, now: Look) -> float:
+    """How far the sides of the avatars' rectangles move in a frame, at most, as a share of the picture's sides."""
+    frames = max(now.frame - before.frame, 1)
+    both = now.rects.keys() & before.rects.keys()
+    moved = [abs(a - b) / 2.0 for one in both for a, b in zip(now.rects[one], before.rects[one], strict=True)]
+    return max(moved, default=0.0) / frames
 
 
 def ideal_shape(rects: Sequence[Rect], output: Shape, budget: TensorBudget) -> Shape:
     """The shape in which the avatars at `rects` are densest within the budget; of equal ones the smallest."""
-    pixels = budget.of(len(rects))
+    pixels = budget.of(rects, output)
     tight = tight_shape(rects, output, MOST_DENSITY)
     shapes = [*shapes_within(pixels), *([tight] if area(tight) <= pixels else [])]
     fits = [(fit.density, shape) for shape in shapes if (fit := lay_out_at(rects, output, shape, MOST_DENSITY))]

@@ -12,6 +12,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import NamedTuple
 
 from trilane.scene.planner import AS_GOOD, area
@@ -75,6 +76,12 @@ def joined(first: ShapeSet, second: ShapeSet) -> ShapeSet:
     shapes = sorted({*first.shapes, *second.shapes}, key=lambda shape: (area(shape), shape))
     unserved = first.unserved if first.shapes else second.unserved
     return ShapeSet(tuple(shapes), first.memory_bytes + second.memory_bytes, unserved)
+
+
+def larger_shapes(shapes: Sequence[Shape], most_pixels: int) -> list[Shape]:
+    """Of each two of `shapes` the one that holds both, where that is none of them and has at most `most_pixels`."""
+    both = {(max(a[0], b[0]), max(a[1], b[1])) for a, b in combinations(shapes, 2)}
+    return sorted((shape for shape in both - set(shapes) if area(shape) <= most_pixels), key=area)
 
 
 def serves(shape: Shape, demand: Demand) -> bool:

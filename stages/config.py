@@ -32,6 +32,8 @@ class RunConfig(Model):
     `units`: cores and threads of each unit.
     `runtime`: that the DSP unit infers with.
     `shapes`: of the tensor, where the scene plans it; else those of its size are used.
+    `changes`: for each of `works` from which second of the scene on a planned tensor has which shape; empty where that
+    was not foreseen.
     `own_pixels`: of the tensor at which the network was trained.
     `works`: of a planned tensor in thousandths of those pixels, the most first; a further one is stepped down to when
     frames would be late.
@@ -49,6 +51,7 @@ class RunConfig(Model):
     units: dict[str, UnitSettings]
     runtime: str = "ort"
     shapes: tuple[Shape, ...] = ()
+    changes: tuple[tuple[tuple[float, Shape], ...], ...] = ()
     own_pixels: int = 0
     works: tuple[int, ...] = (ALL_WORK,)
     record: bool = True

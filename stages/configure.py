@@ -169,6 +169,7 @@ def configure(request: Request, out_dir: Path, gl: GlFacts = gl_facts) -> Checke
         units=settings_of(rule_placement(usable_cores(), asked)),
         runtime=runtime,
         shapes=foreseen.shapes.shapes if foreseen else (),
+        changes=foreseen.changes if foreseen else (),
         own_pixels=whole.own,
         works=works,
         posed_vertices=tuple(len(avatars[folder].shaped.vertices) for folder in folders) if unit == "cpu" else (),

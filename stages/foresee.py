@@ -1,11 +1,12 @@
 """What a scene will put on the screen, looked at before the run. Rule: the same bounds and the same layouts as in the
-run, on a fixed number of frames spread over the scene.
+run, on a fixed number of frames spread over the scene. Where they lie close enough to each other, it is foreseen when
+the tensor changes its shape.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,14 +17,17 @@ from trilane.avatars.network_reshape import STRIDE, reshaped
 from trilane.body.body import ShapedBody
 from trilane.body.kinematics import Skeleton
 from trilane.scene.crop import Rect
-from trilane.scene.planner import TensorBudget, ideal_shape
+from trilane.scene.planner import Look, TensorBudget, area, foreseen_changes, ideal_shape
 from trilane.scene.schema import Scene
-from trilane.scene.shape_set import MOST_SHAPES, Demand, ShapeSet, choose_shapes, joined
+from trilane.scene.shape_set import MOST_SHAPES, Demand, ShapeSet, choose_shapes, joined, larger_shapes
 from trilane.scene.staging import Staged
+from trilane.shapes import Shape
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 
 #: Of the scene, over all avatars; but at least so many of each.
 FORESEEN_FRAMES, LEAST_FRAMES = 96, 24
+#: Frames from a look to the next, at most, for changes to be foreseen.
+MOST_APART = 15
 #: Shapes of each size that is stepped down to.
 MOST_SMALLER = 3
 #: A network that is ready to run holds its tensors once, and a runtime may lay each of them out anew.
@@ -32,10 +36,15 @@ MB = 1_000_000
 BYTE_TYPES = (2, 3)  # of ONNX: uint8 and int8
 
 
+Changes = tuple[tuple[tuple[float, Shape], ...], ...]
+
+
 @dataclass(frozen=True)
 class Foreseen:
     """`shapes`: to make ready. `frames`: numbers of those that were looked at. `seen`: on how many somebody is.
 
+    `changes`: for each of the budgets from which second of the scene on the tensor has which shape; empty where that is
+    not foreseen.
     `left_out`: how many of the sizes that are stepped down to have no shape, because `memory_mb` has no room for one.
     """
 
@@ -43,12 +52,15 @@ class Foreseen:
     frames: tuple[int, ...]
     seen: int
     left_out: int = 0
+    changes: Changes = ()
 
     @property
     def note(self) -> str:
         """What a person should know of it."""
         names = ", ".join(f"{height}x{width}" for height, width in self.shapes.shapes)
         looked_at = f"somebody is seen in {self.seen} of {len(self.frames)} frames looked at"
+        if self.changes:
+            looked_at += f"; {len(self.changes[0]) - 1} changes foreseen"
         text = f"tensor: planned in shapes {names} ({looked_at})"
         if self.shapes.unserved:
             text += f"; {self.shapes.unserved} of them have no shape of their own within memory_mb and are less dense"
@@ -81,36 +93,66 @@ def foresee(
     count = min(scene.frames, max(FORESEEN_FRAMES // len(bodies), LEAST_FRAMES))
     frames = tuple(index * scene.frames // count for index in range(count))
     output = (scene.output.height, scene.output.width)
-    seen = [rects for rects in foreseen_rects(scene, staged, bodies, frames) if rects]
+    looks = [
+        Look(frame, rects) for frame, rects in zip(frames, foreseen_rects(scene, staged, bodies, frames), strict=True)
+    ]
+    seen = [list(look.rects.values()) for look in looks if look.rects]
+    are_close = scene.frames <= MOST_APART * count
     per_pixel = bytes_per_pixel(network)
-    chosen, left_out = ShapeSet((), 0, 0), 0
+    chosen, left_out, changes = ShapeSet((), 0, 0), 0, []
     for budget in budgets:
-        demands = [Demand(ideal_shape(rects, output, budget), budget.of(len(rects))) for rects in seen]
-        anyway = demands or [Demand((STRIDE, STRIDE), budget.of(1))]
+        demands = [Demand(ideal_shape(rects, output, budget), budget.of(rects, output)) for rects in seen]
+        anyway = demands or [Demand((STRIDE, STRIDE), budget.own)]
         left = scene.memory_mb * MB - chosen.memory_bytes
         is_smaller = bool(chosen.shapes)
         most = MOST_SMALLER if is_smaller else MOST_SHAPES
         found = choose_shapes(anyway, per_pixel, left, most, optional=is_smaller)
         left_out += not found.shapes
+        if are_close and found.shapes:
+            room = int(left / per_pixel) - sum(map(area, found.shapes))
+            larger, foreseen = _foreseen(looks, output, found.shapes, budget, (most - len(found.shapes), room))
+            found = joined(found, ShapeSet(larger, math.ceil(per_pixel * sum(map(area, larger))), 0))
+            changes.append(tuple((frame / scene.fps, shape) for frame, shape in foreseen))
+        elif are_close:
+            changes.append(changes[-1])
         chosen = joined(chosen, found)
-    return Foreseen(chosen, frames, len(seen), left_out)
+    return Foreseen(chosen, frames, len(seen), left_out, tuple(changes))
+
+
+def _foreseen(
+    looks: Sequence[Look], output: Shape, shapes: Sequence[Shape], budget: TensorBudget, room: tuple[int, int]
+) -> tuple[tuple[Shape, ...], tuple[tuple[int, Shape], ...]]:
+    """Shapes to make ready beside `shapes`, which spare changes by being good for more frames, and all changes then.
+
+    `room`: how many there may be, and how many pixels they may have together.
+    """
+    most = budget.most_of(max(len(look.rects) for look in looks))
+    larger = larger_shapes(shapes, most)
+    while True:
+        changes = foreseen_changes(looks, output, (*shapes, *larger), budget)
+        taken = {shape for _, shape in changes}
+        used = [shape for shape in larger if shape in taken]
+        if len(used) <= room[0] and sum(map(area, used)) <= room[1]:
+            return tuple(used), changes
+        larger = used[:-1]
 
 
 def foreseen_rects(
     scene: Scene, staged: Staged, bodies: Sequence[ShapedBody], frames: Sequence[int]
-) -> Iterator[list[Rect]]:
-    """For each of `frames` the rectangles of the avatars that are visible, in the order of the scene."""
+) -> Iterator[Mapping[int, Rect]]:
+    """For each of `frames` the rectangles of the avatars that are visible, by their numbers."""
     distinct = {id(body): MeshBounds(body, standoff_m=CLOTHES_STANDOFF_M) for body in bodies}
     skeletons = [Skeleton(body.joints, body.body.parents) for body in bodies]
     for frame in frames:
         t_s = frame / scene.fps
         clip = staged.camera.projection(t_s, (scene.output.height, scene.output.width)) @ staged.camera.sample(t_s)
-        rects = []
-        for body, skeleton, mover in zip(bodies, skeletons, staged.movers, strict=True):
+        rects = {}
+        for number, (body, skeleton, mover) in enumerate(zip(bodies, skeletons, staged.movers, strict=True)):
             pose, translation = mover.sample(t_s)
             posed = skeleton.pose(pose, translation, mover.world)
             rect = distinct[id(body)].rect(posed, clip) if np.isfinite(posed.matrices).all() else None
-            rects += [rect] if rect is not None else []
+            if rect is not None:
+                rects[number] = rect
         yield rects
 
 

@@ -101,7 +101,7 @@ def tried(
 def _thrown_away(checked: Checked) -> Iterator[RunConfig]:
     """The configuration with one of its tensor shapes, prepared soonest, and a folder that is then removed.
 
-    All shapes have about the same area.
+    No shape of the same size has more than 25/16 of its area.
     """
     with tempfile.TemporaryDirectory(prefix="trilane-rehearsal-") as folder:
         height, width = one_shape(checked.config)

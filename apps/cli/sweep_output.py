@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 #: Of a trial's result, where it has them: what the table shows beside how it ended.
 FIGURES = {"fps": ("fps",), "frame ms": ("frame_time_ms", "mean")}
+#: Of trials with `--check`: of the single frames, as in the overview.
+ERRORS = {"PSNR, dB": ("check", "psnr_db"), "worst": ("check", "worst_psnr_db"), "1st pct.": ("check", "p1_psnr_db")}
 
 
 def seconds_left(elapsed_s: float, ended: int, left: int) -> float:
@@ -88,11 +90,12 @@ def print_summary(document: Mapping[str, Any], definition: Definition, records: 
 
     axes = list(definition.axes)
     repeats = ["repeat"] if definition.repeats > 1 else []
-    table = Table(*axes, *repeats, "status", "seconds", *FIGURES)
+    results = {row["id"]: (records.get(row["id"]) or {}).get("result") or {} for row in document["trials"]}
+    shown = FIGURES | (ERRORS if any(result.get("check") for result in results.values()) else {})
+    table = Table(*axes, *repeats, "status", "seconds", *shown)
     for row in document["trials"]:
         cells = [row["options"][name] for name in axes] + [row[name] for name in repeats]
-        result = (records.get(row["id"]) or {}).get("result") or {}
-        figures = [_figure(result, path) for path in FIGURES.values()]
+        figures = [_figure(results[row["id"]], path) for path in shown.values()]
         table.add_row(*(_text(each) for each in [*cells, row["status"], row["seconds"], *figures]))
     stdout_console().print(table)
     counts = document["counts"]

@@ -27,7 +27,18 @@ HOW_DRAWN = (
 #: The overview shows the values of these keys of a scene without the key. Every avatar has the keys of the first.
 WITHOUT_KEY = ("name", "background", "output.width", "output.height", "camera.source", "avatars[0].motion")
 #: Keys of a document's `config` that are no settings, or that the row has by other names.
-NOT_SETTINGS = ("avatar_dirs", "shapes", "own_pixels", "works", "posed_vertices", "pace_ns", "units", "cuts", "record")
+NOT_SETTINGS = (
+    "avatar_dirs",
+    "shapes",
+    "changes",
+    "own_pixels",
+    "works",
+    "posed_vertices",
+    "pace_ns",
+    "units",
+    "cuts",
+    "record",
+)
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ frame that shows what an earlier one showed, or nobody, is told so, skins nothin
 from __future__ import annotations
 
 import time
+from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -85,8 +86,8 @@ class PoseStage:
         self._fps = scene.fps
         self._output = (scene.output.height, scene.output.width)
         self._buckets, self._plans_tensor = config.buckets, scene.plans_tensor
-        self._budgets = config.tensor_budgets
-        self._budget = self._budgets[0]
+        self._budgets, self._changes = config.tensor_budgets, config.changes
+        self._rung = 0
         self._held: Held | None = None
         self._skips = scene.plan == "planned"
         self.plan = FramePlan(Work.NONE, None, None, {})
@@ -176,7 +177,7 @@ class PoseStage:
 
     def step_to(self, rung: int) -> None:
         """Tensors have the pixels of `RunConfig.works[rung]` from now on."""
-        self._budget = self._budgets[rung]
+        self._rung = rung
 
     def _shown_by(self, work: Work) -> bytes | None:
         return self._made[work].shown if work in self._made else None
@@ -207,7 +208,9 @@ class PoseStage:
             return FramePlan(Work.NONE, None, None, {})
         rects, density = [one.rect for _, one in seen], None
         if self._plans_tensor:
-            plan = plan_tensor(rects, self._output, self._buckets, self._budget, self._held)
+            foreseen = self._foreseen(float(packet["media_time_s"]))
+            budget = self._budgets[self._rung]
+            plan = plan_tensor(rects, self._output, self._buckets, budget, self._held, foreseen)
             layout, density, self._held = plan.dense.layout, plan.dense.density, plan.held
         else:
             layout = lay_out(rects, self._output, self._buckets)
@@ -215,6 +218,14 @@ class PoseStage:
         for (avatar, _), (crop, cell) in zip(seen, layout.crops, strict=True):
             avatar["rect"], avatar["tensor_rect"] = crop, cell
         return FramePlan(Work.FULL, layout.shape, density, {int(avatar["avatar"]): one for avatar, one in seen})
+
+    def _foreseen(self, t_s: float) -> Shape | None:
+        """The tensor's shape at `t_s`; None where it was not foreseen."""
+        if not self._changes:
+            return None
+        changes = self._changes[self._rung]
+        # Half a microsecond, so that rounding does not make a change one frame late.
+        return changes[max(bisect_right(changes, t_s + 5e-7, key=lambda change: change[0]) - 1, 0)][1]
 
     def _see(
         self,

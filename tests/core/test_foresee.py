@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -12,9 +11,9 @@ import pytest
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_reshape import reshaped
 from trilane.pipeline.description import UnitSettings
-from trilane.scene.planner import TensorBudget, ideal_shape
+from trilane.scene.planner import Look, TensorBudget, foreseen_changes, ideal_shape
 from trilane.scene.schema import AvatarSpec, OutputSpec, Scene
-from trilane.scene.shape_set import Demand, ShapeSet, choose_shapes
+from trilane.scene.shape_set import Demand, ShapeSet, choose_shapes, larger_shapes
 from trilane.scene.staging import Staged, stage_scene
 from trilane.shapes import shape_buckets
 from trilane.stages.avatar_assets import AvatarData, load_avatar
@@ -46,10 +45,18 @@ def test_the_shapes_are_those_of_frames_spread_over_the_scene(
     monkeypatch.setattr("trilane.stages.foresee.foreseen_rects", lambda *what: asked.append(what) or iter(rows))
     found = foresee(scene, place, [avatar.shaped], avatar.network, [OWN])
     assert asked == [(scene, place, [avatar.shaped], frames)] and found.frames == frames
-    seen = [rects for rects in rows if rects]
+    seen = [list(rects.values()) for rects in rows if rects]
     assert found.seen == len(seen) > 90
-    demands = Counter(Demand(ideal_shape(rects, (240, 320), OWN), OWN.own) for rects in seen)
-    assert found.shapes == choose_shapes(demands.elements(), bytes_per_pixel(avatar.network), 512 * MB)
+    demands = [Demand(ideal_shape(rects, (240, 320), OWN), OWN.of(rects, (240, 320))) for rects in seen]
+    first = choose_shapes(demands, bytes_per_pixel(avatar.network), 512 * MB)
+    assert set(first.shapes) <= set(found.shapes.shapes) and found.shapes.unserved == first.unserved
+    # What is beside them spares changes: each is the least shape that holds two of the first ones.
+    further = set(found.shapes.shapes) - set(first.shapes)
+    assert further <= set(larger_shapes(first.shapes, OWN.most_of(1)))
+    assert further <= {shape for _, shape in found.changes[0]} <= set(found.shapes.shapes)
+    looks = [Look(frame, rects) for frame, rects in zip(frames, rows, strict=True)]
+    expected = foreseen_changes(looks, (240, 320), found.shapes.shapes, OWN)
+    assert found.changes == (tuple((frame / 30, shape) for frame, shape in expected),)
 
 
 def test_a_scenes_megabytes_are_a_million_bytes_and_smaller_sizes_get_what_is_left(
@@ -70,7 +77,7 @@ def test_a_scenes_megabytes_are_a_million_bytes_and_smaller_sizes_get_what_is_le
     found = foresee(scene, staged(scene, avatar), [avatar.shaped], avatar.network, [OWN, OWN.scaled(563)])
     assert given == [(300_000_000, 10, False), (300_000_000 - taken[0], 3, True)]
     assert found.shapes.memory_bytes == sum(taken)
-    assert [area <= 128 * 128 * 563 // 1000 for area in map(prod, found.shapes.shapes)] == [True, False]
+    assert [area <= OWN.scaled(563).most_of(1) for area in map(prod, found.shapes.shapes)] == [True, False]
 
 
 @pytest.mark.parametrize(("frames", "avatars", "looked_at"), [(500, 1, 96), (40, 1, 40), (500, 3, 32), (500, 8, 24)])
@@ -78,11 +85,23 @@ def test_so_many_frames_are_looked_at(
     avatar: AvatarData, monkeypatch: pytest.MonkeyPatch, frames: int, avatars: int, looked_at: int
 ) -> None:
     """96 over all avatars, but at least 24 of each, and no more than there are; nobody is in view of any."""
-    monkeypatch.setattr("trilane.stages.foresee.foreseen_rects", lambda *what: [[] for _ in what[3]])
+    monkeypatch.setattr("trilane.stages.foresee.foreseen_rects", lambda *what: [{} for _ in what[3]])
     specs = tuple(AvatarSpec(position=(0.5 * k - 2, 0, 0), motion="builtin:idle") for k in range(avatars))
     scene = Scene(size="auto", frames=frames, avatars=specs)
     found = foresee(scene, staged(scene, avatar), [avatar.shaped] * avatars, avatar.network, [OWN])
     assert len(found.frames) == looked_at
+
+
+@pytest.mark.parametrize(("frames", "is_foreseen"), [(96 * 15, True), (96 * 15 + 1, False)])
+def test_changes_are_foreseen_where_looks_are_half_a_second_apart(
+    avatar: AvatarData, monkeypatch: pytest.MonkeyPatch, frames: int, is_foreseen: bool
+) -> None:
+    """96 looks, 15 frames from one to the next at most; a size that has no shapes has the changes of the one before."""
+    monkeypatch.setattr("trilane.stages.foresee.foreseen_rects", lambda *what: [{} for _ in what[3]])
+    scene = Scene(size="auto", frames=frames, memory_mb=1)
+    monkeypatch.setattr("trilane.stages.foresee.bytes_per_pixel", lambda _: MB / 1024)
+    found = foresee(scene, staged(scene, avatar), [avatar.shaped], avatar.network, [OWN, OWN.scaled(563)])
+    assert found.changes == ((((0.0, (32, 32)),),) * 2 if is_foreseen else ())
 
 
 def test_with_nobody_in_view_one_least_shape_is_made_ready(avatar: AvatarData) -> None:
@@ -109,6 +128,8 @@ def test_the_note_says_shapes_frames_and_what_is_less_dense() -> None:
     text = "tensor: planned in shapes 64x96, 128x32 (somebody is seen in 2 of 3 frames looked at)"
     assert Foreseen(shapes, (0, 5, 9), 2).note == text
     less = Foreseen(ShapeSet(shapes.shapes, 1, 4), (0, 5, 9), 2).note
+    two = Foreseen(shapes, (0, 5, 9), 2, changes=(((0.0, (64, 96)), (0.5, (128, 32)), (1.0, (64, 96))), ())).note
+    assert two == f"{text[:-1]}; 2 changes foreseen)"
     assert less == f"{text}; 4 of them have no shape of their own within memory_mb and are less dense"
 
 
@@ -121,7 +142,7 @@ def test_smaller_sizes_never_pass_the_memory_of_the_scene(
     scene = Scene(size="auto", frames=1, memory_mb=1)
     budgets = [OWN, OWN.scaled(563), OWN.scaled(250)]
     place = staged(scene, avatar)
-    rects = next(foreseen_rects(scene, place, [avatar.shaped], (0,)))
+    rects = list(next(foreseen_rects(scene, place, [avatar.shaped], (0,))).values())
     output = (scene.output.height, scene.output.width)
     first, second, third = (prod(ideal_shape(rects, output, budget)) for budget in budgets)
     assert first > second > third
@@ -150,7 +171,8 @@ def test_a_configuration_has_the_shapes_the_note_and_the_networks_pixels(tiny_bu
     assert planned.config.own_pixels == 64 * 64
     assert planned.config.tensor_budgets == (TensorBudget(64 * 64, 512 * 512),)
     names = ", ".join(f"{height}x{width}" for height, width in planned.config.shapes)
-    assert f"tensor: planned in shapes {names} (somebody is seen in 30 of 30 frames looked at)" in planned.notes
+    seen = f"somebody is seen in 30 of 30 frames looked at; {len(planned.config.changes[0]) - 1} changes foreseen"
+    assert f"tensor: planned in shapes {names} ({seen})" in planned.notes
     fixed = configure(Request("default", avatar=str(tiny_bundle), runtime="ort"), tmp_path, lambda: None)
     assert (fixed.config.shapes, fixed.config.buckets) == ((), shape_buckets("256"))
     assert not any(note.startswith("tensor:") for note in fixed.notes)

@@ -2,14 +2,29 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from itertools import pairwise, product
+
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
 from trilane.errors import BadInputError
 from trilane.scene.crop import ROUNDING_PX, SCREEN, Rect, grow_on_grid, on_grid
-from trilane.scene.planner import AS_GOOD, MOST_DENSITY, PATIENCE, Held, TensorBudget, area, ideal_shape, plan_tensor
-from trilane.scene.shape_set import Demand, ShapeSet, choose_shapes, joined, serves
+from trilane.scene.planner import (
+    AS_GOOD,
+    MOST_DENSITY,
+    PATIENCE,
+    Held,
+    Look,
+    TensorBudget,
+    area,
+    foreseen_changes,
+    ideal_shape,
+    plan_tensor,
+)
+from trilane.scene.shape_set import Demand, ShapeSet, choose_shapes, joined, larger_shapes, serves
 from trilane.scene.tensor_layout import MARGIN_PX, lay_out_at, tight_shape
 from trilane.shapes import shapes_within
 
@@ -169,7 +184,25 @@ OWN = TensorBudget(own=256 * 256, most=512 * 512)
 
 
 def test_each_avatar_has_its_networks_pixels_up_to_a_limit() -> None:
-    assert [OWN.of(count) for count in (1, 2, 4, 5, 8)] == [65_536, 131_072, 262_144, 262_144, 262_144]
+    dot = pixels(0, 0, 1, 1)
+    assert [OWN.of([dot] * count, OUTPUT) for count in (1, 2, 4, 5, 8)] == [65_536, 131_072] + [262_144] * 3
+
+
+@pytest.mark.parametrize(
+    ("rect", "expected"),
+    [
+        (pixels(0, 0, 100, 300), 65_536),  # in whole steps 320x128, which is less
+        (pixels(0, 0, 224, 436), 448 * 224),
+        (pixels(0, 0, 225, 480), 102_400),  # 480x256 is 122,880, and 25/16 of its own are 102,400
+        (SCREEN, 102_400),
+    ],
+)
+def test_a_body_that_the_picture_shows_larger_gets_more(rect: Rect, expected: int) -> None:
+    """Two of them have twice as much between them; three quarters of the sides are 563 thousandths of it all."""
+    assert OWN.of([rect], OUTPUT) == expected <= OWN.most_of(1) == 102_400
+    assert OWN.scaled(563).of([rect], OUTPUT) == expected * 563 // 1000 <= OWN.scaled(563).most_of(1)
+    assert OWN.of([SCREEN, rect], OUTPUT) == 204_800 == OWN.most_of(2)
+    assert TensorBudget(256 * 256, 300 * 300).of([rect], OUTPUT) == min(expected, 90_000)
 
 
 @pytest.mark.parametrize(
@@ -177,8 +210,8 @@ def test_each_avatar_has_its_networks_pixels_up_to_a_limit() -> None:
     [
         # 100x300: of 512x128, 384x160, 320x192 ... the second is the densest, 384 / 300 = 1.28
         ([pixels(0, 0, 100, 300)], (384, 160)),
-        # the whole screen, 480x640: 192x320 at 0.4, 224x288 at 0.45 and 160x384 at 0.33
-        ([SCREEN], (224, 288)),
+        # the whole screen, 480x640, in 102,400 pixels: 288x352 at 0.55, 256x384 at 0.53, 320x320 at 0.5
+        ([SCREEN], (288, 352)),
         # two of 100x300 beside each other, within 131,072 pixels, with a margin of 16 and a pixel each for rounding:
         # 448x288 at (288 - 18) / 200 = 1.35; 384x320 at (384 - 1) / 300 = 1.28; 480x256 at 1.19
         ([pixels(0, 0, 100, 300), pixels(200, 0, 100, 300)], (448, 288)),
@@ -193,9 +226,10 @@ def test_the_ideal_shape_by_hand(rects: list[Rect], expected: tuple[int, int]) -
 @given(st.lists(boxes, min_size=1, max_size=3))
 def test_no_other_shape_within_the_budget_is_denser(rects: list[Rect]) -> None:
     ideal = ideal_shape(rects, OUTPUT, OWN)
-    assert area(ideal) <= OWN.of(len(rects))
+    most = OWN.of(rects, OUTPUT)
+    assert area(ideal) <= most
     fit = lay_out_at(rects, OUTPUT, ideal, MOST_DENSITY)
-    others = [lay_out_at(rects, OUTPUT, shape, MOST_DENSITY) for shape in shapes_within(OWN.of(len(rects)))]
+    others = [lay_out_at(rects, OUTPUT, shape, MOST_DENSITY) for shape in shapes_within(most)]
     densest = max(other.density for other in others if other is not None)
     assert fit is not None
     assert fit.density >= densest
@@ -248,16 +282,16 @@ def test_a_larger_shape_is_taken_at_once_and_a_smaller_one_after_a_while() -> No
 
 def test_a_shape_that_is_needed_again_is_kept() -> None:
     """The frames for which a smaller one would have done are counted anew."""
-    held = held_for(pixels(0, 0, 100, 200), [SMALL, TALL], Held(TALL, PATIENCE))
-    assert held == Held(TALL, 0)
-    assert held_for(pixels(0, 0, 9, 9), [SMALL, TALL], held) == Held(TALL, 1)
+    held = held_for(pixels(0, 0, 100, 200), [SMALL, TALL], Held(TALL, None, PATIENCE))
+    assert held == Held(TALL)
+    assert held_for(pixels(0, 0, 9, 9), [SMALL, TALL], held) == Held(TALL, None, 1)
 
 
 def test_of_shapes_with_as_many_pixels_the_held_one_stays_while_it_is_good() -> None:
     """A square in 128x256 and in 256x128: both are 128 pixels high at most."""
     shapes = [(128, 256), (256, 128)]
     for shape in shapes:
-        assert held_for(pixels(0, 0, 100, 100), shapes, Held(shape, 3)) == Held(shape, 0)
+        assert held_for(pixels(0, 0, 100, 100), shapes, Held(shape, None, 3)) == Held(shape)
 
 
 def test_a_shape_that_is_no_longer_ready_is_let_go() -> None:
@@ -290,6 +324,163 @@ def test_no_ready_shape_is_much_denser_and_none_as_good_is_smaller(rect: Rect, s
     for shape, fit in fits:
         if fit is not None and fit.density >= AS_GOOD * densest:
             assert area(shape) >= area(chosen)
+
+
+def test_a_foreseen_shape_is_taken_at_once_and_then_kept() -> None:
+    """A square body is good in both; the small one is not taken, however long it would do."""
+    held = held_for(pixels(0, 0, 100, 100), [SMALL, TALL], Held(SMALL))
+    assert held == Held(SMALL)
+    for _ in range(2 * PATIENCE):
+        held = plan_tensor([pixels(0, 0, 100, 100)], OUTPUT, [SMALL, TALL], TWO, held, TALL).held
+        assert held == Held(TALL, TALL)
+
+
+def test_a_foreseen_shape_that_is_not_good_waits_until_it_is() -> None:
+    """A tall body is half as dense in the small shape, so the tall one is held; it comes with the first low body."""
+    held: Held | None = Held(TALL, TALL)
+    for height, expected in ((200, TALL), (200, TALL), (100, SMALL)):
+        plan = plan_tensor([pixels(0, 0, 100, height)], OUTPUT, [SMALL, TALL], TWO, held, SMALL)
+        held = plan.held
+        assert held.shape == expected
+    assert held == Held(SMALL, SMALL)
+
+
+def test_a_frame_that_was_foreseen_wrongly_gets_a_good_shape_and_keeps_it() -> None:
+    """For one tall body the tall shape is taken; the foreseen small one comes back with what is foreseen next."""
+    held = plan_tensor([pixels(0, 0, 100, 200)], OUTPUT, [SMALL, TALL], TWO, Held(SMALL, SMALL), SMALL).held
+    assert held == Held(TALL, SMALL)
+    held = plan_tensor([pixels(0, 0, 100, 100)], OUTPUT, [SMALL, TALL], TWO, held, SMALL).held
+    assert held == Held(TALL, SMALL)
+    wide = (128, 130)
+    assert plan_tensor([pixels(0, 0, 99, 99)], OUTPUT, [SMALL, TALL, wide], TWO, held, wide).held == Held(wide, wide)
+
+
+# --- changes that are foreseen ---------------------------------------------------------------------------------------
+
+WIDE = (128, 256)
+FOR_TWO = TensorBudget(own=128 * 256, most=512 * 512)
+
+
+def tall(left: float = 0.0) -> Rect:
+    return pixels(left, 0, 100, 200)
+
+
+def square(left: float = 0.0) -> Rect:
+    """As dense in `TALL` as in `WIDE`."""
+    return pixels(left, 0, 128, 128)
+
+
+def wide(left: float = 0.0) -> Rect:
+    return pixels(left, 0, 200, 100)
+
+
+def looks_at(rects: list[Rect | None], apart: int = 3) -> list[Look]:
+    return [Look(apart * k, {} if rect is None else {0: rect}) for k, rect in enumerate(rects)]
+
+
+def foreseen(rects: list[Rect | None], *shapes: tuple[int, int]) -> tuple[tuple[int, tuple[int, int]], ...]:
+    return foreseen_changes(looks_at(rects), OUTPUT, shapes, FOR_TWO)
+
+
+@pytest.mark.parametrize(("first", "last"), [(tall, wide), (wide, tall)])
+def test_a_change_that_can_wait_is_made_when_nobody_is_in_view(
+    first: Callable[[], Rect], last: Callable[[], Rect]
+) -> None:
+    """Squares do in both shapes before and after the empty looks at frames 9 and 12."""
+    rects = [first(), square(), square(), None, None, square(), square(), last()]
+    ((start, one), (frame, other)) = foreseen(rects, TALL, WIDE)
+    assert (start, one, other) == ((0, TALL, WIDE) if first is tall else (0, WIDE, TALL))
+    assert 9 <= frame <= 13
+
+
+@pytest.mark.parametrize(("lefts", "frame"), [((0, 0, 0, 0, 250, 250), 15), ((0, 250, 250, 250, 250, 250), 6)])
+def test_a_change_that_can_wait_is_made_when_what_is_seen_moves_fastest(lefts: tuple[int, ...], frame: int) -> None:
+    """Squares at looks 1 to 6, one of which moves by 250 of 640 pixels; from and to the others sides move by 72."""
+    assert foreseen([tall(), *map(square, lefts), wide(250)], TALL, WIDE) == ((0, TALL), (frame, WIDE))
+
+
+def test_a_change_that_is_needed_is_made_early() -> None:
+    """The tall shape is no good at the last look, so the wide one comes in the frame behind the look before. There
+    the body moves by 250 pixels, before it by 28.
+    """
+    rects = [pixels(0, 0, 100, 140), square(), square(), pixels(250, 0, 140, 100)]
+    assert foreseen([*rects], TALL, WIDE) == ((0, TALL), (7, WIDE))
+    assert foreseen([tall(), wide(), wide()], TALL, WIDE) == ((0, TALL), (1, WIDE))
+
+
+def test_a_change_is_made_where_the_density_changes_least() -> None:
+    """125 pixels high and 106, 103, 100, 97, 94 wide. 160x192 has a density of 1.28; 256x128 has 128 over the width,
+    which is 1.28 at 100. It is too little at 106, and so much at 94 that 160x192 is not good any more.
+    """
+    rects = [pixels(0, 0, width, 125) for width in (106, 103, 100, 97, 94)]
+    assert foreseen([*rects], TALL, (160, 192)) == ((0, (160, 192)), (6, TALL))
+
+
+def test_a_shape_that_is_good_for_all_spares_changes_where_they_cost_more_than_its_pixels() -> None:
+    """130x100 pixels and 100x130 in turns. 160x128 and 128x160 are 1.23 times as dense each, and so is 160x160 for
+    both. It has 5,120 pixels more, 15,360 in the three frames of a look. A change costs ten times 20,480, twice that
+    for the density, which becomes 1.25 times as large, by 1 + 30 / 480 / 3 / 0.01: 132,817.
+    """
+    high, broad, both = (160, 128), (128, 160), (160, 160)
+    assert larger_shapes([high, broad], 25_600) == [both]
+    assert larger_shapes([high, broad], 25_599) == larger_shapes([high, both], 99_999) == []
+    budget = TensorBudget(own=20_480, most=512 * 512)
+    looks = looks_at([pixels(0, 0, 100, 130), pixels(0, 0, 130, 100)] * 3)
+    assert foreseen_changes(looks, OUTPUT, [high, broad, both], budget) == ((0, both),)
+    to_and_fro = [(0, high), (1, broad), (4, high), (7, broad), (10, high), (13, broad)]
+    assert foreseen_changes(looks, OUTPUT, [high, broad], budget) == tuple(to_and_fro)
+
+
+@given(
+    st.lists(
+        st.one_of(st.none(), st.tuples(st.integers(40, 220), st.integers(40, 220), st.integers(0, 300))),
+        min_size=1,
+        max_size=5,
+    ),
+    st.lists(st.sampled_from([SMALL, TALL, WIDE, (192, 192), (224, 160)]), min_size=1, max_size=3, unique=True),
+)
+def test_no_other_way_through_the_good_shapes_costs_less(
+    rects: list[tuple[int, int, int] | None], shapes: list[tuple[int, int]]
+) -> None:
+    """All ways, one by one, each with its own cost: pixels, and ten own tensors for a change, less in motion."""
+    looks = looks_at([None if one is None else pixels(one[2], 0, one[0], one[1]) for one in rects])
+    fits = [
+        {shape: lay_out_at([look.rects[0]], OUTPUT, shape, 4.0) for shape in shapes} if look.rects else {}
+        for look in looks
+    ]
+    densities = [{shape: fit.density for shape, fit in each.items() if fit} for each in fits]
+
+    def is_good(number: int, shape: tuple[int, int]) -> bool:
+        if not looks[number].rects:
+            return True
+        within = FOR_TWO.of([looks[number].rects[0]], OUTPUT)
+        fair = [d for one, d in densities[number].items() if area(one) <= within] or [*densities[number].values()]
+        return densities[number][shape] >= 0.95 * max(fair)
+
+    def cost(way: tuple[tuple[int, int], ...]) -> float:
+        total = 0.0
+        for number, shape in enumerate(way):
+            if looks[number].rects:
+                total += area(shape) * (3 if number + 1 < len(way) else 1)
+        for number, (old, new) in enumerate(pairwise(way), start=1):
+            if old != new and looks[number].rects and looks[number - 1].rects:
+                a, b = in_pixels(looks[number - 1].rects[0]), in_pixels(looks[number].rects[0])
+                sides = [abs(a[0] - b[0]) / 640, abs(a[0] + a[2] - b[0] - b[2]) / 640]
+                sides += [abs(a[1] - b[1]) / 480, abs(a[1] + a[3] - b[1] - b[3]) / 480]
+                denser = abs(math.log(densities[number][new] / densities[number][old], 1.25))
+                total += 10 * 32_768 * (1 + denser) / (1 + max(sides) / 3 / 0.01)
+        return total
+
+    ways = [
+        way
+        for way in product(shapes, repeat=len(looks))
+        if all(is_good(number, shape) for number, shape in enumerate(way))
+    ]
+    changes = foreseen_changes(looks, OUTPUT, shapes, FOR_TWO)
+    assert changes[0][0] == 0 and all(a < b for (a, _), (b, _) in pairwise(changes))
+    taken = tuple([shape for frame, shape in changes if frame <= look.frame][-1] for look in looks)
+    assert cost(taken) == pytest.approx(min(map(cost, ways)))
+    assert all(is_good(number, shape) for number, shape in enumerate(taken))
 
 
 # --- which shapes are made ready -------------------------------------------------------------------------------------

@@ -131,6 +131,24 @@ def test_a_rung_limits_the_pixels_of_the_tensor(tiny_bundle: Path, tmp_path: Pat
     assert 192 * 128 <= 160 * 160 and 96 * 64 <= 160 * 160 // 4 < 160 * 96
 
 
+def test_the_tensor_has_the_shape_that_was_foreseen_for_its_second(tiny_bundle: Path, tmp_path: Path) -> None:
+    """On either rung its own changes, the second from frame 10 on; both shapes are as dense for a body that stands."""
+    standing = AvatarSpec(motion="builtin:t-pose", heading_deg=90.0)
+    own = config(tiny_bundle, tmp_path, size="auto", avatars=(standing,), camera=CameraSpec(source="builtin:static"))
+    first, second = (256, 96), (256, 128)
+    changes = (((0.0, first), (10 / 30, second)), ((0.0, second), (10 / 30, first)))
+    planned = {"own_pixels": 256 * 128, "works": (1000, 999), "shapes": (first, second), "changes": changes}
+    stage = pose_stage(own.model_copy(update=planned))
+    packet = bound(stage)
+    for rung, expected in ((0, [first, second]), (1, [second, first])):
+        stage.step_to(rung)
+        for frame, shape in zip((9, 10), expected, strict=True):
+            stage.forget()
+            stage._made.clear()
+            stage.run(frame, None, 0)
+            assert tuple(packet.header["tensor_shape"].tolist()) == shape
+
+
 def test_two_avatars_share_the_tensor(tiny_bundle: Path, tmp_path: Path) -> None:
     pair = (AvatarSpec(position=(-0.6, 0, 0)), AvatarSpec(position=(0.6, 0, 0), motion="builtin:idle"))
     stage = pose_stage(config(tiny_bundle, tmp_path, avatars=pair))

@@ -246,7 +246,26 @@ def test_a_summary_says_why_trials_failed(capsys: pytest.CaptureFixture[str]) ->
     ]
     counts = dict.fromkeys(("trials", "done", "failed", "lost", "skipped"), 1)
     print_summary({"trials": rows, "counts": counts, "clock": "host"}, Definition(RUN, {}, {"size": [0]}), {})
-    assert capsys.readouterr().out.splitlines()[-2:] == ["2 failed: no [room]", "1 lost: killed"]
+    printed = capsys.readouterr().out
+    assert printed.splitlines()[-2:] == ["2 failed: no [room]", "1 lost: killed"] and "worst" not in printed
+
+
+def test_trials_that_were_checked_show_mean_worst_and_first_percentile(capsys: pytest.CaptureFixture[str]) -> None:
+    rows = [{"id": name, "options": {"size": 0}, "status": "done", "seconds": 1.0, "error": None} for name in "ab"]
+    counts = dict.fromkeys(("trials", "done", "failed", "lost", "skipped"), 0)
+    checked = {"check": {"psnr_db": 36.5, "worst_psnr_db": 31.25, "p1_psnr_db": 32.0}}
+    document = {"trials": rows, "counts": counts, "clock": "host"}
+    print_summary(document, Definition(RUN, {}, {"size": [0]}), {"a": {"result": checked}})
+    heads, first = ([cell.strip() for cell in line.split("│" if "│" in line else "┃")] for line in _table_rows(capsys))
+    assert dict(zip(heads, first, strict=True)) | {"PSNR, dB": "36.5", "worst": "31.25", "1st pct.": "32"} == dict(
+        zip(heads, first, strict=True)
+    )
+
+
+def _table_rows(capsys: pytest.CaptureFixture[str]) -> list[str]:
+    """The head of the printed table, and its first row."""
+    head, row, *_ = [line for line in capsys.readouterr().out.splitlines() if "┃" in line or "│" in line]
+    return [head, row]
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from trilane.avatars.bundle import load_bundle, write_manifest
 from trilane.avatars.manifest import BySize
 from trilane.avatars.size_loss import SizeLoss, size_loss
 from trilane.errors import BadInputError
+from trilane.scene.crop import Rect
 from trilane.scene.planner import TensorBudget, work_of_side
 from trilane.scene.schema import Scene
 from trilane.stages.config import RunConfig
@@ -34,8 +35,9 @@ def test_the_works_are_the_squares_of_the_sides() -> None:
     """0.75² = 0.5625, rounded up: 192 x 192 of 256 x 256 pixels is within it."""
     assert tuple(map(work_of_side, (1.0, 0.75, 0.5))) == ALL
     budget = TensorBudget(256 * 256, 512 * 512)
-    assert budget.scaled(563) == TensorBudget(36896, 147587) and budget.scaled(1000) == budget
-    assert 192 * 192 <= budget.scaled(563).own < 192 * 224
+    assert budget.scaled(1000) == budget
+    far = [Rect(0.0, 0.0, 0.1, 0.1)]
+    assert 192 * 192 <= budget.scaled(563).of(far, (480, 640)) == 36_896 < 192 * 224
 
 
 @pytest.mark.parametrize(
@@ -126,15 +128,15 @@ def config(works: tuple[int, ...]) -> RunConfig:
 def test_frames_are_counted_by_size_with_what_it_costs() -> None:
     found = resolution_of({0: 3, 1: 3, 2: 1}, 4, config(ALL), [LOSS, LOSS])
     assert [(size["work"], size["most_pixels"], size["frames"], size["psnr_loss_db"]) for size in found["sizes"]] == [
-        (1.0, 65536, 3, 0.0),
-        (0.563, 36896, 3, 1.0),
-        (0.25, 16384, 1, 3.0),
+        (1.0, 102_400, 3, 0.0),  # 65,536 times 25 / 16
+        (0.563, 57_651, 3, 1.0),
+        (0.25, 25_600, 1, 3.0),
     ]
     assert (found["switches"], found["loss_source"]) == (4, "from somewhere")
     note = resolution_note(Resolution.model_validate(found))
     assert note == (
-        "resolution: to be in time 4 of 7 presented frames had smaller tensors: 3 of at most 36896 pixels an avatar, "
-        "1.0 dB worse, 1 of at most 16384 pixels an avatar, 3.0 dB worse; 4 switches (error: from somewhere)"
+        "resolution: to be in time 4 of 7 presented frames had smaller tensors: 3 of at most 57651 pixels an avatar, "
+        "1.0 dB worse, 1 of at most 25600 pixels an avatar, 3.0 dB worse; 4 switches (error: from somewhere)"
     )
     unknown = resolution_of({1: 1}, 0, config(ALL), [LOSS, UNKNOWN])
     assert [size["psnr_loss_db"] for size in unknown["sizes"]] == [None] * 3
