@@ -20,7 +20,7 @@ from random import Random
 from typing import Final
 from urllib.parse import urlsplit
 
-PATIENCE_S: Final = 20.0
+PATIENCE_S: Final = 60.0
 REFUSED: Final = b'"refused"'
 KEY: Final = "dGhlIHNhbXBsZSBub25jZQ=="
 
