@@ -95,8 +95,8 @@ class CameraSpec(Table):
 
     `source`: `builtin:NAME`, a file or a folder. `fov_y_deg`: of the picture's height; None for that of the file, or
     the usual one of its format. `up_axis`: of the file's world. `metres_per_unit`: of its lengths; None for what it
-    says or is likely. `rate_hz`: of a file without times. `near_m`, `far_m`: clip planes. `place`: whether a recorded
-    camera is placed in the scene (`auto`) or stays where it was recorded (`none`).
+    says or is likely. `rate_hz`: of a file without times, or with numbers of frames. `near_m`, `far_m`: clip planes.
+    `place`: whether a recorded camera is placed in the scene (`auto`) or stays where it was recorded (`none`).
     """
 
     source: str = "builtin:orbit"

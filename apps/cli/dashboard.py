@@ -50,4 +50,4 @@ def dashboard(run: FolderArgument, port: PortOption = None) -> None:
     with contextlib.closing(FinishedView(followed.folder)) as view, contextlib.closing(listen(port)) as place:
         answers = DashboardApp(view, place.port, place.token)
         stderr_console().print(f"dashboard: {place.url}", soft_wrap=True, markup=False)
-        asyncio.run(server(answers.asgi).serve(sockets=[place.listener]))
+        asyncio.run(server(answers).serve(sockets=[place.listener]))

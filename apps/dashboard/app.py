@@ -40,11 +40,11 @@ REFUSED_HELP: Final = (
 
 
 class DashboardApp:
-    """The ASGI application `asgi` for `view` on `port`, for those who know `token`."""
+    """The ASGI application `asgi` for `view` on `port`, for those who know `token`. `refusals`: all of its server."""
 
     def __init__(self, view: View, port: int, token: str) -> None:
         self._view = view
-        self._refusals = Refusals()
+        self.refusals = Refusals()
         self._clients = Clients()
         self._asked = asyncio.Event()
         routes = [
@@ -55,7 +55,7 @@ class DashboardApp:
             Mount("/", StaticFiles(directory=PAGE, check_dir=False)),
         ]
         app = Starlette(routes=routes, lifespan=self._lifespan)
-        self.asgi: Asgi = Guard(app, port, token, self._refusals)
+        self.asgi: Asgi = Guard(app, port, token, self.refusals)
 
     async def finish(self) -> None:
         """Tell all clients what is still to be told; they have a moment to take it."""
@@ -76,7 +76,7 @@ class DashboardApp:
         return FileResponse(PAGE / "index.html")
 
     async def _metrics(self, _request: Request) -> Response:
-        rows = [f'trilane_dashboard_refused_total{{why="{why}"}} {n}\n' for why, n in self._refusals.as_json().items()]
+        rows = [f'trilane_dashboard_refused_total{{why="{why}"}} {n}\n' for why, n in self.refusals.as_json().items()]
         return Response("".join([self._view.metrics(), REFUSED_HELP, *rows, "# EOF\n"]), media_type=OPENMETRICS)
 
     async def _trace(self, _request: Request) -> Response:
@@ -87,10 +87,10 @@ class DashboardApp:
 
     async def _live(self, socket: WebSocket) -> None:
         if self._clients.are_full:
-            self._refusals.add(Refusal.TOO_MANY_CLIENTS)
+            self.refusals.add(Refusal.TOO_MANY_CLIENTS)
             await socket.close(1013)
             return
-        client = Client(socket, lambda: self._refusals.add(Refusal.SLOW_CLIENT))
+        client = Client(socket, lambda: self.refusals.add(Refusal.SLOW_CLIENT))
         with self._clients.joined(client):
             await socket.accept()
             for message in self._view.greeting():
@@ -112,7 +112,7 @@ class DashboardApp:
             event = await socket.receive()
             if event["type"] == "websocket.disconnect":
                 if event.get("code") in PROTOCOL_FAULTS:
-                    self._refusals.add(PROTOCOL_FAULTS[event["code"]])
+                    self.refusals.add(PROTOCOL_FAULTS[event["code"]])
                 return
             try:
                 await self._do(client, heard(event.get("bytes") or b""))
@@ -131,19 +131,19 @@ class DashboardApp:
             self._refuse(client, Refusal.CONTROL, message.name, why)
 
     def _refuse(self, client: Client, kind: Refusal, control: str, why: str) -> None:
-        self._refusals.add(kind)
+        self.refusals.add(kind)
         client.put(said({"type": "refused", "control": control, "why": why}))
 
     def _refused(self) -> dict[str, Any]:
-        return {"type": "refusals", "counts": self._refusals.as_json()}
+        return {"type": "refusals", "counts": self.refusals.as_json()}
 
     async def _tell_news(self) -> None:
-        counts = self._refusals.as_json()
+        counts = self.refusals.as_json()
         while True:
             await asyncio.sleep(NEWS_S)
             await self._tell_newest()
-            if counts != self._refusals.as_json():
-                counts = self._refusals.as_json()
+            if counts != self.refusals.as_json():
+                counts = self.refusals.as_json()
                 self._clients.tell(said(self._refused()))
 
     async def _tell_newest(self) -> None:

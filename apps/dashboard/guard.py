@@ -16,7 +16,15 @@ from trilane.apps.dashboard.refusals import Refusal, Refusals
 ADDRESS: Final = "127.0.0.1"
 #: Paths that need the token; all others are files of the page.
 SECRET_PATHS: Final = frozenset({"/", "/live", "/metrics", "/trace.pftrace"})
-STATUS: Final = {Refusal.FOREIGN_HOST: 421, Refusal.FOREIGN_ORIGIN: 403, Refusal.WRONG_TOKEN: 403}
+STATUS: Final = {
+    Refusal.FOREIGN_HOST: 421,
+    Refusal.FOREIGN_ORIGIN: 403,
+    Refusal.WRONG_TOKEN: 403,
+    Refusal.MALFORMED: 400,
+}
+#: Of a page that is not there: who asks for one asks for nothing that may not be asked.
+NOT_FOUND: Final = 404
+MOST_FIELDS: Final = 16
 
 Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
@@ -49,7 +57,7 @@ def headers(port: int) -> dict[str, str]:
 
 
 class Guard:
-    """ASGI middleware: refuses and counts what `refusal_of` names; gives every answer `headers`."""
+    """ASGI middleware: refuses what `refusal_of` names, counts all that is refused, gives every answer `headers`."""
 
     def __init__(self, app: Asgi, port: int, token: str, refusals: Refusals) -> None:
         self._app, self._hosts, self._token, self._refusals = app, hosts(port), token, refusals
@@ -61,10 +69,10 @@ class Guard:
             return
         why = self.refusal_of(scope)
         if why is None:
-            await self._app(scope, receive, self._with_headers(send))
+            await self._app(scope, receive, self._with_headers(send, is_refused=False))
             return
         self._refusals.add(why)
-        await self._refuse(scope, receive, self._with_headers(send), why)
+        await self._refuse(scope, receive, self._with_headers(send, is_refused=True), why)
 
     def refusal_of(self, scope: Mapping[str, Any]) -> Refusal | None:
         """Why the request is refused, None when it is not."""
@@ -75,13 +83,17 @@ class Guard:
         ours = [[f"http://{host}"] for host in self._hosts]
         if origins not in ours and (origins or scope["type"] == "websocket"):
             return Refusal.FOREIGN_ORIGIN
-        if scope["path"] in SECRET_PATHS and not self._knows_token(scope["query_string"]):
-            return Refusal.WRONG_TOKEN
+        if scope["path"] in SECRET_PATHS:
+            return self._refusal_of_token(scope["query_string"])
         return None
 
-    def _knows_token(self, query: bytes) -> bool:
-        tokens = parse_qs(query.decode("latin-1"), max_num_fields=16).get("token", [])
-        return len(tokens) == 1 and secrets.compare_digest(tokens[0].encode(), self._token.encode())
+    def _refusal_of_token(self, query: bytes) -> Refusal | None:
+        try:
+            tokens = parse_qs(query.decode("latin-1"), max_num_fields=MOST_FIELDS).get("token", [])
+        except ValueError:
+            return Refusal.MALFORMED
+        is_known = len(tokens) == 1 and secrets.compare_digest(tokens[0].encode(), self._token.encode())
+        return None if is_known else Refusal.WRONG_TOKEN
 
     async def _refuse(self, scope: Scope, receive: Receive, send: Send, why: Refusal) -> None:
         if scope["type"] == "websocket":
@@ -93,9 +105,11 @@ class Guard:
         await send({"type": "http.response.start", "status": STATUS[why], "headers": plain})
         await send({"type": "http.response.body", "body": body})
 
-    def _with_headers(self, send: Send) -> Send:
+    def _with_headers(self, send: Send, *, is_refused: bool) -> Send:
         async def sent(message: MutableMapping[str, Any]) -> None:
             if message["type"] == "http.response.start":
+                if not is_refused and 400 <= message["status"] < 500 and message["status"] != NOT_FOUND:
+                    self._refusals.add(Refusal.MALFORMED)
                 ours = {name for name, _ in self._headers}
                 theirs = [pair for pair in message.get("headers", []) if pair[0].lower() not in ours]
                 message = {**message, "headers": [*theirs, *self._headers]}

@@ -9,18 +9,23 @@ import errno
 import secrets
 import socket
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from trilane import machine
 from trilane.apps.dashboard.guard import ADDRESS
+from trilane.apps.dashboard.refusals import Refusal
 from trilane.errors import BadInputError, MissingPartError, reason
 from trilane.install import install_line
+
+if TYPE_CHECKING:
+    from trilane.apps.dashboard.app import DashboardApp
 
 SEND_BYTES: Final = 1 << 18  # that the system keeps of what a client does not take
 PATIENCE_MS: Final = 10_000
 PING_S: Final = 10.0
 BACKLOG: Final = 256
 TOKEN_BYTES: Final = 24
+SWITCHING: Final = 101  # status of a WebSocket that begins
 PACKAGES: Final = ("starlette", "uvicorn", "websockets", "prometheus_client")
 
 
@@ -66,18 +71,37 @@ def listen(port: int | None) -> Place:
     return Place(listener, secrets.token_urlsafe(TOKEN_BYTES))
 
 
-def server(asgi: Any) -> Any:
-    """A uvicorn server of `asgi`; its `serve(sockets=[...])` returns when its `should_exit` is set."""
+def server(app: DashboardApp) -> Any:
+    """A uvicorn server of `app`; its `serve(sockets=[...])` returns when its `should_exit` is set.
+
+    What uvicorn refuses before the app hears of it is counted by the app.
+    """
     import uvicorn
+    from uvicorn.protocols.http.h11_impl import H11Protocol
+    from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
     from trilane.apps.dashboard.wire import MOST_BYTES
 
+    class Http(H11Protocol):  # type: ignore[misc]
+        def send_400_response(self, msg: str) -> None:
+            app.refusals.add(Refusal.MALFORMED)
+            super().send_400_response(msg)
+
+    class WebSockets(WebSocketsSansIOProtocol):  # type: ignore[misc]
+        def handle_connect(self, event: Any) -> None:
+            super().handle_connect(event)
+            if self.response.status_code != SWITCHING:
+                app.refusals.add(Refusal.MALFORMED)
+
+        def handle_text(self, event: Any) -> None:
+            self.handle_bytes(event)  # as text it may be no UTF-8, of which uvicorn prints a traceback
+
     config = uvicorn.Config(
-        asgi,
+        app.asgi,
         log_config=None,
         access_log=False,
         lifespan="on",
-        ws="websockets-sansio",
+        ws=WebSockets,
         ws_max_size=MOST_BYTES,
         ws_ping_interval=PING_S,
         ws_ping_timeout=PING_S,
@@ -87,6 +111,6 @@ def server(asgi: Any) -> Any:
         h11_max_incomplete_event_size=16384,
         server_header=False,
         date_header=False,
-        http="h11",
+        http=Http,
     )
     return uvicorn.Server(config)

@@ -28,7 +28,7 @@ async def serve(listener: socket.socket, channel: Channel, window_fd: int) -> No
     os.close(window_fd)
     view = LiveView(window, channel.send)
     app = DashboardApp(view, listener.getsockname()[1], opened.token)
-    answers = server(app.asgi)
+    answers = server(app)
     run_is_over = asyncio.Event()
     asyncio.get_running_loop().add_reader(channel.fd, _hear, channel, view, run_is_over)
     leaving = asyncio.create_task(_leave(run_is_over, app, answers))

@@ -17,6 +17,7 @@ from trilane.errors import BadInputError
 from trilane.scene.camera.colmap_binary import read_cameras_binary, read_images_binary
 from trilane.scene.camera.colmap_model import ColmapCamera, ColmapImage
 from trilane.scene.camera.colmap_text import read_cameras_text, read_images_text
+from trilane.scene.camera.distortion import distortion_note
 from trilane.scene.camera.map_frame import Unit
 from trilane.scene.camera.recorded import OPENGL_FROM_OPTICAL, RawCamera
 from trilane.scene.camera.untimed import times_without
@@ -86,8 +87,8 @@ def _lenses(
         if image.camera not in cameras:
             raise BadInputError(f"{where}: {image.name}", f"camera {image.camera}", "a camera of the model")
     used = dict.fromkeys(image.camera for image in views)
-    notes = dict.fromkeys(note for number in used for note in cameras[number].notes())
+    notes = distortion_note(cameras[number].bent() for number in used)
     lenses = {number: cameras[number].lens() for number in used}
     if len(set(lenses.values())) == 1:
-        return (next(iter(lenses.values())),), tuple(notes)
-    return tuple(lenses[image.camera] for image in views), tuple(notes)
+        return (next(iter(lenses.values())),), notes
+    return tuple(lenses[image.camera] for image in views), notes

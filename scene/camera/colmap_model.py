@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from trilane.errors import BadInputError
-from trilane.scene.camera.distortion import distortion_note
+from trilane.scene.camera.distortion import Bent
 from trilane.scene.camera.field_of_view import checked
 from trilane.scene.lens import Lens
 
@@ -60,10 +60,10 @@ class ColmapCamera:
         fx, fy = v.get("fx", v.get("f", 0.0)), v.get("fy", v.get("f", 0.0))
         return Lens(self.width_px, self.height_px, fx, fy, v["cx"], v["cy"])
 
-    def notes(self) -> tuple[str, ...]:
-        """What is left out of the lens."""
-        bent = {key: value for key, value in self.values.items() if key[0] in "kp"}
-        return distortion_note(self.lens(), bent, BY_NAME[self.model].is_fisheye)
+    def bent(self) -> Bent:
+        """With distortion."""
+        parameters = {key: value for key, value in self.values.items() if key[0] in "kp"}
+        return Bent(self.lens(), parameters, BY_NAME[self.model].is_fisheye)
 
 
 class ColmapImage(NamedTuple):

@@ -6,7 +6,8 @@ parameters. The largest displacement over the picture's border is reported, so t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,13 +20,21 @@ STEPS = 9
 LEAST_PX = 0.5
 
 
-def distortion_note(lens: Lens, parameters: Mapping[str, float], is_fisheye: bool = False) -> tuple[str, ...]:
-    """What is left out of a lens with `parameters` k1 to k6, p1 and p2; nothing where it is nothing."""
-    if not is_fisheye and not any(parameters.values()):
-        return ()
-    most = largest_px(lens, parameters, is_fisheye)
+class Bent(NamedTuple):
+    """A lens with the `parameters` k1 to k6, p1 and p2 of its distortion."""
+
+    lens: Lens
+    parameters: Mapping[str, float]
+    is_fisheye: bool = False
+
+
+def distortion_note(lenses: Iterable[Bent]) -> tuple[str, ...]:
+    """What is left out of the lens that is distorted the most; nothing where it is nothing."""
+    bent = [each for each in lenses if each.is_fisheye or any(each.parameters.values())]
+    most, worst = max(((largest_px(*each), k) for k, each in enumerate(bent)), default=(0.0, 0))
     if most < LEAST_PX:
         return ()
+    lens, _, is_fisheye = bent[worst]
     kind = "a fisheye lens is drawn as a pinhole" if is_fisheye else "distortion of the lens is left out"
     return (f"{kind}: up to {most:.0f} px of {lens.width_px:.0f}x{lens.height_px:.0f}; undistort the pictures",)
 

@@ -17,7 +17,7 @@ import numpy as np
 from trilane.arrays import F64
 from trilane.errors import BadInputError
 from trilane.files import read_text
-from trilane.scene.camera.distortion import distortion_note
+from trilane.scene.camera.distortion import Bent, distortion_note
 from trilane.scene.camera.field_of_view import checked
 from trilane.scene.camera.pose_table import read_pose_table
 from trilane.scene.camera.recorded import OPENGL_FROM_OPTICAL, RawCamera
@@ -33,9 +33,9 @@ CAM0 = of_opencv(752.0, 480.0, 458.654, 457.296, 367.215, 248.375)
 KEYS = {"data": 16, "resolution": 2, "intrinsics": 4, "distortion_coefficients": 4}
 
 
-def load_euroc(path: Path) -> RawCamera:
-    """Read `path`. Raises BadInputError with the line."""
-    poses = read_pose_table(path, NAMES, EXPECTED, may_have_more=True)
+def load_euroc(path: Path, rate_hz: float | None = None) -> RawCamera:
+    """Read `path`. `rate_hz`: of the scene. Raises BadInputError with the line."""
+    poses = read_pose_table(path, rate_hz, NAMES, EXPECTED, may_have_more=True)
     turns, places, lens, source = poses.turns, poses.places, CAM0, "usual for EuRoC's cameras"
     how: tuple[str, ...] = (f"the axes of the poses are taken for the camera's, as there is no {SENSOR}",)
     sensor = path.parent.parent / SENSOR
@@ -61,7 +61,7 @@ def _lens(numbers: Mapping[str, F64]) -> Lens:
 
 def _distortion(lens: Lens, numbers: Mapping[str, F64]) -> tuple[str, ...]:
     keys = ("k1", "k2", "p1", "p2")
-    return distortion_note(lens, dict(zip(keys, map(float, numbers["distortion_coefficients"]), strict=True)))
+    return distortion_note([Bent(lens, dict(zip(keys, map(float, numbers["distortion_coefficients"]), strict=True)))])
 
 
 def _sensor(path: Path) -> dict[str, F64]:

@@ -30,18 +30,16 @@ from trilane.scene.schema import CameraSpec
 
 PREFIX = "builtin:"
 
-_READERS: dict[str, Callable[[Path], RawCamera]] = {
+#: Readers of a path and the scene's rate.
+_READERS: dict[str, Callable[[Path, float | None], RawCamera]] = {
     "arkit": load_arkit,
-    "euroc": load_euroc,
-    "stray": load_stray,
-    "tum": load_tum,
-}
-#: Of formats without times, which take the scene's rate.
-_UNTIMED: dict[str, Callable[[Path, float | None], RawCamera]] = {
     "colmap": load_colmap,
+    "euroc": load_euroc,
     "kitti": load_kitti,
     "nerf": load_nerf,
     "record3d": load_record3d,
+    "stray": load_stray,
+    "tum": load_tum,
 }
 #: Formats that may be folders.
 FOLDERS = ("colmap", "nerf", "record3d", "stray")
@@ -59,11 +57,11 @@ def load_camera(spec: CameraSpec, base: Path) -> CameraPath:
             raise BadInputError("camera", repr(spec.source), f"{PREFIX}{{{', '.join(BUILTIN)}}} or a file", near)
         return built_in
     path = base / spec.source
-    guess = detect(path) if spec.format == "auto" else Guess(spec.format, "")
+    guess = detect(path, spec.up_axis) if spec.format == "auto" else Guess(spec.format, "")
     if not (path.is_dir() and guess.kind in FOLDERS):
         require_file(path, EXPECTED)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is left out afterwards
-        raw = _UNTIMED[guess.kind](path, spec.rate_hz) if guess.kind in _UNTIMED else _READERS[guess.kind](path)
+        raw = _READERS[guess.kind](path, spec.rate_hz)
         camera = path_from_recording(raw, str(path), spec)
     reason = guess.reason or "as given"
     taken = f"taken for {camera.detected.format}: {reason}"

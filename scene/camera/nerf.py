@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
-from trilane.scene.camera.distortion import distortion_note, largest_px
+from trilane.scene.camera.distortion import Bent, distortion_note
 from trilane.scene.camera.field_of_view import checked
 from trilane.scene.camera.json_object import read_object
 from trilane.scene.camera.map_frame import Unit
@@ -88,14 +88,12 @@ def _distortion(
     path: Path, content: Mapping[str, Any], frames: Sequence[Any], lenses: Sequence[Lens]
 ) -> tuple[str, ...]:
     """What is left out of the lens that is distorted the most."""
-    worst: tuple[float, tuple[str, ...]] = (0.0, ())
-    for k in range(len(lenses)):
-        keys = {**content, **frames[k]}
-        bent = {key: _real(path, keys, key) for key in DISTORTION_KEYS}
-        is_fisheye = FISHEYE in str(keys.get("camera_model", ""))
-        if is_fisheye or any(bent.values()):
-            worst = max(worst, (largest_px(lenses[k], bent, is_fisheye), distortion_note(lenses[k], bent, is_fisheye)))
-    return worst[1]
+    bent = []
+    for lens, frame in zip(lenses, frames, strict=False):  # one lens may be that of all frames
+        keys = {**content, **frame}
+        parameters = {key: _real(path, keys, key) for key in DISTORTION_KEYS}
+        bent.append(Bent(lens, parameters, FISHEYE in str(keys.get("camera_model", ""))))
+    return distortion_note(bent)
 
 
 def _real(path: Path, content: Mapping[str, Any], key: str) -> float:

@@ -118,8 +118,13 @@ def _faults(times_s: F64, turns: F64, places: F64) -> dict[str, NDArray[np.bool_
     """What can be wrong with a pose, in words, and which poses (N,) have it; a pose has one fault at most."""
     finite = np.isfinite(times_s) & np.isfinite(turns).all(axis=(1, 2)) & np.isfinite(places).all(axis=1)
     safe, near = np.where(finite[:, None, None], turns, 0.0), np.where(finite[:, None], places, 0.0)
-    with np.errstate(over="ignore", invalid="ignore"):
-        skew = np.abs(np.swapaxes(safe, -1, -2) @ safe - np.eye(3)).max(axis=(1, 2))
-        rotation = (skew < SKEW) & (np.linalg.det(safe) > 0)
+    rotation = are_rotations(safe)
     is_far = (np.abs(near) >= FARTHEST_M).any(axis=1)
     return {NOT_FINITE: ~finite, "no rotation": finite & ~rotation, FAR_OFF: finite & rotation & is_far}
+
+
+def are_rotations(matrices: F64, skew: float = SKEW) -> NDArray[np.bool_]:
+    """Which of `matrices` (N, 3, 3) turn and do nothing else, where |R^T R - 1| below `skew` is a rotation."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = np.abs(np.swapaxes(matrices, -1, -2) @ matrices - np.eye(3)).max(axis=(1, 2))
+        return np.asarray((off < skew) & (np.linalg.det(matrices) > 0))

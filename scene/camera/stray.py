@@ -29,10 +29,10 @@ EXPECTED = "a Stray Scanner odometry.csv: timestamp, frame, x, y, z, qx, qy, qz,
 VIDEO_PX, NEAR_PX = (1920.0, 1440.0), 100.0
 
 
-def load_stray(path: Path) -> RawCamera:
-    """Read `path`, the file or its folder. Raises BadInputError with the line."""
+def load_stray(path: Path, rate_hz: float | None = None) -> RawCamera:
+    """Read `path`, the file or its folder. `rate_hz`: of the scene. Raises BadInputError with the line."""
     file = path / FILE if path.is_dir() else path
-    poses = read_pose_table(file, NAMES, EXPECTED, may_have_more=True)
+    poses = read_pose_table(file, rate_hz, NAMES, EXPECTED, may_have_more=True)
     lenses, source = _lenses(file, poses)
     notes = (f"Stray Scanner, {len(poses.times_s)} poses{poses.rate}, optical axes, camera to world",)
     detected = Detected("Stray Scanner odometry", "its column names", unit="m", rate="by the times of the file")

@@ -7,6 +7,8 @@ commas is no number (NaN), at the end of a line it is nothing. Column names in a
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,16 +17,23 @@ from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
 from trilane.files import read_text
+from trilane.scene.camera.untimed import FILM_RATE_HZ
 
 MAX_ROWS = 1_000_000
+#: Rows by which it is told what columns hold.
+HEAD = 3000
 #: With a median step above this, times are in nanoseconds, else in seconds.
 LEAST_STEP_NS = 1e3
 #: A time above this is in nanoseconds whatever the steps are: in seconds it would be 30 million years.
 LEAST_TIME_NS = 1e15
-#: Lines of numbers by which a table's format is told.
+#: Lines of numbers by which a table's layout is told.
 LOOKED_AT = 20
+#: Whole numbers below this that mostly grow by 1, in this share of the steps at least, number frames.
+MOST_FRAMES, LEAST_GROWING = 1e7, 0.75
+#: Unit of a first column that numbers frames.
+FRAMES = "frames"
 #: What is left out of a column's name: its unit, the frames of EuRoC's symbols, and all but letters and digits.
-UNIT, FRAMES, OTHER = re.compile(r"\[[^\[\]]*\]"), re.compile(r"_rs(_r)?_"), re.compile(r"[^a-z0-9]")
+UNIT, SYMBOLS, OTHER = re.compile(r"\[[^\[\]]*\]"), re.compile(r"_rs(_r)?_"), re.compile(r"[^a-z0-9]")
 #: A column's name -> what it holds.
 KNOWN = {
     **{name: "time" for name in ("timestamp", "time", "t", "timestamps", "timestampns")},
@@ -80,6 +89,13 @@ def read_table(path: Path, columns: int, expected: str) -> Table:
     return Table(np.array(rows), np.array(lines))
 
 
+def head_of(path: Path, columns: int, expected: str) -> NDArray[np.float64]:
+    """The numbers (N, columns) of the first rows that have as many; N may be 0. Raises BadInputError."""
+    rows = (words for _, words in islice(_rows(path, expected), HEAD))
+    numbers = ([value for word in words for value in _number(word)] for words in rows)
+    return np.array([row for row in numbers if len(row) == columns]).reshape(-1, columns)
+
+
 def layout_of(path: Path, expected: str) -> Layout:
     """Of the first line that is neither comment nor column names; no columns without one. Raises BadInputError."""
     names: tuple[str, ...] = ()
@@ -112,7 +128,7 @@ def names_in(line: str) -> tuple[str, ...]:
     """What the columns hold, if `line`, which may be a comment, names four or more that are known; else nothing."""
     text = UNIT.sub("", line.strip().lstrip("#"))
     words = text.split(",") if "," in text else text.split()
-    plain = (OTHER.sub("", FRAMES.sub("", word.strip().lower())) for word in words)
+    plain = (OTHER.sub("", SYMBOLS.sub("", word.strip().lower())) for word in words)
     names = tuple(KNOWN.get(word, "") for word in plain)
     return names if len({*names} - {""}) >= 4 else ()
 
@@ -132,6 +148,37 @@ def in_seconds(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], float, 
     return since * scale, step * scale, unit
 
 
+class Times(NamedTuple):
+    """`since_s` (N,): since the first finite one. `unit`: of the column, `s`, `ns` or `frames`.
+
+    `rate`: how many a second, for notes, such as `, 30/s`; empty where it is unknown.
+    """
+
+    since_s: NDArray[np.float64]
+    unit: str
+    rate: str
+
+
+def times_of(column: NDArray[np.float64], rate_hz: float | None, usual_hz: float = FILM_RATE_HZ) -> Times:
+    """What the first column of a table says: times, or numbers of frames, of which `rate_hz` (of the scene) tells the
+    rate, else `usual_hz`.
+    """
+    if is_index(column):
+        rate = rate_hz or usual_hz
+        return Times(elapsed(column)[0] / rate, FRAMES, f", {rate:g} a second {'as given' if rate_hz else 'assumed'}")
+    since, step, unit = in_seconds(column)
+    return Times(since, unit, f", {1 / step:.4g}/s" if step > 0 else "")
+
+
+def is_index(column: NDArray[np.float64]) -> bool:
+    """Whether a column (N,) numbers frames, some of which may be missing."""
+    finite = column[np.isfinite(column)]
+    if len(finite) < 2 or not ((finite % 1 == 0) & (finite >= 0) & (finite < MOST_FRAMES)).all():
+        return False
+    steps = np.diff(finite)
+    return bool(np.median(steps) == 1 and (steps >= 1).mean() >= LEAST_GROWING)
+
+
 def words_of(line: str) -> list[str]:
     """The fields of a line without its comment."""
     text = line.split("#", 1)[0]
@@ -144,8 +191,10 @@ def words_of(line: str) -> list[str]:
     return fields
 
 
-def _rows(path: Path, expected: str) -> list[tuple[int, list[str]]]:
-    lines = enumerate(read_text(path, expected).splitlines(), 1)
-    cut = ((number, words_of(line)) for number, line in lines)
-    rows = [(number, words) for number, words in cut if words]
-    return rows[1:] if rows and names_in(" ".join(rows[0][1])) else rows
+def _rows(path: Path, expected: str) -> Iterator[tuple[int, list[str]]]:
+    is_first = True
+    for number, line in enumerate(read_text(path, expected).splitlines(), 1):
+        words = words_of(line)
+        if words and not (is_first and names_in(" ".join(words))):
+            yield number, words
+        is_first = is_first and not words

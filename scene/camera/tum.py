@@ -22,9 +22,9 @@ EXPECTED = "a TUM trajectory: time, tx ty tz, qx qy qz qw a line"
 KINECT = centred(640, 480, 517.0)
 
 
-def load_tum(path: Path) -> RawCamera:
-    """Read `path`. Raises BadInputError with the line."""
-    poses = read_pose_table(path, NAMES, EXPECTED)
+def load_tum(path: Path, rate_hz: float | None = None) -> RawCamera:
+    """Read `path`. `rate_hz`: of the scene. Raises BadInputError with the line."""
+    poses = read_pose_table(path, rate_hz, NAMES, EXPECTED)
     order = "" if poses.order == USUAL else f", columns {poses.order}"
     time = "" if poses.time == "s" else f", time in {poses.time}"
     notes = (f"TUM trajectory, {len(poses.times_s)} poses{poses.rate}{time}{order}, optical axes, camera to world",)

@@ -8,6 +8,7 @@ picture is named. Where no axis fits, and the pictures' horizons agree on a dire
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,22 +78,31 @@ def upright(turns: F64, usual: str, is_levelled: bool, stated: str = AUTO) -> Up
     `usual`: the axis that is up in the format. `is_levelled`: whether the format's world is aligned with gravity by
     definition. `stated`: what the scene says is up; only turns of the picture are tried then.
     """
-    prices = LEVELLED if is_levelled else ANY_WORLD
-    axes = UP if stated == AUTO else {stated: UP[stated]}
     expected = usual if stated == AUTO else stated
+    guesses = _guesses(turns, expected, LEVELLED if is_levelled else ANY_WORLD, stated)
+    if not guesses:
+        return Upright(np.array(UP[expected]), 0, f"{expected.upper()} up, {_why_without(stated)}")
+    best = min(guesses, key=lambda guess: guess.price)
+    of_first = OF_FIRST if best.name and not is_levelled and _is_of_first(turns, best) else ""
+    return Upright(best.up, best.quarter, _note(best, usual, stated) + _rival(best, guesses, stated) + of_first)
+
+
+def price_of(turns: F64, usual: str) -> float:
+    """How dear the cheapest guess is of cameras with axes `turns` (N, 3, 3): 0 where they are level as is `usual`."""
+    return min((guess.price for guess in _guesses(turns, usual, ANY_WORLD, AUTO)), default=math.inf)
+
+
+def _guesses(turns: F64, expected: str, prices: _Prices, stated: str) -> list[_Guess]:
+    axes = UP if stated == AUTO else {stated: UP[stated]}
     guesses = [
         _Guess(name, np.array(up), quarter, price + (name != expected) * prices.axis + (quarter > 0) * prices.turn)
         for name, up in axes.items()
         for quarter in range(4)
         if (price := _price(turns, np.array(up), quarter)) is not None
     ]
-    if stated == AUTO and prices.between is not None:
-        guesses += _between(turns, prices.between)
-    if not guesses:
-        return Upright(np.array(UP[expected]), 0, f"{expected.upper()} up, {_why_without(stated)}")
-    best = min(guesses, key=lambda guess: guess.price)
-    of_first = OF_FIRST if best.name and not is_levelled and _is_of_first(turns, best) else ""
-    return Upright(best.up, best.quarter, _note(best, usual, stated) + _rival(best, guesses, stated) + of_first)
+    if stated != AUTO or prices.between is None:
+        return guesses
+    return guesses + _between(turns, prices.between)
 
 
 def _is_of_first(turns: F64, best: _Guess) -> bool:

@@ -128,7 +128,7 @@ def test_holes_in_a_log_are_mended_and_said(tmp_path: Path) -> None:
 
 WRONG = {
     "columns": ("1 2 3\n", "3 columns"),
-    "ragged": (arkit_line(0, np.eye(3), np.zeros(3)) + "\n1 2\n", "line 2"),
+    "ragged": (arkit_line(0, np.eye(3), np.ones(3)) + "\n1 2\n", "line 2"),
     "words": (" ".join(["x"] * 13), "could not convert"),
     "comments only": ("# nothing\n", "0 columns"),
     "no rotations": (arkit_line(0, np.zeros((3, 3)), np.zeros(3)), "1 samples that are no rotation"),

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from trilane.errors import BadInputError
 from trilane.scene.camera.colmap_model import MODELS, checked_camera
-from trilane.scene.camera.distortion import distortion_note, largest_px
+from trilane.scene.camera.distortion import Bent, distortion_note, largest_px
 from trilane.scene.camera.map_frame import Unit, looked_at_from, metres_per_unit
 from trilane.scene.camera.path import axes_towards
 from trilane.scene.lens import Lens
@@ -115,9 +115,9 @@ def test_the_order_of_columns_is_that_of_their_names(tmp_path: Path) -> None:
     last, first = f"1 2 3 {x} {y} {z} {w}", f"1 2 3 {w} {x} {y} {z}"
     names = "timestamp tx ty tz"
     texts = {
-        f"0 {last}\n1 {last}": ("TUM", "8 columns: the quaternion's scalar is taken to be last"),
-        f"# {names} qx qy qz qw\n0 {last}\n1 {last}": ("TUM", "column names with the quaternion's scalar last"),
-        f"{names} qw qx qy qz\n0 {first}\n1 {first}": ("TUM", "column names with the quaternion's scalar first"),
+        f"0.5 {last}\n1.5 {last}": ("TUM", "8 columns: the quaternion's scalar is taken to be last"),
+        f"# {names} qx qy qz qw\n0.5 {last}\n1.5 {last}": ("TUM", "column names with the quaternion's scalar last"),
+        f"{names} qw qx qy qz\n0.5 {first}\n1.5 {first}": ("TUM", "column names with the quaternion's scalar first"),
         f"0 {last}\n1000000000 {last}": ("TUM", "8 columns: the quaternion's scalar is taken to be last"),
         f"0,{first}\n1000000000,{first}".replace(" ", ","): (
             "EuRoC",
@@ -250,13 +250,14 @@ BENT: list[tuple[str, list[float], float]] = [
 def test_the_distortion_that_is_left_out(model: str, values: list[float], most: float) -> None:
     kind = next(each for each in MODELS.values() if each.name == model)
     camera = checked_camera("here", kind, (200.0, 200.0), values)
-    bent = {key: value for key, value in camera.values.items() if key[0] in "kp"}
-    assert largest_px(camera.lens(), bent, kind.is_fisheye) == pytest.approx(most)
-    assert f"up to {most:.0f} px of 200x200; undistort the pictures" in camera.notes()[0]
+    assert largest_px(*camera.bent()) == pytest.approx(most)
+    straight = Bent(LENS, {"k1": 1e-3})
+    (note,) = distortion_note([straight, camera.bent(), straight])
+    assert f"up to {most:.0f} px of 200x200; undistort the pictures" in note
 
 
 def test_straight_lenses_have_no_note() -> None:
-    assert distortion_note(LENS, {"k1": 0.0}) == () == distortion_note(LENS, {"k1": 1e-6})
+    assert distortion_note([]) == () == distortion_note([Bent(LENS, {"k1": 0.0}), Bent(LENS, {"k1": 1e-6})])
 
 
 def test_a_map_without_unit_is_scaled_by_where_its_cameras_look() -> None:
@@ -449,7 +450,7 @@ def test_columns_that_hold_no_quaternion_are_refused_with_those_that_may(tmp_pat
 
 def test_quaternions_of_two_digits_are_some(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text("".join(f"{k} {k} 2 3 0.58 0.58 0.58 0\n" for k in range(3)))  # length 1.0046
-    assert len(load(tmp_path / "a.txt").times_s) == 3
+    assert len(load(tmp_path / "a.txt", format="tum").times_s) == 3
 
 
 @pytest.mark.parametrize(("columns", "way"), [(1, "commas"), (7, "as TUM has them"), (16, "KITTI's 12")])

@@ -11,6 +11,7 @@ from trilane.errors import BadInputError
 from trilane.scene.camera import text_table
 from trilane.scene.camera.load import load_camera
 from trilane.scene.camera.text_table import Layout, elapsed, layout_of, read_table
+from trilane.scene.rotations import about
 from trilane.scene.schema import CameraSpec
 from trilane.testing.camera_files import load, nerf_text, pose_z_up, rows_of
 
@@ -63,7 +64,7 @@ def test_elapsed_times_by_hand() -> None:
 
 
 def test_the_format_is_told_by_columns_or_given(tmp_path: Path) -> None:
-    tum, ark, other = "0 0 0 0 0 0 0 1\n", rows_of(np.eye(3)), "1 2 3 4\n"
+    tum, ark, other = "0 0 0 0 0 0 0 1\n", rows_of(about(1, 0.1)), "1 2 3 4\n"
     for text, note in ((tum, "TUM trajectory, 1 poses"), (ark, "ARKit log, 1 poses")):
         (tmp_path / "a.log").write_text(text)
         assert load(tmp_path / "a.log").notes[0].startswith(note)

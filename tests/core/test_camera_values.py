@@ -78,7 +78,7 @@ def test_a_phone_held_upright_has_the_long_side_high(tmp_path: Path, quarter: in
     x, y, fov = HELD[quarter]
     axes = np.column_stack([vectors[x], vectors[y], [0, 0, 1], [0, 0, 0]])
     (tmp_path / "a.txt").write_text("0 " + " ".join(map(str, axes.ravel())))
-    camera = load(tmp_path / "a.txt")
+    camera = load(tmp_path / "a.txt", format="arkit")
     assert fov_y(camera) == pytest.approx(fov)
     f = focal(fov)
     assert pixel(camera, [0.3, 0.2, -2.0]) == pytest.approx((320 + 0.15 * f, 240 - 0.1 * f))
@@ -126,7 +126,7 @@ def test_the_numbers_of_a_tum_quaternion_are_x_y_z_w(tmp_path: Path) -> None:
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ])  # fmt: skip
     (tmp_path / "a.txt").write_text("0 0 0 0 " + " ".join(str(value) for value in 1.01 * q))
-    turn, _ = load(tmp_path / "a.txt").pose(0.0)
+    turn, _ = load(tmp_path / "a.txt", format="tum").pose(0.0)
     z_up = np.column_stack([r[:, 0], -r[:, 1], -r[:, 2]])
     assert turn == pytest.approx(np.stack([z_up[0], z_up[2], -z_up[1]]), abs=1e-9)
 
@@ -134,7 +134,7 @@ def test_the_numbers_of_a_tum_quaternion_are_x_y_z_w(tmp_path: Path) -> None:
 def test_a_kinect_held_upright_has_its_width_high(tmp_path: Path) -> None:
     """As above, then rolled by 90 degrees about the line of sight: the quaternions' product by hand."""
     (tmp_path / "a.txt").write_text("10 1 2 3 -0.5 0.5 0.5 0.5\n")  # (w, x, y, z) = ½ (1, -1, 1, 1)
-    camera = load(tmp_path / "a.txt", up_axis="z")
+    camera = load(tmp_path / "a.txt", up_axis="z", format="tum")
     assert fov_y(camera) == pytest.approx(2 * math.degrees(math.atan(320 / 517)))
     assert camera.notes[1] == "Z up, as given, device held so that the picture is turned by 90 degrees"
     assert camera.notes[0] == "TUM trajectory, 1 poses, optical axes, camera to world"

@@ -124,7 +124,7 @@ def test_when_a_camera_was_recorded(tmp_path: Path) -> None:
     for kind, began in (("tum", 1305031098.5), ("euroc", 1403636580.838555648)):
         path = load(WRITERS[kind](tmp_path, turns, places), up_axis="z")
         assert path.began_s == pytest.approx(began + 1 / 30, abs=1e-6)
-    assert load(WRITERS["arkit"](tmp_path, turns, places)).began_s is None
+    assert load(WRITERS["arkit"](tmp_path, turns, places), format="arkit").began_s is None
     (tmp_path / "since start.txt").write_text("7.5 0 0 0 0 0 0 1\n")
     assert load(tmp_path / "since start.txt").began_s is None
 

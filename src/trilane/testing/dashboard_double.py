@@ -258,13 +258,14 @@ class DoubleView:
 class Served:
     """Context manager: a server of `view` in a thread; `url` is the page's address.
 
-    `port`, `token`: of its own if none.
+    `port`, `token`: of its own if none. `app`: what it serves.
     """
 
     def __init__(self, view: DoubleView, port: int | None = None, token: str | None = None) -> None:
         place = listen(port)
         self.place = replace(place, token=token or place.token)
-        self._server = server(DashboardApp(view, self.place.port, self.place.token).asgi)
+        self.app = DashboardApp(view, self.place.port, self.place.token)
+        self._server = server(self.app)
         self._thread = threading.Thread(target=self._serve)
 
     @property
