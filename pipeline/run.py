@@ -132,10 +132,8 @@ def run_pipeline(
                 clock.heed(controls)
             run = _Run(core, clock, processes, interrupts, log, record, cores)
             run.execute()
-        report = core.ledger.report(
-            clock="host",
-            requested=settings.frames if requests is None and controls is None else core.source.released,
-        )
+        is_open = requests is not None or controls is not None
+        report = core.report(clock="host", requested=core.source.released if is_open else None)
         report["percentiles"] = EXACT if core.ledger.is_exact else SKETCHED
         report.update(policy=policy, edge=pipeline.rule, idle_cores=idle_cores, other_programs=run.other_programs)
         _add_caps(report, governor)

@@ -177,6 +177,18 @@ def test_an_unknown_key_is_never_written(change: dict[str, Any]) -> None:
         Report.model_validate(make_report(**change))
 
 
+def test_frames_that_do_not_add_up_are_refused_and_those_of_an_older_report_are_read(tmp_path: Path) -> None:
+    frames = make_report()["frames"]
+    said = "5 frames were requested, but 3 presented, 0 lost, 1 dropped and 0 not begun"
+    with pytest.raises(ValueError, match=said):
+        Report.model_validate(make_report(frames={**frames, "not_begun": 0}))
+    del frames["not_begun"]
+    (tmp_path / "report.json").write_text(json.dumps(make_report(frames=frames)))
+    report = read_report(tmp_path)
+    assert report.frames.not_begun is None
+    assert report.as_json()["frames"] == frames
+
+
 def test_a_report_of_a_newer_schema_is_refused_as_such(tmp_path: Path) -> None:
     (tmp_path / "report.json").write_text(json.dumps({"schema": 2, "everything": "else"}))
     with pytest.raises(BadInputError, match="schema: found 2, expected 1; a newer Trilane"):

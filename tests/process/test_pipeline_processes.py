@@ -374,6 +374,7 @@ def test_an_interrupt_finishes_what_is_in_flight(run: Run) -> None:
     assert result.failure is None
     assert 10 <= result.presented < 100
     assert not result.lost
+    assert result.report.frames.not_begun == 2000 - result.presented
 
 
 def test_a_second_interrupt_ends_at_once(run: Run) -> None:
@@ -389,7 +390,9 @@ def test_a_second_interrupt_ends_at_once(run: Run) -> None:
     hang_ns = 3_600_000_000_000
     result = run(doubles(raster=HANG), 20, hang_ns=hang_ns, on_progress=When(2, interrupt), on_message=again)
     assert result.interrupted
-    assert by_cause(result.lost)["aborted"] >= 1
+    aborted = by_cause(result.lost)["aborted"]
+    assert aborted >= 1
+    assert result.report.frames.not_begun == 20 - result.presented - aborted
     assert not list(replay(result.recording))
 
 
