@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable
@@ -213,6 +214,9 @@ class RealtimeClock:
     def _ping(self, now_ns: int) -> list[Event]:
         """Ask idle units whether they live; a busy one is heard of when its job ends."""
         self._ping_ns = now_ns + PING_NS
+        with contextlib.suppress(OSError):  # it is tried once more when a unit is to be started
+            if why := self._processes.renew_starter():
+                self._log.say(f"{why} and is replaced")
         units = [unit.name for unit in self._core.units.values() if unit.awaits_nothing]
         for unit in units:
             self._processes.send(unit, Ping())

@@ -103,8 +103,8 @@ def run_pipeline(
     `starter`: a fork server that was started earlier; None makes one for this run.
     `on_progress(presented, requested)`, `on_message(text)`: called from this thread.
 
-    SIGINT or SIGTERM ends the run cleanly with its result marked `interrupted`; a second one ends the units at once;
-    before the first frame KeyboardInterrupt is raised instead.
+    SIGINT, SIGTERM, SIGHUP or SIGQUIT ends the run cleanly with its result marked `interrupted`; a second one ends the
+    units at once; before the first frame KeyboardInterrupt is raised instead.
 
     Raises BadInputError for an unknown policy and in a unit's own process, TrilaneError (with the exit code of the
     unit's error) when a unit cannot start; a failure after that is `RunResult.failure`.

@@ -43,7 +43,7 @@ class UnitMessage(NamedTuple):
 
 class _Process:
     def __init__(self, unit: str, started: StartedUnit, stderr_fd: int, link: Link, folder: SocketFolder) -> None:
-        self.unit, self.pid, self.pidfd = unit, started.pid, started.pidfd
+        self.unit, self.pid, self.pidfd, self.lifeline = unit, *started
         self.stderr_fd, self.link, self.folder = stderr_fd, link, folder
         self.tail = b""
         self.folder_open = True
@@ -171,9 +171,13 @@ class UnitProcesses:
         return messages
 
     def why_ended(self, unit: str) -> str:
-        """What a unit that has ended wrote last, or that the fork server ended; to be put behind a sentence."""
-        end = after_stderr(self.stderr_tails.get(unit, "")) or self._starter.end()
+        """What a unit that has ended wrote last; to be put behind a sentence."""
+        end = after_stderr(self.stderr_tails.get(unit, ""))
         return f"; {end}" if end else ""
+
+    def renew_starter(self) -> str:
+        """Have a fork server that answers; why it had to be a fresh one, else "". Raises OSError."""
+        return self._starter.renew()
 
     def close(self) -> None:
         """No process is left when this returns, however it was before."""
@@ -246,6 +250,7 @@ class UnitProcesses:
         process.link.close()
         process.release_folder()
         os.close(process.pidfd)
+        os.close(process.lifeline)
         os.close(process.stderr_fd)
         del self._live[process.unit]
 

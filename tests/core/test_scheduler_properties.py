@@ -183,7 +183,7 @@ def test_however_a_run_ends_its_frames_add_up(
     held: list[tuple[int, int]],
     asked: list[tuple[int, int]],
 ) -> None:
-    """Interrupted, aborted, given up, held, or asked for frames: `not_begun` is what no job began and nobody dropped."""
+    """Interrupted, aborted, given up, held, or asked for frames: `not_begun` is what no job began and none dropped."""
     in_flight, in_queue, timeout_ns = limits
     is_asked = bool(asked) and not is_paced
     run = Settings(
