@@ -24,7 +24,7 @@ from trilane.pipeline.description import Pipeline
 from trilane.pipeline.regions import EdgeRegion
 from trilane.pipeline.run_log import after_stderr
 from trilane.pipeline.unit_spec import UnitSpec
-from trilane.pipeline.unit_starter import StartedUnit, UnitStarter
+from trilane.pipeline.unit_starter import StartedUnit, UnitStarter, is_stopped
 from trilane.transport.job_pipe import JobPipe, JobPipeEnd, job_pipe_pair
 from trilane.transport.link import Link
 from trilane.transport.messages import Message, MessageError
@@ -174,6 +174,11 @@ class UnitProcesses:
         """What a unit that has ended wrote last; to be put behind a sentence."""
         end = after_stderr(self.stderr_tails.get(unit, ""))
         return f"; {end}" if end else ""
+
+    @property
+    def stopped(self) -> set[str]:
+        """Units whose processes are stopped by a signal now."""
+        return {unit for unit, process in self._live.items() if is_stopped(process.pid)}
 
     def renew_starter(self) -> str:
         """Have a fork server that answers; why it had to be a fresh one, else "". Raises OSError."""

@@ -143,7 +143,7 @@ class UnitStarter:
         try:
             code = self._server.wait(wait_s)
         except subprocess.TimeoutExpired:
-            return f"{SERVER} was stopped" if _is_stopped(self._server.pid) else ""
+            return f"{SERVER} was stopped" if is_stopped(self._server.pid) else ""
         return f"{SERVER} " + (f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}")
 
     def _replace(self) -> None:
@@ -249,7 +249,10 @@ class UnitStarter:
         self.close()
 
 
-def _is_stopped(pid: int) -> bool:
-    """Whether the process was stopped by a signal."""
-    stat = (machine.here.proc / f"{pid}/stat").read_text(encoding="ascii", errors="replace")
+def is_stopped(pid: int) -> bool:
+    """Whether the process was stopped by a signal; one that is gone was not."""
+    try:
+        stat = (machine.here.proc / f"{pid}/stat").read_text(encoding="ascii", errors="replace")
+    except OSError:
+        return False
     return stat.rpartition(")")[2].split()[0] == "T"

@@ -60,6 +60,7 @@ class World:
         self.said: list[Any] = []
         self.starters: list[str] = []
         self.starter_fails = False
+        self.stopped: set[str] = set()
         self.watched: list[int] = []
         self.inbox: list[list[tuple[str, Any]]] = []
         self.places = {"draw": 0, "mix": 1, "show": 0}
@@ -346,6 +347,23 @@ def test_a_fork_server_that_had_to_be_replaced_is_told_with_the_next_ping(monkey
         world.now_ns += 500 * MS
         clock.wait(world.now_ns)
         assert world.log.messages == ([] if fails else ["it was stopped and is replaced"])
+
+
+def test_a_unit_that_was_stopped_is_told_with_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seen at the second ping and no more at the fourth, half a second apart each."""
+    world = World(monkeypatch)
+    clock = world.begun()
+    for stopped, said in (
+        ((), []),
+        (("gpu",), []),
+        (("gpu",), []),
+        ((), ["for about 1.0 s"]),
+        ((), ["for about 1.0 s"]),
+    ):
+        world.stopped = set(stopped)
+        world.now_ns += 500 * MS
+        clock.wait(world.now_ns)
+        assert world.log.messages == [f"unit gpu was stopped by a signal {text}" for text in said]
 
 
 def test_progress_is_shown_ten_times_a_second_and_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -356,6 +356,15 @@ def test_a_fork_server_that_has_ended_is_replaced_once(starter_with: Starter) ->
     starter.close()
 
 
+def test_a_process_that_is_stopped_is_told_from_others(started: Started) -> None:
+    processes, starter = started
+    assert processes.stopped == set()
+    starter.sleepers["left"].send_signal(signal.SIGSTOP)
+    os.waitid(os.P_PID, starter.sleepers["left"].pid, os.WSTOPPED | os.WNOWAIT)
+    assert processes.stopped == {"left"}
+    assert not unit_starter.is_stopped(1 << 22)  # above every process number
+
+
 def test_a_server_that_does_not_leave_is_killed(starter_with: Starter) -> None:
     server = FakeServer(None)
     server.deaf = 1
