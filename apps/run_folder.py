@@ -7,6 +7,8 @@ could not be written, such as on a full disk, what was written stays, and the er
 from __future__ import annotations
 
 import errno
+import fcntl
+import glob
 import os
 import shutil
 from pathlib import Path
@@ -35,14 +37,16 @@ def default_place(scene: str) -> Path:
 class RunFolder:
     """Context manager: `work` is the temporary folder. Leaving without `complete()` removes it and the parents it made.
 
-    Raises BadInputError on entry when `target` exists already or nothing can be written there, and TrilaneError on
-    leaving by an error about a file that could not be written: a folder in which anything was written stays then.
+    Raises BadInputError on entry when `target` exists already, another run that goes on has the name, or nothing can be
+    written there, and TrilaneError on leaving by an error about a file that could not be written: a folder in which
+    anything was written stays then.
     """
 
     def __init__(self, target: Path) -> None:
         self.target = target.absolute()
         self.work = self.target.with_name(f"{self.target.name}.{os.getpid()}.partial")
         self._made: list[Path] = []
+        self._lock = -1
         self._keep = False
 
     def __enter__(self) -> Self:
@@ -50,7 +54,7 @@ class RunFolder:
             if self.target.exists():
                 raise BadInputError(self.target, "a file or folder", "a name that is free", "choose another --out")
             self._make_parents()
-            self.work.mkdir()
+            self._claim()
         except OSError as error:
             self._remove()
             raise BadInputError.of_os_error(self.target, error, WRITABLE, "choose another --out") from None
@@ -61,6 +65,21 @@ class RunFolder:
         for folder in reversed(missing):
             folder.mkdir()
             self._made.append(folder)
+
+    def _claim(self) -> None:
+        """Make `work`, which stays locked while this process lives; one run at a time looks for those of others."""
+        parent = os.open(self.target.parent, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            fcntl.flock(parent, fcntl.LOCK_EX)
+            for other in self.target.parent.glob(f"{glob.escape(self.target.name)}.*.partial"):
+                if _is_locked(other):
+                    found = f"a run that goes on, in {other.name}"
+                    raise BadInputError(self.target, found, "a name that is free", "choose another --out")
+            self.work.mkdir()
+            self._lock = os.open(self.work, os.O_RDONLY | os.O_DIRECTORY)
+            fcntl.flock(self._lock, fcntl.LOCK_EX)
+        finally:
+            os.close(parent)
 
     def complete(self) -> Path:
         """Give the folder its name.
@@ -78,6 +97,7 @@ class RunFolder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        os.close(self._lock)
         if self._keep:
             return
         failed = self._unwritten(error)
@@ -105,3 +125,18 @@ class RunFolder:
                 folder.rmdir()
             except OSError:
                 return
+
+
+def _is_locked(folder: Path) -> bool:
+    """Whether a process that lives has the lock of the folder; one that is gone by now has none."""
+    try:
+        fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(fd)
+    return False

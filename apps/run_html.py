@@ -47,8 +47,8 @@ def _run_rows(report: Report) -> Iterable[Row]:
     for name, facts in report.accuracy.items():
         yield (f"error of {name}", *_error(facts))
     yield "latency", f"p50 {latency.p50:.1f} ms, p95 {latency.p95:.1f} ms", measured
-    dropped = sum(frames.dropped.values())
-    yield "frames", f"{frames.presented} presented, {frames.lost} lost, {dropped} dropped", measured
+    counts = f"{frames.presented} presented, {frames.lost} lost, {sum(frames.dropped.values())} dropped"
+    yield "frames", counts + (f", {frames.not_begun} not begun" if frames.not_begun else ""), measured
     if report.bound is not None:
         yield "bound", ", ".join(_of_path(part) for part in (report.bound.unit, report.bound.stage) if part), measured
     for unit, shares in report.units.items():

@@ -155,7 +155,7 @@ def _trilane_ways(graph: Graph, service: Service, frames: int) -> dict[str, Run]
         driver = VirtualDriver(graph, Settings(frames, "pipelined", period_ns=PERIOD_NS), service, keep=keep)
         driver.run()
         if report:
-            driver.core.ledger.report(clock="virtual", requested=frames)
+            driver.core.report(clock="virtual")
         return driver.core.ledger.presented_ns
 
     return {TRILANE: run, NO_REPORT: lambda: run(report=False), RECORDED: lambda: run(keep=True)}

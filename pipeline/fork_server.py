@@ -1,11 +1,14 @@
-"""The process that units are forked from. Rule: one thread; it ends with its parent, and its units end with it.
+"""The process that units are forked from. Rule: one thread; it ends with its parent, and its units outlive it.
 
 `python -P -m trilane.pipeline.fork_server --socket FD --parent PID --preload MODULE,...` imports once what every unit
 needs, then forks a unit for each request, so that a unit starts in milliseconds instead of importing everything again.
 
 A request is one packet on a SOCK_SEQPACKET socket: JSON, and with it the descriptors of the unit's spec (in a memory
-file), of its stderr, and of what the spec names. The answer is the unit's process number, and with it its pidfd. A
-request with `call` names a function instead, whose result goes to the pipe that comes with it; it has no answer.
+file), of its stderr, of its lifeline, and of what the spec names. The answer is the unit's process number, and with it
+its pidfd. A request with `call` names a function instead, whose result goes to the pipe that comes with it; it has no
+answer.
+
+A lifeline is a pipe whose other end the parent alone has: the kernel kills the unit when that end is closed.
 """
 
 from __future__ import annotations
@@ -13,10 +16,12 @@ from __future__ import annotations
 import argparse
 import contextlib
 import ctypes
+import fcntl
 import gc
 import importlib
 import json
 import os
+import select
 import signal
 import socket
 import sys
@@ -25,6 +30,9 @@ from collections.abc import Sequence
 from typing import Any
 
 PR_SET_PDEATHSIG, PR_SET_NAME = 1, 15  # <linux/prctl.h>
+F_SETSIG = 10  # <linux/fcntl.h>
+#: Signals that end a run: the parent decides how.
+OF_THE_PARENT = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 MAX_FDS = 250  # that one packet carries: SCM_MAX_FD of Linux is 253
 PACKET_BYTES = 1 << 16
 ALWAYS = "trilane.pipeline.unit_loop"
@@ -50,8 +58,7 @@ def serve(requests: socket.socket) -> None:
         pid = os.fork()
         if pid == 0:
             requests.close()
-            run = _call if "call" in request else _run_unit
-            os._exit(run(request, fds, server_pid))
+            os._exit(_call(request, fds, server_pid) if "call" in request else _run_unit(request, fds))
         if "call" not in request:
             pidfd = os.pidfd_open(pid)
             socket.send_fds(requests, [str(pid).encode()], [pidfd])
@@ -70,13 +77,14 @@ def _reap(options: int) -> None:
             pass
 
 
-def _run_unit(request: dict[str, Any], fds: Sequence[int], server_pid: int) -> int:
+def _run_unit(request: dict[str, Any], fds: Sequence[int]) -> int:
     """In the forked process: the unit's whole life, and its exit code."""
     try:
-        spec_fd, stderr_fd, *passed = fds
+        spec_fd, stderr_fd, lifeline, *passed = fds
+        _die_with(lifeline)
         os.dup2(stderr_fd, sys.stderr.fileno())
         os.close(stderr_fd)
-        _leave_server(server_pid)
+        _leave_server()
         os.setpgid(0, 0)
         ctypes.CDLL(None).prctl(PR_SET_NAME, process_name(request["unit"]).encode(), 0, 0, 0)
         os.sched_setaffinity(0, request["cores"])
@@ -94,7 +102,8 @@ def _run_unit(request: dict[str, Any], fds: Sequence[int], server_pid: int) -> i
 
 def _call(request: dict[str, Any], fds: Sequence[int], server_pid: int) -> int:
     """In a forked process: write what the function `module:name` returns, as JSON, to the descriptor `fds[0]`."""
-    _leave_server(server_pid)
+    _leave_server()
+    die_with_parent(server_pid)
     module, _, name = request["call"].partition(":")
     try:
         answer = json.dumps(getattr(importlib.import_module(module), name)())
@@ -105,11 +114,25 @@ def _call(request: dict[str, Any], fds: Sequence[int], server_pid: int) -> int:
     return 0
 
 
-def _leave_server(server_pid: int) -> None:
-    """In a forked process: hear of children of its own as any process does, and end with the server."""
-    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+def _leave_server() -> None:
+    """In a forked process: take signals as any process does, but for Ctrl-C, which is the parent's."""
+    for number in (signal.SIGCHLD, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
+        signal.signal(number, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGCHLD})
-    die_with_parent(server_pid)
+
+
+def _die_with(lifeline: int) -> None:
+    """Have the kernel kill this process when the pipe's other end is closed; end it where it is closed already.
+
+    Unlike a parent-death signal this does not depend on which process, and which of its threads, forked this one.
+    """
+    fcntl.fcntl(lifeline, F_SETSIG, signal.SIGKILL)
+    fcntl.fcntl(lifeline, fcntl.F_SETOWN, os.getpid())
+    fcntl.fcntl(lifeline, fcntl.F_SETFL, fcntl.fcntl(lifeline, fcntl.F_GETFL) | os.O_ASYNC)
+    poller = select.poll()  # select(2) takes no descriptor above 1023
+    poller.register(lifeline, 0)
+    if poller.poll(0):
+        os._exit(1)
 
 
 def die_with_parent(parent_pid: int, number: int = signal.SIGKILL) -> None:
@@ -128,7 +151,8 @@ def main() -> None:
     parser.add_argument("--preload", default="")
     arguments = parser.parse_args()
     die_with_parent(arguments.parent)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for number in OF_THE_PARENT:
+        signal.signal(number, signal.SIG_IGN)
     importlib.import_module(ALWAYS)
     for module in filter(None, arguments.preload.split(",")):
         with contextlib.suppress(ImportError):  # who needs it says what is missing

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable
@@ -91,6 +92,7 @@ class RealtimeClock:
         self._controls: RunControls | None = None
         self._held = HeldTime()
         self._to_end: set[str] = set()
+        self._stopped_ns: dict[str, int] = {}
         self._begun = self._stopping = self._is_lost = False
         self._step_ns = self._ping_ns = 0
         self._progress_s = 0.0
@@ -213,10 +215,23 @@ class RealtimeClock:
     def _ping(self, now_ns: int) -> list[Event]:
         """Ask idle units whether they live; a busy one is heard of when its job ends."""
         self._ping_ns = now_ns + PING_NS
+        with contextlib.suppress(OSError):  # it is tried once more when a unit is to be started
+            if why := self._processes.renew_starter():
+                self._log.say(f"{why} and is replaced")
+        self._tell_stopped(now_ns)
         units = [unit.name for unit in self._core.units.values() if unit.awaits_nothing]
         for unit in units:
             self._processes.send(unit, Ping())
         return [Pinged(unit) for unit in units]
+
+    def _tell_stopped(self, now_ns: int) -> None:
+        """Say of each unit that was stopped by a signal, and is not now, for how long; seen with each ping."""
+        stopped = self._processes.stopped
+        for unit in stopped - self._stopped_ns.keys():
+            self._stopped_ns[unit] = now_ns
+        for unit in self._stopped_ns.keys() - stopped:
+            seconds = (now_ns - self._stopped_ns.pop(unit)) / 1e9
+            self._log.say(f"unit {unit} was stopped by a signal for about {seconds:.1f} s")
 
     def _event(self, unit_message: UnitMessage) -> Event | None:
         unit, message = unit_message

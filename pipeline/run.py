@@ -103,8 +103,8 @@ def run_pipeline(
     `starter`: a fork server that was started earlier; None makes one for this run.
     `on_progress(presented, requested)`, `on_message(text)`: called from this thread.
 
-    SIGINT or SIGTERM ends the run cleanly with its result marked `interrupted`; a second one ends the units at once;
-    before the first frame KeyboardInterrupt is raised instead.
+    SIGINT, SIGTERM, SIGHUP or SIGQUIT ends the run cleanly with its result marked `interrupted`; a second one ends the
+    units at once; before the first frame KeyboardInterrupt is raised instead.
 
     Raises BadInputError for an unknown policy and in a unit's own process, TrilaneError (with the exit code of the
     unit's error) when a unit cannot start; a failure after that is `RunResult.failure`.
@@ -132,10 +132,8 @@ def run_pipeline(
                 clock.heed(controls)
             run = _Run(core, clock, processes, interrupts, log, record, cores)
             run.execute()
-        report = core.ledger.report(
-            clock="host",
-            requested=settings.frames if requests is None and controls is None else core.source.released,
-        )
+        is_open = requests is not None or controls is not None
+        report = core.report(clock="host", requested=core.source.released if is_open else None)
         report["percentiles"] = EXACT if core.ledger.is_exact else SKETCHED
         report.update(policy=policy, edge=pipeline.rule, idle_cores=idle_cores, other_programs=run.other_programs)
         _add_caps(report, governor)

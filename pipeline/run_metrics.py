@@ -7,9 +7,9 @@ is left out of the file. Times are in ms, shares between 0 and 1.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from trilane.pipeline.description import Model
 
@@ -23,13 +23,14 @@ class Record(Model):
 
 
 class FrameCounts(Record):
-    """Frames of a run, counted.
+    """Frames of a run, counted: all that were requested are presented, lost, dropped, or not begun.
 
     `requested`: asked for.
     `presented`: that reached the last stage's end.
     `lost`: begun and never presented, because a unit died or a stage failed.
     `lost_by_cause`: the same by `cause:unit`.
     `dropped`: left out by the policy, by `edge:cause`.
+    `not_begun`: never taken, because the run ended before; null in reports of before it was counted.
     `skipped`: of those presented, how many took the pipeline's bypass; absent where it has none.
     """
 
@@ -38,7 +39,21 @@ class FrameCounts(Record):
     lost: int
     lost_by_cause: dict[str, int]
     dropped: dict[str, int]
+    not_begun: int | None = None
     skipped: int = 0
+
+    @model_validator(mode="after")
+    def _add_up(self) -> Self:
+        """Every requested frame became one thing."""
+        if self.not_begun is None:
+            return self
+        dropped = sum(self.dropped.values())
+        if self.requested != self.presented + self.lost + dropped + self.not_begun:
+            raise ValueError(
+                f"{self.requested} frames were requested, but {self.presented} presented, {self.lost} lost, "
+                f"{dropped} dropped and {self.not_begun} not begun"
+            )
+        return self
 
 
 class TimeSummary(Record):

@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM as something that is asked, not something that breaks in. Rule: the handler only counts."""
+"""Signals that end a run, as something that is asked, not that breaks in. Rule: the handler only counts."""
 
 from __future__ import annotations
 
@@ -8,11 +8,14 @@ import threading
 from types import FrameType
 from typing import Any, Self
 
+UNLESS_IGNORED = (signal.SIGHUP, signal.SIGQUIT)
+
 
 class Interrupts:
     """While entered from the main thread, counts the signals and makes `fd` readable; elsewhere does nothing.
 
-    SIGPIPE is ignored meanwhile, as Python does: what is said to a unit that is gone must not end the program.
+    SIGHUP and SIGQUIT stay ignored where the caller was started so (`nohup`, a shell's background job). SIGPIPE is
+    ignored meanwhile, as Python does: what is said to a unit that is gone must not end the program.
     """
 
     def __init__(self) -> None:
@@ -24,7 +27,8 @@ class Interrupts:
     def __enter__(self) -> Self:
         if threading.current_thread() is threading.main_thread():
             self._wakeup_before = signal.set_wakeup_fd(self._write_fd, warn_on_full_buffer=False)
-            for number in (signal.SIGINT, signal.SIGTERM):
+            hears = [number for number in UNLESS_IGNORED if signal.getsignal(number) not in (signal.SIG_IGN, None)]
+            for number in (signal.SIGINT, signal.SIGTERM, *hears):
                 self._before[number] = signal.signal(number, self._count)
             self._before[signal.SIGPIPE] = signal.signal(signal.SIGPIPE, signal.SIG_IGN)
         return self

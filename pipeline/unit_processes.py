@@ -24,7 +24,7 @@ from trilane.pipeline.description import Pipeline
 from trilane.pipeline.regions import EdgeRegion
 from trilane.pipeline.run_log import after_stderr
 from trilane.pipeline.unit_spec import UnitSpec
-from trilane.pipeline.unit_starter import StartedUnit, UnitStarter
+from trilane.pipeline.unit_starter import StartedUnit, UnitStarter, is_stopped
 from trilane.transport.job_pipe import JobPipe, JobPipeEnd, job_pipe_pair
 from trilane.transport.link import Link
 from trilane.transport.messages import Message, MessageError
@@ -43,7 +43,7 @@ class UnitMessage(NamedTuple):
 
 class _Process:
     def __init__(self, unit: str, started: StartedUnit, stderr_fd: int, link: Link, folder: SocketFolder) -> None:
-        self.unit, self.pid, self.pidfd = unit, started.pid, started.pidfd
+        self.unit, self.pid, self.pidfd, self.lifeline = unit, *started
         self.stderr_fd, self.link, self.folder = stderr_fd, link, folder
         self.tail = b""
         self.folder_open = True
@@ -171,9 +171,18 @@ class UnitProcesses:
         return messages
 
     def why_ended(self, unit: str) -> str:
-        """What a unit that has ended wrote last, or that the fork server ended; to be put behind a sentence."""
-        end = after_stderr(self.stderr_tails.get(unit, "")) or self._starter.end()
+        """What a unit that has ended wrote last; to be put behind a sentence."""
+        end = after_stderr(self.stderr_tails.get(unit, ""))
         return f"; {end}" if end else ""
+
+    @property
+    def stopped(self) -> set[str]:
+        """Units whose processes are stopped by a signal now."""
+        return {unit for unit, process in self._live.items() if is_stopped(process.pid)}
+
+    def renew_starter(self) -> str:
+        """Have a fork server that answers; why it had to be a fresh one, else "". Raises OSError."""
+        return self._starter.renew()
 
     def close(self) -> None:
         """No process is left when this returns, however it was before."""
@@ -246,6 +255,7 @@ class UnitProcesses:
         process.link.close()
         process.release_folder()
         os.close(process.pidfd)
+        os.close(process.lifeline)
         os.close(process.stderr_fd)
         del self._live[process.unit]
 

@@ -1,4 +1,8 @@
-"""The parent's end of the fork server. Rule: it starts units, and leaves no process when it is closed."""
+"""The parent's end of the fork server. Rule: it starts units, and leaves no process when it is closed.
+
+Units outlive the server. One that has ended or was stopped is replaced: `renew` is called from time to time, so that a
+fresh one has imported what units need before the next unit is asked for.
+"""
 
 from __future__ import annotations
 
@@ -6,14 +10,14 @@ import contextlib
 import json
 import os
 import select
-import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
-from functools import partial
+import time
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
+from trilane import machine
 from trilane.errors import TrilaneError
 from trilane.pipeline.fork_server import THREAD_LIMITS
 
@@ -21,39 +25,63 @@ if TYPE_CHECKING:
     from trilane.pipeline.unit_spec import UnitSpec
 
 ANSWER_S = 60.0  # the modules to preload may come from a slow disk
+LOOK_S = 0.1  # between two looks at a fork server that has not answered
 CLOSE_S = 5.0
-NOTICE_S = 0.2  # from the end of its units to its own, which ended them
+NOTICE_S = 0.2  # from the end of a call, or of the socket, to that of the fork server, which ended it
 TAIL_BYTES = 8192
+SERVER = "the fork server, which every unit comes from,"
+SERVERS = 3  # that are asked for one unit, before it cannot be started
 
 
 class StartedUnit(NamedTuple):
-    """A unit's process. `pidfd`: readable when it has ended; to be closed by who has it."""
+    """A unit's process. To be closed by who has it, both.
+
+    `pidfd`: readable when it has ended. `lifeline`: the process ends when it is closed, or when this process ends.
+    """
 
     pid: int
     pidfd: int
+    lifeline: int
+
+
+class _ServerError(Exception):
+    """The fork server does not answer."""
 
 
 class ForkedCall:
-    """A call that goes on in another process; `server_end` says why the fork server has ended, "" while it lives."""
+    """A call that goes on in a process of a fork server of `starter`, and answers to the pipe `reads`."""
 
-    def __init__(self, reads: int, server_end: Callable[[], str]) -> None:
-        self._reads, self._server_end = reads, server_end
+    def __init__(self, starter: UnitStarter, function: str, reads: int) -> None:
+        self._starter, self._function, self._reads = starter, function, reads
         self._is_open = True
 
     def result(self) -> Any | None:
         """What the function returned, once; None when it failed, its process died, or no answer came in time.
 
-        Raises TrilaneError when the fork server has ended, and the call with it.
+        A call whose fork server had to be replaced is made once more.
         """
+        answer = self._answer()
+        self.close()
+        if not answer and self._starter.renew(NOTICE_S):
+            self._reads, self._is_open = self._starter.send_call(self._function), True
+            answer = self._answer()
+            self.close()
+        return json.loads(answer) if answer else None
+
+    def _answer(self) -> bytes:
+        """All that is written until the end, the time is over, or the fork server is no more."""
         answer = b""
         poller = select.poll()  # select(2) takes no descriptor above 1023
         poller.register(self._reads, select.POLLIN)
-        while poller.poll(1000 * ANSWER_S) and (chunk := os.read(self._reads, TAIL_BYTES)):
-            answer += chunk
-        self.close()
-        if not answer and (end := self._server_end()):
-            raise TrilaneError(end)
-        return json.loads(answer) if answer else None
+        end = time.monotonic() + ANSWER_S
+        while time.monotonic() < end:
+            if poller.poll(1000 * LOOK_S):
+                if not (chunk := os.read(self._reads, TAIL_BYTES)):
+                    break
+                answer += chunk
+            elif self._starter.trouble():
+                break
+        return answer
 
     def close(self) -> None:
         """Take no answer any more."""
@@ -69,19 +97,27 @@ class UnitStarter:
     """
 
     def __init__(self, preload: Sequence[str] = ()) -> None:
+        self._preload = ",".join(preload)
+        self._stderr = os.memfd_create("trilane:stderr", os.MFD_CLOEXEC)
+        try:
+            self._launch()
+        except OSError:
+            os.close(self._stderr)
+            raise
+
+    def _launch(self) -> None:
+        """A fresh fork server, and the socket to it."""
+        self._has_units = False
         with contextlib.ExitStack() as undo, contextlib.ExitStack() as ended:
             self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             undo.callback(self._socket.close)
             ended.callback(theirs.close)
-            self._stderr = os.memfd_create("trilane:stderr", os.MFD_CLOEXEC)
-            undo.callback(os.close, self._stderr)
-            self._server = self._spawn(theirs, preload)
+            self._socket.settimeout(LOOK_S)
+            self._server = self._spawn(theirs)
             undo.pop_all()
-        self._socket.settimeout(ANSWER_S)
-        self._has_units = False
 
-    def _spawn(self, theirs: socket.socket, preload: Sequence[str]) -> subprocess.Popen[bytes]:
-        arguments = [f"--socket={theirs.fileno()}", f"--parent={os.getpid()}", f"--preload={','.join(preload)}"]
+    def _spawn(self, theirs: socket.socket) -> subprocess.Popen[bytes]:
+        arguments = [f"--socket={theirs.fileno()}", f"--parent={os.getpid()}", f"--preload={self._preload}"]
         return subprocess.Popen(
             [sys.executable, "-P", "-m", "trilane.pipeline.fork_server", *arguments],
             stdin=subprocess.DEVNULL,
@@ -92,72 +128,131 @@ class UnitStarter:
             process_group=0,
         )
 
+    def renew(self, wait_s: float = 0.0) -> str:
+        """Put a fresh fork server in the place of one that has ended or was stopped, and say why; "": it is well.
+
+        `wait_s`: for its end. Raises OSError when no process can be made.
+        """
+        why = self.trouble(wait_s)
+        if why:
+            self._replace()
+        return why
+
+    def trouble(self, wait_s: float = 0.0) -> str:
+        """Why the fork server answers no more; "" where it still may after the time."""
+        try:
+            code = self._server.wait(wait_s)
+        except subprocess.TimeoutExpired:
+            return f"{SERVER} was stopped" if is_stopped(self._server.pid) else ""
+        return f"{SERVER} " + (f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}")
+
+    def _replace(self) -> None:
+        self._end()
+        self._launch()
+
     def start(self, spec: UnitSpec, stderr_fd: int) -> StartedUnit:
-        """A process for the unit, which writes to `stderr_fd`. Raises TrilaneError when the fork server failed."""
-        self._has_units = True
+        """A process for the unit, which writes to `stderr_fd`. Raises TrilaneError when no fork server answers."""
         spec_fd = os.memfd_create(f"trilane:spec:{spec.unit}", os.MFD_CLOEXEC)
         try:
             os.write(spec_fd, spec.model_dump_json().encode())
-            settings = spec.settings
-            request = {"unit": spec.unit, "cores": settings.cores, "threads": settings.threads, "fds": spec.fds}
-            socket.send_fds(self._socket, [json.dumps(request).encode()], [spec_fd, stderr_fd, *spec.fds])
-            answer, fds, _flags, _address = socket.recv_fds(self._socket, 32, 1)
+            self.renew()
+            for server in range(SERVERS):
+                if server:
+                    self._replace()
+                try:
+                    return self._ask(spec, [spec_fd, stderr_fd])
+                except _ServerError as error:
+                    why = str(error)
         except OSError as error:
-            raise TrilaneError(f"unit {spec.unit} could not be started: {self._reason(error)}") from None
+            why = error.strerror or str(error)
         finally:
             os.close(spec_fd)
-        if not answer:
-            raise TrilaneError(f"unit {spec.unit} could not be started: {self._reason(None)}")
-        if not fds:
-            raise TrilaneError(f"unit {spec.unit} could not be started: too many open files: ulimit -n 4096")
-        return StartedUnit(int(answer), fds[0])
+        raise TrilaneError(f"unit {spec.unit} could not be started: {why}")
+
+    def _ask(self, spec: UnitSpec, fds: Sequence[int]) -> StartedUnit:
+        """The unit's process, whose spec and stderr are `fds`; whatever is raised, none is left."""
+        self._has_units = True
+        settings = spec.settings
+        request = {"unit": spec.unit, "cores": settings.cores, "threads": settings.threads, "fds": spec.fds}
+        theirs, lifeline = os.pipe2(os.O_CLOEXEC)
+        with contextlib.ExitStack() as undo:
+            undo.callback(os.close, lifeline)
+            try:
+                socket.send_fds(self._socket, [json.dumps(request).encode()], [*fds, theirs, *spec.fds])
+            except (BrokenPipeError, ConnectionResetError):
+                raise _ServerError(self._why()) from None
+            finally:
+                os.close(theirs)
+            answer, received = self._received()
+            if not answer:
+                raise _ServerError(self._why())
+            if not received:
+                raise TrilaneError(f"unit {spec.unit} could not be started: too many open files: ulimit -n 4096")
+            undo.pop_all()
+        return StartedUnit(int(answer), received[0], lifeline)
+
+    def _received(self) -> tuple[bytes, list[int]]:
+        """The answer and its descriptors; nothing from a server that has ended, was stopped, or takes too long."""
+        end = time.monotonic() + ANSWER_S
+        while time.monotonic() < end:
+            with contextlib.suppress(TimeoutError, ConnectionResetError):
+                answer, fds, _flags, _address = socket.recv_fds(self._socket, 32, 1)
+                return answer, fds
+            if self.trouble():
+                break
+        return b"", []
 
     def call(self, function: str) -> ForkedCall:
-        """Call `module:name`, which takes nothing and returns what JSON takes, in a process of its own.
+        """Call `module:name`, which takes nothing and returns what JSON takes, in a process of its own."""
+        return ForkedCall(self, function, self.send_call(function))
 
-        Raises TrilaneError when the fork server has ended.
-        """
+    def send_call(self, function: str) -> int:
+        """Ask for the call; the end of the pipe to which it answers. One that no fork server hears answers nothing."""
         reads, writes = os.pipe2(os.O_CLOEXEC)
         try:
-            socket.send_fds(self._socket, [json.dumps({"call": function}).encode()], [writes])
-        except OSError as error:
-            os.close(reads)
-            raise TrilaneError(f"{function} could not be called: {self._reason(error)}") from None
+            with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+                socket.send_fds(self._socket, [json.dumps({"call": function}).encode()], [writes])
         finally:
             os.close(writes)
-        return ForkedCall(reads, partial(self.end, NOTICE_S))
+        return reads
 
     def close(self) -> None:
-        """End the fork server; units that still live end with it."""
+        """End the fork server. It waits for units that still live."""
+        self._end()
+        os.close(self._stderr)
+
+    def _end(self) -> None:
         self._socket.close()
-        if not self._has_units:
+        if not self._has_units or self.trouble():
             self._server.kill()  # it may still be importing, or a call go on
         try:
             self._server.wait(CLOSE_S)
         except subprocess.TimeoutExpired:
-            self._server.send_signal(signal.SIGKILL)
+            self._server.kill()
             self._server.wait()
-        os.close(self._stderr)
 
-    def end(self, wait_s: float = 0.0) -> str:
-        """Why the fork server has ended; "" when it still lives after the time."""
-        try:
-            code = self._server.wait(wait_s)
-        except subprocess.TimeoutExpired:
-            return ""
-        how = f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
-        return f"the fork server, which every unit comes from, {how}"
-
-    def _reason(self, error: OSError | None) -> str:
-        """The end of what the fork server wrote, else how it ended, else the error's own words."""
+    def _why(self) -> str:
+        """Why the server does not answer: how it was killed or stopped, else the end of what it wrote."""
+        trouble = self.trouble(NOTICE_S)
+        if trouble and self._server.returncode not in range(1, 256):
+            return trouble
         size = os.fstat(self._stderr).st_size
         tail = os.pread(self._stderr, TAIL_BYTES, max(0, size - TAIL_BYTES)).decode(errors="replace").strip()
         if tail:
             return tail.splitlines()[-1]
-        return self.end(NOTICE_S) or ("no answer" if error is None else error.strerror or str(error))
+        return trouble or f"the fork server gave no answer in {ANSWER_S:.0f} s"
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_exc: object) -> None:
         self.close()
+
+
+def is_stopped(pid: int) -> bool:
+    """Whether the process was stopped by a signal; one that is gone was not."""
+    try:
+        stat = (machine.here.proc / f"{pid}/stat").read_text(encoding="ascii", errors="replace")
+    except OSError:
+        return False
+    return stat.rpartition(")")[2].split()[0] == "T"

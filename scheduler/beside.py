@@ -309,7 +309,6 @@ def simulate_beside(members: Sequence[Member], *, keep: bool = False, **driver: 
 
 
 def _report(line: _Line) -> dict[str, Any]:
-    ledger, due_ns = line.core.ledger, line.member.settings.deadline_ns
-    requested = ledger.presented_count + sum(ledger.dropped.values()) + sum(ledger.lost.values())
-    report = ledger.report(clock="virtual", requested=requested)
-    return {**report, "response_ms": summary_ms(late_ns + due_ns for late_ns in ledger.lateness_ns)}
+    core, due_ns = line.core, line.member.settings.deadline_ns
+    report = core.report(clock="virtual", requested=core.source.left)
+    return {**report, "response_ms": summary_ms(late_ns + due_ns for late_ns in core.ledger.lateness_ns)}

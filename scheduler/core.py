@@ -28,6 +28,8 @@ is the same for the first stage: it begins so late that its pose is new when the
 
 from __future__ import annotations
 
+from typing import Any
+
 from trilane.scheduler import watchdog
 from trilane.scheduler.assignment import Assignment
 from trilane.scheduler.causes import Drop, DropCause, Loss, LossKind, Outcome, OutcomeKind
@@ -139,6 +141,11 @@ class Core:
                 self._finish(Outcome(OutcomeKind.STOPPED if self.stopping else OutcomeKind.DONE))
         next_ns = NEVER if self.finished else self._next_deadline()
         return tuple.__new__(Decision, (tuple(self.actions), next_ns))  # Decision(...) takes twice as long
+
+    def report(self, *, clock: str, requested: int | None = None) -> dict[str, Any]:
+        """What the ledger reports, see there. `requested`: frames that were asked for; None: those of the settings."""
+        asked = self.settings.frames if requested is None else requested
+        return self.ledger.report(clock=clock, requested=asked, not_begun=asked - self.source.left)
 
     def _release(self, now_ns: int) -> int:
         """Release what is due; since when the first of it was, now where there was nothing."""

@@ -28,6 +28,7 @@ class Source:
         self._start_ns = 0
         self._paced = bool(settings.period_ns or settings.arrivals_ns or settings.asked)
         self._held = False
+        self._forgotten = 0
         self.queue: deque[tuple[int, int]] = deque()
         self.due_ns = NEVER
         self.is_empty = self._paced or not self._end
@@ -45,13 +46,19 @@ class Source:
     def stop(self) -> None:
         """Nothing more is released, and what waits is forgotten."""
         self._end = self._next
+        self._forgotten += len(self.queue)
         self.queue.clear()
         self._set_due()
 
     @property
     def released(self) -> int:
-        """How many frames have left or wait."""
+        """How many frames have left, wait, or were forgotten."""
         return self._next
+
+    @property
+    def left(self) -> int:
+        """How many frames were taken or dropped here."""
+        return self._next - self._forgotten - len(self.queue)
 
     @property
     def exhausted(self) -> bool:

@@ -226,8 +226,8 @@ class Ledger:
         samples = [*[book.service for book in books], *[book.wait for book in books], self._latency]
         return self._frame_times.samples.is_exact and all([each.is_exact for each in samples])
 
-    def report(self, *, clock: str, requested: int) -> dict[str, Any]:
-        """The keys of report.json."""
+    def report(self, *, clock: str, requested: int, not_begun: int) -> dict[str, Any]:
+        """The keys of report.json. `not_begun`: of the requested frames, those that never left the source."""
         intervals, span_ns = max(self.presented_count - 1, 0), self._last_ns - self._first_ns
         return {
             "clock": clock,
@@ -237,6 +237,7 @@ class Ledger:
                 "lost": sum(self.lost.values()),
                 "lost_by_cause": self.lost_by_cause,
                 "dropped": self.dropped_by_cause,
+                "not_begun": not_begun,
                 **({"skipped": self.skipped} if self._graph.bypass else {}),
             },
             "duration_s": (self.end_ns - self.start_ns) / 1e9,

@@ -200,5 +200,5 @@ def simulate(
     """
     virtual = VirtualDriver(graph, settings, service, keep=keep, books=Books(target_period_ns), **driver)
     outcome = virtual.run()
-    report = virtual.core.ledger.report(clock="virtual", requested=settings.frames)
+    report = virtual.core.report(clock="virtual")
     return Simulation(report, virtual.recording, tuple(virtual.jobs), outcome)

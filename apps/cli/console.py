@@ -5,12 +5,13 @@ Rule: nothing but a command's result goes to stdout, so that `trilane ... --json
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any, cast
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -19,18 +20,47 @@ if TYPE_CHECKING:
 _WRITTEN_OUT = {code: repr(chr(code))[1:-1] for code in (*range(0x20), *range(0x7F, 0xA0))}
 
 
+class _Kept:
+    """The stream; what is written to a terminal that is gone is lost, and ends nothing."""
+
+    def __init__(self, stream: IO[str]) -> None:
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        with _hung_up():
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with _hung_up():
+            self._stream.flush()
+
+
+@contextmanager
+def _hung_up() -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        if error.errno != errno.EIO:
+            raise
+
+
 def stderr_console() -> Console:
     """Console for messages and progress. Rich obeys NO_COLOR and plain pipes by itself."""
     from rich.console import Console
 
-    return Console(stderr=True, highlight=False)
+    return Console(stderr=True, file=cast("IO[str]", _Kept(sys.stderr)), highlight=False)
 
 
 def stdout_console() -> Console:
     """Console for results that a person reads. A pipe gets 120 columns, so that tables are not cut."""
     from rich.console import Console
 
-    return Console(highlight=False, width=None if sys.stdout.isatty() else 120)
+    file = cast("IO[str]", _Kept(sys.stdout))
+    return Console(file=file, highlight=False, width=None if sys.stdout.isatty() else 120)
 
 
 def say(text: str) -> None:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from trilane.apps.report import Baseline, Check, FrameErrors, Made, PaceComparison, Report
     from trilane.pipeline.run_metrics import (
         Caps,
+        FrameCounts,
         MovedBytes,
         PathShare,
         StageTimes,
@@ -255,8 +256,13 @@ def _rate_rows(runs: Sequence[Report | Baseline]) -> Rows:
     units, stages = ([getattr(run.bound, kind, None) for run in runs] for kind in ("unit", "stage"))
     yield "bound", "unit, % of the path (95 % interval)", [_part_of_path(part) for part in units]
     yield "", "stage, % of the path (95 % interval)", [_part_of_path(part) for part in stages]
-    yield "frames", "lost + dropped", [f"{run.frames.lost} + {sum(run.frames.dropped.values())}" for run in runs]
+    yield "frames", "lost + dropped + not begun", [_left_out(run.frames) for run in runs]
     yield "", "deadline misses", [str(run.deadline_misses) for run in runs]
+
+
+def _left_out(frames: FrameCounts) -> str:
+    not_begun = DASH if frames.not_begun is None else frames.not_begun
+    return f"{frames.lost} + {sum(frames.dropped.values())} + {not_begun}"
 
 
 def _part_of_path(part: PathShare | None) -> str:

@@ -195,7 +195,7 @@ def _frames(figures: Figures) -> str:
     left_out = _listed((f"{drop.edge} {drop.cause}", drop.frames) for drop in frames.dropped)
     lines = [
         f"frames: {frames.presented} of {frames.requested} presented, {frames.skipped} of them skipped stages, "
-        f"{frames.in_flight} in flight",
+        f"{frames.in_flight} in flight, {frames.not_begun} not begun",
         f"lost: {lost}; dropped: {left_out}",
     ]
     if figures.temperature_c:

@@ -68,12 +68,16 @@ class DropCount:
 
 @dataclass(frozen=True)
 class FrameFigures:
-    """Frames of the run, counted. `lost`: by cause. `skipped`: of those presented, how many took the bypass."""
+    """Frames of the run, counted: what is requested is presented, lost, dropped, in flight, or not begun.
+
+    `lost`: by cause. `skipped`: of those presented, how many took the bypass.
+    """
 
     requested: int
     presented: int
     skipped: int
     in_flight: int
+    not_begun: int
     lost: Mapping[str, int]
     dropped: tuple[DropCount, ...]
 

@@ -123,6 +123,11 @@ class FrameFlow:
         """Frames that were taken and neither presented nor lost nor dropped."""
         return self.taken - self.presented - self._gone
 
+    @property
+    def not_begun(self) -> int:
+        """Frames of the run that were never taken nor dropped before they could be."""
+        return self._settings.frames - self.taken - self._dropped_at_source()
+
     def waiting_at_source(self, running_ns: int | None) -> int:
         """Released frames that no job has taken yet; 0 of a run without a rate.
 
@@ -139,7 +144,7 @@ class FrameFlow:
             released = 0 if running_ns is None else running_ns // settings.period_ns + 1
         else:
             return 0
-        return max(min(released, settings.frames) - self.taken - self._dropped_at_source(), 0)
+        return max(min(released - settings.frames, 0) + self.not_begun, 0)
 
     def _dropped_at_source(self) -> int:
         return sum(frames for key, frames in self._dropped.items() if key.startswith(f"{SOURCE}->"))

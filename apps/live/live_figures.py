@@ -244,8 +244,8 @@ class LiveFigures:
     def _frame_figures(self) -> FrameFigures:
         flow = self._flow
         dropped = tuple(_drop_count(key, count) for key, count in self._dropped.items())
-        requested = self._settings.frames
-        return FrameFigures(requested, flow.presented, flow.skipped, flow.in_flight, dict(self._lost), dropped)
+        counts = (self._settings.frames, flow.presented, flow.skipped, flow.in_flight, flow.not_begun)
+        return FrameFigures(*counts, dict(self._lost), dropped)
 
     def _unit_figures(self, unit: str, now_ns: int, is_up: bool) -> UnitFigures:
         held = next(iter(self._flow.held[unit]), None)

@@ -45,6 +45,8 @@ def cached_arrays(name: str, sources: Iterable[NDArray[Any] | str], make: Callab
     if folder is None:
         return make()
     entry = folder / f"{_digest(name, sources)}.npz"
+    if entry.exists() and not entry.is_file():  # a pipe, which would be waited for
+        return make()
     stored = _read(entry)
     if stored is not None:
         return stored

@@ -185,7 +185,7 @@ def fed(settings: Settings, steps: list[tuple[int, tuple[Event, ...]]], jobs: li
     core, recording = Core(graph, settings), Recording(graph, settings)
     for now_ns, events in steps:
         recording.add(now_ns, events, core.step(now_ns, events).actions, core)
-    report = core.ledger.report(clock="host", requested=settings.frames)
+    report = core.report(clock="host")
     assert compared(report["units"], second_accounts(recording, jobs))["largest_difference"] < 1e-12
     return report
 

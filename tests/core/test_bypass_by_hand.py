@@ -86,7 +86,8 @@ def test_the_report_is_the_one_worked_out() -> None:
     """Presented at 11, 18, 19, 21, 31; poses at 0, 3, 10, 17, 20."""
     report = five_frames().report
     assert report["frames"] == {
-        "requested": 5, "presented": 5, "lost": 0, "lost_by_cause": {}, "dropped": {}, "skipped": 2,
+        "requested": 5, "presented": 5, "lost": 0, "lost_by_cause": {}, "dropped": {}, "not_begun": 0,
+        "skipped": 2,
     }  # fmt: skip
     assert (report["duration_s"], report["frame_time_ms"]["mean"], report["frame_time_ms"]["max"]) == (0.031, 5, 10)
     assert (report["latency_ms"]["mean"], report["latency_ms"]["max"]) == (10, 15)  # 11 15 9 4 11

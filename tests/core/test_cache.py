@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -74,6 +75,16 @@ def test_a_damaged_entry_is_made_again_and_replaced(folder: Path, damage: str) -
     assert make.calls == 2
     asked(make)
     assert make.calls == 2, "the entry was left damaged"
+
+
+def test_a_pipe_in_the_place_of_an_entry_is_neither_read_nor_written(folder: Path) -> None:
+    make = Maker()
+    asked(make)
+    (entry,) = folder.rglob("*.npz")
+    entry.unlink()
+    os.mkfifo(entry)
+    asked(make)
+    assert make.calls == 2 and entry.is_fifo()
 
 
 def test_a_full_disk_keeps_nothing_and_loses_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

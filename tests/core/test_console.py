@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 import os
@@ -128,3 +129,31 @@ def test_a_spinner_is_for_terminals(is_terminal: bool, monkeypatch: pytest.Monke
         done.append(1)
     assert done == [1]
     assert ("working" in screen.getvalue()) == is_terminal
+
+
+def test_what_is_written_to_a_terminal_that_is_gone_is_lost_and_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Any other error is told."""
+    lines: list[str] = []
+
+    class Terminal(io.StringIO):
+        error = 0
+
+        def write(self, text: str) -> int:
+            if self.error:
+                raise OSError(self.error, "no")
+            lines.append(text)
+            return len(text)
+
+        def flush(self) -> None:
+            self.write("")
+
+    for name, console in (("stderr", stderr_console), ("stdout", stdout_console)):
+        terminal = Terminal()
+        monkeypatch.setattr(sys, name, terminal)
+        console().print("seen")
+        terminal.error = errno.EIO
+        console().print("lost")
+        terminal.error = errno.ENOSPC
+        with pytest.raises(OSError, match="no"):
+            console().print("told")
+    assert "".join(lines) == "seen\nseen\n"

@@ -91,6 +91,7 @@ def test_a_journal_by_hand() -> None:
     ]
     frames = figures.frames
     assert (frames.requested, frames.presented, frames.in_flight, frames.lost, frames.dropped) == (9, 1, 1, {}, ())
+    assert frames.not_begun == 7
     assert figures.latency_ms["p50"] == 40 - 2
     assert (figures.latency_ms["samples"], figures.frame_time_ms["samples"]) == (1, 0)
     assert (figures.fps, figures.run_fps) == (pytest.approx(1 / 0.07), 0)
@@ -260,7 +261,7 @@ def test_at_every_step_frames_are_where_the_scheduler_has_them(case: str) -> Non
         if core.outcome is None:
             assert_frames(figures.now(), core)
     figures.add(Ended(driver.core.now_ns + S, {}))  # what a run measures after its last frame is no time of its units
-    now, report = figures.now(), core.ledger.report(clock="virtual", requested=settings.frames)
+    now, report = figures.now(), core.report(clock="virtual")
     assert_shares(now, report)
     frames = report["frames"]
     assert (now.frames.presented, now.frames.lost) == (frames["presented"], frames["lost_by_cause"])
@@ -292,6 +293,8 @@ def test_a_longer_run_takes_no_more_memory(sooner: int, later: int, finds_bound:
 def assert_frames(now: Figures, core: Core) -> None:
     """Where frames are and what units do, beside the slots and queues of the scheduler."""
     assert now.frames.in_flight == len(core.frames)
+    counts = (now.frames.presented, now.frames.in_flight, now.frames.not_begun, core.ledger.left_out)
+    assert sum(counts) == now.frames.requested == core.settings.frames
     for stage in core.stages:
         waiting = len(core.source.queue) if stage.input is None else len(stage.input.ready)
         waiting += len(stage.bypassed.passing) if stage.bypassed is not None else 0

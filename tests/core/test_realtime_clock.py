@@ -58,6 +58,9 @@ class World:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, **more: Any) -> None:
         self.now_ns, self.waits_ms = START, []
         self.said: list[Any] = []
+        self.starters: list[str] = []
+        self.starter_fails = False
+        self.stopped: set[str] = set()
         self.watched: list[int] = []
         self.inbox: list[list[tuple[str, Any]]] = []
         self.places = {"draw": 0, "mix": 1, "show": 0}
@@ -94,6 +97,11 @@ class World:
 
     def kill(self, unit: str) -> None:
         self.said.append(("kill", unit))
+
+    def renew_starter(self) -> str:
+        if self.starter_fails:
+            raise OSError(12, "no memory")
+        return self.starters.pop() if self.starters else ""
 
     def connected(self, unit: str) -> None:
         self.said.append(("connected", unit))
@@ -327,6 +335,35 @@ def test_of_jobs_that_end_with_their_process_nothing_is_kept(monkeypatch: pytest
     assert [held[0].id for held in clock._open.values()] == [7]
     clock.wait(NEVER)
     assert clock._open == {}
+
+
+def test_a_fork_server_that_had_to_be_replaced_is_told_with_the_next_ping(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that cannot be replaced now is looked at again with the ping that follows."""
+    world = World(monkeypatch)
+    clock = world.begun()
+    world.starters, world.starter_fails = ["it was stopped"], True
+    for fails in (True, False, False):
+        world.starter_fails = fails
+        world.now_ns += 500 * MS
+        clock.wait(world.now_ns)
+        assert world.log.messages == ([] if fails else ["it was stopped and is replaced"])
+
+
+def test_a_unit_that_was_stopped_is_told_with_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seen at the second ping and no more at the fourth, half a second apart each."""
+    world = World(monkeypatch)
+    clock = world.begun()
+    for stopped, said in (
+        ((), []),
+        (("gpu",), []),
+        (("gpu",), []),
+        ((), ["for about 1.0 s"]),
+        ((), ["for about 1.0 s"]),
+    ):
+        world.stopped = set(stopped)
+        world.now_ns += 500 * MS
+        clock.wait(world.now_ns)
+        assert world.log.messages == [f"unit gpu was stopped by a signal {text}" for text in said]
 
 
 def test_progress_is_shown_ten_times_a_second_and_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import json
 import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -32,6 +34,35 @@ def test_a_folder_has_its_name_once_it_is_complete(tmp_path: Path) -> None:
         assert folder.complete() == target
     assert [path.name for path in target.iterdir()] == ["report.json"]
     assert [path.name for path in target.parent.iterdir()] == ["run"]
+
+
+OTHER_RUN = """
+import sys
+from pathlib import Path
+from trilane.apps.run_folder import RunFolder
+with RunFolder(Path(sys.argv[1])):
+    print("begun", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_a_second_run_with_one_name_is_refused_before_it_begins(tmp_path: Path) -> None:
+    """But not one of another name beside it, and none when the first has been killed, whose folder stays."""
+    command = [sys.executable, "-c", OTHER_RUN, str(tmp_path / "run [1]")]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None and other.stdout.readline() == b"begun\n"
+        with pytest.raises(BadInputError) as refused, RunFolder(tmp_path / "run [1]"):
+            pass
+        found = f"found a run that goes on, in run [1].{other.pid}.partial, expected a name that is free"
+        assert str(refused.value) == f"{tmp_path / 'run [1]'}: {found}; choose another --out"
+        assert [path.name for path in tmp_path.iterdir()] == [f"run [1].{other.pid}.partial"]
+        with RunFolder(tmp_path / "run") as folder:
+            folder.complete()
+        other.kill()
+    with RunFolder(tmp_path / "run [1]") as folder:
+        folder.complete()
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == ["run", "run [1]", f"run [1].{other.pid}.partial"]
 
 
 def test_a_folder_that_was_not_completed_leaves_nothing(tmp_path: Path) -> None:
@@ -175,6 +206,18 @@ def test_the_file_has_the_keys_that_were_set_in_the_order_of_the_model(tmp_path:
 def test_an_unknown_key_is_never_written(change: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="Extra inputs are not permitted"):
         Report.model_validate(make_report(**change))
+
+
+def test_frames_that_do_not_add_up_are_refused_and_those_of_an_older_report_are_read(tmp_path: Path) -> None:
+    frames = make_report()["frames"]
+    said = "5 frames were requested, but 3 presented, 0 lost, 1 dropped and 0 not begun"
+    with pytest.raises(ValueError, match=said):
+        Report.model_validate(make_report(frames={**frames, "not_begun": 0}))
+    del frames["not_begun"]
+    (tmp_path / "report.json").write_text(json.dumps(make_report(frames=frames)))
+    report = read_report(tmp_path)
+    assert report.frames.not_begun is None
+    assert report.as_json()["frames"] == frames
 
 
 def test_a_report_of_a_newer_schema_is_refused_as_such(tmp_path: Path) -> None:

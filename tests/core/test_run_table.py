@@ -175,7 +175,8 @@ def least() -> dict[str, Any]:
     """One frame without a baseline, of which nothing more is known than of any."""
     unmeasured = dict.fromkeys(("efficiency", "core_efficiency", "machine_efficiency", "bottleneck", "bound"))
     report = make_report(baseline=None, accuracy={}, core_shares=[], deadline_misses=4, **unmeasured)
-    report["frames"] = {"requested": 5, "presented": 1, "lost": 2, "lost_by_cause": {"died:gpu": 2}, "dropped": {}}
+    counts = {"requested": 7, "presented": 1, "lost": 2, "lost_by_cause": {"died:gpu": 2}, "dropped": {}}
+    report["frames"] = {**counts, "not_begun": 4}
     idle = {**SHARE["idle"], "preempted": None}
     report["units"] = {"dsp": {**SHARE, "idle": idle}, "cpu": {**SHARE, "cores": [0]}}
     made = {**MADE, "trilane": None, "revision": "0123456789abcdef", "modified": False}

@@ -125,16 +125,20 @@ def test_requests_come_in_order_wake_the_run_and_end_with_it() -> None:
 
 
 def test_interrupts_are_counted_wake_the_poller_and_are_given_back() -> None:
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGPIPE)
+    """SIGQUIT is ignored before, and stays so."""
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGPIPE)
     mine = signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    others = (signal.signal(signal.SIGHUP, signal.SIG_DFL), signal.signal(signal.SIGQUIT, signal.SIG_IGN))
     before = [signal.getsignal(number) for number in numbers]
     try:
         with Interrupts() as interrupts:
             assert signal.getsignal(signal.SIGPIPE) == signal.SIG_IGN
             signal.raise_signal(signal.SIGINT)
             signal.raise_signal(signal.SIGTERM)
-            assert interrupts.count == 2
-            assert os.read(interrupts.fd, 9) == bytes([signal.SIGINT, signal.SIGTERM])
+            signal.raise_signal(signal.SIGHUP)
+            signal.raise_signal(signal.SIGQUIT)
+            assert interrupts.count == 3
+            assert os.read(interrupts.fd, 9) == bytes([signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
             with pytest.raises(BlockingIOError):
                 os.read(interrupts.fd, 9)
             wakes = signal.set_wakeup_fd(-1)
@@ -146,6 +150,8 @@ def test_interrupts_are_counted_wake_the_poller_and_are_given_back() -> None:
                 os.fstat(fd)
     finally:
         signal.signal(signal.SIGPIPE, mine)
+        signal.signal(signal.SIGHUP, others[0])
+        signal.signal(signal.SIGQUIT, others[1])
 
 
 def test_interrupts_do_nothing_outside_the_main_thread() -> None:

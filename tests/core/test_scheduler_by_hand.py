@@ -87,7 +87,9 @@ def test_the_report_of_five_frames_is_the_one_worked_out() -> None:
     assert (report["latency_ms"]["mean"], report["latency_ms"]["max"], report["latency_ms"]["p50"]) == (10.4, 12, 10)
     assert report["deadline_misses"] == 2
     assert report["xrbench"] == {"real_time": pytest.approx(0.5), "qoe": 1, "energy": None}
-    assert report["frames"] == {"requested": 5, "presented": 5, "lost": 0, "lost_by_cause": {}, "dropped": {}}
+    assert report["frames"] == {
+        "requested": 5, "presented": 5, "lost": 0, "lost_by_cause": {}, "dropped": {}, "not_begun": 0,
+    }  # fmt: skip
     stages = report["stages"]
     assert [stages[name]["unit"] for name in ("draw", "show")] == ["gpu", "cpu"]
     assert [stages[name]["service_ms"]["mean"] for name in ("draw", "show")] == [3, 5]
@@ -105,7 +107,7 @@ def test_a_frame_time_above_the_target_is_a_miss_and_one_that_meets_it_is_none(t
 
 
 def test_a_run_without_frames_divides_by_nothing() -> None:
-    report = Ledger(TWO).report(clock="virtual", requested=0)
+    report = Ledger(TWO).report(clock="virtual", requested=0, not_begun=0)
     assert (report["fps"], report["xrbench"]["qoe"]) == (0, 0)
     assert report["xrbench"]["real_time"] is None
     assert shares_ms(report["units"]["gpu"], 1) == dict.fromkeys(GPU, 0)
@@ -175,7 +177,7 @@ def test_hung_slow_and_failed_units_are_killed_started_and_given_jobs_as_worked_
     core = Core(chain([A, B], "double", "b"), Settings(10, hang_ns=100, start_ns=50, max_failures=2))
     for now_ns, events, actions, next_ns in LIFE:
         assert core.step(now_ns, events) == (actions, next_ns), now_ns
-    report = core.ledger.report(clock="virtual", requested=4)
+    report = core.report(clock="virtual")
     assert core.ledger.presented_frames == [0, 2]
     assert core.ledger.lost_by_cause == {"failed:a": 1, "hung:cpu": 1}
     assert [core.ledger.latency_ns, core.ledger.lateness_ns] == [[119, RESTART + 14 - 131], []]

@@ -9,9 +9,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from trilane.pipeline.run_metrics import FrameCounts
 from trilane.scheduler.causes import Outcome, OutcomeKind
 from trilane.scheduler.core import Core
-from trilane.scheduler.events import Dispatch, Graph, Job, JobDone, Settings, StageSpec
+from trilane.scheduler.events import (
+    Abort,
+    Dispatch,
+    Event,
+    FrameRequest,
+    Graph,
+    Hold,
+    Job,
+    JobDone,
+    Settings,
+    StageSpec,
+    Stop,
+)
 from trilane.scheduler.virtual import VirtualDriver
 from trilane.transport.slots import FREE, READING, READY, WRITING
 
@@ -131,11 +144,11 @@ def test_no_slot_is_owned_twice_no_frame_is_lost_or_out_of_order(
         keep=True,
     )
     assert driver.run() == Outcome(OutcomeKind.DONE)
-    frames = driver.core.ledger.report(clock="virtual", requested=60)["frames"]
+    frames = driver.core.report(clock="virtual")["frames"]
     assert frames["presented"] + frames["lost"] + sum(frames["dropped"].values()) == 60
     presented = driver.core.ledger.presented_frames
     assert presented == sorted(set(presented))
-    for row in driver.core.ledger.report(clock="virtual", requested=60)["units"].values():
+    for row in driver.core.report(clock="virtual")["units"].values():
         parts = [row["busy"], *row["idle"].values()]
         assert sum(parts) == pytest.approx(1)
         assert min(parts) >= 0
@@ -145,6 +158,64 @@ def test_no_slot_is_owned_twice_no_frame_is_lost_or_out_of_order(
     for now_ns, events, actions in driver.recording.steps:
         assert core.step(now_ns, events).actions == actions
         check(core)
+
+
+@settings(max_examples=150)
+@given(
+    graph=graphs(),
+    policy=st.sampled_from(POLICIES),
+    seed=st.integers(0, 2**32),
+    is_paced=st.booleans(),
+    limits=st.tuples(st.integers(0, 5), st.integers(0, 3), st.integers(0, 3000)),
+    faults=st.lists(st.tuples(st.integers(0, 20_000), st.sampled_from(UNITS)), max_size=4),
+    ends=st.lists(st.tuples(st.integers(0, 30_000), st.sampled_from([Stop(), Abort()])), max_size=2),
+    held=st.lists(st.tuples(st.integers(0, 20_000), st.sampled_from([-1, 0, 2])), max_size=3),
+    asked=st.lists(st.tuples(st.integers(0, 20_000), st.integers(1, 25)), max_size=5),
+)
+def test_however_a_run_ends_its_frames_add_up(
+    graph: Graph,
+    policy: str,
+    seed: int,
+    is_paced: bool,
+    limits: tuple[int, int, int],
+    faults: list[tuple[int, str]],
+    ends: list[tuple[int, Event]],
+    held: list[tuple[int, int]],
+    asked: list[tuple[int, int]],
+) -> None:
+    """Interrupted, aborted, given up, held, or asked for frames: `not_begun` is what no job began and none dropped."""
+    in_flight, in_queue, timeout_ns = limits
+    is_asked = bool(asked) and not is_paced
+    run = Settings(
+        60,
+        policy,
+        period_ns=0 if is_asked else 300 if is_paced or policy in ("latest", "deadline") else 0,
+        deadline_ns=8000,
+        in_flight=in_flight,
+        in_queue=in_queue,
+        queue_timeout_ns=timeout_ns,
+        asked=is_asked,
+        max_failures=1,
+    )
+    events = [*ends, *((at, Hold(frames)) for at, frames in held), (40_000, Hold(-1)), (40_001, Abort())]
+    events += [(at, FrameRequest(frames)) for at, frames in asked] if is_asked else []
+    driver = VirtualDriver(
+        graph,
+        run,
+        service_of(seed),
+        restart_ns=5000,
+        faults=[fault for fault in faults if fault[1] in graph.units],
+        inputs=events,
+        keep=True,
+    )
+    driver.run()
+    for requested in (60, driver.core.source.released):
+        frames = FrameCounts.model_validate(driver.core.report(clock="virtual", requested=requested)["frames"])
+        at_source = sum(count for cause, count in frames.dropped.items() if cause.startswith("source->"))
+        assert driver.recording is not None
+        actions = [action for step in driver.recording.steps for action in step[2]]
+        begun = {action.job.frame for action in actions if isinstance(action, Dispatch)}
+        assert frames.not_begun == requested - len(begun) - at_source >= 0
 
 
 def check_bypass(graph: Graph, steps: Any, faults: list[tuple[int, str]]) -> None:

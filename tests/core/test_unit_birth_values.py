@@ -54,7 +54,7 @@ def test_a_process_dies_with_its_parent_or_at_once_when_that_is_gone(monkeypatch
 
 
 UNIT_LIFE = """
-import ctypes, json, os, signal, sys
+import ctypes, fcntl, json, os, signal, sys
 from types import SimpleNamespace
 from trilane import machine
 from trilane.pipeline import fork_server
@@ -63,10 +63,12 @@ def serve(spec, number_of):
     death = ctypes.c_int()
     ctypes.CDLL(None).prctl(2, ctypes.byref(death), 0, 0, 0)
     print(json.dumps({
-        "death": death.value, "name": open("/proc/self/comm").read().strip(), "own_group": os.getpgid(0) == os.getpid(),
+        "death": death.value, "lifeline": fcntl.fcntl(lifeline, 11),  # F_GETSIG
+        "name": open("/proc/self/comm").read().strip(), "own_group": os.getpgid(0) == os.getpid(),
         "cores": list(machine.here.cores()), "threads": [os.environ[name] for name in fork_server.THREAD_LIMITS],
         "spec": spec, "fds": sorted(number_of), "sigchld": signal.getsignal(signal.SIGCHLD) == signal.SIG_DFL,
         "blocked": sorted(signal.pthread_sigmask(signal.SIG_BLOCK, [])),
+        "heard": [signal.getsignal(number) == signal.SIG_DFL for number in (1, 3, 15)],
         "shut": not os.path.exists(f"/proc/self/fd/{spec_fd}"),
     }), flush=True)
     print("last words", file=sys.stderr)
@@ -83,9 +85,12 @@ for spec in ("whole", "broken"):
     signal.signal(signal.SIGCHLD, lambda *_: None)
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGCHLD})
     request = {"unit": "left-handed-unit", "cores": [min(machine.here.cores())], "threads": 3, "fds": [41]}
-    server = os.getpid()
+    lifeline, held = os.pipe()
+    for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
+        signal.signal(number, signal.SIG_IGN)
     if (pid := os.fork()) == 0:
-        os._exit(fork_server._run_unit(request, [spec_fd, theirs, os.dup(1)], server))
+        os.close(held)
+        os._exit(fork_server._run_unit(request, [spec_fd, theirs, lifeline, os.dup(1)]))
     os.close(theirs)
     code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
     print(json.dumps([code, os.read(said, 9999).decode().splitlines()]), flush=True)
@@ -93,11 +98,13 @@ for spec in ("whole", "broken"):
 
 
 def test_a_unit_is_forked_into_a_life_of_its_own() -> None:
-    """It dies with the server, has its name, group, cores and thread limits, and its error goes to its own stderr."""
+    """It outlives the server, has its name, group, cores and thread limits, and its error goes to its own stderr."""
     done = subprocess.run([sys.executable, "-c", UNIT_LIFE], capture_output=True, text=True, timeout=60, check=True)
     life, (code, said), other, (broken_code, broken_said) = map(json.loads, done.stdout.splitlines())
     assert life == {
-        "death": signal.SIGKILL,
+        "death": 0,
+        "lifeline": 9,
+        "heard": [True] * 3,
         "name": "trilane-left-ha",
         "own_group": True,
         "cores": [min(machine.here.cores())],
@@ -111,6 +118,40 @@ def test_a_unit_is_forked_into_a_life_of_its_own() -> None:
     assert (code, said, done.stderr) == (7, ["last words"], "")
     assert (other["spec"], broken_code) == ("broken", 1)
     assert (broken_said[0], broken_said[-1]) == ("last words", "ValueError: broken spec")
+
+
+LIFELINE = """
+import os, sys
+from trilane.pipeline import fork_server
+
+lifeline, held = os.pipe()
+if sys.argv[1] == "closed":
+    os.close(held)
+if (pid := os.fork()) == 0:
+    if sys.argv[1] != "closed":
+        os.close(held)
+    fork_server._die_with(lifeline)
+    os.write(1, b"armed ")
+    while True:
+        pass
+if sys.argv[1] == "later":
+    input()
+    os.close(held)
+print(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
+"""
+
+
+def test_the_kernel_kills_a_busy_unit_when_its_lifeline_is_closed() -> None:
+    """And one that comes too late ends by itself; when the holder dies, its unit dies too: its output ends."""
+    closed = subprocess.run([sys.executable, "-c", LIFELINE, "closed"], capture_output=True, timeout=60, check=True)
+    assert closed.stdout.split() == [b"1"]
+    pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    for how, left in (("later", [b"-9"]), ("killed", [])):
+        with subprocess.Popen([sys.executable, "-c", LIFELINE, how], **pipes) as parent:
+            assert parent.stdout.read(6) == b"armed "  # type: ignore[union-attr]
+            if how == "killed":
+                parent.kill()
+            assert parent.communicate(b"\n" if how == "later" else None, 60)[0].split() == left
 
 
 def test_the_fork_servers_life(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -127,7 +168,7 @@ def test_the_fork_servers_life(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
 
     monkeypatch.setattr(fork_server, "die_with_parent", note("dies with"))
     monkeypatch.setattr(fork_server, "importlib", SimpleNamespace(import_module=imported))
-    monkeypatch.setattr(fork_server, "signal", SimpleNamespace(signal=note("signal"), SIGINT=2, SIG_IGN="ignored"))
+    monkeypatch.setattr(fork_server, "signal", SimpleNamespace(signal=note("signal"), SIG_IGN="ignored"))
     monkeypatch.setattr(fork_server, "gc", SimpleNamespace(collect=note("collect"), freeze=note("freeze")))
     monkeypatch.setattr(fork_server, "socket", SimpleNamespace(socket=lambda *, fileno: f"socket {fileno}"))
     monkeypatch.setattr(fork_server, "serve", note("serve"))
@@ -137,7 +178,7 @@ def test_the_fork_servers_life(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     fork_server.main()
     assert lived == [
         ("dies with", 99),
-        ("signal", 2, "ignored"),
+        *(("signal", number, "ignored") for number in (2, 15, 1, 3)),
         *("trilane.pipeline.unit_loop", "json", "absent", "ast"),
         ("collect",),
         ("freeze",),
@@ -147,7 +188,7 @@ def test_the_fork_servers_life(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     lived.clear()
     monkeypatch.setattr("sys.argv", words[:5])
     fork_server.main()
-    assert lived[2:4] == ["trilane.pipeline.unit_loop", ("collect",)]
+    assert lived[5:7] == ["trilane.pipeline.unit_loop", ("collect",)]
     for missing, said in ((words[:3], "--parent"), ([words[0], *words[3:]], "--socket"), ([*words, "-h"], "")):
         monkeypatch.setattr("sys.argv", missing)
         with pytest.raises(SystemExit) as left:
@@ -232,7 +273,8 @@ def unit(seconds):
     spec = os.memfd_create("spec")
     os.write(spec, json.dumps(seconds).encode())
     request = {"unit": "u", "cores": [min(machine.here.cores())], "threads": 1, "fds": []}
-    socket.send_fds(ours, [json.dumps(request).encode()], [spec, os.dup(2)])
+    lifeline, _held = os.pipe()
+    socket.send_fds(ours, [json.dumps(request).encode()], [spec, os.dup(2), lifeline])
     answer, fds, *_ = socket.recv_fds(ours, 99, 9)
     return int(answer), fds
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+import select
 import signal
 import socket
 import subprocess
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from trilane.pipeline.regions import EdgeRegion
 from trilane.pipeline.run_metrics import Caps, Temperature, UnitShares, metrics_of
 from trilane.pipeline.unit_processes import UnitMessage, UnitProcesses
 from trilane.pipeline.unit_spec import UnitSpec
-from trilane.pipeline.unit_starter import ForkedCall, StartedUnit, UnitStarter
+from trilane.pipeline.unit_starter import StartedUnit, UnitStarter
 from trilane.scheduler.events import Settings
 from trilane.scheduler.virtual import simulate
 from trilane.transport.heartbeats import HeartbeatSocket
@@ -64,9 +65,9 @@ class FakeStarter:
         self.pipes[spec.unit] = JobPipe(JobPipeEnd(*(os.dup(fd) for fd in spec.job_pipe)))
         self.stderr[spec.unit] = os.dup(stderr_fd)
         sleeper = self.sleepers[spec.unit] = subprocess.Popen(["sleep", "60"], process_group=0)
-        return StartedUnit(sleeper.pid, os.pidfd_open(sleeper.pid))
+        return StartedUnit(sleeper.pid, os.pidfd_open(sleeper.pid), os.open(os.devnull, os.O_RDONLY))
 
-    def end(self) -> str:
+    def renew(self) -> str:
         return "the server ended"
 
     def leave(self, unit: str) -> None:
@@ -168,7 +169,7 @@ def test_what_a_unit_said_comes_before_its_end_and_its_last_line_is_kept(started
     assert heard(processes, 3) == [UnitMessage("right", m) for m in (done(0), done(1), None)]
     assert processes.stderr_tails["right"] == "x" * (8192 - 12) + "\nlast words"
     assert processes.why_ended("right") == "; it wrote last: last words"
-    assert processes.why_ended("left") == "; the server ended"
+    assert (processes.why_ended("left"), processes.renew_starter()) == ("", "the server ended")
     assert list(processes.pids) == ["left"]
 
 
@@ -228,31 +229,46 @@ def test_units_that_leave_by_themselves_are_waited_for_and_others_not_for_ever(s
 # the parent's end of the fork server, without one
 
 
-def starter_with(server: Any, stderr: bytes = b"") -> tuple[UnitStarter, socket.socket]:
-    starter = object.__new__(UnitStarter)
-    starter._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    starter._server, starter._has_units = server, False
-    starter._stderr = os.memfd_create("stderr")
-    os.write(starter._stderr, stderr)
-    return starter, theirs
+@pytest.fixture
+def starter_with(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., tuple[UnitStarter, list[socket.socket]]]]:
+    """A starter whose fork servers are those given, the last again and again; and their ends of the sockets."""
+    ends: list[socket.socket] = []
+
+    def make(*servers: Any, stderr: bytes = b"", are_open: bool = True) -> tuple[UnitStarter, list[socket.socket]]:
+        def spawn(_starter: UnitStarter, theirs: socket.socket) -> Any:
+            ends.append(theirs.dup())
+            if not are_open:
+                ends[-1].shutdown(socket.SHUT_RDWR)
+            return servers[min(len(ends), len(servers)) - 1]
+
+        monkeypatch.setattr(UnitStarter, "_spawn", spawn)
+        starter = UnitStarter()
+        os.write(starter._stderr, stderr)
+        return starter, ends
+
+    yield make
+    for end in ends:
+        end.close()
 
 
 class FakeServer:
     def __init__(self, code: int | None) -> None:
-        self.code, self.calls = code, []
+        self.code, self.calls, self.pid, self.deaf = code, [], os.getpid(), 0
+
+    @property
+    def returncode(self) -> int | None:
+        return self.code
 
     def wait(self, timeout: float | None = None) -> int:
         self.calls.append(("wait", timeout))
-        if self.code is None:
-            raise subprocess.TimeoutExpired("server", timeout or 0)
-        return self.code
+        if self.code is None and timeout is not None:
+            raise subprocess.TimeoutExpired("server", timeout)
+        return self.code or 0
 
     def kill(self) -> None:
         self.calls.append("kill")
-
-    def send_signal(self, number: int) -> None:
-        self.calls.append(number)
-        self.code = -number
+        if self.calls.count("kill") == self.deaf + 1:
+            self.code = -9
 
 
 def spec() -> UnitSpec:
@@ -262,13 +278,21 @@ def spec() -> UnitSpec:
     )  # fmt: skip
 
 
+Starter = Callable[..., tuple[UnitStarter, list[socket.socket]]]
+
+
 @pytest.mark.parametrize(
     ("answer", "passes_fd", "said"),
     [(b"123", True, ""), (b"123", False, "^unit left could not be started: too many open files: ulimit -n 4096$")],
 )
-def test_a_unit_is_asked_for_with_its_spec_and_files(answer: bytes, passes_fd: bool, said: str) -> None:
-    starter, theirs = starter_with(FakeServer(None))
+def test_a_unit_is_asked_for_with_its_spec_and_files(
+    starter_with: Starter, answer: bytes, passes_fd: bool, said: str
+) -> None:
+    """The third of its files is the lifeline, whose other end is the caller's; without an answer it is nobody's."""
+    server = FakeServer(None)
+    starter, (theirs,) = starter_with(server)
     socket.send_fds(theirs, [answer], [0] if passes_fd else [])
+    unit = None
     if said:
         with pytest.raises(TrilaneError, match=said):
             starter.start(spec(), 2)
@@ -278,49 +302,79 @@ def test_a_unit_is_asked_for_with_its_spec_and_files(answer: bytes, passes_fd: b
         assert unit.pid == 123
     packet, fds, *_ = socket.recv_fds(theirs, 9999, 10)
     assert json.loads(packet) == {"unit": "left", "cores": [1, 0], "threads": 3, "fds": [0, 1, 2]}
-    assert len(fds) == 5
+    assert len(fds) == 6
     assert UnitSpec.model_validate_json(os.pread(fds[0], 9999, 0)) == spec()
+    poller = select.poll()
+    poller.register(fds[2], select.POLLIN)
+    if unit is not None:
+        assert not poller.poll(0)
+        os.close(unit.lifeline)
+    assert poller.poll(0) == [(fds[2], select.POLLHUP)]
     for fd in fds:
         os.close(fd)
+    server.calls.clear()
     starter.close()
-    assert starter._server.calls[0] == ("wait", 5.0)  # type: ignore[attr-defined]
-    theirs.close()
+    assert server.calls[:2] == [("wait", 0.0), ("wait", 5.0)]
+
+
+SERVER = "the fork server, which every unit comes from,"
 
 
 @pytest.mark.parametrize(
     ("code", "stderr", "said"),
     [
-        (None, b"one\ntwo\n", "two"),
         (None, b"one\ntwo\nthree\n", "three"),
-        (None, b"x" * 9000 + b"\nno file \xff\n", "no file \ufffd"),
-        (-9, b"", "the fork server, which every unit comes from, was killed by signal 9"),
-        (3, b"", "the fork server, which every unit comes from, ended with exit code 3"),
-        (0, b"", "the fork server, which every unit comes from, ended with exit code 0"),
-        (None, b"", "no answer"),
+        (3, b"x" * 9000 + b"\nno file \xff\n", "no file \ufffd"),
+        (-9, b"a warning", f"{SERVER} was killed by signal 9"),
+        (3, b"", f"{SERVER} ended with exit code 3"),
+        (None, b"", "the fork server gave no answer in 60 s"),
     ],
 )
-def test_why_a_unit_could_not_be_started_is_said(code: int | None, stderr: bytes, said: str) -> None:
-    starter, theirs = starter_with(FakeServer(code), stderr)
-    theirs.shutdown(socket.SHUT_WR)
+def test_why_a_unit_could_not_be_started_is_said(
+    starter_with: Starter, code: int | None, stderr: bytes, said: str
+) -> None:
+    """After three fork servers, or a fourth in the place of one that is known to have ended."""
+    server = FakeServer(code)
+    server.deaf = 9
+    starter, ends = starter_with(server, stderr=stderr, are_open=False)
     with pytest.raises(TrilaneError, match=f"^unit left could not be started: {said}$"):
         starter.start(spec(), 2)
-    assert starter._reason(OSError(5, "Input/output error")) == ("Input/output error" if said == "no answer" else said)
-    assert starter.end() == ("" if code is None else said)
-    assert starter._server.calls[-1] == ("wait", 0.0)  # type: ignore[attr-defined]
-    theirs.close()
+    assert len(ends) == (3 if code is None else 4)
+    server.code = 0
     starter.close()
 
 
-def test_a_server_that_does_not_leave_is_killed() -> None:
-    starter, theirs = starter_with(FakeServer(None))
+def test_a_fork_server_that_has_ended_is_replaced_once(starter_with: Starter) -> None:
+    ended, well = FakeServer(-15), FakeServer(None)
+    starter, ends = starter_with(ended, well)
+    assert [starter.renew(), starter.renew(), len(ends)] == [f"{SERVER} was killed by signal 15", "", 2]
+    socket.send_fds(ends[1], [b"77"], [0])
+    unit = starter.start(spec(), 2)
+    assert (unit.pid, len(ends)) == (77, 2)
+    os.close(unit.pidfd)
+    os.close(unit.lifeline)
     starter.close()
-    server: Any = starter._server
-    assert server.calls == ["kill", ("wait", 5.0), signal.SIGKILL, ("wait", None)]
-    theirs.close()
 
 
-def test_a_call_names_its_function_and_hands_back_what_was_written() -> None:
-    starter, theirs = starter_with(FakeServer(None))
+def test_a_process_that_is_stopped_is_told_from_others(started: Started) -> None:
+    processes, starter = started
+    assert processes.stopped == set()
+    starter.sleepers["left"].send_signal(signal.SIGSTOP)
+    os.waitid(os.P_PID, starter.sleepers["left"].pid, os.WSTOPPED | os.WNOWAIT)
+    assert processes.stopped == {"left"}
+    assert not unit_starter.is_stopped(1 << 22)  # above every process number
+
+
+def test_a_server_that_does_not_leave_is_killed(starter_with: Starter) -> None:
+    server = FakeServer(None)
+    server.deaf = 1
+    starter, _ = starter_with(server)
+    starter.close()
+    assert server.calls == ["kill", ("wait", 5.0), "kill", ("wait", None)]
+
+
+def test_a_call_names_its_function_and_hands_back_what_was_written(starter_with: Starter) -> None:
+    starter, (theirs,) = starter_with(FakeServer(None))
     call = starter.call("os:getcwd")
     packet, fds, *_ = socket.recv_fds(theirs, 999, 1)
     assert json.loads(packet) == {"call": "os:getcwd"}
@@ -329,28 +383,26 @@ def test_a_call_names_its_function_and_hands_back_what_was_written() -> None:
     os.close(fds[0])
     assert call.result() == {"a": [1, 2]}
     call.close()
-    theirs.close()
-    with pytest.raises(TrilaneError, match=r"^os:getcwd could not be called: Broken pipe$"):
-        starter.call("os:getcwd")
     starter.close()
 
 
-def test_a_call_without_an_answer_is_none_or_the_servers_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    for end, is_closed in (("", True), ("gone", True), ("", False)):
-        monkeypatch.setattr(unit_starter, "ANSWER_S", 60.0 if is_closed else 0.01)
-        reads, writes = os.pipe()
-        if is_closed:
-            os.close(writes)
-        call = ForkedCall(reads, lambda end=end: end)
-        if end:
-            with pytest.raises(TrilaneError, match=r"^gone$"):
-                call.result()
-        else:
-            assert call.result() is None
-        if not is_closed:
-            os.close(writes)
-        with pytest.raises(OSError, match="Bad file"):
-            os.fstat(reads)
+@pytest.mark.parametrize("answers", [True, False])
+def test_a_call_is_made_once_more_where_the_fork_server_has_ended(starter_with: Starter, answers: bool) -> None:
+    """One that no server hears fails at once, and so does the second; with a server that lives there is one call."""
+    starter, ends = starter_with(FakeServer(-9 if answers else None), FakeServer(None), are_open=False)
+    assert starter.call("os:getcwd").result() is None
+    assert len(ends) == (2 if answers else 1)
+    starter.close()
+
+
+def test_a_call_that_is_not_answered_in_time_is_none(starter_with: Starter, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(unit_starter, "ANSWER_S", 0.01)
+    starter, _ = starter_with(FakeServer(None))
+    call = starter.call("os:getcwd")
+    assert call.result() is None
+    with pytest.raises(OSError, match="Bad file"):
+        os.fstat(call._reads)
+    starter.close()
     assert (unit_starter.NOTICE_S, unit_starter.CLOSE_S) == (0.2, 5)
 
 
@@ -370,7 +422,7 @@ def test_the_fork_server_is_started_alone_with_one_thread_a_library(monkeypatch:
         assert [seen["env"][name] for name in limits] == ["1"] * 4
         assert seen["env"]["PATH"] == os.environ["PATH"]
         assert (seen["stdin"], seen["stdout"], seen["process_group"]) == (-3, -3, 0)
-        assert (seen["stderr"], starter._socket.gettimeout()) == (starter._stderr, 60)
+        assert (seen["stderr"], starter._socket.gettimeout()) == (starter._stderr, 0.1)
         with pytest.raises(OSError, match="Bad file"):
             os.fstat(passed)
     server: Any = starter._server

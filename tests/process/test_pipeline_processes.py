@@ -220,23 +220,48 @@ def fork_server() -> psutil.Process:
     return max(servers, key=psutil.Process.create_time)
 
 
-def test_a_killed_fork_server_ends_the_run_with_what_was_done() -> None:
-    """Every unit ends with it, and none can be started again."""
-    kill = When(10, lambda: fork_server().kill())
-    result = run_pipeline(doubles(infer=10), 60, on_progress=kill)
-    assert result.failure is not None
-    assert "the fork server, which every unit comes from, was killed by signal 9" in result.failure.message
-    assert 10 <= result.presented < 60
-    assert not result.interrupted
-    assert not list(replay(result.recording))
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize("is_replaced", [True, False])
+def test_units_outlive_their_fork_server_and_come_from_a_fresh_one(number: signal.Signals, is_replaced: bool) -> None:
+    """A unit is killed when the fork server was found gone or stopped, or before anybody has looked."""
+    units: list[psutil.Process] = []
+
+    def hurt() -> None:
+        units.append(unit_process("dsp"))  # which is nobody's child any more when its fork server has ended
+        fork_server().send_signal(number)
+        if not is_replaced:
+            units[0].kill()
+
+    def heard(text: str) -> None:
+        if is_replaced and "fork server" in text:
+            units[0].kill()
+
+    result = run_pipeline(doubles(infer=30), 60, on_progress=When(5, hurt), on_message=heard)
+    assert result.failure is None
+    assert set(map(str, result.lost)) == {"died:dsp"}
+    assert 1 <= sum(result.lost.values()) <= len(in_hand(result, "dsp")) <= 2
+    assert {unit: row.restarts for unit, row in result.report.units.items()} == {"cpu": 0, "gpu": 0, "dsp": 1}
+    how = "was killed by signal 9" if number == signal.SIGKILL else "was stopped"
+    replaced = f"the fork server, which every unit comes from, {how} and is replaced"
+    assert not is_replaced or result.messages.count(replaced) == 1
+    check_accounts(result)
 
 
-def test_a_call_says_that_the_fork_server_was_killed() -> None:
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_call_is_made_by_a_fresh_fork_server(number: signal.Signals) -> None:
     with UnitStarter() as starter:
         call = starter.call("os:getcwd")
-        fork_server().kill()
-        with pytest.raises(TrilaneError, match="was killed by signal 9"):
-            call.result()
+        fork_server().send_signal(number)
+        assert call.result() == str(Path.cwd())
+
+
+def test_a_fork_server_leaves_to_its_parent_what_ends_a_run() -> None:
+    with UnitStarter() as starter:
+        assert starter.call("os:getcwd").result() == str(Path.cwd())
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
+            fork_server().send_signal(number)
+        assert starter.call("os:getcwd").result() == str(Path.cwd())
+        assert starter.trouble() == ""
 
 
 def test_a_call_that_fails_in_itself_has_no_result() -> None:
@@ -367,13 +392,18 @@ def test_unknown_settings_are_bad_input(policy: str, edge: str) -> None:
         run_pipeline(doubles().with_rule(edge), 5, policy=policy)
 
 
-def test_an_interrupt_finishes_what_is_in_flight(run: Run) -> None:
-    interrupt = When(10, lambda: os.kill(os.getpid(), signal.SIGINT))
-    result = run(doubles(infer=5), 2000, on_progress=interrupt)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
+def test_an_interrupt_finishes_what_is_in_flight(run: Run, number: signal.Signals) -> None:
+    before = signal.signal(number, signal.SIG_DFL)  # the test may itself run under nohup
+    try:
+        result = run(doubles(infer=5), 2000, on_progress=When(10, lambda: os.kill(os.getpid(), number)))
+    finally:
+        signal.signal(number, before)
     assert result.interrupted
     assert result.failure is None
     assert 10 <= result.presented < 100
     assert not result.lost
+    assert result.report.frames.not_begun == 2000 - result.presented
 
 
 def test_a_second_interrupt_ends_at_once(run: Run) -> None:
@@ -389,7 +419,9 @@ def test_a_second_interrupt_ends_at_once(run: Run) -> None:
     hang_ns = 3_600_000_000_000
     result = run(doubles(raster=HANG), 20, hang_ns=hang_ns, on_progress=When(2, interrupt), on_message=again)
     assert result.interrupted
-    assert by_cause(result.lost)["aborted"] >= 1
+    aborted = by_cause(result.lost)["aborted"]
+    assert aborted >= 1
+    assert result.report.frames.not_begun == 20 - result.presented - aborted
     assert not list(replay(result.recording))
 
 
@@ -425,6 +457,23 @@ def test_nothing_outlives_the_parent(nothing_left: Path, number: signal.Signals)
     parent.stdout.close()
     parent.wait(PATIENCE_S)
     _, alive = psutil.wait_procs(children, timeout=PATIENCE_S)
+    assert not [process for process in alive if process.status() != psutil.STATUS_ZOMBIE]
+
+
+def test_units_without_their_fork_server_do_not_outlive_the_parent() -> None:
+    parent = subprocess.Popen(script(100_000, 10), stdout=subprocess.PIPE, text=True, process_group=0)
+    assert parent.stdout is not None
+    while int(parent.stdout.readline()) < 20:
+        pass
+    children = psutil.Process(parent.pid).children(recursive=True)
+    os.kill(parent.pid, signal.SIGSTOP)  # so that it replaces nothing
+    next(child for child in children if "trilane.pipeline.fork_server" in child.cmdline()).kill()
+    units = [child for child in children if child.name().startswith("trilane-")]
+    assert len(units) == 3
+    parent.kill()
+    parent.stdout.close()
+    parent.wait(PATIENCE_S)
+    _, alive = psutil.wait_procs(units, timeout=PATIENCE_S)
     assert not [process for process in alive if process.status() != psutil.STATUS_ZOMBIE]
 
 

@@ -47,7 +47,8 @@ export function showSpeed(figures, accuracy) {
   setText(byId("presented"), number(frames.presented, 0));
   const lost = total(frames.lost);
   const dropped = (frames.dropped ?? []).reduce((sum, drop) => sum + drop.frames, 0);
-  setText(byId("presented-rest"), `presented; ${lost} lost · ${dropped} dropped · ${frames.in_flight ?? DASH} in flight`);
+  const rest = `${frames.in_flight ?? DASH} in flight · ${frames.not_begun ?? DASH} not begun`;
+  setText(byId("presented-rest"), `presented; ${lost} lost · ${dropped} dropped · ${rest}`);
 }
 
 function total(counts) {

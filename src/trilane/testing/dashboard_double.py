@@ -105,6 +105,8 @@ def figures(t_ms: float, restarts: int = 0) -> dict[str, Any]:
     frames = {"requested": 1200, "presented": int(t_ms / PERIOD_MS), "skipped": 0, "in_flight": 4}
     drops = (("pose->raster", "stale", 3), ("raster->infer", "late", 1))
     dropped = [{"edge": edge, "cause": cause, "frames": count} for edge, cause, count in drops]
+    lost = {"died:dsp": 2}
+    frames["not_begun"] = 1200 - frames["presented"] - 4 - sum(lost.values()) - sum(count for *_, count in drops)
     return {
         "type": "figures",
         "t_ms": t_ms,
@@ -116,7 +118,7 @@ def figures(t_ms: float, restarts: int = 0) -> dict[str, Any]:
         "run_fps": 59.8,
         "frame_time_ms": {**times, "samples": 299},
         "latency_ms": {**{key: value + 16 for key, value in times.items()}, "samples": 299},
-        "frames": {**frames, "lost": {"died:dsp": 2}, "dropped": dropped},
+        "frames": {**frames, "lost": lost, "dropped": dropped},
         "units": units,
         "stages": stages,
         "temperature_c": {"device": 38 + wave, "gpu": 51 + 3 * wave, "dsp": 55 + 4 * wave},

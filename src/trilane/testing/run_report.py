@@ -47,9 +47,9 @@ MACHINE = {
 
 def make_report(**changes: Any) -> dict[str, Any]:
     """What a run writes, with `changes`."""
-    counts = {"requested": 3, "presented": 3, "lost": 0, "lost_by_cause": {}, "dropped": {"raster->infer:stale": 1}}
+    counts = {"requested": 5, "presented": 3, "lost": 0, "lost_by_cause": {}, "dropped": {"raster->infer:stale": 1}}
     run = {
-        "frames": counts,
+        "frames": {**counts, "not_begun": 1},
         "frame_time_ms": {**TIMES, "ema20_min": 19.0, "ema20_max": 21.0, "jitter": 0.5},
         "latency_ms": TIMES,
         "fps": 50.0,
