@@ -286,7 +286,7 @@ SCENE = """
 frames = 1
 size = "64"
 output = {{width = 320, height = 240}}
-camera = {{source = "{camera}", fov_y_deg = 60.0, place = "none"}}
+camera = {{source = "{camera}", format = "arkit", fov_y_deg = 60.0, place = "none"}}
 [[avatars]]
 bundle = "{bundle}"
 motion = "builtin:t-pose"

@@ -52,7 +52,7 @@ def test_the_core_does_what_a_plain_reading_of_the_rules_does(seed: int, bypasse
     assert list(presented) == [row[:3] for row in model.presented]
     assert ledger.lateness_ns == ([row[3] for row in model.presented] if settings.deadline_ns else [])
     assert (ledger.dropped_by_cause, ledger.lost_by_cause) == (dict(model.dropped), dict(model.lost))
-    report = ledger.report(clock="virtual", requested=settings.frames)
+    report = driver.core.report(clock="virtual", requested=settings.frames)
     assert report["duration_s"] == model.now_ns / 1e9
     assert report["deadline_misses"] == sum(late > 0 for late in ledger.lateness_ns)
     for spec in graph.stages:
