@@ -190,7 +190,8 @@ def test_pipelined_hides_all_but_the_slowest(run: Run) -> None:
     pipeline = doubles(pose=2, raster=14, infer=40, composite=12, present=18)
     sequential, pipelined = (run(pipeline, 12, policy=policy).report for policy in ("sequential", "pipelined"))
     assert pipelined.frame_time_ms.p50 * 1.4 < sequential.frame_time_ms.p50
-    assert pipelined.bottleneck == "dsp"
+    assert pipelined.bottleneck in ("dsp", "other programs")  # on a busy machine these are most of the path
+    assert max(pipelined.units, key=lambda unit: pipelined.units[unit].busy) == "dsp"
     work_ms = (pipelined.efficiency or 0) * pipelined.frame_time_ms.mean
     assert work_ms > 40 * 9 / 11  # in the 11 frame times lie at least 9 whole jobs
 
