@@ -163,7 +163,8 @@ def _of_matrices(path: Path, numbers: F64, up_axis: str) -> Guess:
         if (~precise).mean() > MOST_IMPRECISE:
             found = f"{columns}matrices that are nearly rotations, but not as exactly as their digits"
             raise BadInputError(path, found, "numbers row by row", WHICH_MATRIX)
-    if len(rows) and (has_time or not path.with_name(kitti.TIMES).is_file()):
+    is_readable = 0 < len(rows) >= len(numbers) / 2  # else the reader names the rows that are no rotation
+    if is_readable and (has_time or not path.with_name(kitti.TIMES).is_file()):
         if has_time:
             _require_clock(path, rows, (4, 8, 12))
         signs = _signs(matrices[sound], _ups(up_axis, has_time=has_time))
