@@ -221,6 +221,10 @@ def test_controls_act_restart_or_say_why_not(opened: Callable[..., Watched]) -> 
         assert policy.get_by_role("button").is_disabled()
         policy.locator("select").select_option("sequential")
         assert controls(view, "policy") == []
+        for action, state in (("pause", "paused"), ("play", "running")):  # what is chosen stays, whatever the run says
+            seen.page.locator(f"[data-action={action}]").click()
+            seen.wait_for(f"() => document.getElementById('state').textContent.includes('{state}')")
+            assert policy.locator("select").input_value() == "sequential"
         policy.get_by_role("button", name="Restart with it: policy").click()
         seen.wait_until(lambda: controls(view, "policy") == ["sequential"])
         seen.wait_for("() => document.querySelector('[data-control=policy] button').disabled")

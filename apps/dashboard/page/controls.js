@@ -59,9 +59,11 @@ export class Controls {
     }
   }
 
+  // What the person has chosen and not yet applied stays chosen.
   #inForce(control, value) {
     control.value = value;
-    control.show?.(value);
+    if (control.isPending) control.compare();
+    else control.show?.(value);
   }
 
   refused(name, why) {
@@ -123,13 +125,14 @@ export class Controls {
     const apply = element("button", { type: "button", text: "Restart with it", disabled: true });
     apply.setAttribute("aria-label", `Restart with it: ${words(control.name)}`);
     apply.addEventListener("click", () => this.use(control.name, chosen()));
-    const update = () => {
-      apply.disabled = select.disabled || select.value === String(control.value);
+    control.compare = () => {
+      control.isPending = select.value !== String(control.value);
+      apply.disabled = select.disabled || !control.isPending;
     };
-    select.addEventListener("change", update);
+    select.addEventListener("change", control.compare);
     control.show = (value) => {
       this.#select(select, value);
-      update();
+      control.compare();
     };
     control.show(control.value);
     return this.#shell(control, label, element("div", { class: "pair" }, select, apply));
