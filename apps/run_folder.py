@@ -67,7 +67,7 @@ class RunFolder:
             self._made.append(folder)
 
     def _claim(self) -> None:
-        """Make `work`, which stays locked while this process lives; one run at a time looks for those of others."""
+        """Make `work` and lock it while this process lives. Only one run at a time looks for folders of other runs."""
         parent = os.open(self.target.parent, os.O_RDONLY | os.O_DIRECTORY)
         try:
             fcntl.flock(parent, fcntl.LOCK_EX)

@@ -99,9 +99,9 @@ def _times(profile: Profile, plan: Plan, corners: Corners, cores: int, given: Pl
 
 
 def with_threads(unit: Unit, threads: int) -> Unit:
-    """The network's unit of the profile with so many threads, each of which has the peak rates of a core.
+    """The network's unit with `threads` threads. Each thread has the peak rates of a core.
 
-    One that was measured is as much slower as it was with these.
+    A measured unit is slower by the factor that was measured with that number of threads.
     """
     scale = threads / unit.threads
     rates: dict[str, Quantity] = {name: getattr(unit, name) for name in PEAKS}

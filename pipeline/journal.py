@@ -246,7 +246,7 @@ def records_of(recording: Recording, jobs: Iterable[JobRecord]) -> Iterator[Reco
 
 
 def _steps_of(recording: Recording, jobs: Iterable[JobRecord]) -> Iterator[tuple[Stepped, list[Record]]]:
-    """Of each step its record, and those of what it changed and of the jobs that it ended."""
+    """Each step's record, with the records of what it changed and of the jobs that it ended."""
     for now_ns, events, actions, accounts, ended in in_order(recording, jobs):
         changed = [Accounted(since_ns, unit, account) for since_ns, unit, account in accounts]
         yield Stepped(now_ns, events, actions), [*changed, *(Worked(job, {}) for job in ended)]

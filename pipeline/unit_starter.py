@@ -27,14 +27,14 @@ if TYPE_CHECKING:
 ANSWER_S = 60.0  # the modules to preload may come from a slow disk
 LOOK_S = 0.1  # between two looks at a fork server that has not answered
 CLOSE_S = 5.0
-NOTICE_S = 0.2  # from the end of a call, or of the socket, to that of the fork server, which ended it
+NOTICE_S = 0.2  # a fork server ends at most this long after its call or its socket
 TAIL_BYTES = 8192
 SERVER = "the fork server, which every unit comes from,"
 SERVERS = 3  # that are asked for one unit, before it cannot be started
 
 
 class StartedUnit(NamedTuple):
-    """A unit's process. To be closed by who has it, both.
+    """A unit's process. Its owner closes both files.
 
     `pidfd`: readable when it has ended. `lifeline`: the process ends when it is closed, or when this process ends.
     """

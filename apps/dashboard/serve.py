@@ -94,7 +94,7 @@ def server(app: DashboardApp) -> Any:
                 app.refusals.add(Refusal.MALFORMED)
 
         def handle_text(self, event: Any) -> None:
-            self.handle_bytes(event)  # as text it may be no UTF-8, of which uvicorn prints a traceback
+            self.handle_bytes(event)  # uvicorn prints a traceback where a text is not UTF-8
 
     config = uvicorn.Config(
         app.asgi,

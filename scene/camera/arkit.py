@@ -1,8 +1,8 @@
 """ARKit log: `time r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz` a line, camera to world, metres, Y up.
 
 Rule: axes are those of the sensor in landscape (x right, y up, looks along -Z); whether times are in nanoseconds or
-seconds is recognised by the size of their steps. Where a program numbered the frames, or left the time out, the rate
-is the scene's, else that of a film.
+seconds is recognised by the size of their steps. Where a program numbered the frames, or left the time out, the scene
+gives the rate; the default is 30 per second.
 """
 
 from __future__ import annotations
