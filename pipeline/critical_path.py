@@ -295,16 +295,29 @@ class Budget:
         return {"bottleneck": unit["name"], "bound": {"unit": unit, "stage": self._largest(stages)}}
 
     def _largest(self, name_of: Mapping[Part, str]) -> dict[str, Any] | None:
-        """The name that most of the path has, its share, and the 95 % interval of that, by its scatter over frames."""
+        """The name that most of the path has, its share, and the 95 % interval of that, by its scatter over frames.
+
+        Its rivals are the names whose share may be as large: the 95 % interval of the difference holds 0.
+        """
         sums = _by_name(self.ns_of, name_of)
         if not sums:
             return None
         name = max(sums, key=sums.__getitem__)
-        share = sums[name] / sum(self.ns_of.values())
-        shares = [_by_name(block, name_of).get(name, 0) / max(sum(block.values()), 1) for block in self._blocks]
-        half = batch_interval(shares)
-        low, high = (None, None) if half is None else (max(share - half, 0.0), min(share + half, 1.0))
-        return {"name": name, "share": share, "share_low": low, "share_high": high}
+        whole = sum(self.ns_of.values())
+        blocks = [(_by_name(block, name_of), max(sum(block.values()), 1)) for block in self._blocks]
+
+        def half_width(other: str | None) -> float | None:
+            """Of the share's interval; with `other`, of that of the difference."""
+            return batch_interval([(ns.get(name, 0) - (ns.get(other, 0) if other else 0)) / of for ns, of in blocks])
+
+        share, half = sums[name] / whole, half_width(None)
+        if half is None:
+            return {"name": name, "share": share, "share_low": None, "share_high": None, "rivals": None}
+        rivals = [
+            other for other in sums if other != name and sums[name] - sums[other] <= (half_width(other) or 0) * whole
+        ]
+        low, high = max(share - half, 0.0), min(share + half, 1.0)
+        return {"name": name, "share": share, "share_low": low, "share_high": high, "rivals": rivals}
 
     def _cut(self, ends_ns: Sequence[int], *, is_whole: bool = True) -> None:
         """Count the path between what is counted already and the last of `ends_ns`, in blocks that end with each.

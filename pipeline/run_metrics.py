@@ -272,13 +272,14 @@ class PathShare(Record):
     """What the critical path was for most of its time (`trilane.pipeline.critical_path`).
 
     `name`: of the unit or the stage, or what it was instead. `share`: of the path. `share_low`, `share_high`: 95 %
-    interval by the scatter of this run's frames; null for fewer than 51.
+    interval by the scatter of this run's frames; null for fewer than 51. `rivals`: names whose share may be as large.
     """
 
     name: str
     share: float
     share_low: float | None = None
     share_high: float | None = None
+    rivals: list[str] | None = None
 
 
 class Bound(Record):

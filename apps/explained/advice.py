@@ -22,7 +22,8 @@ def bound_text(bound: Mapping[str, Any]) -> str:
 def _share(part: Mapping[str, Any]) -> str:
     if part["share_low"] is None:
         return f"{part['share']:.0%} of the path"
-    return f"{part['share']:.0%} of the path ({part['share_low']:.0%} to {part['share_high']:.0%})"
+    rivals = f", not surely more than {' or '.join(part['rivals'])}" if part.get("rivals") else ""
+    return f"{part['share']:.0%} of the path ({part['share_low']:.0%} to {part['share_high']:.0%}){rivals}"
 
 
 #: Of stages of the avatar's pipeline: what makes their work shorter.

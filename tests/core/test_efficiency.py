@@ -203,6 +203,24 @@ def test_the_bounds_share_has_an_interval_that_holds_it_and_short_runs_have_none
     assert ran(STAGE_NS, 51)[1].figures["bound"]["stage"]["share_low"] is not None
 
 
+def test_stages_whose_shares_may_be_equal_are_rivals_and_a_surely_smaller_one_is_none() -> None:
+    """raster and composite take 5 and 7 us, and after ten frames the other way round, so 6 us each in the mean."""
+    graph, settings = chain(STAGES, "double", "composite"), Settings(200)
+    turns = {"raster": (5000, 7000), "composite": (7000, 5000)}
+
+    def service(stage: str, _unit: str, frame: int, _begin_ns: int) -> int:
+        return turns.get(stage, (STAGE_NS[stage],) * 2)[frame // 10 % 2]
+
+    run = simulate(graph, settings, service, keep=True)
+    assert run.recording is not None
+    places = {"cpu": Place((0,), 1), "gpu": Place((1,), 1), "dsp": Place((2,), 1)}
+    _, found = reckoned(graph, settings, places, records_of(run.recording, run.jobs))
+    stage = found.figures["bound"]["stage"]
+    assert {stage["name"], *stage["rivals"]} == {"raster", "composite"}
+    assert ran(STAGE_NS)[1].figures["bound"]["stage"]["rivals"] == []
+    assert ran(STAGE_NS, 50)[1].figures["bound"]["stage"]["rivals"] is None
+
+
 def test_time_that_another_stage_had_a_core_is_that_stages_and_the_rest_is_nobodys() -> None:
     """infer shares core 0 with pose: of its 10 ns on the path pose had the core for 4 and nobody of the run for 2."""
     graph, settings = chain([("pose", "cpu"), ("infer", "dsp")], "double", "infer"), Settings(200)

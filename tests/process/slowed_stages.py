@@ -74,7 +74,8 @@ def main(folder: Path, rounds: int, command: list[str]) -> None:
         more = statistics.median(grown[stage])
         print(f"{stage:10} CPU time {more:+.1%}  frame time {statistics.median(cost[stage]):+.1%}  ({each})")
     print("costs most:", max(stages, key=lambda stage: statistics.median(cost[stage])))
-    named = [report["bound"]["stage"]["name"] for report in plains]
+    bounds = [report["bound"]["stage"] for report in plains]
+    named = [" or ".join([bound["name"], *(bound.get("rivals") or [])]) for bound in bounds]
     print("named:", {name: named.count(name) for name in sorted(set(named))})
     print(f"other programs: {statistics.median(report['other_programs'] for report in plains):.1%} of the cores")
     shutil.rmtree(folder)
