@@ -158,7 +158,7 @@ class Core:
     def _next_deadline(self) -> int:
         if self._lead_ns or self.alarm_ns <= self.now_ns:
             self.alarm_ns = watchdog.next_alarm_ns(self.units.values(), self.now_ns, self._lead_ns)
-        next_ns = self.source.due_ns
+        next_ns = self.source.due_ns if self.started else NEVER  # until then nothing is released, however due it is
         if self.alarm_ns < next_ns:
             next_ns = self.alarm_ns
         if self._latches and not self.source.is_empty:

@@ -102,6 +102,7 @@ class VirtualDriver:
         self._skips, self._bypass_begin = skips, graph.bypass[0] if graph.bypass is not None else ""
         self._heap: list[tuple[int, int, int, Event, int]] = []
         self._sequence = 0
+        self._woken_ns = -1  # the last deadline that came without an event
         self._begun: dict[int, JobRecord] = {}
         self._units = {unit: _VirtualUnit() for unit in graph.units}
         for unit in graph.units:
@@ -135,6 +136,9 @@ class VirtualDriver:
                 return at_ns, (event,)
         if deadline_ns == NEVER:
             raise RuntimeError("the simulation stands still: no event and no deadline is left")
+        if deadline_ns <= self._woken_ns:
+            raise RuntimeError(f"the simulation stands still: the core asks for {deadline_ns} ns again and again")
+        self._woken_ns = deadline_ns
         return deadline_ns, ()
 
     def perform(self, now_ns: int, actions: tuple[Action, ...]) -> None:

@@ -6,6 +6,7 @@ import pytest
 
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import (
+    NEVER,
     Dispatch,
     Event,
     Finish,
@@ -56,6 +57,21 @@ def test_frames_that_are_taken_at_once_are_held_stepped_and_let_go() -> None:
     assert run.step(12, Hold(-1)) == []  # the unit has its two
     assert run.done(13) == [5]
     assert list(replay(run.recording)) == []
+
+
+def test_frames_that_are_let_go_before_the_units_are_ready_wait_for_them_without_being_asked_for() -> None:
+    """A time in the past would be asked for again and again, until the last unit is ready."""
+    run = Run(Settings(10, period_ns=10 * MS))
+    assert run.step(1, Hold(0)) == [] and run.next_ns == NEVER
+    assert run.step(2, Hold(-1)) == [] and run.next_ns == NEVER
+    assert run.step(7, UnitReady("u")) == [0] and run.next_ns == 17 * MS
+
+
+def test_frames_that_wait_for_units_have_their_timeout_when_the_run_begins() -> None:
+    run = Run(Settings(10, period_ns=10 * MS, queue_timeout_ns=3 * MS))
+    assert run.step(1, Hold(2)) == [] and run.next_ns == NEVER
+    assert run.step(7, UnitReady("u")) == [] and run.next_ns > 1000 * MS  # both waited for 6 ms
+    assert sum(run.core.ledger.dropped.values()) == 2
 
 
 def test_a_rate_goes_on_from_the_moment_in_which_the_hold_ends() -> None:

@@ -209,10 +209,10 @@ def test_however_a_run_ends_its_frames_add_up(
         keep=True,
     )
     driver.run()
+    assert driver.recording is not None
     for requested in (60, driver.core.source.released):
         frames = FrameCounts.model_validate(driver.core.report(clock="virtual", requested=requested)["frames"])
         at_source = sum(count for cause, count in frames.dropped.items() if cause.startswith("source->"))
-        assert driver.recording is not None
         actions = [action for step in driver.recording.steps for action in step[2]]
         begun = {action.job.frame for action in actions if isinstance(action, Dispatch)}
         assert frames.not_begun == requested - len(begun) - at_source >= 0
