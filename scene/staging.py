@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from trilane.body.body import ShapedBody
-from trilane.scene.camera.load import load_camera
+from trilane.scene.camera.files import load_camera
 from trilane.scene.camera_placement import place_camera
 from trilane.scene.footage import Footage, filmed
 from trilane.scene.motion.load import load_motion

@@ -15,7 +15,7 @@ from trilane.apps.inspection.pictures import inspect_folder, inspect_picture, in
 from trilane.errors import BadInputError
 from trilane.file_signatures import PICTURE, VIDEO, Signature
 from trilane.files import read_text
-from trilane.scene.detected import Detected
+from trilane.scene.recordings import Detected
 
 #: Kind -> how it is read, and what one of it is called before it was read.
 READERS: dict[str, tuple[Callable[[Path], Inspection], str]] = {

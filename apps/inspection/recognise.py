@@ -15,7 +15,7 @@ from trilane.errors import BadInputError
 from trilane.file_signatures import ARCHIVE, ARRAY, FOREIGN, PICKLE, PICTURE, VIDEO, Signature, signature_of
 from trilane.files import npz_names, read_text, require_file
 from trilane.pipeline.journal import NAME as JOURNAL
-from trilane.scene.camera.detect import COLMAP_FILES, detect
+from trilane.scene.camera.files import COLMAP_FILES, detect
 from trilane.stages.gpu.picture_file import PICTURES
 
 MOTION, CAMERA, PICTURE_FOLDER, BODY, TEXTURE, AVATAR = "motion", "camera", "pictures", "body", "texture", "avatar"

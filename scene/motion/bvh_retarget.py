@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from trilane.arrays import F64
 from trilane.body.joints import BODY_JOINTS, JOINT_INDEX
 from trilane.errors import BadInputError
-from trilane.scene.detected import Detected
 from trilane.scene.motion.bvh import Bvh, BvhJoint, load_bvh
 from trilane.scene.motion.bvh_joint_names import plain
 from trilane.scene.motion.bvh_units import unit_of
@@ -27,6 +26,7 @@ from trilane.scene.motion.t_pose import T_POSE
 from trilane.scene.motion.t_pose_frames import leading_t_pose
 from trilane.scene.motion.tracks import SIDES, Tracks
 from trilane.scene.motion.trunk_turns import trunk_line
+from trilane.scene.recordings import Detected
 
 LEAST_LENGTH = 1e-6
 #: An end site that is nearer to its joint than this share of the legs is a mark, not the end of a bone.

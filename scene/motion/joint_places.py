@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from trilane.arrays import F64
 from trilane.body.joints import JOINT_NAMES, JOINT_PARENTS, JOINTS
 from trilane.files import as_numbers
-from trilane.scene.detected import Detected
 from trilane.scene.motion.bvh_retarget import UPS, feet_of
 from trilane.scene.motion.bvh_units import unit_of
 from trilane.scene.motion.recorded import RawMotion
@@ -28,6 +27,7 @@ from trilane.scene.motion.retarget import retarget
 from trilane.scene.motion.standing import leg_length
 from trilane.scene.motion.t_pose import T_POSE
 from trilane.scene.motion.tracks import Tracks
+from trilane.scene.recordings import Detected
 
 RATE_HZ = 20.0
 #: The joints that are read; others that follow, such as SMPL's hands or fingers, are not.

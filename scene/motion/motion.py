@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from trilane.arrays import F64
-from trilane.scene.detected import NOTHING, Detected
+from trilane.scene.recordings import NOTHING, Detected
 from trilane.scene.rotations import quat_from_rotvec, rotvec_from_quat, slerp
 
 JOINTS = 55

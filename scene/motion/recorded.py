@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F64
 from trilane.errors import BadInputError
-from trilane.scene.detected import NOTHING, Detected
 from trilane.scene.motion.motion import Motion, Wrap
 from trilane.scene.motion.on_floor import lies, lowest, stands
 from trilane.scene.motion.stance import stance
-from trilane.scene.motion.usable_samples import usable_samples
+from trilane.scene.recordings import NOTHING, Detected, usable_samples
 from trilane.scene.rotations import Y_UP_FROM_Z_UP, about, matrix_from_rotvec, rotvec_from_matrix
 
 MAX_FRAMES = 200_000

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from trilane.arrays import F64
 from trilane.errors import BadInputError
 from trilane.files import as_numbers
-from trilane.scene.detected import Detected
 from trilane.scene.motion.motion import SMPL_REST_PELVIS
 from trilane.scene.motion.recorded import ANY, RawMotion
 from trilane.scene.motion.smpl_turns import WHOLE, Turns, turns_in
 from trilane.scene.motion.smplx_npy import hands_note
 from trilane.scene.motion.stored import Found
+from trilane.scene.recordings import Detected
 
 POSES, PLACES, PERSONS = "smpl_thetas", "cam_trans", "track_ids"
 RATE_HZ = 30.0

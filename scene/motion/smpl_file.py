@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F64
 from trilane.errors import BadInputError
-from trilane.scene.detected import Detected
 from trilane.scene.motion.pickled import ARRAYS, printable
 from trilane.scene.motion.recorded import RawMotion
 from trilane.scene.motion.romp_file import POSES, motion_of_frames
@@ -21,6 +20,7 @@ from trilane.scene.motion.smpl_layouts import EXPECTED, LAYOUTS, RATE_KEYS, Layo
 from trilane.scene.motion.smpl_turns import Turns, turns_in
 from trilane.scene.motion.smplx_npy import hands_note
 from trilane.scene.motion.stored import Found, contents, tables_in
+from trilane.scene.recordings import Detected
 
 MAX_BETAS = 400
 LARGEST_SCALE = 1e4

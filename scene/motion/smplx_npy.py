@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
-from trilane.scene.detected import Detected
 from trilane.scene.motion.recorded import ANY, RawMotion
 from trilane.scene.motion.smpl_turns import WHOLE, shapes, turns_in
+from trilane.scene.recordings import Detected
 from trilane.scene.rotations import matrix_from_rotvec, rotvec_from_matrix
 
 ASSUMED_RATE_HZ = 30.0

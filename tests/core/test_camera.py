@@ -12,9 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from trilane.errors import BadInputError
-from trilane.scene.camera.builtin import ORBITS
-from trilane.scene.camera.load import load_camera
-from trilane.scene.camera.path import CameraPath, look_at, projection_matrix
+from trilane.scene.camera.files import load_camera
+from trilane.scene.camera.path import ORBITS, CameraPath, look_at, projection_matrix
 from trilane.scene.rotations import Y_UP_FROM_Z_UP, about, matrix_from_quat, quat_from_matrix
 from trilane.scene.schema import CameraSpec
 

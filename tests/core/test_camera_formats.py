@@ -14,11 +14,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from trilane.errors import BadInputError
-from trilane.scene.camera.colmap_model import MODELS, checked_camera
-from trilane.scene.camera.distortion import Bent, distortion_note, largest_px
-from trilane.scene.camera.map_frame import Unit, looked_at_from, metres_per_unit
+from trilane.scene.camera.colmap import MODELS, checked_camera
 from trilane.scene.camera.path import axes_towards
-from trilane.scene.lens import Lens
+from trilane.scene.camera.recorded import Unit, looked_at_from, metres_per_unit
+from trilane.scene.lens import Bent, Lens, distortion_note, largest_px
 from trilane.scene.rotations import about
 from trilane.scene.schema import CameraSpec
 from trilane.testing.camera_files import (

@@ -13,9 +13,9 @@ import pytest
 
 from trilane.arrays import F64
 from trilane.body.body import ShapedBody
-from trilane.scene.camera.load import load_camera
+from trilane.scene.camera.files import load_camera
 from trilane.scene.camera.path import CameraPath
-from trilane.scene.camera.upright import UP
+from trilane.scene.camera.recorded import UP
 from trilane.scene.camera_placement import _from_the_middle, place_camera
 from trilane.scene.motion.builtin import BUILTIN
 from trilane.scene.mover import make_mover

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from trilane.errors import BadInputError
-from trilane.scene.camera import text_table
-from trilane.scene.camera.load import load_camera
-from trilane.scene.camera.text_table import Layout, elapsed, layout_of, read_table
+from trilane.scene.camera import pose_table
+from trilane.scene.camera.files import load_camera
+from trilane.scene.camera.pose_table import Layout, elapsed, layout_of, read_table
 from trilane.scene.rotations import about
 from trilane.scene.schema import CameraSpec
 from trilane.testing.camera_files import load, nerf_text, pose_z_up, rows_of
@@ -42,8 +42,8 @@ def test_column_names_without_end_take_no_time(tmp_path: Path) -> None:
 
 
 def test_a_table_may_have_a_million_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert text_table.MAX_ROWS == 1_000_000
-    monkeypatch.setattr(text_table, "MAX_ROWS", 2)
+    assert pose_table.MAX_ROWS == 1_000_000
+    monkeypatch.setattr(pose_table, "MAX_ROWS", 2)
     path = tmp_path / "a.txt"
     path.write_text("1\n2\n")
     assert len(read_table(path, 1, "one").numbers) == 2

@@ -8,8 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from trilane.scene.camera.map_frame import MAP_M, near_origin
-from trilane.scene.camera.upright import UP, upright
+from trilane.scene.camera.recorded import MAP_M, UP, find_upright, near_origin
 from trilane.scene.rotations import about, matrix_from_rotvec
 
 OPTICAL = np.diag([1.0, -1.0, -1.0])
@@ -27,7 +26,7 @@ def test_first_camera_coordinates(degrees: float, pitch: float) -> None:
     """World axes are the first view's optical ones; up is -Y, or where the horizons are level if that was tilted."""
     turns = pan(degrees, pitch)
     first = turns[len(turns) // 2] @ OPTICAL  # columns: right, down, ahead
-    found = upright(first.T @ turns, "z", is_levelled=False)
+    found = find_upright(first.T @ turns, "z", is_levelled=False)
     assert found.quarter == 0
     true = first.T @ [0.0, 1.0, 0.0]
     allowed = 1e-6 if pitch == 0.0 or degrees == 170.0 else abs(math.radians(pitch)) + 1e-6
@@ -40,15 +39,15 @@ def test_a_map_of_the_first_picture_that_does_not_tell_its_pitch_says_so() -> No
     said = "; the axes are those of the first picture: if that looked down or up, the floor is tilted by as much"
     for axes, up in ((OPTICAL, "-Y"), (np.eye(3), "Y")):
         own = (turns[0] @ axes).T @ turns
-        assert upright(own, "-y" if up == "-Y" else "y", is_levelled=False).note.removesuffix(said) == f"{up} up"
-        assert upright(own, "-y", is_levelled=False).note.endswith(said)
-        assert not upright(own, "y", is_levelled=True).note.endswith(said)  # gravity is known
-        assert not upright(own[:1], "-y", is_levelled=False).note.endswith(said)  # one picture makes no map
+        assert find_upright(own, "-y" if up == "-Y" else "y", is_levelled=False).note.removesuffix(said) == f"{up} up"
+        assert find_upright(own, "-y", is_levelled=False).note.endswith(said)
+        assert not find_upright(own, "y", is_levelled=True).note.endswith(said)  # gravity is known
+        assert not find_upright(own[:1], "-y", is_levelled=False).note.endswith(said)  # one picture makes no map
     wide = pan(170.0, -20.0)
-    assert not upright((wide[0] @ OPTICAL).T @ wide, "-y", is_levelled=False).note.endswith(
+    assert not find_upright((wide[0] @ OPTICAL).T @ wide, "-y", is_levelled=False).note.endswith(
         said
     )  # the horizons tell it
-    assert not upright(about(1, 0.01) @ wide[:2], "y", is_levelled=False).note.endswith(said)
+    assert not find_upright(about(1, 0.01) @ wide[:2], "y", is_levelled=False).note.endswith(said)
 
 
 @pytest.mark.parametrize(("degrees", "pitch"), [(0, 0), (0, -20), (5, -20), (15, -50), (45, -50), (120, -35), (170, 0)])
@@ -61,7 +60,7 @@ def test_up_is_found_in_every_axis_system(degrees: float, pitch: float) -> None:
         if np.linalg.det(system) < 0:
             continue
         for usual in ("y", "z", "-y"):
-            found = upright(system @ turns, usual, is_levelled=False)
+            found = find_upright(system @ turns, usual, is_levelled=False)
             assert found.quarter == 0 and found.up @ system[:, 1] == pytest.approx(1.0), found.note
 
 
@@ -70,30 +69,35 @@ def test_a_turned_device_is_believed_where_its_horizon_says_so(quarter: int) -> 
     """A pan of 40 degrees either way; a picture on its head is rather one of a world with another up."""
     turns = pan(40.0, -10.0, roll_deg=-90.0 * quarter)
     for is_levelled in (True,) if quarter == 2 else (False, True):
-        found = upright(turns, "y", is_levelled)
+        found = find_upright(turns, "y", is_levelled)
         assert (found.up.tolist(), found.quarter) == ([0.0, 1.0, 0.0], quarter), found.note
 
 
 def test_a_turn_is_not_believed_before_every_axis() -> None:
     """One view that is turned by 90 degrees: in a world that may be any, its own up; in a levelled one the turn."""
     turns = pan(0.0, 0.0, roll_deg=-90.0, count=1)
-    assert upright(turns, "y", is_levelled=False).note == ("X up, as the camera is held (not Y, usual for the format)")
-    assert upright(turns, "y", is_levelled=True).note == "Y up, device held so that the picture is turned by 90 degrees"
+    assert find_upright(turns, "y", is_levelled=False).note == (
+        "X up, as the camera is held (not Y, usual for the format)"
+    )
+    assert (
+        find_upright(turns, "y", is_levelled=True).note
+        == "Y up, device held so that the picture is turned by 90 degrees"
+    )
 
 
 def test_horizons_decide_where_a_camera_looks_down() -> None:
     """50 degrees down, panning by 20 either way: -Z, the usual axis, is nearer to the pictures' up, but not level."""
     turns = pan(20.0, -50.0)
     assert (turns[:, :, 1] @ UP["-z"]).mean() > (turns[:, :, 1] @ UP["y"]).mean() > 0.6
-    assert upright(turns, "-z", is_levelled=False).up.tolist() == list(UP["y"])
+    assert find_upright(turns, "-z", is_levelled=False).up.tolist() == list(UP["y"])
 
 
 def test_a_near_rival_is_named() -> None:
     """Looking 59 degrees down, a still camera in a Z-up world and a level one in another look nearly alike."""
     turns = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]) @ pan(0.0, -59.0, count=1)
-    note = upright(turns, "z", is_levelled=False).note
+    note = find_upright(turns, "z", is_levelled=False).note
     assert "fits nearly as well: camera.up_axis decides" in note
-    assert upright(turns, "z", is_levelled=False, stated="z").note == "Z up, as given"
+    assert find_upright(turns, "z", is_levelled=False, stated="z").note == "Z up, as given"
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -102,7 +106,7 @@ def test_a_tilted_world_is_levelled_by_its_horizons(seed: int) -> None:
     rng = np.random.default_rng(seed)
     system = matrix_from_rotvec(rng.uniform(-2, 2, 3))
     turns = pan(120.0, -20.0) @ about(2, rng.normal(0, 0.03, 31))
-    found = upright(system @ turns, "-y", is_levelled=False)
+    found = find_upright(system @ turns, "-y", is_levelled=False)
     assert math.degrees(math.acos(found.up @ (system @ [0.0, 1.0, 0.0]))) < 2.0
     assert "where the pictures' horizons are level" in found.note
 
@@ -110,7 +114,7 @@ def test_a_tilted_world_is_levelled_by_its_horizons(seed: int) -> None:
 def test_pictures_without_a_horizon_keep_the_usual_axis() -> None:
     """A camera that looks straight down and turns: no axis is on average above its pictures but the one behind it."""
     turns = about(1, np.linspace(0, 2 * math.pi, 32, endpoint=False)) @ about(0, -math.pi / 2)
-    found = upright(turns, "y", is_levelled=True)
+    found = find_upright(turns, "y", is_levelled=True)
     assert found.up.tolist() == list(UP["y"]) and "usual for the format" in found.note
 
 

@@ -11,8 +11,7 @@ import pytest
 
 from trilane.errors import BadInputError
 from trilane.scene.camera.path import CameraPath, one_lens
-from trilane.scene.camera.recorded import OPENGL_FROM_OPTICAL, RawCamera, path_from_recording
-from trilane.scene.camera.upright import OF_FIRST
+from trilane.scene.camera.recorded import OF_FIRST, OPENGL_FROM_OPTICAL, RawCamera, path_from_recording
 from trilane.scene.lens import Lens, of_fov_y
 from trilane.scene.motion.motion import Wrap
 from trilane.scene.schema import CameraSpec

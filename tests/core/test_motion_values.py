@@ -17,7 +17,7 @@ from trilane.scene.motion.load import load_motion
 from trilane.scene.motion.motion import REST_PELVIS, Motion, Wrap, bracket, wrapped_time
 from trilane.scene.motion.recorded import RawMotion, motion_from_recording
 from trilane.scene.motion.smplx_npy import hands_note, median_step_rad
-from trilane.scene.motion.usable_samples import usable_samples
+from trilane.scene.recordings import usable_samples
 from trilane.scene.rotations import matrix_from_rotvec
 from trilane.scene.schema import AvatarSpec
 

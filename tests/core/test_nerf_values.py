@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from trilane.errors import BadInputError
-from trilane.scene.camera import nerf
+from trilane.scene.camera import json_files
 from trilane.testing.camera_files import angle, load, nerf_text, pixel, pose_z_up
 
 
@@ -98,7 +98,7 @@ def test_views_a_step_apart_are_a_film_or_stills(tmp_path: Path) -> None:
         camera = load(tmp_path / "a.json")
         assert camera.times_s == pytest.approx(times)
         assert camera.notes[0] == f"NeRF transforms, 3 views, no times: {note}, camera to world"
-    assert nerf.MAX_FRAMES == 100_000
+    assert json_files.MAX_FRAMES == 100_000
 
 
 ONE = pose_z_up(0).tolist()
@@ -184,7 +184,7 @@ def test_fields_of_view_just_inside_the_range_are_read(tmp_path: Path) -> None:
 
 
 def test_a_nerf_file_may_have_so_many_views(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(nerf, "MAX_FRAMES", 2)
+    monkeypatch.setattr(json_files, "MAX_FRAMES", 2)
     (tmp_path / "a.json").write_text(nerf_text(*[pose_z_up(0)] * 2))
     load(tmp_path / "a.json")
     (tmp_path / "a.json").write_text(nerf_text(*[pose_z_up(0)] * 3))

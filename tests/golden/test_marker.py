@@ -17,7 +17,7 @@ import pytest
 from PIL import ExifTags, Image
 
 from trilane.arrays import F64, U8
-from trilane.scene.camera.load import load_camera
+from trilane.scene.camera.files import load_camera
 from trilane.scene.footage import filmed
 from trilane.scene.schema import CameraSpec, PlaneSpec
 from trilane.shapes import Shape

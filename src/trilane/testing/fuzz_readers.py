@@ -34,7 +34,7 @@ from trilane.avatars.network_file import read_network
 from trilane.body.body import load_body
 from trilane.errors import BadInputError
 from trilane.hw_profiles.graph_file import read_graph
-from trilane.scene.camera.load import load_camera
+from trilane.scene.camera.files import load_camera
 from trilane.scene.load import load_scene, scene_from
 from trilane.scene.motion.load import load_motion
 from trilane.scene.schema import AvatarSpec, CameraSpec

@@ -1,13 +1,14 @@
-"""Tells the format of a camera file or folder by its content.
+"""Loads the camera of a scene: a built-in one by name, or a file whose format is told by its content.
 
-Rule: names of files decide only what is a folder of several; in a text the column names decide, then the number of
-columns with what they hold. What fits a second format, or another order of columns, as well is a question to the user,
-which names both and what settles it. Every guess comes with its reason.
+The scene may state the format. Else a folder is known by the names of its files, and a text by its column names, then
+by how many columns it has and what they hold. What fits a second format, or another order of columns, as well is a
+question to the user: the message names both and what settles it. A note gives the reason of each guess.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from itertools import permutations
 from pathlib import Path
 from typing import NamedTuple
@@ -17,18 +18,50 @@ import numpy as np
 from trilane.arrays import F64
 from trilane.errors import BadInputError
 from trilane.files import read_text, require_file
-from trilane.scene.camera import colmap, euroc, kitti, nerf, record3d, stray, tum
-from trilane.scene.camera.pose_table import MATRIX, SAY_ORDER, is_off
-from trilane.scene.camera.recorded import OPENGL_FROM_OPTICAL, are_rotations
-from trilane.scene.camera.text_table import LEAST_GROWING, POSE, Layout, head_of, is_index, layout_of
-from trilane.scene.camera.upright import AUTO, UP, price_of
+from trilane.near_miss import did_you_mean
+from trilane.scene.camera.colmap import ENDINGS, load_colmap, model_in
+from trilane.scene.camera.json_files import NERF_FILE, RECORD3D_FILE, load_nerf, load_record3d
+from trilane.scene.camera.path import BUILTIN, CameraPath, load_builtin
+from trilane.scene.camera.pose_table import (
+    LEAST_GROWING,
+    MATRIX,
+    POSE,
+    SAY_ORDER,
+    Layout,
+    head_of,
+    is_index,
+    is_off,
+    layout_of,
+)
+from trilane.scene.camera.recorded import (
+    AUTO,
+    OPENGL_FROM_OPTICAL,
+    UP,
+    RawCamera,
+    are_rotations,
+    path_from_recording,
+    price_of,
+)
+from trilane.scene.camera.trajectories import (
+    EUROC_NAMES,
+    KITTI_TIMES,
+    STRAY_FILE,
+    TUM_COLUMNS,
+    TUM_NAMES,
+    load_arkit,
+    load_euroc,
+    load_kitti,
+    load_stray,
+    load_tum,
+)
 from trilane.scene.rotations import matrix_from_quat, normalised
+from trilane.scene.schema import CameraSpec
 
 EXPECTED = (
     "a camera: an ARKit log, a TUM, KITTI or EuRoC trajectory, a transforms.json, odometry.csv of Stray Scanner, "
     "metadata.json of Record3D or a folder of COLMAP"
 )
-COLMAP_FILES = tuple(f"{name}{ending}" for name in ("cameras", "images") for ending in colmap.ENDINGS)
+COLMAP_FILES = tuple(f"{name}{ending}" for name in ("cameras", "images") for ending in ENDINGS)
 
 
 class Guess(NamedTuple):
@@ -72,7 +105,7 @@ def detect(path: Path, up_axis: str = AUTO) -> Guess:
     if path.is_dir():
         return _of_folder(path)
     require_file(path, EXPECTED)
-    if path.name in COLMAP_FILES and colmap.model_in(path.parent) is not None:
+    if path.name in COLMAP_FILES and model_in(path.parent) is not None:
         return Guess("colmap", "a file of a COLMAP model")
     if path.suffix.lower() == ".json" or read_text(path, EXPECTED).lstrip()[:1] == "{":
         return _of_json(path)
@@ -87,15 +120,15 @@ def _of_json(path: Path) -> Guess:
 
 
 def _of_folder(path: Path) -> Guess:
-    found = colmap.model_in(path)
+    found = model_in(path)
     if found is not None:
         return Guess("colmap", f"cameras{found[1]} and images{found[1]} in the folder")
-    for kind, name in (("nerf", nerf.FILE), ("stray", stray.FILE), ("record3d", record3d.FILE)):
+    for kind, name in (("nerf", NERF_FILE), ("stray", STRAY_FILE), ("record3d", RECORD3D_FILE)):
         if (path / name).is_file():
             return Guess(kind, f"{name} in the folder")
     remedy = "name the file of poses in it"
     raise BadInputError(
-        path, f"a folder without {nerf.FILE}, {stray.FILE}, {record3d.FILE} and COLMAP's files", EXPECTED, remedy
+        path, f"a folder without {NERF_FILE}, {STRAY_FILE}, {RECORD3D_FILE} and COLMAP's files", EXPECTED, remedy
     )
 
 
@@ -110,14 +143,14 @@ def _of_table(path: Path, layout: Layout, up_axis: str) -> Guess:
     _require_pose(path, layout)
     if columns in (MATRIX, MATRIX + 1):
         return _of_matrices(path, head_of(path, columns, EXPECTED), up_axis)
-    if columns >= tum.COLUMNS and layout.has_commas and layout.is_ns:
-        _require_one_order(path, head_of(path, columns, EXPECTED), euroc.NAMES)
+    if columns >= TUM_COLUMNS and layout.has_commas and layout.is_ns:
+        _require_one_order(path, head_of(path, columns, EXPECTED), EUROC_NAMES)
         reason = f"{columns} columns with commas and times in ns: the quaternion's scalar is taken to be first"
         return Guess("euroc", reason)
-    if columns == tum.COLUMNS:
-        _require_one_order(path, head_of(path, columns, EXPECTED), tum.NAMES)
+    if columns == TUM_COLUMNS:
+        _require_one_order(path, head_of(path, columns, EXPECTED), TUM_NAMES)
         return Guess("tum", f"{columns} columns: the quaternion's scalar is taken to be last")
-    counts = f"{tum.COLUMNS} (TUM, EuRoC), {MATRIX} (KITTI) or {MATRIX + 1} (ARKit), or column names"
+    counts = f"{TUM_COLUMNS} (TUM, EuRoC), {MATRIX} (KITTI) or {MATRIX + 1} (ARKit), or column names"
     raise BadInputError(path, f"{columns} columns", counts, OTHERS.get(columns, ""))
 
 
@@ -164,7 +197,7 @@ def _of_matrices(path: Path, numbers: F64, up_axis: str) -> Guess:
             found = f"{columns}matrices that are nearly rotations, but not as exactly as their digits"
             raise BadInputError(path, found, "numbers row by row", WHICH_MATRIX)
     is_readable = 0 < len(rows) >= len(numbers) / 2  # else the reader names the rows that are no rotation
-    if is_readable and (has_time or not path.with_name(kitti.TIMES).is_file()):
+    if is_readable and (has_time or not path.with_name(KITTI_TIMES).is_file()):
         if has_time:
             _require_clock(path, rows, (4, 8, 12))
         signs = _signs(matrices[sound], _ups(up_axis, has_time=has_time))
@@ -247,3 +280,43 @@ def _has_digits(numbers: F64) -> bool:
 def _price(quats: F64, order: tuple[int, ...]) -> float:
     """How far from level a camera is whose w, x, y, z are the columns `order` of `quats` (N, 4)."""
     return price_of(matrix_from_quat(normalised(quats[:, order])) @ OPENGL_FROM_OPTICAL, "z")
+
+
+PREFIX = "builtin:"
+
+#: Readers of a path and the scene's rate.
+_READERS: dict[str, Callable[[Path, float | None], RawCamera]] = {
+    "arkit": load_arkit,
+    "colmap": load_colmap,
+    "euroc": load_euroc,
+    "kitti": load_kitti,
+    "nerf": load_nerf,
+    "record3d": load_record3d,
+    "stray": load_stray,
+    "tum": load_tum,
+}
+#: Formats that may be folders.
+FOLDERS = ("colmap", "nerf", "record3d", "stray")
+
+
+def load_camera(spec: CameraSpec, base: Path) -> CameraPath:
+    """The camera that `spec.source` names; a relative path starts at `base`.
+
+    Raises BadInputError when there is no such camera or the file is unusable.
+    """
+    if spec.source.startswith(PREFIX):
+        built_in = load_builtin(spec.source.removeprefix(PREFIX), spec)
+        if built_in is None:
+            near = did_you_mean(spec.source.removeprefix(PREFIX), BUILTIN, PREFIX)
+            raise BadInputError("camera", repr(spec.source), f"{PREFIX}{{{', '.join(BUILTIN)}}} or a file", near)
+        return built_in
+    path = base / spec.source
+    guess = detect(path, spec.up_axis) if spec.format == "auto" else Guess(spec.format, "")
+    if not (path.is_dir() and guess.kind in FOLDERS):
+        require_file(path, EXPECTED)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is left out afterwards
+        raw = _READERS[guess.kind](path, spec.rate_hz)
+        camera = path_from_recording(raw, str(path), spec)
+    reason = guess.reason or "as given"
+    taken = f"taken for {camera.detected.format}: {reason}"
+    return replace(camera, notes=(*camera.notes, taken), detected=replace(camera.detected, reason=reason))

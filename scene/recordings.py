@@ -1,18 +1,43 @@
-"""Leaves bad samples out of a recorded motion or camera path; a note says how many.
+"""What a reader finds in the file of a motion or a camera, and which of its samples are usable.
 
-Rule: a sample is left out when its caller finds it unreadable or its time is not after that of the last usable one.
-Sampling interpolates across the hole. A file in which more than half of the samples are bad is refused.
+A sample is left out when its reader finds it unreadable, or when its time is not after that of the last usable one;
+sampling interpolates across the hole, and a note says how many. A file with more bad samples than good ones is refused.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import F64
 from trilane.errors import BadInputError
+
+
+@dataclass(frozen=True)
+class Detected:
+    """What a file is.
+
+    `format`: its name for people. `reason`: by what the format was told apart. `axes`: which is up, and why. `unit`: of
+    its lengths, and why. `rate`: where the rate comes from. `lens`: the same of a camera's. `joints`: SMPL-X joint ->
+    the file's name of it. `unmapped`: names of the file's joints that have no partner, in its order.
+    """
+
+    format: str = ""
+    reason: str = ""
+    axes: str = ""
+    unit: str = ""
+    rate: str = ""
+    lens: str = ""
+    joints: Mapping[str, str] = field(default_factory=dict)
+    unmapped: tuple[str, ...] = ()
+
+
+#: Of what comes from no file.
+NOTHING = Detected()
+
 
 #: An interval longer than this many median intervals is reported as a gap.
 GAP = 1.5

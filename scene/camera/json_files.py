@@ -1,13 +1,11 @@
-"""NeRF `transforms.json`: `frames[].transform_matrix`, 4x4 camera to world, OpenGL axes, usually Z up.
+"""Readers of camera files in JSON: NeRF's `transforms.json` and Record3D's `metadata.json`.
 
-Rule: the lens is that of the frame, else that of the file (`fl_x`, `fl_y`, `cx`, `cy` in pixels of `w` x `h`, or
-`camera_angle_x` or `camera_angle_y`); distortion is left out and said. The
-format has no times (`untimed.py`). Polycam's and Record3D's exports are such files, as nerfstudio makes them.
-Format: https://docs.nerf.studio/quickstart/data_conventions.html.
+A pose is camera to world with OpenGL axes (x right, y up, looks along -Z). Errors name the key.
 """
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -17,18 +15,36 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from trilane.arrays import F64
 from trilane.errors import BadInputError
-from trilane.scene.camera.distortion import Bent, distortion_note
-from trilane.scene.camera.field_of_view import checked
-from trilane.scene.camera.json_object import read_object
-from trilane.scene.camera.map_frame import Unit
-from trilane.scene.camera.recorded import RawCamera
-from trilane.scene.camera.untimed import times_without
-from trilane.scene.detected import Detected
-from trilane.scene.lens import Known, Lens, centred, of_fov_x, of_fov_y
+from trilane.files import read_text, whole_number
+from trilane.scene.camera.recorded import FILM_RATE_HZ, RawCamera, Unit, times_without
+from trilane.scene.lens import (
+    Bent,
+    Known,
+    Lens,
+    centred,
+    checked_lens,
+    distortion_note,
+    measured_lens,
+    of_fov_x,
+    of_fov_y,
+)
+from trilane.scene.recordings import Detected
+from trilane.scene.rotations import matrix_from_quat, normalised
 
-FILE = "transforms.json"
-EXPECTED = "a NeRF transforms.json: `frames`, each with a 4x4 `transform_matrix`"
+
+def read_object(path: Path, expected: str) -> dict[str, Any]:
+    """The object in `path`, `expected` in words; empty for another value. Raises BadInputError for what is no JSON."""
+    try:
+        content = json.loads(read_text(path, expected), parse_int=whole_number)
+    except (ValueError, RecursionError) as error:
+        raise BadInputError(path, f"no valid JSON ({error})", expected) from None
+    return content if isinstance(content, dict) else {}
+
+
+NERF_FILE = "transforms.json"
+NERF = "a NeRF transforms.json: `frames`, each with a 4x4 `transform_matrix`"
 DEFAULT_ANGLE_X = math.radians(50.0)
 DEFAULT_ASPECT = 4 / 3
 MAX_FRAMES = 100_000
@@ -43,18 +59,24 @@ NO_LENS_REMEDY = "cut the pictures into perspective ones first (ns-process-data 
 
 
 def load_nerf(path: Path, rate_hz: float | None = None) -> RawCamera:
-    """Read `path`, the file or its folder. `rate_hz`: of the scene. Raises BadInputError naming the key."""
-    path = path / FILE if path.is_dir() else path
-    content = read_object(path, EXPECTED)
+    """Read a NeRF `transforms.json`, or its folder: `frames[].transform_matrix`, 4x4, usually Z up, no times.
+
+    The lens is that of the frame, else that of the file: `fl_x`, `fl_y`, `cx`, `cy` in pixels of `w` x `h`, or an
+    angle. Distortion is left out and noted. nerfstudio makes such files of the exports of Polycam and Record3D.
+    `rate_hz`: frames a second by the scene. Raises BadInputError naming the key.
+    Format: https://docs.nerf.studio/quickstart/data_conventions.html.
+    """
+    path = path / NERF_FILE if path.is_dir() else path
+    content = read_object(path, NERF)
     if not isinstance(content.get("frames"), list):
-        raise BadInputError(path, "no list `frames`", EXPECTED)
+        raise BadInputError(path, "no list `frames`", NERF)
     frames = content["frames"]
     if not 1 <= len(frames) <= MAX_FRAMES:
         raise BadInputError(f"{path}: frames", f"{len(frames)} frames", f"1 to {MAX_FRAMES}")
     matrices = np.stack([_matrix(path, k, frame) for k, frame in enumerate(frames)])
     turns, places = matrices[:, :3, :3], matrices[:, :3, 3]
     times, how = times_without(turns, rate_hz)
-    lenses, source = _lenses(path, content, frames)
+    lenses, source = _nerf_lenses(path, content, frames)
     notes = (
         f"NeRF transforms, {len(frames)} views, no times: {how}, camera to world",
         *_distortion(path, content, frames, lenses),
@@ -65,13 +87,13 @@ def load_nerf(path: Path, rate_hz: float | None = None) -> RawCamera:
     )
 
 
-def _lenses(path: Path, content: Mapping[str, Any], frames: Sequence[Any]) -> tuple[tuple[Lens, ...], str]:
+def _nerf_lenses(path: Path, content: Mapping[str, Any], frames: Sequence[Any]) -> tuple[tuple[Lens, ...], str]:
     """One lens for all views, or one for each where a view has a key of its own; and where they come from."""
     _check_models(path, (content, *frames))
     if not any(key in frame for frame in frames if isinstance(frame, dict) for key in LENS_KEYS):
-        lens, source = _lens(path, content, "")
+        lens, source = _nerf_lens(path, content, "")
         return (lens,), source
-    own = [_lens(path, {**content, **frame}, f"frames[{k}].") for k, frame in enumerate(frames)]
+    own = [_nerf_lens(path, {**content, **frame}, f"frames[{k}].") for k, frame in enumerate(frames)]
     sources = dict.fromkeys(source for _, source in own)
     return tuple(lens for lens, _ in own), f"{' or '.join(sources)}, frame by frame"
 
@@ -139,10 +161,10 @@ def _is_singular(matrix: NDArray[np.float64]) -> bool:
     return bool(not lengths.all() or abs(np.linalg.det(square / lengths)) < LEAST_DETERMINANT)
 
 
-def _lens(path: Path, content: Mapping[str, Any], of: str) -> tuple[Lens, str]:
+def _nerf_lens(path: Path, content: Mapping[str, Any], of: str) -> tuple[Lens, str]:
     """The lens, and where it comes from. `of`: the beginning of its keys, for messages."""
     lens, source = _measured(path, content, of)
-    return checked(f"{path}: {of.rstrip('.')}" if of else path, lens), source
+    return checked_lens(f"{path}: {of.rstrip('.')}" if of else path, lens), source
 
 
 def _measured(path: Path, content: Mapping[str, Any], of: str) -> tuple[Lens, str]:
@@ -188,4 +210,80 @@ def _number(where: str, value: Any, key: str) -> float | None:
         raise BadInputError(where, repr(value)[:40], "a positive number")
     if key.startswith("camera_angle") and value >= math.pi:
         raise BadInputError(where, f"{value:g}", "an angle in radians below pi")
+    return float(value)
+
+
+RECORD3D_FILE = "metadata.json"
+RECORD3D = "Record3D's metadata: `poses`, `K`, `w` and `h`"
+
+
+def load_record3d(path: Path, rate_hz: float | None = None) -> RawCamera:
+    """Read Record3D's `metadata.json`, or its folder: a pose `qx qy qz qw tx ty tz`, a time and a lens of each frame.
+
+    The world is ARKit's: levelled, Y up, metres. The lens is `perFrameIntrinsicCoeffs` (fx, fy, cx, cy), else `K`,
+    column by column, in pixels of `w` x `h`. Times are `frameTimestamps`, else by `fps`.
+    `rate_hz`: frames a second by the scene. Raises BadInputError naming the key.
+    Format: keys of the exports of https://record3d.app, as nerfstudio's `process_data/record3d_utils.py` takes them.
+    """
+    path = path / RECORD3D_FILE if path.is_dir() else path
+    content = read_object(path, RECORD3D)
+    if "poses" not in content:
+        raise BadInputError(path, "no `poses`", RECORD3D)
+    poses = _array(path, content, "poses", 7)
+    if not 1 <= len(poses) <= MAX_FRAMES:
+        raise BadInputError(f"{path}: poses", f"{len(poses)} poses", f"1 to {MAX_FRAMES}")
+    turns = matrix_from_quat(normalised(poses[:, [3, 0, 1, 2]]))
+    times, rate = _times(path, content, len(poses), rate_hz)
+    lenses, source = _lenses(path, content, len(poses))
+    notes = (f"Record3D, {len(poses)} poses, {rate}, camera to world",)
+    detected = Detected("Record3D metadata", "JSON with `poses`", unit="m", rate=rate)
+    return RawCamera(
+        times, turns, poses[:, 4:], "y", lenses, source, notes, lambda k: f"poses[{k}]", detected, is_levelled=True
+    )
+
+
+def _array(path: Path, content: Mapping[str, Any], key: str, columns: int) -> F64:
+    """The table (N, columns) at `key`. Raises BadInputError."""
+    try:
+        array = np.array(content.get(key), dtype=np.float64)
+    except (TypeError, ValueError):
+        raise BadInputError(f"{path}: {key}", "something else than numbers", f"rows of {columns} numbers") from None
+    if array.ndim != 2 or array.shape[1] != columns:
+        raise BadInputError(f"{path}: {key}", f"shape {array.shape}", f"rows of {columns} numbers")
+    return array
+
+
+def _times(path: Path, content: Mapping[str, Any], count: int, rate_hz: float | None) -> tuple[F64, str]:
+    """Seconds (N,) of the poses, and where they come from."""
+    if rate_hz is None and content.get("frameTimestamps"):
+        values = content["frameTimestamps"]
+        rows = {"frameTimestamps": [[value] for value in values] if isinstance(values, list) else None}
+        times = _array(path, rows, "frameTimestamps", 1)[:, 0]
+        if len(times) == count:
+            return times - times[np.isfinite(times).argmax()], "by `frameTimestamps`"
+    fps = content.get("fps")
+    own = float(fps) if isinstance(fps, int | float) and not isinstance(fps, bool) and 0 < fps <= 1000 else None
+    rate = rate_hz or own or FILM_RATE_HZ
+    how = "as given" if rate_hz else "by `fps`" if own else "assumed"
+    return np.arange(count) / rate, f"{rate:g} a second {how}"
+
+
+def _lenses(path: Path, content: Mapping[str, Any], count: int) -> tuple[tuple[Lens, ...], str]:
+    """One lens for all poses or one for each, and where they come from."""
+    width, height = (_side(path, content, key) for key in ("w", "h"))
+    if content.get("perFrameIntrinsicCoeffs"):
+        rows = _array(path, content, "perFrameIntrinsicCoeffs", 4)
+        if len(rows) != count:
+            where = f"{path}: perFrameIntrinsicCoeffs"
+            raise BadInputError(where, f"{len(rows)} rows", f"{count}, one for each of `poses`")
+        named = ((f"{path}: perFrameIntrinsicCoeffs[{k}]", row) for k, row in enumerate(rows))
+        return tuple(measured_lens(where, width, height, row) for where, row in named), "by the file, frame by frame"
+    matrix = _array(path, {"K": [content.get("K")]}, "K", 9)[0]
+    return (measured_lens(f"{path}: K", width, height, matrix[[0, 4, 6, 7]]),), "by `K`"
+
+
+def _side(path: Path, content: Mapping[str, Any], key: str) -> float:
+    value = content.get(key)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 1 <= value <= 1e6:
+        raise BadInputError(f"{path}: {key}", repr(value)[:40], "a side of the picture in pixels")
     return float(value)
