@@ -14,7 +14,7 @@ from trilane.body.body import ShapedBody
 from trilane.scene.camera.files import load_camera
 from trilane.scene.camera_placement import place_camera
 from trilane.scene.footage import Footage, filmed
-from trilane.scene.motion.load import load_motion
+from trilane.scene.motion.files import load_motion
 from trilane.scene.mover import Mover, make_mover
 from trilane.scene.placed_camera import PlacedCamera
 from trilane.scene.schema import Scene

@@ -1,9 +1,8 @@
 """Puts recorded joints on the 55 SMPL-X joints of an avatar.
 
-Rule: turns come from places: limbs point where the recorded ones point, pelvis and trunk turn as hip line, trunk and
-shoulder line do (`trunk_turns.py`), and the file's own turns only tell how limbs twist (`limb_turns.py`) and how head
-and toes turn. So neither a file's zero pose nor its axes matter. A joint that the file does not have follows its
-parent.
+Turns come from places: limbs point where the recorded ones point; pelvis and trunk turn as hip line, trunk and shoulder
+line do. The file's own turns tell only how limbs twist (`turns.py`), and how head and toes turn. So neither a file's
+zero pose nor its axes matter. A joint that the file does not have follows its parent.
 """
 
 from __future__ import annotations
@@ -14,15 +13,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import F64
-from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS
-from trilane.scene.motion.frame_turns import level_with, transposed, turned
-from trilane.scene.motion.limb_turns import Evidence, hinge, limb_turns, swung
-from trilane.scene.motion.motion import JOINTS
-from trilane.scene.motion.standing import built_alike, leg_length, planted_frames, standing_frames, upward
-from trilane.scene.motion.tracks import SIDES, Tracks, angle_between, at_rest, unit
-from trilane.scene.motion.trunk_turns import (
+from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS, JOINTS
+from trilane.scene.motion.tracks import (
+    SIDES,
+    Tracks,
+    angle_between,
+    at_rest,
+    built_alike,
+    leg_length,
+    planted_frames,
+    standing_frames,
+    unit,
+    upward,
+)
+from trilane.scene.motion.turns import (
+    Evidence,
+    hinge,
+    level_with,
+    limb_turns,
+    swung,
+    transposed,
     trunk_line,
     trunk_of,
+    turned,
     turns_of_collars,
     turns_of_neck,
     turns_of_trunk,

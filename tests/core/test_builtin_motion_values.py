@@ -10,8 +10,7 @@ import pytest
 
 from trilane.body.joints import JOINT_INDEX, JOINT_NAMES
 from trilane.scene.motion import builtin
-from trilane.scene.motion.arm_poses import hanging_arm, relaxed_hands, waving_arm
-from trilane.scene.motion.builtin import BUILD, BUILTIN, SWINGS
+from trilane.scene.motion.builtin import BUILD, BUILTIN, SWINGS, hanging_arm, relaxed_hands, waving_arm
 from trilane.scene.motion.footsteps import FootTrack, Swing, Walker, blurred, smooth_step, solve_leg
 from trilane.scene.motion.motion import Wrap
 from trilane.scene.rotations import about, matrix_from_rotvec, rotvec_from_matrix

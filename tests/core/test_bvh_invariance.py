@@ -17,8 +17,8 @@ from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS
 from trilane.body.kinematics import Skeleton
 from trilane.body.skinning import CpuSkinner
 from trilane.scene.motion.builtin import BUILTIN
-from trilane.scene.motion.bvh_joint_names import DIALECTS
-from trilane.scene.motion.load import load_motion
+from trilane.scene.motion.files import load_motion
+from trilane.scene.motion.joint_names import DIALECTS
 from trilane.scene.motion.motion import Motion
 from trilane.scene.schema import AvatarSpec
 

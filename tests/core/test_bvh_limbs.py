@@ -11,8 +11,8 @@ import pytest
 from trilane.body.joints import JOINT_INDEX, JOINT_NAMES
 from trilane.errors import BadInputError
 from trilane.scene.motion.bvh_retarget import load_retargeted
+from trilane.scene.motion.motion import T_POSE
 from trilane.scene.motion.recorded import RawMotion
-from trilane.scene.motion.t_pose import T_POSE
 
 
 def axis_turn(axis: str, degrees: float) -> np.ndarray:

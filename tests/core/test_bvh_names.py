@@ -8,9 +8,8 @@ import pytest
 
 from trilane.body.joints import JOINT_NAMES
 from trilane.errors import BadInputError
-from trilane.scene.motion.bvh_joint_names import DIALECTS, plain
-from trilane.scene.motion.bvh_units import unit_of
-from trilane.scene.motion.joint_match import match_names
+from trilane.scene.motion.bvh_retarget import unit_of
+from trilane.scene.motion.joint_names import DIALECTS, match_names, plain
 
 BODY = """pelvis left_hip right_hip spine1 left_knee right_knee spine2 left_ankle right_ankle spine3 left_foot
 right_foot neck left_collar right_collar head left_shoulder right_shoulder left_elbow right_elbow

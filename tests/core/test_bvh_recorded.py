@@ -10,7 +10,7 @@ from trilane.body.body import ShapedBody
 from trilane.body.joints import JOINT_INDEX, JOINT_PARENTS
 from trilane.body.kinematics import Skeleton
 from trilane.body.skinning import CpuSkinner
-from trilane.scene.motion.load import load_motion
+from trilane.scene.motion.files import load_motion
 from trilane.scene.motion.motion import Motion
 from trilane.scene.mover import make_mover
 from trilane.scene.schema import AvatarSpec

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from trilane.scene.camera.files import load_camera
-from trilane.scene.motion.load import load_motion
+from trilane.scene.motion.files import load_motion
 from trilane.scene.schema import AvatarSpec, CameraSpec
 
 

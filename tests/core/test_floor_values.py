@@ -16,7 +16,7 @@ from trilane.body.skinning import CpuSkinner
 from trilane.scene.body_outline import DIRECTIONS, feet, outline
 from trilane.scene.floor import floor_lift, ground_rule, leg_length
 from trilane.scene.motion.motion import Motion, Wrap
-from trilane.scene.motion.stance import stance
+from trilane.scene.motion.recorded import stance
 from trilane.scene.mover import make_mover
 from trilane.scene.schema import AvatarSpec
 

@@ -7,9 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from trilane.scene.motion.frame_turns import frames_along, least_turns, level_with, mean_turn
-from trilane.scene.motion.limb_turns import hinge, limb_turns
 from trilane.scene.motion.tracks import angle_between, unit
+from trilane.scene.motion.turns import frames_along, hinge, least_turns, level_with, limb_turns, mean_turn
 from trilane.scene.rotations import about
 
 X, Y, Z = np.eye(3)

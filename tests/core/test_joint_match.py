@@ -8,8 +8,7 @@ import pytest
 
 from trilane.body.joints import JOINT_NAMES
 from trilane.errors import BadInputError
-from trilane.scene.motion.bvh_joint_names import DIALECTS, plain
-from trilane.scene.motion.joint_match import REQUIRED, match_names
+from trilane.scene.motion.joint_names import DIALECTS, REQUIRED, match_names, plain
 
 HERE = Path("a.bvh")
 BODY = tuple(

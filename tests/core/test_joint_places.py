@@ -11,12 +11,10 @@ from hypothesis import strategies as st
 
 from trilane.body.joints import JOINT_NAMES
 from trilane.errors import BadInputError
-from trilane.scene.motion.array_files import load_npy
+from trilane.scene.motion.array_files import load_npy, places_in
 from trilane.scene.motion.builtin import walk_wave_turn
-from trilane.scene.motion.joint_places import places_in
-from trilane.scene.motion.motion import Motion
+from trilane.scene.motion.motion import T_POSE, Motion
 from trilane.scene.motion.recorded import RawMotion
-from trilane.scene.motion.t_pose import T_POSE
 from trilane.scene.rotations import matrix_from_rotvec
 from trilane.testing.joint_chain import chained_places, degrees_between, limb_directions
 

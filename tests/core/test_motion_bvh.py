@@ -12,10 +12,9 @@ from hypothesis import strategies as st
 from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS
 from trilane.errors import BadInputError
 from trilane.scene.motion.bvh import load_bvh
-from trilane.scene.motion.bvh_joint_names import DIALECTS, plain
-from trilane.scene.motion.load import load_motion
-from trilane.scene.motion.motion import Motion
-from trilane.scene.motion.t_pose import T_POSE
+from trilane.scene.motion.files import load_motion
+from trilane.scene.motion.joint_names import DIALECTS, plain
+from trilane.scene.motion.motion import T_POSE, Motion
 from trilane.scene.rotations import about, matrix_from_rotvec
 from trilane.scene.schema import AvatarSpec
 

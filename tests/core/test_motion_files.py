@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from trilane.errors import BadInputError
-from trilane.scene.motion.load import load_motion
+from trilane.scene.motion.files import load_motion
 from trilane.scene.motion.motion import Motion, Wrap
 from trilane.scene.rotations import matrix_from_rotvec
 from trilane.scene.schema import AvatarSpec

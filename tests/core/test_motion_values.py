@@ -13,10 +13,10 @@ from trilane.body.joints import JOINT_INDEX
 from trilane.errors import BadInputError
 from trilane.scene.motion import recorded as recorded_module
 from trilane.scene.motion.array_files import load_npy, load_npz
-from trilane.scene.motion.load import load_motion
+from trilane.scene.motion.files import load_motion
 from trilane.scene.motion.motion import REST_PELVIS, Motion, Wrap, bracket, wrapped_time
 from trilane.scene.motion.recorded import RawMotion, motion_from_recording
-from trilane.scene.motion.smplx_npy import hands_note, median_step_rad
+from trilane.scene.motion.smpl_files import hands_note, median_step_rad
 from trilane.scene.recordings import usable_samples
 from trilane.scene.rotations import matrix_from_rotvec
 from trilane.scene.schema import AvatarSpec

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from trilane.scene.motion.bvh_retarget import UPS
-from trilane.scene.motion.on_floor import lowest
-from trilane.scene.motion.recorded import ANY, WORLD, RawMotion, motion_from_recording
+from trilane.scene.motion.recorded import ANY, WORLD, RawMotion, lowest, motion_from_recording
 from trilane.scene.rotations import matrix_from_rotvec
 
 #: Turns of the pelvis in a world with Y up: on the back, on the belly, head down; and who stands with -Y, Z or -Z up.

@@ -11,9 +11,8 @@ import pytest
 
 from trilane.errors import BadInputError
 from trilane.scene.load import scene_from
-from trilane.scene.motion.load import load_motion
+from trilane.scene.motion.files import as_played, load_motion
 from trilane.scene.motion.motion import Motion, Wrap, wrapped_time
-from trilane.scene.motion.playing import as_played
 from trilane.scene.schema import AvatarSpec
 
 

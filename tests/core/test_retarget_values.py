@@ -9,8 +9,8 @@ import pytest
 
 from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS
 from trilane.scene.motion.bvh_retarget import load_retargeted
+from trilane.scene.motion.motion import T_POSE
 from trilane.scene.motion.retarget import retarget
-from trilane.scene.motion.t_pose import T_POSE
 from trilane.scene.motion.tracks import Tracks
 from trilane.scene.rotations import about, matrix_from_rotvec
 

@@ -11,7 +11,7 @@ import pytest
 
 from trilane.errors import BadInputError
 from trilane.scene.motion.array_files import load_npy, load_npz, load_pickle
-from trilane.scene.motion.load import load_motion
+from trilane.scene.motion.files import load_motion
 from trilane.scene.motion.motion import REST_PELVIS, SMPL_REST_PELVIS
 from trilane.scene.motion.recorded import RawMotion
 from trilane.scene.rotations import matrix_from_rotvec

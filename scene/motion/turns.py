@@ -1,21 +1,138 @@
-"""Turns of pelvis, spine, neck and shoulders from places: hip line, line of the trunk, shoulder line.
+"""Turns of trunk and limbs from directions, for retargeting: where bones point, and what decides their twist.
 
-Rule: the same frames are built in the recording and in the avatar's rest pose, and a joint's turn takes one to the
-other. Programs put the joints of the trunk at different depths in the body, so in a skeleton that is not built like the
-avatar's the constant pitch of each frame is that of the frames in which the person stands straight.
+**Trunk.** The same frames are built of hip line, line of the trunk and shoulder line in the recording and in the
+avatar's rest pose; a joint's turn takes one to the other. Programs put the joints of the trunk at different depths in
+the body. So in a skeleton that is not built like the avatar's, the constant pitch of each frame is that of the frames
+in which the person stands straight.
+
+**Limbs.** A bone points where the recorded one points. The twist about it follows the file's own turns, so it never
+flips where a limb is straight. Those turns are right up to one constant angle: the angle at which elbows and knees
+bend, toes and fingers point, on average over the recording, as the avatar's do. No zero pose is needed for it.
+
+Functions take (T, 3) and (T, 3, 3) arrays and give proper rotations where their input is finite.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import F64
-from trilane.scene.motion.frame_turns import frames_along, least_turns, transposed, turned
 from trilane.scene.motion.tracks import SIDES, Tracks, unit
-from trilane.scene.rotations import about
+from trilane.scene.rotations import about, matrix_from_quat, matrix_from_rotvec, normalised
+
+#: Of a direction along another one: the part beside it that is too short to tell a turn.
+TOO_SHORT = 1e-6
+
+
+def transposed(turns: F64) -> F64:
+    """The inverse of each turn (T, 3, 3)."""
+    return np.swapaxes(turns, -1, -2)
+
+
+def turned(turns: F64, vectors: F64) -> F64:
+    """Vectors (T, 3) or (3,) under turns (T, 3, 3) or (3, 3)."""
+    return np.asarray((turns @ vectors[..., None])[..., 0])
+
+
+def beside(vectors: F64, axis: F64) -> F64:
+    """The part of vectors (T, 3) that is perpendicular to unit vectors `axis` (T, 3)."""
+    return np.asarray(vectors - (vectors * axis).sum(axis=-1, keepdims=True) * axis)
+
+
+def frames_along(exact: F64, other: F64, first: str) -> F64:
+    """Frames (T, 3, 3) with left, up and forward as columns.
+
+    `first`: `left` when `exact` (T, 3) is the left and `other` (T, 3) is towards up; `up` when it is the other way
+    round. Where both are along one line, any perpendicular direction takes the place of `other`.
+    """
+    a = unit(exact)
+    b = beside(unit(other), a)
+    along = np.linalg.norm(b, axis=-1, keepdims=True) < TOO_SHORT
+    b = unit(np.where(along, np.cross(a, np.eye(3)[np.abs(a).argmin(axis=-1)]), b) if along.any() else b)
+    left, up = (a, b) if first == "left" else (b, a)
+    return np.stack([left, up, np.cross(left, up)], axis=-1)
+
+
+def least_turns(source: F64, target: F64) -> F64:
+    """The turn (T, 3, 3) of the least angle from each direction `source` (T, 3) to `target` (T, 3).
+
+    As a quaternion it is (1 + cos, cross product), at unit length. Between opposite directions the axis is any
+    perpendicular one.
+    """
+    a, b = unit(source), unit(target)
+    a, b = np.broadcast_arrays(a, b)
+    axis, cosine = np.cross(a, b), (a * b).sum(axis=-1)
+    opposite = cosine < -1 + TOO_SHORT**2
+    if opposite.any():
+        axis = np.where(opposite[..., None], np.cross(a, np.eye(3)[np.abs(a).argmin(axis=-1)]), axis)
+    quats = np.concatenate([np.where(opposite, 0.0, 1 + cosine)[..., None], axis], axis=-1)
+    return matrix_from_quat(normalised(quats))
+
+
+def mean_turn(turns: F64) -> F64:
+    """The rotation (3, 3) nearest to the mean of turns (T, 3, 3), in the sense of least squares of their entries.
+
+    Moakher, "Means and averaging in the group of rotations", SIAM J. Matrix Analysis 24(1), 2002.
+    """
+    u, _, v = np.linalg.svd(turns.mean(axis=0))
+    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v)
+
+
+def level_with(turns: F64, base: F64, where: NDArray[np.bool_]) -> F64:
+    """`turns` (T, 3, 3), with a constant turn before them, so that on average over `where` (T,) they equal `base`."""
+    return np.asarray(turns @ mean_turn(transposed(base[where]) @ turns[where]).T)
+
+
+#: Of a sine: below it a limb counts as straight, so that a knee bent backwards a little turns nothing round.
+LEAST_BEND = np.sin(np.radians(15.0))
+
+#: What tells the twist: a direction in the avatar at rest (3,), and where it points in the recording (T, 3); how long
+#: these are beside the bone is their weight.
+Evidence = tuple[F64, F64]
+
+
+def limb_turns(bone: F64, recorded: F64, carrier: F64, evidence: Sequence[Evidence]) -> F64:
+    """Global turns (T, 3, 3) that lay the avatar's rest bone (3,) on the recorded ones (T, 3).
+
+    `carrier` (T, 3, 3): turns that the bone takes part in, of which only the change over time counts. `evidence`: what
+    tells the twist; without any it is the least one from the rest pose to the carrier.
+    """
+    target = unit(recorded)
+    within = unit(turned(transposed(carrier), target).mean(axis=0))
+    held = least_turns(turned(carrier, within), target) @ carrier
+    laid = least_turns(bone[None], within[None])[0]
+    return np.asarray(held @ _twist(held, within, laid, evidence) @ laid)
+
+
+def _twist(held: F64, axis: F64, laid: F64, evidence: Sequence[Evidence]) -> F64:
+    """The turn (3, 3) about `axis` (3,) that brings all of the evidence closest to the recorded directions."""
+    cosine = sine = 0.0
+    inside = transposed(held)
+    for ours, theirs in evidence:
+        expected = unit(beside((laid @ ours)[None], axis[None]))
+        found = beside(turned(inside, theirs), axis[None]).sum(axis=0)
+        cosine += float(found @ expected[0])
+        sine += float(found @ np.cross(axis, expected[0]))
+    if np.hypot(cosine, sine) < TOO_SHORT:
+        return np.eye(3)
+    return matrix_from_rotvec(axis * np.arctan2(sine, cosine))
+
+
+def hinge(upper: F64, lower: F64) -> F64:
+    """Axes (T, 3) about which a limb bends from `upper` to `lower` (T, 3); the more it bends the longer, up to 1."""
+    axes = np.cross(unit(upper), unit(lower))
+    sines = np.linalg.norm(axes, axis=-1, keepdims=True)
+    return np.asarray(axes * np.clip(1 - LEAST_BEND / np.maximum(sines, TOO_SHORT), 0.0, 1.0))
+
+
+def swung(parent: F64, bone: F64, recorded: F64) -> F64:
+    """Turns (T, 3, 3) that lay `bone` (3,) on the recorded ones (T, 3) with the least turn from `parent` (T, 3, 3)."""
+    return least_turns(turned(parent, bone), recorded) @ parent
+
 
 SPINE = ("spine1", "spine2", "spine3")
 #: What the line of the trunk ends at: the first that the recording has.
