@@ -44,7 +44,7 @@ class Known(Enum):
 TURNED = {**{known: known for known in Known}, Known.WIDTH: Known.HEIGHT, Known.HEIGHT: Known.WIDTH}
 
 
-class Cut(NamedTuple):
+class PictureCut(NamedTuple):
     """A picture is scaled to `height` x `width` pixels, of which `top` rows and `left` columns are cut off first."""
 
     height: int
@@ -53,11 +53,11 @@ class Cut(NamedTuple):
     left: int
 
 
-def cover(picture: Shape, output: Shape) -> Cut:
+def cover(picture: Shape, output: Shape) -> PictureCut:
     """How `picture` covers `output`, both (height, width): scaled until no border is left, the overhang cut equally."""
     scale = max(output[0] / picture[0], output[1] / picture[1])
     height, width = (max(side, round(full * scale)) for side, full in zip(output, picture, strict=True))
-    return Cut(height, width, (height - output[0]) // 2, (width - output[1]) // 2)
+    return PictureCut(height, width, (height - output[0]) // 2, (width - output[1]) // 2)
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,7 @@ from trilane.avatars.network_checks import check_network
 from trilane.body.body import Body, ShapedBody
 from trilane.errors import BadInputError
 from trilane.pipeline.shared_assets import Assets
-from trilane.scene.staged_arrays import staged_from_arrays, staged_to_arrays
-from trilane.scene.staging import Staged
+from trilane.scene.staging import Staged, staged_from_arrays, staged_to_arrays
 from trilane.stages.config import RunConfig
 from trilane.stages.gpu.packed_pass import Quantisation
 

@@ -9,21 +9,21 @@ from pydantic import Field, field_validator
 
 from trilane.pipeline.description import UnitSettings
 from trilane.scene.planner import ALL_WORK, TensorBudget
-from trilane.scene.schema import Model, Scene
+from trilane.scene.schema import Scene, StrictModel
 from trilane.shapes import Shape, shape_buckets
 from trilane.transport.live_window import LiveWindow
 from trilane.unexpected_value import UnexpectedValue
 from trilane.units import UnitName
 
 
-class NetworkCut(Model):
+class NetworkCut(StrictModel):
     """The network is cut at quantised tensor `at`; what follows runs on `unit`."""
 
     at: str
     unit: UnitName
 
 
-class RunConfig(Model):
+class RunConfig(StrictModel):
     """One run of the avatar, as plain data. Paths are absolute and were checked by the parent.
 
     `scene`: what is shown, and with what avatars.

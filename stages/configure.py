@@ -28,9 +28,8 @@ from trilane.install import EGL_LINE
 from trilane.near_miss import did_you_mean
 from trilane.pipeline.shared_assets import Assets
 from trilane.scene.footage import Footage
-from trilane.scene.load import find_scene, load_scene, located, scene_from
 from trilane.scene.planner import TensorBudget
-from trilane.scene.schema import Scene
+from trilane.scene.schema import Scene, find_scene, load_scene, located, scene_from
 from trilane.scene.staging import Staged, stage_scene
 from trilane.stages.avatar_assets import AvatarData, load_avatar, pack_assets, require_one_tensor
 from trilane.stages.config import NetworkCut, RunConfig

@@ -17,9 +17,20 @@ from trilane.avatars.network_reshape import STRIDE, reshaped
 from trilane.body.body import ShapedBody
 from trilane.body.kinematics import Skeleton
 from trilane.scene.crop import Rect
-from trilane.scene.planner import Look, TensorBudget, area, foreseen_changes, ideal_shape
+from trilane.scene.planner import (
+    MOST_SHAPES,
+    Demand,
+    LookAhead,
+    ShapeSet,
+    TensorBudget,
+    area,
+    choose_shapes,
+    foreseen_changes,
+    ideal_shape,
+    joined,
+    larger_shapes,
+)
 from trilane.scene.schema import Scene
-from trilane.scene.shape_set import MOST_SHAPES, Demand, ShapeSet, choose_shapes, joined, larger_shapes
 from trilane.scene.staging import Staged
 from trilane.shapes import Shape
 from trilane.stages.cpu.mesh_bounds import MeshBounds
@@ -94,7 +105,8 @@ def foresee(
     frames = tuple(index * scene.frames // count for index in range(count))
     output = (scene.output.height, scene.output.width)
     looks = [
-        Look(frame, rects) for frame, rects in zip(frames, foreseen_rects(scene, staged, bodies, frames), strict=True)
+        LookAhead(frame, rects)
+        for frame, rects in zip(frames, foreseen_rects(scene, staged, bodies, frames), strict=True)
     ]
     seen = [list(look.rects.values()) for look in looks if look.rects]
     are_close = scene.frames <= MOST_APART * count
@@ -120,7 +132,7 @@ def foresee(
 
 
 def _foreseen(
-    looks: Sequence[Look], output: Shape, shapes: Sequence[Shape], budget: TensorBudget, room: tuple[int, int]
+    looks: Sequence[LookAhead], output: Shape, shapes: Sequence[Shape], budget: TensorBudget, room: tuple[int, int]
 ) -> tuple[tuple[Shape, ...], tuple[tuple[int, Shape], ...]]:
     """Shapes to make ready beside `shapes`, which spare changes by being good for more frames, and all changes then.
 

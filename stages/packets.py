@@ -37,7 +37,7 @@ AVATAR_DTYPE = np.dtype(
 def pose_dtype(avatars: int) -> np.dtype[Any]:
     """Layout of the header of a packet with `avatars` avatars.
 
-    `work`: a number of `trilane.scene.work.Work`. `picture`: number of the frame whose picture of the avatars is shown,
+    `work`: a number of `FrameWork`. `picture`: number of the frame whose picture of the avatars is shown,
     -1 when none is. `repeats`: of a composited frame, 0 when it was drawn, else 1 + the number of the frame that was
     drawn with the same bytes. `media_time_s`: time in motion and camera. `view`: world to camera. `projection`: OpenGL
     clip matrix; both row-major for column vectors. `tensor_shape`: height, width of the tensor (the shape bucket) of

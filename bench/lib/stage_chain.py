@@ -19,7 +19,7 @@ from trilane.pipeline.description import Pipeline
 from trilane.pipeline.shared_assets import Assets
 from trilane.pipeline.stage import Skip, UnitContext
 from trilane.pipeline.unit_loop import factory_named
-from trilane.scene.work import Work
+from trilane.scene.planner import FrameWork
 from trilane.stages.avatar_assets import network_of
 from trilane.stages.avatar_pipeline import avatar_pipeline
 from trilane.stages.configure import Checked
@@ -124,7 +124,7 @@ class AvatarFrames:
     def tensor(self) -> str:
         """Height x width of the last frame's tensor; `none` when nobody was seen and none was made."""
         height, width = self.posed["tensor_shape"].tolist()
-        return f"{height}x{width}" if int(self.posed["work"]) == Work.FULL else "none"
+        return f"{height}x{width}" if int(self.posed["work"]) == FrameWork.FULL else "none"
 
     def _picture(self, packet: Packet) -> U8:
         height, width, channels = self._shape

@@ -20,13 +20,13 @@ import numpy as np
 
 from trilane.errors import BadInputError
 from trilane.files import read_text, require_file
-from trilane.scene.camera.recorded import OPENGL_FROM_OPTICAL, RawCamera, Unit, times_without
+from trilane.scene.camera.recorded import OPENGL_FROM_OPTICAL, LengthUnit, RawCamera, times_without
 from trilane.scene.lens import Bent, Lens, checked_lens, distortion_note
 from trilane.scene.recordings import Detected
 from trilane.scene.rotations import matrix_from_quat, normalised
 
 
-class Model(NamedTuple):
+class CameraModel(NamedTuple):
     """`parameters`: their names, in order; `f` is both focal lengths, `k` the first of radial distortion."""
 
     name: str
@@ -37,17 +37,17 @@ class Model(NamedTuple):
 _F, _FXY = ("f", "cx", "cy"), ("fx", "fy", "cx", "cy")
 #: By COLMAP's number.
 MODELS = {
-    0: Model("SIMPLE_PINHOLE", _F),
-    1: Model("PINHOLE", _FXY),
-    2: Model("SIMPLE_RADIAL", (*_F, "k1")),
-    3: Model("RADIAL", (*_F, "k1", "k2")),
-    4: Model("OPENCV", (*_FXY, "k1", "k2", "p1", "p2")),
-    5: Model("OPENCV_FISHEYE", (*_FXY, "k1", "k2", "k3", "k4"), is_fisheye=True),
-    6: Model("FULL_OPENCV", (*_FXY, "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
-    7: Model("FOV", (*_FXY, "omega"), is_fisheye=True),
-    8: Model("SIMPLE_RADIAL_FISHEYE", (*_F, "k1"), is_fisheye=True),
-    9: Model("RADIAL_FISHEYE", (*_F, "k1", "k2"), is_fisheye=True),
-    10: Model("THIN_PRISM_FISHEYE", (*_FXY, "k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"), is_fisheye=True),
+    0: CameraModel("SIMPLE_PINHOLE", _F),
+    1: CameraModel("PINHOLE", _FXY),
+    2: CameraModel("SIMPLE_RADIAL", (*_F, "k1")),
+    3: CameraModel("RADIAL", (*_F, "k1", "k2")),
+    4: CameraModel("OPENCV", (*_FXY, "k1", "k2", "p1", "p2")),
+    5: CameraModel("OPENCV_FISHEYE", (*_FXY, "k1", "k2", "k3", "k4"), is_fisheye=True),
+    6: CameraModel("FULL_OPENCV", (*_FXY, "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
+    7: CameraModel("FOV", (*_FXY, "omega"), is_fisheye=True),
+    8: CameraModel("SIMPLE_RADIAL_FISHEYE", (*_F, "k1"), is_fisheye=True),
+    9: CameraModel("RADIAL_FISHEYE", (*_F, "k1", "k2"), is_fisheye=True),
+    10: CameraModel("THIN_PRISM_FISHEYE", (*_FXY, "k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"), is_fisheye=True),
 }
 BY_NAME = {model.name: model for model in MODELS.values()}
 #: Sides of pictures, in pixels, that are believed; letters of a photo's name.
@@ -84,7 +84,9 @@ class ColmapImage(NamedTuple):
     camera: int
 
 
-def checked_camera(where: str | Path, model: Model, size: tuple[float, float], values: Sequence[float]) -> ColmapCamera:
+def checked_camera(
+    where: str | Path, model: CameraModel, size: tuple[float, float], values: Sequence[float]
+) -> ColmapCamera:
     """A camera whose numbers make sense. Raises BadInputError."""
     if len(values) != len(model.parameters):
         raise BadInputError(where, f"{len(values)} parameters", f"{len(model.parameters)} of {model.name}")
@@ -275,7 +277,7 @@ def load_colmap(path: Path, rate_hz: float | None = None) -> RawCamera:
     detected = Detected("COLMAP model", f"cameras{ending} and images{ending}", rate=f"no times in the format: {rate}")
     source = "by the model" if len(lenses) == 1 else "by the model, view by view"
     return RawCamera(
-        times, turns, places, "-y", lenses, source, notes, lambda k: names[k], detected, names, unit=Unit.NONE
+        times, turns, places, "-y", lenses, source, notes, lambda k: names[k], detected, names, unit=LengthUnit.NONE
     )
 
 

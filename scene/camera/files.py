@@ -27,7 +27,7 @@ from trilane.scene.camera.pose_table import (
     MATRIX,
     POSE,
     SAY_ORDER,
-    Layout,
+    TableLayout,
     head_of,
     is_index,
     is_off,
@@ -55,7 +55,7 @@ from trilane.scene.camera.trajectories import (
     load_tum,
 )
 from trilane.scene.rotations import matrix_from_quat, normalised
-from trilane.scene.schema import CameraSpec
+from trilane.scene.schema import BUILT_IN_PREFIX, CameraSpec
 
 EXPECTED = (
     "a camera: an ARKit log, a TUM, KITTI or EuRoC trajectory, a transforms.json, odometry.csv of Stray Scanner, "
@@ -132,7 +132,7 @@ def _of_folder(path: Path) -> Guess:
     )
 
 
-def _of_table(path: Path, layout: Layout, up_axis: str) -> Guess:
+def _of_table(path: Path, layout: TableLayout, up_axis: str) -> Guess:
     columns = layout.columns
     if layout.has_pose and "frame" in layout.names:
         return Guess("stray", "column names with a frame, a place and a quaternion")
@@ -154,7 +154,7 @@ def _of_table(path: Path, layout: Layout, up_axis: str) -> Guess:
     raise BadInputError(path, f"{columns} columns", counts, OTHERS.get(columns, ""))
 
 
-def _require_pose(path: Path, layout: Layout) -> None:
+def _require_pose(path: Path, layout: TableLayout) -> None:
     """Raises BadInputError where column names have a part of a quaternion, but not the whole pose."""
     if any(name in layout.names for name in ("qw", "qx", "qy", "qz")):
         missing = ", ".join(name for name in POSE if name not in layout.names)
@@ -282,8 +282,6 @@ def _price(quats: F64, order: tuple[int, ...]) -> float:
     return price_of(matrix_from_quat(normalised(quats[:, order])) @ OPENGL_FROM_OPTICAL, "z")
 
 
-PREFIX = "builtin:"
-
 #: Readers of a path and the scene's rate.
 _READERS: dict[str, Callable[[Path, float | None], RawCamera]] = {
     "arkit": load_arkit,
@@ -304,11 +302,12 @@ def load_camera(spec: CameraSpec, base: Path) -> CameraPath:
 
     Raises BadInputError when there is no such camera or the file is unusable.
     """
-    if spec.source.startswith(PREFIX):
-        built_in = load_builtin(spec.source.removeprefix(PREFIX), spec)
+    if spec.source.startswith(BUILT_IN_PREFIX):
+        name, names = spec.source.removeprefix(BUILT_IN_PREFIX), ", ".join(BUILTIN)
+        built_in = load_builtin(name, spec)
         if built_in is None:
-            near = did_you_mean(spec.source.removeprefix(PREFIX), BUILTIN, PREFIX)
-            raise BadInputError("camera", repr(spec.source), f"{PREFIX}{{{', '.join(BUILTIN)}}} or a file", near)
+            near = did_you_mean(name, BUILTIN, BUILT_IN_PREFIX)
+            raise BadInputError("camera", repr(spec.source), f"{BUILT_IN_PREFIX}{{{names}}} or a file", near)
         return built_in
     path = base / spec.source
     guess = detect(path, spec.up_axis) if spec.format == "auto" else Guess(spec.format, "")

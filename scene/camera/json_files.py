@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from trilane.arrays import F64
 from trilane.errors import BadInputError
 from trilane.files import read_text, whole_number
-from trilane.scene.camera.recorded import FILM_RATE_HZ, RawCamera, Unit, times_without
+from trilane.scene.camera.recorded import FILM_RATE_HZ, LengthUnit, RawCamera, times_without
 from trilane.scene.lens import (
     Bent,
     Known,
@@ -83,7 +83,17 @@ def load_nerf(path: Path, rate_hz: float | None = None) -> RawCamera:
     )
     detected = Detected("NeRF transforms.json", "JSON with `frames`", rate=f"no times in the format: {how}")
     return RawCamera(
-        times, turns, places, "z", lenses, source, notes, _place_of, detected, _pictures(frames), unit=Unit.USUALLY_M
+        times,
+        turns,
+        places,
+        "z",
+        lenses,
+        source,
+        notes,
+        _place_of,
+        detected,
+        _pictures(frames),
+        unit=LengthUnit.USUALLY_M,
     )
 
 

@@ -49,7 +49,7 @@ KNOWN = {
 POSE = ("time", "x", "y", "z", "qw", "qx", "qy", "qz")
 
 
-class Table(NamedTuple):
+class NumberTable(NamedTuple):
     """`numbers` (N, columns): of each pose. `lines` (N,): in which it stands, from 1 on."""
 
     numbers: NDArray[np.float64]
@@ -60,7 +60,7 @@ class Table(NamedTuple):
         return f"line {self.lines[index]}"
 
 
-class Layout(NamedTuple):
+class TableLayout(NamedTuple):
     """How the first line of a table with numbers looks.
 
     `columns`: how many there are. `names`: what each holds, by KNOWN, "" for others; none without column names.
@@ -78,7 +78,7 @@ class Layout(NamedTuple):
         return all(name in self.names for name in POSE)
 
 
-def read_table(path: Path, columns: int, expected: str) -> Table:
+def read_table(path: Path, columns: int, expected: str) -> NumberTable:
     """The poses of `path`, at least one; `nan` and `inf` stay. Raises BadInputError with the line."""
     rows, lines = [], []
     for number, words in _rows(path, expected):
@@ -91,7 +91,7 @@ def read_table(path: Path, columns: int, expected: str) -> Table:
             raise BadInputError(f"{path}, line {number}", str(error), expected) from None
     if not rows or len(rows) > MAX_ROWS:
         raise BadInputError(path, f"{len(rows)} poses", f"1 to {MAX_ROWS}; {expected}")
-    return Table(np.array(rows), np.array(lines))
+    return NumberTable(np.array(rows), np.array(lines))
 
 
 def head_of(path: Path, columns: int, expected: str) -> NDArray[np.float64]:
@@ -101,7 +101,7 @@ def head_of(path: Path, columns: int, expected: str) -> NDArray[np.float64]:
     return np.array([row for row in numbers if len(row) == columns]).reshape(-1, columns)
 
 
-def layout_of(path: Path, expected: str) -> Layout:
+def layout_of(path: Path, expected: str) -> TableLayout:
     """Of the first line that is neither comment nor column names; no columns without one. Raises BadInputError."""
     names: tuple[str, ...] = ()
     first: list[str] = []
@@ -118,7 +118,7 @@ def layout_of(path: Path, expected: str) -> Layout:
             break
     with np.errstate(over="ignore"):
         is_ns = bool(times) and (elapsed(np.array(times))[1] > LEAST_STEP_NS or abs(times[0]) > LEAST_TIME_NS)
-    return Layout(len(first), names, has_commas, is_ns)
+    return TableLayout(len(first), names, has_commas, is_ns)
 
 
 def _number(word: str) -> list[float]:
@@ -153,7 +153,7 @@ def in_seconds(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], float, 
     return since * scale, step * scale, unit
 
 
-class Times(NamedTuple):
+class ColumnTimes(NamedTuple):
     """`since_s` (N,): since the first finite one. `unit`: of the column, `s`, `ns` or `frames`.
 
     `rate`: how many a second, for notes, such as `, 30/s`; empty where it is unknown.
@@ -164,15 +164,17 @@ class Times(NamedTuple):
     rate: str
 
 
-def times_of(column: NDArray[np.float64], rate_hz: float | None, usual_hz: float = FILM_RATE_HZ) -> Times:
+def times_of(column: NDArray[np.float64], rate_hz: float | None, usual_hz: float = FILM_RATE_HZ) -> ColumnTimes:
     """What the first column of a table says: times, or numbers of frames, of which `rate_hz` (of the scene) tells the
     rate, else `usual_hz`.
     """
     if is_index(column):
         rate = rate_hz or usual_hz
-        return Times(elapsed(column)[0] / rate, FRAMES, f", {rate:g} a second {'as given' if rate_hz else 'assumed'}")
+        return ColumnTimes(
+            elapsed(column)[0] / rate, FRAMES, f", {rate:g} a second {'as given' if rate_hz else 'assumed'}"
+        )
     since, step, unit = in_seconds(column)
-    return Times(since, unit, f", {1 / step:.4g}/s" if step > 0 else "")
+    return ColumnTimes(since, unit, f", {1 / step:.4g}/s" if step > 0 else "")
 
 
 def is_index(column: NDArray[np.float64]) -> bool:
@@ -231,7 +233,7 @@ class PoseTable:
     rate: str
     order: str
     names: Sequence[str]
-    table: Table
+    table: NumberTable
     began_s: float | None
 
     def column(self, name: str) -> F64:
@@ -268,10 +270,10 @@ def read_pose_table(
 class MatrixTable(NamedTuple):
     """`turns` (N, 3, 3) and `places` (N, 3): as the file has them. `times`: None where it has none."""
 
-    times: Times | None
+    times: ColumnTimes | None
     turns: F64
     places: F64
-    table: Table
+    table: NumberTable
 
 
 def read_matrix_table(path: Path, rate_hz: float | None, usual_hz: float, expected: str) -> MatrixTable:
@@ -293,7 +295,7 @@ def _began(times: F64, unit: str) -> float | None:
     return first if EARLIEST_S < first < LATEST_S else None
 
 
-def _require_quats(path: Path, quats: F64, table: Table) -> None:
+def _require_quats(path: Path, quats: F64, table: NumberTable) -> None:
     """Raises BadInputError when most of `quats` (N, 4), which are of `table`, have not length 1."""
     off = is_off(quats)
     if 2 * np.count_nonzero(off) <= len(off):

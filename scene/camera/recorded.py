@@ -41,7 +41,7 @@ LEAST_SPREAD = 0.02
 PATH_M = 2.0
 
 
-class Unit(Enum):
+class LengthUnit(Enum):
     """The unit of a format's lengths: metres by its definition, usually metres, or none."""
 
     METRES = "metres"
@@ -61,7 +61,7 @@ def near_origin(places: F64) -> tuple[F64, tuple[str, ...]]:
 
 
 def metres_per_unit(
-    turns: F64, places: F64, times_s: F64, fov_y_deg: float, unit: Unit, spec: CameraSpec
+    turns: F64, places: F64, times_s: F64, fov_y_deg: float, unit: LengthUnit, spec: CameraSpec
 ) -> tuple[float, tuple[str, ...]]:
     """What a length of 1 of the map is in metres, and notes on it.
 
@@ -71,9 +71,9 @@ def metres_per_unit(
     if spec.metres_per_unit is not None:
         return spec.metres_per_unit, (f"1 unit of the file is {spec.metres_per_unit:g} m, as given",)
     speed = _speed(places, times_s)
-    if unit is Unit.METRES or (unit is Unit.USUALLY_M and speed <= FASTEST_M_S):
+    if unit is LengthUnit.METRES or (unit is LengthUnit.USUALLY_M and speed <= FASTEST_M_S):
         return 1.0, ()
-    reason = "the file has no unit" if unit is Unit.NONE else f"at {speed:.0f} m/s its unit can be no metre"
+    reason = "the file has no unit" if unit is LengthUnit.NONE else f"at {speed:.0f} m/s its unit can be no metre"
     if spec.place == "none":
         return 1.0, (f"{reason}: 1 unit is taken for 1 m, as camera.place is none; camera.metres_per_unit decides",)
     scale, how = _fitting(turns, places, fov_y_deg)
@@ -324,7 +324,7 @@ class RawCamera:
     detected: Detected = NOTHING
     pictures: tuple[str, ...] = ()
     is_levelled: bool = False
-    unit: Unit = Unit.METRES
+    unit: LengthUnit = LengthUnit.METRES
     began_s: float | None = None
 
 

@@ -28,7 +28,7 @@ from trilane.scene.camera.pose_table import (
     read_table,
     times_of,
 )
-from trilane.scene.camera.recorded import FILM_RATE_HZ, OPENGL_FROM_OPTICAL, RawCamera, Unit
+from trilane.scene.camera.recorded import FILM_RATE_HZ, OPENGL_FROM_OPTICAL, LengthUnit, RawCamera
 from trilane.scene.lens import Bent, Known, Lens, centred, checked_lens, distortion_note, measured_lens, of_opencv
 from trilane.scene.recordings import Detected
 
@@ -137,7 +137,7 @@ def load_tum(path: Path, rate_hz: float | None = None) -> RawCamera:
         notes,
         place_of,
         detected,
-        unit=Unit.USUALLY_M,
+        unit=LengthUnit.USUALLY_M,
         began_s=poses.began_s,
     )
 

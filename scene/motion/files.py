@@ -23,7 +23,7 @@ from trilane.scene.motion.bvh_retarget import load_retargeted
 from trilane.scene.motion.motion import T_POSE, Motion, Wrap
 from trilane.scene.motion.recorded import RawMotion, centred, facing, motion_from_recording
 from trilane.scene.rotations import matrix_from_rotvec, rotvec_from_matrix
-from trilane.scene.schema import AvatarSpec
+from trilane.scene.schema import BUILT_IN_PREFIX, AvatarSpec
 
 WRAPS = {"repeat": Wrap.LOOP, "back-and-forth": Wrap.BOUNCE, "hold": Wrap.HOLD}
 #: A repeat that moves the body by more than this is said, metres.
@@ -91,8 +91,6 @@ def _end_notes(motion: Motion) -> tuple[str, ...]:
     return (follows,)
 
 
-PREFIX = "builtin:"
-
 _READERS: dict[str, Callable[[Path, AvatarSpec, F64], RawMotion]] = {
     ".npy": lambda path, spec, rest: load_npy(path, spec.units, rest),
     ".npz": lambda path, _spec, _rest: load_npz(path),
@@ -110,11 +108,12 @@ def load_motion(spec: AvatarSpec, base: Path, rest: F64 = T_POSE) -> Motion:
     `rest` (55, 3): rest joints of the avatar that does it, metres; those of a plain body when there is none. Raises
     BadInputError when there is no such motion or the file is unusable.
     """
-    if spec.motion.startswith(PREFIX):
-        make = BUILTIN.get(spec.motion.removeprefix(PREFIX))
+    if spec.motion.startswith(BUILT_IN_PREFIX):
+        name, names = spec.motion.removeprefix(BUILT_IN_PREFIX), ", ".join(BUILTIN)
+        make = BUILTIN.get(name)
         if make is None:
-            near = did_you_mean(spec.motion.removeprefix(PREFIX), BUILTIN, PREFIX)
-            raise BadInputError("motion", repr(spec.motion), f"{PREFIX}{{{', '.join(BUILTIN)}}} or a file", near)
+            near = did_you_mean(name, BUILTIN, BUILT_IN_PREFIX)
+            raise BadInputError("motion", repr(spec.motion), f"{BUILT_IN_PREFIX}{{{names}}} or a file", near)
         _check_named(spec, spec.motion)
         return as_played(make(), spec, spec.motion)
     path = base / spec.motion

@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from trilane.arrays import F64
-from trilane.body.joints import JOINT_NAMES
+from trilane.body.joints import JOINT_INDEX, JOINT_NAMES
 from trilane.scene.recordings import NOTHING, Detected
 from trilane.scene.rotations import quat_from_rotvec, rotvec_from_quat, slerp
 
@@ -47,6 +47,12 @@ T_POSE = _joints()
 REST_PELVIS: F64 = np.array([0.003, -0.351, 0.012])
 #: The same of SMPL's neutral body, to some 2 cm: its betas and sex move it by as much.
 SMPL_REST_PELVIS: F64 = np.array([-0.002, -0.23, 0.028])
+
+
+def rest_leg_m(joints: F64) -> float:
+    """Length of the left leg of rest `joints` (55, 3), hip to knee to ankle, metres."""
+    hip, knee, ankle = (joints[JOINT_INDEX[f"left_{name}"]] for name in ("hip", "knee", "ankle"))
+    return float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
 
 
 class Wrap(enum.Enum):

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import F64
-from trilane.body.joints import JOINT_INDEX, JOINT_PARENTS
+from trilane.body.joints import JOINT_PARENTS
 from trilane.errors import BadInputError
-from trilane.scene.motion.motion import T_POSE, Motion, Wrap
+from trilane.scene.motion.motion import T_POSE, Motion, Wrap, rest_leg_m
 from trilane.scene.recordings import NOTHING, Detected, usable_samples
 from trilane.scene.rotations import Y_UP_FROM_Z_UP, about, matrix_from_rotvec, rotvec_from_matrix
 
@@ -39,9 +39,7 @@ def joint_places(poses: F64, places: F64, leg_m: float | None) -> F64:
 
     `poses` (T, 55, 3): axis-angle. `places` (T, 3): of the pelvis, metres.
     """
-    ours = float(np.linalg.norm(T_POSE[JOINT_INDEX["left_hip"]] - T_POSE[JOINT_INDEX["left_knee"]]))
-    ours += float(np.linalg.norm(T_POSE[JOINT_INDEX["left_knee"]] - T_POSE[JOINT_INDEX["left_ankle"]]))
-    rest = T_POSE * (leg_m / ours if leg_m else 1.0)
+    rest = T_POSE * (leg_m / rest_leg_m(T_POSE) if leg_m else 1.0)
     turns = matrix_from_rotvec(poses[:, :BODY_JOINT_COUNT])
     found = np.repeat(places[:, None], BODY_JOINT_COUNT, axis=1)
     for joint, parent in enumerate(JOINT_PARENTS[1:BODY_JOINT_COUNT], 1):

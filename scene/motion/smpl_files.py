@@ -1,7 +1,7 @@
 """Motions of the SMPL family from arrays, whatever file they are in: AMASS, AIST++, GLAMR, smplx, ROMP, or one array.
 
-How a program names its arrays is a `Layout`, which is data. Joints that a layout does not have are at rest; other keys
-are ignored. Of several persons the one with the most frames is read, and a note says so.
+How a program names its arrays is an `ArrayLayout`, which is data. Joints that a layout does not have are at rest; other
+keys are ignored. Of several persons the one with the most frames is read, and a note says so.
 
 An array alone has no frame rate: where neighbouring frames are similar 30 a second are assumed, and where they differ
 by more than POSE_SET_STEP_RAD they are separate poses, one a second. ROMP saves a dict for each frame, with a row for
@@ -105,7 +105,7 @@ class PoseArray:
 
 
 @dataclass(frozen=True)
-class Layout:
+class ArrayLayout:
     """One way to name things.
 
     `place`: key of the pelvis's places, or, with `rest_pelvis` (3,), of shifts of the whole body, whose pelvis is there
@@ -142,18 +142,18 @@ _VIDEO = "no rate in the file, 30 frames/s assumed"
 
 #: The first whose needed keys a dict has is its layout.
 LAYOUTS = (
-    Layout(
+    ArrayLayout(
         "AMASS", (PoseArray("poses", WHOLE),), "trans", "betas", None, "", "z", REST_PELVIS,
     ),
-    Layout(
+    ArrayLayout(
         "AIST++", (PoseArray("smpl_poses", WHOLE),), "smpl_trans", "", 60.0,
         "60 frames/s, as AIST++ has them", "y", SMPL_REST_PELVIS, scale="smpl_scaling",
     ),
-    Layout(
+    ArrayLayout(
         "GLAMR", (PoseArray("smpl_orient_world", PELVIS), PoseArray("smpl_pose", BELOW_PELVIS)), "root_trans_world",
         "smpl_beta", 30.0, _VIDEO, "z", mask="exist_frames",
     ),
-    Layout(
+    ArrayLayout(
         "AMASS in parts",
         (
             PoseArray("root_orient", PELVIS), PoseArray("pose_body", BELOW_PELVIS),
@@ -162,7 +162,7 @@ LAYOUTS = (
         ),
         "trans", "betas", None, "", "z", REST_PELVIS,
     ),
-    Layout(
+    ArrayLayout(
         "smplx",
         (
             PoseArray("global_orient", PELVIS), PoseArray("body_pose", BELOW_PELVIS),
@@ -385,7 +385,7 @@ def motion_of(where: str, source: str, values: Any, there: str = "") -> RawMotio
     )
 
 
-def _layout_of(tables: list[Found]) -> tuple[Layout, list[Found]] | None:
+def _layout_of(tables: list[Found]) -> tuple[ArrayLayout, list[Found]] | None:
     """The first layout that one of `tables` has, and all that have it."""
     for layout in LAYOUTS:
         found = [table for table in tables if all(table.has(key) for key in layout.needs)]
@@ -394,7 +394,7 @@ def _layout_of(tables: list[Found]) -> tuple[Layout, list[Found]] | None:
     return None
 
 
-def _turns(layout: Layout, found: Found) -> JointTurns:
+def _turns(layout: ArrayLayout, found: Found) -> JointTurns:
     """The turns of all of the layout's arrays, which add up since each has joints of its own."""
     parts, notes = [], []
     for array in layout.arrays:
@@ -414,7 +414,7 @@ def _turns(layout: Layout, found: Found) -> JointTurns:
     return JointTurns(np.sum([part.turns for part in parts], axis=0), whole.columns, whole.whose, said)
 
 
-def _rate(layout: Layout, found: Found) -> tuple[float, str]:
+def _rate(layout: ArrayLayout, found: Found) -> tuple[float, str]:
     for key in RATE_KEYS:
         if found.has(key):
             value = found.numbers(key)
@@ -428,7 +428,7 @@ def _rate(layout: Layout, found: Found) -> tuple[float, str]:
     return layout.rate_hz, layout.rate_why
 
 
-def _places(layout: Layout, found: Found, frames: int) -> tuple[F64 | None, tuple[str, ...]]:
+def _places(layout: ArrayLayout, found: Found, frames: int) -> tuple[F64 | None, tuple[str, ...]]:
     """Places of the pelvis (T, 3), metres, or None; and notes."""
     key = layout.place
     if not found.has(key):
@@ -448,7 +448,7 @@ def _places(layout: Layout, found: Found, frames: int) -> tuple[F64 | None, tupl
     return (places if layout.rest_pelvis is None else layout.rest_pelvis + places), notes
 
 
-def _scale(layout: Layout, found: Found) -> float:
+def _scale(layout: ArrayLayout, found: Found) -> float:
     value = found.numbers(layout.scale)
     if value.size != 1 or not 0 < value.item() <= LARGEST_SCALE:
         where = f"{found.where}[{layout.scale}]"
@@ -456,7 +456,7 @@ def _scale(layout: Layout, found: Found) -> float:
     return float(value.item())
 
 
-def _measured(layout: Layout, found: Found, frames: int) -> NDArray[np.bool_]:
+def _measured(layout: ArrayLayout, found: Found, frames: int) -> NDArray[np.bool_]:
     """Which frames (T,) hold the person; all where the layout does not say."""
     if not found.has(layout.mask):
         return np.ones(frames, dtype=bool)
@@ -466,7 +466,7 @@ def _measured(layout: Layout, found: Found, frames: int) -> NDArray[np.bool_]:
     return np.asarray(mask != 0)
 
 
-def _betas(layout: Layout, found: Found) -> F64 | None:
+def _betas(layout: ArrayLayout, found: Found) -> F64 | None:
     """The betas of the whole motion; the mean of those that each frame has."""
     if not found.has(layout.betas):
         return None

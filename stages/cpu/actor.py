@@ -16,8 +16,7 @@ from trilane.body.detail import DETAILS, DetailBounds
 from trilane.body.kinematics import Posed, Skeleton
 from trilane.body.skinning import FrameSkinner
 from trilane.pipeline.moved_bytes import ByteCounter
-from trilane.scene.crop import SCREEN, Rect
-from trilane.scene.pixel_error import cheapest_within, error_px, least_w
+from trilane.scene.crop import SCREEN, Rect, cheapest_within, error_px, least_w
 from trilane.shapes import Shape
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 from trilane.stages.last_level_cache import moved_of_kept

@@ -21,11 +21,10 @@ from trilane.errors import TrilaneError
 from trilane.pipeline.moved_bytes import ByteCounter
 from trilane.pipeline.shared_assets import Assets
 from trilane.pipeline.stage import Skip, UnitContext
+from trilane.scene.camera_placement import steered
 from trilane.scene.mover import Mover
-from trilane.scene.planner import Held, plan_tensor
-from trilane.scene.steering import steered
+from trilane.scene.planner import FrameWork, HeldShape, plan_tensor, shown_by, work_of
 from trilane.scene.tensor_layout import lay_out
-from trilane.scene.work import Work, shown_by, work_of
 from trilane.shapes import Shape
 from trilane.stages.avatar_assets import distinct, shaped_body, staged_of
 from trilane.stages.config import RunConfig
@@ -58,7 +57,7 @@ class FramePlan:
     visible avatar.
     """
 
-    work: Work
+    work: FrameWork
     shape: Shape | None
     density: float | None
     seen: Mapping[int, Seen]
@@ -88,9 +87,9 @@ class PoseStage:
         self._buckets, self._plans_tensor = config.buckets, scene.plans_tensor
         self._budgets, self._changes = config.tensor_budgets, config.changes
         self._rung = 0
-        self._held: Held | None = None
+        self._held: HeldShape | None = None
         self._skips = scene.plan == "planned"
-        self.plan = FramePlan(Work.NONE, None, None, {})
+        self.plan = FramePlan(FrameWork.NONE, None, None, {})
         folders = distinct(config)
         bodies = {
             folder: ModelledBody(shaped_body(assets, number), bool(config.posed_vertices), config.budget_px)
@@ -104,7 +103,7 @@ class PoseStage:
         self._camera = staged.camera
         self._counts = config.posed_vertices
         self._window = config.opened_window()
-        self._made: dict[Work, _Made] = {}
+        self._made: dict[FrameWork, _Made] = {}
         self._moved = ByteCounter()
         self._was_seen = [False] * len(self._actors)
         self._slots: list[NDArray[np.void]] = []
@@ -141,12 +140,12 @@ class PoseStage:
         shown = shown_by([view, projection, *(array for pair in moved for array in pair)])
         work = self._work_of(shown, lambda: self._make(slot_out, frame, view, projection, moved))
         packet["work"] = work
-        known = self._made.get(Work.FULL if work is Work.REUSE else work)
+        known = self._made.get(FrameWork.FULL if work is FrameWork.REUSE else work)
         if self._skips and known is not None and known.shown == shown:
             _copy_same(known.header, packet)
             self.plan = replace(known.plan, work=work)
         else:
-            packet["picture"] = frame if work is Work.FULL else -1
+            packet["picture"] = frame if work is FrameWork.FULL else -1
             self.plan = replace(self.plan, work=work)
             self._made[work] = _Made(shown, packet.copy(), self.plan)
         return _metrics(self.plan, self._moved)
@@ -165,21 +164,21 @@ class PoseStage:
             return view
         return steered(view, self._actors[0].pivot(moved[0][1]), *self._window.steering)
 
-    def _work_of(self, shown: bytes, is_anybody_seen: Callable[[], bool]) -> Work:
+    def _work_of(self, shown: bytes, is_anybody_seen: Callable[[], bool]) -> FrameWork:
         if self._skips:
-            return work_of(shown, self._shown_by(Work.FULL), self._shown_by(Work.NONE), is_anybody_seen)
+            return work_of(shown, self._shown_by(FrameWork.FULL), self._shown_by(FrameWork.NONE), is_anybody_seen)
         is_anybody_seen()
-        return Work.FULL
+        return FrameWork.FULL
 
     def forget(self) -> None:
         """The next frame in which anybody is seen is a full one."""
-        self._made.pop(Work.FULL, None)
+        self._made.pop(FrameWork.FULL, None)
 
     def step_to(self, rung: int) -> None:
         """Tensors have the pixels of `RunConfig.works[rung]` from now on."""
         self._rung = rung
 
-    def _shown_by(self, work: Work) -> bytes | None:
+    def _shown_by(self, work: FrameWork) -> bytes | None:
         return self._made[work].shown if work in self._made else None
 
     def _make(self, slot_out: int, frame: int, view: F64, projection: F64, moved: Sequence[tuple[F64, F64]]) -> bool:
@@ -205,7 +204,7 @@ class PoseStage:
         """Crop rectangles, cells and the tensor's shape; the smallest shape when nothing is to be drawn."""
         if not seen:
             packet["tensor_shape"] = min(self._buckets, key=lambda shape: shape[0] * shape[1])
-            return FramePlan(Work.NONE, None, None, {})
+            return FramePlan(FrameWork.NONE, None, None, {})
         rects, density = [one.rect for _, one in seen], None
         if self._plans_tensor:
             foreseen = self._foreseen(float(packet["media_time_s"]))
@@ -217,7 +216,7 @@ class PoseStage:
         packet["tensor_shape"] = layout.shape
         for (avatar, _), (crop, cell) in zip(seen, layout.crops, strict=True):
             avatar["rect"], avatar["tensor_rect"] = crop, cell
-        return FramePlan(Work.FULL, layout.shape, density, {int(avatar["avatar"]): one for avatar, one in seen})
+        return FramePlan(FrameWork.FULL, layout.shape, density, {int(avatar["avatar"]): one for avatar, one in seen})
 
     def _foreseen(self, t_s: float) -> Shape | None:
         """The tensor's shape at `t_s`; None where it was not foreseen."""
@@ -268,7 +267,7 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> PoseStage:
 
 def _metrics(plan: FramePlan, moved: ByteCounter) -> Mapping[str, float]:
     metrics = {"visible": float(len(plan.seen)), **moved.figures()}
-    if plan.work is not Work.FULL:
+    if plan.work is not FrameWork.FULL:
         return Skip(metrics)
     if plan.seen:
         metrics["level"] = float(max(one.level for one in plan.seen.values()))

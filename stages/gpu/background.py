@@ -14,7 +14,7 @@ from trilane.arrays import U8
 from trilane.errors import BadInputError, reason
 from trilane.files import require_file
 from trilane.scene.camera.path import CameraPath
-from trilane.scene.picture_order import film_of, in_order
+from trilane.scene.footage import film_of, in_order
 from trilane.shapes import Shape
 from trilane.stages.gpu.picture_file import PHONE_PHOTOS, PICTURES, read_picture
 from trilane.stages.gpu.video_reader import VideoReader

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F64, Floats
 from trilane.pipeline.stage import UnitContext
+from trilane.scene.planner import FrameWork
 from trilane.scene.schema import PlaneSpec
-from trilane.scene.work import Work
 from trilane.shapes import Shape
 from trilane.stages.avatar_assets import distinct, shaped_body, staged_of
 from trilane.stages.config import RunConfig
@@ -94,7 +94,7 @@ class CompositeStage:
         with checked(self._ctx):
             self._take(pose, packet.payload)
             drawing = self._drawing(pose)
-            repeated = None if int(pose["work"]) == Work.FULL else self._drawn.slot_of(drawing, slot_out)
+            repeated = None if int(pose["work"]) == FrameWork.FULL else self._drawn.slot_of(drawing, slot_out)
             frame_bytes = math.prod(self._shape) * 3
             if repeated is None:
                 self._draw(pose)
@@ -105,11 +105,11 @@ class CompositeStage:
                 out.payload[:frame_bytes] = self._outputs[repeated].payload[:frame_bytes]
                 moved.copied(frame_bytes)
         out.header["repeats"] = self._drawn.note(slot_out, drawing, frame, repeated)
-        work, is_right = Work(int(pose["work"])), self._holds(int(pose["picture"]))
+        work, is_right = FrameWork(int(pose["work"])), self._holds(int(pose["picture"]))
         said = {
-            "nobody": work is Work.NONE,
-            "reused": work is Work.REUSE and is_right,
-            "stale": work is Work.REUSE and not is_right,
+            "nobody": work is FrameWork.NONE,
+            "reused": work is FrameWork.REUSE and is_right,
+            "stale": work is FrameWork.REUSE and not is_right,
             "copied": repeated is not None,
         }
         return {**{name: float(value) for name, value in said.items()}, **moved.figures()}
@@ -127,7 +127,7 @@ class CompositeStage:
                 self._shows_background += 1
                 self._picture.upload(picture)
                 counter_of(self._ctx).least += picture.nbytes
-        if int(pose["work"]) == Work.FULL:
+        if int(pose["work"]) == FrameWork.FULL:
             self._held = pose.copy()
             if _visible(pose):
                 shape = _tensor_shape(pose)
@@ -142,7 +142,7 @@ class CompositeStage:
         """What the frame's bytes depend on; None when it is like no other."""
         if self._hud is not None:
             return None
-        nobody = self._held is None or int(pose["work"]) == Work.NONE
+        nobody = self._held is None or int(pose["work"]) == FrameWork.NONE
         picture = -1 if self._held is None or nobody else int(self._held["picture"])
         return picture, self._shows_background, pose["view"].tobytes(), pose["projection"].tobytes()
 
@@ -151,7 +151,7 @@ class CompositeStage:
         self._target.use()
         shown = self._shows_background, pose["view"].tobytes(), pose["projection"].tobytes()
         self._still.draw(shown, lambda: self._draw_background(pose))
-        if self._held is not None and int(pose["work"]) != Work.NONE:
+        if self._held is not None and int(pose["work"]) != FrameWork.NONE:
             self._draw_avatars(self._held)
         if self._hud is not None:
             self._hud.draw(self._target, pose)

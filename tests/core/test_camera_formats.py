@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from trilane.errors import BadInputError
 from trilane.scene.camera.colmap import MODELS, checked_camera
 from trilane.scene.camera.path import axes_towards
-from trilane.scene.camera.recorded import Unit, looked_at_from, metres_per_unit
+from trilane.scene.camera.recorded import LengthUnit, looked_at_from, metres_per_unit
 from trilane.scene.lens import Bent, Lens, distortion_note, largest_px
 from trilane.scene.rotations import about
 from trilane.scene.schema import CameraSpec
@@ -266,23 +266,23 @@ def test_a_map_without_unit_is_scaled_by_where_its_cameras_look() -> None:
     turns = axes_towards(places, np.array([10.0, 0, 0]))
     assert looked_at_from(turns, places) == pytest.approx(5.0)
     times, spec = np.arange(9.0), CameraSpec()
-    scale, notes = metres_per_unit(turns, places, times, 60.0, Unit.NONE, spec)
+    scale, notes = metres_per_unit(turns, places, times, 60.0, LengthUnit.NONE, spec)
     assert scale == pytest.approx(1.7 / 0.75 / (2 * math.tan(math.radians(30))) / 5)
     assert "the file has no unit: 1 unit is taken for 0.3926 m" in notes[0]
     outwards = axes_towards(places, np.array([10.0, 0, 0])) @ about(1, math.pi)
     assert looked_at_from(outwards, places) is None
-    scale, _ = metres_per_unit(outwards, places, times, 60.0, Unit.NONE, spec)
+    scale, _ = metres_per_unit(outwards, places, times, 60.0, LengthUnit.NONE, spec)
     assert scale == pytest.approx(2.0 / np.linalg.norm(np.ptp(places, axis=0)))
-    for unit in (Unit.METRES, Unit.USUALLY_M):
+    for unit in (LengthUnit.METRES, LengthUnit.USUALLY_M):
         assert metres_per_unit(turns, places, times, 60.0, unit, spec) == (1.0, ())
-    fast = metres_per_unit(turns, 100 * places, times, 60.0, Unit.USUALLY_M, spec)
+    fast = metres_per_unit(turns, 100 * places, times, 60.0, LengthUnit.USUALLY_M, spec)
     assert fast[0] == pytest.approx(0.01 * 1.7 / 0.75 / (2 * math.tan(math.radians(30))) / 5)
     assert "at 125 m/s its unit can be no metre" in fast[1][0]
-    kept = metres_per_unit(turns, places, times, 60.0, Unit.NONE, CameraSpec(place="none"))
+    kept = metres_per_unit(turns, places, times, 60.0, LengthUnit.NONE, CameraSpec(place="none"))
     assert kept[0] == 1.0 and "as camera.place is none" in kept[1][0]
-    given_ = metres_per_unit(turns, places, times, 60.0, Unit.NONE, CameraSpec(metres_per_unit=0.25))
+    given_ = metres_per_unit(turns, places, times, 60.0, LengthUnit.NONE, CameraSpec(metres_per_unit=0.25))
     assert given_ == (0.25, ("1 unit of the file is 0.25 m, as given",))
-    still = metres_per_unit(turns[:1], places[:1], times[:1], 60.0, Unit.NONE, spec)
+    still = metres_per_unit(turns[:1], places[:1], times[:1], 60.0, LengthUnit.NONE, spec)
     assert still[0] == 1.0
 
 

@@ -16,10 +16,9 @@ from trilane.body.body import ShapedBody
 from trilane.scene.camera.files import load_camera
 from trilane.scene.camera.path import CameraPath
 from trilane.scene.camera.recorded import UP
-from trilane.scene.camera_placement import _from_the_middle, place_camera
+from trilane.scene.camera_placement import PlacedCamera, _from_the_middle, place_camera
 from trilane.scene.motion.builtin import BUILTIN
 from trilane.scene.mover import make_mover
-from trilane.scene.placed_camera import PlacedCamera
 from trilane.scene.rotations import about, matrix_from_quat
 from trilane.scene.schema import AvatarSpec, CameraSpec, Scene
 from trilane.testing.camera_files import LENS, RATE_HZ, VIDEO_LENS, WRITERS

@@ -11,10 +11,10 @@ from trilane.body.body import ShapedBody
 from trilane.scene import camera_placement as placement
 from trilane.scene import rotations as rot
 from trilane.scene.camera.path import CameraPath, one_lens
+from trilane.scene.camera_placement import PlacedCamera
 from trilane.scene.motion.builtin import BUILTIN
 from trilane.scene.motion.motion import Wrap
 from trilane.scene.mover import make_mover
-from trilane.scene.placed_camera import PlacedCamera
 from trilane.scene.schema import AvatarSpec, CameraSpec, OutputSpec, Scene
 
 #: Of x and of y: factor and addend to normalised device coordinates.

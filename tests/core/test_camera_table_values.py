@@ -10,7 +10,7 @@ import pytest
 from trilane.errors import BadInputError
 from trilane.scene.camera import pose_table
 from trilane.scene.camera.files import load_camera
-from trilane.scene.camera.pose_table import Layout, elapsed, layout_of, read_table
+from trilane.scene.camera.pose_table import TableLayout, elapsed, layout_of, read_table
 from trilane.scene.rotations import about
 from trilane.scene.schema import CameraSpec
 from trilane.testing.camera_files import load, nerf_text, pose_z_up, rows_of
@@ -22,7 +22,7 @@ def test_a_table_has_comments_commas_and_blank_lines(tmp_path: Path) -> None:
     table = read_table(path, 3, "three")
     assert table.numbers == pytest.approx(np.array([[1, 2, 3], [4, 5, np.nan]]), nan_ok=True)
     assert [table.place_of(index) for index in (0, 1)] == ["line 3", "line 4"]
-    assert layout_of(path, "three") == Layout(3, (), has_commas=True, is_ns=False)
+    assert layout_of(path, "three") == TableLayout(3, (), has_commas=True, is_ns=False)
     path.write_text("# only this\n")
     assert layout_of(path, "three").columns == 0
     path.write_text("1 2 3\n# x\n1 2\n")

@@ -17,8 +17,7 @@ from trilane.body.detail import CARRIED_BY, DETAILS, EVERYTHING, ROUNDING_M, Det
 from trilane.body.joints import JOINT_INDEX, JOINTS
 from trilane.body.kinematics import Skeleton
 from trilane.body.skinning import CpuSkinner, FrameSkinner
-from trilane.scene.crop import Rect
-from trilane.scene.pixel_error import cheapest_within, error_px, least_w
+from trilane.scene.crop import Rect, cheapest_within, error_px, least_w
 from trilane.scene.rotations import about
 from trilane.stages.cpu.actor import FINEST, ModelledBody, widened
 

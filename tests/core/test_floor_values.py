@@ -13,11 +13,9 @@ from trilane.body.body import ShapedBody
 from trilane.body.joints import JOINT_INDEX
 from trilane.body.kinematics import Skeleton
 from trilane.body.skinning import CpuSkinner
-from trilane.scene.body_outline import DIRECTIONS, feet, outline
-from trilane.scene.floor import floor_lift, ground_rule, leg_length
-from trilane.scene.motion.motion import Motion, Wrap
+from trilane.scene.motion.motion import Motion, Wrap, rest_leg_m
 from trilane.scene.motion.recorded import stance
-from trilane.scene.mover import make_mover
+from trilane.scene.mover import DIRECTIONS, feet, floor_lift, ground_rule, make_mover, outline
 from trilane.scene.schema import AvatarSpec
 
 
@@ -56,7 +54,7 @@ def test_a_leg_is_thigh_and_shin() -> None:
     joints[JOINT_INDEX["left_hip"]] = 0, 1, 0
     joints[JOINT_INDEX["left_knee"]] = 0.3, 0.6, 0
     joints[JOINT_INDEX["left_ankle"]] = 0.3, 0.6, -0.25
-    assert leg_length(joints) == pytest.approx(0.5 + 0.25)
+    assert rest_leg_m(joints) == pytest.approx(0.5 + 0.25)
 
 
 def still(times: list[float], heights: list[float], travels: bool = True, leg_m: float | None = None) -> Motion:
@@ -136,7 +134,7 @@ def test_feet_stand_where_they_are_low() -> None:
 
 def test_a_mover_by_hand(body: ShapedBody) -> None:
     """Legs half as long as the avatar's: places are doubled; the rest pelvis is taken off; the lift is in between."""
-    leg = leg_length(body.joints)
+    leg = rest_leg_m(body.joints)
     motion = still([0, 1], [0.5, 0.7], leg_m=leg / 2)
     spec = AvatarSpec(position=(1, 2, 3), heading_deg=90, ground="none")
     mover = make_mover(spec, motion, body)
@@ -156,7 +154,7 @@ def test_a_mover_by_hand(body: ShapedBody) -> None:
 
 @pytest.mark.parametrize(("ratio", "said"), [(1.009, False), (1.011, True), (0.991, False), (0.989, True)])
 def test_a_scale_of_more_than_a_hundredth_is_said(body: ShapedBody, ratio: float, said: bool) -> None:
-    mover = make_mover(AvatarSpec(), still([0], [1], leg_m=leg_length(body.joints) / ratio), body)
+    mover = make_mover(AvatarSpec(), still([0], [1], leg_m=rest_leg_m(body.joints) / ratio), body)
     assert mover.notes[0] == "floor: the lowest point over the motion touches it"
     assert mover.notes[1:] == ((f"places scaled by {ratio:.3f} for the avatar's legs",) if said else ())
     frame = make_mover(AvatarSpec(), still([0], [1], travels=False), body)

@@ -11,9 +11,17 @@ import pytest
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_reshape import reshaped
 from trilane.pipeline.description import UnitSettings
-from trilane.scene.planner import Look, TensorBudget, foreseen_changes, ideal_shape
+from trilane.scene.planner import (
+    Demand,
+    LookAhead,
+    ShapeSet,
+    TensorBudget,
+    choose_shapes,
+    foreseen_changes,
+    ideal_shape,
+    larger_shapes,
+)
 from trilane.scene.schema import AvatarSpec, OutputSpec, Scene
-from trilane.scene.shape_set import Demand, ShapeSet, choose_shapes, larger_shapes
 from trilane.scene.staging import Staged, stage_scene
 from trilane.shapes import shape_buckets
 from trilane.stages.avatar_assets import AvatarData, load_avatar
@@ -54,7 +62,7 @@ def test_the_shapes_are_those_of_frames_spread_over_the_scene(
     further = set(found.shapes.shapes) - set(first.shapes)
     assert further <= set(larger_shapes(first.shapes, OWN.most_of(1)))
     assert further <= {shape for _, shape in found.changes[0]} <= set(found.shapes.shapes)
-    looks = [Look(frame, rects) for frame, rects in zip(frames, rows, strict=True)]
+    looks = [LookAhead(frame, rects) for frame, rects in zip(frames, rows, strict=True)]
     expected = foreseen_changes(looks, (240, 320), found.shapes.shapes, OWN)
     assert found.changes == (tuple((frame / 30, shape) for frame, shape in expected),)
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trilane.scene.lens import Cut, Known, Lens, centred, cover, of_fov_x, of_fov_y
+from trilane.scene.lens import Known, Lens, PictureCut, centred, cover, of_fov_x, of_fov_y
 
 LENS = Lens(400.0, 300.0, 500.0, 480.0, 210.0, 140.0)
 
@@ -57,11 +57,11 @@ def test_a_photo_of_1080x1920_cut_to_810_rows() -> None:
 @pytest.mark.parametrize(
     ("picture", "output", "cut"),
     [
-        ((1080, 1920), (480, 640), Cut(480, 853, 0, 106)),  # 853.3 columns
-        ((1920, 1080), (480, 640), Cut(1138, 640, 329, 0)),  # 1137.8 rows
-        ((480, 640), (480, 640), Cut(480, 640, 0, 0)),
-        ((10, 10), (100, 30), Cut(100, 100, 0, 35)),
-        ((3, 1000), (3, 3), Cut(3, 1000, 0, 498)),
+        ((1080, 1920), (480, 640), PictureCut(480, 853, 0, 106)),  # 853.3 columns
+        ((1920, 1080), (480, 640), PictureCut(1138, 640, 329, 0)),  # 1137.8 rows
+        ((480, 640), (480, 640), PictureCut(480, 640, 0, 0)),
+        ((10, 10), (100, 30), PictureCut(100, 100, 0, 35)),
+        ((3, 1000), (3, 3), PictureCut(3, 1000, 0, 498)),
     ],
 )
 def test_a_picture_covers_the_output(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from trilane.scene.picture_order import film_of, in_order
+from trilane.scene.footage import film_of, in_order
 
 FILMS: dict[str, tuple[list[str], list[int], int, str]] = {
     "whole": (["f_1.png", "f_2.png", "f_3.jpg"], [0, 1, 2], 3, ""),

@@ -11,10 +11,9 @@ import pytest
 from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import ShapedBody, load_body
 from trilane.body.kinematics import Skeleton
-from trilane.scene.body_outline import outline
 from trilane.scene.motion.builtin import BUILTIN
 from trilane.scene.motion.motion import Motion
-from trilane.scene.mover import make_mover
+from trilane.scene.mover import make_mover, outline
 from trilane.scene.rotations import about, normalised
 from trilane.scene.schema import AvatarSpec, CameraSpec, Scene
 from trilane.scene.staging import Staged, stage_scene

@@ -16,15 +16,20 @@ from trilane.scene.planner import (
     AS_GOOD,
     MOST_DENSITY,
     PATIENCE,
-    Held,
-    Look,
+    Demand,
+    HeldShape,
+    LookAhead,
+    ShapeSet,
     TensorBudget,
     area,
+    choose_shapes,
     foreseen_changes,
     ideal_shape,
+    joined,
+    larger_shapes,
     plan_tensor,
+    serves,
 )
-from trilane.scene.shape_set import Demand, ShapeSet, choose_shapes, joined, larger_shapes, serves
 from trilane.scene.tensor_layout import MARGIN_PX, lay_out_at, tight_shape
 from trilane.shapes import shapes_within
 
@@ -248,25 +253,25 @@ SMALL, TALL, LARGE = (128, 128), (256, 128), (512, 512)
 TWO = TensorBudget(own=128 * 256, most=512 * 512)
 
 
-def held_for(rect: Rect, shapes: list[tuple[int, int]], before: Held | None = None) -> Held:
+def held_for(rect: Rect, shapes: list[tuple[int, int]], before: HeldShape | None = None) -> HeldShape:
     return plan_tensor([rect], OUTPUT, shapes, TWO, before).held
 
 
 def test_the_densest_shape_within_the_budget_is_taken() -> None:
     """A square body is as dense in 128x128 as in 256x128, which has more pixels; 512x512 has too many for one."""
     shapes = [LARGE, TALL, SMALL]
-    assert held_for(pixels(0, 0, 100, 100), shapes) == Held(SMALL)
-    assert held_for(pixels(0, 0, 100, 200), shapes) == Held(TALL)
+    assert held_for(pixels(0, 0, 100, 100), shapes) == HeldShape(SMALL)
+    assert held_for(pixels(0, 0, 100, 200), shapes) == HeldShape(TALL)
     pair = [pixels(0, 0, 100, 200), pixels(300, 0, 100, 200)]
     budget = TensorBudget(own=512 * 256, most=512 * 512)
-    assert plan_tensor(pair, OUTPUT, shapes, budget, None).held == Held(LARGE)
+    assert plan_tensor(pair, OUTPUT, shapes, budget, None).held == HeldShape(LARGE)
 
 
 def test_a_density_within_five_percent_is_as_good() -> None:
     """100x128 pixels: 128x128 is as dense as the height allows, 1; 160x128 would be 1.25, 132... of 96x128 0.96."""
-    assert held_for(pixels(0, 0, 127, 100), [(128, 128), (128, 160)]) == Held((128, 160))
-    assert held_for(pixels(0, 0, 132, 100), [(128, 128), (128, 160), (104, 136)]) == Held((128, 160))
-    assert held_for(pixels(0, 0, 125, 50), [(128, 128), (128, 130)]) == Held((128, 128))
+    assert held_for(pixels(0, 0, 127, 100), [(128, 128), (128, 160)]) == HeldShape((128, 160))
+    assert held_for(pixels(0, 0, 132, 100), [(128, 128), (128, 160), (104, 136)]) == HeldShape((128, 160))
+    assert held_for(pixels(0, 0, 125, 50), [(128, 128), (128, 130)]) == HeldShape((128, 128))
 
 
 def test_a_larger_shape_is_taken_at_once_and_a_smaller_one_after_a_while() -> None:
@@ -282,24 +287,24 @@ def test_a_larger_shape_is_taken_at_once_and_a_smaller_one_after_a_while() -> No
 
 def test_a_shape_that_is_needed_again_is_kept() -> None:
     """The frames for which a smaller one would have done are counted anew."""
-    held = held_for(pixels(0, 0, 100, 200), [SMALL, TALL], Held(TALL, None, PATIENCE))
-    assert held == Held(TALL)
-    assert held_for(pixels(0, 0, 9, 9), [SMALL, TALL], held) == Held(TALL, None, 1)
+    held = held_for(pixels(0, 0, 100, 200), [SMALL, TALL], HeldShape(TALL, None, PATIENCE))
+    assert held == HeldShape(TALL)
+    assert held_for(pixels(0, 0, 9, 9), [SMALL, TALL], held) == HeldShape(TALL, None, 1)
 
 
 def test_of_shapes_with_as_many_pixels_the_held_one_stays_while_it_is_good() -> None:
     """A square in 128x256 and in 256x128: both are 128 pixels high at most."""
     shapes = [(128, 256), (256, 128)]
     for shape in shapes:
-        assert held_for(pixels(0, 0, 100, 100), shapes, Held(shape, None, 3)) == Held(shape)
+        assert held_for(pixels(0, 0, 100, 100), shapes, HeldShape(shape, None, 3)) == HeldShape(shape)
 
 
 def test_a_shape_that_is_no_longer_ready_is_let_go() -> None:
-    assert held_for(pixels(0, 0, 50, 50), [TALL], Held(SMALL)) == Held(TALL)
+    assert held_for(pixels(0, 0, 50, 50), [TALL], HeldShape(SMALL)) == HeldShape(TALL)
 
 
 def test_where_all_shapes_have_too_many_pixels_any_may_be_taken() -> None:
-    assert held_for(pixels(0, 0, 50, 50), [LARGE]) == Held(LARGE)
+    assert held_for(pixels(0, 0, 50, 50), [LARGE]) == HeldShape(LARGE)
 
 
 def test_no_tensor_is_more_than_four_times_as_dense_as_the_picture() -> None:
@@ -328,31 +333,33 @@ def test_no_ready_shape_is_much_denser_and_none_as_good_is_smaller(rect: Rect, s
 
 def test_a_foreseen_shape_is_taken_at_once_and_then_kept() -> None:
     """A square body is good in both; the small one is not taken, however long it would do."""
-    held = held_for(pixels(0, 0, 100, 100), [SMALL, TALL], Held(SMALL))
-    assert held == Held(SMALL)
+    held = held_for(pixels(0, 0, 100, 100), [SMALL, TALL], HeldShape(SMALL))
+    assert held == HeldShape(SMALL)
     for _ in range(2 * PATIENCE):
         held = plan_tensor([pixels(0, 0, 100, 100)], OUTPUT, [SMALL, TALL], TWO, held, TALL).held
-        assert held == Held(TALL, TALL)
+        assert held == HeldShape(TALL, TALL)
 
 
 def test_a_foreseen_shape_that_is_not_good_waits_until_it_is() -> None:
     """A tall body is half as dense in the small shape, so the tall one is held; it comes with the first low body."""
-    held: Held | None = Held(TALL, TALL)
+    held: HeldShape | None = HeldShape(TALL, TALL)
     for height, expected in ((200, TALL), (200, TALL), (100, SMALL)):
         plan = plan_tensor([pixels(0, 0, 100, height)], OUTPUT, [SMALL, TALL], TWO, held, SMALL)
         held = plan.held
         assert held.shape == expected
-    assert held == Held(SMALL, SMALL)
+    assert held == HeldShape(SMALL, SMALL)
 
 
 def test_a_frame_that_was_foreseen_wrongly_gets_a_good_shape_and_keeps_it() -> None:
     """For one tall body the tall shape is taken; the foreseen small one comes back with what is foreseen next."""
-    held = plan_tensor([pixels(0, 0, 100, 200)], OUTPUT, [SMALL, TALL], TWO, Held(SMALL, SMALL), SMALL).held
-    assert held == Held(TALL, SMALL)
+    held = plan_tensor([pixels(0, 0, 100, 200)], OUTPUT, [SMALL, TALL], TWO, HeldShape(SMALL, SMALL), SMALL).held
+    assert held == HeldShape(TALL, SMALL)
     held = plan_tensor([pixels(0, 0, 100, 100)], OUTPUT, [SMALL, TALL], TWO, held, SMALL).held
-    assert held == Held(TALL, SMALL)
+    assert held == HeldShape(TALL, SMALL)
     wide = (128, 130)
-    assert plan_tensor([pixels(0, 0, 99, 99)], OUTPUT, [SMALL, TALL, wide], TWO, held, wide).held == Held(wide, wide)
+    assert plan_tensor([pixels(0, 0, 99, 99)], OUTPUT, [SMALL, TALL, wide], TWO, held, wide).held == HeldShape(
+        wide, wide
+    )
 
 
 # --- changes that are foreseen ---------------------------------------------------------------------------------------
@@ -374,8 +381,8 @@ def wide(left: float = 0.0) -> Rect:
     return pixels(left, 0, 200, 100)
 
 
-def looks_at(rects: list[Rect | None], apart: int = 3) -> list[Look]:
-    return [Look(apart * k, {} if rect is None else {0: rect}) for k, rect in enumerate(rects)]
+def looks_at(rects: list[Rect | None], apart: int = 3) -> list[LookAhead]:
+    return [LookAhead(apart * k, {} if rect is None else {0: rect}) for k, rect in enumerate(rects)]
 
 
 def foreseen(rects: list[Rect | None], *shapes: tuple[int, int]) -> tuple[tuple[int, tuple[int, int]], ...]:

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 from trilane.errors import BadInputError
-from trilane.scene.load import scene_from
 from trilane.scene.motion.files import as_played, load_motion
 from trilane.scene.motion.motion import Motion, Wrap, wrapped_time
-from trilane.scene.schema import AvatarSpec
+from trilane.scene.schema import AvatarSpec, scene_from
 
 
 def walk() -> Motion:

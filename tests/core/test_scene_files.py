@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from trilane.errors import BadInputError
-from trilane.scene.load import find_scene, load_scene, scene_from, scene_names
-from trilane.scene.schema import Scene
+from trilane.scene.schema import Scene, find_scene, load_scene, scene_from, scene_names
 
 WRONG = {
     "size = '100'": ("size", "found side 100", "a multiple of 32"),

@@ -12,8 +12,18 @@ import pytest
 
 from trilane.avatars.bundle import BUILT_IN
 from trilane.errors import BadInputError
-from trilane.scene.load import find_scene, load_scene, located, scene_from, scene_names
-from trilane.scene.schema import AvatarSpec, CameraSpec, OutputSpec, PlaneSpec, Scene
+from trilane.scene.schema import (
+    AvatarSpec,
+    CameraSpec,
+    OutputSpec,
+    PlaneSpec,
+    Scene,
+    find_scene,
+    load_scene,
+    located,
+    scene_from,
+    scene_names,
+)
 
 
 def test_what_a_scene_leaves_out() -> None:

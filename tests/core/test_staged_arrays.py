@@ -10,8 +10,7 @@ import pytest
 from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import ShapedBody, load_body
 from trilane.scene.schema import AvatarSpec, CameraSpec, Scene
-from trilane.scene.staged_arrays import staged_from_arrays, staged_to_arrays
-from trilane.scene.staging import Staged, stage_scene
+from trilane.scene.staging import Staged, stage_scene, staged_from_arrays, staged_to_arrays
 
 TIMES_S = [*(k / 30 for k in range(150)), *(0.37 * k * k for k in range(40)), 1e5]
 LEGS = (("LeftUpLeg", 9), ("RightUpLeg", -9))

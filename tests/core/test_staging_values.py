@@ -11,13 +11,12 @@ import pytest
 
 from trilane.body.body import ShapedBody
 from trilane.scene.camera.path import CameraPath, Optics
+from trilane.scene.camera_placement import PlacedCamera
 from trilane.scene.lens import Known, Lens, of_fov_y
 from trilane.scene.motion.motion import Motion, Wrap
 from trilane.scene.mover import Mover
-from trilane.scene.placed_camera import PlacedCamera
 from trilane.scene.schema import AvatarSpec, Scene
-from trilane.scene.staged_arrays import staged_from_arrays, staged_to_arrays
-from trilane.scene.staging import Staged, stage_scene
+from trilane.scene.staging import Staged, stage_scene, staged_from_arrays, staged_to_arrays
 
 
 def test_notes_of_a_staged_scene_say_what_they_are_of(body: ShapedBody) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from trilane.arrays import F64
 from trilane.scene.camera.path import look_at
-from trilane.scene.steering import HIGHEST_DEG, LOWEST_DEG, steered
+from trilane.scene.camera_placement import HIGHEST_DEG, LOWEST_DEG, steered
 
 PIVOT: F64 = np.array([1.0, 0.9, -2.0])
 

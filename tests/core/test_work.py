@@ -13,8 +13,8 @@ from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline.bound_stage import BoundStage
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.stage import Skip, UnitContext
+from trilane.scene.planner import FrameWork, shown_by, work_of
 from trilane.scene.schema import AvatarSpec, CameraSpec, OutputSpec, Scene
-from trilane.scene.work import Work, shown_by, work_of
 from trilane.stages.config import RunConfig
 from trilane.stages.cpu.pose import PoseStage
 from trilane.stages.cpu.present import PresentStage
@@ -34,12 +34,12 @@ def never() -> bool:
 
 
 def test_a_frame_is_made_again_only_when_something_differs() -> None:
-    assert work_of(b"a", b"a", None, never) is Work.REUSE
-    assert work_of(b"b", b"a", b"b", never) is Work.NONE
-    assert work_of(b"c", b"a", b"b", lambda: True) is Work.FULL
-    assert work_of(b"c", b"a", None, lambda: False) is Work.NONE
-    assert work_of(b"a", None, None, lambda: True) is Work.FULL
-    assert int(Work.FULL) == 0  # what a header says that nobody wrote to
+    assert work_of(b"a", b"a", None, never) is FrameWork.REUSE
+    assert work_of(b"b", b"a", b"b", never) is FrameWork.NONE
+    assert work_of(b"c", b"a", b"b", lambda: True) is FrameWork.FULL
+    assert work_of(b"c", b"a", None, lambda: False) is FrameWork.NONE
+    assert work_of(b"a", None, None, lambda: True) is FrameWork.FULL
+    assert int(FrameWork.FULL) == 0  # what a header says that nobody wrote to
 
 
 def test_what_is_shown_differs_by_its_last_bit() -> None:
@@ -64,7 +64,7 @@ def test_a_still_avatar_is_posed_once_until_the_stage_must_forget(tiny_bundle: P
     assert type(stage.run(4, None, 0)) is dict
     second["epoch"] = 9
     assert without_bytes(stage.run(5, None, 1)) == Skip(visible=1.0)
-    assert [int(header["work"]) for header in (first, second)] == [Work.FULL, Work.REUSE]
+    assert [int(header["work"]) for header in (first, second)] == [FrameWork.FULL, FrameWork.REUSE]
     assert [int(header["picture"]) for header in (first, second)] == [4, 4]
     assert [int(second[name]) for name in ("frame", "epoch")] == [5, 9]
     assert float(second["media_time_s"]) == 5 / 30
@@ -72,7 +72,7 @@ def test_a_still_avatar_is_posed_once_until_the_stage_must_forget(tiny_bundle: P
         assert first[name].tobytes() == second[name].tobytes()
     stage.forget()
     assert type(stage.run(6, None, 1)) is dict
-    assert (int(second["work"]), int(second["picture"])) == (Work.FULL, 6)
+    assert (int(second["work"]), int(second["picture"])) == (FrameWork.FULL, 6)
 
 
 def test_who_is_off_the_screen_is_neither_skinned_nor_drawn(
@@ -83,7 +83,7 @@ def test_who_is_off_the_screen_is_neither_skinned_nor_drawn(
     monkeypatch.setattr(type(stage._actors[0].body.bounds), "rect", lambda *_: never())
     for frame in (0, 1, 30):
         assert without_bytes(stage.run(frame, None, 0)) == Skip(visible=0.0)
-        assert (int(header["work"]), int(header["picture"])) == (Work.NONE, -1)
+        assert (int(header["work"]), int(header["picture"])) == (FrameWork.NONE, -1)
         stage.forget()
 
 
