@@ -34,9 +34,8 @@ from trilane.scene.staging import Staged, stage_scene
 from trilane.stages.avatar_assets import AvatarData, load_avatar, pack_assets, require_one_tensor
 from trilane.stages.config import NetworkCut, RunConfig
 from trilane.stages.dsp.runtime import RUNTIMES, installed, resolve
-from trilane.stages.foresee import foresee
+from trilane.stages.foresee import foresee, tensor_works
 from trilane.stages.machine_facts import gl_facts, machine_facts
-from trilane.stages.tensor_works import tensor_works
 from trilane.transport.slots import RULES, edge_rule
 from trilane.unexpected_value import UnexpectedValue
 

@@ -24,7 +24,7 @@ from trilane.errors import BadInputError
 from trilane.figure_sources import MEASURED
 from trilane.near_miss import did_you_mean
 from trilane.stages.configure import Checked, Request, configure
-from trilane.stages.gpu.texture_array import FILTERS
+from trilane.stages.gpu.packed_pass import FILTERS
 from trilane.training.quantising.calibration import METHODS
 
 STEPS = 255

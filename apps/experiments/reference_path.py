@@ -34,8 +34,7 @@ from trilane.shapes import BUCKET_STEP, Shape
 from trilane.stages.avatar_assets import AvatarData
 from trilane.stages.configure import Checked
 from trilane.stages.dsp.runtime import Binding, RuntimeOptions, load_runtime
-from trilane.stages.gpu.avatar_mesh import avatar_mesh
-from trilane.stages.gpu.mesh_arrays import MeshArrays
+from trilane.stages.gpu.skinned_mesh import MeshArrays, avatar_mesh
 
 #: From so much cover on a pixel belongs to a mask.
 HALF = 0.5

@@ -20,7 +20,7 @@ from trilane.body.joints import JOINTS, POSE_FEATURES
 from trilane.body.kinematics import Posed, Skeleton
 from trilane.body.skinning import FrameSkinner
 from trilane.stages.avatar_assets import AvatarData
-from trilane.stages.gpu.avatar_mesh import enough_weights
+from trilane.stages.gpu.skinned_mesh import enough_weights
 
 
 class RunBody:

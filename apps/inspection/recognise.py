@@ -16,7 +16,7 @@ from trilane.file_signatures import ARCHIVE, ARRAY, FOREIGN, PICKLE, PICTURE, VI
 from trilane.files import npz_names, read_text, require_file
 from trilane.pipeline.journal import NAME as JOURNAL
 from trilane.scene.camera.files import COLMAP_FILES, detect
-from trilane.stages.gpu.picture_file import PICTURES
+from trilane.stages.gpu.background import PICTURES
 
 MOTION, CAMERA, PICTURE_FOLDER, BODY, TEXTURE, AVATAR = "motion", "camera", "pictures", "body", "texture", "avatar"
 NETWORK, SCENE, TRACE, RUN, REPORT, SWEEP = "network", "scene", "trace", "run", "report", "sweep"

@@ -24,7 +24,7 @@ from trilane.stages.avatar_assets import network_of
 from trilane.stages.avatar_pipeline import avatar_pipeline
 from trilane.stages.configure import Checked
 from trilane.stages.cpu.pose import PoseStage
-from trilane.stages.gpu.opengl_context import CONTEXT, open_context
+from trilane.stages.gpu.opengl import CONTEXT, open_context
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 Units = Mapping[str, UnitContext]
@@ -117,7 +117,7 @@ class AvatarFrames:
 
     @property
     def posed(self) -> NDArray[np.void]:
-        """What the pose stage said of the frame that was made last: a header as in `stages/packets.py`."""
+        """What the pose stage said of the frame that was made last: a header as in `stages/config.py`."""
         return self._chain.packets[0].header
 
     @property

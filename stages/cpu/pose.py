@@ -1,7 +1,8 @@
 """The pose stage: from a frame's number to everything that the other stages have to know about it.
 
-Rule: motion and camera are asked for the frame's media time, frame / fps; nothing that is not finite leaves here. A
-frame that shows what an earlier one showed, or nobody, is told so, skins nothing and skips the stages that would draw.
+Motion and camera are asked for the frame's media time, frame / fps; nothing that is not finite leaves here. A frame
+that shows what an earlier one showed, or nobody, skins nothing and skips the stages that would draw it. Of each body as
+much is modelled as the picture needs: the cheapest level of detail within the budget of pixels.
 """
 
 from __future__ import annotations
@@ -10,27 +11,106 @@ import time
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.arrays import F64
+from trilane.arrays import F32, F64
+from trilane.avatars.bundle import CLOTHES_STANDOFF_M
+from trilane.body.body import ShapedBody
+from trilane.body.detail import DETAILS, DetailBounds
 from trilane.body.kinematics import Posed, Skeleton
+from trilane.body.skinning import FrameSkinner
 from trilane.errors import TrilaneError
+from trilane.machine import moved_of_kept
 from trilane.pipeline.moved_bytes import ByteCounter
 from trilane.pipeline.shared_assets import Assets
 from trilane.pipeline.stage import Skip, UnitContext
 from trilane.scene.camera_placement import steered
+from trilane.scene.crop import SCREEN, Rect, cheapest_within, error_px, least_w
 from trilane.scene.mover import Mover
 from trilane.scene.planner import FrameWork, HeldShape, plan_tensor, shown_by, work_of
 from trilane.scene.tensor_layout import lay_out
 from trilane.shapes import Shape
 from trilane.stages.avatar_assets import distinct, shaped_body, staged_of
-from trilane.stages.config import RunConfig
-from trilane.stages.cpu.actor import ModelledBody, Seen
-from trilane.stages.packets import posed_vertices
+from trilane.stages.config import RunConfig, posed_vertices
+from trilane.stages.cpu.mesh_bounds import MeshBounds
 from trilane.transport.packets import FRAME_FIELDS, Packet
+
+FINEST = len(DETAILS) - 1
+
+
+@dataclass(frozen=True)
+class SeenAvatar:
+    """An avatar on the screen. `level`: of `DETAILS`. `error_px`: the bound on what the level moves on the picture."""
+
+    rect: Rect
+    level: int
+    error_px: float
+
+
+class ModelledBody:
+    """A body that several avatars of a scene may share, with what each level of detail needs.
+
+    `skins`: whether the CPU unit skins it. `budget_px`: the largest error of a level on the picture; 0: everything is
+    modelled.
+    """
+
+    def __init__(self, shaped: ShapedBody, skins: bool, budget_px: float) -> None:
+        self.shaped = shaped
+        self.bounds = MeshBounds(shaped, standoff_m=CLOTHES_STANDOFF_M)
+        self.budget_px = budget_px if skins else 0.0
+        self.skinners = self._skinners() if skins else []
+        self.moved_to_skin = [moved_of_kept(skinner.constant_bytes) for skinner in self.skinners]
+
+    def _skinners(self) -> list[FrameSkinner]:
+        """One for each level; only the finest when nothing may be left out."""
+        if self.budget_px == 0.0:
+            return [FrameSkinner(self.shaped)] * len(DETAILS)
+        return [FrameSkinner(self.shaped, detail) for detail in DETAILS]
+
+    @cached_property
+    def detail(self) -> DetailBounds:
+        return DetailBounds(self.shaped)
+
+    def skeleton(self) -> Skeleton:
+        return Skeleton(self.shaped.joints, self.shaped.body.parents)
+
+    def choose(self, posed: Posed, clip: F64, output: Shape) -> tuple[int, float]:
+        """The level of detail of a frame, and the bound on its error in pixels of a picture of `output`."""
+        if self.budget_px == 0.0:
+            return FINEST, 0.0
+        w = least_w(posed, clip, self.detail.reach, self.detail.blend_m(posed))
+        errors = [error_px(metres, clip, w, output) for metres in self.detail.metres(posed)]
+        level = cheapest_within(errors, self.budget_px)
+        return level, errors[level]
+
+    def see(
+        self, posed: Posed, clip: F64, output: Shape, vertices: F32 | None, moved: ByteCounter
+    ) -> SeenAvatar | None:
+        """Skin the body into `vertices`, if given, and find its rectangle; None when nothing of it is visible.
+
+        `posed`: the frame. `clip` (4,4): projection @ view. `output`: (height, width) of the picture. `moved`: counts
+        the vertices, which are written, then read to find the rectangle, and what skinning reads from memory.
+        """
+        level, error = self.choose(posed, clip, output)
+        if vertices is not None:
+            self.skinners[level].skin_into(posed, vertices)
+            moved.copied(vertices.nbytes)
+            moved.read += self.moved_to_skin[level]
+            moved.least += self.moved_to_skin[level] + vertices.nbytes
+        rect = self.bounds.rect(posed, clip, vertices)
+        return None if rect is None else SeenAvatar(widened(rect, error, output), level, error)
+
+
+def widened(rect: Rect, error_px: float, output: Shape) -> Rect:
+    """`rect` with `error_px` pixels more on every side, clipped to the screen."""
+    x, y = 2.0 * error_px / output[1], 2.0 * error_px / output[0]
+    low = max(rect.x0 - x, SCREEN.x0), max(rect.y0 - y, SCREEN.y0)
+    high = min(rect.x1 + x, SCREEN.x1), min(rect.y1 + y, SCREEN.y1)
+    return Rect(*low, *high)
 
 
 @dataclass(frozen=True)
@@ -60,7 +140,7 @@ class FramePlan:
     work: FrameWork
     shape: Shape | None
     density: float | None
-    seen: Mapping[int, Seen]
+    seen: Mapping[int, SeenAvatar]
 
 
 @dataclass(frozen=True)
@@ -200,7 +280,7 @@ class PoseStage:
         self.plan = self._lay_out(packet, seen)
         return bool(seen)
 
-    def _lay_out(self, packet: NDArray[np.void], seen: list[tuple[NDArray[np.void], Seen]]) -> FramePlan:
+    def _lay_out(self, packet: NDArray[np.void], seen: list[tuple[NDArray[np.void], SeenAvatar]]) -> FramePlan:
         """Crop rectangles, cells and the tensor's shape; the smallest shape when nothing is to be drawn."""
         if not seen:
             packet["tensor_shape"] = min(self._buckets, key=lambda shape: shape[0] * shape[1])
@@ -234,7 +314,7 @@ class PoseStage:
         moved: Sequence[tuple[F64, F64]],
         frame: int,
         clip: NDArray[np.float64],
-    ) -> Seen | None:
+    ) -> SeenAvatar | None:
         """Fill one avatar's joints, and `vertices` if given; where it is on the screen, None when it is not visible.
 
         One that is far off the screen is not posed; one that was not seen in the last frame that was made is looked for

@@ -1,18 +1,31 @@
 """The composite stage: background, planes, contact shadow, avatars, display, in that order, to the presented frame.
 
-Rule: avatars are drawn far to near; one that is not visible leaves no trace. A frame that would be drawn as one that an
-output slot still holds is copied, not drawn.
+Avatars are drawn far to near; one that is not visible leaves no trace. A frame that would be drawn as one that an
+output slot still holds is copied, not drawn: only the composite writes to its output slots, so their bytes stay until
+it writes there again.
+
+While the camera stands still, what lies under the avatars is drawn twice and copied from then on. The first frame of a
+view is only drawn, because most views of a moving camera never come again. The second one is kept in host memory: a
+software driver copies it from there in a tenth of a millisecond, and takes twenty times as long to copy between
+framebuffers.
+
+The display shows frame number and time of the picture. Rate and age, which this stage measures, are updated four times
+a second so that they can be read, and start again when frame numbers do.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+import time
+from collections import deque
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import moderngl
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
 
 from trilane.arrays import F64, Floats
 from trilane.pipeline.stage import UnitContext
@@ -21,17 +34,148 @@ from trilane.scene.schema import PlaneSpec
 from trilane.shapes import Shape
 from trilane.stages.avatar_assets import distinct, shaped_body, staged_of
 from trilane.stages.config import RunConfig
-from trilane.stages.gpu import opengl_calls
+from trilane.stages.gpu import opengl
 from trilane.stages.gpu.background import Background, open_background
-from trilane.stages.gpu.composite_painters import AvatarPainter, PicturePainter, RoomPainter, ShadowPainter
-from trilane.stages.gpu.contact_shadows import DISCS, floor_discs
-from trilane.stages.gpu.detected_planes import PlanePainter
-from trilane.stages.gpu.drawn_frames import Drawing, DrawnFrames
-from trilane.stages.gpu.head_up_display import Hud
-from trilane.stages.gpu.opengl_context import CONTEXT, checked, describe, open_context
-from trilane.stages.gpu.still_background import StillBackground
-from trilane.stages.gpu.transfers import counter_of, read_into
+from trilane.stages.gpu.composite_painters import (
+    DISCS,
+    AvatarPainter,
+    PicturePainter,
+    PlanePainter,
+    RoomPainter,
+    ShadowPainter,
+    floor_discs,
+)
+from trilane.stages.gpu.opengl import (
+    CONTEXT,
+    build_program,
+    checked,
+    counter_of,
+    describe,
+    open_context,
+    read_into,
+    upload,
+)
 from trilane.transport.packets import Packet
+
+#: Picture of the avatars, picture of the background, view and projection.
+Drawing = tuple[int, int, bytes, bytes]
+
+
+class DrawnFrames:
+    """Notes of what was drawn, by slot."""
+
+    def __init__(self) -> None:
+        self._slots: dict[int, tuple[Drawing | None, int]] = {}
+
+    def slot_of(self, drawing: Drawing | None, preferred: int) -> int | None:
+        """A slot that holds `drawing`, `preferred` if that does; None when there is none, or `drawing` is None."""
+        if drawing is None:
+            return None
+        held = [slot for slot, (there, _) in self._slots.items() if there == drawing]
+        return preferred if preferred in held else held[0] if held else None
+
+    def note(self, slot: int, drawing: Drawing | None, frame: int, copied_from: int | None) -> int:
+        """`slot` holds `drawing` of `frame` from now on; what `repeats` of the frame's header is to be.
+
+        `copied_from`: the slot that held it already; None when it was drawn now.
+        """
+        drawn = frame if copied_from is None else self._slots[copied_from][1]
+        self._slots[slot] = (drawing, drawn)
+        return 0 if copied_from is None else drawn + 1
+
+
+class StillBackground:
+    """Keeps the background of `target`, a framebuffer with one colour of four bytes."""
+
+    def __init__(self, target: Any) -> None:
+        self._target = target
+        self._bytes = np.empty(target.width * target.height * 4, np.uint8)
+        self._shown: Hashable = None
+        self._is_kept = False
+
+    def draw(self, shown: Hashable, draw: Callable[[], None]) -> None:
+        """Fill the target with the background that `shown`, which is not None, stands for: by `draw`, or a copy."""
+        if shown == self._shown and self._is_kept:
+            upload(self._target.ctx, self._target.color_attachments[0], self._bytes)
+            return
+        draw()
+        self._is_kept = shown == self._shown
+        self._shown = shown
+        if self._is_kept:
+            read_into(self._target.ctx, self._target, self._bytes, components=4, alignment=1)
+
+
+SIZE = (232, 62)  # width, height
+MARGIN_PX = 8
+TEXT_PX = 15
+RENEW_NS = 250_000_000
+REMEMBERED = 60
+SHEET, INK = (0, 0, 0, 150), (255, 255, 255, 255)
+
+
+class Hud:
+    """Draws into the lower left corner of a target; a target smaller than the display shows a part of it."""
+
+    def __init__(self, ctx: Any) -> None:
+        self._ctx = ctx
+        self._program = build_program(ctx, "whole_screen.vert", "head_up_display.frag")
+        self._screen = ctx.vertex_array(self._program, [])
+        self._texture = ctx.texture(SIZE, 4)
+        self._font = ImageFont.load_default(TEXT_PX)
+        self._presented: deque[int] = deque(maxlen=REMEMBERED)
+        self._renewed_ns = self._frame = 0
+        self._measured = ""
+
+    def draw(self, target: Any, pose: NDArray[np.void]) -> None:
+        """Blend the display for the frame of pose packet `pose` over `target`."""
+        lines = self._lines(pose, time.monotonic_ns())
+        upload(self._ctx, self._texture, hud_picture(lines, self._font).tobytes())
+        corner = MARGIN_PX, target.height - MARGIN_PX - SIZE[1]
+        self._program["corner"].value = corner
+        target.viewport = (*corner, *SIZE)
+        self._ctx.enable_only(moderngl.BLEND)
+        self._ctx.blend_func = moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA
+        self._texture.use(0)
+        self._screen.render(vertices=3)
+        target.viewport = (0, 0, target.width, target.height)
+
+    def _lines(self, pose: NDArray[np.void], now_ns: int) -> list[str]:
+        if int(pose["frame"]) <= self._frame:
+            self._presented.clear()
+            self._renewed_ns = 0
+        self._frame = int(pose["frame"])
+        self._presented.append(now_ns)
+        if now_ns - self._renewed_ns >= RENEW_NS:
+            self._renewed_ns = now_ns
+            self._measured = measured_line(pose, list(self._presented))
+        return hud_lines(pose, self._measured)
+
+
+def measured_line(pose: NDArray[np.void], presented_ns: list[int]) -> str:
+    """The line of rate and age. `presented_ns`: when the last frames were composed, this frame's time last."""
+    span = presented_ns[-1] - presented_ns[0]
+    rate = f"{(len(presented_ns) - 1) * 1e9 / span:.1f} fps" if span > 0 else "- fps"
+    age_ms = (presented_ns[-1] - int(pose["t_sampled_ns"])) / 1e6
+    return f"{rate}   {age_ms:.0f} ms from pose"
+
+
+def hud_lines(pose: NDArray[np.void], measured: str) -> list[str]:
+    """The three lines of the display; `measured` is the middle one."""
+    height, width = pose["tensor_shape"].tolist()
+    visible = int(sum(avatar["visible"] for avatar in pose["avatars"][: int(pose["avatar_count"])]))
+    return [
+        f"frame {int(pose['frame'])}   {float(pose['media_time_s']):.2f} s",
+        measured,
+        f"tensor {height}x{width}   {visible} in view",
+    ]
+
+
+def hud_picture(lines: list[str], font: Any) -> NDArray[np.uint8]:
+    """(62,232,4) uint8, straight alpha: `lines` on a dark background."""
+    image = Image.new("RGBA", SIZE, SHEET)
+    ImageDraw.Draw(image).multiline_text((8, 3), "\n".join(lines), INK, font, spacing=3)
+    return np.asarray(image)
+
 
 ROOM = "room"
 
@@ -59,7 +203,7 @@ class CompositeStage:
         hud: bool = False,
     ) -> None:
         self._ctx, self._shape, self._rest, self._background = ctx, shape, rest, background
-        colour = ctx.texture(shape[::-1], 4, internal_format=opengl_calls.SRGB8_ALPHA8)
+        colour = ctx.texture(shape[::-1], 4, internal_format=opengl.SRGB8_ALPHA8)
         self._target = ctx.framebuffer([colour])
         self._still = StillBackground(self._target)
         self._room = RoomPainter(ctx, eyes) if background is None else None

@@ -22,8 +22,7 @@ from trilane.file_signatures import HEAD_BYTES, PICTURE, VIDEO, signature_of_hea
 from trilane.files import require_file
 from trilane.scene.camera.path import CameraPath
 from trilane.scene.footage import Footage, Stored, film_of
-from trilane.stages.gpu.background import is_picture, pictures_in
-from trilane.stages.gpu.picture_file import check_picture, look_at_picture
+from trilane.stages.gpu.background import check_picture, is_picture, look_at_picture, pictures_in
 from trilane.stages.gpu.video_reader import DEFAULT_STEP_S, Pixels, check_size, pixels_of, quarters_of, video_stream
 
 #: Steps between a video's frames that differ by more than this share of the usual one are of a variable rate.

@@ -25,13 +25,12 @@ from trilane.scene.schema import AvatarSpec, OutputSpec, Scene
 from trilane.scene.tensor_layout import lay_out
 from trilane.shapes import shape_buckets
 from trilane.stages.avatar_assets import shaped_body, staged_of
-from trilane.stages.config import RunConfig
-from trilane.stages.cpu import actor
+from trilane.stages.config import RunConfig, pose_dtype, posed_vertices, posed_vertices_bytes
+from trilane.stages.cpu import pose
 from trilane.stages.cpu import present as present_stage
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 from trilane.stages.cpu.pose import PoseStage
 from trilane.stages.cpu.present import PresentStage, Segment
-from trilane.stages.packets import pose_dtype, posed_vertices, posed_vertices_bytes
 from trilane.testing.assets import assets_of
 from trilane.testing.told_bytes import without_bytes
 from trilane.transport.packets import Packet, SlotLayout, view_packet
@@ -186,7 +185,7 @@ def test_a_packet_holds_what_motion_camera_and_layout_give(
     tiny_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, skinned: bool
 ) -> None:
     """Two avatars at frame 40 of 25 a second, from the same parts put together here."""
-    monkeypatch.setattr(actor, "moved_of_kept", lambda _: 1000)
+    monkeypatch.setattr(pose, "moved_of_kept", lambda _: 1000)
     output = OutputSpec(width=320, height=200)
     first = configured(tiny_bundle, tmp_path, fps=25.0, avatars=PAIR, output=output, plan="fixed")
     assets = assets_of(first)
@@ -206,16 +205,16 @@ def test_a_packet_holds_what_motion_camera_and_layout_give(
         sampled + tables + skin, header + skin, 0, 0, least
     ]  # fmt: skip
     assert not slots[0].header["avatar_count"]
-    pose = slots[1].header
-    assert (int(pose["frame"]), int(pose["avatar_count"]), float(pose["media_time_s"])) == (40, 2, 1.6)
+    header = slots[1].header
+    assert (int(header["frame"]), int(header["avatar_count"]), float(header["media_time_s"])) == (40, 2, 1.6)
     view, projection = staged.camera.sample(1.6), staged.camera.projection(1.6, (200, 320))
-    np.testing.assert_allclose(pose["view"], view, rtol=1e-6)
-    np.testing.assert_allclose(pose["projection"], projection, rtol=1e-6)
+    np.testing.assert_allclose(header["view"], view, rtol=1e-6)
+    np.testing.assert_allclose(header["projection"], projection, rtol=1e-6)
     rects, vertices = [], np.zeros((total, 3), np.float32)
     written = posed_vertices(slots[1].payload, config.posed_vertices)
     for number, mover in enumerate(staged.movers):
         posed = Skeleton(body.joints, body.body.parents).pose(*mover.sample(1.6), mover.world)
-        avatar = pose["avatars"][number]
+        avatar = header["avatars"][number]
         assert (int(avatar["avatar"]), int(avatar["visible"])) == (number, 1)
         np.testing.assert_allclose(avatar["joints"], posed.matrices, rtol=1e-6, atol=1e-6)
         np.testing.assert_allclose(avatar["pose_feature"], posed.feature, rtol=1e-6, atol=1e-6)
@@ -225,10 +224,10 @@ def test_a_packet_holds_what_motion_camera_and_layout_give(
         bounds = MeshBounds(body, standoff_m=CLOTHES_STANDOFF_M)
         rects.append(bounds.rect(posed, projection @ view, vertices if skinned else None))
     layout = lay_out(rects, (200, 320), config.buckets)
-    assert tuple(pose["tensor_shape"]) == layout.shape
+    assert tuple(header["tensor_shape"]) == layout.shape
     for number, (crop, cell) in enumerate(layout.crops):
-        np.testing.assert_allclose(pose["avatars"][number]["rect"], crop, rtol=1e-6)
-        assert tuple(pose["avatars"][number]["tensor_rect"]) == cell
+        np.testing.assert_allclose(header["avatars"][number]["rect"], crop, rtol=1e-6)
+        assert tuple(header["avatars"][number]["tensor_rect"]) == cell
     stage.close()
 
 

@@ -19,7 +19,7 @@ from trilane.body.kinematics import Skeleton
 from trilane.body.skinning import CpuSkinner, FrameSkinner
 from trilane.scene.crop import Rect, cheapest_within, error_px, least_w
 from trilane.scene.rotations import about
-from trilane.stages.cpu.actor import FINEST, ModelledBody, widened
+from trilane.stages.cpu.pose import FINEST, ModelledBody, widened
 
 OUTPUT = (480, 640)
 FEW = 200

@@ -26,11 +26,10 @@ from trilane.avatars.network_split import cuts, split
 from trilane.errors import BadInputError, MissingPartError
 from trilane.pipeline.description import UnitSettings
 from trilane.scene.schema import Scene
-from trilane.stages.config import NetworkCut, RunConfig
-from trilane.stages.dsp import cuda, infer, ort, parts, runtime
+from trilane.stages.config import NetworkCut, RunConfig, pose_dtype
+from trilane.stages.dsp import cuda, infer, ort, runtime
 from trilane.stages.dsp.infer import InferStage
 from trilane.stages.dsp.runtime import RuntimeOptions
-from trilane.stages.packets import pose_dtype
 from trilane.transport.packets import SlotLayout, view_packet
 
 
@@ -368,17 +367,17 @@ def test_openvino_layers_in_float_are_named(vino: Any) -> None:
 
 def test_tensors_of_a_cut_lie_on_their_own_cache_lines() -> None:
     shapes = {"a": (1, 3, 5, 7), "b": (1, 64), "c": (2, 1)}
-    assert parts.extent(shapes) == 128 + 64 + 64
-    assert parts.extent({}) == 0
+    assert infer.extent(shapes) == 128 + 64 + 64
+    assert infer.extent({}) == 0
     payload = np.arange(200, dtype=np.uint8)
-    found = parts.views(payload, shapes)
+    found = infer.views(payload, shapes)
     assert {name: array.shape for name, array in found.items()} == shapes
     assert [int(array.flat[0]) for array in found.values()] == [0, 128, 192]
     found["c"][:] = 9
     assert payload[192:195].tolist() == [9, 9, 194]
-    assert list(parts.views(payload[:194], shapes)) == ["a", "b", "c"]
+    assert list(infer.views(payload[:194], shapes)) == ["a", "b", "c"]
     with pytest.raises(ValueError, match="a slot of 193 bytes, 194 needed"):
-        parts.views(payload[:193], shapes)
+        infer.views(payload[:193], shapes)
 
 
 def configured(folder: Path, at: list[str] | tuple[str, ...] = (), size: str = "64x64") -> RunConfig:
@@ -393,14 +392,14 @@ def test_parts_of_a_shape_are_the_same_from_the_cache(network: Any, tmp_path: Pa
     config = configured(tmp_path, at)
     expected = split(reshaped(network, 32, 96), at)
     for _ in range(2):
-        found = parts.parts_for(config, network, (32, 96))
+        found = infer.parts_for(config, network, (32, 96))
         assert [part.model for part in found] == [part.model for part in expected]
         for part, same in zip(found, expected, strict=True):
             assert part.where == network.where
             for name in ("inputs", "outputs", "crossing_in", "crossing_out"):
                 assert list(getattr(part, name).items()) == list(getattr(same, name).items())
-    assert len(parts.parts_for(configured(tmp_path), network, (32, 96))) == 1
-    other = parts.parts_for(config, network, (96, 32))
+    assert len(infer.parts_for(configured(tmp_path), network, (32, 96))) == 1
+    other = infer.parts_for(config, network, (96, 32))
     assert other[0].crossing_in != expected[0].crossing_in
 
 
@@ -408,11 +407,11 @@ def test_a_cut_needs_room_for_the_shape_that_needs_most(network: Any, tmp_path: 
     at = [cut.at for cut in cuts(network)][1:4:2]
     config = configured(tmp_path, at, size="64")
     sizes = [
-        [parts.extent(part.crossing_out) for part in split(reshaped(network, *shape), at)[:-1]]
+        [infer.extent(part.crossing_out) for part in split(reshaped(network, *shape), at)[:-1]]
         for shape in config.buckets
     ]
-    assert parts.crossing_bytes(config, network) == np.max(sizes, axis=0).tolist()
-    assert parts.crossing_bytes(configured(tmp_path), network) == []
+    assert infer.crossing_bytes(config, network) == np.max(sizes, axis=0).tolist()
+    assert infer.crossing_bytes(configured(tmp_path), network) == []
 
 
 # --- the stage -------------------------------------------------------------------------------------------------------
@@ -431,7 +430,7 @@ def test_three_parts_in_a_row_give_the_bytes_of_the_whole(tiny_bundle: Path) -> 
     pairs = combinations([cut.at for cut in cuts(whole)], 2)
     at = next(pair for pair in pairs if set((middle := split(whole, pair)[1]).crossing_out) - set(middle.outputs))
     config, shape = configured(tiny_bundle, at), (64, 64)
-    between = parts.crossing_bytes(config, whole)
+    between = infer.crossing_bytes(config, whole)
     edges = [64 * 64 * 5, *between, 64 * 64 * 4]
     slots = [slot(size, shape) for size in edges]
     slots[0].payload[:] = np.random.default_rng(0).integers(0, 256, edges[0])

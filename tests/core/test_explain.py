@@ -34,8 +34,7 @@ from trilane.scene.crop import Rect
 from trilane.scene.planner import MOST_DENSITY, FrameWork
 from trilane.stages.avatar_assets import shaped_body, staged_of
 from trilane.stages.configure import Checked, Request, configure
-from trilane.stages.cpu.actor import Seen
-from trilane.stages.cpu.pose import FramePlan
+from trilane.stages.cpu.pose import FramePlan, SeenAvatar
 from trilane.units import UNITS
 
 CHIP, CAP = "snapdragon-888", "sustained_high_performance"
@@ -80,7 +79,7 @@ def document(printed: str) -> Any:
 
 
 def planned(frame: int, shape: tuple[int, int] | None, *levels: int) -> PlannedFrame:
-    seen = {number: Seen(Rect(0, 0, 1, 1), level, 0.1) for number, level in enumerate(levels)}
+    seen = {number: SeenAvatar(Rect(0, 0, 1, 1), level, 0.1) for number, level in enumerate(levels)}
     return PlannedFrame(frame, FramePlan(FrameWork.FULL if shape else FrameWork.NONE, shape, None, seen), {})
 
 

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from trilane.errors import BadInputError, MissingPartError, TrilaneError, UnitLostError
-from trilane.stages.gpu import opengl_calls, opengl_context
-from trilane.stages.gpu.packed_pass import PackedPass, Quantisation
+from trilane.stages.gpu import opengl
+from trilane.stages.gpu.opengl import shader_source
+from trilane.stages.gpu.packed_pass import PackedPass, Quantisation, check_texture
 from trilane.stages.gpu.raster import RasterStage
-from trilane.stages.gpu.shader_program import shader_source
-from trilane.stages.gpu.texture_array import check_texture
 
 
 @pytest.mark.parametrize(("scale", "zero_point"), [(0.0, 0), (-1.0, 0), (np.nan, 0), (np.inf, 0), (1, -1), (1, 256)])
@@ -89,8 +88,8 @@ def test_a_software_driver_gets_its_threads(
     """The calling thread counts: one thread is none beside it."""
     monkeypatch.setenv("LP_NUM_THREADS", "kept")
     asked: dict[str, Any] = {}
-    monkeypatch.setattr(opengl_context.moderngl, "create_context", lambda **given: asked.update(given) or "context")
-    assert opengl_context.open_context(threads) == "context"
+    monkeypatch.setattr(opengl.moderngl, "create_context", lambda **given: asked.update(given) or "context")
+    assert opengl.open_context(threads) == "context"
     assert os.environ["LP_NUM_THREADS"] == expected
     library = "libEGL.so.1"
     assert asked == {"require": 330, "standalone": True, "backend": "egl", "libegl": library, "libgl": library}
@@ -102,19 +101,19 @@ def test_a_software_driver_gets_its_threads(
 )
 def test_a_renderer_on_the_cpu_is_no_hardware(renderer: str, hardware: bool) -> None:
     info = {"GL_VENDOR": "v", "GL_RENDERER": renderer, "GL_VERSION": "4.5"}
-    found = opengl_context.describe(SimpleNamespace(info=info))
-    assert found == opengl_context.Driver("v", renderer, "4.5", hardware)
+    found = opengl.describe(SimpleNamespace(info=info))
+    assert found == opengl.Driver("v", renderer, "4.5", hardware)
 
 
 def test_an_error_inside_is_the_contexts_only_when_that_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
     for current, kind in ((True, KeyError), (False, UnitLostError)):
-        monkeypatch.setattr(opengl_context, "current", lambda here=current: here)
-        with pytest.raises(kind), opengl_context.checked(SimpleNamespace(error="GL_NO_ERROR")):
+        monkeypatch.setattr(opengl, "current", lambda here=current: here)
+        with pytest.raises(kind), opengl.checked(SimpleNamespace(error="GL_NO_ERROR")):
             raise KeyError("x")
-    monkeypatch.setattr(opengl_context, "current", lambda: True)
+    monkeypatch.setattr(opengl, "current", lambda: True)
     with (
         pytest.raises(TrilaneError, match="GL_INVALID_VALUE"),
-        opengl_context.checked(SimpleNamespace(error="GL_INVALID_VALUE")),
+        opengl.checked(SimpleNamespace(error="GL_INVALID_VALUE")),
     ):
         pass
 
@@ -125,9 +124,9 @@ def test_a_function_that_the_driver_lacks_is_named(monkeypatch: pytest.MonkeyPat
             self.eglGetProcAddress = SimpleNamespace()
             self.eglGetProcAddress = type("Get", (), {"__call__": lambda _self, _name: None})()
 
-    monkeypatch.setattr(opengl_calls.ctypes, "CDLL", Library)
+    monkeypatch.setattr(opengl.ctypes, "CDLL", Library)
     with pytest.raises(MissingPartError, match="lacks glFenceSync"):
-        opengl_calls.function.__wrapped__("glFenceSync")
+        opengl.function.__wrapped__("glFenceSync")
 
 
 @pytest.mark.parametrize(("result", "failed"), [(0x911A, False), (0x911C, False), (0x911B, True), (0x911D, True)])
@@ -137,19 +136,19 @@ def test_a_fence_is_waited_for_once_and_deleted(monkeypatch: pytest.MonkeyPatch,
     def function(name: str) -> Any:
         return lambda *given: calls.append((name, *given)) or (result if name == "glClientWaitSync" else 77)
 
-    monkeypatch.setattr(opengl_calls, "function", function)
-    assert opengl_calls.fence() == 77
+    monkeypatch.setattr(opengl, "function", function)
+    assert opengl.fence() == 77
     if failed:
         with pytest.raises(TrilaneError, match=r"within 1 s"):
-            opengl_calls.wait_fence(77)
+            opengl.wait_fence(77)
     else:
-        opengl_calls.wait_fence(77)
+        opengl.wait_fence(77)
     assert calls == [("glFenceSync", 0x9117, 0), ("glClientWaitSync", 77, 1, 1_000_000_000), ("glDeleteSync", 77)]
 
 
 def test_srgb_is_switched_off_again_whatever_happens(monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[Any] = []
-    monkeypatch.setattr(opengl_calls, "function", lambda name: lambda *given: calls.append((name, *given)))
-    with pytest.raises(KeyError), opengl_calls.srgb_target():
+    monkeypatch.setattr(opengl, "function", lambda name: lambda *given: calls.append((name, *given)))
+    with pytest.raises(KeyError), opengl.srgb_target():
         raise KeyError("x")
     assert calls == [("glEnable", 0x8DB9), ("glDisable", 0x8DB9)]

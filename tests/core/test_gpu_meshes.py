@@ -13,10 +13,19 @@ from numpy.typing import NDArray
 from trilane.body.joints import JOINTS
 from trilane.errors import BadInputError, TrilaneError
 from trilane.stages.gpu import raster
-from trilane.stages.gpu.avatar_mesh import avatar_mesh, enough_weights
-from trilane.stages.gpu.mesh_arrays import is_closed, mesh_arrays, patch_order, weight_batches
-from trilane.stages.gpu.shader_program import build_program, shader_source
-from trilane.stages.gpu.skinned_mesh import BodyPose, PosedMesh, SkinnedMesh, _index_bytes
+from trilane.stages.gpu.opengl import build_program, shader_source
+from trilane.stages.gpu.skinned_mesh import (
+    BodyPose,
+    PosedMesh,
+    SkinnedMesh,
+    _index_bytes,
+    avatar_mesh,
+    enough_weights,
+    is_closed,
+    mesh_arrays,
+    patch_order,
+    weight_batches,
+)
 
 
 @pytest.mark.parametrize(
@@ -57,7 +66,7 @@ def test_a_closed_body_is_closed_from_the_cache_too(
     np.savez(tmp_path / "body.npz", allow_pickle=False, **body_arrays)
     shaped = load_body(tmp_path / "body.npz").shape()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr("trilane.stages.gpu.mesh_arrays.is_closed", lambda *_: True)
+    monkeypatch.setattr("trilane.stages.gpu.skinned_mesh.is_closed", lambda *_: True)
     assert [avatar_mesh(shaped).closed for _ in range(2)] == [True, True]
 
 

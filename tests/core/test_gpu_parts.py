@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 
 from trilane.body.joints import JOINTS
 from trilane.errors import BadInputError, MissingPartError, TrilaneError, UnitLostError
-from trilane.stages.gpu import opengl_context
+from trilane.stages.gpu import opengl
 from trilane.stages.gpu.builtin_room import Extent, floor_texture, room_mesh, wall_texture
-from trilane.stages.gpu.contact_shadows import DISCS, floor_discs
-from trilane.stages.gpu.mesh_arrays import is_closed, mesh_arrays, patch_order, split_corners
+from trilane.stages.gpu.composite_painters import DISCS, floor_discs
+from trilane.stages.gpu.skinned_mesh import is_closed, mesh_arrays, patch_order, split_corners
 
 TETRAHEDRON = np.array([(0.0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)])
 OUTWARD = np.array([(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)])
@@ -120,9 +120,9 @@ def test_missing_driver_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(**_: Any) -> None:
         raise Exception("libEGL.so.1: cannot open shared object file")
 
-    monkeypatch.setattr(opengl_context.moderngl, "create_context", refuse)
+    monkeypatch.setattr(opengl.moderngl, "create_context", refuse)
     with pytest.raises(MissingPartError, match="apt-get install libegl1 libgl1-mesa-dri"):
-        opengl_context.open_context()
+        opengl.open_context()
 
 
 @pytest.mark.parametrize(
@@ -137,12 +137,12 @@ def test_what_a_driver_reports_is_an_error(
     monkeypatch: pytest.MonkeyPatch, current: bool, error: str, kind: type[TrilaneError]
 ) -> None:
     """A lost context is one that a new process mends; without a current one the driver reports nothing."""
-    monkeypatch.setattr(opengl_context, "current", lambda: current)
+    monkeypatch.setattr(opengl, "current", lambda: current)
     with pytest.raises(kind, match="OpenGL") as caught:
-        opengl_context.check(SimpleNamespace(error=error))
+        opengl.check(SimpleNamespace(error=error))
     assert type(caught.value) is kind
 
 
 def test_a_frame_that_went_well_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(opengl_context, "current", lambda: True)
-    opengl_context.check(SimpleNamespace(error="GL_NO_ERROR"))
+    monkeypatch.setattr(opengl, "current", lambda: True)
+    opengl.check(SimpleNamespace(error="GL_NO_ERROR"))

@@ -10,9 +10,8 @@ import pytest
 from trilane.body.joints import JOINT_INDEX, JOINTS
 from trilane.scene.schema import PlaneSpec
 from trilane.stages.gpu.builtin_room import Extent, floor_texture, room_mesh, room_textures, wall_texture
-from trilane.stages.gpu.camera_matrices import eye_of, target_clip
-from trilane.stages.gpu.contact_shadows import floor_discs
-from trilane.stages.gpu.detected_planes import half_sides
+from trilane.stages.gpu.composite_painters import floor_discs, half_sides
+from trilane.stages.gpu.opengl import eye_of, target_clip
 
 
 def test_the_targets_first_row_is_the_top_one() -> None:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from trilane.stages.gpu.high_range import HLG, PQ, pq_code, pq_light, roll_off, to_srgb
+from trilane.stages.gpu.video_reader import HLG, PQ, pq_code, pq_light, roll_off, to_srgb
 
 
 def shown(transfer: str, red: float, green: float, blue: float, is_wide: bool = True) -> list[int]:

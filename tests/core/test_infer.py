@@ -18,11 +18,10 @@ from trilane.install import install_line
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.stage import UnitContext
 from trilane.scene.schema import Scene
-from trilane.stages.config import RunConfig
+from trilane.stages.config import RunConfig, pose_dtype
 from trilane.stages.dsp import infer
 from trilane.stages.dsp.infer import InferStage, build
 from trilane.stages.dsp.runtime import RUNTIMES, copies_slots
-from trilane.stages.packets import pose_dtype
 from trilane.testing.assets import assets_of
 from trilane.transport.packets import SlotLayout, view_packet
 

@@ -15,7 +15,7 @@ from trilane.body.kinematics import Skeleton
 from trilane.body.skin_weights import branch_sums, joint_distance, largest_weights
 from trilane.body.skinning import CpuSkinner
 from trilane.scene.crop import Rect
-from trilane.stages.cpu import mesh_bounds, mesh_patches
+from trilane.stages.cpu import mesh_bounds
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 
 LENS = np.array([(1.5, 0, 0.2, 0), (0, 2.0, -0.1, 0), (0, 0, -1.02, -0.202), (0, 0, -1, 0.0)])  # near 0.1, far 10
@@ -41,7 +41,7 @@ def test_patches_are_halved_in_the_middle_of_their_longest_axis() -> None:
     features = np.stack([np.cumsum(np.arange(10.0)), np.linspace(0, 20, 10)], axis=1)  # 0 1 3 6 10 15 21 28 36 45
 
     def groups(points: F64, rows: Any, extent: float) -> list[list[int]]:
-        return [group.tolist() for group in mesh_patches._bisect(points, np.array(rows), extent)]
+        return [group.tolist() for group in mesh_bounds._bisect(points, np.array(rows), extent)]
 
     assert groups(features, range(10), 12.0) == [[0, 1, 2, 3, 4], [5, 6], [7, 8, 9]]
     assert groups(features[:, ::-1], range(9, -1, -1), 12.0) == [[4, 3, 2, 1, 0], [6, 5], [9, 8, 7]]
@@ -54,26 +54,26 @@ def test_patches_are_halved_in_the_middle_of_their_longest_axis() -> None:
 
 def test_a_patchs_centre_is_nearest_to_the_middle_of_its_box() -> None:
     points = np.array([(0.0, 0), (4.2, 3.0), (5.4, 0.5), (10.0, 1.0)])
-    assert mesh_patches._nearest_to_middle(points) == 2  # the middle is (5, 1.5)
+    assert mesh_bounds._nearest_to_middle(points) == 2  # the middle is (5, 1.5)
 
 
 def test_blend_shapes_reach_as_far_as_the_norm_of_their_block() -> None:
     posedirs = np.random.default_rng(0).normal(size=(4, 3, 486)).astype(np.float32)
-    found = mesh_patches._blend_reach(posedirs, 4)
+    found = mesh_bounds._blend_reach(posedirs, 4)
     for vertex in range(4):
         for joint in range(54):
             block = posedirs[vertex, :, 9 * joint : 9 * joint + 9].astype(float)
             assert found[vertex, joint] == pytest.approx(np.sqrt((block**2).sum()), rel=1e-5)
-    assert not mesh_patches._blend_reach(None, 3).any()
-    assert mesh_patches._blend_reach(None, 3).shape == (3, 54)
+    assert not mesh_bounds._blend_reach(None, 3).any()
+    assert mesh_bounds._blend_reach(None, 3).shape == (3, 54)
 
 
 def test_levels_hold_what_their_formulas_say(shaped: ShapedBody) -> None:
     """Two levels of all triangles: size, give and blend of each patch, one vertex at a time."""
     body, weights = shaped.body, shaped.body.weights.astype(float)
-    coarse, fine = mesh_patches._build_levels(shaped, weights)
+    coarse, fine = mesh_bounds._build_levels(shaped, weights)
     branches = branch_sums(body.parents, weights)
-    reach = mesh_patches._blend_reach(body.posedirs, len(weights))
+    reach = mesh_bounds._blend_reach(body.posedirs, len(weights))
     rest = shaped.vertices.astype(float)
     swing = 0.5 * (branches * joint_distance(shaped))[:, 1:]
     middles = np.concatenate([rest, swing], axis=1)[body.faces].mean(axis=1)
@@ -98,9 +98,9 @@ def test_levels_hold_what_their_formulas_say(shaped: ShapedBody) -> None:
 
 def test_levels_are_the_same_from_the_cache(shaped: ShapedBody) -> None:
     weights = shaped.body.weights.astype(float)
-    made = mesh_patches._build_levels(shaped, weights)
+    made = mesh_bounds._build_levels(shaped, weights)
     for _ in range(2):
-        for level, expected in zip(mesh_patches.build_levels(shaped, weights), made, strict=True):
+        for level, expected in zip(mesh_bounds.build_levels(shaped, weights), made, strict=True):
             for name in ("centres", "size", "give", "blend"):
                 np.testing.assert_array_equal(getattr(level, name), getattr(expected, name))
             for name in ("parts", "faces"):
@@ -116,7 +116,7 @@ def test_spheres_hold_their_patches_in_every_pose(shaped: ShapedBody, size: floa
         posed = bent(shaped, seed, size)
         vertices = skinner.vertices(posed)
         angles = np.linalg.norm(posed.feature.reshape(-1, 9), axis=1)  # |R - I| = 2 sqrt(2) sin(t / 2)
-        for level in mesh_patches._build_levels(shaped, weights):
+        for level in mesh_bounds._build_levels(shaped, weights):
             radius = level.size + level.give @ (angles / np.sqrt(2)) + 2 * level.blend @ angles
             for number, faces in enumerate(level.faces):
                 members = np.unique(shaped.body.faces[faces])
@@ -126,8 +126,8 @@ def test_spheres_hold_their_patches_in_every_pose(shaped: ShapedBody, size: floa
 
 def test_groups_are_joined_in_the_order_asked_for() -> None:
     groups = [np.array([4, 5]), np.array([1]), np.array([9, 8])]
-    assert mesh_patches.join(groups, np.array([2, 0])).tolist() == [9, 8, 4, 5]
-    assert mesh_patches.join(groups, np.array([], int)).tolist() == []
+    assert mesh_bounds.join(groups, np.array([2, 0])).tolist() == [9, 8, 4, 5]
+    assert mesh_bounds.join(groups, np.array([], int)).tolist() == []
 
 
 # --- spheres on the screen -------------------------------------------------------------------------------------------

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from trilane.body.body import ShapedBody, load_body
 from trilane.body.kinematics import Posed, Skeleton
-from trilane.stages.cpu.mesh_bounds import MeshBounds
-from trilane.stages.cpu.mesh_patches import _blend_reach
+from trilane.stages.cpu.mesh_bounds import MeshBounds, _blend_reach
 
 SQUARE = np.array([[-0.01, -0.01, 0], [0.01, -0.01, 0], [0.01, 0.01, 0], [-0.01, 0.01, 0]], np.float32)
 

@@ -12,12 +12,11 @@ import pytest
 from trilane import machine
 from trilane.body.body import load_body
 from trilane.body.skinning import FrameSkinner
-from trilane.machine import Machine
+from trilane.machine import Machine, last_level_bytes, moved_of_kept
 from trilane.pipeline.moved_bytes import BYTES, ByteCounter, add_bytes
 from trilane.pipeline.run_metrics import MovedInAll
 from trilane.stages.cpu.present import Segment
 from trilane.stages.dsp.infer import BoundPart
-from trilane.stages.last_level_cache import last_level_bytes, moved_of_kept
 
 KEYS = ("read", "written", "uploaded", "read_back", "least")
 

@@ -13,8 +13,7 @@ from trilane.arrays import F64
 from trilane.body.body import ShapedBody, load_body
 from trilane.body.kinematics import Skeleton
 from trilane.body.skinning import CpuSkinner
-from trilane.stages.cpu.mesh_bounds import ROUNDING_M, MeshBounds
-from trilane.stages.cpu.outermost import Outermost
+from trilane.stages.cpu.mesh_bounds import ROUNDING_M, MeshBounds, Outermost
 
 LENS = np.array([(1.5, 0, 0.2, 0), (0, 2.0, -0.1, 0), (0, 0, -1.02, -0.202), (0, 0, -1, 0.0)])  # near 0.1, far 10
 

@@ -19,8 +19,8 @@ from trilane.pipeline.other_programs import OtherPrograms, busy_s
 from trilane.pipeline.trial import Round
 from trilane.scheduler.placement import Ranked
 from trilane.scheduler.places import Place
-from trilane.stages import choosing
-from trilane.stages.choosing import Choice, choice
+from trilane.stages import placing
+from trilane.stages.placing import TriedPlacement, choice
 
 STEP_S = 1 / os.sysconf("SC_CLK_TCK")
 PLACES = [{"cpu": Place((0,), 1), "dsp": Place(cores, 1)} for cores in ((1,), (0,), (0, 1))]
@@ -34,8 +34,8 @@ def machine(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
 
     def made(shares: list[float], *frame_ns: tuple[float, ...]) -> list[str]:
         left, said = list(shares), list[str]()
-        monkeypatch.setattr(choosing, "OtherPrograms", lambda _: SimpleNamespace(share=lambda: left.pop(0)))
-        monkeypatch.setattr(choosing.time, "sleep", lambda seconds: said.append(f"looks for {seconds} s"))
+        monkeypatch.setattr(placing, "OtherPrograms", lambda _: SimpleNamespace(share=lambda: left.pop(0)))
+        monkeypatch.setattr(placing.time, "sleep", lambda seconds: said.append(f"looks for {seconds} s"))
 
         def tried(
             _checked: Any, placements: Any, rounds: int, _starter: Any, limit_s: float, least: int
@@ -43,7 +43,7 @@ def machine(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
             assert (placements, rounds, limit_s, least) == (PLACES, 6, 5.0, 3)
             return [Round(each, left.pop(0)) for each in frame_ns]
 
-        monkeypatch.setattr(choosing, "tried", tried)
+        monkeypatch.setattr(placing, "tried", tried)
         return said
 
     return made
@@ -52,7 +52,7 @@ def machine(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
 def test_frames_decide_on_a_quiet_machine(machine: Callable[..., list[str]]) -> None:
     said = machine([0.02, 0.05, 0.3, 0.0], (9e6, 6e6, 8e6), (30e6, 20e6, 10e6), (9e6, 7e6, 8e6))
     found = choice(ANY, (0, 1), CANDIDATES, ANY, said.append)
-    assert found == Choice(1, "the fastest of 3 that were tried", (9.0, 7.0, 8.0))
+    assert found == TriedPlacement(1, "the fastest of 3 that were tried", (9.0, 7.0, 8.0))
     assert said[0] == "looks for 0.25 s"
     assert said[1:] == ["trying 3 placements with frames of the scene (once for this avatar, scene and machine) ..."]
 
@@ -85,7 +85,7 @@ def test_on_a_busy_machine_the_prediction_decides_and_nothing_is_kept(
         stored.append(make())
         return stored[-1]
 
-    assert choice(ANY, (0, 1), CANDIDATES, ANY, said.append, kept) == Choice(
+    assert choice(ANY, (0, 1), CANDIDATES, ANY, said.append, kept) == TriedPlacement(
         0, f"the least predicted frame time; {why}"
     )
     assert (stored, len(said)) == ([], 2 if len(shares) > 1 else 1)
@@ -95,7 +95,7 @@ def test_what_was_found_before_is_taken_as_it_is(machine: Callable[..., list[str
     machine([])
     found = choice(ANY, (0, 1), CANDIDATES, ANY, kept=lambda _: {"frame_ns": np.array([[3e6, 2e6, 1e6]])})
     assert (found.best, found.frame_ms) == (2, (3.0, 2.0, 1.0))
-    assert choice(ANY, (0, 1), CANDIDATES[:1], ANY) == Choice(0, "the least predicted frame time")
+    assert choice(ANY, (0, 1), CANDIDATES[:1], ANY) == TriedPlacement(0, "the least predicted frame time")
 
 
 def stat(*cores: tuple[int, ...]) -> str:

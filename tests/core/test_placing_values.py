@@ -14,7 +14,7 @@ from trilane.scheduler.placement import Ranked
 from trilane.scheduler.placement_model import Rules
 from trilane.scheduler.places import Core, Place, Work
 from trilane.stages import placing
-from trilane.stages.choosing import Choice
+from trilane.stages.placing import TriedPlacement
 
 ANY: Any = None
 CORES = (Core(0, 0), Core(1, 1))
@@ -50,7 +50,7 @@ def asked(frames: int = 100, **cores: tuple[int, ...]) -> Any:
 class Told:
     """In place of what measures and keeps; `asked`: of what."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, answer: Choice) -> None:
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, answer: TriedPlacement) -> None:
         self.asked: list[Any] = []
         self.answer, self.kept = answer, dict[str, Any]()
         found = [Ranked(A, 9_000_000), Ranked(B, 10_000_000), Ranked(RULE, 15_000_000)]
@@ -77,7 +77,7 @@ class Told:
             self.kept[name] = make()
         return self.kept[name]
 
-    def choose(self, _checked: Any, cores: Any, candidates: Any, starter: Any, _say: Any, kept: Any) -> Choice:
+    def choose(self, _checked: Any, cores: Any, candidates: Any, starter: Any, _say: Any, kept: Any) -> TriedPlacement:
         self.asked.append(("choice", cores, [each.placement for each in candidates], starter))
         kept(lambda: {"frame_ns": np.ones(1)})
         return self.answer
@@ -89,7 +89,7 @@ NOON = "1970-01-02T00:00:00Z"
 
 
 def test_what_is_measured_is_kept_and_the_best_of_those_tried_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    told = Told(monkeypatch, Choice(2, "the fastest of 3 that were tried", (8.0, 9.0, 7.0)))
+    told = Told(monkeypatch, TriedPlacement(2, "the fastest of 3 that were tried", (8.0, 9.0, 7.0)))
     said: list[str] = []
     found = placing.placed(asked(), "pipelined", "starter", "a driver", said.append)  # type: ignore[arg-type]
     names = [placing.described(where) for where in (B, RULE, A)]
@@ -125,7 +125,7 @@ def test_one_frame_at_a_time_is_predicted_and_cores_that_are_asked_for_are_said(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Nothing but the least prediction is a candidate; the frame time that is said is the predicted one."""
-    told = Told(monkeypatch, Choice(0, "the least predicted frame time"))
+    told = Told(monkeypatch, TriedPlacement(0, "the least predicted frame time"))
     found = placing.placed(asked(gpu=(1,)), "sequential", ANY, "a driver")
     assert told.asked[2] == ("ranked", list(CORES), TIMES, Rules("cpu", True), {"gpu": Place((1,), 1)})
     assert told.asked[3] == ("choice", [0, 1], [B], None)
@@ -143,7 +143,7 @@ def test_one_frame_at_a_time_is_predicted_and_cores_that_are_asked_for_are_said(
     ],
 )
 def test_what_is_not_measured_is_placed_by_the_rule(run: Any, how: str, why: str, monkeypatch: Any) -> None:
-    told = Told(monkeypatch, Choice(0, ""))
+    told = Told(monkeypatch, TriedPlacement(0, ""))
     found = placing.placed(run, "pipelined", ANY)
     assert told.asked == []
     assert found.placement == {"how": how, "why": why, "units": placing.unit_rows(RULE)}
@@ -157,7 +157,7 @@ def test_one_core_leaves_nothing_to_choose() -> None:
 
 def test_a_prediction_has_the_times_that_a_run_is_placed_by(monkeypatch: pytest.MonkeyPatch) -> None:
     """Under the run's own key, so whoever comes second measures nothing; each stage has its times frame by frame."""
-    told = Told(monkeypatch, Choice(0, ""))
+    told = Told(monkeypatch, TriedPlacement(0, ""))
     placing.placed(asked(), "sequential", ANY, "a driver")
     found, at = placing.rehearsed(asked(), ANY, "a driver")
     assert (found, at) == (Rehearsed(TIMES, TOOK_NS), NOON)

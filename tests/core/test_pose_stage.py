@@ -19,9 +19,8 @@ from trilane.scene.crop import Rect
 from trilane.scene.schema import AvatarSpec, CameraSpec, Scene
 from trilane.scene.tensor_layout import MARGIN_PX, lay_out
 from trilane.shapes import shape_buckets
-from trilane.stages.config import RunConfig
+from trilane.stages.config import RunConfig, pose_dtype
 from trilane.stages.cpu.pose import PoseStage, build
-from trilane.stages.packets import pose_dtype
 from trilane.testing.assets import assets_of
 from trilane.testing.told_bytes import without_bytes
 from trilane.transport.packets import Packet, SlotLayout, view_packet

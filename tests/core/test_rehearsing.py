@@ -11,7 +11,7 @@ import pytest
 
 from trilane.pipeline.trial import Group, Round
 from trilane.scheduler.places import Core, Place, Placement
-from trilane.stages import rehearsing
+from trilane.stages import avatar_pipeline
 from trilane.stages.configure import Checked
 
 ANY: Any = None
@@ -41,7 +41,7 @@ def described(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         made.append(config)
         return config
 
-    monkeypatch.setattr(rehearsing, "avatar_pipeline", pipeline)
+    monkeypatch.setattr(avatar_pipeline, "avatar_pipeline", pipeline)
     return made
 
 
@@ -73,8 +73,8 @@ def trials(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
                 break
         return rounds
 
-    monkeypatch.setattr(rehearsing, "try_in_turns", try_in_turns)
-    monkeypatch.setattr(rehearsing, "Group", lambda pipeline, places: Group(pipeline, list(Numbered(places))))
+    monkeypatch.setattr(avatar_pipeline, "try_in_turns", try_in_turns)
+    monkeypatch.setattr(avatar_pipeline, "Group", lambda pipeline, places: Group(pipeline, list(Numbered(places))))
     return asked
 
 
@@ -87,7 +87,7 @@ class Numbered(list[Any]):
 
 def test_frame_times_come_in_the_order_of_the_placements(trials: list[tuple[Any, ...]], described: list[Any]) -> None:
     """Groups: the first and the last placement, then one each for those that spin and that do not."""
-    found = rehearsing.tried(checked_of(), PLACEMENTS, 3, "starter")  # type: ignore[arg-type]
+    found = avatar_pipeline.tried(checked_of(), PLACEMENTS, 3, "starter")  # type: ignore[arg-type]
     assert [each.frame_ns for each in found] == [
         (0.0 + turn, 100.0 + turn, 200.0 + turn, 2000.0 + turn) for turn in (0, 10, 20)
     ]
@@ -110,8 +110,8 @@ def test_rounds_end_when_the_time_is_up_but_not_before_the_least(
 ) -> None:
     """Begun at 5 s, for 3 s: after two rounds it is 7 s, after three 8 s, which is not past it, after four 8.5 s."""
     now = iter([5.0, 7.0, 8.0, 8.5])
-    monkeypatch.setattr(rehearsing.time, "monotonic", lambda: next(now))
-    assert len(rehearsing.tried(checked_of(10), PLACEMENTS[:1], 6, ANY, 3.0, 2)) == 4
+    monkeypatch.setattr(avatar_pipeline.time, "monotonic", lambda: next(now))
+    assert len(avatar_pipeline.tried(checked_of(10), PLACEMENTS[:1], 6, ANY, 3.0, 2)) == 4
     assert trials[0][1] == [0] * 6  # the scene is shorter than a slice
 
 
@@ -128,11 +128,11 @@ def test_every_number_of_threads_is_measured_on_the_fastest_cores(
         asked.append((first, others, frames, assets, starter))
         return "times"
 
-    monkeypatch.setattr(rehearsing, "rehearse", rehearse)
+    monkeypatch.setattr(avatar_pipeline, "rehearse", rehearse)
     cores = [Core(0, 0, 500), Core(1, 1, 900), Core(2, 2, 500), Core(3, 3, 900)]
     buckets = ((64, 64), (128, 128), (64, 256), (120, 140))
     checked = checked_of(103, buckets, 2 * 64 * 64 + 1)
-    assert rehearsing.measured_times(checked, cores, PLACEMENTS[0], "starter") == "times"  # type: ignore[arg-type,comparison-overlap]
+    assert avatar_pipeline.measured_times(checked, cores, PLACEMENTS[0], "starter") == "times"  # type: ignore[arg-type,comparison-overlap]
     ((first, others, frames, assets, starter),) = asked
     assert [first, *others] == described
     rows = [[(*unit.cores, unit.threads, unit.spin) for unit in config.units.values()] for config in described]
@@ -150,7 +150,7 @@ def test_the_shape_is_the_squarest_of_those_that_are_large() -> None:
     """Half of the most pixels is too small; of two as square the one with fewer rows."""
 
     def shape(*buckets: tuple[int, int], most: int = 20_000) -> tuple[int, int]:
-        return rehearsing.one_shape(checked_of(9, buckets, most).config)
+        return avatar_pipeline.one_shape(checked_of(9, buckets, most).config)
 
     assert shape((100, 100), (90, 140), (140, 90)) == (90, 140)
     assert shape((100, 100), (80, 240), (140, 90), most=19_999) == (100, 100)

@@ -24,11 +24,9 @@ from trilane.figure_sources import NO_FIGURES
 from trilane.pipeline.description import UnitSettings
 from trilane.scene.schema import AvatarSpec, OutputSpec, Scene
 from trilane.scene.staging import stage_scene
-from trilane.stages import avatar_assets, avatar_pipeline, configure, machine_facts
-from trilane.stages.config import NetworkCut, RunConfig
-from trilane.stages.dsp.parts import crossing_bytes
-from trilane.stages.factories import FACTORIES, PRELOAD
-from trilane.stages.packets import AVATAR_DTYPE, pose_dtype
+from trilane.stages import FACTORIES, PRELOAD, avatar_assets, avatar_pipeline, configure, machine_facts
+from trilane.stages.config import AVATAR_DTYPE, NetworkCut, RunConfig, pose_dtype
+from trilane.stages.dsp.infer import crossing_bytes
 from trilane.testing.assets import assets_of
 
 
@@ -419,10 +417,10 @@ def test_the_driver_is_tried_in_a_process_of_its_own(monkeypatch: Any, output: A
 
 
 def test_a_drivers_limits_are_those_that_it_tells(monkeypatch: pytest.MonkeyPatch) -> None:
-    from trilane.stages.gpu import opengl_context
+    from trilane.stages.gpu import opengl
 
     info = {"GL_VENDOR": "v", "GL_RENDERER": "llvmpipe", "GL_VERSION": "4", "GL_MAX_TEXTURE_SIZE": 8, "GL_OTHER": 1}
-    monkeypatch.setattr(opengl_context, "open_context", lambda: SimpleNamespace(info=info))
+    monkeypatch.setattr(opengl, "open_context", lambda: SimpleNamespace(info=info))
     assert machine_facts.open_gl() == {
         "vendor": "v",
         "renderer": "llvmpipe",

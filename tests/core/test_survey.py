@@ -18,9 +18,8 @@ from trilane.errors import BadInputError
 from trilane.scene.camera.path import CameraPath, one_lens
 from trilane.scene.footage import Stored, filmed
 from trilane.stages.gpu.background import open_background
-from trilane.stages.gpu.high_range import PQ, pq_code
 from trilane.stages.gpu.survey import check_pictures, survey
-from trilane.stages.gpu.video_reader import Pixels, fitted
+from trilane.stages.gpu.video_reader import PQ, Pixels, fitted, pq_code
 
 WIDTH, HEIGHT, WHITE_PX = 64, 48, 16
 LOOSE: Any = SimpleNamespace(is_held=False)

@@ -17,9 +17,8 @@ from trilane.apps.video import contact_sheet, join_segments, run_checksum
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.moved_bytes import BYTES
 from trilane.scene.schema import OutputSpec, Scene
-from trilane.stages.config import RunConfig
+from trilane.stages.config import RunConfig, pose_dtype
 from trilane.stages.cpu.present import SEGMENTS, PresentStage
-from trilane.stages.packets import pose_dtype
 from trilane.testing.told_bytes import without_bytes
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 

@@ -15,11 +15,10 @@ from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.stage import Skip, UnitContext
 from trilane.scene.planner import FrameWork, shown_by, work_of
 from trilane.scene.schema import AvatarSpec, CameraSpec, OutputSpec, Scene
-from trilane.stages.config import RunConfig
+from trilane.stages.config import RunConfig, pose_dtype
 from trilane.stages.cpu.pose import PoseStage
 from trilane.stages.cpu.present import PresentStage
-from trilane.stages.gpu.drawn_frames import DrawnFrames
-from trilane.stages.packets import pose_dtype
+from trilane.stages.gpu.composite import DrawnFrames
 from trilane.testing.assets import assets_of
 from trilane.testing.small_pipeline import EDGES, OWN, STAGES, packets, pipeline
 from trilane.testing.told_bytes import without_bytes

@@ -12,13 +12,12 @@ import pytest
 
 from trilane.scene.planner import FrameWork
 from trilane.scene.schema import PlaneSpec
-from trilane.stages.gpu import transfers
-from trilane.stages.gpu.composite import CompositeStage
-from trilane.stages.gpu.head_up_display import SIZE
+from trilane.stages.config import pose_dtype, posed_vertices
+from trilane.stages.gpu import opengl
+from trilane.stages.gpu.composite import SIZE, CompositeStage
 from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Quantisation
 from trilane.stages.gpu.raster import RasterStage
 from trilane.stages.gpu.skinned_mesh import PosedMesh, SkinnedMesh
-from trilane.stages.packets import pose_dtype, posed_vertices
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 TENSOR, OUTPUT = (96, 64), (240, 320)
@@ -219,4 +218,4 @@ def test_a_room_that_grows_is_uploaded_again(gl: Any, person: Any, camera: Any, 
 
 
 def test_a_contexts_counter_is_one(gl: Any) -> None:
-    assert transfers.counter_of(gl) is transfers.counter_of(gl)
+    assert opengl.counter_of(gl) is opengl.counter_of(gl)
