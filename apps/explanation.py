@@ -15,7 +15,7 @@ from typing import Any
 from trilane.apps.plan_cost import CostModel, FrameCost
 from trilane.apps.resolution import worst_loss
 from trilane.apps.scene_plan import PlannedFrame, ScenePlan, phases
-from trilane.body.detail import DETAILS, left_out
+from trilane.body.skinning import DETAILS, left_out
 from trilane.figure_sources import COMPUTED, MEASURED
 from trilane.scene.planner import ALL_WORK, MOST_DENSITY, FrameWork
 from trilane.shapes import Shape

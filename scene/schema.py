@@ -26,9 +26,8 @@ from pydantic import (
 from pydantic.fields import FieldInfo
 
 from trilane.body.joints import JOINT_INDEX
-from trilane.errors import BadInputError
+from trilane.errors import BadInputError, did_you_mean
 from trilane.files import read_text
-from trilane.near_miss import did_you_mean
 from trilane.shapes import BUCKET_STEP, MAX_SIDE, checked_size
 from trilane.unexpected_value import UnexpectedValue, unexpected_in
 

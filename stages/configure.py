@@ -20,12 +20,10 @@ from trilane.avatars.integer_network import NetworkFile
 from trilane.avatars.network_split import split
 from trilane.avatars.size_loss import SizeLoss, size_loss
 from trilane.avatars.validation import DrawnAs, accuracy_of
-from trilane.errors import BadInputError, MissingPartError
+from trilane.errors import EGL_LINE, BadInputError, MissingPartError, did_you_mean
 from trilane.hw_profiles.host import asked_cores, rule_placement, settings_of, usable_cores
 from trilane.hw_profiles.load import HOST, load_profile
 from trilane.hw_profiles.runtime_choice import fastest_runtime
-from trilane.install import EGL_LINE
-from trilane.near_miss import did_you_mean
 from trilane.pipeline.shared_assets import Assets
 from trilane.scene.footage import Footage
 from trilane.scene.planner import TensorBudget

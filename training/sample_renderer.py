@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from trilane.arrays import F64
 from trilane.body.body import ShapedBody
 from trilane.body.kinematics import Skeleton
-from trilane.body.skin_weights import largest_weights
+from trilane.body.skinning import largest_weights
 from trilane.shapes import shape_buckets
 from trilane.stages.gpu.opengl import open_context
 from trilane.stages.gpu.packed_pass import Placement

@@ -16,9 +16,8 @@ from typing import NamedTuple
 import numpy as np
 
 from trilane.arrays import F64
-from trilane.errors import BadInputError
+from trilane.errors import BadInputError, did_you_mean
 from trilane.files import read_text, require_file
-from trilane.near_miss import did_you_mean
 from trilane.scene.camera.colmap import ENDINGS, load_colmap, model_in
 from trilane.scene.camera.json_files import NERF_FILE, RECORD3D_FILE, load_nerf, load_record3d
 from trilane.scene.camera.path import BUILTIN, CameraPath, load_builtin

@@ -14,9 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from trilane.arrays import F64
-from trilane.errors import BadInputError
+from trilane.errors import BadInputError, did_you_mean
 from trilane.files import refuse_other, require_file
-from trilane.near_miss import did_you_mean
 from trilane.scene.motion.array_files import load_npy, load_npz, load_pickle
 from trilane.scene.motion.builtin import BUILTIN
 from trilane.scene.motion.bvh_retarget import load_retargeted

@@ -20,8 +20,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from trilane.body.joints import JOINT_NAMES
-from trilane.errors import BadInputError
-from trilane.near_miss import did_you_mean
+from trilane.errors import BadInputError, did_you_mean
 
 #: What stands before all names: a namespace, or what Mixamo, 3ds Max, Rigify, VRoid and Character Creator write.
 _PREFIX = re.compile(r"^(?:.*:)?(?:mixamorig\d*_?(?=[a-z])|bip0*1|def-|org-|j_bip_|cc_base_)?")

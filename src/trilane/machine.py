@@ -1,7 +1,7 @@
-"""What Trilane asks of the machine: cores, processor, counters, memory, packages, programs, folders, the date.
+"""What Trilane asks of the machine: cores, processor, caches, counters, memory, packages, programs, folders, the date.
 
-Rule: it is asked here and nowhere else, so a test can put another machine in place of `here`. Ruff refuses the calls
-below in every other file (`banned-api` in pyproject.toml). Two things are asked elsewhere, each in one place: OpenGL by
+It is asked here and nowhere else, so a test can put another machine in place of `here`. Ruff refuses the calls below in
+every other file (`banned-api` in pyproject.toml). Two things are asked elsewhere, each in one place: OpenGL by
 `trilane.stages.gpu.opengl`, and clocks by whoever measures, because a clock is read in every job.
 """
 

@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 from trilane.arrays import F32, F64
 from trilane.avatars.bundle import CLOTHES_STANDOFF_M
 from trilane.body.body import ShapedBody
-from trilane.body.detail import DETAILS, DetailBounds
 from trilane.body.kinematics import Posed, Skeleton
-from trilane.body.skinning import FrameSkinner
+from trilane.body.skinning import DETAILS, DetailBounds, FrameSkinner
 from trilane.errors import TrilaneError
 from trilane.machine import moved_of_kept
 from trilane.pipeline.moved_bytes import ByteCounter

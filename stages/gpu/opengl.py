@@ -29,8 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import U8, Floats
-from trilane.errors import MissingPartError, TrilaneError, UnitLostError
-from trilane.install import EGL_LINE
+from trilane.errors import EGL_LINE, MissingPartError, TrilaneError, UnitLostError
 from trilane.pipeline.moved_bytes import ByteCounter
 
 REQUIRED_VERSION = 330

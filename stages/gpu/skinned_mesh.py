@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from trilane.arrays import F32, Floats, Ints
 from trilane.body.body import Body, ShapedBody
 from trilane.body.joints import JOINTS, POSE_FEATURES
-from trilane.body.skin_weights import WEIGHT_COUNTS, largest_weights
+from trilane.body.skinning import WEIGHT_COUNTS, largest_weights
 from trilane.cache import Arrays, cached_arrays
 from trilane.errors import BadInputError
 from trilane.stages.gpu.opengl import build_program, counter_of, set_uniforms, target_clip, upload

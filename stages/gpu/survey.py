@@ -18,8 +18,7 @@ import av
 
 from trilane import machine
 from trilane.errors import BadInputError
-from trilane.file_signatures import HEAD_BYTES, PICTURE, VIDEO, signature_of_head
-from trilane.files import require_file
+from trilane.files import HEAD_BYTES, PICTURE, VIDEO, require_file, signature_of_head
 from trilane.scene.camera.path import CameraPath
 from trilane.scene.footage import Footage, Stored, film_of
 from trilane.stages.gpu.background import check_picture, is_picture, look_at_picture, pictures_in

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from trilane.body import body
 from trilane.body import body as body_module
-from trilane.body import pose_blend_shapes
-from trilane.body.body import Body, ShapedBody, load_body
+from trilane.body.body import Body, ShapedBody, load_body, read_pose_blend
 from trilane.body.joints import (
     JOINT_INDEX,
     JOINT_NAMES,
@@ -25,9 +25,16 @@ from trilane.body.joints import (
     RIGHT_HAND,
 )
 from trilane.body.kinematics import MAX_VALUE, Skeleton
-from trilane.body.pose_blend_shapes import read_pose_blend
-from trilane.body.skin_weights import branch_sums, joint_distance, largest_weights, weight_error_bound
-from trilane.body.skinning import CpuSkinner, FrameSkinner, blend_matrices, posed_vertices
+from trilane.body.skinning import (
+    CpuSkinner,
+    FrameSkinner,
+    blend_matrices,
+    branch_sums,
+    joint_distance,
+    largest_weights,
+    posed_vertices,
+    weight_error_bound,
+)
 from trilane.errors import BadInputError
 
 Arrays = dict[str, NDArray[Any]]
@@ -258,7 +265,7 @@ def npz_with(path: Path, array: NDArray[Any]) -> Path:
 
 def test_pose_blend_shapes_come_in_chunks_and_in_either_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Chunks of 10 numbers, the first of them zeros; float64 in Fortran order gives the same numbers."""
-    monkeypatch.setattr(pose_blend_shapes, "_CHUNK_ITEMS", 10)
+    monkeypatch.setattr(body, "_CHUNK_ITEMS", 10)
     array = np.arange(42, dtype=np.float32).reshape(7, 3, 2)
     array[:3] = 0.0
     for stored in (array, np.asfortranarray(array.astype(np.float64)), array.astype(np.int16)):
@@ -287,11 +294,11 @@ def test_wrong_pose_blend_shapes_are_refused(tmp_path: Path, case: str) -> None:
 def test_pose_blend_shapes_have_a_largest_size_and_all_their_bytes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert pose_blend_shapes.MAX_BYTES == 1 << 30
+    assert body.MAX_BYTES == 1 << 30
     path = npz_with(tmp_path / "a.npz", np.ones((7, 3, 2)))
-    monkeypatch.setattr(pose_blend_shapes, "MAX_BYTES", 42 * 8)
+    monkeypatch.setattr(body, "MAX_BYTES", 42 * 8)
     assert read_pose_blend(path, (7, 3, 2)) is not None
-    monkeypatch.setattr(pose_blend_shapes, "MAX_BYTES", 42 * 8 - 1)
+    monkeypatch.setattr(body, "MAX_BYTES", 42 * 8 - 1)
     with pytest.raises(
         BadInputError, match=r"a.npz\[posedirs\]: found shape \(7, 3, 2\) of float64, expected at most 335 bytes"
     ):
@@ -301,7 +308,7 @@ def test_pose_blend_shapes_have_a_largest_size_and_all_their_bytes(
     cut = io.BytesIO(whole.getvalue()[:-1])
     monkeypatch.undo()
     with pytest.raises(BadInputError, match="x: found truncated data, expected 336 bytes by its own header"):
-        pose_blend_shapes._read("x", cut, (7, 3, 2))
+        body._read("x", cut, (7, 3, 2))
     np.savez(path, other=np.ones(3))
     with pytest.raises(BadInputError, match=r"no array 'posedirs', expected a body file in the SMPL-X layout \(.npz\)"):
         read_pose_blend(path, (7, 3, 2))

@@ -13,10 +13,19 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F64
 from trilane.body.body import ShapedBody, load_body
-from trilane.body.detail import CARRIED_BY, DETAILS, EVERYTHING, ROUNDING_M, DetailBounds, carried, left_out
 from trilane.body.joints import JOINT_INDEX, JOINTS
 from trilane.body.kinematics import Skeleton
-from trilane.body.skinning import CpuSkinner, FrameSkinner
+from trilane.body.skinning import (
+    CARRIED_BY,
+    DETAILS,
+    EVERYTHING,
+    ROUNDING_M,
+    CpuSkinner,
+    DetailBounds,
+    FrameSkinner,
+    carried,
+    left_out,
+)
 from trilane.scene.crop import Rect, cheapest_within, error_px, least_w
 from trilane.scene.rotations import about
 from trilane.stages.cpu.pose import FINEST, ModelledBody, widened

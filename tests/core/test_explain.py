@@ -21,9 +21,8 @@ from trilane.apps.plan_picture import BODY, GROUND, MESH, TENSOR, _tile, draw_pl
 from trilane.apps.scene_plan import PlannedFrame, ScenePlan, phases
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_reshape import reshaped
-from trilane.body.detail import DETAILS
 from trilane.body.kinematics import Skeleton
-from trilane.body.skinning import CpuSkinner
+from trilane.body.skinning import DETAILS, CpuSkinner
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import Plan, stage_times_ms, steady
 from trilane.hw_profiles.load import load_profile

@@ -43,7 +43,7 @@ def test_as_many_weights_as_hold_all_but_a_thousandth(lost: float, at: int, coun
 
 def test_the_avatars_mesh_is_the_bodys_and_is_the_same_from_the_cache(body_arrays: Any, tmp_path: Any) -> None:
     from trilane.body.body import load_body
-    from trilane.body.skin_weights import largest_weights
+    from trilane.body.skinning import largest_weights
 
     np.savez(tmp_path / "body.npz", allow_pickle=False, **body_arrays)
     shaped = load_body(tmp_path / "body.npz").shape()

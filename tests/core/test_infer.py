@@ -13,8 +13,7 @@ import pytest
 from trilane import machine
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.integer_network import constants_of
-from trilane.errors import BadInputError
-from trilane.install import install_line
+from trilane.errors import BadInputError, install_line
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.stage import UnitContext
 from trilane.scene.schema import Scene

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from trilane.arrays import F64
 from trilane.body.body import ShapedBody, load_body
 from trilane.body.kinematics import Skeleton
-from trilane.body.skin_weights import branch_sums, joint_distance, largest_weights
-from trilane.body.skinning import CpuSkinner
+from trilane.body.skinning import CpuSkinner, branch_sums, joint_distance, largest_weights
 from trilane.scene.crop import Rect
 from trilane.stages.cpu import mesh_bounds
 from trilane.stages.cpu.mesh_bounds import MeshBounds

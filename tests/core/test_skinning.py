@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from trilane.body.body import ShapedBody, load_body
 from trilane.body.kinematics import Skeleton, rodrigues
-from trilane.body.skin_weights import largest_weights, weight_error_bound
-from trilane.body.skinning import CpuSkinner, FrameSkinner, posed_vertices
+from trilane.body.skinning import CpuSkinner, FrameSkinner, largest_weights, posed_vertices, weight_error_bound
 from trilane.errors import BadInputError
 
 Arrays = dict[str, NDArray[Any]]

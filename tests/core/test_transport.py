@@ -18,27 +18,27 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trilane.errors import TrilaneError
-from trilane.transport.job_pipe import PACKETS, JobPipe, job_pipe_pair
-from trilane.transport.link import Link
-from trilane.transport.memory import RegionLayout, create_region, map_region
+from trilane.transport.link import LOCK, Link, SocketFolder, remove_abandoned
 from trilane.transport.messages import (
     MAX_BYTES,
     MAX_TEXT,
+    PACKETS,
     Close,
     Closed,
     Done,
     Failed,
+    JobPipe,
     Message,
     MessageError,
     Ping,
     Pong,
     Ready,
     RunJob,
+    job_pipe_pair,
     pack,
     unpack,
 )
-from trilane.transport.packets import SlotLayout, header_dtype
-from trilane.transport.socket_folder import LOCK, SocketFolder, remove_abandoned
+from trilane.transport.packets import RegionLayout, SlotLayout, create_region, header_dtype, map_region
 from trilane.transport.wakeup import AWAKE, DEFAULT, SHORTEST_NS, awake, use_slice
 
 MESSAGES = [

@@ -18,15 +18,11 @@ import zmq
 
 from trilane import machine
 from trilane.errors import TrilaneError
-from trilane.transport import heartbeats, job_pipe, memory, messages, packets, slots, socket_folder, wakeup
-from trilane.transport.heartbeats import HeartbeatSocket, context_on_cores
-from trilane.transport.job_pipe import JobPipe, job_pipe_pair
-from trilane.transport.link import Link
-from trilane.transport.memory import RegionLayout, create_region, map_region
-from trilane.transport.messages import MessageError, pack, unpack
-from trilane.transport.packets import SlotLayout, header_dtype, view_packet
+from trilane.transport import link, messages, packets, slots, wakeup
+from trilane.transport.link import HeartbeatSocket, Link, SocketFolder, context_on_cores, remove_abandoned
+from trilane.transport.messages import JobPipe, MessageError, job_pipe_pair, pack, unpack
+from trilane.transport.packets import RegionLayout, SlotLayout, create_region, header_dtype, map_region, view_packet
 from trilane.transport.slots import EdgeRule, EdgeSlots, SlotError, edge_rule
-from trilane.transport.socket_folder import SocketFolder, remove_abandoned
 
 PAGE = 4096
 MIB = 1 << 20
@@ -286,7 +282,7 @@ def test_pipes_are_crossed_keep_messages_apart_and_are_not_inherited() -> None:
 
 
 def test_a_pipe_of_sixteen_pages_will_do_and_a_smaller_one_will_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert job_pipe.PACKETS == 16
+    assert messages.PACKETS == 16
     monkeypatch.setattr(fcntl, "fcntl", lambda *_: 16 * os.sysconf("SC_PAGESIZE"))
     for end in job_pipe_pair():
         end.close()
@@ -308,7 +304,7 @@ def test_a_heartbeat_socket_holds_little_takes_no_large_message_and_is_closed_at
     assert [one.socket.getsockopt(option) for option in options] == [zmq.PAIR, 0, 4096, 64, 64]
     assert other.socket.getsockopt(zmq.LINGER) == 5
     assert one.fileno() == one.socket.getsockopt(zmq.FD)
-    assert heartbeats.LINGER_MS == 1000
+    assert link.LINGER_MS == 1000
     one.send(messages.Pong())  # nobody is connected: it is dropped, and nobody waits
     one.close()
     other.close()
@@ -350,7 +346,7 @@ def test_every_heartbeat_that_came_is_received_in_order(tmp_path: Path) -> None:
 def test_the_thread_of_heartbeats_stays_on_the_schedulers_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its time slice is asked for before it is made, for it inherits it."""
     slices: list[int] = []
-    monkeypatch.setattr(heartbeats, "use_slice", slices.append)
+    monkeypatch.setattr(link, "use_slice", slices.append)
     core = max(machine.here.cores())
     tasks = Path("/proc/self/task")
     before = set(tasks.iterdir())
@@ -386,7 +382,7 @@ def test_a_base_whose_name_is_too_long_for_a_socket_gives_way_to_tmp(
     base = "/" + "b" * (length - 1)
     made: list[str] = []
     monkeypatch.setattr("tempfile.tempdir", base)
-    monkeypatch.setattr(socket_folder, "remove_abandoned", lambda path: made.append(str(path)))
+    monkeypatch.setattr(link, "remove_abandoned", lambda path: made.append(str(path)))
     monkeypatch.setattr("tempfile.mkdtemp", lambda prefix, dir: made.append(dir) or str(tmp_path))  # noqa: ARG005
     SocketFolder().remove()
     assert made == [base if is_kept else "/tmp"] * 2  # noqa: S108
@@ -468,7 +464,7 @@ def test_the_file_that_keeps_cores_awake_is_held_open_inside_the_block(
 
 
 def test_the_constants_of_linux_are_those_of_its_headers() -> None:
-    assert (memory.F_ADD_SEALS, memory.F_SEAL_SHRINK, memory.F_SEAL_GROW) == (1033, 2, 4)
+    assert (packets.F_ADD_SEALS, packets.F_SEAL_SHRINK, packets.F_SEAL_GROW) == (1033, 2, 4)
     assert packets.PAGE == PAGE
     assert packets.FRAME_FIELDS == (("frame", "<u8"), ("t_sampled_ns", "<i8"), ("epoch", "<u4"))
 
