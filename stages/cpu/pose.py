@@ -198,7 +198,7 @@ class PoseStage:
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:  # noqa: ARG002
         """Fill `outputs[slot_out]` for `frame`. A `Skip` but for full work, which all frames of a fixed plan are.
 
-        Metrics: `visible`, how many avatars are; of a full frame `level` of `body.detail.DETAILS` and `error_px`, the
+        Metrics: `visible`, how many avatars are; of a full frame `level` of `body.skinning.DETAILS` and `error_px`, the
         bound on what it moves on the picture, both of the worst avatar; `density` of a planned tensor; the bytes moved.
         The least: what was sampled of motions and camera, the header, and of avatars that were skinned the vertices.
 
