@@ -346,7 +346,6 @@ def test_files_that_end_too_early(tmp_path: Path) -> None:
 
 
 def test_limits_on_either_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert (bvh_module.MAX_JOINTS, bvh_module.MAX_FRAMES) == (1000, 200_000)
     path = tmp_path / "a.bvh"
     for time in ("0.001", "1"):
         assert load_bvh(write(path, GOOD.replace("0.04", time))).frame_time_s == float(time)

@@ -104,8 +104,6 @@ def test_the_grids_of_places() -> None:
     assert finer[0].tolist() == [1, 2, 3] and len(finer) == 28
     wanted = {(1 + a, 2 + b, 3 + c) for a in (-0.25, 0, 0.25) for b in (-0.25, 0, 0.25) for c in (-0.25, 0, 0.25)}
     assert {tuple(row) for row in finer[1:]} == wanted
-    assert (placement.FINER_M, placement.PLACES_AT_ONCE) == ((0.25, 0.12, 0.06), 256)
-    assert (placement.SCORED_MOMENTS, placement.SCORED_S) == (48, 10.0)
 
 
 def test_turn_shift_and_distance_of_a_place() -> None:
