@@ -318,7 +318,7 @@ def _check_weights(path: Path, weights: F32) -> None:
 
 
 def weights_of_one(weights: F32) -> F32:
-    """Skin weights (V,J) of which none is below 0 and each row sums to 1; a row that does to within rounding is kept.
+    """Skin weights (V,J) with no number below 0 and rows that sum to 1; a row whose sum is 1 within rounding is kept.
 
     A body that stands p metres from the origin would be off by p times what is missing of 1.
     """

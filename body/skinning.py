@@ -124,7 +124,7 @@ class Detail:
 
 
 def left_out(detail: Detail, body: Body) -> list[str]:
-    """What `detail` does not model of `body`, in words; empty when that is nothing."""
+    """The parts of `body` that `detail` leaves out, in words; empty when it leaves out nothing."""
     found = []
     weights = body.weights
     if not detail.hands_and_face:
@@ -175,7 +175,7 @@ class DetailBounds:
         self.reach: F64 = arrays["reach"]
 
     def metres(self, posed: Posed) -> list[float]:
-        """For each level of `DETAILS`, the furthest that it moves a vertex in this frame of `Skeleton.pose`."""
+        """The furthest, in metres, that each level of `DETAILS` moves a vertex in this frame of `Skeleton.pose`."""
         turned = _turned(posed)
         swing = turned / np.sqrt(2.0)
         blend = self._blend @ turned
@@ -201,8 +201,9 @@ def _bound(detail: Detail, lever: F64, change: F64, blend: F64) -> float:
 
 
 def _terms(shaped: ShapedBody) -> Arrays:
-    """Of the G groups of vertices the largest |E_b| |p - c_b|, `lever`, and |E_b|, `change`, both (levels,G,54); of the
-    blend shapes r_b, `blend` (G,54); and `reach` (55,).
+    """The largest terms of each of the G groups of vertices.
+
+    `lever`, `change` (levels,G,54): |E_b| |p - c_b| and |E_b|. `blend` (G,54): r_b of the blend shapes. `reach` (55,).
     """
     starts, order = _groups(shaped.body.weights)
     distance = joint_distance(shaped)

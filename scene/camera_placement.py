@@ -49,7 +49,7 @@ class PlacedCamera:
         return view_from_pose(self.turn @ turn @ self.mount, self.turn @ place + self.shift)
 
     def reach(self) -> tuple[F64, F64]:
-        """Lowest and highest coordinates (3,), in the scene, of the places that the camera is ever at."""
+        """Lowest and highest coordinates (3,) of all places of the camera in the scene."""
         places = self.path.places @ self.turn.T + self.shift
         return places.min(axis=0), places.max(axis=0)
 
@@ -243,10 +243,7 @@ def _best(footage: _Footage, places: F64) -> F64:
 
 
 def _visibility(footage: _Footage, places: F64) -> tuple[F64, F64]:
-    """For each place: share of the moments with whole bodies, and mean share of the picture's height that they take.
-
-    Each (S,).
-    """
+    """The share of moments with whole bodies, and the mean share of the picture's height that these take; both (S,)."""
     angle = _facing(footage, places)
     cos, sin = (f(angle).astype(np.float32)[:, None] for f in (np.cos, np.sin))
     by_axis = footage.boxes.astype(np.float32).transpose(2, 1, 0)  # the 8 corners before the frames: faster to reduce
@@ -259,7 +256,7 @@ def _visibility(footage: _Footage, places: F64) -> tuple[F64, F64]:
 
 
 def _filmed(footage: _Footage, corners: Sequence[F32] | F32) -> tuple[F64, F64]:
-    """As `_visibility`, of boxes with `corners` x, y, z, each (8, S, F), in the path's world."""
+    """The result of `_visibility` for boxes with `corners` x, y, z, each (8, S, F), in the path's world."""
     x, y, z = corners
     right, up, back = (_row(footage.views[:, k], x, y, z) for k in range(3))
     depth = np.maximum(-back, NEAREST_M)

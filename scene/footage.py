@@ -103,7 +103,7 @@ def _film_by_clock(clock: Sequence[float]) -> Film:
 
 
 def _numbers(names: Sequence[str]) -> list[int]:
-    """The number of each of `names`, when that is all in which they differ but for their endings; else none."""
+    """The number in each of `names`, when they differ in nothing else but their endings; else no numbers."""
     parts = [LAST_NUMBER.match(name.rpartition(".")[0]) for name in names]
     found = [part for part in parts if part]
     if len(found) < len(names) or len({(part[1], part[3]) for part in found}) > 1:
@@ -112,7 +112,7 @@ def _numbers(names: Sequence[str]) -> list[int]:
 
 
 def _step(numbers: Sequence[int]) -> int:
-    """From one frame to the next; 0 when `numbers` are not those of a film."""
+    """The step from one frame to the next; 0 when `numbers` are no film's."""
     steps = Counter(later - earlier for earlier, later in pairwise(numbers))
     if not steps:
         return 0
@@ -233,7 +233,7 @@ def _turned(path: CameraPath, stored: tuple[Stored, ...]) -> tuple[CameraPath, t
 
 
 def _turn(lens: Lens, quarter: int, stored: Stored, is_own: bool) -> int:
-    """By how many quarters `stored` is turned clockwise to be seen through `lens`, which was turned by `quarter`.
+    """Quarters by which `stored` is turned clockwise to be seen through `lens`, which was turned by `quarter`.
 
     A photo that the camera's file measured (`is_own`) was measured as it is stored, or as its file says, whichever has
     the shape of the lens. Else the file is believed, unless its pixels have the shape of a measured lens, and as it is
@@ -314,7 +314,7 @@ def _of_samples(optics: Optics, kept: NDArray[np.intp]) -> Optics:
 
 
 def _matches(names: tuple[str, ...], footage: Footage) -> Mapping[int, int]:
-    """Of each of the `names` that a file of the folder has, the number of that file.
+    """The number of the folder's file for each of the `names` that has one.
 
     Names are compared without their folders, and without their endings where one has none or another one. Where files
     of several folders have the same name, only those are meant whose folder is called like this one.

@@ -45,7 +45,7 @@ TURNED = {**{known: known for known in Known}, Known.WIDTH: Known.HEIGHT, Known.
 
 
 class PictureCut(NamedTuple):
-    """A picture is scaled to `height` x `width` pixels, of which `top` rows and `left` columns are cut off first."""
+    """How a picture is cut: it is scaled to `height` x `width`, then loses its first `top` rows and `left` columns."""
 
     height: int
     width: int
@@ -91,7 +91,7 @@ class Lens:
         return math.degrees(math.atan(self.cx / self.fx) + math.atan((self.width_px - self.cx) / self.fx))
 
     def scaled(self, width_px: float, height_px: float) -> Lens:
-        """Of the picture scaled to `width_px` x `height_px`."""
+        """The lens of the picture scaled to `width_px` x `height_px`."""
         x, y = width_px / self.width_px, height_px / self.height_px
         return replace(
             self,
@@ -104,11 +104,11 @@ class Lens:
         )
 
     def cropped(self, x: float, y: float, width_px: float, height_px: float) -> Lens:
-        """Of the part of `width_px` x `height_px` whose top left corner is at (`x`, `y`), which may be outside."""
+        """The lens of a part of `width_px` x `height_px`; its top left corner (`x`, `y`) may be outside the picture."""
         return replace(self, width_px=width_px, height_px=height_px, cx=self.cx - x, cy=self.cy - y)
 
     def turned(self, quarters: int) -> Lens:
-        """Of the picture turned clockwise by `quarters` of 90 degrees."""
+        """The lens of the picture turned clockwise by `quarters` of 90 degrees."""
         lens = self
         for _ in range(quarters % 4):
             lens = Lens(
@@ -117,7 +117,7 @@ class Lens:
         return lens
 
     def onto(self, picture: Shape) -> Lens:
-        """Of `picture` (height, width), which the lens made.
+        """The lens of `picture` (height, width), which it made.
 
         A picture of another shape than the lens's is taken as cut equally at both sides, by its sensor or later. A lens
         whose shape is not known takes the picture's, with square pixels and the angle that is known.
@@ -135,19 +135,19 @@ class Lens:
         return whole.cropped((whole.width_px - width) / 2, (whole.height_px - height) / 2, width, height)
 
     def covering(self, output: Shape) -> Lens:
-        """Of the picture cut by `cover` to `output` (height, width); the picture has whole pixels."""
+        """The lens of the picture cut by `cover` to `output` (height, width); the picture has whole pixels."""
         cut = cover((round(self.height_px), round(self.width_px)), output)
         return self.scaled(cut.width, cut.height).cropped(cut.left, cut.top, output[1], output[0])
 
     def filling_height(self, output: Shape) -> Lens:
-        """Of a drawing of `output` (height, width) as high as the picture; at its sides it shows more, or less."""
+        """The lens of a drawing of `output` (height, width) as high as the picture; its sides show more, or less."""
         height, width = output
         scale = height / self.height_px
         whole = self.scaled(self.width_px * scale, height)
         return whole.cropped((whole.width_px - width) / 2, 0.0, width, height)
 
     def between(self, other: Lens, fraction: float) -> Lens:
-        """From this lens at a `fraction` of 0 to `other`, of a picture of the same size, at 1."""
+        """The lens between this one, at a `fraction` of 0, and `other`, at 1, which has a picture of the same size."""
 
         def mix(a: float, b: float) -> float:
             return a + (b - a) * fraction
@@ -182,13 +182,13 @@ def of_opencv(width_px: float, height_px: float, fx: float, fy: float, cx: float
 
 
 def of_fov_y(fov_y_deg: float) -> Lens:
-    """A lens of which the field of view over the picture's height is known."""
+    """A lens by its field of view over the picture's height, degrees."""
     focal = ASSUMED_HEIGHT_PX / 2 / math.tan(math.radians(fov_y_deg) / 2)
     return centred(ASSUMED_WIDTH_PX, ASSUMED_HEIGHT_PX, focal, Known.HEIGHT)
 
 
 def of_fov_x(fov_x_deg: float) -> Lens:
-    """A lens of which the field of view over the picture's width is known."""
+    """A lens by its field of view over the picture's width, degrees."""
     focal = ASSUMED_WIDTH_PX / 2 / math.tan(math.radians(fov_x_deg) / 2)
     return centred(ASSUMED_WIDTH_PX, ASSUMED_HEIGHT_PX, focal, Known.WIDTH)
 

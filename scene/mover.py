@@ -61,7 +61,7 @@ class BodyOutline:
 
 
 def outline(body: ShapedBody) -> BodyOutline:
-    """For each joint, of the vertices that it moves most, those that lie furthest along each of DIRECTIONS."""
+    """The outline of the vertices furthest along each of DIRECTIONS, among those that each joint moves most."""
     weights, rest = body.body.weights, body.vertices.astype(np.float64)
     owner = weights.argmax(axis=1)
     picked: set[int] = set()
@@ -149,7 +149,7 @@ def floor_lift(
 
 
 def _lift_of_feet(feet: F64, lowest: F64, stance: F64) -> F64:
-    """Metres (L,) of lift, of the lowest points of the feet (L,) and of the whole body (L,), and the stance (L,)."""
+    """Metres (L,) of lift, by heights (L,) of the feet and of the `lowest` point of the body, and by `stance` (L,)."""
     usual = -float(np.average(feet, weights=stance)) if stance.any() else -np.percentile(lowest, LOWEST_PERCENTILE)
     lift = usual + stance * (-feet - usual)
     return np.maximum(lift, -lowest - DEEPEST_M)

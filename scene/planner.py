@@ -103,15 +103,15 @@ class TensorBudget:
     work: int = ALL_WORK
 
     def scaled(self, work: int) -> TensorBudget:
-        """With so many thousandths of the pixels."""
+        """The budget with `work` thousandths of the pixels."""
         return replace(self, work=work)
 
     def most_of(self, avatars: int) -> int:
-        """For so many avatars in view, however large they are."""
+        """Pixels for so many avatars in view, however large they are."""
         return self._allowed(avatars * self.own * MOST_GROWTH)
 
     def of(self, rects: Sequence[Rect], output: Shape) -> int:
-        """For the avatars at `rects` on a picture of `output`: their own pixels, or as many as the picture shows."""
+        """Pixels for the avatars at `rects` on a picture of `output`: their own, or as many as the picture shows."""
         own = len(rects) * self.own
         return min(self._allowed(max(own, area(tight_shape(rects, output)))), self.most_of(len(rects)))
 
@@ -121,8 +121,10 @@ class TensorBudget:
 
 @dataclass(frozen=True)
 class HeldShape:
-    """The shape in use. `foreseen`: what was foreseen when such a shape was last taken. `smaller_for`: how many frames
-    in a row a smaller shape would have done.
+    """The shape in use.
+
+    `foreseen`: the foreseen shape that was taken last. `smaller_for`: frames in a row for which a smaller shape would
+    have done.
     """
 
     shape: Shape
@@ -203,11 +205,10 @@ class LookAhead:
 def foreseen_changes(
     looks: Sequence[LookAhead], output: Shape, shapes: Sequence[Shape], budget: TensorBudget
 ) -> tuple[tuple[int, Shape], ...]:
-    """From which frame on there is which shape: that of the first of `looks`, at least one, and every change.
+    """The shape from the first of `looks` on, at least one, and every change of shape with its frame.
 
-    Of all ways through the shapes that are good it is the one that costs least, in pixels: those of all frames, and
-    what the changes cost. A change from a shape that is not good at a look is made in the first frame behind the look
-    before.
+    The way through the good shapes is the cheapest one in pixels: those of all frames, and the cost of the changes. A
+    shape that is not good at a look is left in the first frame behind the look before.
     """
     order = sorted(shapes, key=lambda shape: (area(shape), shape))
     costs, origins, needed = dict.fromkeys(order, 0.0), [], []
@@ -233,7 +234,7 @@ def foreseen_changes(
 def _cheapest_way(
     shape: Shape, costs: Mapping[Shape, float], fits: Mapping[Shape, DenseLayout], price: float
 ) -> tuple[float, Shape]:
-    """To come to `shape`: its cost, and from which of the shapes in `costs`. `price`: of a change of shape alone."""
+    """Cost of the cheapest way to `shape`, and the shape of `costs` where it begins. `price`: cost of a change."""
 
     def change(origin: Shape) -> float:
         if origin == shape:
@@ -275,7 +276,7 @@ LEAST_SAVING = 0.02
 
 
 class Demand(NamedTuple):
-    """Of a frame: its ideal shape (height, width), and the pixels that its tensor may have."""
+    """What a frame asks for: its ideal shape (height, width), and the pixels that its tensor may have."""
 
     ideal: Shape
     pixels: int
@@ -330,7 +331,7 @@ def joined(first: ShapeSet, second: ShapeSet) -> ShapeSet:
 
 
 def larger_shapes(shapes: Sequence[Shape], most_pixels: int) -> list[Shape]:
-    """Of each two of `shapes` the one that holds both, where that is none of them and has at most `most_pixels`."""
+    """New shapes that hold two of `shapes` each, with at most `most_pixels`."""
     both = {(max(a[0], b[0]), max(a[1], b[1])) for a, b in combinations(shapes, 2)}
     return sorted((shape for shape in both - set(shapes) if area(shape) <= most_pixels), key=area)
 

@@ -47,7 +47,7 @@ PlaceOf = Callable[[int], str]
 
 
 def by_number(index: int) -> str:
-    """Of a file in which samples have no other places."""
+    """The place of sample `index` in a file without lines or names."""
     return f"number {index}"
 
 

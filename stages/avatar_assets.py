@@ -65,7 +65,7 @@ def _encoding(avatar: AvatarData) -> tuple[Any, ...]:
 
 
 def pack_assets(avatars: Sequence[AvatarData], staged: Staged) -> dict[str, NDArray[Any]]:
-    """The arrays of a run: of every distinct avatar in order, of the network, and of the scene."""
+    """The arrays of a run: those of each distinct avatar in order, the network's and the scene's."""
     arrays: dict[str, NDArray[Any]] = {}
     for number, avatar in enumerate(avatars):
         body, scale = avatar.shaped.body, avatar.bundle.manifest.network.input

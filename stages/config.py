@@ -151,7 +151,7 @@ class RunConfig(StrictModel):
 
     @property
     def tensor_budgets(self) -> tuple[TensorBudget, ...]:
-        """Of a tensor that is planned, for each of `works`."""
+        """The budgets of a planned tensor, one for each of `works`."""
         whole = TensorBudget(self.own_pixels, self.scene.most_side**2)
         return tuple(whole.scaled(work) for work in self.works)
 

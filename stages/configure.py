@@ -221,7 +221,7 @@ def _check_pictures(scene: Scene, staged: Staged) -> None:
 
 
 def _accuracy(avatars: Sequence[AvatarData], drawn: DrawnAs) -> dict[str, Any]:
-    """Of each avatar what may be said of its pictures' error; avatars of one name are told apart by their folders."""
+    """The error of each avatar's pictures by its name; avatars of one name are told apart by their folders."""
     bundles = [avatar.bundle for avatar in avatars]
     names = Counter(bundle.manifest.name for bundle in bundles)
     return {

@@ -191,7 +191,7 @@ def _foreseen(
 def foreseen_rects(
     scene: Scene, staged: Staged, bodies: Sequence[ShapedBody], frames: Sequence[int]
 ) -> Iterator[Mapping[int, Rect]]:
-    """For each of `frames` the rectangles of the avatars that are visible, by their numbers."""
+    """The rectangles of the visible avatars, by their numbers, for each of `frames`."""
     distinct = {id(body): MeshBounds(body, standoff_m=CLOTHES_STANDOFF_M) for body in bodies}
     skeletons = [Skeleton(body.joints, body.body.parents) for body in bodies]
     for frame in frames:

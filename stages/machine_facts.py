@@ -52,7 +52,7 @@ def package_version(name: str) -> str | None:
 
 
 def versions_with(package: str) -> list[str]:
-    """Of every package that times depend on, a runtime's `package` among them."""
+    """The versions of all packages that times depend on, a runtime's `package` among them."""
     return [f"{name} {package_version(name)}" for name in dict.fromkeys(("trilane", *PACKAGES, package))]
 
 

@@ -68,7 +68,7 @@ def create_window(height: int, width: int) -> int:
 
 
 def path_of(fd: int) -> Path:
-    """By which another process of this user opens the window, while this one has it open."""
+    """The path by which another process of this user opens the window, while this one has it open."""
     return Path(f"/proc/{os.getpid()}/fd/{fd}")
 
 

@@ -64,13 +64,13 @@ class ColmapCamera:
     values: dict[str, float]
 
     def lens(self) -> Lens:
-        """Without distortion."""
+        """The lens without its distortion."""
         v = self.values
         fx, fy = v.get("fx", v.get("f", 0.0)), v.get("fy", v.get("f", 0.0))
         return Lens(self.width_px, self.height_px, fx, fy, v["cx"], v["cy"])
 
     def bent(self) -> Bent:
-        """With distortion."""
+        """The lens with its distortion."""
         parameters = {key: value for key, value in self.values.items() if key[0] in "kp"}
         return Bent(self.lens(), parameters, BY_NAME[self.model].is_fisheye)
 

@@ -184,7 +184,7 @@ def _unevenness(column: F64) -> float:
 
 
 def _of_matrices(path: Path, numbers: F64, up_axis: str) -> Guess:
-    """Of a table (N, 12 or 13): KITTI's and ARKit's cameras look along opposite axes, which a matrix does not tell."""
+    """The format of a table (N, 12 or 13) of matrices. KITTI's and ARKit's cameras look along opposite axes."""
     matrices = numbers[:, -MATRIX:].reshape(-1, 3, 4)
     rows = numbers[sound := are_rotations(matrices[:, :, :3])]
     has_time = numbers.shape[1] > MATRIX and not is_index(rows[:, 0])

@@ -197,7 +197,7 @@ def _measured(path: Path, content: Mapping[str, Any], of: str) -> tuple[Lens, st
 def _by_angle(
     width: float | None, height: float | None, angle_x: float | None, angle_y: float | None
 ) -> tuple[Lens, str]:
-    """The lens of which at most the angles over a picture's sides are known, and where they come from."""
+    """A lens for which the file has angles at most, and the source of its numbers."""
     angles = {"camera_angle_x": angle_x, "camera_angle_y": angle_y}
     source = f"by {' and '.join(f'`{key}`' for key, value in angles.items() if value)}"
     if not (angle_x or angle_y):

@@ -84,7 +84,7 @@ class Optics:
     turned: tuple[int, ...] = ()
 
     def lens(self, i: int, j: int, fraction: float, output: Shape) -> Lens:
-        """Of a picture of `output` (height, width), at `fraction` of the way from sample `i` to sample `j`.
+        """The lens of a picture of `output` (height, width), at `fraction` of the way from sample `i` to sample `j`.
 
         Over what the camera filmed it is cut as that is; else the picture's height is the camera's.
         """
@@ -100,7 +100,7 @@ class Optics:
 
 
 def one_lens(fov_y_deg: float, near_m: float, far_m: float) -> Optics:
-    """Of a camera of which the field of view over the picture's height is known."""
+    """Optics with one lens for all samples. `fov_y_deg`: field of view over the picture's height."""
     return Optics((of_fov_y(fov_y_deg),), near_m, far_m)
 
 
@@ -172,13 +172,13 @@ class CameraPath:
         return view_from_pose(*self.pose(t_s))
 
     def own_lens(self, t_s: float) -> Lens:
-        """At `t_s`, of the picture that the camera took."""
+        """The lens at `t_s`, for the picture that the camera took."""
         i, j, fraction = self._between(t_s)
         lenses = self.optics.lenses
         return lenses[i % len(lenses)].between(lenses[j % len(lenses)], fraction) if len(lenses) > 1 else lenses[0]
 
     def lens(self, t_s: float, output: Shape) -> Lens:
-        """At `t_s`, of a picture of `output` (height, width)."""
+        """The lens at `t_s`, for a picture of `output` (height, width)."""
         return self.optics.lens(*self._between(t_s), output)
 
     def projection(self, t_s: float, output: Shape) -> F64:
@@ -211,7 +211,7 @@ class Orbit:
 
 @dataclass(frozen=True)
 class Descent:
-    """From `top_deg` above `target`, on an arc of radius `distance_m` in the plane x = 0, to `low_m` and back."""
+    """A way from `top_deg` above `target` down to `low_m` and back, on an arc of `distance_m` in the plane x = 0."""
 
     what: str
     target: tuple[float, float, float]
@@ -221,7 +221,7 @@ class Descent:
     period_s: float
 
     def places(self, phase: F64) -> F64:
-        """As `Orbit.places`: at the top at 0, at `low_m` after half a cycle."""
+        """Places (N, 3), metres, at `phase` (N,): the top at 0, `low_m` after half a cycle."""
         top, low = np.radians(self.top_deg), np.arcsin((self.low_m - self.target[1]) / self.distance_m)
         angle = low + (top - low) * (1 + np.cos(phase)) / 2
         arc = np.column_stack([np.zeros(len(phase)), np.sin(angle), np.cos(angle)])
@@ -238,7 +238,7 @@ class Stand:
     period_s: float = 1.0
 
     def places(self, phase: F64) -> F64:
-        """As `Orbit.places`."""
+        """Its one place, for each of `phase` (N,): (N, 3), metres."""
         return np.tile(self.place, (len(phase), 1))
 
 

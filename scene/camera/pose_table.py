@@ -102,7 +102,7 @@ def head_of(path: Path, columns: int, expected: str) -> NDArray[np.float64]:
 
 
 def layout_of(path: Path, expected: str) -> TableLayout:
-    """Of the first line that is neither comment nor column names; no columns without one. Raises BadInputError."""
+    """The layout of the first line of numbers; it has no columns where there is no such line. Raises BadInputError."""
     names: tuple[str, ...] = ()
     first: list[str] = []
     times: list[float] = []
@@ -147,7 +147,7 @@ def elapsed(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
 
 
 def in_seconds(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], float, str]:
-    """As `elapsed`, in seconds, and the unit of `times` (N,): `ns` or `s`, by the size of their steps."""
+    """Seconds since the first finite time, their median step, and the unit of `times` (N,), `ns` or `s`."""
     since, step = elapsed(times)
     unit, scale = ("ns", 1e-9) if step > LEAST_STEP_NS else ("s", 1.0)
     return since * scale, step * scale, unit
@@ -165,8 +165,9 @@ class ColumnTimes(NamedTuple):
 
 
 def times_of(column: NDArray[np.float64], rate_hz: float | None, usual_hz: float = FILM_RATE_HZ) -> ColumnTimes:
-    """What the first column of a table says: times, or numbers of frames, of which `rate_hz` (of the scene) tells the
-    rate, else `usual_hz`.
+    """The times in the first column of a table, or those of its numbers of frames.
+
+    `rate_hz`: frames a second by the scene; None for `usual_hz`.
     """
     if is_index(column):
         rate = rate_hz or usual_hz
@@ -178,7 +179,7 @@ def times_of(column: NDArray[np.float64], rate_hz: float | None, usual_hz: float
 
 
 def is_index(column: NDArray[np.float64]) -> bool:
-    """Whether a column (N,) numbers frames, some of which may be missing."""
+    """Whether a column (N,) numbers frames; some may be missing."""
     finite = column[np.isfinite(column)]
     if len(finite) < 2 or not ((finite % 1 == 0) & (finite >= 0) & (finite < MOST_FRAMES)).all():
         return False
@@ -246,8 +247,8 @@ def read_pose_table(
 ) -> PoseTable:
     """The poses of `path`.
 
-    `rate_hz`: of the scene. `usual`: what columns hold in the format. `may_have_more`: whether others may follow.
-    Raises BadInputError with the line.
+    `rate_hz`: frames a second by the scene. `usual`: contents of the columns by the format. `may_have_more`: whether
+    other columns may follow. Raises BadInputError with the line.
     """
     layout = layout_of(path, expected)
     names = layout.names if layout.has_pose else tuple(usual)
@@ -279,7 +280,7 @@ class MatrixTable(NamedTuple):
 def read_matrix_table(path: Path, rate_hz: float | None, usual_hz: float, expected: str) -> MatrixTable:
     """The poses of `path`, 3x4 matrices row by row, with a time or the number of the frame before each, or without.
 
-    `rate_hz`: of the scene. `usual_hz`: of frames that are numbered. Raises BadInputError with the line.
+    `rate_hz`: rate of numbered frames by the scene; None for `usual_hz`. Raises BadInputError with the line.
     """
     columns = MATRIX if layout_of(path, expected).columns == MATRIX else MATRIX + 1
     table = read_table(path, columns, expected)
@@ -296,7 +297,7 @@ def _began(times: F64, unit: str) -> float | None:
 
 
 def _require_quats(path: Path, quats: F64, table: NumberTable) -> None:
-    """Raises BadInputError when most of `quats` (N, 4), which are of `table`, have not length 1."""
+    """Raises BadInputError when most of `quats` (N, 4) have not length 1. `table`: the table that has them."""
     off = is_off(quats)
     if 2 * np.count_nonzero(off) <= len(off):
         return
@@ -310,7 +311,7 @@ def _require_quats(path: Path, quats: F64, table: NumberTable) -> None:
 
 
 def is_off(quats: F64, most: float = MOST_OFF) -> NDArray[np.bool_]:
-    """Of which rows (N, 4) the length is off 1 by more than `most`; not of those that are no rotation at all."""
+    """Which rows (N, 4) have a length that differs from 1 by more than `most`; rows that are no rotation have not."""
     with np.errstate(over="ignore", invalid="ignore"):
         length = np.linalg.norm(quats, axis=1)
         return np.asarray(np.isfinite(length) & (length > 0) & (np.abs(length - 1) > most))

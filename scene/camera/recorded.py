@@ -50,7 +50,7 @@ class LengthUnit(Enum):
 
 
 def near_origin(places: F64) -> tuple[F64, tuple[str, ...]]:
-    """`places` (N, 3) without the offset of a map, such as that of UTM coordinates, and a note on it."""
+    """`places` (N, 3) without the offset of a map, such as UTM coordinates have, and a note on it."""
     finite = np.isfinite(places).all(axis=1)
     middle = np.median(places[finite], axis=0) if finite.any() else np.zeros(3)
     if np.abs(middle).max() <= MAP_M:
@@ -63,7 +63,7 @@ def near_origin(places: F64) -> tuple[F64, tuple[str, ...]]:
 def metres_per_unit(
     turns: F64, places: F64, times_s: F64, fov_y_deg: float, unit: LengthUnit, spec: CameraSpec
 ) -> tuple[float, tuple[str, ...]]:
-    """What a length of 1 of the map is in metres, and notes on it.
+    """The metres that a length of 1 of the map is, and notes on them.
 
     `turns` (N, 3, 3) and `places` (N, 3): camera to world, OpenGL axes. `times_s` (N,). `fov_y_deg`: of the picture's
     height. `unit`: of the format. `spec`: of the scene.
@@ -88,7 +88,7 @@ def _speed(places: F64, times_s: F64) -> float:
 
 
 def _fitting(turns: F64, places: F64, fov_y_deg: float) -> tuple[float, str]:
-    """A scale that depends on nothing but the shape of the path and where it looks, and what it does."""
+    """A scale by the shape of the path and where it looks alone, and its effect in words."""
     distance = looked_at_from(turns, places)
     if distance is not None:
         wanted = PERSON_M / SHARE / (2 * np.tan(np.radians(fov_y_deg) / 2))
@@ -134,7 +134,7 @@ PER_ROLL, PER_TILT, PER_PITCH = 2.0, 1.0, 0.5
 
 @dataclass(frozen=True)
 class _Prices:
-    """Of another axis than the usual one, of a turned picture, and of a direction that is no axis (None: never)."""
+    """Costs of a guess: an unusual axis, a turned picture, a direction between the axes (None: it is never guessed)."""
 
     axis: float
     turn: float
@@ -189,7 +189,7 @@ def find_upright(turns: F64, usual: str, is_levelled: bool, stated: str = AUTO) 
 
 
 def price_of(turns: F64, usual: str) -> float:
-    """How dear the cheapest guess is of cameras with axes `turns` (N, 3, 3): 0 where they are level as is `usual`."""
+    """The cost of the cheapest guess for cameras with axes `turns` (N, 3, 3): 0 where they are level about `usual`."""
     return min((guess.price for guess in _guesses(turns, usual, ANY_WORLD, AUTO)), default=math.inf)
 
 
@@ -224,7 +224,7 @@ def _ups_and_rights(turns: F64, quarter: int) -> tuple[F64, F64]:
 
 
 def _price(turns: F64, up: F64, quarter: int) -> float | None:
-    """What level horizons and level sight say against a pair; None when the picture's up is not up at all."""
+    """The cost of a pair by its horizons and lines of sight; None when the picture's up is not up at all."""
     ups, rights = _ups_and_rights(turns, quarter)
     cosine = float((ups @ up).mean())
     if cosine <= LEAST_UP_COSINE:
@@ -364,7 +364,7 @@ def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraP
 
 
 def _optics(raw: RawCamera, usable: NDArray[np.intp], quarter: int, spec: CameraSpec) -> tuple[Optics, str]:
-    """The lenses of the `usable` poses, of a picture turned by `quarter`, and a note."""
+    """The lenses of the `usable` poses for a picture turned by `quarter`, and a note."""
     if spec.fov_y_deg is not None:
         optics = one_lens(spec.fov_y_deg, spec.near_m, spec.far_m)
         return optics, f"field of view {spec.fov_y_deg:.4g} degrees high, as given"
@@ -377,7 +377,7 @@ def _optics(raw: RawCamera, usable: NDArray[np.intp], quarter: int, spec: Camera
 
 
 def _faults(times_s: F64, turns: F64, places: F64) -> dict[str, NDArray[np.bool_]]:
-    """What can be wrong with a pose, in words, and which poses (N,) have it; a pose has one fault at most."""
+    """Faults of poses in words, and which poses (N,) have each; a pose has one fault at most."""
     finite = np.isfinite(times_s) & np.isfinite(turns).all(axis=(1, 2)) & np.isfinite(places).all(axis=1)
     safe, near = np.where(finite[:, None, None], turns, 0.0), np.where(finite[:, None], places, 0.0)
     rotation = are_rotations(safe)

@@ -82,7 +82,7 @@ def _sound(places: F64) -> NDArray[np.bool_]:
 
 
 def _upright_parts(places: F64) -> NDArray[np.bool_]:
-    """In which frames (T,) the hips are apart and the trunk is not folded."""
+    """Whether the hips are apart and the trunk is not folded, per frame (T,)."""
     at = {name: places[:, index] for index, name in enumerate(NAMES)}
 
     def way(*names: str) -> F64:
@@ -159,7 +159,7 @@ def load_npz(path: Path) -> RawMotion:
 
 
 def load_pickle(path: Path) -> RawMotion:
-    """Read a pickle, of which nothing is executed. Raises BadInputError."""
+    """Read a pickle; nothing in it is executed. Raises BadInputError."""
     return _motion(path, pickle_values(path, EXPECTED))
 
 

@@ -230,7 +230,7 @@ NO_MAP: Mapping[str, str] = {}
 
 
 def match_names(path: Path, names: list[str], joint_map: Mapping[str, str] = NO_MAP) -> tuple[str, dict[str, int]]:
-    """What named the joints, such as the family that has the most of `names`, and {SMPL-X name: index in `names`}.
+    """The source of the names, such as the family that has most of `names`, and {SMPL-X name: index in `names`}.
 
     `joint_map`: SMPL-X name -> name in the file, or empty for none; it overrules the tables. Raises BadInputError about
     `path` when the file has no joint that the map names, or REQUIRED ones have no partner.

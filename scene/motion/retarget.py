@@ -73,7 +73,7 @@ class Retarget:
     notes: list[str] = field(default_factory=list)
 
     def bone(self, start: str, end: str) -> F64:
-        """Of the avatar at rest, (3,)."""
+        """A bone (3,) of the avatar at rest."""
         return unit(self.rest.bone(start, end)[0])
 
     def above(self, name: str) -> F64:
@@ -141,7 +141,7 @@ def _leg(work: Retarget, side: str, up: F64, steeper: float) -> None:
 
 
 def _foot(tracks: Tracks, side: str) -> F64 | None:
-    """From the ankle to the toes, or to what its bone ends at (T, 3); None when the foot has no length."""
+    """The way from the ankle to the toes, or to the end of its bone (T, 3); None when the foot has no length."""
     ankle, toes = f"{side}_ankle", f"{side}_foot"
     end = tracks.places.get(toes, tracks.tips.get(ankle))
     if end is None:
@@ -199,7 +199,7 @@ def _arm(work: Retarget, side: str) -> None:
 
 
 def _arm_bone(tracks: Tracks, start: str, end: str) -> F64 | None:
-    """From one joint of an arm to the next (T, 3), or to what its bone ends at where the file has no next one."""
+    """The way (T, 3) from one joint of an arm to the next, or to the end of its bone where there is no next one."""
     if not tracks.has(start):
         return None
     far = tracks.places.get(end, tracks.tips.get(start))
@@ -255,7 +255,7 @@ def _local(turns: dict[str, F64], frames: int) -> F64:
 
 
 def _pelvis_places(work: Retarget, joints: F64) -> F64:
-    """Where the avatar's pelvis is when the middle of its hips is where that of the recorded ones is, (T, 3)."""
+    """Places (T, 3) of the avatar's pelvis that bring the middle of its hips to the middle of the recorded ones."""
     scale = leg_length(work.tracks) / leg_length(work.rest)
     from_hips = joints[0] - work.rest.between("hip")[0]
     return np.asarray(work.tracks.between("hip") + turned(work.turns["pelvis"], from_hips * scale))

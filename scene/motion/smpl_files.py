@@ -243,7 +243,7 @@ _NUMBER = re.compile(r"(\d+)(?:\.[A-Za-z]+)?$")
 
 
 def motion_of_frames(found: list[Found], source: str) -> RawMotion:
-    """The motion of one person over the frames `found`, each of which has POSES.
+    """The motion of one person over the frames `found`, which all have ROMP_POSES.
 
     `source`: ending of the file, for people. Raises BadInputError when the arrays of a frame are none, or do not fit.
     """

@@ -44,11 +44,11 @@ class Tracks:
         return (self.places[f"left_{part}"] + self.places[f"right_{part}"]) / 2
 
     def across(self, part: str) -> F64:
-        """From the right joint of a pair to the left one, (T, 3)."""
+        """The way (T, 3) from the right joint of a pair to the left one."""
         return self.places[f"left_{part}"] - self.places[f"right_{part}"]
 
     def bone(self, start: str, end: str) -> F64:
-        """From one joint to another, (T, 3)."""
+        """The way (T, 3) from one joint to another."""
         return self.places[end] - self.places[start]
 
 
@@ -111,9 +111,9 @@ def standing_frames(tracks: Tracks, trunk: F64) -> NDArray[np.bool_]:
 
 
 def upward(tracks: Tracks, trunk: F64, stands: NDArray[np.bool_]) -> F64:
-    """The direction (3,) that is up in the recording: the axis of the file beside that of trunk and legs on average.
+    """The direction (3,) that is up in the recording: the file's axis nearest to the mean direction of trunk and legs.
 
-    The average is over the frames that stand, or over all when none does; it is up itself where no axis is near.
+    The mean is over the frames that stand, or over all when none does; it is up itself where no axis is near.
     """
     legs = tracks.between("hip") - tracks.between("ankle")
     both = unit(trunk) + unit(legs)

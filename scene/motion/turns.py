@@ -98,7 +98,7 @@ Evidence = tuple[F64, F64]
 def limb_turns(bone: F64, recorded: F64, carrier: F64, evidence: Sequence[Evidence]) -> F64:
     """Global turns (T, 3, 3) that lay the avatar's rest bone (3,) on the recorded ones (T, 3).
 
-    `carrier` (T, 3, 3): turns that the bone takes part in, of which only the change over time counts. `evidence`: what
+    `carrier` (T, 3, 3): turns that the bone takes part in; only their change over time counts. `evidence`: what
     tells the twist; without any it is the least one from the rest pose to the carrier.
     """
     target = unit(recorded)
@@ -158,7 +158,7 @@ class TrunkLine:
         return tracks.places[self.top]
 
     def along(self, tracks: Tracks) -> F64:
-        """From the pelvis to its upper end, (T, 3)."""
+        """The way (T, 3) from the pelvis to its upper end."""
         return self.end(tracks) - tracks.places["pelvis"]
 
     def points(self, tracks: Tracks) -> F64:
@@ -274,7 +274,7 @@ def turns_of_trunk(recorded: Trunk, rest: Trunk, stands: NDArray[np.bool_], own:
 
 
 def with_neck_on(line: F64, turns: dict[str, F64], rest: Tracks) -> dict[str, F64]:
-    """Turns of the spine, of which the lower two are turned once more, so that the neck lies along `line` (T, 3).
+    """Turns of the spine whose lower two parts are turned once more, so that the neck lies along `line` (T, 3).
 
     `line`: from the pelvis, of any length. The neck is at q + R c, where R is the turn looked for, c from the lowest
     joint of the spine to the highest, and q the rest of the way; so it is at s times the direction of `line` for the s

@@ -123,7 +123,7 @@ _HEADERS = {
 
 
 def require_file(path: Path, expected: str, if_empty: str = "") -> int:
-    """Size of a regular, non-empty file in bytes. Raises BadInputError, of an empty one with the remedy `if_empty`."""
+    """Size of a regular, non-empty file in bytes. Raises BadInputError; `if_empty`: remedy for an empty file."""
     try:
         if not path.is_file():
             raise BadInputError(path, instead_of_file(path), expected)
@@ -168,7 +168,7 @@ def read_text(path: Path, expected: str) -> str:
 
 
 def refuse_other(path: Path, expected: str, *groups: str) -> None:
-    """Raises BadInputError for a file whose head is that of a known format, unless it is of one of `groups`."""
+    """Raises BadInputError for a file whose head tells a known format outside of `groups`."""
     try:
         signature = signature_of(path)
     except OSError as error:
@@ -223,9 +223,9 @@ def npz_names(path: Path, expected: str) -> list[str]:
 
 
 def npz_pickles(path: Path, keys: Collection[str], most: int, expected: str) -> dict[str, bytes]:
-    """Of those `keys` of an `.npz` file that hold Python objects: the pickles, unread. Raises BadInputError.
+    """The unread pickles of those `keys` of an `.npz` file that hold Python objects. Raises BadInputError.
 
-    `most`: bytes that all together may have.
+    `most`: bytes that they may have together.
     """
     require_file(path, expected)
     found: dict[str, bytes] = {}

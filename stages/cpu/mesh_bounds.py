@@ -45,7 +45,7 @@ W_LEAST = 1e-9
 
 
 class Outermost:
-    """For bodies of `count` vertices."""
+    """Finds outermost vertices of bodies with `count` vertices."""
 
     def __init__(self, count: int) -> None:
         self.count = count
@@ -357,7 +357,7 @@ class MeshBounds:
         return seen.rect() if (seen.low > -1.0).all() and (seen.high < 1.0).all() else None
 
     def _sort_out(self, level: Level, rows: I64, view: _View, seen: _Extent) -> tuple[I64, I64]:
-        """Of the patches `rows`: the indices of those that may widen `seen`, and of those the near plane may cut."""
+        """Indices of the patches `rows` that may widen `seen`, and of the ones that the near plane may cut."""
         radius = level.size[rows] + (self._standoff + ROUNDING_M)
         radius += np.einsum("pj,j->p", level.give[rows], view.turned / np.sqrt(2.0))
         if self._blend is not None:

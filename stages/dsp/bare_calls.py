@@ -46,7 +46,7 @@ Shapes = Mapping[str, Sequence[int]]
 
 
 class Calls(NamedTuple):
-    """`took_ns`: by threads, of each call. `runtime`: that ran it. `at`: when, UTC."""
+    """`took_ns`: nanoseconds of each call, by number of threads. `runtime`: its name. `at`: date and time, UTC."""
 
     took_ns: Mapping[int, Sequence[int]]
     runtime: str
@@ -101,7 +101,7 @@ def _integers(path: Path) -> NetworkFile | None:
 
 
 def _digest(path: Path) -> str:
-    """Of the file and its size; weights beside it do not change how long it takes."""
+    """A digest of the file and its size; weights beside it do not change how long it takes."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 

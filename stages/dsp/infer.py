@@ -52,7 +52,7 @@ def parts_for(config: RunConfig, network: NetworkFile, shape: Shape) -> list[Net
 
 
 def _to_arrays(parts: Sequence[NetworkPart]) -> dict[str, NDArray[Any]]:
-    """Of each part the model's bytes, and its shapes as JSON."""
+    """The model's bytes of each part, and its shapes as JSON."""
     arrays: dict[str, NDArray[Any]] = {}
     for number, part in enumerate(parts):
         shapes = json.dumps({name: list(getattr(part, name).items()) for name in SHAPES})
@@ -80,7 +80,7 @@ def crossing_bytes(config: RunConfig, network: NetworkFile) -> list[int]:
 
 
 def constant_bytes(model: onnx.ModelProto) -> int:
-    """Of the constants of `model`: weights, biases, scales."""
+    """Bytes of the constants of `model`: weights, biases, scales."""
     return sum(
         math.prod(tensor.dims) * onnx.helper.tensor_dtype_to_np_dtype(tensor.data_type).itemsize
         for tensor in constants_of(model).values()

@@ -334,7 +334,7 @@ def _visible(pose: NDArray[np.void]) -> list[Any]:
 
 
 def _cells_bytes(pose: NDArray[np.void]) -> int:
-    """Of the network's picture, in the rectangles of the avatars in view."""
+    """Bytes of the network's picture in the rectangles of the avatars in view."""
     return sum(4 * int(avatar["tensor_rect"][2]) * int(avatar["tensor_rect"][3]) for avatar in _visible(pose))
 
 

@@ -91,7 +91,7 @@ def _size(stored: Stored) -> str:
 
 
 class _Head(NamedTuple):
-    """Of a video: its first frame, and what its stream says. `bits`: of a colour."""
+    """A video's first frame, and the facts of its stream. `bits`: bits a colour."""
 
     stored: Stored
     pixels: Pixels
@@ -153,7 +153,7 @@ def _head(container: Any, path: Path) -> _Head:
 
 
 def _times(container: Any, path: Path) -> list[float]:
-    """Of the frames, seconds, increasing; without decoding them. Raises BadInputError when the file was cut off."""
+    """Increasing times of the frames, seconds; they are not decoded. Raises BadInputError when the file was cut off."""
     stream = video_stream(container, path)
     times, count = set(), 0
     for packet in container.demux(stream):
@@ -168,7 +168,7 @@ def _times(container: Any, path: Path) -> list[float]:
 
 
 def _rate(steps: Sequence[float], period_s: float) -> str:
-    """In words, from the `steps` between frames, sorted."""
+    """The rate in words, by the sorted `steps` between frames."""
     if not steps:
         return "one frame"
     usual = median(steps)

@@ -61,7 +61,7 @@ def to_srgb(codes: NDArray[np.uint16], transfer: str, is_wide: bool) -> U8:
 
 @cache
 def _eotf(transfer: str) -> F32:
-    """Of each of STEPS codes: PQ's light in cd/m2; HLG's light of the scene, 0 to 1."""
+    """Light of each of STEPS codes: PQ's in cd/m2; HLG's of the scene, 0 to 1."""
     code = np.arange(STEPS) / (STEPS - 1)
     if transfer == PQ:
         return pq_light(code).astype(np.float32)
@@ -84,7 +84,7 @@ def pq_code(light: F64) -> F64:
 
 @cache
 def _gains() -> F32:
-    """What light is multiplied by, in STEPS steps of its square root up to that of PEAK."""
+    """Factors on light, in STEPS steps of its square root from 0 to the square root of PEAK."""
     light = np.maximum(np.linspace(0, np.sqrt(PEAK), STEPS), 1e-3) ** 2
     gains: F32 = (roll_off(light) / light).astype(np.float32)
     return gains
@@ -238,7 +238,7 @@ def fitted(frame: Any, pixels: Pixels, shape: Shape, turned: int | None = None) 
 
 
 def quarters_of(frame: Any) -> int:
-    """By how many quarters `frame` is turned clockwise to be shown, as its file says."""
+    """Quarters by which `frame` is turned clockwise to be shown, by its file."""
     return int(-round(frame.rotation / 90) % 4)
 
 

@@ -450,7 +450,7 @@ def npz_with(path: Path, array: NDArray[Any]) -> Path:
 
 def test_pose_blend_shapes_come_in_chunks_and_in_either_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Chunks of 10 numbers, the first of them zeros; float64 in Fortran order gives the same numbers."""
-    monkeypatch.setattr(body, "_CHUNK_ITEMS", 10)
+    monkeypatch.setattr(body_module, "_CHUNK_ITEMS", 10)
     array = np.arange(42, dtype=np.float32).reshape(7, 3, 2)
     array[:3] = 0.0
     for stored in (array, np.asfortranarray(array.astype(np.float64)), array.astype(np.int16)):
