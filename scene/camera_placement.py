@@ -65,7 +65,8 @@ LEAST_LEVEL_M = 1e-6  # of the camera's distance from the pivot, level; below it
 def steered(view: F64, pivot: F64, azimuth_deg: float, elevation_deg: float, zoom: float) -> F64:
     """World to camera (4, 4) of the camera of `view` (4, 4), turned about `pivot` (3,) and moved towards it.
 
-    `azimuth_deg`: to the right about the vertical. `elevation_deg`: upwards. `zoom`: how many times nearer, above 0.
+    `azimuth_deg`: turn to the right about the vertical. `elevation_deg`: upwards. `zoom`: how many times nearer, above
+    0.
     """
     if azimuth_deg == 0.0 and elevation_deg == 0.0 and zoom == 1.0:
         return view
@@ -135,10 +136,10 @@ class _Footage:
 def place_camera(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]) -> PlacedCamera:
     """The camera of a scene. A built-in one, and one whose spec has `place = "none"`, stays where it is.
 
-    `path`: of the camera.
+    `path`: path of the camera.
     `scene`: says what lies behind, how large the picture is, and whether the camera is placed.
     `movers`: its avatars.
-    `bodies`: of these avatars, in the same order.
+    `bodies`: bodies of these avatars, in the same order.
     """
     times = np.linspace(0.0, SCORED_S, SCORED_MOMENTS)
     if not path.recorded:

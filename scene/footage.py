@@ -45,8 +45,8 @@ LAST_NUMBER = re.compile(r"(.*?)(\d{1,15})(\D*)\Z", re.DOTALL)
 class Film:
     """`times_s`: when each picture is first shown, from 0. `period_s`: after which time the film starts again.
 
-    `rate`: of the pictures, and what is missing, for people. `began_s`: of the first one, seconds since 1970; None
-    where names do not say it.
+    `rate`: rate of the pictures, and the missing ones, for people. `began_s`: of the first one, seconds since 1970;
+    None where names do not say it.
     """
 
     times_s: tuple[float, ...]

@@ -36,8 +36,8 @@ DIRECTIONS: F64 = np.array(_SIGNS, dtype=np.float64) / np.linalg.norm(_SIGNS, ax
 class BodyOutline:
     """The K outermost vertices of a body.
 
-    `points` (K, 4): at rest, metres, with a 1 appended. `joints` and `weights` (K, W): the joints that move each of
-    them, and how much.
+    `points` (K, 4): places at rest, metres, with a 1 appended. `joints` and `weights` (K, W): the joints that move each
+    of them, and how much.
     """
 
     points: F64
@@ -122,8 +122,8 @@ def floor_lift(
 ) -> tuple[F64, F64]:
     """Times (L,) in seconds, and metres (L,) by which the body is lifted at them; linear between.
 
-    `motion`: that is put on the floor.
-    `skeleton`: of the body that does it.
+    `motion`: motion to put on the floor.
+    `skeleton`: joints of the body that does it.
     `shape`: outline of that body.
     `shift`: as in `Mover`.
     `scale`: as in `Mover`.
@@ -159,9 +159,9 @@ def _lift_of_feet(feet: F64, lowest: F64, stance: F64) -> F64:
 class Mover:
     """A motion in its place.
 
-    `world` (4, 4): from the motion's space to the scene's. `scale`: factor on the pelvis's places, the ratio of the leg
-    lengths. `shift` (3,): added to these places, minus the pelvis of the rest pose. `lift_times_s` (L,), `lift_m` (L,):
-    metres by which the body is lifted onto the floor, linear between these times. `notes`: what was decided, for
+    `world` (4, 4): map from the motion's space to the scene's. `scale`: factor on the pelvis's places, the ratio of the
+    leg lengths. `shift` (3,): added to these places, minus the pelvis of the rest pose. `lift_times_s` (L,), `lift_m`
+    (L,): metres by which the body is lifted onto the floor, linear between these times. `notes`: what was decided, for
     people.
     """
 

@@ -94,8 +94,8 @@ def work_of_side(side: float) -> int:
 class TensorBudget:
     """Pixels of a tensor.
 
-    `own`: of its network's own shape, for each avatar. `most`: of all together. `work`: thousandths of what these two
-    allow.
+    `own`: pixels of the network's own shape, for each avatar. `most`: most pixels of all together. `work`: thousandths
+    of what these two allow.
     """
 
     own: int
@@ -151,8 +151,8 @@ def plan_tensor(
     """The tensor for the avatars at `rects`, at least one.
 
     `output`: (height, width) of the picture in pixels.
-    `shapes`: that are ready. Where all of them are larger than the budget allows, any may be taken.
-    `before`: of the frame before, None for the first.
+    `shapes`: shapes that are ready. Where all of them are larger than the budget allows, any may be taken.
+    `before`: shape of the frame before, None for the first.
     `foreseen`: the shape of this frame by `foreseen_changes`; None where nothing was foreseen.
     Raises BadInputError when no shape has room for all avatars.
     """
@@ -196,7 +196,7 @@ def _held(good: Sequence[Shape], before: HeldShape | None, foreseen: Shape | Non
 
 @dataclass(frozen=True)
 class LookAhead:
-    """A frame that was looked at before the run. `rects`: of the avatars that are seen, by their numbers."""
+    """A frame that was looked at before the run. `rects`: rectangles of the visible avatars, by their numbers."""
 
     frame: int
     rects: Mapping[int, Rect]
@@ -304,7 +304,7 @@ def choose_shapes(
 ) -> ShapeSet:
     """The shapes to prepare: at least one, whatever its memory, unless they are `optional`.
 
-    `demands`: of the frames that can be foreseen, at least one.
+    `demands`: demands of the foreseen frames, at least one.
     `bytes_per_pixel`: memory of a network that is ready to run, for each pixel of its tensor.
     `memory_bytes`: what all of them may take.
     `most_shapes`: how many there may be.
@@ -324,7 +324,7 @@ def choose_shapes(
 
 
 def joined(first: ShapeSet, second: ShapeSet) -> ShapeSet:
-    """Both sets. `unserved` is that of the first, unless it has no shapes. A shape of both counts twice as memory."""
+    """Both sets. `unserved` is the first one's, unless it has no shapes. A shape of both counts twice as memory."""
     shapes = sorted({*first.shapes, *second.shapes}, key=lambda shape: (area(shape), shape))
     unserved = first.unserved if first.shapes else second.unserved
     return ShapeSet(tuple(shapes), first.memory_bytes + second.memory_bytes, unserved)

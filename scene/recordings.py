@@ -20,7 +20,7 @@ from trilane.errors import BadInputError
 class Detected:
     """What a file is.
 
-    `format`: its name for people. `reason`: by what the format was told apart. `axes`: which is up, and why. `unit`: of
+    `format`: its name for people. `reason`: what told the format apart. `axes`: which is up, and why. `unit`: of
     its lengths, and why. `rate`: where the rate comes from. `lens`: the same of a camera's. `joints`: SMPL-X joint ->
     the file's name of it. `unmapped`: names of the file's joints that have no partner, in its order.
     """
@@ -60,9 +60,9 @@ def usable_samples(
 ) -> tuple[NDArray[np.intp], tuple[str, ...]]:
     """Indices of the usable samples, and notes on the others and on gaps in time.
 
-    `where`: the file, for messages. `times_s` (T,): of the samples. `readable` (T,): whether their values are readable.
-    `place_of`: where each stands in the file. `broken_as`: what those that are not readable are. Raises BadInputError
-    when less than half of the samples are usable.
+    `where`: the file, for messages. `times_s` (T,): times of the samples. `readable` (T,): whether their values are
+    readable. `place_of`: where each stands in the file. `broken_as`: what those that are not readable are. Raises
+    BadInputError when less than half of the samples are usable.
     """
     timed = readable & np.isfinite(times_s)
     broken = int(len(times_s) - timed.sum())

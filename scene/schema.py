@@ -110,8 +110,8 @@ class CameraSpec(Table):
     """The camera.
 
     `source`: `builtin:NAME`, a file or a folder. `fov_y_deg`: of the picture's height; None for that of the file, or
-    the usual one of its format. `up_axis`: of the file's world. `metres_per_unit`: of its lengths; None for what it
-    says or is likely. `rate_hz`: of a file without times, or with numbers of frames. `near_m`, `far_m`: clip planes.
+    the usual one of its format. `up_axis`: axis that is up in the file's world. `metres_per_unit`: of its lengths; None
+    for what it says or is likely. `rate_hz`: frames a second of a file without times. `near_m`, `far_m`: clip planes.
     `place`: whether a recorded camera is placed in the scene (`auto`) or stays where it was recorded (`none`).
     """
 
@@ -168,14 +168,14 @@ class Scene(Table):
     """A scene.
 
     `background`: `room`, or a video, a folder of images or a picture. `hud`: whether frame, rate and age are written on
-    the picture. `planes`: detected ones, shown over the background. `texture_filter`: of the neural texture.
+    the picture. `planes`: detected ones, shown over the background. `texture_filter`: filter of the neural texture.
 
     What may be left out: `plan` is `planned` (what the picture does not show is not modelled), `fixed` (everything is,
     in every frame) or `full` (to compare with: float64 body, supersampled raster, FP32 network; nothing runs it in real
     time). `size`: `auto` plans the tensor, up to `most_side`² pixels; else it is fixed to that size. `error_budget_px`:
     how far a vertex may be off on the picture. `error_budget_db`: how much worse avatars may be painted, in dB of PSNR,
     than in tensors of the size that their network was trained for; None: no worse, unless frames would be late.
-    `memory_mb`: of the networks that are made ready for the planned shapes.
+    `memory_mb`: most memory of the networks that are made ready for the planned shapes.
     """
 
     name: str = Field(default="scene", min_length=1, max_length=80, pattern=NAME)

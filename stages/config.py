@@ -101,17 +101,17 @@ class RunConfig(StrictModel):
     `out_dir`: the temporary run folder.
     `avatar_dirs`: the bundle's folder of each avatar of the scene.
     `units`: cores and threads of each unit.
-    `runtime`: that the DSP unit infers with.
+    `runtime`: inference runtime of the DSP unit, by name.
     `shapes`: of the tensor, where the scene plans it; else those of its size are used.
     `changes`: for each of `works` from which second of the scene on a planned tensor has which shape; empty where that
     was not foreseen.
-    `own_pixels`: of the tensor at which the network was trained.
+    `own_pixels`: pixels of the tensor at which the network was trained.
     `works`: of a planned tensor in thousandths of those pixels, the most first; a further one is stepped down to when
     frames would be late.
     `record`: whether the frames are encoded to a video.
     `posed_vertices`: how many of each avatar, when the CPU unit skins; empty when the GPU unit does.
     `pace_ns`: how long a job of a stage is held, at least.
-    `cuts`: of the network; its first part is the DSP's.
+    `cuts`: cuts of the network; its first part is the DSP's.
     `kept`: numbers of frames whose presented pictures are kept, to be compared when the run is over.
     `window`: where somebody looks at the pictures and steers the camera while the run goes on; None: nowhere.
     """

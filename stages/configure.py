@@ -69,9 +69,9 @@ class Checked:
     """A configuration that can be run.
 
     `assets`: what was loaded to check it, as the units take it. `notes`: what the loads said of their sources.
-    `accuracy`: of each avatar, by its name, what `accuracy_of` says of it. `asked_cores`: of units, by the options.
-    `placement`: what `trilane.stages.placing` says of the units' cores. `losses`: of each distinct avatar, what smaller
-    tensors cost.
+    `accuracy`: of each avatar, by its name, what `accuracy_of` says of it. `asked_cores`: cores of units by the
+    options. `placement`: what `trilane.stages.placing` says of the units' cores. `losses`: of each distinct avatar,
+    what smaller tensors cost.
     """
 
     config: RunConfig
@@ -83,7 +83,7 @@ class Checked:
     losses: tuple[SizeLoss, ...] = ()
 
     def changed(self, **values: Any) -> Checked:
-        """The same with other `values` of the configuration, such as `out_dir`, `record` or `units`."""
+        """This run with other `values` of the configuration, such as `out_dir`, `record` or `units`."""
         return replace(self, config=self.config.model_copy(update=values))
 
 

@@ -52,7 +52,7 @@ KEY = "error_budget_db"
 def tensor_works(scene: Scene, policy: str, losses: Sequence[SizeLoss]) -> tuple[tuple[int, ...], str]:
     """`RunConfig.works` of a scene under `policy`, and what is to be said of it; empty when nothing is.
 
-    `losses`: of the scene's avatars. Raises BadInputError for a budget that they have no figures for.
+    `losses`: measured losses of the scene's avatars. Raises BadInputError for a budget that they have no figures for.
     """
     if not scene.plans_tensor:
         return (ALL_WORK,), ""
@@ -91,7 +91,7 @@ Changes = tuple[tuple[tuple[float, Shape], ...], ...]
 
 @dataclass(frozen=True)
 class Foreseen:
-    """`shapes`: to make ready. `frames`: numbers of those that were looked at. `seen`: on how many somebody is.
+    """`shapes`: shapes to make ready. `frames`: numbers of those that were looked at. `seen`: on how many somebody is.
 
     `changes`: for each of the budgets from which second of the scene on the tensor has which shape; empty where that is
     not foreseen.
@@ -136,8 +136,8 @@ def foresee(
 ) -> Foreseen:
     """The tensor shapes that `scene` needs.
 
-    `bodies`: of its avatars, in order.
-    `network`: that all of them share.
+    `bodies`: bodies of its avatars, in order.
+    `network`: network that all of them share.
     `budgets`: of its tensors, the largest first; the further ones are stepped down to, where memory has room for them.
     """
     count = min(scene.frames, max(FORESEEN_FRAMES // len(bodies), LEAST_FRAMES))

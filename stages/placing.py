@@ -54,9 +54,9 @@ def placed(
 ) -> Checked:
     """`checked` with its units on the cores that are best for it, and what is to be said of that.
 
-    `policy`: of the run. `starter`: a fork server. `driver`: OpenGL's, which the times depend on. `say`: is told before
-    something takes seconds.
-    Raises TrilaneError when a unit cannot start or a stage fails, KeyboardInterrupt when interrupted.
+    `policy`: policy of the run. `starter`: a fork server. `driver`: OpenGL's, which the times depend on. `say`: is told
+    before something takes seconds. Raises TrilaneError when a unit cannot start or a stage fails, KeyboardInterrupt
+    when interrupted.
     """
     asked = {unit: Place(own, len(own)) for unit, own in checked.asked_cores.items()}
     cores = host_cores(sorted({*usable_cores(), *(core for place in asked.values() for core in place.cores)}))
@@ -210,7 +210,7 @@ Arrays = Mapping[str, NDArray[Any]]
 
 
 class TriedPlacement(NamedTuple):
-    """`best`: place of the one to take. `why`: in words. `frame_ms`: of each that was tried, empty when none was."""
+    """`best`: place of the one to take. `why`: reason in words. `frame_ms`: frame times of those that were tried."""
 
     best: int
     why: str

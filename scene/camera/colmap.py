@@ -256,7 +256,10 @@ def model_in(folder: Path) -> tuple[Path, str] | None:
 
 
 def load_colmap(path: Path, rate_hz: float | None = None) -> RawCamera:
-    """Read `path`, a folder or a file of the model. `rate_hz`: of the scene. Raises BadInputError naming the file."""
+    """Read `path`, a folder or a file of the model. Raises BadInputError naming the file.
+
+    `rate_hz`: views a second by the scene.
+    """
     found = model_in(path if path.is_dir() else path.parent)
     if found is None:
         raise BadInputError(path, "no COLMAP model", EXPECTED)

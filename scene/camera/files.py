@@ -100,7 +100,7 @@ OTHERS = {
 
 
 def detect(path: Path, up_axis: str = AUTO) -> Guess:
-    """The format of `path`. `up_axis`: of the scene. Raises BadInputError when it is none, or may be two."""
+    """The format of `path`. `up_axis`: up by the scene. Raises BadInputError when it is none, or may be two."""
     if path.is_dir():
         return _of_folder(path)
     require_file(path, EXPECTED)

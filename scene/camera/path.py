@@ -108,8 +108,8 @@ def one_lens(fov_y_deg: float, near_m: float, far_m: float) -> Optics:
 class CameraPath:
     """A camera over time.
 
-    `times_s` (N,): from 0, strictly increasing. `quats` (N, 4) and `places` (N, 3), metres: camera to world. `notes`:
-    how the source was read, for people. `wrap`: what follows the last sample. `recorded`: whether the path
+    `times_s` (N,): times from 0, strictly increasing. `quats` (N, 4) and `places` (N, 3), metres: camera to world.
+    `notes`: how the source was read, for people. `wrap`: what follows the last sample. `recorded`: whether the path
     comes from a recording, which has to be placed in the scene. `detected`: what its file is. `pictures`: names of the
     photos that the samples are of, one for each; empty where the file names none. `quarter`: quarters by which the
     camera's picture was turned clockwise. `is_held`: whether each sample holds, halfway to its neighbours, because its

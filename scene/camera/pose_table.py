@@ -50,7 +50,7 @@ POSE = ("time", "x", "y", "z", "qw", "qx", "qy", "qz")
 
 
 class NumberTable(NamedTuple):
-    """`numbers` (N, columns): of each pose. `lines` (N,): in which it stands, from 1 on."""
+    """`numbers` (N, columns): numbers of each pose. `lines` (N,): line of each, from 1 on."""
 
     numbers: NDArray[np.float64]
     lines: NDArray[np.int64]
@@ -220,7 +220,7 @@ MOST_OFF = 0.02
 
 @dataclass(frozen=True)
 class PoseTable:
-    """`times_s` (N,): from 0. `turns` (N, 3, 3) and `places` (N, 3): as the file has them.
+    """`times_s` (N,): times from 0. `turns` (N, 3, 3) and `places` (N, 3): as the file has them.
 
     `time`: unit of the file's times. `rate`: for notes, such as `, 30/s`. `order`: where the order of columns comes
     from. `names`: what the columns of `table` hold. `began_s`: at a time of 0, seconds since 1970; None where the file

@@ -66,7 +66,7 @@ def metres_per_unit(
     """The metres that a length of 1 of the map is, and notes on them.
 
     `turns` (N, 3, 3) and `places` (N, 3): camera to world, OpenGL axes. `times_s` (N,). `fov_y_deg`: of the picture's
-    height. `unit`: of the format. `spec`: of the scene.
+    height. `unit`: unit of the format. `spec`: camera of the scene.
     """
     if spec.metres_per_unit is not None:
         return spec.metres_per_unit, (f"1 unit of the file is {spec.metres_per_unit:g} m, as given",)
@@ -275,7 +275,8 @@ FILM_STEP_DEG = 6.0
 def times_without(turns: F64, rate_hz: float | None) -> tuple[F64, str]:
     """Seconds (N,) of views with camera axes `turns` (N, 3, 3), and how they were decided.
 
-    `rate_hz`: of the scene, if it says one. Views less than FILM_STEP_DEG apart are a film, others are stills.
+    `rate_hz`: views a second by the scene, if it says so. Views less than FILM_STEP_DEG apart are a film, others are
+    stills.
     """
     rate, how = _rate(turns) if rate_hz is None else (rate_hz, f"{rate_hz:g} a second as given")
     return np.arange(len(turns)) / rate, how
@@ -305,12 +306,12 @@ class RawCamera:
     """The content of a camera file, before anything is left out or turned.
 
     `times_s` (N,): seconds. `turns` (N, 3, 3) and `places` (N, 3), metres: camera to world, OpenGL axes. `usual_up`:
-    the axis of the world that is usually up in the format. `lenses`: of the picture as the axes of a pose have it,
-    one for all poses or one for each; `lens`: where they come from. `notes`: on the file, for people. `place_of`: where
-    a sample stands in the file. `detected`: what the file is, but for its axes and lens. `pictures`: names of the
-    photos that the poses are of, one for each, or none. `is_levelled`: whether the world of the format is aligned with
-    gravity, by its definition. `unit`: of the lengths. `began_s`: at a time of 0, seconds since 1970; None where the
-    file does not say it.
+    the axis of the world that is usually up in the format. `lenses`: of the picture as the axes of a pose have it, one
+    for all poses or one for each; `lens`: where they come from. `notes`: on the file, for people. `place_of`: where a
+    sample stands in the file. `detected`: what the file is, but for its axes and lens. `pictures`: names of the photos
+    that the poses are of, one for each, or none. `is_levelled`: whether the world of the format is aligned with
+    gravity, by its definition. `unit`: unit of the lengths. `began_s`: at a time of 0, seconds since 1970; None where
+    the file does not say it.
     """
 
     times_s: F64
@@ -331,8 +332,8 @@ class RawCamera:
 def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraPath:
     """The camera path of a file.
 
-    `raw`: its content. `where`: its path, for messages. `spec`: of the scene, with the lens. Raises BadInputError when
-    more than half of the poses are unusable.
+    `raw`: its content. `where`: its path, for messages. `spec`: camera of the scene, with its lens. Raises
+    BadInputError when more than half of the poses are unusable.
     """
     near, offset_notes = near_origin(raw.places)
     faults = _faults(raw.times_s, raw.turns, near)

@@ -203,10 +203,10 @@ def _body(
 ) -> tuple[F64, F64]:
     """Poses (T, 55, 3) and pelvis places (T, 3) of a body on two feet.
 
-    `times`: of the cycle (T,).
+    `times` (T,): seconds in the cycle.
     `left`, `right`: tracks of the feet.
     `wave`: whether the right arm waves.
-    `shift_m`: of the pelvis to its left, (T,) or one number.
+    `shift_m`: shift of the pelvis to its left, (T,) or one number.
     """
     heading = blurred_heading(left, right)
     ahead = _along(heading, left.ankle - right.ankle)
@@ -250,10 +250,10 @@ def _pelvis_place(
     """Pelvis places (T, 3): between the feet, towards the loaded one, and low enough for both legs to reach.
 
     `left`, `right`: tracks of the feet.
-    `heading` (T,): of the pelvis.
+    `heading` (T,): heading of the pelvis.
     `pelvis` (T, 3, 3): its turn.
     `weight` (T,): 1 with all weight on the left foot, -1 on the right.
-    `shift_m`: to the left, besides.
+    `shift_m`: further shift to the left.
     """
     between = blurred((left.ankle + right.ankle) / 2, 7)
     aside = 0.028 * weight + shift_m
@@ -276,7 +276,7 @@ def _height_within_reach(side: int, foot: FootTrack, place: F64, pelvis: F64) ->
 
     `side`: +1 left, -1 right.
     `foot`: its track.
-    `place` (T, 3): of the pelvis; only x and z count.
+    `place` (T, 3): place of the pelvis; only x and z count.
     `pelvis` (T, 3, 3): its turn.
     """
     hip = pelvis @ BUILD.side(BUILD.hip, side)
@@ -289,8 +289,8 @@ def _trunk(poses: F64, times: F64, pelvis_yaw: F64, weight: F64, pace: F64) -> N
     """Set spine, neck and head: shoulders turn against the hips, the body leans with the pace and breathes.
 
     `poses` (T, 55, 3): changed in place.
-    `times` (T,): of the cycle.
-    `pelvis_yaw` (T,): of the hips, radians.
+    `times` (T,): seconds in the cycle.
+    `pelvis_yaw` (T,): yaw of the hips, radians.
     `weight` (T,): 1 with all weight on the left foot, -1 on the right.
     `pace` (T,): speed of the feet, m/s.
     """

@@ -89,7 +89,7 @@ def bracket(times_s: F64, t_s: float) -> tuple[int, int, float]:
 class Motion:
     """Poses over time, upright, facing +Z at first, in the middle of the ground it covers.
 
-    `times_s` (T,): from 0, strictly increasing. `poses` (T, 55, 3): axis-angle, radians, SMPL-X joint order.
+    `times_s` (T,): times from 0, strictly increasing. `poses` (T, 55, 3): axis-angle, radians, SMPL-X joint order.
     `translation` (T, 3): place of the pelvis, metres, Y up. `betas` (n,) or None. `notes`: how the source was read, for
     people. `wrap`: what follows the last frame. `leg_m`: hip to ankle of the recorded person, by which the translation
     is scaled to another body; None when unknown. `travels`: whether the translation was recorded. `detected`: what its

@@ -37,7 +37,7 @@ STANDS_M, STANDS_SPREAD_M = (-0.12, 0.25), 0.25
 def joint_places(poses: F64, places: F64, leg_m: float | None) -> F64:
     """Places (T, 22, 3) of the joints of a plain body whose legs are `leg_m` long; its own when that is None.
 
-    `poses` (T, 55, 3): axis-angle. `places` (T, 3): of the pelvis, metres.
+    `poses` (T, 55, 3): axis-angle. `places` (T, 3): places of the pelvis, metres.
     """
     rest = T_POSE * (leg_m / rest_leg_m(T_POSE) if leg_m else 1.0)
     turns = matrix_from_rotvec(poses[:, :BODY_JOINT_COUNT])
@@ -108,10 +108,11 @@ class RawMotion:
     """The content of a motion file, before anything is left out or turned.
 
     `times_s` (T,): seconds; NaNs and repeated times are still in. `poses` (T, 55, 3): axis-angle, radians, SMPL-X joint
-    order. `translation` (T, 3): of the pelvis, metres; None when the format has none. `betas` (n,) or None. `up`: the
-    axis that is usually up in the format; `ups`: the axes that may be up in it. `notes`: on the file, for people.
-    `leg_m`: hip to ankle of the recorded person; None when unknown. `detected`: what the file is, but for its axes.
-    `feet` (T, 2, n, 3): places of n joints of the left and the right foot, metres; None when the format has no places.
+    order. `translation` (T, 3): places of the pelvis, metres; None when the format has none. `betas` (n,) or None.
+    `up`: the axis that is usually up in the format; `ups`: the axes that may be up in it. `notes`: on the file, for
+    people. `leg_m`: hip to ankle of the recorded person; None when unknown. `detected`: what the file is, but for its
+    axes. `feet` (T, 2, n, 3): places of n joints of the left and the right foot, metres; None when the format has no
+    places.
     """
 
     times_s: F64

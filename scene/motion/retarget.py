@@ -246,7 +246,7 @@ def _head(work: Retarget) -> None:
 
 
 def _local(turns: dict[str, F64], frames: int) -> F64:
-    """Axis-angle (T, 55, 3), of each joint relative to its parent."""
+    """Axis-angle (T, 55, 3) of each joint relative to its parent."""
     poses = np.zeros((frames, JOINTS, 3))
     for index, name in enumerate(JOINT_NAMES):
         above = turns[JOINT_NAMES[JOINT_PARENTS[index]]] if index else np.eye(3)

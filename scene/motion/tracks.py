@@ -125,7 +125,7 @@ def upward(tracks: Tracks, trunk: F64, stands: NDArray[np.bool_]) -> F64:
 def planted_frames(tracks: Tracks, side: str, foot: F64, up: F64) -> NDArray[np.bool_]:
     """The frames (T,) in which a foot most likely lies flat: ankle and toes hardly move, and the leg is below the hip.
 
-    `foot`: from the ankle to the toes, (T, 3). `up` (3,): of the recording.
+    `foot` (T, 3): way from the ankle to the toes. `up` (3,): direction that is up in the recording.
     """
     below = angle_between(tracks.bone(f"{side}_ankle", f"{side}_hip"), up) < LEG_BELOW
     if tracks.frames == 1 or not below.any():
@@ -146,7 +146,7 @@ def leg_length(tracks: Tracks) -> float:
 
 
 def built_alike(tracks: Tracks, rest: Tracks) -> bool:
-    """Whether the joints of `tracks` are as far from each other as those of `rest`, at the same length of legs."""
+    """Whether `tracks` and `rest` have the same distances between joints, beside the length of their legs."""
     scale = leg_length(tracks) / leg_length(rest)
     pairs = [pair for pair in RIGID if tracks.has(*pair)]
     for pair in pairs:

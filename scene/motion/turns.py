@@ -276,9 +276,9 @@ def turns_of_trunk(recorded: Trunk, rest: Trunk, stands: NDArray[np.bool_], own:
 def with_neck_on(line: F64, turns: dict[str, F64], rest: Tracks) -> dict[str, F64]:
     """Turns of the spine whose lower two parts are turned once more, so that the neck lies along `line` (T, 3).
 
-    `line`: from the pelvis, of any length. The neck is at q + R c, where R is the turn looked for, c from the lowest
-    joint of the spine to the highest, and q the rest of the way; so it is at s times the direction of `line` for the s
-    at which q is |c| from it.
+    `line`: direction from the pelvis, of any length. The neck is at q + R c, where R is the turn looked for, c from the
+    lowest joint of the spine to the highest, and q the rest of the way; so it is at s times the direction of `line` for
+    the s at which q is |c| from it.
     """
     joint = {name: rest.places[name][0] for name in ("pelvis", *SPINE, "neck")}
     along = unit(line)

@@ -156,7 +156,7 @@ OF_THE_FRAME = {*(name for name, _ in FRAME_FIELDS), "media_time_s", "work"}
 
 
 class PoseStage:
-    """Stage `pose` of the CPU unit: no input edge, an output edge of headers. `plan`: of the frame that it did last."""
+    """Stage `pose` of the CPU unit: no input edge, an output edge of headers. `plan`: plan of the last frame."""
 
     def __init__(self, config: RunConfig, assets: Assets) -> None:
         """The scene of `config`, whose avatars, motions and camera lie in `assets`."""

@@ -58,9 +58,9 @@ def calls_of(
 ) -> Calls:
     """How long calls of the network in `path` take, without the time in which they had no core.
 
-    `shapes`: of inputs by name, in place of what the file says. `runtime`: of a network of integers. `counts`: numbers
-    of threads. `cores`: to run on, the last ones first. `say`: is called before it takes seconds.
-    Raises BadInputError for a file that cannot be read, TrilaneError when the network cannot be run.
+    `shapes`: shapes of inputs by name, in place of the file's. `runtime`: runtime of a network of integers. `counts`:
+    numbers of threads. `cores`: cores to run on, the last ones first. `say`: is called before it takes seconds. Raises
+    BadInputError for a file that cannot be read, TrilaneError when the network cannot be run.
     """
     runs = runtime if not shapes and _integers(path) is not None else ORT
     asked = [runs, str([*cores]), str([*counts]), str(sorted(shapes.items()))]

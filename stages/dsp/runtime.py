@@ -22,7 +22,7 @@ X86 = ("x86_64", "AMD64")
 
 @dataclass(frozen=True)
 class RuntimeOptions:
-    """`threads`: that compute, the calling one included. `spin`: whether they may spin between jobs.
+    """`threads`: number of computing threads, the calling one included. `spin`: whether they may spin between jobs.
 
     `device`: settings that only one runtime has, by its own names, such as `htp_arch` of `qnn`.
     """

@@ -34,8 +34,8 @@ FP16_MAX = float(np.finfo(np.float16).max)
 def texture_array(ctx: Any, texture: Floats, filtering: str = "linear", levels: Sequence[Floats] = ()) -> Any:
     """An FP16 array texture of C/4 RGBA layers from `texture` (H,W,C), clamped at its edge.
 
-    `filtering`: of FILTERS. `levels`: smaller ones that were learnt; they are read in place of the driver's means, and
-    none below them, so `linear` becomes `mipmap`.
+    `filtering`: one of FILTERS. `levels`: smaller ones that were learnt; they are read in place of the driver's means,
+    and none below them, so `linear` becomes `mipmap`.
     """
     height, width, channels = texture.shape
     array = ctx.texture_array((width, height, channels // 4), 4, _pixels(texture), dtype="f2")
@@ -233,7 +233,7 @@ class PackedAvatar:
     def draw(self, target: Target, view: Floats, placement: Placement) -> None:
         """Draw into `target`, which `PackedPass.begin` has cleared.
 
-        `target`: of the pass.
+        `target`: target of the pass.
         `view`: (4,4) the camera.
         `placement`: the avatar's pose, crop and rectangle of the tensor.
         """

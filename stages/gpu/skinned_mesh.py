@@ -205,7 +205,7 @@ GROUPS = "abc"
 
 @dataclass(frozen=True)
 class BodyPose:
-    """One body in one frame. `joints` (55,3,4): skinning matrices. `feature` (486,): of the pose blend shapes.
+    """One body in one frame. `joints` (55,3,4): skinning matrices. `feature` (486,): factors of the pose blend shapes.
 
     `vertices` (V,3): the body's vertices in the world, metres, when the CPU unit has skinned them.
     """
@@ -219,7 +219,7 @@ class Mesh(Protocol):
     """What `MeshDraw` draws: buffers, a vertex shader, and the pose of a frame.
 
     `batches`: pairs of a number of skin weights and the index buffer of the triangles drawn with as many.
-    `pose_bytes`: of a frame's pose, each number of it once.
+    `pose_bytes`: bytes of a frame's pose, each number of it once.
     """
 
     arrays: MeshArrays
