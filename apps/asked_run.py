@@ -157,7 +157,7 @@ def early_processes() -> Iterator[tuple[UnitStarter, GlFacts]]:
     The driver is looked at in a process of its own, because it may crash.
     """
     from trilane.pipeline.unit_starter import UnitStarter
-    from trilane.stages.factories import PRELOAD
+    from trilane.stages import PRELOAD
 
     with UnitStarter(PRELOAD) as starter, closing(starter.call("trilane.stages.machine_facts:open_gl")) as gl:
         yield starter, cache(gl.result)

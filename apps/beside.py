@@ -17,8 +17,8 @@ from trilane.hw_profiles.application import LEAST_FPS, MOST_FPS, RUNTIMES, Varia
 from trilane.hw_profiles.beside import MOST_TENANTS, NEWEST, SKIPS, Tenant
 from trilane.hw_profiles.graph_file import read_graph
 from trilane.hw_profiles.network_work import Network, count_work
-from trilane.scene.load import ENDING
-from trilane.scene.work import Work
+from trilane.scene.planner import FrameWork
+from trilane.scene.schema import ENDING
 from trilane.shapes import Shape
 from trilane.stages.avatar_assets import network_of
 from trilane.stages.configure import Request, configure
@@ -106,7 +106,7 @@ def _avatar(each: Asked, name: str, variant: Variant) -> Tenant:
     scene, file = checked.config.scene, network_of(checked.assets)
     plan = ScenePlan(checked.config, checked.assets)
     plans = [plan.decide(frame).plan for frame in range(min(scene.frames, MOST_FRAMES))]
-    seen = [(one.shape, len(one.seen)) if one.shape and one.work is Work.FULL else None for one in plans]
+    seen = [(one.shape, len(one.seen)) if one.shape and one.work is FrameWork.FULL else None for one in plans]
     distinct = list(dict.fromkeys(one for one in seen if one is not None)) or [(_own(file.shape), 1)]
     by_shape = {
         shape: Network({"scene": each.what}, *shape, file.shape[3], "packed", count_work(reshaped(file, *shape).model))

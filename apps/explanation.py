@@ -15,10 +15,9 @@ from typing import Any
 from trilane.apps.plan_cost import CostModel, FrameCost
 from trilane.apps.resolution import worst_loss
 from trilane.apps.scene_plan import PlannedFrame, ScenePlan, phases
-from trilane.body.detail import DETAILS, left_out
+from trilane.body.skinning import DETAILS, left_out
 from trilane.figure_sources import COMPUTED, MEASURED
-from trilane.scene.planner import ALL_WORK, MOST_DENSITY
-from trilane.scene.work import Work
+from trilane.scene.planner import ALL_WORK, MOST_DENSITY, FrameWork
 from trilane.shapes import Shape
 from trilane.stages.avatar_assets import distinct, network_of, shaped_body
 from trilane.stages.configure import Checked
@@ -28,8 +27,8 @@ from trilane.stages.cpu.pose import FramePlan
 FIXED: Shape = (512, 512)
 BOUND = "proved bound, in pixels of the picture"
 WHY = {
-    Work.NONE: "nobody is on the screen: nothing is drawn, packed or inferred",
-    Work.REUSE: "nothing has changed: the picture that is there is shown again",
+    FrameWork.NONE: "nobody is on the screen: nothing is drawn, packed or inferred",
+    FrameWork.REUSE: "nothing has changed: the picture that is there is shown again",
 }
 
 
@@ -161,7 +160,7 @@ def _phase(
 
 
 def _cost(plan: FramePlan, costs: CostModel) -> FrameCost:
-    return costs.of(plan.shape, len(plan.seen)) if plan.work is Work.FULL else costs.of(None)
+    return costs.of(plan.shape, len(plan.seen)) if plan.work is FrameWork.FULL else costs.of(None)
 
 
 def _least(group: Sequence[PlannedFrame]) -> float:
@@ -194,7 +193,7 @@ def _saved(cost: FrameCost, fixed: FrameCost) -> dict[str, float]:
 
 def _usual(frames: Sequence[PlannedFrame]) -> tuple[Shape | None, int]:
     """The shape of most full frames, and how many avatars are in view there; None and 0 without any."""
-    kinds = Counter((one.plan.shape, len(one.plan.seen)) for one in frames if one.plan.work is Work.FULL)
+    kinds = Counter((one.plan.shape, len(one.plan.seen)) for one in frames if one.plan.work is FrameWork.FULL)
     return kinds.most_common(1)[0][0] if kinds else (None, 0)
 
 

@@ -23,8 +23,7 @@ from trilane.apps.explained.run import explain_run, explained_jobs, open_journal
 from trilane.apps.remake import Remake
 from trilane.apps.report import Report, read_report
 from trilane.apps.run_html import prediction_html, run_html
-from trilane.errors import BadInputError, MissingPartError, TrilaneError
-from trilane.near_miss import did_you_mean
+from trilane.errors import BadInputError, MissingPartError, TrilaneError, did_you_mean
 from trilane.pipeline.journal import Record, Stepped
 from trilane.pipeline.journal_slices import JournalSlices
 from trilane.scheduler.accounts import IdleSlice

@@ -19,7 +19,6 @@ import numpy as np
 from trilane.arrays import F64, U8, Mask
 from trilane.bench.lib.picture_error import psnr_of_frames, require_metrics
 from trilane.errors import TrilaneError
-from trilane.stages.cpu.kept_frames import kept_frames
 
 if TYPE_CHECKING:
     from trilane.apps.experiments.picture_errors import ErrorFigures
@@ -56,6 +55,7 @@ def check_run(checked: Checked, folder: Path, told: Callable[[int, int], None] =
     from trilane.apps.experiments.reference_path import ReferencePath
     from trilane.apps.experiments.scene_pictures import around
     from trilane.bench.lib.true_picture import true_pictures
+    from trilane.stages.cpu.present import kept_frames
 
     files = kept_frames(folder)
     numbers: list[int] = []

@@ -32,7 +32,6 @@ from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.policy import policy_named
 from trilane.stages.avatar_pipeline import run_avatar
 from trilane.stages.configure import Checked
-from trilane.stages.cpu.kept_frames import FOLDER
 from trilane.stages.placing import placed
 
 if TYPE_CHECKING:
@@ -261,7 +260,9 @@ def _checked_frames(checked: Checked, work: Path, hooks: Hooks, interrupted: Cal
         hooks.message(said)
         return {"notes": [*_notes(checked), said]}
     finally:
-        shutil.rmtree(work / FOLDER, ignore_errors=True)
+        from trilane.stages.cpu.present import KEPT_FOLDER
+
+        shutil.rmtree(work / KEPT_FOLDER, ignore_errors=True)
 
 
 def _require(wanted: bool) -> None:

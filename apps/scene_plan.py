@@ -15,9 +15,8 @@ from trilane.body.skinning import CpuSkinner
 from trilane.pipeline.shared_assets import Assets
 from trilane.scene.crop import Rect
 from trilane.stages.avatar_assets import distinct, shaped_body, staged_of
-from trilane.stages.config import RunConfig
+from trilane.stages.config import RunConfig, pose_dtype, posed_vertices, posed_vertices_bytes
 from trilane.stages.cpu.pose import FramePlan, PoseStage
-from trilane.stages.packets import pose_dtype, posed_vertices, posed_vertices_bytes
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 

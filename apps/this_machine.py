@@ -23,13 +23,13 @@ from trilane.hw_profiles.placed_host import NETWORK
 from trilane.hw_profiles.placement_facts import NS_PER_MS
 from trilane.hw_profiles.schema import Profile
 from trilane.pipeline.unit_starter import UnitStarter
+from trilane.stages import PRELOAD
 from trilane.stages.avatar_assets import network_of
+from trilane.stages.avatar_pipeline import one_shape
 from trilane.stages.configure import Request, configure, requested_runtime
 from trilane.stages.dsp.bare_calls import calls_of
-from trilane.stages.factories import PRELOAD
 from trilane.stages.machine_facts import gl_facts
 from trilane.stages.placing import rehearsed
-from trilane.stages.rehearsing import one_shape
 from trilane.units import BURST
 
 MEASURING = "measuring {} on this machine: at most half a minute, once for this machine and these packages ..."

@@ -23,9 +23,8 @@ from trilane.avatars.network_file import read_network
 from trilane.avatars.offsets import read_offsets, save_offsets
 from trilane.avatars.texture_levels import check_levels
 from trilane.body.body import Body, ShapedBody, load_body
-from trilane.errors import BadInputError
+from trilane.errors import BadInputError, did_you_mean
 from trilane.files import read_npz, read_text, require_file
-from trilane.near_miss import did_you_mean
 from trilane.writing import require_writable, write_bytes, write_folder
 
 MANIFEST, OFFSETS = "manifest.json", "offsets.npz"

@@ -15,8 +15,7 @@ from onnx import TensorProto, external_data_helper
 from trilane.avatars.integer_network import NetworkFile
 from trilane.avatars.network_checks import check_network
 from trilane.errors import BadInputError, reason
-from trilane.file_signatures import signature_of
-from trilane.files import require_file
+from trilane.files import require_file, signature_of
 
 MAX_BYTES = 512 << 20
 EXPECTED = "an ONNX network"

@@ -23,8 +23,7 @@ from typing import Any
 
 import psutil
 
-from trilane.errors import BadInputError, MissingPartError, TrilaneError
-from trilane.install import install_line
+from trilane.errors import BadInputError, MissingPartError, TrilaneError, install_line
 from trilane.pipeline.journal import NAME, Begun, Worked, read_journal
 
 #: Nobody: the server's process is stopped. Server: it follows the run, no page is open. Page: one that takes pictures

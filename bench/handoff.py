@@ -21,9 +21,8 @@ import numpy as np
 
 from trilane.bench.lib.handoff_stages import PAUSE_S, READER, check_bytes, handoff_pipeline
 from trilane.bench.lib.handoff_variants import BARE, CHANNELS, SLOT, WRITTEN, Channel
-from trilane.errors import BadInputError, TrilaneError
+from trilane.errors import BadInputError, TrilaneError, install_line
 from trilane.hw_profiles.host import host_units
-from trilane.install import install_line
 from trilane.pipeline.run import run_pipeline
 from trilane.scheduler.stats import median_interval, samples_needed
 from trilane.transport.wakeup import UNIT_NS, awake, use_slice

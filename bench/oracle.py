@@ -18,7 +18,7 @@ from trilane.bench.lib.views import everyday_pose, random_camera
 from trilane.body.body import load_body
 from trilane.body.kinematics import Skeleton
 from trilane.errors import BadInputError
-from trilane.stages.gpu.opengl_context import describe, open_context
+from trilane.stages.gpu.opengl import describe, open_context
 from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement
 from trilane.stages.gpu.skinned_mesh import SkinnedMesh
 from trilane.training.uv_image import UvRaster

@@ -32,13 +32,11 @@ from trilane.scheduler.placement import Ranked, ranked, worth_trying
 from trilane.scheduler.placement_model import Rules, frame_ns
 from trilane.scheduler.places import Core, Placement
 from trilane.scheduler.stats import median_interval
+from trilane.stages import PRELOAD
 from trilane.stages.avatar_assets import network_of
-from trilane.stages.avatar_pipeline import run_avatar
-from trilane.stages.choosing import choice
+from trilane.stages.avatar_pipeline import measured_times, run_avatar, tried
 from trilane.stages.configure import Checked, Request, configure
-from trilane.stages.factories import PRELOAD
-from trilane.stages.placing import FIRST, considered, times_rows
-from trilane.stages.rehearsing import measured_times, tried
+from trilane.stages.placing import FIRST, choice, considered, times_rows
 from trilane.units import BURST
 
 MIN_FRAMES = 20

@@ -29,10 +29,10 @@ from trilane.errors import BadInputError, TrilaneError
 from trilane.figure_sources import MEASURED
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.stats import median_interval
+from trilane.stages import PRELOAD
 from trilane.stages.avatar_pipeline import run_avatar
 from trilane.stages.configure import Checked, Request, configure
-from trilane.stages.factories import PRELOAD
-from trilane.stages.gpu.opengl_context import describe
+from trilane.stages.gpu.opengl import describe
 from trilane.stages.placing import placed
 from trilane.writing import write_folder
 

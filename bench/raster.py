@@ -17,7 +17,7 @@ from trilane.bench.lib.split_pass import SplitPass
 from trilane.bench.lib.timing import interleaved_ms, summary_ms
 from trilane.body.skinning import FrameSkinner
 from trilane.errors import BadInputError, TrilaneError
-from trilane.stages.gpu.opengl_context import describe, open_context
+from trilane.stages.gpu.opengl import describe, open_context
 from trilane.stages.gpu.packed_pass import CHANNELS, PackedAvatar, PackedPass, Placement
 from trilane.stages.gpu.skinned_mesh import PosedMesh, SkinnedMesh
 from trilane.training.uv_image import UvBytes

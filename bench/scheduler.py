@@ -18,9 +18,8 @@ from typing import Any
 import numpy as np
 
 from trilane.compiled import form
-from trilane.errors import BadInputError, TrilaneError
+from trilane.errors import BadInputError, TrilaneError, install_line
 from trilane.hw_profiles.application import application_graph
-from trilane.install import install_line
 from trilane.scheduler.events import Graph, Settings
 from trilane.scheduler.recording import read, replay
 from trilane.scheduler.stats import median_interval

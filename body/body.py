@@ -1,28 +1,109 @@
 """A body, read from a file in the SMPL-X layout: no pickle, sizes checked before memory is taken, read-only arrays.
 
-Rule: a `Body` is finite, consistent and ready for use; anything wrong with a file raises one BadInputError.
+A `Body` is finite, consistent and ready for use; anything wrong with a file raises one BadInputError. A body whose rest
+pose is lower or higher than people are is refused, since everything else is in metres. Pose blend shapes are read as a
+stream: an array of zeros (80 MB in many files) takes no memory, as it is allocated at the first other number.
 
-The layout is that of https://smpl-x.is.tue.mpg.de, read as the `smplx` package reads it: the rest shape is
-`v_template + shapedirs @ [betas, expression]`, the joints are `J_regressor @ rest shape`.
+The layout is that of https://smpl-x.is.tue.mpg.de, read as the `smplx` package reads it: the rest shape is `v_template
++ shapedirs @ [betas, expression]`, the joints are `J_regressor @ rest shape`.
 """
 
 from __future__ import annotations
 
+import math
+import zipfile
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from trilane.arrays import F32, F64, I32
-from trilane.body.height import check_height
 from trilane.body.joints import JOINTS, LEFT_HAND, POSE_FEATURES, POSE_SIZE, RIGHT_HAND
-from trilane.body.pose_blend_shapes import read_pose_blend
 from trilane.errors import BadInputError
-from trilane.files import npz_names, read_npz
+from trilane.files import DAMAGED, npz_names, read_header, read_npz
 from trilane.unexpected_value import UnexpectedValue
+
+#: From sole to crown, metres: from less than a newborn child to more than anybody was.
+LEAST_HEIGHT_M, MOST_HEIGHT_M = 0.3, 3.0
+USUAL_HEIGHT_M = 1.7
+UNITS_M = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254, "feet": 0.3048, "decimetres": 0.1}
+
+
+def check_height(height: float) -> None:
+    """Raises UnexpectedValue for a `height` that no body in metres has, with the unit that would make it one."""
+    if LEAST_HEIGHT_M <= height <= MOST_HEIGHT_M:
+        return
+    found = f"a body {height:.4g} m high, along Y at rest"
+    raise UnexpectedValue(found, f"{LEAST_HEIGHT_M:g} to {MOST_HEIGHT_M:g} m", _height_remedy(height))
+
+
+def _height_remedy(height: float) -> str:
+    fitting = {name: unit for name, unit in UNITS_M.items() if LEAST_HEIGHT_M <= height * unit <= MOST_HEIGHT_M}
+    if not fitting:
+        return "give its places in metres, Y up"
+    name = min(fitting, key=lambda name: abs(math.log(height * fitting[name] / USUAL_HEIGHT_M)))
+    scaled = f"{height * fitting[name]:.2f} m if they are {name}"
+    return f"give its places in metres: {scaled}, so multiply v_template and shapedirs by {fitting[name]:g}"
+
+
+POSE_BLEND_KEY = "posedirs"
+MAX_POSE_BLEND_BYTES = 1 << 30
+_CHUNK_ITEMS = 1 << 18
+
+
+def read_pose_blend(path: Path, shape: tuple[int, int, int]) -> NDArray[np.float32] | None:
+    """The array `posedirs` of the npz at `path`, float32 of `shape`, read-only; None when it is all zero.
+
+    Raises BadInputError when it is missing, misshapen, pickled, too large, truncated or not finite.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if f"{POSE_BLEND_KEY}.npy" not in archive.namelist():
+                raise BadInputError(path, f"no array {POSE_BLEND_KEY!r}", "a body file in the SMPL-X layout (.npz)")
+            with archive.open(f"{POSE_BLEND_KEY}.npy") as file:
+                return _read_pose_blend(f"{path}[{POSE_BLEND_KEY}]", file, shape)
+    except DAMAGED as error:
+        raise BadInputError(path, f"no readable .npz archive ({error})", "a body file (.npz)") from error
+
+
+def _read_pose_blend(where: str, file: IO[bytes], shape: tuple[int, int, int]) -> NDArray[np.float32] | None:
+    dtype, order = _check_pose_blend_header(where, file, shape)
+    count = math.prod(shape)
+    flat: NDArray[np.float32] | None = None
+    for start in range(0, count, _CHUNK_ITEMS):
+        items = min(_CHUNK_ITEMS, count - start)
+        data = file.read(items * dtype.itemsize)
+        if len(data) < items * dtype.itemsize:
+            raise BadInputError(where, "truncated data", f"{count * dtype.itemsize} bytes by its own header")
+        chunk = np.frombuffer(data, dtype)
+        if not chunk.any():
+            continue
+        if flat is None:
+            flat = np.zeros(count, np.float32)
+        with np.errstate(over="ignore"):
+            flat[start : start + items] = chunk
+        if not np.isfinite(flat[start : start + items]).all():
+            raise BadInputError(where, "NaN or infinity", "finite numbers")
+    if flat is None:
+        return None
+    array = np.ascontiguousarray(flat.reshape(shape, order=order))
+    array.flags.writeable = False
+    return array
+
+
+def _check_pose_blend_header(where: str, file: IO[bytes], shape: tuple[int, int, int]) -> tuple[np.dtype[Any], Any]:
+    stored_shape, fortran, dtype = read_header(where, file)
+    if dtype.kind not in "fiu":
+        raise BadInputError(where, f"dtype {dtype}", "numbers")
+    if stored_shape != shape:
+        raise BadInputError(where, f"shape {stored_shape}", str(shape))
+    if math.prod(shape) * dtype.itemsize > MAX_POSE_BLEND_BYTES:
+        raise BadInputError(where, f"shape {stored_shape} of {dtype}", f"at most {MAX_POSE_BLEND_BYTES} bytes")
+    return dtype, "F" if fortran else "C"
+
 
 EXPECTED = "a body file in the SMPL-X layout (.npz)"
 MAX_VERTICES = 1 << 18
@@ -237,7 +318,7 @@ def _check_weights(path: Path, weights: F32) -> None:
 
 
 def weights_of_one(weights: F32) -> F32:
-    """Skin weights (V,J) of which none is below 0 and each row sums to 1; a row that does to within rounding is kept.
+    """Skin weights (V,J) with no number below 0 and rows that sum to 1; a row whose sum is 1 within rounding is kept.
 
     A body that stands p metres from the origin would be off by p times what is missing of 1.
     """

@@ -1,21 +1,245 @@
-"""Linear blend skinning of vertices on the CPU.
+"""Linear blend skinning on the CPU: skin weights, how much of a body is modelled, and the vertices of a pose.
 
-Rule: x_world = sum_j w_j (matrix_j @ [x_rest, 1]); the products are small enough that the BLAS starts no threads.
+x_world = sum_j w_j (matrix_j @ [x_rest, 1]); the products are small enough that the BLAS starts no threads. Of the
+weights of a vertex the K largest remain, scaled to sum to 1. What a level of detail leaves out has a proved bound; the
+last level leaves nothing out.
+
+Proof. Let w be a vertex's skin weights, w' those of the level, p its rest position, c_b the centre of joint b and t_b
+the angle by which b is turned. As in `weight_error_bound`, other weights move the vertex by at most sum_b |E_b| |y_b -
+y_parent|, with E_b the sum of w' - w over b and the joints below it, and b's own turn moves p by |y_b - y_parent| = 2
+sin(t_b / 2) dist(p, axis of b) <= 2 sin(t_b / 2) |p - c_b|. Pose blend shapes move p by at most r = sum_b r_b |R_b -
+I|, r_b the norm of the vertex's block of them. Left out, they move the skinned vertex by at most r, because its weights
+are shares of rigid motions; kept, they make |p - c_b| larger by at most r. |R_b - I|, Frobenius, is 2 sqrt(2) sin(t_b /
+2). Vertices are taken in groups, with the largest of each term in the group.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from trilane.arrays import F32, F64
-from trilane.body.body import ShapedBody
-from trilane.body.detail import EVERYTHING, Detail
-from trilane.body.joints import JOINTS, POSE_FEATURES
+from trilane.body.body import Body, ShapedBody
+from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINTS, POSE_FEATURES
 from trilane.body.kinematics import Posed, Skeleton
-from trilane.body.skin_weights import largest_weights
+from trilane.cache import Arrays, cached_arrays
+from trilane.errors import BadInputError
+
+WEIGHT_COUNTS = (4, 8, 12)
+
+
+@dataclass(frozen=True)
+class TopWeights:
+    """`joints` (V,K) int32 and `weights` (V,K) float32, largest first, rows sum to 1; unused columns have weight 0."""
+
+    joints: NDArray[np.int32]
+    weights: F32
+
+    def dense(self) -> F32:
+        """The weights as (V,55) float32, one column per joint."""
+        full = np.zeros((len(self.weights), JOINTS), np.float32)
+        np.put_along_axis(full, self.joints, self.weights, axis=1)
+        return full
+
+
+def largest_weights(weights: F32, k: int) -> TopWeights:
+    """The `k` largest of each row of `weights` (V,55), scaled to sum to 1.
+
+    Raises BadInputError unless `k` is 4, 8 or 12.
+    """
+    if k not in WEIGHT_COUNTS:
+        raise BadInputError("skin weights", str(k), "4, 8 or 12")
+    order = np.argsort(-weights, axis=1, kind="stable")[:, :k]
+    largest = np.take_along_axis(weights, order, axis=1).astype(np.float64)
+    return TopWeights(order.astype(np.int32), (largest / largest.sum(axis=1, keepdims=True)).astype(np.float32))
+
+
+def weight_error_bound(shaped: ShapedBody, weight_count: int) -> F64:
+    """(V,) metres: the furthest that any pose moves a vertex when only its `weight_count` largest weights are used.
+
+    Proof. Let joint j alone move the rest vertex p to y_j, and let e_j be the change of its weight; the e_j sum to 0.
+    Joint b and its parent both move p rigidly, and both move the centre c_b of b to the same point, so y_b and y_parent
+    lie on one sphere about that point: |y_b - y_parent| <= 2 |p - c_b|. With each y_j written as the root's y plus the
+    steps down the chain to j,
+
+        sum_j e_j y_j = sum_b E_b (y_b - y_parent),   E_b the sum of e_j over b and the joints below it,
+
+    so the vertex moves by at most sum_b |E_b| 2 |p - c_b|. With pose blend shapes, p is the vertex that they moved.
+    """
+    largest = largest_weights(shaped.body.weights, weight_count).dense()
+    change = branch_sums(shaped.body.parents, largest.astype(np.float64) - shaped.body.weights)
+    return np.asarray((np.abs(change[:, 1:]) * 2.0 * joint_distance(shaped)[:, 1:]).sum(axis=1))
+
+
+def joint_distance(shaped: ShapedBody) -> F64:
+    """(V,55) metres from each rest vertex to each joint."""
+    return np.asarray(np.linalg.norm(shaped.vertices[:, None, :] - shaped.joints[None], axis=2))
+
+
+def branch_sums(parents: NDArray[np.int32], values: F64) -> F64:
+    """`values` (..., 55) summed over each joint and all joints below it."""
+    above = np.eye(len(parents))
+    for joint in range(len(parents)):
+        at = int(parents[joint])
+        while at >= 0:
+            above[joint, at] = 1.0
+            at = int(parents[at])
+    return np.asarray(values @ above)
+
+
+#: Joints of the hands and the face, to the joint that carries them.
+CARRIED_BY = {
+    name: JOINT_INDEX["head" if name in ("jaw", "left_eye", "right_eye") else f"{name.partition('_')[0]}_wrist"]
+    for name in JOINT_NAMES[JOINT_INDEX["jaw"] :]
+}
+VERSION = "detail bounds 1"  # to be raised when the same body gives other bounds
+#: What float32 may add: the weights' and the skinned vertices' rounding, metres.
+ROUNDING_M = 5e-6
+
+
+@dataclass(frozen=True)
+class Detail:
+    """A level. `weight_count`: skin weights of a vertex, None for all. `hands_and_face`: whether their joints count,
+    else they are carried by wrist and head. `pose_blend`: whether pose blend shapes are applied, where there are any.
+    """
+
+    name: str
+    weight_count: int | None
+    hands_and_face: bool
+    pose_blend: bool
+
+    def weights(self, shaped: ShapedBody) -> F32:
+        """(V,55) skin weights of this level; rows sum to 1."""
+        weights = shaped.body.weights
+        if not self.hands_and_face:
+            weights = carried(weights)
+        count = self.weight_count
+        if count is None or np.count_nonzero(weights, axis=1).max() <= count:
+            return weights
+        return largest_weights(weights, count).dense()
+
+
+def left_out(detail: Detail, body: Body) -> list[str]:
+    """The parts of `body` that `detail` leaves out, in words; empty when it leaves out nothing."""
+    found = []
+    weights = body.weights
+    if not detail.hands_and_face:
+        found.append("turns of fingers, jaw and eyes")
+        weights = carried(weights)
+    count = detail.weight_count
+    cut = 0 if count is None else int((np.count_nonzero(weights, axis=1) > count).sum())
+    if cut:
+        found.append(f"all but the {count} largest skin weights of {cut} of {len(weights)} vertices")
+    if not detail.pose_blend and body.posedirs is not None:
+        found.append("pose blend shapes")
+    return found
+
+
+#: From the least work to all of it.
+DETAILS = (
+    Detail("4 weights, hands and face at rest, no pose blend shapes", 4, hands_and_face=False, pose_blend=False),
+    Detail("4 weights, no pose blend shapes", 4, hands_and_face=True, pose_blend=False),
+    Detail("8 weights, no pose blend shapes", 8, hands_and_face=True, pose_blend=False),
+    Detail("8 weights", 8, hands_and_face=True, pose_blend=True),
+    Detail("12 weights", 12, hands_and_face=True, pose_blend=True),
+    Detail("everything", None, hands_and_face=True, pose_blend=True),
+)
+EVERYTHING = DETAILS[-1]
+
+
+def carried(weights: F32) -> F32:
+    """`weights` (V,55) with those of the hands' and the face's joints given to wrist and head."""
+    given = weights.astype(np.float64)
+    for name, carrier in CARRIED_BY.items():
+        given[:, carrier] += given[:, JOINT_INDEX[name]]
+        given[:, JOINT_INDEX[name]] = 0.0
+    return given.astype(np.float32)
+
+
+class DetailBounds:
+    """The bounds of every level of `DETAILS`, for one shaped body.
+
+    `reach` (55,): metres, the furthest from each joint's centre at rest of the vertices that any level moves with it.
+    """
+
+    def __init__(self, shaped: ShapedBody) -> None:
+        body = shaped.body
+        sources: list[NDArray[Any]] = [shaped.vertices, shaped.joints, body.parents, body.weights]
+        sources += [body.posedirs] if body.posedirs is not None else []
+        arrays = cached_arrays(VERSION, sources, lambda: _terms(shaped))
+        self._lever, self._change, self._blend = arrays["lever"], arrays["change"], arrays["blend"]
+        self.reach: F64 = arrays["reach"]
+
+    def metres(self, posed: Posed) -> list[float]:
+        """The furthest, in metres, that each level of `DETAILS` moves a vertex in this frame of `Skeleton.pose`."""
+        turned = _turned(posed)
+        swing = turned / np.sqrt(2.0)
+        blend = self._blend @ turned
+        lever, change = self._lever @ swing, self._change @ swing
+        return [
+            0.0 if detail == EVERYTHING else _bound(detail, lever[level], change[level], blend)
+            for level, detail in enumerate(DETAILS)
+        ]
+
+    def blend_m(self, posed: Posed) -> float:
+        """The furthest that pose blend shapes move a vertex in this frame, metres."""
+        return float((self._blend @ _turned(posed)).max())
+
+
+def _turned(posed: Posed) -> F64:
+    """(54,) |R - I|, Frobenius, of joints 1 to 54."""
+    return np.asarray(np.linalg.norm(posed.feature.reshape(-1, 9).astype(np.float64), axis=1))
+
+
+def _bound(detail: Detail, lever: F64, change: F64, blend: F64) -> float:
+    moved = lever + change * blend if detail.pose_blend else lever + blend
+    return float(moved.max()) + ROUNDING_M
+
+
+def _terms(shaped: ShapedBody) -> Arrays:
+    """The largest terms of each of the G groups of vertices.
+
+    `lever`, `change` (levels,G,54): |E_b| |p - c_b| and |E_b|. `blend` (G,54): r_b of the blend shapes. `reach` (55,).
+    """
+    starts, order = _groups(shaped.body.weights)
+    distance = joint_distance(shaped)
+    exact = shaped.body.weights.astype(np.float64)
+    lever, change, used = [], [], exact > 0
+    for detail in DETAILS:
+        weights = detail.weights(shaped)
+        used = used | (weights > 0)
+        moved = np.abs(branch_sums(shaped.body.parents, weights - exact)[:, 1:])
+        change.append(np.maximum.reduceat(moved[order], starts, axis=0))
+        lever.append(np.maximum.reduceat((moved * distance[:, 1:])[order], starts, axis=0))
+    return {
+        "lever": np.array(lever),
+        "change": np.array(change),
+        "blend": np.maximum.reduceat(_blend_reach(shaped)[order], starts, axis=0),
+        "reach": np.where(used, distance, 0.0).max(axis=0),
+    }
+
+
+def _blend_reach(shaped: ShapedBody) -> F64:
+    """(V,54) metres: how far each joint's pose blend shapes can move each vertex at |R - I| = 1."""
+    posedirs = shaped.body.posedirs
+    if posedirs is None:
+        return np.zeros((len(shaped.vertices), JOINTS - 1))
+    blocks = posedirs.reshape(-1, 3, JOINTS - 1, 9)
+    return np.asarray(np.sqrt(np.einsum("vajk,vajk->vj", blocks, blocks).astype(np.float64)))
+
+
+def _groups(weights: F32) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Vertices grouped by their two largest joints: where each group begins in the order (V,) that is also returned."""
+    two = np.sort(np.argsort(-weights, axis=1, kind="stable")[:, :2], axis=1)
+    key = two[:, 0] * JOINTS + two[:, 1]
+    order = np.argsort(key, kind="stable")
+    starts = np.flatnonzero(np.diff(key[order], prepend=-1))
+    return starts, order
+
 
 #: Vertices of one product. OpenBLAS wakes its other threads for more than 2**18 multiplications, which stalls on shared
 #: cores.

@@ -17,8 +17,7 @@ from google.protobuf.message import DecodeError
 from onnx import AttributeProto, TensorProto
 
 from trilane.errors import BadInputError
-from trilane.file_signatures import HEAD_BYTES, signature_of_head
-from trilane.files import require_file
+from trilane.files import HEAD_BYTES, require_file, signature_of_head
 from trilane.hw_profiles.graph_shapes import Shape, with_shapes
 from trilane.hw_profiles.graph_structure import check_structure, in_order
 from trilane.hw_profiles.graph_tensors import forget_data

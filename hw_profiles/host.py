@@ -12,8 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from trilane import machine
-from trilane.errors import BadInputError
-from trilane.near_miss import did_you_mean
+from trilane.errors import BadInputError, did_you_mean
 from trilane.pipeline.description import UnitSettings
 from trilane.scheduler.places import FULL, Core, Place, Placement, has_own_cores
 from trilane.units import UNITS

@@ -10,8 +10,8 @@ from trilane.unet_tables import (
     MOBILE_ENCODERS,
     RESNET18_STAGES,
     RESNET18_STEM,
+    MobileBlock,
     MobileEncoder,
-    Row,
     squeeze_channels,
 )
 
@@ -52,7 +52,7 @@ def _squeeze(b: GraphBuilder, x: TensorRef) -> TensorRef:
     return b.op("Mul", [x.name, gate.name], x[1:])
 
 
-def _inverted_block(b: GraphBuilder, x: TensorRef, row: Row) -> TensorRef:
+def _inverted_block(b: GraphBuilder, x: TensorRef, row: MobileBlock) -> TensorRef:
     activation = ACTIVATIONS[row.activation]
     y = x if row.expanded == x.channels else b.unit(x, row.expanded, 1, activation)
     y = b.unit(y, row.expanded, row.kernel, activation, row.stride, groups=row.expanded)

@@ -7,9 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from trilane.errors import MissingPartError
+from trilane.errors import MissingPartError, package_line
 from trilane.hw_profiles.schema import Profile
-from trilane.install import package_line
 
 
 def fastest_runtime(profile: Profile, installed: Sequence[str]) -> tuple[str, str]:

@@ -7,8 +7,7 @@ import os
 from collections.abc import Iterator
 
 from trilane.pipeline.description import HeaderDtype, Model, Pipeline
-from trilane.transport.memory import RegionLayout, create_region
-from trilane.transport.packets import SlotLayout
+from trilane.transport.packets import RegionLayout, SlotLayout, create_region
 from trilane.transport.slots import edge_rule
 
 

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from trilane import machine
 from trilane.errors import TrilaneError, reason
-from trilane.transport.memory import F_ADD_SEALS, F_SEAL_GROW, F_SEAL_SHRINK
-from trilane.transport.packets import PAGE
+from trilane.transport.packets import F_ADD_SEALS, F_SEAL_GROW, F_SEAL_SHRINK, PAGE
 
 Assets = Mapping[str, NDArray[Any]]
 

@@ -23,10 +23,7 @@ from trilane.pipeline.job_times import JobClock
 from trilane.pipeline.shared_assets import map_assets
 from trilane.pipeline.stage import Skip, StageFactory, UnitContext
 from trilane.pipeline.unit_spec import UnitSpec
-from trilane.transport.heartbeats import LINGER_MS, context_on_cores
-from trilane.transport.job_pipe import JobPipe
-from trilane.transport.link import Link
-from trilane.transport.memory import map_region
+from trilane.transport.link import LINGER_MS, Link, context_on_cores
 from trilane.transport.messages import (
     BUILDING,
     CLOSING,
@@ -34,12 +31,14 @@ from trilane.transport.messages import (
     Close,
     Closed,
     Failed,
+    JobPipe,
     MessageError,
     Ping,
     Pong,
     Ready,
     RunJob,
 )
+from trilane.transport.packets import map_region
 from trilane.transport.wakeup import UNIT_NS, use_slice
 
 

@@ -25,10 +25,8 @@ from trilane.pipeline.regions import EdgeRegion
 from trilane.pipeline.run_log import after_stderr
 from trilane.pipeline.unit_spec import UnitSpec
 from trilane.pipeline.unit_starter import StartedUnit, UnitStarter, is_stopped
-from trilane.transport.job_pipe import JobPipe, JobPipeEnd, job_pipe_pair
-from trilane.transport.link import Link
-from trilane.transport.messages import Message, MessageError
-from trilane.transport.socket_folder import SocketFolder
+from trilane.transport.link import Link, SocketFolder
+from trilane.transport.messages import JobPipe, JobPipeEnd, Message, MessageError, job_pipe_pair
 
 TAIL_BYTES = 8192
 END_S = 2.0

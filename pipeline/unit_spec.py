@@ -7,7 +7,7 @@ from pathlib import Path
 
 from trilane.pipeline.description import Model, PipelineStage, UnitSettings
 from trilane.pipeline.regions import EdgeRegion
-from trilane.transport.job_pipe import JobPipeEnd
+from trilane.transport.messages import JobPipeEnd
 
 
 class UnitSpec(Model):

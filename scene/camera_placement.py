@@ -1,11 +1,15 @@
-"""Places a recorded camera in the scene so that it films the avatars.
+"""The camera in the scene: where a recorded one is placed so that it films the avatars, and how a person steers it.
 
-Rule: the recording is moved as one rigid, upright piece: it is turned about the vertical and shifted; its movement from
-frame to frame never changes. A fixed grid of places is searched, coarse and then finer. The best place shows the whole
-bodies at the most moments; among equals the one where they are larger wins. At first the camera is in front of
-the avatars, in the direction that a heading of 0 faces. Over a drawn background the camera is also tilted by one
-constant angle, so that it does not look down on people. The moments are those of the scene's first seconds, however
-many frames a run shows and at whatever rate: a frame of a scene is the same picture in every run.
+The recording is moved as one rigid, upright piece: it is turned about the vertical and shifted; its movement from frame
+to frame never changes. A fixed grid of places is searched, coarse and then finer. The best place shows the whole bodies
+at the most moments; among equals the one where they are larger wins. At first the camera is in front of the avatars, in
+the direction that a heading of 0 faces. Over a drawn background the camera is also tilted by one constant angle, so
+that it does not look down on people. The moments are those of the scene's first seconds, however many frames a run
+shows and at whatever rate: a frame of a scene is the same picture in every run.
+
+A person turns the view about the vertical through a pivot, then about the level axis that runs to the camera's right.
+The camera stays upright, above the floor and off the pole; where the scene's own camera is beyond that, it is not
+turned further out. Coming nearer is a move along the line to the pivot; the lens stays the same.
 """
 
 from __future__ import annotations
@@ -18,12 +22,76 @@ import numpy as np
 from trilane.arrays import F32, F64
 from trilane.body.body import ShapedBody
 from trilane.body.kinematics import Skeleton
-from trilane.scene.body_outline import outline
 from trilane.scene.camera.path import CameraPath, view_from_pose
-from trilane.scene.mover import Mover
-from trilane.scene.placed_camera import PlacedCamera
+from trilane.scene.mover import Mover, outline
 from trilane.scene.rotations import about, quat_from_matrix, quat_multiply
 from trilane.scene.schema import Scene
+from trilane.shapes import Shape
+
+
+@dataclass(frozen=True)
+class PlacedCamera:
+    """A camera in the scene.
+
+    `turn` (3, 3) and `shift` (3,): from the path's world to the scene's. `mount` (3, 3): from the camera's axes to
+    those of the path. `notes`: what was decided, for people.
+    """
+
+    path: CameraPath
+    turn: F64
+    shift: F64
+    mount: F64
+    notes: tuple[str, ...]
+
+    def sample(self, t_s: float) -> F64:
+        """World to camera (4, 4) at `t_s`; the world is the scene's."""
+        turn, place = self.path.pose(t_s)
+        return view_from_pose(self.turn @ turn @ self.mount, self.turn @ place + self.shift)
+
+    def reach(self) -> tuple[F64, F64]:
+        """Lowest and highest coordinates (3,) of all places of the camera in the scene."""
+        places = self.path.places @ self.turn.T + self.shift
+        return places.min(axis=0), places.max(axis=0)
+
+    def projection(self, t_s: float, output: Shape) -> F64:
+        """OpenGL clip matrix (4, 4) at `t_s` for a picture of `output` (height, width)."""
+        return self.path.projection(t_s, output)
+
+
+LOWEST_DEG, HIGHEST_DEG = -8.0, 85.0
+LEAST_LEVEL_M = 1e-6  # of the camera's distance from the pivot, level; below it stands over the pivot
+
+
+def steered(view: F64, pivot: F64, azimuth_deg: float, elevation_deg: float, zoom: float) -> F64:
+    """World to camera (4, 4) of the camera of `view` (4, 4), turned about `pivot` (3,) and moved towards it.
+
+    `azimuth_deg`: turn to the right about the vertical. `elevation_deg`: upwards. `zoom`: how many times nearer, above
+    0.
+    """
+    if azimuth_deg == 0.0 and elevation_deg == 0.0 and zoom == 1.0:
+        return view
+    eye = -view[:3, :3].T @ view[:3, 3]
+    turn = _turn(eye - pivot, azimuth_deg, elevation_deg)
+    world = np.eye(4)
+    world[:3, :3] = turn.T
+    world[:3, 3] = pivot - turn.T @ pivot
+    moved: F64 = view @ world
+    seen = moved[:3, :3] @ pivot + moved[:3, 3]
+    moved[:3, 3] += (1.0 / zoom - 1.0) * seen
+    return moved
+
+
+def _turn(arm: F64, azimuth_deg: float, elevation_deg: float) -> F64:
+    """The turn (3, 3) of a camera at `arm` (3,) from the pivot."""
+    level = float(np.hypot(arm[0], arm[2]))
+    if level < LEAST_LEVEL_M:
+        return about(1, np.radians(azimuth_deg))
+    heading = np.arctan2(arm[0], arm[2])
+    now_deg = float(np.degrees(np.arctan2(arm[1], level)))
+    low, high = min(LOWEST_DEG, now_deg), max(HIGHEST_DEG, now_deg)
+    raised = np.radians(np.clip(now_deg + elevation_deg, low, high) - now_deg)
+    return about(1, heading + np.radians(azimuth_deg)) @ about(0, -raised) @ about(1, -heading)
+
 
 #: A place is scored at so many moments, evenly spread over the first SCORED_S seconds of the scene, in which a shorter
 #: motion or recording is repeated as in a run. What a longer one shows later does not count.
@@ -68,10 +136,10 @@ class _Footage:
 def place_camera(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]) -> PlacedCamera:
     """The camera of a scene. A built-in one, and one whose spec has `place = "none"`, stays where it is.
 
-    `path`: of the camera.
+    `path`: path of the camera.
     `scene`: says what lies behind, how large the picture is, and whether the camera is placed.
     `movers`: its avatars.
-    `bodies`: of these avatars, in the same order.
+    `bodies`: bodies of these avatars, in the same order.
     """
     times = np.linspace(0.0, SCORED_S, SCORED_MOMENTS)
     if not path.recorded:
@@ -176,10 +244,7 @@ def _best(footage: _Footage, places: F64) -> F64:
 
 
 def _visibility(footage: _Footage, places: F64) -> tuple[F64, F64]:
-    """For each place: share of the moments with whole bodies, and mean share of the picture's height that they take.
-
-    Each (S,).
-    """
+    """The share of moments with whole bodies, and the mean share of the picture's height that these take; both (S,)."""
     angle = _facing(footage, places)
     cos, sin = (f(angle).astype(np.float32)[:, None] for f in (np.cos, np.sin))
     by_axis = footage.boxes.astype(np.float32).transpose(2, 1, 0)  # the 8 corners before the frames: faster to reduce
@@ -192,7 +257,7 @@ def _visibility(footage: _Footage, places: F64) -> tuple[F64, F64]:
 
 
 def _filmed(footage: _Footage, corners: Sequence[F32] | F32) -> tuple[F64, F64]:
-    """As `_visibility`, of boxes with `corners` x, y, z, each (8, S, F), in the path's world."""
+    """The result of `_visibility` for boxes with `corners` x, y, z, each (8, S, F), in the path's world."""
     x, y, z = corners
     right, up, back = (_row(footage.views[:, k], x, y, z) for k in range(3))
     depth = np.maximum(-back, NEAREST_M)

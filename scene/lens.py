@@ -1,21 +1,27 @@
 """A pinhole lens as pixels of the picture that it makes, and what scaling, cutting and turning that picture does to it.
 
-Rule: whatever is done to a picture is done to its lens by the method of the same name, so that a point of the world
-stays on its pixel. Pixels are counted from the picture's top left corner, x to the right and y down: the centre of the
-first pixel is at (0.5, 0.5), as COLMAP has it (https://colmap.github.io/cameras.html). `of_opencv` is for formats that
-count from that centre.
+Whatever is done to a picture is done to its lens by the method of the same name, so that a point of the world stays on
+its pixel. Pixels are counted from the picture's top left corner, x to the right and y down: the centre of the first
+pixel is at (0.5, 0.5), as COLMAP has it (https://colmap.github.io/cameras.html). `of_opencv` is for formats that count
+from that centre.
+
+Pictures are drawn without distortion. `distortion_note` says how far it would move points of the picture's border, by
+the models of OpenCV and COLMAP, so that a person can judge whether that matters.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from trilane.arrays import F64
+from trilane.errors import BadInputError
 from trilane.shapes import Shape
 
 #: Picture of a lens of which nothing but an angle is known.
@@ -38,8 +44,8 @@ class Known(Enum):
 TURNED = {**{known: known for known in Known}, Known.WIDTH: Known.HEIGHT, Known.HEIGHT: Known.WIDTH}
 
 
-class Cut(NamedTuple):
-    """A picture is scaled to `height` x `width` pixels, of which `top` rows and `left` columns are cut off first."""
+class PictureCut(NamedTuple):
+    """How a picture is cut: it is scaled to `height` x `width`, then loses its first `top` rows and `left` columns."""
 
     height: int
     width: int
@@ -47,11 +53,11 @@ class Cut(NamedTuple):
     left: int
 
 
-def cover(picture: Shape, output: Shape) -> Cut:
+def cover(picture: Shape, output: Shape) -> PictureCut:
     """How `picture` covers `output`, both (height, width): scaled until no border is left, the overhang cut equally."""
     scale = max(output[0] / picture[0], output[1] / picture[1])
     height, width = (max(side, round(full * scale)) for side, full in zip(output, picture, strict=True))
-    return Cut(height, width, (height - output[0]) // 2, (width - output[1]) // 2)
+    return PictureCut(height, width, (height - output[0]) // 2, (width - output[1]) // 2)
 
 
 @dataclass(frozen=True)
@@ -85,7 +91,7 @@ class Lens:
         return math.degrees(math.atan(self.cx / self.fx) + math.atan((self.width_px - self.cx) / self.fx))
 
     def scaled(self, width_px: float, height_px: float) -> Lens:
-        """Of the picture scaled to `width_px` x `height_px`."""
+        """The lens of the picture scaled to `width_px` x `height_px`."""
         x, y = width_px / self.width_px, height_px / self.height_px
         return replace(
             self,
@@ -98,11 +104,11 @@ class Lens:
         )
 
     def cropped(self, x: float, y: float, width_px: float, height_px: float) -> Lens:
-        """Of the part of `width_px` x `height_px` whose top left corner is at (`x`, `y`), which may be outside."""
+        """The lens of a part of `width_px` x `height_px`; its top left corner (`x`, `y`) may be outside the picture."""
         return replace(self, width_px=width_px, height_px=height_px, cx=self.cx - x, cy=self.cy - y)
 
     def turned(self, quarters: int) -> Lens:
-        """Of the picture turned clockwise by `quarters` of 90 degrees."""
+        """The lens of the picture turned clockwise by `quarters` of 90 degrees."""
         lens = self
         for _ in range(quarters % 4):
             lens = Lens(
@@ -111,7 +117,7 @@ class Lens:
         return lens
 
     def onto(self, picture: Shape) -> Lens:
-        """Of `picture` (height, width), which the lens made.
+        """The lens of `picture` (height, width), which it made.
 
         A picture of another shape than the lens's is taken as cut equally at both sides, by its sensor or later. A lens
         whose shape is not known takes the picture's, with square pixels and the angle that is known.
@@ -129,19 +135,19 @@ class Lens:
         return whole.cropped((whole.width_px - width) / 2, (whole.height_px - height) / 2, width, height)
 
     def covering(self, output: Shape) -> Lens:
-        """Of the picture cut by `cover` to `output` (height, width); the picture has whole pixels."""
+        """The lens of the picture cut by `cover` to `output` (height, width); the picture has whole pixels."""
         cut = cover((round(self.height_px), round(self.width_px)), output)
         return self.scaled(cut.width, cut.height).cropped(cut.left, cut.top, output[1], output[0])
 
     def filling_height(self, output: Shape) -> Lens:
-        """Of a drawing of `output` (height, width) as high as the picture; at its sides it shows more, or less."""
+        """The lens of a drawing of `output` (height, width) as high as the picture; its sides show more, or less."""
         height, width = output
         scale = height / self.height_px
         whole = self.scaled(self.width_px * scale, height)
         return whole.cropped((whole.width_px - width) / 2, 0.0, width, height)
 
     def between(self, other: Lens, fraction: float) -> Lens:
-        """From this lens at a `fraction` of 0 to `other`, of a picture of the same size, at 1."""
+        """The lens between this one, at a `fraction` of 0, and `other`, at 1, which has a picture of the same size."""
 
         def mix(a: float, b: float) -> float:
             return a + (b - a) * fraction
@@ -176,12 +182,100 @@ def of_opencv(width_px: float, height_px: float, fx: float, fy: float, cx: float
 
 
 def of_fov_y(fov_y_deg: float) -> Lens:
-    """A lens of which the field of view over the picture's height is known."""
+    """A lens by its field of view over the picture's height, degrees."""
     focal = ASSUMED_HEIGHT_PX / 2 / math.tan(math.radians(fov_y_deg) / 2)
     return centred(ASSUMED_WIDTH_PX, ASSUMED_HEIGHT_PX, focal, Known.HEIGHT)
 
 
 def of_fov_x(fov_x_deg: float) -> Lens:
-    """A lens of which the field of view over the picture's width is known."""
+    """A lens by its field of view over the picture's width, degrees."""
     focal = ASSUMED_WIDTH_PX / 2 / math.tan(math.radians(fov_x_deg) / 2)
     return centred(ASSUMED_WIDTH_PX, ASSUMED_HEIGHT_PX, focal, Known.WIDTH)
+
+
+LEAST_FOV_DEG, MOST_FOV_DEG = 1.0, 170.0
+LEAST_SIDE_PX, MOST_SIDE_PX = 1.0, 1e6  # of a side of the picture
+
+
+def checked_lens(where: str | Path, lens: Lens) -> Lens:
+    """`lens`, if its picture has LEAST_PX to MOST_PX a side, and it sees LEAST_DEG to MOST_DEG over each.
+
+    Raises BadInputError about `where`.
+    """
+    if not LEAST_SIDE_PX <= min(lens.width_px, lens.height_px) <= max(lens.width_px, lens.height_px) <= MOST_SIDE_PX:
+        found = f"a picture of {lens.width_px:.4g}x{lens.height_px:.4g} pixels"
+        raise BadInputError(where, found, f"sides of {LEAST_SIDE_PX:g} to {MOST_SIDE_PX:g} pixels")
+    for side, angle in (("height", lens.fov_y_deg), ("width", lens.fov_x_deg)):
+        if not LEAST_FOV_DEG < angle < MOST_FOV_DEG:
+            expected = f"{LEAST_FOV_DEG:g} to {MOST_FOV_DEG:g}"
+            raise BadInputError(where, f"a field of view of {angle:.4g} degrees over the {side}", expected)
+    return lens
+
+
+#: Points along each side of the border.
+BORDER_STEPS = 9
+#: Displacements below this are not worth a note.
+LEAST_BEND_PX = 0.5
+
+
+def measured_lens(where: str | Path, width_px: float, height_px: float, numbers: F64) -> Lens:
+    """The lens of a file's fx, fy, cx and cy, in pixels. Raises BadInputError about `where` for what is no lens."""
+    if not (np.isfinite(numbers).all() and (numbers > 0).all()):
+        raise BadInputError(where, "a lens whose numbers are not all positive", "fx, fy, cx and cy in pixels")
+    fx, fy, cx, cy = (float(value) for value in numbers)
+    return checked_lens(where, Lens(width_px, height_px, fx, fy, cx, cy))
+
+
+class Bent(NamedTuple):
+    """A lens with the `parameters` k1 to k6, p1 and p2 of its distortion."""
+
+    lens: Lens
+    parameters: Mapping[str, float]
+    is_fisheye: bool = False
+
+
+def distortion_note(lenses: Iterable[Bent]) -> tuple[str, ...]:
+    """What is left out of the lens that is distorted the most; nothing where it is nothing."""
+    bent = [each for each in lenses if each.is_fisheye or any(each.parameters.values())]
+    most, worst = max(((largest_px(*each), k) for k, each in enumerate(bent)), default=(0.0, 0))
+    if most < LEAST_BEND_PX:
+        return ()
+    lens, _, is_fisheye = bent[worst]
+    kind = "a fisheye lens is drawn as a pinhole" if is_fisheye else "distortion of the lens is left out"
+    return (f"{kind}: up to {most:.0f} px of {lens.width_px:.0f}x{lens.height_px:.0f}; undistort the pictures",)
+
+
+def largest_px(lens: Lens, parameters: Mapping[str, float], is_fisheye: bool = False) -> float:
+    """The farthest that a point of the pinhole picture's border is from where the lens draws it, pixels."""
+    part = np.linspace(0.0, 1.0, BORDER_STEPS)
+    zero, one = np.zeros(BORDER_STEPS), np.ones(BORDER_STEPS)
+    border = np.column_stack([np.concatenate([part, part, zero, one]), np.concatenate([zero, one, part, part])])
+    focal, middle = np.array([lens.fx, lens.fy]), np.array([lens.cx, lens.cy])
+    points = (border * [lens.width_px, lens.height_px] - middle) / focal
+    drawn = (_fisheye if is_fisheye else _polynomial)(points, parameters)
+    moved = np.linalg.norm((drawn - points) * focal, axis=1)
+    return float(np.nanmax(moved, initial=0.0))
+
+
+def _polynomial(points: F64, parameters: Mapping[str, float]) -> F64:
+    """OpenCV's radial and tangential model of `points` (N, 2), X / Z and Y / Z."""
+    k1, k2, k3, k4, k5, k6, p1, p2 = (
+        parameters.get(key, 0.0) for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+    )
+    x, y = points.T
+    square = x * x + y * y
+    radial = (1 + square * (k1 + square * (k2 + square * k3))) / (1 + square * (k4 + square * (k5 + square * k6)))
+    return np.column_stack([
+        x * radial + 2 * p1 * x * y + p2 * (square + 2 * x * x),
+        y * radial + p1 * (square + 2 * y * y) + 2 * p2 * x * y,
+    ])  # fmt: skip
+
+
+def _fisheye(points: F64, parameters: Mapping[str, float]) -> F64:
+    """OpenCV's fisheye model: the distance from the middle goes with the angle, not with its tangent."""
+    k1, k2, k3, k4 = (parameters.get(key, 0.0) for key in ("k1", "k2", "k3", "k4"))
+    radius = np.linalg.norm(points, axis=1)
+    angle = np.arctan(radius)
+    square = angle * angle
+    drawn = angle * (1 + square * (k1 + square * (k2 + square * (k3 + square * k4))))
+    return np.asarray(points * (drawn / np.where(radius > 0, radius, 1.0))[:, None])

@@ -1,31 +1,167 @@
-"""An avatar in the scene: its motion, put on the floor at the avatar's place and heading.
+"""An avatar in the scene: its motion on the floor, at the avatar's place and heading.
 
-Rule: `Mover.sample` gives pose and place at any time; a Mover never changes.
+A body touches the floor with its outermost vertices, not with its joints; pose blend shapes are left out. The rule
+`sequence` lifts the whole motion by one amount, so that jumps leave the floor. `frame` lifts each frame by its own
+amount, so that some point always touches it. `stance` is for a recording that tells when its feet stand: standing feet
+are on the floor, and other frames are lifted as much as those are on average.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from trilane.arrays import F64
+from trilane.arrays import F32, F64
 from trilane.body.body import ShapedBody
+from trilane.body.joints import JOINT_INDEX
 from trilane.body.kinematics import Skeleton
-from trilane.scene.body_outline import feet, outline
-from trilane.scene.floor import floor_lift, ground_rule, leg_length
-from trilane.scene.motion.motion import Motion, bracket, wrapped_time
+from trilane.scene.motion.motion import Motion, bracket, rest_leg_m, wrapped_time
 from trilane.scene.rotations import about
 from trilane.scene.schema import AvatarSpec
+
+#: How many of a vertex's skin weights are used: the largest ones.
+WEIGHTS = 4
+#: Frames whose heights are computed together: so few that the arrays stay in the processor's cache.
+FRAMES_AT_ONCE = 16
+FEET = ("left_ankle", "right_ankle", "left_foot", "right_foot")
+#: Directions in which the outermost vertices of each joint are taken: the axes and the diagonals of a cube.
+_SIGNS = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if abs(x) + abs(y) + abs(z) in (1, 3)]
+DIRECTIONS: F64 = np.array(_SIGNS, dtype=np.float64) / np.linalg.norm(_SIGNS, axis=1, keepdims=True)
+
+
+@dataclass(frozen=True)
+class BodyOutline:
+    """The K outermost vertices of a body.
+
+    `points` (K, 4): places at rest, metres, with a 1 appended. `joints` and `weights` (K, W): the joints that move each
+    of them, and how much.
+    """
+
+    points: F64
+    joints: NDArray[np.intp]
+    weights: F64
+
+    def posed(self, matrices: F32) -> F64:
+        """World positions (K, 3) under skinning matrices (55, 3, 4)."""
+        blend = np.einsum("kw,kwc->kc", self.weights, matrices.reshape(-1, 12)[self.joints])
+        return np.asarray(np.einsum("kab,kb->ka", blend.reshape(-1, 3, 4), self.points))
+
+    def lowest(self, height_rows: F32) -> F64:
+        """The least height (T,) that `posed` gives, of `height_rows` (T, 55, 4): row 1 of the skinning matrices."""
+        parts = np.split(height_rows, range(FRAMES_AT_ONCE, len(height_rows), FRAMES_AT_ONCE))
+        return np.concatenate([self._heights(rows).min(axis=1) for rows in parts])
+
+    def _heights(self, rows: F32) -> F64:
+        columns = range(self.weights.shape[1])
+        blend = np.asarray(sum(self.weights[:, w, None] * rows[:, self.joints[:, w]] for w in columns))
+        return np.asarray(np.einsum("tkb,kb->tk", blend, self.points))
+
+
+def outline(body: ShapedBody) -> BodyOutline:
+    """The outline of the vertices furthest along each of DIRECTIONS, among those that each joint moves most."""
+    weights, rest = body.body.weights, body.vertices.astype(np.float64)
+    owner = weights.argmax(axis=1)
+    picked: set[int] = set()
+    for joint in np.unique(owner):
+        own = np.flatnonzero(owner == joint)
+        picked.update(own[(rest[own] @ DIRECTIONS.T).argmax(axis=0)].tolist())
+    index = np.array(sorted(picked))
+    return _of(body, index)
+
+
+def feet(body: ShapedBody) -> BodyOutline:
+    """All vertices that ankles and toes move most: those that stand on the floor to the millimetre."""
+    return _of(body, np.flatnonzero(np.isin(body.body.weights.argmax(axis=1), [JOINT_INDEX[name] for name in FEET])))
+
+
+def _of(body: ShapedBody, index: NDArray[np.intp]) -> BodyOutline:
+    """The Outline of the vertices `index`."""
+    weights, rest = body.body.weights[index], body.vertices[index].astype(np.float64)
+    points = np.concatenate([rest, np.ones((len(index), 1))], axis=1)
+    top = np.argsort(-weights, axis=1)[:, :WEIGHTS]
+    largest = np.take_along_axis(weights, top, axis=1).astype(np.float64)
+    return BodyOutline(points, top, largest / largest.sum(axis=1, keepdims=True))
+
+
+Ground = Literal["auto", "sequence", "frame", "none"]
+Rule = Literal["sequence", "frame", "stance", "none"]
+
+#: Times per second of a motion at which the lowest point is computed.
+SAMPLES_PER_S = 30
+#: How many there are at most: with `stance` those of 200 s, beyond which feet are less exactly on the floor.
+MAX_SAMPLES: dict[Rule, int] = {"sequence": 600, "frame": 600, "stance": 6000}
+#: With `sequence` 5 % of the frames may dip below the floor, so that one bad frame does not lift all others.
+LOWEST_PERCENTILE = 5.0
+#: With `stance` no point of the body is further below the floor, metres: hands and knees may be of another length.
+DEEPEST_M = 0.03
+
+
+def ground_rule(motion: Motion, ground: Ground) -> Rule:
+    """`ground`, or for `auto`: what `motion` allows.
+
+    That is `stance` when it tells when its feet stand, `sequence` when it has a recorded place of the pelvis, else
+    `frame`.
+    """
+    if ground != "auto":
+        return ground
+    if not motion.travels:
+        return "frame"
+    return "sequence" if motion.stance is None else "stance"
+
+
+def _sample_count(motion: Motion, rule: Rule) -> int:
+    dense = int(motion.duration_s * SAMPLES_PER_S) + 1
+    return min(max(len(motion.times_s), dense), MAX_SAMPLES[rule])
+
+
+def floor_lift(
+    motion: Motion, skeleton: Skeleton, shape: BodyOutline, shift: F64, scale: float, rule: Rule, soles: BodyOutline
+) -> tuple[F64, F64]:
+    """Times (L,) in seconds, and metres (L,) by which the body is lifted at them; linear between.
+
+    `motion`: motion to put on the floor.
+    `skeleton`: joints of the body that does it.
+    `shape`: outline of that body.
+    `shift`: as in `Mover`.
+    `scale`: as in `Mover`.
+    `rule`: of `ground_rule`.
+    `soles`: outline of the body's feet.
+    """
+    if rule == "none":
+        return np.zeros(1), np.zeros(1)
+    times_s = np.linspace(0.0, motion.duration_s, _sample_count(motion, rule))
+    poses, pelvises = motion.sample_all(times_s)
+    rows = [
+        skeleton.pose(pose, pelvis * scale + shift).matrices[:, 1].copy()
+        for pose, pelvis in zip(poses, pelvises, strict=True)
+    ]
+    heights = np.stack(rows)
+    lowest = shape.lowest(heights)
+    if rule == "frame":
+        return times_s, -lowest
+    if rule == "stance" and motion.stance is not None:
+        stance = np.interp(times_s, motion.times_s, motion.stance)
+        return times_s, _lift_of_feet(soles.lowest(heights), lowest, stance)
+    return np.zeros(1), np.array([-np.percentile(lowest, LOWEST_PERCENTILE)])
+
+
+def _lift_of_feet(feet: F64, lowest: F64, stance: F64) -> F64:
+    """Metres (L,) of lift, by heights (L,) of the feet and of the `lowest` point of the body, and by `stance` (L,)."""
+    usual = -float(np.average(feet, weights=stance)) if stance.any() else -np.percentile(lowest, LOWEST_PERCENTILE)
+    lift = usual + stance * (-feet - usual)
+    return np.maximum(lift, -lowest - DEEPEST_M)
 
 
 @dataclass(frozen=True)
 class Mover:
     """A motion in its place.
 
-    `world` (4, 4): from the motion's space to the scene's. `scale`: factor on the pelvis's places, the ratio of the leg
-    lengths. `shift` (3,): added to these places, minus the pelvis of the rest pose. `lift_times_s` (L,), `lift_m` (L,):
-    metres by which the body is lifted onto the floor, linear between these times. `notes`: what was decided, for
+    `world` (4, 4): map from the motion's space to the scene's. `scale`: factor on the pelvis's places, the ratio of the
+    leg lengths. `shift` (3,): added to these places, minus the pelvis of the rest pose. `lift_times_s` (L,), `lift_m`
+    (L,): metres by which the body is lifted onto the floor, linear between these times. `notes`: what was decided, for
     people.
     """
 
@@ -48,7 +184,7 @@ class Mover:
 
 def make_mover(spec: AvatarSpec, motion: Motion, body: ShapedBody) -> Mover:
     """`motion` on the floor for `body`, at the position and heading of `spec`."""
-    leg = leg_length(body.joints)
+    leg = rest_leg_m(body.joints)
     scale = leg / motion.leg_m if motion.leg_m else 1.0
     shift = -body.joints[0]
     rule = ground_rule(motion, spec.ground)

@@ -1,29 +1,71 @@
-"""The planner: which tensor a frame gets. Rule: each avatar in view gets the pixels that its network was trained to
-paint, more where the picture shows more of it, in a shape that is ready; pure functions of what is on the screen, held
-and foreseen.
+"""The planner: how much of a frame is made, which tensor it gets, and which shapes of tensors a run gets ready.
 
-A network paints a body best at about the size that it has learnt, whatever the distance: much smaller it loses the
-face, much larger it paints ragged edges. A body that has more pixels on the picture than in its tensor loses detail, so
-it gets up to `MOST_GROWTH` times the pixels (docs/decisions/planner.md has the figures).
+**Work.** A picture is used again only when all that it depends on is the same, bit for bit.
 
-A change of shape is seen, so it costs as much as the pixels of `PATIENCE` frames. The scene is known ahead: before the
-run `foreseen_changes` finds the changes that cost least, each in the window in which both shapes are good, where nobody
-is in view or what is seen moves fast. A frame whose shape is not good enough is not waited for: it gets a good one at
-once, whatever was foreseen. Where nothing is foreseen a smaller shape is taken after `PATIENCE` frames in a row in
-which it would have done.
+**Tensor.** A network paints a body best at about the size that it has learnt, whatever the distance: much smaller it
+loses the face, much larger it paints ragged edges. So each avatar in view gets the pixels that its network was trained
+to paint. A body that has more pixels on the picture than in its tensor loses detail, so it gets up to `MOST_GROWTH`
+times the pixels (docs/decisions/planner.md has the figures).
+
+**Changes.** A change of shape is seen, so it costs as much as the pixels of `PATIENCE` frames. The scene is known
+ahead: before the run `foreseen_changes` finds the changes that cost least. Each is made while both shapes are good, and
+where nobody is in view or what is seen moves fast. A frame whose shape is not good enough gets a good one at once,
+whatever was foreseen. Where nothing is foreseen, a smaller shape is taken after `PATIENCE` frames in which it would
+have done.
+
+**Shapes.** They are chosen before the run from the frames that can be foreseen, so that every shape has its network
+ready; their number and their memory have limits. A shape serves a frame when it is within the frame's budget of pixels
+and nearly as dense as the frame's ideal shape. First come the shapes that serve most frames, until all are served; then
+those that save enough work.
+
+All functions are pure: they take what is on the screen, held and foreseen.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from enum import IntEnum
+from itertools import combinations, pairwise
+from typing import NamedTuple
 
+from trilane.arrays import Floats
 from trilane.errors import BadInputError
 from trilane.scene.crop import Rect
 from trilane.scene.tensor_layout import DenseLayout, lay_out_at, tight_shape
 from trilane.shapes import Shape, shapes_within
+
+
+class FrameWork(IntEnum):
+    """What a frame asks for. FULL: a new picture of the avatars. REUSE: the one that is there. NONE: nobody is seen."""
+
+    FULL = 0
+    REUSE = 1
+    NONE = 2
+
+
+def shown_by(arrays: Iterable[Floats]) -> bytes:
+    """What the picture of the avatars depends on, to be compared: `arrays` of always the same shapes."""
+    return b"".join(array.tobytes() for array in arrays)
+
+
+def work_of(
+    shown: bytes, of_picture: bytes | None, of_nobody: bytes | None, is_anybody_seen: Callable[[], bool]
+) -> FrameWork:
+    """What a frame that shows `shown` asks for.
+
+    `of_picture`: what the frame showed whose picture is there, None when there is none.
+    `of_nobody`: what a frame showed on which nobody was seen, None when there was none.
+    `is_anybody_seen`: looks whether an avatar is on the screen; asked only when neither frame tells.
+    """
+    if shown == of_picture:
+        return FrameWork.REUSE
+    if shown == of_nobody or not is_anybody_seen():
+        return FrameWork.NONE
+    return FrameWork.FULL
+
 
 #: Tensor pixels for one pixel of the picture, along a side: more could not be seen.
 MOST_DENSITY = 4.0
@@ -52,8 +94,8 @@ def work_of_side(side: float) -> int:
 class TensorBudget:
     """Pixels of a tensor.
 
-    `own`: of its network's own shape, for each avatar. `most`: of all together. `work`: thousandths of what these two
-    allow.
+    `own`: pixels of the network's own shape, for each avatar. `most`: most pixels of all together. `work`: thousandths
+    of what these two allow.
     """
 
     own: int
@@ -61,15 +103,15 @@ class TensorBudget:
     work: int = ALL_WORK
 
     def scaled(self, work: int) -> TensorBudget:
-        """With so many thousandths of the pixels."""
+        """The budget with `work` thousandths of the pixels."""
         return replace(self, work=work)
 
     def most_of(self, avatars: int) -> int:
-        """For so many avatars in view, however large they are."""
+        """Pixels for so many avatars in view, however large they are."""
         return self._allowed(avatars * self.own * MOST_GROWTH)
 
     def of(self, rects: Sequence[Rect], output: Shape) -> int:
-        """For the avatars at `rects` on a picture of `output`: their own pixels, or as many as the picture shows."""
+        """Pixels for the avatars at `rects` on a picture of `output`: their own, or as many as the picture shows."""
         own = len(rects) * self.own
         return min(self._allowed(max(own, area(tight_shape(rects, output)))), self.most_of(len(rects)))
 
@@ -78,9 +120,11 @@ class TensorBudget:
 
 
 @dataclass(frozen=True)
-class Held:
-    """The shape in use. `foreseen`: what was foreseen when such a shape was last taken. `smaller_for`: how many frames
-    in a row a smaller shape would have done.
+class HeldShape:
+    """The shape in use.
+
+    `foreseen`: the foreseen shape that was taken last. `smaller_for`: frames in a row for which a smaller shape would
+    have done.
     """
 
     shape: Shape
@@ -93,7 +137,7 @@ class TensorPlan:
     """The layout of one frame's tensor, its density, and what to hand to the next `plan_tensor`."""
 
     dense: DenseLayout
-    held: Held
+    held: HeldShape
 
 
 def plan_tensor(
@@ -101,14 +145,14 @@ def plan_tensor(
     output: Shape,
     shapes: Sequence[Shape],
     budget: TensorBudget,
-    before: Held | None,
+    before: HeldShape | None,
     foreseen: Shape | None = None,
 ) -> TensorPlan:
     """The tensor for the avatars at `rects`, at least one.
 
     `output`: (height, width) of the picture in pixels.
-    `shapes`: that are ready. Where all of them are larger than the budget allows, any may be taken.
-    `before`: of the frame before, None for the first.
+    `shapes`: shapes that are ready. Where all of them are larger than the budget allows, any may be taken.
+    `before`: shape of the frame before, None for the first.
     `foreseen`: the shape of this frame by `foreseen_changes`; None where nothing was foreseen.
     Raises BadInputError when no shape has room for all avatars.
     """
@@ -135,37 +179,36 @@ def _fits(
     return fits, [shape for shape, fit in fits.items() if fit.density >= enough]
 
 
-def _held(good: Sequence[Shape], before: Held | None, foreseen: Shape | None) -> Held:
+def _held(good: Sequence[Shape], before: HeldShape | None, foreseen: Shape | None) -> HeldShape:
     """What was foreseen, once and as soon as it is good; then what is held while it is good, else the smallest."""
     last = before.foreseen if before is not None else None
     is_kept = before is not None and before.shape in good
     if foreseen is not None and foreseen in good and (foreseen != last or not is_kept):
-        return Held(foreseen, foreseen)
+        return HeldShape(foreseen, foreseen)
     best = min(good, key=lambda shape: (area(shape), shape))
     if before is None or not is_kept:
-        return Held(best, last)
+        return HeldShape(best, last)
     if foreseen is not None or area(best) >= area(before.shape):
-        return Held(before.shape, last)
+        return HeldShape(before.shape, last)
     waited = before.smaller_for + 1
-    return Held(best, last) if waited > PATIENCE else Held(before.shape, last, waited)
+    return HeldShape(best, last) if waited > PATIENCE else HeldShape(before.shape, last, waited)
 
 
 @dataclass(frozen=True)
-class Look:
-    """A frame that was looked at before the run. `rects`: of the avatars that are seen, by their numbers."""
+class LookAhead:
+    """A frame that was looked at before the run. `rects`: rectangles of the visible avatars, by their numbers."""
 
     frame: int
     rects: Mapping[int, Rect]
 
 
 def foreseen_changes(
-    looks: Sequence[Look], output: Shape, shapes: Sequence[Shape], budget: TensorBudget
+    looks: Sequence[LookAhead], output: Shape, shapes: Sequence[Shape], budget: TensorBudget
 ) -> tuple[tuple[int, Shape], ...]:
-    """From which frame on there is which shape: that of the first of `looks`, at least one, and every change.
+    """The shape from the first of `looks` on, at least one, and every change of shape with its frame.
 
-    Of all ways through the shapes that are good it is the one that costs least, in pixels: those of all frames, and
-    what the changes cost. A change from a shape that is not good at a look is made in the first frame behind the look
-    before.
+    The way through the good shapes is the cheapest one in pixels: those of all frames, and the cost of the changes. A
+    shape that is not good at a look is left in the first frame behind the look before.
     """
     order = sorted(shapes, key=lambda shape: (area(shape), shape))
     costs, origins, needed = dict.fromkeys(order, 0.0), [], []
@@ -191,7 +234,7 @@ def foreseen_changes(
 def _cheapest_way(
     shape: Shape, costs: Mapping[Shape, float], fits: Mapping[Shape, DenseLayout], price: float
 ) -> tuple[float, Shape]:
-    """To come to `shape`: its cost, and from which of the shapes in `costs`. `price`: of a change of shape alone."""
+    """Cost of the cheapest way to `shape`, and the shape of `costs` where it begins. `price`: cost of a change."""
 
     def change(origin: Shape) -> float:
         if origin == shape:
@@ -203,7 +246,7 @@ def _cheapest_way(
     return min(((cost + change(origin), origin) for origin, cost in costs.items()), key=lambda way: way[0])
 
 
-def _speed(before: Look, now: Look) -> float:
+def _speed(before: LookAhead, now: LookAhead) -> float:
     """How far the sides of the avatars' rectangles move in a frame, at most, as a share of the picture's sides."""
     frames = max(now.frame - before.frame, 1)
     both = now.rects.keys() & before.rects.keys()
@@ -225,3 +268,96 @@ def ideal_shape(rects: Sequence[Rect], output: Shape, budget: TensorBudget) -> S
 def area(shape: Shape) -> int:
     """Pixels of a tensor."""
     return shape[0] * shape[1]
+
+
+MOST_SHAPES = 10
+#: Share of the pixels of all frames that a further shape has to save.
+LEAST_SAVING = 0.02
+
+
+class Demand(NamedTuple):
+    """What a frame asks for: its ideal shape (height, width), and the pixels that its tensor may have."""
+
+    ideal: Shape
+    pixels: int
+
+
+@dataclass(frozen=True)
+class ShapeSet:
+    """`shapes` (height, width), the smallest first. `memory_bytes`: what their networks take.
+
+    `unserved`: frames that none of them serves, because there may be no more; they are drawn less densely.
+    """
+
+    shapes: tuple[Shape, ...]
+    memory_bytes: int
+    unserved: int
+
+
+def choose_shapes(
+    demands: Iterable[Demand],
+    bytes_per_pixel: float,
+    memory_bytes: int,
+    most_shapes: int = MOST_SHAPES,
+    *,
+    optional: bool = False,
+) -> ShapeSet:
+    """The shapes to prepare: at least one, whatever its memory, unless they are `optional`.
+
+    `demands`: demands of the foreseen frames, at least one.
+    `bytes_per_pixel`: memory of a network that is ready to run, for each pixel of its tensor.
+    `memory_bytes`: what all of them may take.
+    `most_shapes`: how many there may be.
+    """
+    frames = Counter(demands)
+    chosen: list[Shape] = []
+    while len(chosen) < most_shapes:
+        shape = _next(frames, chosen)
+        if shape is None or (
+            (chosen or optional) and bytes_per_pixel * sum(map(area, (*chosen, shape))) > memory_bytes
+        ):
+            break
+        chosen.append(shape)
+    unserved = sum(count for demand, count in frames.items() if not any(serves(shape, demand) for shape in chosen))
+    memory = math.ceil(bytes_per_pixel * sum(map(area, chosen)))
+    return ShapeSet(tuple(sorted(chosen, key=lambda shape: (area(shape), shape))), memory, unserved)
+
+
+def joined(first: ShapeSet, second: ShapeSet) -> ShapeSet:
+    """Both sets. `unserved` is the first one's, unless it has no shapes. A shape of both counts twice as memory."""
+    shapes = sorted({*first.shapes, *second.shapes}, key=lambda shape: (area(shape), shape))
+    unserved = first.unserved if first.shapes else second.unserved
+    return ShapeSet(tuple(shapes), first.memory_bytes + second.memory_bytes, unserved)
+
+
+def larger_shapes(shapes: Sequence[Shape], most_pixels: int) -> list[Shape]:
+    """New shapes that hold two of `shapes` each, with at most `most_pixels`."""
+    both = {(max(a[0], b[0]), max(a[1], b[1])) for a, b in combinations(shapes, 2)}
+    return sorted((shape for shape in both - set(shapes) if area(shape) <= most_pixels), key=area)
+
+
+def serves(shape: Shape, demand: Demand) -> bool:
+    """Whether the frame of `demand` can be drawn well in a tensor of `shape`."""
+    (height, width), (ideal_height, ideal_width) = shape, demand.ideal
+    large_enough = height >= AS_GOOD * ideal_height and width >= AS_GOOD * ideal_width
+    return large_enough and area(shape) <= demand.pixels
+
+
+def _next(frames: Mapping[Demand, int], chosen: Sequence[Shape]) -> Shape | None:
+    """The shape to add, None when a further one is not worth it."""
+    candidates = sorted({demand.ideal for demand in frames} - set(chosen))
+    if not candidates:
+        return None
+    unserved = {d: count for d, count in frames.items() if not any(serves(shape, d) for shape in chosen)}
+    if unserved:
+        return max(candidates, key=lambda one: (sum(c for d, c in unserved.items() if serves(one, d)), -area(one)))
+    work = _work(frames, chosen)
+    best = min(candidates, key=lambda shape: _work(frames, [*chosen, shape]))
+    return best if work - _work(frames, [*chosen, best]) >= LEAST_SAVING * work else None
+
+
+def _work(frames: Mapping[Demand, int], chosen: Sequence[Shape]) -> int:
+    """Pixels of all frames, each in the smallest shape that serves it."""
+    return sum(
+        count * min(area(shape) for shape in chosen if serves(shape, demand)) for demand, count in frames.items()
+    )

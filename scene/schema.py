@@ -1,19 +1,35 @@
-"""The schema of a scene file.
+"""Scene files (TOML): their schema, how they are loaded, and one sentence for people about the first defect.
 
-Rule: only types and ranges are checked here; the loaders check whether a named file exists and what is in it.
+The schema checks types and ranges; the loaders check whether a named file exists and what is in it. The values of a
+file are never changed, but for paths, which are made absolute.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal, Self
+import tomllib
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    Strict,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
+from pydantic.fields import FieldInfo
 
 from trilane.body.joints import JOINT_INDEX
-from trilane.near_miss import did_you_mean
+from trilane.errors import BadInputError, did_you_mean
+from trilane.files import read_text
 from trilane.shapes import BUCKET_STEP, MAX_SIDE, checked_size
-from trilane.unexpected_value import UnexpectedValue
+from trilane.unexpected_value import UnexpectedValue, unexpected_in
 
 MAX_DEPTH_RATIO = 1e6  # of far to near clip plane; beyond it a depth buffer of 24 bits is too coarse
 AUTO = "auto"  # size of a tensor that is planned
@@ -28,13 +44,13 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Metres = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan=False)]
 
 
-class Model(BaseModel):
+class StrictModel(BaseModel):
     """Base of all tables: unknown keys are errors, and values never change after loading."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class Table(Model):
+class Table(StrictModel):
     """A table of a scene file: a value has the type of its key, and nothing else is read as one.
 
     A number that need not be whole may be written as a whole one, though; and tuples are lists there.
@@ -57,7 +73,7 @@ class AvatarSpec(Table):
     `bundle`: `default`, `hiker` or a folder. `motion`: `builtin:NAME` or a file. `position`: metres. `up_axis`,
     `units`: of the motion file. `joint_map`: joint of the body -> name of the file's, or an empty text for none.
     `start_s`, `end_s`: of the motion's own time, what is played of it; `speed`: how many times as fast; `loop`: what
-    follows, by default what is usual for the motion. `ground`: how the motion is put on the floor (`floor.py`).
+    follows, by default what is usual for the motion. `ground`: how the motion is put on the floor (`mover.py`).
     """
 
     name: str | None = Field(default=None, min_length=1, max_length=80, pattern=NAME)
@@ -94,8 +110,8 @@ class CameraSpec(Table):
     """The camera.
 
     `source`: `builtin:NAME`, a file or a folder. `fov_y_deg`: of the picture's height; None for that of the file, or
-    the usual one of its format. `up_axis`: of the file's world. `metres_per_unit`: of its lengths; None for what it
-    says or is likely. `rate_hz`: of a file without times, or with numbers of frames. `near_m`, `far_m`: clip planes.
+    the usual one of its format. `up_axis`: axis that is up in the file's world. `metres_per_unit`: of its lengths; None
+    for what it says or is likely. `rate_hz`: frames a second of a file without times. `near_m`, `far_m`: clip planes.
     `place`: whether a recorded camera is placed in the scene (`auto`) or stays where it was recorded (`none`).
     """
 
@@ -152,14 +168,14 @@ class Scene(Table):
     """A scene.
 
     `background`: `room`, or a video, a folder of images or a picture. `hud`: whether frame, rate and age are written on
-    the picture. `planes`: detected ones, shown over the background. `texture_filter`: of the neural texture.
+    the picture. `planes`: detected ones, shown over the background. `texture_filter`: filter of the neural texture.
 
     What may be left out: `plan` is `planned` (what the picture does not show is not modelled), `fixed` (everything is,
     in every frame) or `full` (to compare with: float64 body, supersampled raster, FP32 network; nothing runs it in real
     time). `size`: `auto` plans the tensor, up to `most_side`² pixels; else it is fixed to that size. `error_budget_px`:
     how far a vertex may be off on the picture. `error_budget_db`: how much worse avatars may be painted, in dB of PSNR,
     than in tensors of the size that their network was trained for; None: no worse, unless frames would be late.
-    `memory_mb`: of the networks that are made ready for the planned shapes.
+    `memory_mb`: most memory of the networks that are made ready for the planned shapes.
     """
 
     name: str = Field(default="scene", min_length=1, max_length=80, pattern=NAME)
@@ -206,3 +222,145 @@ class Scene(Table):
     def plans_tensor(self) -> bool:
         """Whether the tensor's shapes follow from the scene."""
         return self.size == AUTO
+
+
+INPUT_SHOULD = "Input should be "
+ENDING = ".toml"
+LONGEST_FOUND = 80
+#: Type of a pydantic error -> what was expected, where pydantic's own text is not fit for people.
+EXPECTED = {
+    "too_short": "at least {min_length} of them",
+    "too_long": "at most {max_length} of them",
+    "model_type": "a table",
+    "tuple_type": "a list",
+    "string_type": "text in quotes",
+    "float_type": "a number, without quotes",
+    "bool_type": "true or false, without quotes",
+    "int_type": "a whole number, without quotes or decimal point",
+    "string_too_short": "at least one character",
+    "string_pattern_mismatch": "letters, digits, spaces, dots, hyphens and underscores",
+}
+#: Types of pydantic errors of numbers out of range, or between two steps.
+IN_STEPS = ("multiple_of", "greater_than_equal", "less_than_equal")
+#: Key of the scene -> why it cannot be what it was, where the range alone does not tell.
+REASONS = {"error_budget_px": "numbers are rounded, so nothing is drawn without an error"}
+BUILT_IN_PREFIX = "builtin:"
+BUILT_IN = ("room", "default", "hiker")  # a background, avatars
+
+
+def bad_input(where: str | Path, error: ValidationError) -> BadInputError:
+    """The first defect that `error` lists, as a BadInputError about `where` with the key."""
+    first = error.errors()[0]
+    key = ".".join(str(part) for part in first["loc"])
+    place = f"{where}: {key}" if key else str(where)
+    if first["type"] == "extra_forbidden":
+        remedy = did_you_mean(str(first["loc"][-1]), _keys_beside(first["loc"])) or "correct its spelling or remove it"
+        return BadInputError(place, "an unknown key", "a key of the scene schema", remedy)
+    if first["type"] == "missing":
+        return BadInputError(place, "nothing", "a value", "add the key")
+    unexpected = unexpected_in(first)
+    if unexpected is not None:
+        return BadInputError.at(place, unexpected)
+    value = repr(first["input"])
+    short = value if len(value) <= LONGEST_FOUND else value[:LONGEST_FOUND] + "..."
+    expected = _steps(first) or EXPECTED.get(first["type"], "").format(**first.get("ctx", {}))
+    return BadInputError(place, short, expected or str(first["msg"]).removeprefix(INPUT_SHOULD), _remedy(first))
+
+
+def _steps(first: Mapping[str, Any]) -> str:
+    """All that a number must be that has to be a multiple of another; empty for other errors."""
+    if first["type"] not in IN_STEPS or not isinstance(first["loc"][-1], str):
+        return ""
+    limits = ("multiple_of", "ge", "le")
+    known = {key: getattr(one, key) for one in _field(first["loc"]).metadata for key in limits if hasattr(one, key)}
+    return "a multiple of {multiple_of} from {ge} to {le}".format(**known) if len(known) == len(limits) else ""
+
+
+def _remedy(first: Mapping[str, Any]) -> str:
+    """How to mend a value, by one of the `errors()` of a scene; empty when the expectation says all."""
+    if first["type"] == "literal_error":
+        return did_you_mean(str(first["input"]), _choices(first["loc"]))
+    return REASONS.get(".".join(map(str, first["loc"])), "") if first["type"] == "greater_than" else ""
+
+
+def _keys_beside(loc: tuple[int | str, ...]) -> list[str]:
+    """The keys of the table in which the key at `loc` stands."""
+    return list(_table_of(loc).model_fields)
+
+
+def _choices(loc: tuple[int | str, ...]) -> list[str]:
+    """The words that the key at `loc` may be; of a key that may be nothing else."""
+    return [str(word) for word in get_args(_field(loc).annotation)]
+
+
+def _field(loc: tuple[int | str, ...]) -> FieldInfo:
+    """The schema's field of the key at `loc`."""
+    return _table_of(loc).model_fields[str(loc[-1])]
+
+
+def _table_of(loc: tuple[int | str, ...]) -> type[BaseModel]:
+    """The schema of the table in which the key at `loc` stands."""
+    table: type[BaseModel] = Scene
+    for key in loc[:-1]:
+        if isinstance(key, str):
+            kind = table.model_fields[key].annotation
+            kinds = (each for each in (kind, *get_args(kind)) if isinstance(each, type))
+            table = next(each for each in kinds if issubclass(each, BaseModel))
+    return table
+
+
+def scene_from(where: str | Path, values: Mapping[str, Any]) -> Scene:
+    """`values` as a Scene. Raises BadInputError that names `where` and the key."""
+    try:
+        return Scene.model_validate(values)
+    except ValidationError as error:
+        raise bad_input(where, error) from None
+
+
+def scene_names() -> list[str]:
+    """Names of the scenes that come with the package."""
+    folder = files("trilane.scene.scenes")
+    return sorted(item.name.removesuffix(ENDING) for item in folder.iterdir() if item.name.endswith(ENDING))
+
+
+def find_scene(name: str) -> Path:
+    """The file of a scene: a path, or the name of one that comes with the package. Raises BadInputError."""
+    if name in scene_names():
+        return Path(str(files("trilane.scene.scenes") / f"{name}{ENDING}"))
+    path = Path(name)
+    if path.suffix != ENDING:
+        expected = f"a {ENDING} file or one of {', '.join(scene_names())}"
+        raise BadInputError("scene", repr(name), expected, did_you_mean(name, scene_names()))
+    return path
+
+
+def load_scene(path: Path) -> dict[str, Any]:
+    """The values of a scene file, checked against the schema; paths in it are made absolute from its folder.
+
+    Raises BadInputError naming the line or the key.
+    """
+    try:
+        values = tomllib.loads(read_text(path, "a scene file (TOML)"))
+    except (ValueError, RecursionError) as error:  # also of numbers and lists that are too long
+        raise BadInputError(path, f"no valid TOML ({error})", "a scene file (TOML)") from None
+    values.setdefault("name", path.stem)
+    scene = scene_from(path, values)
+    base = path.absolute().parent
+    values["background"] = located(scene.background, base)
+    values["camera"] = {**values.get("camera", {}), "source": located(scene.camera.source, base)}
+    avatars = values.get("avatars", [{}])
+    values["avatars"] = [
+        {**raw, "motion": located(spec.motion, base), "bundle": located(spec.bundle, base)}
+        for raw, spec in zip(avatars, scene.avatars, strict=True)
+    ]
+    return values
+
+
+def located(source: str, base: Path) -> str:
+    """`source` unchanged if it names something built in, else as a path that starts at `base`.
+
+    Raises BadInputError for an empty text.
+    """
+    if not source:
+        raise BadInputError("name of a file", "nothing", "a path, or the name of something built in")
+    return source if source in BUILT_IN or source.startswith(BUILT_IN_PREFIX) else str(base / source)

@@ -1,22 +1,30 @@
 """A scene with everything in its place: the motions on the floor, and a camera that films them.
 
-Rule: this is the only way from a scene and its bodies to what is sampled per frame, so that what the command line
-reports of a scene is what the pose stage does.
+`stage_scene` is the only way from a scene and its bodies to what is sampled per frame, so the pose stage does what the
+command line reports. Other processes get a staged scene as plain arrays. That round trip is exact: every mover and the
+camera sample to the same bits afterwards; notes do not travel. A key is `mover.N.FIELD` or `camera.FIELD`; a field that
+is None has no key.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from trilane.body.body import ShapedBody
-from trilane.scene.camera.load import load_camera
-from trilane.scene.camera_placement import place_camera
+from trilane.scene.camera.files import load_camera
+from trilane.scene.camera.path import CameraPath, Optics
+from trilane.scene.camera_placement import PlacedCamera, place_camera
 from trilane.scene.footage import Footage, filmed
-from trilane.scene.motion.load import load_motion
+from trilane.scene.lens import Known, Lens
+from trilane.scene.motion.files import load_motion
+from trilane.scene.motion.motion import Motion, Wrap
 from trilane.scene.mover import Mover, make_mover
-from trilane.scene.placed_camera import PlacedCamera
 from trilane.scene.schema import Scene
 
 
@@ -45,3 +53,120 @@ def stage_scene(scene: Scene, bodies: Sequence[ShapedBody], base: Path, footage:
     notes += [f"camera: {note}" for note in (*path.notes, *((path.course,) if path.recorded else ()), *camera.notes)]
     notes += [f"background: {note}" for note in seen]
     return Staged(movers, camera, tuple(notes))
+
+
+Arrays = dict[str, NDArray[Any]]
+
+WRAPS, KNOWN = tuple(Wrap), tuple(Known)
+LENS = ("width_px", "height_px", "fx", "fy", "cx", "cy")
+
+
+def staged_to_arrays(staged: Staged) -> Arrays:
+    """The arrays of `staged`, without copies where it has arrays already. They hold no Python objects."""
+    arrays: Arrays = {"movers": np.array(len(staged.movers))}
+    for index, mover in enumerate(staged.movers):
+        arrays |= {f"mover.{index}.{key}": value for key, value in _mover_arrays(mover).items()}
+    arrays |= {f"camera.{key}": value for key, value in _camera_arrays(staged.camera).items()}
+    return arrays
+
+
+def staged_from_arrays(arrays: Mapping[str, NDArray[Any]]) -> Staged:
+    """The scene that `staged_to_arrays` was called with, without its notes; keeps `arrays`, which may be read-only.
+
+    Raises KeyError when one is missing.
+    """
+    movers = tuple(_mover(_below(arrays, f"mover.{index}.")) for index in range(int(arrays["movers"])))
+    return Staged(movers, _camera(_below(arrays, "camera.")), ())
+
+
+def _below(arrays: Mapping[str, NDArray[Any]], prefix: str) -> Arrays:
+    return {key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)}
+
+
+def _mover_arrays(mover: Mover) -> Arrays:
+    motion = mover.motion
+    optional = {"betas": motion.betas, "leg_m": motion.leg_m}
+    return {
+        "times_s": motion.times_s,
+        "poses": motion.poses,
+        "quats": motion.quats,
+        "translation": motion.translation,
+        "wrap": np.array(WRAPS.index(motion.wrap)),
+        "travels": np.array(motion.travels),
+        "world": mover.world,
+        "scale": np.array(mover.scale),
+        "shift": mover.shift,
+        "lift_times_s": mover.lift_times_s,
+        "lift_m": mover.lift_m,
+        **{key: np.asarray(value) for key, value in optional.items() if value is not None},
+    }
+
+
+def _mover(arrays: Arrays) -> Mover:
+    leg_m = arrays.get("leg_m")
+    motion = Motion(
+        arrays["times_s"],
+        arrays["poses"],
+        arrays["translation"],
+        arrays.get("betas"),
+        (),
+        WRAPS[int(arrays["wrap"])],
+        None if leg_m is None else float(leg_m),
+        bool(arrays["travels"]),
+    )
+    vars(motion)["quats"] = arrays["quats"]  # the cached property, which otherwise is computed at the first sample
+    return Mover(
+        motion, arrays["world"], float(arrays["scale"]), arrays["shift"], arrays["lift_times_s"], arrays["lift_m"], ()
+    )
+
+
+def _camera_arrays(camera: PlacedCamera) -> Arrays:
+    path = camera.path
+    return {
+        "times_s": path.times_s,
+        "quats": path.quats,
+        "places": path.places,
+        "lenses": np.array([[getattr(lens, key) for key in LENS] for lens in path.optics.lenses]),
+        "known": np.array([KNOWN.index(lens.known) for lens in path.optics.lenses]),
+        "clip_m": np.array([path.optics.near_m, path.optics.far_m]),
+        "filmed": np.array(path.optics.filmed, np.int64).reshape(-1, 2),
+        "turned": np.array(path.optics.turned, np.int64),
+        "pictures": np.array(path.pictures, np.str_),
+        "quarter": np.array(path.quarter),
+        "is_held": np.array(path.is_held),
+        "repeat_s": np.array(path.repeat_s),
+        **({} if path.began_s is None else {"began_s": np.array(path.began_s)}),
+        "wrap": np.array(WRAPS.index(path.wrap)),
+        "recorded": np.array(path.recorded),
+        "turn": camera.turn,
+        "shift": camera.shift,
+        "mount": camera.mount,
+    }
+
+
+def _camera(arrays: Arrays) -> PlacedCamera:
+    path = CameraPath(
+        arrays["times_s"],
+        arrays["quats"],
+        arrays["places"],
+        _optics(arrays),
+        (),
+        WRAPS[int(arrays["wrap"])],
+        bool(arrays["recorded"]),
+        pictures=tuple(arrays["pictures"].tolist()),
+        quarter=int(arrays["quarter"]),
+        is_held=bool(arrays["is_held"]),
+        repeat_s=float(arrays["repeat_s"]),
+        began_s=float(arrays["began_s"]) if "began_s" in arrays else None,
+    )
+    return PlacedCamera(path, arrays["turn"], arrays["shift"], arrays["mount"], ())
+
+
+def _optics(arrays: Arrays) -> Optics:
+    near_m, far_m = (float(value) for value in arrays["clip_m"])
+    rows = zip(arrays["lenses"], arrays["known"], strict=True)
+    lenses = tuple(
+        Lens(**dict(zip(LENS, map(float, row), strict=True)), known=KNOWN[int(known)]) for row, known in rows
+    )
+    filmed = tuple((int(height), int(width)) for height, width in arrays["filmed"])
+    return Optics(lenses, near_m, far_m, filmed, tuple(int(quarters) for quarters in arrays["turned"]))

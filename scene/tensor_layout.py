@@ -133,7 +133,7 @@ def _whole_steps(side: int) -> int:
 def _arrangements(
     sizes: Sequence[tuple[float, float]], buckets: Sequence[Shape], margin: int
 ) -> Iterator[_Arrangement]:
-    """In every bucket, the avatars, tallest first, in one row, in two rows, and so on up to a row for each."""
+    """Every arrangement of the avatars, tallest first, in each bucket: one row, two rows, up to a row for each."""
     for rows in _rows(sizes):
         for shape in buckets:
             yield _Arrangement(shape, rows, _scale(sizes, shape, rows, margin))

@@ -50,7 +50,7 @@ make_venv() {
 # Exit code 0: a context can be made; 3: it cannot; else the packages themselves do not work.
 try_egl() { .venv/bin/python -c 'import sys
 from trilane.errors import MissingPartError
-from trilane.stages.gpu.opengl_context import open_context
+from trilane.stages.gpu.opengl import open_context
 try:
     open_context()
 except MissingPartError:

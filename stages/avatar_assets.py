@@ -21,8 +21,7 @@ from trilane.avatars.network_checks import check_network
 from trilane.body.body import Body, ShapedBody
 from trilane.errors import BadInputError
 from trilane.pipeline.shared_assets import Assets
-from trilane.scene.staged_arrays import staged_from_arrays, staged_to_arrays
-from trilane.scene.staging import Staged
+from trilane.scene.staging import Staged, staged_from_arrays, staged_to_arrays
 from trilane.stages.config import RunConfig
 from trilane.stages.gpu.packed_pass import Quantisation
 
@@ -66,7 +65,7 @@ def _encoding(avatar: AvatarData) -> tuple[Any, ...]:
 
 
 def pack_assets(avatars: Sequence[AvatarData], staged: Staged) -> dict[str, NDArray[Any]]:
-    """The arrays of a run: of every distinct avatar in order, of the network, and of the scene."""
+    """The arrays of a run: those of each distinct avatar in order, the network's and the scene's."""
     arrays: dict[str, NDArray[Any]] = {}
     for number, avatar in enumerate(avatars):
         body, scale = avatar.shaped.body, avatar.bundle.manifest.network.input

@@ -1,24 +1,36 @@
-"""The avatar's pipeline as `trilane.pipeline` runs it: its stages, what passes between them, and their data.
+"""The avatar's pipeline as `trilane.pipeline` runs it: its stages, what passes between them, and its rehearsal.
 
-Rule: everything that the run must know of the avatar is said here, as data; no other module of the run knows an avatar.
+Everything that the run must know of the avatar is said here, as data; no other module of the run knows an avatar. A
+rehearsal runs the stages one after the other, and tells what each needs of its unit before they share the cores.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
+from trilane.hw_profiles.host import settings_of
 from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage
+from trilane.pipeline.rehearsal import Rehearsed, rehearse
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run import run_pipeline
 from trilane.pipeline.shared_assets import Assets
+from trilane.pipeline.trial import SLICE, Group, Round, try_in_turns
+from trilane.pipeline.unit_starter import UnitStarter
+from trilane.scheduler.places import Core, Place, Placement
+from trilane.shapes import Shape
+from trilane.stages import FACTORIES, PRELOAD
 from trilane.stages.avatar_assets import network_of
-from trilane.stages.config import RunConfig
-from trilane.stages.dsp.parts import crossing_bytes
-from trilane.stages.factories import FACTORIES, PRELOAD
-from trilane.stages.packets import pose_dtype, posed_vertices_bytes
-from trilane.units import AFTER_INFER, BEFORE_INFER, BYPASS, LATENCY_TO
+from trilane.stages.config import RunConfig, pose_dtype, posed_vertices_bytes
+from trilane.stages.configure import Checked
+from trilane.stages.dsp.infer import crossing_bytes
+from trilane.units import AFTER_INFER, BEFORE_INFER, BYPASS, LATENCY_TO, UNITS
 
 MAX_CHANNELS = 16  # of a tensor: what the GPU packs in one pass
 
@@ -74,3 +86,102 @@ def run_avatar(
     if len(config.works) > 1 and not config.pace_ns:
         options |= {"works": config.works, "follow": config.infer_names}
     return run_pipeline(pipeline, frames or config.scene.frames, fps=config.scene.fps, assets=assets, **options)
+
+
+FRAMES = 12  # of the scene, evenly spread, the first two of which warm up
+
+
+def thread_counts(cores: int, rule: Placement) -> dict[str, list[int]]:
+    """The numbers of threads, beside 1, that each unit is measured with: those that a placement may give it.
+
+    Each, what the `rule` for any run and the options give it. The network also up to four, half of the cores, all, and
+    all but those of the others.
+    """
+    counts = {unit: {place.threads} for unit, place in rule.items()}
+    counts["dsp"] |= {*range(2, min(cores, 4) + 1), cores // 2, cores - 2, cores - 1, cores}
+    return {unit: sorted(count for count in of if count > 1) for unit, of in counts.items()}
+
+
+def measured_times(checked: Checked, cores: Sequence[Core], rule: Placement, starter: UnitStarter) -> Rehearsed:
+    """What each unit needs for a frame, measured now.
+
+    `checked`: what is to be run. `cores`: there are. `rule`: whose numbers of threads are measured too. `starter`: a
+    fork server. Raises TrilaneError when a unit cannot start or a stage fails, KeyboardInterrupt when interrupted.
+    """
+    fastest = [core.number for core in sorted(cores, key=lambda core: (-core.permille, core.number))]
+    one = {unit: Place((fastest[0],), 1) for unit in UNITS}
+    variants = [
+        {**one, unit: Place(tuple(sorted(fastest[:count])), count)}
+        for unit, counts in thread_counts(len(cores), rule).items()
+        for count in counts
+    ]
+    with _thrown_away(checked) as config:
+        first, *others = (
+            avatar_pipeline(config.model_copy(update={"units": _spinning(placement, len(cores))}), checked.assets)
+            for placement in (one, *variants)
+        )
+        frames = config.scene.frames
+        spread = [number * frames // FRAMES for number in range(FRAMES)]
+        return rehearse(first, others, spread, checked.assets, starter)
+
+
+def tried(
+    checked: Checked,
+    placements: Sequence[Placement],
+    rounds: int,
+    starter: UnitStarter,
+    limit_s: float = math.inf,
+    least: int = 1,
+) -> list[Round]:
+    """Frame times of `placements`, in turns.
+
+    `rounds`: how many, on frames from all over the scene; after `limit_s` seconds no further one than the `least`.
+    `checked`, `starter`, and what is raised: as `measured_times`.
+    """
+    groups: dict[tuple[tuple[int, bool], ...], list[int]] = {}
+    for number, placement in enumerate(placements):
+        settings = settings_of(placement).values()
+        kind = tuple((each.threads, each.spin and each.threads > 1) for each in settings)
+        groups.setdefault(kind, []).append(number)
+    windows = [turn * max(checked.config.scene.frames - SLICE, 0) // rounds for turn in range(rounds)]
+    end = time.monotonic() + limit_s
+    with _thrown_away(checked) as config:
+        of_kind = [
+            Group(
+                avatar_pipeline(config.model_copy(update={"units": settings_of(placements[own[0]])}), checked.assets),
+                [{unit: place.cores for unit, place in placements[number].items()} for number in own],
+            )
+            for own in groups.values()
+        ]
+        found = try_in_turns(
+            of_kind, windows, checked.assets, starter, lambda done: len(done) >= least and time.monotonic() > end
+        )
+    order = [number for own in groups.values() for number in own]
+    places = sorted(range(len(order)), key=order.__getitem__)
+    return [Round(tuple(each.frame_ns[place] for place in places), each.others) for each in found]
+
+
+@contextmanager
+def _thrown_away(checked: Checked) -> Iterator[RunConfig]:
+    """The configuration with one of its tensor shapes, prepared soonest, and a folder that is then removed.
+
+    No shape of the same size has more than 25/16 of its area.
+    """
+    with tempfile.TemporaryDirectory(prefix="trilane-rehearsal-") as folder:
+        height, width = one_shape(checked.config)
+        scene = checked.config.scene.model_copy(update={"size": f"{height}x{width}"})
+        yield checked.config.model_copy(update={"out_dir": Path(folder), "scene": scene, "shapes": ()})
+
+
+def _spinning(placement: Placement, cores: int) -> dict[str, Any]:
+    """Settings in which a unit's threads spin if there are cores for it alone, as they then will in the run."""
+    return {
+        unit: settings.model_copy(update={"spin": 1 < settings.threads <= cores - len(UNITS) + 1})
+        for unit, settings in settings_of(placement).items()
+    }
+
+
+def one_shape(config: RunConfig) -> Shape:
+    """The tensor shape nearest to a square, of those that are not stepped down to when frames would be late."""
+    large = [shape for shape in config.buckets if 2 * shape[0] * shape[1] > config.max_tensor_pixels]
+    return min(large, key=lambda shape: (abs(shape[0] - shape[1]), shape))

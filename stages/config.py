@@ -1,46 +1,117 @@
-"""The checked configuration of a run of the avatar. Rule: plain data; the parent has looked at every path in it."""
+"""The configuration of a run of the avatar, checked by the parent, and what the avatar's packets hold.
+
+A `RunConfig` is plain data; the parent has looked at every path in it. Axis orders and signs of packets are those of
+docs/conventions.md.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 from pydantic import Field, field_validator
 
+from trilane.arrays import F32, U8
+from trilane.body.joints import JOINTS, POSE_FEATURES
 from trilane.pipeline.description import UnitSettings
 from trilane.scene.planner import ALL_WORK, TensorBudget
-from trilane.scene.schema import Model, Scene
+from trilane.scene.schema import Scene, StrictModel
 from trilane.shapes import Shape, shape_buckets
 from trilane.transport.live_window import LiveWindow
+from trilane.transport.packets import header_dtype
 from trilane.unexpected_value import UnexpectedValue
 from trilane.units import UnitName
 
+#: One avatar of a frame.
+#: `joints`: skinning matrices, metres, world space, row-major 3x4: x_world = sum_k w_k (joints_k @ [x_rest, 1]).
+#: `pose_feature`: (R - I) row-major of joints 1..54; multiplies the body's `posedirs`.
+#: `rect`: crop rectangle x0, y0, x1, y1 in normalised device coordinates, y up: the mesh's rectangle clipped to
+#: [-1, 1], grown to the tensor's aspect so that tensor pixels are square; what is grown may hang over the screen.
+#: `tensor_rect`: top, left, height, width in tensor pixels that the crop rectangle fills.
+#: `visible`: 0 when nothing of the avatar is on screen; the other fields are then unspecified.
+AVATAR_DTYPE = np.dtype(
+    [
+        ("avatar", "<i4"),
+        ("visible", "<i4"),
+        ("rect", "<f4", (4,)),
+        ("tensor_rect", "<i4", (4,)),
+        ("joints", "<f4", (JOINTS, 3, 4)),
+        ("pose_feature", "<f4", (POSE_FEATURES,)),
+    ],
+    align=True,
+)
 
-class NetworkCut(Model):
+
+def pose_dtype(avatars: int) -> np.dtype[Any]:
+    """Layout of the header of a packet with `avatars` avatars.
+
+    `work`: a number of `FrameWork`. `picture`: number of the frame whose picture of the avatars is shown,
+    -1 when none is. `repeats`: of a composited frame, 0 when it was drawn, else 1 + the number of the frame that was
+    drawn with the same bytes. `media_time_s`: time in motion and camera. `view`: world to camera. `projection`: OpenGL
+    clip matrix; both row-major for column vectors. `tensor_shape`: height, width of the tensor (the shape bucket) of
+    this frame.
+    """
+    return header_dtype(
+        [
+            ("avatar_count", "<i4"),
+            ("work", "<i4"),
+            ("picture", "<i8"),
+            ("repeats", "<i8"),
+            ("media_time_s", "<f8"),
+            ("tensor_shape", "<i4", (2,)),
+            ("view", "<f4", (4, 4)),
+            ("projection", "<f4", (4, 4)),
+            ("avatars", AVATAR_DTYPE, (avatars,)),
+        ]
+    )
+
+
+def posed_vertices(payload: U8, counts: Sequence[int]) -> list[F32]:
+    """Views (V,3) float32 into the payload of the pose edge, one for each avatar of `counts` vertices; none if empty.
+
+    They hold skinned vertices in the body's order, metres, world space, when the CPU unit skins.
+    """
+    views, start = [], 0
+    for count in counts:
+        size = posed_vertices_bytes([count])
+        views.append(payload[start : start + size].view(np.float32).reshape(count, 3))
+        start += size
+    return views
+
+
+def posed_vertices_bytes(counts: Sequence[int]) -> int:
+    """Bytes that `posed_vertices` needs."""
+    return sum(counts) * 3 * np.dtype(np.float32).itemsize
+
+
+class NetworkCut(StrictModel):
     """The network is cut at quantised tensor `at`; what follows runs on `unit`."""
 
     at: str
     unit: UnitName
 
 
-class RunConfig(Model):
+class RunConfig(StrictModel):
     """One run of the avatar, as plain data. Paths are absolute and were checked by the parent.
 
     `scene`: what is shown, and with what avatars.
     `out_dir`: the temporary run folder.
     `avatar_dirs`: the bundle's folder of each avatar of the scene.
     `units`: cores and threads of each unit.
-    `runtime`: that the DSP unit infers with.
+    `runtime`: inference runtime of the DSP unit, by name.
     `shapes`: of the tensor, where the scene plans it; else those of its size are used.
     `changes`: for each of `works` from which second of the scene on a planned tensor has which shape; empty where that
     was not foreseen.
-    `own_pixels`: of the tensor at which the network was trained.
+    `own_pixels`: pixels of the tensor at which the network was trained.
     `works`: of a planned tensor in thousandths of those pixels, the most first; a further one is stepped down to when
     frames would be late.
     `record`: whether the frames are encoded to a video.
     `posed_vertices`: how many of each avatar, when the CPU unit skins; empty when the GPU unit does.
     `pace_ns`: how long a job of a stage is held, at least.
-    `cuts`: of the network; its first part is the DSP's.
+    `cuts`: cuts of the network; its first part is the DSP's.
     `kept`: numbers of frames whose presented pictures are kept, to be compared when the run is over.
     `window`: where somebody looks at the pictures and steers the camera while the run goes on; None: nowhere.
     """
@@ -80,7 +151,7 @@ class RunConfig(Model):
 
     @property
     def tensor_budgets(self) -> tuple[TensorBudget, ...]:
-        """Of a tensor that is planned, for each of `works`."""
+        """The budgets of a planned tensor, one for each of `works`."""
         whole = TensorBudget(self.own_pixels, self.scene.most_side**2)
         return tuple(whole.scaled(work) for work in self.works)
 

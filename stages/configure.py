@@ -20,24 +20,20 @@ from trilane.avatars.integer_network import NetworkFile
 from trilane.avatars.network_split import split
 from trilane.avatars.size_loss import SizeLoss, size_loss
 from trilane.avatars.validation import DrawnAs, accuracy_of
-from trilane.errors import BadInputError, MissingPartError
+from trilane.errors import EGL_LINE, BadInputError, MissingPartError, did_you_mean
 from trilane.hw_profiles.host import asked_cores, rule_placement, settings_of, usable_cores
 from trilane.hw_profiles.load import HOST, load_profile
 from trilane.hw_profiles.runtime_choice import fastest_runtime
-from trilane.install import EGL_LINE
-from trilane.near_miss import did_you_mean
 from trilane.pipeline.shared_assets import Assets
 from trilane.scene.footage import Footage
-from trilane.scene.load import find_scene, load_scene, located, scene_from
 from trilane.scene.planner import TensorBudget
-from trilane.scene.schema import Scene
+from trilane.scene.schema import Scene, find_scene, load_scene, located, scene_from
 from trilane.scene.staging import Staged, stage_scene
 from trilane.stages.avatar_assets import AvatarData, load_avatar, pack_assets, require_one_tensor
 from trilane.stages.config import NetworkCut, RunConfig
 from trilane.stages.dsp.runtime import RUNTIMES, installed, resolve
-from trilane.stages.foresee import foresee
+from trilane.stages.foresee import foresee, tensor_works
 from trilane.stages.machine_facts import gl_facts, machine_facts
-from trilane.stages.tensor_works import tensor_works
 from trilane.transport.slots import RULES, edge_rule
 from trilane.unexpected_value import UnexpectedValue
 
@@ -73,9 +69,9 @@ class Checked:
     """A configuration that can be run.
 
     `assets`: what was loaded to check it, as the units take it. `notes`: what the loads said of their sources.
-    `accuracy`: of each avatar, by its name, what `accuracy_of` says of it. `asked_cores`: of units, by the options.
-    `placement`: what `trilane.stages.placing` says of the units' cores. `losses`: of each distinct avatar, what smaller
-    tensors cost.
+    `accuracy`: of each avatar, by its name, what `accuracy_of` says of it. `asked_cores`: cores of units by the
+    options. `placement`: what `trilane.stages.placing` says of the units' cores. `losses`: of each distinct avatar,
+    what smaller tensors cost.
     """
 
     config: RunConfig
@@ -87,7 +83,7 @@ class Checked:
     losses: tuple[SizeLoss, ...] = ()
 
     def changed(self, **values: Any) -> Checked:
-        """The same with other `values` of the configuration, such as `out_dir`, `record` or `units`."""
+        """This run with other `values` of the configuration, such as `out_dir`, `record` or `units`."""
         return replace(self, config=self.config.model_copy(update=values))
 
 
@@ -225,7 +221,7 @@ def _check_pictures(scene: Scene, staged: Staged) -> None:
 
 
 def _accuracy(avatars: Sequence[AvatarData], drawn: DrawnAs) -> dict[str, Any]:
-    """Of each avatar what may be said of its pictures' error; avatars of one name are told apart by their folders."""
+    """The error of each avatar's pictures by its name; avatars of one name are told apart by their folders."""
     bundles = [avatar.bundle for avatar in avatars]
     names = Counter(bundle.manifest.name for bundle in bundles)
     return {

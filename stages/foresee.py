@@ -1,6 +1,11 @@
-"""What a scene will put on the screen, looked at before the run. Rule: the same bounds and the same layouts as in the
-run, on a fixed number of frames spread over the scene. Where they lie close enough to each other, it is foreseen when
-the tensor changes its shape.
+"""The tensors of a scene, looked at before the run: how many pixels they may have, and in which shapes they come.
+
+The bounds and layouts are those of the run, on a fixed number of frames spread over the scene. Where these lie close
+enough to each other, it is foreseen when the tensor changes its shape.
+
+A tensor has all the pixels that its network was trained for, or fewer where a scene allows it. A policy that releases
+frames at a rate may step down, so that frames are in time. An error budget in dB limits how far, by the avatars'
+measured figures; without such a policy the smallest size within the budget is taken.
 """
 
 from __future__ import annotations
@@ -14,15 +19,60 @@ import numpy as np
 from trilane.avatars.bundle import CLOTHES_STANDOFF_M
 from trilane.avatars.integer_network import NetworkFile
 from trilane.avatars.network_reshape import STRIDE, reshaped
+from trilane.avatars.size_loss import SizeLoss
 from trilane.body.body import ShapedBody
 from trilane.body.kinematics import Skeleton
+from trilane.errors import BadInputError
 from trilane.scene.crop import Rect
-from trilane.scene.planner import Look, TensorBudget, area, foreseen_changes, ideal_shape
+from trilane.scene.planner import (
+    ALL_WORK,
+    MOST_SHAPES,
+    SIDES,
+    Demand,
+    LookAhead,
+    ShapeSet,
+    TensorBudget,
+    area,
+    choose_shapes,
+    foreseen_changes,
+    ideal_shape,
+    joined,
+    larger_shapes,
+    work_of_side,
+)
 from trilane.scene.schema import Scene
-from trilane.scene.shape_set import MOST_SHAPES, Demand, ShapeSet, choose_shapes, joined, larger_shapes
 from trilane.scene.staging import Staged
+from trilane.scheduler.policy import policy_named
 from trilane.shapes import Shape
 from trilane.stages.cpu.mesh_bounds import MeshBounds
+
+KEY = "error_budget_db"
+
+
+def tensor_works(scene: Scene, policy: str, losses: Sequence[SizeLoss]) -> tuple[tuple[int, ...], str]:
+    """`RunConfig.works` of a scene under `policy`, and what is to be said of it; empty when nothing is.
+
+    `losses`: measured losses of the scene's avatars. Raises BadInputError for a budget that they have no figures for.
+    """
+    if not scene.plans_tensor:
+        return (ALL_WORK,), ""
+    works, budget = tuple(work_of_side(side) for side in SIDES), scene.error_budget_db
+    paced = policy_named(policy).paced
+    if budget is None:
+        return (works, "") if paced else ((ALL_WORK,), "")
+    for loss in losses:
+        if not loss.by_work:
+            raise BadInputError(KEY, loss.source, "avatars whose error in smaller tensors was measured")
+    lost = {work: [loss.at(work) for loss in losses] for work in works}
+    within = tuple(work for work in works if all(db is not None and db <= budget for db in lost[work]))
+    least = within[-1]
+    worst = max(db for db in lost[least] if db is not None)
+    said = (
+        f"image error: tensors may have {least / ALL_WORK:.0%} of the pixels that the network was trained for, where "
+        f"they lose {worst:.1f} dB of the {budget:g} allowed ({losses[0].source})"
+    )
+    return (within if paced else within[-1:]), said
+
 
 #: Of the scene, over all avatars; but at least so many of each.
 FORESEEN_FRAMES, LEAST_FRAMES = 96, 24
@@ -41,7 +91,7 @@ Changes = tuple[tuple[tuple[float, Shape], ...], ...]
 
 @dataclass(frozen=True)
 class Foreseen:
-    """`shapes`: to make ready. `frames`: numbers of those that were looked at. `seen`: on how many somebody is.
+    """`shapes`: shapes to make ready. `frames`: numbers of those that were looked at. `seen`: on how many somebody is.
 
     `changes`: for each of the budgets from which second of the scene on the tensor has which shape; empty where that is
     not foreseen.
@@ -86,15 +136,16 @@ def foresee(
 ) -> Foreseen:
     """The tensor shapes that `scene` needs.
 
-    `bodies`: of its avatars, in order.
-    `network`: that all of them share.
+    `bodies`: bodies of its avatars, in order.
+    `network`: network that all of them share.
     `budgets`: of its tensors, the largest first; the further ones are stepped down to, where memory has room for them.
     """
     count = min(scene.frames, max(FORESEEN_FRAMES // len(bodies), LEAST_FRAMES))
     frames = tuple(index * scene.frames // count for index in range(count))
     output = (scene.output.height, scene.output.width)
     looks = [
-        Look(frame, rects) for frame, rects in zip(frames, foreseen_rects(scene, staged, bodies, frames), strict=True)
+        LookAhead(frame, rects)
+        for frame, rects in zip(frames, foreseen_rects(scene, staged, bodies, frames), strict=True)
     ]
     seen = [list(look.rects.values()) for look in looks if look.rects]
     are_close = scene.frames <= MOST_APART * count
@@ -120,7 +171,7 @@ def foresee(
 
 
 def _foreseen(
-    looks: Sequence[Look], output: Shape, shapes: Sequence[Shape], budget: TensorBudget, room: tuple[int, int]
+    looks: Sequence[LookAhead], output: Shape, shapes: Sequence[Shape], budget: TensorBudget, room: tuple[int, int]
 ) -> tuple[tuple[Shape, ...], tuple[tuple[int, Shape], ...]]:
     """Shapes to make ready beside `shapes`, which spare changes by being good for more frames, and all changes then.
 
@@ -140,7 +191,7 @@ def _foreseen(
 def foreseen_rects(
     scene: Scene, staged: Staged, bodies: Sequence[ShapedBody], frames: Sequence[int]
 ) -> Iterator[Mapping[int, Rect]]:
-    """For each of `frames` the rectangles of the avatars that are visible, by their numbers."""
+    """The rectangles of the visible avatars, by their numbers, for each of `frames`."""
     distinct = {id(body): MeshBounds(body, standoff_m=CLOTHES_STANDOFF_M) for body in bodies}
     skeletons = [Skeleton(body.joints, body.body.parents) for body in bodies]
     for frame in frames:

@@ -52,7 +52,7 @@ def package_version(name: str) -> str | None:
 
 
 def versions_with(package: str) -> list[str]:
-    """Of every package that times depend on, a runtime's `package` among them."""
+    """The versions of all packages that times depend on, a runtime's `package` among them."""
     return [f"{name} {package_version(name)}" for name in dict.fromkeys(("trilane", *PACKAGES, package))]
 
 
@@ -70,7 +70,7 @@ def cpu_facts() -> dict[str, Any]:
 
 def open_gl() -> dict[str, Any]:
     """Make a context in this process and describe it. Raises MissingPartError when none can be made."""
-    from trilane.stages.gpu.opengl_context import describe, open_context
+    from trilane.stages.gpu.opengl import describe, open_context
 
     context = open_context()
     driver, info = describe(context), context.info
@@ -102,9 +102,9 @@ def runtime_facts() -> dict[str, Any]:
 
     facts: dict[str, Any] = {"onnxruntime": list(onnxruntime.get_available_providers())}
     if package_version("openvino"):
-        from trilane.stages.dsp.quiet_openvino import openvino
+        from trilane.stages.dsp.runtime import quiet_openvino
 
-        facts["openvino"] = list(openvino.Core().available_devices)
+        facts["openvino"] = list(quiet_openvino().Core().available_devices)
     return facts
 
 

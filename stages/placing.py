@@ -1,10 +1,14 @@
-"""Which cores the units of a run get. Rule: as asked; else the shortest frames, tried or predicted; else by the rule.
+"""Which cores the units of a run get: as asked; else those with the shortest frames, tried or predicted; else by a
+rule.
 
 A run that is long enough is rehearsed for a moment: what each unit needs for a frame is measured, with the numbers of
-threads that it may have; the few placements with the least predicted frame times are then tried with real frames. Both
-are kept for the next run of the same network, shapes, runtime, output and machine. While other programs use the cores
-nothing is tried, and the prediction decides: times of a unit without its core are known, those of a pipeline are not.
-A run that is too short to gain by it, or is held to a chip's pace, is placed by the rule of `trilane.hw_profiles.host`.
+threads that it may have. The few placements with the least predicted frame times are then tried with real frames. Both
+results are kept for the next run of the same network, shapes, runtime, output and machine. A run that is too short to
+gain by it, or is held to a chip's pace, is placed by the rule of `trilane.hw_profiles.host`.
+
+Nothing is tried while other programs use the cores. A unit that floats dodges them and one that does not waits, so
+frame times then say more of those programs than of the placements. The prediction decides, a note says so, and the next
+run looks again.
 """
 
 from __future__ import annotations
@@ -12,7 +16,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from statistics import median
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,17 +25,17 @@ from numpy.typing import NDArray
 from trilane.cache import cached_arrays
 from trilane.hw_profiles.host import host_cores, rule_placement, settings_of, usable_cores
 from trilane.hw_profiles.placement_facts import NS_PER_MS, described, placement_of, predictions, unit_rows
+from trilane.pipeline.other_programs import OtherPrograms
 from trilane.pipeline.rehearsal import Rehearsed
 from trilane.pipeline.unit_starter import UnitStarter
-from trilane.scheduler.placement import Ranked, chosen, ranked, worth_trying
+from trilane.scheduler.placement import Ranked, chosen, fastest, ranked, typical, worth_trying
 from trilane.scheduler.placement_model import Rules, frame_ns
 from trilane.scheduler.places import Core, Place, Placement, Times, Work
 from trilane.stages.avatar_assets import network_of
-from trilane.stages.choosing import choice
+from trilane.stages.avatar_pipeline import measured_times, thread_counts, tried
 from trilane.stages.configure import Checked
 from trilane.stages.dsp.runtime import RUNTIMES
 from trilane.stages.machine_facts import cpu_facts, versions_with
-from trilane.stages.rehearsing import measured_times, thread_counts
 from trilane.units import BEFORE_INFER, UNITS
 
 #: Shorter runs do not gain what a rehearsal takes.
@@ -49,9 +54,9 @@ def placed(
 ) -> Checked:
     """`checked` with its units on the cores that are best for it, and what is to be said of that.
 
-    `policy`: of the run. `starter`: a fork server. `driver`: OpenGL's, which the times depend on. `say`: is told before
-    something takes seconds.
-    Raises TrilaneError when a unit cannot start or a stage fails, KeyboardInterrupt when interrupted.
+    `policy`: policy of the run. `starter`: a fork server. `driver`: OpenGL's, which the times depend on. `say`: is told
+    before something takes seconds. Raises TrilaneError when a unit cannot start or a stage fails, KeyboardInterrupt
+    when interrupted.
     """
     asked = {unit: Place(own, len(own)) for unit, own in checked.asked_cores.items()}
     cores = host_cores(sorted({*usable_cores(), *(core for place in asked.values() for core in place.cores)}))
@@ -192,3 +197,68 @@ def _made_from(checked: Checked, cores: Sequence[Core], rule: Placement) -> list
     machine = [str(cpu_facts()), str([tuple(core) for core in cores]), str(thread_counts(len(cores), rule))]
     network = network_of(checked.assets).digest
     return [said, scene, *machine, network, *versions_with(RUNTIMES[config.runtime].package)]
+
+
+#: Rounds of trying placements; after TRY_S seconds no further one than LEAST_ROUNDS.
+ROUNDS, LEAST_ROUNDS, TRY_S = 6, 3, 5.0
+#: Share of the cores that other programs may have while placements are compared, and for how long that is looked at.
+MOST_OTHERS, LOOK_S = 0.1, 0.25
+PREDICTED = "the least predicted frame time"
+TRYING = "trying {} placements with frames of the scene (once for this avatar, scene and machine) ..."
+
+Arrays = Mapping[str, NDArray[Any]]
+
+
+class TriedPlacement(NamedTuple):
+    """`best`: place of the one to take. `why`: reason in words. `frame_ms`: frame times of those that were tried."""
+
+    best: int
+    why: str
+    frame_ms: tuple[float, ...] = ()
+
+
+class _BusyError(Exception):
+    """Other programs have so large a `share` of the cores that frame times cannot be compared."""
+
+    def __init__(self, share: float) -> None:
+        super().__init__()
+        self.share = share
+
+
+def choice(
+    checked: Checked,
+    cores: Sequence[int],
+    candidates: Sequence[Ranked],
+    starter: UnitStarter,
+    say: Callable[[str], None] = lambda _: None,
+    kept: Callable[[Callable[[], Arrays]], Arrays] = lambda make: make(),
+) -> TriedPlacement:
+    """Which of `candidates` has the shortest frames; where nothing is tried, the first.
+
+    `checked`: what is to be run. `cores`: there are. `starter`: a fork server. `say`: is told before it takes seconds.
+    `kept`: what its argument makes, or has made before. Raises TrilaneError when a unit cannot start or a stage fails,
+    KeyboardInterrupt when interrupted.
+    """
+    if len(candidates) == 1:
+        return TriedPlacement(0, PREDICTED)
+
+    def measured() -> Arrays:
+        others = OtherPrograms(cores)
+        time.sleep(LOOK_S)
+        _refuse_when_busy(others.share())
+        say(TRYING.format(len(candidates)))
+        rounds = tried(checked, [each.placement for each in candidates], ROUNDS, starter, TRY_S, LEAST_ROUNDS)
+        _refuse_when_busy(median(each.others for each in rounds))
+        return {"frame_ns": np.array([each.frame_ns for each in rounds])}
+
+    try:
+        frame_ns = typical(kept(measured)["frame_ns"].tolist())
+    except _BusyError as busy:
+        return TriedPlacement(0, f"{PREDICTED}; not tried while other programs have {busy.share:.0%} of the cores")
+    frame_ms = tuple(value / NS_PER_MS for value in frame_ns)
+    return TriedPlacement(fastest(frame_ns), f"the fastest of {len(candidates)} that were tried", frame_ms)
+
+
+def _refuse_when_busy(share: float) -> None:
+    if share > MOST_OTHERS:
+        raise _BusyError(share)

@@ -8,8 +8,7 @@ from __future__ import annotations
 import psutil
 import torch
 
-from trilane.errors import MissingPartError
-from trilane.install import package_line
+from trilane.errors import MissingPartError, package_line
 
 MB = 1e6
 

@@ -11,7 +11,14 @@ from typing import Protocol
 from torch import Tensor, nn
 from torch.nn import functional
 
-from trilane.unet_tables import MOBILE_ENCODERS, RESNET18_STAGES, RESNET18_STEM, MobileEncoder, Row, squeeze_channels
+from trilane.unet_tables import (
+    MOBILE_ENCODERS,
+    RESNET18_STAGES,
+    RESNET18_STEM,
+    MobileBlock,
+    MobileEncoder,
+    squeeze_channels,
+)
 
 Norm = Callable[[int], nn.Module]
 Scale = Callable[[int], int]
@@ -122,7 +129,7 @@ class SqueezeExcite(nn.Module):
 class InvertedResidual(nn.Module):
     """1x1 expansion, depthwise convolution, optional squeeze, linear 1x1 projection, added where shapes agree."""
 
-    def __init__(self, c_in: int, row: Row, scale: Scale, norm: Norm) -> None:
+    def __init__(self, c_in: int, row: MobileBlock, scale: Scale, norm: Norm) -> None:
         """The block of one row of the table.
 
         `c_in`: channels of its input.

@@ -14,8 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from trilane.errors import BadInputError, MissingPartError, reason
-from trilane.install import package_line
+from trilane.errors import BadInputError, MissingPartError, package_line, reason
 
 #: Convolutions and channels of the five blocks, between which the picture is halved: Simonyan and Zisserman, Very deep
 #: convolutional networks for large-scale image recognition, 2014, table 1, column D.

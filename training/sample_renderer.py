@@ -15,13 +15,11 @@ from numpy.typing import NDArray
 from trilane.arrays import F64
 from trilane.body.body import ShapedBody
 from trilane.body.kinematics import Skeleton
-from trilane.body.skin_weights import largest_weights
+from trilane.body.skinning import largest_weights
 from trilane.shapes import shape_buckets
-from trilane.stages.gpu.avatar_mesh import enough_weights
-from trilane.stages.gpu.mesh_arrays import mesh_arrays
-from trilane.stages.gpu.opengl_context import open_context
+from trilane.stages.gpu.opengl import open_context
 from trilane.stages.gpu.packed_pass import Placement
-from trilane.stages.gpu.skinned_mesh import SkinnedMesh
+from trilane.stages.gpu.skinned_mesh import SkinnedMesh, enough_weights, mesh_arrays
 from trilane.training.body_arrays import body_arrays
 from trilane.training.clear_view import ClothedSurface
 from trilane.training.clothing.clothed_body import ClothedBody

@@ -13,9 +13,8 @@ from typing import Any, Literal
 
 from pydantic import Field, ValidationError
 
-from trilane.errors import BadInputError
+from trilane.errors import BadInputError, did_you_mean
 from trilane.files import read_text
-from trilane.near_miss import did_you_mean
 from trilane.scene.schema import Table
 from trilane.training.loss_weights import LossWeights
 from trilane.training.training_options import BatchOptions, OptimiserOptions, RegularisationOptions

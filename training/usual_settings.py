@@ -8,8 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from trilane.errors import BadInputError
-from trilane.near_miss import did_you_mean
+from trilane.errors import BadInputError, did_you_mean
 from trilane.training.loss_weights import LossWeights
 
 #: Losses by name: the weights, and the settings that belong to them where a training does not say others.

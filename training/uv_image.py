@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import F32, Floats
-from trilane.stages.gpu.mesh_draw import MeshDraw
-from trilane.stages.gpu.skinned_mesh import BodyPose, SkinnedMesh
+from trilane.stages.gpu.skinned_mesh import BodyPose, MeshDraw, SkinnedMesh
 
 
 class _MeshTarget:

@@ -14,7 +14,7 @@ from trilane import machine
 from trilane.avatars.bundle import Bundle, write_manifest
 from trilane.avatars.digests import digests_of, sha256_of, with_figures_digest
 from trilane.avatars.manifest import AT_THE_TOP, MadeWith, Validation
-from trilane.scene.motion.load import load_motion
+from trilane.scene.motion.files import load_motion
 from trilane.scene.motion.motion import Motion
 from trilane.scene.schema import AvatarSpec
 from trilane.stages.dsp.runtime import load_runtime

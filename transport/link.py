@@ -1,16 +1,124 @@
 """One end of the connection between the scheduler and a unit: the job pipe and the heartbeat socket together.
 
-Rule: what must keep its order (jobs and their answers) goes over the job pipe; heartbeats have a way of their own, so
-that neither delays the other.
+What must keep its order (jobs and their answers) goes over the job pipe; heartbeats have a way of their own, so that
+neither delays the other. Neither end ever waits for the other: a heartbeat that the other end does not read is dropped.
+
+The folder of a unit's ZeroMQ socket is private, and there only until the unit has connected: a connection lives on
+without the name of its socket. A parent that is killed before that leaves its folder behind; the next run finds that
+nobody holds the folder's lock, and removes it.
 """
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
+import os
+import shutil
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Self
+
 import zmq
 
-from trilane.transport.heartbeats import HeartbeatSocket
-from trilane.transport.job_pipe import JobPipe
-from trilane.transport.messages import Heartbeat, Message
+from trilane.transport.messages import MAX_BYTES, Heartbeat, JobPipe, Message, pack, unpack
+from trilane.transport.wakeup import SHORTEST_NS, use_slice
+
+PREFIX = "trilane-"
+LOCK = "lock"
+MAX_PATH = 80  # bytes of the folder's path; the path of a Unix socket inside it may have 108
+
+
+class SocketFolder:
+    """A folder with mode 0700 for the names of sockets, held by a lock on a file inside it."""
+
+    def __init__(self) -> None:
+        base = tempfile.gettempdir()
+        base = base if len(base) < MAX_PATH else "/tmp"  # noqa: S108 - mkdtemp below makes a private folder in it
+        remove_abandoned(Path(base))
+        self.path = Path(tempfile.mkdtemp(prefix=PREFIX, dir=base))
+        self._lock = os.open(self.path / LOCK, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
+        fcntl.flock(self._lock, fcntl.LOCK_EX)
+
+    def endpoint(self, name: str) -> str:
+        """The ZeroMQ address of the socket `name` in this folder."""
+        return f"ipc://{self.path / name}"
+
+    def remove(self) -> None:
+        """Remove the folder and let go of its lock."""
+        shutil.rmtree(self.path, ignore_errors=True)
+        os.close(self._lock)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_exc: object) -> None:
+        self.remove()
+
+
+def remove_abandoned(base: Path) -> None:
+    """Remove this user's socket folders in `base` whose owner has ended, which are those whose lock is free."""
+    for folder in base.glob(f"{PREFIX}*"):
+        with contextlib.suppress(OSError):
+            if folder.is_symlink() or folder.stat().st_uid != os.getuid():
+                continue
+            lock = os.open(folder / LOCK, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(folder, ignore_errors=True)
+            finally:
+                os.close(lock)
+
+
+HIGH_WATER = 64  # messages in ZeroMQ's queue; a unit has at most a few outstanding
+LINGER_MS = 1000  # how long a unit that ends tries to deliver its last heartbeat
+
+
+class HeartbeatSocket:
+    """One end of a unit's heartbeat connection.
+
+    `socket`: the ZeroMQ socket; one end binds it, the other connects it.
+    """
+
+    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], linger_ms: int = 0) -> None:
+        """A socket of `context`. On closing it tries for `linger_ms` to deliver what was sent."""
+        self.socket: zmq.Socket[bytes] = context.socket(zmq.PAIR)
+        self.socket.setsockopt(zmq.LINGER, linger_ms)
+        self.socket.setsockopt(zmq.MAXMSGSIZE, MAX_BYTES)
+        self.socket.setsockopt(zmq.SNDHWM, HIGH_WATER)
+        self.socket.setsockopt(zmq.RCVHWM, HIGH_WATER)
+
+    def fileno(self) -> int:
+        """Readable when the socket may have messages: then `receive` is to be called."""
+        return self.socket.fileno()
+
+    def send(self, message: Heartbeat) -> None:
+        """Send without waiting. Does nothing when the other end has stopped reading."""
+        with contextlib.suppress(zmq.Again):
+            self.socket.send(pack(message), zmq.DONTWAIT)
+
+    def receive(self) -> list[Message]:
+        """All messages that have come since the last call. Raises MessageError for bytes that are no message."""
+        messages = []
+        while self.socket.poll(0):  # until it is empty: ZeroMQ's descriptor does not become readable again before
+            messages.append(unpack(self.socket.recv(zmq.DONTWAIT)))
+        return messages
+
+    def close(self) -> None:
+        self.socket.close()
+
+
+def context_on_cores(cores: Sequence[int]) -> zmq.Context[zmq.Socket[bytes]]:
+    """A ZeroMQ context for a unit, whose I/O thread runs on `cores` and preempts other work there when it is woken.
+
+    On the unit's own cores that thread would wait behind the unit's next job. Call it from the thread that makes the
+    first socket: the I/O thread inherits the short time slice that this function sets, and the caller keeps it too.
+    """
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    for core in cores:
+        context.set(zmq.THREAD_AFFINITY_CPU_ADD, core)
+    use_slice(SHORTEST_NS)
+    return context
 
 
 class Link:

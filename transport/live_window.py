@@ -46,7 +46,7 @@ class Steering(NamedTuple):
     zoom: float = 1.0
 
 
-class Shown(NamedTuple):
+class ShownPicture(NamedTuple):
     """A picture (height, width, 3), RGB, of `frame`: the scene at `media_s`, whose pose was sampled at `sampled_ns`."""
 
     frame: int
@@ -68,7 +68,7 @@ def create_window(height: int, width: int) -> int:
 
 
 def path_of(fd: int) -> Path:
-    """By which another process of this user opens the window, while this one has it open."""
+    """The path by which another process of this user opens the window, while this one has it open."""
     return Path(f"/proc/{os.getpid()}/fd/{fd}")
 
 
@@ -106,7 +106,7 @@ class LiveWindow:
         for name, value in zip(Steering._fields, steering, strict=True):
             self._head[name] = value
 
-    def newest(self, had: int) -> Shown | None:
+    def newest(self, had: int) -> ShownPicture | None:
         """The newest picture; None when there is none, or it is of frame `had`."""
         for _ in range(TRIES):
             side = int(self._head["newest"][0]) & 1
@@ -117,7 +117,7 @@ class LiveWindow:
             times = float(self._head["media_s"][0, side]), int(self._head["sampled_ns"][0, side])
             pixels = self._pixels[side].copy()
             if int(self._head["number"][0, side]) == number:
-                return Shown(frame, *times, pixels)
+                return ShownPicture(frame, *times, pixels)
         return None
 
     # by the run

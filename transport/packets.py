@@ -1,11 +1,19 @@
-"""The packets that pass between stages: one slot = one header, then the payload. Rule: views of a slot, never copies.
+"""The packets that pass between stages, and the shared memory that they live in.
 
-Every header begins with `FRAME_FIELDS`, which the unit's loop fills in; the other fields are the pipeline's own.
-Everything that a later stage needs to know about a frame travels in its packet; no stage asks another.
+One slot is one header, then the payload; stages get views of a slot, never copies. Every header begins with
+`FRAME_FIELDS`, which the unit's loop fills in; the other fields are the pipeline's own. Everything that a later stage
+needs to know about a frame travels in its packet; no stage asks another.
+
+There is one region of memory per edge, without a name (memfd) and of a fixed size. The parent makes the regions and
+keeps their descriptors; its children inherit and map them. The kernel frees a region when the last process that has it
+ends, however it ends.
 """
 
 from __future__ import annotations
 
+import fcntl
+import mmap
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,7 +21,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from trilane import machine
 from trilane.arrays import U8
+from trilane.errors import TrilaneError, reason
 
 PAGE = 4096
 #: `frame`: number from 0. `t_sampled_ns`: CLOCK_MONOTONIC, when the frame's input was sampled: latency begins there.
@@ -57,3 +67,59 @@ def view_packet(buffer: memoryview, layout: SlotLayout) -> Packet:
     header = np.frombuffer(buffer, dtype=layout.header, count=1).reshape(())
     payload = np.frombuffer(buffer, dtype=np.uint8, count=layout.payload_bytes, offset=layout.header_bytes)
     return Packet(header, payload)
+
+
+MIB = 1 << 20
+#: Of <linux/fcntl.h>; the fcntl module of Python 3.11 does not have all of them.
+F_ADD_SEALS, F_SEAL_SHRINK, F_SEAL_GROW = 1033, 0x2, 0x4
+
+
+@dataclass(frozen=True)
+class RegionLayout:
+    """The slots of one edge, one after the other."""
+
+    slots: int
+    slot: SlotLayout
+
+    @property
+    def total_bytes(self) -> int:
+        return self.slots * self.slot.slot_bytes
+
+
+def create_region(name: str, layout: RegionLayout) -> int:
+    """A descriptor of new, zeroed shared memory for `layout`. `name` is shown in /proc/PID/maps and nowhere else.
+
+    Every page is reserved here: on a machine with too little memory this function fails, and not a later write, which
+    would end the process by a signal. Raises TrilaneError when there is too little memory.
+    """
+    free = machine.here.free_bytes()
+    if layout.total_bytes > free:
+        raise TrilaneError(_too_little(name, layout, f"{free // MIB} MiB are free"))
+    fd = os.memfd_create(f"trilane:{name}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+    try:
+        os.posix_fallocate(fd, 0, layout.total_bytes)
+        fcntl.fcntl(fd, F_ADD_SEALS, F_SEAL_SHRINK | F_SEAL_GROW)
+    except OSError as error:
+        os.close(fd)
+        raise TrilaneError(_too_little(name, layout, reason(error))) from None
+    return fd
+
+
+def map_region(fd: int, layout: RegionLayout) -> list[Packet]:
+    """Views of every slot of the region; the mapping lives as long as they do.
+
+    Raises ValueError when the region is smaller than the layout.
+    """
+    region_bytes = os.fstat(fd).st_size
+    if region_bytes < layout.total_bytes:
+        raise ValueError(f"region of {region_bytes} bytes, the layout needs {layout.total_bytes}")
+    view = memoryview(mmap.mmap(fd, layout.total_bytes))
+    step = layout.slot.slot_bytes
+    return [view_packet(view[index * step : (index + 1) * step], layout.slot) for index in range(layout.slots)]
+
+
+def _too_little(name: str, layout: RegionLayout, why: str) -> str:
+    return (
+        f"edge {name} needs {layout.total_bytes // MIB} MiB of memory for {layout.slots} slots and {why}; "
+        "lower the tensor or output size, or the number of slots"
+    )

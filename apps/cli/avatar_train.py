@@ -17,8 +17,7 @@ from trilane import machine
 from trilane.apps.cli.commands import given
 from trilane.apps.cli.console import print_facts, stderr_console, stdout_kept
 from trilane.apps.cli.options import JsonOption
-from trilane.errors import BadInputError, MissingPartError
-from trilane.install import install_line, package_line
+from trilane.errors import BadInputError, MissingPartError, install_line, package_line
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -57,7 +57,7 @@ def inspect(path: BodyFileArgument, json: JsonOption = False) -> None:
 def body_facts(path: Path) -> dict[str, Any]:
     """Counts, size and skinning of a body file. Raises BadInputError."""
     from trilane.body.body import load_body
-    from trilane.body.skin_weights import WEIGHT_COUNTS, weight_error_bound
+    from trilane.body.skinning import WEIGHT_COUNTS, weight_error_bound
 
     body = load_body(path)
     shaped = body.shape()

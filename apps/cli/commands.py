@@ -15,8 +15,7 @@ import typer
 from pydantic import ValidationError
 from typer.core import TyperCommand, TyperOption
 
-from trilane.errors import BadInputError
-from trilane.near_miss import did_you_mean
+from trilane.errors import BadInputError, did_you_mean
 
 
 class OnceCommand(TyperCommand):

@@ -18,8 +18,7 @@ from trilane import machine
 from trilane.apps.cli.commands import Commands
 from trilane.apps.cli.console import print_json, stdout_console
 from trilane.apps.cli.options import JsonOption
-from trilane.errors import reason
-from trilane.install import EGL_LINE, clone, install_line, package_line
+from trilane.errors import EGL_LINE, clone, install_line, package_line, reason
 
 app = Commands()
 

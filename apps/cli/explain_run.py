@@ -40,7 +40,7 @@ def run_folder(name: str) -> Path | None:
     """
     from trilane.apps.live.followed_run import EXPECTED, follow, without_journal
     from trilane.pipeline.journal import NAME
-    from trilane.scene.load import scene_names
+    from trilane.scene.schema import scene_names
 
     folder = Path(name)
     if any((folder / file).exists() for file in ("report.json", NAME)):

@@ -17,8 +17,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from trilane.errors import TrilaneError, reason
-from trilane.install import install_line
+from trilane.errors import TrilaneError, install_line, reason
 
 #: Command: its module, and the line that `trilane --help` shows for it.
 COMMANDS = {

@@ -28,7 +28,7 @@ from trilane.apps.dashboard.view import Message
 from trilane.apps.dashboard.wire import ControlSaid, Seek, shown
 from trilane.apps.live.followed_run import FollowedRun
 from trilane.pipeline.journal import NAME, Begun, Record
-from trilane.transport.live_window import LiveWindow, Shown, Steering
+from trilane.transport.live_window import LiveWindow, ShownPicture, Steering
 
 FIGURES_S: Final = 0.25
 PICTURE_S: Final = 0.05  # between two that are encoded
@@ -228,5 +228,5 @@ class LiveView:
         return None if self._is_behind or self._state in ("ended", "failed") else time.monotonic_ns()
 
 
-def _jpeg(seen: Shown) -> bytes:
+def _jpeg(seen: ShownPicture) -> bytes:
     return jpeg_of(Image.fromarray(seen.pixels))

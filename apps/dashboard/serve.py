@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 from trilane import machine
 from trilane.apps.dashboard.guard import ADDRESS
 from trilane.apps.dashboard.refusals import Refusal
-from trilane.errors import BadInputError, MissingPartError, reason
-from trilane.install import install_line
+from trilane.errors import BadInputError, MissingPartError, install_line, reason
 
 if TYPE_CHECKING:
     from trilane.apps.dashboard.app import DashboardApp

@@ -10,10 +10,10 @@ from trilane.arrays import U8
 from trilane.pipeline.stage import UnitContext
 from trilane.stages.avatar_assets import network_of
 from trilane.stages.avatar_pipeline import edge_bytes
+from trilane.stages.config import pose_dtype
 from trilane.stages.configure import Checked
 from trilane.stages.cpu.pose import build as build_pose
 from trilane.stages.gpu.raster import build as build_raster
-from trilane.stages.packets import pose_dtype
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 

@@ -20,11 +20,10 @@ from trilane.apps.experiments.error_by_size import refuse_twice
 from trilane.apps.experiments.scene_pictures import ScenePictures, around, wanted_pictures
 from trilane.arrays import F64, U8
 from trilane.bench.lib.cast import Cast
-from trilane.errors import BadInputError
+from trilane.errors import BadInputError, did_you_mean
 from trilane.figure_sources import MEASURED
-from trilane.near_miss import did_you_mean
 from trilane.stages.configure import Checked, Request, configure
-from trilane.stages.gpu.texture_array import FILTERS
+from trilane.stages.gpu.packed_pass import FILTERS
 from trilane.training.quantising.calibration import METHODS
 
 STEPS = 255

@@ -28,14 +28,13 @@ from trilane.bench.lib.full_picture import SAMPLES, fineness, supersampled
 from trilane.bench.lib.layers import Box, Layer, enlarged, grown, laid_over, placed, premultiplied, shrunk
 from trilane.bench.lib.stage_chain import AvatarFrames
 from trilane.scene.crop import Rect, crop_projection
+from trilane.scene.planner import FrameWork
 from trilane.scene.tensor_layout import Cell
-from trilane.scene.work import Work
 from trilane.shapes import BUCKET_STEP, Shape
 from trilane.stages.avatar_assets import AvatarData
 from trilane.stages.configure import Checked
 from trilane.stages.dsp.runtime import Binding, RuntimeOptions, load_runtime
-from trilane.stages.gpu.avatar_mesh import avatar_mesh
-from trilane.stages.gpu.mesh_arrays import MeshArrays
+from trilane.stages.gpu.skinned_mesh import MeshArrays, avatar_mesh
 
 #: From so much cover on a pixel belongs to a mask.
 HALF = 0.5
@@ -144,7 +143,7 @@ class Moment:
 
     def _cells(self) -> list[tuple[Seen, Rect, Cell]]:
         """Who is in the run's tensor, the crop rectangle, and its part of the tensor."""
-        if int(self._header["work"]) != Work.FULL:
+        if int(self._header["work"]) != FrameWork.FULL:
             return []
         visible = [row for row in self._header["avatars"] if row["visible"] and int(row["avatar"]) in self.seen]
         return [(self.seen[int(row["avatar"])], Rect(*map(float, row["rect"])), _cell(row)) for row in visible]

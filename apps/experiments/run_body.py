@@ -15,12 +15,11 @@ from trilane.arrays import F32, F64
 from trilane.bench.lib.cast import Seen
 from trilane.bench.lib.full_body import FullBody
 from trilane.body.body import Body
-from trilane.body.detail import DETAILS, EVERYTHING, Detail
 from trilane.body.joints import JOINTS, POSE_FEATURES
 from trilane.body.kinematics import Posed, Skeleton
-from trilane.body.skinning import FrameSkinner
+from trilane.body.skinning import DETAILS, EVERYTHING, Detail, FrameSkinner
 from trilane.stages.avatar_assets import AvatarData
-from trilane.stages.gpu.avatar_mesh import enough_weights
+from trilane.stages.gpu.skinned_mesh import enough_weights
 
 
 class RunBody:

@@ -26,7 +26,7 @@ from trilane.pipeline.stage import UnitContext
 from trilane.shapes import Shape
 from trilane.stages.avatar_pipeline import avatar_pipeline
 from trilane.stages.configure import Checked
-from trilane.stages.gpu.opengl_context import CONTEXT, open_context
+from trilane.stages.gpu.opengl import CONTEXT, open_context
 from trilane.transport.packets import Packet
 
 MAX_FRAMES = 10_000

@@ -13,9 +13,8 @@ from trilane.apps.inspection.inspection import Inspection, refused
 from trilane.apps.inspection.moving import inspect_camera, inspect_motion
 from trilane.apps.inspection.pictures import inspect_folder, inspect_picture, inspect_video
 from trilane.errors import BadInputError
-from trilane.file_signatures import PICTURE, VIDEO, Signature
-from trilane.files import read_text
-from trilane.scene.detected import Detected
+from trilane.files import PICTURE, VIDEO, Signature, read_text
+from trilane.scene.recordings import Detected
 
 #: Kind -> how it is read, and what one of it is called before it was read.
 READERS: dict[str, tuple[Callable[[Path], Inspection], str]] = {

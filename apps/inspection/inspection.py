@@ -17,7 +17,7 @@ from PIL import Image
 from trilane.arrays import F64
 from trilane.body.joints import BODY_JOINTS
 from trilane.errors import BadInputError
-from trilane.scene.detected import NOTHING, Detected
+from trilane.scene.recordings import NOTHING, Detected
 
 
 @dataclass(frozen=True)

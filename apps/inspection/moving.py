@@ -16,9 +16,9 @@ from trilane.apps.inspection.inspection import Inspection, Length, used
 from trilane.avatars.bundle import DEFAULT, bundle_folder
 from trilane.body.body import ShapedBody, load_body
 from trilane.body.kinematics import Skeleton
-from trilane.scene.camera.load import load_camera
+from trilane.scene.camera.files import load_camera
 from trilane.scene.camera.path import CameraPath
-from trilane.scene.motion.load import load_motion
+from trilane.scene.motion.files import load_motion
 from trilane.scene.motion.motion import Motion
 from trilane.scene.rotations import matrix_from_quat
 from trilane.scene.schema import AvatarSpec, CameraSpec

@@ -30,8 +30,8 @@ from trilane.hw_profiles.graph_file import read_graph
 from trilane.hw_profiles.load import load_profile
 from trilane.pipeline.journal import NAME as JOURNAL
 from trilane.pipeline.journal import read_journal
-from trilane.scene.detected import Detected
-from trilane.scene.load import load_scene
+from trilane.scene.recordings import Detected
+from trilane.scene.schema import load_scene
 
 SHEET = "contact.png"
 

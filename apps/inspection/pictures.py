@@ -18,10 +18,9 @@ from PIL import ExifTags, Image, ImageDraw
 
 from trilane.apps.inspection.inspection import Inspection, Length, used
 from trilane.errors import BadInputError, reason
-from trilane.scene.detected import Detected
 from trilane.scene.footage import Footage
-from trilane.stages.gpu.background import is_picture, open_background, pictures_in
-from trilane.stages.gpu.picture_file import read_picture
+from trilane.scene.recordings import Detected
+from trilane.stages.gpu.background import is_picture, open_background, pictures_in, read_picture
 from trilane.stages.gpu.survey import MOST_PACKETS, survey
 from trilane.stages.gpu.video_reader import quarters_of
 

@@ -12,11 +12,22 @@ from pathlib import Path
 
 from trilane.avatars.bundle import MANIFEST
 from trilane.errors import BadInputError
-from trilane.file_signatures import ARCHIVE, ARRAY, FOREIGN, PICKLE, PICTURE, VIDEO, Signature, signature_of
-from trilane.files import npz_names, read_text, require_file
+from trilane.files import (
+    ARCHIVE,
+    ARRAY,
+    FOREIGN,
+    PICKLE,
+    PICTURE,
+    VIDEO,
+    Signature,
+    npz_names,
+    read_text,
+    require_file,
+    signature_of,
+)
 from trilane.pipeline.journal import NAME as JOURNAL
-from trilane.scene.camera.detect import COLMAP_FILES, detect
-from trilane.stages.gpu.picture_file import PICTURES
+from trilane.scene.camera.files import COLMAP_FILES, detect
+from trilane.stages.gpu.background import PICTURES
 
 MOTION, CAMERA, PICTURE_FOLDER, BODY, TEXTURE, AVATAR = "motion", "camera", "pictures", "body", "texture", "avatar"
 NETWORK, SCENE, TRACE, RUN, REPORT, SWEEP = "network", "scene", "trace", "run", "report", "sweep"
@@ -50,7 +61,7 @@ JSON_KEYS = {"traceEvents": TRACE, "clock": REPORT, "network": AVATAR, "frames":
 
 
 def kind_of(path: Path) -> tuple[str, Signature | None]:
-    """One of the words above or of `file_signatures`; with FOREIGN, and an archive, its signature.
+    """One of the words above or of `trilane.files`; with FOREIGN, and an archive, its signature.
 
     Raises BadInputError for what is no readable file or folder.
     """

@@ -14,8 +14,7 @@ from pathlib import Path
 
 import psutil
 
-from trilane.errors import BadInputError
-from trilane.near_miss import did_you_mean
+from trilane.errors import BadInputError, did_you_mean
 from trilane.pipeline.journal import NAME, JournalReader, Record, journal_in
 
 RUNS = Path("runs")

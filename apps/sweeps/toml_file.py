@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from trilane.apps.sweeps.definition import Kind, kind_named
-from trilane.errors import BadInputError
+from trilane.errors import BadInputError, did_you_mean
 from trilane.files import read_text
-from trilane.near_miss import did_you_mean
 
 EXPECTED = "a sweep (docs/sweeps.md)"
 #: Key: the type of its value, and what that is called.

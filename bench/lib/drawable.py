@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from trilane.arrays import F32
 from trilane.avatars.bundle import load_bundle
 from trilane.stages.avatar_assets import load_avatar
-from trilane.stages.gpu.avatar_mesh import avatar_mesh
-from trilane.stages.gpu.mesh_arrays import MeshArrays
 from trilane.stages.gpu.packed_pass import Quantisation
+from trilane.stages.gpu.skinned_mesh import MeshArrays, avatar_mesh
 
 
 @dataclass(frozen=True)

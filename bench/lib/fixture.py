@@ -15,9 +15,9 @@ from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import ShapedBody, load_body
 from trilane.body.joints import JOINT_INDEX
 from trilane.body.kinematics import Posed, Skeleton
-from trilane.body.skin_weights import largest_weights
-from trilane.stages.gpu.mesh_arrays import MeshArrays, mesh_arrays
+from trilane.body.skinning import largest_weights
 from trilane.stages.gpu.packed_pass import Quantisation
+from trilane.stages.gpu.skinned_mesh import MeshArrays, mesh_arrays
 
 TEXTURE_SIDE = 512
 ENCODING = Quantisation(6 / 255, 128)

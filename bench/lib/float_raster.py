@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import F64
-from trilane.stages.gpu.camera_matrices import FLIP_Y
-from trilane.stages.gpu.mesh_arrays import MeshArrays
+from trilane.stages.gpu.opengl import FLIP_Y
+from trilane.stages.gpu.skinned_mesh import MeshArrays
 
 BATCH_SAMPLES = 4_000_000
 

@@ -24,8 +24,7 @@ from trilane.bench.lib.layers import Layer, blended, enlarged, grown, premultipl
 from trilane.scene.crop import crop_projection
 from trilane.shapes import BUCKET_STEP, Shape
 from trilane.stages.avatar_assets import AvatarData
-from trilane.stages.gpu.avatar_mesh import avatar_mesh
-from trilane.stages.gpu.mesh_arrays import MeshArrays
+from trilane.stages.gpu.skinned_mesh import MeshArrays, avatar_mesh
 
 #: Points of a tensor pixel, along each side, at which the neural texture is read.
 SAMPLES = 4

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from trilane.arrays import U8
-from trilane.stages.gpu import opengl_calls
+from trilane.stages.gpu import opengl
 
 Box = tuple[int, int, int, int]
 RING = 3
@@ -89,7 +89,7 @@ class RingReadback:
         """Start this read; finish the oldest when no buffer is free."""
         buffer = self._free.popleft()
         target.read_into(buffer, box, components=words, dtype="u4", alignment=1)
-        self._waiting.append((buffer, opengl_calls.fence(), tensor))
+        self._waiting.append((buffer, opengl.fence(), tensor))
         if not self._free:
             self._finish()
 
@@ -100,7 +100,7 @@ class RingReadback:
 
     def _finish(self) -> None:
         buffer, sync, tensor = self._waiting.popleft()
-        opengl_calls.wait_fence(sync)
+        opengl.wait_fence(sync)
         buffer.read_into(tensor, size=tensor.nbytes)
         self._free.append(buffer)
 
@@ -154,10 +154,10 @@ class RingUpload:
         """Copy to the oldest buffer, from there the driver copies on."""
         buffer, sync = self._ring.popleft()
         if sync is not None:
-            opengl_calls.wait_fence(sync)
+            opengl.wait_fence(sync)
         buffer.write(image)
         texture.write(buffer, alignment=1)
-        self._ring.append((buffer, opengl_calls.fence()))
+        self._ring.append((buffer, opengl.fence()))
 
 
 UPLOADS: dict[str, Callable[[Any, int], Upload]] = {"sub": SubUpload, "orphan": OrphanUpload, "ring": RingUpload}

@@ -20,11 +20,9 @@ import numpy as np
 import zmq
 
 from trilane.arrays import U8
-from trilane.transport.job_pipe import JobPipe, JobPipeEnd, job_pipe_pair
-from trilane.transport.memory import RegionLayout, create_region, map_region
-from trilane.transport.messages import RunJob
-from trilane.transport.packets import SlotLayout, header_dtype
-from trilane.transport.socket_folder import SocketFolder
+from trilane.transport.link import SocketFolder
+from trilane.transport.messages import JobPipe, JobPipeEnd, RunJob, job_pipe_pair
+from trilane.transport.packets import RegionLayout, SlotLayout, create_region, header_dtype, map_region
 
 WAIT_MS = 60_000
 SHM = Path("/dev/shm")  # noqa: S108 - what iceoryx2 leaves there under our prefix is removed

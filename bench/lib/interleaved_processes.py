@@ -124,8 +124,9 @@ def _ort_default(variant: Variant) -> Callable[[], object]:
 
 def _openvino_default(variant: Variant) -> Callable[[], object]:
     """As OpenVINO's first example does it: compile a file, call the model with an array."""
-    from trilane.stages.dsp.quiet_openvino import openvino
+    from trilane.stages.dsp.runtime import quiet_openvino
 
+    openvino = quiet_openvino()
     settings = {} if variant.threads is None else {"INFERENCE_NUM_THREADS": variant.threads}
     compiled = openvino.Core().compile_model(str(variant.network), "CPU", settings)
     feed = np.random.default_rng(1).integers(0, 256, tuple(compiled.input(0).shape), dtype=np.uint8)

@@ -11,10 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import U8, Floats
-from trilane.stages.gpu.mesh_draw import MeshDraw
-from trilane.stages.gpu.packed_pass import Placement, Quantisation
-from trilane.stages.gpu.skinned_mesh import SkinnedMesh
-from trilane.stages.gpu.texture_array import check_texture, texture_array
+from trilane.stages.gpu.packed_pass import Placement, Quantisation, check_texture, texture_array
+from trilane.stages.gpu.skinned_mesh import MeshDraw, SkinnedMesh
 
 
 class SplitPass:

@@ -19,12 +19,12 @@ from trilane.pipeline.description import Pipeline
 from trilane.pipeline.shared_assets import Assets
 from trilane.pipeline.stage import Skip, UnitContext
 from trilane.pipeline.unit_loop import factory_named
-from trilane.scene.work import Work
+from trilane.scene.planner import FrameWork
 from trilane.stages.avatar_assets import network_of
 from trilane.stages.avatar_pipeline import avatar_pipeline
 from trilane.stages.configure import Checked
 from trilane.stages.cpu.pose import PoseStage
-from trilane.stages.gpu.opengl_context import CONTEXT, open_context
+from trilane.stages.gpu.opengl import CONTEXT, open_context
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 Units = Mapping[str, UnitContext]
@@ -117,14 +117,14 @@ class AvatarFrames:
 
     @property
     def posed(self) -> NDArray[np.void]:
-        """What the pose stage said of the frame that was made last: a header as in `stages/packets.py`."""
+        """What the pose stage said of the frame that was made last: a header as in `stages/config.py`."""
         return self._chain.packets[0].header
 
     @property
     def tensor(self) -> str:
         """Height x width of the last frame's tensor; `none` when nobody was seen and none was made."""
         height, width = self.posed["tensor_shape"].tolist()
-        return f"{height}x{width}" if int(self.posed["work"]) == Work.FULL else "none"
+        return f"{height}x{width}" if int(self.posed["work"]) == FrameWork.FULL else "none"
 
     def _picture(self, packet: Packet) -> U8:
         height, width, channels = self._shape

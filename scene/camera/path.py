@@ -1,7 +1,8 @@
-"""A camera over time, whatever its source: poses at increasing times, sampled at any time, and its lenses.
+"""A camera over time, whatever its source: poses at increasing times, their lenses, and the built-in cameras.
 
-Rule: a pose is camera to world, OpenGL axes (x right, y up, looks along -Z), world Y up. Between samples place and lens
-are interpolated linearly and the turn by slerp; after the last sample the path loops or is run backwards (`wrap`).
+A pose is camera to world with OpenGL axes (x right, y up, looks along -Z) and world Y up. Between samples, place and
+lens are interpolated linearly, the turn by slerp. After the last sample the path loops or is run backwards (`wrap`). A
+built-in camera is a formula of time for a person at the origin who faces +Z, sampled over one cycle.
 """
 
 from __future__ import annotations
@@ -11,10 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from trilane.arrays import F64
-from trilane.scene.detected import NOTHING, Detected
 from trilane.scene.lens import Lens, of_fov_y
 from trilane.scene.motion.motion import Wrap, bracket, wrapped_time
-from trilane.scene.rotations import matrix_from_quat, slerp
+from trilane.scene.recordings import NOTHING, Detected
+from trilane.scene.rotations import matrix_from_quat, quat_from_matrix, slerp
+from trilane.scene.schema import CameraSpec
 from trilane.shapes import Shape
 
 ROUNDING_S = 1e-6
@@ -82,7 +84,7 @@ class Optics:
     turned: tuple[int, ...] = ()
 
     def lens(self, i: int, j: int, fraction: float, output: Shape) -> Lens:
-        """Of a picture of `output` (height, width), at `fraction` of the way from sample `i` to sample `j`.
+        """The lens of a picture of `output` (height, width), at `fraction` of the way from sample `i` to sample `j`.
 
         Over what the camera filmed it is cut as that is; else the picture's height is the camera's.
         """
@@ -98,7 +100,7 @@ class Optics:
 
 
 def one_lens(fov_y_deg: float, near_m: float, far_m: float) -> Optics:
-    """Of a camera of which the field of view over the picture's height is known."""
+    """Optics with one lens for all samples. `fov_y_deg`: field of view over the picture's height."""
     return Optics((of_fov_y(fov_y_deg),), near_m, far_m)
 
 
@@ -106,8 +108,8 @@ def one_lens(fov_y_deg: float, near_m: float, far_m: float) -> Optics:
 class CameraPath:
     """A camera over time.
 
-    `times_s` (N,): from 0, strictly increasing. `quats` (N, 4) and `places` (N, 3), metres: camera to world. `notes`:
-    how the source was read, for people. `wrap`: what follows the last sample. `recorded`: whether the path
+    `times_s` (N,): times from 0, strictly increasing. `quats` (N, 4) and `places` (N, 3), metres: camera to world.
+    `notes`: how the source was read, for people. `wrap`: what follows the last sample. `recorded`: whether the path
     comes from a recording, which has to be placed in the scene. `detected`: what its file is. `pictures`: names of the
     photos that the samples are of, one for each; empty where the file names none. `quarter`: quarters by which the
     camera's picture was turned clockwise. `is_held`: whether each sample holds, halfway to its neighbours, because its
@@ -170,15 +172,105 @@ class CameraPath:
         return view_from_pose(*self.pose(t_s))
 
     def own_lens(self, t_s: float) -> Lens:
-        """At `t_s`, of the picture that the camera took."""
+        """The lens at `t_s`, for the picture that the camera took."""
         i, j, fraction = self._between(t_s)
         lenses = self.optics.lenses
         return lenses[i % len(lenses)].between(lenses[j % len(lenses)], fraction) if len(lenses) > 1 else lenses[0]
 
     def lens(self, t_s: float, output: Shape) -> Lens:
-        """At `t_s`, of a picture of `output` (height, width)."""
+        """The lens at `t_s`, for a picture of `output` (height, width)."""
         return self.optics.lens(*self._between(t_s), output)
 
     def projection(self, t_s: float, output: Shape) -> F64:
         """OpenGL clip matrix (4, 4) at `t_s` for a picture of `output` (height, width)."""
         return self.lens(t_s, output).projection(self.optics.near_m, self.optics.far_m)
+
+
+FOV_Y_DEG = 40.0
+RATE_HZ = 30
+
+
+@dataclass(frozen=True)
+class Orbit:
+    """A swing of `swing_deg` either way round `target` in `period_s`, from `far_m` in to `near_m` and back."""
+
+    what: str
+    target: tuple[float, float, float]
+    height_m: float
+    far_m: float
+    near_m: float
+    swing_deg: float
+    period_s: float
+
+    def places(self, phase: F64) -> F64:
+        """Places (N, 3), metres, at `phase` (N,) of the cycle, radians."""
+        angle = np.radians(self.swing_deg) * np.sin(phase - 0.6)
+        distance = self.far_m + (self.near_m - self.far_m) * (1 - np.cos(phase)) / 2
+        return np.column_stack([distance * np.sin(angle), np.full(len(phase), self.height_m), distance * np.cos(angle)])
+
+
+@dataclass(frozen=True)
+class Descent:
+    """A way from `top_deg` above `target` down to `low_m` and back, on an arc of `distance_m` in the plane x = 0."""
+
+    what: str
+    target: tuple[float, float, float]
+    distance_m: float
+    top_deg: float
+    low_m: float
+    period_s: float
+
+    def places(self, phase: F64) -> F64:
+        """Places (N, 3), metres, at `phase` (N,): the top at 0, `low_m` after half a cycle."""
+        top, low = np.radians(self.top_deg), np.arcsin((self.low_m - self.target[1]) / self.distance_m)
+        angle = low + (top - low) * (1 + np.cos(phase)) / 2
+        arc = np.column_stack([np.zeros(len(phase)), np.sin(angle), np.cos(angle)])
+        return np.asarray(np.array(self.target) + self.distance_m * arc)
+
+
+@dataclass(frozen=True)
+class Stand:
+    """Stands at `place` and looks at `target`."""
+
+    what: str
+    target: tuple[float, float, float]
+    place: tuple[float, float, float]
+    period_s: float = 1.0
+
+    def places(self, phase: F64) -> F64:
+        """Its one place, for each of `phase` (N,): (N, 3), metres."""
+        return np.tile(self.place, (len(phase), 1))
+
+
+ORBITS = {
+    "orbit": Orbit("whole person, going round, coming nearer", (0.0, 0.93, 0.0), 1.35, 3.9, 3.4, 28.0, 20.0),
+    "static": Orbit("whole person, standing still", (0.0, 0.93, 0.0), 1.30, 3.8, 3.8, 0.0, 20.0),
+    "closeup": Orbit("head and shoulders", (0.0, 1.50, 0.0), 1.58, 1.15, 0.95, 16.0, 12.0),
+    "far": Orbit("whole person, far off", (0.0, 1.00, 0.0), 1.60, 10.0, 8.0, 10.0, 20.0),
+}
+
+
+#: Name: the camera.
+BUILTIN: dict[str, Orbit | Descent | Stand] = {
+    **ORBITS,
+    "top-to-floor": Descent("whole person, from above down to the floor", (0.0, 0.90, 0.0), 3.9, 80.0, 0.12, 12.0),
+    "wayside": Stand("beside the way of one who walks along z", (-0.1, 1.05, -2.5), (0.9, 1.45, 1.9)),
+}
+
+
+def _pace(camera: Orbit | Descent | Stand) -> str:
+    return "fixed" if isinstance(camera, Stand) else f"{camera.period_s:g} s a cycle"
+
+
+def load_builtin(name: str, spec: CameraSpec) -> CameraPath | None:
+    """The camera `name`, or None when there is none of that name."""
+    camera = BUILTIN.get(name)
+    if camera is None:
+        return None
+    count = int(camera.period_s * RATE_HZ)
+    times = np.arange(count + 1) / RATE_HZ
+    places = camera.places(2 * np.pi * times / camera.period_s)
+    fov = FOV_Y_DEG if spec.fov_y_deg is None else spec.fov_y_deg
+    notes = (f"built in: {camera.what}, {_pace(camera)}, field of view {fov:g} degrees high",)
+    quats = quat_from_matrix(axes_towards(places, np.array(camera.target)))
+    return CameraPath(times, quats, places, one_lens(fov, spec.near_m, spec.far_m), notes, Wrap.LOOP, recorded=False)

@@ -1,13 +1,17 @@
-"""Tables with a time, a place and a quaternion in each line, whatever the order of their columns.
+"""Text tables of camera poses: one pose a line, numbers parted by blanks or commas, `#` for comments.
 
-Rule: column names decide the order where a file has them, else its format does. Columns that most often hold no
-quaternion are refused: taken for one, another order of columns would give a camera that looks anywhere.
+Every line has as many numbers as the others; the error names the first that has not. An empty field between two commas
+is NaN, at the end of a line it is nothing. Column names, in a comment or in the first line, win over the order of the
+format. Columns that seldom hold a quaternion of length 1 are refused: another order of columns would give a camera that
+looks anywhere.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,8 +20,193 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F64
 from trilane.errors import BadInputError
-from trilane.scene.camera.text_table import POSE, Table, Times, layout_of, read_table, times_of
+from trilane.files import read_text
+from trilane.scene.camera.recorded import FILM_RATE_HZ
 from trilane.scene.rotations import matrix_from_quat, normalised
+
+MAX_ROWS = 1_000_000
+#: Rows by which it is told what columns hold.
+HEAD = 3000
+#: With a median step above this, times are in nanoseconds, else in seconds.
+LEAST_STEP_NS = 1e3
+#: A time above this is in nanoseconds whatever the steps are: in seconds it would be 30 million years.
+LEAST_TIME_NS = 1e15
+#: Lines of numbers by which a table's layout is told.
+LOOKED_AT = 20
+#: Whole numbers below this that mostly grow by 1, in this share of the steps at least, number frames.
+MOST_FRAMES, LEAST_GROWING = 1e7, 0.75
+#: Unit of a first column that numbers frames.
+FRAMES = "frames"
+#: What is left out of a column's name: its unit, the frames of EuRoC's symbols, and all but letters and digits.
+UNIT, SYMBOLS, OTHER = re.compile(r"\[[^\[\]]*\]"), re.compile(r"_rs(_r)?_"), re.compile(r"[^a-z0-9]")
+#: A column's name -> what it holds.
+KNOWN = {
+    **{name: "time" for name in ("timestamp", "time", "t", "timestamps", "timestampns")},
+    **{name: axis for axis in "xyz" for name in (axis, f"t{axis}", f"p{axis}", f"pos{axis}")},
+    **{name: f"q{part}" for part in "wxyz" for name in (f"q{part}", f"rot{part}")},
+    **{name: name for name in ("frame", "fx", "fy", "cx", "cy")},
+}
+POSE = ("time", "x", "y", "z", "qw", "qx", "qy", "qz")
+
+
+class NumberTable(NamedTuple):
+    """`numbers` (N, columns): numbers of each pose. `lines` (N,): line of each, from 1 on."""
+
+    numbers: NDArray[np.float64]
+    lines: NDArray[np.int64]
+
+    def place_of(self, index: int) -> str:
+        """Where pose `index` stands in the file."""
+        return f"line {self.lines[index]}"
+
+
+class TableLayout(NamedTuple):
+    """How the first line of a table with numbers looks.
+
+    `columns`: how many there are. `names`: what each holds, by KNOWN, "" for others; none without column names.
+    `has_commas`: whether they part the numbers. `is_ns`: whether the first column has times in nanoseconds.
+    """
+
+    columns: int
+    names: tuple[str, ...]
+    has_commas: bool
+    is_ns: bool
+
+    @property
+    def has_pose(self) -> bool:
+        """Whether the names say where time, place and quaternion are."""
+        return all(name in self.names for name in POSE)
+
+
+def read_table(path: Path, columns: int, expected: str) -> NumberTable:
+    """The poses of `path`, at least one; `nan` and `inf` stay. Raises BadInputError with the line."""
+    rows, lines = [], []
+    for number, words in _rows(path, expected):
+        if len(words) != columns:
+            raise BadInputError(f"{path}, line {number}", f"{len(words)} columns", expected)
+        try:
+            rows.append([float(word) for word in words])
+            lines.append(number)
+        except ValueError as error:
+            raise BadInputError(f"{path}, line {number}", str(error), expected) from None
+    if not rows or len(rows) > MAX_ROWS:
+        raise BadInputError(path, f"{len(rows)} poses", f"1 to {MAX_ROWS}; {expected}")
+    return NumberTable(np.array(rows), np.array(lines))
+
+
+def head_of(path: Path, columns: int, expected: str) -> NDArray[np.float64]:
+    """The numbers (N, columns) of the first rows that have as many; N may be 0. Raises BadInputError."""
+    rows = (words for _, words in islice(_rows(path, expected), HEAD))
+    numbers = ([value for word in words for value in _number(word)] for words in rows)
+    return np.array([row for row in numbers if len(row) == columns]).reshape(-1, columns)
+
+
+def layout_of(path: Path, expected: str) -> TableLayout:
+    """The layout of the first line of numbers; it has no columns where there is no such line. Raises BadInputError."""
+    names: tuple[str, ...] = ()
+    first: list[str] = []
+    times: list[float] = []
+    has_commas = False
+    for line in read_text(path, expected).splitlines():
+        words = words_of(line)
+        if found := names_in(line):
+            names = names if times else found
+        elif words:
+            first, has_commas = first or words, has_commas or "," in line
+            times += _number(words[0])
+        if len(times) == LOOKED_AT:
+            break
+    with np.errstate(over="ignore"):
+        is_ns = bool(times) and (elapsed(np.array(times))[1] > LEAST_STEP_NS or abs(times[0]) > LEAST_TIME_NS)
+    return TableLayout(len(first), names, has_commas, is_ns)
+
+
+def _number(word: str) -> list[float]:
+    """`word` as a number, if it is a finite one."""
+    try:
+        return [float(word)] if np.isfinite(float(word)) else []
+    except ValueError:
+        return []
+
+
+def names_in(line: str) -> tuple[str, ...]:
+    """What the columns hold, if `line`, which may be a comment, names four or more that are known; else nothing."""
+    text = UNIT.sub("", line.strip().lstrip("#"))
+    words = text.split(",") if "," in text else text.split()
+    plain = (OTHER.sub("", SYMBOLS.sub("", word.strip().lower())) for word in words)
+    names = tuple(KNOWN.get(word, "") for word in plain)
+    return names if len({*names} - {""}) >= 4 else ()
+
+
+def elapsed(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Times (N,) since the first finite one, and the median of their steps, 0 with fewer than two. NaNs stay NaN."""
+    finite = times[np.isfinite(times)]
+    if len(finite) < 2:
+        return times - times[0], 0.0
+    return times - finite[0], float(np.median(np.diff(finite)))
+
+
+def in_seconds(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], float, str]:
+    """Seconds since the first finite time, their median step, and the unit of `times` (N,), `ns` or `s`."""
+    since, step = elapsed(times)
+    unit, scale = ("ns", 1e-9) if step > LEAST_STEP_NS else ("s", 1.0)
+    return since * scale, step * scale, unit
+
+
+class ColumnTimes(NamedTuple):
+    """`since_s` (N,): since the first finite one. `unit`: of the column, `s`, `ns` or `frames`.
+
+    `rate`: how many a second, for notes, such as `, 30/s`; empty where it is unknown.
+    """
+
+    since_s: NDArray[np.float64]
+    unit: str
+    rate: str
+
+
+def times_of(column: NDArray[np.float64], rate_hz: float | None, usual_hz: float = FILM_RATE_HZ) -> ColumnTimes:
+    """The times in the first column of a table, or those of its numbers of frames.
+
+    `rate_hz`: frames a second by the scene; None for `usual_hz`.
+    """
+    if is_index(column):
+        rate = rate_hz or usual_hz
+        return ColumnTimes(
+            elapsed(column)[0] / rate, FRAMES, f", {rate:g} a second {'as given' if rate_hz else 'assumed'}"
+        )
+    since, step, unit = in_seconds(column)
+    return ColumnTimes(since, unit, f", {1 / step:.4g}/s" if step > 0 else "")
+
+
+def is_index(column: NDArray[np.float64]) -> bool:
+    """Whether a column (N,) numbers frames; some may be missing."""
+    finite = column[np.isfinite(column)]
+    if len(finite) < 2 or not ((finite % 1 == 0) & (finite >= 0) & (finite < MOST_FRAMES)).all():
+        return False
+    steps = np.diff(finite)
+    return bool(np.median(steps) == 1 and (steps >= 1).mean() >= LEAST_GROWING)
+
+
+def words_of(line: str) -> list[str]:
+    """The fields of a line without its comment."""
+    text = line.split("#", 1)[0]
+    if "," not in text:
+        return text.split()
+    fields = [word for field in text.split(",") for word in field.split() or ["nan"]]
+    while fields and text.rstrip().endswith(",") and fields[-1] == "nan":
+        fields.pop()
+        text = text.rstrip()[:-1]
+    return fields
+
+
+def _rows(path: Path, expected: str) -> Iterator[tuple[int, list[str]]]:
+    is_first = True
+    for number, line in enumerate(read_text(path, expected).splitlines(), 1):
+        words = words_of(line)
+        if words and not (is_first and names_in(" ".join(words))):
+            yield number, words
+        is_first = is_first and not words
+
 
 USUAL = "as usual"
 SAY_ORDER = "say the order in a first line, such as `timestamp qx qy qz qw tx ty tz`"
@@ -31,7 +220,7 @@ MOST_OFF = 0.02
 
 @dataclass(frozen=True)
 class PoseTable:
-    """`times_s` (N,): from 0. `turns` (N, 3, 3) and `places` (N, 3): as the file has them.
+    """`times_s` (N,): times from 0. `turns` (N, 3, 3) and `places` (N, 3): as the file has them.
 
     `time`: unit of the file's times. `rate`: for notes, such as `, 30/s`. `order`: where the order of columns comes
     from. `names`: what the columns of `table` hold. `began_s`: at a time of 0, seconds since 1970; None where the file
@@ -45,7 +234,7 @@ class PoseTable:
     rate: str
     order: str
     names: Sequence[str]
-    table: Table
+    table: NumberTable
     began_s: float | None
 
     def column(self, name: str) -> F64:
@@ -58,8 +247,8 @@ def read_pose_table(
 ) -> PoseTable:
     """The poses of `path`.
 
-    `rate_hz`: of the scene. `usual`: what columns hold in the format. `may_have_more`: whether others may follow.
-    Raises BadInputError with the line.
+    `rate_hz`: frames a second by the scene. `usual`: contents of the columns by the format. `may_have_more`: whether
+    other columns may follow. Raises BadInputError with the line.
     """
     layout = layout_of(path, expected)
     names = layout.names if layout.has_pose else tuple(usual)
@@ -82,16 +271,16 @@ def read_pose_table(
 class MatrixTable(NamedTuple):
     """`turns` (N, 3, 3) and `places` (N, 3): as the file has them. `times`: None where it has none."""
 
-    times: Times | None
+    times: ColumnTimes | None
     turns: F64
     places: F64
-    table: Table
+    table: NumberTable
 
 
 def read_matrix_table(path: Path, rate_hz: float | None, usual_hz: float, expected: str) -> MatrixTable:
     """The poses of `path`, 3x4 matrices row by row, with a time or the number of the frame before each, or without.
 
-    `rate_hz`: of the scene. `usual_hz`: of frames that are numbered. Raises BadInputError with the line.
+    `rate_hz`: rate of numbered frames by the scene; None for `usual_hz`. Raises BadInputError with the line.
     """
     columns = MATRIX if layout_of(path, expected).columns == MATRIX else MATRIX + 1
     table = read_table(path, columns, expected)
@@ -107,8 +296,8 @@ def _began(times: F64, unit: str) -> float | None:
     return first if EARLIEST_S < first < LATEST_S else None
 
 
-def _require_quats(path: Path, quats: F64, table: Table) -> None:
-    """Raises BadInputError when most of `quats` (N, 4), which are of `table`, have not length 1."""
+def _require_quats(path: Path, quats: F64, table: NumberTable) -> None:
+    """Raises BadInputError when most of `quats` (N, 4) have not length 1. `table`: the table that has them."""
     off = is_off(quats)
     if 2 * np.count_nonzero(off) <= len(off):
         return
@@ -122,7 +311,7 @@ def _require_quats(path: Path, quats: F64, table: Table) -> None:
 
 
 def is_off(quats: F64, most: float = MOST_OFF) -> NDArray[np.bool_]:
-    """Of which rows (N, 4) the length is off 1 by more than `most`; not of those that are no rotation at all."""
+    """Which rows (N, 4) have a length that differs from 1 by more than `most`; rows that are no rotation have not."""
     with np.errstate(over="ignore", invalid="ignore"):
         length = np.linalg.norm(quats, axis=1)
         return np.asarray(np.isfinite(length) & (length > 0) & (np.abs(length - 1) > most))

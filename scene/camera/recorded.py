@@ -1,26 +1,296 @@
-"""A recorded camera to a CameraPath: bad poses left out, world Y up, picture the right way up.
+"""Turns a recorded camera into a CameraPath: it finds the unit of the map, its up and how the device was held.
 
-Rule: the movement from pose to pose never changes. Two constant turns are applied: one of the world, so that +Y is up,
-and one of the picture by a multiple of 90 degrees, as a phone turns its display.
+The movement from pose to pose never changes. Three constants are applied: one turn of the world, so that +Y is up, one
+turn of the picture by a multiple of 90 degrees, as a phone turns its display, and one scale to metres.
+
+**Unit.** The scene states it, or the format defines it as a metre. Where the format has none, or its cameras would be
+faster than anything that carries one, a person would fill the pictures where the cameras look.
+
+**Up.** People hold a camera level. Each axis of the world is tried with each quarter turn of the picture. A guess costs
+more the farther the horizon is from level, the more steeply the camera looks down or up and the more that changes, and
+where it is not the format's usual axis or turns the picture. The cheapest guess wins; a near rival is named. Where no
+axis fits, and the horizons agree on a direction between the axes, that direction is up.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
+from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import F64
-from trilane.scene.camera.map_frame import Unit, metres_per_unit, near_origin
 from trilane.scene.camera.path import CameraPath, Optics, one_lens
-from trilane.scene.camera.upright import UP
-from trilane.scene.camera.upright import upright as find_upright
-from trilane.scene.detected import NOTHING, Detected
 from trilane.scene.lens import Lens
-from trilane.scene.motion.usable_samples import PlaceOf, by_number, usable_samples
+from trilane.scene.recordings import NOTHING, Detected, PlaceOf, by_number, usable_samples
 from trilane.scene.rotations import about, quat_from_matrix, shortest_turn
 from trilane.scene.schema import CameraSpec
+
+#: An origin from which the middle of all places is farther than this is moved there; beyond it, float32 no longer
+#: resolves tenths of a millimetre.
+MAP_M = 1e3
+#: Above this median speed the unit of a map is no metre.
+FASTEST_M_S = 40.0
+#: How high a person is, and which part of the picture's height one fills where the cameras look.
+PERSON_M, SHARE = 1.7, 0.75
+#: Lines of sight that are less apart than this (least eigenvalue of their mean projection) meet nowhere.
+LEAST_SPREAD = 0.02
+#: How far a camera goes from end to end that looks at nothing in particular.
+PATH_M = 2.0
+
+
+class LengthUnit(Enum):
+    """The unit of a format's lengths: metres by its definition, usually metres, or none."""
+
+    METRES = "metres"
+    USUALLY_M = "usually metres"
+    NONE = "none"
+
+
+def near_origin(places: F64) -> tuple[F64, tuple[str, ...]]:
+    """`places` (N, 3) without the offset of a map, such as UTM coordinates have, and a note on it."""
+    finite = np.isfinite(places).all(axis=1)
+    middle = np.median(places[finite], axis=0) if finite.any() else np.zeros(3)
+    if np.abs(middle).max() <= MAP_M:
+        return places, ()
+    offset = np.round(middle)
+    text = ", ".join(f"{value:.0f}" for value in offset)
+    return places - offset, (f"origin of the map moved: ({text}) subtracted from all places",)
+
+
+def metres_per_unit(
+    turns: F64, places: F64, times_s: F64, fov_y_deg: float, unit: LengthUnit, spec: CameraSpec
+) -> tuple[float, tuple[str, ...]]:
+    """The metres that a length of 1 of the map is, and notes on them.
+
+    `turns` (N, 3, 3) and `places` (N, 3): camera to world, OpenGL axes. `times_s` (N,). `fov_y_deg`: of the picture's
+    height. `unit`: unit of the format. `spec`: camera of the scene.
+    """
+    if spec.metres_per_unit is not None:
+        return spec.metres_per_unit, (f"1 unit of the file is {spec.metres_per_unit:g} m, as given",)
+    speed = _speed(places, times_s)
+    if unit is LengthUnit.METRES or (unit is LengthUnit.USUALLY_M and speed <= FASTEST_M_S):
+        return 1.0, ()
+    reason = "the file has no unit" if unit is LengthUnit.NONE else f"at {speed:.0f} m/s its unit can be no metre"
+    if spec.place == "none":
+        return 1.0, (f"{reason}: 1 unit is taken for 1 m, as camera.place is none; camera.metres_per_unit decides",)
+    scale, how = _fitting(turns, places, fov_y_deg)
+    return scale, (f"{reason}: 1 unit is taken for {scale:.4g} m, so that {how}; camera.metres_per_unit decides",)
+
+
+def _speed(places: F64, times_s: F64) -> float:
+    """The median speed, units a second; 0 of one place."""
+    if len(places) < 2:
+        return 0.0
+    return float(np.median(np.linalg.norm(np.diff(places, axis=0), axis=1) / np.diff(times_s)))
+
+
+def _fitting(turns: F64, places: F64, fov_y_deg: float) -> tuple[float, str]:
+    """A scale by the shape of the path and where it looks alone, and its effect in words."""
+    distance = looked_at_from(turns, places)
+    if distance is not None:
+        wanted = PERSON_M / SHARE / (2 * np.tan(np.radians(fov_y_deg) / 2))
+        return float(wanted / distance), f"a person fills {SHARE:.0%} of the picture's height where the cameras look"
+    length = float(np.linalg.norm(places.max(axis=0) - places.min(axis=0)))
+    if length == 0.0:
+        return 1.0, "nothing changes, as the camera stays where it is"
+    return PATH_M / length, f"the path is {PATH_M:g} m from end to end"
+
+
+def looked_at_from(turns: F64, places: F64) -> float | None:
+    """The median distance of the cameras from the point that is nearest to all their lines of sight.
+
+    None where the lines are nearly parallel, or meet behind the cameras. The point solves the normal equations of the
+    distances: sum (1 - d d') (x - p) = 0 for places p and unit directions d.
+    """
+    ahead = -turns[:, :, 2]
+    across = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
+    if np.linalg.eigvalsh(across.mean(axis=0))[0] < LEAST_SPREAD:
+        return None
+    point = np.linalg.solve(across.sum(axis=0), (across @ places[:, :, None]).sum(axis=0)[:, 0])
+    towards = point - places
+    distance = float(np.median(np.linalg.norm(towards, axis=1)))
+    in_front = float(np.median((towards * ahead).sum(axis=1)))
+    return distance if in_front > 0.5 * distance > 0 else None
+
+
+AUTO = "auto"
+UP: dict[str, tuple[float, float, float]] = {
+    "y": (0.0, 1.0, 0.0),
+    "z": (0.0, 0.0, 1.0),
+    "-y": (0.0, -1.0, 0.0),
+    "x": (1.0, 0.0, 0.0),
+    "-z": (0.0, 0.0, -1.0),
+    "-x": (-1.0, 0.0, 0.0),
+}
+#: The mean cosine of a picture's up with the world's must be above this.
+LEAST_UP_COSINE = 0.3
+#: What a horizon is dear that is off by a radian (root mean square), a line of sight that goes up and down by a radian
+#: (standard deviation; people turn round, but seldom look up and down), and one that is never level.
+PER_ROLL, PER_TILT, PER_PITCH = 2.0, 1.0, 0.5
+
+
+@dataclass(frozen=True)
+class _Prices:
+    """Costs of a guess: an unusual axis, a turned picture, a direction between the axes (None: it is never guessed)."""
+
+    axis: float
+    turn: float
+    between: float | None
+
+
+#: Of a format whose world is whatever the program chose, and of one whose world is aligned with gravity by definition.
+#: In the first a turn of the device is believed after every axis: it costs what another axis costs, and what the
+#: picture's own up can be off an axis (45 degrees) besides.
+ANY_WORLD, LEVELLED = _Prices(0.2, 0.4, 0.25), _Prices(0.4, 0.1, None)
+#: A direction between the axes is believed when the cameras pan by this, in radians (root mean square), and it is
+#: farther than this cosine from every axis.
+LEAST_PAN, MOST_AXIS_COSINE = 0.15, 0.995
+#: Cosine above which the first picture's axes, OpenGL's or optical ones, are the world's; and what is said then, as
+#: nothing else tells it.
+AS_FIRST = 1 - 1e-8
+OF_FIRST = "; the axes are those of the first picture: if that looked down or up, the floor is tilted by as much"
+#: A rival this much dearer than the best is named.
+NEAR = 0.1
+
+
+@dataclass(frozen=True)
+class Upright:
+    """`up` (3,): the world's, of unit length. `quarter`: how many times the picture is turned by 90 degrees."""
+
+    up: F64
+    quarter: int
+    note: str
+
+
+@dataclass(frozen=True)
+class _Guess:
+    name: str
+    up: F64
+    quarter: int
+    price: float
+
+
+def find_upright(turns: F64, usual: str, is_levelled: bool, stated: str = AUTO) -> Upright:
+    """Up of a world, and the quarter turns of the picture, of cameras with axes `turns` (N, 3, 3), camera to world.
+
+    `usual`: the axis that is up in the format. `is_levelled`: whether the format's world is aligned with gravity by
+    definition. `stated`: what the scene says is up; only turns of the picture are tried then.
+    """
+    expected = usual if stated == AUTO else stated
+    guesses = _guesses(turns, expected, LEVELLED if is_levelled else ANY_WORLD, stated)
+    if not guesses:
+        return Upright(np.array(UP[expected]), 0, f"{expected.upper()} up, {_why_without(stated)}")
+    best = min(guesses, key=lambda guess: guess.price)
+    of_first = OF_FIRST if best.name and not is_levelled and _is_of_first(turns, best) else ""
+    return Upright(best.up, best.quarter, _note(best, usual, stated) + _rival(best, guesses, stated) + of_first)
+
+
+def price_of(turns: F64, usual: str) -> float:
+    """The cost of the cheapest guess for cameras with axes `turns` (N, 3, 3): 0 where they are level about `usual`."""
+    return min((guess.price for guess in _guesses(turns, usual, ANY_WORLD, AUTO)), default=math.inf)
+
+
+def _guesses(turns: F64, expected: str, prices: _Prices, stated: str) -> list[_Guess]:
+    axes = UP if stated == AUTO else {stated: UP[stated]}
+    guesses = [
+        _Guess(name, np.array(up), quarter, price + (name != expected) * prices.axis + (quarter > 0) * prices.turn)
+        for name, up in axes.items()
+        for quarter in range(4)
+        if (price := _price(turns, np.array(up), quarter)) is not None
+    ]
+    if stated != AUTO or prices.between is None:
+        return guesses
+    return guesses + _between(turns, prices.between)
+
+
+def _is_of_first(turns: F64, best: _Guess) -> bool:
+    """Whether the world's axes are those of the first of several pictures, as in a SLAM map, and up is its own up."""
+    first = turns[0]
+    is_unturned = abs(first[0, 0]) > AS_FIRST and abs(first[1, 1]) > AS_FIRST
+    return len(turns) > 1 and bool(is_unturned and first[0, 0] > 0 and first[:, 1] @ best.up > AS_FIRST)
+
+
+def _why_without(stated: str) -> str:
+    return "as given" if stated != AUTO else "usual for the format; the pictures show no horizon to tell it by"
+
+
+def _ups_and_rights(turns: F64, quarter: int) -> tuple[F64, F64]:
+    """Up and right (N, 3) of pictures that are turned by `quarter` times 90 degrees."""
+    x, y = turns[:, :, 0], turns[:, :, 1]
+    return ((y, x), (-x, y), (-y, -x), (x, -y))[quarter]
+
+
+def _price(turns: F64, up: F64, quarter: int) -> float | None:
+    """The cost of a pair by its horizons and lines of sight; None when the picture's up is not up at all."""
+    ups, rights = _ups_and_rights(turns, quarter)
+    cosine = float((ups @ up).mean())
+    if cosine <= LEAST_UP_COSINE:
+        return None
+    roll, tilt = float(np.sqrt(np.mean((rights @ up) ** 2))), float(np.std(turns[:, :, 2] @ up))
+    return PER_ROLL * roll + PER_TILT * tilt + PER_PITCH * (1.0 - cosine)
+
+
+def _between(turns: F64, dearer: float) -> list[_Guess]:
+    """The direction to which the horizons of all pictures are level, most nearly: at right angles to their rights."""
+    ups, rights = _ups_and_rights(turns, 0)
+    spread, directions = np.linalg.eigh(rights.T @ rights / len(rights))
+    direction = directions[:, 0] if (ups @ directions[:, 0]).mean() >= 0 else -directions[:, 0]
+    if spread[1] < LEAST_PAN**2 or np.abs(direction).max() > MOST_AXIS_COSINE:
+        return []
+    price = _price(turns, direction, 0)
+    return [] if price is None else [_Guess("", direction, 0, price + dearer)]
+
+
+def _note(best: _Guess, usual: str, stated: str) -> str:
+    turned = f", device held so that the picture is turned by {best.quarter * 90} degrees" if best.quarter else ""
+    if not best.name:
+        nearest = max(UP, key=lambda name: float(best.up @ UP[name]))
+        off = np.degrees(np.arccos(np.clip(best.up @ UP[nearest], -1, 1)))
+        return f"up is {off:.0f} degrees off {nearest.upper()}, where the pictures' horizons are level"
+    if stated != AUTO:
+        return f"{best.name.upper()} up, as given{turned}"
+    if best.name != usual:
+        return f"{best.name.upper()} up, as the camera is held (not {usual.upper()}, usual for the format){turned}"
+    return f"{best.name.upper()} up{turned}"
+
+
+def _rival(best: _Guess, guesses: list[_Guess], stated: str) -> str:
+    """The next guess, when it is nearly as cheap and the two are far apart."""
+    rivals = [g for g in guesses if g.name and g is not best and g.price < best.price + NEAR]
+    rivals = [g for g in rivals if g.quarter != best.quarter or g.up @ best.up < np.sqrt(0.5)]
+    if not rivals or stated != AUTO:
+        return ""
+    rival = min(rivals, key=lambda guess: guess.price)
+    turned = f" with the picture turned by {rival.quarter * 90} degrees" if rival.quarter else ""
+    return f"; {rival.name.upper()} up{turned} fits nearly as well: camera.up_axis decides"
+
+
+FILM_RATE_HZ = 30.0
+FILM_STEP_DEG = 6.0
+
+
+def times_without(turns: F64, rate_hz: float | None) -> tuple[F64, str]:
+    """Seconds (N,) of views with camera axes `turns` (N, 3, 3), and how they were decided.
+
+    `rate_hz`: views a second by the scene, if it says so. Views less than FILM_STEP_DEG apart are a film, others are
+    stills.
+    """
+    rate, how = _rate(turns) if rate_hz is None else (rate_hz, f"{rate_hz:g} a second as given")
+    return np.arange(len(turns)) / rate, how
+
+
+def _rate(turns: F64) -> tuple[float, str]:
+    ahead = turns[:, :, 2]
+    cosine = np.clip((ahead[1:] * ahead[:-1]).sum(axis=1), -1, 1)
+    finite = cosine[np.isfinite(cosine)]
+    step = float(np.degrees(np.median(np.arccos(finite)))) if len(finite) else 0.0
+    if step > FILM_STEP_DEG:
+        return 1.0, f"stills {step:.0f} degrees apart, 1 a second"
+    return FILM_RATE_HZ, f"{FILM_RATE_HZ:g} a second assumed"
+
 
 #: A matrix is taken for a rotation when |R^T R - 1| is below this.
 SKEW = 0.05
@@ -36,12 +306,12 @@ class RawCamera:
     """The content of a camera file, before anything is left out or turned.
 
     `times_s` (N,): seconds. `turns` (N, 3, 3) and `places` (N, 3), metres: camera to world, OpenGL axes. `usual_up`:
-    the axis of the world that is usually up in the format. `lenses`: of the picture as the axes of a pose have it,
-    one for all poses or one for each; `lens`: where they come from. `notes`: on the file, for people. `place_of`: where
-    a sample stands in the file. `detected`: what the file is, but for its axes and lens. `pictures`: names of the
-    photos that the poses are of, one for each, or none. `is_levelled`: whether the world of the format is aligned with
-    gravity, by its definition. `unit`: of the lengths. `began_s`: at a time of 0, seconds since 1970; None where the
-    file does not say it.
+    the axis of the world that is usually up in the format. `lenses`: of the picture as the axes of a pose have it, one
+    for all poses or one for each; `lens`: where they come from. `notes`: on the file, for people. `place_of`: where a
+    sample stands in the file. `detected`: what the file is, but for its axes and lens. `pictures`: names of the photos
+    that the poses are of, one for each, or none. `is_levelled`: whether the world of the format is aligned with
+    gravity, by its definition. `unit`: unit of the lengths. `began_s`: at a time of 0, seconds since 1970; None where
+    the file does not say it.
     """
 
     times_s: F64
@@ -55,15 +325,15 @@ class RawCamera:
     detected: Detected = NOTHING
     pictures: tuple[str, ...] = ()
     is_levelled: bool = False
-    unit: Unit = Unit.METRES
+    unit: LengthUnit = LengthUnit.METRES
     began_s: float | None = None
 
 
 def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraPath:
     """The camera path of a file.
 
-    `raw`: its content. `where`: its path, for messages. `spec`: of the scene, with the lens. Raises BadInputError when
-    more than half of the poses are unusable.
+    `raw`: its content. `where`: its path, for messages. `spec`: camera of the scene, with its lens. Raises
+    BadInputError when more than half of the poses are unusable.
     """
     near, offset_notes = near_origin(raw.places)
     faults = _faults(raw.times_s, raw.turns, near)
@@ -77,14 +347,7 @@ def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraP
     optics, seen = _optics(raw, usable, upright.quarter, spec)
     fov_y_deg = float(np.median([lens.fov_y_deg for lens in optics.lenses]))
     scale, scale_notes = metres_per_unit(turns, places, times, fov_y_deg, raw.unit, spec)
-    notes = (
-        *raw.notes,
-        *offset_notes,
-        upright.note,
-        *scale_notes,
-        seen,
-        *repairs,
-    )
+    notes = (*raw.notes, *offset_notes, upright.note, *scale_notes, seen, *repairs)
     unit = " ".join(scale_notes) or raw.detected.unit
     detected = replace(raw.detected, axes=upright.note, unit=unit, lens=seen)
     pictures = tuple(raw.pictures[k] for k in usable) if raw.pictures else ()
@@ -102,7 +365,7 @@ def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraP
 
 
 def _optics(raw: RawCamera, usable: NDArray[np.intp], quarter: int, spec: CameraSpec) -> tuple[Optics, str]:
-    """The lenses of the `usable` poses, of a picture turned by `quarter`, and a note."""
+    """The lenses of the `usable` poses for a picture turned by `quarter`, and a note."""
     if spec.fov_y_deg is not None:
         optics = one_lens(spec.fov_y_deg, spec.near_m, spec.far_m)
         return optics, f"field of view {spec.fov_y_deg:.4g} degrees high, as given"
@@ -115,7 +378,7 @@ def _optics(raw: RawCamera, usable: NDArray[np.intp], quarter: int, spec: Camera
 
 
 def _faults(times_s: F64, turns: F64, places: F64) -> dict[str, NDArray[np.bool_]]:
-    """What can be wrong with a pose, in words, and which poses (N,) have it; a pose has one fault at most."""
+    """Faults of poses in words, and which poses (N,) have each; a pose has one fault at most."""
     finite = np.isfinite(times_s) & np.isfinite(turns).all(axis=(1, 2)) & np.isfinite(places).all(axis=1)
     safe, near = np.where(finite[:, None, None], turns, 0.0), np.where(finite[:, None], places, 0.0)
     rotation = are_rotations(safe)

@@ -1,6 +1,8 @@
 """The built-in motions: a person who walks, waves and turns; one who walks there and back; one who stands; the T pose.
 
-Rule: the tables below say what happens when; the curves between are computed, and a cycle ends where it began.
+Tables say what happens when; the curves between are computed, and a cycle ends where it began. In the poses of arms and
+hands, `side` is +1 for left and -1 for right; turns are local to the parent joint, from the T pose: +X left, +Y up, +Z
+ahead.
 """
 
 from __future__ import annotations
@@ -10,11 +12,53 @@ from collections.abc import Callable
 import numpy as np
 
 from trilane.arrays import F64
-from trilane.body.joints import JOINT_INDEX
-from trilane.scene.motion.arm_poses import hanging_arm, relaxed_hands, waving_arm
+from trilane.body.joints import JOINT_INDEX, JOINTS
 from trilane.scene.motion.footsteps import Build, FootTrack, Swing, Walker, blurred, smooth_step, solve_leg
-from trilane.scene.motion.motion import JOINTS, Motion, Wrap
-from trilane.scene.rotations import about, matrix_from_quat, quat_from_matrix, rotvec_from_matrix, slerp
+from trilane.scene.motion.motion import Motion, Wrap
+from trilane.scene.rotations import about, matrix_from_quat, normalised, quat_from_matrix, rotvec_from_matrix, slerp
+
+#: Angle of a hanging arm below the T pose, radians, without the collar's part.
+HANG = 1.27
+ELBOW_EASE = 0.22
+#: Directions of the right arm raised to wave: upper arm and forearm at the middle of the wave.
+UPPER_ARM = (-0.80, -0.38, 0.30)
+FOREARM = (-0.22, 0.95, 0.22)
+WAVE_REACH = 0.42
+#: Curl of a relaxed finger's three joints, radians.
+CURL = {
+    "index": (0.22, 0.32, 0.18),
+    "middle": (0.30, 0.38, 0.22),
+    "pinky": (0.38, 0.42, 0.25),
+    "ring": (0.34, 0.40, 0.24),
+}
+
+
+def hanging_arm(side: int, swing: F64) -> tuple[F64, F64, F64]:
+    """Shoulder, elbow and wrist (T, 3, 3) of an arm at the side, swung back by `swing` (T,) radians."""
+    shoulder = about(0, swing + 0.03) @ about(2, np.array(-side * HANG))
+    bend = ELBOW_EASE + np.clip(-swing, 0, None) * 0.7 + 0.1 * np.abs(swing)
+    elbow = about(1, -side * bend)
+    wrist = np.broadcast_to(about(2, np.array(-side * 0.08)), elbow.shape)
+    return shoulder, elbow, wrist
+
+
+def waving_arm(wave: F64) -> tuple[F64, F64, F64]:
+    """Shoulder, elbow and wrist (T, 3, 3) of the right arm, palm to the viewer; `wave` (T,) in [-1, 1] is outward."""
+    upper = normalised(np.array(UPPER_ARM) + 0.05 * wave[:, None] * np.array([-1.0, 0.5, 0.0]))
+    fore = normalised(np.array(FOREARM) + WAVE_REACH * wave[:, None] * np.array([-1.0, 0.0, 0.0]))
+    ahead = normalised(fore - (fore * upper).sum(axis=-1, keepdims=True) * upper)
+    shoulder = np.stack([-upper, np.cross(ahead, -upper), ahead], axis=-1)
+    bend = np.arccos((fore * upper).sum(axis=-1))
+    wrist = about(2, -0.25 * wave)
+    return shoulder, about(1, bend), about(1, np.full(len(wave), -0.1)) @ wrist
+
+
+def relaxed_hands(side: int) -> F64:
+    """Axis-angle (15, 3) of one hand's fingers, SMPL-X order: index, middle, pinky, ring, thumb."""
+    fingers = [[(0.0, 0.0, -side * angle) for angle in CURL[name]] for name in ("index", "middle", "pinky", "ring")]
+    thumb = [(0.1, -side * 0.15, 0.0), (0.0, side * 0.1, 0.0), (0.0, side * 0.12, 0.0)]
+    return np.array([*fingers, thumb]).reshape(15, 3)
+
 
 RATE_HZ = 60
 #: An adult of 1.76 m; other bodies scale the translation by their legs.
@@ -159,10 +203,10 @@ def _body(
 ) -> tuple[F64, F64]:
     """Poses (T, 55, 3) and pelvis places (T, 3) of a body on two feet.
 
-    `times`: of the cycle (T,).
+    `times` (T,): seconds in the cycle.
     `left`, `right`: tracks of the feet.
     `wave`: whether the right arm waves.
-    `shift_m`: of the pelvis to its left, (T,) or one number.
+    `shift_m`: shift of the pelvis to its left, (T,) or one number.
     """
     heading = blurred_heading(left, right)
     ahead = _along(heading, left.ankle - right.ankle)
@@ -206,10 +250,10 @@ def _pelvis_place(
     """Pelvis places (T, 3): between the feet, towards the loaded one, and low enough for both legs to reach.
 
     `left`, `right`: tracks of the feet.
-    `heading` (T,): of the pelvis.
+    `heading` (T,): heading of the pelvis.
     `pelvis` (T, 3, 3): its turn.
     `weight` (T,): 1 with all weight on the left foot, -1 on the right.
-    `shift_m`: to the left, besides.
+    `shift_m`: further shift to the left.
     """
     between = blurred((left.ankle + right.ankle) / 2, 7)
     aside = 0.028 * weight + shift_m
@@ -232,7 +276,7 @@ def _height_within_reach(side: int, foot: FootTrack, place: F64, pelvis: F64) ->
 
     `side`: +1 left, -1 right.
     `foot`: its track.
-    `place` (T, 3): of the pelvis; only x and z count.
+    `place` (T, 3): place of the pelvis; only x and z count.
     `pelvis` (T, 3, 3): its turn.
     """
     hip = pelvis @ BUILD.side(BUILD.hip, side)
@@ -245,8 +289,8 @@ def _trunk(poses: F64, times: F64, pelvis_yaw: F64, weight: F64, pace: F64) -> N
     """Set spine, neck and head: shoulders turn against the hips, the body leans with the pace and breathes.
 
     `poses` (T, 55, 3): changed in place.
-    `times` (T,): of the cycle.
-    `pelvis_yaw` (T,): of the hips, radians.
+    `times` (T,): seconds in the cycle.
+    `pelvis_yaw` (T,): yaw of the hips, radians.
     `weight` (T,): 1 with all weight on the left foot, -1 on the right.
     `pace` (T,): speed of the feet, m/s.
     """

@@ -28,7 +28,7 @@ _CHANNEL_OF = {name.lower(): name for name in CHANNELS}
 class BvhJoint:
     """One joint of the file.
 
-    `parent`: index of its parent, -1 at a root, of which a file may have several. `offset` (3,): from its parent, file
+    `parent`: index of its parent, -1 at a root; a file may have several roots. `offset` (3,): from its parent, file
     units. `channels`: such as `Zrotation`, in file order. `first`: column of the first of them. `tip` (3,): offset of
     its end site, None without.
     """

@@ -1,6 +1,8 @@
-"""Reads the motion of a BVH skeleton: joints matched by name, and laid on the avatar's.
+"""Reads the motion of a BVH skeleton: joints matched by name, and laid on the avatar's by `retarget.py`.
 
-Rule: what the file says about places, names and units is told apart here; turning it into poses is `retarget.py`'s.
+A BVH states no unit: with `auto` it is the one that makes the legs nearest to USUAL_LEG_M, and where none makes human
+legs the file is scaled. A T pose at the beginning from which the recording jumps away is no part of the motion; one
+from which it moves on is.
 """
 
 from __future__ import annotations
@@ -15,18 +17,66 @@ from numpy.typing import NDArray
 from trilane.arrays import F64
 from trilane.body.joints import BODY_JOINTS, JOINT_INDEX
 from trilane.errors import BadInputError
-from trilane.scene.detected import Detected
 from trilane.scene.motion.bvh import Bvh, BvhJoint, load_bvh
-from trilane.scene.motion.bvh_joint_names import plain
-from trilane.scene.motion.bvh_units import unit_of
-from trilane.scene.motion.joint_match import NO_MAP, STATED, match_names
+from trilane.scene.motion.joint_names import NO_MAP, STATED, match_names, plain
+from trilane.scene.motion.motion import T_POSE
 from trilane.scene.motion.recorded import RawMotion
 from trilane.scene.motion.retarget import retarget
-from trilane.scene.motion.standing import leg_length
-from trilane.scene.motion.t_pose import T_POSE
-from trilane.scene.motion.t_pose_frames import leading_t_pose
-from trilane.scene.motion.tracks import SIDES, Tracks
-from trilane.scene.motion.trunk_turns import trunk_line
+from trilane.scene.motion.tracks import SIDES, Tracks, angle_between, leg_length
+from trilane.scene.motion.turns import trunk_line
+from trilane.scene.recordings import Detected
+
+#: Metres in one unit; `cmu` is the unit of the CMU recordings, 1/0.45 inches.
+UNITS_M = {"m": 1.0, "cm": 0.01, "in": 0.0254, "cmu": 0.0254 / 0.45}
+USUAL_LEG_M = 0.85
+#: Length over USUAL_LEG_M, from and to, of legs that are taken for human ones.
+HUMAN_LEG = (0.6, 1.6)
+
+
+def unit_of(leg: float, units: str) -> tuple[str, float]:
+    """A note on the unit, and its length in metres.
+
+    `leg`: length of a leg in the file's units. `units`: a key of UNITS_M, or `auto` to guess.
+    """
+    if units != "auto":
+        return f"{units}, as given", UNITS_M[units]
+    name = min(UNITS_M, key=lambda unit: abs(np.log(leg * UNITS_M[unit] / USUAL_LEG_M)))
+    if HUMAN_LEG[0] < leg * UNITS_M[name] / USUAL_LEG_M < HUMAN_LEG[1]:
+        return f"{name}, by the length of the legs", UNITS_M[name]
+    return f"unknown, scaled to a leg of {USUAL_LEG_M} m", USUAL_LEG_M / leg
+
+
+#: How far arms may be from the line of the hips, and legs from that of the trunk; how far a still bone turns; radians.
+IN_T, STILL = np.radians(20.0), np.radians(2.0)
+#: A bone that turns by more between two frames jumps, radians.
+JUMP = np.radians(20.0)
+CHAINS = (("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "ankle"))
+
+
+def leading_t_pose(tracks: Tracks, trunk: F64) -> tuple[int, tuple[str, ...]]:
+    """How many frames at the beginning are a T pose from which the motion jumps away, and a note on a T pose there.
+
+    `trunk`: its line (T, 3).
+    """
+    pairs = [(f"{side}_{start}", f"{side}_{end}") for start, end in CHAINS for side in SIDES]
+    if tracks.frames < 2 or not all(tracks.has(*pair) for pair in pairs):
+        return 0, ()
+    bones = np.array([tracks.bone(*pair) for pair in pairs])
+    moved = np.flatnonzero(angle_between(bones, bones[:, :1]).max(axis=0) > STILL)
+    if not len(moved) or not _in_t(tracks, trunk, bones)[0]:
+        return 0, ()
+    first = int(moved[0])
+    if angle_between(bones[:, first], bones[:, first - 1]).max() < JUMP:
+        return 0, ("begins in a T pose and moves on from it; `start_s` leaves it out",)
+    return first, (f"a T pose before the motion, which jumps away from it: left out, {first} of the frames",)
+
+
+def _in_t(tracks: Tracks, trunk: F64, bones: F64) -> NDArray[np.bool_]:
+    """Whether the bones (8, T, 3) of CHAINS are in a T pose, per frame (T,)."""
+    left = tracks.across("hip")
+    expected = np.array([left, -left, left, -left, -trunk, -trunk, -trunk, -trunk])
+    return np.asarray((angle_between(bones, expected) < IN_T).all(axis=0))
+
 
 LEAST_LENGTH = 1e-6
 #: An end site that is nearer to its joint than this share of the legs is a mark, not the end of a bone.
@@ -75,7 +125,7 @@ def load_retargeted(path: Path, units: str, joint_map: Mapping[str, str] = NO_MA
     detected = Detected("BVH", reason, unit=unit, rate="by `Frame Time`", joints=joints, unmapped=others)
     times = np.arange(len(bvh.frames), dtype=np.float64) * bvh.frame_time_s
     poses, places, feet = (
-        _spread(values, readable)[start:] for values in (poses, places * unit_m, feet_of(tracks) * unit_m)
+        among_all(values, readable)[start:] for values in (poses, places * unit_m, feet_of(tracks) * unit_m)
     )
     return RawMotion(times[start:], poses, places, None, "y", notes, leg * unit_m, detected, UPS, feet)
 
@@ -160,7 +210,7 @@ def _tip(bvh: Bvh, index: int, turns: F64, places: F64, least: float) -> F64 | N
     return found
 
 
-def _spread(values: F64, readable: NDArray[np.bool_]) -> F64:
+def among_all(values: F64, readable: NDArray[np.bool_]) -> F64:
     """`values` of the readable frames among all frames; the others are NaN."""
     spread = np.full((len(readable), *values.shape[1:]), np.nan)
     spread[readable] = values

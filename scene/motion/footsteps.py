@@ -101,7 +101,7 @@ class Walker:
         return FootTrack(columns[:, :3], columns[:, 3], columns[:, 4], columns[:, 5])
 
     def _step(self, swings: list[Swing], k: int, times_s: F64) -> tuple[NDArray[np.bool_], F64]:
-        """The part of the cycle from the start of swing `k` to that of the next one.
+        """The part of the cycle from the start of swing `k` to the start of the next one.
 
         Returns which times are in it (T,), and a table (T, 6): ankle, heading, pitch, load.
         """

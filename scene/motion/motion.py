@@ -1,6 +1,6 @@
 """A motion, whatever its source: SMPL-X poses at increasing times, sampled at any time between and beyond them.
 
-Rule: a motion of one frame can be sampled like one of a thousand; nothing here depends on a file format.
+A motion of one frame can be sampled like one of a thousand; nothing here depends on a file format.
 """
 
 from __future__ import annotations
@@ -12,14 +12,47 @@ from functools import cached_property
 import numpy as np
 
 from trilane.arrays import F64
-from trilane.scene.detected import NOTHING, Detected
+from trilane.body.joints import JOINT_INDEX, JOINT_NAMES
+from trilane.scene.recordings import NOTHING, Detected
 from trilane.scene.rotations import quat_from_rotvec, rotvec_from_quat, slerp
 
-JOINTS = 55
+#: Millimetres, the pelvis at the origin; right joints are the left ones, mirrored.
+_PLACES_MM = {
+    "pelvis": (0, 0, 0), "left_hip": (117, -8, -10), "spine1": (0, 87, -35), "left_knee": (131, -416, 24),
+    "spine2": (0, 239, -29), "left_ankle": (131, -859, -1), "spine3": (0, 368, -47), "left_foot": (143, -908, 146),
+    "neck": (0, 569, 3), "left_collar": (23, 493, 16), "head": (0, 670, 39), "left_shoulder": (185, 488, 12),
+    "left_elbow": (457, 488, 12), "left_wrist": (712, 488, 12), "jaw": (0, 677, 53), "left_eye": (30, 711, 121),
+    "left_index1": (825, 483, 40), "left_index2": (853, 483, 44), "left_index3": (878, 483, 47),
+    "left_middle1": (824, 488, 12), "left_middle2": (861, 488, 6), "left_middle3": (890, 488, 4),
+    "left_pinky1": (807, 483, -30), "left_pinky2": (828, 483, -40), "left_pinky3": (844, 483, -46),
+    "left_ring1": (818, 488, -10), "left_ring2": (849, 488, -20), "left_ring3": (875, 488, -26),
+    "left_thumb1": (753, 484, 38), "left_thumb2": (766, 461, 59), "left_thumb3": (793, 442, 80),
+}  # fmt: skip
+
+
+def _joints() -> F64:
+    """(55, 3), metres."""
+    rows = [
+        np.multiply(_PLACES_MM[name.replace("right_", "left_")], (-1 if name.startswith("right_") else 1, 1, 1))
+        for name in JOINT_NAMES
+    ]
+    return np.array(rows, dtype=np.float64) / 1000
+
+
+#: Rest joints (55, 3), metres.
+T_POSE = _joints()
+
+
 #: Rest place of the pelvis of the published neutral SMPL-X body, metres; translations in AMASS files start from it.
 REST_PELVIS: F64 = np.array([0.003, -0.351, 0.012])
 #: The same of SMPL's neutral body, to some 2 cm: its betas and sex move it by as much.
 SMPL_REST_PELVIS: F64 = np.array([-0.002, -0.23, 0.028])
+
+
+def rest_leg_m(joints: F64) -> float:
+    """Length of the left leg of rest `joints` (55, 3), hip to knee to ankle, metres."""
+    hip, knee, ankle = (joints[JOINT_INDEX[f"left_{name}"]] for name in ("hip", "knee", "ankle"))
+    return float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
 
 
 class Wrap(enum.Enum):
@@ -56,7 +89,7 @@ def bracket(times_s: F64, t_s: float) -> tuple[int, int, float]:
 class Motion:
     """Poses over time, upright, facing +Z at first, in the middle of the ground it covers.
 
-    `times_s` (T,): from 0, strictly increasing. `poses` (T, 55, 3): axis-angle, radians, SMPL-X joint order.
+    `times_s` (T,): times from 0, strictly increasing. `poses` (T, 55, 3): axis-angle, radians, SMPL-X joint order.
     `translation` (T, 3): place of the pelvis, metres, Y up. `betas` (n,) or None. `notes`: how the source was read, for
     people. `wrap`: what follows the last frame. `leg_m`: hip to ankle of the recorded person, by which the translation
     is scaled to another body; None when unknown. `travels`: whether the translation was recorded. `detected`: what its

@@ -43,7 +43,7 @@ _ORDERS = ("<", ">", "|", "=")
 
 @dataclass(frozen=True)
 class Foreign:
-    """Something that is not built. `name`: of its class or function, module first."""
+    """Something that is not built. `name`: name of its class or function, module first."""
 
     name: str
 

@@ -1,8 +1,12 @@
-"""A recorded motion to a Motion: bad frames left out, Y up, facing +Z at first, centred on the ground it covers.
+"""Turns a recorded motion into a Motion: bad frames left out, Y up, facing +Z at first, centred on its ground.
 
-Rule: up is the axis that the scene states, else the one that the body's own up points along on average, else the usual
-one of the format. Where a format has a world of its own, one that lies or stands on its hands throughout does not turn
-it over: the floor of the file tells (`on_floor.py`), and where it does not, a note says what else may be up.
+**Up** is the axis that the scene states, else the one that the body's own up points along on average, else the usual
+one of the format. A body that lies or stands on its hands throughout does not turn the world over: files that have a
+floor have it at 0, so a body is on the floor along an axis when its lowest joint hardly leaves 0. Where that does not
+tell either, a note says what else may be up.
+
+**Stance** says when the feet stand. Ankles and toes each have a height at which they are while their foot stands; a
+person stands while at least one of them is at its own height.
 """
 
 from __future__ import annotations
@@ -13,13 +17,73 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import F64
+from trilane.body.joints import JOINT_PARENTS
 from trilane.errors import BadInputError
-from trilane.scene.detected import NOTHING, Detected
-from trilane.scene.motion.motion import Motion, Wrap
-from trilane.scene.motion.on_floor import lies, lowest, stands
-from trilane.scene.motion.stance import stance
-from trilane.scene.motion.usable_samples import usable_samples
+from trilane.scene.motion.motion import T_POSE, Motion, Wrap, rest_leg_m
+from trilane.scene.recordings import NOTHING, Detected, usable_samples
 from trilane.scene.rotations import Y_UP_FROM_Z_UP, about, matrix_from_rotvec, rotvec_from_matrix
+
+#: The joints of the body; hands and face follow them.
+BODY_JOINT_COUNT = 22
+#: So many frames, evenly spread, tell it.
+MOST_LOOKED_AT = 200
+#: Height of the lowest joint of one who lies or stands on the hands: from, to, and how far it goes up and down between
+#: a tenth and nine tenths of the frames. Joints of one who lies are up to half a trunk's depth above the floor.
+LIES_M, LIES_SPREAD_M = (-0.02, 0.17), 0.08
+#: The same of one who walks; toes are 2 to 5 cm above the floor, and floors of recordings are off by centimetres.
+STANDS_M, STANDS_SPREAD_M = (-0.12, 0.25), 0.25
+
+
+def joint_places(poses: F64, places: F64, leg_m: float | None) -> F64:
+    """Places (T, 22, 3) of the joints of a plain body whose legs are `leg_m` long; its own when that is None.
+
+    `poses` (T, 55, 3): axis-angle. `places` (T, 3): places of the pelvis, metres.
+    """
+    rest = T_POSE * (leg_m / rest_leg_m(T_POSE) if leg_m else 1.0)
+    turns = matrix_from_rotvec(poses[:, :BODY_JOINT_COUNT])
+    found = np.repeat(places[:, None], BODY_JOINT_COUNT, axis=1)
+    for joint, parent in enumerate(JOINT_PARENTS[1:BODY_JOINT_COUNT], 1):
+        found[:, joint] = found[:, parent] + turns[:, parent] @ (rest[joint] - rest[parent])
+        turns[:, joint] = turns[:, parent] @ turns[:, joint]
+    return found
+
+
+def lowest(poses: F64, places: F64, leg_m: float | None, up: F64) -> F64:
+    """Heights (n,) along `up` (3,) of the lowest joint in at most MOST_FRAMES of the frames; the rest as above."""
+    some = np.linspace(0, len(poses) - 1, min(len(poses), MOST_LOOKED_AT)).round().astype(int)
+    return np.asarray((joint_places(poses[some], places[some], leg_m) @ up).min(axis=1))
+
+
+def lies(heights: F64) -> bool:
+    """Whether `heights` (n,) of the lowest joint are those of one who lies, or stands on the hands, on the floor."""
+    return _are_within(heights, LIES_M, LIES_SPREAD_M)
+
+
+def stands(heights: F64) -> bool:
+    """Whether they are those of one who stands or walks on the floor."""
+    return _are_within(heights, STANDS_M, STANDS_SPREAD_M)
+
+
+def _are_within(heights: F64, within: tuple[float, float], spread: float) -> bool:
+    low, middle, high = np.quantile(heights, (0.1, 0.5, 0.9))
+    return bool(within[0] <= middle <= within[1] and high - low <= spread)
+
+
+#: The height at which a joint stands is that below which it is in this share of the frames, percent.
+STANDING_PERCENTILE = 5.0
+#: At most so far above it a joint still stands; from `FLIES_M` on it does not; metres.
+FOOT_STANDS_M, FOOT_FLIES_M = 0.03, 0.06
+
+
+def stance(heights: F64) -> F64:
+    """How much the person stands, per frame (T,): 1 on the floor, 0 in the air.
+
+    `heights` (T, 2, n): of the n joints of both feet that are recorded, left and right, metres along up.
+    """
+    standing = np.percentile(heights, STANDING_PERCENTILE, axis=(0, 1))
+    above = (heights - standing).min(axis=(1, 2))
+    return np.asarray(np.clip((FOOT_FLIES_M - above) / (FOOT_FLIES_M - FOOT_STANDS_M), 0.0, 1.0))
+
 
 MAX_FRAMES = 200_000
 MAX_ANGLE_RAD = 64.0
@@ -44,10 +108,11 @@ class RawMotion:
     """The content of a motion file, before anything is left out or turned.
 
     `times_s` (T,): seconds; NaNs and repeated times are still in. `poses` (T, 55, 3): axis-angle, radians, SMPL-X joint
-    order. `translation` (T, 3): of the pelvis, metres; None when the format has none. `betas` (n,) or None. `up`: the
-    axis that is usually up in the format; `ups`: the axes that may be up in it. `notes`: on the file, for people.
-    `leg_m`: hip to ankle of the recorded person; None when unknown. `detected`: what the file is, but for its axes.
-    `feet` (T, 2, n, 3): places of n joints of the left and the right foot, metres; None when the format has no places.
+    order. `translation` (T, 3): places of the pelvis, metres; None when the format has none. `betas` (n,) or None.
+    `up`: the axis that is usually up in the format; `ups`: the axes that may be up in it. `notes`: on the file, for
+    people. `leg_m`: hip to ankle of the recorded person; None when unknown. `detected`: what the file is, but for its
+    axes. `feet` (T, 2, n, 3): places of n joints of the left and the right foot, metres; None when the format has no
+    places.
     """
 
     times_s: F64

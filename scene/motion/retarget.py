@@ -1,9 +1,8 @@
 """Puts recorded joints on the 55 SMPL-X joints of an avatar.
 
-Rule: turns come from places: limbs point where the recorded ones point, pelvis and trunk turn as hip line, trunk and
-shoulder line do (`trunk_turns.py`), and the file's own turns only tell how limbs twist (`limb_turns.py`) and how head
-and toes turn. So neither a file's zero pose nor its axes matter. A joint that the file does not have follows its
-parent.
+Turns come from places: limbs point where the recorded ones point; pelvis and trunk turn as hip line, trunk and shoulder
+line do. The file's own turns tell only how limbs twist (`turns.py`), and how head and toes turn. So neither a file's
+zero pose nor its axes matter. A joint that the file does not have follows its parent.
 """
 
 from __future__ import annotations
@@ -14,15 +13,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import F64
-from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS
-from trilane.scene.motion.frame_turns import level_with, transposed, turned
-from trilane.scene.motion.limb_turns import Evidence, hinge, limb_turns, swung
-from trilane.scene.motion.motion import JOINTS
-from trilane.scene.motion.standing import built_alike, leg_length, planted_frames, standing_frames, upward
-from trilane.scene.motion.tracks import SIDES, Tracks, angle_between, at_rest, unit
-from trilane.scene.motion.trunk_turns import (
+from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS, JOINTS
+from trilane.scene.motion.tracks import (
+    SIDES,
+    Tracks,
+    angle_between,
+    at_rest,
+    built_alike,
+    leg_length,
+    planted_frames,
+    standing_frames,
+    unit,
+    upward,
+)
+from trilane.scene.motion.turns import (
+    Evidence,
+    hinge,
+    level_with,
+    limb_turns,
+    swung,
+    transposed,
     trunk_line,
     trunk_of,
+    turned,
     turns_of_collars,
     turns_of_neck,
     turns_of_trunk,
@@ -60,7 +73,7 @@ class Retarget:
     notes: list[str] = field(default_factory=list)
 
     def bone(self, start: str, end: str) -> F64:
-        """Of the avatar at rest, (3,)."""
+        """A bone (3,) of the avatar at rest."""
         return unit(self.rest.bone(start, end)[0])
 
     def above(self, name: str) -> F64:
@@ -128,7 +141,7 @@ def _leg(work: Retarget, side: str, up: F64, steeper: float) -> None:
 
 
 def _foot(tracks: Tracks, side: str) -> F64 | None:
-    """From the ankle to the toes, or to what its bone ends at (T, 3); None when the foot has no length."""
+    """The way from the ankle to the toes, or to the end of its bone (T, 3); None when the foot has no length."""
     ankle, toes = f"{side}_ankle", f"{side}_foot"
     end = tracks.places.get(toes, tracks.tips.get(ankle))
     if end is None:
@@ -186,7 +199,7 @@ def _arm(work: Retarget, side: str) -> None:
 
 
 def _arm_bone(tracks: Tracks, start: str, end: str) -> F64 | None:
-    """From one joint of an arm to the next (T, 3), or to what its bone ends at where the file has no next one."""
+    """The way (T, 3) from one joint of an arm to the next, or to the end of its bone where there is no next one."""
     if not tracks.has(start):
         return None
     far = tracks.places.get(end, tracks.tips.get(start))
@@ -233,7 +246,7 @@ def _head(work: Retarget) -> None:
 
 
 def _local(turns: dict[str, F64], frames: int) -> F64:
-    """Axis-angle (T, 55, 3), of each joint relative to its parent."""
+    """Axis-angle (T, 55, 3) of each joint relative to its parent."""
     poses = np.zeros((frames, JOINTS, 3))
     for index, name in enumerate(JOINT_NAMES):
         above = turns[JOINT_NAMES[JOINT_PARENTS[index]]] if index else np.eye(3)
@@ -242,7 +255,7 @@ def _local(turns: dict[str, F64], frames: int) -> F64:
 
 
 def _pelvis_places(work: Retarget, joints: F64) -> F64:
-    """Where the avatar's pelvis is when the middle of its hips is where that of the recorded ones is, (T, 3)."""
+    """Places (T, 3) of the avatar's pelvis that bring the middle of its hips to the middle of the recorded ones."""
     scale = leg_length(work.tracks) / leg_length(work.rest)
     from_hips = joints[0] - work.rest.between("hip")[0]
     return np.asarray(work.tracks.between("hip") + turned(work.turns["pelvis"], from_hips * scale))

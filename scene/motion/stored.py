@@ -16,8 +16,17 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F64
 from trilane.errors import BadInputError
-from trilane.file_signatures import PICKLE
-from trilane.files import as_numbers, npy_pickle, npz_names, npz_pickles, read_bytes, read_npy, read_npz, refuse_other
+from trilane.files import (
+    PICKLE,
+    as_numbers,
+    npy_pickle,
+    npz_names,
+    npz_pickles,
+    read_bytes,
+    read_npy,
+    read_npz,
+    refuse_other,
+)
 from trilane.scene.motion.pickled import ARRAYS, MAX_BYTES, Foreign, StoredArray, printable, values_of
 from trilane.unexpected_value import UnexpectedValue
 

@@ -1,6 +1,7 @@
-"""Places, turns and end sites of named joints over time: what is retargeted, whatever file it comes from.
+"""Places, turns and end sites of named joints over time: the input of retargeting, whatever file it comes from.
 
-Rule: names are those of the SMPL-X joints; units and axes are the file's own, the same in all arrays.
+Names are those of the SMPL-X joints; units and axes are the file's own, the same in all arrays. Which frames stand, and
+whether a skeleton is built like the avatar's, is told by places alone: the file's zero pose does not matter.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from trilane.arrays import F64
 from trilane.body.joints import JOINT_NAMES
@@ -42,11 +44,11 @@ class Tracks:
         return (self.places[f"left_{part}"] + self.places[f"right_{part}"]) / 2
 
     def across(self, part: str) -> F64:
-        """From the right joint of a pair to the left one, (T, 3)."""
+        """The way (T, 3) from the right joint of a pair to the left one."""
         return self.places[f"left_{part}"] - self.places[f"right_{part}"]
 
     def bone(self, start: str, end: str) -> F64:
-        """From one joint to another, (T, 3)."""
+        """The way (T, 3) from one joint to another."""
         return self.places[end] - self.places[start]
 
 
@@ -65,3 +67,91 @@ def angle_between(a: F64, b: F64) -> F64:
     """Angles (...) between vectors (..., 3), radians; exact near 0 and pi."""
     cross = np.cross(a, b)
     return np.asarray(np.arctan2(np.sqrt((cross * cross).sum(axis=-1)), (a * b).sum(axis=-1)))
+
+
+#: Who stands has thighs less than this from the line of the trunk, and knees that bend less; radians.
+STRAIGHT_HIP, STANDING_KNEE = np.radians(25.0), np.radians(50.0)
+#: Of the frames that stand, those with the straightest knees: with less than this, or so much more than the best.
+STRAIGHT_KNEE, LITTLE_MORE = np.radians(10.0), np.radians(5.0)
+#: A leg is below its hip when it leans less, radians; of such frames this share has the foot flat on the floor.
+LEG_BELOW, PLANTED_SHARE = np.radians(35.0), 0.25
+#: Cosine of the angle within which the direction that a body stands in is taken for the axis beside it.
+NEAR_AXIS = np.cos(np.radians(30.0))
+#: Distances of which some are the same in two skeletons that are built alike: pairs of joints of one bone or one part.
+RIGID = (
+    ("left_hip", "right_hip"),
+    ("pelvis", "left_hip"),
+    ("pelvis", "spine1"),
+    ("left_hip", "spine1"),
+    ("spine1", "spine2"),
+    ("spine2", "spine3"),
+    ("spine3", "neck"),
+    ("spine3", "left_collar"),
+    ("neck", "left_collar"),
+    ("left_collar", "right_collar"),
+    ("left_collar", "left_shoulder"),
+    ("left_ankle", "left_foot"),
+)
+#: How far such distances may differ, as a share of them and of the legs.
+SAME_SHARE, SAME_LEGS = 0.02, 0.003
+
+
+def standing_frames(tracks: Tracks, trunk: F64) -> NDArray[np.bool_]:
+    """Which frames (T,) stand straightest: thighs in line with the trunk (T, 3), and straight knees."""
+    bend = np.zeros(tracks.frames)
+    stands = np.ones(tracks.frames, dtype=bool)
+    for side in SIDES:
+        thigh, shin = tracks.bone(f"{side}_hip", f"{side}_knee"), tracks.bone(f"{side}_knee", f"{side}_ankle")
+        bend = np.maximum(bend, angle_between(thigh, shin))
+        stands &= angle_between(thigh, -trunk) < STRAIGHT_HIP
+    stands &= bend < STANDING_KNEE
+    if not stands.any():
+        return stands
+    return np.asarray(stands & (bend < max(STRAIGHT_KNEE, bend[stands].min() + LITTLE_MORE)))
+
+
+def upward(tracks: Tracks, trunk: F64, stands: NDArray[np.bool_]) -> F64:
+    """The direction (3,) that is up in the recording: the file's axis nearest to the mean direction of trunk and legs.
+
+    The mean is over the frames that stand, or over all when none does; it is up itself where no axis is near.
+    """
+    legs = tracks.between("hip") - tracks.between("ankle")
+    both = unit(trunk) + unit(legs)
+    mean = unit(both[stands].mean(axis=0) if stands.any() else both.mean(axis=0))
+    nearest = np.eye(3)[np.abs(mean).argmax()] * np.sign(mean[np.abs(mean).argmax()])
+    return np.asarray(nearest if nearest @ mean > NEAR_AXIS else mean)
+
+
+def planted_frames(tracks: Tracks, side: str, foot: F64, up: F64) -> NDArray[np.bool_]:
+    """The frames (T,) in which a foot most likely lies flat: ankle and toes hardly move, and the leg is below the hip.
+
+    `foot` (T, 3): way from the ankle to the toes. `up` (3,): direction that is up in the recording.
+    """
+    below = angle_between(tracks.bone(f"{side}_ankle", f"{side}_hip"), up) < LEG_BELOW
+    if tracks.frames == 1 or not below.any():
+        return np.asarray(below)
+    ankle = tracks.places[f"{side}_ankle"]
+    speed = sum(np.linalg.norm(np.gradient(place, axis=0), axis=-1) for place in (ankle, ankle + foot))
+    return np.asarray(below & (speed <= np.quantile(np.asarray(speed)[below], PLANTED_SHARE)))
+
+
+def leg_length(tracks: Tracks) -> float:
+    """Mean length of both legs, hip to knee to ankle: the median over all frames."""
+    bones = [
+        np.linalg.norm(tracks.bone(f"{side}_{start}", f"{side}_{end}"), axis=-1)
+        for side in SIDES
+        for start, end in (("hip", "knee"), ("knee", "ankle"))
+    ]
+    return float(np.median(sum(bones)) / 2)
+
+
+def built_alike(tracks: Tracks, rest: Tracks) -> bool:
+    """Whether `tracks` and `rest` have the same distances between joints, beside the length of their legs."""
+    scale = leg_length(tracks) / leg_length(rest)
+    pairs = [pair for pair in RIGID if tracks.has(*pair)]
+    for pair in pairs:
+        ours = float(np.linalg.norm(rest.bone(*pair)[0])) * scale
+        theirs = float(np.median(np.linalg.norm(tracks.bone(*pair), axis=-1)))
+        if abs(ours - theirs) > SAME_SHARE * ours + SAME_LEGS * leg_length(tracks):
+            return False
+    return ("spine1", "spine2") in pairs or ("spine3", "neck") in pairs

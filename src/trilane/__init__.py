@@ -29,5 +29,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """So that the interface is completed and listed."""
+    """The names of the interface too, so that shells complete them."""
     return [*globals(), *__all__]

@@ -59,7 +59,7 @@ def cached_arrays(name: str, sources: Iterable[NDArray[Any] | str], make: Callab
 
 
 def _read(entry: Path) -> Arrays | None:
-    """The arrays of `entry`, None when it is missing or damaged: whatever the damage raises, they can be made again."""
+    """The arrays of `entry`; None when it is missing or damaged in any way, because they can be made again."""
     try:
         with entry.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             return {key: stored[key] for key in stored.files}

@@ -37,7 +37,6 @@ MODULES = (
     "scheduler/unit_life.py",
     "scheduler/virtual.py",
     "scheduler/work_ladder.py",
-    "transport/job_pipe.py",
     "transport/messages.py",
     "transport/slots.py",
     "pipeline/core_meter.py",

@@ -1,8 +1,8 @@
-"""What Trilane asks of the machine: cores, processor, counters, memory, packages, programs, folders, the date.
+"""What Trilane asks of the machine: cores, processor, caches, counters, memory, packages, programs, folders, the date.
 
-Rule: it is asked here and nowhere else, so a test can put another machine in place of `here`. Ruff refuses the calls
-below in every other file (`banned-api` in pyproject.toml). Two things are asked elsewhere, each in one place: OpenGL by
-`trilane.stages.gpu.opengl_context`, and clocks by whoever measures, because a clock is read in every job.
+It is asked here and nowhere else, so a test can put another machine in place of `here`. Ruff refuses the calls below in
+every other file (`banned-api` in pyproject.toml). Two things are asked elsewhere, each in one place: OpenGL by
+`trilane.stages.gpu.opengl`, and clocks by whoever measures, because a clock is read in every job.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import importlib.util
 import os
 import platform
 import shutil
+from collections.abc import Iterable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
@@ -21,6 +22,8 @@ import psutil
 
 #: Number of the system call perf_event_open, by architecture.
 PERF_EVENT_OPEN: Final = {"x86_64": 298, "aarch64": 241, "riscv64": 241}
+#: Suffixes of sizes in the kernel's files.
+KERNEL_UNITS: Final = {"K": 1 << 10, "M": 1 << 20, "G": 1 << 30}
 _LIBC: Final = ctypes.CDLL(None, use_errno=True)
 _LIBC.syscall.restype = ctypes.c_long
 
@@ -137,3 +140,33 @@ class Machine:
 
 #: The machine that this process runs on.
 here = Machine()
+
+
+def last_level_bytes(cores: Iterable[int]) -> int:
+    """Size of the largest last-level cache of `cores` by the kernel; 0 where it tells none, so that nothing fits.
+
+    On a virtual machine it may be the whole host's.
+    """
+    folder = here.sys / "devices/system/cpu"
+    return max((_cache_bytes(folder / f"cpu{core}" / "cache") for core in cores), default=0)
+
+
+def moved_of_kept(kept_bytes: int) -> int:
+    """The part of `kept_bytes` that each frame reads again from memory: all that do not fit into the cache, or none.
+
+    `kept_bytes`: what a stage keeps from frame to frame, such as a network's weights.
+    """
+    return 0 if kept_bytes <= last_level_bytes(here.cores()) else kept_bytes
+
+
+def _cache_bytes(caches: Path) -> int:
+    try:
+        levels = {int((index / "level").read_text()): index for index in caches.glob("index[0-9]*")}
+        return _bytes((levels[max(levels)] / "size").read_text().strip()) if levels else 0
+    except (OSError, ValueError):
+        return 0
+
+
+def _bytes(text: str) -> int:
+    """The bytes of a size as the kernel writes it, such as 307200K."""
+    return int(text[:-1]) * KERNEL_UNITS[text[-1]] if text[-1:] in KERNEL_UNITS else int(text)

@@ -25,8 +25,8 @@ def parse_shape(text: str) -> Shape:
 def shape_buckets(size: str) -> list[Shape]:
     """Tensor shapes (height, width) that `size` allows.
 
-    `HxW` gives that one shape. A single number S gives the shapes of sides in multiples of 32, aspect within
-    1:4 and area at most S², of which none holds another: tall for a standing body, wide for a lying one, S x S
+    `HxW` gives that one shape. A single number S gives shapes of at most S² pixels, with sides in multiples of 32 and
+    an aspect within 1:4. No shape holds another: they are tall for a standing body, wide for a lying one, S x S
     between. Raises UnexpectedValue when a side is no multiple of 32 or out of range.
     """
     if re.fullmatch(r"\d+", size):
@@ -36,7 +36,7 @@ def shape_buckets(size: str) -> list[Shape]:
 
 
 def shapes_within(pixels: int) -> list[Shape]:
-    """The shapes (height, width) of at most so many pixels, at least `BUCKET_STEP`², of which none holds another.
+    """The shapes (height, width) of at most `pixels`, at least `BUCKET_STEP`²; none holds another.
 
     Their sides are multiples of `BUCKET_STEP`, the longer one at most `MOST_ASPECT` times the shorter one.
     """

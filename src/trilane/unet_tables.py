@@ -24,7 +24,7 @@ RESNET18_STAGES = ((64, 1), (128, 2), (256, 2), (512, 2))
 
 
 @dataclass(frozen=True)
-class Row:
+class MobileBlock:
     """One inverted residual block: 1x1 to `expanded` channels, depthwise `kernel`, 1x1 to `channels`.
 
     `activation`: `relu`, `relu6` or `hardswish`. `squeeze`: whether it has squeeze-and-excitation.
@@ -48,7 +48,7 @@ class MobileEncoder:
 
     stem: int
     activation: str
-    rows: tuple[Row, ...]
+    rows: tuple[MobileBlock, ...]
     last: int
 
 
@@ -57,12 +57,12 @@ def squeeze_channels(channels: int) -> int:
     return max(8, (channels // 4 + 4) // 8 * 8)
 
 
-def _repeated(spec: Sequence[tuple[int, int, int, int, int]], before: int) -> tuple[Row, ...]:
+def _repeated(spec: Sequence[tuple[int, int, int, int, int]], before: int) -> tuple[MobileBlock, ...]:
     """Rows from (kernel, expansion factor, channels, repeats, stride); `before`: channels that enter the first."""
     rows = []
     for kernel, expansion, channels, repeats, stride in spec:
         for i in range(repeats):
-            rows.append(Row(kernel, before * expansion, channels, stride if i == 0 else 1))
+            rows.append(MobileBlock(kernel, before * expansion, channels, stride if i == 0 else 1))
             before = channels
     return tuple(rows)
 
@@ -96,18 +96,18 @@ _MOBILENET_V3 = MobileEncoder(
     stem=16,
     activation="hardswish",
     rows=(
-        Row(3, 16, 16, 1, "relu"),
-        Row(3, 64, 24, 2, "relu"),
-        Row(3, 72, 24, 1, "relu"),
-        Row(5, 72, 40, 2, "relu", squeeze=True),
-        *[Row(5, 120, 40, 1, "relu", squeeze=True)] * 2,
-        Row(3, 240, 80, 2, "hardswish"),
-        Row(3, 200, 80, 1, "hardswish"),
-        *[Row(3, 184, 80, 1, "hardswish")] * 2,
-        Row(3, 480, 112, 1, "hardswish", squeeze=True),
-        Row(3, 672, 112, 1, "hardswish", squeeze=True),
-        Row(5, 672, 160, 2, "hardswish", squeeze=True),
-        *[Row(5, 960, 160, 1, "hardswish", squeeze=True)] * 2,
+        MobileBlock(3, 16, 16, 1, "relu"),
+        MobileBlock(3, 64, 24, 2, "relu"),
+        MobileBlock(3, 72, 24, 1, "relu"),
+        MobileBlock(5, 72, 40, 2, "relu", squeeze=True),
+        *[MobileBlock(5, 120, 40, 1, "relu", squeeze=True)] * 2,
+        MobileBlock(3, 240, 80, 2, "hardswish"),
+        MobileBlock(3, 200, 80, 1, "hardswish"),
+        *[MobileBlock(3, 184, 80, 1, "hardswish")] * 2,
+        MobileBlock(3, 480, 112, 1, "hardswish", squeeze=True),
+        MobileBlock(3, 672, 112, 1, "hardswish", squeeze=True),
+        MobileBlock(5, 672, 160, 2, "hardswish", squeeze=True),
+        *[MobileBlock(5, 960, 160, 1, "hardswish", squeeze=True)] * 2,
     ),
     last=960,
 )

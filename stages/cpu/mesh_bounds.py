@@ -1,11 +1,26 @@
 """The screen rectangle of a skinned mesh, exact, at a fraction of the cost of skinning it.
 
-Rule: no part of the mesh that is on the screen lies outside the rectangle; parts behind the near plane or beside the
-screen do not widen it.
-
-Spheres that hold patches of the mesh in any pose (`mesh_patches`) tell which patches are off the screen, which ones the
+No part of the mesh that is on the screen lies outside the rectangle; parts behind the near plane or beside the screen
+do not widen it. Spheres that hold patches of the mesh in any pose tell which patches are off the screen, which ones the
 near plane cuts, and which ones can reach the rectangle's sides. Only the last two kinds are looked at in finer patches,
 and only their vertices are skinned.
+
+**Patches** are neighbouring triangles with similar skin weights. A patch's radius is proved, not sampled. Let c be the
+rest position of the patch's centre, a vertex with weights u, and p another of its vertices with weights w; G_j is the
+rigid motion of joint j. Then
+
+    x_p - x_c = sum_j w_j (G_j p - G_j c) + sum_j (w_j - u_j) G_j c.
+
+The first sum is at most |p - c|. The second is a change of weights at c as in `skinning.weight_error_bound`, so it is
+at most sum_b |E_b| |G_b c - G_parent c|, where E_b is the sum of w_j - u_j over b and the joints below it; and as b
+turns about its centre c_b by its own angle t_b, |G_b c - G_parent c| <= 2 sin(t_b / 2) |c - c_b|.
+
+**Skinned bodies** are projected in float32, in memory that is allocated once; vertices whose place on the screen comes
+within twice the rounding error of the furthest are handed on, and float64 decides. So the furthest of them in float64
+is the furthest of all. With u = 2**-24, a clip coordinate c = r . v + d is a sum of three products of rounded factors
+and d, so it is off by at most 6 u (sum |r_k| |v_k| + |d|), and 8 u of that, the sphere's reach added, holds what the
+reach and its rounding add: call it e_c. A quotient q = c / w, with w >= w_least, is off by at most (e_c + |q| e_w) /
+w_least + 4 u |q|, where |q| is at most 1 for what is on the screen.
 """
 
 from __future__ import annotations
@@ -16,15 +31,192 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from trilane.arrays import F64, I64, Mask
+from trilane.arrays import F32, F64, I64, Mask
 from trilane.body.body import ShapedBody
 from trilane.body.joints import JOINTS
 from trilane.body.kinematics import Posed
-from trilane.body.skin_weights import branch_sums, joint_distance, largest_weights
-from trilane.body.skinning import blend_matrices
+from trilane.body.skinning import blend_matrices, branch_sums, joint_distance, largest_weights
+from trilane.cache import Arrays, cached_arrays
 from trilane.scene.crop import Rect
-from trilane.stages.cpu.mesh_patches import Level, build_levels, join
-from trilane.stages.cpu.outermost import W_LEAST, Outermost
+
+#: Half the distance from 1 to the next float32: a rounding is off by this share at most.
+U = 2.0**-24
+W_LEAST = 1e-9
+
+
+class Outermost:
+    """Finds outermost vertices of bodies with `count` vertices."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+        self._flat = np.empty((4, count), np.float32)
+        self._scratch = np.empty((3, count), np.float32)
+        self._is_far = np.empty(count, np.bool_)
+
+    def of(self, vertices: F32, camera: F64, radius: float) -> I64 | None:
+        """Numbers of the vertices (N,) that may be outermost of spheres of `radius` metres about `vertices` (V,3).
+
+        `camera`: (4,4) to clip space. None when a sphere may reach over the screen's edge or a clip plane.
+        """
+        reach = radius * np.linalg.norm(camera[:, :3], axis=1)
+        error = self._project(vertices, camera, reach)
+        x, y, z, w = self._flat
+        near, far = (radius * float(np.linalg.norm(camera[3, :3] + sign * camera[2, :3])) for sign in (1, -1))
+        scratch, least, most = self._scratch
+        if not np.add(w, z, out=scratch).min() > near + error[2] + error[3]:
+            return None
+        if not np.subtract(w, z, out=scratch).min() > far + error[2] + error[3]:
+            return None
+        w_least = float(np.subtract(w, np.float32(reach[3]), out=least).min()) - error[3]
+        if not w_least > W_LEAST:
+            return None
+        np.reciprocal(least, out=least)
+        np.reciprocal(np.add(w, np.float32(reach[3]), out=most), out=most)
+        slack = 2 * ((error + error[3]) / w_least + 4 * U)
+        sides = [self._side(row, reach[k], sign, float(slack[k])) for k, row in enumerate((x, y)) for sign in (1, -1)]
+        found = [side for side in sides if side is not None]
+        return np.concatenate(found) if len(found) == len(sides) else None
+
+    def _project(self, vertices: F32, camera: F64, reach: F64) -> F64:
+        """Write the clip coordinates; by how much each of the four may be off."""
+        np.matmul(camera[:, :3].astype(np.float32), vertices.T, out=self._flat)
+        self._flat += camera[:, 3:].astype(np.float32)
+        furthest = max(float(vertices.max()), -float(vertices.min()))
+        return np.asarray(8 * U * (np.abs(camera[:, :3]).sum(axis=1) * furthest + np.abs(camera[:, 3]) + reach))
+
+    def _side(self, row: F32, reach: float, sign: int, slack: float) -> I64 | None:
+        """The vertices that may be lowest along `row` of clip coordinates (`sign` 1) or highest (-1)."""
+        scratch, least, most = self._scratch
+        place = np.subtract(row, np.float32(reach), out=scratch) if sign > 0 else np.negative(row, out=scratch)
+        if sign < 0:
+            place -= np.float32(reach)
+        place *= least if place.min() <= 0 else most
+        lowest = float(place.min())
+        if not lowest > slack - 1.0:
+            return None
+        return np.flatnonzero(np.less_equal(place, np.float32(lowest + slack + U), out=self._is_far))
+
+
+#: Largest distance between the middles of a patch's triangles, metres: of coarse patches, and of fine ones.
+EXTENTS_M = (0.08, 0.02)
+LEAST_FACES = 4
+#: Joint angle, radians, that patches are cut for: triangles that move apart at this angle are put into other patches.
+TYPICAL_TURN = 0.5
+VERSION = "patches 1"  # to be raised when the same body gives other patches
+
+
+@dataclass(frozen=True)
+class Level:
+    """P patches of one level of detail.
+
+    `centres`: (P,) vertex indices.
+    `size`, `give`: (P,) and (P,54). The sphere about a patch's posed centre has the radius
+    size + sum_b give_b 2 sin(t_b / 2), metres, where t_b is the angle of joint b = 1..54.
+    `blend`: (P,54) the furthest that the pose blend shapes of a joint move a vertex, metres per unit of |R - I|.
+    `parts`: for each patch, the indices of its patches in the next level; in the last level, of its vertices.
+    `faces`: for each patch, the indices of its triangles.
+    """
+
+    centres: I64
+    size: F64
+    give: F64
+    blend: F64
+    parts: list[I64]
+    faces: list[I64]
+
+
+def join(groups: list[I64], chosen: I64) -> I64:
+    """The indices of the groups that `chosen` lists, in one array."""
+    return np.concatenate([groups[patch] for patch in chosen]) if len(chosen) else np.zeros(0, np.int64)
+
+
+def build_levels(shaped: ShapedBody, weights: F64) -> list[Level]:
+    """Coarse and fine patches of all triangles of the body, skinned with `weights` (V,55); cached."""
+    body = shaped.body
+    sources: list[NDArray[Any]] = [shaped.vertices, shaped.joints, body.parents, body.faces, weights]
+    sources += [body.posedirs] if body.posedirs is not None else []
+    stored = cached_arrays(VERSION, sources, lambda: _levels_to_arrays(_build_levels(shaped, weights)))
+    return _levels_from_arrays(stored)
+
+
+def _levels_to_arrays(levels: list[Level]) -> dict[str, NDArray[Any]]:
+    arrays: dict[str, NDArray[Any]] = {}
+    for number, level in enumerate(levels):
+        arrays |= {f"{name}{number}": getattr(level, name) for name in ("centres", "size", "give", "blend")}
+        for name in ("parts", "faces"):
+            groups: list[I64] = getattr(level, name)
+            arrays[f"{name}{number}"] = np.concatenate(groups)
+            arrays[f"{name}{number}_ends"] = np.cumsum([len(group) for group in groups])
+    return arrays
+
+
+def _levels_from_arrays(arrays: Arrays) -> list[Level]:
+    levels = []
+    for number in range(len(EXTENTS_M)):
+        parts, faces = (
+            np.split(arrays[f"{name}{number}"], arrays[f"{name}{number}_ends"][:-1]) for name in ("parts", "faces")
+        )
+        own = {name: arrays[f"{name}{number}"] for name in ("centres", "size", "give", "blend")}
+        levels.append(Level(**own, parts=parts, faces=faces))
+    return levels
+
+
+def _build_levels(shaped: ShapedBody, weights: F64) -> list[Level]:
+    branches = branch_sums(shaped.body.parents, weights)
+    swing = branches * joint_distance(shaped)
+    features = np.concatenate([shaped.vertices.astype(np.float64), TYPICAL_TURN * swing[:, 1:]], axis=1)
+    faces = shaped.body.faces
+    middles = features[faces].mean(axis=1)
+    coarse = _bisect(middles, np.arange(len(faces)), EXTENTS_M[0])
+    nested = [_bisect(middles, group, EXTENTS_M[1]) for group in coarse]
+    ends = np.cumsum([len(groups) for groups in nested])
+    children = [np.arange(end - len(groups), end) for groups, end in zip(nested, ends, strict=True)]
+    fine = [group for groups in nested for group in groups]
+    blend = _blend_reach(shaped.body.posedirs, len(weights))
+    return [
+        _level(shaped, features, branches, blend, coarse, children),
+        _level(shaped, features, branches, blend, fine, None),
+    ]
+
+
+def _level(
+    shaped: ShapedBody, features: F64, branches: F64, blend: F64, groups: list[I64], parts: list[I64] | None
+) -> Level:
+    members = [np.unique(shaped.body.faces[group]).astype(np.int64) for group in groups]
+    centres = np.array([rows[_nearest_to_middle(features[rows])] for rows in members])
+    rest = shaped.vertices.astype(np.float64)
+    flat, starts = np.concatenate(members), np.cumsum([0, *map(len, members)])[:-1]
+    own = np.repeat(centres, [len(rows) for rows in members])
+    size = np.maximum.reduceat(np.linalg.norm(rest[flat] - rest[own], axis=1), starts)
+    change = np.maximum.reduceat(np.abs(branches[flat] - branches[own]), starts, axis=0)
+    give = change * np.linalg.norm(rest[centres][:, None] - shaped.joints, axis=2)
+    reach = np.maximum.reduceat(blend[flat], starts, axis=0)
+    return Level(centres, size, give[:, 1:], reach, members if parts is None else parts, groups)
+
+
+def _blend_reach(posedirs: NDArray[np.float32] | None, count: int) -> F64:
+    """(V,54) metres: how far each joint's pose blend shapes can move each vertex at |R - I| = 1."""
+    if posedirs is None:
+        return np.zeros((count, 54))
+    blocks = posedirs.reshape(count, 3, 54, 9)
+    return np.asarray(np.sqrt(np.einsum("vajk,vajk->vj", blocks, blocks).astype(np.float64)))
+
+
+def _bisect(features: F64, rows: I64, extent: float) -> list[I64]:
+    """`rows` in groups: halved along the longest axis of their `features` until no axis is longer than `extent`."""
+    here = features[rows]
+    low, high = here.min(axis=0), here.max(axis=0)
+    axis = int((high - low).argmax())
+    if len(rows) <= LEAST_FACES or high[axis] - low[axis] <= extent:
+        return [rows]
+    left = here[:, axis] < (low[axis] + high[axis]) / 2.0
+    return _bisect(features, rows[left], extent) + _bisect(features, rows[~left], extent)
+
+
+def _nearest_to_middle(points: F64) -> int:
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
+    return int(np.linalg.norm(points - middle, axis=1).argmin())
+
 
 #: Margins for rounding, added to every radius (metres) and to every side of the rectangle (NDC).
 ROUNDING_M = 1e-4
@@ -165,7 +357,7 @@ class MeshBounds:
         return seen.rect() if (seen.low > -1.0).all() and (seen.high < 1.0).all() else None
 
     def _sort_out(self, level: Level, rows: I64, view: _View, seen: _Extent) -> tuple[I64, I64]:
-        """Of the patches `rows`: the indices of those that may widen `seen`, and of those the near plane may cut."""
+        """Indices of the patches `rows` that may widen `seen`, and of the ones that the near plane may cut."""
         radius = level.size[rows] + (self._standoff + ROUNDING_M)
         radius += np.einsum("pj,j->p", level.give[rows], view.turned / np.sqrt(2.0))
         if self._blend is not None:

@@ -1,7 +1,8 @@
 """The pose stage: from a frame's number to everything that the other stages have to know about it.
 
-Rule: motion and camera are asked for the frame's media time, frame / fps; nothing that is not finite leaves here. A
-frame that shows what an earlier one showed, or nobody, is told so, skins nothing and skips the stages that would draw.
+Motion and camera are asked for the frame's media time, frame / fps; nothing that is not finite leaves here. A frame
+that shows what an earlier one showed, or nobody, skins nothing and skips the stages that would draw it. Of each body as
+much is modelled as the picture needs: the cheapest level of detail within the budget of pixels.
 """
 
 from __future__ import annotations
@@ -10,28 +11,105 @@ import time
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.arrays import F64
+from trilane.arrays import F32, F64
+from trilane.avatars.bundle import CLOTHES_STANDOFF_M
+from trilane.body.body import ShapedBody
 from trilane.body.kinematics import Posed, Skeleton
+from trilane.body.skinning import DETAILS, DetailBounds, FrameSkinner
 from trilane.errors import TrilaneError
+from trilane.machine import moved_of_kept
 from trilane.pipeline.moved_bytes import ByteCounter
 from trilane.pipeline.shared_assets import Assets
 from trilane.pipeline.stage import Skip, UnitContext
+from trilane.scene.camera_placement import steered
+from trilane.scene.crop import SCREEN, Rect, cheapest_within, error_px, least_w
 from trilane.scene.mover import Mover
-from trilane.scene.planner import Held, plan_tensor
-from trilane.scene.steering import steered
+from trilane.scene.planner import FrameWork, HeldShape, plan_tensor, shown_by, work_of
 from trilane.scene.tensor_layout import lay_out
-from trilane.scene.work import Work, shown_by, work_of
 from trilane.shapes import Shape
 from trilane.stages.avatar_assets import distinct, shaped_body, staged_of
-from trilane.stages.config import RunConfig
-from trilane.stages.cpu.actor import ModelledBody, Seen
-from trilane.stages.packets import posed_vertices
+from trilane.stages.config import RunConfig, posed_vertices
+from trilane.stages.cpu.mesh_bounds import MeshBounds
 from trilane.transport.packets import FRAME_FIELDS, Packet
+
+FINEST = len(DETAILS) - 1
+
+
+@dataclass(frozen=True)
+class SeenAvatar:
+    """An avatar on the screen. `level`: of `DETAILS`. `error_px`: the bound on what the level moves on the picture."""
+
+    rect: Rect
+    level: int
+    error_px: float
+
+
+class ModelledBody:
+    """A body that several avatars of a scene may share, with what each level of detail needs.
+
+    `skins`: whether the CPU unit skins it. `budget_px`: the largest error of a level on the picture; 0: everything is
+    modelled.
+    """
+
+    def __init__(self, shaped: ShapedBody, skins: bool, budget_px: float) -> None:
+        self.shaped = shaped
+        self.bounds = MeshBounds(shaped, standoff_m=CLOTHES_STANDOFF_M)
+        self.budget_px = budget_px if skins else 0.0
+        self.skinners = self._skinners() if skins else []
+        self.moved_to_skin = [moved_of_kept(skinner.constant_bytes) for skinner in self.skinners]
+
+    def _skinners(self) -> list[FrameSkinner]:
+        """One for each level; only the finest when nothing may be left out."""
+        if self.budget_px == 0.0:
+            return [FrameSkinner(self.shaped)] * len(DETAILS)
+        return [FrameSkinner(self.shaped, detail) for detail in DETAILS]
+
+    @cached_property
+    def detail(self) -> DetailBounds:
+        return DetailBounds(self.shaped)
+
+    def skeleton(self) -> Skeleton:
+        return Skeleton(self.shaped.joints, self.shaped.body.parents)
+
+    def choose(self, posed: Posed, clip: F64, output: Shape) -> tuple[int, float]:
+        """The level of detail of a frame, and the bound on its error in pixels of a picture of `output`."""
+        if self.budget_px == 0.0:
+            return FINEST, 0.0
+        w = least_w(posed, clip, self.detail.reach, self.detail.blend_m(posed))
+        errors = [error_px(metres, clip, w, output) for metres in self.detail.metres(posed)]
+        level = cheapest_within(errors, self.budget_px)
+        return level, errors[level]
+
+    def see(
+        self, posed: Posed, clip: F64, output: Shape, vertices: F32 | None, moved: ByteCounter
+    ) -> SeenAvatar | None:
+        """Skin the body into `vertices`, if given, and find its rectangle; None when nothing of it is visible.
+
+        `posed`: the frame. `clip` (4,4): projection @ view. `output`: (height, width) of the picture. `moved`: counts
+        the vertices, which are written, then read to find the rectangle, and what skinning reads from memory.
+        """
+        level, error = self.choose(posed, clip, output)
+        if vertices is not None:
+            self.skinners[level].skin_into(posed, vertices)
+            moved.copied(vertices.nbytes)
+            moved.read += self.moved_to_skin[level]
+            moved.least += self.moved_to_skin[level] + vertices.nbytes
+        rect = self.bounds.rect(posed, clip, vertices)
+        return None if rect is None else SeenAvatar(widened(rect, error, output), level, error)
+
+
+def widened(rect: Rect, error_px: float, output: Shape) -> Rect:
+    """`rect` with `error_px` pixels more on every side, clipped to the screen."""
+    x, y = 2.0 * error_px / output[1], 2.0 * error_px / output[0]
+    low = max(rect.x0 - x, SCREEN.x0), max(rect.y0 - y, SCREEN.y0)
+    high = min(rect.x1 + x, SCREEN.x1), min(rect.y1 + y, SCREEN.y1)
+    return Rect(*low, *high)
 
 
 @dataclass(frozen=True)
@@ -58,10 +136,10 @@ class FramePlan:
     visible avatar.
     """
 
-    work: Work
+    work: FrameWork
     shape: Shape | None
     density: float | None
-    seen: Mapping[int, Seen]
+    seen: Mapping[int, SeenAvatar]
 
 
 @dataclass(frozen=True)
@@ -78,7 +156,7 @@ OF_THE_FRAME = {*(name for name, _ in FRAME_FIELDS), "media_time_s", "work"}
 
 
 class PoseStage:
-    """Stage `pose` of the CPU unit: no input edge, an output edge of headers. `plan`: of the frame that it did last."""
+    """Stage `pose` of the CPU unit: no input edge, an output edge of headers. `plan`: plan of the last frame."""
 
     def __init__(self, config: RunConfig, assets: Assets) -> None:
         """The scene of `config`, whose avatars, motions and camera lie in `assets`."""
@@ -88,9 +166,9 @@ class PoseStage:
         self._buckets, self._plans_tensor = config.buckets, scene.plans_tensor
         self._budgets, self._changes = config.tensor_budgets, config.changes
         self._rung = 0
-        self._held: Held | None = None
+        self._held: HeldShape | None = None
         self._skips = scene.plan == "planned"
-        self.plan = FramePlan(Work.NONE, None, None, {})
+        self.plan = FramePlan(FrameWork.NONE, None, None, {})
         folders = distinct(config)
         bodies = {
             folder: ModelledBody(shaped_body(assets, number), bool(config.posed_vertices), config.budget_px)
@@ -104,7 +182,7 @@ class PoseStage:
         self._camera = staged.camera
         self._counts = config.posed_vertices
         self._window = config.opened_window()
-        self._made: dict[Work, _Made] = {}
+        self._made: dict[FrameWork, _Made] = {}
         self._moved = ByteCounter()
         self._was_seen = [False] * len(self._actors)
         self._slots: list[NDArray[np.void]] = []
@@ -120,7 +198,7 @@ class PoseStage:
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:  # noqa: ARG002
         """Fill `outputs[slot_out]` for `frame`. A `Skip` but for full work, which all frames of a fixed plan are.
 
-        Metrics: `visible`, how many avatars are; of a full frame `level` of `body.detail.DETAILS` and `error_px`, the
+        Metrics: `visible`, how many avatars are; of a full frame `level` of `body.skinning.DETAILS` and `error_px`, the
         bound on what it moves on the picture, both of the worst avatar; `density` of a planned tensor; the bytes moved.
         The least: what was sampled of motions and camera, the header, and of avatars that were skinned the vertices.
 
@@ -141,12 +219,12 @@ class PoseStage:
         shown = shown_by([view, projection, *(array for pair in moved for array in pair)])
         work = self._work_of(shown, lambda: self._make(slot_out, frame, view, projection, moved))
         packet["work"] = work
-        known = self._made.get(Work.FULL if work is Work.REUSE else work)
+        known = self._made.get(FrameWork.FULL if work is FrameWork.REUSE else work)
         if self._skips and known is not None and known.shown == shown:
             _copy_same(known.header, packet)
             self.plan = replace(known.plan, work=work)
         else:
-            packet["picture"] = frame if work is Work.FULL else -1
+            packet["picture"] = frame if work is FrameWork.FULL else -1
             self.plan = replace(self.plan, work=work)
             self._made[work] = _Made(shown, packet.copy(), self.plan)
         return _metrics(self.plan, self._moved)
@@ -165,21 +243,21 @@ class PoseStage:
             return view
         return steered(view, self._actors[0].pivot(moved[0][1]), *self._window.steering)
 
-    def _work_of(self, shown: bytes, is_anybody_seen: Callable[[], bool]) -> Work:
+    def _work_of(self, shown: bytes, is_anybody_seen: Callable[[], bool]) -> FrameWork:
         if self._skips:
-            return work_of(shown, self._shown_by(Work.FULL), self._shown_by(Work.NONE), is_anybody_seen)
+            return work_of(shown, self._shown_by(FrameWork.FULL), self._shown_by(FrameWork.NONE), is_anybody_seen)
         is_anybody_seen()
-        return Work.FULL
+        return FrameWork.FULL
 
     def forget(self) -> None:
         """The next frame in which anybody is seen is a full one."""
-        self._made.pop(Work.FULL, None)
+        self._made.pop(FrameWork.FULL, None)
 
     def step_to(self, rung: int) -> None:
         """Tensors have the pixels of `RunConfig.works[rung]` from now on."""
         self._rung = rung
 
-    def _shown_by(self, work: Work) -> bytes | None:
+    def _shown_by(self, work: FrameWork) -> bytes | None:
         return self._made[work].shown if work in self._made else None
 
     def _make(self, slot_out: int, frame: int, view: F64, projection: F64, moved: Sequence[tuple[F64, F64]]) -> bool:
@@ -201,11 +279,11 @@ class PoseStage:
         self.plan = self._lay_out(packet, seen)
         return bool(seen)
 
-    def _lay_out(self, packet: NDArray[np.void], seen: list[tuple[NDArray[np.void], Seen]]) -> FramePlan:
+    def _lay_out(self, packet: NDArray[np.void], seen: list[tuple[NDArray[np.void], SeenAvatar]]) -> FramePlan:
         """Crop rectangles, cells and the tensor's shape; the smallest shape when nothing is to be drawn."""
         if not seen:
             packet["tensor_shape"] = min(self._buckets, key=lambda shape: shape[0] * shape[1])
-            return FramePlan(Work.NONE, None, None, {})
+            return FramePlan(FrameWork.NONE, None, None, {})
         rects, density = [one.rect for _, one in seen], None
         if self._plans_tensor:
             foreseen = self._foreseen(float(packet["media_time_s"]))
@@ -217,7 +295,7 @@ class PoseStage:
         packet["tensor_shape"] = layout.shape
         for (avatar, _), (crop, cell) in zip(seen, layout.crops, strict=True):
             avatar["rect"], avatar["tensor_rect"] = crop, cell
-        return FramePlan(Work.FULL, layout.shape, density, {int(avatar["avatar"]): one for avatar, one in seen})
+        return FramePlan(FrameWork.FULL, layout.shape, density, {int(avatar["avatar"]): one for avatar, one in seen})
 
     def _foreseen(self, t_s: float) -> Shape | None:
         """The tensor's shape at `t_s`; None where it was not foreseen."""
@@ -235,7 +313,7 @@ class PoseStage:
         moved: Sequence[tuple[F64, F64]],
         frame: int,
         clip: NDArray[np.float64],
-    ) -> Seen | None:
+    ) -> SeenAvatar | None:
         """Fill one avatar's joints, and `vertices` if given; where it is on the screen, None when it is not visible.
 
         One that is far off the screen is not posed; one that was not seen in the last frame that was made is looked for
@@ -268,7 +346,7 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> PoseStage:
 
 def _metrics(plan: FramePlan, moved: ByteCounter) -> Mapping[str, float]:
     metrics = {"visible": float(len(plan.seen)), **moved.figures()}
-    if plan.work is not Work.FULL:
+    if plan.work is not FrameWork.FULL:
         return Skip(metrics)
     if plan.seen:
         metrics["level"] = float(max(one.level for one in plan.seen.values()))

@@ -1,8 +1,9 @@
 """The present stage: frames become a segment of video, and a digest of every frame a line beside it.
 
-Rule: what is presented is what the slot held, digested before anything else is done to it. Each process writes one
-segment, named so that none replaces another; the parent joins them (`trilane.apps.video`). A segment is fragmented
-MP4: when its writer is killed it is readable, short of the last frame at most.
+What is presented is what the slot held, digested before anything else is done to it. Each process writes one segment,
+named so that none replaces another; the parent joins them (`trilane.apps.video`). A segment is fragmented MP4: when its
+writer is killed it is readable, short of the last frame at most. Frames that somebody wants to compare when the run is
+over are kept as arrays beside it.
 """
 
 from __future__ import annotations
@@ -20,10 +21,10 @@ import numpy as np
 from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 from numpy.typing import NDArray
 
+from trilane.arrays import U8
 from trilane.pipeline.moved_bytes import ByteCounter
 from trilane.pipeline.stage import UnitContext
 from trilane.stages.config import RunConfig
-from trilane.stages.cpu.kept_frames import KeptFrames
 from trilane.transport.packets import Packet
 
 SEGMENTS = "segments"
@@ -157,3 +158,30 @@ class PresentStage:
 def build(settings: Mapping[str, Any], unit: UnitContext) -> PresentStage:  # noqa: ARG001 - a factory's signature
     """The present stage of the configuration in `settings`."""
     return PresentStage(RunConfig.model_validate(settings["config"]))
+
+
+KEPT_FOLDER = "kept"
+
+
+class KeptFrames:
+    """Keeps frames `numbers`, which rise, in `folder`/`FOLDER`."""
+
+    def __init__(self, folder: Path, numbers: Sequence[int]) -> None:
+        self._folder, self._numbers = folder / KEPT_FOLDER, list(numbers)
+        self._next = self._numbers.pop(0) if self._numbers else None
+
+    def see(self, frame: int, pixels: U8) -> None:
+        """Keep frame `frame`, (h,w,3), if it is asked for."""
+        if self._next is None or frame < self._next:
+            return
+        self._folder.mkdir(exist_ok=True)
+        np.save(self._folder / f"{frame}.npy", pixels, allow_pickle=False)
+        while self._next is not None and self._next <= frame:
+            self._next = self._numbers.pop(0) if self._numbers else None
+
+
+def kept_frames(folder: Path) -> dict[int, Path]:
+    """The files of the frames that were kept in `folder`, by number."""
+    return {
+        int(file.stem): file for file in sorted((folder / KEPT_FOLDER).glob("*.npy"), key=lambda file: int(file.stem))
+    }

@@ -46,7 +46,7 @@ Shapes = Mapping[str, Sequence[int]]
 
 
 class Calls(NamedTuple):
-    """`took_ns`: by threads, of each call. `runtime`: that ran it. `at`: when, UTC."""
+    """`took_ns`: nanoseconds of each call, by number of threads. `runtime`: its name. `at`: date and time, UTC."""
 
     took_ns: Mapping[int, Sequence[int]]
     runtime: str
@@ -58,9 +58,9 @@ def calls_of(
 ) -> Calls:
     """How long calls of the network in `path` take, without the time in which they had no core.
 
-    `shapes`: of inputs by name, in place of what the file says. `runtime`: of a network of integers. `counts`: numbers
-    of threads. `cores`: to run on, the last ones first. `say`: is called before it takes seconds.
-    Raises BadInputError for a file that cannot be read, TrilaneError when the network cannot be run.
+    `shapes`: shapes of inputs by name, in place of the file's. `runtime`: runtime of a network of integers. `counts`:
+    numbers of threads. `cores`: cores to run on, the last ones first. `say`: is called before it takes seconds. Raises
+    BadInputError for a file that cannot be read, TrilaneError when the network cannot be run.
     """
     runs = runtime if not shapes and _integers(path) is not None else ORT
     asked = [runs, str([*cores]), str([*counts]), str(sorted(shapes.items()))]
@@ -101,7 +101,7 @@ def _integers(path: Path) -> NetworkFile | None:
 
 
 def _digest(path: Path) -> str:
-    """Of the file and its size; weights beside it do not change how long it takes."""
+    """A digest of the file and its size; weights beside it do not change how long it takes."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 

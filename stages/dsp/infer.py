@@ -1,10 +1,14 @@
 """The infer stage: bytes of a slot in, bytes of a slot out, by the avatar's integer network or a part of it.
 
-Rule: sessions and bindings are all made in `bind`, a frame allocates nothing, and with nobody in view nothing is run.
+Sessions and bindings are all made in `bind`, a frame allocates nothing, and with nobody in view nothing is run. The
+tensors that cross a cut of the network lie in a slot in the order of the cut, each on its own cache lines; every
+process that looks at the same configuration finds the same places.
 """
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -12,29 +16,93 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+import onnx
+from numpy.typing import NDArray
 
 from trilane import machine
 from trilane.arrays import U8
-from trilane.avatars.integer_network import NetworkFile
-from trilane.avatars.network_split import NetworkPart
+from trilane.avatars.integer_network import NetworkFile, constants_of
+from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.network_split import NetworkPart, Shapes, split
+from trilane.cache import Arrays, cached_arrays
 from trilane.errors import BadInputError
+from trilane.machine import moved_of_kept
 from trilane.pipeline.moved_bytes import ByteCounter
 from trilane.pipeline.stage import UnitContext
 from trilane.shapes import Shape
 from trilane.stages.avatar_assets import network_of
 from trilane.stages.config import RunConfig
-from trilane.stages.dsp.parts import constant_bytes, parts_for, views
-from trilane.stages.dsp.runtime import (
-    Binding,
-    RuntimeOptions,
-    Session,
-    copies_slots,
-    has_device,
-    load_runtime,
-    resolve,
-)
-from trilane.stages.last_level_cache import moved_of_kept
+from trilane.stages.dsp.runtime import Binding, RuntimeOptions, Session, copies_slots, has_device, load_runtime, resolve
 from trilane.transport.packets import Packet
+
+VERSION = "network parts 1"  # to be raised when the same network and cuts give other parts
+SHAPES = ("inputs", "outputs", "crossing_in", "crossing_out")
+LINE = 64  # bytes of a cache line, and of the widest vector register
+
+
+def parts_for(config: RunConfig, network: NetworkFile, shape: Shape) -> list[NetworkPart]:
+    """The parts of `network` for tensors of `shape`, cut as `config` says; one part when it is not cut.
+
+    They are cached: inferring every shape of the graph again takes longer than reading them.
+    """
+    cuts = [cut.at for cut in config.cuts]
+    sources = (VERSION, onnx.__version__, network.digest, *map(str, shape), *cuts)
+    stored = cached_arrays(VERSION, sources, lambda: _to_arrays(split(reshaped(network, *shape), cuts)))
+    return _from_arrays(stored, network.where)
+
+
+def _to_arrays(parts: Sequence[NetworkPart]) -> dict[str, NDArray[Any]]:
+    """The model's bytes of each part, and its shapes as JSON."""
+    arrays: dict[str, NDArray[Any]] = {}
+    for number, part in enumerate(parts):
+        shapes = json.dumps({name: list(getattr(part, name).items()) for name in SHAPES})
+        arrays[f"model{number}"] = np.frombuffer(part.model.SerializeToString(), np.uint8)
+        arrays[f"shapes{number}"] = np.frombuffer(shapes.encode(), np.uint8)
+    return arrays
+
+
+def _from_arrays(arrays: Arrays, where: str) -> list[NetworkPart]:
+    parts = []
+    for number in range(len(arrays) // 2):
+        model = onnx.load_from_string(arrays[f"model{number}"].tobytes())
+        rows = json.loads(arrays[f"shapes{number}"].tobytes())
+        shapes = {name: {tensor: tuple(shape) for tensor, shape in rows[name]} for name in SHAPES}
+        parts.append(NetworkPart(where, model, **shapes))
+    return parts
+
+
+def crossing_bytes(config: RunConfig, network: NetworkFile) -> list[int]:
+    """Bytes that cross each cut of `network`, for the scene's shape that needs most. Raises BadInputError."""
+    if not config.cuts:
+        return []
+    shapes = [[part.crossing_out for part in parts_for(config, network, shape)[:-1]] for shape in config.buckets]
+    return [max(extent(crossing) for crossing in crossings) for crossings in zip(*shapes, strict=True)]
+
+
+def constant_bytes(model: onnx.ModelProto) -> int:
+    """Bytes of the constants of `model`: weights, biases, scales."""
+    return sum(
+        math.prod(tensor.dims) * onnx.helper.tensor_dtype_to_np_dtype(tensor.data_type).itemsize
+        for tensor in constants_of(model).values()
+    )
+
+
+def extent(shapes: Shapes) -> int:
+    """Bytes that tensors of `shapes` take up in a slot."""
+    return sum(-(-math.prod(shape) // LINE) * LINE for shape in shapes.values())
+
+
+def views(payload: U8, shapes: Shapes) -> dict[str, U8]:
+    """Tensors of `shapes` in a slot, in their order. Raises ValueError when the slot is too small."""
+    found, start = {}, 0
+    for name, shape in shapes.items():
+        size = math.prod(shape)
+        if start + size > payload.size:
+            raise ValueError(f"a slot of {payload.size} bytes, {start + size} needed")
+        found[name] = payload[start : start + size].reshape(shape)
+        start += -(-size // LINE) * LINE
+    return found
+
 
 Key = tuple[Shape, int, int]
 #: Runtimes that may compile several networks at the same time.

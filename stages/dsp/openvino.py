@@ -16,10 +16,10 @@ from trilane.arrays import U8
 from trilane.avatars.integer_network import IntegerNetwork
 from trilane.cache import cache_dir
 from trilane.errors import BadInputError
-from trilane.stages.dsp.quiet_openvino import openvino
-from trilane.stages.dsp.runtime import RuntimeOptions
+from trilane.stages.dsp.runtime import RuntimeOptions, quiet_openvino
 from trilane.writing import write_bytes
 
+openvino = quiet_openvino()
 DEVICE = "CPU"
 LAYERS = {"Convolution", "Deconvolution", "FullyConnected", "MatMul"}
 INTEGERS = ("i8", "u8")

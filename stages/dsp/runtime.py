@@ -5,24 +5,24 @@ Rule: a runtime is chosen by name; it runs the network or the run stops with an 
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
-from typing import Protocol
+from typing import Any, Protocol, cast
 
 from trilane import machine
 from trilane.arrays import U8
 from trilane.avatars.integer_network import IntegerNetwork
-from trilane.errors import BadInputError, MissingPartError
-from trilane.install import install_line, package_line, pip
+from trilane.errors import BadInputError, MissingPartError, install_line, package_line, pip
 
 X86 = ("x86_64", "AMD64")
 
 
 @dataclass(frozen=True)
 class RuntimeOptions:
-    """`threads`: that compute, the calling one included. `spin`: whether they may spin between jobs.
+    """`threads`: number of computing threads, the calling one included. `spin`: whether they may spin between jobs.
 
     `device`: settings that only one runtime has, by its own names, such as `htp_arch` of `qnn`.
     """
@@ -130,3 +130,15 @@ def load_runtime(name: str) -> Runtime:
     """The module of runtime `name`. Raises as `resolve`."""
     module: Runtime = import_module(RUNTIMES[resolve(name)].module)
     return module
+
+
+def quiet_openvino() -> Any:
+    """OpenVINO, imported without its telemetry; everybody imports it by this function.
+
+    Imported by itself it tells a server of its maker that it was imported, and keeps a number for that in the home
+    folder. Where the package `openvino_telemetry` is missing it uses a stand-in of its own, which does neither.
+    """
+    cast(dict[str, Any], sys.modules).setdefault("openvino_telemetry", None)
+    import openvino
+
+    return openvino

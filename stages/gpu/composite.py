@@ -1,37 +1,181 @@
 """The composite stage: background, planes, contact shadow, avatars, display, in that order, to the presented frame.
 
-Rule: avatars are drawn far to near; one that is not visible leaves no trace. A frame that would be drawn as one that an
-output slot still holds is copied, not drawn.
+Avatars are drawn far to near; one that is not visible leaves no trace. A frame that would be drawn as one that an
+output slot still holds is copied, not drawn: only the composite writes to its output slots, so their bytes stay until
+it writes there again.
+
+While the camera stands still, what lies under the avatars is drawn twice and copied from then on. The first frame of a
+view is only drawn, because most views of a moving camera never come again. The second one is kept in host memory: a
+software driver copies it from there in a tenth of a millisecond, and takes twenty times as long to copy between
+framebuffers.
+
+The display shows frame number and time of the picture. Rate and age, which this stage measures, are updated four times
+a second so that they can be read, and start again when frame numbers do.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+import time
+from collections import deque
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import moderngl
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
 
 from trilane.arrays import F64, Floats
 from trilane.pipeline.stage import UnitContext
+from trilane.scene.planner import FrameWork
 from trilane.scene.schema import PlaneSpec
-from trilane.scene.work import Work
 from trilane.shapes import Shape
 from trilane.stages.avatar_assets import distinct, shaped_body, staged_of
 from trilane.stages.config import RunConfig
-from trilane.stages.gpu import opengl_calls
+from trilane.stages.gpu import opengl
 from trilane.stages.gpu.background import Background, open_background
-from trilane.stages.gpu.composite_painters import AvatarPainter, PicturePainter, RoomPainter, ShadowPainter
-from trilane.stages.gpu.contact_shadows import DISCS, floor_discs
-from trilane.stages.gpu.detected_planes import PlanePainter
-from trilane.stages.gpu.drawn_frames import Drawing, DrawnFrames
-from trilane.stages.gpu.head_up_display import Hud
-from trilane.stages.gpu.opengl_context import CONTEXT, checked, describe, open_context
-from trilane.stages.gpu.still_background import StillBackground
-from trilane.stages.gpu.transfers import counter_of, read_into
+from trilane.stages.gpu.composite_painters import (
+    DISCS,
+    AvatarPainter,
+    PicturePainter,
+    PlanePainter,
+    RoomPainter,
+    ShadowPainter,
+    floor_discs,
+)
+from trilane.stages.gpu.opengl import (
+    CONTEXT,
+    build_program,
+    checked,
+    counter_of,
+    describe,
+    open_context,
+    read_into,
+    upload,
+)
 from trilane.transport.packets import Packet
+
+#: Picture of the avatars, picture of the background, view and projection.
+Drawing = tuple[int, int, bytes, bytes]
+
+
+class DrawnFrames:
+    """Notes of what was drawn, by slot."""
+
+    def __init__(self) -> None:
+        self._slots: dict[int, tuple[Drawing | None, int]] = {}
+
+    def slot_of(self, drawing: Drawing | None, preferred: int) -> int | None:
+        """A slot that holds `drawing`, `preferred` if that does; None when there is none, or `drawing` is None."""
+        if drawing is None:
+            return None
+        held = [slot for slot, (there, _) in self._slots.items() if there == drawing]
+        return preferred if preferred in held else held[0] if held else None
+
+    def note(self, slot: int, drawing: Drawing | None, frame: int, copied_from: int | None) -> int:
+        """`slot` holds `drawing` of `frame` from now on; what `repeats` of the frame's header is to be.
+
+        `copied_from`: the slot that held it already; None when it was drawn now.
+        """
+        drawn = frame if copied_from is None else self._slots[copied_from][1]
+        self._slots[slot] = (drawing, drawn)
+        return 0 if copied_from is None else drawn + 1
+
+
+class StillBackground:
+    """Keeps the background of `target`, a framebuffer with one colour of four bytes."""
+
+    def __init__(self, target: Any) -> None:
+        self._target = target
+        self._bytes = np.empty(target.width * target.height * 4, np.uint8)
+        self._shown: Hashable = None
+        self._is_kept = False
+
+    def draw(self, shown: Hashable, draw: Callable[[], None]) -> None:
+        """Fill the target with the background that `shown`, which is not None, stands for: by `draw`, or a copy."""
+        if shown == self._shown and self._is_kept:
+            upload(self._target.ctx, self._target.color_attachments[0], self._bytes)
+            return
+        draw()
+        self._is_kept = shown == self._shown
+        self._shown = shown
+        if self._is_kept:
+            read_into(self._target.ctx, self._target, self._bytes, components=4, alignment=1)
+
+
+SIZE = (232, 62)  # width, height
+MARGIN_PX = 8
+TEXT_PX = 15
+RENEW_NS = 250_000_000
+REMEMBERED = 60
+SHEET, INK = (0, 0, 0, 150), (255, 255, 255, 255)
+
+
+class Hud:
+    """Draws into the lower left corner of a target; a target smaller than the display shows a part of it."""
+
+    def __init__(self, ctx: Any) -> None:
+        self._ctx = ctx
+        self._program = build_program(ctx, "whole_screen.vert", "head_up_display.frag")
+        self._screen = ctx.vertex_array(self._program, [])
+        self._texture = ctx.texture(SIZE, 4)
+        self._font = ImageFont.load_default(TEXT_PX)
+        self._presented: deque[int] = deque(maxlen=REMEMBERED)
+        self._renewed_ns = self._frame = 0
+        self._measured = ""
+
+    def draw(self, target: Any, pose: NDArray[np.void]) -> None:
+        """Blend the display for the frame of pose packet `pose` over `target`."""
+        lines = self._lines(pose, time.monotonic_ns())
+        upload(self._ctx, self._texture, hud_picture(lines, self._font).tobytes())
+        corner = MARGIN_PX, target.height - MARGIN_PX - SIZE[1]
+        self._program["corner"].value = corner
+        target.viewport = (*corner, *SIZE)
+        self._ctx.enable_only(moderngl.BLEND)
+        self._ctx.blend_func = moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA
+        self._texture.use(0)
+        self._screen.render(vertices=3)
+        target.viewport = (0, 0, target.width, target.height)
+
+    def _lines(self, pose: NDArray[np.void], now_ns: int) -> list[str]:
+        if int(pose["frame"]) <= self._frame:
+            self._presented.clear()
+            self._renewed_ns = 0
+        self._frame = int(pose["frame"])
+        self._presented.append(now_ns)
+        if now_ns - self._renewed_ns >= RENEW_NS:
+            self._renewed_ns = now_ns
+            self._measured = measured_line(pose, list(self._presented))
+        return hud_lines(pose, self._measured)
+
+
+def measured_line(pose: NDArray[np.void], presented_ns: list[int]) -> str:
+    """The line of rate and age. `presented_ns`: when the last frames were composed, this frame's time last."""
+    span = presented_ns[-1] - presented_ns[0]
+    rate = f"{(len(presented_ns) - 1) * 1e9 / span:.1f} fps" if span > 0 else "- fps"
+    age_ms = (presented_ns[-1] - int(pose["t_sampled_ns"])) / 1e6
+    return f"{rate}   {age_ms:.0f} ms from pose"
+
+
+def hud_lines(pose: NDArray[np.void], measured: str) -> list[str]:
+    """The three lines of the display; `measured` is the middle one."""
+    height, width = pose["tensor_shape"].tolist()
+    visible = int(sum(avatar["visible"] for avatar in pose["avatars"][: int(pose["avatar_count"])]))
+    return [
+        f"frame {int(pose['frame'])}   {float(pose['media_time_s']):.2f} s",
+        measured,
+        f"tensor {height}x{width}   {visible} in view",
+    ]
+
+
+def hud_picture(lines: list[str], font: Any) -> NDArray[np.uint8]:
+    """(62,232,4) uint8, straight alpha: `lines` on a dark background."""
+    image = Image.new("RGBA", SIZE, SHEET)
+    ImageDraw.Draw(image).multiline_text((8, 3), "\n".join(lines), INK, font, spacing=3)
+    return np.asarray(image)
+
 
 ROOM = "room"
 
@@ -59,7 +203,7 @@ class CompositeStage:
         hud: bool = False,
     ) -> None:
         self._ctx, self._shape, self._rest, self._background = ctx, shape, rest, background
-        colour = ctx.texture(shape[::-1], 4, internal_format=opengl_calls.SRGB8_ALPHA8)
+        colour = ctx.texture(shape[::-1], 4, internal_format=opengl.SRGB8_ALPHA8)
         self._target = ctx.framebuffer([colour])
         self._still = StillBackground(self._target)
         self._room = RoomPainter(ctx, eyes) if background is None else None
@@ -94,7 +238,7 @@ class CompositeStage:
         with checked(self._ctx):
             self._take(pose, packet.payload)
             drawing = self._drawing(pose)
-            repeated = None if int(pose["work"]) == Work.FULL else self._drawn.slot_of(drawing, slot_out)
+            repeated = None if int(pose["work"]) == FrameWork.FULL else self._drawn.slot_of(drawing, slot_out)
             frame_bytes = math.prod(self._shape) * 3
             if repeated is None:
                 self._draw(pose)
@@ -105,11 +249,11 @@ class CompositeStage:
                 out.payload[:frame_bytes] = self._outputs[repeated].payload[:frame_bytes]
                 moved.copied(frame_bytes)
         out.header["repeats"] = self._drawn.note(slot_out, drawing, frame, repeated)
-        work, is_right = Work(int(pose["work"])), self._holds(int(pose["picture"]))
+        work, is_right = FrameWork(int(pose["work"])), self._holds(int(pose["picture"]))
         said = {
-            "nobody": work is Work.NONE,
-            "reused": work is Work.REUSE and is_right,
-            "stale": work is Work.REUSE and not is_right,
+            "nobody": work is FrameWork.NONE,
+            "reused": work is FrameWork.REUSE and is_right,
+            "stale": work is FrameWork.REUSE and not is_right,
             "copied": repeated is not None,
         }
         return {**{name: float(value) for name, value in said.items()}, **moved.figures()}
@@ -127,7 +271,7 @@ class CompositeStage:
                 self._shows_background += 1
                 self._picture.upload(picture)
                 counter_of(self._ctx).least += picture.nbytes
-        if int(pose["work"]) == Work.FULL:
+        if int(pose["work"]) == FrameWork.FULL:
             self._held = pose.copy()
             if _visible(pose):
                 shape = _tensor_shape(pose)
@@ -142,7 +286,7 @@ class CompositeStage:
         """What the frame's bytes depend on; None when it is like no other."""
         if self._hud is not None:
             return None
-        nobody = self._held is None or int(pose["work"]) == Work.NONE
+        nobody = self._held is None or int(pose["work"]) == FrameWork.NONE
         picture = -1 if self._held is None or nobody else int(self._held["picture"])
         return picture, self._shows_background, pose["view"].tobytes(), pose["projection"].tobytes()
 
@@ -151,7 +295,7 @@ class CompositeStage:
         self._target.use()
         shown = self._shows_background, pose["view"].tobytes(), pose["projection"].tobytes()
         self._still.draw(shown, lambda: self._draw_background(pose))
-        if self._held is not None and int(pose["work"]) != Work.NONE:
+        if self._held is not None and int(pose["work"]) != FrameWork.NONE:
             self._draw_avatars(self._held)
         if self._hud is not None:
             self._hud.draw(self._target, pose)
@@ -190,7 +334,7 @@ def _visible(pose: NDArray[np.void]) -> list[Any]:
 
 
 def _cells_bytes(pose: NDArray[np.void]) -> int:
-    """Of the network's picture, in the rectangles of the avatars in view."""
+    """Bytes of the network's picture in the rectangles of the avatars in view."""
     return sum(4 * int(avatar["tensor_rect"][2]) * int(avatar["tensor_rect"][3]) for avatar in _visible(pose))
 
 

@@ -1,6 +1,12 @@
-"""The painters of the composite, one class per layer of the frame: room, picture, contact shadows, avatars.
+"""The painters of the composite, one class per layer of the frame: room, picture, planes, contact shadows, avatars.
 
-Rule: background bytes are copied unchanged, as sRGB; whatever is blended over them is blended in linear light.
+Background bytes are copied unchanged, as sRGB; whatever is blended over them is blended in linear light. Planes are
+those of the scene file; nothing is detected here. A contact shadow is a disc under a joint, which grows and fades with
+the height of its joint above the floor.
+
+A body fills about half of its rectangle; a software driver takes as long for a pixel that stays as it is as for any
+other. So the network's picture is cut into bands of rows, and each band to the columns between its first and last texel
+that is not transparent, widened by what a screen pixel may read beside its middle.
 """
 
 from __future__ import annotations
@@ -12,14 +18,68 @@ from typing import Any
 
 import moderngl
 import numpy as np
+from numpy.typing import NDArray
 
-from trilane.arrays import F32, U8, Floats, Mask
-from trilane.stages.gpu import opengl_calls
+from trilane.arrays import F32, F64, U8, Floats, Mask
+from trilane.body.joints import JOINT_INDEX
+from trilane.scene.schema import PlaneSpec
+from trilane.stages.gpu import opengl
 from trilane.stages.gpu.builtin_room import Extent, room_mesh, room_textures
-from trilane.stages.gpu.camera_matrices import eye_of, target_clip
-from trilane.stages.gpu.picture_spans import BAND, WHOLE, spans
-from trilane.stages.gpu.shader_program import build_program
-from trilane.stages.gpu.transfers import counter_of, upload, uploaded_buffer
+from trilane.stages.gpu.opengl import build_program, counter_of, eye_of, target_clip, upload, uploaded_buffer
+
+BAND = 16  # rows
+WHOLE: F32 = np.array([[0, 0, 1, 1]], np.float32)
+
+
+def spans(shown: Mask, margin: int) -> F32:
+    """(N,4) float32: left, top, right, bottom of each part, as shares of the picture's sides.
+
+    `shown`: (h,w) where the picture is not transparent. `margin`: texels that are read beside a pixel's middle.
+    """
+    height, width = shown.shape
+    has_any = shown.any(axis=1)
+    first = np.where(has_any, shown.argmax(axis=1), width)
+    end = np.where(has_any, width - shown[:, ::-1].argmax(axis=1), 0)
+    tops = np.arange(0, height, BAND)
+    bottoms = np.minimum(tops + BAND, height)
+    rows = np.column_stack([np.maximum(tops - margin, 0), np.minimum(bottoms + margin, height)]).ravel()
+    left = np.minimum.reduceat(np.append(first, width), rows)[::2] - margin  # of the rows of each pair
+    right = np.maximum.reduceat(np.append(end, 0), rows)[::2] + margin
+    is_shown = right - left > 2 * margin
+    edges = np.column_stack([np.maximum(left, 0), tops, np.minimum(right, width), bottoms])[is_shown]
+    return np.asarray(edges / (width, height, width, height), np.float32)
+
+
+# joint, radius on the floor in metres, strength there, height in metres over which it fades to 1/e
+DISCS = (
+    ("left_ankle", 0.15, 0.65, 0.18),
+    ("right_ankle", 0.15, 0.65, 0.18),
+    ("left_foot", 0.16, 0.70, 0.15),
+    ("right_foot", 0.16, 0.70, 0.15),
+    ("left_knee", 0.22, 0.45, 0.30),
+    ("right_knee", 0.22, 0.45, 0.30),
+    ("pelvis", 0.50, 0.60, 1.20),
+    ("spine3", 0.45, 0.45, 0.60),
+    ("head", 0.30, 0.45, 0.30),
+    ("left_wrist", 0.16, 0.45, 0.15),
+    ("right_wrist", 0.16, 0.45, 0.15),
+)
+WIDENING = 0.35  # metres of radius gained for each metre of height
+FAINTEST = 0.02
+
+_JOINT = np.array([JOINT_INDEX[name] for name, *_ in DISCS])
+_RADIUS, _STRENGTH, _FADE = np.array([numbers for _, *numbers in DISCS]).T
+
+
+def floor_discs(joints: NDArray[np.floating[Any]], rest: F64) -> NDArray[np.float32]:
+    """Discs (N,4) float32: x, z, radius, strength, for skinning matrices (55,3,4) and rest joints (55,3)."""
+    matrices = np.asarray(joints, np.float64)[_JOINT]
+    place = np.einsum("nij,nj->ni", matrices[..., :3], rest[_JOINT]) + matrices[..., 3]
+    height = np.maximum(place[:, 1], 0.0)
+    strength = _STRENGTH * np.exp(-height / _FADE)
+    discs = np.column_stack([place[:, 0], place[:, 2], _RADIUS + WIDENING * height, strength])
+    return np.asarray(discs[strength > FAINTEST], np.float32)
+
 
 MAX_TAPS = 8
 #: Pixels of the screen from which on less is drawn in the time that it takes to find what is transparent.
@@ -107,7 +167,7 @@ class ShadowPainter:
         padded = np.zeros((self._count, 4), np.float32)
         padded[: len(blobs)] = blobs
         upload(self._ctx, self._program["blob"], padded)
-        with opengl_calls.srgb_target():
+        with opengl.srgb_target():
             self._discs.render(vertices=6 * len(blobs))
 
 
@@ -164,11 +224,11 @@ class AvatarPainter:
         program["source"].value = tuple(edge / size)
         program["inside"].value = tuple((edge + HALF_TEXEL_INWARD) / size)
         self._pictures[shape][2].use(0)
-        with opengl_calls.srgb_target():
+        with opengl.srgb_target():
             quad.render(moderngl.TRIANGLE_STRIP, vertices=4, instances=len(parts))
 
     def _picture(self, shape: tuple[int, int]) -> tuple[Any, Any, Any]:
-        straight = self._ctx.texture(shape[::-1], 4, internal_format=opengl_calls.SRGB8_ALPHA8)
+        straight = self._ctx.texture(shape[::-1], 4, internal_format=opengl.SRGB8_ALPHA8)
         premultiplied = self._ctx.texture(shape[::-1], 4, dtype="f2")
         premultiplied.filter = (moderngl.LINEAR, moderngl.LINEAR)
         premultiplied.repeat_x = premultiplied.repeat_y = False
@@ -192,3 +252,39 @@ def _detail(ctx: Any, image: U8, minify: int) -> Any:
     texture.build_mipmaps()
     texture.filter = (minify, moderngl.LINEAR)
     return texture
+
+
+UPRIGHT = 0.9  # sides of a plane whose unit normal has |y| above this are aligned with the world's x, others with its y
+
+
+class PlanePainter:
+    """Draws `planes` (at least one) into the target in use."""
+
+    def __init__(self, ctx: Any, planes: Sequence[PlaneSpec]) -> None:
+        self._ctx, self._count = ctx, len(planes)
+        self._program = build_program(ctx, "plane.vert", "plane.frag", PLANES=len(planes))
+        self._sheets = ctx.vertex_array(self._program, [])
+        sides = [half_sides(plane) for plane in planes]
+        self._program["centre"].write(np.array([plane.centre for plane in planes], np.float32))
+        self._program["across"].write(np.array([across for across, _ in sides], np.float32))
+        self._program["along"].write(np.array([along for _, along in sides], np.float32))
+
+    def draw(self, view: Floats, projection: Floats) -> None:
+        """Blend the planes over the target, as seen by `view` and `projection`."""
+        self._ctx.enable_only(moderngl.BLEND)
+        self._ctx.blend_func = moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA
+        upload(self._ctx, self._program["clip_from_world"], target_clip(view, projection))
+        with opengl.srgb_target():
+            self._sheets.render(vertices=6 * self._count)
+
+
+def half_sides(plane: PlaneSpec) -> tuple[F32, F32]:
+    """Half of each side of `plane` as a vector (3,), metres: at right angles to each other and to the normal."""
+    normal = np.asarray(plane.normal, np.float64) / np.linalg.norm(plane.normal)
+    towards = np.array([1.0, 0.0, 0.0]) if abs(normal[1]) > UPRIGHT else np.array([0.0, 1.0, 0.0])
+    along = np.cross(normal, towards)
+    along /= np.linalg.norm(along)
+    across = np.cross(along, normal)
+    turn = np.radians(plane.turn_deg)
+    across, along = np.cos(turn) * across + np.sin(turn) * along, np.cos(turn) * along - np.sin(turn) * across
+    return (plane.width_m / 2 * across).astype(np.float32), (plane.depth_m / 2 * along).astype(np.float32)

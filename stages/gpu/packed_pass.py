@@ -1,10 +1,13 @@
 """The packed pass: draws a posed mesh with its neural texture as the network's input tensor, in bytes.
 
-Rule: bytes leave the GPU in tensor order (NHWC, row 0 on top) and already have the network's scale and zero point.
+Bytes leave the GPU in tensor order (NHWC, row 0 on top) and already have the network's scale and zero point. The neural
+texture is an array texture of four channels a layer. Its texels are FP16; what FP16 cannot hold is refused before
+anything is uploaded.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,12 +18,58 @@ from trilane.arrays import F32, U8, Floats
 from trilane.avatars.texture_levels import split_levels
 from trilane.errors import BadInputError
 from trilane.shapes import Shape
-from trilane.stages.gpu import opengl_calls
-from trilane.stages.gpu.mesh_draw import MeshDraw
-from trilane.stages.gpu.shader_program import build_program, set_uniforms
-from trilane.stages.gpu.skinned_mesh import BodyPose, Mesh
-from trilane.stages.gpu.texture_array import FILTERS, check_texture, texture_array
-from trilane.stages.gpu.transfers import read_into, upload
+from trilane.stages.gpu import opengl
+from trilane.stages.gpu.opengl import build_program, read_into, set_uniforms, upload
+from trilane.stages.gpu.skinned_mesh import BodyPose, Mesh, MeshDraw
+
+#: How the neural texture is read: the filter when it is shrunk, and the greatest anisotropy (a driver may allow less).
+FILTERS = {
+    "linear": (moderngl.LINEAR, 1.0),
+    "mipmap": (moderngl.LINEAR_MIPMAP_LINEAR, 1.0),
+    "anisotropic": (moderngl.LINEAR_MIPMAP_LINEAR, 16.0),
+}
+FP16_MAX = float(np.finfo(np.float16).max)
+
+
+def texture_array(ctx: Any, texture: Floats, filtering: str = "linear", levels: Sequence[Floats] = ()) -> Any:
+    """An FP16 array texture of C/4 RGBA layers from `texture` (H,W,C), clamped at its edge.
+
+    `filtering`: one of FILTERS. `levels`: smaller ones that were learnt; they are read in place of the driver's means,
+    and none below them, so `linear` becomes `mipmap`.
+    """
+    height, width, channels = texture.shape
+    array = ctx.texture_array((width, height, channels // 4), 4, _pixels(texture), dtype="f2")
+    shrunk, anisotropy = FILTERS[filter_of(filtering, bool(levels))]
+    if shrunk != moderngl.LINEAR:
+        array.build_mipmaps(**({"max_level": len(levels)} if levels else {}))
+    for number, level in enumerate(levels, 1):
+        size = (level.shape[1], level.shape[0], channels // 4)
+        opengl.write_level(array.glo, number, size, _pixels(level))
+    array.filter = (shrunk, moderngl.LINEAR)
+    array.anisotropy = anisotropy
+    array.repeat_x = array.repeat_y = False
+    return array
+
+
+def filter_of(asked: str, learnt: bool) -> str:
+    """The filter of a texture for which the scene has `asked`; one with `learnt` levels is never read without them."""
+    return "mipmap" if learnt and asked == "linear" else asked
+
+
+def _pixels(texture: Floats) -> bytes:
+    height, width, channels = texture.shape
+    layers = texture.reshape(height, width, channels // 4, 4).transpose(2, 0, 1, 3)
+    return np.ascontiguousarray(layers, np.float16).tobytes()
+
+
+def check_texture(texture: Floats, channels: int) -> None:
+    """Raises BadInputError unless `texture` is (H,W,channels) and all its numbers fit into FP16."""
+    if texture.ndim != 3 or texture.shape[2] != channels:
+        raise BadInputError("neural texture", f"shape {texture.shape}", f"(height, width, {channels})")
+    largest = float(np.abs(texture).max()) if texture.size else 0.0
+    if not largest <= FP16_MAX:
+        raise BadInputError("neural texture", f"a value of {largest}", f"numbers within FP16's ±{FP16_MAX:.0f}")
+
 
 CHANNELS = (4, 8, 12, 16)
 WORD_TYPES = {1: "uint", 2: "uvec2", 3: "uvec4", 4: "uvec4"}
@@ -128,10 +177,10 @@ class PackedPass:
         target.words.viewport = (0, 0, shape[1], shape[0])
         target.words.depth_mask = True
         if target.blank is None:
-            opengl_calls.clear_unsigned(self._background)
+            opengl.clear_unsigned(self._background)
         else:
             upload(self.ctx, target.words.color_attachments[0], target.blank)
-        opengl_calls.clear_depth()
+        opengl.clear_depth()
         return target
 
     def read_into(self, shape: Shape, tensor: U8) -> None:
@@ -184,7 +233,7 @@ class PackedAvatar:
     def draw(self, target: Target, view: Floats, placement: Placement) -> None:
         """Draw into `target`, which `PackedPass.begin` has cleared.
 
-        `target`: of the pass.
+        `target`: target of the pass.
         `view`: (4,4) the camera.
         `placement`: the avatar's pose, crop and rectangle of the tensor.
         """

@@ -18,13 +18,10 @@ from trilane.pipeline.stage import UnitContext
 from trilane.scene.crop import Rect, crop_projection
 from trilane.shapes import Shape
 from trilane.stages.avatar_assets import distinct, levels_of, quantisation_of, shaped_body, texture_of
-from trilane.stages.config import RunConfig
-from trilane.stages.gpu.avatar_mesh import avatar_mesh
-from trilane.stages.gpu.opengl_context import CONTEXT, checked, describe, open_context
+from trilane.stages.config import RunConfig, posed_vertices
+from trilane.stages.gpu.opengl import CONTEXT, checked, counter_of, describe, open_context
 from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement
-from trilane.stages.gpu.skinned_mesh import Mesh, PosedMesh, SkinnedMesh
-from trilane.stages.gpu.transfers import counter_of
-from trilane.stages.packets import posed_vertices
+from trilane.stages.gpu.skinned_mesh import Mesh, PosedMesh, SkinnedMesh, avatar_mesh
 from trilane.transport.packets import Packet
 
 

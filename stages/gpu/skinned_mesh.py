@@ -1,23 +1,203 @@
-"""A body's mesh on the GPU: vertex and index buffers, and the pose of the frame.
+"""A body's mesh on the GPU: its arrays, its vertex and index buffers, the pose of a frame, and how it is drawn.
 
-Rule: a mesh offers `Mesh`, whether the vertex shader skins its vertices (`SkinnedMesh`) or the CPU unit (`PosedMesh`).
+There is one vertex per distinct (position, UV) corner, and triangles are ordered so that neighbours are drawn together.
+A mesh offers `Mesh`, whether the vertex shader skins its vertices (`SkinnedMesh`) or the CPU unit (`PosedMesh`).
+
+A triangle whose corners have at most four weights is skinned with four, and so on. Positions are the same to the last
+bit, because a weight of 0 adds nothing. How many weights a body needs is worked out once and then cached.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
+from pathlib import Path
 from typing import Any, Protocol
 
 import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.arrays import F32
+from trilane.arrays import F32, Floats, Ints
+from trilane.body.body import Body, ShapedBody
 from trilane.body.joints import JOINTS, POSE_FEATURES
-from trilane.body.skin_weights import WEIGHT_COUNTS
+from trilane.body.skinning import WEIGHT_COUNTS, largest_weights
+from trilane.cache import Arrays, cached_arrays
 from trilane.errors import BadInputError
-from trilane.stages.gpu.mesh_arrays import MeshArrays, weight_batches
-from trilane.stages.gpu.transfers import counter_of, upload
+from trilane.stages.gpu.opengl import build_program, counter_of, set_uniforms, target_clip, upload
+
+PATCH_TRIANGLES = 320
+MAX_OPEN = 0.005
+
+
+@dataclass(frozen=True)
+class MeshArrays:
+    """Per-vertex arrays after the split at UV seams.
+
+    `position` (N,3) metres, rest pose. `uv` (N,2). `joint` (N,K) uint8 and `weight` (N,K), largest first, rows sum to
+    1. `triangles` (F,3) uint32. `source` (N,) int64: the body's vertex that each row is a copy of. `surface`: arrays
+    `normal` (N,3) and `colour` (N,4) of meshes that are shaded, else empty. `closed`: whether the triangles enclose a
+    volume, so that those facing away from the camera are never seen from outside.
+    """
+
+    position: F32
+    uv: F32
+    joint: NDArray[np.uint8]
+    weight: F32
+    triangles: NDArray[np.uint32]
+    source: NDArray[np.int64]
+    surface: dict[str, F32] = field(default_factory=dict)
+    closed: bool = False
+
+    @property
+    def weights_per_vertex(self) -> int:
+        return int(self.joint.shape[1])
+
+
+def mesh_arrays(
+    vertices: Floats,
+    faces: Ints,
+    uv: Floats,
+    uv_faces: Ints,
+    joint: Ints,
+    weight: Floats,
+    normal: Floats | None = None,
+    colour: Floats | None = None,
+) -> MeshArrays:
+    """Split vertices at UV seams and order them for the vertex cache. Vertices that no face uses are left out.
+
+    `vertices`: (V,3) metres.
+    `faces`: (F,3) indices of `vertices`.
+    `uv`: (T,2).
+    `uv_faces`: (F,3) indices of `uv`, per corner.
+    `joint`: (V,K) joint indices, K of 4, 8 or 12.
+    `weight`: (V,K) their skin weights.
+    `normal`, `colour`: (V,3) unit normals and (V,4) colours of a mesh that is shaded.
+    Raises BadInputError when shapes, indices or values cannot be drawn.
+    """
+    _check(vertices, faces, uv, uv_faces, joint, weight)
+    triangle_order = patch_order(np.asarray(vertices, np.float64)[faces].mean(axis=1))
+    source, uv_source, triangles = split_corners(faces[triangle_order], uv_faces[triangle_order])
+    order = np.argsort(-weight, axis=1, kind="stable")
+    joint, weight = np.take_along_axis(joint, order, axis=1), np.take_along_axis(weight, order, axis=1)
+    return MeshArrays(
+        position=np.ascontiguousarray(vertices[source], np.float32),
+        uv=np.ascontiguousarray(uv[uv_source], np.float32),
+        joint=np.ascontiguousarray(joint[source], np.uint8),
+        weight=np.ascontiguousarray(weight[source], np.float32),
+        triangles=triangles,
+        source=source,
+        surface=_surface(normal, colour, source),
+        closed=is_closed(vertices, faces),
+    )
+
+
+def _surface(normal: Floats | None, colour: Floats | None, source: NDArray[np.int64]) -> dict[str, F32]:
+    arrays = {"normal": normal, "colour": colour}
+    return {name: np.ascontiguousarray(rows[source], np.float32) for name, rows in arrays.items() if rows is not None}
+
+
+def is_closed(vertices: Floats, faces: Ints) -> bool:
+    """Whether the faces (F,3) wind outward around a volume with at most a share `MAX_OPEN` of their edges open.
+
+    Bodies have small openings that no camera sees, such as the backs of the eyes.
+    """
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+    there, back = edges @ [1 << 32, 1], edges @ [1, 1 << 32]
+    corners = np.asarray(vertices, np.float64)[faces]
+    volume = np.einsum("fi,fi->", np.cross(corners[:, 0], corners[:, 1]), corners[:, 2])
+    open_edges = np.count_nonzero(~np.isin(there, back))
+    return bool(volume > 0 and open_edges <= MAX_OPEN * len(edges) and len(np.unique(there)) == len(there))
+
+
+def split_corners(faces: Ints, uv_faces: Ints) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.uint32]]:
+    """Number the distinct (vertex, uv) corners of `faces` (F,3) and `uv_faces` (F,3) by first use.
+
+    Returns the vertex index (N,) and the uv index (N,) of each corner, and the triangles (F,3) of corner numbers.
+    """
+    corner = faces.astype(np.int64).ravel() << 32 | uv_faces.astype(np.int64).ravel()
+    distinct, first, inverse = np.unique(corner, return_index=True, return_inverse=True)
+    by_first_use = np.argsort(first)
+    number = np.empty_like(by_first_use)
+    number[by_first_use] = np.arange(len(by_first_use))
+    ordered = distinct[by_first_use]
+    return ordered >> 32, ordered & 0xFFFFFFFF, number[inverse].reshape(faces.shape).astype(np.uint32)
+
+
+def patch_order(centres: NDArray[np.float64], patch: int = PATCH_TRIANGLES) -> NDArray[np.int64]:
+    """Order of triangles (F,) in compact patches: groups are halved along their longest side down to `patch` triangles.
+
+    `centres` (F,3). Software drivers shade vertices again for each batch of about a thousand indices, and compact
+    patches have few vertices in common.
+    """
+    pending, done = [np.arange(len(centres))], []
+    while pending:
+        part = pending.pop()
+        if len(part) <= patch:
+            done.append(part)
+            continue
+        points = centres[part]
+        axis = int(np.argmax(np.ptp(points, axis=0)))
+        part = part[np.argsort(points[:, axis], kind="stable")]
+        half = -(-len(part) // 2 // patch) * patch if len(part) >= 2 * patch else len(part) // 2
+        pending += [part[half:], part[:half]]
+    return np.concatenate(done) if done else np.empty(0, np.int64)
+
+
+def weight_batches(arrays: MeshArrays) -> dict[int, NDArray[np.uint32]]:
+    """Triangles (F_k,3) by the number of skin weights, 4, 8 or 12, that suffices for all three of their corners."""
+    used = np.count_nonzero(arrays.weight, axis=1)
+    needed = np.maximum(-(-used // 4) * 4, 4)[arrays.triangles].max(axis=1)
+    return {k: arrays.triangles[needed == k] for k in WEIGHT_COUNTS if (needed == k).any()}
+
+
+def _check(vertices: Any, faces: Any, uv: Any, uv_faces: Any, joint: Any, weight: Any) -> None:
+    tests = (
+        (faces.ndim == 2 and faces.shape[1] == 3 and len(faces) > 0, "faces", faces.shape, "(F, 3) with F > 0"),
+        (uv_faces.shape == faces.shape, "uv_faces", uv_faces.shape, f"{faces.shape} as faces has"),
+        (_indexes(faces, len(vertices)), "faces", "an index out of range", f"0 to {len(vertices) - 1}"),
+        (_indexes(uv_faces, len(uv)), "uv_faces", "an index out of range", f"0 to {len(uv) - 1}"),
+        (joint.shape == weight.shape == (len(vertices), joint.shape[-1]), "joint", joint.shape, "(V, K) as weight"),
+        (joint.shape[-1] in WEIGHT_COUNTS, "joint", f"{joint.shape[-1]} weights a vertex", "4, 8 or 12"),
+        (_indexes(joint, JOINTS), "joint", "an index out of range", f"0 to {JOINTS - 1}"),
+        (bool(np.isfinite(vertices).all()), "vertices", "NaN or infinity", "finite metres"),
+        (bool(np.isfinite(uv).all()), "uv", "NaN or infinity", "finite values"),
+        (bool(np.isfinite(weight).all()), "weight", "NaN or infinity", "finite values"),
+    )
+    for passed, where, value, expected in tests:
+        if not passed:
+            raise BadInputError(f"mesh {where}", str(value), expected)
+
+
+def _indexes(values: Any, count: int) -> bool:
+    return bool(values.size) and int(values.min()) >= 0 and int(values.max()) < count
+
+
+LARGEST_LOSS = 1e-3  # of a vertex's weight
+VERSION = "avatar mesh 1"  # to be raised when the same body gives other arrays
+
+
+def avatar_mesh(shaped: ShapedBody) -> MeshArrays:
+    """Vertices, triangles and weights of `shaped`, in the order in which they are drawn."""
+    body = shaped.body
+    sources = (shaped.vertices, body.faces, body.uv, body.uv_faces, body.weights)
+    arrays: dict[str, Any] = dict(cached_arrays(VERSION, sources, lambda: _arrays(shaped)))
+    closed = bool(arrays.pop("closed"))
+    return MeshArrays(**arrays, closed=closed)
+
+
+def _arrays(shaped: ShapedBody) -> Arrays:
+    body = shaped.body
+    top = largest_weights(body.weights, enough_weights(body))
+    mesh = mesh_arrays(shaped.vertices, body.faces, body.uv, body.uv_faces, top.joints, top.weights)
+    return {field.name: np.asarray(getattr(mesh, field.name)) for field in fields(mesh) if field.name != "surface"}
+
+
+def enough_weights(body: Body) -> int:
+    """The smallest K of 4, 8, 12 whose K largest weights hold all but LARGEST_LOSS of every vertex; else 12."""
+    left = -np.sort(-body.weights, axis=1)
+    lost = {k: float(left[:, k:].sum(axis=1).max(initial=0.0)) for k in WEIGHT_COUNTS}
+    return next((k for k in WEIGHT_COUNTS if lost[k] <= LARGEST_LOSS), WEIGHT_COUNTS[-1])
+
 
 POSEDIRS_ROW = 8192  # texels in a row of the pose blend shape texture
 GROUPS = "abc"
@@ -25,7 +205,7 @@ GROUPS = "abc"
 
 @dataclass(frozen=True)
 class BodyPose:
-    """One body in one frame. `joints` (55,3,4): skinning matrices. `feature` (486,): of the pose blend shapes.
+    """One body in one frame. `joints` (55,3,4): skinning matrices. `feature` (486,): factors of the pose blend shapes.
 
     `vertices` (V,3): the body's vertices in the world, metres, when the CPU unit has skinned them.
     """
@@ -39,7 +219,7 @@ class Mesh(Protocol):
     """What `MeshDraw` draws: buffers, a vertex shader, and the pose of a frame.
 
     `batches`: pairs of a number of skin weights and the index buffer of the triangles drawn with as many.
-    `pose_bytes`: of a frame's pose, each number of it once.
+    `pose_bytes`: bytes of a frame's pose, each number of it once.
     """
 
     arrays: MeshArrays
@@ -198,3 +378,36 @@ def _posedirs_texture(ctx: Any, posedirs: NDArray[np.floating[Any]]) -> Any:
     image = np.zeros((rows * POSEDIRS_ROW, 3), np.float16)
     image[:texels] = posedirs.transpose(0, 2, 1).reshape(-1, 3)
     return ctx.texture((POSEDIRS_ROW, rows), 3, image.tobytes(), dtype="f2", alignment=1)
+
+
+class MeshDraw:
+    """A mesh, drawn with one fragment shader."""
+
+    def __init__(self, ctx: Any, mesh: Mesh, fragment: str | Path, **defines: int | str) -> None:
+        """Build a program for each number of skin weights.
+
+        `ctx`: the OpenGL context.
+        `mesh`: what to draw.
+        `fragment`: a file of `trilane.shaders`, or a path.
+        `defines`: preprocessor definitions of both shaders.
+        Raises TrilaneError when a shader does not compile.
+        """
+        self._mesh, self._ctx = mesh, ctx
+        self._parts = []
+        for weights, indices in mesh.batches:
+            program = build_program(ctx, mesh.vertex_shader, fragment, **mesh.defines, **defines, K=weights)
+            self._parts.append((program, mesh.vertex_array(program, indices)))
+
+    def set(self, values: dict[str, Any]) -> None:
+        """Set the uniforms of `values`; those that the shader's compiler removed are skipped."""
+        for program, _ in self._parts:
+            set_uniforms(program, values)
+
+    def draw(self, pose: BodyPose, view: Floats, projection: Floats) -> None:
+        """Draw into the target in use, with the depth test and culling that are enabled."""
+        clip = target_clip(view, projection)
+        self._mesh.upload_pose(pose)
+        for program, vertices in self._parts:
+            self._mesh.bind_pose(program)
+            upload(self._ctx, program["clip_from_world"], clip)
+            vertices.render()

@@ -18,13 +18,10 @@ import av
 
 from trilane import machine
 from trilane.errors import BadInputError
-from trilane.file_signatures import HEAD_BYTES, PICTURE, VIDEO, signature_of_head
-from trilane.files import require_file
+from trilane.files import HEAD_BYTES, PICTURE, VIDEO, require_file, signature_of_head
 from trilane.scene.camera.path import CameraPath
-from trilane.scene.footage import Footage, Stored
-from trilane.scene.picture_order import film_of
-from trilane.stages.gpu.background import is_picture, pictures_in
-from trilane.stages.gpu.picture_file import check_picture, look_at_picture
+from trilane.scene.footage import Footage, Stored, film_of
+from trilane.stages.gpu.background import check_picture, is_picture, look_at_picture, pictures_in
 from trilane.stages.gpu.video_reader import DEFAULT_STEP_S, Pixels, check_size, pixels_of, quarters_of, video_stream
 
 #: Steps between a video's frames that differ by more than this share of the usual one are of a variable rate.
@@ -94,7 +91,7 @@ def _size(stored: Stored) -> str:
 
 
 class _Head(NamedTuple):
-    """Of a video: its first frame, and what its stream says. `bits`: of a colour."""
+    """A video's first frame, and the facts of its stream. `bits`: bits a colour."""
 
     stored: Stored
     pixels: Pixels
@@ -156,7 +153,7 @@ def _head(container: Any, path: Path) -> _Head:
 
 
 def _times(container: Any, path: Path) -> list[float]:
-    """Of the frames, seconds, increasing; without decoding them. Raises BadInputError when the file was cut off."""
+    """Increasing times of the frames, seconds; they are not decoded. Raises BadInputError when the file was cut off."""
     stream = video_stream(container, path)
     times, count = set(), 0
     for packet in container.demux(stream):
@@ -171,7 +168,7 @@ def _times(container: Any, path: Path) -> list[float]:
 
 
 def _rate(steps: Sequence[float], period_s: float) -> str:
-    """In words, from the `steps` between frames, sorted."""
+    """The rate in words, by the sorted `steps` between frames."""
     if not steps:
         return "one frame"
     usual = median(steps)

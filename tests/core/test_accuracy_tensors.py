@@ -9,7 +9,7 @@ import pytest
 
 from trilane.apps.experiments import accuracy, drawn_tensors
 from trilane.pipeline.stage import UnitContext
-from trilane.stages.packets import pose_dtype
+from trilane.stages.config import pose_dtype
 
 NOBODY_IN = 3
 

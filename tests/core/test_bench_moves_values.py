@@ -39,7 +39,7 @@ def log(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         return done.count("fence")
 
     monkeypatch.setattr(
-        gpu_buffering, "opengl_calls", SimpleNamespace(fence=fence, wait_fence=lambda n: done.append(("wait", n)))
+        gpu_buffering, "opengl", SimpleNamespace(fence=fence, wait_fence=lambda n: done.append(("wait", n)))
     )
     return done
 

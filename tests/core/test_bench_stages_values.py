@@ -207,8 +207,6 @@ def test_openvino_is_asked_as_its_first_example_asks(
     monkeypatch: pytest.MonkeyPatch, network: Path, threads: int | None, settings: dict[str, int]
 ) -> None:
     pytest.importorskip("openvino")
-    from trilane.stages.dsp import quiet_openvino
-
     seen: list[Any] = []
 
     class Core:
@@ -219,7 +217,7 @@ def test_openvino_is_asked_as_its_first_example_asks(
                 input=lambda place: SimpleNamespace(shape=[1, 2, 3, 4 + place]), create_infer_request=lambda: request
             )
 
-    monkeypatch.setattr(quiet_openvino, "openvino", SimpleNamespace(Core=Core))
+    monkeypatch.setattr(runtimes, "quiet_openvino", lambda: SimpleNamespace(Core=Core))
     run = KINDS["openvino"](Variant("openvino", network, threads=threads))
     assert run() == "answer"
     asked, feed = seen

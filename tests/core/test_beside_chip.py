@@ -243,11 +243,11 @@ def test_pipelines_of_one_name_are_numbered() -> None:
 
 def test_a_scene_is_planned_frame_by_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     """Frames of 64x96 and 32x32 with some that skip; a network for each shape and number of avatars, as they come."""
-    from trilane.scene.work import Work
+    from trilane.scene.planner import FrameWork
 
     works = [
-        (Work.FULL, (64, 96), "a"), (Work.REUSE, (64, 96), "a"), (Work.FULL, (32, 32), "abc"),
-        (Work.FULL, (64, 96), "ab"), (Work.FULL, (64, 96), "b"),
+        (FrameWork.FULL, (64, 96), "a"), (FrameWork.REUSE, (64, 96), "a"), (FrameWork.FULL, (32, 32), "abc"),
+        (FrameWork.FULL, (64, 96), "ab"), (FrameWork.FULL, (64, 96), "b"),
     ]  # fmt: skip
     scene = SimpleNamespace(frames=700, fps=24.0)
     checked: Any = SimpleNamespace(config=SimpleNamespace(scene=scene), assets="assets")
@@ -275,7 +275,7 @@ def test_a_scene_is_planned_frame_by_frame(monkeypatch: pytest.MonkeyPatch) -> N
     ]
     assert found.networks[0] is found.networks[2] and found.avatars == (1, 3, 2)
     assert found.frames == (0, SKIPS, 1, 2, 0) * 120
-    works[:] = [(Work.NONE, None, "")]
+    works[:] = [(FrameWork.NONE, None, "")]
     (nobody,) = sources.tenants(["home.toml"])
     assert (nobody.fps, nobody.frames[:2], nobody.networks[0].height) == (24.0, (SKIPS, SKIPS), 80)
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from trilane.apps.cli import body as cli
 from trilane.body import body as body_module
-from trilane.body import skin_weights
+from trilane.body import skinning
 from trilane.training import body_from_anny
 
 Command = Callable[..., tuple[str, str]]
@@ -54,8 +54,8 @@ def known_body(monkeypatch: pytest.MonkeyPatch) -> None:
     )
     bounds = {4: np.array([0.0002, 0.00123456]), 8: np.array([0.000123, 0.0])}
     monkeypatch.setattr(body_module, "load_body", lambda path: held if path == Path("b.npz") else None)
-    monkeypatch.setattr(skin_weights, "WEIGHT_COUNTS", (4, 8))
-    monkeypatch.setattr(skin_weights, "weight_error_bound", lambda given, count: bounds[count] * (given is shaped))
+    monkeypatch.setattr(skinning, "WEIGHT_COUNTS", (4, 8))
+    monkeypatch.setattr(skinning, "weight_error_bound", lambda given, count: bounds[count] * (given is shaped))
 
 
 @pytest.mark.usefixtures("known_body")

@@ -19,9 +19,8 @@ from trilane.apps.report import Report
 from trilane.apps.run_job import Outcome, Plan
 from trilane.errors import BadInputError
 from trilane.pipeline import unit_starter
-from trilane.stages import configure
+from trilane.stages import PRELOAD, configure
 from trilane.stages.configure import Request
-from trilane.stages.factories import PRELOAD
 from trilane.testing.run_report import make_report
 from trilane.units import PerformanceProfile
 

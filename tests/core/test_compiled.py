@@ -58,7 +58,7 @@ def test_the_compiled_core_answers_as_its_sources_do(tmp_path: Path) -> None:
         pytest.skip("no compiled core here: it takes a C compiler when Trilane is installed")
     for folder in ("scheduler", "transport"):
         shutil.copytree(PACKAGE / folder, tmp_path / "trilane" / folder, ignore=shutil.ignore_patterns("*.so"))
-    for name in ("__init__.py", "compiled.py", "errors.py", "install.py", "unexpected_value.py"):
+    for name in ("__init__.py", "compiled.py", "errors.py", "unexpected_value.py"):
         shutil.copy(PACKAGE / name, tmp_path / "trilane")
     as_python, as_compiled = traces(tmp_path), traces(PACKAGE.parent)
     assert (as_python[0], as_compiled[0]) == ("False", "True")

@@ -25,8 +25,8 @@ from trilane.avatars.network_reshape import reshaped
 from trilane.bench.lib.full_network import as_written
 from trilane.bench.lib.layers import Box, Layer
 from trilane.body.body import load_body
-from trilane.body.detail import DETAILS
 from trilane.body.kinematics import Skeleton
+from trilane.body.skinning import DETAILS
 from trilane.errors import BadInputError
 from trilane.stages.avatar_assets import AvatarData
 from trilane.testing.byte_network import net

@@ -21,9 +21,8 @@ from trilane.apps.plan_picture import BODY, GROUND, MESH, TENSOR, _tile, draw_pl
 from trilane.apps.scene_plan import PlannedFrame, ScenePlan, phases
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_reshape import reshaped
-from trilane.body.detail import DETAILS
 from trilane.body.kinematics import Skeleton
-from trilane.body.skinning import CpuSkinner
+from trilane.body.skinning import DETAILS, CpuSkinner
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import Plan, stage_times_ms, steady
 from trilane.hw_profiles.load import load_profile
@@ -31,12 +30,10 @@ from trilane.hw_profiles.network_work import Network, count_work
 from trilane.hw_profiles.performance_profiles import corners_of
 from trilane.hw_profiles.predict import predict
 from trilane.scene.crop import Rect
-from trilane.scene.planner import MOST_DENSITY
-from trilane.scene.work import Work
+from trilane.scene.planner import MOST_DENSITY, FrameWork
 from trilane.stages.avatar_assets import shaped_body, staged_of
 from trilane.stages.configure import Checked, Request, configure
-from trilane.stages.cpu.actor import Seen
-from trilane.stages.cpu.pose import FramePlan
+from trilane.stages.cpu.pose import FramePlan, SeenAvatar
 from trilane.units import UNITS
 
 CHIP, CAP = "snapdragon-888", "sustained_high_performance"
@@ -81,8 +78,8 @@ def document(printed: str) -> Any:
 
 
 def planned(frame: int, shape: tuple[int, int] | None, *levels: int) -> PlannedFrame:
-    seen = {number: Seen(Rect(0, 0, 1, 1), level, 0.1) for number, level in enumerate(levels)}
-    return PlannedFrame(frame, FramePlan(Work.FULL if shape else Work.NONE, shape, None, seen), {})
+    seen = {number: SeenAvatar(Rect(0, 0, 1, 1), level, 0.1) for number, level in enumerate(levels)}
+    return PlannedFrame(frame, FramePlan(FrameWork.FULL if shape else FrameWork.NONE, shape, None, seen), {})
 
 
 def test_frames_of_one_kind_are_a_phase() -> None:
@@ -98,7 +95,7 @@ def test_frames_of_one_kind_are_a_phase() -> None:
         planned(6, None),
         planned(7, small, 2),
     ]
-    frames.append(PlannedFrame(8, replace(frames[-1].plan, work=Work.REUSE), {}))
+    frames.append(PlannedFrame(8, replace(frames[-1].plan, work=FrameWork.REUSE), {}))
     assert [[one.frame for one in group] for group in phases(frames)] == [[0, 1], [2], [3], [4], [5, 6], [7], [8]]
 
 
@@ -141,18 +138,18 @@ def test_a_phase_says_what_is_modelled_and_its_error(document: Any) -> None:
 @pytest.mark.parametrize(
     ("work", "densities", "why"),
     [
-        (Work.NONE, [None], "nobody is on the screen: nothing is drawn, packed or inferred"),
-        (Work.REUSE, [None], "nothing has changed: the picture that is there is shown again"),
-        (Work.FULL, [None], "the scene fixes the tensor's size"),
-        (Work.FULL, [3.0, 4.0], "4 tensor pixels along a side of a pixel of the picture: more could not be seen"),
+        (FrameWork.NONE, [None], "nobody is on the screen: nothing is drawn, packed or inferred"),
+        (FrameWork.REUSE, [None], "nothing has changed: the picture that is there is shown again"),
+        (FrameWork.FULL, [None], "the scene fixes the tensor's size"),
+        (FrameWork.FULL, [3.0, 4.0], "4 tensor pixels along a side of a pixel of the picture: more could not be seen"),
         (
-            Work.FULL,
+            FrameWork.FULL,
             [3.0, 3.9],
             "the pixels that the network was trained to paint, in the shape that fits best of those ",
         ),
     ],
 )
-def test_why_a_tensor_is_as_it_is(work: Work, densities: list[float | None], why: str) -> None:
+def test_why_a_tensor_is_as_it_is(work: FrameWork, densities: list[float | None], why: str) -> None:
     group = [PlannedFrame(0, FramePlan(work, (32, 32), density, {}), {}) for density in densities]
     assert _why(group).startswith(why)
 

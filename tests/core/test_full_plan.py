@@ -21,8 +21,7 @@ from trilane.bench.lib.full_picture import SAMPLES, supersampled
 from trilane.body.body import load_body
 from trilane.body.kinematics import Skeleton
 from trilane.body.skinning import CpuSkinner
-from trilane.stages.gpu.avatar_mesh import avatar_mesh
-from trilane.stages.gpu.mesh_arrays import MeshArrays
+from trilane.stages.gpu.skinned_mesh import MeshArrays, avatar_mesh
 from trilane.testing.byte_network import net
 
 EYE = np.eye(4)

@@ -21,8 +21,7 @@ from trilane.bench.lib.handoff_variants import (
     ZmqChannel,
     _SlotEnd,
 )
-from trilane.transport.job_pipe import JobPipeEnd
-from trilane.transport.messages import RunJob
+from trilane.transport.messages import JobPipeEnd, RunJob
 
 
 def open_files() -> int:

@@ -17,10 +17,10 @@ from trilane.apps.experiments.hard_numbers.exact_turn import PI, exact_turn, tur
 from trilane.apps.experiments.hard_numbers.hard_number import U32, HardNumber, U, gamma, worst
 from trilane.apps.experiments.hard_numbers.times import time_cases
 from trilane.avatars.bundle import bundle_folder
-from trilane.body import kinematics, skin_weights, skinning
+from trilane.body import kinematics, skinning
 from trilane.body.body import ShapedBody, load_body, weights_of_one
 from trilane.body.kinematics import Posed, Skeleton
-from trilane.body.skin_weights import TopWeights
+from trilane.body.skinning import TopWeights
 from trilane.errors import BadInputError
 
 
@@ -172,7 +172,7 @@ def test_weights_that_are_not_scaled_fail(shaped: ShapedBody, monkeypatch: pytes
         order = np.argsort(-weights, axis=1, kind="stable")[:, :k]
         return TopWeights(order.astype(np.int32), np.take_along_axis(weights, order, axis=1))
 
-    monkeypatch.setattr(skin_weights, "largest_weights", unscaled)
+    monkeypatch.setattr(skinning, "largest_weights", unscaled)
     monkeypatch.setattr(skinning, "largest_weights", unscaled)
     assert len(failing(bodies._left_out(shaped))) == 4
 

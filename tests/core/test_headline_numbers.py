@@ -28,7 +28,7 @@ from trilane.hw_profiles.schema import Profile
 from trilane.pipeline.journal import records_of
 from trilane.pipeline.reckoning import Reckoned, reckoned
 from trilane.scene.crop import Rect
-from trilane.scene.work import Work
+from trilane.scene.planner import FrameWork
 from trilane.scheduler.beside import Member, simulate_beside
 from trilane.scheduler.events import Graph, SetDuty, Settings, chain
 from trilane.scheduler.places import Place
@@ -362,7 +362,7 @@ def test_a_camera_moved_back_makes_the_body_smaller(seen_from: Any, away: float)
 
 def test_a_camera_moved_past_the_body_leaves_nothing_to_do(seen_from: Any) -> None:
     """At 4 m the picture is 6.2 m wide, and an arm 0.9 m long."""
-    assert (seen_from(0.0, 4.0).plan.work, len(seen_from(0.0, 4.0).plan.seen)) == (Work.FULL, 1)
+    assert (seen_from(0.0, 4.0).plan.work, len(seen_from(0.0, 4.0).plan.seen)) == (FrameWork.FULL, 1)
     for right, away in ((4.5, 4.0), (0.0, -4.0)):
         plan = seen_from(right, away).plan
-        assert (plan.work, plan.shape, plan.seen) == (Work.NONE, None, {})
+        assert (plan.work, plan.shape, plan.seen) == (FrameWork.NONE, None, {})

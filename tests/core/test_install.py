@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from trilane import install
-from trilane.install import clone, install_line, package_line, pip
+from trilane import errors
+from trilane.errors import clone, install_line, package_line, pip
 from trilane.stages.dsp.runtime import RUNTIMES
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -35,7 +35,7 @@ def from_clone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     root = tmp_path / "trilane"
     (root / "src" / "trilane").mkdir(parents=True)
     (root / "pyproject.toml").touch()
-    monkeypatch.setattr(install, "PACKAGE", root / "src" / "trilane")
+    monkeypatch.setattr(errors, "PACKAGE", root / "src" / "trilane")
     monkeypatch.setattr(sys, "prefix", str(root / ".venv"))
     monkeypatch.setattr(sys, "executable", str(root / ".venv/bin/python"))
     monkeypatch.chdir(tmp_path)
@@ -44,7 +44,7 @@ def from_clone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def from_wheel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(install, "PACKAGE", tmp_path / "lib" / "python3.11" / "site-packages" / "trilane")
+    monkeypatch.setattr(errors, "PACKAGE", tmp_path / "lib" / "python3.11" / "site-packages" / "trilane")
     monkeypatch.setattr(sys, "executable", PYTHON)
     monkeypatch.setattr(importlib.metadata, "requires", lambda name: REQUIRES if name == "trilane" else None)
 
@@ -71,7 +71,7 @@ def test_a_clone_in_the_environment_of_another(from_clone: Path, monkeypatch: py
 
 def test_a_clone_whose_path_has_a_space(from_clone: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     spaced = from_clone.rename(from_clone.with_name("my trilane"))
-    monkeypatch.setattr(install, "PACKAGE", spaced / "src" / "trilane")
+    monkeypatch.setattr(errors, "PACKAGE", spaced / "src" / "trilane")
     monkeypatch.setattr(sys, "prefix", str(spaced / ".venv"))
     assert shlex.split(install_line("fit")) == [f"{spaced}/.venv/bin/pip", "install", "-e", f"{spaced}[fit]"]
 

@@ -11,7 +11,7 @@ import pytest
 from trilane.avatars.bundle import bundle_folder, load_bundle, write_bundle
 from trilane.avatars.texture_levels import check_levels, pack_levels, split_levels
 from trilane.errors import BadInputError
-from trilane.stages.gpu.texture_array import filter_of
+from trilane.stages.gpu.packed_pass import filter_of
 
 torch = pytest.importorskip("torch")
 

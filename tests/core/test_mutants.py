@@ -89,7 +89,7 @@ def test_a_fault_is_put_where_it_was_drawn() -> None:
         ("scheduler/core.py", "scheduler"),
         ("stages/gpu/raster.py", "stages/gpu"),
         ("stages/config.py", "stages"),
-        ("scene/camera/tum.py", "scene/camera"),
+        ("scene/camera/trajectories.py", "scene/camera"),
         ("apps/cli/run.py", "apps"),
         ("src/trilane/units.py", "trilane"),
     ],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from trilane.near_miss import did_you_mean
+from trilane.errors import did_you_mean
 
 
 def test_the_nearest_word_is_suggested_and_none_that_is_far() -> None:

@@ -17,7 +17,7 @@ from trilane.bench.lib.ground_truth import shaped_body
 from trilane.errors import BadInputError, MissingPartError
 from trilane.scene.crop import Rect, crop_projection
 from trilane.stages.dsp.runtime import RuntimeOptions
-from trilane.stages.gpu.opengl_context import Driver
+from trilane.stages.gpu.opengl import Driver
 
 Held = Callable[[str, Any], None]
 DRIVER = Driver("v", "r", "3.3", False)

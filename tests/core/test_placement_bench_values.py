@@ -17,9 +17,9 @@ from trilane.pipeline.rehearsal import Rehearsed
 from trilane.pipeline.trial import Round
 from trilane.scheduler.placement import Ranked
 from trilane.scheduler.places import Core, Place, Work
-from trilane.stages.choosing import Choice
+from trilane.stages import PRELOAD
 from trilane.stages.configure import Request
-from trilane.stages.factories import PRELOAD
+from trilane.stages.placing import TriedPlacement
 
 HERE = {"cpu": Place((0,), 1), "gpu": Place((1,), 1)}
 A, B, C, RULE = ({**HERE, "dsp": dsp} for dsp in (Place((0,), 1), Place((1,), 1), Place((0, 1), 1), Place((0, 1), 2)))
@@ -62,7 +62,7 @@ def trial(monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.setattr(placement, "ranked", lambda *_: list(found))
     monkeypatch.setattr(placement, "frame_ns", lambda *_: 15_000_000)
     monkeypatch.setattr(placement, "worth_trying", lambda ranking, rule: [ranking[1], ranking[0], rule])
-    monkeypatch.setattr(placement, "choice", lambda _checked, cores, *_: Choice(1, f"told of {cores}"))
+    monkeypatch.setattr(placement, "choice", lambda _checked, cores, *_: TriedPlacement(1, f"told of {cores}"))
     monkeypatch.setattr(placement, "tried", tried)
     monkeypatch.setattr(placement, "time", SimpleNamespace(monotonic=iter([5.0, 7.5]).__next__))
     monkeypatch.setattr(placement._Trial, "_run", run)

@@ -21,7 +21,7 @@ import trilane
 #: Folders whose modules need no extra and start nothing.
 FOLDERS = ("apps", "avatars", "body", "hw_profiles", "pipeline", "scene", "scheduler", "stages", "transport")
 #: Imported with an extra, a driver or a fork alone.
-NEEDS_MORE = ("stages.dsp.openvino", "stages.dsp.quiet_openvino", "stages.dsp.qnn", "stages.dsp.cuda")
+NEEDS_MORE = ("stages.dsp.openvino", "stages.dsp.qnn", "stages.dsp.cuda")
 CHANGING = {
     "apps.experiments.error_by_cause._Moved",
     "apps.experiments.error_by_cause._Pooled",

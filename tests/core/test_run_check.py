@@ -20,7 +20,7 @@ from trilane.apps.run_check import FLOAT_PATH, TRUTH, asked_frames, check_run, d
 from trilane.arrays import U8
 from trilane.bench.lib.layers import Box
 from trilane.errors import MissingPartError, TrilaneError
-from trilane.stages.cpu.kept_frames import FOLDER, KeptFrames, kept_frames
+from trilane.stages.cpu.present import KEPT_FOLDER, KeptFrames, kept_frames
 
 
 @pytest.mark.parametrize(
@@ -43,7 +43,7 @@ def test_frames_that_were_asked_for_are_kept_or_the_next_ones(tmp_path: Path) ->
 
 def test_nothing_is_kept_unless_it_was_asked_for(tmp_path: Path) -> None:
     KeptFrames(tmp_path, ()).see(0, np.zeros((1, 1, 3), np.uint8))
-    assert not (tmp_path / FOLDER).exists() and kept_frames(tmp_path) == {}
+    assert not (tmp_path / KEPT_FOLDER).exists() and kept_frames(tmp_path) == {}
 
 
 def test_the_check_is_of_all_frames_and_names_the_worst() -> None:

@@ -30,11 +30,9 @@ from trilane.scene.schema import OutputSpec, Scene
 from trilane.scheduler.events import Settings
 from trilane.scheduler.recording import Recording
 from trilane.scheduler.virtual import simulate
-from trilane.stages.config import RunConfig
+from trilane.stages.config import RunConfig, pose_dtype
 from trilane.stages.configure import Checked
-from trilane.stages.cpu.kept_frames import FOLDER
-from trilane.stages.cpu.present import SEGMENTS, PresentStage
-from trilane.stages.packets import pose_dtype
+from trilane.stages.cpu.present import KEPT_FOLDER, SEGMENTS, PresentStage
 from trilane.transport.packets import SlotLayout, view_packet
 from trilane.units import PerformanceProfile
 
@@ -224,12 +222,12 @@ def test_frames_of_the_run_alone_are_kept_and_compared(
     """The baseline keeps none; what was kept is gone when the folder is whole."""
 
     def check(_: Any, folder: Path, told: Any) -> dict[str, Any]:
-        assert (folder / FOLDER).is_dir()
+        assert (folder / KEPT_FOLDER).is_dir()
         told(1, 2)
         return CHECK
 
     def run(folder: Path) -> RunResult:
-        (folder / FOLDER).mkdir()
+        (folder / KEPT_FOLDER).mkdir()
         return a_result()
 
     monkeypatch.setattr(run_job, "check_run", check)
@@ -237,7 +235,7 @@ def test_frames_of_the_run_alone_are_kept_and_compared(
     outcome = go(double, tmp_path / "run", Plan(baseline_frames=4, check=2))
     assert [call["config"].kept for call in double.calls] == [asked_frames(FRAMES, 2), ()]
     assert ("check", 1, 2) in double.said
-    assert not (outcome.folder / FOLDER).exists()
+    assert not (outcome.folder / KEPT_FOLDER).exists()
     document = json.loads((outcome.folder / "report.json").read_text())
     assert document["check"] == {**CHECK, "numbers": [1]}
     assert document["sources"]["check"] == MEASURED

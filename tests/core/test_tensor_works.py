@@ -23,7 +23,7 @@ from trilane.scene.planner import TensorBudget, work_of_side
 from trilane.scene.schema import Scene
 from trilane.stages.config import RunConfig
 from trilane.stages.configure import Request, configure
-from trilane.stages.tensor_works import tensor_works
+from trilane.stages.foresee import tensor_works
 from trilane.testing.validated import validated
 
 ALL = (1000, 563, 250)

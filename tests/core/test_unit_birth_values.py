@@ -22,12 +22,13 @@ from trilane.pipeline import (
 )
 from trilane.pipeline.description import UnitSettings
 from trilane.testing.small_pipeline import spec_of
-from trilane.transport.heartbeats import HeartbeatSocket
-from trilane.transport.job_pipe import JobPipe, job_pipe_pair
+from trilane.transport.link import HeartbeatSocket
 from trilane.transport.messages import (
     Close,
     Closed,
+    JobPipe,
     Ready,
+    job_pipe_pair,
 )
 
 

@@ -27,9 +27,8 @@ from trilane.pipeline.unit_spec import UnitSpec
 from trilane.pipeline.unit_starter import StartedUnit, UnitStarter
 from trilane.scheduler.events import Settings
 from trilane.scheduler.virtual import simulate
-from trilane.transport.heartbeats import HeartbeatSocket
-from trilane.transport.job_pipe import JobPipe, JobPipeEnd
-from trilane.transport.messages import Done, Ping, Pong, Ready
+from trilane.transport.link import HeartbeatSocket
+from trilane.transport.messages import Done, JobPipe, JobPipeEnd, Ping, Pong, Ready
 from trilane.transport.packets import header_dtype
 
 PIPELINE = Pipeline(

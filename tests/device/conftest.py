@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from trilane.stages.gpu.opengl_context import describe, open_context
+from trilane.stages.gpu.opengl import describe, open_context
 
 
 @pytest.fixture(scope="session")

@@ -16,11 +16,10 @@ from trilane.arrays import F32, F64
 from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import Body, load_body
 from trilane.body.kinematics import Skeleton
-from trilane.body.skin_weights import largest_weights
+from trilane.body.skinning import largest_weights
 from trilane.errors import MissingPartError
-from trilane.stages.gpu.mesh_arrays import MeshArrays, mesh_arrays
-from trilane.stages.gpu.opengl_context import open_context
-from trilane.stages.gpu.skinned_mesh import SkinnedMesh
+from trilane.stages.gpu.opengl import open_context
+from trilane.stages.gpu.skinned_mesh import MeshArrays, SkinnedMesh, mesh_arrays
 
 HERE = Path(__file__).parent
 FAILED = HERE / "failed"

@@ -16,7 +16,7 @@ from trilane.bench.lib.fixture import ENCODING, standing
 from trilane.bench.lib.gpu_buffering import SubUpload
 from trilane.bench.lib.split_pass import SplitPass
 from trilane.errors import BadInputError, TrilaneError
-from trilane.stages.gpu.opengl_context import Driver, describe
+from trilane.stages.gpu.opengl import Driver, describe
 from trilane.stages.gpu.packed_pass import PackedPass
 from trilane.stages.gpu.skinned_mesh import SkinnedMesh
 from trilane.training.uv_image import UvRaster

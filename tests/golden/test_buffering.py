@@ -10,7 +10,7 @@ import pytest
 from trilane.bench import raster, readback
 from trilane.bench.lib.gpu_buffering import READBACKS, UPLOADS
 from trilane.errors import BadInputError, TrilaneError
-from trilane.stages.gpu import opengl_calls as raw
+from trilane.stages.gpu import opengl as raw
 
 
 @pytest.mark.parametrize("name", READBACKS)

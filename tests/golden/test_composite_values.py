@@ -18,13 +18,19 @@ from trilane.bench.lib import float_raster
 from trilane.scene.crop import Rect
 from trilane.scene.schema import PlaneSpec
 from trilane.scene.tensor_layout import lay_out_at
-from trilane.stages.gpu import composite_painters, head_up_display, opengl_calls
+from trilane.stages.config import pose_dtype
+from trilane.stages.gpu import composite, composite_painters, opengl
 from trilane.stages.gpu.builtin_room import Extent, room_mesh
 from trilane.stages.gpu.composite import CompositeStage
-from trilane.stages.gpu.composite_painters import AvatarPainter, PicturePainter, RoomPainter, ShadowPainter
-from trilane.stages.gpu.contact_shadows import floor_discs
-from trilane.stages.gpu.detected_planes import PlanePainter, half_sides
-from trilane.stages.packets import pose_dtype
+from trilane.stages.gpu.composite_painters import (
+    AvatarPainter,
+    PicturePainter,
+    PlanePainter,
+    RoomPainter,
+    ShadowPainter,
+    floor_discs,
+    half_sides,
+)
 from trilane.testing.told_bytes import without_bytes
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 
@@ -54,7 +60,7 @@ class Canvas:
 
     def __init__(self, gl: Any, picture: U8) -> None:
         self.shape = picture.shape[:2]
-        texture = gl.texture(self.shape[::-1], 4, internal_format=opengl_calls.SRGB8_ALPHA8)
+        texture = gl.texture(self.shape[::-1], 4, internal_format=opengl.SRGB8_ALPHA8)
         self.target = gl.framebuffer([texture])
         self.target.use()
         painter = PicturePainter(gl, self.shape)
@@ -260,14 +266,14 @@ def test_planes_are_blended_white_in_linear_light_inside_their_sides(gl: Any) ->
 @pytest.mark.parametrize("shape", [(80, 250), (40, 100)], ids=["whole", "a part"])
 def test_the_display_is_blended_at_its_corner(gl: Any, shape: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
     """Bytes, not light: alpha over the picture, 8 pixels from the left and from below; the viewport is put back."""
-    monkeypatch.setattr(head_up_display.time, "monotonic_ns", lambda: 5_000_000_000)
+    monkeypatch.setattr(composite.time, "monotonic_ns", lambda: 5_000_000_000)
     pose = packet(0).header
     pose["frame"], pose["tensor_shape"] = 3, (64, 32)
     picture = noise(shape)
     canvas = Canvas(gl, picture)
-    head_up_display.Hud(gl).draw(canvas.target, pose)
+    composite.Hud(gl).draw(canvas.target, pose)
     lines = ["frame 3   0.00 s", "- fps   5000 ms from pose", "tensor 64x32   0 in view"]
-    display = head_up_display.hud_picture(lines, ImageFont.load_default(15)).astype(float)
+    display = composite.hud_picture(lines, ImageFont.load_default(15)).astype(float)
     expected, bottom = picture.astype(float), shape[0] - 8
     rows, columns = slice(max(bottom - 62, 0), bottom), slice(8, min(8 + 232, shape[1]))
     part = display[62 - (rows.stop - rows.start) :, : columns.stop - columns.start]
@@ -290,7 +296,7 @@ def packet(payload_bytes: int, avatars: int = 1) -> Packet:
 
 def test_the_display_renews_rate_and_age_four_times_a_second(gl: Any) -> None:
     """Frames every 100 ms, each 30 ms old: the line changes with the frames at 0, 300 and 600 ms."""
-    display, pose = head_up_display.Hud(gl), packet(0).header
+    display, pose = composite.Hud(gl), packet(0).header
     seen = []
     for frame in range(7):
         now = 10_000_000_000 + frame * 100_000_000
@@ -309,7 +315,7 @@ def test_the_display_renews_rate_and_age_four_times_a_second(gl: Any) -> None:
 
 
 def test_a_displays_exact_quarter_of_a_second_is_enough(gl: Any) -> None:
-    display, pose = head_up_display.Hud(gl), packet(0).header
+    display, pose = composite.Hud(gl), packet(0).header
     for frame, now in ((1, 1_000_000_000), (2, 1_249_999_999), (3, 1_250_000_000)):
         pose["frame"] = frame
         line = display._lines(pose, now)[1]

@@ -19,8 +19,8 @@ from trilane.apps.experiments.reference_path import Moment, ReferencePath
 from trilane.arrays import F32, F64
 from trilane.bench.lib.cast import Cast
 from trilane.bench.lib.full_picture import FullPictures
+from trilane.stages.config import posed_vertices
 from trilane.stages.configure import Checked, Request, configure
-from trilane.stages.packets import posed_vertices
 
 FRAME = 5
 #: Of the texture everywhere; float16 and bytes cannot hold it.

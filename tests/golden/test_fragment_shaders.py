@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F64
 from trilane.bench.lib.float_raster import sample
-from trilane.stages.gpu.picture_spans import WHOLE
-from trilane.stages.gpu.shader_program import build_program
+from trilane.stages.gpu.composite_painters import WHOLE
+from trilane.stages.gpu.opengl import build_program
 
 #: Metres and shares of a few units, after some ten roundings of float32.
 NEAR = 1e-5

@@ -22,7 +22,7 @@ from trilane.bench.lib.true_picture import SAMPLES, true_pictures
 from trilane.body.body import load_body
 from trilane.stages.configure import Checked, Request, configure
 from trilane.stages.cpu.mesh_bounds import MeshBounds
-from trilane.stages.gpu import opengl_calls
+from trilane.stages.gpu import opengl
 from trilane.stages.gpu.composite_painters import AvatarPainter, PicturePainter
 from trilane.training.body_arrays import body_arrays
 from trilane.training.clothing.clothed_body import ClothedBody
@@ -54,7 +54,7 @@ def test_blending_is_what_the_painter_does_on_the_same_grid(gl: Any) -> None:
     rng = np.random.default_rng(0)
     output, box = (48, 80), Box(-10, 30, 22, 94)
     background, rgba = (rng.integers(0, 256, (*shape, n), dtype=np.uint8) for shape, n in ((output, 3), (box.shape, 4)))
-    texture = gl.texture(output[::-1], 4, internal_format=opengl_calls.SRGB8_ALPHA8)
+    texture = gl.texture(output[::-1], 4, internal_format=opengl.SRGB8_ALPHA8)
     target = gl.framebuffer([texture])
     below, avatar = PicturePainter(gl, output), AvatarPainter(gl, [box.shape])
     below.upload(background)

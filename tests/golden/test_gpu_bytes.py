@@ -10,15 +10,14 @@ import moderngl
 import numpy as np
 import pytest
 
+from trilane.scene.planner import FrameWork
 from trilane.scene.schema import PlaneSpec
-from trilane.scene.work import Work
-from trilane.stages.gpu import transfers
-from trilane.stages.gpu.composite import CompositeStage
-from trilane.stages.gpu.head_up_display import SIZE
+from trilane.stages.config import pose_dtype, posed_vertices
+from trilane.stages.gpu import opengl
+from trilane.stages.gpu.composite import SIZE, CompositeStage
 from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Quantisation
 from trilane.stages.gpu.raster import RasterStage
 from trilane.stages.gpu.skinned_mesh import PosedMesh, SkinnedMesh
-from trilane.stages.packets import pose_dtype, posed_vertices
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 TENSOR, OUTPUT = (96, 64), (240, 320)
@@ -87,7 +86,7 @@ def packet(payload_bytes: int) -> Packet:
 def show(slot: Packet, joints: Any, camera: Any, rect: Any = WHOLE) -> None:
     """One avatar in view, which fills the tensor."""
     pose = slot.header
-    pose["avatar_count"], pose["tensor_shape"], pose["work"] = 1, TENSOR, Work.FULL
+    pose["avatar_count"], pose["tensor_shape"], pose["work"] = 1, TENSOR, FrameWork.FULL
     pose["view"], pose["projection"] = camera
     avatar = pose["avatars"][0]
     avatar["visible"], avatar["rect"], avatar["tensor_rect"] = 1, rect, (0, 0, *TENSOR)
@@ -172,7 +171,7 @@ def test_a_frame_that_a_slot_holds_is_not_drawn(gl: Any, person: Any, camera: An
     """Copied once to the other slot; then both hold it, and nothing but the header moves."""
     stage, source, targets = composite(gl, person, camera, slots=2)
     moved_by(stage, second)
-    source.header["work"] = Work.REUSE
+    source.header["work"] = FrameWork.REUSE
     assert moved_by(stage, second, 1) == (HEADER + FRAME, HEADER + FRAME, 0, 0, 0)
     assert np.array_equal(targets[0].payload, targets[1].payload)
     for slot in (0, 1):
@@ -183,7 +182,7 @@ def test_a_picture_that_is_shown_again_is_not_uploaded_again(gl: Any, person: An
     """The camera moves, the avatar stays: the frame alone is needed."""
     stage, source, _ = composite(gl, person, camera)
     moved_by(stage, second)
-    source.header["work"] = Work.REUSE
+    source.header["work"] = FrameWork.REUSE
     source.header["view"][0, 3] += 0.1
     assert moved_by(stage, second) == (HEADER, HEADER + FRAME, 2 * MATRIX + BLOBS + 16, FRAME, FRAME)
 
@@ -219,4 +218,4 @@ def test_a_room_that_grows_is_uploaded_again(gl: Any, person: Any, camera: Any, 
 
 
 def test_a_contexts_counter_is_one(gl: Any) -> None:
-    assert transfers.counter_of(gl) is transfers.counter_of(gl)
+    assert opengl.counter_of(gl) is opengl.counter_of(gl)

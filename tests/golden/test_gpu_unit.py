@@ -17,13 +17,12 @@ from trilane.errors import BadInputError, TrilaneError, UnitLostError
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.stage import UnitContext
 from trilane.scene.schema import PlaneSpec, Scene
-from trilane.stages.config import RunConfig
-from trilane.stages.gpu import composite, detected_planes, head_up_display
+from trilane.stages.config import RunConfig, pose_dtype
+from trilane.stages.gpu import composite, composite_painters
 from trilane.stages.gpu import raster as raster_stage
 from trilane.stages.gpu.composite import CompositeStage
 from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Quantisation
 from trilane.stages.gpu.raster import RasterStage
-from trilane.stages.packets import pose_dtype
 from trilane.testing.assets import assets_of
 from trilane.testing.lost_context import lose_context
 from trilane.transport.packets import Packet, SlotLayout, view_packet
@@ -145,10 +144,10 @@ def test_the_display_stays_in_its_corner(gl: Any, person: Any, camera: Camera) -
     plain, shown = composed(gl, person, *scene), composed(gl, person, *scene, hud=True)
     changed = np.argwhere((plain != shown).any(axis=2))
     (top, left), (bottom, right) = changed.min(axis=0), changed.max(axis=0)
-    assert top >= OUTPUT[0] - head_up_display.SIZE[1] - head_up_display.MARGIN_PX
-    assert bottom < OUTPUT[0] - head_up_display.MARGIN_PX
-    assert left >= head_up_display.MARGIN_PX
-    assert right < head_up_display.MARGIN_PX + head_up_display.SIZE[0]
+    assert top >= OUTPUT[0] - composite.SIZE[1] - composite.MARGIN_PX
+    assert bottom < OUTPUT[0] - composite.MARGIN_PX
+    assert left >= composite.MARGIN_PX
+    assert right < composite.MARGIN_PX + composite.SIZE[0]
 
 
 def test_the_display_says_frame_rate_and_age() -> None:
@@ -156,13 +155,13 @@ def test_the_display_says_frame_rate_and_age() -> None:
     pose["frame"], pose["media_time_s"], pose["t_sampled_ns"] = 12, 0.4, 1_900_000_000
     pose["tensor_shape"], pose["avatar_count"] = (320, 192), 1
     pose["avatars"][0]["visible"] = 1
-    measured = head_up_display.measured_line(pose, [1_000_000_000, 1_500_000_000, 2_000_000_000])
-    assert head_up_display.hud_lines(pose, measured) == [
+    measured = composite.measured_line(pose, [1_000_000_000, 1_500_000_000, 2_000_000_000])
+    assert composite.hud_lines(pose, measured) == [
         "frame 12   0.40 s",
         "2.0 fps   100 ms from pose",
         "tensor 320x192   1 in view",
     ]
-    assert "- fps" in head_up_display.measured_line(pose, [1])
+    assert "- fps" in composite.measured_line(pose, [1])
 
 
 def test_the_displays_frame_is_the_pictures(gl: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -171,10 +170,10 @@ def test_the_displays_frame_is_the_pictures(gl: Any, monkeypatch: pytest.MonkeyP
 
     def noted(lines: list[str], _font: Any) -> NDArray[np.uint8]:
         shown.append(lines)
-        return np.zeros((*head_up_display.SIZE[::-1], 4), np.uint8)
+        return np.zeros((*composite.SIZE[::-1], 4), np.uint8)
 
-    monkeypatch.setattr(head_up_display, "hud_picture", noted)
-    display, target = head_up_display.Hud(gl), gl.simple_framebuffer((640, 480))
+    monkeypatch.setattr(composite, "hud_picture", noted)
+    display, target = composite.Hud(gl), gl.simple_framebuffer((640, 480))
     pose = packet(0).header
     for frame in (7, 8, 0, 1, 2):
         pose["frame"] = frame
@@ -203,7 +202,7 @@ def test_planes_lie_over_the_room_and_under_the_avatar(gl: Any, person: Any, cam
 @pytest.mark.parametrize("normal", [(0, 1, 0), (0, -3, 0), (0, 0, 1), (1, 2, 3), (1e-3, 0, 0)])
 def test_a_planes_sides_are_at_right_angles(normal: tuple[float, float, float]) -> None:
     plane = PlaneSpec(normal=normal, width_m=3, depth_m=1, turn_deg=30)
-    across, along = detected_planes.half_sides(plane)
+    across, along = composite_painters.half_sides(plane)
     assert [np.linalg.norm(across), np.linalg.norm(along)] == pytest.approx([1.5, 0.5], rel=1e-6)
     assert [across @ along, across @ normal, along @ normal] == pytest.approx([0, 0, 0], abs=1e-6)
 

@@ -9,7 +9,7 @@ import pytest
 from trilane.apps.experiments.hard_numbers.tensors import NUMBERS, STEPS, tensor_cases
 from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import ShapedBody, load_body
-from trilane.stages.gpu import shader_program
+from trilane.stages.gpu import opengl
 
 EXACT = "uvec4(clamp(roundEven(real / scale) + zero_point, 0.0, 255.0))"
 
@@ -44,12 +44,12 @@ def test_hard_values_keep_their_bounds(shaped: ShapedBody, gl: Any) -> None:
 def test_a_wrong_shader_fails(
     fault: str, rows: tuple[str, ...], shaped: ShapedBody, gl: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    source = shader_program.shader_source
+    source = opengl.shader_source
 
     def spoilt(name: Any, **defines: int | str) -> str:
         text = source(name, **defines)
         return text.replace(EXACT, fault) if name == "packed_tensor.frag" else text
 
     assert EXACT in source("packed_tensor.frag")
-    monkeypatch.setattr(shader_program, "shader_source", spoilt)
+    monkeypatch.setattr(opengl, "shader_source", spoilt)
     assert {f"packing {row}" for row in rows} <= failing(shaped, gl)

@@ -17,14 +17,14 @@ import pytest
 from PIL import ExifTags, Image
 
 from trilane.arrays import F64, U8
-from trilane.scene.camera.load import load_camera
+from trilane.scene.camera.files import load_camera
 from trilane.scene.footage import filmed
 from trilane.scene.schema import CameraSpec, PlaneSpec
 from trilane.shapes import Shape
+from trilane.stages.config import pose_dtype
 from trilane.stages.gpu.background import open_background
 from trilane.stages.gpu.composite import CompositeStage
 from trilane.stages.gpu.survey import survey
-from trilane.stages.packets import pose_dtype
 from trilane.testing.camera_files import LENS, WRITERS, Writer, write_nerf
 
 #: Of the camera in a world with Y up: x right, y down, z ahead (optical), and where it stands.

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from trilane.arrays import F64, U8
 from trilane.bench.lib import float_raster
 from trilane.bench.lib.split_pass import SplitPass
-from trilane.stages.gpu.mesh_arrays import MeshArrays, mesh_arrays
 from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement, Quantisation
-from trilane.stages.gpu.skinned_mesh import PosedMesh, SkinnedMesh
+from trilane.stages.gpu.skinned_mesh import MeshArrays, PosedMesh, SkinnedMesh, mesh_arrays
 from trilane.training.uv_image import UvRaster
 
 TIE = 1e-3

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from trilane.arrays import F64
-from trilane.stages.gpu.shader_program import shader_source
+from trilane.stages.gpu.opengl import shader_source
 from trilane.training.body_arrays import BodyArrays, body_arrays
 from trilane.training.clothing.clothed_body import PAINT, _places
 from trilane.training.clothing.garments import GARMENTS

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from trilane.arrays import F64, U8
-from trilane.stages.gpu import composite_painters, opengl_calls
-from trilane.stages.gpu.composite_painters import AvatarPainter
-from trilane.stages.gpu.picture_spans import spans
+from trilane.stages.gpu import composite_painters, opengl
+from trilane.stages.gpu.composite_painters import AvatarPainter, spans
 
 
 def test_bands_are_cut_to_what_shows_by_hand() -> None:
@@ -43,7 +42,7 @@ def test_no_texel_that_shows_is_within_the_margin_of_what_is_left_out(margin: in
 
 def blended(gl: Any, image: U8, rect: F64) -> Any:
     """The picture of 48 x 32 texels over noise of 60 x 90 pixels."""
-    colour = gl.texture((90, 60), 4, internal_format=opengl_calls.SRGB8_ALPHA8)
+    colour = gl.texture((90, 60), 4, internal_format=opengl.SRGB8_ALPHA8)
     target, painter = gl.framebuffer([colour]), AvatarPainter(gl, [(48, 32)])
     colour.write(np.random.default_rng(9).integers(0, 256, 90 * 60 * 4, dtype=np.uint8))
     painter.upload((48, 32), image.reshape(-1))

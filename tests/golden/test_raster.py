@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from trilane.bench.lib import float_raster
 from trilane.body.skinning import FrameSkinner
 from trilane.errors import BadInputError
-from trilane.stages.gpu.mesh_arrays import mesh_arrays
 from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement, Quantisation
-from trilane.stages.gpu.skinned_mesh import PosedMesh, SkinnedMesh
+from trilane.stages.gpu.skinned_mesh import PosedMesh, SkinnedMesh, mesh_arrays
 from trilane.training.uv_image import UvBytes, UvRaster
 
 ENCODING = Quantisation(6 / 255, 117)

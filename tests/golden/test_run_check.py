@@ -27,7 +27,7 @@ from trilane.bench.lib.layers import blended
 from trilane.bench.lib.stage_chain import AvatarFrames
 from trilane.bench.lib.true_picture import TruePictures, true_pictures
 from trilane.stages.configure import Checked, Request, configure
-from trilane.stages.cpu.kept_frames import KeptFrames
+from trilane.stages.cpu.present import KeptFrames
 
 SCENE = """
 frames = 12

@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 
 from trilane.scene.schema import PlaneSpec
-from trilane.stages.gpu import opengl_calls
-from trilane.stages.gpu.composite import CompositeStage
-from trilane.stages.gpu.still_background import StillBackground
-from trilane.stages.packets import pose_dtype
+from trilane.stages.config import pose_dtype
+from trilane.stages.gpu import opengl
+from trilane.stages.gpu.composite import CompositeStage, StillBackground
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 SHAPE = (18, 26)
@@ -19,7 +18,7 @@ SIZE = SHAPE[0] * SHAPE[1] * 3
 
 def test_a_view_is_drawn_twice_and_then_copied(gl: Any) -> None:
     """What lies over it in between is gone, and a view that comes again is drawn again: the room may have grown."""
-    colour = gl.texture(SHAPE[::-1], 4, internal_format=opengl_calls.SRGB8_ALPHA8)
+    colour = gl.texture(SHAPE[::-1], 4, internal_format=opengl.SRGB8_ALPHA8)
     target = gl.framebuffer([colour])
     still, drawn = StillBackground(target), []
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from trilane.stages.gpu.picture_spans import WHOLE
-from trilane.stages.gpu.shader_program import shader_source
+from trilane.stages.gpu.composite_painters import WHOLE
+from trilane.stages.gpu.opengl import shader_source
 
 CLIP = np.array([[0.9, 0.1, -0.2, 0.3], [0.05, 1.1, 0.15, -0.4], [0.2, -0.3, 0.7, 0.6], [-0.1, 0.25, 0.35, 1.7]])
 #: Two triangles of a rectangle: which side of its middle each of the six vertices lies on.

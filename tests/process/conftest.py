@@ -11,7 +11,7 @@ import psutil
 import pytest
 
 from trilane.pipeline.unit_starter import UnitStarter
-from trilane.stages.factories import PRELOAD
+from trilane.stages import PRELOAD
 from trilane.testing import doubles
 
 SHM = Path("/dev/shm")  # noqa: S108 - looked at, not written to

@@ -38,7 +38,7 @@ DATA = tomllib.loads(FILE.read_text(encoding="utf-8"))
 COMMANDS = """
 import importlib, json, os, sys
 from trilane.apps.cli import main
-from trilane.stages.factories import PRELOAD
+from trilane.stages import PRELOAD
 
 for module in ("onnx", "onnxruntime", "rich.table", *PRELOAD, *(module for module, _ in main.COMMANDS.values())):
     importlib.import_module(module)

@@ -14,10 +14,9 @@ from trilane.errors import TrilaneError
 from trilane.hw_profiles.host import rule_placement, usable_cores
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.places import Times
-from trilane.stages import choosing, placing
+from trilane.stages import PRELOAD, placing
 from trilane.stages.configure import Checked, Request, configure
 from trilane.stages.dsp.bare_calls import calls_of
-from trilane.stages.factories import PRELOAD
 
 SEVERAL = pytest.mark.skipif(len(usable_cores()) < 2, reason="there is one core")
 
@@ -36,12 +35,12 @@ def test_a_run_is_rehearsed_once_and_what_was_found_is_kept(
     """However busy the machine is; one round of the placements is enough."""
     monkeypatch.setattr(placing, "LEAST_FRAMES", 4)
     for name, value in (("MOST_OTHERS", 9.0), ("ROUNDS", 1), ("LOOK_S", 0.0)):
-        monkeypatch.setattr(choosing, name, value)
+        monkeypatch.setattr(placing, name, value)
     said: list[str] = []
     with UnitStarter(PRELOAD) as starter:
         first = placing.placed(checked, "pipelined", starter, "", said.append).placement
         monkeypatch.setattr(placing, "measured_times", None)  # whoever calls it fails
-        monkeypatch.setattr(choosing, "tried", None)
+        monkeypatch.setattr(placing, "tried", None)
         again = placing.placed(checked, "pipelined", starter, "", said.append)
         one_at_a_time = placing.placed(checked, "sequential", starter, "", said.append).placement
     assert first is not None

@@ -16,9 +16,8 @@ from trilane.bench.lib.stage_chain import AvatarFrames
 from trilane.errors import BadInputError
 from trilane.stages.avatar_pipeline import run_avatar
 from trilane.stages.configure import Checked, Request, configure
-from trilane.stages.cpu.kept_frames import kept_frames
 from trilane.stages.cpu.pose import PoseStage
-from trilane.stages.cpu.present import SEGMENTS
+from trilane.stages.cpu.present import SEGMENTS, kept_frames
 
 #: Three seconds from frame to frame.
 SCENE = """

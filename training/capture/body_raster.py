@@ -9,9 +9,8 @@ from trilane.arrays import F32, F64
 from trilane.body.body import ShapedBody
 from trilane.body.kinematics import Posed, Skeleton
 from trilane.shapes import Shape
-from trilane.stages.gpu.avatar_mesh import avatar_mesh
-from trilane.stages.gpu.opengl_context import open_context
-from trilane.stages.gpu.skinned_mesh import BodyPose, SkinnedMesh
+from trilane.stages.gpu.opengl import open_context
+from trilane.stages.gpu.skinned_mesh import BodyPose, SkinnedMesh, avatar_mesh
 from trilane.training.capture.capture import Capture
 from trilane.training.capture.fits import Fit
 from trilane.training.uv_image import UvRaster

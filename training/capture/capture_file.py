@@ -14,9 +14,8 @@ import numpy as np
 from pydantic import Field, ValidationError
 
 from trilane.arrays import F64
-from trilane.errors import BadInputError
+from trilane.errors import BadInputError, did_you_mean
 from trilane.files import read_text
-from trilane.near_miss import did_you_mean
 from trilane.scene.lens import Lens
 from trilane.scene.schema import LISTED, Finite, Table
 from trilane.shapes import MAX_SIDE, Shape

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.stages.gpu.mesh_arrays import mesh_arrays
-from trilane.stages.gpu.skinned_mesh import SkinnedMesh
+from trilane.stages.gpu.skinned_mesh import SkinnedMesh, mesh_arrays
 from trilane.training.clothing import landmarks as joint
 from trilane.training.clothing.landmarks import Landmarks
 from trilane.training.clothing.layers import MATERIALS, Layer

@@ -13,10 +13,8 @@ import moderngl
 import numpy as np
 
 from trilane.arrays import F32, U8, Floats
-from trilane.stages.gpu.camera_matrices import eye_of
-from trilane.stages.gpu.mesh_draw import MeshDraw
-from trilane.stages.gpu.shader_program import build_program, set_uniforms
-from trilane.stages.gpu.skinned_mesh import BodyPose, SkinnedMesh
+from trilane.stages.gpu.opengl import build_program, eye_of, set_uniforms
+from trilane.stages.gpu.skinned_mesh import BodyPose, MeshDraw, SkinnedMesh
 
 
 class ShadedMesh:

@@ -43,7 +43,7 @@ def _cases() -> Iterator[HardNumber]:
     from trilane.apps.experiments.hard_numbers.times import time_cases
     from trilane.avatars.bundle import load_bundle
     from trilane.stages.avatar_assets import load_avatar
-    from trilane.stages.gpu.opengl_context import open_context
+    from trilane.stages.gpu.opengl import open_context
 
     context = open_context(2)
     shaped = load_avatar(load_bundle("default")).shaped

@@ -20,8 +20,7 @@ from trilane.arrays import F64
 from trilane.body.body import Body, ShapedBody, weights_of_one
 from trilane.body.joints import JOINTS, POSE_FEATURES
 from trilane.body.kinematics import Skeleton
-from trilane.body.skin_weights import WEIGHT_COUNTS, weight_error_bound
-from trilane.body.skinning import CpuSkinner, FrameSkinner
+from trilane.body.skinning import WEIGHT_COUNTS, CpuSkinner, FrameSkinner, weight_error_bound
 
 SIGMAS = 5.0
 #: Drawn shape directions: how many, and how far one sigma of each moves a vertex, metres.
@@ -33,7 +32,7 @@ SUMS = (0.9991, 1.0009)
 POSES = 8
 #: Skin weights of a vertex that are drawn, on joints from all over the body.
 DRAWN_WEIGHTS = 16
-PROOF = "the bound that body/skin_weights.py proves"
+PROOF = "the bound that body/skinning.py proves"
 
 
 def body_cases(shaped: ShapedBody) -> Iterator[HardNumber]:

@@ -20,10 +20,15 @@ from trilane.body.joints import JOINTS
 from trilane.body.kinematics import Skeleton
 from trilane.errors import BadInputError
 from trilane.scene.camera.path import look_at, projection_matrix
-from trilane.stages.gpu.mesh_arrays import mesh_arrays
-from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement, Quantisation
-from trilane.stages.gpu.skinned_mesh import SkinnedMesh
-from trilane.stages.gpu.texture_array import check_texture, texture_array
+from trilane.stages.gpu.packed_pass import (
+    PackedAvatar,
+    PackedPass,
+    Placement,
+    Quantisation,
+    check_texture,
+    texture_array,
+)
+from trilane.stages.gpu.skinned_mesh import SkinnedMesh, mesh_arrays
 
 SHAPE = (64, 64)
 CHANNELS = 16

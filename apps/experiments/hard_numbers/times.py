@@ -16,7 +16,7 @@ import numpy as np
 from trilane.apps.experiments.hard_numbers.hard_number import HardNumber, U
 from trilane.arrays import F64
 from trilane.body.kinematics import rodrigues
-from trilane.scene.camera.builtin import load_builtin
+from trilane.scene.camera.path import load_builtin
 from trilane.scene.motion.builtin import walk_wave_turn
 from trilane.scene.motion.motion import Wrap
 from trilane.scene.schema import CameraSpec

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from trilane.arrays import F64
-from trilane.scene.camera.load import load_camera
+from trilane.scene.camera.files import load_camera
 from trilane.scene.camera.path import CameraPath
 from trilane.scene.lens import Lens
 from trilane.scene.rotations import quat_from_matrix

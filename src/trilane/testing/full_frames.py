@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from trilane.pipeline.stage import UnitContext
-from trilane.scene.work import Work
+from trilane.scene.planner import FrameWork
 from trilane.stages.cpu import pose
 from trilane.transport.packets import Packet
 
@@ -27,7 +27,7 @@ class FullFrames:
         metrics = dict(self._stage.run(frame, slot_in, slot_out))
         if slot_out is not None:
             header = self._outputs[slot_out].header
-            header["work"], header["picture"] = Work.FULL, frame
+            header["work"], header["picture"] = FrameWork.FULL, frame
         return metrics
 
     def close(self) -> None:

@@ -34,10 +34,9 @@ from trilane.avatars.network_file import read_network
 from trilane.body.body import load_body
 from trilane.errors import BadInputError
 from trilane.hw_profiles.graph_file import read_graph
-from trilane.scene.camera.load import load_camera
-from trilane.scene.load import load_scene, scene_from
-from trilane.scene.motion.load import load_motion
-from trilane.scene.schema import AvatarSpec, CameraSpec
+from trilane.scene.camera.files import load_camera
+from trilane.scene.motion.files import load_motion
+from trilane.scene.schema import AvatarSpec, CameraSpec, load_scene, scene_from
 from trilane.stages.gpu.background import open_background
 from trilane.testing.mutations import mutated
 from trilane.testing.small_inputs import write_small_inputs

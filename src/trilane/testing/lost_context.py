@@ -12,7 +12,7 @@ from typing import Any
 
 from trilane.pipeline.stage import Stage, UnitContext
 from trilane.stages.gpu import raster
-from trilane.stages.gpu.opengl_context import LIBRARY
+from trilane.stages.gpu.opengl import LIBRARY
 from trilane.transport.packets import Packet
 
 FACTORY = "trilane.testing.lost_context:build"

@@ -27,8 +27,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from trilane import machine
-from trilane.errors import BadInputError
-from trilane.near_miss import did_you_mean
+from trilane.errors import BadInputError, did_you_mean
 from trilane.testing.mutants.tree_copy import copied_tree, tracked_files
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -9,7 +9,7 @@ import numpy as np
 from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, UnitSettings
 from trilane.pipeline.regions import EdgeRegion
 from trilane.pipeline.unit_spec import UnitSpec
-from trilane.transport.job_pipe import JobPipeEnd
+from trilane.transport.messages import JobPipeEnd
 from trilane.transport.packets import Packet, SlotLayout, header_dtype, view_packet
 
 #: The header of the first edge's packets.

@@ -1,0 +1,320 @@
+"""Loads the camera of a scene: a built-in one by name, or a file whose format is told by its content.
+
+The scene may state the format. Else a folder is known by the names of its files, and a text by its column names, then
+by how many columns it has and what they hold. What fits a second format, or another order of columns, as well is a
+question to the user: the message names both and what settles it. A note gives the reason of each guess.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from itertools import permutations
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from trilane.arrays import F64
+from trilane.errors import BadInputError, did_you_mean
+from trilane.files import read_text, require_file
+from trilane.scene.camera.colmap import ENDINGS, load_colmap, model_in
+from trilane.scene.camera.json_files import NERF_FILE, RECORD3D_FILE, load_nerf, load_record3d
+from trilane.scene.camera.path import BUILTIN, CameraPath, load_builtin
+from trilane.scene.camera.pose_table import (
+    LEAST_GROWING,
+    MATRIX,
+    POSE,
+    SAY_ORDER,
+    TableLayout,
+    head_of,
+    is_index,
+    is_off,
+    layout_of,
+)
+from trilane.scene.camera.recorded import (
+    AUTO,
+    OPENGL_FROM_OPTICAL,
+    UP,
+    RawCamera,
+    are_rotations,
+    path_from_recording,
+    price_of,
+)
+from trilane.scene.camera.trajectories import (
+    EUROC_NAMES,
+    KITTI_TIMES,
+    STRAY_FILE,
+    TUM_COLUMNS,
+    TUM_NAMES,
+    load_arkit,
+    load_euroc,
+    load_kitti,
+    load_stray,
+    load_tum,
+)
+from trilane.scene.rotations import matrix_from_quat, normalised
+from trilane.scene.schema import BUILT_IN_PREFIX, CameraSpec
+
+EXPECTED = (
+    "a camera: an ARKit log, a TUM, KITTI or EuRoC trajectory, a transforms.json, odometry.csv of Stray Scanner, "
+    "metadata.json of Record3D or a folder of COLMAP"
+)
+COLMAP_FILES = tuple(f"{name}{ending}" for name in ("cameras", "images") for ending in ENDINGS)
+
+
+class Guess(NamedTuple):
+    """`kind`: as the scene's `format` has it. `reason`: part of a sentence."""
+
+    kind: str
+    reason: str
+
+
+#: Fewer rows than this tell nothing of how a camera moves.
+LEAST_ROWS = 5
+#: Median deviation of the steps of a column, in medians: below the first they are a clock's, above the second not.
+EVEN, UNEVEN = 0.1, 0.5
+#: No place is farther from the origin of its map, of whatever unit, but times since 1970 are.
+FARTHEST = 1e8
+#: Numbers of more than three digits after the point are a quaternion's, or a matrix's, to this in most rows.
+PRECISE, MOST_IMPRECISE = 1e-3, 0.25
+#: A pose is without a turn, and at the origin, to this.
+EXACT = 1e-6
+#: Mean cosine of the camera's way with its axis, and of its axes with the world's, from which both are taken for one.
+ALONG, UPRIGHT = 0.9, 0.7
+#: Another order of a quaternion's parts that is cheaper by the first is likely, one that is not dearer by the second is
+#: possible. Both are asked about.
+MUCH_DEARER, AS_DEAR = 0.1, 0.02
+WHICH_MATRIX = (
+    'set camera.format to "kitti" if the camera looks along +Z of its axes (x right, y down), to "arkit" if along -Z '
+    "(x right, y up)"
+)
+
+#: Columns of what others save -> how it becomes usable.
+OTHERS = {
+    1: "part the numbers by blanks or commas",
+    7: "if these are rotation vectors, as in ARKitScenes, or a place and a quaternion: write time, place and "
+    "quaternion of each pose, camera to world, as TUM has them",
+    16: "if these are 4x4 matrices, as of Replica: leave the last four columns out, which are 0 0 0 1, for KITTI's 12",
+}
+
+
+def detect(path: Path, up_axis: str = AUTO) -> Guess:
+    """The format of `path`. `up_axis`: up by the scene. Raises BadInputError when it is none, or may be two."""
+    if path.is_dir():
+        return _of_folder(path)
+    require_file(path, EXPECTED)
+    if path.name in COLMAP_FILES and model_in(path.parent) is not None:
+        return Guess("colmap", "a file of a COLMAP model")
+    if path.suffix.lower() == ".json" or read_text(path, EXPECTED).lstrip()[:1] == "{":
+        return _of_json(path)
+    return _of_table(path, layout_of(path, EXPECTED), up_axis)
+
+
+def _of_json(path: Path) -> Guess:
+    text = read_text(path, EXPECTED)
+    if '"frames"' not in text and '"poses"' in text:
+        return Guess("record3d", "JSON with `poses` and no `frames`")
+    return Guess("nerf", "it is JSON")
+
+
+def _of_folder(path: Path) -> Guess:
+    found = model_in(path)
+    if found is not None:
+        return Guess("colmap", f"cameras{found[1]} and images{found[1]} in the folder")
+    for kind, name in (("nerf", NERF_FILE), ("stray", STRAY_FILE), ("record3d", RECORD3D_FILE)):
+        if (path / name).is_file():
+            return Guess(kind, f"{name} in the folder")
+    remedy = "name the file of poses in it"
+    raise BadInputError(
+        path, f"a folder without {NERF_FILE}, {STRAY_FILE}, {RECORD3D_FILE} and COLMAP's files", EXPECTED, remedy
+    )
+
+
+def _of_table(path: Path, layout: TableLayout, up_axis: str) -> Guess:
+    columns = layout.columns
+    if layout.has_pose and "frame" in layout.names:
+        return Guess("stray", "column names with a frame, a place and a quaternion")
+    if layout.has_pose:
+        scalar_first = layout.names.index("qw") < layout.names.index("qx")
+        reason = f"column names with the quaternion's scalar {'first' if scalar_first else 'last'}"
+        return Guess("euroc" if scalar_first and layout.is_ns else "tum", reason)
+    _require_pose(path, layout)
+    if columns in (MATRIX, MATRIX + 1):
+        return _of_matrices(path, head_of(path, columns, EXPECTED), up_axis)
+    if columns >= TUM_COLUMNS and layout.has_commas and layout.is_ns:
+        _require_one_order(path, head_of(path, columns, EXPECTED), EUROC_NAMES)
+        reason = f"{columns} columns with commas and times in ns: the quaternion's scalar is taken to be first"
+        return Guess("euroc", reason)
+    if columns == TUM_COLUMNS:
+        _require_one_order(path, head_of(path, columns, EXPECTED), TUM_NAMES)
+        return Guess("tum", f"{columns} columns: the quaternion's scalar is taken to be last")
+    counts = f"{TUM_COLUMNS} (TUM, EuRoC), {MATRIX} (KITTI) or {MATRIX + 1} (ARKit), or column names"
+    raise BadInputError(path, f"{columns} columns", counts, OTHERS.get(columns, ""))
+
+
+def _require_pose(path: Path, layout: TableLayout) -> None:
+    """Raises BadInputError where column names have a part of a quaternion, but not the whole pose."""
+    if any(name in layout.names for name in ("qw", "qx", "qy", "qz")):
+        missing = ", ".join(name for name in POSE if name not in layout.names)
+        raise BadInputError(path, f"column names without {missing}", f"names of {', '.join(POSE)} in any order")
+
+
+def _require_clock(path: Path, numbers: F64, others: Iterable[int]) -> None:
+    """Raises BadInputError where one of `others` of the columns (N, columns) has times, or grows as they do."""
+    if len(numbers) < LEAST_ROWS:
+        return
+    is_even = np.ptp(numbers[:, 0]) == 0 or _unevenness(numbers[:, 0]) < UNEVEN  # one time: the reader says so
+    for k in others:
+        middle = float(np.median(numbers[:, k]))
+        if abs(middle) > FARTHEST:
+            raise BadInputError(path, f"{middle:.6g} in column {k + 1}", "a place, not a time", SAY_ORDER)
+        if not is_even and _unevenness(numbers[:, k]) < EVEN:
+            found = f"column {k + 1} growing evenly, as times do, and column 1 not"
+            raise BadInputError(path, found, "a time in the first column", SAY_ORDER)
+
+
+def _unevenness(column: F64) -> float:
+    """The median deviation of the steps of `column` (N,) from their median, in medians; inf where it does not grow."""
+    steps = np.diff(column)
+    middle = float(np.median(steps))
+    if not middle > 0 or (steps > 0).mean() < LEAST_GROWING:
+        return np.inf
+    return float(np.median(np.abs(steps - middle))) / middle
+
+
+def _of_matrices(path: Path, numbers: F64, up_axis: str) -> Guess:
+    """The format of a table (N, 12 or 13) of matrices. KITTI's and ARKit's cameras look along opposite axes."""
+    matrices = numbers[:, -MATRIX:].reshape(-1, 3, 4)
+    rows = numbers[sound := are_rotations(matrices[:, :, :3])]
+    has_time = numbers.shape[1] > MATRIX and not is_index(rows[:, 0])
+    usual, first = ("arkit", "a time and ") if has_time else ("kitti", "a frame's number and ")
+    columns = f"{numbers.shape[1]} columns: {first if numbers.shape[1] > MATRIX else ''}"
+    if len(rows) >= LEAST_ROWS and _has_digits(rows[:, -MATRIX:]):
+        precise = are_rotations(matrices[sound, :, :3], PRECISE)
+        if (~precise).mean() > MOST_IMPRECISE:
+            found = f"{columns}matrices that are nearly rotations, but not as exactly as their digits"
+            raise BadInputError(path, found, "numbers row by row", WHICH_MATRIX)
+    is_readable = 0 < len(rows) >= len(numbers) / 2  # else the reader names the rows that are no rotation
+    if is_readable and (has_time or not path.with_name(KITTI_TIMES).is_file()):
+        if has_time:
+            _require_clock(path, rows, (4, 8, 12))
+        signs = _signs(matrices[sound], _ups(up_axis, has_time=has_time))
+        if signs["kitti" if has_time else "arkit"] or not (has_time or signs["kitti"]):
+            why = " and ".join((*signs["kitti"], *signs["arkit"])) or "which do not tell where the camera looks"
+            raise BadInputError(path, f"{columns}3x4 matrices, {why}", "what fits one format", WHICH_MATRIX)
+    return Guess(usual, f"{columns}a 3x4 matrix{'' if numbers.shape[1] > MATRIX else ' without a time'}")
+
+
+def _ups(up_axis: str, *, has_time: bool) -> tuple[str, ...]:
+    """Axes of the world that a picture's Y cannot point against, but for KITTI's; a phone may be held upside down."""
+    if up_axis != AUTO:
+        return (up_axis,)
+    return ("z",) if has_time else ("z", "y")
+
+
+def _signs(matrices: F64, ups: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
+    """What poses (N, 3, 4) say for KITTI's axes (x right, y down, looks along +Z), and what for ARKit's."""
+    turns, places = matrices[:, :, :3], matrices[:, :, 3]
+    own_up = {axis: float(turns[:, :, 1].mean(axis=0) @ UP[axis]) for axis in ups}
+    steps = np.diff(places, axis=0)
+    length = float(np.linalg.norm(steps, axis=1).sum())
+    ahead = float((steps * turns[:-1, :, 2]).sum()) / length if length > 0 and len(turns) >= LEAST_ROWS else 0.0
+    is_upright = bool(abs(turns[:, 1, 0].mean()) > UPRIGHT)
+    starts = np.abs(turns[0] - np.eye(3)).max() < EXACT and np.abs(places[0]).max() < EXACT
+    said = {
+        "kitti": {
+            "which begin at the origin without a turn, as KITTI's": starts,
+            "which move along +Z, as KITTI's": ahead > ALONG,
+            f"whose Y is down where {' or '.join(ups).upper()} is up, as KITTI's": (
+                min(own_up.values()) < -UPRIGHT and not is_upright
+            ),
+        },
+        "arkit": {
+            "which move along -Z, as ARKit's": ahead < -ALONG,
+            "of a device held upright, as ARKit's": is_upright,
+            f"whose Y is up where {ups[0].upper()} is up, as ARKit's": own_up[ups[0]] > UPRIGHT,
+        },
+    }
+    return {kind: tuple(why for why, holds in of.items() if holds) for kind, of in said.items()}
+
+
+def _require_one_order(path: Path, numbers: F64, names: tuple[str, ...]) -> None:
+    """Raises BadInputError where the quaternion's parts may be in another order than `names` of a table's columns.
+
+    That is where another order makes cameras that are more level, or where the other usual one (scalar first or last)
+    makes them as level. A map of SLAM that begins without a turn has the 1 where its scalar is.
+    """
+    at = names.index("qw"), names.index("qx"), names.index("qy"), names.index("qz")
+    first_of = min(at)
+    numbers = numbers[np.any(numbers[:, first_of : first_of + 4] != 0, axis=1)]
+    quats = numbers[:, first_of : first_of + 4]
+    if not len(numbers) or 2 * np.count_nonzero(is_off(quats)) > len(quats):
+        return  # the reader says what is wrong
+    where = f"columns {first_of + 1} to {first_of + 4}"
+    if len(quats) >= LEAST_ROWS and _has_digits(quats) and is_off(quats, PRECISE).mean() > MOST_IMPRECISE:
+        found = f"quaternions in {where} that have length 1, but not as exactly as their digits"
+        raise BadInputError(path, found, "a quaternion in these columns", SAY_ORDER)
+    _require_clock(path, numbers, (1, 2, 3))
+    own = tuple(k - first_of for k in at)
+    one = np.abs(np.abs(quats[0]) - 1) < EXACT
+    some = quats[:: len(quats) // 100 + 1]
+    prices = {order: _price(some, order) for order in permutations(range(4)) if not one.any() or one[order[0]]}
+    other = (3, 0, 1, 2) if own[0] == 0 else (0, 1, 2, 3)
+    mine = prices.get(own, np.inf)
+    if not (mine < min(prices.values()) + MUCH_DEARER and mine < prices.get(other, np.inf) - AS_DEAR):
+        raise BadInputError(
+            path,
+            f"{where} with quaternions whose order is not told by how the camera is held",
+            "an order that makes a level camera, and no other",
+            'set camera.format to "tum" (qx qy qz qw) or "euroc" (qw qx qy qz), or ' + SAY_ORDER,
+        )
+
+
+def _has_digits(numbers: F64) -> bool:
+    """Whether numbers have more than three digits after the point."""
+    return bool((np.abs(numbers - np.round(numbers, 3)) > EXACT).any())
+
+
+def _price(quats: F64, order: tuple[int, ...]) -> float:
+    """How far from level a camera is whose w, x, y, z are the columns `order` of `quats` (N, 4)."""
+    return price_of(matrix_from_quat(normalised(quats[:, order])) @ OPENGL_FROM_OPTICAL, "z")
+
+
+#: Readers of a path and the scene's rate.
+_READERS: dict[str, Callable[[Path, float | None], RawCamera]] = {
+    "arkit": load_arkit,
+    "colmap": load_colmap,
+    "euroc": load_euroc,
+    "kitti": load_kitti,
+    "nerf": load_nerf,
+    "record3d": load_record3d,
+    "stray": load_stray,
+    "tum": load_tum,
+}
+#: Formats that may be folders.
+FOLDERS = ("colmap", "nerf", "record3d", "stray")
+
+
+def load_camera(spec: CameraSpec, base: Path) -> CameraPath:
+    """The camera that `spec.source` names; a relative path starts at `base`.
+
+    Raises BadInputError when there is no such camera or the file is unusable.
+    """
+    if spec.source.startswith(BUILT_IN_PREFIX):
+        name, names = spec.source.removeprefix(BUILT_IN_PREFIX), ", ".join(BUILTIN)
+        built_in = load_builtin(name, spec)
+        if built_in is None:
+            near = did_you_mean(name, BUILTIN, BUILT_IN_PREFIX)
+            raise BadInputError("camera", repr(spec.source), f"{BUILT_IN_PREFIX}{{{names}}} or a file", near)
+        return built_in
+    path = base / spec.source
+    guess = detect(path, spec.up_axis) if spec.format == "auto" else Guess(spec.format, "")
+    if not (path.is_dir() and guess.kind in FOLDERS):
+        require_file(path, EXPECTED)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is left out afterwards
+        raw = _READERS[guess.kind](path, spec.rate_hz)
+        camera = path_from_recording(raw, str(path), spec)
+    reason = guess.reason or "as given"
+    taken = f"taken for {camera.detected.format}: {reason}"
+    return replace(camera, notes=(*camera.notes, taken), detected=replace(camera.detected, reason=reason))

@@ -1,0 +1,261 @@
+"""Readers of camera trajectories, which are text tables with a pose in each line: five formats.
+
+A format says the order of its columns, its axes and the lens that its devices usually have. `pose_table.py` reads the
+lines; a file's own column names win over the order of the format. Optical axes are x right, y down, looking along +Z.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from trilane.arrays import F64
+from trilane.errors import BadInputError
+from trilane.files import read_text
+from trilane.scene.camera.pose_table import (
+    FRAMES,
+    MATRIX,
+    USUAL,
+    MatrixTable,
+    PoseTable,
+    elapsed,
+    read_matrix_table,
+    read_pose_table,
+    read_table,
+    times_of,
+)
+from trilane.scene.camera.recorded import FILM_RATE_HZ, OPENGL_FROM_OPTICAL, LengthUnit, RawCamera
+from trilane.scene.lens import Bent, Known, Lens, centred, checked_lens, distortion_note, measured_lens, of_opencv
+from trilane.scene.recordings import Detected
+
+ARKIT_COLUMNS = 13
+ARKIT = "an ARKit log: time and the 12 numbers of a 3x4 matrix a line"
+#: An iPhone's main camera, 26 mm equivalent, on a 16:9 picture: 36 degrees high, 60 wide.
+PHONE = centred(1920, 1080, 540 / math.tan(math.radians(18.0)), Known.LONG)
+
+
+def load_arkit(path: Path, rate_hz: float | None = None) -> RawCamera:
+    """Read an ARKit log: `time r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz` a line, camera to world, metres, Y up.
+
+    Axes are those of the sensor in landscape (x right, y up, looks along -Z). Steps tell nanoseconds from seconds.
+    `rate_hz`: frames a second by the scene, for files without times; 30 by default. Raises BadInputError with the line.
+    """
+    read = read_matrix_table(path, rate_hz, FILM_RATE_HZ, ARKIT)
+    count = len(read.turns)
+    times = read.times or times_of(np.arange(float(count)), rate_hz)
+    notes = (f"ARKit log, {count} poses{times.rate}, time in {times.unit}, camera to world",)
+    return RawCamera(
+        times.since_s,
+        read.turns,
+        read.places,
+        "y",
+        (PHONE,),
+        "usual for a phone",
+        notes,
+        read.table.place_of,
+        Detected(
+            "ARKit log",
+            f"{ARKIT_COLUMNS} columns of numbers",
+            unit="m",
+            rate=f"by the times of the file, in {times.unit}",
+        ),
+        is_levelled=True,
+    )
+
+
+KITTI = "KITTI poses: the 12 numbers of a 3x4 matrix a line"
+KITTI_HZ = 10.0
+KITTI_TIMES = "times.txt"
+#: The left grey camera of the first sequences, rectified.
+GREY = of_opencv(1241.0, 376.0, 718.856, 718.856, 607.1928, 185.2157)
+
+
+def load_kitti(path: Path, rate_hz: float | None = None) -> RawCamera:
+    """Read KITTI odometry poses: a 3x4 matrix a line, row by row, camera to the first camera's axes, metres.
+
+    Axes are optical, so -Y is usually up. Some programs write a frame's number or a time before each matrix.
+    `rate_hz`: frames a second by the scene. Raises BadInputError with the line.
+    Format: https://www.cvlibs.net/datasets/kitti/eval_odometry.php, readme.txt of the development kit.
+    """
+    read = read_matrix_table(path, rate_hz, KITTI_HZ, KITTI)
+    times, rate = _kitti_times(path, read, rate_hz)
+    notes = (f"KITTI poses, {len(times)}, {rate}, optical axes, camera to the first one",)
+    detected = Detected("KITTI poses", f"{MATRIX} columns of numbers", unit="m", rate=rate)
+    lens = ((GREY,), "usual for KITTI's cameras")
+    turns = read.turns @ OPENGL_FROM_OPTICAL
+    return RawCamera(times, turns, read.places, "-y", *lens, notes, read.table.place_of, detected)
+
+
+def _kitti_times(path: Path, read: MatrixTable, rate_hz: float | None) -> tuple[F64, str]:
+    """Seconds (N,) of the poses and their source: the file, `times.txt` beside it, the scene or the usual rate."""
+    if read.times is not None and read.times.unit != FRAMES:
+        return read.times.since_s, f"by the times of the file, in {read.times.unit}"
+    frames = np.arange(float(len(read.turns))) if read.times is None else read.table.numbers[:, 0]
+    beside = path.with_name(KITTI_TIMES)
+    if rate_hz is None and beside.is_file() and beside != path:
+        times = read_table(beside, 1, "the time of a pose a line").numbers[:, 0]
+        if len(times) == len(frames):
+            return elapsed(times)[0], f"times by {KITTI_TIMES}"
+    rate = rate_hz or KITTI_HZ
+    how = "as given" if rate_hz else "assumed"
+    return elapsed(frames)[0] / rate, f"{rate:g} a second {how}, as the file has no times"
+
+
+TUM_NAMES = ("time", "x", "y", "z", "qx", "qy", "qz", "qw")
+TUM_COLUMNS = len(TUM_NAMES)
+TUM = "a TUM trajectory: time, tx ty tz, qx qy qz qw a line"
+#: The Kinect's colour camera, as calibrated for the first of these recordings: 49.8 degrees high, 63.5 wide.
+KINECT = centred(640, 480, 517.0)
+
+
+def load_tum(path: Path, rate_hz: float | None = None) -> RawCamera:
+    """Read a TUM RGB-D trajectory: `time tx ty tz qx qy qz qw` a line, camera to world, metres, seconds.
+
+    Axes are optical. SLAM programs write their maps so too, some with times in nanoseconds.
+    `rate_hz`: frames a second by the scene. Raises BadInputError with the line.
+    Format: https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats.
+    """
+    poses = read_pose_table(path, rate_hz, TUM_NAMES, TUM)
+    order = "" if poses.order == USUAL else f", columns {poses.order}"
+    time = "" if poses.time == "s" else f", time in {poses.time}"
+    notes = (f"TUM trajectory, {len(poses.times_s)} poses{poses.rate}{time}{order}, optical axes, camera to world",)
+    lens = ((KINECT,), "usual for a Kinect")
+    reason = f"{TUM_COLUMNS} columns of numbers"
+    detected = Detected("TUM trajectory", reason, unit="m", rate="by the times of the file")
+    turns = poses.turns @ OPENGL_FROM_OPTICAL
+    place_of = poses.table.place_of
+    return RawCamera(
+        poses.times_s,
+        turns,
+        poses.places,
+        "z",
+        *lens,
+        notes,
+        place_of,
+        detected,
+        unit=LengthUnit.USUALLY_M,
+        began_s=poses.began_s,
+    )
+
+
+EUROC_NAMES = ("time", "x", "y", "z", "qw", "qx", "qy", "qz")
+EUROC = "EuRoC poses: time in ns, x, y, z, qw, qx, qy, qz a line"
+EUROC_SENSOR = Path("cam0") / "sensor.yaml"
+#: The left camera of the data sets.
+CAM0 = of_opencv(752.0, 480.0, 458.654, 457.296, 367.215, 248.375)
+#: Key of the sensor's file -> how many numbers follow it.
+SENSOR_KEYS = {"data": 16, "resolution": 2, "intrinsics": 4, "distortion_coefficients": 4}
+
+
+def load_euroc(path: Path, rate_hz: float | None = None) -> RawCamera:
+    """Read EuRoC MAV poses, `data.csv`: time in nanoseconds, place, quaternion `w, x, y, z`, then any other columns.
+
+    Poses are those of the device's body; `cam0/sensor.yaml` beside them leads to the camera, and without it the
+    body's axes are taken. Camera axes are optical; the world's Z is up.
+    `rate_hz`: frames a second by the scene. Raises BadInputError with the line.
+    Format: M. Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016.
+    """
+    poses = read_pose_table(path, rate_hz, EUROC_NAMES, EUROC, may_have_more=True)
+    turns, places, lens, source = poses.turns, poses.places, CAM0, "usual for EuRoC's cameras"
+    how: tuple[str, ...] = (f"the axes of the poses are taken for the camera's, as there is no {EUROC_SENSOR}",)
+    sensor = path.parent.parent / EUROC_SENSOR
+    if sensor.is_file():
+        numbers = _sensor(sensor)
+        to_body = numbers["data"].reshape(4, 4)
+        turns, places = turns @ to_body[:3, :3], places + turns @ to_body[:3, 3]
+        lens, source = checked_lens(sensor, _sensor_lens(numbers)), f"by {EUROC_SENSOR}"
+        how = (f"poses of the body, brought to the camera by {EUROC_SENSOR}", *_sensor_distortion(lens, numbers))
+    notes = (f"EuRoC poses, {len(poses.times_s)}{poses.rate}, time in {poses.time}, columns {poses.order}", *how)
+    detected = Detected("EuRoC poses", "times in ns and commas", unit="m", rate="by the times of the file")
+    turns = turns @ OPENGL_FROM_OPTICAL
+    return RawCamera(
+        poses.times_s, turns, places, "z", (lens,), source, notes, poses.table.place_of, detected, began_s=poses.began_s
+    )
+
+
+def _sensor_lens(numbers: Mapping[str, F64]) -> Lens:
+    width, height = (float(value) for value in numbers["resolution"])
+    fx, fy, cx, cy = (float(value) for value in numbers["intrinsics"])
+    return of_opencv(width, height, fx, fy, cx, cy)
+
+
+def _sensor_distortion(lens: Lens, numbers: Mapping[str, F64]) -> tuple[str, ...]:
+    keys = ("k1", "k2", "p1", "p2")
+    return distortion_note([Bent(lens, dict(zip(keys, map(float, numbers["distortion_coefficients"]), strict=True)))])
+
+
+def _sensor(path: Path) -> dict[str, F64]:
+    """The numbers of a `sensor.yaml` by SENSOR_KEYS; each is a list in brackets. Raises BadInputError."""
+    text = "\n".join(line.split("#", 1)[0] for line in read_text(path, "a EuRoC sensor.yaml").splitlines())
+    numbers = {}
+    for key, count in SENSOR_KEYS.items():
+        found = re.search(rf"\b{key}:\s*\[([^\[\]]*)\]", text)
+        try:
+            values = np.array([float(word) for word in found.group(1).split(",")]) if found else np.zeros(0)
+        except ValueError as error:
+            raise BadInputError(f"{path}: {key}", str(error), f"{count} numbers") from None
+        if len(values) != count or not np.isfinite(values).all():
+            raise BadInputError(f"{path}: {key}", f"{len(values)} numbers", f"{count} finite numbers in brackets")
+        numbers[key] = values
+    if (numbers["resolution"] <= 0).any() or (numbers["intrinsics"] <= 0).any():
+        raise BadInputError(path, "a resolution or focal length that is not positive", "positive numbers")
+    return numbers
+
+
+STRAY_FILE, STRAY_MATRIX = "odometry.csv", "camera_matrix.csv"
+STRAY_NAMES = ("time", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
+STRAY = "a Stray Scanner odometry.csv: timestamp, frame, x, y, z, qx, qy, qz, qw"
+#: Width and height of the video; a principal point this near its middle belongs to it.
+VIDEO_PX, NEAR_PX = (1920.0, 1440.0), 100.0
+
+
+def load_stray(path: Path, rate_hz: float | None = None) -> RawCamera:
+    """Read Stray Scanner's `odometry.csv`, or its folder: time, frame, place and quaternion of each frame.
+
+    Axes are optical in ARKit's world, which is levelled, Y up, metres. Newer files have a lens for each frame, in
+    pixels of the sensor in landscape; `camera_matrix.csv` beside older ones has one for all.
+    `rate_hz`: frames a second by the scene. Raises BadInputError with the line.
+    Format: https://docs.strayrobots.io/apps/scanner/format.html.
+    """
+    file = path / STRAY_FILE if path.is_dir() else path
+    poses = read_pose_table(file, rate_hz, STRAY_NAMES, STRAY, may_have_more=True)
+    lenses, source = _stray_lenses(file, poses)
+    notes = (f"Stray Scanner, {len(poses.times_s)} poses{poses.rate}, optical axes, camera to world",)
+    detected = Detected("Stray Scanner odometry", "its column names", unit="m", rate="by the times of the file")
+    turns, place_of = poses.turns @ OPENGL_FROM_OPTICAL, poses.table.place_of
+    return RawCamera(
+        poses.times_s, turns, poses.places, "y", lenses, source, notes, place_of, detected, is_levelled=True
+    )
+
+
+def _stray_lenses(file: Path, poses: PoseTable) -> tuple[tuple[Lens, ...], str]:
+    """One lens for all poses or one for each, and where they come from."""
+    parts = ("fx", "fy", "cx", "cy")
+    if all(name in poses.names for name in parts):
+        table = np.column_stack([poses.column(name) for name in parts])
+        if np.isfinite(table).any():
+            places = (f"{file}, {poses.table.place_of(k)}" for k in range(len(table)))
+            lenses = tuple(_stray_lens(where, row) for where, row in zip(places, table, strict=True))
+            return lenses, "by the file, frame by frame"
+    matrix = file.with_name(STRAY_MATRIX)
+    if not matrix.is_file():
+        return (PHONE,), f"usual for a phone, as there is no {STRAY_MATRIX}"
+    numbers = read_table(matrix, 3, "the 3 x 3 camera matrix").numbers
+    if numbers.shape != (3, 3):
+        raise BadInputError(matrix, f"{len(numbers)} rows", "a 3 x 3 camera matrix")
+    return (_stray_lens(matrix, numbers[[0, 1, 0, 1], [0, 1, 2, 2]]),), f"by {STRAY_MATRIX}"
+
+
+def _stray_lens(where: str | Path, numbers: F64) -> Lens:
+    """The lens of fx, fy, cx and cy; a principal point near the usual middle belongs to a video of the usual size.
+
+    Raises BadInputError about `where`.
+    """
+    _, _, cx, cy = (float(value) for value in numbers)
+    is_usual = abs(cx - VIDEO_PX[0] / 2) < NEAR_PX and abs(cy - VIDEO_PX[1] / 2) < NEAR_PX
+    width, height = VIDEO_PX if is_usual else (2 * cx, 2 * cy)
+    return measured_lens(where, width, height, numbers)

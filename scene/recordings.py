@@ -1,0 +1,102 @@
+"""What a reader finds in the file of a motion or a camera, and which of its samples are usable.
+
+A sample is left out when its reader finds it unreadable, or when its time is not after that of the last usable one;
+sampling interpolates across the hole, and a note says how many. A file with more bad samples than good ones is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilane.arrays import F64
+from trilane.errors import BadInputError
+
+
+@dataclass(frozen=True)
+class Detected:
+    """What a file is.
+
+    `format`: its name for people. `reason`: what told the format apart. `axes`: which is up, and why. `unit`: of
+    its lengths, and why. `rate`: where the rate comes from. `lens`: the same of a camera's. `joints`: SMPL-X joint ->
+    the file's name of it. `unmapped`: names of the file's joints that have no partner, in its order.
+    """
+
+    format: str = ""
+    reason: str = ""
+    axes: str = ""
+    unit: str = ""
+    rate: str = ""
+    lens: str = ""
+    joints: Mapping[str, str] = field(default_factory=dict)
+    unmapped: tuple[str, ...] = ()
+
+
+#: Of what comes from no file.
+NOTHING = Detected()
+
+
+#: An interval longer than this many median intervals is reported as a gap.
+GAP = 1.5
+
+#: The index of a sample -> where it stands in its file, for messages.
+PlaceOf = Callable[[int], str]
+
+
+def by_number(index: int) -> str:
+    """The place of sample `index` in a file without lines or names."""
+    return f"number {index}"
+
+
+def usable_samples(
+    where: str,
+    times_s: F64,
+    readable: NDArray[np.bool_],
+    place_of: PlaceOf = by_number,
+    broken_as: str = "not finite or no rotation",
+) -> tuple[NDArray[np.intp], tuple[str, ...]]:
+    """Indices of the usable samples, and notes on the others and on gaps in time.
+
+    `where`: the file, for messages. `times_s` (T,): times of the samples. `readable` (T,): whether their values are
+    readable. `place_of`: where each stands in the file. `broken_as`: what those that are not readable are. Raises
+    BadInputError when less than half of the samples are usable.
+    """
+    timed = readable & np.isfinite(times_s)
+    broken = int(len(times_s) - timed.sum())
+    indices = np.flatnonzero(timed)
+    increasing = indices[_strictly_increasing(times_s[indices])]
+    late = len(indices) - len(increasing)
+    first = f" (first: {place_of(int(np.flatnonzero(~timed)[0]))})" if broken else ""
+    if not len(increasing) or 2 * len(increasing) < len(times_s):
+        raise BadInputError(
+            where,
+            f"{broken} samples that are {broken_as}{first} and {late} times that do not increase, of {len(times_s)}",
+            "at least half of the samples sound",
+        )
+    notes = []
+    if broken:
+        notes.append(f"{broken} samples {broken_as}{first}, interpolated across")
+    if late:
+        notes.append(f"{late} samples with repeated or decreasing times left out")
+    return increasing, (*notes, *_gap_notes(times_s[increasing]))
+
+
+def _strictly_increasing(times_s: F64) -> NDArray[np.bool_]:
+    """Whether each time (T,) is later than all before it."""
+    highest = np.maximum.accumulate(times_s)
+    later = np.ones(len(times_s), dtype=bool)
+    later[1:] = times_s[1:] > highest[:-1]
+    return later
+
+
+def _gap_notes(times_s: F64) -> tuple[str, ...]:
+    steps = np.diff(times_s)
+    if len(steps) < 2:
+        return ()
+    wide = steps[steps > GAP * np.median(steps)]
+    if not len(wide):
+        return ()
+    return (f"{len(wide)} gaps, the longest {wide.max() * 1000:.0f} ms, interpolated across",)

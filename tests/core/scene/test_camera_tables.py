@@ -1,0 +1,311 @@
+"""Camera tables: which reader a file gets; columns that were swapped, added or left out are read, or refused."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from trilane.arrays import F64
+from trilane.errors import BadInputError
+from trilane.scene.camera import pose_table
+from trilane.scene.camera.files import load_camera
+from trilane.scene.camera.pose_table import TableLayout, elapsed, layout_of, read_table
+from trilane.scene.rotations import Y_UP_FROM_Z_UP, about, matrix_from_quat, quat_from_matrix
+from trilane.scene.schema import CameraSpec
+from trilane.testing.camera_files import OPTICAL, lines_of, load, nerf_text, pose_z_up, rows_of
+
+COUNT = 60
+STEPS = np.linspace(0.0, 1.0, COUNT)
+
+
+class Truth(NamedTuple):
+    """A camera, and its `table` as saved.
+
+    `turns` (N, 3, 3) and `places` (N, 3): camera to world, OpenGL axes. `times_s` (N,).
+    """
+
+    turns: F64
+    places: F64
+    times_s: F64
+    table: F64
+
+
+def by_hand(heading: float) -> tuple[F64, F64]:
+    """Someone looks about by 20 degrees, a little down, and sidesteps; Y up."""
+    turns = about(1, heading + 0.35 * np.sin(5 * STEPS)) @ about(0, -0.2 + 0.06 * np.sin(11 * STEPS))
+    turns = turns @ about(2, 0.02 * np.sin(17 * STEPS))
+    places = np.column_stack([0.5 * np.sin(3 * STEPS), 1.5 + 0.05 * np.cos(9 * STEPS), 0.4 * np.cos(4 * STEPS)])
+    return turns, places @ about(1, heading).T
+
+
+def by_car() -> tuple[F64, F64]:
+    """It drives 60 m round a bend, and looks ahead; the first picture's optical axes are the world's."""
+    turns = about(1, -0.8 * STEPS**2) @ about(0, 0.03 * np.sin(13 * STEPS))
+    places = np.cumsum(np.vstack([np.zeros(3), -turns[:-1, :, 2] * (0.9 + 0.2 * np.sin(6 * STEPS[1:, None]))]), axis=0)
+    return OPTICAL @ turns, places @ OPTICAL
+
+
+def arkit(heading: float, roll: float = 0.0) -> Truth:
+    turns, places = by_hand(heading)
+    turns = turns @ about(2, roll)
+    times = np.arange(COUNT) / 60
+    ns = 105230574092166 + np.round(times * 1e9)
+    return Truth(turns, places, times, np.column_stack([ns, np.dstack([turns, places]).reshape(-1, 12)]))
+
+
+def kitti(first: int = 0) -> Truth:
+    turns, places = (part[first:] for part in by_car())
+    return Truth(turns, places, np.arange(len(turns)) / 10, np.dstack([turns @ OPTICAL, places]).reshape(-1, 12))
+
+
+def tum(heading: float, is_map: bool = False) -> Truth:
+    turns, places = by_hand(heading)
+    own = OPTICAL @ turns[0].T if is_map else Y_UP_FROM_Z_UP.T
+    turns, places = own @ turns, (places - is_map * places[0]) @ own.T
+    times = np.arange(COUNT) / 30 + 0.001 * np.sin(np.arange(COUNT) * 7)
+    quats = quat_from_matrix(turns @ OPTICAL)[:, [1, 2, 3, 0]]
+    return Truth(turns, places, times - times[0], np.column_stack([1305031098.5 + times, places, quats]))
+
+
+TRUTHS: dict[str, Truth] = {
+    "arkit": arkit(0.7),
+    "arkit upright": arkit(-1.9, np.pi / 2),
+    "kitti": kitti(),
+    "kitti later": kitti(10),
+    "tum": tum(0.5),
+    "tum there": tum(2.3),
+    "tum map": tum(1.1, is_map=True),
+}
+#: Columns of a place: which of them is which, no file tells.
+PLACES = {12: {3, 7, 11}, 13: {4, 8, 12}, 8: {1, 2, 3}}
+
+
+def variants(table: F64) -> Iterator[tuple[str, F64]]:
+    """Everything that happens to columns."""
+    rows, columns = table.shape
+    index, clock = np.arange(rows) + 0.0, np.arange(rows) / 10 + 3.25
+    yield "as it is", table
+    for name, extra in (("frame", index), ("frame from 700", index + 700), ("time", clock), ("ones", np.ones(rows))):
+        for at in (0, 1, columns):
+            yield f"{name} added at {at}", np.insert(table, at, extra, axis=1)
+    for at in range(columns):
+        yield f"{at} left out", np.delete(table, at, axis=1)
+        yield f"frame first, {at} left out", np.insert(np.delete(table, at, axis=1), 0, index, axis=1)
+        for other in range(at):
+            if not {at, other} <= PLACES[columns]:
+                swapped = table.copy()
+                swapped[:, [at, other]] = table[:, [other, at]]
+                yield f"{other} and {at} swapped", swapped
+    yield "last first", np.roll(table, 1, axis=1)
+    yield "first last", np.roll(table, -1, axis=1)
+    if columns == 8:
+        yield "scalar first", table[:, [0, 1, 2, 3, 7, 4, 5, 6]]
+        yield "quaternion first", table[:, [0, 4, 5, 6, 7, 1, 2, 3]]
+        yield "frames for times", np.column_stack([index, table[:, 1:]])
+    else:
+        first = table[:, : columns - 12]
+        matrices = table[:, columns - 12 :].reshape(-1, 3, 4)
+        yield "by columns", np.hstack([first, matrices.swapaxes(1, 2).reshape(-1, 12)])
+        yield "place last", np.hstack([first, matrices[:, :, :3].reshape(-1, 9), matrices[:, :, 3]])
+
+
+#: Of a map that begins without a turn: small turns about two axes of the camera, which may be either.
+UNKNOWABLE = {("tum map", "4 and 6 swapped")}
+EVERY = [(name, *each) for name, truth in TRUTHS.items() for each in variants(truth.table)]
+EVERY = [each for each in EVERY if each[:2] not in UNKNOWABLE]
+
+
+def seen_from_the_first(turns: F64, places: F64) -> F64:
+    """All poses in the axes of the first: the same in every world."""
+    return np.concatenate([(turns[0].T @ turns).ravel(), ((places - places[0]) @ turns[0]).ravel()])
+
+
+def is_right_or_refused(path: Path, name: str, what: str, table: F64) -> bool:
+    """Whether the camera in `table` was read; it must be that of the truth then, and refused in words otherwise."""
+    truth = TRUTHS[name]
+    path.write_text(lines_of(table))
+    try:
+        camera = load(path)
+    except BadInputError as error:
+        assert error.where.startswith(str(path)) and error.found and error.expected, what
+        return False
+    turns = matrix_from_quat(camera.quats) @ about(2, -camera.quarter * math.pi / 2)
+    assert len(turns) == len(truth.turns), what
+    assert seen_from_the_first(turns, camera.places) == pytest.approx(
+        seen_from_the_first(truth.turns, truth.places), abs=1e-3
+    ), what
+    assert camera.times_s == pytest.approx(truth.times_s, abs=2e-3), what
+    return True
+
+
+def test_60_tables_are_right_or_refused(tmp_path: Path) -> None:
+    chosen = np.random.default_rng(33).choice(len(EVERY), 60, replace=False)
+    for k in chosen:
+        is_right_or_refused(tmp_path / "a.txt", *EVERY[k])
+
+
+@pytest.mark.slow
+def test_all_tables_are_right_or_refused(tmp_path: Path) -> None:
+    read = [is_right_or_refused(tmp_path / "a.txt", *each) for each in EVERY]
+    assert len(read) > 600
+
+
+@pytest.mark.parametrize("name", TRUTHS)
+def test_tables_as_they_should_be_are_read(tmp_path: Path, name: str) -> None:
+    assert is_right_or_refused(tmp_path / "a.txt", name, "as it is", TRUTHS[name].table)
+
+
+@pytest.mark.parametrize("first", [0, 700])
+def test_kitti_with_the_numbers_of_frames(tmp_path: Path, first: int) -> None:
+    """Read as without them, 10 a second; a frame that is missing leaves a gap, and `rate_hz` and times.txt count."""
+    table = np.insert(TRUTHS["kitti"].table, 0, np.arange(COUNT) + first, axis=1)
+    path = tmp_path / "a.txt"
+    assert is_right_or_refused(path, "kitti", "numbered", table)
+    camera = load(path)
+    assert camera.detected.format == "KITTI poses"
+    assert camera.notes[-1] == "taken for KITTI poses: 13 columns: a frame's number and a 3x4 matrix"
+    path.write_text(lines_of(np.delete(table, [4, 5], axis=0)))
+    assert load(path, rate_hz=5).times_s[[3, 4, 5]] == pytest.approx([0.6, 1.2, 1.4])
+    (tmp_path / "times.txt").write_text(lines_of(np.arange(COUNT - 2)[:, None] * 0.25))
+    assert load(path).times_s[:5] == pytest.approx(np.arange(5) * 0.25)
+
+
+def test_what_may_be_two_formats_is_a_question_that_format_settles(tmp_path: Path) -> None:
+    """KITTI with a time in front, and ARKit without one: each is read right with what the sentence says."""
+    path = tmp_path / "a.txt"
+    for name, table, kind, times in (
+        ("kitti", np.insert(TRUTHS["kitti"].table, 0, np.arange(COUNT) / 4 + 0.5, axis=1), "kitti", 0.25),
+        ("arkit", TRUTHS["arkit"].table[:, 1:], "arkit", 1 / 30),
+    ):
+        path.write_text(lines_of(table))
+        with pytest.raises(BadInputError) as asked:
+            load(path)
+        assert all(f'"{each}"' in asked.value.remedy for each in ("kitti", "arkit"))
+        assert asked.value.remedy.startswith("set camera.format to ") and asked.value.exit_code == 2
+        camera, truth = load(path, format=kind), TRUTHS[name]
+        assert matrix_from_quat(camera.quats)[0].T @ matrix_from_quat(camera.quats)[-1] == pytest.approx(
+            truth.turns[0].T @ truth.turns[-1], abs=1e-6
+        )
+        assert camera.times_s == pytest.approx(np.arange(COUNT) * times)
+        assert load(path, format=kind, rate_hz=20).times_s[1] == pytest.approx(0.25 if kind == "kitti" else 0.05)
+
+
+def test_the_order_of_a_quaternion_is_a_question_that_names_both(tmp_path: Path) -> None:
+    truth = TRUTHS["tum"]
+    (tmp_path / "a.txt").write_text(lines_of(truth.table[:, [0, 1, 2, 3, 7, 4, 5, 6]]))
+    with pytest.raises(BadInputError, match=r'"tum" \(qx qy qz qw\) or "euroc" \(qw qx qy qz\)'):
+        load(tmp_path / "a.txt")
+    camera = load(tmp_path / "a.txt", format="euroc")
+    assert seen_from_the_first(matrix_from_quat(camera.quats), camera.places) == pytest.approx(
+        seen_from_the_first(truth.turns, truth.places), abs=1e-6
+    )
+
+
+def test_numbers_of_frames_are_no_seconds(tmp_path: Path) -> None:
+    """A TUM table of a program that counts frames: 30 a second, or what the scene says."""
+    (tmp_path / "a.txt").write_text(lines_of(np.column_stack([np.arange(COUNT), TRUTHS["tum"].table[:, 1:]])))
+    camera = load(tmp_path / "a.txt")
+    assert camera.times_s == pytest.approx(np.arange(COUNT) / 30)
+    assert camera.notes[0].startswith("TUM trajectory, 60 poses, 30 a second assumed, time in frames")
+    assert load(tmp_path / "a.txt", rate_hz=1).times_s == pytest.approx(np.arange(COUNT))
+
+
+def test_column_names_without_a_whole_pose_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("timestamp tx ty tz qx qy qz confidence\n0.5 0 0 0 0 0 0 1\n")
+    with pytest.raises(BadInputError, match=r"column names without qw, expected names of time, x, y, z, qw, qx"):
+        load(tmp_path / "a.txt")
+
+
+def test_a_table_has_comments_commas_and_blank_lines(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    path.write_text("# 9 9 9\n\n1, 2,3 # not 4\n  4 5\tnan\n")
+    table = read_table(path, 3, "three")
+    assert table.numbers == pytest.approx(np.array([[1, 2, 3], [4, 5, np.nan]]), nan_ok=True)
+    assert [table.place_of(index) for index in (0, 1)] == ["line 3", "line 4"]
+    assert layout_of(path, "three") == TableLayout(3, (), has_commas=True, is_ns=False)
+    path.write_text("# only this\n")
+    assert layout_of(path, "three").columns == 0
+    path.write_text("1 2 3\n# x\n1 2\n")
+    with pytest.raises(BadInputError) as raised:
+        read_table(path, 3, "three numbers")
+    assert str(raised.value) == f"{path}, line 3: found 2 columns, expected three numbers"
+    path.write_text("1 2 3\n1 2 x\n")
+    with pytest.raises(BadInputError) as raised:
+        read_table(path, 3, "three numbers")
+    assert str(raised.value) == f"{path}, line 2: found could not convert string to float: 'x', expected three numbers"
+
+
+def test_column_names_without_end_take_no_time(tmp_path: Path) -> None:
+    """Brackets that are never closed: a search that looks for the end of each would take minutes."""
+    (tmp_path / "a.txt").write_text("[" * 2_000_000 + "\n0 0 0 0 0 0 0 1\n")
+    assert layout_of(tmp_path / "a.txt", "a table").columns == 1
+
+
+def test_a_table_may_have_a_million_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pose_table, "MAX_ROWS", 2)
+    path = tmp_path / "a.txt"
+    path.write_text("1\n2\n")
+    assert len(read_table(path, 1, "one").numbers) == 2
+    for text, count in (("1\n2\n3\n", 3), ("# 1\n", 0)):
+        path.write_text(text)
+        with pytest.raises(BadInputError, match=f"found {count} poses, expected 1 to 2; one"):
+            read_table(path, 1, "one")
+
+
+def test_elapsed_times_by_hand() -> None:
+    times, step = elapsed(np.array([np.nan, 5.0, 6.0, 8.0, 8.5]))
+    assert times == pytest.approx([np.nan, 0, 1, 3, 3.5], nan_ok=True)
+    assert step == 1.0
+    times, step = elapsed(np.array([4.0, np.nan]))
+    assert (times[0], step) == (0.0, 0.0)
+    times, step = elapsed(np.array([4.0, 6.0]))
+    assert (times.tolist(), step) == ([0.0, 2.0], 2.0)
+
+
+def test_the_format_is_told_by_columns_or_given(tmp_path: Path) -> None:
+    tum, ark, other = "0 0 0 0 0 0 0 1\n", rows_of(about(1, 0.1)), "1 2 3 4\n"
+    for text, note in ((tum, "TUM trajectory, 1 poses"), (ark, "ARKit log, 1 poses")):
+        (tmp_path / "a.log").write_text(text)
+        assert load(tmp_path / "a.log").notes[0].startswith(note)
+    (tmp_path / "a.JSON").write_text(nerf_text(pose_z_up(0)))
+    assert load(tmp_path / "a.JSON").notes[0].startswith("NeRF")
+    (tmp_path / "a.txt").write_text(nerf_text(pose_z_up(0)))
+    assert load(tmp_path / "a.txt", format="nerf").notes[0].startswith("NeRF")
+    for text, kind, sentence in (
+        (other, "auto", "found 4 columns, expected 8 (TUM, EuRoC), 12 (KITTI) or 13 (ARKit), or column names"),
+        (
+            tum,
+            "arkit",
+            ", line 1: found 8 columns, expected an ARKit log: time and the 12 numbers of a 3x4 matrix a line",
+        ),
+        (ark, "tum", ", line 1: found 13 columns, expected a TUM trajectory: time, tx ty tz, qx qy qz qw a line"),
+        (tum, "nerf", "expected a NeRF transforms.json: `frames`, each with a 4x4 `transform_matrix`"),
+    ):
+        (tmp_path / "a.txt").write_text(text)
+        with pytest.raises(BadInputError) as raised:
+            load(tmp_path / "a.txt", format=kind)
+        assert f"{tmp_path}/a.txt" in str(raised.value) and str(raised.value).endswith(sentence)
+    with pytest.raises(BadInputError) as raised:
+        load("builtin:drone")
+    assert str(raised.value) == (
+        "camera: found 'builtin:drone', expected builtin:{orbit, static, closeup, far, top-to-floor, wayside} or a file"
+    )
+    with pytest.raises(BadInputError, match=r"; did you mean 'builtin:wayside'\?$"):
+        load("builtin:waside")
+    with pytest.raises(BadInputError) as raised:
+        load(tmp_path / "nowhere.txt")
+    assert str(raised.value) == (
+        f"{tmp_path}/nowhere.txt: found no such file, expected a camera: an ARKit log, a TUM, KITTI or EuRoC "
+        "trajectory, a transforms.json, odometry.csv of Stray Scanner, metadata.json of Record3D or a "
+        "folder of COLMAP"
+    )
+
+
+def test_a_relative_path_starts_at_the_base(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("0 0 0 0 0 0 0 1\n")
+    assert load_camera(CameraSpec(source="a.txt"), tmp_path).recorded

@@ -1,0 +1,497 @@
+"""Motion files: how each format is read and repaired, what is detected, refused and played."""
+
+from __future__ import annotations
+
+import math
+import pickle
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from trilane.errors import BadInputError
+from trilane.scene.camera.files import load_camera
+from trilane.scene.motion.builtin import walk_wave_turn
+from trilane.scene.motion.files import as_played, load_motion
+from trilane.scene.motion.motion import REST_PELVIS, SMPL_REST_PELVIS, T_POSE, Motion, Wrap, wrapped_time
+from trilane.scene.rotations import about, matrix_from_rotvec, rotvec_from_matrix
+from trilane.scene.schema import AvatarSpec, CameraSpec, scene_from
+from trilane.testing.joint_chain import chained_places, degrees_between, limb_directions
+
+HALF = np.pi / 2
+
+
+def load(path: Path | str, **spec: Any) -> Motion:
+    return load_motion(AvatarSpec(motion=str(path), **spec), Path("/"))
+
+
+def poses(frames: int = 4, up: str = "y") -> np.ndarray:
+    array = np.zeros((frames, 165))
+    array[:, 0] = HALF if up == "z" else 0.0
+    array[:, 48:51] = np.linspace(0, 0.3, frames)[:, None]
+    return array
+
+
+def save_npz(path: Path, **arrays: Any) -> Path:
+    np.savez(path, **arrays)
+    return path
+
+
+def amass(path: Path, width: int = 165, key: str = "mocap_frame_rate", **extra: Any) -> Path:
+    frames = 6
+    array = np.zeros((frames, width))
+    array[:, 0] = HALF
+    array[:, -3:] = 0.5
+    trans = np.column_stack([np.linspace(0, 1, frames), np.zeros(frames), np.full(frames, 0.9)])
+    return save_npz(path, **{"poses": array, "trans": trans, "betas": np.ones(16), key: np.array(60.0), **extra})
+
+
+def test_npy_has_an_assumed_rate_and_says_so(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", poses(31).astype(np.float32))
+    motion = load(tmp_path / "a.npy")
+    assert motion.poses.shape == (31, 55, 3)
+    assert motion.duration_s == pytest.approx(1.0)
+    assert "30 frames/s assumed" in " ".join(motion.notes)
+    assert not motion.travels
+
+
+def test_unlike_neighbours_are_separate_poses(tmp_path: Path) -> None:
+    array = poses(5)
+    array[:, 3:66] = np.random.default_rng(0).normal(0, 0.6, (5, 63))
+    np.save(tmp_path / "a.npy", array)
+    motion = load(tmp_path / "a.npy")
+    assert motion.duration_s == pytest.approx(4.0)
+    assert "separate poses" in " ".join(motion.notes)
+
+
+@pytest.mark.parametrize(("up", "stated", "note"), [
+    ("y", "auto", "Y up, as the body stands"),
+    ("z", "auto", "Z up, as the body stands"),
+    ("y", "z", "Z up, as given"),
+])  # fmt: skip
+def test_the_up_axis_is_the_bodys_own(tmp_path: Path, up: str, stated: str, note: str) -> None:
+    np.save(tmp_path / "a.npy", poses(up=up))
+    motion = load(tmp_path / "a.npy", up_axis=stated)
+    assert note in motion.notes
+    if stated == "auto":
+        assert matrix_from_rotvec(motion.poses[0, 0]) == pytest.approx(np.eye(3), abs=1e-12)
+
+
+def test_a_motion_faces_the_viewer_at_first_and_is_centred(tmp_path: Path) -> None:
+    path = amass(tmp_path / "a.npz")
+    motion = load(path)
+    assert matrix_from_rotvec(motion.poses[0, 0])[:, 2] == pytest.approx([0, 0, 1], abs=1e-12)
+    ground = motion.translation[:, [0, 2]]
+    assert ground.min(axis=0) + ground.max(axis=0) == pytest.approx([0, 0], abs=1e-12)
+    assert np.ptp(motion.translation[:, 1]) == pytest.approx(0, abs=1e-12)
+
+
+@pytest.mark.parametrize("key", ["mocap_framerate", "mocap_frame_rate"])
+@pytest.mark.parametrize("width", [156, 165])
+def test_amass_in_both_spellings_and_widths(tmp_path: Path, key: str, width: int) -> None:
+    motion = load(amass(tmp_path / "a.npz", width, key))
+    assert motion.times_s == pytest.approx(np.arange(6) / 60)
+    assert motion.poses[0, 54] == pytest.approx([0.5] * 3)
+    assert motion.poses[:, 22:25] == pytest.approx(0)
+    assert motion.betas is not None
+    notes = " ".join(motion.notes)
+    assert key in notes
+    assert f"{width} columns" in notes
+    assert "betas: 16" in notes
+    assert "Z up" in notes
+
+
+def test_broken_frames_are_interpolated_across_and_counted(tmp_path: Path) -> None:
+    array = np.zeros((7, 165))
+    array[:, 48] = np.linspace(0, 0.6, 7)
+    array[3, 100] = np.nan
+    np.save(tmp_path / "a.npy", array)
+    motion = load(tmp_path / "a.npy")
+    assert len(motion.times_s) == 6
+    assert motion.sample(3 / 30)[0][16, 0] == pytest.approx(0.3)
+    assert any("1 samples not finite" in note and "number 3" in note for note in motion.notes)
+    assert any("1 gaps, the longest 67 ms" in note for note in motion.notes)
+
+
+def test_one_frame_is_held(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", poses(1))
+    motion = load(tmp_path / "a.npy")
+    assert "one frame: held" in motion.notes
+    for t_s in (0.0, 0.5, 1e6):
+        assert np.isfinite(motion.sample(t_s)[0]).all()
+
+
+def test_a_recording_plays_back_and_forth(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", poses(31))
+    motion = load(tmp_path / "a.npy")
+    assert motion.wrap is Wrap.BOUNCE
+    for t_s in (0.2, 0.95):
+        assert motion.sample(2 - t_s)[0] == pytest.approx(motion.sample(t_s)[0])
+        assert motion.sample(2 + t_s)[0] == pytest.approx(motion.sample(t_s)[0])
+
+
+WRONG_NPY = {
+    "wide": (np.zeros((3, 71)), "shape (3, 71)"),
+    "no frames": (np.zeros((0, 165)), "shape (0, 165)"),
+    "text": (np.array([["x"] * 165]), "dtype <U1"),
+    "all NaN": (np.full((3, 165), np.nan), "3 samples that are not finite"),
+    "degrees": (np.full((3, 165), 90.0), "an angle of 90"),
+    "scalar": (np.zeros(()), "shape ()"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_NPY)
+def test_a_wrong_npy_is_refused(tmp_path: Path, case: str) -> None:
+    array, found = WRONG_NPY[case]
+    path = tmp_path / "a.npy"
+    np.save(path, array)
+    with pytest.raises(BadInputError) as raised:
+        load(path)
+    assert str(path) in str(raised.value)
+    assert found in str(raised.value)
+
+
+def test_objects_truncated_and_huge_files_are_refused_unread(tmp_path: Path) -> None:
+    pickled, cut, huge, empty = (tmp_path / f"{name}.npy" for name in ("pickled", "cut", "huge", "empty"))
+    np.save(pickled, np.array([{}]), allow_pickle=True)
+    np.save(cut, poses(100))
+    cut.write_bytes(cut.read_bytes()[:500])
+    with huge.open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (10**9, 165)})
+    empty.write_bytes(b"")
+    for path, found in (
+        (pickled, "found nothing, expected a motion"),
+        (cut, "truncated"),
+        (huge, "at most"),
+        (empty, "an empty file"),
+    ):
+        with pytest.raises(BadInputError, match=found):
+            load(path)
+
+
+def test_missing_folders_and_unknown_endings_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "folder.npy").mkdir()
+    (tmp_path / "a.fbx").write_text("x")
+    for name, found in (("none.npy", "no such file"), ("folder.npy", "a folder"), ("a.fbx", "the ending '.fbx'")):
+        with pytest.raises(BadInputError, match=found):
+            load(tmp_path / name)
+    with pytest.raises(BadInputError, match="walk-wave-turn"):
+        load("builtin:dance")
+
+
+WRONG_AMASS = {
+    "poses": ({"poses": np.zeros((6, 71))}, "shape (6, 71)"),
+    "trans": ({"trans": np.zeros((5, 3))}, "shape (5, 3)"),
+    "betas": ({"betas": np.full(16, np.nan)}, "not finite"),
+    "mocap_frame_rate": ({"mocap_frame_rate": np.array(0.0)}, "one rate from 1 to 1000"),
+}
+
+
+@pytest.mark.parametrize("key", WRONG_AMASS)
+def test_a_wrong_amass_file_is_named_by_key(tmp_path: Path, key: str) -> None:
+    changes, found = WRONG_AMASS[key]
+    path = amass(tmp_path / "a.npz", **changes)
+    with pytest.raises(BadInputError) as raised:
+        load(path)
+    assert f"{path}[{key}]" in str(raised.value)
+    assert found in str(raised.value)
+
+
+def test_an_npz_without_its_keys_or_damaged_is_refused(tmp_path: Path) -> None:
+    path = save_npz(tmp_path / "a.npz", poses=np.zeros((3, 165)))
+    with pytest.raises(BadInputError, match="no frame rate"):
+        load(path)
+    save_npz(path, trans=np.zeros((3, 3)))
+    with pytest.raises(BadInputError, match="found arrays trans, expected a motion: `poses`"):
+        load(path)
+    path.write_bytes(amass(tmp_path / "b.npz").read_bytes()[:900])
+    with pytest.raises(BadInputError, match=r"no readable \.npz"):
+        load(path)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("poses.npy", pickle.dumps({}))
+    with pytest.raises(BadInputError, match=r"no readable \.npz"):
+        load(path)
+
+
+@pytest.mark.parametrize("name", ["a.npy", "a.npz"])
+@given(st.lists(st.tuples(st.integers(0, 300), st.integers(0, 255)), min_size=1, max_size=6))
+@settings(max_examples=60)
+def test_damaged_arrays_are_read_or_refused(
+    tmp_path_factory: pytest.TempPathFactory, name: str, changes: list[tuple[int, int]]
+) -> None:
+    path = tmp_path_factory.mktemp("damaged") / name
+    if name == "a.npy":
+        np.save(path, poses())
+    else:
+        amass(path)
+    content = bytearray(path.read_bytes())
+    for place, value in changes:
+        content[place] = value
+    path.write_bytes(content)
+    try:
+        load(path)
+    except BadInputError as error:
+        assert name in str(error)
+
+
+def test_real_smplx_poses_stand_up(shared_data: Path) -> None:
+    motion = load(shared_data / "motion" / "smplx_poses_8.npy")
+    assert "Z up, as the body stands" in motion.notes
+    assert (matrix_from_rotvec(motion.poses[:, 0])[:, 1, 1] > 0.8).all()
+
+
+RATE, FRAMES = 30, 90
+
+
+def turned(turn: np.ndarray, poses: np.ndarray, pelvis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A motion in a world that is turned."""
+    roots = rotvec_from_matrix(turn @ matrix_from_rotvec(poses[:, 0]))
+    return np.concatenate([roots[:, None], poses[:, 1:]], axis=1), pelvis @ turn.T
+
+
+def walk() -> tuple[np.ndarray, np.ndarray]:
+    """Poses and places of the pelvis of three seconds in which one walks and waves, at first towards +Z."""
+    motion, frames = walk_wave_turn(), slice(100, 100 + 2 * FRAMES, 2)
+    ahead = matrix_from_rotvec(motion.poses[100, 0])[:, 2]
+    level = about(1, -np.arctan2(ahead[0], ahead[2]))
+    return turned(level, motion.poses[frames], motion.translation[frames] + np.array([0, 0.94, 0]))
+
+
+POSES, PELVIS = walk()
+Z_UP, CAMERA = turned(about(0, np.pi / 2), POSES, PELVIS), turned(about(0, np.pi), POSES, PELVIS)
+
+
+def smpl(poses: np.ndarray) -> np.ndarray:
+    """The 72 columns of SMPL, whose hands do not turn."""
+    return np.concatenate([poses[:, :22], np.zeros((len(poses), 2, 3))], axis=1).reshape(len(poses), 72)
+
+
+def as_smplh(poses: np.ndarray) -> np.ndarray:
+    return np.delete(poses, [22, 23, 24], axis=1).reshape(len(poses), 156)
+
+
+def parts(poses: np.ndarray, *names: str) -> dict[str, np.ndarray]:
+    """Columns of SMPL-X under the names of pelvis, body, jaw, eyes and hands."""
+    rows = poses.reshape(len(poses), 165)
+    ends = dict(zip(names, (0, 3, 66, 69, 75), strict=True))
+    stops = (*list(ends.values())[1:], 165)
+    return {name: rows[:, start:stop] for (name, start), stop in zip(ends.items(), stops, strict=True)}
+
+
+def romp() -> dict[str, Any]:
+    poses, places = CAMERA[0], CAMERA[1] + np.array([0.2, 1.0, 5.0])
+    rows = smpl(poses)
+    frames = {
+        f"{k:08d}.jpg": {
+            "smpl_thetas": rows[k : k + 1], "cam_trans": places[k : k + 1] - SMPL_REST_PELVIS,
+            "track_ids": np.array([3]),
+        }
+        for k in range(FRAMES)
+    }  # fmt: skip
+    return {"results": np.array(frames, dtype=object)}
+
+
+def glamr() -> dict[str, Any]:
+    person = {
+        "smpl_pose": smpl(Z_UP[0])[:, 3:], "smpl_orient_world": Z_UP[0][:, 0], "root_trans_world": Z_UP[1],
+        "smpl_beta": np.zeros((FRAMES, 10)), "exist_frames": np.ones(FRAMES, dtype=bool),
+    }  # fmt: skip
+    return {"person_data": {0: person}, "seq_len": FRAMES}
+
+
+IN_PARTS = ("root_orient", "pose_body", "pose_jaw", "pose_eye", "pose_hand")
+#: File -> what is in it.
+FILES: dict[str, Callable[[], Any]] = {
+    "smpl-66.npy": lambda: POSES[:, :22].reshape(FRAMES, 66),
+    "smpl-72.npy": lambda: smpl(POSES),
+    "smplh.npy": lambda: as_smplh(POSES),
+    "camera.npy": lambda: smpl(CAMERA[0]),
+    "places.npy": lambda: chained_places(POSES, PELVIS, T_POSE),
+    "amass-66.npz": lambda: {"poses": Z_UP[0][:, :22].reshape(FRAMES, 66), "trans": Z_UP[1] - REST_PELVIS,
+                             "mocap_framerate": RATE},
+    "amass-72.npz": lambda: {"poses": smpl(Z_UP[0]), "trans": Z_UP[1] - REST_PELVIS, "mocap_frame_rate": RATE},
+    "amass-parts.npz": lambda: {**parts(Z_UP[0], *IN_PARTS), "trans": Z_UP[1] - REST_PELVIS, "mocap_frame_rate": RATE},
+    "smplx.npz": lambda: {"global_orient": POSES[:, 0], "body_pose": POSES[:, 1:22].reshape(FRAMES, 63),
+                          "transl": PELVIS - REST_PELVIS},
+    "aist.pkl": lambda: {"smpl_poses": smpl(POSES), "smpl_trans": 93 * (PELVIS - SMPL_REST_PELVIS),
+                         "smpl_scaling": np.array([93.0]), "fps": RATE},
+    "glamr.pkl": glamr,
+    "romp.npz": romp,
+}  # fmt: skip
+
+
+def written(folder: Path, name: str) -> Path:
+    path, values = folder / name, FILES[name]()
+    if path.suffix == ".npz":
+        np.savez(path, **values)
+    elif path.suffix == ".npy":
+        np.save(path, values)
+    else:
+        path.write_bytes(pickle.dumps(values, 2))
+    return path
+
+
+def of_walk(motion: Motion) -> np.ndarray:
+    """Places of the joints at the frames of the file, whatever rate it was taken to have."""
+    return chained_places(*motion.sample_all(np.linspace(0, motion.duration_s, FRAMES)), T_POSE)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_walk_is_one_body_in_every_format(name: str, tmp_path: Path) -> None:
+    """Turned to face +Z in its first frame and moved to the middle of its ground, as every recording is."""
+    motion = load_motion(AvatarSpec(motion=str(written(tmp_path, name))), Path("/"))
+    places = of_walk(motion)
+    wanted = limb_directions(chained_places(POSES, PELVIS, T_POSE))
+    for limb, direction in limb_directions(places).items():
+        assert degrees_between(direction, wanted[limb]).max() < 0.1, limb
+    if name.endswith(".npy") and name != "places.npy":
+        assert not motion.travels
+    else:
+        path = PELVIS - (PELVIS.min(axis=0) + PELVIS.max(axis=0)) / 2
+        assert places[:, 0, [0, 2]] == pytest.approx(path[:, [0, 2]], abs=1e-3)
+        assert np.ptp(places[:, 0, 1]) == pytest.approx(np.ptp(PELVIS[:, 1]), abs=1e-3)
+
+
+def walking() -> Motion:
+    """Five frames a second apart; at t the body is at x = t, turned by t / 10 rad about Y, its elbow bent by t / 4."""
+    times = np.arange(5.0)
+    poses = np.zeros((5, 55, 3))
+    poses[:, 0, 1], poses[:, 18, 0] = times / 10, times / 4
+    places = np.stack([times, np.ones(5), np.zeros(5)], axis=1)
+    return Motion(times, poses, places, None, ("a walk",), Wrap.BOUNCE)
+
+
+def played(**keys: Any) -> Motion:
+    return as_played(walking(), AvatarSpec(**keys), "here")
+
+
+def test_nothing_said_changes_nothing() -> None:
+    motion = played()
+    assert motion.times_s.tolist() == [0, 1, 2, 3, 4] and motion.wrap is Wrap.BOUNCE
+    assert motion.translation == pytest.approx(walking().translation)
+    assert motion.notes == ("a walk", "4.00 s, then plays back and forth")
+
+
+def test_a_part_begins_and_ends_between_frames() -> None:
+    """From 0.5 to 2.25 s: frames at 1 and 2 s are inside; the ends are interpolated."""
+    motion = played(start_s=0.5, end_s=2.25)
+    assert motion.times_s == pytest.approx([0, 0.5, 1.5, 1.75])
+    assert motion.poses[:, 18, 0] == pytest.approx(np.array([0.5, 1, 2, 2.25]) / 4)
+    assert motion.notes[1:] == ("plays from 0.5 s to 2.25 s of 4.00 s", "1.75 s, then plays back and forth")
+
+
+def test_a_part_faces_ahead_at_first_and_is_in_the_middle_of_its_ground() -> None:
+    """It begins turned by 0.2 rad at x = 2; the turn is undone, and the two metres that are left lie along it."""
+    motion = played(start_s=2)
+    assert motion.poses[:, 0, 1] == pytest.approx([0, 0.1, 0.2])
+    ahead = np.array([math.cos(0.2), 0, math.sin(0.2)])  # x, turned by -0.2 rad about Y
+    expected = np.outer([-1, 0, 1], ahead) + np.array([0, 1, 0])
+    assert motion.translation == pytest.approx(expected)
+
+
+def test_frames_at_the_ends_of_a_part_are_taken_once() -> None:
+    motion = played(start_s=1, end_s=3)
+    assert motion.times_s.tolist() == [0, 1, 2]
+    assert motion.poses[:, 18, 0] == pytest.approx([0.25, 0.5, 0.75])
+
+
+def test_the_end_of_a_loop_is_its_last_frame() -> None:
+    looping = as_played(walking(), AvatarSpec(loop="repeat", end_s=4.0), "here")
+    assert looping.poses[-1, 18, 0] == pytest.approx(1.0)
+
+
+def test_speed_is_of_what_is_played() -> None:
+    motion = played(start_s=1, end_s=3, speed=4)
+    assert motion.times_s == pytest.approx([0, 0.25, 0.5])
+    assert motion.notes[1] == "plays from 1 s to 3 s of 4.00 s, at 4 times its speed"
+    assert motion.sample(0.25)[0][18, 0] == pytest.approx(0.5)
+    assert played(speed=0.5).duration_s == 8
+
+
+@pytest.mark.parametrize(("loop", "wrap", "note", "at_five"), [
+    ("repeat", Wrap.LOOP, "4.00 s, then loops: the first frame is 4.00 m from the last", 0.25),
+    ("back-and-forth", Wrap.BOUNCE, "4.00 s, then plays back and forth", 0.75),
+    ("hold", Wrap.HOLD, "4.00 s, then holds its last frame", 1.0),
+])  # fmt: skip
+def test_what_follows_the_last_frame(loop: str, wrap: Wrap, note: str, at_five: float) -> None:
+    motion = played(loop=loop)
+    assert (motion.wrap, motion.notes[-1]) == (wrap, note)
+    assert motion.sample(5.0)[0][18, 0] == pytest.approx(at_five)
+
+
+def test_a_held_motion_stays_at_its_ends() -> None:
+    assert [wrapped_time(t_s, 4.0, Wrap.HOLD) for t_s in (-1.0, 0.0, 3.0, 4.0, 1e6)] == [0, 0, 3, 4, 4]
+
+
+@pytest.mark.parametrize(("keys", "sentence"), [
+    ({"end_s": 4.5}, "here: end_s: found 4.5, expected at most the motion's length, 4 s"),
+    ({"start_s": 4.0}, "here: start_s: found 4, expected less than the motion's length, 4 s"),
+    ({"start_s": 9.0}, "here: start_s: found 9, expected less than the motion's length, 4 s"),
+])  # fmt: skip
+def test_times_beyond_the_motion_are_refused(keys: dict[str, float], sentence: str) -> None:
+    with pytest.raises(BadInputError) as raised:
+        played(**keys)
+    assert str(raised.value) == sentence
+
+
+def test_a_start_after_the_end_is_refused_by_the_scene() -> None:
+    with pytest.raises(BadInputError, match=r"avatars.0: found start_s 3 and end_s 2, expected start_s below end_s"):
+        scene_from("a.toml", {"avatars": [{"start_s": 3.0, "end_s": 2.0}]})
+    with pytest.raises(BadInputError, match=r"joint_map: found the joint 'left_hipp'.*did you mean 'left_hip'"):
+        scene_from("a.toml", {"avatars": [{"joint_map": {"left_hipp": "a"}}]})
+
+
+def test_built_in_motions_are_played_alike_and_have_no_names() -> None:
+    motion = load_motion(AvatarSpec(motion="builtin:walk-wave-turn", start_s=2.5, end_s=5.0, loop="hold"), Path("/"))
+    assert (motion.duration_s, motion.wrap) == (2.5, Wrap.HOLD)
+    assert motion.notes == (
+        "built in: walks, waves and turns, 60 frames/s",
+        "plays from 2.5 s to 5 s of 10.00 s",
+        "2.50 s, then holds its last frame",
+    )
+    with pytest.raises(BadInputError, match=r"builtin:idle: found joint_map, expected none: only joints of \.bvh"):
+        load_motion(AvatarSpec(motion="builtin:idle", joint_map={"head": "Head"}), Path("/"))
+
+
+def test_of_a_real_bvh(shared_data: Path) -> None:
+    """Every joint of the file is named once: with its partner, or without one."""
+    path = shared_data / "motion" / "cmu_jumping_jacks.bvh"
+    found = load_motion(AvatarSpec(motion=str(path)), Path()).detected
+    assert (found.format, found.rate, found.axes) == ("BVH", "by `Frame Time`", "Y up, as the body stands")
+    assert found.reason.endswith("of MotionBuilder")
+    assert found.unit.startswith("cmu")
+    assert found.joints["left_knee"] == "LeftKnee"
+    assert {"LHipJoint", "RHipJoint"} <= set(found.unmapped)
+    named = [line.split()[1] for line in path.read_text().splitlines() if line.split()[:1] in (["JOINT"], ["ROOT"])]
+    assert sorted((*found.joints.values(), *found.unmapped)) == sorted(named)
+
+
+def test_of_real_poses_without_a_rate(shared_data: Path) -> None:
+    path = shared_data / "motion" / "smplx_poses_8.npy"
+    found = load_motion(AvatarSpec(motion=str(path)), Path()).detected
+    assert found.format == "SMPL-X poses (.npy)"
+    assert found.reason == "an array of shape (8, 165)"
+    assert "taken for separate poses" in found.rate
+
+
+def test_of_real_cameras(shared_data: Path) -> None:
+    formats = {
+        "arkit_camera_pose.txt": ("ARKit log", "13 columns"),
+        "tum_freiburg1_xyz.txt": ("TUM trajectory", "column names"),
+    }
+    for name, (format_, reason) in formats.items():
+        found = load_camera(CameraSpec(source=str(shared_data / "camera" / name)), Path()).detected
+        assert found.format == format_
+        assert found.reason.startswith(reason)
+        assert found.rate.startswith("by the times of the file")
+        assert found.axes and found.lens.startswith("field of view")
+
+
+def test_what_is_built_in_has_no_file() -> None:
+    assert not load_motion(AvatarSpec(motion="builtin:idle"), Path()).detected.format
+    assert not load_camera(CameraSpec(source="builtin:orbit"), Path()).detected.format

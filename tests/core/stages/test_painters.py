@@ -1,0 +1,312 @@
+"""The GPU unit without a driver: mesh order, seams, shadows, room, planes, camera matrices, driver errors."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from trilane.body.joints import JOINT_INDEX, JOINTS
+from trilane.errors import BadInputError, MissingPartError, TrilaneError, UnitLostError
+from trilane.scene.schema import PlaneSpec
+from trilane.stages.gpu import opengl
+from trilane.stages.gpu.builtin_room import Extent, floor_texture, room_mesh, room_textures, wall_texture
+from trilane.stages.gpu.composite_painters import DISCS, floor_discs, half_sides
+from trilane.stages.gpu.opengl import eye_of, target_clip
+from trilane.stages.gpu.skinned_mesh import is_closed, mesh_arrays, patch_order, split_corners
+
+TETRAHEDRON = np.array([(0.0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)])
+OUTWARD = np.array([(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)])
+
+
+def test_seams_split_vertices_and_nothing_else() -> None:
+    """Each corner keeps its vertex and its UV; corners that share both share a row."""
+    faces, uv_faces = np.array([(0, 1, 2), (2, 1, 3)]), np.array([(0, 1, 2), (4, 1, 3)])
+    vertex, uv, triangles = split_corners(faces, uv_faces)
+    assert np.array_equal(vertex[triangles], faces)
+    assert np.array_equal(uv[triangles], uv_faces)
+    assert len(vertex) == 5
+    assert list(triangles.ravel()[:3]) == [0, 1, 2]
+
+
+@given(count=st.integers(0, 300), patch=st.integers(1, 50))
+def test_patch_order_is_a_permutation(count: int, patch: int) -> None:
+    """No triangle is lost or drawn twice."""
+    centres = np.random.default_rng(count).normal(size=(count, 3))
+    assert sorted(patch_order(centres, patch)) == list(range(count))
+
+
+def test_closed_meshes_wind_outward() -> None:
+    """Turned inside out, opened, or with a face twice, it is not closed."""
+    assert is_closed(TETRAHEDRON, OUTWARD)
+    assert not is_closed(TETRAHEDRON, OUTWARD[:, ::-1])
+    assert not is_closed(TETRAHEDRON, OUTWARD[:3])
+    assert not is_closed(TETRAHEDRON, np.concatenate([OUTWARD, OUTWARD[:1]]))
+
+
+BAD_MESHES = {
+    "no faces": {"faces": np.empty((0, 3), int), "uv_faces": np.empty((0, 3), int)},
+    "vertex index": {"faces": OUTWARD + 1},
+    "negative index": {"faces": OUTWARD - 1},
+    "uv index": {"uv_faces": OUTWARD + 1},
+    "NaN": {"vertices": TETRAHEDRON * np.nan},
+    "three weights": {"joint": np.zeros((4, 3), int), "weight": np.ones((4, 3)) / 3},
+    "joint index": {"joint": np.full((4, 4), JOINTS)},
+}
+
+
+@pytest.mark.parametrize("name", BAD_MESHES)
+def test_meshes_that_cannot_be_drawn_are_refused(name: str) -> None:
+    """One BadInputError that names the array."""
+    good: dict[str, Any] = {
+        "vertices": TETRAHEDRON,
+        "faces": OUTWARD,
+        "uv": np.zeros((4, 2)),
+        "uv_faces": OUTWARD,
+        "joint": np.zeros((4, 4), int),
+        "weight": np.full((4, 4), 0.25),
+    }
+    mesh_arrays(**good)
+    with pytest.raises(BadInputError, match="mesh "):
+        mesh_arrays(**(good | BAD_MESHES[name]))
+
+
+def test_discs_fade_with_height() -> None:
+    """On the floor every part casts its shadow; two metres up, none of the feet do."""
+    joints = np.tile(np.eye(4)[:3], (JOINTS, 1, 1))
+    rest = np.zeros((JOINTS, 3))
+    on_floor = floor_discs(joints, rest)
+    assert on_floor.shape == (len(DISCS), 4)
+    joints[:, 1, 3] = 2.0
+    assert len(floor_discs(joints, rest)) < 4
+    joints[:, :, 3] = (3.0, 0.0, -1.0)
+    assert np.allclose(floor_discs(joints, rest)[:, :2], (3.0, -1.0))
+
+
+@given(st.tuples(*[st.floats(-50, 50)] * 3))
+def test_room_holds_every_camera(eye: tuple[float, float, float]) -> None:
+    """It grows, never shrinks, and its floor stays at 0."""
+    room = Extent().holding(np.array(eye))
+    assert all(low <= at - 0.5 for low, at in zip(room.low[::2], eye[::2], strict=True))
+    assert all(high >= at + 0.5 for high, at in zip(room.high, eye, strict=True))
+    assert room.low[1] == 0.0
+    assert room.holding(np.array(eye)) is room
+    assert room.holding(np.zeros(3)) is room
+
+
+def test_room_faces_inward() -> None:
+    """Every triangle winds counter-clockwise for an eye inside."""
+    mesh = room_mesh(Extent())
+    for triangles in (mesh.floor, mesh.rest):
+        corners = mesh.vertices[triangles, :3].astype(float)
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        assert (np.einsum("fi,fi->f", normal, np.array([0, 1.5, 0]) - corners[:, 0]) > 0).all()
+
+
+def test_textures_repeat_without_a_seam() -> None:
+    """Across the border neighbours differ no more than inside, where they may repeat."""
+    for texture, axes in ((floor_texture(), (0, 1)), (wall_texture(), (1,))):
+        for axis in axes:
+            rows = np.moveaxis(texture.astype(int), axis, 0)
+            inside = np.abs(np.diff(rows, axis=0)).mean(axis=(1, 2))
+            assert np.abs(rows[0] - rows[-1]).mean() <= inside.max() + 1
+
+
+def test_missing_driver_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The message holds the line that installs it."""
+
+    def refuse(**_: Any) -> None:
+        raise Exception("libEGL.so.1: cannot open shared object file")
+
+    monkeypatch.setattr(opengl.moderngl, "create_context", refuse)
+    with pytest.raises(MissingPartError, match="apt-get install libegl1 libgl1-mesa-dri"):
+        opengl.open_context()
+
+
+@pytest.mark.parametrize(
+    ("current", "error", "kind"),
+    [
+        (True, "GL_CONTEXT_LOST", UnitLostError),
+        (False, "GL_NO_ERROR", UnitLostError),
+        (True, "GL_OUT_OF_MEMORY", TrilaneError),
+    ],
+)
+def test_what_a_driver_reports_is_an_error(
+    monkeypatch: pytest.MonkeyPatch, current: bool, error: str, kind: type[TrilaneError]
+) -> None:
+    """A lost context is one that a new process mends; without a current one the driver reports nothing."""
+    monkeypatch.setattr(opengl, "current", lambda: current)
+    with pytest.raises(kind, match="OpenGL") as caught:
+        opengl.check(SimpleNamespace(error=error))
+    assert type(caught.value) is kind
+
+
+def test_a_frame_that_went_well_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(opengl, "current", lambda: True)
+    opengl.check(SimpleNamespace(error="GL_NO_ERROR"))
+
+
+def test_the_targets_first_row_is_the_top_one() -> None:
+    """The product of both matrices with its second row negated, column by column."""
+    view, projection = np.random.default_rng(0).normal(size=(2, 4, 4))
+    product = projection @ view
+    found = np.frombuffer(target_clip(view, projection), np.float32).reshape(4, 4).T
+    np.testing.assert_allclose(found, [product[0], -product[1], product[2], product[3]], rtol=1e-6)
+
+
+def test_the_eye_is_where_the_view_puts_the_origin() -> None:
+    turn = np.array([[0.0, 0, -1], [0.6, 0.8, 0], [0.8, -0.6, 0]])
+    view = np.eye(4)
+    view[:3, :3], view[:3, 3] = turn, (1.0, 2.0, 3.0)
+    np.testing.assert_allclose(view @ [*eye_of(view), 1], [0, 0, 0, 1], atol=1e-12)
+
+
+def test_a_room_grows_to_sixty_centimetres_beyond_the_camera() -> None:
+    grown = Extent().holding(np.array([3.6, 2.9, -7.0]))
+    assert (grown.low, grown.high) == ((-4.0, 0.0, -7.6), (4.2, 3.5, 4.0))
+    assert grown.holding(np.array([-9.0, -5.0, 0.0])).low == (-9.6, 0.0, -7.6)
+    assert Extent().holding(np.array([3.4, 2.4, -3.4])) == Extent()
+
+
+def test_the_rooms_vertices_have_place_uv_and_light_of_their_side() -> None:
+    """Every side on its own: a grid of seven by seven, finer in the corners, and the formulas of its light."""
+    extent = Extent(low=(-5.0, 0.0, -4.0), high=(4.0, 3.5, 6.0))
+    low, high = np.array(extent.low), np.array(extent.high)
+    mesh = room_mesh(extent)
+    vertices = mesh.vertices.astype(float).reshape(6, 49, 8)
+    shares = [0, 0.04, 0.12, 0.5, 0.88, 0.96, 1]
+    for vertex, (axis, end) in zip(vertices, [(1, 0), (1, 1), (0, 0), (0, 1), (2, 0), (2, 1)], strict=True):
+        place = vertex[:, :3]
+        np.testing.assert_allclose(place[:, axis], (low, high)[end][axis], rtol=1e-6)
+        others = [k for k in range(3) if k != axis]
+        expected = {
+            tuple(np.round([low[k] + s * (high - low)[k] for k, s in zip(others, pair, strict=True)], 4))
+            for pair in ((a, b) for a in shares for b in shares)
+        }
+        assert {tuple(row) for row in np.round(place[:, others], 4)} == expected
+        if (axis, end) == (1, 0):
+            np.testing.assert_allclose(vertex[:, 3:5], place[:, [0, 2]] / 2.4, atol=1e-5)
+        elif axis == 1:
+            np.testing.assert_allclose(vertex[:, 3:5], [(0.3, 0.7)] * 49, rtol=1e-6)
+        else:
+            along = place[:, 2] if axis == 0 else place[:, 0]
+            np.testing.assert_allclose(vertex[:, 3:5], np.c_[along / 2.0, place[:, 1] / 4.0], atol=1e-5)
+        for row in vertex:
+            dim = 1.0
+            for k in others:
+                dim *= (1 - 0.26 * np.exp(-(row[k] - low[k]) / 0.45)) * (1 - 0.26 * np.exp(-(high[k] - row[k]) / 0.45))
+            window = (high[0] - row[0]) / (high[0] - low[0]) / 2 + (row[2] - low[2]) / (high[2] - low[2]) / 2
+            strength = dim * (0.86 + 0.2 * window) * (0.97 if axis == 1 else 1)
+            colour = np.array([1 - 0.02 * window, 0.985, 0.955 + 0.035 * window])
+            np.testing.assert_allclose(row[5:], strength * colour, rtol=1e-5)
+    assert mesh.floor.max() == 48 and mesh.floor.shape == (72, 3) and mesh.rest.shape == (360, 3)
+    assert sorted(np.unique(mesh.rest).tolist()) == list(range(49, 294))
+    for triangles in (mesh.floor, mesh.rest):
+        corners = mesh.vertices[triangles, :3].astype(float)
+        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+        sides = (high - low) @ np.diag([1, 1, 1])
+        walls = 2 * (sides[0] + sides[2]) * sides[1] + sides[0] * sides[2]
+        assert area.sum() == pytest.approx(sides[0] * sides[2] if triangles is mesh.floor else walls, rel=1e-5)
+
+
+def test_the_floor_is_of_sixteen_planks_with_dark_seams() -> None:
+    """Each plank has the tone of its draw; the seam between two is 0.58 as bright, and 0.81 a pixel beside it."""
+    floor = floor_texture()
+    assert floor.shape == (1024, 1024, 4) and (floor[..., 3] == 255).all()
+    assert np.array_equal(room_textures()[0], floor)
+    pixels = floor[..., :3].astype(float)
+    columns = pixels.mean(axis=(0, 2)).reshape(16, 64).mean(axis=0)
+    inner = columns[4:60].mean()
+    np.testing.assert_allclose(columns[[0, 1, 63]] / inner, [0.58, 1 - 0.42 * 0.4583, 1 - 0.42 * 0.4583], atol=0.02)
+    np.testing.assert_allclose(columns[2:63] / inner, 1, atol=0.02)
+    random = np.random.default_rng(7)
+    start, tones = random.random(16), np.clip(random.normal(0, 0.05, (16, 2)), -0.09, 0.09)
+    for plank in range(16):
+        along = np.arange(1024) / 512 + start[plank]
+        for length in range(2):
+            rows = (along.astype(int) % 2 == length) & (np.abs(along % 1 - 0.5) < 0.49)
+            tone = tones[plank, length]
+            found = pixels[rows, 64 * plank + 4 : 64 * plank + 60].mean(axis=(0, 1))
+            wanted = (1 + tone) * (np.array([176, 134, 96]) + np.array([7, 2, -3]) * tone / 0.05)
+            np.testing.assert_allclose(found, wanted, rtol=0.02)  # the grain's mean over 56 columns, four deviations
+        ends = np.abs(along % 1 - 0.5) * 2 > 0.998
+        assert pixels[ends, 64 * plank + 4 : 64 * plank + 60].mean() < 0.7 * inner
+    assert 0.03 < (pixels[:, 4:60].std(axis=0) / inner).mean() < 0.08
+
+
+def test_the_wall_is_paint_above_a_board() -> None:
+    """Rows by their height, each the mean of its columns: the noise of the paint is 0.7 %."""
+    wall = wall_texture()
+    assert wall.shape == (1024, 256, 4) and (wall[..., 3] == 255).all()
+    assert np.array_equal(room_textures()[1], wall)
+    height = (np.arange(1024) + 0.5) / 256
+    found = wall[..., :3].astype(float).mean(axis=1)
+    for row, at in enumerate(height):
+        if at < 0.11:
+            rising = (at - (0.11 - 0.012)) / 0.012
+            expected = np.array([243, 241, 236]) * (1 - 0.25 * min(max(rising, 0), 1)) * (0.6 if at < 0.012 else 1)
+            np.testing.assert_allclose(found[row], expected, atol=0.5)
+        else:
+            expected = np.array([218, 213, 201]) * (1 - 0.12 * np.exp(-(at - 0.11) / 0.02))
+            np.testing.assert_allclose(found[row], expected, rtol=0.01)
+    paint = wall[200:, :, :3].astype(float)
+    assert 0.006 < (paint / paint.mean(axis=(0, 1))).std() < 0.008
+    assert not np.array_equal(paint[0], paint[12])
+
+
+#: Radius on the floor, strength there, height over which it fades to 1/e.
+SHADOWS = {
+    "ankle": (0.15, 0.65, 0.18),
+    "foot": (0.16, 0.70, 0.15),
+    "knee": (0.22, 0.45, 0.30),
+    "pelvis": (0.50, 0.60, 1.20),
+    "spine3": (0.45, 0.45, 0.60),
+    "head": (0.30, 0.45, 0.30),
+    "wrist": (0.16, 0.45, 0.15),
+}
+
+
+@pytest.mark.parametrize("height", [-0.3, 0.0, 0.2, 0.45])
+def test_a_disc_widens_and_fades_with_its_joints_height(height: float) -> None:
+    """Joint k is moved to (k / 10, height, k); discs fainter than 0.02 are left out."""
+    random = np.random.default_rng(0)
+    rest = random.normal(size=(JOINTS, 3))
+    joints = random.normal(size=(JOINTS, 3, 4))
+    place = np.stack([np.arange(JOINTS) / 10, np.full(JOINTS, height), np.arange(JOINTS)], axis=1)
+    joints[:, :, 3] = place - np.einsum("nij,nj->ni", joints[:, :, :3], rest)
+    found = {round(float(row[1])): row for row in floor_discs(joints, rest)}
+    above = max(height, 0)
+    expected = {}
+    for name, index in JOINT_INDEX.items():
+        part = SHADOWS.get(name.removeprefix("left_").removeprefix("right_"))
+        if part is not None and name not in ("jaw",):
+            radius, strength, fade = part
+            shown = strength * np.exp(-above / fade)
+            if shown > 0.02:
+                expected[index] = (index / 10, index, radius + 0.35 * above, shown)
+    assert set(found) == set(expected)
+    for index, row in expected.items():
+        np.testing.assert_allclose(found[index], row, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("normal", "turn", "across", "along"),
+    [
+        ((0, 2, 0), 0, (1, 0, 0), (0, 0, -1)),
+        ((0, 1, 0), 90, (0, 0, -1), (-1, 0, 0)),
+        ((0, -1, 0), 0, (1, 0, 0), (0, 0, 1)),
+        ((0, 0, 3), 0, (0, 1, 0), (-1, 0, 0)),
+        ((0, 0, 1), 30, (-0.5, 3**0.5 / 2, 0), (-(3**0.5) / 2, -0.5, 0)),
+        ((1, 0, 0), 0, (0, 1, 0), (0, 0, 1)),
+        ((0.6, 0.8, 0), 0, (-0.8, 0.6, 0), (0, 0, 1)),
+        ((0, 0.96, 0.28), 0, (1, 0, 0), (0, 0.28, -0.96)),
+    ],
+)
+def test_a_planes_sides_point_as_the_normal_and_its_turn_say(normal: Any, turn: float, across: Any, along: Any) -> None:
+    found = half_sides(PlaneSpec(normal=normal, width_m=3, depth_m=1, turn_deg=turn))
+    np.testing.assert_allclose(found[0], 1.5 * np.array(across), atol=1e-6)
+    np.testing.assert_allclose(found[1], 0.5 * np.array(along), atol=1e-6)

@@ -1,0 +1,372 @@
+"""The pose stage: a frame's number to a packet that says everything, and what other stages make of a frame's work."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from trilane.body.kinematics import Skeleton
+from trilane.errors import BadInputError, TrilaneError
+from trilane.pipeline.bound_stage import BoundStage
+from trilane.pipeline.description import UnitSettings
+from trilane.pipeline.stage import Skip, UnitContext
+from trilane.scene.crop import Rect
+from trilane.scene.planner import FrameWork, shown_by, work_of
+from trilane.scene.schema import AvatarSpec, CameraSpec, OutputSpec, Scene
+from trilane.scene.tensor_layout import MARGIN_PX, lay_out
+from trilane.shapes import shape_buckets
+from trilane.stages.config import RunConfig, pose_dtype
+from trilane.stages.cpu.pose import PoseStage, build
+from trilane.stages.cpu.present import PresentStage
+from trilane.stages.gpu.composite import DrawnFrames
+from trilane.testing.assets import assets_of
+from trilane.testing.small_pipeline import EDGES, OWN, STAGES, packets, pipeline
+from trilane.testing.told_bytes import without_bytes
+from trilane.transport.packets import Packet, SlotLayout, header_dtype, view_packet
+
+OUTPUT = (480, 640)
+
+
+def config(bundle: Path, out_dir: Path, **scene: Any) -> RunConfig:
+    made = Scene(**scene)
+    settings = {unit: UnitSettings(cores=(0,), threads=1) for unit in ("cpu", "gpu", "dsp")}
+    return RunConfig(scene=made, out_dir=out_dir, avatar_dirs=(bundle,) * len(made.avatars), units=settings)
+
+
+def pose_stage(config: RunConfig) -> PoseStage:
+    return PoseStage(config, assets_of(config))
+
+
+def bound(stage: PoseStage, avatars: int = 1) -> Packet:
+    layout = SlotLayout(pose_dtype(avatars), 0)
+    packet = view_packet(memoryview(bytearray(layout.slot_bytes)), layout)
+    stage.bind([], [packet])
+    return packet
+
+
+def test_a_packet_says_everything_of_its_frame(tiny_bundle: Path, tmp_path: Path) -> None:
+    stage = pose_stage(config(tiny_bundle, tmp_path, fps=25.0))
+    packet = bound(stage)
+    before = time.monotonic_ns()
+    assert without_bytes(stage.run(50, None, 0)) == {"visible": 1.0, "level": 5.0, "error_px": 0.0}
+    pose, avatar = packet.header, packet.header["avatars"][0]
+    assert (int(pose["frame"]), float(pose["media_time_s"]), int(pose["avatar_count"])) == (50, 2.0, 1)
+    assert before <= int(pose["t_sampled_ns"]) <= time.monotonic_ns()
+    assert tuple(pose["tensor_shape"]) in shape_buckets("256")
+    assert avatar["visible"] == 1
+    assert tuple(avatar["tensor_rect"]) == (0, 0, *pose["tensor_shape"])
+    rect = avatar["rect"]
+    aspect = (rect[2] - rect[0]) * OUTPUT[1] / ((rect[3] - rect[1]) * OUTPUT[0])
+    assert aspect == pytest.approx(pose["tensor_shape"][1] / pose["tensor_shape"][0], rel=1e-4)
+
+
+def test_the_skinned_feet_stand_on_the_floor(tiny_bundle: Path, tmp_path: Path) -> None:
+    stage = pose_stage(config(tiny_bundle, tmp_path))
+    packet = bound(stage)
+    for frame in (0, 31, 150):
+        stage.run(frame, None, 0)
+        joints = packet.header["avatars"][0]["joints"].astype(np.float64)
+        ankles = [joints[k] @ [0.131 * side, -0.859, -0.001, 1.0] for k, side in ((7, 1), (8, -1))]
+        assert 0.05 < min(place[1] for place in ankles) < 0.11
+
+
+def test_a_frame_is_the_same_whatever_came_before(tiny_bundle: Path, tmp_path: Path) -> None:
+    first, second = (pose_stage(config(tiny_bundle, tmp_path)) for _ in range(2))
+    packets = bound(first), bound(second)
+    for frame in (7, 250, 90):
+        first.run(frame, None, 0)
+    second.run(90, None, 0)
+    for key in ("view", "projection", "tensor_shape", "avatars"):
+        assert packets[0].header[key].tobytes() == packets[1].header[key].tobytes()
+
+
+def test_an_avatar_out_of_the_picture_is_not_visible(tiny_bundle: Path, tmp_path: Path) -> None:
+    spec = AvatarSpec(position=(0.0, 0.0, 40.0))
+    stage = pose_stage(config(tiny_bundle, tmp_path, avatars=(AvatarSpec(), spec)))
+    packet = bound(stage, 2)
+    assert stage.run(0, None, 0)["visible"] == 1.0
+    assert packet.header["avatars"]["visible"].tolist() == [1, 0]
+    only_hidden = pose_stage(config(tiny_bundle, tmp_path, avatars=(spec,)))
+    packet = bound(only_hidden)
+    assert without_bytes(only_hidden.run(0, None, 0)) == {"visible": 0.0}
+    assert tuple(packet.header["tensor_shape"]) in shape_buckets("256")
+
+
+def test_an_avatar_that_no_pose_brings_into_the_picture_is_not_posed(
+    tiny_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It stands behind the camera; the other one is posed in every frame."""
+    posed: list[float] = []
+    pose = Skeleton.pose
+
+    def noted(self: Skeleton, *args: Any) -> Any:
+        posed.append(float(args[2][2, 3]))
+        return pose(self, *args)
+
+    away = AvatarSpec(position=(0.0, 0.0, 40.0), heading_deg=30.0)
+    stage = pose_stage(config(tiny_bundle, tmp_path, avatars=(away, AvatarSpec())))
+    bound(stage, 2)
+    monkeypatch.setattr(Skeleton, "pose", noted)
+    for frame in range(3):
+        assert stage.run(frame, None, 0)["visible"] == 1.0
+    assert posed == [0.0] * 3
+
+
+def test_a_rung_limits_the_pixels_of_the_tensor(tiny_bundle: Path, tmp_path: Path) -> None:
+    """Of 160 x 160 pixels all, then a quarter; the shape that is taken is the densest within them."""
+    own = config(tiny_bundle, tmp_path, size="auto")
+    stepped = own.model_copy(
+        update={"own_pixels": 160 * 160, "works": (1000, 250), "shapes": ((64, 32), (96, 64), (160, 96), (192, 128))}
+    )
+    stage = pose_stage(stepped)
+    packet = bound(stage)
+    shapes = []
+    for rung in (0, 1, 0):
+        stage.step_to(rung)
+        stage.run(30 + rung, None, 0)
+        shapes.append(tuple(packet.header["tensor_shape"].tolist()))
+    assert shapes == [(192, 128), (96, 64), (192, 128)]
+    assert 192 * 128 <= 160 * 160 and 96 * 64 <= 160 * 160 // 4 < 160 * 96
+
+
+def test_the_tensor_has_the_shape_that_was_foreseen_for_its_second(tiny_bundle: Path, tmp_path: Path) -> None:
+    """On either rung its own changes, the second from frame 10 on; both shapes are as dense for a body that stands."""
+    standing = AvatarSpec(motion="builtin:t-pose", heading_deg=90.0)
+    own = config(tiny_bundle, tmp_path, size="auto", avatars=(standing,), camera=CameraSpec(source="builtin:static"))
+    first, second = (256, 96), (256, 128)
+    changes = (((0.0, first), (10 / 30, second)), ((0.0, second), (10 / 30, first)))
+    planned = {"own_pixels": 256 * 128, "works": (1000, 999), "shapes": (first, second), "changes": changes}
+    stage = pose_stage(own.model_copy(update=planned))
+    packet = bound(stage)
+    for rung, expected in ((0, [first, second]), (1, [second, first])):
+        stage.step_to(rung)
+        for frame, shape in zip((9, 10), expected, strict=True):
+            stage.forget()
+            stage._made.clear()
+            stage.run(frame, None, 0)
+            assert tuple(packet.header["tensor_shape"].tolist()) == shape
+
+
+def test_two_avatars_share_the_tensor(tiny_bundle: Path, tmp_path: Path) -> None:
+    pair = (AvatarSpec(position=(-0.6, 0, 0)), AvatarSpec(position=(0.6, 0, 0), motion="builtin:idle"))
+    stage = pose_stage(config(tiny_bundle, tmp_path, avatars=pair))
+    packet = bound(stage, 2)
+    stage.run(0, None, 0)
+    (_, left, _, width), second = sorted(packet.header["avatars"]["tensor_rect"].tolist(), key=lambda cell: cell[1])
+    assert second[1] >= left + width + MARGIN_PX
+
+
+def test_nan_never_leaves_the_stage(tiny_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stage = pose_stage(config(tiny_bundle, tmp_path, camera=CameraSpec(source="builtin:static")))
+    bound(stage)
+    mover = type(stage._actors[0].mover)
+    monkeypatch.setattr(mover, "sample", lambda *_: (np.full((55, 3), np.nan), np.zeros(3)))
+    with pytest.raises(TrilaneError, match="frame 3: the pose of avatar 0 is not finite"):
+        stage.run(3, None, 0)
+
+
+def test_edges_are_checked(tiny_bundle: Path, tmp_path: Path) -> None:
+    asked = config(tiny_bundle, tmp_path)
+    unit = UnitContext("cpu", asked.units["cpu"], assets_of(asked))
+    stage = build({"config": asked.model_dump(mode="json")}, unit)
+    packet = bound(stage)
+    with pytest.raises(ValueError, match="no input edge"):
+        stage.bind([packet], [])
+    with pytest.raises(ValueError, match="needs an output slot"):
+        stage.run(0, None, None)
+    stage.close()
+
+
+sides = st.tuples(st.floats(-1, 0.9), st.floats(0.02, 2)).map(lambda p: (p[0], min(p[0] + p[1], 1.0)))
+rects = st.tuples(sides, sides).map(lambda p: Rect(p[0][0], p[1][0], p[0][1], p[1][1]))
+
+
+@given(st.lists(rects, min_size=1, max_size=8), st.sampled_from(["256", "320x192", "512"]))
+def test_crops_hold_their_bodies_and_cells_keep_their_distance(found: list[Rect], size: str) -> None:
+    layout = lay_out(found, OUTPUT, shape_buckets(size))
+    taken = np.zeros((layout.shape[0] + MARGIN_PX, layout.shape[1] + MARGIN_PX), dtype=int)
+    for rect, (crop, (top, left, height, width)) in zip(found, layout.crops, strict=True):
+        assert crop.x0 <= rect.x0 + 1e-9
+        assert crop.y0 <= rect.y0 + 1e-9
+        assert crop.x1 >= rect.x1 - 1e-9
+        assert crop.y1 >= rect.y1 - 1e-9
+        assert top + height <= layout.shape[0]
+        assert left + width <= layout.shape[1]
+        assert top >= 0
+        assert left >= 0
+        taken[top : top + height + MARGIN_PX, left : left + width + MARGIN_PX] += 1
+        shown = crop.width * OUTPUT[1] / (crop.height * OUTPUT[0])
+        assert shown == pytest.approx(width / height, rel=1e-6)
+    assert taken.max() == 1
+
+
+@given(st.lists(rects, min_size=2, max_size=8), st.sampled_from(["256", "512"]))
+def test_avatars_share_the_tensor_in_proportion_to_their_area(found: list[Rect], size: str) -> None:
+    """One scale for all, to the pixel that rounding up may add to each side."""
+    layout = lay_out(found, OUTPUT, shape_buckets(size))
+    pixels = [cell[3] / (crop.width * OUTPUT[1] / 2) for crop, cell in layout.crops]
+    assert max(pixels) == pytest.approx(min(pixels), rel=1e-6)
+
+
+def test_margins_shrink_before_avatars_are_left_out() -> None:
+    small = [Rect(-0.5, -0.5, 0.5, 0.5)] * 8
+    assert len(lay_out(small, OUTPUT, [(32, 32)]).crops) == 8
+    with pytest.raises(BadInputError, match="8 avatars"):
+        lay_out(small, OUTPUT, [(2, 2)])
+
+
+UNITS = {unit: UnitSettings(cores=(0,), threads=1) for unit in ("cpu", "gpu", "dsp")}
+STATIC = CameraSpec(source="builtin:static")
+
+
+def never() -> bool:
+    raise AssertionError("asked in vain")
+
+
+def test_a_frame_is_made_again_only_when_something_differs() -> None:
+    assert work_of(b"a", b"a", None, never) is FrameWork.REUSE
+    assert work_of(b"b", b"a", b"b", never) is FrameWork.NONE
+    assert work_of(b"c", b"a", b"b", lambda: True) is FrameWork.FULL
+    assert work_of(b"c", b"a", None, lambda: False) is FrameWork.NONE
+    assert work_of(b"a", None, None, lambda: True) is FrameWork.FULL
+    assert int(FrameWork.FULL) == 0  # what a header says that nobody wrote to
+
+
+def test_what_is_shown_differs_by_its_last_bit() -> None:
+    view, pose = np.eye(4), np.zeros((55, 3))
+    other = pose.copy()
+    other[54, 2] = np.nextafter(0.0, 1.0)
+    assert shown_by([view, pose]) == shown_by([view.copy(), pose.copy()])
+    assert len({shown_by([view, pose]), shown_by([view, other]), shown_by([np.eye(4) * 2, pose])}) == 3
+
+
+def bound_pose(bundle: Path, folder: Path, slots: int = 2, **scene: Any) -> tuple[PoseStage, list[Any]]:
+    made = Scene(camera=STATIC, **scene)
+    config = RunConfig(scene=made, out_dir=folder, avatar_dirs=(bundle,) * len(made.avatars), units=UNITS)
+    stage, layout = PoseStage(config, assets_of(config)), SlotLayout(pose_dtype(len(made.avatars)), 0)
+    made_packets = [view_packet(memoryview(bytearray(layout.slot_bytes)), layout) for _ in range(slots)]
+    stage.bind([], made_packets)
+    return stage, [packet.header for packet in made_packets]
+
+
+def test_a_still_avatar_is_posed_once_until_the_stage_must_forget(tiny_bundle: Path, tmp_path: Path) -> None:
+    stage, (first, second) = bound_pose(tiny_bundle, tmp_path, avatars=(AvatarSpec(motion="builtin:t-pose"),))
+    assert type(stage.run(4, None, 0)) is dict
+    second["epoch"] = 9
+    assert without_bytes(stage.run(5, None, 1)) == Skip(visible=1.0)
+    assert [int(header["work"]) for header in (first, second)] == [FrameWork.FULL, FrameWork.REUSE]
+    assert [int(header["picture"]) for header in (first, second)] == [4, 4]
+    assert [int(second[name]) for name in ("frame", "epoch")] == [5, 9]
+    assert float(second["media_time_s"]) == 5 / 30
+    for name in ("view", "projection", "avatars", "avatar_count", "tensor_shape"):
+        assert first[name].tobytes() == second[name].tobytes()
+    stage.forget()
+    assert type(stage.run(6, None, 1)) is dict
+    assert (int(second["work"]), int(second["picture"])) == (FrameWork.FULL, 6)
+
+
+def test_who_is_off_the_screen_is_neither_skinned_nor_drawn(
+    tiny_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Behind the camera; that the body moves changes nothing, and to forget makes no frame full in which nobody is."""
+    stage, (header, _) = bound_pose(tiny_bundle, tmp_path, avatars=(AvatarSpec(position=(0.0, 0.0, 40.0)),))
+    monkeypatch.setattr(type(stage._actors[0].body.bounds), "rect", lambda *_: never())
+    for frame in (0, 1, 30):
+        assert without_bytes(stage.run(frame, None, 0)) == Skip(visible=0.0)
+        assert (int(header["work"]), int(header["picture"])) == (FrameWork.NONE, -1)
+        stage.forget()
+
+
+def test_a_slot_that_holds_a_drawing_need_not_be_drawn_again() -> None:
+    drawn = DrawnFrames()
+    still, other = (3, 0, b"v", b"p"), (3, 1, b"v", b"p")
+    assert drawn.slot_of(still, 0) is None
+    assert drawn.note(0, still, 7, None) == 0
+    assert (drawn.slot_of(still, 1), drawn.slot_of(other, 1), drawn.slot_of(None, 0)) == (0, None, None)
+    assert drawn.note(1, still, 8, 0) == 8  # 1 + 7
+    assert (drawn.slot_of(still, 1), drawn.slot_of(still, 0)) == (1, 0)
+    assert drawn.note(0, other, 9, None) == 0
+    assert (drawn.slot_of(still, 0), drawn.slot_of(other, 1)) == (1, 0)
+    assert drawn.note(0, still, 10, 1) == 8
+    assert drawn.note(0, None, 11, None) == 0
+    assert drawn.slot_of(None, 0) is None
+
+
+def test_a_repeated_frame_is_digested_and_shown_as_the_one_that_it_repeats(tmp_path: Path) -> None:
+    """Frames 0 to 5: 1 and 2 say that they are 0, 4 says 3; 5 says 0, which was not the last one, so it is digested."""
+    layout = SlotLayout(pose_dtype(1), 64 * 64 * 3)
+    slots = [view_packet(memoryview(bytearray(layout.slot_bytes)), layout) for _ in range(3)]
+    for number, slot in enumerate(slots):
+        slot.payload[:] = 50 * number + 1
+    scene = Scene(output=OutputSpec(width=64, height=64))
+    stage = PresentStage(RunConfig(scene=scene, out_dir=tmp_path, avatar_dirs=(), units=UNITS))
+    stage.bind(slots, [])
+    for frame, slot, repeats in ((0, 0, 0), (1, 0, 1), (2, 0, 1), (3, 1, 0), (4, 1, 4), (5, 2, 1)):
+        slots[slot].header["repeats"] = repeats
+        stage.run(frame, slot, None)
+    stage.close()
+    (file,) = (tmp_path / "segments").glob("*.sha256")
+    digests = [line.split()[1] for line in file.read_text().splitlines()]
+    assert digests[0] == digests[1] == digests[2] and digests[3] == digests[4]
+    assert len(set(digests)) == 3
+
+
+class Skipping:
+    """Notes what it is asked; every frame skips."""
+
+    def __init__(self) -> None:
+        self.forgot = 0
+
+    def bind(self, inputs: Any, outputs: Any) -> None:
+        self.bound = inputs, outputs
+
+    def run(self, frame: int, *_slots: int | None) -> Mapping[str, float]:
+        return Skip(frame=frame)
+
+    def forget(self) -> None:
+        self.forgot += 1
+
+    def close(self) -> None:
+        pass
+
+
+def test_a_stage_is_told_to_forget_and_may_skip_only_where_a_bypass_begins() -> None:
+    unit = UnitContext("left", UNITS["cpu"], {})
+    stage = Skipping()
+    bound = BoundStage("a", stage, [], packets(OWN, 1), 0, unit, may_skip=True)
+    assert (bound.run(3, -1, 0, 0), stage.forgot) == (Skip(frame=3), 0)
+    bound.run(4, -1, 0, 0, fresh=True)
+    assert stage.forgot == 1
+    other = BoundStage("b", stage, [], packets(OWN, 1), 0, unit)
+    with pytest.raises(TrilaneError, match="stage b returned a Skip, and the pipeline's bypass does not begin at it"):
+        other.run(3, -1, 0, 0, fresh=True)
+    assert stage.forgot == 1
+
+
+def test_a_header_is_passed_on_from_either_edge_at_the_end_of_a_bypass() -> None:
+    inputs, outputs = packets(OWN, 3), packets(OWN, 1)
+    bound = BoundStage("c", Skipping(), inputs, outputs, 0, UnitContext("right", UNITS["cpu"], {}), may_skip=True)
+    inputs[2].header["frame"] = 77
+    bound.run(77, 2, 0, 5)
+    assert (int(outputs[0].header["frame"]), int(outputs[0].header["epoch"])) == (77, 5)
+
+
+def test_a_bypass_joins_edges_of_one_header() -> None:
+    names = (STAGES[0].name, STAGES[2].name)
+    alike = tuple(edge.model_copy(update={"header": OWN}) for edge in EDGES)
+    made = pipeline(edges=alike, bypass=names)
+    assert made.edges_into(names[1]) == ("mid->out", "in->mid")
+    assert made.edges_into("mid") == ("in->mid",) and made.edges_into("in") == ()
+    assert made.graph().bypass == names
+    unlike = (alike[0], alike[1].model_copy(update={"header": header_dtype()}))
+    with pytest.raises(BadInputError, match="different headers of edges mid->out, in->mid"):
+        pipeline(edges=unlike, bypass=names)
+    with pytest.raises(BadInputError, match="bypass"):
+        pipeline(edges=alike, bypass=("in", "mid"))

@@ -1,0 +1,253 @@
+"""The present stage and what the parent makes of its segments."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+from PIL import Image
+
+from trilane.apps import video
+from trilane.apps.video import contact_sheet, join_segments, run_checksum
+from trilane.pipeline.description import UnitSettings
+from trilane.pipeline.moved_bytes import BYTES
+from trilane.scene.schema import OutputSpec, Scene
+from trilane.stages.config import RunConfig, pose_dtype
+from trilane.stages.cpu.present import SEGMENTS, PresentStage
+from trilane.testing.told_bytes import without_bytes
+from trilane.transport.packets import Packet, SlotLayout, view_packet
+
+WIDTH, HEIGHT, FPS = 96, 64, 30.0
+
+
+def make_config(out_dir: Path, *, record: bool = True) -> RunConfig:
+    return RunConfig(
+        scene=Scene(output=OutputSpec(width=WIDTH, height=HEIGHT)),
+        out_dir=out_dir,
+        avatar_dirs=(),
+        units={"cpu": UnitSettings(cores=(0,), threads=1)},
+        record=record,
+    )
+
+
+def make_slot() -> Packet:
+    layout = SlotLayout(pose_dtype(1), payload_bytes=WIDTH * HEIGHT * 3)
+    return view_packet(memoryview(bytearray(layout.slot_bytes)), layout)
+
+
+def grey_of(frame: int) -> int:
+    return 40 + 5 * frame
+
+
+def present(out_dir: Path, frames: range, *, close: bool = True) -> list[dict[str, float]]:
+    """Present grey frames whose brightness tells their number."""
+    stage, slot = PresentStage(make_config(out_dir)), make_slot()
+    stage.bind([slot], [])
+    figures = []
+    for frame in frames:
+        slot.payload[:] = grey_of(frame)
+        figures.append(dict(stage.run(frame, 0, None)))
+    if close:
+        stage.close()
+    return figures
+
+
+def segments(out_dir: Path, ending: str = "mp4") -> list[Path]:
+    return sorted((out_dir / SEGMENTS).glob(f"*.{ending}"))
+
+
+def greys(video: Path) -> list[int]:
+    with av.open(str(video)) as container:
+        return [int(frame.to_ndarray(format="rgb24").mean()) for frame in container.decode(video=0)]
+
+
+def test_every_frame_is_in_the_video_in_order(tmp_path: Path) -> None:
+    figures = present(tmp_path, range(12))
+    joined = join_segments(segments(tmp_path), tmp_path / "video.mp4", FPS)
+    assert joined is not None
+    assert (joined.frames, joined.seconds) == (12, pytest.approx(12 / 30))
+    assert greys(tmp_path / "video.mp4") == pytest.approx([grey_of(k) for k in range(12)], abs=3)
+    assert all(set(without_bytes(row)) == {"digest_ms", "encode_ms"} for row in figures)
+
+
+def test_segments_of_a_restarted_stage_are_joined_without_encoding_again(tmp_path: Path) -> None:
+    present(tmp_path, range(5))
+    present(tmp_path, range(7, 12))
+    joined = join_segments(segments(tmp_path), tmp_path / "video.mp4", FPS)
+    assert joined is not None
+    assert joined.frames == 10
+    assert joined.seconds == pytest.approx(12 / 30), "lost frames leave their time in the video"
+    assert greys(tmp_path / "video.mp4")[-1] == pytest.approx(grey_of(11), abs=3)
+
+
+def test_a_segment_that_was_cut_off_keeps_all_but_its_last_frame(tmp_path: Path) -> None:
+    present(tmp_path, range(9))
+    whole = segments(tmp_path)[0]
+    whole.write_bytes(whole.read_bytes()[:-40])
+    empty = tmp_path / "empty.mp4"
+    empty.touch()
+    joined = join_segments([empty, whole], tmp_path / "video.mp4", FPS)
+    assert joined is not None
+    assert joined.frames >= 8
+
+
+def test_no_segment_gives_no_video(tmp_path: Path) -> None:
+    assert join_segments([], tmp_path / "video.mp4", FPS) is None
+    assert not (tmp_path / "video.mp4").exists()
+
+
+def test_the_checksum_is_of_the_presented_bytes_whatever_the_segments(tmp_path: Path) -> None:
+    present(tmp_path / "one", range(6))
+    present(tmp_path / "two", range(3))
+    present(tmp_path / "two", range(3, 6))
+    present(tmp_path / "other", range(1, 7))
+    sums = [run_checksum(segments(tmp_path / name, "sha256")) for name in ("one", "two", "other")]
+    assert sums[0] == sums[1] != sums[2]
+    line = segments(tmp_path / "one", "sha256")[0].read_text().splitlines()[2]
+    assert line == f"2 {hashlib.sha256(bytes([grey_of(2)]) * (WIDTH * HEIGHT * 3)).hexdigest()}"
+    assert run_checksum([]) is None
+
+
+def test_the_contact_sheet_shows_first_and_last_frame(tmp_path: Path) -> None:
+    present(tmp_path, range(40))
+    join_segments(segments(tmp_path), tmp_path / "video.mp4", FPS)
+    assert contact_sheet(tmp_path / "video.mp4", tmp_path / "contact.png", FPS) == 20
+    with Image.open(tmp_path / "contact.png") as picture:
+        sheet = np.asarray(picture)
+    cell_height = 320 * HEIGHT // WIDTH
+    assert sheet.shape == (5 * cell_height, 4 * 320, 3)
+    assert sheet[cell_height - 3, 300].mean() == pytest.approx(grey_of(0), abs=3)
+    assert sheet[-3, -3].mean() == pytest.approx(grey_of(39), abs=3)
+
+
+def sheet_of(tmp_path: Path, frames: range, fps: float = FPS) -> tuple[int, np.ndarray]:
+    """How many frames a sheet of these has, and the grey of each of its places, read at the lower right."""
+    present(tmp_path, frames)
+    join_segments(segments(tmp_path), tmp_path / "video.mp4", fps)
+    count = contact_sheet(tmp_path / "video.mp4", tmp_path / "contact.png", fps)
+    with Image.open(tmp_path / "contact.png") as picture:
+        sheet = np.asarray(picture)
+    high = 320 * HEIGHT // WIDTH
+    assert sheet.shape[1] % 320 == 0 and sheet.shape[0] % high == 0
+    return count, sheet[high - 3 :: high, 317::320].mean(axis=2)
+
+
+@pytest.mark.parametrize(
+    ("frames", "count", "shape"), [(1, 1, (1, 1)), (3, 3, (1, 3)), (6, 6, (2, 4)), (20, 20, (5, 4)), (39, 20, (5, 4))]
+)
+def test_a_sheet_has_as_many_rows_as_it_needs(tmp_path: Path, frames: int, count: int, shape: tuple[int, int]) -> None:
+    """Of 39 frames every second one; places without a frame are black."""
+    found, greys_of = sheet_of(tmp_path, range(frames))
+    shown = [grey_of(round(k * (frames - 1) / max(1, count - 1))) for k in range(count)]
+    assert (found, greys_of.shape) == (count, shape)
+    assert greys_of.ravel() == pytest.approx([*shown, *[0] * (shape[0] * shape[1] - count)], abs=4)
+
+
+@pytest.mark.parametrize("decode", ["_decode_all", "_decode_each"])
+def test_both_ways_to_decode_give_the_frames_that_are_wanted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, decode: str
+) -> None:
+    """Seeking to each is used where more than 30 frames lie between them: here it is said to be fewer or more."""
+    used = []
+    chosen = getattr(video, decode)
+    monkeypatch.setattr(video, decode, lambda *given: used.append(len(given[1])) or chosen(*given))
+    monkeypatch.setattr(video, "KEYFRAME_EVERY", 2 if decode == "_decode_all" else 1.9)
+    _, greys_of = sheet_of(tmp_path, range(40))
+    assert used == [20]
+    assert greys_of.ravel() == pytest.approx([grey_of(round(k * 39 / 19)) for k in range(20)], abs=4)
+
+
+def test_each_frame_is_sought_in_the_time_of_its_stream(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A seek without a stream counts in microseconds: it would end at the first key frame, and all would be decoded."""
+    sought: list[Any] = []
+    frames = [SimpleNamespace(pts=pts) for pts in (0, 512, 1024)]
+    container = SimpleNamespace(
+        streams=SimpleNamespace(video=["the stream"]),
+        seek=lambda pts, **settings: sought.append((pts, settings)),
+        decode=lambda stream: iter(frames) if stream == "the stream" else iter(()),
+    )
+    monkeypatch.setattr(video, "_thumbnail", lambda frame: f"of {frame.pts}")
+    assert list(video._decode_each(container, [512, 1000])) == [(512, "of 512"), (1000, "of 1024")]
+    assert sought == [(512, {"stream": "the stream"}), (1000, {"stream": "the stream"})]
+
+
+def test_a_sheet_is_compressed(tmp_path: Path) -> None:
+    """Even grey pictures with labels: far below a byte for each of the 320 x 213 x 3."""
+    sheet_of(tmp_path, range(1))
+    assert (tmp_path / "contact.png").stat().st_size < 320 * 213
+
+
+def test_frames_are_labelled_with_their_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames 2, 3 and 7 of a run: the time of a frame tells its number."""
+    said: list[Any] = []
+    monkeypatch.setattr(video.ImageDraw, "Draw", lambda _: SimpleNamespace(text=lambda *a, **k: said.append((a, k))))
+    present(tmp_path, range(2, 4))
+    sheet_of(tmp_path, range(7, 8))
+    style = {"fill": "white", "stroke_width": 2, "stroke_fill": "black", "font_size": 14}
+    assert said == [(((320 * k + 6, 4), f"frame {frame}"), style) for k, frame in enumerate((2, 3, 7))]
+
+
+def test_labels_are_at_the_upper_left_of_their_pictures(tmp_path: Path) -> None:
+    """White with black round it on grey: the darkest and the brightest of each place are in its upper left corner."""
+    present(tmp_path, range(10, 15))
+    join_segments(segments(tmp_path), tmp_path / "video.mp4", FPS)
+    contact_sheet(tmp_path / "video.mp4", tmp_path / "contact.png", FPS)
+    with Image.open(tmp_path / "contact.png") as picture:
+        grey = np.asarray(picture.convert("L")).astype(int)
+    high = 320 * HEIGHT // WIDTH
+    for row, column in ((0, 0), (0, 3), (1, 0)):
+        place = grey[row * high : (row + 1) * high, column * 320 : (column + 1) * 320]
+        label = np.s_[2:24, 4:80]
+        assert place[label].max() == 255 and place[label].min() == 0
+        place = place.copy()
+        place[label] = grey_of(10)
+        assert place.min() > 80 and place.max() < 130
+
+
+def test_a_frame_that_comes_too_soon_is_shown_after_the_one_before(tmp_path: Path) -> None:
+    """A second segment that begins with an earlier number goes on where the first one ended."""
+    present(tmp_path, range(4, 6))
+    present(tmp_path, range(1, 3))
+    joined = join_segments(segments(tmp_path), tmp_path / "video.mp4", FPS)
+    assert joined is not None and (joined.frames, joined.seconds) == (4, pytest.approx(8 / 30))
+    with av.open(str(tmp_path / "video.mp4")) as container:
+        stream = container.streams.video[0]
+        packets = [packet for packet in container.demux(stream) if packet.size]
+        times = [float(packet.pts * stream.time_base * 30) for packet in packets]
+        assert times == pytest.approx([4, 5, 6, 7], abs=0.02)
+        lengths = [float(packet.duration * stream.time_base * 30) for packet in packets]
+        assert lengths == pytest.approx([1, 1, 1, 1], abs=0.02)
+    text = (tmp_path / "video.mp4").read_bytes()
+    assert text.index(b"moov") < text.index(b"mdat")  # can be shown while it is still loaded
+
+
+def test_what_a_digest_file_says(tmp_path: Path) -> None:
+    """Lines in the order of their frames, whichever file they are in; a last line without an end is none."""
+    (tmp_path / "a.sha256").write_text("10 aa\n2 bb\n11 c")
+    (tmp_path / "b.sha256").write_text("1 dd\n")
+    files = [tmp_path / "a.sha256", tmp_path / "b.sha256"]
+    assert run_checksum(files) == hashlib.sha256(b"1 dd\n2 bb\n10 aa\n").hexdigest()
+    (tmp_path / "b.sha256").write_text("1 d")
+    assert run_checksum(files[1:]) is None
+
+
+def test_nothing_is_written_when_the_run_is_not_recorded(tmp_path: Path) -> None:
+    stage, slot = PresentStage(make_config(tmp_path, record=False)), make_slot()
+    stage.bind([slot], [])
+    assert stage.run(0, 0, None) == dict.fromkeys(BYTES, 0)
+    stage.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_present_stage_has_an_input_and_no_output(tmp_path: Path) -> None:
+    stage, slot = PresentStage(make_config(tmp_path, record=False)), make_slot()
+    with pytest.raises(ValueError, match="no output"):
+        stage.bind([slot], [slot])
+    stage.bind([slot], [])
+    with pytest.raises(ValueError, match="input slot"):
+        stage.run(0, None, None)
