@@ -117,7 +117,6 @@ def _trained(work: _Work, source: Callable[[], Any], folder: Path) -> tuple[Pain
     import torch
 
     from trilane.training.body_arrays import body_arrays
-    from trilane.training.captured_avatar import DEFAULT_NETWORK
     from trilane.training.dataset import plan_training, write_dataset
     from trilane.training.first_texture import first_texture
     from trilane.training.float_painter import float_painter
@@ -125,6 +124,7 @@ def _trained(work: _Work, source: Callable[[], Any], folder: Path) -> tuple[Pain
     from trilane.training.neural_texture import SIDES, NeuralTexture
     from trilane.training.sample_files import open_groups
     from trilane.training.step_loop import first_state, steps
+    from trilane.training.train import DEFAULT_NETWORK
     from trilane.training.trainable_avatar import TrainableAvatar
     from trilane.training.training_settings import parsed_settings
     from trilane.training.weights_file import load_network

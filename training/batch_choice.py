@@ -14,14 +14,17 @@ from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from trilane.errors import BadInputError
 from trilane.training.sample_files import U16, ShapeGroup, batches
 from trilane.training.sample_renderer import BAND_NAMES
-from trilane.training.training_loop import SMALL_PIXELS
 from trilane.training.training_settings import TrainingSettings
 
+#: Tensors with fewer pixels are half-size ones, which alone are used at first because they are cheap.
+SMALL_PIXELS = 160 * 160
 #: Bands whose samples show the whole body: the tensor is cut to the body, so it has one size in both.
 WHOLE_BANDS = [BAND_NAMES.index(name) for name in ("far", "full_body")]
 #: Zooms in one octave that batches of one zoom tell apart; every which row of a sample its zoom is measured on.
@@ -48,9 +51,19 @@ def batch_stream(groups: list[ShapeGroup], settings: TrainingSettings, count: in
     per_step = settings.optimiser.batches_per_step
     for number, phase in enumerate(phases(groups, settings, count)):
         rng = np.random.default_rng((settings.seed, 2, number))
-        stream = batches(groups, settings.batch, rng, labels=phase.labels)
+        stream = batches(groups, settings.batch, rng, settings.batches.repeats, phase.labels)
         done = min(max(step - phase.first, 0), phase.end - phase.first)
         yield from islice(stream, done * per_step, (phase.end - phase.first) * per_step)
+
+
+def load_batch(
+    group: ShapeGroup, index: NDArray[np.int64], device: torch.device | str = "cpu"
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`uv` (N,H,W,2) in 0..1, `covered` (N,H,W) bool and the target (N,4,H,W) in 0..1 of the samples `index` (N,)."""
+    uv = torch.from_numpy(group.uv[index].astype(np.float32) / U16)
+    covered = torch.from_numpy(group.covered[index] > 0)
+    target = torch.from_numpy(group.rgba[index].astype(np.float32) / 255).permute(0, 3, 1, 2)
+    return uv.to(device), covered.to(device), target.to(device)
 
 
 def phases(groups: list[ShapeGroup], settings: TrainingSettings, count: int) -> list[Phase]:

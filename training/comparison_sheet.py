@@ -14,24 +14,8 @@ from PIL import Image
 from trilane.training.backgrounds import SIDE, scenes
 from trilane.training.evaluate import Evaluated
 from trilane.training.image_error import over
-from trilane.training.sample_renderer import BAND_NAMES
 
 SHEET_CELL = (256, 192)
-
-
-def comparison_sheet(samples: Sequence[Evaluated], painters: Sequence[str]) -> NDArray[np.uint8]:
-    """Rows of bands, two samples each: those of median and of upper-quartile PSNR by the last of `painters`.
-
-    Returns (height, width, 3) uint8.
-    """
-    rows = []
-    for band in BAND_NAMES:
-        by_error = sorted(
-            (sample for sample in samples if sample.band == band), key=lambda s: s.errors[painters[-1]].psnr_db
-        )
-        chosen = (by_error[len(by_error) // 2], by_error[-len(by_error) // 4])
-        rows.append(np.hstack([_cells(sample, painters) for sample in chosen]))
-    return np.vstack(rows)
 
 
 def worst_sheet(samples: Sequence[Evaluated], painters: Sequence[str]) -> NDArray[np.uint8]:

@@ -20,11 +20,11 @@ from trilane.arrays import F32
 from trilane.avatars.bundle import Bundle
 from trilane.avatars.integer_network import constants_of
 from trilane.errors import BadInputError
+from trilane.training.batch_choice import load_batch
 from trilane.training.byte_grid import convolutions, module_of
 from trilane.training.network import UNet
 from trilane.training.neural_texture import read_texture
 from trilane.training.sample_files import ShapeGroup, batches
-from trilane.training.training_loop import load_batch
 
 #: The two convolutions of the heads, which are exported side by side: colour first, then the mask.
 FIRST, SECOND, COLOURS = "first", "second", 3

@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from trilane.training.batch_choice import load_batch
 from trilane.training.sample_files import ShapeGroup
-from trilane.training.training_loop import load_batch
 from trilane.training.training_state import TrainingState
 
 

@@ -1,21 +1,23 @@
 """Training by a number of steps, in one process: the same settings give the same weights.
 
 Rule: what a step does depends on its number, the settings and the state alone, so a training that was ended anywhere
-goes on as if it had not been. `training_loop.py` is the other loop, of processes that share a budget of time.
+goes on as if it had not been.
 """
 
 from __future__ import annotations
 
 import copy
+import math
 import time
 from collections.abc import Iterator
 from itertools import islice
 
 import torch
+from torch import Tensor, nn
 
 from trilane.training.activation_noise import add_activation_noise
 from trilane.training.adversary import Adversary
-from trilane.training.batch_choice import Batch, batch_stream, is_whole
+from trilane.training.batch_choice import Batch, batch_stream, is_whole, load_batch
 from trilane.training.byte_grid import ByteGrid
 from trilane.training.device import chosen_device
 from trilane.training.dropout import add_dropout
@@ -25,10 +27,11 @@ from trilane.training.perceptual import Vgg16
 from trilane.training.rounding import round_to_bytes
 from trilane.training.sample_files import ShapeGroup
 from trilane.training.trainable_avatar import TrainableAvatar
-from trilane.training.training_loop import add_gradients, follow, load_batch, rate_share, set_mode
 from trilane.training.training_settings import TrainingSettings
 from trilane.training.training_state import TrainingState
 
+#: Share of the steps in which the learning rate rises.
+WARM_UP = 0.02
 #: Steps that are measured to say what all will take.
 MEASURED = 4
 #: Moves the number of a step into the bits above the seed.
@@ -57,7 +60,7 @@ def first_state(avatar: TrainableAvatar, settings: TrainingSettings, vgg: Vgg16 
 def steps(
     state: TrainingState, groups: list[ShapeGroup], settings: TrainingSettings, count: int
 ) -> Iterator[dict[str, float]]:
-    """Do the steps of `state` up to number `count`; yields after each what `train_step` tells.
+    """Do the steps of `state` up to number `count`; yields after each what `add_gradients` tells.
 
     `state`: changes in place.
     `groups`: the samples.
@@ -98,6 +101,44 @@ def _step(state: TrainingState, stream: Iterator[Batch], settings: TrainingSetti
     clip_gradients(avatar, options)
     state.optimiser.step()
     return sums
+
+
+def add_gradients(
+    avatar: TrainableAvatar, batch: tuple[Tensor, Tensor, Tensor], objective: Objective, share: float = 1.0
+) -> dict[str, float]:
+    """Add `share` of the gradients of `batch`, as `load_batch` returns it, to those of `avatar`; the terms by name.
+
+    `objective`: what is minimised; its discriminators learn from every batch.
+    """
+    uv, covered, target = batch
+    output = avatar(uv, covered)
+    terms = objective.terms(output, target)
+    (share * objective.total(terms)).backward()
+    return {name: float(term.detach()) for name, term in terms.items()} | objective.learn(output.detach(), target)
+
+
+def rate_share(share: float) -> float:
+    """What learning rates are multiplied by when `share` of the training is done: up at first, then half a cosine."""
+    if share < WARM_UP:
+        return max(share / WARM_UP, 0.02)
+    return 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * (share - WARM_UP) / (1 - WARM_UP)))
+
+
+def set_mode(avatar: TrainableAvatar, frozen: bool) -> None:
+    """Put `avatar` into training mode; `frozen`: its batch statistics no longer change."""
+    avatar.train()
+    if frozen:
+        for module in avatar.modules():
+            if isinstance(module, nn.BatchNorm2d):
+                module.eval()
+
+
+def follow(average: TrainableAvatar, avatar: TrainableAvatar, keep: float) -> None:
+    """Move `average` towards `avatar`; it keeps the share `keep` of itself."""
+    current = avatar.state_dict()
+    for name, value in average.state_dict().items():
+        if value.dtype.is_floating_point:
+            value.lerp_(current[name], 1 - keep)
 
 
 def step_seconds(

@@ -5,11 +5,13 @@ Rule: it needs no PyTorch, so that settings are read, and refused, where none is
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
 from trilane.scene.schema import Table
+
+Repeats = Annotated[int, Field(ge=1, le=100)]
 
 
 class OptimiserOptions(Table):
@@ -35,13 +37,15 @@ class BatchOptions(Table):
 
     `sample_share`: of the samples, drawn once, that are used. `same_zoom`: the samples of a batch have about one zoom.
     `full_body_statistics`: batch statistics come from batches of whole bodies alone, other batches use them.
-    `full_body_from`: share of the steps after which all samples show whole bodies.
+    `full_body_from`: share of the steps after which all samples show whole bodies. `repeats`: how often an epoch has a
+    sample of each band: far, full body, upper body, face, anywhere.
     """
 
     sample_share: float = Field(default=1.0, gt=0, le=1)
     same_zoom: bool = False
     full_body_statistics: bool = False
     full_body_from: float = Field(default=1.0, ge=0, le=1)
+    repeats: tuple[Repeats, Repeats, Repeats, Repeats, Repeats] = (1, 1, 1, 1, 1)
 
 
 class RegularisationOptions(Table):

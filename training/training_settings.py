@@ -1,4 +1,4 @@
-"""`training.toml`: everything that decides what a training on a capture makes, in one file that the bundle keeps.
+"""`training.toml`: everything that decides what a training makes, in one file that the bundle keeps.
 
 Rule: no folders are in it; the same file, capture and machine give the same avatar on one thread of a CPU.
 """
@@ -23,16 +23,18 @@ from trilane.training.usual_settings import with_usual
 
 NAME = "training.toml"
 EXPECTED = "settings of a training (TOML): docs/captures.md"
-HEAD = "# How this avatar was trained; `trilane avatar train CAPTURE --config training.toml` trains one so again.\n"
+HEAD = "# How this avatar was trained; `trilane avatar train --config training.toml` trains one so again.\n"
 
 
 class TrainingSettings(Table):
     """One training.
 
-    `samples`: views of the capture's frames, drawn before training. `minutes`: of training, which `steps` are counted
+    `samples`: views of the person, drawn before training. `minutes`: of training, which `steps` are counted
     for by measured time where they are not given. `batch`: samples of a step. `seed`: of all random numbers. `threads`:
     of PyTorch. `device`: auto is a GPU that PyTorch can use, where there is one. `precision`: of the network while it
-    is trained. `start`: the network of the default avatar, or one of random weights. `width`: of a new one.
+    is trained. `look`: the default body in these clothes is who is trained; none: the person of a capture. `start`: the
+    avatar whose network is trained further, or one of random weights. `width`: of a new one. `texture`: the avatar
+    whose texture is trained further, or one of the samples' colours.
     `network_rate`, `texture_rate`: peaks of the learning rates. `small_until`, `freeze_norms_at`: shares of the steps,
     up to which only half-size samples are used, and after which batch statistics stay. `average_share`: of the steps so
     far, time constant of the average that becomes the avatar. `discriminator_rate`: of learning, for discriminators; it
@@ -52,7 +54,9 @@ class TrainingSettings(Table):
     threads: int = Field(default=1, ge=1, le=256)
     device: Literal["auto", "cpu", "cuda"] = "auto"
     precision: Literal["float32", "bfloat16"] = "float32"
-    start: Literal["default", "new"] = "default"
+    look: str | None = None
+    start: Literal["default", "hiker", "new"] = "default"
+    texture: Literal["default", "hiker", "new"] = "new"
     width: int = Field(default=16, ge=4, le=64)
     network_rate: float = Field(default=1.5e-3, gt=0, le=1)
     texture_rate: float = Field(default=4e-4, gt=0, le=1)
@@ -97,7 +101,7 @@ def parsed_settings(values: dict[str, Any], where: str | Path) -> TrainingSettin
 
 #: What does not go together: key, test, what is expected of the key, and another way.
 CLASHES: tuple[tuple[str, Callable[[TrainingSettings], bool], str, str], ...] = (
-    ("norm", lambda s: s.start == "default" and s.norm != "batch", "batch of the default network", 'or start = "new"'),
+    ("norm", lambda s: s.start != "new" and s.norm != "batch", "batch of a trained network", 'or start = "new"'),
     (
         "bytes_from",
         lambda s: s.bytes_from < 1 and s.norm in ("instance", "group"),

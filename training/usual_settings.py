@@ -25,11 +25,9 @@ LOSSES: dict[str, dict[str, Any]] = {
         "optimiser": {"kind": "adam", "second_momentum": 0.999, "clip_norm": 0.0},
     },
 }
-#: By `start`: a network that is trained already, and a new one.
-STARTS: dict[str, dict[str, Any]] = {
-    "default": {"small_until": 0.0, "freeze_norms_at": 0.3},
-    "new": {"small_until": 0.12, "freeze_norms_at": 0.6},
-}
+#: With a network that is trained already, and with a new one.
+TRAINED: dict[str, Any] = {"small_until": 0.0, "freeze_norms_at": 0.3}
+NEW: dict[str, Any] = {"small_until": 0.12, "freeze_norms_at": 0.6}
 #: Of a new network that has less than so many minutes: cheap steps at a high rate (docs/decisions/avatar-training.md).
 SHORT_MINUTES = 5.0
 SHORT: dict[str, Any] = {"batch": 2, "small_until": 0.8, "network_rate": 5e-3, "texture_rate": 1e-3}
@@ -41,7 +39,7 @@ def with_usual(values: dict[str, Any], where: str | Path) -> dict[str, Any]:
     Raises BadInputError for a name that no loss has.
     """
     start, name = values.get("start", "default"), values.get("loss")
-    usual = STARTS.get(str(start), {}) | (_of_loss(name, where) if isinstance(name, str) else {})
+    usual = (NEW if start == "new" else TRAINED) | (_of_loss(name, where) if isinstance(name, str) else {})
     if start == "new" and _is_short(values):
         usual |= SHORT
     given = {key: value for key, value in values.items() if key != "loss" or not isinstance(name, str)}

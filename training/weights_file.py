@@ -1,4 +1,4 @@
-"""Weights of an avatar and of its network as .npz files.
+"""Weights of a network as an .npz file.
 
 Rule: a file is complete or not there; weights are loaded only into a network that has every one of them.
 """
@@ -19,22 +19,8 @@ from trilane.writing import write_atomically
 SAVED_WEIGHTS = "weights that this network's training saved"
 
 
-def save_avatar(avatar: TrainableAvatar, steps: int, path: Path) -> None:
-    """Write all weights and the number of steps as the .npz file `path`, whole or not at all. Raises BadInputError."""
-    with write_atomically(path) as draft, draft.open("wb") as file:
-        np.savez(file, steps=steps, **{name: value.detach().numpy() for name, value in avatar.state_dict().items()})
-
-
-def load_avatar(avatar: TrainableAvatar, path: Path) -> tuple[TrainableAvatar, int]:
-    """Load a file of `save_avatar` into `avatar`; the avatar and the number of steps. Raises BadInputError."""
-    weights = _read_weights(path)
-    steps = int(weights.pop("steps", torch.tensor(0)))
-    _fill(avatar, weights, path)
-    return avatar.eval(), steps
-
-
 def load_network(network: UNet, path: Path) -> UNet:
-    """Load the network of a file of `save_avatar` or `save_network` into `network`. Raises BadInputError."""
+    """Load the network of a file of `save_network` into `network`. Raises BadInputError."""
     weights = _read_weights(path)
     prefix = "network."
     _fill(network, {k.removeprefix(prefix): v.float() for k, v in weights.items() if k.startswith(prefix)}, path)

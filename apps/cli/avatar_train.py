@@ -1,6 +1,6 @@
-"""`trilane avatar train`: an avatar of a person, from a capture.
+"""`trilane avatar train`: an avatar of a person, from a capture or from settings that say who it is.
 
-Rule: this file talks to the person; the work is done in `trilane.training.captured_avatar`.
+Rule: this file talks to the person; the work is done in `trilane.training.train`.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ Examples:
   trilane avatar train my-capture --out mine --minutes 600
   trilane avatar train my-capture --out smoke --minutes 1 --samples 200
   trilane avatar train my-capture --out again --config mine/training.toml
+  trilane avatar train --out further --config avatars/default/training.toml
 """
 #: Where wheels of PyTorch lie that need no GPU; the plain package index has those for NVIDIA's.
 CPU_INDEX = "https://download.pytorch.org/whl/cpu"
@@ -38,14 +39,16 @@ CPU_INDEX = "https://download.pytorch.org/whl/cpu"
 NEWEST, LINE_S = 0.05, 30.0
 #: Folder of the log for TensorBoard, in the work folder.
 LOG = "tensorboard"
-#: Width of the default avatar's network.
+#: Width of the networks of `default` and `hiker`.
 DEFAULT_WIDTH = 16
 
 
 def train(
     ctx: typer.Context,
-    capture: Annotated[Path, typer.Argument(help="Folder of a capture; docs/captures.md says what is in it.")],
     out: Annotated[Path, typer.Option(help="Folder of the avatar to write.")],
+    capture: Annotated[
+        Path | None, typer.Argument(help="Folder of a capture (docs/captures.md); none if the settings have a look.")
+    ] = None,
     work: Annotated[
         Path | None, typer.Option(help="Folder of samples, state and sheets; OUT-work if none. Training goes on there.")
     ] = None,
@@ -58,7 +61,9 @@ def train(
     seed: Annotated[int, typer.Option(help="Of all random numbers.")] = 1,
     threads: Annotated[int, typer.Option(help="Of PyTorch, and processes that draw; only 1 repeats to the bit.")] = 1,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda; auto takes an NVIDIA GPU that is there.")] = "auto",
-    start: Annotated[str, typer.Option(help="default: the default avatar's network; new: random weights.")] = "default",
+    start: Annotated[
+        str, typer.Option(help="Network to train further, of avatar default or hiker; new: random weights.")
+    ] = "default",
     width: Annotated[int, typer.Option(help="Of a new network; 64 is full.")] = 16,
     loss: Annotated[
         str, typer.Option(help="default: the default avatar's; thesis: L1, Dice, perceptual, GAN.")
@@ -69,7 +74,7 @@ def train(
     tensorboard: Annotated[bool, typer.Option("--tensorboard", help="Log the losses to WORK/tensorboard too.")] = False,
     json: JsonOption = False,
 ) -> None:
-    """Train an avatar on a capture and write it as a folder for `trilane run --avatar`.
+    """Train an avatar of a capture, or of the default body in a look, and write a folder for `trilane run --avatar`.
 
     A command that was ended goes on where it was when it is given again.
     """
@@ -83,11 +88,11 @@ def train(
     }
     values = read_settings(config).model_dump(by_alias=True, exclude_none=True) if config is not None else {}
     asked = parsed_settings(values | options, "options" if config is None else config)
-    if asked.start == "default" and asked.width != DEFAULT_WIDTH:
-        raise BadInputError("--width", str(asked.width), f"{DEFAULT_WIDTH} of the default network", "or --start new")
+    if asked.start != "new" and asked.width != DEFAULT_WIDTH:
+        raise BadInputError("--width", str(asked.width), f"{DEFAULT_WIDTH} of a trained network", "or --start new")
     _require_torch()
-    from trilane.training.captured_avatar import Places, train_on_capture
     from trilane.training.event_log import EventLog, require_tensorboard
+    from trilane.training.train import Places, train_avatar
 
     if tensorboard:
         require_tensorboard()
@@ -95,7 +100,7 @@ def train(
     places = Places(capture, out, work, out.name, vgg)
     log = EventLog(work / LOG) if tensorboard else None
     with stdout_kept(), _shown(log) as listener:
-        facts = train_on_capture(places, asked, listener)
+        facts = train_avatar(places, asked, listener)
     print_facts(facts, json)
 
 
@@ -125,7 +130,7 @@ def _shown(log: EventLog | None) -> Iterator[_Shown]:
 
 
 class _Shown:
-    """Shows what a training says; a `captured_avatar.Listener`."""
+    """Shows what a training says; a `train.Listener`."""
 
     def __init__(self, console: Console, progress: Progress, log: EventLog | None) -> None:
         self._console, self._progress, self._log = console, progress, log

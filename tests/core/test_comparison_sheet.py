@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("skimage")
 
 from trilane.training.backgrounds import scenes
-from trilane.training.comparison_sheet import comparison_sheet, worst_sheet
+from trilane.training.comparison_sheet import worst_sheet
 from trilane.training.evaluate import Evaluated
 from trilane.training.image_error import ImageError
 
@@ -36,22 +36,6 @@ def cells(sheet: np.ndarray) -> list[list[int]]:
     """The grey in the middle of each cell."""
     rows, columns = sheet.shape[0] // CELL[0], sheet.shape[1] // CELL[1]
     return [[int(sheet[256 * r + 128, 192 * c + 96, 0]) for c in range(columns)] for r in range(rows)]
-
-
-def test_each_band_shows_its_median_and_its_upper_quartile_by_the_last_painter() -> None:
-    """Of five samples by rising PSNR the third and the fourth."""
-    samples = [
-        evaluated(band, 5 * row + column, psnr_db)
-        for row, band in enumerate(BANDS)
-        for column, psnr_db in enumerate((30.0, 10.0, 50.0, 20.0, 40.0))
-    ]
-    sheet = comparison_sheet(samples, PAINTERS)
-    assert sheet.shape == (4 * 256, 6 * 192, 3) and sheet.dtype == np.uint8
-    wanted = []
-    for row in range(4):
-        median, upper = 50 * row, 50 * row + 40
-        wanted.append([median, median + 1, median + 2, upper, upper + 1, upper + 2])
-    assert cells(sheet) == wanted
 
 
 def test_a_small_picture_stands_in_the_middle_of_grey() -> None:

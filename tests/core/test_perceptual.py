@@ -14,11 +14,11 @@ pytest.importorskip("skimage")
 
 from trilane.errors import BadInputError, MissingPartError  # noqa: E402
 from trilane.training import perceptual  # noqa: E402
-from trilane.training.captured_avatar import with_vgg  # noqa: E402
 from trilane.training.losses import WEIGHTS, composite, drawn_behind  # noqa: E402
 from trilane.training.objective import Objective  # noqa: E402
 from trilane.training.perceptual import read_vgg16  # noqa: E402
 from trilane.training.structural_similarity import ms_ssim  # noqa: E402
+from trilane.training.train import with_vgg  # noqa: E402
 from trilane.training.training_settings import parsed_settings  # noqa: E402
 
 #: Of torchvision's VGG-16, by its documentation: places of the convolutions among the layers, and their channels.

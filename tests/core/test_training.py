@@ -1,8 +1,6 @@
-"""Training: samples repeat, held-out poses stay unseen, losses and metrics mean what they say, two steps run."""
+"""Training: samples repeat, held-out poses stay unseen, losses and metrics mean what they say."""
 
 from __future__ import annotations
-
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +13,6 @@ from trilane.avatars.bundle import bundle_folder  # noqa: E402
 from trilane.body.joints import JOINT_INDEX  # noqa: E402
 from trilane.errors import BadInputError  # noqa: E402
 from trilane.scene.motion.builtin import BUILTIN  # noqa: E402
-from trilane.training import training_loop  # noqa: E402
 from trilane.training.clear_view import ClothedSurface, vertex_reach  # noqa: E402
 from trilane.training.clothing.layers import Layer  # noqa: E402
 from trilane.training.error_summary import SampleError, summary  # noqa: E402
@@ -28,10 +25,8 @@ from trilane.training.random_views import BANDS, View, look_at, perspective, ran
 from trilane.training.sample_files import U16, batches, create_group, open_groups  # noqa: E402
 from trilane.training.surface_fields import eigenfunctions  # noqa: E402
 from trilane.training.texture_layout import fill_gaps, lay_out  # noqa: E402
-from trilane.training.train import TrainConfig, command_of, main  # noqa: E402
 from trilane.training.trainable_avatar import TrainableAvatar  # noqa: E402
-from trilane.training.training_loop import FitConfig, fit  # noqa: E402
-from trilane.training.weights_file import load_avatar, load_network, save_avatar, save_network  # noqa: E402
+from trilane.training.weights_file import load_network, save_network  # noqa: E402
 
 CHANNELS = 4
 SHAPE = (32, 64)
@@ -234,54 +229,6 @@ def test_fields_are_smooth_and_gaps_filled():
     assert np.allclose(filled[known], image[known]) and np.isfinite(filled).all()
 
 
-@pytest.fixture
-def in_this_process(monkeypatch):
-    """A worker in this process instead of one of its own, which `process/test_training_command.py` has."""
-    threads = torch.get_num_threads()
-
-    def spawn(worker, work, nprocs, join):
-        assert (nprocs, join) == (1, False)
-        worker(0, *work)
-        return SimpleNamespace(join=lambda timeout: timeout > 0)
-
-    monkeypatch.setattr(training_loop.tmp, "spawn", spawn)
-    yield
-    torch.set_num_threads(threads)
-
-
-@pytest.mark.usefixtures("in_this_process")
-def test_two_steps_of_training_run_and_are_saved(groups, tmp_path):
-    made, steps = fit(
-        avatar(),
-        groups,
-        FitConfig(minutes=2, workers=1, batch=2, max_steps=2),
-        report=lambda _: None,
-        checkpoint=lambda *_: None,
-    )
-    assert steps == 2
-    save_avatar(made, steps, tmp_path / "weights.npz")
-    again, steps_read = load_avatar(avatar(), tmp_path / "weights.npz")
-    assert steps_read == 2
-    assert all(torch.equal(a, b) for a, b in zip(made.state_dict().values(), again.state_dict().values(), strict=True))
-
-
-def test_weights_of_another_network_are_refused(tmp_path):
-    np.savez(tmp_path / "other.npz", steps=1, weights=np.zeros(3))
-    with pytest.raises(BadInputError, match=r"other\.npz"):
-        load_avatar(avatar(), tmp_path / "other.npz")
-
-
-def test_the_command_names_no_folder(tmp_path):
-    config = TrainConfig(work=tmp_path, held_out=(str(tmp_path / "jump.bvh"),), minutes=3.0)
-    command = command_of(config)
-    assert str(tmp_path) not in command and "--held-out jump.bvh" in command and "--minutes 3.0" in command
-
-
-def test_a_missing_body_is_a_sentence(tmp_path, capsys):
-    assert main(["--body", str(tmp_path / "none.npz"), "--work", str(tmp_path)]) == 2
-    assert "none.npz" in capsys.readouterr().err
-
-
 def test_the_network_alone_comes_back_in_half_precision(tmp_path):
     made, path = avatar(), tmp_path / "network.npz"
     save_network(made, path)
@@ -303,3 +250,33 @@ def test_a_network_of_another_width_is_refused(tmp_path):
     save_network(avatar(), path)
     with pytest.raises(BadInputError, match="size mismatch"):
         load_network(UNet(width=16, channels=CHANNELS), path)
+
+
+def kept_weights(path, **changes):
+    """A file of the network's weights, changed: None takes one out."""
+    arrays = {f"network.{name}": value.numpy() for name, value in avatar().network.state_dict().items()} | changes
+    np.savez(path, **{name: value for name, value in arrays.items() if value is not None})
+    return path
+
+
+def test_counters_of_batches_may_be_missing(tmp_path):
+    path = kept_weights(tmp_path / "a.npz", **{"network.mask.1.num_batches_tracked": None})
+    made = load_network(UNet(width=8, channels=CHANNELS), path).state_dict()
+    assert all(torch.equal(made[name], value) for name, value in avatar().network.state_dict().items())
+
+
+@pytest.mark.parametrize(
+    ("changes", "found"),
+    [({"network.mask.3.bias": None}, "no mask.3.bias"), ({"network.another": np.zeros(1)}, "also another")],
+)
+def test_weights_that_are_not_all_there_are_refused(tmp_path, changes, found):
+    path = kept_weights(tmp_path / "a.npz", **changes)
+    with pytest.raises(BadInputError) as caught:
+        load_network(UNet(width=8, channels=CHANNELS), path)
+    assert str(caught.value) == f"{path}: found {found}, expected weights that this network's training saved"
+
+
+def test_a_file_that_is_no_archive_is_refused(tmp_path):
+    (tmp_path / "b.npz").write_text("no archive")
+    with pytest.raises(BadInputError, match=r"b\.npz: found .*, expected weights that this network's training saved"):
+        load_network(UNet(width=8, channels=CHANNELS), tmp_path / "b.npz")

@@ -15,11 +15,14 @@ pytest.importorskip("skimage")
 
 from trilane.errors import BadInputError  # noqa: E402
 from trilane.training import batch_choice, step_loop  # noqa: E402
-from trilane.training.captured_avatar import resumed_settings  # noqa: E402
+from trilane.training.activation_noise import add_activation_noise  # noqa: E402
+from trilane.training.batch_choice import load_batch  # noqa: E402
+from trilane.training.losses import drawn_behind, loss_terms, total_loss  # noqa: E402
 from trilane.training.network import UNet  # noqa: E402
 from trilane.training.neural_texture import NeuralTexture  # noqa: E402
-from trilane.training.sample_files import U16, ShapeGroup, create_group, open_groups  # noqa: E402
+from trilane.training.sample_files import U16, ShapeGroup, batches, create_group, open_groups  # noqa: E402
 from trilane.training.step_loop import first_state, step_seconds, steps  # noqa: E402
+from trilane.training.train import resumed_settings  # noqa: E402
 from trilane.training.trainable_avatar import TrainableAvatar  # noqa: E402
 from trilane.training.training_settings import (  # noqa: E402
     TrainingSettings,
@@ -31,6 +34,8 @@ from trilane.training.training_state import TrainingState, load_state, save_stat
 
 SMALL, LARGE = (32, 32), (64, 32)
 COUNT = 7
+#: How often an epoch has a sample of each band.
+REPEATS = (1, 2, 1, 1, 1)
 #: Steps 0 to 2 are of small samples alone, and from step 5 on batch statistics stay.
 VALUES: dict[str, Any] = {
     "device": "cpu",
@@ -89,6 +94,80 @@ def go(state: TrainingState, groups: list[ShapeGroup], asked: TrainingSettings, 
 
 def bits(state: TrainingState) -> dict[str, bytes]:
     return {name: value.detach().contiguous().numpy().tobytes() for name, value in state.tensors().items()}
+
+
+def test_half_size_tensors_have_fewer_than_160_x_160_pixels() -> None:
+    assert batch_choice.SMALL_PIXELS == 25600
+
+
+def test_a_batch_is_in_shares(groups: list[ShapeGroup]) -> None:
+    group = groups[0]
+    uv, covered, target = load_batch(group, np.array([3, 1]))
+    np.testing.assert_allclose(uv, group.uv[[3, 1]] / 65535, atol=1e-7)
+    assert covered.dtype == torch.bool and (covered.numpy() == (group.covered[[3, 1]] == 1)).all()
+    np.testing.assert_allclose(target, group.rgba[[3, 1]].transpose(0, 3, 1, 2) / 255, atol=1e-7)
+
+
+def trained_again(made: TrainableAvatar, groups: list[ShapeGroup], jitter: float = 0.0) -> list[dict[str, float]]:
+    """Seven steps as `VALUES` ask for them, written out again; the terms of each. `made` changes in place.
+
+    `jitter`: of the gradients, relative.
+    """
+    add_activation_noise(made.network, 1.0)
+    made.network.to(memory_format=torch.channels_last)
+    streams = [
+        batches(some, 2, np.random.default_rng((5, 2, phase)), REPEATS)
+        for phase, some in enumerate((groups[:1], groups))
+    ]
+    kernels = [p for p in made.network.parameters() if p.ndim > 1]
+    vectors = [p for p in made.network.parameters() if p.ndim == 1]
+    parts = ((kernels, 1.5e-3, 1e-3), (vectors, 1.5e-3, 0.0), (list(made.texture.parameters()), 4e-4, 1e-3))
+    optimisers = [torch.optim.AdamW(ps, lr=1.0, betas=(0.9, 0.99), weight_decay=decay) for ps, _, decay in parts]
+    found = []
+    for step in range(COUNT):
+        share = step / COUNT
+        torch.manual_seed(step * 2**31 + 5)
+        made.train()
+        if share > 0.6:
+            for module in made.modules():
+                if isinstance(module, torch.nn.BatchNorm2d):
+                    module.train(False)
+        uv, covered, target = load_batch(*next(streams[0 if share < 0.4 else 1]))
+        terms = loss_terms(made(uv, covered), target, drawn_behind(target))
+        made.zero_grad()
+        total_loss(terms).backward()
+        length = math.sqrt(sum(float(p.grad.double().square().sum()) for p in made.parameters()))
+        for p in made.parameters():
+            p.grad *= min(1.0, 1.0 / (length + 1e-6))
+            p.grad *= 1 + jitter * torch.randn(p.shape, generator=torch.Generator().manual_seed(step))
+        falls = 0.01 + 0.99 * (1 + math.cos(math.pi * (share - 0.02) / 0.98)) / 2
+        for optimiser, (_, rate, _) in zip(optimisers, parts, strict=True):
+            optimiser.param_groups[0]["lr"] = rate * (0.02 if step == 0 else falls)
+            optimiser.step()
+        found.append({name: float(term.detach()) for name, term in terms.items()})
+    return found
+
+
+def test_a_training_does_what_the_loop_written_out_again_does(groups: list[ShapeGroup]) -> None:
+    """The first terms to float32's rounding. Later ones, and weights, to a thousandth or a twentieth of the way, or ten
+    times what rounding does: Adam divides by a gradient's size, so where that is next to nothing a rounding moves a
+    weight by a whole step."""
+    asked = settings(batches={"repeats": REPEATS})
+    state = first_state(avatar(), asked)
+    terms = list(steps(state, groups, asked, COUNT))
+    again, rounded = avatar(), avatar()
+    wanted = trained_again(again, groups)
+    jittered_terms = trained_again(rounded, groups, jitter=2.0**-22)
+    assert terms[0] == pytest.approx(wanted[0], rel=1e-5)
+    for one, other, third in zip(terms, wanted, jittered_terms, strict=True):
+        rounding = max(abs(third[name] / other[name] - 1) for name in other)
+        assert one == pytest.approx(other, rel=max(1e-3, 10 * rounding))
+    start, alike, jittered = avatar().state_dict(), again.state_dict(), rounded.state_dict()
+    for name, found in state.avatar.state_dict().items():
+        way = float((alike[name] - start[name]).double().abs().mean())
+        off, rounding = (float((one - alike[name]).double().abs().mean()) for one in (found, jittered[name]))
+        assert off <= max(5e-2 * way, 10 * rounding), f"{name}: moved by {way}, {off} from where it should be"
+        assert way > 0 or name.endswith("num_batches_tracked"), name
 
 
 def test_the_same_seed_gives_the_same_bits(groups: list[ShapeGroup]) -> None:
@@ -262,7 +341,7 @@ def test_a_new_network_with_little_time_takes_many_cheap_steps(tmp_path: Path) -
         ({"loss": "thesi"}, "options: loss: found 'thesi', expected one of default, thesis; did you mean 'thesis'"),
         ({"vgg": "mine.pth"}, "options: vgg: found 'mine.pth', expected String should match pattern"),
         ({"samples": 3}, "options: samples: found 3, expected greater than or equal to 8"),
-        ({"start": "old"}, "options: start: found 'old', expected 'default' or 'new'"),
+        ({"start": "old"}, "options: start: found 'old', expected 'default', 'hiker' or 'new'"),
     ],
 )
 def test_wrong_settings_are_refused(values: dict[str, Any], words: str) -> None:

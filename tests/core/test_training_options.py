@@ -16,16 +16,25 @@ pytest.importorskip("skimage")
 
 from trilane.errors import BadInputError  # noqa: E402
 from trilane.training import batch_choice, objective, step_loop  # noqa: E402
-from trilane.training.batch_choice import batch_stream, is_whole, phases, zoom  # noqa: E402
+from trilane.training.batch_choice import (  # noqa: E402
+    batch_stream,
+    is_whole,
+    load_batch,
+    phases,
+    zoom,
+)
 from trilane.training.dropout import add_dropout  # noqa: E402
 from trilane.training.network import NORMS, UNet  # noqa: E402
 from trilane.training.neural_texture import NeuralTexture  # noqa: E402
 from trilane.training.objective import Objective  # noqa: E402
 from trilane.training.optimisers import clip_gradients, optimiser_of  # noqa: E402
 from trilane.training.sample_files import U16, ShapeGroup, create_group, open_groups  # noqa: E402
-from trilane.training.step_loop import first_state, steps  # noqa: E402
+from trilane.training.step_loop import (  # noqa: E402
+    add_gradients,
+    first_state,
+    steps,
+)
 from trilane.training.trainable_avatar import TrainableAvatar  # noqa: E402
-from trilane.training.training_loop import add_gradients, load_batch  # noqa: E402
 from trilane.training.training_options import OptimiserOptions  # noqa: E402
 from trilane.training.training_settings import TrainingSettings, parsed_settings, settings_text  # noqa: E402
 from trilane.training.training_state import TrainingState, load_state, save_state  # noqa: E402

@@ -14,13 +14,13 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from trilane.errors import MissingPartError  # noqa: E402
+from trilane.training.batch_choice import load_batch  # noqa: E402
 from trilane.training.device import chosen_device, device_words, memory_words  # noqa: E402
 from trilane.training.event_log import EventLog  # noqa: E402
 from trilane.training.losses import drawn_behind, loss_terms, total_loss  # noqa: E402
 from trilane.training.objective import Objective  # noqa: E402
 from trilane.training.probe_loss import probe_loss  # noqa: E402
 from trilane.training.sample_files import U16, ShapeGroup, create_group  # noqa: E402
-from trilane.training.training_loop import load_batch  # noqa: E402
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("scipy")
 pytest.importorskip("skimage")
 
-from trilane.training import losses, training_loop  # noqa: E402
+from trilane.training import losses, step_loop  # noqa: E402
 from trilane.training.activation_noise import add_activation_noise  # noqa: E402
 from trilane.training.body_arrays import BodyArrays  # noqa: E402
 from trilane.training.encoders import ENCODERS  # noqa: E402
@@ -19,11 +19,12 @@ from trilane.training.first_texture import first_texture, head_on, mean_colours,
 from trilane.training.network import NORMS, UNet  # noqa: E402
 from trilane.training.neural_texture import NeuralTexture, read_texture  # noqa: E402
 from trilane.training.onnx_export import export_onnx  # noqa: E402
+from trilane.training.optimisers import optimiser_of  # noqa: E402
 from trilane.training.sample_files import U16, ShapeGroup, batches  # noqa: E402
 from trilane.training.surface_fields import eigenfunctions  # noqa: E402
 from trilane.training.texture_layout import fill_gaps, lay_out  # noqa: E402
 from trilane.training.trainable_avatar import TrainableAvatar  # noqa: E402
-from trilane.training.training_loop import FitConfig  # noqa: E402
+from trilane.training.training_settings import parsed_settings  # noqa: E402
 
 
 def avatar() -> TrainableAvatar:
@@ -108,36 +109,19 @@ def test_masks_at_their_ends_cost_a_finite_amount():
     ],
 )
 def test_the_learning_rate_rises_and_falls_as_a_cosine(share, rate):
-    assert training_loop.rate_share(share) == pytest.approx(rate)
+    assert step_loop.rate_share(share) == pytest.approx(rate)
 
 
 def test_kernels_decay_and_the_texture_has_a_rate_of_its_own():
     made = avatar()
-    config = FitConfig(1.0, network_rate=3.0, texture_rate=5.0, weight_decay=7.0)
-    kernels, others, texture = training_loop.optimiser_of(made, config).param_groups
-    assert [(group["lr"], group["weight_decay"]) for group in (kernels, others, texture)] == [(3, 7), (3, 0), (5, 7)]
+    config = parsed_settings({"network_rate": 0.25, "texture_rate": 0.5, "weight_decay": 0.75}, "a test")
+    kernels, others, texture = optimiser_of(made, config).param_groups
+    rates = [(group["lr"], group["weight_decay"]) for group in (kernels, others, texture)]
+    assert rates == [(0.25, 0.75), (0.25, 0), (0.5, 0.75)]
     assert {p.ndim for p in kernels["params"]} == {4}
     assert {p.ndim for p in others["params"]} == {1}
     assert [tuple(p.shape) for p in texture["params"]] == [(1, 4, 64, 64), (1, 4, 32, 32)]
     assert sum(len(group["params"]) for group in (kernels, others, texture)) == len(list(made.parameters()))
-
-
-def test_an_exchange_adds_a_share_of_the_change_and_means_the_statistics():
-    mine, shared = avatar(), avatar()
-    before = training_loop._copy(mine)
-    name = "network.mask.3.bias"
-    statistic = "network.mask.1.running_var"
-    with torch.no_grad():
-        mine.state_dict()[name] += 2.0
-        shared.state_dict()[name] += 1.0
-        mine.state_dict()[statistic].fill_(3.0)
-        shared.state_dict()[statistic].fill_(5.0)
-    start = before[name].clone()
-    training_loop._exchange(mine, before, shared, 0.25)
-    for weights in (mine.state_dict(), shared.state_dict()):
-        assert torch.allclose(weights[name], start + 1.0 + 0.25 * 2.0)
-        assert torch.equal(weights[statistic], torch.full_like(weights[statistic], 4.0))
-    assert torch.equal(before[name], mine.state_dict()[name])
 
 
 def test_the_average_keeps_its_share():
@@ -146,14 +130,14 @@ def test_the_average_keeps_its_share():
     old = average.state_dict()[name].clone()
     with torch.no_grad():
         now.state_dict()[name] += 8.0
-    training_loop.follow(average, now, keep=0.75)
+    step_loop.follow(average, now, keep=0.75)
     assert torch.allclose(average.state_dict()[name], old + 2.0)
 
 
 @pytest.mark.parametrize("frozen", [False, True])
 def test_frozen_norms_keep_their_statistics(frozen):
     made = avatar().eval()
-    training_loop.set_mode(made, frozen)
+    step_loop.set_mode(made, frozen)
     norms = [module for module in made.modules() if isinstance(module, torch.nn.BatchNorm2d)]
     assert norms and made.network.colour[0].training
     assert all(norm.training is not frozen for norm in norms)
