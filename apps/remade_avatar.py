@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 from trilane.apps.remake import METHOD, VIEWS, Remake, calibration_of
 from trilane.arrays import F32
 from trilane.avatars.bundle import MANIFEST, TEXTURE_KEYS, Bundle, load_bundle, write_bundle
-from trilane.avatars.digests import digests_of, sha256_of
-from trilane.avatars.manifest import UNTRAINED, Manifest, network_entry
+from trilane.avatars.manifest import UNTRAINED, Manifest, digests_of, network_entry, sha256_of
 from trilane.bench.lib.full_network import float_weights, weights_name
 from trilane.cache import cache_dir
 from trilane.errors import BadInputError, MissingPartError, TrilaneError
@@ -117,7 +116,7 @@ def _alone(lock: Path) -> Iterator[None]:
 
 
 def _make(bundle: Bundle, recipe: _Recipe, folder: Path) -> None:
-    from trilane.avatars.network_reshape import reshaped
+    from trilane.avatars.network_file import reshaped
 
     chosen = np.arange(recipe.channels) % bundle.manifest.network.channels
     quantised = _quantised(bundle, recipe, chosen)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from trilane.avatars.size_loss import SizeLoss
+from trilane.avatars.validation import SizeLoss
 from trilane.errors import BadInputError
 from trilane.scene.planner import ALL_WORK, SIDES, work_of_side
 from trilane.scene.schema import Scene

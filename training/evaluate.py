@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F64, U8
 from trilane.avatars.bundle import Bundle
-from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.network_file import reshaped
 from trilane.shapes import Shape
 from trilane.stages.dsp.runtime import RuntimeOptions, Session, load_runtime
 from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Placement, Quantisation

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from trilane.arrays import F32
 from trilane.avatars.bundle import Bundle
-from trilane.avatars.integer_network import constants_of
+from trilane.avatars.network_file import constants_of
 from trilane.errors import BadInputError
 from trilane.training.batch_choice import load_batch
 from trilane.training.byte_grid import convolutions, module_of

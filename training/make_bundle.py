@@ -15,10 +15,9 @@ import torch
 from numpy.typing import NDArray
 
 from trilane.arrays import F64, Mask
-from trilane.avatars.bundle import write_bundle
+from trilane.avatars.bundle import pack_levels, write_bundle
 from trilane.avatars.manifest import Manifest, network_entry
-from trilane.avatars.network_reshape import reshaped
-from trilane.avatars.texture_levels import pack_levels
+from trilane.avatars.network_file import reshaped
 from trilane.body.body import ShapedBody
 from trilane.training.body_arrays import BodyArrays, body_arrays
 from trilane.training.first_texture import used_texels

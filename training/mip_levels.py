@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from trilane.avatars.bundle import Bundle
-from trilane.avatars.texture_levels import split_levels
+from trilane.avatars.bundle import Bundle, split_levels
 from trilane.training.neural_texture import read_texture
 
 #: Texels a pixel below which the level is 0 anyway.

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from trilane.arrays import F32
-from trilane.avatars.offsets import as_kept, read_offsets, save_offsets
+from trilane.avatars.bundle import as_kept, read_offsets, save_offsets
 from trilane.training.dataset import plan_training
 from trilane.training.stand_off import Outline, measured_heights, smooth_normals, stand_off
 from trilane.training.subject import Subject

@@ -34,14 +34,14 @@ from trilane.training.sample_crop import Crop, Cropper
 from trilane.training.uv_image import UvRaster
 
 BAND_NAMES = tuple(BANDS)
-ANYWHERE = len(BAND_NAMES)
+ANYWHERE_BAND = len(BAND_NAMES)
 LEAST_PIXELS = 200
 PoseSource = Callable[[np.random.Generator], F64]
 
 
 @dataclass(frozen=True)
 class Sample:
-    """What to render. `pose` (55,3) axis-angle, radians. `band`: an index into BAND_NAMES, or ANYWHERE."""
+    """What to render. `pose` (55,3) axis-angle, radians. `band`: an index into BAND_NAMES, or ANYWHERE_BAND."""
 
     pose: F64
     view: View
@@ -94,7 +94,7 @@ class SampleRenderer:
                 continue
             crop = self.cropper.crop(posed, view, shape_buckets(size))
             if crop is not None and crop.pixels >= LEAST_PIXELS:
-                return Sample(pose, view, crop, BAND_NAMES.index(band) if band in BANDS else ANYWHERE)
+                return Sample(pose, view, crop, BAND_NAMES.index(band) if band in BANDS else ANYWHERE_BAND)
 
     def training_sample(self, seed: Sequence[int], band: str, size: str) -> Sample:
         """As `plan`, in a random pose."""

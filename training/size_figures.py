@@ -17,8 +17,7 @@ from PIL import Image
 from trilane import machine
 from trilane.arrays import U8
 from trilane.avatars.bundle import Bundle
-from trilane.avatars.digests import with_figures_digest
-from trilane.avatars.manifest import BySize, Validation
+from trilane.avatars.manifest import BySize, Validation, with_figures_digest
 from trilane.scene.planner import SIDES
 from trilane.shapes import BUCKET_STEP, Shape
 from trilane.training.dataset import plan_validation

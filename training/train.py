@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from trilane.avatars.bundle import OFFSETS, bundle_folder, load_bundle
-from trilane.avatars.digests import sha256_of
+from trilane.avatars.manifest import sha256_of
 from trilane.errors import BadInputError
 from trilane.files import read_text
 from trilane.training.body_arrays import body_arrays

@@ -12,8 +12,7 @@ from typing import Any
 
 from trilane import machine
 from trilane.avatars.bundle import Bundle, write_manifest
-from trilane.avatars.digests import digests_of, sha256_of, with_figures_digest
-from trilane.avatars.manifest import AT_THE_TOP, MadeWith, Validation
+from trilane.avatars.manifest import AT_THE_TOP, MadeWith, Validation, digests_of, sha256_of, with_figures_digest
 from trilane.scene.motion.load import load_motion
 from trilane.scene.motion.motion import Motion
 from trilane.scene.schema import AvatarSpec

@@ -26,7 +26,7 @@ from trilane.errors import BadInputError, MissingPartError
 if TYPE_CHECKING:
     import onnx
 
-    from trilane.avatars.integer_network import NetworkFile
+    from trilane.avatars.network_file import NetworkFile
     from trilane.shapes import Shape
 
 EPILOG_NETWORK = """\b
@@ -82,7 +82,7 @@ def split(
     `trilane run --split TENSOR=UNIT` runs the parts as stages of their own.
     """
     from trilane.avatars.bundle import load_bundle
-    from trilane.avatars.network_reshape import reshaped
+    from trilane.avatars.network_file import reshaped
 
     if bool(at) != (out is not None):
         raise BadInputError("options", "--at without --out" if at else "--out without --at", "both, or neither")
@@ -106,7 +106,7 @@ def export(
 ) -> None:
     """Compile an avatar's network for a Snapdragon, without one."""
     from trilane.avatars.bundle import load_bundle
-    from trilane.avatars.network_reshape import reshaped
+    from trilane.avatars.network_file import reshaped
     from trilane.stages.dsp.runtime import resolve
 
     if not qnn:

@@ -12,8 +12,7 @@ import onnx
 
 from trilane.arrays import F32
 from trilane.avatars.bundle import load_bundle
-from trilane.avatars.integer_network import NetworkFile
-from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.network_file import NetworkFile, reshaped
 from trilane.bench.lib.full_network import float_weights
 from trilane.errors import BadInputError, MissingPartError
 from trilane.stages.avatar_assets import distinct, with_network

@@ -12,8 +12,7 @@ import numpy as np
 import onnx
 from numpy.typing import NDArray
 
-from trilane.avatars.integer_network import NetworkFile
-from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.network_file import NetworkFile, reshaped
 from trilane.errors import MissingPartError
 from trilane.hw_profiles.network_work import graph_facts
 from trilane.training.quantising.quantise import quantise

@@ -15,7 +15,7 @@ import numpy as np
 
 from trilane import machine
 from trilane.arrays import U8
-from trilane.avatars.integer_network import NetworkFile
+from trilane.avatars.network_file import NetworkFile
 from trilane.avatars.network_split import NetworkPart
 from trilane.errors import BadInputError
 from trilane.pipeline.moved_bytes import ByteCounter

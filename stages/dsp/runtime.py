@@ -13,7 +13,7 @@ from typing import Protocol
 
 from trilane import machine
 from trilane.arrays import U8
-from trilane.avatars.integer_network import IntegerNetwork
+from trilane.avatars.network_file import IntegerNetwork
 from trilane.errors import BadInputError, MissingPartError
 from trilane.install import install_line, package_line, pip
 

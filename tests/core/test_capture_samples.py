@@ -29,7 +29,7 @@ from trilane.training.capture.check import checked_frame, coverage_of
 from trilane.training.capture.image_map import moved, projected, seen_of_frame
 from trilane.training.capture.zoomed_view import Camera, ViewRule, zoomed_view
 from trilane.training.random_views import BANDS
-from trilane.training.sample_renderer import ANYWHERE
+from trilane.training.sample_renderer import ANYWHERE_BAND
 from trilane.training.subject import captured_subject
 
 WIDE = ViewRule(turn_deg=25, squeeze=0.2, flip_share=0.5, shift=0.1)
@@ -177,7 +177,7 @@ def test_a_sample_depends_on_its_seed_alone(capture: Capture) -> None:
 def test_only_the_frames_that_are_given_are_shown(capture: Capture) -> None:
     renderer = CaptureRenderer(capture, (2, 5), WIDE)
     samples = [renderer.training_sample((9, number), "anywhere", "128") for number in range(20)]
-    assert {sample.picture for sample in samples} == {2, 5} and {sample.band for sample in samples} == {ANYWHERE}
+    assert {sample.picture for sample in samples} == {2, 5} and {sample.band for sample in samples} == {ANYWHERE_BAND}
 
 
 def test_a_band_that_no_frame_can_show_is_said(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:

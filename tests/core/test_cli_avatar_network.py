@@ -16,7 +16,7 @@ from trilane.apps.avatar_facts import bundle_facts
 from trilane.apps.cli import avatar_network
 from trilane.avatars import network_split
 from trilane.avatars.bundle import load_bundle
-from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.network_file import reshaped
 from trilane.avatars.network_split import Cut
 from trilane.body.body import load_body
 from trilane.hw_profiles.network_work import graph_facts

@@ -23,8 +23,7 @@ from trilane.apps import made
 from trilane.apps.cli import avatar_quantise, avatar_validate
 from trilane.apps.experiments import calibrated_network
 from trilane.avatars.bundle import load_bundle, write_manifest
-from trilane.avatars.digests import sha256_of
-from trilane.avatars.manifest import Validation
+from trilane.avatars.manifest import Validation, sha256_of
 from trilane.stages.dsp import runtime
 from trilane.testing.validated import validated
 from trilane.training.quantising import (

@@ -21,7 +21,7 @@ from onnx import helper
 
 from trilane import machine
 from trilane.avatars.bundle import load_bundle
-from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.network_file import reshaped
 from trilane.avatars.network_split import cuts, split
 from trilane.errors import BadInputError, MissingPartError
 from trilane.pipeline.description import UnitSettings

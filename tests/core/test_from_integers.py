@@ -11,7 +11,7 @@ pytest.importorskip("onnxruntime")
 from pathlib import Path  # noqa: E402
 
 from trilane.avatars.bundle import Bundle, load_bundle  # noqa: E402
-from trilane.avatars.network_reshape import reshaped  # noqa: E402
+from trilane.avatars.network_file import reshaped  # noqa: E402
 from trilane.errors import BadInputError  # noqa: E402
 from trilane.stages.dsp.runtime import RuntimeOptions, load_runtime  # noqa: E402
 from trilane.training.from_integers import network_of  # noqa: E402

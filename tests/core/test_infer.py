@@ -12,7 +12,7 @@ import pytest
 
 from trilane import machine
 from trilane.avatars.bundle import load_bundle
-from trilane.avatars.integer_network import constants_of
+from trilane.avatars.network_file import constants_of
 from trilane.errors import BadInputError
 from trilane.install import install_line
 from trilane.pipeline.description import UnitSettings

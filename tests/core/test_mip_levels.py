@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trilane.avatars.bundle import bundle_folder, load_bundle, write_bundle
-from trilane.avatars.texture_levels import check_levels, pack_levels, split_levels
+from trilane.avatars.bundle import bundle_folder, check_levels, load_bundle, pack_levels, split_levels, write_bundle
 from trilane.errors import BadInputError
 from trilane.stages.gpu.texture_array import filter_of
 

@@ -8,7 +8,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from trilane.avatars.network_reshape import reshaped  # noqa: E402
+from trilane.avatars.network_file import reshaped  # noqa: E402
 from trilane.errors import BadInputError  # noqa: E402
 from trilane.training.encoders import ENCODERS, Shortcut  # noqa: E402
 from trilane.training.network import NORMS, UNet  # noqa: E402

@@ -11,16 +11,17 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from trilane.avatars import network_checks
-from trilane.avatars.integer_network import (
+from trilane.avatars import network_file
+from trilane.avatars.network_file import (
     FLOAT_LAYERS_KEY,
+    TO_INTEGERS,
     Affine,
     IntegerNetwork,
     check_integer_layers,
+    check_network,
     constants_of,
     node_name,
 )
-from trilane.avatars.network_checks import TO_INTEGERS, check_network
 from trilane.errors import BadInputError
 from trilane.testing.byte_network import net, node_of
 
@@ -256,7 +257,7 @@ def test_zero_points_of_every_type(kind: int, low: int, high: int) -> None:
         with pytest.raises(BadInputError) as raised:
             check_network(model, "here")
         assert str(raised.value) == f"here: found zero point {value} in node 'mid_out', expected {low} to {high}"
-    assert network_checks.ZERO_POINT_TYPES[TensorProto.INT32] == (-2147483648, 2147483647)
+    assert network_file.ZERO_POINT_TYPES[TensorProto.INT32] == (-2147483648, 2147483647)
 
 
 #: By what they do: layers, activations, norms, pooling, moving data, bytes.
@@ -267,7 +268,7 @@ Concat Pad Reshape Slice Split Transpose  QuantizeLinear DequantizeLinear"""
 
 
 def test_the_operators_that_a_dsp_has() -> None:
-    assert set(ALLOWED.split()) == network_checks.OPERATORS
+    assert set(ALLOWED.split()) == network_file.OPERATORS
 
 
 def test_several_transposes_may_lie_before_the_ends() -> None:

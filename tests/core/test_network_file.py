@@ -9,8 +9,7 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from trilane.avatars.network_checks import check_network
-from trilane.avatars.network_file import read_network
+from trilane.avatars.network_file import check_network, read_network
 from trilane.errors import BadInputError
 
 

@@ -9,10 +9,7 @@ import pytest
 from onnx import TensorProto, helper
 
 from trilane.avatars import network_file
-from trilane.avatars.integer_network import (
-    constants_of,
-)
-from trilane.avatars.network_file import parse_network, read_network
+from trilane.avatars.network_file import constants_of, parse_network, read_network
 from trilane.errors import BadInputError
 from trilane.testing.byte_network import net
 

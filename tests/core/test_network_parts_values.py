@@ -9,11 +9,7 @@ import numpy as np
 import pytest
 from onnx import helper, numpy_helper
 
-from trilane.avatars.integer_network import (
-    NetworkFile,
-)
-from trilane.avatars.network_checks import check_network
-from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.network_file import NetworkFile, check_network, reshaped
 from trilane.avatars.network_split import Cut, cuts, split
 from trilane.errors import BadInputError
 from trilane.testing.byte_network import net, node_of

@@ -8,9 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trilane.avatars.bundle import BUILT_IN, bundle_folder, load_bundle, write_bundle, write_manifest
-from trilane.avatars.digests import digests_of
-from trilane.avatars.offsets import as_kept, read_offsets, save_offsets
+from trilane.avatars.bundle import (
+    BUILT_IN,
+    as_kept,
+    bundle_folder,
+    load_bundle,
+    read_offsets,
+    save_offsets,
+    write_bundle,
+    write_manifest,
+)
+from trilane.avatars.manifest import digests_of
 from trilane.errors import BadInputError
 
 

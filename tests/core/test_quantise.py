@@ -10,7 +10,7 @@ import onnxruntime
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from trilane.avatars.network_reshape import reshaped
+from trilane.avatars.network_file import reshaped
 from trilane.errors import BadInputError
 from trilane.training.quantising.calibration import METHODS, saturated
 from trilane.training.quantising.quantise import quantise

@@ -14,7 +14,7 @@ from trilane.apps.asked_run import AskedRun, prepare
 from trilane.apps.cli.sweep_options import SweptCommand
 from trilane.apps.remake import METHODS, Remake, calibration_of, check_remake
 from trilane.avatars.bundle import MANIFEST, load_bundle
-from trilane.avatars.digests import sha256_of
+from trilane.avatars.manifest import sha256_of
 from trilane.avatars.validation import DrawnAs, accuracy_of
 from trilane.bench.lib import full_network
 from trilane.errors import BadInputError

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from trilane.apps.cli.avatar import app
 from trilane.avatars.bundle import load_bundle
-from trilane.avatars.integer_network import NetworkFile
+from trilane.avatars.network_file import NetworkFile
 from trilane.avatars.network_split import cuts, split
 from trilane.errors import BadInputError
 

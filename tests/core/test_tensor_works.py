@@ -16,7 +16,7 @@ from trilane.apps.report import Resolution
 from trilane.apps.resolution import resolution_note, resolution_of
 from trilane.avatars.bundle import load_bundle, write_manifest
 from trilane.avatars.manifest import BySize
-from trilane.avatars.size_loss import SizeLoss, size_loss
+from trilane.avatars.validation import SizeLoss, size_loss
 from trilane.errors import BadInputError
 from trilane.scene.crop import Rect
 from trilane.scene.planner import TensorBudget, work_of_side

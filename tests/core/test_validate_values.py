@@ -16,7 +16,7 @@ pytest.importorskip("skimage")
 
 from trilane import machine
 from trilane.avatars.bundle import Bundle, load_bundle
-from trilane.avatars.digests import digests_of
+from trilane.avatars.manifest import digests_of
 from trilane.body.body import load_body
 from trilane.training import dataset, evaluate, validate
 from trilane.training.clothing.looks import LOOKS

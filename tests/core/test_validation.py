@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from trilane.apps.cli.avatar import app
 from trilane.avatars.bundle import load_bundle, write_bundle, write_manifest
-from trilane.avatars.digests import digests_of, sha256_of, with_figures_digest
+from trilane.avatars.manifest import digests_of, sha256_of, with_figures_digest
 from trilane.avatars.validation import DrawnAs, accuracy_of, validation_facts
 from trilane.errors import BadInputError
 from trilane.figure_sources import NO_FIGURES

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trilane.avatars.texture_levels import pack_levels
+from trilane.avatars.bundle import pack_levels
 from trilane.errors import BadInputError
 from trilane.stages.gpu.packed_pass import PackedAvatar, PackedPass, Quantisation
 

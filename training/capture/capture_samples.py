@@ -23,7 +23,7 @@ from trilane.training.capture.image_map import augmented_projection, map_between
 from trilane.training.capture.zoomed_view import Camera, ViewRule, screen_shape, zoomed_view
 from trilane.training.random_views import BANDS, View
 from trilane.training.sample_crop import Crop, Cropper
-from trilane.training.sample_renderer import ANYWHERE, BAND_NAMES, LEAST_PIXELS
+from trilane.training.sample_renderer import ANYWHERE_BAND, BAND_NAMES, LEAST_PIXELS
 
 #: Draws of a view before it is said that no frame has one.
 TRIES = 1000
@@ -38,7 +38,7 @@ class CaptureSample:
     """What to render. `picture`: number of the frame. `crop`: its projection draws the body, before it is mirrored.
 
     `by` (3,3): from the frame's pixels to the tensor's. `mirrored`: whether `by` mirrors, see `unmirrored`. `band`: an
-    index into BAND_NAMES, or ANYWHERE.
+    index into BAND_NAMES, or ANYWHERE_BAND.
     """
 
     picture: int
@@ -100,7 +100,7 @@ class CaptureRenderer:
         if crop is None:
             return None
         by = map_between(self._projection, crop.projection, frame, crop.shape)
-        return CaptureSample(number, crop, by, False, ANYWHERE)
+        return CaptureSample(number, crop, by, False, ANYWHERE_BAND)
 
     def placed(self, sample: CaptureSample) -> tuple[F64, Placement]:
         """The camera (4,4) of a sample that is not mirrored, and its body as the packed pass draws it."""
@@ -124,7 +124,7 @@ class CaptureRenderer:
         whole = map_between(self._projection, crop.projection, camera.shape, crop.shape)
         if mirrored:
             whole = np.array([[-1.0, 0.0, crop.shape[1]], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]) @ whole
-        return CaptureSample(number, crop, whole, mirrored, BAND_NAMES.index(band) if band in BANDS else ANYWHERE)
+        return CaptureSample(number, crop, whole, mirrored, BAND_NAMES.index(band) if band in BANDS else ANYWHERE_BAND)
 
     def render(self, sample: CaptureSample) -> tuple[F32, U8]:
         """The UV image (h,w,3) float32 of u, v, coverage, and the ground truth (h,w,4) uint8, straight alpha."""

@@ -15,11 +15,10 @@ import onnxruntime
 from numpy.typing import NDArray
 from onnx import TensorProto, helper
 
-from trilane.avatars.integer_network import LAYERS, NetworkFile
+from trilane.avatars.network_file import LAYERS, NetworkFile
+from trilane.training.quantising.noise_model import ERRORS_ONLY, PROVIDERS
 from trilane.training.quantising.quantise import Quantised
 
-PROVIDERS = ["CPUExecutionProvider"]
-ERRORS_ONLY = 3
 #: Greatest ratio that is reported: a layer without error has an infinite one, which JSON cannot express.
 MAX_DB = 200.0
 

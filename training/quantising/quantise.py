@@ -24,8 +24,7 @@ from onnx import TensorProto, TypeProto, helper, numpy_helper
 from onnxruntime.quantization.shape_inference import quant_pre_process
 
 from trilane.arrays import F32
-from trilane.avatars.integer_network import FLOAT_LAYERS_KEY, NetworkFile, constants_of
-from trilane.avatars.network_checks import check_network
+from trilane.avatars.network_file import FLOAT_LAYERS_KEY, NetworkFile, check_network, constants_of
 from trilane.errors import BadInputError
 from trilane.training.quantising.byte_input_output import replace_ends_by_bytes
 from trilane.training.quantising.calibration import limit_logits, measure, norm_inputs, saturated, share_ranges, widen
